@@ -26,11 +26,10 @@ from dataset_builder.blender.colour import configure_colour, render_colour
 from dataset_builder.blender.evaluated_mesh import evaluated_world_mesh
 from dataset_builder.blender.scene import build_scene
 from dataset_builder.config.catalog import BuildRequest
-from dataset_builder.config.quality import QUALITIES, UNIFORM, colour_spec
 from dataset_builder.config.rigs import rig_cameras
-from dataset_builder.config.specs import ColourSpec, ConfigSpec
-from dataset_builder.config.trajectories import poses, subset
-from dataset_builder.scene.assemblies import aim_point_m, make_assembly
+from dataset_builder.config.specs import QUALITIES, UNIFORM, ColourSpec, ConfigSpec, colour_spec
+from dataset_builder.config.trajectories import aim_point_m, poses, subset
+from dataset_builder.scene.assemblies import make_assembly
 from dataset_builder.scene.raycast import RayCaster
 from rebar_depth_bench.geometry.cameras import Camera
 

@@ -32,14 +32,13 @@ from dataset_builder.audit import audit
 from dataset_builder.config.cages import CAGES, CagesRequest
 from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.config.specs import ConfigSpec, RandomViewsSpec
+from dataset_builder.pipeline.blender_process import OnViewDone
 from dataset_builder.pipeline.build import plan_build
-from dataset_builder.pipeline.disk_space import check_readable, spaces_of_configs
+from dataset_builder.pipeline.disk_space import check_readable, spaces_by_config
 from dataset_builder.pipeline.folder import remove_build_folder, remove_stagings
-from dataset_builder.pipeline.local_renderer import OnViewDone
-from dataset_builder.pipeline.place_cameras import ScenePlan
-from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan
+from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, ScenePlan
 from dataset_builder.pipeline.publish import publish_plans
-from dataset_builder.pipeline.retained import Finished, check_retained, kept_scenes
+from dataset_builder.pipeline.retained import Finished, kept_scenes
 from dataset_builder.pipeline.shards import Staging, View, encode_view, stage_row
 from dataset_builder.pipeline.work_units import UnitResult, WorkUnit
 from dataset_builder.scene.mesh_ply import write_mesh_ply
@@ -101,16 +100,14 @@ def placed(plan: ConfigPlan) -> ConfigPlan:
     if not isinstance(protocol, RandomViewsSpec):
         return plan
     spec = replace(plan.spec, protocol=replace(protocol, stations=(_STATION,) * protocol.views))
-    return ScenePlan(spec, plan.indices, plan.key, plan.staging, BARS, {"family": "column"})
+    return ScenePlan(spec, plan.indices, plan.key, plan.staging, bars=BARS, record={"family": "column"})
 
 
 def plan_missing(out: Path, scenes: int, split: str = "test") -> tuple[Finished, list[ConfigPlan]]:
     """Return what the folder has, and the plans of the scenes that are missing."""
-    plans = plan_build(request(scenes, split), out)
-    finished = Finished(out)
-    check_retained(out, finished, plans, ())
+    plans, finished = plan_build(request(scenes, split), out)
     missing = [plan for plan in plans if not finished.has(plan)]
-    spaces_of_configs(out, missing, finished)  # Not compared: it is that of real scenes.
+    spaces_by_config(missing)  # Not compared: it is that of real scenes.
     return finished, missing
 
 

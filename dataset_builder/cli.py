@@ -1,52 +1,44 @@
-"""Command-line interface of ``rebar-build``."""
+"""Command-line interface of ``rebar-build``.
+
+Modules that only one command needs are imported when it is called.
+"""
 
 from __future__ import annotations
 
 import argparse
-import os
+import re
 import sys
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import replace
-from importlib.util import find_spec
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
 
-from dataset_builder.build_options import add_build_arguments, add_mesh_unit, add_scene_arguments
-from dataset_builder.config.cages import CAGES, CagesRequest
-from dataset_builder.config.catalog import CONFIGS, LATTICE_CONFIGS, BuildRequest
-from dataset_builder.config.quality import colour_spec
-from dataset_builder.config.specs import CPU
-from dataset_builder.export import command as export_command
-from dataset_builder.importing import command as import_command
-from dataset_builder.push import command as push_command
-from rebar_depth_bench.console import ProgressBars, Rate, require_extra, run_command
-from rebar_depth_bench.errors import InputError, printable
+from rebar_depth_bench.console import ProgressBars, print_notice, run_command
+from rebar_depth_bench.errors import InputError, escape_text
 from rebar_depth_bench.output_options import add_output_file, check_outputs, prints_table
 from rebar_depth_bench.outputs import write_output
+from rebar_depth_bench.paths import PATH_PATTERN
 from rebar_depth_bench.terminal import use_plain_characters
 from rebar_depth_bench.version import software_version
+from rebar_depth_bench.view_ids import SPLITS
 
-if TYPE_CHECKING:
-    from dataset_builder.config.specs import ColourSpec
-    from dataset_builder.pipeline.build import BuildSummary
-    from dataset_builder.pipeline.local_renderer import Renderer
-
-_EXTRA_MODULES = ("bpy", "cv2", "embreex", "trimesh")
-
-
-CAGES_OPTIONS = ("split", "scenes", "views_per_scene")
-"""Options of the scenes of ``cages``; each is None if it is not given."""
 BUILD = "build"
-COMMANDS = (BUILD, "audit", "export", "import", "inspect", "push")
-COLOUR_OPTIONS = ("sampling", "quality", "samples", "device")
-"""Options that only colour has; each is None if it is not given."""
+_STRAY_SHOWN = 5
+
+
+@dataclass(frozen=True)
+class Command:
+    """Command: one-line summary, the function that adds its options to a parser, and the one that runs it."""
+
+    summary: str
+    add_arguments: Callable[[argparse.ArgumentParser], None]
+    run: Callable[[argparse.Namespace], None]
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``rebar-build``; return its exit status."""
     use_plain_characters()
-    options = argument_parser().parse_args(with_command(sys.argv[1:] if arguments is None else arguments))
+    words = with_command(sys.argv[1:] if arguments is None else arguments)
+    options = argument_parser(words[:1]).parse_args(words)
     interrupted = "interrupted; run the same command again to continue"
     return run_command(lambda: options.run(options), interrupted=interrupted)
 
@@ -57,171 +49,58 @@ def with_command(words: Sequence[str]) -> list[str]:
     return [*words] if has_command else [BUILD, *words]
 
 
-def _check_extra() -> None:
-    """Raise ``InputError`` if the build extra is not installed."""
-    require_extra("build", _EXTRA_MODULES)
+def argument_parser(commands: Collection[str] | None = None) -> argparse.ArgumentParser:
+    """Return the argument parser of ``rebar-build``; other commands than ``commands`` have no options in it."""
+    parser = argparse.ArgumentParser(
+        prog="rebar-build",
+        description="Build, check and convert dataset folders of stereo views with exact depth.",
+        epilog=f"Without a command, the options are those of {BUILD}: rebar-build {BUILD} --help lists them.",
+    )
+    parser.add_argument("--version", action="version", version=software_version())
+    subparsers = parser.add_subparsers(metavar=f"{{{','.join(COMMANDS)}}}")
+    for name, command in COMMANDS.items():
+        subparser = subparsers.add_parser(name, help=command.summary)
+        if commands is None or name in commands:
+            command.add_arguments(subparser)
+            subparser.set_defaults(run=command.run)
+    return parser
+
+
+def _add_build_arguments(parser: argparse.ArgumentParser) -> None:
+    from dataset_builder.build_command import add_arguments
+
+    parser.description = (
+        "Render a dataset folder of stereo views with exact depth, or resume an interrupted build."
+    )
+    add_arguments(parser)
 
 
 def _build(options: argparse.Namespace) -> None:
+    from dataset_builder.build_command import run
+
     if commands := [name for name in options.config or () if name in COMMANDS]:
         raise InputError(
             f"--config is followed by the command {commands[0]}, expected names of configs; a command is the "
             f"first word: rebar-build {commands[0]} ..."
         )
-    if options.out is None:
-        raise InputError("--out ROOT is missing, expected the dataset folder to build")
-    if options.rewrite_manifest:
-        names = ("config", "scene", "mesh", "views", "overwrite", "dry_run")
-        if given := [f"--{name.replace('_', '-')}" for name in names if getattr(options, name)]:
-            raise InputError(f"--rewrite-manifest is combined with {', '.join(given)}, expected only --out ROOT")
-        from dataset_builder.pipeline.rewrite import rewrite_manifest
-
-        rewrite_manifest(options.out)
-        print(options.out)
-        return
-    _check_extra()
-    from dataset_builder.pipeline.build import build
-    from dataset_builder.pipeline.devices import Devices, find_devices
-
-    if options.cluster is not None and options.dry_run:
-        raise InputError(
-            f"--dry-run is combined with --cluster {options.cluster}, expected only one of them: the estimate is "
-            "measured on this machine"
-        )
-    if options.cluster is not None and options.workers is not None:
-        raise InputError(
-            f"--workers {options.workers} is combined with --cluster {options.cluster}, expected only one of "
-            "them: on a cluster, the number of its workers determines how many views are rendered at once"
-        )
-    workers = 1 if options.workers is None else options.workers
-    if workers < 1:
-        raise InputError(f"--workers is {workers}, expected 1 or more")
-    device = options.device or CPU
-    with _cluster_context(options.cluster, device) as cluster:
-        devices = Devices(device) if cluster else find_devices(device)
-        request = _build_request(options, devices.type)
-        threads = max(1, (os.cpu_count() or 1) // (workers * devices.count))
-        if options.dry_run:
-            _print_estimate(request, options.out, workers * devices.count, threads)
-            return
-        with ProgressBars(Rate("pictures", 2)) as bars:
-            summary = build(
-                request,
-                options.out,
-                workers=workers,
-                threads=threads,
-                devices=devices.count,
-                cluster=cluster,
-                progress=bars.update,
-            )
-    _print_summary(options.out, summary)
+    run(options)
 
 
-def _print_estimate(request: BuildRequest, out: Path, processes: int, threads: int) -> None:
-    """Print what a build would need; raise ``InputError`` if it would be refused."""
-    from dataset_builder.pipeline.build import plan_build
-    from dataset_builder.pipeline.disk_space import check_space
-    from dataset_builder.pipeline.estimate import estimate_build, estimate_lines
-    from dataset_builder.pipeline.retained import Finished, check_retained
-
-    plans = plan_build(request, out)
-    finished = Finished(out)
-    check_retained(out, finished, plans, request.overwrite)
-    with ProgressBars() as bars:
-        estimates = estimate_build(plans, finished, out, threads, bars.update)
-    print(*map(printable, estimate_lines(estimates, out, processes)), sep="\n")
-    check_space(out, [estimate.space for estimate in estimates if estimate.space])
-
-
-def _build_request(options: argparse.Namespace, device: str) -> BuildRequest:
-    """Return the build request of the options.
-
-    With ``--scene`` and without ``--config``, only the given scene files are built. With ``--mesh``, the default
-    configs are those of the lattice.
-    """
-    from dataset_builder.config.scene_file import scene_config
-    from dataset_builder.scene.assemblies.mesh_file import mesh_file_spec
-
-    default = () if options.scene else LATTICE_CONFIGS if options.mesh else CONFIGS
-    return BuildRequest(
-        configs=tuple(options.config or default),
-        views=options.views,
-        width=options.width,
-        height=options.height,
-        colour=_colour_spec(options, device),
-        seed=options.seed,
-        mesh=mesh_file_spec(options.mesh, options.mesh_unit) if options.mesh else None,
-        variants=tuple(options.variant or ()),
-        scenes=tuple(scene_config(path) for path in options.scene or ()),
-        cages=_cages_request(options),
-        overwrite=tuple(options.overwrite or ()),
+def _add_audit_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("root", metavar="ROOT", help="dataset folder")
+    parser.add_argument(
+        "--depth-views",
+        type=int,
+        default=4,
+        metavar="N",
+        help="number of views per config whose depth is compared with Cycles' depth pass (default: %(default)s)",
     )
 
 
-def _cages_request(options: argparse.Namespace) -> CagesRequest | None:
-    """Return the request for scenes of ``cages``, or None if that is not among the configs.
-
-    Raises ``InputError`` if options of its scenes are given without it.
-    """
-    given = {name: value for name in CAGES_OPTIONS if (value := getattr(options, name)) is not None}
-    if CAGES in (options.config or ()):
-        return CagesRequest(**given)
-    if given:
-        names = ", ".join(f"--{name.replace('_', '-')}" for name in given)
-        raise InputError(f"{names}: only {CAGES} has such scenes, expected --config {CAGES}")
-    return None
-
-
-def _colour_spec(options: argparse.Namespace, device: str) -> ColourSpec | None:
-    """Return the colour settings of the options, or None for ``--no-colour``.
-
-    Raises ``InputError`` if ``--no-colour`` is combined with options of colour.
-    """
-    if not options.no_colour:
-        return replace(colour_spec(options.sampling, options.quality, options.samples), device=device)
-    given = [f"--{name} {value}" for name in COLOUR_OPTIONS if (value := getattr(options, name)) is not None]
-    if given:
-        raise InputError(
-            f"--no-colour is combined with {', '.join(given)}, expected only one of them: without colour, "
-            "nothing is sampled"
-        )
-    return None
-
-
-@contextmanager
-def _cluster_context(address: str | None, device: str) -> Iterator[Renderer | None]:
-    """Connect to the cluster at ``address``, whose workers must have ``device``; yield None without an address.
-
-    Raises ``InputError`` if ``distributed`` is not installed or a worker has no such device.
-    """
-    if address is None:
-        yield None
-        return
-    if find_spec("distributed") is None:
-        raise InputError(
-            "not installed: distributed; --cluster needs it: pip install 'rebar-depth-bench[cluster]'"
-        )
-    from dataset_builder.pipeline.dask_renderer import connect_to_cluster
-
-    with connect_to_cluster(address) as cluster:
-        cluster.check_device(device)
-        yield cluster
-
-
-def _print_summary(out: Path, summary: BuildSummary) -> None:
-    """Print the configs built and up to date, and the seconds per stage to standard error."""
-    if summary.up_to_date:
-        print(f"up to date: {', '.join(summary.up_to_date)}")
-    if summary.built:
-        print(f"built: {', '.join(summary.built)}")
-        longest_first = sorted(summary.seconds.items(), key=lambda item: -item[1])
-        stages = ", ".join(f"{stage} {seconds:.1f}" for stage, seconds in longest_first)
-        print(f"seconds in render processes: {stages}", file=sys.stderr)
-    print(out)
-
-
 def _audit(options: argparse.Namespace) -> None:
-    _check_extra()
+    from dataset_builder.build_command import check_extra
+
+    check_extra()
     from dataset_builder.audit import audit, print_audit
 
     with ProgressBars() as bars:
@@ -231,13 +110,99 @@ def _audit(options: argparse.Namespace) -> None:
         raise InputError(f"{options.root}: {len(report.failures)} of {len(report.checks)} checks failed")
 
 
+def _add_export_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("root", metavar="ROOT", help="dataset folder")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="output folder: new, or an earlier export to resume"
+    )
+    parser.add_argument(
+        "--config", nargs="+", action="extend", metavar="NAME", help="configs to export (default: all)"
+    )
+    parser.add_argument(
+        "--split", choices=SPLITS, metavar="NAME", help="split to export: train, validation or test (default: all)"
+    )
+    parser.add_argument(
+        "--views",
+        type=int,
+        metavar="N",
+        help="number of views per config, or per scene of a config with splits, evenly spaced over the views of "
+        "the folder (default: all)",
+    )
+
+
+def _export(options: argparse.Namespace) -> None:
+    """Export configs of a dataset folder; print the numbers of files."""
+    from dataset_builder.export import export
+
+    with ProgressBars() as bars:
+        summary = export(
+            options.root,
+            options.out,
+            options.config,
+            options.views,
+            progress=bars.update,
+            split=options.split,
+        )
+    for config in summary.configs:
+        print(f"{config.config}: {config.views} views, {config.written} files written, {config.kept} kept")
+    print(options.out)
+
+
+def _add_import_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("layout", type=Path, metavar="LAYOUT", help="TOML file that describes the data")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="ROOT", help="dataset folder: new, or one to add the config to"
+    )
+    parser.add_argument("--config", required=True, metavar="NAME", help="name of the config")
+    parser.add_argument(
+        "--overwrite",
+        nargs="+",
+        default=(),
+        metavar="NAME",
+        help="config of ROOT that may be replaced, if it was imported from other data",
+    )
+    parser.add_argument(
+        "--dry-run",
+        action="store_true",
+        help="check the layout and show what it describes; nothing is written",
+    )
+
+
+def _import(options: argparse.Namespace) -> None:
+    """Check the layout, print what is imported, and import it unless this is a dry run."""
+    from dataset_builder.importing.run import plan_import, run_import
+
+    source = plan_import(options.layout, options.config)
+    (height, width), views = source.views.grid, source.views.names
+    print(f"{source.name}: {len(views)} views of {width} x {height}, sigma {source.layout.truth_sigma_m} m")
+    if source.absent_columns:
+        print(f"absent: {', '.join(source.absent_columns)}")
+    if source.bars:
+        print(f"surveyed bars: {len(source.bars)}")
+    if not options.dry_run:
+        with ProgressBars() as bars:
+            run_import(source, options.out, bars.update, overwrite=options.overwrite)
+        print(options.out)
+
+
+def _add_inspect_arguments(parser: argparse.ArgumentParser) -> None:
+    from dataset_builder.build_command import add_mesh_unit
+
+    parser.add_argument("scene_file", metavar="SCENE", help="scene TOML, IFC model, or mesh file (STL, PLY, OBJ)")
+    add_mesh_unit(parser)
+    add_output_file(parser, "--json", "write the bars, what is left out, and the placement as JSON")
+    add_output_file(parser, "--picture", "write a PNG of the cage from four sides")
+
+
 def _inspect(options: argparse.Namespace) -> None:
-    _check_extra()
+    from dataset_builder.build_command import check_extra
+
+    check_extra()
     from dataset_builder.config.scene_file import files_of_scene, scene_cage
     from dataset_builder.inspection.picture import inspection_picture
     from dataset_builder.inspection.report import inspection_json, print_inspection
     from dataset_builder.inspection.summary import inspect_cage
-    from dataset_builder.pipeline.notes import print_notes
+    from dataset_builder.pipeline.plan import print_notes
     from dataset_builder.scene.assemblies.cage_checks import raise_problems
 
     check_outputs({**vars(options), "scene_files": files_of_scene(options.scene_file)})
@@ -253,49 +218,70 @@ def _inspect(options: argparse.Namespace) -> None:
     raise_problems(cage.problems, options.scene_file)
 
 
-def argument_parser() -> argparse.ArgumentParser:
-    """Return the argument parser of ``rebar-build``."""
-    parser = argparse.ArgumentParser(
-        prog="rebar-build",
-        description="Build, check and convert dataset folders of stereo views with exact depth.",
-        epilog=f"Without a command, the options are those of {BUILD}: rebar-build {BUILD} --help lists them.",
-    )
-    parser.add_argument("--version", action="version", version=software_version())
-    commands = parser.add_subparsers(metavar=f"{{{','.join(COMMANDS)}}}")
-    building = commands.add_parser(
-        BUILD,
-        help="render a dataset folder",
-        description="Render a dataset folder of stereo views with exact depth, or resume an interrupted build.",
-    )
-    add_build_arguments(building)
-    add_scene_arguments(building)
-    building.set_defaults(run=_build)
-    auditing = commands.add_parser("audit", help="check a dataset folder and its ground truth")
-    _add_audit_arguments(auditing)
-    auditing.set_defaults(run=_audit)
-    inspecting = commands.add_parser("inspect", help="show the bars of a scene file without rendering")
-    _add_inspect_arguments(inspecting)
-    inspecting.set_defaults(run=_inspect)
-    for name, command in (("export", export_command), ("import", import_command), ("push", push_command)):
-        subparser = commands.add_parser(name, help=command.SUMMARY)
-        command.add_arguments(subparser)
-        subparser.set_defaults(run=command.run)
-    return parser
+def _add_push_arguments(parser: argparse.ArgumentParser) -> None:
+    from dataset_builder.push.repository import MAIN_BRANCH
 
-
-def _add_audit_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("root", metavar="ROOT", help="dataset folder")
+    parser.add_argument("--hub-id", required=True, metavar="ID", help="id of the repository, ORG/NAME")
     parser.add_argument(
-        "--depth-views",
-        type=int,
-        default=4,
-        metavar="N",
-        help="number of views per config whose depth is compared with Cycles' depth pass (default: %(default)s)",
+        "--yes", action="store_true", help="publish; without it, only what would be sent is printed"
+    )
+    parser.add_argument("--private", action="store_true", help="make a new repository private")
+    parser.add_argument(
+        "--revision",
+        default=MAIN_BRANCH,
+        metavar="BRANCH",
+        help="branch to publish on, created from the main branch if it does not exist (default: %(default)s)",
     )
 
 
-def _add_inspect_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("scene_file", metavar="SCENE", help="scene TOML, IFC model, or mesh file (STL, PLY, OBJ)")
-    add_mesh_unit(parser)
-    add_output_file(parser, "--json", "write the bars, what is left out, and the placement as JSON")
-    add_output_file(parser, "--picture", "write a PNG of the cage from four sides")
+def _push(options: argparse.Namespace) -> None:
+    """Print what a push changes, and publish it with ``--yes``."""
+    from dataset_builder.push.errors import require_online, require_token
+    from dataset_builder.push.repository import Repository, check_repository_id
+
+    repository = Repository(check_repository_id(options.hub_id, "--hub-id"), options.revision)
+    if not re.fullmatch(PATH_PATTERN, options.revision):
+        raise InputError(f"--revision is {escape_text(options.revision)}, expected the name of a branch")
+    require_online()
+    if options.yes:
+        require_token()
+    from dataset_builder.push.run import plan_push, send_push
+    from dataset_builder.push.verified import verified_folder
+
+    with ProgressBars() as bars:
+        source = verified_folder(options.root, bars.update)
+    if source.stray:
+        more = f" and {len(source.stray) - _STRAY_SHOWN} more" if len(source.stray) > _STRAY_SHOWN else ""
+        print_notice(f"not in the manifest, stays local: {', '.join(source.stray[:_STRAY_SHOWN])}{more}")
+    push = plan_push(source, repository, private=options.private)
+    print(*push.lines(), sep="\n")
+    sys.stdout.flush()
+    if not push.is_needed:
+        print("up to date: nothing to send")
+    elif not options.yes:
+        print("dry run: nothing was sent; --yes publishes")
+    else:
+        with ProgressBars() as bars:
+            print(send_push(push, bars.update))
+
+
+COMMANDS: Mapping[str, Command] = {
+    BUILD: Command("render a dataset folder", _add_build_arguments, _build),
+    "audit": Command("check a dataset folder and its ground truth", _add_audit_arguments, _audit),
+    "export": Command(
+        "export a dataset folder as plain files, with COLMAP's and nerfstudio's cameras",
+        _add_export_arguments,
+        _export,
+    ),
+    "import": Command(
+        "import images with depth from other programs as a config of a dataset folder",
+        _add_import_arguments,
+        _import,
+    ),
+    "inspect": Command("show the bars of a scene file without rendering", _add_inspect_arguments, _inspect),
+    "push": Command(
+        "publish a dataset folder as a dataset repository of the Hugging Face Hub", _add_push_arguments, _push
+    ),
+}
+"""Commands by name."""

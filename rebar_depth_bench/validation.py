@@ -182,7 +182,7 @@ def _is_model(annotation: Any) -> TypeGuard[type[BaseModel]]:
 
 
 def _expectation(model: type[BaseModel], key: int | str) -> str:
-    field = model.model_fields.get(str(key))
+    field = next((field for name, field in model.model_fields.items() if key in (name, field.alias)), None)
     if field is None:  # The table was validated by a validator of the model.
         return ""
     if _is_model(field.annotation):

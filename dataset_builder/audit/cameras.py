@@ -22,8 +22,7 @@ from dataset_builder.audit.report import Check
 from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
 from dataset_builder.config.manifest_specs import rig_spec, trajectory_spec
 from dataset_builder.config.rigs import rig_cameras
-from dataset_builder.config.trajectories import poses, subset
-from dataset_builder.scene.assemblies import aim_point_m
+from dataset_builder.config.trajectories import aim_point_m, poses, subset
 from dataset_builder.scene.mesh_ply import read_mesh_ply
 from dataset_builder.scene.model import NOT_STEEL, Assembly, Mesh, Part
 from rebar_depth_bench.data.bars import Bar

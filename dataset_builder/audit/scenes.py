@@ -9,8 +9,8 @@ from numpy import ndarray
 
 from dataset_builder.audit.geometry import polyline_distance_m
 from dataset_builder.audit.report import Check
+from dataset_builder.config.camera_placement import RANDOM_RULES
 from dataset_builder.config.manifest_specs import cage_spec, trajectory_spec
-from dataset_builder.config.random_views import STEEL_CLEARANCE, STEEL_CLEARANCE_M
 from dataset_builder.config.specs import RandomViewsSpec
 from dataset_builder.scene.assemblies import assembly_bars
 from dataset_builder.scene.cages.clearance import Clearances
@@ -103,6 +103,6 @@ def _clearance_check(scene: DatasetConfig, bars: Sequence[Bar]) -> Check:
         float((polyline_distance_m(centres_m, np.array(bar.axis_m)) - radius_m(bar.diameter_m)).min())
         for bar in bars
     )
-    bound_m = min(STEEL_CLEARANCE_M, STEEL_CLEARANCE * views.distances_m[0])
+    bound_m = RANDOM_RULES.clearance_m(views.distances_m[0])
     problems = () if nearest_m >= bound_m else (f"a camera is {nearest_m:.3f} m from steel",)
     return Check(name, f"{nearest_m:.2f} m or more", f"{bound_m:g} m", problems)

@@ -48,8 +48,7 @@ def _runner_for(task: object) -> Callable[[Any, Report], None]:
 
     The imports are local because Blender's output on import must go to the log.
     """
-    from dataset_builder.blender.devices import run_devices_task
-    from dataset_builder.blender.tasks import run_depth_task, run_render_task
+    from dataset_builder.blender.tasks import run_depth_task, run_devices_task, run_render_task
     from dataset_builder.pipeline.blender_process import DepthTask, DevicesTask, RenderTask
 
     runners: Mapping[type, Callable[[Any, Report], None]] = {

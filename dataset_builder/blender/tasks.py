@@ -8,8 +8,6 @@ from __future__ import annotations
 
 import io
 import os
-import resource
-import sys
 import tempfile
 import time
 from collections import defaultdict
@@ -25,45 +23,37 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.blender.colour import configure_colour, render_colour
-from dataset_builder.blender.devices import select_device
 from dataset_builder.blender.evaluated_mesh import evaluated_world_mesh
 from dataset_builder.blender.render import render_depth, use_cycles
 from dataset_builder.blender.scene import add_object, build_scene, mesh_data
+from dataset_builder.config.file_specs import PinnedFile
 from dataset_builder.config.rigs import rig_cameras
-from dataset_builder.config.specs import ConfigSpec
-from dataset_builder.config.trajectories import poses
-from dataset_builder.pipeline.blender_process import DepthTask, RenderTask
+from dataset_builder.config.specs import CPU, GPU_TYPES, ConfigSpec
+from dataset_builder.config.trajectories import aim_point_m, poses
+from dataset_builder.pipeline.blender_process import DepthTask, DevicesTask, RenderTask
 from dataset_builder.pipeline.shards import View, encode_view, stage_row
-from dataset_builder.scene.assemblies import aim_point_m, make_assembly
+from dataset_builder.scene.assemblies import make_assembly
+from dataset_builder.scene.assemblies.cage import unpacked_cage
 from dataset_builder.scene.mesh_ply import read_mesh_ply, write_mesh_ply
 from dataset_builder.scene.model import Mesh, WorldMesh, surface
 from dataset_builder.scene.raycast import RayCaster
 from dataset_builder.scene.variants.sensor import recorded
 from rebar_depth_bench.atomic_io import write_bytes
 from rebar_depth_bench.data.digests import file_sha256
-from rebar_depth_bench.errors import BuildError
+from rebar_depth_bench.errors import BuildError, InputError
+
+Seconds = defaultdict[str, float]
+"""Wall-clock seconds by stage."""
 
 
-class Stopwatch:
-    """Accumulator of wall-clock seconds by stage."""
-
-    def __init__(self) -> None:
-        self._seconds: defaultdict[str, float] = defaultdict(float)
-
-    @contextmanager
-    def timing(self, stage: str) -> Iterator[None]:
-        """Add the time spent in the block to ``stage``."""
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self._seconds[stage] += time.perf_counter() - start
-
-    def take(self) -> dict[str, float]:
-        """Return the seconds by stage since the last call, and reset them to zero."""
-        seconds = dict(self._seconds)
-        self._seconds.clear()
-        return seconds
+@contextmanager
+def _timed(seconds: Seconds, stage: str) -> Iterator[None]:
+    """Add the time spent in the block to ``stage``."""
+    start = time.perf_counter()
+    try:
+        yield
+    finally:
+        seconds[stage] += time.perf_counter() - start
 
 
 def run_render_task(task: RenderTask, report: Callable[[Mapping[str, Any]], None]) -> None:
@@ -71,38 +61,34 @@ def run_render_task(task: RenderTask, report: Callable[[Mapping[str, Any]], None
 
     Raises ``BuildError`` if the scene's mesh differs from the one of other shards or Blender fails.
     """
-    watch = Stopwatch()
+    seconds = Seconds(float)
     unit, staging = task.unit, task.staging
     config = unit.config
-    with watch.timing("scene"):
-        assembly = make_assembly(config.scene.assembly)
+    with _timed(seconds, "scene"):
+        of_file = isinstance(config.scene.assembly, PinnedFile)
+        cage = unpacked_cage(staging.cage.read_bytes()) if of_file else None
+        assembly = make_assembly(config.scene.assembly, cage)
         build_scene(assembly, config.scene, colour=config.colour is not None)
         if config.colour is not None:
             configure_colour(task.threads)
-            select_device(config.colour.device, task.device_index)
+            select_device(config.colour.device)
         mesh = evaluated_world_mesh()
         _stage_mesh(mesh, staging.mesh, unit.mesh_sha256)
         caster = RayCaster(mesh)
         left_poses = poses(config.protocol, aim_point_m(assembly), config.rig, assembly.bars)
         rays_cam = {eye: camera.rays() for eye, camera in rig_cameras(config.rig, np.eye(4)).items()}
-    report({"seconds": watch.take()})
+    report({"seconds": seconds})
     with tempfile.TemporaryDirectory(dir=staging.root) as scratch:
         context = _RenderContext(config, caster, rays_cam, Path(scratch))
         for index in unit.indices:
-            path = staging.row(index)
+            path, seconds = staging.row(index), Seconds(float)
             if not path.is_file():
-                view = _render_view(context, index, left_poses[index], watch)
-                with watch.timing("encode"):
+                view = _render_view(context, index, left_poses[index], seconds)
+                with _timed(seconds, "encode"):
                     row, record = encode_view(view)
-                with watch.timing("write"):
+                with _timed(seconds, "write"):
                     stage_row(path, row, record)
-            report({"view": index, "seconds": watch.take()})
-    report({"seconds": {}, "memory_bytes": _peak_memory_bytes(), "cpu_s": time.process_time()})
-
-
-def _peak_memory_bytes() -> int:
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak if sys.platform == "darwin" else peak * 1024  # Linux counts KiB.
+            report({"view": index, "seconds": seconds})
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,16 +102,16 @@ class _RenderContext:
 
 
 def _render_view(
-    context: _RenderContext, index: int, left_cam_from_world: Float64[ndarray, "4 4"], watch: Stopwatch
+    context: _RenderContext, index: int, left_cam_from_world: Float64[ndarray, "4 4"], seconds: Seconds
 ) -> View:
     """Render colour, if the config has it, and ray cast ground truth of both eyes of one view."""
     config = context.config
     eyes, rgb = {}, None
     for eye_index, (eye, camera) in enumerate(rig_cameras(config.rig, left_cam_from_world).items()):
-        with watch.timing("truth"):
+        with _timed(seconds, "truth"):
             truth = context.caster.cast(camera, context.rays_cam[eye])
         if config.colour is not None:
-            with watch.timing("colour"):
+            with _timed(seconds, "colour"):
                 seed = _cycles_seed(config, index, eye_index)
                 rgb = render_colour(camera, truth.mask, config.colour, seed, context.scratch)
                 rgb = recorded(rgb, config.scene, seed)
@@ -174,3 +160,48 @@ def run_depth_task(task: DepthTask, report: Callable[[Mapping[str, Any]], None])
             np.save(content, depth_m)
             write_bytes(task.out / f"{n}.npy", content.getvalue())
             report({"camera": n})
+
+
+def run_devices_task(task: DevicesTask, report: Callable[[Mapping[str, Any]], None]) -> None:  # noqa: ARG001
+    """Report the devices of this machine."""
+    report({"devices": available_devices()})
+
+
+def available_devices() -> dict[str, list[str]]:
+    """Return the names of the devices by type; types without devices are absent."""
+    supported = {entry[0].lower() for entry in _preferences().get_device_types(bpy.context)}
+    found = {device: [entry.name for entry in _entries(device)] for device in (CPU, *GPU_TYPES)}
+    return {device: names for device, names in found.items() if names and device in (CPU, *supported)}
+
+
+def select_device(device: str) -> None:
+    """Let Cycles render the open scene on all devices of a type, and on no other device.
+
+    Required after ``configure_colour``. The compositor denoises on the CPU in any case: images are then denoised
+    in the same way on all devices, and the GPU's memory holds only the scene. Ground truth is ray cast on the CPU
+    and does not depend on the device. Rendering on a GPU is untested, since no machine with one was at hand.
+
+    Raises ``InputError`` if there is no such device.
+    """
+    cycles = bpy.context.scene.cycles
+    if device == CPU:
+        cycles.device = "CPU"
+        return
+    if not _entries(device):
+        listed = ", ".join(f"{name} ({len(names)})" for name, names in available_devices().items())
+        raise InputError(f"--device {device}: no such device was found, only: {listed}")
+    preferences = _preferences()
+    preferences.compute_device_type = device.upper()
+    for entry in preferences.devices:
+        entry.use = entry.type == device.upper()
+    cycles.device = "GPU"
+
+
+def _preferences() -> Any:
+    """Return the preferences of Cycles; ``read_factory_settings`` replaces them."""
+    return bpy.context.preferences.addons["cycles"].preferences
+
+
+def _entries(device: str) -> list[Any]:
+    """Return Cycles' entries of the devices of a type."""
+    return [entry for entry in _preferences().get_devices_for_type(device.upper()) if entry.type == device.upper()]

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from dataset_builder.config.rigs import STEREO_CAMERAS
 from dataset_builder.config.specs import (
     AppearanceSpec,
     ColourSpec,
@@ -19,11 +20,8 @@ from dataset_builder.config.specs import (
     SceneConfigSpec,
     SceneSpec,
 )
-from dataset_builder.config.stereo_cameras import STEREO_CAMERAS
 from dataset_builder.config.surroundings import FORMWORK_FAMILIES, LIFE_SIZE_ENVIRONMENTS, SURROUNDINGS
-from dataset_builder.scene.cages.generate import drawn_family
 from dataset_builder.scene.variants import EXCLUSIVE_SLOTS, SENSOR, SHADOWS, VARIANTS
-from rebar_depth_bench.errors import InputError, Problem
 from rebar_depth_bench.view_ids import SPLITS, TEST_SPLIT
 
 CAGES = "cages"
@@ -52,34 +50,21 @@ class CagesRequest:
     scenes: int = 40
     views_per_scene: int = 8
 
-    def check(self) -> None:
-        """Raise ``InputError`` that names every value out of range."""
-        problems = []
-        if self.split not in SPLITS:
-            problems.append(Problem("unknown", "--split", f"got {self.split!r}", f"one of {', '.join(SPLITS)}"))
-        for name, value, high in (
-            ("--scenes", self.scenes, MAX_SCENES),
-            ("--views-per-scene", self.views_per_scene, MAX_VIEWS_PER_SCENE),
-        ):
-            if not 1 <= value <= high:
-                problems.append(Problem("invalid", name, f"got {value}", f"1 to {high}"))
-        if problems:
-            raise InputError.from_problems("build request", problems)
-
 
 def cage_scenes(
     request: CagesRequest, seed: int, width: int, height: int, colour: ColourSpec | None
 ) -> list[SceneConfigSpec]:
     """Return the scenes of a request, without the stations of their cameras (``pipeline.place_cameras``).
 
-    ``seed`` is that of cages, surroundings and cameras. Raises ``InputError`` for values out of range.
+    ``seed`` is that of cages, surroundings and cameras.
     """
-    request.check()
     scenes = (_scene(request, number, seed) for number in range(request.scenes))
     return [replace(scene, rig=replace(scene.rig, width=width, height=height), colour=colour) for scene in scenes]
 
 
 def _scene(request: CagesRequest, number: int, seed: int) -> SceneConfigSpec:
+    from dataset_builder.scene.cages.generate import drawn_family  # Only builds of ``cages`` need the generator.
+
     rng = np.random.default_rng([_STREAM, seed, SPLITS.index(request.split), number])
     family = drawn_family(request.split, number, seed)
     environment = str(rng.choice(LIFE_SIZE_ENVIRONMENTS))
@@ -118,4 +103,4 @@ def _variants(rng: np.random.Generator, environment: str, family: str) -> tuple[
 
 
 def _rig(rng: np.random.Generator) -> RigSpec:
-    return list(STEREO_CAMERAS.values())[int(rng.integers(len(STEREO_CAMERAS)))].rig()
+    return list(STEREO_CAMERAS.values())[int(rng.integers(len(STEREO_CAMERAS)))]

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
-from dataset_builder.config.cages import CAGES, CagesRequest, cage_scenes
+from dataset_builder.config.cages import CAGES, MAX_SCENES, MAX_VIEWS_PER_SCENE, CagesRequest, cage_scenes
 from dataset_builder.config.file_specs import MeshFileSpec
 from dataset_builder.config.rigs import zed_rig
 from dataset_builder.config.specs import (
@@ -23,7 +24,6 @@ from dataset_builder.config.specs import (
     PileSpec,
     RigSpec,
     RingSpec,
-    SceneConfigSpec,
     SceneSpec,
 )
 from dataset_builder.config.surroundings import check_suitable
@@ -31,6 +31,10 @@ from dataset_builder.scene.variants import VARIANTS, check_variants
 from rebar_depth_bench.data.trajectory import NEAREST_STEEL
 from rebar_depth_bench.errors import InputError, Problem
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
+from rebar_depth_bench.view_ids import SPLITS
+
+if TYPE_CHECKING:
+    from dataset_builder.scene.assemblies.cage import Cage
 
 LATTICE_DOME = DomeSpec(
     radii_m=(0.22, 0.30, 0.35, 0.38, 0.40, 0.42, 0.43),
@@ -115,6 +119,7 @@ SWEEPS: Mapping[str, Callable[[], ConfigSpec]] = {
 A sweep starts where the steel fills the frame. It ends at the limit of the laboratory, or where bars become too
 thin to have interior pixels.
 """
+_KNOWN = {**CONFIGS, **SWEEPS}
 LATTICE_CONFIGS = tuple(name for name in CONFIGS if name.startswith("lattice"))
 """Names of the configs in which ``--mesh`` replaces the rods."""
 
@@ -127,7 +132,8 @@ class BuildRequest:
     ``colour`` None builds no colour. ``mesh`` replaces the rods of the lattice. ``variants`` are names of
     ``scene.variants.VARIANTS``; they are appended to the names of configs and scenes. ``scenes`` are the configs
     of user scene files. ``cages`` are the scenes of the config of that name, if it is among the ``configs``.
-    ``overwrite`` are the names of configs whose finished views may be replaced.
+    ``overwrite`` are the names of configs whose finished views may be replaced. ``cages_read`` has what was read
+    already from files of the ``scenes``, by their specs.
     """
 
     configs: tuple[str, ...] = tuple(CONFIGS)
@@ -141,28 +147,32 @@ class BuildRequest:
     scenes: tuple[ConfigSpec, ...] = ()
     cages: CagesRequest | None = None
     overwrite: tuple[str, ...] = ()
+    cages_read: Mapping[AssemblySpec, Cage] = field(default_factory=dict)
 
     def config_specs(self) -> list[ConfigSpec]:
         """Return the specs of all requested configs.
 
-        Raises ``InputError`` that names every value out of range, and ``InputError`` for unknown configs, invalid
-        variants and duplicate config names, if ``mesh`` is combined with a config that is not a lattice, and if
-        the device of ``colour`` cannot render a config.
+        Raises ``InputError`` that names every value that is out of range or unknown, or cannot be combined with
+        ``cages``; and ``InputError`` for invalid variants and duplicate config names, if ``mesh`` is combined with
+        a config that is not a lattice, and if the device of ``colour`` cannot render a config.
         """
-        self._check_ranges()
+        if problems := [*self._problems()]:
+            raise InputError.from_problems("build request", problems)
         check_variants(self.variants)
-        known = _known_configs([name for name in self.configs if name != CAGES])
-        specs = [self._with_request(spec) for spec in (*known, *self.scenes)]
+        named = [_KNOWN[name]() for name in dict.fromkeys(self.configs) if name != CAGES]
+        specs = [self._with_request(spec) for spec in (*named, *self.scenes)]
         for spec in specs:
             check_suitable(spec.scene.environment, self.variants)
-        self._check_device(specs)
+        self._check_lenses(specs)
         built = [spec.name for spec in specs]
         duplicates = sorted({name for name in built if built.count(name) > 1})
         if duplicates:
             raise InputError(
                 f"more than one config is named {', '.join(duplicates)}, expected unique names: rename the scene"
             )
-        scenes = [*specs, *self._cage_scenes()]
+        scenes = [*specs]
+        if self._cages is not None:
+            scenes += cage_scenes(self._cages, self.seed, self.width, self.height, self.colour)
         names = {spec.name for spec in scenes}
         if unknown := [name for name in self.overwrite if name not in names]:
             expected = f"one of the configs that are built: {', '.join(sorted(names))}"
@@ -170,47 +180,46 @@ class BuildRequest:
             raise InputError.from_problems("build request", [problem])
         return scenes
 
-    def _cage_scenes(self) -> list[SceneConfigSpec]:
-        """Return the scenes of ``cages``, if it is requested; each draws its own variants and takes no mesh."""
-        if CAGES not in self.configs:
-            return []
-        unusable = {"--mesh": self.mesh, "--variant": self.variants, "--views": self.views}
-        problems = [
-            Problem("conflict", name, f"is combined with --config {CAGES}", "only one of them")
-            for name, value in unusable.items()
-            if value
-        ]
-        if problems:
-            raise InputError.from_problems("build request", problems)
-        return cage_scenes(self.cages or CagesRequest(), self.seed, self.width, self.height, self.colour)
+    @property
+    def _cages(self) -> CagesRequest | None:
+        """Request for the scenes of ``cages``, or None if they are not requested."""
+        return (self.cages or CagesRequest()) if CAGES in self.configs else None
 
-    def _check_ranges(self) -> None:
+    def _problems(self) -> Iterator[Problem]:
+        """Yield the problems of single options, and of those that cannot be combined with ``cages``."""
+        colour, cages = self.colour, self._cages
         limits: Sequence[tuple[str, int | None, int, int]] = (
             ("--views", self.views, 1, 1_000_000),
             ("--width", self.width, 16, 8192),
             ("--height", self.height, 16, 8192),
-            ("--samples", None if self.colour is None else self.colour.steel_samples, 1, 65_536),
+            ("--samples", None if colour is None else colour.steel_samples, 1, 65_536),
             ("--seed", self.seed, 0, 2**31 - 1),
+            ("--scenes", None if cages is None else cages.scenes, 1, MAX_SCENES),
+            ("--views-per-scene", None if cages is None else cages.views_per_scene, 1, MAX_VIEWS_PER_SCENE),
         )
-        problems = [
-            Problem("invalid", name, f"got {value}", f"{low} to {high}")
-            for name, value, low, high in limits
-            if value is not None and not low <= value <= high
-        ]
-        if problems:
-            raise InputError.from_problems("build request", problems)
+        for name, value, low, high in limits:
+            if value is not None and not low <= value <= high:
+                yield Problem("invalid", name, f"got {value}", f"{low} to {high}")
+        choices: Sequence[tuple[str, Iterable[str], Sequence[str]]] = (
+            ("--config", dict.fromkeys(self.configs), (*_KNOWN, CAGES)),
+            ("--device", () if colour is None else (colour.device,), (CPU, *GPU_TYPES)),
+            ("--split", () if cages is None else (cages.split,), SPLITS),
+        )
+        for name, chosen, known in choices:
+            for text in chosen:
+                if text not in known:
+                    yield Problem("unknown", name, f"got {text!r}", f"one of {', '.join(known)}")
+        # Each scene of cages draws its own variants, and takes no mesh.
+        for name, given in {"--mesh": self.mesh, "--variant": self.variants, "--views": self.views}.items():
+            if cages is not None and given:
+                yield Problem("conflict", name, f"is combined with --config {CAGES}", "only one of them")
 
-    def _check_device(self, specs: Sequence[ConfigSpec]) -> None:
-        if self.colour is None:
-            return
-        device = self.colour.device
-        if device not in (CPU, *GPU_TYPES):
-            problem = Problem("unknown", "--device", f"got {device!r}", ", ".join((CPU, *GPU_TYPES)))
-            raise InputError.from_problems("build request", [problem])
+    def _check_lenses(self, specs: Sequence[ConfigSpec]) -> None:
+        """Raise ``InputError`` if the device cannot render the lenses of a config."""
         raw = [spec.name for spec in specs if spec.rig.grid == "raw"]
-        if raw and device not in LENS_DEVICES:
+        if raw and self.colour is not None and self.colour.device not in LENS_DEVICES:
             raise InputError(
-                f"{', '.join(raw)}: cannot be rendered with --device {device}, expected "
+                f"{', '.join(raw)}: cannot be rendered with --device {self.colour.device}, expected "
                 f"{' or '.join(LENS_DEVICES)}: Cycles has no lenses with distortion on others; "
                 "build the other configs separately, named with --config"
             )
@@ -241,14 +250,3 @@ class BuildRequest:
         if not isinstance(spec.scene.assembly, LatticeSpec):
             raise InputError(f"--mesh replaces the rods of a lattice, but config {spec.name} is not a lattice")
         return self.mesh
-
-
-def _known_configs(names: Sequence[str]) -> list[ConfigSpec]:
-    """Return the named configs, each once; raise ``InputError`` that lists the unknown names."""
-    known = {**CONFIGS, **SWEEPS}
-    unknown = [name for name in dict.fromkeys(names) if name not in known]
-    if unknown:
-        expected = f"one of {', '.join((*known, CAGES))}"
-        problems = [Problem("unknown", "--config", f"got {name!r}", expected) for name in unknown]
-        raise InputError.from_problems("build request", problems)
-    return [known[name]() for name in dict.fromkeys(names)]

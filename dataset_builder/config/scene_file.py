@@ -6,19 +6,20 @@ The keys of the TOML file are documented in ``scene_schema``. An IFC model uses 
 from __future__ import annotations
 
 import os
+import re
+import unicodedata
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64
-from numpy import ndarray
 
 from dataset_builder.config.cages import CAGES
+from dataset_builder.config.camera_fit import cameras_misfit, check_above_ground, check_fits, misfit
+from dataset_builder.config.camera_placement import with_stations
 from dataset_builder.config.catalog import CONFIGS, LATTICE_DOME, SWEEPS
-from dataset_builder.config.file_specs import CageFileSpec, MeshFileSpec, unsupported_type
-from dataset_builder.config.scene_name import scene_name_of
+from dataset_builder.config.file_specs import CageFileSpec, MeshFileSpec
 from dataset_builder.config.scene_schema import SCENE_NAME, SceneToml, read_scene_toml
 from dataset_builder.config.specs import (
     ConfigSpec,
@@ -26,15 +27,12 @@ from dataset_builder.config.specs import (
     RigSpec,
     SceneSpec,
     SurveySpec,
-    TrajectorySpec,
 )
-from dataset_builder.config.surroundings import LIFE_SIZE_ENVIRONMENTS, SURROUNDINGS
-from dataset_builder.config.survey import with_stations
-from dataset_builder.config.trajectories import camera_offsets_m
-from dataset_builder.scene.assemblies import aim_point_m, check_above_ground, check_fits, make_assembly
+from dataset_builder.config.surroundings import SURROUNDINGS
+from dataset_builder.config.trajectories import aim_point_m
+from dataset_builder.scene.assemblies import make_assembly
 from dataset_builder.scene.assemblies.cage import Cage
-from dataset_builder.scene.assemblies.cage_file import cage_file_spec, read_cage
-from dataset_builder.scene.assemblies.mesh_file import mesh_file_spec
+from dataset_builder.scene.assemblies.cage_file import cage_file_spec, mesh_file_spec, read_cage, unsupported_type
 from dataset_builder.scene.assemblies.mesh_import import SUFFIXES as MESH_SUFFIXES
 from dataset_builder.scene.model import Assembly
 from rebar_depth_bench.errors import InputError, MeshError
@@ -51,15 +49,30 @@ NEAREST_RADIUS_PER_REACH = 2.5
 At this distance the whole assembly is in the frame and fills much of it.
 """
 
-OUTDOORS_CAMERA_RADIUS_M = SURROUNDINGS["outdoors"].cameras.radius_m
-"""Maximum horizontal distance of cameras, and of steel that is surveyed, from the world origin, metres."""
+_SMALL, _LARGE = "laboratory", "outdoors"
+"""Environment of steel and cameras that fit in it, and of others."""
 
-_SMALL = "laboratory"
-"""Environment of steel and cameras that fit in it; for others it is outdoors."""
+_ADVICE_OF_ROOMS = f'place the cage at the origin, or set environment = "{_LARGE}"'
+_ADVICE = (
+    "is the unit right, and is the cage at the origin? [[select]] tables choose a part of an IFC or mesh file"
+)
+
+
+@dataclass(frozen=True, eq=False)
+class UserScene:
+    """Scene of a user's file: its config, and the cage that was read from the file."""
+
+    config: ConfigSpec
+    cage: Cage
 
 
 def scene_config(path: str | os.PathLike[str]) -> ConfigSpec:
-    """Return the config of a scene file, with the default rig, colour settings and seed.
+    """Return the config of a scene file. Raises as ``read_scene``."""
+    return read_scene(path).config
+
+
+def read_scene(path: str | os.PathLike[str]) -> UserScene:
+    """Return the config of a scene file, with the default rig, colour settings and seed, and its cage.
 
     Defaults of omitted keys: the name is that of the file in lower case, with hyphens; the cameras are
     ``default_dome``, or a survey if that does not fit outdoors, or into the hall or onto the deck where these are
@@ -77,15 +90,12 @@ def scene_config(path: str | os.PathLike[str]) -> ConfigSpec:
     _check_name(name, path)
     with _scene_and_key_named(scene_toml, path):
         assembly_spec = _assembly_spec(scene_toml, path)
-        assembly = make_assembly(assembly_spec)
-    trajectory = scene_toml.trajectory or _default_trajectory(assembly, scene_toml.environment)
-    environment = scene_toml.environment or ("outdoors" if _misfit(_SMALL, assembly, trajectory) else _SMALL)
-    if environment != "outdoors" and (misfit := _misfit(environment, assembly, trajectory)):
-        raise InputError(f'{path}: {misfit}: place the cage at the origin, or set environment = "outdoors"')
-    if isinstance(trajectory, SurveySpec):
-        _check_outdoors_radius(path, "the steel extends", _steel_radius_m(assembly))
-    else:
-        _check_outdoors_radius(path, "cameras are", _camera_radius_m(assembly, trajectory))
+        cage = read_cage(assembly_spec)
+        assembly = make_assembly(assembly_spec, cage)
+    trajectory = scene_toml.cameras or _default_trajectory(assembly, scene_toml.environment)
+    environment = scene_toml.environment or (_LARGE if misfit(_SMALL, assembly, trajectory) else _SMALL)
+    if problem := misfit(environment, assembly, trajectory):
+        raise InputError(f"{path}: {problem}: {_ADVICE if environment == _LARGE else _ADVICE_OF_ROOMS}")
     try:
         check_above_ground(assembly, name)
         if isinstance(trajectory, SurveySpec):
@@ -97,7 +107,7 @@ def scene_config(path: str | os.PathLike[str]) -> ConfigSpec:
         raise MeshError(f"{path}: {error}") from None
     markers = SURROUNDINGS[environment].markers if scene_toml.board is None else scene_toml.board
     board = BoardSpec(markers=markers) if markers else None
-    return replace(config, scene=replace(config.scene, board=board))
+    return UserScene(replace(config, scene=replace(config.scene, board=board)), cage)
 
 
 def scene_cage(path: str | os.PathLike[str], mesh_unit: str | float = "m") -> Cage:
@@ -131,8 +141,8 @@ def _default_trajectory(assembly: Assembly, environment: str | None) -> DomeSpec
     It must fit outdoors; in the laboratory, which is too small for a survey of what has no dome there, as well.
     """
     dome = default_dome(assembly)
-    place = "outdoors" if environment in (None, _SMALL) else environment
-    return dome if _cameras_misfit(str(place), assembly, dome) is None else SurveySpec()
+    place = _LARGE if environment is None or environment == _SMALL else environment
+    return dome if cameras_misfit(place, assembly, dome) is None else SurveySpec()
 
 
 def default_dome(assembly: Assembly) -> DomeSpec:
@@ -150,10 +160,20 @@ def default_dome(assembly: Assembly) -> DomeSpec:
 def _read_scene(path: Path) -> SceneToml:
     suffix = path.suffix.lower()
     if suffix == ".ifc":
-        return SceneToml(ifc=path.name)
+        return SceneToml.model_construct(ifc=path.name)
     if suffix != ".toml":
         raise InputError(unsupported_type(path, "scene", ".toml or .ifc"))
     return read_scene_toml(read_file(path, TOML_BYTES, "a scene file", InputError), str(path), RESERVED_NAMES)
+
+
+def scene_name_of(path: Path) -> str:
+    """Return the scene name that a file name gives: lower case, with hyphens for all but letters and digits.
+
+    Accents are removed, and letters without an ASCII form are left out; the name may be empty or reserved.
+    """
+    letters = unicodedata.normalize("NFKD", path.stem).casefold()
+    plain = "".join(character for character in letters if not unicodedata.combining(character))
+    return re.sub("[^a-z0-9]+", "-", plain).strip("-")
 
 
 def _check_name(name: str, path: Path) -> None:
@@ -185,65 +205,3 @@ def _scene_and_key_named(scene_toml: SceneToml, path: Path) -> Iterator[None]:
         named = type(error)(f"{path}: {key}: {error}")
         named.problems = error.problems
         raise named from error
-
-
-def _camera_radius_m(assembly: Assembly, trajectory: TrajectorySpec) -> float:
-    """Return the largest horizontal distance of a left camera from the world origin, metres.
-
-    For a survey, which has no stations yet, this is the largest distance that they could have.
-    """
-    if isinstance(trajectory, SurveySpec):
-        return _steel_radius_m(assembly) + max(trajectory.distances_m)
-    return max(float(np.linalg.norm(centre_m[:2])) for centre_m in _camera_centres_m(assembly, trajectory))
-
-
-def _camera_centres_m(assembly: Assembly, trajectory: TrajectorySpec) -> list[Float64[ndarray, " 3"]]:
-    """Return the centres of the left cameras of a trajectory that is no survey, world, metres."""
-    aim_m = aim_point_m(assembly)
-    return [aim_m + offset_m for offset_m in camera_offsets_m(trajectory, aim_m, assembly.bars)]
-
-
-def _steel_radius_m(assembly: Assembly) -> float:
-    """Return the largest horizontal distance of steel from the world origin, metres."""
-    return float(np.linalg.norm(assembly.vertices_m[:, :2], axis=1).max())
-
-
-def _check_outdoors_radius(path: Path, what: str, radius_m: float) -> None:
-    """Raise ``InputError`` if ``what`` is beyond the cleared ground of the outdoor environment."""
-    if radius_m > OUTDOORS_CAMERA_RADIUS_M:
-        raise InputError(
-            f"{path}: {what} {radius_m:.4g} m from the world's origin, expected at most "
-            f"{OUTDOORS_CAMERA_RADIUS_M} m: is the unit right, and is the cage at the origin? [[select]] tables "
-            "choose a part of an IFC or mesh file"
-        )
-
-
-def _misfit(environment: str, assembly: Assembly, trajectory: TrajectorySpec) -> str | None:
-    """Return why the assembly or its cameras do not fit into an environment, or None if they do."""
-    steel_radius_m, limit_m = _steel_radius_m(assembly), SURROUNDINGS[environment].steel_radius_m
-    if steel_radius_m > limit_m:
-        return (
-            f"the steel extends {steel_radius_m:.4g} m from the {environment}'s centre, "
-            f"expected at most {limit_m:g} m"
-        )
-    return _cameras_misfit(environment, assembly, trajectory)
-
-
-def _cameras_misfit(environment: str, assembly: Assembly, trajectory: TrajectorySpec) -> str | None:
-    """Return why the cameras do not fit into an environment, or None if they do.
-
-    In the hall and on the deck, the cameras of a survey are placed where they fit.
-    """
-    space = SURROUNDINGS[environment].cameras
-    if isinstance(trajectory, SurveySpec) and environment in LIFE_SIZE_ENVIRONMENTS:
-        return None
-    radius_m = _camera_radius_m(assembly, trajectory)
-    if radius_m > space.radius_m:
-        return (
-            f"cameras are {radius_m:.4g} m from the {environment}'s centre, expected at most {space.radius_m:g} m"
-        )
-    if np.isfinite(space.ceiling_m):
-        height_m = max(float(centre_m[2]) for centre_m in _camera_centres_m(assembly, trajectory))
-        if height_m > space.ceiling_m:
-            return f"cameras are {height_m:.4g} m high, expected at most {space.ceiling_m:g} m"
-    return None

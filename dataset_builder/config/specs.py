@@ -6,7 +6,8 @@ with ``dataclasses.asdict``: field names and defaults are part of the dataset fo
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 from dataset_builder.config.file_specs import CageFileSpec, MeshFileSpec
 from rebar_depth_bench.data.trajectory import CENTRE, RANDOM_VIEWS, SURVEY
@@ -148,7 +149,7 @@ class SurveySpec:
 
     The distances are those of the left camera from the point of a bar's surface that the rig is aimed at.
     ``stations`` are the places of the views in order, to the micrometre: they follow from the other fields and the
-    assembly (``config.survey``), and are stored so that every machine uses the same ones.
+    assembly (``config.camera_placement``), and are stored so that every machine uses the same ones.
     """
 
     distances_m: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)
@@ -167,8 +168,8 @@ class RandomViewsSpec:
     """Random views of steel: cameras at distances between the two ``distances_m`` from points of the steel.
 
     ``stations`` are the places of the views in order. They follow from the other fields, the assembly and the rig
-    (``config.random_views``), each view from its own number, so that the views of a longer list begin with those
-    of a shorter one.
+    (``config.camera_placement``), each view from its own number, so that the views of a longer list begin with
+    those of a shorter one.
     """
 
     views: int
@@ -224,6 +225,35 @@ class ColourSpec:
     steel_samples: int = 24
     prefilter: str = "FAST"
     device: str = CPU
+
+
+QUALITIES: Mapping[str, ColourSpec] = {
+    "preview": ColourSpec(samples=2, steel_samples=8),
+    "standard": ColourSpec(),
+    "high": ColourSpec(samples=6, steel_samples=44),
+}
+"""Presets by name, chosen by measurement (``python -m benchmarks.colour``)."""
+
+DEFAULT_QUALITY = "standard"
+
+STEEL_FIRST, UNIFORM = "steel-first", "uniform"
+SAMPLINGS = (STEEL_FIRST, UNIFORM)
+
+
+def colour_spec(sampling: str | None = None, quality: str | None = None, samples: int | None = None) -> ColourSpec:
+    """Return the colour settings that the options select; None is an option that is not given.
+
+    ``samples`` are those of steel pixels, by default those of ``quality``. With uniform sampling, which is the
+    default if ``samples`` are given, all other pixels have as many.
+    """
+    preset = QUALITIES[quality or DEFAULT_QUALITY]
+    steel_samples = preset.steel_samples if samples is None else samples
+    is_uniform = (sampling or (STEEL_FIRST if samples is None else UNIFORM)) == UNIFORM
+    return replace(
+        preset,
+        samples=steel_samples if is_uniform else min(preset.samples, steel_samples),
+        steel_samples=steel_samples,
+    )
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,35 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from dataset_builder.config.camera_site import CameraSpace
+import numpy as np
+from jaxtyping import Bool, Float64
+from numpy import ndarray
+
 from dataset_builder.scene.variants import SHADOWS, VARIANTS
 from rebar_depth_bench.errors import InputError, Problem
+
+GROUND_CLEARANCE_M = 0.1
+"""Least height of an eye above the ground, or above objects that stand there, metres."""
+
+
+@dataclass(frozen=True)
+class CameraSpace:
+    """Space for cameras: within ``radius_m`` of the origin in plan, above the ground, not above ``ceiling_m``.
+
+    Objects up to ``objects_m`` high stand on the ground beyond ``clear_radius_m``.
+    """
+
+    radius_m: float
+    clear_radius_m: float
+    objects_m: float = 0.0
+    ceiling_m: float = np.inf
+
+    def contains(self, points_m: Float64[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
+        """Return which points are in the space."""
+        plan_m = np.hypot(points_m[:, 0], points_m[:, 1])
+        lowest_m = GROUND_CLEARANCE_M + np.where(plan_m > self.clear_radius_m, self.objects_m, 0.0)
+        is_between = (points_m[:, 2] >= lowest_m) & (points_m[:, 2] <= self.ceiling_m)
+        return np.asarray((plan_m <= self.radius_m) & is_between)
 
 
 @dataclass(frozen=True)
@@ -34,16 +60,11 @@ class Surroundings:
         )
 
 
-LABORATORY_CAMERAS = CameraSpace(1.6, clear_radius_m=0.6, objects_m=0.2)
-OUTDOOR_CAMERAS = CameraSpace(20.5, clear_radius_m=20.5)
-HALL_CAMERAS = CameraSpace(10.4, clear_radius_m=10.4, ceiling_m=6.8)
-DECK_CAMERAS = CameraSpace(8.3, clear_radius_m=8.3, ceiling_m=8.0)
-
 SURROUNDINGS: Mapping[str, Surroundings] = {
-    "laboratory": Surroundings(LABORATORY_CAMERAS, 0.45, markers=6),
-    "outdoors": Surroundings(OUTDOOR_CAMERAS, 20.5),
-    "hall": Surroundings(HALL_CAMERAS, 5.0, unsuitable=(SHADOWS,)),
-    "deck": Surroundings(DECK_CAMERAS, 5.0, unsuitable=(SHADOWS,)),
+    "laboratory": Surroundings(CameraSpace(1.6, clear_radius_m=0.6, objects_m=0.2), 0.45, markers=6),
+    "outdoors": Surroundings(CameraSpace(20.5, clear_radius_m=20.5), 20.5),
+    "hall": Surroundings(CameraSpace(10.4, clear_radius_m=10.4, ceiling_m=6.8), 5.0, unsuitable=(SHADOWS,)),
+    "deck": Surroundings(CameraSpace(8.3, clear_radius_m=8.3, ceiling_m=8.0), 5.0, unsuitable=(SHADOWS,)),
 }
 """Surroundings by the name of their environment.
 

@@ -19,6 +19,7 @@ from dataset_builder.config.specs import (
     SurveySpec,
     TrajectorySpec,
 )
+from dataset_builder.scene.model import Assembly
 from dataset_builder.scene.steel_distance import radii_at_steel_distance_m
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.trajectory import NEAREST_STEEL
@@ -30,6 +31,9 @@ GOLDEN_TURN_DEG = 360.0 * (5**0.5 - 1) / 2
 _RADIUS_DECIMALS = 3
 """Rounding of solved distances in metres: to the millimetre, so that they are equal on every machine."""
 
+_AIM_POINT_DECIMALS = 3
+"""Rounding of the aim point in metres: to the millimetre."""
+
 
 class _Place(NamedTuple):
     """Place of the left camera in spherical coordinates round the target."""
@@ -37,6 +41,16 @@ class _Place(NamedTuple):
     radius_m: float
     elevation_deg: float
     azimuth_deg: float
+
+
+def aim_point_m(assembly: Assembly) -> Float64[ndarray, 3]:
+    """Return the point that cameras aim at (world, metres): the steel's bounding-box centre, to the millimetre.
+
+    Rounding keeps ribs and float32 storage from moving the cameras.
+    """
+    vertices = assembly.vertices_m
+    middle: Float64[ndarray, 3] = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+    return np.asarray(np.round(middle, _AIM_POINT_DECIMALS) + 0.0)  # Adding 0.0 turns -0.0 into 0.0.
 
 
 def poses(

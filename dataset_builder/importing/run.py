@@ -9,15 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from dataset_builder.config.scene_file import RESERVED_NAMES
-from dataset_builder.config.scene_name import scene_name_of
+from dataset_builder.config.scene_file import RESERVED_NAMES, scene_name_of
 from dataset_builder.config.scene_schema import SCENE_NAME
 from dataset_builder.importing.bars_file import read_bars_file
 from dataset_builder.importing.layout import Layout, read_layout
 from dataset_builder.importing.views import SourceViews, open_views
-from dataset_builder.pipeline.folder import check_target, remove_build_folder
+from dataset_builder.pipeline.folder import build_lock, check_target, remove_build_folder
 from dataset_builder.pipeline.plan import BUILD_FOLDER, KEY_CHARACTERS, generator_versions
-from dataset_builder.pipeline.publish import StagedScene, build_lock, publish, remove_leftovers
+from dataset_builder.pipeline.publish import StagedScene, publish, remove_leftovers
 from dataset_builder.pipeline.retained import Finished, check_retained
 from dataset_builder.pipeline.shards import Staging, encode_row, stage_row, view_record
 from rebar_depth_bench.data.bars import Bar
@@ -79,7 +78,7 @@ def run_import(source: Import, out: Path, progress: Progress = silent, *, overwr
     """
     key = parameters_digest(_key_inputs(source, progress))
     staging = Staging(out / BUILD_FOLDER / f"{source.name}-{key[:KEY_CHARACTERS]}")
-    check_target(out, [source.name], [staging.root])
+    check_target(out, [source.name])
     finished = Finished(out)
     published = finished.configs.get(source.name)
     if published is not None:

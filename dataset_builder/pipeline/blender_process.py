@@ -1,8 +1,10 @@
-"""Blender subprocesses, the tasks they run and the events they report.
+"""Blender subprocesses: the tasks they run, the events they report, and the rendering of work units in them.
 
 A task is pickled to the standard input of the process. The input then stays open, and the process exits when it is
 closed, so that no render outlives its parent. Events are JSON lines on the standard output of the process. The
 output of Blender and its libraries goes to a log file, whose end is shown only if the process fails.
+
+Workers of a cluster render with ``dask_renderer``.
 """
 
 from __future__ import annotations
@@ -13,14 +15,19 @@ import signal
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from dataset_builder.config.specs import CPU, GPU_TYPES
 from dataset_builder.pipeline.shards import Staging
-from dataset_builder.pipeline.work_units import WorkUnit
+from dataset_builder.pipeline.work_units import UnitResult, WorkUnit
+from rebar_depth_bench.atomic_io import scratch_folder
+from rebar_depth_bench.data.digests import file_sha256
 from rebar_depth_bench.errors import BuildError, InputError, OutputError, RebarDepthError, RenderProcessError
 from rebar_depth_bench.geometry.cameras import Camera
 
@@ -36,8 +43,6 @@ class RenderTask:
     unit: WorkUnit
     staging: Staging
     threads: int
-    device_index: int = 0
-    """Index of the device among those of the type that the config names; unused on the CPU."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +140,10 @@ def _exchange(process: subprocess.Popen[bytes], task: Task, on_event: Callable[[
     for line in process.stdout:
         if not line.endswith(b"\n"):
             break  # The process died while writing an event.
-        _dispatch_event(json.loads(line), on_event)
+        event = json.loads(line)
+        for name in _ERRORS.keys() & event.keys():
+            raise _ERRORS[name](event[name])
+        on_event(event)
     return process.wait()
 
 
@@ -148,13 +156,6 @@ def _send_task(stream: Any, task: Task) -> None:
             stream.close()  # Discard the unsent bytes: Popen would otherwise flush them again on exit.
 
 
-def _dispatch_event(event: Event, on_event: Callable[[Event], None]) -> None:
-    for name, error in _ERRORS.items():
-        if name in event:
-            raise error(event[name])
-    on_event(event)
-
-
 def _failure_message(label: str, status: int, attempts: int, log: Path) -> str:
     reason = f"signal {signal.Signals(-status).name}" if status < 0 else f"exit status {status}"
     tail = log.read_text("utf-8", errors="replace").splitlines()[-_LOG_TAIL_LINES:] if log.is_file() else []
@@ -163,3 +164,99 @@ def _failure_message(label: str, status: int, attempts: int, log: Path) -> str:
         f"the render process for {label} died {attempts} times, the last time with {reason}; "
         f"end of {log}:\n{log_excerpt}"
     )
+
+
+OnViewDone = Callable[[int], None]
+"""Callback with the index of each rendered view; may run in another thread, and twice for the same view."""
+
+
+Submit = Callable[[WorkUnit, Staging, OnViewDone], Future[UnitResult]]
+"""Function that schedules a unit to be rendered; ``staging`` is the staging folder of the config on this machine.
+
+Leaving the context that made the function cancels unfinished units.
+"""
+
+
+@contextmanager
+def local_processes(workers: int, threads: int) -> Iterator[Submit]:
+    """Yield the function that renders in ``workers`` concurrent processes of ``threads`` threads each.
+
+    They write directly to the staging folder: a kill loses at most one view.
+    """
+    with ThreadPoolExecutor(workers) as pool, BlenderProcesses() as blender:
+
+        def submit(unit: WorkUnit, staging: Staging, on_view_done: OnViewDone) -> Future[UnitResult]:
+            return pool.submit(render_unit, unit, staging, on_view_done, threads, blender, "this machine")
+
+        yield submit
+
+
+def render_unit(
+    unit: WorkUnit,
+    staging: Staging,
+    on_view_done: OnViewDone,
+    threads: int,
+    blender: BlenderProcesses,
+    worker: str,
+) -> UnitResult:
+    """Render a unit in a Blender process into ``staging`` and return its result without the content of files.
+
+    Raises the ``InputError``, ``BuildError`` or ``OutputError`` that the process reports, and
+    ``RenderProcessError`` naming the unit if the process dies twice.
+    """
+    seconds: defaultdict[str, float] = defaultdict(float)
+
+    def on_event(event: Event) -> None:
+        for stage, duration_s in event["seconds"].items():
+            seconds[stage] += duration_s
+        if "view" in event:
+            on_view_done(event["view"])
+
+    blender.run(RenderTask(unit, staging, threads), unit.label, staging.log(unit.shard), on_event)
+    return UnitResult(worker, dict(seconds), file_sha256(staging.mesh))
+
+
+AUTO = "auto"
+"""Choice of the best type of device that the machine has."""
+
+DeviceNames = Mapping[str, Sequence[str]]
+"""Names of the devices by type, ``cpu`` or one of ``GPU_TYPES``; types without devices are absent."""
+
+
+def find_device(requested: str) -> str:
+    """Return the type of device for a value of ``--device`` on this machine.
+
+    Raises what ``choose_device`` raises, and ``RenderProcessError`` if Blender fails while it lists the devices.
+    """
+    return CPU if requested == CPU else choose_device(requested, available_devices(), "this machine")
+
+
+def available_devices() -> DeviceNames:
+    """Return the devices of this machine, as Cycles lists them in a Blender process."""
+    found: dict[str, list[str]] = {}
+
+    def on_event(event: Event) -> None:
+        found.update(event["devices"])
+
+    with scratch_folder("rebar-devices-") as scratch, BlenderProcesses() as blender:
+        blender.run(DevicesTask(), "the list of devices", scratch / "blender.log", on_event)
+    return found
+
+
+def choose_device(requested: str, available: DeviceNames, machine: str) -> str:
+    """Return the type of device that is ``requested``, or the best available type for ``auto``.
+
+    Only the type is part of a config's key, so that equal GPUs give equal keys; GPUs of different models may
+    differ in the last bit of a pixel. Rendering on a GPU is untested: no machine with one was at hand.
+
+    Raises ``InputError`` that lists the devices of ``machine`` if it has none of this type.
+    """
+    if requested == AUTO:
+        requested = next((name for name in GPU_TYPES if available.get(name)), CPU)
+    if requested != CPU and not available.get(requested):
+        listed = [f"{device} ({', '.join(names)})" for device, names in available.items()]
+        raise InputError(
+            f"--device {requested}: {machine} has no such device, expected one of those that Cycles finds: "
+            f"{'; '.join(listed) or CPU}"
+        )
+    return requested

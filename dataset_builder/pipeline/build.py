@@ -13,23 +13,22 @@ from functools import partial
 from itertools import groupby
 from pathlib import Path
 
+from dataset_builder.config.camera_fit import check_fits
 from dataset_builder.config.catalog import BuildRequest
+from dataset_builder.config.file_specs import CageFileSpec, MeshFileSpec
 from dataset_builder.config.specs import SceneConfigSpec
-from dataset_builder.pipeline.disk_space import check_fits_on_disk, check_readable
-from dataset_builder.pipeline.folder import check_folder, remove_build_folder, remove_stagings
-from dataset_builder.pipeline.local_renderer import Renderer, local_processes
-from dataset_builder.pipeline.notes import print_notes
-from dataset_builder.pipeline.place_cameras import place_cameras
-from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, plan_config
+from dataset_builder.pipeline.blender_process import Submit, local_processes
+from dataset_builder.pipeline.disk_space import check_readable, check_space, spaces_by_config
+from dataset_builder.pipeline.folder import build_lock, check_target, remove_build_folder, remove_stagings
+from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, place_cameras, plan_config, print_notes
 from dataset_builder.pipeline.publish import (
-    build_lock,
     publish_plans,
     remove_leftovers,
     repair_metadata,
 )
 from dataset_builder.pipeline.retained import Finished, check_retained, kept_scenes
 from dataset_builder.pipeline.work_units import UnitResult, WorkUnit, accept_result, remaining_units
-from dataset_builder.scene.assemblies import check_fits
+from rebar_depth_bench.atomic_io import write_bytes
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.progress import Progress, silent
 
@@ -49,26 +48,23 @@ def build(
     *,
     workers: int = 1,
     threads: int = 1,
-    devices: int = 1,
-    cluster: Renderer | None = None,
+    submit: Submit | None = None,
     progress: Progress = silent,
 ) -> BuildSummary:
     """Build the requested configs in the folder ``out``, or continue an interrupted build of them.
 
-    Rendering uses ``workers`` concurrent processes of ``threads`` threads each on this machine, for each of
-    ``devices`` devices of the request's type, or the workers of ``cluster`` if it is not None. None of these
-    changes the bytes of the result. Each config is published as soon as it is complete.
+    Rendering uses ``workers`` concurrent processes of ``threads`` threads each on this machine, or what ``submit``
+    schedules if it is not None, such as workers of a cluster. None of these changes the bytes of the result. Each
+    config is published as soon as it is complete.
 
     Raises ``InputError`` for a request that cannot be built, ``OutputError`` if it does not fit on the disk or the
     machine cannot write, ``RenderProcessError`` if a render process dies twice, and ``BuildError`` if rendered
     data does not match its digests.
     """
-    plans = plan_build(request, out)
-    finished = Finished(out)
-    check_retained(out, finished, plans, request.overwrite)
+    plans, finished = plan_build(request, out)
     print_notes(finished.notes(plans))
     missing = [plan for plan in plans if not finished.has(plan)]
-    check_fits_on_disk(out, missing, finished)
+    check_space(out, spaces_by_config(missing).values())
     missing = place_cameras(missing, os.cpu_count() or 1, progress)
     check_readable(missing, finished)
     with build_lock(out / BUILD_FOLDER):
@@ -76,25 +72,37 @@ def build(
             if finished.is_outdated:
                 raise InputError(f"{out}: another build has changed the folder; run the same command again")
             remove_leftovers(out, finished.folder)
-            with nullcontext(cluster) if cluster else local_processes(workers, threads, devices) as renderer:
-                return _build_plans(out, finished, plans, missing, renderer, progress)
+            with nullcontext(submit) if submit else local_processes(workers, threads) as schedule:
+                return _build_plans(out, finished, plans, missing, schedule, progress)
         finally:
             remove_build_folder(out / BUILD_FOLDER)
 
 
-def plan_build(request: BuildRequest, out: Path) -> list[ConfigPlan]:
-    """Return the plans of the requested configs; nothing is written. Notes on their files go to standard error.
+def plan_build(request: BuildRequest, out: Path) -> tuple[list[ConfigPlan], Finished]:
+    """Return the plans of the requested configs, and what the folder ``out`` has; nothing is written.
 
-    Raises ``InputError`` for a request that cannot be built in the folder ``out``, such as an unusable mesh file.
+    Files that the request has not read are read here, each once; notes on them go to standard error. Raises
+    ``InputError`` for a request that cannot be built in the folder, such as an unusable mesh file or one whose
+    finished views would be lost.
     """
-    plans = [plan_config(spec, request.views, out) for spec in request.config_specs()]
+    specs = request.config_specs()
+    cages = dict(request.cages_read)
+    for spec in specs:
+        file = spec.scene.assembly
+        if isinstance(file, CageFileSpec | MeshFileSpec) and file not in cages:
+            from dataset_builder.scene.assemblies.cage_file import read_cage
+
+            cages[file] = read_cage(file)
+    plans = [plan_config(spec, request.views, out, cages.get(spec.scene.assembly)) for spec in specs]
     # Cameras of generated scenes are placed later, so that they fit.
     with_cameras = [plan for plan in plans if not isinstance(plan.spec, SceneConfigSpec)]
     for plan in with_cameras:
         check_fits(plan.assembly, plan.spec)
     print_notes(list(dict.fromkeys(note for plan in with_cameras for note in plan.assembly.notes)))
-    check_folder(out, plans)
-    return plans
+    check_target(out, {spec.name for spec in specs})
+    finished = Finished(out)
+    check_retained(out, finished, plans, request.overwrite)
+    return plans, finished
 
 
 def _build_plans(
@@ -102,7 +110,7 @@ def _build_plans(
     finished: Finished,
     plans: Sequence[ConfigPlan],
     missing: Sequence[ConfigPlan],
-    renderer: Renderer,
+    submit: Submit,
     progress: Progress,
 ) -> BuildSummary:
     """Build the ``missing`` plans config by config, and repair the metadata of the others."""
@@ -113,7 +121,7 @@ def _build_plans(
         if of_config := missing_by_name.get(name):
             for plan in of_config:
                 finished.stage_views(plan)
-            _render(of_config, renderer, progress, summary)
+            _render(of_config, submit, progress, summary)
             kept = kept_scenes(finished.configs.get(name), of_config)
             folder = publish_plans(out, folder, of_config, kept)
             summary.built.append(name)
@@ -147,15 +155,20 @@ class _ViewCount:
             self._progress(self._name, len(self._done), self._total)
 
 
-def _render(plans: Sequence[ConfigPlan], renderer: Renderer, progress: Progress, summary: BuildSummary) -> None:
+def _render(plans: Sequence[ConfigPlan], submit: Submit, progress: Progress, summary: BuildSummary) -> None:
     """Render and stage the remaining work units of a config's plans; on failure, cancel those not started."""
     count = _ViewCount(plans, progress)
     count.add("")
     waiting: dict[Future[UnitResult], tuple[ConfigPlan, WorkUnit]] = {}
     for plan in plans:
         plan.staging.root.mkdir(parents=True, exist_ok=True)
-        for unit in remaining_units(plan):
-            waiting[renderer.submit(unit, plan.staging, partial(count.add, plan.key))] = plan, unit
+        units = remaining_units(plan)
+        if units and plan.cage is not None:
+            from dataset_builder.scene.assemblies.cage import packed_cage
+
+            write_bytes(plan.staging.cage, packed_cage(plan.cage))
+        for unit in units:
+            waiting[submit(unit, plan.staging, partial(count.add, plan.key))] = plan, unit
     try:
         for future in as_completed(list(waiting)):
             plan, unit = waiting.pop(future)  # Drop the future, which holds the rendered bytes.

@@ -2,12 +2,12 @@
 
 No shared file system is required: a unit is sent to a worker as a plain value, is rendered by a Blender process in
 the worker's scratch folder, and is returned as bytes with their digests. The units of a lost worker are rendered
-by other workers, with the same bytes. An assembly file, which exists only on this machine, is uploaded once and
-passed on between the workers.
+by other workers, with the same bytes. The staged cage of a user's file is uploaded once and passed on between the
+workers.
 
-A worker renders on the first device of its machine that has the requested type. On a machine with several GPUs,
-start one worker per GPU and let it see only this one, for example with ``CUDA_VISIBLE_DEVICES``; ``--nthreads`` is
-then the number of render processes per GPU.
+A render process uses all devices of its machine that have the requested type. To render in several processes on a
+machine with several GPUs, start one worker per GPU and let it see only this one, for example with
+``CUDA_VISIBLE_DEVICES``.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ import warnings
 from collections.abc import Iterator, Mapping
 from concurrent.futures import CancelledError, Future
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -28,14 +28,18 @@ import distributed
 from distributed.comm import get_address_host_port
 from distributed.scheduler import KilledWorker
 
-from dataset_builder.config.file_specs import PinnedFile, read_assembly_file
-from dataset_builder.config.specs import CPU, ConfigSpec
-from dataset_builder.pipeline.blender_process import BlenderProcesses
-from dataset_builder.pipeline.devices import AUTO, available_devices, choose_devices
-from dataset_builder.pipeline.local_renderer import OnViewDone, render_unit
+from dataset_builder.config.specs import CPU
+from dataset_builder.pipeline.blender_process import (
+    AUTO,
+    BlenderProcesses,
+    OnViewDone,
+    available_devices,
+    choose_device,
+    render_unit,
+)
 from dataset_builder.pipeline.plan import generator_versions
 from dataset_builder.pipeline.shards import Staging
-from dataset_builder.pipeline.work_units import UnitResult, WorkUnit, check_software_versions, with_payload
+from dataset_builder.pipeline.work_units import UnitResult, WorkUnit, with_files
 from rebar_depth_bench.errors import BuildError, InputError, RenderProcessError
 
 _CONNECT_S = 10
@@ -48,10 +52,10 @@ class ClusterRenderer:
     client: distributed.Client
     keys: dict[str, WorkUnit] = field(default_factory=dict)
     """Units by their dask key."""
-    files: dict[str, distributed.Future] = field(default_factory=dict)
-    """Assembly files on the cluster, by SHA-256. A lost file is recreated from the task kept by the scheduler."""
+    cages: dict[Staging, distributed.Future] = field(default_factory=dict)
+    """Staged cages on the cluster. A lost one is recreated from the task kept by the scheduler."""
 
-    def submit(self, unit: WorkUnit, staging: Staging, on_view_done: OnViewDone) -> Future[UnitResult]:  # noqa: ARG002
+    def submit(self, unit: WorkUnit, staging: Staging, on_view_done: OnViewDone) -> Future[UnitResult]:
         """Schedule ``unit`` on the next free worker.
 
         The worker reports rendered views in a dask topic named by the key of the unit.
@@ -60,7 +64,7 @@ class ClusterRenderer:
         self.keys[key] = unit
         self.client.subscribe_topic(key, lambda event: on_view_done(event[1]))
         future: Future[UnitResult] = self.client.get_executor(pure=False).submit(
-            render_on_worker, unit, self._assembly_file(unit.config), key=key
+            render_on_worker, unit, generator_versions(), self._cage(staging), key=key
         )
         return future
 
@@ -73,21 +77,18 @@ class ClusterRenderer:
             raise InputError(f"--device {AUTO} is combined with --cluster, expected the name of a device type")
         if device != CPU:
             for worker, available in self.client.run(available_devices).items():
-                choose_devices(device, available, f"worker {worker}")
+                choose_device(device, available, f"worker {worker}")
 
-    def _assembly_file(self, config: ConfigSpec) -> distributed.Future | None:
-        spec = config.scene.assembly
-        if not isinstance(spec, PinnedFile):
+    def _cage(self, staging: Staging) -> distributed.Future | None:
+        """Return the content of the staged cage, sent through the scheduler once; None if there is none."""
+        if not staging.cage.is_file():
             return None
-        if spec.sha256 not in self.files:
-            key = f"assembly-{uuid.uuid4().hex}"
+        if staging not in self.cages:
+            key = f"cage-{uuid.uuid4().hex}"
             with warnings.catch_warnings():
-                # The file must be sent through the scheduler; it is sent only once.
                 warnings.filterwarnings("ignore", "Sending large graph", UserWarning)
-                suffix = Path(spec.path).suffix.lower()
-                content = spec.check(read_assembly_file(spec.path, "assembly", [suffix]))
-                self.files[spec.sha256] = self.client.submit(bytes, content, key=key, pure=False)
-        return self.files[spec.sha256]
+                self.cages[staging] = self.client.submit(bytes, staging.cage.read_bytes(), key=key, pure=False)
+        return self.cages[staging]
 
 
 @contextmanager
@@ -135,7 +136,7 @@ def _quiet_client() -> Iterator[None]:
 
 
 def _task_label(renderer: ClusterRenderer, key: object) -> str:
-    return renderer.keys[key].label if isinstance(key, str) and key in renderer.keys else "the assembly file"
+    return renderer.keys[key].label if isinstance(key, str) and key in renderer.keys else "a staged cage"
 
 
 def _connect(address: str) -> distributed.Client:
@@ -175,6 +176,19 @@ def _check_workers(client: distributed.Client, address: str) -> None:
         raise _software_error(f"the scheduler {address}", error) from None
 
 
+def check_software_versions(expected: Mapping[str, str], worker: str, actual: Mapping[str, str]) -> None:
+    """Raise ``InputError`` if the software versions ``actual`` on ``worker`` differ from ``expected``."""
+    different = [
+        f"{name} {actual.get(name, 'missing')}, expected {expected.get(name, 'none')}"
+        for name in sorted({*actual, *expected})
+        if actual.get(name) != expected.get(name)
+    ]
+    if different:
+        raise InputError(
+            f"worker {worker} has other software versions than the building machine: {'; '.join(different)}"
+        )
+
+
 def _software_error(machine: str, error: object) -> InputError:
     software_versions = generator_versions()
     return InputError(
@@ -187,41 +201,29 @@ def _first_line(error: object) -> str:
     return (str(error).splitlines() or [type(error).__name__])[0]
 
 
-def render_on_worker(unit: WorkUnit, assembly_file: bytes | None) -> UnitResult:
-    """Render a unit in the scratch folder of this dask worker, and return the result with its bytes.
+def render_on_worker(unit: WorkUnit, software_versions: Mapping[str, str], cage: bytes | None) -> UnitResult:
+    """Render a unit in the scratch folder of this dask worker, and return the result with its files.
 
-    Raises ``InputError`` if the software versions of the worker differ from those of the unit, and ``BuildError``
-    or ``InputError`` naming the worker if rendering fails.
+    ``cage`` is the content of the staged cage. Raises ``InputError`` if the software versions of the worker are
+    not ``software_versions``, and ``BuildError`` or ``InputError`` naming the worker if rendering fails.
     """
     worker = distributed.get_worker()
-    check_software_versions(unit.software_versions, worker.address, generator_versions())
+    check_software_versions(software_versions, worker.address, generator_versions())
     threads = max(1, (os.cpu_count() or 1) // worker.state.nthreads)
     with (
         tempfile.TemporaryDirectory(prefix="rebar-unit-", dir=worker.local_directory) as scratch,
         BlenderProcesses() as blender,
     ):
-        local_unit = replace(unit, config=_with_local_assembly_file(unit.config, assembly_file, Path(scratch)))
-        staging = Staging(Path(scratch) / "staging")
-        staging.root.mkdir()
+        staging = Staging(Path(scratch))
+        if cage is not None:
+            staging.cage.write_bytes(cage)
         try:
-            result = render_unit(
-                local_unit, staging, threads, blender, _make_progress_reporter(worker), worker.address
-            )
+            result = render_unit(unit, staging, _make_progress_reporter(worker), threads, blender, worker.address)
         except BuildError as error:
             raise type(error)(f"worker {worker.address}: {error}") from None
         except InputError as error:
             raise InputError(f"worker {worker.address}: {error}") from None
-        return with_payload(result, unit, staging)
-
-
-def _with_local_assembly_file(config: ConfigSpec, content: bytes | None, folder: Path) -> ConfigSpec:
-    """Write the assembly file to ``folder`` under its own name, and return the config that refers to it."""
-    spec = config.scene.assembly
-    if content is None or not isinstance(spec, PinnedFile):
-        return config
-    path = folder / Path(spec.path).name
-    path.write_bytes(content)
-    return replace(config, scene=replace(config.scene, assembly=replace(spec, path=str(path))))
+        return with_files(result, unit, staging)
 
 
 def _make_progress_reporter(worker: Any) -> OnViewDone:

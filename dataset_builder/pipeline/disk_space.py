@@ -1,26 +1,24 @@
-"""Sizes of a build: estimates, and the refusal of one that does not fit on the disk or could not be read.
+"""Sizes of a build: views, disk space and memory, and the refusal of one that does not fit or could not be read.
 
-While a config is built, its rows are staged and then packed into shards beside them. The staged rows, and the
-files of an older build of the config, are deleted when it has been published. Only views that are not staged yet
-are estimated.
-The scratch folders of the workers of a cluster, which hold one work unit per render process, are not checked.
+While a config is built, its rows are staged and then packed into shards beside them. Staged rows and replaced
+files are deleted when it has been published; their space is not counted on. The scratch folders of the workers of
+a cluster, which hold one work unit per render process, are not checked.
 """
 
 from __future__ import annotations
 
 import json
-import os
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
-from contextlib import suppress
-from dataclasses import dataclass
+from collections.abc import Collection, Iterator, Sequence
+from dataclasses import asdict, dataclass
 from itertools import groupby
 from pathlib import Path
 
 from dataset_builder.config.specs import RigSpec, SceneConfigSpec
-from dataset_builder.pipeline.folder import existing_ancestor, stagings_by_label
+from dataset_builder.pipeline.folder import existing_ancestor
 from dataset_builder.pipeline.plan import ConfigPlan, config_parameters, generator_versions
 from dataset_builder.pipeline.retained import Finished
+from dataset_builder.scene.variants.image_light import image_light
 from rebar_depth_bench.data.bars import BARS_FILE, decoded_bytes
 from rebar_depth_bench.data.manifest import MANIFEST_FILE
 from rebar_depth_bench.errors import InputError, OutputError
@@ -46,33 +44,21 @@ _SURROUNDINGS_BYTES = 1_000_000
 
 _VIEW_BYTES, _SCENE_BYTES, _HEAD_BYTES = 280, 1200, 2000
 """Lengths in the manifest: a view, a scene without its parameters, and the rest, with digests of their files."""
+_PROCESS_BYTES, _PANORAMA_BYTES, _MEMORY_BYTES_PER_PIXEL = 660_000_000, 330_000_000, 850
+"""Peak memory of a render process: with any image, what a panorama adds, and growth with the number of pixels.
+
+Lattice, pile and pier differ by 5 %. ``python -m benchmarks.build`` prints the memory at 1280 x 720.
+"""
 _CAGE_BYTES = 6_000_000
 """Allowance for the mesh of a generated cage, which is not made for an estimate: the mean of 40 is 4 MB."""
 
 
 @dataclass(frozen=True)
 class ConfigSpace:
-    """Disk space of a config: bytes of staged views, missing views, the mesh, and the files that it replaces."""
+    """Additional disk space of a config: what is staged until it is published, and its finished files, bytes."""
 
     staged_bytes: int
-    missing_bytes: int
-    mesh_bytes: int
-    replaced_bytes: int = 0
-
-    @property
-    def finished_bytes(self) -> int:
-        """Size of the finished config in the dataset folder."""
-        return self.staged_bytes + self.missing_bytes + self.mesh_bytes
-
-    @property
-    def building_bytes(self) -> int:
-        """Largest additional space during the build: missing rows, all rows packed, and two copies of the mesh."""
-        return self.missing_bytes + self.finished_bytes + self.mesh_bytes
-
-    @property
-    def kept_bytes(self) -> int:
-        """Additional space after the build; negative if it needs less than what it replaces."""
-        return self.finished_bytes - self.staged_bytes - self.replaced_bytes
+    finished_bytes: int
 
 
 def view_bytes(rig: RigSpec, has_colour: bool) -> int:
@@ -82,43 +68,26 @@ def view_bytes(rig: RigSpec, has_colour: bool) -> int:
     return int(_MARGIN * at_measured_size * pixels * (pixels / _MEASURED_PIXELS) ** _EXPONENT)
 
 
-def config_space(
-    plans: Sequence[ConfigPlan], finished: Finished, stagings: Mapping[str, list[Path]]
-) -> ConfigSpace:
+def spaces_by_config(plans: Sequence[ConfigPlan]) -> dict[str, ConfigSpace]:
+    """Return the disk space by name of each config of plans that are missing in their folder."""
+    groups = groupby(plans, key=lambda plan: plan.spec.name)
+    return {name: config_space(list(of_config)) for name, of_config in groups}
+
+
+def config_space(plans: Sequence[ConfigPlan]) -> ConfigSpace:
     """Return the disk space of one config, of which ``plans`` are the scenes that are missing or to be replaced.
 
-    ``stagings`` are those of the folder, as ``stagings_by_label`` returns them. All rows of all scenes are staged
-    before their shards are packed.
+    All rows of all scenes are staged before their shards are packed.
     """
-    staged = [path for plan in plans for index in plan.indices if (path := plan.staging.row(index)).is_file()]
-    missing = sum(len(plan.indices) for plan in plans) - len(staged)
-    replaced = [scene for plan in plans if (scene := finished.scene(plan)) is not None]
-    abandoned = (path for plan in plans for path in stagings.get(plan.spec.label, ()) if path != plan.staging.root)
-    other_files = (
-        Path(folder, name) for path in abandoned for folder, _, names in os.walk(path) for name in names
-    )
-    return ConfigSpace(
-        _size(staged),
-        missing * view_bytes(plans[0].spec.rig, plans[0].spec.colour is not None),
-        sum(map(_mesh_bytes, plans)),
-        sum(scene.bytes for scene in replaced) + _size(other_files),
-    )
+    per_view = view_bytes(plans[0].spec.rig, plans[0].spec.colour is not None)
+    views, mesh_bytes = sum(len(plan.indices) for plan in plans), sum(map(_mesh_bytes, plans))
+    missing = views - sum(plan.staging.row(index).is_file() for plan in plans for index in plan.indices)
+    return ConfigSpace(missing * per_view + mesh_bytes, views * per_view + mesh_bytes)
 
 
-def spaces_of_configs(out: Path, plans: Sequence[ConfigPlan], finished: Finished) -> list[ConfigSpace]:
-    """Return the disk space of each config of the plans that are missing in the folder ``out``."""
-    stagings = stagings_by_label(out)
-    groups = groupby(plans, key=lambda plan: plan.spec.name)
-    return [config_space(list(of_config), finished, stagings) for _, of_config in groups]
-
-
-def needed_bytes(spaces: Iterable[ConfigSpace]) -> int:
+def needed_bytes(spaces: Collection[ConfigSpace]) -> int:
     """Return the largest additional space at any time while configs are built one after the other."""
-    needed = kept = 0
-    for space in spaces:
-        needed = max(needed, kept + space.building_bytes)
-        kept += space.kept_bytes
-    return needed
+    return sum(space.finished_bytes for space in spaces) + max((space.staged_bytes for space in spaces), default=0)
 
 
 def free_bytes(out: Path) -> int:
@@ -149,12 +118,43 @@ def check_readable(plans: Sequence[ConfigPlan], finished: Finished) -> None:
             )
 
 
-def check_fits_on_disk(out: Path, plans: Sequence[ConfigPlan], finished: Finished) -> None:
-    """Raise ``OutputError`` if building the plans, which are missing, needs more than the free disk space."""
-    check_space(out, spaces_of_configs(out, plans, finished))
+def estimate_lines(out: Path, plans: Sequence[ConfigPlan], finished: Finished) -> Iterator[str]:
+    """Yield lines that tell what building the plans in the folder ``out`` needs: views, disk space and memory."""
+    views, spaces = 0, spaces_by_config([plan for plan in plans if not finished.has(plan)])
+    for name, group in groupby(plans, key=lambda plan: plan.spec.name):
+        of_config = list(group)
+        spec, planned = of_config[0].spec, sum(len(plan.indices) for plan in of_config)
+        scenes = f" in {len(of_config)} scenes," if len(of_config) > 1 else ""
+        yield f"{name}: {planned} views{scenes} of two pictures, {spec.rig.width} x {spec.rig.height}"
+        if name not in spaces:
+            yield "  up to date: nothing to render"
+            continue
+        missing = sum(_missing_views(plan, finished) for plan in of_config if not finished.has(plan))
+        views, space = views + missing, spaces[name]
+        colour = asdict(spec.colour).items() if spec.colour else [("none", "")]
+        yield f"  views: {missing} to render ({2 * missing} pictures), {planned - missing} already rendered"
+        yield f"  colour: {', '.join(f'{key} {value}'.rstrip() for key, value in colour)}"
+        finished_text, building_text = bytes_text(space.finished_bytes), bytes_text(needed_bytes([space]))
+        yield f"  disk space: {finished_text} finished, {building_text} to build"
+        yield f"  memory: about {bytes_text(max(map(memory_bytes, of_config)))} in each render process"
+    yield f"total: {views} of {sum(len(plan.indices) for plan in plans)} views to render"
+    needed_text, free_text = bytes_text(needed_bytes(spaces.values())), bytes_text(free_bytes(out))
+    yield f"disk space: {needed_text} needed, {free_text} free for {out}"
 
 
-def check_space(out: Path, spaces: Iterable[ConfigSpace]) -> None:
+def _missing_views(plan: ConfigPlan, finished: Finished) -> int:
+    """Return the number of views of a plan that are neither staged nor kept from the finished config."""
+    staged = sum(plan.staging.row(index).is_file() for index in plan.indices)
+    return len(plan.indices) - staged - len(finished.kept_views(plan))
+
+
+def memory_bytes(plan: ConfigPlan) -> int:
+    """Return the peak memory of a process that renders colour of a plan; without colour, it needs less."""
+    panorama_bytes = _PANORAMA_BYTES if image_light(plan.spec.scene) is not None else 0
+    return _PROCESS_BYTES + panorama_bytes + _MEMORY_BYTES_PER_PIXEL * plan.spec.rig.width * plan.spec.rig.height
+
+
+def check_space(out: Path, spaces: Collection[ConfigSpace]) -> None:
     """Raise ``OutputError`` if building configs one after the other needs more than the free disk space."""
     needed, free = needed_bytes(spaces), free_bytes(out)
     if needed > free:
@@ -179,12 +179,3 @@ def _mesh_bytes(plan: ConfigPlan) -> int:
         return _SURROUNDINGS_BYTES + _CAGE_BYTES
     meshes = [part.mesh for part in plan.assembly.parts]
     return _SURROUNDINGS_BYTES + sum(24 * len(mesh.vertices_m) + 15 * len(mesh.faces) for mesh in meshes)
-
-
-def _size(paths: Iterable[Path]) -> int:
-    """Return the size of files; those that a build in another process has just removed have none."""
-    size = 0
-    for path in paths:
-        with suppress(FileNotFoundError):
-            size += path.stat().st_size
-    return size

@@ -6,21 +6,30 @@ that it changes are no links, and it deletes regular files whose names are its o
 
 from __future__ import annotations
 
+import json
 import os
 import re
-from collections.abc import Collection, Iterable, Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
 from dataset_builder.pipeline.plan import BUILD_FOLDER, STAGING_KEY, ConfigPlan
-from rebar_depth_bench.atomic_io import temporary_target
+from rebar_depth_bench.atomic_io import exclusive_lock, temporary_target, write_error, write_text
 from rebar_depth_bench.bar_crossings.table import CROSSINGS_FILE
 from rebar_depth_bench.data.bars import BARS_FILE
 from rebar_depth_bench.data.digests import file_sha256
-from rebar_depth_bench.data.manifest import MANIFEST_FILE, DatasetFolder
+from rebar_depth_bench.data.manifest import (
+    MANIFEST_FILE,
+    MANIFEST_FORMAT,
+    OLD_FORMAT,
+    DatasetFolder,
+    read_manifest,
+    validated_folder,
+)
 from rebar_depth_bench.errors import InputError, OutputError
 from rebar_depth_bench.paths import check_no_links, remove_file, remove_folder
-from rebar_depth_bench.view_ids import SPLITS
+from rebar_depth_bench.view_ids import SPLITS, TEST_SPLIT
 
 MESHES = "meshes"
 PICTURES = "pictures"
@@ -37,20 +46,6 @@ SHARD_NAME = re.compile(
 """Names of the files in the folder of a config; those of a config of several scenes name split and scene."""
 
 
-def check_folder(out: Path, plans: Sequence[ConfigPlan]) -> None:
-    """Raise ``InputError`` unless ``out`` is new, empty or a dataset folder that the plans can be built in.
-
-    Raises as ``check_target`` does.
-    """
-    labels = {plan.spec.label for plan in plans}
-
-    def stagings() -> Iterator[Path]:  # Not read before ``out`` is checked.
-        for label, paths in stagings_by_label(out).items():
-            yield from paths if label in labels else ()
-
-    check_target(out, {plan.spec.name for plan in plans}, stagings())
-
-
 def stagings_by_label(out: Path) -> dict[str, list[Path]]:
     """Return the staging folders of ``out`` by the label of their config, those of abandoned builds included."""
     by_label: dict[str, list[Path]] = {}
@@ -62,11 +57,11 @@ def stagings_by_label(out: Path) -> dict[str, list[Path]]:
     return by_label
 
 
-def check_target(out: Path, configs: Collection[str], stagings: Iterable[Path]) -> None:
+def check_target(out: Path, configs: Collection[str]) -> None:
     """Raise ``InputError`` unless ``out`` is new, empty or a dataset folder, where configs can be written.
 
     Raises ``OutputError`` if it cannot be written. No other files are ever changed. Folders that a build changes,
-    its lock and the files in the staging folders may not be links.
+    its lock and the files in staging folders may not be links.
     """
     ancestor = existing_ancestor(out)
     if not ancestor.is_dir():
@@ -74,7 +69,7 @@ def check_target(out: Path, configs: Collection[str], stagings: Iterable[Path]) 
     if not os.access(ancestor, os.W_OK | os.X_OK):
         raise OutputError(f"{out}: cannot be written: no permission to write in {ancestor}")
     check_no_links(out, f"{BUILD_FOLDER}/{LOCK}", f"{BUILD_FOLDER}/{BARS_FILE}", MESHES, PICTURES, *configs)
-    for staging in stagings:
+    for staging in (path for paths in stagings_by_label(out).values() for path in paths):
         check_no_links(out, os.path.relpath(staging, out))
         for folder, folders, files in os.walk(staging):
             check_no_links(Path(folder), *folders, *files)
@@ -93,6 +88,24 @@ def existing_ancestor(path: Path) -> Path:
             if candidate.exists():
                 return candidate
     return Path(path.anchor)
+
+
+@contextmanager
+def build_lock(folder: Path) -> Iterator[None]:
+    """Hold an exclusive lock on the file ``lock`` in ``folder``; the lock of a killed process is released.
+
+    Raises ``InputError`` if another process holds the lock, and ``OutputError`` if the folder cannot be written.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise write_error(folder.parent, error) from None
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(exclusive_lock(folder / LOCK))
+        except BlockingIOError:
+            raise InputError(f"{folder.parent}: another rebar-build process is using this folder") from None
+        yield
 
 
 def file_matches(folder: DatasetFolder, name: str) -> bool:
@@ -158,3 +171,71 @@ def _own_folders(out: Path) -> Iterator[tuple[Path, re.Pattern[str]]]:
     for folder in sorted(out.iterdir()):
         if re.fullmatch(_NAME, folder.name) and folder.is_dir() and not folder.is_symlink():
             yield folder, _OWN_NAMES.get(folder.name, SHARD_NAME)
+
+
+_OF_SCENE = (
+    *("protocol", "protocol_views", "rig", "aim_point_m", "world_from_source", "key", "generator"),
+    *("mesh", "shards", "bytes"),
+)
+"""Keys beside the scene in an entry of one scene that belong to the scene now, in the order of the manifest."""
+_OF_CONFIG = ("name", "imported", "rig", "colour", "sheet", "ground_truth_digest", "views")
+
+
+def rewrite_manifest(out: Path) -> None:
+    """Convert the manifest of a dataset folder to the present format; one that has it already is left as it is.
+
+    Digests of views and files do not change. Raises ``DatasetError`` if the folder has no valid manifest, and
+    ``InputError`` if another build is using the folder.
+    """
+    check_target(out, ())
+    path = out / MANIFEST_FILE
+    values, problems = read_manifest(path)
+    if isinstance(values, dict) and values.get("format") == OLD_FORMAT:
+        values = converted(values)
+        validated_folder(values, problems, str(out), path)
+        with build_lock(out / BUILD_FOLDER):
+            try:
+                write_text(path, manifest_text(values))
+            finally:
+                remove_build_folder(out / BUILD_FOLDER)
+        return
+    validated_folder(values, problems, str(out), path)
+
+
+def converted(manifest: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a manifest of the earlier format in the present one; what is not valid in it stays so."""
+    configs = manifest.get("configs")
+    if isinstance(configs, dict):
+        configs = {name: _converted_config(name, entry) for name, entry in configs.items()}
+    return {**manifest, "format": MANIFEST_FORMAT, "configs": configs}
+
+
+def _converted_config(name: str, entry: Any) -> Any:
+    """Return the entry of a config: an entry of one scene had its parameters and files beside ``scene``."""
+    if not isinstance(entry, dict):
+        return entry
+    if isinstance(scenes := entry.get("scenes"), list):
+        parts = {"has_splits": True, "scenes": [_with_number_of_views(scene) for scene in scenes]}
+        references = entry.get("references", {})
+    else:
+        scene = entry["scene"] if isinstance(entry.get("scene"), dict) else {}
+        files = {key: entry[key] for key in _OF_SCENE if key in entry}
+        if "imported" in entry:  # Its rig has only the size of the images, and it has no trajectory.
+            files = {key: value for key, value in files.items() if key not in ("rig", "protocol")}
+        parts = {"has_splits": False, "scenes": [{**scene, "split": TEST_SPLIT, **files}]}
+        references = {TEST_SPLIT: entry["reference"]} if "reference" in entry else {}
+    kept = {"name": name, **{key: entry[key] for key in _OF_CONFIG if key in entry}}
+    if isinstance(rig := kept.get("rig"), dict):
+        kept["rig"] = {key: rig[key] for key in ("width", "height") if key in rig}
+    return {**kept, **parts, "references": references}
+
+
+def _with_number_of_views(scene: Any) -> Any:
+    """Return a scene with the number of views of its trajectory."""
+    protocol = scene.get("protocol") if isinstance(scene, dict) else None
+    return {**scene, "protocol_views": protocol.get("views")} if isinstance(protocol, dict) else scene
+
+
+def manifest_text(manifest: Mapping[str, Any]) -> str:
+    """Return the text of a manifest."""
+    return json.dumps(manifest, indent=1, allow_nan=False) + "\n"

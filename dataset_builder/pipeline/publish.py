@@ -12,8 +12,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -25,19 +24,18 @@ from dataset_builder.config.trajectories import view_count
 from dataset_builder.pipeline.contact_sheet import write_contact_sheet, write_scenes_strip
 from dataset_builder.pipeline.folder import (
     CARD,
-    LOCK,
     MESHES,
     PICTURES,
     SHARD_DIGEST_CHARACTERS,
     file_matches,
+    manifest_text,
     remove_temporary_files,
     remove_unlisted_files,
     stored_bars_path,
 )
 from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, config_parameters, generator_versions
 from dataset_builder.pipeline.shards import Staging, pack_shard, read_staged_record, split_into_shards
-from dataset_builder.scene.assemblies import assembly_bars
-from rebar_depth_bench.atomic_io import exclusive_lock, write_bytes, write_error, write_text
+from rebar_depth_bench.atomic_io import write_bytes, write_text
 from rebar_depth_bench.bar_crossings.definition import Crossings, crossing_parameters
 from rebar_depth_bench.bar_crossings.table import (
     CROSSINGS_FILE,
@@ -49,7 +47,6 @@ from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars, write_bars
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.digests import file_sha256, parameters_digest, views_digest
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, MANIFEST_FORMAT, DatasetFolder, validated_folder
-from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.paths import remove_file
 from rebar_depth_bench.scoring.ground_truth import reference_errors
 from rebar_depth_bench.scoring.protocol import PROTOCOL
@@ -58,24 +55,6 @@ from rebar_depth_bench.view_ids import SPLITS, TEST_SPLIT
 
 STRIP = f"{PICTURES}/scenes.webp"
 """Strip with one view of each kind of assembly."""
-
-
-@contextmanager
-def build_lock(folder: Path) -> Iterator[None]:
-    """Hold an exclusive lock on the file ``lock`` in ``folder``; the lock of a killed process is released.
-
-    Raises ``InputError`` if another process holds the lock, and ``OutputError`` if the folder cannot be written.
-    """
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise write_error(folder.parent, error) from None
-    with ExitStack() as stack:
-        try:
-            stack.enter_context(exclusive_lock(folder / LOCK))
-        except BlockingIOError:
-            raise InputError(f"{folder.parent}: another rebar-build process is using this folder") from None
-        yield
 
 
 @dataclass(frozen=True)
@@ -205,7 +184,7 @@ def repair_metadata(out: Path, folder: DatasetFolder, plans: Sequence[ConfigPlan
         return folder
     write_contact_sheet(config, out / config.sheet)
     digests = {config.sheet: file_sha256(out / config.sheet)}
-    bars = {plan.spec.scene.name: assembly_bars(plan.spec.scene.assembly) for plan in plans}
+    bars = {plan.spec.scene.name: plan.bars for plan in plans}
     return write_folder(out, folder, folder.config_by_name, digests, bars)
 
 
@@ -284,11 +263,6 @@ def write_folder(
     remove_file(out / BUILD_FOLDER / BARS_FILE)
     remove_unlisted_files(out, _listed_files(ordered))
     return published
-
-
-def manifest_text(manifest: Mapping[str, Any]) -> str:
-    """Return the text of a manifest."""
-    return json.dumps(manifest, indent=1, allow_nan=False) + "\n"
 
 
 def _write_scene_bars(

@@ -6,7 +6,6 @@ or scenes, the finished views among the new ones are kept. All of this is checke
 
 from __future__ import annotations
 
-import json
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
@@ -133,15 +132,8 @@ def differences(scene: DatasetConfig, plan: ConfigPlan) -> list[str]:
     if scene.has_splits != isinstance(plan.spec, SceneConfigSpec):
         return ["its views have other ids"]
     entry, parameters = scene.scene.entry, config_parameters(plan.spec)
-    planned = {
-        **{
-            key: parameters["scene"][key]
-            for key in ("name", "assembly", "board", "environment", "appearance", "seed")
-        },
-        **{key: parameters[key] for key in ("protocol", "rig", "colour")},
-        "generator": generator_versions(),
-    }
-    planned = json.loads(json.dumps(planned))
+    of_config = {key: parameters[key] for key in ("protocol", "rig", "colour")}
+    planned = {**parameters["scene"], **of_config, "generator": dict(generator_versions())}
     found = {**{key: entry.get(key) for key in planned}, "colour": scene.manifest_entry.get("colour")}
     if planned["protocol"]["kind"] == RANDOM_VIEWS:
         found["protocol"], planned["protocol"] = _shared_views(found["protocol"], planned["protocol"])
@@ -206,7 +198,7 @@ def kept_scenes(config: DatasetConfig | None, plans: Sequence[ConfigPlan]) -> li
     """
     if config is None or not config.has_splits or not isinstance(plans[0].spec, SceneConfigSpec):
         return []
-    spec, parameters = plans[0].spec, json.loads(json.dumps(config_parameters(plans[0].spec)))
+    spec, parameters = plans[0].spec, config_parameters(plans[0].spec)
     shown = ((spec.rig.height, spec.rig.width), parameters["colour"])
     if (config.grid, config.manifest_entry["colour"]) != shown:
         return []
@@ -293,7 +285,7 @@ def _check_scene(out: Path, config: DatasetConfig, plans: Sequence[ConfigPlan]) 
         name = plan.spec.scene.name
         if plan.spec.name == config.name or name not in scenes:
             continue
-        planned = json.loads(json.dumps(config_parameters(plan.spec)["scene"]))
+        planned = config_parameters(plan.spec)["scene"]
         if any(scenes[name].get(key) != value for key, value in planned.items()):
             raise InputError(
                 f"{out}: config {config.name} was built with other parameters of scene {name!r}; rebuild it too "

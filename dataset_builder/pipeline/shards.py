@@ -49,6 +49,11 @@ class Staging:
         """Path of the mesh of the scene."""
         return self.root / "mesh.ply"
 
+    @property
+    def cage(self) -> Path:
+        """Path of the bars that were read from a user's file; a generated assembly has no such file."""
+        return self.root / "cage.npz"
+
     def log(self, shard: int) -> Path:
         """Return the path of the Blender log of a shard."""
         return self.root / "logs" / f"shard-{shard:05d}.log"

@@ -5,14 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from decimal import ROUND_DOWN, Decimal
+from typing import TYPE_CHECKING
 
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.scoring.bootstrap import MIN_BLOCKS
 from rebar_depth_bench.scoring.groups import GROUPINGS
 from rebar_depth_bench.scoring.metrics import METRICS, DepthMetrics
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, WITHIN_MM
-from rebar_depth_bench.scoring.result import Table
-from rebar_depth_bench.submission.metadata import Declaration
+
+if TYPE_CHECKING:
+    from rebar_depth_bench.scoring.result import Table
+    from rebar_depth_bench.submission.metadata import Declaration
 
 DASH = "–"
 """Text of an undefined number, which is null in the JSON."""

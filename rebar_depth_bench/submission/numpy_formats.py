@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rebar_depth_bench.errors import EntryError, Problem, escape_text, format_shape
-from rebar_depth_bench.submission.zip_directory import DirectoryError, MemorySource, read_directory
+from rebar_depth_bench.reading import MemorySource
+from rebar_depth_bench.submission.zip_directory import DirectoryError, read_directory
 from rebar_depth_bench.submission.zip_entries import check_entries, read_data
 
 MAX_HEADER_BYTES = 4096

@@ -16,7 +16,8 @@ from dataclasses import dataclass
 from zlib_ng import zlib_ng
 
 from rebar_depth_bench.errors import EntryError, Problem, escape_text
-from rebar_depth_bench.submission.zip_directory import ByteSource, Directory, ZipEntry
+from rebar_depth_bench.reading import ByteSource
+from rebar_depth_bench.submission.zip_directory import Directory, ZipEntry
 
 STORED = 0
 DEFLATED = 8

@@ -16,12 +16,12 @@ import numpy as np
 from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.config.rigs import rig_cameras
 from dataset_builder.config.specs import ColourSpec
-from dataset_builder.config.trajectories import poses
+from dataset_builder.config.trajectories import aim_point_m, poses
+from dataset_builder.pipeline.blender_process import OnViewDone
 from dataset_builder.pipeline.build import build
-from dataset_builder.pipeline.local_renderer import OnViewDone
 from dataset_builder.pipeline.shards import Staging, View, encode_view, stage_row
 from dataset_builder.pipeline.work_units import UnitResult, WorkUnit
-from dataset_builder.scene.assemblies import aim_point_m, make_assembly
+from dataset_builder.scene.assemblies import make_assembly
 from dataset_builder.scene.mesh_ply import read_mesh_ply
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.scene.raycast import RayCaster
@@ -76,7 +76,7 @@ class StoredImages:
 
 def write_orbit(root: Path, mesh: Path) -> None:
     """Write the dataset folder ``root``; ``mesh`` is the PLY file of the lattice."""
-    build(REQUEST, root, cluster=StoredImages(mesh))
+    build(REQUEST, root, submit=StoredImages(mesh).submit)
 
 
 def _image(index: int) -> Path:

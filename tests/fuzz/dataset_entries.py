@@ -16,7 +16,7 @@ import pyarrow.parquet as pq
 
 from dataset_builder.cli import argument_parser as builder_parser
 from dataset_builder.config.catalog import BuildRequest
-from dataset_builder.config.quality import colour_spec
+from dataset_builder.config.specs import colour_spec
 from dataset_builder.pipeline.build import build
 from rebar_depth_bench import SubmissionWriter, load
 from rebar_depth_bench.console import EXIT_DONE
@@ -177,7 +177,7 @@ class _NoRenderer:
 
 
 def _build(workspace: Workspace) -> None:
-    build(_REQUEST, workspace.root / ROOT, cluster=_NoRenderer())
+    build(_REQUEST, workspace.root / ROOT, submit=_NoRenderer().submit)
 
 
 _REQUEST = BuildRequest(configs=(CONFIG,), views=2, width=160, height=90, colour=colour_spec(quality="preview"))

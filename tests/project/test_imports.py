@@ -60,6 +60,15 @@ def test_a_command_line_imports_only_its_command(words: str, commands: set[str])
     assert commands or not modules & {"numpy", "pyarrow", "pydantic", "jinja2"}
 
 
+def test_options_of_a_command_load_no_other_command() -> None:
+    modules = modules_after("from dataset_builder.cli import argument_parser; argument_parser(['export'])")
+    assert {name for name in modules if name.startswith("dataset_builder")} == {
+        "dataset_builder",
+        "dataset_builder.cli",
+    }
+    assert not modules & {"numpy", "pyarrow"}
+
+
 @pytest.mark.slow
 def test_build_planning_does_not_import_blender() -> None:
     modules = modules_after("import dataset_builder.cli, dataset_builder.pipeline.build, dataset_builder.audit")

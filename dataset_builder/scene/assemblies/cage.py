@@ -5,6 +5,8 @@ The reader of a file returns them in the file's frame, in metres, and ``placemen
 
 from __future__ import annotations
 
+import io
+import json
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Literal
@@ -13,9 +15,12 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.scene.model import Mesh, Note
+from dataset_builder.scene.model import Mesh, Note, axis_of
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.errors import Problem
+
+_NO_MESH = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
+"""What is packed for a bar whose mesh is swept along its axis."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,3 +87,50 @@ class Cage:
 def unit_scale(unit_m: float) -> Float64[ndarray, "4 4"]:
     """Return the matrix that takes coordinates in a file's unit to metres."""
     return np.diag([unit_m, unit_m, unit_m, 1.0])
+
+
+def packed_cage(cage: Cage) -> bytes:
+    """Return the bars of a cage as an ``.npz`` file: all that their meshes depend on. Equal bars give equal bytes.
+
+    Nominal axes, which bars of a file do not have, are left out, and so is what describes their source.
+    """
+    bars = [bar.bar for bar in cage.bars]
+    meshes = [bar.mesh or _NO_MESH for bar in cage.bars]
+    content = io.BytesIO()
+    np.savez(
+        content,
+        bar_id=np.array([bar.bar_id for bar in bars], np.uint16),
+        roles_json=np.frombuffer(json.dumps([bar.role for bar in bars]).encode(), np.uint8),
+        diameter_m=np.array([bar.diameter_m for bar in bars], np.float64),
+        ribs=np.array([bar.ribs for bar in cage.bars], np.bool_),
+        axis_points=np.array([len(bar.axis_m) for bar in bars]),
+        axis_m=np.array([point for bar in bars for point in bar.axis_m], np.float64).reshape(-1, 3),
+        vertices=np.array([len(mesh.vertices_m) for mesh in meshes]),
+        vertices_m=np.concatenate([mesh.vertices_m for mesh in meshes]),
+        triangles=np.array([len(mesh.faces) for mesh in meshes]),
+        faces=np.concatenate([mesh.faces for mesh in meshes]),
+    )
+    return content.getvalue()
+
+
+def unpacked_cage(content: bytes) -> Cage:
+    """Return the cage of bars that ``packed_cage`` has packed."""
+    with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
+        ids, diameters_m, ribs = (arrays[name].tolist() for name in ("bar_id", "diameter_m", "ribs"))
+        roles = json.loads(arrays["roles_json"].tobytes())
+        axes_m = _split(arrays["axis_m"], arrays["axis_points"])
+        meshes = map(
+            Mesh, _split(arrays["vertices_m"], arrays["vertices"]), _split(arrays["faces"], arrays["triangles"])
+        )
+    bars = map(Bar, ids, roles, diameters_m, map(axis_of, axes_m))
+    return Cage(
+        tuple(
+            CageBar(f"bar {bar.bar_id}", bar, has_ribs, mesh if len(mesh.faces) else None)
+            for bar, has_ribs, mesh in zip(bars, ribs, meshes, strict=True)
+        )
+    )
+
+
+def _split(rows: ndarray, counts: ndarray) -> list[ndarray]:
+    """Return the rows of each bar, of which there are ``counts``."""
+    return np.split(rows, np.cumsum(counts)[:-1])

@@ -30,8 +30,7 @@ from dataset_builder.config.specs import (
     RigSpec,
     SceneSpec,
 )
-from dataset_builder.config.trajectories import poses
-from dataset_builder.scene.assemblies import aim_point_m
+from dataset_builder.config.trajectories import aim_point_m, poses
 from dataset_builder.scene.assemblies.lattice import lattice_assembly
 from dataset_builder.scene.assemblies.pier import pier_assembly
 from dataset_builder.scene.assemblies.pile import pile_assembly

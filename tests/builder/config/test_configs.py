@@ -15,12 +15,13 @@ from PIL import Image
 
 import rebar_depth_bench as rdb
 from dataset_builder.audit import audit
+from dataset_builder.config.cages import CagesRequest
+from dataset_builder.config.camera_fit import check_fits
 from dataset_builder.config.catalog import CONFIGS, BuildRequest
-from dataset_builder.config.quality import colour_spec
-from dataset_builder.config.specs import ColourSpec, DomeSpec, RigSpec, RingSpec
+from dataset_builder.config.specs import ColourSpec, DomeSpec, RigSpec, RingSpec, colour_spec
 from dataset_builder.config.trajectories import view_count
 from dataset_builder.pipeline.contact_sheet import STRIP_PANEL_PX, TILE_PX
-from dataset_builder.scene.assemblies import check_fits, make_assembly
+from dataset_builder.scene.assemblies import make_assembly
 from rebar_depth_bench.bar_crossings.table import read_crossings
 from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.errors import InputError
@@ -184,6 +185,16 @@ def test_user_scene_and_variant_are_added_to_dataset(tiny_root: Path, tmp_path: 
         (BuildRequest(variants=("wet", "rusted")), [("conflict", "")]),
         (BuildRequest(configs=("pier", "latice", "pil")), [("unknown", "--config")] * 2),
         (BuildRequest(views=0, width=2), [("invalid", "--views"), ("invalid", "--width")]),
+        (
+            BuildRequest(("cages", "pil"), views=1, width=2, cages=CagesRequest("val", 0)),
+            [
+                ("invalid", "--width"),
+                ("invalid", "--scenes"),
+                ("unknown", "--config"),
+                ("unknown", "--split"),
+                ("conflict", "--views"),
+            ],
+        ),
     ],
 )
 def test_invalid_build_request_is_rejected(request_: BuildRequest, problems: list[tuple[str, str]]) -> None:

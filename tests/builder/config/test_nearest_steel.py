@@ -10,10 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dataset_builder.config.catalog import LATTICE_DOME, PIER_DOME, PILE_DOME
-from dataset_builder.config.scene_file import OUTDOORS_CAMERA_RADIUS_M
 from dataset_builder.config.specs import DomeSpec, PierSpec, RigSpec
-from dataset_builder.config.trajectories import camera_offsets_m, poses, view_count
-from dataset_builder.scene.assemblies import aim_point_m
+from dataset_builder.config.surroundings import SURROUNDINGS
+from dataset_builder.config.trajectories import aim_point_m, camera_offsets_m, poses, view_count
 from dataset_builder.scene.assemblies.pier import pier_assembly
 from dataset_builder.scene.environments.outdoors import CLEAR_M
 from dataset_builder.scene.model import Assembly
@@ -77,7 +76,7 @@ def test_pier_cameras_are_above_ground_in_clear_area(pier: Assembly) -> None:
     rights = [right_camera_pose(left, RigSpec.baseline_m) for left in lefts]
     centres_m = np.array([camera_centre(pose) for pose in (*lefts, *rights)])
     assert centres_m[:, 2].min() > 0.6
-    assert np.linalg.norm(centres_m[:, :2], axis=1).max() < OUTDOORS_CAMERA_RADIUS_M < CLEAR_M
+    assert np.linalg.norm(centres_m[:, :2], axis=1).max() < SURROUNDINGS["outdoors"].cameras.radius_m < CLEAR_M
     assert Cylinders.from_bars(pier.bars).distance_m(centres_m).min() > 8 - RigSpec.baseline_m
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
@@ -26,7 +25,7 @@ def config_of_spec(spec: ConfigSpec, views: int | None = None) -> DatasetConfig:
         ViewRecord(view_id=f"{spec.name}/{n:04d}", left="0" * 64, right="0" * 64, steel_px=9, scored_px=1)
         for n in range(views or count)
     ]
-    parameters = json.loads(json.dumps(config_parameters(spec)))
+    parameters = config_parameters(spec)
     scene = {
         **parameters["scene"],
         **{key: parameters[key] for key in ("protocol", "rig")},

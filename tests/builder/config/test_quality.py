@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from dataset_builder.config.quality import DEFAULT_QUALITY, QUALITIES, SAMPLINGS, colour_spec
-from dataset_builder.config.specs import ColourSpec
+from dataset_builder.config.specs import DEFAULT_QUALITY, QUALITIES, SAMPLINGS, ColourSpec, colour_spec
 
 
 def test_default_is_the_standard_preset() -> None:

@@ -9,18 +9,10 @@ import numpy as np
 import pytest
 import trimesh
 
-from dataset_builder.config.camera_site import CameraSite, CameraSpace
-from dataset_builder.config.random_views import (
-    MAX_ROLL_DEG,
-    MIN_STEEL_SHARE,
-    SPACING_M,
-    STEEL_CLEARANCE,
-    STEEL_CLEARANCE_M,
-    with_random_stations,
-)
-from dataset_builder.config.rigs import rig_cameras
+from dataset_builder.config.camera_placement import MAX_ROLL_DEG, RANDOM_RULES, with_random_stations
+from dataset_builder.config.rigs import STEREO_CAMERAS, focal_of_view_px, rig_cameras
 from dataset_builder.config.specs import FocalRigSpec, GeneratedCageSpec, RandomViewsSpec
-from dataset_builder.config.stereo_cameras import STEREO_CAMERAS, StereoCamera, focal_of_view_px
+from dataset_builder.config.surroundings import CameraSpace
 from dataset_builder.config.trajectories import camera_offsets_m, look_at_with_rig, poses, view_count
 from dataset_builder.scene.assemblies import make_assembly
 from dataset_builder.scene.cages.families import FAMILIES
@@ -31,7 +23,7 @@ from rebar_depth_bench.geometry.cameras import camera_centre, ideal_K
 SPACE = CameraSpace(20.0, clear_radius_m=20.0)
 VIEWS = 6
 SPEC = RandomViewsSpec(VIEWS, seed=4)
-RIG = STEREO_CAMERAS["Luxonis OAK-D"].rig()
+RIG = STEREO_CAMERAS["Luxonis OAK-D"]
 
 
 @pytest.fixture(scope="module")
@@ -45,7 +37,7 @@ def views(cages: Mapping[str, Assembly]) -> Mapping[str, RandomViewsSpec]:
 
 
 def placed(spec: RandomViewsSpec, cage: Assembly, space: CameraSpace = SPACE) -> RandomViewsSpec:
-    return with_random_stations(spec, CameraSite(cage, space, SPACING_M), RIG, "cage")
+    return with_random_stations(spec, cage, space, RIG, "cage")
 
 
 def steel(assembly: Assembly) -> trimesh.Trimesh:
@@ -65,13 +57,13 @@ def test_eyes_are_clear_of_steel_and_see_it(
     for pose in poses(views[family], np.zeros(3), RIG, cage.bars):
         for camera in rig_cameras(rig, pose).values():
             eye_m = camera_centre(camera.cam_from_world)
-            assert np.linalg.norm(mesh.vertices - eye_m, axis=1).min() > min(
-                STEEL_CLEARANCE_M, STEEL_CLEARANCE * SPEC.distances_m[0]
+            assert np.linalg.norm(mesh.vertices - eye_m, axis=1).min() > RANDOM_RULES.clearance_m(
+                SPEC.distances_m[0]
             )
             assert eye_m[2] >= 0.1
             directions = camera.rays().reshape(-1, 3) @ camera.cam_from_world[:3, :3]
             is_hit = mesh.ray.intersects_any(np.tile(eye_m, (len(directions), 1)), directions)
-            assert is_hit.mean() > MIN_STEEL_SHARE / 2  # Other rays than those of the placement.
+            assert is_hit.mean() > RANDOM_RULES.min_steel_share / 2  # Other rays than those of the placement.
 
 
 def test_views_of_a_longer_list_begin_with_those_of_a_shorter_one(
@@ -115,8 +107,8 @@ def test_rolled_rig_turns_about_its_line_of_sight() -> None:
 
 
 @pytest.mark.parametrize("camera", STEREO_CAMERAS.values(), ids=STEREO_CAMERAS)
-def test_rig_of_a_named_camera_has_its_focal_length(camera: StereoCamera) -> None:
-    eyes = rig_cameras(camera.rig(), np.eye(4))
+def test_rig_of_a_named_camera_has_its_focal_length(camera: FocalRigSpec) -> None:
+    eyes = rig_cameras(camera, np.eye(4))
     assert eyes["left"].K[0, 0] == eyes["left"].K[1, 1] == camera.focal_px
     assert eyes["right"].cam_from_world[0, 3] == -camera.baseline_m
     half = ideal_K(640, 360, camera.focal_px)

@@ -15,13 +15,14 @@ from hypothesis import strategies as st
 from numpy import ndarray
 from scipy.spatial import cKDTree
 
+from dataset_builder.config.camera_fit import check_fits
 from dataset_builder.config.catalog import LATTICE_DOME
 from dataset_builder.config.file_specs import CageFileSpec, MeshFileSpec
 from dataset_builder.config.scene_file import NEAREST_RADIUS_PER_REACH, scene_config
 from dataset_builder.config.scene_schema import read_scene_toml
 from dataset_builder.config.specs import DomeSpec, LatticeSpec, RingSpec
-from dataset_builder.config.trajectories import view_count
-from dataset_builder.scene.assemblies import aim_point_m, check_fits, make_assembly
+from dataset_builder.config.trajectories import aim_point_m, view_count
+from dataset_builder.scene.assemblies import make_assembly
 from dataset_builder.scene.assemblies.bar_meshes import MAX_RIBS_PER_ROW
 from dataset_builder.scene.assemblies.cage import CageBar
 from dataset_builder.scene.assemblies.cage_file import cage_file_spec, load_cage
@@ -167,7 +168,8 @@ def test_large_cage_is_outdoors_and_rejected_in_laboratory(tmp_path: Path) -> No
     config = scene_config(write_scene(tmp_path, content))
     assert (config.scene.environment, config.scene.board) == ("outdoors", None)
     with pytest.raises(
-        InputError, match=r"steel extends 2 m from the laboratory's centre, expected at most 0\.45 m"
+        InputError,
+        match=r"steel extends 2 m from the world's origin, expected at most 0\.45 m in the environment lab",
     ):
         scene_config(write_scene(tmp_path, 'environment = "laboratory"\n' + content))
     far = '[cameras]\nkind = "ring"\nradius = 2000\nelevation_deg = 35\nazimuths = 4\n'
@@ -175,7 +177,7 @@ def test_large_cage_is_outdoors_and_rejected_in_laboratory(tmp_path: Path) -> No
         InputError, match=r"the steel extends 21 m from the world's origin, expected at most 20\.5"
     ):
         scene_config(write_scene(tmp_path, MM + BAR.replace("100", "21000")))
-    with pytest.raises(InputError, match=r"cameras are 1.638 m from the laboratory's centre"):
+    with pytest.raises(InputError, match=r"cameras are 1.638 m from the world's origin"):
         scene_config(write_scene(tmp_path, 'environment = "laboratory"\n' + MM + BAR + far))
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import shutil
 import unicodedata
 from pathlib import Path
 
@@ -12,9 +13,8 @@ from hypothesis import strategies as st
 
 from dataset_builder.config import scene_schema
 from dataset_builder.config.catalog import CONFIGS, BuildRequest
-from dataset_builder.config.scene_file import scene_config
-from dataset_builder.config.scene_name import scene_name_of
-from dataset_builder.config.scene_schema import TomlBar, read_scene_toml
+from dataset_builder.config.scene_file import scene_config, scene_name_of
+from dataset_builder.config.scene_schema import read_scene_toml
 from dataset_builder.config.specs import DomeSpec, SurveySpec
 from dataset_builder.scene.assemblies.cage_file import cage_file_spec, load_cage
 from rebar_depth_bench.errors import InputError, MeshError
@@ -217,9 +217,17 @@ def test_conflicts_are_reported_with_other_problems(tmp_path: Path) -> None:
 def test_documented_example_is_valid() -> None:
     example = (scene_schema.__doc__ or "").split("```")[1].removeprefix("toml")
     scene = read_scene_toml(example.encode(), "example")
-    assert (scene.name, scene.board, scene.trajectory) == ("my-beam", 6, DomeSpec((0.3, 0.4), (15.0, 45.0), 12))
+    assert (scene.name, scene.board, scene.cameras) == ("my-beam", 6, DomeSpec((0.3, 0.4), (15.0, 45.0), 12))
     corners_m = ((-0.15, 0.0, 0.005), (0.15, 0.0, 0.005), (0.15, 0.0, 0.08))
-    assert scene.bars == (TomlBar(7, "main", 0.01, corners_m, 0.04, True),)
+    [bar] = scene.bars
+    assert bar.model_dump() == {
+        "bar_id": 7,
+        "role": "main",
+        "diameter_m": 0.01,
+        "corners_m": corners_m,
+        "mandrel_m": 0.04,
+        "ribs": True,
+    }
 
 
 def test_survey_has_defaults_in_metres_and_distances_in_the_unit() -> None:
@@ -230,7 +238,7 @@ def test_survey_has_defaults_in_metres_and_distances_in_the_unit() -> None:
         ("mm", "views_per_distance = 2500\nseed = 7\n", SurveySpec(views_per_distance=2500, seed=7)),
     ):
         content = f'unit = "{unit}"\n{BAR}{SURVEY}{keys}'
-        assert read_scene_toml(content.encode(), "a").trajectory == expected
+        assert read_scene_toml(content.encode(), "a").cameras == expected
 
 
 BAR_1 = "bar 1 (bar, diameter 0.01 m)"
@@ -315,6 +323,13 @@ def test_file_names_without_a_scene_name_are_refused(tmp_path: Path) -> None:
     ):
         with pytest.raises(InputError, match=f"would be named '{name}', expected a name.*rename the file"):
             scene_config(write_scene(tmp_path, MM + BAR, file))
+
+
+def test_ifc_file_may_have_a_name_that_a_scene_file_cannot_name(tmp_path: Path) -> None:
+    """A path in a scene file must not begin with a tilde, but an IFC file that is the scene itself may."""
+    path = tmp_path / "~x.ifc"
+    shutil.copy("examples/column.ifc", path)
+    assert scene_config(path).name == "x"
 
 
 def test_files_that_give_the_same_scene_name_are_refused(tmp_path: Path) -> None:

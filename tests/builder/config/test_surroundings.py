@@ -56,14 +56,14 @@ def test_scene_file_names_hall_or_deck(place: str, limit_m: float, tmp_path: Pat
     assert (config.scene.environment, config.scene.board) == (place, None)
     ring = f'[cameras]\nkind = "ring"\nradius = {1000 * limit_m + 200:g}\nelevation_deg = 5\nazimuths = 4\n'
     with pytest.raises(
-        InputError, match=rf"cameras are .* m from the {place}'s centre, expected at most {limit_m}"
+        InputError, match=rf"cameras are .* m from the world's origin, expected at most {limit_m} m in .* {place}"
     ):
         scene_config(write_scene(tmp_path, head + BAR + ring))
     high = '[cameras]\nkind = "ring"\nradius = 9000\nelevation_deg = 80\nazimuths = 4\n'
     with pytest.raises(InputError, match=r"cameras are .* m high, expected at most"):
         scene_config(write_scene(tmp_path, head + BAR + high))
     with pytest.raises(
-        InputError, match=rf"the steel extends 6 m from the {place}'s centre, expected at most 5 m"
+        InputError, match=rf"the steel extends 6 m from the world's origin, expected at most 5 m in .* {place}"
     ):
         scene_config(write_scene(tmp_path, head + BAR.replace("100", "6000") + SMALL_SURVEY))
 

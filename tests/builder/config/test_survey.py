@@ -12,14 +12,15 @@ import pytest
 from numpy import ndarray
 from scipy.spatial import cKDTree
 
-from dataset_builder.config.camera_site import GROUND_CLEARANCE_M, SIGHT_TOLERANCE_M, CameraSpace
+from dataset_builder.config.camera_fit import check_fits
+from dataset_builder.config.camera_placement import NEAR, SIGHT_TOLERANCE_M, SURVEY_RULES, with_stations
 from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.config.rigs import rig_cameras
 from dataset_builder.config.scene_file import scene_config
 from dataset_builder.config.specs import ConfigSpec, RigSpec, SurveySpec
-from dataset_builder.config.survey import NEAR, steel_clearance_m, with_stations
-from dataset_builder.config.trajectories import camera_offsets_m, poses, view_count
-from dataset_builder.scene.assemblies import aim_point_m, check_fits, make_assembly
+from dataset_builder.config.surroundings import GROUND_CLEARANCE_M, CameraSpace
+from dataset_builder.config.trajectories import aim_point_m, camera_offsets_m, poses, view_count
+from dataset_builder.scene.assemblies import make_assembly
 from dataset_builder.scene.assemblies.cage_file import cage_file_spec, load_cage
 from dataset_builder.scene.model import Assembly
 from dataset_builder.scene.shapes.point_sets import SurfaceSampler
@@ -100,7 +101,7 @@ def test_cameras_have_stated_distances_from_steel_that_they_aim_at(placed: Place
 @pytest.mark.parametrize("eye", ["left", "right"])
 def test_eyes_are_above_ground_and_clear_of_all_steel(placed: Placed, eye: str) -> None:
     eyes_m = placed.eyes_m(eye)
-    least_m = np.array([steel_clearance_m(distance_m) for distance_m in placed.distances_m])
+    least_m = np.array([SURVEY_RULES.clearance_m(distance_m) for distance_m in placed.distances_m])
     assert least_m.tolist() == [0.25] * VIEWS + [0.3] * 2 * VIEWS
     assert (surface_distance_m(eyes_m, placed.assembly.bars) >= least_m).all()
     assert eyes_m[:, 2].min() >= GROUND_CLEARANCE_M
@@ -206,7 +207,9 @@ def test_survey_of_small_cage_is_in_the_laboratory_above_the_objects_on_its_benc
         assert eyes_m[plan_m > 0.6, 2].min() >= 0.2 + GROUND_CLEARANCE_M
     far = scene(bars, "distances = [300, 1600]\nviews_per_distance = 2")
     assert place(tmp_path, far).config.scene.environment == "outdoors"
-    with pytest.raises(InputError, match=r"cameras are .* from the laboratory's centre, expected at most 1\.6 m"):
+    with pytest.raises(
+        InputError, match=r"cameras are .* from the world's origin, expected at most 1\.6 m in .* laboratory"
+    ):
         place(tmp_path, f'environment = "laboratory"\n{far}')
 
 

@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from dataset_builder.cli import argument_parser
+from dataset_builder.config.camera_fit import check_fits
 from dataset_builder.config.catalog import CONFIGS, SWEEPS, BuildRequest
 from dataset_builder.config.specs import ConfigSpec, DistanceSweepSpec
 from dataset_builder.config.surroundings import SURROUNDINGS
-from dataset_builder.config.trajectories import camera_offsets_m, poses, subset
-from dataset_builder.scene.assemblies import aim_point_m, check_fits, make_assembly
+from dataset_builder.config.trajectories import aim_point_m, camera_offsets_m, poses, subset
+from dataset_builder.scene.assemblies import make_assembly
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.scene.raycast import RayCaster
 from rebar_depth_bench.geometry.cameras import Camera, ideal_K

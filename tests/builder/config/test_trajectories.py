@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from dataset_builder.config.camera_fit import check_fits
 from dataset_builder.config.catalog import CONFIGS
 from dataset_builder.config.rigs import rig_cameras
 from dataset_builder.config.specs import ConfigSpec
-from dataset_builder.config.trajectories import poses, subset
-from dataset_builder.scene.assemblies import aim_point_m, check_fits, make_assembly
+from dataset_builder.config.trajectories import aim_point_m, poses, subset
+from dataset_builder.scene.assemblies import make_assembly
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.scene.raycast import RayCaster
 from dataset_builder.scene.shapes.solids import merge_meshes

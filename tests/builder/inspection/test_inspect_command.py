@@ -19,7 +19,7 @@ from dataset_builder.inspection.font import font
 from dataset_builder.inspection.picture import _draw_scale_bar, inspection_picture
 from dataset_builder.inspection.report import inspection_json, print_inspection
 from dataset_builder.inspection.summary import bar_box_m, inspect_cage
-from dataset_builder.pipeline.notes import MAX_NOTES, print_notes
+from dataset_builder.pipeline.plan import MAX_NOTES, print_notes
 from dataset_builder.scene.assemblies.bar_meshes import bar_mesh
 from dataset_builder.scene.assemblies.cage import Cage, CageBar, LeftOut
 from dataset_builder.scene.model import Mesh, Note, axis_of

@@ -16,9 +16,11 @@ import pytest
 
 import rebar_depth_bench as rdb
 from dataset_builder.config.catalog import BuildRequest
-from dataset_builder.config.quality import colour_spec
+from dataset_builder.config.scene_file import read_scene
+from dataset_builder.config.specs import colour_spec
 from dataset_builder.pipeline.build import build
 from dataset_builder.pipeline.plan import BUILD_FOLDER
+from dataset_builder.scene.assemblies.cage_file import mesh_file_spec
 from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.data.manifest import open_folder
 from tests.building import (
@@ -173,6 +175,34 @@ def test_mesh_import_of_lattice_reproduces_ground_truth(
         assert imported_bar.bar_id == bar.bar_id
         assert imported_bar.diameter_m == pytest.approx(bar.diameter_m, rel=0.01)
         assert np.array(imported_bar.axis_m) == pytest.approx(np.array(bar.axis_m), abs=1e-4)
+
+
+def test_file_of_a_scene_is_read_once(small_root: Path, tmp_path: Path) -> None:
+    file = Path(shutil.copy(TWO_BARS, tmp_path))
+    scene = read_scene(file)
+    file.unlink()
+    request = BuildRequest(
+        (),
+        TINY_VIEWS,
+        *(160, 90),
+        colour_spec(None, "preview", None),
+        scenes=(scene.config,),
+        cages_read={scene.config.scene.assembly: scene.cage},
+    )
+    build(request, tmp_path / "dataset", workers=2)
+    assert contents(tmp_path / "dataset") == contents(small_root)
+
+
+def test_mesh_file_is_read_once_for_all_configs(tmp_path: Path, tiny_root: Path, blender: None) -> None:
+    file = Path(shutil.copy(tiny_root / "meshes" / "lattice.ply", tmp_path))
+    request = BuildRequest(("lattice", "lattice-orbit"), 1, 64, 36, None, mesh=mesh_file_spec(file, "m"))
+
+    def remove_file(*_: object) -> None:
+        file.unlink(missing_ok=True)
+
+    summary = build(request, tmp_path / "dataset", progress=remove_file)
+    assert summary.built == ["lattice", "lattice-orbit"]
+    assert not file.exists()
 
 
 def test_concurrent_build_is_rejected(tmp_path: Path, run_build: RunBuild, start_build: StartBuild) -> None:

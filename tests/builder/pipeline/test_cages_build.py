@@ -236,11 +236,11 @@ def test_version_of_the_generator_changes_the_key(tmp_path: Path) -> None:
 
 
 def test_infeasible_cage_is_refused_without_a_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from dataset_builder.pipeline import place_cameras
+    from dataset_builder.pipeline import plan as plan_module
     from dataset_builder.pipeline.build import build
 
     def place_here(plans: Any, *_: Any) -> Any:
-        return [place_cameras.with_cameras(plan) for plan in plans]
+        return [plan_module.with_cameras(plan) for plan in plans]
 
     monkeypatch.setattr("dataset_builder.pipeline.build.place_cameras", place_here)
     monkeypatch.setattr(generate_module, "MAX_ATTEMPTS", 0)

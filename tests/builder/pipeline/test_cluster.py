@@ -17,11 +17,12 @@ import pytest
 import trimesh
 
 from dataset_builder.config.catalog import CONFIGS
-from dataset_builder.pipeline.dask_renderer import connect_to_cluster
+from dataset_builder.config.specs import ColourSpec
+from dataset_builder.pipeline import dask_renderer
+from dataset_builder.pipeline.dask_renderer import check_software_versions, connect_to_cluster
 from dataset_builder.pipeline.plan import BUILD_FOLDER, generator_versions, plan_config
 from dataset_builder.pipeline.shards import Staging
 from dataset_builder.pipeline.work_units import remaining_units
-from dataset_builder.scene.assemblies.mesh_file import mesh_file_spec
 from rebar_depth_bench.errors import InputError
 from tests.building import (
     TINY,
@@ -170,21 +171,40 @@ def staging(tmp_path: Path) -> Staging:
     return Staging(tmp_path / "staging")
 
 
-def test_input_errors_on_workers_are_raised_in_client(cluster: Cluster, staging: Staging, tmp_path: Path) -> None:
-    """Submit an unreadable mesh file and a unit planned with other software versions."""
-    bad = tmp_path / "bad.stl"
-    bad.write_bytes(b"solid nothing\nendsolid nothing\n")
+def test_input_errors_on_workers_are_raised_in_client(
+    cluster: Cluster, staging: Staging, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Submit a unit for a device that the workers do not have, and one with other software versions."""
     spec = CONFIGS["lattice"]()
-    bad_spec = replace(spec, scene=replace(spec.scene, assembly=mesh_file_spec(bad, "m")))
-    unreadable, *_ = remaining_units(plan_config(bad_spec, 1, tmp_path))
+    units = [
+        remaining_units(plan_config(replace(spec, colour=ColourSpec(device=device)), 1, tmp_path))[0]
+        for device in ("hip", "cpu")
+    ]
     stamp = {**generator_versions(), "embreex": "0.1"}
-    outdated = replace(remaining_units(plan_config(spec, 1, tmp_path))[0], software_versions=stamp)
     with connect_to_cluster(cluster.address) as renderer:
-        futures = [renderer.submit(unit, staging, lambda _: None) for unit in (unreadable, outdated)]
-        with pytest.raises(InputError, match=r"rebar-unit-\w+/bad\.stl: "):
-            futures[0].result(timeout=120)
+        absent = renderer.submit(units[0], staging, lambda _: None)
+        monkeypatch.setattr(dask_renderer, "generator_versions", lambda: stamp)
+        outdated = renderer.submit(units[1], staging, lambda _: None)
+        with pytest.raises(InputError, match=r"worker tcp://127.*: --device hip: no such device was found"):
+            absent.result(timeout=120)
         with pytest.raises(InputError, match=r"worker tcp://127.*: embreex 4.*, expected 0\.1"):
-            futures[1].result(timeout=120)
+            outdated.result(timeout=120)
+
+
+def test_other_software_versions_are_rejected_by_name() -> None:
+    local_versions = dict(generator_versions())
+    check_software_versions(local_versions, "tcp://far:1", dict(local_versions))
+    worker_versions = {**local_versions, "embreex": "4.3.0"}
+    del worker_versions["pillow"]
+    with pytest.raises(InputError) as raised:
+        check_software_versions(local_versions, "tcp://far:1", worker_versions)
+    message = str(raised.value)
+    assert message.startswith("worker tcp://far:1 has other software")
+    assert (
+        f"embreex 4.3.0, expected {local_versions['embreex']}; pillow missing, expected {local_versions['pillow']}"
+        in message
+    )
+    assert "numpy" not in message
 
 
 def test_worker_with_other_software_is_rejected(

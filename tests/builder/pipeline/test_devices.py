@@ -1,15 +1,14 @@
-"""Devices that render colour: the list of Cycles, the choice of a type, and the device of each process."""
+"""Devices that render colour: the list of Cycles, and the choice of a type."""
 
 from __future__ import annotations
 
-from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
 
 from dataset_builder.config.catalog import CONFIGS, BuildRequest
 from dataset_builder.config.specs import CPU, GPU_TYPES, ColourSpec
-from dataset_builder.pipeline.devices import AUTO, Devices, DeviceShares, available_devices, choose_devices
+from dataset_builder.pipeline.blender_process import AUTO, available_devices, choose_device
 from dataset_builder.pipeline.plan import config_parameters, plan_config
 from rebar_depth_bench.errors import InputError
 from tests.building import TINY, TWO_BARS, RunBuild
@@ -26,42 +25,30 @@ SMALL = ("--scene", str(TWO_BARS), "--views", "1", *TINY)
 @pytest.mark.parametrize(
     ("available", "expected"),
     [
-        (NVIDIA, Devices("optix", 2)),
-        (AMD, Devices("hip", 1)),
-        (INTEL, Devices("oneapi", 3)),
-        (APPLE, Devices("metal", 1)),
-        ({"cpu": ["Xeon"], "hip": ["Radeon"], "cuda": ["GTX 680"], "optix": []}, Devices("cuda", 1)),
-        (NO_GPU, Devices(CPU, 1)),
-        ({}, Devices(CPU, 1)),
+        (NVIDIA, "optix"),
+        (AMD, "hip"),
+        (INTEL, "oneapi"),
+        (APPLE, "metal"),
+        ({"cpu": ["Xeon"], "hip": ["Radeon"], "cuda": ["GTX 680"], "optix": []}, "cuda"),
+        (NO_GPU, CPU),
+        ({}, CPU),
     ],
 )
-def test_auto_is_the_best_type_of_the_list(available: dict[str, list[str]], expected: Devices) -> None:
-    assert choose_devices(AUTO, available, "this machine") == expected
+def test_auto_is_the_best_type_of_the_list(available: dict[str, list[str]], expected: str) -> None:
+    assert choose_device(AUTO, available, "this machine") == expected
 
 
 @pytest.mark.parametrize("available", [NVIDIA, AMD, INTEL, APPLE, NO_GPU])
 def test_named_type_is_used_or_refused_with_the_list(available: dict[str, list[str]]) -> None:
     for device in (CPU, *GPU_TYPES):
         if device in available:
-            count = 1 if device == CPU else len(available[device])
-            assert choose_devices(device, available, "this machine") == Devices(device, count)
+            assert choose_device(device, available, "this machine") == device
         else:
             with pytest.raises(InputError) as error:
-                choose_devices(device, available, "worker tcp://a:1")
+                choose_device(device, available, "worker tcp://a:1")
             assert str(error.value).startswith(f"--device {device}: worker tcp://a:1 has no such device")
             for name, models in available.items():
                 assert f"{name} ({', '.join(models)})" in str(error.value)
-
-
-def test_processes_are_spread_over_devices() -> None:
-    shares = DeviceShares(3)
-    with ExitStack() as running:
-        assert [running.enter_context(shares.least_busy()) for _ in range(7)] == [0, 1, 2, 0, 1, 2, 0]
-    with shares.least_busy() as first, shares.least_busy() as second:
-        assert (first, second) == (0, 1)
-        for _ in range(2):  # The first failure leaves the device free.
-            with pytest.raises(ValueError, match="on device 2"), shares.least_busy() as third:
-                raise ValueError(f"on device {third}")
 
 
 def test_device_is_part_of_key_and_manifest(tmp_path: Path) -> None:

@@ -12,10 +12,17 @@ import trimesh
 
 from dataset_builder.audit import audit
 from dataset_builder.export import export
+from dataset_builder.scene.assemblies.cage import packed_cage, unpacked_cage
+from dataset_builder.scene.assemblies.cage_file import (
+    cage_assembly,
+    cage_file_spec,
+    mesh_file_spec,
+    read_cage,
+)
 from rebar_depth_bench.cli.main import main as rebar_bench
 from rebar_depth_bench.data.bars import read_bars
 from tests.builder.scene.tube_shapes import CENTRELINES_M, length_m, line_distance_m, swept
-from tests.building import TINY, RunBuild
+from tests.building import TINY, TWO_BARS, RunBuild
 from tests.commands import run_in_process
 
 SCENE = 'unit = "m"\nmesh = "cage.obj"\nenvironment = "laboratory"\n'
@@ -37,6 +44,19 @@ def cage_obj() -> str:
         lines += [f"f {a} {b} {c}" for a, b, c in (np.asarray(faces) + first).tolist()]
         first += len(vertices_m)
     return "\n".join(lines) + "\n"
+
+
+def test_staged_cage_has_the_same_meshes(tmp_path: Path) -> None:
+    (tmp_path / "cage.obj").write_text(cage_obj())
+    for cage in (read_cage(mesh_file_spec(tmp_path / "cage.obj", "m")), read_cage(cage_file_spec(TWO_BARS))):
+        content = packed_cage(cage)
+        assert packed_cage(cage) == content
+        expected, staged = cage_assembly(cage, "cage"), cage_assembly(unpacked_cage(content), "staged")
+        assert repr(staged.bars) == repr(expected.bars)  # A diameter that is NaN equals no other.
+        for part, expected_part in zip(staged.parts, expected.parts, strict=True):
+            assert part.name == expected_part.name
+            assert part.mesh.vertices_m.tobytes() == expected_part.mesh.vertices_m.tobytes()
+            assert part.mesh.faces.tobytes() == expected_part.mesh.faces.tobytes()
 
 
 @pytest.mark.slow

@@ -15,7 +15,7 @@ from benchmarks.scale import PreparedRows, placed
 from dataset_builder.audit import audit, run
 from dataset_builder.config.cages import CagesRequest
 from dataset_builder.config.catalog import BuildRequest
-from dataset_builder.pipeline import folder, place_cameras, retained
+from dataset_builder.pipeline import folder, retained
 from dataset_builder.pipeline.build import BuildSummary, build
 from dataset_builder.pipeline.plan import BUILD_FOLDER
 from rebar_depth_bench.data.bars import BARS_FILE
@@ -41,14 +41,13 @@ def cages(scenes: int, views: int = 2, split: str = "test", **changes: Any) -> B
 @pytest.fixture(autouse=True)
 def cameras_without_search(monkeypatch: pytest.MonkeyPatch) -> None:
     """Give all generated scenes the same cameras, which takes no time."""
-    monkeypatch.setattr(place_cameras, "with_cameras", placed)
     monkeypatch.setattr("dataset_builder.pipeline.build.place_cameras", lambda plans, *_: [*map(placed, plans)])
 
 
 def built(out: Path, request: BuildRequest) -> tuple[list[str], BuildSummary]:
     """Build with prepared rows; return the ids of the views that were rendered, and the summary."""
     renderer = PreparedRows()
-    summary = build(request, out, cluster=renderer)
+    summary = build(request, out, submit=renderer.submit)
     return renderer.rendered, summary
 
 
@@ -100,7 +99,7 @@ def test_old_config_stays_readable_while_it_grows_and_after_an_interruption(tmp_
     built(root, lattice(9))
     before = contents(root)
     with pytest.raises(KeyboardInterrupt):
-        build(lattice(63), root, cluster=Interrupting(1))
+        build(lattice(63), root, submit=Interrupting(1).submit)
     assert {name: digest for name, digest in contents(root).items() if BUILD_FOLDER not in name} == before
     assert len(rdb.load(root, "lattice")) == 9
     problems = file_problems(open_folder(root), silent)
@@ -203,7 +202,7 @@ def test_damaged_bars_of_other_scenes_are_refused(tmp_path: Path) -> None:
     (tmp_path / BARS_FILE).unlink()
     renderer = PreparedRows()
     with pytest.raises(InputError, match=r"bars\.parquet does not match the manifest"):
-        build(cages(1), tmp_path, cluster=renderer)
+        build(cages(1), tmp_path, submit=renderer.submit)
     assert renderer.rendered == []
 
 

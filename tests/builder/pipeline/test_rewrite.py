@@ -12,7 +12,7 @@ import pytest
 
 from dataset_builder.cli import main
 from dataset_builder.importing.run import plan_import, run_import
-from dataset_builder.pipeline.publish import manifest_text
+from dataset_builder.pipeline.folder import manifest_text
 from rebar_depth_bench.cli.main import main as rebar_bench
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, open_folder
 from rebar_depth_bench.errors import DatasetError

@@ -10,17 +10,16 @@ from pathlib import Path
 import pytest
 
 from dataset_builder.config.catalog import CONFIGS
-from dataset_builder.pipeline.plan import ConfigPlan, generator_versions, plan_config
+from dataset_builder.pipeline.plan import ConfigPlan, plan_config
 from dataset_builder.pipeline.work_units import (
-    StagedRow,
+    ReceivedFile,
     UnitResult,
     WorkUnit,
     accept_result,
-    check_software_versions,
     remaining_units,
-    with_payload,
+    with_files,
 )
-from rebar_depth_bench.errors import BuildError, InputError
+from rebar_depth_bench.errors import BuildError
 
 MESH = b"ply: the mesh that rays were cast against"
 
@@ -29,14 +28,14 @@ def sha256(content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-def make_row(index: int) -> StagedRow:
+def make_row(index: int) -> ReceivedFile:
     content = f"row {index}".encode()
-    return StagedRow(index, content, sha256(content))
+    return ReceivedFile(f"rows/{index:04d}.parquet", content, sha256(content))
 
 
 def make_result(unit: WorkUnit) -> UnitResult:
-    rows = tuple(make_row(index) for index in unit.indices)
-    return UnitResult("tcp://far:1", {"colour": 1.0}, sha256(MESH), MESH if unit.with_mesh else None, rows)
+    mesh = [ReceivedFile("mesh.ply", MESH, sha256(MESH))] if unit.with_mesh else []
+    return UnitResult("tcp://far:1", {"colour": 1.0}, sha256(MESH), (*map(make_row, unit.indices), *mesh))
 
 
 def staged_files(plan: ConfigPlan) -> dict[str, bytes]:
@@ -91,45 +90,48 @@ def test_missing_mesh_is_planned_alone(plan: ConfigPlan) -> None:
 
 
 def with_damaged_row(result: UnitResult) -> UnitResult:
-    first, *others = result.rows
-    return replace(result, rows=(replace(first, content=first.content[:-1] + b"!"), *others))
+    first, *others = result.files
+    return replace(result, files=(replace(first, content=first.content[:-1] + b"!"), *others))
 
 
 def with_empty_row(result: UnitResult) -> UnitResult:
-    *others, last = result.rows
-    return replace(result, rows=(*others, replace(last, content=b"")))
+    first, *others = result.files
+    return replace(result, files=(replace(first, content=b""), *others))
 
 
 def with_damaged_mesh(result: UnitResult) -> UnitResult:
-    return replace(result, mesh=MESH + b" ")
+    *rows, mesh = result.files
+    return replace(result, files=(*rows, replace(mesh, content=MESH + b" ")))
 
 
 def with_other_mesh(result: UnitResult) -> UnitResult:
-    return replace(result, mesh=b"another", mesh_sha256=sha256(b"another"))
+    *rows, mesh = result.files
+    another = replace(mesh, content=b"another", sha256=sha256(b"another"))
+    return replace(result, files=(*rows, another), mesh_sha256=another.sha256)
 
 
 def with_missing_row(result: UnitResult) -> UnitResult:
-    return replace(result, rows=result.rows[1:])
+    return replace(result, files=result.files[1:])
 
 
 def with_missing_mesh(result: UnitResult) -> UnitResult:
-    return replace(result, mesh=None)
+    return replace(result, files=result.files[:-1])
 
 
 def with_extra_row(result: UnitResult) -> UnitResult:
-    return replace(result, rows=(*result.rows, make_row(3)))
+    return replace(result, files=(*result.files, make_row(3)))
 
 
 @pytest.mark.parametrize(
     ("spoil", "words"),
     [
-        (with_damaged_row, "view 14 was received with sha256"),
+        (with_damaged_row, "rows/0014.parquet was received with sha256"),
         (with_empty_row, f"was received with sha256 {sha256(b'')}, expected"),
-        (with_damaged_mesh, "the received mesh has sha256"),
+        (with_damaged_mesh, "mesh.ply was received with sha256"),
         (with_other_mesh, f"its mesh has sha256 {sha256(b'another')}, expected"),
-        (with_missing_row, "view 14 is missing"),
-        (with_missing_mesh, "the mesh is missing"),
-        (with_extra_row, "view 3 was not requested"),
+        (with_missing_row, "rows/0014.parquet is missing"),
+        (with_missing_mesh, "mesh.ply is missing"),
+        (with_extra_row, "rows/0003.parquet was not requested"),
     ],
 )
 def test_result_that_does_not_match_unit_is_rejected(
@@ -155,28 +157,12 @@ def test_local_result_without_payload_needs_staged_rows(plan: ConfigPlan) -> Non
     local_result = UnitResult("this machine", {}, sha256(MESH))
     plan.staging.mesh.parent.mkdir(parents=True)
     plan.staging.mesh.write_bytes(MESH)
-    with pytest.raises(BuildError, match=f"view {first.indices[-1]} is missing"):
+    with pytest.raises(BuildError, match=rf"rows/{first.indices[-1]:04d}\.parquet is missing"):
         accept_result(first, local_result, plan.staging)
     plan.staging.row(14).parent.mkdir()
     for index in first.indices:
         plan.staging.row(index).write_bytes(make_row(index).content)
     accept_result(first, local_result, plan.staging)
-    assert with_payload(local_result, first, plan.staging) == replace(
+    assert with_files(local_result, first, plan.staging) == replace(
         make_result(first), worker="this machine", seconds={}
     )
-
-
-def test_other_software_versions_are_rejected_by_name() -> None:
-    local_versions = dict(generator_versions())
-    check_software_versions(local_versions, "tcp://far:1", dict(local_versions))
-    worker_versions = {**local_versions, "embreex": "4.3.0"}
-    del worker_versions["pillow"]
-    with pytest.raises(InputError) as raised:
-        check_software_versions(local_versions, "tcp://far:1", worker_versions)
-    message = str(raised.value)
-    assert message.startswith("worker tcp://far:1 has other software")
-    assert (
-        f"embreex 4.3.0, expected {local_versions['embreex']}; pillow missing, expected {local_versions['pillow']}"
-        in message
-    )
-    assert "numpy" not in message

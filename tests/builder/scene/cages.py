@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from dataset_builder.scene.assemblies.cage import Cage, CageBar
-from dataset_builder.scene.assemblies.cage_assembly import cage_assembly
 from dataset_builder.scene.assemblies.cage_checks import cage_problems, check_values
+from dataset_builder.scene.assemblies.cage_file import cage_assembly
 from dataset_builder.scene.model import Assembly
 
 

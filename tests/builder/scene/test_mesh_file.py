@@ -11,9 +11,8 @@ import pytest
 import trimesh
 
 from dataset_builder.config.specs import LatticeSpec
-from dataset_builder.scene.assemblies.cage_file import load_cage
+from dataset_builder.scene.assemblies.cage_file import load_cage, mesh_file_spec, read_mesh
 from dataset_builder.scene.assemblies.lattice import lattice_assembly
-from dataset_builder.scene.assemblies.mesh_file import mesh_file_spec, read_mesh
 from dataset_builder.scene.mesh_ply import write_mesh_ply
 from dataset_builder.scene.model import Assembly
 from rebar_depth_bench.errors import MeshError

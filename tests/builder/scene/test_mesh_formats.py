@@ -12,8 +12,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from dataset_builder.scene.assemblies.cage_file import load_cage
-from dataset_builder.scene.assemblies.mesh_file import mesh_file_spec
+from dataset_builder.scene.assemblies.cage_file import load_cage, mesh_file_spec
 from rebar_depth_bench.errors import MeshError
 from tests.builder.scene.test_mesh_file import RODS, load_content, obj_bytes
 

@@ -9,7 +9,8 @@ import pytest
 import trimesh
 
 from dataset_builder.config.specs import PierSpec
-from dataset_builder.scene.assemblies import aim_point_m, make_assembly
+from dataset_builder.config.trajectories import aim_point_m
+from dataset_builder.scene.assemblies import make_assembly
 from dataset_builder.scene.assemblies.lattice import LIFT_M
 from dataset_builder.scene.assemblies.pier import pier_assembly
 from dataset_builder.scene.assemblies.pier_layout import CLEAR_GAP_M

@@ -17,7 +17,7 @@ from dataset_builder.config.file_specs import Origin, PlacementSpec, Up
 from dataset_builder.config.scene_file import scene_cage, scene_config
 from dataset_builder.scene.assemblies import make_assembly
 from dataset_builder.scene.assemblies.cage import Cage, CageBar
-from dataset_builder.scene.assemblies.cage_assembly import cage_assembly
+from dataset_builder.scene.assemblies.cage_file import cage_assembly
 from dataset_builder.scene.assemblies.placement import placed
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.errors import InputError, MeshError

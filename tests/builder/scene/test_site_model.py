@@ -10,7 +10,7 @@ import pytest
 from dataset_builder.config.scene_file import scene_cage, scene_config
 from dataset_builder.scene.assemblies import make_assembly
 from dataset_builder.scene.assemblies.cage import Cage
-from dataset_builder.scene.assemblies.cage_assembly import cage_assembly
+from dataset_builder.scene.assemblies.cage_file import cage_assembly
 from rebar_depth_bench.errors import MeshError
 from tests.builder.config.scene_files import write_scene
 from tests.builder.scene.site_model import (
