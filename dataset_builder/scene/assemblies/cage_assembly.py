@@ -7,7 +7,7 @@ from collections import Counter
 from dataset_builder.scene.assemblies.bar_meshes import bar_mesh, with_ribs_chosen
 from dataset_builder.scene.assemblies.cage import Cage
 from dataset_builder.scene.assemblies.cage_checks import raise_problems
-from dataset_builder.scene.assemblies.surface_bar import axis_notes
+from dataset_builder.scene.assemblies.mesh_import import axis_notes
 from dataset_builder.scene.model import Assembly, Note
 from rebar_depth_bench.errors import Problem
 

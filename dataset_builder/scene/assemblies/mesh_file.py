@@ -1,7 +1,7 @@
 """User mesh files (STL, PLY, OBJ) as cages.
 
 The module ``mesh_import`` defines what counts as a bar in each format and which id it gets. The centreline and the
-diameter of each bar are fitted to its mesh (``scene.assemblies.surface_bar``).
+diameter of each bar are fitted to its mesh.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from dataset_builder.scene.assemblies.mesh_import import (
     MAX_FLOAT32_SPACING_M,
     SUFFIXES,
     MeshPart,
+    fitted_bar,
     read_parts,
 )
-from dataset_builder.scene.assemblies.surface_bar import fitted_bar
 from dataset_builder.scene.selection import Selection
 from rebar_depth_bench.errors import MeshError, escape_text
 

@@ -19,7 +19,7 @@ from __future__ import annotations
 import logging
 import re
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -30,12 +30,13 @@ from jaxtyping import Float, Integer
 from numpy import ndarray
 
 from dataset_builder.config.file_specs import MeshFileSpec
-from dataset_builder.scene.assemblies.mesh_formats.obj import read_obj
 from dataset_builder.scene.assemblies.mesh_formats.parsing import MalformedMeshError, Surface
 from dataset_builder.scene.assemblies.mesh_formats.ply import read_ply
-from dataset_builder.scene.assemblies.mesh_formats.stl import read_stl
+from dataset_builder.scene.assemblies.mesh_formats.stl_obj import read_obj, read_stl
 from dataset_builder.scene.mesh_ply import has_mesh_ply_header, parse_mesh_ply
-from dataset_builder.scene.model import MAX_BARS, NOT_STEEL, Mesh
+from dataset_builder.scene.model import ESTIMATED_ROLE, MAX_BARS, NOT_STEEL, Mesh, Note, axis_of
+from dataset_builder.scene.shapes.tube_fit import NoTubeError, fit_tube
+from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.errors import DatasetError, MeshError
 
 SUFFIXES = (".obj", ".ply", ".stl")
@@ -43,6 +44,12 @@ SUFFIXES = (".obj", ".ply", ".stl")
 
 MAX_FLOAT32_SPACING_M = 1e-4
 """Largest distance of neighbouring 32-bit coordinates that is accepted, metres."""
+
+AXIS_NOTE = "axis"
+"""Code of the note on bars without an axis."""
+
+_MAX_NAMED = 10
+"""Largest number of bars that a note names."""
 
 # A handler on trimesh's logger keeps its messages, including tracebacks, off stderr.
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
@@ -181,3 +188,31 @@ def _loader_errors_as_mesh_errors(where: str) -> Iterator[None]:
     except Exception as error:
         reason = shorten(f"{type(error).__name__}: {error}", 200)
         raise MeshError(f"{where}: not a readable mesh file of its type ({reason})") from error
+
+
+def fitted_bar(bar_id: int, mesh: Mesh) -> Bar:
+    """Return the bar of a surface (world, metres), with role ``imported``; without axis if no tube fits.
+
+    Raises ``ValueError`` if every triangle has zero area.
+    """
+    a_m, b_m, c_m = mesh.vertices_m[mesh.faces].transpose(1, 0, 2)
+    if not np.cross(b_m - a_m, c_m - a_m).any():
+        raise ValueError("every triangle has zero area")
+    try:
+        tube = fit_tube(mesh.vertices_m, mesh.faces)
+    except NoTubeError:
+        return Bar.without_axis(bar_id, ESTIMATED_ROLE)
+    return Bar(bar_id, ESTIMATED_ROLE, tube.diameter_m, axis_of(tube.axis_m))
+
+
+def axis_notes(source: str, labels: Sequence[str], bars: int) -> tuple[Note, ...]:
+    """Return the note that names the bars without an axis (``labels``) of all ``bars`` of a file, or none."""
+    if not labels:
+        return ()
+    named = ", ".join(labels[:_MAX_NAMED])
+    more = f" and {len(labels) - _MAX_NAMED} more" if len(labels) > _MAX_NAMED else ""
+    text = (
+        f"{len(labels)} of {bars} bars are not the surface of one round bar and have neither axis nor diameter; "
+        f"measures of bars leave them out: {named}{more}"
+    )
+    return (Note(source, AXIS_NOTE, text),)

@@ -1,7 +1,7 @@
 """Centreline and diameter of a bar, fitted to its surface and checked against all of it.
 
-Three centrelines are tried: a straight line, the middles of vertex rings (``tube_rings``) and the middles of plane
-sections (``tube_sections``). The first is taken for which the whole surface is that of a round tube:
+Three centrelines are tried: a straight line, the middles of vertex rings and the middles of plane sections
+(``tube_centrelines``). The first is taken for which the whole surface is that of a round tube:
 
 - every vertex, and the middle of every edge and triangle, lies within ``TOLERANCE`` diameters of the tube's
   surface (ends are flat; at a corner of the centreline the tube is mitred), as for polygons of five sides or more;
@@ -30,10 +30,8 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray
 
-from dataset_builder.scene.shapes.polyline_feet import feet_on, simplified_m
-from dataset_builder.scene.shapes.tube_rings import ring_centreline_m
-from dataset_builder.scene.shapes.tube_sections import section_centreline_m
-from dataset_builder.scene.shapes.tube_surface import TubeSurface
+from dataset_builder.scene.shapes.tube_centrelines import ring_centreline_m, section_centreline_m
+from dataset_builder.scene.shapes.tube_surface import TubeSurface, feet_on, simplified_m
 
 TOLERANCE = 0.1
 """Largest distance of a vertex from the fitted tube's surface, in diameters: the height of the highest ribs."""
