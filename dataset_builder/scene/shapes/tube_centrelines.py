@@ -4,9 +4,10 @@ Programs that sweep bars make rings of vertices. A ring is found in the middle o
 rings follow each other: the next one consists of the neighbours of a ring that are not on it or the one before.
 Their centres are the points of the centreline that was swept, also at sharp corners.
 
-A tube of any other triangulation is cut with planes across its direction. From a first section the planes advance in both directions. A step is longer where the tube is straight and shorter
-where it bends; a section is refused if its area is not that of the first, or if its middle is not near the
-predicted point. The march ends where the shortest step fails: at an end of the tube, or where it is no tube.
+A tube of any other triangulation is cut with planes across its direction, which advance from a first section in
+both directions. A step is longer where the tube is straight and shorter where it bends; a section is refused if
+its area is not that of the first, or if its middle is not near the predicted point. The march ends where the
+shortest step fails: at an end of the tube, or where it is no tube.
 """
 
 from __future__ import annotations
