@@ -128,7 +128,7 @@ class TubeSurface:
 
     def is_connected(self) -> bool:
         """Return whether all triangles hang together."""
-        return bool((_component(self.edges, len(self.vertices_m)) == 0).all())
+        return bool((component_labels(self.edges, len(self.vertices_m)) == 0).all())
 
     @cached_property
     def volume_m3(self) -> float:
@@ -137,7 +137,7 @@ class TubeSurface:
         directed = np.stack([self.faces, np.roll(self.faces, -1, axis=1)], axis=-1).reshape(-1, 2)
         uses = np.bincount(self.face_edges.ravel(), minlength=len(self.edges))
         start, end = directed[uses[self.face_edges.ravel()] == 1].T
-        opening = _component(self.boundary_edges, len(self.vertices_m))[start]
+        opening = component_labels(self.boundary_edges, len(self.vertices_m))[start]
         count = np.maximum(np.bincount(opening, minlength=1), 1)
         start_m, end_m = self.vertices_m[start], self.vertices_m[end]
         sums_m = [np.bincount(opening, start_m[:, axis], len(count)) for axis in range(3)]
@@ -167,7 +167,7 @@ class TubeSurface:
         return _outline(corners_m, index.reshape(-1, 2), faces, point_m, normal, reach_m)
 
 
-def _component(edges: Int64[ndarray, "e 2"], vertices: int) -> Int64[ndarray, " v"]:
+def component_labels(edges: Int64[ndarray, "e 2"], vertices: int) -> Int64[ndarray, " v"]:
     """Return the number of each vertex's connected component, from 0."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components

@@ -74,8 +74,8 @@ _Columns = Mapping[str, ndarray | _Lists]
 """Values of an element by property."""
 
 
-def read_ply(content: bytes) -> Surface:
-    """Return the vertices and the triangulated polygons of a PLY file.
+def read_ply(content: bytes) -> Mapping[str, Surface]:
+    """Return the vertices and the triangulated polygons of a PLY file, as one object without a name.
 
     Raises ``MalformedMeshError`` if the header is malformed, if counts in it are not those of the content, if
     there are no vertices or faces, or for a property ``bar_id``, which only files in another layout have.
@@ -94,7 +94,7 @@ def read_ply(content: bytes) -> Surface:
     body = content[header.end() :]
     read = _binary_elements(elements, body, order) if order else _text_elements(elements, body)
     surface = _vertices(read.get("vertex", {})), _triangles(read.get("face", {}))
-    return check_surface(surface, lambda row: f"vertex {row}", lambda row: f"triangle {row}")
+    return {"": check_surface(surface, lambda row: f"vertex {row}", lambda row: f"triangle {row}")}
 
 
 def _parse_header(lines: Sequence[bytes]) -> tuple[str, list[_Element]]:

@@ -1,4 +1,12 @@
-"""Readers of STL and Wavefront OBJ files."""
+"""Readers of STL files, binary and text, and of Wavefront OBJ files.
+
+An STL file is binary if its size is that of the triangle count in its header, also if it begins with "solid", as
+files of several programs do. Normals, attributes and names are ignored.
+
+Of an OBJ file the vertices, polygons and the objects that they belong to are read. Texture coordinates, normals,
+groups, materials, lines and points are ignored, and the files that a material library or a texture names are never
+opened.
+"""
 
 from __future__ import annotations
 
@@ -37,15 +45,15 @@ _PADDING = b"\0\x1a"
 """Bytes that some programs append: zeros, and the end-of-file character of DOS."""
 
 
-def read_stl(content: bytes) -> Surface:
-    """Return the triangles of all solids, in order; each has its own three vertices.
+def read_stl(content: bytes) -> Mapping[str, Surface]:
+    """Return the triangles of all solids, in order, as one object without a name; each has its own three vertices.
 
     Raises ``MalformedMeshError`` if the content is neither a binary nor a text STL, or is truncated.
     """
     corners = _binary_corners(content)
     if corners is None:
         corners = _text_corners(content)
-    return check_surface((corners, np.arange(len(corners)).reshape(-1, 3)), _corner_place, str)
+    return {"": check_surface((corners, np.arange(len(corners)).reshape(-1, 3)), _corner_place, str)}
 
 
 def _binary_corners(content: bytes) -> ndarray | None:
@@ -102,9 +110,7 @@ _UNNAMED = b"geometry"
 """Name of the object of faces that precede the first name."""
 _NUMBERS_OF_VERTICES = {3, 6}
 """Numbers of a vertex, without and with a colour, which may both occur in one file."""
-_CORNER = rb"-?\d+(?:/-?\d*){0,2}"
-_CORNERS = re.compile(rb"(?:%s(?: +|$))*+" % _CORNER)
-_FACE = re.compile(rb"(?:%s(?: +|$)){3,}" % _CORNER)
+_CORNERS = re.compile(rb"(?:-?\d+(?:/-?\d*){0,2}(?: +|$))*+")
 _NUMERIC = re.compile(rb"[-+./eE]*+\d[-+.\d/eE]*+")
 _CONTINUATION = re.compile(rb"(?<=[\d/ ])\\\r?\n")
 """End of a line of numbers that continues; a path in a comment may end in a backslash too."""
@@ -185,8 +191,9 @@ def _triangles(rows: _Rows, vertex_count: int) -> Int64[ndarray, "n 3"]:
     text = b" ".join(rows.texts)
     sizes = [len(text.split()) for text in rows.texts]
     if min(sizes) < 3 or not _CORNERS.fullmatch(text):
-        row, bad = next((row, text) for row, text in enumerate(rows.texts) if not _FACE.fullmatch(text))
-        raise MalformedMeshError("invalid", rows.place(row), f"found f {shown(bad)}", "three or more corners")
+        row = next(n for n, size in enumerate(sizes) if size < 3 or not _CORNERS.fullmatch(rows.texts[n]))
+        found = f"found f {shown(rows.texts[row])}"
+        raise MalformedMeshError("invalid", rows.place(row), found, "three or more corners")
     numbers = parse_numbers([re.sub(rb"/[-/\d]*", b"", text)], rows.place).astype(np.int64)
     corners = np.where(numbers < 0, np.repeat(rows.vertices_above, sizes) + numbers, numbers - 1)
     ends = np.cumsum(sizes)
