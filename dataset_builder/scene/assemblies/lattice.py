@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
@@ -20,15 +18,6 @@ CLEAR_GAP_M = 2e-4
 AXIS_NAMES = ("x", "y", "z")
 
 
-@dataclass(frozen=True)
-class _Rod:
-    """Position of a rod: index of the world axis it runs along, midpoint of its centreline, and diameter."""
-
-    axis: int
-    middle_m: tuple[float, float, float]
-    diameter_m: float
-
-
 def lattice_assembly(spec: LatticeSpec) -> Assembly:
     """Return the lattice of ``spec``, centred on x = y = 0, from z = 0 (plus ``STANDING_M``) upwards, metres.
 
@@ -37,25 +26,20 @@ def lattice_assembly(spec: LatticeSpec) -> Assembly:
     """
     line_m = np.array([[-spec.extent_m / 2, 0.0, 0.0], [spec.extent_m / 2, 0.0, 0.0]])
     along_x = {diameter_m: ribbed_bar_mesh(line_m, diameter_m) for diameter_m in spec.diameters_m}
-    return Assembly.from_meshes(
-        _placed_rod(bar_id, rod, line_m, along_x[rod.diameter_m])
-        for bar_id, rod in enumerate(_rods(spec), start=1)
-    )
-
-
-def _rods(spec: LatticeSpec) -> list[_Rod]:
-    """Return all rods in the order of their bar ids."""
     count = round(spec.extent_m / spec.pitch_m)
     grid_m = (np.arange(count) - (count - 1) / 2) * spec.pitch_m
-    return [
-        _Rod(axis, _rod_middle_m(axis, grid_m[i], grid_m[j], spec), spec.diameters_m[(i + j) % 2])
-        for axis in range(3)
-        for i in range(count)
-        for j in range(count)
-    ]
+    rods: list[tuple[Bar, Mesh]] = []
+    for axis, slow, fast in np.ndindex(3, count, count):
+        diameter_m = spec.diameters_m[(slow + fast) % 2]
+        mesh, middle_m = along_x[diameter_m], _rod_middle_m(axis, grid_m[slow], grid_m[fast], spec)
+        # The centreline and the mesh along x are rotated by a permutation of the axes.
+        axis_m, vertices_m = (np.roll(points_m, axis, axis=1) + middle_m for points_m in (line_m, mesh.vertices_m))
+        bar = Bar(len(rods) + 1, f"{AXIS_NAMES[axis]}-rod", diameter_m, axis_of(axis_m))
+        rods.append((bar, Mesh(vertices_m, mesh.faces)))
+    return Assembly.from_meshes(rods)
 
 
-def _rod_middle_m(axis: int, slow_m: float, fast_m: float, spec: LatticeSpec) -> tuple[float, float, float]:
+def _rod_middle_m(axis: int, slow_m: float, fast_m: float, spec: LatticeSpec) -> Float64[ndarray, " 3"]:
     """Return the midpoint (world) of the rod along ``axis`` at the grid position (``slow_m``, ``fast_m``).
 
     Each family is shifted by half a layer offset along its two grid axes, in opposite directions, so that two
@@ -70,13 +54,4 @@ def _rod_middle_m(axis: int, slow_m: float, fast_m: float, spec: LatticeSpec) ->
     middle[fast_axis] += fast_m
     middle[next_axis] += half_m
     middle[last_axis] -= half_m
-    return (float(middle[0]), float(middle[1]), float(middle[2]))
-
-
-def _placed_rod(bar_id: int, rod: _Rod, line_m: Float64[ndarray, "2 3"], along_x: Mesh) -> tuple[Bar, Mesh]:
-    """Return bar and mesh of a rod, whose centreline and mesh along x are rotated by a permutation of the axes."""
-    axis_m, vertices_m = (
-        np.roll(points_m, rod.axis, axis=1) + np.array(rod.middle_m) for points_m in (line_m, along_x.vertices_m)
-    )
-    bar = Bar(bar_id, f"{AXIS_NAMES[rod.axis]}-rod", rod.diameter_m, axis_of(axis_m))
-    return bar, Mesh(vertices_m, along_x.faces)
+    return middle

@@ -218,7 +218,7 @@ class _March:
             return np.asarray(
                 np.average(surface.corners_m[cap].mean(axis=1), axis=0, weights=surface.areas_m2[cap])
             )
-        start_m, end_m = surface.vertices_m[surface.boundary_edges.T]
+        start_m, end_m = surface.vertices_m[surface.edges[surface.is_open].T]
         rim = self._is_ahead((start_m + end_m) / 2, last_m, direction)
         length_m = np.linalg.norm(end_m - start_m, axis=1)[rim]
         if length_m.sum() > np.pi * self._radius_m:

@@ -43,10 +43,16 @@ class Cut:
 
 @dataclass(frozen=True, eq=False)
 class TubeSurface:
-    """Triangles without duplicates or zero area, vertices closer than the weld grid merged; metres."""
+    """Triangles without duplicates or zero area, vertices closer than the weld grid merged; metres.
+
+    ``edges`` are the vertices of each edge, the smaller index first; ``face_edges`` the edges of each triangle:
+    from its first to its second vertex, second to third, third to first.
+    """
 
     vertices_m: Float64[ndarray, "v 3"]
     faces: Int64[ndarray, "f 3"]
+    edges: Int64[ndarray, "e 2"]
+    face_edges: Int64[ndarray, "f 3"]
 
     @classmethod
     def welded(cls, vertices_m: Float64[ndarray, "v 3"], faces: ndarray) -> TubeSurface:
@@ -61,8 +67,10 @@ class TubeSurface:
         distinct = (low != middle) & (middle != high)
         count = len(first)
         _, kept = np.unique((low * count + middle) * count + high, return_index=True)
-        kept = kept[distinct[kept]]
-        return cls(used[first], corners[np.sort(kept)])
+        faces = corners[np.sort(kept[distinct[kept]])]
+        pairs = np.sort(np.stack([faces, np.roll(faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
+        edge_keys, edge = np.unique(pairs[:, 0] * count + pairs[:, 1], return_inverse=True)
+        return cls(used[first], faces, np.stack(np.divmod(edge_keys, count), axis=1), edge.reshape(-1, 3))
 
     @cached_property
     def corners_m(self) -> Float64[ndarray, "f 3 3"]:
@@ -81,26 +89,9 @@ class TubeSurface:
         return np.asarray(np.linalg.norm(self.area_vectors_m2, axis=1))
 
     @cached_property
-    def edges(self) -> Int64[ndarray, "e 2"]:
-        """Vertices of each edge, the smaller index first."""
-        return np.stack(np.divmod(self._edge_keys[0], len(self.vertices_m)), axis=1)
-
-    @cached_property
-    def face_edges(self) -> Int64[ndarray, "f 3"]:
-        """Edges of each triangle: from its first to its second vertex, second to third, third to first."""
-        return self._edge_keys[1].reshape(-1, 3)
-
-    @cached_property
-    def _edge_keys(self) -> tuple[Int64[ndarray, " e"], Int64[ndarray, " n"]]:
-        pairs = np.sort(np.stack([self.faces, np.roll(self.faces, -1, axis=1)], axis=-1).reshape(-1, 2), axis=1)
-        keys, index = np.unique(pairs[:, 0] * len(self.vertices_m) + pairs[:, 1], return_inverse=True)
-        return keys, index.ravel()
-
-    @cached_property
-    def boundary_edges(self) -> Int64[ndarray, "b 2"]:
-        """Edges of one triangle only: open ends."""
-        uses = np.bincount(self.face_edges.ravel(), minlength=len(self.edges))
-        return np.asarray(self.edges[uses == 1])
+    def is_open(self) -> Bool[ndarray, " e"]:
+        """Whether an edge is that of one triangle only: of an open end."""
+        return np.asarray(np.bincount(self.face_edges.ravel(), minlength=len(self.edges)) == 1)
 
     @cached_property
     def neighbours(self) -> tuple[Int64[ndarray, " n"], Int64[ndarray, " m"]]:
@@ -135,9 +126,8 @@ class TubeSurface:
         """Enclosed volume; an open end is closed towards the middle of the vertices around it."""
         inside = np.einsum("fi,fi->", self.corners_m[:, 0], self.area_vectors_m2) / 3
         directed = np.stack([self.faces, np.roll(self.faces, -1, axis=1)], axis=-1).reshape(-1, 2)
-        uses = np.bincount(self.face_edges.ravel(), minlength=len(self.edges))
-        start, end = directed[uses[self.face_edges.ravel()] == 1].T
-        opening = component_labels(self.boundary_edges, len(self.vertices_m))[start]
+        start, end = directed[self.is_open[self.face_edges.ravel()]].T
+        opening = component_labels(self.edges[self.is_open], len(self.vertices_m))[start]
         count = np.maximum(np.bincount(opening, minlength=1), 1)
         start_m, end_m = self.vertices_m[start], self.vertices_m[end]
         sums_m = [np.bincount(opening, start_m[:, axis], len(count)) for axis in range(3)]
