@@ -35,7 +35,7 @@ from dataset_builder.scene.assemblies.mesh_formats.ply import read_ply
 from dataset_builder.scene.assemblies.mesh_formats.stl_obj import read_obj, read_stl
 from dataset_builder.scene.mesh_ply import has_mesh_ply_header, parse_mesh_ply
 from dataset_builder.scene.model import ESTIMATED_ROLE, MAX_BARS, NOT_STEEL, Mesh, Note, axis_of
-from dataset_builder.scene.shapes.tube_fit import NoTubeError, fit_tube
+from dataset_builder.scene.shapes.tube_fit import fit_tube
 from dataset_builder.scene.shapes.tube_surface import component_labels
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.errors import DatasetError, MeshError
@@ -194,9 +194,8 @@ def fitted_bar(bar_id: int, mesh: Mesh) -> Bar:
     a_m, b_m, c_m = mesh.vertices_m[mesh.faces].transpose(1, 0, 2)
     if not np.cross(b_m - a_m, c_m - a_m).any():
         raise ValueError("every triangle has zero area")
-    try:
-        tube = fit_tube(mesh.vertices_m, mesh.faces)
-    except NoTubeError:
+    tube = fit_tube(mesh.vertices_m, mesh.faces)
+    if tube is None:
         return Bar.without_axis(bar_id, ESTIMATED_ROLE)
     return Bar(bar_id, ESTIMATED_ROLE, tube.diameter_m, axis_of(tube.axis_m))
 

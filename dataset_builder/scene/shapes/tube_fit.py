@@ -66,31 +66,27 @@ class Tube:
     diameter_m: float
 
 
-class NoTubeError(ValueError):
-    """Surface to which no tube fits; the message is the reason."""
-
-
-def fit_tube(vertices_m: Float64[ndarray, "v 3"], faces: ndarray) -> Tube:
-    """Return the tube whose surface the triangles are, in the frame of ``vertices_m``; raise ``NoTubeError``.
+def fit_tube(vertices_m: Float64[ndarray, "v 3"], faces: ndarray) -> Tube | None:
+    """Return the tube whose surface the triangles are, in the frame of ``vertices_m``, or None if no tube fits.
 
     Vertices need not be shared, ends may be open, and the triangles may be wound either way, but consistently.
     """
     if len(faces) > MAX_TRIANGLES:
-        raise NoTubeError(f"{len(faces)} triangles, more than {MAX_TRIANGLES}")
+        return None
     origin_m = vertices_m.mean(axis=0)
     scale_m = float(np.ptp(vertices_m, axis=0).max())
     if not 0 < scale_m < math.inf:
-        raise NoTubeError("a surface without extent")
+        return None
     # The surface is fitted at unit size, so that no product of small or large lengths loses its value.
     surface = TubeSurface.welded((vertices_m - origin_m) / scale_m, faces)
     if len(surface.faces) < 6 or surface.areas_m2.sum() < _MIN_AREA or not surface.is_connected():
-        raise NoTubeError("too few triangles, no area, or separate surfaces")
+        return None
     with np.errstate(all="ignore"):
         for line_m in _centrelines_m(surface):
             tube = _verified(surface, line_m)
             if tube is not None:
                 return Tube(tube.axis_m * scale_m + origin_m, tube.diameter_m * scale_m)
-    raise NoTubeError("not the surface of one round bar")
+    return None
 
 
 def _centrelines_m(surface: TubeSurface) -> Iterator[Float64[ndarray, "n 3"]]:

@@ -9,6 +9,7 @@ import re
 import struct
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import Any
 
 import numpy as np
@@ -92,6 +93,7 @@ def read_ply(content: bytes) -> Mapping[str, Surface]:
             "a file without bar_id, whose connected components are numbered as bars",
         )
     body = content[header.end() :]
+    elements = [element for element in elements if element.properties]
     read = _binary_elements(elements, body, order) if order else _text_elements(elements, body)
     surface = _vertices(read.get("vertex", {})), _triangles(read.get("face", {}))
     return {"": check_surface(surface, lambda row: f"vertex {row}", lambda row: f"triangle {row}")}
@@ -166,17 +168,12 @@ def _text_elements(elements: Sequence[_Element], body: bytes) -> dict[str, _Colu
     if body.strip() and not body.endswith((b"\n", b"\r")):
         raise MalformedMeshError("damaged", "", "truncated: the last row has no line end", "complete rows")
     rows = [line for line in body.splitlines() if line.strip()]
-    total = sum(element.count for element in elements if element.properties)
+    total = sum(element.count for element in elements)
     if len(rows) != total:
         found = f"truncated or damaged: {len(rows)} rows after the header"
         raise MalformedMeshError("damaged", "", found, f"{total} as in the header")
-    read: dict[str, _Columns] = {}
-    start = 0
-    for element in elements:
-        if element.properties:
-            read[element.name] = _text_columns(element, rows[start : start + element.count])
-            start += element.count
-    return read
+    following = iter(rows)
+    return {element.name: _text_columns(element, [*islice(following, element.count)]) for element in elements}
 
 
 def _text_columns(element: _Element, rows: Sequence[bytes]) -> _Columns:
@@ -211,9 +208,8 @@ def _binary_elements(elements: Sequence[_Element], body: bytes, order: str) -> d
     read: dict[str, _Columns] = {}
     start = 0
     for element in elements:
-        if element.properties:
-            columns = _equal_rows(element, body, start, order) or _unequal_rows(element, body, start, order)
-            read[element.name], start = columns
+        columns = _equal_rows(element, body, start, order) or _unequal_rows(element, body, start, order)
+        read[element.name], start = columns
     if body[start:].strip(b"\r\n"):
         found = f"damaged: {len(body) - start} bytes after the last row"
         raise MalformedMeshError("damaged", "", found, "as many rows as in the header")
