@@ -177,26 +177,28 @@ def _text_elements(elements: Sequence[_Element], body: bytes) -> dict[str, _Colu
 
 
 def _text_columns(element: _Element, rows: Sequence[bytes]) -> _Columns:
-    """Return the values of the rows of an element, which are read together, one property after the other."""
+    """Return the values of the rows of an element, of which one property after the other is read."""
     numbers = parse_numbers(rows, lambda row: f"{element.name} {row}")
     row_sizes = np.array([len(row.split()) for row in rows], np.int64)
     ends = np.cumsum(row_sizes)
     at = ends - row_sizes
-    is_sound = np.ones(len(rows), bool)
     columns: dict[str, ndarray | _Lists] = {}
     for item in element.properties:
-        value = np.take(numbers, at, mode="clip")  # A row that is too short reads on, and does not end at its end.
+        values, is_sound = np.take(numbers, at, mode="clip"), at < ends
         at = at + 1
         if item.count is None:
             with np.errstate(over="ignore"):  # A number beyond float32 becomes infinite and is refused.
-                columns[item.name] = value.astype(item.values)
-            continue
-        is_sound &= (value >= 0) & (value < row_sizes) & (value == np.floor(value))
-        sizes = np.where(is_sound, value, 0).astype(np.int64)
-        inside = np.arange(sizes.sum()) + np.repeat(at - np.cumsum(sizes) + sizes, sizes)
-        columns[item.name] = _Lists(sizes, np.take(numbers, inside, mode="clip"))
-        at = at + sizes
-    row = first_true(~is_sound | (at != ends))
+                columns[item.name] = values.astype(item.values)
+        else:
+            is_sound &= (values >= 0) & (values <= ends - at) & (values == np.floor(values))
+            sizes = np.where(is_sound, values, 0).astype(np.int64)
+            inside = np.arange(sizes.sum()) + np.repeat(at - np.cumsum(sizes) + sizes, sizes)
+            columns[item.name] = _Lists(sizes, numbers[inside])
+            at = at + sizes
+        # Only the rows before the first one that is not sound are read on, so that the time is linear.
+        sound_rows = first_true(~is_sound)
+        at, ends = at[:sound_rows], ends[:sound_rows]
+    row = first_true(np.append(at != ends, len(at) < len(rows)))
     if row is not None:
         found = f"found {shown(rows[row])}"
         raise MalformedMeshError("damaged", f"{element.name} {row}", found, "the values that the header lists")
