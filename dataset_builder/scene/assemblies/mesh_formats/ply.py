@@ -246,7 +246,7 @@ def _equal_rows(element: _Element, body: bytes, start: int, order: str) -> tuple
         if item.count is not None:
             if (rows[f"{item.name} count"] != values.shape[1]).any():
                 return None
-            columns[item.name] = _Lists(np.full(*values.shape), values.ravel())
+            columns[item.name] = _Lists(np.broadcast_to(values.shape[1], len(values)), values.ravel())
     return columns, start + rows.nbytes
 
 
