@@ -75,8 +75,7 @@ class _Motion:
 def _about_z(angle_deg: float) -> Float64[ndarray, "3 3"]:
     """Return the rotation about the z axis; exact for multiples of 90 degrees."""
     quarter_turns, rest_deg = divmod(angle_deg, 90.0)
-    turned = np.linalg.matrix_power(_QUARTER_TURN, int(quarter_turns) % 4)
-    return np.asarray(rotation_about_z(rest_deg) @ turned)
+    return np.asarray(rotation_about_z(rest_deg) @ np.linalg.matrix_power(_QUARTER_TURN, int(quarter_turns) % 4))
 
 
 def _origin_m(
