@@ -192,9 +192,10 @@ def fitted_bar(bar_id: int, mesh: Mesh) -> Bar:
     Raises ``ValueError`` if every triangle has zero area.
     """
     a_m, b_m, c_m = mesh.vertices_m[mesh.faces].transpose(1, 0, 2)
-    if not np.cross(b_m - a_m, c_m - a_m).any():
-        raise ValueError("every triangle has zero area")
-    tube = fit_tube(mesh.vertices_m, mesh.faces)
+    with np.errstate(all="ignore"):  # Products of huge lengths overflow; such bars are refused by their extent.
+        if not np.cross(b_m - a_m, c_m - a_m).any():
+            raise ValueError("every triangle has zero area")
+        tube = fit_tube(mesh.vertices_m, mesh.faces)
     if tube is None:
         return Bar.without_axis(bar_id, ESTIMATED_ROLE)
     return Bar(bar_id, ESTIMATED_ROLE, tube.diameter_m, axis_of(tube.axis_m))
