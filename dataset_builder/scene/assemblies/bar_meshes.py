@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -58,13 +57,8 @@ def bar_reach_m(bar: CageBar) -> float:
     """Return the largest distance of a bar's surface from its axis, metres; 0 for a bar with a mesh of its own."""
     if bar.mesh is not None:
         return 0.0
-    return bar.bar.diameter_m * (_ribbed_reach() if bar.ribs else plain_outer_radius_m(1.0, _PLAIN_BAR_SEGMENTS))
-
-
-@cache
-def _ribbed_reach() -> float:
-    """Return the largest distance of a ribbed bar's surface from its axis, in diameters."""
-    return outer_radius_m(1.0)
+    diameter_m = bar.bar.diameter_m
+    return outer_radius_m(diameter_m) if bar.ribs else plain_outer_radius_m(diameter_m, _PLAIN_BAR_SEGMENTS)
 
 
 def estimated_triangles(bar: CageBar) -> int:

@@ -26,10 +26,11 @@ from dataset_builder.scene.assemblies.mesh_import import (
     MAX_FLOAT32_SPACING_M,
     SUFFIXES,
     MeshPart,
+    axis_notes,
+    fitted_bar,
     read_parts,
 )
 from dataset_builder.scene.assemblies.placement import placed
-from dataset_builder.scene.assemblies.surface_bar import axis_notes, fitted_bar
 from dataset_builder.scene.assemblies.toml_bars import toml_cage
 from dataset_builder.scene.model import Assembly, Note
 from dataset_builder.scene.selection import Selection

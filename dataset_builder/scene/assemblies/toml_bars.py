@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from dataset_builder.config.scene_schema import TomlBar, read_scene_toml
+from dataset_builder.config.scene_schema import read_scene_toml
 from dataset_builder.scene.assemblies.cage import Cage, CageBar, unit_scale
 from dataset_builder.scene.model import axis_of
 from dataset_builder.scene.shapes.bending import bent_line_m, mandrel_diameter_m
@@ -23,25 +23,15 @@ def toml_cage(content: bytes, where: str) -> Cage:
         raise MeshError.from_problems(where, error.problems) from error
     cage_bars, problems = [], []
     for number, bar in enumerate(scene.bars, start=1):
+        label = f"bar {bar.bar_id} ({bar.role}, diameter {bar.diameter_m:g} m)"
+        mandrel_m = mandrel_diameter_m(bar.diameter_m) if bar.mandrel_m is None else bar.mandrel_m
         try:
-            cage_bars.append(_bent_bar(bar, f"bar {number}"))
+            line_m = bent_line_m(np.array(bar.corners_m), (mandrel_m + bar.diameter_m) / 2)
         except ValueError as error:
-            expected = "a path that is long enough for its bends"
-            problems.append(Problem("invalid", _label(bar), str(error), expected))
+            problems.append(Problem("invalid", label, str(error), "a path that is long enough for its bends"))
+            continue
+        bent = Bar(bar.bar_id, bar.role, bar.diameter_m, axis_of(line_m))
+        cage_bars.append(CageBar(label, bent, bar.ribs, source=f"bar {number}"))
     if problems:
         raise MeshError.from_problems(where, problems)
     return Cage(tuple(cage_bars), (), unit_scale(scene.unit_m))
-
-
-def _bent_bar(bar: TomlBar, source: str) -> CageBar:
-    """Return the bar bent along its corners; raise ``ValueError`` if its bends do not fit its legs."""
-    mandrel_m = mandrel_diameter_m(bar.diameter_m) if bar.mandrel_m is None else bar.mandrel_m
-    line_m = bent_line_m(np.array(bar.corners_m), (mandrel_m + bar.diameter_m) / 2)
-    return CageBar(
-        _label(bar), Bar(bar.bar_id, bar.role, bar.diameter_m, axis_of(line_m)), bar.ribs, source=source
-    )
-
-
-def _label(bar: TomlBar) -> str:
-    """Return the bar's name in error messages."""
-    return f"bar {bar.bar_id} ({bar.role}, diameter {bar.diameter_m:g} m)"

@@ -9,6 +9,7 @@ with few triangles.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 from itertools import pairwise
 
 import numpy as np
@@ -136,6 +137,7 @@ def _rib_profile(along: Float64[ndarray, "*n"], ribs: RibPattern) -> Float64[nda
     return np.asarray(np.clip((ribs.base_width / 2 - from_centre) / flank, 0.0, 1.0))
 
 
+@cache
 def _core_ratio(ribs: RibPattern) -> float:
     """Return the core radius in diameters for which the bar including its ribs has the nominal cross-section.
 

@@ -64,28 +64,43 @@ def stirrup_centreline_m(
 
 
 def tie_centreline_m(
-    half_length_m: float, radius_m: float, extension_m: float, second_deg: float = SQUARE_HOOK_DEG
+    half_length_m: float,
+    radius_m: float,
+    extension_m: float,
+    second_deg: float = SQUARE_HOOK_DEG,
+    first_deg: float = HOOK_DEG,
+    step_deg: float = BEND_STEP_DEG,
 ) -> Float64[ndarray, "n 3"]:
     """Return the centreline of a tie along x that holds two bars at x = -/+ ``half_length_m``, y = 0; metres.
 
-    Its hooks bend round the two bars with ``radius_m``, the first by ``HOOK_DEG`` and the second by
+    Its hooks bend round the two bars with ``radius_m``, the first by ``first_deg`` and the second by
     ``second_deg``, with straight ends of ``extension_m``; its leg is at y = -``radius_m``, and all of it is
-    at z = 0. Raises ``ValueError`` as ``bent_line_m``.
+    at z = 0. Bends are sampled as by ``bent_line_m``, which also raises ``ValueError``.
     """
-    ends = [_hook_m(half_length_m, -1, HOOK_DEG, radius_m, extension_m)[::-1]]
-    ends.append(_hook_m(half_length_m, 1, second_deg, radius_m, extension_m))
-    return bent_line_m(np.concatenate(ends), radius_m, BEND_STEP_DEG)
+    first, second = (
+        hook_m((side * half_length_m, -radius_m), (side, 0.0), (0.0, 1.0), turn_deg, radius_m, extension_m)
+        for side, turn_deg in ((-1, first_deg), (1, second_deg))
+    )
+    corners_m = np.concatenate([first[::-1], second])
+    return bent_line_m(np.column_stack([corners_m, np.zeros(4)]), radius_m, step_deg)
 
 
-def _hook_m(
-    half_length_m: float, side: int, turn_deg: float, radius_m: float, extension_m: float
-) -> Float64[ndarray, "2 3"]:
-    """Return the corner and the tip of a tie's hook at x = ``side`` * ``half_length_m``."""
+def hook_m(
+    start_m: tuple[float, float],
+    ahead: tuple[float, float],
+    inward: tuple[float, float],
+    turn_deg: float,
+    radius_m: float,
+    extension_m: float,
+) -> Float64[ndarray, "2 2"]:
+    """Return corner and tip of a hook whose bend begins at ``start_m`` on a leg in direction ``ahead``, metres.
+
+    It turns towards ``inward`` by ``turn_deg``; its straight end has the length ``extension_m``.
+    """
     turn = np.deg2rad(turn_deg)
     tangent_m = radius_m * np.tan(turn / 2)
-    ahead, inward = np.array([side, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
-    corner_m = np.array([side * half_length_m, -radius_m, 0.0]) + tangent_m * ahead
-    back = np.cos(turn) * ahead + np.sin(turn) * inward
+    corner_m = np.array(start_m) + tangent_m * np.array(ahead)
+    back = np.cos(turn) * np.array(ahead) + np.sin(turn) * np.array(inward)
     return np.stack([corner_m, corner_m + (tangent_m + extension_m) * back])
 
 

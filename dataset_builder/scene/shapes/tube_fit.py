@@ -1,7 +1,7 @@
 """Centreline and diameter of a bar, fitted to its surface and checked against all of it.
 
-Three centrelines are tried: a straight line, the middles of vertex rings (``tube_rings``) and the middles of plane
-sections (``tube_sections``). The first is taken for which the whole surface is that of a round tube:
+Three centrelines are tried: a straight line, the middles of vertex rings and the middles of plane sections
+(``tube_centrelines``). The first is taken for which the whole surface is that of a round tube:
 
 - every vertex, and the middle of every edge and triangle, lies within ``TOLERANCE`` diameters of the tube's
   surface (ends are flat; at a corner of the centreline the tube is mitred), as for polygons of five sides or more;
@@ -30,10 +30,8 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray
 
-from dataset_builder.scene.shapes.polyline_feet import feet_on, simplified_m
-from dataset_builder.scene.shapes.tube_rings import ring_centreline_m
-from dataset_builder.scene.shapes.tube_sections import section_centreline_m
-from dataset_builder.scene.shapes.tube_surface import TubeSurface
+from dataset_builder.scene.shapes.tube_centrelines import ring_centreline_m, section_centreline_m
+from dataset_builder.scene.shapes.tube_surface import TubeSurface, feet_on, simplified_m
 
 TOLERANCE = 0.1
 """Largest distance of a vertex from the fitted tube's surface, in diameters: the height of the highest ribs."""
@@ -68,31 +66,27 @@ class Tube:
     diameter_m: float
 
 
-class NoTubeError(ValueError):
-    """Surface to which no tube fits; the message is the reason."""
-
-
-def fit_tube(vertices_m: Float64[ndarray, "v 3"], faces: ndarray) -> Tube:
-    """Return the tube whose surface the triangles are, in the frame of ``vertices_m``; raise ``NoTubeError``.
+def fit_tube(vertices_m: Float64[ndarray, "v 3"], faces: ndarray) -> Tube | None:
+    """Return the tube whose surface the triangles are, in the frame of ``vertices_m``, or None if no tube fits.
 
     Vertices need not be shared, ends may be open, and the triangles may be wound either way, but consistently.
     """
     if len(faces) > MAX_TRIANGLES:
-        raise NoTubeError(f"{len(faces)} triangles, more than {MAX_TRIANGLES}")
+        return None
     origin_m = vertices_m.mean(axis=0)
     scale_m = float(np.ptp(vertices_m, axis=0).max())
     if not 0 < scale_m < math.inf:
-        raise NoTubeError("a surface without extent")
+        return None
     # The surface is fitted at unit size, so that no product of small or large lengths loses its value.
     surface = TubeSurface.welded((vertices_m - origin_m) / scale_m, faces)
     if len(surface.faces) < 6 or surface.areas_m2.sum() < _MIN_AREA or not surface.is_connected():
-        raise NoTubeError("too few triangles, no area, or separate surfaces")
+        return None
     with np.errstate(all="ignore"):
         for line_m in _centrelines_m(surface):
             tube = _verified(surface, line_m)
             if tube is not None:
                 return Tube(tube.axis_m * scale_m + origin_m, tube.diameter_m * scale_m)
-    raise NoTubeError("not the surface of one round bar")
+    return None
 
 
 def _centrelines_m(surface: TubeSurface) -> Iterator[Float64[ndarray, "n 3"]]:

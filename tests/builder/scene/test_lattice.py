@@ -9,7 +9,8 @@ import pytest
 from numpy import ndarray
 
 from dataset_builder.config.specs import LatticeSpec
-from dataset_builder.scene.assemblies.lattice import CLEAR_GAP_M, LIFT_M, lattice_assembly
+from dataset_builder.scene.assemblies.lattice import CLEAR_GAP_M, lattice_assembly
+from dataset_builder.scene.cages.design import STANDING_M
 from dataset_builder.scene.model import Assembly
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
 from rebar_depth_bench.data.bars import Bar
@@ -47,8 +48,8 @@ def test_numbering_and_roles(lattice: Assembly) -> None:
 
 def test_steel_has_specified_bounding_box(lattice: Assembly) -> None:
     vertices_m = np.concatenate([part.mesh.vertices_m for part in lattice.parts])
-    np.testing.assert_allclose(vertices_m.min(axis=0), [-0.05, -0.05, LIFT_M], atol=1e-12)
-    np.testing.assert_allclose(vertices_m.max(axis=0), [0.05, 0.05, 0.1 + LIFT_M], atol=1e-12)
+    np.testing.assert_allclose(vertices_m.min(axis=0), [-0.05, -0.05, STANDING_M], atol=1e-12)
+    np.testing.assert_allclose(vertices_m.max(axis=0), [0.05, 0.05, 0.1 + STANDING_M], atol=1e-12)
 
 
 @pytest.mark.slow

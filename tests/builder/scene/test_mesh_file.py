@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -104,6 +105,12 @@ def test_dataset_ply_keeps_bar_ids_and_skips_board(tmp_path: Path) -> None:
         load_cage(mesh_file_spec(tmp_path / "a.ply", "m"))
     with pytest.raises(MeshError, match=f"^{tmp_path}/b.ply: truncated or damaged"):
         load_content(tmp_path, "b.ply", (tmp_path / "a.ply").read_bytes()[:-1])
+
+
+def test_huge_coordinates_are_refused_without_warnings(tmp_path: Path) -> None:
+    write_mesh_ply(tmp_path / "a.ply", RODS[0].vertices * 1e234, RODS[0].faces, np.ones(len(RODS[0].faces), int))
+    with warnings.catch_warnings(action="error"), pytest.raises(MeshError, match=r"extends 5e\+233 m"):
+        load_cage(mesh_file_spec(tmp_path / "a.ply", "m"))
 
 
 def test_triangle_soup_is_split_in_order_of_first_face(tmp_path: Path) -> None:

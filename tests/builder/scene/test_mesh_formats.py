@@ -21,6 +21,9 @@ BINARY_STL = trimesh.exchange.stl.export_stl(RODS[0])
 BINARY_PLY = trimesh.exchange.ply.export_ply(RODS[0])
 PLY = trimesh.exchange.ply.export_ply(RODS[0], encoding="ascii").decode()
 TRIANGLE = "v 0 0 0\nv 1 0 0\nv 0 1 0\n"
+MANY_PROPERTIES = "ply\nformat ascii 1.0\nelement face 1500000\n" + "".join(
+    f"property char {number:x}\n" for number in range(3000)
+)
 HEADER = "ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
 
 
@@ -236,8 +239,9 @@ def test_size_limit_and_pipes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         (".obj", TRIANGLE + "v " + "1" * 1_000_000 + "x 0 0"),
         (".ply", PLY.replace("\n3 ", "\n" + "3" * 1_000_000 + "x ", 1)),
         (".ply", "ply\n" + " \n" * 1_000_000),
+        (".ply", MANY_PROPERTIES + "end_header\n" + "1\n" * 1_500_000),
     ],
-    ids=range(7),
+    ids=range(8),
 )
 def test_hostile_texts_are_refused_in_linear_time(tmp_path: Path, suffix: str, content: str) -> None:
     start = time.process_time()

@@ -11,9 +11,8 @@ import trimesh
 from dataset_builder.config.specs import PierSpec
 from dataset_builder.config.trajectories import aim_point_m
 from dataset_builder.scene.assemblies import make_assembly
-from dataset_builder.scene.assemblies.lattice import LIFT_M
-from dataset_builder.scene.assemblies.pier import pier_assembly
-from dataset_builder.scene.assemblies.pier_layout import CLEAR_GAP_M
+from dataset_builder.scene.assemblies.pier import CLEAR_GAP_M, pier_assembly
+from dataset_builder.scene.cages.design import STANDING_M
 from dataset_builder.scene.model import Assembly, Part
 from dataset_builder.scene.shapes.bar_mesh import plain_outer_radius_m
 from rebar_depth_bench.data.bars import Bar
@@ -73,8 +72,8 @@ def test_numbering_and_roles(pier: Assembly) -> None:
 
 def test_steel_has_specified_bounding_box(pier: Assembly) -> None:
     vertices_m = np.concatenate([part.mesh.vertices_m for part in pier.parts])
-    np.testing.assert_allclose(vertices_m.min(axis=0), [-2.4, -2.4, LIFT_M], atol=1e-6)
-    np.testing.assert_allclose(vertices_m.max(axis=0), [2.4, 2.4, 6.67 + LIFT_M], atol=1e-6)
+    np.testing.assert_allclose(vertices_m.min(axis=0), [-2.4, -2.4, STANDING_M], atol=1e-6)
+    np.testing.assert_allclose(vertices_m.max(axis=0), [2.4, 2.4, 6.67 + STANDING_M], atol=1e-6)
     assert aim_point_m(pier).tolist() == [0.0, 0.0, 3.335]
 
 

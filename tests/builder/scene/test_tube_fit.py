@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from dataset_builder.scene.model import Mesh
 from dataset_builder.scene.shapes.solids import ring_faces
-from dataset_builder.scene.shapes.tube_fit import MAX_TRIANGLES, NoTubeError, Tube, fit_tube
+from dataset_builder.scene.shapes.tube_fit import MAX_TRIANGLES, Tube, fit_tube
 from tests.builder.scene.tube_shapes import (
     CENTRELINES_M,
     DIAMETER_M,
@@ -25,7 +25,9 @@ from tests.builder.scene.tube_shapes import (
 
 
 def fit(mesh: Mesh) -> Tube:
-    return fit_tube(mesh.vertices_m, mesh.faces)
+    tube = fit_tube(mesh.vertices_m, mesh.faces)
+    assert tube is not None
+    return tube
 
 
 @pytest.mark.parametrize(("shape", "facets"), [*product(CENTRELINES_M, (8, 12, 24))])
@@ -91,7 +93,7 @@ def test_fit_does_not_depend_on_order_position_scale_or_sharing(
     faces = faces[:, ::-1] if inside_out else faces
     if unshared:
         vertices_m, faces = vertices_m[faces].reshape(-1, 3), np.arange(faces.size).reshape(-1, 3)
-    tube = fit_tube(vertices_m, faces)
+    tube = fit(Mesh(vertices_m, faces))
     expected_m = scale * (line_m @ rotation.T + place)
     assert tube.diameter_m == pytest.approx(scale * DIAMETER_M, rel=1e-3)
     assert line_distance_m(tube.axis_m, expected_m) < 0.01 * scale * DIAMETER_M
@@ -106,7 +108,7 @@ def test_open_ends_float32_and_duplicate_triangles() -> None:
         (mesh.vertices_m, np.concatenate([open_ends, mesh.faces])),
         (mesh.vertices_m.astype(np.float32).astype(np.float64), mesh.faces),
     ):
-        tube = fit_tube(vertices_m, faces)
+        tube = fit(Mesh(vertices_m, faces))
         assert tube.diameter_m == pytest.approx(DIAMETER_M, rel=1e-3)
         assert line_distance_m(tube.axis_m, line_m) < 1e-5
 
@@ -167,8 +169,7 @@ def _double_wall() -> trimesh.Trimesh:
     ],
 )
 def test_other_bodies_are_refused(body: trimesh.Trimesh) -> None:
-    with pytest.raises(NoTubeError):
-        fit_tube(np.array(body.vertices), np.array(body.faces))
+    assert fit_tube(np.array(body.vertices), np.array(body.faces)) is None
 
 
 def test_branching_bars_are_refused() -> None:
@@ -178,15 +179,13 @@ def test_branching_bars_are_refused() -> None:
     crossing = trimesh.util.concatenate(
         trimesh.Trimesh(mesh.vertices_m, mesh.faces), trimesh.Trimesh(other @ np.diag([1, -1, 1]), mesh.faces)
     )
-    with pytest.raises(NoTubeError):
-        fit_tube(np.array(crossing.vertices), np.array(crossing.faces))
+    assert fit_tube(np.array(crossing.vertices), np.array(crossing.faces)) is None
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_random_triangles_are_refused(seed: int) -> None:
     rng = np.random.default_rng(seed)
-    with pytest.raises(NoTubeError):
-        fit_tube(rng.normal(size=(200, 3)), rng.integers(0, 200, (600, 3)))
+    assert fit_tube(rng.normal(size=(200, 3)), rng.integers(0, 200, (600, 3))) is None
 
 
 def test_degenerate_and_huge_surfaces_are_refused() -> None:
@@ -198,5 +197,5 @@ def test_degenerate_and_huge_surfaces_are_refused() -> None:
         (np.full((8, 3), np.inf), some),
         (line, np.zeros((MAX_TRIANGLES + 1, 3), dtype=np.int32)),
     ):
-        with pytest.raises(NoTubeError), np.errstate(invalid="ignore"):
-            fit_tube(vertices_m, faces)
+        with np.errstate(invalid="ignore"):
+            assert fit_tube(vertices_m, faces) is None

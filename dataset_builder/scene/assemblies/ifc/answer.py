@@ -18,8 +18,7 @@ from pydantic import Field, TypeAdapter, ValidationError
 from dataset_builder.config.file_specs import Trust
 from dataset_builder.scene.assemblies.cage import Cage, CageBar, LeftOut, unit_scale
 from dataset_builder.scene.assemblies.ifc.declared import compare_declared
-from dataset_builder.scene.assemblies.mesh_import import connected_components
-from dataset_builder.scene.assemblies.surface_bar import fitted_bar
+from dataset_builder.scene.assemblies.mesh_import import connected_components, fitted_bar
 from dataset_builder.scene.model import MAX_BARS, METRE_DECIMALS, Mesh, Note, axis_of
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.errors import MeshError, Problem

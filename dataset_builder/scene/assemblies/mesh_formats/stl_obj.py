@@ -1,7 +1,11 @@
-"""Reader of Wavefront OBJ files: vertices, polygons and the objects that they belong to.
+"""Readers of STL files, binary and text, and of Wavefront OBJ files.
 
-Texture coordinates, normals, groups, materials, lines and points are ignored, and the files that a material
-library or a texture names are never opened.
+An STL file is binary if its size is that of the triangle count in its header, also if it begins with "solid", as
+files of several programs do. Normals, attributes and names are ignored.
+
+Of an OBJ file the vertices, polygons and the objects that they belong to are read. Texture coordinates, normals,
+groups, materials, lines and points are ignored, and the files that a material library or a texture names are never
+opened.
 """
 
 from __future__ import annotations
@@ -26,15 +30,87 @@ from dataset_builder.scene.assemblies.mesh_formats.parsing import (
     triangulate,
 )
 
+_HEADER_BYTES = 84
+_TRIANGLE = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attributes", "<u2")])
+
+_SOLID = re.compile(rb"\s*solid\b[^\r\n]*", re.IGNORECASE)
+_FACET = re.compile(
+    rb"\s*facet(?:\s+normal(?:\s+\S+){3})?\s+outer\s*loop"
+    rb"((?:\s+vertex(?:\s+\S+){3}){3})\s+end\s*loop\s+end\s*facet\b",
+    re.IGNORECASE,
+)
+_VERTEX = re.compile(rb"vertex\b", re.IGNORECASE)
+_END = re.compile(rb"\s*end\s*solid\b[^\r\n]*", re.IGNORECASE)
+_PADDING = b"\0\x1a"
+"""Bytes that some programs append: zeros, and the end-of-file character of DOS."""
+
+
+def read_stl(content: bytes) -> Mapping[str, Surface]:
+    """Return the triangles of all solids, in order, as one object without a name; each has its own three vertices.
+
+    Raises ``MalformedMeshError`` if the content is neither a binary nor a text STL, or is truncated.
+    """
+    corners = _binary_corners(content)
+    if corners is None:
+        corners = _text_corners(content)
+    return {"": check_surface((corners, np.arange(len(corners)).reshape(-1, 3)), _corner_place, str)}
+
+
+def _binary_corners(content: bytes) -> ndarray | None:
+    """Return the corners of a binary STL, (3 n, 3), or None if the content is a text.
+
+    Raises ``MalformedMeshError`` if the content is neither.
+    """
+    triangles = int.from_bytes(content[_HEADER_BYTES - 4 : _HEADER_BYTES], "little")
+    size = _HEADER_BYTES + triangles * _TRIANGLE.itemsize
+    if len(content) == size:
+        rows = np.frombuffer(content, _TRIANGLE, triangles, _HEADER_BYTES)
+        return rows["corners"].reshape(-1, 3).astype(np.float32)
+    if _SOLID.match(content.removeprefix(BYTE_ORDER_MARK)) and b"\0" not in content[:_HEADER_BYTES]:
+        return None
+    if len(content) < _HEADER_BYTES:
+        raise MalformedMeshError("syntax", "", f"{len(content)} bytes", "a text or binary STL file")
+    found = f"truncated or damaged: the header counts {triangles} triangles, but the file has {len(content)} bytes"
+    raise MalformedMeshError("damaged", "", found, f"{size}")
+
+
+def _text_corners(content: bytes) -> ndarray:
+    """Return the corners of a text STL, (3 n, 3)."""
+    text = content.removeprefix(BYTE_ORDER_MARK).rstrip(_PADDING).rstrip()
+    corners: list[bytes] = []
+    position = 0
+    while position < len(text):
+        position = _matched(_SOLID, text, position, '"solid"').end()
+        while facet := _FACET.match(text, position):
+            corners.append(facet[1])
+            position = facet.end()
+        position = _matched(_END, text, position, 'a facet of three vertices, or "endsolid"').end()
+    rows = [_VERTEX.sub(b"", row) for row in corners]
+    return parse_numbers(rows, lambda row: _corner_place(3 * row)).reshape(-1, 3)
+
+
+def _corner_place(corner: int) -> str:
+    return f"triangle {corner // 3 + 1}"
+
+
+def _matched(pattern: re.Pattern[bytes], text: bytes, position: int, expected: str) -> re.Match[bytes]:
+    """Return the match at ``position``; raise ``MalformedMeshError`` that names the line if there is none."""
+    if match := pattern.match(text, position):
+        return match
+    start = position + len(text[position:]) - len(text[position:].lstrip())
+    line = text.count(b"\n", 0, start) + 1
+    rest = text[start : start + 200].splitlines()
+    found = f"found {shown(rest[0])}" if rest else "the file ends"
+    raise MalformedMeshError("damaged", f"line {line}", found, expected)
+
+
 _NOT_READ = (b"curv", b"curv2", b"surf", b"cstype", b"call", b"csh")
 """Statements of free-form curves and surfaces, and of other files: without them, a part would be missing."""
 _UNNAMED = b"geometry"
 """Name of the object of faces that precede the first name."""
 _NUMBERS_OF_VERTICES = {3, 6}
 """Numbers of a vertex, without and with a colour, which may both occur in one file."""
-_CORNER = rb"-?\d+(?:/-?\d*){0,2}"
-_CORNERS = re.compile(rb"(?:%s(?: +|$))*+" % _CORNER)
-_FACE = re.compile(rb"(?:%s(?: +|$)){3,}" % _CORNER)
+_CORNERS = re.compile(rb"(?:-?\d+(?:/-?\d*){0,2}(?: +|$))*+")
 _NUMERIC = re.compile(rb"[-+./eE]*+\d[-+.\d/eE]*+")
 _CONTINUATION = re.compile(rb"(?<=[\d/ ])\\\r?\n")
 """End of a line of numbers that continues; a path in a comment may end in a backslash too."""
@@ -115,8 +191,9 @@ def _triangles(rows: _Rows, vertex_count: int) -> Int64[ndarray, "n 3"]:
     text = b" ".join(rows.texts)
     sizes = [len(text.split()) for text in rows.texts]
     if min(sizes) < 3 or not _CORNERS.fullmatch(text):
-        row, bad = next((row, text) for row, text in enumerate(rows.texts) if not _FACE.fullmatch(text))
-        raise MalformedMeshError("invalid", rows.place(row), f"found f {shown(bad)}", "three or more corners")
+        row = next(n for n, size in enumerate(sizes) if size < 3 or not _CORNERS.fullmatch(rows.texts[n]))
+        found = f"found f {shown(rows.texts[row])}"
+        raise MalformedMeshError("invalid", rows.place(row), found, "three or more corners")
     numbers = parse_numbers([re.sub(rb"/[-/\d]*", b"", text)], rows.place).astype(np.int64)
     corners = np.where(numbers < 0, np.repeat(rows.vertices_above, sizes) + numbers, numbers - 1)
     ends = np.cumsum(sizes)

@@ -1,8 +1,13 @@
-"""Centreline of a tube of any triangulation, by cutting it with planes across its direction.
+"""Centrelines of candidate tubes: the middles of vertex rings, or of plane sections.
 
-From a first section the planes advance in both directions. A step is longer where the tube is straight and shorter
-where it bends; a section is refused if its area is not that of the first, or if its middle is not near the
-predicted point. The march ends where the shortest step fails: at an end of the tube, or where it is no tube.
+Programs that sweep bars make rings of vertices. A ring is found in the middle of the longest edge. From there the
+rings follow each other: the next one consists of the neighbours of a ring that are not on it or the one before.
+Their centres are the points of the centreline that was swept, also at sharp corners.
+
+A tube of any other triangulation is cut with planes across its direction, which advance from a first section in
+both directions. A step is longer where the tube is straight and shorter where it bends; a section is refused if
+its area is not that of the first, or if its middle is not near the predicted point. The march ends where the
+shortest step fails: at an end of the tube, or where it is no tube.
 """
 
 from __future__ import annotations
@@ -10,10 +15,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
 from dataset_builder.scene.shapes.tube_surface import TubeSurface
+
+MIN_FACETS = 5
+"""Smallest number of vertices of a ring."""
 
 MAX_SECTIONS = 4000
 """Largest number of sections of a bar."""
@@ -35,6 +43,63 @@ _TURN_SHARE = 0.5
 
 _AREA_RANGE = 0.75, 1.35
 """Bounds of a section's area, relative to that of the first."""
+
+
+def ring_centreline_m(
+    surface: TubeSurface, point_m: Float64[ndarray, " 3"], direction: Float64[ndarray, " 3"], radius_m: float
+) -> Float64[ndarray, "n 3"] | None:
+    """Return the centres of the rings in order, metres, or None if the triangulation has no rings.
+
+    ``point_m`` is on the surface between two rings, ``direction`` the unit direction of the tube there and
+    ``radius_m`` its approximate radius. The centreline of a closed hoop ends at its first point.
+    """
+    start = surface.cut(point_m, direction, radius_m)
+    if start is None:
+        return None
+    corners = np.unique(surface.faces[start.faces])
+    above = (surface.vertices_m[corners] - point_m) @ direction > 0
+    first, before = corners[above], corners[~above]
+    if len(first) != len(before) or len(first) < MIN_FACETS:
+        return None
+    visited = np.zeros(len(surface.vertices_m), dtype=bool)
+    visited[corners] = True
+    ahead = _rings_from(surface, first, visited)
+    is_hoop = bool(np.isin(_neighbours(surface, ahead[-1]), before).any()) and len(ahead) > 1
+    rings = [*reversed(_rings_from(surface, before, visited)), *ahead]
+    centres_m = np.stack([surface.vertices_m[ring].mean(axis=0) for ring in rings])
+    if not _are_covered(surface, visited, centres_m, radius_m):
+        return None
+    return np.asarray(np.concatenate([centres_m, centres_m[:1]]) if is_hoop else centres_m)
+
+
+def _rings_from(
+    surface: TubeSurface, first: Int64[ndarray, " k"], visited: Bool[ndarray, " v"]
+) -> list[Int64[ndarray, " k"]]:
+    """Return ``first`` and the rings that follow it, and mark their vertices in ``visited``."""
+    rings = [first]
+    while True:
+        around = _neighbours(surface, rings[-1])
+        following = np.unique(around[~visited[around]])
+        if len(following) != len(first):
+            return rings
+        visited[following] = True
+        rings.append(following)
+
+
+def _neighbours(surface: TubeSurface, vertices: Int64[ndarray, " k"]) -> Int64[ndarray, " n"]:
+    """Return the neighbours of all ``vertices``, with repetitions."""
+    neighbours, starts = surface.neighbours
+    return np.concatenate([neighbours[starts[vertex] : starts[vertex + 1]] for vertex in vertices])
+
+
+def _are_covered(
+    surface: TubeSurface, visited: Bool[ndarray, " v"], centres_m: Float64[ndarray, "n 3"], radius_m: float
+) -> bool:
+    """Return whether all vertices beyond the rings are within the end caps, less than a radius from an end."""
+    beyond_m = surface.vertices_m[~visited]
+    ends_m = centres_m[[0, -1]]
+    distance_m = np.linalg.norm(beyond_m[:, None] - ends_m, axis=2).min(axis=1, initial=np.inf)
+    return bool((distance_m < radius_m).all())
 
 
 class _Section(NamedTuple):
@@ -153,7 +218,7 @@ class _March:
             return np.asarray(
                 np.average(surface.corners_m[cap].mean(axis=1), axis=0, weights=surface.areas_m2[cap])
             )
-        start_m, end_m = surface.vertices_m[surface.boundary_edges.T]
+        start_m, end_m = surface.vertices_m[surface.edges[surface.is_open].T]
         rim = self._is_ahead((start_m + end_m) / 2, last_m, direction)
         length_m = np.linalg.norm(end_m - start_m, axis=1)[rim]
         if length_m.sum() > np.pi * self._radius_m:
