@@ -9,7 +9,7 @@ from dataset_builder.config.cages import CAGES, CagesRequest
 from dataset_builder.config.catalog import CONFIGS, SWEEPS, BuildRequest
 from dataset_builder.config.quality import DEFAULT_QUALITY, QUALITIES, SAMPLINGS
 from dataset_builder.config.specs import CPU, GPU_TYPES
-from dataset_builder.scene.variants import VARIANTS
+from dataset_builder.scene.variants.registry import VARIANTS
 from rebar_depth_bench.view_ids import SPLITS
 
 

@@ -14,7 +14,7 @@ from mathutils import Vector
 
 from dataset_builder.blender.shader_nodes import Colour, NodeTreeBuilder, Socket
 from dataset_builder.scene.shapes.solids import Point
-from dataset_builder.scene.variants import SHADOWS, SUN_FROM
+from dataset_builder.scene.variants.registry import SHADOWS, SUN_FROM
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 import bpy
 
 from dataset_builder.blender.shader_nodes import NodeTreeBuilder
-from dataset_builder.scene.variants.image_light import ImageLight
+from dataset_builder.scene.variants.registry import ImageLight
 from rebar_depth_bench.data.digests import file_sha256
 from rebar_depth_bench.errors import BuildError
 

@@ -37,9 +37,14 @@ from dataset_builder.scene.environments.laboratory import BENCH_TOP_M, SHEET_THI
 from dataset_builder.scene.environments.outdoors import outdoors
 from dataset_builder.scene.model import Assembly, Mesh, Part, surface
 from dataset_builder.scene.shapes.solids import box
-from dataset_builder.scene.variants import LIGHT_SLOT, STEEL_SLOT, check_variants, exclusive_variant
-from dataset_builder.scene.variants.image_light import image_light
 from dataset_builder.scene.variants.props import make_props
+from dataset_builder.scene.variants.registry import (
+    LIGHT_SLOT,
+    STEEL_SLOT,
+    check_variants,
+    exclusive_variant,
+    image_light,
+)
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 
 

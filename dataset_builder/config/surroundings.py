@@ -10,7 +10,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from dataset_builder.config.camera_site import CameraSpace
-from dataset_builder.scene.variants import SHADOWS, VARIANTS
+from dataset_builder.scene.variants.registry import SHADOWS, VARIANTS
 from rebar_depth_bench.errors import InputError, Problem
 
 

@@ -14,8 +14,8 @@ from numpy import ndarray
 
 from dataset_builder.scene.model import Mesh, Part, surface
 from dataset_builder.scene.shapes.solids import box, merge_meshes, rotation_about_z, transformed
-from dataset_builder.scene.variants import SUN_FROM
 from dataset_builder.scene.variants.placement import GAP_M, PlacementContext
+from dataset_builder.scene.variants.registry import SUN_FROM
 
 PANEL_WIDTHS = (0.8, 0.5)
 """Widths of the panels, as fractions of the side of the steel at which they stand."""

@@ -13,11 +13,11 @@ from collections.abc import Callable, Mapping
 
 from dataset_builder.config.specs import GeneratedCageSpec, SceneSpec
 from dataset_builder.scene.model import Assembly, Part
-from dataset_builder.scene.variants import SHADOWS, check_variants
 from dataset_builder.scene.variants.clutter import clutter, life_size_clutter
 from dataset_builder.scene.variants.fitted_formwork import fitted_formwork
 from dataset_builder.scene.variants.panels import formwork, slatted_screen
 from dataset_builder.scene.variants.placement import PlacementContext
+from dataset_builder.scene.variants.registry import SHADOWS, check_variants
 from dataset_builder.scene.variants.spacers import spacers
 from dataset_builder.scene.variants.supports import supports
 from dataset_builder.scene.variants.tie_wire import tie_wire

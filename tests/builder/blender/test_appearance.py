@@ -19,7 +19,9 @@ from dataset_builder.config.trajectories import look_at_with_rig
 from dataset_builder.scene.assemblies.lattice import lattice_assembly
 from dataset_builder.scene.model import Assembly
 from dataset_builder.scene.raycast import RayCaster
-from dataset_builder.scene.variants import (
+from dataset_builder.scene.variants.props import PROP_BUILDERS, make_props
+from dataset_builder.scene.variants.registry import (
+    IMAGE_LIGHTS,
     LIGHT_SLOT,
     PROPS_SLOT,
     SENSOR_SLOT,
@@ -28,8 +30,6 @@ from dataset_builder.scene.variants import (
     VARIANTS,
     check_variants,
 )
-from dataset_builder.scene.variants.image_light import IMAGE_LIGHTS
-from dataset_builder.scene.variants.props import PROP_BUILDERS, make_props
 from dataset_builder.scene.variants.sensor import recorded
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec

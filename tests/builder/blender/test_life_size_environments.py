@@ -24,8 +24,7 @@ from dataset_builder.scene.environments import deck, hall
 from dataset_builder.scene.model import Part, WorldMesh
 from dataset_builder.scene.raycast import RayCaster
 from dataset_builder.scene.shapes.solids import merge_meshes
-from dataset_builder.scene.variants import LIGHT_SLOT
-from dataset_builder.scene.variants.image_light import IMAGE_LIGHTS
+from dataset_builder.scene.variants.registry import IMAGE_LIGHTS, LIGHT_SLOT
 from rebar_depth_bench.geometry.cameras import Camera, ideal_K, look_at
 from tests.builder.blender.cages import cage
 from tests.builder.blender.probe import RunProbe

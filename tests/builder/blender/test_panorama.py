@@ -18,8 +18,14 @@ import pytest
 from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.config.specs import AppearanceSpec, ColourSpec, LatticeSpec, SceneSpec
 from dataset_builder.pipeline.plan import config_parameters
-from dataset_builder.scene.variants import LIGHT_SLOT, VARIANTS
-from dataset_builder.scene.variants.image_light import IMAGE_LIGHTS, IRRADIANCE, ImageLight, image_light
+from dataset_builder.scene.variants.registry import (
+    IMAGE_LIGHTS,
+    IRRADIANCE,
+    LIGHT_SLOT,
+    VARIANTS,
+    ImageLight,
+    image_light,
+)
 from rebar_depth_bench.errors import BuildError
 from rebar_depth_bench.geometry.cameras import Camera, look_at
 from tests.builder.blender.probe import RunProbe
