@@ -14,8 +14,7 @@ from scipy.spatial import ConvexHull
 
 from dataset_builder.scene.cages.clearance import Clearances
 from dataset_builder.scene.cages.design import Design, DesignBar, InfeasibleError
-from dataset_builder.scene.cages.families import FAMILIES
-from dataset_builder.scene.cages.generate import generate_cage
+from dataset_builder.scene.cages.generate import FAMILIES, generate_cage
 from dataset_builder.scene.cages.rules import radius_m
 from dataset_builder.scene.shapes.bending import resample_polyline_m
 

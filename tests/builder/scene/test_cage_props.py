@@ -13,7 +13,7 @@ from numpy import ndarray
 from dataset_builder.config.specs import AppearanceSpec, GeneratedCageSpec, SceneSpec
 from dataset_builder.config.surroundings import FORMWORK_FAMILIES
 from dataset_builder.scene.assemblies import make_assembly
-from dataset_builder.scene.cages.families import FAMILIES
+from dataset_builder.scene.cages.generate import FAMILIES
 from dataset_builder.scene.model import NOT_STEEL, Assembly, Part, WorldMesh
 from dataset_builder.scene.raycast import RayCaster
 from dataset_builder.scene.shapes.solids import merge_meshes

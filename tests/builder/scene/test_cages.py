@@ -26,8 +26,14 @@ from dataset_builder.scene.cages.as_built import (
 )
 from dataset_builder.scene.cages.clearance import NEAR_M, Clearances
 from dataset_builder.scene.cages.design import Design, DesignBar, InfeasibleError, straight
-from dataset_builder.scene.cages.families import FAMILIES, Family
-from dataset_builder.scene.cages.generate import MAX_BARS, GeneratedCage, drawn_family, generate_cage
+from dataset_builder.scene.cages.generate import (
+    FAMILIES,
+    MAX_BARS,
+    Family,
+    GeneratedCage,
+    drawn_family,
+    generate_cage,
+)
 from dataset_builder.scene.cages.rules import DIAMETERS_M, radius_m
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.view_ids import SPLITS

@@ -16,6 +16,7 @@ from dataset_builder.scene.cages.design import (
     InfeasibleError,
     drawn_of,
     drawn_step,
+    rise_m,
     spaced,
     turned,
 )
@@ -29,8 +30,6 @@ from dataset_builder.scene.cages.families.beams import (
     hook_reach_m,
 )
 from dataset_builder.scene.cages.families.columns import drawn_section
-from dataset_builder.scene.cages.linear import rise_m
-from dataset_builder.scene.cages.rectangular import LINK, Section, links_height_m, main_bars, stirrups, ties
 from dataset_builder.scene.cages.rules import (
     CONTACT_GAP_M,
     column_link_spacing_m,
@@ -38,6 +37,7 @@ from dataset_builder.scene.cages.rules import (
     link_diameters_m,
     radius_m,
 )
+from dataset_builder.scene.cages.sections import LINK, Section, links_height_m, main_bars, stirrups, ties
 
 _PASSING_M = 0.002
 """Clear distance of links of a column from the bars of the beam that they pass."""
