@@ -1,4 +1,4 @@
-"""Scene lights: sky, sun, panels and spots, and the tables of lights of each environment and light variant.
+"""Scene lights: sky, sun, panels, spots and panoramas, and the lights of each environment and light variant.
 
 Lights are not surfaces and have no depth.
 """
@@ -8,13 +8,19 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import radians
+from pathlib import Path
 
 import bpy
 from mathutils import Vector
 
 from dataset_builder.blender.shader_nodes import Colour, NodeTreeBuilder, Socket
 from dataset_builder.scene.shapes.solids import Point
-from dataset_builder.scene.variants.registry import SHADOWS, SUN_FROM
+from dataset_builder.scene.variants.registry import SHADOWS, SUN_FROM, ImageLight
+from rebar_depth_bench.data.digests import file_sha256
+from rebar_depth_bench.errors import BuildError
+
+PANORAMAS = Path("datafiles", "studiolights", "world")
+"""Folder of the panoramas, below the local resources of Blender."""
 
 
 @dataclass(frozen=True)
@@ -129,6 +135,36 @@ def _add_lamp(lamp: Panel | Sun | Spot) -> None:
     added.rotation_euler = direction.to_track_quat("-Z", "Y").to_euler()
     added.visible_camera = False
     bpy.context.scene.collection.objects.link(added)
+
+
+def add_panorama(light: ImageLight) -> None:
+    """Make the panorama the background of the open scene, which must have no light yet.
+
+    Raises ``BuildError`` if the wheel has no such image or another one.
+    """
+    path = Path(bpy.utils.resource_path("LOCAL")) / PANORAMAS / f"{light.image}.exr"
+    found = file_sha256(path) if path.is_file() else "missing"
+    if found != light.sha256:
+        raise BuildError(f"{path}: the panorama has sha256 {found}, expected {light.sha256} as in bpy 4.5")
+    world = bpy.data.worlds.new("panorama")
+    world.use_nodes = True
+    tree = NodeTreeBuilder(world.node_tree)
+    # The image turns against the direction at which it is looked up.
+    turned = tree.turned(tree.direction(), -radians(light.turn_deg))
+    image = bpy.data.images.load(str(path))
+    colour = tree.node("ShaderNodeTexEnvironment", {"Vector": turned}, image=image).outputs["Color"]
+    background = world.node_tree.nodes["Background"]
+    world.node_tree.links.new(colour, background.inputs["Color"])
+    background.inputs["Strength"].default_value = light.strength
+    # Importance sampling at the resolution of the image, because suns and lamps are a few of its pixels.
+    world.cycles.sampling_method = "AUTOMATIC"
+    bpy.context.scene.world = world
+
+
+def let_light_through(surface: bpy.types.Object) -> None:
+    """Make an object transparent for light and reflections; cameras still see it, and it is still lit."""
+    surface.visible_diffuse = surface.visible_glossy = surface.visible_transmission = False
+    surface.visible_shadow = surface.visible_volume_scatter = False
 
 
 WARM, WHITE = (1.0, 0.93, 0.85), (1.0, 0.98, 0.95)

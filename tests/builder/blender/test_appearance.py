@@ -63,9 +63,8 @@ WITHOUT_SURFACES = [name for name in VARIANTS if name not in PROP_BUILDERS]
 def probe(folder: Path) -> None:
     """Render every variant at low resolution and cast its ground truth (runs in the Blender process)."""
     from dataset_builder.blender.colour import configure_colour, render_colour
-    from dataset_builder.blender.evaluated_mesh import evaluated_world_mesh
     from dataset_builder.blender.render import render_depth
-    from dataset_builder.blender.scene import build_scene
+    from dataset_builder.blender.scene import build_scene, evaluated_world_mesh
 
     arrays: dict[str, ndarray] = {}
     lattice = lattice_assembly(LatticeSpec(pitch_m=0.05))

@@ -42,9 +42,8 @@ CAMERA = Camera(
 def probe(folder: Path) -> None:
     """Render the environments with several lights and cast their ground truth (runs in the Blender process)."""
     from dataset_builder.blender.colour import configure_colour, render_colour
-    from dataset_builder.blender.evaluated_mesh import evaluated_world_mesh
     from dataset_builder.blender.render import render_depth
-    from dataset_builder.blender.scene import ENVIRONMENTS, build_scene
+    from dataset_builder.blender.scene import ENVIRONMENTS, build_scene, evaluated_world_mesh
 
     facts = {
         name: {
