@@ -27,8 +27,7 @@ from dataset_builder.scene.assemblies.lattice import lattice_assembly
 from dataset_builder.scene.assemblies.pier import pier_assembly
 from dataset_builder.scene.assemblies.pile import pile_assembly
 from dataset_builder.scene.model import Assembly
-from dataset_builder.scene.variants.panels import SCREEN_DISTANCE
-from dataset_builder.scene.variants.registry import SHADOWS
+from dataset_builder.scene.variants.registry import SCREEN_DISTANCE, SHADOWS
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.errors import InputError, MeshError
 

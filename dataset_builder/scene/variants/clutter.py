@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from dataset_builder.scene.model import Mesh, Part, surface
 from dataset_builder.scene.shapes.solids import box, lathe, rotation_about_z, transformed
-from dataset_builder.scene.variants.placement import GAP_M, PlacementContext, Rect
+from dataset_builder.scene.variants.context import GAP_M, PlacementContext, Rect
 
 CLEARANCE = 0.04
 """Minimum distance between clutter and the bounding box of the steel, as a fraction of the steel's span."""

@@ -23,6 +23,8 @@ SENSOR = "sensor"
 SHADOWS = "shadows"
 SUN_FROM = (-0.53, -0.36, 0.77)
 """Direction from the steel to the sun of ``shadows``, world axes; the slatted screen is in this direction."""
+SCREEN_DISTANCE = 6.0
+"""Distance of this screen from the centre of the steel, in half diagonals of the steel; cameras are nearer."""
 
 
 @dataclass(frozen=True)

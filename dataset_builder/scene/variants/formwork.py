@@ -1,8 +1,9 @@
-"""Formwork that fits a generated cage: panels at the cover along faces of its bounding box, and a base below it.
+"""Formwork of plywood panels: beside the steel, scaled with it, or fitted to a generated cage in real sizes.
 
-Sheets of plywood up to 2.5 m long are held by studs, walers and, where they are high, raking struts of timber. Two
-adjacent sides are closed for a cage that stands or is deep, three for a flat one, which is seen from above. A cage
-that is cast lying gets a base, except on the deck, which is one.
+Two panels with battens stand on adjacent sides of the steel. Formwork that fits a cage is at the cover along faces
+of its bounding box. Its sheets, up to 2.5 m long, are held by studs, walers and, where they are high, raking
+struts of timber. Two adjacent sides are closed for a cage that stands or is deep, three for a flat one, which is
+seen from above. A cage that is cast lying gets a base, except on the deck, which is one.
 """
 
 from __future__ import annotations
@@ -15,8 +16,86 @@ from numpy import ndarray
 
 from dataset_builder.scene.model import Mesh, Part, surface
 from dataset_builder.scene.shapes.solids import box, rotation_about_z, transformed
-from dataset_builder.scene.variants.placement import GAP_M, PlacementContext, Rect
-from dataset_builder.scene.variants.supports import LEAST_COVER_M
+from dataset_builder.scene.variants.context import GAP_M, PlacementContext, Rect
+from dataset_builder.scene.variants.spacers import LEAST_COVER_M
+
+PANEL_WIDTHS = (0.8, 0.5)
+"""Widths of the panels, as fractions of the side of the steel at which they stand."""
+PANEL_HEIGHT = 0.75
+"""Height of the panels, as a fraction of the height of the steel."""
+BATTENS = 4
+"""Number of battens per panel."""
+
+
+@dataclass(frozen=True)
+class _Panel:
+    """Dimensions of a panel, metres.
+
+    ``off_m`` is the distance of its inner face from the centre of the steel, ``along_m`` the offset of its centre
+    along the side.
+    """
+
+    off_m: float
+    along_m: float
+    width_m: float
+    height_m: float
+    thickness_m: float
+
+
+def formwork(context: PlacementContext) -> tuple[Part, ...]:
+    """Return the panels and their battens; the seed of the scene selects the sides."""
+    first = int(context.rng("formwork").integers(4))
+    middle_m = context.middle_m * [1, 1, 0]
+    parts: list[Part] = []
+    for n, share in enumerate(PANEL_WIDTHS):
+        side = (first + n) % 4
+        rotation = rotation_about_z(90.0 * side)
+        for name, mesh, material in _panel_meshes(_panel(context, side, share, shift=0.25 * n)):
+            parts.append(surface(f"formwork-{n}-{name}", transformed(mesh, rotation, middle_m), material))
+    return tuple(parts)
+
+
+def _panel(context: PlacementContext, side: int, share: float, shift: float) -> _Panel:
+    """Return the panel of one side; side 0 is at +x, the others follow in quarter turns.
+
+    ``share`` is the width and ``shift`` the offset, both as fractions: of the side and of the width.
+    """
+    across_m, along_m = (
+        (context.size_m[0], context.size_m[1]) if side % 2 == 0 else (context.size_m[1], context.size_m[0])
+    )
+    # Leave room for spacers and hooks, which extend beyond the bounding box of the bars.
+    gap_m = max(0.03 * context.span_m, 3.5 * context.thickest_m)
+    return _Panel(
+        off_m=float(across_m / 2 + gap_m),
+        along_m=float(along_m * share * shift),
+        width_m=float(along_m * share),
+        height_m=float(max(PANEL_HEIGHT * context.high_m[2], 0.2 * context.span_m)),
+        thickness_m=float(np.clip(0.012 * context.span_m, 0.0012, 0.021)),
+    )
+
+
+def _panel_meshes(panel: _Panel) -> list[tuple[str, Mesh, str]]:
+    """Return (name, mesh, material) of the sheet, its battens and its walers; the steel is towards -x.
+
+    The pieces do not touch each other.
+    """
+    x, t, gap = panel.off_m, panel.thickness_m, panel.thickness_m * 0.05
+    low, high = panel.along_m - panel.width_m / 2, panel.along_m + panel.width_m / 2
+    depth = 2.5 * t
+    x_batten, x_waler = x + t + gap, x + t + depth + 2 * gap
+    half = min(1.8 * t, 0.08 * panel.width_m)
+    at = np.linspace(low + 2 * half, high - 2 * half, BATTENS)
+    top = GAP_M + panel.height_m
+    meshes = [("sheet", box((x, low, GAP_M), (x + t, high, top)), "plywood")]
+    for k, y in enumerate(at):
+        batten = box((x_batten, y - half, GAP_M), (x_batten + depth, y + half, top - 0.02 * panel.height_m))
+        meshes.append((f"batten-{k}", batten, "timber"))
+    for k, share in enumerate((0.25, 0.75)):
+        z = share * panel.height_m
+        waler = box((x_waler, low, z - half), (x_waler + depth, high, z + half))
+        meshes.append((f"waler-{k}", waler, "timber"))
+    return meshes
+
 
 STANDING_COVER_M = 0.04
 COVERS_M = (0.025, 0.075)
@@ -65,7 +144,7 @@ def fitted_formwork(context: PlacementContext) -> tuple[Part, ...]:
         panel = _side(context, side, cover_m, is_lying=is_lying, is_last=n == len(sides) - 1)
         parts += [
             surface(f"formwork-{n}-{name}", transformed(mesh, rotation, middle_m), material)
-            for name, mesh, material in _panel_meshes(panel)
+            for name, mesh, material in _fitted_meshes(panel)
         ]
     if is_lying and context.environment != "deck":
         rim_m = cover_m - _TIGHT_M
@@ -117,7 +196,7 @@ def _top_at_face_m(context: PlacementContext, side: int) -> float:
     return float((ends_m[near, 2] + radius_m[near]).max(initial=0.1))
 
 
-def _panel_meshes(side: _Side) -> list[tuple[str, Mesh, str]]:
+def _fitted_meshes(side: _Side) -> list[tuple[str, Mesh, str]]:
     """Return (name, mesh, material) of the pieces of a panel, which do not touch each other."""
     low, high, top = side.low_m, side.high_m, GAP_M + side.top_m
     width_m = high - low
