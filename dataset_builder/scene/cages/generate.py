@@ -20,7 +20,7 @@ from dataset_builder.scene.cages.families.footings import footing
 from dataset_builder.scene.cages.families.joints import joint
 from dataset_builder.scene.cages.families.slabs import slab
 from dataset_builder.scene.cages.families.walls import wall
-from dataset_builder.scene.cages.rules import radius_m
+from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.view_ids import SPLITS
 
@@ -157,7 +157,7 @@ def _offset_m(bars: tuple[BuiltBar, ...], ground_m: float) -> Float64[ndarray, "
 
 def _lowest_m(bar: BuiltBar) -> float:
     """Return the height of the lowest point of a bar's surface, whose ends are flat discs."""
-    line_m, radius = bar.line_m, radius_m(bar.diameter_m)
+    line_m, radius = bar.line_m, outer_radius_m(bar.diameter_m)
     tangents = np.gradient(line_m, axis=0)
     level = np.linalg.norm(tangents[:, :2], axis=1) / np.linalg.norm(tangents, axis=1)
     return float((line_m[:, 2] - radius * level).min())

@@ -21,8 +21,8 @@ from dataset_builder.scene.cages.rules import (
     lap_m,
     least_clear_m,
     link_bend_m,
-    radius_m,
 )
+from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
 from dataset_builder.scene.shapes.links import HOOK_DEG, helix_m, ring_m, stirrup_centreline_m, tie_centreline_m
 
 MAIN, LINK, TIE = "main", "link", "tie"
@@ -160,7 +160,7 @@ def stirrups(section: Section, levels_m: Sequence[float], corners: int = 4) -> l
     size = (section.side_x_m - 2 * section.cover_m, section.side_y_m - 2 * section.cover_m)
     try:
         line_m = stirrup_centreline_m(
-            size, section.link_m, radius_m(section.link_m), section.bend_m, hook_end_m(section.link_m)
+            size, section.link_m, outer_radius_m(section.link_m), section.bend_m, hook_end_m(section.link_m)
         )
     except ValueError:
         raise InfeasibleError("a link has no room for its hooks") from None
@@ -205,7 +205,7 @@ def ties(section: Section, levels_m: Sequence[float], link_rise_m: float) -> lis
 def links_height_m(section: Section, link_rise_m: float, *, with_ties: bool) -> tuple[float, float]:
     """Return how far the steel of a link and of the ties on it reaches below and above the level of the link."""
     layers = sum(map(bool, section.along_m())) if with_ties else 0
-    below_m = link_rise_m + radius_m(section.link_m)
+    below_m = link_rise_m + outer_radius_m(section.link_m)
     return below_m, below_m + layers * contact_m(section.link_m, section.link_m)
 
 
@@ -277,7 +277,7 @@ class RoundSection:
 
     def spiral(self, length_m: float, pitch_m: float) -> DesignBar:
         """Return one spiral, with ``_CLOSED_TURNS`` at each end."""
-        closed_m = 2 * radius_m(self.link_m) + 3 * CONTACT_GAP_M
+        closed_m = 2 * outer_radius_m(self.link_m) + 3 * CONTACT_GAP_M
         turns = (length_m - 0.1 - 2 * _CLOSED_TURNS * closed_m) / pitch_m
         parts: list[Line] = []
         height_m, start_deg = 0.05, 0.0
@@ -312,7 +312,7 @@ class RoundSection:
     def _ring(
         self, role: str, bar_m: float, axis_radius_m: float, z_m: float, ring_lap_m: float, start_deg: float
     ) -> DesignBar:
-        line_m = ring_m(axis_radius_m, radius_m(bar_m), ring_lap_m, start_deg)
+        line_m = ring_m(axis_radius_m, outer_radius_m(bar_m), ring_lap_m, start_deg)
         return DesignBar(role, bar_m, line_m + _up(z_m), Z, role != LINK)
 
 

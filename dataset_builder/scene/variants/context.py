@@ -14,6 +14,7 @@ from numpy import ndarray
 
 from dataset_builder.config.specs import SceneSpec
 from dataset_builder.scene.model import Assembly, Part
+from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
 from dataset_builder.scene.shapes.capsules import Capsules
 from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.geometry.aruco_board import marker_corners_m
@@ -73,8 +74,9 @@ class PlacementContext:
 
     @cached_property
     def capsules(self) -> Capsules:
-        """Capsules around the axes of the bars."""
-        return Capsules.from_bars(self.bars)
+        """Capsules around the axes of the bars, which enclose all steel with its ribs."""
+        lines = [np.array(bar.axis_m, dtype=np.float64) for bar in self.bars]
+        return Capsules.of_lines(lines, [outer_radius_m(bar.diameter_m) for bar in self.bars])
 
     @property
     def footprint(self) -> Rect:

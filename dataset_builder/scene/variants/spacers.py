@@ -102,11 +102,9 @@ def _is_clear(
     r, a, h = (grid.ravel() for grid in np.meshgrid(radii, angle, heights, indexing="ij"))
     local = np.stack([r * np.cos(a), r * np.sin(a), h], axis=1)
     points_m = local @ _frame_along(direction).T + at_m
-    others = capsules.overlapping(points_m.min(axis=0), points_m.max(axis=0))
-    others[piece] = False
     # Every point of the wheel is within half a cell diagonal of a sample.
     cell_m = (2 * np.pi * wheel.rim_m / CIRCLE_SAMPLES, radii[1] - radii[0], heights[1] - heights[0])
-    return bool(capsules.select(others).clearance_m(points_m) > np.linalg.norm(cell_m) / 2)
+    return bool(capsules.clearance_m(points_m, without=piece) > np.linalg.norm(cell_m) / 2)
 
 
 def _wheel_mesh(wheel: Wheel) -> Mesh:
@@ -206,5 +204,4 @@ def _is_block_clear(capsules: Capsules, top_m: Float64[ndarray, " 3"]) -> bool:
     """Return whether the upper part of a block is clear of all bars; none is lower."""
     at, down = np.linspace(-BLOCK_HALF_M, BLOCK_HALF_M, 9), np.linspace(-1.5 * _LAYER_M, 0.0, 5)
     grid = np.stack(np.meshgrid(at, at, down, indexing="ij"), axis=-1).reshape(-1, 3) + top_m
-    near = capsules.select(capsules.overlapping(grid.min(axis=0), grid.max(axis=0)))
-    return bool(near.clearance_m(grid) > _CLEAR_M)
+    return capsules.clearance_m(grid) > _CLEAR_M

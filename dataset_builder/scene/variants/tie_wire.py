@@ -64,8 +64,7 @@ def _tie_line_m(crossing: Crossing, context: PlacementContext) -> Float64[ndarra
 def _is_clear(line_m: Float64[ndarray, "n 3"], capsules: Capsules) -> bool:
     """Return whether the wire, including its thickening at corners, is clear of all bars."""
     dense_m = np.concatenate([line_m, (line_m[1:] + line_m[:-1]) / 2])
-    around = capsules.overlapping(line_m.min(axis=0) - WIRE_M, line_m.max(axis=0) + WIRE_M)
-    return bool(capsules.select(around).clearance_m(dense_m) > CORNER_THICKENING * WIRE_M / 2)
+    return capsules.clearance_m(dense_m, WIRE_M) > CORNER_THICKENING * WIRE_M / 2
 
 
 def _loop_m(
