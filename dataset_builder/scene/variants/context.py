@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.config.specs import SceneSpec
+from dataset_builder.config.specs import GeneratedCageSpec, SceneSpec
 from dataset_builder.scene.model import Assembly, Part
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
 from dataset_builder.scene.shapes.capsules import Capsules
@@ -45,7 +45,8 @@ class Rect:
 class PlacementContext:
     """Bars with an axis and bounding box of all steel, occupied ground rectangles, and seed of the scene.
 
-    ``environment`` is that of the scene.
+    ``environment`` is that of the scene. Props have their real sizes (``is_life_size``) beside a generated cage;
+    others are scaled with the steel.
     """
 
     bars: tuple[Bar, ...]
@@ -54,6 +55,7 @@ class PlacementContext:
     occupied: tuple[Rect, ...]
     seed: int
     environment: str
+    is_life_size: bool
 
     @classmethod
     def from_assembly(cls, assembly: Assembly, spec: SceneSpec) -> PlacementContext:
@@ -62,7 +64,8 @@ class PlacementContext:
         markers = marker_corners_m(spec.board).values() if spec.board else ()
         occupied = tuple(_footprint(corners_m) for corners_m in markers)
         low_m, high_m = vertices_m.min(axis=0), vertices_m.max(axis=0)
-        return cls(with_axis(assembly.bars), low_m, high_m, occupied, spec.seed, spec.environment)
+        is_generated = isinstance(spec.assembly, GeneratedCageSpec)
+        return cls(with_axis(assembly.bars), low_m, high_m, occupied, spec.seed, spec.environment, is_generated)
 
     def with_parts(self, parts: tuple[Part, ...]) -> PlacementContext:
         """Return the context in which the footprints of ``parts`` are occupied too."""

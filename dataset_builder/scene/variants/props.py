@@ -15,13 +15,13 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.config.specs import GeneratedCageSpec, SceneSpec
+from dataset_builder.config.specs import SceneSpec
 from dataset_builder.scene.model import Assembly, Part, surface
 from dataset_builder.scene.shapes.solids import box, merge_meshes, transformed
-from dataset_builder.scene.variants.clutter import clutter, life_size_clutter
+from dataset_builder.scene.variants.clutter import clutter
 from dataset_builder.scene.variants.context import GAP_M, PlacementContext
-from dataset_builder.scene.variants.formwork import fitted_formwork, formwork
-from dataset_builder.scene.variants.registry import SCREEN_DISTANCE, SHADOWS, SUN_FROM, check_variants
+from dataset_builder.scene.variants.formwork import formwork
+from dataset_builder.scene.variants.registry import SCREEN_DISTANCE, SHADOWS, SUN_FROM
 from dataset_builder.scene.variants.spacers import spacers, supports
 from dataset_builder.scene.variants.tie_wire import tie_wire
 
@@ -73,31 +73,16 @@ PROP_BUILDERS: Mapping[str, Callable[[PlacementContext], tuple[Part, ...]]] = {
 }
 """Prop builders by variant, in execution order, which does not depend on the order of the names in a spec."""
 
-CAGE_PROP_BUILDERS: Mapping[str, Callable[[PlacementContext], tuple[Part, ...]]] = {
-    **PROP_BUILDERS,
-    "formwork": fitted_formwork,
-    "clutter": life_size_clutter,
-}
-"""Prop builders of generated cages, in the same order."""
-
 
 def make_props(assembly: Assembly, spec: SceneSpec) -> tuple[Part, ...]:
     """Return the props requested by ``spec.appearance``, and the supports of a generated cage.
 
     They are in the world frame, all with bar id ``NOT_STEEL``.
-
-    Raises ``InputError`` if the variants do not pass ``check_variants``.
     """
-    requested = spec.appearance.variants
-    check_variants(requested)
-    is_generated = isinstance(spec.assembly, GeneratedCageSpec)
-    builders = CAGE_PROP_BUILDERS if is_generated else PROP_BUILDERS
-    if not is_generated and not any(name in builders for name in requested):
-        return ()
     context = PlacementContext.from_assembly(assembly, spec)
-    parts = supports(context) if is_generated else ()
-    for name, build_props in builders.items():
-        if name in requested:
+    parts = supports(context) if context.is_life_size else ()
+    for name, build_props in PROP_BUILDERS.items():
+        if name in spec.appearance.variants:
             props = build_props(context)
             parts = (*parts, *props)
             context = context.with_parts(props)
