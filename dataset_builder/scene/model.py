@@ -33,9 +33,6 @@ def to_metres(length: float, unit_m: float) -> float:
 STEEL = "steel"
 """Material name of bars."""
 
-LIFT_M = 5e-5
-"""Height of the lower ends of standing bars above z = 0, metres, so that they do not coincide with the ground."""
-
 ESTIMATED_ROLE = "imported"
 """Role of bars whose axis and diameter were fitted to their surface, or could not be."""
 

@@ -9,12 +9,15 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.config.specs import LatticeSpec
-from dataset_builder.scene.model import LIFT_M, Assembly, Mesh, axis_of
+from dataset_builder.scene.model import Assembly, Mesh, axis_of
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m, ribbed_bar_mesh
 from rebar_depth_bench.data.bars import Bar
 
 CLEAR_GAP_M = 2e-4
 """Clear distance between crossing rods, metres: as tied with wire, and large enough that no surfaces coincide."""
+
+LIFT_M = 5e-5
+"""Height of the upright bars' lower ends above z = 0, metres, so that they do not coincide with the paper."""
 
 AXIS_NAMES = ("x", "y", "z")
 

@@ -11,6 +11,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.config.specs import PierSpec
+from dataset_builder.scene.assemblies.lattice import LIFT_M
 from dataset_builder.scene.assemblies.pier_layout import (
     BentBarType,
     PierLayout,
@@ -18,7 +19,7 @@ from dataset_builder.scene.assemblies.pier_layout import (
     tie_row,
     vertical_positions_m,
 )
-from dataset_builder.scene.model import LIFT_M, Assembly, Mesh, axis_of
+from dataset_builder.scene.model import Assembly, Mesh, axis_of
 from dataset_builder.scene.shapes.bar_mesh import plain_bar_mesh
 from dataset_builder.scene.shapes.bending import bent_line_m
 from rebar_depth_bench.data.bars import Bar

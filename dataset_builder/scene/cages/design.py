@@ -10,7 +10,6 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.scene.cages.rules import CRANK_SLOPE, contact_m, lap_m
-from dataset_builder.scene.model import LIFT_M
 from dataset_builder.scene.shapes.bending import bend_radius_m, bent_line_m
 
 Line = Float64[ndarray, "n 3"]
@@ -18,6 +17,9 @@ Direction = tuple[float, float, float]
 X: Direction = (1.0, 0.0, 0.0)
 Y: Direction = (0.0, 1.0, 0.0)
 Z: Direction = (0.0, 0.0, 1.0)
+
+STANDING_M = 5e-5
+"""Height of the ends of standing bars above z = 0, so that they do not coincide with the ground."""
 
 
 class InfeasibleError(ValueError):
@@ -46,7 +48,7 @@ class DesignBar:
 class Design:
     """Bars of a cage, world frame, and what was drawn: names and values of its parameters, metres.
 
-    ``ground_m`` is the height of the lowest point of its steel above z = 0: ``LIFT_M`` if bars stand on the
+    ``ground_m`` is the height of the lowest point of its steel above z = 0: ``STANDING_M`` if bars stand on the
     ground, or the cover of a cage on spacers.
     """
 
@@ -58,7 +60,7 @@ class Design:
     @property
     def stands(self) -> bool:
         """True if bars stand on the ground."""
-        return self.ground_m == LIFT_M
+        return self.ground_m == STANDING_M
 
 
 def straight(start_m: Sequence[float], end_m: Sequence[float]) -> Line:

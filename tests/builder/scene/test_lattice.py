@@ -9,8 +9,8 @@ import pytest
 from numpy import ndarray
 
 from dataset_builder.config.specs import LatticeSpec
-from dataset_builder.scene.assemblies.lattice import CLEAR_GAP_M, lattice_assembly
-from dataset_builder.scene.model import LIFT_M, Assembly
+from dataset_builder.scene.assemblies.lattice import CLEAR_GAP_M, LIFT_M, lattice_assembly
+from dataset_builder.scene.model import Assembly
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
 from rebar_depth_bench.data.bars import Bar
 

@@ -10,9 +10,10 @@ import trimesh
 
 from dataset_builder.config.specs import PierSpec
 from dataset_builder.scene.assemblies import aim_point_m, make_assembly
+from dataset_builder.scene.assemblies.lattice import LIFT_M
 from dataset_builder.scene.assemblies.pier import pier_assembly
 from dataset_builder.scene.assemblies.pier_layout import CLEAR_GAP_M
-from dataset_builder.scene.model import LIFT_M, Assembly, Part
+from dataset_builder.scene.model import Assembly, Part
 from dataset_builder.scene.shapes.bar_mesh import plain_outer_radius_m
 from rebar_depth_bench.data.bars import Bar
 from tests.builder.scene.polylines import (

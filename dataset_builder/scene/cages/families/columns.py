@@ -8,6 +8,7 @@ import numpy as np
 
 from dataset_builder.scene.cages.design import (
     LYING,
+    STANDING_M,
     Design,
     DesignBar,
     InfeasibleError,
@@ -31,7 +32,6 @@ from dataset_builder.scene.cages.rules import (
     link_diameters_m,
 )
 from dataset_builder.scene.cages.sections import RoundSection, Section, bundled, main_bars, stirrups, ties
-from dataset_builder.scene.model import LIFT_M
 
 LYING_M = 2e-4
 """Height above the ground of the lowest steel of a cage that lies."""
@@ -70,7 +70,7 @@ def column(rng: np.random.Generator, shape: str) -> Design:
     drawn = {**common, "diameter_m": diameter_m, "bars": float(section.bars), "spacing_m": spacing_m}
     drawn["steel_share"] = share
     drawn |= {"extra": "none"} if lap is None else {"extra": "laps", "lap_start_m": lap.start_m}
-    return Design("column", tuple(bars), drawn, LIFT_M)
+    return Design("column", tuple(bars), drawn, STANDING_M)
 
 
 def _drawn_lap(rng: np.random.Generator, bar_m: float, has_laps: bool) -> Lap | None:
@@ -125,7 +125,7 @@ def _rectangular(rng: np.random.Generator, shape: str, common: dict[str, float |
         "steel_share": share,
     }
     drawn |= {} if lap is None else {"lap_start_m": lap.start_m}
-    return Design("column", tuple(bars), drawn, LIFT_M)
+    return Design("column", tuple(bars), drawn, STANDING_M)
 
 
 def pile_cage(rng: np.random.Generator, shape: str) -> Design:
@@ -164,4 +164,4 @@ def pile_cage(rng: np.random.Generator, shape: str) -> Design:
         "steel_share": share,
         "lies": float(lies),
     }
-    return Design("pile-cage", tuple(bars), drawn, LYING_M if lies else LIFT_M)
+    return Design("pile-cage", tuple(bars), drawn, LYING_M if lies else STANDING_M)

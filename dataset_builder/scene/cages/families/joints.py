@@ -9,6 +9,7 @@ import numpy as np
 
 from dataset_builder.scene.cages.design import (
     LYING,
+    STANDING_M,
     Design,
     DesignBar,
     InfeasibleError,
@@ -35,7 +36,6 @@ from dataset_builder.scene.cages.rules import (
     link_diameters_m,
 )
 from dataset_builder.scene.cages.sections import LINK, Section, links_height_m, main_bars, stirrups, ties
-from dataset_builder.scene.model import LIFT_M
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
 from dataset_builder.scene.shapes.capsules import Clearances
 
@@ -86,7 +86,7 @@ def joint(rng: np.random.Generator, shape: str) -> Design:
         "ties_left_out": float(len(held) - len(kept)),
     }
     bars = (*standing, *stirrups(column, levels), *kept, *beam)
-    return Design("joint", bars, drawn, LIFT_M)
+    return Design("joint", bars, drawn, STANDING_M)
 
 
 def _beam(

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from dataset_builder.scene.cages.design import (
+    STANDING_M,
     Design,
     DesignBar,
     InfeasibleError,
@@ -32,7 +33,6 @@ from dataset_builder.scene.cages.rules import (
     wall_spacing_m,
 )
 from dataset_builder.scene.cages.sections import TIE, held_tie_m
-from dataset_builder.scene.model import LIFT_M
 from dataset_builder.scene.shapes.bending import bend_radius_m
 
 UPRIGHT, LEVEL, U_BAR = "upright", "level", "u-bar"
@@ -99,7 +99,7 @@ def wall(rng: np.random.Generator, shape: str) -> Design:
     bars += _ties(columns, rows, (spacing_m, level_spacing_m), (tie_m, upright_m, level_m), upright_y)
     if shape == "u-bars":
         bars += _u_bars(level_m, rows, end_x - level_m / 2, level_y)
-    return Design("wall", tuple(bars), drawn, LIFT_M)
+    return Design("wall", tuple(bars), drawn, STANDING_M)
 
 
 def _level_bars(level_m: float, rows: Sequence[float], end_x: float, level_y: float) -> list[DesignBar]:
