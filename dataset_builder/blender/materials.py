@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray
 
-from dataset_builder.blender.shader_nodes import Colour, MaterialBuilder
+from dataset_builder.blender.shader_nodes import MaterialBuilder
+from dataset_builder.scene.model import Colour
 
 RUST_PROPERTY, PATTERN_PROPERTY, TONE_PROPERTY = "rust_amount", "pattern_shift_m", "scale_tone"
 """Names of the custom properties of a steel object that its material reads."""

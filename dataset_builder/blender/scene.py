@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import bpy
@@ -10,16 +10,7 @@ import numpy as np
 from jaxtyping import Float64, Int32
 from numpy import ndarray
 
-from dataset_builder.blender.lights import (
-    DECK_LIGHT,
-    HALL_LIGHT,
-    LABORATORY_LIGHT,
-    OUTDOOR_LIGHT,
-    LightRig,
-    add_light,
-    add_panorama,
-    let_light_through,
-)
+from dataset_builder.blender.lights import add_light, add_panorama, let_light_through
 from dataset_builder.blender.materials import (
     GLOW_PROPERTY,
     LAMP,
@@ -29,49 +20,14 @@ from dataset_builder.blender.materials import (
     surface_variation,
 )
 from dataset_builder.config.specs import SceneSpec
-from dataset_builder.config.surroundings import check_suitable
+from dataset_builder.config.surroundings import SURROUNDINGS
 from dataset_builder.scene.board_texture import board_texture
-from dataset_builder.scene.environments.deck import deck
-from dataset_builder.scene.environments.hall import ROOF, hall
-from dataset_builder.scene.environments.hall import WALLS as HALL_WALLS
-from dataset_builder.scene.environments.laboratory import BENCH_TOP_M, SHEET_THICKNESS_M, WALLS, laboratory
-from dataset_builder.scene.environments.outdoors import outdoors
+from dataset_builder.scene.environments.laboratory import BENCH_TOP_M, SHEET_THICKNESS_M
 from dataset_builder.scene.model import NOT_STEEL, Assembly, Mesh, Part, WorldMesh, surface
 from dataset_builder.scene.shapes.solids import box, merge_meshes, transformed
 from dataset_builder.scene.variants.props import make_props
-from dataset_builder.scene.variants.registry import (
-    LIGHT_SLOT,
-    STEEL_SLOT,
-    check_variants,
-    exclusive_variant,
-    image_light,
-)
+from dataset_builder.scene.variants.registry import LIGHT_SLOT, STEEL_SLOT, exclusive_variant, image_light
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
-
-
-@dataclass(frozen=True)
-class Environment:
-    """Surroundings of the steel: surfaces (world, none is steel) and lights by light variant (None: default).
-
-    ``enclosure`` and ``roof`` are the first words of the names of surfaces that would keep out the light of a
-    panorama, and that of any sky or lamp.
-    """
-
-    parts: Callable[[], tuple[Part, ...]]
-    light: Mapping[str | None, LightRig]
-    floor_m: float
-    """Height of the surface that a board lies on."""
-    enclosure: tuple[str, ...]
-    roof: tuple[str, ...] = ()
-
-
-ENVIRONMENTS: Mapping[str, Environment] = {
-    "laboratory": Environment(laboratory, LABORATORY_LIGHT, BENCH_TOP_M, WALLS),
-    "outdoors": Environment(outdoors, OUTDOOR_LIGHT, 0.0, ("trees",)),
-    "hall": Environment(hall, HALL_LIGHT, 0.0, HALL_WALLS, ROOF),
-    "deck": Environment(deck, DECK_LIGHT, 0.0, ("trees", "hills", "core")),
-}
-
 
 BAR_ID = "bar_id"
 """Name of the custom property with an object's bar id."""
@@ -89,12 +45,10 @@ SHAPE_TOLERANCE_M = 1e-9
 def build_scene(assembly: Assembly, spec: SceneSpec, *, colour: bool = True) -> None:
     """Replace Blender's open file with the scene: one object per steel part, environment, props, board and lights.
 
-    Without ``colour``, the scene has the same meshes but neither materials nor lights.
-    Raises ``InputError`` if the appearance variants do not pass ``check_variants`` or do not suit the environment.
+    Without ``colour``, the scene has the same meshes but neither materials nor lights. The appearance variants
+    must have passed ``check_variants`` and ``check_suitable``.
     """
     variants = spec.appearance.variants
-    check_variants(variants)
-    check_suitable(spec.environment, variants)
     bpy.ops.wm.read_factory_settings(use_empty=True)
     for part, mesh, origin_m in _with_shared_meshes(
         _with_material(assembly.parts, exclusive_variant(variants, STEEL_SLOT)), colour
@@ -102,13 +56,13 @@ def build_scene(assembly: Assembly, spec: SceneSpec, *, colour: bool = True) -> 
         steel = add_object(part, mesh, origin_m)
         for name, value in surface_variation(spec.seed, part.bar_id).items():
             steel[name] = value
-    environment = ENVIRONMENTS[spec.environment]
+    surroundings = SURROUNDINGS[spec.environment]
     # A floor at z = 0 would coincide with the top of the sheet, so it is lowered under a board.
-    offset_z_m = 0.0 if spec.board is None else min(0.0, BENCH_TOP_M - environment.floor_m)
+    offset_z_m = 0.0 if spec.board is None else min(0.0, BENCH_TOP_M - surroundings.floor_m)
     panorama = image_light(spec)
-    rig = None if panorama is not None else environment.light[exclusive_variant(variants, LIGHT_SLOT)]
-    opened = environment.roof if panorama is None else (*environment.enclosure, *environment.roof)
-    for part in environment.parts():
+    rig = None if panorama is not None else surroundings.light[exclusive_variant(variants, LIGHT_SLOT)]
+    opened = surroundings.roof if panorama is None else (*surroundings.enclosure, *surroundings.roof)
+    for part in surroundings.parts():
         added = add_object(part, _part_data(part, part.mesh, colour), np.array([0.0, 0.0, offset_z_m]))
         if part.name.partition("-")[0] in opened:
             let_light_through(added)

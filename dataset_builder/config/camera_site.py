@@ -6,42 +6,19 @@ World frame, metres.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
+from dataset_builder.config.surroundings import CameraSpace
 from dataset_builder.scene.model import NOT_STEEL, Assembly, Part, WorldMesh
 from dataset_builder.scene.raycast import RayCaster
 from dataset_builder.scene.shapes.point_sets import SurfaceSampler, covering_points
 from dataset_builder.scene.shapes.solids import merge_meshes
 
-GROUND_CLEARANCE_M = 0.1
-"""Least height of an eye above the ground, or above objects that stand there, metres."""
-
 SIGHT_TOLERANCE_M = 0.01
 """Largest distance along the line of sight between its first hit and the aimed point: about a bar's radius."""
-
-
-@dataclass(frozen=True)
-class CameraSpace:
-    """Space for cameras: within ``radius_m`` of the origin in plan, above the ground, not above ``ceiling_m``.
-
-    Objects up to ``objects_m`` high stand on the ground beyond ``clear_radius_m``.
-    """
-
-    radius_m: float
-    clear_radius_m: float
-    objects_m: float = 0.0
-    ceiling_m: float = np.inf
-
-    def contains(self, points_m: Float64[ndarray, "n 3"]) -> Bool[ndarray, " n"]:
-        """Return which points are in the space."""
-        plan_m = np.hypot(points_m[:, 0], points_m[:, 1])
-        lowest_m = GROUND_CLEARANCE_M + np.where(plan_m > self.clear_radius_m, self.objects_m, 0.0)
-        is_between = (points_m[:, 2] >= lowest_m) & (points_m[:, 2] <= self.ceiling_m)
-        return np.asarray((plan_m <= self.radius_m) & is_between)
 
 
 class CameraSite:

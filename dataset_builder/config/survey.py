@@ -14,9 +14,10 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
-from dataset_builder.config.camera_site import GROUND_CLEARANCE_M, CameraSite, CameraSpace
+from dataset_builder.config.camera_site import CameraSite
 from dataset_builder.config.rigs import rig_cameras
 from dataset_builder.config.specs import RigSpec, Station, SurveySpec
+from dataset_builder.config.surroundings import GROUND_CLEARANCE_M, CameraSpace
 from dataset_builder.config.trajectories import look_at_with_rig
 from dataset_builder.scene.model import Assembly
 from dataset_builder.scene.shapes.point_sets import SurfacePoints, farthest_points, short_path

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from dataset_builder.config.camera_site import CameraSite, CameraSpace
+from dataset_builder.config.camera_site import CameraSite
 from dataset_builder.config.random_views import (
     MAX_ROLL_DEG,
     MIN_STEEL_SHARE,
@@ -21,6 +21,7 @@ from dataset_builder.config.random_views import (
 from dataset_builder.config.rigs import rig_cameras
 from dataset_builder.config.specs import FocalRigSpec, GeneratedCageSpec, RandomViewsSpec
 from dataset_builder.config.stereo_cameras import STEREO_CAMERAS, StereoCamera, focal_of_view_px
+from dataset_builder.config.surroundings import CameraSpace
 from dataset_builder.config.trajectories import camera_offsets_m, look_at_with_rig, poses, view_count
 from dataset_builder.scene.assemblies import make_assembly
 from dataset_builder.scene.cages.generate import FAMILIES

@@ -12,11 +12,12 @@ import pytest
 from numpy import ndarray
 from scipy.spatial import cKDTree
 
-from dataset_builder.config.camera_site import GROUND_CLEARANCE_M, SIGHT_TOLERANCE_M, CameraSpace
+from dataset_builder.config.camera_site import SIGHT_TOLERANCE_M
 from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.config.rigs import rig_cameras
 from dataset_builder.config.scene_file import scene_config
 from dataset_builder.config.specs import ConfigSpec, RigSpec, SurveySpec
+from dataset_builder.config.surroundings import GROUND_CLEARANCE_M, CameraSpace
 from dataset_builder.config.survey import NEAR, steel_clearance_m, with_stations
 from dataset_builder.config.trajectories import camera_offsets_m, poses, view_count
 from dataset_builder.scene.assemblies import aim_point_m, check_fits, make_assembly
