@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import bpy
 import numpy as np
@@ -14,9 +14,9 @@ from dataset_builder.blender.lights import add_light, add_panorama, let_light_th
 from dataset_builder.blender.materials import (
     GLOW_PROPERTY,
     LAMP,
-    STEEL_VARIANT_MATERIALS,
     material,
     paper,
+    steel_material_name,
     surface_variation,
 )
 from dataset_builder.config.specs import SceneSpec
@@ -50,9 +50,8 @@ def build_scene(assembly: Assembly, spec: SceneSpec, *, colour: bool = True) -> 
     """
     variants = spec.appearance.variants
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    for part, mesh, origin_m in _with_shared_meshes(
-        _with_material(assembly.parts, exclusive_variant(variants, STEEL_SLOT)), colour
-    ):
+    steel_material = steel_material_name(exclusive_variant(variants, STEEL_SLOT)) if colour else None
+    for part, mesh, origin_m in _with_shared_meshes(assembly.parts, steel_material):
         steel = add_object(part, mesh, origin_m)
         for name, value in surface_variation(spec.seed, part.bar_id).items():
             steel[name] = value
@@ -63,13 +62,13 @@ def build_scene(assembly: Assembly, spec: SceneSpec, *, colour: bool = True) -> 
     rig = None if panorama is not None else surroundings.light[exclusive_variant(variants, LIGHT_SLOT)]
     opened = surroundings.roof if panorama is None else (*surroundings.enclosure, *surroundings.roof)
     for part in surroundings.parts():
-        added = add_object(part, _part_data(part, part.mesh, colour), np.array([0.0, 0.0, offset_z_m]))
+        added = _add_surface(part, offset_z_m, colour)
         if part.name.partition("-")[0] in opened:
             let_light_through(added)
         if part.material == LAMP:
             added[GLOW_PROPERTY] = 0.0 if rig is None else rig.glow
     for part in make_props(assembly, spec):
-        add_object(part, _part_data(part, part.mesh, colour), np.zeros(3))
+        _add_surface(part, 0.0, colour)
     if spec.board is not None:
         _add_board(spec.board, colour)
     if colour and panorama is not None:
@@ -79,27 +78,18 @@ def build_scene(assembly: Assembly, spec: SceneSpec, *, colour: bool = True) -> 
     bpy.context.view_layer.update()
 
 
-def _with_material(parts: tuple[Part, ...], look: str | None) -> tuple[Part, ...]:
-    """Return the parts with the material of a steel variant, or unchanged for None."""
-    return (
-        parts if look is None else tuple(replace(part, material=STEEL_VARIANT_MATERIALS[look]) for part in parts)
-    )
-
-
 def _with_shared_meshes(
-    parts: tuple[Part, ...], colour: bool
+    parts: tuple[Part, ...], material_name: str | None
 ) -> Iterator[tuple[Part, bpy.types.Mesh, Float64[ndarray, " 3"]]]:
     """Yield each part with its mesh data and origin; parts that differ only by a translation share mesh data."""
-    shapes: list[tuple[Mesh, str, bpy.types.Mesh]] = []
+    shapes: list[tuple[Mesh, bpy.types.Mesh]] = []
     for part in parts:
         origin_m = part.mesh.vertices_m.min(axis=0)
         local = Mesh(part.mesh.vertices_m - origin_m, part.mesh.faces)
-        data = next(
-            (data for mesh, name, data in shapes if name == part.material and _same_shape(mesh, local)), None
-        )
+        data = next((data for mesh, data in shapes if _same_shape(mesh, local)), None)
         if data is None:
-            data = _part_data(part, local, colour)
-            shapes.append((local, part.material, data))
+            data = mesh_data(part.name, local, material_name)
+            shapes.append((local, data))
         yield part, data, origin_m
 
 
@@ -121,9 +111,10 @@ def add_object(part: Part, data: bpy.types.Mesh, origin_m: Float64[ndarray, " 3"
     return added
 
 
-def _part_data(part: Part, mesh: Mesh, colour: bool) -> bpy.types.Mesh:
-    """Return Blender mesh data with the triangles of ``mesh``, with the part's material if ``colour`` is True."""
-    return mesh_data(part.name, mesh, part.material if colour else None)
+def _add_surface(part: Part, height_m: float, colour: bool) -> bpy.types.Object:
+    """Add a part to the open scene, ``height_m`` above its place, with its material if ``colour`` is True."""
+    data = mesh_data(part.name, part.mesh, part.material if colour else None)
+    return add_object(part, data, np.array([0.0, 0.0, height_m]))
 
 
 def mesh_data(name: str, mesh: Mesh, material_name: str | None) -> bpy.types.Mesh:
