@@ -8,7 +8,7 @@ from pathlib import Path
 from dataset_builder.config.cages import CAGES, CagesRequest
 from dataset_builder.config.catalog import CONFIGS, SWEEPS, BuildRequest
 from dataset_builder.config.specs import CPU, DEFAULT_QUALITY, GPU_TYPES, QUALITIES, SAMPLINGS
-from dataset_builder.scene.variants import VARIANTS
+from dataset_builder.scene.variants.registry import VARIANTS
 from rebar_depth_bench.view_ids import SPLITS
 
 

@@ -13,9 +13,9 @@ from dataset_builder.config.camera_placement import RANDOM_RULES
 from dataset_builder.config.manifest_specs import cage_spec, trajectory_spec
 from dataset_builder.config.specs import RandomViewsSpec
 from dataset_builder.scene.assemblies import assembly_bars
-from dataset_builder.scene.cages.clearance import Clearances
 from dataset_builder.scene.cages.generate import VERSION
-from dataset_builder.scene.cages.rules import radius_m
+from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
+from dataset_builder.scene.shapes.capsules import Clearances
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 
@@ -76,7 +76,7 @@ def _lines(a: Bar, b: Bar) -> list[tuple[ndarray, ndarray]]:
 
 def _gap_check(scene: DatasetConfig, bars: Sequence[Bar]) -> Check:
     """Return the check that no two bars touch, ribs included."""
-    lines, radii = [np.array(bar.axis_m) for bar in bars], [radius_m(bar.diameter_m) for bar in bars]
+    lines, radii = [np.array(bar.axis_m) for bar in bars], [outer_radius_m(bar.diameter_m) for bar in bars]
     clearances = Clearances(lines, radii)
     least_m = min(
         clearances.least_m(line, radius, i) for i, (line, radius) in enumerate(zip(lines, radii, strict=True))
@@ -100,7 +100,7 @@ def _clearance_check(scene: DatasetConfig, bars: Sequence[Bar]) -> Check:
         return Check.skip(name, "no random views")
     centres_m = np.array([centre_m for centre_m, *_ in views.stations])
     nearest_m = min(
-        float((polyline_distance_m(centres_m, np.array(bar.axis_m)) - radius_m(bar.diameter_m)).min())
+        float((polyline_distance_m(centres_m, np.array(bar.axis_m)) - outer_radius_m(bar.diameter_m)).min())
         for bar in bars
     )
     bound_m = RANDOM_RULES.clearance_m(views.distances_m[0])

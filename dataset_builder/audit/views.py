@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.scene.model import ESTIMATED_ROLE
-from dataset_builder.scene.variants import PROPS_SLOT, variants_of_slot
+from dataset_builder.scene.variants.registry import PROPS_SLOT, variants_of_slot
 from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.data.columns import EYES
 from rebar_depth_bench.data.eye_view import EyeView, eye_from_row

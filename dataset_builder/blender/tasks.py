@@ -26,9 +26,8 @@ from numpy import ndarray
 
 from dataset_builder.blender.colour import configure_colour, render_colour
 from dataset_builder.blender.devices import select_device
-from dataset_builder.blender.evaluated_mesh import evaluated_world_mesh
 from dataset_builder.blender.render import render_depth, use_cycles
-from dataset_builder.blender.scene import add_object, build_scene, mesh_data
+from dataset_builder.blender.scene import add_object, build_scene, evaluated_world_mesh, mesh_data
 from dataset_builder.config.rigs import rig_cameras
 from dataset_builder.config.specs import ConfigSpec
 from dataset_builder.config.trajectories import aim_point_m, poses

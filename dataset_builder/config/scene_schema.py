@@ -55,7 +55,7 @@ from dataset_builder.config.specs import DomeSpec, RigSpec, RingSpec, SurveySpec
 from dataset_builder.config.surroundings import SURROUNDINGS
 from dataset_builder.scene.model import MAX_BARS, to_metres
 from dataset_builder.scene.selection import KEYS, Selection
-from dataset_builder.scene.variants import VARIANTS
+from dataset_builder.scene.variants.registry import VARIANTS
 from rebar_depth_bench.errors import InputError, Problem
 from rebar_depth_bench.reading import parse_toml
 from rebar_depth_bench.validation import (

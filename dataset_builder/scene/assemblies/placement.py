@@ -13,6 +13,7 @@ from dataset_builder.config.file_specs import PlacementSpec
 from dataset_builder.scene.assemblies.bar_meshes import bar_mesh, bar_reach_m, with_ribs_chosen
 from dataset_builder.scene.assemblies.cage import Cage, CageBar
 from dataset_builder.scene.model import METRE_DECIMALS, Mesh, axis_of
+from dataset_builder.scene.shapes.solids import rotation_about_z
 
 _Z_FROM_UP = {"z": np.eye(3), "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])}
 """Rotation from the axes of a file to those of the world, by the file's vertical axis."""
@@ -74,9 +75,7 @@ class _Motion:
 def _about_z(angle_deg: float) -> Float64[ndarray, "3 3"]:
     """Return the rotation about the z axis; exact for multiples of 90 degrees."""
     quarter_turns, rest_deg = divmod(angle_deg, 90.0)
-    cosine, sine = np.cos(np.deg2rad(rest_deg)), np.sin(np.deg2rad(rest_deg))
-    rest = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
-    return np.asarray(rest @ np.linalg.matrix_power(_QUARTER_TURN, int(quarter_turns) % 4))
+    return np.asarray(rotation_about_z(rest_deg) @ np.linalg.matrix_power(_QUARTER_TURN, int(quarter_turns) % 4))
 
 
 def _origin_m(
