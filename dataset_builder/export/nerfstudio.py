@@ -12,14 +12,10 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import numpy as np
-from jaxtyping import Float64
-from numpy import ndarray
-
 from dataset_builder.export.colmap import HALF_PIXEL
 from dataset_builder.export.images import EXPORT_FILES, MILLIMETRE_M
 from dataset_builder.export.views import CameraView
-from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid
+from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid, swap_camera_axes
 
 _EMPTY_END = "[]\n}"
 """End of a JSON object whose last member is an empty list."""
@@ -35,10 +31,6 @@ def json_lines(head: Mapping[str, Any], name: str, entries: Sequence[Mapping[str
     return f"{head_text}[\n{lines}\n]}}\n"
 
 
-_OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Change of camera axes from OpenGL to OpenCV."""
-
-
 def transforms_json(views: Sequence[CameraView]) -> str:
     """Return ``transforms.json``; intrinsics are at the top level if all frames share them, else in each frame."""
     frames = [(view.stem(eye), camera) for view in views for eye, camera in view.cameras.items()]
@@ -52,18 +44,13 @@ def transforms_json(views: Sequence[CameraView]) -> str:
     return json_lines(head, "frames", entries)
 
 
-def world_from_opengl_cam(cam_from_world: Float64[ndarray, "4 4"]) -> Float64[ndarray, "4 4"]:
-    """Return the pose of a camera in OpenGL axes (x right, y up, z backwards) from our ``cam_from_world``."""
-    return np.asarray(inverse_rigid(cam_from_world) @ _OPENCV_FROM_OPENGL)
-
-
 def _frame(stem: str, camera: Camera) -> dict[str, Any]:
     """Return the file names and the pose of one frame."""
     return {
         "file_path": EXPORT_FILES["image"].path(stem),
         "mask_path": EXPORT_FILES["mask"].path(stem),
         "depth_file_path": EXPORT_FILES["depth_mm"].path(stem),
-        "transform_matrix": world_from_opengl_cam(camera.cam_from_world).tolist(),
+        "transform_matrix": inverse_rigid(swap_camera_axes(camera.cam_from_world)).tolist(),
     }
 
 

@@ -9,17 +9,16 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.importing.layout import UNITS_M, PosesTable
+from dataset_builder.importing.layout import PosesTable
 from rebar_depth_bench.errors import EntryError, InputError, Problem, escape_text
-from rebar_depth_bench.geometry.cameras import inverse_rigid
+from rebar_depth_bench.geometry.cameras import inverse_rigid, swap_camera_axes
 from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.reading import parse_json, read_file
-from rebar_depth_bench.validation import short_repr
+from rebar_depth_bench.validation import UNITS_M, short_repr
 
 MATRIX_SUFFIXES = (".txt", ".npy", ".json")
 _ROUNDED_ROTATION = 1e-3
 """Largest deviation of ``R @ R.T`` from the identity in files with few digits; the rotation is made exact."""
-_OPENCV_FROM_OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def read_matrix(path: Path, key: str | None, shape: tuple[int, int]) -> Float64[ndarray, "n m"]:
@@ -56,7 +55,7 @@ def cam_from_world(path: Path, table: PosesTable) -> Float64[ndarray, "4 4"]:
     pose[:3, 3] *= UNITS_M[table.unit]
     if table.kind == "world_from_cam":
         pose = inverse_rigid(pose)
-    return _OPENCV_FROM_OPENGL @ pose if table.axes == "opengl" else pose
+    return swap_camera_axes(pose) if table.axes == "opengl" else pose
 
 
 def _text(content: bytes, _: str | None) -> ndarray:

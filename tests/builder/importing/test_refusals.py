@@ -59,6 +59,8 @@ def refused(layout: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> str:
         ("[bars]", "[masks]\nvalues = 255\n[bars]", "invalid", "masks.values", 38),
         ('\n[poses]\nfile = "poses/{view}.txt"\n', "", "conflict", "", None),
         ('"bars.csv"', '"../bars.csv"', "invalid", "bars.file", 38),
+        ('"bars.csv"', '"~/bars.csv"', "invalid", "bars.file", 38),
+        ('"bars.csv"', '""', "invalid", "bars.file", 38),
     ],
 )
 def test_invalid_layout_is_refused_with_its_line(
