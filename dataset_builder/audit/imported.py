@@ -14,8 +14,8 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from dataset_builder.audit.checks import Check
 from dataset_builder.audit.geometry import polyline_distance_m
-from dataset_builder.audit.report import Check
 from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.data.columns import COLUMNS
 from rebar_depth_bench.data.config_tables import Imported, ViewRecord

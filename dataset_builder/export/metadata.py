@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from dataset_builder.export.images import EXPORT_FILES, ExportFile
-from dataset_builder.export.nerfstudio import json_lines
-from dataset_builder.export.views import CameraView
+from dataset_builder.export.camera_formats import json_lines
+from dataset_builder.export.exported_views import EXPORT_FILES, CameraView, ExportFile
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.manifest import DatasetFolder
 from rebar_depth_bench.geometry.cameras import Camera

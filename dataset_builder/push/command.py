@@ -6,8 +6,8 @@ import argparse
 import re
 import sys
 
-from dataset_builder.push.errors import require_online, require_token
-from dataset_builder.push.repository import MAIN_BRANCH, Repository, check_repository_id
+from dataset_builder.push.hub_errors import require_online, require_token
+from dataset_builder.push.pushing import MAIN_BRANCH, Repository, check_repository_id
 from rebar_depth_bench.console import ProgressBars, print_notice
 from rebar_depth_bench.errors import InputError, escape_text
 from rebar_depth_bench.paths import PATH_PATTERN
@@ -40,8 +40,7 @@ def run(options: argparse.Namespace) -> None:
     require_online()
     if options.yes:
         require_token()
-    from dataset_builder.push.run import plan_push, send_push
-    from dataset_builder.push.verified import verified_folder
+    from dataset_builder.push.pushing import plan_push, send_push, verified_folder
 
     with ProgressBars() as bars:
         source = verified_folder(options.root, bars.update)

@@ -17,10 +17,14 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from dataset_builder.export import export
-from dataset_builder.export.colmap import cameras_txt, images_txt, points_txt, quaternion_wxyz
-from dataset_builder.export.images import depth_exr, depth_mm_png
-from dataset_builder.export.nerfstudio import transforms_json
-from dataset_builder.export.views import CameraView
+from dataset_builder.export.camera_formats import (
+    cameras_txt,
+    images_txt,
+    points_txt,
+    quaternion_wxyz,
+    transforms_json,
+)
+from dataset_builder.export.exported_views import CameraView, depth_exr, depth_mm_png
 from rebar_depth_bench import load
 from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m

@@ -7,12 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dataset_builder.config.trajectories import subset
-from dataset_builder.export.colmap import cameras_txt, images_txt, points_txt
-from dataset_builder.export.images import EXPORT_FILES
+from dataset_builder.export.camera_formats import cameras_txt, images_txt, points_txt, transforms_json
+from dataset_builder.export.exported_views import EXPORT_FILES, CameraView, StoredView, stored_views
 from dataset_builder.export.metadata import cameras_json, exported_files, readme_txt
-from dataset_builder.export.nerfstudio import transforms_json
 from dataset_builder.export.target import ExportedPart, export_target
-from dataset_builder.export.views import CameraView, StoredView, stored_views
 from rebar_depth_bench.atomic_io import write_bytes, write_error, write_text
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars
 from rebar_depth_bench.data.dataset_config import DatasetConfig

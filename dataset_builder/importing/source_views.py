@@ -12,10 +12,18 @@ import numpy as np
 from jaxtyping import Bool
 from numpy import ndarray
 
-from dataset_builder.importing.depth_maps import DEPTH_SUFFIXES, depth_converter, read_depth
-from dataset_builder.importing.labels import LABEL_SUFFIXES, bar_ids, read_labels
-from dataset_builder.importing.layout import VIEW, Layout
-from dataset_builder.importing.matrices import MATRIX_SUFFIXES, cam_from_world, read_matrix
+from dataset_builder.importing.import_layout import VIEW, Layout
+from dataset_builder.importing.source_files import (
+    DEPTH_SUFFIXES,
+    LABEL_SUFFIXES,
+    MATRIX_SUFFIXES,
+    bar_ids,
+    cam_from_world,
+    depth_converter,
+    read_depth,
+    read_labels,
+    read_matrix,
+)
 from rebar_depth_bench.captures.camera_files import CaptureCameras, cameras_of_table
 from rebar_depth_bench.captures.image_files import IMAGE_SUFFIXES, common_shape, read_image
 from rebar_depth_bench.data.columns import EYES, column_kind

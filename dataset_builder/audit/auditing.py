@@ -1,13 +1,15 @@
-"""Audit of a dataset folder: runs every check in one pass over the rows of each config."""
+"""Audit of a dataset folder: its files, and every check in one pass over the rows of each config."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from dataset_builder.audit.cameras import (
+import numpy as np
+
+from dataset_builder.audit.camera_checks import (
     ExpectedView,
     camera_problems,
     checked_aim_point_m,
@@ -16,22 +18,111 @@ from dataset_builder.audit.cameras import (
     view_list_problems,
     view_projection_error_px,
 )
-from dataset_builder.audit.cycles_depth import cycles_difference_m, cycles_verdict
-from dataset_builder.audit.files import check_crossings, check_files, row_problems
-from dataset_builder.audit.geometry import axis_verdict, board_verdict, max_axis_distance_ratio, view_board_error
+from dataset_builder.audit.checks import (
+    AuditedConfig,
+    AuditedEye,
+    AuditedView,
+    AuditReport,
+    Check,
+    RayCache,
+    view_from_row,
+)
+from dataset_builder.audit.geometry import (
+    axis_verdict,
+    board_verdict,
+    cage_checks,
+    max_axis_distance_ratio,
+    merged_checks,
+    view_board_error,
+)
 from dataset_builder.audit.imported import imported_checks
-from dataset_builder.audit.report import AuditReport, Check
-from dataset_builder.audit.scenes import cage_checks, merged_checks
-from dataset_builder.audit.stereo_consistency import epipolar_counts, epipolar_verdict
-from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView, RayCache, view_from_row
+from dataset_builder.audit.independent_depth import (
+    cycles_difference_m,
+    cycles_verdict,
+    epipolar_counts,
+    epipolar_verdict,
+)
 from dataset_builder.config.trajectories import subset
+from dataset_builder.pipeline.plan import BUILD_FOLDER
+from rebar_depth_bench.bar_crossings.definition import Crossings, scene_crossings
+from rebar_depth_bench.bar_crossings.table import CROSSINGS_FILE, folder_crossings
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars
-from rebar_depth_bench.data.columns import COLUMNS
+from rebar_depth_bench.data.columns import COLUMNS, EYES
+from rebar_depth_bench.data.config_tables import ViewRecord
 from rebar_depth_bench.data.dataset import iterate_rows
 from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.data.eye_view import EyeView, eye_from_row
+from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
+from rebar_depth_bench.data.verification import file_problems
 from rebar_depth_bench.errors import DatasetError, InputError
 from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.scoring.protocol import scored_pixels
+
+
+def check_files(folder: DatasetFolder, root: Path, progress: Progress) -> Check:
+    """Check that every file of the manifest exists with its SHA-256, and that the folder has no other file."""
+    problems = [str(problem) for problem in file_problems(folder, progress)]
+    if (root / BUILD_FOLDER).exists():
+        problems.append(
+            f"{BUILD_FOLDER}: the folder contains an unfinished build; run rebar-build again or remove it"
+        )
+    return Check("files against the manifest", f"{len(folder.files)} files", "all SHA-256 equal", tuple(problems))
+
+
+def check_crossings(folder: DatasetFolder, bars: Mapping[str, tuple[Bar, ...]]) -> Check:
+    """Check that the table of crossings holds the crossings of the bars, to ``_CROSSING_TOLERANCE_M``."""
+    if CROSSINGS_FILE not in folder.files:
+        return Check("crossings of the bars", "none", f"the folder has no {CROSSINGS_FILE}")
+    stored = folder_crossings(folder, bars).by_scene
+    expected = {
+        scene: crossings for scene, of_scene in bars.items() if len(crossings := scene_crossings(of_scene))
+    }
+    problems = [
+        f"{CROSSINGS_FILE}: scene {scene} differs from the crossings of its bars"
+        for scene in sorted({*stored, *expected})
+        if not _are_equal(stored.get(scene), expected.get(scene))
+    ]
+    total = sum(len(crossings) for crossings in expected.values())
+    return Check("crossings of the bars", f"{total} crossings", "equal to 1 nm", tuple(problems))
+
+
+_CROSSING_TOLERANCE_M = 1e-9
+
+
+def _are_equal(stored: Crossings | None, expected: Crossings | None) -> bool:
+    if stored is None or expected is None or len(stored) != len(expected):
+        return False
+    return all(
+        np.allclose(getattr(stored, field.name), getattr(expected, field.name), rtol=0, atol=_CROSSING_TOLERANCE_M)
+        for field in fields(Crossings)
+    )
+
+
+def row_problems(row: Mapping[str, Any], record: ViewRecord, bar_ids: set[int]) -> Iterator[str]:
+    """Yield the problems of a decoded row: masks, bar ids, differences from the manifest."""
+    eyes = {name: eye_from_row(row, name) for name in EYES}
+    for name, eye in eyes.items():
+        for problem in _ground_truth_problems(eye, bar_ids):
+            yield f"{name}: {problem}"
+    if row["view_id"] != record.view_id:
+        yield f"the row's view_id is {row['view_id']}, expected {record.view_id}"
+    for name, expected in (("left", record.left), ("right", record.right)):
+        if eyes[name].digest() != expected:
+            yield f"{name} ground-truth digest differs from the manifest's"
+    left = eyes["left"]
+    counts = np.count_nonzero(left.mask), len(scored_pixels(left.mask, left.depth_m))
+    if counts != (record.steel_px, record.scored_px):
+        yield "steel and scored pixel counts differ from the manifest's"
+
+
+def _ground_truth_problems(eye: EyeView, bar_ids: set[int]) -> Iterator[str]:
+    if not np.array_equal(eye.mask, eye.bars > 0):
+        yield "the mask differs from the pixels that have a bar id"
+    if (eye.depth_m[eye.mask] <= 0).any():
+        yield "steel pixels without depth"
+    unknown = set(np.unique(eye.bars[eye.mask]).tolist()) - bar_ids
+    if unknown:
+        yield f"bar ids {sorted(unknown)[:5]} are not in bars.parquet"
 
 
 @dataclass(frozen=True)

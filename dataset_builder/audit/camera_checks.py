@@ -18,8 +18,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.audit.report import Check
-from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
+from dataset_builder.audit.checks import AuditedConfig, AuditedEye, AuditedView, Check
 from dataset_builder.config.manifest_specs import rig_spec, trajectory_spec
 from dataset_builder.config.rigs import rig_cameras
 from dataset_builder.config.trajectories import poses, subset

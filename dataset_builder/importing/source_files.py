@@ -1,0 +1,300 @@
+"""Readers of files of other programs: depth maps, labels, matrices and surveyed bars."""
+
+from __future__ import annotations
+
+import io
+import warnings
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float32, Float64, Shaped, UInt16
+from numpy import ndarray
+
+from dataset_builder.importing.import_layout import DepthTable, PosesTable
+from rebar_depth_bench.data.bars import Bar
+from rebar_depth_bench.errors import EntryError, InputError, Problem, escape_text, exception_summary, format_shape
+from rebar_depth_bench.geometry.cameras import inverse_rigid, pixel_rays, swap_camera_axes
+from rebar_depth_bench.geometry.stereo_calibration import (
+    Calibration,
+    Lens,
+    StereoCalibration,
+    lens_distortion,
+    lens_K,
+)
+from rebar_depth_bench.limits import CELL_BYTES, TABLE_BYTES, TOML_BYTES
+from rebar_depth_bench.reading import parse_json, read_file
+from rebar_depth_bench.submission.formats import FORMATS
+from rebar_depth_bench.validation import UNITS_M, short_repr
+
+Grid = tuple[int, int]
+_PILLOW_FORMATS = {".tif": "TIFF", ".tiff": "TIFF", ".pfm": "PPM", ".png": "PNG"}
+DEPTH_SUFFIXES = (*FORMATS, *(suffix for suffix in _PILLOW_FORMATS if suffix not in FORMATS))
+
+
+def read_depth(path: Path, grid: Grid, table: DepthTable) -> Float64[ndarray, "h w"]:
+    """Return the values of a depth map of ``grid`` (height, width) times its factor; NaN where there is none.
+
+    Raises ``EntryError`` for a damaged file, and for one of another size.
+    """
+    suffix = path.suffix.lower()
+    content = read_content(path, "a depth map")
+    if suffix == ".exr" and table.channel is not None:
+        values = _exr_channel(path, table.channel)
+    elif suffix in FORMATS:
+        values = FORMATS[suffix].decode(path.name, memoryview(content), grid, 1.0)
+    else:
+        values = read_pixels(path, content, _PILLOW_FORMATS[suffix])
+    check_grid(path, values, grid)
+    with np.errstate(invalid="ignore"):  # A damaged file may hold NaN that signal.
+        units = values.astype(np.float64)
+    units[~np.isfinite(units) | (units <= 0) | np.isin(units, table.invalid)] = np.nan
+    with np.errstate(over="ignore"):
+        return np.asarray(units * table.factor)
+
+
+def depth_converter(
+    table: DepthTable, calibration: Calibration
+) -> Callable[[Float64[ndarray, "h w"], str], Float32[ndarray, "h w"]]:
+    """Return the function that converts values of a depth map of an eye to planar depth, metres, 0 without depth.
+
+    Range is divided by the length of the ray (x, y, 1) of its pixel. Disparity d is that of the left pixel to the
+    right: z = fx B / (d + cx_right - cx_left). Raises ``InputError`` for disparity of cameras that are not
+    rectified.
+    """
+    lenses = {"left": calibration.left}
+    if isinstance(calibration, StereoCalibration):
+        lenses["right"] = calibration.right
+    if table.kind == "range":
+        lengths = {eye: _ray_lengths(lens, calibration) for eye, lens in lenses.items()}
+        return lambda values, eye: _stored(values / lengths[eye])
+    if table.kind == "z":
+        return lambda values, _: _stored(values)
+    if not isinstance(calibration, StereoCalibration) or not _is_rectified(calibration):
+        raise InputError("depth.kind is disparity, which needs cameras of a rectified pair")
+    baseline_m, offset_px = -calibration.translation_m[0], calibration.right.cx - calibration.left.cx
+    product = calibration.left.fx * baseline_m
+
+    def from_disparity(values: Float64[ndarray, "h w"], _: str) -> Float32[ndarray, "h w"]:
+        with np.errstate(divide="ignore", over="ignore"):
+            return _stored(product / (values + offset_px))
+
+    return from_disparity
+
+
+def _stored(depth_m: Float64[ndarray, "h w"]) -> Float32[ndarray, "h w"]:
+    with np.errstate(over="ignore"):
+        stored = depth_m.astype(np.float32)
+    return np.where(np.isfinite(stored) & (stored > 0), stored, np.float32(0))
+
+
+def _ray_lengths(lens: Lens, calibration: Calibration) -> Float64[ndarray, "h w"]:
+    rays = pixel_rays(lens_K(lens), calibration.width, calibration.height, lens_distortion(lens))
+    return np.asarray(np.linalg.norm(rays, axis=-1))
+
+
+def _is_rectified(calibration: StereoCalibration) -> bool:
+    left, right = calibration.left, calibration.right
+    moved = (*calibration.rotation_rad, *calibration.translation_m[1:], *left.distortion, *right.distortion)
+    return (left.fx, left.fy, left.cy) == (right.fx, right.fy, right.cy) and not any(moved)
+
+
+def read_content(path: Path, expected: str) -> bytes:
+    """Return the content of a file. Raises ``InputError`` if it is missing, no regular file or too large."""
+    return read_file(path, CELL_BYTES, expected, InputError)
+
+
+def read_pixels(path: Path, content: bytes, image_format: str) -> Shaped[ndarray, "h w"]:
+    """Return the values of a TIFF, PNG or PFM image with one channel. Raises ``EntryError`` for other images."""
+    from PIL import Image
+
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # Pillow warns of huge images before it decodes them.
+            with Image.open(io.BytesIO(content), formats=[image_format]) as image:
+                values = np.asarray(image)
+    except Exception as error:  # Pillow raises many types, which depend on the damage.
+        reason = escape_text(str(error) or type(error).__name__)
+        raise EntryError(Problem("damaged", path.name, f"cannot be decoded: {reason}", image_format)) from None
+    if values.ndim != 2 or values.dtype.kind not in "buif":
+        found = f"has values of type {values.dtype} and shape {values.shape}"
+        raise EntryError(Problem("invalid", path.name, found, "one channel"))
+    return values
+
+
+def check_grid(path: Path, values: ndarray, grid: Grid) -> None:
+    """Raise ``EntryError`` if the image has another size than ``grid`` (height, width)."""
+    if values.shape != grid:
+        found = f"is {' x '.join(map(str, values.shape))} (H x W)"
+        raise EntryError(Problem("size", path.name, found, f"{format_shape(grid)} as the first image"))
+
+
+def _exr_channel(path: Path, channel: str) -> Shaped[ndarray, "h w"]:
+    """Return one channel of an EXR file with several."""
+    import OpenEXR
+
+    try:
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            channels: Mapping[str, OpenEXR.Channel] = file.channels()
+            names, pixels = list(channels), channels[channel].pixels if channel in channels else None
+    except Exception as error:  # OpenEXR raises RuntimeError and others.
+        reason = escape_text(str(error) or type(error).__name__)
+        raise EntryError(Problem("damaged", path.name, f"cannot be decoded: {reason}", "EXR")) from None
+    if pixels is None:
+        found = f"has the channels {', '.join(map(escape_text, names[:10]))}"
+        raise EntryError(Problem("missing", path.name, found, channel))
+    return np.asarray(pixels)
+
+
+_IMAGE_FORMATS = {".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF"}
+LABEL_SUFFIXES = (*_IMAGE_FORMATS, ".npy")
+_MAX_BAR_ID = np.iinfo(np.uint16).max
+
+
+def read_labels(path: Path, grid: Grid) -> Shaped[ndarray, "h w"]:
+    """Return the values of an image of labels of ``grid`` (height, width).
+
+    Raises ``EntryError`` for a damaged file, another size, and values that are not whole numbers.
+    """
+    content, suffix = read_content(path, "an image of labels"), path.suffix.lower()
+    values = _npy(path, content) if suffix == ".npy" else read_pixels(path, content, _IMAGE_FORMATS[suffix])
+    check_grid(path, values, grid)
+    if values.dtype.kind not in "bui":
+        raise EntryError(Problem("invalid", path.name, f"has values of type {values.dtype}", "whole numbers"))
+    return values
+
+
+def bar_ids(path: Path, values: Shaped[ndarray, "h w"]) -> UInt16[ndarray, "h w"]:
+    """Return labels as bar ids. Raises ``EntryError`` for values outside of 0 to 65535."""
+    if values.min() < 0 or values.max() > _MAX_BAR_ID:
+        found = f"has ids from {values.min()} to {values.max()}"
+        raise EntryError(Problem("invalid", path.name, found, f"0 to {_MAX_BAR_ID}"))
+    return values.astype(np.uint16)
+
+
+def _npy(path: Path, content: bytes) -> ndarray:
+    try:
+        return np.asarray(np.load(io.BytesIO(content), allow_pickle=False))
+    except Exception as error:  # NumPy raises many types, which depend on the damage.
+        reason = escape_text(str(error) or type(error).__name__)
+        raise EntryError(Problem("damaged", path.name, f"cannot be read: {reason}", "an array")) from None
+
+
+MATRIX_SUFFIXES = (".txt", ".npy", ".json")
+_ROUNDED_ROTATION = 1e-3
+"""Largest deviation of ``R @ R.T`` from the identity in files with few digits; the rotation is made exact."""
+
+
+def read_matrix(path: Path, key: str | None, shape: tuple[int, int]) -> Float64[ndarray, "n m"]:
+    """Return the matrix in a file, of ``shape`` or, for poses, without the row 0 0 0 1.
+
+    ``key`` is that of a JSON object. Raises ``EntryError`` for anything but finite numbers.
+    """
+    content = read_file(path, TOML_BYTES, "a matrix", InputError)
+    try:
+        values = np.asarray(_READERS[path.suffix.lower()](content, key), dtype=np.float64)
+    except EntryError:
+        raise
+    except Exception as error:  # NumPy raises many types, which depend on the damage.
+        reason = escape_text(str(error) or type(error).__name__)
+        raise EntryError(Problem("damaged", path.name, f"cannot be read: {reason}", "numbers")) from None
+    if values.size == 12 and shape == (4, 4):
+        values = np.vstack([values.reshape(3, 4), [0, 0, 0, 1]])
+    if values.size != shape[0] * shape[1] or not np.isfinite(values).all():
+        found = f"holds {values.size} numbers"
+        raise EntryError(Problem("invalid", path.name, found, f"{shape[0]} x {shape[1]} finite numbers"))
+    return values.reshape(shape)
+
+
+def cam_from_world(path: Path, table: PosesTable) -> Float64[ndarray, "4 4"]:
+    """Return a pose in OpenCV axes and metres. Raises ``EntryError`` for a matrix that is no rigid pose."""
+    pose = read_matrix(path, table.key, (4, 4))
+    rotation = pose[:3, :3]
+    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    if not (error <= _ROUNDED_ROTATION and np.linalg.det(rotation) > 0 and (pose[3] == (0, 0, 0, 1)).all()):
+        found = f"holds {short_repr(pose.tolist())}"
+        raise EntryError(Problem("invalid", path.name, found, "a rotation, a translation, and 0 0 0 1"))
+    u, _, vt = np.linalg.svd(rotation)
+    pose[:3, :3] = u @ vt
+    pose[:3, 3] *= UNITS_M[table.unit]
+    if table.kind == "world_from_cam":
+        pose = inverse_rigid(pose)
+    return swap_camera_axes(pose) if table.axes == "opengl" else pose
+
+
+def _text(content: bytes, _: str | None) -> ndarray:
+    return np.loadtxt(io.StringIO(content.decode().replace(",", " ")), ndmin=2)
+
+
+def _npy_matrix(content: bytes, _: str | None) -> ndarray:
+    return np.asarray(np.load(io.BytesIO(content), allow_pickle=False))
+
+
+def _json(content: bytes, key: str | None) -> object:
+    value, problems = parse_json(content)
+    if problems:
+        raise EntryError(problems[0])
+    for part in key.split(".") if key is not None else ():
+        if not isinstance(value, dict) or part not in value:
+            raise ValueError(f"it has no key {key}")
+        value = value[part]
+    return value
+
+
+_READERS = {".txt": _text, ".npy": _npy, ".json": _json}
+
+
+_NUMBERS = ("diameter_m", "x_m", "y_m", "z_m")
+_DEFAULT_ROLE = "surveyed"
+
+
+def read_bars_file(path: Path) -> tuple[Bar, ...]:
+    """Return the bars of a CSV file with the columns bar_id, diameter_m, x_m, y_m, z_m and, if wanted, role.
+
+    Each line is a point of an axis, in order. Raises ``InputError`` with all problems, which name the line.
+    """
+    import pandas as pd
+
+    content = read_file(path, TABLE_BYTES, "a CSV file of bars", InputError)
+    try:
+        table = pd.read_csv(io.BytesIO(content), dtype=str, keep_default_na=False, skipinitialspace=True)
+    except ValueError as error:  # Errors of pandas' parser and of decoding are ValueErrors.
+        problem = Problem("syntax", "", f"no CSV file: {escape_text(exception_summary(error))}")
+        raise InputError.from_problems(path, [problem]) from None
+    problems = [
+        Problem("missing", name, "missing", "a column") for name in ("bar_id", *_NUMBERS) if name not in table
+    ]
+    if problems:
+        raise InputError.from_problems(path, problems)
+    numbers = table[["bar_id", *_NUMBERS]].apply(pd.to_numeric, errors="coerce").to_numpy(np.float64)
+    ids, sizes = numbers[:, 0], numbers[:, 1:]
+    sound_id = np.isfinite(ids) & (ids == np.round(ids)) & (ids >= 1) & (ids <= _MAX_BAR_ID)
+    sound = sound_id & np.isfinite(sizes).all(axis=1) & (sizes[:, 0] > 0) & (np.abs(sizes) < 1e6).all(axis=1)
+    for row in np.flatnonzero(~sound):
+        expected = f"a bar_id from 1 to {_MAX_BAR_ID}, a diameter above 0 and finite coordinates"
+        found = f"line {row + 2}: got {escape_text(','.join(table.iloc[row]))}"
+        problems.append(Problem("invalid", "", found, expected))
+    roles = table.get("role")
+    bars = []
+    for bar_id in [] if problems else np.unique(ids).astype(int).tolist():
+        rows = np.flatnonzero(ids == bar_id)
+        role = _DEFAULT_ROLE if roles is None else roles.iloc[rows[0]]
+        bars.append(_bar(bar_id, role, sizes[rows], problems))
+    if not problems and not bars:
+        problems.append(Problem("missing", "", "has no bars", "one or more"))
+    if problems:
+        raise InputError.from_problems(path, problems)
+    return tuple(bars)
+
+
+def _bar(bar_id: int, role: str, sizes: Float64[ndarray, "n 4"], problems: list[Problem]) -> Bar:
+    """Return a bar of the diameter and the points in ``sizes``; problems are added to ``problems``."""
+    diameters_m, axis_m = sizes[:, 0], sizes[:, 1:]
+    if len(set(diameters_m.tolist())) > 1:
+        problems.append(Problem("conflict", f"bar {bar_id}", "has several diameters", "one"))
+    if len(axis_m) < 2 or not np.diff(axis_m, axis=0).any(axis=1).all():
+        problems.append(
+            Problem("invalid", f"bar {bar_id}", f"has {len(axis_m)} points", "two or more, no two the same")
+        )
+    points = tuple((float(x), float(y), float(z)) for x, y, z in axis_m)
+    return Bar(bar_id, role, float(diameters_m[0]), points)
