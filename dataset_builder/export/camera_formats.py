@@ -1,7 +1,12 @@
-"""COLMAP text model of the true cameras: ``cameras.txt``, ``images.txt``, ``points3D.txt``.
+"""True cameras for other programs: COLMAP's text model and nerfstudio's ``transforms.json``.
 
-Source: COLMAP's documentation, "Output Format" and "Camera Models". COLMAP uses OpenCV's camera axes. The centre
-of its first pixel is (0.5, 0.5), that of ours is (0, 0), so ``HALF_PIXEL`` is added to cx and cy.
+The centre of their first pixel is (0.5, 0.5), that of ours is (0, 0), so ``HALF_PIXEL`` is added to cx and cy.
+Numbers have up to 17 digits, so that they are read back as the same float64.
+
+COLMAP (its documentation, "Output Format" and "Camera Models"; files ``cameras.txt``, ``images.txt`` and
+``points3D.txt``) uses OpenCV's camera axes. nerfstudio's cameras (its documentation, "Data conventions", and its
+``Nerfstudio`` data parser) look along -z with y up, as OpenGL's: its ``get_image_coords`` adds 0.5, and it
+subtracts 0.5 from cx and cy before it calls OpenCV. k1 k2 k3 p1 p2 are OpenCV's.
 """
 
 from __future__ import annotations
@@ -13,6 +18,7 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
+from scipy.spatial.transform import Rotation
 
 from dataset_builder.export.exported_views import EXPORT_FILES, MILLIMETRE_M, CameraView
 from dataset_builder.scene.shapes.bending import resample_polyline_m
@@ -41,9 +47,7 @@ def cameras_txt(views: Sequence[CameraView]) -> str:
     Cameras without distortion are PINHOLE (fx fy cx cy), all others FULL_OPENCV
     (fx fy cx cy k1 k2 p1 p2 k3 0 0 0).
     """
-    lines = [
-        f"{camera_id} {camera_line}" for camera_line, camera_id in _camera_ids(views).items()
-    ]  # Cameras with the same line are the same camera.
+    lines = [f"{camera_id} {camera_line}" for camera_line, camera_id in _camera_ids(views).items()]
     return _with_header("CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", lines)
 
 
@@ -69,10 +73,9 @@ def points_txt(bars: Sequence[Bar]) -> str:
     No image observes them. Some tools (Gaussian splatting among them) initialise from the points and reject a
     model without any.
     """
-    points_m = axis_points_m(bars)
     lines = [
         f"{number} {_format_floats(point)} {_GREY} {_REPROJECTION_ERROR}"
-        for number, point in enumerate(points_m, start=1)
+        for number, point in enumerate(axis_points_m(bars), start=1)
     ]
     return _with_header("POINT3D_ID X Y Z R G B ERROR TRACK[] as (IMAGE_ID POINT2D_IDX)", lines)
 
@@ -86,27 +89,12 @@ def axis_points_m(bars: Sequence[Bar]) -> Float64[ndarray, "n 3"]:
 
 
 def quaternion_wxyz(rotation: Float64[ndarray, "3 3"]) -> Float64[ndarray, " 4"]:
-    """Return the unit quaternion (w, x, y, z), w >= 0, of a rotation matrix.
-
-    The row of 4 q q^T with the largest diagonal element is a multiple of q and well conditioned for every rotation
-    (Shepperd, "Quaternion from rotation matrix", 1978).
-    """
-    r = rotation
-    outer = np.array(
-        [
-            [1 + r[0, 0] + r[1, 1] + r[2, 2], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
-            [r[2, 1] - r[1, 2], 1 + r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]],
-            [r[0, 2] - r[2, 0], r[0, 1] + r[1, 0], 1 - r[0, 0] + r[1, 1] - r[2, 2], r[1, 2] + r[2, 1]],
-            [r[1, 0] - r[0, 1], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], 1 - r[0, 0] - r[1, 1] + r[2, 2]],
-        ]
-    )
-    quaternion = outer[np.argmax(np.diag(outer))]
-    quaternion = quaternion / np.linalg.norm(quaternion)
-    return np.asarray(-quaternion if quaternion[0] < 0 else quaternion)
+    """Return the unit quaternion (w, x, y, z), w >= 0, of a rotation matrix."""
+    return np.asarray(np.roll(Rotation.from_matrix(rotation).as_quat(canonical=True), 1))
 
 
 def _camera_ids(views: Iterable[CameraView]) -> dict[str, int]:
-    """Return the camera id of each distinct camera by its line of ``cameras.txt``, in order of appearance."""
+    """Return the ids of cameras by their line of ``cameras.txt``; those with the same line are the same camera."""
     lines = dict.fromkeys(_camera_line(camera) for view in views for camera in view.cameras.values())
     return {line: number for number, line in enumerate(lines, start=1)}
 
@@ -132,16 +120,12 @@ def _with_header(columns: str, lines: Iterable[str]) -> str:
     return "".join(f"{line}\n" for line in (f"# {columns}", *lines))
 
 
-_EMPTY_END = "[]\n}"
-"""End of a JSON object whose last member is an empty list."""
-
-
 def json_lines(head: Mapping[str, Any], name: str, entries: Sequence[Mapping[str, Any]]) -> str:
     """Return ``head`` as a JSON object with an additional member ``name``: the list of ``entries``, one per line.
 
     The result is readable: a short head, then a long list.
     """
-    head_text = json.dumps({**head, name: []}, indent=1, allow_nan=False).removesuffix(_EMPTY_END)
+    head_text = json.dumps({**head, name: []}, indent=1, allow_nan=False).removesuffix("[]\n}")
     lines = ",\n".join(json.dumps(entry, allow_nan=False) for entry in entries)
     return f"{head_text}[\n{lines}\n]}}\n"
 

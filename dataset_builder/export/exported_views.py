@@ -34,14 +34,12 @@ class CameraView:
     baseline_m: float
     cameras: Mapping[str, Camera]
 
-    @property
-    def index(self) -> str:
-        """Number of the view in the full protocol of its scene, with the digits of its id."""
-        return self.view_id.removeprefix(scene_of(self.view_id))
-
     def stem(self, eye: str) -> str:
-        """Return the common file name of one eye's files, without folder and suffix, e.g. ``0000_left``."""
-        return f"{self.index}_{eye}"
+        """Return the common file name of one eye's files, without folder and suffix, e.g. ``0000_left``.
+
+        It begins with the number of the view in the full protocol of its scene, with the digits of its id.
+        """
+        return f"{self.view_id.removeprefix(scene_of(self.view_id))}_{eye}"
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,3 +155,8 @@ EXPORT_FILES: Mapping[str, ExportFile] = {
     "bars": ExportFile("bars", ".png", "bars", plain_png),
 }
 """Files exported for each eye, by their key in ``cameras.json``."""
+
+
+def exported_files(config: DatasetConfig) -> Mapping[str, ExportFile]:
+    """Return the files exported for each eye of a config, by key: without colour there is no image."""
+    return {name: file for name, file in EXPORT_FILES.items() if config.colour is not None or file.column != "rgb"}

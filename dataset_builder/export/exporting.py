@@ -8,12 +8,19 @@ from pathlib import Path
 
 from dataset_builder.config.trajectories import subset
 from dataset_builder.export.camera_formats import cameras_txt, images_txt, points_txt, transforms_json
-from dataset_builder.export.exported_views import EXPORT_FILES, CameraView, StoredView, stored_views
-from dataset_builder.export.metadata import cameras_json, exported_files, readme_txt
+from dataset_builder.export.exported_views import (
+    EXPORT_FILES,
+    CameraView,
+    StoredView,
+    exported_files,
+    stored_views,
+)
+from dataset_builder.export.metadata import cameras_json, readme_txt
 from dataset_builder.export.target import ExportedPart, export_target
 from rebar_depth_bench.atomic_io import write_bytes, write_error, write_text
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars
 from rebar_depth_bench.data.dataset_config import DatasetConfig
+from rebar_depth_bench.data.location import local_folder
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.errors import DatasetError, InputError
 from rebar_depth_bench.progress import Progress, silent
@@ -64,45 +71,31 @@ def export(
     or data that contradict the manifest; ``InputError`` for fewer than one view and for a ``to`` that contains
     anything but an earlier export of the same data; ``OutputError`` for one that cannot be written.
     """
-    folder = _local_folder(root)
+    if views is not None and views < 1:
+        raise InputError(f"--views is {views}, expected 1 or more")
+    folder = open_folder(local_folder(root))
     chosen = [folder.config(name) for name in dict.fromkeys(configs or _with_split(folder, split))]
     for config in chosen:
         if config.imported is not None:
             raise InputError(f"{root}: config {config.name} was imported, expected configs that were rendered")
     parts = _by_folder(chosen, split)
-    wanted = {name: _select_view_ids(config, views) for name, config in parts.items()}
-    targets = {name: ExportedPart(_key(config), wanted[name], _FOLDERS) for name, config in parts.items()}
-    has_bars = BARS_FILE in folder.files
-    bars = read_bars(folder.verified_file(BARS_FILE)) if has_bars else {}
+    wanted = {
+        name: ExportedPart(
+            key=config.key, views=[config.view_ids[index] for index in subset(len(config.views), views)]
+        )
+        for name, config in parts.items()
+    }
+    bars = read_bars(folder.verified_file(BARS_FILE)) if BARS_FILE in folder.files else {}
     target = Path(to)
     try:
-        with export_target(target, folder, targets):
+        with export_target(target, folder, wanted, _FOLDERS):
             exported = [
-                _export_config(folder, name, config, wanted[name], bars, target, progress)
+                _export_part(folder, name, config, wanted[name].views, bars, target, progress)
                 for name, config in parts.items()
             ]
     except OSError as error:  # Only writing raises OSError here: reading raises DatasetError.
         raise write_error(error.filename or to, error) from error
     return ExportSummary(target, tuple(exported))
-
-
-def _local_folder(root: str | Path) -> DatasetFolder:
-    """Open a local dataset folder. Raises ``DatasetError`` if ``root`` is not a folder."""
-    if not Path(root).is_dir():
-        raise DatasetError(
-            f"{root}: no such folder, expected a dataset folder on this machine; download a Hub repository first"
-        )
-    return open_folder(root)
-
-
-def _select_view_ids(config: DatasetConfig, views: int | None) -> list[str]:
-    """Return the ids of the selected views of a config.
-
-    Raises ``InputError`` for fewer than one view.
-    """
-    if views is not None and views < 1:
-        raise InputError(f"--views is {views}, expected 1 or more")
-    return [config.views[index].view_id for index in subset(len(config.views), views)]
 
 
 def _with_split(folder: DatasetFolder, split: str | None) -> list[str]:
@@ -120,20 +113,15 @@ def _by_folder(chosen: Sequence[DatasetConfig], split: str | None) -> dict[str, 
     """
     parts = {}
     for config in chosen:
-        if config.has_splits:
-            for scene in (config if split is None else config.of_split(split)).by_scene():
-                parts[f"{config.name}/{scene.scene.split}-{scene.scene.name}"] = scene
-        else:
-            parts[config.name] = config if split is None else config.of_split(split)
+        selected = config if split is None else config.of_split(split)
+        for scene in selected.by_scene() if config.has_splits else ():
+            parts[f"{config.name}/{scene.scene.split}-{scene.scene.name}"] = scene
+        if not config.has_splits:
+            parts[config.name] = selected
     return parts
 
 
-def _key(config: DatasetConfig) -> str:
-    """Return the key of the build of a config or of a scene of it."""
-    return config.key
-
-
-def _export_config(
+def _export_part(
     folder: DatasetFolder,
     name: str,
     config: DatasetConfig,

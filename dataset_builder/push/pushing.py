@@ -28,6 +28,7 @@ from huggingface_hub.utils.sha import git_hash
 
 from dataset_builder.push.hub_errors import hub_errors
 from rebar_depth_bench.data.digests import file_sha256
+from rebar_depth_bench.data.location import local_folder
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, DatasetFolder, open_folder
 from rebar_depth_bench.data.verification import file_problems
 from rebar_depth_bench.errors import (
@@ -84,9 +85,7 @@ def verified_folder(root: str, progress: Progress = silent) -> VerifiedFolder:
     Raises ``DatasetError`` for anything but a complete local dataset folder, with all of its problems.
     ``progress`` counts files.
     """
-    if not Path(root).is_dir():
-        raise DatasetError(f"{root}: no such folder, expected a dataset folder")
-    manifest = Path(root, MANIFEST_FILE)
+    manifest = local_folder(root) / MANIFEST_FILE
     # Before the manifest is read: if a build replaces it in between, the file to be uploaded has another digest.
     manifest_sha256 = file_sha256(manifest) if manifest.is_file() else ""
     folder = open_folder(root)
