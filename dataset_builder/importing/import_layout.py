@@ -180,8 +180,9 @@ class Layout(StrictModel):
             raise field_error("got poses and cameras.pose", "one of them", "conflict")
         if self.bars is not None and self.poses is None and "pose" not in self.cameras:
             raise field_error("got bars without poses", "poses in the frame of the bars", "conflict")
-        if self.intrinsics is not None and self.files.has_right:
-            raise field_error("got intrinsics of each view and a right camera", "one calibration", "conflict")
+        if self.intrinsics is not None and (self.files.has_right or self.depth.kind == "disparity"):
+            other = "a right camera" if self.files.has_right else "disparity"
+            raise field_error(f"got intrinsics of each view and {other}", "one calibration", "conflict")
         return self
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
@@ -15,37 +16,55 @@ from dataset_builder.importing.import_layout import DepthTable, PosesTable
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.errors import EntryError, InputError, Problem, escape_text, exception_summary, format_shape
 from rebar_depth_bench.geometry.cameras import inverse_rigid, pixel_rays, swap_camera_axes
-from rebar_depth_bench.geometry.stereo_calibration import (
-    Calibration,
-    Lens,
-    StereoCalibration,
-    lens_distortion,
-    lens_K,
-)
+from rebar_depth_bench.geometry.stereo_calibration import Calibration, StereoCalibration
 from rebar_depth_bench.limits import CELL_BYTES, TABLE_BYTES, TOML_BYTES
 from rebar_depth_bench.reading import parse_json, read_file
 from rebar_depth_bench.submission.formats import FORMATS
 from rebar_depth_bench.validation import UNITS_M, short_repr
 
 Grid = tuple[int, int]
-_PILLOW_FORMATS = {".tif": "TIFF", ".tiff": "TIFF", ".pfm": "PPM", ".png": "PNG"}
-DEPTH_SUFFIXES = (*FORMATS, *(suffix for suffix in _PILLOW_FORMATS if suffix not in FORMATS))
+"""Height and width of an image, pixels."""
+
+_IMAGE_FORMATS = {".tif": "TIFF", ".tiff": "TIFF", ".pfm": "PPM", ".png": "PNG"}
+"""Pillow's names of formats."""
+
+DEPTH_SUFFIXES = (*FORMATS, *(suffix for suffix in _IMAGE_FORMATS if suffix not in FORMATS))
+LABEL_SUFFIXES = (".png", ".tif", ".tiff", ".npy")
+MATRIX_SUFFIXES = (".txt", ".npy", ".json")
+
+_MAX_BAR_ID = np.iinfo(np.uint16).max
+_ROUNDED_ROTATION = 1e-3
+"""Largest deviation of ``R @ R.T`` from the identity in files with few digits; the rotation is made exact."""
+_BAR_NUMBERS = ("diameter_m", "x_m", "y_m", "z_m")
+_DEFAULT_ROLE = "surveyed"
+
+
+@contextmanager
+def _damage(path: Path, expected: str) -> Iterator[None]:
+    """Convert the errors of decoders, many types that depend on the damage, to ``EntryError``."""
+    try:
+        yield
+    except EntryError:
+        raise
+    except Exception as error:
+        reason = escape_text(str(error) or type(error).__name__)
+        raise EntryError(Problem("damaged", path.name, f"cannot be read: {reason}", expected)) from None
 
 
 def read_depth(path: Path, grid: Grid, table: DepthTable) -> Float64[ndarray, "h w"]:
-    """Return the values of a depth map of ``grid`` (height, width) times its factor; NaN where there is none.
+    """Return the values of a depth map of ``grid`` times its factor; NaN where there is none.
 
     Raises ``EntryError`` for a damaged file, and for one of another size.
     """
     suffix = path.suffix.lower()
-    content = read_content(path, "a depth map")
+    content = read_file(path, CELL_BYTES, "a depth map", InputError)
     if suffix == ".exr" and table.channel is not None:
         values = _exr_channel(path, table.channel)
     elif suffix in FORMATS:
         values = FORMATS[suffix].decode(path.name, memoryview(content), grid, 1.0)
     else:
-        values = read_pixels(path, content, _PILLOW_FORMATS[suffix])
-    check_grid(path, values, grid)
+        values = _pixels(path, content)
+    _check_grid(path, values, grid)
     with np.errstate(invalid="ignore"):  # A damaged file may hold NaN that signal.
         units = values.astype(np.float64)
     units[~np.isfinite(units) | (units <= 0) | np.isin(units, table.invalid)] = np.nan
@@ -53,112 +72,50 @@ def read_depth(path: Path, grid: Grid, table: DepthTable) -> Float64[ndarray, "h
         return np.asarray(units * table.factor)
 
 
-def depth_converter(
-    table: DepthTable, calibration: Calibration
-) -> Callable[[Float64[ndarray, "h w"], str], Float32[ndarray, "h w"]]:
-    """Return the function that converts values of a depth map of an eye to planar depth, metres, 0 without depth.
+def planar_depth_m(
+    values: Float64[ndarray, "h w"],
+    kind: str,
+    calibration: Calibration,
+    K: Float64[ndarray, "3 3"],
+    distortion: Float64[ndarray, " 5"],
+) -> Float32[ndarray, "h w"]:
+    """Return the values of a depth map as planar depth, metres, 0 without depth.
 
-    Range is divided by the length of the ray (x, y, 1) of its pixel. Disparity d is that of the left pixel to the
-    right: z = fx B / (d + cx_right - cx_left). Raises ``InputError`` for disparity of cameras that are not
-    rectified.
+    Range is divided by the length of the ray (x, y, 1) of its pixel in the camera with ``K`` and ``distortion``.
+    Disparity d is that of the left pixel to the right: z = fx B / (d + cx_right - cx_left). Raises ``InputError``
+    as ``rectified_pair`` does.
     """
-    lenses = {"left": calibration.left}
-    if isinstance(calibration, StereoCalibration):
-        lenses["right"] = calibration.right
-    if table.kind == "range":
-        lengths = {eye: _ray_lengths(lens, calibration) for eye, lens in lenses.items()}
-        return lambda values, eye: _stored(values / lengths[eye])
-    if table.kind == "z":
-        return lambda values, _: _stored(values)
-    if not isinstance(calibration, StereoCalibration) or not _is_rectified(calibration):
-        raise InputError("depth.kind is disparity, which needs cameras of a rectified pair")
-    baseline_m, offset_px = -calibration.translation_m[0], calibration.right.cx - calibration.left.cx
-    product = calibration.left.fx * baseline_m
-
-    def from_disparity(values: Float64[ndarray, "h w"], _: str) -> Float32[ndarray, "h w"]:
+    if kind == "range":
+        height, width = values.shape
+        values = values / np.linalg.norm(pixel_rays(K, width, height, distortion), axis=-1)
+    if kind == "disparity":
+        pair = rectified_pair(calibration)
         with np.errstate(divide="ignore", over="ignore"):
-            return _stored(product / (values + offset_px))
-
-    return from_disparity
-
-
-def _stored(depth_m: Float64[ndarray, "h w"]) -> Float32[ndarray, "h w"]:
+            offset_px = pair.right.cx - pair.left.cx
+            values = pair.left.fx * -pair.translation_m[0] / (values + offset_px)
     with np.errstate(over="ignore"):
-        stored = depth_m.astype(np.float32)
+        stored = values.astype(np.float32)
     return np.where(np.isfinite(stored) & (stored > 0), stored, np.float32(0))
 
 
-def _ray_lengths(lens: Lens, calibration: Calibration) -> Float64[ndarray, "h w"]:
-    rays = pixel_rays(lens_K(lens), calibration.width, calibration.height, lens_distortion(lens))
-    return np.asarray(np.linalg.norm(rays, axis=-1))
-
-
-def _is_rectified(calibration: StereoCalibration) -> bool:
-    left, right = calibration.left, calibration.right
-    moved = (*calibration.rotation_rad, *calibration.translation_m[1:], *left.distortion, *right.distortion)
-    return (left.fx, left.fy, left.cy) == (right.fx, right.fy, right.cy) and not any(moved)
-
-
-def read_content(path: Path, expected: str) -> bytes:
-    """Return the content of a file. Raises ``InputError`` if it is missing, no regular file or too large."""
-    return read_file(path, CELL_BYTES, expected, InputError)
-
-
-def read_pixels(path: Path, content: bytes, image_format: str) -> Shaped[ndarray, "h w"]:
-    """Return the values of a TIFF, PNG or PFM image with one channel. Raises ``EntryError`` for other images."""
-    from PIL import Image
-
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("error")  # Pillow warns of huge images before it decodes them.
-            with Image.open(io.BytesIO(content), formats=[image_format]) as image:
-                values = np.asarray(image)
-    except Exception as error:  # Pillow raises many types, which depend on the damage.
-        reason = escape_text(str(error) or type(error).__name__)
-        raise EntryError(Problem("damaged", path.name, f"cannot be decoded: {reason}", image_format)) from None
-    if values.ndim != 2 or values.dtype.kind not in "buif":
-        found = f"has values of type {values.dtype} and shape {values.shape}"
-        raise EntryError(Problem("invalid", path.name, found, "one channel"))
-    return values
-
-
-def check_grid(path: Path, values: ndarray, grid: Grid) -> None:
-    """Raise ``EntryError`` if the image has another size than ``grid`` (height, width)."""
-    if values.shape != grid:
-        found = f"is {' x '.join(map(str, values.shape))} (H x W)"
-        raise EntryError(Problem("size", path.name, found, f"{format_shape(grid)} as the first image"))
-
-
-def _exr_channel(path: Path, channel: str) -> Shaped[ndarray, "h w"]:
-    """Return one channel of an EXR file with several."""
-    import OpenEXR
-
-    try:
-        with OpenEXR.File(str(path), separate_channels=True) as file:
-            channels: Mapping[str, OpenEXR.Channel] = file.channels()
-            names, pixels = list(channels), channels[channel].pixels if channel in channels else None
-    except Exception as error:  # OpenEXR raises RuntimeError and others.
-        reason = escape_text(str(error) or type(error).__name__)
-        raise EntryError(Problem("damaged", path.name, f"cannot be decoded: {reason}", "EXR")) from None
-    if pixels is None:
-        found = f"has the channels {', '.join(map(escape_text, names[:10]))}"
-        raise EntryError(Problem("missing", path.name, found, channel))
-    return np.asarray(pixels)
-
-
-_IMAGE_FORMATS = {".png": "PNG", ".tif": "TIFF", ".tiff": "TIFF"}
-LABEL_SUFFIXES = (*_IMAGE_FORMATS, ".npy")
-_MAX_BAR_ID = np.iinfo(np.uint16).max
+def rectified_pair(calibration: Calibration) -> StereoCalibration:
+    """Return the calibration of a rectified pair, to which disparity refers. Raises ``InputError`` for others."""
+    if isinstance(calibration, StereoCalibration):
+        left, right = calibration.left, calibration.right
+        moved = (*calibration.rotation_rad, *calibration.translation_m[1:], *left.distortion, *right.distortion)
+        if (left.fx, left.fy, left.cy) == (right.fx, right.fy, right.cy) and not any(moved):
+            return calibration
+    raise InputError("depth.kind is disparity, which needs cameras of a rectified pair")
 
 
 def read_labels(path: Path, grid: Grid) -> Shaped[ndarray, "h w"]:
-    """Return the values of an image of labels of ``grid`` (height, width).
+    """Return the values of an image of labels, a steel mask or bar ids, of ``grid``.
 
     Raises ``EntryError`` for a damaged file, another size, and values that are not whole numbers.
     """
-    content, suffix = read_content(path, "an image of labels"), path.suffix.lower()
-    values = _npy(path, content) if suffix == ".npy" else read_pixels(path, content, _IMAGE_FORMATS[suffix])
-    check_grid(path, values, grid)
+    content = read_file(path, CELL_BYTES, "an image of labels", InputError)
+    values = _npy(path, content) if path.suffix.lower() == ".npy" else _pixels(path, content)
+    _check_grid(path, values, grid)
     if values.dtype.kind not in "bui":
         raise EntryError(Problem("invalid", path.name, f"has values of type {values.dtype}", "whole numbers"))
     return values
@@ -172,17 +129,43 @@ def bar_ids(path: Path, values: Shaped[ndarray, "h w"]) -> UInt16[ndarray, "h w"
     return values.astype(np.uint16)
 
 
+def _check_grid(path: Path, values: ndarray, grid: Grid) -> None:
+    """Raise ``EntryError`` if the image has another size than ``grid``."""
+    if values.shape != grid:
+        found = f"is {' x '.join(map(str, values.shape))} (H x W)"
+        raise EntryError(Problem("size", path.name, found, f"{format_shape(grid)} as the first image"))
+
+
 def _npy(path: Path, content: bytes) -> ndarray:
-    try:
+    with _damage(path, "an array"):
         return np.asarray(np.load(io.BytesIO(content), allow_pickle=False))
-    except Exception as error:  # NumPy raises many types, which depend on the damage.
-        reason = escape_text(str(error) or type(error).__name__)
-        raise EntryError(Problem("damaged", path.name, f"cannot be read: {reason}", "an array")) from None
 
 
-MATRIX_SUFFIXES = (".txt", ".npy", ".json")
-_ROUNDED_ROTATION = 1e-3
-"""Largest deviation of ``R @ R.T`` from the identity in files with few digits; the rotation is made exact."""
+def _pixels(path: Path, content: bytes) -> Shaped[ndarray, "h w"]:
+    """Return the values of a TIFF, PNG or PFM image with one channel. Raises ``EntryError`` for other images."""
+    from PIL import Image
+
+    image_format = _IMAGE_FORMATS[path.suffix.lower()]
+    with _damage(path, image_format), warnings.catch_warnings():
+        warnings.simplefilter("error")  # Pillow warns of huge images before it decodes them.
+        with Image.open(io.BytesIO(content), formats=[image_format]) as image:
+            values = np.asarray(image)
+    if values.ndim != 2 or values.dtype.kind not in "buif":
+        found = f"has values of type {values.dtype} and shape {values.shape}"
+        raise EntryError(Problem("invalid", path.name, found, "one channel"))
+    return values
+
+
+def _exr_channel(path: Path, channel: str) -> Shaped[ndarray, "h w"]:
+    """Return one channel of an EXR file with several. Raises ``EntryError`` if it has no such channel."""
+    import OpenEXR
+
+    with _damage(path, "EXR"), OpenEXR.File(str(path), separate_channels=True) as file:
+        channels = file.channels()
+        if channel in channels:
+            return np.asarray(channels[channel].pixels)
+    found = f"has the channels {', '.join(map(escape_text, list(channels)[:10]))}"
+    raise EntryError(Problem("missing", path.name, found, channel))
 
 
 def read_matrix(path: Path, key: str | None, shape: tuple[int, int]) -> Float64[ndarray, "n m"]:
@@ -190,20 +173,33 @@ def read_matrix(path: Path, key: str | None, shape: tuple[int, int]) -> Float64[
 
     ``key`` is that of a JSON object. Raises ``EntryError`` for anything but finite numbers.
     """
-    content = read_file(path, TOML_BYTES, "a matrix", InputError)
-    try:
-        values = np.asarray(_READERS[path.suffix.lower()](content, key), dtype=np.float64)
-    except EntryError:
-        raise
-    except Exception as error:  # NumPy raises many types, which depend on the damage.
-        reason = escape_text(str(error) or type(error).__name__)
-        raise EntryError(Problem("damaged", path.name, f"cannot be read: {reason}", "numbers")) from None
+    content, suffix = read_file(path, TOML_BYTES, "a matrix", InputError), path.suffix.lower()
+    with _damage(path, "numbers"):
+        if suffix == ".npy":
+            numbers: object = _npy(path, content)
+        elif suffix == ".json":
+            numbers = _json_value(content, key)
+        else:
+            numbers = np.loadtxt(io.StringIO(content.decode().replace(",", " ")), ndmin=2)
+        values = np.asarray(numbers, dtype=np.float64)
     if values.size == 12 and shape == (4, 4):
         values = np.vstack([values.reshape(3, 4), [0, 0, 0, 1]])
     if values.size != shape[0] * shape[1] or not np.isfinite(values).all():
         found = f"holds {values.size} numbers"
         raise EntryError(Problem("invalid", path.name, found, f"{shape[0]} x {shape[1]} finite numbers"))
     return values.reshape(shape)
+
+
+def _json_value(content: bytes, key: str | None) -> object:
+    """Return the value of a JSON object at a key, whose parts are joined by dots."""
+    value, problems = parse_json(content)
+    if problems:
+        raise EntryError(problems[0])
+    for part in key.split(".") if key is not None else ():
+        if not isinstance(value, dict) or part not in value:
+            raise ValueError(f"it has no key {key}")
+        value = value[part]
+    return value
 
 
 def cam_from_world(path: Path, table: PosesTable) -> Float64[ndarray, "4 4"]:
@@ -222,32 +218,6 @@ def cam_from_world(path: Path, table: PosesTable) -> Float64[ndarray, "4 4"]:
     return swap_camera_axes(pose) if table.axes == "opengl" else pose
 
 
-def _text(content: bytes, _: str | None) -> ndarray:
-    return np.loadtxt(io.StringIO(content.decode().replace(",", " ")), ndmin=2)
-
-
-def _npy_matrix(content: bytes, _: str | None) -> ndarray:
-    return np.asarray(np.load(io.BytesIO(content), allow_pickle=False))
-
-
-def _json(content: bytes, key: str | None) -> object:
-    value, problems = parse_json(content)
-    if problems:
-        raise EntryError(problems[0])
-    for part in key.split(".") if key is not None else ():
-        if not isinstance(value, dict) or part not in value:
-            raise ValueError(f"it has no key {key}")
-        value = value[part]
-    return value
-
-
-_READERS = {".txt": _text, ".npy": _npy, ".json": _json}
-
-
-_NUMBERS = ("diameter_m", "x_m", "y_m", "z_m")
-_DEFAULT_ROLE = "surveyed"
-
-
 def read_bars_file(path: Path) -> tuple[Bar, ...]:
     """Return the bars of a CSV file with the columns bar_id, diameter_m, x_m, y_m, z_m and, if wanted, role.
 
@@ -262,11 +232,11 @@ def read_bars_file(path: Path) -> tuple[Bar, ...]:
         problem = Problem("syntax", "", f"no CSV file: {escape_text(exception_summary(error))}")
         raise InputError.from_problems(path, [problem]) from None
     problems = [
-        Problem("missing", name, "missing", "a column") for name in ("bar_id", *_NUMBERS) if name not in table
+        Problem("missing", name, "missing", "a column") for name in ("bar_id", *_BAR_NUMBERS) if name not in table
     ]
     if problems:
         raise InputError.from_problems(path, problems)
-    numbers = table[["bar_id", *_NUMBERS]].apply(pd.to_numeric, errors="coerce").to_numpy(np.float64)
+    numbers = table[["bar_id", *_BAR_NUMBERS]].apply(pd.to_numeric, errors="coerce").to_numpy(np.float64)
     ids, sizes = numbers[:, 0], numbers[:, 1:]
     sound_id = np.isfinite(ids) & (ids == np.round(ids)) & (ids >= 1) & (ids <= _MAX_BAR_ID)
     sound = sound_id & np.isfinite(sizes).all(axis=1) & (sizes[:, 0] > 0) & (np.abs(sizes) < 1e6).all(axis=1)

@@ -19,10 +19,11 @@ from dataset_builder.importing.source_files import (
     MATRIX_SUFFIXES,
     bar_ids,
     cam_from_world,
-    depth_converter,
+    planar_depth_m,
     read_depth,
     read_labels,
     read_matrix,
+    rectified_pair,
 )
 from rebar_depth_bench.captures.camera_files import CaptureCameras, cameras_of_table
 from rebar_depth_bench.captures.image_files import IMAGE_SUFFIXES, common_shape, read_image
@@ -79,7 +80,8 @@ class SourceViews:
         Raises ``InputError`` with the problems of the view's files.
         """
         try:
-            return {**self._cameras(name), **self._images(name)}
+            cameras = self._cameras(name)
+            return {**cameras, **self._images(name, cameras)}
         except EntryError as error:
             raise InputError.from_problems(f"{self.root}: view {name}", error.problems) from None
 
@@ -105,15 +107,17 @@ class SourceViews:
             }
         return columns
 
-    def _images(self, name: str) -> dict[str, Any]:
-        convert = depth_converter(self.layout.depth, self.cameras.calibration)
+    def _images(self, name: str, cameras: Mapping[str, Any]) -> dict[str, Any]:
+        table = self.layout.depth
         columns: dict[str, Any] = {}
         for column, pattern in self.layout.files.patterns.items():
             path, kind, eye = self.file(pattern, name), column_kind(column), column.partition("_")[0]
             if kind == "rgb":
                 columns[column] = read_image(path, self.grid)
             elif kind == "depth":
-                columns[column] = convert(read_depth(path, self.grid, self.layout.depth), eye)
+                values = read_depth(path, self.grid, table)
+                K, distortion = cameras[f"{eye}_K"], cameras[f"{eye}_distortion"]
+                columns[column] = planar_depth_m(values, table.kind, self.cameras.calibration, K, distortion)
             else:
                 values = read_labels(path, self.grid)
                 columns[column] = self._mask(values) if kind == "mask" else bar_ids(path, values)
@@ -166,7 +170,8 @@ def open_views(path: Path, layout: Layout) -> SourceViews:
     cameras = cameras_of_table(
         path, layout.cameras, names, width, height, is_stereo=layout.files.has_right, where="cameras"
     )
-    depth_converter(layout.depth, cameras.calibration)
+    if layout.depth.kind == "disparity":
+        rectified_pair(cameras.calibration)
     return SourceViews(root, layout, tuple(names), (height, width), cameras)
 
 

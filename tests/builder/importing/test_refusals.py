@@ -61,6 +61,7 @@ def refused(layout: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> str:
         ('"bars.csv"', '"../bars.csv"', "invalid", "bars.file", 38),
         ('"bars.csv"', '"~/bars.csv"', "invalid", "bars.file", 38),
         ('"bars.csv"', '""', "invalid", "bars.file", 38),
+        ("[poses]", "[intrinsics]\nfile = 'k/{view}.txt'\n[poses]", "conflict", "", None),
     ],
 )
 def test_invalid_layout_is_refused_with_its_line(
@@ -75,6 +76,12 @@ def test_invalid_layout_is_refused_with_its_line(
     problem = next(one for one in caught.value.problems if one.where == where)
     assert problem.code == code
     assert problem.found.startswith(f"line {line}: " if line else "")
+
+
+def test_disparity_is_refused_beside_intrinsics_of_each_view(tmp_path: Path) -> None:
+    tables = "\n[intrinsics]\nfile = 'k/{view}.txt'\n[depth]\nkind = 'disparity'\n"
+    with pytest.raises(InputError, match="got intrinsics of each view and disparity, expected one calibration"):
+        plan_import(data.write_layout(tmp_path, ("left_depth", "left_rgb"), tables=tables), "mock-up")
 
 
 def test_invalid_cameras_are_refused_with_their_line(folder: Path) -> None:
