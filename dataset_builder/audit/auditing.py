@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from dataset_builder.audit.camera_checks import (
-    ExpectedView,
     camera_problems,
     checked_aim_point_m,
     expected_views,
@@ -19,12 +18,14 @@ from dataset_builder.audit.camera_checks import (
     view_projection_error_px,
 )
 from dataset_builder.audit.checks import (
+    AUDITED_COLUMNS,
     AuditedConfig,
     AuditedEye,
     AuditedView,
     AuditReport,
     Check,
     RayCache,
+    record_problems,
     view_from_row,
 )
 from dataset_builder.audit.geometry import (
@@ -32,7 +33,6 @@ from dataset_builder.audit.geometry import (
     board_verdict,
     cage_checks,
     max_axis_distance_ratio,
-    merged_checks,
     view_board_error,
 )
 from dataset_builder.audit.imported import imported_checks
@@ -47,16 +47,21 @@ from dataset_builder.pipeline.plan import BUILD_FOLDER
 from rebar_depth_bench.bar_crossings.definition import Crossings, scene_crossings
 from rebar_depth_bench.bar_crossings.table import CROSSINGS_FILE, folder_crossings
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars
-from rebar_depth_bench.data.columns import COLUMNS, EYES
+from rebar_depth_bench.data.columns import EYES
 from rebar_depth_bench.data.config_tables import ViewRecord
 from rebar_depth_bench.data.dataset import iterate_rows
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.eye_view import EyeView, eye_from_row
+from rebar_depth_bench.data.location import local_folder
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.data.verification import file_problems
 from rebar_depth_bench.errors import DatasetError, InputError
 from rebar_depth_bench.progress import Progress, silent
-from rebar_depth_bench.scoring.protocol import scored_pixels
+
+_CROSSING_TOLERANCE_M = 1e-9
+"""Largest difference of crossings from those of the bars."""
+SAMPLED_SCENES = 8
+"""Scenes of a config of several scenes in which depth is rendered again."""
 
 
 def check_files(folder: DatasetFolder, root: Path, progress: Progress) -> Check:
@@ -86,9 +91,6 @@ def check_crossings(folder: DatasetFolder, bars: Mapping[str, tuple[Bar, ...]]) 
     return Check("crossings of the bars", f"{total} crossings", "equal to 1 nm", tuple(problems))
 
 
-_CROSSING_TOLERANCE_M = 1e-9
-
-
 def _are_equal(stored: Crossings | None, expected: Crossings | None) -> bool:
     if stored is None or expected is None or len(stored) != len(expected):
         return False
@@ -104,15 +106,7 @@ def row_problems(row: Mapping[str, Any], record: ViewRecord, bar_ids: set[int]) 
     for name, eye in eyes.items():
         for problem in _ground_truth_problems(eye, bar_ids):
             yield f"{name}: {problem}"
-    if row["view_id"] != record.view_id:
-        yield f"the row's view_id is {row['view_id']}, expected {record.view_id}"
-    for name, expected in (("left", record.left), ("right", record.right)):
-        if eyes[name].digest() != expected:
-            yield f"{name} ground-truth digest differs from the manifest's"
-    left = eyes["left"]
-    counts = np.count_nonzero(left.mask), len(scored_pixels(left.mask, left.depth_m))
-    if counts != (record.steel_px, record.scored_px):
-        yield "steel and scored pixel counts differ from the manifest's"
+    yield from record_problems(row["view_id"], eyes, record)
 
 
 def _ground_truth_problems(eye: EyeView, bar_ids: set[int]) -> Iterator[str]:
@@ -147,11 +141,6 @@ VIEW_CHECKS: tuple[ViewCheck, ...] = (
 """Checks of every view, in the order of the report."""
 
 
-_NOT_AUDITED = {"left_preview"}
-SAMPLED_SCENES = 8
-"""Scenes of a config of several scenes in which depth is rendered again."""
-
-
 def audit(root: str | Path, *, depth_views: int = 4, progress: Progress = silent) -> AuditReport:
     """Check every invariant of a local dataset folder, and its ground truth against independent sources.
 
@@ -161,24 +150,19 @@ def audit(root: str | Path, *, depth_views: int = 4, progress: Progress = silent
     """
     if depth_views < 0:
         raise InputError(f"--depth-views is {depth_views}, expected 0 or more")
-    folder = open_folder(root)
-    if folder.local is None:
-        raise DatasetError(f"{root}: is not a local folder, expected a dataset folder on this machine")
-    files = check_files(folder, folder.local, progress)
-    checks = [files]
-    if files.passed:  # Rows of damaged files cannot be checked.
-        bars = read_bars(folder.local / BARS_FILE)
+    path = local_folder(root)
+    folder = open_folder(path)
+    checks = [check_files(folder, path, progress)]
+    if checks[0].passed:  # Rows of damaged files cannot be checked.
+        bars = read_bars(path / BARS_FILE)
         checks.append(check_crossings(folder, bars))
         for config in folder.config_by_name.values():
-            checks += _config_checks(config, folder.local, bars, depth_views, progress)
+            checks += _config_checks(config, path, bars, depth_views, progress)
     return AuditReport(str(root), tuple(checks))
 
 
-_SceneBars = Mapping[str, tuple[Bar, ...]]
-
-
 def _config_checks(
-    config: DatasetConfig, root: Path, bars: _SceneBars, depth_views: int, progress: Progress
+    config: DatasetConfig, root: Path, bars: Mapping[str, tuple[Bar, ...]], depth_views: int, progress: Progress
 ) -> Iterator[Check]:
     """Yield the checks of a config; those of several scenes are made of all scenes together.
 
@@ -188,20 +172,38 @@ def _config_checks(
         yield from imported_checks(config, config.imported, bars.get(config.scene.name, ()), progress)
         return
     if not config.has_splits:
-        yield from _scene_checks(config, root, bars, depth_views, progress)
+        yield from _scene_checks(config, root, _steel(config, bars), depth_views, progress)
         return
     scenes = config.by_scene()
     sampled = set(subset(len(scenes), SAMPLED_SCENES))
     checks: list[Check] = []
     for number, scene in enumerate(scenes):
-        views = depth_views if number in sampled else 0
-        checks += cage_checks(scene, _steel(scene, bars))
-        checks += _scene_checks(scene, root, bars, views, silent)
+        steel = _steel(scene, bars)
+        checks += cage_checks(scene, steel)
+        checks += _scene_checks(scene, root, steel, depth_views if number in sampled else 0, silent)
         progress(f"audit of {config.name}", number + 1, len(scenes))
-    yield from merged_checks(config.name, checks)
+    yield from _merged_checks(config.name, checks)
 
 
-def _steel(config: DatasetConfig, bars: _SceneBars) -> tuple[Bar, ...]:
+def _merged_checks(config: str, checks: Sequence[Check]) -> Iterator[Check]:
+    """Yield one check for all checks of the same name, which begins with the label of a scene and a colon.
+
+    A check that is skipped in all scenes is skipped for the reason of the first one.
+    """
+    by_name: dict[str, list[Check]] = {}
+    for check in checks:
+        by_name.setdefault(check.name.partition(": ")[2], []).append(check)
+    for name, group in by_name.items():
+        made = [check for check in group if not check.skipped]
+        if not made:
+            yield Check.skip(f"{config}: {name}", group[0].measured)
+            continue
+        problems = (f"{check.name.partition(': ')[0]}: {problem}" for check in made for problem in check.problems)
+        measured = f"{sum(check.passed for check in made)} of {len(made)} scenes, such as: {made[0].measured}"
+        yield Check(f"{config}: {name}", measured, made[0].bound, tuple(problems))
+
+
+def _steel(config: DatasetConfig, bars: Mapping[str, tuple[Bar, ...]]) -> tuple[Bar, ...]:
     """Return the bars of a scene; raise ``DatasetError`` if there are none."""
     if config.scene.name not in bars:
         raise DatasetError(f"{config.root}: {BARS_FILE} has no bars of scene {config.scene.name}, expected some")
@@ -209,67 +211,37 @@ def _steel(config: DatasetConfig, bars: _SceneBars) -> tuple[Bar, ...]:
 
 
 def _scene_checks(
-    config: DatasetConfig, root: Path, bars: _SceneBars, depth_views: int, progress: Progress
+    config: DatasetConfig, root: Path, steel: tuple[Bar, ...], depth_views: int, progress: Progress
 ) -> Iterator[Check]:
-    """Yield the checks of a config of one scene, or restricted to one scene."""
-    name, mesh, steel = config.label, root / config.mesh, _steel(config, bars)
-    variants, board = config.scene.appearance.variants, config.scene.board
-    audited = AuditedConfig(name, variants, steel, board)
+    """Yield the checks of a config of one scene, or restricted to one scene, with the bars ``steel``."""
+    name, mesh = config.label, root / config.mesh
+    audited = AuditedConfig(name, config.scene.appearance.variants, steel, config.scene.board)
     aim_m, aim_problems = checked_aim_point_m(config, mesh)
     expected = expected_views(config, aim_m, steel)
-    accumulator = _AuditAccumulator(config, audited, expected, depth_views)
-    for row in iterate_rows(config, [column for column in COLUMNS if column not in _NOT_AUDITED]):
-        accumulator.add(row)
-        progress(f"audit of {name}", accumulator.rows, len(config.views))
-    yield accumulator.rows_check()
-    camera_faults = (*aim_problems, *view_list_problems(config, expected), *accumulator.cameras)
-    yield Check(f"{name}: cameras", f"{len(expected)} poses of the protocol", "equal to 1e-12", camera_faults)
-    for check, measurements in zip(VIEW_CHECKS, accumulator.measurements, strict=True):
-        yield check.verdict(audited, measurements)
-    cycles_eyes = accumulator.cycles_eyes
+    row_faults, camera_faults = list[str](), [*aim_problems, *view_list_problems(config, expected)]
+    measured = [set(subset(len(config.views), check.views)) for check in VIEW_CHECKS]
+    measurements: list[list[Any]] = [[] for _ in VIEW_CHECKS]
+    rendered = set(subset(len(config.views), depth_views) if depth_views else ())
+    cycles_eyes: list[AuditedEye] = []
+    bar_ids, rays = {bar.bar_id for bar in steel}, RayCache()
+    for n, (record, row) in enumerate(zip(config.views, iterate_rows(config, AUDITED_COLUMNS), strict=True)):
+        row_faults += [f"{record.view_id}: {problem}" for problem in row_problems(row, record, bar_ids)]
+        if n < len(expected):
+            camera_faults += [f"{record.view_id}: {problem}" for problem in camera_problems(row, expected[n])]
+        view = view_from_row(row, rays)
+        for check, of_check, selected in zip(VIEW_CHECKS, measurements, measured, strict=True):
+            if n in selected:
+                of_check.append(check.measure(audited, view))
+        if n in rendered:
+            cycles_eyes += [view.left, view.right]
+        progress(f"audit of {name}", n + 1, len(config.views))
+    yield Check(f"{name}: rows", f"{len(config.views)} views", "all invariants", tuple(row_faults))
+    yield Check(
+        f"{name}: cameras", f"{len(expected)} poses of the protocol", "equal to 1e-12", tuple(camera_faults)
+    )
+    for check, of_check in zip(VIEW_CHECKS, measurements, strict=True):
+        yield check.verdict(audited, of_check)
     difference_and_depth_m = cycles_difference_m(
         mesh, cycles_eyes, lambda done, total: progress(f"Cycles depth of {name}", done, total)
     )
     yield cycles_verdict(name, difference_and_depth_m, len(cycles_eyes) // 2)
-
-
-class _AuditAccumulator:
-    """Accumulator over a config's rows: problems, measurements of every check, and eyes to render in Cycles."""
-
-    def __init__(
-        self,
-        config: DatasetConfig,
-        audited: AuditedConfig,
-        expected: Sequence[ExpectedView],
-        depth_views: int,
-    ) -> None:
-        self._config, self._audited, self._expected = config, audited, expected
-        self._bar_ids = {bar.bar_id for bar in audited.steel}
-        self._rays = RayCache()
-        self._measured = [set(subset(len(config.views), check.views)) for check in VIEW_CHECKS]
-        self._cycles_indices = set(subset(len(config.views), depth_views) if depth_views else ())
-        self._problems: list[str] = []
-        self.rows = 0
-        self.cameras: list[str] = []
-        self.measurements: list[list[Any]] = [[] for _ in VIEW_CHECKS]
-        self.cycles_eyes: list[AuditedEye] = []
-
-    def add(self, row: Mapping[str, Any]) -> None:
-        """Check and measure the next row."""
-        n = self.rows
-        self.rows += 1
-        record = self._config.views[n]
-        view_id = record.view_id
-        self._problems += [f"{view_id}: {problem}" for problem in row_problems(row, record, self._bar_ids)]
-        if n < len(self._expected):
-            self.cameras += [f"{view_id}: {problem}" for problem in camera_problems(row, self._expected[n])]
-        view = view_from_row(row, self._rays)
-        for check, measurements, selected in zip(VIEW_CHECKS, self.measurements, self._measured, strict=True):
-            if n in selected:
-                measurements.append(check.measure(self._audited, view))
-        if n in self._cycles_indices:
-            self.cycles_eyes += [view.left, view.right]
-
-    def rows_check(self) -> Check:
-        """Return the check of the rows' invariants."""
-        return Check(f"{self._config.label}: rows", f"{self.rows} views", "all invariants", tuple(self._problems))

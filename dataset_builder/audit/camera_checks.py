@@ -106,20 +106,14 @@ def expected_views(
 
 def view_list_problems(config: DatasetConfig, views: Sequence[ExpectedView]) -> Iterator[str]:
     """Yield a problem if the manifest's view ids are not those of the expected views, in order."""
-    listed_ids = list(config.view_ids)
-    expected_ids = [view.view_id for view in views]
-    if listed_ids != expected_ids:
-        first_mismatch = next(
-            (pair for pair in zip(listed_ids, expected_ids, strict=False) if pair[0] != pair[1]), None
-        )
-        detail = (
-            f": the first difference is {first_mismatch[0]}, expected {first_mismatch[1]}"
-            if first_mismatch
-            else ""
-        )
+    pairs = list(zip(config.view_ids, [view.view_id for view in views], strict=False))
+    different = [
+        f": the first difference is {found}, expected {wanted}" for found, wanted in pairs if found != wanted
+    ]
+    if different or len(config.views) != len(views):
         yield (
-            f"the manifest lists {len(listed_ids)} views, expected the {len(expected_ids)} views of its protocol"
-            f"{detail}"
+            f"the manifest lists {len(config.views)} views, expected the {len(views)} views of its protocol"
+            f"{''.join(different[:1])}"
         )
 
 

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Bool, Float64, UInt16
 from numpy import ndarray
 from rich.console import Console
 from rich.table import Table
@@ -16,11 +16,16 @@ from rich.table import Table
 from dataset_builder.scene.model import ESTIMATED_ROLE
 from dataset_builder.scene.variants import PROPS_SLOT, variants_of_slot
 from rebar_depth_bench.data.bars import Bar, with_axis
-from rebar_depth_bench.data.columns import EYES
-from rebar_depth_bench.data.eye_view import EyeView, eye_from_row
+from rebar_depth_bench.data.columns import COLUMNS, EYES
+from rebar_depth_bench.data.config_tables import ViewRecord
+from rebar_depth_bench.data.eye_view import EyeTruth, truth_from_row
 from rebar_depth_bench.errors import problem_summary
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid, transform
+from rebar_depth_bench.scoring.protocol import scored_pixels
+
+AUDITED_COLUMNS = tuple(column for column in COLUMNS if column != "left_preview")
+"""Columns whose cells are checked."""
 
 
 @dataclass(frozen=True)
@@ -107,11 +112,10 @@ class AuditedConfig:
 
 
 @dataclass(frozen=True, eq=False)
-class AuditedEye(EyeView):
-    """Eye of a view under audit: it has pixel rays and the points that these determine.
+class EyeWithRays(EyeTruth):
+    """Eye of a rendered or imported view, with pixel rays and the points that these determine.
 
     ``rays_cam`` are the pixel rays in the camera frame with z = 1, so that planar depth scales them to points.
-    ``rgb`` is None in a config without colour.
     """
 
     rays_cam: Float64[ndarray, "h w 3"]
@@ -124,8 +128,16 @@ class AuditedEye(EyeView):
 
 
 @dataclass(frozen=True, eq=False)
+class AuditedEye(EyeWithRays):
+    """Eye of a rendered view under audit; ``rgb`` is None in a config without colour."""
+
+    mask: Bool[ndarray, "h w"]
+    bars: UInt16[ndarray, "h w"]
+
+
+@dataclass(frozen=True, eq=False)
 class AuditedView:
-    """Stereo view under audit: its id and both eyes."""
+    """Rendered stereo view under audit: its id and both eyes."""
 
     view_id: str
     left: AuditedEye
@@ -159,9 +171,23 @@ class RayCache:
 
 def view_from_row(row: Mapping[str, Any], rays: RayCache) -> AuditedView:
     """Return the stereo view of a decoded row, whose arrays must have the shapes of the schema."""
-    return AuditedView(row["view_id"], *(_eye_from_row(row, eye, rays) for eye in EYES))
+    return AuditedView(row["view_id"], *(AuditedEye(**vars(eye_with_rays(row, eye, rays))) for eye in EYES))
 
 
-def _eye_from_row(row: Mapping[str, Any], name: str, rays: RayCache) -> AuditedEye:
-    eye = eye_from_row(row, name)
-    return AuditedEye(**vars(eye), rays_cam=rays.rays_cam(eye.camera))
+def eye_with_rays(row: Mapping[str, Any], eye: str, rays: RayCache) -> EyeWithRays:
+    """Return one eye of a decoded row, which has its depth."""
+    truth = truth_from_row(row, eye)
+    return EyeWithRays(**vars(truth), rays_cam=rays.rays_cam(truth.camera))
+
+
+def record_problems(view_id: str, truths: Mapping[str, EyeTruth], record: ViewRecord) -> Iterator[str]:
+    """Yield the differences of a row, its view id and its eyes by name, from the record in the manifest."""
+    if view_id != record.view_id:
+        yield f"the row's view_id is {view_id}, expected {record.view_id}"
+    for eye, truth in truths.items():
+        if truth.digest() != getattr(record, eye):
+            yield f"{eye} ground-truth digest differs from the manifest's"
+    left = truths["left"]
+    steel_px = None if left.mask is None else int(np.count_nonzero(left.mask))
+    if (steel_px, len(scored_pixels(left.mask, left.depth_m))) != (record.steel_px, record.scored_px):
+        yield "steel and scored pixel counts differ from the manifest's"

@@ -1,6 +1,8 @@
-"""Depth checks against known geometry: distances of steel from the bar axes, of the board from z = 0.
+"""Checks against known geometry: steel from the bar axes, the board from z = 0, generated cages from their spec.
 
-Neither reference depends on the ray caster that produced the depth.
+No reference depends on the ray caster that produced the depth. The distance from an axis is computed here on its
+own (``polyline_distance_m``), on purpose not by the functions that place cameras and make meshes: their errors would
+not show.
 """
 
 from __future__ import annotations
@@ -55,31 +57,17 @@ class BoardError:
 def max_axis_distance_ratio(config: AuditedConfig, view: AuditedView) -> float:
     """Return the largest distance of a steel pixel of both eyes from its bar's axis, in nominal radii.
 
-    The sagitta of a bend's chords is subtracted, so that the same bound holds for every bar.
+    It is 1 on the lateral surface up to the height of the ribs, and less on an end cap. The sagitta of a bend's
+    chords is subtracted, so that the same bound holds for every bar. Bars without a known axis are left out.
     """
-    ratios = [
-        axis_distance_ratio(eye.points_m, eye.bars, config.bars_with_known_axis) for eye in view.eyes.values()
-    ]
-    return max(float(eye_ratios.max(initial=0.0)) for eye_ratios in ratios)
-
-
-def axis_distance_ratio(
-    points_m: Float64[ndarray, "h w 3"], bars: UInt16[ndarray, "h w"], steel: Iterable[Bar]
-) -> Float64[ndarray, " n"]:
-    """Return each steel pixel's distance from its bar's centreline, divided by the bar's nominal radius.
-
-    The ratio is 1 on the lateral surface up to the height of the ribs, and less on an end cap. The sagitta of a
-    bend's chords is subtracted from the distance. Bars that are not in ``steel`` are left out.
-    """
-    axes = {bar.bar_id: bar for bar in steel}
-    ratios = []
-    for bar_id, on_bar_m in _points_by_bar(points_m, bars):
-        if bar_id in axes:
-            bar = axes[bar_id]
-            axis_m = np.array(bar.axis_m)
-            distance_m = polyline_distance_m(on_bar_m, axis_m) - bend_sagitta_m(axis_m)
-            ratios.append(distance_m / (bar.diameter_m / 2))
-    return np.concatenate(ratios) if ratios else np.zeros(0)
+    bars, ratios = {bar.bar_id: bar for bar in config.bars_with_known_axis}, list[float]()
+    for eye in view.eyes.values():
+        for bar_id, on_bar_m in _points_by_bar(eye.points_m, eye.bars):
+            if bar_id in bars:
+                axis_m, radius_m = np.array(bars[bar_id].axis_m), bars[bar_id].diameter_m / 2
+                distance_m = polyline_distance_m(on_bar_m, axis_m) - bend_sagitta_m(axis_m)
+                ratios.append(float((distance_m / radius_m).max()))
+    return float(np.max(ratios, initial=0.0))
 
 
 def bend_sagitta_m(axis_m: Float64[ndarray, "k 3"]) -> float:
@@ -136,21 +124,21 @@ def axis_verdict(config: AuditedConfig, ratios: Sequence[float]) -> Check:
 
 def view_board_error(config: AuditedConfig, view: AuditedView) -> BoardError:
     """Return the board error of both eyes of a view, all zeros for a scene without a board."""
-    if config.board is None:
-        return BoardError()
-    return merged_board_errors([board_error(eye, config.board) for eye in view.eyes.values()])
+    board = config.board
+    return BoardError() if board is None else board_error(view.eyes.values(), board)
 
 
-def board_error(eye: AuditedEye, board: BoardSpec) -> BoardError:
-    """Return the board error of the eye's non-steel points over the board's rectangle.
+def board_error(eyes: Iterable[AuditedEye], board: BoardSpec) -> BoardError:
+    """Return the board error of the eyes' non-steel points over the board's rectangle.
 
     A margin of 1 mm inside the rectangle's edge is left out, because the sheet has sides.
     """
-    x_m, y_m, z_m = np.moveaxis(eye.points_m, -1, 0)
-    inside = (np.abs(x_m) < board.width_m / 2 - _BOARD_EDGE_MARGIN_M) & (
-        np.abs(y_m) < board.height_m / 2 - _BOARD_EDGE_MARGIN_M
-    )
-    board_z_m = z_m[inside & ~eye.mask & (eye.depth_m > 0)]
+    half_m = np.array([board.width_m, board.height_m]) / 2 - _BOARD_EDGE_MARGIN_M
+    heights_m = []
+    for eye in eyes:
+        inside = (np.abs(eye.points_m[..., :2]) < half_m).all(axis=-1)
+        heights_m.append(eye.points_m[inside & ~eye.mask & (eye.depth_m > 0)][:, 2])
+    board_z_m = np.concatenate(heights_m)
     off_m = np.abs(board_z_m)
     on_board = off_m < _ON_BOARD_TOLERANCE_M
     return BoardError(
@@ -159,17 +147,6 @@ def board_error(eye: AuditedEye, board: BoardSpec) -> BoardError:
         below_m=float((-board_z_m).max(initial=0.0)),
         near_m=float(off_m[on_board].max(initial=0.0)),
         off_plane=int(np.count_nonzero(~on_board)),
-    )
-
-
-def merged_board_errors(errors: Sequence[BoardError]) -> BoardError:
-    """Return one board error with the maxima of the distances and the sums of the counts."""
-    return BoardError(
-        pixels=sum(error.pixels for error in errors),
-        off_m=max((error.off_m for error in errors), default=0.0),
-        below_m=max((error.below_m for error in errors), default=0.0),
-        near_m=max((error.near_m for error in errors), default=0.0),
-        off_plane=sum(error.off_plane for error in errors),
     )
 
 
@@ -182,16 +159,16 @@ def board_verdict(config: AuditedConfig, errors: Sequence[BoardError]) -> Check:
     name = f"{config.name}: board at z = 0"
     if config.board is None:
         return Check.skip(name, "no board in this scene")
-    all_views = merged_board_errors(errors)
-    if not all_views.pixels:
+    pixels = sum(error.pixels for error in errors)
+    if not pixels:
         return Check.skip(name, "no view sees the board")
     bound = f"{MAX_BOARD_ERROR_M * 1e6:g} um"
     if not config.has_props:
-        measured = f"at most {all_views.off_m * 1e6:.3f} um"
-        return Check(name, measured, bound, tuple(_plane_problems(all_views.off_m)))
-    share = all_views.off_plane / all_views.pixels
-    measured = f"at most {all_views.near_m * 1e6:.3f} um, {share:.1%} occluded by objects on the board"
-    problems = [*_plane_problems(max(all_views.near_m, all_views.below_m))]
+        off_m = max(error.off_m for error in errors)
+        return Check(name, f"at most {off_m * 1e6:.3f} um", bound, tuple(_plane_problems(off_m)))
+    share, near_m = sum(error.off_plane for error in errors) / pixels, max(error.near_m for error in errors)
+    measured = f"at most {near_m * 1e6:.3f} um, {share:.1%} occluded by objects on the board"
+    problems = [*_plane_problems(max(near_m, *(error.below_m for error in errors)))]
     if share > _MAX_OCCLUDED_SHARE:
         problems.append(
             f"{share:.1%} of the board's pixels are occluded, expected less than {_MAX_OCCLUDED_SHARE:.0%}"
@@ -226,24 +203,6 @@ def cage_checks(scene: DatasetConfig, bars: Sequence[Bar]) -> Iterator[Check]:
     yield _gap_check(scene, bars)
     yield _steel_check(scene)
     yield _clearance_check(scene, bars)
-
-
-def merged_checks(config: str, checks: Sequence[Check]) -> Iterator[Check]:
-    """Yield one check for all checks of the same name, which begins with the label of a scene and a colon.
-
-    A check that is skipped in all scenes is skipped for the reason of the first one.
-    """
-    by_name: dict[str, list[Check]] = {}
-    for check in checks:
-        by_name.setdefault(check.name.partition(": ")[2], []).append(check)
-    for name, group in by_name.items():
-        made = [check for check in group if not check.skipped]
-        if not made:
-            yield Check.skip(f"{config}: {name}", group[0].measured)
-            continue
-        problems = (f"{check.name.partition(': ')[0]}: {problem}" for check in made for problem in check.problems)
-        measured = f"{sum(check.passed for check in made)} of {len(made)} scenes, such as: {made[0].measured}"
-        yield Check(f"{config}: {name}", measured, made[0].bound, tuple(problems))
 
 
 def _bars_check(scene: DatasetConfig, bars: Sequence[Bar]) -> Check:

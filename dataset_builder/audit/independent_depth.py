@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
-from dataset_builder.audit.checks import AuditedConfig, AuditedEye, AuditedView, Check
+from dataset_builder.audit.checks import AuditedConfig, AuditedEye, AuditedView, Check, EyeWithRays
 from dataset_builder.pipeline.blender_process import BlenderProcesses, DepthTask
 from rebar_depth_bench.atomic_io import scratch_folder
 from rebar_depth_bench.data.bars import with_axis
@@ -121,7 +121,7 @@ class ProjectedPoints:
     inside: Bool[ndarray, " n"]
 
 
-def project_into(eye: AuditedEye, points_m: Float64[ndarray, "n 3"], margin_px: int) -> ProjectedPoints:
+def project_into(eye: EyeWithRays, points_m: Float64[ndarray, "n 3"], margin_px: int) -> ProjectedPoints:
     """Project world points (metres) into an eye.
 
     A point counts as inside if it is at least ``margin_px`` whole pixels away from the frame's border.

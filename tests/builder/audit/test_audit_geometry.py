@@ -85,7 +85,7 @@ def test_undistorted_depth_on_raw_grid_is_reported() -> None:
     eye = view("raw").left
     ideal = scene().caster.cast(replace(eye.camera, distortion=np.zeros(5)))
     wrong = replace(eye, depth_m=ideal.depth_m, mask=ideal.mask, bars=ideal.bars)
-    assert board_error(wrong, BOARD).off_m > 1e-3
+    assert board_error([wrong], BOARD).off_m > 1e-3
 
 
 def test_board_check_is_skipped_without_board() -> None:
