@@ -1,8 +1,8 @@
 """Checks against known geometry: steel from the bar axes, the board from z = 0, generated cages from their spec.
 
 No reference depends on the ray caster that produced the depth. The distance from an axis is computed here on its
-own (``polyline_distance_m``), on purpose not by the functions that place cameras and make meshes: their errors would
-not show.
+own (``polyline_distance_m``), on purpose not by the functions that place cameras and make meshes: errors of theirs
+would not show.
 """
 
 from __future__ import annotations
