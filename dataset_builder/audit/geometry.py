@@ -215,19 +215,17 @@ def _bars_check(scene: DatasetConfig, bars: Sequence[Bar]) -> Check:
     if [_identity(bar) for bar in bars] != [_identity(bar) for bar in expected]:
         problem = f"{len(bars)} bars differ from the {len(expected)} of the generator in number, role or diameter"
         return Check(name, "other bars", "those of the generator", (problem,))
-    pairs = [pair for a, b in zip(bars, expected, strict=True) for pair in _lines(a, b)]
-    off_m = max(float(np.abs(found - wanted).max(initial=0.0)) for found, wanted in pairs)
+    off_m = max(
+        float(np.abs(np.subtract(getattr(bar, line), getattr(wanted, line))).max(initial=0.0))
+        for bar, wanted in zip(bars, expected, strict=True)
+        for line in ("axis_m", "nominal_axis_m")
+    )
     problems = () if off_m <= _AXIS_TOLERANCE_M else (f"axes are {off_m:.2e} m off those of the generator",)
     return Check(name, f"{len(bars)} bars: at most {off_m:.1e} m off", f"{_AXIS_TOLERANCE_M:g} m", problems)
 
 
 def _identity(bar: Bar) -> tuple[int, str, float, int, int]:
     return bar.bar_id, bar.role, bar.diameter_m, len(bar.axis_m), len(bar.nominal_axis_m)
-
-
-def _lines(a: Bar, b: Bar) -> list[tuple[ndarray, ndarray]]:
-    lines = (a.axis_m, b.axis_m), (a.nominal_axis_m, b.nominal_axis_m)
-    return [(np.array(found), np.array(wanted)) for found, wanted in lines]
 
 
 def _gap_check(scene: DatasetConfig, bars: Sequence[Bar]) -> Check:

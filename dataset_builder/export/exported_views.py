@@ -42,45 +42,35 @@ class CameraView:
         return f"{self.view_id.removeprefix(scene_of(self.view_id))}_{eye}"
 
 
-@dataclass(frozen=True, eq=False)
-class StoredView:
-    """One row of a dataset folder, its images still encoded."""
-
-    config: DatasetConfig
-    view: CameraView
-    record: ViewRecord
-    row: Mapping[str, Any]
-
-    def decode(self) -> dict[str, Any]:
-        """Return the decoded row (see ``rebar_depth_bench.load``), checked against the manifest.
-
-        Raises ``DatasetError``, naming the view, if an image cannot be decoded or the digest of the ground truth
-        differs from the manifest.
-        """
-        decoded = RowDecoder.of(self.config).row(self.row)
-        for eye in self.config.truth_eyes:
-            digest, expected = truth_from_row(decoded, eye).digest(), getattr(self.record, eye)
-            if digest != expected:
-                raise DatasetError(
-                    f"{self.config.root}: view {self.record.view_id}: the {eye} ground truth has digest "
-                    f"{digest[:16]}, expected {expected[:16]} as in the manifest"
-                )
-        return decoded
-
-
-def stored_views(config: DatasetConfig, wanted: Collection[str]) -> Iterator[StoredView]:
-    """Yield the wanted views of a config in the folder's order, one row in memory at a time.
+def stored_views(config: DatasetConfig, wanted: Collection[str]) -> Iterator[tuple[CameraView, Mapping[str, Any]]]:
+    """Yield the wanted views of a config in the folder's order, with their rows, whose images are encoded.
 
     Raises ``DatasetError`` for shards that cannot be read, lack a wanted view or contain an unknown one.
     """
-    records = {record.view_id: record for record in config.views}
     missing = set(wanted)
     for row in iterate_undecoded(config, _COLUMNS):
         if row["view_id"] in missing:
             missing.remove(row["view_id"])
-            yield StoredView(config, _camera_view(row, config), records[row["view_id"]], row)
+            yield _camera_view(row, config), row
     if missing:
         raise DatasetError(f"{config.root}: {config.name} lacks {len(missing)} views, among them {min(missing)}")
+
+
+def decoded_row(config: DatasetConfig, record: ViewRecord, row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the decoded row of a view (see ``rebar_depth_bench.load``), checked against its record.
+
+    Raises ``DatasetError``, naming the view, if an image cannot be decoded or the digest of the ground truth
+    differs from the manifest.
+    """
+    decoded = RowDecoder.of(config).row(row)
+    for eye in config.truth_eyes:
+        digest, expected = truth_from_row(decoded, eye).digest(), getattr(record, eye)
+        if digest != expected:
+            raise DatasetError(
+                f"{config.root}: view {record.view_id}: the {eye} ground truth has digest {digest[:16]}, expected "
+                f"{expected[:16]} as in the manifest"
+            )
+    return decoded
 
 
 def _camera_view(row: Mapping[str, Any], config: DatasetConfig) -> CameraView:

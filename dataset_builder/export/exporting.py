@@ -11,7 +11,7 @@ from dataset_builder.export.camera_formats import cameras_txt, images_txt, point
 from dataset_builder.export.exported_views import (
     EXPORT_FILES,
     CameraView,
-    StoredView,
+    decoded_row,
     exported_files,
     stored_views,
 )
@@ -130,18 +130,29 @@ def _export_part(
     to: Path,
     progress: Progress,
 ) -> ConfigExport:
-    """Write the images of what is exported into the folder ``name``, then the texts that refer to them."""
+    """Write the images of what is exported into the folder ``name``, then the texts that refer to them.
+
+    Images that exist are kept.
+    """
     views: list[CameraView] = []
-    into = to / name
-    written = files = 0
-    for stored in stored_views(config, wanted):
-        view_files, view_written = _write_missing(stored, into)
-        files, written = files + view_files, written + view_written
-        views.append(stored.view)
+    written = kept = 0
+    records = {record.view_id: record for record in config.views}
+    for view, row in stored_views(config, wanted):
+        images = [
+            (to / name / file.path(view.stem(eye)), f"{eye}_{file.column}", file.encode)
+            for eye in view.cameras
+            for file in exported_files(config).values()
+        ]
+        missing = [image for image in images if not image[0].is_file()]
+        decoded = decoded_row(config, records[view.view_id], row) if missing else {}
+        for path, column, encode in missing:
+            write_bytes(path, encode(decoded[column]))
+        written, kept = written + len(missing), kept + len(images) - len(missing)
+        views.append(view)
         progress(f"export of {name}", len(views), len(wanted))
-    for path, text in _texts(folder, config, views, bars).items():
-        write_text(into / path, text)
-    return ConfigExport(name, len(views), written, files - written)
+    for place, text in _texts(folder, config, views, bars).items():
+        write_text(to / name / place, text)
+    return ConfigExport(name, len(views), written, kept)
 
 
 def _texts(
@@ -160,17 +171,3 @@ def _texts(
             "transforms.json": transforms_json(views),
         }
     return texts
-
-
-def _write_missing(stored: StoredView, into: Path) -> tuple[int, int]:
-    """Write those image files of a view that do not exist yet; return the numbers of all and of those written."""
-    images = [
-        (into / file.path(stored.view.stem(eye)), f"{eye}_{file.column}", file.encode)
-        for eye in stored.view.cameras
-        for file in exported_files(stored.config).values()
-    ]
-    missing = [image for image in images if not image[0].is_file()]
-    decoded = stored.decode() if missing else {}
-    for path, column, encode in missing:
-        write_bytes(path, encode(decoded[column]))
-    return len(images), len(missing)

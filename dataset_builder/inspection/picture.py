@@ -215,12 +215,10 @@ def _draw_scale_bar(draw: ImageDraw.ImageDraw, px_per_m: float) -> None:
 
 
 def _write_head(draw: ImageDraw.ImageDraw, inspection: Inspection, width: int) -> None:
-    lower_m, upper_m = inspection.box_m
-    sides = " x ".join(f"{side:.3f}" for side in upper_m - lower_m)
     name = shortened(printable(inspection.name), 30, width - 2 * _MARGIN_PX)
     draw.text((_MARGIN_PX, 14), name, _INK, font(30))
     bars = counted(len(inspection.cage.bars), "bar")
-    words = [f"{bars}, {sides} m (x, y, z)"]
+    words = [f"{bars}, {inspection.size_text} (x, y, z)"]
     if inspection.overlaps:
         words.append(f"red circles: {counted(len(inspection.overlaps), 'pair')} of bars overlap")
     draw.text((_MARGIN_PX, 54), "; ".join(words), _GREY, font(20))

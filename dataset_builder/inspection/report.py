@@ -114,16 +114,16 @@ def _axis_lines(inspection: Inspection) -> list[str]:
 
 def _place_lines(inspection: Inspection) -> list[str]:
     """Return the box of the steel and the transform from the file's frame."""
-    lower, upper = inspection.box_m
-    sides = " x ".join(f"{side:.3f}" for side in upper - lower)
-    ranges = ", ".join(
-        f"{axis} {low:.3f} to {high:.3f}" for axis, low, high in zip("xyz", lower, upper, strict=True)
-    )
+    corners = zip("xyz", *inspection.box_m, strict=True)
+    ranges = ", ".join(f"{axis} {low:.3f} to {high:.3f}" for axis, low, high in corners)
     matrix = inspection.cage.world_from_source
     rows = [f"  [{', '.join(f'{value:.12g}' for value in row)}]" for row in matrix[:3]]
     is_placed = not np.array_equal(matrix, np.eye(4))
     words = "world_from_source (coordinates of the file to metres of the world):"
-    return [f"steel: {sides} m ({ranges})", *([words, *rows] if is_placed else ["coordinates: those of the file"])]
+    return [
+        f"steel: {inspection.size_text} ({ranges})",
+        *([words, *rows] if is_placed else ["coordinates: those of the file"]),
+    ]
 
 
 def _overlap_lines(inspection: Inspection) -> list[str]:

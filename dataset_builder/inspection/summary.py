@@ -70,6 +70,11 @@ class Inspection:
     box_m: Box
     overlaps: tuple[Overlap, ...] | None
 
+    @property
+    def size_text(self) -> str:
+        """Sides of the box, such as ``1.000 x 0.300 x 0.200 m``."""
+        return f"{' x '.join(f'{side:.3f}' for side in self.box_m[1] - self.box_m[0])} m"
+
 
 def inspect_cage(cage: Cage, name: str) -> Inspection:
     """Return the summary of a cage of one or more bars."""
