@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, Shaped, UInt16
 from numpy import ndarray
 
-from dataset_builder.importing.import_layout import DepthTable, PosesTable
+from dataset_builder.importing.import_layout import DepthTable, MatricesTable, PosesTable
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.errors import EntryError, InputError, Problem, escape_text, exception_summary, format_shape
 from rebar_depth_bench.geometry.cameras import inverse_rigid, pixel_rays, swap_camera_axes
@@ -83,11 +83,15 @@ def planar_depth_m(
 
     Range is divided by the length of the ray (x, y, 1) of its pixel in the camera with ``K`` and ``distortion``.
     Disparity d is that of the left pixel to the right: z = fx B / (d + cx_right - cx_left). Raises ``InputError``
-    as ``rectified_pair`` does.
+    as ``rectified_pair`` does, and ``EntryError`` for a lens model that cannot be inverted at a pixel.
     """
     if kind == "range":
         height, width = values.shape
-        values = values / np.linalg.norm(pixel_rays(K, width, height, distortion), axis=-1)
+        try:
+            rays = pixel_rays(K, width, height, distortion)
+        except ValueError as error:
+            raise EntryError(Problem("invalid", "K", str(error), "a lens that sees every pixel")) from None
+        values = values / np.linalg.norm(rays, axis=-1)
     if kind == "disparity":
         pair = rectified_pair(calibration)
         with np.errstate(divide="ignore", over="ignore"):
@@ -168,7 +172,7 @@ def _exr_channel(path: Path, channel: str) -> Shaped[ndarray, "h w"]:
     raise EntryError(Problem("missing", path.name, found, channel))
 
 
-def read_matrix(path: Path, key: str | None, shape: tuple[int, int]) -> Float64[ndarray, "n m"]:
+def _read_matrix(path: Path, key: str | None, shape: tuple[int, int]) -> Float64[ndarray, "n m"]:
     """Return the matrix in a file, of ``shape`` or, for poses, without the row 0 0 0 1.
 
     ``key`` is that of a JSON object. Raises ``EntryError`` for anything but finite numbers.
@@ -202,11 +206,21 @@ def _json_value(content: bytes, key: str | None) -> object:
     return value
 
 
+def intrinsics(path: Path, table: MatricesTable) -> Float64[ndarray, "3 3"]:
+    """Return the pinhole matrix K of a view, pixels. Raises ``EntryError`` for any other matrix."""
+    K = _read_matrix(path, table.key, (3, 3))
+    if not (K[0, 0] > 0 and K[1, 1] > 0 and K[0, 1] == K[1, 0] == 0 and (K[2] == (0, 0, 1)).all()):
+        found = f"holds {short_repr(K.tolist())}"
+        raise EntryError(Problem("invalid", path.name, found, "fx 0 cx, 0 fy cy, 0 0 1 with fx and fy above 0"))
+    return K
+
+
 def cam_from_world(path: Path, table: PosesTable) -> Float64[ndarray, "4 4"]:
     """Return a pose in OpenCV axes and metres. Raises ``EntryError`` for a matrix that is no rigid pose."""
-    pose = read_matrix(path, table.key, (4, 4))
+    pose = _read_matrix(path, table.key, (4, 4))
     rotation = pose[:3, :3]
-    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = np.abs(rotation @ rotation.T - np.eye(3)).max()
     if not (error <= _ROUNDED_ROTATION and np.linalg.det(rotation) > 0 and (pose[3] == (0, 0, 0, 1)).all()):
         found = f"holds {short_repr(pose.tolist())}"
         raise EntryError(Problem("invalid", path.name, found, "a rotation, a translation, and 0 0 0 1"))

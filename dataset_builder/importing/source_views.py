@@ -19,10 +19,10 @@ from dataset_builder.importing.source_files import (
     MATRIX_SUFFIXES,
     bar_ids,
     cam_from_world,
+    intrinsics,
     planar_depth_m,
     read_depth,
     read_labels,
-    read_matrix,
     rectified_pair,
 )
 from rebar_depth_bench.captures.camera_files import CaptureCameras, cameras_of_table
@@ -92,7 +92,7 @@ class SourceViews:
             pose = cam_from_world(self.file(layout.poses.file, name), layout.poses)
         K = lens_K(calibration.left)
         if layout.intrinsics is not None:
-            K = read_matrix(self.file(layout.intrinsics.file, name), layout.intrinsics.key, (3, 3))
+            K = intrinsics(self.file(layout.intrinsics.file, name), layout.intrinsics)
         columns: dict[str, Any] = {
             "left_K": K,
             "left_distortion": lens_distortion(calibration.left),

@@ -171,6 +171,25 @@ def test_invalid_file_is_refused_and_named(
 
 
 @pytest.mark.parametrize(
+    ("K", "words"),
+    [
+        ("1 2 3 4 5 6 7 8 9", "expected fx 0 cx"),
+        ("0 0 79 0 87 44 0 0 1", "expected fx 0 cx"),
+        ("87 1 79 0 87 44 0 0 1", "expected fx 0 cx"),
+        ("9 0 79 0 9 44 0 0 1", "cannot be inverted at"),
+    ],
+)
+def test_intrinsics_that_are_no_camera_of_the_images_are_refused(K: str, words: str, folder: Path) -> None:
+    for name in NAMES:
+        data.write(folder / f"k/{name}.txt", K.encode())
+    tables = "\n[intrinsics]\nfile = 'k/{view}.txt'\n[depth]\nkind = 'range'\n"
+    layout = data.write_layout(folder, ("left_depth", "left_rgb"), tables=tables)
+    layout.write_text(layout.read_text().replace("[0, 0, 0, 0]", "[-0.1, 0, 0, 0]"))
+    with pytest.raises(InputError, match=words):
+        plan_import(layout, "mock-up").views.decode(NAMES[0])
+
+
+@pytest.mark.parametrize(
     ("line", "problem"),
     [
         ("1,x,0.01,0,0", "invalid"),
