@@ -43,6 +43,13 @@ _AIM_TOLERANCE_M = 0.0011
 
 The aim point is rounded to the millimetre, and the float32 vertices of the mesh may round to the neighbouring one.
 """
+MAX_PROJECTION_ERROR_PX = 1e-6
+"""Largest distance of a reprojected point from its pixel centre, pixels."""
+_MAX_PROJECTED_PIXELS = 60_000
+"""Pixels projected per eye, evenly spaced.
+
+OpenCV also computes 15 derivatives per coordinate, which takes seconds and 200 MB for all pixels.
+"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,15 +152,6 @@ def _rig_problems(row: Mapping[str, Any], baseline_m: float) -> Iterator[str]:
         deviation = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
         if not deviation <= CAMERA_TOLERANCE or not np.linalg.det(rotation) > 0:
             yield f"{eye}_cam_from_world is not a rigid pose (deviation {deviation:.1e})"
-
-
-MAX_PROJECTION_ERROR_PX = 1e-6
-"""Largest distance of a reprojected point from its pixel centre, pixels."""
-_MAX_PROJECTED_PIXELS = 60_000
-"""Pixels projected per eye, evenly spaced.
-
-OpenCV also computes 15 derivatives per coordinate, which takes seconds and 200 MB for all pixels.
-"""
 
 
 def view_projection_error_px(_: AuditedConfig, view: AuditedView) -> float:

@@ -36,6 +36,8 @@ _CHUNK = 4096
 _BOARD_EDGE_MARGIN_M = 0.001
 _ON_BOARD_TOLERANCE_M = 1e-4
 _MAX_OCCLUDED_SHARE = 0.5
+_AXIS_TOLERANCE_M = 1e-9
+"""Largest difference of a coordinate from that of the generator, which differs by this much between machines."""
 
 
 @dataclass(frozen=True)
@@ -191,10 +193,6 @@ def _points_by_bar(
     starts = np.flatnonzero(np.diff(ids[order], prepend=0))
     for group in np.split(order, starts[1:]) if len(starts) else ():
         yield int(ids[group[0]]), points_m.reshape(-1, 3)[pixels[group]]
-
-
-_AXIS_TOLERANCE_M = 1e-9
-"""Largest difference of a coordinate from that of the generator, which differs by this much between machines."""
 
 
 def cage_checks(scene: DatasetConfig, bars: Sequence[Bar]) -> Iterator[Check]:

@@ -33,6 +33,16 @@ CYCLES_OUTLIER_RATIO = 1e-3
 
 Only a different surface explains so large a difference.
 """
+MAX_CONTRADICTED_SHARE = 1e-4
+"""Largest share of contradicted pixels among those that project into the right frame."""
+_MIN_BAR_WIDTH_PX = 2.0
+_NEIGHBOUR_OFFSETS = tuple((dv, du) for dv in (-1, 0, 1, 2) for du in (-1, 0, 1, 2))
+"""Offsets (dv, du) of the 4 x 4 pixel centres around a projection, relative to the one above and left of it."""
+_MAX_RAY_DEVIATION_PX = 3.0
+"""Largest distance of a projected point from the ray of its pixel, pixels.
+
+A distortion polynomial is not monotonic far outside the frame and may project a point there back into it.
+"""
 
 
 def cycles_difference_m(
@@ -83,18 +93,6 @@ def cycles_verdict(config: str, difference_and_depth_m: ndarray[Any, Any], views
         f"median {bound_m * 1e6:.3g} um, {MAX_CYCLES_OUTLIER_SHARE:.1%} over 1 mm/m",
         () if median_m <= bound_m and share <= MAX_CYCLES_OUTLIER_SHARE else (measured,),
     )
-
-
-MAX_CONTRADICTED_SHARE = 1e-4
-"""Largest share of contradicted pixels among those that project into the right frame."""
-_MIN_BAR_WIDTH_PX = 2.0
-_NEIGHBOUR_OFFSETS = tuple((dv, du) for dv in (-1, 0, 1, 2) for du in (-1, 0, 1, 2))
-"""Offsets (dv, du) of the 4 x 4 pixel centres around a projection, relative to the one above and left of it."""
-_MAX_RAY_DEVIATION_PX = 3.0
-"""Largest distance of a projected point from the ray of its pixel, pixels.
-
-A distortion polynomial is not monotonic far outside the frame and may project a point there back into it.
-"""
 
 
 @dataclass(frozen=True)
