@@ -33,7 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Check the layout, print what is imported, and import it unless this is a dry run."""
-    from dataset_builder.importing.run import plan_import, run_import
+    from dataset_builder.importing.config_import import plan_import, run_import
 
     source = plan_import(options.layout, options.config)
     (height, width), views = source.views.grid, source.views.names

@@ -6,8 +6,6 @@ import argparse
 import re
 import sys
 
-from dataset_builder.push.errors import require_online, require_token
-from dataset_builder.push.repository import MAIN_BRANCH, Repository, check_repository_id
 from rebar_depth_bench.console import ProgressBars, print_notice
 from rebar_depth_bench.errors import InputError, escape_text
 from rebar_depth_bench.paths import PATH_PATTERN
@@ -26,7 +24,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--private", action="store_true", help="make a new repository private")
     parser.add_argument(
         "--revision",
-        default=MAIN_BRANCH,
+        default="main",
         metavar="BRANCH",
         help="branch to publish on, created from the main branch if it does not exist (default: %(default)s)",
     )
@@ -34,15 +32,21 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Print what a push changes, and publish it with ``--yes``."""
+    from dataset_builder.push.hub_errors import require_online, require_token
+    from dataset_builder.push.pushing import (
+        Repository,
+        check_repository_id,
+        plan_push,
+        send_push,
+        verified_folder,
+    )
+
     repository = Repository(check_repository_id(options.hub_id, "--hub-id"), options.revision)
     if not re.fullmatch(PATH_PATTERN, options.revision):
         raise InputError(f"--revision is {escape_text(options.revision)}, expected the name of a branch")
     require_online()
     if options.yes:
         require_token()
-    from dataset_builder.push.run import plan_push, send_push
-    from dataset_builder.push.verified import verified_folder
-
     with ProgressBars() as bars:
         source = verified_folder(options.root, bars.update)
     if source.stray:

@@ -13,7 +13,6 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 from dataset_builder.config.file_specs import MeshFileSpec, PlacementSpec, read_assembly_file
-from dataset_builder.config.scene_schema import UNITS_M
 from dataset_builder.scene.assemblies.cage import Cage, CageBar, LeftOut, unit_scale
 from dataset_builder.scene.assemblies.mesh_import import (
     MAX_FLOAT32_SPACING_M,
@@ -24,6 +23,7 @@ from dataset_builder.scene.assemblies.mesh_import import (
 from dataset_builder.scene.assemblies.surface_bar import fitted_bar
 from dataset_builder.scene.selection import Selection
 from rebar_depth_bench.errors import MeshError, escape_text
+from rebar_depth_bench.validation import UNITS_M
 
 
 def mesh_file_spec(
