@@ -14,8 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from dataset_builder.scene.model import ESTIMATED_ROLE
-from dataset_builder.scene.variants.registry import PROPS_SLOT
-from dataset_builder.scene.variants.registry import variants_of_slot
+from dataset_builder.scene.variants.registry import PROPS_SLOT, variants_of_slot
 from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.data.columns import COLUMNS, EYES
 from rebar_depth_bench.data.config_tables import ViewRecord
