@@ -30,8 +30,7 @@ from dataset_builder.inspection.summary import inspect_cage
 from dataset_builder.scene.assemblies.cage import Cage
 from dataset_builder.scene.assemblies.generated import cage_bars
 from dataset_builder.scene.cages.as_built import END_TOLERANCE_M, PLACE_TOLERANCE_M, SPACING_TOLERANCE_M
-from dataset_builder.scene.cages.families import FAMILIES
-from dataset_builder.scene.cages.generate import GeneratedCage, generate_cage
+from dataset_builder.scene.cages.generate import FAMILIES, GeneratedCage, generate_cage
 from dataset_builder.scene.cages.rules import (
     BEAM_STEEL,
     COLUMN_STEEL,

@@ -23,8 +23,7 @@ from PIL import Image
 
 from benchmarks.timing import machine_description, print_markdown
 from dataset_builder.blender.colour import configure_colour, render_colour
-from dataset_builder.blender.evaluated_mesh import evaluated_world_mesh
-from dataset_builder.blender.scene import build_scene
+from dataset_builder.blender.scene import build_scene, evaluated_world_mesh
 from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.config.rigs import rig_cameras
 from dataset_builder.config.specs import QUALITIES, UNIFORM, ColourSpec, ConfigSpec, colour_spec

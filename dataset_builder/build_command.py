@@ -23,7 +23,7 @@ from dataset_builder.config.specs import (
     ColourSpec,
     colour_spec,
 )
-from dataset_builder.scene.variants import VARIANTS
+from dataset_builder.scene.variants.registry import VARIANTS
 from rebar_depth_bench.console import ProgressBars, Rate, require_extra
 from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.view_ids import SPLITS

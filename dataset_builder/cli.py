@@ -170,7 +170,7 @@ def _add_import_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _import(options: argparse.Namespace) -> None:
     """Check the layout, print what is imported, and import it unless this is a dry run."""
-    from dataset_builder.importing.run import plan_import, run_import
+    from dataset_builder.importing.config_import import plan_import, run_import
 
     source = plan_import(options.layout, options.config)
     (height, width), views = source.views.grid, source.views.names
@@ -219,8 +219,6 @@ def _inspect(options: argparse.Namespace) -> None:
 
 
 def _add_push_arguments(parser: argparse.ArgumentParser) -> None:
-    from dataset_builder.push.repository import MAIN_BRANCH
-
     parser.add_argument("root", metavar="ROOT", help="dataset folder")
     parser.add_argument("--hub-id", required=True, metavar="ID", help="id of the repository, ORG/NAME")
     parser.add_argument(
@@ -229,7 +227,7 @@ def _add_push_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--private", action="store_true", help="make a new repository private")
     parser.add_argument(
         "--revision",
-        default=MAIN_BRANCH,
+        default="main",
         metavar="BRANCH",
         help="branch to publish on, created from the main branch if it does not exist (default: %(default)s)",
     )
@@ -237,8 +235,14 @@ def _add_push_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _push(options: argparse.Namespace) -> None:
     """Print what a push changes, and publish it with ``--yes``."""
-    from dataset_builder.push.errors import require_online, require_token
-    from dataset_builder.push.repository import Repository, check_repository_id
+    from dataset_builder.push.hub_errors import require_online, require_token
+    from dataset_builder.push.pushing import (
+        Repository,
+        check_repository_id,
+        plan_push,
+        send_push,
+        verified_folder,
+    )
 
     repository = Repository(check_repository_id(options.hub_id, "--hub-id"), options.revision)
     if not re.fullmatch(PATH_PATTERN, options.revision):
@@ -246,9 +250,6 @@ def _push(options: argparse.Namespace) -> None:
     require_online()
     if options.yes:
         require_token()
-    from dataset_builder.push.run import plan_push, send_push
-    from dataset_builder.push.verified import verified_folder
-
     with ProgressBars() as bars:
         source = verified_folder(options.root, bars.update)
     if source.stray:

@@ -10,7 +10,7 @@ import os
 import re
 import shutil
 import stat
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from rebar_depth_bench.errors import InputError, escape_text
 
@@ -34,6 +34,12 @@ def path_below(folder: Path, name: str) -> Path:
             f"{folder}: {escape_text(name)} is not a path in this folder, expected names of {NAME_LETTERS}"
         )
     return folder / name
+
+
+def is_below(path: str) -> bool:
+    """Return whether a relative path from a file stays in its folder: it names no other files of the machine."""
+    parts = PurePosixPath(path).parts
+    return bool(parts) and path.isprintable() and ".." not in parts and not path.startswith(("/", "~"))
 
 
 def check_no_links(folder: Path, *names: str) -> None:

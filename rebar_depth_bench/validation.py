@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Annotated, Any, TypeGuard, TypeVar, get_args
@@ -120,6 +120,9 @@ def one_of(*values: str | int) -> Expected:
     *others, last = (f'"{value}"' if isinstance(value, str) else f"{value}" for value in values)
     return Expected(f"{', '.join(others)} or {last}" if others else last, lambda value: value in values)
 
+
+UNITS_M: Mapping[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
+"""Length of one unit in metres, by the name of the unit in files."""
 
 Triple = Annotated[tuple[float, float, float], Strict(False)]
 """Type of a list of three numbers, converted to a tuple."""

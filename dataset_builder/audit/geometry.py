@@ -1,6 +1,8 @@
-"""Depth checks against known geometry: distances of steel from the bar axes, of the board from z = 0.
+"""Checks against known geometry: steel from the bar axes, the board from z = 0, generated cages from their spec.
 
-Neither reference depends on the ray caster that produced the depth.
+No reference depends on the ray caster that produced the depth. The distance from an axis is computed here on its
+own (``polyline_distance_m``), on purpose not by the functions that place cameras and make meshes: errors of theirs
+would not show.
 """
 
 from __future__ import annotations
@@ -12,9 +14,16 @@ import numpy as np
 from jaxtyping import Float64, UInt16
 from numpy import ndarray
 
-from dataset_builder.audit.report import Check
-from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
+from dataset_builder.audit.checks import AuditedConfig, AuditedEye, AuditedView, Check
+from dataset_builder.config.camera_placement import RANDOM_RULES
+from dataset_builder.config.manifest_specs import cage_spec, trajectory_spec
+from dataset_builder.config.specs import RandomViewsSpec
+from dataset_builder.scene.assemblies import assembly_bars
+from dataset_builder.scene.cages.generate import VERSION
+from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
+from dataset_builder.scene.shapes.capsules import Clearances
 from rebar_depth_bench.data.bars import Bar
+from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 
 MAX_AXIS_RATIO = 1.2
@@ -27,6 +36,8 @@ _CHUNK = 4096
 _BOARD_EDGE_MARGIN_M = 0.001
 _ON_BOARD_TOLERANCE_M = 1e-4
 _MAX_OCCLUDED_SHARE = 0.5
+_AXIS_TOLERANCE_M = 1e-9
+"""Largest difference of a coordinate from that of the generator, which differs by this much between machines."""
 
 
 @dataclass(frozen=True)
@@ -48,31 +59,17 @@ class BoardError:
 def max_axis_distance_ratio(config: AuditedConfig, view: AuditedView) -> float:
     """Return the largest distance of a steel pixel of both eyes from its bar's axis, in nominal radii.
 
-    The sagitta of a bend's chords is subtracted, so that the same bound holds for every bar.
+    It is 1 on the lateral surface up to the height of the ribs, and less on an end cap. The sagitta of a bend's
+    chords is subtracted, so that the same bound holds for every bar. Bars without a known axis are left out.
     """
-    ratios = [
-        axis_distance_ratio(eye.points_m, eye.bars, config.bars_with_known_axis) for eye in view.eyes.values()
-    ]
-    return max(float(eye_ratios.max(initial=0.0)) for eye_ratios in ratios)
-
-
-def axis_distance_ratio(
-    points_m: Float64[ndarray, "h w 3"], bars: UInt16[ndarray, "h w"], steel: Iterable[Bar]
-) -> Float64[ndarray, " n"]:
-    """Return each steel pixel's distance from its bar's centreline, divided by the bar's nominal radius.
-
-    The ratio is 1 on the lateral surface up to the height of the ribs, and less on an end cap. The sagitta of a
-    bend's chords is subtracted from the distance. Bars that are not in ``steel`` are left out.
-    """
-    axes = {bar.bar_id: bar for bar in steel}
-    ratios = []
-    for bar_id, on_bar_m in _points_by_bar(points_m, bars):
-        if bar_id in axes:
-            bar = axes[bar_id]
-            axis_m = np.array(bar.axis_m)
-            distance_m = polyline_distance_m(on_bar_m, axis_m) - bend_sagitta_m(axis_m)
-            ratios.append(distance_m / (bar.diameter_m / 2))
-    return np.concatenate(ratios) if ratios else np.zeros(0)
+    bars, ratios = {bar.bar_id: bar for bar in config.bars_with_known_axis}, list[float]()
+    for eye in view.eyes.values():
+        for bar_id, on_bar_m in _points_by_bar(eye.points_m, eye.bars):
+            if bar_id in bars:
+                axis_m, radius_m = np.array(bars[bar_id].axis_m), bars[bar_id].diameter_m / 2
+                distance_m = polyline_distance_m(on_bar_m, axis_m) - bend_sagitta_m(axis_m)
+                ratios.append(float((distance_m / radius_m).max()))
+    return float(np.max(ratios, initial=0.0))
 
 
 def bend_sagitta_m(axis_m: Float64[ndarray, "k 3"]) -> float:
@@ -129,21 +126,21 @@ def axis_verdict(config: AuditedConfig, ratios: Sequence[float]) -> Check:
 
 def view_board_error(config: AuditedConfig, view: AuditedView) -> BoardError:
     """Return the board error of both eyes of a view, all zeros for a scene without a board."""
-    if config.board is None:
-        return BoardError()
-    return merged_board_errors([board_error(eye, config.board) for eye in view.eyes.values()])
+    board = config.board
+    return BoardError() if board is None else board_error(view.eyes.values(), board)
 
 
-def board_error(eye: AuditedEye, board: BoardSpec) -> BoardError:
-    """Return the board error of the eye's non-steel points over the board's rectangle.
+def board_error(eyes: Iterable[AuditedEye], board: BoardSpec) -> BoardError:
+    """Return the board error of the eyes' non-steel points over the board's rectangle.
 
     A margin of 1 mm inside the rectangle's edge is left out, because the sheet has sides.
     """
-    x_m, y_m, z_m = np.moveaxis(eye.points_m, -1, 0)
-    inside = (np.abs(x_m) < board.width_m / 2 - _BOARD_EDGE_MARGIN_M) & (
-        np.abs(y_m) < board.height_m / 2 - _BOARD_EDGE_MARGIN_M
-    )
-    board_z_m = z_m[inside & ~eye.mask & (eye.depth_m > 0)]
+    half_m = np.array([board.width_m, board.height_m]) / 2 - _BOARD_EDGE_MARGIN_M
+    heights_m = []
+    for eye in eyes:
+        inside = (np.abs(eye.points_m[..., :2]) < half_m).all(axis=-1)
+        heights_m.append(eye.points_m[inside & ~eye.mask & (eye.depth_m > 0)][:, 2])
+    board_z_m = np.concatenate(heights_m)
     off_m = np.abs(board_z_m)
     on_board = off_m < _ON_BOARD_TOLERANCE_M
     return BoardError(
@@ -152,17 +149,6 @@ def board_error(eye: AuditedEye, board: BoardSpec) -> BoardError:
         below_m=float((-board_z_m).max(initial=0.0)),
         near_m=float(off_m[on_board].max(initial=0.0)),
         off_plane=int(np.count_nonzero(~on_board)),
-    )
-
-
-def merged_board_errors(errors: Sequence[BoardError]) -> BoardError:
-    """Return one board error with the maxima of the distances and the sums of the counts."""
-    return BoardError(
-        pixels=sum(error.pixels for error in errors),
-        off_m=max((error.off_m for error in errors), default=0.0),
-        below_m=max((error.below_m for error in errors), default=0.0),
-        near_m=max((error.near_m for error in errors), default=0.0),
-        off_plane=sum(error.off_plane for error in errors),
     )
 
 
@@ -175,16 +161,16 @@ def board_verdict(config: AuditedConfig, errors: Sequence[BoardError]) -> Check:
     name = f"{config.name}: board at z = 0"
     if config.board is None:
         return Check.skip(name, "no board in this scene")
-    all_views = merged_board_errors(errors)
-    if not all_views.pixels:
+    pixels = sum(error.pixels for error in errors)
+    if not pixels:
         return Check.skip(name, "no view sees the board")
     bound = f"{MAX_BOARD_ERROR_M * 1e6:g} um"
     if not config.has_props:
-        measured = f"at most {all_views.off_m * 1e6:.3f} um"
-        return Check(name, measured, bound, tuple(_plane_problems(all_views.off_m)))
-    share = all_views.off_plane / all_views.pixels
-    measured = f"at most {all_views.near_m * 1e6:.3f} um, {share:.1%} occluded by objects on the board"
-    problems = [*_plane_problems(max(all_views.near_m, all_views.below_m))]
+        off_m = max(error.off_m for error in errors)
+        return Check(name, f"at most {off_m * 1e6:.3f} um", bound, tuple(_plane_problems(off_m)))
+    share, near_m = sum(error.off_plane for error in errors) / pixels, max(error.near_m for error in errors)
+    measured = f"at most {near_m * 1e6:.3f} um, {share:.1%} occluded by objects on the board"
+    problems = [*_plane_problems(max(near_m, *(error.below_m for error in errors)))]
     if share > _MAX_OCCLUDED_SHARE:
         problems.append(
             f"{share:.1%} of the board's pixels are occluded, expected less than {_MAX_OCCLUDED_SHARE:.0%}"
@@ -207,3 +193,68 @@ def _points_by_bar(
     starts = np.flatnonzero(np.diff(ids[order], prepend=0))
     for group in np.split(order, starts[1:]) if len(starts) else ():
         yield int(ids[group[0]]), points_m.reshape(-1, 3)[pixels[group]]
+
+
+def cage_checks(scene: DatasetConfig, bars: Sequence[Bar]) -> Iterator[Check]:
+    """Yield the checks of one generated scene that need no images; ``bars`` are those of ``bars.parquet``."""
+    yield _bars_check(scene, bars)
+    yield _gap_check(scene, bars)
+    yield _steel_check(scene)
+    yield _clearance_check(scene, bars)
+
+
+def _bars_check(scene: DatasetConfig, bars: Sequence[Bar]) -> Check:
+    """Return the check of the bars against those that the generator makes from the parameters in the manifest."""
+    name = f"{scene.label}: bars and their designs"
+    spec = cage_spec(scene)
+    if spec.version != VERSION:
+        return Check.skip(name, f"made by version {spec.version} of the generator, this is {VERSION}")
+    expected = assembly_bars(spec)
+    if [_identity(bar) for bar in bars] != [_identity(bar) for bar in expected]:
+        problem = f"{len(bars)} bars differ from the {len(expected)} of the generator in number, role or diameter"
+        return Check(name, "other bars", "those of the generator", (problem,))
+    off_m = max(
+        float(np.abs(np.subtract(getattr(bar, line), getattr(wanted, line))).max(initial=0.0))
+        for bar, wanted in zip(bars, expected, strict=True)
+        for line in ("axis_m", "nominal_axis_m")
+    )
+    problems = () if off_m <= _AXIS_TOLERANCE_M else (f"axes are {off_m:.2e} m off those of the generator",)
+    return Check(name, f"{len(bars)} bars: at most {off_m:.1e} m off", f"{_AXIS_TOLERANCE_M:g} m", problems)
+
+
+def _identity(bar: Bar) -> tuple[int, str, float, int, int]:
+    return bar.bar_id, bar.role, bar.diameter_m, len(bar.axis_m), len(bar.nominal_axis_m)
+
+
+def _gap_check(scene: DatasetConfig, bars: Sequence[Bar]) -> Check:
+    """Return the check that no two bars touch, ribs included."""
+    lines, radii = [np.array(bar.axis_m) for bar in bars], [outer_radius_m(bar.diameter_m) for bar in bars]
+    clearances = Clearances(lines, radii)
+    least_m = min(
+        clearances.least_m(line, radius, i) for i, (line, radius) in enumerate(zip(lines, radii, strict=True))
+    )
+    problems = () if least_m > 0 else (f"two bars penetrate each other by {-least_m * 1000:.2f} mm",)
+    return Check(f"{scene.label}: gaps of bars", f"{least_m * 1000:.2f} mm or more", "above 0 mm", problems)
+
+
+def _steel_check(scene: DatasetConfig) -> Check:
+    """Return the check that every view shows steel in its left image, as the manifest counts it."""
+    without = [view.view_id for view in scene.views if not view.steel_px]
+    least = min((view.steel_px or 0) for view in scene.views) / (scene.rig.width * scene.rig.height)
+    problems = tuple(f"{view_id} shows no steel" for view_id in without)
+    return Check(f"{scene.label}: steel in every view", f"{least:.1%} of the frame or more", "above 0", problems)
+
+
+def _clearance_check(scene: DatasetConfig, bars: Sequence[Bar]) -> Check:
+    """Return the check that the left cameras of random views are clear of all bars."""
+    name, views = f"{scene.label}: cameras clear of steel", trajectory_spec(scene)
+    if not isinstance(views, RandomViewsSpec):
+        return Check.skip(name, "no random views")
+    centres_m = np.array([centre_m for centre_m, *_ in views.stations])
+    nearest_m = min(
+        float((polyline_distance_m(centres_m, np.array(bar.axis_m)) - outer_radius_m(bar.diameter_m)).min())
+        for bar in bars
+    )
+    bound_m = RANDOM_RULES.clearance_m(views.distances_m[0])
+    problems = () if nearest_m >= bound_m else (f"a camera is {nearest_m:.3f} m from steel",)
+    return Check(name, f"{nearest_m:.2f} m or more", f"{bound_m:g} m", problems)

@@ -7,24 +7,31 @@ compared with the standard deviation of the depth that the config states.
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from dataset_builder.audit.checks import (
+    AUDITED_COLUMNS,
+    Check,
+    EyeWithRays,
+    RayCache,
+    eye_with_rays,
+    record_problems,
+)
 from dataset_builder.audit.geometry import polyline_distance_m
-from dataset_builder.audit.report import Check
+from dataset_builder.audit.independent_depth import project_into
 from rebar_depth_bench.data.bars import Bar, with_axis
-from rebar_depth_bench.data.columns import COLUMNS
-from rebar_depth_bench.data.config_tables import Imported, ViewRecord
+from rebar_depth_bench.data.config_tables import Imported
 from rebar_depth_bench.data.dataset import iterate_rows
 from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.eye_view import EyeTruth, truth_from_row
-from rebar_depth_bench.geometry.cameras import camera_centre, inverse_rigid, pixel_rays, project, transform
+from rebar_depth_bench.data.eye_view import EyeTruth
+from rebar_depth_bench.geometry.cameras import camera_centre
 from rebar_depth_bench.progress import Progress
-from rebar_depth_bench.scoring.protocol import interior, scored_pixels
+from rebar_depth_bench.scoring.protocol import interior
 
 SIGMAS = 4.0
 """Largest deviation of a point from where it should be, in standard deviations of the depth."""
@@ -57,64 +64,45 @@ class _Deviations:
         return Check(name, f"{share:.1%} within", bound, (problem,) if share < MIN_SHARE else ())
 
 
-@dataclass
-class _Findings:
-    """Problems and deviations of all rows."""
-
-    rows: list[str] = field(default_factory=list)
-    cameras: list[str] = field(default_factory=list)
-    axes: _Deviations = field(default_factory=_Deviations)
-    eyes: _Deviations = field(default_factory=_Deviations)
-
-
 def imported_checks(
     config: DatasetConfig, imported: Imported, bars: tuple[Bar, ...], progress: Progress
 ) -> Iterator[Check]:
     """Yield the checks of an imported config with the ``bars`` of its scene, in one pass over its rows."""
-    findings, name = _Findings(), config.name
+    name, row_faults, camera_faults = config.name, list[str](), list[str]()
+    from_axes, between_eyes = _Deviations(), _Deviations()
     ids = {bar.bar_id for bar in bars}
     axes = {bar.bar_id: bar for bar in with_axis(bars)} if imported.has_poses else {}
-    columns = [column for column in COLUMNS if column != "left_preview"]
-    rows = enumerate(iterate_rows(config, columns), start=1)
+    allowed_m, rays = SIGMAS * imported.truth_sigma_m, RayCache()
+    rows = enumerate(iterate_rows(config, AUDITED_COLUMNS), start=1)
     for record, (done, row) in zip(config.views, rows, strict=True):
-        truths = {eye: truth_from_row(row, eye) for eye in config.truth_eyes}
-        findings.rows += [f"{record.view_id}: {one}" for one in _row_problems(row, record, truths, ids)]
-        findings.cameras += [f"{record.view_id}: {one}" for one in _camera_problems(row, config)]
-        for truth in truths.values():
-            _compare_with_axes(truth, axes, imported.truth_sigma_m, findings.axes)
-        if "right" in truths:
-            _compare_eyes(truths["left"], truths["right"], imported.truth_sigma_m, findings.eyes)
+        eyes = {eye: eye_with_rays(row, eye, rays) for eye in config.truth_eyes}
+        row_faults += [f"{record.view_id}: {one}" for one in record_problems(row["view_id"], eyes, record)]
+        for eye, truth in eyes.items():
+            row_faults += [f"{record.view_id}: {eye}: {one}" for one in _truth_problems(truth, ids)]
+            _compare_with_axes(truth, axes, allowed_m, from_axes)
+        camera_faults += [f"{record.view_id}: {one}" for one in _camera_problems(row, config)]
+        if "right" in eyes:
+            _compare_eyes(eyes["left"], eyes["right"], allowed_m, between_eyes)
         progress(f"audit of {name}", done, len(config.views))
-    yield Check(f"{name}: rows", f"{len(config.views)} views", "all invariants", tuple(findings.rows))
-    yield Check(f"{name}: cameras", f"{len(config.views)} views", "plausible", tuple(findings.cameras))
+    yield Check(f"{name}: rows", f"{len(config.views)} views", "all invariants", tuple(row_faults))
+    yield Check(f"{name}: cameras", f"{len(config.views)} views", "plausible", tuple(camera_faults))
     reason = "no bar ids, no surveyed bars, or no poses"
-    yield findings.axes.check(f"{name}: steel from the surface of its surveyed bar", reason)
-    yield findings.eyes.check(f"{name}: left depth against right depth", "no depth of the right camera")
+    yield from_axes.check(f"{name}: steel from the surface of its surveyed bar", reason)
+    yield between_eyes.check(f"{name}: left depth against right depth", "no depth of the right camera")
     yield Check.skip(f"{name}: depth against a second source", "imported")
 
 
-def _row_problems(
-    row: Mapping[str, Any], record: ViewRecord, truths: Mapping[str, EyeTruth], bar_ids: set[int]
-) -> Iterator[str]:
-    """Yield the problems of a decoded row: differences from the manifest, bar ids without steel or bar."""
-    if row["view_id"] != record.view_id:
-        yield f"the row's view_id is {row['view_id']}, expected {record.view_id}"
-    for eye, truth in truths.items():
-        if truth.digest() != getattr(record, eye):
-            yield f"{eye} ground-truth digest differs from the manifest's"
-        if not (truth.depth_m > 0).any():
-            yield f"{eye}: no pixel has depth"
-        if truth.mask is not None and truth.mask.any() and not (truth.depth_m[truth.mask] > 0).any():
-            yield f"{eye}: no steel pixel has depth"
-        if truth.bars is not None and truth.mask is not None:
-            if (truth.bars[~truth.mask] > 0).any():
-                yield f"{eye}: pixels beside the steel have bar ids"
-            if unknown := sorted(set(np.unique(truth.bars).tolist()) - bar_ids - {0}):
-                yield f"{eye}: bar ids {unknown[:5]} are not in bars.parquet"
-    left = truths["left"]
-    steel_px = None if left.mask is None else int(np.count_nonzero(left.mask))
-    if (steel_px, len(scored_pixels(left.mask, left.depth_m))) != (record.steel_px, record.scored_px):
-        yield "steel and scored pixel counts differ from the manifest's"
+def _truth_problems(truth: EyeTruth, bar_ids: set[int]) -> Iterator[str]:
+    """Yield the problems of the ground truth of one eye: no depth, bar ids without steel or bar."""
+    if not (truth.depth_m > 0).any():
+        yield "no pixel has depth"
+    if truth.mask is not None and truth.mask.any() and not (truth.depth_m[truth.mask] > 0).any():
+        yield "no steel pixel has depth"
+    if truth.bars is not None and truth.mask is not None:
+        if (truth.bars[~truth.mask] > 0).any():
+            yield "pixels beside the steel have bar ids"
+        if unknown := sorted(set(np.unique(truth.bars).tolist()) - bar_ids - {0}):
+            yield f"bar ids {unknown[:5]} are not in bars.parquet"
 
 
 def _camera_problems(row: Mapping[str, Any], config: DatasetConfig) -> Iterator[str]:
@@ -137,37 +125,24 @@ def _camera_problems(row: Mapping[str, Any], config: DatasetConfig) -> Iterator[
             yield f"the cameras are {distance_m:.6f} m apart, baseline_m is {row['baseline_m']:.6f}"
 
 
-def _points_cam(truth: EyeTruth) -> Float64[ndarray, "h w 3"]:
-    camera = truth.camera
-    rays = pixel_rays(camera.K, camera.width, camera.height, camera.distortion)
-    return np.asarray(rays * truth.depth_m[..., None].astype(np.float64))
-
-
-def _compare_with_axes(truth: EyeTruth, axes: Mapping[int, Bar], sigma_m: float, found: _Deviations) -> None:
+def _compare_with_axes(eye: EyeWithRays, axes: Mapping[int, Bar], allowed_m: float, found: _Deviations) -> None:
     """Compare interior steel pixels of bars with a known axis with the surface of a cylinder around it."""
-    if truth.bars is None or truth.mask is None or not axes:
+    if eye.bars is None or eye.mask is None or not axes:
         return
-    points_m = transform(inverse_rigid(truth.camera.cam_from_world), _points_cam(truth))
-    usable = interior(truth.mask) & (truth.depth_m > 0)
+    usable = interior(eye.mask) & (eye.depth_m > 0)
     for bar_id, bar in axes.items():
-        on_bar_m = points_m[usable & (truth.bars == bar_id)]
+        on_bar_m = eye.points_m[usable & (eye.bars == bar_id)]
         if len(on_bar_m):
             distance_m = polyline_distance_m(on_bar_m, np.array(bar.axis_m))
-            found.add(np.abs(distance_m - bar.diameter_m / 2), SIGMAS * sigma_m)
+            found.add(np.abs(distance_m - bar.diameter_m / 2), allowed_m)
 
 
-def _compare_eyes(left: EyeTruth, right: EyeTruth, sigma_m: float, found: _Deviations) -> None:
+def _compare_eyes(left: EyeWithRays, right: EyeWithRays, allowed_m: float, found: _Deviations) -> None:
     """Compare left points with the nearest depth of the 2 x 2 right pixels around them, unless one is in front."""
-    points_m = transform(inverse_rigid(left.camera.cam_from_world), _points_cam(left)[left.depth_m > 0])
-    points_cam = transform(right.camera.cam_from_world, points_m)
-    points_cam = points_cam[points_cam[:, 2] > 0]
-    corner = np.floor(project(right.camera.K, points_cam, right.camera.distortion)).astype(int)
-    height, width = right.depth_m.shape
-    inside = ((corner >= 0) & (corner < (width - 1, height - 1))).all(axis=1)
-    u, v = corner[inside].T
-    z_m = points_cam[inside, 2]
+    projected = project_into(right, left.points_m[left.depth_m > 0], margin_px=0)
+    u, v = np.floor(projected.px[projected.inside]).astype(int).T
+    z_m = projected.depth_m[projected.inside]
     around_m = np.stack([right.depth_m[v + dv, u + du] for dv in (0, 1) for du in (0, 1)], axis=1)
     off_m = np.where(around_m > 0, np.abs(around_m - z_m[:, None]), np.inf).min(axis=1)
-    allowed_m = SIGMAS * sigma_m
     is_hidden = ((around_m > 0) & (around_m < z_m[:, None] - allowed_m)).any(axis=1)
     found.add(off_m[np.isfinite(off_m) & ~(is_hidden & (off_m > allowed_m))], allowed_m)

@@ -17,7 +17,7 @@ from numpy import ndarray
 
 from rebar_depth_bench.atomic_io import scratch_folder
 from rebar_depth_bench.errors import BuildError
-from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid
+from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid, swap_camera_axes
 
 SHADER = "brown_conrady.osl"
 """File name of the OSL camera shader in this package."""
@@ -78,8 +78,6 @@ MAX_POSE_DEVIATION = 1e-5
 
 CAMERA_NAME = "camera"
 
-_OPENGL_FROM_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-
 
 def place_camera(camera: Camera) -> float:
     """Set the scene's camera to ``camera`` (pixel centres at integers), a pinhole or a lens with distortion.
@@ -99,7 +97,7 @@ def place_camera(camera: Camera) -> float:
     _set_pinhole_optics(blender_camera.data, camera.K, camera.width, camera.height)
     if distorted:
         set_distorted_optics(blender_camera.data, camera)
-    world_from_gl = inverse_rigid(camera.cam_from_world) @ _OPENGL_FROM_OPENCV
+    world_from_gl = inverse_rigid(swap_camera_axes(camera.cam_from_world))
     blender_camera.matrix_world = Matrix(world_from_gl.tolist())
     bpy.context.view_layer.update()
     deviation = float(np.abs(blender_cam_from_world() - camera.cam_from_world).max())
@@ -113,7 +111,7 @@ def place_camera(camera: Camera) -> float:
 def blender_cam_from_world() -> Float64[ndarray, "4 4"]:
     """Return the pose that Blender stores, in OpenCV axes: the inverse of its float32 ``matrix_world``."""
     world_from_gl = np.array(_scene_camera().matrix_world, dtype=np.float64)
-    return np.asarray(np.linalg.inv(world_from_gl @ _OPENGL_FROM_OPENCV))
+    return swap_camera_axes(np.linalg.inv(world_from_gl))
 
 
 def _scene_camera() -> bpy.types.Object:

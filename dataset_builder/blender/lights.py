@@ -1,75 +1,24 @@
-"""Scene lights: sky, sun, panels and spots, and the tables of lights of each environment and light variant.
+"""Scene lights in Blender: sky, sun, panels, spots and panoramas.
 
 Lights are not surfaces and have no depth.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from math import radians
+from pathlib import Path
 
 import bpy
 from mathutils import Vector
 
-from dataset_builder.blender.shader_nodes import Colour, NodeTreeBuilder, Socket
-from dataset_builder.scene.shapes.solids import Point
-from dataset_builder.scene.variants import SHADOWS, SUN_FROM
+from dataset_builder.blender.shader_nodes import NodeTreeBuilder, Socket
+from dataset_builder.scene.environments.light_rigs import LightRig, Panel, Sky, Spot, Sun
+from dataset_builder.scene.variants.registry import ImageLight
+from rebar_depth_bench.data.digests import file_sha256
+from rebar_depth_bench.errors import BuildError
 
-
-@dataclass(frozen=True)
-class Sky:
-    """Sky background: a vertical gradient from ``horizon`` to ``zenith``, uniform if they are equal."""
-
-    horizon: Colour
-    zenith: Colour
-    strength: float
-    clouds: bool = False
-
-
-@dataclass(frozen=True)
-class Panel:
-    """A rectangular light of ``size_m`` at ``at_m``, facing ``towards_m`` (world, metres); ``energy`` in watts."""
-
-    at_m: Point
-    towards_m: Point
-    size_m: tuple[float, float]
-    energy: float
-    colour: Colour
-
-
-@dataclass(frozen=True)
-class Sun:
-    """A light at infinity: direction it comes from, angular diameter in degrees and strength (W / m2)."""
-
-    from_direction: Point
-    angle_deg: float
-    energy: float
-    colour: Colour
-
-
-@dataclass(frozen=True)
-class Spot:
-    """A spot lamp at ``at_m``, facing ``towards_m`` (world, metres).
-
-    ``radius_m`` is the radius of the lamp, ``cone_deg`` the full angle of its cone, ``energy`` its power in watts.
-    """
-
-    at_m: Point
-    towards_m: Point
-    radius_m: float
-    cone_deg: float
-    energy: float
-    colour: Colour
-
-
-@dataclass(frozen=True)
-class LightRig:
-    """The sky and the lamp of a scene; ``glow`` is that of surfaces which look like lamps, 1 if they are lit."""
-
-    sky: Sky
-    lamp: Panel | Sun | Spot
-    glow: float = 0.0
+PANORAMAS = Path("datafiles", "studiolights", "world")
+"""Folder of the panoramas, below the local resources of Blender."""
 
 
 def add_light(rig: LightRig) -> None:
@@ -131,77 +80,31 @@ def _add_lamp(lamp: Panel | Sun | Spot) -> None:
     bpy.context.scene.collection.objects.link(added)
 
 
-WARM, WHITE = (1.0, 0.93, 0.85), (1.0, 0.98, 0.95)
-EMBER = (1.0, 0.60, 0.30)
+def add_panorama(light: ImageLight) -> None:
+    """Make the panorama the background of the open scene, which must have no light yet.
+
+    Raises ``BuildError`` if the wheel has no such image or another one.
+    """
+    path = Path(bpy.utils.resource_path("LOCAL")) / PANORAMAS / f"{light.image}.exr"
+    found = file_sha256(path) if path.is_file() else "missing"
+    if found != light.sha256:
+        raise BuildError(f"{path}: the panorama has sha256 {found}, expected {light.sha256} as in bpy 4.5")
+    world = bpy.data.worlds.new("panorama")
+    world.use_nodes = True
+    tree = NodeTreeBuilder(world.node_tree)
+    # The image turns against the direction at which it is looked up.
+    turned = tree.turned(tree.direction(), -radians(light.turn_deg))
+    image = bpy.data.images.load(str(path))
+    colour = tree.node("ShaderNodeTexEnvironment", {"Vector": turned}, image=image).outputs["Color"]
+    background = world.node_tree.nodes["Background"]
+    world.node_tree.links.new(colour, background.inputs["Color"])
+    background.inputs["Strength"].default_value = light.strength
+    # Importance sampling at the resolution of the image, because suns and lamps are a few of its pixels.
+    world.cycles.sampling_method = "AUTOMATIC"
+    bpy.context.scene.world = world
 
 
-def _uniform_sky(colour: Colour, strength: float) -> Sky:
-    """Return a sky of one colour."""
-    return Sky(colour, colour, strength)
-
-
-LABORATORY_LIGHT: Mapping[str | None, LightRig] = {
-    None: LightRig(
-        # One lamp and a bright sky, because a second lamp from the side increased the noise on steel.
-        _uniform_sky((0.86, 0.93, 1.0), 0.80),
-        Panel((-0.35, 0.45, 1.9), (0.0, 0.05, 0.0), (0.9, 0.45), 62.0, WARM),
-    ),
-    "dusk": LightRig(
-        _uniform_sky((0.42, 0.55, 1.0), 0.13),
-        Panel((-1.9, -0.9, 0.9), (0.0, 0.0, 0.05), (1.1, 0.5), 14.0, EMBER),
-    ),
-    "spotlight": LightRig(
-        _uniform_sky((0.7, 0.8, 1.0), 0.05),
-        Spot((-0.95, 0.10, 0.85), (0.0, 0.0, 0.03), 0.012, 62.0, 75.0, WHITE),
-    ),
-    "backlight": LightRig(
-        _uniform_sky((0.86, 0.93, 1.0), 0.07),
-        Panel((0.2, 2.0, 0.85), (0.0, 0.0, 0.05), (1.4, 0.6), 75.0, WHITE),
-    ),
-    SHADOWS: LightRig(_uniform_sky((0.80, 0.90, 1.0), 0.30), Sun(SUN_FROM, 0.5, 3.6, WARM)),
-}
-"""Lights of the laboratory by light variant; None is the default."""
-
-_DAY = Sky((0.70, 0.82, 0.95), (0.17, 0.35, 0.74), 0.80, clouds=True)
-
-OUTDOOR_LIGHT: Mapping[str | None, LightRig] = {
-    None: LightRig(_DAY, Sun((-0.55, -0.45, 0.70), 1.2, 4.0, WARM)),
-    "dusk": LightRig(
-        Sky((0.95, 0.52, 0.30), (0.10, 0.16, 0.38), 0.28, clouds=False),
-        Sun((-0.85, -0.45, 0.16), 6.0, 0.55, EMBER),
-    ),
-    "spotlight": LightRig(
-        Sky((0.05, 0.07, 0.12), (0.015, 0.022, 0.05), 0.4),
-        Spot((-14.0, -19.0, 10.5), (0.0, 0.0, 2.6), 0.25, 34.0, 26_000.0, WHITE),
-    ),
-    "backlight": LightRig(
-        Sky((0.90, 0.84, 0.74), (0.34, 0.46, 0.66), 0.42),
-        Sun((0.22, 0.90, 0.30), 0.6, 4.2, WARM),
-    ),
-    SHADOWS: LightRig(_DAY, Sun(SUN_FROM, 0.5, 3.8, WARM)),
-}
-"""Lights of the building site by light variant; None is the default."""
-
-HALL_LIGHT: Mapping[str | None, LightRig] = {
-    None: LightRig(
-        _uniform_sky((0.86, 0.93, 1.0), 0.64),
-        Panel((1.5, -1.0, 7.05), (1.5, -1.0, 0.0), (9.0, 1.6), 1350.0, WARM),
-        glow=1.0,
-    ),
-    "dusk": LightRig(
-        _uniform_sky((0.42, 0.55, 1.0), 0.17),
-        Panel((-5.0, -10.2, 4.2), (0.0, 0.0, 0.8), (6.0, 2.0), 700.0, EMBER),
-    ),
-    "spotlight": LightRig(
-        _uniform_sky((0.7, 0.8, 1.0), 0.06),
-        Spot((-7.5, -6.5, 6.6), (0.0, 0.0, 0.7), 0.12, 50.0, 9000.0, WHITE),
-    ),
-    "backlight": LightRig(
-        _uniform_sky((0.86, 0.93, 1.0), 0.09),
-        Panel((2.0, 11.2, 2.9), (0.0, 0.0, 0.7), (5.5, 4.0), 2600.0, WHITE),
-    ),
-}
-"""Lights of the hall by light variant; None is the default."""
-
-DECK_LIGHT: Mapping[str | None, LightRig] = {name: rig for name, rig in OUTDOOR_LIGHT.items() if name != SHADOWS}
-"""Lights of the deck by light variant; the screen of ``shadows`` would stand beside the deck, above the ground."""
+def let_light_through(surface: bpy.types.Object) -> None:
+    """Make an object transparent for light and reflections; cameras still see it, and it is still lit."""
+    surface.visible_diffuse = surface.visible_glossy = surface.visible_transmission = False
+    surface.visible_shadow = surface.visible_volume_scatter = False

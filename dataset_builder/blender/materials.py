@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray
 
-from dataset_builder.blender.shader_nodes import Colour, MaterialBuilder
+from dataset_builder.blender.shader_nodes import MaterialBuilder
+from dataset_builder.scene.model import STEEL, Colour
 
 RUST_PROPERTY, PATTERN_PROPERTY, TONE_PROPERTY = "rust_amount", "pattern_shift_m", "scale_tone"
 """Names of the custom properties of a steel object that its material reads."""
@@ -20,8 +21,10 @@ GLOW_PROPERTY = "glow"
 LAMP = "lamp"
 """Name of the material of lamps, which are lit or not."""
 
-STEEL_VARIANT_MATERIALS = {"mill-scale": "steel, mill-scale", "rusted": "steel, rusted", "wet": "steel, wet"}
-"""Material name of each steel variant."""
+
+def steel_material_name(variant: str | None) -> str:
+    """Return the name of the material of steel with a steel variant, or without one."""
+    return STEEL if variant is None else f"{STEEL}, {variant}"
 
 
 def surface_variation(seed: int, bar_id: int) -> dict[str, float]:
@@ -184,7 +187,7 @@ def _glossy(colour: Colour, roughness: float, shader: MaterialBuilder) -> bpy.ty
 
 
 _MATERIAL_BUILDERS: dict[str, Callable[[MaterialBuilder], bpy.types.Material]] = {
-    "steel": _steel,
+    STEEL: _steel,
     "steel, mill-scale": partial(
         _steel, rust_shift=(-0.45, -0.16), tint=1.15, metallic=0.8, roughness=(0.30, 0.60)
     ),

@@ -1,71 +1,33 @@
-"""Scene construction in Blender's open file: steel, board, environment and light. World frame, metres."""
+"""Scene in Blender's open file, and its evaluated mesh. World frame, metres."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import bpy
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int32
 from numpy import ndarray
 
-from dataset_builder.blender.lights import (
-    DECK_LIGHT,
-    HALL_LIGHT,
-    LABORATORY_LIGHT,
-    OUTDOOR_LIGHT,
-    LightRig,
-    add_light,
-)
+from dataset_builder.blender.lights import add_light, add_panorama, let_light_through
 from dataset_builder.blender.materials import (
     GLOW_PROPERTY,
     LAMP,
-    STEEL_VARIANT_MATERIALS,
     material,
     paper,
+    steel_material_name,
     surface_variation,
 )
-from dataset_builder.blender.panorama import add_panorama, let_light_through
 from dataset_builder.config.specs import SceneSpec
-from dataset_builder.config.surroundings import check_suitable
+from dataset_builder.config.surroundings import SURROUNDINGS
 from dataset_builder.scene.board_texture import board_texture
-from dataset_builder.scene.environments.deck import deck
-from dataset_builder.scene.environments.hall import ROOF, hall
-from dataset_builder.scene.environments.hall import WALLS as HALL_WALLS
-from dataset_builder.scene.environments.laboratory import BENCH_TOP_M, SHEET_THICKNESS_M, WALLS, laboratory
-from dataset_builder.scene.environments.outdoors import outdoors
-from dataset_builder.scene.model import Assembly, Mesh, Part, surface
-from dataset_builder.scene.shapes.solids import box
-from dataset_builder.scene.variants import LIGHT_SLOT, STEEL_SLOT, check_variants, exclusive_variant
-from dataset_builder.scene.variants.image_light import image_light
+from dataset_builder.scene.environments.laboratory import BENCH_TOP_M, SHEET_THICKNESS_M
+from dataset_builder.scene.model import NOT_STEEL, Assembly, Mesh, Part, WorldMesh, surface
+from dataset_builder.scene.shapes.solids import box, merge_meshes, transformed
 from dataset_builder.scene.variants.props import make_props
+from dataset_builder.scene.variants.registry import LIGHT_SLOT, STEEL_SLOT, exclusive_variant, image_light
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
-
-
-@dataclass(frozen=True)
-class Environment:
-    """Surroundings of the steel: surfaces (world, none is steel) and lights by light variant (None: default).
-
-    ``enclosure`` and ``roof`` are the first words of the names of surfaces that would keep out the light of a
-    panorama, and that of any sky or lamp.
-    """
-
-    parts: Callable[[], tuple[Part, ...]]
-    light: Mapping[str | None, LightRig]
-    floor_m: float
-    """Height of the surface that a board lies on."""
-    enclosure: tuple[str, ...]
-    roof: tuple[str, ...] = ()
-
-
-ENVIRONMENTS: Mapping[str, Environment] = {
-    "laboratory": Environment(laboratory, LABORATORY_LIGHT, BENCH_TOP_M, WALLS),
-    "outdoors": Environment(outdoors, OUTDOOR_LIGHT, 0.0, ("trees",)),
-    "hall": Environment(hall, HALL_LIGHT, 0.0, HALL_WALLS, ROOF),
-    "deck": Environment(deck, DECK_LIGHT, 0.0, ("trees", "hills", "core")),
-}
-
 
 BAR_ID = "bar_id"
 """Name of the custom property with an object's bar id."""
@@ -83,33 +45,30 @@ SHAPE_TOLERANCE_M = 1e-9
 def build_scene(assembly: Assembly, spec: SceneSpec, *, colour: bool = True) -> None:
     """Replace Blender's open file with the scene: one object per steel part, environment, props, board and lights.
 
-    Without ``colour``, the scene has the same meshes but neither materials nor lights.
-    Raises ``InputError`` if the appearance variants do not pass ``check_variants`` or do not suit the environment.
+    Without ``colour``, the scene has the same meshes but neither materials nor lights. The appearance variants
+    must have passed ``check_variants`` and ``check_suitable``.
     """
     variants = spec.appearance.variants
-    check_variants(variants)
-    check_suitable(spec.environment, variants)
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    for part, mesh, origin_m in _with_shared_meshes(
-        _with_material(assembly.parts, exclusive_variant(variants, STEEL_SLOT)), colour
-    ):
+    steel_material = steel_material_name(exclusive_variant(variants, STEEL_SLOT)) if colour else None
+    for part, mesh, origin_m in _with_shared_meshes(assembly.parts, steel_material):
         steel = add_object(part, mesh, origin_m)
         for name, value in surface_variation(spec.seed, part.bar_id).items():
             steel[name] = value
-    environment = ENVIRONMENTS[spec.environment]
+    surroundings = SURROUNDINGS[spec.environment]
     # A floor at z = 0 would coincide with the top of the sheet, so it is lowered under a board.
-    offset_z_m = 0.0 if spec.board is None else min(0.0, BENCH_TOP_M - environment.floor_m)
+    offset_z_m = 0.0 if spec.board is None else min(0.0, BENCH_TOP_M - surroundings.floor_m)
     panorama = image_light(spec)
-    rig = None if panorama is not None else environment.light[exclusive_variant(variants, LIGHT_SLOT)]
-    opened = environment.roof if panorama is None else (*environment.enclosure, *environment.roof)
-    for part in environment.parts():
-        added = add_object(part, _part_data(part, part.mesh, colour), np.array([0.0, 0.0, offset_z_m]))
+    rig = None if panorama is not None else surroundings.light[exclusive_variant(variants, LIGHT_SLOT)]
+    opened = surroundings.roof if panorama is None else (*surroundings.enclosure, *surroundings.roof)
+    for part in surroundings.parts():
+        added = _add_surface(part, offset_z_m, colour)
         if part.name.partition("-")[0] in opened:
             let_light_through(added)
         if part.material == LAMP:
             added[GLOW_PROPERTY] = 0.0 if rig is None else rig.glow
     for part in make_props(assembly, spec):
-        add_object(part, _part_data(part, part.mesh, colour), np.zeros(3))
+        _add_surface(part, 0.0, colour)
     if spec.board is not None:
         _add_board(spec.board, colour)
     if colour and panorama is not None:
@@ -119,27 +78,18 @@ def build_scene(assembly: Assembly, spec: SceneSpec, *, colour: bool = True) -> 
     bpy.context.view_layer.update()
 
 
-def _with_material(parts: tuple[Part, ...], look: str | None) -> tuple[Part, ...]:
-    """Return the parts with the material of a steel variant, or unchanged for None."""
-    return (
-        parts if look is None else tuple(replace(part, material=STEEL_VARIANT_MATERIALS[look]) for part in parts)
-    )
-
-
 def _with_shared_meshes(
-    parts: tuple[Part, ...], colour: bool
+    parts: tuple[Part, ...], material_name: str | None
 ) -> Iterator[tuple[Part, bpy.types.Mesh, Float64[ndarray, " 3"]]]:
     """Yield each part with its mesh data and origin; parts that differ only by a translation share mesh data."""
-    shapes: list[tuple[Mesh, str, bpy.types.Mesh]] = []
+    shapes: list[tuple[Mesh, bpy.types.Mesh]] = []
     for part in parts:
         origin_m = part.mesh.vertices_m.min(axis=0)
         local = Mesh(part.mesh.vertices_m - origin_m, part.mesh.faces)
-        data = next(
-            (data for mesh, name, data in shapes if name == part.material and _same_shape(mesh, local)), None
-        )
+        data = next((data for mesh, data in shapes if _same_shape(mesh, local)), None)
         if data is None:
-            data = _part_data(part, local, colour)
-            shapes.append((local, part.material, data))
+            data = mesh_data(part.name, local, material_name)
+            shapes.append((local, data))
         yield part, data, origin_m
 
 
@@ -161,9 +111,10 @@ def add_object(part: Part, data: bpy.types.Mesh, origin_m: Float64[ndarray, " 3"
     return added
 
 
-def _part_data(part: Part, mesh: Mesh, colour: bool) -> bpy.types.Mesh:
-    """Return Blender mesh data with the triangles of ``mesh``, with the part's material if ``colour`` is True."""
-    return mesh_data(part.name, mesh, part.material if colour else None)
+def _add_surface(part: Part, height_m: float, colour: bool) -> bpy.types.Object:
+    """Add a part to the open scene, ``height_m`` above its place, with its material if ``colour`` is True."""
+    data = mesh_data(part.name, part.mesh, part.material if colour else None)
+    return add_object(part, data, np.array([0.0, 0.0, height_m]))
 
 
 def mesh_data(name: str, mesh: Mesh, material_name: str | None) -> bpy.types.Mesh:
@@ -205,3 +156,59 @@ def _print_board(data: bpy.types.Mesh, sheet: Mesh, spec: BoardSpec) -> None:
     uv = sheet.vertices_m[:, :2] / np.array([spec.width_m, spec.height_m]) + 0.5
     layer = data.uv_layers.new(name="print")
     layer.data.foreach_set("uv", uv[sheet.faces.ravel()].astype(np.float32).ravel())
+
+
+@dataclass(frozen=True, eq=False)
+class _MeshInstance:
+    """An object or an instance of it: sort key, mesh in the world frame and bar id."""
+
+    order: tuple[str, tuple[int, ...]]
+    mesh: Mesh
+    bar_id: int
+
+
+def evaluated_world_mesh() -> WorldMesh:
+    """Return all surfaces of the open scene that are visible to cameras, with modifiers and instances applied.
+
+    Vertices are Blender's float32 coordinates times its float32 ``matrix_world``, multiplied in float64.
+    Objects are ordered by name.
+    """
+    placed_meshes = sorted(_mesh_instances(), key=lambda item: item.order)
+    mesh = merge_meshes([item.mesh for item in placed_meshes])
+    ids = [np.full(len(item.mesh.faces), item.bar_id, dtype=np.uint16) for item in placed_meshes]
+    return WorldMesh(mesh.vertices_m, mesh.faces, np.concatenate(ids))
+
+
+def _mesh_instances() -> Iterator[_MeshInstance]:
+    """Yield the visible mesh objects and instances in the order of the dependency graph."""
+    depsgraph = bpy.context.evaluated_depsgraph_get()
+    local_meshes: dict[int, Mesh] = {}
+    for instance in depsgraph.object_instances:
+        evaluated = instance.object
+        if evaluated.type != "MESH" or not instance.show_self or _hidden(evaluated.original):
+            continue
+        # Mesh data that several objects share is read once.
+        key = evaluated.data.as_pointer()
+        if key not in local_meshes:
+            local_meshes[key] = _local_mesh(evaluated.data)
+        world_from_local = np.array(instance.matrix_world, dtype=np.float64)
+        yield _MeshInstance(
+            order=(evaluated.name, tuple(instance.persistent_id) if instance.is_instance else ()),
+            mesh=transformed(local_meshes[key], world_from_local[:3, :3], world_from_local[:3, 3]),
+            bar_id=int(evaluated.get(BAR_ID, NOT_STEEL)),
+        )
+
+
+def _hidden(original: bpy.types.Object) -> bool:
+    """Return whether an object is not rendered or not visible to cameras."""
+    return bool(original.hide_render or not original.visible_camera)
+
+
+def _local_mesh(data: bpy.types.Mesh) -> Mesh:
+    """Return the triangles of Blender mesh data in its own frame."""
+    co = np.empty(len(data.vertices) * 3, dtype=np.float32)
+    data.vertices.foreach_get("co", co)
+    data.calc_loop_triangles()
+    corners: Int32[ndarray, " n"] = np.empty(len(data.loop_triangles) * 3, dtype=np.int32)
+    data.loop_triangles.foreach_get("vertices", corners)
+    return Mesh(co.reshape(-1, 3).astype(np.float64), corners.reshape(-1, 3))

@@ -6,11 +6,10 @@ from typing import Any
 
 import bpy
 
+from dataset_builder.scene.model import Colour
+
 Socket = Any
 """An output socket of a node (``bpy.types.NodeSocket``)."""
-
-Colour = tuple[float, float, float]
-"""Red, green and blue, linear Rec. 709."""
 
 
 class NodeTreeBuilder:

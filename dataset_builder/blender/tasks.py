@@ -23,9 +23,8 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.blender.colour import configure_colour, render_colour
-from dataset_builder.blender.evaluated_mesh import evaluated_world_mesh
 from dataset_builder.blender.render import render_depth, use_cycles
-from dataset_builder.blender.scene import add_object, build_scene, mesh_data
+from dataset_builder.blender.scene import add_object, build_scene, evaluated_world_mesh, mesh_data
 from dataset_builder.config.file_specs import PinnedFile
 from dataset_builder.config.rigs import rig_cameras
 from dataset_builder.config.specs import CPU, GPU_TYPES, ConfigSpec

@@ -21,7 +21,7 @@ from dataset_builder.config.specs import (
     SceneSpec,
 )
 from dataset_builder.config.surroundings import FORMWORK_FAMILIES, LIFE_SIZE_ENVIRONMENTS, SURROUNDINGS
-from dataset_builder.scene.variants import EXCLUSIVE_SLOTS, SENSOR, SHADOWS, VARIANTS
+from dataset_builder.scene.variants.registry import EXCLUSIVE_SLOTS, SENSOR, SHADOWS, VARIANTS
 from rebar_depth_bench.view_ids import SPLITS, TEST_SPLIT
 
 CAGES = "cages"

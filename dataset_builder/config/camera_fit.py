@@ -10,8 +10,7 @@ from dataset_builder.config.specs import ConfigSpec, RandomViewsSpec, SurveySpec
 from dataset_builder.config.surroundings import LIFE_SIZE_ENVIRONMENTS, SURROUNDINGS
 from dataset_builder.config.trajectories import aim_point_m, camera_offsets_m
 from dataset_builder.scene.model import Assembly
-from dataset_builder.scene.variants import SHADOWS
-from dataset_builder.scene.variants.panels import SCREEN_DISTANCE
+from dataset_builder.scene.variants.registry import SCREEN_DISTANCE, SHADOWS
 from rebar_depth_bench.errors import InputError, MeshError
 
 _BOARD_TOLERANCE_M = 0.001

@@ -27,7 +27,7 @@ from dataset_builder.config.specs import (
     SceneSpec,
 )
 from dataset_builder.config.surroundings import check_suitable
-from dataset_builder.scene.variants import VARIANTS, check_variants
+from dataset_builder.scene.variants.registry import VARIANTS, check_variants
 from rebar_depth_bench.data.trajectory import NEAREST_STEEL
 from rebar_depth_bench.errors import InputError, Problem
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
@@ -130,7 +130,7 @@ class BuildRequest:
 
     ``views`` is the number of views per config, spread evenly over the trajectory; None selects all views.
     ``colour`` None builds no colour. ``mesh`` replaces the rods of the lattice. ``variants`` are names of
-    ``scene.variants.VARIANTS``; they are appended to the names of configs and scenes. ``scenes`` are the configs
+    ``VARIANTS``; they are appended to the names of configs and scenes. ``scenes`` are the configs
     of user scene files. ``cages`` are the scenes of the config of that name, if it is among the ``configs``.
     ``overwrite`` are the names of configs whose finished views may be replaced. ``cages_read`` has what was read
     already from files of the ``scenes``, by their specs.

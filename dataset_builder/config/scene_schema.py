@@ -45,7 +45,6 @@ import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import count
-from pathlib import PurePosixPath
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, BeforeValidator, Field, Strict, ValidationInfo, field_validator
@@ -55,10 +54,12 @@ from dataset_builder.config.specs import DomeSpec, RigSpec, RingSpec, SurveySpec
 from dataset_builder.config.surroundings import SURROUNDINGS
 from dataset_builder.scene.model import MAX_BARS, to_metres
 from dataset_builder.scene.selection import KEYS, Selection
-from dataset_builder.scene.variants import VARIANTS
+from dataset_builder.scene.variants.registry import VARIANTS
 from rebar_depth_bench.errors import InputError, Problem
+from rebar_depth_bench.paths import is_below
 from rebar_depth_bench.reading import parse_toml
 from rebar_depth_bench.validation import (
+    UNITS_M,
     Expected,
     Flag,
     StrictModel,
@@ -72,9 +73,6 @@ from rebar_depth_bench.validation import (
     validate_table,
     whole_number,
 )
-
-UNITS_M: Mapping[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001, "in": 0.0254, "ft": 0.3048}
-"""Length of one unit in metres, by unit name."""
 
 MAX_VIEWS = 10_000
 """Maximum number of views of a config: the index in a view id has four digits."""
@@ -99,12 +97,6 @@ SCENE_NAME = Expected(
     lambda name: bool(re.fullmatch(r"[a-z0-9][a-z0-9-]{0,62}", name)) and not name.endswith(_VARIANT_ENDINGS),
 )
 """Description of scene names, which are also the names of configs."""
-
-
-def _is_below(path: str) -> bool:
-    """Return whether a relative path stays in its folder: a scene file names no other files of the machine."""
-    parts = PurePosixPath(path).parts
-    return bool(parts) and path.isprintable() and ".." not in parts and not path.startswith(("/", "~"))
 
 
 def _length_in_metres(length: float, info: ValidationInfo[_Context]) -> float:
@@ -147,7 +139,7 @@ _ROLE = Expected(
     "a name of up to 60 printable characters, without spaces at its ends",
     lambda role: role == role.strip() and text(60).accept(role),
 )
-_File = Annotated[str, Expected("the path of a file in the folder of this file, or below it", _is_below)]
+_File = Annotated[str, Expected("the path of a file in the folder of this file, or below it", is_below)]
 _Length = Annotated[
     float,
     number(0, expected="a length above 0, up to 1e9, in the file's unit"),

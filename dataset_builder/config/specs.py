@@ -79,7 +79,7 @@ AssemblySpec = LatticeSpec | PileSpec | PierSpec | CageFileSpec | MeshFileSpec |
 
 @dataclass(frozen=True)
 class AppearanceSpec:
-    """Appearance variants of a scene, as names of ``scene.variants.VARIANTS``.
+    """Appearance variants of a scene, as names of ``variants.registry.VARIANTS``.
 
     The standard configs, like the scenes of the paper, have none.
     """

@@ -1,19 +1,30 @@
-"""Surroundings of the steel by environment: space for cameras and steel, and the variants that suit them.
+"""Surroundings of the steel by environment: surfaces, lights, space for cameras and steel, suitable variants.
 
-The surfaces of the environments are in ``dataset_builder.scene.environments``, their lights in
-``dataset_builder.blender.lights``.
+A new environment is a module in ``dataset_builder.scene.environments`` with its surfaces, a table of lights in
+``light_rigs`` beside it, and an entry of ``SURROUNDINGS``.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
-from dataset_builder.scene.variants import SHADOWS, VARIANTS
+from dataset_builder.scene.environments import hall, laboratory
+from dataset_builder.scene.environments.deck import deck
+from dataset_builder.scene.environments.light_rigs import (
+    DECK_LIGHT,
+    HALL_LIGHT,
+    LABORATORY_LIGHT,
+    OUTDOOR_LIGHT,
+    LightRig,
+)
+from dataset_builder.scene.environments.outdoors import outdoors
+from dataset_builder.scene.model import Part
+from dataset_builder.scene.variants.registry import IMAGE_LIGHTS, LIGHT_SLOT, VARIANTS
 from rebar_depth_bench.errors import InputError, Problem
 
 GROUND_CLEARANCE_M = 0.1
@@ -42,29 +53,60 @@ class CameraSpace:
 
 @dataclass(frozen=True)
 class Surroundings:
-    """Surroundings of an environment: the space for cameras, and ``steel_radius_m``, that for steel in plan.
+    """Surroundings of an environment: surfaces (world, none is steel), lights, and space for cameras and steel.
 
-    ``markers`` is the default number of markers on a board, 0 for no board. The ``unsuitable`` variants cannot be
-    built there.
+    ``light`` has the lights by light variant, None for the default. ``steel_radius_m`` is the space for steel in
+    plan, ``floor_m`` the height of the surface that a board lies on, and ``markers`` the default number of markers
+    of a board, 0 for no board. ``enclosure`` and ``roof`` are the first words of the names of surfaces that would
+    keep out the light of a panorama, and that of any sky or lamp.
     """
 
+    parts: Callable[[], tuple[Part, ...]]
+    light: Mapping[str | None, LightRig]
     cameras: CameraSpace
     steel_radius_m: float
+    enclosure: tuple[str, ...]
+    roof: tuple[str, ...] = ()
+    floor_m: float = 0.0
     markers: int = 0
-    unsuitable: tuple[str, ...] = ()
+
+    def suits(self, variant: str) -> bool:
+        """Return whether a variant can be built there: not a light variant without an entry in ``light``."""
+        return VARIANTS[variant].slot != LIGHT_SLOT or variant in self.light or variant in IMAGE_LIGHTS
 
     def variants(self, slot: str) -> tuple[str, ...]:
         """Return the names of the variants of a slot that suit the environment."""
-        return tuple(
-            name for name, variant in VARIANTS.items() if variant.slot == slot and name not in self.unsuitable
-        )
+        return tuple(name for name, variant in VARIANTS.items() if variant.slot == slot and self.suits(name))
 
 
 SURROUNDINGS: Mapping[str, Surroundings] = {
-    "laboratory": Surroundings(CameraSpace(1.6, clear_radius_m=0.6, objects_m=0.2), 0.45, markers=6),
-    "outdoors": Surroundings(CameraSpace(20.5, clear_radius_m=20.5), 20.5),
-    "hall": Surroundings(CameraSpace(10.4, clear_radius_m=10.4, ceiling_m=6.8), 5.0, unsuitable=(SHADOWS,)),
-    "deck": Surroundings(CameraSpace(8.3, clear_radius_m=8.3, ceiling_m=8.0), 5.0, unsuitable=(SHADOWS,)),
+    "laboratory": Surroundings(
+        laboratory.laboratory,
+        LABORATORY_LIGHT,
+        CameraSpace(1.6, clear_radius_m=0.6, objects_m=0.2),
+        steel_radius_m=0.45,
+        enclosure=laboratory.WALLS,
+        floor_m=laboratory.BENCH_TOP_M,
+        markers=6,
+    ),
+    "outdoors": Surroundings(
+        outdoors, OUTDOOR_LIGHT, CameraSpace(20.5, clear_radius_m=20.5), steel_radius_m=20.5, enclosure=("trees",)
+    ),
+    "hall": Surroundings(
+        hall.hall,
+        HALL_LIGHT,
+        CameraSpace(10.4, clear_radius_m=10.4, ceiling_m=6.8),
+        steel_radius_m=5.0,
+        enclosure=hall.WALLS,
+        roof=hall.ROOF,
+    ),
+    "deck": Surroundings(
+        deck,
+        DECK_LIGHT,
+        CameraSpace(8.3, clear_radius_m=8.3, ceiling_m=8.0),
+        steel_radius_m=5.0,
+        enclosure=("trees", "hills", "core"),
+    ),
 }
 """Surroundings by the name of their environment.
 
@@ -82,7 +124,6 @@ FORMWORK_FAMILIES = ("column", "beam", "wall", "slab", "footing")
 
 def check_suitable(environment: str, variants: Iterable[str]) -> None:
     """Raise ``InputError`` that lists the variants which cannot be built in an environment."""
-    unsuitable = SURROUNDINGS[environment].unsuitable
     problems = [
         Problem(
             "conflict",
@@ -91,11 +132,11 @@ def check_suitable(environment: str, variants: Iterable[str]) -> None:
             f"another variant, or an environment out of {', '.join(_environments_of(name))}",
         )
         for name in variants
-        if name in unsuitable
+        if not SURROUNDINGS[environment].suits(name)
     ]
     if problems:
         raise InputError.from_problems("appearance variants", problems)
 
 
 def _environments_of(variant: str) -> list[str]:
-    return [name for name, surroundings in SURROUNDINGS.items() if variant not in surroundings.unsuitable]
+    return [name for name, surroundings in SURROUNDINGS.items() if surroundings.suits(variant)]

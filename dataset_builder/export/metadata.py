@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
-from dataset_builder.export.images import EXPORT_FILES, ExportFile
-from dataset_builder.export.nerfstudio import json_lines
-from dataset_builder.export.views import CameraView
+from dataset_builder.export.camera_formats import json_lines
+from dataset_builder.export.exported_views import CameraView, exported_files
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.manifest import DatasetFolder
 from rebar_depth_bench.geometry.cameras import Camera
@@ -30,11 +29,6 @@ CONVENTIONS = {
 
 _NOT_PARAMETERS = ("shards", "key", "mesh", "bytes")
 """Keys of a scene's manifest entry that are not its parameters."""
-
-
-def exported_files(config: DatasetConfig) -> Mapping[str, ExportFile]:
-    """Return the files exported for each eye of a config, by key: without colour there is no image."""
-    return {name: file for name, file in EXPORT_FILES.items() if config.colour is not None or file.column != "rgb"}
 
 
 def cameras_json(folder: DatasetFolder, config: DatasetConfig, views: Sequence[CameraView]) -> str:

@@ -5,11 +5,8 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
-
-from pydantic import Strict
 
 from rebar_depth_bench.atomic_io import exclusive_lock, temporary_target, write_error, write_text
 from rebar_depth_bench.data.manifest import DatasetFolder
@@ -26,23 +23,11 @@ FORMAT = "rebar-depth-export-1"
 """Format version of ``MARKER``."""
 
 
-@dataclass(frozen=True)
-class ExportedPart:
-    """What is exported into one folder, a config or a scene: the key of its build and the ids of its views.
-
-    ``folders`` are those that the export writes to, relative to it.
-    """
+class ExportedPart(StrictModel):
+    """What is exported into one folder, a config or a scene: the key of its build and the ids of its views."""
 
     key: str
-    view_ids: Sequence[str]
-    folders: tuple[str, ...]
-
-
-class _ExportedConfig(StrictModel):
-    """Content of the target for one config or scene: the key of its build and the ids of its views."""
-
-    key: str
-    views: Annotated[tuple[str, ...], Strict(False)]
+    views: list[str]
 
 
 class _Marker(StrictModel):
@@ -50,16 +35,14 @@ class _Marker(StrictModel):
 
     format: Annotated[str, one_of(FORMAT)]
     dataset: str
-    configs: dict[str, _ExportedConfig]
+    configs: dict[str, ExportedPart]
 
 
 @contextmanager
 def export_target(
-    to: Path,
-    folder: DatasetFolder,
-    parts: Mapping[str, ExportedPart],
+    to: Path, folder: DatasetFolder, parts: Mapping[str, ExportedPart], subfolders: Sequence[str]
 ) -> Iterator[None]:
-    """Prepare and lock ``to`` for an export of ``parts``, whose keys are folders below ``to``.
+    """Prepare and lock ``to`` for an export of ``parts``, by folder below ``to``, into ``subfolders`` of each.
 
     Context manager; the lock is held until it exits. ``export.json`` in the folder records the dataset and, for
     each config, its build and its views. Temporary files left by a killed export are removed. Raises
@@ -67,7 +50,7 @@ def export_target(
     wanted now, a link in place of a folder that the export writes to, or if another export holds the lock.
     """
     _check_target(to, folder)
-    folders = [f"{name}/{folder}" for name, part in parts.items() for folder in part.folders]
+    folders = [f"{name}/{subfolder}" for name in parts for subfolder in subfolders]
     check_no_links(to, *folders)
     try:
         to.mkdir(parents=True, exist_ok=True)
@@ -78,10 +61,12 @@ def export_target(
             stack.enter_context(exclusive_lock(to))  # Locking the folder itself leaves no file behind.
         except BlockingIOError:
             raise InputError(f"{to}: another export is using this folder") from None
-        exported = _merged_configs(to, folder, parts)
+        earlier = _read_marker(to / MARKER, folder) if (to / MARKER).is_file() else {}
+        for name in earlier.keys() & parts.keys():
+            _check_same_build(to, name, earlier[name], parts[name])
         for path in (to, *(to / name for name in folders)):
             _remove_temporary_files(path, MARKER if path == to else None)
-        marker = _Marker(format=FORMAT, dataset=folder.digest, configs=exported)
+        marker = _Marker(format=FORMAT, dataset=folder.digest, configs={**earlier, **parts})
         write_text(to / MARKER, json.dumps(marker.model_dump()) + "\n")
         yield
 
@@ -110,18 +95,7 @@ def _check_target(to: Path, folder: DatasetFolder) -> None:
             )
 
 
-def _merged_configs(
-    to: Path, folder: DatasetFolder, parts: Mapping[str, ExportedPart]
-) -> dict[str, _ExportedConfig]:
-    """Return the configs in ``to`` after the export: earlier ones remain, wanted ones are added or extended."""
-    configs = {name: _ExportedConfig(key=part.key, views=tuple(part.view_ids)) for name, part in parts.items()}
-    earlier = _read_marker(to / MARKER, folder) if (to / MARKER).is_file() else {}
-    for name in earlier.keys() & configs.keys():
-        _check_same_build(to, name, earlier[name], configs[name])
-    return {**earlier, **configs}
-
-
-def _read_marker(path: Path, folder: DatasetFolder) -> dict[str, _ExportedConfig]:
+def _read_marker(path: Path, folder: DatasetFolder) -> dict[str, ExportedPart]:
     """Return the configs of an earlier export from its ``export.json``.
 
     Raises ``InputError`` if the file is invalid, has another format or names another dataset.
@@ -138,7 +112,7 @@ def _read_marker(path: Path, folder: DatasetFolder) -> dict[str, _ExportedConfig
     return marker.configs
 
 
-def _check_same_build(to: Path, name: str, earlier: _ExportedConfig, wanted: _ExportedConfig) -> None:
+def _check_same_build(to: Path, name: str, earlier: ExportedPart, wanted: ExportedPart) -> None:
     """Raise ``InputError`` if a config was exported from another build or has unselected views."""
     if earlier.key != wanted.key:
         raise InputError(

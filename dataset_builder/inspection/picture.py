@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator, Sequence
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
-from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw
 
 from dataset_builder.inspection.font import font, shortened
-from dataset_builder.inspection.summary import Inspection
+from dataset_builder.inspection.summary import Inspection, diameter_mm
 from dataset_builder.scene.assemblies.cage import CageBar
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting.formatting import counted
@@ -36,29 +36,26 @@ _MAX_EDGES = 20_000
 """Largest number of edges that are drawn of the mesh of a bar without axis."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True)
 class _Side:
-    """Side of a cage: title, and the unit vectors to the right, up and towards the viewer as rows."""
+    """Side of a cage: title, and the directions to the right and towards the viewer."""
 
     title: str
-    axes: Float64[ndarray, "3 3"]
+    right: tuple[float, float, float]
+    towards: tuple[float, float, float]
+
+    @property
+    def axes(self) -> Float64[ndarray, "3 3"]:
+        """Unit vectors to the right, up and towards the viewer, as rows."""
+        rows = np.array([self.right, np.cross(self.towards, self.right), self.towards], dtype=np.float64)
+        return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True))
 
 
-def _rows(right: ArrayLike, up: ArrayLike, towards: ArrayLike) -> Float64[ndarray, "3 3"]:
-    rows = np.array([right, up, towards], dtype=np.float64)
-    return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True))
-
-
-_TOWARDS_CORNER = np.array([0.9, -1.2, 0.8])
-_RIGHT_OF_CORNER = np.array([1.2, 0.9, 0.0])
 _SIDES = (
-    _Side("front: x to the right, z up", _rows((1, 0, 0), (0, 0, 1), (0, -1, 0))),
-    _Side("right: y to the right, z up", _rows((0, 1, 0), (0, 0, 1), (1, 0, 0))),
-    _Side("top: x to the right, y up", _rows((1, 0, 0), (0, 1, 0), (0, 0, 1))),
-    _Side(
-        "corner: from the front, the right and above",
-        _rows(_RIGHT_OF_CORNER, np.cross(_TOWARDS_CORNER, _RIGHT_OF_CORNER), _TOWARDS_CORNER),
-    ),
+    _Side("front: x to the right, z up", (1, 0, 0), (0, -1, 0)),
+    _Side("right: y to the right, z up", (0, 1, 0), (1, 0, 0)),
+    _Side("top: x to the right, y up", (1, 0, 0), (0, 0, 1)),
+    _Side("corner: from the front, the right and above", (1.2, 0.9, 0.0), (0.9, -1.2, 0.8)),
 )
 
 
@@ -97,13 +94,9 @@ def corner_view(inspection: Inspection) -> Image.Image:
     return _panel(inspection, _strokes(bars, _colours(bars)), _SIDES[-1])
 
 
-def _diameter_mm(bar: CageBar) -> float | None:
-    return round(bar.bar.diameter_m * 1000, 2) if bar.bar.has_axis else None
-
-
 def _colours(bars: Sequence[CageBar]) -> dict[float | None, tuple[int, int, int]]:
     """Return the colour of each diameter in millimetres, the largest first; None is an unknown diameter."""
-    found = {_diameter_mm(bar) for bar in bars}
+    found = {diameter_mm(bar) for bar in bars}
     known = sorted((diameter for diameter in found if diameter is not None), reverse=True)
     colours: dict[float | None, tuple[int, int, int]] = {
         diameter: _COLOURS[number % len(_COLOURS)] for number, diameter in enumerate(known)
@@ -116,7 +109,7 @@ def _strokes(bars: Sequence[CageBar], colours: dict[float | None, tuple[int, int
     whole = sum(len(bar.bar.axis_m) for bar in bars) > _MAX_PIECES
     strokes = []
     for bar in bars:
-        colour = colours[_diameter_mm(bar)]
+        colour = colours[diameter_mm(bar)]
         if not bar.bar.has_axis:
             strokes += [_Stroke(edge_m, 0.0, colour) for edge_m in _mesh_edges(bar)]
             continue
@@ -222,12 +215,10 @@ def _draw_scale_bar(draw: ImageDraw.ImageDraw, px_per_m: float) -> None:
 
 
 def _write_head(draw: ImageDraw.ImageDraw, inspection: Inspection, width: int) -> None:
-    lower_m, upper_m = inspection.box_m
-    sides = " x ".join(f"{side:.3f}" for side in upper_m - lower_m)
     name = shortened(printable(inspection.name), 30, width - 2 * _MARGIN_PX)
     draw.text((_MARGIN_PX, 14), name, _INK, font(30))
     bars = counted(len(inspection.cage.bars), "bar")
-    words = [f"{bars}, {sides} m (x, y, z)"]
+    words = [f"{bars}, {inspection.size_text} (x, y, z)"]
     if inspection.overlaps:
         words.append(f"red circles: {counted(len(inspection.overlaps), 'pair')} of bars overlap")
     draw.text((_MARGIN_PX, 54), "; ".join(words), _GREY, font(20))
@@ -240,20 +231,13 @@ def _write_legend(
     y: int,
 ) -> None:
     """Write the diameters with their colours, in as many columns as fit."""
-    x = _MARGIN_PX
-    for colour, text in _legend_entries(colours, inspection):
+    x, counts = _MARGIN_PX, Counter(map(diameter_mm, inspection.cage.bars))
+    for size_mm, colour in colours.items():
+        name = "no diameter" if size_mm is None else f"{size_mm:g} mm"
+        text = f"{name} ({counts[size_mm]})"
         end = x + 46 + font(20).getlength(text)
         if end > 2 * _PANEL_PX[0] - _MARGIN_PX:
             x, y, end = _MARGIN_PX, y + 30, _MARGIN_PX + 46 + font(20).getlength(text)
         draw.line((x, y + 12, x + 34, y + 12), colour, 8)
         draw.text((x + 46, y), text, _INK, font(20))
         x = int(end) + 36
-
-
-def _legend_entries(
-    colours: dict[float | None, tuple[int, int, int]], inspection: Inspection
-) -> Iterator[tuple[tuple[int, int, int], str]]:
-    for diameter_mm, colour in colours.items():
-        count = sum(_diameter_mm(bar) == diameter_mm for bar in inspection.cage.bars)
-        name = "no diameter" if diameter_mm is None else f"{diameter_mm:g} mm"
-        yield colour, f"{name} ({count})"

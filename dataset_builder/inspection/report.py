@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -75,9 +75,8 @@ def print_inspection(inspection: Inspection, console: Console | None = None) -> 
             console, f"and {counted(len(more), 'more group')} of {counted(bars, 'bar')} (--json lists all bars)"
         )
     console.print()
-    for line in (*_axis_lines(inspection), *_place_lines(inspection), *_overlap_lines(inspection)):
-        _print(console, line)
-    for line in _left_out_lines(inspection):
+    kinds = (_axis_lines, _place_lines, _overlap_lines, _left_out_lines)
+    for line in (line for lines in kinds for line in lines(inspection)):
         _print(console, line)
 
 
@@ -91,33 +90,20 @@ def _group_table(groups: Sequence[BarGroup]) -> Table:
         is_text = head.strip() in ("role", "host", "storey")
         table.add_column(head, justify="left" if is_text else "right", no_wrap=True)
     for group in groups[:_MAX_GROUPS]:
-        table.add_row(*map(plain_text, _cells(group)))
+        diameter = "unknown" if group.diameter_mm is None else f"{group.diameter_mm:g}"
+        _add_row(table, [diameter, group.role, group.host or "", group.storey or ""], [group])
     if len(groups) > 1:
         table.add_section()
-        table.add_row(*map(plain_text, _total_cells(groups)))
+        _add_row(table, ["all", "", "", ""], groups)
     return table
 
 
-def _cells(group: BarGroup) -> list[str]:
-    diameter = "unknown" if group.diameter_mm is None else f"{group.diameter_mm:g}"
-    names = [group.role, group.host or "", group.storey or ""]
-    return [diameter, *names, str(group.bars), _decimals(group.length_m, 2), _decimals(group.mass_kg, 1)]
-
-
-def _total_cells(groups: Sequence[BarGroup]) -> list[str]:
-    bars = sum(group.bars for group in groups)
-    return ["all", "", "", "", str(bars), _total(group.length_m for group in groups), _total(
-        (group.mass_kg for group in groups), 1
-    )]  # fmt: skip
-
-
-def _total(values: Iterable[float | None], decimals: int = 2) -> str:
-    known = [value for value in values if value is not None]
-    return _decimals(sum(known) if known else None, decimals)
-
-
-def _decimals(value: float | None, decimals: int) -> str:
-    return "" if value is None else f"{value:.{decimals}f}"
+def _add_row(table: Table, names: Sequence[str], groups: Sequence[BarGroup]) -> None:
+    """Add a row of names, and the sums of groups."""
+    lengths_m = [group.length_m for group in groups if group.length_m is not None]
+    masses_kg = [group.mass_kg for group in groups if group.mass_kg is not None]
+    sums = f"{sum(lengths_m):.2f}" if lengths_m else "", f"{sum(masses_kg):.1f}" if masses_kg else ""
+    table.add_row(*map(plain_text, (*names, str(sum(group.bars for group in groups)), *sums)))
 
 
 def _axis_lines(inspection: Inspection) -> list[str]:
@@ -128,16 +114,16 @@ def _axis_lines(inspection: Inspection) -> list[str]:
 
 def _place_lines(inspection: Inspection) -> list[str]:
     """Return the box of the steel and the transform from the file's frame."""
-    lower, upper = inspection.box_m
-    sides = " x ".join(f"{side:.3f}" for side in upper - lower)
-    ranges = ", ".join(
-        f"{axis} {low:.3f} to {high:.3f}" for axis, low, high in zip("xyz", lower, upper, strict=True)
-    )
+    corners = zip("xyz", *inspection.box_m, strict=True)
+    ranges = ", ".join(f"{axis} {low:.3f} to {high:.3f}" for axis, low, high in corners)
     matrix = inspection.cage.world_from_source
     rows = [f"  [{', '.join(f'{value:.12g}' for value in row)}]" for row in matrix[:3]]
     is_placed = not np.array_equal(matrix, np.eye(4))
     words = "world_from_source (coordinates of the file to metres of the world):"
-    return [f"steel: {sides} m ({ranges})", *([words, *rows] if is_placed else ["coordinates: those of the file"])]
+    return [
+        f"steel: {inspection.size_text} ({ranges})",
+        *([words, *rows] if is_placed else ["coordinates: those of the file"]),
+    ]
 
 
 def _overlap_lines(inspection: Inspection) -> list[str]:

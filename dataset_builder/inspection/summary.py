@@ -70,6 +70,11 @@ class Inspection:
     box_m: Box
     overlaps: tuple[Overlap, ...] | None
 
+    @property
+    def size_text(self) -> str:
+        """Sides of the box, such as ``1.000 x 0.300 x 0.200 m``."""
+        return f"{' x '.join(f'{side:.3f}' for side in self.box_m[1] - self.box_m[0])} m"
+
 
 def inspect_cage(cage: Cage, name: str) -> Inspection:
     """Return the summary of a cage of one or more bars."""
@@ -128,20 +133,23 @@ def bar_box_m(bar: CageBar) -> Box:
     return np.array([lower_m.min(axis=0), upper_m.max(axis=0)])
 
 
+def diameter_mm(bar: CageBar) -> float | None:
+    """Return the diameter of a bar as it is listed, millimetres; None if it is unknown."""
+    return round(bar.bar.diameter_m * 1000, 2) if bar.bar.has_axis else None
+
+
 def _groups(bars: Sequence[CageBar]) -> list[BarGroup]:
     """Return the groups by descending diameter, then by role, host and storey; unknown diameters last."""
     by_key: dict[tuple[float | None, str, str | None, str | None], list[float]] = defaultdict(list)
     for bar in bars:
-        diameter_mm = round(bar.bar.diameter_m * 1000, 2) if bar.bar.has_axis else None
-        by_key[diameter_mm, bar.bar.role, bar.host, bar.storey].append(bar.bar.length_m)
+        by_key[diameter_mm(bar), bar.bar.role, bar.host, bar.storey].append(bar.bar.length_m)
     ordered = sorted(by_key, key=lambda key: (-(key[0] or 0.0), key[1], key[2] or "", key[3] or ""))
-    return [_group(key, by_key[key]) for key in ordered]
-
-
-def _group(key: tuple[float | None, str, str | None, str | None], lengths_m: Sequence[float]) -> BarGroup:
-    diameter_mm, role, host, storey = key
-    if diameter_mm is None:
-        return BarGroup(None, role, host, storey, len(lengths_m), None, None)
-    length_m = math.fsum(lengths_m)
-    mass_kg = math.pi / 4 * (diameter_mm / 1000) ** 2 * length_m * STEEL_KG_PER_M3
-    return BarGroup(diameter_mm, role, host, storey, len(lengths_m), length_m, mass_kg)
+    groups = []
+    for key in ordered:
+        count, size_mm = len(by_key[key]), key[0]
+        length_m = mass_kg = None
+        if size_mm is not None:
+            length_m = math.fsum(by_key[key])
+            mass_kg = math.pi / 4 * (size_mm / 1000) ** 2 * length_m * STEEL_KG_PER_M3
+        groups.append(BarGroup(*key, count, length_m, mass_kg))
+    return groups

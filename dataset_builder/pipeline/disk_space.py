@@ -18,7 +18,7 @@ from dataset_builder.config.specs import RigSpec, SceneConfigSpec
 from dataset_builder.pipeline.folder import existing_ancestor
 from dataset_builder.pipeline.plan import ConfigPlan, config_parameters, generator_versions
 from dataset_builder.pipeline.retained import Finished
-from dataset_builder.scene.variants.image_light import image_light
+from dataset_builder.scene.variants.registry import image_light
 from rebar_depth_bench.data.bars import BARS_FILE, decoded_bytes
 from rebar_depth_bench.data.manifest import MANIFEST_FILE
 from rebar_depth_bench.errors import InputError, OutputError

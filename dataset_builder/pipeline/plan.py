@@ -18,7 +18,7 @@ from dataset_builder.config.trajectories import aim_point_m, subset, view_count
 from dataset_builder.pipeline.shards import VIEWS_PER_SHARD, Staging
 from dataset_builder.scene.assemblies import assembly_bars, make_assembly
 from dataset_builder.scene.model import Assembly, Note
-from dataset_builder.scene.variants.image_light import image_light
+from dataset_builder.scene.variants.registry import image_light
 from dataset_builder.scene.variants.sensor import sensor_spec
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.columns import ROW_SCHEMA

@@ -33,6 +33,9 @@ def to_metres(length: float, unit_m: float) -> float:
 STEEL = "steel"
 """Material name of bars."""
 
+Colour = tuple[float, float, float]
+"""Red, green and blue, linear Rec. 709."""
+
 ESTIMATED_ROLE = "imported"
 """Role of bars whose axis and diameter were fitted to their surface, or could not be."""
 

@@ -48,6 +48,7 @@ from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.paths import NAME_LETTERS, NAME_PATTERN
 from rebar_depth_bench.reading import parse_toml, read_file
 from rebar_depth_bench.validation import (
+    UNITS_M,
     Expected,
     StrictModel,
     check_unique,
@@ -61,7 +62,6 @@ from rebar_depth_bench.validation import (
 CAMERAS_FILE = "cameras.toml"
 CALIBRATION_SUFFIXES = (".conf", *DOCUMENT_SUFFIXES)
 _CALIBRATION_FILES = ("calibration.conf", "calibration.toml")
-_UNITS_M: Mapping[str, float] = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _SQUARE_PIXEL_TOLERANCE = 0.03
 """Maximum deviation of fx / fy from 1.
 
@@ -130,7 +130,7 @@ class _CamerasTable(StrictModel):
         _FileName | Annotated[list[_FileName], Field(min_length=1, max_length=2)] | None,
         Expected("the name of a file beside this one, or two"),
     ] = None
-    unit: Annotated[str, one_of(*_UNITS_M)] = "m"
+    unit: Annotated[str, one_of(*UNITS_M)] = "m"
     board: _BoardTable | None = None
     pose: tuple[_PoseTable, ...] = Field(default=(), strict=False)
     width: Any = None
@@ -202,7 +202,7 @@ def cameras_of_table(
         names = [table.calibration] if isinstance(table.calibration, str) else list(table.calibration or ())
         paths = [path.parent / name for name in names]
         calibration = _file_calibration(
-            path.parent, paths, _UNITS_M[table.unit], width, height, is_stereo=is_stereo
+            path.parent, paths, UNITS_M[table.unit], width, height, is_stereo=is_stereo
         )
     board = None if table.board is None else table.board.spec
     return CaptureCameras(calibration, board or BoardSpec(), board is None, poses)

@@ -81,6 +81,15 @@ def _hub_root(root: str) -> tuple[str, str | None]:
     return match["repository"], match["revision"]
 
 
+def local_folder(root: str | Path) -> Path:
+    """Return the path of a dataset folder on this machine. Raises ``DatasetError`` if ``root`` is no folder."""
+    if not Path(root).is_dir():
+        raise DatasetError(
+            f"{root}: no such folder, expected a dataset folder on this machine; download a Hub repository first"
+        )
+    return Path(root)
+
+
 def local_path(root: str, name: str, commit: str = "") -> Path:
     """Return the local path of a regular file below ``root``; ``commit`` replaces the revision of a Hub root.
 

@@ -106,6 +106,11 @@ def camera_centre(cam_from_world: Float[ndarray, "4 4"]) -> Float[ndarray, 3]:
     return inverse_rigid(cam_from_world)[:3, 3]
 
 
+def swap_camera_axes(cam_from_world: Float[ndarray, "4 4"]) -> Float64[ndarray, "4 4"]:
+    """Return a pose in OpenGL's camera axes (x right, y up, z backwards) from one in OpenCV's, or the reverse."""
+    return np.asarray(np.diag([1.0, -1.0, -1.0, 1.0]) @ cam_from_world)
+
+
 def right_camera_pose(left_cam_from_world: Float[ndarray, "4 4"], baseline_m: float) -> Float[ndarray, "4 4"]:
     """Return ``cam_from_world`` of a right camera parallel to the left one, ``baseline_m`` along its x axis."""
     pose = left_cam_from_world.copy()

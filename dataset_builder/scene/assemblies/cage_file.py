@@ -17,7 +17,6 @@ from dataset_builder.config.file_specs import (
     PlacementSpec,
     Trust,
 )
-from dataset_builder.config.scene_schema import UNITS_M
 from dataset_builder.scene.assemblies.bar_meshes import bar_mesh, with_ribs_chosen
 from dataset_builder.scene.assemblies.cage import Cage, CageBar, LeftOut, unit_scale
 from dataset_builder.scene.assemblies.cage_checks import cage_problems, check_values, raise_problems
@@ -37,6 +36,7 @@ from dataset_builder.scene.selection import Selection
 from rebar_depth_bench.errors import MeshError, Problem, escape_text
 from rebar_depth_bench.limits import IFC_BYTES, MESH_BYTES, TOML_BYTES
 from rebar_depth_bench.reading import read_file
+from rebar_depth_bench.validation import UNITS_M
 
 _SUFFIXES = (".toml", ".ifc")
 _GLTF_CONVERSION = (

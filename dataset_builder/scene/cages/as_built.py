@@ -14,9 +14,10 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.scene.cages.clearance import Clearances
 from dataset_builder.scene.cages.design import Design, DesignBar, InfeasibleError, Z
-from dataset_builder.scene.cages.rules import contact_m, radius_m
+from dataset_builder.scene.cages.rules import contact_m
+from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
+from dataset_builder.scene.shapes.capsules import Clearances
 
 SPACING_TOLERANCE_M = 0.020
 """Largest deviation of a bar along the direction in which its kind is spaced."""
@@ -77,18 +78,18 @@ class BuiltCage:
 def build_as(design: Design, rng: np.random.Generator) -> BuiltCage:
     """Return the cage as it is built. Raises ``InfeasibleError`` if bars of the design touch each other."""
     bars, left_out = _some_left_out(design.bars, rng)
-    clearances = Clearances([bar.line_m for bar in bars], [radius_m(bar.diameter_m) for bar in bars])
+    clearances = Clearances([bar.line_m for bar in bars], [outer_radius_m(bar.diameter_m) for bar in bars])
     if not clearances.are_all(_NEEDED_M):
         raise InfeasibleError("bars of the design touch each other")
     lines, reduced, refused = [bar.line_m for bar in bars], 0, 0
     for index in rng.permutation(len(bars)).tolist():
         bar = bars[index]
         deviation = _drawn_deviation(bar, rng, stands=design.stands)
-        radius = radius_m(bar.diameter_m)
+        radius = outer_radius_m(bar.diameter_m)
         near = clearances.neighbours(bar.line_m, radius, index, deviation.most_m)
         for share, spacing_share in _SHARES:
             line_m = deviation.applied(share, spacing_share)
-            if near.least_m(line_m, radius) >= _NEEDED_M:
+            if near.bar_clearance_m(line_m, radius) >= _NEEDED_M:
                 lines[index] = line_m
                 clearances.replace(index, line_m)
                 reduced += (share, spacing_share) != _SHARES[0]
@@ -132,8 +133,8 @@ def _doubled(built: list[BuiltBar], clearances: Clearances, rng: np.random.Gener
         beside = np.cross(along, side) * rng.choice([-1.0, 1.0])
         distance_m = contact_m(bar.diameter_m, bar.diameter_m) + MIN_CLEAR_M
         line_m = bar.line_m + beside / np.linalg.norm(beside) * distance_m
-        if clearances.least_m(line_m, radius_m(bar.diameter_m)) >= _NEEDED_M:
-            clearances.append(line_m, radius_m(bar.diameter_m))
+        if clearances.least_m(line_m, outer_radius_m(bar.diameter_m)) >= _NEEDED_M:
+            clearances.append(line_m, outer_radius_m(bar.diameter_m))
             return [BuiltBar(bar.role, bar.diameter_m, line_m, None)]
     return []
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from hashlib import sha256
 from typing import Any
@@ -12,9 +13,14 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.scene.cages.as_built import BuiltBar, build_as
-from dataset_builder.scene.cages.design import InfeasibleError
-from dataset_builder.scene.cages.families import FAMILIES
-from dataset_builder.scene.cages.rules import radius_m
+from dataset_builder.scene.cages.design import Design, InfeasibleError
+from dataset_builder.scene.cages.families.beams import beam
+from dataset_builder.scene.cages.families.columns import column, pile_cage
+from dataset_builder.scene.cages.families.footings import footing
+from dataset_builder.scene.cages.families.joints import joint
+from dataset_builder.scene.cages.families.slabs import slab
+from dataset_builder.scene.cages.families.walls import wall
+from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.view_ids import SPLITS
 
@@ -26,6 +32,29 @@ MAX_BARS = 200
 
 MAX_ATTEMPTS = 200
 """Number of designs that are drawn before a cage is given up."""
+
+
+@dataclass(frozen=True)
+class Family:
+    """Family of cages: a function that draws a design of a shape, and the shapes.
+
+    ``draw`` raises ``InfeasibleError`` for drawn parameters that do not fit.
+    """
+
+    draw: Callable[[np.random.Generator, str], Design]
+    shapes: tuple[str, ...]
+
+
+FAMILIES: Mapping[str, Family] = {
+    "column": Family(column, ("square", "rectangular", "round-ties", "spiral")),
+    "beam": Family(beam, ("straight", "hooked")),
+    "wall": Family(wall, ("plain", "laps", "u-bars")),
+    "slab": Family(slab, ("two-mats",)),
+    "footing": Family(footing, ("bobs", "full-height")),
+    "pile-cage": Family(pile_cage, ("spiral", "rings")),
+    "joint": Family(joint, ("corner", "passing")),
+}
+"""Families by name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,7 +157,7 @@ def _offset_m(bars: tuple[BuiltBar, ...], ground_m: float) -> Float64[ndarray, "
 
 def _lowest_m(bar: BuiltBar) -> float:
     """Return the height of the lowest point of a bar's surface, whose ends are flat discs."""
-    line_m, radius = bar.line_m, radius_m(bar.diameter_m)
+    line_m, radius = bar.line_m, outer_radius_m(bar.diameter_m)
     tangents = np.gradient(line_m, axis=0)
     level = np.linalg.norm(tangents[:, :2], axis=1) / np.linalg.norm(tangents, axis=1)
     return float((line_m[:, 2] - radius * level).min())

@@ -7,7 +7,6 @@ They were taken from secondary sources, not from the text of the standards.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cache
 from math import pi
 
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
@@ -49,15 +48,9 @@ CRANK_SLOPE = 1 / 6
 """Slope at which a bar is bent sideways to lap with another one (ACI 318-19, 10.7.4.1; secondary source)."""
 
 
-@cache
-def radius_m(diameter_m: float) -> float:
-    """Return the largest distance of a bar's surface from its axis, ribs included."""
-    return outer_radius_m(diameter_m)
-
-
 def contact_m(first_m: float, second_m: float) -> float:
     """Return the distance between the axes of two bars of these diameters that are tied to each other."""
-    return radius_m(first_m) + radius_m(second_m) + CONTACT_GAP_M
+    return outer_radius_m(first_m) + outer_radius_m(second_m) + CONTACT_GAP_M
 
 
 def least_clear_m(diameter_m: float) -> float:

@@ -25,8 +25,7 @@ class RibPattern:
     """Rib dimensions of a bar in nominal diameters d; ASTM A615 requires spacing <= 0.7 d, angle >= 45 degrees.
 
     ``angle_deg`` is the angle between rib and bar axis, ``seam_half_deg`` the angular half width of a longitudinal
-    rib seen from the axis, ``segments_per_row`` the number of mesh segments across one of the two rows. Raises
-    ``ValueError`` for a spacing or angle outside the limits.
+    rib seen from the axis, ``segments_per_row`` the number of mesh segments across one of the two rows.
     """
 
     spacing: float = 0.68
@@ -38,15 +37,12 @@ class RibPattern:
     seam_half_deg: float = 10.0
     segments_per_row: int = 10
 
-    def __post_init__(self) -> None:
-        if not 0 < self.spacing <= 0.7:
-            raise ValueError(f"rib spacing is {self.spacing} d, expected at most 0.7 d (ASTM A615)")
-        if not 45 <= self.angle_deg <= 90:
-            raise ValueError(f"rib angle is {self.angle_deg} degrees to the axis, expected 45 or more (ASTM A615)")
+
+STANDARD_RIBS = RibPattern()
 
 
 def ribbed_bar_mesh(
-    centreline_m: Float64[ndarray, "n 3"], diameter_m: float, ribs: RibPattern | None = None
+    centreline_m: Float64[ndarray, "n 3"], diameter_m: float, ribs: RibPattern = STANDARD_RIBS
 ) -> Mesh:
     """Return the watertight mesh of a ribbed bar along ``centreline_m`` (world or local frame, metres).
 
@@ -54,7 +50,6 @@ def ribbed_bar_mesh(
     finely sampled; the seams follow a parallel-transported frame along the line. Raises ``ValueError`` for a
     diameter that is not positive and for an invalid centreline.
     """
-    ribs = RibPattern() if ribs is None else ribs
     axis = _Axis.from_points(np.asarray(centreline_m, dtype=np.float64))
     if diameter_m <= 0:
         raise ValueError(f"diameter_m is {diameter_m}, expected a positive length")
@@ -91,9 +86,8 @@ def plain_outer_radius_m(diameter_m: float, segments: int = 24) -> float:
     return float(diameter_m / 2 * np.sqrt(wedge / np.sin(wedge)))
 
 
-def outer_radius_m(diameter_m: float, ribs: RibPattern | None = None) -> float:
+def outer_radius_m(diameter_m: float, ribs: RibPattern = STANDARD_RIBS) -> float:
     """Return the maximum distance of the surface of a straight bar from its axis: core plus rib, metres."""
-    ribs = RibPattern() if ribs is None else ribs
     return diameter_m * (_core_ratio(ribs) + max(ribs.height, ribs.seam_height))
 
 

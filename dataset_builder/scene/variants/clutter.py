@@ -1,4 +1,4 @@
-"""Clutter props: objects on the ground around the steel, scaled with the steel."""
+"""Clutter props: objects on the ground around the steel, scaled with it or life-size."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from dataset_builder.scene.model import Mesh, Part, surface
 from dataset_builder.scene.shapes.solids import box, lathe, rotation_about_z, transformed
-from dataset_builder.scene.variants.placement import GAP_M, PlacementContext, Rect
+from dataset_builder.scene.variants.context import GAP_M, PlacementContext, Rect
 
 CLEARANCE = 0.04
 """Minimum distance between clutter and the bounding box of the steel, as a fraction of the steel's span."""
@@ -43,20 +43,13 @@ LIFE_SIZE_BAND_M = 1.6
 def clutter(context: PlacementContext) -> tuple[Part, ...]:
     """Return the objects, placed clear of the steel, the markers, earlier props and each other.
 
-    All objects are within 0.9 spans (at most 0.7 m) of the bounding box of the steel and at most 0.23 spans high.
-    Objects for which no free position is found are omitted.
+    All scaled objects are within 0.9 spans (at most 0.7 m) of the bounding box of the steel and at most 0.23 spans
+    high, life-size ones within ``LIFE_SIZE_BAND_M`` and at most 0.3 m high. Objects for which no free position is
+    found are omitted.
     """
-    unit_m = float(np.clip(0.25 * context.span_m, 0.015, 0.4))
-    return _scattered(context, unit_m, min(0.9 * context.span_m, 0.7))
-
-
-def life_size_clutter(context: PlacementContext) -> tuple[Part, ...]:
-    """Return the objects of ``clutter`` in their real sizes, at most 0.3 m high and further apart."""
-    return _scattered(context, LIFE_SIZE_UNIT_M, LIFE_SIZE_BAND_M)
-
-
-def _scattered(context: PlacementContext, unit_m: float, band_m: float) -> tuple[Part, ...]:
-    """Return the objects, in the unit of their sizes and within a band round the bounding box of the steel."""
+    unit_m, band_m = float(np.clip(0.25 * context.span_m, 0.015, 0.4)), min(0.9 * context.span_m, 0.7)
+    if context.is_life_size:
+        unit_m, band_m = LIFE_SIZE_UNIT_M, LIFE_SIZE_BAND_M
     rng = context.rng("clutter")
     allowed = context.footprint.expanded(band_m)
     blocked = (context.footprint.expanded(CLEARANCE * context.span_m), *context.occupied)

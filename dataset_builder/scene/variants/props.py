@@ -11,16 +11,58 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 
-from dataset_builder.config.specs import GeneratedCageSpec, SceneSpec
-from dataset_builder.scene.model import Assembly, Part
-from dataset_builder.scene.variants import SHADOWS, check_variants
-from dataset_builder.scene.variants.clutter import clutter, life_size_clutter
-from dataset_builder.scene.variants.fitted_formwork import fitted_formwork
-from dataset_builder.scene.variants.panels import formwork, slatted_screen
-from dataset_builder.scene.variants.placement import PlacementContext
-from dataset_builder.scene.variants.spacers import spacers
-from dataset_builder.scene.variants.supports import supports
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from dataset_builder.config.specs import SceneSpec
+from dataset_builder.scene.model import Assembly, Part, surface
+from dataset_builder.scene.shapes.solids import box, merge_meshes, transformed
+from dataset_builder.scene.variants.clutter import clutter
+from dataset_builder.scene.variants.context import GAP_M, PlacementContext
+from dataset_builder.scene.variants.formwork import formwork
+from dataset_builder.scene.variants.registry import SCREEN_DISTANCE, SHADOWS, SUN_FROM
+from dataset_builder.scene.variants.spacers import spacers, supports
 from dataset_builder.scene.variants.tie_wire import tie_wire
+
+SLATS = 9
+"""Number of slats of the screen."""
+SCREEN_HALF_SIZE = 1.5
+"""Half the side of the square screen, in half diagonals of the steel."""
+
+
+def slatted_screen(context: PlacementContext) -> tuple[Part, ...]:
+    """Return the screen: slats on two rails that extend to the ground in the plane of the screen.
+
+    The plane is perpendicular to the direction of the sun, so its centre is its point nearest to the steel.
+    """
+    world_from_screen = _world_from_screen()
+    reach_m = context.reach_m
+    middle_m = context.middle_m + SCREEN_DISTANCE * reach_m * world_from_screen[:, 2]
+    half_m, pitch_m = SCREEN_HALF_SIZE * reach_m, 2 * SCREEN_HALF_SIZE * reach_m / SLATS
+    thick_m = 0.03 * reach_m
+    slats = [
+        box((-half_m, v_m, 0.0), (half_m, v_m + 0.5 * pitch_m, thick_m))
+        for v_m in np.linspace(-half_m, half_m - 0.5 * pitch_m, SLATS)
+    ]
+    down_m = (middle_m[2] - GAP_M) / world_from_screen[2, 1] - 3 * thick_m
+    rails = [
+        box((u_m - thick_m, -down_m, 1.1 * thick_m), (u_m + thick_m, half_m + thick_m, 3.1 * thick_m))
+        for u_m in (-0.7 * half_m, 0.7 * half_m)
+    ]
+    return tuple(
+        surface(f"screen-{name}", transformed(merge_meshes(meshes), world_from_screen, middle_m), "timber")
+        for name, meshes in (("slats", slats), ("rails", rails))
+    )
+
+
+def _world_from_screen() -> Float64[ndarray, "3 3"]:
+    """Return the axes of the screen as columns: horizontal, up the slope, towards the sun."""
+    towards_sun = np.array(SUN_FROM) / np.linalg.norm(SUN_FROM)
+    horizontal = np.cross([0.0, 0.0, 1.0], towards_sun)
+    horizontal /= np.linalg.norm(horizontal)
+    return np.stack([horizontal, np.cross(towards_sun, horizontal), towards_sun], axis=1)
+
 
 PROP_BUILDERS: Mapping[str, Callable[[PlacementContext], tuple[Part, ...]]] = {
     "tie-wire": tie_wire,
@@ -31,31 +73,16 @@ PROP_BUILDERS: Mapping[str, Callable[[PlacementContext], tuple[Part, ...]]] = {
 }
 """Prop builders by variant, in execution order, which does not depend on the order of the names in a spec."""
 
-CAGE_PROP_BUILDERS: Mapping[str, Callable[[PlacementContext], tuple[Part, ...]]] = {
-    **PROP_BUILDERS,
-    "formwork": fitted_formwork,
-    "clutter": life_size_clutter,
-}
-"""Prop builders of generated cages, in the same order."""
-
 
 def make_props(assembly: Assembly, spec: SceneSpec) -> tuple[Part, ...]:
     """Return the props requested by ``spec.appearance``, and the supports of a generated cage.
 
     They are in the world frame, all with bar id ``NOT_STEEL``.
-
-    Raises ``InputError`` if the variants do not pass ``check_variants``.
     """
-    requested = spec.appearance.variants
-    check_variants(requested)
-    is_generated = isinstance(spec.assembly, GeneratedCageSpec)
-    builders = CAGE_PROP_BUILDERS if is_generated else PROP_BUILDERS
-    if not is_generated and not any(name in builders for name in requested):
-        return ()
     context = PlacementContext.from_assembly(assembly, spec)
-    parts = supports(context) if is_generated else ()
-    for name, build_props in builders.items():
-        if name in requested:
+    parts = supports(context) if context.is_life_size else ()
+    for name, build_props in PROP_BUILDERS.items():
+        if name in spec.appearance.variants:
             props = build_props(context)
             parts = (*parts, *props)
             context = context.with_parts(props)

@@ -24,7 +24,7 @@ from numpy import ndarray
 from PIL import Image
 
 from dataset_builder.config.specs import SceneSpec
-from dataset_builder.scene.variants import SENSOR
+from dataset_builder.scene.variants.registry import SENSOR
 
 
 @dataclass(frozen=True)

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from numpy import ndarray
 
 from dataset_builder.scene.model import Part, surface
 from dataset_builder.scene.shapes.bar_mesh import plain_bar_mesh
+from dataset_builder.scene.shapes.capsules import Capsules
 from dataset_builder.scene.shapes.solids import merge_meshes
-from dataset_builder.scene.variants.placement import GAP_M, Capsules, Crossing, PlacementContext, find_crossings
+from dataset_builder.scene.variants.context import GAP_M, PlacementContext
 
 WIRE_M = 0.0012
 """Diameter of annealed tie wire, metres."""
@@ -26,6 +29,10 @@ TAIL_M = 0.006
 CORNER_THICKENING = 1.45
 """Ratio of the thickness of a swept wire at a right-angle turn to that of straight wire."""
 SEGMENTS = 6
+MIN_CROSSING_ANGLE_DEG = 30.0
+"""Smallest angle between the axes of a crossing, degrees."""
+_EPSILON = 1e-12
+"""Smallest distance between the axes of a crossing, metres."""
 
 
 def tie_wire(context: PlacementContext) -> tuple[Part, ...]:
@@ -57,8 +64,7 @@ def _tie_line_m(crossing: Crossing, context: PlacementContext) -> Float64[ndarra
 def _is_clear(line_m: Float64[ndarray, "n 3"], capsules: Capsules) -> bool:
     """Return whether the wire, including its thickening at corners, is clear of all bars."""
     dense_m = np.concatenate([line_m, (line_m[1:] + line_m[:-1]) / 2])
-    around = capsules.overlapping(line_m.min(axis=0) - WIRE_M, line_m.max(axis=0) + WIRE_M)
-    return bool(capsules.select(around).clearance_m(dense_m) > CORNER_THICKENING * WIRE_M / 2)
+    return capsules.clearance_m(dense_m, WIRE_M) > CORNER_THICKENING * WIRE_M / 2
 
 
 def _loop_m(
@@ -95,3 +101,47 @@ def _loop_m(
     loop_m = middle_m + hull_m[:, :1] * w + hull_m[:, 1:] * n + aside_m[:, None] * m
     # Both free ends leave along the diagonal, where the first turn starts and the last turn ends.
     return np.concatenate([loop_m[:1] + TAIL_M * (w - 0.3 * n), loop_m, loop_m[-1:] + TAIL_M * (w + 0.3 * n)])
+
+
+@dataclass(frozen=True, eq=False)
+class Crossing:
+    """Crossing of two pieces (indices into the capsules), with the closest points of their axes."""
+
+    pieces: tuple[int, int]
+    points_m: tuple[Float64[ndarray, " 3"], Float64[ndarray, " 3"]]
+
+
+def find_crossings(capsules: Capsules, gap_m: float) -> list[Crossing]:
+    """Return the crossings of straight legs of different bars.
+
+    Their surfaces are at most ``gap_m`` apart. Pieces of at most two diameters belong to bends and are omitted.
+    """
+    crossings = []
+    legs = np.linalg.norm(capsules.b_m - capsules.a_m, axis=1) > 4 * capsules.radius_m
+    low = np.minimum(capsules.a_m, capsules.b_m) - capsules.radius_m[:, None] - gap_m
+    high = np.maximum(capsules.a_m, capsules.b_m) + capsules.radius_m[:, None] + gap_m
+    for piece in np.flatnonzero(legs):
+        later = legs & capsules.overlapping(low[piece], high[piece]) & (capsules.bar > capsules.bar[piece])
+        others = np.flatnonzero(later)
+        if len(others):
+            crossings += _crossings_of(int(piece), others, capsules, gap_m)
+    return crossings
+
+
+def _crossings_of(piece: int, others: Int64[ndarray, " k"], capsules: Capsules, gap_m: float) -> list[Crossing]:
+    u = capsules.b_m[piece] - capsules.a_m[piece]
+    v = capsules.b_m[others] - capsules.a_m[others]
+    w = capsules.a_m[piece] - capsules.a_m[others]
+    uu, uv, vv, uw, vw = u @ u, v @ u, (v * v).sum(axis=1), w @ u, (w * v).sum(axis=1)
+    squared_sine = 1.0 - uv**2 / (uu * vv)
+    steep = squared_sine > np.sin(np.deg2rad(MIN_CROSSING_ANGLE_DEG)) ** 2
+    across = np.where(steep, uu * vv - uv**2, 1.0)
+    s, t = (uv * vw - vv * uw) / across, (uu * vw - uv * uw) / across
+    # A closest point beyond the end of a piece is a crossing of the adjacent piece, or no crossing.
+    inside = (s >= 0) & (s < 1) & (t >= 0) & (t < 1)
+    on_piece = capsules.a_m[piece] + s[:, None] * u
+    on_other = capsules.a_m[others] + t[:, None] * v
+    apart = np.linalg.norm(on_piece - on_other, axis=1)
+    close = (apart > _EPSILON) & (apart - capsules.radius_m[piece] - capsules.radius_m[others] <= gap_m)
+    which = np.flatnonzero(steep & inside & close)
+    return [Crossing((piece, int(others[k])), (on_piece[k], on_other[k])) for k in which]

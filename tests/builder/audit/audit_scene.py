@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 from numpy import ndarray
 
-from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
+from dataset_builder.audit.checks import AuditedConfig, AuditedEye, AuditedView
 from dataset_builder.config.rigs import rig_cameras
 from dataset_builder.config.specs import RigSpec
 from dataset_builder.config.trajectories import look_at_with_rig

@@ -17,8 +17,7 @@ import pytest
 
 import rebar_depth_bench as rdb
 from dataset_builder.audit import audit
-from dataset_builder.audit.files import check_crossings, row_problems
-from dataset_builder.audit.run import VIEW_CHECKS
+from dataset_builder.audit.auditing import VIEW_CHECKS, check_crossings, row_problems
 from rebar_depth_bench.bar_crossings.table import write_crossings
 from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.data.manifest import open_folder

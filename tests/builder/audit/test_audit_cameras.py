@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import rebar_depth_bench as rdb
-from dataset_builder.audit.cameras import (
+from dataset_builder.audit.camera_checks import (
     ExpectedView,
     camera_problems,
     checked_aim_point_m,

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from dataset_builder.audit.cameras import MAX_PROJECTION_ERROR_PX, projection_error_px, projection_verdict
-from dataset_builder.audit.cycles_depth import cycles_difference_m, cycles_verdict
+from dataset_builder.audit.camera_checks import MAX_PROJECTION_ERROR_PX, projection_error_px, projection_verdict
+from dataset_builder.audit.checks import AuditedView
 from dataset_builder.audit.geometry import (
     MAX_AXIS_RATIO,
     MAX_BOARD_ERROR_M,
@@ -24,14 +24,15 @@ from dataset_builder.audit.geometry import (
     polyline_distance_m,
     view_board_error,
 )
-from dataset_builder.audit.stereo_consistency import (
+from dataset_builder.audit.independent_depth import (
     MAX_CONTRADICTED_SHARE,
     EpipolarCounts,
+    cycles_difference_m,
+    cycles_verdict,
     epipolar_counts,
     epipolar_verdict,
     project_into,
 )
-from dataset_builder.audit.views import AuditedView
 from dataset_builder.scene.model import ESTIMATED_ROLE
 from dataset_builder.scene.shapes.bending import bent_line_m
 from tests.builder.audit.audit_scene import BOARD, RIGS, config, scene, view, with_depth
@@ -84,7 +85,7 @@ def test_undistorted_depth_on_raw_grid_is_reported() -> None:
     eye = view("raw").left
     ideal = scene().caster.cast(replace(eye.camera, distortion=np.zeros(5)))
     wrong = replace(eye, depth_m=ideal.depth_m, mask=ideal.mask, bars=ideal.bars)
-    assert board_error(wrong, BOARD).off_m > 1e-3
+    assert board_error([wrong], BOARD).off_m > 1e-3
 
 
 def test_board_check_is_skipped_without_board() -> None:

@@ -29,10 +29,8 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.audit.report import Check
-from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
-from dataset_builder.scene.variants import LIGHT_SLOT, variants_of_slot
-from dataset_builder.scene.variants.image_light import IMAGE_LIGHTS
+from dataset_builder.audit.checks import AuditedConfig, AuditedEye, AuditedView, Check
+from dataset_builder.scene.variants.registry import IMAGE_LIGHTS, LIGHT_SLOT, variants_of_slot
 from rebar_depth_bench.geometry.aruco_board import MARKER_MODULES, BoardSpec, marker_corners_m
 from rebar_depth_bench.geometry.aruco_detection import Corners, detected_corners_px
 from rebar_depth_bench.geometry.cameras import NOMINAL_FOCAL_PX, Camera, camera_centre, project, rigid, transform

@@ -24,9 +24,8 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64
 from numpy import ndarray
 
-from dataset_builder.audit.report import Check
-from dataset_builder.audit.stereo_consistency import project_into
-from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
+from dataset_builder.audit.checks import AuditedConfig, AuditedEye, AuditedView, Check
+from dataset_builder.audit.independent_depth import project_into
 from rebar_depth_bench.geometry.cameras import camera_centre
 
 MAX_SHIFT_PX, SHIFT_NOISE_PX = 0.1, 6.0

@@ -5,7 +5,6 @@ Blender runs in a separate process, ``python -m tests.builder.blender.test_appea
 
 from __future__ import annotations
 
-import json
 import sys
 from hashlib import sha256
 from pathlib import Path
@@ -14,12 +13,15 @@ import numpy as np
 import pytest
 from numpy import ndarray
 
+from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.config.specs import AppearanceSpec, ColourSpec, LatticeSpec, SceneSpec
 from dataset_builder.config.trajectories import look_at_with_rig
 from dataset_builder.scene.assemblies.lattice import lattice_assembly
 from dataset_builder.scene.model import Assembly
 from dataset_builder.scene.raycast import RayCaster
-from dataset_builder.scene.variants import (
+from dataset_builder.scene.variants.props import PROP_BUILDERS
+from dataset_builder.scene.variants.registry import (
+    IMAGE_LIGHTS,
     LIGHT_SLOT,
     PROPS_SLOT,
     SENSOR_SLOT,
@@ -28,8 +30,6 @@ from dataset_builder.scene.variants import (
     VARIANTS,
     check_variants,
 )
-from dataset_builder.scene.variants.image_light import IMAGE_LIGHTS
-from dataset_builder.scene.variants.props import PROP_BUILDERS, make_props
 from dataset_builder.scene.variants.sensor import recorded
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
@@ -63,9 +63,8 @@ WITHOUT_SURFACES = [name for name in VARIANTS if name not in PROP_BUILDERS]
 def probe(folder: Path) -> None:
     """Render every variant at low resolution and cast its ground truth (runs in the Blender process)."""
     from dataset_builder.blender.colour import configure_colour, render_colour
-    from dataset_builder.blender.evaluated_mesh import evaluated_world_mesh
     from dataset_builder.blender.render import render_depth
-    from dataset_builder.blender.scene import build_scene
+    from dataset_builder.blender.scene import build_scene, evaluated_world_mesh
 
     arrays: dict[str, ndarray] = {}
     lattice = lattice_assembly(LatticeSpec(pitch_m=0.05))
@@ -103,10 +102,6 @@ def probe(folder: Path) -> None:
         appearance = AppearanceSpec((name,) if name else ())
         spec = SceneSpec("s", LatticeSpec(), None, environment="outdoors", appearance=appearance)
         render_and_cast(f"outdoors/{name}", cage(4.8, 6.67, 0.1), spec, {0: SITE_CAMERA})
-    try:
-        build_scene(lattice, SceneSpec("s", LatticeSpec(), None, appearance=AppearanceSpec(("dusk", "backlight"))))
-    except InputError as error:
-        (folder / "refusal.json").write_text(json.dumps(str(error)))
     np.savez(folder / "arrays.npz", **arrays)
 
 
@@ -133,8 +128,8 @@ def test_invalid_variant_names_are_rejected(names: tuple[str, ...], problems: li
     with pytest.raises(InputError) as raised:
         check_variants(names)
     assert [(problem.code, problem.where, problem.found) for problem in raised.value.problems] == problems
-    with pytest.raises(InputError):
-        make_props(Assembly((), ()), SceneSpec("s", LatticeSpec(), None, appearance=AppearanceSpec(names)))
+    with pytest.raises(InputError, match="appearance variants"):
+        BuildRequest(configs=("lattice",), variants=names).config_specs()
 
 
 def test_compatible_variant_names_are_accepted() -> None:
@@ -236,10 +231,6 @@ def test_panoramas_expose_like_standard_light(arrays: dict[str, ndarray], place:
     assert abs(rgb.mean() - standard.mean()) < 40
     assert (rgb.min(axis=1) >= 250).mean() < 0.02
     assert (rgb.max(axis=1) <= 8).mean() < 0.02
-
-
-def test_variants_of_same_slot_are_rejected_before_build(folder: Path) -> None:
-    assert "dusk, backlight all set the light" in json.loads((folder / "refusal.json").read_text())
 
 
 if __name__ == "__main__":

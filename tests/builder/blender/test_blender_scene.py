@@ -54,9 +54,8 @@ def probe(folder: Path) -> None:
     """Render, read back and write all results to ``folder`` (runs in the Blender process)."""
     from dataset_builder.blender.camera import place_camera
     from dataset_builder.blender.colour import configure_colour, render_colour
-    from dataset_builder.blender.evaluated_mesh import evaluated_world_mesh
     from dataset_builder.blender.render import render_depth
-    from dataset_builder.blender.scene import build_scene
+    from dataset_builder.blender.scene import build_scene, evaluated_world_mesh
 
     facts: dict[str, Any] = {}
     build_scene(lattice_assembly(SCENE.assembly), SCENE)  # type: ignore[arg-type]

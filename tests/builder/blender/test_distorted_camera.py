@@ -50,9 +50,8 @@ DEPTH_CAMERAS = {"left": LEFT, "right": RIGHT, "tangential": TANGENTIAL_CAMERA, 
 def probe(folder: Path) -> None:
     """Render depth and colour with distorted and pinhole cameras in turn (runs in the Blender process)."""
     from dataset_builder.blender.colour import configure_colour, render_colour
-    from dataset_builder.blender.evaluated_mesh import evaluated_world_mesh
     from dataset_builder.blender.render import render_depth
-    from dataset_builder.blender.scene import build_scene
+    from dataset_builder.blender.scene import build_scene, evaluated_world_mesh
 
     build_scene(lattice_assembly(SCENE.assembly), SCENE)  # type: ignore[arg-type]
     configure_colour(threads=1)

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dataset_builder.audit.report import Check
-from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
+from dataset_builder.audit.checks import AuditedConfig, AuditedEye, AuditedView, Check
 from rebar_depth_bench.geometry.aruco_board import marker_corners_m
 from tests.builder.audit.audit_scene import BOARD, RIGS, config, view, with_baseline, with_K_shift
 from tests.builder.blender.markers import (

@@ -18,8 +18,14 @@ import pytest
 from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.config.specs import AppearanceSpec, ColourSpec, LatticeSpec, SceneSpec
 from dataset_builder.pipeline.plan import config_parameters
-from dataset_builder.scene.variants import LIGHT_SLOT, VARIANTS
-from dataset_builder.scene.variants.image_light import IMAGE_LIGHTS, IRRADIANCE, ImageLight, image_light
+from dataset_builder.scene.variants.registry import (
+    IMAGE_LIGHTS,
+    IRRADIANCE,
+    LIGHT_SLOT,
+    VARIANTS,
+    ImageLight,
+    image_light,
+)
 from rebar_depth_bench.errors import BuildError
 from rebar_depth_bench.geometry.cameras import Camera, look_at
 from tests.builder.blender.probe import RunProbe
@@ -66,7 +72,7 @@ def probe(folder: Path) -> None:
     import bpy
 
     from dataset_builder.blender.colour import configure_colour, render_colour
-    from dataset_builder.blender.panorama import add_panorama
+    from dataset_builder.blender.lights import add_panorama
 
     bpy.ops.wm.read_factory_settings(use_empty=True)
     light = replace(light_of("sunrise"), strength=0.02, turn_deg=TURN_DEG)

@@ -12,8 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import rebar_depth_bench as rdb
-from dataset_builder.audit.report import Check
-from dataset_builder.audit.views import AuditedConfig, AuditedView, RayCache, view_from_row
+from dataset_builder.audit.checks import AuditedConfig, AuditedView, Check, RayCache, view_from_row
 from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from tests.builder.audit.audit_scene import RIGS, config, view, with_baseline, with_depth, with_K_shift

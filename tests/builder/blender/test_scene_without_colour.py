@@ -31,8 +31,7 @@ def probe(folder: Path) -> None:
     """Build every scene with and without colour; write the digests of its mesh (runs in the Blender process)."""
     import bpy
 
-    from dataset_builder.blender.evaluated_mesh import evaluated_world_mesh
-    from dataset_builder.blender.scene import build_scene
+    from dataset_builder.blender.scene import build_scene, evaluated_world_mesh
 
     facts: dict[str, Any] = {}
     for scene in scenes():

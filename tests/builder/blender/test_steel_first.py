@@ -46,9 +46,8 @@ def probe(folder: Path) -> None:
 
     from dataset_builder.blender.camera import place_camera
     from dataset_builder.blender.colour import BOX_MARGIN_PX, configure_colour, render_colour
-    from dataset_builder.blender.evaluated_mesh import evaluated_world_mesh
     from dataset_builder.blender.render import render_passes, rendered_file, temporary_settings
-    from dataset_builder.blender.scene import build_scene
+    from dataset_builder.blender.scene import build_scene, evaluated_world_mesh
 
     build_scene(lattice_assembly(SCENE.assembly), SCENE)  # type: ignore[arg-type]
     configure_colour(threads=2)

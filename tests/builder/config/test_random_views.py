@@ -15,7 +15,7 @@ from dataset_builder.config.specs import FocalRigSpec, GeneratedCageSpec, Random
 from dataset_builder.config.surroundings import CameraSpace
 from dataset_builder.config.trajectories import camera_offsets_m, look_at_with_rig, poses, view_count
 from dataset_builder.scene.assemblies import make_assembly
-from dataset_builder.scene.cages.families import FAMILIES
+from dataset_builder.scene.cages.generate import FAMILIES
 from dataset_builder.scene.model import Assembly
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.geometry.cameras import camera_centre, ideal_K

@@ -16,8 +16,8 @@ from dataset_builder.config.surroundings import (
     SURROUNDINGS,
     check_suitable,
 )
-from dataset_builder.scene.cages.families import FAMILIES
-from dataset_builder.scene.variants import LIGHT_SLOT, PROPS_SLOT, VARIANTS
+from dataset_builder.scene.cages.generate import FAMILIES
+from dataset_builder.scene.variants.registry import LIGHT_SLOT, PROPS_SLOT, VARIANTS
 from rebar_depth_bench.errors import InputError
 from tests.builder.config.scene_files import BAR, MM, write_scene
 

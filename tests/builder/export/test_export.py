@@ -17,10 +17,14 @@ from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from dataset_builder.export import export
-from dataset_builder.export.colmap import cameras_txt, images_txt, points_txt, quaternion_wxyz
-from dataset_builder.export.images import depth_exr, depth_mm_png
-from dataset_builder.export.nerfstudio import transforms_json
-from dataset_builder.export.views import CameraView
+from dataset_builder.export.camera_formats import (
+    cameras_txt,
+    images_txt,
+    points_txt,
+    quaternion_wxyz,
+    transforms_json,
+)
+from dataset_builder.export.exported_views import CameraView, depth_exr, depth_mm_png
 from rebar_depth_bench import load
 from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
@@ -188,6 +192,9 @@ def test_distorted_camera_is_full_opencv_in_colmap(tmp_path: Path, known_points_
             expected_px, _ = cv2.projectPoints(known_points_m, rotation, translation, camera.K, camera.distortion)
             colmap_px = np.array([image.project_point(point) for point in known_points_m])
             assert np.abs(colmap_px - (expected_px[:, 0] + 0.5)).max() < 1e-6
+            calibrated_K = image.camera.calibration_matrix() - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]
+            assert np.abs(calibrated_K - camera.K).max() < 1e-12
+            assert np.abs(image.cam_from_world().matrix() - camera.cam_from_world[:3]).max() < 1e-12
 
 
 def test_colmap_extracts_features_only_inside_mask(exported: Path, tmp_path: Path) -> None:

@@ -131,7 +131,7 @@ def test_folder_with_only_partial_record_counts_as_empty(tiny_root: Path, tmp_pa
 def test_export_imports_no_renderer() -> None:
     code = "import sys, dataset_builder.export; print(*sys.modules)"
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "dataset_builder.export.run" in process.stdout.split()
+    assert "dataset_builder.export.exporting" in process.stdout.split()
     assert not {"bpy", "embreex", "trimesh", "pycolmap", "torch"} & set(process.stdout.split())
 
 

@@ -16,7 +16,7 @@ import rebar_depth_bench as rdb
 from cards.dataset import dataset_card
 from dataset_builder.audit import audit
 from dataset_builder.cli import main as build_main
-from dataset_builder.importing.run import plan_import, run_import
+from dataset_builder.importing.config_import import plan_import, run_import
 from rebar_depth_bench.cli.main import main as bench_main
 from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.data.dataset_config import DatasetConfig
@@ -164,14 +164,18 @@ def test_pose_convention_is_read(table: str, write: Any, rows: list[Row], folder
 
 
 def test_intrinsics_of_each_view(rows: list[Row], folder: Path, tmp_path: Path) -> None:
+    """They also convert range along the ray to planar depth."""
     for n, (view, row) in enumerate(zip(NAMES, rows, strict=True)):
-        data.write(
-            folder / f"k/{view}.json", data.json_matrix(row["left_K"] * [[1 + n, 1, 1], [1, 1 + n, 1], [1, 1, 1]])
-        )
-    tables = '\n[intrinsics]\nfile = "k/{view}.json"\nkey = "camera.K"\n'
-    imported(data.write_layout(folder, ("left_depth", "left_rgb"), tables=tables), tmp_path / "out")
+        K = row["left_K"] * [[1 + n, 1, 1], [1, 1 + n, 1], [1, 1, 1]]
+        data.write(folder / f"k/{view}.json", data.json_matrix(K))
+        data.write(folder / f"other/{view}.npy", data.npy(data.range_m({**row, "left_K": K})))
+    tables = '\n[intrinsics]\nfile = "k/{view}.json"\nkey = "camera.K"\n[depth]\nkind = "range"\n'
+    files = {"left_depth": "other/{view}.npy"}
+    imported(data.write_layout(folder, ("left_depth", "left_rgb"), tables=tables, files=files), tmp_path / "out")
     read = list(rdb.load(tmp_path / "out", "mock-up"))
     assert [row["left_K"][0, 0] for row in read] == [87.5, 175, 262.5]
+    for row, expected in zip(read, rows, strict=True):
+        assert row["left_depth"] == pytest.approx(expected["left_depth"], abs=1e-7)
 
 
 PARTS = {

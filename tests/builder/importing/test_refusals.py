@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from dataset_builder.cli import main
-from dataset_builder.importing.run import plan_import, run_import
+from dataset_builder.importing.config_import import plan_import, run_import
 from dataset_builder.pipeline.retained import Finished
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import InputError
@@ -59,6 +59,9 @@ def refused(layout: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> str:
         ("[bars]", "[masks]\nvalues = 255\n[bars]", "invalid", "masks.values", 38),
         ('\n[poses]\nfile = "poses/{view}.txt"\n', "", "conflict", "", None),
         ('"bars.csv"', '"../bars.csv"', "invalid", "bars.file", 38),
+        ('"bars.csv"', '"~/bars.csv"', "invalid", "bars.file", 38),
+        ('"bars.csv"', '""', "invalid", "bars.file", 38),
+        ("[poses]", "[intrinsics]\nfile = 'k/{view}.txt'\n[poses]", "conflict", "", None),
     ],
 )
 def test_invalid_layout_is_refused_with_its_line(
@@ -73,6 +76,12 @@ def test_invalid_layout_is_refused_with_its_line(
     problem = next(one for one in caught.value.problems if one.where == where)
     assert problem.code == code
     assert problem.found.startswith(f"line {line}: " if line else "")
+
+
+def test_disparity_is_refused_beside_intrinsics_of_each_view(tmp_path: Path) -> None:
+    tables = "\n[intrinsics]\nfile = 'k/{view}.txt'\n[depth]\nkind = 'disparity'\n"
+    with pytest.raises(InputError, match="got intrinsics of each view and disparity, expected one calibration"):
+        plan_import(data.write_layout(tmp_path, ("left_depth", "left_rgb"), tables=tables), "mock-up")
 
 
 def test_invalid_cameras_are_refused_with_their_line(folder: Path) -> None:
@@ -159,6 +168,25 @@ def test_invalid_file_is_refused_and_named(
     shutil.rmtree(folder)
     data.write_layout(data.write_source(folder, rows, tiny_root))
     run_import(plan_import(layout, "mock-up"), tmp_path / "out")  # What is repaired is imported.
+
+
+@pytest.mark.parametrize(
+    ("K", "words"),
+    [
+        ("1 2 3 4 5 6 7 8 9", "expected fx 0 cx"),
+        ("0 0 79 0 87 44 0 0 1", "expected fx 0 cx"),
+        ("87 1 79 0 87 44 0 0 1", "expected fx 0 cx"),
+        ("9 0 79 0 9 44 0 0 1", "cannot be inverted at"),
+    ],
+)
+def test_intrinsics_that_are_no_camera_of_the_images_are_refused(K: str, words: str, folder: Path) -> None:
+    for name in NAMES:
+        data.write(folder / f"k/{name}.txt", K.encode())
+    tables = "\n[intrinsics]\nfile = 'k/{view}.txt'\n[depth]\nkind = 'range'\n"
+    layout = data.write_layout(folder, ("left_depth", "left_rgb"), tables=tables)
+    layout.write_text(layout.read_text().replace("[0, 0, 0, 0]", "[-0.1, 0, 0, 0]"))
+    with pytest.raises(InputError, match=words):
+        plan_import(layout, "mock-up").views.decode(NAMES[0])
 
 
 @pytest.mark.parametrize(

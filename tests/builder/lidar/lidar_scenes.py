@@ -6,7 +6,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from dataset_builder.lidar import SURVEY, ScannerSpec, scan_depth_m
+from dataset_builder.lidar.scan_method import scan_depth_m
+from dataset_builder.lidar.scanner import SURVEY, ScannerSpec
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.scene.raycast import RayCaster
 from rebar_depth_bench.geometry.cameras import Camera, ideal_K

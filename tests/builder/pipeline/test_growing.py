@@ -12,7 +12,7 @@ import pytest
 
 import rebar_depth_bench as rdb
 from benchmarks.scale import PreparedRows, placed
-from dataset_builder.audit import audit, run
+from dataset_builder.audit import audit, auditing
 from dataset_builder.config.cages import CagesRequest
 from dataset_builder.config.catalog import BuildRequest
 from dataset_builder.pipeline import folder, retained
@@ -262,7 +262,7 @@ def test_number_of_reads_does_not_grow_with_the_number_of_scenes(
     built(tmp_path, cages(5, 1))
     opened = counted(monkeypatch, retained, "open_folder")
     hashed = counted(monkeypatch, folder, "file_sha256")
-    tables = counted(monkeypatch, run, "read_bars")
+    tables = counted(monkeypatch, auditing, "read_bars")
     built(tmp_path, cages(5, 1))
     audit(tmp_path, depth_views=0)
     config = open_folder(tmp_path).config("cages")

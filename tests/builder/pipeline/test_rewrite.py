@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from dataset_builder.cli import main
-from dataset_builder.importing.run import plan_import, run_import
+from dataset_builder.importing.config_import import plan_import, run_import
 from dataset_builder.pipeline.folder import manifest_text
 from rebar_depth_bench.cli.main import main as rebar_bench
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, open_folder

@@ -8,8 +8,9 @@ import trimesh
 from jaxtyping import Float64
 from numpy import ndarray
 
+from dataset_builder.scene.assemblies.pile import RIBS as PILE_RIBS
 from dataset_builder.scene.model import Mesh
-from dataset_builder.scene.shapes.bar_mesh import RibPattern, outer_radius_m, ribbed_bar_mesh
+from dataset_builder.scene.shapes.bar_mesh import STANDARD_RIBS, RibPattern, outer_radius_m, ribbed_bar_mesh
 
 LENGTH_M = 0.1
 
@@ -127,8 +128,7 @@ def test_invalid_bars_are_rejected(centreline_m: Float64[ndarray, "n 3"], diamet
         ribbed_bar_mesh(centreline_m, diameter_m)
 
 
-def test_rib_patterns_outside_standard_are_rejected() -> None:
-    with pytest.raises(ValueError, match="spacing"):
-        RibPattern(spacing=0.8)
-    with pytest.raises(ValueError, match="angle"):
-        RibPattern(angle_deg=40.0)
+@pytest.mark.parametrize("ribs", [STANDARD_RIBS, PILE_RIBS], ids=["standard", "pile"])
+def test_rib_patterns_are_within_the_standard(ribs: RibPattern) -> None:
+    assert 0 < ribs.spacing <= 0.7
+    assert 45 <= ribs.angle_deg <= 90

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dataset_builder.config.catalog import CONFIGS
-from dataset_builder.export.colmap import axis_points_m
+from dataset_builder.export.camera_formats import axis_points_m
 from dataset_builder.scene.assemblies.cage import CageBar
 from dataset_builder.scene.model import Assembly
 from dataset_builder.scene.shapes.solids import box

@@ -14,8 +14,7 @@ import pytest
 
 from dataset_builder.config.specs import GeneratedCageSpec
 from dataset_builder.scene.assemblies import make_assembly
-from dataset_builder.scene.cages.families import FAMILIES
-from dataset_builder.scene.cages.generate import generate_cage
+from dataset_builder.scene.cages.generate import FAMILIES, generate_cage
 from tests.builder.config.test_same_bits import KERNELS
 
 VECTORISED = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX2 FMA3"

@@ -12,12 +12,11 @@ from jaxtyping import Bool, Float64
 from numpy import ndarray
 from scipy.spatial import ConvexHull
 
-from dataset_builder.scene.cages.clearance import Clearances
 from dataset_builder.scene.cages.design import Design, DesignBar, InfeasibleError
-from dataset_builder.scene.cages.families import FAMILIES
-from dataset_builder.scene.cages.generate import generate_cage
-from dataset_builder.scene.cages.rules import radius_m
+from dataset_builder.scene.cages.generate import FAMILIES, generate_cage
+from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
 from dataset_builder.scene.shapes.bending import resample_polyline_m
+from dataset_builder.scene.shapes.capsules import Clearances
 
 Line = Float64[ndarray, "n 3"]
 TOUCH_M = 0.006
@@ -37,7 +36,9 @@ def designs(family: str, shape: str) -> tuple[Design, ...]:
             design = FAMILIES[family].draw(rng, shape)
         except InfeasibleError:
             continue
-        bars = Clearances([bar.line_m for bar in design.bars], [radius_m(bar.diameter_m) for bar in design.bars])
+        bars = Clearances(
+            [bar.line_m for bar in design.bars], [outer_radius_m(bar.diameter_m) for bar in design.bars]
+        )
         if bars.are_all(1e-4):
             found.append(design)
         if len(found) == DESIGNS:
@@ -62,7 +63,7 @@ def touched(bar: DesignBar, others: list[DesignBar], within_m: float = TOUCH_M) 
     points_m = resample_polyline_m(bar.line_m, 0.005)
     is_touched = np.zeros(len(points_m), bool)
     for other in others:
-        reach_m = radius_m(bar.diameter_m) + radius_m(other.diameter_m) + within_m
+        reach_m = outer_radius_m(bar.diameter_m) + outer_radius_m(other.diameter_m) + within_m
         low, high = other.line_m.min(axis=0) - reach_m, other.line_m.max(axis=0) + reach_m
         near = np.flatnonzero(((points_m >= low) & (points_m <= high)).all(axis=1))
         if other is bar or not len(near):
@@ -126,7 +127,7 @@ def test_links_enclose_the_bars_and_their_hooks_point_inwards(family: str, shape
                     share = (level_m - along[segment]) / (along[segment + 1] - along[segment])
                     place = bar.line_m[segment] + share * (bar.line_m[segment + 1] - bar.line_m[segment])
                     clear_m = inside_m(hull, place[None, axes])[0]
-                    assert clear_m > radius_m(bar.diameter_m) + radius_m(link.diameter_m)
+                    assert clear_m > outer_radius_m(bar.diameter_m) + outer_radius_m(link.diameter_m)
                     checked += 1
         assert checked > 20 or shape == "spiral"
 
@@ -136,7 +137,7 @@ def test_hooks_of_beam_bars_stay_within_the_outline_of_the_links(shape: str) -> 
     for design in designs("beam", shape):
         hull = outline(of(design, "link")[0], [1, 2])
         for bar in of(design, "top", "bottom", "side", "spacer"):
-            assert inside_m(hull, bar.line_m[:, 1:]).min() > radius_m(bar.diameter_m)
+            assert inside_m(hull, bar.line_m[:, 1:]).min() > outer_radius_m(bar.diameter_m)
 
 
 @pytest.mark.parametrize("shape", ["square", "rectangular"])

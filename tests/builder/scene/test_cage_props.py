@@ -13,11 +13,11 @@ from numpy import ndarray
 from dataset_builder.config.specs import AppearanceSpec, GeneratedCageSpec, SceneSpec
 from dataset_builder.config.surroundings import FORMWORK_FAMILIES
 from dataset_builder.scene.assemblies import make_assembly
-from dataset_builder.scene.cages.families import FAMILIES
+from dataset_builder.scene.cages.generate import FAMILIES
 from dataset_builder.scene.model import NOT_STEEL, Assembly, Part, WorldMesh
 from dataset_builder.scene.raycast import RayCaster
 from dataset_builder.scene.shapes.solids import merge_meshes
-from dataset_builder.scene.variants.props import CAGE_PROP_BUILDERS, PROP_BUILDERS, make_props
+from dataset_builder.scene.variants.props import make_props
 
 LYING = ("beam", "slab", "footing")
 STANDING = ("column", "wall", "joint")
@@ -56,10 +56,6 @@ def heights_above_m(points_m: ndarray, assembly: Assembly) -> Float64[ndarray, "
     mesh = merge_meshes([part.mesh for part in assembly.parts])
     steel = RayCaster(WorldMesh(mesh.vertices_m, mesh.faces, np.ones(len(mesh.faces), np.uint16)))
     return steel.hits(points_m, np.tile([0.0, 0.0, 1.0], (len(points_m), 1))).range_m
-
-
-def test_cages_have_the_same_props_as_other_steel() -> None:
-    assert list(CAGE_PROP_BUILDERS) == list(PROP_BUILDERS)
 
 
 @pytest.mark.slow

@@ -24,11 +24,18 @@ from dataset_builder.scene.cages.as_built import (
     SPACING_TOLERANCE_M,
     build_as,
 )
-from dataset_builder.scene.cages.clearance import NEAR_M, Clearances
 from dataset_builder.scene.cages.design import Design, DesignBar, InfeasibleError, straight
-from dataset_builder.scene.cages.families import FAMILIES, Family
-from dataset_builder.scene.cages.generate import MAX_BARS, GeneratedCage, drawn_family, generate_cage
-from dataset_builder.scene.cages.rules import DIAMETERS_M, radius_m
+from dataset_builder.scene.cages.generate import (
+    FAMILIES,
+    MAX_BARS,
+    Family,
+    GeneratedCage,
+    drawn_family,
+    generate_cage,
+)
+from dataset_builder.scene.cages.rules import DIAMETERS_M
+from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
+from dataset_builder.scene.shapes.capsules import NEAR_M, Clearances
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.view_ids import SPLITS
 from tests.builder.scene.test_pile import segment_distances_m
@@ -52,7 +59,9 @@ def clearances_m(cage: GeneratedCage) -> Float64[ndarray, "n n"]:
             gap = np.maximum(a.line_m.min(0) - b.line_m.max(0), b.line_m.min(0) - a.line_m.max(0)).max()
             if gap < 0.1:  # Farther boxes cannot hold the nearest bars.
                 distance_m = segment_distances_m(a.line_m, b.line_m).min()
-                clear_m[i, j] = clear_m[j, i] = distance_m - radius_m(a.diameter_m) - radius_m(b.diameter_m)
+                clear_m[i, j] = clear_m[j, i] = (
+                    distance_m - outer_radius_m(a.diameter_m) - outer_radius_m(b.diameter_m)
+                )
     return clear_m
 
 
@@ -216,4 +225,4 @@ def test_neighbours_are_enough_for_lines_within_the_margin(
 ) -> None:
     clearances = Clearances(lines, [0.004] * len(lines))
     near = clearances.neighbours(lines[0], 0.004, 0, float(np.linalg.norm(shift_m)))
-    assert near.least_m(lines[0] + shift_m, 0.004) == clearances.least_m(lines[0] + shift_m, 0.004, 0)
+    assert near.bar_clearance_m(lines[0] + shift_m, 0.004) == clearances.least_m(lines[0] + shift_m, 0.004, 0)

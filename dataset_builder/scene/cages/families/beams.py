@@ -19,14 +19,13 @@ from dataset_builder.scene.cages.design import (
     bent,
     drawn_of,
     drawn_step,
+    rise_m,
     spaced,
     steel_share,
     straight,
     turned,
 )
 from dataset_builder.scene.cages.families.columns import drawn_section
-from dataset_builder.scene.cages.linear import rise_m
-from dataset_builder.scene.cages.rectangular import Section, stirrups
 from dataset_builder.scene.cages.rules import (
     BEAM_STEEL,
     COVER_M,
@@ -39,6 +38,7 @@ from dataset_builder.scene.cages.rules import (
     link_diameters_m,
     square_end_m,
 )
+from dataset_builder.scene.cages.sections import Section, stirrups
 from dataset_builder.scene.shapes.bending import bend_radius_m
 
 BOTTOM, TOP, SIDE, SPACER = "bottom", "top", "side", "spacer"

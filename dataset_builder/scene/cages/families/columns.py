@@ -12,14 +12,15 @@ from dataset_builder.scene.cages.design import (
     Design,
     DesignBar,
     InfeasibleError,
+    Lap,
     drawn_of,
     drawn_step,
+    lapped,
+    link_levels_m,
+    rise_m,
     steel_share,
     turned,
 )
-from dataset_builder.scene.cages.linear import Lap, lapped, link_levels_m, rise_m
-from dataset_builder.scene.cages.rectangular import Section, bundled, main_bars, stirrups, ties
-from dataset_builder.scene.cages.round_section import RoundSection
 from dataset_builder.scene.cages.rules import (
     COLUMN_STEEL,
     COVER_M,
@@ -30,6 +31,7 @@ from dataset_builder.scene.cages.rules import (
     least_pile_steel_m2,
     link_diameters_m,
 )
+from dataset_builder.scene.cages.sections import RoundSection, Section, bundled, main_bars, stirrups, ties
 
 LYING_M = 2e-4
 """Height above the ground of the lowest steel of a cage that lies."""

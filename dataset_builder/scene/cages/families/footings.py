@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from dataset_builder.scene.cages.design import (
+    STARTER,
     Design,
     DesignBar,
     InfeasibleError,
@@ -19,8 +20,6 @@ from dataset_builder.scene.cages.design import (
     straight,
 )
 from dataset_builder.scene.cages.families.columns import drawn_section
-from dataset_builder.scene.cages.linear import STARTER
-from dataset_builder.scene.cages.rectangular import Section, stirrups
 from dataset_builder.scene.cages.rules import (
     GROUND_COVER_M,
     SLAB_STEEL,
@@ -29,6 +28,7 @@ from dataset_builder.scene.cages.rules import (
     lap_m,
     square_end_m,
 )
+from dataset_builder.scene.cages.sections import Section, stirrups
 from dataset_builder.scene.shapes.bending import bend_radius_m
 
 LOWER, UPPER, EDGE = "lower", "upper", "edge"

@@ -7,7 +7,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from dataset_builder.scene.cages.clearance import Clearances
 from dataset_builder.scene.cages.design import (
     LYING,
     STANDING_M,
@@ -16,6 +15,7 @@ from dataset_builder.scene.cages.design import (
     InfeasibleError,
     drawn_of,
     drawn_step,
+    rise_m,
     spaced,
     turned,
 )
@@ -29,15 +29,15 @@ from dataset_builder.scene.cages.families.beams import (
     hook_reach_m,
 )
 from dataset_builder.scene.cages.families.columns import drawn_section
-from dataset_builder.scene.cages.linear import rise_m
-from dataset_builder.scene.cages.rectangular import LINK, Section, links_height_m, main_bars, stirrups, ties
 from dataset_builder.scene.cages.rules import (
     CONTACT_GAP_M,
     column_link_spacing_m,
     contact_m,
     link_diameters_m,
-    radius_m,
 )
+from dataset_builder.scene.cages.sections import LINK, Section, links_height_m, main_bars, stirrups, ties
+from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
+from dataset_builder.scene.shapes.capsules import Clearances
 
 _PASSING_M = 0.002
 """Clear distance of links of a column from the bars of the beam that they pass."""
@@ -61,14 +61,14 @@ def joint(rng: np.random.Generator, shape: str) -> Design:
         raise InfeasibleError("a column ends too close to its beam")
     beam, drawn = _beam(rng, column, shape, depth_m, level_m)
     standing = main_bars(column, height_m)
-    steel = Clearances([bar.line_m for bar in beam], [radius_m(bar.diameter_m) for bar in beam])
-    if any(steel.least_m(bar.line_m, radius_m(bar.diameter_m)) < CONTACT_GAP_M for bar in standing):
+    steel = Clearances([bar.line_m for bar in beam], [outer_radius_m(bar.diameter_m) for bar in beam])
+    if any(steel.least_m(bar.line_m, outer_radius_m(bar.diameter_m)) < CONTACT_GAP_M for bar in standing):
         raise InfeasibleError("bars of a beam meet those of its column")
     with_ties = column.needs_ties() or (bool(rng.random() < 0.4) and column.count > 4)
     rise = rise_m(stirrups(column, [0.0]))
     levels = _levels_past(beam, links_height_m(column, rise, with_ties=with_ties), height_m, spacing_m)
     held = ties(column, levels, rise) if with_ties else []
-    kept = [bar for bar in held if steel.least_m(bar.line_m, radius_m(bar.diameter_m)) > _PASSING_M]
+    kept = [bar for bar in held if steel.least_m(bar.line_m, outer_radius_m(bar.diameter_m)) > _PASSING_M]
     drawn |= {
         "shape": shape,
         "bar_m": bar_m,
@@ -130,7 +130,7 @@ def _levels_past(
     limits_m = [0.05]
     for role in (BOTTOM, TOP):
         layer = [bar for bar in beam if bar.role == role]
-        radius = radius_m(layer[0].diameter_m) + _PASSING_M
+        radius = outer_radius_m(layer[0].diameter_m) + _PASSING_M
         ends_m = [float(bar.line_m[-1, 2]) for bar in layer]  # The end that has no hook.
         limits_m += [min(ends_m) - radius - reach_m[1], max(ends_m) + radius + reach_m[0]]
     limits_m.append(height_m - 0.05)

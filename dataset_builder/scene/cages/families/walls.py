@@ -11,18 +11,18 @@ from dataset_builder.scene.cages.design import (
     Design,
     DesignBar,
     InfeasibleError,
+    Lap,
     X,
     Y,
     Z,
     bent,
     drawn_of,
     drawn_step,
+    lapped,
     spaced,
     steel_share,
     straight,
 )
-from dataset_builder.scene.cages.linear import Lap, lapped
-from dataset_builder.scene.cages.rectangular import TIE, held_tie_m
 from dataset_builder.scene.cages.rules import (
     COVER_M,
     DIAMETERS_M,
@@ -32,6 +32,7 @@ from dataset_builder.scene.cages.rules import (
     lap_m,
     wall_spacing_m,
 )
+from dataset_builder.scene.cages.sections import TIE, held_tie_m
 from dataset_builder.scene.shapes.bending import bend_radius_m
 
 UPRIGHT, LEVEL, U_BAR = "upright", "level", "u-bar"

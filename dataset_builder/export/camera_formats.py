@@ -1,21 +1,29 @@
-"""COLMAP text model of the true cameras: ``cameras.txt``, ``images.txt``, ``points3D.txt``.
+"""True cameras for other programs: COLMAP's text model and nerfstudio's ``transforms.json``.
 
-Source: COLMAP's documentation, "Output Format" and "Camera Models". COLMAP uses OpenCV's camera axes. The centre
-of its first pixel is (0.5, 0.5), that of ours is (0, 0), so ``HALF_PIXEL`` is added to cx and cy.
+The centre of their first pixel is (0.5, 0.5), that of ours is (0, 0), so ``HALF_PIXEL`` is added to cx and cy.
+Numbers have up to 17 digits, so that they are read back as the same float64.
+
+COLMAP (its documentation, "Output Format" and "Camera Models"; files ``cameras.txt``, ``images.txt`` and
+``points3D.txt``) uses OpenCV's camera axes. nerfstudio's cameras (its documentation, "Data conventions", and its
+``Nerfstudio`` data parser) look along -z with y up, as OpenGL's: its ``get_image_coords`` adds 0.5, and it
+subtracts 0.5 from cx and cy before it calls OpenCV. k1 k2 k3 p1 p2 are OpenCV's.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
+from scipy.spatial.transform import Rotation
 
-from dataset_builder.export.views import CameraView
+from dataset_builder.export.exported_views import EXPORT_FILES, MILLIMETRE_M, CameraView
 from dataset_builder.scene.shapes.bending import resample_polyline_m
 from rebar_depth_bench.data.bars import Bar, with_axis
-from rebar_depth_bench.geometry.cameras import Camera
+from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid, swap_camera_axes
 
 HALF_PIXEL = 0.5
 """Offset of COLMAP's and nerfstudio's pixel coordinates from ours, pixels."""
@@ -39,9 +47,7 @@ def cameras_txt(views: Sequence[CameraView]) -> str:
     Cameras without distortion are PINHOLE (fx fy cx cy), all others FULL_OPENCV
     (fx fy cx cy k1 k2 p1 p2 k3 0 0 0).
     """
-    lines = [
-        f"{camera_id} {camera_line}" for camera_line, camera_id in _camera_ids(views).items()
-    ]  # Cameras with the same line are the same camera.
+    lines = [f"{camera_id} {camera_line}" for camera_line, camera_id in _camera_ids(views).items()]
     return _with_header("CAMERA_ID MODEL WIDTH HEIGHT PARAMS[]", lines)
 
 
@@ -67,10 +73,9 @@ def points_txt(bars: Sequence[Bar]) -> str:
     No image observes them. Some tools (Gaussian splatting among them) initialise from the points and reject a
     model without any.
     """
-    points_m = axis_points_m(bars)
     lines = [
         f"{number} {_format_floats(point)} {_GREY} {_REPROJECTION_ERROR}"
-        for number, point in enumerate(points_m, start=1)
+        for number, point in enumerate(axis_points_m(bars), start=1)
     ]
     return _with_header("POINT3D_ID X Y Z R G B ERROR TRACK[] as (IMAGE_ID POINT2D_IDX)", lines)
 
@@ -84,27 +89,12 @@ def axis_points_m(bars: Sequence[Bar]) -> Float64[ndarray, "n 3"]:
 
 
 def quaternion_wxyz(rotation: Float64[ndarray, "3 3"]) -> Float64[ndarray, " 4"]:
-    """Return the unit quaternion (w, x, y, z), w >= 0, of a rotation matrix.
-
-    The row of 4 q q^T with the largest diagonal element is a multiple of q and well conditioned for every rotation
-    (Shepperd, "Quaternion from rotation matrix", 1978).
-    """
-    r = rotation
-    outer = np.array(
-        [
-            [1 + r[0, 0] + r[1, 1] + r[2, 2], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
-            [r[2, 1] - r[1, 2], 1 + r[0, 0] - r[1, 1] - r[2, 2], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]],
-            [r[0, 2] - r[2, 0], r[0, 1] + r[1, 0], 1 - r[0, 0] + r[1, 1] - r[2, 2], r[1, 2] + r[2, 1]],
-            [r[1, 0] - r[0, 1], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], 1 - r[0, 0] - r[1, 1] + r[2, 2]],
-        ]
-    )
-    quaternion = outer[np.argmax(np.diag(outer))]
-    quaternion = quaternion / np.linalg.norm(quaternion)
-    return np.asarray(-quaternion if quaternion[0] < 0 else quaternion)
+    """Return the unit quaternion (w, x, y, z), w >= 0, of a rotation matrix."""
+    return np.asarray(np.roll(Rotation.from_matrix(rotation).as_quat(canonical=True), 1))
 
 
 def _camera_ids(views: Iterable[CameraView]) -> dict[str, int]:
-    """Return the camera id of each distinct camera by its line of ``cameras.txt``, in order of appearance."""
+    """Return the ids of cameras by their line of ``cameras.txt``; those with the same line are the same camera."""
     lines = dict.fromkeys(_camera_line(camera) for view in views for camera in view.cameras.values())
     return {line: number for number, line in enumerate(lines, start=1)}
 
@@ -128,3 +118,45 @@ def _format_floats(values: Iterable[float]) -> str:
 def _with_header(columns: str, lines: Iterable[str]) -> str:
     """Return the lines as a file's text, after a comment that names the columns."""
     return "".join(f"{line}\n" for line in (f"# {columns}", *lines))
+
+
+def json_lines(head: Mapping[str, Any], name: str, entries: Sequence[Mapping[str, Any]]) -> str:
+    """Return ``head`` as a JSON object with an additional member ``name``: the list of ``entries``, one per line.
+
+    The result is readable: a short head, then a long list.
+    """
+    head_text = json.dumps({**head, name: []}, indent=1, allow_nan=False).removesuffix("[]\n}")
+    lines = ",\n".join(json.dumps(entry, allow_nan=False) for entry in entries)
+    return f"{head_text}[\n{lines}\n]}}\n"
+
+
+def transforms_json(views: Sequence[CameraView]) -> str:
+    """Return ``transforms.json``; intrinsics are at the top level if all frames share them, else in each frame."""
+    frames = [(view.stem(eye), camera) for view in views for eye, camera in view.cameras.items()]
+    intrinsics = [_intrinsics(camera) for _, camera in frames]
+    shared = intrinsics[0] if all(entry == intrinsics[0] for entry in intrinsics) else None
+    head = {"camera_model": "OPENCV", "depth_unit_scale_factor": MILLIMETRE_M, **(shared or {})}
+    entries = [
+        {**_frame(stem, camera), **({} if shared else own)}
+        for (stem, camera), own in zip(frames, intrinsics, strict=True)
+    ]
+    return json_lines(head, "frames", entries)
+
+
+def _frame(stem: str, camera: Camera) -> dict[str, Any]:
+    """Return the file names and the pose of one frame."""
+    return {
+        "file_path": EXPORT_FILES["image"].path(stem),
+        "mask_path": EXPORT_FILES["mask"].path(stem),
+        "depth_file_path": EXPORT_FILES["depth_mm"].path(stem),
+        "transform_matrix": inverse_rigid(swap_camera_axes(camera.cam_from_world)).tolist(),
+    }
+
+
+def _intrinsics(camera: Camera) -> dict[str, float]:
+    """Return nerfstudio's intrinsics of a camera."""
+    K = camera.K
+    focal = {"fl_x": float(K[0, 0]), "fl_y": float(K[1, 1])}
+    centre = {"cx": float(K[0, 2]) + HALF_PIXEL, "cy": float(K[1, 2]) + HALF_PIXEL}
+    distortion = dict(zip(("k1", "k2", "p1", "p2", "k3"), camera.distortion.tolist(), strict=True))
+    return {**focal, **centre, "w": camera.width, "h": camera.height, **distortion}

@@ -7,15 +7,20 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dataset_builder.config.trajectories import subset
-from dataset_builder.export.colmap import cameras_txt, images_txt, points_txt
-from dataset_builder.export.images import EXPORT_FILES
-from dataset_builder.export.metadata import cameras_json, exported_files, readme_txt
-from dataset_builder.export.nerfstudio import transforms_json
+from dataset_builder.export.camera_formats import cameras_txt, images_txt, points_txt, transforms_json
+from dataset_builder.export.exported_views import (
+    EXPORT_FILES,
+    CameraView,
+    decoded_row,
+    exported_files,
+    stored_views,
+)
+from dataset_builder.export.metadata import cameras_json, readme_txt
 from dataset_builder.export.target import ExportedPart, export_target
-from dataset_builder.export.views import CameraView, StoredView, stored_views
 from rebar_depth_bench.atomic_io import write_bytes, write_error, write_text
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars
 from rebar_depth_bench.data.dataset_config import DatasetConfig
+from rebar_depth_bench.data.location import local_folder
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.errors import DatasetError, InputError
 from rebar_depth_bench.progress import Progress, silent
@@ -66,45 +71,31 @@ def export(
     or data that contradict the manifest; ``InputError`` for fewer than one view and for a ``to`` that contains
     anything but an earlier export of the same data; ``OutputError`` for one that cannot be written.
     """
-    folder = _local_folder(root)
+    if views is not None and views < 1:
+        raise InputError(f"--views is {views}, expected 1 or more")
+    folder = open_folder(local_folder(root))
     chosen = [folder.config(name) for name in dict.fromkeys(configs or _with_split(folder, split))]
     for config in chosen:
         if config.imported is not None:
             raise InputError(f"{root}: config {config.name} was imported, expected configs that were rendered")
     parts = _by_folder(chosen, split)
-    wanted = {name: _select_view_ids(config, views) for name, config in parts.items()}
-    targets = {name: ExportedPart(_key(config), wanted[name], _FOLDERS) for name, config in parts.items()}
-    has_bars = BARS_FILE in folder.files
-    bars = read_bars(folder.verified_file(BARS_FILE)) if has_bars else {}
+    wanted = {
+        name: ExportedPart(
+            key=config.key, views=[config.view_ids[index] for index in subset(len(config.views), views)]
+        )
+        for name, config in parts.items()
+    }
+    bars = read_bars(folder.verified_file(BARS_FILE)) if BARS_FILE in folder.files else {}
     target = Path(to)
     try:
-        with export_target(target, folder, targets):
+        with export_target(target, folder, wanted, _FOLDERS):
             exported = [
-                _export_config(folder, name, config, wanted[name], bars, target, progress)
+                _export_part(folder, name, config, wanted[name].views, bars, target, progress)
                 for name, config in parts.items()
             ]
     except OSError as error:  # Only writing raises OSError here: reading raises DatasetError.
         raise write_error(error.filename or to, error) from error
     return ExportSummary(target, tuple(exported))
-
-
-def _local_folder(root: str | Path) -> DatasetFolder:
-    """Open a local dataset folder. Raises ``DatasetError`` if ``root`` is not a folder."""
-    if not Path(root).is_dir():
-        raise DatasetError(
-            f"{root}: no such folder, expected a dataset folder on this machine; download a Hub repository first"
-        )
-    return open_folder(root)
-
-
-def _select_view_ids(config: DatasetConfig, views: int | None) -> list[str]:
-    """Return the ids of the selected views of a config.
-
-    Raises ``InputError`` for fewer than one view.
-    """
-    if views is not None and views < 1:
-        raise InputError(f"--views is {views}, expected 1 or more")
-    return [config.views[index].view_id for index in subset(len(config.views), views)]
 
 
 def _with_split(folder: DatasetFolder, split: str | None) -> list[str]:
@@ -122,20 +113,15 @@ def _by_folder(chosen: Sequence[DatasetConfig], split: str | None) -> dict[str, 
     """
     parts = {}
     for config in chosen:
-        if config.has_splits:
-            for scene in (config if split is None else config.of_split(split)).by_scene():
-                parts[f"{config.name}/{scene.scene.split}-{scene.scene.name}"] = scene
-        else:
-            parts[config.name] = config if split is None else config.of_split(split)
+        selected = config if split is None else config.of_split(split)
+        for scene in selected.by_scene() if config.has_splits else ():
+            parts[f"{config.name}/{scene.scene.split}-{scene.scene.name}"] = scene
+        if not config.has_splits:
+            parts[config.name] = selected
     return parts
 
 
-def _key(config: DatasetConfig) -> str:
-    """Return the key of the build of a config or of a scene of it."""
-    return config.key
-
-
-def _export_config(
+def _export_part(
     folder: DatasetFolder,
     name: str,
     config: DatasetConfig,
@@ -144,18 +130,29 @@ def _export_config(
     to: Path,
     progress: Progress,
 ) -> ConfigExport:
-    """Write the images of what is exported into the folder ``name``, then the texts that refer to them."""
+    """Write the images of what is exported into the folder ``name``, then the texts that refer to them.
+
+    Images that exist are kept.
+    """
     views: list[CameraView] = []
-    into = to / name
-    written = files = 0
-    for stored in stored_views(config, wanted):
-        view_files, view_written = _write_missing(stored, into)
-        files, written = files + view_files, written + view_written
-        views.append(stored.view)
+    written = kept = 0
+    records = {record.view_id: record for record in config.views}
+    for view, row in stored_views(config, wanted):
+        images = [
+            (to / name / file.path(view.stem(eye)), f"{eye}_{file.column}", file.encode)
+            for eye in view.cameras
+            for file in exported_files(config).values()
+        ]
+        missing = [image for image in images if not image[0].is_file()]
+        decoded = decoded_row(config, records[view.view_id], row) if missing else {}
+        for path, column, encode in missing:
+            write_bytes(path, encode(decoded[column]))
+        written, kept = written + len(missing), kept + len(images) - len(missing)
+        views.append(view)
         progress(f"export of {name}", len(views), len(wanted))
-    for path, text in _texts(folder, config, views, bars).items():
-        write_text(into / path, text)
-    return ConfigExport(name, len(views), written, files - written)
+    for place, text in _texts(folder, config, views, bars).items():
+        write_text(to / name / place, text)
+    return ConfigExport(name, len(views), written, kept)
 
 
 def _texts(
@@ -174,17 +171,3 @@ def _texts(
             "transforms.json": transforms_json(views),
         }
     return texts
-
-
-def _write_missing(stored: StoredView, into: Path) -> tuple[int, int]:
-    """Write those image files of a view that do not exist yet; return the numbers of all and of those written."""
-    images = [
-        (into / file.path(stored.view.stem(eye)), f"{eye}_{file.column}", file.encode)
-        for eye in stored.view.cameras
-        for file in exported_files(stored.config).values()
-    ]
-    missing = [image for image in images if not image[0].is_file()]
-    decoded = stored.decode() if missing else {}
-    for path, column, encode in missing:
-        write_bytes(path, encode(decoded[column]))
-    return len(images), len(missing)

@@ -48,8 +48,10 @@ from pydantic import Strict, model_validator
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.key_lines import with_lines
 from rebar_depth_bench.limits import TOML_BYTES
+from rebar_depth_bench.paths import is_below
 from rebar_depth_bench.reading import parse_toml, read_file
 from rebar_depth_bench.validation import (
+    UNITS_M,
     Expected,
     StrictModel,
     field_error,
@@ -61,20 +63,15 @@ from rebar_depth_bench.validation import (
 )
 
 VIEW = "{view}"
-UNITS_M = {"m": 1.0, "cm": 0.01, "mm": 0.001}
 _MAX_SIDE_PX = 16384
 
 
 def _is_pattern(name: str) -> bool:
-    return name.count(VIEW) == 1 and not set(name.replace(VIEW, "")) & set("{}*?[]") and _is_below(name)
-
-
-def _is_below(name: str) -> bool:
-    return not Path(name).is_absolute() and ".." not in Path(name).parts
+    return name.count(VIEW) == 1 and not set(name.replace(VIEW, "")) & set("{}*?[]") and is_below(name)
 
 
 _Pattern = Annotated[str, Expected(f"a name in or below the layout's folder with one {VIEW}", _is_pattern)]
-_File = Annotated[str, Expected("the name of a file in or below the layout's folder", _is_below)]
+_File = Annotated[str, Expected("the name of a file in or below the layout's folder", is_below)]
 _Unit = Annotated[str, one_of(*UNITS_M)]
 _Values = Annotated[tuple[float, ...], Strict(False)]
 
@@ -183,8 +180,9 @@ class Layout(StrictModel):
             raise field_error("got poses and cameras.pose", "one of them", "conflict")
         if self.bars is not None and self.poses is None and "pose" not in self.cameras:
             raise field_error("got bars without poses", "poses in the frame of the bars", "conflict")
-        if self.intrinsics is not None and self.files.has_right:
-            raise field_error("got intrinsics of each view and a right camera", "one calibration", "conflict")
+        if self.intrinsics is not None and (self.files.has_right or self.depth.kind == "disparity"):
+            other = "a right camera" if self.files.has_right else "disparity"
+            raise field_error(f"got intrinsics of each view and {other}", "one calibration", "conflict")
         return self
 
 

@@ -9,8 +9,11 @@ from __future__ import annotations
 
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+
+from huggingface_hub import constants, get_token
+from huggingface_hub.errors import HfHubHTTPError
 
 from rebar_depth_bench.errors import (
     HubError,
@@ -21,34 +24,31 @@ from rebar_depth_bench.errors import (
     terminal_text,
 )
 
-_EXPECTED_OF_INPUT = {
-    400: "content that the Hub accepts",
-    401: "a valid token: hf auth login, or HF_TOKEN",
-    403: "a token with permission to write to this repository, and room in the storage of its owner",
-    404: "the id of a repository that exists, and that the token may see",
-    422: "content that the Hub accepts",
+_OTHER_CHANGE = "no other change of the repository at the same time; run the command again"
+_EXPECTED: Mapping[int, tuple[type[RebarDepthError], str]] = {
+    400: (InputError, "content that the Hub accepts"),
+    401: (InputError, "a valid token: hf auth login, or HF_TOKEN"),
+    403: (InputError, "a token with permission to write to this repository, and room in the storage of its owner"),
+    404: (InputError, "the id of a repository that exists, and that the token may see"),
+    409: (HubError, _OTHER_CHANGE),
+    412: (HubError, _OTHER_CHANGE),
+    422: (InputError, "content that the Hub accepts"),
+    429: (HubError, "fewer requests; run the command again later"),
 }
-"""What is expected instead, by the HTTP status of answers that are caused by the user's id, token or files."""
-_EXPECTED_LATER = {
-    409: "no other change of the repository at the same time; run the command again",
-    412: "no other change of the repository at the same time; run the command again",
-    429: "fewer requests; run the command again later",
-}
-"""What is expected instead, by the HTTP status of answers that may be different later."""
+"""Error and what is expected instead, by the HTTP status of an answer.
+
+It is an ``InputError`` if the user's id, token or files cause the answer, not if it may be different later.
+"""
 
 
 def require_token() -> None:
     """Raise ``InputError`` unless a token is stored or given by the environment."""
-    from huggingface_hub import get_token
-
     if not get_token():
         raise InputError("no token for the Hugging Face Hub, expected one: hf auth login, or HF_TOKEN")
 
 
 def require_online() -> None:
     """Raise ``InputError`` if ``HF_HUB_OFFLINE`` is set."""
-    from huggingface_hub import constants
-
     if constants.HF_HUB_OFFLINE:
         raise InputError("HF_HUB_OFFLINE is set, expected a connection to the Hugging Face Hub: unset it")
 
@@ -75,29 +75,18 @@ def hub_errors(action: str) -> Iterator[None]:
 
 def _converted(action: str, error: Exception) -> RebarDepthError:
     """Return the error of this project for an error of ``huggingface_hub``."""
-    from huggingface_hub import constants
-    from huggingface_hub.errors import HfHubHTTPError
-
     place = f"{action}: the Hub at {constants.ENDPOINT}"
     causes = list(_causes(error))
     for cause in causes:
         if isinstance(cause, HfHubHTTPError):
-            return _refusal(place, cause)
+            status, message = cause.response.status_code, cause.server_message
+            words = f" ({escape_text(_without_token(str(message)))})" if message else ""  # the Hub's own
+            error_type, expected = _EXPECTED.get(status, (HubError, "success"))
+            return error_type(f"{place} answers with status {status}{words}, expected {expected}")
         if isinstance(cause, OSError) and cause.filename is not None:
             return InputError(f"{action}: {cause.filename} cannot be read: {cause.strerror or cause}")
     summary = escape_text(_without_token(exception_summary(causes[-1])))
     return HubError(f"{place} gives no usable answer: {summary}")
-
-
-def _refusal(place: str, error: object) -> RebarDepthError:
-    """Return the error for an HTTP status, with the Hub's own words if it gives any."""
-    status: int = error.response.status_code  # type: ignore[attr-defined]
-    message = error.server_message  # type: ignore[attr-defined]
-    words = f" ({escape_text(_without_token(str(message)))})" if message else ""
-    found = f"{place} answers with status {status}{words}"
-    if status in _EXPECTED_OF_INPUT:
-        return InputError(f"{found}, expected {_EXPECTED_OF_INPUT[status]}")
-    return HubError(f"{found}, expected {_EXPECTED_LATER.get(status, 'success')}")
 
 
 def _causes(error: Exception) -> Iterator[Exception]:
@@ -112,7 +101,5 @@ def _causes(error: Exception) -> Iterator[Exception]:
 
 def _without_token(text: str) -> str:
     """Return text of a server without the token, which the server knows and could repeat."""
-    from huggingface_hub import get_token
-
     token = get_token()
     return text.replace(token, "[token]") if token else text

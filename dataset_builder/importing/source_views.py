@@ -12,10 +12,19 @@ import numpy as np
 from jaxtyping import Bool
 from numpy import ndarray
 
-from dataset_builder.importing.depth_maps import DEPTH_SUFFIXES, depth_converter, read_depth
-from dataset_builder.importing.labels import LABEL_SUFFIXES, bar_ids, read_labels
-from dataset_builder.importing.layout import VIEW, Layout
-from dataset_builder.importing.matrices import MATRIX_SUFFIXES, cam_from_world, read_matrix
+from dataset_builder.importing.import_layout import VIEW, Layout
+from dataset_builder.importing.source_files import (
+    DEPTH_SUFFIXES,
+    LABEL_SUFFIXES,
+    MATRIX_SUFFIXES,
+    bar_ids,
+    cam_from_world,
+    intrinsics,
+    planar_depth_m,
+    read_depth,
+    read_labels,
+    rectified_pair,
+)
 from rebar_depth_bench.captures.camera_files import CaptureCameras, cameras_of_table
 from rebar_depth_bench.captures.image_files import IMAGE_SUFFIXES, common_shape, read_image
 from rebar_depth_bench.data.columns import EYES, column_kind
@@ -71,7 +80,8 @@ class SourceViews:
         Raises ``InputError`` with the problems of the view's files.
         """
         try:
-            return {**self._cameras(name), **self._images(name)}
+            cameras = self._cameras(name)
+            return {**cameras, **self._images(name, cameras)}
         except EntryError as error:
             raise InputError.from_problems(f"{self.root}: view {name}", error.problems) from None
 
@@ -82,7 +92,7 @@ class SourceViews:
             pose = cam_from_world(self.file(layout.poses.file, name), layout.poses)
         K = lens_K(calibration.left)
         if layout.intrinsics is not None:
-            K = read_matrix(self.file(layout.intrinsics.file, name), layout.intrinsics.key, (3, 3))
+            K = intrinsics(self.file(layout.intrinsics.file, name), layout.intrinsics)
         columns: dict[str, Any] = {
             "left_K": K,
             "left_distortion": lens_distortion(calibration.left),
@@ -97,15 +107,17 @@ class SourceViews:
             }
         return columns
 
-    def _images(self, name: str) -> dict[str, Any]:
-        convert = depth_converter(self.layout.depth, self.cameras.calibration)
+    def _images(self, name: str, cameras: Mapping[str, Any]) -> dict[str, Any]:
+        table = self.layout.depth
         columns: dict[str, Any] = {}
         for column, pattern in self.layout.files.patterns.items():
             path, kind, eye = self.file(pattern, name), column_kind(column), column.partition("_")[0]
             if kind == "rgb":
                 columns[column] = read_image(path, self.grid)
             elif kind == "depth":
-                columns[column] = convert(read_depth(path, self.grid, self.layout.depth), eye)
+                values = read_depth(path, self.grid, table)
+                K, distortion = cameras[f"{eye}_K"], cameras[f"{eye}_distortion"]
+                columns[column] = planar_depth_m(values, table.kind, self.cameras.calibration, K, distortion)
             else:
                 values = read_labels(path, self.grid)
                 columns[column] = self._mask(values) if kind == "mask" else bar_ids(path, values)
@@ -158,7 +170,8 @@ def open_views(path: Path, layout: Layout) -> SourceViews:
     cameras = cameras_of_table(
         path, layout.cameras, names, width, height, is_stereo=layout.files.has_right, where="cameras"
     )
-    depth_converter(layout.depth, cameras.calibration)
+    if layout.depth.kind == "disparity":
+        rectified_pair(cameras.calibration)
     return SourceViews(root, layout, tuple(names), (height, width), cameras)
 
 

@@ -18,8 +18,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.audit.report import Check
-from dataset_builder.audit.views import AuditedConfig, AuditedEye, AuditedView
+from dataset_builder.audit.checks import AuditedConfig, AuditedEye, AuditedView, Check
 from dataset_builder.config.manifest_specs import rig_spec, trajectory_spec
 from dataset_builder.config.rigs import rig_cameras
 from dataset_builder.config.trajectories import aim_point_m, poses, subset
@@ -42,6 +41,13 @@ _AIM_TOLERANCE_M = 0.0011
 """Largest difference of the aim point per axis, metres.
 
 The aim point is rounded to the millimetre, and the float32 vertices of the mesh may round to the neighbouring one.
+"""
+MAX_PROJECTION_ERROR_PX = 1e-6
+"""Largest distance of a reprojected point from its pixel centre, pixels."""
+_MAX_PROJECTED_PIXELS = 60_000
+"""Pixels projected per eye, evenly spaced.
+
+OpenCV also computes 15 derivatives per coordinate, which takes seconds and 200 MB for all pixels.
 """
 
 
@@ -106,20 +112,14 @@ def expected_views(
 
 def view_list_problems(config: DatasetConfig, views: Sequence[ExpectedView]) -> Iterator[str]:
     """Yield a problem if the manifest's view ids are not those of the expected views, in order."""
-    listed_ids = list(config.view_ids)
-    expected_ids = [view.view_id for view in views]
-    if listed_ids != expected_ids:
-        first_mismatch = next(
-            (pair for pair in zip(listed_ids, expected_ids, strict=False) if pair[0] != pair[1]), None
-        )
-        detail = (
-            f": the first difference is {first_mismatch[0]}, expected {first_mismatch[1]}"
-            if first_mismatch
-            else ""
-        )
+    pairs = list(zip(config.view_ids, [view.view_id for view in views], strict=False))
+    different = [
+        f": the first difference is {found}, expected {wanted}" for found, wanted in pairs if found != wanted
+    ]
+    if different or len(config.views) != len(views):
         yield (
-            f"the manifest lists {len(listed_ids)} views, expected the {len(expected_ids)} views of its protocol"
-            f"{detail}"
+            f"the manifest lists {len(config.views)} views, expected the {len(views)} views of its protocol"
+            f"{''.join(different[:1])}"
         )
 
 
@@ -151,15 +151,6 @@ def _rig_problems(row: Mapping[str, Any], baseline_m: float) -> Iterator[str]:
         deviation = float(np.abs(rotation @ rotation.T - np.eye(3)).max())
         if not deviation <= CAMERA_TOLERANCE or not np.linalg.det(rotation) > 0:
             yield f"{eye}_cam_from_world is not a rigid pose (deviation {deviation:.1e})"
-
-
-MAX_PROJECTION_ERROR_PX = 1e-6
-"""Largest distance of a reprojected point from its pixel centre, pixels."""
-_MAX_PROJECTED_PIXELS = 60_000
-"""Pixels projected per eye, evenly spaced.
-
-OpenCV also computes 15 derivatives per coordinate, which takes seconds and 200 MB for all pixels.
-"""
 
 
 def view_projection_error_px(_: AuditedConfig, view: AuditedView) -> float:
