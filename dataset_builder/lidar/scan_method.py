@@ -1,12 +1,11 @@
-"""Benchmark methods of simulated scanners: scans projected to the left camera's grid.
+"""Methods of the benchmark that simulate a scanner.
 
-The paper leaves "a synthetic LiDAR baseline on the existing meshes" as future work.
-
-A scan is projected to the left camera's grid: each return fills its beam's cell at its own depth. Where cells
-overlap, the nearest return is used. A return of planar depth z covers a pixel if the pixel's point at depth z
-lies in the beam's cell as seen from the scanner. Cells tile the scanner's sphere, so that a wall is covered
-without gaps at any step size, and nothing is interpolated beyond a cell. Surfaces that the scanner sees but the
-left camera does not are removed by the z-buffer.
+The paper leaves "a synthetic LiDAR baseline on the existing meshes" as future work. A scan is projected to the
+left camera's grid: each return fills its beam's cell at its own depth. Where cells overlap, the nearest return is
+used. A return of planar depth z covers a pixel if the pixel's point at depth z lies in the beam's cell as seen
+from the scanner. Cells tile the scanner's sphere, so that a wall is covered without gaps at any step size, and
+nothing is interpolated beyond a cell. Surfaces that the scanner sees but the left camera does not are removed by
+the z-buffer.
 """
 
 from __future__ import annotations
