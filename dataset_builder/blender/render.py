@@ -96,12 +96,9 @@ def render_depth(camera: Camera, scratch_dir: Path) -> Float32[ndarray, "h w"]:
     ):
         depth_m = _read_channels(path, [DEPTH_CHANNEL])[..., 0]
     depth_m[depth_m > NO_SURFACE_M] = 0.0
-    return depth_m / _range_per_depth(camera) if camera.distortion.any() else depth_m
-
-
-def _range_per_depth(camera: Camera) -> Float32[ndarray, "h w"]:
-    """Return the ratio of the distance along each pixel's ray to planar depth."""
-    return np.asarray(np.linalg.norm(camera.rays(), axis=-1), dtype=np.float32)
+    if camera.distortion.any():
+        depth_m /= np.linalg.norm(camera.rays(), axis=-1).astype(np.float32)
+    return depth_m
 
 
 def _read_channels(path: Path, names: Sequence[str]) -> Float32[ndarray, "h w c"]:

@@ -20,40 +20,23 @@ PAPER, GREY_INK = 255, 120
 
 
 def board_texture(spec: BoardSpec, px_per_m: float) -> UInt8[ndarray, "h w"]:
-    """Return the printed board as grey levels; every marker edge coincides with a pixel edge.
+    """Return the printed board as grey levels, for a dictionary of 4 x 4 modules.
 
-    Raises ``ValueError`` if an edge of the board or of a marker is not a whole number of pixels at ``px_per_m``,
-    and for a dictionary other than 4 x 4.
+    Marker edges coincide with pixel edges if their distances are whole numbers of pixels at ``px_per_m``.
     """
-    height, width = (_whole_pixels(side * px_per_m, spec, px_per_m) for side in (spec.height_m, spec.width_m))
+    height, width = round(spec.height_m * px_per_m), round(spec.width_m * px_per_m)
     texture = np.full((height, width), PAPER, dtype=np.uint8)
     _draw_border(texture, px_per_m)
-    module_px = _whole_pixels(spec.marker_side_m / MARKER_MODULES * px_per_m, spec, px_per_m)
+    module_px = round(spec.marker_side_m / MARKER_MODULES * px_per_m)
     side_px = module_px * MARKER_MODULES
-    dictionary = _dictionary(spec)
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, spec.dictionary))
     for marker_id, corners in marker_corners_m(spec).items():
-        row = _whole_pixels((spec.height_m / 2 - corners[0, 1]) * px_per_m, spec, px_per_m)
-        column = _whole_pixels((spec.width_m / 2 + corners[0, 0]) * px_per_m, spec, px_per_m)
+        row = round((spec.height_m / 2 - corners[0, 1]) * px_per_m)
+        column = round((spec.width_m / 2 + corners[0, 0]) * px_per_m)
         marker = cv2.aruco.generateImageMarker(dictionary, marker_id, side_px)
         texture[row : row + side_px, column : column + side_px] = marker
         _draw_caption(texture, f"{spec.dictionary} {marker_id}", row + side_px, column, module_px)
     return texture
-
-
-def _whole_pixels(pixels: float, spec: BoardSpec, px_per_m: float) -> int:
-    """Return ``pixels`` rounded; raise ``ValueError`` if it is not a whole number (to 1e-6)."""
-    if abs(pixels - round(pixels)) > 1e-6:
-        raise ValueError(
-            f"at {px_per_m} px/m an edge of the board {spec} is at {pixels:.4f} pixels, "
-            "expected a whole number of pixels"
-        )
-    return round(pixels)
-
-
-def _dictionary(spec: BoardSpec) -> cv2.aruco.Dictionary:
-    if not spec.dictionary.startswith("DICT_4X4_"):
-        raise ValueError(f"dictionary is {spec.dictionary}, expected a 4 x 4 dictionary")
-    return cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, spec.dictionary))
 
 
 def _draw_border(texture: UInt8[ndarray, "h w"], px_per_m: float) -> None:
