@@ -17,7 +17,7 @@ from dataset_builder.config.file_specs import (
 from dataset_builder.scene.assemblies.cage import Cage
 from dataset_builder.scene.assemblies.cage_assembly import cage_assembly
 from dataset_builder.scene.assemblies.cage_checks import cage_problems, check_values
-from dataset_builder.scene.assemblies.ifc.process import ifc_cage
+from dataset_builder.scene.assemblies.ifc_file import ifc_cage
 from dataset_builder.scene.assemblies.mesh_file import read_mesh
 from dataset_builder.scene.assemblies.placement import placed
 from dataset_builder.scene.assemblies.toml_bars import toml_cage

@@ -2,7 +2,7 @@
 
 The records, told apart by ``kind``, are ``project`` (first), ``left_out``, ``bar`` (points as float64),
 ``surface`` (vertices as float64, triangles as int32), ``step`` before the geometry kernel is used, and at the end
-``failure`` or ``end``. ``scene.assemblies.ifc.answer`` reads and validates them.
+``failure`` or ``end``. ``scene.assemblies.ifc_file`` reads and validates them.
 """
 
 from __future__ import annotations

@@ -1,23 +1,32 @@
-"""IFC models: opening with checks of completeness, units, tessellation.
+"""IFC models: opening with checks of completeness, units, tessellation, and the check of single instances.
 
-The parser skips what it cannot read and goes on, which could place a bar wrongly without an error. The instances
-that the bars depend on are therefore compared with the file's text (``source_check``).
+The parser skips what it cannot read and goes on, which could place a bar wrongly without an error. It turns an
+attribute that it cannot parse, and a reference to an instance that it could not read, into null or drops it from a
+list. So each instance that a bar depends on is written again and compared with its text (``SourceCheck``). The
+types of its attributes and the dimensions of its points are checked too, since the geometry kernel replaces
+missing coordinates by zero.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from textwrap import shorten
 from typing import Any
 
 import ifcopenshell
 import numpy as np
-from ifcopenshell import geom
+from ifcopenshell import entity_instance, geom, ifcopenshell_wrapper
 from ifcopenshell import ifcopenshell_wrapper as wrapper
 
-from dataset_builder.scene.ifc_reader.source_check import Entity, SourceCheck
-from dataset_builder.scene.ifc_reader.step_text import StepText, class_name
+from dataset_builder.scene.ifc_reader.step_text import (
+    StepText,
+    class_name,
+    same_tokens,
+    same_values,
+    split_arguments,
+)
 from rebar_depth_bench.errors import MeshError, escape_text
 
 _LOGGED_REASON = re.compile(r"\] (?!Pars)[A-Za-z]")
@@ -148,3 +157,262 @@ def _to_base_unit(unit: Entity, base: str) -> float | None:
     if not unit.is_a("IfcSIUnit") or unit.Name != base or unit.Prefix not in _PREFIXES or not factor > 0:
         return None
     return float(factor * _PREFIXES[unit.Prefix])
+
+
+_types: Any = ifcopenshell_wrapper
+Entity = Any
+"""An ``ifcopenshell.entity_instance``, with the attributes of its IFC class."""
+
+_UNUSED = {
+    *("ContextOfItems", "Dimensions", "ProfileName", "RepresentationType", "SelfIntersect", "TagList"),
+    "Transition",
+}
+"""Attributes without influence on the shape of a bar, which are neither checked nor followed."""
+
+_MAY_BE_NULL = {
+    *("BarRole", "EndParam", "GlobalId", "NominalDiameter", "PredefinedType", "StartParam", "UnitsInContext"),
+    *("LongitudinalBarNominalDiameter", "TransverseBarNominalDiameter"),
+}
+"""Attributes that a version of IFC requires, that exporters leave out, and that the reader can do without."""
+
+_DIMENSION: dict[str, int | None] = {
+    **dict.fromkeys(["IfcAxis2Placement2D", "IfcCartesianTransformationOperator2D", "IfcCartesianPointList2D"], 2),
+    **dict.fromkeys(["IfcCartesianTransformationOperator3D", "IfcCartesianTransformationOperator3DnonUniform"], 3),
+    **dict.fromkeys(["IfcAxis1Placement", "IfcAxis2Placement3D", "IfcCartesianPointList3D", "IfcPolyLoop"], 3),
+    **dict.fromkeys(["IfcExtrudedAreaSolid", "IfcRevolvedAreaSolid", "IfcVertexPoint"], 3),
+    **dict.fromkeys(["IfcPolyline", "IfcIndexedPolyCurve", "IfcLine", "IfcVector", "IfcTrimmedCurve"]),
+    **dict.fromkeys(["IfcCircle", "IfcEllipse", "IfcCompositeCurve", "IfcCompositeCurveSegment"]),
+    **dict.fromkeys(["IfcBSplineCurveWithKnots", "IfcRationalBSplineCurveWithKnots", "IfcSweptDiskSolid"]),
+    **dict.fromkeys(["IfcSweptDiskSolidPolygonal"]),
+}
+"""Dimension of the points below instances of a class; None: that of its first point."""
+
+_COORDINATES = {name: f"{name.upper()}((" for name in ("IfcCartesianPoint", "IfcDirection")}
+"""Beginning of the text of an instance that has nothing but coordinates, by class."""
+
+_PYTHON_TYPES: dict[str, tuple[type, ...]] = {
+    "string": (str,),
+    "binary": (str,),
+    "integer": (int,),
+    "real": (int, float),  # Some exporters write 5 in place of 5.
+    "number": (int, float),
+    "boolean": (bool,),
+    "logical": (bool, str),
+}
+
+
+@dataclass(frozen=True)
+class _Attribute:
+    """Attribute of a class: position, name, type as text, and whether a value is valid; None: any value.
+
+    ``may_refer`` is False if no value refers to an instance.
+    """
+
+    index: int
+    name: str
+    kind: str
+    accepts: Callable[[Any], bool] | None
+    may_refer: bool
+
+
+class SourceCheck:
+    """Comparison of a model's instances with the text of its file. Every method raises ``MeshError``."""
+
+    def __init__(self, schema: Any, step: StepText) -> None:
+        self._schema, self._step = schema, step
+        self._attributes: dict[str, list[_Attribute]] = {}
+        self._used: dict[tuple[str, tuple[str, ...]], list[_Attribute]] = {}
+        self._seen: set[int] = set()
+        self._dimensions: dict[int, frozenset[int]] = {}
+
+    def attributes(self, entity: Entity, *names: str) -> list[Entity]:
+        """Check the attributes ``names`` of an instance, or all; return the instances that they refer to.
+
+        A class may lack some of the names.
+        """
+        used = self._used_attributes(entity.is_a(), names)
+        source, written = self._step.instance(entity.id()), entity.to_string(True).partition("=")[2]
+        if source != written and not same_values(source, written):
+            self._compare(entity, used, source, written)
+        references: list[Entity] = []
+        for attribute in used:
+            value = entity.get_argument(attribute.index)
+            assert attribute.accepts
+            if not attribute.accepts(value):
+                found = "null" if value is None else escape_text(shorten(str(value), 60))
+                raise MeshError(f"{_where(entity, attribute)} is {found}, expected {shorten(attribute.kind, 80)}")
+            if attribute.may_refer:
+                references += _references(value)
+        return references
+
+    def tree(self, root: Entity) -> None:
+        """Check an instance and all instances that it refers to, directly or through others, each once."""
+        stack: list[tuple[Entity, list[Entity] | None]] = [(root, None)]
+        while stack:
+            entity, references = stack.pop()
+            if references is not None:
+                self._dimensions[entity.id()] = self._dimensions_below(entity, references)
+            elif entity.id() not in self._seen:
+                self._seen.add(entity.id())
+                if size := self._size_as_written(entity):
+                    self._dimensions[entity.id()] = frozenset((size,))
+                    continue
+                references = self.attributes(entity)
+                stack.append((entity, references))  # It is completed after the instances below it.
+                stack += [(reference, None) for reference in references]
+
+    def _size_as_written(self, entity: Entity) -> int:
+        """Return the number of coordinates (2 or 3) of a point or direction that is as written, else 0.
+
+        Half of the instances below a bar are of these classes, in their plain form. Of others, and of any doubt,
+        the result is 0: ``attributes`` decides.
+        """
+        name = entity.is_a()
+        if name not in _COORDINATES:
+            return 0
+        source = self._step.instance(entity.id())
+        begin, end = _COORDINATES[name], "))"
+        if not (source.startswith(begin) and source.endswith(end)):
+            return 0
+        try:
+            written = tuple(map(float, source[len(begin) : -len(end)].split(",")))
+        except ValueError:
+            return 0
+        return len(written) if len(written) in (2, 3) and written == entity.get_argument(0) else 0
+
+    def _dimensions_below(self, entity: Entity, references: list[Entity]) -> frozenset[int]:
+        """Return the numbers of coordinates of the points and directions that define an instance.
+
+        The set is empty for classes whose points are in several spaces.
+        """
+        name = entity.is_a()
+        if name in _COORDINATES:
+            size = len(entity.get_argument(0))
+            if size not in (2, 3):
+                raise MeshError(f"#{entity.id()} ({name}) has {size} coordinates, expected 2 or 3")
+            return frozenset((size,))
+        if name not in _DIMENSION:
+            return frozenset()
+        sizes: frozenset[int] = frozenset().union(
+            *(self._dimensions.get(reference.id(), ()) for reference in references)
+        )
+        expected = _DIMENSION[name]
+        if len(sizes) > 1 or (expected and sizes - {expected}):
+            found = " and ".join(map(str, sorted(sizes)))
+            raise MeshError(
+                f"#{entity.id()} ({name}) refers to points of {found} coordinates, "
+                f"expected {expected or 'one kind'}"
+            )
+        return frozenset((expected,)) if expected else sizes
+
+    def _compare(self, entity: Entity, used: list[_Attribute], source: str, written: str) -> None:
+        """Raise ``MeshError`` if used attributes of an instance differ between its text and what was read."""
+        given, read = split_arguments(source) or [], split_arguments(written) or []
+        attributes = self._class_attributes(entity.is_a())
+        # Lists of points have the attribute TagList in IFC4x3 only; exporters mix the versions up.
+        if entity.is_a() in ("IfcCartesianPointList2D", "IfcCartesianPointList3D"):
+            given, read = given[:1], read[:1]
+        if class_name(source) != class_name(written) or not given or len(given) != len(read):
+            raise MeshError(
+                f"#{entity.id()} is {escape_text(source)}, expected {len(attributes)} readable attributes of "
+                f"{entity.is_a()}"
+            )
+        for attribute in used:
+            if not same_tokens(given[attribute.index], read[attribute.index]):
+                found = escape_text("".join(given[attribute.index]))
+                raise MeshError(
+                    f"{_where(entity, attribute)} is {found}, which cannot be read, "
+                    f"expected {shorten(attribute.kind, 80)}"
+                )
+
+    def _used_attributes(self, name: str, names: tuple[str, ...]) -> list[_Attribute]:
+        """Return the attributes ``names`` of a class, or all, that have an influence on a bar."""
+        if (name, names) not in self._used:
+            self._used[name, names] = [
+                attribute
+                for attribute in self._class_attributes(name)
+                if attribute.accepts and (not names or attribute.name in names)
+            ]
+        return self._used[name, names]
+
+    def _class_attributes(self, name: str) -> list[_Attribute]:
+        """Return the attributes of a class."""
+        if name not in self._attributes:
+            entity = self._schema.declaration_by_name(name).as_entity()
+            self._attributes[name] = [
+                self._attribute(index, declared, derived)
+                for index, (declared, derived) in enumerate(
+                    zip(entity.all_attributes(), entity.derived(), strict=True)
+                )
+            ]
+        return self._attributes[name]
+
+    def _attribute(self, index: int, declared: Any, derived: bool) -> _Attribute:
+        kind, name = declared.type_of_attribute(), str(declared.name())
+        accepts = None if derived or name in _UNUSED else _predicate(kind)
+        if accepts and (declared.optional() or name in _MAY_BE_NULL):
+            accepts = _or_null(accepts)
+        return _Attribute(index, name, str(kind), accepts, _may_refer(kind))
+
+
+def _where(entity: Entity, attribute: _Attribute) -> str:
+    return f"#{entity.id()} ({entity.is_a()}): {attribute.name}"
+
+
+def _references(value: Any) -> Iterator[Entity]:
+    """Yield the numbered instances in an attribute's value."""
+    if isinstance(value, entity_instance):
+        if value.id():
+            yield value
+    elif isinstance(value, tuple):
+        for item in value:
+            yield from _references(item)
+
+
+def _may_refer(kind: Any) -> bool:
+    """Return whether values of a type can refer to instances."""
+    while isinstance(kind, _types.named_type | _types.type_declaration | _types.aggregation_type):
+        kind = kind.type_of_element() if isinstance(kind, _types.aggregation_type) else kind.declared_type()
+    return not isinstance(kind, _types.simple_type | _types.enumeration_type)
+
+
+def _or_null(accepts: Callable[[Any], bool]) -> Callable[[Any], bool]:
+    return lambda value: value is None or accepts(value)
+
+
+def _predicate(kind: Any) -> Callable[[Any], bool]:
+    """Return the function that tells whether a value is of an attribute's type."""
+    while isinstance(kind, _types.named_type | _types.type_declaration):
+        kind = kind.declared_type()
+    if isinstance(kind, _types.aggregation_type):
+        accepts, low, high = _predicate(kind.type_of_element()), kind.bound1(), kind.bound2()
+        return lambda value: (
+            isinstance(value, tuple) and low <= len(value) and (high < 0 or len(value) <= high)
+            and all(map(accepts, value))
+        )  # fmt: skip
+    if isinstance(kind, _types.simple_type):
+        types = _PYTHON_TYPES[kind.declared_type()]
+        return lambda value: isinstance(value, types) and (bool in types or not isinstance(value, bool))
+    if isinstance(kind, _types.enumeration_type):
+        return lambda value: isinstance(value, str)
+    if isinstance(kind, _types.select_type):
+        members = dict(_select_members(kind))
+        return lambda value: (
+            isinstance(value, entity_instance) and value.is_a() in members and members[value.is_a()](value)
+        )
+    name = kind.name()
+    return lambda value: isinstance(value, entity_instance) and value.is_a(name)
+
+
+def _select_members(kind: Any) -> Iterator[tuple[str, Callable[[Any], bool]]]:
+    """Yield the names of a select type's classes and value types, each with a test of its instances."""
+    if isinstance(kind, _types.select_type):
+        for member in kind.select_list():
+            yield from _select_members(member)
+    elif isinstance(kind, _types.entity):
+        yield kind.name(), lambda _: True
+        for subtype in kind.subtypes():
+            yield from _select_members(subtype)
+    else:
+        accepts = _predicate(kind)
+        yield kind.name(), lambda value: accepts(value.get_argument(0))

@@ -18,10 +18,10 @@ from ifcopenshell import geom
 from numpy import ndarray
 
 from dataset_builder.scene.assemblies.cage_file import cage_file_spec, load_cage
-from dataset_builder.scene.assemblies.ifc.process import ifc_cage
+from dataset_builder.scene.assemblies.ifc_file import ifc_cage
+from dataset_builder.scene.ifc_reader.bodies import axis_placement
+from dataset_builder.scene.ifc_reader.curves import arc_through
 from dataset_builder.scene.ifc_reader.model import open_model
-from dataset_builder.scene.ifc_reader.pieces import arc_through
-from dataset_builder.scene.ifc_reader.placements import axis_placement
 from rebar_depth_bench.data.bars import Bar
 from tests.builder.scene.ifc_writer import Ifc, bars_in_process, extruded_circle, extruded_square
 

@@ -18,9 +18,8 @@ import numpy as np
 import pytest
 
 from dataset_builder.config.scene_file import scene_config
-from dataset_builder.scene.assemblies.ifc import process
-from dataset_builder.scene.assemblies.ifc.answer import MAX_ARRAY_BYTES, Answer, AnswerError
-from dataset_builder.scene.assemblies.ifc.process import ifc_cage
+from dataset_builder.scene.assemblies import ifc_file as process
+from dataset_builder.scene.assemblies.ifc_file import MAX_ARRAY_BYTES, Answer, AnswerError, ifc_cage
 from dataset_builder.scene.ifc_reader.__main__ import SECONDS_PER_SHAPE, _limited_time
 from dataset_builder.scene.model import MAX_BARS
 from rebar_depth_bench.errors import InputError, MeshError
@@ -273,7 +272,7 @@ def test_this_process_does_not_import_ifcopenshell() -> None:
     code = """
 import sys
 from pathlib import Path
-from dataset_builder.scene.assemblies.ifc.process import ifc_cage
+from dataset_builder.scene.assemblies.ifc_file import ifc_cage
 assert len(ifc_cage(Path("examples/column.ifc").read_bytes(), "a.ifc").bars) == 13
 assert not [name for name in sys.modules if "ifcopenshell" in name or "ifc_reader" in name]
 """

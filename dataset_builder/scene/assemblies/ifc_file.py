@@ -1,13 +1,26 @@
-"""Answer of the process that reads an IFC file, validated, as the bars of a cage.
+"""Reinforcing bars of an IFC file, read by a process of their own with limits of time and memory.
 
-The process has read content from a stranger, so its answer is data like any other file: one JSON line per record,
-followed by the arrays that it announces (see ``scene.ifc_reader.answer``).
+Bars that are swept circles have axes and diameters as modelled; another solid gives one bar for each connected
+surface, with the axis and the diameter of ``fitted_bar`` and the role "imported". ``scene.ifc_reader`` says which
+objects are read. ifcopenshell may crash, hang or use any amount of memory on damaged files. The process has read
+content from a stranger, so its answer (``scene.ifc_reader.answer``) is checked like any other file.
+
+The geometry is always what is built. Some programs model the outer diameter of the ribs (some 10 % more), so
+diameters may differ from the declared ones; beyond a quarter, one of the two values is wrong. Lengths are compared
+for information: some programs write them in another unit, or for a whole row of bars.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import replace
+import importlib.util
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, replace
+from threading import Event, Timer
 from typing import IO, Annotated, Literal
 
 import numpy as np
@@ -17,14 +30,105 @@ from pydantic import Field, TypeAdapter, ValidationError
 
 from dataset_builder.config.file_specs import Trust
 from dataset_builder.scene.assemblies.cage import Cage, CageBar, LeftOut, unit_scale
-from dataset_builder.scene.assemblies.ifc.declared import compare_declared
 from dataset_builder.scene.assemblies.mesh_import import connected_components
 from dataset_builder.scene.assemblies.surface_bar import fitted_bar
 from dataset_builder.scene.model import MAX_BARS, METRE_DECIMALS, Mesh, Note, axis_of
+from dataset_builder.scene.selection import TABLES, Selection
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.errors import MeshError, Problem
+from rebar_depth_bench.errors import InputError, MeshError, Problem
+from rebar_depth_bench.limits import IFC_MEMORY_BYTES, IFC_SECONDS
 from rebar_depth_bench.reading import parse_json
 from rebar_depth_bench.validation import StrictModel
+
+COMMAND = (sys.executable, "-P", "-m", "dataset_builder.scene.ifc_reader")
+"""Command of the process; the memory limit, the time limit and the id of this process follow."""
+
+_WALL_CLOCK_FACTOR = 2
+"""Largest duration of the process, in multiples of its processor time."""
+
+
+def ifc_cage(content: bytes, where: str, select: tuple[Selection, ...] = (), trust: Trust = "declared") -> Cage:
+    """Return the bars of an IFC file's ``content`` (its frame, metres); ``where`` names the file in messages.
+
+    Without ``select``, all reinforcement is read. Bar ids start at 1 and follow the instance numbers in the file.
+    Diameters and lengths are always those of the geometry; with ``trust`` "declared", a diameter that is far from
+    the declared one is a problem of the cage (see the module).
+
+    Raises ``MeshError`` if the file is not a complete IFC file, has no known length unit, nothing to read or
+    a bar without usable geometry (with its GlobalId), if a bar depends on an instance that cannot be read as
+    written, or if reading exceeds a limit; ``InputError`` if ifcopenshell is not installed.
+    """
+    if importlib.util.find_spec("ifcopenshell") is None:
+        raise InputError(
+            "not installed: ifcopenshell; expected the ifc extra for IFC models: "
+            "pip install 'rebar-depth-bench[ifc]'"
+        )
+    with _reader(TABLES.dump_json(select) + b"\n" + content) as reader:
+        answer = Answer(reader.stdout, where, trust)
+        try:
+            return answer.cage()
+        except OutOfMemoryError:
+            raise MeshError(f"{where}: reading needs {_memory_limit()}") from None
+        except AnswerError as error:
+            if not error.ended:
+                raise MeshError(f"{where}: the IFC reader gave an invalid answer: {error}") from None
+            problem = reader.end_reason()
+        if answer.step is not None:
+            raise answer.no_shape_error(problem)
+        raise MeshError(f"{where}: the file cannot be read: {problem}, expected a sound IFC file")
+
+
+@dataclass(frozen=True)
+class _Reader:
+    """Running process; ``expired`` is set when its duration has passed and it was killed."""
+
+    process: subprocess.Popen[bytes]
+    stdout: IO[bytes]
+    expired: Event
+
+    def end_reason(self) -> str:
+        """Return how the process ended, which gave no complete answer."""
+        status = self.process.wait()
+        if self.expired.is_set() or status == -signal.SIGXCPU:
+            return f"reading takes more than {IFC_SECONDS.value()} s ({IFC_SECONDS.variable} raises the limit)"
+        if status == -signal.SIGALRM:
+            return "it takes more than the time limit for one object"
+        end = signal.strsignal(-status) if status < 0 else f"status {status}"
+        return f"ifcopenshell crashed ({end}), or needs {_memory_limit()}"
+
+
+def _memory_limit() -> str:
+    limit = IFC_MEMORY_BYTES
+    return f"more than {limit.value()} bytes of memory ({limit.variable} raises the limit)"
+
+
+@contextmanager
+def _reader(request: bytes) -> Iterator[_Reader]:
+    """Start the process and pass it ``request``; it is killed at the end, or after its largest duration."""
+    seconds = IFC_SECONDS.value()
+    command = (*COMMAND, str(IFC_MEMORY_BYTES.value()), str(seconds), str(os.getpid()))
+    with subprocess.Popen(
+        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL
+    ) as process:
+        assert process.stdin
+        assert process.stdout
+        expired = Event()
+
+        def expire() -> None:
+            expired.set()
+            process.kill()
+
+        timer = Timer(_WALL_CLOCK_FACTOR * seconds, expire)
+        timer.start()
+        try:
+            # The pipe is broken if the process has ended, for a reason that its status tells.
+            with suppress(BrokenPipeError), process.stdin as stream:
+                stream.write(request)
+            yield _Reader(process, process.stdout, expired)
+        finally:
+            timer.cancel()
+            process.kill()
+
 
 MAX_ARRAY_BYTES = 1 << 30
 """Largest size of all arrays of an answer: more than ``MAX_TRIANGLES`` of a cage."""
@@ -141,7 +245,7 @@ class Answer:
     def cage(self) -> Cage:
         """Return the bars (the file's frame, metres), with ids from 1 in the order of the answer.
 
-        Diameters that are far from the declared ones are problems of the cage (``ifc.declared``). Raises
+        Diameters that are far from the declared ones are problems of the cage (see the module). Raises
         ``MeshError`` if the process refused the file or a surface is not a bar, ``OutOfMemoryError`` if it ran out
         of memory, and ``AnswerError`` if the answer is not complete and valid.
         """
@@ -256,3 +360,33 @@ class Answer:
 
 def _bar_label(bar_id: int, label: str) -> str:
     return f"bar {bar_id}, {label}"
+
+
+_NOTED, _REFUSED = 0.05, 0.25
+"""Differences, relative to the declared value, above which there is a note, and above which a bar is refused."""
+
+
+def compare_declared(
+    bar: CageBar, name: str, diameters_m: Sequence[float], length_m: float | None, trust: Trust
+) -> tuple[list[Note], Problem | None]:
+    """Return notes (with ``name`` as source) on a bar, and the reason to refuse it or None.
+
+    The declared ``diameters_m`` may be none, one, or two for a mesh, of which the nearest counts; ``length_m`` is
+    the declared length of the centreline or None. A bar without axis and diameter is not compared.
+    """
+    if not bar.bar.has_axis:
+        return [], None
+    notes: list[Note] = []
+    found_m = bar.bar.diameter_m
+    if diameters_m:
+        nearest_m = min(diameters_m, key=lambda declared_m: abs(declared_m - found_m))
+        difference = abs(found_m - nearest_m) / nearest_m
+        values = f"the diameter is {found_m * 1000:.4g} mm in the geometry, {nearest_m * 1000:.4g} mm as declared"
+        if difference > _REFUSED and trust != "geometry":
+            return [], Problem("invalid", bar.label, values, f"at most {_REFUSED:.0%} difference")
+        if difference > _NOTED:
+            notes.append(Note(name, "diameter", values))
+    if length_m and abs(bar.bar.length_m - length_m) > _NOTED * length_m:
+        values = f"the length is {bar.bar.length_m:.4g} m in the geometry, {length_m:.4g} m as declared"
+        notes.append(Note(name, "length", values))
+    return notes, None
