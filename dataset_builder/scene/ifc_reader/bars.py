@@ -1,275 +1,68 @@
 """Shapes of the reinforcement in an IFC model, as modelled: the project's frame, metres.
 
 Every IfcReinforcingBar, IfcReinforcingMesh and IfcTendon is read, or every object that a selection chooses, in the
-order of the instance numbers. Each sweep of a circle in its Body (``sweeps``), directly or through IfcMappedItem,
-is one bar, since some programs write a whole row of bars as one object. Only other solids are tessellated, each
-once for all of its uses. All other objects are left out.
+order of the instance numbers. Each sweep of a circle in its Body (an IfcSweptDiskSolid or a straight
+IfcExtrudedAreaSolid), directly or through IfcMappedItem, is one bar, since some programs write a whole row of bars
+as one object. Only other solids are tessellated, each once for all of its uses. All other objects are left out.
 
 The project's coordinates are world coordinates; a context's coordinate system and map projections are ignored.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager, nullcontext
+import math
+import signal
+import time
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 from textwrap import shorten
 from typing import Any
 
 import numpy as np
+from ifcopenshell import geom
 from jaxtyping import Float64, Int32
 from numpy import ndarray
 
 from dataset_builder.scene.ifc_reader.bodies import (
-    BodyItem,
     axis_placement,
     body_items,
     placement_matrix,
     point_xyz,
-    type_objects,
     unit_vector,
 )
 from dataset_builder.scene.ifc_reader.curves import ARC_STEP_DEG, Leg, Piece, curve_pieces, cut
-from dataset_builder.scene.ifc_reader.model import (
-    Entity,
-    Model,
-    angle_unit_rad,
-    item_mesh,
-    length_unit_m,
-    open_model,
-)
+from dataset_builder.scene.ifc_reader.model import Entity, Model, open_model
 from dataset_builder.scene.ifc_reader.objects import (
     DAMAGE,
-    Declared,
-    LeftOut,
-    Relations,
+    Units,
     choose_objects,
-    declared_sizes,
-    left_out_object,
+    left_out_record,
+    object_label,
+    project_units,
     role,
-    shown,
+    source_record,
+    type_objects,
+)
+from dataset_builder.scene.ifc_records import (
+    BarRecord,
+    NoteRecord,
+    ProjectRecord,
+    Record,
+    StepRecord,
+    SurfaceRecord,
 )
 from dataset_builder.scene.model import MAX_BARS
 from dataset_builder.scene.selection import Selection
 from dataset_builder.scene.shapes.bending import bent_line_m, without_repeats
-from rebar_depth_bench.errors import MeshError
+from rebar_depth_bench.errors import MeshError, printable
 
 MAX_POINTS = 20_000_000
 """Largest number of points of all axes and surfaces of a model, which maps can multiply: 480 MB."""
 
-
-class ShapeError(MeshError):
-    """Solid that the geometry kernel cannot tessellate; the message is the reason alone."""
-
-
-@dataclass(frozen=True, eq=False)
-class Source:
-    """Object of a model: GlobalId, name in messages, what it declares about its bars, host and storey."""
-
-    global_id: str
-    label: str
-    declared: Declared
-    host: str | None
-    storey: str | None
-
-
-@dataclass(frozen=True, eq=False)
-class SweptBar:
-    """Bar with an axis: object, role, axis and diameter (the project's frame, metres), notes (code and text)."""
-
-    source: Source
-    role: str
-    axis_m: Float64[ndarray, "n 3"]
-    diameter_m: float
-    notes: tuple[tuple[str, str], ...]
-
-
-@dataclass(frozen=True, eq=False)
-class Surface:
-    """Tessellated solid, of one or several bars: object, vertices (the project's frame, metres), triangles."""
-
-    source: Source
-    vertices_m: Float64[ndarray, "v 3"]
-    faces: Int32[ndarray, "f 3"]
-
-
-@dataclass(frozen=True)
-class Project:
-    """Project of a model: its length unit, metres."""
-
-    unit_m: float
-
-
-Shape = SweptBar | Surface
-
-KernelStep = Callable[[str, str], AbstractContextManager[object]]
-"""Function of an object's name and a reason; its context is entered while the geometry kernel is used."""
-
-
-def read_bars(
-    content: bytes,
-    select: Sequence[Selection] = (),
-    kernel_step: KernelStep = lambda *_: nullcontext(),
-) -> Iterator[Project | Shape | LeftOut]:
-    """Yield the project of an IFC file's ``content``, the objects that are left out, and the shapes in its order.
-
-    ``select`` chooses objects (``choose_objects``). ``kernel_step`` is called with an object's name and the reason
-    why it has no axis, and entered while the geometry kernel tessellates a solid of it, which may hang or crash.
-
-    Raises ``MeshError`` if the file is not a complete IFC file, has no known length unit, nothing to read or too
-    much of it, if a bar depends on an instance that was not read as written, or if it has no usable geometry;
-    ``ShapeError`` if a solid cannot be tessellated.
-    """
-    model = open_model(content)
-    relations = Relations(model)
-    chosen, left_out = choose_objects(model, relations, select)
-    for relation in model.by_type("IfcRelDefinesByType"):
-        model.check.attributes(relation, "RelatedObjects", "RelatingType")
-    reader = _Reader(model, relations, kernel_step)
-    yield Project(reader.unit_m)
-    yield from left_out
-    outside = 0
-    size = _Size()
-    for item in chosen:
-        shapes = reader.shapes(item.entity)
-        for shape in shapes:
-            size.add(shape.source.label, len(_points_m(shape)))
-        points = np.concatenate([_points_m(shape) for shape in shapes]) / reader.unit_m
-        if item.tables and not any(table.contains(points) for table in item.tables):
-            outside += 1
-            yield left_out_object(item.entity, "not inside the box of a [[select]] table")
-        else:
-            yield from shapes
-    if outside == len(chosen):
-        found = f"{outside} selected objects are not wholly inside"
-        raise MeshError(f"no object is inside the box of a [[select]] table: {found}, expected one or more")
-
-
-def _points_m(shape: Shape) -> Float64[ndarray, "n 3"]:
-    return shape.axis_m if isinstance(shape, SweptBar) else shape.vertices_m
-
-
-class _Size:
-    """Number of shapes and of their points."""
-
-    def __init__(self) -> None:
-        self._shapes = self._points = 0
-
-    def add(self, label: str, points: int) -> None:
-        """Count a shape of the object ``label``; raise ``MeshError`` if there are too many shapes or points."""
-        self._shapes, self._points = self._shapes + 1, self._points + points
-        if self._shapes > MAX_BARS or self._points > MAX_POINTS:
-            raise MeshError(
-                f"{label}: {self._shapes} bars of {self._points} points up to this object, "
-                f"expected at most {MAX_BARS} and {MAX_POINTS}"
-            )
-
-
-class _Reader:
-    """Reader of a model's objects, which share placements and solids."""
-
-    def __init__(self, model: Model, relations: Relations, kernel_step: KernelStep) -> None:
-        self._model, self._relations, self._kernel_step = model, relations, kernel_step
-        self._units = Units(length_unit_m(model), angle_unit_rad(model))
-        self._placements: dict[int, Float64[ndarray, "4 4"]] = {}
-        self._sweeps: dict[int, Sweep | None] = {}
-        self._meshes: dict[int, tuple[Float64[ndarray, "v 3"], Int32[ndarray, "f 3"]]] = {}
-
-    @property
-    def unit_m(self) -> float:
-        """The project's length unit, metres."""
-        return self._units.length_m
-
-    def shapes(self, entity: Entity) -> list[Shape]:
-        """Return the shapes of an object; raise ``MeshError`` that names it."""
-        label = _label(entity)
-        try:
-            types = self._checked_types(entity)
-            source = Source(
-                shown(entity.GlobalId),
-                label,
-                declared_sizes(self._model, entity, types, self._units.length_m),
-                _name(self._relations.host(entity)),
-                _name(self._relations.storey(entity)),
-            )
-            items = body_items(self._model, entity, types)
-            world_from_object = placement_matrix(entity.ObjectPlacement, self._placements)
-            sweeps = [self._sweep(item.item) for item in items]
-        except MeshError as error:
-            raise MeshError(f"{label}: {error}") from error
-        except DAMAGE as error:
-            reason = shorten(str(error), 400) or type(error).__name__
-            raise MeshError(f"{label} has no readable shape: {reason}") from error
-        shapes: list[Shape] = []
-        size = _Size()
-        for item, sweep in zip(items, sweeps, strict=True):
-            matrix = world_from_object @ item.object_from_item
-            shape = (
-                self._surface(source, item, matrix)
-                if sweep is None
-                else self._bar(source, role(entity, types), sweep, matrix, item.scale)
-            )
-            size.add(label, len(_points_m(shape)))
-            shapes.append(shape)
-        return shapes
-
-    def _checked_types(self, entity: Entity) -> list[Entity]:
-        """Return the types of an object; raise ``MeshError`` unless its attributes were read as written."""
-        check = self._model.check
-        check.attributes(
-            entity, *("GlobalId", "Name", "ObjectType", "ObjectPlacement", "Representation"),
-            *("PredefinedType", "BarRole"),
-        )  # fmt: skip
-        if entity.ObjectPlacement is not None:
-            check.tree(entity.ObjectPlacement)
-        return type_objects(self._model, entity)
-
-    def _sweep(self, solid: Entity) -> Sweep | None:
-        if solid.id() not in self._sweeps:
-            self._sweeps[solid.id()] = read_sweep(solid, self._units)
-        return self._sweeps[solid.id()]
-
-    def _bar(
-        self, source: Source, bar_role: str, sweep: Sweep, matrix: Float64[ndarray, "4 4"], scale: float
-    ) -> SweptBar:
-        axis = sweep.axis @ matrix[:3, :3].T + matrix[:3, 3]
-        unit_m = self._units.length_m
-        return SweptBar(source, bar_role, axis * unit_m, sweep.diameter * scale * unit_m, sweep.notes)
-
-    def _surface(self, source: Source, item: BodyItem, matrix: Float64[ndarray, "4 4"]) -> Surface:
-        number = item.item.id()
-        if number not in self._meshes:
-            with self._kernel_step(source.label, f"the body is a {item.item.is_a()}"):
-                self._meshes[number] = _tessellated(self._model, number)
-        vertices_m, faces = self._meshes[number]
-        if np.linalg.det(matrix[:3, :3]) < 0:  # A reflection turns the triangles inside out.
-            faces = faces[:, ::-1]
-        return Surface(source, vertices_m @ matrix[:3, :3].T + matrix[:3, 3] * self._units.length_m, faces)
-
-
-def _tessellated(model: Model, number: int) -> tuple[Float64[ndarray, "v 3"], Int32[ndarray, "f 3"]]:
-    """Return the surface of an item, metres; raise ``ShapeError`` if it cannot be tessellated."""
-    try:
-        vertices, faces = item_mesh(model, number)
-    except RuntimeError as error:
-        if "bad_alloc" in str(error):
-            raise MemoryError from error
-        raise ShapeError(str(error) or "the geometry kernel failed") from error
-    if not len(faces):
-        raise ShapeError("has no surface")
-    return np.array(vertices, np.float64).reshape(-1, 3), np.array(faces, np.int32).reshape(-1, 3)
-
-
-def _name(entity: Entity | None) -> str | None:
-    """Return the name of a host or storey, or its GlobalId if it has no name."""
-    return None if entity is None else shown(entity.Name or entity.GlobalId)
-
-
-def _label(entity: Entity) -> str:
-    """Return the object's name in error messages: class, GlobalId and instance number."""
-    return f"{entity.is_a()} {shown(entity.GlobalId)} (#{entity.id()})"
-
+SECONDS_PER_SHAPE = 60
+"""Time limit for tessellating one object; SIGALRM ends the process after it."""
 
 _FOOT_M = 0.3048
 _SAME_PARAMETER = 1e-6
@@ -285,28 +78,176 @@ _OBLIQUE = 1e-6
 """Smallest 1 - cos of the angle between an extrusion and its circle's axis that makes it no bar."""
 
 
-@dataclass(frozen=True)
-class Units:
-    """Units of a project: length in metres, plane angle in radians."""
+class ShapeError(MeshError):
+    """Solid that the geometry kernel cannot tessellate; the message is the reason alone."""
 
-    length_m: float
-    angle_rad: float
+
+_Arrays = tuple[ndarray, ...]
+_Shape = tuple[BarRecord | SurfaceRecord, _Arrays]
+
+
+def read_bars(content: bytes, select: Sequence[Selection] = ()) -> Iterator[tuple[Record, _Arrays]]:
+    """Yield the records of an IFC file's ``content`` with their arrays, but for the last one of an answer.
+
+    They are the project, the objects that are left out, and the shapes in the file's order, with a ``StepRecord``
+    before the geometry kernel is used. ``select`` chooses objects (``choose_objects``).
+
+    Raises ``MeshError`` if the file is not a complete IFC file, has no known length unit, nothing to read or too
+    much of it, if a bar depends on an instance that was not read as written, or if it has no usable geometry;
+    ``ShapeError`` if a solid cannot be tessellated.
+    """
+    model = open_model(content)
+    chosen, left_out = choose_objects(model, select)
+    for relation in model.by_type("IfcRelDefinesByType"):
+        model.check.attributes(relation, "RelatedObjects", "RelatingType")
+    reader = _Reader(model)
+    yield ProjectRecord(unit_m=reader.units.length_m), ()
+    for record in left_out:
+        yield record, ()
+    outside = 0
+    for entity, tables in chosen:
+        shapes = yield from reader.shapes(entity)
+        points = np.concatenate([arrays[0] for _, arrays in shapes]) / reader.units.length_m
+        if tables and not any(table.contains(points) for table in tables):
+            outside += 1
+            yield left_out_record(entity, "not inside the box of a [[select]] table"), ()
+        else:
+            yield from shapes
+    if outside == len(chosen):
+        found = f"{outside} selected objects are not wholly inside"
+        raise MeshError(f"no object is inside the box of a [[select]] table: {found}, expected one or more")
+
+
+class _Reader:
+    """Reader of a model's objects, which share placements and solids."""
+
+    def __init__(self, model: Model) -> None:
+        self._model = model
+        self.units = project_units(model)
+        self._placements: dict[int, Float64[ndarray, "4 4"]] = {}
+        self._sweeps: dict[int, Sweep | None] = {}
+        self._meshes: dict[int, tuple[Float64[ndarray, "v 3"], Int32[ndarray, "f 3"]]] = {}
+        self._num_shapes = self._num_points = 0
+
+    def shapes(self, entity: Entity) -> Generator[tuple[StepRecord, _Arrays], None, list[_Shape]]:
+        """Return the shapes of an object, after a step for each solid that is tessellated.
+
+        Raises ``MeshError`` that names the object.
+        """
+        label = object_label(entity)
+        try:
+            types = self._checked_types(entity)
+            source = source_record(self._model, entity, types, self.units.length_m)
+            bar_role = role(entity, types)
+            items = body_items(self._model, entity, types)
+            world_from_object = placement_matrix(entity.ObjectPlacement, self._placements)
+            sweeps = [self._sweep(item.item) for item in items]
+        except MeshError as error:
+            raise MeshError(f"{label}: {error}") from error
+        except DAMAGE as error:
+            reason = shorten(str(error), 400) or type(error).__name__
+            raise MeshError(f"{label} has no readable shape: {reason}") from error
+        unit_m = self.units.length_m
+        shapes: list[_Shape] = []
+        for item, sweep in zip(items, sweeps, strict=True):
+            matrix = world_from_object @ item.object_from_item
+            turn, origin = matrix[:3, :3], matrix[:3, 3]
+            if sweep is not None:
+                axis_m = (sweep.axis @ turn.T + origin) * unit_m
+                bar = BarRecord(
+                    source=source,
+                    notes=sweep.notes,
+                    role=bar_role,
+                    diameter_m=sweep.diameter * item.scale * unit_m,
+                    points=len(axis_m),
+                )
+                shapes.append((bar, (axis_m,)))
+            else:
+                if item.item.id() not in self._meshes:
+                    reason = f"the body is a {item.item.is_a()}"
+                    yield StepRecord(label=label, reason=printable(reason)), ()
+                    self._meshes[item.item.id()] = _tessellated(item.item)
+                mesh_vertices_m, faces = self._meshes[item.item.id()]
+                if np.linalg.det(turn) < 0:  # A reflection turns the triangles inside out.
+                    faces = faces[:, ::-1]
+                vertices_m = mesh_vertices_m @ turn.T + origin * unit_m
+                surface = SurfaceRecord(source=source, vertices=len(vertices_m), faces=len(faces))
+                shapes.append((surface, (vertices_m, faces)))
+            self._count(label, len(shapes[-1][1][0]))
+        return shapes
+
+    def _checked_types(self, entity: Entity) -> list[Entity]:
+        """Return the types of an object; raise ``MeshError`` unless its attributes were read as written."""
+        check = self._model.check
+        check.attributes(
+            entity, *("GlobalId", "Name", "ObjectType", "ObjectPlacement", "Representation"),
+            *("PredefinedType", "BarRole"),
+        )  # fmt: skip
+        if entity.ObjectPlacement is not None:
+            check.tree(entity.ObjectPlacement)
+        return type_objects(self._model, entity)
+
+    def _sweep(self, solid: Entity) -> Sweep | None:
+        if solid.id() not in self._sweeps:
+            self._sweeps[solid.id()] = read_sweep(solid, self.units)
+        return self._sweeps[solid.id()]
+
+    def _count(self, label: str, num_points: int) -> None:
+        """Count a shape of the object ``label``; raise ``MeshError`` if there are too many shapes or points."""
+        self._num_shapes, self._num_points = self._num_shapes + 1, self._num_points + num_points
+        if self._num_shapes > MAX_BARS or self._num_points > MAX_POINTS:
+            raise MeshError(
+                f"{label}: {self._num_shapes} bars of {self._num_points} points up to this object, "
+                f"expected at most {MAX_BARS} and {MAX_POINTS}"
+            )
+
+
+def _tessellated(solid: Entity) -> tuple[Float64[ndarray, "v 3"], Int32[ndarray, "f 3"]]:
+    """Return vertices (metres, frame of the solid) and triangles; the geometry kernel may hang or crash.
+
+    Raises ``ShapeError`` if the kernel cannot tessellate the solid, and ``MemoryError`` at the limit of memory.
+    """
+    settings = geom.settings()
+    settings.set("mesher-linear-deflection", 1e-5)
+    settings.set("mesher-angular-deflection", 0.15)
+    try:
+        with limited_time():
+            mesh = geom.create_shape(settings, solid)
+    except RuntimeError as error:
+        if "bad_alloc" in str(error):
+            raise MemoryError from error
+        raise ShapeError(str(error) or "the geometry kernel failed") from error
+    if not len(mesh.faces):
+        raise ShapeError("has no surface")
+    return np.array(mesh.verts, np.float64).reshape(-1, 3), np.array(mesh.faces, np.int32).reshape(-1, 3)
+
+
+@contextmanager
+def limited_time() -> Iterator[None]:
+    """Let SIGALRM end the process after ``SECONDS_PER_SHAPE``, or at the end of its own time if that is sooner."""
+    begin_s, left_s = time.monotonic(), signal.getitimer(signal.ITIMER_REAL)[0]
+    signal.setitimer(signal.ITIMER_REAL, min(left_s or math.inf, SECONDS_PER_SHAPE))
+    try:
+        yield
+    finally:
+        used_s = time.monotonic() - begin_s
+        signal.setitimer(signal.ITIMER_REAL, max(left_s - used_s, 1e-6) if left_s else 0)
 
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """Circle swept along an axis, in the frame and unit of its file; ``notes`` are pairs of a code and a text."""
+    """Circle swept along an axis, in the frame and unit of its file, and notes on how it was read."""
 
     axis: Float64[ndarray, "n 3"]
     diameter: float
-    notes: tuple[tuple[str, str], ...] = ()
+    notes: list[NoteRecord]
 
 
 def read_sweep(solid: Any, units: Units) -> Sweep | None:
     """Return the sweep that a solid is, or None if it is not the sweep of a circle.
 
     Raises ``ValueError`` if an IfcSweptDiskSolid has a curve that is not supported, degenerate or not connected,
-    or has parameters that are not on the curve.
+    has no radius, or has parameters that are not on the curve.
     """
     if solid.is_a("IfcSweptDiskSolid"):
         return _swept_disc(solid, units)
@@ -316,25 +257,32 @@ def read_sweep(solid: Any, units: Units) -> Sweep | None:
 
 
 def _swept_disc(solid: Any, units: Units) -> Sweep:
-    diameter = 2 * float(solid.Radius)
-    notes = _hollow_note(solid.InnerRadius)
+    diameter, notes = _diameter(solid.Radius), _hollow_notes(solid.InnerRadius)
     whole = curve_pieces(solid.Directrix, units.angle_rad)
     pieces = _swept_pieces(solid, whole, units.length_m)
     line, gap = _joined(pieces, diameter)
     axis = _drop_repeated_points(line)
     if gap > _NOTED_GAP * diameter:
-        notes += (("gap", f"closed a gap of {gap / diameter:.0%} of the diameter between two segments"),)
+        found = f"closed a gap of {gap / diameter:.0%} of the diameter between two segments"
+        notes.append(NoteRecord(code="gap", text=found))
     if pieces is not whole:
         share = _length(axis) / sum(_length(piece.points()) for piece in whole)
         found = f"the curve is swept from {solid.StartParam} to {solid.EndParam}, {share:.1%} of its length"
-        notes += (("cut", found),)
+        notes.append(NoteRecord(code="cut", text=found))
     if solid.is_a("IfcSweptDiskSolidPolygonal") and solid.FilletRadius:
         axis = bent_line_m(axis, solid.FilletRadius, ARC_STEP_DEG)
     return Sweep(axis, diameter, notes)
 
 
-def _hollow_note(inner_radius: float | None) -> tuple[tuple[str, str], ...]:
-    return (("hollow", "a hollow bar is taken to be solid"),) if inner_radius else ()
+def _diameter(radius: float) -> float:
+    """Return the diameter for a radius; raise ``ValueError`` unless it is finite and above 0."""
+    if not 0 < radius < math.inf:
+        raise ValueError(f"a circle has the radius {radius:g}, expected above 0")
+    return 2 * float(radius)
+
+
+def _hollow_notes(inner_radius: float | None) -> list[NoteRecord]:
+    return [NoteRecord(code="hollow", text="a hollow bar is taken to be solid")] if inner_radius else []
 
 
 def _extruded_circle(solid: Any) -> Sweep | None:
@@ -345,8 +293,8 @@ def _extruded_circle(solid: Any) -> Sweep | None:
     start = np.array((0.0, 0.0, 0.0) if profile.Position is None else point_xyz(profile.Position.Location))
     matrix = np.eye(4) if solid.Position is None else axis_placement(solid.Position)
     ends = np.array([start, start + float(solid.Depth) * along]) @ matrix[:3, :3].T + matrix[:3, 3]
-    notes = _hollow_note(getattr(profile, "WallThickness", None))
-    return Sweep(_drop_repeated_points(ends), 2 * float(profile.Radius), notes)
+    notes = _hollow_notes(getattr(profile, "WallThickness", None))
+    return Sweep(_drop_repeated_points(ends), _diameter(profile.Radius), notes)
 
 
 def _swept_pieces(solid: Any, pieces: list[Piece], unit_m: float) -> list[Piece]:

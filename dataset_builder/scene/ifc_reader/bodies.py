@@ -143,15 +143,6 @@ class BodyItem:
     scale: float
 
 
-def type_objects(model: Model, entity: Entity) -> list[Entity]:
-    """Return the IfcTypeObjects that define an object; raise ``MeshError`` if one was not read as written."""
-    relations = [*(getattr(entity, "IsTypedBy", None) or ()), *(getattr(entity, "IsDefinedBy", None) or ())]
-    types = [relation.RelatingType for relation in relations if relation.is_a("IfcRelDefinesByType")]
-    for type_object in types:
-        model.check.attributes(type_object, "PredefinedType", "BarRole", "RepresentationMaps")
-    return types
-
-
 def body_items(model: Model, entity: Entity, types: list[Entity]) -> list[BodyItem]:
     """Return the items of an object's Body, or of the Body of its type if it has none, in order.
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from jaxtyping import Float64
@@ -23,32 +23,43 @@ ARC_STEP_DEG = 6.0
 
 
 @dataclass(frozen=True, eq=False)
-class Leg:
+class Sampled:
+    """Curve sampled at increasing ``shares`` (0 to 1) of its parameter range ``parameters``."""
+
+    line: Float64[ndarray, "n 3"]
+    shares: Float64[ndarray, " n"]
+    parameters: float
+
+    def points(self) -> Float64[ndarray, "n 3"]:
+        """Return the sampled points."""
+        return self.line
+
+    def part(self, first: float, last: float) -> Self:
+        """Return the part between two shares of the parameter range, interpolated at its ends."""
+        inner = (self.shares > first) & (self.shares < last)
+        at = np.concatenate([[first], self.shares[inner], [last]])
+        line = np.stack([np.interp(at, self.shares, column) for column in self.line.T], axis=-1)
+        size = last - first
+        return replace(self, line=line, shares=(at - first) / size, parameters=self.parameters * size)
+
+    def reversed(self) -> Self:
+        """Return the curve from its end to its start."""
+        return replace(self, line=self.line[::-1], shares=1 - self.shares[::-1])
+
+
+@dataclass(frozen=True, eq=False)
+class Leg(Sampled):
     """Straight leg; ``parameters`` is its parameter range: 1 in a polyline, else a multiple of a line's vector."""
 
-    start: Float64[ndarray, " 3"]
-    end: Float64[ndarray, " 3"]
-    parameters: float
+    @classmethod
+    def between(cls, start: Float64[ndarray, " 3"], end: Float64[ndarray, " 3"], parameters: float = 1.0) -> Leg:
+        """Return the leg between two points."""
+        return cls(np.array([start, end]), np.array([0.0, 1.0]), parameters)
 
     @property
     def length(self) -> float:
         """Length of the leg."""
-        return float(np.linalg.norm(self.end - self.start))
-
-    def points(self) -> Float64[ndarray, "2 3"]:
-        """Return both ends."""
-        return np.array([self.start, self.end])
-
-    def part(self, first: float, last: float) -> Leg:
-        """Return the part between two shares (0 to 1) of the parameter range."""
-        along = self.end - self.start
-        start = self.start if first == 0 else self.start + first * along
-        end = self.end if last == 1 else self.start + last * along
-        return Leg(start, end, self.parameters * (last - first))
-
-    def reversed(self) -> Leg:
-        """Return the leg from its end to its start."""
-        return replace(self, start=self.end, end=self.start)
+        return float(np.linalg.norm(self.line[1] - self.line[0]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,31 +98,7 @@ class Arc:
         return replace(self, first_rad=self.first_rad + self.turn_rad, turn_rad=-self.turn_rad)
 
 
-@dataclass(frozen=True, eq=False)
-class Sampled:
-    """Curve sampled at increasing ``shares`` (0 to 1) of its parameter range ``parameters``."""
-
-    line: Float64[ndarray, "n 3"]
-    shares: Float64[ndarray, " n"]
-    parameters: float
-
-    def points(self) -> Float64[ndarray, "n 3"]:
-        """Return the sampled points."""
-        return self.line
-
-    def part(self, first: float, last: float) -> Sampled:
-        """Return the part between two shares of the parameter range, interpolated at its ends."""
-        inner = (self.shares > first) & (self.shares < last)
-        at = np.concatenate([[first], self.shares[inner], [last]])
-        line = np.stack([np.interp(at, self.shares, column) for column in self.line.T], axis=-1)
-        return Sampled(line, (at - first) / (last - first), self.parameters * (last - first))
-
-    def reversed(self) -> Sampled:
-        """Return the curve from its end to its start."""
-        return Sampled(self.line[::-1], 1 - self.shares[::-1], self.parameters)
-
-
-Piece = Leg | Arc | Sampled
+Piece = Sampled | Arc
 
 
 def arc_through(
@@ -125,7 +112,7 @@ def arc_through(
     to_middle, to_end = middle - start, end - start
     normal = np.cross(to_middle, to_end)
     if np.linalg.norm(normal) <= 1e-9 * np.linalg.norm(to_middle) * np.linalg.norm(to_end):
-        return [Leg(start, middle, 1.0), Leg(middle, end, 1.0)]
+        return [Leg.between(start, middle), Leg.between(middle, end)]
     x_axis = to_end / np.linalg.norm(to_end)
     y_axis = np.cross(normal, x_axis) / np.linalg.norm(normal)
     half = float(np.linalg.norm(to_end)) / 2
@@ -180,7 +167,7 @@ def curve_pieces(curve: Any, angle_rad: float, depth: int = 0) -> list[Piece]:
 
 
 def _legs(points: Float64[ndarray, "n 3"]) -> list[Piece]:
-    return [Leg(start, end, 1.0) for start, end in pairwise(points)]
+    return [Leg.between(start, end) for start, end in pairwise(points)]
 
 
 def _polyline(curve: Any, _angle_rad: float, _depth: int) -> list[Piece]:
@@ -248,7 +235,7 @@ def _trimmed_line(curve: Any, line: Any) -> Leg:
         _trim_parameter(curve, trim, lambda point: float((point - start) @ along / (along @ along)), 1.0)
         for trim in "12"
     )
-    return Leg(start + first * along, start + last * along, abs(last - first))
+    return Leg.between(start + first * along, start + last * along, abs(last - first))
 
 
 def _trimmed_conic(curve: Any, conic: Any, angle_rad: float) -> Arc:

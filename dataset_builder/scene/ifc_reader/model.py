@@ -1,4 +1,4 @@
-"""IFC models: opening with checks of completeness, units, tessellation, and the check of single instances.
+"""IFC models: opening with checks of completeness, and the check of single instances.
 
 The parser skips what it cannot read and goes on, which could place a bar wrongly without an error. It turns an
 attribute that it cannot parse, and a reference to an instance that it could not read, into null or drops it from a
@@ -17,31 +17,19 @@ from typing import Any
 
 import ifcopenshell
 import numpy as np
-from ifcopenshell import entity_instance, geom, ifcopenshell_wrapper
+from ifcopenshell import entity_instance, ifcopenshell_wrapper
 from ifcopenshell import ifcopenshell_wrapper as wrapper
 
 from dataset_builder.scene.ifc_reader.step_text import (
     StepText,
     class_name,
     same_tokens,
-    same_values,
     split_arguments,
 )
 from rebar_depth_bench.errors import MeshError, escape_text
 
 _LOGGED_REASON = re.compile(r"\] (?!Pars)[A-Za-z]")
 """Message in the parser's log that gives a reason, after severity and time; out of memory, it may be cut off."""
-_PREFIXES: dict[str | None, float] = {
-    None: 1.0,
-    **dict(
-        zip(
-            ("DECI", "CENTI", "MILLI", "MICRO", "NANO", "PICO"), (1e-1, 1e-2, 1e-3, 1e-6, 1e-9, 1e-12), strict=True
-        )
-    ),
-    **dict(zip(("DECA", "HECTO", "KILO", "MEGA", "GIGA"), (1e1, 1e2, 1e3, 1e6, 1e9), strict=True)),
-}
-_MAX_UNIT_DEPTH = 10
-"""Largest number of units that are each defined by the next, such as an inch by a foot by a metre."""
 
 
 @dataclass(frozen=True)
@@ -105,60 +93,6 @@ def _has_class(schema: Any, name: str) -> bool:
     return True
 
 
-def item_mesh(model: Model, number: int) -> tuple[Any, Any]:
-    """Return vertices (flat, metres, frame of the item) and triangles (flat) of the solid ``number``.
-
-    Raises ``RuntimeError`` if the geometry kernel cannot tessellate it. The kernel may also hang or crash.
-    """
-    settings = geom.settings()
-    settings.set("mesher-linear-deflection", 1e-5)
-    settings.set("mesher-angular-deflection", 0.15)
-    mesh = geom.create_shape(settings, model.file.by_id(number))
-    return mesh.verts, mesh.faces
-
-
-def length_unit_m(model: Model) -> float:
-    """Return the project's length unit in metres; raise ``MeshError`` if the file does not define a known one."""
-    metres = _project_unit(model, "LENGTHUNIT", "METRE")
-    if metres is None:
-        raise MeshError("the project has no known length unit, expected for example metres or feet")
-    return metres
-
-
-def angle_unit_rad(model: Model) -> float:
-    """Return the project's plane angle unit in radians, 1.0 if the file does not define a known one."""
-    return _project_unit(model, "PLANEANGLEUNIT", "RADIAN") or 1.0
-
-
-def _project_unit(model: Model, kind: str, base: str) -> float | None:
-    """Return the project unit of a kind, expressed in the SI unit ``base``, or None."""
-    for project in model.by_type("IfcProject"):
-        model.check.attributes(project, "UnitsInContext")
-        if project.UnitsInContext is None:
-            continue
-        model.check.attributes(project.UnitsInContext)
-        for unit in project.UnitsInContext.Units:
-            if unit.is_a("IfcNamedUnit"):
-                model.check.attributes(unit, "UnitType")
-                if unit.UnitType == kind:
-                    model.check.tree(unit)
-                    return _to_base_unit(unit, base)
-    return None
-
-
-def _to_base_unit(unit: Entity, base: str) -> float | None:
-    """Return the factor from an IFC unit to the SI unit ``base``, or None if it is not such a unit."""
-    factor = 1.0
-    for _ in range(_MAX_UNIT_DEPTH):
-        if not unit.is_a("IfcConversionBasedUnit"):  # For example, a foot defined as a number of metres.
-            break
-        factor *= float(unit.ConversionFactor.ValueComponent.wrappedValue)
-        unit = unit.ConversionFactor.UnitComponent
-    if not unit.is_a("IfcSIUnit") or unit.Name != base or unit.Prefix not in _PREFIXES or not factor > 0:
-        return None
-    return float(factor * _PREFIXES[unit.Prefix])
-
-
 _types: Any = ifcopenshell_wrapper
 Entity = Any
 """An ``ifcopenshell.entity_instance``, with the attributes of its IFC class."""
@@ -187,9 +121,6 @@ _DIMENSION: dict[str, int | None] = {
 }
 """Dimension of the points below instances of a class; None: that of its first point."""
 
-_COORDINATES = {name: f"{name.upper()}((" for name in ("IfcCartesianPoint", "IfcDirection")}
-"""Beginning of the text of an instance that has nothing but coordinates, by class."""
-
 _PYTHON_TYPES: dict[str, tuple[type, ...]] = {
     "string": (str,),
     "binary": (str,),
@@ -203,16 +134,12 @@ _PYTHON_TYPES: dict[str, tuple[type, ...]] = {
 
 @dataclass(frozen=True)
 class _Attribute:
-    """Attribute of a class: position, name, type as text, and whether a value is valid; None: any value.
-
-    ``may_refer`` is False if no value refers to an instance.
-    """
+    """Attribute of a class: position, name, type as text, and whether a value is valid; None: any value."""
 
     index: int
     name: str
     kind: str
     accepts: Callable[[Any], bool] | None
-    may_refer: bool
 
 
 class SourceCheck:
@@ -222,17 +149,24 @@ class SourceCheck:
         self._schema, self._step = schema, step
         self._attributes: dict[str, list[_Attribute]] = {}
         self._used: dict[tuple[str, tuple[str, ...]], list[_Attribute]] = {}
+        self._checked: set[tuple[int, tuple[str, ...]]] = set()
         self._seen: set[int] = set()
         self._dimensions: dict[int, frozenset[int]] = {}
 
-    def attributes(self, entity: Entity, *names: str) -> list[Entity]:
-        """Check the attributes ``names`` of an instance, or all; return the instances that they refer to.
+    def attributes(self, entity: Entity, *names: str) -> None:
+        """Check the attributes ``names`` of an instance, or all, once; a class may lack some of the names.
 
-        A class may lack some of the names.
+        A relation is checked for each of the objects that it holds, which may be all bars of a model.
         """
+        if (entity.id(), names) not in self._checked:
+            self._check_attributes(entity, names)
+            self._checked.add((entity.id(), names))
+
+    def _check_attributes(self, entity: Entity, names: tuple[str, ...]) -> list[Entity]:
+        """Check the attributes ``names`` of an instance, or all; return the instances that they refer to."""
         used = self._used_attributes(entity.is_a(), names)
         source, written = self._step.instance(entity.id()), entity.to_string(True).partition("=")[2]
-        if source != written and not same_values(source, written):
+        if source != written:
             self._compare(entity, used, source, written)
         references: list[Entity] = []
         for attribute in used:
@@ -241,8 +175,7 @@ class SourceCheck:
             if not attribute.accepts(value):
                 found = "null" if value is None else escape_text(shorten(str(value), 60))
                 raise MeshError(f"{_where(entity, attribute)} is {found}, expected {shorten(attribute.kind, 80)}")
-            if attribute.may_refer:
-                references += _references(value)
+            references += _references(value)
         return references
 
     def tree(self, root: Entity) -> None:
@@ -254,31 +187,9 @@ class SourceCheck:
                 self._dimensions[entity.id()] = self._dimensions_below(entity, references)
             elif entity.id() not in self._seen:
                 self._seen.add(entity.id())
-                if size := self._size_as_written(entity):
-                    self._dimensions[entity.id()] = frozenset((size,))
-                    continue
-                references = self.attributes(entity)
+                references = self._check_attributes(entity, ())
                 stack.append((entity, references))  # It is completed after the instances below it.
                 stack += [(reference, None) for reference in references]
-
-    def _size_as_written(self, entity: Entity) -> int:
-        """Return the number of coordinates (2 or 3) of a point or direction that is as written, else 0.
-
-        Half of the instances below a bar are of these classes, in their plain form. Of others, and of any doubt,
-        the result is 0: ``attributes`` decides.
-        """
-        name = entity.is_a()
-        if name not in _COORDINATES:
-            return 0
-        source = self._step.instance(entity.id())
-        begin, end = _COORDINATES[name], "))"
-        if not (source.startswith(begin) and source.endswith(end)):
-            return 0
-        try:
-            written = tuple(map(float, source[len(begin) : -len(end)].split(",")))
-        except ValueError:
-            return 0
-        return len(written) if len(written) in (2, 3) and written == entity.get_argument(0) else 0
 
     def _dimensions_below(self, entity: Entity, references: list[Entity]) -> frozenset[int]:
         """Return the numbers of coordinates of the points and directions that define an instance.
@@ -286,7 +197,7 @@ class SourceCheck:
         The set is empty for classes whose points are in several spaces.
         """
         name = entity.is_a()
-        if name in _COORDINATES:
+        if name in ("IfcCartesianPoint", "IfcDirection"):
             size = len(entity.get_argument(0))
             if size not in (2, 3):
                 raise MeshError(f"#{entity.id()} ({name}) has {size} coordinates, expected 2 or 3")
@@ -352,7 +263,7 @@ class SourceCheck:
         accepts = None if derived or name in _UNUSED else _predicate(kind)
         if accepts and (declared.optional() or name in _MAY_BE_NULL):
             accepts = _or_null(accepts)
-        return _Attribute(index, name, str(kind), accepts, _may_refer(kind))
+        return _Attribute(index, name, str(kind), accepts)
 
 
 def _where(entity: Entity, attribute: _Attribute) -> str:
@@ -367,13 +278,6 @@ def _references(value: Any) -> Iterator[Entity]:
     elif isinstance(value, tuple):
         for item in value:
             yield from _references(item)
-
-
-def _may_refer(kind: Any) -> bool:
-    """Return whether values of a type can refer to instances."""
-    while isinstance(kind, _types.named_type | _types.type_declaration | _types.aggregation_type):
-        kind = kind.type_of_element() if isinstance(kind, _types.aggregation_type) else kind.declared_type()
-    return not isinstance(kind, _types.simple_type | _types.enumeration_type)
 
 
 def _or_null(accepts: Callable[[Any], bool]) -> Callable[[Any], bool]:

@@ -36,9 +36,6 @@ _TOKEN = re.compile(
     re.ASCII,
 )
 
-_PIECE = re.compile(
-    r"'(?:[^']|'')*+'|\#\d++|[A-Za-z]\w*+|[-+]?+\d++(?:\.\d*+)?+(?:[Ee][-+]?+\d++)?+|.", re.ASCII | re.DOTALL
-)
 _NUMBER_STARTS = frozenset("+-0123456789")
 
 
@@ -128,22 +125,6 @@ def split_arguments(instance: str) -> list[list[str]] | None:
             arguments[-1].append(value)
         depth += value == "("
     return arguments if depth == 0 and position == len(instance) else None
-
-
-def same_values(first: str, second: str) -> bool:
-    """Return whether two texts of instances are the same but for the form of their numbers.
-
-    This is much faster than the comparison of split arguments, which also knows comments and other spellings.
-    """
-    pieces = _PIECE.findall(first), _PIECE.findall(second)
-    return len(pieces[0]) == len(pieces[1]) and all(
-        a == b or (_is_number(a) and _is_number(b) and float(a) == float(b)) for a, b in zip(*pieces, strict=True)
-    )
-
-
-def _is_number(piece: str) -> bool:
-    """Return whether a piece is a number; a lone sign is none."""
-    return piece[0] in _NUMBER_STARTS and piece[-1] not in "+-"
 
 
 def same_tokens(first: list[str], second: list[str]) -> bool:

@@ -19,8 +19,9 @@ import pytest
 
 from dataset_builder.config.scene_file import scene_config
 from dataset_builder.scene.assemblies import ifc_file as process
-from dataset_builder.scene.assemblies.ifc_file import MAX_ARRAY_BYTES, Answer, AnswerError, ifc_cage
-from dataset_builder.scene.ifc_reader.__main__ import SECONDS_PER_SHAPE, _limited_time
+from dataset_builder.scene.assemblies.ifc_file import Answer
+from dataset_builder.scene.ifc_reader.bars import SECONDS_PER_SHAPE, limited_time
+from dataset_builder.scene.ifc_records import MAX_ARRAY_BYTES, AnswerError, ifc_cage
 from dataset_builder.scene.model import MAX_BARS
 from rebar_depth_bench.errors import InputError, MeshError
 from rebar_depth_bench.limits import IFC_MEMORY_BYTES, IFC_SECONDS
@@ -120,7 +121,7 @@ def test_large_model_is_read_by_one_process(monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_time_limit_ends_with_the_use_of_the_kernel() -> None:
-    with _limited_time():
+    with limited_time():
         assert 0 < signal.getitimer(signal.ITIMER_REAL)[0] <= SECONDS_PER_SHAPE
     assert signal.getitimer(signal.ITIMER_REAL)[0] == 0
 
