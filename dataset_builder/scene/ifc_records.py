@@ -7,7 +7,7 @@ writes it, and ``assemblies.ifc_file`` reads it, as data of a stranger: the writ
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import IO, Annotated, Literal
+from typing import IO, Annotated, ClassVar, Literal
 
 import numpy as np
 from numpy import ndarray
@@ -26,7 +26,6 @@ _MAX_LINE_BYTES = 20_000
 _Label = Annotated[str, Field(min_length=1, max_length=200)]
 _Message = Annotated[str, Field(max_length=MAX_MESSAGE)]
 _Size = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-_Arrays = tuple[tuple[int, str], ...]
 
 
 class AnswerError(Exception):
@@ -59,12 +58,9 @@ class NoteRecord(StrictModel):
 
 
 class _Record(StrictModel):
-    """Record without arrays."""
+    """Record; ``ARRAYS`` are its arrays: field with the number of rows, of three values, and data type of each."""
 
-    @property
-    def arrays(self) -> _Arrays:
-        """Number of rows, of three values, and data type of each array that follows."""
-        return ()
+    ARRAYS: ClassVar[tuple[tuple[str, str], ...]] = ()
 
 
 class ProjectRecord(_Record):
@@ -85,6 +81,7 @@ class LeftOutRecord(_Record):
 class BarRecord(_Record):
     """Bar with an axis; its points follow (the file's frame, metres)."""
 
+    ARRAYS = (("points", "<f8"),)
     kind: Literal["bar"] = "bar"
     source: Source
     notes: Annotated[list[NoteRecord], Field(max_length=10)]
@@ -92,24 +89,15 @@ class BarRecord(_Record):
     diameter_m: _Size
     points: Annotated[int, Field(ge=2)]
 
-    @property
-    def arrays(self) -> _Arrays:
-        """Points of the axis."""
-        return ((self.points, "<f8"),)
-
 
 class SurfaceRecord(_Record):
     """Tessellated solid, of one or several bars; vertices (the file's frame, metres) and triangles follow."""
 
+    ARRAYS = (("vertices", "<f8"), ("faces", "<i4"))
     kind: Literal["surface"] = "surface"
     source: Source
     vertices: Annotated[int, Field(ge=3)]
     faces: Annotated[int, Field(ge=1)]
-
-    @property
-    def arrays(self) -> _Arrays:
-        """Vertices and triangles."""
-        return (self.vertices, "<f8"), (self.faces, "<i4")
 
 
 class StepRecord(_Record):
@@ -124,7 +112,7 @@ class FailureRecord(_Record):
     """Reason for which reading ended."""
 
     kind: Literal["failure"] = "failure"
-    cause: Literal["file", "memory", "package", "shape"]
+    cause: Literal["file", "memory", "shape"]
     message: _Message
 
 
@@ -142,7 +130,7 @@ _RECORD: TypeAdapter[Record] = TypeAdapter(Annotated[Record, Field(discriminator
 def write_record(stream: IO[bytes], record: Record, arrays: Sequence[ndarray] = ()) -> None:
     """Write a record with its arrays, at once: a later crash of the process does not hide it."""
     stream.write(record.model_dump_json().encode() + b"\n")
-    for array, (_, dtype) in zip(arrays, record.arrays, strict=True):
+    for array, (_, dtype) in zip(arrays, record.ARRAYS, strict=True):
         stream.write(np.ascontiguousarray(array, dtype).tobytes())
     stream.flush()
 
@@ -154,10 +142,14 @@ def read_records(stream: IO[bytes]) -> Iterator[tuple[Record, tuple[ndarray, ...
     """
     count, bytes_left = 0, MAX_ARRAY_BYTES
     while not isinstance(record := _read_record(stream), EndRecord):
-        bytes_left -= sum(rows * 3 * np.dtype(dtype).itemsize for rows, dtype in record.arrays)
-        if bytes_left < 0:
-            raise AnswerError(f"arrays of more than {MAX_ARRAY_BYTES} bytes")
-        yield record, tuple(_read_array(stream, rows, dtype) for rows, dtype in record.arrays)
+        arrays = []
+        for rows, dtype in record.ARRAYS:
+            size = getattr(record, rows) * 3 * np.dtype(dtype).itemsize
+            bytes_left -= size
+            if bytes_left < 0:
+                raise AnswerError(f"arrays of more than {MAX_ARRAY_BYTES} bytes")
+            arrays.append(_read_array(stream, size, dtype))
+        yield record, tuple(arrays)
         count += 1
     if record.records != count:
         raise AnswerError(f"{count} records, expected {record.records}")
@@ -176,11 +168,11 @@ def _read_record(stream: IO[bytes]) -> Record:
         raise AnswerError(f"{error.error_count()} invalid values in a record, expected none") from None
 
 
-def _read_array(stream: IO[bytes], rows: int, dtype: str) -> ndarray:
-    content = stream.read(rows * 3 * np.dtype(dtype).itemsize)
-    if len(content) < rows * 3 * np.dtype(dtype).itemsize:
+def _read_array(stream: IO[bytes], size: int, dtype: str) -> ndarray:
+    content = stream.read(size)
+    if len(content) < size:
         raise AnswerError("an array is not complete", ended=True)
-    values = np.frombuffer(content, dtype).reshape(rows, 3)
+    values = np.frombuffer(content, dtype).reshape(-1, 3)
     if not np.isfinite(values).all():
         raise AnswerError("an array has values that are not finite")
     return values

@@ -17,9 +17,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from contextlib import suppress
+from dataclasses import replace
 from typing import IO
 
 import numpy as np
@@ -73,46 +72,6 @@ def ifc_cage(content: bytes, where: str, select: tuple[Selection, ...] = (), tru
             "not installed: ifcopenshell; expected the ifc extra for IFC models: "
             "pip install 'rebar-depth-bench[ifc]'"
         )
-    with _reader(TABLES.dump_json(select) + b"\n" + content) as reader:
-        answer = Answer(reader.stdout, where, trust)
-        try:
-            return answer.cage()
-        except AnswerError as error:
-            if not error.ended:
-                raise MeshError(f"{where}: the IFC reader gave an invalid answer: {error}") from None
-            problem = reader.end_reason()
-        if answer.step is not None:
-            raise answer.no_shape_error(problem)
-        raise MeshError(f"{where}: the file cannot be read: {problem}, expected a sound IFC file")
-
-
-@dataclass(frozen=True)
-class _Reader:
-    """Running process, its answer, and the time of ``time.monotonic`` until which it may run."""
-
-    process: subprocess.Popen[bytes]
-    stdout: IO[bytes]
-    deadline_s: float
-
-    def end_reason(self) -> str:
-        """Return how the process ended, which gave no complete answer."""
-        status = self.process.wait()
-        if status == -signal.SIGXCPU or (status == -signal.SIGALRM and time.monotonic() >= self.deadline_s):
-            return f"reading takes more than {IFC_SECONDS.value()} s ({IFC_SECONDS.variable} raises the limit)"
-        if status == -signal.SIGALRM:
-            return "it takes more than the time limit for one object"
-        end = signal.strsignal(-status) if status < 0 else f"status {status}"
-        return f"ifcopenshell crashed ({end}), or needs {_memory_limit()}"
-
-
-def _memory_limit() -> str:
-    limit = IFC_MEMORY_BYTES
-    return f"more than {limit.value()} bytes of memory ({limit.variable} raises the limit)"
-
-
-@contextmanager
-def _reader(request: bytes) -> Iterator[_Reader]:
-    """Start the process, which sets its own limits, and pass it ``request``; it is killed at the end."""
     seconds = IFC_SECONDS.value()
     wall_seconds = _WALL_CLOCK_FACTOR * seconds
     limits = map(str, (os.getpid(), IFC_MEMORY_BYTES.value(), seconds, wall_seconds))
@@ -122,13 +81,36 @@ def _reader(request: bytes) -> Iterator[_Reader]:
     ) as process:
         assert process.stdin
         assert process.stdout
+        answer = Answer(process.stdout, where, trust)
         try:
             # The pipe is broken if the process has ended, for a reason that its status tells.
             with suppress(BrokenPipeError), process.stdin as stream:
-                stream.write(request)
-            yield _Reader(process, process.stdout, deadline_s)
+                stream.write(TABLES.dump_json(select) + b"\n" + content)
+            return answer.cage()
+        except AnswerError as error:
+            if not error.ended:
+                raise MeshError(f"{where}: the IFC reader gave an invalid answer: {error}") from None
+            problem = _end_reason(process.wait(), time.monotonic() >= deadline_s)
         finally:
             process.kill()
+    if answer.step is not None:
+        raise answer.no_shape_error(problem)
+    raise MeshError(f"{where}: the file cannot be read: {problem}, expected a sound IFC file")
+
+
+def _end_reason(status: int, is_late: bool) -> str:
+    """Return how the process ended, which gave no complete answer; ``is_late``: after its largest duration."""
+    if status == -signal.SIGXCPU or (status == -signal.SIGALRM and is_late):
+        return f"reading takes more than {IFC_SECONDS.value()} s ({IFC_SECONDS.variable} raises the limit)"
+    if status == -signal.SIGALRM:
+        return "it takes more than the time limit for one object"
+    end = signal.strsignal(-status) if status < 0 else f"status {status}"
+    return f"ifcopenshell crashed ({end}), or needs {_memory_limit()}"
+
+
+def _memory_limit() -> str:
+    limit = IFC_MEMORY_BYTES
+    return f"more than {limit.value()} bytes of memory ({limit.variable} raises the limit)"
 
 
 class Answer:

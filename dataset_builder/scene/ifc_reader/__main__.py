@@ -35,7 +35,7 @@ def write_answer(content: bytes, stream: IO[bytes], select: Sequence[Selection] 
         # Imported here, so that a failed import is part of the answer.
         from dataset_builder.scene.ifc_reader.bars import ShapeError, read_bars
     except ImportError as error:
-        write_record(stream, _failure("package", exception_summary(error)))
+        write_record(stream, _failure("file", exception_summary(error)))
         return
     count = 0
     end: EndRecord | FailureRecord
@@ -54,7 +54,7 @@ def write_answer(content: bytes, stream: IO[bytes], select: Sequence[Selection] 
     write_record(stream, end)
 
 
-def _failure(cause: Literal["file", "memory", "package", "shape"], message: str) -> FailureRecord:
+def _failure(cause: Literal["file", "memory", "shape"], message: str) -> FailureRecord:
     return FailureRecord(cause=cause, message=printable(message, MAX_MESSAGE))
 
 

@@ -136,7 +136,14 @@ class _Reader:
         """
         label = object_label(entity)
         try:
-            types = self._checked_types(entity)
+            check = self._model.check
+            check.attributes(
+                entity, *("GlobalId", "Name", "ObjectType", "ObjectPlacement", "Representation"),
+                *("PredefinedType", "BarRole"),
+            )  # fmt: skip
+            if entity.ObjectPlacement is not None:
+                check.tree(entity.ObjectPlacement)
+            types = type_objects(self._model, entity)
             source = source_record(self._model, entity, types, self.units.length_m)
             bar_role = role(entity, types)
             items = body_items(self._model, entity, types)
@@ -175,17 +182,6 @@ class _Reader:
                 shapes.append((surface, (vertices_m, faces)))
             self._count(label, len(shapes[-1][1][0]))
         return shapes
-
-    def _checked_types(self, entity: Entity) -> list[Entity]:
-        """Return the types of an object; raise ``MeshError`` unless its attributes were read as written."""
-        check = self._model.check
-        check.attributes(
-            entity, *("GlobalId", "Name", "ObjectType", "ObjectPlacement", "Representation"),
-            *("PredefinedType", "BarRole"),
-        )  # fmt: skip
-        if entity.ObjectPlacement is not None:
-            check.tree(entity.ObjectPlacement)
-        return type_objects(self._model, entity)
 
     def _sweep(self, solid: Entity) -> Sweep | None:
         if solid.id() not in self._sweeps:

@@ -192,21 +192,17 @@ def _checked_bodies(model: Model, representations: list[Entity]) -> list[Entity]
 
 def _resolved(items: list[BodyItem]) -> list[BodyItem]:
     """Return the items with each IfcMappedItem replaced by the items of its map."""
-    maps: dict[int, tuple[Float64[ndarray, "4 4"], float, list[Entity]]] = {}
     pending = items[::-1]
     resolved: list[BodyItem] = []
     for _ in range(_MAX_BODY_ITEMS):
         if not pending:
             return resolved
         outer = pending.pop()
-        item = outer.item
-        if not item.is_a("IfcMappedItem"):
+        if not outer.item.is_a("IfcMappedItem"):
             resolved.append(outer)
             continue
-        if item.id() not in maps:
-            inside = item.MappingSource.MappedRepresentation.Items
-            maps[item.id()] = (*mapped_matrix(item), list(reversed(inside)))
-        mapped, factor, inner = maps[item.id()]
+        mapped, factor = mapped_matrix(outer.item)
         matrix, scale = outer.object_from_item @ mapped, outer.scale * factor
-        pending += [BodyItem(inner_item, matrix, scale) for inner_item in inner]
+        inside = outer.item.MappingSource.MappedRepresentation.Items
+        pending += [BodyItem(item, matrix, scale) for item in reversed(inside)]
     raise ValueError(f"the body has more than {_MAX_BODY_ITEMS} items, or circular maps")

@@ -148,7 +148,6 @@ class SourceCheck:
     def __init__(self, schema: Any, step: StepText) -> None:
         self._schema, self._step = schema, step
         self._attributes: dict[str, list[_Attribute]] = {}
-        self._used: dict[tuple[str, tuple[str, ...]], list[_Attribute]] = {}
         self._checked: set[tuple[int, tuple[str, ...]]] = set()
         self._seen: set[int] = set()
         self._dimensions: dict[int, frozenset[int]] = {}
@@ -164,7 +163,11 @@ class SourceCheck:
 
     def _check_attributes(self, entity: Entity, names: tuple[str, ...]) -> list[Entity]:
         """Check the attributes ``names`` of an instance, or all; return the instances that they refer to."""
-        used = self._used_attributes(entity.is_a(), names)
+        used = [
+            attribute
+            for attribute in self._class_attributes(entity.is_a())
+            if attribute.accepts and (not names or attribute.name in names)
+        ]
         source, written = self._step.instance(entity.id()), entity.to_string(True).partition("=")[2]
         if source != written:
             self._compare(entity, used, source, written)
@@ -235,16 +238,6 @@ class SourceCheck:
                     f"{_where(entity, attribute)} is {found}, which cannot be read, "
                     f"expected {shorten(attribute.kind, 80)}"
                 )
-
-    def _used_attributes(self, name: str, names: tuple[str, ...]) -> list[_Attribute]:
-        """Return the attributes ``names`` of a class, or all, that have an influence on a bar."""
-        if (name, names) not in self._used:
-            self._used[name, names] = [
-                attribute
-                for attribute in self._class_attributes(name)
-                if attribute.accepts and (not names or attribute.name in names)
-            ]
-        return self._used[name, names]
 
     def _class_attributes(self, name: str) -> list[_Attribute]:
         """Return the attributes of a class."""

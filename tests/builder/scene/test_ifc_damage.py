@@ -82,6 +82,7 @@ UNREAD = "which cannot be read"
         ("#133=IFCCARTESIANPOINT((0.,0.,100.))", "#133=IFCCARTESIANPOINT((0.,0.))", "#134 .*points of 2 coord"),
         ("#26,4.,$,$,$)", "#26,4 5.,$,$,$)", f"#27 .*Radius is 45., {UNREAD}"),
         ("#26,4.,$,$,$)", "#26,'4',$,$,$)", "#27 .*Radius is 4, expected"),
+        ("#26,4.,$,$,$)", "#26,0.,$,$,$)", "#33.* a circle has the radius 0, expected above 0"),
         ("#26,4.,$,$,$)", "#26,4.)", "#27 is .*, expected 5 readable attributes of IfcSweptDiskSolid"),
         (".MAIN.", ".MAIX.", f"#33 .*PredefinedType is .MAIX., {UNREAD}"),
         ("#6=IFCSIUNIT(*,.PLANEANGLEUNIT.", "#6=IFCSIUNIT(*,.PLANEANGLEUNIX.", f"#6 .*UnitType is .*, {UNREAD}"),
