@@ -17,14 +17,13 @@ from rebar_depth_bench.reading import parse_json
 from rebar_depth_bench.validation import StrictModel
 
 MAX_MESSAGE = 1000
-"""Largest number of characters of a message or reason."""
+"""Largest number of characters of the reason for a failure."""
 
 MAX_ARRAY_BYTES = 1 << 30
 """Largest size of all arrays of an answer: more than ``MAX_TRIANGLES`` of a cage."""
 
 _MAX_LINE_BYTES = 20_000
 _Label = Annotated[str, Field(min_length=1, max_length=200)]
-_Message = Annotated[str, Field(max_length=MAX_MESSAGE)]
 _Size = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
@@ -105,15 +104,21 @@ class StepRecord(_Record):
 
     kind: Literal["step"] = "step"
     label: _Label
-    reason: _Message
+    reason: _Label
+
+    def failure(self, problem: str) -> str:
+        """Return the message for an object whose tessellation has ended with ``problem``."""
+        return (
+            f"{self.label} has no readable shape: {self.reason}; tessellation: {problem}; "
+            "expected a swept circle or another solid"
+        )
 
 
 class FailureRecord(_Record):
-    """Reason for which reading ended."""
+    """Reason for which reading ended; None if there was not enough memory."""
 
     kind: Literal["failure"] = "failure"
-    cause: Literal["file", "memory", "shape"]
-    message: _Message
+    message: Annotated[str, Field(min_length=1, max_length=MAX_MESSAGE)] | None
 
 
 class EndRecord(_Record):

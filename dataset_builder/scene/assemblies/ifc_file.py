@@ -93,9 +93,9 @@ def ifc_cage(content: bytes, where: str, select: tuple[Selection, ...] = (), tru
             problem = _end_reason(process.wait(), time.monotonic() >= deadline_s)
         finally:
             process.kill()
-    if answer.step is not None:
-        raise answer.no_shape_error(problem)
-    raise MeshError(f"{where}: the file cannot be read: {problem}, expected a sound IFC file")
+    if answer.step is None:
+        raise MeshError(f"{where}: the file cannot be read: {problem}, expected a sound IFC file")
+    raise MeshError(f"{where}: {answer.step.failure(problem)}")
 
 
 def _end_reason(status: int, is_late: bool) -> str:
@@ -144,27 +144,13 @@ class Answer:
                 case StepRecord():
                     self.step = record
                 case FailureRecord():
-                    raise self._failure(record)
+                    reason = record.message or f"reading needs {_memory_limit()}"
+                    raise MeshError(f"{self._where}: {reason}")
             if len(bars) > MAX_BARS:
                 raise MeshError(f"{self._where}: more than {MAX_BARS} bars found, expected at most {MAX_BARS}")
         if unit_m is None:
             raise AnswerError("there is no project")
         return Cage(tuple(bars), tuple(left_out), unit_scale(unit_m), tuple(self._problems))
-
-    def no_shape_error(self, problem: str) -> MeshError:
-        """Return the error of the object that was tessellated when ``problem`` occurred."""
-        label, reason = ("a bar", "") if self.step is None else (self.step.label, self.step.reason)
-        return MeshError(
-            f"{self._where}: {label} has no readable shape: {reason}; tessellation: {problem}; "
-            "expected a swept circle or another solid"
-        )
-
-    def _failure(self, record: FailureRecord) -> MeshError:
-        if record.cause == "memory":
-            return MeshError(f"{self._where}: reading needs {_memory_limit()}")
-        if record.cause == "shape":
-            return self.no_shape_error(record.message)
-        return MeshError(f"{self._where}: {record.message}")
 
     def _swept_bar(self, bar_id: int, record: BarRecord, axis_m: Float64[ndarray, "n 3"]) -> CageBar:
         axis = axis_of(np.round(axis_m, METRE_DECIMALS))

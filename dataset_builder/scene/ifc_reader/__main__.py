@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
-from typing import IO, Literal
+from typing import IO
 
 from dataset_builder.scene.ifc_records import MAX_MESSAGE, EndRecord, FailureRecord, write_record
 from dataset_builder.scene.selection import TABLES, Selection
@@ -33,9 +33,9 @@ def write_answer(content: bytes, stream: IO[bytes], select: Sequence[Selection] 
     """Write the selected shapes of an IFC file's ``content`` to ``stream``, or a failure; nothing is raised."""
     try:
         # Imported here, so that a failed import is part of the answer.
-        from dataset_builder.scene.ifc_reader.bars import ShapeError, read_bars
+        from dataset_builder.scene.ifc_reader.bars import read_bars
     except ImportError as error:
-        write_record(stream, _failure("file", exception_summary(error)))
+        write_record(stream, _failure(exception_summary(error)))
         return
     count = 0
     end: EndRecord | FailureRecord
@@ -44,18 +44,16 @@ def write_answer(content: bytes, stream: IO[bytes], select: Sequence[Selection] 
             write_record(stream, record, arrays)
         end = EndRecord(records=count)
     except MemoryError:
-        end = _failure("memory", "")
-    except ShapeError as error:
-        end = _failure("shape", str(error))
+        end = FailureRecord(message=None)
     except MeshError as error:
-        end = _failure("file", str(error))
+        end = _failure(str(error))
     except Exception as error:  # Damaged instances raise various exceptions when their attributes are read.
-        end = _failure("file", f"cannot be read ({exception_summary(error)}), expected an IFC file")
+        end = _failure(f"cannot be read ({exception_summary(error)}), expected an IFC file")
     write_record(stream, end)
 
 
-def _failure(cause: Literal["file", "memory", "shape"], message: str) -> FailureRecord:
-    return FailureRecord(cause=cause, message=printable(message, MAX_MESSAGE))
+def _failure(message: str) -> FailureRecord:
+    return FailureRecord(message=printable(message, MAX_MESSAGE))
 
 
 if __name__ == "__main__":

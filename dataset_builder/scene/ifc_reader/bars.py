@@ -56,7 +56,7 @@ from dataset_builder.scene.ifc_records import (
 from dataset_builder.scene.model import MAX_BARS
 from dataset_builder.scene.selection import Selection
 from dataset_builder.scene.shapes.bending import bent_line_m, without_repeats
-from rebar_depth_bench.errors import MeshError, printable
+from rebar_depth_bench.errors import MeshError
 
 MAX_POINTS = 20_000_000
 """Largest number of points of all axes and surfaces of a model, which maps can multiply: 480 MB."""
@@ -78,10 +78,6 @@ _OBLIQUE = 1e-6
 """Smallest 1 - cos of the angle between an extrusion and its circle's axis that makes it no bar."""
 
 
-class ShapeError(MeshError):
-    """Solid that the geometry kernel cannot tessellate; the message is the reason alone."""
-
-
 _Arrays = tuple[ndarray, ...]
 _Shape = tuple[BarRecord | SurfaceRecord, _Arrays]
 
@@ -93,8 +89,7 @@ def read_bars(content: bytes, select: Sequence[Selection] = ()) -> Iterator[tupl
     before the geometry kernel is used. ``select`` chooses objects (``choose_objects``).
 
     Raises ``MeshError`` if the file is not a complete IFC file, has no known length unit, nothing to read or too
-    much of it, if a bar depends on an instance that was not read as written, or if it has no usable geometry;
-    ``ShapeError`` if a solid cannot be tessellated.
+    much of it, if a bar depends on an instance that was not read as written, or if it has no usable geometry.
     """
     model = open_model(content)
     chosen, left_out = choose_objects(model, select)
@@ -171,9 +166,9 @@ class _Reader:
                 shapes.append((bar, (axis_m,)))
             else:
                 if item.item.id() not in self._meshes:
-                    reason = f"the body is a {item.item.is_a()}"
-                    yield StepRecord(label=label, reason=printable(reason)), ()
-                    self._meshes[item.item.id()] = _tessellated(item.item)
+                    step = StepRecord(label=label, reason=f"the body is a {item.item.is_a()}")
+                    yield step, ()
+                    self._meshes[item.item.id()] = _tessellated(item.item, step)
                 mesh_vertices_m, faces = self._meshes[item.item.id()]
                 if np.linalg.det(turn) < 0:  # A reflection turns the triangles inside out.
                     faces = faces[:, ::-1]
@@ -198,10 +193,10 @@ class _Reader:
             )
 
 
-def _tessellated(solid: Entity) -> tuple[Float64[ndarray, "v 3"], Int32[ndarray, "f 3"]]:
+def _tessellated(solid: Entity, step: StepRecord) -> tuple[Float64[ndarray, "v 3"], Int32[ndarray, "f 3"]]:
     """Return vertices (metres, frame of the solid) and triangles; the geometry kernel may hang or crash.
 
-    Raises ``ShapeError`` if the kernel cannot tessellate the solid, and ``MemoryError`` at the limit of memory.
+    Raises ``MeshError`` if the kernel cannot tessellate the solid, and ``MemoryError`` at the limit of memory.
     """
     settings = geom.settings()
     settings.set("mesher-linear-deflection", 1e-5)
@@ -212,9 +207,9 @@ def _tessellated(solid: Entity) -> tuple[Float64[ndarray, "v 3"], Int32[ndarray,
     except RuntimeError as error:
         if "bad_alloc" in str(error):
             raise MemoryError from error
-        raise ShapeError(str(error) or "the geometry kernel failed") from error
+        raise MeshError(step.failure(str(error) or "the geometry kernel failed")) from error
     if not len(mesh.faces):
-        raise ShapeError("has no surface")
+        raise MeshError(step.failure("has no surface"))
     return np.array(mesh.verts, np.float64).reshape(-1, 3), np.array(mesh.faces, np.int32).reshape(-1, 3)
 
 

@@ -184,13 +184,8 @@ def _indexed_curve(curve: Any, angle_rad: float, _depth: int) -> list[Piece]:
         if index.min() < 0 or index.max() >= len(points):
             raise ValueError("a segment refers to a point that does not exist")
         corners = points[index]
-        pieces += _arc_index(corners, angle_rad) if segment.is_a("IfcArcIndex") else _legs(corners)
+        pieces += arc_through(*corners, angle_rad) if segment.is_a("IfcArcIndex") else _legs(corners)
     return pieces
-
-
-def _arc_index(corners: Float64[ndarray, "3 3"], angle_rad: float) -> list[Piece]:
-    start, middle, end = corners
-    return arc_through(start, middle, end, angle_rad)
 
 
 def _composite_curve(curve: Any, angle_rad: float, depth: int) -> list[Piece]:

@@ -147,19 +147,17 @@ def _names(model: Model, entity: Entity) -> Mapping[str, Sequence[str]]:
     return {
         "class": (str(entity.is_a()),),
         "global_id": (str(entity.GlobalId),),
-        "name": _texts(entity.Name),
-        "host": _texts(*_name_and_id(_host(model, entity))),
-        "storey": _texts(*_name_and_id(_storey(model, entity))),
+        "name": _texts(entity, "Name"),
+        "host": _texts(_host(model, entity), "Name", "GlobalId"),
+        "storey": _texts(_storey(model, entity), "Name", "GlobalId"),
         "layer": _layers(model, entity),
     }
 
 
-def _name_and_id(entity: Entity | None) -> tuple[object, ...]:
-    return () if entity is None else (entity.Name, entity.GlobalId)
-
-
-def _texts(*values: object) -> tuple[str, ...]:
-    return tuple(str(value) for value in values if value)
+def _texts(entity: Entity | None, *names: str) -> list[str]:
+    """Return the attributes of these names that an object has, none for None."""
+    values = [] if entity is None else [getattr(entity, name) for name in names]
+    return [str(value) for value in values if value]
 
 
 def _host(model: Model, entity: Entity) -> Entity | None:
@@ -193,7 +191,7 @@ def _relating(model: Model, entity: Entity, kinds: Mapping[str, tuple[str, str]]
     return None
 
 
-def _layers(model: Model, entity: Entity) -> tuple[str, ...]:
+def _layers(model: Model, entity: Entity) -> list[str]:
     """Return the names of the layers of an object's shapes and their items."""
     shape = entity.Representation
     shapes = [] if shape is None else list(shape.Representations or ())
@@ -204,8 +202,8 @@ def _layers(model: Model, entity: Entity) -> tuple[str, ...]:
         # The name of the inverse attribute depends on the version of IFC.
         for layer in getattr(item, "LayerAssignments", None) or getattr(item, "LayerAssignment", None) or ():
             model.check.attributes(layer, "Name")
-            names.append(layer.Name)
-    return _texts(*names)
+            names += _texts(layer, "Name")
+    return names
 
 
 def _nothing_error(left_out: Sequence[LeftOutRecord], is_selection: bool) -> MeshError:
