@@ -184,11 +184,10 @@ def _indexed_curve(curve: Any, angle_rad: float, _depth: int) -> list[Piece]:
         if index.min() < 0 or index.max() >= len(points):
             raise ValueError("a segment refers to a point that does not exist")
         corners = points[index]
-        pieces += (
-            arc_through(corners[0], corners[1], corners[2], angle_rad)
-            if segment.is_a("IfcArcIndex")
-            else _legs(corners)
-        )
+        if segment.is_a("IfcArcIndex"):
+            pieces += arc_through(corners[0], corners[1], corners[2], angle_rad)
+        else:
+            pieces += _legs(corners)
     return pieces
 
 
