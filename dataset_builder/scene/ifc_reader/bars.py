@@ -94,7 +94,7 @@ def read_bars(content: bytes, select: Sequence[Selection] = ()) -> Iterator[tupl
     model = open_model(content)
     chosen, left_out = choose_objects(model, select)
     for relation in model.by_type("IfcRelDefinesByType"):
-        model.check.attributes(relation, "RelatedObjects", "RelatingType")
+        model.check_attributes(relation, "RelatedObjects", "RelatingType")
     reader = _Reader(model)
     yield ProjectRecord(unit_m=reader.units.length_m), ()
     for record in left_out:
@@ -131,13 +131,12 @@ class _Reader:
         """
         label = object_label(entity)
         try:
-            check = self._model.check
-            check.attributes(
+            self._model.check_attributes(
                 entity, *("GlobalId", "Name", "ObjectType", "ObjectPlacement", "Representation"),
                 *("PredefinedType", "BarRole"),
             )  # fmt: skip
             if entity.ObjectPlacement is not None:
-                check.tree(entity.ObjectPlacement)
+                self._model.check_tree(entity.ObjectPlacement)
             types = type_objects(self._model, entity)
             source = source_record(self._model, entity, types, self.units.length_m)
             bar_role = role(entity, types)

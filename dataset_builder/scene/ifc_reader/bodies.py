@@ -22,6 +22,12 @@ MAX_PLACEMENT_DEPTH = 50
 _SCALE_TOLERANCE = 1e-6
 """Largest relative difference between the scales of a map's axes."""
 
+_MAX_BODY_ITEMS = 10_000
+"""Largest number of items in one object's Body, with the items of nested maps counted at each use.
+
+A short file with nested maps can expand to billions of items.
+"""
+
 
 def placement_matrix(
     placement: Any, known: dict[int, Float64[ndarray, "4 4"]], depth: int = 0
@@ -127,13 +133,6 @@ def xyz(coordinates: tuple[float, ...]) -> tuple[float, float, float]:
     return float(x), float(y), float(rest[0]) if rest else 0.0
 
 
-_MAX_BODY_ITEMS = 10_000
-"""Largest number of items in one object's Body, with the items of nested maps counted at each use.
-
-A short file with nested maps can expand to billions of items.
-"""
-
-
 @dataclass(frozen=True, eq=False)
 class BodyItem:
     """Item of a body, its ``object_from_item`` and the factor by which that scales lengths."""
@@ -160,15 +159,15 @@ def body_items(model: Model, entity: Entity, types: list[Entity]) -> list[BodyIt
 def _own_bodies(model: Model, entity: Entity) -> list[Entity]:
     if entity.Representation is None:
         return []
-    model.check.attributes(entity.Representation, "Representations")
+    model.check_attributes(entity.Representation, "Representations")
     return _checked_bodies(model, list(entity.Representation.Representations))
 
 
 def _type_items(model: Model, type_object: Entity) -> list[BodyItem]:
     maps = list(getattr(type_object, "RepresentationMaps", None) or ())
     for source in maps:
-        model.check.attributes(source)
-        model.check.tree(source.MappingOrigin)
+        model.check_attributes(source)
+        model.check_tree(source.MappingOrigin)
     bodies = {body.id() for body in _checked_bodies(model, [source.MappedRepresentation for source in maps])}
     return [
         BodyItem(item, axis_placement(source.MappingOrigin), 1.0)
@@ -181,12 +180,12 @@ def _type_items(model: Model, type_object: Entity) -> list[BodyItem]:
 def _checked_bodies(model: Model, representations: list[Entity]) -> list[Entity]:
     """Return the representations named Body, or all of them if there is none, with everything below checked."""
     for representation in representations:
-        model.check.attributes(representation, "RepresentationIdentifier")
+        model.check_attributes(representation, "RepresentationIdentifier")
     named = [
         representation for representation in representations if representation.RepresentationIdentifier == "Body"
     ]
     for body in named or representations:
-        model.check.tree(body)
+        model.check_tree(body)
     return named or representations
 
 

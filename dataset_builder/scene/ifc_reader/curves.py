@@ -21,6 +21,18 @@ from dataset_builder.scene.ifc_reader.bodies import axis_placement, point_xyz, u
 ARC_STEP_DEG = 6.0
 """Largest angle between sampled points of an arc, degrees, as in ``bent_line_m``."""
 
+_MAX_DEPTH = 20
+"""Largest nesting depth of curves; deeper nesting is taken to be a cycle."""
+
+_MAX_PIECES = 10_000
+"""Largest number of pieces of a composite curve, which a short file with nested curves can multiply."""
+
+_MAX_SPLINE_POINTS = 20_000
+"""Largest number of sampled points of one B-spline."""
+
+_FULL_TURN_RAD = 2 * np.pi
+_ANGLE_NOISE_RAD = 1e-9
+
 
 @dataclass(frozen=True, eq=False)
 class Sampled:
@@ -135,19 +147,6 @@ def cut(pieces: list[Piece], ranges: list[float], first: float, last: float) -> 
             kept.append(piece.part(low / size, 1.0 if high == size else high / size))
         begin += size
     return kept
-
-
-_MAX_DEPTH = 20
-"""Largest nesting depth of curves; deeper nesting is taken to be a cycle."""
-
-_MAX_PIECES = 10_000
-"""Largest number of pieces of a composite curve, which a short file with nested curves can multiply."""
-
-_MAX_SPLINE_POINTS = 20_000
-"""Largest number of sampled points of one B-spline."""
-
-_FULL_TURN_RAD = 2 * np.pi
-_ANGLE_NOISE_RAD = 1e-9
 
 
 def curve_pieces(curve: Any, angle_rad: float, depth: int = 0) -> list[Piece]:

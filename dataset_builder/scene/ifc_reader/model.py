@@ -2,9 +2,9 @@
 
 The parser skips what it cannot read and goes on, which could place a bar wrongly without an error. It turns an
 attribute that it cannot parse, and a reference to an instance that it could not read, into null or drops it from a
-list. So each instance that a bar depends on is written again and compared with its text (``SourceCheck``). The
-types of its attributes and the dimensions of its points are checked too, since the geometry kernel replaces
-missing coordinates by zero.
+list. So each instance that a bar depends on is written again and compared with its text (``Model``). The types of
+its attributes and the dimensions of its points are checked too, since the geometry kernel replaces missing
+coordinates by zero.
 """
 
 from __future__ import annotations
@@ -18,84 +18,16 @@ from typing import Any
 import ifcopenshell
 import numpy as np
 from ifcopenshell import entity_instance, ifcopenshell_wrapper
-from ifcopenshell import ifcopenshell_wrapper as wrapper
 
-from dataset_builder.scene.ifc_reader.step_text import (
-    StepText,
-    class_name,
-    same_tokens,
-    split_arguments,
-)
+from dataset_builder.scene.ifc_reader.step_text import StepText, class_name, same_tokens, split_arguments
 from rebar_depth_bench.errors import MeshError, escape_text
 
-_LOGGED_REASON = re.compile(r"\] (?!Pars)[A-Za-z]")
-"""Message in the parser's log that gives a reason, after severity and time; out of memory, it may be cut off."""
-
-
-@dataclass(frozen=True)
-class Model:
-    """IFC model: ifcopenshell's model, and the check of its instances against the file's text."""
-
-    file: Any
-    check: SourceCheck
-
-    def by_type(self, name: str) -> list[Entity]:
-        """Return the instances of a class and its subclasses, by number."""
-        return sorted(self.file.by_type(name), key=lambda entity: int(entity.id()))
-
-
-def open_model(content: bytes) -> Model:
-    """Return the model of a STEP file's ``content``.
-
-    Raises ``MeshError`` if the file is not a complete IFC file: truncated, of an unknown schema, with text that
-    is not an instance, or with instances that the parser cannot read; ``MemoryError`` at the limit of memory.
-    """
-    text = content.decode("utf-8", errors="replace")
-    step = StepText(text)
-    try:
-        file = ifcopenshell.file.from_string(text)
-        schema = str(file.schema_identifier)
-        read = np.array(sorted(file.entity_names()), np.int64)
-    except MemoryError:
-        raise
-    except Exception as error:
-        reason = shorten(str(error), 200) or type(error).__name__
-        raise MeshError(f"not a readable IFC file ({reason})") from error
-    unread = np.setdiff1d(step.numbers, read).tolist()
-    if unread and not _LOGGED_REASON.search(ifcopenshell.get_log()):
-        raise MemoryError  # The parser swallows a failed allocation; it logs any other reason.
-    known = wrapper.schema_by_name(schema)
-    _check_unread(step, unread, known)
-    return Model(file, SourceCheck(known, step))
-
-
-def _check_unread(step: StepText, unread: list[int], schema: Any) -> None:
-    """Raise ``MeshError`` if the parser left out an instance that may be a bar.
-
-    Some programs write classes of another version of IFC, which are left out. A name that no version has may be
-    a damaged one.
-    """
-    others = [wrapper.schema_by_name(name) for name in wrapper.schema_names() if name.startswith("IFC")]
-    for number in unread:
-        name = class_name(step.instance(number))
-        if _has_class(schema, name) or not any(_has_class(other, name) for other in others):
-            raise MeshError(
-                f"{len(unread)} of its instances cannot be read, first #{number} ({escape_text(name)}), expected "
-                f"a complete {schema.name()} file"
-            )
-
-
-def _has_class(schema: Any, name: str) -> bool:
-    try:
-        schema.declaration_by_name(name)
-    except RuntimeError:
-        return False
-    return True
-
-
-_types: Any = ifcopenshell_wrapper
 Entity = Any
 """An ``ifcopenshell.entity_instance``, with the attributes of its IFC class."""
+
+_wrapper: Any = ifcopenshell_wrapper
+_LOGGED_REASON = re.compile(r"\] (?!Pars)[A-Za-z]")
+"""Message in the parser's log that gives a reason, after severity and time; out of memory, it may be cut off."""
 
 _UNUSED = {
     *("ContextOfItems", "Dimensions", "ProfileName", "RepresentationType", "SelfIntersect", "TagList"),
@@ -132,6 +64,55 @@ _PYTHON_TYPES: dict[str, tuple[type, ...]] = {
 }
 
 
+def open_model(content: bytes) -> Model:
+    """Return the model of a STEP file's ``content``.
+
+    Raises ``MeshError`` if the file is not a complete IFC file: truncated, of an unknown schema, with text that
+    is not an instance, or with instances that the parser cannot read; ``MemoryError`` at the limit of memory.
+    """
+    text = content.decode("utf-8", errors="replace")
+    step = StepText(text)
+    try:
+        file = ifcopenshell.file.from_string(text)
+        schema = str(file.schema_identifier)
+        read = np.array(sorted(file.entity_names()), np.int64)
+    except MemoryError:
+        raise
+    except Exception as error:
+        reason = shorten(str(error), 200) or type(error).__name__
+        raise MeshError(f"not a readable IFC file ({reason})") from error
+    unread = np.setdiff1d(step.numbers, read).tolist()
+    if unread and not _LOGGED_REASON.search(ifcopenshell.get_log()):
+        raise MemoryError  # The parser swallows a failed allocation; it logs any other reason.
+    known = _wrapper.schema_by_name(schema)
+    _check_unread(step, unread, known)
+    return Model(file, known, step)
+
+
+def _check_unread(step: StepText, unread: list[int], schema: Any) -> None:
+    """Raise ``MeshError`` if the parser left out an instance that may be a bar.
+
+    Some programs write classes of another version of IFC, which are left out. A name that no version has may be
+    a damaged one.
+    """
+    others = [_wrapper.schema_by_name(name) for name in _wrapper.schema_names() if name.startswith("IFC")]
+    for number in unread:
+        name = class_name(step.instance(number))
+        if _has_class(schema, name) or not any(_has_class(other, name) for other in others):
+            raise MeshError(
+                f"{len(unread)} of its instances cannot be read, first #{number} ({escape_text(name)}), expected "
+                f"a complete {schema.name()} file"
+            )
+
+
+def _has_class(schema: Any, name: str) -> bool:
+    try:
+        schema.declaration_by_name(name)
+    except RuntimeError:
+        return False
+    return True
+
+
 @dataclass(frozen=True)
 class _Attribute:
     """Attribute of a class: position, name, type as text, and whether a value is valid; None: any value."""
@@ -142,26 +123,33 @@ class _Attribute:
     accepts: Callable[[Any], bool] | None
 
 
-class SourceCheck:
-    """Comparison of a model's instances with the text of its file. Every method raises ``MeshError``."""
+class Model:
+    """IFC model: ifcopenshell's ``file``, and the comparison of its instances with the text of the file.
 
-    def __init__(self, schema: Any, step: StepText) -> None:
-        self._schema, self._step = schema, step
+    The methods that check raise ``MeshError``.
+    """
+
+    def __init__(self, file: Any, schema: Any, step: StepText) -> None:
+        self.file, self._schema, self._step = file, schema, step
         self._attributes: dict[str, list[_Attribute]] = {}
         self._checked: set[tuple[int, tuple[str, ...]]] = set()
         self._seen: set[int] = set()
         self._dimensions: dict[int, frozenset[int]] = {}
 
-    def attributes(self, entity: Entity, *names: str) -> None:
+    def by_type(self, name: str) -> list[Entity]:
+        """Return the instances of a class and its subclasses, by number."""
+        return sorted(self.file.by_type(name), key=lambda entity: int(entity.id()))
+
+    def check_attributes(self, entity: Entity, *names: str) -> None:
         """Check the attributes ``names`` of an instance, or all, once; a class may lack some of the names.
 
         A relation is checked for each of the objects that it holds, which may be all bars of a model.
         """
         if (entity.id(), names) not in self._checked:
-            self._check_attributes(entity, names)
+            self._checked_references(entity, names)
             self._checked.add((entity.id(), names))
 
-    def _check_attributes(self, entity: Entity, names: tuple[str, ...]) -> list[Entity]:
+    def _checked_references(self, entity: Entity, names: tuple[str, ...]) -> list[Entity]:
         """Check the attributes ``names`` of an instance, or all; return the instances that they refer to."""
         used = [
             attribute
@@ -181,7 +169,7 @@ class SourceCheck:
             references += _references(value)
         return references
 
-    def tree(self, root: Entity) -> None:
+    def check_tree(self, root: Entity) -> None:
         """Check an instance and all instances that it refers to, directly or through others, each once."""
         stack: list[tuple[Entity, list[Entity] | None]] = [(root, None)]
         while stack:
@@ -190,7 +178,7 @@ class SourceCheck:
                 self._dimensions[entity.id()] = self._dimensions_below(entity, references)
             elif entity.id() not in self._seen:
                 self._seen.add(entity.id())
-                references = self._check_attributes(entity, ())
+                references = self._checked_references(entity, ())
                 stack.append((entity, references))  # It is completed after the instances below it.
                 stack += [(reference, None) for reference in references]
 
@@ -279,20 +267,20 @@ def _or_null(accepts: Callable[[Any], bool]) -> Callable[[Any], bool]:
 
 def _predicate(kind: Any) -> Callable[[Any], bool]:
     """Return the function that tells whether a value is of an attribute's type."""
-    while isinstance(kind, _types.named_type | _types.type_declaration):
+    while isinstance(kind, _wrapper.named_type | _wrapper.type_declaration):
         kind = kind.declared_type()
-    if isinstance(kind, _types.aggregation_type):
+    if isinstance(kind, _wrapper.aggregation_type):
         accepts, low, high = _predicate(kind.type_of_element()), kind.bound1(), kind.bound2()
         return lambda value: (
             isinstance(value, tuple) and low <= len(value) and (high < 0 or len(value) <= high)
             and all(map(accepts, value))
         )  # fmt: skip
-    if isinstance(kind, _types.simple_type):
+    if isinstance(kind, _wrapper.simple_type):
         types = _PYTHON_TYPES[kind.declared_type()]
         return lambda value: isinstance(value, types) and (bool in types or not isinstance(value, bool))
-    if isinstance(kind, _types.enumeration_type):
+    if isinstance(kind, _wrapper.enumeration_type):
         return lambda value: isinstance(value, str)
-    if isinstance(kind, _types.select_type):
+    if isinstance(kind, _wrapper.select_type):
         members = dict(_select_members(kind))
         return lambda value: (
             isinstance(value, entity_instance) and value.is_a() in members and members[value.is_a()](value)
@@ -303,10 +291,10 @@ def _predicate(kind: Any) -> Callable[[Any], bool]:
 
 def _select_members(kind: Any) -> Iterator[tuple[str, Callable[[Any], bool]]]:
     """Yield the names of a select type's classes and value types, each with a test of its instances."""
-    if isinstance(kind, _types.select_type):
+    if isinstance(kind, _wrapper.select_type):
         for member in kind.select_list():
             yield from _select_members(member)
-    elif isinstance(kind, _types.entity):
+    elif isinstance(kind, _wrapper.entity):
         yield kind.name(), lambda _: True
         for subtype in kind.subtypes():
             yield from _select_members(subtype)

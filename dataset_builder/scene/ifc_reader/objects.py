@@ -71,15 +71,15 @@ def project_units(model: Model) -> Units:
 def _project_unit(model: Model, kind: str, base: str) -> float | None:
     """Return the project unit of a kind, expressed in the SI unit ``base``, or None."""
     for project in model.by_type("IfcProject"):
-        model.check.attributes(project, "UnitsInContext")
+        model.check_attributes(project, "UnitsInContext")
         if project.UnitsInContext is None:
             continue
-        model.check.attributes(project.UnitsInContext)
+        model.check_attributes(project.UnitsInContext)
         for unit in project.UnitsInContext.Units:
             if unit.is_a("IfcNamedUnit"):
-                model.check.attributes(unit, "UnitType")
+                model.check_attributes(unit, "UnitType")
                 if unit.UnitType == kind:
-                    model.check.tree(unit)
+                    model.check_tree(unit)
                     return _in_base_unit(unit, base)
     return None
 
@@ -186,7 +186,7 @@ def _relating(model: Model, entity: Entity, kinds: Mapping[str, tuple[str, str]]
     for inverse, (relating, related) in kinds.items():
         if relations := getattr(entity, inverse, None):
             relation = min(relations, key=lambda relation: int(relation.id()))
-            model.check.attributes(relation, relating, related)
+            model.check_attributes(relation, relating, related)
             return getattr(relation, relating)
     return None
 
@@ -201,7 +201,7 @@ def _layers(model: Model, entity: Entity) -> list[str]:
     for item in (*shapes, *items, *maps):
         # The name of the inverse attribute depends on the version of IFC.
         for layer in getattr(item, "LayerAssignments", None) or getattr(item, "LayerAssignment", None) or ():
-            model.check.attributes(layer, "Name")
+            model.check_attributes(layer, "Name")
             names += _texts(layer, "Name")
     return names
 
@@ -230,7 +230,7 @@ def type_objects(model: Model, entity: Entity) -> list[Entity]:
     relations = [*(getattr(entity, "IsTypedBy", None) or ()), *(getattr(entity, "IsDefinedBy", None) or ())]
     types = [relation.RelatingType for relation in relations if relation.is_a("IfcRelDefinesByType")]
     for type_object in types:
-        model.check.attributes(type_object, "PredefinedType", "BarRole", "RepresentationMaps")
+        model.check_attributes(type_object, "PredefinedType", "BarRole", "RepresentationMaps")
     return types
 
 
@@ -241,7 +241,7 @@ def source_record(model: Model, entity: Entity, types: Sequence[Entity], unit_m:
     """
     sources = [entity, *types]
     for source in sources:
-        model.check.attributes(source, *_DIAMETERS, "BarLength")
+        model.check_attributes(source, *_DIAMETERS, "BarLength")
     return Source(
         global_id=_shown(entity.GlobalId),
         label=object_label(entity),
