@@ -30,13 +30,14 @@ _SCHEMA = re.compile(rf"FILE_SCHEMA{_GAP}({_BODY});")
 _INSTANCE = re.compile(rf"{_GAP}#(\d{{1,18}}){_GAP}={_GAP}(!?+[A-Za-z]\w*+{_GAP}\({_BODY});", re.ASCII)
 _FOOTER = re.compile(rf"{_GAP}ENDSEC{_GAP};{_GAP}END-ISO-10303-21{_GAP};\s*+\Z")
 _CLASS = re.compile(rf"(!?+[A-Za-z]\w*+){_GAP}", re.ASCII)
+# Some programs leave out the digit before the point, which ISO 10303-21 requires.
+_NUMBER = r"[-+]?+(?:\d++(?:\.\d*+)?+|\.\d++)(?:[Ee][-+]?+\d++)?+"
+_IS_NUMBER = re.compile(_NUMBER, re.ASCII)
 _TOKEN = re.compile(
-    rf"{_GAP}({_STRING}|\#\d++|[-+]?+\d++(?:\.\d*+)?+(?:[Ee][-+]?+\d++)?+|\.[A-Za-z]\w*+\."
+    rf"{_GAP}({_STRING}|\#\d++|{_NUMBER}|\.[A-Za-z]\w*+\."
     rf"|[A-Za-z]\w*+(?={_GAP}\()|\"[0-9A-Fa-f]*+\"|[$*(),]){_GAP}",
     re.ASCII,
 )
-
-_NUMBER_STARTS = frozenset("+-0123456789")
 
 
 class StepText:
@@ -135,6 +136,6 @@ def same_tokens(first: list[str], second: list[str]) -> bool:
 def _same_token(first: str, second: str) -> bool:
     if first == second or first[0] == second[0] == "'":  # Writers encode the same string in different ways.
         return True
-    if first[0] in _NUMBER_STARTS and second[0] in _NUMBER_STARTS:
+    if _IS_NUMBER.fullmatch(first) and _IS_NUMBER.fullmatch(second):
         return float(first) == float(second)
     return first.upper() == second.upper()
