@@ -30,7 +30,7 @@ _SCHEMA = re.compile(rf"FILE_SCHEMA{_GAP}({_BODY});")
 _INSTANCE = re.compile(rf"{_GAP}#(\d{{1,18}}){_GAP}={_GAP}(!?+[A-Za-z]\w*+{_GAP}\({_BODY});", re.ASCII)
 _FOOTER = re.compile(rf"{_GAP}ENDSEC{_GAP};{_GAP}END-ISO-10303-21{_GAP};\s*+\Z")
 _CLASS = re.compile(rf"(!?+[A-Za-z]\w*+){_GAP}", re.ASCII)
-# Some programs leave out the digit before the point, which ISO 10303-21 requires.
+# ISO 10303-21 requires a digit before the point; the parser reads numbers without it after a sign only.
 _NUMBER = r"[-+]?+(?:\d++(?:\.\d*+)?+|\.\d++)(?:[Ee][-+]?+\d++)?+"
 _IS_NUMBER = re.compile(_NUMBER, re.ASCII)
 _TOKEN = re.compile(
