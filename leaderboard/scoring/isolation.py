@@ -6,21 +6,20 @@ the service: it is no barrier against code that an archive would manage to run.
 
 from __future__ import annotations
 
-import ctypes
 import multiprocessing
 import os
-import resource
 import signal
 import time
 from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
+from rebar_depth_bench.limits import limit_process
+
 POLL_INTERVAL_S = 1.0
 NICENESS = 10
 MIN_MEMORY_BYTES = 1 << 30
 """Minimum memory limit: interpreter, libraries and thread stacks alone take several hundred megabytes."""
-_PR_SET_PDEATHSIG = 1
 _SPAWN = multiprocessing.get_context("spawn")
 
 T = TypeVar("T")
@@ -94,26 +93,16 @@ def call_isolated(
 def _run(
     sender: Connection, memory: int, parent: int, function: Callable[..., object], arguments: tuple[Any, ...]
 ) -> None:
-    """Send the value of the function from a process whose output is discarded, because it could fill the log."""
+    """Send the value of the function from a process whose output is discarded, because it could fill the log.
+
+    Its priority is lowered, so that it does not slow down the server.
+    """
     with open(os.devnull, "w") as null:  # noqa: PTH123
         for stream in (1, 2):
             os.dup2(null.fileno(), stream)
-    limit_process(memory, parent)
+    os.nice(NICENESS)
+    limit_process(parent, max(memory, MIN_MEMORY_BYTES))
     try:
         sender.send(function(*arguments))
     except UnavailableError as error:
         sender.send(error)
-
-
-def limit_process(memory: int, parent: int) -> None:
-    """Limit the memory of this process to ``memory`` bytes and have it killed when process ``parent`` dies.
-
-    Its priority is lowered, so that it does not slow down the server, and core dumps are disabled.
-    """
-    os.nice(NICENESS)
-    limit = max(memory, MIN_MEMORY_BYTES)
-    resource.setrlimit(resource.RLIMIT_DATA, (limit, limit))  # Not RLIMIT_AS, because archives are memory-mapped.
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent:  # The parent died before the signal was set.
-        os.kill(os.getpid(), signal.SIGKILL)

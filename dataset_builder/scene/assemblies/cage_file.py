@@ -20,7 +20,7 @@ from dataset_builder.config.file_specs import (
 from dataset_builder.scene.assemblies.bar_meshes import bar_mesh, with_ribs_chosen
 from dataset_builder.scene.assemblies.cage import Cage, CageBar, LeftOut, unit_scale
 from dataset_builder.scene.assemblies.cage_checks import cage_problems, check_values, raise_problems
-from dataset_builder.scene.assemblies.ifc.process import ifc_cage
+from dataset_builder.scene.assemblies.ifc_file import ifc_cage
 from dataset_builder.scene.assemblies.mesh_import import (
     MAX_FLOAT32_SPACING_M,
     SUFFIXES,

@@ -1,4 +1,5 @@
 """Reader of IFC models, the only package that uses ifcopenshell. It runs in its own process.
 
-``scene.assemblies.ifc`` starts that process, ``python -m`` this package, with limits, and validates its answer.
+``scene.assemblies.ifc_file`` starts that process, ``python -m`` this package, with limits, and validates its
+answer.
 """

@@ -1,63 +1,59 @@
 """Process that reads an IFC file: a line of JSON and the content on standard input, answer on standard output.
 
-The line is a list of the tables that select objects (``scene.selection.TABLES``).
+The line is a list of the tables that select objects (``scene.selection.TABLES``), the answer a list of records
+(``scene.ifc_records``).
 
-``python -m dataset_builder.scene.ifc_reader MEMORY_BYTES CPU_SECONDS PARENT_PID``
+``python -m dataset_builder.scene.ifc_reader PARENT_PID MEMORY_BYTES CPU_SECONDS WALL_SECONDS``
 """
 
 from __future__ import annotations
 
-import ctypes
 import os
-import resource
-import signal
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
+from collections.abc import Sequence
+from typing import IO
 
-SECONDS_PER_SHAPE = 60
-"""Time limit for tessellating one object; SIGALRM ends the process after it."""
-
-_PR_SET_PDEATHSIG = 1
+from dataset_builder.scene.ifc_records import MAX_MESSAGE, EndRecord, FailureRecord, write_record
+from dataset_builder.scene.selection import TABLES, Selection
+from rebar_depth_bench.errors import MeshError, exception_summary, printable
+from rebar_depth_bench.limits import limit_process
 
 
 def main() -> None:
     """Set the limits, read the content and write the answer; native output is redirected to standard error."""
-    memory_bytes, cpu_seconds, parent_pid = map(int, sys.argv[1:])
-    _end_with_parent(parent_pid)
-    _set_limits(memory_bytes, cpu_seconds)
-    from dataset_builder.scene.ifc_reader.answer import write_answer
-    from dataset_builder.scene.selection import TABLES
-
+    parent, memory_bytes, cpu_seconds, wall_seconds = map(int, sys.argv[1:])
+    limit_process(parent, memory_bytes, cpu_seconds=cpu_seconds, wall_seconds=wall_seconds)
     with os.fdopen(os.dup(1), "wb") as stream:
         os.dup2(2, 1)
         select = TABLES.validate_json(sys.stdin.buffer.readline())
-        write_answer(sys.stdin.buffer.read(), stream, select, _limited_time)
+        write_answer(sys.stdin.buffer.read(), stream, select)
 
 
-def _end_with_parent(parent_pid: int) -> None:
-    """Let the kernel end this process when its parent ends, where the system can do so (Linux)."""
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent_pid:
-            os._exit(1)
-
-
-@contextmanager
-def _limited_time() -> Iterator[None]:
-    """Limit the time of a use of the geometry kernel."""
-    signal.alarm(SECONDS_PER_SHAPE)
+def write_answer(content: bytes, stream: IO[bytes], select: Sequence[Selection] = ()) -> None:
+    """Write the selected shapes of an IFC file's ``content`` to ``stream``, or a failure; nothing is raised."""
     try:
-        yield
-    finally:
-        signal.alarm(0)
+        # Imported here, so that a failed import is part of the answer.
+        from dataset_builder.scene.ifc_reader.bars import read_bars
+    except ImportError as error:
+        write_record(stream, _failure(exception_summary(error)))
+        return
+    count = 0
+    end: EndRecord | FailureRecord
+    try:
+        for count, (record, arrays) in enumerate(read_bars(content, select), start=1):  # noqa: B007
+            write_record(stream, record, arrays)
+        end = EndRecord(records=count)
+    except MemoryError:
+        end = FailureRecord(message=None)
+    except MeshError as error:
+        end = _failure(str(error))
+    except Exception as error:  # Damaged instances raise various exceptions when their attributes are read.
+        end = _failure(f"cannot be read ({exception_summary(error)}), expected an IFC file")
+    write_record(stream, end)
 
 
-def _set_limits(memory_bytes: int, cpu_seconds: int) -> None:
-    """Limit memory and processor time, and turn off core dumps."""
-    resource.setrlimit(resource.RLIMIT_DATA, (memory_bytes, memory_bytes))
-    resource.setrlimit(resource.RLIMIT_CPU, (cpu_seconds, cpu_seconds + 1))
-    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+def _failure(message: str) -> FailureRecord:
+    return FailureRecord(message=printable(message, MAX_MESSAGE))
 
 
 if __name__ == "__main__":

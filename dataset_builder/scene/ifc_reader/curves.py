@@ -1,20 +1,25 @@
-"""IFC curves as pieces (``pieces``): polylines, indexed, composite and trimmed curves, conics and B-splines.
+"""IFC curves as pieces: straight legs, arcs and sampled curves, in the file's length unit.
 
-Implements the definitions of IFC2x3 and IFC4 (ISO 16739-1). Anything else raises ``ValueError``.
+Each piece counts parameters as ISO 10303-42 does for the curve that it comes from, and can be cut exactly.
+Polylines, indexed, composite and trimmed curves, conics and B-splines are read as IFC2x3 and IFC4 (ISO 16739-1)
+define them. Anything else raises ``ValueError``.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.scene.ifc_reader.pieces import ARC_STEP_DEG, Arc, Leg, Piece, Sampled, arc_through, cut
-from dataset_builder.scene.ifc_reader.placements import axis_placement, point_xyz, unit_vector, xyz
+from dataset_builder.scene.ifc_reader.bodies import axis_placement, point_xyz, unit_vector, xyz
+
+ARC_STEP_DEG = 6.0
+"""Largest angle between sampled points of an arc, degrees, as in ``bent_line_m``."""
 
 _MAX_DEPTH = 20
 """Largest nesting depth of curves; deeper nesting is taken to be a cycle."""
@@ -27,6 +32,121 @@ _MAX_SPLINE_POINTS = 20_000
 
 _FULL_TURN_RAD = 2 * np.pi
 _ANGLE_NOISE_RAD = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Sampled:
+    """Curve sampled at increasing ``shares`` (0 to 1) of its parameter range ``parameters``."""
+
+    line: Float64[ndarray, "n 3"]
+    shares: Float64[ndarray, " n"]
+    parameters: float
+
+    def points(self) -> Float64[ndarray, "n 3"]:
+        """Return the sampled points."""
+        return self.line
+
+    def part(self, first: float, last: float) -> Self:
+        """Return the part between two shares of the parameter range, interpolated at its ends."""
+        inner = (self.shares > first) & (self.shares < last)
+        at = np.concatenate([[first], self.shares[inner], [last]])
+        line = np.stack([np.interp(at, self.shares, column) for column in self.line.T], axis=-1)
+        size = last - first
+        return replace(self, line=line, shares=(at - first) / size, parameters=self.parameters * size)
+
+    def reversed(self) -> Self:
+        """Return the curve from its end to its start."""
+        return replace(self, line=self.line[::-1], shares=1 - self.shares[::-1])
+
+
+@dataclass(frozen=True, eq=False)
+class Leg(Sampled):
+    """Straight leg; ``parameters`` is its parameter range: 1 in a polyline, else a multiple of a line's vector."""
+
+    @classmethod
+    def between(cls, start: Float64[ndarray, " 3"], end: Float64[ndarray, " 3"], parameters: float = 1.0) -> Leg:
+        """Return the leg between two points."""
+        return cls(np.array([start, end]), np.array([0.0, 1.0]), parameters)
+
+    @property
+    def length(self) -> float:
+        """Length of the leg."""
+        return float(np.linalg.norm(self.line[1] - self.line[0]))
+
+
+@dataclass(frozen=True, eq=False)
+class Arc:
+    """Arc of a circle or an ellipse: centre + cos(t) x_axis + sin(t) y_axis for t from ``first_rad``.
+
+    The arc turns by ``turn_rad``, which is negative if it runs clockwise about x_axis x y_axis. ``parameters`` is
+    the turn's size in the project's plane angle unit.
+    """
+
+    centre: Float64[ndarray, " 3"]
+    x_axis: Float64[ndarray, " 3"]
+    y_axis: Float64[ndarray, " 3"]
+    first_rad: float
+    turn_rad: float
+    parameters: float
+
+    def points(self) -> Float64[ndarray, "n 3"]:
+        """Return points at most ``ARC_STEP_DEG`` apart, including both ends."""
+        count = max(2, int(np.ceil(np.rad2deg(abs(self.turn_rad)) / ARC_STEP_DEG - 1e-6)) + 1)
+        angles_rad = self.first_rad + self.turn_rad * np.linspace(0.0, 1.0, count)[:, None]
+        return np.asarray(self.centre + np.cos(angles_rad) * self.x_axis + np.sin(angles_rad) * self.y_axis)
+
+    def part(self, first: float, last: float) -> Arc:
+        """Return the part between two shares (0 to 1) of the parameter range."""
+        share = last - first
+        return replace(
+            self,
+            first_rad=self.first_rad + first * self.turn_rad,
+            turn_rad=share * self.turn_rad,
+            parameters=share * self.parameters,
+        )
+
+    def reversed(self) -> Arc:
+        """Return the arc from its end to its start."""
+        return replace(self, first_rad=self.first_rad + self.turn_rad, turn_rad=-self.turn_rad)
+
+
+Piece = Sampled | Arc
+
+
+def arc_through(
+    start: Float64[ndarray, " 3"], middle: Float64[ndarray, " 3"], end: Float64[ndarray, " 3"], angle_rad: float
+) -> list[Piece]:
+    """Return the circular arc from ``start`` through ``middle`` to ``end``, or two legs if they are collinear.
+
+    The centre c solves |c - start|^2 = |c - end|^2 = |c - middle|^2 in the plane of the three points.
+    ``angle_rad`` is the project's plane angle unit.
+    """
+    to_middle, to_end = middle - start, end - start
+    normal = np.cross(to_middle, to_end)
+    if np.linalg.norm(normal) <= 1e-9 * np.linalg.norm(to_middle) * np.linalg.norm(to_end):
+        return [Leg.between(start, middle), Leg.between(middle, end)]
+    x_axis = to_end / np.linalg.norm(to_end)
+    y_axis = np.cross(normal, x_axis) / np.linalg.norm(normal)
+    half = float(np.linalg.norm(to_end)) / 2
+    x, y = float(to_middle @ x_axis), float(to_middle @ y_axis)
+    centre_y = (x * x + y * y - 2 * half * x) / (2 * y)
+    centre, radius = start + half * x_axis + centre_y * y_axis, float(np.hypot(half, centre_y))
+    # By the choice of y_axis the middle has negative y, so the arc runs anticlockwise from start to end.
+    first = float(np.arctan2(-centre_y, -half))
+    turn = (float(np.arctan2(-centre_y, half)) - first) % (2 * np.pi)
+    return [Arc(centre, radius * x_axis, radius * y_axis, first, turn, turn / angle_rad)]
+
+
+def cut(pieces: list[Piece], ranges: list[float], first: float, last: float) -> list[Piece]:
+    """Return the pieces between two values of a parameter that counts ``ranges[i]`` along piece i, from 0."""
+    kept: list[Piece] = []
+    begin = 0.0
+    for piece, size in zip(pieces, ranges, strict=True):
+        low, high = max(first - begin, 0.0), min(last - begin, size)
+        if size > 0 and high > low:
+            kept.append(piece.part(low / size, 1.0 if high == size else high / size))
+        begin += size
+    return kept
 
 
 def curve_pieces(curve: Any, angle_rad: float, depth: int = 0) -> list[Piece]:
@@ -46,7 +166,7 @@ def curve_pieces(curve: Any, angle_rad: float, depth: int = 0) -> list[Piece]:
 
 
 def _legs(points: Float64[ndarray, "n 3"]) -> list[Piece]:
-    return [Leg(start, end, 1.0) for start, end in pairwise(points)]
+    return [Leg.between(start, end) for start, end in pairwise(points)]
 
 
 def _polyline(curve: Any, _angle_rad: float, _depth: int) -> list[Piece]:
@@ -63,13 +183,11 @@ def _indexed_curve(curve: Any, angle_rad: float, _depth: int) -> list[Piece]:
         if index.min() < 0 or index.max() >= len(points):
             raise ValueError("a segment refers to a point that does not exist")
         corners = points[index]
-        pieces += _arc_index(corners, angle_rad) if segment.is_a("IfcArcIndex") else _legs(corners)
+        if segment.is_a("IfcArcIndex"):
+            pieces += arc_through(corners[0], corners[1], corners[2], angle_rad)
+        else:
+            pieces += _legs(corners)
     return pieces
-
-
-def _arc_index(corners: Float64[ndarray, "3 3"], angle_rad: float) -> list[Piece]:
-    start, middle, end = corners
-    return arc_through(start, middle, end, angle_rad)
 
 
 def _composite_curve(curve: Any, angle_rad: float, depth: int) -> list[Piece]:
@@ -114,7 +232,7 @@ def _trimmed_line(curve: Any, line: Any) -> Leg:
         _trim_parameter(curve, trim, lambda point: float((point - start) @ along / (along @ along)), 1.0)
         for trim in "12"
     )
-    return Leg(start + first * along, start + last * along, abs(last - first))
+    return Leg.between(start + first * along, start + last * along, abs(last - first))
 
 
 def _trimmed_conic(curve: Any, conic: Any, angle_rad: float) -> Arc:

@@ -30,16 +30,14 @@ _SCHEMA = re.compile(rf"FILE_SCHEMA{_GAP}({_BODY});")
 _INSTANCE = re.compile(rf"{_GAP}#(\d{{1,18}}){_GAP}={_GAP}(!?+[A-Za-z]\w*+{_GAP}\({_BODY});", re.ASCII)
 _FOOTER = re.compile(rf"{_GAP}ENDSEC{_GAP};{_GAP}END-ISO-10303-21{_GAP};\s*+\Z")
 _CLASS = re.compile(rf"(!?+[A-Za-z]\w*+){_GAP}", re.ASCII)
+# ISO 10303-21 requires a digit before the point; the parser reads numbers without it after a sign only.
+_NUMBER = r"[-+]?+(?:\d++(?:\.\d*+)?+|\.\d++)(?:[Ee][-+]?+\d++)?+"
+_IS_NUMBER = re.compile(_NUMBER, re.ASCII)
 _TOKEN = re.compile(
-    rf"{_GAP}({_STRING}|\#\d++|[-+]?+\d++(?:\.\d*+)?+(?:[Ee][-+]?+\d++)?+|\.[A-Za-z]\w*+\."
+    rf"{_GAP}({_STRING}|\#\d++|{_NUMBER}|\.[A-Za-z]\w*+\."
     rf"|[A-Za-z]\w*+(?={_GAP}\()|\"[0-9A-Fa-f]*+\"|[$*(),]){_GAP}",
     re.ASCII,
 )
-
-_PIECE = re.compile(
-    r"'(?:[^']|'')*+'|\#\d++|[A-Za-z]\w*+|[-+]?+\d++(?:\.\d*+)?+(?:[Ee][-+]?+\d++)?+|.", re.ASCII | re.DOTALL
-)
-_NUMBER_STARTS = frozenset("+-0123456789")
 
 
 class StepText:
@@ -130,22 +128,6 @@ def split_arguments(instance: str) -> list[list[str]] | None:
     return arguments if depth == 0 and position == len(instance) else None
 
 
-def same_values(first: str, second: str) -> bool:
-    """Return whether two texts of instances are the same but for the form of their numbers.
-
-    This is much faster than the comparison of split arguments, which also knows comments and other spellings.
-    """
-    pieces = _PIECE.findall(first), _PIECE.findall(second)
-    return len(pieces[0]) == len(pieces[1]) and all(
-        a == b or (_is_number(a) and _is_number(b) and float(a) == float(b)) for a, b in zip(*pieces, strict=True)
-    )
-
-
-def _is_number(piece: str) -> bool:
-    """Return whether a piece is a number; a lone sign is none."""
-    return piece[0] in _NUMBER_STARTS and piece[-1] not in "+-"
-
-
 def same_tokens(first: list[str], second: list[str]) -> bool:
     """Return whether two lists of tokens have the same values; the content of strings is not compared."""
     return len(first) == len(second) and all(map(_same_token, first, second))
@@ -154,6 +136,6 @@ def same_tokens(first: list[str], second: list[str]) -> bool:
 def _same_token(first: str, second: str) -> bool:
     if first == second or first[0] == second[0] == "'":  # Writers encode the same string in different ways.
         return True
-    if first[0] in _NUMBER_STARTS and second[0] in _NUMBER_STARTS:
+    if _IS_NUMBER.fullmatch(first) and _IS_NUMBER.fullmatch(second):
         return float(first) == float(second)
     return first.upper() == second.upper()

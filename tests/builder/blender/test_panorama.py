@@ -124,7 +124,7 @@ def test_manifest_records_panorama_and_sensor() -> None:
     [spec] = BuildRequest(configs=("lattice",), variants=("sensor", "night"), seed=3).config_specs()
     assert spec.name == "lattice-night-sensor"
     appearance = config_parameters(spec)["scene"]["appearance"]
-    assert appearance["variants"] == ("night", "sensor")
+    assert appearance["variants"] == ["night", "sensor"]
     assert appearance["image_light"]["image"] == "night"
     assert len(appearance["image_light"]["sha256"]) == 64
     assert 0 <= appearance["image_light"]["turn_deg"] < 360

@@ -13,8 +13,8 @@ from numpy import ndarray
 
 from dataset_builder.scene.assemblies.cage import CageBar
 from dataset_builder.scene.assemblies.cage_checks import raise_problems
-from dataset_builder.scene.assemblies.ifc.answer import Answer
-from dataset_builder.scene.ifc_reader.answer import write_answer
+from dataset_builder.scene.assemblies.ifc_file import Answer
+from dataset_builder.scene.ifc_reader.__main__ import write_answer
 
 Numbers = Sequence[float]
 

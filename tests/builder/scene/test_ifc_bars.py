@@ -18,10 +18,11 @@ from ifcopenshell import geom
 from numpy import ndarray
 
 from dataset_builder.scene.assemblies.cage_file import cage_file_spec, load_cage
-from dataset_builder.scene.assemblies.ifc.process import ifc_cage
+from dataset_builder.scene.assemblies.ifc_file import ifc_cage
+from dataset_builder.scene.ifc_reader.bodies import axis_placement
+from dataset_builder.scene.ifc_reader.curves import arc_through
 from dataset_builder.scene.ifc_reader.model import open_model
-from dataset_builder.scene.ifc_reader.pieces import arc_through
-from dataset_builder.scene.ifc_reader.placements import axis_placement
+from dataset_builder.scene.ifc_reader.step_text import StepText
 from rebar_depth_bench.data.bars import Bar
 from tests.builder.scene.ifc_writer import Ifc, bars_in_process, extruded_circle, extruded_square
 
@@ -314,3 +315,33 @@ def test_spline_is_trimmed_in_parameters_of_its_knots(first: float, last: float,
     ifc.bar(ifc.disc(ifc.new("IfcTrimmedCurve", spline, *trims, True, "PARAMETER")))
     axis_mm = ifc.axis_m() * 1000
     np.testing.assert_allclose(axis_mm[[0, -1]], [(0, 0, 0), (length_mm, 0, 0)], atol=1e-9)
+
+
+def test_host_is_a_whole_or_a_connected_element() -> None:
+    ifc = Ifc()
+    part, connected, other = (ifc.bar(ifc.disc(ifc.polyline((0, y, 0), (500, y, 0)))) for y in (0, 100, 200))
+    wall, slab = ifc.rooted("IfcWall", Name="W"), ifc.rooted("IfcSlab", Name="S")
+    ifc.rooted("IfcRelNests", RelatingObject=wall, RelatedObjects=[part])
+    for bar in (part, connected):
+        ifc.rooted("IfcRelConnectsWithRealizingElements", RelatingElement=slab, RelatedElement=bar,
+                   RealizingElements=[bar])  # fmt: skip
+    storey = ifc.rooted("IfcBuildingStorey", Name="EG")
+    ifc.rooted("IfcRelContainedInSpatialStructure", RelatedElements=[wall, other], RelatingStructure=storey)
+    assert [(bar.host, bar.storey) for bar in ifc.bars()] == [("W", "EG"), ("S", None), (None, "EG")]
+
+
+def test_relation_of_all_bars_is_compared_with_its_text_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    ifc = Ifc()
+    bars = [ifc.bar(ifc.disc(ifc.polyline((0, 100 * n, 0), (500, 100 * n, 0)))) for n in range(50)]
+    relation = ifc.rooted("IfcRelAggregates", RelatingObject=ifc.rooted("IfcWall", Name="W"), RelatedObjects=bars)
+    content = ifc.file.to_string().encode()
+    compared: list[int] = []
+    instance = StepText.instance
+
+    def noted_instance(step: StepText, number: int) -> str:
+        compared.append(number)
+        return instance(step, number)
+
+    monkeypatch.setattr(StepText, "instance", noted_instance)
+    assert {bar.host for bar in bars_in_process(content)} == {"W"}
+    assert compared.count(relation.id()) == 1  # Once per bar would take quadratic time.

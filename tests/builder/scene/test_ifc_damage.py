@@ -82,6 +82,7 @@ UNREAD = "which cannot be read"
         ("#133=IFCCARTESIANPOINT((0.,0.,100.))", "#133=IFCCARTESIANPOINT((0.,0.))", "#134 .*points of 2 coord"),
         ("#26,4.,$,$,$)", "#26,4 5.,$,$,$)", f"#27 .*Radius is 45., {UNREAD}"),
         ("#26,4.,$,$,$)", "#26,'4',$,$,$)", "#27 .*Radius is 4, expected"),
+        ("#26,4.,$,$,$)", "#26,0.,$,$,$)", "#33.* a circle has the radius 0, expected above 0"),
         ("#26,4.,$,$,$)", "#26,4.)", "#27 is .*, expected 5 readable attributes of IfcSweptDiskSolid"),
         (".MAIN.", ".MAIX.", f"#33 .*PredefinedType is .MAIX., {UNREAD}"),
         ("#6=IFCSIUNIT(*,.PLANEANGLEUNIT.", "#6=IFCSIUNIT(*,.PLANEANGLEUNIX.", f"#6 .*UnitType is .*, {UNREAD}"),
@@ -117,7 +118,8 @@ def test_damage_and_unknown_classes_beside_the_bars_are_accepted(instances: str)
 def test_other_spellings_of_the_same_values_are_accepted() -> None:
     sound = [cage_bar.bar for cage_bar in bars_in_process(COLUMN.read_bytes())]
     text = column_with(POINT, "#24 = IfcCartesianPoint ( ( -4.60E+001 , /* y */ -46,\n +0.10 ) ) ;")
-    text = text.replace("(0.,0.,0.)", "(0.0,0,0.E0)").replace("'Upright 2'", r"'\X2\00FC\X0\'")
+    text = text.replace("(0.,0.,0.)", "(-.0,0,0.E0)").replace("#26,4.,", "#26,+.4e1,")
+    text = text.replace("'Upright 2'", r"'\X2\00FC\X0\'")
     assert [cage_bar.bar for cage_bar in bars_in_process(text.encode())] == sound
 
 

@@ -9,9 +9,9 @@ import pytest
 
 from dataset_builder.config.file_specs import Trust
 from dataset_builder.scene.assemblies.cage import CageBar
-from dataset_builder.scene.assemblies.ifc.answer import Answer
+from dataset_builder.scene.assemblies.ifc_file import Answer
 from dataset_builder.scene.ifc_reader import bars as reader_bars
-from dataset_builder.scene.ifc_reader.answer import write_answer
+from dataset_builder.scene.ifc_reader.__main__ import write_answer
 from rebar_depth_bench.errors import MeshError
 from tests.builder.scene.cages import assembly_of
 from tests.builder.scene.ifc_exporters import STYLES, revit, u_curve

@@ -18,10 +18,10 @@ import numpy as np
 import pytest
 
 from dataset_builder.config.scene_file import scene_config
-from dataset_builder.scene.assemblies.ifc import process
-from dataset_builder.scene.assemblies.ifc.answer import MAX_ARRAY_BYTES, Answer, AnswerError
-from dataset_builder.scene.assemblies.ifc.process import ifc_cage
-from dataset_builder.scene.ifc_reader.__main__ import SECONDS_PER_SHAPE, _limited_time
+from dataset_builder.scene.assemblies import ifc_file
+from dataset_builder.scene.assemblies.ifc_file import Answer, ifc_cage
+from dataset_builder.scene.ifc_reader.bars import SECONDS_PER_SHAPE, limited_time
+from dataset_builder.scene.ifc_records import MAX_ARRAY_BYTES, AnswerError
 from dataset_builder.scene.model import MAX_BARS
 from rebar_depth_bench.errors import InputError, MeshError
 from rebar_depth_bench.limits import IFC_MEMORY_BYTES, IFC_SECONDS
@@ -35,7 +35,7 @@ COLUMN = Path("examples/column.ifc")
 def run_instead(monkeypatch: pytest.MonkeyPatch, code: str) -> None:
     """Let a Python program take the place of the reader; its standard output is the answer."""
     program = f"import json, sys; sys.stdin.buffer.read(); out = sys.stdout.buffer; {code}"
-    monkeypatch.setattr(process, "COMMAND", (sys.executable, "-c", program))
+    monkeypatch.setattr(ifc_file, "COMMAND", (sys.executable, "-c", program))
 
 
 def column_with(old: str, new: str) -> bytes:
@@ -86,7 +86,7 @@ def test_crash_and_time_limits_name_the_object(monkeypatch: pytest.MonkeyPatch) 
 
 @pytest.mark.slow
 def test_end_before_the_input_is_read_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(process, "COMMAND", (sys.executable, "-c", "raise SystemExit(7)"))
+    monkeypatch.setattr(ifc_file, "COMMAND", (sys.executable, "-c", "raise SystemExit(7)"))
     with pytest.raises(MeshError, match=r"^a.ifc: the file cannot be read: ifcopenshell crashed \(status 7\)"):
         ifc_cage(b" " * 5_000_000, "a.ifc")
 
@@ -116,19 +116,30 @@ def test_large_model_is_read_by_one_process(monkeypatch: pytest.MonkeyPatch) -> 
         "import os, runpy, sys; sys.addaudithook(lambda event, _: os._exit(3) if event == 'os.fork' else None); "
         "runpy.run_module('dataset_builder.scene.ifc_reader', run_name='__main__')"
     )
-    monkeypatch.setattr(process, "COMMAND", (sys.executable, "-c", program))
+    monkeypatch.setattr(ifc_file, "COMMAND", (sys.executable, "-c", program))
     assert len(ifc_cage(step.text().encode(), "a.ifc").bars) == bars  # A fork would have limits of its own.
 
 
-def test_time_limit_ends_with_the_use_of_the_kernel() -> None:
-    with _limited_time():
-        assert 0 < signal.getitimer(signal.ITIMER_REAL)[0] <= SECONDS_PER_SHAPE
-    assert signal.getitimer(signal.ITIMER_REAL)[0] == 0
+@pytest.mark.parametrize(("own_s", "during_s", "after_s"), [(0, 60, 0), (30, 30, 30), (90, 60, 90)])
+def test_time_limit_of_an_object_keeps_that_of_the_process(own_s: int, during_s: int, after_s: int) -> None:
+    assert SECONDS_PER_SHAPE == 60
+    signal.setitimer(signal.ITIMER_REAL, own_s)
+    try:
+        with limited_time():
+            assert during_s - 10 < signal.getitimer(signal.ITIMER_REAL)[0] <= during_s
+        assert after_s - 10 < signal.getitimer(signal.ITIMER_REAL)[0] <= after_s
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
 
 
 @pytest.mark.slow
-def test_process_that_sleeps_is_killed(monkeypatch: pytest.MonkeyPatch) -> None:
-    run_instead(monkeypatch, "import time; time.sleep(100)")
+def test_process_that_sleeps_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    program = (
+        "import runpy, sys, time; from dataset_builder.scene.ifc_reader import bars; "
+        "bars.read_bars = lambda *_: time.sleep(100); "
+        "runpy.run_module('dataset_builder.scene.ifc_reader', run_name='__main__')"
+    )
+    monkeypatch.setattr(ifc_file, "COMMAND", (sys.executable, "-c", program))
     monkeypatch.setenv(IFC_SECONDS.variable, "1")
     start = time.monotonic()
     with pytest.raises(MeshError, match=r"more than 1 s \(REBAR_MAX_IFC_SECONDS raises the limit\)"):
@@ -142,7 +153,7 @@ def test_process_ends_with_its_parent() -> None:
     code = f"""
 import os, subprocess, time
 command = [{sys.executable!r}, "-m", "dataset_builder.scene.ifc_reader"]
-child = subprocess.Popen([*command, str(8 << 30), "60", str(os.getpid())])
+child = subprocess.Popen([*command, str(os.getpid()), str(8 << 30), "60", "120"])
 print(child.pid, flush=True)
 time.sleep(100)
 """
@@ -273,7 +284,7 @@ def test_this_process_does_not_import_ifcopenshell() -> None:
     code = """
 import sys
 from pathlib import Path
-from dataset_builder.scene.assemblies.ifc.process import ifc_cage
+from dataset_builder.scene.assemblies.ifc_file import ifc_cage
 assert len(ifc_cage(Path("examples/column.ifc").read_bytes(), "a.ifc").bars) == 13
 assert not [name for name in sys.modules if "ifcopenshell" in name or "ifc_reader" in name]
 """
