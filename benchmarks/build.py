@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from benchmarks.timing import machine_description, print_markdown
-from dataset_builder.config.catalog import CONFIGS, BuildRequest
-from dataset_builder.config.trajectories import view_count
+from dataset_builder.cameras.trajectories import view_count
+from dataset_builder.catalog.named_configs import CONFIGS, BuildRequest
 from dataset_builder.pipeline.build import build
 from dataset_builder.pipeline.shards import VIEWS_PER_SHARD
 

@@ -24,12 +24,12 @@ from PIL import Image
 from benchmarks.timing import machine_description, print_markdown
 from dataset_builder.blender.colour import configure_colour, render_colour
 from dataset_builder.blender.scene import build_scene, evaluated_world_mesh
-from dataset_builder.config.catalog import BuildRequest
-from dataset_builder.config.rigs import rig_cameras
-from dataset_builder.config.specs import QUALITIES, UNIFORM, ColourSpec, ConfigSpec, colour_spec
-from dataset_builder.config.trajectories import aim_point_m, poses, subset
-from dataset_builder.scene.assemblies import make_assembly
+from dataset_builder.cameras.rigs import rig_cameras
+from dataset_builder.cameras.trajectories import aim_point_m, poses, subset
+from dataset_builder.catalog.named_configs import BuildRequest
 from dataset_builder.scene.raycast import RayCaster
+from dataset_builder.specs.config_specs import QUALITIES, UNIFORM, ColourSpec, ConfigSpec, colour_spec
+from dataset_builder.user_files.make_assembly import make_assembly
 from rebar_depth_bench.geometry.cameras import Camera
 
 SCENES = ("lattice", "pile", "pier")

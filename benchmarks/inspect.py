@@ -19,7 +19,7 @@ import time
 from pathlib import Path
 
 from benchmarks.timing import machine_description, print_markdown
-from tests.builder.scene.ifc_step_text import MILLIMETRES, Step
+from tests.builder.user_files.ifc_step_text import MILLIMETRES, Step
 
 _LEVELS = 100
 """Stirrups of a column."""

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from cards.reference import results_file
-from dataset_builder.cli import main as rebar_build
+from dataset_builder.cli.main import main as rebar_build
 from rebar_depth_bench import score
 from rebar_depth_bench.atomic_io import write_text
 from rebar_depth_bench.cli.main import main as rebar_bench

@@ -29,9 +29,8 @@ import numpy as np
 
 from benchmarks.timing import machine_description, print_markdown
 from dataset_builder.audit import audit
-from dataset_builder.config.cages import CAGES, CagesRequest
-from dataset_builder.config.catalog import BuildRequest
-from dataset_builder.config.specs import ConfigSpec, RandomViewsSpec
+from dataset_builder.catalog.cages_config import CAGES, CagesRequest
+from dataset_builder.catalog.named_configs import BuildRequest
 from dataset_builder.pipeline.blender_process import OnViewDone
 from dataset_builder.pipeline.build import plan_build
 from dataset_builder.pipeline.disk_space import check_readable, spaces_by_config
@@ -42,6 +41,7 @@ from dataset_builder.pipeline.retained import Finished, kept_scenes
 from dataset_builder.pipeline.shards import Staging, View, encode_view, stage_row
 from dataset_builder.pipeline.work_units import UnitResult, WorkUnit
 from dataset_builder.scene.mesh_ply import write_mesh_ply
+from dataset_builder.specs.config_specs import ConfigSpec, RandomViewsSpec
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.digests import file_sha256
 from rebar_depth_bench.data.eye_view import EyeView

@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.timing import print_markdown
 from cards.steel import range_text
-from dataset_builder.scene.steel_distance import Cylinders
+from dataset_builder.cameras.steel_distance import Cylinders
 from rebar_depth_bench.atomic_io import write_text
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars
 from rebar_depth_bench.data.dataset import iterate_rows

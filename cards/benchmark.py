@@ -38,7 +38,7 @@ from rebar_depth_bench.scoring.rounding import SIGNIFICANT_DIGITS
 from rebar_depth_bench.submission import INPUTS
 
 _CONTACTS = {"lattice": "375", "pier": "4,860", "pile": "15"}
-"""Numbers of crossings of the scenes, as `tests/builder/config/test_configs.py` expects them."""
+"""Numbers of crossings of the scenes, as `tests/builder/catalog/test_configs.py` expects them."""
 
 
 def steel_context() -> dict[str, Any]:

@@ -25,10 +25,10 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.config.specs import PileSpec
 from dataset_builder.scene.assemblies.pile import RIBS, Pose, points_in_world_m, spec_centreline_m
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
 from dataset_builder.scene.shapes.bending import resample_polyline_m
+from dataset_builder.specs.config_specs import PileSpec
 from rebar_depth_bench.atomic_io import write_text
 from rebar_depth_bench.console import run_command
 from rebar_depth_bench.errors import BuildError

@@ -42,7 +42,7 @@ from dataset_builder.audit.independent_depth import (
     epipolar_counts,
     epipolar_verdict,
 )
-from dataset_builder.config.trajectories import subset
+from dataset_builder.cameras.trajectories import subset
 from dataset_builder.pipeline.plan import BUILD_FOLDER
 from rebar_depth_bench.bar_crossings.definition import Crossings, scene_crossings
 from rebar_depth_bench.bar_crossings.table import CROSSINGS_FILE, folder_crossings

@@ -19,11 +19,11 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.audit.checks import AuditedConfig, AuditedEye, AuditedView, Check
-from dataset_builder.config.manifest_specs import rig_spec, trajectory_spec
-from dataset_builder.config.rigs import rig_cameras
-from dataset_builder.config.trajectories import aim_point_m, poses, subset
+from dataset_builder.cameras.rigs import rig_cameras
+from dataset_builder.cameras.trajectories import aim_point_m, poses, subset
 from dataset_builder.scene.mesh_ply import read_mesh_ply
 from dataset_builder.scene.model import NOT_STEEL, Assembly, Mesh, Part
+from dataset_builder.specs.manifest_specs import rig_spec, trajectory_spec
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.columns import EYES
 from rebar_depth_bench.data.dataset_config import DatasetConfig

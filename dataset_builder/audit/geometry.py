@@ -15,13 +15,13 @@ from jaxtyping import Float64, UInt16
 from numpy import ndarray
 
 from dataset_builder.audit.checks import AuditedConfig, AuditedEye, AuditedView, Check
-from dataset_builder.config.camera_placement import RANDOM_RULES
-from dataset_builder.config.manifest_specs import cage_spec, trajectory_spec
-from dataset_builder.config.specs import RandomViewsSpec
-from dataset_builder.scene.assemblies import assembly_bars
+from dataset_builder.cameras.camera_placement import RANDOM_RULES
 from dataset_builder.scene.cages.generate import VERSION
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
 from dataset_builder.scene.shapes.capsules import Clearances
+from dataset_builder.specs.config_specs import RandomViewsSpec
+from dataset_builder.specs.manifest_specs import cage_spec, trajectory_spec
+from dataset_builder.user_files.make_assembly import assembly_bars
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.geometry.aruco_board import BoardSpec

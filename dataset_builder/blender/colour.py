@@ -26,8 +26,8 @@ from dataset_builder.blender.render import (
     set_attributes,
     use_cycles,
 )
-from dataset_builder.config.specs import ColourSpec
 from dataset_builder.scene.steel_box import steel_box
+from dataset_builder.specs.config_specs import ColourSpec
 from rebar_depth_bench.errors import BuildError
 from rebar_depth_bench.geometry.cameras import Camera
 

@@ -19,14 +19,14 @@ from dataset_builder.blender.materials import (
     steel_material_name,
     surface_variation,
 )
-from dataset_builder.config.specs import SceneSpec
-from dataset_builder.config.surroundings import SURROUNDINGS
 from dataset_builder.scene.board_texture import board_texture
 from dataset_builder.scene.environments.laboratory import BENCH_TOP_M, SHEET_THICKNESS_M
+from dataset_builder.scene.environments.surroundings import SURROUNDINGS
 from dataset_builder.scene.model import NOT_STEEL, Assembly, Mesh, Part, WorldMesh, surface
 from dataset_builder.scene.shapes.solids import box, merge_meshes, transformed
 from dataset_builder.scene.variants.props import make_props
 from dataset_builder.scene.variants.registry import LIGHT_SLOT, STEEL_SLOT, exclusive_variant, image_light
+from dataset_builder.specs.config_specs import SceneSpec
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 
 BAR_ID = "bar_id"

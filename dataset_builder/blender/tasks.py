@@ -25,18 +25,18 @@ from numpy import ndarray
 from dataset_builder.blender.colour import configure_colour, render_colour
 from dataset_builder.blender.render import render_depth, use_cycles
 from dataset_builder.blender.scene import add_object, build_scene, evaluated_world_mesh, mesh_data
-from dataset_builder.config.file_specs import PinnedFile
-from dataset_builder.config.rigs import rig_cameras
-from dataset_builder.config.specs import CPU, GPU_TYPES, ConfigSpec
-from dataset_builder.config.trajectories import aim_point_m, poses
+from dataset_builder.cameras.rigs import rig_cameras
+from dataset_builder.cameras.trajectories import aim_point_m, poses
 from dataset_builder.pipeline.blender_process import DepthTask, DevicesTask, RenderTask
 from dataset_builder.pipeline.shards import View, encode_view, stage_row
-from dataset_builder.scene.assemblies import make_assembly
 from dataset_builder.scene.assemblies.cage import unpacked_cage
 from dataset_builder.scene.mesh_ply import read_mesh_ply, write_mesh_ply
 from dataset_builder.scene.model import Mesh, WorldMesh, surface
 from dataset_builder.scene.raycast import RayCaster
 from dataset_builder.scene.variants.sensor import recorded
+from dataset_builder.specs.config_specs import CPU, GPU_TYPES, ConfigSpec
+from dataset_builder.specs.file_specs import PinnedFile
+from dataset_builder.user_files.make_assembly import make_assembly
 from rebar_depth_bench.atomic_io import write_bytes
 from rebar_depth_bench.data.digests import file_sha256
 from rebar_depth_bench.errors import BuildError, InputError

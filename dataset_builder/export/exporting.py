@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from dataset_builder.config.trajectories import subset
+from dataset_builder.cameras.trajectories import subset
 from dataset_builder.export.camera_formats import cameras_txt, images_txt, points_txt, transforms_json
 from dataset_builder.export.exported_views import (
     EXPORT_FILES,

@@ -9,8 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from dataset_builder.config.scene_file import RESERVED_NAMES, scene_name_of
-from dataset_builder.config.scene_schema import SCENE_NAME
+from dataset_builder.catalog.scene_file import RESERVED_NAMES, scene_name_of
 from dataset_builder.importing.import_layout import Layout, read_layout
 from dataset_builder.importing.source_files import read_bars_file
 from dataset_builder.importing.source_views import SourceViews, open_views
@@ -19,6 +18,7 @@ from dataset_builder.pipeline.plan import BUILD_FOLDER, KEY_CHARACTERS, generato
 from dataset_builder.pipeline.publish import StagedScene, publish, remove_leftovers
 from dataset_builder.pipeline.retained import Finished, check_retained
 from dataset_builder.pipeline.shards import Staging, encode_row, stage_row, view_record
+from dataset_builder.user_files.scene_schema import SCENE_NAME
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.columns import OPTIONAL_COLUMNS
 from rebar_depth_bench.data.digests import file_sha256, parameters_digest

@@ -13,10 +13,8 @@ from functools import partial
 from itertools import groupby
 from pathlib import Path
 
-from dataset_builder.config.camera_fit import check_fits
-from dataset_builder.config.catalog import BuildRequest
-from dataset_builder.config.file_specs import CageFileSpec, MeshFileSpec
-from dataset_builder.config.specs import SceneConfigSpec
+from dataset_builder.cameras.camera_fit import check_fits
+from dataset_builder.catalog.named_configs import BuildRequest
 from dataset_builder.pipeline.blender_process import Submit, local_processes
 from dataset_builder.pipeline.disk_space import check_readable, check_space, spaces_by_config
 from dataset_builder.pipeline.folder import build_lock, check_target, remove_build_folder, remove_stagings
@@ -28,6 +26,8 @@ from dataset_builder.pipeline.publish import (
 )
 from dataset_builder.pipeline.retained import Finished, check_retained, kept_scenes
 from dataset_builder.pipeline.work_units import UnitResult, WorkUnit, accept_result, remaining_units
+from dataset_builder.specs.config_specs import SceneConfigSpec
+from dataset_builder.specs.file_specs import CageFileSpec, MeshFileSpec
 from rebar_depth_bench.atomic_io import write_bytes
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.progress import Progress, silent
@@ -90,7 +90,7 @@ def plan_build(request: BuildRequest, out: Path) -> tuple[list[ConfigPlan], Fini
     for spec in specs:
         file = spec.scene.assembly
         if isinstance(file, CageFileSpec | MeshFileSpec) and file not in cages:
-            from dataset_builder.scene.assemblies.cage_file import read_cage
+            from dataset_builder.user_files.cage_file import read_cage
 
             cages[file] = read_cage(file)
     plans = [plan_config(spec, request.views, out, cages.get(spec.scene.assembly)) for spec in specs]

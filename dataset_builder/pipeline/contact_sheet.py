@@ -11,7 +11,7 @@ from jaxtyping import UInt8
 from numpy import ndarray
 from PIL import Image, ImageDraw
 
-from dataset_builder.config.trajectories import subset
+from dataset_builder.cameras.trajectories import subset
 from rebar_depth_bench.atomic_io import write_bytes
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.decoding import RowDecoder

@@ -28,7 +28,6 @@ import distributed
 from distributed.comm import get_address_host_port
 from distributed.scheduler import KilledWorker
 
-from dataset_builder.config.specs import CPU
 from dataset_builder.pipeline.blender_process import (
     AUTO,
     BlenderProcesses,
@@ -40,6 +39,7 @@ from dataset_builder.pipeline.blender_process import (
 from dataset_builder.pipeline.plan import generator_versions
 from dataset_builder.pipeline.shards import Staging
 from dataset_builder.pipeline.work_units import UnitResult, WorkUnit, with_files
+from dataset_builder.specs.config_specs import CPU
 from rebar_depth_bench.errors import BuildError, InputError, RenderProcessError
 
 _CONNECT_S = 10

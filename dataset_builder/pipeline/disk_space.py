@@ -14,11 +14,11 @@ from dataclasses import asdict, dataclass
 from itertools import groupby
 from pathlib import Path
 
-from dataset_builder.config.specs import RigSpec, SceneConfigSpec
 from dataset_builder.pipeline.folder import existing_ancestor
 from dataset_builder.pipeline.plan import ConfigPlan, config_parameters, generator_versions
 from dataset_builder.pipeline.retained import Finished
 from dataset_builder.scene.variants.registry import image_light
+from dataset_builder.specs.config_specs import RigSpec, SceneConfigSpec
 from rebar_depth_bench.data.bars import BARS_FILE, decoded_bytes
 from rebar_depth_bench.data.manifest import MANIFEST_FILE
 from rebar_depth_bench.errors import InputError, OutputError

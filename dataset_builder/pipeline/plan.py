@@ -13,13 +13,13 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, cast
 
-from dataset_builder.config.specs import ConfigSpec, GeneratedCageSpec, RandomViewsSpec, SceneConfigSpec
-from dataset_builder.config.trajectories import aim_point_m, subset, view_count
+from dataset_builder.cameras.trajectories import aim_point_m, subset, view_count
 from dataset_builder.pipeline.shards import VIEWS_PER_SHARD, Staging
-from dataset_builder.scene.assemblies import assembly_bars, make_assembly
 from dataset_builder.scene.model import Assembly, Note
 from dataset_builder.scene.variants.registry import image_light
 from dataset_builder.scene.variants.sensor import sensor_spec
+from dataset_builder.specs.config_specs import ConfigSpec, GeneratedCageSpec, RandomViewsSpec, SceneConfigSpec
+from dataset_builder.user_files.make_assembly import assembly_bars, make_assembly
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.columns import ROW_SCHEMA
 from rebar_depth_bench.data.digests import parameters_digest
@@ -172,9 +172,9 @@ def place_cameras(plans: Sequence[ConfigPlan], processes: int, progress: Progres
 def with_cameras(plan: ConfigPlan) -> ScenePlan:
     """Return the plan of a generated scene with its cameras. Raises as ``place_cameras``."""
     # Only processes that place cameras need these modules.
-    from dataset_builder.config.camera_placement import with_random_stations
-    from dataset_builder.config.surroundings import SURROUNDINGS
+    from dataset_builder.cameras.camera_placement import with_random_stations
     from dataset_builder.scene.assemblies.generated import cage_assembly, spec_cage
+    from dataset_builder.scene.environments.surroundings import SURROUNDINGS
     from dataset_builder.scene.variants.props import make_props
 
     spec = plan.spec

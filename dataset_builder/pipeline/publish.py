@@ -18,9 +18,8 @@ from pathlib import Path
 from typing import Any
 
 from cards.dataset import dataset_card
-from dataset_builder.config.catalog import CONFIGS
-from dataset_builder.config.specs import SceneConfigSpec
-from dataset_builder.config.trajectories import view_count
+from dataset_builder.cameras.trajectories import view_count
+from dataset_builder.catalog.named_configs import CONFIGS
 from dataset_builder.pipeline.contact_sheet import write_contact_sheet, write_scenes_strip
 from dataset_builder.pipeline.folder import (
     CARD,
@@ -35,6 +34,7 @@ from dataset_builder.pipeline.folder import (
 )
 from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, config_parameters, generator_versions
 from dataset_builder.pipeline.shards import Staging, pack_shard, read_staged_record, split_into_shards
+from dataset_builder.specs.config_specs import SceneConfigSpec
 from rebar_depth_bench.atomic_io import write_bytes, write_text
 from rebar_depth_bench.bar_crossings.definition import Crossings, crossing_parameters
 from rebar_depth_bench.bar_crossings.table import (

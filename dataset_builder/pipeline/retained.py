@@ -11,13 +11,13 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from dataset_builder.config.manifest_specs import cage_spec
-from dataset_builder.config.specs import SceneConfigSpec
 from dataset_builder.pipeline.folder import MESHES, PICTURES, SHARD_NAME, file_matches, stored_bars_path
 from dataset_builder.pipeline.plan import ConfigPlan, config_parameters, generator_versions
 from dataset_builder.pipeline.shards import VIEWS_PER_SHARD, stage_published_rows
 from dataset_builder.pipeline.work_units import stage_mesh_digest
 from dataset_builder.scene.model import Note
+from dataset_builder.specs.config_specs import SceneConfigSpec
+from dataset_builder.specs.manifest_specs import cage_spec
 from rebar_depth_bench.atomic_io import write_bytes
 from rebar_depth_bench.data.config_tables import ViewRecord
 from rebar_depth_bench.data.dataset_config import DatasetConfig

@@ -13,9 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-from dataset_builder.config.catalog import BuildRequest
-from dataset_builder.config.scene_schema import read_scene_toml
-from dataset_builder.scene.assemblies.cage_file import cage_file_spec, load_cage
+from dataset_builder.catalog.named_configs import BuildRequest
+from dataset_builder.user_files.cage_file import cage_file_spec, load_cage
+from dataset_builder.user_files.scene_schema import read_scene_toml
 from rebar_depth_bench.captures.folder import open_capture
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import InputError

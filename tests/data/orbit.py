@@ -13,18 +13,18 @@ from pathlib import Path
 
 import numpy as np
 
-from dataset_builder.config.catalog import BuildRequest
-from dataset_builder.config.rigs import rig_cameras
-from dataset_builder.config.specs import ColourSpec
-from dataset_builder.config.trajectories import aim_point_m, poses
+from dataset_builder.cameras.rigs import rig_cameras
+from dataset_builder.cameras.trajectories import aim_point_m, poses
+from dataset_builder.catalog.named_configs import BuildRequest
 from dataset_builder.pipeline.blender_process import OnViewDone
 from dataset_builder.pipeline.build import build
 from dataset_builder.pipeline.shards import Staging, View, encode_view, stage_row
 from dataset_builder.pipeline.work_units import UnitResult, WorkUnit
-from dataset_builder.scene.assemblies import make_assembly
 from dataset_builder.scene.mesh_ply import read_mesh_ply
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.scene.raycast import RayCaster
+from dataset_builder.specs.config_specs import ColourSpec
+from dataset_builder.user_files.make_assembly import make_assembly
 from rebar_depth_bench.data.codecs import decode
 from rebar_depth_bench.data.digests import file_sha256
 

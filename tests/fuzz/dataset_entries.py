@@ -14,10 +14,10 @@ import pandas as pd
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from dataset_builder.cli import argument_parser as builder_parser
-from dataset_builder.config.catalog import BuildRequest
-from dataset_builder.config.specs import colour_spec
+from dataset_builder.catalog.named_configs import BuildRequest
+from dataset_builder.cli.main import argument_parser as builder_parser
 from dataset_builder.pipeline.build import build
+from dataset_builder.specs.config_specs import colour_spec
 from rebar_depth_bench import SubmissionWriter, load
 from rebar_depth_bench.console import EXIT_DONE
 from rebar_depth_bench.data.dataset import ConfigViews

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import trimesh
 
-from dataset_builder.config.scene_file import scene_config
-from dataset_builder.scene.assemblies.cage_file import cage_file_spec, load_cage, mesh_file_spec
+from dataset_builder.catalog.scene_file import scene_config
 from dataset_builder.scene.mesh_ply import write_mesh_ply
+from dataset_builder.user_files.cage_file import cage_file_spec, load_cage, mesh_file_spec
 from rebar_depth_bench.geometry.calibration import read_calibration
 from tests.bench.geometry.calibrations import CONF, TOML
 from tests.building import TWO_BARS

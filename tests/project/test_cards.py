@@ -13,10 +13,10 @@ from benchmarks import steel_coverage
 from cards.benchmark import benchmark_card
 from cards.dataset import column_rows, dataset_card
 from cards.steel import steel_by_config
-from dataset_builder.config.catalog import CONFIGS, SWEEPS
-from dataset_builder.config.specs import DomeSpec
-from dataset_builder.config.trajectories import view_count
-from dataset_builder.scene.steel_distance import Cylinders
+from dataset_builder.cameras.steel_distance import Cylinders
+from dataset_builder.cameras.trajectories import view_count
+from dataset_builder.catalog.named_configs import CONFIGS, SWEEPS
+from dataset_builder.specs.config_specs import DomeSpec
 from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.data.columns import features
 from rebar_depth_bench.data.manifest import open_folder

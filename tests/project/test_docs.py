@@ -18,12 +18,12 @@ import pytest
 from _pytest.mark.structures import ParameterSet
 
 from cards.reference import FULL_SETS, reference_context
-from dataset_builder.cli import argument_parser as build_parser
-from dataset_builder.cli import with_command
-from dataset_builder.config.catalog import CONFIGS, SWEEPS
-from dataset_builder.config.scene_schema import read_scene_toml
+from dataset_builder.catalog.named_configs import CONFIGS, SWEEPS
+from dataset_builder.cli.main import argument_parser as build_parser
+from dataset_builder.cli.main import with_command
 from dataset_builder.importing.import_layout import read_layout
 from dataset_builder.scene.variants.registry import VARIANTS
+from dataset_builder.user_files.scene_schema import read_scene_toml
 from leaderboard.cli import argument_parser as board_parser
 from rebar_depth_bench.bar_crossings.table import CROSSINGS_SCHEMA
 from rebar_depth_bench.cli.main import argument_parser as bench_parser

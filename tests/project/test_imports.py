@@ -17,12 +17,12 @@ SCORING_IMPORTS = (
 )
 
 BUILDER_MODULES = [
-    "config.catalog",
-    "config.rigs",
-    "config.scene_schema",
+    "catalog.named_configs",
+    "cameras.rigs",
+    "user_files.scene_schema",
     "export",
-    "scene.assemblies",
-    "scene.assemblies.cage_file",
+    "user_files.make_assembly",
+    "user_files.cage_file",
     "scene.variants.props",
 ]
 """Packages, and modules that could take part in circular imports."""
@@ -61,17 +61,19 @@ def test_a_command_line_imports_only_its_command(words: str, commands: set[str])
 
 
 def test_options_of_a_command_load_no_other_command() -> None:
-    modules = modules_after("from dataset_builder.cli import argument_parser; argument_parser(['export'])")
+    modules = modules_after("from dataset_builder.cli.main import argument_parser; argument_parser(['export'])")
     assert {name for name in modules if name.startswith("dataset_builder")} == {
         "dataset_builder",
-        "dataset_builder.cli",
+        "dataset_builder.cli.main",
     }
     assert not modules & {"numpy", "pyarrow"}
 
 
 @pytest.mark.slow
 def test_build_planning_does_not_import_blender() -> None:
-    modules = modules_after("import dataset_builder.cli, dataset_builder.pipeline.build, dataset_builder.audit")
+    modules = modules_after(
+        "import dataset_builder.cli.main, dataset_builder.pipeline.build, dataset_builder.audit"
+    )
     assert "dataset_builder.pipeline.build" in modules
     assert not modules & {"bpy", "mathutils", "torch"}
 
@@ -88,7 +90,7 @@ import importlib.util, sys
 find = importlib.util.find_spec
 importlib.util.find_spec = lambda name, *rest: None if name in ("bpy", "trimesh") else find(name, *rest)
 sys.modules["trimesh"] = None
-from dataset_builder.cli import main
+from dataset_builder.cli.main import main
 sys.exit(main(["--out", "nowhere"]))
 """
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)

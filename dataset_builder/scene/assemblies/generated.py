@@ -6,12 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from dataset_builder.config.specs import GeneratedCageSpec
 from dataset_builder.scene.assemblies.bar_meshes import bar_mesh, ribs_per_row
 from dataset_builder.scene.assemblies.cage import CageBar
 from dataset_builder.scene.cages.as_built import BuiltBar
 from dataset_builder.scene.cages.generate import VERSION, GeneratedCage, generate_cage
 from dataset_builder.scene.model import Assembly, Mesh, axis_of
+from dataset_builder.specs.config_specs import GeneratedCageSpec
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.errors import InputError
 

@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.config.specs import LatticeSpec
 from dataset_builder.scene.cages.design import STANDING_M
 from dataset_builder.scene.model import Assembly, Mesh, axis_of
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m, ribbed_bar_mesh
+from dataset_builder.specs.config_specs import LatticeSpec
 from rebar_depth_bench.data.bars import Bar
 
 CLEAR_GAP_M = 2e-4

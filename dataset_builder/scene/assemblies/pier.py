@@ -16,12 +16,12 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.config.specs import PierSpec
 from dataset_builder.scene.cages.design import STANDING_M
 from dataset_builder.scene.model import Assembly, Mesh, axis_of
 from dataset_builder.scene.shapes.bar_mesh import plain_bar_mesh, plain_outer_radius_m
 from dataset_builder.scene.shapes.bending import bend_radius_m, bent_line_m
 from dataset_builder.scene.shapes.links import HOOK_DEG, SQUARE_HOOK_DEG, hook_m, tie_centreline_m
+from dataset_builder.specs.config_specs import PierSpec
 from rebar_depth_bench.data.bars import Bar
 
 VERTICAL, HOOP, TIE = "vertical", "hoop", "tie"

@@ -18,10 +18,10 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.config.specs import PileSpec
 from dataset_builder.scene.model import Assembly, Mesh, axis_of
 from dataset_builder.scene.shapes.bar_mesh import RibPattern, outer_radius_m, ribbed_bar_mesh
 from dataset_builder.scene.shapes.links import stirrup_centreline_m
+from dataset_builder.specs.config_specs import PileSpec
 from rebar_depth_bench.data.bars import Bar
 
 STATES_DIR = Path(__file__).with_name("settled")

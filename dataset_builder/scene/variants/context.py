@@ -12,10 +12,10 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.config.specs import GeneratedCageSpec, SceneSpec
 from dataset_builder.scene.model import Assembly, Part
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
 from dataset_builder.scene.shapes.capsules import Capsules
+from dataset_builder.specs.config_specs import GeneratedCageSpec, SceneSpec
 from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.geometry.aruco_board import marker_corners_m
 

@@ -15,7 +15,6 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.config.specs import SceneSpec
 from dataset_builder.scene.model import Assembly, Part, surface
 from dataset_builder.scene.shapes.solids import box, merge_meshes, transformed
 from dataset_builder.scene.variants.clutter import clutter
@@ -24,6 +23,7 @@ from dataset_builder.scene.variants.formwork import formwork
 from dataset_builder.scene.variants.registry import SCREEN_DISTANCE, SHADOWS, SUN_FROM
 from dataset_builder.scene.variants.spacers import spacers, supports
 from dataset_builder.scene.variants.tie_wire import tie_wire
+from dataset_builder.specs.config_specs import SceneSpec
 
 SLATS = 9
 """Number of slats of the screen."""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from dataset_builder.config.specs import SceneSpec
+from dataset_builder.specs.config_specs import SceneSpec
 from rebar_depth_bench.errors import InputError, Problem
 
 LIGHT_SLOT, STEEL_SLOT, PROPS_SLOT, SENSOR_SLOT = "light", "steel", "things", "sensor"

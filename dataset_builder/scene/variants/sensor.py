@@ -23,8 +23,8 @@ from jaxtyping import Float64, UInt8, UInt16
 from numpy import ndarray
 from PIL import Image
 
-from dataset_builder.config.specs import SceneSpec
 from dataset_builder.scene.variants.registry import SENSOR
+from dataset_builder.specs.config_specs import SceneSpec
 
 
 @dataclass(frozen=True)

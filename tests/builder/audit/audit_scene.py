@@ -15,14 +15,14 @@ from jaxtyping import Float64, UInt8
 from numpy import ndarray
 
 from dataset_builder.audit.checks import AuditedConfig, AuditedEye, AuditedView
-from dataset_builder.config.rigs import rig_cameras
-from dataset_builder.config.specs import RigSpec
-from dataset_builder.config.trajectories import look_at_with_rig
+from dataset_builder.cameras.rigs import rig_cameras
+from dataset_builder.cameras.trajectories import look_at_with_rig
 from dataset_builder.scene.board_texture import board_texture
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.scene.raycast import RayCaster
 from dataset_builder.scene.shapes.bar_mesh import plain_bar_mesh
 from dataset_builder.scene.shapes.bending import bent_line_m
+from dataset_builder.specs.config_specs import RigSpec
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.eye_view import EyeView
 from rebar_depth_bench.geometry.aruco_board import BoardSpec

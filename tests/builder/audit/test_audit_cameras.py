@@ -20,12 +20,12 @@ from dataset_builder.audit.camera_checks import (
     mesh_aim_point_m,
     view_list_problems,
 )
-from dataset_builder.config.manifest_specs import rig_spec, trajectory_spec
-from dataset_builder.config.rigs import rig_cameras
-from dataset_builder.config.specs import DomeSpec, RandomViewsSpec, RingSpec
-from dataset_builder.config.trajectories import poses
+from dataset_builder.cameras.rigs import rig_cameras
+from dataset_builder.cameras.steel_distance import Cylinders
+from dataset_builder.cameras.trajectories import poses
 from dataset_builder.scene.mesh_ply import write_mesh_ply
-from dataset_builder.scene.steel_distance import Cylinders
+from dataset_builder.specs.config_specs import DomeSpec, RandomViewsSpec, RingSpec
+from dataset_builder.specs.manifest_specs import rig_spec, trajectory_spec
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.config_tables import Scene, ViewRecord
 from rebar_depth_bench.data.dataset_config import DatasetConfig

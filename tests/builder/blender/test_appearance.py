@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 from numpy import ndarray
 
-from dataset_builder.config.catalog import BuildRequest
-from dataset_builder.config.specs import AppearanceSpec, ColourSpec, LatticeSpec, SceneSpec
-from dataset_builder.config.trajectories import look_at_with_rig
+from dataset_builder.cameras.trajectories import look_at_with_rig
+from dataset_builder.catalog.named_configs import BuildRequest
 from dataset_builder.scene.assemblies.lattice import lattice_assembly
 from dataset_builder.scene.model import Assembly
 from dataset_builder.scene.raycast import RayCaster
@@ -31,6 +30,7 @@ from dataset_builder.scene.variants.registry import (
     check_variants,
 )
 from dataset_builder.scene.variants.sensor import recorded
+from dataset_builder.specs.config_specs import AppearanceSpec, ColourSpec, LatticeSpec, SceneSpec
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import Camera, ideal_K, look_at

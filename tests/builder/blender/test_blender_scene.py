@@ -18,11 +18,11 @@ import pytest
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.config.specs import ColourSpec, LatticeSpec, SceneSpec
-from dataset_builder.config.trajectories import look_at_with_rig
+from dataset_builder.cameras.trajectories import look_at_with_rig
 from dataset_builder.scene.assemblies.lattice import lattice_assembly
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.scene.raycast import RayCaster
+from dataset_builder.specs.config_specs import ColourSpec, LatticeSpec, SceneSpec
 from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
 from rebar_depth_bench.geometry.cameras import Camera, ideal_K, look_at, project, transform
 from tests.builder.blender.probe import RunProbe

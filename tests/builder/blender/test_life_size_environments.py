@@ -16,12 +16,12 @@ import trimesh
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.config.specs import AppearanceSpec, ColourSpec, LatticeSpec, SceneSpec
-from dataset_builder.config.surroundings import SURROUNDINGS
 from dataset_builder.scene.environments import deck, hall
+from dataset_builder.scene.environments.surroundings import SURROUNDINGS
 from dataset_builder.scene.model import Part, WorldMesh
 from dataset_builder.scene.raycast import RayCaster
 from dataset_builder.scene.shapes.solids import merge_meshes
+from dataset_builder.specs.config_specs import AppearanceSpec, ColourSpec, LatticeSpec, SceneSpec
 from rebar_depth_bench.geometry.cameras import Camera, ideal_K, look_at
 from tests.builder.blender.cages import cage
 from tests.builder.blender.probe import RunProbe

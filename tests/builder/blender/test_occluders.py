@@ -19,18 +19,9 @@ from jaxtyping import Float64
 from numpy import ndarray
 from scipy.spatial import ConvexHull
 
-from dataset_builder.config.catalog import LATTICE_DOME, LATTICE_RING, PIER_DOME, PILE_DOME
-from dataset_builder.config.rigs import rig_cameras
-from dataset_builder.config.specs import (
-    AppearanceSpec,
-    AssemblySpec,
-    LatticeSpec,
-    PierSpec,
-    PileSpec,
-    RigSpec,
-    SceneSpec,
-)
-from dataset_builder.config.trajectories import aim_point_m, poses
+from dataset_builder.cameras.rigs import rig_cameras
+from dataset_builder.cameras.trajectories import aim_point_m, poses
+from dataset_builder.catalog.named_configs import LATTICE_DOME, LATTICE_RING, PIER_DOME, PILE_DOME
 from dataset_builder.scene.assemblies.lattice import lattice_assembly
 from dataset_builder.scene.assemblies.pier import pier_assembly
 from dataset_builder.scene.assemblies.pile import pile_assembly
@@ -41,6 +32,15 @@ from dataset_builder.scene.environments.outdoors import CLEAR_M, SLAB_HALF_M, ou
 from dataset_builder.scene.model import NOT_STEEL, Assembly, Mesh, Part
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
 from dataset_builder.scene.variants.props import PROP_BUILDERS, make_props
+from dataset_builder.specs.config_specs import (
+    AppearanceSpec,
+    AssemblySpec,
+    LatticeSpec,
+    PierSpec,
+    PileSpec,
+    RigSpec,
+    SceneSpec,
+)
 from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
 from rebar_depth_bench.geometry.cameras import camera_centre
 from tests.builder.blender.cages import cage

@@ -15,8 +15,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from dataset_builder.config.catalog import BuildRequest
-from dataset_builder.config.specs import AppearanceSpec, ColourSpec, LatticeSpec, SceneSpec
+from dataset_builder.catalog.named_configs import BuildRequest
 from dataset_builder.pipeline.plan import config_parameters
 from dataset_builder.scene.variants.registry import (
     IMAGE_LIGHTS,
@@ -26,6 +25,7 @@ from dataset_builder.scene.variants.registry import (
     ImageLight,
     image_light,
 )
+from dataset_builder.specs.config_specs import AppearanceSpec, ColourSpec, LatticeSpec, SceneSpec
 from rebar_depth_bench.errors import BuildError
 from rebar_depth_bench.geometry.cameras import Camera, look_at
 from tests.builder.blender.probe import RunProbe

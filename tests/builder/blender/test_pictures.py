@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from dataset_builder.audit.checks import AuditedConfig, AuditedView, Check, RayCache, view_from_row
-from dataset_builder.config.catalog import CONFIGS
+from dataset_builder.catalog.named_configs import CONFIGS
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars
 from rebar_depth_bench.data.columns import COLUMNS
 from rebar_depth_bench.data.dataset import iterate_rows

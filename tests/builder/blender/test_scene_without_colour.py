@@ -11,9 +11,9 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from dataset_builder.config.catalog import BuildRequest
-from dataset_builder.config.specs import SceneSpec
-from dataset_builder.scene.assemblies import make_assembly
+from dataset_builder.catalog.named_configs import BuildRequest
+from dataset_builder.specs.config_specs import SceneSpec
+from dataset_builder.user_files.make_assembly import make_assembly
 from tests.builder.blender.probe import RunProbe
 
 REQUESTS = [

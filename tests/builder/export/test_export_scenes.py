@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 import rebar_depth_bench as rdb
-from dataset_builder.cli import main
+from dataset_builder.cli.main import main
 from dataset_builder.export import export
 from dataset_builder.export.target import MARKER
 from rebar_depth_bench.errors import DatasetError, InputError

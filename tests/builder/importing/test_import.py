@@ -15,7 +15,7 @@ import yaml
 import rebar_depth_bench as rdb
 from cards.dataset import dataset_card
 from dataset_builder.audit import audit
-from dataset_builder.cli import main as build_main
+from dataset_builder.cli.main import main as build_main
 from dataset_builder.importing.config_import import plan_import, run_import
 from rebar_depth_bench.cli.main import main as bench_main
 from rebar_depth_bench.data.bars import read_bars

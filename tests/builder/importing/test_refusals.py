@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dataset_builder.cli import main
+from dataset_builder.cli.main import main
 from dataset_builder.importing.config_import import plan_import, run_import
 from dataset_builder.pipeline.retained import Finished
 from rebar_depth_bench.data.manifest import open_folder

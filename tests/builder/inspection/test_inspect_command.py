@@ -14,7 +14,7 @@ import trimesh
 from PIL import Image, ImageDraw
 from rich.console import Console
 
-from dataset_builder.cli import main
+from dataset_builder.cli.main import main
 from dataset_builder.inspection.font import font
 from dataset_builder.inspection.picture import _draw_scale_bar, inspection_picture
 from dataset_builder.inspection.report import inspection_json, print_inspection
@@ -25,8 +25,8 @@ from dataset_builder.scene.assemblies.cage import Cage, CageBar, LeftOut
 from dataset_builder.scene.model import Mesh, Note, axis_of
 from dataset_builder.scene.shapes.bending import bent_line_m
 from rebar_depth_bench.data.bars import Bar
-from tests.builder.config.scene_files import BAR, MM, write_scene
-from tests.builder.scene.ifc_writer import Ifc
+from tests.builder.catalog.scene_files import BAR, MM, write_scene
+from tests.builder.user_files.ifc_writer import Ifc
 from tests.commands import run_in_process
 
 COLUMN = Path("examples/column.ifc")

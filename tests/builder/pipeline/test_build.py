@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 
 import rebar_depth_bench as rdb
-from dataset_builder.config.catalog import BuildRequest
-from dataset_builder.config.scene_file import read_scene
-from dataset_builder.config.specs import colour_spec
+from dataset_builder.catalog.named_configs import BuildRequest
+from dataset_builder.catalog.scene_file import read_scene
 from dataset_builder.pipeline.build import build
 from dataset_builder.pipeline.plan import BUILD_FOLDER
-from dataset_builder.scene.assemblies.cage_file import mesh_file_spec
+from dataset_builder.specs.config_specs import colour_spec
+from dataset_builder.user_files.cage_file import mesh_file_spec
 from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.data.manifest import open_folder
 from tests.building import (

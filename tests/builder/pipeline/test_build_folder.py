@@ -13,9 +13,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from dataset_builder.cli import main
-from dataset_builder.config.catalog import BuildRequest
-from dataset_builder.config.specs import ColourSpec
+from dataset_builder.catalog.named_configs import BuildRequest
+from dataset_builder.cli.main import main
 from dataset_builder.pipeline.build import build
 from dataset_builder.pipeline.contact_sheet import write_contact_sheet
 from dataset_builder.pipeline.folder import check_target
@@ -24,6 +23,7 @@ from dataset_builder.pipeline.publish import remove_leftovers
 from dataset_builder.pipeline.retained import Finished, check_retained
 from dataset_builder.pipeline.shards import Staging, pack_shard, read_staged_record
 from dataset_builder.pipeline.work_units import remaining_units
+from dataset_builder.specs.config_specs import ColourSpec
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import DatasetError, InputError
 from tests.commands import run_in_process

@@ -17,12 +17,12 @@ import pytest
 
 import rebar_depth_bench as rdb
 from dataset_builder.audit import audit
-from dataset_builder.config.cages import MAX_SCENES, CagesRequest
-from dataset_builder.config.catalog import BuildRequest
-from dataset_builder.config.specs import ColourSpec, GeneratedCageSpec, SceneConfigSpec
+from dataset_builder.catalog.cages_config import MAX_SCENES, CagesRequest
+from dataset_builder.catalog.named_configs import BuildRequest
 from dataset_builder.pipeline.plan import BUILD_FOLDER, plan_config
 from dataset_builder.scene.cages import generate as generate_module
 from dataset_builder.scene.cages.generate import drawn_family
+from dataset_builder.specs.config_specs import ColourSpec, GeneratedCageSpec, SceneConfigSpec
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, open_folder
 from rebar_depth_bench.errors import InputError

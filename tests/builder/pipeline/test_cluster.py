@@ -16,13 +16,13 @@ from pathlib import Path
 import pytest
 import trimesh
 
-from dataset_builder.config.catalog import CONFIGS
-from dataset_builder.config.specs import ColourSpec
+from dataset_builder.catalog.named_configs import CONFIGS
 from dataset_builder.pipeline import dask_renderer
 from dataset_builder.pipeline.dask_renderer import check_software_versions, connect_to_cluster
 from dataset_builder.pipeline.plan import BUILD_FOLDER, generator_versions, plan_config
 from dataset_builder.pipeline.shards import Staging
 from dataset_builder.pipeline.work_units import remaining_units
+from dataset_builder.specs.config_specs import ColourSpec
 from rebar_depth_bench.errors import InputError
 from tests.building import (
     TINY,
@@ -253,7 +253,7 @@ def test_workers_with_cluster_is_rejected(tmp_path: Path, run_build: RunBuild) -
 
 
 def run_cli(prepare: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    code = f"import sys; {prepare}; from dataset_builder.cli import main; sys.exit(main(sys.argv[1:]))"
+    code = f"import sys; {prepare}; from dataset_builder.cli.main import main; sys.exit(main(sys.argv[1:]))"
     command = [sys.executable, "-c", code, *arguments]
     return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
 

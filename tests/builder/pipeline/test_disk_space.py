@@ -7,10 +7,9 @@ from pathlib import Path
 
 import pytest
 
-from dataset_builder.cli import main
-from dataset_builder.config.cages import CagesRequest
-from dataset_builder.config.catalog import BuildRequest
-from dataset_builder.config.specs import RigSpec
+from dataset_builder.catalog.cages_config import CagesRequest
+from dataset_builder.catalog.named_configs import BuildRequest
+from dataset_builder.cli.main import main
 from dataset_builder.pipeline.disk_space import (
     ConfigSpace,
     bytes_text,
@@ -22,6 +21,7 @@ from dataset_builder.pipeline.disk_space import (
     view_bytes,
 )
 from dataset_builder.pipeline.plan import plan_config
+from dataset_builder.specs.config_specs import RigSpec
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import OutputError
 from tests.commands import run_in_process

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from dataset_builder.config.specs import QUALITIES
+from dataset_builder.specs.config_specs import QUALITIES
 from tests.building import TINY, TWO_BARS, RunBuild, contents
 
 SMALL = ("--scene", str(TWO_BARS), "--views", "9", *TINY)

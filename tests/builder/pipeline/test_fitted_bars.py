@@ -13,7 +13,7 @@ import trimesh
 from dataset_builder.audit import audit
 from dataset_builder.export import export
 from dataset_builder.scene.assemblies.cage import packed_cage, unpacked_cage
-from dataset_builder.scene.assemblies.cage_file import (
+from dataset_builder.user_files.cage_file import (
     cage_assembly,
     cage_file_spec,
     mesh_file_spec,
@@ -21,7 +21,7 @@ from dataset_builder.scene.assemblies.cage_file import (
 )
 from rebar_depth_bench.cli.main import main as rebar_bench
 from rebar_depth_bench.data.bars import read_bars
-from tests.builder.scene.tube_shapes import CENTRELINES_M, length_m, line_distance_m, swept
+from tests.builder.user_files.tube_shapes import CENTRELINES_M, length_m, line_distance_m, swept
 from tests.building import TINY, TWO_BARS, RunBuild
 from tests.commands import run_in_process
 

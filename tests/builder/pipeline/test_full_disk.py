@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from dataset_builder.cli import main
+from dataset_builder.cli.main import main
 from dataset_builder.pipeline import build as build_module
 from tests.building import TWO_BARS, contents
 from tests.commands import run_in_process
@@ -59,7 +59,7 @@ def test_build_on_a_full_disk_is_finished_by_a_later_run(new_disk: NewDisk, tmp_
 
 LIMITED = """
 import resource, sys
-from dataset_builder.cli import main
+from dataset_builder.cli.main import main
 resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), int(sys.argv[1])))
 sys.exit(main(sys.argv[2:]))
 """

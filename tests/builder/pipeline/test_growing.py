@@ -13,8 +13,8 @@ import pytest
 import rebar_depth_bench as rdb
 from benchmarks.scale import PreparedRows, placed
 from dataset_builder.audit import audit, auditing
-from dataset_builder.config.cages import CagesRequest
-from dataset_builder.config.catalog import BuildRequest
+from dataset_builder.catalog.cages_config import CagesRequest
+from dataset_builder.catalog.named_configs import BuildRequest
 from dataset_builder.pipeline import folder, retained
 from dataset_builder.pipeline.build import BuildSummary, build
 from dataset_builder.pipeline.plan import BUILD_FOLDER

@@ -14,7 +14,7 @@ from PIL import Image
 
 import rebar_depth_bench as rdb
 from dataset_builder.audit import audit
-from dataset_builder.config.catalog import BuildRequest
+from dataset_builder.catalog.named_configs import BuildRequest
 from dataset_builder.export import export
 from dataset_builder.pipeline.contact_sheet import TILE_PX
 from dataset_builder.pipeline.plan import BUILD_FOLDER

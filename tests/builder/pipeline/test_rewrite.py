@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from dataset_builder.cli import main
+from dataset_builder.cli.main import main
 from dataset_builder.importing.config_import import plan_import, run_import
 from dataset_builder.pipeline.folder import manifest_text
 from rebar_depth_bench.cli.main import main as rebar_bench

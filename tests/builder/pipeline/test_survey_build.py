@@ -15,8 +15,8 @@ from rebar_depth_bench.cli.main import main as rebar_bench
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.trajectory import Survey
 from rebar_depth_bench.geometry.cameras import camera_centre
-from tests.builder.config.scene_files import write_scene
-from tests.builder.config.survey_cages import column, scene
+from tests.builder.cameras.survey_cages import column, scene
+from tests.builder.catalog.scene_files import write_scene
 from tests.building import RunBuild
 from tests.commands import run_in_process
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from dataset_builder.config.catalog import CONFIGS
+from dataset_builder.catalog.named_configs import CONFIGS
 from dataset_builder.pipeline.plan import ConfigPlan, plan_config
 from dataset_builder.pipeline.work_units import (
     ReceivedFile,

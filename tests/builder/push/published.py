@@ -7,7 +7,7 @@ import subprocess
 from collections.abc import Sequence
 from pathlib import Path
 
-from dataset_builder.cli import main
+from dataset_builder.cli.main import main
 from rebar_depth_bench.data.digests import file_sha256
 from tests.commands import run_in_process
 from tests.hub_server import READ_TOKEN, TOKEN, folder_files

@@ -8,12 +8,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from dataset_builder.config.catalog import CONFIGS
+from dataset_builder.cameras.steel_distance import Cylinders
+from dataset_builder.catalog.named_configs import CONFIGS
 from dataset_builder.export.camera_formats import axis_points_m
 from dataset_builder.scene.assemblies.cage import CageBar
 from dataset_builder.scene.model import Assembly
 from dataset_builder.scene.shapes.solids import box
-from dataset_builder.scene.steel_distance import Cylinders
 from dataset_builder.scene.variants.props import make_props
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.extended.inspection.segments import cage_truth

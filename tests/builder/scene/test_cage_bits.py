@@ -12,10 +12,10 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from dataset_builder.config.specs import GeneratedCageSpec
-from dataset_builder.scene.assemblies import make_assembly
 from dataset_builder.scene.cages.generate import FAMILIES, generate_cage
-from tests.builder.config.test_same_bits import KERNELS
+from dataset_builder.specs.config_specs import GeneratedCageSpec
+from dataset_builder.user_files.make_assembly import make_assembly
+from tests.builder.cameras.test_same_bits import KERNELS
 
 VECTORISED = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX2 FMA3"
 ENVIRONMENTS: tuple[Mapping[str, str], ...] = (

@@ -10,14 +10,14 @@ import trimesh
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.config.specs import AppearanceSpec, GeneratedCageSpec, SceneSpec
-from dataset_builder.config.surroundings import FORMWORK_FAMILIES
-from dataset_builder.scene.assemblies import make_assembly
 from dataset_builder.scene.cages.generate import FAMILIES
+from dataset_builder.scene.environments.surroundings import FORMWORK_FAMILIES
 from dataset_builder.scene.model import NOT_STEEL, Assembly, Part, WorldMesh
 from dataset_builder.scene.raycast import RayCaster
 from dataset_builder.scene.shapes.solids import merge_meshes
 from dataset_builder.scene.variants.props import make_props
+from dataset_builder.specs.config_specs import AppearanceSpec, GeneratedCageSpec, SceneSpec
+from dataset_builder.user_files.make_assembly import make_assembly
 
 LYING = ("beam", "slab", "footing")
 STANDING = ("column", "wall", "joint")

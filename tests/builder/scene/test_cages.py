@@ -13,8 +13,6 @@ from hypothesis import strategies as st
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.config.specs import GeneratedCageSpec
-from dataset_builder.scene.assemblies import make_assembly
 from dataset_builder.scene.cages import generate as generate_module
 from dataset_builder.scene.cages.as_built import (
     BOW_TOLERANCE,
@@ -36,6 +34,8 @@ from dataset_builder.scene.cages.generate import (
 from dataset_builder.scene.cages.rules import DIAMETERS_M
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
 from dataset_builder.scene.shapes.capsules import NEAR_M, Clearances
+from dataset_builder.specs.config_specs import GeneratedCageSpec
+from dataset_builder.user_files.make_assembly import make_assembly
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.view_ids import SPLITS
 from tests.builder.scene.test_pile import segment_distances_m

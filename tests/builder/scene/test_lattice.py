@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from numpy import ndarray
 
-from dataset_builder.config.specs import LatticeSpec
 from dataset_builder.scene.assemblies.lattice import CLEAR_GAP_M, lattice_assembly
 from dataset_builder.scene.cages.design import STANDING_M
 from dataset_builder.scene.model import Assembly
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
+from dataset_builder.specs.config_specs import LatticeSpec
 from rebar_depth_bench.data.bars import Bar
 
 SPEC = LatticeSpec()

@@ -8,13 +8,13 @@ import numpy as np
 import pytest
 import trimesh
 
-from dataset_builder.config.specs import PierSpec
-from dataset_builder.config.trajectories import aim_point_m
-from dataset_builder.scene.assemblies import make_assembly
+from dataset_builder.cameras.trajectories import aim_point_m
 from dataset_builder.scene.assemblies.pier import CLEAR_GAP_M, pier_assembly
 from dataset_builder.scene.cages.design import STANDING_M
 from dataset_builder.scene.model import Assembly, Part
 from dataset_builder.scene.shapes.bar_mesh import plain_outer_radius_m
+from dataset_builder.specs.config_specs import PierSpec
+from dataset_builder.user_files.make_assembly import make_assembly
 from rebar_depth_bench.data.bars import Bar
 from tests.builder.scene.polylines import (
     hooks_m,

@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.config.specs import PileSpec
-from dataset_builder.scene.assemblies import make_assembly
 from dataset_builder.scene.assemblies.pile import RIBS, STATES_DIR, load_settled_poses, pile_assembly
 from dataset_builder.scene.model import Assembly
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
 from dataset_builder.scene.shapes.links import SELF_GAP_M, hook_extension_m, stirrup_centreline_m
+from dataset_builder.specs.config_specs import PileSpec
+from dataset_builder.user_files.make_assembly import make_assembly
 from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
 
 SPEC = PileSpec()

@@ -14,7 +14,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dataset_builder.config.specs import PileSpec
 from dataset_builder.scene.assemblies.pile import (
     STATES_DIR,
     Pose,
@@ -22,6 +21,7 @@ from dataset_builder.scene.assemblies.pile import (
     points_in_world_m,
     spec_centreline_m,
 )
+from dataset_builder.specs.config_specs import PileSpec
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 
 mujoco = pytest.importorskip("mujoco", reason="it is in the extra dev")

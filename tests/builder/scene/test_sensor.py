@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dataset_builder.config.specs import AppearanceSpec, LatticeSpec, SceneSpec
 from dataset_builder.scene.variants.sensor import (
     SensorSpec,
     apply_sensor,
@@ -19,6 +18,7 @@ from dataset_builder.scene.variants.sensor import (
     recorded,
     sensor_spec,
 )
+from dataset_builder.specs.config_specs import AppearanceSpec, LatticeSpec, SceneSpec
 
 SPEC = SensorSpec()
 PLAIN = replace(SPEC, corner_illumination=1.0, jpeg_quality=100, jpeg_subsampling="4:4:4")

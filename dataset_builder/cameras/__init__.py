@@ -1,0 +1,1 @@
+"""Stereo rigs and the places of their cameras."""

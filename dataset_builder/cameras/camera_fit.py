@@ -1,0 +1,107 @@
+"""Checks that an assembly and its cameras fit each other and their environment. World frame, metres."""
+
+from __future__ import annotations
+
+import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
+
+from dataset_builder.cameras.trajectories import aim_point_m, camera_offsets_m
+from dataset_builder.scene.environments.surroundings import LIFE_SIZE_ENVIRONMENTS, SURROUNDINGS
+from dataset_builder.scene.model import Assembly
+from dataset_builder.scene.variants.registry import SCREEN_DISTANCE, SHADOWS
+from dataset_builder.specs.config_specs import ConfigSpec, RandomViewsSpec, SurveySpec, TrajectorySpec
+from rebar_depth_bench.errors import InputError, MeshError
+
+_BOARD_TOLERANCE_M = 0.001
+"""Depth below z = 0 that an assembly may reach, metres."""
+
+
+def check_fits(assembly: Assembly, config: ConfigSpec) -> None:
+    """Check that an assembly stays above the board and clear of the config's cameras.
+
+    Raises ``MeshError`` if it reaches more than 1 mm below z = 0 or as far as the nearest camera, and
+    ``InputError`` if the screen of the variant ``shadows`` would be among the cameras. The cameras of a survey
+    and random views may be nearer, since each is clear of the steel by itself.
+    """
+    check_above_ground(assembly, config.name)
+    vertices_m, aim_m = assembly.vertices_m, aim_point_m(assembly)
+    reach_m = float(np.linalg.norm(vertices_m - aim_m, axis=1).max())
+    camera_distances_m = np.linalg.norm(camera_offsets_m(config.protocol, aim_m, assembly.bars), axis=1)
+    nearest_m = float(camera_distances_m.min())
+    if reach_m >= nearest_m and not isinstance(config.protocol, SurveySpec | RandomViewsSpec):
+        raise MeshError(
+            f"the assembly extends {reach_m:.4g} m from its centre, expected less than {nearest_m:.4g} m, "
+            f"the distance of the nearest camera of {config.name}: is the unit right?"
+        )
+    _check_shadow_screen(vertices_m, float(camera_distances_m.max()), config)
+
+
+def check_above_ground(assembly: Assembly, where: str) -> None:
+    """Raise ``MeshError``, which begins with ``where``, if an assembly reaches more than 1 mm below z = 0."""
+    lowest = min(assembly.parts, key=lambda part: float(part.mesh.vertices_m[:, 2].min()))
+    lowest_m = float(lowest.mesh.vertices_m[:, 2].min())
+    if lowest_m < -_BOARD_TOLERANCE_M:
+        raise MeshError(
+            f"{where}: {lowest.name} extends down to z = {lowest_m:.4g} m, including its ribs, expected 0 "
+            "or above (the board or the ground is at z = 0)"
+        )
+
+
+def _check_shadow_screen(vertices_m: Float64[ndarray, "n 3"], farthest_m: float, config: ConfigSpec) -> None:
+    """Raise ``InputError`` if the screen of the variant ``shadows`` would be among the cameras."""
+    if SHADOWS not in config.scene.appearance.variants:
+        return
+    right_eye_m = float(np.hypot(farthest_m, config.rig.baseline_m))
+    screen_m = SCREEN_DISTANCE * float(np.linalg.norm(np.ptp(vertices_m, axis=0))) / 2
+    if right_eye_m >= screen_m:
+        raise InputError(
+            f"the screen of the variant {SHADOWS!r} would be among the cameras: {screen_m:.4g} m from the steel, "
+            f"expected more than {right_eye_m:.4g} m, the distance of the farthest camera of {config.name}"
+        )
+
+
+def misfit(environment: str, assembly: Assembly, trajectory: TrajectorySpec) -> str | None:
+    """Return why the assembly or its cameras do not fit into an environment, or None if they do."""
+    steel_radius_m, limit_m = _steel_radius_m(assembly), SURROUNDINGS[environment].steel_radius_m
+    if steel_radius_m > limit_m:
+        return _outside("the steel extends", steel_radius_m, limit_m, environment)
+    return cameras_misfit(environment, assembly, trajectory)
+
+
+def cameras_misfit(environment: str, assembly: Assembly, trajectory: TrajectorySpec) -> str | None:
+    """Return why the cameras do not fit into an environment, or None if they do.
+
+    A survey has no stations yet: in an environment for life-size steel its cameras are placed where they fit, in
+    the laboratory all places that they could have must fit.
+    """
+    space = SURROUNDINGS[environment].cameras
+    if isinstance(trajectory, SurveySpec):
+        if environment in LIFE_SIZE_ENVIRONMENTS:
+            return None
+        radius_m, height_m = _steel_radius_m(assembly) + max(trajectory.distances_m), 0.0
+    else:
+        aim_m = aim_point_m(assembly)
+        centres_m = aim_m + np.array(camera_offsets_m(trajectory, aim_m, assembly.bars))
+        radius_m = float(np.linalg.norm(centres_m[:, :2], axis=1).max())
+        height_m = float(centres_m[:, 2].max())
+    if radius_m > space.radius_m:
+        return _outside("cameras are", radius_m, space.radius_m, environment)
+    if height_m > space.ceiling_m:
+        return (
+            f"cameras are {height_m:.4g} m high, "
+            f"expected at most {space.ceiling_m:g} m in the environment {environment}"
+        )
+    return None
+
+
+def _steel_radius_m(assembly: Assembly) -> float:
+    """Return the largest horizontal distance of steel from the world's origin."""
+    return float(np.linalg.norm(assembly.vertices_m[:, :2], axis=1).max())
+
+
+def _outside(what: str, radius_m: float, limit_m: float, environment: str) -> str:
+    return (
+        f"{what} {radius_m:.4g} m from the world's origin, "
+        f"expected at most {limit_m:g} m in the environment {environment}"
+    )

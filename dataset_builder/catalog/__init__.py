@@ -1,0 +1,1 @@
+"""Configs by name, from scene files, and the generated config ``cages``."""

@@ -1,0 +1,288 @@
+"""Command-line interface of ``rebar-build``.
+
+Modules that only one command needs are imported when it is called.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from rebar_depth_bench.console import ProgressBars, print_notice, run_command
+from rebar_depth_bench.errors import InputError, escape_text
+from rebar_depth_bench.output_options import add_output_file, check_outputs, prints_table
+from rebar_depth_bench.outputs import write_output
+from rebar_depth_bench.paths import PATH_PATTERN
+from rebar_depth_bench.terminal import use_plain_characters
+from rebar_depth_bench.version import software_version
+from rebar_depth_bench.view_ids import SPLITS
+
+BUILD = "build"
+_STRAY_SHOWN = 5
+
+
+@dataclass(frozen=True)
+class Command:
+    """Command: one-line summary, the function that adds its options to a parser, and the one that runs it."""
+
+    summary: str
+    add_arguments: Callable[[argparse.ArgumentParser], None]
+    run: Callable[[argparse.Namespace], None]
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run ``rebar-build``; return its exit status."""
+    use_plain_characters()
+    words = with_command(sys.argv[1:] if arguments is None else arguments)
+    options = argument_parser(words[:1]).parse_args(words)
+    interrupted = "interrupted; run the same command again to continue"
+    return run_command(lambda: options.run(options), interrupted=interrupted)
+
+
+def with_command(words: Sequence[str]) -> list[str]:
+    """Return the words of a command line that begins with a command; without one, it is ``build``."""
+    has_command = words and words[0] in (*COMMANDS, "-h", "--help", "--version")
+    return [*words] if has_command else [BUILD, *words]
+
+
+def argument_parser(commands: Collection[str] | None = None) -> argparse.ArgumentParser:
+    """Return the argument parser of ``rebar-build``; other commands than ``commands`` have no options in it."""
+    parser = argparse.ArgumentParser(
+        prog="rebar-build",
+        description="Build, check and convert dataset folders of stereo views with exact depth.",
+        epilog=f"Without a command, the options are those of {BUILD}: rebar-build {BUILD} --help lists them.",
+    )
+    parser.add_argument("--version", action="version", version=software_version())
+    subparsers = parser.add_subparsers(metavar=f"{{{','.join(COMMANDS)}}}")
+    for name, command in COMMANDS.items():
+        subparser = subparsers.add_parser(name, help=command.summary)
+        if commands is None or name in commands:
+            command.add_arguments(subparser)
+            subparser.set_defaults(run=command.run)
+    return parser
+
+
+def _add_build_arguments(parser: argparse.ArgumentParser) -> None:
+    from dataset_builder.cli.build_command import add_arguments
+
+    parser.description = (
+        "Render a dataset folder of stereo views with exact depth, or resume an interrupted build."
+    )
+    add_arguments(parser)
+
+
+def _build(options: argparse.Namespace) -> None:
+    from dataset_builder.cli.build_command import run
+
+    if commands := [name for name in options.config or () if name in COMMANDS]:
+        raise InputError(
+            f"--config is followed by the command {commands[0]}, expected names of configs; a command is the "
+            f"first word: rebar-build {commands[0]} ..."
+        )
+    run(options)
+
+
+def _add_audit_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("root", metavar="ROOT", help="dataset folder")
+    parser.add_argument(
+        "--depth-views",
+        type=int,
+        default=4,
+        metavar="N",
+        help="number of views per config whose depth is compared with Cycles' depth pass (default: %(default)s)",
+    )
+
+
+def _audit(options: argparse.Namespace) -> None:
+    from dataset_builder.cli.build_command import check_extra
+
+    check_extra()
+    from dataset_builder.audit import audit, print_audit
+
+    with ProgressBars() as bars:
+        report = audit(options.root, depth_views=options.depth_views, progress=bars.update)
+    print_audit(report)
+    if report.failures:
+        raise InputError(f"{options.root}: {len(report.failures)} of {len(report.checks)} checks failed")
+
+
+def _add_export_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("root", metavar="ROOT", help="dataset folder")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="DIR", help="output folder: new, or an earlier export to resume"
+    )
+    parser.add_argument(
+        "--config", nargs="+", action="extend", metavar="NAME", help="configs to export (default: all)"
+    )
+    parser.add_argument(
+        "--split", choices=SPLITS, metavar="NAME", help="split to export: train, validation or test (default: all)"
+    )
+    parser.add_argument(
+        "--views",
+        type=int,
+        metavar="N",
+        help="number of views per config, or per scene of a config with splits, evenly spaced over the views of "
+        "the folder (default: all)",
+    )
+
+
+def _export(options: argparse.Namespace) -> None:
+    """Export configs of a dataset folder; print the numbers of files."""
+    from dataset_builder.export import export
+
+    with ProgressBars() as bars:
+        summary = export(
+            options.root,
+            options.out,
+            options.config,
+            options.views,
+            progress=bars.update,
+            split=options.split,
+        )
+    for config in summary.configs:
+        print(f"{config.config}: {config.views} views, {config.written} files written, {config.kept} kept")
+    print(options.out)
+
+
+def _add_import_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("layout", type=Path, metavar="LAYOUT", help="TOML file that describes the data")
+    parser.add_argument(
+        "--out", type=Path, required=True, metavar="ROOT", help="dataset folder: new, or one to add the config to"
+    )
+    parser.add_argument("--config", required=True, metavar="NAME", help="name of the config")
+    parser.add_argument(
+        "--overwrite",
+        nargs="+",
+        default=(),
+        metavar="NAME",
+        help="config of ROOT that may be replaced, if it was imported from other data",
+    )
+    parser.add_argument(
+        "--dry-run",
+        action="store_true",
+        help="check the layout and show what it describes; nothing is written",
+    )
+
+
+def _import(options: argparse.Namespace) -> None:
+    """Check the layout, print what is imported, and import it unless this is a dry run."""
+    from dataset_builder.importing.config_import import plan_import, run_import
+
+    source = plan_import(options.layout, options.config)
+    (height, width), views = source.views.grid, source.views.names
+    print(f"{source.name}: {len(views)} views of {width} x {height}, sigma {source.layout.truth_sigma_m} m")
+    if source.absent_columns:
+        print(f"absent: {', '.join(source.absent_columns)}")
+    if source.bars:
+        print(f"surveyed bars: {len(source.bars)}")
+    if not options.dry_run:
+        with ProgressBars() as bars:
+            run_import(source, options.out, bars.update, overwrite=options.overwrite)
+        print(options.out)
+
+
+def _add_inspect_arguments(parser: argparse.ArgumentParser) -> None:
+    from dataset_builder.cli.build_command import add_mesh_unit
+
+    parser.add_argument("scene_file", metavar="SCENE", help="scene TOML, IFC model, or mesh file (STL, PLY, OBJ)")
+    add_mesh_unit(parser)
+    add_output_file(parser, "--json", "write the bars, what is left out, and the placement as JSON")
+    add_output_file(parser, "--picture", "write a PNG of the cage from four sides")
+
+
+def _inspect(options: argparse.Namespace) -> None:
+    from dataset_builder.cli.build_command import check_extra
+
+    check_extra()
+    from dataset_builder.catalog.scene_file import files_of_scene, scene_cage
+    from dataset_builder.inspection.picture import inspection_picture
+    from dataset_builder.inspection.report import inspection_json, print_inspection
+    from dataset_builder.inspection.summary import inspect_cage
+    from dataset_builder.pipeline.plan import print_notes
+    from dataset_builder.user_files.cage_checks import raise_problems
+
+    check_outputs({**vars(options), "scene_files": files_of_scene(options.scene_file)})
+    cage = scene_cage(options.scene_file, options.mesh_unit)
+    inspection = inspect_cage(cage, Path(options.scene_file).name)
+    if options.json is not None:
+        write_output(options.json, inspection_json(inspection))
+    if options.picture is not None:
+        write_output(options.picture, inspection_picture(inspection))
+    if prints_table(options):
+        print_inspection(inspection)
+    print_notes(cage.notes)
+    raise_problems(cage.problems, options.scene_file)
+
+
+def _add_push_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("root", metavar="ROOT", help="dataset folder")
+    parser.add_argument("--hub-id", required=True, metavar="ID", help="id of the repository, ORG/NAME")
+    parser.add_argument(
+        "--yes", action="store_true", help="publish; without it, only what would be sent is printed"
+    )
+    parser.add_argument("--private", action="store_true", help="make a new repository private")
+    parser.add_argument(
+        "--revision",
+        default="main",
+        metavar="BRANCH",
+        help="branch to publish on, created from the main branch if it does not exist (default: %(default)s)",
+    )
+
+
+def _push(options: argparse.Namespace) -> None:
+    """Print what a push changes, and publish it with ``--yes``."""
+    from dataset_builder.push.hub_errors import require_online, require_token
+    from dataset_builder.push.pushing import (
+        Repository,
+        check_repository_id,
+        plan_push,
+        send_push,
+        verified_folder,
+    )
+
+    repository = Repository(check_repository_id(options.hub_id, "--hub-id"), options.revision)
+    if not re.fullmatch(PATH_PATTERN, options.revision):
+        raise InputError(f"--revision is {escape_text(options.revision)}, expected the name of a branch")
+    require_online()
+    if options.yes:
+        require_token()
+    with ProgressBars() as bars:
+        source = verified_folder(options.root, bars.update)
+    if source.stray:
+        more = f" and {len(source.stray) - _STRAY_SHOWN} more" if len(source.stray) > _STRAY_SHOWN else ""
+        print_notice(f"not in the manifest, stays local: {', '.join(source.stray[:_STRAY_SHOWN])}{more}")
+    push = plan_push(source, repository, private=options.private)
+    print(*push.lines(), sep="\n")
+    sys.stdout.flush()
+    if not push.is_needed:
+        print("up to date: nothing to send")
+    elif not options.yes:
+        print("dry run: nothing was sent; --yes publishes")
+    else:
+        with ProgressBars() as bars:
+            print(send_push(push, bars.update))
+
+
+COMMANDS: Mapping[str, Command] = {
+    BUILD: Command("render a dataset folder", _add_build_arguments, _build),
+    "audit": Command("check a dataset folder and its ground truth", _add_audit_arguments, _audit),
+    "export": Command(
+        "export a dataset folder as plain files, with COLMAP's and nerfstudio's cameras",
+        _add_export_arguments,
+        _export,
+    ),
+    "import": Command(
+        "import images with depth from other programs as a config of a dataset folder",
+        _add_import_arguments,
+        _import,
+    ),
+    "inspect": Command("show the bars of a scene file without rendering", _add_inspect_arguments, _inspect),
+    "push": Command(
+        "publish a dataset folder as a dataset repository of the Hugging Face Hub", _add_push_arguments, _push
+    ),
+}
+"""Commands by name."""

@@ -1,1 +1,0 @@
-"""Configs: scenes, camera trajectories, stereo rigs, and the schema of scene files."""

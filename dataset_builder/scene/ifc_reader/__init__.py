@@ -1,5 +1,0 @@
-"""Reader of IFC models, the only package that uses ifcopenshell. It runs in its own process.
-
-``scene.assemblies.ifc_file`` starts that process, ``python -m`` this package, with limits, and validates its
-answer.
-"""

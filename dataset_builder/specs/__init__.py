@@ -1,0 +1,1 @@
+"""Specs of scenes, cameras, colour and user files: plain data."""

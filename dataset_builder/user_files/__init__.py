@@ -1,0 +1,1 @@
+"""Cages from users' files: scene TOML, mesh and IFC."""

@@ -1,0 +1,214 @@
+"""Mesh file import: the parts of a file's content, in the file's frame and in metres.
+
+- The dataset's own PLY layout (``dataset_builder.scene.mesh_ply``) is used unchanged: the faces with one
+  ``bar_id`` form a part with that id; faces with id 0 (board, table) are left out.
+- Every other file is read by ``mesh_formats``. If it holds several OBJ objects (``o``), each is a part. Parts are
+  numbered from 1 in the order of their names, with numbers within names compared by value ("bar2" before "bar10").
+- A file with one object (any STL or PLY) is split into connected components after vertices closer than 10 nm
+  are merged. Components are numbered from 1 in the order of their first faces. Bars that share a vertex are
+  one part.
+
+Except in the dataset's own PLY, a closed part that is wound inside out is reversed.
+
+trimesh takes more than half a second to import, which builds of the standard scenes do not need, so functions
+import it on use.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import warnings
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from textwrap import shorten
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float, Integer
+from numpy import ndarray
+
+from dataset_builder.scene.mesh_ply import has_mesh_ply_header, parse_mesh_ply
+from dataset_builder.scene.model import ESTIMATED_ROLE, MAX_BARS, NOT_STEEL, Mesh, Note, axis_of
+from dataset_builder.specs.file_specs import MeshFileSpec
+from dataset_builder.user_files.mesh_formats.parsing import MalformedMeshError, Surface
+from dataset_builder.user_files.mesh_formats.ply import read_ply
+from dataset_builder.user_files.mesh_formats.stl_obj import read_obj, read_stl
+from dataset_builder.user_files.tubes.tube_fit import fit_tube
+from dataset_builder.user_files.tubes.tube_surface import component_labels
+from rebar_depth_bench.data.bars import Bar
+from rebar_depth_bench.errors import DatasetError, MeshError
+
+if TYPE_CHECKING:
+    import trimesh
+
+_READERS: Mapping[str, Callable[[bytes], Mapping[str, Surface]]] = {
+    ".obj": read_obj,
+    ".ply": read_ply,
+    ".stl": read_stl,
+}
+SUFFIXES = tuple(_READERS)
+"""Supported suffixes of mesh files, in lower case."""
+
+MAX_FLOAT32_SPACING_M = 1e-4
+"""Largest distance of neighbouring 32-bit coordinates that is accepted, metres."""
+
+AXIS_NOTE = "axis"
+"""Code of the note on bars without an axis."""
+
+_MAX_NAMED = 10
+"""Largest number of bars that a note names."""
+
+# A handler on trimesh's logger keeps its messages, including tracebacks, off stderr.
+logging.getLogger("trimesh").addHandler(logging.NullHandler())
+
+
+@dataclass(frozen=True, eq=False)
+class MeshPart:
+    """Part of a file: id, name, mesh (the file's frame, metres), and the spacing of 32-bit coordinates or 0."""
+
+    bar_id: int
+    name: str
+    mesh: Mesh
+    spacing_m: float = 0.0
+
+
+def read_parts(content: bytes, spec: MeshFileSpec) -> list[MeshPart]:
+    """Return the parts of a file's ``content``, by ascending id; the suffix of ``spec.path`` selects the format.
+
+    Raises ``MeshError`` if the content cannot be read, holds no triangle, only id 0, more than ``MAX_BARS`` parts
+    or a non-finite coordinate. Any exception that a damaged or hostile file causes becomes one of one line.
+    """
+    try:
+        with warnings.catch_warnings(), np.errstate(all="ignore"):
+            warnings.simplefilter("ignore")
+            if Path(spec.path).suffix.lower() == ".ply" and has_mesh_ply_header(content):
+                return _dataset_ply_parts(content, spec)
+            return _numbered_parts(_read_objects(content, spec), spec)
+    except MeshError:
+        raise
+    except MalformedMeshError as error:
+        rejected = MeshError(f"{spec.path}: {error.problem}")
+        rejected.problems = (error.problem,)
+        raise rejected from None
+    except DatasetError as error:
+        raise MeshError(str(error)) from error
+    except Exception as error:
+        reason = shorten(f"{type(error).__name__}: {error}", 200)
+        raise MeshError(f"{spec.path}: not a readable mesh file of its type ({reason})") from error
+
+
+def _dataset_ply_parts(content: bytes, spec: MeshFileSpec) -> list[MeshPart]:
+    """Return the parts of a PLY in the dataset's own layout, bit by bit if the unit is the metre."""
+    vertices, faces, face_bar_id = parse_mesh_ply(content, spec.path)
+    whole = Mesh(vertices * spec.unit_m, faces)
+    meshes = {int(face_bar_id[group[0]]): _submesh(whole, group) for group in _indices_by_label(face_bar_id)}
+    if meshes.pop(NOT_STEEL, None) is not None and not meshes:
+        raise MeshError(f"{spec.path}: every face has bar_id 0 (not steel), expected at least one bar")
+    return [MeshPart(bar_id, f"bar {bar_id}", mesh) for bar_id, mesh in meshes.items()]
+
+
+def _numbered_parts(objects: Sequence[MeshPart], spec: MeshFileSpec) -> list[MeshPart]:
+    """Return the parts of objects that are ordered and not numbered; a single one is split."""
+    if not objects:
+        raise MeshError(f"{spec.path}: no triangle found, expected the surface of at least one bar")
+    if len(objects) == 1:
+        (whole,) = objects
+        meshes = connected_components(_mesh_of(_merged_close_vertices(whole.mesh)))
+        objects = [replace(whole, name=f"part {number}", mesh=mesh) for number, mesh in enumerate(meshes, start=1)]
+    if len(objects) > MAX_BARS:
+        raise MeshError(f"{spec.path}: {len(objects)} separate parts found, expected at most {MAX_BARS} bars")
+    return [
+        replace(part, bar_id=bar_id, mesh=_oriented_outward(part.mesh))
+        for bar_id, part in enumerate(objects, start=1)
+    ]
+
+
+def _read_objects(content: bytes, spec: MeshFileSpec) -> list[MeshPart]:
+    """Return the objects of a file of any program, without ids, ordered by name, without empty ones."""
+    surfaces = _READERS[Path(spec.path).suffix.lower()](content)
+    spacing_m = spec.unit_m * max((_spacing(vertices) for vertices, _ in surfaces.values()), default=0.0)
+    return [
+        MeshPart(0, name, Mesh(vertices.astype(np.float64) * spec.unit_m, faces.astype(np.int32)), spacing_m)
+        for name, (vertices, faces) in sorted(surfaces.items(), key=lambda item: _natural_sort_key(item[0]))
+        if len(faces)
+    ]
+
+
+def _spacing(vertices: Float[ndarray, "v 3"]) -> float:
+    """Return the distance of the largest coordinate from the next that the file can store; 0 for float64."""
+    return float(np.spacing(np.abs(vertices).max(initial=0))) if vertices.dtype == np.float32 else 0.0
+
+
+def _natural_sort_key(name: str) -> tuple[list[str | int], str]:
+    """Return a sort key that compares numbers within names by value."""
+    return [int(text) if index % 2 else text for index, text in enumerate(re.split(r"(\d+)", name))], name
+
+
+def connected_components(mesh: Mesh) -> list[Mesh]:
+    """Return the connected components, ordered by their first faces; faces and vertices keep their order."""
+    edges = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    vertex_label = component_labels(edges, len(mesh.vertices_m))
+    groups = _indices_by_label(vertex_label[mesh.faces[:, 0]])
+    return [_submesh(mesh, group) for group in sorted(groups, key=lambda group: int(group[0]))]
+
+
+def _indices_by_label(label: Integer[ndarray, " n"]) -> list[Integer[ndarray, " k"]]:
+    """Return the ascending indices at which each label occurs, ordered by label."""
+    order = np.argsort(label, kind="stable")
+    return [group for group in np.split(order, np.flatnonzero(np.diff(label[order])) + 1) if len(group)]
+
+
+def _submesh(mesh: Mesh, faces_kept: Integer[ndarray, " k"]) -> Mesh:
+    """Return the faces ``faces_kept`` with the vertices they use; vertices and faces keep their order."""
+    faces = mesh.faces[faces_kept]
+    used, index = np.unique(faces, return_inverse=True)
+    return Mesh(mesh.vertices_m[used], index.reshape(faces.shape).astype(np.int32))
+
+
+def _merged_close_vertices(mesh: Mesh) -> trimesh.Trimesh:
+    """Return the mesh with vertices closer than 10 nm merged."""
+    import trimesh
+
+    return trimesh.Trimesh(mesh.vertices_m, mesh.faces)
+
+
+def _mesh_of(body: trimesh.Trimesh) -> Mesh:
+    return Mesh(np.array(body.vertices), np.array(body.faces, np.int32))
+
+
+def _oriented_outward(mesh: Mesh) -> Mesh:
+    """Return the mesh with close vertices merged, reversed if it is closed and wound inside out."""
+    body = _merged_close_vertices(mesh)
+    if body.is_watertight and body.is_winding_consistent and body.volume < 0:
+        body.invert()
+    return _mesh_of(body)
+
+
+def fitted_bar(bar_id: int, mesh: Mesh) -> Bar:
+    """Return the bar of a surface (world, metres), with role ``imported``; without axis if no tube fits.
+
+    Raises ``ValueError`` if every triangle has zero area.
+    """
+    a_m, b_m, c_m = mesh.vertices_m[mesh.faces].transpose(1, 0, 2)
+    with np.errstate(all="ignore"):  # Products of huge lengths overflow; such bars are refused by their extent.
+        if not np.cross(b_m - a_m, c_m - a_m).any():
+            raise ValueError("every triangle has zero area")
+        tube = fit_tube(mesh.vertices_m, mesh.faces)
+    if tube is None:
+        return Bar.without_axis(bar_id, ESTIMATED_ROLE)
+    return Bar(bar_id, ESTIMATED_ROLE, tube.diameter_m, axis_of(tube.axis_m))
+
+
+def axis_notes(source: str, labels: Sequence[str], bars: int) -> tuple[Note, ...]:
+    """Return the note that names the bars without an axis (``labels``) of all ``bars`` of a file, or none."""
+    if not labels:
+        return ()
+    named = ", ".join(labels[:_MAX_NAMED])
+    more = f" and {len(labels) - _MAX_NAMED} more" if len(labels) > _MAX_NAMED else ""
+    text = (
+        f"{len(labels)} of {bars} bars are not the surface of one round bar and have neither axis nor diameter; "
+        f"measures of bars leave them out: {named}{more}"
+    )
+    return (Note(source, AXIS_NOTE, text),)

@@ -1,0 +1,388 @@
+"""Schema and reader of scene TOML files. Files named by ``mesh`` and ``ifc`` are not opened here.
+
+```toml
+name = "my-beam"              # default: the file name; lower-case letters, digits and hyphens
+unit = "mm"                   # of every length: m, cm, mm, in, ft; default with ifc: m
+environment = "laboratory"    # or "outdoors", "hall", "deck"
+board = 6                     # markers on the A3 sheet: 6, 12, or false for no sheet
+
+[cameras]                     # default: a dome around the assembly, or a survey of large steel
+kind = "dome"                 # or "ring" with radius, elevation_deg, azimuths;
+                              # or "survey" with, if wanted, distances, views_per_distance, seed
+radii = [300, 400]
+elevations_deg = [15, 45]
+azimuths = 12
+
+[[bar]]                       # or, above the tables: mesh = "cage.stl", or ifc = "cage.ifc"
+diameter = 10
+points = [[-150, 0, 5], [150, 0, 5], [150, 0, 80]]   # corners of the path; world, z up, board at z = 0
+role = "main"                 # default "bar"
+id = 7                        # default: the lowest free id
+bend_diameter = 40            # of the mandrel; default EN 1992-1-1: 4 d up to 16 mm, 7 d above
+ribs = true                   # default
+```
+
+Keys about the file that ``mesh`` or ``ifc`` names: selected objects and placement.
+
+```toml
+ifc = "building.ifc"          # or mesh = "cage.stl", a file beside this one
+up = "z"                      # vertical axis of the file, the default, or "y"
+origin = "centre"             # above the world's origin and on the ground, the default for mesh and ifc; or "keep"
+rotate_deg = 30               # about the vertical axis, after centring
+translate = [0.5, 0, 0]       # at last; in this file's unit
+trust = "geometry"            # if an IFC object declares another diameter than it has; default "declared": refuse
+
+[[select]]                    # an object is taken if all keys of any table match
+class = "IfcBuildingElementProxy"    # default: IfcReinforcingBar, IfcReinforcingMesh, IfcTendon
+name = "Rebar*"               # and so global_id, host, storey, layer; of a mesh file: only name and box
+box = [[0, 0, 0], [5e3, 5e3, 3e3]]   # two corners, in the frame and unit of the file; objects wholly inside it
+```
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass
+from itertools import count
+from typing import Annotated, Any
+
+from pydantic import AfterValidator, BeforeValidator, Field, Strict, ValidationInfo, field_validator
+
+from dataset_builder.scene.environments.surroundings import SURROUNDINGS
+from dataset_builder.scene.model import MAX_BARS, to_metres
+from dataset_builder.scene.variants.registry import VARIANTS
+from dataset_builder.specs.config_specs import DomeSpec, RigSpec, RingSpec, SurveySpec
+from dataset_builder.specs.file_specs import Origin, PlacementSpec, Trust, Up
+from dataset_builder.specs.selection import KEYS, Selection
+from rebar_depth_bench.errors import InputError, Problem
+from rebar_depth_bench.paths import is_below
+from rebar_depth_bench.reading import parse_toml
+from rebar_depth_bench.validation import (
+    UNITS_M,
+    Expected,
+    Flag,
+    StrictModel,
+    Triple,
+    field_error,
+    number,
+    one_of,
+    short_repr,
+    text,
+    three_numbers,
+    validate_table,
+    whole_number,
+)
+
+MAX_VIEWS = 10_000
+"""Maximum number of views of a config: the index in a view id has four digits."""
+_MAX_AZIMUTHS = 3600
+_MAX_SELECTIONS = 100
+_MESH_KEYS = ("name", "box")
+"""Keys of ``[[select]]`` for a mesh file, whose parts have no other names."""
+
+
+@dataclass(frozen=True)
+class _Context:
+    """Context of the validation of a file: its unit in metres, and the names that its scene may not have."""
+
+    unit_m: float
+    reserved: Collection[str]
+
+
+_VARIANT_ENDINGS = tuple(f"-{variant}" for variant in VARIANTS)
+SCENE_NAME = Expected(
+    "a name of at most 63 lower-case letters, digits and hyphens that starts with a letter or digit and does not "
+    "end in a variant's name",
+    lambda name: bool(re.fullmatch(r"[a-z0-9][a-z0-9-]{0,62}", name)) and not name.endswith(_VARIANT_ENDINGS),
+)
+"""Description of scene names, which are also the names of configs."""
+
+
+def _length_in_metres(length: float, info: ValidationInfo[_Context]) -> float:
+    return to_metres(length, info.context.unit_m)
+
+
+def _point_in_metres(point: Triple, info: ValidationInfo[_Context]) -> Triple:
+    x, y, z = (to_metres(value, info.context.unit_m) for value in point)
+    return x, y, z
+
+
+def _distance_in_metres(distance: float, info: ValidationInfo[_Context]) -> float:
+    """Return a camera distance in metres, which is at least the rig's baseline."""
+    distance_m = to_metres(distance, info.context.unit_m)
+    if distance_m < RigSpec.baseline_m:
+        found = f"cameras are {distance_m:.4g} m from the aim point"
+        expected = f"at least the rig's baseline, {RigSpec.baseline_m} m: is the unit right?"
+        raise field_error(found, expected, "conflict")
+    return distance_m
+
+
+def _list_of(expected: str, min_length: int = 1) -> Expected:
+    """Return the description of lists of ``min_length`` to 10,000 elements."""
+    return Expected(expected, lambda values: min_length <= len(values) <= 10_000)
+
+
+def _tables(key: str, most: int) -> BeforeValidator:
+    """Return the check that a value is a list of 1 to ``most`` tables, each under the heading of ``key``."""
+
+    def check(tables: object) -> object:
+        if not isinstance(tables, list) or not 1 <= len(tables) <= most:
+            raise field_error(f"got {short_repr(tables)}", f"1 to {most} tables, each under [[{key}]]")
+        return tables
+
+    return BeforeValidator(check)
+
+
+_UNIT = one_of(*UNITS_M)
+_ROLE = Expected(
+    "a name of up to 60 printable characters, without spaces at its ends",
+    lambda role: role == role.strip() and text(60).accept(role),
+)
+_File = Annotated[str, Expected("the path of a file in the folder of this file, or below it", is_below)]
+_Length = Annotated[
+    float,
+    number(0, expected="a length above 0, up to 1e9, in the file's unit"),
+    AfterValidator(_length_in_metres),
+]
+_Point = Annotated[
+    Triple, three_numbers(-1e9, 1e9, "three numbers from -1e9 to 1e9, [x, y, z]"), AfterValidator(_point_in_metres)
+]
+_Distance = Annotated[
+    float,
+    number(0, expected="a distance above 0, up to 1e9"),
+    AfterValidator(_distance_in_metres),
+]
+_Distances = Annotated[tuple[_Distance, ...], Strict(False), _list_of("a list of distances")]
+_Elevation = Annotated[float, number(0, 89, "degrees above 0, up to 89")]
+_Azimuths = Annotated[int, whole_number(1, _MAX_AZIMUTHS)]
+_Pattern = Annotated[str, text(200, 'a name or a glob pattern such as "Level 1*"')]
+_Corner = Annotated[Triple, three_numbers(-1e12, 1e12, "three numbers from -1e12 to 1e12, [x, y, z]")]
+_Box = Annotated[
+    tuple[_Corner, _Corner], Strict(False), Expected("two corners, [[x, y, z], [x, y, z]], in any order")
+]
+
+
+class TomlBar(StrictModel):
+    """One ``[[bar]]`` table in metres; ``corners_m`` are the corners of its path in the world frame.
+
+    ``bar_id`` 0 stands for the lowest free id. ``mandrel_m`` is the mandrel diameter; None selects the minimum of
+    EN 1992-1-1.
+    """
+
+    diameter_m: _Length = Field(alias="diameter")
+    corners_m: Annotated[
+        tuple[_Point, ...], Strict(False), _list_of("two or more points, [[x, y, z], ...]", 2)
+    ] = Field(alias="points")
+    role: Annotated[str, _ROLE] = "bar"
+    bar_id: Annotated[int, whole_number(1, MAX_BARS)] = Field(default=0, alias="id")
+    mandrel_m: _Length | None = Field(default=None, alias="bend_diameter")
+    ribs: Flag = True
+
+    @field_validator("mandrel_m")
+    @classmethod
+    def _check_mandrel(cls, mandrel_m: float, info: ValidationInfo[_Context]) -> float:
+        diameter_m = info.data.get("diameter_m", 0.0)
+        if mandrel_m < diameter_m:
+            found, least = (length_m / info.context.unit_m for length_m in (mandrel_m, diameter_m))
+            raise field_error(f"got {found:g}", f"at least the bar's diameter, {least:g}", "conflict")
+        return mandrel_m
+
+
+class CamerasTable(StrictModel, extra="ignore"):
+    """Keys of the table ``[cameras]`` for all kinds; the fields of a kind are those of its spec, in metres."""
+
+    kind: Annotated[str, one_of("dome", "ring", "survey")]
+
+
+class DomeTable(CamerasTable, extra="forbid"):
+    """Table ``[cameras]`` of a dome."""
+
+    azimuths: _Azimuths
+    radii_m: _Distances = Field(alias="radii")
+    elevations_deg: Annotated[tuple[_Elevation, ...], Strict(False), _list_of("a list of elevations in degrees")]
+
+
+class RingTable(CamerasTable, extra="forbid"):
+    """Table ``[cameras]`` of a ring."""
+
+    azimuths: _Azimuths
+    radius_m: _Distance = Field(alias="radius")
+    elevation_deg: _Elevation
+
+
+class SurveyTable(CamerasTable, extra="forbid"):
+    """Table ``[cameras]`` of a survey."""
+
+    distances_m: _Distances = Field(default=SurveySpec.distances_m, alias="distances")
+    views_per_distance: Annotated[int, whole_number(1, MAX_VIEWS)] = SurveySpec.views_per_distance
+    seed: Annotated[int, whole_number(0, 2**31 - 1)] = SurveySpec.seed
+
+
+_Trajectory = DomeSpec | RingSpec | SurveySpec
+_KINDS: Mapping[str, tuple[type[CamerasTable], Callable[..., _Trajectory]]] = {
+    "dome": (DomeTable, DomeSpec),
+    "ring": (RingTable, RingSpec),
+    "survey": (SurveyTable, SurveySpec),
+}
+"""Table and spec of each kind of cameras."""
+
+
+class SelectTable(StrictModel):
+    """Table ``[[select]]``: patterns of the names of objects, and a box in the frame and unit of their file."""
+
+    class_name: _Pattern | None = Field(default=None, alias="class")
+    global_id: _Pattern | None = None
+    name: _Pattern | None = None
+    host: _Pattern | None = None
+    storey: _Pattern | None = None
+    layer: _Pattern | None = None
+    box: _Box | None = None
+
+    def selection(self) -> Selection:
+        """Return the table as a selection, with the lower corner of its box first."""
+        values = self.model_dump(by_alias=True)
+        patterns = tuple((key, values[key]) for key in KEYS if values[key] is not None)
+        if self.box is None:
+            return Selection(patterns)
+        (x0, x1), (y0, y1), (z0, z1) = (sorted(pair) for pair in zip(*self.box, strict=True))
+        return Selection(patterns, ((x0, y0, z0), (x1, y1, z1)))
+
+
+class SceneToml(StrictModel):
+    """Content of a scene TOML file, lengths in metres; None marks keys left to their defaults.
+
+    ``board`` is the number of markers (0 or false: no board); a survey in ``cameras`` has no stations.
+    """
+
+    name: Annotated[str, SCENE_NAME] | None = None
+    unit: Annotated[str, _UNIT] | None = None
+    bar: Annotated[tuple[TomlBar, ...], Strict(False), _tables("bar", MAX_BARS)] = ()
+    mesh: _File | None = None
+    ifc: _File | None = None
+    environment: Annotated[str, one_of(*SURROUNDINGS)] | None = None
+    board: Annotated[int | bool, Expected("6, 12 or false", lambda markers: markers in (0, 6, 12))] | None = None
+    cameras: _Trajectory | None = None
+    up: Annotated[Up, one_of("z", "y")] = "z"
+    origin: Annotated[Origin, one_of("centre", "keep")] | None = None
+    rotate_deg: Annotated[float, number(-360, 360, "degrees from -360 to 360")] = 0.0
+    translate_m: _Point = Field(default=(0.0, 0.0, 0.0), alias="translate")
+    select: Annotated[tuple[SelectTable, ...], Strict(False), _tables("select", _MAX_SELECTIONS)] = ()
+    trust: Annotated[Trust, one_of("declared", "geometry")] = "declared"
+
+    @property
+    def unit_m(self) -> float:
+        """One file unit in metres; 1.0 if an IFC scene has no unit."""
+        return _unit_m(self.unit)
+
+    @property
+    def placement(self) -> PlacementSpec:
+        """Placement in metres."""
+        origin: Origin = self.origin or ("keep" if self.bar else "centre")
+        return PlacementSpec(self.up, origin, self.rotate_deg, self.translate_m)
+
+    @property
+    def selections(self) -> tuple[Selection, ...]:
+        """Tables ``[[select]]`` in file order."""
+        return tuple(table.selection() for table in self.select)
+
+    @property
+    def bars(self) -> tuple[TomlBar, ...]:
+        """Bars in file order; those without an id get the lowest free ids."""
+        used_ids = {bar.bar_id for bar in self.bar}
+        free_ids = (bar_id for bar_id in count(1) if bar_id not in used_ids)
+        return tuple(bar if bar.bar_id else bar.model_copy(update={"bar_id": next(free_ids)}) for bar in self.bar)
+
+    @field_validator("name")
+    @classmethod
+    def _check_name(cls, name: str, info: ValidationInfo[_Context]) -> str:
+        """Check that the name is not reserved."""
+        if name in info.context.reserved:
+            raise field_error(f"got {name!r}", f"none of the names {', '.join(info.context.reserved)}", "conflict")
+        return name
+
+
+def read_scene_toml(content: bytes, where: str, reserved: Collection[str] = ()) -> SceneToml:
+    """Return the parsed content of a scene TOML file.
+
+    ``where`` names the file in errors; ``reserved`` are names the scene may not have. Raises ``InputError`` that
+    lists all problems: content that is not TOML, or keys that are missing, unknown, invalid or in conflict.
+    """
+    values, problems = parse_toml(content)
+    if not problems:
+        problems += _conflicts(values)
+        context = _Context(_unit_m(values.get("unit")), reserved)
+        if "cameras" in values:
+            values["cameras"] = _read_cameras(values["cameras"], context, problems)
+        scene = validate_table(SceneToml, values, problems, context=context)
+        if scene is not None and not problems:
+            return scene
+    raise InputError.from_problems(where, problems)
+
+
+def _unit_m(unit: object) -> float:
+    return UNITS_M[unit] if isinstance(unit, str) and unit in UNITS_M else 1.0
+
+
+def _read_cameras(values: object, context: _Context, problems: list[Problem]) -> _Trajectory | None:
+    """Return the trajectory of the table ``[cameras]``, or None after adding its problems to ``problems``."""
+    match values:
+        case {"kind": str(kind)} if kind in _KINDS:
+            model, spec = _KINDS[kind]
+            table = validate_table(model, values, problems, "cameras", context)
+            return None if table is None else spec(**table.model_dump())
+    validate_table(CamerasTable, values, problems, "cameras")
+    return None
+
+
+def _conflicts(values: Mapping[str, Any]) -> Iterator[Problem]:
+    """Yield the problems that concern several keys; values that are invalid alone are ignored."""
+    if "unit" not in values and "ifc" not in values:
+        yield Problem("missing", "unit", "missing", _UNIT.text)
+    sources = [key for key in ("bar", "mesh", "ifc") if key in values]
+    if len(sources) != 1:
+        found = f"found {' and '.join(sources) or 'no bars'}"
+        expected = "exactly one of [[bar]] tables, mesh and ifc"
+        yield Problem("conflict" if sources else "missing", "", found, expected)
+    if "trust" in values and "ifc" not in values:
+        yield Problem("conflict", "trust", "only IFC files declare diameters", "ifc, or no trust")
+    if "bar" in values and "select" in values:
+        yield Problem("conflict", "select", "found beside [[bar]] tables", "mesh or ifc, or no [[select]] tables")
+    for table_number, table in _numbered_tables(values, "select"):
+        only_ifc = [key for key in table if key in KEYS and key not in _MESH_KEYS]
+        where = f"select {table_number}"
+        if not table:
+            yield Problem("missing", where, "no key", f"one or more of {', '.join((*KEYS, 'box'))}")
+        if "mesh" in values and only_ifc:
+            found = f"{', '.join(only_ifc)} with a mesh"
+            expected = f"{' or '.join(_MESH_KEYS)}: parts of a mesh have no other names"
+            yield Problem("conflict", where, found, expected)
+    if (views := _view_count(values.get("cameras"))) > MAX_VIEWS:
+        yield Problem("conflict", "cameras", f"{views} views requested", f"at most {MAX_VIEWS}")
+    number_of_id: dict[int, int] = {}
+    for table_number, table in _numbered_tables(values, "bar"):
+        bar_id = table.get("id")
+        if type(bar_id) is int and 1 <= bar_id <= MAX_BARS:
+            first = number_of_id.setdefault(bar_id, table_number)
+            if first != table_number:
+                found = f"{bar_id} is the id of bar {first}"
+                yield Problem("duplicate", f"bar {table_number}: id", found, "a unique id")
+
+
+def _numbered_tables(values: Mapping[str, Any], key: str) -> Iterator[tuple[int, Mapping[str, Any]]]:
+    """Yield the tables under the heading of ``key`` with their numbers in the file."""
+    tables = values.get(key)
+    for table_number, table in enumerate(tables if isinstance(tables, list) else (), start=1):
+        if isinstance(table, dict):
+            yield table_number, table
+
+
+def _view_count(cameras: object) -> int:
+    """Return the number of views of a dome or survey, by its table; 0 for a ring, and for invalid values."""
+    defaults = {"distances": SurveySpec.distances_m, "views_per_distance": SurveySpec.views_per_distance}
+    match {**defaults, **cameras} if isinstance(cameras, dict) else None:
+        case {"kind": "dome", "radii": [*radii], "elevations_deg": [*elevations], "azimuths": int(azimuths)}:
+            return len(radii) * len(elevations) * azimuths if azimuths <= _MAX_AZIMUTHS else 0
+        case {"kind": "survey", "distances": [*distances], "views_per_distance": int(count_each)}:
+            return len(distances) * count_each if count_each <= MAX_VIEWS else 0
+    return 0

@@ -1,0 +1,1 @@
+"""Axis and diameter of round bars from their surfaces."""

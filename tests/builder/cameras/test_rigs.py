@@ -1,0 +1,242 @@
+"""Stereo rigs: ideal pinholes, and the ZED on its raw and rectified grids, compared with OpenCV's maps."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+from jaxtyping import Float64
+from numpy import ndarray
+
+from dataset_builder.cameras.rigs import rig_cameras, zed_rig
+from dataset_builder.scene.model import WorldMesh
+from dataset_builder.scene.raycast import RayCaster
+from dataset_builder.specs.config_specs import RigSpec
+from rebar_depth_bench.geometry.cameras import (
+    Camera,
+    camera_centre,
+    ideal_K,
+    inverse_rigid,
+    look_at,
+    pixel_rays,
+    project,
+    right_camera_pose,
+    rigid,
+    transform,
+)
+from rebar_depth_bench.geometry.rectification import rectify
+from rebar_depth_bench.geometry.stereo_calibration import (
+    StereoCalibration,
+    lens_distortion,
+    lens_K,
+    right_from_left,
+    scale_calibration,
+)
+
+POSE = look_at(np.array([0.20, -0.24, 0.15]), np.array([0.0, 0.0, 0.05]))
+CAMERA_NAMES = ("left", "right")
+SIZES = [(1280, 720), (640, 360), (160, 90)]
+
+
+def calibration_of(rig: RigSpec) -> StereoCalibration:
+    assert rig.calibration is not None
+    return scale_calibration(rig.calibration, rig.width, rig.height)
+
+
+def test_ideal_rig_is_two_parallel_pinholes() -> None:
+    cameras = rig_cameras(RigSpec(320, 180), POSE)
+    assert tuple(cameras) == CAMERA_NAMES
+    for eye, pose in (("left", POSE), ("right", right_camera_pose(POSE, 0.12))):
+        assert cameras[eye].K.tobytes() == ideal_K(320, 180).tobytes()
+        assert cameras[eye].cam_from_world.tobytes() == pose.tobytes()
+        assert cameras[eye].distortion.tolist() == [0.0] * 5
+
+
+def test_zed_rig_has_factory_calibration() -> None:
+    rig = zed_rig(640, 360, "raw")
+    assert rig.baseline_m == pytest.approx(0.119978, abs=1e-12)
+    assert (rig.width, rig.height, rig.grid) == (640, 360, "raw")
+    assert rig.calibration is not None
+    assert rig.calibration.left.fx == 701.88
+    assert zed_rig().grid == "rectified"
+
+
+@pytest.mark.parametrize("grid", ["raw", "rectified"])
+def test_resized_rig_equals_rig_created_at_that_size(grid: str) -> None:
+    resized = rig_cameras(replace(zed_rig(1280, 720, grid), width=320, height=180), POSE)
+    direct = rig_cameras(zed_rig(320, 180, grid), POSE)
+    for eye in CAMERA_NAMES:
+        assert resized[eye].K.tobytes() == direct[eye].K.tobytes()
+        assert resized[eye].cam_from_world.tobytes() == direct[eye].cam_from_world.tobytes()
+
+
+def test_raw_cameras_have_calibrated_lenses_and_poses() -> None:
+    rig = zed_rig(1280, 720, "raw")
+    left, right = rig_cameras(rig, POSE).values()
+    assert left.cam_from_world.tobytes() == POSE.tobytes()
+    assert left.K.tolist() == [[701.88, 0, 641.285], [0, 701.70, 344.1835], [0, 0, 1]]
+    assert right.distortion.tolist() == [-0.172795, 0.0265223, 1.64e-4, 1.02e-5, 0.0]
+    points = np.random.default_rng(1).uniform(-0.3, 0.3, (20, 3))
+    rotation = cv2.Rodrigues(np.array([-9.17e-4, 6.24e-3, 7.70e-4]))[0]
+    expected = transform(left.cam_from_world, points) @ rotation.T + [-0.119978, 0.0, 0.0]
+    assert transform(right.cam_from_world, points) == pytest.approx(expected, abs=1e-14)
+
+
+@pytest.mark.parametrize("grid", ["raw", "rectified"])
+def test_raw_and_rectified_centres_are_equal(grid: str) -> None:
+    rig = zed_rig(160, 90, grid)
+    left, right = (camera_centre(camera.cam_from_world) for camera in rig_cameras(rig, POSE).values())
+    raw_right = camera_centre(rig_cameras(replace(rig, grid="raw"), POSE)["right"].cam_from_world)
+    assert left == pytest.approx(camera_centre(POSE), abs=1e-15)
+    assert right == pytest.approx(raw_right, abs=1e-13)
+    assert np.linalg.norm(right - left) == pytest.approx(rig.baseline_m, abs=1e-13)
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+def test_rectified_cameras_are_parallel_pinholes(width: int, height: int) -> None:
+    rig = zed_rig(width, height)
+    left, right = rig_cameras(rig, POSE).values()
+    assert left.K.tobytes() == right.K.tobytes()
+    assert not left.distortion.any()
+    assert not right.distortion.any()
+    assert right.cam_from_world.tobytes() == right_camera_pose(left.cam_from_world, rig.baseline_m).tobytes()
+    assert left.cam_from_world[:3, :3] @ left.cam_from_world[:3, :3].T == pytest.approx(np.eye(3), abs=1e-14)
+    turned = rectify(calibration_of(rig)).R_right @ right_from_left(calibration_of(rig))[:3, :3] @ POSE[:3, :3]
+    assert right.cam_from_world[:3, :3] == pytest.approx(turned, abs=1e-12)  # R2 of stereoRectify
+
+
+@pytest.mark.parametrize(("width", "height"), SIZES)
+@pytest.mark.parametrize("eye", CAMERA_NAMES)
+def test_rectified_to_raw_projection_matches_opencv_map(width: int, height: int, eye: str) -> None:
+    raw = rig_cameras(zed_rig(width, height, "raw"), POSE)[eye]
+    rectified = rig_cameras(zed_rig(width, height), POSE)[eye]
+    opencv_px = opencv_rectify_map(calibration_of(zed_rig(width, height)), eye)
+    rays = pixel_rays(rectified.K, width, height)
+    world = transform(inverse_rigid(rectified.cam_from_world), rays)
+    projected_px = project(raw.K, transform(raw.cam_from_world, world), raw.distortion)
+    assert np.abs(projected_px - opencv_px).max() < 1e-6 + 2e-7 * width  # The maps are float32.
+
+
+@pytest.mark.parametrize("eye", CAMERA_NAMES)
+def test_raw_to_rectified_matches_opencv_undistort(eye: str) -> None:
+    """Compare raw pixel -> ray -> rectified pixel with ``cv2.undistortPointsIter`` in float64."""
+    raw = rig_cameras(zed_rig(1280, 720, "raw"), POSE)[eye]
+    rectified = rig_cameras(zed_rig(), POSE)[eye]
+    rectification = rectify(calibration_of(zed_rig()))
+    rotation = {"left": rectification.R_left, "right": rectification.R_right}[eye]
+    rays = pixel_rays(raw.K, 1280, 720, raw.distortion)[::60, ::80].reshape(-1, 3)
+    world = transform(inverse_rigid(raw.cam_from_world), 0.4 * rays)
+    projected_px = project(rectified.K, transform(rectified.cam_from_world, world))
+    v, u = np.mgrid[:720:60, :1280:80].astype(np.float64)
+    pixels = np.stack([u, v], axis=-1).reshape(-1, 1, 2)
+    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-16)
+    expected_px = cv2.undistortPointsIter(pixels, raw.K, raw.distortion, rotation, rectification.K, criteria)
+    assert np.abs(projected_px - expected_px[:, 0]).max() < 1e-6
+
+
+def opencv_rectify_map(calibration: StereoCalibration, eye: str) -> Float64[ndarray, "h w 2"]:
+    """Return the position of each rectified pixel in the raw image, computed by OpenCV."""
+    (Kl, Dl), (Kr, Dr) = ((lens_K(lens), lens_distortion(lens)) for lens in (calibration.left, calibration.right))
+    size = (calibration.width, calibration.height)
+    rotation, offset = cv2.Rodrigues(np.array(calibration.rotation_rad))[0], np.array(calibration.translation_m)
+    R1, R2, P1, P2, *_ = cv2.stereoRectify(
+        Kl, Dl, Kr, Dr, size, rotation, offset, flags=cv2.CALIB_ZERO_DISPARITY, alpha=0
+    )
+    K, D, R, P = {"left": (Kl, Dl, R1, P1), "right": (Kr, Dr, R2, P2)}[eye]
+    maps = cv2.initUndistortRectifyMap(K, D, R, P[:, :3], size, cv2.CV_32FC1)
+    return np.asarray(np.stack(maps, axis=-1), dtype=np.float64)
+
+
+def test_sign_of_baseline_does_not_change_rectification() -> None:
+    """Check that the vendor's code, which passes the baseline unnegated, gives the same rectification."""
+    calibration = calibration_of(zed_rig())
+    negated = replace(calibration, translation_m=tuple(-length for length in calibration.translation_m))  # type: ignore[arg-type]
+    original, with_negated = rectify(calibration), rectify(negated)
+    assert original.R_left == pytest.approx(with_negated.R_left, abs=1e-15)
+    assert original.R_right == pytest.approx(with_negated.R_right, abs=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("rig", "words"),
+    [
+        (replace(zed_rig(), grid="warped"), "no grid 'warped', expected one of ideal, raw, rectified"),
+        (replace(zed_rig(), grid="ideal"), "is 'ideal', expected 'raw' or 'rectified'"),
+        (RigSpec(grid="raw"), "grid 'raw' requires a calibration"),
+        (replace(zed_rig(), baseline_m=0.12), "baseline_m is 0.12, expected 0.119978 as in its calibration"),
+    ],
+)
+def test_inconsistent_rig_is_rejected(rig: RigSpec, words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        rig_cameras(rig, POSE)
+
+
+@pytest.mark.parametrize("grid", ["raw", "rectified"])
+@pytest.mark.parametrize("eye", CAMERA_NAMES)
+def test_depth_of_plane_matches_analytic_depth(grid: str, eye: str) -> None:
+    camera = rig_cameras(zed_rig(160, 90, grid), POSE)[eye]
+    square = np.array([[-9.0, -9, 0], [9, -9, 0], [9, 9, 0], [-9, 9, 0]])
+    mesh = WorldMesh(square, np.array([[0, 1, 2], [0, 2, 3]], np.int32), np.ones(2, np.uint16))
+    depth_m = cast_depth_m(mesh, camera)
+    R, centre_m = camera.cam_from_world[:3, :3], camera_centre(camera.cam_from_world)
+    checked = 0
+    for v, u in [(0, 0), (0, 159), (89, 0), (89, 159), (44, 80), (60, 3)]:
+        x, y = opencv_ray(camera, u, v)
+        expected_m = -centre_m[2] / (R.T @ [x, y, 1.0])[2]
+        if 0 < expected_m < 5:
+            assert depth_m[v, u] == pytest.approx(expected_m, rel=1e-6)
+            checked += 1
+    assert checked >= 4
+
+
+@pytest.mark.parametrize("eye", CAMERA_NAMES)
+def test_raw_depth_of_sphere_matches_analytic_depth(eye: str) -> None:
+    camera = rig_cameras(zed_rig(160, 90, "raw"), POSE)[eye]
+    middle_m, radius_m = np.array([0.05, 0.02, 0.05]), 0.08
+    mesh = sphere(middle_m, radius_m)
+    depth_m = cast_depth_m(mesh, camera)
+    middle_cam_m = transform(camera.cam_from_world, middle_m)
+    hits = 0
+    for v, u in np.argwhere(depth_m > 0)[::17]:
+        ray = np.array([*opencv_ray(camera, int(u), int(v)), 1.0])
+        ray_dot_middle, ray_squared = ray @ middle_cam_m, ray @ ray
+        discriminant = ray_dot_middle**2 - ray_squared * (middle_cam_m @ middle_cam_m - radius_m**2)
+        if discriminant > 0.05 * ray_dot_middle**2:  # Facets approximate the sphere badly at its outline.
+            assert depth_m[v, u] == pytest.approx((ray_dot_middle - discriminant**0.5) / ray_squared, abs=2e-5)
+            hits += 1
+    assert hits > 15
+
+
+def cast_depth_m(mesh: WorldMesh, camera: Camera) -> ndarray:
+    return RayCaster(mesh).cast(camera).depth_m
+
+
+def opencv_ray(camera: Camera, u: int, v: int) -> tuple[float, float]:
+    criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-16)
+    pixel = np.array([[[float(u), float(v)]]])
+    x, y = cv2.undistortPointsIter(pixel, camera.K, camera.distortion, np.eye(3), np.eye(3), criteria)[0, 0]
+    return float(x), float(y)
+
+
+def sphere(middle_m: ndarray, radius_m: float, rings: int = 200) -> WorldMesh:
+    """Return a sphere mesh of ``rings`` x 2 ``rings`` vertices."""
+    polar, azimuth = np.meshgrid(np.linspace(0, np.pi, rings), np.linspace(0, 2 * np.pi, 2 * rings), indexing="ij")
+    sin_polar = np.sin(polar)
+    vertices = np.stack([sin_polar * np.cos(azimuth), sin_polar * np.sin(azimuth), np.cos(polar)], axis=-1)
+    first_vertex = (np.arange(rings - 1)[:, None] * 2 * rings + np.arange(2 * rings - 1)).ravel()
+    quads = np.stack(
+        [first_vertex, first_vertex + 1, first_vertex + 2 * rings + 1, first_vertex + 2 * rings], axis=-1
+    )
+    faces = np.concatenate([quads[:, [0, 2, 1]], quads[:, [0, 3, 2]]]).astype(np.int32)
+    points = vertices.reshape(-1, 3) * radius_m + middle_m
+    return WorldMesh(points, faces, np.ones(len(faces), np.uint16))
+
+
+def test_rectified_optical_axis_is_rotated_from_raw_axis() -> None:
+    """Check the rotation of about 0.4 degrees by which planar depth of the two grids differs."""
+    raw, rectified = (rig_cameras(zed_rig(160, 90, grid), POSE)["left"] for grid in ("raw", "rectified"))
+    turn = rectified.cam_from_world @ inverse_rigid(raw.cam_from_world)
+    assert turn == pytest.approx(rigid(rectify(calibration_of(zed_rig())).R_left, np.zeros(3)), abs=1e-13)
+    cosine = (np.trace(turn[:3, :3]) - 1) / 2
+    assert 0.1 < np.degrees(np.arccos(cosine)) < 1.0

@@ -1,0 +1,347 @@
+"""Bars of IFC models: placements, axes, diameters and roles."""
+
+from __future__ import annotations
+
+import math
+import runpy
+import subprocess
+import sys
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from ifcopenshell import geom
+from numpy import ndarray
+
+from dataset_builder.user_files.cage_file import cage_file_spec, load_cage
+from dataset_builder.user_files.ifc_file import ifc_cage
+from dataset_builder.user_files.ifc_reader.bodies import axis_placement
+from dataset_builder.user_files.ifc_reader.curves import arc_through
+from dataset_builder.user_files.ifc_reader.ifc_model import open_model
+from dataset_builder.user_files.ifc_reader.step_text import StepText
+from rebar_depth_bench.data.bars import Bar
+from tests.builder.user_files.ifc_writer import Ifc, bars_in_process, extruded_circle, extruded_square
+
+COLUMN = Path("examples/column.ifc")
+
+
+def test_example_column_equals_same_cage_in_toml(tmp_path: Path) -> None:
+    script = runpy.run_path("examples/make_column_ifc.py")
+    foot, head = script["FOOT"], script["HEAD"]
+    lines = ['unit = "mm"']
+    for x, y in script["UPRIGHTS"]:
+        lines += ["[[bar]]", "role = 'main'", "diameter = 8", f"points = [[{x}, {y}, {foot}], [{x}, {y}, {head}]]"]
+    for n, level in enumerate(script["LEVELS"]):
+        corners = script["stirrup_corners"]() * ([1, 1, 1] if n % 2 == 0 else [-1, -1, 1]) + [0, 0, level]
+        lines += ["[[bar]]", "role = 'stirrup'", "diameter = 5", f"points = {corners.tolist()}"]
+    (tmp_path / "same.toml").write_text("\n".join(lines))
+    from_ifc, from_toml = (load_cage(cage_file_spec(path)) for path in (COLUMN, tmp_path / "same.toml"))
+    assert len(from_ifc.bars) == 13
+    for a, b in zip(from_ifc.bars, from_toml.bars, strict=True):
+        assert (a.bar_id, a.role, a.diameter_m) == (b.bar_id, b.role, b.diameter_m)
+        np.testing.assert_allclose(a.axis_m, b.axis_m, rtol=0, atol=1e-9)
+    for ifc_part, toml_part in zip(from_ifc.parts, from_toml.parts, strict=True):
+        np.testing.assert_array_equal(ifc_part.mesh.faces, toml_part.mesh.faces)
+        np.testing.assert_allclose(ifc_part.mesh.vertices_m, toml_part.mesh.vertices_m, rtol=0, atol=1e-7)
+
+
+def test_example_column_script_reproduces_file(tmp_path: Path) -> None:
+    subprocess.run([sys.executable, "examples/make_column_ifc.py", tmp_path / "a.ifc"], check=True)
+    assert (tmp_path / "a.ifc").read_bytes() == COLUMN.read_bytes()
+    assert COLUMN.stat().st_size < 40_000
+
+
+@pytest.mark.slow
+def test_example_column_matches_ifcopenshell_geometry() -> None:
+    """Check that every vertex of IfcOpenShell's tessellation is one radius away from the axis."""
+    content = COLUMN.read_bytes()
+    model = open_model(content)
+    numbers = [entity.id() for entity in model.by_type("IfcReinforcingBar")]
+    bars = [cage_bar.bar for cage_bar in bars_in_process(content)]
+    settings = geom.settings()
+    settings.set("use-world-coords", True)
+    settings.set("mesher-linear-deflection", 1e-5)
+    settings.set("mesher-angular-deflection", 0.15)
+    for k in (0, 8, 9):  # a vertical bar and stirrups in both orientations
+        object_mesh = geom.create_shape(settings, model.file.by_id(numbers[k])).geometry
+        distance_m = distance_to_axis_m(np.array(object_mesh.verts).reshape(-1, 3), bars[k])
+        # A chord of 6 degrees lies 17 um inside its arc of 12.5 mm.
+        radius_m = bars[k].diameter_m / 2
+        np.testing.assert_allclose(distance_m[distance_m > radius_m / 2], radius_m, atol=2e-5)
+
+
+def distance_to_axis_m(points_m: ndarray, bar: Bar) -> ndarray:
+    axis = np.array(bar.axis_m)
+    nearest_m = np.full(len(points_m), np.inf)
+    for a, b in pairwise(axis):
+        share = np.clip((points_m - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
+        nearest_m = np.minimum(nearest_m, np.linalg.norm(points_m - a - share[:, None] * (b - a), axis=1))
+    return nearest_m
+
+
+@pytest.mark.parametrize(
+    ("prefix", "unit", "metres"),
+    [
+        ("MILLI", None, 0.001),
+        (None, None, 1.0),
+        ("CENTI", None, 0.01),
+        (None, 0.3048, 0.3048),
+        ("MILLI", 25.4, 0.0254),
+    ],
+)
+def test_nested_placements_in_every_unit(prefix: str | None, unit: float | None, metres: float) -> None:
+    ifc = Ifc(prefix=prefix, unit=unit)
+    # The storey's x axis is the world's y, its z axis the world's x and therefore its y axis the world's z.
+    storey = ifc.at((10, 20, 30), (1, 0, 0), (0, 1, 0))
+    # The bar is rotated by 90 degrees about z: its x axis is the storey's y, its y axis the storey's -x.
+    ifc.bar(
+        ifc.disc(ifc.polyline((0, 0, 0), (5, 2, 1)), 0.25), at=ifc.at((1, 2, 3), None, (0, 1, 0), parent=storey)
+    )
+    # (5, 2, 1) -> storey (1 - 2, 2 + 5, 3 + 1) = (-1, 7, 4) -> world (10 + 4, 20 - 1, 30 + 7).
+    [cage_bar] = ifc.bars()
+    np.testing.assert_allclose(cage_bar.bar.axis_m, np.array([(13, 21, 32), (14, 19, 37)]) * metres, atol=1e-11)
+    assert cage_bar.bar.diameter_m == pytest.approx(0.5 * metres, abs=1e-12)
+
+
+def test_placement_axes_are_orthogonalised() -> None:
+    ifc = Ifc()
+    matrix = axis_placement(ifc.axes((1, 2, 3), (0, 0, 2), (3, 0, 4)))
+    np.testing.assert_allclose(matrix, [[1, 0, 0, 1], [0, 1, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]], atol=1e-15)
+
+
+def test_nested_mapped_items() -> None:
+    ifc = Ifc()
+    disc = ifc.disc(ifc.polyline((0, 0, 0), (100, 0, 10)))
+    rotation = ifc.new(
+        "IfcCartesianTransformationOperator3D",
+        ifc.direction((0, 1, 0)), ifc.direction((-1, 0, 0)), ifc.point((5, 6, 7)), 2.0, ifc.direction((0, 0, 1)),
+    )  # fmt: skip
+    inner = ifc.mapped(rotation, ifc.axes((50, 0, 0)), disc)
+    translation = ifc.new("IfcCartesianTransformationOperator3D", LocalOrigin=ifc.point((0, 0, 1000)))
+    ifc.bar(ifc.mapped(translation, ifc.axes((0, 0, 0)), inner, disc))
+    first, second = ifc.bars()
+    # x + 50, scaled by 2, rotated by 90 degrees about z, translated: (5 - 2 y, 6 + 2 (x + 50), 7 + 2 z + 1000).
+    np.testing.assert_allclose(np.array(first.bar.axis_m) * 1000, [(5, 106, 1007), (5, 306, 1027)], atol=1e-9)
+    assert (first.bar.diameter_m, second.bar.diameter_m) == (0.032, 0.016)
+    np.testing.assert_allclose(np.array(second.bar.axis_m) * 1000, [(0, 0, 1000), (100, 0, 1010)], atol=1e-9)
+    assert (first.bar.bar_id, second.bar.bar_id) == (1, 2)
+
+
+def test_mirrored_mapped_item() -> None:
+    ifc = Ifc()
+    mirror = ifc.new("IfcCartesianTransformationOperator3D", None, ifc.direction((0, -1, 0)), ifc.point((0, 0, 0)))
+    ifc.bar(ifc.mapped(mirror, ifc.axes((0, 0, 0)), ifc.disc(ifc.polyline((0, 0, 0), (100, 30, 10)))))
+    np.testing.assert_allclose(ifc.axis_m()[1], (0.1, -0.03, 0.01), atol=1e-12)
+
+
+@given(
+    turn=st.floats(0.02, 6.2), middle=st.floats(0.1, 0.9), radius=st.floats(1.0, 500.0),
+    seed=st.integers(0, 1000),
+)  # fmt: skip
+def test_arc_through_three_points_is_on_circle(turn: float, middle: float, radius: float, seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    basis, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    centre = rng.normal(size=3) * 100
+
+    def on_circle(angle: float) -> ndarray:
+        return np.asarray(centre + radius * (math.cos(angle) * basis[0] + math.sin(angle) * basis[1]))
+
+    [arc] = arc_through(on_circle(0.0), on_circle(middle * turn), on_circle(turn), 1.0)
+    points = arc.points()
+    assert len(points) == max(2, math.ceil(math.degrees(turn) / 6 - 1e-6) + 1)
+    expected = [on_circle(angle) for angle in np.linspace(0.0, turn, len(points))]
+    np.testing.assert_allclose(points, expected, atol=radius * 1e-6)
+
+
+def test_arc_of_collinear_points_is_line() -> None:
+    points = np.array([(0.0, 0, 0), (1, 1, 0), (3, 3, 0)])
+    start, middle, end = points
+    first, second = arc_through(start, middle, end, 1.0)
+    np.testing.assert_array_equal([*first.points(), *second.points()[1:]], points)
+
+
+QUARTER_CIRCLE_MM = [
+    (0, 0, 0),
+    (200, 0, 0),
+    (200 + 40 * math.sin(math.pi / 4), 40 - 40 * math.cos(math.pi / 4), 0),
+    (240, 40, 0),
+]
+
+
+def quarter_circle_axis(ifc: Ifc, arc: Any, same: bool) -> ndarray:
+    """Return the axis of a bar made of a line, an arc and a reversed line, in metres."""
+    line = ifc.new("IfcLine", ifc.point((0, 0, 0)), ifc.new("IfcVector", ifc.direction((2, 0, 0)), 10.0))
+    first = ifc.new("IfcTrimmedCurve", line, [ifc.parameter(0.0)], [ifc.parameter(20.0)], True, "PARAMETER")
+    curves = [(first, True), (arc, same), (ifc.polyline((240, 140, 0), (240, 40, 0)), False)]
+    segments = [ifc.new("IfcCompositeCurveSegment", "CONTINUOUS", sense, curve) for curve, sense in curves]
+    ifc.bar(ifc.disc(ifc.new("IfcCompositeCurve", segments, False)))
+    return ifc.axis_m()
+
+
+@pytest.mark.parametrize("kind", ["parameters", "points", "both", "backwards", "sense", "indexed"])
+def test_all_encodings_of_bend_give_same_axis(kind: str) -> None:
+    ifc = Ifc()
+    up = ifc.new("IfcCircle", ifc.axes((200, 40, 0), (0, 0, 1), (0, -1, 0)), 40.0)
+    down = ifc.new("IfcCircle", ifc.axes((200, 40, 0), (0, 0, -1), (0, -1, 0)), 40.0)
+    start, end = ifc.point((200, 0, 0)), ifc.point((240, 40, 0))
+    parameter = ifc.parameter
+    trimmed_curve_args: dict[str, tuple[Any, ...]] = {
+        "parameters": (up, [parameter(0.0)], [parameter(90.0)], True, "PARAMETER"),
+        "points": (up, [start], [end], True, "CARTESIAN"),
+        "both": (up, [start, parameter(0.0)], [end, parameter(90.0)], True, "PARAMETER"),
+        "backwards": (down, [parameter(270.0)], [parameter(0.0)], True, "PARAMETER"),
+        "sense": (up, [end], [start], False, "CARTESIAN"),
+    }
+    if kind == "indexed":
+        points = ifc.new(
+            "IfcCartesianPointList3D", [tuple(map(float, p)) for p in (*QUARTER_CIRCLE_MM, (240, 140, 0))]
+        )
+        segments = [
+            ifc.new("IfcLineIndex", (1, 2)),
+            ifc.new("IfcArcIndex", (2, 3, 4)),
+            ifc.new("IfcLineIndex", (4, 5)),
+        ]
+        ifc.bar(ifc.disc(ifc.new("IfcIndexedPolyCurve", points, segments, False)))
+        axis_mm = ifc.axis_m() * 1000
+    else:
+        arc = ifc.new("IfcTrimmedCurve", *trimmed_curve_args[kind])
+        axis_mm = quarter_circle_axis(ifc, arc, same=kind not in ("backwards", "sense")) * 1000
+    angles = np.linspace(0, math.pi / 2, 16)
+    bend = [(200 + 40 * math.sin(a), 40 - 40 * math.cos(a), 0) for a in angles]
+    np.testing.assert_allclose(axis_mm, [(0, 0, 0), *bend, (240, 140, 0)], atol=1e-9)
+
+
+def test_polygonal_disk_solid_has_rounded_corners() -> None:
+    ifc = Ifc()
+    line = ifc.polyline((0, 0, 0), (240, 0, 0), (240, 140, 0))
+    ifc.bar(ifc.new("IfcSweptDiskSolidPolygonal", line, 8.0, None, None, None, 40.0))
+    axis_mm = ifc.axis_m() * 1000
+    assert len(axis_mm) == 18
+    np.testing.assert_allclose(np.hypot(axis_mm[1:-1, 0] - 200, axis_mm[1:-1, 1] - 40), 40, atol=1e-9)
+
+
+def test_bar_roles_and_order() -> None:
+    ifc = Ifc()
+    expected = [
+        ("main", {"PredefinedType": "MAIN"}),
+        ("stirrup", {"PredefinedType": "LIGATURE", "Name": "x"}),
+        ("Top layer", {"PredefinedType": "USERDEFINED", "ObjectType": " Top \n layer "}),
+        ("Bügel 7", {"Name": "Bügel 7"}),
+        ("bar", {}),
+    ]
+    entities = [
+        ifc.bar(ifc.disc(ifc.polyline((0, 100 * n, 0), (500, 100 * n, 0))), **attributes)
+        for n, (_, attributes) in enumerate(expected)
+    ]
+    ifc.rooted(
+        "IfcRelDefinesByType",
+        RelatedObjects=[entities[-1]],
+        RelatingType=ifc.rooted("IfcReinforcingBarType", PredefinedType="SHEAR"),
+    )
+    bars = [bar.bar for bar in ifc.bars()]
+    assert [bar.role for bar in bars] == [*(role for role, _ in expected[:-1]), "shear"]
+    assert [bar.axis_m[0][1] for bar in bars] == pytest.approx([0.0, 0.1, 0.2, 0.3, 0.4])
+    assert [bar.bar_id for bar in bars] == [1, 2, 3, 4, 5]
+
+
+def test_extruded_circles_are_exact_bars() -> None:
+    ifc = Ifc()
+    ifc.bar(
+        extruded_circle(ifc), extruded_circle(ifc, 6.0, x=50.0), at=ifc.at((100, 200, 300), (1, 0, 0), (0, 0, 1))
+    )
+    first, second = ifc.bars()
+    np.testing.assert_allclose(first.bar.axis_m, [(0.1, 0.2, 0.3), (0.6, 0.2, 0.3)], atol=1e-12)
+    np.testing.assert_allclose(second.bar.axis_m, [(0.1, 0.2, 0.35), (0.6, 0.2, 0.35)], atol=1e-12)
+    assert (first.bar.diameter_m, second.bar.diameter_m) == (0.016, 0.012)
+    assert first.mesh is None
+
+
+@pytest.mark.slow
+def test_other_solids_are_tessellated_and_placed() -> None:
+    ifc = Ifc(prefix=None)
+    solid = extruded_square(ifc, 0.008, 0.5)
+    ifc.bar(ifc.disc(ifc.polyline((0, 0, 0), (0.5, 0, 0)), 0.008))
+    mirror = ifc.new("IfcCartesianTransformationOperator3D", None, ifc.direction((0, -1, 0)), ifc.point((0, 1, 0)))
+    placed = ifc.at((0.1, 0.2, 0.3), (1, 0, 0), (0, 0, 1))
+    ifc.bar(solid, ifc.mapped(mirror, ifc.axes((0, 0, 0)), solid), at=placed)
+    swept, first, second = ifc_cage(ifc.file.to_string().encode(), "a.ifc").bars
+    assert (swept.bar.role, first.bar.role, second.bar.role) == ("bar", "imported", "imported")
+    assert not first.bar.has_axis  # A square section is no round bar.
+    assert first.mesh is not None
+    assert second.mesh is not None
+    np.testing.assert_allclose(first.mesh.vertices_m.mean(axis=0), (0.35, 0.2, 0.3), atol=1e-6)
+    np.testing.assert_allclose(second.mesh.vertices_m.mean(axis=0), (0.35, -0.8, 0.3), atol=1e-6)
+    volumes = [signed_volume(bar.mesh.vertices_m, bar.mesh.faces) for bar in (first, second) if bar.mesh]
+    np.testing.assert_allclose(volumes, 0.008**2 * 0.5, rtol=1e-6)
+    assert [bar.bar.bar_id for bar in (swept, first, second)] == [1, 2, 3]
+
+
+@pytest.mark.slow
+def test_tessellated_bodies_get_bent_axis_or_none() -> None:
+    """A U-bar and a plate in one Body are two bars; the kernel tessellates the bends of 30 mm."""
+    ifc = Ifc()
+    sine = 30 * (1 - 0.5**0.5)
+    points = [(0, 400, 0), (0, 30, 0), (sine, sine, 0), (30, 0, 0), (170, 0, 0)]
+    points += [(200 - sine, sine, 0), (200, 30, 0), (200, 400, 0)]
+    coordinates = ifc.new("IfcCartesianPointList3D", [tuple(map(float, point)) for point in points])
+    pieces = [("IfcLineIndex", (1, 2)), ("IfcArcIndex", (2, 3, 4)), ("IfcLineIndex", (4, 5))]
+    pieces += [("IfcArcIndex", (5, 6, 7)), ("IfcLineIndex", (7, 8))]
+    curve = ifc.new("IfcIndexedPolyCurve", coordinates, [ifc.new(*piece) for piece in pieces], False)
+    section = ifc.new("IfcRectangleProfileDef", "AREA", None, None, 100.0, 20.0)
+    plate = ifc.new("IfcExtrudedAreaSolid", section, ifc.axes((100, 200, 50)), ifc.direction((0, 0, 1)), 100.0)
+    ifc.bar(ifc.disc(curve, 6.0), plate)
+    bent, other = (cage_bar.bar for cage_bar in ifc.bars())
+    assert bent.diameter_m == pytest.approx(0.012, rel=0.001)
+    assert bent.length_m == pytest.approx(2 * 0.37 + 0.14 + math.pi * 0.03, rel=0.001)
+    assert not other.has_axis
+
+
+def signed_volume(vertices: ndarray, faces: ndarray) -> float:
+    a, b, c = (vertices[faces[:, k]] for k in range(3))
+    return float((a * np.cross(b, c)).sum() / 6)
+
+
+@pytest.mark.parametrize(("first", "last", "length_mm"), [(100.0, 200.0, 500.0), (100.0, 150.0, 250.0)])
+def test_spline_is_trimmed_in_parameters_of_its_knots(first: float, last: float, length_mm: float) -> None:
+    ifc = Ifc()
+    control = [ifc.point((0, 0, 0)), ifc.point((500, 0, 0))]
+    shape = ("UNSPECIFIED", False, False, [2, 2], [100.0, 200.0], "UNSPECIFIED")
+    spline = ifc.new("IfcBSplineCurveWithKnots", 1, control, *shape)
+    trims = [ifc.parameter(first)], [ifc.parameter(last)]
+    ifc.bar(ifc.disc(ifc.new("IfcTrimmedCurve", spline, *trims, True, "PARAMETER")))
+    axis_mm = ifc.axis_m() * 1000
+    np.testing.assert_allclose(axis_mm[[0, -1]], [(0, 0, 0), (length_mm, 0, 0)], atol=1e-9)
+
+
+def test_host_is_a_whole_or_a_connected_element() -> None:
+    ifc = Ifc()
+    part, connected, other = (ifc.bar(ifc.disc(ifc.polyline((0, y, 0), (500, y, 0)))) for y in (0, 100, 200))
+    wall, slab = ifc.rooted("IfcWall", Name="W"), ifc.rooted("IfcSlab", Name="S")
+    ifc.rooted("IfcRelNests", RelatingObject=wall, RelatedObjects=[part])
+    for bar in (part, connected):
+        ifc.rooted("IfcRelConnectsWithRealizingElements", RelatingElement=slab, RelatedElement=bar,
+                   RealizingElements=[bar])  # fmt: skip
+    storey = ifc.rooted("IfcBuildingStorey", Name="EG")
+    ifc.rooted("IfcRelContainedInSpatialStructure", RelatedElements=[wall, other], RelatingStructure=storey)
+    assert [(bar.host, bar.storey) for bar in ifc.bars()] == [("W", "EG"), ("S", None), (None, "EG")]
+
+
+def test_relation_of_all_bars_is_compared_with_its_text_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    ifc = Ifc()
+    bars = [ifc.bar(ifc.disc(ifc.polyline((0, 100 * n, 0), (500, 100 * n, 0)))) for n in range(50)]
+    relation = ifc.rooted("IfcRelAggregates", RelatingObject=ifc.rooted("IfcWall", Name="W"), RelatedObjects=bars)
+    content = ifc.file.to_string().encode()
+    compared: list[int] = []
+    instance = StepText.instance
+
+    def noted_instance(step: StepText, number: int) -> str:
+        compared.append(number)
+        return instance(step, number)
+
+    monkeypatch.setattr(StepText, "instance", noted_instance)
+    assert {bar.host for bar in bars_in_process(content)} == {"W"}
+    assert compared.count(relation.id()) == 1  # Once per bar would take quadratic time.

@@ -1,0 +1,340 @@
+"""Validation of users' scene files: all problems are reported at once, and no value is guessed."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import unicodedata
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from dataset_builder.catalog.named_configs import CONFIGS, BuildRequest
+from dataset_builder.catalog.scene_file import scene_config, scene_name_of
+from dataset_builder.specs.config_specs import DomeSpec, SurveySpec
+from dataset_builder.user_files import scene_schema
+from dataset_builder.user_files.cage_file import cage_file_spec, load_cage
+from dataset_builder.user_files.scene_schema import read_scene_toml
+from rebar_depth_bench.errors import InputError, MeshError
+from tests.builder.catalog.scene_files import BAR, MM, write_scene
+
+SURVEY = "[cameras]\nkind = 'survey'\n"
+INVALID_COUNT_AND_SEED = "invalid cameras.views_per_distance, invalid cameras.seed"
+INVALID_SCENES = [
+    ("", "missing unit, missing"),
+    (BAR, "missing unit"),
+    ('unit = "yard"\n' + BAR, "invalid unit"),
+    ("unit = 5\n" + BAR, "invalid unit"),
+    (MM + "nmae = 'x'\n" + BAR, "unknown nmae"),
+    (MM + "zzz = 1\n" + BAR, "unknown zzz"),
+    (MM + "name = 'My Beam'\n" + BAR, "invalid name"),
+    (MM + "name = 'lattice-dusk'\n" + BAR, "invalid name"),
+    (MM + "name = 'lattice'\n" + BAR, "conflict name"),
+    (MM + "name = 'meshes'\n" + BAR, "conflict name"),
+    (MM + "name = 'scenes'\n" + BAR, "conflict name"),
+    (MM + "name = '../x'\n" + BAR, "invalid name"),
+    (MM + "name = ''\n" + BAR, "invalid name"),
+    (MM + "name = '" + "a" * 64 + "'\n" + BAR, "invalid name"),
+    (MM + "name = true\n" + BAR, "invalid name"),
+    (MM + "mesh = 'a.stl'\n" + BAR, "conflict"),
+    (MM + "mesh = 'a.stl'\nifc = 'b.ifc'", "conflict"),
+    (MM + "mesh = 3", "invalid mesh"),
+    (MM + "mesh = ''", "invalid mesh"),
+    (MM + "bar = 3", "invalid bar"),
+    (MM + "up = 'x'\n" + BAR, "invalid up"),
+    (MM + "origin = 'center'\n" + BAR, "invalid origin"),
+    (MM + "rotate_deg = 361\n" + BAR, "invalid rotate_deg"),
+    (MM + "translate = [1, 2]\n" + BAR, "invalid translate"),
+    (MM + "translate = [1, 2, nan]\n" + BAR, "invalid translate"),
+    (MM + "trust = 'geometry'\n" + BAR, "conflict trust"),
+    ("ifc = 'a.ifc'\ntrust = 'me'\n", "invalid trust"),
+    (MM + BAR + "[[select]]\nname = 'a'\n", "conflict select"),
+    ("ifc = 'a.ifc'\nselect = []\n", "invalid select"),
+    ("ifc = 'a.ifc'\nselect = 'a'\n", "invalid select"),
+    ("ifc = 'a.ifc'\n[[select]]\n", "missing select 1"),
+    ("ifc = 'a.ifc'\n[[select]]\nclas = 'a'\n", "unknown select 1: clas"),
+    ("ifc = 'a.ifc'\n[[select]]\nname = ''\n", "invalid select 1: name"),
+    ("ifc = 'a.ifc'\n[[select]]\nbox = [[0, 0, 0]]\n", "invalid select 1: box"),
+    (MM + "mesh = 'a.stl'\n[[select]]\nname = 'a'\nstorey = 'b'\n", "conflict select 1"),
+    (MM + "bar = []", "invalid bar"),
+    (MM + "bar = [1]", "invalid bar 1"),
+    (MM + "[bar]\ndiameter = 10", "invalid bar"),
+    (MM + "environment = 'moon'\n" + BAR, "invalid environment"),
+    (MM + "board = true\n" + BAR, "invalid board"),
+    (MM + "board = 7\n" + BAR, "invalid board"),
+    (MM + "board = 6.0\n" + BAR, "invalid board"),
+    (MM + "cameras = 3\n" + BAR, "invalid cameras"),
+    (MM + BAR + "[cameras]\n", "missing cameras.kind"),
+    (MM + BAR + "[cameras]\nkind = 'x'\n", "invalid cameras.kind"),
+    (MM + BAR + "[cameras]\nkind = ['survey']\n", "invalid cameras.kind"),
+    (MM + BAR + SURVEY + "azimuths = 3\n", "unknown cameras.azimuths"),
+    (MM + BAR + SURVEY + "distances = []\n", "invalid cameras.distances"),
+    (MM + BAR + SURVEY + "distances = 500\n", "invalid cameras.distances"),
+    (MM + BAR + SURVEY + "distances = [500, 0]\n", "invalid cameras.distances 2"),
+    (MM + BAR + SURVEY + "distances = [500, 119]\n", "conflict cameras.distances 2"),
+    (MM + BAR + SURVEY + "views_per_distance = 0\n", "invalid cameras.views_per_distance"),
+    (MM + BAR + SURVEY + "views_per_distance = 2.0\nseed = -1\n", INVALID_COUNT_AND_SEED),
+    (MM + BAR + SURVEY + "views_per_distance = 2501\n", "conflict cameras"),
+    (MM + BAR + SURVEY + f"distances = {[500] * 80}\n", "conflict cameras"),
+    (MM + BAR + SURVEY + "views_per_distance = 10001\n", "invalid cameras.views_per_distance"),
+    (MM + BAR + SURVEY + "stations = []\n", "unknown cameras.stations"),
+    (
+        MM + BAR + "[cameras]\nkind = 'ring'\n",
+        "missing cameras.azimuths, missing cameras.radius, missing cameras.elevation_deg",
+    ),
+    (
+        MM + BAR + "[cameras]\nkind = 'ring'\nradii = [1]\n",
+        "missing cameras.azimuths, missing cameras.radius, missing cameras.elevation_deg, unknown cameras.radii",
+    ),
+    (
+        MM + BAR + "[cameras]\nkind = 'dome'\nradii = []\n",
+        "missing cameras.azimuths, invalid cameras.radii, missing cameras.elevations_deg",
+    ),
+    (
+        MM + BAR + "[cameras]\nkind = 'dome'\nradii = [400, -1]\n",
+        "missing cameras.azimuths, invalid cameras.radii 2, missing cameras.elevations_deg",
+    ),
+    (
+        MM + BAR + "[cameras]\nkind = 'dome'\nelevations_deg = [90]\n",
+        "missing cameras.azimuths, missing cameras.radii, invalid cameras.elevations_deg 1",
+    ),
+    (
+        MM + BAR + "[cameras]\nkind = 'ring'\nazimuths = 2.5\n",
+        "invalid cameras.azimuths, missing cameras.radius, missing cameras.elevation_deg",
+    ),
+    (
+        MM + BAR + "[cameras]\nkind = 'ring'\nazimuths = true\n",
+        "invalid cameras.azimuths, missing cameras.radius, missing cameras.elevation_deg",
+    ),
+    (
+        MM + BAR + "[cameras]\nkind = 'ring'\nradius = 50\nelevation_deg = 9\nazimuths = 3\n",
+        "conflict cameras.radius",
+    ),
+    (
+        MM + BAR + "[cameras]\nkind = 'dome'\nradii = [400, 500]\nelevations_deg = [5, 9]\nazimuths = 3600\n",
+        "conflict cameras",
+    ),
+    (MM + "[[bar]]\n", "missing bar 1: diameter, missing bar 1: points"),
+    (MM + BAR + "dia = 3\n", "unknown bar 1: dia"),
+    (MM + BAR + "ribs = 1\n", "invalid bar 1: ribs"),
+    (MM + BAR + "id = 0\n", "invalid bar 1: id"),
+    (MM + BAR + "id = 65536\n", "invalid bar 1: id"),
+    (
+        MM + BAR + "id = 5\n" + BAR + "id = 5\n",
+        "duplicate bar 2: id",
+    ),
+    (MM + BAR + "role = ''\n", "invalid bar 1: role"),
+    (MM + BAR + 'role = "a\\nb"\n', "invalid bar 1: role"),
+    (MM + BAR + "role = '" + "x" * 61 + "'\n", "invalid bar 1: role"),
+    (MM + BAR + "bend_diameter = 9\n", "conflict bar 1: bend_diameter"),
+    (MM + BAR + "bend_diameter = -4\n", "invalid bar 1: bend_diameter"),
+    (MM + BAR.replace("= 10", "= 0"), "invalid bar 1: diameter"),
+    (MM + BAR.replace("= 10", "= nan"), "invalid bar 1: diameter"),
+    (MM + BAR.replace("= 10", "= inf"), "invalid bar 1: diameter"),
+    (MM + BAR.replace("= 10", "= '10'"), "invalid bar 1: diameter"),
+    (MM + BAR.replace("= 10", "= true"), "invalid bar 1: diameter"),
+    (MM + BAR.replace("= 10", "= 1" + "0" * 400), "invalid bar 1: diameter"),
+    (MM + BAR.replace("= 10", "= 2020-01-01"), "invalid bar 1: diameter"),
+    (
+        MM + BAR.replace("[100, 0, 50]", "[100, 0]"),
+        "invalid bar 1: points 2",
+    ),
+    (MM + BAR.replace("[100, 0, 50]", "[100, 0, nan]"), "invalid bar 1: points 2"),
+    (MM + BAR.replace("[100, 0, 50]", "[100, 0, '5']"), "invalid bar 1: points 2"),
+    (MM + BAR.replace("[100, 0, 50]", "7"), "invalid bar 1: points 2"),
+    (MM + BAR.replace("[100, 0, 50]", "[1e300, 0, 5]"), "invalid bar 1: points 2"),
+    (MM + BAR.replace(", [100, 0, 50]", ""), "invalid bar 1: points"),
+    ("unit = ", "syntax"),
+    ("x = " + "[" * 5000, "size"),
+    ("x = " + "9" * 5000, "syntax"),
+    ("a = 1\na = 2\n", "syntax"),
+    ("\x00", "syntax"),
+]
+
+
+def codes_and_places(error: InputError) -> list[str]:
+    return [f"{problem.code} {problem.where}".strip() for problem in error.problems]
+
+
+@pytest.mark.parametrize(("content", "problems"), INVALID_SCENES)
+def test_invalid_scene_file_is_rejected(tmp_path: Path, content: str, problems: str) -> None:
+    with pytest.raises(InputError, match=f"^{tmp_path}/my-beam.toml: [0-9]+ problem") as raised:
+        scene_config(write_scene(tmp_path, content))
+    assert ", ".join(codes_and_places(raised.value)) == problems
+
+
+def test_all_problems_are_reported_together(tmp_path: Path) -> None:
+    content = "unit = 'mmm'\nfoo = 1\nboard = 7\n" + BAR.replace("= 10", "= -1") + "rips = true\n"
+    with pytest.raises(InputError) as raised:
+        scene_config(write_scene(tmp_path, content))
+    head, *lines = str(raised.value).splitlines()
+    assert head == f"{tmp_path}/my-beam.toml: 5 problems"
+    assert lines == [f"  - {problem}" for problem in raised.value.problems]
+    assert codes_and_places(raised.value) == [
+        "invalid unit",
+        "invalid bar 1: diameter",
+        "unknown bar 1: rips",
+        "invalid board",
+        "unknown foo",
+    ]
+    with pytest.raises(MeshError) as raised_by_cage:
+        load_cage(cage_file_spec(write_scene(tmp_path, content)))
+    assert raised_by_cage.value.problems == raised.value.problems
+    with pytest.raises(InputError, match=r"40 problems(.|\n)*and 20 more"):
+        scene_config(write_scene(tmp_path, MM + "[[bar]]\n" * 20))
+
+
+def test_conflicts_are_reported_with_other_problems(tmp_path: Path) -> None:
+    content = (
+        MM
+        + "name = 'pile'\nmesh = 'a.stl'\nboard = 7\n"
+        + (BAR + "id = 5\nbend_diameter = 9\nrips = 1\n") * 2
+        + "[[bar]]\nid = 5\n"
+        + f"[[bar]]\nid = 0x{'f' * 6000}\n" * 2
+        + "[cameras]\nkind = 'dome'\nradii = [400, 50]\nelevations_deg = [5, 90]\nazimuths = 3600\nfoo = 1\n"
+    )
+    with pytest.raises(InputError) as raised:
+        scene_config(write_scene(tmp_path, content))
+    codes = [code for code in codes_and_places(raised.value) if not code.startswith(("missing", "unknown"))]
+    assert sorted(codes) == [
+        "conflict",
+        "conflict bar 1: bend_diameter",
+        "conflict bar 2: bend_diameter",
+        "conflict cameras",
+        "conflict cameras.radii 2",
+        "conflict name",
+        "duplicate bar 2: id",
+        "duplicate bar 3: id",
+        "invalid bar 4: id",
+        "invalid bar 5: id",
+        "invalid board",
+        "invalid cameras.elevations_deg 2",
+    ]
+
+
+def test_documented_example_is_valid() -> None:
+    example = (scene_schema.__doc__ or "").split("```")[1].removeprefix("toml")
+    scene = read_scene_toml(example.encode(), "example")
+    assert (scene.name, scene.board, scene.cameras) == ("my-beam", 6, DomeSpec((0.3, 0.4), (15.0, 45.0), 12))
+    corners_m = ((-0.15, 0.0, 0.005), (0.15, 0.0, 0.005), (0.15, 0.0, 0.08))
+    [bar] = scene.bars
+    assert bar.model_dump() == {
+        "bar_id": 7,
+        "role": "main",
+        "diameter_m": 0.01,
+        "corners_m": corners_m,
+        "mandrel_m": 0.04,
+        "ribs": True,
+    }
+
+
+def test_survey_has_defaults_in_metres_and_distances_in_the_unit() -> None:
+    for unit, keys, expected in (
+        ("mm", "", SurveySpec((0.5, 1.0, 2.0, 4.0), 126, 0)),
+        ("ft", "", SurveySpec()),
+        ("ft", "distances = [5, 10]\n", SurveySpec((1.524, 3.048))),
+        ("mm", "views_per_distance = 2500\nseed = 7\n", SurveySpec(views_per_distance=2500, seed=7)),
+    ):
+        content = f'unit = "{unit}"\n{BAR}{SURVEY}{keys}'
+        assert read_scene_toml(content.encode(), "a").cameras == expected
+
+
+BAR_1 = "bar 1 (bar, diameter 0.01 m)"
+
+
+@pytest.mark.parametrize(
+    ("content", "problem", "words"),
+    [
+        (BAR.replace("[100, 0, 50]", "[-100, 0, 50]"), f"invalid {BAR_1}", "none repeated in a row"),
+        (BAR.replace("50]]", "50], [100, 0, 60]]"), f"invalid {BAR_1}", "leg 2 is 0.0100 m .* need 0.0250 m"),
+        (BAR.replace("50]]", "50], [0, 0, 50]]"), f"invalid {BAR_1}", "turns straight back on itself"),
+        (BAR.replace("= 10", "= 1000"), "invalid bar 1 (bar, diameter 1 m)", "diameter is 1 m"),
+        (BAR.replace("= 10", "= 0.0001"), "invalid bar 1 (bar, diameter 1e-07 m)", "diameter is 1e-07 m"),
+        (BAR.replace("100", "1e6"), f"invalid {BAR_1}", "extends 1000 m"),
+        (BAR + BAR.replace("10\n", "12\n"), "duplicate bar 2 (bar, diameter 0.012 m)", "same axis as bar 1"),
+        ("[[bar]]\ndiameter = 1\npoints = [[0, 0, 5], [0.5, 0, 5]]\n", "invalid", "cage is 0.0005 m long"),
+    ],
+)
+def test_impossible_bar_geometry_is_rejected(tmp_path: Path, content: str, problem: str, words: str) -> None:
+    with pytest.raises(MeshError, match=f"^{tmp_path}/my-beam.toml: 1 problem(.|\n)*{words}") as raised:
+        scene_config(write_scene(tmp_path, MM + content))
+    assert codes_and_places(raised.value) == [problem]
+
+
+def test_steel_below_board_or_around_cameras_is_rejected(tmp_path: Path) -> None:
+    with pytest.raises(MeshError, match=r"extends down to z = -0\.0"):
+        scene_config(write_scene(tmp_path, MM + BAR.replace("50]", "-50]")))
+    near = '[cameras]\nkind = "ring"\nradius = 130\nelevation_deg = 35\nazimuths = 20\n'
+    with pytest.raises(MeshError, match=r"extends 0\.2\d* m from its centre, expected less than 0\.13 m"):
+        scene_config(write_scene(tmp_path, MM + BAR.replace("100", "200") + near))
+
+
+def test_unreadable_or_misnamed_files_are_rejected(tmp_path: Path) -> None:
+    for name, words in (
+        ("a.yaml", "unsupported scene file type '.yaml'"),
+        ("a.toml", "cannot be read: No such file"),
+    ):
+        with pytest.raises(InputError, match=words):
+            scene_config(tmp_path / name)
+    with pytest.raises(InputError) as raised:
+        scene_config(write_scene(tmp_path, b"\xff\xfe"))
+    assert codes_and_places(raised.value) == ["syntax"]
+    with pytest.raises(MeshError, match=r"my-beam.toml: ifc: .*gone.ifc: 1 problem\n  - cannot be read"):
+        scene_config(write_scene(tmp_path, 'ifc = "gone.ifc"'))
+    assert scene_config(write_scene(tmp_path, "\ufeff" + (MM + BAR).replace("\n", "\r\n"))).name == "my-beam"
+    builtin_name = next(iter(CONFIGS))
+    with pytest.raises(InputError, match=f"would be named '{builtin_name}'"):
+        scene_config(write_scene(tmp_path, MM + BAR, f"{builtin_name}.toml"))
+
+
+@pytest.mark.parametrize(
+    ("file", "name"),
+    [
+        ("IfcReinforcingBar.ifc", "ifcreinforcingbar"),
+        ("My Beam.toml", "my-beam"),
+        ("(Rev. 3) Säule_B25.0  neu!.ifc", "rev-3-saule-b25-0-neu"),
+        ("Stra\u00dfe \u2116 1.IFC", "strasse-no-1"),
+        ("bewehrung.v2.toml", "bewehrung-v2"),
+        ("\u9244\u7b4b.ifc", ""),
+        ("\u9244\u7b4b 7.ifc", "7"),
+    ],
+)
+def test_scene_names_come_from_file_names(file: str, name: str) -> None:
+    assert scene_name_of(Path(file)) == name
+    assert scene_name_of(Path(unicodedata.normalize("NFD", file))) == name
+
+
+@given(st.text(min_size=1))
+def test_derived_scene_names_are_valid_or_refused(stem: str) -> None:
+    name = scene_name_of(Path("folder", f"a{stem.replace('/', '')}.ifc"))
+    assert re.fullmatch("[a-z0-9]+(-[a-z0-9]+)*", name)
+    assert scene_name_of(Path(f"{name}.ifc")) == name
+
+
+def test_file_names_without_a_scene_name_are_refused(tmp_path: Path) -> None:
+    assert scene_config(write_scene(tmp_path, MM + BAR, "My Beam.toml")).name == "my-beam"
+    for file, name in (
+        ("\u9244\u7b4b.toml", ""),
+        ("Lattice Orbit.toml", "lattice-orbit"),
+        (f"{'x' * 64}.toml", "x" * 64),
+        ("Beam Dusk.toml", "beam-dusk"),
+    ):
+        with pytest.raises(InputError, match=f"would be named '{name}', expected a name.*rename the file"):
+            scene_config(write_scene(tmp_path, MM + BAR, file))
+
+
+def test_ifc_file_may_have_a_name_that_a_scene_file_cannot_name(tmp_path: Path) -> None:
+    """A path in a scene file must not begin with a tilde, but an IFC file that is the scene itself may."""
+    path = tmp_path / "~x.ifc"
+    shutil.copy("examples/column.ifc", path)
+    assert scene_config(path).name == "x"
+
+
+def test_files_that_give_the_same_scene_name_are_refused(tmp_path: Path) -> None:
+    scenes = tuple(
+        scene_config(write_scene(tmp_path, MM + BAR, file)) for file in ("My Beam.toml", "my_beam.toml")
+    )
+    with pytest.raises(InputError, match="more than one config is named my-beam"):
+        BuildRequest(configs=(), scenes=scenes).config_specs()
