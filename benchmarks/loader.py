@@ -22,7 +22,7 @@ from rebar_depth_bench.data.columns import COLUMNS
 from rebar_depth_bench.data.dataset import iterate_undecoded
 from rebar_depth_bench.data.decoding import RowDecoder
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.view_ids import TEST_SPLIT
+from rebar_depth_bench.names import TEST_SPLIT
 
 REPEATS = 7
 WORKERS = (0, 1, 2)

@@ -14,9 +14,9 @@ from rebar_depth_bench.data.columns import COLUMN_DESCRIPTIONS, column_kind, fea
 from rebar_depth_bench.data.config_tables import Assembly, Colour, References, Scene
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.trajectory import CENTRE, NEAREST_STEEL, AnyTrajectory, Survey, Trajectory
+from rebar_depth_bench.names import TEST_SPLIT
 from rebar_depth_bench.reporting.formatting import DASH
 from rebar_depth_bench.scoring.protocol import PROTOCOL
-from rebar_depth_bench.view_ids import TEST_SPLIT
 
 if TYPE_CHECKING:
     from datasets import DatasetInfo

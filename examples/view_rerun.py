@@ -33,12 +33,12 @@ from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.data.shards import rows_at
 from rebar_depth_bench.errors import InputError, SubmissionError, escape_text, printable
 from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid, transform
+from rebar_depth_bench.names import config_of
 from rebar_depth_bench.outputs import write_output
 from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.metrics import is_valid_prediction, median, median_scale
 from rebar_depth_bench.scoring.protocol import scored_pixels
 from rebar_depth_bench.submission import EntryError
-from rebar_depth_bench.view_ids import config_of
 
 COLUMNS = ("left_rgb", "right_rgb", *truth_columns("left"), *(f"right_{kind}" for kind in CAMERA_KINDS))
 COLOURS = np.array([[0, 114, 178], [213, 94, 0], [0, 158, 115], [160, 72, 138]], np.uint8)  # Of archives.

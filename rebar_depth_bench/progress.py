@@ -1,12 +1,3 @@
-"""Progress callback type and a no-op callback."""
+"""Former place of ``rebar_depth_bench.parallel``, until the builder imports from there."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-
-Progress = Callable[[str, int, int], None]
-"""Callback with the arguments: name of the task, number of steps done, total number of steps."""
-
-
-def silent(task: str, done: int, total: int) -> None:
-    """Ignore progress; the default callback."""
+from rebar_depth_bench.parallel import *  # noqa: F403

@@ -7,17 +7,22 @@ folders are refused without blocking.
 from __future__ import annotations
 
 import errno
+import hashlib
 import json
 import math
+import mmap
 import os
 import re
+import shutil
 import stat
 import tomllib
+import weakref
 from pathlib import Path
-from typing import Any, BinaryIO, NoReturn
+from typing import Any, BinaryIO, NoReturn, Protocol
 
 from rebar_depth_bench.errors import InputError, Problem, ProblemCode, escape_text
 from rebar_depth_bench.limits import Limit
+from rebar_depth_bench.names import NAME_LETTERS, PATH_PATTERN
 
 MAX_NESTING = 64
 """Largest number of JSON or TOML containers inside each other."""
@@ -147,3 +152,125 @@ def _nesting_exceeds(value: Any, levels: int) -> bool:
         if not containers:
             return False
     return True
+
+
+def path_below(folder: Path, name: str) -> Path:
+    """Return the path of ``name``, one or more names joined by ``/``, below ``folder``.
+
+    Raises ``InputError`` for any other text, such as an absolute path or one with ``..``.
+    """
+    if not re.fullmatch(PATH_PATTERN, name):
+        raise InputError(
+            f"{folder}: {escape_text(name)} is not a path in this folder, expected names of {NAME_LETTERS}"
+        )
+    return folder / name
+
+
+def check_no_links(folder: Path, *names: str) -> None:
+    """Raise ``InputError`` if one of ``names`` below ``folder``, or a folder on the way to it, is a symbolic link.
+
+    ``folder`` itself may be a link: the user named it.
+    """
+    for name in names:
+        path = folder
+        for part in Path(name).parts:
+            path = path / part
+            if path.is_symlink():
+                raise InputError(
+                    f"{path}: is a symbolic link, expected a file or folder (links are not followed here)"
+                )
+
+
+def remove_file(path: Path) -> None:
+    """Delete a regular file; links, folders and missing files are left alone."""
+    try:
+        if stat.S_ISREG(os.lstat(path).st_mode):
+            path.unlink()
+    except FileNotFoundError:
+        return
+
+
+def remove_folder(path: Path) -> None:
+    """Delete a folder with its content, without following links; a link or a missing folder is left alone."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
+
+
+# For smaller reads, pread is cheaper than a mapping and its page faults.
+_MIN_MAPPED_BYTES = 64 * 1024
+
+
+class ByteSource(Protocol):
+    """Interface of thread-safe random access to a sequence of bytes."""
+
+    @property
+    def size(self) -> int:
+        """Length in bytes."""
+
+    def read_at(self, offset: int, length: int) -> memoryview:
+        """Return exactly ``length`` bytes, or raise ``EOFError`` if the source holds fewer."""
+
+
+_HASH_CHUNK_BYTES = 1 << 20
+
+
+class FileSource:
+    """Byte source of a regular file, read through ``pread`` and short-lived read-only mappings.
+
+    Every large read maps its own range, and the mapping is released with the last view on it, so the resident
+    memory is that of the views in use, independent of the file size. The file must not be truncated while a view
+    exists (the operating system would terminate the process with SIGBUS). Raises ``OSError`` for a pipe, device or
+    folder.
+    """
+
+    def __init__(self, path: Path) -> None:
+        with open_regular(path) as stream:
+            self._fd = os.dup(stream.fileno())
+        self._close = weakref.finalize(self, os.close, self._fd)
+        self.size = os.fstat(self._fd).st_size
+
+    def read_at(self, offset: int, length: int) -> memoryview:
+        """Return exactly ``length`` bytes, or raise ``EOFError`` if the source holds fewer."""
+        if offset < 0 or length < 0 or offset + length > os.fstat(self._fd).st_size:
+            raise EOFError(f"{length} bytes at {offset} lie past the end of the file")
+        if length < _MIN_MAPPED_BYTES:
+            return _check_length(memoryview(os.pread(self._fd, length, offset)), length)
+        lead = offset % mmap.ALLOCATIONGRANULARITY
+        # MAP_POPULATE loads all pages at once: one page fault per page would take as long as reading the pages.
+        flags = mmap.MAP_SHARED | getattr(mmap, "MAP_POPULATE", 0)
+        mapped = mmap.mmap(self._fd, lead + length, flags, mmap.PROT_READ, offset=offset - lead)
+        return memoryview(mapped)[lead:]
+
+    def sha256(self) -> str:
+        """Return the hex SHA-256 of the whole file, read in chunks."""
+        digest = hashlib.sha256()
+        offset = 0
+        while chunk := os.pread(self._fd, _HASH_CHUNK_BYTES, offset):
+            digest.update(chunk)
+            offset += len(chunk)
+        return digest.hexdigest()
+
+    def close(self) -> None:
+        """Close the file; views that were already returned stay valid. A second call has no effect."""
+        self._close()
+        self._fd = -1
+
+
+class MemorySource:
+    """Byte source of data in memory."""
+
+    def __init__(self, data: memoryview) -> None:
+        self._data = data
+        self.size = len(data)
+
+    def read_at(self, offset: int, length: int) -> memoryview:
+        """Return exactly ``length`` bytes, or raise ``EOFError`` if the source holds fewer."""
+        if offset < 0 or length < 0:
+            raise EOFError(f"{length} bytes at {offset} lie outside the data")
+        return _check_length(self._data[offset : offset + length], length)
+
+
+def _check_length(data: memoryview, length: int) -> memoryview:
+    if len(data) != length:
+        raise EOFError(f"{len(data)} bytes found, expected {length}")
+    return data

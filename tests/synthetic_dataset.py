@@ -20,8 +20,8 @@ from rebar_depth_bench.data.digests import file_sha256, views_digest
 from rebar_depth_bench.data.eye_view import EyeView
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, MANIFEST_FORMAT, OLD_FORMAT
 from rebar_depth_bench.geometry.cameras import Camera
+from rebar_depth_bench.names import config_of
 from rebar_depth_bench.scoring.protocol import PROTOCOL
-from rebar_depth_bench.view_ids import config_of
 
 HEIGHT, WIDTH = 90, 160
 BASELINE_M = 0.12

@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, ParamSpec, TypeVar
 from leaderboard.scoring.isolation import UnavailableError
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import DatasetError, Problem, RebarDepthError, SubmissionError
+from rebar_depth_bench.names import TEST_SPLIT, config_of, split_of
 from rebar_depth_bench.scoring.view_score import ViewScore
 from rebar_depth_bench.submission import SubmissionMeta, open_submission
-from rebar_depth_bench.view_ids import TEST_SPLIT, config_of, split_of
 
 if TYPE_CHECKING:
     from rebar_depth_bench.scoring.evaluation import Evaluation

@@ -45,7 +45,7 @@ from rebar_depth_bench.geometry.calibration_toml import table_calibration
 from rebar_depth_bench.geometry.stereo_calibration import Calibration, StereoCalibration
 from rebar_depth_bench.key_lines import with_lines
 from rebar_depth_bench.limits import TOML_BYTES
-from rebar_depth_bench.paths import NAME_LETTERS, NAME_PATTERN
+from rebar_depth_bench.names import NAME_LETTERS, NAME_PATTERN
 from rebar_depth_bench.reading import parse_toml, read_file
 from rebar_depth_bench.validation import (
     Expected,

@@ -19,7 +19,7 @@ from pathlib import Path
 
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.limits import CACHE_BYTES
-from rebar_depth_bench.paths import check_no_links, remove_file
+from rebar_depth_bench.reading import check_no_links, remove_file
 
 FOLDER_NAME = "rebar-depth-bench"
 ENTRY_SUFFIX, UNFINISHED_SUFFIX = ".truth", ".tmp"

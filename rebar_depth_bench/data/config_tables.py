@@ -12,7 +12,7 @@ from rebar_depth_bench.data.manifest_table import ManifestTable
 from rebar_depth_bench.data.trajectory import AnyTrajectory, trajectory_of
 from rebar_depth_bench.errors import escape_text
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
-from rebar_depth_bench.paths import NAME_LETTERS, NAME_PATTERN, PATH_PATTERN, VIEW_ID_PATTERN
+from rebar_depth_bench.names import NAME_LETTERS, NAME_PATTERN, PATH_PATTERN, SPLITS, VIEW_ID_PATTERN
 from rebar_depth_bench.validation import (
     Expected,
     StrictModel,
@@ -25,7 +25,6 @@ from rebar_depth_bench.validation import (
     three_numbers,
     whole_number,
 )
-from rebar_depth_bench.view_ids import SPLITS
 
 DIGEST_PATTERN = "sha256:[0-9a-f]{64}"
 Name = Annotated[str, StringConstraints(pattern=f"^{NAME_PATTERN}$"), Expected(f"a name of {NAME_LETTERS}")]

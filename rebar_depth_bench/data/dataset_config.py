@@ -23,8 +23,8 @@ from rebar_depth_bench.data.config_tables import (
 from rebar_depth_bench.data.digests import parameters_digest, views_digest
 from rebar_depth_bench.data.location import Located
 from rebar_depth_bench.errors import DatasetError, escape_text
+from rebar_depth_bench.names import SPLITS, TEST_SPLIT, scene_prefix
 from rebar_depth_bench.validation import check_unique, field_error
-from rebar_depth_bench.view_ids import SPLITS, TEST_SPLIT, scene_prefix
 
 
 class DatasetConfig(Located):

@@ -17,7 +17,7 @@ from rebar_depth_bench.data.decoding import RowDecoder
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.shards import check_shards, damaged_error, iterate_shards
 from rebar_depth_bench.errors import DatasetError, InputError, escape_text
-from rebar_depth_bench.view_ids import TEST_SPLIT
+from rebar_depth_bench.names import TEST_SPLIT
 
 if TYPE_CHECKING:
     from datasets import Dataset, IterableDataset

@@ -11,8 +11,8 @@ from typing import BinaryIO, cast
 from pydantic import ConfigDict
 
 from rebar_depth_bench.errors import DatasetError, InputError, escape_text
-from rebar_depth_bench.paths import PATH_PATTERN, path_below
-from rebar_depth_bench.reading import open_regular
+from rebar_depth_bench.names import PATH_PATTERN
+from rebar_depth_bench.reading import open_regular, path_below
 from rebar_depth_bench.validation import StrictModel
 
 _HUB_NAME = "[A-Za-z0-9][A-Za-z0-9_.-]{0,95}"

@@ -17,7 +17,7 @@ from rebar_depth_bench.extended.measures import percentile
 from rebar_depth_bench.extended.result import CrossingsSource
 from rebar_depth_bench.scoring.bootstrap import INTERVALS, Interval, Resampling, interval
 from rebar_depth_bench.scoring.rounding import rounded, rounded_interval
-from rebar_depth_bench.submission.metadata import SubmissionMeta
+from rebar_depth_bench.submission.declaration import SubmissionMeta
 from rebar_depth_bench.version import software_version
 
 AVERAGE_PRECISION_MM = (5, 10, 20)

@@ -28,10 +28,9 @@ from rebar_depth_bench.extended.ground_truth import SceneBars, has_bar_ids, load
 from rebar_depth_bench.extended.result import CrossingsSource
 from rebar_depth_bench.extended.steel_truth import SteelTruth
 from rebar_depth_bench.geometry.cameras import transform
-from rebar_depth_bench.parallel import map_with_progress
-from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.names import TEST_SPLIT, config_of, split_of
+from rebar_depth_bench.parallel import Progress, map_with_progress, silent
 from rebar_depth_bench.scoring.view_score import resample_views
-from rebar_depth_bench.view_ids import TEST_SPLIT, config_of, split_of
 
 
 def score_crossings(

@@ -37,8 +37,7 @@ from rebar_depth_bench.extended.result import (
     view_numbers,
 )
 from rebar_depth_bench.extended.steel_truth import SteelTruth
-from rebar_depth_bench.parallel import map_with_progress
-from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.parallel import Progress, map_with_progress, silent
 from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.view_score import resample_views

@@ -28,11 +28,11 @@ from rebar_depth_bench.methods import AnyMethod, ConfigViews, Method, MultiViewM
 from rebar_depth_bench.methods.base import input_class
 from rebar_depth_bench.methods.kept_views import KeptViews, PreparationReport
 from rebar_depth_bench.methods.raw_images import rectifying_predictor
+from rebar_depth_bench.names import TEST_SPLIT
 from rebar_depth_bench.outputs import is_stream, link_target
-from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.submission import SubmissionWriter
 from rebar_depth_bench.version import software_version
-from rebar_depth_bench.view_ids import TEST_SPLIT
 
 
 def predict(

@@ -12,7 +12,7 @@ from rebar_depth_bench.scoring.groups import GROUPINGS
 from rebar_depth_bench.scoring.metrics import METRICS, DepthMetrics
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, WITHIN_MM
 from rebar_depth_bench.scoring.result import Table
-from rebar_depth_bench.submission.metadata import Declaration
+from rebar_depth_bench.submission.declaration import Declaration
 
 DASH = "–"
 """Text of an undefined number, which is null in the JSON."""

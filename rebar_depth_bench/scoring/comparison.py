@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.names import config_of
 from rebar_depth_bench.scoring.bootstrap import INTERVALS, Interval
 from rebar_depth_bench.scoring.frames import ALIGNMENTS, differences_frame
 from rebar_depth_bench.scoring.metrics import METRICS
@@ -29,7 +30,6 @@ from rebar_depth_bench.scoring.view_score import (
     resample_views,
     view_metric_values,
 )
-from rebar_depth_bench.view_ids import config_of
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -11,12 +11,12 @@ from pathlib import Path
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.errors import SubmissionError
-from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.names import TEST_SPLIT, config_of, split_of
+from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.scoring.provenance import ArchiveIdentity, Provenance
 from rebar_depth_bench.submission import Declaration, SubmissionReader, open_submission
-from rebar_depth_bench.submission.metadata import NOT_DECLARED
-from rebar_depth_bench.view_ids import TEST_SPLIT, config_of, split_of
+from rebar_depth_bench.submission.declaration import NOT_DECLARED
 
 
 @dataclass(frozen=True)

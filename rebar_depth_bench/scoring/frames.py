@@ -8,10 +8,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from rebar_depth_bench.names import config_of
 from rebar_depth_bench.scoring.metrics import METRIC_NAMES
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
 from rebar_depth_bench.scoring.rounding import rounded
-from rebar_depth_bench.view_ids import config_of
 
 if TYPE_CHECKING:
     from pandas import DataFrame

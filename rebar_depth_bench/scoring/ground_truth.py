@@ -24,7 +24,7 @@ from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.data.eye_view import EyeTruth, truth_columns, truth_from_row
 from rebar_depth_bench.data.manifest import DatasetFolder
 from rebar_depth_bench.errors import DatasetError
-from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.scoring.groups import ViewTraits, bar_width_px
 from rebar_depth_bench.scoring.metrics import median
 from rebar_depth_bench.scoring.protocol import PROTOCOL, scored_pixels, single_bar_pixels

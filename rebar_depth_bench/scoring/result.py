@@ -18,7 +18,7 @@ from rebar_depth_bench.scoring.published_match import PublishedMatch
 from rebar_depth_bench.scoring.reference import NO_REFERENCE, Reference
 from rebar_depth_bench.scoring.rounding import rounded, rounded_interval
 from rebar_depth_bench.scoring.view_score import VIEW_METRICS, ViewScore, view_intervals
-from rebar_depth_bench.submission.metadata import NOT_DECLARED, Declaration
+from rebar_depth_bench.submission.declaration import NOT_DECLARED, Declaration
 
 if TYPE_CHECKING:
     from pandas import DataFrame

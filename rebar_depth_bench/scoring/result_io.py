@@ -14,6 +14,7 @@ from pydantic import BeforeValidator, ConfigDict, FailFast, Field, Strict, model
 
 from rebar_depth_bench.errors import InputError, Problem
 from rebar_depth_bench.limits import JSON_BYTES
+from rebar_depth_bench.names import SPLITS, config_of
 from rebar_depth_bench.reading import parse_json
 from rebar_depth_bench.scoring.metrics import DepthMetrics
 from rebar_depth_bench.scoring.protocol import PROTOCOL, WITHIN_MM
@@ -21,9 +22,8 @@ from rebar_depth_bench.scoring.published_match import PublishedMatch
 from rebar_depth_bench.scoring.reference import Reference
 from rebar_depth_bench.scoring.result import Result, Table
 from rebar_depth_bench.scoring.view_score import VIEW_METRICS, ViewScore
-from rebar_depth_bench.submission.metadata import INPUTS, Declaration
+from rebar_depth_bench.submission.declaration import INPUTS, Declaration
 from rebar_depth_bench.validation import Expected, StrictModel, field_error, one_of, text, validate_table
-from rebar_depth_bench.view_ids import SPLITS, config_of
 
 
 def read_result(data: bytes, where: str) -> Result:

@@ -15,8 +15,7 @@ from numpy import ndarray
 
 from rebar_depth_bench.data.dataset_config import DatasetConfig
 from rebar_depth_bench.errors import Problem, SubmissionError
-from rebar_depth_bench.parallel import map_with_progress
-from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.parallel import Progress, map_with_progress, silent
 from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation
 from rebar_depth_bench.scoring.ground_truth import ConfigTruth, ViewTruth, config_truth
 from rebar_depth_bench.scoring.groups import GROUPINGS, positions_by_group

@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from rebar_depth_bench.names import scene_of
 from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval, resample, resample_scenes
 from rebar_depth_bench.scoring.metrics import METRIC_NAMES, DepthMetrics
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
-from rebar_depth_bench.view_ids import scene_of
 
 SCALE_MEDIAN = "scale_median"
 """Key of the median over views of the scale factor in ``VIEW_METRICS``."""

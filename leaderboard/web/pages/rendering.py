@@ -23,7 +23,7 @@ from rebar_depth_bench.reporting.html.assets import environment
 from rebar_depth_bench.reporting.published import load_published
 from rebar_depth_bench.scoring.disclosure import COVERAGE_RULE
 from rebar_depth_bench.scoring.protocol import PROTOCOL, WITHIN_MM
-from rebar_depth_bench.submission.metadata import INPUTS, is_http_url
+from rebar_depth_bench.submission.declaration import INPUTS, is_http_url
 from rebar_depth_bench.version import software_version
 
 

@@ -13,7 +13,7 @@ from urllib.parse import urlencode
 from leaderboard.db.rankings import LeaderboardEntry
 from rebar_depth_bench.scoring.metrics import METRICS
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
-from rebar_depth_bench.submission.metadata import INPUTS
+from rebar_depth_bench.submission.declaration import INPUTS
 
 PAGE_ROWS = 50
 """Number of submitted rows on a page."""

@@ -13,8 +13,7 @@ from rebar_depth_bench.extended.ground_truth import load_steel_truth
 from rebar_depth_bench.extended.measures import Samples
 from rebar_depth_bench.extended.predictions import NATIVE, SCALED, aligned_predictions
 from rebar_depth_bench.extended.result import CrossingsSource
-from rebar_depth_bench.parallel import map_with_progress
-from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.parallel import Progress, map_with_progress, silent
 from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.scoring.view_score import resample_views
 

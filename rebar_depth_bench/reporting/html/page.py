@@ -20,6 +20,7 @@ from rebar_depth_bench.data.dataset import iterate_undecoded
 from rebar_depth_bench.data.decoding import RowDecoder
 from rebar_depth_bench.diagnosis.diagnose import PossibleMistake
 from rebar_depth_bench.errors import printable
+from rebar_depth_bench.names import config_of
 from rebar_depth_bench.outputs import write_output
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.charts import score_charts
@@ -45,7 +46,6 @@ from rebar_depth_bench.scoring.protocol import WITHIN_MM
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.view_score import ViewScore
 from rebar_depth_bench.submission import SubmissionReader
-from rebar_depth_bench.view_ids import config_of
 
 WORST_SHOWN = 10
 """Number of views of a config that are listed openly; the full list is collapsed."""

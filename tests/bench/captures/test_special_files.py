@@ -14,8 +14,8 @@ from PIL import Image
 from rebar_depth_bench.captures.folder import open_capture
 from rebar_depth_bench.captures.image_header import read_image_shape
 from rebar_depth_bench.errors import InputError, Problem
+from rebar_depth_bench.reading import FileSource
 from rebar_depth_bench.submission import EntryError, open_submission
-from rebar_depth_bench.submission.zip_directory import FileSource
 from tests.bench.captures.example_capture import write_capture
 
 VIEWS = {"walk/a": (3, 4), "walk/b": (3, 4)}

@@ -12,7 +12,7 @@ from rebar_depth_bench.scoring.published_match import PublishedMatch
 from rebar_depth_bench.scoring.reference import Reference
 from rebar_depth_bench.scoring.result import Result, tabulate
 from rebar_depth_bench.scoring.view_score import ViewScore
-from rebar_depth_bench.submission.metadata import Declaration
+from rebar_depth_bench.submission.declaration import Declaration
 
 DECLARED = Declaration("rgb+K", uses_ground_truth=False)
 REFERENCE = Reference(0.0571, 2.21, 0.0062, 0.71)

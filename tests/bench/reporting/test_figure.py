@@ -29,7 +29,7 @@ from rebar_depth_bench.scoring.published_match import PublishedMatch
 from rebar_depth_bench.scoring.reference import NO_REFERENCE
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.view_score import ViewScore
-from rebar_depth_bench.submission.metadata import Declaration
+from rebar_depth_bench.submission.declaration import Declaration
 from tests.bench.reporting.results import (
     HOSTILE,
     REFERENCE,

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.reporting.latex import escape_latex, latex_table
 from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.submission.metadata import NOT_DECLARED, Declaration
+from rebar_depth_bench.submission.declaration import NOT_DECLARED, Declaration
 from tests.bench.reporting.results import HOSTILE, overflowed_view, result, scored_view, unpredicted_view
 
 _COMMANDS = {
