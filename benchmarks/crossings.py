@@ -33,8 +33,7 @@ from numpy import ndarray
 
 import rebar_depth_bench as rdb
 from benchmarks.timing import print_markdown
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
 from rebar_depth_bench.detections.score import score_crossings
 from rebar_depth_bench.extended.evaluate import score_extended
 from rebar_depth_bench.extended.predictions import NATIVE

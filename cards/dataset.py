@@ -10,10 +10,21 @@ from huggingface_hub import DatasetCardData
 
 from cards.steel import depth_text, steel_by_config
 from cards.templates import render
-from rebar_depth_bench.data.columns import COLUMN_DESCRIPTIONS, column_kind, features
-from rebar_depth_bench.data.config_tables import Assembly, Colour, References, Scene
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.trajectory import CENTRE, NEAREST_STEEL, AnyTrajectory, Survey, Trajectory
+from rebar_depth_bench.data.manifest import DatasetConfig
+from rebar_depth_bench.data.schema import (
+    CENTRE,
+    COLUMN_DESCRIPTIONS,
+    NEAREST_STEEL,
+    AnyTrajectory,
+    Assembly,
+    Colour,
+    References,
+    Scene,
+    Survey,
+    Trajectory,
+    column_kind,
+    features,
+)
 from rebar_depth_bench.names import TEST_SPLIT
 from rebar_depth_bench.reporting.formatting import DASH
 from rebar_depth_bench.scoring.protocol import PROTOCOL

@@ -46,8 +46,8 @@ from torch.nn import functional
 import rebar_depth_bench as rdb
 from rebar_depth_bench.atomic_io import atomic_replace, write_text
 from rebar_depth_bench.console import ProgressBars, duration_text, print_notice, run_command
-from rebar_depth_bench.data.dataset import check_columns
 from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.data.rows import check_columns
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.methods import find_method
 from rebar_depth_bench.methods.runner import predict

@@ -27,9 +27,15 @@ from numpy import ndarray
 
 from rebar_depth_bench.console import print_notice, run_command
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars, with_axis
-from rebar_depth_bench.data.decoding import RowDecoder
-from rebar_depth_bench.data.eye_view import CAMERA_KINDS, EyeTruth, camera_from_row, truth_columns, truth_from_row
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
+from rebar_depth_bench.data.rows import (
+    CAMERA_KINDS,
+    EyeTruth,
+    RowDecoder,
+    camera_from_row,
+    truth_columns,
+    truth_from_row,
+)
 from rebar_depth_bench.data.shards import rows_at
 from rebar_depth_bench.errors import InputError, SubmissionError, escape_text, printable
 from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid, transform

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
     from rebar_depth_bench.bar_crossings.table import crossings
     from rebar_depth_bench.data.bars import bars
     from rebar_depth_bench.data.loading import load
-    from rebar_depth_bench.data.torch_loader import torch_loader
+    from rebar_depth_bench.data.torch import torch_loader
     from rebar_depth_bench.errors import (
         CalibrationError,
         DatasetError,

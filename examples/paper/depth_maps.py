@@ -12,9 +12,8 @@ import numpy as np
 
 from outputs import only_config
 from rebar_depth_bench.captures.folder import is_capture, open_capture
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.digests import file_sha256
-from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.data.files import file_sha256
+from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
 from rebar_depth_bench.errors import EntryError, InputError, SubmissionError, printable
 from rebar_depth_bench.names import config_of, split_of
 from rebar_depth_bench.parallel import silent

@@ -23,7 +23,7 @@ from numpy import ndarray
 
 from outputs import add_outputs, flat_table, number, run_script, write_outputs
 from rebar_depth_bench.console import ProgressBars, add_archive, add_data
-from rebar_depth_bench.data.dataset_config import DatasetConfig
+from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.extended.crossings.config import config_reaches
 from rebar_depth_bench.extended.ground_truth import has_bar_ids

@@ -35,7 +35,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
-from rebar_depth_bench.data.eye_view import camera_array
+from rebar_depth_bench.data.rows import camera_array
 from rebar_depth_bench.errors import CalibrationError, InputError, Problem
 from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
 from rebar_depth_bench.geometry.calibration import check_image_size, read_calibration, scaled_calibration

@@ -23,7 +23,7 @@ from numpy import ndarray
 from zlib_ng import zlib_ng
 
 from rebar_depth_bench.data.cache_folder import ENTRY_SUFFIX
-from rebar_depth_bench.data.digests import parameters_digest
+from rebar_depth_bench.data.files import parameters_digest
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.reading import ByteSource, FileSource, MemorySource
 from rebar_depth_bench.validation import StrictModel

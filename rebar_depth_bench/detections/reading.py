@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from rebar_depth_bench.data.digests import file_sha256
-from rebar_depth_bench.data.parquet import Table, open_parquet
+from rebar_depth_bench.data.files import file_sha256
+from rebar_depth_bench.data.shards import Table, open_parquet
 from rebar_depth_bench.detections.columns import (
     MAX_REPORTED,
     METADATA,

@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
+from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_folder
 from rebar_depth_bench.detections.columns import Detections
 from rebar_depth_bench.detections.matching import excused, greedy_matches, matched_pairs
 from rebar_depth_bench.detections.reading import DetectionFile, read_detections

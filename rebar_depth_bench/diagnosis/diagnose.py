@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from rebar_depth_bench.data.dataset_config import DatasetConfig
+from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.diagnosis.corrections import (
     Correction,
     Errors,

@@ -10,9 +10,8 @@ import numpy as np
 from jaxtyping import Float, Float64, Int64
 from numpy import ndarray
 
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.decoding import RowDecoder
-from rebar_depth_bench.data.eye_view import CAMERA_KINDS, camera_from_row
+from rebar_depth_bench.data.manifest import DatasetConfig
+from rebar_depth_bench.data.rows import CAMERA_KINDS, RowDecoder, camera_from_row
 from rebar_depth_bench.data.shards import rows_at
 from rebar_depth_bench.geometry.cameras import Camera
 from rebar_depth_bench.scoring.protocol import scored_pixels

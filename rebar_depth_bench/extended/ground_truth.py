@@ -16,9 +16,8 @@ from rebar_depth_bench.bar_crossings.table import FolderCrossings, folder_crossi
 from rebar_depth_bench.data.array_cache import ArrayCache, open_cache
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars, with_axis
 from rebar_depth_bench.data.cache_entry import CacheContent, ViewArrays
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.eye_view import EyeTruth
-from rebar_depth_bench.data.manifest import DatasetFolder
+from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder
+from rebar_depth_bench.data.rows import EyeTruth
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.extended.crossings.judged import SAMPLED_PIXELS, judged_crossings
 from rebar_depth_bench.extended.crossings.scene import SceneCrossings, no_crossings, prepared_crossings

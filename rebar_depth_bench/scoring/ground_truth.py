@@ -18,11 +18,9 @@ from numpy import ndarray
 from rebar_depth_bench.data.array_cache import ArrayCache, open_cache
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars, with_axis
 from rebar_depth_bench.data.cache_entry import CacheContent, ViewArrays
-from rebar_depth_bench.data.config_tables import ViewRecord
-from rebar_depth_bench.data.dataset import iterate_rows
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.eye_view import EyeTruth, truth_columns, truth_from_row
-from rebar_depth_bench.data.manifest import DatasetFolder
+from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder
+from rebar_depth_bench.data.rows import EyeTruth, iterate_rows, truth_columns, truth_from_row
+from rebar_depth_bench.data.schema import ViewRecord
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.scoring.groups import ViewTraits, bar_width_px

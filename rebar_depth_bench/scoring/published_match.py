@@ -10,9 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from rebar_depth_bench.data.config_tables import Assembly
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.trajectory import NEAREST_STEEL, Trajectory
+from rebar_depth_bench.data.manifest import DatasetConfig
+from rebar_depth_bench.data.schema import NEAREST_STEEL, Assembly, Trajectory
 
 _GRID = (720, 1280)
 _IDEAL = ("ideal", 0.12)

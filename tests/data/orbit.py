@@ -26,7 +26,7 @@ from dataset_builder.scene.mesh_ply import read_mesh_ply
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.scene.raycast import RayCaster
 from rebar_depth_bench.data.codecs import decode
-from rebar_depth_bench.data.digests import file_sha256
+from rebar_depth_bench.data.files import file_sha256
 
 IMAGES = Path(__file__).parent / "orbit"
 SAMPLES = 1

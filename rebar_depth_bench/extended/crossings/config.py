@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from rebar_depth_bench.data.dataset_config import DatasetConfig
+from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.extended.crossings.evaluate import crossing_samples, view_crossings
 from rebar_depth_bench.extended.crossings.reach import Reach, reaches
 from rebar_depth_bench.extended.ground_truth import load_steel_truth

@@ -7,9 +7,8 @@ from collections.abc import Iterable, Iterator, Mapping
 import numpy as np
 from numpy import ndarray
 
-from rebar_depth_bench.data.dataset import iterate_undecoded
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.decoding import RowDecoder
+from rebar_depth_bench.data.manifest import DatasetConfig
+from rebar_depth_bench.data.rows import RowDecoder, iterate_undecoded
 from rebar_depth_bench.extended.crossings.evaluate import fitted_ties, view_crossings
 from rebar_depth_bench.extended.ground_truth import ConfigSteelTruth, has_bar_ids, load_steel_truth
 from rebar_depth_bench.extended.predictions import NATIVE, aligned_predictions

@@ -16,8 +16,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from rebar_depth_bench.data.dataset import iterate_undecoded
-from rebar_depth_bench.data.decoding import RowDecoder
+from rebar_depth_bench.data.rows import RowDecoder, iterate_undecoded
 from rebar_depth_bench.diagnosis.diagnose import PossibleMistake
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.names import config_of

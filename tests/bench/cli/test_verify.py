@@ -12,7 +12,7 @@ import pytest
 import rebar_depth_bench as rdb
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.codecs import encode_depth
-from rebar_depth_bench.data.digests import file_sha256
+from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.data.manifest import open_folder
 from tests.commands import run_in_process
 from tests.damage import change_manifest, change_rows, copy_dataset, first_shard

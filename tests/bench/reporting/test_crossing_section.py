@@ -12,7 +12,7 @@ import pytest
 from rich.console import Console
 
 import rebar_depth_bench as rdb
-from rebar_depth_bench.data.digests import file_sha256
+from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.extended.crossings.config import config_reaches
 from rebar_depth_bench.extended.evaluate import score_extended
 from rebar_depth_bench.extended.result import ExtendedResult

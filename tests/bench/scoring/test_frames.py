@@ -15,7 +15,7 @@ import pytest
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.data.bars import read_bars, write_bars
-from rebar_depth_bench.data.digests import file_sha256
+from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.extended.result import ExtendedResult
 from rebar_depth_bench.reporting.comparison_tables import comparison_csv
 from rebar_depth_bench.reporting.extended_tables import extended_csv

@@ -17,7 +17,7 @@ from scipy.ndimage import binary_erosion
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars, write_bars
-from rebar_depth_bench.data.digests import file_sha256
+from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.scoring.bootstrap import end_percents, resample_scenes
 from rebar_depth_bench.scoring.comparison import compare

@@ -1,0 +1,398 @@
+"""Schema of a dataset: columns of its rows, and entries of its manifest on scenes, cameras, views and sources."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Any
+
+import pyarrow as pa
+from pydantic import ConfigDict, Field, Strict, StringConstraints, ValidationInfo, field_validator, model_validator
+
+from rebar_depth_bench.errors import DatasetError, escape_text
+from rebar_depth_bench.geometry.aruco_board import BoardSpec
+from rebar_depth_bench.names import NAME_LETTERS, NAME_PATTERN, PATH_PATTERN, SPLITS, VIEW_ID_PATTERN
+from rebar_depth_bench.validation import (
+    Expected,
+    StrictModel,
+    Triple,
+    check_unique,
+    field_error,
+    number,
+    one_of,
+    short_repr,
+    text,
+    three_numbers,
+    whole_number,
+)
+
+if TYPE_CHECKING:
+    from datasets import Features
+
+
+EYES = ("left", "right")
+COLUMNS = (
+    "view_id",
+    "scene",
+    *(f"{eye}_{kind}" for kind in ("rgb", "depth", "mask", "bars") for eye in EYES),
+    "left_preview",
+    *(f"{eye}_{kind}" for kind in ("K", "distortion", "cam_from_world") for eye in EYES),
+    "baseline_m",
+)
+"""Names of the columns, in order."""
+OPTIONAL_COLUMNS = (
+    *("left_rgb", "left_mask", "left_bars"),
+    *(name for name in COLUMNS if name.startswith("right_") or name == "baseline_m"),
+)
+"""Columns that may be null in every row of a config that was imported; K, distortion and pose are NaN then."""
+
+
+def features() -> Features:
+    """Return the ``datasets`` features of the shards' rows, in column order."""
+    from datasets import Features, Image  # Takes a second to import, which scoring does not need.
+
+    stored = Features.from_arrow_schema(ROW_SCHEMA)
+    return Features(
+        {name: Image() if ROW_SCHEMA.field(name).type == _IMAGE_CELL else stored[name] for name in COLUMNS}
+    )
+
+
+COLUMN_DESCRIPTIONS: dict[str, str] = {
+    "view_id": "`<config>/<0000>`: the view's index in its full protocol, also when a subset is built; "
+    "`<config>/<split>-<scene>-<0000>` in configs of several scenes",
+    "scene": "name of the scene, as in `bars.parquet` and `meshes/`",
+    "rgb": "lossless 8-bit colour, H x W, WebP; null in every row of a config built without colour",
+    "depth": "lossless float32 planar depth along the optical axis, metres, 0.0 where there is no surface; "
+    'TIFF, which `Image(mode="F")` of `datasets` reads too',
+    "mask": "1-bit: steel, rim included",
+    "bars": "16-bit: the bar's id as in `bars.parquet`, 0 where no steel",
+    "preview": "8-bit colour-mapped depth, for people and the Hub viewer",
+    "K": "3 x 3 pinhole matrix, pixels; pixel centres at integer coordinates",
+    "distortion": "k1 k2 p1 p2 k3 (OpenCV), zeros where the grid has none",
+    "cam_from_world": "4 x 4 rigid pose: `x_cam = cam_from_world @ x_world`; OpenCV axes, metres",
+    "baseline_m": "metres between the two camera centres; along the left one's x axis except on a raw grid",
+}
+"""Description of each column, by column kind (see ``column_kind``); shown in the dataset card."""
+
+
+def column_kind(name: str) -> str:
+    """Return the kind of a column: its name without the prefix ``left_`` or ``right_``."""
+    eye, _, kind = name.partition("_")
+    return kind if eye in EYES else name
+
+
+_IMAGE_CELL = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+_ARROW_TYPES: Mapping[str, pa.DataType] = {
+    **dict.fromkeys(("view_id", "scene"), pa.string()),
+    **dict.fromkeys(("rgb", "mask", "bars", "preview"), _IMAGE_CELL),
+    "depth": pa.binary(),
+    "K": pa.list_(pa.list_(pa.float64(), 3), 3),
+    "distortion": pa.list_(pa.float64(), 5),
+    "cam_from_world": pa.list_(pa.list_(pa.float64(), 4), 4),
+    "baseline_m": pa.float64(),
+}
+ROW_SCHEMA = pa.schema([(name, _ARROW_TYPES[column_kind(name)]) for name in COLUMNS])
+"""Arrow schema of ``features``, without its metadata."""
+
+
+def validated_columns(columns: Sequence[str] | None) -> tuple[str, ...]:
+    """Return the names of columns as a tuple, all of them for None. Raises ``DatasetError`` for unknown names."""
+    if columns is None:
+        return COLUMNS
+    if isinstance(columns, str):
+        raise DatasetError(f"columns is {columns!r}, expected a list of column names")
+    unknown = [name for name in columns if name not in COLUMNS]
+    if unknown:
+        raise DatasetError(f"no column {', '.join(map(repr, unknown))}, expected some of {', '.join(COLUMNS)}")
+    return tuple(columns)
+
+
+class ManifestTable(StrictModel):
+    """Base class of the objects that may contain further keys, which are ignored."""
+
+    model_config = ConfigDict(extra="ignore")
+
+
+CENTRE, NEAREST_STEEL = "centre", "nearest steel"
+"""Values of ``Trajectory.distance_to``."""
+SURVEY = "survey"
+"""Kind of the trajectories that are a ``Survey``."""
+RANDOM_VIEWS = "random views"
+"""Kind of the trajectories that are ``RandomViews``."""
+_SHELLS = ("dome", "ring", "sweep")
+"""Kinds of the trajectories that are a ``Trajectory``."""
+_Views = Annotated[int, whole_number(1, 1_000_000)]
+_Distances = Annotated[tuple[Annotated[float, number(0)], ...], Strict(False), Field(min_length=1)]
+_Point = Annotated[Triple, three_numbers(-1e9, 1e9, "three numbers, [x, y, z]")]
+_Station = Annotated[
+    tuple[_Point, _Point], Strict(False), Expected("two points, of the left camera and of the steel aimed at")
+]
+
+
+class Trajectory(ManifestTable):
+    """Cameras of a config: shells, rings of a shell, and azimuths of a ring.
+
+    ``radii_m`` are distances from the left camera to ``distance_to``: the centre of the assembly, or the nearest
+    point of any bar's surface. A ring has ``radius_m`` instead.
+    """
+
+    kind: Annotated[str, one_of(*_SHELLS)] = "dome"
+    radii_m: _Distances = (1.0,)
+    radius_m: Annotated[float, number(0)] | None = None
+    elevations_deg: Annotated[tuple[float, ...], Strict(False), Field(min_length=1)] = (0.0,)
+    azimuths: _Views
+    distance_to: Annotated[str, one_of(CENTRE, NEAREST_STEEL)] = CENTRE
+
+    @property
+    def distances_m(self) -> tuple[float, ...]:
+        """Distances of the shells, metres."""
+        return self.radii_m if self.radius_m is None else (self.radius_m,)
+
+    @property
+    def views(self) -> int:
+        """Number of views of the full trajectory."""
+        return len(self.radii_m) * len(self.elevations_deg) * self.azimuths
+
+
+class Survey(ManifestTable):
+    """Cameras of a config that stand at the ``distances_m`` from points of the steel.
+
+    ``stations`` are the centre of the left camera and the point aimed at of each view, world metres, in order.
+    """
+
+    kind: Annotated[str, one_of(SURVEY)] = SURVEY
+    distances_m: _Distances
+    views_per_distance: _Views
+    stations: Annotated[tuple[_Station, ...], Strict(False)]
+
+    @field_validator("stations")
+    @classmethod
+    def _check_stations(cls, stations: tuple[_Station, ...], info: ValidationInfo) -> tuple[_Station, ...]:
+        if {"distances_m", "views_per_distance"} <= info.data.keys():
+            views = len(info.data["distances_m"]) * info.data["views_per_distance"]
+            if len(stations) != views:
+                raise field_error(f"got {len(stations)} stations", f"{views}: one for each view", "conflict")
+        return stations
+
+    @property
+    def views(self) -> int:
+        """Number of views of the full trajectory."""
+        return len(self.stations)
+
+
+class RandomViews(ManifestTable):
+    """Cameras of a config that stand at distances between the two ``distances_m`` from points of the steel."""
+
+    kind: Annotated[str, one_of(RANDOM_VIEWS)] = RANDOM_VIEWS
+    distances_m: _Distances
+    views: _Views
+
+
+AnyTrajectory = Trajectory | Survey | RandomViews
+_BY_KIND: Mapping[str, type[AnyTrajectory]] = {
+    **dict.fromkeys(_SHELLS, Trajectory),
+    SURVEY: Survey,
+    RANDOM_VIEWS: RandomViews,
+}
+
+
+def trajectory_of(fields: Any) -> AnyTrajectory:
+    """Return the trajectory of a scene in the manifest; raise the error of a field if it is not valid."""
+    if isinstance(fields, AnyTrajectory):
+        return fields
+    kind = fields.get("kind") if isinstance(fields, Mapping) else None
+    if not isinstance(kind, str) or kind not in _BY_KIND:
+        raise field_error(f"got {short_repr(fields)}", f"a table whose kind is one of {', '.join(_BY_KIND)}")
+    return _BY_KIND[kind].model_validate(fields)
+
+
+DIGEST_PATTERN = "sha256:[0-9a-f]{64}"
+Name = Annotated[str, StringConstraints(pattern=f"^{NAME_PATTERN}$"), Expected(f"a name of {NAME_LETTERS}")]
+RelativePath = Annotated[
+    str,
+    StringConstraints(pattern=f"^{PATH_PATTERN}$"),
+    Expected(f"a path in the folder, whose parts are {NAME_LETTERS}"),
+]
+_ViewId = Annotated[str, StringConstraints(pattern=f"^{VIEW_ID_PATTERN}$")]
+# Views have no ``Expected``, which is called from pydantic: a folder has thousands.
+Sha256 = Annotated[str, StringConstraints(pattern="^[0-9a-f]{64}$")]
+Digest = Annotated[str, StringConstraints(pattern=f"^{DIGEST_PATTERN}$"), Expected("sha256: and 64 hex digits")]
+_Side = Annotated[int, whole_number(1, 16384)]
+_Length = Annotated[float, number(0, 10)]
+_Count = Annotated[int, Expected("a whole number from 0", lambda count: count >= 0)]
+_Error = Annotated[float, Expected("a number from 0 to 1e+09", lambda error: 0 <= error <= 1e9)]
+"""Error of a reference; it is 0 where a view has one scored pixel."""
+
+
+class ViewRecord(StrictModel):
+    """Manifest entry of one view.
+
+    ``left`` and ``right`` are the hex SHA-256 digests of the cameras' ground truth; ``steel_px`` and ``scored_px``
+    count steel and scored pixels. ``right`` is None in a config without depth of the right camera, ``steel_px``
+    in one without masks.
+    """
+
+    view_id: _ViewId
+    left: Sha256
+    right: Sha256 | None
+    steel_px: Annotated[int, Field(ge=0)] | None
+    scored_px: Annotated[int, Field(ge=0)]
+
+
+class ImageLight(ManifestTable):
+    """Panorama that lights a scene, by the name of its image."""
+
+    image: Annotated[str, text(200)]
+
+
+class Appearance(ManifestTable):
+    """Names of the appearance variants of a scene, and its panorama if it has one."""
+
+    variants: Annotated[tuple[Name, ...], Strict(False)] = ()
+    image_light: ImageLight | None = None
+
+
+class Assembly(ManifestTable):
+    """Steel of a scene: its kind, the file if it comes from one, and all other parameters as in the manifest."""
+
+    model_config = ConfigDict(extra="allow")
+
+    kind: Annotated[str, text(60)]
+    path: Annotated[str, text(1000)] | None = None
+    sha256: Annotated[str, text(64)] | None = None
+
+
+class Colour(ManifestTable):
+    """Samples per pixel of rendered colour, everywhere and around the steel; None in an imported config."""
+
+    samples: _Count | None = None
+    steel_samples: _Count | None = None
+
+
+class _BoardTable(StrictModel):
+    width_m: _Length
+    height_m: _Length
+    markers: Annotated[int, one_of(6, 12)]
+    marker_side_m: _Length
+    dictionary: Name
+
+
+class Imported(ManifestTable):
+    """How the data of a config were measured, if they were not rendered.
+
+    ``truth_sigma_m`` is the standard deviation of the ground truth's depth, metres, as its authors state it.
+    ``absent_columns`` are null in every row. Without ``has_poses``, the world frame of a view is its left camera.
+    """
+
+    truth_sigma_m: Annotated[float, number(1e-9, 10)]
+    absent_columns: Annotated[tuple[str, ...], Strict(False)] = ()
+    has_poses: bool = True
+    description: Annotated[str, StringConstraints(max_length=1000)] = ""
+    source: Annotated[str, StringConstraints(max_length=1000)] = ""
+    licence: Annotated[str, StringConstraints(max_length=200)] = ""
+
+    @field_validator("absent_columns")
+    @classmethod
+    def _check_absent(cls, names: tuple[str, ...]) -> tuple[str, ...]:
+        absent = set(names)
+        if unknown := sorted(absent - set(OPTIONAL_COLUMNS)):
+            raise field_error(f"got {escape_text(unknown[0])}", f"some of {', '.join(OPTIONAL_COLUMNS)}")
+        for needed, columns in _NEEDED.items():
+            if needed in absent and (present := sorted(columns - absent)):
+                found = f"{needed} is absent and {present[0]} is not"
+                raise field_error(found, f"{present[0]} to be absent as well", "conflict")
+        return names
+
+
+_NEEDED = {
+    "left_mask": {"left_bars"},
+    "right_mask": {"right_bars"},
+    "right_depth": {"right_mask", "right_bars"},
+    "right_K": {name for name in OPTIONAL_COLUMNS if name.startswith("right_") or name == "baseline_m"},
+}
+"""Columns that cannot be present without the column that is the key."""
+
+
+class SceneRig(ManifestTable):
+    """Optics of a scene: pixel grid, baseline in metres, and the camera by its name if it has one."""
+
+    grid: Annotated[str, one_of("ideal", "raw", "rectified")]
+    baseline_m: _Length
+    camera: Annotated[str, StringConstraints(max_length=100)] = ""
+
+
+class Scene(ManifestTable):
+    """Scene of a config, with its cameras, its mesh and its shards, which hold the rows of no other scene.
+
+    ``board`` is the ArUco board under the assembly, or None; ``protocol_views`` is the number of views of the full
+    trajectory; ``aim_point_m`` is the point that its cameras aim at, world metres, if they share one; ``bytes`` is
+    the size of the shards; ``key`` is the digest of all parameters. ``family`` is the kind of cage of a generated
+    scene, otherwise None. ``assembly``, ``protocol``, ``rig`` and ``mesh`` are None in a config that was imported.
+    ``entry`` is the scene as it was written, with all parameters of the build.
+    """
+
+    name: Name
+    split: Annotated[str, one_of(*SPLITS)]
+    family: Name | None = None
+    assembly: Assembly | None = None
+    board: BoardSpec | None
+    environment: Annotated[str, StringConstraints(max_length=60)] = ""
+    appearance: Appearance = Appearance()
+    protocol: AnyTrajectory | None = None
+    protocol_views: Annotated[int, whole_number(1, 1_000_000)]
+    rig: SceneRig | None = None
+    aim_point_m: Annotated[Triple, three_numbers(-1e9, 1e9, "three numbers, [x, y, z]")] | None = None
+    key: Annotated[str, StringConstraints(max_length=200)]
+    mesh: RelativePath | None
+    shards: Annotated[tuple[RelativePath, ...], Strict(False)]
+    bytes: _Count
+    entry: dict[str, Any] = Field(repr=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _keep_entry(cls, values: Any) -> Any:
+        return {**values, "entry": values} if isinstance(values, Mapping) else values
+
+    @field_validator("board", mode="before")
+    @classmethod
+    def _make_board(cls, fields: Any) -> BoardSpec | None:
+        return None if fields is None else BoardSpec(**_BoardTable.model_validate(fields).model_dump())
+
+    @field_validator("protocol", mode="before")
+    @classmethod
+    def _make_protocol(cls, fields: Any) -> AnyTrajectory | None:
+        return None if fields is None else trajectory_of(fields)
+
+    @field_validator("protocol_views")
+    @classmethod
+    def _check_protocol_views(cls, protocol_views: int, info: ValidationInfo) -> int:
+        trajectory = info.data.get("protocol")
+        if trajectory is not None and protocol_views != trajectory.views:
+            raise field_error(f"got {protocol_views}", f"the trajectory's {trajectory.views} views", "conflict")
+        return protocol_views
+
+    @field_validator("shards")
+    @classmethod
+    def _check_shards(cls, shards: tuple[str, ...]) -> tuple[str, ...]:
+        check_unique(shards, "shard")
+        return shards
+
+
+class Rig(ManifestTable):
+    """Image size of a stereo rig, pixels."""
+
+    width: _Side
+    height: _Side
+
+
+class ReferenceRecord(ManifestTable):
+    """AbsRel and RMSE (cm) of a reference, means over the views; None where undefined."""
+
+    abs_rel: _Error | None
+    rmse_cm: _Error | None
+
+
+class References(ManifestTable):
+    """Reference errors of a config, as in the tables of results."""
+
+    constant: ReferenceRecord
+    one_pixel: ReferenceRecord

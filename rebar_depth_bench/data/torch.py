@@ -1,0 +1,277 @@
+"""Batches of tensors for training: a PyTorch loader of dataset rows, and geometric augmentation of a row."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+from zlib import crc32
+
+import numpy as np
+import PIL.Image
+from datasets import Dataset, Image, IterableDataset, Value
+
+from rebar_depth_bench.data.codecs import PICTURE_KINDS
+from rebar_depth_bench.data.loading import STORED_MODES
+from rebar_depth_bench.data.rows import is_absent
+from rebar_depth_bench.data.schema import EYES, column_kind
+from rebar_depth_bench.errors import DatasetError, InputError, MethodError, Problem
+
+Row = Mapping[str, Any]
+
+IMAGE_KINDS = ("rgb", "depth", "mask", "bars")
+"""Kinds of columns that hold an image of a view, H x W or H x W x 3."""
+
+_MIRROR_X = np.diag([-1.0, 1.0, 1.0, 1.0])
+FLIP_PROBABILITY = 0.5
+
+
+@dataclass(frozen=True)
+class Augmentation:
+    """Random changes of rows: crops of ``crop`` (height, width) pixels, None for none, and flips of half the rows.
+
+    They depend on ``seed``, the epoch and the view id only, not on the order of rows or the number of workers.
+    """
+
+    crop: tuple[int, int] | None = None
+    flip: bool = False
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        """Raise ``InputError`` for a crop that is empty and for a seed below 0."""
+        problems = []
+        if self.crop is not None and (len(self.crop) != 2 or min(self.crop) < 1):
+            problems.append(
+                Problem("invalid", "crop", f"got {self.crop}", "height and width in pixels, 1 or more")
+            )
+        if self.seed < 0:
+            problems.append(Problem("invalid", "seed", f"got {self.seed}", "0 or more"))
+        if problems:
+            raise InputError.from_problems("augmentation", problems)
+
+    def __call__(self, row: Row, epoch: int) -> Row:
+        """Return a row with ``view_id`` as changed in an epoch.
+
+        Raises ``InputError`` if the crop is larger than the image, and as ``flip_row``.
+        """
+        rng = np.random.default_rng([self.seed, epoch, crc32(row["view_id"].encode())])
+        if self.crop is not None:
+            row = crop_row(row, self.crop, rng)
+        is_flipped = self.flip and rng.random() < FLIP_PROBABILITY
+        return flip_row(row) if is_flipped else row
+
+
+def crop_row(row: Row, size: tuple[int, int], rng: np.random.Generator) -> Row:
+    """Return a row with all images cropped to (height, width) at one random place, the same in both eyes.
+
+    The principal points are relative to the crop: rectified pairs stay rectified, with the same disparities.
+    Raises ``InputError`` if the crop is larger than the image.
+    """
+    height, width = next(row[name].shape[:2] for name in row if _is_image(row, name))
+    if size[0] > height or size[1] > width:
+        found, expected = f"got {size[0]} x {size[1]} (height x width)", f"at most {height} x {width}, the image"
+        raise InputError.from_problems(f"view {row['view_id']}", [Problem("invalid", "crop", found, expected)])
+    top, left = (int(rng.integers(whole - part + 1)) for whole, part in zip((height, width), size, strict=True))
+    offset = np.array([[0.0, 0.0, left], [0.0, 0.0, top], [0.0, 0.0, 0.0]])
+    cropped = dict(row)
+    for name in row:
+        if _is_image(row, name):
+            cropped[name] = row[name][top : top + size[0], left : left + size[1]]
+        elif column_kind(name) == "K" and row[name] is not None:
+            cropped[name] = row[name] - offset
+    return cropped
+
+
+def flip_row(row: Row) -> Row:
+    """Return a row with its images mirrored, and its eyes exchanged if it has columns of both.
+
+    Raises ``InputError`` if it has an image of one eye only that the row should have of both.
+    """
+    eyes = [eye for eye in EYES if any(name.startswith(f"{eye}_") for name in row)]
+    width = next(row[name].shape[1] for name in row if _is_image(row, name))
+    flipped = dict(row)
+    for name, value in row.items():
+        eye, _, kind = name.partition("_")
+        if eye not in EYES:
+            continue
+        source = row[f"{EYES[1 - EYES.index(eye)]}_{kind}"] if len(eyes) == len(EYES) else value
+        if (source is None) != (value is None):
+            problem = Problem("missing", kind, "the view has it for one eye only", "both eyes, to exchange them")
+            raise InputError.from_problems(f"flip of view {row['view_id']}", [problem])
+        flipped[name] = None if source is None else _mirrored(source, kind, width)
+    return flipped
+
+
+def _mirrored(value: Any, kind: str, width: int) -> Any:
+    """Return the value of a column of one eye for the mirrored image of ``width`` pixels."""
+    if kind in IMAGE_KINDS:
+        return value[:, ::-1]
+    if kind == "cam_from_world":
+        return _MIRROR_X @ value
+    if kind == "K":
+        K = np.array(value)
+        K[0, 2] = width - 1 - K[0, 2]
+        return K
+    raise ValueError(f"columns of kind {kind!r} cannot be mirrored, expected images, K or cam_from_world")
+
+
+def _is_image(row: Row, name: str) -> bool:
+    return column_kind(name) in IMAGE_KINDS and row[name] is not None
+
+
+try:
+    import torch
+    from torch.utils.data import DataLoader
+    from torch.utils.data import IterableDataset as TorchIterableDataset
+except ImportError as error:
+    raise MethodError(f"torch_loader needs torch ({error}): pip install 'rebar-depth-bench[torch]'") from None
+
+Batch = dict[str, Any]
+
+_LEFT = {
+    "rgb": "left_rgb",
+    "depth": "left_depth",
+    "mask": "left_mask",
+    "K": "left_K",
+    "poses": "left_cam_from_world",
+}
+_NUMBER_KINDS = ("K", "cam_from_world", "baseline_m")
+SHUFFLE_BUFFER = 32
+"""Views of a streamed dataset among which the next one is drawn."""
+_RIGHT = {f"right_{key}": column.replace("left", "right") for key, column in _LEFT.items()}
+
+
+def torch_loader(
+    ds: Dataset | IterableDataset,
+    batch_size: int = 1,
+    num_workers: int = 0,
+    *,
+    shuffle: bool = False,
+    stereo: bool = False,
+    crop: tuple[int, int] | None = None,
+    flip: bool = False,
+    seed: int = 0,
+) -> DataLoader[Batch]:
+    """Return a ``DataLoader`` over a dataset returned by ``load``, streaming or not, or by ``load_dataset``.
+
+    A batch is a dict: ``rgb`` uint8 B x 3 x H x W, ``depth`` float32 B x 1 x H x W (planar, metres, 0 where there
+    is no surface), ``mask`` bool B x 1 x H x W, ``K`` float64 B x 3 x 3 (pixels), ``poses`` float64 B x 4 x 4
+    (``cam_from_world``), all of the left view, and ``view_id``, a list of str. With ``stereo`` the batch also has
+    the same keys of the right view, prefixed ``right_``, and ``baseline_m`` float64 B. Batches of a config without
+    colour lack ``rgb`` and ``right_rgb``, and those of an imported config all that it lacks.
+
+    Columns that a batch does not need are not decoded. The format of ``ds`` makes no difference, but a transform
+    is applied. A dataset that only ``datasets`` has read is not compared with the manifest.
+
+    For training, ``shuffle`` changes the order in every epoch. A streamed dataset is shuffled by shard, and then
+    in a buffer of 32 views (``SHUFFLE_BUFFER``). ``crop`` (height, width) takes a random part of each view, and
+    ``flip`` mirrors half of the views. Depth, masks, K and poses stay consistent: a flipped stereo pair has its
+    eyes exchanged, and the pose of a flipped view contains the reflection. The order of shuffled views depends on
+    ``seed`` and the epoch, and for a streamed dataset on the number of workers; crops and flips depend on
+    ``seed``, the epoch and the view id.
+
+    Importing this module without torch raises ``MethodError``. Raises ``InputError`` for an invalid crop or seed,
+    and ``DatasetError`` if ``ds`` lacks columns.
+    """
+    keys = {**_LEFT, **_RIGHT, "baseline_m": "baseline_m"} if stereo else _LEFT
+    rows = _pictured(ds, ["view_id", *keys.values()])
+    collate = _Collate(keys, Augmentation(crop, flip, seed))
+    if not isinstance(rows, IterableDataset):
+        return _EpochLoader(rows, batch_size, shuffle, collate, num_workers)
+    shuffled = rows.shuffle(seed, buffer_size=SHUFFLE_BUFFER) if shuffle else rows
+    return _EpochLoader(_StreamedRows(shuffled), batch_size, False, collate, num_workers)
+
+
+def _pictured(ds: Dataset | IterableDataset, columns: Sequence[str]) -> Dataset | IterableDataset:
+    """Return ``columns`` with images decoded to pictures, or as the transform of ``ds`` decodes them."""
+    if not isinstance(ds, (Dataset, IterableDataset)):
+        raise DatasetError(f"got a {type(ds).__name__}, expected one split, as rdb.load(ROOT, CONFIG) returns it")
+    missing = [name for name in columns if ds.column_names is not None and name not in ds.column_names]
+    if missing:
+        found = f"the dataset lacks the columns {', '.join(missing)}"
+        raise DatasetError(f"{found}, expected those that rdb.load(ROOT, CONFIG) returns")
+    rows = ds.select_columns(list(columns))
+    for name in columns:
+        if rows.features is not None and rows.features[name] == Value("binary"):
+            rows = rows.cast_column(name, Image(mode=STORED_MODES[column_kind(name)]))
+    has_transform = isinstance(rows, Dataset) and rows.format["type"] == "custom"
+    return rows if has_transform else rows.with_format(None)
+
+
+class _EpochLoader(DataLoader[Any]):
+    """Data loader that counts its iterations, on which the order, crops and flips depend."""
+
+    def __init__(
+        self, source: Dataset | _StreamedRows, batch_size: int, shuffle: bool, collate: _Collate, num_workers: int
+    ) -> None:
+        super().__init__(
+            source,
+            batch_size=batch_size,
+            shuffle=shuffle,
+            collate_fn=collate,
+            num_workers=num_workers,
+            generator=torch.Generator(),
+        )
+        self._collate = collate
+        self._rows = source.rows if isinstance(source, _StreamedRows) else None
+
+    def __iter__(self) -> Any:
+        self._collate.epoch += 1
+        self.generator.manual_seed(self._collate.augmentation.seed + self._collate.epoch)
+        if self._rows is not None:
+            self._rows.set_epoch(self._collate.epoch)
+        return super().__iter__()
+
+
+class _Collate:
+    """Collate function that decodes and changes rows and stacks them to tensors; it is pickled for workers."""
+
+    def __init__(self, keys: Mapping[str, str], augmentation: Augmentation) -> None:
+        self._keys = keys
+        self.augmentation = augmentation
+        self.epoch = -1
+
+    def __call__(self, rows: Sequence[Mapping[str, Any]]) -> Batch:
+        rows = [{name: _array(column_kind(name), cell) for name, cell in row.items()} for row in rows]
+        rows = [self.augmentation(row, self.epoch) for row in rows]
+        batch: Batch = {
+            key: _tensor(key, np.stack([row[column] for row in rows]))
+            for key, column in self._keys.items()
+            if rows[0][column] is not None
+        }
+        batch["view_id"] = [row["view_id"] for row in rows]
+        return batch
+
+
+def _array(kind: str, cell: Any) -> Any:
+    """Convert a cell with an image, a matrix or a number to an array, None for an absent one, and keep others."""
+    if is_absent(cell):
+        return None
+    if kind in _NUMBER_KINDS:
+        return np.asarray(cell, dtype=np.float64)
+    if kind not in PICTURE_KINDS:
+        return cell
+    is_colour = kind == "rgb" and isinstance(cell, PIL.Image.Image)
+    return np.asarray(cell.convert("RGB") if is_colour else cell, dtype=PICTURE_KINDS[kind].dtype)
+
+
+def _tensor(key: str, stacked: np.ndarray[Any, Any]) -> torch.Tensor:
+    """Convert a stacked array to a tensor, with a channel axis for depth and masks.
+
+    Colour is permuted to channels first as a view, without a copy (memory stays channels last).
+    """
+    kind = key.removeprefix("right_")
+    tensor = torch.from_numpy(stacked)
+    if kind == "rgb":
+        return tensor.permute(0, 3, 1, 2)
+    return tensor[:, None] if kind in ("depth", "mask") else tensor
+
+
+class _StreamedRows(TorchIterableDataset[Mapping[str, Any]]):
+    """Torch iterable over a streamed dataset; ``datasets`` assigns separate shards to each worker."""
+
+    def __init__(self, rows: IterableDataset) -> None:
+        self.rows = rows
+
+    def __iter__(self) -> Iterator[Mapping[str, Any]]:
+        return iter(self.rows)
