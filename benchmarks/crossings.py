@@ -38,9 +38,8 @@ from rebar_depth_bench.detections.score import score_crossings
 from rebar_depth_bench.extended.evaluate import score_extended
 from rebar_depth_bench.extended.predictions import NATIVE
 from rebar_depth_bench.names import config_of
-from rebar_depth_bench.scoring.evaluation import open_evaluation
-from rebar_depth_bench.scoring.rounding import rounded
-from rebar_depth_bench.scoring.score import score_evaluation
+from rebar_depth_bench.scoring.columns import rounded
+from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
 from rebar_depth_bench.submission import SubmissionReader, open_submission
 
 OPENING_SHARE = 0.06

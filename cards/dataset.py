@@ -26,7 +26,7 @@ from rebar_depth_bench.data.schema import (
     features,
 )
 from rebar_depth_bench.names import TEST_SPLIT
-from rebar_depth_bench.reporting.formatting import DASH
+from rebar_depth_bench.scoring.columns import DASH
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 
 if TYPE_CHECKING:

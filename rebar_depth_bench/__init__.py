@@ -19,9 +19,8 @@ if TYPE_CHECKING:
         RebarDepthError,
         SubmissionError,
     )
-    from rebar_depth_bench.scoring.result import Result, Table
-    from rebar_depth_bench.scoring.score import score
-    from rebar_depth_bench.scoring.view_score import ViewScore
+    from rebar_depth_bench.scoring.evaluation import score
+    from rebar_depth_bench.scoring.result import Result, Table, ViewScore
     from rebar_depth_bench.submission import SubmissionWriter
 
 __all__ = [
@@ -47,7 +46,7 @@ _MODULE_BY_NAME = {
     "bars": "data.bars",
     "crossings": "bar_crossings.table",
     "load": "data.loading",
-    "score": "scoring.score",
+    "score": "scoring.evaluation",
     "torch_loader": "data.torch_loader",
     "SubmissionWriter": "submission",
     "Result": "scoring.result",

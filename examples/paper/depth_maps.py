@@ -18,7 +18,7 @@ from rebar_depth_bench.errors import EntryError, InputError, SubmissionError, pr
 from rebar_depth_bench.names import config_of, split_of
 from rebar_depth_bench.parallel import silent
 from rebar_depth_bench.reading import FileSource
-from rebar_depth_bench.scoring.ground_truth import verified_views
+from rebar_depth_bench.scoring.truth import verified_views
 from rebar_depth_bench.submission import ExpectedViews, open_submission
 from rebar_depth_bench.submission.declaration import METADATA_NAME, parse_metadata
 from rebar_depth_bench.submission.entries import FORMATS

@@ -28,13 +28,19 @@ from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.extended.crossings.config import config_reaches
 from rebar_depth_bench.extended.ground_truth import has_bar_ids
 from rebar_depth_bench.reporting.crossing_texts import reach_sentence
-from rebar_depth_bench.scoring.bootstrap import INTERVALS, Resampling, interval, resample
-from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation
-from rebar_depth_bench.scoring.ground_truth import config_truth
+from rebar_depth_bench.scoring.bootstrap import (
+    INTERVALS,
+    Resampling,
+    interval,
+    protocol_indices,
+    resample,
+    resample_views,
+)
+from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation, score_evaluation
 from rebar_depth_bench.scoring.metrics import mean
-from rebar_depth_bench.scoring.score import score_evaluation
+from rebar_depth_bench.scoring.result import ViewScore
 from rebar_depth_bench.scoring.single_bar import mean_single_bar, single_bar_scores
-from rebar_depth_bench.scoring.view_score import ViewScore, protocol_indices, resample_views
+from rebar_depth_bench.scoring.truth import config_truth
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -16,7 +16,7 @@ from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.output_options import add_output_file, check_outputs, prints_table
 from rebar_depth_bench.outputs import output_file, write_output
 from rebar_depth_bench.reporting.tables import frame_csv
-from rebar_depth_bench.scoring.rounding import rounded
+from rebar_depth_bench.scoring.columns import rounded
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

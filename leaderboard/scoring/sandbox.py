@@ -18,7 +18,7 @@ from leaderboard.scoring.isolation import UnavailableError
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import DatasetError, Problem, RebarDepthError, SubmissionError
 from rebar_depth_bench.names import TEST_SPLIT, config_of, split_of
-from rebar_depth_bench.scoring.view_score import ViewScore
+from rebar_depth_bench.scoring.result import ViewScore
 from rebar_depth_bench.submission import SubmissionMeta, open_submission
 
 if TYPE_CHECKING:
@@ -93,8 +93,7 @@ def score(archive: Path, data: str, dataset_digest: str, error_maps: int, hidden
     # Half a second to import, which a check does not need.
     from rebar_depth_bench.diagnosis.diagnose import diagnose
     from rebar_depth_bench.scoring.disclosure import check_view_coverage
-    from rebar_depth_bench.scoring.evaluation import open_evaluation
-    from rebar_depth_bench.scoring.score import score_evaluation
+    from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
 
     digest = open_folder(data).digest
     if digest != dataset_digest:  # Checked first: on another dataset, the archive could seem invalid.

@@ -18,9 +18,8 @@ from rebar_depth_bench.reporting.extended_tables import extended_csv, print_exte
 from rebar_depth_bench.reporting.html.page import write_report
 from rebar_depth_bench.reporting.html.view_browser import VIEWS_SHOWN
 from rebar_depth_bench.reporting.tables import groups_csv, print_table, result_csv
-from rebar_depth_bench.scoring.evaluation import open_evaluation
+from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
 from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.scoring.score import score_evaluation
 
 SUMMARY = "score a submission archive, native and scaled"
 

@@ -16,7 +16,7 @@ from rebar_depth_bench.detections.average_precision import RankedDetections
 from rebar_depth_bench.extended.measures import percentile
 from rebar_depth_bench.extended.result import CrossingsSource
 from rebar_depth_bench.scoring.bootstrap import INTERVALS, Interval, Resampling, interval
-from rebar_depth_bench.scoring.rounding import rounded, rounded_interval
+from rebar_depth_bench.scoring.columns import rounded, rounded_interval
 from rebar_depth_bench.submission.declaration import SubmissionMeta
 from rebar_depth_bench.version import software_version
 

@@ -29,7 +29,7 @@ from rebar_depth_bench.extended.steel_truth import SteelTruth
 from rebar_depth_bench.geometry.cameras import transform
 from rebar_depth_bench.names import TEST_SPLIT, config_of, split_of
 from rebar_depth_bench.parallel import Progress, map_with_progress, silent
-from rebar_depth_bench.scoring.view_score import resample_views
+from rebar_depth_bench.scoring.bootstrap import resample_views
 
 
 def score_crossings(

@@ -38,9 +38,9 @@ from rebar_depth_bench.extended.result import (
 )
 from rebar_depth_bench.extended.steel_truth import SteelTruth
 from rebar_depth_bench.parallel import Progress, map_with_progress, silent
+from rebar_depth_bench.scoring.bootstrap import resample_views
 from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.scoring.view_score import resample_views
 from rebar_depth_bench.submission import SubmissionReader
 
 Predictions = Sequence[Float64[ndarray, " n"]]

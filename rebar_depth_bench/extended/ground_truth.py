@@ -28,8 +28,8 @@ from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL
 from rebar_depth_bench.extended.steel_truth import JudgedCrossings, SteelTruth
 from rebar_depth_bench.geometry.cameras import Camera, pixel_rays
 from rebar_depth_bench.parallel import Progress, silent
-from rebar_depth_bench.scoring.ground_truth import are_pixels_inside, cache_inputs, scored_counts, verified_views
 from rebar_depth_bench.scoring.protocol import single_bar_pixels
+from rebar_depth_bench.scoring.truth import are_pixels_inside, cache_inputs, scored_counts, verified_views
 
 _DTYPES: Mapping[str, type] = {
     "index": np.uint32,

@@ -9,25 +9,23 @@ added to results is hidden unless it is added here, too.
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Sequence
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, Strict
 
 from rebar_depth_bench.errors import InputError, Problem, SubmissionError
 from rebar_depth_bench.reading import parse_json
 from rebar_depth_bench.scoring.protocol import PROTOCOL
-from rebar_depth_bench.scoring.result_io import (
+from rebar_depth_bench.scoring.result import (
     LIMITED,
-    DatasetJson,
+    DatasetIdentity,
     Name,
-    SoftwareJson,
-    StoredModel,
-    SubmissionJson,
+    SoftwareIdentity,
+    SubmissionIdentity,
+    ViewScore,
 )
-from rebar_depth_bench.scoring.view_score import ViewScore
-from rebar_depth_bench.validation import one_of, validate_table
+from rebar_depth_bench.validation import StrictModel, one_of, validate_table
 
 DECIMALS = 3
 """Decimals of the disclosed numbers."""
@@ -43,17 +41,10 @@ def disclosed_number(value: float) -> float:
     return round(value, DECIMALS)
 
 
-def smallest_disclosed_alike(value: float) -> float:
-    """Return the smallest number that is disclosed as the same number as ``value``."""
-    shown = disclosed_number(value)
-    bound = round(shown - 0.5 * 10**-DECIMALS, DECIMALS + 1)
-    return bound if disclosed_number(bound) == shown else math.nextafter(bound, math.inf)
+_Number = Annotated[float, Strict(), Field(ge=0, le=1), AfterValidator(disclosed_number)] | None
 
 
-_Number = Annotated[float, Field(ge=0, le=1), AfterValidator(disclosed_number)] | None
-
-
-class DisclosedTable(StoredModel):
+class DisclosedTable(StrictModel, extra="ignore"):
     """Disclosed part of the table of a config; ``rank_error`` is None without scored views."""
 
     coverage: _Number
@@ -61,26 +52,21 @@ class DisclosedTable(StoredModel):
     rank_error: _Number
 
 
-class DisclosedResult(StoredModel):
+class DisclosedResult(StrictModel, extra="ignore", strict=False):
     """Disclosed part of a result; ``hidden_truth`` distinguishes it from a whole result."""
 
-    protocol: Annotated[str, one_of(PROTOCOL)]
+    protocol: Annotated[str, Strict(), one_of(PROTOCOL)]
     hidden_truth: Literal[True] = True
-    dataset: DatasetJson
-    submission: SubmissionJson
-    software: SoftwareJson
+    dataset: DatasetIdentity
+    submission: SubmissionIdentity
+    software: SoftwareIdentity
     tables: Annotated[dict[Name, DisclosedTable], LIMITED]
-
-    @property
-    def submission_sha256(self) -> str:
-        """SHA-256 of the archive in hexadecimal."""
-        return self.submission.sha256
 
 
 def disclosed_json(result: bytes) -> bytes:
     """Return the JSON of the disclosed part of a result; of a result that cannot be read, it has no numbers."""
     content = validate_table(DisclosedResult, json.loads(result), [])
-    disclosed = {"hidden_truth": True} if content is None else content.model_dump()
+    disclosed = {"hidden_truth": True} if content is None else content.model_dump(mode="json")
     return (json.dumps(disclosed, indent=1, ensure_ascii=False) + "\n").encode()
 
 

@@ -20,7 +20,9 @@ from leaderboard.web.pages.static import static_path
 from rebar_depth_bench.errors import MAX_PROBLEMS_SHOWN, Problem, printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.html.assets import environment
+from rebar_depth_bench.reporting.html.rows import METRIC_HEADS
 from rebar_depth_bench.reporting.published import load_published
+from rebar_depth_bench.scoring.columns import number
 from rebar_depth_bench.scoring.disclosure import COVERAGE_RULE
 from rebar_depth_bench.scoring.protocol import PROTOCOL, WITHIN_MM
 from rebar_depth_bench.submission.declaration import INPUTS, is_http_url
@@ -33,7 +35,7 @@ def make_templates() -> Environment:
     templates.filters.update(
         clean=clean_text,
         link=link_html,
-        number=formatting.number,
+        number=number,
         printable=printable,
         scripts=confused_scripts,
         size=format_size,
@@ -41,7 +43,7 @@ def make_templates() -> Environment:
     )
     templates.globals.update(
         protocol=PROTOCOL,
-        metric_heads=formatting.METRIC_HEADS,
+        metric_heads=METRIC_HEADS,
         tolerances=WITHIN_MM,
         dash_note=formatting.DASH_NOTE,
         reference_note=formatting.REFERENCE_NOTE,

@@ -14,8 +14,8 @@ from rebar_depth_bench.extended.measures import Samples
 from rebar_depth_bench.extended.predictions import NATIVE, SCALED, aligned_predictions
 from rebar_depth_bench.extended.result import CrossingsSource
 from rebar_depth_bench.parallel import Progress, map_with_progress, silent
+from rebar_depth_bench.scoring.bootstrap import resample_views
 from rebar_depth_bench.scoring.evaluation import Evaluation
-from rebar_depth_bench.scoring.view_score import resample_views
 
 
 @dataclass(frozen=True)

@@ -14,9 +14,8 @@ from rebar_depth_bench.reporting.published import (
     published_rows,
 )
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE
-from rebar_depth_bench.scoring.published_match import PublishedMatch
 from rebar_depth_bench.scoring.reference import Reference
-from rebar_depth_bench.scoring.result import Result, Table
+from rebar_depth_bench.scoring.result import PublishedMatch, Result, Table
 
 ANCHORED_MARK = "†"
 

@@ -94,7 +94,7 @@ def _entries(content: FigureContent) -> list[_Entry]:
     if any(panel.constants for panel in content.panels):
         sample = Path(flat, INK, 0.9, dash=CONSTANT_DASH)
         entries.append((f"reference: {CONSTANT_TITLE} (for scaled)", (sample,)))
-    if any(panel.reference.one_pixel_abs_rel is not None for panel in content.panels):
+    if any(panel.reference.one_pixel.abs_rel is not None for panel in content.panels):
         sample = Path(upright, INK, 0.9, dash=ONE_PIXEL_DASH)
         entries.append((f"reference: {ONE_PIXEL_TITLE} (for native)", (sample,)))
     entries.append(("native = scaled", (Path(flat, GREY, 0.7, dash=DIAGONAL_DASH),)))

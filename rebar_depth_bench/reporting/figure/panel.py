@@ -55,7 +55,7 @@ def frame_of(panel: Panel, left: float, top: float, right: float, bottom: float)
     The x axis also covers the y axis, so that the diagonal crosses the panel.
     """
     scaled = [point.scaled for point in panel.points] + list(panel.constants.values())
-    native = [point.native for point in panel.points] + _defined(panel.reference.one_pixel_abs_rel)
+    native = [point.native for point in panel.points] + _defined(panel.reference.one_pixel.abs_rel)
     y = decade_axis(_with_margin(scaled), bottom, top)
     x = decade_axis([*_with_margin(native), *((y.low, y.high) if scaled else ())], left, right)
     return Frame(left, top, right, bottom, x, y)
@@ -64,7 +64,7 @@ def frame_of(panel: Panel, left: float, top: float, right: float, bottom: float)
 def is_beyond(panel: Panel) -> bool:
     """Return whether anything is drawn on the frame of a panel because the axes do not reach it."""
     errors = [error for point in panel.points for error in (point.native, point.scaled)]
-    errors += [*panel.constants.values(), *_defined(panel.reference.one_pixel_abs_rel)]
+    errors += [*panel.constants.values(), *_defined(panel.reference.one_pixel.abs_rel)]
     return not all(LIMITS[0] <= error <= LIMITS[1] for error in errors)
 
 
@@ -140,7 +140,7 @@ def _reference_lines(panel: Panel, frame: Frame) -> list[Element]:
         description = f"{panel.config}, {title}: scaled {value:.4g}"
         across = Path(((0.0, 0.0), (frame.right - frame.left, 0.0)), INK, 0.9, dash=CONSTANT_DASH)
         lines.append(Marker((frame.left, y), "reference constant", description, (across,)))
-    for value in _defined(panel.reference.one_pixel_abs_rel):
+    for value in _defined(panel.reference.one_pixel.abs_rel):
         x = frame.x.at(value)
         description = f"{panel.config}, one pixel: native {value:.4g}"
         upwards = Path(((0.0, 0.0), (0.0, frame.top - frame.bottom)), INK, 0.9, dash=ONE_PIXEL_DASH)

@@ -6,17 +6,15 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 from rebar_depth_bench.reporting import formatting
-from rebar_depth_bench.reporting.html.rows import Cell, ScoreRow, number_cells, table_row
+from rebar_depth_bench.reporting.html.rows import Cell, ScoreRow, cells, table_row
+from rebar_depth_bench.scoring.columns import NATIVE, ONE_PIXEL, SCALED, SCALED_CONSTANT, with_reference
 from rebar_depth_bench.scoring.groups import GROUPINGS
-from rebar_depth_bench.scoring.metrics import METRIC_NAMES
 from rebar_depth_bench.scoring.result import Table
-
-_POSITIONS = [METRIC_NAMES.index(name) for name in formatting.GROUP_METRICS]
 
 
 @dataclass(frozen=True)
 class GroupRow:
-    """Cells of a group; the lists have the errors ``formatting.GROUP_METRICS``."""
+    """Cells of a group; the lists have the errors ``columns.REFERENCE_ERRORS``."""
 
     row: ScoreRow
     native: list[Cell]
@@ -61,12 +59,10 @@ def _group_table(grouping: str, groups: Mapping[str, Table]) -> GroupTable:
 
 
 def _group_row(group: str, table: Table) -> GroupRow:
-    row, reference = table_row(group, replace(table, split=None)), table.reference
-    one_pixel, constant = formatting.group_reference_cells(table)
     return GroupRow(
-        row,
-        native=[row.native[position] for position in _POSITIONS],
-        one_pixel=number_cells(one_pixel, [reference.one_pixel_abs_rel, reference.one_pixel_rmse_cm]),
-        scaled=[row.scaled[position] for position in _POSITIONS],
-        constant=number_cells(constant, table.scaled_constant),
+        table_row(group, replace(table, split=None)),
+        native=cells(with_reference(NATIVE), table),
+        one_pixel=cells(ONE_PIXEL, table),
+        scaled=cells(with_reference(SCALED), table),
+        constant=cells(SCALED_CONSTANT, table),
     )

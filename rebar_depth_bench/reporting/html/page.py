@@ -30,7 +30,7 @@ from rebar_depth_bench.reporting.html.crossings import CrossingPicture, crossing
 from rebar_depth_bench.reporting.html.extended import extended_section
 from rebar_depth_bench.reporting.html.groups import config_groups
 from rebar_depth_bench.reporting.html.published import paper_scenes
-from rebar_depth_bench.reporting.html.rows import ScoreRow, table_row, view_row
+from rebar_depth_bench.reporting.html.rows import METRIC_HEADS, ScoreRow, table_row, view_row
 from rebar_depth_bench.reporting.html.view_browser import (
     VIEWS_SHOWN,
     ShownView,
@@ -42,8 +42,7 @@ from rebar_depth_bench.reporting.html.view_images import ViewPanels, colour_bar_
 from rebar_depth_bench.reporting.published import OTHER_OPTICS_NOTE, load_published
 from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
-from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.scoring.view_score import ViewScore
+from rebar_depth_bench.scoring.result import Result, ViewScore
 from rebar_depth_bench.submission import SubmissionReader
 
 WORST_SHOWN = 10
@@ -88,7 +87,7 @@ def render_report(
             script=script.text,
             policy=script.policy,
             mistakes=[printable(mistake.text) for mistake in mistakes],
-            metric_heads=formatting.METRIC_HEADS,
+            metric_heads=METRIC_HEADS,
             tolerances=WITHIN_MM,
             dash_note=formatting.DASH_NOTE,
             **results_context(result, views),
@@ -155,10 +154,10 @@ def _provenance(result: Result) -> list[tuple[str, str]]:
         ("Protocol", result.protocol),
         ("Inputs", formatting.inputs_text(result.declared)),
         ("Ground truth", formatting.ground_truth_text(result.declared)),
-        ("Dataset version", printable(result.dataset_version)),
-        ("Dataset digest", printable(result.dataset_digest)),
-        ("Archive sha256", printable(result.submission_sha256.removeprefix("sha256:"))),
-        ("Software", f"rebar-depth-bench {printable(result.software_version)}"),
+        ("Dataset version", printable(result.dataset.version)),
+        ("Dataset digest", printable(result.dataset.digest)),
+        ("Archive sha256", printable(result.submission.sha256.removeprefix("sha256:"))),
+        ("Software", f"rebar-depth-bench {printable(result.software.version)}"),
     ]
 
 

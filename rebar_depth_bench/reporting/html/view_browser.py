@@ -10,7 +10,7 @@ from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.names import config_of
 from rebar_depth_bench.reporting.html.rows import ScoreRow, view_row
 from rebar_depth_bench.reporting.html.view_images import ViewImages, ViewPanels, view_images
-from rebar_depth_bench.scoring.view_score import ViewScore
+from rebar_depth_bench.scoring.result import ViewScore
 
 VIEWS_SHOWN = 12
 """Default number of views of a config shown with images, about 150 kB each at 1280 x 720."""

@@ -116,7 +116,7 @@ def test_other_dataset_than_expected_is_refused(
         assert len(notes) == (command[0] in ("score", "check", "predict"))
     with pytest.raises(rdb.DatasetError, match=f"expected {other}"):
         rdb.score(archive, tiny_root, expect_digest=other)
-    assert rdb.score(archive, tiny_root, expect_digest=digest).dataset_digest == digest
+    assert rdb.score(archive, tiny_root, expect_digest=digest).dataset.digest == digest
 
 
 def test_false_digest_is_refused_by_every_command(

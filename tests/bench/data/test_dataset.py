@@ -21,7 +21,7 @@ from rebar_depth_bench.data.rows import iterate_rows
 from rebar_depth_bench.data.schema import References, Survey, Trajectory, features
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import ideal_K, right_camera_pose
-from rebar_depth_bench.scoring.published_match import published_match
+from rebar_depth_bench.scoring.truth import published_match
 
 HEIGHT, WIDTH, VIEWS = 90, 160, 9
 

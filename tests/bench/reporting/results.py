@@ -8,14 +8,20 @@ import numpy as np
 
 from rebar_depth_bench.reporting.html.view_images import ViewPanels
 from rebar_depth_bench.scoring.metrics import DepthMetrics
-from rebar_depth_bench.scoring.published_match import PublishedMatch
-from rebar_depth_bench.scoring.reference import Reference
-from rebar_depth_bench.scoring.result import Result, tabulate
-from rebar_depth_bench.scoring.view_score import ViewScore
+from rebar_depth_bench.scoring.reference import Errors, Reference
+from rebar_depth_bench.scoring.result import (
+    DatasetIdentity,
+    PublishedMatch,
+    Result,
+    SoftwareIdentity,
+    SubmissionIdentity,
+    ViewScore,
+)
+from rebar_depth_bench.scoring.score import tabulate
 from rebar_depth_bench.submission.declaration import Declaration
 
 DECLARED = Declaration("rgb+K", uses_ground_truth=False)
-REFERENCE = Reference(0.0571, 2.21, 0.0062, 0.71)
+REFERENCE = Reference(Errors(0.0571, 2.21), Errors(0.0062, 0.71))
 
 HOSTILE = '=<script src="//evil.example/x.js">alert(1)</script>[red]\x1b[31m\u202e&amp;'
 
@@ -68,14 +74,11 @@ def result(
         for name in configs
     }
     return Result(
-        method=method,
-        submission_sha256="0123456789abcdef" * 4,
-        dataset_digest="sha256:" + "fedcba9876543210" * 4,
-        dataset_version="1.2.3",
-        software_version="0.1.0",
+        dataset=DatasetIdentity("sha256:" + "fedcba9876543210" * 4, "1.2.3"),
+        submission=SubmissionIdentity(method, "0123456789abcdef" * 4, declared.inputs, declared.uses_ground_truth),
+        software=SoftwareIdentity("0.1.0"),
         tables=tables,
-        views=views,
-        declared=declared,
+        views=list(views),
     )
 
 

@@ -20,8 +20,7 @@ from rebar_depth_bench.reporting.crossing_texts import reach_sentence
 from rebar_depth_bench.reporting.extended_tables import print_extended
 from rebar_depth_bench.reporting.html.crossing_picture import crossing_pictures, error_kind
 from rebar_depth_bench.reporting.html.page import write_report
-from rebar_depth_bench.scoring.evaluation import open_evaluation
-from rebar_depth_bench.scoring.score import score_evaluation
+from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
 from tests.bench.extended.cage_scenes import HEIGHT, WIDTH
 from tests.mat_dataset import CONFIG, VIEWS, write_mat_dataset
 

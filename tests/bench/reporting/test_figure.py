@@ -25,10 +25,8 @@ from rebar_depth_bench.reporting.figure.png import png_bytes
 from rebar_depth_bench.reporting.figure.svg import svg_bytes
 from rebar_depth_bench.reporting.figure.write import check_figure_path, write_figure
 from rebar_depth_bench.reporting.published import published_rows
-from rebar_depth_bench.scoring.published_match import PublishedMatch
 from rebar_depth_bench.scoring.reference import NO_REFERENCE
-from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.scoring.view_score import ViewScore
+from rebar_depth_bench.scoring.result import PublishedMatch, Result, ViewScore
 from rebar_depth_bench.submission.declaration import Declaration
 from tests.bench.reporting.results import (
     HOSTILE,
@@ -100,11 +98,11 @@ def test_points_and_references_are_where_the_tick_labels_say() -> None:
     assert list(constants) == ["lattice, constant: scaled 0.0571", "lattice, constant, far: scaled 0.0529"]
     (_, constant), (_, of_far) = constants.values()
     [(one_pixel, _)] = places(svg, "reference one-pixel").values()
-    assert REFERENCE.constant_abs_rel is not None
-    assert REFERENCE.one_pixel_abs_rel is not None
-    assert constant == pytest.approx(y(REFERENCE.constant_abs_rel), abs=0.02)
+    assert REFERENCE.constant.abs_rel is not None
+    assert REFERENCE.one_pixel.abs_rel is not None
+    assert constant == pytest.approx(y(REFERENCE.constant.abs_rel), abs=0.02)
     assert of_far == pytest.approx(y(0.0529), abs=0.02)
-    assert one_pixel == pytest.approx(x(REFERENCE.one_pixel_abs_rel), abs=0.02)
+    assert one_pixel == pytest.approx(x(REFERENCE.one_pixel.abs_rel), abs=0.02)
     legend = list(places(svg, "legend"))
     assert legend[:2] == ["near", "far"]
     assert legend[2:8] == [f"paper: {row.method}" for row in rows]
@@ -292,7 +290,7 @@ def test_table_command_draws_archives(
     assert [name.partition(",")[0] for name in points] == ["lattice", "lattice-orbit"]
     assert all(" ?: native 0.5, scaled " in name for name in points)
     references = places(ElementTree.fromstring(before), "reference constant")
-    expected = rdb.score(archives[0], tiny_root).tables["lattice"].reference.constant_abs_rel
+    expected = rdb.score(archives[0], tiny_root).tables["lattice"].reference.constant.abs_rel
     assert next(iter(references)) == f"lattice, constant: scaled {expected:.4g}"
     assert main(command) == 0
     assert out.read_bytes() == before

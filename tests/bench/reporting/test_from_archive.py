@@ -12,8 +12,7 @@ import pytest
 
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.reporting.html.page import write_report
-from rebar_depth_bench.scoring.evaluation import open_evaluation
-from rebar_depth_bench.scoring.score import score_evaluation
+from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
 
 
 def test_report_embeds_requested_views_worst_first(

@@ -18,10 +18,11 @@ from rebar_depth_bench.scoring.bootstrap import (
     block_length,
     half_width,
     interval,
+    protocol_indices,
     resample,
     resample_scenes,
+    resample_views,
 )
-from rebar_depth_bench.scoring.view_score import protocol_indices, resample_views
 
 
 def mean_interval(values: np.ndarray, indices: range) -> tuple[float, float] | None:

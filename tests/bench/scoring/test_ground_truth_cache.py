@@ -23,7 +23,7 @@ from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import EyeTruth
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
 from rebar_depth_bench.parallel import silent
-from rebar_depth_bench.scoring.ground_truth import config_truth, verified_views
+from rebar_depth_bench.scoring.truth import config_truth, verified_views
 from tests.commands import run_in_process
 from tests.damage import change_manifest
 from tests.ground_truth import truth_of

@@ -31,8 +31,7 @@ from rebar_depth_bench.scoring.groups import (
     bin_names,
     positions_by_group,
 )
-from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.scoring.result_io import read_result, read_table
+from rebar_depth_bench.scoring.result import Result, read_result, read_table
 from tests.damage import change_manifest
 from tests.ground_truth import truth_of
 from tests.synthetic_dataset import write_archive, write_dataset, write_split_dataset
@@ -261,7 +260,7 @@ def test_groups_are_not_disclosed(scored: Result) -> None:
 
 def test_comparison_resamples_scenes(root: Path, archive: Path, tmp_path: Path, scored: Result) -> None:
     other = rdb.score(write_noisy(root, tmp_path / "b.zip", "other", 1.05), root)
-    [row] = [row for row in compare(scored, other).configs["cages"] if row.name == "rank_error"]
+    [row] = [row for row in compare(scored, other).configs["cages"] if row.column.path == "rank_error"]
     change = [b.rank_error - a.rank_error for a, b in zip(scored.views, other.views, strict=True)]
     by_scene = np.reshape(change, (len(SCENES), VIEWS))
     counts = resample_scenes(list(SCENES)).counts

@@ -1,0 +1,315 @@
+"""Ground truth of a config for scoring: the scored pixels of each view, and the scene of the paper that it shows.
+
+It is extracted once per config and kept as arrays in the user's cache, keyed by a digest of the views; later runs
+read the cache one view at a time.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, UInt32
+from numpy import ndarray
+
+from rebar_depth_bench.data.array_cache import ArrayCache, open_cache
+from rebar_depth_bench.data.bars import BARS_FILE, read_bars, with_axis
+from rebar_depth_bench.data.cache_entry import CacheContent, ViewArrays
+from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder
+from rebar_depth_bench.data.rows import EyeTruth, iterate_rows, truth_columns, truth_from_row
+from rebar_depth_bench.data.schema import NEAREST_STEEL, Assembly, Trajectory, ViewRecord
+from rebar_depth_bench.errors import DatasetError
+from rebar_depth_bench.parallel import Progress, silent
+from rebar_depth_bench.scoring.groups import ViewTraits, bar_width_px
+from rebar_depth_bench.scoring.metrics import median
+from rebar_depth_bench.scoring.protocol import PROTOCOL, scored_pixels, single_bar_pixels
+from rebar_depth_bench.scoring.reference import (
+    REFERENCE_NUMBERS,
+    Reference,
+    mean_reference,
+    reference_of_numbers,
+    view_reference,
+)
+from rebar_depth_bench.scoring.result import PublishedMatch
+from rebar_depth_bench.scoring.score import ViewTruth
+
+_REFERENCE = slice(1, 1 + REFERENCE_NUMBERS)
+_WIDTH = 1 + REFERENCE_NUMBERS
+"""Places of the reference errors and of the bar width among the cached numbers; the median depth is the first."""
+_NO_WIDTH = -1.0
+
+
+@dataclass(frozen=True, eq=False)
+class ConfigTruth:
+    """Views of a config that have scored pixels, each read from the cache on access (see ``score.Truth``)."""
+
+    cache: ArrayCache
+    config: DatasetConfig
+
+    @property
+    def split(self) -> str | None:
+        """Split of the views, None in a config of one scene."""
+        return self.config.scenes[0].split if self.config.has_splits else None
+
+    @property
+    def truth_sigma_m(self) -> float | None:
+        """Standard deviation of the depth, metres, None if it is exact."""
+        return self.config.truth_sigma_m
+
+    @property
+    def published(self) -> PublishedMatch | None:
+        """Scene of the paper's Table I that the config shows, if any."""
+        return published_match(self.config)
+
+    @property
+    def view_ids(self) -> tuple[str, ...]:
+        """Ids of the views, in order."""
+        return self.cache.view_ids
+
+    def single_bar(self, position: int) -> Bool[ndarray, " n"]:
+        """Return which scored pixels of the view at ``position`` are single-bar: see ``single_bar_pixels``."""
+        return self.cache.view(position).arrays["single_bar"]
+
+    @property
+    def medians_m(self) -> tuple[float, ...]:
+        """Median ground-truth depth of the scored pixels of each view, metres."""
+        return tuple(median_m for median_m, *_ in self.cache.numbers)
+
+    @property
+    def references(self) -> tuple[Reference, ...]:
+        """Reference errors of each view."""
+        return tuple(reference_of_numbers(numbers[_REFERENCE]) for numbers in self.cache.numbers)
+
+    @property
+    def traits(self) -> tuple[ViewTraits, ...]:
+        """Properties of each view by which views are grouped, without bar widths in a config of one scene."""
+        families = {scene.name: scene.family for scene in self.config.scenes}
+        widths_px = (numbers[_WIDTH:] for numbers in self.cache.numbers)
+        return tuple(
+            ViewTraits(
+                families[self.config.scene_by_view[view_id]],
+                median_m,
+                width_px[0] if width_px and width_px[0] > 0 else None,
+            )
+            for view_id, median_m, width_px in zip(self.view_ids, self.medians_m, widths_px, strict=True)
+        )
+
+    def __len__(self) -> int:
+        return len(self.cache)
+
+    def __iter__(self) -> Iterator[ViewTruth]:
+        return map(self.view, range(len(self)))
+
+    def view(self, position: int) -> ViewTruth:
+        """Return the view at ``position`` in protocol order."""
+        view = self.cache.view(position)
+        median_m, abs_rel, rmse_cm, *_ = view.numbers
+        constant = abs_rel, rmse_cm
+        return ViewTruth(view.view_id, view.arrays["index"], view.arrays["depth_m"], median_m, constant)
+
+
+def config_truth(folder: DatasetFolder, config: DatasetConfig, progress: Progress = silent) -> ConfigTruth:
+    """Return the ground truth of a config, from the cache or else extracted from the dataset.
+
+    Views without scored pixels are omitted. A config with splits that has bar ids also needs the table of bars.
+    Raises ``DatasetError`` naming the view if its ground truth does not match its digest in the manifest, and if
+    the table of bars is missing or damaged.
+    """
+    scored_px = scored_counts(config)
+    has_widths = config.has_splits and "left_bars" not in config.absent_columns
+    diameters = _diameters_by_scene(folder) if has_widths else None
+
+    def is_sound(view: ViewArrays) -> bool:
+        has_counts = len(view.arrays["index"]) == scored_px[view.view_id]
+        return has_counts and len(view.numbers) == _WIDTH + has_widths and are_pixels_inside(view, config)
+
+    content = CacheContent(
+        source=config.root,
+        inputs=cache_inputs(config, PROTOCOL, folder.files[BARS_FILE] if has_widths else ""),
+        dtypes={"index": np.uint32, "depth_m": np.float32, "single_bar": np.bool_},
+        view_ids=tuple(scored_px),
+        extract=lambda: _extract_views(config, progress, diameters),
+        is_sound=is_sound,
+    )
+    return ConfigTruth(open_cache(content), config)
+
+
+def _diameters_by_scene(folder: DatasetFolder) -> dict[str, dict[int, float]]:
+    """Return the nominal diameters of the bars whose axis is known, metres, by scene and bar id."""
+    scenes = read_bars(folder.verified_file(BARS_FILE))
+    return {name: {bar.bar_id: bar.diameter_m for bar in with_axis(bars)} for name, bars in scenes.items()}
+
+
+def reference_errors(config: DatasetConfig) -> Reference:
+    """Return the reference errors of a config, computed from its rows without the cache.
+
+    Raises ``DatasetError`` as ``config_truth``.
+    """
+    views = _extract_views(config, silent, None)
+    return mean_reference(reference_of_numbers(view.numbers[_REFERENCE]) for view in views)
+
+
+def cache_inputs(config: DatasetConfig, protocol: str, extra_digest: str = "") -> dict[str, Any]:
+    """Return what the cached arrays of a config under a protocol depend on; it becomes the key of the cache.
+
+    The digests of the views are those that are verified when the arrays are extracted. ``extra_digest`` is the hex
+    SHA-256 of further inputs, other than the views.
+    """
+    return {
+        "protocol": protocol,
+        "config": config.name,
+        "scenes": [scene.name for scene in config.scenes],
+        "grid": config.grid,
+        "views": [view.model_dump() for view in config.views],
+        "extra": extra_digest,
+    }
+
+
+def are_pixels_inside(view: ViewArrays, config: DatasetConfig) -> bool:
+    """Return whether all values of ``index``, one or more, are pixels of the image."""
+    return bool(view.arrays["index"].max() < math.prod(config.grid))
+
+
+def scored_counts(config: DatasetConfig) -> dict[str, int]:
+    """Return the number of scored pixels of each view that has any, in the order of the manifest."""
+    return {view.view_id: view.scored_px for view in config.views if view.scored_px}
+
+
+def verified_views(
+    config: DatasetConfig, progress: Progress, task: str
+) -> Iterator[tuple[str, EyeTruth, UInt32[ndarray, " n"]]]:
+    """Yield id, left eye and flat indices of the scored pixels of every view, verified against the manifest.
+
+    ``task`` is its name in ``progress``. Raises ``DatasetError`` as ``iterate_rows``, and naming a view that does
+    not match its digest.
+    """
+    records = {view.view_id: view for view in config.views}
+    rows = iterate_rows(config, ("view_id", *truth_columns("left")))
+    for done, row in enumerate(rows, start=1):
+        view_id, left = row["view_id"], truth_from_row(row, "left")
+        yield view_id, left, _verified_pixels(left, records[view_id], config)
+        progress(f"{task} of {config.name}", done, len(records))
+
+
+def _extract_views(
+    config: DatasetConfig, progress: Progress, diameters: Mapping[str, Mapping[int, float]] | None
+) -> Iterator[ViewArrays]:
+    """Yield the cached arrays and numbers of every view with scored pixels.
+
+    With ``diameters``, the diameters of the bars by scene, the last number is the bar width in pixels.
+    """
+    for view_id, left, pixels in verified_views(config, progress, "ground truth"):
+        if len(pixels):
+            depth_m = left.depth_m.ravel()[pixels]
+            median_m = median(depth_m)
+            reference = view_reference(left.depth_m, pixels, median_m)
+            numbers = (median_m, *reference.to_numbers())
+            if diameters is not None:
+                known_m = diameters.get(config.scene_by_view[view_id], {})
+                assert left.bars is not None
+                bar_id, focal_px = left.bars.ravel()[pixels], float(left.camera.K[0, 0])
+                numbers += (bar_width_px(depth_m, bar_id, known_m, focal_px) or _NO_WIDTH,)
+            single_bar = single_bar_pixels(left.bars, pixels)
+            arrays = {"index": pixels, "depth_m": depth_m, "single_bar": single_bar}
+            yield ViewArrays(view_id, arrays, numbers)
+
+
+def _verified_pixels(left: EyeTruth, record: ViewRecord, config: DatasetConfig) -> UInt32[ndarray, " n"]:
+    digest, pixels = left.digest(), scored_pixels(left.mask, left.depth_m)
+    if digest != record.left or len(pixels) != record.scored_px:
+        raise DatasetError(
+            f"{config.root}: view {record.view_id}: ground truth has digest {digest[:16]} and {len(pixels)} "
+            f"scored pixels, the manifest has {record.left[:16]} and {record.scored_px}; "
+            f"rebar-bench verify {config.root} lists damaged files"
+        )
+    return pixels
+
+
+# Conditions of the paper's Table I: which configs of a dataset its rows may be shown beside. Source: "Benchmarking
+# Metric Depth for Construction Perception: Industrial Rebar Scenes with Exact Synthetic Ground Truth", sections
+# II.A and II.C. The lattice was evaluated on the views of a ZED, rectified.
+
+_GRID = (720, 1280)
+_IDEAL = ("ideal", 0.12)
+_ZED_RECTIFIED = ("rectified", 0.119978)
+
+
+@dataclass(frozen=True)
+class _Conditions:
+    """Conditions of a scene; ``optics`` are grid and baseline in metres, ``markers`` are those of the board."""
+
+    assembly: Mapping[str, Any]
+    markers: int
+    environment: str
+    trajectory: Trajectory
+    optics: tuple[str, float]
+
+
+_CONDITIONS: Mapping[str, _Conditions] = {
+    "lattice": _Conditions(
+        {"kind": "lattice", "extent_m": 0.1, "pitch_m": 0.02, "diameters_m": [0.007, 0.004]},
+        6,
+        "laboratory",
+        Trajectory(
+            radii_m=(0.22, 0.3, 0.35, 0.38, 0.4, 0.42, 0.43),
+            elevations_deg=(15.0, 27.0, 39.0, 51.0, 63.0, 75.0),
+            azimuths=12,
+        ),
+        _ZED_RECTIFIED,
+    ),
+    "pile": _Conditions(
+        {"kind": "pile", "stirrups": 6, "diameter_m": 0.01, "size_m": [0.28, 0.2], "state": "pile-0"},
+        6,
+        "laboratory",
+        Trajectory(
+            radii_m=(0.5, 0.57, 0.59, 0.62, 0.65, 0.67, 0.9),
+            elevations_deg=(28.0, 37.0, 46.0, 55.0, 64.0, 73.0),
+            azimuths=12,
+        ),
+        _IDEAL,
+    ),
+    "pier": _Conditions(
+        {
+            "kind": "pier",
+            "side_m": 4.8,
+            "height_m": 6.67,
+            "verticals": 96,
+            "levels": 45,
+            "vertical_diameter_m": 0.032,
+            "hoop_diameter_m": 0.016,
+            "tie_diameter_m": 0.016,
+        },
+        0,
+        "outdoors",
+        Trajectory(
+            radii_m=(8.0, 11.0, 13.0, 14.5, 15.5, 16.25, 17.0),
+            elevations_deg=(-7.5, -1.0, 7.0, 17.0, 29.0, 44.0),
+            azimuths=12,
+            distance_to=NEAREST_STEEL,
+        ),
+        _IDEAL,
+    ),
+}
+
+
+def published_match(config: DatasetConfig) -> PublishedMatch | None:
+    """Return the scene of Table I whose rows may be shown beside a config, or None.
+
+    Assembly, board, environment, image size and trajectory have to be equal, with all of its views and without
+    appearance variants.
+    """
+    is_complete = len(config.views) == config.scenes[0].protocol_views and config.grid == _GRID
+    if config.imported is not None or config.has_splits or not is_complete or config.scene.appearance.variants:
+        return None
+    scene = config.scene
+    markers = scene.board.markers if scene.board else 0
+    shown = (scene.assembly, markers, scene.environment, scene.protocol)
+    for name, expected in _CONDITIONS.items():
+        assembly = Assembly.model_validate(expected.assembly)
+        if shown == (assembly, expected.markers, expected.environment, expected.trajectory):
+            optics = None if scene.rig is None else (scene.rig.grid, scene.rig.baseline_m)
+            return PublishedMatch(name, optics == expected.optics)
+    return None
