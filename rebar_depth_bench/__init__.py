@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from importlib import import_module
+from importlib.metadata import version
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -20,7 +21,8 @@ if TYPE_CHECKING:
         SubmissionError,
     )
     from rebar_depth_bench.scoring.evaluation import score
-    from rebar_depth_bench.scoring.result import Result, Table, ViewScore
+    from rebar_depth_bench.scoring.result import Result
+    from rebar_depth_bench.scoring.table import Table, ViewScore
     from rebar_depth_bench.submission import SubmissionWriter
 
 __all__ = [
@@ -53,6 +55,14 @@ _MODULE_BY_NAME = {
     "Table": "scoring.result",
     "ViewScore": "scoring.result",
 }
+
+
+DISTRIBUTION = "rebar-depth-bench"
+
+
+def software_version() -> str:
+    """Return the version of the installed distribution."""
+    return version(DISTRIBUTION)
 
 
 def __dir__() -> list[str]:

@@ -24,8 +24,7 @@ from rebar_depth_bench.errors import (
     problem_summary,
 )
 from rebar_depth_bench.reading import parse_json
-from rebar_depth_bench.scoring.disclosure import DisclosedResult, is_disclosed, read_disclosed
-from rebar_depth_bench.scoring.result import Result, read_result
+from rebar_depth_bench.scoring.result import DisclosedResult, Result, is_disclosed, read_disclosed, read_result
 from rebar_depth_bench.validation import Expected, StrictModel, one_of, text, validate_table, whole_number
 
 _MAX_INTEGER = 2**63 - 1

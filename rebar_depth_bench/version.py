@@ -1,10 +1,3 @@
-"""Software version, read from the metadata of the installed distribution."""
+"""Former place of ``rebar_depth_bench.software_version``, until the builder imports it from there."""
 
-from importlib.metadata import version
-
-DISTRIBUTION = "rebar-depth-bench"
-
-
-def software_version() -> str:
-    """Return the version of the installed distribution."""
-    return version(DISTRIBUTION)
+from rebar_depth_bench import software_version as software_version

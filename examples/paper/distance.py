@@ -38,8 +38,8 @@ from rebar_depth_bench.scoring.bootstrap import (
 )
 from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation, score_evaluation
 from rebar_depth_bench.scoring.metrics import mean
-from rebar_depth_bench.scoring.result import ViewScore
 from rebar_depth_bench.scoring.single_bar import mean_single_bar, single_bar_scores
+from rebar_depth_bench.scoring.table import ViewScore
 from rebar_depth_bench.scoring.truth import config_truth
 
 if TYPE_CHECKING:

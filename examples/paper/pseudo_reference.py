@@ -33,8 +33,8 @@ from rebar_depth_bench.scoring.bootstrap import INTERVALS
 from rebar_depth_bench.scoring.columns import METRICS
 from rebar_depth_bench.scoring.evaluation import ArchiveIdentity, Provenance
 from rebar_depth_bench.scoring.metrics import mean
-from rebar_depth_bench.scoring.result import ViewScore
 from rebar_depth_bench.scoring.score import ViewTruth, score_view, tabulate
+from rebar_depth_bench.scoring.table import ViewScore
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

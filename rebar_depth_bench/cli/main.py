@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from typing import Protocol
 
+from rebar_depth_bench import software_version
 from rebar_depth_bench.cli import (
     cache,
     check,
@@ -23,7 +24,6 @@ from rebar_depth_bench.cli import (
 from rebar_depth_bench.console import run_command
 from rebar_depth_bench.output_options import check_outputs
 from rebar_depth_bench.terminal import use_plain_characters
-from rebar_depth_bench.version import software_version
 
 
 class Command(Protocol):

@@ -63,9 +63,10 @@ def run(options: argparse.Namespace) -> None:
         print_verified(
             evaluation.folder, f"views of {names} verified when their ground truth was stored in the cache"
         )
-        mistakes = diagnose(evaluation)
         if options.html:
-            write_report(result, evaluation, options.html, mistakes=mistakes, views_shown=options.html_views)
+            mistakes = write_report(result, evaluation, options.html, views_shown=options.html_views)
+        else:
+            mistakes = diagnose(evaluation)
     if options.json:
         write_output(options.json, result.to_json())
     if options.csv:

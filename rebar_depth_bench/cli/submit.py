@@ -19,8 +19,7 @@ from rebar_depth_bench.output_options import add_output_file, prints_table
 from rebar_depth_bench.outputs import write_output
 from rebar_depth_bench.reporting.tables import print_table
 from rebar_depth_bench.scoring.columns import COVERAGE, number
-from rebar_depth_bench.scoring.disclosure import DECIMALS, DisclosedResult, is_disclosed, read_disclosed
-from rebar_depth_bench.scoring.result import read_result
+from rebar_depth_bench.scoring.result import DECIMALS, DisclosedResult, is_disclosed, read_disclosed, read_result
 
 SUMMARY = "upload an archive to a leaderboard, wait for its score and print the table"
 TOKEN_VARIABLE = "REBAR_LEADERBOARD_TOKEN"

@@ -20,7 +20,7 @@ from rebar_depth_bench.extended import (
 )
 from rebar_depth_bench.extended.crossings import measures as crossing_measures
 from rebar_depth_bench.extended.crossings.evaluate import crossing_samples, view_crossings
-from rebar_depth_bench.extended.ground_truth import ConfigSteelTruth, SceneBars, has_bar_ids, load_steel_truth
+from rebar_depth_bench.extended.ground_truth import ConfigSteelTruth, SceneBars, has_bar_ids, steel_truth
 from rebar_depth_bench.extended.inspection import as_built
 from rebar_depth_bench.extended.inspection import evaluate as inspection
 from rebar_depth_bench.extended.inspection import measures as inspection_measures
@@ -165,7 +165,7 @@ def score_extended(
         if not has_bar_ids(config):
             tables[config.name] = tabulate_extended([], resample_views([], by_scene=False), measures)
             continue
-        steel = load_steel_truth(evaluation.folder, config, progress)
+        steel = steel_truth(evaluation, config, progress)
         source = CrossingsSource(steel.crossings_source, steel.crossings_sha256)
         work = partial(_view, evaluation.submission, steel, scales)
         task = f"extended measures of {config.name}"

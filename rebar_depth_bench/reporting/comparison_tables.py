@@ -14,6 +14,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table as RichTable
 
+from rebar_depth_bench import software_version
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.published import (
@@ -28,8 +29,8 @@ from rebar_depth_bench.scoring.columns import DASH, PAPER_COLUMNS, RANK_ERROR, r
 from rebar_depth_bench.scoring.comparison import Comparison, Difference
 from rebar_depth_bench.scoring.frames import differences_frame
 from rebar_depth_bench.scoring.protocol import PROTOCOL
-from rebar_depth_bench.scoring.result import PublishedMatch, Result, Table
-from rebar_depth_bench.version import software_version
+from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.scoring.table import PublishedMatch, Table
 
 COMPARISON_NOTE = (
     "B - A: mean over the views that both have. 95 % interval: bootstrap of blocks of neighbouring views "

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from functools import partial
 
+from rebar_depth_bench import software_version
 from rebar_depth_bench.bar_crossings.definition import CROSSINGS_PROTOCOL
 from rebar_depth_bench.detections.matching import MATCH_M
 from rebar_depth_bench.detections.result import AVERAGE_PRECISION_MM, DetectionResult, DetectionTable
@@ -13,7 +14,6 @@ from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.charts.lines import HEIGHT, LEFT, RIGHT, TOP, ChartText, LinearAxis, Series, chart
 from rebar_depth_bench.reporting.table_page import Columns, PageFigure, PageTable, TablePage, page_table
 from rebar_depth_bench.scoring.columns import ARROWS, DASH, Column
-from rebar_depth_bench.version import software_version
 
 Row = tuple[str, DetectionTable]
 """Name and table of a config, or of all together."""

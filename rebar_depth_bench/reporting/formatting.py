@@ -19,7 +19,7 @@ from rebar_depth_bench.scoring.columns import (
 )
 from rebar_depth_bench.scoring.groups import GROUPINGS
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE
-from rebar_depth_bench.scoring.result import Table
+from rebar_depth_bench.scoring.table import Table
 from rebar_depth_bench.submission.declaration import Declaration
 
 DASH_NOTE = f"{DASH}: undefined, because no pixel has a prediction or a number overflowed."

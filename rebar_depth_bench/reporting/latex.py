@@ -18,7 +18,8 @@ from rebar_depth_bench.reporting.html.assets import environment
 from rebar_depth_bench.reporting.published import PublishedRow, load_published, published_rows
 from rebar_depth_bench.scoring.columns import DASH, PAPER_COLUMNS, RANK_ERROR, rounded, texts
 from rebar_depth_bench.scoring.protocol import PROTOCOL
-from rebar_depth_bench.scoring.result import PublishedMatch, Result, Table
+from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.scoring.table import PublishedMatch, Table
 
 CONFIGS_PER_BLOCK = 2
 """Number of configs side by side that fit into a page width of 17 cm; further configs follow in blocks below."""

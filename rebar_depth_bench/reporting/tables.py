@@ -33,7 +33,8 @@ from rebar_depth_bench.scoring.columns import (
     with_reference,
 )
 from rebar_depth_bench.scoring.frames import tables_frame
-from rebar_depth_bench.scoring.result import Result, Table
+from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.scoring.table import Table
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -28,7 +28,8 @@ from rebar_depth_bench.scoring.columns import (
 from rebar_depth_bench.scoring.evaluation import ArchiveIdentity, Provenance
 from rebar_depth_bench.scoring.frames import differences_frame
 from rebar_depth_bench.scoring.protocol import PROTOCOL
-from rebar_depth_bench.scoring.result import Result, ViewScore
+from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.scoring.table import ViewScore
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -15,7 +15,10 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
 
+from rebar_depth_bench import software_version
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_folder
 from rebar_depth_bench.data.rows import CAMERA_KINDS, RowDecoder, camera_from_row, iterate_undecoded
 from rebar_depth_bench.data.shards import rows_at
@@ -24,19 +27,13 @@ from rebar_depth_bench.geometry.cameras import Camera
 from rebar_depth_bench.names import TEST_SPLIT, config_of, split_of
 from rebar_depth_bench.parallel import Progress, map_with_progress, silent
 from rebar_depth_bench.scoring.protocol import PROTOCOL
-from rebar_depth_bench.scoring.result import (
-    DatasetIdentity,
-    Result,
-    SoftwareIdentity,
-    SubmissionIdentity,
-    ViewScore,
-)
-from rebar_depth_bench.scoring.score import score_views
+from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareIdentity, SubmissionIdentity
+from rebar_depth_bench.scoring.score import ReadDepth, score_views
+from rebar_depth_bench.scoring.table import ViewScore
 from rebar_depth_bench.scoring.truth import ConfigTruth, config_truth
 from rebar_depth_bench.submission import Declaration, EntryError, SubmissionReader, open_submission
 from rebar_depth_bench.submission.declaration import NOT_DECLARED
 from rebar_depth_bench.submission.maps import Depth
-from rebar_depth_bench.version import software_version
 
 _Found = TypeVar("_Found")
 
@@ -77,13 +74,13 @@ class Provenance:
 class View:
     """View of a submission, for diagnosis and pictures: cells and prediction are decoded once, on first use.
 
-    ``position`` counts the views of the config, and ``encoded`` is the row.
+    ``position`` counts the views of the config, ``encoded`` is the row, and ``read_depth`` reads predictions.
     """
 
     config: DatasetConfig
     position: int
     encoded: Mapping[str, Any]
-    submission: SubmissionReader
+    read_depth: ReadDepth
     _decoded: dict[str, Any] = field(default_factory=dict)
 
     @property
@@ -92,9 +89,9 @@ class View:
         return self.config.view_ids[self.position]
 
     @cached_property
-    def prediction_m(self) -> Depth:
+    def prediction_m(self) -> Float[ndarray, "h w"]:
         """Submitted planar depth in metres, H x W. Raises ``EntryError`` for an invalid entry."""
-        return self.submission.read(self.view_id)
+        return self.read_depth(self.view_id)
 
     def cell(self, column: str) -> Any:
         """Return the decoded cell of a column. Raises ``DatasetError`` if it is damaged."""
@@ -107,6 +104,23 @@ class View:
         """Return the camera of one eye."""
         cells = {f"{eye}_{kind}": self.cell(f"{eye}_{kind}") for kind in CAMERA_KINDS}
         return camera_from_row(cells, eye, self.config.grid)
+
+
+def read_views(
+    config: DatasetConfig, columns: Sequence[str], positions: Collection[int], read_depth: ReadDepth
+) -> Iterator[View]:
+    """Yield the views at ``positions`` of a config, one at a time; only their rows are read.
+
+    Raises ``DatasetError`` for a damaged shard.
+    """
+    remaining = {config.view_ids[position]: position for position in sorted(positions)}
+    for row in rows_at(config, ("view_id", *columns), list(remaining.values())):
+        if (position := remaining.pop(row["view_id"], None)) is not None:
+            yield View(config, position, row, read_depth)
+    if remaining:  # The rows are in another order than in the manifest.
+        for row in iterate_undecoded(config, ("view_id", *columns)):
+            if (position := remaining.pop(row["view_id"], None)) is not None:
+                yield View(config, position, row, read_depth)
 
 
 @dataclass(frozen=True)
@@ -145,19 +159,8 @@ class Evaluation:
         return found
 
     def views(self, config: DatasetConfig, columns: Sequence[str], positions: Collection[int]) -> Iterator[View]:
-        """Yield the views at ``positions`` of a config, one at a time; only their rows are read.
-
-        Raises ``DatasetError`` for a damaged shard.
-        """
-        remaining = {config.view_ids[position]: position for position in sorted(positions)}
-        for row in rows_at(config, ("view_id", *columns), list(remaining.values())):
-            position = remaining.pop(row["view_id"], None)
-            if position is not None:
-                yield View(config, position, row, self.submission)
-        for row in iterate_undecoded(config, ("view_id", *columns)) if remaining else ():  # In another order.
-            position = remaining.pop(row["view_id"], None)
-            if position is not None:
-                yield View(config, position, row, self.submission)
+        """Yield the views at ``positions`` of a config as ``read_views``."""
+        return read_views(config, columns, positions, self.submission.read)
 
     def check_entries(self, progress: Progress = silent) -> None:
         """Decode every entry. Raises ``SubmissionError`` with all problems."""

@@ -14,7 +14,8 @@ from rebar_depth_bench.scoring.columns import TABLE_COLUMNS, VIEW_COLUMNS, round
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-    from rebar_depth_bench.scoring.result import Result, Table, ViewScore
+    from rebar_depth_bench.scoring.result import Result
+    from rebar_depth_bench.scoring.table import Table, ViewScore
 
 _DECLARED_COLUMNS = ("protocol", "method", "inputs", "uses_ground_truth")
 _NUMBER_COLUMNS = (

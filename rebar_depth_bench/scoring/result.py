@@ -1,14 +1,13 @@
-"""Result of scoring one submission: tables by config and scores of views, written and read by the same classes.
+"""Result of scoring one submission, written and read by the same classes, and the part of it that is disclosed.
 
-The classes mirror the JSON, whose keys are their fields. Unknown keys are ignored, because results of later
-versions have more of them.
+The classes mirror the JSON. Unknown keys are ignored, because results of later versions have more of them.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import cache
 from html import escape
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -16,41 +15,38 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import (
     AfterValidator,
     BeforeValidator,
-    ConfigDict,
     FailFast,
     Field,
     GetPydanticSchema,
     Strict,
     TypeAdapter,
-    WrapSerializer,
-    create_model,
 )
 from pydantic_core import core_schema
 
-from rebar_depth_bench.errors import InputError, Problem, printable
+from rebar_depth_bench.errors import InputError, Problem, SubmissionError, printable
 from rebar_depth_bench.limits import JSON_BYTES
-from rebar_depth_bench.names import SPLITS, config_of
+from rebar_depth_bench.names import config_of
 from rebar_depth_bench.reading import parse_json
 from rebar_depth_bench.scoring import frames
-from rebar_depth_bench.scoring.bootstrap import INTERVALS, Interval
-from rebar_depth_bench.scoring.columns import (
-    COLUMN_BY_PATH,
-    VIEW_COLUMNS,
-    Share,
-    Size,
-    json_as,
-    rounded,
-    rounded_interval,
+from rebar_depth_bench.scoring.bootstrap import INTERVALS
+from rebar_depth_bench.scoring.columns import Share
+from rebar_depth_bench.scoring.protocol import PROTOCOL
+from rebar_depth_bench.scoring.table import (
+    LIMITED,
+    Count,
+    Flag,
+    Name,
+    Table,
+    TableJson,
+    ViewJson,
+    ViewScore,
+    check_tables,
 )
-from rebar_depth_bench.scoring.metrics import DepthMetrics
-from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, PROTOCOL, WITHIN_MM
-from rebar_depth_bench.scoring.reference import Reference
 from rebar_depth_bench.submission.declaration import INPUTS, Declaration
-from rebar_depth_bench.validation import Expected, field_error, one_of, text, validate_document
+from rebar_depth_bench.validation import StrictModel, field_error, one_of, validate_document, validate_table
 
 if TYPE_CHECKING:
     from pandas import DataFrame
-    from pydantic import SerializerFunctionWrapHandler
 
     from rebar_depth_bench.extended.result import ExtendedResult
 
@@ -59,196 +55,6 @@ _NOTEBOOK_COLUMNS = (
     *("config", "views", "views_scored", "coverage", "ranked", "rank_error"),
     *("native_abs_rel", "native_rmse_cm", "scaled_abs_rel", "scaled_rmse_cm", "scale_median"),
 )
-_NAME_CHARACTERS = 300
-_MAX_ENTRIES = 5000
-"""Largest number of entries of a JSON object whose keys are names."""
-
-
-def _check_length(table: object) -> object:
-    """Return ``table``; raise the error of a field if it has so many entries that their errors take minutes."""
-    if isinstance(table, dict) and len(table) > _MAX_ENTRIES:
-        raise field_error(f"got {len(table)} entries", f"at most {_MAX_ENTRIES}", "size")
-    return table
-
-
-LIMITED = BeforeValidator(_check_length)
-"""Annotation of a JSON object whose keys are names."""
-Name = Annotated[str, Strict(), text(_NAME_CHARACTERS)]
-_Flag = Annotated[bool, Strict()]
-_Count = Annotated[int, Strict(), Field(ge=0, lt=1 << 53)]
-
-
-def _all_fields(metrics: DepthMetrics | None, write: SerializerFunctionWrapHandler) -> Any:
-    """Return the JSON object of metrics, whose fields are null without predictions."""
-    return dict.fromkeys((one.name for one in fields(DepthMetrics)), None) if metrics is None else write(metrics)
-
-
-Metrics = Annotated[DepthMetrics | None, WrapSerializer(_all_fields)]
-_WITHIN = Expected(
-    f"a share for each of {', '.join(map(str, WITHIN_MM))} mm", lambda within: within.keys() >= set(WITHIN_MM)
-)
-_KNOWN = AfterValidator(lambda within: {tolerance_mm: within[tolerance_mm] for tolerance_mm in WITHIN_MM})
-
-
-def _write_within(within_mm: Mapping[int, float | None]) -> dict[str, float | None]:
-    return {str(tolerance_mm): rounded(share) for tolerance_mm, share in within_mm.items()}
-
-
-_Bound = Annotated[float, Strict(), Field(allow_inf_nan=False)] | None
-_Ends = tuple[_Bound, _Bound] | None
-_INTERVAL_FIELDS: dict[str, Any] = {
-    column.path.partition(".")[0]: (
-        (Annotated[dict[str, _Ends], LIMITED], Field({})) if "." in column.path else (_Ends, None)
-    )
-    for column in VIEW_COLUMNS
-}
-_IntervalsJson = create_model("_IntervalsJson", __config__=ConfigDict(extra="ignore"), **_INTERVAL_FIELDS)
-"""Intervals nested like the numbers of a table; a missing one is undefined."""
-
-
-def _flat(nested: Any) -> dict[str, Interval | None]:
-    """Return the interval of each of ``VIEW_COLUMNS`` by its path."""
-    found = {path: column.value(vars(nested)) for path, column in COLUMN_BY_PATH.items()}
-    return {path: None if ends is None or None in ends else ends for path, ends in found.items()}
-
-
-def _nested(intervals: Mapping[str, Interval | None]) -> dict[str, Any]:
-    """Return intervals nested like the numbers of a table."""
-    nested: dict[str, Any] = {}
-    for path, ends in intervals.items():
-        group, _, key = path.rpartition(".")
-        (nested.setdefault(group, {}) if group else nested)[key] = rounded_interval(ends)
-    return nested
-
-
-@dataclass(frozen=True)
-class ViewScore:
-    """Metrics of one view; ``scale``, ``native`` and ``scaled`` are None without valid predictions.
-
-    ``scaled_constant`` is that of ``Reference``, None in results that were read from a file.
-    """
-
-    view_id: Name
-    scored_px: _Count
-    coverage: Share
-    rank_error: Share
-    scale: Size | None
-    native: Metrics
-    scaled: Metrics
-    within_mm: Annotated[
-        Mapping[int, float], json_as(Annotated[dict[int, Share], _WITHIN, LIMITED, _KNOWN], dict, _write_within)
-    ]
-    scaled_constant: Annotated[
-        tuple[float, float] | None, Field(exclude=True), BeforeValidator(lambda _: None)
-    ] = None
-
-
-@dataclass(frozen=True)
-class PublishedMatch:
-    """Scene of Table I that a config shows; ``same_optics`` is False if nothing but the optics differs."""
-
-    scene: Name
-    same_optics: _Flag
-
-
-@dataclass(frozen=True, kw_only=True)
-class Table:
-    """Metrics of one config: means over its views, and the median of their scale factors.
-
-    ``rank_error`` is None without views; ``reference`` are the config's reference errors,
-    and ``published`` is the scene of the paper's Table I that it shows, if any. ``split`` is None
-    for a config of one scene. ``truth_sigma_m`` is the standard deviation of the ground truth's depth, None where
-    it is exact. ``intervals`` has the 95 % bootstrap interval of each of ``VIEW_COLUMNS``, None where undefined.
-    ``groups`` has the tables of groups of views by grouping (see ``groups.GROUPINGS``) and group, of a config with
-    splits; they have no groups.
-    """
-
-    split: Annotated[str, Strict(), one_of(*SPLITS)] | None = None
-    truth_sigma_m: Annotated[float, Strict(), Field(ge=0)] | None = None
-    views: _Count
-    views_scored: _Count
-    coverage: Share | None
-    ranked: _Flag
-    rank_error: Share | None
-    native: Metrics
-    scaled: Metrics
-    scale_median: Size | None
-    within_mm: Annotated[
-        Mapping[int, float | None],
-        json_as(Annotated[dict[int, Share | None], _WITHIN, LIMITED, _KNOWN], dict, _write_within),
-    ]
-    reference: Reference
-    published: PublishedMatch | None = None
-    intervals: Annotated[
-        Mapping[str, Interval | None], Field(alias="ci95"), json_as(_IntervalsJson, _flat, _nested)
-    ] = field(default_factory=lambda: dict.fromkeys(COLUMN_BY_PATH))
-    groups: dict[Name, dict[Name, _GroupTable]] = field(default_factory=dict)
-
-    @property
-    def scored_of_views(self) -> str:
-        """Numbers of the views with a prediction and of all views."""
-        return f"{self.views_scored}/{self.views}"
-
-    @property
-    def is_comparable(self) -> bool:
-        """Whether the errors of valid predictions can be compared with those of other submissions.
-
-        Every view needs a prediction, the coverage must be at least ``MIN_COMPARABLE_COVERAGE``, and no metric may
-        be infinite. Otherwise, missing or enormous predictions could improve the comparison.
-        """
-        is_complete = 0 < self.views == self.views_scored
-        is_finite = all(metrics is not None and metrics.is_finite for metrics in (self.native, self.scaled))
-        return is_complete and is_finite and (self.coverage or 0.0) >= MIN_COMPARABLE_COVERAGE
-
-
-def _checked(scores: Any, is_predicted: bool) -> Any:
-    """Return a table or view, with no metrics if it has no predictions; raise the error of a field if they lack."""
-    if not is_predicted:
-        return replace(scores, native=None, scaled=None)
-    if scores.native is None or scores.scaled is None:
-        raise field_error("native or scaled is null", "metrics where there is a prediction", "conflict")
-    return scores
-
-
-def _checked_table(table: Table) -> Table:
-    checked: Table = _checked(table, table.views_scored > 0)
-    return replace(checked, ranked=table.ranked and table.rank_error is not None)
-
-
-def _without_absent(table: Table, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-    """Return the JSON object of a table, without the keys that only some tables have."""
-    absent = {
-        "split": table.split is None,
-        "truth_sigma_m": table.truth_sigma_m is None,
-        "groups": not table.groups,
-    }
-    return {key: value for key, value in write(table).items() if not absent.get(key)}
-
-
-def _without_groups(table: Any) -> Any:
-    """Return the JSON object of a table of a group, which has no groups of its own."""
-    return {key: value for key, value in table.items() if key != "groups"} if isinstance(table, dict) else table
-
-
-_Table = Annotated[Table, AfterValidator(_checked_table), WrapSerializer(_without_absent)]
-_GroupTable = Annotated[_Table, BeforeValidator(_without_groups)]
-_View = Annotated[ViewScore, AfterValidator(lambda view: _checked(view, view.coverage > 0))]
-
-
-def _check_tables(tables: object) -> object:
-    """Return ``tables``; raise the error of a field if they are too many, those of groups included."""
-    count = sum(_group_tables(table) for table in tables.values()) if isinstance(tables, dict) else 0
-    if count > _MAX_ENTRIES:
-        raise field_error(f"got {count} tables of groups", f"at most {_MAX_ENTRIES}", "size")
-    return _check_length(tables)
-
-
-def _group_tables(table: object) -> int:
-    """Return the number of groupings and groups of a table that has not been validated."""
-    groups = table.get("groups") if isinstance(table, dict) else None
-    if not isinstance(groups, dict):
-        return 0
-    return len(groups) + sum(len(of_grouping) for of_grouping in groups.values() if isinstance(of_grouping, dict))
 
 
 @dataclass(frozen=True)
@@ -266,7 +72,7 @@ class SubmissionIdentity:
     method: Name
     sha256: Annotated[str, Strict(), Field(pattern="^[0-9a-f]{64}$")]
     inputs: Annotated[str, Strict(), one_of(*INPUTS)] | None = None
-    uses_ground_truth: _Flag | None = None
+    uses_ground_truth: Flag | None = None
 
 
 @dataclass(frozen=True)
@@ -281,7 +87,7 @@ class IntervalMethod:
     """How intervals were computed."""
 
     method: Name
-    draws: _Count
+    draws: Count
     level: Share
 
 
@@ -311,8 +117,8 @@ class Result:
     submission: SubmissionIdentity
     software: SoftwareIdentity
     intervals: IntervalMethod | None = field(default_factory=lambda: IntervalMethod(**INTERVALS))
-    tables: Annotated[dict[Name, _Table], BeforeValidator(_check_tables)]
-    views: Annotated[list[_View], FailFast()]
+    tables: Annotated[dict[Name, TableJson], BeforeValidator(check_tables)]
+    views: Annotated[list[ViewJson], FailFast()]
     extended: Annotated[ExtendedResult | None, _EXTENDED] = None
 
     @property
@@ -375,11 +181,6 @@ def _result_type() -> TypeAdapter[Result]:
     return TypeAdapter(Annotated[Result, AfterValidator(_check_views)])
 
 
-@cache
-def _table_type() -> TypeAdapter[Table]:
-    return TypeAdapter(_GroupTable)
-
-
 def _check_views(result: Result) -> Result:
     view_ids = [view.view_id for view in result.views]
     if len(set(view_ids)) < len(view_ids):
@@ -411,21 +212,85 @@ def read_result(data: bytes, where: str) -> Result:
     return result
 
 
-def read_table(table: Mapping[str, Any]) -> Table:
-    """Return the table of a config from its JSON object, without groups.
-
-    Raises ``InputError`` if it is invalid.
-    """
-    problems: list[Problem] = []
-    found = validate_document(_table_type(), table, problems)
-    if found is None:
-        raise InputError.from_problems("the table of a result", problems)
-    return found
-
-
 def _describe_table(table: Table) -> str:
     if table.native is None or table.scaled is None:
         return "no predictions"
     note = "" if table.ranked else ", not ranked"
     error = "" if table.rank_error is None else f"rank error {table.rank_error:.4g}, "
     return f"{error}AbsRel {table.native.abs_rel:.4g} native, {table.scaled.abs_rel:.4g} scaled{note}"
+
+
+# Disclosed results: what a leaderboard with hidden ground truth returns of a result. Most numbers of a result help
+# a submitter to compute the ground truth: a view's scale factor, for example, is the ratio of the median true
+# depth to the median of the submitter's own depth. Only the rank error and the coverage of each config are
+# disclosed, rounded to ``DECIMALS``. The models name all that is disclosed, so that a number that is added to
+# results is hidden unless it is added here, too.
+
+DECIMALS = 3
+"""Decimals of the disclosed numbers."""
+
+MIN_VIEW_COVERAGE = 0.5
+"""Smallest coverage of a view that is scored if the ground truth is hidden; it limits probing by omission."""
+
+COVERAGE_RULE = f"predictions for at least {MIN_VIEW_COVERAGE * 100:.0f} % of the scored pixels of each view"
+
+
+def disclosed_number(value: float) -> float:
+    """Return a number as it is disclosed."""
+    return round(value, DECIMALS)
+
+
+_Number = Annotated[float, Strict(), Field(ge=0, le=1), AfterValidator(disclosed_number)] | None
+
+
+class DisclosedTable(StrictModel, extra="ignore"):
+    """Disclosed part of the table of a config; ``rank_error`` is None without scored views."""
+
+    coverage: _Number
+    ranked: bool
+    rank_error: _Number
+
+
+class DisclosedResult(StrictModel, extra="ignore", strict=False):
+    """Disclosed part of a result; ``hidden_truth`` distinguishes it from a whole result."""
+
+    protocol: Annotated[str, Strict(), one_of(PROTOCOL)]
+    hidden_truth: Literal[True] = True
+    dataset: DatasetIdentity
+    submission: SubmissionIdentity
+    software: SoftwareIdentity
+    tables: Annotated[dict[Name, DisclosedTable], LIMITED]
+
+
+def disclosed_json(result: bytes) -> bytes:
+    """Return the JSON of the disclosed part of a result; of a result that cannot be read, it has no numbers."""
+    content = validate_table(DisclosedResult, json.loads(result), [])
+    disclosed = {"hidden_truth": True} if content is None else content.model_dump(mode="json")
+    return (json.dumps(disclosed, indent=1, ensure_ascii=False) + "\n").encode()
+
+
+def is_disclosed(document: object) -> bool:
+    """Return whether a JSON value is the disclosed part of a result."""
+    return isinstance(document, dict) and document.get("hidden_truth") is True
+
+
+def read_disclosed(data: bytes, where: str) -> DisclosedResult:
+    """Return the disclosed result in ``data``; ``where`` names the source in error messages.
+
+    Raises ``InputError`` with all problems if it is none.
+    """
+    document, problems = parse_json(data)
+    content = None if problems else validate_table(DisclosedResult, document, problems)
+    if content is None:
+        raise InputError.from_problems(f"{where}: is not a disclosed result", problems)
+    return content
+
+
+def check_view_coverage(views: Sequence[ViewScore]) -> None:
+    """Raise ``SubmissionError`` if a view has less than ``MIN_VIEW_COVERAGE``.
+
+    The message names neither the view nor its coverage, because these tell how many omitted pixels are scored.
+    """
+    if any(view.coverage < MIN_VIEW_COVERAGE for view in views):
+        problem = Problem("missing", "", "a view has too few predictions on scored pixels", COVERAGE_RULE)
+        raise SubmissionError.from_problems("the archive", [problem])

@@ -29,7 +29,7 @@ from rebar_depth_bench.scoring.metrics import (
 )
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
 from rebar_depth_bench.scoring.reference import NO_REFERENCE, Errors, Reference, constant_errors, mean_reference
-from rebar_depth_bench.scoring.result import PublishedMatch, Table, ViewScore
+from rebar_depth_bench.scoring.table import PublishedMatch, Table, ViewScore
 from rebar_depth_bench.submission.declaration import NOT_DECLARED, Declaration
 
 ReadDepth = Callable[[str], Float[ndarray, "h w"]]

@@ -21,8 +21,8 @@ from rebar_depth_bench.scoring.metrics import (
     mean_metrics,
     metrics_at_scales,
 )
-from rebar_depth_bench.scoring.result import ViewScore
 from rebar_depth_bench.scoring.score import ViewTruth
+from rebar_depth_bench.scoring.table import ViewScore
 from rebar_depth_bench.scoring.truth import ConfigTruth
 from rebar_depth_bench.submission import SubmissionReader
 

@@ -15,9 +15,8 @@ import numpy as np
 from jaxtyping import Bool, UInt32
 from numpy import ndarray
 
-from rebar_depth_bench.data.array_cache import ArrayCache, open_cache
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars, with_axis
-from rebar_depth_bench.data.cache_entry import CacheContent, ViewArrays
+from rebar_depth_bench.data.cache import ArrayCache, CacheContent, ViewArrays, open_cache
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder
 from rebar_depth_bench.data.rows import EyeTruth, iterate_rows, truth_columns, truth_from_row
 from rebar_depth_bench.data.schema import NEAREST_STEEL, Assembly, Trajectory, ViewRecord
@@ -33,8 +32,8 @@ from rebar_depth_bench.scoring.reference import (
     reference_of_numbers,
     view_reference,
 )
-from rebar_depth_bench.scoring.result import PublishedMatch
 from rebar_depth_bench.scoring.score import ViewTruth
+from rebar_depth_bench.scoring.table import PublishedMatch
 
 _REFERENCE = slice(1, 1 + REFERENCE_NUMBERS)
 _WIDTH = 1 + REFERENCE_NUMBERS

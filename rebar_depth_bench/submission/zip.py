@@ -18,7 +18,7 @@ from dataclasses import dataclass
 
 from zlib_ng import zlib_ng
 
-from rebar_depth_bench.errors import EntryError, Problem, escape_text
+from rebar_depth_bench.errors import EntryError, Problem, ProblemCode, escape_text
 from rebar_depth_bench.reading import ByteSource
 
 _END_RECORD = struct.Struct("<4s4H2LH")
@@ -50,6 +50,10 @@ class ZipEntry:
     header_offset: int
     unix_mode: int
     disk: int
+
+    def problem(self, code: ProblemCode, found: str, expected: str = "") -> Problem:
+        """Return a problem of the entry, whose name is escaped."""
+        return Problem(code, escape_text(self.name), found, expected)
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,61 +266,59 @@ def _check_entry(source: ByteSource, entry: ZipEntry, directory_offset: int, lim
 def _name_problem(entry: ZipEntry) -> Problem | None:
     name = entry.name
     if any(ord(character) < 32 or ord(character) == 127 for character in name):
-        return Problem("name", escape_text(name), "the name has a control character", "plain text")
+        return entry.problem("name", "the name has a control character", "plain text")
     plain = name.removeprefix("./")  # It is dropped before names are compared.
     if plain.startswith("/") or "\\" in name or re.match(r"[A-Za-z]:", plain) or ".." in name.split("/"):
         expected = "a relative path without '..', '\\' or a drive"
-        return Problem("name", escape_text(name), "the name escapes the archive", expected)
+        return entry.problem("name", "the name escapes the archive", expected)
     return None
 
 
 def _type_problems(entry: ZipEntry) -> Iterator[Problem]:
-    name = escape_text(entry.name)
     kind = stat.S_IFMT(entry.unix_mode)
     if kind not in (0, stat.S_IFREG) and not (kind == stat.S_IFDIR and entry.name.endswith("/")):
         file_type = _FILE_TYPES.get(kind, f"of file type {kind:#o}")
-        yield Problem("kind", name, f"the entry is {file_type}", "a regular file")
+        yield entry.problem("kind", f"the entry is {file_type}", "a regular file")
     if entry.flags & _ENCRYPTED:
-        yield Problem("kind", name, "the entry is encrypted", "plain data")
+        yield entry.problem("kind", "the entry is encrypted", "plain data")
     if entry.flags & _PATCH_DATA:
-        yield Problem("kind", name, "the entry is patch data", "plain data")
+        yield entry.problem("kind", "the entry is patch data", "plain data")
     if entry.method not in (STORED, DEFLATED):
         expected = f"{STORED} (stored) or {DEFLATED} (deflated)"
-        yield Problem("kind", name, f"the compression method is {entry.method}", expected)
+        yield entry.problem("kind", f"the compression method is {entry.method}", expected)
     if entry.disk:
         found = f"the entry is on disk {entry.disk} of a multi-disk set"
-        yield Problem("kind", name, found, "a single complete file")
+        yield entry.problem("kind", found, "a single complete file")
 
 
 def _size_problems(entry: ZipEntry, limit: SizeLimit) -> Iterator[Problem]:
-    name = escape_text(entry.name)
     allowed = 0 if entry.name.endswith("/") else limit(entry.name)
     if allowed is not None and entry.size > allowed:
-        yield Problem("size", name, f"the declared size is {entry.size} bytes", f"at most {allowed}")
+        yield entry.problem("size", f"the declared size is {entry.size} bytes", f"at most {allowed}")
     if entry.method == STORED and entry.compressed_size != entry.size:
-        yield Problem("size", name, f"{entry.compressed_size} bytes are stored", f"the declared {entry.size}")
+        yield entry.problem("size", f"{entry.compressed_size} bytes are stored", f"the declared {entry.size}")
     # Deflate enlarges incompressible data by at most 5 bytes per block of 16 KiB.
     max_compressed = entry.size + entry.size // 1024 + 1024
     if entry.method == DEFLATED and entry.compressed_size > max_compressed:
         found = f"{entry.compressed_size} bytes are deflated for {entry.size}"
-        yield Problem("size", name, found, f"at most {max_compressed}")
+        yield entry.problem("size", found, f"at most {max_compressed}")
 
 
 def _check_local_header(source: ByteSource, entry: ZipEntry, directory_offset: int) -> tuple[int, list[Problem]]:
     """Compare the entry with its local header; return its data's byte offset (0 if unknown) and the problems."""
-    start, name = entry.header_offset, escape_text(entry.name)
+    start = entry.header_offset
     before_directory = f"it before the directory at {directory_offset}"
     if start + _LOCAL_HEADER.size > directory_offset:
-        return 0, [Problem("damaged", name, f"the data is declared at byte {start}", before_directory)]
+        return 0, [entry.problem("damaged", f"the data is declared at byte {start}", before_directory)]
     magic, _, flags, method, _, _, crc, compressed, size, name_length, extra_length = _LOCAL_HEADER.unpack(
         source.read_at(start, _LOCAL_HEADER.size)
     )
     if magic != b"PK\x03\x04":
-        return 0, [Problem("damaged", name, f"no local header was found at byte {start}", "one")]
+        return 0, [entry.problem("damaged", f"no local header was found at byte {start}", "one")]
     data_offset = start + _LOCAL_HEADER.size + name_length + extra_length
     end = data_offset + entry.compressed_size
     if end > directory_offset:
-        return 0, [Problem("damaged", name, f"the data ends at byte {end}", before_directory)]
+        return 0, [entry.problem("damaged", f"the data ends at byte {end}", before_directory)]
     raw_name = bytes(source.read_at(start + _LOCAL_HEADER.size, name_length))
     comparisons: list[tuple[str, object, object]] = [
         ("name", raw_name, entry.raw_name),
@@ -329,9 +331,8 @@ def _check_local_header(source: ByteSource, entry: ZipEntry, directory_offset: i
         comparisons += [("size", size, entry.size)] if size != _FULL32 else []
         comparisons += [("compressed size", compressed, entry.compressed_size)] if compressed != _FULL32 else []
     return data_offset, [
-        Problem(
+        entry.problem(
             "damaged",
-            name,
             f"the {field} in the local header is {escape_text(str(local))}",
             f"the directory's {escape_text(str(central))}",
         )
@@ -349,9 +350,8 @@ def _overlap_problems(checked: Sequence[CheckedEntry]) -> dict[int, tuple[Proble
     for index in located:
         start, end = checked[index].span
         if widest >= 0 and start < checked[widest].span[1]:
-            name, other = escape_text(checked[index].entry.name), escape_text(checked[widest].entry.name)
-            found = f"the data from byte {start} overlaps that of {other}"
-            problems[index] = (Problem("damaged", name, found, "separate data"),)
+            found = f"the data from byte {start} overlaps that of {escape_text(checked[widest].entry.name)}"
+            problems[index] = (checked[index].entry.problem("damaged", found, "separate data"),)
         if widest < 0 or end > checked[widest].span[1]:
             widest = index
     return problems
@@ -364,37 +364,36 @@ def read_data(source: ByteSource, checked: CheckedEntry) -> memoryview:
     ``EntryError`` if the data is corrupt or the file was truncated.
     """
     entry = checked.entry
-    name = escape_text(entry.name)
     try:
         data = source.read_at(checked.data_offset, entry.compressed_size)
     except EOFError as error:
         found = f"the archive was truncated while it was read: {error}"
-        raise EntryError(Problem("damaged", name, found)) from error
+        raise EntryError(entry.problem("damaged", found)) from error
     if entry.method == DEFLATED:
-        data = _inflate(name, data, entry.size)
+        data = _inflate(entry, data)
     # zlib-ng's CRC-32 is six times as fast as zlib's, whose time exceeds the rest of reading a view.
     crc = zlib_ng.crc32(data)
     if crc != entry.crc:
         found = f"the data is corrupt: its checksum is {crc:08x}"
-        raise EntryError(Problem("damaged", name, found, f"{entry.crc:08x}"))
+        raise EntryError(entry.problem("damaged", found, f"{entry.crc:08x}"))
     return data
 
 
-def _inflate(name: str, data: memoryview, size: int) -> memoryview:
-    inflater = zlib.decompressobj(-zlib.MAX_WBITS)
+def _inflate(entry: ZipEntry, data: memoryview) -> memoryview:
+    size, inflater = entry.size, zlib.decompressobj(-zlib.MAX_WBITS)
     try:
         # One byte more than declared suffices to detect a stream that is too long.
         inflated = inflater.decompress(data, size + 1)
     except zlib.error as error:
         found = f"the deflated data is corrupt ({error})"
-        raise EntryError(Problem("damaged", name, found, f"{size} bytes")) from error
+        raise EntryError(entry.problem("damaged", found, f"{size} bytes")) from error
     if len(inflated) > size:
         found = f"the data inflates to more than {size} bytes"
-        raise EntryError(Problem("size", name, found, f"the declared {size}"))
+        raise EntryError(entry.problem("size", found, f"the declared {size}"))
     if not inflater.eof or len(inflated) != size:
         found = f"the data inflates to {len(inflated)} bytes and stops"
-        raise EntryError(Problem("size", name, found, f"{size}"))
+        raise EntryError(entry.problem("size", found, f"{size}"))
     if inflater.unused_data:
         found = f"{len(inflater.unused_data)} bytes follow the deflated data"
-        raise EntryError(Problem("damaged", name, found, "none"))
+        raise EntryError(entry.problem("damaged", found, "none"))
     return memoryview(inflated)

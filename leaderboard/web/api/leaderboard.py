@@ -15,8 +15,8 @@ from leaderboard.web.api.schemas import Leaderboard, LeaderboardRow, Responses, 
 from leaderboard.web.cache import NO_STORE, REVALIDATE
 from rebar_depth_bench.reporting.tables import csv_text
 from rebar_depth_bench.scoring.columns import TABLE_COLUMNS
-from rebar_depth_bench.scoring.disclosure import DisclosedTable
 from rebar_depth_bench.scoring.protocol import PROTOCOL
+from rebar_depth_bench.scoring.result import DisclosedTable
 
 
 def entries_to_csv(rows: Sequence[LeaderboardEntry], hidden_truth: bool = False) -> str:

@@ -41,10 +41,10 @@ from rebar_depth_bench.reporting.html.published import (
 from rebar_depth_bench.reporting.html.rows import Cell, ScoreRow, table_row
 from rebar_depth_bench.reporting.published import OTHER_OPTICS_NOTE, load_published
 from rebar_depth_bench.scoring.columns import COVERAGE, METRICS, number
-from rebar_depth_bench.scoring.disclosure import DECIMALS as DISCLOSED_DECIMALS
-from rebar_depth_bench.scoring.disclosure import DisclosedTable
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
-from rebar_depth_bench.scoring.result import Table, read_table
+from rebar_depth_bench.scoring.result import DECIMALS as DISCLOSED_DECIMALS
+from rebar_depth_bench.scoring.result import DisclosedTable
+from rebar_depth_bench.scoring.table import Table, read_table
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 

@@ -17,16 +17,16 @@ from leaderboard.names import confused_scripts
 from leaderboard.service import Service
 from leaderboard.web.cache import NO_STORE, REVALIDATE
 from leaderboard.web.pages.static import static_path
+from rebar_depth_bench import software_version
 from rebar_depth_bench.errors import MAX_PROBLEMS_SHOWN, Problem, printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.html.assets import environment
 from rebar_depth_bench.reporting.html.rows import METRIC_HEADS
 from rebar_depth_bench.reporting.published import load_published
 from rebar_depth_bench.scoring.columns import number
-from rebar_depth_bench.scoring.disclosure import COVERAGE_RULE
 from rebar_depth_bench.scoring.protocol import PROTOCOL, WITHIN_MM
+from rebar_depth_bench.scoring.result import COVERAGE_RULE
 from rebar_depth_bench.submission.declaration import INPUTS, is_http_url
-from rebar_depth_bench.version import software_version
 
 
 def make_templates() -> Environment:

@@ -42,8 +42,8 @@ from rebar_depth_bench.reporting.html.page import (
 from rebar_depth_bench.reporting.html.rows import view_row
 from rebar_depth_bench.reporting.html.view_images import colour_bar_uri
 from rebar_depth_bench.scoring.comparison import compare
-from rebar_depth_bench.scoring.disclosure import read_disclosed
-from rebar_depth_bench.scoring.result import Result, ViewScore, read_result
+from rebar_depth_bench.scoring.result import Result, read_disclosed, read_result
+from rebar_depth_bench.scoring.table import ViewScore
 from rebar_depth_bench.submission import Declaration
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)

@@ -9,7 +9,7 @@ from typing import Any
 from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.extended.crossings.evaluate import crossing_samples, view_crossings
 from rebar_depth_bench.extended.crossings.reach import Reach, reaches
-from rebar_depth_bench.extended.ground_truth import load_steel_truth
+from rebar_depth_bench.extended.ground_truth import steel_truth
 from rebar_depth_bench.extended.measures import Samples
 from rebar_depth_bench.extended.predictions import NATIVE, SCALED, aligned_predictions
 from rebar_depth_bench.extended.result import CrossingsSource
@@ -43,7 +43,7 @@ def config_reaches(
 
     Raises ``DatasetError`` as ``load_steel_truth``.
     """
-    steel = load_steel_truth(evaluation.folder, config, progress)
+    steel = steel_truth(evaluation, config, progress)
 
     def view_samples(position: int) -> dict[str, Samples]:
         truth = steel.view(position)

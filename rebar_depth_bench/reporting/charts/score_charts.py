@@ -23,7 +23,7 @@ from rebar_depth_bench.reporting.charts.axes import (
     tick_label,
 )
 from rebar_depth_bench.scoring.columns import SCALE, number
-from rebar_depth_bench.scoring.result import Table, ViewScore
+from rebar_depth_bench.scoring.table import Table, ViewScore
 
 _LEFT, _RIGHT = 14.0, WIDTH - 14.0
 _ROW_HEIGHT_PX = 50

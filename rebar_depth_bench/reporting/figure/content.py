@@ -15,7 +15,8 @@ from rebar_depth_bench.reporting.published import (
 )
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE
 from rebar_depth_bench.scoring.reference import Reference
-from rebar_depth_bench.scoring.result import PublishedMatch, Result, Table
+from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.scoring.table import PublishedMatch, Table
 
 ANCHORED_MARK = "†"
 

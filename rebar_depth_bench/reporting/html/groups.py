@@ -9,7 +9,7 @@ from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.html.rows import Cell, ScoreRow, cells, table_row
 from rebar_depth_bench.scoring.columns import NATIVE, ONE_PIXEL, SCALED, SCALED_CONSTANT, with_reference
 from rebar_depth_bench.scoring.groups import GROUPINGS
-from rebar_depth_bench.scoring.result import Table
+from rebar_depth_bench.scoring.table import Table
 
 
 @dataclass(frozen=True)

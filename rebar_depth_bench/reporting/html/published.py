@@ -11,7 +11,8 @@ from markupsafe import Markup
 from rebar_depth_bench.reporting.charts.scatter import ScatterPoint, scatter_chart
 from rebar_depth_bench.reporting.html.rows import Cell, table_row
 from rebar_depth_bench.reporting.published import OTHER_OPTICS_MARK, PublishedRow, PublishedScene, load_published
-from rebar_depth_bench.scoring.result import Result, Table
+from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.scoring.table import Table
 
 _FIRST_LETTER = ord("A")
 

@@ -19,7 +19,7 @@ from rebar_depth_bench.scoring.columns import (
     WITHIN,
     Column,
 )
-from rebar_depth_bench.scoring.result import Table, ViewScore
+from rebar_depth_bench.scoring.table import Table, ViewScore
 
 METRIC_HEADS = tuple((metric.title, metric.unit, ARROWS[metric.better]) for metric in METRICS.values())
 """Name, unit and better direction of each metric, for the headings of tables."""

@@ -10,7 +10,7 @@ from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.names import config_of
 from rebar_depth_bench.reporting.html.rows import ScoreRow, view_row
 from rebar_depth_bench.reporting.html.view_images import ViewImages, ViewPanels, view_images
-from rebar_depth_bench.scoring.result import ViewScore
+from rebar_depth_bench.scoring.table import ViewScore
 
 VIEWS_SHOWN = 12
 """Default number of views of a config shown with images, about 150 kB each at 1280 x 720."""
@@ -20,9 +20,11 @@ VIEWS_SHOWN = 12
 class ShownView:
     """View shown with images: its numbers, images and the texts of their colour bars.
 
-    ``label`` is the text of its thumbnail.
+    ``error`` is its rank error, ``label`` the text of its thumbnail.
     """
 
+    view_id: str
+    error: float
     config: str
     label: str
     row: ScoreRow
@@ -65,10 +67,12 @@ def views_to_show(views: Sequence[ViewScore], count: int) -> list[ViewScore]:
     return worst_first[:worst] + [rest[(n + 1) * len(rest) // spread - 1] for n in range(spread)]
 
 
-def shown_views(panels: Iterable[ViewPanels], configs: Sequence[str]) -> list[ShownView]:
-    """Return the encoded views in the order of ``configs``, the worst view of each config first."""
-    encoded = [(_worst_first_key(view, configs), shown_view(view)) for view in panels]
-    return [view for _, view in sorted(encoded, key=lambda pair: pair[0])]
+def sorted_views(views: Iterable[ShownView], configs: Sequence[str]) -> list[ShownView]:
+    """Return encoded views in the order of ``configs``, the worst view of each config first."""
+    rank = {config: number for number, config in enumerate(configs)}
+    return sorted(
+        views, key=lambda view: (rank.get(config_of(view.view_id), len(rank)), -view.error, view.view_id)
+    )
 
 
 def shown_counts(shown: Sequence[ShownView], views: Mapping[str, int]) -> list[ShownCount]:
@@ -80,21 +84,14 @@ def shown_counts(shown: Sequence[ShownView], views: Mapping[str, int]) -> list[S
     return [count for count in counts if count.shown]
 
 
-def _worst_first_key(view: ViewPanels, configs: Sequence[str]) -> tuple[int, float, str]:
-    config = config_of(view.view_id)
-    return (
-        configs.index(config) if config in configs else len(configs),
-        -view.score.rank_error,
-        view.view_id,
-    )
-
-
 def shown_view(view: ViewPanels) -> ShownView:
     """Return the encoded images of a view with its numbers and the texts of the colour bars."""
     images = view_images(view)
     predicted = images.predicted_m
     row = view_row(view.score)
     return ShownView(
+        view_id=view.view_id,
+        error=view.score.rank_error,
         config=printable(config_of(view.view_id)),
         label=f"{row.name}\n{row.native[0].text}",
         row=row,

@@ -17,7 +17,7 @@ from PIL import Image
 from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS, colour_indices, robust_range
 from rebar_depth_bench.reporting.html.assets import data_uri
 from rebar_depth_bench.scoring.protocol import scored_pixels
-from rebar_depth_bench.scoring.result import ViewScore
+from rebar_depth_bench.scoring.table import ViewScore
 
 PANEL_WIDTH = 640
 """Approximate width of a panel, pixels; images are reduced by an integer factor."""

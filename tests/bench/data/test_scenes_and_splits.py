@@ -24,7 +24,7 @@ from rebar_depth_bench.extended.ground_truth import load_steel_truth
 from rebar_depth_bench.methods.base import Method, MethodInfo, MultiViewMethod, Prepared
 from rebar_depth_bench.methods.runner import predict
 from rebar_depth_bench.reporting.figure.content import figure_content
-from rebar_depth_bench.reporting.html.page import iter_view_panels
+from rebar_depth_bench.reporting.html.page import look_at_views
 from rebar_depth_bench.reporting.latex import latex_table
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
@@ -125,8 +125,8 @@ def test_reports_name_the_split(root: Path, tmp_path: Path) -> None:
 def test_report_shows_views_of_the_split(root: Path, tmp_path: Path) -> None:
     with open_evaluation(write_truth(root, tmp_path / "a.zip", "train"), root) as evaluation:
         result = score_evaluation(evaluation)
-        panels = list(iter_view_panels({"cages": list(result.views)}, evaluation))
-    assert [panel.view_id for panel in panels] == view_ids("train")
+        shown = look_at_views(evaluation, {"cages": list(result.views)}).shown
+    assert [view.view_id for view in shown] == view_ids("train")
 
 
 INFO = MethodInfo("shifted", "test", ("left_depth", "scene"), False, "here", "none")

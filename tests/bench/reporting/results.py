@@ -6,18 +6,13 @@ import math
 
 import numpy as np
 
+from rebar_depth_bench.reporting.html.view_browser import ShownView, shown_view
 from rebar_depth_bench.reporting.html.view_images import ViewPanels
 from rebar_depth_bench.scoring.metrics import DepthMetrics
 from rebar_depth_bench.scoring.reference import Errors, Reference
-from rebar_depth_bench.scoring.result import (
-    DatasetIdentity,
-    PublishedMatch,
-    Result,
-    SoftwareIdentity,
-    SubmissionIdentity,
-    ViewScore,
-)
+from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareIdentity, SubmissionIdentity
 from rebar_depth_bench.scoring.score import tabulate
+from rebar_depth_bench.scoring.table import PublishedMatch, ViewScore
 from rebar_depth_bench.submission.declaration import Declaration
 
 DECLARED = Declaration("rgb+K", uses_ground_truth=False)
@@ -90,3 +85,8 @@ def panels(view_id: str = "lattice/0000", score: ViewScore | None = None, factor
     truth[steel] = 0.5
     rgb = np.full((40, 60, 3), 128, np.uint8)
     return ViewPanels(view_id, rgb, truth, truth * np.float32(factor), steel, score or scored_view(view_id))
+
+
+def shown(view_id: str = "lattice/0000", score: ViewScore | None = None, factor: float = 1.6) -> ShownView:
+    """Return the encoded images of ``panels``."""
+    return shown_view(panels(view_id, score, factor))

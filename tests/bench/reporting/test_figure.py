@@ -26,7 +26,8 @@ from rebar_depth_bench.reporting.figure.svg import svg_bytes
 from rebar_depth_bench.reporting.figure.write import check_figure_path, write_figure
 from rebar_depth_bench.reporting.published import published_rows
 from rebar_depth_bench.scoring.reference import NO_REFERENCE
-from rebar_depth_bench.scoring.result import PublishedMatch, Result, ViewScore
+from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.scoring.table import PublishedMatch, ViewScore
 from rebar_depth_bench.submission.declaration import Declaration
 from tests.bench.reporting.results import (
     HOSTILE,

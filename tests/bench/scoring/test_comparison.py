@@ -20,14 +20,9 @@ from rebar_depth_bench.reporting.comparison_tables import comparison_csv, print_
 from rebar_depth_bench.scoring.columns import COLUMN_BY_PATH, VIEW_COLUMNS
 from rebar_depth_bench.scoring.comparison import Difference, compare
 from rebar_depth_bench.scoring.metrics import DepthMetrics
-from rebar_depth_bench.scoring.result import (
-    DatasetIdentity,
-    Result,
-    SoftwareIdentity,
-    SubmissionIdentity,
-    ViewScore,
-)
+from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareIdentity, SubmissionIdentity
 from rebar_depth_bench.scoring.score import tabulate
+from rebar_depth_bench.scoring.table import ViewScore
 
 
 def result_of(errors: np.ndarray, method: str = "m", config: str = "lattice", digest: str = "sha256:1") -> Result:

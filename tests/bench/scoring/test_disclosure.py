@@ -7,12 +7,7 @@ import json
 import pytest
 
 from rebar_depth_bench.errors import InputError, SubmissionError
-from rebar_depth_bench.scoring.disclosure import (
-    check_view_coverage,
-    disclosed_json,
-    is_disclosed,
-    read_disclosed,
-)
+from rebar_depth_bench.scoring.result import check_view_coverage, disclosed_json, is_disclosed, read_disclosed
 from tests.bench.reporting.results import result, scored_view
 
 RESULT = result(scored_view("lattice/0000", 0.12345), scored_view("pile/0000", 0.5, coverage=0.98765))

@@ -21,7 +21,6 @@ from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.scoring.bootstrap import end_percents, resample_scenes
 from rebar_depth_bench.scoring.comparison import compare
-from rebar_depth_bench.scoring.disclosure import disclosed_json
 from rebar_depth_bench.scoring.groups import (
     DISTANCE_EDGES_M,
     GROUPINGS,
@@ -31,7 +30,8 @@ from rebar_depth_bench.scoring.groups import (
     bin_names,
     positions_by_group,
 )
-from rebar_depth_bench.scoring.result import Result, read_result, read_table
+from rebar_depth_bench.scoring.result import Result, disclosed_json, read_result
+from rebar_depth_bench.scoring.table import read_table
 from tests.damage import change_manifest
 from tests.ground_truth import truth_of
 from tests.synthetic_dataset import write_archive, write_dataset, write_split_dataset

@@ -14,8 +14,8 @@ from numpy import ndarray
 from rebar_depth_bench import score
 from rebar_depth_bench.scoring.columns import rounded
 from rebar_depth_bench.scoring.metrics import is_valid_prediction, rank_error
-from rebar_depth_bench.scoring.result import ViewScore
 from rebar_depth_bench.scoring.score import ViewTruth, score_view, tabulate
+from rebar_depth_bench.scoring.table import ViewScore
 
 INVALID = (np.nan, 0.0, -0.0, -1.0, np.inf, -np.inf)
 

@@ -12,14 +12,9 @@ from hypothesis import strategies as st
 
 from rebar_depth_bench.scoring.metrics import DepthMetrics
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
-from rebar_depth_bench.scoring.result import (
-    DatasetIdentity,
-    Result,
-    SoftwareIdentity,
-    SubmissionIdentity,
-    ViewScore,
-)
+from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareIdentity, SubmissionIdentity
 from rebar_depth_bench.scoring.score import tabulate
+from rebar_depth_bench.scoring.table import ViewScore
 from rebar_depth_bench.submission import Declaration
 
 

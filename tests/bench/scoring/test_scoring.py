@@ -23,8 +23,8 @@ from rebar_depth_bench.data.codecs import decode, encode_depth, encode_mask
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.scoring.columns import rounded
 from rebar_depth_bench.scoring.protocol import interior
-from rebar_depth_bench.scoring.result import Table
 from rebar_depth_bench.scoring.score import ViewTruth, score_view, tabulate
+from rebar_depth_bench.scoring.table import Table
 from tests.damage import change_manifest
 from tests.ground_truth import truth_of
 

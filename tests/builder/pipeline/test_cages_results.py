@@ -14,8 +14,7 @@ from rebar_depth_bench.data.bars import BARS_FILE, read_bars
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.extended.evaluate import score_extended
 from rebar_depth_bench.extended.inspection.as_built import MEASURES
-from rebar_depth_bench.scoring.evaluation import open_evaluation
-from rebar_depth_bench.scoring.evaluation import score_evaluation
+from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
 from tests.building import RunBuild
 from tests.commands import run_in_process
 from tests.ground_truth import truth_of
