@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from importlib import import_module
-from importlib.metadata import version
+from importlib import import_module, metadata
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -62,7 +61,7 @@ DISTRIBUTION = "rebar-depth-bench"
 
 def software_version() -> str:
     """Return the version of the installed distribution."""
-    return version(DISTRIBUTION)
+    return metadata.version(DISTRIBUTION)
 
 
 def __dir__() -> list[str]:
