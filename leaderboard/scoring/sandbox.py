@@ -22,7 +22,7 @@ from rebar_depth_bench.scoring.table import ViewScore
 from rebar_depth_bench.submission import SubmissionMeta, open_submission
 
 if TYPE_CHECKING:
-    from rebar_depth_bench.reporting.html.view_browser import ShownView
+    from rebar_depth_bench.reporting.html.views import ShownView
 
 P = ParamSpec("P")
 T = TypeVar("T")

@@ -16,7 +16,7 @@ from rebar_depth_bench.output_options import add_output_file, prints_table
 from rebar_depth_bench.outputs import write_output
 from rebar_depth_bench.reporting.extended_tables import extended_csv, print_extended
 from rebar_depth_bench.reporting.html.page import write_report
-from rebar_depth_bench.reporting.html.view_browser import VIEWS_SHOWN
+from rebar_depth_bench.reporting.html.views import VIEWS_SHOWN
 from rebar_depth_bench.reporting.tables import groups_csv, print_table, result_csv
 from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
 from rebar_depth_bench.scoring.result import Result

@@ -16,8 +16,8 @@ from rebar_depth_bench.diagnosis.corrections import (
     logarithm_corrections,
     shape_corrections,
     unit_corrections,
+    valid_share,
 )
-from rebar_depth_bench.diagnosis.errors import valid_share
 from rebar_depth_bench.diagnosis.views import COLUMNS, DiagnosedView, diagnosed_view, positions_to_read
 from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.submission import SubmissionReader

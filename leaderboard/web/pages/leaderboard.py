@@ -31,15 +31,16 @@ from leaderboard.web.pages.selection import (
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.charts.scatter import ScatterPoint, scatter_chart
-from rebar_depth_bench.reporting.html.published import (
+from rebar_depth_bench.reporting.html.rows import Cell, ScoreRow, table_row
+from rebar_depth_bench.reporting.published import (
+    OTHER_OPTICS_NOTE,
     PaperRow,
     finite_interval,
+    load_published,
     published_mark,
     published_row,
     scatter_points,
 )
-from rebar_depth_bench.reporting.html.rows import Cell, ScoreRow, table_row
-from rebar_depth_bench.reporting.published import OTHER_OPTICS_NOTE, load_published
 from rebar_depth_bench.scoring.columns import COVERAGE, METRICS, number
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
 from rebar_depth_bench.scoring.result import DECIMALS as DISCLOSED_DECIMALS

@@ -40,7 +40,7 @@ from rebar_depth_bench.reporting.html.page import (
     views_by_config,
 )
 from rebar_depth_bench.reporting.html.rows import view_row
-from rebar_depth_bench.reporting.html.view_images import colour_bar_uri
+from rebar_depth_bench.reporting.html.views import colour_bar_uri
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.result import Result, read_disclosed, read_result
 from rebar_depth_bench.scoring.table import ViewScore

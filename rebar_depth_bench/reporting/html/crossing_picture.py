@@ -17,7 +17,7 @@ from rebar_depth_bench.extended.steel_truth import SteelTruth
 from rebar_depth_bench.geometry.cameras import fold_radius, project, transform
 from rebar_depth_bench.reporting.html.assets import data_uri
 from rebar_depth_bench.reporting.html.crossings import CrossingPicture, Mark
-from rebar_depth_bench.reporting.html.view_images import backdrop_image
+from rebar_depth_bench.reporting.html.views import backdrop_image
 from rebar_depth_bench.scoring.evaluation import Evaluation, View
 
 KINDS: Mapping[str, str] = {

@@ -27,19 +27,18 @@ from rebar_depth_bench.reporting.html.assets import environment, inline_script
 from rebar_depth_bench.reporting.html.crossing_picture import crossing_view
 from rebar_depth_bench.reporting.html.crossings import CrossingPicture, crossing_section
 from rebar_depth_bench.reporting.html.extended import extended_section
-from rebar_depth_bench.reporting.html.groups import config_groups
-from rebar_depth_bench.reporting.html.published import paper_scenes
-from rebar_depth_bench.reporting.html.rows import METRIC_HEADS, ScoreRow, table_row, view_row
-from rebar_depth_bench.reporting.html.view_browser import (
+from rebar_depth_bench.reporting.html.rows import METRIC_HEADS, ScoreRow, config_groups, table_row, view_row
+from rebar_depth_bench.reporting.html.views import (
     VIEWS_SHOWN,
     ShownView,
+    ViewPanels,
+    colour_bar_uri,
     shown_counts,
     shown_view,
     sorted_views,
     views_to_show,
 )
-from rebar_depth_bench.reporting.html.view_images import ViewPanels, colour_bar_uri
-from rebar_depth_bench.reporting.published import OTHER_OPTICS_NOTE, load_published
+from rebar_depth_bench.reporting.published import OTHER_OPTICS_NOTE, load_published, paper_scenes
 from rebar_depth_bench.scoring.evaluation import Evaluation, View
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
 from rebar_depth_bench.scoring.result import Result

@@ -1,10 +1,10 @@
-"""Table rows of configs and views: cells with their text and sort value."""
+"""Table rows of configs, views and groups of views: cells with their text and sort value."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
@@ -13,12 +13,16 @@ from rebar_depth_bench.scoring.columns import (
     COVERAGE,
     METRICS,
     NATIVE,
+    ONE_PIXEL,
     RANK_ERROR,
     SCALE,
     SCALED,
+    SCALED_CONSTANT,
     WITHIN,
     Column,
+    with_reference,
 )
+from rebar_depth_bench.scoring.groups import GROUPINGS
 from rebar_depth_bench.scoring.table import Table, ViewScore
 
 METRIC_HEADS = tuple((metric.title, metric.unit, ARROWS[metric.better]) for metric in METRICS.values())
@@ -112,3 +116,59 @@ def cell(column: Column, scores: Table | ViewScore) -> Cell:
     else:
         value, interval = column.value(scores), column.interval_text(scores.intervals.get(column.path))
     return Cell(column.text(value), value if value is not None and math.isfinite(value) else None, interval)
+
+
+@dataclass(frozen=True)
+class GroupRow:
+    """Cells of a group; the lists have the errors ``columns.REFERENCE_ERRORS``."""
+
+    row: ScoreRow
+    native: list[Cell]
+    one_pixel: list[Cell]
+    scaled: list[Cell]
+    constant: list[Cell]
+
+
+@dataclass(frozen=True)
+class GroupTable:
+    """Table of the groups of one grouping; ``definition`` is empty if a later version has defined the grouping."""
+
+    title: str
+    definition: str
+    rows: list[GroupRow]
+
+
+@dataclass(frozen=True)
+class ConfigGroups:
+    """Tables of the groups of a config with splits."""
+
+    name: str
+    tables: list[GroupTable]
+
+
+def config_groups(tables: Mapping[str, Table]) -> list[ConfigGroups]:
+    """Return the tables of groups of each config that has any."""
+    return [
+        ConfigGroups(
+            formatting.config_title(config, table.split),
+            [_group_table(grouping, groups) for grouping, groups in table.groups.items() if groups],
+        )
+        for config, table in tables.items()
+        if any(table.groups.values())
+    ]
+
+
+def _group_table(grouping: str, groups: Mapping[str, Table]) -> GroupTable:
+    definition = GROUPINGS[grouping].definition if grouping in GROUPINGS else ""
+    rows = [_group_row(group, table) for group, table in groups.items()]
+    return GroupTable(formatting.grouping_title(grouping), definition, rows)
+
+
+def _group_row(group: str, table: Table) -> GroupRow:
+    return GroupRow(
+        table_row(group, replace(table, split=None)),
+        native=cells(with_reference(NATIVE), table),
+        one_pixel=cells(ONE_PIXEL, table),
+        scaled=cells(with_reference(SCALED), table),
+        constant=cells(SCALED_CONSTANT, table),
+    )

@@ -16,9 +16,15 @@ from rebar_depth_bench import SubmissionWriter, score
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import iterate_rows
-from rebar_depth_bench.diagnosis.corrections import UNITS, best_shift
+from rebar_depth_bench.diagnosis.corrections import (
+    UNITS,
+    best_shift,
+    line_error,
+    mean_error,
+    median_ratio,
+    resistant_line,
+)
 from rebar_depth_bench.diagnosis.diagnose import diagnose
-from rebar_depth_bench.diagnosis.errors import line_error, mean_error, median_ratio, resistant_line
 from rebar_depth_bench.diagnosis.views import (
     COLUMNS,
     MAX_VIEWS,

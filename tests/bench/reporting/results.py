@@ -6,8 +6,7 @@ import math
 
 import numpy as np
 
-from rebar_depth_bench.reporting.html.view_browser import ShownView, shown_view
-from rebar_depth_bench.reporting.html.view_images import ViewPanels
+from rebar_depth_bench.reporting.html.views import ShownView, ViewPanels, shown_view
 from rebar_depth_bench.scoring.metrics import DepthMetrics
 from rebar_depth_bench.scoring.reference import Errors, Reference
 from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareIdentity, SubmissionIdentity

@@ -17,13 +17,13 @@ from rebar_depth_bench.reporting.charts.axes import LogAxis, decade_axis, log_ax
 from rebar_depth_bench.reporting.charts.score_charts import alignment_chart, scale_chart, views_chart
 from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS
 from rebar_depth_bench.reporting.html.page import WORST_SHOWN, render_report
-from rebar_depth_bench.reporting.html.view_browser import shown_view
-from rebar_depth_bench.reporting.html.view_images import (
+from rebar_depth_bench.reporting.html.views import (
     ViewPanels,
     depth_image,
     depth_range,
     error_image,
     error_limit_cm,
+    shown_view,
     signed_error,
     view_images,
 )

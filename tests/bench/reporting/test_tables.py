@@ -17,9 +17,9 @@ from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.charts.scatter import ScatterPoint, place_labels, scatter_chart
 from rebar_depth_bench.reporting.charts.score_charts import alignment_chart
 from rebar_depth_bench.reporting.html.page import render_report
-from rebar_depth_bench.reporting.html.published import paper_scenes
 from rebar_depth_bench.reporting.html.rows import table_row, view_row
-from rebar_depth_bench.reporting.html.view_browser import views_to_show
+from rebar_depth_bench.reporting.html.views import views_to_show
+from rebar_depth_bench.reporting.published import paper_scenes
 from rebar_depth_bench.scoring.columns import COVERAGE, RANK_ERROR
 from rebar_depth_bench.scoring.reference import Errors
 from rebar_depth_bench.scoring.result import Result
