@@ -313,8 +313,8 @@ class ArrayCache:
         try:
             return self._entry.view(view_id)
         except _DAMAGE as error:
-            message = f"{self._entry.path}: the cache is damaged again after it was written: {_reason(error)}"
-            raise DatasetError(message) from None
+            found = f"the cache is damaged again after it was written: {_reason(error)}"
+            raise DatasetError(f"{self._entry.path}: {found}") from None
 
 
 def open_cache(content: CacheContent) -> ArrayCache:
@@ -367,8 +367,7 @@ def _open_in(folder: Path, content: CacheContent, anew: bool) -> _Entry:
 def _write(path: Path, content: CacheContent) -> _Entry:
     """Write an entry and return it open. It appears complete or not at all, without locks between processes."""
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    prefix = f"{path.name}."
-    descriptor, name = tempfile.mkstemp(prefix=prefix, suffix=".tmp", dir=path.parent)
+    descriptor, name = tempfile.mkstemp(".tmp", f"{path.name}.", path.parent)
     unfinished = Path(name)
     try:
         with os.fdopen(descriptor, "wb") as file:
@@ -382,8 +381,8 @@ def _write(path: Path, content: CacheContent) -> _Entry:
         unfinished.unlink(missing_ok=True)
     limit_size(path.parent)
     if not path.exists():
-        limit = f"at most {CACHE_BYTES.value()} bytes ({CACHE_BYTES.variable})"
-        _warn_once(f"{path}: {entry.source.size} bytes are not kept, expected a cache of {limit}")
+        limit = f"{CACHE_BYTES.value()} bytes ({CACHE_BYTES.variable})"
+        _warn_once(f"{path}: {entry.source.size} bytes are not kept, expected a cache of at most {limit}")
     return entry
 
 

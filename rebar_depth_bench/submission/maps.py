@@ -79,9 +79,9 @@ def _parse_header(
     if not _FLOAT_DESCR.fullmatch(descr[0]):
         actual = escape_text(descr[0]) if descr[0] else "structured"
         raise EntryError(Problem("invalid", name, f"the dtype is {actual}", "float16, float32 or float64"))
-    actual_shape = [escape_text(size) for size in shapes[0].replace("L", "").replace(",", " ").split()]
+    actual_shape = shapes[0].replace("L", "").replace(",", " ").split()
     if actual_shape != [str(size) for size in shape]:
-        actual = " x ".join(actual_shape) if actual_shape else "a single value"
+        actual = " x ".join(map(escape_text, actual_shape)) if actual_shape else "a single value"
         raise EntryError(Problem("invalid", name, f"the shape is {actual}", f"{format_shape(shape)} (H x W)"))
     return np.dtype(descr[0].replace("|", "=")), fortran[0] == "True", data_offset
 
