@@ -104,8 +104,8 @@ class Column:
     ``path`` is its place in the JSON, keys joined by dots; ``of_view`` is its place in a view if that differs.
     ``title`` names it, ``unit`` is that of the shown value, which is the value times ``factor`` with ``decimals``.
     ``as_text``, if set, makes the text of the value. ``head`` is a heading of three lines for narrow columns.
-    ``has_interval`` means that it has a value of each view and an interval. ``statistic`` makes the number of a
-    table from those of its views. Views without predictions have only numbers that are ``of_all_views``.
+    ``statistic`` makes the number of a table from those of its views. Views without predictions have only numbers
+    that are ``of_all_views``.
     """
 
     path: str
@@ -117,7 +117,6 @@ class Column:
     as_text: Callable[[float | None], str] | None = None
     head: str = ""
     of_view: str = ""
-    has_interval: bool = True
     of_all_views: bool = False
     statistic: Literal["mean", "median"] = "mean"
 
@@ -202,7 +201,6 @@ def _reference(kind: str, name: str) -> Column:
         unit=metric.unit,
         decimals=metric.decimals,
         head=f"{'1 pixel' if kind == 'one_pixel' else 'const.'}\n{metric.title}\n{metric.unit}",
-        has_interval=False,
     )
 
 
@@ -247,10 +245,8 @@ CONSTANT, ONE_PIXEL, SCALED_CONSTANT = (
     for kind in ("constant", "one_pixel", "scaled_constant")
 )
 """Columns of the reference errors of a config."""
-_VIEWS, _SCORED, _RANKED = (
-    Column(name, name.replace("_", " "), has_interval=False) for name in ("views", "views_scored", "ranked")
-)
-VIEWS_SCORED = Column("scored_of_views", "views", as_text=str, head="views\nscored\n/all", has_interval=False)
+_VIEWS, _SCORED, _RANKED = (Column(name, name.replace("_", " ")) for name in ("views", "views_scored", "ranked"))
+VIEWS_SCORED = Column("scored_of_views", "views", as_text=str, head="views\nscored\n/all")
 """Column of the numbers of scored and of all views, as text; the JSON has the two numbers."""
 TABLE_COLUMNS = (_VIEWS, _SCORED, COVERAGE, _RANKED, *VIEW_COLUMNS[1:], *CONSTANT, *ONE_PIXEL, *SCALED_CONSTANT)
 """Columns of a config's table in frames and CSV."""

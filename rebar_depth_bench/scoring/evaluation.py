@@ -30,7 +30,7 @@ from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareIdentity, SubmissionIdentity
 from rebar_depth_bench.scoring.score import ReadDepth, score_views
 from rebar_depth_bench.scoring.table import ViewScore
-from rebar_depth_bench.scoring.truth import ConfigTruth, config_truth
+from rebar_depth_bench.scoring.truth import config_truth
 from rebar_depth_bench.submission import Declaration, EntryError, SubmissionReader, open_submission
 from rebar_depth_bench.submission.declaration import NOT_DECLARED
 from rebar_depth_bench.submission.maps import Depth
@@ -214,19 +214,14 @@ def score_evaluation(evaluation: Evaluation, *, workers: int | None = None, prog
     """Score an open submission as ``score`` does. Raises ``SubmissionError`` if an entry is invalid."""
     submission, folder = evaluation.submission, evaluation.folder
     read = _Entries(submission, folder.expected_views())
-    truths: dict[str, ConfigTruth] = {}
-
-    def opened() -> Iterator[tuple[str, ConfigTruth]]:
-        for config in evaluation.configs:
-            truths[config.name] = config_truth(folder, config, progress)
-            yield config.name, truths[config.name]
+    truths = ((config.name, config_truth(folder, config, progress)) for config in evaluation.configs)
 
     def each(name: str, work: Callable[[int], ViewScore], positions: Sequence[int]) -> list[ViewScore]:
         return map_with_progress(work, positions, workers, progress, f"scoring {name}", len(positions))
 
     with ThreadPoolExecutor(1) as pool:
         sha256 = pool.submit(submission.sha256)
-        tables, views = score_views(opened(), read.depth, evaluation.declared, each)
+        tables, views = score_views(truths, read.depth, evaluation.declared, each)
         read.check([view.view_id for view in views])
         return Result(
             dataset=DatasetIdentity(folder.digest, folder.version),

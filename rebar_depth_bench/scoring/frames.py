@@ -31,12 +31,6 @@ _DIFFERENCE_COLUMNS = (
 )
 
 
-def make_frame(rows: Sequence[Mapping[str, Any]]) -> DataFrame:
-    """Return rows with equal keys as the frame of ``frame_of_values``; without rows it has no columns."""
-    names = list(rows[0]) if rows else []
-    return frame_of_values(names, [[row[name] for name in names] for row in rows])
-
-
 def frame_of_values(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> DataFrame:
     """Return rows of one value per column as a frame, which has the columns even if there are no rows.
 

@@ -23,7 +23,7 @@ from rebar_depth_bench.reporting.extended_tables import extended_csv
 from rebar_depth_bench.reporting.tables import frame_csv, result_csv
 from rebar_depth_bench.scoring.columns import TABLE_COLUMNS, VIEW_COLUMNS
 from rebar_depth_bench.scoring.comparison import compare
-from rebar_depth_bench.scoring.frames import make_frame
+from rebar_depth_bench.scoring.frames import frame_of_values
 from rebar_depth_bench.scoring.result import Result, read_result
 from tests.bench.reporting.pages import Page
 from tests.bench.reporting.results import HOSTILE, result, scored_view, unpredicted_view
@@ -81,10 +81,10 @@ def test_comparison_has_one_row_per_metric(two_configs: Result) -> None:
 
 
 def test_integers_with_missing_values_stay_integers() -> None:
-    frame = make_frame([{"count": 3, "text": "a"}, {"count": None, "text": None}])
+    frame = frame_of_values(("count", "text"), [(3, "a"), (None, None)])
     assert isinstance(frame["count"].dtype, pd.Int64Dtype)
     assert frame_csv(frame) == "count,text\n3,a\n,\n"
-    assert frame_csv(make_frame([])) == ""
+    assert frame_csv(frame_of_values((), [])) == ""
 
 
 def test_csv_without_rows_has_the_header(two_configs: Result) -> None:
