@@ -33,16 +33,14 @@ from numpy import ndarray
 
 import rebar_depth_bench as rdb
 from benchmarks.timing import print_markdown
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
 from rebar_depth_bench.detections.score import score_crossings
 from rebar_depth_bench.extended.evaluate import score_extended
 from rebar_depth_bench.extended.predictions import NATIVE
-from rebar_depth_bench.scoring.evaluation import open_evaluation
-from rebar_depth_bench.scoring.rounding import rounded
-from rebar_depth_bench.scoring.score import score_evaluation
+from rebar_depth_bench.names import config_of
+from rebar_depth_bench.scoring.columns import rounded
+from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
 from rebar_depth_bench.submission import SubmissionReader, open_submission
-from rebar_depth_bench.view_ids import config_of
 
 OPENING_SHARE = 0.06
 """Size of the opening that removes bars, as a share of the width of the image."""

@@ -20,8 +20,8 @@ from scipy.ndimage import gaussian_filter, shift
 
 from benchmarks.timing import print_markdown
 from rebar_depth_bench import SubmissionWriter
-from rebar_depth_bench.data.dataset import iterate_rows
 from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.data.rows import iterate_rows
 from rebar_depth_bench.diagnosis.corrections import UNITS
 from rebar_depth_bench.diagnosis.diagnose import diagnose
 from rebar_depth_bench.scoring.evaluation import open_evaluation

@@ -18,11 +18,10 @@ from typing import Any
 
 import rebar_depth_bench as rdb
 from benchmarks.timing import machine_description, median_seconds, print_markdown
-from rebar_depth_bench.data.columns import COLUMNS
-from rebar_depth_bench.data.dataset import iterate_undecoded
-from rebar_depth_bench.data.decoding import RowDecoder
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.view_ids import TEST_SPLIT
+from rebar_depth_bench.data.rows import RowDecoder, iterate_undecoded
+from rebar_depth_bench.data.schema import COLUMNS
+from rebar_depth_bench.names import TEST_SPLIT
 
 REPEATS = 7
 WORKERS = (0, 1, 2)

@@ -43,9 +43,9 @@ from dataset_builder.pipeline.work_units import UnitResult, WorkUnit
 from dataset_builder.scene.mesh_ply import write_mesh_ply
 from dataset_builder.specs.config_specs import ConfigSpec, RandomViewsSpec
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.data.digests import file_sha256
-from rebar_depth_bench.data.eye_view import EyeView
+from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.data.rows import EyeView
 from rebar_depth_bench.geometry.cameras import Camera, ideal_K
 
 WIDTH, HEIGHT = 32, 18

@@ -32,9 +32,9 @@ from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, MeasureFamily
 from rebar_depth_bench.extended.ground_truth import ConfigSteelTruth, load_steel_truth
 from rebar_depth_bench.extended.predictions import SCALED
 from rebar_depth_bench.extended.steel_truth import SteelTruth
-from rebar_depth_bench.scoring.ground_truth import config_truth
 from rebar_depth_bench.scoring.protocol import interior
 from rebar_depth_bench.scoring.score import score_view
+from rebar_depth_bench.scoring.truth import config_truth
 from rebar_depth_bench.submission import SubmissionReader, open_submission
 
 REPEATS = 15

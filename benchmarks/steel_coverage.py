@@ -22,13 +22,12 @@ from cards.steel import range_text
 from dataset_builder.cameras.steel_distance import Cylinders
 from rebar_depth_bench.atomic_io import write_text
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars
-from rebar_depth_bench.data.dataset import iterate_rows
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.data.trajectory import CENTRE
+from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
+from rebar_depth_bench.data.rows import iterate_rows
+from rebar_depth_bench.data.schema import CENTRE
 from rebar_depth_bench.geometry.cameras import camera_centre
+from rebar_depth_bench.names import TEST_SPLIT
 from rebar_depth_bench.scoring.protocol import scored_pixels, single_bar_pixels
-from rebar_depth_bench.view_ids import TEST_SPLIT
 
 HEADS = ["config", "radius, m", "views", "scored", "nearest steel, m", "steel depth, m", "steel, %", "interior, %"]
 NEAREST, NEAR, FAR, STEEL, INTERIOR, SINGLE = range(6)

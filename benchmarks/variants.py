@@ -18,8 +18,7 @@ from PIL import Image, ImageDraw
 
 import rebar_depth_bench as rdb
 from benchmarks.timing import print_markdown
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
 
 TILE_PX = (480, 270)
 """Width and height of a tile, pixels."""

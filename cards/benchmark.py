@@ -32,9 +32,9 @@ from rebar_depth_bench.extended.predictions import ONCE
 from rebar_depth_bench.methods import AnyMethod, MultiViewMethod, own_methods
 from rebar_depth_bench.reporting.crossing_texts import FITS_NOTE, REACH_NOTE
 from rebar_depth_bench.scoring.bootstrap import BLOCK_VIEWS, INTERVALS, MIN_BLOCKS, RESAMPLES
+from rebar_depth_bench.scoring.columns import SIGNIFICANT_DIGITS
 from rebar_depth_bench.scoring.groups import GROUPINGS
 from rebar_depth_bench.scoring.protocol import DELTA1_RATIO, MIN_COMPARABLE_COVERAGE, PROTOCOL, WITHIN_MM
-from rebar_depth_bench.scoring.rounding import SIGNIFICANT_DIGITS
 from rebar_depth_bench.submission import INPUTS
 
 _CONTACTS = {"lattice": "375", "pier": "4,860", "pile": "15"}

@@ -10,13 +10,24 @@ from huggingface_hub import DatasetCardData
 
 from cards.steel import depth_text, steel_by_config
 from cards.templates import render
-from rebar_depth_bench.data.columns import COLUMN_DESCRIPTIONS, column_kind, features
-from rebar_depth_bench.data.config_tables import Assembly, Colour, References, Scene
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.trajectory import CENTRE, NEAREST_STEEL, AnyTrajectory, Survey, Trajectory
-from rebar_depth_bench.reporting.formatting import DASH
+from rebar_depth_bench.data.manifest import DatasetConfig
+from rebar_depth_bench.data.schema import (
+    CENTRE,
+    COLUMN_DESCRIPTIONS,
+    NEAREST_STEEL,
+    AnyTrajectory,
+    Assembly,
+    Colour,
+    References,
+    Scene,
+    Survey,
+    Trajectory,
+    column_kind,
+    features,
+)
+from rebar_depth_bench.names import TEST_SPLIT
+from rebar_depth_bench.scoring.columns import DASH
 from rebar_depth_bench.scoring.protocol import PROTOCOL
-from rebar_depth_bench.view_ids import TEST_SPLIT
 
 if TYPE_CHECKING:
     from datasets import DatasetInfo

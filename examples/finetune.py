@@ -46,18 +46,13 @@ from torch.nn import functional
 import rebar_depth_bench as rdb
 from rebar_depth_bench.atomic_io import atomic_replace, write_text
 from rebar_depth_bench.console import ProgressBars, duration_text, print_notice, run_command
-from rebar_depth_bench.data.dataset import check_columns
 from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.data.rows import check_columns
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.methods import find_method
 from rebar_depth_bench.methods.runner import predict
-from rebar_depth_bench.reporting.formatting import (
-    coverage_percent,
-    metric_cell,
-    number,
-    rank_error_cell,
-    scaled_constants,
-)
+from rebar_depth_bench.reporting.formatting import scaled_constants
+from rebar_depth_bench.scoring.columns import COVERAGE, NATIVE, RANK_ERROR, SCALED, number, texts
 
 CONFIG = "cages"
 TARGETS = ((CONFIG, "validation"), ("lattice", "test"), ("pile", "test"))
@@ -324,8 +319,7 @@ def score_rows(root: str, method_names: Sequence[str], out: Path) -> Iterator[Se
                 predict(method, root, archive, configs=[config], split=split, progress=bars.update)
             table = rdb.score(archive, root).tables[config]
             scored.append((method.info.name.partition(" ")[0], table))
-            errors = (metric_cell(metrics, "abs_rel") for metrics in (table.native, table.scaled))
-            cells = (rank_error_cell(table.rank_error), *errors, coverage_percent(table.coverage))
+            cells = texts((RANK_ERROR, NATIVE[0], SCALED[0], COVERAGE), table)
             yield (title, method.info.name.partition(" ")[0], str(table.views), *cells)
         for name, (abs_rel, _) in scaled_constants(scored).items():
             yield title, f"{name}, scaled", str(table.views), "", "", number(abs_rel, 4), ""

@@ -27,18 +27,24 @@ from numpy import ndarray
 
 from rebar_depth_bench.console import print_notice, run_command
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars, with_axis
-from rebar_depth_bench.data.decoding import RowDecoder
-from rebar_depth_bench.data.eye_view import CAMERA_KINDS, EyeTruth, camera_from_row, truth_columns, truth_from_row
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
+from rebar_depth_bench.data.rows import (
+    CAMERA_KINDS,
+    EyeTruth,
+    RowDecoder,
+    camera_from_row,
+    truth_columns,
+    truth_from_row,
+)
 from rebar_depth_bench.data.shards import rows_at
 from rebar_depth_bench.errors import InputError, SubmissionError, escape_text, printable
 from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid, transform
+from rebar_depth_bench.names import config_of
 from rebar_depth_bench.outputs import write_output
 from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.metrics import is_valid_prediction, median, median_scale
 from rebar_depth_bench.scoring.protocol import scored_pixels
 from rebar_depth_bench.submission import EntryError
-from rebar_depth_bench.view_ids import config_of
 
 COLUMNS = ("left_rgb", "right_rgb", *truth_columns("left"), *(f"right_{kind}" for kind in CAMERA_KINDS))
 COLOURS = np.array([[0, 114, 178], [213, 94, 0], [0, 158, 115], [160, 72, 138]], np.uint8)  # Of archives.

@@ -13,10 +13,10 @@ from leaderboard.db.engine import database_errors, sqlite_path
 from leaderboard.log_setup import set_up_logs
 from leaderboard.settings import Settings, read_settings
 from leaderboard.storage.archive_store import make_folder, state_lock
+from rebar_depth_bench import software_version
 from rebar_depth_bench.console import run_command
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.terminal import use_plain_characters
-from rebar_depth_bench.version import software_version
 
 _STORED = ("state_dir", "db")
 _WITH_ARCHIVES = (*_STORED, "archives")

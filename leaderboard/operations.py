@@ -24,12 +24,12 @@ from leaderboard.settings import Settings
 from leaderboard.storage import retention
 from leaderboard.storage.archive_store import ArchiveStore, archive_problem
 from leaderboard.storage.backup import back_up
+from rebar_depth_bench import software_version
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.verification import file_problems
 from rebar_depth_bench.errors import InputError, StorageError, problem_summary
 from rebar_depth_bench.reporting.formatting import counted
 from rebar_depth_bench.reporting.tables import csv_text
-from rebar_depth_bench.version import software_version
 
 _LOG = structlog.get_logger("worker")
 Cell = str | float | None

@@ -24,7 +24,7 @@ from leaderboard.db.versions import CurrentRankings, VersionReader
 from leaderboard.settings import Settings
 from leaderboard.storage.archive_store import ArchiveStore, delete_abandoned_uploads, make_folder
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, DatasetFolder, open_folder
-from rebar_depth_bench.view_ids import TEST_SPLIT, config_of
+from rebar_depth_bench.names import TEST_SPLIT, config_of
 
 SIMULTANEOUS_CHECKS = 2
 MIN_FREE_BYTES = 1 << 30

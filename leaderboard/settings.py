@@ -17,7 +17,7 @@ from sqlalchemy.exc import ArgumentError
 from rebar_depth_bench.errors import InputError, Problem
 from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.reading import parse_toml, read_file
-from rebar_depth_bench.submission.metadata import is_http_url
+from rebar_depth_bench.submission.declaration import is_http_url
 from rebar_depth_bench.validation import format_location, short_repr
 
 GIB = 1 << 30

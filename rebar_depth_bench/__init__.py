@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from importlib import import_module
+from importlib import import_module, metadata
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from rebar_depth_bench.bar_crossings.table import crossings
     from rebar_depth_bench.data.bars import bars
     from rebar_depth_bench.data.loading import load
-    from rebar_depth_bench.data.torch_loader import torch_loader
+    from rebar_depth_bench.data.torch import torch_loader
     from rebar_depth_bench.errors import (
         CalibrationError,
         DatasetError,
@@ -19,9 +19,9 @@ if TYPE_CHECKING:
         RebarDepthError,
         SubmissionError,
     )
-    from rebar_depth_bench.scoring.result import Result, Table
-    from rebar_depth_bench.scoring.score import score
-    from rebar_depth_bench.scoring.view_score import ViewScore
+    from rebar_depth_bench.scoring.evaluation import score
+    from rebar_depth_bench.scoring.result import Result
+    from rebar_depth_bench.scoring.table import Table, ViewScore
     from rebar_depth_bench.submission import SubmissionWriter
 
 __all__ = [
@@ -47,13 +47,21 @@ _MODULE_BY_NAME = {
     "bars": "data.bars",
     "crossings": "bar_crossings.table",
     "load": "data.loading",
-    "score": "scoring.score",
+    "score": "scoring.evaluation",
     "torch_loader": "data.torch_loader",
     "SubmissionWriter": "submission",
     "Result": "scoring.result",
     "Table": "scoring.result",
     "ViewScore": "scoring.result",
 }
+
+
+DISTRIBUTION = "rebar-depth-bench"
+
+
+def software_version() -> str:
+    """Return the version of the installed distribution."""
+    return metadata.version(DISTRIBUTION)
 
 
 def __dir__() -> list[str]:

@@ -24,9 +24,7 @@ from rebar_depth_bench.errors import (
     problem_summary,
 )
 from rebar_depth_bench.reading import parse_json
-from rebar_depth_bench.scoring.disclosure import DisclosedResult, is_disclosed, read_disclosed
-from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.scoring.result_io import read_result
+from rebar_depth_bench.scoring.result import DisclosedResult, Result, is_disclosed, read_disclosed, read_result
 from rebar_depth_bench.validation import Expected, StrictModel, one_of, text, validate_table, whole_number
 
 _MAX_INTEGER = 2**63 - 1
@@ -139,8 +137,8 @@ class Response:
             result = (read_disclosed if is_disclosed(document) else read_result)(self.body, where)
         except InputError as error:
             raise AnswerError(str(error)) from None
-        if archive_sha256 not in (None, result.submission_sha256):
-            found = server_text(str(result.submission_sha256))
+        if archive_sha256 not in (None, result.submission.sha256):
+            found = server_text(str(result.submission.sha256))
             raise AnswerError(f"{where} is of the archive with SHA-256 {found}, expected {archive_sha256}")
         return result
 

@@ -26,7 +26,7 @@ from rebar_depth_bench.leaderboard_answers import (
     server_text,
 )
 from rebar_depth_bench.limits import JSON_BYTES
-from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.reading import open_regular
 
 POLL_INTERVAL_S = 2.0

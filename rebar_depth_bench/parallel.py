@@ -1,4 +1,4 @@
-"""Ordered parallel map over threads with bounded memory."""
+"""Progress callbacks, and an ordered parallel map over threads with bounded memory."""
 
 from __future__ import annotations
 
@@ -9,7 +9,14 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
 from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.progress import Progress
+
+Progress = Callable[[str, int, int], None]
+"""Callback with the arguments: name of the task, number of steps done, total number of steps."""
+
+
+def silent(task: str, done: int, total: int) -> None:
+    """Ignore progress; the default callback."""
+
 
 _Item = TypeVar("_Item")
 _Done = TypeVar("_Done")

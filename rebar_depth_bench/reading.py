@@ -13,14 +13,16 @@ import math
 import mmap
 import os
 import re
+import shutil
 import stat
 import tomllib
 import weakref
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO, NoReturn, Protocol
 
 from rebar_depth_bench.errors import InputError, Problem, ProblemCode, escape_text
 from rebar_depth_bench.limits import Limit
+from rebar_depth_bench.names import NAME_LETTERS, PATH_PATTERN
 
 MAX_NESTING = 64
 """Largest number of JSON or TOML containers inside each other."""
@@ -150,6 +152,54 @@ def _nesting_exceeds(value: Any, levels: int) -> bool:
         if not containers:
             return False
     return True
+
+
+def path_below(folder: Path, name: str) -> Path:
+    """Return the path of ``name``, one or more names joined by ``/``, below ``folder``.
+
+    Raises ``InputError`` for any other text, such as an absolute path or one with ``..``.
+    """
+    if not re.fullmatch(PATH_PATTERN, name):
+        raise InputError(
+            f"{folder}: {escape_text(name)} is not a path in this folder, expected names of {NAME_LETTERS}"
+        )
+    return folder / name
+
+
+def is_below(path: str) -> bool:
+    """Return whether a relative path from a file stays in its folder: it names no other files of the machine."""
+    parts = PurePosixPath(path).parts
+    return bool(parts) and path.isprintable() and ".." not in parts and not path.startswith(("/", "~"))
+
+
+def check_no_links(folder: Path, *names: str) -> None:
+    """Raise ``InputError`` if one of ``names`` below ``folder``, or a folder on the way to it, is a symbolic link.
+
+    ``folder`` itself may be a link: the user named it.
+    """
+    for name in names:
+        path = folder
+        for part in Path(name).parts:
+            path = path / part
+            if path.is_symlink():
+                raise InputError(
+                    f"{path}: is a symbolic link, expected a file or folder (links are not followed here)"
+                )
+
+
+def remove_file(path: Path) -> None:
+    """Delete a regular file; links, folders and missing files are left alone."""
+    try:
+        if stat.S_ISREG(os.lstat(path).st_mode):
+            path.unlink()
+    except FileNotFoundError:
+        return
+
+
+def remove_folder(path: Path) -> None:
+    """Delete a folder with its content, without following links; a link or a missing folder is left alone."""
+    if path.is_dir() and not path.is_symlink():
+        shutil.rmtree(path, ignore_errors=True)
 
 
 # For smaller reads, pread is cheaper than a mapping and its page faults.

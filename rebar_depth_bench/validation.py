@@ -18,12 +18,13 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from typing import Annotated, Any, TypeGuard, TypeVar, get_args
 
-from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, Strict, ValidationError
+from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, Strict, TypeAdapter, ValidationError
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, core_schema
 
 from rebar_depth_bench.errors import Problem, ProblemCode
 
 Model = TypeVar("Model", bound=BaseModel)
+Document = TypeVar("Document")
 _MAX_REPR_CHARACTERS = 60
 _MAX_MAGNITUDE = 1e9
 """Largest accepted magnitude: far above any number of a scene or model file, with powers that stay finite."""
@@ -150,6 +151,15 @@ def validate_table(
         return model.model_validate(values, context=context)
     except ValidationError as error:
         problems += [_problem(details, model, where) for details in error.errors(include_url=False)]
+        return None
+
+
+def validate_document(schema: TypeAdapter[Document], values: object, problems: list[Problem]) -> Document | None:
+    """Return the validated value of a JSON document that is no model, as ``validate_table`` does of a table."""
+    try:
+        return schema.validate_python(values)
+    except ValidationError as error:
+        problems += [_problem(details, BaseModel, "") for details in error.errors(include_url=False)]
         return None
 
 

@@ -11,8 +11,8 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from rebar_depth_bench.data.config_tables import ViewRecord
-from rebar_depth_bench.data.digests import views_digest
+from rebar_depth_bench.data.files import views_digest
+from rebar_depth_bench.data.schema import ViewRecord
 
 
 def copy_dataset(root: Path, target: Path) -> Path:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.scoring.ground_truth import ConfigTruth, config_truth
+from rebar_depth_bench.scoring.truth import ConfigTruth, config_truth
 
 
 def truth_of(root: Path, config: str, split: str | None = None) -> ConfigTruth:

@@ -47,16 +47,13 @@ from dataset_builder.pipeline.plan import BUILD_FOLDER
 from rebar_depth_bench.bar_crossings.definition import Crossings, scene_crossings
 from rebar_depth_bench.bar_crossings.table import CROSSINGS_FILE, folder_crossings
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars
-from rebar_depth_bench.data.columns import EYES
-from rebar_depth_bench.data.config_tables import ViewRecord
-from rebar_depth_bench.data.dataset import iterate_rows
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.eye_view import EyeView, eye_from_row
-from rebar_depth_bench.data.location import local_folder
-from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
+from rebar_depth_bench.data.files import local_folder
+from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_folder
+from rebar_depth_bench.data.rows import EyeView, eye_from_row, iterate_rows
+from rebar_depth_bench.data.schema import EYES, ViewRecord
 from rebar_depth_bench.data.verification import file_problems
 from rebar_depth_bench.errors import DatasetError, InputError
-from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.parallel import Progress, silent
 
 _CROSSING_TOLERANCE_M = 1e-9
 """Largest difference of crossings from those of the bars."""

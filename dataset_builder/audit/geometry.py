@@ -23,7 +23,7 @@ from dataset_builder.specs.config_specs import RandomViewsSpec
 from dataset_builder.specs.manifest_specs import cage_spec, trajectory_spec
 from dataset_builder.user_files.make_assembly import assembly_bars
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.data.dataset_config import DatasetConfig
+from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 
 MAX_AXIS_RATIO = 1.2

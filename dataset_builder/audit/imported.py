@@ -25,12 +25,11 @@ from dataset_builder.audit.checks import (
 from dataset_builder.audit.geometry import polyline_distance_m
 from dataset_builder.audit.independent_depth import project_into
 from rebar_depth_bench.data.bars import Bar, with_axis
-from rebar_depth_bench.data.config_tables import Imported
-from rebar_depth_bench.data.dataset import iterate_rows
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.eye_view import EyeTruth
+from rebar_depth_bench.data.manifest import DatasetConfig
+from rebar_depth_bench.data.rows import EyeTruth, iterate_rows
+from rebar_depth_bench.data.schema import Imported
 from rebar_depth_bench.geometry.cameras import camera_centre
-from rebar_depth_bench.progress import Progress
+from rebar_depth_bench.parallel import Progress
 from rebar_depth_bench.scoring.protocol import interior
 
 SIGMAS = 4.0

@@ -22,7 +22,7 @@ from dataset_builder.scene.raycast import RayCaster
 from dataset_builder.scene.shapes.point_sets import SurfaceSampler, covering_points, farthest_points, short_path
 from dataset_builder.scene.shapes.solids import merge_meshes
 from dataset_builder.specs.config_specs import RandomViewsSpec, RigSpec, RolledStation, Station, SurveySpec
-from rebar_depth_bench.data.columns import EYES
+from rebar_depth_bench.data.schema import EYES
 from rebar_depth_bench.errors import InputError, Problem
 from rebar_depth_bench.geometry.cameras import inverse_rigid
 

@@ -22,7 +22,7 @@ from dataset_builder.specs.config_specs import (
     TrajectorySpec,
 )
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.data.trajectory import NEAREST_STEEL
+from rebar_depth_bench.data.schema import NEAREST_STEEL
 from rebar_depth_bench.geometry.cameras import look_at, matrix_product, rigid, vector_length
 
 GOLDEN_TURN_DEG = 360.0 * (5**0.5 - 1) / 2

@@ -26,7 +26,7 @@ from dataset_builder.specs.config_specs import (
 )
 from rebar_depth_bench.console import ProgressBars, Rate, require_extra
 from rebar_depth_bench.errors import InputError, printable
-from rebar_depth_bench.view_ids import SPLITS
+from rebar_depth_bench.names import SPLITS
 
 if TYPE_CHECKING:
     from dataset_builder.pipeline.blender_process import Submit

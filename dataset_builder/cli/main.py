@@ -12,14 +12,13 @@ from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from rebar_depth_bench import software_version
 from rebar_depth_bench.console import ProgressBars, print_notice, run_command
 from rebar_depth_bench.errors import InputError, escape_text
+from rebar_depth_bench.names import PATH_PATTERN, SPLITS
 from rebar_depth_bench.output_options import add_output_file, check_outputs, prints_table
 from rebar_depth_bench.outputs import write_output
-from rebar_depth_bench.paths import PATH_PATTERN
 from rebar_depth_bench.terminal import use_plain_characters
-from rebar_depth_bench.version import software_version
-from rebar_depth_bench.view_ids import SPLITS
 
 BUILD = "build"
 _STRAY_SHOWN = 5

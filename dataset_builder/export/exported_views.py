@@ -13,15 +13,18 @@ from jaxtyping import Bool, Float32
 from numpy import ndarray
 from PIL import Image
 
-from rebar_depth_bench.data.columns import EYES
-from rebar_depth_bench.data.config_tables import ViewRecord
-from rebar_depth_bench.data.dataset import iterate_undecoded
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.decoding import RowDecoder
-from rebar_depth_bench.data.eye_view import camera_from_row, truth_columns, truth_from_row
+from rebar_depth_bench.data.manifest import DatasetConfig
+from rebar_depth_bench.data.rows import (
+    RowDecoder,
+    camera_from_row,
+    iterate_undecoded,
+    truth_columns,
+    truth_from_row,
+)
+from rebar_depth_bench.data.schema import EYES, ViewRecord
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.geometry.cameras import Camera
-from rebar_depth_bench.view_ids import scene_of
+from rebar_depth_bench.names import scene_of
 
 _COLUMNS = ("view_id", "baseline_m", *(name for eye in EYES for name in (f"{eye}_rgb", *truth_columns(eye))))
 

@@ -7,8 +7,7 @@ from typing import Any
 
 from dataset_builder.export.camera_formats import json_lines
 from dataset_builder.export.exported_views import CameraView, exported_files
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.manifest import DatasetFolder
+from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder
 from rebar_depth_bench.geometry.cameras import Camera
 
 LICENCE = "CC BY 4.0 (https://creativecommons.org/licenses/by/4.0/)"

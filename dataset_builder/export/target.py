@@ -12,8 +12,7 @@ from rebar_depth_bench.atomic_io import exclusive_lock, temporary_target, write_
 from rebar_depth_bench.data.manifest import DatasetFolder
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.limits import JSON_BYTES
-from rebar_depth_bench.paths import check_no_links, remove_file
-from rebar_depth_bench.reading import parse_json, read_file
+from rebar_depth_bench.reading import check_no_links, parse_json, read_file, remove_file
 from rebar_depth_bench.validation import StrictModel, one_of, validate_table
 
 MARKER = "export.json"

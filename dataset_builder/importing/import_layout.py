@@ -48,8 +48,7 @@ from pydantic import Strict, model_validator
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.key_lines import with_lines
 from rebar_depth_bench.limits import TOML_BYTES
-from rebar_depth_bench.paths import is_below
-from rebar_depth_bench.reading import parse_toml, read_file
+from rebar_depth_bench.reading import is_below, parse_toml, read_file
 from rebar_depth_bench.validation import (
     UNITS_M,
     Expected,

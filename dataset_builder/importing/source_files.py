@@ -19,7 +19,7 @@ from rebar_depth_bench.geometry.cameras import inverse_rigid, pixel_rays, swap_c
 from rebar_depth_bench.geometry.stereo_calibration import Calibration, StereoCalibration
 from rebar_depth_bench.limits import CELL_BYTES, TABLE_BYTES, TOML_BYTES
 from rebar_depth_bench.reading import parse_json, read_file
-from rebar_depth_bench.submission.formats import FORMATS
+from rebar_depth_bench.submission.entries import FORMATS
 from rebar_depth_bench.validation import UNITS_M, short_repr
 
 Grid = tuple[int, int]

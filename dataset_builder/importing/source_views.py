@@ -27,7 +27,7 @@ from dataset_builder.importing.source_files import (
 )
 from rebar_depth_bench.captures.camera_files import CaptureCameras, cameras_of_table
 from rebar_depth_bench.captures.image_files import IMAGE_SUFFIXES, common_shape, read_image
-from rebar_depth_bench.data.columns import EYES, column_kind
+from rebar_depth_bench.data.schema import EYES, column_kind
 from rebar_depth_bench.errors import EntryError, InputError, Problem, escape_text
 from rebar_depth_bench.geometry.stereo_calibration import (
     StereoCalibration,
@@ -36,7 +36,7 @@ from rebar_depth_bench.geometry.stereo_calibration import (
     lens_K,
     right_from_left,
 )
-from rebar_depth_bench.paths import NAME_LETTERS, NAME_PATTERN
+from rebar_depth_bench.names import NAME_LETTERS, NAME_PATTERN
 
 _SUFFIXES: Mapping[str, tuple[str, ...]] = {
     "rgb": IMAGE_SUFFIXES,

@@ -30,7 +30,7 @@ from dataset_builder.specs.config_specs import SceneConfigSpec
 from dataset_builder.specs.file_specs import CageFileSpec, MeshFileSpec
 from rebar_depth_bench.atomic_io import write_bytes
 from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.parallel import Progress, silent
 
 
 @dataclass

@@ -13,8 +13,8 @@ from PIL import Image, ImageDraw
 
 from dataset_builder.cameras.trajectories import subset
 from rebar_depth_bench.atomic_io import write_bytes
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.decoding import RowDecoder
+from rebar_depth_bench.data.manifest import DatasetConfig
+from rebar_depth_bench.data.rows import RowDecoder
 from rebar_depth_bench.data.shards import rows_at
 
 TILE_PX = (320, 180)

@@ -18,7 +18,7 @@ from dataset_builder.pipeline.plan import BUILD_FOLDER, STAGING_KEY, ConfigPlan
 from rebar_depth_bench.atomic_io import exclusive_lock, temporary_target, write_error, write_text
 from rebar_depth_bench.bar_crossings.table import CROSSINGS_FILE
 from rebar_depth_bench.data.bars import BARS_FILE
-from rebar_depth_bench.data.digests import file_sha256
+from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.data.manifest import (
     MANIFEST_FILE,
     MANIFEST_FORMAT,
@@ -28,8 +28,8 @@ from rebar_depth_bench.data.manifest import (
     validated_folder,
 )
 from rebar_depth_bench.errors import InputError, OutputError
-from rebar_depth_bench.paths import check_no_links, remove_file, remove_folder
-from rebar_depth_bench.view_ids import SPLITS, TEST_SPLIT
+from rebar_depth_bench.names import SPLITS, TEST_SPLIT
+from rebar_depth_bench.reading import check_no_links, remove_file, remove_folder
 
 MESHES = "meshes"
 PICTURES = "pictures"

@@ -35,6 +35,7 @@ from dataset_builder.pipeline.folder import (
 from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, config_parameters, generator_versions
 from dataset_builder.pipeline.shards import Staging, pack_shard, read_staged_record, split_into_shards
 from dataset_builder.specs.config_specs import SceneConfigSpec
+from rebar_depth_bench import software_version
 from rebar_depth_bench.atomic_io import write_bytes, write_text
 from rebar_depth_bench.bar_crossings.definition import Crossings, crossing_parameters
 from rebar_depth_bench.bar_crossings.table import (
@@ -44,14 +45,18 @@ from rebar_depth_bench.bar_crossings.table import (
     write_crossings,
 )
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars, write_bars
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.digests import file_sha256, parameters_digest, views_digest
-from rebar_depth_bench.data.manifest import MANIFEST_FILE, MANIFEST_FORMAT, DatasetFolder, validated_folder
-from rebar_depth_bench.paths import remove_file
-from rebar_depth_bench.scoring.ground_truth import reference_errors
+from rebar_depth_bench.data.files import file_sha256, parameters_digest, views_digest
+from rebar_depth_bench.data.manifest import (
+    MANIFEST_FILE,
+    MANIFEST_FORMAT,
+    DatasetConfig,
+    DatasetFolder,
+    validated_folder,
+)
+from rebar_depth_bench.names import SPLITS, TEST_SPLIT
+from rebar_depth_bench.reading import remove_file
 from rebar_depth_bench.scoring.protocol import PROTOCOL
-from rebar_depth_bench.version import software_version
-from rebar_depth_bench.view_ids import SPLITS, TEST_SPLIT
+from rebar_depth_bench.scoring.truth import reference_errors
 
 STRIP = f"{PICTURES}/scenes.webp"
 """Strip with one view of each kind of assembly."""

@@ -19,14 +19,12 @@ from dataset_builder.scene.model import Note
 from dataset_builder.specs.config_specs import SceneConfigSpec
 from dataset_builder.specs.manifest_specs import cage_spec
 from rebar_depth_bench.atomic_io import write_bytes
-from rebar_depth_bench.data.config_tables import ViewRecord
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.digests import file_sha256
-from rebar_depth_bench.data.manifest import MANIFEST_FILE, DatasetFolder, open_folder
-from rebar_depth_bench.data.trajectory import RANDOM_VIEWS
+from rebar_depth_bench.data.files import file_sha256
+from rebar_depth_bench.data.manifest import MANIFEST_FILE, DatasetConfig, DatasetFolder, open_folder
+from rebar_depth_bench.data.schema import RANDOM_VIEWS, ViewRecord
 from rebar_depth_bench.errors import DatasetError, InputError, Problem
+from rebar_depth_bench.names import TEST_SPLIT
 from rebar_depth_bench.validation import format_location, short_repr
-from rebar_depth_bench.view_ids import TEST_SPLIT
 
 _SHOWN_DIFFERENCES = 5
 

@@ -21,11 +21,9 @@ import pyarrow.parquet as pq
 
 from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.data import codecs
-from rebar_depth_bench.data.columns import COLUMNS, ROW_SCHEMA, column_kind, features
-from rebar_depth_bench.data.config_tables import ViewRecord
-from rebar_depth_bench.data.eye_view import CAMERA_KINDS, EyeTruth, EyeView, absent_cell
-from rebar_depth_bench.data.parquet import open_parquet
-from rebar_depth_bench.data.shards import rows_table
+from rebar_depth_bench.data.rows import CAMERA_KINDS, EyeTruth, EyeView, absent_cell
+from rebar_depth_bench.data.schema import COLUMNS, ROW_SCHEMA, ViewRecord, column_kind, features
+from rebar_depth_bench.data.shards import open_parquet, rows_table
 from rebar_depth_bench.errors import InputError, Problem, escape_text
 from rebar_depth_bench.reading import open_regular, parse_json
 from rebar_depth_bench.reporting.colormap import depth_preview

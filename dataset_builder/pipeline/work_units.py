@@ -22,7 +22,7 @@ from dataset_builder.pipeline.plan import ConfigPlan
 from dataset_builder.pipeline.shards import VIEWS_PER_SHARD, Staging, split_into_shards
 from dataset_builder.specs.config_specs import ConfigSpec
 from rebar_depth_bench.atomic_io import write_bytes, write_text
-from rebar_depth_bench.data.digests import file_sha256
+from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.errors import BuildError, InputError
 from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.reading import read_file

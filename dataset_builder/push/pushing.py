@@ -27,8 +27,8 @@ from huggingface_hub.utils import disable_progress_bars, validate_repo_id  # typ
 from huggingface_hub.utils.sha import git_hash
 
 from dataset_builder.push.hub_errors import hub_errors
-from rebar_depth_bench.data.digests import file_sha256
-from rebar_depth_bench.data.location import local_folder
+from rebar_depth_bench import software_version
+from rebar_depth_bench.data.files import file_sha256, local_folder
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, DatasetFolder, open_folder
 from rebar_depth_bench.data.verification import file_problems
 from rebar_depth_bench.errors import (
@@ -40,9 +40,8 @@ from rebar_depth_bench.errors import (
     printable,
     problem_summary,
 )
-from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.reading import parse_json
-from rebar_depth_bench.version import software_version
 
 _FILES_AT_ONCE = 8
 _IGNORE_NOTHING = "# Every file of the commit is uploaded.\n"

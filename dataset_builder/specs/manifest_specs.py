@@ -19,9 +19,8 @@ from dataset_builder.specs.config_specs import (
     SurveySpec,
     TrajectorySpec,
 )
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.manifest import MANIFEST_FILE
-from rebar_depth_bench.data.trajectory import RANDOM_VIEWS, SURVEY
+from rebar_depth_bench.data.manifest import MANIFEST_FILE, DatasetConfig
+from rebar_depth_bench.data.schema import RANDOM_VIEWS, SURVEY
 from rebar_depth_bench.errors import DatasetError, Problem
 from rebar_depth_bench.validation import StrictModel, format_location, validate_table
 

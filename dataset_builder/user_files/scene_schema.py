@@ -56,8 +56,7 @@ from dataset_builder.specs.config_specs import DomeSpec, RigSpec, RingSpec, Surv
 from dataset_builder.specs.file_specs import Origin, PlacementSpec, Trust, Up
 from dataset_builder.specs.selection import KEYS, Selection
 from rebar_depth_bench.errors import InputError, Problem
-from rebar_depth_bench.paths import is_below
-from rebar_depth_bench.reading import parse_toml
+from rebar_depth_bench.reading import is_below, parse_toml
 from rebar_depth_bench.validation import (
     UNITS_M,
     Expected,

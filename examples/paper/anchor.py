@@ -27,8 +27,9 @@ from rebar_depth_bench.console import ProgressBars, add_data
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.parallel import map_with_progress
 from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation
-from rebar_depth_bench.scoring.ground_truth import ViewTruth, config_truth
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
+from rebar_depth_bench.scoring.score import ViewTruth
+from rebar_depth_bench.scoring.truth import config_truth
 from rebar_depth_bench.submission import SubmissionReader
 
 if TYPE_CHECKING:

@@ -12,18 +12,18 @@ import numpy as np
 
 from outputs import only_config
 from rebar_depth_bench.captures.folder import is_capture, open_capture
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.digests import file_sha256
-from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.data.files import file_sha256
+from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
 from rebar_depth_bench.errors import EntryError, InputError, SubmissionError, printable
-from rebar_depth_bench.progress import silent
+from rebar_depth_bench.names import config_of, split_of
+from rebar_depth_bench.parallel import silent
 from rebar_depth_bench.reading import FileSource
-from rebar_depth_bench.scoring.ground_truth import verified_views
+from rebar_depth_bench.scoring.truth import verified_views
 from rebar_depth_bench.submission import ExpectedViews, open_submission
-from rebar_depth_bench.submission.formats import FORMATS, Depth
-from rebar_depth_bench.submission.metadata import METADATA_NAME, parse_metadata
-from rebar_depth_bench.submission.zip_directory import DirectoryError, read_directory
-from rebar_depth_bench.view_ids import config_of, split_of
+from rebar_depth_bench.submission.declaration import METADATA_NAME, parse_metadata
+from rebar_depth_bench.submission.entries import FORMATS
+from rebar_depth_bench.submission.maps import Depth
+from rebar_depth_bench.submission.zip import DirectoryError, read_directory
 
 _MAX_SHAPE, _MAX_ENTRIES = (1024, 4096), 100_000
 """Bounds of views that an archive may hold but that are not read, and of the number of its entries."""

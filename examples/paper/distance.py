@@ -23,18 +23,18 @@ from numpy import ndarray
 
 from outputs import add_outputs, flat_table, number, run_script, write_outputs
 from rebar_depth_bench.console import ProgressBars, add_archive, add_data
-from rebar_depth_bench.data.dataset_config import DatasetConfig
+from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.extended.crossings.config import config_reaches
 from rebar_depth_bench.extended.ground_truth import has_bar_ids
 from rebar_depth_bench.reporting.crossing_texts import reach_sentence
-from rebar_depth_bench.scoring.bootstrap import INTERVALS, Resampling, interval, resample
-from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation
-from rebar_depth_bench.scoring.ground_truth import config_truth
+from rebar_depth_bench.scoring import bootstrap
+from rebar_depth_bench.scoring.bootstrap import Resampling, interval, resample_views
+from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation, score_evaluation
 from rebar_depth_bench.scoring.metrics import mean
-from rebar_depth_bench.scoring.score import score_evaluation
 from rebar_depth_bench.scoring.single_bar import mean_single_bar, single_bar_scores
-from rebar_depth_bench.scoring.view_score import ViewScore, protocol_indices, resample_views
+from rebar_depth_bench.scoring.table import ViewScore
+from rebar_depth_bench.scoring.truth import config_truth
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -67,7 +67,7 @@ def resampling_of(views: pd.DataFrame) -> Resampling:
     """Return the resamples of views of one config: of whole scenes if it has several."""
     if views["by_scene"].any():
         return resample_views(views["view_id"].tolist(), by_scene=True)
-    return resample(views["index"].tolist())
+    return bootstrap.resample(views["index"].tolist())
 
 
 def view_table(evaluation: Evaluation, config: DatasetConfig, scored: Mapping[str, ViewScore]) -> pd.DataFrame:
@@ -77,7 +77,7 @@ def view_table(evaluation: Evaluation, config: DatasetConfig, scored: Mapping[st
     columns = {
         "config": config.name,
         "by_scene": config.has_splits,
-        "index": protocol_indices(truths.view_ids),
+        "index": bootstrap.protocol_indices(truths.view_ids),
         "view_id": truths.view_ids,
         "distance_m": np.array(truths.medians_m),
         "scale": np.array([score.scale for score in scores], np.float64),
@@ -175,7 +175,7 @@ def run(options: argparse.Namespace) -> None:
         scales = {view_id: score.scale for view_id, score in scores.items()}
         with_bars = [present[name] for name in names if has_bar_ids(present[name])]
         reaches = {one.name: config_reaches(evaluation, one, scales, progress=bars.update) for one in with_bars}
-        provenance = evaluation.provenance().to_dict() | {"intervals": INTERVALS}
+        provenance = evaluation.provenance().to_dict() | {"intervals": bootstrap.INTERVALS}
     slopes = [scale_slope(name, {name: of_config}) for name, of_config in by_config.items()]
     slopes += [scale_slope("all", by_config)] if len(by_config) > 1 else []
     bin_rows = [row for one in by_config.values() for row in distance_bins(one, options.bins_per_decade)]

@@ -34,9 +34,9 @@ from rebar_depth_bench.methods import find_method
 from rebar_depth_bench.methods.runner import predict_views
 from rebar_depth_bench.parallel import map_with_progress
 from rebar_depth_bench.scoring.bootstrap import INTERVALS, interval, resample
+from rebar_depth_bench.scoring.evaluation import ArchiveIdentity, Provenance
 from rebar_depth_bench.scoring.metrics import is_valid_prediction, mean, median_scale
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE
-from rebar_depth_bench.scoring.provenance import ArchiveIdentity, Provenance
 
 PROTOCOL = "rebar-kitti-eigen-1"
 EIGEN_SPLIT = Path(__file__).with_name("kitti_eigen_test_697.txt")  # As distributed with Monodepth.

@@ -30,12 +30,11 @@ from rebar_depth_bench.console import ProgressBars, add_workers
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.parallel import map_with_progress
 from rebar_depth_bench.scoring.bootstrap import INTERVALS
-from rebar_depth_bench.scoring.ground_truth import ViewTruth
-from rebar_depth_bench.scoring.metrics import METRIC_NAMES, mean
-from rebar_depth_bench.scoring.provenance import ArchiveIdentity, Provenance
-from rebar_depth_bench.scoring.result import tabulate
-from rebar_depth_bench.scoring.score import score_view
-from rebar_depth_bench.scoring.view_score import ViewScore
+from rebar_depth_bench.scoring.columns import METRICS
+from rebar_depth_bench.scoring.evaluation import ArchiveIdentity, Provenance
+from rebar_depth_bench.scoring.metrics import mean
+from rebar_depth_bench.scoring.score import ViewTruth, score_view, tabulate
+from rebar_depth_bench.scoring.table import ViewScore
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -124,7 +123,7 @@ def row_json(pair: Pair, views: list[ViewScore | None], frame_px: int, split: st
         "views_scored": table.views_scored,
         "coverage": table.coverage,
         "ranked": table.is_comparable,
-        **{key: {name: getattr(one, name, None) for name in METRIC_NAMES} for key, one in aligned.items()},
+        **{key: {name: getattr(one, name, None) for name in METRICS} for key, one in aligned.items()},
         "scale_median": table.scale_median,
         "ci95": {name: ends for name, ends in table.intervals.items() if not name.startswith("within_mm")},
     }

@@ -35,7 +35,7 @@ class Database:
     it; read transactions never wait.
 
     With ``hidden_truth``, the functions of this package return only the disclosed part of the stored scores
-    (``rebar_depth_bench.scoring.disclosure``). What is stored does not depend on it.
+    (``rebar_depth_bench.scoring.result``). What is stored does not depend on it.
 
     With ``read_only``, an SQLite database must exist, and nothing is written or created to read it.
     """

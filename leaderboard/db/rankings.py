@@ -26,8 +26,8 @@ from leaderboard.db.models import (
 )
 from leaderboard.db.submissions import QUEUED, SCORED
 from leaderboard.db.view_errors import rank_ranges
-from rebar_depth_bench.scoring.disclosure import DisclosedTable, disclosed_number
-from rebar_depth_bench.submission.metadata import INPUTS
+from rebar_depth_bench.scoring.result import DisclosedTable, disclosed_number
+from rebar_depth_bench.submission.declaration import INPUTS
 
 _CACHED_TABLES = 4096
 

@@ -22,7 +22,7 @@ from leaderboard.db.models import (
     TokenModel,
     increment_content_version,
 )
-from rebar_depth_bench.scoring.disclosure import disclosed_json
+from rebar_depth_bench.scoring.result import disclosed_json
 from rebar_depth_bench.submission import SubmissionMeta
 
 QUEUED, SCORING, SCORED, FAILED, DELETED = "queued", "scoring", "scored", "failed", "deleted"

@@ -14,9 +14,9 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from rebar_depth_bench.names import config_of, scene_of
 from rebar_depth_bench.scoring import bootstrap
-from rebar_depth_bench.scoring.view_score import protocol_indices
-from rebar_depth_bench.view_ids import config_of, scene_of
+from rebar_depth_bench.scoring.bootstrap import protocol_indices
 
 _CLEAR, _UNCLEAR = 1.6, 0.6
 """Differences in half widths from which a pair is decided, and below which it is undecided, without draws."""

@@ -17,13 +17,12 @@ from typing import TYPE_CHECKING, ParamSpec, TypeVar
 from leaderboard.scoring.isolation import UnavailableError
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import DatasetError, Problem, RebarDepthError, SubmissionError
-from rebar_depth_bench.scoring.view_score import ViewScore
+from rebar_depth_bench.names import TEST_SPLIT, config_of, split_of
+from rebar_depth_bench.scoring.table import ViewScore
 from rebar_depth_bench.submission import SubmissionMeta, open_submission
-from rebar_depth_bench.view_ids import TEST_SPLIT, config_of, split_of
 
 if TYPE_CHECKING:
-    from rebar_depth_bench.scoring.evaluation import Evaluation
-    from rebar_depth_bench.scoring.result import Result
+    from rebar_depth_bench.reporting.html.views import ShownView
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -91,10 +90,9 @@ def score(archive: Path, data: str, dataset_digest: str, error_maps: int, hidden
     With ``hidden_truth``, archives with a view of low coverage have a problem.
     """
     # Half a second to import, which a check does not need.
-    from rebar_depth_bench.diagnosis.diagnose import diagnose
-    from rebar_depth_bench.scoring.disclosure import check_view_coverage
-    from rebar_depth_bench.scoring.evaluation import open_evaluation
-    from rebar_depth_bench.scoring.score import score_evaluation
+    from rebar_depth_bench.reporting.html.page import look_at_views, views_by_config
+    from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
+    from rebar_depth_bench.scoring.result import check_view_coverage
 
     digest = open_folder(data).digest
     if digest != dataset_digest:  # Checked first: on another dataset, the archive could seem invalid.
@@ -103,9 +101,11 @@ def score(archive: Path, data: str, dataset_digest: str, error_maps: int, hidden
         result = score_evaluation(evaluation)
         if hidden_truth:
             check_view_coverage(result.views)
-        notes = [mistake.text for mistake in diagnose(evaluation)]
-        pictures = list(_pictures(evaluation, result, error_maps)) if error_maps else []
-    return Outcome(result.to_json(), notes, pictures)
+        views = views_by_config(result) if error_maps else {}
+        chosen = {name: views_to_picture(of_config, error_maps) for name, of_config in views.items()}
+        found = look_at_views(evaluation, chosen)
+    notes = [mistake.text for mistake in found.mistakes]
+    return Outcome(result.to_json(), notes, list(map(_picture, found.shown)))
 
 
 def views_to_picture(views: Sequence[ViewScore], count: int) -> list[ViewScore]:
@@ -115,20 +115,14 @@ def views_to_picture(views: Sequence[ViewScore], count: int) -> list[ViewScore]:
     return [*worst_first[:count], *(view for view in median if view not in worst_first[:count])]
 
 
-def _pictures(evaluation: Evaluation, result: Result, count: int) -> Iterator[ViewPicture]:
-    from rebar_depth_bench.reporting.html.page import iter_view_panels, views_by_config
-    from rebar_depth_bench.reporting.html.view_browser import shown_view
-
-    chosen = {name: views_to_picture(views, count) for name, views in views_by_config(result).items()}
-    for panels in iter_view_panels(chosen, evaluation):
-        shown = shown_view(panels)
-        size = {"width": shown.images.width, "height": shown.images.height}
-        facts = {**size, "near": shown.near, "far": shown.far, "limit": shown.native_limit}
-        images = {
-            "colour": shown.images.colour,
-            "truth": shown.images.truth,
-            "prediction": shown.images.prediction,
-            "error": shown.images.native_error,
-        }
-        stored = {kind: webp for kind, webp in images.items() if webp is not None}
-        yield ViewPicture(panels.view_id, json.dumps(facts), stored)
+def _picture(shown: ShownView) -> ViewPicture:
+    size = {"width": shown.images.width, "height": shown.images.height}
+    facts = {**size, "near": shown.near, "far": shown.far, "limit": shown.native_limit}
+    images = {
+        "colour": shown.images.colour,
+        "truth": shown.images.truth,
+        "prediction": shown.images.prediction,
+        "error": shown.images.native_error,
+    }
+    stored = {kind: webp for kind, webp in images.items() if webp is not None}
+    return ViewPicture(shown.view_id, json.dumps(facts), stored)

@@ -23,8 +23,8 @@ from leaderboard.web.middleware import EarlyResponseMiddleware, RequestMiddlewar
 from leaderboard.web.pages import account, static, submission, submit
 from leaderboard.web.pages import leaderboard as board
 from leaderboard.web.pages.rendering import error_response, make_templates
+from rebar_depth_bench import software_version
 from rebar_depth_bench.errors import Problem
-from rebar_depth_bench.version import software_version
 
 _LOG = structlog.get_logger("http")
 DESCRIPTION = """Accepts prediction archives and scores them exactly as `rebar-bench score` does.

@@ -14,9 +14,9 @@ import pyarrow.parquet as pq
 from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.bar_crossings.definition import Crossings, crossing_parameters, scene_crossings
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars
-from rebar_depth_bench.data.digests import file_sha256
+from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
-from rebar_depth_bench.data.parquet import Table, open_parquet, read_rows
+from rebar_depth_bench.data.shards import Table, open_parquet, read_rows
 from rebar_depth_bench.errors import DatasetError, escape_text
 from rebar_depth_bench.limits import TABLE_BYTES
 from rebar_depth_bench.reading import open_regular

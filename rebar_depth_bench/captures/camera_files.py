@@ -35,7 +35,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
-from rebar_depth_bench.data.eye_view import camera_array
+from rebar_depth_bench.data.rows import camera_array
 from rebar_depth_bench.errors import CalibrationError, InputError, Problem
 from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
 from rebar_depth_bench.geometry.calibration import check_image_size, read_calibration, scaled_calibration
@@ -45,7 +45,7 @@ from rebar_depth_bench.geometry.calibration_toml import table_calibration
 from rebar_depth_bench.geometry.stereo_calibration import Calibration, StereoCalibration
 from rebar_depth_bench.key_lines import with_lines
 from rebar_depth_bench.limits import TOML_BYTES
-from rebar_depth_bench.paths import NAME_LETTERS, NAME_PATTERN
+from rebar_depth_bench.names import NAME_LETTERS, NAME_PATTERN
 from rebar_depth_bench.reading import parse_toml, read_file
 from rebar_depth_bench.validation import (
     UNITS_M,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from rebar_depth_bench.data.cache_folder import cache_folder, clear, entries, total_bytes
+from rebar_depth_bench.data.cache import cache_folder, clear, entries, total_bytes
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.limits import CACHE_BYTES
 

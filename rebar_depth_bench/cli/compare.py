@@ -13,7 +13,7 @@ from rebar_depth_bench.output_options import add_output_file, prints_table
 from rebar_depth_bench.outputs import write_output
 from rebar_depth_bench.reporting.comparison_tables import comparison_csv, print_comparison
 from rebar_depth_bench.scoring.comparison import compare
-from rebar_depth_bench.scoring.score import score
+from rebar_depth_bench.scoring.evaluation import score
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

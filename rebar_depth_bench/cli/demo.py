@@ -21,8 +21,7 @@ from rebar_depth_bench.methods import METHODS
 from rebar_depth_bench.methods.runner import predict
 from rebar_depth_bench.reporting.html.page import write_report
 from rebar_depth_bench.reporting.tables import print_table
-from rebar_depth_bench.scoring.evaluation import open_evaluation
-from rebar_depth_bench.scoring.score import score_evaluation
+from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
 
 DEMO_FOLDER = "demo-output"
 DEMO_VIEWS = 6

@@ -7,10 +7,10 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 
+from rebar_depth_bench import software_version
 from rebar_depth_bench.console import Command, add_commands, run_command
 from rebar_depth_bench.output_options import check_outputs
 from rebar_depth_bench.terminal import use_plain_characters
-from rebar_depth_bench.version import software_version
 
 _CLI = "rebar_depth_bench.cli"
 COMMANDS: Mapping[str, Command] = {

@@ -19,8 +19,8 @@ from rebar_depth_bench.methods import METHODS, MultiViewMethod, find_method
 from rebar_depth_bench.methods.onnx.session import VIEW_TIMEOUT_S
 from rebar_depth_bench.methods.registry import FROM_FOLDER
 from rebar_depth_bench.methods.runner import dataset_views, predict_views
+from rebar_depth_bench.names import SPLITS, TEST_SPLIT
 from rebar_depth_bench.output_options import add_output_file, prints_table
-from rebar_depth_bench.view_ids import SPLITS, TEST_SPLIT
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -16,11 +16,10 @@ from rebar_depth_bench.output_options import add_output_file, prints_table
 from rebar_depth_bench.outputs import write_output
 from rebar_depth_bench.reporting.extended_tables import extended_csv, print_extended
 from rebar_depth_bench.reporting.html.page import write_report
-from rebar_depth_bench.reporting.html.view_browser import VIEWS_SHOWN
+from rebar_depth_bench.reporting.html.views import VIEWS_SHOWN
 from rebar_depth_bench.reporting.tables import groups_csv, print_table, result_csv
-from rebar_depth_bench.scoring.evaluation import open_evaluation
+from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
 from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.scoring.score import score_evaluation
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -62,9 +61,10 @@ def run(options: argparse.Namespace) -> None:
         print_verified(
             evaluation.folder, f"views of {names} verified when their ground truth was stored in the cache"
         )
-        mistakes = diagnose(evaluation)
         if options.html:
-            write_report(result, evaluation, options.html, mistakes=mistakes, views_shown=options.html_views)
+            mistakes = write_report(result, evaluation, options.html, views_shown=options.html_views)
+        else:
+            mistakes = diagnose(evaluation)
     if options.json:
         write_output(options.json, result.to_json())
     if options.csv:

@@ -17,10 +17,9 @@ from rebar_depth_bench.leaderboard_answers import server_lines
 from rebar_depth_bench.leaderboard_client import WAIT_S, LeaderboardClient
 from rebar_depth_bench.output_options import add_output_file, prints_table
 from rebar_depth_bench.outputs import write_output
-from rebar_depth_bench.reporting.formatting import coverage_percent, number
 from rebar_depth_bench.reporting.tables import print_table
-from rebar_depth_bench.scoring.disclosure import DECIMALS, DisclosedResult, is_disclosed, read_disclosed
-from rebar_depth_bench.scoring.result_io import read_result
+from rebar_depth_bench.scoring.columns import COVERAGE, number
+from rebar_depth_bench.scoring.result import DECIMALS, DisclosedResult, is_disclosed, read_disclosed, read_result
 
 TOKEN_VARIABLE = "REBAR_LEADERBOARD_TOKEN"
 """Environment variable that holds the token."""
@@ -78,7 +77,7 @@ def _print_disclosed(result: DisclosedResult) -> None:
     """Print what a leaderboard with hidden ground truth discloses: one line per config."""
     print(f"{printable(result.submission.method)}, protocol {result.protocol}, ground truth hidden")
     for config, table in result.tables.items():
-        error, coverage = number(table.rank_error, DECIMALS), coverage_percent(table.coverage)
+        error, coverage = number(table.rank_error, DECIMALS), COVERAGE.text(table.coverage)
         note = "" if table.ranked else ", not ranked"
         print(f"{printable(config)}: rank error {error}, coverage {coverage} %{note}")
 

@@ -15,7 +15,7 @@ from rebar_depth_bench.reporting.figure import check_figure, write_figure
 from rebar_depth_bench.reporting.latex import latex_table
 from rebar_depth_bench.reporting.tables import results_csv
 from rebar_depth_bench.scoring.comparison import check_same_splits
-from rebar_depth_bench.scoring.score import score
+from rebar_depth_bench.scoring.evaluation import score
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

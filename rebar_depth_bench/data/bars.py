@@ -16,11 +16,10 @@ import pyarrow.parquet as pq
 
 from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.data.parquet import Table, open_parquet, read_rows
-from rebar_depth_bench.data.parquet_footer import read_footer
+from rebar_depth_bench.data.shards import Table, open_parquet, read_footer, read_rows
 from rebar_depth_bench.errors import DatasetError, escape_text
 from rebar_depth_bench.limits import TABLE_BYTES
-from rebar_depth_bench.paths import NAME_LETTERS, NAME_PATTERN
+from rebar_depth_bench.names import NAME_LETTERS, NAME_PATTERN
 from rebar_depth_bench.reading import open_regular
 from rebar_depth_bench.validation import short_repr
 

@@ -1,19 +1,259 @@
-"""Rows of a config's shards, read with pyarrow and compared with the manifest; images stay encoded."""
+"""Shards of a config, and other Parquet files from outside, whose footer is checked before any page is read.
+
+A few bytes can declare gigabytes: a page that a general compressor expands a thousandfold, or a list of a billion
+elements. The footer therefore has to declare the expected schema, no more rows and values than expected, and a
+compression that expands its input at most about twentyfold.
+
+The footer is parsed in Python, because pyarrow ends the process where a damaged footer is inspected. It is a
+structure of Thrift's compact protocol. Structures become dicts by field number; the numbers used here are those of
+``parquet.thrift``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from typing import Any
+from dataclasses import dataclass, field
+from typing import Any, BinaryIO
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from rebar_depth_bench.data.columns import ROW_SCHEMA, column_kind
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.parquet import Table, open_parquet, read_rows
+from rebar_depth_bench.data.manifest import DatasetConfig
+from rebar_depth_bench.data.schema import ROW_SCHEMA, column_kind
 from rebar_depth_bench.errors import DatasetError, InputError, escape_text
 from rebar_depth_bench.limits import CELL_BYTES
+
+_TAIL_BYTES = 8
+"""Length of the end of a file: the number of bytes of the footer (32 bits, little-endian), and ``PAR1``."""
+_READ_BYTES = 1 << 16
+"""Bytes that are read first; pyarrow reads the same range, which a file of the Hub then has in memory."""
+_MAX_NESTING = 16
+_TRUE, _FALSE, _BYTE, _DOUBLE, _BINARY, _LIST, _SET, _STRUCT = 1, 2, 3, 7, 8, 9, 10, 12
+_INTEGERS = (4, 5, 6)
+
+
+class ParquetError(ValueError):
+    """Parquet file that is damaged or does not hold the expected table."""
+
+
+@dataclass(frozen=True, slots=True)
+class Chunk:
+    """Values of one column in one row group, as the footer declares them."""
+
+    column: str
+    rows: int
+    compression: int
+    values: int
+    decoded_bytes: int
+
+
+@dataclass(frozen=True, slots=True)
+class Footer:
+    """Number of rows of a file, and its column chunks."""
+
+    rows: int
+    chunks: tuple[Chunk, ...]
+
+
+def read_footer(stream: BinaryIO, max_bytes: int) -> Footer:
+    """Return the footer of a file. Raises ``ParquetError`` if it is damaged or has more than ``max_bytes``."""
+    size = stream.seek(0, 2)
+    stream.seek(max(0, size - _READ_BYTES))
+    content = stream.read(_READ_BYTES)
+    footer_bytes = int.from_bytes(content[-_TAIL_BYTES:-4], "little")
+    if not content.endswith(b"PAR1") or footer_bytes > size - _TAIL_BYTES:
+        raise ParquetError("the file does not end like a Parquet file")
+    if footer_bytes > max_bytes:
+        raise ParquetError(f"the footer has {footer_bytes} bytes, expected at most {max_bytes}")
+    if footer_bytes > len(content) - _TAIL_BYTES:
+        stream.seek(size - _TAIL_BYTES - footer_bytes)
+        content = stream.read(footer_bytes + _TAIL_BYTES)
+    stream.seek(0)
+    try:
+        return _footer(_read_structure(content[-_TAIL_BYTES - footer_bytes : -_TAIL_BYTES], 0)[0])
+    except (AttributeError, LookupError, TypeError, UnicodeDecodeError) as error:
+        raise ParquetError(f"the footer is damaged ({type(error).__name__})") from None
+
+
+def _footer(metadata: dict[int, Any]) -> Footer:
+    chunks = []
+    for group in metadata[4]:
+        for column in group[1]:
+            if 1 in column:
+                raise ParquetError("the values of a column are in another file")
+            values = column[3]
+            name = values[3][0].decode()
+            chunks.append(Chunk(name, int(group[3]), int(values[4]), int(values[5]), int(values[6])))
+    rows = sum(int(group[3]) for group in metadata[4])
+    if rows != metadata[3] or any(min(chunk.rows, chunk.values, chunk.decoded_bytes) < 0 for chunk in chunks):
+        raise ParquetError("the numbers of the footer contradict each other")
+    return Footer(rows, tuple(chunks))
+
+
+def _read_structure(content: bytes, position: int, depth: int = 0) -> tuple[dict[int, Any], int]:
+    """Return a structure as a dict of its fields by number, and the position behind it.
+
+    Integers are read here without a call: footers have a hundred thousand. Raises ``LookupError`` at the end of
+    the content.
+    """
+    if depth > _MAX_NESTING:
+        raise ParquetError("the footer is nested too deep")
+    fields: dict[int, Any] = {}
+    number = 0
+    while header := content[position]:
+        position += 1
+        kind = header & 15
+        if header < 16:
+            value, position = _read_varint(content, position)
+            number = (value >> 1) ^ -(value & 1)
+        else:
+            number += header >> 4
+        if kind in _INTEGERS:
+            value = content[position]
+            position += 1
+            if value & 128:
+                value, position = _read_varint(content, position - 1)
+            fields[number] = (value >> 1) ^ -(value & 1)
+        elif kind in (_TRUE, _FALSE):
+            fields[number] = kind == _TRUE
+        else:
+            fields[number], position = _read_value(content, position, kind, depth)
+    return fields, position + 1
+
+
+def _read_value(content: bytes, position: int, kind: int, depth: int) -> tuple[Any, int]:
+    """Return a value of any type but a boolean field, and the position behind it."""
+    if kind == _STRUCT:
+        return _read_structure(content, position, depth + 1)
+    if kind in (_LIST, _SET):
+        return _read_list(content, position, depth + 1)
+    if kind == _BINARY:
+        count, position = _read_varint(content, position)
+        return content[position : position + count], position + count
+    if kind in _INTEGERS:
+        value, position = _read_varint(content, position)
+        return (value >> 1) ^ -(value & 1), position
+    if kind in (_TRUE, _FALSE, _BYTE):  # The elements of a list of booleans are bytes.
+        return content[position], position + 1
+    if kind == _DOUBLE:
+        return content[position : position + 8], position + 8
+    raise ParquetError(f"the footer has a value of type {kind}, which no Parquet file has")
+
+
+def _read_list(content: bytes, position: int, depth: int) -> tuple[list[Any], int]:
+    header = content[position]
+    position += 1
+    count = header >> 4
+    if count == 15:
+        count, position = _read_varint(content, position)
+    if count > len(content) - position or depth > _MAX_NESTING:
+        raise ParquetError("the footer ends within a list, or is nested too deep")
+    values = []
+    for _ in range(count):
+        value, position = _read_value(content, position, header & 15, depth)
+        values.append(value)
+    return values, position
+
+
+def _read_varint(content: bytes, position: int) -> tuple[int, int]:
+    value = shift = 0
+    while (byte := content[position]) & 128:
+        value |= (byte & 127) << shift
+        shift += 7
+        position += 1
+        if shift > 63:
+            raise ParquetError("the footer has an integer of more than 64 bits")
+    return value | byte << shift, position + 1
+
+
+_COMPRESSIONS = {0: "none", 1: "snappy"}
+_MAX_STRING_BYTES = 1 << 22
+
+
+@dataclass(frozen=True)
+class Table:
+    """Expected content of a Parquet file; further columns are not read, and those of ``optional`` may be absent.
+
+    ``max_values`` limits the values of a column on average over the rows (default: 1 per row), and ``max_bytes``
+    the decoded size of all columns of ``schema`` together.
+    """
+
+    schema: pa.Schema
+    max_rows: int
+    max_bytes: int
+    max_values: Mapping[str, int] = field(default_factory=dict)
+    optional: frozenset[str] = frozenset()
+
+    @property
+    def max_footer_bytes(self) -> int:
+        """Largest accepted footer; one with a row group per row has about 4 kB for each."""
+        return (1 << 18) + (min(self.max_rows, 1 << 11) << 13)
+
+    def check(self, footer: Footer) -> None:
+        """Raise ``ParquetError`` if a footer declares more rows, values or bytes, or another compression."""
+        if footer.rows > self.max_rows:
+            raise ParquetError(f"the file has {footer.rows} rows, expected at most {self.max_rows}")
+        names = frozenset(self.schema.names)
+        for chunk in footer.chunks:
+            if chunk.column in names:
+                if chunk.compression not in _COMPRESSIONS:
+                    expected = " or ".join(_COMPRESSIONS.values())
+                    raise ParquetError(f"column {chunk.column} is compressed otherwise than expected: {expected}")
+                max_values = chunk.rows * self.max_values.get(chunk.column, 1)
+                if chunk.values > max_values:
+                    found = f"column {chunk.column} has {chunk.values} values"
+                    raise ParquetError(f"{found}, expected at most {max_values}")
+        if (size := self.decoded_bytes(footer)) > self.max_bytes:
+            raise ParquetError(f"the file has {size} decoded bytes, expected at most {self.max_bytes}")
+
+    def decoded_bytes(self, footer: Footer) -> int:
+        """Return the decoded size of the columns of ``schema`` that a footer declares."""
+        chunks = (chunk for chunk in footer.chunks if chunk.column in self.schema.names)
+        return sum(max(8 * chunk.values, chunk.decoded_bytes) for chunk in chunks)
+
+
+@contextmanager
+def open_parquet(stream: BinaryIO, table: Table) -> Iterator[tuple[pq.ParquetFile, int]]:
+    """Yield the Parquet file in ``stream`` and its number of rows, after checking that it declares ``table``.
+
+    Raises ``ParquetError``, or another ``ValueError``, ``OSError`` or ``pa.ArrowException`` for a damaged file.
+    """
+    footer = read_footer(stream, table.max_footer_bytes)
+    table.check(footer)
+    max_elements = max(len(footer.chunks), 1 << 12)
+    limits = {"thrift_string_size_limit": _MAX_STRING_BYTES, "thrift_container_size_limit": max_elements}
+    with pq.ParquetFile(stream, **limits) as file:
+        _check_schema(file.schema_arrow, table)
+        yield file, footer.rows
+
+
+def read_rows(
+    file: pq.ParquetFile, schema: pa.Schema, *, batch_rows: int = 1, row_groups: Sequence[int] | None = None
+) -> Iterator[dict[str, Any]]:
+    """Yield the rows of an open file, of which ``batch_rows`` are converted to Python objects at a time.
+
+    Columns of ``schema`` that the file lacks are left out. ``row_groups`` are the indices of the row groups that
+    are read (default: all).
+    """
+    present = pa.schema([column for column in schema if column.name in file.schema_arrow.names])
+    for batch in file.iter_batches(batch_size=batch_rows, row_groups=row_groups, columns=present.names):
+        yield from batch.select(present.names).cast(present).to_pylist()
+
+
+def _check_schema(found: pa.Schema, table: Table) -> None:
+    for column in table.schema:
+        occurrences = found.names.count(column.name)
+        if not occurrences and column.name in table.optional:
+            continue
+        if occurrences != 1:
+            raise ParquetError(f"the file has {occurrences or 'no'} columns named {column.name}, expected one")
+        found_type = found.field(column.name).type
+        try:
+            pa.array([], found_type).cast(column.type)
+        except pa.ArrowException:
+            raise ParquetError(f"column {column.name} is {str(found_type)[:60]}, expected {column.type}") from None
+
 
 _VALUES = {"K": 9, "distortion": 5, "cam_from_world": 16}
 """Numbers in a cell, by column kind; the other columns have one value per cell."""
@@ -72,19 +312,21 @@ def iterate_shards(
 
 
 def rows_at(config: DatasetConfig, columns: Sequence[str], positions: Sequence[int]) -> Iterator[dict[str, Any]]:
-    """Yield the rows at ``positions`` of a local config, whose shards have one row group per view.
+    """Yield the rows at ``positions``, counted over all shards; the cells of ``columns`` stay encoded.
 
-    Positions are counted over all shards; the cells of ``columns`` stay encoded. Raises ``DatasetError`` as
-    ``check_shards``.
+    Only these are read from shards with one row group per view, as the builder writes them. Raises
+    ``DatasetError`` for a damaged shard.
     """
-    check_shards(config)
     table, first = _shard_table(config, ("view_id", *columns)), 0
     for shard in config.shards:
-        with _open_shard(config, shard, table) as (file, rows):
-            row_groups = [position - first for position in positions if first <= position < first + rows]
-            for row in read_rows(file, table.schema, row_groups=row_groups):
-                yield {name: row[name] for name in columns}
-        first += rows
+        with _open_shard(config, shard, table) as (file, count):
+            wanted = [position - first for position in positions if first <= position < first + count]
+            is_direct = file.num_row_groups == count
+            rows = read_rows(file, table.schema, row_groups=wanted if is_direct else None) if wanted else ()
+            for index, row in enumerate(rows):
+                if is_direct or index in wanted:
+                    yield {name: row[name] for name in columns}
+        first += count
 
 
 def damaged_error(config: DatasetConfig, error: Exception, shard: str = "") -> DatasetError:

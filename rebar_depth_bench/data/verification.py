@@ -6,14 +6,12 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from rebar_depth_bench.data.dataset import iterate_rows
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.digests import file_sha256
-from rebar_depth_bench.data.eye_view import truth_columns, truth_from_row
-from rebar_depth_bench.data.manifest import MANIFEST_FILE, DatasetFolder
+from rebar_depth_bench.data.files import file_sha256
+from rebar_depth_bench.data.manifest import MANIFEST_FILE, DatasetConfig, DatasetFolder
+from rebar_depth_bench.data.rows import iterate_rows, truth_columns, truth_from_row
 from rebar_depth_bench.errors import DatasetError, Problem, escape_text
-from rebar_depth_bench.paths import path_below
-from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.parallel import Progress, silent
+from rebar_depth_bench.reading import path_below
 
 
 def file_problems(folder: DatasetFolder, progress: Progress = silent) -> Iterator[Problem]:

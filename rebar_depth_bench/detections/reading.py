@@ -14,8 +14,8 @@ from pathlib import Path
 import numpy as np
 import pyarrow as pa
 
-from rebar_depth_bench.data.digests import file_sha256
-from rebar_depth_bench.data.parquet import Table, open_parquet
+from rebar_depth_bench.data.files import file_sha256
+from rebar_depth_bench.data.shards import Table, open_parquet
 from rebar_depth_bench.detections.columns import (
     MAX_REPORTED,
     METADATA,
@@ -28,10 +28,10 @@ from rebar_depth_bench.detections.columns import (
 )
 from rebar_depth_bench.errors import Problem, SubmissionError, escape_text
 from rebar_depth_bench.limits import DETECTIONS_BYTES
+from rebar_depth_bench.names import config_of, split_of
 from rebar_depth_bench.reading import open_regular, parse_number, read_file
-from rebar_depth_bench.submission.metadata import SubmissionMeta
+from rebar_depth_bench.submission.declaration import SubmissionMeta
 from rebar_depth_bench.validation import validate_table
-from rebar_depth_bench.view_ids import config_of, split_of
 
 MAX_ROWS_PER_VIEW = 5000
 """Largest number of detections of one view."""

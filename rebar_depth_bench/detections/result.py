@@ -11,14 +11,14 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
+from rebar_depth_bench import software_version
 from rebar_depth_bench.bar_crossings.definition import CROSSINGS_PROTOCOL
 from rebar_depth_bench.detections.average_precision import RankedDetections
 from rebar_depth_bench.extended.measures import percentile
 from rebar_depth_bench.extended.result import CrossingsSource
 from rebar_depth_bench.scoring.bootstrap import INTERVALS, Interval, Resampling, interval
-from rebar_depth_bench.scoring.rounding import rounded, rounded_interval
-from rebar_depth_bench.submission.metadata import SubmissionMeta
-from rebar_depth_bench.version import software_version
+from rebar_depth_bench.scoring.columns import rounded, rounded_interval
+from rebar_depth_bench.submission.declaration import SubmissionMeta
 
 AVERAGE_PRECISION_MM = (5, 10, 20)
 """Limits of average precision, mm."""

@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
+from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_folder
 from rebar_depth_bench.detections.columns import Detections
 from rebar_depth_bench.detections.matching import excused, greedy_matches, matched_pairs
 from rebar_depth_bench.detections.reading import DetectionFile, read_detections
@@ -28,10 +27,9 @@ from rebar_depth_bench.extended.ground_truth import SceneBars, has_bar_ids, load
 from rebar_depth_bench.extended.result import CrossingsSource
 from rebar_depth_bench.extended.steel_truth import SteelTruth
 from rebar_depth_bench.geometry.cameras import transform
-from rebar_depth_bench.parallel import map_with_progress
-from rebar_depth_bench.progress import Progress, silent
-from rebar_depth_bench.scoring.view_score import resample_views
-from rebar_depth_bench.view_ids import TEST_SPLIT, config_of, split_of
+from rebar_depth_bench.names import TEST_SPLIT, config_of, split_of
+from rebar_depth_bench.parallel import Progress, map_with_progress, silent
+from rebar_depth_bench.scoring.bootstrap import resample_views
 
 
 def score_crossings(

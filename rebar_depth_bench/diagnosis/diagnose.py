@@ -5,22 +5,25 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
-from rebar_depth_bench.data.dataset_config import DatasetConfig
+from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.diagnosis.corrections import (
     Correction,
     Errors,
     logarithm_corrections,
     shape_corrections,
     unit_corrections,
+    valid_share,
 )
-from rebar_depth_bench.diagnosis.errors import valid_share
-from rebar_depth_bench.diagnosis.views import DiagnosedView, positions_to_read, read_views
+from rebar_depth_bench.diagnosis.views import COLUMNS, DiagnosedView, diagnosed_view, positions_to_read
 from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.submission import SubmissionReader
 
+MAX_KEPT = 16
+"""Number of predictions of other views that are kept decoded."""
 MIN_VIEWS = 3
 """Number of views below which nothing is said."""
 LEAST_COVERAGE = 0.05
@@ -47,22 +50,31 @@ class PossibleMistake:
 
 
 def diagnose(evaluation: Evaluation) -> list[PossibleMistake]:
-    """Return the possible mistakes in a submission, at most two for each config.
-
-    They are one of units and one other, or with few valid values what the others are, and a logarithm.
+    """Return the possible mistakes in a submission, those of ``diagnose_config`` for each config.
 
     Up to ``views.MAX_VIEWS`` views of each config in a local folder are read. Raises ``EntryError`` and
     ``DatasetError`` for entries and shards that scoring refuses.
     """
-    local = [config for config in evaluation.configs if config.local is not None]
-    return [mistake for config in local for mistake in _diagnose_config(config, evaluation.submission)]
+    mistakes = []
+    for config in evaluation.configs:
+        views = map(diagnosed_view, evaluation.views(config, COLUMNS, positions_to_read(config)))
+        mistakes += diagnose_config(config, list(views), evaluation.submission)
+    return mistakes
 
 
-def _diagnose_config(config: DatasetConfig, submission: SubmissionReader) -> list[PossibleMistake]:
+def diagnose_config(
+    config: DatasetConfig, views: Sequence[DiagnosedView], submission: SubmissionReader
+) -> list[PossibleMistake]:
+    """Return at most two possible mistakes in the ``views`` of a config, those at ``positions_to_read``.
+
+    They are one of units and one other, or with few valid values what the others are, and a logarithm.
+    """
+    known = {view.position: view.prediction for view in views}
+
+    @lru_cache(MAX_KEPT)
     def read(position: int) -> np.ndarray:
-        return submission.read(config.view_ids[position])
+        return known[position] if position in known else submission.read(config.view_ids[position])
 
-    views = list(read_views(config, positions_to_read(config), read))
     if len(views) < MIN_VIEWS:
         return []
     invalid = invalid_values(config.name, views)

@@ -1,20 +1,17 @@
-"""Views that a diagnosis looks at: their scored pixels, read from the shards, and their predictions."""
+"""Views that a diagnosis looks at: some of their scored pixels, and their predictions."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int64
 from numpy import ndarray
 
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.decoding import RowDecoder
-from rebar_depth_bench.data.eye_view import CAMERA_KINDS, camera_from_row
-from rebar_depth_bench.data.shards import rows_at
+from rebar_depth_bench.data.manifest import DatasetConfig
+from rebar_depth_bench.data.rows import CAMERA_KINDS
 from rebar_depth_bench.geometry.cameras import Camera
+from rebar_depth_bench.scoring.evaluation import View
 from rebar_depth_bench.scoring.protocol import scored_pixels
 
 MAX_VIEWS = 8
@@ -24,11 +21,11 @@ MAX_PIXELS = 4000
 MIN_PIXELS = 50
 """Scored pixels that a view must have to be looked at."""
 
-_COLUMNS = (
-    "view_id",
+COLUMNS = (
     *("left_depth", "left_mask", "right_depth", "right_mask"),
     *(f"left_{kind}" for kind in CAMERA_KINDS),
 )
+"""Columns that are looked at."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,34 +63,23 @@ class DiagnosedView:
 def positions_to_read(config: DatasetConfig) -> list[int]:
     """Return the positions of ``MAX_VIEWS`` evenly spaced views that have enough scored pixels.
 
-    There are none in a config that lacks a column that is looked at.
+    There are none in a config that lacks a column that is looked at, and in one that is not in a local folder.
     """
-    if not config.absent_columns.isdisjoint(_COLUMNS):
+    if config.local is None or not config.absent_columns.isdisjoint(COLUMNS):
         return []
     usable = [n for n, view in enumerate(config.views) if view.scored_px >= MIN_PIXELS]
     count = min(len(usable), MAX_VIEWS)
     return [usable[n * len(usable) // count] for n in range(count)]
 
 
-def read_views(
-    config: DatasetConfig, positions: Sequence[int], read: Callable[[int], Float[ndarray, "h w"]]
-) -> Iterator[DiagnosedView]:
-    """Yield the views at ``positions``; ``read`` returns the prediction of the view at a position.
-
-    Only these rows are read, by their place in the shards; a view that is not there is left out. Raises
-    ``DatasetError`` for a damaged shard.
-    """
-    position_by_id = {config.view_ids[position]: position for position in positions}
-    for row in map(RowDecoder.of(config).row, rows_at(config, _COLUMNS, positions)):
-        position = position_by_id.get(row["view_id"])
-        if position is not None:
-            camera = camera_from_row(row, "left", config.grid)
-            yield DiagnosedView(position, camera, _pixels(row, "left"), _pixels(row, "right"), read(position))
+def diagnosed_view(view: View) -> DiagnosedView:
+    """Return what a diagnosis needs of a view. Raises ``EntryError`` for an invalid entry of the archive."""
+    left, right = (_pixels(view.cell(f"{eye}_mask"), view.cell(f"{eye}_depth")) for eye in ("left", "right"))
+    return DiagnosedView(view.position, view.camera("left"), left, right, view.prediction_m)
 
 
-def _pixels(row: Mapping[str, Any], eye: str) -> Pixels:
-    depth_m = row[f"{eye}_depth"]
-    index = scored_pixels(row[f"{eye}_mask"], depth_m).astype(np.int64)
+def _pixels(mask: Bool[ndarray, "h w"] | None, depth_m: Float32[ndarray, "h w"]) -> Pixels:
+    index = scored_pixels(mask, depth_m).astype(np.int64)
     index = index[:: -(-len(index) // MAX_PIXELS) or 1]
     v, u = np.divmod(index, depth_m.shape[1])
     return Pixels(v, u, depth_m[v, u].astype(np.float64))

@@ -14,9 +14,8 @@ from numpy import ndarray
 
 from rebar_depth_bench.extended.measures import Measure, Samples, finite_sample
 from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.scoring.columns import METRICS
 from rebar_depth_bench.scoring.metrics import (
-    METRIC_NAMES,
-    METRICS,
     depth_metrics,
     is_valid_prediction,
     median,
@@ -83,7 +82,7 @@ def _scale_numbers(p: Float64[ndarray, " n"], z: Float64[ndarray, " n"]) -> dict
 def _log_numbers(p: Float64[ndarray, " n"], z: Float64[ndarray, " n"]) -> dict[str, float]:
     """Return SILog and the metrics after the least-squares scale in log depth."""
     metrics = depth_metrics(p, z, log_scale(p, z))
-    numbers = {f"log_scaled_{name}": getattr(metrics, name) for name in METRIC_NAMES}
+    numbers = {f"log_scaled_{name}": getattr(metrics, name) for name in METRICS}
     return {"silog": scale_invariant_log(p, z), **numbers}
 
 
@@ -91,12 +90,12 @@ def _shift_numbers(p: Float64[ndarray, " n"], z: Float64[ndarray, " n"]) -> dict
     """Return the shift b and the metrics after least-squares scale and shift."""
     a, b_m = scale_and_shift(p, z)
     metrics = depth_metrics(a * p + b_m, z)
-    return {"shift_cm": 100 * b_m} | {f"shifted_{name}": getattr(metrics, name) for name in METRIC_NAMES}
+    return {"shift_cm": 100 * b_m} | {f"shifted_{name}": getattr(metrics, name) for name in METRICS}
 
 
 _SAMPLE_NAMES = (
     *("scale", "log_of_scale", "scale_explains", "silog", "shift_cm"),
-    *(f"{alignment}_{name}" for alignment in ("log_scaled", "shifted") for name in METRIC_NAMES),
+    *(f"{alignment}_{name}" for alignment in ("log_scaled", "shifted") for name in METRICS),
 )
 """Names of all samples of a view."""
 

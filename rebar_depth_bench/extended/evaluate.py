@@ -20,7 +20,7 @@ from rebar_depth_bench.extended import (
 )
 from rebar_depth_bench.extended.crossings import measures as crossing_measures
 from rebar_depth_bench.extended.crossings.evaluate import crossing_samples, view_crossings
-from rebar_depth_bench.extended.ground_truth import ConfigSteelTruth, SceneBars, has_bar_ids, load_steel_truth
+from rebar_depth_bench.extended.ground_truth import ConfigSteelTruth, SceneBars, has_bar_ids, steel_truth
 from rebar_depth_bench.extended.inspection import as_built
 from rebar_depth_bench.extended.inspection import evaluate as inspection
 from rebar_depth_bench.extended.inspection import measures as inspection_measures
@@ -37,11 +37,10 @@ from rebar_depth_bench.extended.result import (
     view_numbers,
 )
 from rebar_depth_bench.extended.steel_truth import SteelTruth
-from rebar_depth_bench.parallel import map_with_progress
-from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.parallel import Progress, map_with_progress, silent
+from rebar_depth_bench.scoring.bootstrap import resample_views
 from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.scoring.view_score import resample_views
 from rebar_depth_bench.submission import SubmissionReader
 
 Predictions = Sequence[Float64[ndarray, " n"]]
@@ -166,7 +165,7 @@ def score_extended(
         if not has_bar_ids(config):
             tables[config.name] = tabulate_extended([], resample_views([], by_scene=False), measures)
             continue
-        steel = load_steel_truth(evaluation.folder, config, progress)
+        steel = steel_truth(evaluation, config, progress)
         source = CrossingsSource(steel.crossings_source, steel.crossings_sha256)
         work = partial(_view, evaluation.submission, steel, scales)
         task = f"extended measures of {config.name}"

@@ -21,7 +21,8 @@ from numpy import ndarray
 
 from rebar_depth_bench.extended.measures import Measure, Samples
 from rebar_depth_bench.extended.steel_truth import SteelTruth
-from rebar_depth_bench.scoring.metrics import METRIC_NAMES, METRICS, is_valid_prediction, metrics_at_scales
+from rebar_depth_bench.scoring.columns import METRICS
+from rebar_depth_bench.scoring.metrics import is_valid_prediction, metrics_at_scales
 from rebar_depth_bench.scoring.protocol import PROTOCOL, WITHIN_MM
 
 
@@ -56,7 +57,7 @@ def region_scores(
         numbers.update((f"within_{t}mm", 0.0) for t in WITHIN_MM)
     if len(p_valid_m):
         [metrics], within = metrics_at_scales(p_valid_m, z_m, (1.0,), WITHIN_MM)
-        numbers.update((name, getattr(metrics, name)) for name in METRIC_NAMES)
+        numbers.update((name, getattr(metrics, name)) for name in METRICS)
         numbers.update((f"within_{t}mm", count / total) for t, count in within.items())
     return {
         f"{region}_{name}": np.array([numbers[name]] if name in numbers else [], np.float64)
@@ -64,7 +65,7 @@ def region_scores(
     }
 
 
-REGION_NUMBERS = (*METRIC_NAMES, "coverage", *(f"within_{t}mm" for t in WITHIN_MM))
+REGION_NUMBERS = (*METRICS, "coverage", *(f"within_{t}mm" for t in WITHIN_MM))
 """Names of all numbers computed on each region."""
 
 

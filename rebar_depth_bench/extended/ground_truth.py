@@ -13,12 +13,10 @@ from numpy import ndarray
 
 from rebar_depth_bench.bar_crossings.definition import CROSSINGS_PROTOCOL
 from rebar_depth_bench.bar_crossings.table import FolderCrossings, folder_crossings
-from rebar_depth_bench.data.array_cache import ArrayCache, open_cache
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars, with_axis
-from rebar_depth_bench.data.cache_entry import CacheContent, ViewArrays
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.eye_view import EyeTruth
-from rebar_depth_bench.data.manifest import DatasetFolder
+from rebar_depth_bench.data.cache import ArrayCache, CacheContent, ViewArrays, open_cache
+from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder
+from rebar_depth_bench.data.rows import EyeTruth
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.extended.crossings.judged import SAMPLED_PIXELS, judged_crossings
 from rebar_depth_bench.extended.crossings.scene import SceneCrossings, no_crossings, prepared_crossings
@@ -28,9 +26,10 @@ from rebar_depth_bench.extended.inspection.segments import CageTruth, assign_seg
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL
 from rebar_depth_bench.extended.steel_truth import JudgedCrossings, SteelTruth
 from rebar_depth_bench.geometry.cameras import Camera, pixel_rays
-from rebar_depth_bench.progress import Progress, silent
-from rebar_depth_bench.scoring.ground_truth import are_pixels_inside, cache_inputs, scored_counts, verified_views
+from rebar_depth_bench.parallel import Progress, silent
+from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.scoring.protocol import single_bar_pixels
+from rebar_depth_bench.scoring.truth import are_pixels_inside, cache_inputs, scored_counts, verified_views
 
 _DTYPES: Mapping[str, type] = {
     "index": np.uint32,
@@ -125,6 +124,11 @@ def _steel_truth(view: ViewArrays, grid: tuple[int, int], rays: Mapping[Lens, Ra
 def has_bar_ids(config: DatasetConfig) -> bool:
     """Return whether a config has the masks and bar ids that all extended measures need."""
     return config.absent_columns.isdisjoint(("left_mask", "left_bars"))
+
+
+def steel_truth(evaluation: Evaluation, config: DatasetConfig, progress: Progress = silent) -> ConfigSteelTruth:
+    """Return ``load_steel_truth`` of a config of an evaluation, which is loaded once."""
+    return evaluation.once(("steel", config.name), lambda: load_steel_truth(evaluation.folder, config, progress))
 
 
 def load_steel_truth(

@@ -14,6 +14,8 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray
 
+from rebar_depth_bench.scoring.columns import Better, Column
+
 EXTENDED_PROTOCOL = "rebar-extended-4"
 """Version of the definitions of all extended measures; any change of a definition changes it."""
 
@@ -47,6 +49,9 @@ STATISTICS: Mapping[Statistic, Callable[[Float64[ndarray, " n"]], float]] = {
 """Population statistics of one or more values."""
 
 
+_DECIMALS: Mapping[str, int] = {"mm": 2, "cm": 2, "m": 3, "%": 1, "": 4}
+
+
 @dataclass(frozen=True)
 class Measure:
     """Definition of one table entry: ``statistic`` of the samples named ``sample``, pooled over a config's views.
@@ -62,9 +67,22 @@ class Measure:
     statistic: Statistic
     title: str
     unit: str
-    better: Literal["lower", "higher", ""]
+    better: Better
     definition: str
     convert: Callable[[float], float | None] | None = None
+
+    @property
+    def column(self) -> Column:
+        """Column of the measure in tables and pages."""
+        is_ratio = self.convert is not None or self.name.endswith("_deg")
+        return Column(
+            path=self.name,
+            title=self.title,
+            unit=self.unit,
+            better=self.better,
+            decimals=2 if is_ratio else _DECIMALS[self.unit],
+            factor=100.0 if self.unit == "%" else 1.0,
+        )
 
     def number(self, statistic: float) -> float | None:
         """Return the measure's value from the statistic of its samples; None where it is undefined."""

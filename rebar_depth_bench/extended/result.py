@@ -14,8 +14,8 @@ from numpy import ndarray
 from rebar_depth_bench.extended.crossings.reach import Reach, reaches
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, STATISTICS, Measure, Samples, Statistic
 from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval
+from rebar_depth_bench.scoring.columns import rounded, rounded_interval
 from rebar_depth_bench.scoring.frames import frame_of_values
-from rebar_depth_bench.scoring.rounding import rounded, rounded_interval
 
 if TYPE_CHECKING:
     from pandas import DataFrame

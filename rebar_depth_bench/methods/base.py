@@ -11,7 +11,7 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 from rebar_depth_bench.data.views import Views
-from rebar_depth_bench.progress import Progress
+from rebar_depth_bench.parallel import Progress
 
 Predictor = Callable[[Mapping[str, Any]], Float32[ndarray, "h w"]]
 """Function from a decoded row to planar depth of the left view, metres, on the left grid; NaN: no prediction."""

@@ -22,7 +22,7 @@ from rebar_depth_bench.data.views import Views
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.cameras import pixel_rays
 from rebar_depth_bench.methods.base import Method, MethodInfo, MultiViewMethod, Prepared
-from rebar_depth_bench.progress import Progress
+from rebar_depth_bench.parallel import Progress
 
 CONSTANT_DEPTH_M = 1.0
 

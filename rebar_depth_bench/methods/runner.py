@@ -19,6 +19,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from rebar_depth_bench import software_version
 from rebar_depth_bench.atomic_io import NO_SPACE, scratch_folder, write_error
 from rebar_depth_bench.console import print_notice
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
@@ -28,11 +29,10 @@ from rebar_depth_bench.methods import AnyMethod, ConfigViews, Method, MultiViewM
 from rebar_depth_bench.methods.base import input_class
 from rebar_depth_bench.methods.kept_views import KeptViews, PreparationReport
 from rebar_depth_bench.methods.raw_images import rectifying_predictor
+from rebar_depth_bench.names import TEST_SPLIT
 from rebar_depth_bench.outputs import is_stream, link_target
-from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.submission import SubmissionWriter
-from rebar_depth_bench.version import software_version
-from rebar_depth_bench.view_ids import TEST_SPLIT
 
 
 def predict(

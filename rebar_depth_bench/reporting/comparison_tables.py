@@ -7,13 +7,14 @@ printed side by side in the layout of the paper's Table I.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from rich import box
 from rich.console import Console
 from rich.table import Table as RichTable
 
+from rebar_depth_bench import software_version
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.published import (
@@ -24,31 +25,12 @@ from rebar_depth_bench.reporting.published import (
 )
 from rebar_depth_bench.reporting.tables import frame_csv, plain_text
 from rebar_depth_bench.scoring.bootstrap import BLOCK_VIEWS, MIN_BLOCKS
+from rebar_depth_bench.scoring.columns import DASH, PAPER_COLUMNS, RANK_ERROR, rounded, texts
 from rebar_depth_bench.scoring.comparison import Comparison, Difference
 from rebar_depth_bench.scoring.frames import differences_frame
-from rebar_depth_bench.scoring.metrics import METRICS
-from rebar_depth_bench.scoring.protocol import PROTOCOL, WITHIN_MM
-from rebar_depth_bench.scoring.published_match import PublishedMatch
-from rebar_depth_bench.scoring.result import Result, Table
-from rebar_depth_bench.scoring.rounding import rounded
-from rebar_depth_bench.scoring.view_score import SCALE_MEDIAN
-from rebar_depth_bench.version import software_version
-
-
-def _titles() -> dict[str, tuple[str, int, float]]:
-    """Return title, number of decimals and display factor by name of the number."""
-    titles = {"coverage": ("coverage, % ↑", 1, 100.0), "rank_error": ("rank error ↓", 4, 1.0)}
-    for alignment in ("native", "scaled"):
-        for (name, info), (title, unit, better) in zip(METRICS.items(), formatting.METRIC_HEADS, strict=True):
-            head = f"{alignment} {title}{f', {unit}' if unit else ''} {better}"
-            titles[f"{alignment}.{name}"] = (head, info.decimals, 1.0)
-    titles[SCALE_MEDIAN] = ("scale s, median", 3, 1.0)
-    return titles | {f"within_mm.{t}": (f"within {t} mm, % ↑", 1, 100.0) for t in WITHIN_MM}
-
-
-NUMBER_TITLES: Mapping[str, tuple[str, int, float]] = _titles()
-"""Title, number of decimals and factor from value to display, by name of the number."""
-
+from rebar_depth_bench.scoring.protocol import PROTOCOL
+from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.scoring.table import PublishedMatch, Table
 
 COMPARISON_NOTE = (
     "B - A: mean over the views that both have. 95 % interval: bootstrap of blocks of neighbouring views "
@@ -114,23 +96,10 @@ def _comparison_table(rows: Sequence[Difference]) -> RichTable:
 
 def comparison_cells(row: Difference) -> list[str]:
     """Return title, both values, difference, interval and verdict as text."""
-    title, decimals, factor = NUMBER_TITLES[row.name]
-    first, other = (_number(value, decimals, factor) for value in (row.first, row.other))
-    change = _signed(row.difference, decimals, factor)
-    interval = row.interval
-    interval_text = (
-        formatting.DASH if interval is None else " to ".join(_signed(end, decimals, factor) for end in interval)
-    )
-    return [title, first, other, change, interval_text, row.verdict]
-
-
-def _number(value: float | None, decimals: int, factor: float) -> str:
-    return formatting.number(None if value is None else factor * value, decimals)
-
-
-def _signed(value: float | None, decimals: int, factor: float) -> str:
-    text = _number(value, decimals, factor)
-    return f"+{text}" if value is not None and value > 0 and text != formatting.DASH else text
+    column = row.column
+    first, other = (column.number_text(value) for value in (row.first, row.other))
+    interval = DASH if row.interval is None else " to ".join(map(column.signed_text, row.interval))
+    return [column.heading, first, other, column.signed_text(row.difference), interval, row.verdict]
 
 
 _HEADS = ("rank err. ↓", "RMSE cm ↓", "AbsRel ↓", "AbsRel_s ↓", "s")
@@ -143,7 +112,10 @@ def disambiguate_method_names(results: Sequence[Result]) -> list[Result]:
     """
     names = Counter(result.method for result in results)
     return [
-        replace(result, method=f"{result.method} ({result.submission_sha256[:8]})")
+        replace(
+            result,
+            submission=replace(result.submission, method=f"{result.method} ({result.submission.sha256[:8]})"),
+        )
         if names[result.method] > 1
         else result
         for result in results
@@ -159,8 +131,8 @@ def print_paper_table(results: Sequence[Result], console: Console, *, published:
     scene follow; they are marked and not compared with the results.
     """
     first = results[0]
-    digest = formatting.short_digest(first.dataset_digest)
-    version = printable(first.dataset_version)
+    digest = formatting.short_digest(first.dataset.digest)
+    version = printable(first.dataset.version)
     console.print(
         plain_text(
             f"protocol {PROTOCOL}, dataset {version} ({digest}), software {software_version()}", style="dim"
@@ -198,8 +170,7 @@ def _paper_table(rows: Sequence[tuple[Result, Table]], match: PublishedMatch | N
     for result, table in rows:
         grid.add_row(
             plain_text(printable(result.method, 40) + formatting.rank_mark(result.declared, table)),
-            plain_text(formatting.rank_error_cell(table.rank_error)),
-            *map(plain_text, formatting.paper_cells(table)),
+            *map(plain_text, texts((RANK_ERROR, *PAPER_COLUMNS), table)),
         )
     for title, cells in formatting.paper_reference_rows([(result.method, table) for result, table in rows]):
         grid.add_row(plain_text(f"reference: {title}"), "", *map(plain_text, cells), style="dim")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from rebar_depth_bench.extended.crossings.reach import MIN_CROSSINGS, MIN_REACH_VIEWS, SHARE, Reach
-from rebar_depth_bench.reporting.formatting import DASH
+from rebar_depth_bench.scoring.columns import DASH
 
 FITS_NOTE = (
     "The fits take from the ground truth which pixels show which bar, the radius of each bar, and each pixel's "

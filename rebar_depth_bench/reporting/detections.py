@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 
+from rebar_depth_bench import software_version
 from rebar_depth_bench.bar_crossings.definition import CROSSINGS_PROTOCOL
 from rebar_depth_bench.detections.matching import MATCH_M
 from rebar_depth_bench.detections.result import AVERAGE_PRECISION_MM, DetectionResult, DetectionTable
@@ -11,23 +13,27 @@ from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.charts.lines import HEIGHT, LEFT, RIGHT, TOP, ChartText, LinearAxis, Series, chart
 from rebar_depth_bench.reporting.table_page import Columns, PageFigure, PageTable, TablePage, page_table
-from rebar_depth_bench.version import software_version
+from rebar_depth_bench.scoring.columns import ARROWS, DASH, Column
 
 Row = tuple[str, DetectionTable]
 """Name and table of a config, or of all together."""
 
-_PERCENT: dict[str, str] = {
-    "precision": "Precision ↑",
-    "recall": "Recall ↑",
-    "f1": "F1 ↑",
-    "node_recall": "Recall of nodes ↑",
-}
-_ERRORS: dict[str, tuple[str, str]] = {
-    "position_mm": ("Position ↓", "mm, median"),
-    "position_p95_mm": ("Position ↓", "mm, p95"),
-    "normal_deg": ("Normal ↓", "degrees, median"),
-    "normal_p95_deg": ("Normal ↓", "degrees, p95"),
-}
+_SHARES = (
+    Column("precision", "Precision", "%", "higher", 1, 100.0),
+    Column("recall", "Recall", "%", "higher", 1, 100.0),
+    Column("f1", "F1", "%", "higher", 1, 100.0),
+    Column("node_recall", "Recall of nodes", "%", "higher", 1, 100.0),
+)
+_AVERAGES = tuple(
+    Column(f"average_precision_{limit}mm", f"AP at {limit} mm", "%", "higher", 1, 100.0)
+    for limit in AVERAGE_PRECISION_MM
+)
+_ERRORS = (
+    Column("position_mm", "Position", "mm, median", "lower", 2),
+    Column("position_p95_mm", "Position", "mm, p95", "lower", 2),
+    Column("normal_deg", "Normal", "degrees, median", "lower", 2),
+    Column("normal_p95_deg", "Normal", "degrees, p95", "lower", 2),
+)
 
 
 def detection_page(result: DetectionResult) -> TablePage:
@@ -45,7 +51,18 @@ def detection_page(result: DetectionResult) -> TablePage:
         f"{1000 * MATCH_M:g} mm: {matched}.",
         stamps=_stamps(result),
         figures=[_curve_figure(name, table) for name, table in rows if table.counts["crossings"]],
-        tables=(_share_table(rows), _average_table(rows), _error_table(rows), _count_table(rows)),
+        tables=(
+            _number_table("Precision and recall, pooled over views.", _SHARES, rows),
+            _number_table(
+                "Average precision over all confidences: greedy matching, the most confident first.",
+                _AVERAGES,
+                rows,
+            ),
+            _number_table(
+                "Errors of matched detections: tie point, and normal where one is given.", _ERRORS, rows
+            ),
+            _count_table(rows),
+        ),
         notes=_notes(result),
     )
 
@@ -63,48 +80,24 @@ def _stamps(result: DetectionResult) -> list[tuple[str, str]]:
     ]
 
 
-def _percent_cells(name: str) -> tuple[Callable[[Row], str], Callable[[Row], str]]:
-    def value(row: Row) -> str:
-        number = row[1].numbers[name]
-        return formatting.number(None if number is None else 100 * number, 1)
-
-    def ends(row: Row) -> str:
-        interval = row[1].intervals[name]
-        return formatting.interval_text(None if interval is None else (100 * interval[0], 100 * interval[1]), 1)
-
-    return value, ends
-
-
-def _share_table(rows: list[Row]) -> PageTable:
+def _number_table(caption: str, numbers: Sequence[Column], rows: list[Row]) -> PageTable:
+    """Return the table of some numbers, each beside its interval."""
     columns: list[tuple[str, str, Callable[[Row], str]]] = [("Config", "", lambda row: printable(row[0]))]
-    for name, title in _PERCENT.items():
-        value, ends = _percent_cells(name)
-        columns += [(title, "%", value), (title, "95 % interval", ends)]
-    return page_table("Precision and recall, pooled over views.", columns, rows)
-
-
-def _average_table(rows: list[Row]) -> PageTable:
-    columns: list[tuple[str, str, Callable[[Row], str]]] = [("Config", "", lambda row: printable(row[0]))]
-    for limit in AVERAGE_PRECISION_MM:
-        value, ends = _percent_cells(f"average_precision_{limit}mm")
-        columns += [(f"AP at {limit} mm ↑", "%", value), (f"AP at {limit} mm ↑", "95 % interval", ends)]
-    caption = "Average precision over all confidences: greedy matching, the most confident first."
+    for column in numbers:
+        title = f"{column.title} {ARROWS[column.better]}"
+        columns += [
+            (title, column.unit, partial(_value, column)),
+            (title, "95 % interval", partial(_ends, column)),
+        ]
     return page_table(caption, columns, rows)
 
 
-def _error_cells(name: str) -> tuple[Callable[[Row], str], Callable[[Row], str]]:
-    return (
-        lambda row: formatting.number(row[1].numbers[name], 2),
-        lambda row: formatting.interval_text(row[1].intervals[name], 2),
-    )
+def _value(column: Column, row: Row) -> str:
+    return column.text(row[1].numbers[column.path])
 
 
-def _error_table(rows: list[Row]) -> PageTable:
-    columns: list[tuple[str, str, Callable[[Row], str]]] = [("Config", "", lambda row: printable(row[0]))]
-    for name, (title, unit) in _ERRORS.items():
-        value, ends = _error_cells(name)
-        columns += [(title, unit, value), (title, "95 % interval", ends)]
-    return page_table("Errors of matched detections: tie point, and normal where one is given.", columns, rows)
+def _ends(column: Column, row: Row) -> str:
+    return column.interval_text(row[1].intervals[column.path], " to ") or DASH
 
 
 def _count(name: str) -> Callable[[Row], str]:
@@ -131,8 +124,8 @@ def _curve_figure(name: str, table: DetectionTable) -> PageFigure:
         for colour, (limit, curve) in enumerate(table.curves.items())
     ]
     average = "; ".join(
-        f"average precision at {limit} mm: {_percent_cells(f'average_precision_{limit}mm')[0]((name, table))} %"
-        for limit in AVERAGE_PRECISION_MM
+        f"average precision at {limit} mm: {_value(column, (name, table))} %"
+        for limit, column in zip(AVERAGE_PRECISION_MM, _AVERAGES, strict=True)
     )
     labels = ChartText(f"Precision over recall, {name}", average, "recall", "precision")
     svg = chart(series, LinearAxis(0, 1, LEFT, RIGHT), LinearAxis(0, 1, HEIGHT, TOP), labels)
@@ -146,8 +139,7 @@ def _notes(result: DetectionResult) -> list[str]:
         "bars, and each bar has 30 single-bar interior pixels or more within 6 diameters, on both sides.",
         f"Ignored: detections whose nearest crossing is not judged and within {1000 * MATCH_M:g} mm, one for each "
         "such crossing, and those that project onto a bar whose axis is not known.",
-        "Intervals: bootstrap over blocks of neighbouring views, or over scenes. "
-        f"{formatting.DASH}: undefined or unknown.",
+        f"Intervals: bootstrap over blocks of neighbouring views, or over scenes. {DASH}: undefined or unknown.",
     ]
     if not result.has_confidence:
         notes.append("The file has no confidences, so that average precision has one point of the curve only.")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 
 from rich import box
 from rich.console import Console
@@ -17,10 +16,10 @@ from rebar_depth_bench.extended.inspection.measures import MISS_MM
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, Measure
 from rebar_depth_bench.extended.predictions import NATIVE, SCALED
 from rebar_depth_bench.extended.result import ExtendedResult, ExtendedTable, MeasureEstimate
-from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.crossing_texts import reach_sentence
 from rebar_depth_bench.reporting.tables import frame_csv, plain_text
 from rebar_depth_bench.scoring.bootstrap import Interval
+from rebar_depth_bench.scoring.columns import DASH, number
 from rebar_depth_bench.scoring.result import Result
 
 UNDEFINED = "n/a"
@@ -35,8 +34,6 @@ _ZERO_TOLERANCE = 1e-12
 _MIN_WIDTH_WITH_INTERVALS = 100
 """Least console width that shows intervals, characters; in a narrower one, names would take three lines each."""
 
-_ARROWS: Mapping[str, str] = {"lower": " ↓", "higher": " ↑", "": ""}
-
 
 def print_extended(extended: ExtendedResult, console: Console) -> None:
     """Print every measure that has a value, native beside scaled; a wide console also shows the intervals."""
@@ -50,9 +47,7 @@ def print_extended(extended: ExtendedResult, console: Console) -> None:
             grid.add_column(heading, justify="right", no_wrap=True)
         for family in MEASURE_FAMILIES.values():
             rows = [(measure, measure_cells(table, family, measure)) for measure in family.measures]
-            known_rows = [
-                (measure, texts) for measure, texts in rows if any(cell != formatting.DASH for cell in texts)
-            ]
+            known_rows = [(measure, texts) for measure, texts in rows if any(cell != DASH for cell in texts)]
             if known_rows:
                 grid.add_section()
                 grid.add_row(plain_text(family.title, style="italic"))
@@ -85,8 +80,7 @@ def print_extended(extended: ExtendedResult, console: Console) -> None:
 
 def measure_heading(measure: Measure) -> str:
     """Return a measure's title with its unit and better direction."""
-    unit = f", {measure.unit}" if measure.unit else ""
-    return f"{measure.title}{unit}{_ARROWS[measure.better]}"
+    return measure.column.heading
 
 
 def measure_cells(table: ExtendedTable, family: MeasureFamily, measure: Measure) -> list[str]:
@@ -98,7 +92,7 @@ def measure_cells(table: ExtendedTable, family: MeasureFamily, measure: Measure)
     for alignment in family.alignments:
         estimate = table.numbers[alignment][measure.name]
         if is_miss(estimate, measure):
-            texts += [MISSED, formatting.DASH]
+            texts += [MISSED, DASH]
         else:
             defined = estimate.value is not None or not estimate.samples
             texts += [
@@ -121,7 +115,7 @@ def format_value(value: float | None, measure: Measure, digits: int = 4) -> str:
     An undefined value is a dash.
     """
     if value is None or not math.isfinite(value):
-        return formatting.DASH
+        return DASH
     value = value if abs(value) >= _ZERO_TOLERANCE else 0.0
     return f"{100 * value:.1f}" if measure.unit == "%" else f"{value:.{digits}g}"
 
@@ -135,8 +129,8 @@ def single_bar_sentence(table: ExtendedTable) -> str:
     if not share:
         return f"{text}: every scored pixel has a second bar within one pixel."
     errors = [
-        f"{alignment} {formatting.number(table.numbers[alignment]['single_bar_abs_rel'].value, 4)} "
-        f"(all scored pixels: {formatting.number(table.numbers[alignment]['single_bar_views_abs_rel'].value, 4)})"
+        f"{alignment} {number(table.numbers[alignment]['single_bar_abs_rel'].value, 4)} "
+        f"(all scored pixels: {number(table.numbers[alignment]['single_bar_views_abs_rel'].value, 4)})"
         for alignment in (NATIVE, SCALED)
     ]
     return (
@@ -152,10 +146,11 @@ def extended_csv(result: Result) -> str:
     frame = result.extended.to_pandas()
     frame.insert(0, "method", result.method)
     frame["protocol"] = EXTENDED_PROTOCOL
-    for name in ("dataset_digest", "submission_sha256", "software_version"):
-        frame[name] = getattr(result, name)
+    frame["dataset_digest"] = result.dataset.digest
+    frame["submission_sha256"] = result.submission.sha256
+    frame["software_version"] = result.software.version
     return frame_csv(frame)
 
 
 def _interval_text(ends: Interval | None, measure: Measure) -> str:
-    return formatting.DASH if ends is None else " to ".join(format_value(end, measure, 3) for end in ends)
+    return DASH if ends is None else " to ".join(format_value(end, measure, 3) for end in ends)

@@ -35,7 +35,8 @@ from rebar_depth_bench.reporting.published import (
     published_rows,
 )
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE
-from rebar_depth_bench.scoring.result import Result, Table
+from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.scoring.table import Table
 
 if TYPE_CHECKING:
     from matplotlib.artist import Artist
@@ -170,7 +171,7 @@ def _panel(config: str, results: Sequence[Result], *, published: bool) -> Panel:
         if errors := _errors(table):
             points.append(FigurePoint(name, *errors, hollow=not table.is_comparable))
     optics = f", paper {OTHER_OPTICS_MARK}" if match and not match.same_optics else ""
-    one_pixel = first.reference.one_pixel_abs_rel
+    one_pixel = first.reference.one_pixel.abs_rel
     return Panel(
         f"{config_title(printable(config, 40), first.split)}, {counted(first.views, 'view')}{optics}",
         tuple(points),

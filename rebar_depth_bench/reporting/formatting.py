@@ -2,23 +2,28 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
-from decimal import ROUND_DOWN, Decimal
 from typing import TYPE_CHECKING
 
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.scoring.bootstrap import MIN_BLOCKS
+from rebar_depth_bench.scoring.columns import (
+    CONSTANT,
+    COVERAGE,
+    DASH,
+    METRICS,
+    NATIVE,
+    REFERENCE_ERRORS,
+    SCALED,
+    SCALED_CONSTANT,
+    texts,
+)
 from rebar_depth_bench.scoring.groups import GROUPINGS
-from rebar_depth_bench.scoring.metrics import METRICS, DepthMetrics
-from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, WITHIN_MM
+from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE
 
 if TYPE_CHECKING:
-    from rebar_depth_bench.scoring.result import Table
-    from rebar_depth_bench.submission.metadata import Declaration
-
-DASH = "–"
-"""Text of an undefined number, which is null in the JSON."""
+    from rebar_depth_bench.scoring.table import Table
+    from rebar_depth_bench.submission.declaration import Declaration
 
 DASH_NOTE = f"{DASH}: undefined, because no pixel has a prediction or a number overflowed."
 
@@ -41,49 +46,11 @@ INTERVAL_NOTE = (
 
 _SCENES_NOTE = "bootstrap over scenes (other scenes of the same generator)."
 
-METRIC_HEADS = tuple((info.title, info.unit, "↑" if info.higher_is_better else "↓") for info in METRICS.values())
-"""Name, unit and better direction of each number that ``metric_cells`` formats."""
-
-GROUP_METRICS = ("abs_rel", "rmse_cm")
-"""Metrics in tables of groups: those that have reference errors."""
-
 GROUP_NOTE = (
     "The group of a view follows from its ground truth. Beside the errors of a group are the reference errors of "
     f"its views: {ONE_PIXEL_TITLE} for native, {CONSTANT_TITLE} for scaled errors. A group with views of fewer "
     f"than {MIN_BLOCKS} scenes has no intervals."
 )
-
-
-def number(value: float | None, decimals: int) -> str:
-    """Return a number with fixed decimals, in scientific notation if these would hide it, a dash if undefined.
-
-    Scientific notation is used below half a unit of the last decimal and from 1e6 on.
-    """
-    if value is None or not math.isfinite(value):
-        return DASH
-    if value != 0 and not 0.5 * 10**-decimals <= abs(value) < 1e6:
-        return f"{value:.1e}"
-    return f"{value:.{decimals}f}"
-
-
-def percent(share: float | None) -> str:
-    """Return a share in per cent, rounded to one decimal."""
-    return DASH if share is None else f"{share * 100:.1f}"
-
-
-def coverage_percent(share: float | None) -> str:
-    """Return a coverage in per cent with one decimal, rounded down.
-
-    Incomplete coverage is therefore never shown as 100 %, and coverage below the threshold never as reaching it.
-    """
-    if share is None:
-        return DASH
-    return str((Decimal(repr(share)) * 100).quantize(Decimal("0.1"), rounding=ROUND_DOWN))
-
-
-def rank_error_cell(rank_error: float | None) -> str:
-    """Return a rank error with four decimals."""
-    return number(rank_error, 4)
 
 
 def inputs_text(declared: Declaration) -> str:
@@ -101,60 +68,6 @@ def ground_truth_text(declared: Declaration) -> str:
 def declaration_text(declared: Declaration) -> str:
     """Return a submission's declaration in one line."""
     return f"inputs: {declared.inputs or 'not declared'}; ground truth: {ground_truth_text(declared)}"
-
-
-def metric_cell(metrics: DepthMetrics | None, name: str) -> str:
-    """Return one field of ``metrics`` as text; a dash if ``metrics`` is None."""
-    return number(getattr(metrics, name, None), METRICS[name].decimals)
-
-
-def metric_cells(metrics: DepthMetrics | None) -> list[str]:
-    """Return AbsRel, RMSE (cm), MAE (cm) and delta1 as text; dashes if ``metrics`` is None."""
-    return [metric_cell(metrics, name) for name in METRICS]
-
-
-def paper_cells(table: Table) -> list[str]:
-    """Return RMSE (cm) and AbsRel native, AbsRel scaled and the median s as text, as in the paper's Table I."""
-    native = (metric_cell(table.native, name) for name in ("rmse_cm", "abs_rel"))
-    return [*native, metric_cell(table.scaled, "abs_rel"), scale_cell(table.scale_median)]
-
-
-def scale_cell(scale: float | None) -> str:
-    """Return a scale factor s with three decimals."""
-    return number(scale, 3)
-
-
-def within_cells(within_mm: Mapping[int, float | None] | Mapping[int, float]) -> list[str]:
-    """Return the shares within each tolerance of ``WITHIN_MM``, per cent."""
-    return [percent(within_mm[tolerance]) for tolerance in WITHIN_MM]
-
-
-def interval_cell(interval: tuple[float, float] | None, decimals: int, factor: float = 1.0) -> str:
-    """Return a 95 % interval times ``factor`` as ``low – high``; empty if it is undefined."""
-    if interval is None or not all(math.isfinite(end) for end in interval):
-        return ""
-    low, high = (number(end * factor, decimals) for end in interval)
-    return f"{low} – {high}"
-
-
-def interval_text(interval: tuple[float, float] | None, decimals: int) -> str:
-    """Return an interval as ``low to high``; a dash if it is None."""
-    return DASH if interval is None else " to ".join(number(end, decimals) for end in interval)
-
-
-def coverage_interval_cell(interval: tuple[float, float] | None) -> str:
-    """Return the 95 % interval of a coverage in per cent, both ends rounded down like the coverage itself."""
-    if interval is None or not all(math.isfinite(end) for end in interval):
-        return ""
-    return " – ".join(coverage_percent(end) for end in interval)
-
-
-def metric_interval_cells(intervals: Mapping[str, tuple[float, float] | None], alignment: str) -> list[str]:
-    """Return the intervals of the numbers of ``metric_cells``, with the same numbers of decimals.
-
-    ``alignment`` is ``native`` or ``scaled``.
-    """
-    return [interval_cell(intervals.get(f"{alignment}.{name}"), info.decimals) for name, info in METRICS.items()]
 
 
 def interval_note(tables: Iterable[Table]) -> str:
@@ -207,20 +120,10 @@ def incomparable_reasons(table: Table) -> list[str]:
         reasons.append(f"{missing} of {counted(table.views, 'view')} without any prediction")
     if table.coverage is not None and table.coverage < MIN_COMPARABLE_COVERAGE:
         minimum = f"{MIN_COMPARABLE_COVERAGE * 100:.0f} %"
-        reasons.append(f"coverage {coverage_percent(table.coverage)} % is below {minimum}")
+        reasons.append(f"coverage {COVERAGE.text(table.coverage)} % is below {minimum}")
     if any(metrics is not None and not metrics.is_finite for metrics in (table.native, table.scaled)):
         reasons.append("a number overflowed")
     return reasons
-
-
-def group_reference_cells(table: Table) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Return the errors ``GROUP_METRICS`` of the references one pixel and constant as text."""
-    one_pixel = _error_texts(table.reference.one_pixel_abs_rel, table.reference.one_pixel_rmse_cm)
-    return one_pixel, _error_texts(*table.scaled_constant)
-
-
-def _error_texts(*errors: float | None) -> tuple[str, ...]:
-    return tuple(number(error, METRICS[name].decimals) for name, error in zip(GROUP_METRICS, errors, strict=True))
 
 
 def grouping_title(grouping: str) -> str:
@@ -237,35 +140,31 @@ def scaled_constants(results: Sequence[tuple[str, Table]]) -> dict[str, tuple[fl
     found: dict[tuple[str, ...], tuple[float, float | None]] = {}
     titles: dict[tuple[str, ...], str] = {}
     for method, table in results:
-        abs_rel, rmse_cm = table.scaled_constant
-        if abs_rel is not None:
-            texts = _error_texts(abs_rel, rmse_cm)
-            complete = _error_texts(table.reference.constant_abs_rel, table.reference.constant_rmse_cm)
-            found.setdefault(texts, (abs_rel, rmse_cm))
-            listed = f"{titles.get(texts, CONSTANT_TITLE)}, {printable(method)}"
-            titles[texts] = CONSTANT_TITLE if texts == complete else listed
-    return {titles[texts] if len(found) > 1 else CONSTANT_TITLE: errors for texts, errors in found.items()}
+        constant = table.reference.scaled_constant
+        if constant.abs_rel is not None:
+            shown, complete = (tuple(texts(columns, table)) for columns in (SCALED_CONSTANT, CONSTANT))
+            found.setdefault(shown, (constant.abs_rel, constant.rmse_cm))
+            listed = f"{titles.get(shown, CONSTANT_TITLE)}, {printable(method)}"
+            titles[shown] = CONSTANT_TITLE if shown == complete else listed
+    return {titles[shown] if len(found) > 1 else CONSTANT_TITLE: errors for shown, errors in found.items()}
 
 
 def reference_rows(results: Sequence[tuple[str, Table]]) -> list[tuple[str, list[str], list[str]]]:
-    """Return name, native and scaled cells (as ``metric_cells``, empty if they do not apply) of each reference.
+    """Return name, native and scaled cells (of ``METRICS``, empty if they do not apply) of each reference.
 
     ``results`` are as in ``scaled_constants``.
     """
     empty = [""] * len(METRICS)
     rows = [
-        (title, empty, _reference_cells(dict(zip(GROUP_METRICS, errors, strict=True))))
+        (title, empty, _reference_cells(dict(zip(REFERENCE_ERRORS, errors, strict=True))))
         for title, errors in scaled_constants(results).items()
     ]
-    references = [table.reference for _, table in results if table.reference.one_pixel_abs_rel is not None]
-    for reference in references[:1]:
-        values = {"abs_rel": reference.one_pixel_abs_rel, "rmse_cm": reference.one_pixel_rmse_cm}
-        rows.append((ONE_PIXEL_TITLE, _reference_cells(values), empty))
-    return rows
+    shifted = [table.reference.one_pixel for _, table in results if table.reference.one_pixel.abs_rel is not None]
+    return rows + [(ONE_PIXEL_TITLE, _reference_cells(vars(errors)), empty) for errors in shifted[:1]]
 
 
 def paper_reference_rows(results: Sequence[tuple[str, Table]]) -> list[tuple[str, list[str]]]:
-    """Return name and cells of each reference in the columns of ``paper_cells``, empty where they do not apply."""
+    """Return name and cells of each reference for ``PAPER_COLUMNS``, empty where they do not apply."""
     abs_rel, rmse_cm = list(METRICS).index("abs_rel"), list(METRICS).index("rmse_cm")
     return [
         (name, [native[rmse_cm], native[abs_rel], scaled[abs_rel], ""])
@@ -282,24 +181,25 @@ def rank_mark(declared: Declaration, table: Table) -> str:
 
 def reference_findings(table: Table) -> list[str]:
     """Return a sentence on each error of a table that its reference errors put into perspective."""
-    findings, reference = [], table.reference
-    if table.native and reference.one_pixel_abs_rel and table.native.abs_rel < reference.one_pixel_abs_rel:
+    findings = []
+    native, scaled = NATIVE[0], SCALED[0]
+    one_pixel, constant = table.reference.one_pixel.abs_rel, table.reference.scaled_constant.abs_rel
+    if table.native and one_pixel and table.native.abs_rel < one_pixel:
         findings.append(
-            f"The native AbsRel {metric_cell(table.native, 'abs_rel')} is below that of exact depth shifted by "
-            f"one pixel ({number(reference.one_pixel_abs_rel, METRICS['abs_rel'].decimals)}): it is smaller than "
-            "the differences between neighbouring pixels."
+            f"The native AbsRel {native.text(table.native.abs_rel)} is below that of exact depth shifted by "
+            f"one pixel ({native.text(one_pixel)}): it is smaller than the differences between neighbouring "
+            "pixels."
         )
-    constant, _ = table.scaled_constant
     if table.scaled and constant and table.scaled.abs_rel > constant:
         findings.append(
-            f"The scaled AbsRel {metric_cell(table.scaled, 'abs_rel')} is above that of a constant "
-            f"({number(constant, METRICS['abs_rel'].decimals)}): a plane at one depth describes the shape better."
+            f"The scaled AbsRel {scaled.text(table.scaled.abs_rel)} is above that of a constant "
+            f"({scaled.text(constant)}): a plane at one depth describes the shape better."
         )
     return findings
 
 
 def _reference_cells(values: Mapping[str, float | None]) -> list[str]:
-    return [number(values[name], info.decimals) if name in values else "" for name, info in METRICS.items()]
+    return [metric.text(values[name]) if name in values else "" for name, metric in METRICS.items()]
 
 
 def has_dash(rows: Iterable[Iterable[str]]) -> bool:

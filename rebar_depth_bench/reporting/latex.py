@@ -16,15 +16,16 @@ from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.html.assets import environment
 from rebar_depth_bench.reporting.published import PublishedRow, load_published, published_rows
+from rebar_depth_bench.scoring.columns import DASH, PAPER_COLUMNS, RANK_ERROR, rounded, texts
 from rebar_depth_bench.scoring.protocol import PROTOCOL
-from rebar_depth_bench.scoring.published_match import PublishedMatch
-from rebar_depth_bench.scoring.result import Result, Table
-from rebar_depth_bench.scoring.rounding import rounded
+from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.scoring.table import PublishedMatch, Table
 
 CONFIGS_PER_BLOCK = 2
 """Number of configs side by side that fit into a page width of 17 cm; further configs follow in blocks below."""
 
-_COLUMNS = 5
+_TABLE_COLUMNS = (RANK_ERROR, *PAPER_COLUMNS)
+_COLUMNS = len(_TABLE_COLUMNS)
 _MISSING = "--"
 _UNRANKED_MARK = r"$^{\ddagger}$"
 _OTHER_OPTICS_MARK = r"$^{\S}$"
@@ -57,7 +58,7 @@ def latex_table(results: Sequence[Result], *, published: bool, intervals: bool =
 
     Raises ``InputError`` if there are no results, or if they belong to different datasets.
     """
-    digests = {result.dataset_digest for result in results}
+    digests = {result.dataset.digest for result in results}
     if len(digests) != 1:
         digest_list = ", ".join(sorted(map(formatting.short_digest, digests))) or "no result"
         raise InputError(f"LaTeX table: results of {len(digests)} datasets ({digest_list}), expected one dataset")
@@ -70,8 +71,8 @@ def latex_table(results: Sequence[Result], *, published: bool, intervals: bool =
     return _template().render(
         protocol=PROTOCOL,
         columns=_COLUMNS,
-        version=results[0].dataset_version,
-        digest=formatting.short_digest(results[0].dataset_digest, 16),
+        version=results[0].dataset.version,
+        digest=formatting.short_digest(results[0].dataset.digest, 16),
         view_counts=[
             f"{_config_name(config, table)} {formatting.counted(table.views, 'view')}"
             for config, table in tables.items()
@@ -177,15 +178,11 @@ def _cells(table: Table | None, best: Sequence[str | None], intervals: bool) -> 
 
 
 def _number_texts(table: Table) -> list[str]:
-    texts = [formatting.rank_error_cell(table.rank_error), *formatting.paper_cells(table)]
-    return [_MISSING if text == formatting.DASH else text for text in texts]
+    return [_MISSING if text == DASH else text for text in texts(_TABLE_COLUMNS, table)]
 
 
 def _interval_texts(table: Table) -> list[str]:
-    native, scaled = (formatting.metric_interval_cells(table.intervals, kind) for kind in ("native", "scaled"))
-    scale = formatting.interval_cell(table.intervals.get("scale_median"), 3)
-    rank_error = formatting.interval_cell(table.intervals.get("rank_error"), 4)
-    return [text.replace(" – ", ", ") for text in (rank_error, native[1], native[0], scaled[0], scale)]
+    return [column.interval_text(table.intervals.get(column.path), ", ") for column in _TABLE_COLUMNS]
 
 
 def _best_texts(tables: Iterable[Table | None]) -> list[str | None]:
@@ -203,11 +200,10 @@ def _best_texts(tables: Iterable[Table | None]) -> list[str | None]:
     return [*best, *[None] * (_COLUMNS - columns)]
 
 
-def _errors(table: Table) -> tuple[float, float, float, float]:
+def _errors(table: Table) -> list[float]:
     """Return rank error, RMSE and AbsRel, native, and AbsRel after the oracle scale; infinity where undefined."""
-    rank_error = math.inf if table.rank_error is None else table.rank_error
-    rmse_cm, abs_rel = (table.native.rmse_cm, table.native.abs_rel) if table.native else (math.inf, math.inf)
-    return rank_error, rmse_cm, abs_rel, table.scaled.abs_rel if table.scaled else math.inf
+    values = [column.value(table) for column in _TABLE_COLUMNS[:-1]]
+    return [math.inf if value is None else value for value in values]
 
 
 def _paper_rows(match: PublishedMatch | None) -> tuple[PublishedRow, ...]:

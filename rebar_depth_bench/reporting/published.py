@@ -8,12 +8,19 @@ numbers wherever they are shown. Numbers are kept as strings, so that they are p
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
 
+from markupsafe import Markup
 from pydantic import TypeAdapter
+
+from rebar_depth_bench.reporting.charts.scatter import ScatterPoint, scatter_chart
+from rebar_depth_bench.reporting.html.rows import Cell, table_row
+from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.scoring.table import Table
 
 
 @dataclass(frozen=True)
@@ -81,3 +88,90 @@ def published_rows(scene: str) -> tuple[PublishedRow, ...]:
     """Return the rows of Table I of ``lattice``, ``pile`` or ``pier`` in order; empty for other scenes."""
     scenes = load_published().scenes
     return scenes[scene].rows if scene in scenes else ()
+
+
+# Paper section of the report: a result beside the published rows of the same scene, not ranked with them.
+
+_FIRST_LETTER = ord("A")
+
+
+@dataclass(frozen=True)
+class PaperRow:
+    """Row of a scene's table: RMSE (cm), AbsRel, AbsRel_s, s; ``mark`` labels its point in the chart."""
+
+    mark: str
+    name: str
+    published: bool
+    dagger: bool
+    cells: list[Cell]
+
+
+@dataclass(frozen=True)
+class PaperScene:
+    """Scene of Table I: rows of the submission's configs, then the published rows, measured at ``distance``."""
+
+    heading: str
+    distance: str
+    chart: Markup
+    rows: list[PaperRow]
+    other_optics: bool
+
+
+def paper_scenes(result: Result) -> list[PaperScene]:
+    """Return the scenes of Table I for which the result has configs, in the paper's order."""
+    tables_by_scene: dict[str, dict[str, Table]] = {}
+    for config, table in result.tables.items():
+        if table.published is not None:
+            tables_by_scene.setdefault(table.published.scene, {})[config] = table
+    scenes = load_published().scenes
+    return [
+        _paper_scene(name, scene, tables_by_scene[name])
+        for name, scene in scenes.items()
+        if name in tables_by_scene
+    ]
+
+
+def _paper_scene(name: str, scene: PublishedScene, tables: Mapping[str, Table]) -> PaperScene:
+    rows = [_own_row(str(index + 1), config) for index, config in enumerate(tables.items())]
+    rows += [published_row(published_mark(index), row) for index, row in enumerate(scene.rows)]
+    heading = scene.title if scene.title.lower() == name else f"{scene.title} ({name})"
+    chart = scatter_chart(f"{heading}: native and scaled AbsRel", scatter_points(rows, tables))
+    other_optics = any(table.published and not table.published.same_optics for table in tables.values())
+    return PaperScene(heading, scene.distance, chart, rows, other_optics)
+
+
+def published_mark(index: int) -> str:
+    """Return the capital letter of a published row; rows of submissions have numbers."""
+    return chr(_FIRST_LETTER + index) if index < 26 else f"A{index - 25}"
+
+
+def _own_row(mark: str, config: tuple[str, Table]) -> PaperRow:
+    row, match = table_row(*config), config[1].published
+    name = row.name if match is None or match.same_optics else f"{row.name} {OTHER_OPTICS_MARK}"
+    return PaperRow(mark, name, False, False, [row.native[1], row.native[0], row.scaled[0], row.scale])
+
+
+def published_row(mark: str, row: PublishedRow) -> PaperRow:
+    """Return the table row of a published row, printed as published; ``mark`` labels its point in the chart."""
+    return PaperRow(mark, row.method, True, row.median_anchored, [Cell(text, float(text)) for text in row.cells])
+
+
+def scatter_points(rows: Iterable[PaperRow], tables: Mapping[str, Table]) -> list[ScatterPoint]:
+    """Return the points of the rows with both values; rows that are not published are those of ``tables``."""
+    intervals = [table.intervals for table in tables.values()]
+    points = []
+    for index, row in enumerate(rows):
+        row_intervals = {} if row.published else intervals[index]
+        native, scaled = row.cells[1].value, row.cells[2].value
+        if native is not None and scaled is not None:
+            interval_pair = (
+                finite_interval(row_intervals.get("native.abs_rel")),
+                finite_interval(row_intervals.get("scaled.abs_rel")),
+            )
+            points.append(ScatterPoint(row.mark, row.name, native, scaled, row.published, *interval_pair))
+    return points
+
+
+def finite_interval(interval: tuple[float, float] | None) -> tuple[float, float] | None:
+    """Return the interval if both ends are finite, else None."""
+    return interval if interval and all(map(math.isfinite, interval)) else None

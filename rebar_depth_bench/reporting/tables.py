@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -18,10 +18,23 @@ from rich.text import Text
 
 from rebar_depth_bench.errors import printable, terminal_text
 from rebar_depth_bench.reporting import formatting
+from rebar_depth_bench.scoring.columns import (
+    COVERAGE,
+    NATIVE,
+    ONE_PIXEL,
+    RANK_ERROR,
+    SCALE,
+    SCALED,
+    SCALED_CONSTANT,
+    VIEWS_SCORED,
+    WITHIN,
+    Column,
+    texts,
+    with_reference,
+)
 from rebar_depth_bench.scoring.frames import tables_frame
-from rebar_depth_bench.scoring.metrics import METRIC_NAMES
-from rebar_depth_bench.scoring.protocol import WITHIN_MM
-from rebar_depth_bench.scoring.result import Result, Table
+from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.scoring.table import Table
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -32,14 +45,15 @@ _FORMULA_STARTS = ("=", "+", "-", "@")
 
 @dataclass(frozen=True)
 class _ColumnGroup:
-    """Columns that are printed together, under a title that states their alignment.
-
-    ``cells`` returns the cells of a config, as many as there are ``heads``.
-    """
+    """Columns that are printed together, under a title that states their alignment."""
 
     title: str
-    heads: Sequence[str]
-    cells: Callable[[Table], Sequence[str]]
+    columns: Sequence[Column]
+
+    def cells(self, table: Table) -> list[str]:
+        """Return the cells of a config; a rank error that does not rank is marked."""
+        marks = ["‡" if column is RANK_ERROR and not table.ranked else "" for column in self.columns]
+        return [text + mark for text, mark in zip(texts(self.columns, table), marks, strict=True)]
 
 
 @dataclass(frozen=True)
@@ -51,31 +65,10 @@ class _Row:
     references: Sequence[tuple[str, list[str], list[str]]] = ()
 
 
-_METRIC_HEADS = [f"{name} {better}\n{unit}" for name, unit, better in formatting.METRIC_HEADS]
-_BASE = _ColumnGroup(
-    "",
-    ["views\nscored\n/all", "cover-\nage ↑\n%", "rank\nerror ↓\n"],
-    lambda table: [
-        f"{table.views_scored}/{table.views}",
-        formatting.coverage_percent(table.coverage),
-        formatting.rank_error_cell(table.rank_error) + ("" if table.ranked else "‡"),
-    ],
-)
-_NATIVE = _ColumnGroup(
-    formatting.NATIVE_TITLE,
-    [f"native\n{head}" for head in _METRIC_HEADS],
-    lambda table: formatting.metric_cells(table.native),
-)
-_SCALED = _ColumnGroup(
-    formatting.SCALED_TITLE,
-    [*(f"scaled\n{head}" for head in _METRIC_HEADS), "scale\ns\n"],
-    lambda table: [*formatting.metric_cells(table.scaled), formatting.scale_cell(table.scale_median)],
-)
-_WITHIN = _ColumnGroup(
-    formatting.WITHIN_TITLE,
-    [f"within\n{tolerance_mm} mm\n% ↑" for tolerance_mm in WITHIN_MM],
-    lambda table: formatting.within_cells(table.within_mm),
-)
+_BASE = _ColumnGroup("", [VIEWS_SCORED, COVERAGE, RANK_ERROR])
+_NATIVE = _ColumnGroup(formatting.NATIVE_TITLE, NATIVE)
+_SCALED = _ColumnGroup(formatting.SCALED_TITLE, [*SCALED, SCALE])
+_WITHIN = _ColumnGroup(formatting.WITHIN_TITLE, WITHIN)
 _LAYOUTS = (
     [[_BASE, _NATIVE, _SCALED, _WITHIN]],
     [[_NATIVE, _SCALED], [_BASE, _WITHIN]],
@@ -83,32 +76,9 @@ _LAYOUTS = (
 )
 """Column groups of each table to print, from the widest to the narrowest layout."""
 
-_ERROR_POSITIONS = [METRIC_NAMES.index(name) for name in formatting.GROUP_METRICS]
-_ERROR_HEADS = [_METRIC_HEADS[position] for position in _ERROR_POSITIONS]
-_REFERENCE_HEADS = [head.replace(" ↓", "") for head in _ERROR_HEADS]
-_GROUP_NATIVE = _ColumnGroup(
-    "",
-    [f"native\n{head}" for head in _ERROR_HEADS],
-    lambda table: [formatting.metric_cell(table.native, name) for name in formatting.GROUP_METRICS],
-)
-_GROUP_ONE_PIXEL = _ColumnGroup(
-    "",
-    [f"1 pixel\n{head}" for head in _REFERENCE_HEADS],
-    lambda table: formatting.group_reference_cells(table)[0],
-)
-_GROUP_SCALED = _ColumnGroup(
-    "",
-    [f"scaled\n{head}" for head in _ERROR_HEADS],
-    lambda table: [formatting.metric_cell(table.scaled, name) for name in formatting.GROUP_METRICS],
-)
-_GROUP_CONSTANT = _ColumnGroup(
-    "",
-    [*(f"const.\n{head}" for head in _REFERENCE_HEADS), "scale\ns\n"],
-    lambda table: [
-        *formatting.group_reference_cells(table)[1],
-        formatting.scale_cell(table.scale_median),
-    ],
-)
+_GROUP_NATIVE, _GROUP_SCALED = (_ColumnGroup("", with_reference(columns)) for columns in (NATIVE, SCALED))
+_GROUP_ONE_PIXEL = _ColumnGroup("", ONE_PIXEL)
+_GROUP_CONSTANT = _ColumnGroup("", [*SCALED_CONSTANT, SCALE])
 _GROUP_LAYOUTS = (
     [[_BASE, _GROUP_NATIVE, _GROUP_ONE_PIXEL, _GROUP_SCALED, _GROUP_CONSTANT]],
     [[_BASE, _GROUP_NATIVE, _GROUP_ONE_PIXEL], [_GROUP_SCALED, _GROUP_CONSTANT]],
@@ -141,24 +111,20 @@ def print_table(result: Result, console: Console) -> None:
 def result_csv(result: Result) -> str:
     r"""Return the tables as CSV with one row per config and ``\n`` line ends.
 
-    Columns are the JSON's numbers and provenance. Undefined numbers are empty. Text that a spreadsheet would
-    execute as a formula gets a leading apostrophe, and control characters become U+FFFD.
+    Columns are the JSON's numbers, the ends of their intervals, and provenance. Undefined numbers are empty. Text
+    that a spreadsheet would execute as a formula gets a leading apostrophe, and control characters become U+FFFD.
     """
     return results_csv([result])
 
 
 def groups_csv(result: Result) -> str:
     """Return the tables of groups of views as CSV, one row per group, in the format of ``result_csv``."""
-    return frame_csv(_without_intervals(result.to_pandas("groups")))
+    return frame_csv(result.to_pandas("groups"))
 
 
 def results_csv(results: Sequence[Result]) -> str:
     """Return the tables of several results as one CSV, in the format of ``result_csv``."""
-    return frame_csv(_without_intervals(tables_frame([result.to_dict() for result in results])))
-
-
-def _without_intervals(frame: DataFrame) -> DataFrame:
-    return frame[[name for name in frame if not name.endswith(("_low", "_high"))]]
+    return frame_csv(tables_frame(results))
 
 
 def _headline(result: Result) -> str:
@@ -166,10 +132,10 @@ def _headline(result: Result) -> str:
 
 
 def _provenance(result: Result) -> str:
-    digest = formatting.short_digest(result.dataset_digest)
+    digest = formatting.short_digest(result.dataset.digest)
     return (
-        f"dataset {printable(result.dataset_version)} ({digest}), "
-        f"archive {formatting.short_digest(result.submission_sha256)}, software {result.software_version}"
+        f"dataset {printable(result.dataset.version)} ({digest}), "
+        f"archive {formatting.short_digest(result.submission.sha256)}, software {result.software.version}"
     )
 
 
@@ -239,7 +205,7 @@ def _fitting_layout(
 def _rich_table(rows: Sequence[_Row | str], groups: Sequence[_ColumnGroup], head: str = "config") -> RichTable:
     """Return the table of rows; a text among the rows is the heading of a section."""
     table = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
-    heads = [head for group in groups for head in group.heads]
+    heads = [column.head for group in groups for column in group.columns]
     lines = max(head.count("\n") for head in heads)
     table.add_column(_header(head, lines), no_wrap=True)
     for column_head in heads:
@@ -257,8 +223,8 @@ def _rich_table(rows: Sequence[_Row | str], groups: Sequence[_ColumnGroup], head
             if any(map(any, filled)):
                 cells = [
                     cell
-                    for group, texts in zip(groups, filled, strict=True)
-                    for cell in [*texts, *[""] * (len(group.heads) - len(texts))]
+                    for group, shown in zip(groups, filled, strict=True)
+                    for cell in [*shown, *[""] * (len(group.columns) - len(shown))]
                 ]
                 table.add_row(*map(plain_text, [f"  {title}", *cells]), style="dim")
     return table

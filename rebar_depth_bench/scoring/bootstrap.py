@@ -18,6 +18,7 @@ simulates how often intervals contain the true mean.
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
@@ -26,6 +27,8 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray
+
+from rebar_depth_bench.names import scene_of
 
 RESAMPLES = 2000
 """Number of bootstrap resamples (draws)."""
@@ -43,6 +46,7 @@ INTERVALS: Mapping[str, Any] = {"method": "expanded-percentile", "draws": RESAMP
 """Entry ``intervals`` of the JSON of results: how all of their intervals were computed."""
 
 _SEED = 0
+_VIEW_INDEX = re.compile("[0-9]{4,9}")
 
 Interval = tuple[float, float]
 
@@ -197,6 +201,30 @@ def resample_scenes(scenes: Sequence[str]) -> Resampling:
     n = len(number)
     drawn = (np.random.PCG64(_SEED).random_raw(RESAMPLES * n) % max(n, 1)).astype(np.int64).reshape(RESAMPLES, n)
     return Resampling(_counts(drawn, n), np.array([number[scene] for scene in scenes], np.int64))
+
+
+def resample_views(view_ids: Sequence[str], *, by_scene: bool) -> Resampling:
+    """Return the resamples of views: of whole scenes if ``by_scene``, otherwise of blocks of consecutive views.
+
+    Scenes are resampled in configs of several scenes, which are those with splits.
+    """
+    if by_scene:
+        return resample_scenes([scene_of(view_id) for view_id in view_ids])
+    return resample(protocol_indices(view_ids))
+
+
+def protocol_indices(view_ids: Sequence[str]) -> list[int]:
+    """Return each view's index in its full camera protocol: the four or more digits at the end of its view_id.
+
+    If the ids do not all end with such an index, or are not in its ascending order, return the positions in the
+    sequence.
+    """
+    suffixes = [view_id.rpartition("/")[2] for view_id in view_ids]
+    if all(map(_VIEW_INDEX.fullmatch, suffixes)):
+        indices = list(map(int, suffixes))
+        if indices == sorted(indices):
+            return indices
+    return list(range(len(suffixes)))
 
 
 def block_length(indices: Sequence[int]) -> int:

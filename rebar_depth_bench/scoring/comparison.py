@@ -13,42 +13,28 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.scoring.bootstrap import INTERVALS, Interval
-from rebar_depth_bench.scoring.frames import ALIGNMENTS, differences_frame
-from rebar_depth_bench.scoring.metrics import METRICS
-from rebar_depth_bench.scoring.protocol import PROTOCOL
-from rebar_depth_bench.scoring.provenance import ArchiveIdentity, Provenance
-from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.scoring.rounding import rounded, rounded_interval
-from rebar_depth_bench.scoring.view_score import (
-    SCALE_MEDIAN,
-    VIEW_METRICS,
-    ViewScore,
+from rebar_depth_bench.names import config_of
+from rebar_depth_bench.scoring.bootstrap import INTERVALS, Interval, resample_views
+from rebar_depth_bench.scoring.columns import (
+    COLUMN_BY_PATH,
+    VIEW_COLUMNS,
+    Column,
     bootstrap_estimates,
-    metric_intervals,
-    resample_views,
-    view_metric_values,
+    column_intervals,
+    rounded,
+    rounded_interval,
+    view_values,
 )
-from rebar_depth_bench.view_ids import config_of
+from rebar_depth_bench.scoring.evaluation import ArchiveIdentity, Provenance
+from rebar_depth_bench.scoring.frames import differences_frame
+from rebar_depth_bench.scoring.protocol import PROTOCOL
+from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.scoring.table import ViewScore
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
 Verdict = Literal["better", "worse", "equal", "undecided", "no verdict", ""]
-
-_ALL_VIEWS_PREFIXES = ("coverage", "rank_error", "within_mm.")
-"""Name prefixes of the metrics that every view has, also a view without predictions."""
-
-_HIGHER_IS_BETTER_PREFIXES = (
-    *("coverage", "within_mm."),
-    *(
-        f"{alignment}.{name}"
-        for alignment in ALIGNMENTS
-        for name, info in METRICS.items()
-        if info.higher_is_better
-    ),
-)
-"""Name prefixes of the metrics whose larger value is better."""
 
 
 @dataclass(frozen=True)
@@ -58,10 +44,10 @@ class Difference:
     ``verdict`` rates the other submission: "better" or "worse" if the interval excludes zero; "equal" if the
     interval is [0, 0]; "undecided" if the interval contains zero or is None; "no verdict" for errors of valid
     predictions if either submission has less than ``MIN_COMPARABLE_COVERAGE``, since errors over freely chosen
-    pixels are not comparable; "" for the scale factor, where neither direction is better.
+    pixels are not comparable; "" for numbers of which neither direction is better, as the scale factor.
     """
 
-    name: str
+    column: Column
     views: int
     first: float | None
     other: float | None
@@ -98,9 +84,9 @@ def compare(first: Result, other: Result) -> Comparison:
     Raises ``InputError`` if they were scored against different ground truth, have no config in common, or cover
     different splits of one.
     """
-    if first.dataset_digest != other.dataset_digest:
+    if first.dataset.digest != other.dataset.digest:
         raise InputError(
-            f"{other.method} was scored on the dataset {other.dataset_digest}, expected {first.dataset_digest} as "
+            f"{other.method} was scored on the dataset {other.dataset.digest}, expected {first.dataset.digest} as "
             f"{first.method}: only submissions on the same ground truth can be compared"
         )
     check_same_splits([first, other])
@@ -110,9 +96,9 @@ def compare(first: Result, other: Result) -> Comparison:
             f"{first.method} has {', '.join(first.tables)} and {other.method} has {', '.join(other.tables)}: "
             "expected a config that is in both"
         )
-    archives = [ArchiveIdentity(result.method, result.submission_sha256) for result in (first, other)]
+    archives = [ArchiveIdentity(result.method, result.submission.sha256) for result in (first, other)]
     return Comparison(
-        provenance=Provenance(PROTOCOL, first.dataset_digest, first.dataset_version, archives),
+        provenance=Provenance(PROTOCOL, first.dataset.digest, first.dataset.version, archives),
         configs={config: _config_differences(first, other, config) for config in shared},
     )
 
@@ -136,7 +122,7 @@ def _config_differences(first: Result, other: Result, config: str) -> list[Diffe
         return differences
     return [
         difference
-        if difference.name == SCALE_MEDIAN or difference.name.startswith(_ALL_VIEWS_PREFIXES)
+        if difference.column.of_all_views or not difference.column.better
         else replace(difference, verdict="no verdict")
         for difference in differences
     ]
@@ -156,8 +142,7 @@ def _differences(
         for ids in (list(first), predicted_by_both)
     )
     return [
-        on_all_views[name] if name.startswith(_ALL_VIEWS_PREFIXES) else on_predicted_by_both[name]
-        for name in VIEW_METRICS
+        (on_all_views if column.of_all_views else on_predicted_by_both)[column.path] for column in VIEW_COLUMNS
     ]
 
 
@@ -166,39 +151,40 @@ def _differences_on_views(
 ) -> dict[str, Difference]:
     """Return the differences on the given views by metric name, with the same resamples for both submissions."""
     resampling = resample_views([view.view_id for view in first], by_scene=by_scene)
-    first_values, other_values = view_metric_values(first), view_metric_values(other)
+    first_values, other_values = view_values(first), view_values(other)
     draws = bootstrap_estimates(other_values, resampling) - bootstrap_estimates(first_values, resampling)
-    intervals = metric_intervals(draws, first_values + other_values, resampling)
+    intervals = column_intervals(draws, first_values + other_values, resampling)
     differences = {}
     for name, bounds in intervals.items():
-        first_value, other_value = (_table_value(name, views) for views in (first, other))
+        column = COLUMN_BY_PATH[name]
+        first_value, other_value = (_table_value(column, views) for views in (first, other))
         change = None if first_value is None or other_value is None else other_value - first_value
         differences[name] = Difference(
-            name, len(first), first_value, other_value, change, bounds, _verdict(name, bounds)
+            column, len(first), first_value, other_value, change, bounds, _verdict(column, bounds)
         )
     return differences
 
 
-def _table_value(name: str, views: Sequence[ViewScore]) -> float | None:
-    values = [value for view in views if (value := VIEW_METRICS[name](view)) is not None]
+def _table_value(column: Column, views: Sequence[ViewScore]) -> float | None:
+    values = [value for view in views if (value := column.view_value(view)) is not None]
     if not values or not np.isfinite(values).all():
         return None
-    return float(np.median(values) if name == SCALE_MEDIAN else np.mean(values))
+    return float(np.median(values) if column.statistic == "median" else np.mean(values))
 
 
-def _verdict(name: str, bounds: Interval | None) -> Verdict:
-    if name == SCALE_MEDIAN:
+def _verdict(column: Column, bounds: Interval | None) -> Verdict:
+    if not column.better:
         return ""
     if bounds == (0.0, 0.0):
         return "equal"
     if bounds is None or bounds[0] <= 0.0 <= bounds[1]:
         return "undecided"
-    return "better" if (bounds[0] > 0) == name.startswith(_HIGHER_IS_BETTER_PREFIXES) else "worse"
+    return "better" if (bounds[0] > 0) == (column.better == "higher") else "worse"
 
 
 def _difference_dict(difference: Difference) -> dict[str, Any]:
     return {
-        "name": difference.name,
+        "name": difference.column.path,
         "views": difference.views,
         "first": rounded(difference.first),
         "other": rounded(difference.other),

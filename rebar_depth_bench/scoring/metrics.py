@@ -9,13 +9,14 @@ NeurIPS 2014, section 4; the median scale follows Zhou et al., CVPR 2017, applie
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 from numpy import ndarray
 
+from rebar_depth_bench.scoring.columns import METRICS, MetricShare, MetricSize
 from rebar_depth_bench.scoring.protocol import DELTA1_RATIO
 
 _CHUNK_PX = 8192
@@ -31,36 +32,15 @@ class DepthMetrics:
     depth p and true depth z in metres.
     """
 
-    abs_rel: float
-    rmse_cm: float
-    mae_cm: float
-    delta1: float
+    abs_rel: MetricSize
+    rmse_cm: MetricSize
+    mae_cm: MetricSize
+    delta1: MetricShare
 
     @property
     def is_finite(self) -> bool:
         """Whether no error overflowed."""
         return all(math.isfinite(value) for value in vars(self).values())
-
-
-@dataclass(frozen=True)
-class MetricInfo:
-    """Presentation of a metric: title, unit, number of decimals, and whether a larger value is better."""
-
-    title: str
-    unit: str
-    decimals: int
-    higher_is_better: bool = False
-
-
-METRICS: Mapping[str, MetricInfo] = {
-    "abs_rel": MetricInfo("AbsRel", "", 4),
-    "rmse_cm": MetricInfo("RMSE", "cm", 2),
-    "mae_cm": MetricInfo("MAE", "cm", 2),
-    "delta1": MetricInfo("δ1", "", 3, higher_is_better=True),
-}
-"""Presentation of each field of ``DepthMetrics``, in order, in all tables and pages."""
-
-METRIC_NAMES = tuple(METRICS)
 
 
 def depth_metrics(p_m: Float[ndarray, " n"], z_m: Float[ndarray, " n"], scale: float = 1.0) -> DepthMetrics:
@@ -150,7 +130,7 @@ def mean(values: Sequence[float]) -> float | None:
 
 def mean_metrics(metrics: Sequence[DepthMetrics]) -> DepthMetrics | None:
     """Return the mean of each metric over views; None for no views."""
-    means = {name: mean([getattr(of_view, name) for of_view in metrics]) for name in METRIC_NAMES}
+    means = {name: mean([getattr(of_view, name) for of_view in metrics]) for name in METRICS}
     defined = {name: value for name, value in means.items() if value is not None}
     return DepthMetrics(**defined) if defined else None
 

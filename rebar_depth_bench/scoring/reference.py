@@ -14,49 +14,59 @@ import numpy as np
 from jaxtyping import Float32, UInt32
 from numpy import ndarray
 
+from rebar_depth_bench.scoring.columns import Size, rounded
 from rebar_depth_bench.scoring.metrics import depth_metrics, mean
-from rebar_depth_bench.scoring.rounding import rounded
 
 _UNDEFINED = -1.0
 """Number that stands for an undefined error in the cache, which stores finite numbers."""
 
 
 @dataclass(frozen=True)
+class Errors:
+    """AbsRel and RMSE (cm) of a reference; None where undefined."""
+
+    abs_rel: Size | None = None
+    rmse_cm: Size | None = None
+
+
+@dataclass(frozen=True)
 class Reference:
-    """Reference errors of a view, or their means over the views of a config; None where undefined.
+    """Reference errors of a view, or their means over the views of a config.
 
     The errors of ``constant``, a constant prediction after scaling, are compared with scaled errors of complete
-    predictions (with others, ``Table.scaled_constant``). The errors of ``one_pixel``, exact depth taken one pixel
-    to the left, right, above and below (means of the four), are compared with native errors.
+    predictions. The errors of ``one_pixel``, exact depth taken one pixel to the left, right, above and below
+    (means of the four), are compared with native errors. ``scaled_constant`` has those of a constant after scaling
+    on the predicted pixels, to compare with scaled errors; it depends on the predictions.
     """
 
-    constant_abs_rel: float | None = None
-    constant_rmse_cm: float | None = None
-    one_pixel_abs_rel: float | None = None
-    one_pixel_rmse_cm: float | None = None
+    constant: Errors = Errors()
+    one_pixel: Errors = Errors()
+    scaled_constant: Errors = Errors()
 
     def to_dict(self) -> dict[str, dict[str, float | None]]:
-        """Return the errors as a JSON-compatible object."""
+        """Return the errors that follow from the ground truth as a JSON-compatible object."""
         return {
-            "constant": {"abs_rel": rounded(self.constant_abs_rel), "rmse_cm": rounded(self.constant_rmse_cm)},
-            "one_pixel": {"abs_rel": rounded(self.one_pixel_abs_rel), "rmse_cm": rounded(self.one_pixel_rmse_cm)},
+            name: {key: rounded(value) for key, value in vars(errors).items()}
+            for name, errors in (("constant", self.constant), ("one_pixel", self.one_pixel))
         }
 
     def to_numbers(self) -> tuple[float, ...]:
-        """Return the errors as numbers for the cache."""
-        return tuple(_UNDEFINED if value is None else value for value in astuple(self))
+        """Return the errors that follow from the ground truth as numbers for the cache."""
+        errors = (*astuple(self.constant), *astuple(self.one_pixel))
+        return tuple(_UNDEFINED if value is None else value for value in errors)
 
 
 NO_REFERENCE = Reference()
 """Reference errors that are not known."""
 
-REFERENCE_NUMBERS = len(astuple(NO_REFERENCE))
+REFERENCE_NUMBERS = len(NO_REFERENCE.to_numbers())
 """Length of ``Reference.to_numbers``."""
 
 
 def reference_of_numbers(numbers: Iterable[float]) -> Reference:
     """Return the reference errors with the given ``Reference.to_numbers``."""
-    return Reference(*[None if number == _UNDEFINED else number for number in numbers])
+    constant, constant_cm, shifted, shifted_cm = (None if one == _UNDEFINED else one for one in numbers)
+    return Reference(Errors(constant, constant_cm), Errors(shifted, shifted_cm))
 
 
 def view_reference(depth_m: Float32[ndarray, "h w"], pixels: UInt32[ndarray, " n"], median_m: float) -> Reference:
@@ -71,7 +81,7 @@ def view_reference(depth_m: Float32[ndarray, "h w"], pixels: UInt32[ndarray, " n
     z_m = depth_m[row, column]
     shifted = [_errors(framed_m[row + v, column + u], z_m) for v, u in ((1, 0), (1, 2), (0, 1), (2, 1))]
     one_pixel = [_defined_mean(values) for values in zip(*shifted, strict=True)]
-    return Reference(*constant_errors(z_m, median_m), *one_pixel)
+    return Reference(Errors(*constant_errors(z_m, median_m)), Errors(*one_pixel))
 
 
 def constant_errors(z_m: Float32[ndarray, " n"], median_m: float) -> tuple[float, float]:
@@ -82,7 +92,9 @@ def constant_errors(z_m: Float32[ndarray, " n"], median_m: float) -> tuple[float
 
 def mean_reference(views: Iterable[Reference]) -> Reference:
     """Return the means over views of the reference errors."""
-    return Reference(*[_defined_mean(values) for values in zip(*map(astuple, views), strict=True)])
+    numbers = zip(*map(Reference.to_numbers, views), strict=True)
+    means = [mean([value for value in values if value != _UNDEFINED]) for values in numbers]
+    return Reference(Errors(*means[:2]), Errors(*means[2:]))
 
 
 def _errors(p_m: ndarray, z_m: Float32[ndarray, " n"]) -> tuple[float | None, float | None]:

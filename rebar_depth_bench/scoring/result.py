@@ -1,24 +1,49 @@
-"""Results of scoring: tables by config, and the JSON of a result."""
+"""Result of scoring one submission, written and read by the same classes, and the part of it that is disclosed.
+
+The classes mirror the JSON. Unknown keys are ignored, because results of later versions have more of them.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cache
 from html import escape
-from statistics import median
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from rebar_depth_bench.errors import printable
-from rebar_depth_bench.scoring.bootstrap import INTERVALS, Interval
-from rebar_depth_bench.scoring.frames import groups_frame, tables_frame, views_frame
-from rebar_depth_bench.scoring.metrics import METRIC_NAMES, DepthMetrics, mean, mean_metrics
-from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, PROTOCOL, WITHIN_MM
-from rebar_depth_bench.scoring.published_match import PublishedMatch
-from rebar_depth_bench.scoring.reference import NO_REFERENCE, Reference
-from rebar_depth_bench.scoring.rounding import rounded, rounded_interval
-from rebar_depth_bench.scoring.view_score import VIEW_METRICS, ViewScore, view_intervals
-from rebar_depth_bench.submission.metadata import NOT_DECLARED, Declaration
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    FailFast,
+    Field,
+    GetPydanticSchema,
+    Strict,
+    TypeAdapter,
+)
+from pydantic_core import core_schema
+
+from rebar_depth_bench.errors import InputError, Problem, SubmissionError, printable
+from rebar_depth_bench.limits import JSON_BYTES
+from rebar_depth_bench.names import config_of
+from rebar_depth_bench.reading import parse_json
+from rebar_depth_bench.scoring import frames
+from rebar_depth_bench.scoring.bootstrap import INTERVALS
+from rebar_depth_bench.scoring.columns import Share
+from rebar_depth_bench.scoring.protocol import PROTOCOL
+from rebar_depth_bench.scoring.table import (
+    LIMITED,
+    Count,
+    Flag,
+    Name,
+    Table,
+    TableJson,
+    ViewJson,
+    ViewScore,
+    check_tables,
+)
+from rebar_depth_bench.submission.declaration import INPUTS, Declaration
+from rebar_depth_bench.validation import StrictModel, field_error, one_of, validate_document, validate_table
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -33,83 +58,83 @@ _NOTEBOOK_COLUMNS = (
 
 
 @dataclass(frozen=True)
-class Table:
-    """Metrics of one config: means over its views, and the median of their scale factors.
+class DatasetIdentity:
+    """Identity of the dataset."""
 
-    ``rank_error`` is None without views; ``reference`` are the config's reference errors,
-    and ``published`` is the scene of the paper's Table I that it shows, if any. ``scaled_constant`` has AbsRel and
-    RMSE (cm) of a constant after scaling on the predicted pixels, to compare with ``scaled``. ``split`` is None
-    for a config of one scene. ``truth_sigma_m`` is the standard deviation of the ground truth's depth, None where
-    it is exact. ``intervals`` has the 95 % bootstrap interval of each of ``VIEW_METRICS``, None where undefined.
-    ``groups`` has the tables of groups of views by grouping (see ``groups.GROUPINGS``) and group, of a config with
-    splits; they have no groups.
-    """
-
-    views: int
-    views_scored: int
-    coverage: float | None
-    ranked: bool
-    rank_error: float | None
-    native: DepthMetrics | None
-    scaled: DepthMetrics | None
-    scale_median: float | None
-    within_mm: Mapping[int, float | None]
-    reference: Reference = NO_REFERENCE
-    scaled_constant: tuple[float | None, float | None] = (None, None)
-    published: PublishedMatch | None = None
-    split: str | None = None
-    truth_sigma_m: float | None = None
-    intervals: Mapping[str, Interval | None] = field(default_factory=dict)
-    groups: Mapping[str, Mapping[str, Table]] = field(default_factory=dict)
-
-    @property
-    def is_comparable(self) -> bool:
-        """Whether the errors of valid predictions can be compared with those of other submissions.
-
-        Every view needs a prediction, the coverage must be at least ``MIN_COMPARABLE_COVERAGE``, and no metric may
-        be infinite. Otherwise, missing or enormous predictions could improve the comparison.
-        """
-        is_complete = 0 < self.views == self.views_scored
-        is_finite = all(metrics is not None and metrics.is_finite for metrics in (self.native, self.scaled))
-        return is_complete and is_finite and (self.coverage or 0.0) >= MIN_COMPARABLE_COVERAGE
+    digest: Annotated[str, Strict(), Field(pattern="^sha256:[0-9a-f]{64}$")]
+    version: Name
 
 
-@dataclass(frozen=True, repr=False)
+@dataclass(frozen=True)
+class SubmissionIdentity:
+    """Method name of a submission, SHA-256 of its archive in hexadecimal, and what it declares."""
+
+    method: Name
+    sha256: Annotated[str, Strict(), Field(pattern="^[0-9a-f]{64}$")]
+    inputs: Annotated[str, Strict(), one_of(*INPUTS)] | None = None
+    uses_ground_truth: Flag | None = None
+
+
+@dataclass(frozen=True)
+class SoftwareIdentity:
+    """Version of the software that scored."""
+
+    version: Name
+
+
+@dataclass(frozen=True)
+class IntervalMethod:
+    """How intervals were computed."""
+
+    method: Name
+    draws: Count
+    level: Share
+
+
+_EXTENDED = GetPydanticSchema(
+    lambda *_: core_schema.no_info_plain_validator_function(
+        lambda _: None,
+        serialization=core_schema.plain_serializer_function_ser_schema(
+            lambda extended: None if extended is None else extended.to_dict()
+        ),
+    )
+)
+"""Annotation of extended measures, which are written and not read."""
+if not TYPE_CHECKING:
+    ExtendedResult = Any  # Only type checkers need the class, which would be imported in a circle.
+
+
+@dataclass(frozen=True, repr=False, kw_only=True)
 class Result:
     """Result of scoring one submission, with the digests and versions of its inputs.
 
     ``intervals`` states how the intervals were computed; None in a file of an earlier version, which does not.
+    ``extended`` are the extended measures, None in a result that was read from a file.
     """
 
-    method: str
-    submission_sha256: str
-    dataset_digest: str
-    dataset_version: str
-    software_version: str
-    tables: Mapping[str, Table]
-    views: Sequence[ViewScore]
-    extended: ExtendedResult | None = None
-    declared: Declaration = NOT_DECLARED
-    protocol: str = PROTOCOL
-    intervals: Mapping[str, Any] | None = field(default_factory=lambda: dict(INTERVALS))
+    protocol: Annotated[str, Strict(), one_of(PROTOCOL)] = PROTOCOL
+    dataset: DatasetIdentity
+    submission: SubmissionIdentity
+    software: SoftwareIdentity
+    intervals: IntervalMethod | None = field(default_factory=lambda: IntervalMethod(**INTERVALS))
+    tables: Annotated[dict[Name, TableJson], BeforeValidator(check_tables)]
+    views: Annotated[list[ViewJson], FailFast()]
+    extended: Annotated[ExtendedResult | None, _EXTENDED] = None
+
+    @property
+    def method(self) -> str:
+        """Name of the method."""
+        return self.submission.method
+
+    @property
+    def declared(self) -> Declaration:
+        """What the submission declares about its inputs and its use of ground truth."""
+        return Declaration(self.submission.inputs, self.submission.uses_ground_truth)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as a JSON-compatible object; extended measures, if computed, are its last entry."""
-        extended = {} if self.extended is None else {"extended": self.extended.to_dict()}
-        return {
-            "protocol": self.protocol,
-            "dataset": {"digest": self.dataset_digest, "version": self.dataset_version},
-            "submission": {
-                "method": self.method,
-                "sha256": self.submission_sha256,
-                **self.declared.to_dict(),
-            },
-            "software": {"version": self.software_version},
-            **({} if self.intervals is None else {"intervals": dict(self.intervals)}),
-            "tables": {name: _table_dict(table) for name, table in self.tables.items()},
-            "views": [_view_dict(view) for view in self.views],
-            **extended,
-        }
+        document: dict[str, Any] = _result_type().dump_python(self, mode="json", by_alias=True)
+        return {key: value for key, value in document.items() if value is not None}
 
     def to_pandas(self, rows: Literal["tables", "groups", "views", "extended"] = "tables") -> DataFrame:
         """Return the numbers of the JSON as a frame.
@@ -121,11 +146,11 @@ class Result:
         has no extended measures.
         """
         if rows == "tables":
-            return tables_frame([self.to_dict()])
+            return frames.tables_frame([self])
         if rows == "groups":
-            return groups_frame([self.to_dict()])
+            return frames.groups_frame([self])
         if rows == "views":
-            return views_frame(self.to_dict())
+            return frames.views_frame(self.views)
         if rows == "extended" and self.extended is not None:
             return self.extended.to_pandas()
         expected = "'tables', 'groups', 'views', or 'extended' for a result that has them"
@@ -142,7 +167,7 @@ class Result:
         """Return the method, its provenance and the tables for notebooks."""
         frame = self.to_pandas()[[*_NOTEBOOK_COLUMNS]]
         frame["config"] = frame["config"].map(printable)
-        provenance = f"protocol {self.protocol}, dataset {self.dataset_version} ({self.dataset_digest[:19]})"
+        provenance = f"protocol {self.protocol}, dataset {self.dataset.version} ({self.dataset.digest[:19]})"
         head = f"<p><b>{escape(printable(self.method))}</b>, {escape(printable(provenance))}</p>"
         return head + str(frame.to_html(index=False, na_rep="–", float_format="{:.4g}".format, border=0))
 
@@ -151,42 +176,40 @@ class Result:
         return (json.dumps(self.to_dict(), indent=1, ensure_ascii=False, allow_nan=False) + "\n").encode()
 
 
-def tabulate(
-    views: Sequence[ViewScore],
-    declared: Declaration = NOT_DECLARED,
-    reference: Reference = NO_REFERENCE,
-    published: PublishedMatch | None = None,
-    split: str | None = None,
-    truth_sigma_m: float | None = None,
-) -> Table:
-    """Return the table of a config, or of a group of its views, from the scores of its scored views.
+@cache
+def _result_type() -> TypeAdapter[Result]:
+    return TypeAdapter(Annotated[Result, AfterValidator(_check_views)])
 
-    The intervals of a config with splits are those of resampled scenes, of others those of consecutive views.
-    A config without views is not ranked, and neither is a submission that declares the use of ground truth. An
-    infinite metric (of a prediction so large that its square overflows) is written as null; the rank error is
-    always finite.
+
+def _check_views(result: Result) -> Result:
+    view_ids = [view.view_id for view in result.views]
+    if len(set(view_ids)) < len(view_ids):
+        raise field_error("views: a view_id occurs twice", "each view once", "duplicate")
+    if not {config_of(view_id) for view_id in view_ids} <= result.tables.keys():
+        raise field_error("views: a view belongs to no config of the tables", "views of these", "conflict")
+    groups = [
+        table for tables in result.tables.values() for group in tables.groups.values() for table in group.values()
+    ]
+    if any(table.views and table.rank_error is None for table in (*result.tables.values(), *groups)):
+        raise field_error("a table of views has no rank_error", "one in each of them", "missing")
+    return result
+
+
+def read_result(data: bytes, where: str) -> Result:
+    """Return the result in ``data`` without extended measures; ``where`` names the source in error messages.
+
+    Raises ``InputError`` with all problems if ``data`` is not a result of ``PROTOCOL``.
     """
-    predicted = [view for view in views if view.native is not None]
-    native = mean_metrics([view.native for view in predicted if view.native])
-    scaled = mean_metrics([view.scaled for view in predicted if view.scaled])
-    constants = [view.scaled_constant for view in predicted if view.scaled_constant is not None]
-    return Table(
-        views=len(views),
-        views_scored=len(predicted),
-        coverage=mean([view.coverage for view in views]),
-        ranked=bool(views) and not declared.uses_ground_truth,
-        rank_error=mean([view.rank_error for view in views]),
-        native=native,
-        scaled=scaled,
-        scale_median=median([view.scale for view in predicted if view.scale is not None]) if predicted else None,
-        within_mm={t: mean([view.within_mm[t] for view in views]) for t in WITHIN_MM},
-        reference=reference,
-        scaled_constant=(mean([abs_rel for abs_rel, _ in constants]), mean([rmse_cm for _, rmse_cm in constants])),
-        published=published,
-        split=split,
-        truth_sigma_m=truth_sigma_m,
-        intervals=view_intervals(views, by_scene=split is not None) if views else dict.fromkeys(VIEW_METRICS),
-    )
+    if len(data) > JSON_BYTES.value():
+        problem = Problem("size", "", f"the result has {len(data)} bytes", JSON_BYTES.allowed())
+        raise InputError.from_problems(where, [problem])
+    document, problems = parse_json(data)
+    if isinstance(document, dict):
+        document.setdefault("intervals", None)  # Results of earlier versions do not state how they were computed.
+    result = None if problems else validate_document(_result_type(), document, problems)
+    if result is None:
+        raise InputError.from_problems(f"{where}: is not a rebar-bench result", problems)
+    return result
 
 
 def _describe_table(table: Table) -> str:
@@ -197,60 +220,77 @@ def _describe_table(table: Table) -> str:
     return f"{error}AbsRel {table.native.abs_rel:.4g} native, {table.scaled.abs_rel:.4g} scaled{note}"
 
 
-def _metrics_dict(metrics: DepthMetrics | None) -> dict[str, float | None]:
-    return {name: rounded(getattr(metrics, name, None)) for name in METRIC_NAMES}
+# Disclosed results: what a leaderboard with hidden ground truth returns of a result. Most numbers of a result help
+# a submitter to compute the ground truth: a view's scale factor, for example, is the ratio of the median true
+# depth to the median of the submitter's own depth. Only the rank error and the coverage of each config are
+# disclosed, rounded to ``DECIMALS``. The models name all that is disclosed, so that a number that is added to
+# results is hidden unless it is added here, too.
+
+DECIMALS = 3
+"""Decimals of the disclosed numbers."""
+
+MIN_VIEW_COVERAGE = 0.5
+"""Smallest coverage of a view that is scored if the ground truth is hidden; it limits probing by omission."""
+
+COVERAGE_RULE = f"predictions for at least {MIN_VIEW_COVERAGE * 100:.0f} % of the scored pixels of each view"
 
 
-def _within_dict(within_mm: Mapping[int, float | None] | Mapping[int, float]) -> dict[str, float | None]:
-    return {str(tolerance): rounded(share) for tolerance, share in within_mm.items()}
+def disclosed_number(value: float) -> float:
+    """Return a number as it is disclosed."""
+    return round(value, DECIMALS)
 
 
-def _table_dict(table: Table) -> dict[str, Any]:
-    abs_rel, rmse_cm = map(rounded, table.scaled_constant)
-    return {
-        **({} if table.split is None else {"split": table.split}),
-        **({} if table.truth_sigma_m is None else {"truth_sigma_m": table.truth_sigma_m}),
-        "views": table.views,
-        "views_scored": table.views_scored,
-        "coverage": rounded(table.coverage),
-        "ranked": table.ranked,
-        "rank_error": rounded(table.rank_error),
-        "native": _metrics_dict(table.native),
-        "scaled": _metrics_dict(table.scaled),
-        "scale_median": rounded(table.scale_median),
-        "within_mm": _within_dict(table.within_mm),
-        "reference": {**table.reference.to_dict(), "scaled_constant": {"abs_rel": abs_rel, "rmse_cm": rmse_cm}},
-        "published": None if table.published is None else table.published.to_dict(),
-        "ci95": _intervals_dict(table.intervals),
-        **({"groups": _groups_dict(table.groups)} if table.groups else {}),
-    }
+_Number = Annotated[float, Strict(), Field(ge=0, le=1), AfterValidator(disclosed_number)] | None
 
 
-def _groups_dict(groups: Mapping[str, Mapping[str, Table]]) -> dict[str, dict[str, Any]]:
-    return {
-        grouping: {group: _table_dict(table) for group, table in tables.items()}
-        for grouping, tables in groups.items()
-    }
+class DisclosedTable(StrictModel, extra="ignore"):
+    """Disclosed part of the table of a config; ``rank_error`` is None without scored views."""
+
+    coverage: _Number
+    ranked: bool
+    rank_error: _Number
 
 
-def _intervals_dict(intervals: Mapping[str, Interval | None]) -> dict[str, Any]:
-    """Return the intervals nested like the metrics of the table."""
-    nested: dict[str, Any] = {}
-    for name, bounds in intervals.items():
-        group, _, key = name.rpartition(".")
-        target = nested.setdefault(group, {}) if group else nested
-        target[key] = rounded_interval(bounds)
-    return nested
+class DisclosedResult(StrictModel, extra="ignore", strict=False):
+    """Disclosed part of a result; ``hidden_truth`` distinguishes it from a whole result."""
+
+    protocol: Annotated[str, Strict(), one_of(PROTOCOL)]
+    hidden_truth: Literal[True] = True
+    dataset: DatasetIdentity
+    submission: SubmissionIdentity
+    software: SoftwareIdentity
+    tables: Annotated[dict[Name, DisclosedTable], LIMITED]
 
 
-def _view_dict(view: ViewScore) -> dict[str, Any]:
-    return {
-        "view_id": view.view_id,
-        "scored_px": view.scored_px,
-        "coverage": rounded(view.coverage),
-        "rank_error": rounded(view.rank_error),
-        "scale": rounded(view.scale),
-        "native": _metrics_dict(view.native),
-        "scaled": _metrics_dict(view.scaled),
-        "within_mm": _within_dict(view.within_mm),
-    }
+def disclosed_json(result: bytes) -> bytes:
+    """Return the JSON of the disclosed part of a result; of a result that cannot be read, it has no numbers."""
+    content = validate_table(DisclosedResult, json.loads(result), [])
+    disclosed = {"hidden_truth": True} if content is None else content.model_dump(mode="json")
+    return (json.dumps(disclosed, indent=1, ensure_ascii=False) + "\n").encode()
+
+
+def is_disclosed(document: object) -> bool:
+    """Return whether a JSON value is the disclosed part of a result."""
+    return isinstance(document, dict) and document.get("hidden_truth") is True
+
+
+def read_disclosed(data: bytes, where: str) -> DisclosedResult:
+    """Return the disclosed result in ``data``; ``where`` names the source in error messages.
+
+    Raises ``InputError`` with all problems if it is none.
+    """
+    document, problems = parse_json(data)
+    content = None if problems else validate_table(DisclosedResult, document, problems)
+    if content is None:
+        raise InputError.from_problems(f"{where}: is not a disclosed result", problems)
+    return content
+
+
+def check_view_coverage(views: Sequence[ViewScore]) -> None:
+    """Raise ``SubmissionError`` if a view has less than ``MIN_VIEW_COVERAGE``.
+
+    The message names neither the view nor its coverage, because these tell how many omitted pixels are scored.
+    """
+    if any(view.coverage < MIN_VIEW_COVERAGE for view in views):
+        problem = Problem("missing", "", "a view has too few predictions on scored pixels", COVERAGE_RULE)
+        raise SubmissionError.from_problems("the archive", [problem])

@@ -1,76 +1,121 @@
-"""Scoring of a submission archive against a dataset folder by protocol ``rebar-2``."""
+"""Arithmetic of a score by protocol ``rebar-2``: from depth maps to tables, without files, caches and threads.
+
+``score_views`` is the whole computation: each view of ``Truth`` is compared with the depth that ``ReadDepth``
+returns, and the scores of a config's views are tabulated. ``evaluation.score`` calls it with a dataset folder and
+an archive.
+"""
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
-from functools import partial
-from pathlib import Path
+import statistics
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Float32, UInt32
 from numpy import ndarray
 
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.errors import Problem, SubmissionError
-from rebar_depth_bench.parallel import map_with_progress
-from rebar_depth_bench.progress import Progress, silent
-from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation
-from rebar_depth_bench.scoring.ground_truth import ConfigTruth, ViewTruth, config_truth
-from rebar_depth_bench.scoring.groups import GROUPINGS, positions_by_group
+from rebar_depth_bench.scoring.columns import COLUMN_BY_PATH, view_intervals
+from rebar_depth_bench.scoring.groups import GROUPINGS, ViewTraits, positions_by_group
 from rebar_depth_bench.scoring.metrics import (
     is_valid_prediction,
+    mean,
+    mean_metrics,
     median,
     median_scale,
     metrics_at_scales,
     rank_error,
 )
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
-from rebar_depth_bench.scoring.published_match import published_match
-from rebar_depth_bench.scoring.reference import constant_errors, mean_reference
-from rebar_depth_bench.scoring.result import Result, Table, tabulate
-from rebar_depth_bench.scoring.view_score import ViewScore
-from rebar_depth_bench.submission import Declaration, EntryError, SubmissionReader
-from rebar_depth_bench.version import software_version
+from rebar_depth_bench.scoring.reference import NO_REFERENCE, Errors, Reference, constant_errors, mean_reference
+from rebar_depth_bench.scoring.table import PublishedMatch, Table, ViewScore
+from rebar_depth_bench.submission.declaration import NOT_DECLARED, Declaration
+
+ReadDepth = Callable[[str], Float[ndarray, "h w"]]
+"""Function that returns the predicted planar depth of a view in metres, by view id."""
 
 
-def score(
-    archive: str | os.PathLike[str],
-    root: str | Path,
-    *,
-    workers: int | None = None,
-    expect_digest: str | None = None,
-    progress: Progress = silent,
-) -> Result:
-    """Score an archive against a dataset folder or Hub repository.
+@dataclass(frozen=True, eq=False)
+class ViewTruth:
+    """Scored pixels of one view.
 
-    Views are read directly from the archive and scored on ``workers`` threads (default: one per core); only a few
-    views are in memory at a time. The result does not depend on the number of workers.
-
-    Raises ``SubmissionError`` with all problems if any part of the archive is invalid, and ``DatasetError`` if the
-    dataset folder is invalid or its digest is not ``expect_digest``.
+    ``index`` holds flat indices into the H x W image, ``depth_m`` their planar depth and ``median_m`` its median,
+    in metres. ``constant`` has ``reference.constant_errors``, if they are known.
     """
-    with open_evaluation(archive, root, expect_digest=expect_digest) as evaluation:
-        return score_evaluation(evaluation, workers=workers, progress=progress)
+
+    view_id: str
+    index: UInt32[ndarray, " n"]
+    depth_m: Float32[ndarray, " n"]
+    median_m: float
+    constant: tuple[float, float] | None = None
 
 
-def score_evaluation(evaluation: Evaluation, *, workers: int | None = None, progress: Progress = silent) -> Result:
-    """Score an open submission as ``score`` does. Raises ``SubmissionError`` if an entry is invalid."""
-    with ThreadPoolExecutor(1) as pool:
-        sha256 = pool.submit(evaluation.submission.sha256)
-        tables, views = _score_all(evaluation, workers, progress)
-        return Result(
-            method=evaluation.method,
-            declared=evaluation.declared,
-            submission_sha256=sha256.result(),
-            dataset_digest=evaluation.folder.digest,
-            dataset_version=evaluation.folder.version,
-            software_version=software_version(),
-            tables=tables,
-            views=views,
-        )
+class Truth(Protocol):
+    """Ground truth of a config: its views with scored pixels, and what its table states besides their means."""
+
+    @property
+    def view_ids(self) -> tuple[str, ...]:
+        """Ids of the views, in order."""
+
+    @property
+    def references(self) -> Sequence[Reference]:
+        """Reference errors of each view."""
+
+    @property
+    def traits(self) -> Sequence[ViewTraits]:
+        """Properties of each view by which views are grouped in a config with splits."""
+
+    @property
+    def split(self) -> str | None:
+        """Split of the views, None in a config of one scene."""
+
+    @property
+    def truth_sigma_m(self) -> float | None:
+        """Standard deviation of the depth, metres, None if it is exact."""
+
+    @property
+    def published(self) -> PublishedMatch | None:
+        """Scene of the paper's Table I that the config shows, if any."""
+
+    def view(self, position: int) -> ViewTruth:
+        """Return the view at ``position``."""
+
+
+Each = Callable[[str, Callable[[int], ViewScore], Sequence[int]], Iterable[ViewScore]]
+"""Function that maps a function over the positions of a config's views, in order; the config's name is first."""
+
+
+def _in_turn(_: str, work: Callable[[int], ViewScore], positions: Sequence[int]) -> Iterable[ViewScore]:
+    return map(work, positions)
+
+
+def score_views(
+    truths: Iterable[tuple[str, Truth]],
+    read_depth: ReadDepth,
+    declared: Declaration = NOT_DECLARED,
+    each: Each = _in_turn,
+) -> tuple[dict[str, Table], list[ViewScore]]:
+    """Return the tables by config, and the scores of all views.
+
+    ``truths`` are names and ground truth of configs. One view is in memory at a time, unless ``each`` computes
+    several at once.
+    """
+    tables: dict[str, Table] = {}
+    views: list[ViewScore] = []
+    for name, truth in truths:
+        scores = list(each(name, _scorer(truth, read_depth), range(len(truth.view_ids))))
+        tables[name] = tabulate_config(scores, truth, declared)
+        views += scores
+    return tables, views
+
+
+def _scorer(truth: Truth, read_depth: ReadDepth) -> Callable[[int], ViewScore]:
+    def score_at(position: int) -> ViewScore:
+        view = truth.view(position)
+        return score_view(view, read_depth(view.view_id))
+
+    return score_at
 
 
 def score_view(truth: ViewTruth, prediction_m: Float[ndarray, "h w"]) -> ViewScore:
@@ -103,78 +148,63 @@ def score_view(truth: ViewTruth, prediction_m: Float[ndarray, "h w"]) -> ViewSco
     )
 
 
-def _score_all(
-    evaluation: Evaluation, workers: int | None, progress: Progress
-) -> tuple[dict[str, Table], list[ViewScore]]:
-    """Return the tables by config and the scores of all views. Raises ``SubmissionError`` with all problems."""
-    submission = evaluation.submission
-    unread = set(submission.view_ids)
-    problems: list[Problem] = []
-    tables: dict[str, Table] = {}
-    views: list[ViewScore] = []
-    for config in evaluation.configs:
-        truths = config_truth(evaluation.folder, config, progress)
-        work = partial(_score_or_problem, submission, truths)
-        scored = map_with_progress(
-            work, range(len(truths)), workers, progress, f"scoring {config.name}", len(truths)
-        )
-        scores = [outcome for outcome in scored if isinstance(outcome, ViewScore)]
-        views += scores
-        problems += [outcome for outcome in scored if isinstance(outcome, Problem)]
-        unread.difference_update(truths.view_ids)
-        if not problems:
-            tables[config.name] = _tabulate_config(config, truths, scores, evaluation.declared)
-    problems += _unscored_view_problems(submission, unread)
-    if problems:
-        raise SubmissionError.from_problems(submission.path, problems)
-    return tables, views
-
-
-def _tabulate_config(
-    config: DatasetConfig, truths: ConfigTruth, scores: Sequence[ViewScore], declared: Declaration
-) -> Table:
+def tabulate_config(scores: Sequence[ViewScore], truth: Truth, declared: Declaration) -> Table:
     """Return the table of a config, with the tables of groups of its views if it has splits."""
-    references = truths.references
+    references = truth.references
     table = tabulate(
-        scores,
-        declared,
-        mean_reference(references),
-        published_match(config),
-        config.scenes[0].split if config.has_splits else None,
-        config.truth_sigma_m,
+        scores, declared, mean_reference(references), truth.published, truth.split, truth.truth_sigma_m
     )
-    if not config.has_splits:
+    if truth.split is None:
         return table
 
     def of_group(positions: Sequence[int]) -> Table:
         reference = mean_reference(references[position] for position in positions)
         group = [scores[position] for position in positions]
-        return tabulate(group, declared, reference, None, table.split, table.truth_sigma_m)
+        return tabulate(group, declared, reference, None, truth.split, truth.truth_sigma_m)
 
     groups = {
         key: {
-            group: of_group(positions) for group, positions in positions_by_group(grouping, truths.traits).items()
+            group: of_group(positions) for group, positions in positions_by_group(grouping, truth.traits).items()
         }
         for key, grouping in GROUPINGS.items()
     }
     return replace(table, groups=groups)
 
 
-def _score_or_problem(submission: SubmissionReader, truths: ConfigTruth, index: int) -> ViewScore | Problem:
-    """Return a view's score, or the problem of its entry."""
-    truth = truths.view(index)
-    try:
-        return score_view(truth, submission.read(truth.view_id))
-    except EntryError as error:
-        return error.problem
+def tabulate(
+    views: Sequence[ViewScore],
+    declared: Declaration = NOT_DECLARED,
+    reference: Reference = NO_REFERENCE,
+    published: PublishedMatch | None = None,
+    split: str | None = None,
+    truth_sigma_m: float | None = None,
+) -> Table:
+    """Return the table of a config, or of a group of its views, from the scores of its scored views.
 
-
-def _unscored_view_problems(submission: SubmissionReader, view_ids: Iterable[str]) -> list[Problem]:
-    """Return the problems of the entries of views without scored pixels, which are decoded but not scored."""
-    problems = []
-    for view_id in sorted(view_ids):
-        try:
-            submission.read(view_id)
-        except EntryError as error:
-            problems.append(error.problem)
-    return problems
+    The intervals of a config with splits are those of resampled scenes, of others those of consecutive views.
+    A config without views is not ranked, and neither is a submission that declares the use of ground truth. An
+    infinite metric (of a prediction so large that its square overflows) is written as null; the rank error is
+    always finite.
+    """
+    predicted = [view for view in views if view.native is not None]
+    native = mean_metrics([view.native for view in predicted if view.native])
+    scaled = mean_metrics([view.scaled for view in predicted if view.scaled])
+    constants = [view.scaled_constant for view in predicted if view.scaled_constant is not None]
+    return Table(
+        views=len(views),
+        views_scored=len(predicted),
+        coverage=mean([view.coverage for view in views]),
+        ranked=bool(views) and not declared.uses_ground_truth,
+        rank_error=mean([view.rank_error for view in views]),
+        native=native,
+        scaled=scaled,
+        scale_median=statistics.median([view.scale for view in predicted if view.scale is not None])
+        if predicted
+        else None,
+        within_mm={t: mean([view.within_mm[t] for view in views]) for t in WITHIN_MM},
+        reference=replace(reference, scaled_constant=Errors(*map(mean, zip(*constants, strict=True)))),
+        published=published,
+        split=split,
+        truth_sigma_m=truth_sigma_m,
+        intervals=view_intervals(views, by_scene=split is not None) if views else dict.fromkeys(COLUMN_BY_PATH),
+    )

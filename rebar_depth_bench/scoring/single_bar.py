@@ -14,7 +14,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from rebar_depth_bench.scoring.ground_truth import ConfigTruth, ViewTruth
 from rebar_depth_bench.scoring.metrics import (
     DepthMetrics,
     is_valid_prediction,
@@ -22,7 +21,9 @@ from rebar_depth_bench.scoring.metrics import (
     mean_metrics,
     metrics_at_scales,
 )
-from rebar_depth_bench.scoring.view_score import ViewScore
+from rebar_depth_bench.scoring.score import ViewTruth
+from rebar_depth_bench.scoring.table import ViewScore
+from rebar_depth_bench.scoring.truth import ConfigTruth
 from rebar_depth_bench.submission import SubmissionReader
 
 

@@ -1,8 +1,8 @@
 """Submission archives: writing, validation and reading of predictions."""
 
 from rebar_depth_bench.errors import EntryError
+from rebar_depth_bench.submission.declaration import INPUTS, Declaration, SubmissionMeta
 from rebar_depth_bench.submission.entries import CaptureViews, ExpectedViews
-from rebar_depth_bench.submission.metadata import INPUTS, Declaration, SubmissionMeta
 from rebar_depth_bench.submission.reader import SubmissionReader, check_archive, open_submission
 from rebar_depth_bench.submission.writer import SubmissionWriter
 

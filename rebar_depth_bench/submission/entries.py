@@ -1,4 +1,4 @@
-"""Assignment of archive entries to dataset views, with reports of unknown, duplicate and missing entries.
+"""Entries of an archive: their formats, and their views, with reports of unknown, duplicate and missing entries.
 
 A leading ``./``, with which bsdtar (Windows, macOS, FreeBSD) begins names, is dropped before they are compared.
 """
@@ -6,14 +6,24 @@ A leading ``./``, with which bsdtar (Windows, macOS, FreeBSD) begins names, is d
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 
 from rebar_depth_bench.errors import Problem, escape_text
-from rebar_depth_bench.submission.formats import FORMATS
-from rebar_depth_bench.submission.metadata import MAX_METADATA_BYTES, METADATA_NAME
-from rebar_depth_bench.view_ids import config_of, split_of
+from rebar_depth_bench.names import config_of, split_of
+from rebar_depth_bench.submission.declaration import MAX_METADATA_BYTES, METADATA_NAME
+from rebar_depth_bench.submission.maps import (
+    Depth,
+    decode_exr,
+    decode_npy,
+    decode_npz,
+    decode_png,
+    max_exr_bytes,
+    max_npy_bytes,
+    max_npz_bytes,
+    max_png_bytes,
+)
 
 ExpectedViews = Mapping[str, tuple[int, int]]
 """Mapping of every view_id of a dataset folder to its (H, W) in pixels."""
@@ -22,6 +32,26 @@ ExpectedViews = Mapping[str, tuple[int, int]]
 class CaptureViews(dict[str, tuple[int, int]]):
     """Expected views of a capture, whose ids are names of pictures and never name a split."""
 
+
+@dataclass(frozen=True, slots=True)
+class Format:
+    """Decoder and size bound of one entry format.
+
+    ``decode(name, data, (H, W), depth_scale)`` returns the depth in metres and raises ``EntryError``; only PNG has
+    units, of ``depth_scale`` metres. ``max_bytes((H, W))`` is the largest acceptable length of ``data`` in bytes.
+    """
+
+    decode: Callable[[str, memoryview, tuple[int, int], float], Depth]
+    max_bytes: Callable[[tuple[int, int]], int]
+
+
+FORMATS: Mapping[str, Format] = {
+    ".npy": Format(decode_npy, max_npy_bytes),
+    ".npz": Format(decode_npz, max_npz_bytes),
+    ".exr": Format(decode_exr, max_exr_bytes),
+    ".png": Format(decode_png, max_png_bytes),
+}
+"""Formats of entries by the suffix of their names."""
 
 _ANY_SUFFIX = f"one of {', '.join(FORMATS)}"
 _ZIP_HINT = "zip with: zip -r submission.zip submission.json <config> -x '*.DS_Store'"

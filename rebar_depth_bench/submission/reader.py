@@ -11,13 +11,19 @@ from types import TracebackType
 from typing import Self
 
 from rebar_depth_bench.errors import EntryError, Problem
-from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.reading import ByteSource, FileSource
-from rebar_depth_bench.submission.entries import ExpectedViews, match_entries, max_entry_bytes
-from rebar_depth_bench.submission.formats import FORMATS, Depth
-from rebar_depth_bench.submission.metadata import DEPTH_SCALE, SubmissionMeta, parse_metadata
-from rebar_depth_bench.submission.zip_directory import DirectoryError, read_directory
-from rebar_depth_bench.submission.zip_entries import CheckedEntry, check_entries, has_unsafe_name, read_data
+from rebar_depth_bench.submission.declaration import DEPTH_SCALE, SubmissionMeta, parse_metadata
+from rebar_depth_bench.submission.entries import FORMATS, ExpectedViews, match_entries, max_entry_bytes
+from rebar_depth_bench.submission.maps import Depth
+from rebar_depth_bench.submission.zip import (
+    CheckedEntry,
+    DirectoryError,
+    check_entries,
+    has_unsafe_name,
+    read_data,
+    read_directory,
+)
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,10 +16,10 @@ from typing import BinaryIO, Self
 import numpy as np
 
 from rebar_depth_bench.errors import InputError, Problem, escape_text
+from rebar_depth_bench.names import VIEW_ID_PATTERN
 from rebar_depth_bench.outputs import output_file
-from rebar_depth_bench.paths import VIEW_ID_PATTERN
-from rebar_depth_bench.submission.metadata import METADATA_NAME, SubmissionMeta
-from rebar_depth_bench.submission.numpy_formats import Depth
+from rebar_depth_bench.submission.declaration import METADATA_NAME, SubmissionMeta
+from rebar_depth_bench.submission.maps import Depth
 from rebar_depth_bench.validation import validate_table
 
 _EPOCH = (1980, 1, 1, 0, 0, 0)

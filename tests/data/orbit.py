@@ -26,7 +26,7 @@ from dataset_builder.scene.raycast import RayCaster
 from dataset_builder.specs.config_specs import ColourSpec
 from dataset_builder.user_files.make_assembly import make_assembly
 from rebar_depth_bench.data.codecs import decode
-from rebar_depth_bench.data.digests import file_sha256
+from rebar_depth_bench.data.files import file_sha256
 
 IMAGES = Path(__file__).parent / "orbit"
 SAMPLES = 1

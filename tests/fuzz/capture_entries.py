@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rebar_depth_bench.scoring.result_io import read_result
+from rebar_depth_bench.scoring.result import read_result
 from tests.bench.captures.example_capture import write_capture
 from tests.fuzz.dataset_entries import write_dataset_and_archive
 from tests.fuzz.entry_point import EntryPoint, bench

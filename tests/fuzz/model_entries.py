@@ -14,7 +14,7 @@ import onnx
 
 from leaderboard.settings import read_settings
 from rebar_depth_bench.console import EXIT_DONE, EXIT_INPUT, EXIT_OTHER
-from rebar_depth_bench.data.digests import file_sha256
+from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods import find_method
 from tests.bench.methods.onnx_models import write_mixer_model, write_toml

@@ -23,7 +23,7 @@ from leaderboard.web.pages.rendering import clean_text, error_response, format_s
 from leaderboard.web.pages.selection import COLUMNS, RANK, Selection, parse_selection
 from rebar_depth_bench.errors import Problem
 from rebar_depth_bench.reporting.html.rows import table_row
-from rebar_depth_bench.scoring.result_io import read_result
+from rebar_depth_bench.scoring.result import read_result
 from tests.bench.reporting.results import overflowed_view, result, scored_view, unpredicted_view
 
 ERRORS = [0.3, 0.1, 0.1, 2.0, 0.7, None, 0.05]

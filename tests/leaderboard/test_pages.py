@@ -13,7 +13,7 @@ import pytest
 
 from rebar_depth_bench.reporting.comparison_tables import comparison_cells
 from rebar_depth_bench.scoring.comparison import compare
-from rebar_depth_bench.scoring.result_io import read_result
+from rebar_depth_bench.scoring.result import read_result
 from tests.bench.reporting.pages import Page
 from tests.leaderboard.conftest import HOSTILE, SharedServer, WriteArchive
 from tests.leaderboard.serving import RunServer

@@ -11,7 +11,8 @@ from leaderboard.db import view_errors as view_errors_module
 from leaderboard.db.view_errors import rank_ranges, unpack_view_errors, view_errors
 from rebar_depth_bench.scoring.bootstrap import interval, resample
 from rebar_depth_bench.scoring.comparison import compare
-from rebar_depth_bench.scoring.result import Result, tabulate
+from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.scoring.score import tabulate
 from tests.bench.reporting.results import result, scored_view
 
 VIEWS = 40
@@ -35,7 +36,7 @@ def test_ranges_agree_with_the_paired_comparison(spread: float) -> None:
     ranges = rank_ranges([view_errors(one.to_dict(), "lattice") for one in results])
     for index, one in enumerate(results):
         verdicts = [
-            next(row for row in compare(one, other).configs["lattice"] if row.name == "rank_error").verdict
+            next(row for row in compare(one, other).configs["lattice"] if row.column.path == "rank_error").verdict
             for number, other in enumerate(results)
             if number != index
         ]
@@ -76,7 +77,7 @@ def test_scenes_are_resampled_in_a_config_with_splits() -> None:
     ranges = rank_ranges([view_errors(one.to_dict(), "cages") for one in results])
     for index, one in enumerate(results):
         verdicts = [
-            next(row for row in compare(one, other).configs["cages"] if row.name == "rank_error").verdict
+            next(row for row in compare(one, other).configs["cages"] if row.column.path == "rank_error").verdict
             for number, other in enumerate(results)
             if number != index
         ]

@@ -18,9 +18,8 @@ from dataset_builder.cameras.trajectories import view_count
 from dataset_builder.catalog.named_configs import CONFIGS, SWEEPS
 from dataset_builder.specs.config_specs import DomeSpec
 from rebar_depth_bench.data.bars import read_bars
-from rebar_depth_bench.data.columns import features
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.data.trajectory import CENTRE, NEAREST_STEEL
+from rebar_depth_bench.data.schema import CENTRE, NEAREST_STEEL, features
 from rebar_depth_bench.methods import own_methods
 
 

@@ -28,7 +28,7 @@ from leaderboard.cli import argument_parser as board_parser
 from rebar_depth_bench.bar_crossings.table import CROSSINGS_SCHEMA
 from rebar_depth_bench.cli.main import argument_parser as bench_parser
 from rebar_depth_bench.data.bars import BARS_SCHEMA
-from rebar_depth_bench.data.columns import COLUMN_DESCRIPTIONS, COLUMNS, column_kind
+from rebar_depth_bench.data.schema import COLUMN_DESCRIPTIONS, COLUMNS, column_kind
 from rebar_depth_bench.limits import LIMITS, Limit
 from rebar_depth_bench.methods import find_method, own_methods
 from rebar_depth_bench.methods.onnx.spec import OUTPUT_MEANINGS

@@ -22,7 +22,7 @@ from dataset_builder.scene.cages.families.slabs import slab
 from dataset_builder.scene.cages.families.walls import wall
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
 from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.view_ids import SPLITS
+from rebar_depth_bench.names import SPLITS
 
 VERSION = 1
 """Version of the generator: it changes when the same seed gives another cage."""

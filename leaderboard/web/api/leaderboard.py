@@ -14,9 +14,9 @@ from leaderboard.web.api.auth import WITHOUT_TOKEN, OptionalToken, ServiceDep
 from leaderboard.web.api.schemas import Leaderboard, LeaderboardRow, Responses, errors
 from leaderboard.web.cache import NO_STORE, REVALIDATE
 from rebar_depth_bench.reporting.tables import csv_text
-from rebar_depth_bench.scoring.disclosure import DisclosedTable
-from rebar_depth_bench.scoring.frames import TABLE_COLUMNS, table_values
+from rebar_depth_bench.scoring.columns import TABLE_COLUMNS
 from rebar_depth_bench.scoring.protocol import PROTOCOL
+from rebar_depth_bench.scoring.result import DisclosedTable
 
 
 def entries_to_csv(rows: Sequence[LeaderboardEntry], hidden_truth: bool = False) -> str:
@@ -25,13 +25,17 @@ def entries_to_csv(rows: Sequence[LeaderboardEntry], hidden_truth: bool = False)
     If the ground truth is hidden, the last columns are those of the disclosed table. Undefined numbers are empty
     cells.
     """
-    columns = tuple(DisclosedTable.model_fields) if hidden_truth else TABLE_COLUMNS
+    columns = tuple(DisclosedTable.model_fields) if hidden_truth else tuple(one.name for one in TABLE_COLUMNS)
     header = ["rank", "class_rank", "id", "method", "submitter", "inputs", "uses_ground_truth", "config"]
     cells = (
         [
             *(row.rank, row.class_rank, row.id, row.method, row.submitter),
             *(row.inputs, row.uses_ground_truth, row.config),
-            *((row.table[name] for name in columns) if hidden_truth else table_values(row.table)),
+            *(
+                (row.table[name] for name in columns)
+                if hidden_truth
+                else (column.value(row.table) for column in TABLE_COLUMNS)
+            ),
         ]
         for row in rows
     )

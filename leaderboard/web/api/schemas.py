@@ -14,7 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from leaderboard.db.models import SubmissionModel
 from leaderboard.db.submissions import SCORED
 from rebar_depth_bench.errors import Problem
-from rebar_depth_bench.submission.metadata import MethodDetails
+from rebar_depth_bench.submission.declaration import MethodDetails
 
 _ID = "5f0c9a7e2b4d4c1f8e6a3d2b1c0f9e8d"
 _PROBLEM = Problem("invalid", "lattice/0042.npy", "the dtype is <i4", "float16, float32 or float64")

@@ -11,7 +11,7 @@ from leaderboard.db.submissions import quota_used
 from leaderboard.service import service_problems
 from leaderboard.web.api.auth import RequiredToken, ServiceDep
 from leaderboard.web.api.schemas import Token, errors
-from rebar_depth_bench.version import software_version
+from rebar_depth_bench import software_version
 
 router = APIRouter()
 

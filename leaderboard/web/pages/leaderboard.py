@@ -31,21 +31,21 @@ from leaderboard.web.pages.selection import (
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.charts.scatter import ScatterPoint, scatter_chart
-from rebar_depth_bench.reporting.html.published import (
+from rebar_depth_bench.reporting.html.rows import Cell, ScoreRow, table_row
+from rebar_depth_bench.reporting.published import (
+    OTHER_OPTICS_NOTE,
     PaperRow,
     finite_interval,
+    load_published,
     published_mark,
     published_row,
     scatter_points,
 )
-from rebar_depth_bench.reporting.html.rows import Cell, ScoreRow, table_row
-from rebar_depth_bench.reporting.published import OTHER_OPTICS_NOTE, load_published
-from rebar_depth_bench.scoring.disclosure import DECIMALS as DISCLOSED_DECIMALS
-from rebar_depth_bench.scoring.disclosure import DisclosedTable
-from rebar_depth_bench.scoring.metrics import METRIC_NAMES
+from rebar_depth_bench.scoring.columns import COVERAGE, METRICS, number
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
-from rebar_depth_bench.scoring.result import Table
-from rebar_depth_bench.scoring.result_io import read_table
+from rebar_depth_bench.scoring.result import DECIMALS as DISCLOSED_DECIMALS
+from rebar_depth_bench.scoring.result import DisclosedTable
+from rebar_depth_bench.scoring.table import Table, read_table
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
@@ -187,12 +187,12 @@ def _formatted(method: str, table_json: str, hidden_truth: bool) -> tuple[ScoreR
 def disclosed_row(name: str, table: DisclosedTable) -> ScoreRow:
     """Return the row of a config or submission; the cells of numbers that are not disclosed are empty."""
     empty = Cell("", None)
-    metrics = [empty] * len(METRIC_NAMES)
+    metrics = [empty] * len(METRICS)
     return ScoreRow(
         name=printable(name),
         views=empty,
-        coverage=Cell(formatting.coverage_percent(table.coverage), table.coverage),
-        rank_error=Cell(formatting.number(table.rank_error, DISCLOSED_DECIMALS), table.rank_error),
+        coverage=Cell(COVERAGE.text(table.coverage), table.coverage),
+        rank_error=Cell(number(table.rank_error, DISCLOSED_DECIMALS), table.rank_error),
         ranked=table.ranked and table.rank_error is not None,
         notes=[],
         findings=[],

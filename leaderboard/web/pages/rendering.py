@@ -17,14 +17,16 @@ from leaderboard.names import confused_scripts
 from leaderboard.service import Service
 from leaderboard.web.cache import NO_STORE, REVALIDATE
 from leaderboard.web.pages.static import static_path
+from rebar_depth_bench import software_version
 from rebar_depth_bench.errors import MAX_PROBLEMS_SHOWN, Problem, printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.html.assets import environment
+from rebar_depth_bench.reporting.html.rows import METRIC_HEADS
 from rebar_depth_bench.reporting.published import load_published
-from rebar_depth_bench.scoring.disclosure import COVERAGE_RULE
+from rebar_depth_bench.scoring.columns import number
 from rebar_depth_bench.scoring.protocol import PROTOCOL, WITHIN_MM
-from rebar_depth_bench.submission.metadata import INPUTS, is_http_url
-from rebar_depth_bench.version import software_version
+from rebar_depth_bench.scoring.result import COVERAGE_RULE
+from rebar_depth_bench.submission.declaration import INPUTS, is_http_url
 
 
 def make_templates() -> Environment:
@@ -33,7 +35,7 @@ def make_templates() -> Environment:
     templates.filters.update(
         clean=clean_text,
         link=link_html,
-        number=formatting.number,
+        number=number,
         printable=printable,
         scripts=confused_scripts,
         size=format_size,
@@ -41,7 +43,7 @@ def make_templates() -> Environment:
     )
     templates.globals.update(
         protocol=PROTOCOL,
-        metric_heads=formatting.METRIC_HEADS,
+        metric_heads=METRIC_HEADS,
         tolerances=WITHIN_MM,
         dash_note=formatting.DASH_NOTE,
         reference_note=formatting.REFERENCE_NOTE,

@@ -11,9 +11,9 @@ from typing import Any, TypeVar
 from urllib.parse import urlencode
 
 from leaderboard.db.rankings import LeaderboardEntry
-from rebar_depth_bench.scoring.metrics import METRICS
-from rebar_depth_bench.scoring.protocol import WITHIN_MM
-from rebar_depth_bench.submission.metadata import INPUTS
+from rebar_depth_bench.scoring import columns
+from rebar_depth_bench.scoring.columns import Column
+from rebar_depth_bench.submission.declaration import INPUTS
 
 PAGE_ROWS = 50
 """Number of submitted rows on a page."""
@@ -24,41 +24,38 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Column:
-    """A sortable column: its name in URLs, the path of its value in a table's JSON, whether more is better."""
+class SortedColumn:
+    """A sortable column and its name in URLs."""
 
     name: str
-    path: tuple[str, ...]
-    largest_first: bool
+    column: Column
+
+    @property
+    def largest_first(self) -> bool:
+        """Whether more is better."""
+        return self.column.better == "higher"
 
     def value(self, table: Mapping[str, Any]) -> float | None:
-        """Return the value, or None if it is undefined or hidden."""
-        found = _look_up(table, self.path)
+        """Return the value in the JSON of a table, or None if it is undefined or hidden."""
+        found = self.column.value(table)
         return found if isinstance(found, int | float) else None
 
     def interval(self, table: Mapping[str, Any]) -> tuple[float, float] | None:
         """Return the 95 % interval of the value, or None if there is none."""
-        found = _look_up(table, ("ci95", *self.path))
+        found = self.column.value(table.get("ci95", {}))
         return (found[0], found[1]) if isinstance(found, list) and len(found) == 2 else None
 
 
-def _look_up(table: Mapping[str, Any], path: Sequence[str]) -> Any:
-    found: Any = table
-    for key in path:
-        found = found.get(key) if isinstance(found, dict) else None
-    return found
+def _sorted(columns: Sequence[Column]) -> tuple[SortedColumn, ...]:
+    return tuple(
+        SortedColumn(column.name.removeprefix("native_").removesuffix("_cm").removesuffix("_median"), column)
+        for column in columns
+    )
 
 
-NATIVE = tuple(
-    Column(name.removesuffix("_cm"), ("native", name), info.higher_is_better) for name, info in METRICS.items()
-)
-SCALED = tuple(
-    Column(f"scaled_{column.name}", ("scaled", column.path[1]), column.largest_first) for column in NATIVE
-)
-WITHIN = tuple(Column(f"within_{t}mm", ("within_mm", str(t)), True) for t in WITHIN_MM)
-RANK_ERROR, SCALE = Column("rank_error", ("rank_error",), False), Column("scale", ("scale_median",), False)
-COVERAGE = Column("coverage", ("coverage",), True)
-COLUMNS = {column.name: column for column in (RANK_ERROR, *NATIVE, *SCALED, SCALE, *WITHIN, COVERAGE)}
+NATIVE, SCALED, WITHIN = map(_sorted, (columns.NATIVE, columns.SCALED, columns.WITHIN))
+_OTHERS = _sorted((columns.RANK_ERROR, columns.SCALE, columns.COVERAGE))
+COLUMNS = {column.name: column for column in (_OTHERS[0], *NATIVE, *SCALED, _OTHERS[1], *WITHIN, _OTHERS[2])}
 
 
 @dataclass(frozen=True)

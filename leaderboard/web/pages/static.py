@@ -13,9 +13,8 @@ from fastapi import APIRouter, HTTPException, Request, Response
 from PIL import Image
 
 from leaderboard.web.api.auth import ServiceDep
-from rebar_depth_bench.data.dataset import iterate_undecoded
-from rebar_depth_bench.data.decoding import RowDecoder
 from rebar_depth_bench.data.manifest import DatasetFolder
+from rebar_depth_bench.data.rows import RowDecoder, iterate_undecoded
 
 router = APIRouter(include_in_schema=False)
 

@@ -27,6 +27,7 @@ from leaderboard.web.cache import NO_STORE, REVALIDATE
 from leaderboard.web.pages.leaderboard import NameQuery, disclosed_row
 from leaderboard.web.pages.rendering import PICTURE_TITLES, clean_text, render
 from rebar_depth_bench.errors import InputError, printable
+from rebar_depth_bench.names import config_of
 from rebar_depth_bench.reporting.charts import score_charts
 from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS
 from rebar_depth_bench.reporting.comparison_tables import COMPARISON_NOTE, comparison_cells, views_note
@@ -39,14 +40,11 @@ from rebar_depth_bench.reporting.html.page import (
     views_by_config,
 )
 from rebar_depth_bench.reporting.html.rows import view_row
-from rebar_depth_bench.reporting.html.view_images import colour_bar_uri
+from rebar_depth_bench.reporting.html.views import colour_bar_uri
 from rebar_depth_bench.scoring.comparison import compare
-from rebar_depth_bench.scoring.disclosure import read_disclosed
-from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.scoring.result_io import read_result
-from rebar_depth_bench.scoring.view_score import ViewScore
+from rebar_depth_bench.scoring.result import Result, read_disclosed, read_result
+from rebar_depth_bench.scoring.table import ViewScore
 from rebar_depth_bench.submission import Declaration
-from rebar_depth_bench.view_ids import config_of
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 

@@ -18,7 +18,7 @@ from leaderboard.web.api.auth import ServiceDep, service_of
 from leaderboard.web.api.submissions import check_length, page_url
 from leaderboard.web.cache import NO_STORE, REVALIDATE
 from leaderboard.web.pages.rendering import clean_text, problem_lines, render
-from rebar_depth_bench.view_ids import TEST_SPLIT
+from rebar_depth_bench.names import TEST_SPLIT
 
 router = APIRouter(include_in_schema=False)
 

@@ -6,17 +6,16 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from rebar_depth_bench.data.dataset_config import DatasetConfig
+from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.extended.crossings.evaluate import crossing_samples, view_crossings
 from rebar_depth_bench.extended.crossings.reach import Reach, reaches
-from rebar_depth_bench.extended.ground_truth import load_steel_truth
+from rebar_depth_bench.extended.ground_truth import steel_truth
 from rebar_depth_bench.extended.measures import Samples
 from rebar_depth_bench.extended.predictions import NATIVE, SCALED, aligned_predictions
 from rebar_depth_bench.extended.result import CrossingsSource
-from rebar_depth_bench.parallel import map_with_progress
-from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.parallel import Progress, map_with_progress, silent
+from rebar_depth_bench.scoring.bootstrap import resample_views
 from rebar_depth_bench.scoring.evaluation import Evaluation
-from rebar_depth_bench.scoring.view_score import resample_views
 
 
 @dataclass(frozen=True)
@@ -44,7 +43,7 @@ def config_reaches(
 
     Raises ``DatasetError`` as ``load_steel_truth``.
     """
-    steel = load_steel_truth(evaluation.folder, config, progress)
+    steel = steel_truth(evaluation, config, progress)
 
     def view_samples(position: int) -> dict[str, Samples]:
         truth = steel.view(position)

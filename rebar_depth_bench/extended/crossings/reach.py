@@ -20,7 +20,7 @@ from numpy import ndarray
 from rebar_depth_bench.extended.crossings.measures import CROSSING_EDGES_M
 from rebar_depth_bench.extended.measures import Samples
 from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval
-from rebar_depth_bench.scoring.rounding import rounded, rounded_interval
+from rebar_depth_bench.scoring.columns import rounded, rounded_interval
 
 SHARE = 0.95
 """Share of the judged crossings of a bin that must be within the limit."""

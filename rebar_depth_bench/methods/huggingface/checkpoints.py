@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rebar_depth_bench.data.digests import files_digest
+from rebar_depth_bench.data.files import files_digest
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.monocular.hub import hub_download, local_copy_hint, snapshot
 from rebar_depth_bench.methods.monocular.third_party import read_json_object

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Num
 from numpy import ndarray
 
-from rebar_depth_bench.data.digests import files_digest
+from rebar_depth_bench.data.files import files_digest
 from rebar_depth_bench.errors import MethodError, Problem
 from rebar_depth_bench.limits import JSON_BYTES
 from rebar_depth_bench.methods.base import MethodInfo

@@ -13,7 +13,7 @@ from types import ModuleType
 from rebar_depth_bench.data.views import Views
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.base import MethodInfo, MultiViewMethod, Prepared
-from rebar_depth_bench.progress import Progress
+from rebar_depth_bench.parallel import Progress
 
 _DENSE_SUMMARIES = {
     "colmap": "dense depth by COLMAP's PatchMatch, which needs CUDA",

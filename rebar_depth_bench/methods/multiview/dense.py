@@ -24,8 +24,7 @@ from rebar_depth_bench.methods.multiview.images import LeftImages
 from rebar_depth_bench.methods.multiview.patch_match import patch_match, read_depth_map, require_cuda
 from rebar_depth_bench.methods.multiview.plane_sweep import PlaneSweepSpec, PosedImage, sweep_depth
 from rebar_depth_bench.methods.multiview.sfm import SparseReconstruction
-from rebar_depth_bench.parallel import map_with_progress
-from rebar_depth_bench.progress import Progress
+from rebar_depth_bench.parallel import Progress, map_with_progress
 
 MAX_RELATIVE_DIFFERENCE = 0.01
 """Two views are consistent at a point if their depths differ by at most this fraction."""

@@ -17,7 +17,7 @@ from rebar_depth_bench.methods.multiview.dense import DENSE_METHODS
 from rebar_depth_bench.methods.multiview.images import LeftImages, row_columns, select_pairs, write_left_images
 from rebar_depth_bench.methods.multiview.metric_scale import SCALE_SOURCES
 from rebar_depth_bench.methods.multiview.sfm import SparseReconstruction, reconstruct_sparse
-from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.parallel import Progress, silent
 
 
 def reconstruct_images(

@@ -18,7 +18,7 @@ from numpy import ndarray
 
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.cameras import rigid
-from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.parallel import Progress, silent
 
 SEED = 0
 SIFT_PEAK_THRESHOLD = 0.003

@@ -18,7 +18,7 @@ from jaxtyping import Float, Float32, Float64, Int64, UInt8
 from numpy import ndarray
 from PIL import Image
 
-from rebar_depth_bench.data.digests import files_digest
+from rebar_depth_bench.data.files import files_digest
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
 from rebar_depth_bench.methods.onnx.external_data import external_files

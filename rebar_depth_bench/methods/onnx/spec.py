@@ -41,7 +41,7 @@ from pydantic import Field, ValidationInfo, field_validator
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.reading import parse_toml, read_file
-from rebar_depth_bench.submission.metadata import MAX_METHOD_CHARACTERS
+from rebar_depth_bench.submission.declaration import MAX_METHOD_CHARACTERS
 from rebar_depth_bench.validation import (
     Expected,
     Flag,

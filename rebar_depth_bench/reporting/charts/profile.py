@@ -18,7 +18,7 @@ from rebar_depth_bench.reporting.charts.axes import (
     svg_text,
     tick_label,
 )
-from rebar_depth_bench.reporting.formatting import number, scale_cell
+from rebar_depth_bench.scoring.columns import SCALE, number
 
 _LEFT, _RIGHT = 52.0, WIDTH - 14.0
 _ERROR_TOP, _ERROR_BOTTOM = 24.0, 164.0
@@ -121,6 +121,6 @@ def _series(points: Sequence[tuple[float, MeasureEstimate]], y: LogAxis, kind: s
 def _description(bins: Sequence[ProfileBin], unit: str) -> str:
     return "; ".join(
         f"{entry.low:g} to {entry.high:g} {unit}: AbsRel native {number(entry.native.value, 4)}, "
-        f"scaled {number(entry.scaled.value, 4)}, s {scale_cell(entry.scale.value)}"
+        f"scaled {number(entry.scaled.value, 4)}, s {SCALE.text(entry.scale.value)}"
         for entry in bins
     )

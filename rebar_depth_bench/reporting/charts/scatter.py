@@ -13,7 +13,7 @@ from markupsafe import Markup, escape
 
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting.charts.axes import WIDTH, LogAxis, decade_axis, svg_figure, svg_text, tick_label
-from rebar_depth_bench.reporting.formatting import number
+from rebar_depth_bench.scoring.columns import number
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 64.0, WIDTH - 14.0, 14.0, 286.0
 _POINT_RADIUS_PX, _LABEL_RADIUS_PX, _CELL_PX = 5.0, 7.0, 2.0

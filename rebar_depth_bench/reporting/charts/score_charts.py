@@ -22,9 +22,8 @@ from rebar_depth_bench.reporting.charts.axes import (
     svg_text,
     tick_label,
 )
-from rebar_depth_bench.reporting.formatting import number, scale_cell
-from rebar_depth_bench.scoring.result import Table
-from rebar_depth_bench.scoring.view_score import ViewScore
+from rebar_depth_bench.scoring.columns import SCALE, number
+from rebar_depth_bench.scoring.table import Table, ViewScore
 
 _LEFT, _RIGHT = 14.0, WIDTH - 14.0
 _ROW_HEIGHT_PX = 50
@@ -70,12 +69,12 @@ def scale_chart(tables: Mapping[str, Table], views: Mapping[str, Sequence[ViewSc
     for index, (name, strip) in enumerate(scales.items()):
         y = _row_y(index)
         points = [(axis.at(s), y - 9 + 18 * (i * _GOLDEN_RATIO % 1)) for i, s in enumerate(strip)]
-        rows.append(_row_title(name, f"median s {scale_cell(tables[name].scale_median)}", y))
+        rows.append(_row_title(name, f"median s {SCALE.text(tables[name].scale_median)}", y))
         rows.append(_dots(points, "points"))
         rows.append(_median_mark(tables[name].scale_median, axis, y))
     description = (
         "Scale factor s = median(z)/median(p) of every view: 1 is metric, below 1 the prediction is too far. "
-        + _description(tables, lambda table: f"median {scale_cell(table.scale_median)}")
+        + _description(tables, lambda table: f"median {SCALE.text(table.scale_median)}")
     )
     return svg_figure(
         "Scale factor of each view", description, bottom + 22, _vertical_grid(axis, bottom) + "".join(rows)

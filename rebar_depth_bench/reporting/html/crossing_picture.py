@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy import ndarray
 
-from rebar_depth_bench.data.dataset import iterate_undecoded
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.decoding import RowDecoder
+from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.extended.crossings.evaluate import fitted_ties, view_crossings
-from rebar_depth_bench.extended.ground_truth import ConfigSteelTruth, has_bar_ids, load_steel_truth
+from rebar_depth_bench.extended.crossings.scene import SceneCrossings
+from rebar_depth_bench.extended.ground_truth import has_bar_ids, steel_truth
 from rebar_depth_bench.extended.predictions import NATIVE, aligned_predictions
 from rebar_depth_bench.extended.steel_truth import SteelTruth
 from rebar_depth_bench.geometry.cameras import fold_radius, project, transform
 from rebar_depth_bench.reporting.html.assets import data_uri
 from rebar_depth_bench.reporting.html.crossings import CrossingPicture, Mark
-from rebar_depth_bench.reporting.html.view_images import backdrop_image
-from rebar_depth_bench.scoring.evaluation import Evaluation
+from rebar_depth_bench.reporting.html.views import backdrop_image
+from rebar_depth_bench.scoring.evaluation import Evaluation, View
 
 KINDS: Mapping[str, str] = {
     "within2": "within 2 mm",
@@ -31,43 +31,42 @@ KINDS: Mapping[str, str] = {
 }
 """Kinds of marks: class of the style sheet, and meaning."""
 
-_COLUMNS = ("view_id", "left_rgb", "left_depth", "left_mask")
+
+@dataclass(frozen=True, eq=False)
+class CrossingView:
+    """View of a config that is pictured with its crossings: the one with most judged crossings."""
+
+    position: int
+    truth: SteelTruth
+    scene: SceneCrossings
+
+    def picture(self, view: View) -> CrossingPicture:
+        """Return the picture of the view, which has colour, depth and mask of the left camera."""
+        truth, crossings = self.truth, view_crossings(self.truth, self.scene)
+        fitted = fitted_ties(aligned_predictions(view.prediction_m, truth, None)[NATIVE], crossings)
+        with np.errstate(invalid="ignore", over="ignore"):
+            error_mm = 1000 * np.linalg.norm(fitted.ties.tie_point_m - crossings.ties.tie_point_m, axis=1)
+        kinds = dict.fromkeys(range(len(self.scene)), "unjudged")
+        kinds |= dict.fromkeys(truth.judged.crossing.tolist(), "bent")
+        located = zip(crossings.crossing.tolist(), fitted.located.tolist(), error_mm.tolist(), strict=True)
+        kinds |= {crossing: error_kind(error) if found else "missed" for crossing, found, error in located}
+        image = backdrop_image(*(view.cell(f"left_{kind}") for kind in ("rgb", "depth", "mask")))
+        marks = list(_marks(truth, self.scene.crossings.tie_point_m, kinds))
+        size = (truth.width, truth.height)
+        return CrossingPicture(truth.view_id, data_uri(image, "webp"), *size, marks, _counts(marks))
 
 
-def crossing_pictures(evaluation: Evaluation) -> dict[str, CrossingPicture]:
-    """Return a picture of one view of each config that has crossings: the one with most judged crossings."""
-    pictures = {}
-    for config in evaluation.configs:
-        if has_bar_ids(config):
-            steel = load_steel_truth(evaluation.folder, config)
-            if picture := _config_picture(evaluation, config, steel):
-                pictures[config.name] = picture
-    return pictures
-
-
-def _config_picture(
-    evaluation: Evaluation, config: DatasetConfig, steel: ConfigSteelTruth
-) -> CrossingPicture | None:
+def crossing_view(evaluation: Evaluation, config: DatasetConfig) -> CrossingView | None:
+    """Return the view of a config that is pictured, None if it has no crossings."""
+    if not has_bar_ids(config):
+        return None
+    steel = steel_truth(evaluation, config)
     if not any(len(bars.crossings) for bars in steel.bars_by_view.values()) or not len(steel):
         return None
     counts = [len(steel.judged(position).crossing) for position in range(len(steel))]
     truth = steel.view(int(np.argmax(counts)))
-    scene = steel.bars_by_view[truth.view_id].crossings
-    prediction_m = evaluation.submission.read(truth.view_id)
-    view = view_crossings(truth, scene)
-    fitted = fitted_ties(aligned_predictions(prediction_m, truth, None)[NATIVE], view)
-    with np.errstate(invalid="ignore", over="ignore"):
-        error_mm = 1000 * np.linalg.norm(fitted.ties.tie_point_m - view.ties.tie_point_m, axis=1)
-    kinds = dict.fromkeys(range(len(scene)), "unjudged")
-    kinds |= dict.fromkeys(truth.judged.crossing.tolist(), "bent")
-    located = zip(view.crossing.tolist(), fitted.located.tolist(), error_mm.tolist(), strict=True)
-    kinds |= {crossing: error_kind(error) if found else "missed" for crossing, found, error in located}
-    row = next(row for row in iterate_undecoded(config, _COLUMNS) if row["view_id"] == truth.view_id)
-    decoded = RowDecoder.of(config).row(row)
-    image = backdrop_image(decoded["left_rgb"], decoded["left_depth"], decoded["left_mask"])
-    marks = list(_marks(truth, scene.crossings.tie_point_m, kinds))
-    size = (truth.width, truth.height)
-    return CrossingPicture(truth.view_id, data_uri(image, "webp"), *size, marks, _counts(marks))
+    position = config.view_ids.index(truth.view_id)
+    return CrossingView(position, truth, steel.bars_by_view[truth.view_id].crossings)
 
 
 def error_kind(error_mm: float) -> str:

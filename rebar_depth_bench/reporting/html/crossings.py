@@ -11,9 +11,11 @@ from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES
 from rebar_depth_bench.extended.predictions import NATIVE, SCALED
 from rebar_depth_bench.extended.result import ExtendedResult, ExtendedTable
 from rebar_depth_bench.reporting.crossing_texts import FITS_NOTE, REACH_NOTE, reach_sentence
-from rebar_depth_bench.reporting.formatting import interval_cell, number
 from rebar_depth_bench.reporting.html.extended import ExtendedMeasureTable, measure_table
 from rebar_depth_bench.reporting.html.rows import Cell
+from rebar_depth_bench.scoring.columns import Column
+
+_SHARE = Column("share", "judged crossings within a limit", "%", "higher", 1, 100.0)
 
 
 @dataclass(frozen=True)
@@ -116,6 +118,6 @@ def _distance_rows(table: ExtendedTable) -> Iterable[DistanceRow]:
             crossings=Cell(str(first.crossings), first.crossings),
             views=Cell(str(first.views), first.views),
             shares=[
-                Cell(number(100 * one.share, 1), one.share, interval_cell(one.interval, 1, 100.0)) for one in bins
+                Cell(_SHARE.number_text(one.share), one.share, _SHARE.interval_text(one.interval)) for one in bins
             ],
         )

@@ -28,12 +28,9 @@ from rebar_depth_bench.extended.profiles import AXES, bin_names
 from rebar_depth_bench.extended.result import ExtendedResult, ExtendedTable, MeasureEstimate
 from rebar_depth_bench.reporting.charts.profile import ProfileBin, profile_chart
 from rebar_depth_bench.reporting.extended_tables import MISSED, UNDEFINED, is_miss, single_bar_sentence
-from rebar_depth_bench.reporting.formatting import DASH, interval_cell, number
 from rebar_depth_bench.reporting.html.rows import Cell
+from rebar_depth_bench.scoring.columns import ARROWS, DASH
 
-_DECIMALS: Mapping[str, int] = {"mm": 2, "cm": 2, "m": 3, "%": 1, "": 4}
-_RATIO_DECIMALS = 2
-_ARROWS: Mapping[str, str] = {"lower": "↓", "higher": "↑", "": ""}
 _TITLE_NUMBER = re.compile(r"\d[\d.]*(?:-[\d.]+)?(?= (?:mm|%|m|px|degrees)(?!\w))")
 """Tolerance, threshold or bin in a measure's title: a number followed by a unit."""
 
@@ -65,28 +62,21 @@ def measure_rows(table: ExtendedTable, measures: Iterable[Measure], alignments: 
         if any(estimate.samples for estimate in estimates):
             cells = [estimate_cell(estimate, measure) for estimate in estimates]
             samples = " / ".join(dict.fromkeys(str(estimate.samples) for estimate in estimates))
-            rows.append(MeasureRow(measure.title, measure.unit, _ARROWS[measure.better], cells, samples))
+            rows.append(MeasureRow(measure.title, measure.unit, ARROWS[measure.better], cells, samples))
     return rows
 
 
 def estimate_cell(estimate: MeasureEstimate, measure: Measure) -> Cell:
     """Return the cell of an estimate with its interval, formatted in the measure's unit."""
-    factor = 100.0 if measure.unit == "%" else 1.0
-    decimals = _decimals(measure)
     if estimate.value is None:
         return Cell(UNDEFINED if estimate.samples else DASH, None)
     if not math.isfinite(estimate.value):
         return Cell("∞" if measure.convert is not None else DASH, None)
     if is_miss(estimate, measure):
         informative = estimate.interval is not None and estimate.interval[0] < estimate.interval[1]
-        return Cell(
-            MISSED, estimate.value, _interval_text(estimate.interval, factor, decimals) if informative else ""
-        )
-    return Cell(
-        number(estimate.value * factor, decimals).replace("-", "−"),
-        estimate.value,
-        _interval_text(estimate.interval, factor, decimals),
-    )
+        return Cell(MISSED, estimate.value, _interval_text(estimate.interval, measure) if informative else "")
+    text = measure.column.text(estimate.value).replace("-", "−")
+    return Cell(text, estimate.value, _interval_text(estimate.interval, measure))
 
 
 def measure_definitions(measures: Iterable[Measure]) -> list[MeasureDefinition]:
@@ -101,12 +91,6 @@ def measure_definitions(measures: Iterable[Measure]) -> list[MeasureDefinition]:
     return [_measure_definition(title, group) for title, group in by_title.items()]
 
 
-def _decimals(measure: Measure) -> int:
-    if measure.convert is not None or measure.name.endswith("_deg"):
-        return _RATIO_DECIMALS
-    return _DECIMALS[measure.unit]
-
-
 def _measure_definition(title: str, measures: Sequence[Measure]) -> MeasureDefinition:
     first = measures[0]
     if len(measures) == 1:
@@ -116,8 +100,8 @@ def _measure_definition(title: str, measures: Sequence[Measure]) -> MeasureDefin
     return MeasureDefinition(title, f"{definition}; N: {', '.join(steps)}")
 
 
-def _interval_text(ends: tuple[float, float] | None, factor: float, decimals: int) -> str:
-    text = interval_cell(ends, decimals, factor).replace("-", "−")
+def _interval_text(ends: tuple[float, float] | None, measure: Measure) -> str:
+    text = measure.column.interval_text(ends).replace("-", "−")
     return text.replace(" – ", " to ") if ends is not None and ends[0] < 0 else text
 
 

@@ -8,44 +8,41 @@ views to show and loads their images.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from operator import attrgetter
 from pathlib import Path
-from typing import Any
 
 from markupsafe import Markup
 
-from rebar_depth_bench.data.dataset import iterate_undecoded
-from rebar_depth_bench.data.decoding import RowDecoder
-from rebar_depth_bench.diagnosis.diagnose import PossibleMistake
+from rebar_depth_bench.diagnosis.diagnose import PossibleMistake, diagnose_config
+from rebar_depth_bench.diagnosis.views import COLUMNS, diagnosed_view, positions_to_read
 from rebar_depth_bench.errors import printable
+from rebar_depth_bench.names import config_of
 from rebar_depth_bench.outputs import write_output
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.charts import score_charts
 from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS
 from rebar_depth_bench.reporting.html.assets import environment, inline_script
-from rebar_depth_bench.reporting.html.crossing_picture import crossing_pictures
+from rebar_depth_bench.reporting.html.crossing_picture import crossing_view
 from rebar_depth_bench.reporting.html.crossings import CrossingPicture, crossing_section
 from rebar_depth_bench.reporting.html.extended import extended_section
-from rebar_depth_bench.reporting.html.groups import config_groups
-from rebar_depth_bench.reporting.html.published import paper_scenes
-from rebar_depth_bench.reporting.html.rows import ScoreRow, table_row, view_row
-from rebar_depth_bench.reporting.html.view_browser import (
+from rebar_depth_bench.reporting.html.rows import METRIC_HEADS, ScoreRow, config_groups, table_row, view_row
+from rebar_depth_bench.reporting.html.views import (
     VIEWS_SHOWN,
     ShownView,
+    ViewPanels,
+    colour_bar_uri,
     shown_counts,
-    shown_views,
+    shown_view,
+    sorted_views,
     views_to_show,
 )
-from rebar_depth_bench.reporting.html.view_images import ViewPanels, colour_bar_uri
-from rebar_depth_bench.reporting.published import OTHER_OPTICS_NOTE, load_published
-from rebar_depth_bench.scoring.evaluation import Evaluation
+from rebar_depth_bench.reporting.published import OTHER_OPTICS_NOTE, load_published, paper_scenes
+from rebar_depth_bench.scoring.evaluation import Evaluation, View
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
 from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.scoring.view_score import ViewScore
-from rebar_depth_bench.submission import SubmissionReader
-from rebar_depth_bench.view_ids import config_of
+from rebar_depth_bench.scoring.table import ViewScore
 
 WORST_SHOWN = 10
 """Number of views of a config that are listed openly; the full list is collapsed."""
@@ -67,17 +64,17 @@ class ConfigViewTables:
 
 def render_report(
     result: Result,
-    panels: Iterable[ViewPanels],
+    shown: Iterable[ShownView],
     mistakes: Sequence[PossibleMistake] = (),
     pictures: Mapping[str, CrossingPicture] | None = None,
 ) -> str:
-    """Return the HTML report of ``result`` with the images of ``panels``, by config, worst view first.
+    """Return the HTML report of ``result`` with the images of ``shown``, by config, worst view first.
 
-    ``panels`` may be in any order and is iterated once; only the encoded images stay in memory. ``mistakes`` are
-    the possible mistakes in the submission, and ``pictures`` the views with their crossings, by config.
+    ``mistakes`` are the possible mistakes in the submission, and ``pictures`` the views with their crossings, by
+    config.
     """
     views = views_by_config(result)
-    shown = shown_views(panels, list(result.tables))
+    shown = sorted_views(shown, list(result.tables))
     script = inline_script("sortable.js", "browser.js")
     return (
         environment()
@@ -89,7 +86,7 @@ def render_report(
             script=script.text,
             policy=script.policy,
             mistakes=[printable(mistake.text) for mistake in mistakes],
-            metric_heads=formatting.METRIC_HEADS,
+            metric_heads=METRIC_HEADS,
             tolerances=WITHIN_MM,
             dash_note=formatting.DASH_NOTE,
             **results_context(result, views),
@@ -156,10 +153,10 @@ def _provenance(result: Result) -> list[tuple[str, str]]:
         ("Protocol", result.protocol),
         ("Inputs", formatting.inputs_text(result.declared)),
         ("Ground truth", formatting.ground_truth_text(result.declared)),
-        ("Dataset version", printable(result.dataset_version)),
-        ("Dataset digest", printable(result.dataset_digest)),
-        ("Archive sha256", printable(result.submission_sha256.removeprefix("sha256:"))),
-        ("Software", f"rebar-depth-bench {printable(result.software_version)}"),
+        ("Dataset version", printable(result.dataset.version)),
+        ("Dataset digest", printable(result.dataset.digest)),
+        ("Archive sha256", printable(result.submission.sha256.removeprefix("sha256:"))),
+        ("Software", f"rebar-depth-bench {printable(result.software.version)}"),
     ]
 
 
@@ -182,47 +179,65 @@ def _config_views(name: str, views: Sequence[ViewScore]) -> ConfigViewTables:
     )
 
 
-_COLUMNS = ("view_id", "left_rgb", "left_depth", "left_mask")
+_COLUMNS = ("left_rgb", "left_depth", "left_mask")
+
+
+@dataclass(frozen=True)
+class LookedAt:
+    """What was found in views of a submission: mistakes, encoded images, and pictures of crossings by config."""
+
+    mistakes: Sequence[PossibleMistake] = ()
+    shown: Sequence[ShownView] = ()
+    pictures: Mapping[str, CrossingPicture] = field(default_factory=dict)
+
+
+def look_at_views(
+    evaluation: Evaluation, chosen: Mapping[str, Sequence[ViewScore]], *, crossings: bool = False
+) -> LookedAt:
+    """Diagnose a submission and encode the images of the chosen views, by config, decoding each view once.
+
+    With ``crossings``, one view of each config that has any is pictured with its crossings. Only the rows of these
+    views are read, and one is in memory at a time. Raises ``EntryError`` and ``DatasetError`` for entries and
+    shards that scoring refuses.
+    """
+    mistakes: list[PossibleMistake] = []
+    shown: list[ShownView] = []
+    pictures: dict[str, CrossingPicture] = {}
+    for config in evaluation.configs:
+        scores = {view.view_id: view for view in chosen.get(config.name, ())}
+        positions = {position for position, view_id in enumerate(config.view_ids) if view_id in scores}
+        diagnosed_at = positions_to_read(config)
+        pictured = crossing_view(evaluation, config) if crossings else None
+        wanted = {*positions, *diagnosed_at, *({pictured.position} if pictured else ())}
+        columns = dict.fromkeys((*_COLUMNS, *(COLUMNS if diagnosed_at else ())))
+        diagnosed = []
+        for view in evaluation.views(config, tuple(columns), wanted):
+            if view.position in diagnosed_at:
+                diagnosed.append(diagnosed_view(view))
+            if view.position in positions:
+                shown.append(shown_view(view_panels(view, scores[view.view_id])))
+            if pictured and view.position == pictured.position:
+                pictures[config.name] = pictured.picture(view)
+        mistakes += diagnose_config(config, diagnosed, evaluation.submission)
+    return LookedAt(mistakes, shown, pictures)
 
 
 def write_report(
-    result: Result,
-    evaluation: Evaluation,
-    target: Path,
-    *,
-    mistakes: Sequence[PossibleMistake] = (),
-    views_shown: int = VIEWS_SHOWN,
-) -> None:
-    """Write the HTML report of ``result``, the scores of the submission of ``evaluation``, and its ``mistakes``.
+    result: Result, evaluation: Evaluation, target: Path, *, views_shown: int = VIEWS_SHOWN
+) -> Sequence[PossibleMistake]:
+    """Write the HTML report of ``result``, the scores of the submission of ``evaluation``; return its mistakes.
 
     Up to ``views_shown`` views of each config are shown with images: the worst by rank error, then evenly
     spaced down to the best. Raises ``InputError`` if ``views_shown`` is negative.
     """
-    chosen = {
-        config: views_to_show([view for view in result.views if config_of(view.view_id) == config], views_shown)
-        for config in result.tables
-    }
-    pictures = crossing_pictures(evaluation) if result.extended is not None else {}
-    write_output(target, render_report(result, iter_view_panels(chosen, evaluation), mistakes, pictures))
+    chosen = {name: views_to_show(views, views_shown) for name, views in views_by_config(result).items()}
+    found = look_at_views(evaluation, chosen, crossings=result.extended is not None)
+    write_output(target, render_report(result, found.shown, found.mistakes, found.pictures))
+    return found.mistakes
 
 
-def iter_view_panels(chosen: Mapping[str, list[ViewScore]], evaluation: Evaluation) -> Iterator[ViewPanels]:
-    """Yield the arrays of the chosen views (by config), one view at a time; other rows are not decoded."""
-    for config in evaluation.configs:
-        scores = {view.view_id: view for view in chosen.get(config.name, ())}
-        if scores:
-            decoder = RowDecoder.of(config)
-            for row in iterate_undecoded(config, _COLUMNS):
-                if score := scores.get(row["view_id"]):
-                    yield _panels(score, decoder.row(row), evaluation.submission)
-
-
-def _panels(score: ViewScore, row: Mapping[str, Any], submission: SubmissionReader) -> ViewPanels:
-    return ViewPanels(
-        view_id=score.view_id,
-        rgb=row["left_rgb"],
-        truth_m=row["left_depth"],
-        prediction_m=submission.read(score.view_id),
-        steel=row["left_depth"] > 0 if row["left_mask"] is None else row["left_mask"],
-        score=score,
-    )
+def view_panels(view: View, score: ViewScore) -> ViewPanels:
+    """Return the arrays of a view that are rendered."""
+    truth_m, mask = view.cell("left_depth"), view.cell("left_mask")
+    steel = truth_m > 0 if mask is None else mask
+    return ViewPanels(view.view_id, view.cell("left_rgb"), truth_m, view.prediction_m, steel, score)

@@ -1,17 +1,32 @@
-"""Table rows of configs and views: cells with their text and sort value."""
+"""Table rows of configs, views and groups of views: cells with their text and sort value."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
-from rebar_depth_bench.scoring.metrics import METRIC_NAMES, DepthMetrics
-from rebar_depth_bench.scoring.protocol import WITHIN_MM
-from rebar_depth_bench.scoring.result import Table
-from rebar_depth_bench.scoring.view_score import ViewScore
+from rebar_depth_bench.scoring.columns import (
+    ARROWS,
+    COVERAGE,
+    METRICS,
+    NATIVE,
+    ONE_PIXEL,
+    RANK_ERROR,
+    SCALE,
+    SCALED,
+    SCALED_CONSTANT,
+    WITHIN,
+    Column,
+    with_reference,
+)
+from rebar_depth_bench.scoring.groups import GROUPINGS
+from rebar_depth_bench.scoring.table import Table, ViewScore
+
+METRIC_HEADS = tuple((metric.title, metric.unit, ARROWS[metric.better]) for metric in METRICS.values())
+"""Name, unit and better direction of each metric, for the headings of tables."""
 
 
 @dataclass(frozen=True)
@@ -57,70 +72,103 @@ class ScoreRow:
 
 def table_row(name: str, table: Table) -> ScoreRow:
     """Return the row of a config, with a printable name and intervals."""
-    intervals = table.intervals
-    within_intervals = [formatting.interval_cell(intervals.get(f"within_mm.{t}"), 1, 100.0) for t in WITHIN_MM]
     return ScoreRow(
         name=formatting.config_title(name, table.split),
-        views=Cell(f"{table.views_scored}/{table.views}", table.views_scored),
-        coverage=_cell(
-            formatting.coverage_percent(table.coverage),
-            table.coverage,
-            formatting.coverage_interval_cell(intervals.get("coverage")),
-        ),
-        rank_error=_cell(
-            formatting.rank_error_cell(table.rank_error),
-            table.rank_error,
-            formatting.interval_cell(intervals.get("rank_error"), 4),
-        ),
+        views=Cell(table.scored_of_views, table.views_scored),
+        coverage=cell(COVERAGE, table),
+        rank_error=cell(RANK_ERROR, table),
         ranked=table.ranked,
         notes=formatting.table_notes(table),
         findings=formatting.reference_findings(table),
-        native=_metric_cells(table.native, formatting.metric_interval_cells(intervals, "native")),
-        scaled=_metric_cells(table.scaled, formatting.metric_interval_cells(intervals, "scaled")),
-        scale=_cell(
-            formatting.scale_cell(table.scale_median),
-            table.scale_median,
-            formatting.interval_cell(intervals.get("scale_median"), 3),
-        ),
-        within=_cells(
-            formatting.within_cells(table.within_mm), [table.within_mm[t] for t in WITHIN_MM], within_intervals
-        ),
+        native=cells(NATIVE, table),
+        scaled=cells(SCALED, table),
+        scale=cell(SCALE, table),
+        within=cells(WITHIN, table),
     )
 
 
 def view_row(view: ViewScore) -> ScoreRow:
     """Return the row of a view; its ``views`` cell holds the number of scored pixels."""
-    no_intervals = [""] * len(METRIC_NAMES)
     return ScoreRow(
         name=printable(view.view_id),
         views=Cell(f"{view.scored_px:,}".replace(",", "\N{NARROW NO-BREAK SPACE}"), view.scored_px),
-        coverage=_cell(formatting.coverage_percent(view.coverage), view.coverage),
-        rank_error=_cell(formatting.rank_error_cell(view.rank_error), view.rank_error),
+        coverage=cell(COVERAGE, view),
+        rank_error=cell(RANK_ERROR, view),
         ranked=True,
         notes=[],
         findings=[],
-        native=_metric_cells(view.native, no_intervals),
-        scaled=_metric_cells(view.scaled, no_intervals),
-        scale=_cell(formatting.scale_cell(view.scale), view.scale),
-        within=_cells(
-            formatting.within_cells(view.within_mm), [view.within_mm[t] for t in WITHIN_MM], [""] * len(WITHIN_MM)
-        ),
+        native=cells(NATIVE, view),
+        scaled=cells(SCALED, view),
+        scale=cell(SCALE, view),
+        within=cells(WITHIN, view),
     )
 
 
-def number_cells(texts: Sequence[str], values: Sequence[float | None]) -> list[Cell]:
-    """Return cells of numbers without intervals."""
-    return _cells(texts, values, [""] * len(texts))
+def cells(columns: Sequence[Column], scores: Table | ViewScore) -> list[Cell]:
+    """Return the cell of each column."""
+    return [cell(column, scores) for column in columns]
 
 
-def _metric_cells(metrics: DepthMetrics | None, intervals: Sequence[str]) -> list[Cell]:
-    values = [getattr(metrics, name, None) for name in METRIC_NAMES]
-    return _cells(formatting.metric_cells(metrics), values, intervals)
+def cell(column: Column, scores: Table | ViewScore) -> Cell:
+    """Return the cell of a number of a config, with its interval, or of a view."""
+    if isinstance(scores, ViewScore):
+        value, interval = column.view_value(scores), ""
+    else:
+        value, interval = column.value(scores), column.interval_text(scores.intervals.get(column.path))
+    return Cell(column.text(value), value if value is not None and math.isfinite(value) else None, interval)
 
 
-def _cells(texts: Sequence[str], values: Sequence[float | None], intervals: Sequence[str]) -> list[Cell]:
-    return [_cell(*parts) for parts in zip(texts, values, intervals, strict=True)]
+@dataclass(frozen=True)
+class GroupRow:
+    """Cells of a group; the lists have the errors ``columns.REFERENCE_ERRORS``."""
+
+    row: ScoreRow
+    native: list[Cell]
+    one_pixel: list[Cell]
+    scaled: list[Cell]
+    constant: list[Cell]
 
 
-def _cell(text: str, value: float | None, interval: str = "") -> Cell:
-    return Cell(text, value if value is not None and math.isfinite(value) else None, interval)
+@dataclass(frozen=True)
+class GroupTable:
+    """Table of the groups of one grouping; ``definition`` is empty if a later version has defined the grouping."""
+
+    title: str
+    definition: str
+    rows: list[GroupRow]
+
+
+@dataclass(frozen=True)
+class ConfigGroups:
+    """Tables of the groups of a config with splits."""
+
+    name: str
+    tables: list[GroupTable]
+
+
+def config_groups(tables: Mapping[str, Table]) -> list[ConfigGroups]:
+    """Return the tables of groups of each config that has any."""
+    return [
+        ConfigGroups(
+            formatting.config_title(config, table.split),
+            [_group_table(grouping, groups) for grouping, groups in table.groups.items() if groups],
+        )
+        for config, table in tables.items()
+        if any(table.groups.values())
+    ]
+
+
+def _group_table(grouping: str, groups: Mapping[str, Table]) -> GroupTable:
+    definition = GROUPINGS[grouping].definition if grouping in GROUPINGS else ""
+    rows = [_group_row(group, table) for group, table in groups.items()]
+    return GroupTable(formatting.grouping_title(grouping), definition, rows)
+
+
+def _group_row(group: str, table: Table) -> GroupRow:
+    return GroupRow(
+        table_row(group, replace(table, split=None)),
+        native=cells(with_reference(NATIVE), table),
+        one_pixel=cells(ONE_PIXEL, table),
+        scaled=cells(with_reference(SCALED), table),
+        constant=cells(SCALED_CONSTANT, table),
+    )

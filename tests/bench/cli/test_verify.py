@@ -12,7 +12,7 @@ import pytest
 import rebar_depth_bench as rdb
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.codecs import encode_depth
-from rebar_depth_bench.data.digests import file_sha256
+from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.data.manifest import open_folder
 from tests.commands import run_in_process
 from tests.damage import change_manifest, change_rows, copy_dataset, first_shard
@@ -116,7 +116,7 @@ def test_other_dataset_than_expected_is_refused(
         assert len(notes) == (command[0] in ("score", "check", "predict"))
     with pytest.raises(rdb.DatasetError, match=f"expected {other}"):
         rdb.score(archive, tiny_root, expect_digest=other)
-    assert rdb.score(archive, tiny_root, expect_digest=digest).dataset_digest == digest
+    assert rdb.score(archive, tiny_root, expect_digest=digest).dataset.digest == digest
 
 
 def test_false_digest_is_refused_by_every_command(

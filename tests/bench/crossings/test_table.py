@@ -22,7 +22,7 @@ from rebar_depth_bench.bar_crossings.table import (
     write_crossings,
 )
 from rebar_depth_bench.data.bars import Bar, read_bars
-from rebar_depth_bench.data.digests import file_sha256
+from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import DatasetError
 

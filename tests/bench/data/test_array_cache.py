@@ -16,9 +16,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rebar_depth_bench.data.array_cache import ArrayCache, open_cache
-from rebar_depth_bench.data.cache_entry import CacheContent, ViewArrays
-from rebar_depth_bench.data.cache_folder import cache_folder, clear, entries
+from rebar_depth_bench.data.cache import (
+    ArrayCache,
+    CacheContent,
+    ViewArrays,
+    cache_folder,
+    clear,
+    entries,
+    open_cache,
+)
 from rebar_depth_bench.errors import DatasetError, InputError
 
 DTYPES = {"index": np.uint32, "inside": np.bool_}
@@ -305,7 +311,7 @@ def test_score_needs_no_space_for_files(folder: Path, limit_bytes: int) -> None:
     code = f"""
         import resource
         from tests.bench.data.test_array_cache import EXPECTED, content, indices
-        from rebar_depth_bench.data.array_cache import open_cache
+        from rebar_depth_bench.data.cache import open_cache
         resource.setrlimit(resource.RLIMIT_FSIZE, ({limit_bytes}, {limit_bytes}))
         cache = open_cache(content())
         assert indices(cache) == EXPECTED and len(cache.numbers) == len(EXPECTED)
@@ -338,7 +344,7 @@ PROCESS = textwrap.dedent(
     """
     import sys, time
     from tests.bench.data.test_array_cache import EXPECTED, content, indices, views
-    from rebar_depth_bench.data.array_cache import open_cache
+    from rebar_depth_bench.data.cache import open_cache
 
     def slow():
         for view in views():

@@ -16,14 +16,12 @@ import pytest
 from pydantic import ValidationError
 
 import rebar_depth_bench as rdb
-from rebar_depth_bench.data.columns import features
-from rebar_depth_bench.data.config_tables import References
-from rebar_depth_bench.data.dataset import iterate_rows
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.data.trajectory import Survey, Trajectory
+from rebar_depth_bench.data.rows import iterate_rows
+from rebar_depth_bench.data.schema import References, Survey, Trajectory, features
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import ideal_K, right_camera_pose
-from rebar_depth_bench.scoring.published_match import published_match
+from rebar_depth_bench.scoring.truth import published_match
 
 HEIGHT, WIDTH, VIEWS = 90, 160, 9
 

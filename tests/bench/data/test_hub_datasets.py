@@ -25,7 +25,7 @@ REVISIONS = ("main", "v1.0", "refs/pr/1")
 SCRIPT = """
 import sys
 import rebar_depth_bench as rdb
-from rebar_depth_bench.data.dataset import iterate_rows
+from rebar_depth_bench.data.rows import iterate_rows
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.cli.main import main
 root, work = sys.argv[1:]

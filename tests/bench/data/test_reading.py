@@ -13,8 +13,17 @@ import pytest
 from rebar_depth_bench import limits
 from rebar_depth_bench.atomic_io import write_text
 from rebar_depth_bench.errors import InputError, terminal_text
-from rebar_depth_bench.paths import check_no_links, path_below, remove_file, remove_folder
-from rebar_depth_bench.reading import MAX_NESTING, open_regular, parse_json, parse_toml, read_file
+from rebar_depth_bench.reading import (
+    MAX_NESTING,
+    check_no_links,
+    open_regular,
+    parse_json,
+    parse_toml,
+    path_below,
+    read_file,
+    remove_file,
+    remove_folder,
+)
 
 
 def test_file_above_the_limit_is_not_read(tmp_path: Path) -> None:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import datasets
 
-from rebar_depth_bench.data.columns import COLUMNS, ROW_SCHEMA, features
-from rebar_depth_bench.data.dataset import iterate_undecoded
 from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.data.rows import iterate_undecoded
+from rebar_depth_bench.data.schema import COLUMNS, ROW_SCHEMA, features
 
 
 def test_row_schema_is_that_of_the_features() -> None:

@@ -13,24 +13,22 @@ import pyarrow.parquet as pq
 import pytest
 
 import rebar_depth_bench as rdb
-from rebar_depth_bench.data.config_tables import ViewRecord
-from rebar_depth_bench.data.dataset import ConfigViews
-from rebar_depth_bench.data.digests import views_digest
+from rebar_depth_bench.data.files import views_digest
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, open_folder
+from rebar_depth_bench.data.schema import ViewRecord
 from rebar_depth_bench.data.verification import truth_problems
-from rebar_depth_bench.data.views import Views
+from rebar_depth_bench.data.views import ConfigViews, Views
 from rebar_depth_bench.errors import DatasetError, InputError, SubmissionError
 from rebar_depth_bench.extended.evaluate import score_extended
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
 from rebar_depth_bench.methods.base import Method, MethodInfo, MultiViewMethod, Prepared
 from rebar_depth_bench.methods.runner import predict
 from rebar_depth_bench.reporting.figure import figure_content
-from rebar_depth_bench.reporting.html.page import iter_view_panels
+from rebar_depth_bench.reporting.html.page import look_at_views
 from rebar_depth_bench.reporting.latex import latex_table
 from rebar_depth_bench.scoring.comparison import compare
-from rebar_depth_bench.scoring.evaluation import open_evaluation
-from rebar_depth_bench.scoring.result_io import read_result
-from rebar_depth_bench.scoring.score import score_evaluation
+from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
+from rebar_depth_bench.scoring.result import read_result
 from tests.synthetic_dataset import HEIGHT, WIDTH, write_dataset, write_split_dataset
 
 SCENES = {"a": "train", "b-1": "train", "c": "validation", "d": "test", "e": "test"}
@@ -127,8 +125,8 @@ def test_reports_name_the_split(root: Path, tmp_path: Path) -> None:
 def test_report_shows_views_of_the_split(root: Path, tmp_path: Path) -> None:
     with open_evaluation(write_truth(root, tmp_path / "a.zip", "train"), root) as evaluation:
         result = score_evaluation(evaluation)
-        panels = list(iter_view_panels({"cages": list(result.views)}, evaluation))
-    assert [panel.view_id for panel in panels] == view_ids("train")
+        shown = look_at_views(evaluation, {"cages": list(result.views)}).shown
+    assert [view.view_id for view in shown] == view_ids("train")
 
 
 INFO = MethodInfo("shifted", "test", ("left_depth", "scene"), False, "here", "none")

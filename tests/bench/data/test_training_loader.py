@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 import rebar_depth_bench as rdb
-from rebar_depth_bench.data.augmentation import Augmentation, flip_row
+from rebar_depth_bench.data.torch import Augmentation, flip_row
 from rebar_depth_bench.errors import InputError
 
 torch = pytest.importorskip("torch")

@@ -14,8 +14,8 @@ import pytest
 from PIL import Image
 
 import rebar_depth_bench as rdb
-from rebar_depth_bench.data.dataset import iterate_rows
 from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.data.rows import iterate_rows
 
 torch = pytest.importorskip("torch")
 

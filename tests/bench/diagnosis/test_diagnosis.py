@@ -14,15 +14,28 @@ from hypothesis import strategies as st
 from benchmarks.diagnosis import SOUND, learned_like, mistakes, mistakes_named
 from rebar_depth_bench import SubmissionWriter, score
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.data.dataset import iterate_rows
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.diagnosis.corrections import UNITS, best_shift
+from rebar_depth_bench.data.rows import iterate_rows
+from rebar_depth_bench.diagnosis.corrections import (
+    UNITS,
+    best_shift,
+    line_error,
+    mean_error,
+    median_ratio,
+    resistant_line,
+)
 from rebar_depth_bench.diagnosis.diagnose import diagnose
-from rebar_depth_bench.diagnosis.errors import line_error, mean_error, median_ratio, resistant_line
-from rebar_depth_bench.diagnosis.views import MAX_VIEWS, DiagnosedView, Pixels, positions_to_read, read_views
+from rebar_depth_bench.diagnosis.views import (
+    COLUMNS,
+    MAX_VIEWS,
+    DiagnosedView,
+    Pixels,
+    diagnosed_view,
+    positions_to_read,
+)
 from rebar_depth_bench.methods import own_methods
 from rebar_depth_bench.methods.runner import predict
-from rebar_depth_bench.scoring.evaluation import open_evaluation
+from rebar_depth_bench.scoring.evaluation import open_evaluation, read_views
 from tests.commands import run_in_process
 from tests.synthetic_dataset import write_dataset
 
@@ -203,7 +216,11 @@ def test_at_most_eight_evenly_spaced_views_with_steel_are_read(tmp_path: Path) -
     positions = positions_to_read(config)
     assert len(positions) == MAX_VIEWS
     assert set(np.diff(positions)) <= {3, 4}
-    views = list(read_views(config, positions, lambda position: np.full((90, 160), float(position))))
+
+    def read(view_id: str) -> np.ndarray:
+        return np.full((90, 160), float(view_id[-4:]))
+
+    views = [diagnosed_view(view) for view in read_views(config, COLUMNS, positions, read)]
     assert [view.position for view in views] == positions
     assert all((view.prediction == view.position).all() for view in views)
 

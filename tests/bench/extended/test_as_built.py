@@ -19,8 +19,7 @@ from rebar_depth_bench.extended.inspection.evaluate import inspection_samples
 from rebar_depth_bench.extended.inspection.measures import MISS_MM
 from rebar_depth_bench.extended.measures import STATISTICS, Samples
 from rebar_depth_bench.geometry.cameras import rotation_matrix
-from rebar_depth_bench.scoring.evaluation import open_evaluation
-from rebar_depth_bench.scoring.score import score_evaluation
+from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
 from tests.bench.extended.cage_scenes import mat, predicted_m, view
 
 BUILT_MM = np.array([(0, 0, 0), (4, 0, 3), (12, 5, 0), (0, 9, -12), (3, -15, 2), (-8, 0, 7)], float)

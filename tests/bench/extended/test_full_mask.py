@@ -13,8 +13,7 @@ from numpy import ndarray
 
 from rebar_depth_bench.extended.full_mask import MEASURES, full_mask_samples
 from rebar_depth_bench.extended.steel_truth import SteelTruth
-from rebar_depth_bench.scoring.ground_truth import ViewTruth
-from rebar_depth_bench.scoring.score import score_view
+from rebar_depth_bench.scoring.score import ViewTruth, score_view
 from tests.bench.extended.thin_scenes import random_prediction, random_truth, steel_truth, with_holes
 
 SEEDS = st.integers(0, 2**32 - 1)

@@ -30,7 +30,7 @@ from rebar_depth_bench.methods import (
     find_method,
 )
 from rebar_depth_bench.methods.runner import predict
-from rebar_depth_bench.progress import Progress
+from rebar_depth_bench.parallel import Progress
 
 USER_METHOD = """
 import time

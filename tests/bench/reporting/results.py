@@ -6,16 +6,16 @@ import math
 
 import numpy as np
 
-from rebar_depth_bench.reporting.html.view_images import ViewPanels
+from rebar_depth_bench.reporting.html.views import ShownView, ViewPanels, shown_view
 from rebar_depth_bench.scoring.metrics import DepthMetrics
-from rebar_depth_bench.scoring.published_match import PublishedMatch
-from rebar_depth_bench.scoring.reference import Reference
-from rebar_depth_bench.scoring.result import Result, tabulate
-from rebar_depth_bench.scoring.view_score import ViewScore
-from rebar_depth_bench.submission.metadata import Declaration
+from rebar_depth_bench.scoring.reference import Errors, Reference
+from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareIdentity, SubmissionIdentity
+from rebar_depth_bench.scoring.score import tabulate
+from rebar_depth_bench.scoring.table import PublishedMatch, ViewScore
+from rebar_depth_bench.submission.declaration import Declaration
 
 DECLARED = Declaration("rgb+K", uses_ground_truth=False)
-REFERENCE = Reference(0.0571, 2.21, 0.0062, 0.71)
+REFERENCE = Reference(Errors(0.0571, 2.21), Errors(0.0062, 0.71))
 
 HOSTILE = '=<script src="//evil.example/x.js">alert(1)</script>[red]\x1b[31m\u202e&amp;'
 
@@ -68,14 +68,11 @@ def result(
         for name in configs
     }
     return Result(
-        method=method,
-        submission_sha256="0123456789abcdef" * 4,
-        dataset_digest="sha256:" + "fedcba9876543210" * 4,
-        dataset_version="1.2.3",
-        software_version="0.1.0",
+        dataset=DatasetIdentity("sha256:" + "fedcba9876543210" * 4, "1.2.3"),
+        submission=SubmissionIdentity(method, "0123456789abcdef" * 4, declared.inputs, declared.uses_ground_truth),
+        software=SoftwareIdentity("0.1.0"),
         tables=tables,
-        views=views,
-        declared=declared,
+        views=list(views),
     )
 
 
@@ -87,3 +84,8 @@ def panels(view_id: str = "lattice/0000", score: ViewScore | None = None, factor
     truth[steel] = 0.5
     rgb = np.full((40, 60, 3), 128, np.uint8)
     return ViewPanels(view_id, rgb, truth, truth * np.float32(factor), steel, score or scored_view(view_id))
+
+
+def shown(view_id: str = "lattice/0000", score: ViewScore | None = None, factor: float = 1.6) -> ShownView:
+    """Return the encoded images of ``panels``."""
+    return shown_view(panels(view_id, score, factor))

@@ -12,7 +12,8 @@ from typing import Any
 
 from rebar_depth_bench.reporting.html.assets import inline_script
 from rebar_depth_bench.reporting.html.page import render_report
-from tests.bench.reporting.results import overflowed_view, panels, result, scored_view, unpredicted_view
+from tests.bench.reporting.results import overflowed_view, result, scored_view, unpredicted_view
+from tests.bench.reporting.results import shown as images_of
 
 _TABLE = """
 <table class="sortable"><thead>
@@ -70,7 +71,7 @@ def test_view_browser_navigates_by_button_key_and_thumbnail(chromium_program: st
         scored_view("lattice/0001", abs_rel=0.9),
         unpredicted_view("pile/0000"),
     ]
-    page = render_report(result(*views), [panels(view.view_id, view) for view in views])
+    page = render_report(result(*views), [images_of(view.view_id, view) for view in views])
     page = re.sub(r"<meta http-equiv=[^>]*>", "", page)  # The policy would block the test's own script.
     states = _run_in_browser(
         chromium_program,
@@ -107,7 +108,7 @@ def test_view_browser_navigates_by_button_key_and_thumbnail(chromium_program: st
 
 
 def test_content_security_policy_blocks_foreign_scripts(chromium_program: str, tmp_path: Path) -> None:
-    page = render_report(result(scored_view("lattice/0000"), overflowed_view("pier/0000")), [panels()])
+    page = render_report(result(scored_view("lattice/0000"), overflowed_view("pier/0000")), [images_of()])
     file = tmp_path / "page.html"
     file.write_text(
         page.replace("</body>", "<script>document.title = 'stranger'</script></body>"), encoding="utf-8"

@@ -12,16 +12,15 @@ import pytest
 from rich.console import Console
 
 import rebar_depth_bench as rdb
-from rebar_depth_bench.data.digests import file_sha256
+from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.extended.crossings.config import config_reaches
 from rebar_depth_bench.extended.evaluate import score_extended
 from rebar_depth_bench.extended.result import ExtendedResult
 from rebar_depth_bench.reporting.crossing_texts import reach_sentence
 from rebar_depth_bench.reporting.extended_tables import print_extended
-from rebar_depth_bench.reporting.html.crossing_picture import crossing_pictures, error_kind
-from rebar_depth_bench.reporting.html.page import write_report
-from rebar_depth_bench.scoring.evaluation import open_evaluation
-from rebar_depth_bench.scoring.score import score_evaluation
+from rebar_depth_bench.reporting.html.crossing_picture import error_kind
+from rebar_depth_bench.reporting.html.page import look_at_views, write_report
+from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
 from tests.bench.extended.cage_scenes import HEIGHT, WIDTH
 from tests.mat_dataset import CONFIG, VIEWS, write_mat_dataset
 
@@ -84,7 +83,7 @@ def test_report_shows_crossings_by_error(mat: tuple[Path, Depths], tmp_path: Pat
     with open_evaluation(archive, root) as evaluation:
         result = score_evaluation(evaluation)
         result = replace(result, extended=score_extended(result, evaluation))
-        picture = crossing_pictures(evaluation)[CONFIG]
+        picture = look_at_views(evaluation, {}, crossings=True).pictures[CONFIG]
         write_report(result, evaluation, tmp_path / "report.html")
     assert (picture.view_id, picture.width, picture.height) == (f"{CONFIG}/0000", WIDTH, HEIGHT)
     assert [(kind, count) for kind, _, count in picture.counts] == [("within5", 4)]

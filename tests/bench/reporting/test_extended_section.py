@@ -31,7 +31,8 @@ from rebar_depth_bench.reporting.html.page import render_report
 from rebar_depth_bench.scoring.bootstrap import resample
 from rebar_depth_bench.scoring.result import Result
 from tests.bench.reporting.pages import Page
-from tests.bench.reporting.results import HOSTILE, panels, result, scored_view
+from tests.bench.reporting.results import HOSTILE, result, scored_view
+from tests.bench.reporting.results import shown as images_of
 
 VIEWS = 8
 INDICES = [100 * index for index in range(VIEWS)]
@@ -245,7 +246,9 @@ def test_empty_measures_and_too_few_views() -> None:
 
 def test_page_nests_and_escapes_hostile_config_name() -> None:
     name = HOSTILE.replace("/", "")
-    page = Page(render_report(result_with_extended(make_extended("lattice", name), "lattice", name), [panels()]))
+    page = Page(
+        render_report(result_with_extended(make_extended("lattice", name), "lattice", name), [images_of()])
+    )
     assert len(page.attributes_of("script")) == 1
     assert "\x1b" not in page.text
     ids = [attributes["id"] for _, attributes in page.tags if "id" in attributes]

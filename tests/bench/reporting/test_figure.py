@@ -36,11 +36,10 @@ from rebar_depth_bench.reporting.figure import (
     write_figure,
 )
 from rebar_depth_bench.reporting.published import published_rows
-from rebar_depth_bench.scoring.published_match import PublishedMatch
 from rebar_depth_bench.scoring.reference import NO_REFERENCE
 from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.scoring.view_score import ViewScore
-from rebar_depth_bench.submission.metadata import Declaration
+from rebar_depth_bench.scoring.table import PublishedMatch, ViewScore
+from rebar_depth_bench.submission.declaration import Declaration
 from tests.bench.reporting.results import (
     HOSTILE,
     REFERENCE,
@@ -106,8 +105,8 @@ def test_points_and_references_have_their_errors() -> None:
     assert points(axes) == {**published, "near": (0.04, 0.03)}
     assert points(axes, hollow=True) == {"far": (0.8, 0.05)}
     across, up = references(axes)
-    assert across == [REFERENCE.constant_abs_rel, pytest.approx(0.0529)]
-    assert up == [REFERENCE.one_pixel_abs_rel]
+    assert across == [REFERENCE.constant.abs_rel, pytest.approx(0.0529)]
+    assert up == [REFERENCE.one_pixel.abs_rel]
     names = legend(figure)
     assert names[:2] == ["near", "far"]
     assert names[2:8] == [f"paper: {row.method}" for row in rows]

@@ -13,13 +13,14 @@ from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.html.page import render_report
 from rebar_depth_bench.reporting.latex import latex_table
 from rebar_depth_bench.reporting.tables import groups_csv, print_table
-from rebar_depth_bench.scoring.reference import Reference
-from rebar_depth_bench.scoring.result import Result, tabulate
+from rebar_depth_bench.scoring.reference import Errors, Reference
+from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.scoring.score import tabulate
 from tests.bench.reporting.pages import Page
 from tests.bench.reporting.results import HOSTILE, REFERENCE, result, scored_view, unpredicted_view
 
 SCENES = 8
-NEAR = Reference(0.2222, 7.89, 0.0333, 4.56)
+NEAR = Reference(Errors(0.2222, 7.89), Errors(0.0333, 4.56))
 
 
 def split_result(group: str = "wall", grouping: str = "family", scenes: int = SCENES) -> Result:

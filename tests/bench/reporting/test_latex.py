@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.reporting.latex import escape_latex, latex_table
-from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.submission.metadata import NOT_DECLARED, Declaration
+from rebar_depth_bench.scoring.result import DatasetIdentity, Result
+from rebar_depth_bench.submission.declaration import NOT_DECLARED, Declaration
 from tests.bench.reporting.results import HOSTILE, overflowed_view, result, scored_view, unpredicted_view
 
 _COMMANDS = {
@@ -114,7 +114,10 @@ def test_declarations_are_marked() -> None:
 
 
 def test_published_rows_are_verbatim_and_never_bold() -> None:
-    results = [dataclasses.replace(entry, method=name) for entry, name in zip(_two_results(), "ab", strict=True)]
+    results = [
+        dataclasses.replace(entry, submission=dataclasses.replace(entry.submission, method=name))
+        for entry, name in zip(_two_results(), "ab", strict=True)
+    ]
     table = _check_latex(latex_table(results, published=True))
     own, _, paper = table.partition(r"\emph{Published, measured on the authors' renders")
     assert r"Depth Pro &  & 91.19 & 3.145 & 0.029 & 0.25 &  & 1151 & 0.901 & 0.179 & 12.17 \\" in paper
@@ -214,7 +217,7 @@ def test_overflowed_values_are_dashes() -> None:
 
 def test_mixed_datasets_and_no_results_raise() -> None:
     first, second = _two_results()
-    other = dataclasses.replace(second, dataset_digest="sha256:" + "0" * 64)
+    other = dataclasses.replace(second, dataset=DatasetIdentity("sha256:" + "0" * 64, "1"))
     with pytest.raises(InputError, match=r"results of 2 datasets \(sha256:000000000000, sha256:fedc"):
         latex_table([first, other], published=False)
     with pytest.raises(InputError, match=r"results of 0 datasets \(no result\), expected one"):

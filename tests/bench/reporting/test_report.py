@@ -17,17 +17,19 @@ from rebar_depth_bench.reporting.charts.axes import LogAxis, decade_axis, log_ax
 from rebar_depth_bench.reporting.charts.score_charts import alignment_chart, scale_chart, views_chart
 from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS
 from rebar_depth_bench.reporting.html.page import WORST_SHOWN, render_report
-from rebar_depth_bench.reporting.html.view_images import (
+from rebar_depth_bench.reporting.html.views import (
     ViewPanels,
     depth_image,
     depth_range,
     error_image,
     error_limit_cm,
+    shown_view,
     signed_error,
     view_images,
 )
 from tests.bench.reporting.pages import Page
 from tests.bench.reporting.results import HOSTILE, overflowed_view, panels, result, scored_view, unpredicted_view
+from tests.bench.reporting.results import shown as images_of
 
 
 def _decode(webp: bytes) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
@@ -35,7 +37,7 @@ def _decode(webp: bytes) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
 
 
 def test_page_shows_numbers_provenance_and_alignment() -> None:
-    page = Page(render_report(result(scored_view("lattice/0000"), unpredicted_view("pile/0000")), [panels()]))
+    page = Page(render_report(result(scored_view("lattice/0000"), unpredicted_view("pile/0000")), [images_of()]))
     for stated in (
         *("0.7500", "20.09", "18.71", "0.123", "0.0613", "1.52", "1.17", "0.988", "0.625"),
         *("1.2", "4.6", "7.9", "13.6"),
@@ -49,10 +51,10 @@ def test_page_shows_numbers_provenance_and_alignment() -> None:
 
 def test_hostile_names_are_escaped() -> None:
     hostile = result(scored_view("<b>x/0000"), method=HOSTILE)
-    rendered = render_report(hostile, [panels("<b>x/0000")])
+    rendered = render_report(hostile, [images_of("<b>x/0000")])
     page = Page(rendered)
     assert len(page.attributes_of("script")) == 1, "the page's own"
-    benign = Page(render_report(result(scored_view("beam/0000")), [panels("beam/0000")]))
+    benign = Page(render_report(result(scored_view("beam/0000")), [images_of("beam/0000")]))
     assert len(page.attributes_of("b")) == len(benign.attributes_of("b"))
     assert "<b>x" not in rendered
     assert '=<script src="//evil.example/x.js">alert(1)</script>[red]' in page.text
@@ -61,7 +63,7 @@ def test_hostile_names_are_escaped() -> None:
 
 
 def test_page_is_self_contained_with_one_hashed_script() -> None:
-    rendered = render_report(result(scored_view("lattice/0000")), [panels()])
+    rendered = render_report(result(scored_view("lattice/0000")), [images_of()])
     page = Page(rendered)
     assert not re.search(
         r"https?://|<link|<iframe|@import|url\(|javascript:|fetch|import\(|XMLHttp|innerHTML", rendered
@@ -81,7 +83,7 @@ def test_page_is_self_contained_with_one_hashed_script() -> None:
 
 def test_page_is_complete_without_script() -> None:
     views = [scored_view(f"lattice/{index:04d}", abs_rel=0.1 * (index + 1)) for index in range(3)]
-    page = Page(render_report(result(*views), [panels(view.view_id, view) for view in views]))
+    page = Page(render_report(result(*views), [images_of(view.view_id, view) for view in views]))
     assert len(page.attributes_of("article")) == 3
     assert [tags for tags in page.attributes_of("div") if tags.get("class") == "controls"] == [
         {"class": "controls", "hidden": None}
@@ -92,7 +94,7 @@ def test_page_is_complete_without_script() -> None:
 
 
 def test_page_is_well_formed_with_alternative_texts() -> None:
-    page = Page(render_report(result(scored_view("lattice/0000"), scored_view("pile/0000")), [panels()]))
+    page = Page(render_report(result(scored_view("lattice/0000"), scored_view("pile/0000")), [images_of()]))
     assert len(page.attributes_of("h1")) == 1
     assert page.attributes_of("html") == [{"lang": "en"}]
     assert len(page.attributes_of("svg")) == len(page.attributes_of("desc")) == 6
@@ -105,7 +107,7 @@ def test_page_is_well_formed_with_alternative_texts() -> None:
 
 def test_rendering_is_deterministic() -> None:
     shown = result(scored_view("lattice/0000"), unpredicted_view("pile/0000"))
-    assert render_report(shown, [panels()]) == render_report(shown, [panels()])
+    assert render_report(shown, [images_of()]) == render_report(shown, [images_of()])
 
 
 def test_no_view_section_without_panels() -> None:
@@ -131,7 +133,7 @@ def test_overflow_and_zero_errors_render() -> None:
     perfect = dataclasses.replace(scored_view("lattice/0000"), native=None, scaled=None, scale=None)
     exact = scored_view("lattice/0001", abs_rel=0.0, scale=1.0)
     shown = result(overflowed_view("pier/0000"), perfect, exact)
-    text = Page(render_report(shown, [panels(factor=1e30), panels(factor=math.nan)])).text
+    text = Page(render_report(shown, [images_of(factor=1e30), images_of(factor=math.nan)])).text
     assert "not compared with those of others: a number overflowed." in text
     assert "no prediction on scored pixels" in text
     assert "off the scale" in text
@@ -169,7 +171,7 @@ def test_view_without_colour_has_other_panels() -> None:
     assert (images.width, images.truth) == (with_colour.width, with_colour.truth)
     image = error_image(signed_error(view, 1.0), view.steel, None, 1.0)
     assert (image[5, 25].tolist(), image[5, 5].tolist()) == (ERROR_COLOURS[254].tolist(), [0, 0, 0])
-    text = render_report(result(scored_view("lattice/0000")), [view])
+    text = render_report(result(scored_view("lattice/0000")), [shown_view(view)])
     assert "<strong>Colour</strong>" not in text
     assert "<strong>Native error</strong>" in text
 

@@ -12,7 +12,9 @@ from rich.console import Console
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.tables import print_table, result_csv
-from rebar_depth_bench.scoring.result import Result, tabulate
+from rebar_depth_bench.scoring.columns import DASH, coverage_percent, number
+from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.scoring.score import tabulate
 from tests.bench.reporting.results import HOSTILE, overflowed_view, result, scored_view, unpredicted_view
 
 
@@ -105,7 +107,7 @@ def test_config_without_prediction_is_all_dashes() -> None:
 
 
 def test_no_footnote_without_dash() -> None:
-    assert formatting.DASH not in _print_to_text(result(scored_view("lattice/0000")), 160)
+    assert DASH not in _print_to_text(result(scored_view("lattice/0000")), 160)
 
 
 def test_output_has_no_control_characters() -> None:
@@ -118,18 +120,18 @@ def test_output_has_no_control_characters() -> None:
 
 
 def test_coverage_percent_is_rounded_down() -> None:
-    assert formatting.coverage_percent(0.94999) == "94.9"
-    assert formatting.coverage_percent(0.99999) == "99.9"
-    assert formatting.coverage_percent(0.283) == "28.3"
-    assert formatting.coverage_percent(1.0) == "100.0"
+    assert coverage_percent(0.94999) == "94.9"
+    assert coverage_percent(0.99999) == "99.9"
+    assert coverage_percent(0.283) == "28.3"
+    assert coverage_percent(1.0) == "100.0"
 
 
 def test_extreme_numbers_use_scientific_notation() -> None:
-    assert formatting.number(0.00004, 4) == "4.0e-05"
-    assert formatting.number(0.00005, 4) == "0.0001"
-    assert formatting.number(0.0, 4) == "0.0000"
-    assert formatting.number(2e6, 2) == "2.0e+06"
-    assert formatting.number(float("nan"), 2) == formatting.DASH
+    assert number(0.00004, 4) == "4.0e-05"
+    assert number(0.00005, 4) == "0.0001"
+    assert number(0.0, 4) == "0.0000"
+    assert number(2e6, 2) == "2.0e+06"
+    assert number(float("nan"), 2) == DASH
 
 
 def test_no_views_is_an_unranked_reason() -> None:

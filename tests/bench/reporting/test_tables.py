@@ -17,11 +17,20 @@ from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.charts.scatter import ScatterPoint, place_labels, scatter_chart
 from rebar_depth_bench.reporting.charts.score_charts import alignment_chart
 from rebar_depth_bench.reporting.html.page import render_report
-from rebar_depth_bench.reporting.html.published import paper_scenes
 from rebar_depth_bench.reporting.html.rows import table_row, view_row
-from rebar_depth_bench.reporting.html.view_browser import views_to_show
+from rebar_depth_bench.reporting.html.views import views_to_show
+from rebar_depth_bench.reporting.published import paper_scenes
+from rebar_depth_bench.scoring.columns import COVERAGE, RANK_ERROR
+from rebar_depth_bench.scoring.reference import Errors
 from rebar_depth_bench.scoring.result import Result
-from tests.bench.reporting.results import HOSTILE, overflowed_view, result, scored_view, unpredicted_view
+from tests.bench.reporting.results import (
+    HOSTILE,
+    REFERENCE,
+    overflowed_view,
+    result,
+    scored_view,
+    unpredicted_view,
+)
 
 
 def _with_intervals(shown: Result, **intervals: tuple[float, float] | None) -> Result:
@@ -44,16 +53,15 @@ def test_constants_of_results_on_other_pixels_are_named() -> None:
     assert formatting.scaled_constants(rows[1:3]) == {"constant": (0.0529, 2.05)}
     titles = [title for title, _, _ in formatting.reference_rows(rows)]
     assert titles == [*formatting.scaled_constants(rows), "one pixel"]
-    assert (
-        formatting.reference_rows([("x", dataclasses.replace(rows[0][1], scaled_constant=(None, None)))])[0][0]
-        == "one pixel"
-    )
+    without = dataclasses.replace(rows[0][1], reference=REFERENCE)
+    assert formatting.reference_rows([("x", without)])[0][0] == "one pixel"
 
 
 def test_scaled_error_is_compared_with_the_constant_on_the_same_pixels() -> None:
     table = result(scored_view("lattice/0000", coverage=0.9)).tables["lattice"]
     assert any("above that of a constant (0.0529)" in finding for finding in formatting.reference_findings(table))
-    between = dataclasses.replace(table, scaled_constant=(0.07, 2.6))
+    reference = dataclasses.replace(REFERENCE, scaled_constant=Errors(0.07, 2.6))
+    between = dataclasses.replace(table, reference=reference)
     assert not any("constant" in finding for finding in formatting.reference_findings(between))
 
 
@@ -90,9 +98,9 @@ def test_intervals_use_decimals_of_their_numbers() -> None:
 
 
 def test_overflowed_intervals_are_omitted() -> None:
-    assert formatting.interval_cell((0.1, math.inf), 4) == ""
-    assert formatting.interval_cell((math.nan, 1.0), 4) == ""
-    assert formatting.coverage_interval_cell(None) == ""
+    assert RANK_ERROR.interval_text((0.1, math.inf)) == ""
+    assert RANK_ERROR.interval_text((math.nan, 1.0)) == ""
+    assert COVERAGE.interval_text(None) == ""
 
 
 def test_charts_draw_intervals_as_bars() -> None:

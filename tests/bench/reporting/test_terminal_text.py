@@ -15,7 +15,7 @@ from rebar_depth_bench.reporting.comparison_tables import print_comparison, prin
 from rebar_depth_bench.reporting.table_page import PageTable, TablePage, print_page
 from rebar_depth_bench.reporting.tables import print_table
 from rebar_depth_bench.scoring.comparison import compare
-from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareIdentity
 from tests.bench.reporting.results import result, scored_view
 
 NAME = "[link=x]a[/link]\x1b[2J\x9b2J\u202e\x07[/]"
@@ -25,7 +25,12 @@ MARKUP = "[link=x]a[/link]"
 def hostile_result() -> Result:
     config = NAME.replace("/", "|")
     shown = result(scored_view(f"{config}/0000"), method=NAME)
-    return replace(shown, dataset_version=NAME, dataset_digest=NAME, submission_sha256=NAME, software_version=NAME)
+    return replace(
+        shown,
+        dataset=DatasetIdentity(NAME, NAME),
+        submission=replace(shown.submission, sha256=NAME),
+        software=SoftwareIdentity(NAME),
+    )
 
 
 def page() -> TablePage:

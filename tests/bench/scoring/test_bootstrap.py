@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rebar_depth_bench.names import view_id
 from rebar_depth_bench.scoring.bootstrap import (
     MIN_BLOCKS,
     RESAMPLES,
@@ -17,11 +18,11 @@ from rebar_depth_bench.scoring.bootstrap import (
     block_length,
     half_width,
     interval,
+    protocol_indices,
     resample,
     resample_scenes,
+    resample_views,
 )
-from rebar_depth_bench.scoring.view_score import protocol_indices, resample_views
-from rebar_depth_bench.view_ids import view_id
 
 
 def mean_interval(values: np.ndarray, indices: range) -> tuple[float, float] | None:

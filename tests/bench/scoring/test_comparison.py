@@ -16,11 +16,13 @@ from rich.console import Console
 
 from rebar_depth_bench import InputError, score
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.reporting.comparison_tables import NUMBER_TITLES, comparison_csv, print_comparison
+from rebar_depth_bench.reporting.comparison_tables import comparison_csv, print_comparison
+from rebar_depth_bench.scoring.columns import COLUMN_BY_PATH, VIEW_COLUMNS
 from rebar_depth_bench.scoring.comparison import Difference, compare
 from rebar_depth_bench.scoring.metrics import DepthMetrics
-from rebar_depth_bench.scoring.result import Result, tabulate
-from rebar_depth_bench.scoring.view_score import VIEW_METRICS, ViewScore
+from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareIdentity, SubmissionIdentity
+from rebar_depth_bench.scoring.score import tabulate
+from rebar_depth_bench.scoring.table import ViewScore
 
 
 def result_of(errors: np.ndarray, method: str = "m", config: str = "lattice", digest: str = "sha256:1") -> Result:
@@ -34,12 +36,18 @@ def result_of(errors: np.ndarray, method: str = "m", config: str = "lattice", di
         views.append(
             ViewScore(f"{config}/{step * n:04}", 100, covered, rank_error, scale, metrics, metrics, within)
         )
-    return Result(method, "ab" * 32, digest, "1", "2", {config: tabulate(views)}, views)
+    return Result(
+        dataset=DatasetIdentity(digest, "1"),
+        submission=SubmissionIdentity(method, "ab" * 32),
+        software=SoftwareIdentity("2"),
+        tables={config: tabulate(views)},
+        views=views,
+    )
 
 
 def difference(first: Result, other: Result, name: str = "native.abs_rel") -> Difference:
     [rows] = compare(first, other).configs.values()
-    return next(row for row in rows if row.name == name)
+    return next(row for row in rows if row.column.path == name)
 
 
 @pytest.mark.slow
@@ -78,7 +86,7 @@ def test_equal_quality_is_rarely_decided() -> None:
 def test_submission_equals_itself() -> None:
     same = result_of(np.linspace(0.1, 0.9, 20))
     for rows in compare(same, same).configs.values():
-        assert [row.name for row in rows] == list(VIEW_METRICS)
+        assert [row.column for row in rows] == list(VIEW_COLUMNS)
         assert all(row.difference == 0 and row.interval == (0, 0) for row in rows)
         assert {row.verdict for row in rows} == {"equal", ""}
 
@@ -130,10 +138,10 @@ def test_table_is_80_columns_and_names_every_number() -> None:
     print_comparison(comparison, console)
     text = console.export_text()
     assert "B: =B, against A: A [red]" in text
-    assert all(title in text for title, _, _ in NUMBER_TITLES.values())
+    assert all(column.heading in text for column in VIEW_COLUMNS)
     assert max(map(len, text.splitlines())) <= 80
     rows = list(csv.DictReader(io.StringIO(comparison_csv([comparison]))))
-    assert [row["number"] for row in rows] == list(VIEW_METRICS)
+    assert [row["number"] for row in rows] == list(COLUMN_BY_PATH)
     assert rows[0]["other_method"] == "'=B"
     assert float(rows[1]["low"]) <= float(rows[1]["difference"]) <= float(rows[1]["high"])
 
@@ -157,5 +165,5 @@ def test_compare_command_on_archives(
     assert by_name["native.abs_rel"]["verdict"] == "worse"
     assert by_name["scaled.abs_rel"]["other"] == pytest.approx(0, abs=1e-6)
     assert {row["difference"] for row in to_exact["configs"]["lattice"]} == {0}
-    assert to_far["dataset"]["digest"] == score(exact, tiny_root).dataset_digest
+    assert to_far["dataset"]["digest"] == score(exact, tiny_root).dataset.digest
     assert "worse" in capsys.readouterr().out

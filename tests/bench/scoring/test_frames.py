@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 import shutil
 from pathlib import Path
@@ -15,15 +16,15 @@ import pytest
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.data.bars import read_bars, write_bars
-from rebar_depth_bench.data.digests import file_sha256
+from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.extended.result import ExtendedResult
 from rebar_depth_bench.reporting.comparison_tables import comparison_csv
 from rebar_depth_bench.reporting.extended_tables import extended_csv
 from rebar_depth_bench.reporting.tables import frame_csv, result_csv
+from rebar_depth_bench.scoring.columns import TABLE_COLUMNS, VIEW_COLUMNS
 from rebar_depth_bench.scoring.comparison import compare
-from rebar_depth_bench.scoring.frames import TABLE_COLUMNS, make_frame, table_values, tables_frame, views_frame
-from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.scoring.view_score import VIEW_METRICS
+from rebar_depth_bench.scoring.frames import frame_of_values
+from rebar_depth_bench.scoring.result import Result, read_result
 from tests.bench.reporting.pages import Page
 from tests.bench.reporting.results import HOSTILE, result, scored_view, unpredicted_view
 
@@ -48,15 +49,15 @@ def test_tables_have_numbers_and_intervals_of_json(two_configs: Result) -> None:
     low, high = document["tables"]["lattice"]["ci95"]["native"]["abs_rel"]
     assert frame.loc["lattice", ["native_abs_rel_low", "native_abs_rel_high"]].tolist() == [low, high]
     assert math.isnan(frame.loc["pier", "native_abs_rel_low"]), "two views have no interval"
-    assert sum(name.endswith("_low") for name in frame) == len(VIEW_METRICS)
+    assert sum(name.endswith("_low") for name in frame) == len(VIEW_COLUMNS)
 
 
 def test_numbers_of_tables_of_earlier_versions_stay_in_their_columns(two_configs: Result) -> None:
     table = two_configs.to_dict()["tables"]["lattice"]
     earlier = {**table, "reference": {"constant": table["reference"]["constant"]}}
-    numbers = dict(zip(TABLE_COLUMNS, table_values(earlier), strict=True))
+    numbers = {column.name: column.value(earlier) for column in TABLE_COLUMNS}
     assert (numbers["constant_abs_rel"], numbers["scaled_constant_abs_rel"]) == (0.0571, None)
-    assert dict(zip(TABLE_COLUMNS, table_values(table), strict=True))["scaled_constant_abs_rel"] == 0.0571
+    assert {column.name: column.value(table) for column in TABLE_COLUMNS}["scaled_constant_abs_rel"] == 0.0571
 
 
 def test_views_have_one_row_each(two_configs: Result) -> None:
@@ -75,20 +76,20 @@ def test_unknown_or_missing_rows_raise_value_error(two_configs: Result) -> None:
 def test_comparison_has_one_row_per_metric(two_configs: Result) -> None:
     comparison = compare(two_configs, two_configs)
     frame = comparison.to_pandas()
-    assert frame["number"].tolist() == [*VIEW_METRICS, *VIEW_METRICS]
+    assert frame["number"].tolist() == 2 * [column.path for column in VIEW_COLUMNS]
     assert set(frame["verdict"]) <= {"equal", "no verdict", "undecided", ""}
 
 
 def test_integers_with_missing_values_stay_integers() -> None:
-    frame = make_frame([{"count": 3, "text": "a"}, {"count": None, "text": None}])
+    frame = frame_of_values(("count", "text"), [(3, "a"), (None, None)])
     assert isinstance(frame["count"].dtype, pd.Int64Dtype)
     assert frame_csv(frame) == "count,text\n3,a\n,\n"
-    assert frame_csv(make_frame([])) == ""
+    assert frame_csv(frame_of_values((), [])) == ""
 
 
 def test_csv_without_rows_has_the_header(two_configs: Result) -> None:
     extended = ExtendedResult(measures={}, tables={}, views=())
-    empty = dataclasses.replace(two_configs, tables={}, views=(), extended=extended)
+    empty = dataclasses.replace(two_configs, tables={}, views=[], extended=extended)
     assert result_csv(empty) == result_csv(two_configs).splitlines(keepends=True)[0]
     compared = comparison_csv([compare(two_configs, two_configs)])
     assert comparison_csv([]) == compared.splitlines(keepends=True)[0]
@@ -117,10 +118,9 @@ def test_bars_of_a_dataset_folder(tiny_root: Path, tmp_path: Path) -> None:
 
 
 def test_columns_do_not_depend_on_the_order_of_a_document(two_configs: Result) -> None:
-    document = two_configs.to_dict()
-    tables = tables_frame([_reversed(document)]).iloc[::-1]
-    assert tables.to_csv(index=False) == tables_frame([document]).to_csv(index=False)
-    assert views_frame(_reversed(document)).to_csv() == views_frame(document).to_csv()
+    turned = read_result(json.dumps(_reversed(two_configs.to_dict())).encode(), "x")
+    assert turned.to_pandas().iloc[::-1].to_csv(index=False) == two_configs.to_pandas().to_csv(index=False)
+    assert turned.to_pandas("views").to_csv() == two_configs.to_pandas("views").to_csv()
 
 
 def _reversed(value: Any) -> Any:

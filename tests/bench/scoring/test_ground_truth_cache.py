@@ -18,12 +18,12 @@ from rebar_depth_bench.bar_crossings.table import write_crossings
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.bars import read_bars, write_bars
 from rebar_depth_bench.data.codecs import decode, encode_depth
-from rebar_depth_bench.data.digests import file_sha256
-from rebar_depth_bench.data.eye_view import EyeTruth
+from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.data.rows import EyeTruth
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
-from rebar_depth_bench.progress import silent
-from rebar_depth_bench.scoring.ground_truth import config_truth, verified_views
+from rebar_depth_bench.parallel import silent
+from rebar_depth_bench.scoring.truth import config_truth, verified_views
 from tests.commands import run_in_process
 from tests.damage import change_manifest
 from tests.ground_truth import truth_of

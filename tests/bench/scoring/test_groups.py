@@ -17,11 +17,10 @@ from scipy.ndimage import binary_erosion
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars, write_bars
-from rebar_depth_bench.data.digests import file_sha256
+from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.scoring.bootstrap import end_percents, resample_scenes
 from rebar_depth_bench.scoring.comparison import compare
-from rebar_depth_bench.scoring.disclosure import disclosed_json
 from rebar_depth_bench.scoring.groups import (
     DISTANCE_EDGES_M,
     GROUPINGS,
@@ -31,8 +30,8 @@ from rebar_depth_bench.scoring.groups import (
     bin_names,
     positions_by_group,
 )
-from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.scoring.result_io import read_result, read_table
+from rebar_depth_bench.scoring.result import Result, disclosed_json, read_result
+from rebar_depth_bench.scoring.table import read_table
 from tests.damage import change_manifest
 from tests.ground_truth import truth_of
 from tests.synthetic_dataset import write_archive, write_dataset, write_split_dataset
@@ -261,7 +260,7 @@ def test_groups_are_not_disclosed(scored: Result) -> None:
 
 def test_comparison_resamples_scenes(root: Path, archive: Path, tmp_path: Path, scored: Result) -> None:
     other = rdb.score(write_noisy(root, tmp_path / "b.zip", "other", 1.05), root)
-    [row] = [row for row in compare(scored, other).configs["cages"] if row.name == "rank_error"]
+    [row] = [row for row in compare(scored, other).configs["cages"] if row.column.path == "rank_error"]
     change = [b.rank_error - a.rank_error for a, b in zip(scored.views, other.views, strict=True)]
     by_scene = np.reshape(change, (len(SCENES), VIEWS))
     counts = resample_scenes(list(SCENES)).counts

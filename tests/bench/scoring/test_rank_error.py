@@ -12,12 +12,10 @@ from hypothesis import strategies as st
 from numpy import ndarray
 
 from rebar_depth_bench import score
-from rebar_depth_bench.scoring.ground_truth import ViewTruth
+from rebar_depth_bench.scoring.columns import rounded
 from rebar_depth_bench.scoring.metrics import is_valid_prediction, rank_error
-from rebar_depth_bench.scoring.result import tabulate
-from rebar_depth_bench.scoring.rounding import rounded
-from rebar_depth_bench.scoring.score import score_view
-from rebar_depth_bench.scoring.view_score import ViewScore
+from rebar_depth_bench.scoring.score import ViewTruth, score_view, tabulate
+from rebar_depth_bench.scoring.table import ViewScore
 
 INVALID = (np.nan, 0.0, -0.0, -1.0, np.inf, -np.inf)
 

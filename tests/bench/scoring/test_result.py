@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 
 from rebar_depth_bench.scoring.metrics import DepthMetrics
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
-from rebar_depth_bench.scoring.result import Result, tabulate
-from rebar_depth_bench.scoring.view_score import ViewScore
+from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareIdentity, SubmissionIdentity
+from rebar_depth_bench.scoring.score import tabulate
+from rebar_depth_bench.scoring.table import ViewScore
 from rebar_depth_bench.submission import Declaration
 
 
@@ -32,7 +33,13 @@ def view(number: int, value: float | None, coverage: float = 1.0, scale: float =
 
 
 def result_of(*views: ViewScore) -> Result:
-    return Result("m", "00", "sha256:11", "1", "2", {"lattice": tabulate(views)}, views)
+    return Result(
+        dataset=DatasetIdentity("sha256:11", "1"),
+        submission=SubmissionIdentity("m", "00"),
+        software=SoftwareIdentity("2"),
+        tables={"lattice": tabulate(views)},
+        views=list(views),
+    )
 
 
 def test_table_has_mean_metrics_and_median_scale() -> None:

@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 
 from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.scoring.result_io import read_result, read_table
+from rebar_depth_bench.scoring.result import read_result
+from rebar_depth_bench.scoring.table import read_table
 from tests.bench.reporting.results import overflowed_view, result, scored_view, unpredicted_view
 
 VIEWS = [scored_view("lattice/0000"), unpredicted_view("lattice/0001"), overflowed_view("pile/0000")]

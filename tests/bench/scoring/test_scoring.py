@@ -21,11 +21,10 @@ from hypothesis import strategies as st
 from rebar_depth_bench import DatasetError, SubmissionError, score
 from rebar_depth_bench.data.codecs import decode, encode_depth, encode_mask
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.scoring.ground_truth import ViewTruth
+from rebar_depth_bench.scoring.columns import rounded
 from rebar_depth_bench.scoring.protocol import interior
-from rebar_depth_bench.scoring.result import Table, tabulate
-from rebar_depth_bench.scoring.rounding import rounded
-from rebar_depth_bench.scoring.score import score_view
+from rebar_depth_bench.scoring.score import ViewTruth, score_view, tabulate
+from rebar_depth_bench.scoring.table import Table
 from tests.damage import change_manifest
 from tests.ground_truth import truth_of
 

@@ -17,12 +17,11 @@ import rebar_depth_bench as rdb
 from rebar_depth_bench.extended.full_mask import REGION_NUMBERS, full_mask_samples
 from rebar_depth_bench.extended.profiles import DISTANCE_EDGES_M, MIN_PIXELS, profile_samples
 from rebar_depth_bench.extended.single_bar import single_bar_samples
-from rebar_depth_bench.scoring.evaluation import open_evaluation
-from rebar_depth_bench.scoring.ground_truth import config_truth
-from rebar_depth_bench.scoring.metrics import METRIC_NAMES
+from rebar_depth_bench.scoring.columns import METRICS
+from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
 from rebar_depth_bench.scoring.protocol import interior, scored_pixels, single_bar_pixels
-from rebar_depth_bench.scoring.score import score_evaluation
 from rebar_depth_bench.scoring.single_bar import SingleBarScore, mean_single_bar, single_bar_scores
+from rebar_depth_bench.scoring.truth import config_truth
 from tests.bench.extended.thin_scenes import random_images, random_prediction, random_truth, steel_truth
 from tests.ground_truth import truth_of
 
@@ -210,6 +209,6 @@ def test_scores_of_a_config_are_those_of_its_pixels(
         assert [score.native.abs_rel, score.scaled.abs_rel] == pytest.approx(errors, rel=1e-9)
     means = mean_single_bar(scores)
     assert means.share == pytest.approx(np.mean([score.share for score in scores]))
-    for name in METRIC_NAMES:
+    for name in METRICS:
         values = [getattr(score.scaled, name) for score in scores if score.scaled]
         assert getattr(means.scaled, name) == pytest.approx(np.mean(values))

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 from PIL import Image
 
-from rebar_depth_bench.submission.formats import FORMATS
+from rebar_depth_bench.submission.entries import FORMATS
 from tests.bench.submission import zips
 from tests.bench.submission.conftest import Check
 from tests.bench.submission.zips import DEPTH, SHAPE, Array, chunk, npy, npy_header, npz, png, with_view

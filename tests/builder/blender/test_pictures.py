@@ -10,9 +10,9 @@ import pytest
 from dataset_builder.audit.checks import AuditedConfig, AuditedView, Check, RayCache, view_from_row
 from dataset_builder.catalog.named_configs import CONFIGS
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars
-from rebar_depth_bench.data.columns import COLUMNS
-from rebar_depth_bench.data.dataset import iterate_rows
 from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.data.rows import iterate_rows
+from rebar_depth_bench.data.schema import COLUMNS
 from tests.builder.audit.audit_scene import with_K_shift
 from tests.builder.blender.markers import detect_view_markers, marker_verdict
 from tests.builder.blender.photometric import photometric_fit, photometric_verdict

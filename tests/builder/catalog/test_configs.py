@@ -27,7 +27,7 @@ from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import ideal_K
-from rebar_depth_bench.scoring.score import score
+from rebar_depth_bench.scoring.evaluation import score
 from tests.building import TINY, RunBuild
 from tests.requirements import Repetitions
 

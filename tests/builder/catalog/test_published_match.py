@@ -12,10 +12,11 @@ from dataset_builder.cameras.trajectories import view_count
 from dataset_builder.catalog.named_configs import CONFIGS
 from dataset_builder.pipeline.plan import config_parameters
 from dataset_builder.specs.config_specs import ConfigSpec
-from rebar_depth_bench.data.config_tables import ViewRecord
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.digests import views_digest
-from rebar_depth_bench.scoring.published_match import PublishedMatch, published_match
+from rebar_depth_bench.data.files import views_digest
+from rebar_depth_bench.data.manifest import DatasetConfig
+from rebar_depth_bench.data.schema import ViewRecord
+from rebar_depth_bench.scoring.table import PublishedMatch
+from rebar_depth_bench.scoring.truth import published_match
 
 
 def config_of_spec(spec: ConfigSpec, views: int | None = None) -> DatasetConfig:

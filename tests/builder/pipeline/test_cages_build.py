@@ -26,7 +26,7 @@ from dataset_builder.specs.config_specs import ColourSpec, GeneratedCageSpec, Sc
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, open_folder
 from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.scoring.ground_truth import reference_errors
+from rebar_depth_bench.scoring.truth import reference_errors
 from tests.building import RunBuild, StartBuild, contents, staged_rows
 from tests.dask_cluster import NewCluster
 from tests.processes import wait_until

@@ -14,8 +14,7 @@ from rebar_depth_bench.data.bars import BARS_FILE, read_bars
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.extended.evaluate import score_extended
 from rebar_depth_bench.extended.inspection.as_built import MEASURES
-from rebar_depth_bench.scoring.evaluation import open_evaluation
-from rebar_depth_bench.scoring.score import score_evaluation
+from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
 from tests.building import RunBuild
 from tests.commands import run_in_process
 from tests.ground_truth import truth_of
@@ -57,7 +56,7 @@ def test_exact_depth_is_perfect_in_every_group(root: Path, tmp_path: Path, split
             assert group.native is not None
             assert (group.native.abs_rel, group.native.delta1) == (0.0, 1.0)
             assert group.within_mm == dict.fromkeys(group.within_mm, 1.0)
-            assert 0 < (group.reference.one_pixel_abs_rel or 0) < 1
+            assert 0 < (group.reference.one_pixel.abs_rel or 0) < 1
 
 
 def test_reference_errors_of_the_manifest_are_those_of_the_table(root: Path, tmp_path: Path) -> None:

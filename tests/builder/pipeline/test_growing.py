@@ -23,7 +23,7 @@ from rebar_depth_bench.data.manifest import MANIFEST_FILE, open_folder
 from rebar_depth_bench.data.verification import file_problems
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.limits import JSON_BYTES, TABLE_BYTES
-from rebar_depth_bench.progress import silent
+from rebar_depth_bench.parallel import silent
 from tests.building import contents
 
 SIZE: dict[str, Any] = {"width": 32, "height": 18, "colour": None}

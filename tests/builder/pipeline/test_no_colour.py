@@ -19,9 +19,9 @@ from dataset_builder.export import export
 from dataset_builder.pipeline.contact_sheet import TILE_PX
 from dataset_builder.pipeline.plan import BUILD_FOLDER
 from rebar_depth_bench.cli.main import main as rebar_bench
-from rebar_depth_bench.data.columns import COLUMNS
-from rebar_depth_bench.data.dataset import ConfigViews
 from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.data.schema import COLUMNS
+from rebar_depth_bench.data.views import ConfigViews
 from rebar_depth_bench.errors import DatasetError
 from tests.building import TINY, TINY_VIEWS, TWO_BARS, RunBuild, contents
 from tests.commands import run_in_process
@@ -82,7 +82,7 @@ def test_rows_have_no_colour_and_equal_others(root: Path, tiny_root: Path, strea
 
 @pytest.mark.parametrize("streaming", [False, True])
 def test_batches_have_no_colour(root: Path, streaming: bool) -> None:
-    torch_loader = pytest.importorskip("rebar_depth_bench.data.torch_loader").torch_loader
+    torch_loader = pytest.importorskip("rebar_depth_bench.data.torch").torch_loader
     batch = next(iter(torch_loader(rdb.load(root, "lattice", streaming=streaming), batch_size=2, stereo=True)))
     assert not {"rgb", "right_rgb"} & set(batch)
     assert batch["depth"].shape == batch["right_depth"].shape == (2, 1, 90, 160)

@@ -13,7 +13,7 @@ from dataset_builder.audit import audit
 from dataset_builder.export import export
 from rebar_depth_bench.cli.main import main as rebar_bench
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.data.trajectory import Survey
+from rebar_depth_bench.data.schema import Survey
 from rebar_depth_bench.geometry.cameras import camera_centre
 from tests.builder.cameras.survey_cages import column, scene
 from tests.builder.catalog.scene_files import write_scene

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from dataset_builder.cli.main import main
-from rebar_depth_bench.data.digests import file_sha256
+from rebar_depth_bench.data.files import file_sha256
 from tests.commands import run_in_process
 from tests.hub_server import READ_TOKEN, TOKEN, folder_files
 from tests.synthetic_dataset import write_dataset

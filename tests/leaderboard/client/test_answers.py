@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from rebar_depth_bench.scoring.disclosure import disclosed_json
+from rebar_depth_bench.scoring.result import disclosed_json
 from tests.leaderboard.client.requests import ESCAPES, TOKEN_INFO, URL, check_refused, submission, submit
 from tests.leaderboard.client.scripted_server import ScriptedServer, answer
 

@@ -1,18 +1,16 @@
-"""Tables of a config's entry in the manifest: scenes, rig, views, references, and how data were imported."""
+"""Schema of a dataset: columns of its rows, and entries of its manifest on scenes, cameras, views and sources."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Annotated, Any
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Annotated, Any
 
+import pyarrow as pa
 from pydantic import ConfigDict, Field, Strict, StringConstraints, ValidationInfo, field_validator, model_validator
 
-from rebar_depth_bench.data.columns import OPTIONAL_COLUMNS
-from rebar_depth_bench.data.manifest_table import ManifestTable
-from rebar_depth_bench.data.trajectory import AnyTrajectory, trajectory_of
-from rebar_depth_bench.errors import escape_text
+from rebar_depth_bench.errors import DatasetError, escape_text
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
-from rebar_depth_bench.paths import NAME_LETTERS, NAME_PATTERN, PATH_PATTERN, VIEW_ID_PATTERN
+from rebar_depth_bench.names import NAME_LETTERS, NAME_PATTERN, PATH_PATTERN, SPLITS, VIEW_ID_PATTERN
 from rebar_depth_bench.validation import (
     Expected,
     StrictModel,
@@ -21,11 +19,191 @@ from rebar_depth_bench.validation import (
     field_error,
     number,
     one_of,
+    short_repr,
     text,
     three_numbers,
     whole_number,
 )
-from rebar_depth_bench.view_ids import SPLITS
+
+if TYPE_CHECKING:
+    from datasets import Features
+
+
+EYES = ("left", "right")
+COLUMNS = (
+    "view_id",
+    "scene",
+    *(f"{eye}_{kind}" for kind in ("rgb", "depth", "mask", "bars") for eye in EYES),
+    "left_preview",
+    *(f"{eye}_{kind}" for kind in ("K", "distortion", "cam_from_world") for eye in EYES),
+    "baseline_m",
+)
+"""Names of the columns, in order."""
+OPTIONAL_COLUMNS = (
+    *("left_rgb", "left_mask", "left_bars"),
+    *(name for name in COLUMNS if name.startswith("right_") or name == "baseline_m"),
+)
+"""Columns that may be null in every row of a config that was imported; K, distortion and pose are NaN then."""
+
+
+def features() -> Features:
+    """Return the ``datasets`` features of the shards' rows, in column order."""
+    from datasets import Features, Image  # Takes a second to import, which scoring does not need.
+
+    stored = Features.from_arrow_schema(ROW_SCHEMA)
+    return Features(
+        {name: Image() if ROW_SCHEMA.field(name).type == _IMAGE_CELL else stored[name] for name in COLUMNS}
+    )
+
+
+COLUMN_DESCRIPTIONS: dict[str, str] = {
+    "view_id": "`<config>/<0000>`: the view's index in its full protocol, also when a subset is built; "
+    "`<config>/<split>-<scene>-<0000>` in configs of several scenes",
+    "scene": "name of the scene, as in `bars.parquet` and `meshes/`",
+    "rgb": "lossless 8-bit colour, H x W, WebP; null in every row of a config built without colour",
+    "depth": "lossless float32 planar depth along the optical axis, metres, 0.0 where there is no surface; "
+    'TIFF, which `Image(mode="F")` of `datasets` reads too',
+    "mask": "1-bit: steel, rim included",
+    "bars": "16-bit: the bar's id as in `bars.parquet`, 0 where no steel",
+    "preview": "8-bit colour-mapped depth, for people and the Hub viewer",
+    "K": "3 x 3 pinhole matrix, pixels; pixel centres at integer coordinates",
+    "distortion": "k1 k2 p1 p2 k3 (OpenCV), zeros where the grid has none",
+    "cam_from_world": "4 x 4 rigid pose: `x_cam = cam_from_world @ x_world`; OpenCV axes, metres",
+    "baseline_m": "metres between the two camera centres; along the left one's x axis except on a raw grid",
+}
+"""Description of each column, by column kind (see ``column_kind``); shown in the dataset card."""
+
+
+def column_kind(name: str) -> str:
+    """Return the kind of a column: its name without the prefix ``left_`` or ``right_``."""
+    eye, _, kind = name.partition("_")
+    return kind if eye in EYES else name
+
+
+_IMAGE_CELL = pa.struct([("bytes", pa.binary()), ("path", pa.string())])
+_ARROW_TYPES: Mapping[str, pa.DataType] = {
+    **dict.fromkeys(("view_id", "scene"), pa.string()),
+    **dict.fromkeys(("rgb", "mask", "bars", "preview"), _IMAGE_CELL),
+    "depth": pa.binary(),
+    "K": pa.list_(pa.list_(pa.float64(), 3), 3),
+    "distortion": pa.list_(pa.float64(), 5),
+    "cam_from_world": pa.list_(pa.list_(pa.float64(), 4), 4),
+    "baseline_m": pa.float64(),
+}
+ROW_SCHEMA = pa.schema([(name, _ARROW_TYPES[column_kind(name)]) for name in COLUMNS])
+"""Arrow schema of ``features``, without its metadata."""
+
+
+def validated_columns(columns: Sequence[str] | None) -> tuple[str, ...]:
+    """Return the names of columns as a tuple, all of them for None. Raises ``DatasetError`` for unknown names."""
+    if columns is None:
+        return COLUMNS
+    if isinstance(columns, str):
+        raise DatasetError(f"columns is {columns!r}, expected a list of column names")
+    unknown = [name for name in columns if name not in COLUMNS]
+    if unknown:
+        raise DatasetError(f"no column {', '.join(map(repr, unknown))}, expected some of {', '.join(COLUMNS)}")
+    return tuple(columns)
+
+
+class ManifestTable(StrictModel):
+    """Base class of the objects that may contain further keys, which are ignored."""
+
+    model_config = ConfigDict(extra="ignore")
+
+
+CENTRE, NEAREST_STEEL = "centre", "nearest steel"
+"""Values of ``Trajectory.distance_to``."""
+SURVEY = "survey"
+"""Kind of the trajectories that are a ``Survey``."""
+RANDOM_VIEWS = "random views"
+"""Kind of the trajectories that are ``RandomViews``."""
+_SHELLS = ("dome", "ring", "sweep")
+"""Kinds of the trajectories that are a ``Trajectory``."""
+_Views = Annotated[int, whole_number(1, 1_000_000)]
+_Distances = Annotated[tuple[Annotated[float, number(0)], ...], Strict(False), Field(min_length=1)]
+_Point = Annotated[Triple, three_numbers(-1e9, 1e9, "three numbers, [x, y, z]")]
+_Station = Annotated[
+    tuple[_Point, _Point], Strict(False), Expected("two points, of the left camera and of the steel aimed at")
+]
+
+
+class Trajectory(ManifestTable):
+    """Cameras of a config: shells, rings of a shell, and azimuths of a ring.
+
+    ``radii_m`` are distances from the left camera to ``distance_to``: the centre of the assembly, or the nearest
+    point of any bar's surface. A ring has ``radius_m`` instead.
+    """
+
+    kind: Annotated[str, one_of(*_SHELLS)] = "dome"
+    radii_m: _Distances = (1.0,)
+    radius_m: Annotated[float, number(0)] | None = None
+    elevations_deg: Annotated[tuple[float, ...], Strict(False), Field(min_length=1)] = (0.0,)
+    azimuths: _Views
+    distance_to: Annotated[str, one_of(CENTRE, NEAREST_STEEL)] = CENTRE
+
+    @property
+    def distances_m(self) -> tuple[float, ...]:
+        """Distances of the shells, metres."""
+        return self.radii_m if self.radius_m is None else (self.radius_m,)
+
+    @property
+    def views(self) -> int:
+        """Number of views of the full trajectory."""
+        return len(self.radii_m) * len(self.elevations_deg) * self.azimuths
+
+
+class Survey(ManifestTable):
+    """Cameras of a config that stand at the ``distances_m`` from points of the steel.
+
+    ``stations`` are the centre of the left camera and the point aimed at of each view, world metres, in order.
+    """
+
+    kind: Annotated[str, one_of(SURVEY)] = SURVEY
+    distances_m: _Distances
+    views_per_distance: _Views
+    stations: Annotated[tuple[_Station, ...], Strict(False)]
+
+    @field_validator("stations")
+    @classmethod
+    def _check_stations(cls, stations: tuple[_Station, ...], info: ValidationInfo) -> tuple[_Station, ...]:
+        if {"distances_m", "views_per_distance"} <= info.data.keys():
+            views = len(info.data["distances_m"]) * info.data["views_per_distance"]
+            if len(stations) != views:
+                raise field_error(f"got {len(stations)} stations", f"{views}: one for each view", "conflict")
+        return stations
+
+    @property
+    def views(self) -> int:
+        """Number of views of the full trajectory."""
+        return len(self.stations)
+
+
+class RandomViews(ManifestTable):
+    """Cameras of a config that stand at distances between the two ``distances_m`` from points of the steel."""
+
+    kind: Annotated[str, one_of(RANDOM_VIEWS)] = RANDOM_VIEWS
+    distances_m: _Distances
+    views: _Views
+
+
+AnyTrajectory = Trajectory | Survey | RandomViews
+_BY_KIND: Mapping[str, type[AnyTrajectory]] = {
+    **dict.fromkeys(_SHELLS, Trajectory),
+    SURVEY: Survey,
+    RANDOM_VIEWS: RandomViews,
+}
+
+
+def trajectory_of(fields: Any) -> AnyTrajectory:
+    """Return the trajectory of a scene in the manifest; raise the error of a field if it is not valid."""
+    if isinstance(fields, AnyTrajectory):
+        return fields
+    kind = fields.get("kind") if isinstance(fields, Mapping) else None
+    if not isinstance(kind, str) or kind not in _BY_KIND:
+        raise field_error(f"got {short_repr(fields)}", f"a table whose kind is one of {', '.join(_BY_KIND)}")
+    return _BY_KIND[kind].model_validate(fields)
+
 
 DIGEST_PATTERN = "sha256:[0-9a-f]{64}"
 Name = Annotated[str, StringConstraints(pattern=f"^{NAME_PATTERN}$"), Expected(f"a name of {NAME_LETTERS}")]

@@ -1,4 +1,4 @@
-"""Ground truth for scoring: the scored pixels of each view and their depth.
+"""Ground truth of a config for scoring: the scored pixels of each view, and the scene of the paper that it shows.
 
 It is extracted once per config and kept as arrays in the user's cache, keyed by a digest of the views; later runs
 read the cache one view at a time.
@@ -12,19 +12,16 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float32, UInt32
+from jaxtyping import Bool, UInt32
 from numpy import ndarray
 
-from rebar_depth_bench.data.array_cache import ArrayCache, open_cache
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars, with_axis
-from rebar_depth_bench.data.cache_entry import CacheContent, ViewArrays
-from rebar_depth_bench.data.config_tables import ViewRecord
-from rebar_depth_bench.data.dataset import iterate_rows
-from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.eye_view import EyeTruth, truth_columns, truth_from_row
-from rebar_depth_bench.data.manifest import DatasetFolder
+from rebar_depth_bench.data.cache import ArrayCache, CacheContent, ViewArrays, open_cache
+from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder
+from rebar_depth_bench.data.rows import EyeTruth, iterate_rows, truth_columns, truth_from_row
+from rebar_depth_bench.data.schema import NEAREST_STEEL, Assembly, Trajectory, ViewRecord
 from rebar_depth_bench.errors import DatasetError
-from rebar_depth_bench.progress import Progress, silent
+from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.scoring.groups import ViewTraits, bar_width_px
 from rebar_depth_bench.scoring.metrics import median
 from rebar_depth_bench.scoring.protocol import PROTOCOL, scored_pixels, single_bar_pixels
@@ -35,6 +32,8 @@ from rebar_depth_bench.scoring.reference import (
     reference_of_numbers,
     view_reference,
 )
+from rebar_depth_bench.scoring.score import ViewTruth
+from rebar_depth_bench.scoring.table import PublishedMatch
 
 _REFERENCE = slice(1, 1 + REFERENCE_NUMBERS)
 _WIDTH = 1 + REFERENCE_NUMBERS
@@ -43,29 +42,26 @@ _NO_WIDTH = -1.0
 
 
 @dataclass(frozen=True, eq=False)
-class ViewTruth:
-    """Scored pixels of one view.
-
-    ``index`` holds flat indices into the H x W image, ``depth_m`` their planar depth and ``median_m`` its median,
-    in metres. ``constant`` has ``reference.constant_errors``, if they are known.
-    """
-
-    view_id: str
-    index: UInt32[ndarray, " n"]
-    depth_m: Float32[ndarray, " n"]
-    median_m: float
-    constant: tuple[float, float] | None = None
-
-
-@dataclass(frozen=True, eq=False)
 class ConfigTruth:
-    """Views of a config that have scored pixels, each read from the cache on access.
-
-    ``family_by_view`` has the family of the scene of each view.
-    """
+    """Views of a config that have scored pixels, each read from the cache on access (see ``score.Truth``)."""
 
     cache: ArrayCache
-    family_by_view: Mapping[str, str | None]
+    config: DatasetConfig
+
+    @property
+    def split(self) -> str | None:
+        """Split of the views, None in a config of one scene."""
+        return self.config.scenes[0].split if self.config.has_splits else None
+
+    @property
+    def truth_sigma_m(self) -> float | None:
+        """Standard deviation of the depth, metres, None if it is exact."""
+        return self.config.truth_sigma_m
+
+    @property
+    def published(self) -> PublishedMatch | None:
+        """Scene of the paper's Table I that the config shows, if any."""
+        return published_match(self.config)
 
     @property
     def view_ids(self) -> tuple[str, ...]:
@@ -89,10 +85,13 @@ class ConfigTruth:
     @property
     def traits(self) -> tuple[ViewTraits, ...]:
         """Properties of each view by which views are grouped, without bar widths in a config of one scene."""
+        families = {scene.name: scene.family for scene in self.config.scenes}
         widths_px = (numbers[_WIDTH:] for numbers in self.cache.numbers)
         return tuple(
             ViewTraits(
-                self.family_by_view[view_id], median_m, width_px[0] if width_px and width_px[0] > 0 else None
+                families[self.config.scene_by_view[view_id]],
+                median_m,
+                width_px[0] if width_px and width_px[0] > 0 else None,
             )
             for view_id, median_m, width_px in zip(self.view_ids, self.medians_m, widths_px, strict=True)
         )
@@ -134,9 +133,7 @@ def config_truth(folder: DatasetFolder, config: DatasetConfig, progress: Progres
         extract=lambda: _extract_views(config, progress, diameters),
         is_sound=is_sound,
     )
-    family_by_scene = {scene.name: scene.family for scene in config.scenes}
-    families = {view_id: family_by_scene[scene] for view_id, scene in config.scene_by_view.items()}
-    return ConfigTruth(open_cache(content), families)
+    return ConfigTruth(open_cache(content), config)
 
 
 def _diameters_by_scene(folder: DatasetFolder) -> dict[str, dict[int, float]]:
@@ -228,3 +225,90 @@ def _verified_pixels(left: EyeTruth, record: ViewRecord, config: DatasetConfig) 
             f"rebar-bench verify {config.root} lists damaged files"
         )
     return pixels
+
+
+# Conditions of the paper's Table I: which configs of a dataset its rows may be shown beside. Source: "Benchmarking
+# Metric Depth for Construction Perception: Industrial Rebar Scenes with Exact Synthetic Ground Truth", sections
+# II.A and II.C. The lattice was evaluated on the views of a ZED, rectified.
+
+_GRID = (720, 1280)
+_IDEAL = ("ideal", 0.12)
+_ZED_RECTIFIED = ("rectified", 0.119978)
+
+
+@dataclass(frozen=True)
+class _Conditions:
+    """Conditions of a scene; ``optics`` are grid and baseline in metres, ``markers`` are those of the board."""
+
+    assembly: Mapping[str, Any]
+    markers: int
+    environment: str
+    trajectory: Trajectory
+    optics: tuple[str, float]
+
+
+_CONDITIONS: Mapping[str, _Conditions] = {
+    "lattice": _Conditions(
+        {"kind": "lattice", "extent_m": 0.1, "pitch_m": 0.02, "diameters_m": [0.007, 0.004]},
+        6,
+        "laboratory",
+        Trajectory(
+            radii_m=(0.22, 0.3, 0.35, 0.38, 0.4, 0.42, 0.43),
+            elevations_deg=(15.0, 27.0, 39.0, 51.0, 63.0, 75.0),
+            azimuths=12,
+        ),
+        _ZED_RECTIFIED,
+    ),
+    "pile": _Conditions(
+        {"kind": "pile", "stirrups": 6, "diameter_m": 0.01, "size_m": [0.28, 0.2], "state": "pile-0"},
+        6,
+        "laboratory",
+        Trajectory(
+            radii_m=(0.5, 0.57, 0.59, 0.62, 0.65, 0.67, 0.9),
+            elevations_deg=(28.0, 37.0, 46.0, 55.0, 64.0, 73.0),
+            azimuths=12,
+        ),
+        _IDEAL,
+    ),
+    "pier": _Conditions(
+        {
+            "kind": "pier",
+            "side_m": 4.8,
+            "height_m": 6.67,
+            "verticals": 96,
+            "levels": 45,
+            "vertical_diameter_m": 0.032,
+            "hoop_diameter_m": 0.016,
+            "tie_diameter_m": 0.016,
+        },
+        0,
+        "outdoors",
+        Trajectory(
+            radii_m=(8.0, 11.0, 13.0, 14.5, 15.5, 16.25, 17.0),
+            elevations_deg=(-7.5, -1.0, 7.0, 17.0, 29.0, 44.0),
+            azimuths=12,
+            distance_to=NEAREST_STEEL,
+        ),
+        _IDEAL,
+    ),
+}
+
+
+def published_match(config: DatasetConfig) -> PublishedMatch | None:
+    """Return the scene of Table I whose rows may be shown beside a config, or None.
+
+    Assembly, board, environment, image size and trajectory have to be equal, with all of its views and without
+    appearance variants.
+    """
+    is_complete = len(config.views) == config.scenes[0].protocol_views and config.grid == _GRID
+    if config.imported is not None or config.has_splits or not is_complete or config.scene.appearance.variants:
+        return None
+    scene = config.scene
+    markers = scene.board.markers if scene.board else 0
+    shown = (scene.assembly, markers, scene.environment, scene.protocol)
+    for name, expected in _CONDITIONS.items():
+        assembly = Assembly.model_validate(expected.assembly)
+        if shown == (assembly, expected.markers, expected.environment, expected.trajectory):
+            optics = None if scene.rig is None else (scene.rig.grid, scene.rig.baseline_m)
+            return PublishedMatch(name, optics == expected.optics)
+    return None

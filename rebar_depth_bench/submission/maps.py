@@ -1,23 +1,148 @@
-"""Decoders of ``.exr`` and ``.png`` entries.
+"""Decoders of the depth maps in an archive: ``.npy``, ``.npz``, ``.exr`` and ``.png``.
 
-The OpenEXR header is parsed and checked in this module, so that the OpenEXR library receives only files with one
-flat channel of the expected size. For PNG, the chunks and the inflated size are checked in this module, and Pillow
-only undoes the row filters.
+The header of ``.npy`` is parsed with regular expressions before any value is read. NumPy's reader is not used on
+untrusted data: it allocates the size that the header declares, evaluates the header as a Python literal and emits
+warnings for old format versions. An ``.npz`` entry is a zip inside the archive and is checked by the same rules as
+the archive itself.
+
+The header of OpenEXR is parsed and checked here too, so that the OpenEXR library receives only files with one flat
+channel of the expected size. For PNG, the chunks and the inflated size are checked, and Pillow only undoes the row
+filters.
 """
 
 from __future__ import annotations
 
 import io
+import re
 import struct
 import zlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from rebar_depth_bench.errors import EntryError, Problem, escape_text, format_shape
-from rebar_depth_bench.submission.numpy_formats import Depth
+from rebar_depth_bench.reading import MemorySource
+from rebar_depth_bench.submission.zip import DirectoryError, check_entries, read_data, read_directory
+
+MAX_HEADER_BYTES = 4096
+"""Largest accepted ``.npy`` header, magic string included, in bytes."""
+
+Depth = NDArray[np.floating[Any]]
+"""Planar depth along the optical axis in metres: (H, W), float16, float32 or float64 in native byte order."""
+
+_MAGIC = b"\x93NUMPY"
+_LENGTH_BYTES = {1: 2, 2: 4, 3: 4}
+_DESCR = re.compile(r"'descr'\s*:\s*(?:'([^']*)'|\[[^]]*\])")
+_FORTRAN_ORDER = re.compile(r"'fortran_order'\s*:\s*(True|False)")
+_SHAPE = re.compile(r"'shape'\s*:\s*\(([0-9L,\s]*)\)")
+_FLOAT_DESCR = re.compile(r"[<>=|]?f[248]")
+
+
+def max_npy_bytes(shape: tuple[int, int]) -> int:
+    """Return the largest acceptable size of an ``.npy`` file of shape (H, W) in bytes (float64 values)."""
+    return shape[0] * shape[1] * 8 + MAX_HEADER_BYTES
+
+
+def decode_npy(name: str, data: memoryview, shape: tuple[int, int], _: float = 1.0) -> Depth:
+    """Return the depth array in ``data``, in metres: (H, W), float16, float32 or float64 in native byte order.
+
+    The array is a read-only view on ``data``, or a copy if its bytes had to be swapped or aligned.
+    Raises ``EntryError`` if the data is damaged or has another shape or dtype.
+    """
+    dtype, fortran_order, offset = _parse_header(name, data, shape)
+    actual_bytes, expected_bytes = len(data) - offset, shape[0] * shape[1] * dtype.itemsize
+    if actual_bytes != expected_bytes:
+        expected = f"{expected_bytes} for {format_shape(shape)} {dtype.name}"
+        raise EntryError(Problem("size", name, f"{actual_bytes} bytes of values follow the header", expected))
+    values = np.frombuffer(data, dtype, offset=offset)
+    array = values.reshape(shape[::-1]).T if fortran_order else values.reshape(shape)
+    return np.require(array, array.dtype.newbyteorder("="), "A")
+
+
+def _parse_header(
+    name: str, data: memoryview, shape: tuple[int, int]
+) -> tuple[np.dtype[np.floating[Any]], bool, int]:
+    """Return the type of the values, whether they are in Fortran order, and the offset of the first."""
+    text, data_offset = _header_text(name, bytes(data[: MAX_HEADER_BYTES + 1]))
+    descr, fortran, shapes = (pattern.findall(text) for pattern in (_DESCR, _FORTRAN_ORDER, _SHAPE))
+    remainder = _SHAPE.sub("", _FORTRAN_ORDER.sub("", _DESCR.sub("", text)))
+    if not len(descr) == len(fortran) == len(shapes) == 1 or re.sub(r"[\s,]", "", remainder) != "{}":
+        found = f"the .npy header is {escape_text(text.strip())}"
+        raise EntryError(Problem("syntax", name, found, "descr, fortran_order and shape"))
+    if descr[0].lstrip("<>=|").startswith("O"):
+        found = "the array holds pickled Python objects (dtype object)"
+        raise EntryError(Problem("invalid", name, found, "float16/32/64"))
+    if not _FLOAT_DESCR.fullmatch(descr[0]):
+        actual = escape_text(descr[0]) if descr[0] else "structured"
+        raise EntryError(Problem("invalid", name, f"the dtype is {actual}", "float16, float32 or float64"))
+    actual_shape = shapes[0].replace("L", "").replace(",", " ").split()
+    if actual_shape != [str(size) for size in shape]:
+        actual = " x ".join(map(escape_text, actual_shape)) if actual_shape else "a single value"
+        raise EntryError(Problem("invalid", name, f"the shape is {actual}", f"{format_shape(shape)} (H x W)"))
+    return np.dtype(descr[0].replace("|", "=")), fortran[0] == "True", data_offset
+
+
+def _header_text(name: str, head: bytes) -> tuple[str, int]:
+    """Return the header's text and the byte offset of the values."""
+    version = head[6] if head.startswith(_MAGIC) and len(head) >= 8 else 0
+    if version not in _LENGTH_BYTES:
+        pickled = head[:1] == b"\x80"
+        actual = "a Python pickle" if pickled else f"bytes that start with {head[:8]!r}"
+        raise EntryError(Problem("syntax", name, f"{actual} was found", "a .npy array of version 1, 2 or 3"))
+    start = 8 + _LENGTH_BYTES[version]
+    length = int.from_bytes(head[8:start], "little")
+    if start + length > MAX_HEADER_BYTES:
+        found = f"the .npy header declares {length} bytes"
+        raise EntryError(Problem("size", name, found, f"at most {MAX_HEADER_BYTES - start}"))
+    if start + length > len(head):
+        found = f"the .npy header is cut off at {len(head)} bytes"
+        raise EntryError(Problem("damaged", name, found, f"{start + length}"))
+    return head[start : start + length].decode("utf-8", "backslashreplace"), start + length
+
+
+# More than the one expected array, so that the error message can list the members of a wrong file.
+_MAX_NPZ_MEMBERS = 256
+_MAX_NPZ_OVERHEAD_BYTES = 64 * 1024
+
+
+def max_npz_bytes(shape: tuple[int, int]) -> int:
+    """Return the largest acceptable size of an ``.npz`` file of shape (H, W), in bytes."""
+    values = max_npy_bytes(shape)
+    return values + values // 1024 + _MAX_NPZ_OVERHEAD_BYTES
+
+
+def decode_npz(name: str, data: memoryview, shape: tuple[int, int], _: float = 1.0) -> Depth:
+    """Return the only array of an ``.npz`` file, as ``decode_npy`` does. Raises ``EntryError``."""
+    source = MemorySource(data)
+    try:
+        directory = read_directory(source, _MAX_NPZ_MEMBERS)
+    except DirectoryError as error:
+        raise _inner_error(name, error.problems) from error
+    members = [escape_text(entry.name) for entry in directory.entries]
+    if len(members) != 1:
+        listed = f" ({', '.join(members[:4])}{', ...' if len(members) > 4 else ''})" if members else ""
+        raise EntryError(Problem("invalid", name, f"the .npz holds {len(members)} arrays{listed}", "exactly one"))
+    (checked,) = check_entries(source, directory, lambda _: max_npy_bytes(shape))
+    if checked.problems:
+        raise _inner_error(name, checked.problems)
+    if not checked.entry.name.endswith(".npy"):
+        raise EntryError(Problem("invalid", name, f"the .npz holds {members[0]}", "one .npy array"))
+    try:
+        values = read_data(source, checked)
+    except EntryError as error:
+        raise _inner_error(name, error.problems) from error
+    return decode_npy(f"{name} ({members[0]})", values, shape)
+
+
+def _inner_error(name: str, problems: Sequence[Problem]) -> EntryError:
+    """Return the error of an ``.npz`` entry whose zip or member has the given problems."""
+    found = f"inside the .npz, {'; '.join(map(str, problems))}"
+    return EntryError(Problem(problems[0].code, name, found))
+
 
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
 _TILED, _LONG_NAMES, _DEEP, _MULTI_PART = 0x200, 0x400, 0x800, 0x1000
@@ -36,13 +161,12 @@ def max_exr_bytes(shape: tuple[int, int]) -> int:
     return shape[0] * shape[1] * 4 + shape[0] * 16 + _MAX_HEADER_BYTES
 
 
-def decode_exr(name: str, data: memoryview, shape: tuple[int, int], depth_scale: float = 1.0) -> Depth:
+def decode_exr(name: str, data: memoryview, shape: tuple[int, int], _: float = 1.0) -> Depth:
     """Return the single channel of an OpenEXR file in metres: (H, W), float16 (HALF) or float32 (FLOAT).
 
-    ``depth_scale`` is ignored. Raises ``EntryError`` if the file is damaged, has another size or pixel type, or is
-    not one flat image with one channel.
+    Raises ``EntryError`` if the file is damaged, has another size or pixel type, or is not one flat image with one
+    channel.
     """
-    del depth_scale
     _check_exr_header(name, data, shape)
     import OpenEXR  # A tenth of a second, which archives of other formats do not need.
 
@@ -88,16 +212,12 @@ def _check_exr_header(name: str, data: memoryview, shape: tuple[int, int]) -> No
 
 def _check_channel(name: str, channels: list[tuple[str, int, int, int]]) -> None:
     if len(channels) != 1:
-        names = ", ".join(escape_text(channel[0]) for channel in channels[:4]) + (
-            ", ..." if len(channels) > 4 else ""
-        )
-        raise EntryError(
-            Problem("invalid", name, f"the OpenEXR file has {len(channels)} channels ({names})", "one")
-        )
+        names = [escape_text(label) for label, *_ in channels[:4]] + ["..."] * (len(channels) > 4)
+        found = f"the OpenEXR file has {len(channels)} channels ({', '.join(names)})"
+        raise EntryError(Problem("invalid", name, found, "one"))
     label, pixel_type, x_step, y_step = channels[0]
     if pixel_type not in (1, 2):
-        type_name = _PIXEL_TYPES.get(pixel_type, f"of type {pixel_type}")
-        found = f"the channel {escape_text(label)} is {type_name}"
+        found = f"the channel {escape_text(label)} is {_PIXEL_TYPES.get(pixel_type, f'of type {pixel_type}')}"
         raise EntryError(Problem("invalid", name, found, "HALF or FLOAT"))
     if (x_step, y_step) != (1, 1):
         found = f"the channel {escape_text(label)} is subsampled {x_step} x {y_step}"

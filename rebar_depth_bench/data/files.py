@@ -1,19 +1,26 @@
-"""Places of datasets: a local folder, or a Hub repository at one commit, and the files in them."""
+"""Files of a dataset, in a local folder or a Hub repository at one commit, and digests of files and parameters."""
 
 from __future__ import annotations
 
+import hashlib
+import json
 import re
+from collections.abc import Iterable
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import BinaryIO, cast
+from typing import TYPE_CHECKING, BinaryIO, cast
 
 from pydantic import ConfigDict
 
 from rebar_depth_bench.errors import DatasetError, InputError, escape_text
-from rebar_depth_bench.paths import PATH_PATTERN, path_below
-from rebar_depth_bench.reading import open_regular
+from rebar_depth_bench.names import PATH_PATTERN
+from rebar_depth_bench.reading import open_regular, path_below
 from rebar_depth_bench.validation import StrictModel
+
+if TYPE_CHECKING:
+    from rebar_depth_bench.data.schema import ViewRecord
+
 
 _HUB_NAME = "[A-Za-z0-9][A-Za-z0-9_.-]{0,95}"
 _HUB_ROOT_PATTERN = re.compile(rf"(?P<repository>{_HUB_NAME}/{_HUB_NAME})(@(?P<revision>{PATH_PATTERN}))?")
@@ -138,3 +145,40 @@ def _download(root: str, name: str, commit: str) -> Path:
 
 def _download_error(root: str, name: str, error: Exception) -> InputError:
     return DatasetError(f"{root}: not a local folder, and its {name} cannot be downloaded from the Hub: {error}")
+
+
+_CHUNK_BYTES = 1 << 20
+
+
+def file_sha256(path: Path) -> str:
+    """Return the hex SHA-256 of a regular file, read in chunks of 1 MiB.
+
+    Raises ``OSError`` if the file is missing or not a regular file.
+    """
+    digest = hashlib.sha256()
+    with open_regular(path) as stream:
+        while chunk := stream.read(_CHUNK_BYTES):
+            digest.update(chunk)
+    return digest.hexdigest()
+
+
+def files_digest(paths: Iterable[Path]) -> str:
+    """Return the hex SHA-256 over the names and SHA-256 digests of files, in the order of ``paths``.
+
+    Folders do not enter the digest, so that copies elsewhere have the same one. Raises ``OSError`` if a file is
+    missing.
+    """
+    lines = [f"{path.name} {file_sha256(path)}\n" for path in paths]
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+def views_digest(views: Iterable[ViewRecord]) -> str:
+    """Return the ground-truth digest, ``sha256:...``, over the ids and eye digests of the views, sorted by id."""
+    lines = sorted(f"{view.view_id} {view.left} {view.right}\n" for view in views)
+    return "sha256:" + hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+def parameters_digest(parameters: object) -> str:
+    """Return the hex SHA-256 of the canonical JSON of ``parameters`` (sorted keys, no whitespace, no NaN)."""
+    canonical = json.dumps(parameters, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(canonical.encode()).hexdigest()

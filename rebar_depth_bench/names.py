@@ -1,8 +1,20 @@
-"""View ids: ``<config>/<0000>``, or ``<config>/<split>-<scene>-<0000>`` in configs of several scenes."""
+"""Names in files: patterns of names and paths, and view ids.
+
+A view id is ``<config>/<0000>``, or ``<config>/<split>-<scene>-<0000>`` in configs of several scenes.
+"""
 
 from __future__ import annotations
 
 import re
+
+NAME_PATTERN = "[A-Za-z0-9_][A-Za-z0-9_.-]{0,199}"
+"""Regular expression of a name, which is one part of a path: it cannot be hidden, ``..`` or empty."""
+NAME_LETTERS = 'letters, digits, "_", "." and "-", not starting with a dot'
+"""Description of ``NAME_PATTERN`` for messages."""
+PATH_PATTERN = f"({NAME_PATTERN}/){{0,9}}{NAME_PATTERN}"
+"""Regular expression of up to ten names that are joined by ``/``."""
+VIEW_ID_PATTERN = f"{NAME_PATTERN}/{NAME_PATTERN}"
+"""Regular expression of a view id, ``<config>/<index>``."""
 
 SPLITS = ("train", "validation", "test")
 """Splits that a config may have; a config of one scene has only the last."""

@@ -1,0 +1,255 @@
+"""Rows of a config: decoding of the cells to arrays, and cameras with their ground truth.
+
+The shards are read with pyarrow: ``datasets`` takes a second to import, and imports torch, which takes several, to
+stream.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Self
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, UInt8, UInt16
+from numpy import ndarray
+
+from rebar_depth_bench.data import codecs
+from rebar_depth_bench.data.manifest import DatasetConfig
+from rebar_depth_bench.data.schema import column_kind, validated_columns
+from rebar_depth_bench.data.shards import all_rows
+from rebar_depth_bench.errors import DatasetError, escape_text
+from rebar_depth_bench.geometry.cameras import Camera
+from rebar_depth_bench.validation import short_repr
+
+CAMERA_KINDS = ("K", "distortion", "cam_from_world")
+"""Kinds of the dataset's columns that describe a camera (see ``columns.column_kind``)."""
+_CAMERA_SHAPES = dict(zip(CAMERA_KINDS, ((3, 3), (5,), (4, 4)), strict=True))
+_MAX_ROTATION_ERROR = 1e-6
+"""Largest deviation of a rotation times its transpose from the identity matrix."""
+
+
+@dataclass(frozen=True, eq=False)
+class EyeTruth:
+    """Camera and images of one eye of a view, rendered or imported.
+
+    ``rgb`` is None where colour is not needed. ``depth_m`` is planar z (0: no surface), ``mask`` marks steel
+    pixels, ``bars`` holds bar ids (0: no steel). Mask and bar ids are None in a config that was imported without.
+    """
+
+    camera: Camera
+    rgb: UInt8[ndarray, "h w 3"] | None
+    depth_m: Float32[ndarray, "h w"]
+    mask: Bool[ndarray, "h w"] | None
+    bars: UInt16[ndarray, "h w"] | None
+
+    def digest(self) -> str:
+        """Return the hex SHA-256 of the ground truth: of image size, depth, mask, bar ids and camera.
+
+        It covers the decoded values, not their encoding, and which of them are absent.
+        """
+        digest = hashlib.sha256(np.array(self.depth_m.shape, "<u4").tobytes())
+        arrays = (
+            (self.depth_m, "<f4"),
+            (self.mask, "u1"),
+            (self.bars, "<u2"),
+            (self.camera.K, "<f8"),
+            (self.camera.distortion, "<f8"),
+            (self.camera.cam_from_world, "<f8"),
+        )
+        for array, dtype in arrays:
+            digest.update(b"absent" if array is None else np.ascontiguousarray(array, dtype=dtype).data)
+        return digest.hexdigest()
+
+
+@dataclass(frozen=True, eq=False)
+class EyeView(EyeTruth):
+    """One eye of a rendered view, which has a mask and bar ids."""
+
+    mask: Bool[ndarray, "h w"]
+    bars: UInt16[ndarray, "h w"]
+
+
+def truth_columns(eye: str) -> tuple[str, ...]:
+    """Return the names of the columns that ``truth_from_row`` requires for ``left`` or ``right``."""
+    return tuple(f"{eye}_{kind}" for kind in ("depth", "mask", "bars", *CAMERA_KINDS))
+
+
+def eye_from_row(row: Mapping[str, Any], eye: str) -> EyeView:
+    """Return one eye of a decoded row of a rendered config; ``rgb`` is None if the row lacks that column."""
+    return EyeView(**vars(truth_from_row(row, eye)))
+
+
+def truth_from_row(row: Mapping[str, Any], eye: str) -> EyeTruth:
+    """Return one eye of a decoded row that has its depth; ``rgb`` is None if the row lacks that column."""
+    depth_m = row[f"{eye}_depth"]
+    camera = camera_from_row(row, eye, depth_m.shape[:2])  # A damaged image may have a third axis.
+    return EyeTruth(camera, row.get(f"{eye}_rgb"), depth_m, row[f"{eye}_mask"], row[f"{eye}_bars"])
+
+
+def camera_from_row(row: Mapping[str, Any], eye: str, grid: tuple[int, int]) -> Camera:
+    """Return the camera of one eye of a row, decoded or not; ``grid`` is its image size (height, width).
+
+    Raises ``ValueError`` for arrays that ``camera_array`` rejects.
+    """
+    K, distortion, cam_from_world = (camera_array(kind, row[f"{eye}_{kind}"]) for kind in CAMERA_KINDS)
+    height, width = grid
+    return Camera(K, distortion, cam_from_world, width, height)
+
+
+def absent_cell(kind: str) -> list[Any] | None:
+    """Return the cell of an absent column: null, or NaN for ``CAMERA_KINDS``.
+
+    Parquet readers of Arrow fail on null lists of a fixed size.
+    """
+    return np.full(_CAMERA_SHAPES[kind], np.nan).tolist() if kind in CAMERA_KINDS else None
+
+
+def is_absent(cell: Any) -> bool:
+    """Return whether a cell is null, or a list of NaN."""
+    return cell is None or (isinstance(cell, list) and len(cell) > 0 and bool(np.isnan(np.ravel(cell)).all()))
+
+
+def camera_array(kind: str, cell: Any) -> Float64[ndarray, ...]:
+    """Return a cell of one of ``CAMERA_KINDS`` as an array; arrays are returned unchanged.
+
+    Raises ``ValueError`` unless it holds finite numbers of the kind's shape; a pose has to be rigid.
+    """
+    if isinstance(cell, ndarray):
+        return cell
+    array = np.array(cell, dtype=np.float64)
+    if array.shape != _CAMERA_SHAPES[kind]:
+        raise ValueError(f"it has the shape {array.shape}, expected {_CAMERA_SHAPES[kind]}")
+    if not np.isfinite(array).all():
+        raise ValueError("it has values that are not finite, expected finite numbers")
+    if kind == "cam_from_world":
+        rotation = array[:3, :3]
+        with np.errstate(over="ignore", invalid="ignore"):
+            error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        if not (error < _MAX_ROTATION_ERROR and np.linalg.det(rotation) > 0 and (array[3] == (0, 0, 0, 1)).all()):
+            raise ValueError("it is no rigid pose: a rotation, a translation and the last row 0 0 0 1")
+    return array
+
+
+@dataclass(frozen=True)
+class RowDecoder:
+    """Decoder of the rows of a config; it is small and can be pickled for worker processes.
+
+    ``grid`` is the image size (height, width) that every cell must have, ``scene_by_view`` the name of the
+    scene of each view. The cells of ``absent_columns`` are null, or NaN in a matrix, and decode to None.
+    """
+
+    root: str
+    config: str
+    grid: tuple[int, int]
+    scene_by_view: Mapping[str, str]
+    absent_columns: frozenset[str] = frozenset()
+
+    @classmethod
+    def of(cls, config: DatasetConfig) -> Self:
+        """Return the decoder of a config."""
+        return cls(config.root, config.name, config.grid, config.scene_by_view, config.absent_columns)
+
+    def row(self, row: Mapping[str, Any]) -> dict[str, Any]:
+        """Decode the cells of a row. Raises ``DatasetError`` naming view and column if a cell is damaged."""
+        view = str(row.get("view_id", f"a view of {self.config}"))
+        return {name: self._decode(name, cell, view) for name, cell in row.items()}
+
+    def encoded(self, row: Mapping[str, Any]) -> dict[str, Any]:
+        """Return a row for ``datasets``, whose images stay encoded and have the path that ``picture`` expects.
+
+        All other cells are checked. Raises ``DatasetError`` as ``row``.
+        """
+        return {name: self._encoded(name, cell, str(row["view_id"])) for name, cell in row.items()}
+
+    def picture(self, column: str, content: bytes, path: str) -> codecs.Picture:
+        """Decode the image in a cell of ``encoded``. Raises ``DatasetError`` as ``row``."""
+        with self._naming(path.removeprefix(self.place), column):
+            return codecs.open_picture(column_kind(column), content, self.grid)
+
+    @property
+    def place(self) -> str:
+        """Start of the paths of images, before the id of the view."""
+        return f"{self.root}/"
+
+    def _encoded(self, column: str, cell: Any, view: str) -> Any:
+        kind = column_kind(column)
+        if kind not in codecs.PICTURE_KINDS or column in self.absent_columns:
+            self._decode(column, cell, view)
+            return cell
+        with self._naming(view, column):
+            return {"bytes": _content(kind, cell), "path": self.place + view}
+
+    def _decode(self, column: str, cell: Any, view: str) -> Any:
+        with self._naming(view, column):
+            if column in self.absent_columns:
+                if not is_absent(cell):
+                    raise ValueError("it has a value, expected null as in the manifest")
+                return None
+            return self._decode_kind(column_kind(column), cell, view)
+
+    @contextmanager
+    def _naming(self, view: str, column: str) -> Iterator[None]:
+        try:
+            yield
+        except Exception as error:  # Pillow raises many types, which depend on the damage.
+            reason = escape_text(str(error) or type(error).__name__)
+            raise DatasetError(
+                f"{self.root}: view {escape_text(view)}: {column} is damaged: {reason}; "
+                f"rebar-bench verify {self.root} lists damaged files"
+            ) from error
+
+    def _decode_kind(self, kind: str, cell: Any, view: str) -> Any:
+        if kind in codecs.PICTURE_KINDS:
+            return codecs.decode(kind, _content(kind, cell), self.grid)
+        if kind in CAMERA_KINDS:
+            return camera_array(kind, cell)
+        if kind == "view_id" and cell not in self.scene_by_view:
+            raise ValueError("it is not in the manifest")
+        if kind == "scene" and cell != (expected := self.scene_by_view.get(view, cell)):
+            raise ValueError(f"got {short_repr(cell)}, expected {expected} as in the manifest")
+        if kind == "baseline_m" and not (isinstance(cell, float) and math.isfinite(cell)):
+            raise ValueError(f"got {cell}, expected a length in metres")
+        return cell
+
+
+def _content(kind: str, cell: Any) -> bytes:
+    """Return the encoded image in a cell of a shard. Raises an error of any type for another cell."""
+    content = cell if kind == "depth" else cell["bytes"]
+    if not isinstance(content, bytes):
+        raise ValueError("the cell holds no bytes")
+    return content
+
+
+def iterate_rows(config: DatasetConfig, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """Yield the decoded rows of a config, one at a time, without a cache.
+
+    Raises ``DatasetError`` if a shard or a cell is damaged, and unless the rows are the views of the manifest.
+    """
+    return map(RowDecoder.of(config).row, iterate_undecoded(config, columns))
+
+
+def iterate_undecoded(config: DatasetConfig, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
+    """Yield the rows of a config with encoded images and depth, one at a time; ``RowDecoder`` decodes them.
+
+    The shards are read with pyarrow: ``datasets`` takes a second to import, and imports torch, which takes
+    several, to stream. Shards of the Hub are streamed. Raises ``DatasetError`` as ``iterate_rows``.
+    """
+    return all_rows(config, validated_columns(columns))
+
+
+def check_columns(config: DatasetConfig, columns: Sequence[str], reader: str) -> None:
+    """Raise ``DatasetError`` if ``reader`` needs columns that are absent: built or imported without them."""
+    needed = [name for name in columns if name in config.absent_columns]
+    if not needed:
+        return
+    place = f"{config.root}: {reader} needs {', '.join(needed)}, but config {config.name} was"
+    if config.imported is not None:
+        raise DatasetError(f"{place} imported without them; choose other configs (--config)")
+    raise DatasetError(
+        f"{place} built without colour (rebar-build --no-colour); choose configs with colour (--config), or build "
+        "it with colour"
+    )
