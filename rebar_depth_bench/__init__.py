@@ -48,11 +48,11 @@ _MODULE_BY_NAME = {
     "crossings": "bar_crossings.table",
     "load": "data.loading",
     "score": "scoring.evaluation",
-    "torch_loader": "data.torch_loader",
+    "torch_loader": "data.torch",
     "SubmissionWriter": "submission",
     "Result": "scoring.result",
-    "Table": "scoring.result",
-    "ViewScore": "scoring.result",
+    "Table": "scoring.table",
+    "ViewScore": "scoring.table",
 }
 
 
