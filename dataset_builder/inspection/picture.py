@@ -6,17 +6,21 @@ import io
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFont
 
-from dataset_builder.inspection.font import font, shortened
 from dataset_builder.inspection.summary import Inspection, diameter_mm
 from dataset_builder.scene.assemblies.cage import CageBar
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting.formatting import counted
+
+FONT_FILE = "DejaVuSans-subset.ttf"
+"""Font of the pictures, which comes with the package: the same text width on every machine."""
 
 _PANEL_PX, _MARGIN_PX, _HEAD_PX = (960, 640), 40, 90
 _OVERSAMPLING = 2
@@ -241,3 +245,26 @@ def _write_legend(
         draw.line((x, y + 12, x + 34, y + 12), colour, 8)
         draw.text((x + 46, y), text, _INK, font(20))
         x = int(end) + 36
+
+
+@cache
+def font(size_px: float) -> ImageFont.FreeTypeFont:
+    """Return the font at a size in pixels."""
+    content = files("dataset_builder.inspection").joinpath(FONT_FILE).read_bytes()
+    return ImageFont.truetype(io.BytesIO(content), size_px, layout_engine=ImageFont.Layout.BASIC)
+
+
+def text_width(text: str, size_px: float) -> float:
+    """Return the width of a text in pixels."""
+    return font(1000).getlength(text) * size_px / 1000
+
+
+def shortened(text: str, size_px: float, width_px: float) -> str:
+    """Return a text that fits into a width, an ellipsis in its middle if need be: names differ at the end."""
+    if text_width(text, size_px) <= width_px:
+        return text
+    for kept in range(len(text) - 1, 1, -1):
+        short = f"{text[: (kept + 1) // 2]}…{text[len(text) - kept // 2 :]}"
+        if text_width(short, size_px) <= width_px:
+            return short
+    return "…"
