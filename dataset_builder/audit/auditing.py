@@ -30,10 +30,10 @@ from dataset_builder.audit.checks import (
 )
 from dataset_builder.audit.geometry import (
     axis_verdict,
+    board_error,
     board_verdict,
     cage_checks,
     max_axis_distance_ratio,
-    view_board_error,
 )
 from dataset_builder.audit.imported import imported_checks
 from dataset_builder.audit.independent_depth import (
@@ -47,11 +47,9 @@ from dataset_builder.pipeline.plan import BUILD_FOLDER
 from rebar_depth_bench.bar_crossings.definition import Crossings, scene_crossings
 from rebar_depth_bench.bar_crossings.table import CROSSINGS_FILE, folder_crossings
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars
-from rebar_depth_bench.data.columns import EYES
 from rebar_depth_bench.data.config_tables import ViewRecord
 from rebar_depth_bench.data.dataset import iterate_rows
 from rebar_depth_bench.data.dataset_config import DatasetConfig
-from rebar_depth_bench.data.eye_view import EyeView, eye_from_row
 from rebar_depth_bench.data.location import local_folder
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.data.verification import file_problems
@@ -100,16 +98,15 @@ def _are_equal(stored: Crossings | None, expected: Crossings | None) -> bool:
     )
 
 
-def row_problems(row: Mapping[str, Any], record: ViewRecord, bar_ids: set[int]) -> Iterator[str]:
-    """Yield the problems of a decoded row: masks, bar ids, differences from the manifest."""
-    eyes = {name: eye_from_row(row, name) for name in EYES}
-    for name, eye in eyes.items():
+def row_problems(view: AuditedView, record: ViewRecord, bar_ids: set[int]) -> Iterator[str]:
+    """Yield the problems of a view's row: masks, bar ids, differences from the manifest."""
+    for name, eye in view.eyes.items():
         for problem in _ground_truth_problems(eye, bar_ids):
             yield f"{name}: {problem}"
-    yield from record_problems(row["view_id"], eyes, record)
+    yield from record_problems(view.view_id, view.eyes, record)
 
 
-def _ground_truth_problems(eye: EyeView, bar_ids: set[int]) -> Iterator[str]:
+def _ground_truth_problems(eye: AuditedEye, bar_ids: set[int]) -> Iterator[str]:
     if not np.array_equal(eye.mask, eye.bars > 0):
         yield "the mask differs from the pixels that have a bar id"
     if (eye.depth_m[eye.mask] <= 0).any():
@@ -133,7 +130,7 @@ class ViewCheck:
 
 VIEW_CHECKS: tuple[ViewCheck, ...] = (
     ViewCheck(max_axis_distance_ratio, axis_verdict),
-    ViewCheck(view_board_error, board_verdict),
+    ViewCheck(board_error, board_verdict),
     ViewCheck(epipolar_counts, epipolar_verdict),
     # The camera check compares K and distortion of every view, so a few views suffice for the lens model.
     ViewCheck(view_projection_error_px, projection_verdict, views=12),
@@ -225,10 +222,10 @@ def _scene_checks(
     cycles_eyes: list[AuditedEye] = []
     bar_ids, rays = {bar.bar_id for bar in steel}, RayCache()
     for n, (record, row) in enumerate(zip(config.views, iterate_rows(config, AUDITED_COLUMNS), strict=True)):
-        row_faults += [f"{record.view_id}: {problem}" for problem in row_problems(row, record, bar_ids)]
+        view = view_from_row(row, rays)
+        row_faults += [f"{record.view_id}: {problem}" for problem in row_problems(view, record, bar_ids)]
         if n < len(expected):
             camera_faults += [f"{record.view_id}: {problem}" for problem in camera_problems(row, expected[n])]
-        view = view_from_row(row, rays)
         for check, of_check, selected in zip(VIEW_CHECKS, measurements, measured, strict=True):
             if n in selected:
                 of_check.append(check.measure(audited, view))
