@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -154,7 +154,8 @@ def audit(root: str | Path, *, depth_views: int = 4, progress: Progress = silent
         bars = read_bars(path / BARS_FILE)
         checks.append(check_crossings(folder, bars))
         for config in folder.config_by_name.values():
-            checks += _config_checks(config, path, bars, depth_views, progress)
+            of_config = _config_checks(config, path, bars, depth_views, progress)
+            checks += [replace(check, name=f"{config.name}: {check.name}") for check in of_config]
     return AuditReport(str(root), tuple(checks))
 
 
@@ -173,31 +174,29 @@ def _config_checks(
         return
     scenes = config.by_scene()
     sampled = set(subset(len(scenes), SAMPLED_SCENES))
-    checks: list[Check] = []
+    by_scene: dict[str, list[Check]] = {}
     for number, scene in enumerate(scenes):
-        steel = _steel(scene, bars)
-        checks += cage_checks(scene, steel)
-        checks += _scene_checks(scene, root, steel, depth_views if number in sampled else 0, silent)
+        steel, views = _steel(scene, bars), depth_views if number in sampled else 0
+        by_scene[scene.label] = [*cage_checks(scene, steel), *_scene_checks(scene, root, steel, views, silent)]
         progress(f"audit of {config.name}", number + 1, len(scenes))
-    yield from _merged_checks(config.name, checks)
+    yield from _merged_checks(by_scene)
 
 
-def _merged_checks(config: str, checks: Sequence[Check]) -> Iterator[Check]:
-    """Yield one check for all checks of the same name, which begins with the label of a scene and a colon.
+def _merged_checks(by_scene: Mapping[str, Sequence[Check]]) -> Iterator[Check]:
+    """Yield one check for each check of the scenes, which are the same in all of them.
 
     A check that is skipped in all scenes is skipped for the reason of the first one.
     """
-    by_name: dict[str, list[Check]] = {}
-    for check in checks:
-        by_name.setdefault(check.name.partition(": ")[2], []).append(check)
-    for name, group in by_name.items():
+    for group in zip(*by_scene.values(), strict=True):
         made = [check for check in group if not check.skipped]
         if not made:
-            yield Check.skip(f"{config}: {name}", group[0].measured)
+            yield group[0]
             continue
-        problems = (f"{check.name.partition(': ')[0]}: {problem}" for check in made for problem in check.problems)
+        problems = (
+            f"{scene}: {one}" for scene, check in zip(by_scene, group, strict=True) for one in check.problems
+        )
         measured = f"{sum(check.passed for check in made)} of {len(made)} scenes, such as: {made[0].measured}"
-        yield Check(f"{config}: {name}", measured, made[0].bound, tuple(problems))
+        yield Check(made[0].name, measured, made[0].bound, tuple(problems))
 
 
 def _steel(config: DatasetConfig, bars: Mapping[str, tuple[Bar, ...]]) -> tuple[Bar, ...]:
@@ -211,8 +210,8 @@ def _scene_checks(
     config: DatasetConfig, root: Path, steel: tuple[Bar, ...], depth_views: int, progress: Progress
 ) -> Iterator[Check]:
     """Yield the checks of a config of one scene, or restricted to one scene, with the bars ``steel``."""
-    name, mesh = config.label, root / config.mesh
-    audited = AuditedConfig(name, config.scene.appearance.variants, steel, config.scene.board)
+    mesh = root / config.mesh
+    audited = AuditedConfig(config.scene.appearance.variants, steel, config.scene.board)
     aim_m, aim_problems = checked_aim_point_m(config, mesh)
     expected = expected_views(config, aim_m, steel)
     row_faults, camera_faults = list[str](), [*aim_problems, *view_list_problems(config, expected)]
@@ -231,14 +230,12 @@ def _scene_checks(
                 of_check.append(check.measure(audited, view))
         if n in rendered:
             cycles_eyes += [view.left, view.right]
-        progress(f"audit of {name}", n + 1, len(config.views))
-    yield Check(f"{name}: rows", f"{len(config.views)} views", "all invariants", tuple(row_faults))
-    yield Check(
-        f"{name}: cameras", f"{len(expected)} poses of the protocol", "equal to 1e-12", tuple(camera_faults)
-    )
+        progress(f"audit of {config.label}", n + 1, len(config.views))
+    yield Check("rows", f"{len(config.views)} views", "all invariants", tuple(row_faults))
+    yield Check("cameras", f"{len(expected)} poses of the protocol", "equal to 1e-12", tuple(camera_faults))
     for check, of_check in zip(VIEW_CHECKS, measurements, strict=True):
         yield check.verdict(audited, of_check)
     difference_and_depth_m = cycles_difference_m(
-        mesh, cycles_eyes, lambda done, total: progress(f"Cycles depth of {name}", done, total)
+        mesh, cycles_eyes, lambda done, total: progress(f"Cycles depth of {config.label}", done, total)
     )
-    yield cycles_verdict(name, difference_and_depth_m, len(cycles_eyes) // 2)
+    yield cycles_verdict(difference_and_depth_m, len(cycles_eyes) // 2)

@@ -172,12 +172,12 @@ def projection_error_px(eye: AuditedEye) -> float:
     return float(np.abs(projected_px[:, 0] - np.stack([u, v], axis=1)).max())
 
 
-def projection_verdict(config: AuditedConfig, errors_px: Sequence[float]) -> Check:
+def projection_verdict(_: AuditedConfig, errors_px: Sequence[float]) -> Check:
     """Return the check of the largest reprojection error of the measured views."""
     worst_px = max(errors_px, default=0.0)
     problem = f"cv2.projectPoints projects a pixel's 3-D point {worst_px:.2e} px away from the pixel"
     return Check(
-        f"{config.name}: reprojection with OpenCV's lens model",
+        "reprojection with OpenCV's lens model",
         f"{len(errors_px)} views: at most {worst_px:.1e} px",
         f"{MAX_PROJECTION_ERROR_PX:g} px",
         () if worst_px <= MAX_PROJECTION_ERROR_PX else (problem,),

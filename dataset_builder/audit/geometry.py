@@ -125,7 +125,7 @@ def polyline_distance_m(
 
 def axis_verdict(config: AuditedConfig, ratios: Sequence[float]) -> Check:
     """Return the check of the largest axis distance of all views; bars with estimated axes are left out."""
-    name, largest = f"{config.name}: steel distance from the bar axis", max(ratios, default=0.0)
+    name, largest = "steel distance from the bar axis", max(ratios, default=0.0)
     measured = f"at most {largest:.3f} radii"
     if not config.bars_with_known_axis:
         return Check.skip(name, "the bar axes are estimated")
@@ -163,7 +163,7 @@ def board_verdict(config: AuditedConfig, errors: Sequence[BoardError]) -> Check:
     Props of a scene may stand on the board. In such a scene no point may lie below the plane, at least half of the
     points must lie within 0.1 mm of it, and those must lie on it within ``MAX_BOARD_ERROR_M``.
     """
-    name = f"{config.name}: board at z = 0"
+    name = "board at z = 0"
     if config.board is None:
         return Check.skip(name, "no board in this scene")
     pixels = sum(error.pixels for error in errors)
@@ -191,14 +191,14 @@ def _plane_problems(off_m: float) -> Iterator[str]:
 def cage_checks(scene: DatasetConfig, bars: Sequence[Bar]) -> Iterator[Check]:
     """Yield the checks of one generated scene that need no images; ``bars`` are those of ``bars.parquet``."""
     yield _bars_check(scene, bars)
-    yield _gap_check(scene, bars)
+    yield _gap_check(bars)
     yield _steel_check(scene)
     yield _clearance_check(scene, bars)
 
 
 def _bars_check(scene: DatasetConfig, bars: Sequence[Bar]) -> Check:
     """Return the check of the bars against those that the generator makes from the parameters in the manifest."""
-    name = f"{scene.label}: bars and their designs"
+    name = "bars and their designs"
     spec = cage_spec(scene)
     if spec.version != VERSION:
         return Check.skip(name, f"made by version {spec.version} of the generator, this is {VERSION}")
@@ -219,7 +219,7 @@ def _identity(bar: Bar) -> tuple[int, str, float, int, int]:
     return bar.bar_id, bar.role, bar.diameter_m, len(bar.axis_m), len(bar.nominal_axis_m)
 
 
-def _gap_check(scene: DatasetConfig, bars: Sequence[Bar]) -> Check:
+def _gap_check(bars: Sequence[Bar]) -> Check:
     """Return the check that no two bars touch, ribs included."""
     lines, radii = [np.array(bar.axis_m) for bar in bars], [outer_radius_m(bar.diameter_m) for bar in bars]
     clearances = Clearances(lines, radii)
@@ -227,7 +227,7 @@ def _gap_check(scene: DatasetConfig, bars: Sequence[Bar]) -> Check:
         clearances.least_m(line, radius, i) for i, (line, radius) in enumerate(zip(lines, radii, strict=True))
     )
     problems = () if least_m > 0 else (f"two bars penetrate each other by {-least_m * 1000:.2f} mm",)
-    return Check(f"{scene.label}: gaps of bars", f"{least_m * 1000:.2f} mm or more", "above 0 mm", problems)
+    return Check("gaps of bars", f"{least_m * 1000:.2f} mm or more", "above 0 mm", problems)
 
 
 def _steel_check(scene: DatasetConfig) -> Check:
@@ -235,12 +235,12 @@ def _steel_check(scene: DatasetConfig) -> Check:
     without = [view.view_id for view in scene.views if not view.steel_px]
     least = min((view.steel_px or 0) for view in scene.views) / (scene.rig.width * scene.rig.height)
     problems = tuple(f"{view_id} shows no steel" for view_id in without)
-    return Check(f"{scene.label}: steel in every view", f"{least:.1%} of the frame or more", "above 0", problems)
+    return Check("steel in every view", f"{least:.1%} of the frame or more", "above 0", problems)
 
 
 def _clearance_check(scene: DatasetConfig, bars: Sequence[Bar]) -> Check:
     """Return the check that the left cameras of random views are clear of all bars."""
-    name, views = f"{scene.label}: cameras clear of steel", trajectory_spec(scene)
+    name, views = "cameras clear of steel", trajectory_spec(scene)
     if not isinstance(views, RandomViewsSpec):
         return Check.skip(name, "no random views")
     centres_m = np.array([centre_m for centre_m, *_ in views.stations])

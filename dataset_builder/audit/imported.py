@@ -68,7 +68,7 @@ def imported_checks(
     config: DatasetConfig, imported: Imported, bars: tuple[Bar, ...], progress: Progress
 ) -> Iterator[Check]:
     """Yield the checks of an imported config with the ``bars`` of its scene, in one pass over its rows."""
-    name, row_faults, camera_faults = config.name, list[str](), list[str]()
+    row_faults, camera_faults = list[str](), list[str]()
     from_axes, between_eyes = _Deviations(), _Deviations()
     ids = {bar.bar_id for bar in bars}
     surveyed = with_axis(bars) if imported.has_poses else ()
@@ -83,13 +83,13 @@ def imported_checks(
         camera_faults += [f"{record.view_id}: {one}" for one in _camera_problems(row, config)]
         if "right" in eyes:
             _compare_eyes(eyes["left"], eyes["right"], allowed_m, between_eyes)
-        progress(f"audit of {name}", done, len(config.views))
-    yield Check(f"{name}: rows", f"{len(config.views)} views", "all invariants", tuple(row_faults))
-    yield Check(f"{name}: cameras", f"{len(config.views)} views", "plausible", tuple(camera_faults))
+        progress(f"audit of {config.name}", done, len(config.views))
+    yield Check("rows", f"{len(config.views)} views", "all invariants", tuple(row_faults))
+    yield Check("cameras", f"{len(config.views)} views", "plausible", tuple(camera_faults))
     reason = "no bar ids, no surveyed bars, or no poses"
-    yield from_axes.check(f"{name}: steel from the surface of its surveyed bar", reason)
-    yield between_eyes.check(f"{name}: left depth against right depth", "no depth of the right camera")
-    yield Check.skip(f"{name}: depth against a second source", "imported")
+    yield from_axes.check("steel from the surface of its surveyed bar", reason)
+    yield between_eyes.check("left depth against right depth", "no depth of the right camera")
+    yield Check.skip("depth against a second source", "imported")
 
 
 def _truth_problems(truth: EyeTruth, bar_ids: set[int]) -> Iterator[str]:

@@ -70,9 +70,9 @@ def cycles_difference_m(
     return np.concatenate(differences)
 
 
-def cycles_verdict(config: str, difference_and_depth_m: ndarray[Any, Any], views: int) -> Check:
+def cycles_verdict(difference_and_depth_m: ndarray[Any, Any], views: int) -> Check:
     """Return the check of the depth differences of ``views`` views, skipped if no views were requested."""
-    name = f"{config}: depth compared with Cycles"
+    name = "depth compared with Cycles"
     if not views:
         return Check.skip(name, "no views requested")
     if not len(difference_and_depth_m):
@@ -165,9 +165,9 @@ def epipolar_counts(config: AuditedConfig, view: AuditedView) -> EpipolarCounts:
     )
 
 
-def epipolar_verdict(config: AuditedConfig, views: Sequence[EpipolarCounts]) -> Check:
+def epipolar_verdict(_: AuditedConfig, views: Sequence[EpipolarCounts]) -> Check:
     """Return the check of the share of contradicted pixels of all views."""
-    name = f"{config.name}: left steel projected into the right eye"
+    name = "left steel projected into the right eye"
     seen, hidden, contradicted = (
         sum(getattr(counts, kind) for counts in views) for kind in ("seen", "hidden", "contradicted")
     )

@@ -138,15 +138,15 @@ def test_epipolar_share_is_over_all_views() -> None:
 def test_cycles_differences_are_relative_to_depth() -> None:
     depth_m = np.full(10_000, 8.0)
     noise_m = np.full(10_000, 3e-6 * 8.0)
-    assert cycles_verdict("c", np.stack([noise_m, depth_m], axis=1), 2).passed
-    assert not cycles_verdict("c", np.stack([noise_m, depth_m / 8], axis=1), 2).passed
+    assert cycles_verdict(np.stack([noise_m, depth_m], axis=1), 2).passed
+    assert not cycles_verdict(np.stack([noise_m, depth_m / 8], axis=1), 2).passed
     noise_m[:20] = 0.009  # 20 pixels on another surface
-    assert not cycles_verdict("c", np.stack([noise_m, depth_m], axis=1), 2).passed
+    assert not cycles_verdict(np.stack([noise_m, depth_m], axis=1), 2).passed
     noise_m[:20] = 0.007
-    assert cycles_verdict("c", np.stack([noise_m, depth_m], axis=1), 2).passed
-    assert not cycles_verdict("c", np.full((5, 2), np.nan), 2).passed
-    assert cycles_verdict("c", cycles_difference_m(Path("none.ply"), [], print), 0).skipped
-    assert cycles_verdict("c", np.zeros((0, 2)), 2).measured == "2 views: no steel"
+    assert cycles_verdict(np.stack([noise_m, depth_m], axis=1), 2).passed
+    assert not cycles_verdict(np.full((5, 2), np.nan), 2).passed
+    assert cycles_verdict(cycles_difference_m(Path("none.ply"), [], print), 0).skipped
+    assert cycles_verdict(np.zeros((0, 2)), 2).measured == "2 views: no steel"
 
 
 def test_points_beyond_lens_model_are_not_in_frame() -> None:
