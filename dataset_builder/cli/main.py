@@ -135,7 +135,7 @@ def _export(options: argparse.Namespace) -> None:
     from dataset_builder.export import export
 
     with ProgressBars() as bars:
-        summary = export(
+        exported = export(
             options.root,
             options.out,
             options.config,
@@ -143,7 +143,7 @@ def _export(options: argparse.Namespace) -> None:
             progress=bars.update,
             split=options.split,
         )
-    for config in summary.configs:
+    for config in exported:
         print(f"{config.config}: {config.views} views, {config.written} files written, {config.kept} kept")
     print(options.out)
 
