@@ -106,7 +106,6 @@ def _card(folder: DatasetFolder) -> DatasetCard:
 
     Raises ``DatasetError`` if it cannot be parsed or has other configs than the manifest.
     """
-    problem = None
     try:
         card: DatasetCard = DatasetCard.load(folder.verified_file(REPOCARD_NAME))
         names = [str(entry["config_name"]) for entry in card.data["configs"]]
@@ -115,13 +114,11 @@ def _card(folder: DatasetFolder) -> DatasetCard:
     except Exception as error:  # The parsers of YAML and of the card's fields raise many types.
         found = f"is no dataset card: {escape_text(exception_summary(error))}"
         problem = Problem("syntax", REPOCARD_NAME, found, "one written by rebar-build")
-    else:
-        if sorted(names) != sorted(folder.configs):
-            found = f"has the configs {escape_text(', '.join(names))}"
-            expected = f"those of the manifest, {', '.join(folder.configs)}"
-            problem = Problem("conflict", REPOCARD_NAME, found, expected)
-    if problem is not None:
-        raise DatasetError.from_problems(folder.root, [problem])
+        raise DatasetError.from_problems(folder.root, [problem]) from None
+    if sorted(names) != sorted(folder.configs):
+        found = f"has the configs {escape_text(', '.join(names))}"
+        expected = f"those of the manifest, {', '.join(folder.configs)}"
+        raise DatasetError.from_problems(folder.root, [Problem("conflict", REPOCARD_NAME, found, expected)])
     return card
 
 
