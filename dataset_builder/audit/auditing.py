@@ -215,8 +215,7 @@ def _scene_checks(
     aim_m, aim_problems = checked_aim_point_m(config, mesh)
     expected = expected_views(config, aim_m, steel)
     row_faults, camera_faults = list[str](), [*aim_problems, *view_list_problems(config, expected)]
-    measured = [set(subset(len(config.views), check.views)) for check in VIEW_CHECKS]
-    measurements: list[list[Any]] = [[] for _ in VIEW_CHECKS]
+    measured = [(check, set(subset(len(config.views), check.views)), list[Any]()) for check in VIEW_CHECKS]
     rendered = set(subset(len(config.views), depth_views) if depth_views else ())
     cycles_eyes: list[AuditedEye] = []
     bar_ids, rays = {bar.bar_id for bar in steel}, RayCache()
@@ -225,16 +224,16 @@ def _scene_checks(
         row_faults += [f"{record.view_id}: {problem}" for problem in row_problems(view, record, bar_ids)]
         if n < len(expected):
             camera_faults += [f"{record.view_id}: {problem}" for problem in camera_problems(row, expected[n])]
-        for check, of_check, selected in zip(VIEW_CHECKS, measurements, measured, strict=True):
+        for check, selected, measurements in measured:
             if n in selected:
-                of_check.append(check.measure(audited, view))
+                measurements.append(check.measure(audited, view))
         if n in rendered:
             cycles_eyes += [view.left, view.right]
         progress(f"audit of {config.label}", n + 1, len(config.views))
     yield Check("rows", f"{len(config.views)} views", "all invariants", tuple(row_faults))
     yield Check("cameras", f"{len(expected)} poses of the protocol", "equal to 1e-12", tuple(camera_faults))
-    for check, of_check in zip(VIEW_CHECKS, measurements, strict=True):
-        yield check.verdict(audited, of_check)
+    for check, _, measurements in measured:
+        yield check.verdict(audited, measurements)
     difference_and_depth_m = cycles_difference_m(
         mesh, cycles_eyes, lambda done, total: progress(f"Cycles depth of {config.label}", done, total)
     )
