@@ -24,8 +24,7 @@ from numpy import ndarray
 from PIL import Image, ImageDraw
 
 from benchmarks.timing import machine_description, print_markdown
-from dataset_builder.inspection.font import font
-from dataset_builder.inspection.picture import corner_view
+from dataset_builder.inspection.picture import corner_view, font
 from dataset_builder.inspection.summary import inspect_cage
 from dataset_builder.scene.assemblies.cage import Cage
 from dataset_builder.scene.assemblies.generated import cage_bars

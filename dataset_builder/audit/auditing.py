@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -30,10 +30,10 @@ from dataset_builder.audit.checks import (
 )
 from dataset_builder.audit.geometry import (
     axis_verdict,
+    board_error,
     board_verdict,
     cage_checks,
     max_axis_distance_ratio,
-    view_board_error,
 )
 from dataset_builder.audit.imported import imported_checks
 from dataset_builder.audit.independent_depth import (
@@ -49,8 +49,8 @@ from rebar_depth_bench.bar_crossings.table import CROSSINGS_FILE, folder_crossin
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars
 from rebar_depth_bench.data.files import local_folder
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_folder
-from rebar_depth_bench.data.rows import EyeView, eye_from_row, iterate_rows
-from rebar_depth_bench.data.schema import EYES, ViewRecord
+from rebar_depth_bench.data.rows import iterate_rows
+from rebar_depth_bench.data.schema import ViewRecord
 from rebar_depth_bench.data.verification import file_problems
 from rebar_depth_bench.errors import DatasetError, InputError
 from rebar_depth_bench.parallel import Progress, silent
@@ -97,16 +97,15 @@ def _are_equal(stored: Crossings | None, expected: Crossings | None) -> bool:
     )
 
 
-def row_problems(row: Mapping[str, Any], record: ViewRecord, bar_ids: set[int]) -> Iterator[str]:
-    """Yield the problems of a decoded row: masks, bar ids, differences from the manifest."""
-    eyes = {name: eye_from_row(row, name) for name in EYES}
-    for name, eye in eyes.items():
+def row_problems(view: AuditedView, record: ViewRecord, bar_ids: set[int]) -> Iterator[str]:
+    """Yield the problems of a view's row: masks, bar ids, differences from the manifest."""
+    for name, eye in view.eyes.items():
         for problem in _ground_truth_problems(eye, bar_ids):
             yield f"{name}: {problem}"
-    yield from record_problems(row["view_id"], eyes, record)
+    yield from record_problems(view.view_id, view.eyes, record)
 
 
-def _ground_truth_problems(eye: EyeView, bar_ids: set[int]) -> Iterator[str]:
+def _ground_truth_problems(eye: AuditedEye, bar_ids: set[int]) -> Iterator[str]:
     if not np.array_equal(eye.mask, eye.bars > 0):
         yield "the mask differs from the pixels that have a bar id"
     if (eye.depth_m[eye.mask] <= 0).any():
@@ -130,7 +129,7 @@ class ViewCheck:
 
 VIEW_CHECKS: tuple[ViewCheck, ...] = (
     ViewCheck(max_axis_distance_ratio, axis_verdict),
-    ViewCheck(view_board_error, board_verdict),
+    ViewCheck(board_error, board_verdict),
     ViewCheck(epipolar_counts, epipolar_verdict),
     # The camera check compares K and distortion of every view, so a few views suffice for the lens model.
     ViewCheck(view_projection_error_px, projection_verdict, views=12),
@@ -154,7 +153,8 @@ def audit(root: str | Path, *, depth_views: int = 4, progress: Progress = silent
         bars = read_bars(path / BARS_FILE)
         checks.append(check_crossings(folder, bars))
         for config in folder.config_by_name.values():
-            checks += _config_checks(config, path, bars, depth_views, progress)
+            of_config = _config_checks(config, path, bars, depth_views, progress)
+            checks += [replace(check, name=f"{config.name}: {check.name}") for check in of_config]
     return AuditReport(str(root), tuple(checks))
 
 
@@ -173,31 +173,29 @@ def _config_checks(
         return
     scenes = config.by_scene()
     sampled = set(subset(len(scenes), SAMPLED_SCENES))
-    checks: list[Check] = []
+    by_scene: dict[str, list[Check]] = {}
     for number, scene in enumerate(scenes):
-        steel = _steel(scene, bars)
-        checks += cage_checks(scene, steel)
-        checks += _scene_checks(scene, root, steel, depth_views if number in sampled else 0, silent)
+        steel, views = _steel(scene, bars), depth_views if number in sampled else 0
+        by_scene[scene.label] = [*cage_checks(scene, steel), *_scene_checks(scene, root, steel, views, silent)]
         progress(f"audit of {config.name}", number + 1, len(scenes))
-    yield from _merged_checks(config.name, checks)
+    yield from _merged_checks(by_scene)
 
 
-def _merged_checks(config: str, checks: Sequence[Check]) -> Iterator[Check]:
-    """Yield one check for all checks of the same name, which begins with the label of a scene and a colon.
+def _merged_checks(by_scene: Mapping[str, Sequence[Check]]) -> Iterator[Check]:
+    """Yield one check for each check of the scenes, which are the same in all of them.
 
     A check that is skipped in all scenes is skipped for the reason of the first one.
     """
-    by_name: dict[str, list[Check]] = {}
-    for check in checks:
-        by_name.setdefault(check.name.partition(": ")[2], []).append(check)
-    for name, group in by_name.items():
+    for group in zip(*by_scene.values(), strict=True):
         made = [check for check in group if not check.skipped]
         if not made:
-            yield Check.skip(f"{config}: {name}", group[0].measured)
+            yield group[0]
             continue
-        problems = (f"{check.name.partition(': ')[0]}: {problem}" for check in made for problem in check.problems)
+        problems = (
+            f"{scene}: {one}" for scene, check in zip(by_scene, group, strict=True) for one in check.problems
+        )
         measured = f"{sum(check.passed for check in made)} of {len(made)} scenes, such as: {made[0].measured}"
-        yield Check(f"{config}: {name}", measured, made[0].bound, tuple(problems))
+        yield Check(made[0].name, measured, made[0].bound, tuple(problems))
 
 
 def _steel(config: DatasetConfig, bars: Mapping[str, tuple[Bar, ...]]) -> tuple[Bar, ...]:
@@ -211,34 +209,31 @@ def _scene_checks(
     config: DatasetConfig, root: Path, steel: tuple[Bar, ...], depth_views: int, progress: Progress
 ) -> Iterator[Check]:
     """Yield the checks of a config of one scene, or restricted to one scene, with the bars ``steel``."""
-    name, mesh = config.label, root / config.mesh
-    audited = AuditedConfig(name, config.scene.appearance.variants, steel, config.scene.board)
+    mesh = root / config.mesh
+    audited = AuditedConfig(config.scene.appearance.variants, steel, config.scene.board)
     aim_m, aim_problems = checked_aim_point_m(config, mesh)
     expected = expected_views(config, aim_m, steel)
     row_faults, camera_faults = list[str](), [*aim_problems, *view_list_problems(config, expected)]
-    measured = [set(subset(len(config.views), check.views)) for check in VIEW_CHECKS]
-    measurements: list[list[Any]] = [[] for _ in VIEW_CHECKS]
+    measured = [(check, set(subset(len(config.views), check.views)), list[Any]()) for check in VIEW_CHECKS]
     rendered = set(subset(len(config.views), depth_views) if depth_views else ())
     cycles_eyes: list[AuditedEye] = []
     bar_ids, rays = {bar.bar_id for bar in steel}, RayCache()
     for n, (record, row) in enumerate(zip(config.views, iterate_rows(config, AUDITED_COLUMNS), strict=True)):
-        row_faults += [f"{record.view_id}: {problem}" for problem in row_problems(row, record, bar_ids)]
+        view = view_from_row(row, rays)
+        row_faults += [f"{record.view_id}: {problem}" for problem in row_problems(view, record, bar_ids)]
         if n < len(expected):
             camera_faults += [f"{record.view_id}: {problem}" for problem in camera_problems(row, expected[n])]
-        view = view_from_row(row, rays)
-        for check, of_check, selected in zip(VIEW_CHECKS, measurements, measured, strict=True):
+        for check, selected, measurements in measured:
             if n in selected:
-                of_check.append(check.measure(audited, view))
+                measurements.append(check.measure(audited, view))
         if n in rendered:
             cycles_eyes += [view.left, view.right]
-        progress(f"audit of {name}", n + 1, len(config.views))
-    yield Check(f"{name}: rows", f"{len(config.views)} views", "all invariants", tuple(row_faults))
-    yield Check(
-        f"{name}: cameras", f"{len(expected)} poses of the protocol", "equal to 1e-12", tuple(camera_faults)
-    )
-    for check, of_check in zip(VIEW_CHECKS, measurements, strict=True):
-        yield check.verdict(audited, of_check)
+        progress(f"audit of {config.label}", n + 1, len(config.views))
+    yield Check("rows", f"{len(config.views)} views", "all invariants", tuple(row_faults))
+    yield Check("cameras", f"{len(expected)} poses of the protocol", "equal to 1e-12", tuple(camera_faults))
+    for check, _, measurements in measured:
+        yield check.verdict(audited, measurements)
     difference_and_depth_m = cycles_difference_m(
-        mesh, cycles_eyes, lambda done, total: progress(f"Cycles depth of {name}", done, total)
+        mesh, cycles_eyes, lambda done, total: progress(f"Cycles depth of {config.label}", done, total)
     )
-    yield cycles_verdict(name, difference_and_depth_m, len(cycles_eyes) // 2)
+    yield cycles_verdict(difference_and_depth_m, len(cycles_eyes) // 2)

@@ -68,11 +68,6 @@ class AuditReport:
         """Checks that did not pass; those that are skipped are no failures."""
         return tuple(check for check in self.checks if check.problems)
 
-    @property
-    def skipped(self) -> tuple[Check, ...]:
-        """Checks that were skipped."""
-        return tuple(check for check in self.checks if check.skipped)
-
 
 def print_audit(report: AuditReport, console: Console | None = None) -> None:
     """Print one table row per check, then the problems of each failed check.
@@ -94,7 +89,6 @@ def print_audit(report: AuditReport, console: Console | None = None) -> None:
 class AuditedConfig:
     """Config under audit: its appearance variants, the bars of its scene, and its board (None without one)."""
 
-    name: str
     variants: tuple[str, ...]
     steel: tuple[Bar, ...]
     board: BoardSpec | None

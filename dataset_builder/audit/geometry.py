@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64, UInt16
 from numpy import ndarray
 
-from dataset_builder.audit.checks import AuditedConfig, AuditedEye, AuditedView, Check
+from dataset_builder.audit.checks import AuditedConfig, AuditedView, Check
 from dataset_builder.cameras.camera_placement import RANDOM_RULES
 from dataset_builder.scene.cages.generate import VERSION
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
@@ -24,7 +24,6 @@ from dataset_builder.specs.manifest_specs import cage_spec, trajectory_spec
 from dataset_builder.user_files.make_assembly import assembly_bars
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.manifest import DatasetConfig
-from rebar_depth_bench.geometry.aruco_board import BoardSpec
 
 MAX_AXIS_RATIO = 1.2
 """Largest distance of a rib's surface from the bar axis, in nominal radii."""
@@ -62,14 +61,24 @@ def max_axis_distance_ratio(config: AuditedConfig, view: AuditedView) -> float:
     It is 1 on the lateral surface up to the height of the ribs, and less on an end cap. The sagitta of a bend's
     chords is subtracted, so that the same bound holds for every bar. Bars without a known axis are left out.
     """
-    bars, ratios = {bar.bar_id: bar for bar in config.bars_with_known_axis}, list[float]()
-    for eye in view.eyes.values():
-        for bar_id, on_bar_m in _points_by_bar(eye.points_m, eye.bars):
-            if bar_id in bars:
-                axis_m, radius_m = np.array(bars[bar_id].axis_m), bars[bar_id].diameter_m / 2
-                distance_m = polyline_distance_m(on_bar_m, axis_m) - bend_sagitta_m(axis_m)
-                ratios.append(float((distance_m / radius_m).max()))
+    ratios = [
+        float(((distance_m - bend_sagitta_m(np.array(bar.axis_m))) / (bar.diameter_m / 2)).max())
+        for eye in view.eyes.values()
+        for bar, distance_m in axis_distances_m(eye.points_m, eye.bars, config.bars_with_known_axis)
+    ]
     return float(np.max(ratios, initial=0.0))
+
+
+def axis_distances_m(
+    points_m: Float64[ndarray, "*n 3"], bar_ids: UInt16[ndarray, "*n"], bars: Iterable[Bar]
+) -> Iterator[tuple[Bar, Float64[ndarray, " m"]]]:
+    """Yield each of the bars that occurs in ``bar_ids``, and the distances of its points from its axis, metres."""
+    on_bar = bar_ids > 0
+    points_m, bar_ids = points_m[on_bar], bar_ids[on_bar]
+    found = set(np.unique(bar_ids).tolist())
+    for bar in bars:
+        if bar.bar_id in found:
+            yield bar, polyline_distance_m(points_m[bar_ids == bar.bar_id], np.array(bar.axis_m))
 
 
 def bend_sagitta_m(axis_m: Float64[ndarray, "k 3"]) -> float:
@@ -116,7 +125,7 @@ def polyline_distance_m(
 
 def axis_verdict(config: AuditedConfig, ratios: Sequence[float]) -> Check:
     """Return the check of the largest axis distance of all views; bars with estimated axes are left out."""
-    name, largest = f"{config.name}: steel distance from the bar axis", max(ratios, default=0.0)
+    name, largest = "steel distance from the bar axis", max(ratios, default=0.0)
     measured = f"at most {largest:.3f} radii"
     if not config.bars_with_known_axis:
         return Check.skip(name, "the bar axes are estimated")
@@ -124,20 +133,16 @@ def axis_verdict(config: AuditedConfig, ratios: Sequence[float]) -> Check:
     return Check(name, measured, f"{MAX_AXIS_RATIO} radii", (problem,) if largest > MAX_AXIS_RATIO else ())
 
 
-def view_board_error(config: AuditedConfig, view: AuditedView) -> BoardError:
-    """Return the board error of both eyes of a view, all zeros for a scene without a board."""
-    board = config.board
-    return BoardError() if board is None else board_error(view.eyes.values(), board)
-
-
-def board_error(eyes: Iterable[AuditedEye], board: BoardSpec) -> BoardError:
-    """Return the board error of the eyes' non-steel points over the board's rectangle.
+def board_error(config: AuditedConfig, view: AuditedView) -> BoardError:
+    """Return the board error of both eyes of a view, all zeros for a scene without a board.
 
     A margin of 1 mm inside the rectangle's edge is left out, because the sheet has sides.
     """
-    half_m = np.array([board.width_m, board.height_m]) / 2 - _BOARD_EDGE_MARGIN_M
+    if config.board is None:
+        return BoardError()
+    half_m = np.array([config.board.width_m, config.board.height_m]) / 2 - _BOARD_EDGE_MARGIN_M
     heights_m = []
-    for eye in eyes:
+    for eye in view.eyes.values():
         inside = (np.abs(eye.points_m[..., :2]) < half_m).all(axis=-1)
         heights_m.append(eye.points_m[inside & ~eye.mask & (eye.depth_m > 0)][:, 2])
     board_z_m = np.concatenate(heights_m)
@@ -158,7 +163,7 @@ def board_verdict(config: AuditedConfig, errors: Sequence[BoardError]) -> Check:
     Props of a scene may stand on the board. In such a scene no point may lie below the plane, at least half of the
     points must lie within 0.1 mm of it, and those must lie on it within ``MAX_BOARD_ERROR_M``.
     """
-    name = f"{config.name}: board at z = 0"
+    name = "board at z = 0"
     if config.board is None:
         return Check.skip(name, "no board in this scene")
     pixels = sum(error.pixels for error in errors)
@@ -183,29 +188,17 @@ def _plane_problems(off_m: float) -> Iterator[str]:
         yield f"a board pixel is {off_m * 1e6:.3f} um away from z = 0"
 
 
-def _points_by_bar(
-    points_m: Float64[ndarray, "h w 3"], bars: UInt16[ndarray, "h w"]
-) -> Iterator[tuple[int, Float64[ndarray, "n 3"]]]:
-    """Yield each bar id of an image with the world points of its pixels, metres."""
-    pixels = np.flatnonzero(bars)
-    ids = bars.ravel()[pixels]
-    order = np.argsort(ids, kind="stable")
-    starts = np.flatnonzero(np.diff(ids[order], prepend=0))
-    for group in np.split(order, starts[1:]) if len(starts) else ():
-        yield int(ids[group[0]]), points_m.reshape(-1, 3)[pixels[group]]
-
-
 def cage_checks(scene: DatasetConfig, bars: Sequence[Bar]) -> Iterator[Check]:
     """Yield the checks of one generated scene that need no images; ``bars`` are those of ``bars.parquet``."""
     yield _bars_check(scene, bars)
-    yield _gap_check(scene, bars)
+    yield _gap_check(bars)
     yield _steel_check(scene)
     yield _clearance_check(scene, bars)
 
 
 def _bars_check(scene: DatasetConfig, bars: Sequence[Bar]) -> Check:
     """Return the check of the bars against those that the generator makes from the parameters in the manifest."""
-    name = f"{scene.label}: bars and their designs"
+    name = "bars and their designs"
     spec = cage_spec(scene)
     if spec.version != VERSION:
         return Check.skip(name, f"made by version {spec.version} of the generator, this is {VERSION}")
@@ -226,7 +219,7 @@ def _identity(bar: Bar) -> tuple[int, str, float, int, int]:
     return bar.bar_id, bar.role, bar.diameter_m, len(bar.axis_m), len(bar.nominal_axis_m)
 
 
-def _gap_check(scene: DatasetConfig, bars: Sequence[Bar]) -> Check:
+def _gap_check(bars: Sequence[Bar]) -> Check:
     """Return the check that no two bars touch, ribs included."""
     lines, radii = [np.array(bar.axis_m) for bar in bars], [outer_radius_m(bar.diameter_m) for bar in bars]
     clearances = Clearances(lines, radii)
@@ -234,7 +227,7 @@ def _gap_check(scene: DatasetConfig, bars: Sequence[Bar]) -> Check:
         clearances.least_m(line, radius, i) for i, (line, radius) in enumerate(zip(lines, radii, strict=True))
     )
     problems = () if least_m > 0 else (f"two bars penetrate each other by {-least_m * 1000:.2f} mm",)
-    return Check(f"{scene.label}: gaps of bars", f"{least_m * 1000:.2f} mm or more", "above 0 mm", problems)
+    return Check("gaps of bars", f"{least_m * 1000:.2f} mm or more", "above 0 mm", problems)
 
 
 def _steel_check(scene: DatasetConfig) -> Check:
@@ -242,12 +235,12 @@ def _steel_check(scene: DatasetConfig) -> Check:
     without = [view.view_id for view in scene.views if not view.steel_px]
     least = min((view.steel_px or 0) for view in scene.views) / (scene.rig.width * scene.rig.height)
     problems = tuple(f"{view_id} shows no steel" for view_id in without)
-    return Check(f"{scene.label}: steel in every view", f"{least:.1%} of the frame or more", "above 0", problems)
+    return Check("steel in every view", f"{least:.1%} of the frame or more", "above 0", problems)
 
 
 def _clearance_check(scene: DatasetConfig, bars: Sequence[Bar]) -> Check:
     """Return the check that the left cameras of random views are clear of all bars."""
-    name, views = f"{scene.label}: cameras clear of steel", trajectory_spec(scene)
+    name, views = "cameras clear of steel", trajectory_spec(scene)
     if not isinstance(views, RandomViewsSpec):
         return Check.skip(name, "no random views")
     centres_m = np.array([centre_m for centre_m, *_ in views.stations])

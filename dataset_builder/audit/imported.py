@@ -6,7 +6,7 @@ compared with the standard deviation of the depth that the config states.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,7 +22,7 @@ from dataset_builder.audit.checks import (
     eye_with_rays,
     record_problems,
 )
-from dataset_builder.audit.geometry import polyline_distance_m
+from dataset_builder.audit.geometry import axis_distances_m
 from dataset_builder.audit.independent_depth import project_into
 from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.data.manifest import DatasetConfig
@@ -67,10 +67,10 @@ def imported_checks(
     config: DatasetConfig, imported: Imported, bars: tuple[Bar, ...], progress: Progress
 ) -> Iterator[Check]:
     """Yield the checks of an imported config with the ``bars`` of its scene, in one pass over its rows."""
-    name, row_faults, camera_faults = config.name, list[str](), list[str]()
+    row_faults, camera_faults = list[str](), list[str]()
     from_axes, between_eyes = _Deviations(), _Deviations()
     ids = {bar.bar_id for bar in bars}
-    axes = {bar.bar_id: bar for bar in with_axis(bars)} if imported.has_poses else {}
+    surveyed = with_axis(bars) if imported.has_poses else ()
     allowed_m, rays = SIGMAS * imported.truth_sigma_m, RayCache()
     rows = enumerate(iterate_rows(config, AUDITED_COLUMNS), start=1)
     for record, (done, row) in zip(config.views, rows, strict=True):
@@ -78,17 +78,17 @@ def imported_checks(
         row_faults += [f"{record.view_id}: {one}" for one in record_problems(row["view_id"], eyes, record)]
         for eye, truth in eyes.items():
             row_faults += [f"{record.view_id}: {eye}: {one}" for one in _truth_problems(truth, ids)]
-            _compare_with_axes(truth, axes, allowed_m, from_axes)
+            _compare_with_axes(truth, surveyed, allowed_m, from_axes)
         camera_faults += [f"{record.view_id}: {one}" for one in _camera_problems(row, config)]
         if "right" in eyes:
             _compare_eyes(eyes["left"], eyes["right"], allowed_m, between_eyes)
-        progress(f"audit of {name}", done, len(config.views))
-    yield Check(f"{name}: rows", f"{len(config.views)} views", "all invariants", tuple(row_faults))
-    yield Check(f"{name}: cameras", f"{len(config.views)} views", "plausible", tuple(camera_faults))
+        progress(f"audit of {config.name}", done, len(config.views))
+    yield Check("rows", f"{len(config.views)} views", "all invariants", tuple(row_faults))
+    yield Check("cameras", f"{len(config.views)} views", "plausible", tuple(camera_faults))
     reason = "no bar ids, no surveyed bars, or no poses"
-    yield from_axes.check(f"{name}: steel from the surface of its surveyed bar", reason)
-    yield between_eyes.check(f"{name}: left depth against right depth", "no depth of the right camera")
-    yield Check.skip(f"{name}: depth against a second source", "imported")
+    yield from_axes.check("steel from the surface of its surveyed bar", reason)
+    yield between_eyes.check("left depth against right depth", "no depth of the right camera")
+    yield Check.skip("depth against a second source", "imported")
 
 
 def _truth_problems(truth: EyeTruth, bar_ids: set[int]) -> Iterator[str]:
@@ -124,16 +124,13 @@ def _camera_problems(row: Mapping[str, Any], config: DatasetConfig) -> Iterator[
             yield f"the cameras are {distance_m:.6f} m apart, baseline_m is {row['baseline_m']:.6f}"
 
 
-def _compare_with_axes(eye: EyeWithRays, axes: Mapping[int, Bar], allowed_m: float, found: _Deviations) -> None:
+def _compare_with_axes(eye: EyeWithRays, bars: Sequence[Bar], allowed_m: float, found: _Deviations) -> None:
     """Compare interior steel pixels of bars with a known axis with the surface of a cylinder around it."""
-    if eye.bars is None or eye.mask is None or not axes:
+    if eye.bars is None or eye.mask is None or not bars:
         return
     usable = interior(eye.mask) & (eye.depth_m > 0)
-    for bar_id, bar in axes.items():
-        on_bar_m = eye.points_m[usable & (eye.bars == bar_id)]
-        if len(on_bar_m):
-            distance_m = polyline_distance_m(on_bar_m, np.array(bar.axis_m))
-            found.add(np.abs(distance_m - bar.diameter_m / 2), allowed_m)
+    for bar, distance_m in axis_distances_m(eye.points_m[usable], eye.bars[usable], bars):
+        found.add(np.abs(distance_m - bar.diameter_m / 2), allowed_m)
 
 
 def _compare_eyes(left: EyeWithRays, right: EyeWithRays, allowed_m: float, found: _Deviations) -> None:

@@ -70,18 +70,16 @@ def cycles_difference_m(
     return np.concatenate(differences)
 
 
-def cycles_verdict(config: str, difference_and_depth_m: ndarray[Any, Any], views: int) -> Check:
+def cycles_verdict(difference_and_depth_m: ndarray[Any, Any], views: int) -> Check:
     """Return the check of the depth differences of ``views`` views, skipped if no views were requested."""
-    name = f"{config}: depth compared with Cycles"
+    name = "depth compared with Cycles"
     if not views:
         return Check.skip(name, "no views requested")
     if not len(difference_and_depth_m):
         return Check.skip(name, f"{views} views: no steel")
     difference_m, depth_m = difference_and_depth_m.T
-    median_m, share = (
-        float(np.median(difference_m)),
-        float(np.mean(difference_m > CYCLES_OUTLIER_RATIO * np.maximum(depth_m, 1.0))),
-    )
+    median_m = float(np.median(difference_m))
+    share = float(np.mean(difference_m > CYCLES_OUTLIER_RATIO * np.maximum(depth_m, 1.0)))
     bound_m = MAX_CYCLES_MEDIAN_RATIO * float(np.median(depth_m))
     measured = (
         f"{views} views: median {median_m * 1e6:.3f} um, 99.9 % {np.quantile(difference_m, 0.999) * 1e6:.2f} um, "
@@ -99,14 +97,13 @@ def cycles_verdict(config: str, difference_and_depth_m: ndarray[Any, Any], views
 class EpipolarCounts:
     """Numbers of interior steel pixels of the left view by the result of their projection into the right view.
 
-    ``seen``: the right view has the same bar at the same depth; ``hidden``: it has a nearer surface; ``outside``:
-    the projection is outside the right frame; ``contradicted``: the point should be visible, but the right view
-    shows another or a farther surface.
+    ``seen``: the right view has the same bar at the same depth; ``hidden``: it has a nearer surface;
+    ``contradicted``: the point should be visible, but the right view shows another or a farther surface. Pixels
+    whose projections are outside the right frame are not counted.
     """
 
     seen: int = 0
     hidden: int = 0
-    outside: int = 0
     contradicted: int = 0
 
 
@@ -164,14 +161,13 @@ def epipolar_counts(config: AuditedConfig, view: AuditedView) -> EpipolarCounts:
     return EpipolarCounts(
         seen=int(np.count_nonzero(seen)),
         hidden=int(np.count_nonzero(hidden)),
-        outside=int(np.count_nonzero(~inside)),
         contradicted=int(np.count_nonzero(~seen & ~hidden)),
     )
 
 
-def epipolar_verdict(config: AuditedConfig, views: Sequence[EpipolarCounts]) -> Check:
+def epipolar_verdict(_: AuditedConfig, views: Sequence[EpipolarCounts]) -> Check:
     """Return the check of the share of contradicted pixels of all views."""
-    name = f"{config.name}: left steel projected into the right eye"
+    name = "left steel projected into the right eye"
     seen, hidden, contradicted = (
         sum(getattr(counts, kind) for counts in views) for kind in ("seen", "hidden", "contradicted")
     )

@@ -134,7 +134,7 @@ def _export(options: argparse.Namespace) -> None:
     from dataset_builder.export import export
 
     with ProgressBars() as bars:
-        summary = export(
+        exported = export(
             options.root,
             options.out,
             options.config,
@@ -142,7 +142,7 @@ def _export(options: argparse.Namespace) -> None:
             progress=bars.update,
             split=options.split,
         )
-    for config in summary.configs:
+    for config in exported:
         print(f"{config.config}: {config.views} views, {config.written} files written, {config.kept} kept")
     print(options.out)
 
@@ -235,15 +235,9 @@ def _add_push_arguments(parser: argparse.ArgumentParser) -> None:
 def _push(options: argparse.Namespace) -> None:
     """Print what a push changes, and publish it with ``--yes``."""
     from dataset_builder.push.hub_errors import require_online, require_token
-    from dataset_builder.push.pushing import (
-        Repository,
-        check_repository_id,
-        plan_push,
-        send_push,
-        verified_folder,
-    )
+    from dataset_builder.push.pushing import check_repository_id, plan_push, send_push, verified_folder
 
-    repository = Repository(check_repository_id(options.hub_id, "--hub-id"), options.revision)
+    check_repository_id(options.hub_id)
     if not re.fullmatch(PATH_PATTERN, options.revision):
         raise InputError(f"--revision is {escape_text(options.revision)}, expected the name of a branch")
     require_online()
@@ -254,7 +248,7 @@ def _push(options: argparse.Namespace) -> None:
     if source.stray:
         more = f" and {len(source.stray) - _STRAY_SHOWN} more" if len(source.stray) > _STRAY_SHOWN else ""
         print_notice(f"not in the manifest, stays local: {', '.join(source.stray[:_STRAY_SHOWN])}{more}")
-    push = plan_push(source, repository, private=options.private)
+    push = plan_push(source, options.hub_id, options.revision, private=options.private)
     print(*push.lines(), sep="\n")
     sys.stdout.flush()
     if not push.is_needed:

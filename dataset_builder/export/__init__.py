@@ -1,5 +1,5 @@
 """Export of a dataset folder as plain images, OpenEXR depth, COLMAP models and nerfstudio transforms."""
 
-from dataset_builder.export.exporting import ConfigExport, ExportSummary, export
+from dataset_builder.export.exporting import ConfigExport, export
 
-__all__ = ["ConfigExport", "ExportSummary", "export"]
+__all__ = ["ConfigExport", "export"]

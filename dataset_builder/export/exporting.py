@@ -41,14 +41,6 @@ class ConfigExport:
     kept: int
 
 
-@dataclass(frozen=True)
-class ExportSummary:
-    """Summary of an export, config by config."""
-
-    folder: Path
-    configs: tuple[ConfigExport, ...]
-
-
 def export(
     root: str | Path,
     to: str | Path,
@@ -56,7 +48,7 @@ def export(
     views: int | None = None,
     progress: Progress = silent,
     split: str | None = None,
-) -> ExportSummary:
+) -> list[ConfigExport]:
     """Export configs (default: all) of the dataset folder ``root``, each into its own folder below ``to``.
 
     A scene of a config with splits has a folder of its own, ``<config>/<split>-<scene>``, since each has its own
@@ -88,13 +80,12 @@ def export(
     target = Path(to)
     try:
         with export_target(target, folder, wanted, _FOLDERS):
-            exported = [
+            return [
                 _export_part(folder, name, config, wanted[name].views, bars, target, progress)
                 for name, config in parts.items()
             ]
     except OSError as error:  # Only writing raises OSError here: reading raises DatasetError.
         raise write_error(error.filename or to, error) from error
-    return ExportSummary(target, tuple(exported))
 
 
 def _with_split(folder: DatasetFolder, split: str | None) -> list[str]:
@@ -113,9 +104,10 @@ def _by_folder(chosen: Sequence[DatasetConfig], split: str | None) -> dict[str, 
     parts = {}
     for config in chosen:
         selected = config if split is None else config.of_split(split)
-        for scene in selected.by_scene() if config.has_splits else ():
-            parts[f"{config.name}/{scene.scene.split}-{scene.scene.name}"] = scene
-        if not config.has_splits:
+        if config.has_splits:
+            for scene in selected.by_scene():
+                parts[f"{config.name}/{scene.scene.split}-{scene.scene.name}"] = scene
+        else:
             parts[config.name] = selected
     return parts
 

@@ -43,8 +43,8 @@ _SUFFIXES: Mapping[str, tuple[str, ...]] = {
     "depth": DEPTH_SUFFIXES,
     "mask": LABEL_SUFFIXES,
     "bars": LABEL_SUFFIXES,
-    "matrix": MATRIX_SUFFIXES,
 }
+"""Suffixes of the files of each kind of column; matrices are no columns."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -140,9 +140,9 @@ def open_views(path: Path, layout: Layout) -> SourceViews:
 
     Sizes of images are compared by their headers. Raises ``InputError`` with all problems.
     """
-    root, problems = path.parent, list[Problem]()
-    for key, pattern in _patterns(layout).items():
-        suffixes = _SUFFIXES[column_kind(key)] if key in layout.files.patterns else _SUFFIXES["matrix"]
+    root, patterns, problems = path.parent, _patterns(layout), list[Problem]()
+    for key, pattern in patterns.items():
+        suffixes = _SUFFIXES.get(column_kind(key), MATRIX_SUFFIXES)
         if Path(pattern).suffix.lower() not in suffixes:
             problems.append(
                 Problem("invalid", key, f"got {escape_text(pattern)}", f"a name ending in {', '.join(suffixes)}")
@@ -150,15 +150,16 @@ def open_views(path: Path, layout: Layout) -> SourceViews:
     names = _view_names(root, layout.files.left_depth, problems)
     if not names and not problems:
         problems.append(Problem("missing", "files.left_depth", "no file has this name", layout.files.left_depth))
-    for key, pattern in _patterns(layout).items():
-        missing = [name for name in names if not (root / pattern.replace(VIEW, name)).is_file()]
+    files = {key: [pattern.replace(VIEW, name) for name in names] for key, pattern in patterns.items()}
+    for key, of_views in files.items():
+        missing = [file for file in of_views if not (root / file).is_file()]
         if missing:
-            found = f"{pattern.replace(VIEW, missing[0])} is missing, as for {len(missing)} of {len(names)} views"
+            found = f"{missing[0]} is missing, as for {len(missing)} of {len(names)} views"
             problems.append(Problem("missing", key, found))
     if problems:
         raise InputError.from_problems(path, problems)
-    patterns = [layout.files.patterns[key] for key in ("left_rgb", "right_rgb") if key in layout.files.patterns]
-    grid = common_shape([root / pattern.replace(VIEW, name) for pattern in patterns for name in names], problems)
+    images = [root / file for key in ("left_rgb", "right_rgb") for file in files.get(key, ())]
+    grid = common_shape(images, problems)
     stated = (layout.height, layout.width)
     if grid is not None and None not in stated and grid != stated:
         problems.append(

@@ -6,19 +6,25 @@ import io
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
-from PIL import Image, ImageDraw
+from PIL import Image, ImageDraw, ImageFont
 
-from dataset_builder.inspection.font import font, shortened
 from dataset_builder.inspection.summary import Inspection, diameter_mm
 from dataset_builder.scene.assemblies.cage import CageBar
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting.formatting import counted
 
+FONT_FILE = "DejaVuSans-subset.ttf"
+"""Font of the pictures, which comes with the package: the same text width on every machine."""
+
 _PANEL_PX, _MARGIN_PX, _HEAD_PX = (960, 640), 40, 90
+_WIDTH_PX, _LEGEND_PX = 2 * _PANEL_PX[0], 2 * _PANEL_PX[1] + _HEAD_PX
+"""Width of a picture, and the upper end of the legend below its panels."""
 _OVERSAMPLING = 2
 """Pixels per pixel of the picture, along each side, that are drawn and averaged."""
 
@@ -28,6 +34,9 @@ _COLOURS = ((0, 90, 160), (213, 94, 0), (0, 135, 100), (130, 70, 150), (170, 120
 _UNKNOWN = (150, 150, 150)
 _HAZE = 0.6
 """Share of white in the colour of the farthest bars."""
+
+_Colours = dict[float | None, tuple[int, int, int]]
+"""Colour of each diameter in millimetres; None is an unknown diameter."""
 
 _MAX_MARKS = 200
 _MAX_PIECES = 50_000
@@ -76,13 +85,12 @@ def inspection_picture(inspection: Inspection) -> bytes:
     """Return a PNG of a cage from four sides, with its diameters, sizes, and marks where bars overlap."""
     colours = _colours(inspection.cage.bars)
     strokes = _strokes(inspection.cage.bars, colours)
-    width, height = 2 * _PANEL_PX[0], 2 * _PANEL_PX[1] + 2 * _HEAD_PX
-    picture = Image.new("RGB", (width, height), _PAPER)
+    picture = Image.new("RGB", (_WIDTH_PX, _LEGEND_PX + _HEAD_PX), _PAPER)
     for number, side in enumerate(_SIDES):
         place = (number % 2 * _PANEL_PX[0], number // 2 * _PANEL_PX[1] + _HEAD_PX)
         picture.paste(_panel(inspection, strokes, side), place)
-    _write_head(ImageDraw.Draw(picture), inspection, width)
-    _write_legend(ImageDraw.Draw(picture), colours, inspection, height - _HEAD_PX + 24)
+    _write_head(ImageDraw.Draw(picture), inspection)
+    _write_legend(ImageDraw.Draw(picture), colours, inspection)
     stream = io.BytesIO()
     picture.save(stream, "png")
     return stream.getvalue()
@@ -94,17 +102,15 @@ def corner_view(inspection: Inspection) -> Image.Image:
     return _panel(inspection, _strokes(bars, _colours(bars)), _SIDES[-1])
 
 
-def _colours(bars: Sequence[CageBar]) -> dict[float | None, tuple[int, int, int]]:
-    """Return the colour of each diameter in millimetres, the largest first; None is an unknown diameter."""
+def _colours(bars: Sequence[CageBar]) -> _Colours:
+    """Return the colours of the diameters of bars, the largest first."""
     found = {diameter_mm(bar) for bar in bars}
     known = sorted((diameter for diameter in found if diameter is not None), reverse=True)
-    colours: dict[float | None, tuple[int, int, int]] = {
-        diameter: _COLOURS[number % len(_COLOURS)] for number, diameter in enumerate(known)
-    }
+    colours: _Colours = {diameter: _COLOURS[number % len(_COLOURS)] for number, diameter in enumerate(known)}
     return colours | ({None: _UNKNOWN} if None in found else {})
 
 
-def _strokes(bars: Sequence[CageBar], colours: dict[float | None, tuple[int, int, int]]) -> list[_Stroke]:
+def _strokes(bars: Sequence[CageBar], colours: _Colours) -> list[_Stroke]:
     """Return the straight pieces of all bars, or whole bars if there are more than ``_MAX_PIECES`` pieces."""
     whole = sum(len(bar.bar.axis_m) for bar in bars) > _MAX_PIECES
     strokes = []
@@ -214,8 +220,8 @@ def _draw_scale_bar(draw: ImageDraw.ImageDraw, px_per_m: float) -> None:
     draw.text((end + 10, y - 11), text, _INK, font(18))
 
 
-def _write_head(draw: ImageDraw.ImageDraw, inspection: Inspection, width: int) -> None:
-    name = shortened(printable(inspection.name), 30, width - 2 * _MARGIN_PX)
+def _write_head(draw: ImageDraw.ImageDraw, inspection: Inspection) -> None:
+    name = shortened(printable(inspection.name), 30, _WIDTH_PX - 2 * _MARGIN_PX)
     draw.text((_MARGIN_PX, 14), name, _INK, font(30))
     bars = counted(len(inspection.cage.bars), "bar")
     words = [f"{bars}, {inspection.size_text} (x, y, z)"]
@@ -224,20 +230,38 @@ def _write_head(draw: ImageDraw.ImageDraw, inspection: Inspection, width: int) -
     draw.text((_MARGIN_PX, 54), "; ".join(words), _GREY, font(20))
 
 
-def _write_legend(
-    draw: ImageDraw.ImageDraw,
-    colours: dict[float | None, tuple[int, int, int]],
-    inspection: Inspection,
-    y: int,
-) -> None:
+def _write_legend(draw: ImageDraw.ImageDraw, colours: _Colours, inspection: Inspection) -> None:
     """Write the diameters with their colours, in as many columns as fit."""
-    x, counts = _MARGIN_PX, Counter(map(diameter_mm, inspection.cage.bars))
+    x, y, counts = _MARGIN_PX, _LEGEND_PX + 24, Counter(map(diameter_mm, inspection.cage.bars))
     for size_mm, colour in colours.items():
         name = "no diameter" if size_mm is None else f"{size_mm:g} mm"
         text = f"{name} ({counts[size_mm]})"
         end = x + 46 + font(20).getlength(text)
-        if end > 2 * _PANEL_PX[0] - _MARGIN_PX:
+        if end > _WIDTH_PX - _MARGIN_PX:
             x, y, end = _MARGIN_PX, y + 30, _MARGIN_PX + 46 + font(20).getlength(text)
         draw.line((x, y + 12, x + 34, y + 12), colour, 8)
         draw.text((x + 46, y), text, _INK, font(20))
         x = int(end) + 36
+
+
+@cache
+def font(size_px: float) -> ImageFont.FreeTypeFont:
+    """Return the font at a size in pixels."""
+    content = files("dataset_builder.inspection").joinpath(FONT_FILE).read_bytes()
+    return ImageFont.truetype(io.BytesIO(content), size_px, layout_engine=ImageFont.Layout.BASIC)
+
+
+def text_width(text: str, size_px: float) -> float:
+    """Return the width of a text in pixels."""
+    return font(1000).getlength(text) * size_px / 1000
+
+
+def shortened(text: str, size_px: float, width_px: float) -> str:
+    """Return a text that fits into a width, an ellipsis in its middle if need be: names differ at the end."""
+    if text_width(text, size_px) <= width_px:
+        return text
+    for kept in range(len(text) - 1, 1, -1):
+        short = f"{text[: (kept + 1) // 2]}…{text[len(text) - kept // 2 :]}"
+        if text_width(short, size_px) <= width_px:
+            return short
+    return "…"

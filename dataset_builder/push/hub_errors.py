@@ -76,7 +76,9 @@ def hub_errors(action: str) -> Iterator[None]:
 def _converted(action: str, error: Exception) -> RebarDepthError:
     """Return the error of this project for an error of ``huggingface_hub``."""
     place = f"{action}: the Hub at {constants.ENDPOINT}"
-    causes = list(_causes(error))
+    causes = [error]
+    while isinstance(earlier := causes[-1].__cause__, Exception) and earlier not in causes:
+        causes.append(earlier)  # ``huggingface_hub`` wraps the errors of its threads.
     for cause in causes:
         if isinstance(cause, HfHubHTTPError):
             status, message = cause.response.status_code, cause.server_message
@@ -87,16 +89,6 @@ def _converted(action: str, error: Exception) -> RebarDepthError:
             return InputError(f"{action}: {cause.filename} cannot be read: {cause.strerror or cause}")
     summary = escape_text(_without_token(exception_summary(causes[-1])))
     return HubError(f"{place} gives no usable answer: {summary}")
-
-
-def _causes(error: Exception) -> Iterator[Exception]:
-    """Yield an error, the one that caused it, and so on; ``huggingface_hub`` wraps the errors of its threads."""
-    seen: set[int] = set()
-    current: BaseException | None = error
-    while isinstance(current, Exception) and id(current) not in seen:
-        seen.add(id(current))
-        yield current
-        current = current.__cause__
 
 
 def _without_token(text: str) -> str:

@@ -105,7 +105,6 @@ def _card(folder: DatasetFolder) -> DatasetCard:
 
     Raises ``DatasetError`` if it cannot be parsed or has other configs than the manifest.
     """
-    problem = None
     try:
         card: DatasetCard = DatasetCard.load(folder.verified_file(REPOCARD_NAME))
         names = [str(entry["config_name"]) for entry in card.data["configs"]]
@@ -114,26 +113,23 @@ def _card(folder: DatasetFolder) -> DatasetCard:
     except Exception as error:  # The parsers of YAML and of the card's fields raise many types.
         found = f"is no dataset card: {escape_text(exception_summary(error))}"
         problem = Problem("syntax", REPOCARD_NAME, found, "one written by rebar-build")
-    else:
-        if sorted(names) != sorted(folder.configs):
-            found = f"has the configs {escape_text(', '.join(names))}"
-            expected = f"those of the manifest, {', '.join(folder.configs)}"
-            problem = Problem("conflict", REPOCARD_NAME, found, expected)
-    if problem is not None:
-        raise DatasetError.from_problems(folder.root, [problem])
+        raise DatasetError.from_problems(folder.root, [problem]) from None
+    if sorted(names) != sorted(folder.configs):
+        found = f"has the configs {escape_text(', '.join(names))}"
+        expected = f"those of the manifest, {', '.join(folder.configs)}"
+        raise DatasetError.from_problems(folder.root, [Problem("conflict", REPOCARD_NAME, found, expected)])
     return card
 
 
-def check_repository_id(text: str, option: str) -> str:
-    """Return ``text``, the value of ``option``. Raises ``InputError`` unless it is the id of a repository."""
+def check_repository_id(text: str) -> None:
+    """Raise ``InputError`` unless ``text``, the value of ``--hub-id``, is the id of a repository."""
     try:
         validate_repo_id(text)
         valid = text.count("/") == 1
     except HFValidationError:
         valid = False
     if not valid:
-        raise InputError(f"{option} is {escape_text(text)}, expected the id of a repository, ORG/NAME")
-    return text
+        raise InputError(f"--hub-id is {escape_text(text)}, expected the id of a repository, ORG/NAME")
 
 
 @dataclass(frozen=True)
@@ -161,25 +157,25 @@ class Repository:
         return {name for name in self.files if not name.startswith(".")}
 
 
-def _read(repository: Repository) -> Repository:
-    """Return the repository with what the Hub has of it.
+def _read(repository_id: str, branch: str) -> Repository:
+    """Return what the Hub has of a repository and a branch of it.
 
     Raises ``InputError`` and ``HubError`` as ``hub_errors`` does.
     """
     api, has_branch = HfApi(), True
-    with hub_errors(f"{repository.id} cannot be read"):
+    with hub_errors(f"{repository_id} cannot be read"):
         try:
-            info = api.repo_info(repository.id, repo_type="dataset", revision=repository.branch)
+            info = api.repo_info(repository_id, repo_type="dataset", revision=branch)
         except GatedRepoError:
             raise
         except RepositoryNotFoundError:
-            return Repository(repository.id, repository.branch)
+            return Repository(repository_id, branch)
         except RevisionNotFoundError:
-            info, has_branch = api.repo_info(repository.id, repo_type="dataset"), False
+            info, has_branch = api.repo_info(repository_id, repo_type="dataset"), False
         commit = str(info.sha)
-        tree = api.list_repo_tree(repository.id, recursive=True, revision=commit, repo_type="dataset")
+        tree = api.list_repo_tree(repository_id, recursive=True, revision=commit, repo_type="dataset")
         files = {str(entry.path): entry for entry in tree if isinstance(entry, RepoFile)}
-        return Repository(repository.id, repository.branch, commit, has_branch, bool(info.private), files)
+        return Repository(repository_id, branch, commit, has_branch, bool(info.private), files)
 
 
 @dataclass(frozen=True)
@@ -220,13 +216,13 @@ class Push:
         )
 
 
-def plan_push(source: VerifiedFolder, repository: Repository, *, private: bool) -> Push:
+def plan_push(source: VerifiedFolder, repository_id: str, branch: str, *, private: bool) -> Push:
     """Compare a folder with a repository; nothing is written.
 
     Raises ``InputError`` if the repository holds anything but a dataset folder, or is public and should be
     private, and as ``hub_errors`` does.
     """
-    repository = _read(repository)
+    repository = _read(repository_id, branch)
     if repository.visible - {REPOCARD_NAME} and MANIFEST_FILE not in repository.files:
         raise InputError(
             f"{repository.url}: has {len(repository.visible)} files and no {MANIFEST_FILE}, expected an empty "
@@ -250,7 +246,7 @@ def send_push(push: Push, progress: Progress = silent) -> str:
     if not repository.commit:
         with hub_errors(f"{repository.id} cannot be created"):
             api.create_repo(repository.id, repo_type="dataset", private=push.private or None, exist_ok=True)
-        push = plan_push(push.source, repository, private=push.private)
+        push = plan_push(push.source, repository.id, repository.branch, private=push.private)
         repository = push.repository
     if not repository.has_branch:
         with hub_errors(f"branch {repository.branch} of {repository.id} cannot be created"):

@@ -78,11 +78,6 @@ def truth_columns(eye: str) -> tuple[str, ...]:
     return tuple(f"{eye}_{kind}" for kind in ("depth", "mask", "bars", *CAMERA_KINDS))
 
 
-def eye_from_row(row: Mapping[str, Any], eye: str) -> EyeView:
-    """Return one eye of a decoded row of a rendered config; ``rgb`` is None if the row lacks that column."""
-    return EyeView(**vars(truth_from_row(row, eye)))
-
-
 def truth_from_row(row: Mapping[str, Any], eye: str) -> EyeTruth:
     """Return one eye of a decoded row that has its depth; ``rgb`` is None if the row lacks that column."""
     depth_m = row[f"{eye}_depth"]

@@ -89,7 +89,7 @@ def scene() -> Scene:
 
 def config(board: BoardSpec | None = BOARD, variants: tuple[str, ...] = ()) -> AuditedConfig:
     """Return the config of the scene."""
-    return AuditedConfig("scene", variants, scene().steel, board)
+    return AuditedConfig(variants, scene().steel, board)
 
 
 @cache

@@ -18,6 +18,7 @@ import pytest
 import rebar_depth_bench as rdb
 from dataset_builder.audit import audit
 from dataset_builder.audit.auditing import VIEW_CHECKS, check_crossings, row_problems
+from dataset_builder.audit.checks import RayCache, view_from_row
 from rebar_depth_bench.bar_crossings.table import write_crossings
 from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.data.manifest import open_folder
@@ -79,10 +80,6 @@ def test_crossings_that_are_not_those_of_the_bars_are_reported(copy: Path) -> No
     assert check_crossings(folder, bars).passed
 
 
-def with_cells(row: Row, **cells: Any) -> Row:
-    return {**row, **cells}
-
-
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
@@ -105,8 +102,9 @@ def test_broken_row_invariants_are_reported(
 ) -> None:
     record = open_folder(tiny_root).config("lattice").views[4]
     bar_ids = {bar.bar_id for bar in read_bars(tiny_root / "bars.parquet")["lattice"]}
-    assert list(row_problems(row, record, bar_ids)) == []
-    problems = list(row_problems(with_cells(row, **damage(row)), record, bar_ids))
+    assert list(row_problems(view_from_row(row, RayCache()), record, bar_ids)) == []
+    damaged = view_from_row({**row, **damage(row)}, RayCache())
+    problems = list(row_problems(damaged, record, bar_ids))
     assert any(words in problem for problem in problems), problems
 
 
@@ -141,5 +139,5 @@ def test_swapped_rows_are_reported(copy: Path) -> None:
 def test_all_fields_of_view_record_are_compared(tiny_root: Path, row: Row) -> None:
     view = open_folder(tiny_root).config("lattice").views[4]
     record = view.model_copy(update={"scored_px": 1})
-    problems = list(row_problems(row, record, set(range(1, 76))))
+    problems = list(row_problems(view_from_row(row, RayCache()), record, set(range(1, 76))))
     assert problems == ["steel and scored pixel counts differ from the manifest's"]

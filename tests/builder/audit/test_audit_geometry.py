@@ -22,7 +22,6 @@ from dataset_builder.audit.geometry import (
     board_verdict,
     max_axis_distance_ratio,
     polyline_distance_m,
-    view_board_error,
 )
 from dataset_builder.audit.independent_depth import (
     MAX_CONTRADICTED_SHARE,
@@ -35,7 +34,7 @@ from dataset_builder.audit.independent_depth import (
 )
 from dataset_builder.scene.model import ESTIMATED_ROLE
 from dataset_builder.scene.shapes.bending import bent_line_m
-from tests.builder.audit.audit_scene import BOARD, RIGS, config, scene, view, with_depth
+from tests.builder.audit.audit_scene import RIGS, config, scene, view, with_depth
 
 EVERY_GRID = pytest.mark.parametrize("rig", RIGS)
 
@@ -44,7 +43,7 @@ EVERY_GRID = pytest.mark.parametrize("rig", RIGS)
 def test_correct_depth_passes_on_every_grid(rig: str) -> None:
     audited = view(rig)
     assert 0.98 < max_axis_distance_ratio(config(), audited) < 1.02  # plain bars
-    error = view_board_error(config(), audited)
+    error = board_error(config(), audited)
     assert error.pixels > 100_000
     assert error.off_m < MAX_BOARD_ERROR_M
     counts = epipolar_counts(config(), audited)
@@ -57,7 +56,7 @@ def test_correct_depth_passes_on_every_grid(rig: str) -> None:
 def test_depth_scaled_by_1_percent_fails_board_and_axes(rig: str) -> None:
     scaled = with_depth(view(rig), 1.01)
     assert not axis_verdict(config(), [max_axis_distance_ratio(config(), scaled)]).passed
-    assert not board_verdict(config(), [view_board_error(config(), scaled)]).passed
+    assert not board_verdict(config(), [board_error(config(), scaled)]).passed
 
 
 @EVERY_GRID
@@ -85,12 +84,12 @@ def test_undistorted_depth_on_raw_grid_is_reported() -> None:
     eye = view("raw").left
     ideal = scene().caster.cast(replace(eye.camera, distortion=np.zeros(5)))
     wrong = replace(eye, depth_m=ideal.depth_m, mask=ideal.mask, bars=ideal.bars)
-    assert board_error([wrong], BOARD).off_m > 1e-3
+    assert board_error(config(), replace(view("raw"), left=wrong)).off_m > 1e-3
 
 
 def test_board_check_is_skipped_without_board() -> None:
     without_board = config(board=None)
-    check = board_verdict(without_board, [view_board_error(without_board, view("ideal"))])
+    check = board_verdict(without_board, [board_error(without_board, view("ideal"))])
     assert (check.skipped, check.measured) == (True, "no board in this scene")
 
 
@@ -111,7 +110,7 @@ def test_props_may_occlude_board_but_not_lie_below_it() -> None:
 
     def passed(audited: AuditedView, of: str = "things") -> bool:
         audited_config = cluttered if of == "things" else config(variants=("dusk",))
-        return board_verdict(audited_config, [view_board_error(audited_config, audited)]).passed
+        return board_verdict(audited_config, [board_error(audited_config, audited)]).passed
 
     assert passed(with_occluder(0.02, 0.3))
     assert not passed(with_occluder(0.02, 0.3), of="light alone")
@@ -139,15 +138,15 @@ def test_epipolar_share_is_over_all_views() -> None:
 def test_cycles_differences_are_relative_to_depth() -> None:
     depth_m = np.full(10_000, 8.0)
     noise_m = np.full(10_000, 3e-6 * 8.0)
-    assert cycles_verdict("c", np.stack([noise_m, depth_m], axis=1), 2).passed
-    assert not cycles_verdict("c", np.stack([noise_m, depth_m / 8], axis=1), 2).passed
+    assert cycles_verdict(np.stack([noise_m, depth_m], axis=1), 2).passed
+    assert not cycles_verdict(np.stack([noise_m, depth_m / 8], axis=1), 2).passed
     noise_m[:20] = 0.009  # 20 pixels on another surface
-    assert not cycles_verdict("c", np.stack([noise_m, depth_m], axis=1), 2).passed
+    assert not cycles_verdict(np.stack([noise_m, depth_m], axis=1), 2).passed
     noise_m[:20] = 0.007
-    assert cycles_verdict("c", np.stack([noise_m, depth_m], axis=1), 2).passed
-    assert not cycles_verdict("c", np.full((5, 2), np.nan), 2).passed
-    assert cycles_verdict("c", cycles_difference_m(Path("none.ply"), [], print), 0).skipped
-    assert cycles_verdict("c", np.zeros((0, 2)), 2).measured == "2 views: no steel"
+    assert cycles_verdict(np.stack([noise_m, depth_m], axis=1), 2).passed
+    assert not cycles_verdict(np.full((5, 2), np.nan), 2).passed
+    assert cycles_verdict(cycles_difference_m(Path("none.ply"), [], print), 0).skipped
+    assert cycles_verdict(np.zeros((0, 2)), 2).measured == "2 views: no steel"
 
 
 def test_points_beyond_lens_model_are_not_in_frame() -> None:

@@ -197,7 +197,7 @@ def pose_error(markers: DetectedMarkers, inset_px: float) -> tuple[float, float]
 
 def marker_verdict(config: AuditedConfig, views: Sequence[Sequence[DetectedMarkers]]) -> Check:
     """Return the check of corners, detected share and poses of all views together."""
-    name = f"{config.name}: ArUco markers"
+    name = "ArUco markers"
     if config.board is None:
         return Check.skip(name, "no board in this scene")
     eyes = [eye for view in views for eye in view]

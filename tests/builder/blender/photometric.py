@@ -129,7 +129,7 @@ def best_shift_px(cost: Float64[ndarray, " n"]) -> float:
 
 def photometric_verdict(config: AuditedConfig, fits: Sequence[PhotometricFit]) -> Check:
     """Return the check of the best shift of all views together, and of each view alone."""
-    name = f"{config.name}: right image warped to the left by depth"
+    name = "right image warped to the left by depth"
     pixels = sum(fit.pixels for fit in fits)
     if pixels < _MIN_PIXELS:
         return Check.skip(name, f"only {pixels} textured pixels visible to both eyes")

@@ -75,7 +75,7 @@ def test_images_without_texture_are_skipped() -> None:
 def tiny(tiny_root: Path) -> tuple[AuditedConfig, list[AuditedView]]:
     """Return the config and its nine rendered views of 160 x 90 pixels with one sample per pixel (very noisy)."""
     steel = read_bars(tiny_root / "bars.parquet")["lattice"]
-    audited = AuditedConfig("lattice", (), steel, BoardSpec())
+    audited = AuditedConfig((), steel, BoardSpec())
     rays = RayCache()
     return audited, [view_from_row(row, rays) for row in rdb.load(tiny_root, "lattice")]
 

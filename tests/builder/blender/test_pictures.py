@@ -18,7 +18,7 @@ from tests.builder.blender.markers import detect_view_markers, marker_verdict
 from tests.builder.blender.photometric import photometric_fit, photometric_verdict
 from tests.building import RunBuild
 
-Pictures = tuple[AuditedConfig, Sequence[AuditedView]]
+Pictures = tuple[str, AuditedConfig, Sequence[AuditedView]]
 GRID = ("--width", "640", "--height", "360")
 
 
@@ -34,13 +34,13 @@ CHECKS = (photometric_check, marker_check)
 
 
 def pictures(root: Path) -> Iterator[Pictures]:
-    """Yield the views of each scene of each config of a folder."""
+    """Yield the label and the views of each scene of each config of a folder."""
     steel = read_bars(root / BARS_FILE)
     for config in open_folder(root).config_by_name.values():
         for scene in config.by_scene():
             spec, rays = scene.scene, RayCache()
-            audited = AuditedConfig(scene.label, spec.appearance.variants, steel[spec.name], spec.board)
-            yield audited, [view_from_row(row, rays) for row in iterate_rows(scene, COLUMNS)]
+            audited = AuditedConfig(spec.appearance.variants, steel[spec.name], spec.board)
+            yield scene.label, audited, [view_from_row(row, rays) for row in iterate_rows(scene, COLUMNS)]
 
 
 @pytest.fixture(scope="module")
@@ -55,7 +55,7 @@ def lattice(tmp_path_factory: pytest.TempPathFactory, run_build: RunBuild) -> Pi
 
 @pytest.mark.parametrize("check", CHECKS)
 def test_lattice_is_where_its_ground_truth_says(lattice: Pictures, check: Callable[..., Check]) -> None:
-    config, views = lattice
+    _, config, views = lattice
     assert check(config, views).passed
     assert check(config, [with_K_shift(view, ("right",), 0, 0.5) for view in views]).problems
 
@@ -73,11 +73,11 @@ def test_every_config_is_where_its_ground_truth_says(tmp_path: Path, run_build: 
         process = run_build("--out", root, *options, *GRID, "--samples", "8")
         assert process.returncode == 0, process.stderr
     made = {check.__name__: set[str]() for check in CHECKS}
-    for config, views in pictures(root):
+    for label, config, views in pictures(root):
         for check in CHECKS:
             verdict = check(config, views)
             assert not verdict.problems, verdict
             if verdict.passed:
-                made[check.__name__].add(config.name)
+                made[check.__name__].add(label)
     assert made["photometric_check"] >= set(CONFIGS)
     assert made["marker_check"] >= {name for name in CONFIGS if name not in ("pile", "pier")}

@@ -45,7 +45,9 @@ CAMERA_NAMES = ("left", "right")
 @pytest.fixture(scope="module")
 def exported(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return an export of the whole tiny dataset."""
-    return export(tiny_root, tmp_path_factory.mktemp("export") / "all").folder
+    to = tmp_path_factory.mktemp("export") / "all"
+    export(tiny_root, to)
+    return to
 
 
 @pytest.fixture(scope="module")

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from dataset_builder.export import ExportSummary, export
+from dataset_builder.export import export
 from rebar_depth_bench.errors import DatasetError, InputError
 from tests.damage import change_manifest
 
@@ -26,7 +26,9 @@ MARKER = "export.json"
 @pytest.fixture(scope="module")
 def exported(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a complete export of the small config."""
-    return export(tiny_root, tmp_path_factory.mktemp("export") / "all", SMALL_CONFIG).folder
+    to = tmp_path_factory.mktemp("export") / "all"
+    export(tiny_root, to, SMALL_CONFIG)
+    return to
 
 
 def content(folder: Path) -> dict[str, bytes]:
@@ -54,7 +56,7 @@ def test_killed_export_resumes_to_same_bytes(tiny_root: Path, exported: Path, tm
         b"half"
     )  # as left by a kill while writing
     (to / "lattice-orbit/bars/0025_right.png").unlink()
-    (summary,) = export(tiny_root, to, SMALL_CONFIG).configs
+    (summary,) = export(tiny_root, to, SMALL_CONFIG)
     assert (summary.kept, summary.written) == (IMAGES_PER_VIEW - 1, IMAGES_PER_VIEW + 1)
     assert content(to) == content(exported)
 
@@ -76,19 +78,14 @@ def test_interrupt_leaves_no_partial_file(tiny_root: Path, tmp_path: Path) -> No
     with pytest.raises(KeyboardInterrupt):
         export(tiny_root, tmp_path / "x", SMALL_CONFIG, progress=interrupt)
     assert not list((tmp_path / "x").rglob("*.tmp"))
-    assert export(tiny_root, tmp_path / "x", SMALL_CONFIG).configs[0].kept == IMAGES_PER_VIEW
+    assert export(tiny_root, tmp_path / "x", SMALL_CONFIG)[0].kept == IMAGES_PER_VIEW
 
 
 @pytest.mark.slow
 def test_export_is_extended_by_views_and_configs(tiny_root: Path, exported: Path, tmp_path: Path) -> None:
     to = tmp_path / "grown"
     progress_calls: list[tuple[object, ...]] = []
-    first_summary = export(
-        tiny_root, to, SMALL_CONFIG, views=1, progress=lambda *step: progress_calls.append(step)
-    )
-    assert isinstance(first_summary, ExportSummary)
-    assert first_summary.folder == to
-    (summary,) = first_summary.configs
+    (summary,) = export(tiny_root, to, SMALL_CONFIG, views=1, progress=lambda *step: progress_calls.append(step))
     assert (summary.config, summary.views, summary.written) == ("lattice-orbit", 1, IMAGES_PER_VIEW)
     assert progress_calls == [("export of lattice-orbit", 1, 1)]
     assert {path.stem[:4] for path in (to / "lattice-orbit/images").iterdir()} == {"0075"}
@@ -189,7 +186,7 @@ def test_concurrent_export_to_same_folder_is_rejected(tiny_root: Path, tmp_path:
         with pytest.raises(InputError, match="another export is using this folder"):
             export(tiny_root, tmp_path / "x", SMALL_CONFIG)
 
-    assert export(tiny_root, tmp_path / "x", SMALL_CONFIG, views=1, progress=second).configs[0].written
+    assert export(tiny_root, tmp_path / "x", SMALL_CONFIG, views=1, progress=second)[0].written
 
 
 def test_data_contradicting_manifest_is_not_exported(tiny_root: Path, tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ def files(folder: Path) -> set[str]:
 
 def test_plain_export_has_a_folder_for_each_scene(root: Path, tmp_path: Path) -> None:
     summary = export(root, tmp_path / "out")
-    assert [(part.config, part.views) for part in summary.configs] == [(name, VIEWS) for name in FOLDERS.values()]
+    assert [(part.config, part.views) for part in summary] == [(name, VIEWS) for name in FOLDERS.values()]
     for scene, name in FOLDERS.items():
         folder = tmp_path / "out" / name
         cameras = json.loads((folder / "cameras.json").read_text())
@@ -53,9 +53,9 @@ def test_plain_export_has_a_folder_for_each_scene(root: Path, tmp_path: Path) ->
 
 def test_export_is_resumed_and_extended_by_splits(root: Path, tmp_path: Path) -> None:
     first = export(root, tmp_path / "out", split="validation", views=2)
-    assert [(part.config, part.views) for part in first.configs] == [(FOLDERS["c"], 2)]
+    assert [(part.config, part.views) for part in first] == [(FOLDERS["c"], 2)]
     second = export(root, tmp_path / "out")
-    assert {part.config: part.kept > 0 for part in second.configs} == {
+    assert {part.config: part.kept > 0 for part in second} == {
         name: name == FOLDERS["c"] for name in FOLDERS.values()
     }
     assert {path.split("/", 1)[0] for path in files(tmp_path / "out")} == {"cages", MARKER}

@@ -74,7 +74,7 @@ def test_imported_folder_passes_verification_and_audit(complete: Path) -> None:
     assert bench_main(["verify", str(complete)]) == 0
     report = audit(complete)
     assert not report.failures
-    assert [check.name for check in report.skipped] == ["mock-up: depth against a second source"]
+    assert [check.name for check in report.checks if check.skipped] == ["mock-up: depth against a second source"]
 
 
 def test_plain_datasets_load_the_folder(complete: Path, rows: list[Row]) -> None:

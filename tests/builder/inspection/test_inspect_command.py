@@ -15,8 +15,7 @@ from PIL import Image, ImageDraw
 from rich.console import Console
 
 from dataset_builder.cli.main import main
-from dataset_builder.inspection.font import font
-from dataset_builder.inspection.picture import _draw_scale_bar, inspection_picture
+from dataset_builder.inspection.picture import _draw_scale_bar, font, inspection_picture
 from dataset_builder.inspection.report import inspection_json, print_inspection
 from dataset_builder.inspection.summary import bar_box_m, inspect_cage
 from dataset_builder.pipeline.plan import MAX_NOTES, print_notes

@@ -107,4 +107,4 @@ def test_commands_work_on_several_scenes(root: Path, tmp_path: Path) -> None:
     groups = {line.split(",")[6] for line in (tmp_path / "g.csv").read_text().splitlines()[1:]}
     assert groups == {"family", "distance", "bar_width"}
     exported = export(root, tmp_path / "out", split="test")
-    assert [part.views for part in exported.configs] == [VIEWS] * SPLITS["test"]
+    assert [part.views for part in exported] == [VIEWS] * SPLITS["test"]

@@ -177,7 +177,7 @@ def test_contact_sheet_shows_depth_alone(root: Path) -> None:
 
 def test_export_leaves_out_what_describes_images(root: Path, tmp_path: Path) -> None:
     summary = export(root, tmp_path / "export", ["lattice-orbit"])
-    assert [(config.views, config.written, config.kept) for config in summary.configs] == [(2, 16, 0)]
+    assert [(config.views, config.written, config.kept) for config in summary] == [(2, 16, 0)]
     folder = tmp_path / "export" / "lattice-orbit"
     assert {path.name for path in folder.iterdir()} == {
         *("depth", "depth_mm", "masks", "bars", "cameras.json", "README.txt"),
