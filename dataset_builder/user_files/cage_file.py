@@ -6,9 +6,10 @@ import hashlib
 import math
 import os
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -19,7 +20,6 @@ from dataset_builder.scene.shapes.bending import bent_line_m, mandrel_diameter_m
 from dataset_builder.specs.file_specs import (
     CageFileSpec,
     MeshFileSpec,
-    PinnedFile,
     PlacementSpec,
     Trust,
 )
@@ -27,14 +27,8 @@ from dataset_builder.specs.selection import Selection
 from dataset_builder.user_files.cage_checks import cage_problems, check_values, raise_problems
 from dataset_builder.user_files.cage_placement import placed
 from dataset_builder.user_files.ifc_file import ifc_cage
-from dataset_builder.user_files.mesh_import import (
-    MAX_FLOAT32_SPACING_M,
-    SUFFIXES,
-    MeshPart,
-    axis_notes,
-    fitted_bar,
-    read_parts,
-)
+from dataset_builder.user_files.mesh_import import MAX_FLOAT32_SPACING_M, MeshPart, fitted_bar, read_parts
+from dataset_builder.user_files.mesh_import import SUFFIXES as MESH_SUFFIXES
 from dataset_builder.user_files.scene_schema import read_scene_toml
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.errors import InputError, MeshError, Problem, escape_text
@@ -42,7 +36,8 @@ from rebar_depth_bench.limits import IFC_BYTES, MESH_BYTES, TOML_BYTES
 from rebar_depth_bench.reading import read_file
 from rebar_depth_bench.validation import UNITS_M
 
-_SUFFIXES = (".toml", ".ifc")
+_Kind = Literal["cage", "mesh"]
+_SUFFIXES: Mapping[_Kind, Sequence[str]] = {"cage": (".toml", ".ifc"), "mesh": MESH_SUFFIXES}
 _GLTF_CONVERSION = (
     ": convert glTF to OBJ, as with python -c "
     "\"import trimesh; trimesh.load_scene('FILE.glb').export('FILE.obj')\", "
@@ -50,6 +45,12 @@ _GLTF_CONVERSION = (
 )
 _LIMITS = {".toml": TOML_BYTES, ".ifc": IFC_BYTES}
 """Limits of the files of an assembly by suffix; those of meshes have ``MESH_BYTES``."""
+
+_MAX_NAMED = 10
+"""Largest number of bars that a note names."""
+
+_MAX_REASONS = 5
+"""Largest number of reasons for leaving out objects that a note gives."""
 
 
 def cage_file_spec(
@@ -62,7 +63,7 @@ def cage_file_spec(
 
     Raises ``MeshError`` if it cannot be read or its suffix is neither ``.toml`` nor ``.ifc``.
     """
-    digest = hashlib.sha256(read_assembly_file(path, "cage", _SUFFIXES)).hexdigest()
+    digest = hashlib.sha256(_read_user_file(path, "cage")).hexdigest()
     return CageFileSpec(os.fspath(path), digest, placement, select, trust)
 
 
@@ -81,18 +82,16 @@ def read_cage(spec: CageFileSpec | MeshFileSpec) -> Cage:
     Raises ``MeshError`` if the file cannot be read, does not match ``spec.sha256``, violates its format, or has no
     bar or a coordinate that is not finite; ``InputError`` if it is an IFC file and ifcopenshell is not installed.
     """
-    source = read_mesh(spec) if isinstance(spec, MeshFileSpec) else _read_bars(spec)
+    content = _pinned_content(spec)
+    if isinstance(spec, MeshFileSpec):
+        source = _mesh_cage(content, spec)
+    elif Path(spec.path).suffix.lower() == ".ifc":
+        source = ifc_cage(content, spec.path, spec.select, spec.trust)
+    else:
+        source = _toml_cage(content, spec.path)
     check_values(source.bars, spec.path)
     cage = placed(source, spec.placement)
     return replace(cage, problems=(*cage.problems, *cage_problems(cage.bars)))
-
-
-def _read_bars(spec: CageFileSpec) -> Cage:
-    """Return the bars of a TOML or IFC file (the file's frame, metres)."""
-    content = _pinned_content(spec, "cage", _SUFFIXES)
-    if Path(spec.path).suffix.lower() == ".ifc":
-        return ifc_cage(content, spec.path, spec.select, spec.trust)
-    return _toml_cage(content, spec.path)
 
 
 def _toml_cage(content: bytes, where: str) -> Cage:
@@ -115,21 +114,16 @@ def _toml_cage(content: bytes, where: str) -> Cage:
             continue
         bent = Bar(bar.bar_id, bar.role, bar.diameter_m, axis_of(line_m))
         cage_bars.append(CageBar(label, bent, bar.ribs, source=f"bar {number}"))
-    if problems:
-        raise MeshError.from_problems(where, problems)
+    raise_problems(problems, where)
     return Cage(tuple(cage_bars), (), unit_scale(scene.unit_m))
 
 
-_MAX_REASONS = 5
-"""Largest number of reasons for leaving out objects that a note gives."""
-
-
-def _pinned_content(spec: PinnedFile, kind: str, suffixes: Collection[str]) -> bytes:
+def _pinned_content(spec: CageFileSpec | MeshFileSpec) -> bytes:
     """Return the content of the file of a spec.
 
-    Raises as ``read_assembly_file``, and ``MeshError`` if the content is not that of the spec.
+    Raises as ``_read_user_file``, and ``MeshError`` if the content is not that of the spec.
     """
-    content = read_assembly_file(spec.path, kind, suffixes)
+    content = _read_user_file(spec.path, "mesh" if isinstance(spec, MeshFileSpec) else "cage")
     actual_sha256 = hashlib.sha256(content).hexdigest()
     if actual_sha256 != spec.sha256:
         raise MeshError(
@@ -146,14 +140,14 @@ def unsupported_type(path: str | os.PathLike[str], kind: str, expected: str) -> 
     return f"{path}: unsupported {kind} file type {suffix!r}, expected {expected}{conversion}"
 
 
-def read_assembly_file(path: str | os.PathLike[str], kind: str, suffixes: Collection[str]) -> bytes:
-    """Return the bytes of a user's file; ``kind`` is ``mesh`` or ``cage``.
+def _read_user_file(path: str | os.PathLike[str], kind: _Kind) -> bytes:
+    """Return the bytes of a user's file.
 
-    Raises ``MeshError`` if its suffix is not one of ``suffixes``, it cannot be read or it is too large.
+    Raises ``MeshError`` if its suffix is not one of its kind, it cannot be read or it is too large.
     """
     suffix = Path(path).suffix.lower()
-    if suffix not in suffixes:
-        raise MeshError(unsupported_type(path, kind, ", ".join(suffixes)))
+    if suffix not in _SUFFIXES[kind]:
+        raise MeshError(unsupported_type(path, kind, ", ".join(_SUFFIXES[kind])))
     return read_file(Path(path), _LIMITS.get(suffix, MESH_BYTES), f"a {kind} file", MeshError)
 
 
@@ -173,19 +167,25 @@ def cage_assembly(cage: Cage, where: str) -> Assembly:
         except ValueError as error:
             problems.append(Problem("invalid", bar.label, str(error)))
     raise_problems(problems, where)
-    without_axis = [bar.label for bar in cage.bars if not bar.bar.has_axis]
-    notes = [*cage.notes, *axis_notes(where, without_axis, len(cage.bars))]
-    return Assembly.from_meshes(meshes, (*notes, *_left_out_notes(cage, where)), cage.world_from_source)
+    return Assembly.from_meshes(meshes, (*cage.notes, *_file_notes(cage, where)), cage.world_from_source)
 
 
-def _left_out_notes(cage: Cage, where: str) -> tuple[Note, ...]:
-    """Return the note that counts the objects of the file that are not in the cage, or none."""
-    if not cage.left_out:
-        return ()
-    reasons = Counter(record.reason for record in cage.left_out).most_common(_MAX_REASONS)
-    counted = ", ".join(f"{count} ({reason})" for reason, count in reasons)
-    text = f"{len(cage.left_out)} objects are left out, which rebar-build inspect lists: {counted}"
-    return (Note(where, "left-out", text),)
+def _file_notes(cage: Cage, where: str) -> Iterator[Note]:
+    """Yield the note that names the bars without an axis, and that which counts the objects that are left out."""
+    labels = [bar.label for bar in cage.bars if not bar.bar.has_axis]
+    if labels:
+        named = ", ".join(labels[:_MAX_NAMED])
+        more = f" and {len(labels) - _MAX_NAMED} more" if len(labels) > _MAX_NAMED else ""
+        text = (
+            f"{len(labels)} of {len(cage.bars)} bars are not the surface of one round bar and have neither axis "
+            f"nor diameter; measures of bars leave them out: {named}{more}"
+        )
+        yield Note(where, "axis", text)
+    if cage.left_out:
+        reasons = Counter(record.reason for record in cage.left_out).most_common(_MAX_REASONS)
+        counted = ", ".join(f"{count} ({reason})" for reason, count in reasons)
+        text = f"{len(cage.left_out)} objects are left out, which rebar-build inspect lists: {counted}"
+        yield Note(where, "left-out", text)
 
 
 def mesh_file_spec(
@@ -206,45 +206,43 @@ def mesh_file_spec(
     unit_m = UNITS_M[unit] if isinstance(unit, str) else float(unit)
     if not (math.isfinite(unit_m) and unit_m > 0):
         raise MeshError(f"{path}: one file unit is {unit_m} m, expected a positive length")
-    digest = hashlib.sha256(read_assembly_file(path, "mesh", SUFFIXES)).hexdigest()
+    digest = hashlib.sha256(_read_user_file(path, "mesh")).hexdigest()
     return MeshFileSpec(os.fspath(path), digest, unit_m, placement or PlacementSpec(), select)
 
 
-def read_mesh(spec: MeshFileSpec) -> Cage:
+def _mesh_cage(content: bytes, spec: MeshFileSpec) -> Cage:
     """Return the selected parts of a mesh file as bars, by ascending id (the file's frame, metres).
 
     A bar's axis and diameter are fitted to its mesh (``fitted_bar``), or null where no tube fits; parts need not
-    be watertight. Selected parts are numbered from 1, but those of the dataset's own PLY keep their ids.
+    be watertight. Selected parts are numbered from 1, but without a selection those of the dataset's own PLY keep
+    their ids.
 
-    Raises ``MeshError`` if the file cannot be read, does not match ``spec.sha256``, holds no bar, more than
-    65,535 bars, a bar without area or a non-finite coordinate, or stores coordinates that are too coarse.
+    Raises ``MeshError`` if the content cannot be read, holds no bar, more than 65,535 bars, a bar without area or
+    a non-finite coordinate, or stores coordinates that are too coarse.
     """
-    parts = read_parts(_pinned_content(spec, "mesh", SUFFIXES), spec)
-    taken, left_out = _selected(parts, spec)
+    taken, left_out = _selected(read_parts(content, spec), spec)
     _check_spacing(taken, spec)
     bars = [_fitted_bar(part, spec.path) for part in taken]
     return Cage(tuple(bars), tuple(left_out), unit_scale(spec.unit_m))
 
 
-def _selected(parts: Sequence[MeshPart], spec: MeshFileSpec) -> tuple[list[MeshPart], list[LeftOut]]:
+def _selected(parts: list[MeshPart], spec: MeshFileSpec) -> tuple[list[MeshPart], list[LeftOut]]:
     """Return the parts that any table selects, numbered again, and those left out."""
     if not spec.select:
-        return list(parts), []
-    taken = [part for part in parts if any(_is_selected(part, table, spec.unit_m) for table in spec.select)]
+        return parts, []
+    taken, left_out = list[MeshPart](), list[LeftOut]()
+    for part in parts:
+        points = part.mesh.vertices_m / spec.unit_m
+        if any(table.matches({"name": (part.name,)}) and table.contains(points) for table in spec.select):
+            taken.append(replace(part, bar_id=len(taken) + 1))
+        else:
+            left_out.append(LeftOut(escape_text(part.name), "no [[select]] table matches"))
     if not taken:
         raise MeshError(
             f"{spec.path}: no part is selected, expected [[select]] tables that match at least one of its "
             f"{len(parts)} parts, such as {escape_text(parts[0].name)}"
         )
-    kept = {part.bar_id for part in taken}
-    left_out = [
-        LeftOut(escape_text(part.name), "no [[select]] table matches") for part in parts if part.bar_id not in kept
-    ]
-    return [replace(part, bar_id=number) for number, part in enumerate(taken, start=1)], left_out
-
-
-def _is_selected(part: MeshPart, table: Selection, unit_m: float) -> bool:
-    return table.matches({"name": (part.name,)}) and table.contains(part.mesh.vertices_m / unit_m)
+    return taken, left_out
 
 
 def _check_spacing(parts: Sequence[MeshPart], spec: MeshFileSpec) -> None:

@@ -30,7 +30,7 @@ from jaxtyping import Float, Integer
 from numpy import ndarray
 
 from dataset_builder.scene.mesh_ply import has_mesh_ply_header, parse_mesh_ply
-from dataset_builder.scene.model import ESTIMATED_ROLE, MAX_BARS, NOT_STEEL, Mesh, Note, axis_of
+from dataset_builder.scene.model import ESTIMATED_ROLE, MAX_BARS, NOT_STEEL, Mesh, axis_of
 from dataset_builder.specs.file_specs import MeshFileSpec
 from dataset_builder.user_files.mesh_formats.parsing import MalformedMeshError, Surface
 from dataset_builder.user_files.mesh_formats.ply import read_ply
@@ -53,12 +53,6 @@ SUFFIXES = tuple(_READERS)
 
 MAX_FLOAT32_SPACING_M = 1e-4
 """Largest distance of neighbouring 32-bit coordinates that is accepted, metres."""
-
-AXIS_NOTE = "axis"
-"""Code of the note on bars without an axis."""
-
-_MAX_NAMED = 10
-"""Largest number of bars that a note names."""
 
 # A handler on trimesh's logger keeps its messages, including tracebacks, off stderr.
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
@@ -199,16 +193,3 @@ def fitted_bar(bar_id: int, mesh: Mesh) -> Bar:
     if tube is None:
         return Bar.without_axis(bar_id, ESTIMATED_ROLE)
     return Bar(bar_id, ESTIMATED_ROLE, tube.diameter_m, axis_of(tube.axis_m))
-
-
-def axis_notes(source: str, labels: Sequence[str], bars: int) -> tuple[Note, ...]:
-    """Return the note that names the bars without an axis (``labels``) of all ``bars`` of a file, or none."""
-    if not labels:
-        return ()
-    named = ", ".join(labels[:_MAX_NAMED])
-    more = f" and {len(labels) - _MAX_NAMED} more" if len(labels) > _MAX_NAMED else ""
-    text = (
-        f"{len(labels)} of {bars} bars are not the surface of one round bar and have neither axis nor diameter; "
-        f"measures of bars leave them out: {named}{more}"
-    )
-    return (Note(source, AXIS_NOTE, text),)
