@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 
 from dataset_builder.scene.assemblies.bar_meshes import bar_mesh, with_ribs_chosen
-from dataset_builder.scene.assemblies.cage import Cage, CageBar, LeftOut, unit_scale
+from dataset_builder.scene.assemblies.cage import Cage, CageBar, unit_scale
 from dataset_builder.scene.model import Assembly, Note, axis_of
 from dataset_builder.scene.shapes.bending import bent_line_m, mandrel_diameter_m
 from dataset_builder.specs.file_specs import (
@@ -27,11 +27,11 @@ from dataset_builder.specs.selection import Selection
 from dataset_builder.user_files.cage_checks import cage_problems, check_values, raise_problems
 from dataset_builder.user_files.cage_placement import placed
 from dataset_builder.user_files.ifc_file import ifc_cage
-from dataset_builder.user_files.mesh_import import MAX_FLOAT32_SPACING_M, MeshPart, fitted_bar, read_parts
 from dataset_builder.user_files.mesh_import import SUFFIXES as MESH_SUFFIXES
+from dataset_builder.user_files.mesh_import import mesh_cage
 from dataset_builder.user_files.scene_schema import read_scene_toml
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.errors import InputError, MeshError, Problem, escape_text
+from rebar_depth_bench.errors import InputError, MeshError, Problem
 from rebar_depth_bench.limits import IFC_BYTES, MESH_BYTES, TOML_BYTES
 from rebar_depth_bench.reading import read_file
 from rebar_depth_bench.validation import UNITS_M
@@ -84,7 +84,7 @@ def read_cage(spec: CageFileSpec | MeshFileSpec) -> Cage:
     """
     content = _pinned_content(spec)
     if isinstance(spec, MeshFileSpec):
-        source = _mesh_cage(content, spec)
+        source = mesh_cage(content, spec)
     elif Path(spec.path).suffix.lower() == ".ifc":
         source = ifc_cage(content, spec.path, spec.select, spec.trust)
     else:
@@ -208,60 +208,3 @@ def mesh_file_spec(
         raise MeshError(f"{path}: one file unit is {unit_m} m, expected a positive length")
     digest = hashlib.sha256(_read_user_file(path, "mesh")).hexdigest()
     return MeshFileSpec(os.fspath(path), digest, unit_m, placement or PlacementSpec(), select)
-
-
-def _mesh_cage(content: bytes, spec: MeshFileSpec) -> Cage:
-    """Return the selected parts of a mesh file as bars, by ascending id (the file's frame, metres).
-
-    A bar's axis and diameter are fitted to its mesh (``fitted_bar``), or null where no tube fits; parts need not
-    be watertight. Selected parts are numbered from 1, but without a selection those of the dataset's own PLY keep
-    their ids.
-
-    Raises ``MeshError`` if the content cannot be read, holds no bar, more than 65,535 bars, a bar without area or
-    a non-finite coordinate, or stores coordinates that are too coarse.
-    """
-    taken, left_out = _selected(read_parts(content, spec), spec)
-    _check_spacing(taken, spec)
-    bars = [_fitted_bar(part, spec.path) for part in taken]
-    return Cage(tuple(bars), tuple(left_out), unit_scale(spec.unit_m))
-
-
-def _selected(parts: list[MeshPart], spec: MeshFileSpec) -> tuple[list[MeshPart], list[LeftOut]]:
-    """Return the parts that any table selects, numbered again, and those left out."""
-    if not spec.select:
-        return parts, []
-    taken, left_out = list[MeshPart](), list[LeftOut]()
-    for part in parts:
-        points = part.mesh.vertices_m / spec.unit_m
-        if any(table.matches({"name": (part.name,)}) and table.contains(points) for table in spec.select):
-            taken.append(replace(part, bar_id=len(taken) + 1))
-        else:
-            left_out.append(LeftOut(escape_text(part.name), "no [[select]] table matches"))
-    if not taken:
-        raise MeshError(
-            f"{spec.path}: no part is selected, expected [[select]] tables that match at least one of its "
-            f"{len(parts)} parts, such as {escape_text(parts[0].name)}"
-        )
-    return taken, left_out
-
-
-def _check_spacing(parts: Sequence[MeshPart], spec: MeshFileSpec) -> None:
-    """Raise ``MeshError`` if 32-bit coordinates are so large that they cannot tell 0.1 mm apart."""
-    spacing_m = max(part.spacing_m for part in parts)
-    if spacing_m > MAX_FLOAT32_SPACING_M:
-        raise MeshError(
-            f"{spec.path}: its 32-bit coordinates are {spacing_m * 1000:.3g} mm apart so far from the file's "
-            f"origin, expected {MAX_FLOAT32_SPACING_M * 1000:g} mm or less: is the unit right? Otherwise export "
-            "the cage near the origin, or in a format with 64-bit coordinates (OBJ, PLY with double, IFC)"
-        )
-
-
-def _fitted_bar(part: MeshPart, where: str) -> CageBar:
-    """Return the bar of a part; raise ``MeshError`` that names the file ``where`` if its mesh has no area."""
-    label = f"bar {part.bar_id}, {escape_text(part.name)}"
-    try:
-        return CageBar(label, fitted_bar(part.bar_id, part.mesh), mesh=part.mesh, source=escape_text(part.name))
-    except ValueError as error:
-        raise MeshError(
-            f"{where}: {label} ({len(part.mesh.faces)} triangles) is not a valid surface: {error}"
-        ) from error

@@ -1,4 +1,4 @@
-"""Mesh file import: the parts of a file's content, in the file's frame and in metres.
+"""Mesh file import: the parts of a file's content as bars, in the file's frame and in metres.
 
 - The dataset's own PLY layout (``dataset_builder.scene.mesh_ply``) is used unchanged: the faces with one
   ``bar_id`` form a part with that id; faces with id 0 (board, table) are left out.
@@ -29,6 +29,7 @@ import numpy as np
 from jaxtyping import Float, Integer
 from numpy import ndarray
 
+from dataset_builder.scene.assemblies.cage import Cage, CageBar, LeftOut, unit_scale
 from dataset_builder.scene.mesh_ply import has_mesh_ply_header, parse_mesh_ply
 from dataset_builder.scene.model import ESTIMATED_ROLE, MAX_BARS, NOT_STEEL, Mesh, axis_of
 from dataset_builder.specs.file_specs import MeshFileSpec
@@ -38,7 +39,7 @@ from dataset_builder.user_files.mesh_formats.stl_obj import read_obj, read_stl
 from dataset_builder.user_files.tubes.tube_fit import fit_tube
 from dataset_builder.user_files.tubes.tube_surface import component_labels
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.errors import DatasetError, MeshError
+from rebar_depth_bench.errors import DatasetError, MeshError, escape_text
 
 if TYPE_CHECKING:
     import trimesh
@@ -66,6 +67,63 @@ class MeshPart:
     name: str
     mesh: Mesh
     spacing_m: float = 0.0
+
+
+def mesh_cage(content: bytes, spec: MeshFileSpec) -> Cage:
+    """Return the selected parts of a mesh file as bars, by ascending id (the file's frame, metres).
+
+    A bar's axis and diameter are fitted to its mesh (``fitted_bar``), or null where no tube fits; parts need not
+    be watertight. Selected parts are numbered from 1, but without a selection those of the dataset's own PLY keep
+    their ids.
+
+    Raises ``MeshError`` if the content cannot be read, holds no bar, more than 65,535 bars, a bar without area or
+    a non-finite coordinate, or stores coordinates that are too coarse.
+    """
+    taken, left_out = _selected(read_parts(content, spec), spec)
+    _check_spacing(taken, spec)
+    bars = [_fitted_bar(part, spec.path) for part in taken]
+    return Cage(tuple(bars), tuple(left_out), unit_scale(spec.unit_m))
+
+
+def _selected(parts: list[MeshPart], spec: MeshFileSpec) -> tuple[list[MeshPart], list[LeftOut]]:
+    """Return the parts that any table selects, numbered again, and those left out."""
+    if not spec.select:
+        return parts, []
+    taken, left_out = list[MeshPart](), list[LeftOut]()
+    for part in parts:
+        points = part.mesh.vertices_m / spec.unit_m
+        if any(table.matches({"name": (part.name,)}) and table.contains(points) for table in spec.select):
+            taken.append(replace(part, bar_id=len(taken) + 1))
+        else:
+            left_out.append(LeftOut(escape_text(part.name), "no [[select]] table matches"))
+    if not taken:
+        raise MeshError(
+            f"{spec.path}: no part is selected, expected [[select]] tables that match at least one of its "
+            f"{len(parts)} parts, such as {escape_text(parts[0].name)}"
+        )
+    return taken, left_out
+
+
+def _check_spacing(parts: Sequence[MeshPart], spec: MeshFileSpec) -> None:
+    """Raise ``MeshError`` if 32-bit coordinates are so large that they cannot tell 0.1 mm apart."""
+    spacing_m = max(part.spacing_m for part in parts)
+    if spacing_m > MAX_FLOAT32_SPACING_M:
+        raise MeshError(
+            f"{spec.path}: its 32-bit coordinates are {spacing_m * 1000:.3g} mm apart so far from the file's "
+            f"origin, expected {MAX_FLOAT32_SPACING_M * 1000:g} mm or less: is the unit right? Otherwise export "
+            "the cage near the origin, or in a format with 64-bit coordinates (OBJ, PLY with double, IFC)"
+        )
+
+
+def _fitted_bar(part: MeshPart, where: str) -> CageBar:
+    """Return the bar of a part; raise ``MeshError`` that names the file ``where`` if its mesh has no area."""
+    label = f"bar {part.bar_id}, {escape_text(part.name)}"
+    try:
+        return CageBar(label, fitted_bar(part.bar_id, part.mesh), mesh=part.mesh, source=escape_text(part.name))
+    except ValueError as error:
+        raise MeshError(
+            f"{where}: {label} ({len(part.mesh.faces)} triangles) is not a valid surface: {error}"
+        ) from error
 
 
 def read_parts(content: bytes, spec: MeshFileSpec) -> list[MeshPart]:
