@@ -19,7 +19,7 @@ from __future__ import annotations
 import logging
 import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from textwrap import shorten
@@ -52,7 +52,7 @@ _READERS: Mapping[str, Callable[[bytes], Mapping[str, Surface]]] = {
 SUFFIXES = tuple(_READERS)
 """Supported suffixes of mesh files, in lower case."""
 
-MAX_FLOAT32_SPACING_M = 1e-4
+_MAX_FLOAT32_SPACING_M = 1e-4
 """Largest distance of neighbouring 32-bit coordinates that is accepted, metres."""
 
 # A handler on trimesh's logger keeps its messages, including tracebacks, off stderr.
@@ -61,12 +61,11 @@ logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 @dataclass(frozen=True, eq=False)
 class MeshPart:
-    """Part of a file: id, name, mesh (the file's frame, metres), and the spacing of 32-bit coordinates or 0."""
+    """Part of a file: id, name and mesh (the file's frame, metres)."""
 
     bar_id: int
     name: str
     mesh: Mesh
-    spacing_m: float = 0.0
 
 
 def mesh_cage(content: bytes, spec: MeshFileSpec) -> Cage:
@@ -76,11 +75,9 @@ def mesh_cage(content: bytes, spec: MeshFileSpec) -> Cage:
     be watertight. Selected parts are numbered from 1, but without a selection those of the dataset's own PLY keep
     their ids.
 
-    Raises ``MeshError`` if the content cannot be read, holds no bar, more than 65,535 bars, a bar without area or
-    a non-finite coordinate, or stores coordinates that are too coarse.
+    Raises ``MeshError`` as ``read_parts``, if no part is selected, and for a part without area.
     """
     taken, left_out = _selected(read_parts(content, spec), spec)
-    _check_spacing(taken, spec)
     bars = [_fitted_bar(part, spec.path) for part in taken]
     return Cage(tuple(bars), tuple(left_out), unit_scale(spec.unit_m))
 
@@ -104,17 +101,6 @@ def _selected(parts: list[MeshPart], spec: MeshFileSpec) -> tuple[list[MeshPart]
     return taken, left_out
 
 
-def _check_spacing(parts: Sequence[MeshPart], spec: MeshFileSpec) -> None:
-    """Raise ``MeshError`` if 32-bit coordinates are so large that they cannot tell 0.1 mm apart."""
-    spacing_m = max(part.spacing_m for part in parts)
-    if spacing_m > MAX_FLOAT32_SPACING_M:
-        raise MeshError(
-            f"{spec.path}: its 32-bit coordinates are {spacing_m * 1000:.3g} mm apart so far from the file's "
-            f"origin, expected {MAX_FLOAT32_SPACING_M * 1000:g} mm or less: is the unit right? Otherwise export "
-            "the cage near the origin, or in a format with 64-bit coordinates (OBJ, PLY with double, IFC)"
-        )
-
-
 def _fitted_bar(part: MeshPart, where: str) -> CageBar:
     """Return the bar of a part; raise ``MeshError`` that names the file ``where`` if its mesh has no area."""
     label = f"bar {part.bar_id}, {escape_text(part.name)}"
@@ -130,7 +116,8 @@ def read_parts(content: bytes, spec: MeshFileSpec) -> list[MeshPart]:
     """Return the parts of a file's ``content``, by ascending id; the suffix of ``spec.path`` selects the format.
 
     Raises ``MeshError`` if the content cannot be read, holds no triangle, only id 0, more than ``MAX_BARS`` parts
-    or a non-finite coordinate. Any exception that a damaged or hostile file causes becomes one of one line.
+    or a non-finite coordinate, or stores coordinates that are too coarse. Any exception that a damaged or hostile
+    file causes becomes one of one line.
     """
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
@@ -161,36 +148,44 @@ def _dataset_ply_parts(content: bytes, spec: MeshFileSpec) -> list[MeshPart]:
     return [MeshPart(bar_id, f"bar {bar_id}", mesh) for bar_id, mesh in meshes.items()]
 
 
-def _numbered_parts(objects: Sequence[MeshPart], spec: MeshFileSpec) -> list[MeshPart]:
-    """Return the parts of objects that are ordered and not numbered; a single one is split."""
-    if not objects:
-        raise MeshError(f"{spec.path}: no triangle found, expected the surface of at least one bar")
+def _numbered_parts(objects: Mapping[str, Mesh], spec: MeshFileSpec) -> list[MeshPart]:
+    """Return the parts of objects that are ordered; a single one is split."""
     if len(objects) == 1:
-        (whole,) = objects
-        meshes = connected_components(_mesh_of(_merged_close_vertices(whole.mesh)))
-        objects = [replace(whole, name=f"part {number}", mesh=mesh) for number, mesh in enumerate(meshes, start=1)]
+        [whole] = objects.values()
+        meshes = connected_components(_mesh_of(_merged_close_vertices(whole)))
+        objects = {f"part {number}": mesh for number, mesh in enumerate(meshes, start=1)}
     if len(objects) > MAX_BARS:
         raise MeshError(f"{spec.path}: {len(objects)} separate parts found, expected at most {MAX_BARS} bars")
     return [
-        replace(part, bar_id=bar_id, mesh=_oriented_outward(part.mesh))
-        for bar_id, part in enumerate(objects, start=1)
+        MeshPart(bar_id, name, _oriented_outward(mesh))
+        for bar_id, (name, mesh) in enumerate(objects.items(), start=1)
     ]
 
 
-def _read_objects(content: bytes, spec: MeshFileSpec) -> list[MeshPart]:
-    """Return the objects of a file of any program, without ids, ordered by name, without empty ones."""
+def _read_objects(content: bytes, spec: MeshFileSpec) -> dict[str, Mesh]:
+    """Return the objects of a file of any program, ordered by name, without empty ones."""
     surfaces = _READERS[Path(spec.path).suffix.lower()](content)
-    spacing_m = spec.unit_m * max((_spacing(vertices) for vertices, _ in surfaces.values()), default=0.0)
-    return [
-        MeshPart(0, name, Mesh(vertices.astype(np.float64) * spec.unit_m, faces.astype(np.int32)), spacing_m)
+    objects = {
+        name: Mesh(vertices.astype(np.float64) * spec.unit_m, faces.astype(np.int32))
         for name, (vertices, faces) in sorted(surfaces.items(), key=lambda item: _natural_sort_key(item[0]))
         if len(faces)
-    ]
+    }
+    if not objects:
+        raise MeshError(f"{spec.path}: no triangle found, expected the surface of at least one bar")
+    for vertices, _ in surfaces.values():
+        _check_spacing(vertices, spec)
+    return objects
 
 
-def _spacing(vertices: Float[ndarray, "v 3"]) -> float:
-    """Return the distance of the largest coordinate from the next that the file can store; 0 for float64."""
-    return float(np.spacing(np.abs(vertices).max(initial=0))) if vertices.dtype == np.float32 else 0.0
+def _check_spacing(vertices: Float[ndarray, "v 3"], spec: MeshFileSpec) -> None:
+    """Raise ``MeshError`` if 32-bit coordinates are so large that they cannot tell 0.1 mm apart."""
+    spacing_m = spec.unit_m * float(np.spacing(np.abs(vertices).max())) if vertices.dtype == np.float32 else 0.0
+    if spacing_m > _MAX_FLOAT32_SPACING_M:
+        raise MeshError(
+            f"{spec.path}: its 32-bit coordinates are {spacing_m * 1000:.3g} mm apart so far from the file's "
+            f"origin, expected {_MAX_FLOAT32_SPACING_M * 1000:g} mm or less: is the unit right? Otherwise export "
+            "the cage near the origin, or in a format with 64-bit coordinates (OBJ, PLY with double, IFC)"
+        )
 
 
 def _natural_sort_key(name: str) -> tuple[list[str | int], str]:
