@@ -252,15 +252,13 @@ def _duplicate_axis_problems(bars: Sequence[CageBar]) -> list[Problem]:
 
     The pixels of such bars would be ambiguous.
     """
-    first_label: dict[object, str] = {}
+    first_label: dict[bytes, str] = {}
     problems = []
     for bar in bars:
         if not bar.bar.has_axis:
             continue
-        points = [
-            tuple(point) for point in np.round(np.array(bar.bar.axis_m) / _SAME_AXIS_M).astype(np.int64).tolist()
-        ]
-        key = min(tuple(points), tuple(reversed(points)))
+        steps = np.round(np.array(bar.bar.axis_m) / _SAME_AXIS_M).astype(np.int64)
+        key = min(steps.tobytes(), steps[::-1].tobytes())
         if key in first_label:
             found = f"has the same axis as {first_label[key]}"
             problems.append(Problem("duplicate", bar.label, found, "distinct axes"))
