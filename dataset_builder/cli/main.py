@@ -202,7 +202,7 @@ def _inspect(options: argparse.Namespace) -> None:
     from dataset_builder.inspection.report import inspection_json, print_inspection
     from dataset_builder.inspection.summary import inspect_cage
     from dataset_builder.pipeline.plan import print_notes
-    from dataset_builder.user_files.cage_checks import raise_problems
+    from dataset_builder.user_files.cage_file import raise_problems
 
     check_outputs({**vars(options), "scene_files": files_of_scene(options.scene_file)})
     cage = scene_cage(options.scene_file, options.mesh_unit)

@@ -6,39 +6,37 @@ import hashlib
 import math
 import os
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Literal
 
-from dataset_builder.scene.assemblies.bar_meshes import bar_mesh, with_ribs_chosen
-from dataset_builder.scene.assemblies.cage import Cage, CageBar, LeftOut, unit_scale
-from dataset_builder.scene.model import Assembly, Note
+import numpy as np
+
+from dataset_builder.scene.assemblies.bar_meshes import bar_mesh, estimated_triangles, with_ribs_chosen
+from dataset_builder.scene.assemblies.cage import Cage, CageBar, unit_scale
+from dataset_builder.scene.model import MAX_BARS, Assembly, Note, axis_of
+from dataset_builder.scene.shapes.bending import bent_line_m, mandrel_diameter_m
 from dataset_builder.specs.file_specs import (
     CageFileSpec,
     MeshFileSpec,
-    PinnedFile,
     PlacementSpec,
     Trust,
 )
 from dataset_builder.specs.selection import Selection
-from dataset_builder.user_files.cage_checks import cage_problems, check_values, raise_problems
 from dataset_builder.user_files.cage_placement import placed
 from dataset_builder.user_files.ifc_file import ifc_cage
-from dataset_builder.user_files.mesh_import import (
-    MAX_FLOAT32_SPACING_M,
-    SUFFIXES,
-    MeshPart,
-    axis_notes,
-    fitted_bar,
-    read_parts,
-)
-from dataset_builder.user_files.toml_bars import toml_cage
-from rebar_depth_bench.errors import MeshError, Problem, escape_text
+from dataset_builder.user_files.mesh_import import SUFFIXES as MESH_SUFFIXES
+from dataset_builder.user_files.mesh_import import mesh_cage
+from dataset_builder.user_files.scene_schema import read_scene_toml
+from rebar_depth_bench.data.bars import Bar
+from rebar_depth_bench.errors import InputError, MeshError, Problem
 from rebar_depth_bench.limits import IFC_BYTES, MESH_BYTES, TOML_BYTES
 from rebar_depth_bench.reading import read_file
 from rebar_depth_bench.validation import UNITS_M
 
-_SUFFIXES = (".toml", ".ifc")
+_Kind = Literal["cage", "mesh"]
+_SUFFIXES: Mapping[_Kind, Sequence[str]] = {"cage": (".toml", ".ifc"), "mesh": MESH_SUFFIXES}
 _GLTF_CONVERSION = (
     ": convert glTF to OBJ, as with python -c "
     "\"import trimesh; trimesh.load_scene('FILE.glb').export('FILE.obj')\", "
@@ -46,6 +44,28 @@ _GLTF_CONVERSION = (
 )
 _LIMITS = {".toml": TOML_BYTES, ".ifc": IFC_BYTES}
 """Limits of the files of an assembly by suffix; those of meshes have ``MESH_BYTES``."""
+
+_MAX_NAMED = 10
+"""Largest number of bars that a note names."""
+
+_MAX_REASONS = 5
+"""Largest number of reasons for leaving out objects that a note gives."""
+
+MIN_DIAMETER_M, MAX_DIAMETER_M = 0.0005, 0.2
+"""Bounds of a bar's diameter: thin binding wire, and far more than the thickest bar made.
+
+Beyond them the unit is wrong.
+"""
+
+MIN_EXTENT_M = 0.001
+MAX_EXTENT_M = 100.0
+"""Exclusive bounds of the largest side of a cage, metres; beyond them its unit is wrong."""
+
+MAX_TRIANGLES = 20_000_000
+"""Largest estimated number of triangles of a cage."""
+
+_SAME_AXIS_M = 1e-6
+"""Grid spacing to which axes are rounded for the comparison of bars, metres."""
 
 
 def cage_file_spec(
@@ -58,105 +78,8 @@ def cage_file_spec(
 
     Raises ``MeshError`` if it cannot be read or its suffix is neither ``.toml`` nor ``.ifc``.
     """
-    digest = hashlib.sha256(read_assembly_file(path, "cage", _SUFFIXES)).hexdigest()
+    digest = hashlib.sha256(_read_user_file(path, "cage")).hexdigest()
     return CageFileSpec(os.fspath(path), digest, placement, select, trust)
-
-
-def load_cage(spec: CageFileSpec | MeshFileSpec, cage: Cage | None = None) -> Assembly:
-    """Return the file's bars, in its order, and a mesh (world, metres) for each of them.
-
-    The file is not read if ``cage`` is what was read from it. Raises as ``read_cage``, and ``MeshError`` if the
-    bars are not valid (see ``cage_assembly``).
-    """
-    return cage_assembly(cage or read_cage(spec), spec.path)
-
-
-def read_cage(spec: CageFileSpec | MeshFileSpec) -> Cage:
-    """Return the bars of a file in the world frame, with the reasons for which a build refuses them.
-
-    Raises ``MeshError`` if the file cannot be read, does not match ``spec.sha256``, violates its format, or has no
-    bar or a coordinate that is not finite; ``InputError`` if it is an IFC file and ifcopenshell is not installed.
-    """
-    source = read_mesh(spec) if isinstance(spec, MeshFileSpec) else _read_bars(spec)
-    check_values(source.bars, spec.path)
-    cage = placed(source, spec.placement)
-    return replace(cage, problems=(*cage.problems, *cage_problems(cage.bars)))
-
-
-def _read_bars(spec: CageFileSpec) -> Cage:
-    """Return the bars of a TOML or IFC file (the file's frame, metres)."""
-    content = _pinned_content(spec, "cage", _SUFFIXES)
-    if Path(spec.path).suffix.lower() == ".ifc":
-        return ifc_cage(content, spec.path, spec.select, spec.trust)
-    return toml_cage(content, spec.path)
-
-
-_MAX_REASONS = 5
-"""Largest number of reasons for leaving out objects that a note gives."""
-
-
-def _pinned_content(spec: PinnedFile, kind: str, suffixes: Collection[str]) -> bytes:
-    """Return the content of the file of a spec.
-
-    Raises as ``read_assembly_file``, and ``MeshError`` if the content is not that of the spec.
-    """
-    content = read_assembly_file(spec.path, kind, suffixes)
-    actual_sha256 = hashlib.sha256(content).hexdigest()
-    if actual_sha256 != spec.sha256:
-        raise MeshError(
-            f"{spec.path}: the file has changed since it was selected: its sha256 is {actual_sha256}, "
-            f"expected {spec.sha256}"
-        )
-    return content
-
-
-def unsupported_type(path: str | os.PathLike[str], kind: str, expected: str) -> str:
-    """Return the message about a file of a type that is not read; for glTF it names the conversion."""
-    suffix = Path(path).suffix.lower()
-    conversion = _GLTF_CONVERSION if suffix in (".glb", ".gltf") else ""
-    return f"{path}: unsupported {kind} file type {suffix!r}, expected {expected}{conversion}"
-
-
-def read_assembly_file(path: str | os.PathLike[str], kind: str, suffixes: Collection[str]) -> bytes:
-    """Return the bytes of a user's file; ``kind`` is ``mesh`` or ``cage``.
-
-    Raises ``MeshError`` if its suffix is not one of ``suffixes``, it cannot be read or it is too large.
-    """
-    suffix = Path(path).suffix.lower()
-    if suffix not in suffixes:
-        raise MeshError(unsupported_type(path, kind, ", ".join(suffixes)))
-    return read_file(Path(path), _LIMITS.get(suffix, MESH_BYTES), f"a {kind} file", MeshError)
-
-
-def cage_assembly(cage: Cage, where: str) -> Assembly:
-    """Return the assembly of a cage's bars, in their order (world frame, metres).
-
-    A bar is ribbed unless its ``ribs`` is false or it would have more than ``MAX_RIBS_PER_ROW`` ribs in a row.
-    If the ribbed bars have more than ``MAX_RIBS_PER_CAGE`` ribs altogether, no bar is ribbed.
-
-    Raises ``MeshError`` with all ``problems`` of the cage, or with all bars of which no mesh can be made.
-    """
-    raise_problems(cage.problems, where)
-    meshes, problems = [], []
-    for bar in with_ribs_chosen(cage.bars):
-        try:
-            meshes.append((bar.bar, bar_mesh(bar)))
-        except ValueError as error:
-            problems.append(Problem("invalid", bar.label, str(error)))
-    raise_problems(problems, where)
-    without_axis = [bar.label for bar in cage.bars if not bar.bar.has_axis]
-    notes = [*cage.notes, *axis_notes(where, without_axis, len(cage.bars))]
-    return Assembly.from_meshes(meshes, (*notes, *_left_out_notes(cage, where)), cage.world_from_source)
-
-
-def _left_out_notes(cage: Cage, where: str) -> tuple[Note, ...]:
-    """Return the note that counts the objects of the file that are not in the cage, or none."""
-    if not cage.left_out:
-        return ()
-    reasons = Counter(record.reason for record in cage.left_out).most_common(_MAX_REASONS)
-    counted = ", ".join(f"{count} ({reason})" for reason, count in reasons)
-    text = f"{len(cage.left_out)} objects are left out, which rebar-build inspect lists: {counted}"
-    return (Note(where, "left-out", text),)
 
 
 def mesh_file_spec(
@@ -177,64 +100,204 @@ def mesh_file_spec(
     unit_m = UNITS_M[unit] if isinstance(unit, str) else float(unit)
     if not (math.isfinite(unit_m) and unit_m > 0):
         raise MeshError(f"{path}: one file unit is {unit_m} m, expected a positive length")
-    digest = hashlib.sha256(read_assembly_file(path, "mesh", SUFFIXES)).hexdigest()
+    digest = hashlib.sha256(_read_user_file(path, "mesh")).hexdigest()
     return MeshFileSpec(os.fspath(path), digest, unit_m, placement or PlacementSpec(), select)
 
 
-def read_mesh(spec: MeshFileSpec) -> Cage:
-    """Return the selected parts of a mesh file as bars, by ascending id (the file's frame, metres).
+def load_cage(spec: CageFileSpec | MeshFileSpec, cage: Cage | None = None) -> Assembly:
+    """Return the file's bars, in its order, and a mesh (world, metres) for each of them.
 
-    A bar's axis and diameter are fitted to its mesh (``fitted_bar``), or null where no tube fits; parts need not
-    be watertight. Selected parts are numbered from 1, but those of the dataset's own PLY keep their ids.
-
-    Raises ``MeshError`` if the file cannot be read, does not match ``spec.sha256``, holds no bar, more than
-    65,535 bars, a bar without area or a non-finite coordinate, or stores coordinates that are too coarse.
+    The file is not read if ``cage`` is what was read from it. Raises as ``read_cage``, and ``MeshError`` if the
+    bars are not valid (see ``cage_assembly``).
     """
-    parts = read_parts(_pinned_content(spec, "mesh", SUFFIXES), spec)
-    taken, left_out = _selected(parts, spec)
-    _check_spacing(taken, spec)
-    bars = [_fitted_bar(part, spec.path) for part in taken]
-    return Cage(tuple(bars), tuple(left_out), unit_scale(spec.unit_m))
+    return cage_assembly(cage or read_cage(spec), spec.path)
 
 
-def _selected(parts: Sequence[MeshPart], spec: MeshFileSpec) -> tuple[list[MeshPart], list[LeftOut]]:
-    """Return the parts that any table selects, numbered again, and those left out."""
-    if not spec.select:
-        return list(parts), []
-    taken = [part for part in parts if any(_is_selected(part, table, spec.unit_m) for table in spec.select)]
-    if not taken:
-        raise MeshError(
-            f"{spec.path}: no part is selected, expected [[select]] tables that match at least one of its "
-            f"{len(parts)} parts, such as {escape_text(parts[0].name)}"
-        )
-    kept = {part.bar_id for part in taken}
-    left_out = [
-        LeftOut(escape_text(part.name), "no [[select]] table matches") for part in parts if part.bar_id not in kept
-    ]
-    return [replace(part, bar_id=number) for number, part in enumerate(taken, start=1)], left_out
+def read_cage(spec: CageFileSpec | MeshFileSpec) -> Cage:
+    """Return the bars of a file in the world frame, with the reasons for which a build refuses them.
+
+    Raises ``MeshError`` if the file cannot be read, does not match ``spec.sha256``, violates its format, or has no
+    bar or a coordinate that is not finite; ``InputError`` if it is an IFC file and ifcopenshell is not installed.
+    """
+    content = _pinned_content(spec)
+    if isinstance(spec, MeshFileSpec):
+        source = mesh_cage(content, spec)
+    elif Path(spec.path).suffix.lower() == ".ifc":
+        source = ifc_cage(content, spec.path, spec.select, spec.trust)
+    else:
+        source = _toml_cage(content, spec.path)
+    check_values(source.bars, spec.path)
+    cage = placed(source, spec.placement)
+    return replace(cage, problems=(*cage.problems, *cage_problems(cage.bars)))
 
 
-def _is_selected(part: MeshPart, table: Selection, unit_m: float) -> bool:
-    return table.matches({"name": (part.name,)}) and table.contains(part.mesh.vertices_m / unit_m)
+def _toml_cage(content: bytes, where: str) -> Cage:
+    """Return the bars of a scene TOML file, in its order (the file's frame, metres).
 
-
-def _check_spacing(parts: Sequence[MeshPart], spec: MeshFileSpec) -> None:
-    """Raise ``MeshError`` if 32-bit coordinates are so large that they cannot tell 0.1 mm apart."""
-    spacing_m = max(part.spacing_m for part in parts)
-    if spacing_m > MAX_FLOAT32_SPACING_M:
-        raise MeshError(
-            f"{spec.path}: its 32-bit coordinates are {spacing_m * 1000:.3g} mm apart so far from the file's "
-            f"origin, expected {MAX_FLOAT32_SPACING_M * 1000:g} mm or less: is the unit right? Otherwise export "
-            "the cage near the origin, or in a format with 64-bit coordinates (OBJ, PLY with double, IFC)"
-        )
-
-
-def _fitted_bar(part: MeshPart, where: str) -> CageBar:
-    """Return the bar of a part; raise ``MeshError`` that names the file ``where`` if its mesh has no area."""
-    label = f"bar {part.bar_id}, {escape_text(part.name)}"
+    Raises ``MeshError`` that names the file ``where`` and all bars that cannot be bent.
+    """
     try:
-        return CageBar(label, fitted_bar(part.bar_id, part.mesh), mesh=part.mesh, source=escape_text(part.name))
-    except ValueError as error:
+        scene = read_scene_toml(content, where)
+    except InputError as error:
+        raise MeshError.from_problems(where, error.problems) from error
+    cage_bars, problems = [], []
+    for number, bar in enumerate(scene.bars, start=1):
+        label = f"bar {bar.bar_id} ({bar.role}, diameter {bar.diameter_m:g} m)"
+        mandrel_m = mandrel_diameter_m(bar.diameter_m) if bar.mandrel_m is None else bar.mandrel_m
+        try:
+            line_m = bent_line_m(np.array(bar.corners_m), (mandrel_m + bar.diameter_m) / 2)
+        except ValueError as error:
+            problems.append(Problem("invalid", label, str(error), "a path that is long enough for its bends"))
+            continue
+        bent = Bar(bar.bar_id, bar.role, bar.diameter_m, axis_of(line_m))
+        cage_bars.append(CageBar(label, bent, bar.ribs, source=f"bar {number}"))
+    raise_problems(problems, where)
+    return Cage(tuple(cage_bars), (), unit_scale(scene.unit_m))
+
+
+def _pinned_content(spec: CageFileSpec | MeshFileSpec) -> bytes:
+    """Return the content of the file of a spec.
+
+    Raises as ``_read_user_file``, and ``MeshError`` if the content is not that of the spec.
+    """
+    content = _read_user_file(spec.path, "mesh" if isinstance(spec, MeshFileSpec) else "cage")
+    actual_sha256 = hashlib.sha256(content).hexdigest()
+    if actual_sha256 != spec.sha256:
         raise MeshError(
-            f"{where}: {label} ({len(part.mesh.faces)} triangles) is not a valid surface: {error}"
-        ) from error
+            f"{spec.path}: the file has changed since it was selected: its sha256 is {actual_sha256}, "
+            f"expected {spec.sha256}"
+        )
+    return content
+
+
+def unsupported_type(path: str | os.PathLike[str], kind: str, expected: str) -> str:
+    """Return the message about a file of a type that is not read; for glTF it names the conversion."""
+    suffix = Path(path).suffix.lower()
+    conversion = _GLTF_CONVERSION if suffix in (".glb", ".gltf") else ""
+    return f"{path}: unsupported {kind} file type {suffix!r}, expected {expected}{conversion}"
+
+
+def _read_user_file(path: str | os.PathLike[str], kind: _Kind) -> bytes:
+    """Return the bytes of a user's file.
+
+    Raises ``MeshError`` if its suffix is not one of its kind, it cannot be read or it is too large.
+    """
+    suffix = Path(path).suffix.lower()
+    if suffix not in _SUFFIXES[kind]:
+        raise MeshError(unsupported_type(path, kind, ", ".join(_SUFFIXES[kind])))
+    return read_file(Path(path), _LIMITS.get(suffix, MESH_BYTES), f"a {kind} file", MeshError)
+
+
+def check_values(bars: Sequence[CageBar], where: str) -> None:
+    """Raise ``MeshError`` for no bar or too many, and for coordinates that are not finite."""
+    if not 1 <= len(bars) <= MAX_BARS:
+        raise MeshError(f"{where}: {len(bars)} bars found, expected 1 to {MAX_BARS}")
+    unbounded = [bar for bar in bars if not np.isfinite(bar.points_m).all()]
+    problems = [Problem("invalid", bar.label, "a coordinate is not finite", "finite numbers") for bar in unbounded]
+    raise_problems(problems, where)
+
+
+def cage_problems(bars: Sequence[CageBar]) -> list[Problem]:
+    """Return the reasons to refuse bars in the world frame, whose coordinates are finite.
+
+    They are implausible diameters, bars far from the origin, an implausible size of the whole, bars with the same
+    axis, and too many triangles.
+    """
+    problems = [problem for bar in bars for problem in _bar_problems(bar)]
+    if not problems:
+        problems = [*_extent_problems(bars), *_duplicate_axis_problems(bars)]
+    return problems or _size_problems(bars)
+
+
+def raise_problems(problems: Sequence[Problem], where: str) -> None:
+    """Raise ``MeshError`` with all ``problems`` of the file ``where``, if there are any."""
+    if problems:
+        raise MeshError.from_problems(where, problems)
+
+
+def _bar_problems(bar: CageBar) -> list[Problem]:
+    """Return what is wrong with one bar: its diameter, or points too far away."""
+    diameter_m, farthest_m = bar.bar.diameter_m, float(np.abs(bar.points_m).max())
+    problems = []
+    if bar.bar.has_axis and not MIN_DIAMETER_M <= diameter_m <= MAX_DIAMETER_M:  # Also catches NaN.
+        expected = f"{MIN_DIAMETER_M:g} to {MAX_DIAMETER_M:g} m: is the unit right?"
+        problems.append(Problem("invalid", bar.label, f"the diameter is {diameter_m:.6g} m", expected))
+    if farthest_m > MAX_EXTENT_M:
+        found = f"extends {farthest_m:.6g} m from the world's origin"
+        expected = f"at most {MAX_EXTENT_M:g} m: is the unit right, and is the cage at the origin?"
+        problems.append(Problem("invalid", bar.label, found, expected))
+    return problems
+
+
+def _extent_problems(bars: Sequence[CageBar]) -> list[Problem]:
+    """Return a problem if the largest side of the cage is implausible, else an empty list."""
+    points_m = np.concatenate([bar.points_m for bar in bars])
+    extent_m = float(np.ptp(points_m, axis=0).max())
+    if MIN_EXTENT_M < extent_m < MAX_EXTENT_M:
+        return []
+    expected = f"{MIN_EXTENT_M:g} to {MAX_EXTENT_M:g} m: is the unit right?"
+    return [Problem("invalid", "", f"the cage is {extent_m:.6g} m long", expected)]
+
+
+def _size_problems(bars: Sequence[CageBar]) -> list[Problem]:
+    triangles = sum(map(estimated_triangles, with_ribs_chosen(bars)))
+    if triangles <= MAX_TRIANGLES:
+        return []
+    expected = f"at most {MAX_TRIANGLES}: choose a part of the model with [[select]] tables in a scene TOML file"
+    return [Problem("invalid", "", f"the bars make {triangles} triangles", expected)]
+
+
+def _duplicate_axis_problems(bars: Sequence[CageBar]) -> list[Problem]:
+    """Return a problem for each bar whose axis equals an earlier one, in either direction, to the micrometre.
+
+    The pixels of such bars would be ambiguous.
+    """
+    first_label: dict[bytes, str] = {}
+    problems = []
+    for bar in bars:
+        if not bar.bar.has_axis:
+            continue
+        steps = np.round(np.array(bar.bar.axis_m) / _SAME_AXIS_M).astype(np.int64)
+        key = min(steps.tobytes(), steps[::-1].tobytes())
+        if key in first_label:
+            found = f"has the same axis as {first_label[key]}"
+            problems.append(Problem("duplicate", bar.label, found, "distinct axes"))
+        first_label.setdefault(key, bar.label)
+    return problems
+
+
+def cage_assembly(cage: Cage, where: str) -> Assembly:
+    """Return the assembly of a cage's bars, in their order (world frame, metres).
+
+    A bar is ribbed unless its ``ribs`` is false or it would have more than ``MAX_RIBS_PER_ROW`` ribs in a row.
+    If the ribbed bars have more than ``MAX_RIBS_PER_CAGE`` ribs altogether, no bar is ribbed.
+
+    Raises ``MeshError`` with all ``problems`` of the cage, or with all bars of which no mesh can be made.
+    """
+    raise_problems(cage.problems, where)
+    meshes, problems = [], []
+    for bar in with_ribs_chosen(cage.bars):
+        try:
+            meshes.append((bar.bar, bar_mesh(bar)))
+        except ValueError as error:
+            problems.append(Problem("invalid", bar.label, str(error)))
+    raise_problems(problems, where)
+    return Assembly.from_meshes(meshes, (*cage.notes, *_file_notes(cage, where)), cage.world_from_source)
+
+
+def _file_notes(cage: Cage, where: str) -> Iterator[Note]:
+    """Yield the note that names the bars without an axis, and that which counts the objects that are left out."""
+    labels = [bar.label for bar in cage.bars if not bar.bar.has_axis]
+    if labels:
+        named = ", ".join(labels[:_MAX_NAMED])
+        more = f" and {len(labels) - _MAX_NAMED} more" if len(labels) > _MAX_NAMED else ""
+        text = (
+            f"{len(labels)} of {len(cage.bars)} bars are not the surface of one round bar and have neither axis "
+            f"nor diameter; measures of bars leave them out: {named}{more}"
+        )
+        yield Note(where, "axis", text)
+    if cage.left_out:
+        reasons = Counter(record.reason for record in cage.left_out).most_common(_MAX_REASONS)
+        counted = ", ".join(f"{count} ({reason})" for reason, count in reasons)
+        text = f"{len(cage.left_out)} objects are left out, which rebar-build inspect lists: {counted}"
+        yield Note(where, "left-out", text)

@@ -154,7 +154,7 @@ class Answer:
     def _swept_bar(self, bar_id: int, record: BarRecord, axis_m: Float64[ndarray, "n 3"]) -> CageBar:
         axis = axis_of(np.round(axis_m, METRE_DECIMALS))
         bar = Bar(bar_id, record.role, round(record.diameter_m, METRE_DECIMALS), axis)
-        notes = tuple(Note(record.source.label, note.code, note.text) for note in record.notes)
+        notes = tuple(Note(record.source.label, code, text) for code, text in record.notes.items())
         return self._compared(CageBar(_bar_label(bar_id, record.source), bar, notes=notes), record.source)
 
     def _surface_bars(

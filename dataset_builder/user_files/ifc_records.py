@@ -1,7 +1,7 @@
 """Records of the answer of the process that reads an IFC file: lines of JSON, each followed by its arrays.
 
 An answer begins with a ``ProjectRecord`` and ends with an ``EndRecord`` or a ``FailureRecord``. ``ifc_reader``
-writes it, and ``assemblies.ifc_file`` reads it, as data of a stranger: the writer has read a file from outside.
+writes it, and ``user_files.ifc_file`` reads it, as data of a stranger: the writer has read a file from outside.
 """
 
 from __future__ import annotations
@@ -24,6 +24,7 @@ MAX_ARRAY_BYTES = 1 << 30
 
 _MAX_LINE_BYTES = 20_000
 _Label = Annotated[str, Field(min_length=1, max_length=200)]
+_Code = Annotated[str, Field(pattern="^[a-z]{1,20}$")]
 _Size = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 
 
@@ -49,13 +50,6 @@ class Source(StrictModel):
     length_m: _Size | None
 
 
-class NoteRecord(StrictModel):
-    """Remark on a bar."""
-
-    code: Annotated[str, Field(pattern="^[a-z]{1,20}$")]
-    text: Annotated[str, Field(max_length=200)]
-
-
 class _Record(StrictModel):
     """Record; ``ARRAYS`` are its arrays: field with the number of rows, of three values, and data type of each."""
 
@@ -78,12 +72,12 @@ class LeftOutRecord(_Record):
 
 
 class BarRecord(_Record):
-    """Bar with an axis; its points follow (the file's frame, metres)."""
+    """Bar with an axis, and remarks on it by their codes; its points follow (the file's frame, metres)."""
 
     ARRAYS = (("points", "<f8"),)
     kind: Literal["bar"] = "bar"
     source: Source
-    notes: Annotated[list[NoteRecord], Field(max_length=10)]
+    notes: Annotated[dict[_Code, Annotated[str, Field(max_length=200)]], Field(max_length=10)]
     role: Annotated[str, Field(min_length=1, max_length=60)]
     diameter_m: _Size
     points: Annotated[int, Field(ge=2)]

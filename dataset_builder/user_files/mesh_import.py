@@ -1,4 +1,4 @@
-"""Mesh file import: the parts of a file's content, in the file's frame and in metres.
+"""Mesh file import: the parts of a file's content as bars, in the file's frame and in metres.
 
 - The dataset's own PLY layout (``dataset_builder.scene.mesh_ply``) is used unchanged: the faces with one
   ``bar_id`` form a part with that id; faces with id 0 (board, table) are left out.
@@ -19,7 +19,7 @@ from __future__ import annotations
 import logging
 import re
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from textwrap import shorten
@@ -29,8 +29,9 @@ import numpy as np
 from jaxtyping import Float, Integer
 from numpy import ndarray
 
+from dataset_builder.scene.assemblies.cage import Cage, CageBar, LeftOut, unit_scale
 from dataset_builder.scene.mesh_ply import has_mesh_ply_header, parse_mesh_ply
-from dataset_builder.scene.model import ESTIMATED_ROLE, MAX_BARS, NOT_STEEL, Mesh, Note, axis_of
+from dataset_builder.scene.model import ESTIMATED_ROLE, MAX_BARS, NOT_STEEL, Mesh, axis_of
 from dataset_builder.specs.file_specs import MeshFileSpec
 from dataset_builder.user_files.mesh_formats.parsing import MalformedMeshError, Surface
 from dataset_builder.user_files.mesh_formats.ply import read_ply
@@ -38,7 +39,7 @@ from dataset_builder.user_files.mesh_formats.stl_obj import read_obj, read_stl
 from dataset_builder.user_files.tubes.tube_fit import fit_tube
 from dataset_builder.user_files.tubes.tube_surface import component_labels
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.errors import DatasetError, MeshError
+from rebar_depth_bench.errors import DatasetError, MeshError, escape_text
 
 if TYPE_CHECKING:
     import trimesh
@@ -51,14 +52,8 @@ _READERS: Mapping[str, Callable[[bytes], Mapping[str, Surface]]] = {
 SUFFIXES = tuple(_READERS)
 """Supported suffixes of mesh files, in lower case."""
 
-MAX_FLOAT32_SPACING_M = 1e-4
+_MAX_FLOAT32_SPACING_M = 1e-4
 """Largest distance of neighbouring 32-bit coordinates that is accepted, metres."""
-
-AXIS_NOTE = "axis"
-"""Code of the note on bars without an axis."""
-
-_MAX_NAMED = 10
-"""Largest number of bars that a note names."""
 
 # A handler on trimesh's logger keeps its messages, including tracebacks, off stderr.
 logging.getLogger("trimesh").addHandler(logging.NullHandler())
@@ -66,19 +61,63 @@ logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 @dataclass(frozen=True, eq=False)
 class MeshPart:
-    """Part of a file: id, name, mesh (the file's frame, metres), and the spacing of 32-bit coordinates or 0."""
+    """Part of a file: id, name and mesh (the file's frame, metres)."""
 
     bar_id: int
     name: str
     mesh: Mesh
-    spacing_m: float = 0.0
+
+
+def mesh_cage(content: bytes, spec: MeshFileSpec) -> Cage:
+    """Return the selected parts of a mesh file as bars, by ascending id (the file's frame, metres).
+
+    A bar's axis and diameter are fitted to its mesh (``fitted_bar``), or null where no tube fits; parts need not
+    be watertight. Selected parts are numbered from 1, but without a selection those of the dataset's own PLY keep
+    their ids.
+
+    Raises ``MeshError`` as ``read_parts``, if no part is selected, and for a part without area.
+    """
+    taken, left_out = _selected(read_parts(content, spec), spec)
+    bars = [_fitted_bar(part, spec.path) for part in taken]
+    return Cage(tuple(bars), tuple(left_out), unit_scale(spec.unit_m))
+
+
+def _selected(parts: list[MeshPart], spec: MeshFileSpec) -> tuple[list[MeshPart], list[LeftOut]]:
+    """Return the parts that any table selects, numbered again, and those left out."""
+    if not spec.select:
+        return parts, []
+    taken, left_out = list[MeshPart](), list[LeftOut]()
+    for part in parts:
+        points = part.mesh.vertices_m / spec.unit_m
+        if any(table.matches({"name": (part.name,)}) and table.contains(points) for table in spec.select):
+            taken.append(replace(part, bar_id=len(taken) + 1))
+        else:
+            left_out.append(LeftOut(escape_text(part.name), "no [[select]] table matches"))
+    if not taken:
+        raise MeshError(
+            f"{spec.path}: no part is selected, expected [[select]] tables that match at least one of its "
+            f"{len(parts)} parts, such as {escape_text(parts[0].name)}"
+        )
+    return taken, left_out
+
+
+def _fitted_bar(part: MeshPart, where: str) -> CageBar:
+    """Return the bar of a part; raise ``MeshError`` that names the file ``where`` if its mesh has no area."""
+    label = f"bar {part.bar_id}, {escape_text(part.name)}"
+    try:
+        return CageBar(label, fitted_bar(part.bar_id, part.mesh), mesh=part.mesh, source=escape_text(part.name))
+    except ValueError as error:
+        raise MeshError(
+            f"{where}: {label} ({len(part.mesh.faces)} triangles) is not a valid surface: {error}"
+        ) from error
 
 
 def read_parts(content: bytes, spec: MeshFileSpec) -> list[MeshPart]:
     """Return the parts of a file's ``content``, by ascending id; the suffix of ``spec.path`` selects the format.
 
     Raises ``MeshError`` if the content cannot be read, holds no triangle, only id 0, more than ``MAX_BARS`` parts
-    or a non-finite coordinate. Any exception that a damaged or hostile file causes becomes one of one line.
+    or a non-finite coordinate, or stores coordinates that are too coarse. Any exception that a damaged or hostile
+    file causes becomes one of one line.
     """
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
@@ -109,36 +148,44 @@ def _dataset_ply_parts(content: bytes, spec: MeshFileSpec) -> list[MeshPart]:
     return [MeshPart(bar_id, f"bar {bar_id}", mesh) for bar_id, mesh in meshes.items()]
 
 
-def _numbered_parts(objects: Sequence[MeshPart], spec: MeshFileSpec) -> list[MeshPart]:
-    """Return the parts of objects that are ordered and not numbered; a single one is split."""
-    if not objects:
-        raise MeshError(f"{spec.path}: no triangle found, expected the surface of at least one bar")
+def _numbered_parts(objects: Mapping[str, Mesh], spec: MeshFileSpec) -> list[MeshPart]:
+    """Return the parts of objects that are ordered; a single one is split."""
     if len(objects) == 1:
-        (whole,) = objects
-        meshes = connected_components(_mesh_of(_merged_close_vertices(whole.mesh)))
-        objects = [replace(whole, name=f"part {number}", mesh=mesh) for number, mesh in enumerate(meshes, start=1)]
+        [whole] = objects.values()
+        meshes = connected_components(_mesh_of(_merged_close_vertices(whole)))
+        objects = {f"part {number}": mesh for number, mesh in enumerate(meshes, start=1)}
     if len(objects) > MAX_BARS:
         raise MeshError(f"{spec.path}: {len(objects)} separate parts found, expected at most {MAX_BARS} bars")
     return [
-        replace(part, bar_id=bar_id, mesh=_oriented_outward(part.mesh))
-        for bar_id, part in enumerate(objects, start=1)
+        MeshPart(bar_id, name, _oriented_outward(mesh))
+        for bar_id, (name, mesh) in enumerate(objects.items(), start=1)
     ]
 
 
-def _read_objects(content: bytes, spec: MeshFileSpec) -> list[MeshPart]:
-    """Return the objects of a file of any program, without ids, ordered by name, without empty ones."""
+def _read_objects(content: bytes, spec: MeshFileSpec) -> dict[str, Mesh]:
+    """Return the objects of a file of any program, ordered by name, without empty ones."""
     surfaces = _READERS[Path(spec.path).suffix.lower()](content)
-    spacing_m = spec.unit_m * max((_spacing(vertices) for vertices, _ in surfaces.values()), default=0.0)
-    return [
-        MeshPart(0, name, Mesh(vertices.astype(np.float64) * spec.unit_m, faces.astype(np.int32)), spacing_m)
+    objects = {
+        name: Mesh(vertices.astype(np.float64) * spec.unit_m, faces.astype(np.int32))
         for name, (vertices, faces) in sorted(surfaces.items(), key=lambda item: _natural_sort_key(item[0]))
         if len(faces)
-    ]
+    }
+    if not objects:
+        raise MeshError(f"{spec.path}: no triangle found, expected the surface of at least one bar")
+    for vertices, _ in surfaces.values():
+        _check_spacing(vertices, spec)
+    return objects
 
 
-def _spacing(vertices: Float[ndarray, "v 3"]) -> float:
-    """Return the distance of the largest coordinate from the next that the file can store; 0 for float64."""
-    return float(np.spacing(np.abs(vertices).max(initial=0))) if vertices.dtype == np.float32 else 0.0
+def _check_spacing(vertices: Float[ndarray, "v 3"], spec: MeshFileSpec) -> None:
+    """Raise ``MeshError`` if 32-bit coordinates are so large that they cannot tell 0.1 mm apart."""
+    spacing_m = spec.unit_m * float(np.spacing(np.abs(vertices).max())) if vertices.dtype == np.float32 else 0.0
+    if spacing_m > _MAX_FLOAT32_SPACING_M:
+        raise MeshError(
+            f"{spec.path}: its 32-bit coordinates are {spacing_m * 1000:.3g} mm apart so far from the file's "
+            f"origin, expected {_MAX_FLOAT32_SPACING_M * 1000:g} mm or less: is the unit right? Otherwise export "
+            "the cage near the origin, or in a format with 64-bit coordinates (OBJ, PLY with double, IFC)"
+        )
 
 
 def _natural_sort_key(name: str) -> tuple[list[str | int], str]:
@@ -199,16 +246,3 @@ def fitted_bar(bar_id: int, mesh: Mesh) -> Bar:
     if tube is None:
         return Bar.without_axis(bar_id, ESTIMATED_ROLE)
     return Bar(bar_id, ESTIMATED_ROLE, tube.diameter_m, axis_of(tube.axis_m))
-
-
-def axis_notes(source: str, labels: Sequence[str], bars: int) -> tuple[Note, ...]:
-    """Return the note that names the bars without an axis (``labels``) of all ``bars`` of a file, or none."""
-    if not labels:
-        return ()
-    named = ", ".join(labels[:_MAX_NAMED])
-    more = f" and {len(labels) - _MAX_NAMED} more" if len(labels) > _MAX_NAMED else ""
-    text = (
-        f"{len(labels)} of {bars} bars are not the surface of one round bar and have neither axis nor diameter; "
-        f"measures of bars leave them out: {named}{more}"
-    )
-    return (Note(source, AXIS_NOTE, text),)

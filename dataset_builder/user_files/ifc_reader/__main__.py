@@ -31,15 +31,12 @@ def main() -> None:
 
 def write_answer(content: bytes, stream: IO[bytes], select: Sequence[Selection] = ()) -> None:
     """Write the selected shapes of an IFC file's ``content`` to ``stream``, or a failure; nothing is raised."""
-    try:
-        # Imported here, so that a failed import is part of the answer.
-        from dataset_builder.user_files.ifc_reader.bars import read_bars
-    except ImportError as error:
-        write_record(stream, _failure(exception_summary(error)))
-        return
     count = 0
     end: EndRecord | FailureRecord
     try:
+        # Imported here, so that a failed import is part of the answer.
+        from dataset_builder.user_files.ifc_reader.bars import read_bars
+
         for count, (record, arrays) in enumerate(read_bars(content, select), start=1):  # noqa: B007
             write_record(stream, record, arrays)
         end = EndRecord(records=count)
@@ -47,6 +44,8 @@ def write_answer(content: bytes, stream: IO[bytes], select: Sequence[Selection] 
         end = FailureRecord(message=None)
     except MeshError as error:
         end = _failure(str(error))
+    except ImportError as error:
+        end = _failure(exception_summary(error))
     except Exception as error:  # Damaged instances raise various exceptions when their attributes are read.
         end = _failure(f"cannot be read ({exception_summary(error)}), expected an IFC file")
     write_record(stream, end)

@@ -50,7 +50,6 @@ from dataset_builder.user_files.ifc_reader.objects import (
 )
 from dataset_builder.user_files.ifc_records import (
     BarRecord,
-    NoteRecord,
     ProjectRecord,
     Record,
     StepRecord,
@@ -226,11 +225,11 @@ def limited_time() -> Iterator[None]:
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
-    """Circle swept along an axis, in the frame and unit of its file, and notes on how it was read."""
+    """Circle swept along an axis, in the frame and unit of its file, and notes on how it was read, by code."""
 
     axis: Float64[ndarray, "n 3"]
     diameter: float
-    notes: list[NoteRecord]
+    notes: dict[str, str]
 
 
 def read_sweep(solid: Any, units: Units) -> Sweep | None:
@@ -253,12 +252,10 @@ def _swept_disc(solid: Any, units: Units) -> Sweep:
     line, gap = _joined(pieces, diameter)
     axis = _drop_repeated_points(line)
     if gap > _NOTED_GAP * diameter:
-        found = f"closed a gap of {gap / diameter:.0%} of the diameter between two segments"
-        notes.append(NoteRecord(code="gap", text=found))
+        notes["gap"] = f"closed a gap of {gap / diameter:.0%} of the diameter between two segments"
     if pieces is not whole:
         share = _length(axis) / sum(_length(piece.points()) for piece in whole)
-        found = f"the curve is swept from {solid.StartParam} to {solid.EndParam}, {share:.1%} of its length"
-        notes.append(NoteRecord(code="cut", text=found))
+        notes["cut"] = f"the curve is swept from {solid.StartParam} to {solid.EndParam}, {share:.1%} of its length"
     if solid.is_a("IfcSweptDiskSolidPolygonal") and solid.FilletRadius:
         axis = bent_line_m(axis, solid.FilletRadius, ARC_STEP_DEG)
     return Sweep(axis, diameter, notes)
@@ -271,8 +268,8 @@ def _diameter(radius: float) -> float:
     return 2 * float(radius)
 
 
-def _hollow_notes(inner_radius: float | None) -> list[NoteRecord]:
-    return [NoteRecord(code="hollow", text="a hollow bar is taken to be solid")] if inner_radius else []
+def _hollow_notes(inner_radius: float | None) -> dict[str, str]:
+    return {"hollow": "a hollow bar is taken to be solid"} if inner_radius else {}
 
 
 def _extruded_circle(solid: Any) -> Sweep | None:

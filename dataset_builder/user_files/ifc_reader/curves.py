@@ -7,7 +7,7 @@ define them. Anything else raises ``ValueError``.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from typing import Any, Self
@@ -157,9 +157,21 @@ def curve_pieces(curve: Any, angle_rad: float, depth: int = 0) -> list[Piece]:
     """
     if depth > _MAX_DEPTH:
         raise ValueError(f"curves are nested more than {_MAX_DEPTH} times, or in a circle")
-    if curve.is_a() not in _READERS:
-        raise ValueError(f"a curve is a {curve.is_a()}, expected lines, arcs and B-splines")
-    pieces = _READERS[curve.is_a()](curve, angle_rad, depth)
+    match curve.is_a():
+        case "IfcPolyline":
+            pieces = _legs(np.array([point_xyz(point) for point in curve.Points]))
+        case "IfcIndexedPolyCurve":
+            pieces = _indexed_curve(curve, angle_rad)
+        case "IfcCompositeCurve":
+            pieces = _composite_curve(curve, angle_rad, depth)
+        case "IfcTrimmedCurve":
+            pieces = _trimmed_curve(curve, angle_rad, depth)
+        case "IfcCircle" | "IfcEllipse":
+            pieces = [_conic(curve, angle_rad)]
+        case "IfcBSplineCurveWithKnots" | "IfcRationalBSplineCurveWithKnots":
+            pieces = [_b_spline(curve)]
+        case name:
+            raise ValueError(f"a curve is a {name}, expected lines, arcs and B-splines")
     if not pieces:
         raise ValueError(f"a curve ({curve.is_a()}) is empty")
     return pieces
@@ -169,11 +181,7 @@ def _legs(points: Float64[ndarray, "n 3"]) -> list[Piece]:
     return [Leg.between(start, end) for start, end in pairwise(points)]
 
 
-def _polyline(curve: Any, _angle_rad: float, _depth: int) -> list[Piece]:
-    return _legs(np.array([point_xyz(point) for point in curve.Points]))
-
-
-def _indexed_curve(curve: Any, angle_rad: float, _depth: int) -> list[Piece]:
+def _indexed_curve(curve: Any, angle_rad: float) -> list[Piece]:
     points = np.array([xyz(row) for row in curve.Points.CoordList])
     if not curve.Segments:
         return _legs(points)
@@ -289,11 +297,7 @@ def _conic(conic: Any, angle_rad: float) -> Arc:
     return Arc(frame[:3, 3], x_axis, y_axis, 0.0, _FULL_TURN_RAD, _FULL_TURN_RAD / angle_rad)
 
 
-def _whole_conic(curve: Any, angle_rad: float, _depth: int) -> list[Piece]:
-    return [_conic(curve, angle_rad)]
-
-
-def _b_spline(curve: Any, _angle_rad: float, _depth: int) -> list[Piece]:
+def _b_spline(curve: Any) -> Sampled:
     """Return a B-spline with knots, sampled so that neighbouring chords turn by at most ``ARC_STEP_DEG``."""
     from scipy.interpolate import BSpline  # Imported when needed: it takes a second.
 
@@ -314,7 +318,7 @@ def _b_spline(curve: Any, _angle_rad: float, _depth: int) -> list[Piece]:
         line = values[:, :3] / values[:, 3:]
         if _largest_turn_deg(line) <= ARC_STEP_DEG:
             size = float(spans[-1] - spans[0])
-            return [Sampled(line, (at - spans[0]) / size, size)]
+            return Sampled(line, (at - spans[0]) / size, size)
     raise ValueError(f"a B-spline needs more than {_MAX_SPLINE_POINTS} points, or has a sharp corner")
 
 
@@ -335,15 +339,3 @@ def _largest_turn_deg(line: Float64[ndarray, "n 3"]) -> float:
     before, after = chords[:-1], chords[1:]
     sines, cosines = np.linalg.norm(np.cross(before, after), axis=1), (before * after).sum(axis=1)
     return float(np.rad2deg(np.arctan2(sines, cosines)).max())
-
-
-_READERS: Mapping[str, Callable[[Any, float, int], list[Piece]]] = {
-    "IfcPolyline": _polyline,
-    "IfcIndexedPolyCurve": _indexed_curve,
-    "IfcCompositeCurve": _composite_curve,
-    "IfcTrimmedCurve": _trimmed_curve,
-    "IfcCircle": _whole_conic,
-    "IfcEllipse": _whole_conic,
-    "IfcBSplineCurveWithKnots": _b_spline,
-    "IfcRationalBSplineCurveWithKnots": _b_spline,
-}

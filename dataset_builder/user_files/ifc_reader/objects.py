@@ -26,12 +26,6 @@ CLASSES = ("IfcReinforcingBar", "IfcReinforcingMesh", "IfcTendon")
 DAMAGE = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
 """Exceptions of instances that are incomplete or not supported."""
 
-_CLASS_ROLES = {"IfcReinforcingMesh": "mesh", "IfcTendon": "tendon"}
-"""Roles of the classes whose objects have one role."""
-
-_ROLES = {"LIGATURE": "stirrup"}
-"""Roles of PredefinedType values whose lower-case name is not used as the role."""
-
 _DIAMETERS = ("NominalDiameter", "LongitudinalBarNominalDiameter", "TransverseBarNominalDiameter")
 _UNSPECIFIED_TYPES = ("USERDEFINED", "NOTDEFINED", None, "")
 _MAX_NAME = 60
@@ -269,12 +263,13 @@ def role(entity: Entity, types: Sequence[Entity]) -> str:
     It is "mesh" or "tendon" by class, else the PredefinedType (BarRole in IFC2x3) of the object or of its type,
     else its ObjectType or Name, else "bar".
     """
-    for class_name, class_role in _CLASS_ROLES.items():
-        if entity.is_a(class_name):
-            return class_role
+    if entity.is_a("IfcReinforcingMesh"):
+        return "mesh"
+    if entity.is_a("IfcTendon"):
+        return "tendon"
     kind = next(filter(None, map(_own_kind, [entity, *types])), None)
     if kind:
-        return _ROLES.get(kind, kind.lower())
+        return "stirrup" if kind == "LIGATURE" else kind.lower()
     description = " ".join(str(entity.ObjectType or entity.Name or "").split())
     return description[:_MAX_NAME].strip() or "bar"
 

@@ -19,7 +19,7 @@ Vertices are float32 where the file stores them so, otherwise float64.
 """
 
 Place = Callable[[int], str]
-"""Function from the index of a row, vertex or triangle to its place in the file."""
+"""Function from the index of a row or vertex to its place in the file."""
 
 BYTE_ORDER_MARK = b"\xef\xbb\xbf"
 _NUMBER = re.compile(rb"[-+]?(\d+(\.\d*)?|\.\d+)([eE][-+]?\d+)?")
@@ -58,18 +58,12 @@ def shown(line: bytes) -> str:
     return escape_text(line[:200].decode(errors="replace").strip())
 
 
-def check_surface(surface: Surface, vertex_place: Place, triangle_place: Place) -> Surface:
-    """Return ``surface``; raise ``MalformedMeshError`` for a vertex that is not finite or does not exist."""
-    vertices, faces = surface
+def check_finite(vertices: Float[ndarray, "v 3"], place: Place) -> None:
+    """Raise ``MalformedMeshError`` for a vertex that is not finite."""
     row = first_true(~np.isfinite(vertices).all(axis=1))
     if row is not None:
         found = f"a vertex is {vertices[row].tolist()}"
-        raise MalformedMeshError("invalid", vertex_place(row), found, "finite coordinates")
-    row = first_true(((faces < 0) | (faces >= len(vertices))).any(axis=1))
-    if row is not None:
-        found = f"the corners are the vertices {faces[row].tolist()}"
-        raise MalformedMeshError("invalid", triangle_place(row), found, f"0 to {len(vertices) - 1}")
-    return surface
+        raise MalformedMeshError("invalid", place(row), found, "finite coordinates")
 
 
 def triangulate(polygons: Sequence[Int64[ndarray, " k"]] | Int64[ndarray, "n k"]) -> Int64[ndarray, "n 3"]:

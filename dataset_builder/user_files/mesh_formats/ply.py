@@ -19,7 +19,7 @@ from numpy import ndarray
 from dataset_builder.user_files.mesh_formats.parsing import (
     MalformedMeshError,
     Surface,
-    check_surface,
+    check_finite,
     first_true,
     parse_numbers,
     shown,
@@ -95,8 +95,13 @@ def read_ply(content: bytes) -> Mapping[str, Surface]:
     body = content[header.end() :]
     elements = [element for element in elements if element.properties]
     read = _binary_elements(elements, body, order) if order else _text_elements(elements, body)
-    surface = _vertices(read.get("vertex", {})), _triangles(read.get("face", {}))
-    return {"": check_surface(surface, lambda row: f"vertex {row}", lambda row: f"triangle {row}")}
+    vertices, triangles = _vertices(read.get("vertex", {})), _triangles(read.get("face", {}))
+    check_finite(vertices, lambda row: f"vertex {row}")
+    row = first_true(((triangles < 0) | (triangles >= len(vertices))).any(axis=1))
+    if row is not None:
+        found = f"the corners are the vertices {triangles[row].tolist()}"
+        raise MalformedMeshError("invalid", f"triangle {row}", found, f"0 to {len(vertices) - 1}")
+    return {"": (vertices, triangles)}
 
 
 def _parse_header(lines: Sequence[bytes]) -> tuple[str, list[_Element]]:

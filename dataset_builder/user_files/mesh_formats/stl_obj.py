@@ -23,7 +23,7 @@ from dataset_builder.user_files.mesh_formats.parsing import (
     BYTE_ORDER_MARK,
     MalformedMeshError,
     Surface,
-    check_surface,
+    check_finite,
     first_true,
     parse_numbers,
     shown,
@@ -53,7 +53,8 @@ def read_stl(content: bytes) -> Mapping[str, Surface]:
     corners = _binary_corners(content)
     if corners is None:
         corners = _text_corners(content)
-    return {"": check_surface((corners, np.arange(len(corners)).reshape(-1, 3)), _corner_place, str)}
+    check_finite(corners, _corner_place)
+    return {"": (corners, np.arange(len(corners)).reshape(-1, 3))}
 
 
 def _binary_corners(content: bytes) -> ndarray | None:
@@ -138,10 +139,9 @@ def read_obj(content: bytes) -> Mapping[str, Surface]:
     """
     vertex_rows, face_rows = _statements(content)
     vertices = _vertices(vertex_rows)
-    return {
-        _decoded(name): check_surface((vertices, _triangles(rows, len(vertices))), vertex_rows.place, str)
-        for name, rows in face_rows.items()
-    }
+    triangles = {_decoded(name): _triangles(rows, len(vertices)) for name, rows in face_rows.items()}
+    check_finite(vertices, vertex_rows.place)
+    return {name: (vertices, faces) for name, faces in triangles.items()}
 
 
 def _statements(content: bytes) -> tuple[_Rows, Mapping[bytes, _Rows]]:

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 
 from dataset_builder.scene.assemblies.cage import Cage, CageBar
 from dataset_builder.scene.model import Assembly
-from dataset_builder.user_files.cage_checks import cage_problems, check_values
-from dataset_builder.user_files.cage_file import cage_assembly
+from dataset_builder.user_files.cage_file import cage_assembly, cage_problems, check_values
 
 
 def assembly_of(bars: Sequence[CageBar], where: str = "a.ifc") -> Assembly:

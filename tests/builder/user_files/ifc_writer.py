@@ -12,7 +12,7 @@ import numpy as np
 from numpy import ndarray
 
 from dataset_builder.scene.assemblies.cage import CageBar
-from dataset_builder.user_files.cage_checks import raise_problems
+from dataset_builder.user_files.cage_file import raise_problems
 from dataset_builder.user_files.ifc_file import Answer
 from dataset_builder.user_files.ifc_reader.__main__ import write_answer
 

@@ -179,7 +179,7 @@ SOURCE: dict[str, Any] = NAMES | {"diameters_m": [], "length_m": None}
 PROJECT: dict[str, Any] = {"kind": "project", "unit_m": 0.001}
 LEFT_OUT: dict[str, Any] = {"kind": "left_out", "global_id": "w", "reason": "IfcWall: not reinforcement"}
 SWEEP: dict[str, Any] = {"role": "b", "diameter_m": 0.01, "points": 2}
-BAR: dict[str, Any] = {"kind": "bar", "source": SOURCE, "notes": []} | SWEEP
+BAR: dict[str, Any] = {"kind": "bar", "source": SOURCE, "notes": {}} | SWEEP
 SURFACE: dict[str, Any] = {"kind": "surface", "source": SOURCE, "vertices": 3, "faces": 1}
 END: dict[str, Any] = {"kind": "end", "records": 2}
 LINE = np.array([[0, 0, 0], [1, 0, 0]], "<f8")
@@ -226,7 +226,7 @@ def test_sound_answer_gives_bars() -> None:
         [BAR | {"role": ""}, LINE, END],
         [BAR | {"source": SOURCE | {"label": "x" * 201}}, LINE, END],
         [BAR | {"source": SOURCE | {"diameters_m": [-1.0]}}, LINE, END],
-        [BAR | {"notes": [{"code": "A b", "text": ""}]}, LINE, END],
+        [BAR | {"notes": {"A b": ""}}, LINE, END],
         [BAR | {"extra": 1}, LINE, END],
         [BAR | {"source": SOURCE | {"host": 1}}, LINE, END],
         [BAR, LINE + np.inf, END],

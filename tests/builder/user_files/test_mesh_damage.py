@@ -13,7 +13,7 @@ import trimesh
 from dataset_builder.scene.assemblies.cage import CageBar
 from dataset_builder.scene.model import Mesh
 from dataset_builder.specs.file_specs import MeshFileSpec
-from dataset_builder.user_files.cage_checks import cage_problems, raise_problems
+from dataset_builder.user_files.cage_file import cage_problems, raise_problems
 from dataset_builder.user_files.mesh_import import read_parts
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.errors import MeshError

@@ -15,7 +15,7 @@ from dataset_builder.scene.assemblies.lattice import lattice_assembly
 from dataset_builder.scene.mesh_ply import write_mesh_ply
 from dataset_builder.scene.model import Assembly
 from dataset_builder.specs.config_specs import LatticeSpec
-from dataset_builder.user_files.cage_file import load_cage, mesh_file_spec, read_mesh
+from dataset_builder.user_files.cage_file import load_cage, mesh_file_spec, read_cage
 from rebar_depth_bench.errors import MeshError
 from tests.builder.user_files.tube_shapes import CENTRELINES_M, length_m, swept
 
@@ -170,7 +170,7 @@ def test_axis_and_diameter_of_open_tube_far_from_origin(tmp_path: Path) -> None:
         tube = tube.subdivide(np.flatnonzero((x > 0.26) & (y > 0)))
     tube.apply_translation([300, -200, 500])
     (tmp_path / "a.obj").write_bytes(obj_bytes((tube,), "a"))
-    bar = read_mesh(mesh_file_spec(tmp_path / "a.obj", "m")).bars[0].bar
+    bar = read_cage(mesh_file_spec(tmp_path / "a.obj", "m")).bars[0].bar
     np.testing.assert_allclose(bar.axis_m, [[300.0, -200, 500.1], [300.5, -200, 500.1]], rtol=0, atol=2e-6)
     assert bar.diameter_m == pytest.approx(0.016, rel=0.005)
 
