@@ -9,11 +9,11 @@ depend on the number of workers or attempts.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -32,6 +32,7 @@ from rebar_depth_bench.reporting.colormap import depth_preview
 from rebar_depth_bench.scoring.protocol import scored_pixels
 from rebar_depth_bench.validation import validate_table
 
+ViewT = TypeVar("ViewT")
 VIEWS_PER_SHARD = 8
 _RECORD_KEY = b"rebar_view_record"
 _PARQUET = {"compression": "none", "use_dictionary": False, "write_statistics": False}
@@ -67,9 +68,9 @@ class Staging:
         return self.root / "shards" / f"{shard:05d}.parquet"
 
 
-def split_into_shards(indices: Sequence[int], views: int = VIEWS_PER_SHARD) -> list[tuple[int, ...]]:
-    """Split the view indices of a config into shards, or other runs of ``views`` views."""
-    return [tuple(indices[i : i + views]) for i in range(0, len(indices), views)]
+def split_into_shards(views: Sequence[ViewT], count: int = VIEWS_PER_SHARD) -> list[Sequence[ViewT]]:
+    """Split the views of a config into those of each shard, or other runs of ``count`` views."""
+    return [views[i : i + count] for i in range(0, len(views), count)]
 
 
 def stage_row(path: Path, row: pa.Table, record: ViewRecord) -> None:
@@ -79,36 +80,23 @@ def stage_row(path: Path, row: pa.Table, record: ViewRecord) -> None:
         pq.write_table(row.replace_schema_metadata(metadata), temporary, **_PARQUET)
 
 
-def read_staged_record(path: Path, view_id: str) -> ViewRecord:
-    """Return the manifest record stored in the staged row of a view.
-
-    Raises ``InputError`` if the file is damaged or holds another view.
-    """
-    with _open_staged_row(path) as file:
-        metadata = file.schema_arrow.metadata or {}
-    values, problems = parse_json(metadata.get(_RECORD_KEY, b""), "record")
-    record = None if problems else validate_table(ViewRecord, values, problems, "record")
-    if record is not None and record.view_id == view_id:
-        return record
-    raise _damaged_row(path, problems[0] if problems else Problem("conflict", "record", "another view", view_id))
-
-
 def _damaged_row(path: Path, problem: Problem) -> InputError:
     expected = "a row of an interrupted build; delete the file to render the view again"
     return InputError.from_problems(path, [problem, Problem("invalid", "", "not usable", expected)])
 
 
-def pack_shard(rows: Sequence[Path], target: Path) -> None:
-    """Write the staged ``rows`` as one Parquet shard with one row group per view, to keep streaming cheap.
+def pack_shard(rows: Mapping[str, Path], target: Path) -> list[ViewRecord]:
+    """Write staged ``rows``, paths by view id, as one Parquet shard; return the records of the views.
 
-    Raises ``InputError`` if a row is damaged.
+    There is one row group per view, to keep streaming cheap. Raises ``InputError`` if a row is damaged or that of
+    another view.
     """
-    tables = (_read_staged_row(path) for path in rows)
-    first = next(tables)
-    schema = first.schema.with_metadata(features().arrow_schema.metadata)
+    staged = [_read_staged_row(path, view_id) for view_id, path in rows.items()]
+    schema = staged[0][0].schema.with_metadata(features().arrow_schema.metadata)
     with atomic_replace(target) as temporary, pq.ParquetWriter(temporary, schema, **_PARQUET) as writer:
-        for table in (first, *tables):
-            writer.write_table(table.replace_schema_metadata(schema.metadata))
+        for row, _ in staged:
+            writer.write_table(row.replace_schema_metadata(schema.metadata))
+    return [record for _, record in staged]
 
 
 def stage_published_rows(shard: Path, targets: Mapping[str, Path], records: Mapping[str, ViewRecord]) -> None:
@@ -128,22 +116,22 @@ def stage_published_rows(shard: Path, targets: Mapping[str, Path], records: Mapp
                 stage_row(targets[view_id], row, records[view_id])
 
 
-def _read_staged_row(path: Path) -> pa.Table:
-    with _open_staged_row(path) as file:
-        table = file.read()
-    if not table.schema.equals(ROW_SCHEMA) or table.num_rows != 1:
-        raise _damaged_row(path, Problem("invalid", "", f"{table.num_rows} rows of other columns", "one row"))
-    return table
-
-
-@contextmanager
-def _open_staged_row(path: Path) -> Iterator[pq.ParquetFile]:
-    """Yield the staged row of a view. Raises ``InputError`` if the file is damaged or no such row."""
+def _read_staged_row(path: Path, view_id: str) -> tuple[pa.Table, ViewRecord]:
+    """Return the staged row of a view and its record. Raises ``InputError`` if the file has no such row."""
     try:
         with open_regular(path) as stream, open_parquet(stream, rows_table(ROW_SCHEMA.names, 1)) as (file, _):
-            yield file
+            row = file.read()
     except (OSError, ValueError) as error:
         raise _damaged_row(path, Problem("damaged", "", f"no Parquet file: {escape_text(str(error))}")) from None
+    if not row.schema.equals(ROW_SCHEMA) or row.num_rows != 1:
+        raise _damaged_row(path, Problem("invalid", "", f"{row.num_rows} rows of other columns", "one row"))
+    values, problems = parse_json((row.schema.metadata or {}).get(_RECORD_KEY, b""), "record")
+    record = None if problems else validate_table(ViewRecord, values, problems, "record")
+    if record is None:
+        raise _damaged_row(path, problems[0])
+    if record.view_id != view_id:
+        raise _damaged_row(path, Problem("conflict", "record", "another view", view_id))
+    return row, record
 
 
 @dataclass(frozen=True, eq=False)
