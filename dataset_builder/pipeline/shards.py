@@ -51,6 +51,11 @@ class Staging:
         return self.root / "mesh.ply"
 
     @property
+    def mesh_digest(self) -> Path:
+        """Path of the SHA-256 of the mesh that the staged rows were cast against."""
+        return self.root / "mesh.sha256"
+
+    @property
     def cage(self) -> Path:
         """Path of the bars that were read from a user's file; a generated assembly has no such file."""
         return self.root / "cage.npz"
