@@ -23,7 +23,7 @@ from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.data import codecs
 from rebar_depth_bench.data.columns import COLUMNS, ROW_SCHEMA, column_kind, features
 from rebar_depth_bench.data.config_tables import ViewRecord
-from rebar_depth_bench.data.eye_view import CAMERA_KINDS, EyeTruth, EyeView, absent_cell
+from rebar_depth_bench.data.eye_view import CAMERA_KINDS, EyeView, absent_cell, truth_from_row
 from rebar_depth_bench.data.parquet import open_parquet
 from rebar_depth_bench.data.shards import rows_table
 from rebar_depth_bench.errors import InputError, Problem, escape_text
@@ -157,23 +157,31 @@ def encode_view(view: View) -> tuple[pa.Table, ViewRecord]:
         columns |= {f"{name}_{kind}": getattr(eye, kind) for kind in ("rgb", "mask", "bars")}
         columns |= {f"{name}_{kind}": getattr(eye.camera, kind) for kind in CAMERA_KINDS}
         columns[f"{name}_depth"] = eye.depth_m
-    return encode_row(columns), view_record(view.view_id, view.left, view.right)
+    return encode_row(columns)
 
 
-def encode_row(columns: Mapping[str, Any]) -> pa.Table:
-    """Return a one-row table of ``ROW_SCHEMA``; a column that is missing or None is absent.
+def encode_row(columns: Mapping[str, Any]) -> tuple[pa.Table, ViewRecord]:
+    """Return a one-row table of ``ROW_SCHEMA``, and the record of its view; columns that are None are absent.
 
     ``columns`` holds what ``rebar_depth_bench.load`` returns, without the preview, which is made from the depth.
     """
-    preview: Any = _image_cell(codecs.encode_palette(*depth_preview(columns["left_depth"])))
-    cells = {"left_preview": preview}
+    preview = codecs.encode_palette(*depth_preview(columns["left_depth"]))
+    cells: dict[str, Any] = {"left_preview": _image_cell(preview)}
     for name in COLUMNS:
         value, kind = columns.get(name), column_kind(name)
         if value is not None:
             cells[name] = _ENCODERS.get(kind, _plain)(value)
         elif name not in cells:
             cells[name] = absent_cell(kind)
-    return pa.Table.from_pylist([cells], schema=ROW_SCHEMA)
+    left = truth_from_row(columns, "left")
+    record = ViewRecord(
+        view_id=columns["view_id"],
+        left=left.digest(),
+        right=truth_from_row(columns, "right").digest() if columns["right_depth"] is not None else None,
+        steel_px=None if left.mask is None else int(np.count_nonzero(left.mask)),
+        scored_px=len(scored_pixels(left.mask, left.depth_m)),
+    )
+    return pa.Table.from_pylist([cells], schema=ROW_SCHEMA), record
 
 
 def _plain(value: Any) -> Any:
@@ -192,14 +200,3 @@ _ENCODERS: Mapping[str, Callable[[Any], Any]] = {
 
 def _image_cell(content: bytes) -> dict[str, bytes | None]:
     return {"bytes": content, "path": None}
-
-
-def view_record(view_id: str, left: EyeTruth, right: EyeTruth | None) -> ViewRecord:
-    """Return the record of a view for the manifest; ``right`` is None without depth of the right camera."""
-    return ViewRecord(
-        view_id=view_id,
-        left=left.digest(),
-        right=right.digest() if right is not None else None,
-        steel_px=None if left.mask is None else int(np.count_nonzero(left.mask)),
-        scored_px=len(scored_pixels(left.mask, left.depth_m)),
-    )
