@@ -141,26 +141,33 @@ def _shard_paths(config: DatasetConfig, split: str) -> str | list[str]:
 
 def _config_rows(config: DatasetConfig) -> list[dict[str, Any]]:
     """Return the rows of a config in the tables: one for each split."""
-    row = _imported_row if config.imported is not None else _split_row if config.has_splits else _config_row
-    return [_shared_row(part := config.of_split(split), split) | row(part) for split in config.splits]
+    rows = []
+    for split in config.splits:
+        part = config.of_split(split)
+        row = _shared_row(part, split)
+        if config.imported is None:
+            row |= _rendered_row(part) | (_split_row(part) if config.has_splits else _config_row(part))
+        rows.append(row)
+    return rows
 
 
 def _shared_row(config: DatasetConfig, split: str) -> dict[str, Any]:
-    """Return the columns that are alike for all configs, restricted to a split."""
+    """Return the columns of a config restricted to a split; those that only rendered configs have are dashes."""
     rig, references = config.rig, config.references.get(split)
-    scored = [view.scored_px for view in config.views]
     return {
+        **dict.fromkeys(("samples", "distance", "steel", "kept", "steel_depth"), DASH),
+        **dict.fromkeys(("optics", "variants", "panorama")),
         "name": config.name,
+        "steel_source": "imported",
         "views": f"{len(config.views)}",
-        "steel_depth": DASH,
         "grid": f"{rig.width} x {rig.height}",
         "has_colour": config.colour is not None,
-        "out_of_protocol": scored.count(0),
+        "out_of_protocol": sum(view.scored_px == 0 for view in config.views),
         "sheet": config.sheet,
         "constant": _reference(references, "constant"),
         "one_pixel": _reference(references, "one_pixel"),
         "megabytes": f"{config.bytes / 1e6:.1f}",
-        **dict.fromkeys(("variants", "panorama", "imported")),
+        "imported": config.imported,
     }
 
 
@@ -171,7 +178,6 @@ def _split_row(config: DatasetConfig) -> dict[str, Any]:
     cameras = dict.fromkeys(scene.rig.camera for scene in config.scenes if scene.rig is not None)
     split = config.scenes[0].split
     return {
-        **_rendered_row(config),
         "name": f"{config.name}, {split}",
         "steel_source": f"{len(config.scenes)} generated cages",
         "distance": f"{min(distances_m):g}-{max(distances_m):g} m, random views",
@@ -184,7 +190,6 @@ def _config_row(config: DatasetConfig) -> dict[str, Any]:
     """Return the columns of a config of one scene that was rendered."""
     scene, light = config.scene, config.scene.appearance.image_light
     return {
-        **_rendered_row(config),
         "views": f"{len(config.views)} of {scene.protocol_views}",
         "steel_source": _steel_source(scene.assembly) if scene.assembly is not None else DASH,
         "distance": _distance(scene.protocol) if scene.protocol is not None else DASH,
@@ -196,7 +201,7 @@ def _config_row(config: DatasetConfig) -> dict[str, Any]:
 
 
 def _rendered_row(config: DatasetConfig) -> dict[str, Any]:
-    """Return the columns that all rows of rendered configs compute alike."""
+    """Return the columns that all rendered configs have."""
     rig, views = config.rig, config.views
     steel = np.array([view.steel_px for view in views], float)
     scored = np.array([view.scored_px for view in views], float)
@@ -205,16 +210,6 @@ def _rendered_row(config: DatasetConfig) -> dict[str, Any]:
         "samples": "no colour" if config.colour is None else _samples(config.colour),
         "steel": f"{100 * np.mean(steel) / (rig.width * rig.height):.1f} %",
         "kept": f"{100 * np.mean(scored[with_steel] / steel[with_steel]):.0f} %" if with_steel.any() else "none",
-    }
-
-
-def _imported_row(config: DatasetConfig) -> dict[str, Any]:
-    """Return the columns of an imported config; what is not known of it is a dash."""
-    return {
-        **dict.fromkeys(("samples", "distance", "steel", "kept"), DASH),
-        "steel_source": "imported",
-        "optics": None,
-        "imported": config.imported,
     }
 
 

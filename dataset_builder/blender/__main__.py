@@ -11,8 +11,8 @@ from collections.abc import Callable, Mapping
 from contextlib import suppress
 from typing import Any, BinaryIO
 
+from dataset_builder.pipeline.blender_process import ERRORS, DepthTask, DevicesTask, RenderTask
 from rebar_depth_bench.atomic_io import WRITE_ERRORS, write_error
-from rebar_depth_bench.errors import BuildError, InputError, OutputError
 
 Report = Callable[[Mapping[str, Any]], None]
 """Function that sends one event to the parent process."""
@@ -30,12 +30,8 @@ def main() -> int:
     try:
         _redirect_output(sys.argv[1])
         _runner_for(task)(task, report)
-    except InputError as error:
-        report({"input_error": str(error)})
-    except BuildError as error:
-        report({"build_error": str(error)})
-    except OutputError as error:
-        report({"output_error": str(error)})
+    except tuple(ERRORS.values()) as error:
+        report({name: str(error) for name, kind in ERRORS.items() if isinstance(error, kind)})
     except OSError as error:
         if error.errno not in WRITE_ERRORS:
             raise
@@ -46,10 +42,9 @@ def main() -> int:
 def _runner_for(task: object) -> Callable[[Any, Report], None]:
     """Return the function that runs a task.
 
-    The imports are local because Blender's output on import must go to the log.
+    The import is local because Blender's output on import must go to the log.
     """
     from dataset_builder.blender.tasks import run_depth_task, run_devices_task, run_render_task
-    from dataset_builder.pipeline.blender_process import DepthTask, DevicesTask, RenderTask
 
     runners: Mapping[type, Callable[[Any, Report], None]] = {
         RenderTask: run_render_task,

@@ -17,11 +17,10 @@ from dataset_builder.pipeline.folder import build_lock, check_target, remove_bui
 from dataset_builder.pipeline.plan import BUILD_FOLDER, KEY_CHARACTERS, generator_versions
 from dataset_builder.pipeline.publish import StagedScene, publish, remove_leftovers
 from dataset_builder.pipeline.retained import Finished, check_retained
-from dataset_builder.pipeline.shards import Staging, encode_row, stage_row, view_record
+from dataset_builder.pipeline.shards import Staging, encode_row, stage_row
 from dataset_builder.user_files.scene_schema import SCENE_NAME
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.files import file_sha256, parameters_digest
-from rebar_depth_bench.data.rows import truth_from_row
 from rebar_depth_bench.data.schema import OPTIONAL_COLUMNS
 from rebar_depth_bench.errors import InputError, escape_text
 from rebar_depth_bench.names import TEST_SPLIT, view_id
@@ -144,10 +143,8 @@ def _stage_views(source: Import, staging: Staging, progress: Progress) -> set[in
         if not path.is_file():
             path.parent.mkdir(parents=True, exist_ok=True)
             identity = {"view_id": view_id(source.name, index), "scene": source.name}
-            row = {**dict.fromkeys(OPTIONAL_COLUMNS), **identity, **columns}
-            right = truth_from_row(row, "right") if row["right_depth"] is not None else None
-            record = view_record(identity["view_id"], truth_from_row(row, "left"), right)
-            stage_row(path, encode_row(row), record)
+            row, record = encode_row({**dict.fromkeys(OPTIONAL_COLUMNS), **identity, **columns})
+            stage_row(path, row, record)
         progress(f"import of {source.name}", index + 1, len(source.views.names))
     return ids
 

@@ -64,7 +64,7 @@ Task = RenderTask | DepthTask | DevicesTask
 
 
 Event = Mapping[str, Any]
-_ERRORS: Mapping[str, type[RebarDepthError]] = {
+ERRORS: Mapping[str, type[RebarDepthError]] = {
     "input_error": InputError,
     "build_error": BuildError,
     "output_error": OutputError,
@@ -141,8 +141,8 @@ def _exchange(process: subprocess.Popen[bytes], task: Task, on_event: Callable[[
         if not line.endswith(b"\n"):
             break  # The process died while writing an event.
         event = json.loads(line)
-        for name in _ERRORS.keys() & event.keys():
-            raise _ERRORS[name](event[name])
+        for name in ERRORS.keys() & event.keys():
+            raise ERRORS[name](event[name])
         on_event(event)
     return process.wait()
 

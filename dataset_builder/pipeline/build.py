@@ -10,7 +10,6 @@ from concurrent.futures import Future, as_completed
 from contextlib import nullcontext
 from dataclasses import dataclass, field
 from functools import partial
-from itertools import groupby
 from pathlib import Path
 
 from dataset_builder.cameras.camera_fit import check_fits
@@ -18,12 +17,15 @@ from dataset_builder.catalog.named_configs import BuildRequest
 from dataset_builder.pipeline.blender_process import Submit, local_processes
 from dataset_builder.pipeline.disk_space import check_readable, check_space, spaces_by_config
 from dataset_builder.pipeline.folder import build_lock, check_target, remove_build_folder, remove_stagings
-from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, place_cameras, plan_config, print_notes
-from dataset_builder.pipeline.publish import (
-    publish_plans,
-    remove_leftovers,
-    repair_metadata,
+from dataset_builder.pipeline.plan import (
+    BUILD_FOLDER,
+    ConfigPlan,
+    by_config,
+    place_cameras,
+    plan_config,
+    print_notes,
 )
+from dataset_builder.pipeline.publish import publish_plans, remove_leftovers, repair_metadata
 from dataset_builder.pipeline.retained import Finished, check_retained, kept_scenes
 from dataset_builder.pipeline.work_units import UnitResult, WorkUnit, accept_result, remaining_units
 from dataset_builder.specs.config_specs import SceneConfigSpec
@@ -114,10 +116,8 @@ def _build_plans(
     progress: Progress,
 ) -> BuildSummary:
     """Build the ``missing`` plans config by config, and repair the metadata of the others."""
-    summary, folder = BuildSummary(), finished.folder
-    missing_by_name = {name: list(group) for name, group in groupby(missing, key=_name)}
-    for name, group in groupby(plans, key=_name):
-        plans_of_config = list(group)
+    summary, folder, missing_by_name = BuildSummary(), finished.folder, by_config(missing)
+    for name, plans_of_config in by_config(plans).items():
         if of_config := missing_by_name.get(name):
             for plan in of_config:
                 finished.stage_views(plan)
@@ -130,10 +130,6 @@ def _build_plans(
             summary.up_to_date.append(name)
         remove_stagings(out, plans_of_config)
     return summary
-
-
-def _name(plan: ConfigPlan) -> str:
-    return plan.spec.name
 
 
 class _ViewCount:

@@ -65,10 +65,8 @@ def write_scenes_strip(configs: Sequence[DatasetConfig], target: Path) -> None:
 def _decoded_rows(config: DatasetConfig, positions: Sequence[int]) -> Iterator[dict[str, Any]]:
     """Yield view id, colour and depth preview of the views at ``positions``; other scenes are not opened."""
     decoder, wanted = RowDecoder.of(config), {config.views[position].view_id for position in positions}
-    scenes = {config.scene_by_view[view_id] for view_id in wanted}
     for scene in config.by_scene():
-        if scene.scene.name in scenes:
-            in_scene = [n for n, view_id in enumerate(scene.view_ids) if view_id in wanted]
+        if in_scene := [n for n, view_id in enumerate(scene.view_ids) if view_id in wanted]:
             yield from map(decoder.row, rows_at(scene, _SHOWN_COLUMNS, in_scene))
 
 

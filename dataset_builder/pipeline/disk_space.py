@@ -11,11 +11,10 @@ import json
 import shutil
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import asdict, dataclass
-from itertools import groupby
 from pathlib import Path
 
 from dataset_builder.pipeline.folder import existing_ancestor
-from dataset_builder.pipeline.plan import ConfigPlan, config_parameters, generator_versions
+from dataset_builder.pipeline.plan import ConfigPlan, by_config, config_parameters, generator_versions
 from dataset_builder.pipeline.retained import Finished
 from dataset_builder.scene.variants.registry import image_light
 from dataset_builder.specs.config_specs import RigSpec, SceneConfigSpec
@@ -70,8 +69,7 @@ def view_bytes(rig: RigSpec, has_colour: bool) -> int:
 
 def spaces_by_config(plans: Sequence[ConfigPlan]) -> dict[str, ConfigSpace]:
     """Return the disk space by name of each config of plans that are missing in their folder."""
-    groups = groupby(plans, key=lambda plan: plan.spec.name)
-    return {name: config_space(list(of_config)) for name, of_config in groups}
+    return {name: config_space(of_config) for name, of_config in by_config(plans).items()}
 
 
 def config_space(plans: Sequence[ConfigPlan]) -> ConfigSpace:
@@ -121,8 +119,7 @@ def check_readable(plans: Sequence[ConfigPlan], finished: Finished) -> None:
 def estimate_lines(out: Path, plans: Sequence[ConfigPlan], finished: Finished) -> Iterator[str]:
     """Yield lines that tell what building the plans in the folder ``out`` needs: views, disk space and memory."""
     views, spaces = 0, spaces_by_config([plan for plan in plans if not finished.has(plan)])
-    for name, group in groupby(plans, key=lambda plan: plan.spec.name):
-        of_config = list(group)
+    for name, of_config in by_config(plans).items():
         spec, planned = of_config[0].spec, sum(len(plan.indices) for plan in of_config)
         scenes = f" in {len(of_config)} scenes," if len(of_config) > 1 else ""
         yield f"{name}: {planned} views{scenes} of two pictures, {spec.rig.width} x {spec.rig.height}"

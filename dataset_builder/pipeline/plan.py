@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import multiprocessing
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from functools import cache, cached_property
@@ -98,6 +98,14 @@ def plan_config(spec: ConfigSpec, views: int | None, out: Path, cage: Cage | Non
     key = parameters_digest([config_parameters(spec), VIEWS_PER_SHARD, ROW_SCHEMA.names, generator_versions()])
     staging = Staging(out / BUILD_FOLDER / f"{spec.label}-{key[:KEY_CHARACTERS]}")
     return ConfigPlan(spec, indices, key, staging, cage)
+
+
+def by_config(plans: Iterable[ConfigPlan]) -> dict[str, list[ConfigPlan]]:
+    """Return plans by the name of their config, in order."""
+    plans_by_name: dict[str, list[ConfigPlan]] = {}
+    for plan in plans:
+        plans_by_name.setdefault(plan.spec.name, []).append(plan)
+    return plans_by_name
 
 
 def config_parameters(spec: ConfigSpec) -> dict[str, Any]:

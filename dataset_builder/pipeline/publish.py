@@ -33,7 +33,7 @@ from dataset_builder.pipeline.folder import (
     stored_bars_path,
 )
 from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, config_parameters, generator_versions
-from dataset_builder.pipeline.shards import Staging, pack_shard, read_staged_record, split_into_shards
+from dataset_builder.pipeline.shards import Staging, pack_shard, split_into_shards
 from dataset_builder.specs.config_specs import SceneConfigSpec
 from rebar_depth_bench import software_version
 from rebar_depth_bench.atomic_io import write_bytes, write_text
@@ -53,6 +53,7 @@ from rebar_depth_bench.data.manifest import (
     DatasetFolder,
     validated_folder,
 )
+from rebar_depth_bench.data.schema import ViewRecord
 from rebar_depth_bench.names import SPLITS, TEST_SPLIT
 from rebar_depth_bench.reading import remove_file
 from rebar_depth_bench.scoring.protocol import PROTOCOL
@@ -125,8 +126,7 @@ def publish(
     digests: dict[str, str] = {}
     scenes = {config.scene.name: (config.scene.entry, config.views) for config in kept}
     for scene in staged:
-        shards = _publish_shards(out, name, scene.prefix, scene.staging, list(scene.views.values()))
-        records = [read_staged_record(scene.staging.row(index), view_id) for view_id, index in scene.views.items()]
+        shards, records = _publish_shards(out, name, scene)
         size = sum((out / shard).stat().st_size for shard in shards)
         scenes[scene.entry["name"]] = {**scene.entry, "shards": list(shards), "bytes": size}, tuple(records)
         digests |= shards
@@ -199,29 +199,25 @@ def remove_leftovers(out: Path, folder: DatasetFolder | None) -> None:
     remove_temporary_files(out)
 
 
-def _publish_shards(
-    out: Path, config: str, prefix: str, staging: Staging, view_indices: Sequence[int]
-) -> dict[str, str]:
-    """Pack the shards and give each its name in the folder, which carries the digest of all of them.
+def _publish_shards(out: Path, config: str, scene: StagedScene) -> tuple[dict[str, str], list[ViewRecord]]:
+    """Pack the shards of a scene and give each its name in the folder, which carries the digest of all of them.
 
-    Return their SHA-256 digests by name.
-
-    ``prefix`` is the beginning of the names of the files: the split, and the scene if the config has several.
+    Return their SHA-256 digests by name, and the records of the views.
     """
-    shard_indices = split_into_shards(view_indices)
-    packed_paths = [staging.shard(shard) for shard in range(len(shard_indices))]
-    for target, indices in zip(packed_paths, shard_indices, strict=True):
-        pack_shard([staging.row(index) for index in indices], target)
+    runs = split_into_shards(list(scene.views.items()))
+    packed_paths = [scene.staging.shard(shard) for shard in range(len(runs))]
+    records: list[ViewRecord] = []
+    for target, run in zip(packed_paths, runs, strict=True):
+        records += pack_shard({view_id: scene.staging.row(index) for view_id, index in run}, target)
     digests = [file_sha256(path) for path in packed_paths]
     digest = parameters_digest(digests)[:SHARD_DIGEST_CHARACTERS]
     names = [
-        f"{config}/{prefix}-{shard:05d}-of-{len(shard_indices):05d}-{digest}.parquet"
-        for shard in range(len(shard_indices))
+        f"{config}/{scene.prefix}-{shard:05d}-of-{len(runs):05d}-{digest}.parquet" for shard in range(len(runs))
     ]
     (out / config).mkdir(exist_ok=True)
     for path, name in zip(packed_paths, names, strict=True):
         path.replace(out / name)
-    return dict(zip(names, digests, strict=True))
+    return dict(zip(names, digests, strict=True)), records
 
 
 def write_folder(

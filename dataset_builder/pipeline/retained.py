@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from dataset_builder.pipeline.folder import MESHES, PICTURES, SHARD_NAME, file_matches, stored_bars_path
-from dataset_builder.pipeline.plan import ConfigPlan, config_parameters, generator_versions
+from dataset_builder.pipeline.plan import ConfigPlan, by_config, config_parameters, generator_versions
 from dataset_builder.pipeline.shards import VIEWS_PER_SHARD, stage_published_rows
 from dataset_builder.pipeline.work_units import stage_mesh_digest
 from dataset_builder.scene.model import Note
@@ -170,9 +170,7 @@ def check_retained(out: Path, finished: Finished, plans: Sequence[ConfigPlan], o
     """
     if finished.folder is None:
         return
-    by_name: dict[str, list[ConfigPlan]] = {}
-    for plan in plans:
-        by_name.setdefault(plan.spec.name, []).append(plan)
+    by_name = by_config(plans)
     kept = [config for name, config in finished.configs.items() if name not in overwrite]
     # Of a config that is overwritten, other scenes may be kept.
     checked = [config for config in finished.configs.values() if config.name not in overwrite or config.has_splits]

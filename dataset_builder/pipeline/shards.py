@@ -9,11 +9,11 @@ depend on the number of workers or attempts.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -21,7 +21,7 @@ import pyarrow.parquet as pq
 
 from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.data import codecs
-from rebar_depth_bench.data.rows import CAMERA_KINDS, EyeTruth, EyeView, absent_cell
+from rebar_depth_bench.data.rows import CAMERA_KINDS, EyeView, absent_cell, truth_from_row
 from rebar_depth_bench.data.schema import COLUMNS, ROW_SCHEMA, ViewRecord, column_kind, features
 from rebar_depth_bench.data.shards import open_parquet, rows_table
 from rebar_depth_bench.errors import InputError, Problem, escape_text
@@ -30,6 +30,7 @@ from rebar_depth_bench.reporting.colormap import depth_preview
 from rebar_depth_bench.scoring.protocol import scored_pixels
 from rebar_depth_bench.validation import validate_table
 
+ViewT = TypeVar("ViewT")
 VIEWS_PER_SHARD = 8
 _RECORD_KEY = b"rebar_view_record"
 _PARQUET = {"compression": "none", "use_dictionary": False, "write_statistics": False}
@@ -46,6 +47,11 @@ class Staging:
     def mesh(self) -> Path:
         """Path of the mesh of the scene."""
         return self.root / "mesh.ply"
+
+    @property
+    def mesh_digest(self) -> Path:
+        """Path of the SHA-256 of the mesh that the staged rows were cast against."""
+        return self.root / "mesh.sha256"
 
     @property
     def cage(self) -> Path:
@@ -65,9 +71,9 @@ class Staging:
         return self.root / "shards" / f"{shard:05d}.parquet"
 
 
-def split_into_shards(indices: Sequence[int], views: int = VIEWS_PER_SHARD) -> list[tuple[int, ...]]:
-    """Split the view indices of a config into shards, or other runs of ``views`` views."""
-    return [tuple(indices[i : i + views]) for i in range(0, len(indices), views)]
+def split_into_shards(views: Sequence[ViewT], count: int = VIEWS_PER_SHARD) -> list[Sequence[ViewT]]:
+    """Split the views of a config into those of each shard, or other runs of ``count`` views."""
+    return [views[i : i + count] for i in range(0, len(views), count)]
 
 
 def stage_row(path: Path, row: pa.Table, record: ViewRecord) -> None:
@@ -77,36 +83,23 @@ def stage_row(path: Path, row: pa.Table, record: ViewRecord) -> None:
         pq.write_table(row.replace_schema_metadata(metadata), temporary, **_PARQUET)
 
 
-def read_staged_record(path: Path, view_id: str) -> ViewRecord:
-    """Return the manifest record stored in the staged row of a view.
-
-    Raises ``InputError`` if the file is damaged or holds another view.
-    """
-    with _open_staged_row(path) as file:
-        metadata = file.schema_arrow.metadata or {}
-    values, problems = parse_json(metadata.get(_RECORD_KEY, b""), "record")
-    record = None if problems else validate_table(ViewRecord, values, problems, "record")
-    if record is not None and record.view_id == view_id:
-        return record
-    raise _damaged_row(path, problems[0] if problems else Problem("conflict", "record", "another view", view_id))
-
-
 def _damaged_row(path: Path, problem: Problem) -> InputError:
     expected = "a row of an interrupted build; delete the file to render the view again"
     return InputError.from_problems(path, [problem, Problem("invalid", "", "not usable", expected)])
 
 
-def pack_shard(rows: Sequence[Path], target: Path) -> None:
-    """Write the staged ``rows`` as one Parquet shard with one row group per view, to keep streaming cheap.
+def pack_shard(rows: Mapping[str, Path], target: Path) -> list[ViewRecord]:
+    """Write staged ``rows``, paths by view id, as one Parquet shard; return the records of the views.
 
-    Raises ``InputError`` if a row is damaged.
+    There is one row group per view, to keep streaming cheap. Raises ``InputError`` if a row is damaged or that of
+    another view.
     """
-    tables = (_read_staged_row(path) for path in rows)
-    first = next(tables)
-    schema = first.schema.with_metadata(features().arrow_schema.metadata)
+    staged = [_read_staged_row(path, view_id) for view_id, path in rows.items()]
+    schema = staged[0][0].schema.with_metadata(features().arrow_schema.metadata)
     with atomic_replace(target) as temporary, pq.ParquetWriter(temporary, schema, **_PARQUET) as writer:
-        for table in (first, *tables):
-            writer.write_table(table.replace_schema_metadata(schema.metadata))
+        for row, _ in staged:
+            writer.write_table(row.replace_schema_metadata(schema.metadata))
+    return [record for _, record in staged]
 
 
 def stage_published_rows(shard: Path, targets: Mapping[str, Path], records: Mapping[str, ViewRecord]) -> None:
@@ -126,22 +119,22 @@ def stage_published_rows(shard: Path, targets: Mapping[str, Path], records: Mapp
                 stage_row(targets[view_id], row, records[view_id])
 
 
-def _read_staged_row(path: Path) -> pa.Table:
-    with _open_staged_row(path) as file:
-        table = file.read()
-    if not table.schema.equals(ROW_SCHEMA) or table.num_rows != 1:
-        raise _damaged_row(path, Problem("invalid", "", f"{table.num_rows} rows of other columns", "one row"))
-    return table
-
-
-@contextmanager
-def _open_staged_row(path: Path) -> Iterator[pq.ParquetFile]:
-    """Yield the staged row of a view. Raises ``InputError`` if the file is damaged or no such row."""
+def _read_staged_row(path: Path, view_id: str) -> tuple[pa.Table, ViewRecord]:
+    """Return the staged row of a view and its record. Raises ``InputError`` if the file has no such row."""
     try:
         with open_regular(path) as stream, open_parquet(stream, rows_table(ROW_SCHEMA.names, 1)) as (file, _):
-            yield file
+            row = file.read()
     except (OSError, ValueError) as error:
         raise _damaged_row(path, Problem("damaged", "", f"no Parquet file: {escape_text(str(error))}")) from None
+    if not row.schema.equals(ROW_SCHEMA) or row.num_rows != 1:
+        raise _damaged_row(path, Problem("invalid", "", f"{row.num_rows} rows of other columns", "one row"))
+    values, problems = parse_json((row.schema.metadata or {}).get(_RECORD_KEY, b""), "record")
+    record = None if problems else validate_table(ViewRecord, values, problems, "record")
+    if record is None:
+        raise _damaged_row(path, problems[0])
+    if record.view_id != view_id:
+        raise _damaged_row(path, Problem("conflict", "record", "another view", view_id))
+    return row, record
 
 
 @dataclass(frozen=True, eq=False)
@@ -162,23 +155,31 @@ def encode_view(view: View) -> tuple[pa.Table, ViewRecord]:
         columns |= {f"{name}_{kind}": getattr(eye, kind) for kind in ("rgb", "mask", "bars")}
         columns |= {f"{name}_{kind}": getattr(eye.camera, kind) for kind in CAMERA_KINDS}
         columns[f"{name}_depth"] = eye.depth_m
-    return encode_row(columns), view_record(view.view_id, view.left, view.right)
+    return encode_row(columns)
 
 
-def encode_row(columns: Mapping[str, Any]) -> pa.Table:
-    """Return a one-row table of ``ROW_SCHEMA``; a column that is missing or None is absent.
+def encode_row(columns: Mapping[str, Any]) -> tuple[pa.Table, ViewRecord]:
+    """Return a one-row table of ``ROW_SCHEMA``, and the record of its view; columns that are None are absent.
 
     ``columns`` holds what ``rebar_depth_bench.load`` returns, without the preview, which is made from the depth.
     """
-    preview: Any = _image_cell(codecs.encode_palette(*depth_preview(columns["left_depth"])))
-    cells = {"left_preview": preview}
+    preview = codecs.encode_palette(*depth_preview(columns["left_depth"]))
+    cells: dict[str, Any] = {"left_preview": _image_cell(preview)}
     for name in COLUMNS:
         value, kind = columns.get(name), column_kind(name)
         if value is not None:
             cells[name] = _ENCODERS.get(kind, _plain)(value)
         elif name not in cells:
             cells[name] = absent_cell(kind)
-    return pa.Table.from_pylist([cells], schema=ROW_SCHEMA)
+    left = truth_from_row(columns, "left")
+    record = ViewRecord(
+        view_id=columns["view_id"],
+        left=left.digest(),
+        right=truth_from_row(columns, "right").digest() if columns["right_depth"] is not None else None,
+        steel_px=None if left.mask is None else int(np.count_nonzero(left.mask)),
+        scored_px=len(scored_pixels(left.mask, left.depth_m)),
+    )
+    return pa.Table.from_pylist([cells], schema=ROW_SCHEMA), record
 
 
 def _plain(value: Any) -> Any:
@@ -197,14 +198,3 @@ _ENCODERS: Mapping[str, Callable[[Any], Any]] = {
 
 def _image_cell(content: bytes) -> dict[str, bytes | None]:
     return {"bytes": content, "path": None}
-
-
-def view_record(view_id: str, left: EyeTruth, right: EyeTruth | None) -> ViewRecord:
-    """Return the record of a view for the manifest; ``right`` is None without depth of the right camera."""
-    return ViewRecord(
-        view_id=view_id,
-        left=left.digest(),
-        right=right.digest() if right is not None else None,
-        steel_px=None if left.mask is None else int(np.count_nonzero(left.mask)),
-        scored_px=len(scored_pixels(left.mask, left.depth_m)),
-    )

@@ -29,7 +29,6 @@ from rebar_depth_bench.reading import read_file
 
 VIEWS_WITHOUT_COLOUR = 4 * VIEWS_PER_SHARD
 """Views of a work unit without colour."""
-_MESH_DIGEST = "mesh.sha256"
 
 
 @dataclass(frozen=True)
@@ -111,8 +110,8 @@ def accept_result(unit: WorkUnit, result: UnitResult, staging: Staging) -> None:
     known_mesh_sha256 = _known_mesh_sha256(staging)
     if problems := [*_problems(unit, result, staging, known_mesh_sha256)]:
         raise BuildError(f"{unit.label}, rendered by {result.worker}: rejected: {'; '.join(problems)}")
-    if known_mesh_sha256 is None or not _mesh_digest_path(staging).is_file():
-        write_text(_mesh_digest_path(staging), result.mesh_sha256)
+    if known_mesh_sha256 is None or not staging.mesh_digest.is_file():
+        write_text(staging.mesh_digest, result.mesh_sha256)
     for file in result.files:
         write_bytes(staging.root / file.name, file.content)
 
@@ -145,7 +144,7 @@ def _known_mesh_sha256(staging: Staging) -> str | None:
 
     Raises ``InputError`` if the file of the digest holds anything else.
     """
-    path = _mesh_digest_path(staging)
+    path = staging.mesh_digest
     if not path.is_file():
         return file_sha256(staging.mesh) if staging.mesh.is_file() else None
     content = read_file(path, TOML_BYTES, "a digest", InputError)
@@ -157,11 +156,7 @@ def _known_mesh_sha256(staging: Staging) -> str | None:
 def stage_mesh_digest(staging: Staging, sha256: str) -> None:
     """Require that the mesh of all views to be rendered has this digest, unless there is one already."""
     if _known_mesh_sha256(staging) is None:
-        write_text(_mesh_digest_path(staging), sha256)
-
-
-def _mesh_digest_path(staging: Staging) -> Path:
-    return staging.root / _MESH_DIGEST
+        write_text(staging.mesh_digest, sha256)
 
 
 def _sha256(content: bytes) -> str:

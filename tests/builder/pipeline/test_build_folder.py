@@ -21,7 +21,7 @@ from dataset_builder.pipeline.folder import check_target
 from dataset_builder.pipeline.plan import ConfigPlan, plan_config
 from dataset_builder.pipeline.publish import remove_leftovers
 from dataset_builder.pipeline.retained import Finished, check_retained
-from dataset_builder.pipeline.shards import Staging, pack_shard, read_staged_record
+from dataset_builder.pipeline.shards import Staging, pack_shard
 from dataset_builder.pipeline.work_units import remaining_units
 from dataset_builder.specs.config_specs import ColourSpec
 from rebar_depth_bench.data.manifest import open_folder
@@ -206,9 +206,7 @@ def test_damaged_staged_rows_are_named(tmp_path: Path, content: bytes | None) ->
     else:
         path.write_bytes(content)
     with pytest.raises(InputError, match=f"^{path}: .*problem"):
-        read_staged_record(path, "lattice/0000")
-    with pytest.raises(InputError, match=f"^{path}: .*problem"):
-        pack_shard([path], tmp_path / "shard.parquet")
+        pack_shard({"lattice/0000": path}, tmp_path / "shard.parquet")
     assert [item.name for item in tmp_path.iterdir()] == [path.name]
 
 
