@@ -18,9 +18,9 @@ from dataset_builder.specs.file_specs import (
     MeshFileSpec,
     PinnedFile,
     PlacementSpec,
+    Selection,
     Trust,
 )
-from dataset_builder.specs.selection import Selection
 from dataset_builder.user_files.cage_checks import cage_problems, check_values, raise_problems
 from dataset_builder.user_files.cage_placement import placed
 from dataset_builder.user_files.ifc_file import ifc_cage
