@@ -131,7 +131,7 @@ def _stage_mesh(mesh: WorldMesh, path: Path, expected_sha256: str | None) -> Non
     cast against the same mesh.
     """
     own_path = path.with_name(f"mesh-{os.getpid()}.ply")
-    write_mesh_ply(own_path, mesh.vertices_m, mesh.faces, mesh.face_bar_id)
+    write_mesh_ply(own_path, mesh)
     expected = file_sha256(path) if path.exists() else expected_sha256
     actual = file_sha256(own_path)
     if expected not in (None, actual):
@@ -147,9 +147,9 @@ def run_depth_task(task: DepthTask, report: Callable[[Mapping[str, Any]], None])
 
     The file ``<n>.npy`` of camera n holds float32 depth in metres, (H, W); pixels without a surface are 0.0.
     """
-    vertices_m, faces, _ = read_mesh_ply(task.mesh)
+    mesh = read_mesh_ply(task.mesh)
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    part = surface("dataset", Mesh(vertices_m, faces), "steel")
+    part = surface("dataset", Mesh(mesh.vertices_m, mesh.faces), "steel")
     add_object(part, mesh_data(part.name, part.mesh, part.material), np.zeros(3))
     use_cycles(bpy.context.scene, task.threads)
     with tempfile.TemporaryDirectory(dir=task.out) as scratch:
