@@ -26,7 +26,7 @@ from dataset_builder.blender.render import (
     set_attributes,
     use_cycles,
 )
-from dataset_builder.scene.steel_box import steel_box
+from dataset_builder.scene.raycast import steel_box
 from dataset_builder.specs.config_specs import ColourSpec
 from rebar_depth_bench.errors import BuildError
 from rebar_depth_bench.geometry.cameras import Camera
