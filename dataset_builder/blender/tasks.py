@@ -31,7 +31,7 @@ from dataset_builder.pipeline.blender_process import DepthTask, DevicesTask, Ren
 from dataset_builder.pipeline.shards import View, encode_view, stage_row
 from dataset_builder.scene.assemblies.cage import unpacked_cage
 from dataset_builder.scene.mesh_ply import read_mesh_ply, write_mesh_ply
-from dataset_builder.scene.model import Mesh, WorldMesh, surface
+from dataset_builder.scene.model import WorldMesh, surface
 from dataset_builder.scene.raycast import RayCaster
 from dataset_builder.scene.variants.sensor import recorded
 from dataset_builder.specs.config_specs import CPU, GPU_TYPES, ConfigSpec
@@ -149,7 +149,7 @@ def run_depth_task(task: DepthTask, report: Callable[[Mapping[str, Any]], None])
     """
     mesh = read_mesh_ply(task.mesh)
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    part = surface("dataset", Mesh(mesh.vertices_m, mesh.faces), "steel")
+    part = surface("dataset", mesh, "steel")
     add_object(part, mesh_data(part.name, part.mesh, part.material), np.zeros(3))
     use_cycles(bpy.context.scene, task.threads)
     with tempfile.TemporaryDirectory(dir=task.out) as scratch:
