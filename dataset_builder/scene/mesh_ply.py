@@ -22,13 +22,12 @@ from rebar_depth_bench.reading import read_file
 
 COMMENT = (
     "comment rebar-depth-bench mesh: world frame, right-handed, z up, board at z = 0;"
-    " unit metre; bar_id 0 is not steel"
+    " unit metre; bar_id 0 is not steel\n"
 )
 _HEADER = """\
 ply
 format binary_little_endian 1.0
-{comment}
-element vertex {vertices}
+{comment}element vertex {vertices}
 property double x
 property double y
 property double z
@@ -42,12 +41,8 @@ _FACE = np.dtype([("corners", "u1"), ("index", "<i4", (3,)), ("bar_id", "<u2")])
 _HEADER_LIMIT = 1 << 16
 """Maximum header size in bytes: a file without ``end_header`` is not searched to its end."""
 # Ten digits exceed int32, the type of vertex indices; longer counts are rejected without being converted.
-_HEADER_PATTERN = re.compile(
-    r"ply\nformat binary_little_endian 1\.0\n"
-    r"element vertex (\d{1,10})\nproperty double x\nproperty double y\nproperty double z\n"
-    r"element face (\d{1,10})\nproperty list uchar int vertex_indices\nproperty ushort bar_id\nend_header\n",
-    re.ASCII,
-)
+_COUNT = r"([0-9]{1,10})"
+_HEADER_PATTERN = re.compile(_HEADER.replace(".", r"\.").format(comment="", vertices=_COUNT, faces=_COUNT))
 _COMMENTS = re.compile(r"^(?:comment|obj_info)(?: [^\n]*)?\n", re.MULTILINE)
 
 
