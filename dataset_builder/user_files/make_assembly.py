@@ -37,9 +37,9 @@ def make_assembly(spec: AssemblySpec, cage: Cage | None = None) -> Assembly:
 
         return pier_assembly(spec)
     if isinstance(spec, GeneratedCageSpec):
-        from dataset_builder.scene.cages.generate import generated_assembly
+        from dataset_builder.scene.cages.generate import cage_assembly, spec_cage
 
-        return generated_assembly(spec)
+        return cage_assembly(spec_cage(spec))
     from dataset_builder.user_files.cage_file import load_cage
 
     return load_cage(spec, cage)

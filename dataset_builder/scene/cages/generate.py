@@ -188,11 +188,6 @@ def _placed(line_m: Float64[ndarray, "n 3"], offset_m: Float64[ndarray, " 3"]) -
     return np.asarray(np.round(line_m + offset_m, 9) + 0.0)
 
 
-def generated_assembly(spec: GeneratedCageSpec) -> Assembly:
-    """Return the ``cage_assembly`` of the cage of a spec. Raises ``InputError`` as ``spec_cage``."""
-    return cage_assembly(spec_cage(spec))
-
-
 def spec_cage(spec: GeneratedCageSpec) -> GeneratedCage:
     """Return the cage of a spec.
 
