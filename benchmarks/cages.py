@@ -27,9 +27,8 @@ from benchmarks.timing import machine_description, print_markdown
 from dataset_builder.inspection.picture import corner_view, font
 from dataset_builder.inspection.summary import inspect_cage
 from dataset_builder.scene.assemblies.cage import Cage
-from dataset_builder.scene.assemblies.generated import cage_bars
 from dataset_builder.scene.cages.as_built import END_TOLERANCE_M, PLACE_TOLERANCE_M, SPACING_TOLERANCE_M
-from dataset_builder.scene.cages.generate import FAMILIES, GeneratedCage, generate_cage
+from dataset_builder.scene.cages.generate import FAMILIES, GeneratedCage, cage_bars, generate_cage
 from dataset_builder.scene.cages.rules import (
     BEAM_STEEL,
     COLUMN_STEEL,

@@ -41,6 +41,7 @@ from dataset_builder.pipeline.retained import Finished, kept_scenes
 from dataset_builder.pipeline.shards import Staging, View, encode_view, stage_row
 from dataset_builder.pipeline.work_units import UnitResult, WorkUnit
 from dataset_builder.scene.mesh_ply import write_mesh_ply
+from dataset_builder.scene.model import WorldMesh
 from dataset_builder.specs.config_specs import ConfigSpec, RandomViewsSpec
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.files import file_sha256
@@ -77,7 +78,7 @@ def stage_prepared(config: ConfigSpec, indices: Sequence[int], staging: Staging)
     """Stage views of a config, and its mesh: one triangle, whose bar has the id 1."""
     staging.mesh.parent.mkdir(parents=True, exist_ok=True)
     triangle_m = np.array([[0.0, 0.0, 0.0], [0.3, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    write_mesh_ply(staging.mesh, triangle_m, np.array([[0, 1, 2]]), np.array([1]))
+    write_mesh_ply(staging.mesh, WorldMesh(triangle_m, np.array([[0, 1, 2]], np.int32), np.ones(1, np.uint16)))
     width, height = config.rig.width, config.rig.height
     mask = np.broadcast_to(np.arange(width) % 8 < 4, (height, width))
     camera = Camera(ideal_K(width, height), np.zeros(5), np.eye(4), width, height)

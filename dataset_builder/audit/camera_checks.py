@@ -65,11 +65,11 @@ def mesh_aim_point_m(mesh: Path) -> Float64[ndarray, " 3"]:
 
     Raises ``DatasetError`` if the file is not a mesh of this dataset or holds no steel.
     """
-    vertices_m, faces, face_bar_id = read_mesh_ply(mesh)
-    steel = vertices_m[np.unique(faces[face_bar_id != NOT_STEEL])]
+    scene = read_mesh_ply(mesh)
+    steel = scene.vertices_m[np.unique(scene.faces[scene.face_bar_id != NOT_STEEL])]
     if not len(steel):
         raise DatasetError(f"{mesh}: contains no steel, expected the bars of its scene")
-    return aim_point_m(Assembly((), (Part("steel", Mesh(steel, faces[:0]), 1, "steel"),)))
+    return aim_point_m(Assembly((), (Part("steel", Mesh(steel, scene.faces[:0]), 1, "steel"),)))
 
 
 def checked_aim_point_m(config: DatasetConfig, mesh: Path) -> tuple[Float64[ndarray, " 3"], tuple[str, ...]]:

@@ -24,9 +24,10 @@ from dataset_builder.blender.render import (
     render_passes,
     rendered_file,
     set_attributes,
+    set_pixels,
     use_cycles,
 )
-from dataset_builder.scene.steel_box import steel_box
+from dataset_builder.scene.raycast import steel_box
 from dataset_builder.specs.config_specs import ColourSpec
 from rebar_depth_bench.errors import BuildError
 from rebar_depth_bench.geometry.cameras import Camera
@@ -142,8 +143,5 @@ def _with_pixels(image: bpy.types.Image | None, values: Float32[ndarray, "h w 3"
         image = None
     if image is None:
         image = bpy.data.images.new("pass", width, height, float_buffer=True, is_data=True)
-    rgba = np.ones((height, width, 4), np.float32)
-    rgba[..., :3] = values[::-1]  # Blender's first row is the lowest.
-    image.pixels.foreach_set(rgba.ravel())
-    image.update()
+    set_pixels(image, values)
     return image

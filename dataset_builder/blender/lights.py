@@ -11,7 +11,7 @@ from pathlib import Path
 import bpy
 from mathutils import Vector
 
-from dataset_builder.blender.shader_nodes import NodeTreeBuilder, Socket
+from dataset_builder.blender.shader_nodes import NodeTreeBuilder, Socket, WorldBuilder
 from dataset_builder.scene.environments.light_rigs import LightRig, Panel, Sky, Spot, Sun
 from dataset_builder.scene.variants.registry import ImageLight
 from rebar_depth_bench.data.files import file_sha256
@@ -29,17 +29,9 @@ def add_light(rig: LightRig) -> None:
 
 def _add_sky(sky: Sky) -> None:
     """Set the sky as the background of the open scene."""
-    world = bpy.data.worlds.new("sky")
-    world.use_nodes = True
-    background = world.node_tree.nodes["Background"]
-    background.inputs["Color"].default_value = (*sky.horizon, 1.0)
-    background.inputs["Strength"].default_value = sky.strength
-    if sky.zenith != sky.horizon:
-        tree = NodeTreeBuilder(world.node_tree)
-        world.node_tree.links.new(_sky_gradient(tree, sky), background.inputs["Color"])
     # The sky is smooth enough for unguided sampling, so that lamps get all the shadow rays.
-    world.cycles.sampling_method = "NONE"
-    bpy.context.scene.world = world
+    tree = WorldBuilder("sky", "NONE")
+    tree.background(sky.horizon if sky.zenith == sky.horizon else _sky_gradient(tree, sky), sky.strength)
 
 
 def _sky_gradient(tree: NodeTreeBuilder, sky: Sky) -> Socket:
@@ -89,19 +81,13 @@ def add_panorama(light: ImageLight) -> None:
     found = file_sha256(path) if path.is_file() else "missing"
     if found != light.sha256:
         raise BuildError(f"{path}: the panorama has sha256 {found}, expected {light.sha256} as in bpy 4.5")
-    world = bpy.data.worlds.new("panorama")
-    world.use_nodes = True
-    tree = NodeTreeBuilder(world.node_tree)
+    # Importance sampling at the resolution of the image, because suns and lamps are a few of its pixels.
+    tree = WorldBuilder("panorama", "AUTOMATIC")
     # The image turns against the direction at which it is looked up.
     turned = tree.turned(tree.direction(), -radians(light.turn_deg))
     image = bpy.data.images.load(str(path))
     colour = tree.node("ShaderNodeTexEnvironment", {"Vector": turned}, image=image).outputs["Color"]
-    background = world.node_tree.nodes["Background"]
-    world.node_tree.links.new(colour, background.inputs["Color"])
-    background.inputs["Strength"].default_value = light.strength
-    # Importance sampling at the resolution of the image, because suns and lamps are a few of its pixels.
-    world.cycles.sampling_method = "AUTOMATIC"
-    bpy.context.scene.world = world
+    tree.background(colour, light.strength)
 
 
 def let_light_through(surface: bpy.types.Object) -> None:

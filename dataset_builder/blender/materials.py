@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import UInt8
 from numpy import ndarray
 
+from dataset_builder.blender.render import set_pixels
 from dataset_builder.blender.shader_nodes import MaterialBuilder
 from dataset_builder.scene.model import STEEL, Colour
 
@@ -65,11 +66,7 @@ def _image(name: str, texture: UInt8[ndarray, "h w"]) -> bpy.types.Image:
     image = bpy.data.images.new(name, width, height)
     # The values are mixing factors and not light, so no transfer curve applies.
     image.colorspace_settings.name = "Non-Color"
-    # Row 0 of a Blender image is at the bottom.
-    grey = np.flipud(texture).astype(np.float32)[..., None] / np.float32(255)
-    rgba = np.concatenate([grey, grey, grey, np.ones_like(grey)], axis=2)
-    image.pixels.foreach_set(np.ascontiguousarray(rgba).ravel())
-    image.update()
+    set_pixels(image, texture[..., None].astype(np.float32) / np.float32(255))
     image.pack()
     return image
 

@@ -15,7 +15,7 @@ from jaxtyping import Float32
 from numpy import ndarray
 
 from dataset_builder.blender.camera import place_camera
-from dataset_builder.scene.steel_box import PixelBox
+from dataset_builder.scene.raycast import PixelBox
 from rebar_depth_bench.atomic_io import named_write_errors
 from rebar_depth_bench.errors import BuildError
 from rebar_depth_bench.geometry.cameras import Camera
@@ -171,3 +171,11 @@ def set_attributes(owner: Any, **values: Any) -> None:
     """Set several attributes of ``owner``."""
     for name, value in values.items():
         setattr(owner, name, value)
+
+
+def set_pixels(image: bpy.types.Image, values: Float32[ndarray, "h w c"]) -> None:
+    """Set the opaque colours of an image of the same size; row 0 is at the top, and one channel is a grey."""
+    rgba = np.ones((*values.shape[:2], 4), np.float32)
+    rgba[..., :3] = values[::-1]  # Blender's first row is the lowest.
+    image.pixels.foreach_set(rgba.ravel())
+    image.update()

@@ -23,7 +23,7 @@ from dataset_builder.scene.board_texture import board_texture
 from dataset_builder.scene.environments.laboratory import BENCH_TOP_M, SHEET_THICKNESS_M
 from dataset_builder.scene.environments.surroundings import SURROUNDINGS
 from dataset_builder.scene.model import NOT_STEEL, Assembly, Mesh, Part, WorldMesh, surface
-from dataset_builder.scene.shapes.solids import box, merge_meshes, transformed
+from dataset_builder.scene.shapes.solids import box, transformed, world_mesh
 from dataset_builder.scene.variants.props import make_props
 from dataset_builder.scene.variants.registry import LIGHT_SLOT, STEEL_SLOT, exclusive_variant, image_light
 from dataset_builder.specs.config_specs import SceneSpec
@@ -174,9 +174,7 @@ def evaluated_world_mesh() -> WorldMesh:
     Objects are ordered by name.
     """
     placed_meshes = sorted(_mesh_instances(), key=lambda item: item.order)
-    mesh = merge_meshes([item.mesh for item in placed_meshes])
-    ids = [np.full(len(item.mesh.faces), item.bar_id, dtype=np.uint16) for item in placed_meshes]
-    return WorldMesh(mesh.vertices_m, mesh.faces, np.concatenate(ids))
+    return world_mesh([item.mesh for item in placed_meshes], [item.bar_id for item in placed_meshes])
 
 
 def _mesh_instances() -> Iterator[_MeshInstance]:

@@ -117,6 +117,23 @@ class NodeTreeBuilder:
         return self.node("ShaderNodeMix", inputs, data_type="RGBA").outputs[2]
 
 
+class WorldBuilder(NodeTreeBuilder):
+    """The node tree of a new world of the open scene; ``background`` completes it."""
+
+    def __init__(self, name: str, sampling_method: str) -> None:
+        world = bpy.data.worlds.new(name)
+        world.use_nodes = True
+        world.cycles.sampling_method = sampling_method
+        super().__init__(world.node_tree)
+        bpy.context.scene.world = world
+
+    def background(self, colour: Socket | Colour, strength: float) -> None:
+        """Set the radiance of the world: ``colour`` times ``strength``."""
+        inputs = self._tree.nodes["Background"].inputs
+        self._set_input(inputs["Color"], colour)
+        self._set_input(inputs["Strength"], strength)
+
+
 class MaterialBuilder(NodeTreeBuilder):
     """The node tree of a new material, empty at first; ``matt`` or ``surface`` completes it."""
 

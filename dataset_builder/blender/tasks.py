@@ -31,7 +31,7 @@ from dataset_builder.pipeline.blender_process import DepthTask, DevicesTask, Ren
 from dataset_builder.pipeline.shards import View, encode_view, stage_row
 from dataset_builder.scene.assemblies.cage import unpacked_cage
 from dataset_builder.scene.mesh_ply import read_mesh_ply, write_mesh_ply
-from dataset_builder.scene.model import Mesh, WorldMesh, surface
+from dataset_builder.scene.model import WorldMesh, surface
 from dataset_builder.scene.raycast import RayCaster
 from dataset_builder.scene.variants.sensor import recorded
 from dataset_builder.specs.config_specs import CPU, GPU_TYPES, ConfigSpec
@@ -131,7 +131,7 @@ def _stage_mesh(mesh: WorldMesh, path: Path, expected_sha256: str | None) -> Non
     cast against the same mesh.
     """
     own_path = path.with_name(f"mesh-{os.getpid()}.ply")
-    write_mesh_ply(own_path, mesh.vertices_m, mesh.faces, mesh.face_bar_id)
+    write_mesh_ply(own_path, mesh)
     expected = file_sha256(path) if path.exists() else expected_sha256
     actual = file_sha256(own_path)
     if expected not in (None, actual):
@@ -147,9 +147,9 @@ def run_depth_task(task: DepthTask, report: Callable[[Mapping[str, Any]], None])
 
     The file ``<n>.npy`` of camera n holds float32 depth in metres, (H, W); pixels without a surface are 0.0.
     """
-    vertices_m, faces, _ = read_mesh_ply(task.mesh)
+    mesh = read_mesh_ply(task.mesh)
     bpy.ops.wm.read_factory_settings(use_empty=True)
-    part = surface("dataset", Mesh(vertices_m, faces), "steel")
+    part = surface("dataset", mesh, "steel")
     add_object(part, mesh_data(part.name, part.mesh, part.material), np.zeros(3))
     use_cycles(bpy.context.scene, task.threads)
     with tempfile.TemporaryDirectory(dir=task.out) as scratch:

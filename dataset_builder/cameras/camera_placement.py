@@ -17,10 +17,10 @@ from numpy import ndarray
 from dataset_builder.cameras.rigs import rig_cameras
 from dataset_builder.cameras.trajectories import look_at_with_rig
 from dataset_builder.scene.environments.surroundings import GROUND_CLEARANCE_M, CameraSpace
-from dataset_builder.scene.model import NOT_STEEL, Assembly, Part, WorldMesh
+from dataset_builder.scene.model import NOT_STEEL, Assembly, Part
 from dataset_builder.scene.raycast import RayCaster
 from dataset_builder.scene.shapes.point_sets import SurfaceSampler, covering_points, farthest_points, short_path
-from dataset_builder.scene.shapes.solids import merge_meshes
+from dataset_builder.scene.shapes.solids import merge_meshes, world_mesh
 from dataset_builder.specs.config_specs import RandomViewsSpec, RigSpec, RolledStation, Station, SurveySpec
 from rebar_depth_bench.data.schema import EYES
 from rebar_depth_bench.errors import InputError, Problem
@@ -141,9 +141,8 @@ class _Site:
 
         self.surface = SurfaceSampler(merge_meshes([part.mesh for part in assembly.parts]))
         parts = (*assembly.parts, *obstacles)
-        surfaces = merge_meshes([part.mesh for part in parts])
-        bar_id = np.repeat([part.bar_id for part in parts], [len(part.mesh.faces) for part in parts])
-        self._caster = RayCaster(WorldMesh(surfaces.vertices_m, surfaces.faces, bar_id.astype(np.uint16)))
+        surfaces = world_mesh([part.mesh for part in parts], [part.bar_id for part in parts])
+        self._caster = RayCaster(surfaces)
         self._points = cKDTree(covering_points(surfaces, spacing_m))
         self._space, self._rules, self._spacing_m = space, rules, spacing_m
         width, height = rules.grid

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from dataset_builder.scene.shapes.capsules import Capsules
 from rebar_depth_bench.data.bars import Bar, with_axis
 
 _CHUNK = 32
@@ -33,15 +34,14 @@ class Cylinders:
         """Return the cylinders of the bars that have an axis; raise ``ValueError`` if there is no segment."""
         measured = with_axis(bars)
         lines_m = [np.array(bar.axis_m, dtype=np.float64) for bar in measured]
-        start_m = np.concatenate([np.zeros((0, 3)), *(line_m[:-1] for line_m in lines_m)])
-        along_m = np.concatenate([np.zeros((0, 3)), *(np.diff(line_m, axis=0) for line_m in lines_m)])
-        radius_m = np.repeat([bar.diameter_m / 2 for bar in measured], [len(line_m) - 1 for line_m in lines_m])
+        pieces = Capsules.of_lines(lines_m, [bar.diameter_m / 2 for bar in measured])
+        along_m = pieces.b_m - pieces.a_m
         length_m = np.linalg.norm(along_m, axis=1)
         used = length_m > 0
         if not used.any():
             raise ValueError("there are no bars to measure the distance from")
         direction = along_m[used] / length_m[used, None]
-        return cls(start_m[used], direction, length_m[used], radius_m[used])
+        return cls(pieces.a_m[used], direction, length_m[used], pieces.radius_m[used])
 
     def distance_m(self, points_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, " n"]:
         """Return the Euclidean distance of each point from the nearest cylinder, 0 inside of one."""

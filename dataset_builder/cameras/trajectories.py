@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import product
 from math import cos, radians, sin
 from typing import NamedTuple
 
@@ -110,21 +111,15 @@ def view_count(trajectory: TrajectorySpec) -> int:
 
 def _places(trajectory: DomeSpec | RingSpec | DistanceSweepSpec) -> list[_Place]:
     """Return the places of the views in order, with the radii of the trajectory."""
-    if isinstance(trajectory, RingSpec):
-        return [
-            _Place(trajectory.radius_m, trajectory.elevation_deg, 360.0 * k / trajectory.azimuths)
-            for k in range(trajectory.azimuths)
-        ]
-    if isinstance(trajectory, DistanceSweepSpec):
-        return [
-            _Place(radius_m, trajectory.elevation_deg, 360.0 * (k + 0.5) / trajectory.azimuths)
-            for radius_m in trajectory.radii_m
-            for k in range(trajectory.azimuths)
-        ]
-    rings = [(radius_m, elevation) for radius_m in trajectory.radii_m for elevation in trajectory.elevations_deg]
+    radii_m = (trajectory.radius_m,) if isinstance(trajectory, RingSpec) else trajectory.radii_m
+    first = 0.5 if isinstance(trajectory, DistanceSweepSpec) else 0.0
+    if isinstance(trajectory, DomeSpec):
+        elevations_deg, turn_deg = trajectory.elevations_deg, GOLDEN_TURN_DEG
+    else:
+        elevations_deg, turn_deg = (trajectory.elevation_deg,), 0.0
     return [
-        _Place(radius_m, elevation, GOLDEN_TURN_DEG * ring + 360.0 * k / trajectory.azimuths)
-        for ring, (radius_m, elevation) in enumerate(rings)
+        _Place(radius_m, elevation_deg, turn_deg * ring + 360.0 * (first + k) / trajectory.azimuths)
+        for ring, (radius_m, elevation_deg) in enumerate(product(radii_m, elevations_deg))
         for k in range(trajectory.azimuths)
     ]
 

@@ -225,9 +225,8 @@ class BuildRequest:
             )
 
     def _with_request(self, spec: ConfigSpec) -> ConfigSpec:
-        variants = tuple(
-            name for name in VARIANTS if name in self.variants
-        )  # fixed order: equal sets of variants give equal names
+        # In a fixed order, so that equal sets of variants give equal names.
+        variants = tuple(name for name in VARIANTS if name in self.variants)
         suffix = "".join(f"-{name}" for name in variants)
         scene = replace(
             spec.scene,

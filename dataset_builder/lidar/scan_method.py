@@ -33,7 +33,6 @@ from dataset_builder.lidar.scanner import (
     visible_beams,
 )
 from dataset_builder.scene.mesh_ply import read_mesh_ply
-from dataset_builder.scene.model import WorldMesh
 from dataset_builder.scene.raycast import RayCaster
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.cameras import Camera, fold_radius, project
@@ -63,7 +62,7 @@ def lidar_method(name: str, spec: ScannerSpec, what: str) -> MultiViewMethod:
 
     def prepare(views: Views, _: Path, progress: Progress) -> Prepared:
         progress(f"{name}: the mesh of {views.config}", 0, 1)
-        caster = RayCaster(WorldMesh(*read_mesh_ply(views.mesh)))
+        caster = RayCaster(read_mesh_ply(views.mesh))
         progress(f"{name}: the mesh of {views.config}", 1, 1)
         height, width = views.grid
 

@@ -181,7 +181,7 @@ def with_cameras(plan: ConfigPlan) -> ScenePlan:
     """Return the plan of a generated scene with its cameras. Raises as ``place_cameras``."""
     # Only processes that place cameras need these modules.
     from dataset_builder.cameras.camera_placement import with_random_stations
-    from dataset_builder.scene.assemblies.generated import cage_assembly, spec_cage
+    from dataset_builder.scene.cages.generate import cage_assembly, spec_cage
     from dataset_builder.scene.environments.surroundings import SURROUNDINGS
     from dataset_builder.scene.variants.props import make_props
 

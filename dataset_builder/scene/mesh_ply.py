@@ -11,9 +11,10 @@ import re
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64, Int32, Integer, UInt16
+from jaxtyping import Float64
 from numpy import ndarray
 
+from dataset_builder.scene.model import WorldMesh
 from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.limits import MESH_BYTES
@@ -21,13 +22,12 @@ from rebar_depth_bench.reading import read_file
 
 COMMENT = (
     "comment rebar-depth-bench mesh: world frame, right-handed, z up, board at z = 0;"
-    " unit metre; bar_id 0 is not steel"
+    " unit metre; bar_id 0 is not steel\n"
 )
 _HEADER = """\
 ply
 format binary_little_endian 1.0
-{comment}
-element vertex {vertices}
+{comment}element vertex {vertices}
 property double x
 property double y
 property double z
@@ -41,43 +41,26 @@ _FACE = np.dtype([("corners", "u1"), ("index", "<i4", (3,)), ("bar_id", "<u2")])
 _HEADER_LIMIT = 1 << 16
 """Maximum header size in bytes: a file without ``end_header`` is not searched to its end."""
 # Ten digits exceed int32, the type of vertex indices; longer counts are rejected without being converted.
-_HEADER_PATTERN = re.compile(
-    r"ply\nformat binary_little_endian 1\.0\n"
-    r"element vertex (\d{1,10})\nproperty double x\nproperty double y\nproperty double z\n"
-    r"element face (\d{1,10})\nproperty list uchar int vertex_indices\nproperty ushort bar_id\nend_header\n",
-    re.ASCII,
-)
+_COUNT = r"([0-9]{1,10})"
+_HEADER_PATTERN = re.compile(_HEADER.replace(".", r"\.").format(comment="", vertices=_COUNT, faces=_COUNT))
 _COMMENTS = re.compile(r"^(?:comment|obj_info)(?: [^\n]*)?\n", re.MULTILINE)
 
-MeshArrays = tuple[Float64[ndarray, "v 3"], Int32[ndarray, "n 3"], UInt16[ndarray, " n"]]
-"""Vertices (world frame, metres), triangles, and the bar id of each triangle."""
 
-
-def write_mesh_ply(
-    path: str | os.PathLike[str],
-    vertices_m: Float64[ndarray, "v 3"],
-    faces: Integer[ndarray, "n 3"],
-    face_bar_id: Integer[ndarray, " n"],
-) -> None:
-    """Write a world-frame mesh in metres as a PLY file of the dataset, atomically.
-
-    Raises ``ValueError`` if the arrays are not a mesh: wrong shape or type, a coordinate that is not finite, a
-    vertex index out of range, or a bar id outside 0 to 65535.
-    """
-    _check_arrays(vertices_m, faces, face_bar_id)
-    header = _HEADER.format(comment=COMMENT, vertices=len(vertices_m), faces=len(faces))
-    vertex_rows = np.empty(len(vertices_m), _VERTEX)
-    vertex_rows["xyz"] = vertices_m
-    face_rows = np.empty(len(faces), _FACE)
+def write_mesh_ply(path: str | os.PathLike[str], mesh: WorldMesh) -> None:
+    """Write the mesh of a scene as a PLY file of the dataset, atomically."""
+    header = _HEADER.format(comment=COMMENT, vertices=len(mesh.vertices_m), faces=len(mesh.faces))
+    vertex_rows = np.empty(len(mesh.vertices_m), _VERTEX)
+    vertex_rows["xyz"] = mesh.vertices_m
+    face_rows = np.empty(len(mesh.faces), _FACE)
     face_rows["corners"] = 3
-    face_rows["index"] = faces
-    face_rows["bar_id"] = face_bar_id
+    face_rows["index"] = mesh.faces
+    face_rows["bar_id"] = mesh.face_bar_id
     with atomic_replace(Path(path)) as temporary, temporary.open("wb") as file:
         file.writelines((header.encode("ascii"), vertex_rows.data, face_rows.data))
 
 
-def read_mesh_ply(path: str | os.PathLike[str]) -> MeshArrays:
-    """Return vertices (v x 3 float64, world metres), triangles (n x 3 int32) and bar ids (n uint16).
+def read_mesh_ply(path: str | os.PathLike[str]) -> WorldMesh:
+    """Return the mesh of a scene from its file.
 
     Raises ``DatasetError`` if the file cannot be read or differs from this layout in any way.
     """
@@ -89,8 +72,8 @@ def has_mesh_ply_header(content: bytes) -> bool:
     return _match_header(content) is not None
 
 
-def parse_mesh_ply(content: bytes, where: str) -> MeshArrays:
-    """Return the arrays of ``read_mesh_ply`` from the content of a file; ``where`` names the file in errors.
+def parse_mesh_ply(content: bytes, where: str) -> WorldMesh:
+    """Return the mesh of ``read_mesh_ply`` from the content of a file; ``where`` names the file in errors.
 
     The size of the content is compared with the counts in the header before arrays are allocated. Raises
     ``DatasetError`` as ``read_mesh_ply`` does.
@@ -112,7 +95,7 @@ def parse_mesh_ply(content: bytes, where: str) -> MeshArrays:
     vertices = np.frombuffer(content, _VERTEX, vertex_count, start)["xyz"].astype(np.float64)
     rows = np.frombuffer(content, _FACE, face_count, faces_start)
     _check_rows(vertices, rows, where)
-    return vertices, rows["index"].astype(np.int32), rows["bar_id"].astype(np.uint16)
+    return WorldMesh(vertices, rows["index"].astype(np.int32), rows["bar_id"].astype(np.uint16))
 
 
 def _match_header(content: bytes) -> tuple[int, int, int] | None:
@@ -144,21 +127,3 @@ def _check_rows(vertices: Float64[ndarray, "v 3"], rows: ndarray, where: str) ->
     if len(not_finite):
         row = not_finite[0]
         raise DatasetError(f"{where}: vertex {row} is {vertices[row].tolist()}, expected finite metres")
-
-
-def _check_arrays(vertices_m: ndarray, faces: ndarray, face_bar_id: ndarray) -> None:
-    """Raise ``ValueError`` if the arrays cannot be written in this layout."""
-    if vertices_m.ndim != 2 or vertices_m.shape[1] != 3 or faces.ndim != 2 or faces.shape[1] != 3:
-        raise ValueError(f"vertices {vertices_m.shape} and faces {faces.shape}: expected (v, 3) and (n, 3)")
-    if face_bar_id.shape != faces.shape[:1]:
-        raise ValueError(f"bar ids {face_bar_id.shape}: expected one for each of the {len(faces)} faces")
-    if faces.dtype.kind not in "iu" or face_bar_id.dtype.kind not in "iu":
-        raise ValueError(f"faces {faces.dtype} and bar ids {face_bar_id.dtype}: expected integers")
-    if not np.isfinite(vertices_m).all():
-        raise ValueError("a vertex is not finite: expected metres")
-    if faces.size and not (faces.min() >= 0 and faces.max() < len(vertices_m)):
-        raise ValueError(
-            f"faces refer to vertices {faces.min()} to {faces.max()}: expected 0 to {len(vertices_m) - 1}"
-        )
-    if face_bar_id.size and not (face_bar_id.min() >= 0 and face_bar_id.max() <= np.iinfo(np.uint16).max):
-        raise ValueError(f"bar ids {face_bar_id.min()} to {face_bar_id.max()}: expected 0 to 65535")

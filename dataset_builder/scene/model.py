@@ -109,9 +109,7 @@ class Assembly:
 
 
 @dataclass(frozen=True, eq=False)
-class WorldMesh:
+class WorldMesh(Mesh):
     """All surfaces of a scene as one mesh: the input of the ray caster and the content of ``meshes/*.ply``."""
 
-    vertices_m: Float64[ndarray, "v 3"]
-    faces: Int32[ndarray, "f 3"]
     face_bar_id: UInt16[ndarray, " f"]

@@ -1,4 +1,4 @@
-"""Exact ground truth by casting rays through pixel centres against the mesh of a scene.
+"""Exact ground truth by casting rays through pixel centres against the mesh of a scene, and the box of its steel.
 
 Embree finds the first triangle that a ray hits; the depth is then computed in float64 from the intersection of the
 ray with the plane of that triangle. The float32 distance of Embree deviates by up to 29 um at 16 m (measured).
@@ -163,3 +163,35 @@ def _closest_to_edges(
     on_edges_m = np.stack([on_edge for _, on_edge in closest], axis=1)
     nearest_m = on_edges_m[np.arange(len(origins_m)), distance_m.argmin(axis=1)]
     return np.asarray(np.einsum("ij,ij->i", nearest_m - origins_m, directions) / square[:, 0])
+
+
+@dataclass(frozen=True)
+class PixelBox:
+    """Rectangle of pixels: rows ``top`` to ``bottom - 1``, columns ``left`` to ``right - 1``."""
+
+    top: int
+    bottom: int
+    left: int
+    right: int
+
+    @property
+    def slices(self) -> tuple[slice, slice]:
+        """Index of the box in an image."""
+        return slice(self.top, self.bottom), slice(self.left, self.right)
+
+
+def steel_box(mask: Bool[ndarray, "h w"], margin_px: int) -> PixelBox | None:
+    """Return the smallest box with all steel pixels and ``margin_px`` around them; None without steel.
+
+    The box is cut off at the borders of the image.
+    """
+    rows, columns = (np.flatnonzero(mask.any(axis=axis)) for axis in (1, 0))
+    if not rows.size:
+        return None
+    height, width = mask.shape
+    return PixelBox(
+        top=max(int(rows[0]) - margin_px, 0),
+        bottom=min(int(rows[-1]) + 1 + margin_px, height),
+        left=max(int(columns[0]) - margin_px, 0),
+        right=min(int(columns[-1]) + 1 + margin_px, width),
+    )

@@ -4,34 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Mapping
 from functools import cache
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar, cast, get_args
 
 from pydantic import create_model
 
-from dataset_builder.specs.config_specs import (
-    DistanceSweepSpec,
-    DomeSpec,
-    FocalRigSpec,
-    GeneratedCageSpec,
-    RandomViewsSpec,
-    RigSpec,
-    RingSpec,
-    SurveySpec,
-    TrajectorySpec,
-)
+from dataset_builder.specs.config_specs import FocalRigSpec, GeneratedCageSpec, RigSpec, TrajectorySpec
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, DatasetConfig
-from rebar_depth_bench.data.schema import RANDOM_VIEWS, SURVEY
 from rebar_depth_bench.errors import DatasetError, Problem
 from rebar_depth_bench.validation import StrictModel, format_location, validate_table
 
 _Spec = TypeVar("_Spec")
-_TRAJECTORIES: Mapping[str, type[TrajectorySpec]] = {
-    "dome": DomeSpec,
-    "ring": RingSpec,
-    "sweep": DistanceSweepSpec,
-    SURVEY: SurveySpec,
-    RANDOM_VIEWS: RandomViewsSpec,
-}
+_TRAJECTORIES: Mapping[str, type[TrajectorySpec]] = {spec.kind: spec for spec in get_args(TrajectorySpec)}
 
 
 def trajectory_spec(config: DatasetConfig) -> TrajectorySpec:

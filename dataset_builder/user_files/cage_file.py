@@ -21,9 +21,9 @@ from dataset_builder.specs.file_specs import (
     CageFileSpec,
     MeshFileSpec,
     PlacementSpec,
+    Selection,
     Trust,
 )
-from dataset_builder.specs.selection import Selection
 from dataset_builder.user_files.cage_placement import placed
 from dataset_builder.user_files.ifc_file import ifc_cage
 from dataset_builder.user_files.mesh_import import SUFFIXES as MESH_SUFFIXES

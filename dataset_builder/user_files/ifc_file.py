@@ -27,8 +27,7 @@ from numpy import ndarray
 
 from dataset_builder.scene.assemblies.cage import Cage, CageBar, LeftOut, unit_scale
 from dataset_builder.scene.model import MAX_BARS, METRE_DECIMALS, Mesh, Note, axis_of
-from dataset_builder.specs.file_specs import Trust
-from dataset_builder.specs.selection import TABLES, Selection
+from dataset_builder.specs.file_specs import TABLES, Selection, Trust
 from dataset_builder.user_files.ifc_records import (
     AnswerError,
     BarRecord,

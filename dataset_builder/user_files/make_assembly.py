@@ -37,9 +37,9 @@ def make_assembly(spec: AssemblySpec, cage: Cage | None = None) -> Assembly:
 
         return pier_assembly(spec)
     if isinstance(spec, GeneratedCageSpec):
-        from dataset_builder.scene.assemblies.generated import generated_assembly
+        from dataset_builder.scene.cages.generate import cage_assembly, spec_cage
 
-        return generated_assembly(spec)
+        return cage_assembly(spec_cage(spec))
     from dataset_builder.user_files.cage_file import load_cage
 
     return load_cage(spec, cage)
@@ -48,7 +48,7 @@ def make_assembly(spec: AssemblySpec, cage: Cage | None = None) -> Assembly:
 def assembly_bars(spec: AssemblySpec) -> tuple[Bar, ...]:
     """Return the bars of an assembly; for a generated cage, without making meshes. Raises as ``make_assembly``."""
     if isinstance(spec, GeneratedCageSpec):
-        from dataset_builder.scene.assemblies.generated import cage_bars, spec_cage
+        from dataset_builder.scene.cages.generate import cage_bars, spec_cage
 
         return tuple(bar.bar for bar in cage_bars(spec_cage(spec)))
     return make_assembly(spec).bars

@@ -140,9 +140,9 @@ def read_parts(content: bytes, spec: MeshFileSpec) -> list[MeshPart]:
 
 def _dataset_ply_parts(content: bytes, spec: MeshFileSpec) -> list[MeshPart]:
     """Return the parts of a PLY in the dataset's own layout, bit by bit if the unit is the metre."""
-    vertices, faces, face_bar_id = parse_mesh_ply(content, spec.path)
-    whole = Mesh(vertices * spec.unit_m, faces)
-    meshes = {int(face_bar_id[group[0]]): _submesh(whole, group) for group in _indices_by_label(face_bar_id)}
+    scene = parse_mesh_ply(content, spec.path)
+    whole, ids = Mesh(scene.vertices_m * spec.unit_m, scene.faces), scene.face_bar_id
+    meshes = {int(ids[group[0]]): _submesh(whole, group) for group in _indices_by_label(ids)}
     if meshes.pop(NOT_STEEL, None) is not None and not meshes:
         raise MeshError(f"{spec.path}: every face has bar_id 0 (not steel), expected at least one bar")
     return [MeshPart(bar_id, f"bar {bar_id}", mesh) for bar_id, mesh in meshes.items()]

@@ -21,7 +21,6 @@ from dataset_builder.pipeline.build import build
 from dataset_builder.pipeline.shards import Staging, View, encode_view, stage_row
 from dataset_builder.pipeline.work_units import UnitResult, WorkUnit
 from dataset_builder.scene.mesh_ply import read_mesh_ply
-from dataset_builder.scene.model import WorldMesh
 from dataset_builder.scene.raycast import RayCaster
 from dataset_builder.specs.config_specs import ColourSpec
 from dataset_builder.user_files.make_assembly import make_assembly
@@ -45,7 +44,7 @@ class StoredImages:
         """Stage the views of the unit."""
         staging.row(0).parent.mkdir(parents=True, exist_ok=True)
         staging.mesh.write_bytes(self.mesh.read_bytes())
-        caster = RayCaster(WorldMesh(*read_mesh_ply(self.mesh)))
+        caster = RayCaster(read_mesh_ply(self.mesh))
         config = unit.config
         left_poses = poses(config.protocol, aim_point_m(make_assembly(config.scene.assembly)), config.rig)
         for index in unit.indices:

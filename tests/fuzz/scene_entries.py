@@ -11,6 +11,7 @@ import trimesh
 
 from dataset_builder.catalog.scene_file import scene_config
 from dataset_builder.scene.mesh_ply import write_mesh_ply
+from dataset_builder.scene.model import WorldMesh
 from dataset_builder.user_files.cage_file import cage_file_spec, load_cage, mesh_file_spec
 from rebar_depth_bench.geometry.calibration import read_calibration
 from tests.bench.geometry.calibrations import CONF, TOML
@@ -31,7 +32,7 @@ def _rods() -> trimesh.Trimesh:
 
 def _dataset_ply(path: Path) -> None:
     bar_id = np.repeat(range(1, len(_RODS) + 1), [len(rod.faces) for rod in _RODS])
-    write_mesh_ply(path, np.asarray(_rods().vertices), np.asarray(_rods().faces), bar_id)
+    write_mesh_ply(path, WorldMesh(np.asarray(_rods().vertices), np.asarray(_rods().faces), bar_id))
 
 
 def _read_mesh(path: Path) -> object:

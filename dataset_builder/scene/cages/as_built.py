@@ -134,7 +134,6 @@ def _doubled(built: list[BuiltBar], clearances: Clearances, rng: np.random.Gener
         distance_m = contact_m(bar.diameter_m, bar.diameter_m) + MIN_CLEAR_M
         line_m = bar.line_m + beside / np.linalg.norm(beside) * distance_m
         if clearances.least_m(line_m, outer_radius_m(bar.diameter_m)) >= _NEEDED_M:
-            clearances.append(line_m, outer_radius_m(bar.diameter_m))
             return [BuiltBar(bar.role, bar.diameter_m, line_m, None)]
     return []
 

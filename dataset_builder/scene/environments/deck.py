@@ -40,11 +40,10 @@ def deck() -> tuple[Part, ...]:
 
 def _site() -> tuple[Part, ...]:
     """Return the building site below the deck, and the hills round it."""
-    lowered = [
+    return tuple(
         replace(part, mesh=transformed(part.mesh, np.eye(3), (0.0, 0.0, -STOREY_M)))
         for part in (*site(), _hills())
-    ]
-    return tuple(lowered)
+    )
 
 
 def _hills() -> Part:
@@ -91,23 +90,17 @@ def _body() -> tuple[Part, ...]:
 
 def _rim() -> tuple[Part, ...]:
     """Return edge boards round the deck with their blocks, and guard rails of painted boards on posts."""
-    edges, posts, rails = [], [], []
-    for turn in range(4):
-        rotation = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
-        rotation = np.linalg.matrix_power(rotation, turn)
-
-        def at_rim(mesh: Mesh, rotation: np.ndarray = rotation) -> Mesh:
-            return transformed(mesh, rotation, (0.0, 0.0, 0.0))
-
-        r, end = _RIM_M, HALF_M + 0.05
-        edges.append(at_rim(box((r, -end, -0.28), (r + 0.027, end, 0.22))))
-        at_m = np.linspace(-HALF_M + 0.1, HALF_M - 0.1, 9)
-        posts += [at_rim(box((r + 0.03, y - 0.045, -0.32), (r + 0.12, y + 0.045, 1.14))) for y in at_m]
-        rails += [at_rim(box((r + 0.005, -end, z), (r + 0.028, end, z + 0.15))) for z in (0.3, 0.62, 0.97)]
-    return (
-        surface("edge", merge_meshes(edges), "plywood"),
-        surface("posts", merge_meshes(posts), "timber"),
-        surface("rails", merge_meshes(rails), "yellow paint"),
+    r, end = _RIM_M, HALF_M + 0.05
+    edge = [box((r, -end, -0.28), (r + 0.027, end, 0.22))]
+    at_m = np.linspace(-HALF_M + 0.1, HALF_M - 0.1, 9)
+    posts = [box((r + 0.03, y - 0.045, -0.32), (r + 0.12, y + 0.045, 1.14)) for y in at_m]
+    rails = [box((r + 0.005, -end, z), (r + 0.028, end, z + 0.15)) for z in (0.3, 0.62, 0.97)]
+    quarter = np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]])
+    turns = [np.linalg.matrix_power(quarter, turn) for turn in range(4)]
+    pieces = (("edge", edge, "plywood"), ("posts", posts, "timber"), ("rails", rails, "yellow paint"))
+    return tuple(
+        surface(name, merge_meshes([transformed(merge_meshes(side), turn, (0, 0, 0)) for turn in turns]), material)
+        for name, side, material in pieces
     )
 
 

@@ -112,13 +112,6 @@ class Clearances:
         self._lines_m[index] = line_m
         self._low_m[index], self._high_m[index] = line_m.min(axis=0), line_m.max(axis=0)
 
-    def append(self, line_m: Float64[ndarray, "n 3"], radius_m: float) -> None:
-        """Add a bar."""
-        self._lines_m.append(line_m)
-        self._radii_m = np.append(self._radii_m, radius_m)
-        self._low_m = np.vstack([self._low_m, line_m.min(axis=0)])
-        self._high_m = np.vstack([self._high_m, line_m.max(axis=0)])
-
     def neighbours(
         self, line_m: Float64[ndarray, "n 3"], radius_m: float, without: int | None = None, margin_m: float = 0.0
     ) -> Capsules:

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Float64, Int32
 from numpy import ndarray
 
-from dataset_builder.scene.model import Mesh
+from dataset_builder.scene.model import Mesh, WorldMesh
 
 Point = tuple[float, float, float]
 
@@ -103,3 +103,10 @@ def merge_meshes(meshes: Sequence[Mesh]) -> Mesh:
     starts = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes)])
     faces = [mesh.faces + start for mesh, start in zip(meshes, starts, strict=False)]
     return Mesh(np.concatenate([mesh.vertices_m for mesh in meshes]), np.concatenate(faces).astype(np.int32))
+
+
+def world_mesh(meshes: Sequence[Mesh], bar_ids: Sequence[int]) -> WorldMesh:
+    """Return the meshes in the world frame, each with its bar id, as one mesh in order."""
+    merged = merge_meshes(meshes)
+    face_bar_id = np.repeat(np.array(bar_ids, np.uint16), [len(mesh.faces) for mesh in meshes])
+    return WorldMesh(merged.vertices_m, merged.faces, face_bar_id)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,7 +9,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.scene.model import Mesh, Part, surface
-from dataset_builder.scene.shapes.solids import box, lathe, rotation_about_z, transformed
+from dataset_builder.scene.shapes.solids import Point, box, lathe, rotation_about_z, transformed
 from dataset_builder.scene.variants.context import GAP_M, PlacementContext, Rect
 
 CLEARANCE = 0.04
@@ -24,14 +23,14 @@ Piece = tuple[Mesh, str]
 
 @dataclass(frozen=True)
 class _Item:
-    """Object to place: name, footprint (length, width), and a function that returns its pieces.
+    """Object to place: name, footprint (length, width) and pieces.
 
     The pieces are in a local frame with the origin at the centre of the footprint.
     """
 
     name: str
     footprint_m: tuple[float, float]
-    pieces: Callable[[], list[Piece]]
+    pieces: list[Piece]
 
 
 LIFE_SIZE_UNIT_M = 0.36
@@ -60,7 +59,7 @@ def clutter(context: PlacementContext) -> tuple[Part, ...]:
         if pose is not None:
             at_m, turn_deg = pose
             circles.append(_covering_circles(item, at_m, turn_deg))
-            for k, (mesh, material) in enumerate(item.pieces()):
+            for k, (mesh, material) in enumerate(item.pieces):
                 placed_mesh = transformed(mesh, rotation_about_z(turn_deg), (at_m[0], at_m[1], GAP_M))
                 parts.append(surface(f"clutter-{number}-{item.name}-{k}", placed_mesh, material))
     return tuple(parts)
@@ -103,23 +102,26 @@ def _min_distance_m(points_m: Float64[ndarray, "k 2"], others_m: Float64[ndarray
 def _items(u: float) -> tuple[_Item, ...]:
     """Return the objects to place, largest first, with dimensions in units of ``u`` metres."""
     return (
-        _Item("offcut", (3.2 * u, 0.5 * u), lambda: [(_slab(3.2 * u, 0.5 * u, 0.18 * u), "timber")]),
-        _Item("batten", (2.1 * u, 0.26 * u), lambda: [(_slab(2.1 * u, 0.26 * u, 0.26 * u), "timber")]),
-        _Item("bucket", (0.92 * u, 0.92 * u), lambda: [(_bucket(u), "black rubber")]),
-        _Item("box", (0.95 * u, 0.62 * u), lambda: [(_slab(0.95 * u, 0.62 * u, 0.4 * u), "cardboard")]),
-        _Item("bucket", (0.78 * u, 0.78 * u), lambda: [(_bucket(0.85 * u), "blue plastic")]),
-        _Item("hammer", (1.35 * u, 0.42 * u), lambda: _hammer(u)),
-        _Item("block", (0.8 * u, 0.4 * u), lambda: [(_slab(0.8 * u, 0.4 * u, 0.4 * u), "concrete")]),
-        _Item("glove", (0.62 * u, 0.3 * u), lambda: [(_slab(0.62 * u, 0.3 * u, 0.1 * u), "orange plastic")]),
-        _Item("tape", (0.5 * u, 0.5 * u), lambda: [(_tape(u), "red paint")]),
-        _Item("offcut", (1.3 * u, 0.5 * u), lambda: [(_slab(1.3 * u, 0.5 * u, 0.18 * u), "timber")]),
-        _Item("block", (0.5 * u, 0.4 * u), lambda: [(_slab(0.5 * u, 0.4 * u, 0.3 * u), "concrete")]),
-        _Item("tape", (0.5 * u, 0.5 * u), lambda: [(_tape(u), "grey plastic")]),
+        _slab("offcut", (3.2 * u, 0.5 * u, 0.18 * u), "timber"),
+        _slab("batten", (2.1 * u, 0.26 * u, 0.26 * u), "timber"),
+        _Item("bucket", (0.92 * u, 0.92 * u), [(_bucket(u), "black rubber")]),
+        _slab("box", (0.95 * u, 0.62 * u, 0.4 * u), "cardboard"),
+        _Item("bucket", (0.78 * u, 0.78 * u), [(_bucket(0.85 * u), "blue plastic")]),
+        _Item("hammer", (1.35 * u, 0.42 * u), _hammer(u)),
+        _slab("block", (0.8 * u, 0.4 * u, 0.4 * u), "concrete"),
+        _slab("glove", (0.62 * u, 0.3 * u, 0.1 * u), "orange plastic"),
+        _Item("tape", (0.5 * u, 0.5 * u), [(_tape(u), "red paint")]),
+        _slab("offcut", (1.3 * u, 0.5 * u, 0.18 * u), "timber"),
+        _slab("block", (0.5 * u, 0.4 * u, 0.3 * u), "concrete"),
+        _Item("tape", (0.5 * u, 0.5 * u), [(_tape(u), "grey plastic")]),
     )
 
 
-def _slab(length_m: float, width_m: float, height_m: float) -> Mesh:
-    return box((-length_m / 2, -width_m / 2, 0.0), (length_m / 2, width_m / 2, height_m))
+def _slab(name: str, size_m: Point, material: str) -> _Item:
+    """Return a box of one material."""
+    length_m, width_m, height_m = size_m
+    mesh = box((-length_m / 2, -width_m / 2, 0.0), (length_m / 2, width_m / 2, height_m))
+    return _Item(name, (length_m, width_m), [(mesh, material)])
 
 
 def _bucket(u: float) -> Mesh:

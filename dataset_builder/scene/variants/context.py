@@ -23,22 +23,26 @@ GAP_M = 5e-4
 """Height of props above the ground, metres, so that no two surfaces coincide."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Rect:
     """Axis-aligned rectangle on the ground; ``low_m`` and ``high_m`` are its (x, y) corners, metres."""
 
-    low_m: tuple[float, float]
-    high_m: tuple[float, float]
+    low_m: Float64[ndarray, " 2"]
+    high_m: Float64[ndarray, " 2"]
+
+    @classmethod
+    def of_points(cls, points_m: Float64[ndarray, "n 3"]) -> Rect:
+        """Return the bounding box of points seen from above."""
+        return cls(points_m[:, :2].min(axis=0), points_m[:, :2].max(axis=0))
 
     def distance_m(self, points_m: Float64[ndarray, "k 2"]) -> Float64[ndarray, " k"]:
         """Return the distance of each (x, y) point from the rectangle, metres; 0 inside."""
-        outside = np.maximum(np.array(self.low_m) - points_m, points_m - np.array(self.high_m))
+        outside = np.maximum(self.low_m - points_m, points_m - self.high_m)
         return np.asarray(np.linalg.norm(np.maximum(outside, 0.0), axis=1))
 
     def expanded(self, by_m: float) -> Rect:
         """Return the rectangle with every side moved outwards by ``by_m``."""
-        (x0, y0), (x1, y1) = self.low_m, self.high_m
-        return Rect((x0 - by_m, y0 - by_m), (x1 + by_m, y1 + by_m))
+        return Rect(self.low_m - by_m, self.high_m + by_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,14 +66,14 @@ class PlacementContext:
         """Return the context of an assembly; the markers of the board are occupied."""
         vertices_m = assembly.vertices_m
         markers = marker_corners_m(spec.board).values() if spec.board else ()
-        occupied = tuple(_footprint(corners_m) for corners_m in markers)
+        occupied = tuple(map(Rect.of_points, markers))
         low_m, high_m = vertices_m.min(axis=0), vertices_m.max(axis=0)
         is_generated = isinstance(spec.assembly, GeneratedCageSpec)
         return cls(with_axis(assembly.bars), low_m, high_m, occupied, spec.seed, spec.environment, is_generated)
 
     def with_parts(self, parts: tuple[Part, ...]) -> PlacementContext:
         """Return the context in which the footprints of ``parts`` are occupied too."""
-        return replace(self, occupied=(*self.occupied, *(_footprint(part.mesh.vertices_m) for part in parts)))
+        return replace(self, occupied=(*self.occupied, *(Rect.of_points(part.mesh.vertices_m) for part in parts)))
 
     def rng(self, purpose: str) -> np.random.Generator:
         """Return a random generator that depends only on the seed of the scene and on ``purpose``."""
@@ -84,7 +88,7 @@ class PlacementContext:
     @property
     def footprint(self) -> Rect:
         """Bounding box of the steel seen from above."""
-        return Rect(_xy(self.low_m), _xy(self.high_m))
+        return Rect(self.low_m[:2], self.high_m[:2])
 
     @property
     def middle_m(self) -> Float64[ndarray, " 3"]:
@@ -110,11 +114,3 @@ class PlacementContext:
     def thickest_m(self) -> float:
         """Largest bar diameter."""
         return max((bar.diameter_m for bar in self.bars), default=0.0)
-
-
-def _footprint(points_m: Float64[ndarray, "n 3"]) -> Rect:
-    return Rect(_xy(points_m.min(axis=0)), _xy(points_m.max(axis=0)))
-
-
-def _xy(point_m: Float64[ndarray, " 3"]) -> tuple[float, float]:
-    return float(point_m[0]), float(point_m[1])

@@ -216,8 +216,7 @@ def _cover_m(context: PlacementContext) -> float:
 
 def _overhang_m(inner: Rect, outer: Rect) -> float:
     """Return how far ``outer`` extends beyond ``inner`` on any side, metres."""
-    below = max(a - b for a, b in zip(inner.low_m, outer.low_m, strict=True))
-    return max(below, *(b - a for a, b in zip(inner.high_m, outer.high_m, strict=True)))
+    return float(max((inner.low_m - outer.low_m).max(), (outer.high_m - inner.high_m).max()))
 
 
 def _top_at_face_m(context: PlacementContext, side: int) -> float:

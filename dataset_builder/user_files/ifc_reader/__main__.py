@@ -1,6 +1,6 @@
 """Process that reads an IFC file: a line of JSON and the content on standard input, answer on standard output.
 
-The line is a list of the tables that select objects (``specs.selection.TABLES``), the answer a list of records
+The line is a list of the tables that select objects (``specs.file_specs.TABLES``), the answer a list of records
 (``user_files.ifc_records``).
 
 ``python -m dataset_builder.user_files.ifc_reader PARENT_PID MEMORY_BYTES CPU_SECONDS WALL_SECONDS``
@@ -13,7 +13,7 @@ import sys
 from collections.abc import Sequence
 from typing import IO
 
-from dataset_builder.specs.selection import TABLES, Selection
+from dataset_builder.specs.file_specs import TABLES, Selection
 from dataset_builder.user_files.ifc_records import MAX_MESSAGE, EndRecord, FailureRecord, write_record
 from rebar_depth_bench.errors import MeshError, exception_summary, printable
 from rebar_depth_bench.limits import limit_process

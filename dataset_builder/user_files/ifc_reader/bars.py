@@ -27,7 +27,7 @@ from numpy import ndarray
 
 from dataset_builder.scene.model import MAX_BARS
 from dataset_builder.scene.shapes.bending import bent_line_m, without_repeats
-from dataset_builder.specs.selection import Selection
+from dataset_builder.specs.file_specs import Selection
 from dataset_builder.user_files.ifc_reader.bodies import (
     axis_placement,
     body_items,

@@ -15,7 +15,7 @@ from textwrap import shorten
 
 from ifcopenshell.util.unit import get_prefix_multiplier
 
-from dataset_builder.specs.selection import Selection
+from dataset_builder.specs.file_specs import Selection
 from dataset_builder.user_files.ifc_reader.ifc_model import Entity, Model
 from dataset_builder.user_files.ifc_records import LeftOutRecord, Source
 from rebar_depth_bench.errors import MeshError, escape_text

@@ -24,6 +24,7 @@ from dataset_builder.cameras.rigs import rig_cameras
 from dataset_builder.cameras.steel_distance import Cylinders
 from dataset_builder.cameras.trajectories import poses
 from dataset_builder.scene.mesh_ply import write_mesh_ply
+from dataset_builder.scene.model import WorldMesh
 from dataset_builder.specs.config_specs import DomeSpec, RandomViewsSpec, RingSpec
 from dataset_builder.specs.manifest_specs import rig_spec, trajectory_spec
 from rebar_depth_bench.data.bars import Bar
@@ -202,7 +203,8 @@ def test_wrong_view_indices_are_reported() -> None:
 def test_aim_point_is_centre_of_steel_only(tmp_path: Path) -> None:
     vertices_m = np.array([[0.1, 0, 0], [0.3, 0, 0.2], [0.1, 0.4, 0], [9, 9, 9], [-9, 9, 0], [0, 1, 1]])
     mesh = tmp_path / "m.ply"
-    write_mesh_ply(mesh, vertices_m, np.array([[0, 1, 2], [3, 4, 5]]), np.array([4, 0]))
+    faces = np.array([[0, 1, 2], [3, 4, 5]], np.int32)
+    write_mesh_ply(mesh, WorldMesh(vertices_m, faces, np.array([4, 0], np.uint16)))
     assert mesh_aim_point_m(mesh).tolist() == [0.2, 0.2, 0.1]
     assert checked_aim_point_m(manifest_config(), mesh)[0].tolist() == [0.2, 0.2, 0.1]
     aim_m, problems = checked_aim_point_m(manifest_config(aim_point_m=[0.2, 0.2, 0.101]), mesh)
@@ -214,6 +216,6 @@ def test_aim_point_is_centre_of_steel_only(tmp_path: Path) -> None:
 
 def test_mesh_without_steel_is_rejected(tmp_path: Path) -> None:
     mesh = tmp_path / "m.ply"
-    write_mesh_ply(mesh, np.eye(3), np.array([[0, 1, 2]]), np.array([0]))
+    write_mesh_ply(mesh, WorldMesh(np.eye(3), np.array([[0, 1, 2]], np.int32), np.zeros(1, np.uint16)))
     with pytest.raises(DatasetError, match="contains no steel"):
         mesh_aim_point_m(mesh)

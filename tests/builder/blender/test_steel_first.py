@@ -18,8 +18,7 @@ from numpy import ndarray
 from dataset_builder.cameras.rigs import rig_cameras, zed_rig
 from dataset_builder.cameras.trajectories import look_at_with_rig
 from dataset_builder.scene.assemblies.lattice import lattice_assembly
-from dataset_builder.scene.raycast import RayCaster
-from dataset_builder.scene.steel_box import PixelBox, steel_box
+from dataset_builder.scene.raycast import PixelBox, RayCaster, steel_box
 from dataset_builder.specs.config_specs import ColourSpec, LatticeSpec, SceneSpec
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import Camera, ideal_K

@@ -23,7 +23,7 @@ from dataset_builder.scene.assemblies.bar_meshes import MAX_RIBS_PER_ROW
 from dataset_builder.scene.assemblies.cage import CageBar
 from dataset_builder.scene.assemblies.lattice import lattice_assembly
 from dataset_builder.scene.mesh_ply import write_mesh_ply
-from dataset_builder.scene.model import Assembly
+from dataset_builder.scene.model import Assembly, WorldMesh
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
 from dataset_builder.specs.config_specs import DomeSpec, LatticeSpec, RingSpec
 from dataset_builder.specs.file_specs import CageFileSpec, MeshFileSpec
@@ -185,7 +185,8 @@ def test_mesh_and_ifc_paths_are_relative_to_scene_file(tmp_path: Path) -> None:
     (tmp_path / "parts").mkdir()
     part = load_cage_text(tmp_path, MM + BAR).parts[0]
     faces = part.mesh.faces
-    write_mesh_ply(tmp_path / "parts/a.ply", part.mesh.vertices_m * 1000, faces, np.full(len(faces), 4))
+    bar_id = np.full(len(faces), 4, np.uint16)
+    write_mesh_ply(tmp_path / "parts/a.ply", WorldMesh(part.mesh.vertices_m * 1000, faces, bar_id))
     config = scene_config(write_scene(tmp_path, MM + 'mesh = "parts/a.ply"\n'))
     assert isinstance(config.scene.assembly, MeshFileSpec)
     assert make_assembly(config.scene.assembly).bars[0].diameter_m == pytest.approx(0.01, rel=0.01)

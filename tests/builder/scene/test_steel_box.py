@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import array_shapes, arrays
 from numpy import ndarray
 
-from dataset_builder.scene.steel_box import steel_box
+from dataset_builder.scene.raycast import steel_box
 
 
 @given(arrays(bool, array_shapes(min_dims=2, max_dims=2, max_side=12)), st.integers(0, 4))

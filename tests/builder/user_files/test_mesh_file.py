@@ -13,7 +13,7 @@ import trimesh
 
 from dataset_builder.scene.assemblies.lattice import lattice_assembly
 from dataset_builder.scene.mesh_ply import write_mesh_ply
-from dataset_builder.scene.model import Assembly
+from dataset_builder.scene.model import Assembly, WorldMesh
 from dataset_builder.specs.config_specs import LatticeSpec
 from dataset_builder.user_files.cage_file import load_cage, mesh_file_spec, read_cage
 from rebar_depth_bench.errors import MeshError
@@ -65,7 +65,7 @@ def test_lattice_round_trips_through_every_format(tmp_path: Path, suffix: str) -
     whole, path = concatenate_meshes(bodies), tmp_path / f"a{suffix}"
     if suffix == ".ply":
         bar_id = np.repeat(range(1, 13), [len(body.faces) for body in bodies])
-        write_mesh_ply(path, whole.vertices, whole.faces, bar_id)
+        write_mesh_ply(path, WorldMesh(whole.vertices, whole.faces, bar_id))
     else:
         path.write_bytes(obj_bytes(bodies, names) if suffix == ".obj" else trimesh.exchange.stl.export_stl(whole))
 
@@ -93,14 +93,14 @@ def test_dataset_ply_keeps_bar_ids_and_skips_board(tmp_path: Path) -> None:
     bodies = (RODS[0], trimesh.creation.box((2, 2, 0.01)), inside_out)
     whole = concatenate_meshes(bodies)
     bar_id = np.repeat([40_000, 0, 7], [len(body.faces) for body in bodies])
-    write_mesh_ply(tmp_path / "a.ply", whole.vertices, whole.faces, bar_id)
+    write_mesh_ply(tmp_path / "a.ply", WorldMesh(whole.vertices, whole.faces, bar_id))
     parts = load_cage(mesh_file_spec(tmp_path / "a.ply", "m")).parts
     assert [(part.bar_id, part.name) for part in parts] == [(7, "imported-007"), (40_000, "imported-40000")]
     np.testing.assert_array_equal(parts[0].mesh.faces, inside_out.faces)
     np.testing.assert_array_equal(parts[1].mesh.vertices_m, RODS[0].vertices)
     in_feet = load_cage(mesh_file_spec(tmp_path / "a.ply", "ft")).parts[1].mesh.vertices_m
     np.testing.assert_array_equal(in_feet, RODS[0].vertices * 0.3048)
-    write_mesh_ply(tmp_path / "a.ply", whole.vertices, whole.faces, bar_id * 0)
+    write_mesh_ply(tmp_path / "a.ply", WorldMesh(whole.vertices, whole.faces, bar_id * 0))
     with pytest.raises(MeshError, match="every face has bar_id 0"):
         load_cage(mesh_file_spec(tmp_path / "a.ply", "m"))
     with pytest.raises(MeshError, match=f"^{tmp_path}/b.ply: truncated or damaged"):
@@ -108,7 +108,8 @@ def test_dataset_ply_keeps_bar_ids_and_skips_board(tmp_path: Path) -> None:
 
 
 def test_huge_coordinates_are_refused_without_warnings(tmp_path: Path) -> None:
-    write_mesh_ply(tmp_path / "a.ply", RODS[0].vertices * 1e234, RODS[0].faces, np.ones(len(RODS[0].faces), int))
+    huge = WorldMesh(RODS[0].vertices * 1e234, RODS[0].faces, np.ones(len(RODS[0].faces), np.uint16))
+    write_mesh_ply(tmp_path / "a.ply", huge)
     with warnings.catch_warnings(action="error"), pytest.raises(MeshError, match=r"extends 5e\+233 m"):
         load_cage(mesh_file_spec(tmp_path / "a.ply", "m"))
 
