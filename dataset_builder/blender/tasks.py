@@ -1,4 +1,4 @@
-"""Tasks of the Blender process: rendering of the views of one shard, and Cycles depth of a mesh file.
+"""Tasks of the Blender process: views of a work unit, Cycles depth of a mesh file, and the list of devices.
 
 Colour is rendered by Cycles; ground truth is ray cast against the meshes that Cycles renders. Cycles' planar depth
 is an independent check of the ground truth.
@@ -136,8 +136,7 @@ def _stage_mesh(mesh: WorldMesh, path: Path, expected_sha256: str | None) -> Non
     actual = file_sha256(own_path)
     if expected not in (None, actual):
         raise BuildError(
-            f"{own_path}: the scene's mesh has sha256 {actual}, expected {expected} as for the "
-            "config's other views"
+            f"{own_path}: the scene's mesh has sha256 {actual}, expected {expected} as for the scene's other views"
         )
     own_path.replace(path)
 

@@ -1,7 +1,8 @@
 """Placement of the cameras of surveys and of random views of steel. World frame, metres.
 
-Random points of the steel's surface are tried, each with a random direction towards the camera. A view is
-acceptable if both eyes are clear of steel, see the point, and have little steel near to them (``ViewRules``).
+Random points of the steel's surface are tried, each with a random direction near the normal there. A view is
+acceptable if both eyes are clear of steel, see the point, and have little steel near to them (``ViewRules``). A
+survey keeps the acceptable views that are farthest apart.
 """
 
 from __future__ import annotations

@@ -37,7 +37,7 @@ _DEFAULT_SHARE = 0.3
 """Probabilities of the default light, and of the default steel; the variants share the rest equally."""
 FORMWORK = "formwork"
 _PROPS: Mapping[str, float] = {"clutter": 0.25, FORMWORK: 0.25, "spacers": 0.3, "tie-wire": 0.5}
-"""Probability of each variant of things on and round the steel."""
+"""Probability of each variant of props on and round the steel."""
 _SENSOR_SHARE = 0.3
 """Probability of the variant of the camera's sensor."""
 
@@ -54,7 +54,7 @@ class CagesRequest:
 def cage_scenes(
     request: CagesRequest, seed: int, width: int, height: int, colour: ColourSpec | None
 ) -> list[SceneConfigSpec]:
-    """Return the scenes of a request, without the stations of their cameras (``pipeline.place_cameras``).
+    """Return the scenes of a request, without the stations of their cameras (``pipeline.plan.place_cameras``).
 
     ``seed`` is that of cages, surroundings and cameras.
     """

@@ -1,4 +1,4 @@
-"""Blender subprocesses: the tasks they run, the events they report, and the rendering of work units in them.
+"""Blender subprocesses: their tasks and events, the rendering of work units in them, and the choice of a device.
 
 A task is pickled to the standard input of the process. The input then stays open, and the process exits when it is
 closed, so that no render outlives its parent. Events are JSON lines on the standard output of the process. The

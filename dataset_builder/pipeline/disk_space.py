@@ -1,4 +1,4 @@
-"""Sizes of a build: views, disk space and memory, and the refusal of one that does not fit or could not be read.
+"""Sizes of a build: views, disk space and memory. Refused: what does not fit, or is too large for its readers.
 
 While a config is built, its rows are staged and then packed into shards beside them. Staged rows and replaced
 files are deleted when it has been published; their space is not counted on. The scratch folders of the workers of

@@ -1,4 +1,4 @@
-"""Files and folders of a dataset folder that a build owns: their names, checks for links, and removal.
+"""Files and folders of a dataset folder that a build owns: names, links, removal, the lock, old manifests.
 
 A build may continue in a folder from another machine. It writes and deletes nothing outside the folder: folders
 that it changes are no links, and it deletes regular files whose names are its own, but no others.

@@ -1,4 +1,7 @@
-"""Build plan of a config, and its key: the digest of all parameters that determine the bytes of its views."""
+"""Build plan of a scene of a config: its views, the places of its cameras, and its key.
+
+The key is the digest of all parameters that determine the bytes of the views.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Publishing of staged configs into the dataset folder, and the lock that allows one build per folder.
+"""Publishing of staged configs into the dataset folder.
 
 Files are written in an order that can be repaired after an interruption at any point: first the shards, whose
 names contain the digest of their content; then meshes and contact sheets; then the strip, bars, crossings and the

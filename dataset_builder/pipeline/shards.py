@@ -1,9 +1,9 @@
 """Encoding of rendered views as dataset rows, their staging, and their packing into shards.
 
-A build works in a staging folder named by the digest of everything that determines its bytes. Each view is staged
-as a one-row Parquet file that contains its manifest record in the metadata; files are created by a rename, so an
-existing file is complete. A shard consists of the staged rows of a fixed range of views, so its bytes do not
-depend on the number of workers or attempts.
+A scene is built in a staging folder named by its key (``plan``). Each view is staged as a one-row Parquet file
+that contains its manifest record in the metadata; files are created by a rename, so an existing file is complete.
+A shard consists of the staged rows of a fixed range of views, so its bytes do not depend on the number of workers
+or attempts.
 """
 
 from __future__ import annotations

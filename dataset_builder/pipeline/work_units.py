@@ -6,7 +6,7 @@ that are not staged yet. Its result is a ``UnitResult``. A unit rendered on this
 staging folder, view by view, and its result contains no files; the result of a unit rendered elsewhere contains
 the requested ones. In both cases ``accept_result`` checks the result before it is used.
 
-The ground truth of all rows of a config is cast against the same mesh. The digest of the mesh is stored with the
+The ground truth of all rows of a scene is cast against the same mesh. The digest of the mesh is stored with the
 first result; the mesh itself, tens of megabytes, is returned only by the one unit that has ``with_mesh`` set.
 """
 
@@ -123,7 +123,7 @@ def _problems(
     if known_mesh_sha256 not in (None, result.mesh_sha256):
         yield (
             f"its mesh has sha256 {result.mesh_sha256}, expected "
-            f"{known_mesh_sha256} as for the config's other views"
+            f"{known_mesh_sha256} as for the scene's other views"
         )
     requested = {path.relative_to(staging.root).as_posix(): path for path in unit.files(staging)}
     for file in result.files:

@@ -1,4 +1,4 @@
-"""Specs of a scene from its entry in the manifest, which ``dataclasses.asdict`` has made of them."""
+"""Specs of a scene, read from its entry in the manifest; ``dataclasses.asdict`` writes them there."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Cages from users' files: scene TOML, mesh and IFC."""
+"""Cages from users' files (scene TOML, mesh and IFC), and ``make_assembly`` for all kinds of steel."""

@@ -1,7 +1,8 @@
 """Records of the answer of the process that reads an IFC file: lines of JSON, each followed by its arrays.
 
 An answer begins with a ``ProjectRecord`` and ends with an ``EndRecord`` or a ``FailureRecord``. ``ifc_reader``
-writes it, and ``user_files.ifc_file`` reads it, as data of a stranger: the writer has read a file from outside.
+writes it, and ``user_files.ifc_file`` reads it, as untrusted data, since the writer has read a
+file from outside.
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ PICTURE_KINDS: Mapping[str, PictureKind] = {
     "mask": PictureKind(("PNG",), ("1", "L"), "1", np.bool_),
     "bars": PictureKind(("PNG",), ("I;16", "I", "L"), "I;16", np.uint16),
 }
-"""Images by the kind of their column (see ``columns.column_kind``)."""
+"""Images by the kind of their column (see ``schema.column_kind``)."""
 
 
 class Picture(Image.Image):

@@ -26,7 +26,7 @@ from rebar_depth_bench.geometry.cameras import Camera
 from rebar_depth_bench.validation import short_repr
 
 CAMERA_KINDS = ("K", "distortion", "cam_from_world")
-"""Kinds of the dataset's columns that describe a camera (see ``columns.column_kind``)."""
+"""Kinds of the dataset's columns that describe a camera (see ``schema.column_kind``)."""
 _CAMERA_SHAPES = dict(zip(CAMERA_KINDS, ((3, 3), (5,), (4, 4)), strict=True))
 _MAX_ROTATION_ERROR = 1e-6
 """Largest deviation of a rotation times its transpose from the identity matrix."""

@@ -13,7 +13,7 @@ from rebar_depth_bench.geometry.aruco_board import BoardSpec
 
 
 class Views(Protocol):
-    """Views of one image size. A row has the columns of a dataset (``columns.COLUMNS``), decoded."""
+    """Views of one image size. A row has the columns of a dataset (``schema.COLUMNS``), decoded."""
 
     @property
     def config(self) -> str:

@@ -70,7 +70,7 @@ class ViewDetections:
 class DetectionTable:
     """Numbers of one config, or of all together.
 
-    ``numbers`` are those of ``table_numbers``, ``intervals`` their 95 % intervals (None where unknown), and
+    ``numbers`` are those of ``tabulate_detections``, ``intervals`` their 95 % intervals (None where unknown), and
     ``curves`` the points (recall, precision) by limit in mm. ``counts`` are sums over the views.
     """
 

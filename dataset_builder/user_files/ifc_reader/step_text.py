@@ -1,7 +1,8 @@
 """Text of a STEP file (ISO 10303-21): schema name, instances, and the arguments of an instance.
 
-All patterns are possessive: a damaged text takes linear time and no recursion. The syntax of instances is
-checked for the whole file, since a lost quote or semicolon hides the instances that follow it.
+All patterns have possessive quantifiers, which never backtrack: a damaged text takes linear time and no recursion.
+The syntax of instances is checked for the whole file, since a lost quote or semicolon hides the instances that
+follow it.
 """
 
 from __future__ import annotations
