@@ -64,6 +64,7 @@ def test_options_of_a_command_load_no_other_command() -> None:
     modules = modules_after("from dataset_builder.cli.main import argument_parser; argument_parser(['export'])")
     assert {name for name in modules if name.startswith("dataset_builder")} == {
         "dataset_builder",
+        "dataset_builder.cli",
         "dataset_builder.cli.main",
     }
     assert not modules & {"numpy", "pyarrow"}

@@ -7,7 +7,7 @@ from pathlib import Path
 from rebar_depth_bench.geometry.calibration import read_calibration
 from rebar_depth_bench.geometry.stereo_calibration import StereoCalibration
 
-SHIPPED_CALIBRATION = Path(__file__).parents[3] / "dataset_builder" / "config" / "calibrations" / "zed-hd720.conf"
+SHIPPED_CALIBRATION = Path(__file__).parents[3] / "dataset_builder" / "cameras" / "calibrations" / "zed-hd720.conf"
 
 
 CONF = """\

@@ -159,7 +159,7 @@ import resource, sys, numpy as np
 resource.setrlimit(resource.RLIMIT_AS, (2 << 30, 2 << 30))
 from pathlib import Path
 from {package}.test_hostile import _mutate
-from rebar_depth_bench.submission.maps import FORMATS
+from rebar_depth_bench.submission.entries import FORMATS
 from rebar_depth_bench.submission import EntryError
 random, outcomes = np.random.default_rng(7), dict()
 for path in sorted(Path(sys.argv[1]).iterdir()):
