@@ -25,6 +25,7 @@ import rerun.blueprint as rrb
 from jaxtyping import UInt8
 from numpy import ndarray
 
+from rebar_depth_bench.atomic_io import write_output
 from rebar_depth_bench.console import print_notice, run_command
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars, with_axis
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
@@ -40,7 +41,6 @@ from rebar_depth_bench.data.shards import rows_at
 from rebar_depth_bench.errors import InputError, SubmissionError, escape_text, printable
 from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid, transform
 from rebar_depth_bench.names import config_of
-from rebar_depth_bench.outputs import write_output
 from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.metrics import is_valid_prediction, median, median_scale
 from rebar_depth_bench.scoring.protocol import scored_pixels

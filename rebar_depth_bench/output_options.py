@@ -8,8 +8,14 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
+from rebar_depth_bench.atomic_io import (
+    STANDARD_OUTPUT,
+    is_standard_output,
+    is_stream,
+    link_target,
+    open_descriptor,
+)
 from rebar_depth_bench.errors import InputError, OutputError
-from rebar_depth_bench.outputs import STANDARD_OUTPUT, is_standard_output, is_stream, link_target, open_descriptor
 
 OUTPUT_OPTIONS = ("out", "json", "csv", "html", "latex", "groups_csv", "extended_csv", "figure", "picture")
 """Names (argparse dest) of the options that are output paths."""

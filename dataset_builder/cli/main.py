@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rebar_depth_bench import software_version
+from rebar_depth_bench.atomic_io import write_output
 from rebar_depth_bench.console import ProgressBars, print_notice, run_command
 from rebar_depth_bench.errors import InputError, escape_text
 from rebar_depth_bench.names import PATH_PATTERN, SPLITS
 from rebar_depth_bench.output_options import add_output_file, check_outputs, prints_table
-from rebar_depth_bench.outputs import write_output
 from rebar_depth_bench.terminal import use_plain_characters
 
 BUILD = "build"

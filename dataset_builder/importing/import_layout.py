@@ -46,7 +46,6 @@ from typing import Annotated, Any
 from pydantic import Strict, model_validator
 
 from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.key_lines import with_lines
 from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.reading import is_below, parse_toml, read_file
 from rebar_depth_bench.validation import (
@@ -59,6 +58,7 @@ from rebar_depth_bench.validation import (
     text,
     validate_table,
     whole_number,
+    with_lines,
 )
 
 VIEW = "{view}"

@@ -43,7 +43,6 @@ from rebar_depth_bench.geometry.calibration_documents import DOCUMENT_SUFFIXES, 
 from rebar_depth_bench.geometry.calibration_programs import program_calibration
 from rebar_depth_bench.geometry.calibration_toml import table_calibration
 from rebar_depth_bench.geometry.stereo_calibration import Calibration, StereoCalibration
-from rebar_depth_bench.key_lines import with_lines
 from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.names import NAME_LETTERS, NAME_PATTERN
 from rebar_depth_bench.reading import parse_toml, read_file
@@ -57,6 +56,7 @@ from rebar_depth_bench.validation import (
     one_of,
     text,
     validate_table,
+    with_lines,
 )
 
 CAMERAS_FILE = "cameras.toml"

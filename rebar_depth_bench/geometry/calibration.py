@@ -17,9 +17,9 @@ from rebar_depth_bench.geometry.stereo_calibration import (
     check_invertible,
     scale_calibration,
 )
-from rebar_depth_bench.key_lines import with_lines
 from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.reading import parse_toml, read_file
+from rebar_depth_bench.validation import with_lines
 
 _AnyCalibration = TypeVar("_AnyCalibration", StereoCalibration, MonoCalibration, Calibration)
 Parser = Callable[[bytes, int, int, list[Problem]], StereoCalibration | None]

@@ -20,7 +20,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from rebar_depth_bench import software_version
-from rebar_depth_bench.atomic_io import NO_SPACE, scratch_folder, write_error
+from rebar_depth_bench.atomic_io import NO_SPACE, is_stream, link_target, scratch_folder, write_error
 from rebar_depth_bench.console import print_notice
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.data.views import Views
@@ -30,7 +30,6 @@ from rebar_depth_bench.methods.base import input_class
 from rebar_depth_bench.methods.kept_views import KeptViews, PreparationReport
 from rebar_depth_bench.methods.raw_images import rectifying_predictor
 from rebar_depth_bench.names import TEST_SPLIT
-from rebar_depth_bench.outputs import is_stream, link_target
 from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.submission import SubmissionWriter
 

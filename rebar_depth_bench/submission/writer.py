@@ -15,9 +15,9 @@ from typing import BinaryIO, Self
 
 import numpy as np
 
+from rebar_depth_bench.atomic_io import output_file
 from rebar_depth_bench.errors import InputError, Problem, escape_text
 from rebar_depth_bench.names import VIEW_ID_PATTERN
-from rebar_depth_bench.outputs import output_file
 from rebar_depth_bench.submission.declaration import METADATA_NAME, SubmissionMeta
 from rebar_depth_bench.submission.maps import Depth
 from rebar_depth_bench.validation import validate_table

@@ -7,7 +7,7 @@ import time
 import pytest
 
 from rebar_depth_bench.errors import Problem
-from rebar_depth_bench.key_lines import with_lines
+from rebar_depth_bench.validation import with_lines
 
 TOML = '''\
 # left.fx = 1, and [right]

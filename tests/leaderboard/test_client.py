@@ -13,8 +13,7 @@ from typing import Any
 import pytest
 
 from rebar_depth_bench.errors import InputError, SubmissionError
-from rebar_depth_bench.leaderboard_answers import ServiceError
-from rebar_depth_bench.leaderboard_client import LeaderboardClient
+from rebar_depth_bench.leaderboard_client import LeaderboardClient, ServiceError
 from tests.leaderboard.conftest import SharedServer, WriteArchive
 from tests.leaderboard.serving import RunServer, Server
 

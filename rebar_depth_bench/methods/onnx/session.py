@@ -15,9 +15,8 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from rebar_depth_bench.deadline import DeadlineError, call_within
 from rebar_depth_bench.errors import MethodError, Problem
-from rebar_depth_bench.limits import ONNX_MEMORY_BYTES
+from rebar_depth_bench.limits import ONNX_MEMORY_BYTES, DeadlineError, call_within
 from rebar_depth_bench.methods.onnx.spec import InputSpec, OutputSpec
 
 PROVIDERS = ("CUDAExecutionProvider", "CPUExecutionProvider")
