@@ -1,7 +1,7 @@
 """Limits on the size, time and memory of files and answers from outside.
 
 Each limit has a default, which an environment variable ``REBAR_MAX_<NAME>`` replaces. ``SECURITY.md`` lists them.
-``limit_process`` limits a process that reads what may crash, hang or need any amount of memory; ``call_until`` limits
+``limit_process`` limits a process that reads what may crash, hang or need any amount of memory, and ``call_until``
 the time of a call.
 """
 

@@ -11,14 +11,17 @@ import numpy as np
 
 from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.diagnosis.corrections import (
+    COLUMNS,
     Correction,
+    DiagnosedView,
     Errors,
+    diagnosed_view,
     logarithm_corrections,
+    positions_to_read,
     shape_corrections,
     unit_corrections,
     valid_share,
 )
-from rebar_depth_bench.diagnosis.views import COLUMNS, DiagnosedView, diagnosed_view, positions_to_read
 from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.submission import SubmissionReader
 

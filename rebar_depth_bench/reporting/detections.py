@@ -7,8 +7,8 @@ from functools import partial
 
 from rebar_depth_bench import software_version
 from rebar_depth_bench.bar_crossings.definition import CROSSINGS_PROTOCOL
-from rebar_depth_bench.detections.matching import MATCH_M
 from rebar_depth_bench.detections.result import AVERAGE_PRECISION_MM, DetectionResult, DetectionTable
+from rebar_depth_bench.detections.score import MATCH_M
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.charts.lines import HEIGHT, LEFT, RIGHT, TOP, ChartText, LinearAxis, Series, chart

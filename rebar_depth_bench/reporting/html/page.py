@@ -16,8 +16,8 @@ from pathlib import Path
 from markupsafe import Markup
 
 from rebar_depth_bench.atomic_io import write_output
+from rebar_depth_bench.diagnosis.corrections import COLUMNS, diagnosed_view, positions_to_read
 from rebar_depth_bench.diagnosis.diagnose import PossibleMistake, diagnose_config
-from rebar_depth_bench.diagnosis.views import COLUMNS, diagnosed_view, positions_to_read
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.names import config_of
 from rebar_depth_bench.reporting import formatting

@@ -10,8 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy import ndarray
 
-from rebar_depth_bench.detections.average_precision import RankedDetections
-from rebar_depth_bench.detections.matching import excused, greedy_matches, matched_pairs
+from rebar_depth_bench.detections.result import RankedDetections
+from rebar_depth_bench.detections.score import excused, greedy_matches, matched_pairs
 from rebar_depth_bench.scoring.bootstrap import resample
 
 SEEDS = st.integers(0, 2**32 - 1)

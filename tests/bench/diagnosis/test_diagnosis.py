@@ -17,22 +17,20 @@ from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import iterate_rows
 from rebar_depth_bench.diagnosis.corrections import (
+    COLUMNS,
+    MAX_VIEWS,
     UNITS,
+    DiagnosedView,
+    Pixels,
     best_shift,
+    diagnosed_view,
     line_error,
     mean_error,
     median_ratio,
+    positions_to_read,
     resistant_line,
 )
 from rebar_depth_bench.diagnosis.diagnose import diagnose
-from rebar_depth_bench.diagnosis.views import (
-    COLUMNS,
-    MAX_VIEWS,
-    DiagnosedView,
-    Pixels,
-    diagnosed_view,
-    positions_to_read,
-)
 from rebar_depth_bench.methods import own_methods
 from rebar_depth_bench.methods.runner import predict
 from rebar_depth_bench.scoring.evaluation import open_evaluation, read_views
