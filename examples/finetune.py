@@ -45,7 +45,7 @@ from torch.nn import functional
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.atomic_io import atomic_replace, write_text
-from rebar_depth_bench.console import ProgressBars, duration_text, print_notice, run_command
+from rebar_depth_bench.console import run_command
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import check_columns
 from rebar_depth_bench.errors import InputError
@@ -53,6 +53,7 @@ from rebar_depth_bench.methods import find_method
 from rebar_depth_bench.methods.runner import predict
 from rebar_depth_bench.reporting.formatting import scaled_constants
 from rebar_depth_bench.scoring.columns import COVERAGE, NATIVE, RANK_ERROR, SCALED, number, texts
+from rebar_depth_bench.terminal import ProgressBars, duration_text, print_notice
 
 CONFIG = "cages"
 TARGETS = ((CONFIG, "validation"), ("lattice", "test"), ("pile", "test"))

@@ -1,136 +1,40 @@
-"""Command-line basics of all programs: progress, exit codes, and shared options."""
+"""Command lines of all programs: commands, exit codes, shared options, and the check of output files."""
 
 from __future__ import annotations
 
 import argparse
 import os
+import re
 import sys
-import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
-from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
 
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
-from rich.progress import TimeRemainingColumn as Remaining
-
-from rebar_depth_bench.atomic_io import WRITE_ERRORS
-from rebar_depth_bench.errors import InputError, RebarDepthError, printable, terminal_text
+from rebar_depth_bench.atomic_io import (
+    STANDARD_OUTPUT,
+    WRITE_ERRORS,
+    is_standard_output,
+    is_stream,
+    link_target,
+    open_descriptor,
+)
+from rebar_depth_bench.errors import InputError, OutputError, RebarDepthError
 from rebar_depth_bench.reading import parse_number
+from rebar_depth_bench.terminal import print_notice
+
+if TYPE_CHECKING:
+    from rebar_depth_bench.data.manifest import DatasetFolder
 
 EXIT_DONE, EXIT_OTHER, EXIT_INPUT = 0, 1, 2
 """Exit codes: success, any other error, invalid input."""
 
-
-MAX_SILENCE_S = 600.0
-"""Longest time between two lines of progress, if there is progress, seconds."""
-
 MAX_SECONDS = 1e6
 """Longest duration that an option accepts, seconds; Python cannot wait for more than some 1e10."""
-
-
-@dataclass(frozen=True)
-class Rate:
-    """Rate of a task for the display: the name of what is counted, and how many of them are one step."""
-
-    unit: str
-    per_step: int
-
-    def text(self, steps: int, remaining: int, seconds: float) -> str:
-        """Return the rate of ``steps`` done in ``seconds``, and the time for the remaining ones."""
-        if steps < 1 or seconds <= 0:
-            return ""
-        per_minute = 60 * steps * self.per_step / seconds
-        return f"{per_minute:.3g} {self.unit}/min, {duration_text(remaining * seconds / steps)} left"
-
-
-def duration_text(seconds: float) -> str:
-    """Return a duration in its two largest units of hours, minutes and seconds."""
-    hours, minutes = divmod(round(seconds / 60), 60)
-    if seconds < 59.5:
-        return f"{seconds:.0f} s"
-    if seconds < 600:
-        return f"{round(seconds) // 60} min {round(seconds) % 60} s"
-    return f"{hours} h {minutes} min" if hours else f"{minutes} min"
-
-
-@dataclass
-class _Started:
-    """State of a task when it was first shown, and the last line printed for it."""
-
-    done: int
-    seconds: float
-    tenth: int = -1
-    printed_s: float = 0.0
-
-
-class ProgressBars:
-    """Progress bars on standard error, one per task; plain lines if standard error is not a terminal.
-
-    With a ``rate`` they show it and the remaining time, from the steps done since a task was first shown.
-    """
-
-    def __init__(self, rate: Rate | None = None) -> None:
-        self._console = Console(stderr=True)
-        self._bars: dict[str, TaskID] = {}
-        self._started: dict[str, _Started] = {}
-        self._rate = rate
-        self._progress = Progress(
-            TextColumn("{task.description}", markup=False),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TextColumn("{task.fields[rate]}") if rate else Remaining(),
-            console=self._console,
-            disable=not self._console.is_terminal,
-        )
-
-    def __enter__(self) -> ProgressBars:
-        self._progress.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self._progress.stop()
-
-    def update(self, name: str, done: int, total: int) -> None:
-        """Show that ``done`` of ``total`` steps of the task ``name`` are finished."""
-        name = printable(name)
-        now = time.monotonic()
-        started = self._started.setdefault(name, _Started(done, now))
-        rate = self._rate.text(done - started.done, total - done, now - started.seconds) if self._rate else ""
-        if not self._console.is_terminal:
-            _print_line(
-                started, now, f"{name}: {done} of {total}{rate and f', {rate}'}", done * 10 // max(total, 1)
-            )
-            return
-        if name not in self._bars:
-            self._bars[name] = self._progress.add_task(name, total=total, rate=rate)
-        self._progress.update(self._bars[name], completed=done, total=total, rate=rate)
-
-
-def _print_line(started: _Started, now: float, line: str, tenth: int) -> None:
-    """Print a line at each tenth of the task, and at least every ten minutes, which keeps log files short."""
-    if tenth != started.tenth or now - started.printed_s >= MAX_SILENCE_S:
-        started.tenth, started.printed_s = tenth, now
-        sys.stderr.write(line + "\n")  # In one call: several threads may write lines.
-        sys.stderr.flush()
-
-
-def require_extra(extra: str, modules: Sequence[str]) -> None:
-    """Raise ``InputError`` if a module of an extra of this distribution is not installed.
-
-    Modules that need the extra are imported only after this check.
-    """
-    missing = [name for name in modules if find_spec(name) is None]
-    if missing:
-        raise InputError(
-            f"not installed: {', '.join(missing)}; expected the {extra} extra: "
-            f"pip install 'rebar-depth-bench[{extra}]'"
-        )
 
 
 @dataclass(frozen=True)
@@ -232,6 +136,134 @@ def positive_number(text: str, expected: str, high: float = sys.float_info.max) 
     return value
 
 
-def print_notice(text: str) -> None:
-    """Print text to standard error; control characters of names in it are shown as escapes."""
-    print(terminal_text(text), file=sys.stderr)
+def add_expect_digest(parser: argparse.ArgumentParser) -> None:
+    """Add the option ``--expect-digest``."""
+    parser.add_argument(
+        "--expect-digest",
+        metavar="DIGEST",
+        help="refuse any other dataset than that with this ground-truth digest (sha256:...)",
+    )
+
+
+def print_verified(
+    folder: DatasetFolder, verified: str = "files and views not read (rebar-bench verify does)"
+) -> None:
+    """Print to standard error which digests of a dataset were verified, in one line."""
+    print_notice(f"dataset {folder.digest} of {folder.root}: manifest consistent; {verified}")
+
+
+# Output files, and the check of all output paths that precedes any work.
+
+OUTPUT_OPTIONS = ("out", "json", "csv", "html", "latex", "groups_csv", "extended_csv", "figure", "picture")
+"""Names (argparse dest) of the options that are output paths."""
+STANDARD_OUTPUT_OPTIONS = ("--json", "--csv")
+"""Options whose file may be ``-``, standard output."""
+INPUT_FILE_OPTIONS = (
+    "archive",
+    "detections",
+    "archives",
+    "first",
+    "others",
+    "method",
+    "token_file",
+    "scene_files",
+)
+"""Names of the options that are files to read; a method may be ``FILE.py:NAME`` or ``FILE.toml``."""
+INPUT_FOLDER_OPTIONS = ("data", "predictions", "kitti", "methods", "reference")
+"""Names of the options that are folders to read, or files or Hub repositories in their place."""
+
+
+def add_output_file(
+    parser: argparse.ArgumentParser,
+    option: str,
+    summary: str,
+    *,
+    metavar: str = "FILE",
+    required: bool = False,
+) -> None:
+    """Add ``option``, the path of a file to write; ``-`` is standard output for ``STANDARD_OUTPUT_OPTIONS``."""
+    may_be_stdout = option in STANDARD_OUTPUT_OPTIONS
+    parser.add_argument(
+        option,
+        type=_output_path_or_stdout if may_be_stdout else _output_path,
+        required=required,
+        metavar=metavar,
+        help=f"{summary}; - is standard output, and no table is printed" if may_be_stdout else summary,
+    )
+
+
+def _output_path_or_stdout(text: str) -> Path:
+    return STANDARD_OUTPUT if text == "-" else Path(text)
+
+
+def _output_path(text: str) -> Path:
+    if text == "-":
+        allowed = " and ".join(STANDARD_OUTPUT_OPTIONS)
+        raise argparse.ArgumentTypeError(
+            f"- is standard output, expected the name of a file: only {allowed} can be -"
+        )
+    return Path(text)
+
+
+def prints_table(options: argparse.Namespace) -> bool:
+    """Return whether a command prints its table: standard output is free of the content of an output."""
+    return not any(map(is_standard_output, _outputs(vars(options)).values()))
+
+
+def check_outputs(options: Mapping[str, object]) -> None:
+    """Check the output paths of a command's ``options``.
+
+    Outputs are the options in ``OUTPUT_OPTIONS``, inputs those in ``INPUT_FILE_OPTIONS`` and
+    ``INPUT_FOLDER_OPTIONS``. Raises ``InputError`` if an output would overwrite an input, another output or a file
+    of an input folder, or is a folder, and ``OutputError`` if it or its folder cannot be written. Several outputs
+    may be the same device, but only one may be a pipe or standard output.
+    """
+    folders = [path for name in INPUT_FOLDER_OPTIONS for path in _paths(options.get(name))]
+    files = [path for name in INPUT_FILE_OPTIONS for path in _paths(options.get(name))]
+    seen: dict[Path, str] = {}
+    for name, output in _outputs(options).items():
+        option, target = f"--{name.replace('_', '-')}", Path(os.path.realpath(output))
+        if target in seen and not target.is_char_device():
+            raise InputError(f"{option} and {seen[target]} both name {output}, expected different files")
+        seen[target] = option
+        for path in (*files, *folders):
+            if path.exists() and target == path.resolve():
+                raise InputError(f"{option} names {output}, which is an input and would be overwritten")
+        for path in folders:
+            if path.is_dir() and name != "out" and path.resolve() in target.parents:
+                raise InputError(
+                    f"{option} names {output}, which is inside {path}: expected a path outside the input"
+                )
+        if is_stream(output):
+            _check_stream(option, output)
+        elif name != "out" or not target.is_dir():
+            _check_writable(option, output, link_target(output).absolute())
+
+
+def _outputs(options: Mapping[str, object]) -> dict[str, Path]:
+    """Return the output paths of a command by the names of their options."""
+    return {name: value for name in OUTPUT_OPTIONS if isinstance(value := options.get(name), Path)}
+
+
+def _check_stream(option: str, output: Path) -> None:
+    descriptor = open_descriptor(output)
+    if descriptor is not None and not Path(f"/dev/fd/{descriptor}").exists():
+        raise InputError(f"{option} names {output}, but descriptor {descriptor} is not open")
+    if descriptor is None and not os.access(output, os.W_OK):
+        raise OutputError(f"{option} names {output}, which cannot be written to")
+
+
+def _check_writable(option: str, output: Path, target: Path) -> None:
+    if target.is_dir():
+        raise InputError(f"{option} names {output}, which is a folder: expected a file to write")
+    ancestor = next(parent for parent in target.parents if parent.exists())
+    if not ancestor.is_dir():
+        raise InputError(f"{option} names {output}, but {ancestor} is a file: expected a folder")
+    if not os.access(ancestor, os.W_OK):
+        raise OutputError(f"{option} names {output}, but {ancestor} cannot be written to")
+
+
+def _paths(value: object) -> list[Path]:
+    """Return the paths of an option: one, several or none; ``FILE.py:NAME`` is a path and the name of a method."""
+    values = value if isinstance(value, list) else [] if value is None else [value]
+    return [Path(re.sub(r"(\.py):\w+$", r"\1", str(item))) for item in values]

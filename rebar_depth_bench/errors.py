@@ -1,4 +1,4 @@
-"""Exception hierarchy of the project, and helpers that format problems for error messages.
+"""Exception hierarchy of the project, text of problems for error messages, and the check for optional packages.
 
 A message names the file or entry, what was found and what was expected, in one line for each problem. An
 ``InputError`` is caused by the user's input (exit status 2); any other ``RebarDepthError`` is caused by this
@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from typing import Literal, Self
 
 MAX_PROBLEMS_SHOWN = 20
@@ -132,8 +133,6 @@ def problem_summary(problems: Sequence[Problem | str]) -> str:
 
 
 _MAX_TEXT_CHARACTERS = 120
-_MAX_LINES = 100
-_MAX_LINE_CHARACTERS = 2000
 
 
 def escape_text(text: str) -> str:
@@ -151,21 +150,6 @@ def printable(text: str, limit: int = 200) -> str:
     return clean if len(clean) <= limit else clean[: limit - 1] + "…"
 
 
-def terminal_text(message: str) -> str:
-    """Return a message of several lines for a terminal: escape sequences are shown, long lines truncated.
-
-    Messages quote files and servers, whose control characters could otherwise change what a terminal displays.
-    """
-    lines = message.split("\n")
-    shown = [line if line.isprintable() else _escape_controls(line) for line in lines[:_MAX_LINES]]
-    shown = [line if len(line) <= _MAX_LINE_CHARACTERS else f"{line[:_MAX_LINE_CHARACTERS]}..." for line in shown]
-    return "\n".join([*shown, *(["..."] if len(lines) > _MAX_LINES else [])])
-
-
-def _escape_controls(line: str) -> str:
-    return "".join(char if char.isprintable() else ascii(char)[1:-1] for char in line)
-
-
 def exception_summary(error: Exception) -> str:
     """Return the type of an exception and the first line of its message."""
     first_line = (str(error).strip().splitlines() or [""])[0]
@@ -175,3 +159,16 @@ def exception_summary(error: Exception) -> str:
 def format_shape(shape: tuple[int, int]) -> str:
     """Return a (height, width) shape formatted as ``H x W``."""
     return f"{shape[0]} x {shape[1]}"
+
+
+def require_extra(extra: str, modules: Sequence[str]) -> None:
+    """Raise ``InputError`` if a module of an extra of this distribution is not installed.
+
+    Modules that need the extra are imported only after this check.
+    """
+    missing = [name for name in modules if find_spec(name) is None]
+    if missing:
+        raise InputError(
+            f"not installed: {', '.join(missing)}; expected the {extra} extra: "
+            f"pip install 'rebar-depth-bench[{extra}]'"
+        )

@@ -1,7 +1,7 @@
-"""Plain replacements of characters that a terminal cannot show, in place of an error.
+"""Text on a terminal: characters that it can show, notices, and progress bars.
 
 A terminal that is not UTF-8 (``LC_ALL=C``, code page 1252) lacks arrows and mathematical signs; no terminal shows
-the undecodable bytes of a file name. Files are always UTF-8.
+the undecodable bytes of a file name. Such characters are replaced in place of an error. Files are always UTF-8.
 """
 
 from __future__ import annotations
@@ -9,7 +9,15 @@ from __future__ import annotations
 import codecs
 import io
 import sys
+import time
 import unicodedata
+from dataclasses import dataclass
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.progress import TimeRemainingColumn as Remaining
+
+from rebar_depth_bench.errors import printable
 
 _REPLACEMENTS = str.maketrans(
     {
@@ -60,3 +68,117 @@ def _replace_unencodable(error: UnicodeError) -> tuple[str, int]:
 
 _HANDLER = "rebar-plain"
 codecs.register_error(_HANDLER, _replace_unencodable)
+
+_MAX_LINES = 100
+_MAX_LINE_CHARACTERS = 2000
+
+
+def terminal_text(message: str) -> str:
+    """Return a message of several lines for a terminal: escape sequences are shown, long lines truncated.
+
+    Messages quote files and servers, whose control characters could otherwise change what a terminal displays.
+    """
+    lines = message.split("\n")
+    shown = [line if line.isprintable() else _escape_controls(line) for line in lines[:_MAX_LINES]]
+    shown = [line if len(line) <= _MAX_LINE_CHARACTERS else f"{line[:_MAX_LINE_CHARACTERS]}..." for line in shown]
+    return "\n".join([*shown, *(["..."] if len(lines) > _MAX_LINES else [])])
+
+
+def _escape_controls(line: str) -> str:
+    return "".join(char if char.isprintable() else ascii(char)[1:-1] for char in line)
+
+
+def print_notice(text: str) -> None:
+    """Print text to standard error; control characters of names in it are shown as escapes."""
+    print(terminal_text(text), file=sys.stderr)
+
+
+MAX_SILENCE_S = 600.0
+"""Longest time between two lines of progress, if there is progress, seconds."""
+
+
+@dataclass(frozen=True)
+class Rate:
+    """Rate of a task for the display: the name of what is counted, and how many of them are one step."""
+
+    unit: str
+    per_step: int
+
+    def text(self, steps: int, remaining: int, seconds: float) -> str:
+        """Return the rate of ``steps`` done in ``seconds``, and the time for the remaining ones."""
+        if steps < 1 or seconds <= 0:
+            return ""
+        per_minute = 60 * steps * self.per_step / seconds
+        return f"{per_minute:.3g} {self.unit}/min, {duration_text(remaining * seconds / steps)} left"
+
+
+def duration_text(seconds: float) -> str:
+    """Return a duration in its two largest units of hours, minutes and seconds."""
+    hours, minutes = divmod(round(seconds / 60), 60)
+    if seconds < 59.5:
+        return f"{seconds:.0f} s"
+    if seconds < 600:
+        return f"{round(seconds) // 60} min {round(seconds) % 60} s"
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min"
+
+
+@dataclass
+class _Started:
+    """State of a task when it was first shown, and the last line printed for it."""
+
+    done: int
+    seconds: float
+    tenth: int = -1
+    printed_s: float = 0.0
+
+
+class ProgressBars:
+    """Progress bars on standard error, one per task; plain lines if standard error is not a terminal.
+
+    With a ``rate`` they show it and the remaining time, from the steps done since a task was first shown.
+    """
+
+    def __init__(self, rate: Rate | None = None) -> None:
+        self._console = Console(stderr=True)
+        self._bars: dict[str, TaskID] = {}
+        self._started: dict[str, _Started] = {}
+        self._rate = rate
+        self._progress = Progress(
+            TextColumn("{task.description}", markup=False),
+            BarColumn(),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            TextColumn("{task.fields[rate]}") if rate else Remaining(),
+            console=self._console,
+            disable=not self._console.is_terminal,
+        )
+
+    def __enter__(self) -> ProgressBars:
+        self._progress.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._progress.stop()
+
+    def update(self, name: str, done: int, total: int) -> None:
+        """Show that ``done`` of ``total`` steps of the task ``name`` are finished."""
+        name = printable(name)
+        now = time.monotonic()
+        started = self._started.setdefault(name, _Started(done, now))
+        rate = self._rate.text(done - started.done, total - done, now - started.seconds) if self._rate else ""
+        if not self._console.is_terminal:
+            _print_line(
+                started, now, f"{name}: {done} of {total}{rate and f', {rate}'}", done * 10 // max(total, 1)
+            )
+            return
+        if name not in self._bars:
+            self._bars[name] = self._progress.add_task(name, total=total, rate=rate)
+        self._progress.update(self._bars[name], completed=done, total=total, rate=rate)
+
+
+def _print_line(started: _Started, now: float, line: str, tenth: int) -> None:
+    """Print a line at each tenth of the task, and at least every ten minutes, which keeps log files short."""
+    if tenth != started.tenth or now - started.printed_s >= MAX_SILENCE_S:
+        started.tenth, started.printed_s = tenth, now
+        sys.stderr.write(line + "\n")  # In one call: several threads may write lines.
+        sys.stderr.flush()

@@ -14,11 +14,10 @@ from pathlib import Path
 
 from rebar_depth_bench import software_version
 from rebar_depth_bench.atomic_io import write_output
-from rebar_depth_bench.console import ProgressBars, print_notice, run_command
+from rebar_depth_bench.console import add_output_file, check_outputs, prints_table, run_command
 from rebar_depth_bench.errors import InputError, escape_text
 from rebar_depth_bench.names import PATH_PATTERN, SPLITS
-from rebar_depth_bench.output_options import add_output_file, check_outputs, prints_table
-from rebar_depth_bench.terminal import use_plain_characters
+from rebar_depth_bench.terminal import ProgressBars, print_notice, use_plain_characters
 
 BUILD = "build"
 _STRAY_SHOWN = 5

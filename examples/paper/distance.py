@@ -22,7 +22,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from outputs import add_outputs, flat_table, number, run_script, write_outputs
-from rebar_depth_bench.console import ProgressBars, add_archive, add_data
+from rebar_depth_bench.console import add_archive, add_data
 from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.extended.crossings.config import config_reaches
@@ -35,6 +35,7 @@ from rebar_depth_bench.scoring.metrics import mean
 from rebar_depth_bench.scoring.single_bar import mean_single_bar, single_bar_scores
 from rebar_depth_bench.scoring.table import ViewScore
 from rebar_depth_bench.scoring.truth import config_truth
+from rebar_depth_bench.terminal import ProgressBars
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -27,7 +27,7 @@ from depth_maps import DepthMaps, open_maps
 from outputs import add_outputs, number, run_script, write_outputs
 from rebar_depth_bench.captures.image_header import read_image_shape
 from rebar_depth_bench.captures.views import ImageViews
-from rebar_depth_bench.console import ProgressBars, add_workers
+from rebar_depth_bench.console import add_workers
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.geometry.stereo_calibration import Calibration, Lens, MonoCalibration, StereoCalibration
 from rebar_depth_bench.methods import find_method
@@ -37,6 +37,7 @@ from rebar_depth_bench.scoring.bootstrap import INTERVALS, interval, resample
 from rebar_depth_bench.scoring.evaluation import ArchiveIdentity, Provenance
 from rebar_depth_bench.scoring.metrics import is_valid_prediction, mean, median_scale
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE
+from rebar_depth_bench.terminal import ProgressBars
 
 PROTOCOL = "rebar-kitti-eigen-1"
 EIGEN_SPLIT = Path(__file__).with_name("kitti_eigen_test_697.txt")  # As distributed with Monodepth.

@@ -11,10 +11,9 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import pandas as pd
 
 from rebar_depth_bench.atomic_io import write_output
-from rebar_depth_bench.console import run_command
+from rebar_depth_bench.console import add_output_file, check_outputs, prints_table, run_command
 from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.errors import InputError, printable
-from rebar_depth_bench.output_options import add_output_file, check_outputs, prints_table
 from rebar_depth_bench.reporting.figure import check_figure, figure_bytes, figure_style
 from rebar_depth_bench.reporting.tables import frame_csv
 from rebar_depth_bench.scoring.columns import rounded

@@ -8,12 +8,11 @@ import json
 from rich.console import Console
 
 from rebar_depth_bench.atomic_io import write_output
-from rebar_depth_bench.cli.dataset_options import add_expect_digest
-from rebar_depth_bench.console import ProgressBars, add_data, add_workers
-from rebar_depth_bench.output_options import add_output_file, prints_table
+from rebar_depth_bench.console import add_data, add_expect_digest, add_output_file, add_workers, prints_table
 from rebar_depth_bench.reporting.comparison_tables import comparison_csv, print_comparison
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.evaluation import score
+from rebar_depth_bench.terminal import ProgressBars
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

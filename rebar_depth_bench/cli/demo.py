@@ -15,13 +15,14 @@ from pathlib import Path
 from rich.console import Console
 
 from rebar_depth_bench.atomic_io import write_bytes
-from rebar_depth_bench.console import EXIT_INPUT, ProgressBars
+from rebar_depth_bench.console import EXIT_INPUT
 from rebar_depth_bench.errors import BuildError, InputError
 from rebar_depth_bench.methods import METHODS
 from rebar_depth_bench.methods.runner import predict
 from rebar_depth_bench.reporting.html.page import write_report
 from rebar_depth_bench.reporting.tables import print_table
 from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
+from rebar_depth_bench.terminal import ProgressBars
 
 DEMO_FOLDER = "demo-output"
 DEMO_VIEWS = 6

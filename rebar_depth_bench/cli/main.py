@@ -8,8 +8,7 @@ import sys
 from collections.abc import Mapping, Sequence
 
 from rebar_depth_bench import software_version
-from rebar_depth_bench.console import Command, add_commands, run_command
-from rebar_depth_bench.output_options import check_outputs
+from rebar_depth_bench.console import Command, add_commands, check_outputs, run_command
 from rebar_depth_bench.terminal import use_plain_characters
 
 _CLI = "rebar_depth_bench.cli"

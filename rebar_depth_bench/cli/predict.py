@@ -10,8 +10,14 @@ from pathlib import Path
 from rebar_depth_bench.captures.camera_files import CAMERAS_FILE
 from rebar_depth_bench.captures.folder import is_capture, open_capture
 from rebar_depth_bench.captures.views import ImageViews
-from rebar_depth_bench.cli.dataset_options import add_expect_digest, print_verified
-from rebar_depth_bench.console import ProgressBars, add_seconds, positive_number, print_notice
+from rebar_depth_bench.console import (
+    add_expect_digest,
+    add_output_file,
+    add_seconds,
+    positive_number,
+    print_verified,
+    prints_table,
+)
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, open_folder
 from rebar_depth_bench.data.views import Views
 from rebar_depth_bench.errors import InputError
@@ -20,7 +26,7 @@ from rebar_depth_bench.methods.onnx.session import VIEW_TIMEOUT_S
 from rebar_depth_bench.methods.registry import FROM_FOLDER
 from rebar_depth_bench.methods.runner import dataset_views, predict_views
 from rebar_depth_bench.names import SPLITS, TEST_SPLIT
-from rebar_depth_bench.output_options import add_output_file, prints_table
+from rebar_depth_bench.terminal import ProgressBars, print_notice
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -8,18 +8,25 @@ from dataclasses import replace
 from rich.console import Console
 
 from rebar_depth_bench.atomic_io import write_output
-from rebar_depth_bench.cli.dataset_options import add_expect_digest, print_verified
-from rebar_depth_bench.console import ProgressBars, add_archive, add_data, add_workers, print_notice
+from rebar_depth_bench.console import (
+    add_archive,
+    add_data,
+    add_expect_digest,
+    add_output_file,
+    add_workers,
+    print_verified,
+    prints_table,
+)
 from rebar_depth_bench.diagnosis.diagnose import diagnose
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.extended.evaluate import score_extended
-from rebar_depth_bench.output_options import add_output_file, prints_table
 from rebar_depth_bench.reporting.extended_tables import extended_csv, print_extended
 from rebar_depth_bench.reporting.html.page import write_report
 from rebar_depth_bench.reporting.html.views import VIEWS_SHOWN
 from rebar_depth_bench.reporting.tables import groups_csv, print_table, result_csv
 from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
 from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.terminal import ProgressBars, print_notice
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -12,13 +12,13 @@ from pathlib import Path
 from rich.console import Console
 
 from rebar_depth_bench.atomic_io import write_output
-from rebar_depth_bench.console import ProgressBars, add_archive, add_seconds
+from rebar_depth_bench.console import add_archive, add_output_file, add_seconds, prints_table
 from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.leaderboard_client import WAIT_S, LeaderboardClient, server_lines
-from rebar_depth_bench.output_options import add_output_file, prints_table
 from rebar_depth_bench.reporting.tables import print_table
 from rebar_depth_bench.scoring.columns import COVERAGE, number
 from rebar_depth_bench.scoring.result import DECIMALS, DisclosedResult, is_disclosed, read_disclosed, read_result
+from rebar_depth_bench.terminal import ProgressBars
 
 TOKEN_VARIABLE = "REBAR_LEADERBOARD_TOKEN"
 """Environment variable that holds the token."""

@@ -7,15 +7,14 @@ import argparse
 from rich.console import Console
 
 from rebar_depth_bench.atomic_io import write_output
-from rebar_depth_bench.cli.dataset_options import add_expect_digest
-from rebar_depth_bench.console import ProgressBars, add_data, add_workers, print_notice
-from rebar_depth_bench.output_options import add_output_file, prints_table
+from rebar_depth_bench.console import add_data, add_expect_digest, add_output_file, add_workers, prints_table
 from rebar_depth_bench.reporting.comparison_tables import disambiguate_method_names, print_paper_table
 from rebar_depth_bench.reporting.figure import check_figure, write_figure
 from rebar_depth_bench.reporting.latex import latex_table
 from rebar_depth_bench.reporting.tables import results_csv
 from rebar_depth_bench.scoring.comparison import check_same_splits
 from rebar_depth_bench.scoring.evaluation import score
+from rebar_depth_bench.terminal import ProgressBars, print_notice
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 
-from rebar_depth_bench.cli.dataset_options import add_expect_digest
-from rebar_depth_bench.console import ProgressBars
+from rebar_depth_bench.console import add_expect_digest
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.verification import file_problems, truth_problems
 from rebar_depth_bench.errors import DatasetError
+from rebar_depth_bench.terminal import ProgressBars
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

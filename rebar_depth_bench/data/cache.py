@@ -34,9 +34,10 @@ from numpy import ndarray
 from zlib_ng import zlib_ng
 
 from rebar_depth_bench.data.files import parameters_digest
-from rebar_depth_bench.errors import DatasetError, InputError, terminal_text
+from rebar_depth_bench.errors import DatasetError, InputError
 from rebar_depth_bench.limits import CACHE_BYTES
 from rebar_depth_bench.reading import ByteSource, FileSource, MemorySource, check_no_links, remove_file
+from rebar_depth_bench.terminal import terminal_text
 from rebar_depth_bench.validation import StrictModel
 
 FOLDER_NAME = "rebar-depth-bench"

@@ -21,13 +21,13 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from rebar_depth_bench.atomic_io import named_write_errors, write_bytes, write_error, write_text
-from rebar_depth_bench.console import print_notice
 from rebar_depth_bench.errors import EntryError, InputError, Problem, escape_text
 from rebar_depth_bench.limits import JSON_BYTES
 from rebar_depth_bench.names import NAME_PATTERN
 from rebar_depth_bench.reading import FileSource, parse_json, path_below, read_file, remove_folder
 from rebar_depth_bench.submission.maps import Depth, decode_npy, max_npy_bytes
 from rebar_depth_bench.submission.zip import check_entries, read_data, read_directory
+from rebar_depth_bench.terminal import print_notice
 from rebar_depth_bench.validation import Expected, StrictModel, validate_table
 
 _KEY_FILE = "key.json"

@@ -21,7 +21,6 @@ from numpy import ndarray
 
 from rebar_depth_bench import software_version
 from rebar_depth_bench.atomic_io import NO_SPACE, is_stream, link_target, scratch_folder, write_error
-from rebar_depth_bench.console import print_notice
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.data.views import Views
 from rebar_depth_bench.errors import DatasetError, InputError, MethodError, RebarDepthError, escape_text
@@ -32,6 +31,7 @@ from rebar_depth_bench.methods.raw_images import rectifying_predictor
 from rebar_depth_bench.names import TEST_SPLIT
 from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.submission import SubmissionWriter
+from rebar_depth_bench.terminal import print_notice
 
 
 def predict(

@@ -17,8 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rebar_depth_bench.atomic_io import write_output
-from rebar_depth_bench.console import require_extra
-from rebar_depth_bench.errors import InputError, printable
+from rebar_depth_bench.errors import InputError, printable, require_extra
 from rebar_depth_bench.reporting.charts.axes import LogAxis, decade_axis, select_spaced, tick_label
 from rebar_depth_bench.reporting.formatting import (
     CONSTANT_TITLE,

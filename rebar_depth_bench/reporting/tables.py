@@ -16,7 +16,7 @@ from rich.segment import Segments
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from rebar_depth_bench.errors import printable, terminal_text
+from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.scoring.columns import (
     COVERAGE,
@@ -35,6 +35,7 @@ from rebar_depth_bench.scoring.columns import (
 from rebar_depth_bench.scoring.frames import tables_frame
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.table import Table
+from rebar_depth_bench.terminal import terminal_text
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rebar_depth_bench.cli.main import argument_parser
-from rebar_depth_bench.console import EXIT_DONE, EXIT_INPUT
-from rebar_depth_bench.output_options import check_outputs
+from rebar_depth_bench.console import EXIT_DONE, EXIT_INPUT, check_outputs
 from tests.fuzz.workspace import Workspace
 
 

@@ -12,7 +12,7 @@ import pytest
 
 from rebar_depth_bench import limits
 from rebar_depth_bench.atomic_io import write_text
-from rebar_depth_bench.errors import InputError, terminal_text
+from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.reading import (
     MAX_NESTING,
     check_no_links,
@@ -24,6 +24,7 @@ from rebar_depth_bench.reading import (
     remove_file,
     remove_folder,
 )
+from rebar_depth_bench.terminal import terminal_text
 
 
 def test_file_above_the_limit_is_not_read(tmp_path: Path) -> None:

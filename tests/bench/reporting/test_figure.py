@@ -309,7 +309,7 @@ def test_table_command_draws_archives(
 def test_missing_extra_is_named_before_scoring(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("rebar_depth_bench.console.find_spec", lambda _: None)
+    monkeypatch.setattr("rebar_depth_bench.errors.find_spec", lambda _: None)
     assert main(["table", "nowhere.zip", "--data", "nowhere", "--figure", str(tmp_path / "a.pdf")]) == 2
     assert "matplotlib; expected the plot extra: pip install 'rebar-depth-bench[plot]'" in capsys.readouterr().err
 
