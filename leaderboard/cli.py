@@ -6,6 +6,7 @@ import argparse
 import stat
 from collections.abc import Sequence
 from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,8 @@ from leaderboard.db.engine import database_errors, sqlite_path
 from leaderboard.log_setup import set_up_logs
 from leaderboard.settings import Settings, read_settings
 from leaderboard.storage.archive_store import make_folder, state_lock
-from rebar_depth_bench import software_version
-from rebar_depth_bench.console import run_command
+from rebar_depth_bench.console import Command, program_parser, run_program
 from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.terminal import use_plain_characters
 
 _STORED = ("state_dir", "db")
 _WITH_ARCHIVES = (*_STORED, "archives")
@@ -49,9 +48,7 @@ All settings can also be set in a TOML file or the environment.
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run a command and return the exit status: 0 = success, 2 = invalid input, 1 = any other error."""
-    use_plain_characters()
-    options = argument_parser().parse_args(arguments)
-    return run_command(lambda: _run(options), interrupted="stopped")
+    return run_program(argument_parser(), arguments)
 
 
 def _run(options: argparse.Namespace) -> None:
@@ -93,36 +90,38 @@ def _make_state_dir(folder: Path) -> None:
 
 def argument_parser() -> argparse.ArgumentParser:
     """Return the argument parser with all commands."""
-    parser = argparse.ArgumentParser(
+    parser = program_parser(
         "rebar-leaderboard",
-        description="Leaderboard server that scores prediction archives exactly as rebar-bench does.",
+        "Leaderboard server that scores prediction archives exactly as rebar-bench does.",
+        {name: Command(summary, partial(_add_arguments, name), _run) for name, (summary, _) in COMMANDS.items()},
         epilog="Each setting can also be given as the environment variable REBAR_LEADERBOARD_NAME or as "
         "name = value in a TOML file (--settings). The command line takes precedence over the file, and the file "
         "over the environment.",
     )
-    parser.add_argument("--version", action="version", version=software_version())
-    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    for name, (help_text, settings) in COMMANDS.items():
-        command = commands.add_parser(name, help=help_text, description=help_text)
-        command.add_argument("--settings", type=Path, metavar="FILE", help="TOML file with settings")
-        for setting in settings:
-            _add_setting(command, setting)
-        if name == "token":
-            command.add_argument("name", metavar="NAME", help="name of the submitter, shown on the leaderboard")
-            change = command.add_mutually_exclusive_group()
-            change.add_argument("--replace", action="store_true", help="revoke the existing token of NAME")
-            change.add_argument("--revoke", action="store_true", help="only revoke the existing token of NAME")
-        if name == "remove":
-            command.add_argument("id", metavar="ID", help="id of the submission, the last part of its URL")
-        if name == "prune":
-            command.add_argument("--dry-run", action="store_true", help="print the ids, but delete nothing")
-            command.add_argument("--orphans", action="store_true", help="delete the archives without a submission")
-        if name == "check":
-            command.add_argument("--hash-archives", action="store_true", help="read all archives, too")
-        if name == "backup":
-            command.add_argument("target", type=Path, metavar="FOLDER", help="folder to write the backup to")
-            command.add_argument("--prune", action="store_true", help="delete what is removed or pruned from it")
+    parser.set_defaults(interrupted="stopped")
     return parser
+
+
+def _add_arguments(name: str, command: argparse.ArgumentParser) -> None:
+    command.set_defaults(command=name)
+    command.add_argument("--settings", type=Path, metavar="FILE", help="TOML file with settings")
+    for setting in COMMANDS[name][1]:
+        _add_setting(command, setting)
+    if name == "token":
+        command.add_argument("name", metavar="NAME", help="name of the submitter, shown on the leaderboard")
+        change = command.add_mutually_exclusive_group()
+        change.add_argument("--replace", action="store_true", help="revoke the existing token of NAME")
+        change.add_argument("--revoke", action="store_true", help="only revoke the existing token of NAME")
+    if name == "remove":
+        command.add_argument("id", metavar="ID", help="id of the submission, the last part of its URL")
+    if name == "prune":
+        command.add_argument("--dry-run", action="store_true", help="print the ids, but delete nothing")
+        command.add_argument("--orphans", action="store_true", help="delete the archives without a submission")
+    if name == "check":
+        command.add_argument("--hash-archives", action="store_true", help="read all archives, too")
+    if name == "backup":
+        command.add_argument("target", type=Path, metavar="FOLDER", help="folder to write the backup to")
+        command.add_argument("--prune", action="store_true", help="delete what is removed or pruned from it")
 
 
 def _add_setting(command: argparse.ArgumentParser, name: str) -> None:

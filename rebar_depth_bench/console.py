@@ -12,9 +12,10 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
-from pathlib import Path
+from pathlib import Path, PosixPath
 from typing import TYPE_CHECKING
 
+from rebar_depth_bench import software_version
 from rebar_depth_bench.atomic_io import (
     STANDARD_OUTPUT,
     WRITE_ERRORS,
@@ -25,7 +26,7 @@ from rebar_depth_bench.atomic_io import (
 )
 from rebar_depth_bench.errors import InputError, OutputError, RebarDepthError
 from rebar_depth_bench.reading import parse_number
-from rebar_depth_bench.terminal import print_notice
+from rebar_depth_bench.terminal import print_notice, use_plain_characters
 
 if TYPE_CHECKING:
     from rebar_depth_bench.data.manifest import DatasetFolder
@@ -33,37 +34,70 @@ if TYPE_CHECKING:
 EXIT_DONE, EXIT_OTHER, EXIT_INPUT = 0, 1, 2
 """Exit codes: success, any other error, invalid input."""
 
+STANDARD_OUTPUT_OPTIONS = ("--json", "--csv")
+"""Options whose file may be ``-``, standard output."""
+
 MAX_SECONDS = 1e6
 """Longest duration that an option accepts, seconds; Python cannot wait for more than some 1e10."""
 
 
 @dataclass(frozen=True)
 class Command:
-    """Command of a program: its module, with ``add_arguments(parser)`` and ``run(options)``, and its summary.
+    """Command of a program: its summary, what adds its arguments to a parser, and what runs it with the options.
 
     ``run`` prints results to standard output and progress to standard error, and raises ``RebarDepthError``.
     """
 
-    module: str
     summary: str
+    add_arguments: Callable[[argparse.ArgumentParser], None]
+    run: Callable[[argparse.Namespace], None]
 
 
-def add_commands(
-    subparsers: argparse._SubParsersAction[argparse.ArgumentParser],
+def module_command(module: str, summary: str) -> Command:
+    """Return the command of a module with ``add_arguments`` and ``run``, imported when they are called."""
+    return Command(
+        summary,
+        lambda parser: import_module(module).add_arguments(parser),
+        lambda options: import_module(module).run(options),
+    )
+
+
+def program_parser(
+    program: str,
+    description: str,
     commands: Mapping[str, Command],
-    words: Sequence[str] | None,
-) -> None:
-    """Add a parser for each command by name, with the arguments of those that ``words`` contains.
+    words: Sequence[str] | None = None,
+    epilog: str | None = None,
+) -> argparse.ArgumentParser:
+    """Return the argument parser of a program with several commands.
 
-    Only the modules of these are imported, since an import may take seconds. ``words`` are those of a command
-    line; if they are None, all commands have their arguments.
+    Commands have their arguments if the words of a command line contain their name, or all if ``words`` is None:
+    the modules of a command may take seconds to import.
     """
+    parser = argparse.ArgumentParser(prog=program, description=description, epilog=epilog)
+    parser.add_argument("--version", action="version", version=software_version())
+    subparsers = parser.add_subparsers(required=True, metavar="COMMAND")
     for name, command in commands.items():
-        parser = subparsers.add_parser(name, help=command.summary, description=command.summary)
+        subparser = subparsers.add_parser(name, help=command.summary, description=command.summary)
         if words is None or name in words:
-            module = import_module(command.module)
-            module.add_arguments(parser)
-            parser.set_defaults(run=module.run)
+            command.add_arguments(subparser)
+            subparser.set_defaults(run=command.run)
+    return parser
+
+
+def run_program(parser: argparse.ArgumentParser, words: Sequence[str] | None = None) -> int:
+    """Parse the words of a command line, check the outputs, call ``run(options)`` and return the exit code.
+
+    ``run`` is a default of the parser, as is ``interrupted``, the message printed on Ctrl-C, if it has one.
+    """
+    use_plain_characters()
+    options = parser.parse_args(words)
+
+    def run() -> None:
+        check_outputs(vars(options))
+        options.run(options)
+
+    return run_command(run, getattr(options, "interrupted", "interrupted"))
 
 
 def run_command(command: Callable[[], None], interrupted: str = "interrupted") -> int:
@@ -102,14 +136,30 @@ def _discard_standard_output() -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
+class InputFile(str):
+    """Argument that names a file to read; a method may be ``FILE.py:NAME``, ``FILE.toml`` or no file."""
+
+
+class InputFolder(str):
+    """Argument that names a folder to read, or a file or Hub repository in its place."""
+
+
+class OutputFile(PosixPath):
+    """Argument that names a file to write."""
+
+
+class OutputArchive(OutputFile):
+    """Argument that names a submission archive to write, which may be inside an input folder."""
+
+
 def add_archive(parser: argparse.ArgumentParser) -> None:
     """Add the positional argument ``archive``."""
-    parser.add_argument("archive", metavar="ARCHIVE", help="submission archive (zip)")
+    parser.add_argument("archive", type=InputFile, metavar="ARCHIVE", help="submission archive (zip)")
 
 
-def add_data(parser: argparse.ArgumentParser) -> None:
+def add_data(parser: argparse.ArgumentParser, summary: str = "dataset folder or Hub repository id") -> None:
     """Add the option ``--data``."""
-    parser.add_argument("--data", required=True, metavar="ROOT", help="dataset folder or Hub repository id")
+    parser.add_argument("--data", type=InputFolder, required=True, metavar="ROOT", help=summary)
 
 
 def add_workers(parser: argparse.ArgumentParser) -> None:
@@ -152,97 +202,68 @@ def print_verified(
     print_notice(f"dataset {folder.digest} of {folder.root}: manifest consistent; {verified}")
 
 
-# Output files, and the check of all output paths that precedes any work.
-
-OUTPUT_OPTIONS = ("out", "json", "csv", "html", "latex", "groups_csv", "extended_csv", "figure", "picture")
-"""Names (argparse dest) of the options that are output paths."""
-STANDARD_OUTPUT_OPTIONS = ("--json", "--csv")
-"""Options whose file may be ``-``, standard output."""
-INPUT_FILE_OPTIONS = (
-    "archive",
-    "detections",
-    "archives",
-    "first",
-    "others",
-    "method",
-    "token_file",
-    "scene_files",
-)
-"""Names of the options that are files to read; a method may be ``FILE.py:NAME`` or ``FILE.toml``."""
-INPUT_FOLDER_OPTIONS = ("data", "predictions", "kitti", "methods", "reference")
-"""Names of the options that are folders to read, or files or Hub repositories in their place."""
-
-
 def add_output_file(
     parser: argparse.ArgumentParser,
     option: str,
     summary: str,
     *,
+    kind: type[OutputFile] = OutputFile,
     metavar: str = "FILE",
     required: bool = False,
 ) -> None:
     """Add ``option``, the path of a file to write; ``-`` is standard output for ``STANDARD_OUTPUT_OPTIONS``."""
+
+    def convert(text: str) -> OutputFile:
+        if text != "-":
+            return kind(text)
+        if not may_be_stdout:
+            allowed = " and ".join(STANDARD_OUTPUT_OPTIONS)
+            raise argparse.ArgumentTypeError(
+                f"- is standard output, expected the name of a file: only {allowed} can be -"
+            )
+        return kind(STANDARD_OUTPUT)
+
     may_be_stdout = option in STANDARD_OUTPUT_OPTIONS
-    parser.add_argument(
-        option,
-        type=_output_path_or_stdout if may_be_stdout else _output_path,
-        required=required,
-        metavar=metavar,
-        help=f"{summary}; - is standard output, and no table is printed" if may_be_stdout else summary,
-    )
-
-
-def _output_path_or_stdout(text: str) -> Path:
-    return STANDARD_OUTPUT if text == "-" else Path(text)
-
-
-def _output_path(text: str) -> Path:
-    if text == "-":
-        allowed = " and ".join(STANDARD_OUTPUT_OPTIONS)
-        raise argparse.ArgumentTypeError(
-            f"- is standard output, expected the name of a file: only {allowed} can be -"
-        )
-    return Path(text)
+    help_text = f"{summary}; - is standard output, and no table is printed" if may_be_stdout else summary
+    parser.add_argument(option, type=convert, required=required, metavar=metavar, help=help_text)
 
 
 def prints_table(options: argparse.Namespace) -> bool:
     """Return whether a command prints its table: standard output is free of the content of an output."""
-    return not any(map(is_standard_output, _outputs(vars(options)).values()))
+    return not any(isinstance(value, OutputFile) and is_standard_output(value) for value in vars(options).values())
 
 
 def check_outputs(options: Mapping[str, object]) -> None:
-    """Check the output paths of a command's ``options``.
+    """Check the values of a command's options that are an ``OutputFile``, before any work.
 
-    Outputs are the options in ``OUTPUT_OPTIONS``, inputs those in ``INPUT_FILE_OPTIONS`` and
-    ``INPUT_FOLDER_OPTIONS``. Raises ``InputError`` if an output would overwrite an input, another output or a file
-    of an input folder, or is a folder, and ``OutputError`` if it or its folder cannot be written. Several outputs
-    may be the same device, but only one may be a pipe or standard output.
+    Raises ``InputError`` if one would overwrite an ``InputFile``, another output or a file of an ``InputFolder``,
+    or is a folder, and ``OutputError`` if it or its folder cannot be written. Several outputs may be the same
+    device, but only one may be a pipe or standard output.
     """
-    folders = [path for name in INPUT_FOLDER_OPTIONS for path in _paths(options.get(name))]
-    files = [path for name in INPUT_FILE_OPTIONS for path in _paths(options.get(name))]
+    values = [value for given in options.values() for value in (given if isinstance(given, list) else [given])]
+    folders = [Path(value) for value in values if isinstance(value, InputFolder)]
+    methods = re.compile(r"(?<=\.py):\w+$")
+    inputs = [*(Path(methods.sub("", value)) for value in values if isinstance(value, InputFile)), *folders]
     seen: dict[Path, str] = {}
-    for name, output in _outputs(options).items():
+    for name, output in options.items():
+        if not isinstance(output, OutputFile):
+            continue
         option, target = f"--{name.replace('_', '-')}", Path(os.path.realpath(output))
         if target in seen and not target.is_char_device():
             raise InputError(f"{option} and {seen[target]} both name {output}, expected different files")
         seen[target] = option
-        for path in (*files, *folders):
+        for path in inputs:
             if path.exists() and target == path.resolve():
                 raise InputError(f"{option} names {output}, which is an input and would be overwritten")
         for path in folders:
-            if path.is_dir() and name != "out" and path.resolve() in target.parents:
+            if path.is_dir() and not isinstance(output, OutputArchive) and path.resolve() in target.parents:
                 raise InputError(
                     f"{option} names {output}, which is inside {path}: expected a path outside the input"
                 )
         if is_stream(output):
             _check_stream(option, output)
-        elif name != "out" or not target.is_dir():
+        else:
             _check_writable(option, output, link_target(output).absolute())
-
-
-def _outputs(options: Mapping[str, object]) -> dict[str, Path]:
-    """Return the output paths of a command by the names of their options."""
-    return {name: value for name in OUTPUT_OPTIONS if isinstance(value := options.get(name), Path)}
 
 
 def _check_stream(option: str, output: Path) -> None:
@@ -261,9 +282,3 @@ def _check_writable(option: str, output: Path, target: Path) -> None:
         raise InputError(f"{option} names {output}, but {ancestor} is a file: expected a folder")
     if not os.access(ancestor, os.W_OK):
         raise OutputError(f"{option} names {output}, but {ancestor} cannot be written to")
-
-
-def _paths(value: object) -> list[Path]:
-    """Return the paths of an option: one, several or none; ``FILE.py:NAME`` is a path and the name of a method."""
-    values = value if isinstance(value, list) else [] if value is None else [value]
-    return [Path(re.sub(r"(\.py):\w+$", r"\1", str(item))) for item in values]

@@ -8,37 +8,31 @@ from __future__ import annotations
 import argparse
 import re
 import sys
-from collections.abc import Callable, Collection, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from rebar_depth_bench import software_version
 from rebar_depth_bench.atomic_io import write_output
-from rebar_depth_bench.console import add_output_file, check_outputs, prints_table, run_command
+from rebar_depth_bench.console import (
+    Command,
+    InputFile,
+    add_output_file,
+    check_outputs,
+    prints_table,
+    program_parser,
+    run_program,
+)
 from rebar_depth_bench.errors import InputError, escape_text
 from rebar_depth_bench.names import PATH_PATTERN, SPLITS
-from rebar_depth_bench.terminal import ProgressBars, print_notice, use_plain_characters
+from rebar_depth_bench.terminal import ProgressBars, print_notice
 
 BUILD = "build"
 _STRAY_SHOWN = 5
 
 
-@dataclass(frozen=True)
-class Command:
-    """Command: one-line summary, the function that adds its options to a parser, and the one that runs it."""
-
-    summary: str
-    add_arguments: Callable[[argparse.ArgumentParser], None]
-    run: Callable[[argparse.Namespace], None]
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run ``rebar-build``; return its exit status."""
-    use_plain_characters()
     words = with_command(sys.argv[1:] if arguments is None else arguments)
-    options = argument_parser(words[:1]).parse_args(words)
-    interrupted = "interrupted; run the same command again to continue"
-    return run_command(lambda: options.run(options), interrupted=interrupted)
+    return run_program(argument_parser(words[:1]), words)
 
 
 def with_command(words: Sequence[str]) -> list[str]:
@@ -47,20 +41,12 @@ def with_command(words: Sequence[str]) -> list[str]:
     return [*words] if has_command else [BUILD, *words]
 
 
-def argument_parser(commands: Collection[str] | None = None) -> argparse.ArgumentParser:
-    """Return the argument parser of ``rebar-build``; other commands than ``commands`` have no options in it."""
-    parser = argparse.ArgumentParser(
-        prog="rebar-build",
-        description="Build, check and convert dataset folders of stereo views with exact depth.",
-        epilog=f"Without a command, the options are those of {BUILD}: rebar-build {BUILD} --help lists them.",
-    )
-    parser.add_argument("--version", action="version", version=software_version())
-    subparsers = parser.add_subparsers(metavar=f"{{{','.join(COMMANDS)}}}")
-    for name, command in COMMANDS.items():
-        subparser = subparsers.add_parser(name, help=command.summary)
-        if commands is None or name in commands:
-            command.add_arguments(subparser)
-            subparser.set_defaults(run=command.run)
+def argument_parser(words: Sequence[str] | None = None) -> argparse.ArgumentParser:
+    """Return the argument parser of ``rebar-build``, complete for the command in ``words``, or for all if None."""
+    description = "Build, check and convert dataset folders of stereo views with exact depth."
+    epilog = f"Without a command, the options are those of {BUILD}: rebar-build {BUILD} --help lists them."
+    parser = program_parser("rebar-build", description, COMMANDS, words, epilog)
+    parser.set_defaults(interrupted="interrupted; run the same command again to continue")
     return parser
 
 
@@ -186,7 +172,8 @@ def _import(options: argparse.Namespace) -> None:
 def _add_inspect_arguments(parser: argparse.ArgumentParser) -> None:
     from dataset_builder.cli.build_command import add_mesh_unit
 
-    parser.add_argument("scene_file", metavar="SCENE", help="scene TOML, IFC model, or mesh file (STL, PLY, OBJ)")
+    scene_file = "scene TOML, IFC model, or mesh file (STL, PLY, OBJ)"
+    parser.add_argument("scene_file", metavar="SCENE", help=scene_file)
     add_mesh_unit(parser)
     add_output_file(parser, "--json", "write the bars, what is left out, and the placement as JSON")
     add_output_file(parser, "--picture", "write a PNG of the cage from four sides")
@@ -203,7 +190,8 @@ def _inspect(options: argparse.Namespace) -> None:
     from dataset_builder.pipeline.plan import print_notes
     from dataset_builder.user_files.cage_file import raise_problems
 
-    check_outputs({**vars(options), "scene_files": files_of_scene(options.scene_file)})
+    files = [InputFile(path) for path in files_of_scene(options.scene_file)]
+    check_outputs({**vars(options), "scene_files": files})
     cage = scene_cage(options.scene_file, options.mesh_unit)
     inspection = inspect_cage(cage, Path(options.scene_file).name)
     if options.json is not None:

@@ -23,7 +23,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from outputs import add_outputs, number, only_config, run_script, write_outputs
-from rebar_depth_bench.console import add_data
+from rebar_depth_bench.console import add_archive, add_data
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.parallel import map_with_progress
 from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation
@@ -46,8 +46,8 @@ Values = Float64[ndarray, " n"]
 
 def argument_parser() -> argparse.ArgumentParser:
     """Return the parser of the script's arguments."""
-    parser = argparse.ArgumentParser(description="scale a whole archive from k views of known depth")
-    parser.add_argument("archive", metavar="ARCHIVE", help="submission archive (zip), metric or up to scale")
+    parser = argparse.ArgumentParser(description="scale an archive, metric or not, from k views of known depth")
+    add_archive(parser)
     add_data(parser)
     parser.add_argument("--config", metavar="NAME", help="config to evaluate (default: the archive's only one)")
     positive, count = number(float, sys.float_info.min), number(int, 1)
@@ -55,8 +55,7 @@ def argument_parser() -> argparse.ArgumentParser:
     parser.add_argument("--baseline-scale", type=positive, default=1.0, metavar="S", help=scale)
     known = f"numbers of known-depth views (default: {' '.join(map(str, COUNTS))})"
     parser.add_argument("--num-anchor-views", type=count, nargs="+", default=COUNTS, metavar="K", help=known)
-    draws = "independent draws for each k (default: %(default)s)"
-    parser.add_argument("--draws", type=number(int, 1, 1000), default=24, metavar="N", help=draws)
+    parser.add_argument("--draws", type=number(int, 1, 1000), default=24, help="draws for each k (default: 24)")
     parser.add_argument("--seed", type=number(int, 0, 2**31 - 1), default=0, help="seed of the draws (default: 0)")
     add_outputs(parser)
     return parser

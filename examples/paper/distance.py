@@ -47,9 +47,8 @@ VIEW_COLUMNS = ["view_id", "distance_m", "scale", *ERRORS, "single_bar"]
 
 def argument_parser() -> argparse.ArgumentParser:
     """Return the parser of the script's arguments."""
-    parser = argparse.ArgumentParser(
-        description="scale and error of predictions over distance, reach at crossings"
-    )
+    description = "scale and error of predictions over distance, reach at crossings"
+    parser = argparse.ArgumentParser(description=description)
     add_archive(parser)
     add_data(parser)
     parser.add_argument("--config", nargs="+", metavar="NAME", help="configs (default: all in the archive)")

@@ -27,7 +27,7 @@ from depth_maps import DepthMaps, open_maps
 from outputs import add_outputs, number, run_script, write_outputs
 from rebar_depth_bench.captures.image_header import read_image_shape
 from rebar_depth_bench.captures.views import ImageViews
-from rebar_depth_bench.console import add_workers
+from rebar_depth_bench.console import InputFile, InputFolder, add_workers
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.geometry.stereo_calibration import Calibration, Lens, MonoCalibration, StereoCalibration
 from rebar_depth_bench.methods import find_method
@@ -59,14 +59,13 @@ DepthMap = Float[ndarray, "h w"]
 def argument_parser() -> argparse.ArgumentParser:
     """Return the parser of the script's arguments."""
     parser = argparse.ArgumentParser(description="check a method on KITTI's Eigen split")
-    parser.add_argument("--predictions", required=True, metavar="DIR_OR_ZIP", help="one depth map per image")
-    parser.add_argument("--method", help="method to run first, which writes the archive --predictions")
-    parser.add_argument("--kitti", required=True, type=Path, metavar="ROOT", help="KITTI's raw data or depth maps")
-    parser.add_argument(
-        "--ground-truth", required=True, choices=("raw", "improved"), help="one laser scan, or several"
-    )
+    maps = "one depth map per image"
+    parser.add_argument("--predictions", type=InputFolder, required=True, metavar="DIR_OR_ZIP", help=maps)
+    parser.add_argument("--method", type=InputFile, help="method to run first, which writes --predictions")
+    parser.add_argument("--kitti", type=InputFolder, required=True, metavar="ROOT", help="raw data or depth maps")
+    parser.add_argument("--ground-truth", required=True, choices=("raw", "improved"), help="one scan, or several")
     images = "lines <date>/<drive> <frame> l|r (default: the Eigen test split)"
-    parser.add_argument("--images", type=Path, default=EIGEN_SPLIT, metavar="FILE", help=images)
+    parser.add_argument("--images", type=InputFile, default=EIGEN_SPLIT, metavar="FILE", help=images)
     parser.add_argument("--crop", choices=(*CROPS, "none"), default="garg", help="default: garg")
     cap = number(float, np.nextafter(MIN_DEPTH_M, 1))
     parser.add_argument("--cap", type=cap, default=80.0, metavar="M", help="largest depth, m (default: 80)")
@@ -148,7 +147,7 @@ def score_image(image: Any, source: DepthMaps, options: argparse.Namespace) -> d
 
     Pixels with ground truth from 1 mm to the cap inside the crop are scored; values are None without prediction.
     """
-    truth_m = read_truth(image, options.kitti, options.lidar_depth)
+    truth_m = read_truth(image, Path(options.kitti), options.lidar_depth)
     scored = np.zeros(truth_m.shape, bool)
     parts = zip(CROPS.get(options.crop, ((0, 1), (0, 1))), truth_m.shape, strict=True)
     scored[*(slice(int(low * size), int(high * size)) for (low, high), size in parts)] = True
@@ -215,15 +214,15 @@ def image_views(root: Path, images: pd.DataFrame) -> list[ImageViews]:
 
 def run(options: argparse.Namespace) -> None:
     """Predict with the method, if one is named; score, write the requested files and print the means."""
-    images, kind = read_images(options.images), options.ground_truth
-    images["truth"] = [truth_file(options.kitti, kind, image) for image in images.itertuples()]
+    root, images, kind = Path(options.kitti), read_images(Path(options.images)), options.ground_truth
+    images["truth"] = [truth_file(root, kind, image) for image in images.itertuples()]
     missing, images = images.index[images["truth"].isna()], images[images["truth"].notna()]
     if images.empty:
         raise InputError(f"{options.kitti}: has no {kind} ground truth of the {len(missing)} images of the list")
-    shapes = {f"kitti/{image.Index}": truth_shape(image, options.kitti) for image in images.itertuples()}
+    shapes = {f"kitti/{image.Index}": truth_shape(image, root) for image in images.itertuples()}
     with ProgressBars() as bars:
         if options.method:
-            views = image_views(options.kitti, images)
+            views = image_views(root, images)
             predict_views(find_method(options.method), views, options.predictions, bars.update)
         with open_maps(options.predictions, shapes, 1 / 256, optional="kitti/" + missing) as source:
             work, each = partial(score_image, source=source, options=options), images.itertuples()

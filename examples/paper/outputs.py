@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import pandas as pd
 
 from rebar_depth_bench.atomic_io import write_output
-from rebar_depth_bench.console import add_output_file, check_outputs, prints_table, run_command
+from rebar_depth_bench.console import add_output_file, prints_table, run_program
 from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.reporting.figure import check_figure, figure_bytes, figure_style
@@ -60,15 +60,14 @@ def run_script(
     arguments: Sequence[str] | None = None,
 ) -> int:
     """Run a script with its arguments; return its exit status: 2 for invalid input, which is printed."""
-    options = parser.parse_args(arguments)
 
-    def checked() -> None:
-        check_outputs(vars(options))
+    def checked(options: argparse.Namespace) -> None:
         if options.figure:
             check_figure(options.figure)
         run(options)
 
-    return run_command(checked)
+    parser.set_defaults(run=checked)
+    return run_program(parser, arguments)
 
 
 def flat_table(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:

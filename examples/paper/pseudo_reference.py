@@ -26,7 +26,7 @@ from scipy.stats import kendalltau
 
 from depth_maps import DepthMaps, labelled, masked, open_data
 from outputs import add_outputs, flat_table, number, plain_name, run_script, write_outputs
-from rebar_depth_bench.console import add_workers
+from rebar_depth_bench.console import InputFolder, add_data, add_workers
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.parallel import map_with_progress
 from rebar_depth_bench.scoring.bootstrap import INTERVALS
@@ -58,9 +58,9 @@ def argument_parser() -> argparse.ArgumentParser:
     """Return the parser of the script's arguments."""
     parser = argparse.ArgumentParser(description="score methods on the full frame against pseudo-references")
     maps = "archives, or folders of <view_id>.npy|npz|exr|png"
-    parser.add_argument("methods", nargs="+", metavar="METHOD", help=f"depth of the methods: {maps}")
-    parser.add_argument("--reference", nargs="+", required=True, metavar="DEPTH", help=f"references: {maps}")
-    parser.add_argument("--data", required=True, metavar="ROOT", help="dataset folder, Hub repository or capture")
+    parser.add_argument("methods", type=InputFolder, nargs="+", metavar="METHOD", help=maps)
+    parser.add_argument("--reference", type=InputFolder, nargs="+", required=True, metavar="DEPTH", help=maps)
+    add_data(parser, "dataset folder, Hub repository or capture")
     parser.add_argument("--config", metavar="NAME", help="config of a dataset folder (default: its only one)")
     for option, default in (("--near", 0.1), ("--far", 20.0)):
         limit = f"{option[2:]}est depth scored, m (default: {default:g})"

@@ -8,7 +8,14 @@ import json
 from rich.console import Console
 
 from rebar_depth_bench.atomic_io import write_output
-from rebar_depth_bench.console import add_data, add_expect_digest, add_output_file, add_workers, prints_table
+from rebar_depth_bench.console import (
+    InputFile,
+    add_data,
+    add_expect_digest,
+    add_output_file,
+    add_workers,
+    prints_table,
+)
 from rebar_depth_bench.reporting.comparison_tables import comparison_csv, print_comparison
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.evaluation import score
@@ -17,8 +24,8 @@ from rebar_depth_bench.terminal import ProgressBars
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
-    parser.add_argument("first", metavar="A", help="the archive that the others are compared with")
-    parser.add_argument("others", metavar="B", nargs="+", help="one or more archives")
+    parser.add_argument("first", type=InputFile, metavar="A", help="the archive that the others are compared with")
+    parser.add_argument("others", type=InputFile, metavar="B", nargs="+", help="one or more archives")
     add_data(parser)
     add_expect_digest(parser)
     add_output_file(parser, "--json", "write the differences as JSON")

@@ -11,6 +11,9 @@ from rebar_depth_bench.captures.camera_files import CAMERAS_FILE
 from rebar_depth_bench.captures.folder import is_capture, open_capture
 from rebar_depth_bench.captures.views import ImageViews
 from rebar_depth_bench.console import (
+    InputFile,
+    OutputArchive,
+    add_data,
     add_expect_digest,
     add_output_file,
     add_seconds,
@@ -37,11 +40,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         f"weights for {', '.join(FROM_FOLDER)})"
     )
     parser.set_defaults(interrupted="interrupted; run the same command again to resume")
-    parser.add_argument("method", metavar="METHOD", help=names)
+    parser.add_argument("method", type=InputFile, metavar="METHOD", help=names)
     data = "dataset folder, Hub repository, capture (left/, right/, calibration.conf) or images with their cameras"
-    parser.add_argument("--data", required=True, metavar="ROOT", help=data)
+    add_data(parser, data)
     add_expect_digest(parser)
-    add_output_file(parser, "--out", "submission archive (zip) to write", metavar="ARCHIVE", required=True)
+    archive = "submission archive (zip) to write"
+    add_output_file(parser, "--out", archive, kind=OutputArchive, metavar="ARCHIVE", required=True)
     parser.add_argument(
         "--config",
         nargs="+",

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import argparse
 import math
-from pathlib import Path
 
 from rich.console import Console
 
 from rebar_depth_bench.atomic_io import write_output
-from rebar_depth_bench.console import add_data, add_output_file, add_workers, prints_table
+from rebar_depth_bench.console import InputFile, add_data, add_output_file, add_workers, prints_table
 from rebar_depth_bench.detections.score import score_crossings
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.reporting.detections import detection_page
@@ -22,7 +21,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     parser.add_argument(
         "detections",
-        type=Path,
+        type=InputFile,
         metavar="FILE",
         help="CSV or Parquet file: view_id; x, y, z or world_x, world_y, world_z; nx, ny, nz, confidence",
     )

@@ -12,7 +12,7 @@ from pathlib import Path
 from rich.console import Console
 
 from rebar_depth_bench.atomic_io import write_output
-from rebar_depth_bench.console import add_archive, add_output_file, add_seconds, prints_table
+from rebar_depth_bench.console import InputFile, add_archive, add_output_file, add_seconds, prints_table
 from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.leaderboard_client import WAIT_S, LeaderboardClient, server_lines
 from rebar_depth_bench.reporting.tables import print_table
@@ -31,7 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--url", required=True, help="URL of the leaderboard")
     parser.add_argument(
         "--token-file",
-        type=Path,
+        type=InputFile,
         metavar="FILE",
         help=f"file with the token (default: the environment variable {TOKEN_VARIABLE}, or a prompt)",
     )
@@ -81,7 +81,7 @@ def _print_disclosed(result: DisclosedResult) -> None:
         print(f"{printable(config)}: rank error {error}, coverage {coverage} %{note}")
 
 
-def read_token(file: Path | None) -> str:
+def read_token(file: str | None) -> str:
     """Return the token from ``file``, the environment or a prompt.
 
     It is never a command-line argument, which other users of the machine could read. Raises ``InputError`` if
@@ -89,7 +89,7 @@ def read_token(file: Path | None) -> str:
     """
     if file is not None:
         try:
-            with file.open(encoding="utf-8") as stream:  # It may be a pipe of the user's own.
+            with Path(file).open(encoding="utf-8") as stream:  # It may be a pipe of the user's own.
                 token = stream.read(_MAX_TOKEN_CHARACTERS).strip()
         except (OSError, ValueError) as error:
             raise InputError(f"{file}: cannot be read: {error}") from None

@@ -7,7 +7,14 @@ import argparse
 from rich.console import Console
 
 from rebar_depth_bench.atomic_io import write_output
-from rebar_depth_bench.console import add_data, add_expect_digest, add_output_file, add_workers, prints_table
+from rebar_depth_bench.console import (
+    InputFile,
+    add_data,
+    add_expect_digest,
+    add_output_file,
+    add_workers,
+    prints_table,
+)
 from rebar_depth_bench.reporting.comparison_tables import disambiguate_method_names, print_paper_table
 from rebar_depth_bench.reporting.figure import check_figure, write_figure
 from rebar_depth_bench.reporting.latex import latex_table
@@ -19,9 +26,8 @@ from rebar_depth_bench.terminal import ProgressBars, print_notice
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
-    parser.add_argument(
-        "archives", metavar="ARCHIVE", nargs="+", help="submission archives (zip), one table row per archive"
-    )
+    archives = "submission archives (zip), one table row per archive"
+    parser.add_argument("archives", type=InputFile, metavar="ARCHIVE", nargs="+", help=archives)
     add_data(parser)
     add_expect_digest(parser)
     add_output_file(parser, "--latex", "write the table as LaTeX (booktabs)")

@@ -207,6 +207,15 @@ def test_missing_predictions_make_result_incomplete(root: Path, truths: Depths, 
     assert table["coverage"] == pytest.approx(sum(coverages[1:]) / COUNT)
 
 
+def test_list_of_images_is_not_overwritten(root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    listed = tmp_path / "list.txt"
+    listed.write_text("precious")
+    words = ("--predictions", root, "--kitti", root, "--ground-truth", "raw", "--images", listed, "--json", listed)
+    assert run(kitti, *words) == 2
+    assert "which is an input" in capsys.readouterr().err
+    assert listed.read_text() == "precious"
+
+
 def test_archive_and_png_folder_score_alike(root: Path, truths: Depths, tmp_path: Path) -> None:
     depths = {name: np.round(depth_m * 256).clip(1, 65535) / 256 for name, depth_m in predictions(truths).items()}
     archive, other = tmp_path / "mono.zip", folder_of.first_images(COUNT + 1)[-1].name

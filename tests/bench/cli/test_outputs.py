@@ -8,7 +8,7 @@ import pytest
 
 from rebar_depth_bench import InputError
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.console import check_outputs
+from rebar_depth_bench.console import InputFile, InputFolder, OutputArchive, OutputFile, check_outputs
 
 
 def test_output_that_is_an_input_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -49,7 +49,7 @@ def test_unwritable_output_raises_input_error(
     monkeypatch.chdir(tmp_path)
     Path("file").touch()
     with pytest.raises(InputError, match=message):
-        check_outputs({name: Path(value) for name, value in options.items()})
+        check_outputs({name: OutputFile(value) for name, value in options.items()})
 
 
 def test_method_file_and_prediction_folder_are_inputs(tmp_path: Path) -> None:
@@ -57,19 +57,20 @@ def test_method_file_and_prediction_folder_are_inputs(tmp_path: Path) -> None:
     method.touch()
     predictions.mkdir()
     with pytest.raises(InputError, match="which is an input"):
-        check_outputs({"method": f"{method}:METHOD", "out": method})
+        check_outputs({"method": InputFile(f"{method}:METHOD"), "out": OutputFile(method)})
     with pytest.raises(InputError, match="inside"):
-        check_outputs({"kitti": predictions, "csv": predictions / "t.csv"})
+        check_outputs({"maps": [InputFolder(predictions)], "csv": OutputFile(predictions / "t.csv")})
+    check_outputs({"maps": [InputFolder(predictions)], "out": OutputArchive(predictions / "a.zip")})
 
 
 def test_folder_named_like_config_or_method_is_no_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     for name in ("lattice", "sgbm"):
         Path(name).mkdir()
-    check_outputs(
-        {"config": ["lattice"], "method": "sgbm", "csv": Path("lattice/t.csv"), "out": Path("sgbm/a.zip")}
-    )
+    inputs = {"config": ["lattice"], "method": InputFile("sgbm")}
+    check_outputs({**inputs, "csv": OutputFile("lattice/t.csv"), "out": OutputFile("sgbm/a.zip")})
 
 
 def test_new_files_in_new_folders_are_accepted(tmp_path: Path) -> None:
-    check_outputs({"json": tmp_path / "a" / "b.json", "csv": tmp_path / "c.csv", "data": str(tmp_path / "data")})
+    outputs = {"json": OutputFile(tmp_path / "a" / "b.json"), "csv": OutputFile(tmp_path / "c.csv")}
+    check_outputs({**outputs, "data": InputFolder(tmp_path / "data")})

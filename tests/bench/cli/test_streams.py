@@ -18,7 +18,7 @@ import pytest
 from rebar_depth_bench import InputError, SubmissionWriter
 from rebar_depth_bench.atomic_io import STANDARD_OUTPUT, output_file, write_output
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.console import check_outputs
+from rebar_depth_bench.console import InputFile, OutputFile, check_outputs
 from rebar_depth_bench.errors import OutputError
 from tests.commands import run_in_process
 
@@ -149,7 +149,8 @@ def test_devices_stay_devices(tmp_path: Path) -> None:
     assert Path("/dev/null").is_char_device()
     with pytest.raises(OutputError, match=r"^/dev/full: cannot be written: No space left on device$"):
         write_output(Path("/dev/full"), b"content")
-    check_outputs({"json": Path("/dev/null"), "csv": Path("/dev/null"), "html": STANDARD_OUTPUT})
+    null = OutputFile("/dev/null")
+    check_outputs({"json": null, "csv": null, "html": OutputFile(STANDARD_OUTPUT)})
 
 
 def test_prediction_into_a_device_leaves_nothing_beside_it(tiny_root: Path) -> None:
@@ -185,7 +186,7 @@ def test_link_to_an_input_is_refused(archive: Path, tmp_path: Path) -> None:
     link = tmp_path / "link"
     link.symlink_to(archive)
     with pytest.raises(InputError, match="which is an input"):
-        check_outputs({"archive": str(archive), "json": link})
+        check_outputs({"archive": InputFile(archive), "json": OutputFile(link)})
 
 
 def test_replaced_files_keep_their_permissions(tmp_path: Path) -> None:
