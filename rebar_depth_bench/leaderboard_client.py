@@ -32,7 +32,7 @@ from rebar_depth_bench.limits import JSON_BYTES, DeadlineError, call_until
 from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.reading import open_regular, parse_json
 from rebar_depth_bench.scoring.result import DisclosedResult, Result, is_disclosed, read_disclosed, read_result
-from rebar_depth_bench.validation import Expected, StrictModel, one_of, text, validate_table, whole_number
+from rebar_depth_bench.validation import Expected, StrictModel, one_of, validate_table, whole_number
 
 POLL_INTERVAL_S = 2.0
 """Time between two status requests, seconds."""
@@ -45,7 +45,6 @@ REQUEST_TIMEOUT_S, RESULT_TIMEOUT_S = 60.0, 600.0
 _CHUNK_BYTES = 1 << 16
 UPLOAD_TIMEOUT_S = 3600.0
 """Time limit from the last byte of an upload to the end of the response, seconds: the archive is checked first."""
-_MAX_INTEGER = 2**63 - 1
 _MAX_LINE_CHARACTERS = 500
 _PROBLEMS = TypeAdapter(tuple[Problem, ...], config=ConfigDict(defer_build=True))
 
@@ -71,12 +70,9 @@ class _Answer(StrictModel, extra="ignore"):
 
 
 class TokenInfo(_Answer):
-    """Name of a token, its quota and the size limit of the service, bytes."""
+    """Answer to a valid token: the size limit of the service, bytes."""
 
-    max_upload_bytes: Annotated[int, whole_number(1, _MAX_INTEGER)]
-    name: Annotated[str, text(1000)] | None = None
-    quota: Annotated[int, whole_number(0, _MAX_INTEGER)] | None = None
-    quota_left: Annotated[int, whole_number(0, _MAX_INTEGER)] | None = None
+    max_upload_bytes: Annotated[int, whole_number(1, 2**63 - 1)]
 
 
 class Submission(_Answer):
@@ -117,7 +113,7 @@ class Response:
             wanted = f"{expected} with a JSON object" if self.status in statuses else expected
             default = f"the response status is {self.status}, expected {wanted}"
             error_type = InputError if 400 <= self.status < 500 else ServiceError
-            raise error_type(f"{self.where}: {detail(content, default)}")
+            raise error_type(f"{self.where}: {_detail(content, default)}")
         problems: list[Problem] = []
         answer = validate_table(model, content, problems)
         if answer is None:
@@ -132,10 +128,10 @@ class Response:
         lines = content.get("problems")
         lines = [line for line in lines if isinstance(line, str)] if isinstance(lines, list) else []
         # The last of the service's lines is the number of those that it leaves out.
-        shown = [f"\n  - {server_text(line)}" for line in lines[: MAX_PROBLEMS_SHOWN + 1]]
+        shown = [f"\n  - {_one_line(line)}" for line in lines[: MAX_PROBLEMS_SHOWN + 1]]
         more = len(lines) - len(shown)
         omitted = f"\n  ... and {more} more" if more > 0 else ""
-        error = SubmissionError(f"{archive}: {detail(content, 'rejected')}{''.join(shown)}{omitted}")
+        error = SubmissionError(f"{archive}: {_detail(content, 'rejected')}{''.join(shown)}{omitted}")
         try:
             error.problems = _PROBLEMS.validate_python(content.get("problem_details", ()))
         except ValidationError:  # Another version of the service.
@@ -148,33 +144,24 @@ class Response:
         A leaderboard with hidden ground truth returns only the disclosed part of it.
         """
         where = f"{self.where}: the result of the leaderboard"
-        document, problems = parse_json(self.body)
-        if problems:
-            raise AnswerError(f"{where}: {problem_summary(problems)}")
         try:
-            result = (read_disclosed if is_disclosed(document) else read_result)(self.body, where)
+            result = (read_disclosed if is_disclosed(self.content()) else read_result)(self.body, where)
         except InputError as error:
             raise AnswerError(str(error)) from None
         if archive_sha256 not in (None, result.submission.sha256):
-            found = server_text(str(result.submission.sha256))
+            found = escape_text(str(result.submission.sha256))
             raise AnswerError(f"{where} is of the archive with SHA-256 {found}, expected {archive_sha256}")
         return result
 
 
-def detail(content: Mapping[str, Any], default: str) -> str:
+def _detail(content: Mapping[str, Any], default: str) -> str:
     """Return the explanation in the JSON object of an error, or ``default`` if it has none."""
     value = content.get("detail")
-    return server_text(value) if isinstance(value, str) and value.strip() else default
+    return _one_line(value) if isinstance(value, str) and value.strip() else default
 
 
-def server_lines(value: str) -> str:
-    """Return text of a server with its line breaks, each line as ``server_text``, at most 21 lines."""
-    return "\n".join(server_text(line) for line in value.splitlines()[: MAX_PROBLEMS_SHOWN + 1])
-
-
-def server_text(value: str) -> str:
-    """Return text of a server on one line, without control characters, truncated to 500 characters."""
-    return printable(" ".join(value[: 10 * _MAX_LINE_CHARACTERS].split()), _MAX_LINE_CHARACTERS)
+def _one_line(text: str) -> str:
+    return printable(" ".join(text[: 10 * _MAX_LINE_CHARACTERS].split()), _MAX_LINE_CHARACTERS)
 
 
 class LeaderboardClient:
@@ -202,7 +189,9 @@ class LeaderboardClient:
         an exhausted quota, an archive that is too large or a file that cannot be read, and ``ServiceError`` if
         the service cannot be reached or its answer is not valid.
         """
-        max_bytes = self.token().max_upload_bytes
+        max_bytes = (
+            self._call("GET", "token", _deadline(REQUEST_TIMEOUT_S)).answer(TokenInfo, 200).max_upload_bytes
+        )
         try:
             with open_regular(archive) as stream:
                 total = os.fstat(stream.fileno()).st_size
@@ -219,13 +208,6 @@ class LeaderboardClient:
         if accepted.archive_sha256 not in (None, upload.sha256()):
             raise AnswerError(f"{self._url}: the service received another archive than was sent")
         return accepted.model_copy(update={"archive_sha256": upload.sha256()})
-
-    def token(self) -> TokenInfo:
-        """Return the token's name, its quota and the size limit of the service.
-
-        Raises ``InputError`` for an unknown token or a wrong URL, ``ServiceError`` if the service does not answer.
-        """
-        return self._call("GET", "token", _deadline(REQUEST_TIMEOUT_S)).answer(TokenInfo, 200)
 
     def wait(self, submission_id: str, progress: Progress = silent, limit_s: float = WAIT_S) -> Submission:
         """Poll until the submission is scored or failed, and return it.
@@ -259,8 +241,10 @@ class LeaderboardClient:
             "once it is scored"
         )
 
-    def result(self, submission_id: str, archive_sha256: str | None = None) -> bytes:
-        """Return the result JSON, byte-identical to the output of ``rebar-bench score --json``.
+    def result(
+        self, submission_id: str, archive_sha256: str | None = None
+    ) -> tuple[Result | DisclosedResult, bytes]:
+        """Return the result and its JSON, byte-identical to the output of ``rebar-bench score --json``.
 
         A leaderboard with hidden ground truth returns only the disclosed part of it.
 
@@ -273,13 +257,12 @@ class LeaderboardClient:
             raise ServiceError(
                 f"{self._url}: the response status for the result is {response.status}, expected 200"
             )
-        response.result(archive_sha256)
-        return response.body
+        return response.result(archive_sha256), response.body
 
     def _poll(self, submission_id: str, limit_s: float) -> Submission:
         response = self._call("GET", f"submissions/{_checked_id(submission_id)}", _deadline(limit_s))
         if response.status == 429:
-            raise ServiceError(f"{self._url}: {detail(response.content(), 'too many requests')}")
+            raise ServiceError(f"{self._url}: {_detail(response.content(), 'too many requests')}")
         submission = response.answer(Submission, 200)
         if submission.id != submission_id:
             raise AnswerError(
@@ -297,7 +280,7 @@ class LeaderboardClient:
         except (self._http.InvalidURL, self._http.UnsupportedProtocol) as error:
             raise InputError(f"{self._url!r}: is not a valid URL, expected http://HOST:PORT: {error}") from None
         except self._http.HTTPError as error:
-            found = server_text(str(error)) or type(error).__name__
+            found = _one_line(str(error)) or type(error).__name__
             raise ServiceError(f"{self._url}: no response: {found}") from None
 
     def _exchange(self, client: Any, method: str, path: str, content: dict[str, Any]) -> Response:

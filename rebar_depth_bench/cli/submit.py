@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import getpass
-import json
 import os
 import sys
 from pathlib import Path
@@ -14,10 +13,10 @@ from rich.console import Console
 from rebar_depth_bench.atomic_io import write_output
 from rebar_depth_bench.console import InputFile, add_archive, add_output_file, add_seconds, prints_table
 from rebar_depth_bench.errors import InputError, printable
-from rebar_depth_bench.leaderboard_client import WAIT_S, LeaderboardClient, server_lines
+from rebar_depth_bench.leaderboard_client import WAIT_S, LeaderboardClient
 from rebar_depth_bench.reporting.tables import print_table
 from rebar_depth_bench.scoring.columns import COVERAGE, number
-from rebar_depth_bench.scoring.result import DECIMALS, DisclosedResult, is_disclosed, read_disclosed, read_result
+from rebar_depth_bench.scoring.result import DECIMALS, DisclosedResult, Result
 from rebar_depth_bench.terminal import ProgressBars
 
 TOKEN_VARIABLE = "REBAR_LEADERBOARD_TOKEN"
@@ -59,17 +58,17 @@ def run(options: argparse.Namespace) -> None:
             print("the submission is accepted and will be scored; its URL is printed above", file=sys.stderr)
             raise
         if submission.status == "failed":
-            reason = server_lines(submission.reason or "the service gives no reason")
+            reason = submission.reason or "the service gives no reason"
             raise InputError(f"{options.archive}: scoring failed: {reason}")
-        result = leaderboard.result(accepted.id, accepted.archive_sha256)
+        result, result_json = leaderboard.result(accepted.id, accepted.archive_sha256)
     if options.json:
-        write_output(options.json, result)
+        write_output(options.json, result_json)
     if not prints_table(options):
         return
-    if is_disclosed(json.loads(result)):
-        _print_disclosed(read_disclosed(result, options.url))
+    if isinstance(result, Result):
+        print_table(result, Console())
     else:
-        print_table(read_result(result, options.url), Console())
+        _print_disclosed(result)
 
 
 def _print_disclosed(result: DisclosedResult) -> None:

@@ -158,8 +158,8 @@ def test_client_library_raises_errors_of_command(board: SharedServer, tmp_path: 
         assert raised.value.problems
         with pytest.raises(ServiceError, match="status for the result is 404"):
             leaderboard.result("nope")
-        scored = json.loads(leaderboard.result(board.ids["good"]))
-        assert scored["submission"]["method"] == "good"
+        scored, scored_json = leaderboard.result(board.ids["good"])
+        assert scored.submission.method == json.loads(scored_json)["submission"]["method"] == "good"
     with (
         LeaderboardClient("http://127.0.0.1:9", "x") as unreachable,
         pytest.raises(ServiceError, match="no response"),

@@ -33,7 +33,7 @@ ERRORS: dict[str, tuple[str, bytes, int, str]] = {
         "status",
         answer({"id": ID, "url": URL, "status": "failed", "reason": f"no{ESCAPES}more" + "\n1" * 1000}),
         2,
-        "no\ufffd",
+        "no\\x1b]0;owned",
     ),
     "no reason": ("status", answer({"id": ID, "url": URL, "status": "failed"}), 2, "scoring failed"),
     "no HTTP": ("token", b"SSH-2.0-OpenSSH\r\n", 1, "no response"),

@@ -171,6 +171,6 @@ def test_result_of_another_archive_is_refused_by_library(
 ) -> None:
     with LeaderboardClient(server.url, TOKEN) as client:
         accepted = client.submit(archive)
-        assert client.result(accepted.id, accepted.archive_sha256) == result_json
+        assert client.result(accepted.id, accepted.archive_sha256)[1] == result_json
         with pytest.raises(ServiceError, match="is of the archive"):
             client.result(accepted.id, "0" * 64)
