@@ -24,6 +24,9 @@ from rebar_depth_bench.scoring.evaluation import View
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
 from rebar_depth_bench.scoring.protocol import scored_pixels
 
+Values = Float64[ndarray, " n"]
+Image = Float[ndarray, "h w"]
+
 # Views that a diagnosis looks at: some of their scored pixels, and their predictions.
 
 MAX_VIEWS = 8
@@ -48,7 +51,7 @@ class Pixels:
     u: Int64[ndarray, " n"]
     depth_m: Float64[ndarray, " n"]
 
-    def values(self, image: Float[ndarray, "h w"], dv: int = 0, du: int = 0) -> Float64[ndarray, " n"]:
+    def values(self, image: Image, dv: int = 0, du: int = 0) -> Values:
         """Return the values of an image ``dv`` rows below and ``du`` columns to the right; NaN outside of it."""
         v, u = self.v + dv, self.u + du
         height, width = image.shape
@@ -69,7 +72,12 @@ class DiagnosedView:
     camera: Camera
     left: Pixels
     right: Pixels
-    prediction: Float[ndarray, "h w"]
+    prediction: Image
+
+    @property
+    def p(self) -> Values:
+        """Prediction at the pixels of the left eye."""
+        return self.left.values(self.prediction)
 
 
 def positions_to_read(config: DatasetConfig) -> list[int]:
@@ -95,9 +103,6 @@ def _pixels(mask: Bool[ndarray, "h w"] | None, depth_m: Float32[ndarray, "h w"])
     index = index[:: -(-len(index) // MAX_PIXELS) or 1]
     v, u = np.divmod(index, depth_m.shape[1])
     return Pixels(v, u, depth_m[v, u].astype(np.float64))
-
-
-Values = Float64[ndarray, " n"]
 
 
 def pixel_errors(p: Values, z_m: Values, scale: float | None = None) -> Values:
@@ -152,11 +157,6 @@ def resistant_line(x: Values, y: Values) -> tuple[float, float]:
     return slope, float(np.median(y - slope * x))
 
 
-def plane_error(z_m: Values) -> float:
-    """Return the median error of a plane at the median depth: that of a line fitted to nothing but noise."""
-    return _median(pixel_errors(np.ones_like(z_m), z_m))
-
-
 def _median(errors: Values) -> float:
     return float(np.median(errors)) if errors.size else math.nan
 
@@ -166,7 +166,6 @@ def valid_share(p: Values) -> float:
     return float(is_valid_prediction(p).mean())
 
 
-Image = Float[ndarray, "h w"]
 ReadPrediction = Callable[[int], Image]
 """Function that returns the prediction submitted for the view at a position of the config."""
 
@@ -194,8 +193,6 @@ factor of 1.5 for millimetres, of 1.07 for feet.
 """
 MAX_SHIFT_PX = 6
 """Largest shift that is looked for, pixels."""
-CLEARLY_BETTER = 0.8
-"""``clearly_better`` of a mistake that changes the whole picture."""
 BETTER_THAN_PLANE = 0.7
 """Largest error after an inversion, as a share of that of a plane at the median depth.
 
@@ -224,27 +221,21 @@ class Correction:
     seems: str
     measure: str
     errors: Callable[[DiagnosedView], Errors]
-    clearly_better: float
+    clearly_better: float = 0.8
 
 
 def unit_corrections() -> list[Correction]:
     """Return the corrections of depth in other units than metres: those of ``UNITS``, or the largest value."""
     units = [
-        Correction(
-            unit,
-            f"in {unit}",
-            "mean error",
-            partial(_unit_errors, units_in_metre=units_in_metre),
-            CLEARLY_BETTER,
-        )
+        Correction(unit, f"in {unit}", "mean error", partial(_unit_errors, units_in_metre=units_in_metre))
         for unit, units_in_metre in UNITS.items()
     ]
     seems = "depth divided by the largest value of each picture"
-    return [*units, Correction("normalised", seems, "mean error", _normalised_errors, CLEARLY_BETTER)]
+    return [*units, Correction("normalised", seems, "mean error", _normalised_errors)]
 
 
 def _unit_errors(view: DiagnosedView, units_in_metre: float) -> Errors:
-    p, z_m = view.left.values(view.prediction), view.left.depth_m
+    p, z_m = view.p, view.left.depth_m
     before, scale = mean_error(p, z_m, 1.0), median_ratio(p, z_m) * units_in_metre
     # One depth for every pixel can be near any unit by chance.
     is_unit = scale > 0 and abs(math.log(scale)) <= UNIT_TOLERANCE * math.log(units_in_metre) and np.ptp(p) != 0
@@ -252,7 +243,7 @@ def _unit_errors(view: DiagnosedView, units_in_metre: float) -> Errors:
 
 
 def _normalised_errors(view: DiagnosedView) -> Errors:
-    p, z_m = view.left.values(view.prediction), view.left.depth_m
+    p, z_m = view.p, view.left.depth_m
     valid = view.prediction[is_valid_prediction(view.prediction)]
     is_normalised = valid.size and abs(valid.max() - 1) <= NORMALISED_TOLERANCE and np.ptp(p) != 0
     return Errors(mean_error(p, z_m, 1.0), mean_error(p, z_m) if is_normalised else math.nan)
@@ -262,13 +253,13 @@ def logarithm_corrections() -> list[Correction]:
     """Return the corrections of logarithms of depth, of which those of depth below a metre are no valid depth."""
     measure = f"{_SCALED}, 100 % at values of 0 and less,"
     return [
-        Correction(name, seems, measure, partial(_logarithm_errors, log_base=log_base), CLEARLY_BETTER)
+        Correction(name, seems, measure, partial(_logarithm_errors, log_base=log_base))
         for name, (seems, log_base) in LOGARITHMS.items()
     ]
 
 
 def _logarithm_errors(view: DiagnosedView, log_base: float) -> Errors:
-    p = view.left.values(view.prediction)
+    p = view.p
     finite = np.isfinite(p)  # Holes of a method do not count.
     if not finite.any():
         return Errors(math.nan, math.nan)
@@ -287,34 +278,29 @@ def shape_corrections(views: Sequence[DiagnosedView], read: ReadPrediction, coun
     """Return the corrections of everything but units, for the ``views`` of a config that has ``count`` views."""
     height, width = views[0].prediction.shape
     turns = {**_TURNS, **(_QUARTER_TURNS if height == width else {})}
-    shift = best_shift(views)
+    dv, du = best_shift(views)
     ray = "distances along the rays instead of depth along the optical axis"
-    by_name: dict[str, tuple[str, str, Callable[[DiagnosedView], Errors]]] = {
-        "range": (ray, _SCALED, _range_errors),
-        "inverse": ("disparity or inverse depth instead of depth", _FITTED, _inverse_errors),
-        "right-eye": ("those of the right pictures", _SCALED, _right_eye_errors),
-        **{name: (seems, _SCALED, partial(_turned_errors, turn=turn)) for name, (seems, turn) in turns.items()},
-        **{
-            name: (f"those of other views: {order}", _SCALED, partial(_order_errors, source=source, read=read))
-            for name, (order, source) in _orders(count).items()
-        },
-    }
-    if shift != (0, 0):
-        seems = f"shifted by {shift[1]:+d} columns and {shift[0]:+d} rows"
-        by_name["shift"] = (seems, _SCALED, partial(_shift_errors, shift=shift))
-    return [
-        Correction(name, *parts, clearly_better=_SUBTLE.get(name, CLEARLY_BETTER))
-        for name, parts in by_name.items()
+    # Range and shift change most pixels by less than the errors of a method. The sound predictions of those in
+    # "benchmarks.diagnosis" are not better than 0.98 after these corrections.
+    corrections = [
+        Correction("range", ray, _SCALED, _range_errors, clearly_better=0.95),
+        Correction("inverse", "disparity or inverse depth instead of depth", _FITTED, _inverse_errors),
+        Correction("right-eye", "those of the right pictures", _SCALED, _right_eye_errors),
     ]
+    for name, (seems, turn) in turns.items():
+        corrections.append(Correction(name, seems, _SCALED, partial(_turned_errors, turn=turn)))
+    for name, (order, source) in _orders(count).items():
+        errors = partial(_order_errors, source=source, read=read)
+        corrections.append(Correction(name, f"those of other views: {order}", _SCALED, errors))
+    if (dv, du) != (0, 0):
+        seems = f"shifted by {du:+d} columns and {dv:+d} rows"
+        errors = partial(_shift_errors, dv=dv, du=du)
+        corrections.append(Correction("shift", seems, _SCALED, errors, clearly_better=0.9))
+    return corrections
 
 
 _SCALED = "mean error after scaling"
 _FITTED = "median error after scaling and shifting"
-_SUBTLE = {"range": 0.95, "shift": 0.9}
-"""``clearly_better`` of mistakes that change most pixels by less than the errors of a method.
-
-Those of sound predictions of the methods in ``benchmarks.diagnosis`` are 0.98 or more.
-"""
 _TURNS: Mapping[str, tuple[str, Callable[[Image], Image]]] = {
     "mirrored": ("mirrored left to right", np.fliplr),
     "upside-down": ("mirrored upside down", np.flipud),
@@ -352,51 +338,46 @@ def best_shift(views: Sequence[DiagnosedView]) -> tuple[int, int]:
     shifts = sorted(
         ((dv, du) for dv in steps for du in steps), key=lambda shift: (abs(shift[0]) + abs(shift[1]), shift)
     )
-    return min(shifts, key=lambda shift: math.fsum(_shift_errors(view, shift).after for view in views))
+    return min(shifts, key=lambda shift: math.fsum(_shift_errors(view, *shift).after for view in views))
 
 
-def _shift_errors(view: DiagnosedView, shift: tuple[int, int]) -> Errors:
-    before, after = view.left.values(view.prediction), view.left.values(view.prediction, *shift)
-    errors = mean_error(before, view.left.depth_m), mean_error(after, view.left.depth_m)
-    return _comparable(Errors(*errors), before, after)
+def _shift_errors(view: DiagnosedView, dv: int, du: int) -> Errors:
+    return _errors(view, view.left.values(view.prediction, dv, du))
 
 
 def _range_errors(view: DiagnosedView) -> Errors:
-    p = view.left.values(view.prediction)
     range_per_depth = np.linalg.norm(view.camera.rays(), axis=-1)[view.left.v, view.left.u]
-    return _errors(view, p, p / range_per_depth)
+    return _errors(view, view.p / range_per_depth)
 
 
 def _inverse_errors(view: DiagnosedView) -> Errors:
     """Return the errors of lines fitted to depth and to inverse depth, because disparity often has an offset."""
-    p, z_m = view.left.values(view.prediction), view.left.depth_m
+    p, z_m = view.p, view.left.depth_m
     as_depth, as_inverse = line_error(p, z_m, np.positive), line_error(p, z_m, np.reciprocal)
-    plane = plane_error(z_m)
-    before = plane if math.isnan(as_depth) else as_depth  # No rising line describes more than a plane does.
+    # A plane at the median depth is the line fitted to nothing but noise; no rising line describes more.
+    plane = _median(pixel_errors(np.ones_like(z_m), z_m))
+    before = plane if math.isnan(as_depth) else as_depth
     return Errors(before, as_inverse if as_inverse <= BETTER_THAN_PLANE * plane else math.nan)
 
 
 def _right_eye_errors(view: DiagnosedView) -> Errors:
-    before, after = view.left.values(view.prediction), view.right.values(view.prediction)
-    errors = mean_error(before, view.left.depth_m), mean_error(after, view.right.depth_m)
-    return _comparable(Errors(*errors), before, after)
+    return _errors(view, view.right.values(view.prediction), view.right.depth_m)
 
 
 def _turned_errors(view: DiagnosedView, turn: Callable[[Image], Image]) -> Errors:
-    return _errors(view, view.left.values(view.prediction), view.left.values(turn(view.prediction)))
+    return _errors(view, view.left.values(turn(view.prediction)))
 
 
 def _order_errors(view: DiagnosedView, source: Callable[[int], int], read: ReadPrediction) -> Errors:
-    return _errors(view, view.left.values(view.prediction), view.left.values(read(source(view.position))))
+    return _errors(view, view.left.values(read(source(view.position))))
 
 
-def _errors(view: DiagnosedView, before: Values, after: Values) -> Errors:
-    """Return the errors after scaling of the values before and after a correction."""
-    errors = mean_error(before, view.left.depth_m), mean_error(after, view.left.depth_m)
-    return _comparable(Errors(*errors), before, after)
+def _errors(view: DiagnosedView, corrected: Values, corrected_z_m: Values | None = None) -> Errors:
+    """Return the errors after scaling of the prediction, and of the corrected values unless fewer are valid.
 
-
-def _comparable(errors: Errors, before: Values, after: Values) -> Errors:
-    """Return errors without that after the correction if fewer pixels are valid then."""
-    is_comparable = valid_share(after) >= LEAST_VALID_SHARE * valid_share(before)
-    return errors if is_comparable else Errors(errors.before, math.nan)
+    ``corrected_z_m`` is the true depth of the corrected values, by default that of the left eye.
+    """
+    p, z_m = view.p, view.left.depth_m
+    is_comparable = valid_share(corrected) >= LEAST_VALID_SHARE * valid_share(p)
+    after = mean_error(corrected, z_m if corrected_z_m is None else corrected_z_m) if is_comparable else math.nan
+    return Errors(mean_error(p, z_m), after)

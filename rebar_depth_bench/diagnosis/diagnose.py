@@ -96,7 +96,7 @@ def diagnose_config(
 
 def invalid_values(config: str, views: Sequence[DiagnosedView]) -> PossibleMistake | None:
     """Return the mistake of predictions that are hardly anywhere finite and above 0; None if they are."""
-    p = np.concatenate([view.left.values(view.prediction) for view in views])
+    p = np.concatenate([view.p for view in views])
     if valid_share(p) >= LEAST_COVERAGE:
         return None
     shares = {
