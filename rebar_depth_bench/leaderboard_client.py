@@ -13,7 +13,6 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Annotated, Any, BinaryIO, Self, TypeVar
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
@@ -27,6 +26,7 @@ from rebar_depth_bench.errors import (
     escape_text,
     printable,
     problem_summary,
+    require_extra,
 )
 from rebar_depth_bench.limits import JSON_BYTES, DeadlineError, call_until
 from rebar_depth_bench.parallel import Progress, silent
@@ -171,7 +171,10 @@ class LeaderboardClient:
         """Open an HTTP client; raise ``InputError`` if ``httpx2`` is not installed or the token is not ASCII."""
         if not token.isascii() or not token.isprintable():
             raise InputError("the token has other characters than printable ASCII, expected it as it was issued")
-        self._http = _httpx()
+        require_extra("submit", ["httpx2"])
+        import httpx2
+
+        self._http: Any = httpx2
         self._url = url.rstrip("/")
         self._token = token
         self._client = self._new_client()
@@ -189,9 +192,7 @@ class LeaderboardClient:
         an exhausted quota, an archive that is too large or a file that cannot be read, and ``ServiceError`` if
         the service cannot be reached or its answer is not valid.
         """
-        max_bytes = (
-            self._call("GET", "token", _deadline(REQUEST_TIMEOUT_S)).answer(TokenInfo, 200).max_upload_bytes
-        )
+        max_bytes = self._get("token", REQUEST_TIMEOUT_S).answer(TokenInfo, 200).max_upload_bytes
         try:
             with open_regular(archive) as stream:
                 total = os.fstat(stream.fileno()).st_size
@@ -251,8 +252,7 @@ class LeaderboardClient:
         Raises ``ServiceError`` if the response status is not 200 or the body is no result, or that of another
         archive than the one with ``archive_sha256``.
         """
-        path = f"submissions/{_checked_id(submission_id)}/result.json"
-        response = self._call("GET", path, _deadline(RESULT_TIMEOUT_S))
+        response = self._get(f"submissions/{_checked_id(submission_id)}/result.json", RESULT_TIMEOUT_S)
         if response.status != 200:
             raise ServiceError(
                 f"{self._url}: the response status for the result is {response.status}, expected 200"
@@ -260,7 +260,7 @@ class LeaderboardClient:
         return response.result(archive_sha256), response.body
 
     def _poll(self, submission_id: str, limit_s: float) -> Submission:
-        response = self._call("GET", f"submissions/{_checked_id(submission_id)}", _deadline(limit_s))
+        response = self._get(f"submissions/{_checked_id(submission_id)}", limit_s)
         if response.status == 429:
             raise ServiceError(f"{self._url}: {_detail(response.content(), 'too many requests')}")
         submission = response.answer(Submission, 200)
@@ -269,6 +269,10 @@ class LeaderboardClient:
                 f"{self._url}: the answer is on submission {submission.id}, expected {submission_id}"
             )
         return submission
+
+    def _get(self, path: str, limit_s: float) -> Response:
+        end = time.monotonic() + limit_s
+        return self._call("GET", path, lambda: end)
 
     def _call(self, method: str, path: str, end: Callable[[], float], **content: Any) -> Response:
         """Return the response to a request, which must be complete before the time ``end()``."""
@@ -329,11 +333,6 @@ class _Upload:
         return self._last_read + UPLOAD_TIMEOUT_S
 
 
-def _deadline(limit_s: float) -> Callable[[], float]:
-    end = time.monotonic() + limit_s
-    return lambda: end
-
-
 def _checked_id(submission_id: str) -> str:
     """Return an id that can be part of a URL; raise ``InputError`` for any other text."""
     if not SUBMISSION_ID.accept(submission_id):
@@ -341,14 +340,3 @@ def _checked_id(submission_id: str) -> str:
             f"{escape_text(submission_id)} is not the id of a submission, expected {SUBMISSION_ID.text}"
         )
     return submission_id
-
-
-def _httpx() -> ModuleType:
-    try:
-        import httpx2
-    except ImportError as error:
-        raise InputError(
-            f"submitting requires httpx2 ({error}): pip install 'rebar-depth-bench[submit]'"
-        ) from None
-    module: ModuleType = httpx2
-    return module

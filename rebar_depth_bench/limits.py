@@ -70,22 +70,6 @@ CACHE_BYTES = Limit(
     "cache_bytes", 20 * _GIB, "the cache of ground truth; the least recently used entries go first"
 )
 
-LIMITS = (
-    JSON_BYTES,
-    TOML_BYTES,
-    TABLE_BYTES,
-    DETECTIONS_BYTES,
-    CELL_BYTES,
-    IMAGE_PIXELS,
-    MESH_BYTES,
-    IFC_BYTES,
-    IFC_SECONDS,
-    IFC_MEMORY_BYTES,
-    ONNX_MEMORY_BYTES,
-    CACHE_BYTES,
-)
-"""All limits that an environment variable can raise, in the order of the documentation."""
-
 
 def limit_process(
     parent: int, memory_bytes: int, *, cpu_seconds: int | None = None, wall_seconds: float | None = None

@@ -17,6 +17,7 @@ import shutil
 import stat
 import tomllib
 import weakref
+from collections import Counter
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO, NoReturn, Protocol
 
@@ -126,8 +127,7 @@ class _DuplicateKeyError(ValueError):
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     table = dict(pairs)
     if len(table) < len(pairs):
-        seen: set[str] = set()
-        duplicate = next(key for key, _ in pairs if key in seen or seen.add(key))  # type: ignore[func-returns-value]
+        [(duplicate, _)] = Counter(key for key, _ in pairs).most_common(1)
         raise _DuplicateKeyError(escape_text(duplicate))
     return table
 
@@ -217,9 +217,6 @@ class ByteSource(Protocol):
         """Return exactly ``length`` bytes, or raise ``EOFError`` if the source holds fewer."""
 
 
-_HASH_CHUNK_BYTES = 1 << 20
-
-
 class FileSource:
     """Byte source of a regular file, read through ``pread`` and short-lived read-only mappings.
 
@@ -248,13 +245,10 @@ class FileSource:
         return memoryview(mapped)[lead:]
 
     def sha256(self) -> str:
-        """Return the hex SHA-256 of the whole file, read in chunks."""
-        digest = hashlib.sha256()
-        offset = 0
-        while chunk := os.pread(self._fd, _HASH_CHUNK_BYTES, offset):
-            digest.update(chunk)
-            offset += len(chunk)
-        return digest.hexdigest()
+        """Return the hex SHA-256 of the whole file."""
+        with os.fdopen(os.dup(self._fd), "rb") as stream:
+            stream.seek(0)
+            return hashlib.file_digest(stream, "sha256").hexdigest()
 
     def close(self) -> None:
         """Close the file; views that were already returned stay valid. A second call has no effect."""
