@@ -189,11 +189,8 @@ def check_no_links(folder: Path, *names: str) -> None:
 
 def remove_file(path: Path) -> None:
     """Delete a regular file; links, folders and missing files are left alone."""
-    try:
-        if stat.S_ISREG(os.lstat(path).st_mode):
-            path.unlink()
-    except FileNotFoundError:
-        return
+    if path.is_file() and not path.is_symlink():
+        path.unlink(missing_ok=True)
 
 
 def remove_folder(path: Path) -> None:
