@@ -79,18 +79,16 @@ def terminal_text(message: str) -> str:
     Messages quote files and servers, whose control characters could otherwise change what a terminal displays.
     """
     lines = message.split("\n")
-    shown = [line if line.isprintable() else _escape_controls(line) for line in lines[:_MAX_LINES]]
-    shown = [line if len(line) <= _MAX_LINE_CHARACTERS else f"{line[:_MAX_LINE_CHARACTERS]}..." for line in shown]
+    shown = []
+    for line in lines[:_MAX_LINES]:
+        escaped = "".join(char if char.isprintable() else ascii(char)[1:-1] for char in line)
+        shown.append(escaped if len(escaped) <= _MAX_LINE_CHARACTERS else f"{escaped[:_MAX_LINE_CHARACTERS]}...")
     return "\n".join([*shown, *(["..."] if len(lines) > _MAX_LINES else [])])
-
-
-def _escape_controls(line: str) -> str:
-    return "".join(char if char.isprintable() else ascii(char)[1:-1] for char in line)
 
 
 def print_notice(text: str) -> None:
     """Print text to standard error; control characters of names in it are shown as escapes."""
-    print(terminal_text(text), file=sys.stderr)
+    sys.stderr.write(f"{terminal_text(text)}\n")  # In one call, so that threads do not mix lines.
 
 
 MAX_SILENCE_S = 600.0
@@ -180,5 +178,4 @@ def _print_line(started: _Started, now: float, line: str, tenth: int) -> None:
     """Print a line at each tenth of the task, and at least every ten minutes, which keeps log files short."""
     if tenth != started.tenth or now - started.printed_s >= MAX_SILENCE_S:
         started.tenth, started.printed_s = tenth, now
-        sys.stderr.write(line + "\n")  # In one call: several threads may write lines.
-        sys.stderr.flush()
+        print_notice(line)
