@@ -19,8 +19,9 @@ from typing import Any
 import rebar_depth_bench as rdb
 from benchmarks.timing import machine_description, median_seconds, print_markdown
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.data.rows import RowDecoder, iterate_undecoded
+from rebar_depth_bench.data.rows import RowDecoder
 from rebar_depth_bench.data.schema import COLUMNS
+from rebar_depth_bench.data.shards import encoded_rows
 from rebar_depth_bench.names import TEST_SPLIT
 
 REPEATS = 7
@@ -38,7 +39,7 @@ def main(root: str, config: str = "lattice", split: str = TEST_SPLIT) -> None:
 
 def print_overhead(root: str, config: str, split: str) -> None:
     located = open_folder(root).config(config).of_split(split)
-    raw = list(iterate_undecoded(located, COLUMNS))
+    raw = list(encoded_rows(located, COLUMNS))
     decoder = RowDecoder.of(located)
     loaded = rdb.load(root, config, split=split)
     loader = rdb.torch_loader(loaded, batch_size=1)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
 from rebar_depth_bench.data.rows import RowDecoder
 from rebar_depth_bench.data.schema import COLUMNS, validated_columns
-from rebar_depth_bench.data.shards import check_shards, damaged_error, iterate_shards
+from rebar_depth_bench.data.shards import check_shards, damaged_error, shard_rows
 from rebar_depth_bench.errors import DatasetError, InputError, escape_text
 from rebar_depth_bench.names import TEST_SPLIT
 
@@ -119,7 +119,7 @@ def _encoded_rows(
     config: DatasetConfig, columns: Sequence[str], shards: Sequence[str]
 ) -> Iterator[dict[str, Any]]:
     decoder = RowDecoder.of(config)
-    for row in iterate_shards(config, ("view_id", *columns), shards):
+    for row in shard_rows(config, ("view_id", *columns), shards):
         encoded = decoder.encoded(row)
         yield {name: encoded[name] for name in columns}
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, Self
@@ -19,8 +19,8 @@ from numpy import ndarray
 
 from rebar_depth_bench.data import codecs
 from rebar_depth_bench.data.manifest import DatasetConfig
-from rebar_depth_bench.data.schema import column_kind, validated_columns
-from rebar_depth_bench.data.shards import all_rows
+from rebar_depth_bench.data.schema import column_kind
+from rebar_depth_bench.data.shards import encoded_rows
 from rebar_depth_bench.errors import DatasetError, escape_text
 from rebar_depth_bench.geometry.cameras import Camera
 from rebar_depth_bench.validation import short_repr
@@ -219,21 +219,14 @@ def _content(kind: str, cell: Any) -> bytes:
     return content
 
 
-def iterate_rows(config: DatasetConfig, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Yield the decoded rows of a config, one at a time, without a cache.
+def iterate_rows(
+    config: DatasetConfig, columns: Sequence[str], view_ids: Collection[str] | None = None
+) -> Iterator[dict[str, Any]]:
+    """Yield the decoded rows of a config, or those of some views, one at a time, without a cache.
 
-    Raises ``DatasetError`` if a shard or a cell is damaged, and unless the rows are the views of the manifest.
+    Raises ``DatasetError`` if a cell is damaged, and as ``encoded_rows``.
     """
-    return map(RowDecoder.of(config).row, iterate_undecoded(config, columns))
-
-
-def iterate_undecoded(config: DatasetConfig, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Yield the rows of a config with encoded images and depth, one at a time; ``RowDecoder`` decodes them.
-
-    The shards are read with pyarrow: ``datasets`` takes a second to import, and imports torch, which takes
-    several, to stream. Shards of the Hub are streamed. Raises ``DatasetError`` as ``iterate_rows``.
-    """
-    return all_rows(config, validated_columns(columns))
+    return map(RowDecoder.of(config).row, encoded_rows(config, columns, view_ids))
 
 
 def check_columns(config: DatasetConfig, columns: Sequence[str], reader: str) -> None:

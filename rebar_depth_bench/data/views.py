@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from rebar_depth_bench.data.manifest import DatasetConfig
-from rebar_depth_bench.data.rows import RowDecoder, check_columns, iterate_undecoded
+from rebar_depth_bench.data.rows import check_columns, iterate_rows
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 
 
@@ -120,7 +120,5 @@ class ConfigViews:
         Raises ``DatasetError`` for columns that the config lacks.
         """
         self.check_columns(columns, "the method")
-        decoder = RowDecoder.of(self.source)
-        for row in iterate_undecoded(self.source, ("view_id", *columns)):
-            if row["view_id"] not in skip:
-                yield decoder.row(row)
+        wanted = [view_id for view_id in self.view_ids if view_id not in skip] if skip else None
+        return iterate_rows(self.source, ("view_id", *columns), wanted)
