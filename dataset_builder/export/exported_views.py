@@ -14,7 +14,7 @@ from numpy import ndarray
 from PIL import Image
 
 from rebar_depth_bench.data.manifest import DatasetConfig
-from rebar_depth_bench.data.rows import RowDecoder, camera_from_row, truth_columns, truth_from_row
+from rebar_depth_bench.data.rows import camera_from_row, decode_row, truth_columns, truth_from_row
 from rebar_depth_bench.data.schema import EYES, ViewRecord
 from rebar_depth_bench.data.shards import encoded_rows
 from rebar_depth_bench.errors import DatasetError
@@ -55,7 +55,7 @@ def decoded_row(config: DatasetConfig, record: ViewRecord, row: Mapping[str, Any
     Raises ``DatasetError``, naming the view, if an image cannot be decoded or the digest of the ground truth
     differs from the manifest.
     """
-    decoded = RowDecoder.of(config).row(row)
+    decoded = decode_row(config, row)
     for eye in config.truth_eyes:
         digest, expected = truth_from_row(decoded, eye).digest(), getattr(record, eye)
         if digest != expected:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
 from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
-from rebar_depth_bench.data.rows import RowDecoder
+from rebar_depth_bench.data.rows import row_of_pictures
 from rebar_depth_bench.data.schema import COLUMNS, validated_columns
 from rebar_depth_bench.data.shards import check_shards, damaged_error, shard_rows
 from rebar_depth_bench.errors import DatasetError, InputError, escape_text
@@ -118,10 +118,9 @@ def _part(config: DatasetConfig, split: str) -> range:
 def _encoded_rows(
     config: DatasetConfig, columns: Sequence[str], shards: Sequence[str]
 ) -> Iterator[dict[str, Any]]:
-    decoder = RowDecoder.of(config)
     for row in shard_rows(config, ("view_id", *columns), shards):
-        encoded = decoder.encoded(row)
-        yield {name: encoded[name] for name in columns}
+        cells = row_of_pictures(config, row)
+        yield {name: cells[name] for name in columns}
 
 
 def _cached(config: DatasetConfig, split: str) -> Dataset:

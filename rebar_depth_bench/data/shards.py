@@ -14,15 +14,18 @@ from __future__ import annotations
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, BinaryIO
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.data.schema import ROW_SCHEMA, column_kind, validated_columns
 from rebar_depth_bench.errors import DatasetError, InputError, escape_text
 from rebar_depth_bench.limits import CELL_BYTES
+from rebar_depth_bench.reading import open_regular
 
 _TAIL_BYTES = 8
 """Length of the end of a file: the number of bytes of the footer (32 bits, little-endian), and ``PAR1``."""
@@ -239,6 +242,25 @@ def read_rows(
     present = pa.schema([column for column in schema if column.name in file.schema_arrow.names])
     for batch in file.iter_batches(batch_size=batch_rows, row_groups=row_groups, columns=present.names):
         yield from batch.select(present.names).cast(present).to_pylist()
+
+
+def read_table(path: Path, table: Table, what: str) -> Iterator[dict[str, Any]]:
+    """Yield the rows of a Parquet file from outside; ``what`` is its content, for messages.
+
+    Raises ``DatasetError`` if the file is missing, damaged, or does not hold ``table``.
+    """
+    try:
+        with open_regular(path) as stream, open_parquet(stream, table) as (file, _):
+            yield from read_rows(file, table.schema, batch_rows=1000)
+    except Exception as error:  # pyarrow raises many types, which depend on the damage.
+        reason = escape_text(str(error) or type(error).__name__)
+        raise DatasetError(f"{path}: cannot be read as a table of {what}: {reason}") from error
+
+
+def write_table(path: Path, rows: Sequence[Mapping[str, Any]], schema: pa.Schema) -> None:
+    """Write rows as a Parquet file, atomically."""
+    with atomic_replace(path) as temporary:
+        pq.write_table(pa.Table.from_pylist(rows, schema=schema), temporary)
 
 
 def _check_schema(found: pa.Schema, table: Table) -> None:

@@ -20,7 +20,7 @@ from numpy import ndarray
 
 from rebar_depth_bench import software_version
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_folder
-from rebar_depth_bench.data.rows import CAMERA_KINDS, RowDecoder, camera_from_row
+from rebar_depth_bench.data.rows import CAMERA_KINDS, camera_from_row, decode_row
 from rebar_depth_bench.data.shards import encoded_rows
 from rebar_depth_bench.errors import Problem, SubmissionError
 from rebar_depth_bench.geometry.cameras import Camera
@@ -97,7 +97,7 @@ class View:
         """Return the decoded cell of a column. Raises ``DatasetError`` if it is damaged."""
         if column not in self._decoded:
             row = {"view_id": self.view_id, column: self.encoded[column]}
-            self._decoded[column] = RowDecoder.of(self.config).row(row)[column]
+            self._decoded[column] = decode_row(self.config, row)[column]
         return self._decoded[column]
 
     def camera(self, eye: str) -> Camera:
