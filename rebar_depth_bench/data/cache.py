@@ -325,7 +325,8 @@ def open_cache(content: CacheContent, progress: Progress = silent) -> ArrayCache
     except DatasetError:
         raise
     except (InputError, OutputError, OSError) as error:
-        _warn_once(f"ground truth is not cached, but computed whenever it is needed: {error}")
+        reason = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) else error
+        _warn_once(f"ground truth is not cached, but computed whenever it is needed: {reason}")
         entry, numbers = None, {view.view_id: view.numbers for view in content.compute(progress=progress)}
     return ArrayCache(content, entry, tuple(numbers[view_id] for view_id in content.view_ids))
 

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import AliasPath, Field, Strict, ValidationInfo, field_validator
 
-from rebar_depth_bench.data.files import Located, file_sha256, local_path, parameters_digest, views_digest
+from rebar_depth_bench.data.files import Located, file_sha256, parameters_digest, views_digest
 from rebar_depth_bench.data.schema import (
     DIGEST_PATTERN,
     EYES,
@@ -320,7 +320,7 @@ def open_folder(root: str | Path, *, expect_digest: str | None = None) -> Datase
             f"the expected digest is {escape_text(expect_digest)}, expected sha256: and 64 hex digits"
         )
     root = str(root)
-    path = local_path(root, MANIFEST_FILE)
+    path = Located(root=root).file(MANIFEST_FILE)
     values, problems = read_manifest(path)
     if isinstance(values, dict) and values.get("format") == OLD_FORMAT:
         raise DatasetError(

@@ -6,7 +6,16 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
 import pyarrow as pa
-from pydantic import ConfigDict, Field, Strict, StringConstraints, ValidationInfo, field_validator, model_validator
+from pydantic import (
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    Strict,
+    StringConstraints,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from rebar_depth_bench.errors import DatasetError, escape_text
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
@@ -337,7 +346,7 @@ class Scene(ManifestTable):
     board: BoardSpec | None
     environment: Annotated[str, StringConstraints(max_length=60)] = ""
     appearance: Appearance = Appearance()
-    protocol: AnyTrajectory | None = None
+    protocol: Annotated[AnyTrajectory, BeforeValidator(trajectory_of)] | None = None
     protocol_views: Annotated[int, whole_number(1, 1_000_000)]
     rig: SceneRig | None = None
     aim_point_m: Annotated[Triple, three_numbers(-1e9, 1e9, "three numbers, [x, y, z]")] | None = None
@@ -356,11 +365,6 @@ class Scene(ManifestTable):
     @classmethod
     def _make_board(cls, fields: Any) -> BoardSpec | None:
         return None if fields is None else BoardSpec(**_BoardTable.model_validate(fields).model_dump())
-
-    @field_validator("protocol", mode="before")
-    @classmethod
-    def _make_protocol(cls, fields: Any) -> AnyTrajectory | None:
-        return None if fields is None else trajectory_of(fields)
 
     @field_validator("protocol_views")
     @classmethod
