@@ -173,13 +173,11 @@ def manifest(tiny_root: Path) -> Any:
 SCENE = "configs.lattice.scenes 1:"
 BOARD = f"{SCENE} board"
 PROTOCOL_VIEWS = f"{SCENE} protocol_views"
-STATION = [[1.0, 0.0, 0.5], [0.5, 0.0, 0.5]]
 SURVEY = {
     "kind": "survey",
     "distances_m": [0.5, 1.0],
     "views_per_distance": 252,
     "seed": 0,
-    "stations": [STATION] * 504,
 }
 SURVEY_PLACE = f"{SCENE} protocol"
 ORBIT_SCENES = "configs.lattice-orbit.scenes"
@@ -205,7 +203,6 @@ def test_survey_is_a_trajectory(manifest: Any, tmp_path: Path) -> None:
     config = open_folder(tmp_path).config("lattice")
     assert isinstance(config.scene.protocol, Survey)
     assert (config.scene.protocol.views, config.scene.protocol.distances_m) == (504, (0.5, 1.0))
-    assert config.scene.protocol.stations[0] == ((1.0, 0.0, 0.5), (0.5, 0.0, 0.5))
     assert published_match(config) is None
     assert isinstance(open_folder(tmp_path).config("lattice-orbit").scene.protocol, Trajectory)
 
@@ -276,17 +273,12 @@ def test_survey_is_a_trajectory(manifest: Any, tmp_path: Path) -> None:
                 f"{SURVEY_PLACE}.{place}",
             )
             for keys, code, place in (
-                ({"stations": [STATION] * 503}, "conflict", "stations"),
-                ({"stations": [STATION] * 503 + [3]}, "invalid", "stations 504"),
-                ({"stations": [[[1, 2], [3, 4, 5]]] + [STATION] * 503}, "invalid", "stations 1: 1"),
                 ({"distances_m": [1.0, -2.0]}, "invalid", "distances_m 2"),
                 ({"views_per_distance": 252.5}, "invalid", "views_per_distance"),
             )
         ),
         (
-            lambda _, config: scene_of(config).update(
-                protocol={**SURVEY, "stations": [STATION] * 2, "views_per_distance": 1}
-            ),
+            lambda _, config: scene_of(config).update(protocol={**SURVEY, "views_per_distance": 1}),
             "conflict",
             PROTOCOL_VIEWS,
         ),
