@@ -15,7 +15,7 @@ from pydantic import ConfigDict
 
 from rebar_depth_bench.errors import DatasetError, InputError, escape_text
 from rebar_depth_bench.names import PATH_PATTERN
-from rebar_depth_bench.reading import open_regular, path_below
+from rebar_depth_bench.reading import FileSource, open_regular, path_below
 from rebar_depth_bench.validation import StrictModel
 
 if TYPE_CHECKING:
@@ -137,8 +137,7 @@ def _download_error(root: str, name: str, error: Exception) -> InputError:
 
 def file_sha256(path: Path) -> str:
     """Return the hex SHA-256 of a regular file. Raises ``OSError`` if it is missing or not a regular file."""
-    with open_regular(path) as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+    return FileSource(path).sha256()
 
 
 def files_digest(paths: Iterable[Path]) -> str:
