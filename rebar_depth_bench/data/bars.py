@@ -162,8 +162,8 @@ def _bar_from_row(path: Path, row: Mapping[str, Any]) -> Bar:
     has_axis = diameter_m is not None or axis is not None  # Both are null, or neither.
     required = ("scene", "bar_id", "role", *(("diameter_m", "axis") if has_axis else ()))
     empty = [name for name in required if row[name] is None]
-    if empty or (axis is not None and any(point is None for point in axis)):
-        raise DatasetError(f"{where} has no {', '.join(empty) or 'complete axis'}")
+    if empty:
+        raise DatasetError(f"{where} has no {', '.join(empty)}")
     if not re.fullmatch(NAME_PATTERN, row["scene"]):
         raise DatasetError(f"{where}: the name of the scene is invalid, expected {NAME_LETTERS}")
     if re.search(r"[\x00-\x1f\x7f-\x9f]", row["role"]):
