@@ -213,17 +213,3 @@ def iterate_rows(
     Raises ``DatasetError`` if a cell is damaged, and as ``encoded_rows``.
     """
     return (decode_row(config, row) for row in encoded_rows(config, columns, view_ids))
-
-
-def check_columns(config: DatasetConfig, columns: Sequence[str], reader: str) -> None:
-    """Raise ``DatasetError`` if ``reader`` needs columns that are absent: built or imported without them."""
-    needed = [name for name in columns if name in config.absent_columns]
-    if not needed:
-        return
-    place = f"{config.root}: {reader} needs {', '.join(needed)}, but config {config.name} was"
-    if config.imported is not None:
-        raise DatasetError(f"{place} imported without them; choose other configs (--config)")
-    raise DatasetError(
-        f"{place} built without colour (rebar-build --no-colour); choose configs with colour (--config), or build "
-        "it with colour"
-    )
