@@ -19,8 +19,9 @@ from typing import Any
 import rebar_depth_bench as rdb
 from benchmarks.timing import machine_description, median_seconds, print_markdown
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.data.rows import RowDecoder, iterate_undecoded
+from rebar_depth_bench.data.rows import decode_row
 from rebar_depth_bench.data.schema import COLUMNS
+from rebar_depth_bench.data.shards import encoded_rows
 from rebar_depth_bench.names import TEST_SPLIT
 
 REPEATS = 7
@@ -38,16 +39,17 @@ def main(root: str, config: str = "lattice", split: str = TEST_SPLIT) -> None:
 
 def print_overhead(root: str, config: str, split: str) -> None:
     located = open_folder(root).config(config).of_split(split)
-    raw = list(iterate_undecoded(located, COLUMNS))
-    decoder = RowDecoder.of(located)
+    raw = list(encoded_rows(located, COLUMNS))
     loaded = rdb.load(root, config, split=split)
     loader = rdb.torch_loader(loaded, batch_size=1)
     raw_left = [{name: row[name] for name in LEFT} for row in raw]
     print(f"{len(raw)} views, one process\n")
     timings = {
-        "all columns: bare decoders": median_seconds(lambda: [decoder.row(row) for row in raw], REPEATS),
+        "all columns: bare decoders": median_seconds(lambda: [decode_row(located, row) for row in raw], REPEATS),
         "all columns: rdb.load": median_seconds(lambda: list(loaded), REPEATS),
-        "left view: bare decoders": median_seconds(lambda: [decoder.row(row) for row in raw_left], REPEATS),
+        "left view: bare decoders": median_seconds(
+            lambda: [decode_row(located, row) for row in raw_left], REPEATS
+        ),
         "left view: rdb.torch_loader": median_seconds(lambda: list(loader), REPEATS),
     }
     bare = {name.partition(":")[0]: seconds for name, seconds in timings.items() if "bare" in name}

@@ -47,7 +47,7 @@ import rebar_depth_bench as rdb
 from rebar_depth_bench.atomic_io import atomic_replace, write_text
 from rebar_depth_bench.console import run_command
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.data.rows import check_columns
+from rebar_depth_bench.data.views import ConfigViews
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.methods import find_method
 from rebar_depth_bench.methods.runner import predict
@@ -329,7 +329,7 @@ def score_rows(root: str, method_names: Sequence[str], out: Path) -> Iterator[Se
 def run(options: argparse.Namespace) -> None:
     """Train, export, predict and score; print the table as Markdown."""
     config = open_folder(options.root).config(CONFIG).of_split("train")
-    check_columns(config, COLUMNS, "the training")
+    ConfigViews(config).check_columns(COLUMNS, "the training")
     options.out.mkdir(parents=True, exist_ok=True)
     net = train(options, options.out / "checkpoint.pt")
     height, width = config.grid

@@ -32,12 +32,11 @@ from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.data.rows import (
     CAMERA_KINDS,
     EyeTruth,
-    RowDecoder,
     camera_from_row,
+    iterate_rows,
     truth_columns,
     truth_from_row,
 )
-from rebar_depth_bench.data.shards import rows_at
 from rebar_depth_bench.errors import InputError, SubmissionError, escape_text, printable
 from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid, transform
 from rebar_depth_bench.names import config_of
@@ -59,7 +58,7 @@ def show(stream: rr.RecordingStream, folder: DatasetFolder, view_id: str, archiv
     config = folder.config(config_of(view_id))
     if view_id not in config.view_ids:
         raise InputError(f"{config.root}: no view {escape_text(view_id)}, expected one of {config.name}")
-    row = RowDecoder.of(config).row(next(rows_at(config, COLUMNS, [config.view_ids.index(view_id)])))
+    [row] = iterate_rows(config, COLUMNS, [view_id])
     left = truth_from_row(row, "left")
     stream.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     colours = np.full((*left.depth_m.shape, 3), 160, np.uint8) if left.rgb is None else left.rgb

@@ -187,8 +187,9 @@ def _problem(details: ErrorDetails, model: type[BaseModel], where: str) -> Probl
 def _model_at(model: type[BaseModel], location: Sequence[int | str]) -> type[BaseModel]:
     """Return the model of the table that holds the last key of a location."""
     for key in location[:-1]:
-        if isinstance(key, str) and key in model.model_fields:  # Other keys are those of a dict.
-            annotation = model.model_fields[key].annotation
+        fields = {field.alias or name: field for name, field in model.model_fields.items()}
+        if key in fields:  # Other keys are those of a dict.
+            annotation = fields[key].annotation
             model = next((item for item in (annotation, *get_args(annotation)) if _is_model(item)), model)
     return model
 

@@ -14,14 +14,9 @@ from numpy import ndarray
 from PIL import Image
 
 from rebar_depth_bench.data.manifest import DatasetConfig
-from rebar_depth_bench.data.rows import (
-    RowDecoder,
-    camera_from_row,
-    iterate_undecoded,
-    truth_columns,
-    truth_from_row,
-)
+from rebar_depth_bench.data.rows import camera_from_row, decode_row, truth_columns, truth_from_row
 from rebar_depth_bench.data.schema import EYES, ViewRecord
+from rebar_depth_bench.data.shards import encoded_rows
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.geometry.cameras import Camera
 from rebar_depth_bench.names import scene_of
@@ -48,15 +43,10 @@ class CameraView:
 def stored_views(config: DatasetConfig, wanted: Collection[str]) -> Iterator[tuple[CameraView, Mapping[str, Any]]]:
     """Yield the wanted views of a config in the folder's order, with their rows, whose images are encoded.
 
-    Raises ``DatasetError`` for shards that cannot be read, lack a wanted view or contain an unknown one.
+    Raises ``DatasetError`` for shards that cannot be read or lack a wanted view.
     """
-    missing = set(wanted)
-    for row in iterate_undecoded(config, _COLUMNS):
-        if row["view_id"] in missing:
-            missing.remove(row["view_id"])
-            yield _camera_view(row, config), row
-    if missing:
-        raise DatasetError(f"{config.root}: {config.name} lacks {len(missing)} views, among them {min(missing)}")
+    for row in encoded_rows(config, _COLUMNS, wanted):
+        yield _camera_view(row, config), row
 
 
 def decoded_row(config: DatasetConfig, record: ViewRecord, row: Mapping[str, Any]) -> dict[str, Any]:
@@ -65,7 +55,7 @@ def decoded_row(config: DatasetConfig, record: ViewRecord, row: Mapping[str, Any
     Raises ``DatasetError``, naming the view, if an image cannot be decoded or the digest of the ground truth
     differs from the manifest.
     """
-    decoded = RowDecoder.of(config).row(row)
+    decoded = decode_row(config, row)
     for eye in config.truth_eyes:
         digest, expected = truth_from_row(decoded, eye).digest(), getattr(record, eye)
         if digest != expected:

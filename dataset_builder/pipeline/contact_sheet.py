@@ -14,8 +14,7 @@ from PIL import Image, ImageDraw
 from dataset_builder.cameras.trajectories import subset
 from rebar_depth_bench.atomic_io import write_bytes
 from rebar_depth_bench.data.manifest import DatasetConfig
-from rebar_depth_bench.data.rows import RowDecoder
-from rebar_depth_bench.data.shards import rows_at
+from rebar_depth_bench.data.rows import iterate_rows
 
 TILE_PX = (320, 180)
 """Width and height of a tile, pixels."""
@@ -64,10 +63,7 @@ def write_scenes_strip(configs: Sequence[DatasetConfig], target: Path) -> None:
 
 def _decoded_rows(config: DatasetConfig, positions: Sequence[int]) -> Iterator[dict[str, Any]]:
     """Yield view id, colour and depth preview of the views at ``positions``; other scenes are not opened."""
-    decoder, wanted = RowDecoder.of(config), {config.views[position].view_id for position in positions}
-    for scene in config.by_scene():
-        if in_scene := [n for n, view_id in enumerate(scene.view_ids) if view_id in wanted]:
-            yield from map(decoder.row, rows_at(scene, _SHOWN_COLUMNS, in_scene))
+    return iterate_rows(config, _SHOWN_COLUMNS, [config.views[position].view_id for position in positions])
 
 
 def _letterboxed(rgb: UInt8[ndarray, "h w 3"], size: tuple[int, int]) -> Image.Image:

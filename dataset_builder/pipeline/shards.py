@@ -189,8 +189,8 @@ def _plain(value: Any) -> Any:
 _ENCODERS: Mapping[str, Callable[[Any], Any]] = {
     "rgb": lambda rgb: _image_cell(codecs.encode_rgb(rgb)),
     "depth": codecs.encode_depth,
-    "mask": lambda mask: _image_cell(codecs.encode_mask(mask)),
-    "bars": lambda bars: _image_cell(codecs.encode_bars(bars)),
+    "mask": lambda mask: _image_cell(codecs.encode_png(mask)),
+    "bars": lambda bars: _image_cell(codecs.encode_png(bars)),
     **dict.fromkeys(CAMERA_KINDS, lambda array: array.tolist()),
 }
 """Encoders of cells by column kind; values of other kinds are stored as they are."""

@@ -16,7 +16,6 @@ from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
 from rebar_depth_bench.errors import EntryError, InputError, SubmissionError, printable
 from rebar_depth_bench.names import config_of, split_of
-from rebar_depth_bench.parallel import silent
 from rebar_depth_bench.reading import FileSource
 from rebar_depth_bench.scoring.truth import verified_views
 from rebar_depth_bench.submission import ExpectedViews, open_submission
@@ -160,7 +159,7 @@ class Data:
         if self.config is None or not exact:
             yield from ((view_id, None) for view_id in self.views)
             return
-        for view_id, left, _ in verified_views(self.config, silent, "full frame"):
+        for view_id, left, _ in verified_views(self.config):
             yield view_id, left.depth_m
 
 

@@ -3,23 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
-from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.bar_crossings.definition import Crossings, crossing_parameters, scene_crossings
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars
 from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
-from rebar_depth_bench.data.shards import Table, open_parquet, read_rows
-from rebar_depth_bench.errors import DatasetError, escape_text
+from rebar_depth_bench.data.shards import Table, read_table, write_table
+from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.limits import TABLE_BYTES
-from rebar_depth_bench.reading import open_regular
 from rebar_depth_bench.validation import short_repr
 
 if TYPE_CHECKING:
@@ -46,6 +43,8 @@ CROSSINGS_SCHEMA = pa.schema(
 )
 """Schema of ``crossings.parquet``; points and ``normal`` (from a to b) in the world frame, metres."""
 
+_FIELD_BY_COLUMN = dict(zip(CROSSINGS_SCHEMA.names[2:], (field.name for field in fields(Crossings)), strict=True))
+"""Fields of ``Crossings`` by the names of their columns, which have the same order."""
 _MIN_ROW_BYTES = 100
 _UNIT_TOLERANCE = 1e-6
 
@@ -92,8 +91,7 @@ def write_crossings(
         for scene, crossings in sorted(by_scene.items(), key=lambda item: item[0])
         for row in _rows(scene, scene_crossings(bars[scene]) if crossings is None else crossings)
     ]
-    with atomic_replace(path) as temporary:
-        pq.write_table(pa.Table.from_pylist(rows, schema=CROSSINGS_SCHEMA), temporary)
+    write_table(path, rows, CROSSINGS_SCHEMA)
 
 
 def crossings_entry(path: Path) -> dict[str, Any]:
@@ -108,20 +106,12 @@ def read_crossings(path: Path) -> dict[str, Crossings]:
     an invalid crossing.
     """
     max_bytes = TABLE_BYTES.value()
-    max_values = dict.fromkeys(_POINTS, 3)
-    table = Table(CROSSINGS_SCHEMA, max_bytes // _MIN_ROW_BYTES, max_bytes, max_values=max_values)
+    table = Table(CROSSINGS_SCHEMA, max_bytes // _MIN_ROW_BYTES, max_bytes, dict.fromkeys(_POINTS, 3))
     rows: dict[str, list[dict[str, Any]]] = {}
-    try:
-        with open_regular(path) as stream, open_parquet(stream, table) as (file, _):
-            for row in read_rows(file, CROSSINGS_SCHEMA, batch_rows=1000):
-                if None in row.values() or any(None in row[name] for name in _POINTS):
-                    raise DatasetError(f"{path}: a crossing has no value in a column, expected one in each")
-                rows.setdefault(row["scene"], []).append(row)
-    except DatasetError:
-        raise
-    except Exception as error:  # pyarrow raises many types, which depend on the damage.
-        reason = escape_text(str(error) or type(error).__name__)
-        raise DatasetError(f"{path}: cannot be read as a table of crossings: {reason}") from error
+    for row in read_table(path, table, "crossings"):
+        if None in row.values() or any(None in row[name] for name in _POINTS):
+            raise DatasetError(f"{path}: a crossing has no value in a column, expected one in each")
+        rows.setdefault(row["scene"], []).append(row)
     return {scene: _crossings(path, scene, of_scene) for scene, of_scene in rows.items()}
 
 
@@ -144,20 +134,9 @@ def crossings(root: str | Path) -> DataFrame:
 
 def _rows(scene: str, crossings: Crossings) -> list[dict[str, Any]]:
     """Return the rows of a scene's crossings."""
-    columns = {
-        "crossing_id": crossings.crossing_id,
-        "node_id": crossings.node_id,
-        "bar_a": crossings.bar_a,
-        "bar_b": crossings.bar_b,
-        "point_a": crossings.point_a_m,
-        "point_b": crossings.point_b_m,
-        "tie_point": crossings.tie_point_m,
-        "gap_m": crossings.gap_m,
-        "angle_deg": crossings.angle_deg,
-        "normal": crossings.normal,
-    }
-    values = zip(*(column.tolist() for column in columns.values()), strict=True)
-    return [{"scene": scene, **dict(zip(columns, row, strict=True))} for row in values]
+    columns = [crossings.crossing_id, *(getattr(crossings, field) for field in _FIELD_BY_COLUMN.values())]
+    values = zip(*(column.tolist() for column in columns), strict=True)
+    return [dict(zip(CROSSINGS_SCHEMA.names, (scene, *row), strict=True)) for row in values]
 
 
 def _crossings(path: Path, scene: str, rows: Sequence[Mapping[str, Any]]) -> Crossings:
@@ -174,14 +153,4 @@ def _crossings(path: Path, scene: str, rows: Sequence[Mapping[str, Any]]) -> Cro
     ):
         if not valid:
             raise DatasetError(f"{path}: scene {short_repr(scene)}: invalid crossings, expected {expected}")
-    return Crossings(
-        node_id=columns["node_id"],
-        bar_a=columns["bar_a"],
-        bar_b=columns["bar_b"],
-        point_a_m=columns["point_a"],
-        point_b_m=columns["point_b"],
-        tie_point_m=columns["tie_point"],
-        gap_m=columns["gap_m"],
-        angle_deg=columns["angle_deg"],
-        normal=columns["normal"],
-    )
+    return Crossings(**{field: columns[name] for name, field in _FIELD_BY_COLUMN.items()})

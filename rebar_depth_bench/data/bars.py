@@ -12,11 +12,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.parquet as pq
 
-from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.data.shards import Table, open_parquet, read_footer, read_rows
+from rebar_depth_bench.data.shards import Table, read_footer, read_table, write_table
 from rebar_depth_bench.errors import DatasetError, escape_text
 from rebar_depth_bench.limits import TABLE_BYTES
 from rebar_depth_bench.names import NAME_LETTERS, NAME_PATTERN
@@ -27,10 +25,8 @@ if TYPE_CHECKING:
     from pandas import DataFrame
 
 BARS_FILE = "bars.parquet"
-_MEASURES = ("diameter_m", "axis")
 NOMINAL_AXIS = "nominal_axis"
 _Line = tuple[tuple[float, float, float], ...]
-_CONTROL_CHARACTER = r"[\x00-\x1f\x7f-\x9f]"
 BARS_SCHEMA = pa.schema(
     [
         ("scene", pa.string()),
@@ -46,7 +42,6 @@ BARS_SCHEMA = pa.schema(
 Axis and diameter are null for steel whose surface is not that of one round bar. ``nominal_axis`` is the centreline
 in the design, null for bars that are not in a design; the column may be absent.
 """
-_OPTIONAL = frozenset({NOMINAL_AXIS})
 
 
 @dataclass(frozen=True)
@@ -98,27 +93,19 @@ def read_bars(path: Path) -> dict[str, tuple[Bar, ...]]:
     Raises ``DatasetError`` if the file is missing, is not such a table, is larger than ``TABLE_BYTES``, or holds
     an invalid bar or a repeated id.
     """
-    table = _table()
     scenes: dict[str, dict[int, Bar]] = {}
-    try:
-        with open_regular(path) as stream, open_parquet(stream, table) as (file, _):
-            for row in read_rows(file, BARS_SCHEMA, batch_rows=1000):
-                bar = _bar_from_row(path, row)
-                if scenes.setdefault(row["scene"], {}).setdefault(bar.bar_id, bar) is not bar:
-                    where = f"scene {short_repr(row['scene'])}"
-                    raise DatasetError(f"{path}: {where} has bar {bar.bar_id} twice, expected each id once")
-    except DatasetError:
-        raise
-    except Exception as error:  # pyarrow raises many types, which depend on the damage.
-        reason = escape_text(str(error) or type(error).__name__)
-        raise DatasetError(f"{path}: cannot be read as a table of bars: {reason}") from error
+    for row in read_table(path, _table(), "bars"):
+        bar = _bar_from_row(path, row)
+        if scenes.setdefault(row["scene"], {}).setdefault(bar.bar_id, bar) is not bar:
+            where = f"scene {short_repr(row['scene'])}"
+            raise DatasetError(f"{path}: {where} has bar {bar.bar_id} twice, expected each id once")
     return {scene: tuple(bars.values()) for scene, bars in scenes.items()}
 
 
 def _table() -> Table:
     max_bytes = TABLE_BYTES.value()
     max_values = {"axis": max_bytes, NOMINAL_AXIS: max_bytes}
-    return Table(BARS_SCHEMA, max_bytes // 64, max_bytes, max_values, _OPTIONAL)
+    return Table(BARS_SCHEMA, max_bytes // 64, max_bytes, max_values, frozenset({NOMINAL_AXIS}))
 
 
 def decoded_bytes(path: Path) -> int:
@@ -165,8 +152,7 @@ def write_bars(path: Path, scenes: Mapping[str, tuple[Bar, ...]]) -> None:
         for scene, bars in sorted(scenes.items())
         for bar in bars
     ]
-    with atomic_replace(path) as temporary:
-        pq.write_table(pa.Table.from_pylist(rows, schema=BARS_SCHEMA), temporary)
+    write_table(path, rows, BARS_SCHEMA)
 
 
 def _bar_from_row(path: Path, row: Mapping[str, Any]) -> Bar:
@@ -174,15 +160,13 @@ def _bar_from_row(path: Path, row: Mapping[str, Any]) -> Bar:
     where = f"{path}: bar {row['bar_id']} of scene {short_repr(row['scene'])}"
     diameter_m, axis = row["diameter_m"], row["axis"]
     has_axis = diameter_m is not None or axis is not None  # Both are null, or neither.
-    required = (
-        name for name in BARS_SCHEMA.names if name not in _OPTIONAL and (has_axis or name not in _MEASURES)
-    )
+    required = ("scene", "bar_id", "role", *(("diameter_m", "axis") if has_axis else ()))
     empty = [name for name in required if row[name] is None]
-    if empty or (axis is not None and any(point is None for point in axis)):
-        raise DatasetError(f"{where} has no {', '.join(empty) or 'complete axis'}")
+    if empty:
+        raise DatasetError(f"{where} has no {', '.join(empty)}")
     if not re.fullmatch(NAME_PATTERN, row["scene"]):
         raise DatasetError(f"{where}: the name of the scene is invalid, expected {NAME_LETTERS}")
-    if re.search(_CONTROL_CHARACTER, row["role"]):
+    if re.search(r"[\x00-\x1f\x7f-\x9f]", row["role"]):
         raise DatasetError(f"{where}: role is {escape_text(row['role'])}, expected no control characters")
     if row["bar_id"] < 1:
         raise DatasetError(f"{where}: bar_id is {row['bar_id']}, expected 1 or more (0 means no steel)")

@@ -73,14 +73,9 @@ def encode_rgb(rgb: UInt8[ndarray, "h w 3"]) -> bytes:
     return _encode_image(Image.fromarray(rgb), "WEBP", lossless=True)
 
 
-def encode_mask(mask: Bool[ndarray, "h w"]) -> bytes:
-    """Encode a mask as 1-bit PNG."""
-    return _encode_image(Image.fromarray(mask), "PNG")
-
-
-def encode_bars(bars: UInt16[ndarray, "h w"]) -> bytes:
-    """Encode bar ids as 16-bit greyscale PNG."""
-    return _encode_image(Image.fromarray(bars), "PNG")
+def encode_png(image: Bool[ndarray, "h w"] | UInt16[ndarray, "h w"]) -> bytes:
+    """Encode a mask as 1-bit PNG, or bar ids as 16-bit greyscale PNG."""
+    return _encode_image(Image.fromarray(image), "PNG")
 
 
 def encode_palette(indices: UInt8[ndarray, "h w"], palette: bytes) -> bytes:
@@ -102,10 +97,24 @@ def decode(kind: str, content: bytes, grid: tuple[int, int]) -> ndarray[Any, Any
 def open_picture(kind: str, content: bytes, grid: tuple[int, int]) -> Picture:
     """Decode the image of a column of ``kind`` and ``grid`` (height, width), in the mode of that kind.
 
-    Raises ``ValueError`` or an error of Pillow, which has no base class, for other content.
+    Format, mode and size are checked before it is decoded. Raises ``ValueError`` or an error of Pillow, which has
+    no base class, for other content.
     """
-    expected = PICTURE_KINDS[kind]
-    with _open_image(content, grid, expected.formats, expected.modes) as file:
+    expected, (height, width) = PICTURE_KINDS[kind], grid
+    if not isinstance(content, bytes):
+        raise ValueError("the cell holds no bytes")
+    if len(content) > CELL_BYTES.value():
+        raise ValueError(f"it has {len(content)} bytes, expected {CELL_BYTES.allowed()}")
+    plugin = next((plugin for start, plugin in _plugins().items() if content.startswith(start)), None)
+    if plugin is None or plugin.format not in expected.formats:
+        raise ValueError(f"it starts with {content[:4]!r}, expected {' or '.join(expected.formats)}")
+    with plugin(io.BytesIO(content)) as file:
+        if file.size != (width, height):
+            raise ValueError(f"its size is {file.size[0]} x {file.size[1]}, expected {width} x {height}")
+        if file.mode not in expected.modes:
+            raise ValueError(f"its mode is {file.mode}, expected {' or '.join(expected.modes)}")
+        if _TIFF_TILE_WIDTH in getattr(file, "tag_v2", ()):
+            raise ValueError("it is a TIFF of tiles, whose size is not that of the image, expected strips")
         file.load()
         image: Image.Image = file
         if file.mode != expected.mode:
@@ -116,31 +125,6 @@ def open_picture(kind: str, content: bytes, grid: tuple[int, int]) -> Picture:
         if not (depth_m.min() >= 0 and depth_m.max() < np.inf):
             raise ValueError("it holds negative or non-finite values, expected depth from 0")
     return Picture(image)
-
-
-def _open_image(
-    content: bytes, grid: tuple[int, int], formats: tuple[str, ...], modes: tuple[str, ...]
-) -> ImageFile:
-    """Return an image that is not decoded yet, after checking its format, mode and size.
-
-    Raises ``ValueError`` or an error of Pillow, which has no base class, for other content.
-    """
-    if not isinstance(content, bytes):
-        raise ValueError("the cell holds no bytes")
-    if len(content) > CELL_BYTES.value():
-        raise ValueError(f"it has {len(content)} bytes, expected {CELL_BYTES.allowed()}")
-    plugin = next((plugin for start, plugin in _plugins().items() if content.startswith(start)), None)
-    if plugin is None or plugin.format not in formats:
-        raise ValueError(f"it starts with {content[:4]!r}, expected {' or '.join(formats)}")
-    image = plugin(io.BytesIO(content))
-    height, width = grid
-    if image.size != (width, height):
-        raise ValueError(f"its size is {image.size[0]} x {image.size[1]}, expected {width} x {height}")
-    if image.mode not in modes:
-        raise ValueError(f"its mode is {image.mode}, expected {' or '.join(modes)}")
-    if _TIFF_TILE_WIDTH in getattr(image, "tag_v2", ()):
-        raise ValueError("it is a TIFF of tiles, whose size is not that of the image, expected strips")
-    return image
 
 
 @cache

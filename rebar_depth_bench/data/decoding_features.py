@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, is_dataclass, replace
+from dataclasses import dataclass, field, is_dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -18,7 +18,7 @@ from datasets import Features, Image, List, Value
 
 from rebar_depth_bench.data.codecs import PICTURE_KINDS, Picture
 from rebar_depth_bench.data.manifest import DatasetConfig
-from rebar_depth_bench.data.rows import CAMERA_KINDS, RowDecoder, is_absent
+from rebar_depth_bench.data.rows import CAMERA_KINDS, is_absent, open_cell, picture_place
 from rebar_depth_bench.data.schema import column_kind, features
 
 STORED_MODES = {"depth": "F", "preview": "RGB"}
@@ -30,10 +30,10 @@ def decoding_features(config: DatasetConfig, columns: Sequence[str], *, to_array
 
     They decode to arrays, or to pictures and lists, of which the format ``numpy`` makes the same arrays.
     """
-    decoder, by_name = replace(RowDecoder.of(config), scene_by_view={}), features()
+    by_name = features()
     for name in columns:
         if column_kind(name) in PICTURE_KINDS:
-            by_name[name] = _Images(decoder, name, to_arrays)
+            by_name[name] = _Images(config.root, config.grid, name, to_arrays)
         elif column_kind(name) in CAMERA_KINDS:
             by_name[name] = _Matrices(by_name[name].feature, by_name[name].length)
             by_name[name].to_arrays = to_arrays
@@ -58,24 +58,25 @@ def _stored(feature: object) -> Any:
 class _Images(_Stored, Image):  # type: ignore[misc]
     """Image column of a config, stored as ``datasets.Image``.
 
-    It decodes images of the config's shards, which ``RowDecoder.encoded`` marks by their paths, with all checks of
+    It decodes images of the config's shards, which ``row_of_pictures`` marks by their paths, with all checks of
     their content, and others, as from ``map``, as ``datasets.Image`` does.
     """
 
-    def __init__(self, decoder: RowDecoder, column: str, to_arrays: bool) -> None:
+    def __init__(self, root: str, grid: tuple[int, int], column: str, to_arrays: bool) -> None:
         super().__init__(mode=STORED_MODES.get(column_kind(column)))
-        self._decoder = decoder
+        self._root = root
+        self._grid = grid
         self._column = column
         self._to_arrays = to_arrays
 
     def encode_example(self, value: Any) -> Any:
-        """Return the stored cell of a picture, an array or a cell of ``RowDecoder.encoded``."""
+        """Return the stored cell of a picture, an array or a cell of ``row_of_pictures``."""
         return value if self._is_of_shard(value) else super().encode_example(value)
 
     def decode_example(self, value: Any, token_per_repo_id: Any = None) -> Any:
         """Return the image in a cell. Raises ``DatasetError`` for a damaged image of the config's shards."""
         if self._is_of_shard(value):
-            picture = self._decoder.picture(self._column, value["bytes"], value["path"])
+            picture = open_cell(self._root, self._grid, self._column, value)
         else:
             picture = Picture(super().decode_example(value, token_per_repo_id))
         return np.asarray(picture) if self._to_arrays else picture
@@ -91,7 +92,7 @@ class _Images(_Stored, Image):  # type: ignore[misc]
         return super().cast_storage(storage)
 
     def _is_of_shard(self, value: Any) -> bool:
-        return isinstance(value, dict) and (value["path"] or "").startswith(self._decoder.place)
+        return isinstance(value, dict) and (value["path"] or "").startswith(picture_place(self._root))
 
 
 def _image_array(values: pa.Array, kind: str) -> np.ndarray[Any, Any]:

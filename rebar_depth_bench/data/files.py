@@ -15,7 +15,7 @@ from pydantic import ConfigDict
 
 from rebar_depth_bench.errors import DatasetError, InputError, escape_text
 from rebar_depth_bench.names import PATH_PATTERN
-from rebar_depth_bench.reading import open_regular, path_below
+from rebar_depth_bench.reading import FileSource, open_regular, path_below
 from rebar_depth_bench.validation import StrictModel
 
 if TYPE_CHECKING:
@@ -44,17 +44,26 @@ class Located(StrictModel):
         path = Path(self.root)
         return path if path.is_dir() else None
 
-    @property
-    def repository(self) -> str:
-        """Id of the Hub repository, or empty for a local dataset folder."""
-        return "" if self.local is not None else _hub_root(self.root)[0]
-
     def file(self, name: str) -> Path:
         """Return the local path of a file of the dataset, downloaded first if the dataset is a Hub repository.
 
-        Raises ``DatasetError`` if the file is missing, not a regular file, or cannot be downloaded.
+        Without a commit, the root may be a mistyped folder: the Hub is asked once, and not if its owner is a
+        folder here. Raises ``DatasetError`` if the root is neither a folder nor a repository, and if the file is
+        missing, not a regular file, or cannot be downloaded.
         """
-        return local_path(self.root, name, self.commit)
+        folder = Path(self.root)
+        if folder.exists() and not folder.is_dir():
+            raise DatasetError(f"{self.root}: is a file, no such folder")
+        path = path_below(folder, name) if folder.is_dir() else _download(self.root, name, self.commit)
+        try:
+            open_regular(path).close()
+        except FileNotFoundError:
+            raise DatasetError(
+                f"{self.root}: has no {name}, expected a complete dataset folder written by rebar-build"
+            ) from None
+        except OSError as error:
+            raise DatasetError(f"{path}: cannot be read: {error.strerror or error}") from None
+        return path
 
     def open(self, name: str) -> BinaryIO:
         """Open a file of the dataset for reading; a file of the Hub that is not cached is read in ranges.
@@ -65,11 +74,12 @@ class Located(StrictModel):
             return open_regular(self.file(name))
         from huggingface_hub import HfFileSystem, try_to_load_from_cache
 
-        cached = try_to_load_from_cache(self.repository, name, repo_type="dataset", revision=self.commit)
+        repository, _ = _hub_root(self.root)
+        cached = try_to_load_from_cache(repository, name, repo_type="dataset", revision=self.commit)
         if isinstance(cached, str):
             return open_regular(Path(cached))
         try:
-            return cast(BinaryIO, HfFileSystem().open(f"datasets/{self.repository}@{self.commit}/{name}"))
+            return cast(BinaryIO, HfFileSystem().open(f"datasets/{repository}@{self.commit}/{name}"))
         except Exception as error:  # The errors of the HTTP client have no base class in the Hub's package.
             raise _download_error(self.root, name, error) from None
 
@@ -95,28 +105,6 @@ def local_folder(root: str | Path) -> Path:
             f"{root}: no such folder, expected a dataset folder on this machine; download a Hub repository first"
         )
     return Path(root)
-
-
-def local_path(root: str, name: str, commit: str = "") -> Path:
-    """Return the local path of a regular file below ``root``; ``commit`` replaces the revision of a Hub root.
-
-    Without ``commit``, a Hub root may be a mistyped folder: the Hub is asked once, and not if its owner is a
-    folder here.
-    Raises ``DatasetError`` if ``root`` is neither a folder nor a Hub root, or as ``Located.file`` does.
-    """
-    folder = Path(root)
-    if folder.exists() and not folder.is_dir():
-        raise DatasetError(f"{root}: is a file, no such folder")
-    path = path_below(folder, name) if folder.is_dir() else _download(root, name, commit)
-    try:
-        open_regular(path).close()
-    except FileNotFoundError:
-        raise DatasetError(
-            f"{root}: has no {name}, expected a complete dataset folder written by rebar-build"
-        ) from None
-    except OSError as error:
-        raise DatasetError(f"{path}: cannot be read: {error.strerror or error}") from None
-    return path
 
 
 def _download(root: str, name: str, commit: str) -> Path:
@@ -147,19 +135,9 @@ def _download_error(root: str, name: str, error: Exception) -> InputError:
     return DatasetError(f"{root}: not a local folder, and its {name} cannot be downloaded from the Hub: {error}")
 
 
-_CHUNK_BYTES = 1 << 20
-
-
 def file_sha256(path: Path) -> str:
-    """Return the hex SHA-256 of a regular file, read in chunks of 1 MiB.
-
-    Raises ``OSError`` if the file is missing or not a regular file.
-    """
-    digest = hashlib.sha256()
-    with open_regular(path) as stream:
-        while chunk := stream.read(_CHUNK_BYTES):
-            digest.update(chunk)
-    return digest.hexdigest()
+    """Return the hex SHA-256 of a regular file. Raises ``OSError`` if it is missing or not a regular file."""
+    return FileSource(path).sha256()
 
 
 def files_digest(paths: Iterable[Path]) -> str:

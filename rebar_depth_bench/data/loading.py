@@ -9,14 +9,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
 from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
-from rebar_depth_bench.data.rows import RowDecoder
+from rebar_depth_bench.data.rows import row_of_pictures
 from rebar_depth_bench.data.schema import COLUMNS, validated_columns
-from rebar_depth_bench.data.shards import check_shards, damaged_error, iterate_shards
+from rebar_depth_bench.data.shards import check_shards, damaged_error, shard_rows
 from rebar_depth_bench.errors import DatasetError, InputError, escape_text
 from rebar_depth_bench.names import TEST_SPLIT
 
 if TYPE_CHECKING:
-    from datasets import Dataset, IterableDataset
+    from datasets import Dataset, Features, IterableDataset
 
 _CACHE_VERSION = 1
 _ROWS_IN_MEMORY = 8
@@ -97,7 +97,7 @@ def load(
             split=NamedSplit(whole),
         )
         return streamed if part is None else streamed.skip(part.start).take(len(part))
-    loaded = _cached(located, whole).select_columns(list(selected))
+    loaded = _cached(located, whole, decoding_features(located, COLUMNS)).select_columns(list(selected))
     loaded.info.features = decoding_features(located, selected)
     formatted = loaded.with_format("numpy")
     return formatted if part is None else formatted.select(part)
@@ -118,13 +118,12 @@ def _part(config: DatasetConfig, split: str) -> range:
 def _encoded_rows(
     config: DatasetConfig, columns: Sequence[str], shards: Sequence[str]
 ) -> Iterator[dict[str, Any]]:
-    decoder = RowDecoder.of(config)
-    for row in iterate_shards(config, ("view_id", *columns), shards):
-        encoded = decoder.encoded(row)
-        yield {name: encoded[name] for name in columns}
+    for row in shard_rows(config, ("view_id", *columns), shards):
+        cells = row_of_pictures(config, row)
+        yield {name: cells[name] for name in columns}
 
 
-def _cached(config: DatasetConfig, split: str) -> Dataset:
+def _cached(config: DatasetConfig, split: str, features: Features) -> Dataset:
     """Return the rows of a config from the cache of ``datasets``, into which they are copied at the first call.
 
     The cache is mapped into memory. Its key covers the manifest's entry of the config, and place, size and time of
@@ -132,15 +131,13 @@ def _cached(config: DatasetConfig, split: str) -> Dataset:
     """
     from datasets import Dataset, NamedSplit
 
-    from rebar_depth_bench.data.decoding_features import decoding_features
-
     files = [config.file(shard).absolute() for shard in config.shards]
     stamps = [(str(file), file.stat().st_size, file.stat().st_mtime_ns) for file in files]
     key = json.dumps([_CACHE_VERSION, config.root, split, stamps, config.manifest_entry], sort_keys=True)
     try:
         return Dataset.from_generator(
             _encoded_rows,
-            features=decoding_features(config, COLUMNS),
+            features=features,
             gen_kwargs={"config": config, "columns": COLUMNS, "shards": list(config.shards)},
             split=NamedSplit(split),
             fingerprint=hashlib.sha256(key.encode()).hexdigest()[:32],

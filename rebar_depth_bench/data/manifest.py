@@ -8,9 +8,9 @@ from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from pydantic import Field, Strict, ValidationInfo, field_validator
+from pydantic import AliasPath, Field, Strict, ValidationInfo, field_validator
 
-from rebar_depth_bench.data.files import Located, file_sha256, local_path, parameters_digest, views_digest
+from rebar_depth_bench.data.files import Located, file_sha256, parameters_digest, views_digest
 from rebar_depth_bench.data.schema import (
     DIGEST_PATTERN,
     EYES,
@@ -31,11 +31,11 @@ from rebar_depth_bench.limits import JSON_BYTES
 from rebar_depth_bench.names import SPLITS, TEST_SPLIT, scene_prefix
 from rebar_depth_bench.reading import parse_json, read_file
 from rebar_depth_bench.validation import (
-    Expected,
     check_unique,
     field_error,
     format_location,
     one_of,
+    short_repr,
     text,
     validate_table,
 )
@@ -51,6 +51,7 @@ class DatasetConfig(Located):
     row. ``imported`` is None in configs that were rendered.
     """
 
+    manifest_entry: dict[str, Any] = Field(repr=False)
     name: Name
     has_splits: bool
     imported: Imported | None = None
@@ -61,12 +62,18 @@ class DatasetConfig(Located):
     sheet: RelativePath
     references: dict[str, References] = Field({})
     colour: Colour | None
-    manifest_entry: dict[str, Any] = Field(repr=False)
 
     @classmethod
     def fields_of_entry(cls, name: str, entry: Mapping[str, Any]) -> dict[str, Any]:
         """Return the fields of a config from its entry in the manifest, ``root`` left out."""
         return {**entry, "name": name, "manifest_entry": entry}
+
+    @field_validator("name")
+    @classmethod
+    def _check_name(cls, name: str, info: ValidationInfo) -> str:
+        if (found := info.data["manifest_entry"].get("name", name)) != name:
+            raise field_error(f"got {escape_text(str(found))}", f"{name}, the config's key", "conflict")
+        return name
 
     @field_validator("scenes")
     @classmethod
@@ -247,11 +254,23 @@ class DatasetFolder(Located):
     crossings of bars were found.
     """
 
-    version: str
-    digest: str
-    files: dict[str, str]
-    config_by_name: dict[str, DatasetConfig]
+    version: Annotated[str, text(100)]
+    protocol: Annotated[str, one_of("rebar-2")]
+    config_by_name: dict[str, DatasetConfig] = Field(alias="configs")
+    digest: Digest = Field(validation_alias=AliasPath("ground_truth", "digest"))
     crossings: dict[str, Any] = Field({})
+    files: dict[RelativePath, Sha256]
+
+    @field_validator("config_by_name", mode="before")
+    @classmethod
+    def _add_place(cls, entries: Any, info: ValidationInfo) -> Any:
+        if not isinstance(entries, dict) or not entries:
+            raise field_error(f"got {short_repr(entries)}", "a table of one or more configs")
+        place = {"root": info.data["root"], "commit": info.data["commit"]}
+        return {
+            name: {**DatasetConfig.fields_of_entry(name, entry), **place} if isinstance(entry, dict) else entry
+            for name, entry in entries.items()
+        }
 
     @property
     def configs(self) -> tuple[str, ...]:
@@ -286,23 +305,8 @@ class DatasetFolder(Located):
         return {view_id: config.grid for config in configs for view_id in config.view_ids}
 
 
-class _GroundTruth(ManifestTable):
-    digest: Digest
-
-
 class _Format(ManifestTable):
     format: Annotated[str, one_of(MANIFEST_FORMAT)]
-
-
-class _Manifest(ManifestTable):
-    """Manifest of the supported format; its configs are validated one by one."""
-
-    version: Annotated[str, text(100)]
-    protocol: Annotated[str, one_of("rebar-2")]
-    ground_truth: _GroundTruth
-    crossings: dict[str, Any] = Field({})
-    configs: Annotated[dict[str, dict[str, Any]], Expected("a table of one or more configs", bool)]
-    files: dict[RelativePath, Sha256]
 
 
 def open_folder(root: str | Path, *, expect_digest: str | None = None) -> DatasetFolder:
@@ -316,7 +320,7 @@ def open_folder(root: str | Path, *, expect_digest: str | None = None) -> Datase
             f"the expected digest is {escape_text(expect_digest)}, expected sha256: and 64 hex digits"
         )
     root = str(root)
-    path = local_path(root, MANIFEST_FILE)
+    path = Located(root=root).file(MANIFEST_FILE)
     values, problems = read_manifest(path)
     if isinstance(values, dict) and values.get("format") == OLD_FORMAT:
         raise DatasetError(
@@ -342,43 +346,19 @@ def validated_folder(values: Any, problems: list[Problem], root: str, path: Path
 
     Raises ``DatasetError`` with the problems, and with those of the values.
     """
-    # Another format would cause many other problems.
-    supported = not problems and validate_table(_Format, values, problems)
-    head = validate_table(_Manifest, values, problems) if supported else None
-    place = {"root": root, "commit": "" if Path(root).is_dir() else path.parent.name}
-    configs = _read_configs(values.get("configs"), place, problems) if supported else {}
-    if head is not None and not problems:
-        digest = views_digest(view for config in configs.values() for view in config.views)
-        if head.ground_truth.digest != digest:
-            found, expected = f"got {head.ground_truth.digest}", f"the digest of all views, {digest}"
+    folder = None
+    if not problems and validate_table(_Format, values, problems):  # Another format would cause many problems.
+        place = {"root": root, "commit": "" if Path(root).is_dir() else path.parent.name}
+        folder = validate_table(DatasetFolder, {**values, **place}, problems)
+    if folder is not None:
+        problems += _scene_problems(folder.config_by_name.values())
+        digest = views_digest(view for config in folder.config_by_name.values() for view in config.views)
+        if folder.digest != digest:
+            found, expected = f"got {folder.digest}", f"the digest of all views, {digest}"
             problems.append(Problem("conflict", "ground_truth.digest", found, expected))
-    if head is None or problems:
+    if folder is None or problems:
         raise DatasetError.from_problems(path, problems)
-    return DatasetFolder(
-        **place,
-        version=head.version,
-        digest=head.ground_truth.digest,
-        files=head.files,
-        config_by_name=configs,
-        crossings=head.crossings,
-    )
-
-
-def _read_configs(entries: object, place: dict[str, str], problems: list[Problem]) -> dict[str, DatasetConfig]:
-    """Return the valid configs of a manifest, and append the problems of the others."""
-    configs: dict[str, DatasetConfig] = {}
-    for name, entry in entries.items() if isinstance(entries, dict) else ():
-        if not isinstance(entry, dict):  # A problem of the whole manifest.
-            continue
-        where = format_location("configs", name)
-        if entry.get("name", name) != name:
-            found, expected = f"got {escape_text(str(entry['name']))}", f"{escape_text(name)}, the config's key"
-            problems.append(Problem("conflict", format_location(where, "name"), found, expected))
-        fields = {**DatasetConfig.fields_of_entry(name, entry), **place}
-        if config := validate_table(DatasetConfig, fields, problems, where):
-            configs[name] = config
-    problems += _scene_problems(configs.values())
-    return configs
+    return folder
 
 
 def _scene_problems(configs: Iterable[DatasetConfig]) -> Iterator[Problem]:

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8, UInt16
@@ -19,8 +19,8 @@ from numpy import ndarray
 
 from rebar_depth_bench.data import codecs
 from rebar_depth_bench.data.manifest import DatasetConfig
-from rebar_depth_bench.data.schema import column_kind, validated_columns
-from rebar_depth_bench.data.shards import all_rows
+from rebar_depth_bench.data.schema import column_kind
+from rebar_depth_bench.data.shards import encoded_rows
 from rebar_depth_bench.errors import DatasetError, escape_text
 from rebar_depth_bench.geometry.cameras import Camera
 from rebar_depth_bench.validation import short_repr
@@ -129,82 +129,68 @@ def camera_array(kind: str, cell: Any) -> Float64[ndarray, ...]:
     return array
 
 
-@dataclass(frozen=True)
-class RowDecoder:
-    """Decoder of the rows of a config; it is small and can be pickled for worker processes.
+def decode_row(config: DatasetConfig, row: Mapping[str, Any]) -> dict[str, Any]:
+    """Decode the cells of a row of a config; those of its absent columns decode to None.
 
-    ``grid`` is the image size (height, width) that every cell must have, ``scene_by_view`` the name of the
-    scene of each view. The cells of ``absent_columns`` are null, or NaN in a matrix, and decode to None.
+    Raises ``DatasetError`` naming view and column if a cell is damaged or contradicts the manifest.
     """
+    view = str(row.get("view_id", f"a view of {config.name}"))
+    return {name: _decode(config, name, cell, view) for name, cell in row.items()}
 
-    root: str
-    config: str
-    grid: tuple[int, int]
-    scene_by_view: Mapping[str, str]
-    absent_columns: frozenset[str] = frozenset()
 
-    @classmethod
-    def of(cls, config: DatasetConfig) -> Self:
-        """Return the decoder of a config."""
-        return cls(config.root, config.name, config.grid, config.scene_by_view, config.absent_columns)
+def row_of_pictures(config: DatasetConfig, row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a row for ``datasets``, whose images stay encoded and have the path that ``open_cell`` expects.
 
-    def row(self, row: Mapping[str, Any]) -> dict[str, Any]:
-        """Decode the cells of a row. Raises ``DatasetError`` naming view and column if a cell is damaged."""
-        view = str(row.get("view_id", f"a view of {self.config}"))
-        return {name: self._decode(name, cell, view) for name, cell in row.items()}
-
-    def encoded(self, row: Mapping[str, Any]) -> dict[str, Any]:
-        """Return a row for ``datasets``, whose images stay encoded and have the path that ``picture`` expects.
-
-        All other cells are checked. Raises ``DatasetError`` as ``row``.
-        """
-        return {name: self._encoded(name, cell, str(row["view_id"])) for name, cell in row.items()}
-
-    def picture(self, column: str, content: bytes, path: str) -> codecs.Picture:
-        """Decode the image in a cell of ``encoded``. Raises ``DatasetError`` as ``row``."""
-        with self._naming(path.removeprefix(self.place), column):
-            return codecs.open_picture(column_kind(column), content, self.grid)
-
-    @property
-    def place(self) -> str:
-        """Start of the paths of images, before the id of the view."""
-        return f"{self.root}/"
-
-    def _encoded(self, column: str, cell: Any, view: str) -> Any:
+    All other cells are checked. Raises ``DatasetError`` as ``decode_row``.
+    """
+    cells, view = dict(row), str(row["view_id"])
+    for column, cell in row.items():
         kind = column_kind(column)
-        if kind not in codecs.PICTURE_KINDS or column in self.absent_columns:
-            self._decode(column, cell, view)
-            return cell
-        with self._naming(view, column):
-            return {"bytes": _content(kind, cell), "path": self.place + view}
+        if kind not in codecs.PICTURE_KINDS or column in config.absent_columns:
+            _decode(config, column, cell, view)
+        else:
+            with _naming(config.root, view, column):
+                cells[column] = {"bytes": _content(kind, cell), "path": picture_place(config.root) + view}
+    return cells
 
-    def _decode(self, column: str, cell: Any, view: str) -> Any:
-        with self._naming(view, column):
-            if column in self.absent_columns:
-                if not is_absent(cell):
-                    raise ValueError("it has a value, expected null as in the manifest")
-                return None
-            return self._decode_kind(column_kind(column), cell, view)
 
-    @contextmanager
-    def _naming(self, view: str, column: str) -> Iterator[None]:
-        try:
-            yield
-        except Exception as error:  # Pillow raises many types, which depend on the damage.
-            reason = escape_text(str(error) or type(error).__name__)
-            raise DatasetError(
-                f"{self.root}: view {escape_text(view)}: {column} is damaged: {reason}; "
-                f"rebar-bench verify {self.root} lists damaged files"
-            ) from error
+def picture_place(root: str) -> str:
+    """Return the start of the paths of images in ``row_of_pictures``, before the id of the view."""
+    return f"{root}/"
 
-    def _decode_kind(self, kind: str, cell: Any, view: str) -> Any:
+
+def open_cell(root: str, grid: tuple[int, int], column: str, cell: Mapping[str, Any]) -> codecs.Picture:
+    """Decode the image in a cell of ``row_of_pictures``. Raises ``DatasetError`` as ``decode_row``."""
+    with _naming(root, cell["path"].removeprefix(picture_place(root)), column):
+        return codecs.open_picture(column_kind(column), cell["bytes"], grid)
+
+
+@contextmanager
+def _naming(root: str, view: str, column: str) -> Iterator[None]:
+    try:
+        yield
+    except Exception as error:  # Pillow raises many types, which depend on the damage.
+        reason = escape_text(str(error) or type(error).__name__)
+        raise DatasetError(
+            f"{root}: view {escape_text(view)}: {column} is damaged: {reason}; "
+            f"rebar-bench verify {root} lists damaged files"
+        ) from error
+
+
+def _decode(config: DatasetConfig, column: str, cell: Any, view: str) -> Any:
+    kind = column_kind(column)
+    with _naming(config.root, view, column):
+        if column in config.absent_columns:
+            if not is_absent(cell):
+                raise ValueError("it has a value, expected null as in the manifest")
+            return None
         if kind in codecs.PICTURE_KINDS:
-            return codecs.decode(kind, _content(kind, cell), self.grid)
+            return codecs.decode(kind, _content(kind, cell), config.grid)
         if kind in CAMERA_KINDS:
             return camera_array(kind, cell)
-        if kind == "view_id" and cell not in self.scene_by_view:
+        if kind == "view_id" and cell not in config.scene_by_view:
             raise ValueError("it is not in the manifest")
-        if kind == "scene" and cell != (expected := self.scene_by_view.get(view, cell)):
+        if kind == "scene" and cell != (expected := config.scene_by_view.get(view, cell)):
             raise ValueError(f"got {short_repr(cell)}, expected {expected} as in the manifest")
         if kind == "baseline_m" and not (isinstance(cell, float) and math.isfinite(cell)):
             raise ValueError(f"got {cell}, expected a length in metres")
@@ -219,32 +205,11 @@ def _content(kind: str, cell: Any) -> bytes:
     return content
 
 
-def iterate_rows(config: DatasetConfig, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Yield the decoded rows of a config, one at a time, without a cache.
+def iterate_rows(
+    config: DatasetConfig, columns: Sequence[str], view_ids: Collection[str] | None = None
+) -> Iterator[dict[str, Any]]:
+    """Yield the decoded rows of a config, or those of some views, one at a time, without a cache.
 
-    Raises ``DatasetError`` if a shard or a cell is damaged, and unless the rows are the views of the manifest.
+    Raises ``DatasetError`` if a cell is damaged, and as ``encoded_rows``.
     """
-    return map(RowDecoder.of(config).row, iterate_undecoded(config, columns))
-
-
-def iterate_undecoded(config: DatasetConfig, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Yield the rows of a config with encoded images and depth, one at a time; ``RowDecoder`` decodes them.
-
-    The shards are read with pyarrow: ``datasets`` takes a second to import, and imports torch, which takes
-    several, to stream. Shards of the Hub are streamed. Raises ``DatasetError`` as ``iterate_rows``.
-    """
-    return all_rows(config, validated_columns(columns))
-
-
-def check_columns(config: DatasetConfig, columns: Sequence[str], reader: str) -> None:
-    """Raise ``DatasetError`` if ``reader`` needs columns that are absent: built or imported without them."""
-    needed = [name for name in columns if name in config.absent_columns]
-    if not needed:
-        return
-    place = f"{config.root}: {reader} needs {', '.join(needed)}, but config {config.name} was"
-    if config.imported is not None:
-        raise DatasetError(f"{place} imported without them; choose other configs (--config)")
-    raise DatasetError(
-        f"{place} built without colour (rebar-build --no-colour); choose configs with colour (--config), or build "
-        "it with colour"
-    )
+    return (decode_row(config, row) for row in encoded_rows(config, columns, view_ids))

@@ -6,7 +6,16 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
 import pyarrow as pa
-from pydantic import ConfigDict, Field, Strict, StringConstraints, ValidationInfo, field_validator, model_validator
+from pydantic import (
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    Strict,
+    StringConstraints,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from rebar_depth_bench.errors import DatasetError, escape_text
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
@@ -122,10 +131,6 @@ _SHELLS = ("dome", "ring", "sweep")
 """Kinds of the trajectories that are a ``Trajectory``."""
 _Views = Annotated[int, whole_number(1, 1_000_000)]
 _Distances = Annotated[tuple[Annotated[float, number(0)], ...], Strict(False), Field(min_length=1)]
-_Point = Annotated[Triple, three_numbers(-1e9, 1e9, "three numbers, [x, y, z]")]
-_Station = Annotated[
-    tuple[_Point, _Point], Strict(False), Expected("two points, of the left camera and of the steel aimed at")
-]
 
 
 class Trajectory(ManifestTable):
@@ -154,29 +159,16 @@ class Trajectory(ManifestTable):
 
 
 class Survey(ManifestTable):
-    """Cameras of a config that stand at the ``distances_m`` from points of the steel.
-
-    ``stations`` are the centre of the left camera and the point aimed at of each view, world metres, in order.
-    """
+    """Cameras of a config that stand at the ``distances_m`` from points of the steel."""
 
     kind: Annotated[str, one_of(SURVEY)] = SURVEY
     distances_m: _Distances
     views_per_distance: _Views
-    stations: Annotated[tuple[_Station, ...], Strict(False)]
-
-    @field_validator("stations")
-    @classmethod
-    def _check_stations(cls, stations: tuple[_Station, ...], info: ValidationInfo) -> tuple[_Station, ...]:
-        if {"distances_m", "views_per_distance"} <= info.data.keys():
-            views = len(info.data["distances_m"]) * info.data["views_per_distance"]
-            if len(stations) != views:
-                raise field_error(f"got {len(stations)} stations", f"{views}: one for each view", "conflict")
-        return stations
 
     @property
     def views(self) -> int:
         """Number of views of the full trajectory."""
-        return len(self.stations)
+        return len(self.distances_m) * self.views_per_distance
 
 
 class RandomViews(ManifestTable):
@@ -337,7 +329,7 @@ class Scene(ManifestTable):
     board: BoardSpec | None
     environment: Annotated[str, StringConstraints(max_length=60)] = ""
     appearance: Appearance = Appearance()
-    protocol: AnyTrajectory | None = None
+    protocol: Annotated[AnyTrajectory, BeforeValidator(trajectory_of)] | None = None
     protocol_views: Annotated[int, whole_number(1, 1_000_000)]
     rig: SceneRig | None = None
     aim_point_m: Annotated[Triple, three_numbers(-1e9, 1e9, "three numbers, [x, y, z]")] | None = None
@@ -356,11 +348,6 @@ class Scene(ManifestTable):
     @classmethod
     def _make_board(cls, fields: Any) -> BoardSpec | None:
         return None if fields is None else BoardSpec(**_BoardTable.model_validate(fields).model_dump())
-
-    @field_validator("protocol", mode="before")
-    @classmethod
-    def _make_protocol(cls, fields: Any) -> AnyTrajectory | None:
-        return None if fields is None else trajectory_of(fields)
 
     @field_validator("protocol_views")
     @classmethod

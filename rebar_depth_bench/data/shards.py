@@ -11,18 +11,21 @@ structure of Thrift's compact protocol. Structures become dicts by field number;
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, BinaryIO
 
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.data.manifest import DatasetConfig
-from rebar_depth_bench.data.schema import ROW_SCHEMA, column_kind
+from rebar_depth_bench.data.schema import ROW_SCHEMA, column_kind, validated_columns
 from rebar_depth_bench.errors import DatasetError, InputError, escape_text
 from rebar_depth_bench.limits import CELL_BYTES
+from rebar_depth_bench.reading import open_regular
 
 _TAIL_BYTES = 8
 """Length of the end of a file: the number of bytes of the footer (32 bits, little-endian), and ``PAR1``."""
@@ -241,6 +244,25 @@ def read_rows(
         yield from batch.select(present.names).cast(present).to_pylist()
 
 
+def read_table(path: Path, table: Table, what: str) -> Iterator[dict[str, Any]]:
+    """Yield the rows of a Parquet file from outside; ``what`` is its content, for messages.
+
+    Raises ``DatasetError`` if the file is missing, damaged, or does not hold ``table``.
+    """
+    try:
+        with open_regular(path) as stream, open_parquet(stream, table) as (file, _):
+            yield from read_rows(file, table.schema, batch_rows=1000)
+    except Exception as error:  # pyarrow raises many types, which depend on the damage.
+        reason = escape_text(str(error) or type(error).__name__)
+        raise DatasetError(f"{path}: cannot be read as a table of {what}: {reason}") from error
+
+
+def write_table(path: Path, rows: Sequence[Mapping[str, Any]], schema: pa.Schema) -> None:
+    """Write rows as a Parquet file, atomically."""
+    with atomic_replace(path) as temporary:
+        pq.write_table(pa.Table.from_pylist(rows, schema=schema), temporary)
+
+
 def _check_schema(found: pa.Schema, table: Table) -> None:
     for column in table.schema:
         occurrences = found.names.count(column.name)
@@ -274,14 +296,19 @@ def check_shards(config: DatasetConfig) -> None:
             raise DatasetError(f"{config.root}: {found}, expected the manifest's {views} views")
 
 
-def all_rows(config: DatasetConfig, columns: Sequence[str]) -> Iterator[dict[str, Any]]:
-    """Yield the rows of all shards, with the cells of ``columns`` encoded.
+def encoded_rows(
+    config: DatasetConfig, columns: Sequence[str], view_ids: Collection[str] | None = None
+) -> Iterator[dict[str, Any]]:
+    """Yield the rows of a config, or those of some views, one at a time, with images and depth encoded.
 
-    Raises ``DatasetError`` for a damaged shard, and unless each view of the manifest occurs exactly once.
+    Raises ``DatasetError`` for a damaged shard, and unless each of the views occurs exactly once; if all are read,
+    no others may occur.
     """
-    remaining = set(config.view_ids)
-    known = frozenset(remaining)
-    for row in iterate_shards(config, ("view_id", *columns), config.shards):
+    columns = validated_columns(columns)
+    known = frozenset(config.view_ids if view_ids is None else view_ids)
+    remaining = set(known)
+    shards = config.shards if view_ids is None else _shards_with(config, view_ids)
+    for row in shard_rows(config, ("view_id", *columns), shards, None if view_ids is None else remaining):
         view_id = row["view_id"]
         if view_id not in remaining:
             found = f"view {escape_text(str(view_id))}"
@@ -291,42 +318,45 @@ def all_rows(config: DatasetConfig, columns: Sequence[str]) -> Iterator[dict[str
             raise DatasetError(f"{config.root}: {problem}")
         remaining.remove(view_id)
         yield {name: row[name] for name in columns}
+        if view_ids is not None and not remaining:
+            return
     if remaining:
         raise DatasetError(
             f"{config.root}: {config.name} lacks {len(remaining)} views, among them {min(remaining)}"
         )
 
 
-def iterate_shards(
-    config: DatasetConfig, columns: Sequence[str], shards: Sequence[str]
-) -> Iterator[dict[str, Any]]:
-    """Yield the rows of ``shards``, with the cells of ``columns`` encoded; only one is in memory at a time.
+def _shards_with(config: DatasetConfig, view_ids: Collection[str]) -> list[str]:
+    """Return the shards of the scenes of some views; those of a single view begin where it is expected."""
+    scenes = {config.scene_by_view[view_id] for view_id in view_ids}
+    shards = [shard for scene in config.scenes if scene.name in scenes for shard in scene.shards]
+    if len(view_ids) == 1:
+        [view_id] = view_ids
+        in_scene = [other for other in config.view_ids if config.scene_by_view[other] in scenes]
+        expected = in_scene.index(view_id) * len(shards) // len(in_scene)
+        shards = sorted(shards, key=lambda shard: abs(shards.index(shard) - expected))
+    return shards
 
-    Raises ``DatasetError`` for a damaged shard.
+
+def shard_rows(
+    config: DatasetConfig, columns: Sequence[str], shards: Sequence[str], view_ids: Collection[str] | None = None
+) -> Iterator[dict[str, Any]]:
+    """Yield the rows of ``shards``, or those of some views, with the cells of ``columns`` encoded.
+
+    Of a shard with one row group for each view, as the builder writes it, only the wanted rows are read. Raises
+    ``DatasetError`` for a damaged shard.
     """
     table = _shard_table(config, ("view_id", *columns))
     for shard in shards:
-        with _open_shard(config, shard, table) as (file, _):
-            for row in read_rows(file, table.schema):
-                yield {name: row[name] for name in columns}
-
-
-def rows_at(config: DatasetConfig, columns: Sequence[str], positions: Sequence[int]) -> Iterator[dict[str, Any]]:
-    """Yield the rows at ``positions``, counted over all shards; the cells of ``columns`` stay encoded.
-
-    Only these are read from shards with one row group per view, as the builder writes them. Raises
-    ``DatasetError`` for a damaged shard.
-    """
-    table, first = _shard_table(config, ("view_id", *columns)), 0
-    for shard in config.shards:
         with _open_shard(config, shard, table) as (file, count):
-            wanted = [position - first for position in positions if first <= position < first + count]
-            is_direct = file.num_row_groups == count
-            rows = read_rows(file, table.schema, row_groups=wanted if is_direct else None) if wanted else ()
-            for index, row in enumerate(rows):
-                if is_direct or index in wanted:
+            groups = None
+            if view_ids is not None:
+                stored = file.read(columns=["view_id"])["view_id"].to_pylist()
+                wanted = [index for index, view_id in enumerate(stored) if view_id in view_ids]
+                groups = wanted if not wanted or file.num_row_groups == count else None
+            for row in read_rows(file, table.schema, row_groups=groups):
+                if view_ids is None or row["view_id"] in view_ids:
                     yield {name: row[name] for name in columns}
-        first += count
 
 
 def damaged_error(config: DatasetConfig, error: Exception, shard: str = "") -> DatasetError:

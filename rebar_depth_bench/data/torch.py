@@ -213,13 +213,12 @@ class _EpochLoader(DataLoader[Any]):
             generator=torch.Generator(),
         )
         self._collate = collate
-        self._rows = source.rows if isinstance(source, _StreamedRows) else None
 
     def __iter__(self) -> Any:
         self._collate.epoch += 1
         self.generator.manual_seed(self._collate.augmentation.seed + self._collate.epoch)
-        if self._rows is not None:
-            self._rows.set_epoch(self._collate.epoch)
+        if isinstance(self.dataset, _StreamedRows):
+            self.dataset.rows.set_epoch(self._collate.epoch)
         return super().__iter__()
 
 

@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from rebar_depth_bench.data.manifest import DatasetConfig
-from rebar_depth_bench.data.rows import RowDecoder, check_columns, iterate_undecoded
+from rebar_depth_bench.data.rows import iterate_rows
+from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 
 
@@ -111,8 +112,17 @@ class ConfigViews:
         return tuple(map(ConfigViews, self.source.by_scene()))
 
     def check_columns(self, columns: Sequence[str], reader: str) -> None:
-        """Raise ``DatasetError`` if ``reader`` needs columns that the config lacks."""
-        check_columns(self.source, columns, reader)
+        """Raise ``DatasetError`` if ``reader`` needs columns that the config was built or imported without."""
+        needed = [name for name in columns if name in self.source.absent_columns]
+        if not needed:
+            return
+        place = f"{self.source.root}: {reader} needs {', '.join(needed)}, but config {self.source.name} was"
+        if self.source.imported is not None:
+            raise DatasetError(f"{place} imported without them; choose other configs (--config)")
+        raise DatasetError(
+            f"{place} built without colour (rebar-build --no-colour); choose configs with colour (--config), or "
+            "build it with colour"
+        )
 
     def rows(self, *columns: str, skip: Collection[str] = ()) -> Iterator[dict[str, Any]]:
         """Yield the decoded ``view_id`` and named columns of each view that is not in ``skip``, in order.
@@ -120,7 +130,5 @@ class ConfigViews:
         Raises ``DatasetError`` for columns that the config lacks.
         """
         self.check_columns(columns, "the method")
-        decoder = RowDecoder.of(self.source)
-        for row in iterate_undecoded(self.source, ("view_id", *columns)):
-            if row["view_id"] not in skip:
-                yield decoder.row(row)
+        wanted = [view_id for view_id in self.view_ids if view_id not in skip] if skip else None
+        return iterate_rows(self.source, ("view_id", *columns), wanted)

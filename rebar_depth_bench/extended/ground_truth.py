@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -152,25 +152,27 @@ def load_steel_truth(
 
     content = CacheContent(
         source=config.root,
+        task=f"bars in the views of {config.name}",
         inputs=cache_inputs(config, EXTENDED_PROTOCOL, folder.files[BARS_FILE]),
         dtypes=_DTYPES,
         view_ids=tuple(scored_px),
-        extract=lambda: _view_arrays(config, bars_by_view, progress),
+        extract=lambda view_ids: _view_arrays(config, bars_by_view, view_ids),
         is_sound=is_sound,
     )
-    cache = open_cache(content)
+    cache = open_cache(content, progress)
     rays = {lens: _rays(lens, height, width) for lens in {numbers[:_LENS_NUMBERS] for numbers in cache.numbers}}
     protocol = f"{EXTENDED_PROTOCOL} {CROSSINGS_PROTOCOL}"
     judged = CacheContent(
         source=config.root,
+        task=f"crossings in the views of {config.name}",
         inputs=cache_inputs(config, protocol, f"{folder.files[BARS_FILE]} {found.sha256}"),
         dtypes={"crossing": np.uint32, "pixel": np.uint32},
         view_ids=tuple(scored_px),
-        extract=lambda: _judged_arrays(cache, config, rays, bars_by_view, progress),
+        extract=lambda view_ids: _judged_arrays(cache, config, rays, bars_by_view, view_ids),
         is_sound=lambda view: len(view.arrays["pixel"]) % (2 * SAMPLED_PIXELS) == 0,
     )
     return ConfigSteelTruth(
-        height, width, bars_by_view, rays, cache, open_cache(judged), found.source, found.sha256
+        height, width, bars_by_view, rays, cache, open_cache(judged, progress), found.source, found.sha256
     )
 
 
@@ -198,24 +200,25 @@ def _judged_arrays(
     config: DatasetConfig,
     rays: Mapping[Lens, Rays],
     bars_by_view: Mapping[str, SceneBars],
-    progress: Progress,
+    view_ids: Collection[str] | None,
 ) -> Iterator[ViewArrays]:
-    """Yield the judged crossings of every view: their sampled pixels, each with the index of its crossing."""
-    for position in range(len(cache)):
+    """Yield the judged crossings of some views, or all: their sampled pixels, each with its crossing's index."""
+    for position, view_id in enumerate(cache.view_ids):
+        if view_ids is not None and view_id not in view_ids:
+            continue
         truth = _steel_truth(cache.view(position), config.grid, rays)
         judged = judged_crossings(truth, bars_by_view[truth.view_id].crossings)
         pixel = judged.pixels.ravel()
         arrays = {"crossing": np.repeat(judged.crossing, 2 * SAMPLED_PIXELS), "pixel": pixel}
         yield ViewArrays(truth.view_id, arrays, ())
-        progress(f"crossings in the views of {config.name}", position + 1, len(cache))
 
 
 def _view_arrays(
-    config: DatasetConfig, bars_by_view: Mapping[str, SceneBars], progress: Progress
+    config: DatasetConfig, bars_by_view: Mapping[str, SceneBars], view_ids: Collection[str] | None
 ) -> Iterator[ViewArrays]:
-    """Yield the cached arrays of every view with scored pixels, with the numbers of K, distortion and pose."""
+    """Yield the cached arrays of some views, or of all with scored pixels, with numbers of K, distortion, pose."""
     rays: dict[Lens, Rays] = {}
-    for view_id, left, scored in verified_views(config, progress, "bars in the views"):
+    for view_id, left, scored in verified_views(config, view_ids):
         if not len(scored):
             continue
         lens = _lens(left.camera)

@@ -20,8 +20,8 @@ from numpy import ndarray
 
 from rebar_depth_bench import software_version
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_folder
-from rebar_depth_bench.data.rows import CAMERA_KINDS, RowDecoder, camera_from_row, iterate_undecoded
-from rebar_depth_bench.data.shards import rows_at
+from rebar_depth_bench.data.rows import CAMERA_KINDS, camera_from_row, decode_row
+from rebar_depth_bench.data.shards import encoded_rows
 from rebar_depth_bench.errors import Problem, SubmissionError
 from rebar_depth_bench.geometry.cameras import Camera
 from rebar_depth_bench.names import TEST_SPLIT, config_of, split_of
@@ -97,7 +97,7 @@ class View:
         """Return the decoded cell of a column. Raises ``DatasetError`` if it is damaged."""
         if column not in self._decoded:
             row = {"view_id": self.view_id, column: self.encoded[column]}
-            self._decoded[column] = RowDecoder.of(self.config).row(row)[column]
+            self._decoded[column] = decode_row(self.config, row)[column]
         return self._decoded[column]
 
     def camera(self, eye: str) -> Camera:
@@ -113,14 +113,9 @@ def read_views(
 
     Raises ``DatasetError`` for a damaged shard.
     """
-    remaining = {config.view_ids[position]: position for position in sorted(positions)}
-    for row in rows_at(config, ("view_id", *columns), list(remaining.values())):
-        if (position := remaining.pop(row["view_id"], None)) is not None:
-            yield View(config, position, row, read_depth)
-    if remaining:  # The rows are in another order than in the manifest.
-        for row in iterate_undecoded(config, ("view_id", *columns)):
-            if (position := remaining.pop(row["view_id"], None)) is not None:
-                yield View(config, position, row, read_depth)
+    position_by_view = {config.view_ids[position]: position for position in positions}
+    for row in encoded_rows(config, ("view_id", *columns), position_by_view):
+        yield View(config, position_by_view[row["view_id"]], row, read_depth)
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,7 @@ read the cache one view at a time.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -127,13 +127,14 @@ def config_truth(folder: DatasetFolder, config: DatasetConfig, progress: Progres
 
     content = CacheContent(
         source=config.root,
+        task=f"ground truth of {config.name}",
         inputs=cache_inputs(config, PROTOCOL, folder.files[BARS_FILE] if has_widths else ""),
         dtypes={"index": np.uint32, "depth_m": np.float32, "single_bar": np.bool_},
         view_ids=tuple(scored_px),
-        extract=lambda: _extract_views(config, progress, diameters),
+        extract=lambda view_ids: _extract_views(config, diameters, view_ids),
         is_sound=is_sound,
     )
-    return ConfigTruth(open_cache(content), config)
+    return ConfigTruth(open_cache(content, progress), config)
 
 
 def _diameters_by_scene(folder: DatasetFolder) -> dict[str, dict[int, float]]:
@@ -147,7 +148,7 @@ def reference_errors(config: DatasetConfig) -> Reference:
 
     Raises ``DatasetError`` as ``config_truth``.
     """
-    views = _extract_views(config, silent, None)
+    views = _extract_views(config, None)
     return mean_reference(reference_of_numbers(view.numbers[_REFERENCE]) for view in views)
 
 
@@ -178,29 +179,28 @@ def scored_counts(config: DatasetConfig) -> dict[str, int]:
 
 
 def verified_views(
-    config: DatasetConfig, progress: Progress, task: str
+    config: DatasetConfig, view_ids: Collection[str] | None = None
 ) -> Iterator[tuple[str, EyeTruth, UInt32[ndarray, " n"]]]:
-    """Yield id, left eye and flat indices of the scored pixels of every view, verified against the manifest.
+    """Yield id, left eye and flat indices of the scored pixels of some views, or all, verified by the manifest.
 
-    ``task`` is its name in ``progress``. Raises ``DatasetError`` as ``iterate_rows``, and naming a view that does
-    not match its digest.
+    Raises ``DatasetError`` as ``iterate_rows``, and naming a view that does not match its digest.
     """
     records = {view.view_id: view for view in config.views}
-    rows = iterate_rows(config, ("view_id", *truth_columns("left")))
-    for done, row in enumerate(rows, start=1):
+    for row in iterate_rows(config, ("view_id", *truth_columns("left")), view_ids):
         view_id, left = row["view_id"], truth_from_row(row, "left")
         yield view_id, left, _verified_pixels(left, records[view_id], config)
-        progress(f"{task} of {config.name}", done, len(records))
 
 
 def _extract_views(
-    config: DatasetConfig, progress: Progress, diameters: Mapping[str, Mapping[int, float]] | None
+    config: DatasetConfig,
+    diameters: Mapping[str, Mapping[int, float]] | None,
+    view_ids: Collection[str] | None = None,
 ) -> Iterator[ViewArrays]:
-    """Yield the cached arrays and numbers of every view with scored pixels.
+    """Yield the cached arrays and numbers of some views, or of all that have scored pixels.
 
     With ``diameters``, the diameters of the bars by scene, the last number is the bar width in pixels.
     """
-    for view_id, left, pixels in verified_views(config, progress, "ground truth"):
+    for view_id, left, pixels in verified_views(config, view_ids):
         if len(pixels):
             depth_m = left.depth_m.ravel()[pixels]
             median_m = median(depth_m)

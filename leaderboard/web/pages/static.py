@@ -14,7 +14,7 @@ from PIL import Image
 
 from leaderboard.web.api.auth import ServiceDep
 from rebar_depth_bench.data.manifest import DatasetFolder
-from rebar_depth_bench.data.rows import RowDecoder, iterate_undecoded
+from rebar_depth_bench.data.rows import iterate_rows
 
 router = APIRouter(include_in_schema=False)
 
@@ -70,8 +70,8 @@ def _scene_webp(folder: DatasetFolder, config: str) -> bytes | None:
     Raises ``DatasetError`` if the shard cannot be read.
     """
     shown = folder.config(config)
-    row = next(iter(iterate_undecoded(shown, ("view_id", "left_rgb"))), None)
-    rgb = None if row is None else RowDecoder.of(shown).row(row)["left_rgb"]
+    row = next(iterate_rows(shown, ("view_id", "left_rgb")), None)
+    rgb = None if row is None else row["left_rgb"]
     if rgb is None:
         return None
     image = Image.fromarray(rgb)

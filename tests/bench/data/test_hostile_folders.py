@@ -24,7 +24,7 @@ from PIL import Image
 import rebar_depth_bench as rdb
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.bars import BARS_SCHEMA, read_bars
-from rebar_depth_bench.data.codecs import encode_depth, encode_mask
+from rebar_depth_bench.data.codecs import encode_depth, encode_png
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import iterate_rows
 from rebar_depth_bench.data.schema import COLUMNS
@@ -86,7 +86,7 @@ MIRRORED = [[-1.0, 0.0, 0.0, 0.0], *IDENTITY[1:]]
         ("left_depth", encode_depth(np.full(GRID, np.nan, np.float32))),
         ("left_depth", encode_depth(np.full(GRID, -1, np.float32))),
         ("right_depth", encode_depth(np.ones(GRID, np.float32))[:-20]),
-        ("left_mask", {"bytes": encode_mask(np.ones((180, 160), bool)), "path": None}),
+        ("left_mask", {"bytes": encode_png(np.ones((180, 160), bool)), "path": None}),
         ("left_mask", {"bytes": None, "path": "/etc/hostname"}),
         ("left_mask", None),
         ("left_bars", png(np.ones((90, 160, 3), np.uint8))),
@@ -121,7 +121,7 @@ def test_large_image_is_refused_before_it_is_decoded(copy: Path, column: str) ->
     """Refuse an image of 12,000 x 12,000 in a few kilobytes; decoded, it takes 576 MB as depth."""
     cells: dict[str, Callable[[], Any]] = {
         "left_depth": lambda: encode_depth(np.zeros((12_000, 12_000), np.float32)),
-        "left_mask": lambda: {"bytes": encode_mask(np.zeros((12_000, 12_000), bool)), "path": None},
+        "left_mask": lambda: {"bytes": encode_png(np.zeros((12_000, 12_000), bool)), "path": None},
     }
     cell = cells[column]()
     change_rows(first_shard(copy), lambda rows: rows[0].update({column: cell}))

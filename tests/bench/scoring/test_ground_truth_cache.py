@@ -22,7 +22,6 @@ from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import EyeTruth
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
-from rebar_depth_bench.parallel import silent
 from rebar_depth_bench.scoring.truth import config_truth, verified_views
 from tests.commands import run_in_process
 from tests.damage import change_manifest
@@ -35,7 +34,7 @@ CONFIG = "lattice-orbit"
 
 @pytest.fixture
 def archive(tiny_root: Path, archive_of: Callable[..., Path]) -> Path:
-    views = verified_views(open_folder(tiny_root).config(CONFIG), silent, "")
+    views = verified_views(open_folder(tiny_root).config(CONFIG))
     return archive_of({view_id: 1.015 * left.depth_m for view_id, left, _ in views})
 
 
@@ -87,6 +86,7 @@ def test_changed_bytes_of_cache_never_change_results(
         assert found == expected, (path.name, position)
         [warning] = warnings.splitlines()
         assert path.name in warning
+        assert result(archive, tiny_root, target, *options) == (expected, "")  # Written again, if it was deleted.
         assert tree(empty_cache) == intact
 
 
@@ -180,7 +180,7 @@ def test_grid_that_differs_from_images_names_view(copy: Path) -> None:
 def change_depth(root: Path, change: Callable[[np.ndarray], np.ndarray]) -> None:
     """Change the left depth of all views of a config, and their digests in the manifest."""
     digests: dict[str, str] = {}
-    views = {view_id: left for view_id, left, _ in verified_views(open_folder(root).config(CONFIG), silent, "")}
+    views = {view_id: left for view_id, left, _ in verified_views(open_folder(root).config(CONFIG))}
     for path in root.glob(f"{CONFIG}/*.parquet"):
         table = pq.read_table(path)
         rows = table.to_pylist()

@@ -19,7 +19,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from rebar_depth_bench import DatasetError, SubmissionError, score
-from rebar_depth_bench.data.codecs import decode, encode_depth, encode_mask
+from rebar_depth_bench.data.codecs import decode, encode_depth, encode_png
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.scoring.columns import rounded
 from rebar_depth_bench.scoring.protocol import interior
@@ -198,7 +198,7 @@ def test_damaged_ground_truth_names_view(
         ("left_depth", lambda cell: encode_depth(decode("depth", cell, (90, 160))[:, 1:])),
         (
             "left_mask",
-            lambda cell: cell | {"bytes": encode_mask(decode("mask", cell["bytes"], (90, 160)).reshape(-1, 90))},
+            lambda cell: cell | {"bytes": encode_png(decode("mask", cell["bytes"], (90, 160)).reshape(-1, 90))},
         ),
     ],
 )

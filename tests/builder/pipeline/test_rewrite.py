@@ -82,7 +82,7 @@ def test_other_commands_name_the_option(root: Path, command: Any, arguments: tup
     ("change", "where"),
     [
         (lambda manifest: manifest.update(configs=[]), "configs"),
-        (lambda manifest: manifest["configs"].update(lattice=7), "configs"),
+        (lambda manifest: manifest["configs"].update(lattice=7), "configs.lattice"),
         (lambda manifest: manifest["configs"]["lattice"].update(scene=7), "configs.lattice.scenes 1: name"),
         (lambda manifest: manifest["configs"]["lattice"].update(scenes=[7]), "configs.lattice.scenes 1"),
         (lambda manifest: manifest["configs"]["lattice"].update(rig="x"), "configs.lattice.rig"),

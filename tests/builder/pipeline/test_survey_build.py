@@ -39,7 +39,7 @@ def test_build_of_life_size_column(tmp_path: Path, run_build: RunBuild) -> None:
     assert all((view.steel_px or 0) > 10 for view in config.views)
     assert all(view.scored_px > 20 for view in config.views[:2])  # Bars at 2 m are a pixel thick.
     for row, n in zip(rdb.load(root, "column"), (1, 3, 5, 7), strict=True):
-        centre_m, aimed_m = config.scene.protocol.stations[n]
+        centre_m, aimed_m = config.scene.entry["protocol"]["stations"][n]
         np.testing.assert_allclose(camera_centre(row["left_cam_from_world"]), centre_m, atol=1e-9)
         steel_m = row["left_depth"][row["left_mask"]]
         distance_m = float(np.linalg.norm(np.subtract(centre_m, aimed_m)))
