@@ -31,7 +31,7 @@ from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareId
 from rebar_depth_bench.scoring.score import ReadDepth, score_views
 from rebar_depth_bench.scoring.table import ViewScore
 from rebar_depth_bench.scoring.truth import config_truth
-from rebar_depth_bench.submission import Declaration, EntryError, SubmissionReader, open_submission
+from rebar_depth_bench.submission import Declaration, EntryError, SubmissionReader
 from rebar_depth_bench.submission.declaration import NOT_DECLARED
 from rebar_depth_bench.submission.maps import Depth
 
@@ -184,7 +184,7 @@ def open_evaluation(
     invalid, and ``DatasetError`` if the dataset folder is, or if its digest is not ``expect_digest``.
     """
     folder = open_folder(root, expect_digest=expect_digest)
-    with open_submission(archive, folder.expected_views()) as submission:
+    with SubmissionReader(archive, folder.expected_views()) as submission:
         if submission.meta is None or submission.structure_problems:
             raise SubmissionError.from_problems(archive, list(submission.problems()))
         yield Evaluation(folder, submission)

@@ -26,7 +26,7 @@ from PIL import Image
 
 from rebar_depth_bench.errors import EntryError, Problem, escape_text, format_shape
 from rebar_depth_bench.reading import MemorySource
-from rebar_depth_bench.submission.zip import DirectoryError, check_entries, read_data, read_directory
+from rebar_depth_bench.submission.zip import read_data, read_entries
 
 MAX_HEADER_BYTES = 4096
 """Largest accepted ``.npy`` header, magic string included, in bytes."""
@@ -119,20 +119,20 @@ def decode_npz(name: str, data: memoryview, shape: tuple[int, int], _: float = 1
     """Return the only array of an ``.npz`` file, as ``decode_npy`` does. Raises ``EntryError``."""
     source = MemorySource(data)
     try:
-        directory = read_directory(source, _MAX_NPZ_MEMBERS)
-    except DirectoryError as error:
+        entries = read_entries(source, _MAX_NPZ_MEMBERS, lambda _: max_npy_bytes(shape))
+    except EntryError as error:
         raise _inner_error(name, error.problems) from error
-    members = [escape_text(entry.name) for entry in directory.entries]
+    members = [escape_text(entry.name) for entry in entries]
     if len(members) != 1:
         listed = f" ({', '.join(members[:4])}{', ...' if len(members) > 4 else ''})" if members else ""
         raise EntryError(Problem("invalid", name, f"the .npz holds {len(members)} arrays{listed}", "exactly one"))
-    (checked,) = check_entries(source, directory, lambda _: max_npy_bytes(shape))
-    if checked.problems:
-        raise _inner_error(name, checked.problems)
-    if not checked.entry.name.endswith(".npy"):
+    [entry] = entries
+    if entry.problems:
+        raise _inner_error(name, entry.problems)
+    if not entry.name.endswith(".npy"):
         raise EntryError(Problem("invalid", name, f"the .npz holds {members[0]}", "one .npy array"))
     try:
-        values = read_data(source, checked)
+        values = read_data(source, entry)
     except EntryError as error:
         raise _inner_error(name, error.problems) from error
     return decode_npy(f"{name} ({members[0]})", values, shape)
