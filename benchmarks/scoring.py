@@ -140,7 +140,7 @@ def main(root: str, config: str = "lattice") -> None:
                 whole_s = median_seconds(
                     lambda: [
                         *pool.map(
-                            lambda index: score_view(scored.view(index), submission.read(scored.view_ids[index])),
+                            lambda index: score_view(scored.read(index), submission.read(scored.view_ids[index])),
                             islice(cycle(range(len(scored))), FULL_CONFIG),
                         )
                     ],

@@ -79,7 +79,7 @@ def view_table(evaluation: Evaluation, config: DatasetConfig, scored: Mapping[st
         "by_scene": config.has_splits,
         "index": bootstrap.protocol_indices(truths.view_ids),
         "view_id": truths.view_ids,
-        "distance_m": np.array(truths.medians_m),
+        "distance_m": [view.distance_m for view in truths.traits],
         "scale": np.array([score.scale for score in scores], np.float64),
         "native_abs_rel": [score.native.abs_rel if score.native else math.nan for score in scores],
         "scaled_abs_rel": [score.scaled.abs_rel if score.scaled else math.nan for score in scores],

@@ -25,7 +25,7 @@ from rebar_depth_bench.scoring.columns import (
     rounded_interval,
     view_values,
 )
-from rebar_depth_bench.scoring.evaluation import ArchiveIdentity, Provenance
+from rebar_depth_bench.scoring.evaluation import Provenance
 from rebar_depth_bench.scoring.frames import differences_frame
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.scoring.result import Result
@@ -96,7 +96,7 @@ def compare(first: Result, other: Result) -> Comparison:
             f"{first.method} has {', '.join(first.tables)} and {other.method} has {', '.join(other.tables)}: "
             "expected a config that is in both"
         )
-    archives = [ArchiveIdentity(result.method, result.submission.sha256) for result in (first, other)]
+    archives = (first.submission, other.submission)
     return Comparison(
         provenance=Provenance(PROTOCOL, first.dataset.digest, first.dataset.version, archives),
         configs={config: _config_differences(first, other, config) for config in shared},

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 from numpy import ndarray
 
 from rebar_depth_bench.scoring.metrics import (
@@ -21,9 +21,8 @@ from rebar_depth_bench.scoring.metrics import (
     mean_metrics,
     metrics_at_scales,
 )
-from rebar_depth_bench.scoring.score import ViewTruth
+from rebar_depth_bench.scoring.score import Truth, ViewTruth
 from rebar_depth_bench.scoring.table import ViewScore
-from rebar_depth_bench.scoring.truth import ConfigTruth
 from rebar_depth_bench.submission import SubmissionReader
 
 
@@ -41,14 +40,12 @@ class SingleBarScore:
     scaled: DepthMetrics | None
 
 
-def score_single_bar(
-    truth: ViewTruth, single_bar: Bool[ndarray, " n"], prediction_m: Float[ndarray, "h w"], scale: float | None
-) -> SingleBarScore:
-    """Return the score of a view on its single-bar pixels.
+def score_single_bar(truth: ViewTruth, prediction_m: Float[ndarray, "h w"], scale: float | None) -> SingleBarScore:
+    """Return the score of a view on its single-bar pixels, none of which is known without bar ids.
 
-    ``single_bar`` marks them among the pixels of ``truth``; ``prediction_m`` is planar depth, metres, and
-    ``scale`` the view's scale, None if it has none.
+    ``prediction_m`` is planar depth, metres, and ``scale`` the view's scale, None if it has none.
     """
+    single_bar = np.zeros(len(truth.index), bool) if truth.single_bar is None else truth.single_bar
     share = float(np.mean(single_bar))
     p_m = prediction_m.ravel().take(truth.index.astype(np.intp))
     chosen = single_bar & is_valid_prediction(p_m)
@@ -60,12 +57,12 @@ def score_single_bar(
 
 
 def single_bar_scores(
-    submission: SubmissionReader, truths: ConfigTruth, scores: Sequence[ViewScore]
+    submission: SubmissionReader, truths: Truth, scores: Sequence[ViewScore]
 ) -> list[SingleBarScore]:
     """Return the scores on single-bar pixels of all views of a config, given their scores in the same order."""
     return [
-        score_single_bar(truth, truths.single_bar(position), submission.read(truth.view_id), score.scale)
-        for position, (truth, score) in enumerate(zip(truths, scores, strict=True))
+        score_single_bar(truth, submission.read(truth.view_id), score.scale)
+        for truth, score in zip(truths, scores, strict=True)
     ]
 
 
