@@ -67,7 +67,21 @@ def _parse_header(
     name: str, data: memoryview, shape: tuple[int, int]
 ) -> tuple[np.dtype[np.floating[Any]], bool, int]:
     """Return the type of the values, whether they are in Fortran order, and the offset of the first."""
-    text, data_offset = _header_text(name, bytes(data[: MAX_HEADER_BYTES + 1]))
+    head = bytes(data[: MAX_HEADER_BYTES + 1])
+    version = head[6] if head.startswith(_MAGIC) and len(head) >= 8 else 0
+    if version not in _LENGTH_BYTES:
+        pickled = head[:1] == b"\x80"
+        actual = "a Python pickle" if pickled else f"bytes that start with {head[:8]!r}"
+        raise EntryError(Problem("syntax", name, f"{actual} was found", "a .npy array of version 1, 2 or 3"))
+    start = 8 + _LENGTH_BYTES[version]
+    end = start + int.from_bytes(head[8:start], "little")
+    if end > MAX_HEADER_BYTES:
+        found = f"the .npy header declares {end - start} bytes"
+        raise EntryError(Problem("size", name, found, f"at most {MAX_HEADER_BYTES - start}"))
+    if end > len(head):
+        found = f"the .npy header is cut off at {len(head)} bytes"
+        raise EntryError(Problem("damaged", name, found, f"{end}"))
+    text = head[start:end].decode("utf-8", "backslashreplace")
     descr, fortran, shapes = (pattern.findall(text) for pattern in (_DESCR, _FORTRAN_ORDER, _SHAPE))
     remainder = _SHAPE.sub("", _FORTRAN_ORDER.sub("", _DESCR.sub("", text)))
     if not len(descr) == len(fortran) == len(shapes) == 1 or re.sub(r"[\s,]", "", remainder) != "{}":
@@ -83,25 +97,7 @@ def _parse_header(
     if actual_shape != [str(size) for size in shape]:
         actual = " x ".join(map(escape_text, actual_shape)) if actual_shape else "a single value"
         raise EntryError(Problem("invalid", name, f"the shape is {actual}", f"{format_shape(shape)} (H x W)"))
-    return np.dtype(descr[0].replace("|", "=")), fortran[0] == "True", data_offset
-
-
-def _header_text(name: str, head: bytes) -> tuple[str, int]:
-    """Return the header's text and the byte offset of the values."""
-    version = head[6] if head.startswith(_MAGIC) and len(head) >= 8 else 0
-    if version not in _LENGTH_BYTES:
-        pickled = head[:1] == b"\x80"
-        actual = "a Python pickle" if pickled else f"bytes that start with {head[:8]!r}"
-        raise EntryError(Problem("syntax", name, f"{actual} was found", "a .npy array of version 1, 2 or 3"))
-    start = 8 + _LENGTH_BYTES[version]
-    length = int.from_bytes(head[8:start], "little")
-    if start + length > MAX_HEADER_BYTES:
-        found = f"the .npy header declares {length} bytes"
-        raise EntryError(Problem("size", name, found, f"at most {MAX_HEADER_BYTES - start}"))
-    if start + length > len(head):
-        found = f"the .npy header is cut off at {len(head)} bytes"
-        raise EntryError(Problem("damaged", name, found, f"{start + length}"))
-    return head[start : start + length].decode("utf-8", "backslashreplace"), start + length
+    return np.dtype(descr[0].replace("|", "=")), fortran[0] == "True", end
 
 
 # More than the one expected array, so that the error message can list the members of a wrong file.

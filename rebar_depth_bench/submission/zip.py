@@ -111,7 +111,7 @@ def read_entries(source: ByteSource, max_entries: int, limit: SizeLimit) -> list
 
 def _read_end_record(source: ByteSource) -> tuple[int, int, int, int]:
     """Return where the central directory must end, and what is declared: its entries, its size and its start."""
-    length = min(source.size, _END_RECORD.size + _MAX_COMMENT_BYTES)
+    length = min(source.size, _ZIP64_END_LOCATOR.size + _END_RECORD.size + _MAX_COMMENT_BYTES)
     tail = bytes(source.read_at(source.size - length, length))
     offset = tail.rfind(b"PK\x05\x06")
     while offset >= 0:
@@ -127,9 +127,9 @@ def _read_end_record(source: ByteSource) -> tuple[int, int, int, int]:
         raise EntryError(Problem("syntax", "", found, "a zip archive"))
     position = source.size - length + offset
     fields: tuple[int, ...] = _END_RECORD.unpack_from(tail, offset)[1:7]
-    zip64 = _find_zip64_end_record(source, position)
-    if zip64 is not None:
-        position, expected = zip64
+    locator = tail[max(0, offset - _ZIP64_END_LOCATOR.size) : offset]
+    if len(locator) == _ZIP64_END_LOCATOR.size and locator.startswith(b"PK\x06\x07"):
+        position, expected = _read_zip64_end_record(source, position, locator)
         if any(a not in (b, limit) for a, b, limit in zip(fields, expected, _FULL_FIELDS, strict=True)):
             found = f"the zip end record declares {fields}"
             raise EntryError(Problem("damaged", "", found, f"the zip64 end record's {expected}"))
@@ -141,18 +141,13 @@ def _read_end_record(source: ByteSource) -> tuple[int, int, int, int]:
     return position, count, size, start
 
 
-def _find_zip64_end_record(source: ByteSource, position: int) -> tuple[int, tuple[int, ...]] | None:
-    locator_offset = position - _ZIP64_END_LOCATOR.size
-    if locator_offset < 0:
-        return None
-    magic, disk, record_offset, disks = _ZIP64_END_LOCATOR.unpack(
-        source.read_at(locator_offset, _ZIP64_END_LOCATOR.size)
-    )
-    if magic != b"PK\x06\x07":
-        return None
+def _read_zip64_end_record(source: ByteSource, position: int, locator: bytes) -> tuple[int, tuple[int, ...]]:
+    """Return where the zip64 end record starts, and its fields; ``locator``, before ``position``, points to it."""
+    _, disk, record_offset, disks = _ZIP64_END_LOCATOR.unpack(locator)
     if disk or disks > 1:
         found = f"the zip is part of a multi-disk set of {disks}"
         raise EntryError(Problem("kind", "", found, "a single complete file"))
+    locator_offset = position - _ZIP64_END_LOCATOR.size
     if record_offset + _ZIP64_END_RECORD.size > locator_offset:
         found = f"the zip64 end record is declared at byte {record_offset}"
         raise EntryError(Problem("damaged", "", found, f"it before byte {locator_offset}"))
