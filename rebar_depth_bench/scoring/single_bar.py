@@ -11,8 +11,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float
-from numpy import ndarray
 
 from rebar_depth_bench.scoring.metrics import (
     DepthMetrics,
@@ -21,7 +19,7 @@ from rebar_depth_bench.scoring.metrics import (
     mean_metrics,
     metrics_at_scales,
 )
-from rebar_depth_bench.scoring.score import Truth, ViewTruth
+from rebar_depth_bench.scoring.score import Truth
 from rebar_depth_bench.scoring.table import ViewScore
 from rebar_depth_bench.submission import SubmissionReader
 
@@ -40,30 +38,21 @@ class SingleBarScore:
     scaled: DepthMetrics | None
 
 
-def score_single_bar(truth: ViewTruth, prediction_m: Float[ndarray, "h w"], scale: float | None) -> SingleBarScore:
-    """Return the score of a view on its single-bar pixels, none of which is known without bar ids.
-
-    ``prediction_m`` is planar depth, metres, and ``scale`` the view's scale, None if it has none.
-    """
-    single_bar = np.zeros(len(truth.index), bool) if truth.single_bar is None else truth.single_bar
-    share = float(np.mean(single_bar))
-    p_m = prediction_m.ravel().take(truth.index.astype(np.intp))
-    chosen = single_bar & is_valid_prediction(p_m)
-    coverage = np.count_nonzero(chosen) / np.count_nonzero(single_bar) if share else None
-    if scale is None or not chosen.any():
-        return SingleBarScore(share, coverage, None, None)
-    (native, scaled), _ = metrics_at_scales(p_m[chosen], truth.depth_m[chosen], (1.0, scale), ())
-    return SingleBarScore(share, coverage, native, scaled)
-
-
 def single_bar_scores(
     submission: SubmissionReader, truths: Truth, scores: Sequence[ViewScore]
 ) -> list[SingleBarScore]:
     """Return the scores on single-bar pixels of all views of a config, given their scores in the same order."""
-    return [
-        score_single_bar(truth, submission.read(truth.view_id), score.scale)
-        for truth, score in zip(truths, scores, strict=True)
-    ]
+    found = []
+    for truth, score in zip(truths, scores, strict=True):
+        p_m = submission.read(truth.view_id).ravel().take(truth.index.astype(np.intp))
+        single_bar = np.zeros(len(p_m), bool) if truth.single_bar is None else truth.single_bar
+        chosen = single_bar & is_valid_prediction(p_m)
+        coverage = np.count_nonzero(chosen) / np.count_nonzero(single_bar) if single_bar.any() else None
+        native, scaled = None, None
+        if score.scale is not None and chosen.any():
+            (native, scaled), _ = metrics_at_scales(p_m[chosen], truth.depth_m[chosen], (1.0, score.scale))
+        found.append(SingleBarScore(float(np.mean(single_bar)), coverage, native, scaled))
+    return found
 
 
 def mean_single_bar(scores: Sequence[SingleBarScore]) -> SingleBarScore:
