@@ -25,9 +25,14 @@ from rebar_depth_bench import score
 from rebar_depth_bench.atomic_io import write_text
 from rebar_depth_bench.cli.main import main as rebar_bench
 from rebar_depth_bench.names import TEST_SPLIT, config_of
-from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
+from rebar_depth_bench.scoring.evaluation import (
+    SingleBarScore,
+    mean_single_bar,
+    open_evaluation,
+    score_evaluation,
+    single_bar_scores,
+)
 from rebar_depth_bench.scoring.metrics import mean
-from rebar_depth_bench.scoring.single_bar import SingleBarScore, mean_single_bar, single_bar_scores
 from rebar_depth_bench.scoring.table import ViewScore
 from rebar_depth_bench.scoring.truth import config_truth
 from rebar_depth_bench.submission.declaration import METADATA_NAME

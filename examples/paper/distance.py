@@ -30,9 +30,14 @@ from rebar_depth_bench.extended.ground_truth import has_bar_ids
 from rebar_depth_bench.reporting.crossing_texts import reach_sentence
 from rebar_depth_bench.scoring import bootstrap
 from rebar_depth_bench.scoring.bootstrap import Resampling, interval, resample_views
-from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation, score_evaluation
+from rebar_depth_bench.scoring.evaluation import (
+    Evaluation,
+    mean_single_bar,
+    open_evaluation,
+    score_evaluation,
+    single_bar_scores,
+)
 from rebar_depth_bench.scoring.metrics import mean
-from rebar_depth_bench.scoring.single_bar import mean_single_bar, single_bar_scores
 from rebar_depth_bench.scoring.table import ViewScore
 from rebar_depth_bench.scoring.truth import config_truth
 
