@@ -75,15 +75,11 @@ class View:
     """
 
     config: DatasetConfig
+    view_id: str
     position: int
     encoded: Mapping[str, Any]
     read_depth: ReadDepth
     _decoded: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def view_id(self) -> str:
-        """Id of the view."""
-        return self.config.view_ids[self.position]
 
     @cached_property
     def prediction_m(self) -> Float[ndarray, "h w"]:
@@ -110,14 +106,15 @@ def read_views(
 
     Raises ``DatasetError`` for a damaged shard.
     """
-    remaining = {config.view_ids[position]: position for position in sorted(positions)}
+    view_ids = config.view_ids
+    remaining = {view_ids[position]: position for position in sorted(positions)}
     for row in rows_at(config, ("view_id", *columns), list(remaining.values())):
         if (position := remaining.pop(row["view_id"], None)) is not None:
-            yield View(config, position, row, read_depth)
+            yield View(config, view_ids[position], position, row, read_depth)
     if remaining:  # The rows are in another order than in the manifest.
         for row in iterate_undecoded(config, ("view_id", *columns)):
             if (position := remaining.pop(row["view_id"], None)) is not None:
-                yield View(config, position, row, read_depth)
+                yield View(config, view_ids[position], position, row, read_depth)
 
 
 @dataclass(frozen=True)
