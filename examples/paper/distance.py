@@ -30,14 +30,9 @@ from rebar_depth_bench.extended.ground_truth import has_bar_ids
 from rebar_depth_bench.reporting.crossing_texts import reach_sentence
 from rebar_depth_bench.scoring import bootstrap
 from rebar_depth_bench.scoring.bootstrap import Resampling, interval, resample_views
-from rebar_depth_bench.scoring.evaluation import (
-    Evaluation,
-    mean_single_bar,
-    open_evaluation,
-    score_evaluation,
-    single_bar_scores,
-)
+from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation, score_evaluation
 from rebar_depth_bench.scoring.metrics import mean
+from rebar_depth_bench.scoring.score import mean_single_bar, single_bar_scores
 from rebar_depth_bench.scoring.table import ViewScore
 from rebar_depth_bench.scoring.truth import config_truth
 
@@ -88,7 +83,7 @@ def view_table(evaluation: Evaluation, config: DatasetConfig, scored: Mapping[st
         "scale": np.array([score.scale for score in scores], np.float64),
         "native_abs_rel": [score.native.abs_rel if score.native else math.nan for score in scores],
         "scaled_abs_rel": [score.scaled.abs_rel if score.scaled else math.nan for score in scores],
-        "single_bar": single_bar_scores(evaluation.submission, truths, scores),
+        "single_bar": single_bar_scores(truths, evaluation.submission.read, scores),
     }
     return pd.DataFrame(columns)
 

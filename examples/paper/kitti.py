@@ -62,9 +62,7 @@ def argument_parser() -> argparse.ArgumentParser:
     parser.add_argument("--predictions", required=True, metavar="DIR_OR_ZIP", help="one depth map per image")
     parser.add_argument("--method", help="method to run first, which writes the archive --predictions")
     parser.add_argument("--kitti", required=True, type=Path, metavar="ROOT", help="KITTI's raw data or depth maps")
-    parser.add_argument(
-        "--ground-truth", required=True, choices=("raw", "improved"), help="one laser scan, or several"
-    )
+    parser.add_argument("--ground-truth", required=True, choices=("raw", "improved"), help="one or more scans")
     images = "lines <date>/<drive> <frame> l|r (default: the Eigen test split)"
     parser.add_argument("--images", type=Path, default=EIGEN_SPLIT, metavar="FILE", help=images)
     parser.add_argument("--crop", choices=(*CROPS, "none"), default="garg", help="default: garg")
