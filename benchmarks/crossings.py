@@ -40,7 +40,7 @@ from rebar_depth_bench.extended.predictions import NATIVE
 from rebar_depth_bench.names import config_of
 from rebar_depth_bench.scoring.columns import rounded
 from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
-from rebar_depth_bench.submission import SubmissionReader, open_submission
+from rebar_depth_bench.submission import SubmissionReader
 
 OPENING_SHARE = 0.06
 """Size of the opening that removes bars, as a share of the width of the image."""
@@ -70,7 +70,7 @@ def main(root: str, out: str, *archives: str) -> None:
     folder = open_folder(root)
     files, depth = [], {}
     for archive in archives:
-        with open_submission(archive, folder.expected_views()) as submission:
+        with SubmissionReader(archive, folder.expected_views()) as submission:
             method = submission.meta.method if submission.meta else Path(archive).stem
             configs = list(dict.fromkeys(map(config_of, submission.view_ids)))
             rows = [row for config in configs for row in _detected(root, config, submission)]

@@ -38,7 +38,7 @@ def main(root: Path, config: str, archives: Sequence[Path]) -> None:
     for archive in archives:
         with open_evaluation(archive, root) as evaluation:
             images = [evaluation.submission.read(row["view_id"]) for row in rows]
-            predictions[evaluation.method] = [np.array(image, np.float32) for image in images]
+            predictions[evaluation.meta.method] = [np.array(image, np.float32) for image in images]
     cells = {name: mistakes_named(root, rows, images) for name, images in predictions.items()}
     made = list(mistakes(rows))
     print_markdown(["mistake", *cells], [[name, *(named[name] for named in cells.values())] for name in made])

@@ -27,7 +27,7 @@ from rebar_depth_bench.cli.main import main as rebar_bench
 from rebar_depth_bench.names import TEST_SPLIT, config_of
 from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
 from rebar_depth_bench.scoring.metrics import mean
-from rebar_depth_bench.scoring.single_bar import SingleBarScore, mean_single_bar, single_bar_scores
+from rebar_depth_bench.scoring.score import SingleBarScore, mean_single_bar, single_bar_scores
 from rebar_depth_bench.scoring.table import ViewScore
 from rebar_depth_bench.scoring.truth import config_truth
 from rebar_depth_bench.submission.declaration import METADATA_NAME
@@ -173,7 +173,7 @@ def _single_bar(archive: Path, root: Path) -> dict[str, dict[str, float | int | 
         for config in evaluation.configs:
             truths = config_truth(evaluation.folder, config)
             of_config = [scores[view_id] for view_id in truths.view_ids]
-            single_bar = single_bar_scores(evaluation.submission, truths, of_config)
+            single_bar = single_bar_scores(truths, evaluation.submission.read, of_config)
             means[config.name] = _single_bar_means(of_config, single_bar)
     return means
 

@@ -35,7 +35,7 @@ from rebar_depth_bench.extended.steel_truth import SteelTruth
 from rebar_depth_bench.scoring.protocol import interior
 from rebar_depth_bench.scoring.score import score_view
 from rebar_depth_bench.scoring.truth import config_truth
-from rebar_depth_bench.submission import SubmissionReader, open_submission
+from rebar_depth_bench.submission import SubmissionReader
 
 REPEATS = 15
 FULL_CONFIG = 504
@@ -127,7 +127,7 @@ def main(root: str, config: str = "lattice") -> None:
         with rdb.SubmissionWriter(archive, method="benchmark") as writer:
             for view_id, (truth_m, _) in truths.items():
                 writer.add(view_id, 1.1 * truth_m + np.float32(0.01))
-        with open_submission(archive, folder.expected_views()) as submission:
+        with SubmissionReader(archive, folder.expected_views()) as submission:
             runs: dict[str, Callable[[], object]] = {
                 "read and checksum alone": lambda: [submission.read(truth.view_id) for truth in scored],
                 "rebar-bench": lambda: [score_view(truth, submission.read(truth.view_id)) for truth in scored],
@@ -140,7 +140,7 @@ def main(root: str, config: str = "lattice") -> None:
                 whole_s = median_seconds(
                     lambda: [
                         *pool.map(
-                            lambda index: score_view(scored.view(index), submission.read(scored.view_ids[index])),
+                            lambda index: score_view(scored.read(index), submission.read(scored.view_ids[index])),
                             islice(cycle(range(len(scored))), FULL_CONFIG),
                         )
                     ],

@@ -89,7 +89,7 @@ def log_prediction(
             predicted_m = evaluation.submission.read(view_id)
         except EntryError as error:
             raise SubmissionError.from_problems(archive, error.problems) from None
-        path = ["world", "predictions", f"{number + 1}: {printable(evaluation.method)}"]
+        path = ["world", "predictions", f"{number + 1}: {printable(evaluation.meta.method)}"]
     pixels = scored_pixels(left.mask, left.depth_m)
     p_m, z_m = predicted_m.ravel()[pixels], left.depth_m.ravel()[pixels]
     valid = is_valid_prediction(p_m)

@@ -1,11 +1,12 @@
-"""Progress callbacks, and an ordered parallel map over threads with bounded memory."""
+"""Progress callbacks, and a map over threads in order, with bounded memory."""
 
 from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
+from itertools import islice
 from typing import TypeVar
 
 from rebar_depth_bench.errors import InputError
@@ -22,29 +23,6 @@ _Item = TypeVar("_Item")
 _Done = TypeVar("_Done")
 
 
-def ordered_map(work: Callable[[_Item], _Done], items: Iterable[_Item], workers: int | None) -> Iterator[_Done]:
-    """Yield ``work(item)`` in the order of ``items``, computed on ``workers`` threads (None: one per core).
-
-    At most two items per thread are taken ahead of the result being yielded, so memory use does not grow with the
-    number of items. Exceptions of ``items`` and ``work`` propagate. Raises ``InputError`` if ``workers`` is less
-    than 1.
-    """
-    if workers is not None and workers < 1:
-        raise InputError(f"workers is {workers}, expected 1 or more")
-    threads = workers or os.cpu_count() or 1
-    pending: deque[Future[_Done]] = deque()
-    pool = ThreadPoolExecutor(threads)
-    try:
-        for item in items:
-            pending.append(pool.submit(work, item))
-            if len(pending) >= 2 * threads:
-                yield pending.popleft().result()
-        while pending:
-            yield pending.popleft().result()
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
 def map_with_progress(
     work: Callable[[_Item], _Done],
     items: Iterable[_Item],
@@ -53,9 +31,24 @@ def map_with_progress(
     task: str,
     total: int,
 ) -> list[_Done]:
-    """Return the results of ``ordered_map``, and report each of the ``total`` items as a step of ``task``."""
-    results = []
-    for done, result in enumerate(ordered_map(work, items, workers), start=1):
-        results.append(result)
-        progress(task, done, total)
-    return results
+    """Return ``work(item)`` of each of ``total`` items, in order, computed on ``workers`` threads.
+
+    ``workers`` None means one per core. Each result is a step of ``task`` in ``progress``. At most two items per
+    thread are taken ahead of the next result, so that few items are in memory at a time. Exceptions of ``items``
+    and ``work`` propagate. Raises ``InputError`` if ``workers`` is less than 1.
+    """
+    if workers is not None and workers < 1:
+        raise InputError(f"workers is {workers}, expected 1 or more")
+    threads = workers or os.cpu_count() or 1
+    source, results = iter(items), list[_Done]()
+    pending: deque[Future[_Done]] = deque()
+    pool = ThreadPoolExecutor(threads)
+    try:
+        while True:
+            pending.extend(pool.submit(work, item) for item in islice(source, 2 * threads - len(pending)))
+            if not pending:
+                return results
+            results.append(pending.popleft().result())
+            progress(task, len(results), total)
+    finally:
+        pool.shutdown(cancel_futures=True)

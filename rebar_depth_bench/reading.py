@@ -234,7 +234,10 @@ class FileSource:
         if offset < 0 or length < 0 or offset + length > os.fstat(self._fd).st_size:
             raise EOFError(f"{length} bytes at {offset} lie past the end of the file")
         if length < _MIN_MAPPED_BYTES:
-            return _check_length(memoryview(os.pread(self._fd, length, offset)), length)
+            data = os.pread(self._fd, length, offset)
+            if len(data) < length:  # The file was truncated just now.
+                raise EOFError(f"{len(data)} bytes found at {offset}, expected {length}")
+            return memoryview(data)
         lead = offset % mmap.ALLOCATIONGRANULARITY
         # MAP_POPULATE loads all pages at once: one page fault per page would take as long as reading the pages.
         flags = mmap.MAP_SHARED | getattr(mmap, "MAP_POPULATE", 0)
@@ -262,12 +265,6 @@ class MemorySource:
 
     def read_at(self, offset: int, length: int) -> memoryview:
         """Return exactly ``length`` bytes, or raise ``EOFError`` if the source holds fewer."""
-        if offset < 0 or length < 0:
+        if offset < 0 or length < 0 or offset + length > self.size:
             raise EOFError(f"{length} bytes at {offset} lie outside the data")
-        return _check_length(self._data[offset : offset + length], length)
-
-
-def _check_length(data: memoryview, length: int) -> memoryview:
-    if len(data) != length:
-        raise EOFError(f"{len(data)} bytes found, expected {length}")
-    return data
+        return self._data[offset : offset + length]

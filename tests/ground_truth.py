@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.scoring.truth import ConfigTruth, config_truth
+from rebar_depth_bench.scoring.score import Truth
+from rebar_depth_bench.scoring.truth import config_truth
 
 
-def truth_of(root: Path, config: str, split: str | None = None) -> ConfigTruth:
+def truth_of(root: Path, config: str, split: str | None = None) -> Truth:
     """Return the ground truth of a config of a dataset folder, or of one of its splits."""
     folder = open_folder(root)
     chosen = folder.config(config)

@@ -148,7 +148,7 @@ def anchored(evaluation: Evaluation, options: argparse.Namespace, bars: Progress
     scales = np.concatenate([[options.baseline_scale, np.median(ratios)], *drawn])
 
     def errors_of_view(position: int) -> Float64[ndarray, "2 m"]:
-        return errors_at_scales(*pairs(truths.view(position)), scales)
+        return errors_at_scales(*pairs(truths.read(position)), scales)
 
     errors = map_with_progress(errors_of_view, predicted, None, bars.update, "errors", len(predicted))
     numbers = zip(scales.tolist(), *np.mean(errors, axis=0).tolist(), strict=True)

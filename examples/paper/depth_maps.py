@@ -18,11 +18,11 @@ from rebar_depth_bench.errors import EntryError, InputError, SubmissionError, pr
 from rebar_depth_bench.names import config_of, split_of
 from rebar_depth_bench.reading import FileSource
 from rebar_depth_bench.scoring.truth import verified_views
-from rebar_depth_bench.submission import ExpectedViews, open_submission
+from rebar_depth_bench.submission import ExpectedViews, SubmissionReader
 from rebar_depth_bench.submission.declaration import METADATA_NAME, parse_metadata
 from rebar_depth_bench.submission.entries import FORMATS
 from rebar_depth_bench.submission.maps import Depth
-from rebar_depth_bench.submission.zip import DirectoryError, read_directory
+from rebar_depth_bench.submission.zip import read_entries
 
 _MAX_SHAPE, _MAX_ENTRIES = (1024, 4096), 100_000
 """Bounds of views that an archive may hold but that are not read, and of the number of its entries."""
@@ -57,7 +57,7 @@ def open_maps(
         yield _folder_maps(Path(path), expected, png_scale, complete=optional is not None)
         return
     present = _entry_stems(Path(path)).intersection(() if optional is None else optional)
-    with open_submission(path, {**expected, **dict.fromkeys(present, _MAX_SHAPE)}) as reader:
+    with SubmissionReader(path, {**expected, **dict.fromkeys(present, _MAX_SHAPE)}) as reader:
         problems = [problem for problem in reader.problems() if problem.where.rpartition(".")[0] not in present]
         if reader.meta is None or problems:
             raise SubmissionError.from_problems(path, problems)
@@ -66,8 +66,9 @@ def open_maps(
 
 def _entry_stems(archive: Path) -> set[str]:
     """Return the entry names of an archive without suffix; none of a file that is no sound archive."""
-    with suppress(OSError, ValueError, EOFError, DirectoryError), closing(FileSource(archive)) as source:
-        return {entry.name.rpartition(".")[0] for entry in read_directory(source, _MAX_ENTRIES).entries}
+    with suppress(OSError, ValueError, EOFError, EntryError), closing(FileSource(archive)) as source:
+        entries = read_entries(source, _MAX_ENTRIES, lambda _: None)
+        return {entry.name.rpartition(".")[0] for entry in entries}
     return set()
 
 

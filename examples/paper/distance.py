@@ -32,7 +32,7 @@ from rebar_depth_bench.scoring import bootstrap
 from rebar_depth_bench.scoring.bootstrap import Resampling, interval, resample_views
 from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation, score_evaluation
 from rebar_depth_bench.scoring.metrics import mean
-from rebar_depth_bench.scoring.single_bar import mean_single_bar, single_bar_scores
+from rebar_depth_bench.scoring.score import mean_single_bar, single_bar_scores
 from rebar_depth_bench.scoring.table import ViewScore
 from rebar_depth_bench.scoring.truth import config_truth
 from rebar_depth_bench.terminal import ProgressBars
@@ -79,11 +79,11 @@ def view_table(evaluation: Evaluation, config: DatasetConfig, scored: Mapping[st
         "by_scene": config.has_splits,
         "index": bootstrap.protocol_indices(truths.view_ids),
         "view_id": truths.view_ids,
-        "distance_m": np.array(truths.medians_m),
+        "distance_m": [view.distance_m for view in truths.traits],
         "scale": np.array([score.scale for score in scores], np.float64),
         "native_abs_rel": [score.native.abs_rel if score.native else math.nan for score in scores],
         "scaled_abs_rel": [score.scaled.abs_rel if score.scaled else math.nan for score in scores],
-        "single_bar": single_bar_scores(evaluation.submission, truths, scores),
+        "single_bar": single_bar_scores(truths, evaluation.submission.read, scores),
     }
     return pd.DataFrame(columns)
 

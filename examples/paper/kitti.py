@@ -34,9 +34,10 @@ from rebar_depth_bench.methods import find_method
 from rebar_depth_bench.methods.runner import predict_views
 from rebar_depth_bench.parallel import map_with_progress
 from rebar_depth_bench.scoring.bootstrap import INTERVALS, interval, resample
-from rebar_depth_bench.scoring.evaluation import ArchiveIdentity, Provenance
+from rebar_depth_bench.scoring.evaluation import Provenance
 from rebar_depth_bench.scoring.metrics import is_valid_prediction, mean, median_scale
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE
+from rebar_depth_bench.scoring.result import SubmissionIdentity
 from rebar_depth_bench.terminal import ProgressBars
 
 PROTOCOL = "rebar-kitti-eigen-1"
@@ -232,7 +233,7 @@ def run(options: argparse.Namespace) -> None:
         raise InputError(f"{options.kitti}: no image has ground truth inside the crop {options.crop}")
     protocol = {"ground_truth": kind, "crop": options.crop, "cap_m": options.cap}
     content = {
-        **Provenance(PROTOCOL, None, None, [ArchiveIdentity(source.method, source.sha256)]).to_dict(),
+        **Provenance(PROTOCOL, None, None, [SubmissionIdentity(source.method, source.sha256)]).to_dict(),
         "intervals": INTERVALS,
         "method": source.method,
         "kitti": protocol | {"lidar_depth": options.lidar_depth, "found": len(images), "missing": [*missing]},

@@ -31,8 +31,9 @@ from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.parallel import map_with_progress
 from rebar_depth_bench.scoring.bootstrap import INTERVALS
 from rebar_depth_bench.scoring.columns import METRICS
-from rebar_depth_bench.scoring.evaluation import ArchiveIdentity, Provenance
+from rebar_depth_bench.scoring.evaluation import Provenance
 from rebar_depth_bench.scoring.metrics import mean
+from rebar_depth_bench.scoring.result import SubmissionIdentity
 from rebar_depth_bench.scoring.score import ViewTruth, score_view, tabulate
 from rebar_depth_bench.scoring.table import ViewScore
 from rebar_depth_bench.terminal import ProgressBars
@@ -174,7 +175,7 @@ def run(options: argparse.Namespace) -> None:
     by_pair = {pair: [scores[pair] for _, scores, _ in outcomes] for pair in outcomes[0][1]}
     rows = [row_json(pair, views, math.prod(data.shape), split) for pair, views in by_pair.items()]
     agreed = pd.DataFrame([row for *_, rows in outcomes for row in rows], columns=[*PAIR, *OVER_VIEWS])
-    archives = [ArchiveIdentity(name, source.sha256) for name, source in sources.items()]
+    archives = [SubmissionIdentity(name, source.sha256) for name, source in sources.items()]
     content = {
         **Provenance(PROTOCOL, data.digest, data.version, archives).to_dict(),
         "intervals": INTERVALS,

@@ -19,7 +19,7 @@ from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import DatasetError, Problem, RebarDepthError, SubmissionError
 from rebar_depth_bench.names import TEST_SPLIT, config_of, split_of
 from rebar_depth_bench.scoring.table import ViewScore
-from rebar_depth_bench.submission import SubmissionMeta, open_submission
+from rebar_depth_bench.submission import SubmissionMeta, SubmissionReader
 
 if TYPE_CHECKING:
     from rebar_depth_bench.reporting.html.views import ShownView
@@ -69,7 +69,7 @@ def _with_problems(task: Callable[P, T]) -> Callable[P, T | Problems]:
 @_with_problems
 def check(archive: Path, data: str) -> SubmissionMeta | Problems:
     """Return the content of ``submission.json`` if the archive is valid, otherwise all problems."""
-    with open_submission(archive, open_folder(data).expected_views()) as submission:
+    with SubmissionReader(archive, open_folder(data).expected_views()) as submission:
         if problems := tuple(_split_problems(submission.view_ids)) or tuple(submission.problems()):
             return problems
         assert submission.meta is not None

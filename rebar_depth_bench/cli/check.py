@@ -9,7 +9,7 @@ from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.diagnosis.diagnose import diagnose
 from rebar_depth_bench.errors import SubmissionError
 from rebar_depth_bench.scoring.evaluation import Evaluation
-from rebar_depth_bench.submission import check_archive, open_submission
+from rebar_depth_bench.submission import SubmissionReader
 from rebar_depth_bench.terminal import ProgressBars, print_notice
 
 
@@ -23,12 +23,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Check an archive, and look for mistakes; raise ``SubmissionError`` with all problems of the archive."""
     folder = open_folder(options.data, expect_digest=options.expect_digest)
-    with ProgressBars() as bars:
-        problems = check_archive(options.archive, folder.expected_views(), bars.update)
-    print_verified(folder)
-    if problems:
-        raise SubmissionError.from_problems(options.archive, problems)
-    print(f"{options.archive}: no problem found")
-    with open_submission(options.archive, folder.expected_views()) as submission:
+    with SubmissionReader(options.archive, folder.expected_views()) as submission:
+        with ProgressBars() as bars:
+            problems = list(submission.problems(bars.update))
+        print_verified(folder)
+        if problems:
+            raise SubmissionError.from_problems(options.archive, problems)
+        print(f"{options.archive}: no problem found")
         for mistake in diagnose(Evaluation(folder, submission)):
             print_notice(f"possible mistake: {mistake.text}")

@@ -21,6 +21,7 @@ import math
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from statistics import NormalDist
 from typing import Any, Literal
 
@@ -56,27 +57,25 @@ class Resampling:
     """Bootstrap resamples of n views, in which units are drawn: single views, or scenes with all of their views.
 
     ``counts[i, j]`` is the number of times that unit j occurs in resample i; there are ``RESAMPLES`` resamples.
-    ``unit`` holds the unit of each view; None if each view is a unit of its own. ``length`` is the number of
-    consecutive views that are drawn together.
+    ``unit`` holds the unit of each view; ``length`` is the number of consecutive views that are drawn together.
     """
 
     counts: Float64[ndarray, "draws units"]
-    unit: Int64[ndarray, " n"] | None = None
+    unit: Int64[ndarray, " n"]
     length: int = 1
 
     @property
     def view_counts(self) -> Float64[ndarray, "draws n"]:
         """Number of times that each view occurs in each resample."""
-        return self.counts if self.unit is None else self.counts[:, self.unit]
+        return self.counts[:, self.unit]
 
     def blocks(self, view: Int64[ndarray, " m"] | None = None) -> int:
         """Return the number of blocks of ``length`` views, or of scenes, that have any of some views.
 
         ``view`` holds positions of views, in any order and any number of times; all views by default.
         """
-        if view is None:
-            view = np.arange(self.counts.shape[1] if self.unit is None else len(self.unit))
-        return len(np.unique(self._units(view) // self.length))
+        units = self.unit if view is None else self.unit[view]
+        return len(np.unique(units // self.length))
 
     def means(self, values: Float64[ndarray, "n k"]) -> Float64[ndarray, "draws k"]:
         """Return the mean of each column in each resample; NaN in ``values`` marks a view without a value.
@@ -91,8 +90,6 @@ class Resampling:
 
     def sums(self, values: Float64[ndarray, "n k"]) -> Float64[ndarray, "units k"]:
         """Return the sums of each column over the views of each unit."""
-        if self.unit is None:
-            return values
         sums = np.zeros((self.counts.shape[1], values.shape[1]))
         np.add.at(sums, self.unit, values)
         return sums
@@ -106,7 +103,7 @@ class Resampling:
         """
         if not np.isfinite(samples).all():
             return np.full(len(self.counts), np.nan)
-        unit, units = self._units(view), self.counts.shape[1]
+        unit, units = self.unit[view], self.counts.shape[1]
         totals = np.stack([np.bincount(unit, weights, units) for weights in (samples, np.ones(len(samples)))], 1)
         sums = self.counts @ totals
         with np.errstate(invalid="ignore", divide="ignore"):
@@ -135,15 +132,19 @@ class Resampling:
         if not len(samples) or not np.isfinite(samples).all():
             return np.full(len(self.counts), np.nan)
         order = np.argsort(samples, kind="stable")
-        ordered, ranks = samples[order], _Ranks.of(self.counts, self._units(view)[order])
-        threshold = ranks.totals * percent / 100
-        values = ordered[ranks.below(threshold, inclusive=False)]
+        ordered, unit = samples[order], self.unit[view[order]]
+        # Weights are added by blocks of samples, about the square root of their number, which makes a percentile
+        # hundreds of times faster. They are whole numbers: no sum is rounded, and the order has no effect.
+        size, units = math.isqrt(len(unit)), self.counts.shape[1]
+        blocks = -(-len(unit) // size)
+        samples_by_block = np.bincount(unit * blocks + np.arange(len(unit)) // size, minlength=units * blocks)
+        ends = np.cumsum(self.counts @ samples_by_block.reshape(units, blocks).astype(np.float64), axis=1)
+        totals = ends[:, -1]
+        places = partial(_first_places, self.counts, unit, ends, totals * percent / 100)
+        values = ordered[places(np.less)]
         if percent == 50:
-            values = (values + ordered[ranks.below(threshold, inclusive=True)]) / 2
-        return np.where(ranks.totals > 0, values, np.nan)
-
-    def _units(self, view: Int64[ndarray, " m"]) -> Int64[ndarray, " m"]:
-        return view if self.unit is None else self.unit[view]
+            values = (values + ordered[places(np.less_equal)]) / 2
+        return np.where(totals > 0, values, np.nan)
 
 
 def half_width(blocks: int) -> float:
@@ -180,15 +181,19 @@ def interval(
 def resample(indices: Sequence[int]) -> Resampling:
     """Return the resamples of views, given their ascending indices in the full camera protocol.
 
+    Blocks have the views on ``BLOCK_VIEWS`` steps of the full protocol; the views of a sparse subset, which are
+    farther apart than that, are resampled one by one.
+
     The same indices give the same resamples on every machine, since the raw PCG64 stream does not change between
     NumPy versions.
     """
     n = len(indices)
-    length = block_length(indices)
+    stride = max(1.0, (indices[-1] - indices[0]) / (n - 1)) if n > 1 else BLOCK_VIEWS
+    length = max(1, round(BLOCK_VIEWS / stride))
     blocks = -(-n // length)
     starts = (np.random.PCG64(_SEED).random_raw(RESAMPLES * blocks) % max(n, 1)).astype(np.int64)
     views = (starts.reshape(RESAMPLES, blocks, 1) + np.arange(length)).reshape(RESAMPLES, -1)[:, :n] % max(n, 1)
-    return Resampling(_counts(views, n), length=length)
+    return Resampling(_counts(views, n), np.arange(n), length)
 
 
 def resample_scenes(scenes: Sequence[str]) -> Resampling:
@@ -227,61 +232,30 @@ def protocol_indices(view_ids: Sequence[str]) -> list[int]:
     return list(range(len(suffixes)))
 
 
-def block_length(indices: Sequence[int]) -> int:
-    """Return the number of views per block: those on ``BLOCK_VIEWS`` steps of the full camera protocol, or 1.
-
-    The views of a sparse subset, which are farther apart than that, are resampled one by one.
-    """
-    n = len(indices)
-    if n < 2:
-        return 1
-    stride = max(1.0, (indices[-1] - indices[0]) / (n - 1))
-    return max(1, round(BLOCK_VIEWS / stride))
-
-
 def _counts(drawn: Int64[ndarray, "draws n"], units: int) -> Float64[ndarray, "draws units"]:
     """Return how often each of the units occurs in each row of ``drawn``."""
     flat = drawn + units * np.arange(RESAMPLES)[:, None]
     return np.bincount(flat.ravel(), minlength=RESAMPLES * units).reshape(RESAMPLES, units).astype(np.float64)
 
 
-@dataclass(frozen=True, eq=False)
-class _Ranks:
-    """Cumulative weights of ordered samples in each resample, by blocks of about the square root of their number.
+def _first_places(
+    counts: Float64[ndarray, "draws units"],
+    unit: Int64[ndarray, " m"],
+    ends: Float64[ndarray, "draws blocks"],
+    threshold: Float64[ndarray, " draws"],
+    is_below: np.ufunc,
+) -> Int64[ndarray, " draws"]:
+    """Return the first of ordered samples whose cumulative weight is not ``is_below`` the threshold.
 
-    The blocks make a percentile hundreds of times faster than adding up all samples. Weights are whole numbers, so
-    that no sum is rounded and the order of additions has no effect. ``unit`` has the unit of each place of the
-    blocks; places behind the last sample have a unit of weight 0.
+    ``unit`` is that of each sample, and ``ends`` are the cumulative weights at the ends of blocks of them.
     """
-
-    counts: Float64[ndarray, "draws v"]
-    unit: Int64[ndarray, "blocks size"]
-    ends: Float64[ndarray, "draws blocks"]
-    samples: int
-
-    @classmethod
-    def of(cls, counts: Float64[ndarray, "draws n"], unit: Int64[ndarray, " m"]) -> _Ranks:
-        """Return the weights of ordered samples, given the unit of each."""
-        size = max(1, math.isqrt(len(unit)))
-        blocks, units = -(-len(unit) // size), counts.shape[1]
-        places = np.full(blocks * size, units)
-        places[: len(unit)] = unit
-        block = np.arange(len(unit)) // size
-        samples_by_unit = np.bincount(unit * blocks + block, minlength=units * blocks).reshape(units, blocks)
-        ends = np.cumsum(counts @ samples_by_unit.astype(np.float64), axis=1)
-        return cls(np.pad(counts, ((0, 0), (0, 1))), places.reshape(blocks, size), ends, len(unit))
-
-    @property
-    def totals(self) -> Float64[ndarray, " draws"]:
-        """Weight of all samples in each resample."""
-        return self.ends[:, -1]
-
-    def below(self, threshold: Float64[ndarray, " draws"], *, inclusive: bool) -> Int64[ndarray, " draws"]:
-        """Return the first place with a cumulative weight of ``threshold`` or more; of more, if ``inclusive``."""
-        compare = np.less_equal if inclusive else np.less
-        draw = np.arange(len(self.counts))
-        block = np.minimum(compare(self.ends, threshold[:, None]).sum(axis=1), len(self.unit) - 1)
-        before = np.where(block > 0, self.ends[draw, block - 1], 0.0)
-        weights = self.counts[draw[:, None], self.unit[block]]
-        inside = compare(before[:, None] + np.cumsum(weights, axis=1), threshold[:, None]).sum(axis=1)
-        return np.asarray(np.minimum(block * self.unit.shape[1] + inside, self.samples - 1))
+    draw, blocks = np.arange(len(counts)), ends.shape[1]
+    block = np.minimum(is_below(ends, threshold[:, None]).sum(axis=1), blocks - 1)
+    before = np.where(block > 0, ends[draw, block - 1], 0.0)
+    # Places behind the last sample have a unit of weight 0.
+    size = math.isqrt(len(unit))
+    padded = np.full(blocks * size, counts.shape[1])
+    padded[: len(unit)] = unit
+    weights = np.pad(counts, ((0, 0), (0, 1)))[draw[:, None], padded.reshape(blocks, size)[block]]
+    inside = is_below(before[:, None] + np.cumsum(weights, axis=1), threshold[:, None]).sum(axis=1)
+    return np.asarray(np.minimum(block * size + inside, len(unit) - 1))

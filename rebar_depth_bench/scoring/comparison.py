@@ -7,7 +7,7 @@ narrower than the intervals of the two submissions, and only it shows whether on
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -25,7 +25,7 @@ from rebar_depth_bench.scoring.columns import (
     rounded_interval,
     view_values,
 )
-from rebar_depth_bench.scoring.evaluation import ArchiveIdentity, Provenance
+from rebar_depth_bench.scoring.evaluation import Provenance
 from rebar_depth_bench.scoring.frames import differences_frame
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.scoring.result import Result
@@ -96,7 +96,7 @@ def compare(first: Result, other: Result) -> Comparison:
             f"{first.method} has {', '.join(first.tables)} and {other.method} has {', '.join(other.tables)}: "
             "expected a config that is in both"
         )
-    archives = [ArchiveIdentity(result.method, result.submission.sha256) for result in (first, other)]
+    archives = (first.submission, other.submission)
     return Comparison(
         provenance=Provenance(PROTOCOL, first.dataset.digest, first.dataset.version, archives),
         configs={config: _config_differences(first, other, config) for config in shared},
@@ -116,30 +116,21 @@ def check_same_splits(results: Sequence[Result]) -> None:
 
 
 def _config_differences(first: Result, other: Result, config: str) -> list[Difference]:
-    by_scene = first.tables[config].split is not None
-    differences = _differences(_views_by_id(first, config), _views_by_id(other, config), by_scene)
-    if first.tables[config].is_comparable and other.tables[config].is_comparable:
-        return differences
-    return [
-        difference
-        if difference.column.of_all_views or not difference.column.better
-        else replace(difference, verdict="no verdict")
-        for difference in differences
-    ]
-
-
-def _views_by_id(result: Result, config: str) -> dict[str, ViewScore]:
-    return {view.view_id: view for view in result.views if config_of(view.view_id) == config}
-
-
-def _differences(
-    first: Mapping[str, ViewScore], other: Mapping[str, ViewScore], by_scene: bool
-) -> list[Difference]:
     """Return one difference per metric; error metrics use only the views where both submissions have a value."""
-    predicted_by_both = [view_id for view_id in first if first[view_id].native and other[view_id].native]
+    tables = first.tables[config], other.tables[config]
+    of_first, of_other = (
+        {view.view_id: view for view in result.views if config_of(view.view_id) == config}
+        for result in (first, other)
+    )
+    predicted_by_both = [view_id for view_id in of_first if of_first[view_id].native and of_other[view_id].native]
     on_all_views, on_predicted_by_both = (
-        _differences_on_views([first[v] for v in ids], [other[v] for v in ids], by_scene)
-        for ids in (list(first), predicted_by_both)
+        _differences_on_views(
+            [of_first[view_id] for view_id in view_ids],
+            [of_other[view_id] for view_id in view_ids],
+            by_scene=tables[0].split is not None,
+            are_comparable=all(table.is_comparable for table in tables),
+        )
+        for view_ids in (of_first, predicted_by_both)
     )
     return [
         (on_all_views if column.of_all_views else on_predicted_by_both)[column.path] for column in VIEW_COLUMNS
@@ -147,7 +138,7 @@ def _differences(
 
 
 def _differences_on_views(
-    first: Sequence[ViewScore], other: Sequence[ViewScore], by_scene: bool
+    first: Sequence[ViewScore], other: Sequence[ViewScore], *, by_scene: bool, are_comparable: bool
 ) -> dict[str, Difference]:
     """Return the differences on the given views by metric name, with the same resamples for both submissions."""
     resampling = resample_views([view.view_id for view in first], by_scene=by_scene)
@@ -159,8 +150,9 @@ def _differences_on_views(
         column = COLUMN_BY_PATH[name]
         first_value, other_value = (_table_value(column, views) for views in (first, other))
         change = None if first_value is None or other_value is None else other_value - first_value
+        verdict = _verdict(column, bounds) if are_comparable or column.of_all_views else "no verdict"
         differences[name] = Difference(
-            column, len(first), first_value, other_value, change, bounds, _verdict(column, bounds)
+            column, len(first), first_value, other_value, change, bounds, verdict if column.better else ""
         )
     return differences
 
@@ -173,8 +165,6 @@ def _table_value(column: Column, views: Sequence[ViewScore]) -> float | None:
 
 
 def _verdict(column: Column, bounds: Interval | None) -> Verdict:
-    if not column.better:
-        return ""
     if bounds == (0.0, 0.0):
         return "equal"
     if bounds is None or bounds[0] <= 0.0 <= bounds[1]:

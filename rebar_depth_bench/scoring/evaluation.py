@@ -14,7 +14,6 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
@@ -22,28 +21,17 @@ from rebar_depth_bench import software_version
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_folder
 from rebar_depth_bench.data.rows import CAMERA_KINDS, camera_from_row, decode_row
 from rebar_depth_bench.data.shards import encoded_rows
-from rebar_depth_bench.errors import Problem, SubmissionError
+from rebar_depth_bench.errors import SubmissionError
 from rebar_depth_bench.geometry.cameras import Camera
 from rebar_depth_bench.names import TEST_SPLIT, config_of, split_of
 from rebar_depth_bench.parallel import Progress, map_with_progress, silent
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareIdentity, SubmissionIdentity
 from rebar_depth_bench.scoring.score import ReadDepth, score_views
-from rebar_depth_bench.scoring.table import ViewScore
 from rebar_depth_bench.scoring.truth import config_truth
-from rebar_depth_bench.submission import Declaration, EntryError, SubmissionReader, open_submission
-from rebar_depth_bench.submission.declaration import NOT_DECLARED
-from rebar_depth_bench.submission.maps import Depth
+from rebar_depth_bench.submission import EntryError, SubmissionMeta, SubmissionReader
 
 _Found = TypeVar("_Found")
-
-
-@dataclass(frozen=True)
-class ArchiveIdentity:
-    """Method name of an archive and the hex SHA-256 of its file."""
-
-    method: str
-    sha256: str
 
 
 @dataclass(frozen=True)
@@ -57,7 +45,7 @@ class Provenance:
     protocol: str
     dataset_digest: str | None
     dataset_version: str | None
-    archives: Sequence[ArchiveIdentity]
+    archives: Sequence[SubmissionIdentity]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the provenance entries of a JSON object."""
@@ -78,15 +66,11 @@ class View:
     """
 
     config: DatasetConfig
+    view_id: str
     position: int
     encoded: Mapping[str, Any]
     read_depth: ReadDepth
     _decoded: dict[str, Any] = field(default_factory=dict)
-
-    @property
-    def view_id(self) -> str:
-        """Id of the view."""
-        return self.config.view_ids[self.position]
 
     @cached_property
     def prediction_m(self) -> Float[ndarray, "h w"]:
@@ -115,7 +99,7 @@ def read_views(
     """
     position_by_view = {config.view_ids[position]: position for position in positions}
     for row in encoded_rows(config, ("view_id", *columns), position_by_view):
-        yield View(config, position_by_view[row["view_id"]], row, read_depth)
+        yield View(config, row["view_id"], position_by_view[row["view_id"]], row, read_depth)
 
 
 @dataclass(frozen=True)
@@ -127,14 +111,10 @@ class Evaluation:
     _made: dict[object, Any] = field(default_factory=dict, repr=False, compare=False)
 
     @property
-    def method(self) -> str:
-        """Name of the method."""
-        return self.submission.meta.method if self.submission.meta else ""
-
-    @property
-    def declared(self) -> Declaration:
-        """What the submission declares about its inputs and its use of ground truth."""
-        return self.submission.meta.declaration if self.submission.meta else NOT_DECLARED
+    def meta(self) -> SubmissionMeta:
+        """Content of ``submission.json``."""
+        assert self.submission.meta is not None
+        return self.submission.meta
 
     @cached_property
     def configs(self) -> tuple[DatasetConfig, ...]:
@@ -165,8 +145,8 @@ class Evaluation:
 
     def provenance(self) -> Provenance:
         """Return the provenance of an analysis of the submission."""
-        archives = (ArchiveIdentity(self.method, self.submission.sha256()),)
-        return Provenance(PROTOCOL, self.folder.digest, self.folder.version, archives)
+        archive = SubmissionIdentity(self.meta.method, self.submission.sha256())
+        return Provenance(PROTOCOL, self.folder.digest, self.folder.version, [archive])
 
 
 @contextmanager
@@ -179,7 +159,7 @@ def open_evaluation(
     invalid, and ``DatasetError`` if the dataset folder is, or if its digest is not ``expect_digest``.
     """
     folder = open_folder(root, expect_digest=expect_digest)
-    with open_submission(archive, folder.expected_views()) as submission:
+    with SubmissionReader(archive, folder.expected_views()) as submission:
         if submission.meta is None or submission.structure_problems:
             raise SubmissionError.from_problems(archive, list(submission.problems()))
         yield Evaluation(folder, submission)
@@ -207,52 +187,28 @@ def score(
 
 def score_evaluation(evaluation: Evaluation, *, workers: int | None = None, progress: Progress = silent) -> Result:
     """Score an open submission as ``score`` does. Raises ``SubmissionError`` if an entry is invalid."""
-    submission, folder = evaluation.submission, evaluation.folder
-    read = _Entries(submission, folder.expected_views())
+    submission, folder, meta = evaluation.submission, evaluation.folder, evaluation.meta
     truths = ((config.name, config_truth(folder, config, progress)) for config in evaluation.configs)
-
-    def each(name: str, work: Callable[[int], ViewScore], positions: Sequence[int]) -> list[ViewScore]:
-        return map_with_progress(work, positions, workers, progress, f"scoring {name}", len(positions))
-
     with ThreadPoolExecutor(1) as pool:
         sha256 = pool.submit(submission.sha256)
-        tables, views = score_views(truths, read.depth, evaluation.declared, each)
-        read.check([view.view_id for view in views])
+        try:
+            tables, views = score_views(
+                truths,
+                submission.read,
+                meta.declaration,
+                lambda name, work, positions: map_with_progress(
+                    work, positions, workers, progress, f"scoring {name}", len(positions)
+                ),
+            )
+            for view_id in set(submission.view_ids) - {view.view_id for view in views}:
+                submission.read(view_id)  # A view without scored pixels.
+        except EntryError:
+            evaluation.check_entries(progress)
+            raise
         return Result(
             dataset=DatasetIdentity(folder.digest, folder.version),
-            submission=SubmissionIdentity(
-                evaluation.method,
-                sha256.result(),
-                evaluation.declared.inputs,
-                evaluation.declared.uses_ground_truth,
-            ),
+            submission=SubmissionIdentity(meta.method, sha256.result(), meta.inputs, meta.uses_ground_truth),
             software=SoftwareIdentity(software_version()),
             tables=tables,
             views=views,
         )
-
-
-@dataclass(frozen=True)
-class _Entries:
-    """Depth of the entries of a submission; problems of invalid ones are collected, so that all are reported."""
-
-    submission: SubmissionReader
-    grids: dict[str, tuple[int, int]]
-    problems: dict[str, Problem] = field(default_factory=dict)
-
-    def depth(self, view_id: str) -> Depth:
-        """Return the depth of a view, no predictions if its entry is invalid: then nothing is scored at all."""
-        try:
-            return self.submission.read(view_id)
-        except EntryError as error:
-            self.problems[view_id] = error.problem
-            return np.broadcast_to(np.float32(0), self.grids[view_id])
-
-    def check(self, scored: Sequence[str]) -> None:
-        """Raise ``SubmissionError`` with all problems: of the ``scored`` views in order, then of all others."""
-        others = sorted(set(self.submission.view_ids) - set(scored))
-        for view_id in others:  # Views without scored pixels.
-            self.depth(view_id)
-        problems = [self.problems[view_id] for view_id in (*scored, *others) if view_id in self.problems]
-        if problems:
-            raise SubmissionError.from_problems(self.submission.path, problems)

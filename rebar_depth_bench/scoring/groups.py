@@ -55,32 +55,35 @@ def bin_names(edges: Sequence[float], unit: str) -> tuple[str, ...]:
     return tuple(f"{low:g}{f'-{high:g}' if math.isfinite(high) else '+'} {unit}" for low, high in pairwise(edges))
 
 
-def _binned(
-    value_of: Callable[[ViewTraits], float | None], edges: Sequence[float], unit: str
-) -> Callable[[ViewTraits], str | None]:
+def _bins(
+    title: str, definition: str, value_of: Callable[[ViewTraits], float | None], edges: Sequence[float], unit: str
+) -> Grouping:
+    """Return the grouping by the bin of a value; views without one belong to no group."""
     names = bin_names(edges, unit)
 
     def group_of(view: ViewTraits) -> str | None:
         value = value_of(view)
         return None if value is None else names[int(np.searchsorted(edges[1:-1], value, side="right"))]
 
-    return group_of
+    return Grouping(title, definition, group_of, names)
 
 
 GROUPINGS: Mapping[str, Grouping] = {
     "family": Grouping("cage family", "the family of its cage", lambda view: view.family),
-    "distance": Grouping(
+    "distance": _bins(
         "distance",
         "the bin of the median true depth of its scored pixels",
-        _binned(lambda view: view.distance_m, DISTANCE_EDGES_M, "m"),
-        bin_names(DISTANCE_EDGES_M, "m"),
+        lambda view: view.distance_m,
+        DISTANCE_EDGES_M,
+        "m",
     ),
-    "bar_width": Grouping(
+    "bar_width": _bins(
         "bar width",
         "the bin of the median of f d / z over its scored pixels: focal length in pixels times the bar's nominal "
         "diameter by true depth",
-        _binned(lambda view: view.bar_width_px, WIDTH_EDGES_PX, "px"),
-        bin_names(WIDTH_EDGES_PX, "px"),
+        lambda view: view.bar_width_px,
+        WIDTH_EDGES_PX,
+        "px",
     ),
 }
 """Groupings by their key in the result's JSON, in the order of tables."""

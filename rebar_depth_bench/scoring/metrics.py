@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float
 from numpy import ndarray
 
 from rebar_depth_bench.scoring.columns import METRICS, MetricShare, MetricSize
@@ -60,16 +60,36 @@ def metrics_at_scales(
     All sums are computed in one pass over chunks that fit into the processor's cache. Temporary arrays of a whole
     view would be mapped, cleared and unmapped for every operation, which takes longer than the arithmetic.
     """
-    sums = [_ErrorSums(dict.fromkeys(() if index else tolerances_mm, 0)) for index in range(len(scales))]
+    inliers, within_mm = [0] * len(scales), dict.fromkeys(tolerances_mm, 0)
+    sums = np.zeros((len(scales), 3))  # Of |p - z|, of its square, and of it by z.
     scaled, buffer = np.empty((2, _CHUNK_PX))
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         for start in range(0, len(z_m), _CHUNK_PX):
             chunk = slice(start, start + _CHUNK_PX)
-            p, z = p_m[chunk].astype(np.float64), z_m[chunk].astype(np.float64)
-            for error_sums, scale in zip(sums, scales, strict=True):
-                at_scale = p if scale == 1.0 else np.multiply(p, scale, out=scaled[: len(p)])
-                error_sums.add(at_scale, z, buffer[: len(p)])
-    return [error_sums.metrics(len(z_m)) for error_sums in sums], sums[0].within_mm
+            predicted, z = p_m[chunk].astype(np.float64), z_m[chunk].astype(np.float64)
+            out = buffer[: len(z)]
+            for k, scale in enumerate(scales):
+                p = predicted if scale == 1.0 else np.multiply(predicted, scale, out=scaled[: len(z)])
+                # The ratios are compared as products: in float64 the product of a float32 depth and DELTA1_RATIO
+                # is exact, whereas a quotient would be rounded. The pixels with z/p at or above the ratio all
+                # satisfy p < ratio * z and are counted there.
+                inliers[k] += np.count_nonzero(p < np.multiply(z, DELTA1_RATIO, out=out))
+                inliers[k] -= np.count_nonzero(z >= np.multiply(p, DELTA1_RATIO, out=out))
+                error_m = np.abs(np.subtract(p, z, out=out), out=out)
+                for tolerance_mm in within_mm if k == 0 else ():
+                    within_mm[tolerance_mm] += int(np.count_nonzero(error_m <= tolerance_mm / 1000.0))
+                absolute, square = np.add.reduce(error_m), error_m @ error_m
+                sums[k] += absolute, square, np.add.reduce(np.divide(error_m, z, out=out))
+    metrics = [
+        DepthMetrics(
+            abs_rel=relative / len(z_m),
+            rmse_cm=100.0 * math.sqrt(square_m2 / len(z_m)),
+            mae_cm=100.0 * absolute_m / len(z_m),
+            delta1=count / len(z_m),
+        )
+        for (absolute_m, square_m2, relative), count in zip(sums.tolist(), inliers, strict=True)
+    ]
+    return metrics, within_mm
 
 
 def rank_error(p_m: Float[ndarray, " n"], z_m: Float[ndarray, " n"], valid: Bool[ndarray, " n"]) -> float:
@@ -139,41 +159,6 @@ def is_valid_prediction(p_m: Float[ndarray, " n"]) -> Bool[ndarray, " n"]:
     """Return a mask of the valid predictions: finite and > 0."""
     with np.errstate(invalid="ignore"):
         return np.asarray(np.isfinite(p_m) & (p_m > 0))
-
-
-@dataclass
-class _ErrorSums:
-    """Running sums over pixels, from which ``DepthMetrics`` are computed."""
-
-    within_mm: dict[int, int]
-    absolute_m: float = 0.0
-    square_m2: float = 0.0
-    relative: float = 0.0
-    inliers: int = 0
-
-    def add(self, p: Float64[ndarray, " m"], z: Float64[ndarray, " m"], buffer: Float64[ndarray, " m"]) -> None:
-        """Add the pixels of one chunk to the sums; ``buffer`` is overwritten."""
-        # The ratios are compared as products: in float64 the product of a float32 depth and DELTA1_RATIO is exact,
-        # whereas a quotient would be rounded.
-        self.inliers += np.count_nonzero(p < np.multiply(z, DELTA1_RATIO, out=buffer))
-        # The pixels with z/p at or above the ratio all satisfy p < ratio * z and were counted in the line above.
-        self.inliers -= np.count_nonzero(z >= np.multiply(p, DELTA1_RATIO, out=buffer))
-        error_m = np.subtract(p, z, out=buffer)
-        np.abs(error_m, out=error_m)
-        for tolerance_mm in self.within_mm:
-            self.within_mm[tolerance_mm] += int(np.count_nonzero(error_m <= tolerance_mm / 1000.0))
-        self.absolute_m += float(np.add.reduce(error_m))
-        self.square_m2 += float(error_m @ error_m)
-        self.relative += float(np.add.reduce(np.divide(error_m, z, out=error_m)))
-
-    def metrics(self, count: int) -> DepthMetrics:
-        """Return the metrics over ``count`` pixels."""
-        return DepthMetrics(
-            abs_rel=self.relative / count,
-            rmse_cm=100.0 * math.sqrt(self.square_m2 / count),
-            mae_cm=100.0 * self.absolute_m / count,
-            delta1=self.inliers / count,
-        )
 
 
 def _values_around_median(values: Float[ndarray, " n"], low_rank: int, high_rank: int) -> tuple[ndarray, int]:

@@ -7,8 +7,8 @@ pixel is smaller than the differences between neighbouring pixels.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import astuple, dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float32, UInt32
@@ -17,8 +17,11 @@ from numpy import ndarray
 from rebar_depth_bench.scoring.columns import Size, rounded
 from rebar_depth_bench.scoring.metrics import depth_metrics, mean
 
-_UNDEFINED = -1.0
-"""Number that stands for an undefined error in the cache, which stores finite numbers."""
+UNDEFINED = -1.0
+"""Number that stands for an undefined one in the cache, which stores finite numbers."""
+
+ReferenceNumbers = tuple[float, ...]
+"""AbsRel and RMSE (cm) of the constant, and those of depth shifted by one pixel, of a view; or ``UNDEFINED``."""
 
 
 @dataclass(frozen=True)
@@ -31,7 +34,7 @@ class Errors:
 
 @dataclass(frozen=True)
 class Reference:
-    """Reference errors of a view, or their means over the views of a config.
+    """Reference errors of a config: means over its views.
 
     The errors of ``constant``, a constant prediction after scaling, are compared with scaled errors of complete
     predictions. The errors of ``one_pixel``, exact depth taken one pixel to the left, right, above and below
@@ -50,26 +53,14 @@ class Reference:
             for name, errors in (("constant", self.constant), ("one_pixel", self.one_pixel))
         }
 
-    def to_numbers(self) -> tuple[float, ...]:
-        """Return the errors that follow from the ground truth as numbers for the cache."""
-        errors = (*astuple(self.constant), *astuple(self.one_pixel))
-        return tuple(_UNDEFINED if value is None else value for value in errors)
-
 
 NO_REFERENCE = Reference()
 """Reference errors that are not known."""
 
-REFERENCE_NUMBERS = len(NO_REFERENCE.to_numbers())
-"""Length of ``Reference.to_numbers``."""
 
-
-def reference_of_numbers(numbers: Iterable[float]) -> Reference:
-    """Return the reference errors with the given ``Reference.to_numbers``."""
-    constant, constant_cm, shifted, shifted_cm = (None if one == _UNDEFINED else one for one in numbers)
-    return Reference(Errors(constant, constant_cm), Errors(shifted, shifted_cm))
-
-
-def view_reference(depth_m: Float32[ndarray, "h w"], pixels: UInt32[ndarray, " n"], median_m: float) -> Reference:
+def view_reference(
+    depth_m: Float32[ndarray, "h w"], pixels: UInt32[ndarray, " n"], median_m: float
+) -> ReferenceNumbers:
     """Return the reference errors of a view on its scored pixels, one or more.
 
     ``depth_m`` is the true planar depth of the view in metres, 0 where there is no surface; ``pixels`` are flat
@@ -79,9 +70,14 @@ def view_reference(depth_m: Float32[ndarray, "h w"], pixels: UInt32[ndarray, " n
     row, column = np.divmod(pixels.astype(np.intp), depth_m.shape[1])
     framed_m = np.pad(depth_m, 1)
     z_m = depth_m[row, column]
-    shifted = [_errors(framed_m[row + v, column + u], z_m) for v, u in ((1, 0), (1, 2), (0, 1), (2, 1))]
-    one_pixel = [_defined_mean(values) for values in zip(*shifted, strict=True)]
-    return Reference(Errors(*constant_errors(z_m, median_m)), Errors(*one_pixel))
+    shifted = []
+    for v, u in ((1, 0), (1, 2), (0, 1), (2, 1)):
+        neighbour_m = framed_m[row + v, column + u]
+        if (has_depth := neighbour_m > 0).any():
+            shifted.append(depth_metrics(neighbour_m[has_depth], z_m[has_depth]))
+    abs_rel, rmse_cm = mean([one.abs_rel for one in shifted]), mean([one.rmse_cm for one in shifted])
+    one_pixel = (UNDEFINED, UNDEFINED) if abs_rel is None or rmse_cm is None else (abs_rel, rmse_cm)
+    return *constant_errors(z_m, median_m), *one_pixel
 
 
 def constant_errors(z_m: Float32[ndarray, " n"], median_m: float) -> tuple[float, float]:
@@ -90,21 +86,7 @@ def constant_errors(z_m: Float32[ndarray, " n"], median_m: float) -> tuple[float
     return metrics.abs_rel, metrics.rmse_cm
 
 
-def mean_reference(views: Iterable[Reference]) -> Reference:
-    """Return the means over views of the reference errors."""
-    numbers = zip(*map(Reference.to_numbers, views), strict=True)
-    means = [mean([value for value in values if value != _UNDEFINED]) for values in numbers]
+def mean_reference(views: Sequence[ReferenceNumbers]) -> Reference:
+    """Return the means over views of their defined reference errors."""
+    means = [mean([view[k] for view in views if view[k] != UNDEFINED]) for k in range(4)]
     return Reference(Errors(*means[:2]), Errors(*means[2:]))
-
-
-def _errors(p_m: ndarray, z_m: Float32[ndarray, " n"]) -> tuple[float | None, float | None]:
-    """Return AbsRel and RMSE (cm) where ``p_m`` is above 0; None if it is nowhere."""
-    has_depth = p_m > 0
-    if not has_depth.any():
-        return None, None
-    metrics = depth_metrics(p_m[has_depth], z_m[has_depth])
-    return metrics.abs_rel, metrics.rmse_cm
-
-
-def _defined_mean(values: Iterable[float | None]) -> float | None:
-    return mean([value for value in values if value is not None])

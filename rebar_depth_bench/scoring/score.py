@@ -8,17 +8,18 @@ an archive.
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Protocol
+from functools import partial
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt32
+from jaxtyping import Bool, Float, Float32, UInt32
 from numpy import ndarray
 
 from rebar_depth_bench.scoring.columns import COLUMN_BY_PATH, view_intervals
 from rebar_depth_bench.scoring.groups import GROUPINGS, ViewTraits, positions_by_group
 from rebar_depth_bench.scoring.metrics import (
+    DepthMetrics,
     is_valid_prediction,
     mean,
     mean_metrics,
@@ -28,7 +29,14 @@ from rebar_depth_bench.scoring.metrics import (
     rank_error,
 )
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
-from rebar_depth_bench.scoring.reference import NO_REFERENCE, Errors, Reference, constant_errors, mean_reference
+from rebar_depth_bench.scoring.reference import (
+    NO_REFERENCE,
+    Errors,
+    Reference,
+    ReferenceNumbers,
+    constant_errors,
+    mean_reference,
+)
 from rebar_depth_bench.scoring.table import PublishedMatch, Table, ViewScore
 from rebar_depth_bench.submission.declaration import NOT_DECLARED, Declaration
 
@@ -41,7 +49,8 @@ class ViewTruth:
     """Scored pixels of one view.
 
     ``index`` holds flat indices into the H x W image, ``depth_m`` their planar depth and ``median_m`` its median,
-    in metres. ``constant`` has ``reference.constant_errors``, if they are known.
+    in metres. ``constant`` has ``reference.constant_errors``, and ``single_bar`` marks the pixels of
+    ``protocol.single_bar_pixels``, if they are known.
     """
 
     view_id: str
@@ -49,52 +58,42 @@ class ViewTruth:
     depth_m: Float32[ndarray, " n"]
     median_m: float
     constant: tuple[float, float] | None = None
+    single_bar: Bool[ndarray, " n"] | None = None
 
 
-class Truth(Protocol):
-    """Ground truth of a config: its views with scored pixels, and what its table states besides their means."""
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """Ground truth of the views of a config that have scored pixels, in order.
 
-    @property
-    def view_ids(self) -> tuple[str, ...]:
-        """Ids of the views, in order."""
+    ``read(position)`` returns a view. ``references`` are the errors of ``view_reference`` and ``traits`` the
+    properties by which views are grouped, of each view. ``split`` is that of the views, None in a config of one
+    scene. ``truth_sigma_m`` and ``published`` are those of ``Table``.
+    """
 
-    @property
-    def references(self) -> Sequence[Reference]:
-        """Reference errors of each view."""
+    view_ids: tuple[str, ...]
+    read: Callable[[int], ViewTruth]
+    references: Sequence[ReferenceNumbers]
+    traits: Sequence[ViewTraits] = ()
+    split: str | None = None
+    truth_sigma_m: float | None = None
+    published: PublishedMatch | None = None
 
-    @property
-    def traits(self) -> Sequence[ViewTraits]:
-        """Properties of each view by which views are grouped in a config with splits."""
+    def __len__(self) -> int:
+        return len(self.view_ids)
 
-    @property
-    def split(self) -> str | None:
-        """Split of the views, None in a config of one scene."""
-
-    @property
-    def truth_sigma_m(self) -> float | None:
-        """Standard deviation of the depth, metres, None if it is exact."""
-
-    @property
-    def published(self) -> PublishedMatch | None:
-        """Scene of the paper's Table I that the config shows, if any."""
-
-    def view(self, position: int) -> ViewTruth:
-        """Return the view at ``position``."""
+    def __iter__(self) -> Iterator[ViewTruth]:
+        return map(self.read, range(len(self)))
 
 
 Each = Callable[[str, Callable[[int], ViewScore], Sequence[int]], Iterable[ViewScore]]
 """Function that maps a function over the positions of a config's views, in order; the config's name is first."""
 
 
-def _in_turn(_: str, work: Callable[[int], ViewScore], positions: Sequence[int]) -> Iterable[ViewScore]:
-    return map(work, positions)
-
-
 def score_views(
     truths: Iterable[tuple[str, Truth]],
     read_depth: ReadDepth,
     declared: Declaration = NOT_DECLARED,
-    each: Each = _in_turn,
+    each: Each = lambda _, work, positions: map(work, positions),
 ) -> tuple[dict[str, Table], list[ViewScore]]:
     """Return the tables by config, and the scores of all views.
 
@@ -104,18 +103,15 @@ def score_views(
     tables: dict[str, Table] = {}
     views: list[ViewScore] = []
     for name, truth in truths:
-        scores = list(each(name, _scorer(truth, read_depth), range(len(truth.view_ids))))
+        scores = list(each(name, partial(_score_at, truth, read_depth), range(len(truth.view_ids))))
         tables[name] = tabulate_config(scores, truth, declared)
         views += scores
     return tables, views
 
 
-def _scorer(truth: Truth, read_depth: ReadDepth) -> Callable[[int], ViewScore]:
-    def score_at(position: int) -> ViewScore:
-        view = truth.view(position)
-        return score_view(view, read_depth(view.view_id))
-
-    return score_at
+def _score_at(truth: Truth, read_depth: ReadDepth, position: int) -> ViewScore:
+    view = truth.read(position)
+    return score_view(view, read_depth(view.view_id))
 
 
 def score_view(truth: ViewTruth, prediction_m: Float[ndarray, "h w"]) -> ViewScore:
@@ -150,15 +146,13 @@ def score_view(truth: ViewTruth, prediction_m: Float[ndarray, "h w"]) -> ViewSco
 
 def tabulate_config(scores: Sequence[ViewScore], truth: Truth, declared: Declaration) -> Table:
     """Return the table of a config, with the tables of groups of its views if it has splits."""
-    references = truth.references
-    table = tabulate(
-        scores, declared, mean_reference(references), truth.published, truth.split, truth.truth_sigma_m
-    )
+    reference = mean_reference(truth.references)
+    table = tabulate(scores, declared, reference, truth.published, truth.split, truth.truth_sigma_m)
     if truth.split is None:
         return table
 
     def of_group(positions: Sequence[int]) -> Table:
-        reference = mean_reference(references[position] for position in positions)
+        reference = mean_reference([truth.references[position] for position in positions])
         group = [scores[position] for position in positions]
         return tabulate(group, declared, reference, None, truth.split, truth.truth_sigma_m)
 
@@ -207,4 +201,49 @@ def tabulate(
         split=split,
         truth_sigma_m=truth_sigma_m,
         intervals=view_intervals(views, by_scene=split is not None) if views else dict.fromkeys(COLUMN_BY_PATH),
+    )
+
+
+# Single-bar interior: scored pixels whose 3 x 3 neighbourhood belongs to one bar. The interior of the protocol
+# erodes the union of all bars. Where bars lie side by side in the image, a scored pixel can therefore have another
+# bar beside it, at another depth; a prediction that is exact but shifted by one pixel has a large error there.
+# Errors on the single-bar interior contain no such steps.
+
+
+@dataclass(frozen=True)
+class SingleBarScore:
+    """Share of a view's scored pixels that are single-bar, their coverage, and the metrics of the valid ones.
+
+    ``coverage`` is None without such pixels, ``native`` and ``scaled`` without valid predictions on them.
+    ``scaled`` uses the view's scale, that of all its scored pixels.
+    """
+
+    share: float
+    coverage: float | None
+    native: DepthMetrics | None
+    scaled: DepthMetrics | None
+
+
+def single_bar_scores(truths: Truth, read_depth: ReadDepth, scores: Sequence[ViewScore]) -> list[SingleBarScore]:
+    """Return the scores on single-bar pixels of all views of a config, given their scores in the same order."""
+    found = []
+    for truth, score in zip(truths, scores, strict=True):
+        p_m = read_depth(truth.view_id).ravel().take(truth.index.astype(np.intp))
+        single_bar = np.zeros(len(p_m), bool) if truth.single_bar is None else truth.single_bar
+        chosen = single_bar & is_valid_prediction(p_m)
+        coverage = np.count_nonzero(chosen) / np.count_nonzero(single_bar) if single_bar.any() else None
+        native, scaled = None, None
+        if score.scale is not None and chosen.any():
+            (native, scaled), _ = metrics_at_scales(p_m[chosen], truth.depth_m[chosen], (1.0, score.scale))
+        found.append(SingleBarScore(float(np.mean(single_bar)), coverage, native, scaled))
+    return found
+
+
+def mean_single_bar(scores: Sequence[SingleBarScore]) -> SingleBarScore:
+    """Return the means over one or more views: the share of all, and the others of those that have a value."""
+    return SingleBarScore(
+        share=sum(score.share for score in scores) / len(scores),
+        coverage=mean([score.coverage for score in scores if score.coverage is not None]),
+        native=mean_metrics([score.native for score in scores if score.native]),
+        scaled=mean_metrics([score.scaled for score in scores if score.scaled]),
     )

@@ -12,105 +12,28 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, UInt32
+from jaxtyping import UInt32
 from numpy import ndarray
 
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars, with_axis
-from rebar_depth_bench.data.cache import ArrayCache, CacheContent, ViewArrays, open_cache
+from rebar_depth_bench.data.cache import CacheContent, ViewArrays, open_cache
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder
 from rebar_depth_bench.data.rows import EyeTruth, iterate_rows, truth_columns, truth_from_row
-from rebar_depth_bench.data.schema import NEAREST_STEEL, Assembly, Trajectory, ViewRecord
+from rebar_depth_bench.data.schema import NEAREST_STEEL, Assembly, Trajectory
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.scoring.groups import ViewTraits, bar_width_px
 from rebar_depth_bench.scoring.metrics import median
 from rebar_depth_bench.scoring.protocol import PROTOCOL, scored_pixels, single_bar_pixels
-from rebar_depth_bench.scoring.reference import (
-    REFERENCE_NUMBERS,
-    Reference,
-    mean_reference,
-    reference_of_numbers,
-    view_reference,
-)
-from rebar_depth_bench.scoring.score import ViewTruth
+from rebar_depth_bench.scoring.reference import UNDEFINED, Reference, mean_reference, view_reference
+from rebar_depth_bench.scoring.score import Truth, ViewTruth
 from rebar_depth_bench.scoring.table import PublishedMatch
 
-_REFERENCE = slice(1, 1 + REFERENCE_NUMBERS)
-_WIDTH = 1 + REFERENCE_NUMBERS
-"""Places of the reference errors and of the bar width among the cached numbers; the median depth is the first."""
-_NO_WIDTH = -1.0
+_REFERENCE = slice(1, 5)
+"""Places of ``view_reference`` among the cached numbers: after the median depth, before the bar width, if any."""
 
 
-@dataclass(frozen=True, eq=False)
-class ConfigTruth:
-    """Views of a config that have scored pixels, each read from the cache on access (see ``score.Truth``)."""
-
-    cache: ArrayCache
-    config: DatasetConfig
-
-    @property
-    def split(self) -> str | None:
-        """Split of the views, None in a config of one scene."""
-        return self.config.scenes[0].split if self.config.has_splits else None
-
-    @property
-    def truth_sigma_m(self) -> float | None:
-        """Standard deviation of the depth, metres, None if it is exact."""
-        return self.config.truth_sigma_m
-
-    @property
-    def published(self) -> PublishedMatch | None:
-        """Scene of the paper's Table I that the config shows, if any."""
-        return published_match(self.config)
-
-    @property
-    def view_ids(self) -> tuple[str, ...]:
-        """Ids of the views, in order."""
-        return self.cache.view_ids
-
-    def single_bar(self, position: int) -> Bool[ndarray, " n"]:
-        """Return which scored pixels of the view at ``position`` are single-bar: see ``single_bar_pixels``."""
-        return self.cache.view(position).arrays["single_bar"]
-
-    @property
-    def medians_m(self) -> tuple[float, ...]:
-        """Median ground-truth depth of the scored pixels of each view, metres."""
-        return tuple(median_m for median_m, *_ in self.cache.numbers)
-
-    @property
-    def references(self) -> tuple[Reference, ...]:
-        """Reference errors of each view."""
-        return tuple(reference_of_numbers(numbers[_REFERENCE]) for numbers in self.cache.numbers)
-
-    @property
-    def traits(self) -> tuple[ViewTraits, ...]:
-        """Properties of each view by which views are grouped, without bar widths in a config of one scene."""
-        families = {scene.name: scene.family for scene in self.config.scenes}
-        widths_px = (numbers[_WIDTH:] for numbers in self.cache.numbers)
-        return tuple(
-            ViewTraits(
-                families[self.config.scene_by_view[view_id]],
-                median_m,
-                width_px[0] if width_px and width_px[0] > 0 else None,
-            )
-            for view_id, median_m, width_px in zip(self.view_ids, self.medians_m, widths_px, strict=True)
-        )
-
-    def __len__(self) -> int:
-        return len(self.cache)
-
-    def __iter__(self) -> Iterator[ViewTruth]:
-        return map(self.view, range(len(self)))
-
-    def view(self, position: int) -> ViewTruth:
-        """Return the view at ``position`` in protocol order."""
-        view = self.cache.view(position)
-        median_m, abs_rel, rmse_cm, *_ = view.numbers
-        constant = abs_rel, rmse_cm
-        return ViewTruth(view.view_id, view.arrays["index"], view.arrays["depth_m"], median_m, constant)
-
-
-def config_truth(folder: DatasetFolder, config: DatasetConfig, progress: Progress = silent) -> ConfigTruth:
+def config_truth(folder: DatasetFolder, config: DatasetConfig, progress: Progress = silent) -> Truth:
     """Return the ground truth of a config, from the cache or else extracted from the dataset.
 
     Views without scored pixels are omitted. A config with splits that has bar ids also needs the table of bars.
@@ -123,7 +46,7 @@ def config_truth(folder: DatasetFolder, config: DatasetConfig, progress: Progres
 
     def is_sound(view: ViewArrays) -> bool:
         has_counts = len(view.arrays["index"]) == scored_px[view.view_id]
-        return has_counts and len(view.numbers) == _WIDTH + has_widths and are_pixels_inside(view, config)
+        return has_counts and len(view.numbers) == _REFERENCE.stop + has_widths and are_pixels_inside(view, config)
 
     content = CacheContent(
         source=config.root,
@@ -134,7 +57,30 @@ def config_truth(folder: DatasetFolder, config: DatasetConfig, progress: Progres
         extract=lambda view_ids: _extract_views(config, diameters, view_ids),
         is_sound=is_sound,
     )
-    return ConfigTruth(open_cache(content, progress), config)
+    cache = open_cache(content, progress)
+    families = {scene.name: scene.family for scene in config.scenes}
+    references, traits = [], []
+    for view_id, numbers in zip(cache.view_ids, cache.numbers, strict=True):
+        width_px = numbers[-1] if has_widths and numbers[-1] != UNDEFINED else None
+        references.append(numbers[_REFERENCE])
+        traits.append(ViewTraits(families[config.scene_by_view[view_id]], numbers[0], width_px))
+    return Truth(
+        view_ids=cache.view_ids,
+        read=lambda position: _view_truth(cache.view(position)),
+        references=references,
+        traits=traits,
+        split=config.scenes[0].split if config.has_splits else None,
+        truth_sigma_m=config.truth_sigma_m,
+        published=published_match(config),
+    )
+
+
+def _view_truth(view: ViewArrays) -> ViewTruth:
+    median_m, abs_rel, rmse_cm, *_ = view.numbers
+    arrays = view.arrays
+    return ViewTruth(
+        view.view_id, arrays["index"], arrays["depth_m"], median_m, (abs_rel, rmse_cm), arrays["single_bar"]
+    )
 
 
 def _diameters_by_scene(folder: DatasetFolder) -> dict[str, dict[int, float]]:
@@ -149,7 +95,7 @@ def reference_errors(config: DatasetConfig) -> Reference:
     Raises ``DatasetError`` as ``config_truth``.
     """
     views = _extract_views(config, None)
-    return mean_reference(reference_of_numbers(view.numbers[_REFERENCE]) for view in views)
+    return mean_reference([view.numbers[_REFERENCE] for view in views])
 
 
 def cache_inputs(config: DatasetConfig, protocol: str, extra_digest: str = "") -> dict[str, Any]:
@@ -187,8 +133,15 @@ def verified_views(
     """
     records = {view.view_id: view for view in config.views}
     for row in iterate_rows(config, ("view_id", *truth_columns("left")), view_ids):
-        view_id, left = row["view_id"], truth_from_row(row, "left")
-        yield view_id, left, _verified_pixels(left, records[view_id], config)
+        record, left = records[row["view_id"]], truth_from_row(row, "left")
+        digest, pixels = left.digest(), scored_pixels(left.mask, left.depth_m)
+        if digest != record.left or len(pixels) != record.scored_px:
+            raise DatasetError(
+                f"{config.root}: view {record.view_id}: ground truth has digest {digest[:16]} and {len(pixels)} "
+                f"scored pixels, the manifest has {record.left[:16]} and {record.scored_px}; "
+                f"rebar-bench verify {config.root} lists damaged files"
+            )
+        yield record.view_id, left, pixels
 
 
 def _extract_views(
@@ -204,27 +157,15 @@ def _extract_views(
         if len(pixels):
             depth_m = left.depth_m.ravel()[pixels]
             median_m = median(depth_m)
-            reference = view_reference(left.depth_m, pixels, median_m)
-            numbers = (median_m, *reference.to_numbers())
+            numbers = (median_m, *view_reference(left.depth_m, pixels, median_m))
             if diameters is not None:
                 known_m = diameters.get(config.scene_by_view[view_id], {})
                 assert left.bars is not None
                 bar_id, focal_px = left.bars.ravel()[pixels], float(left.camera.K[0, 0])
-                numbers += (bar_width_px(depth_m, bar_id, known_m, focal_px) or _NO_WIDTH,)
+                numbers += (bar_width_px(depth_m, bar_id, known_m, focal_px) or UNDEFINED,)
             single_bar = single_bar_pixels(left.bars, pixels)
             arrays = {"index": pixels, "depth_m": depth_m, "single_bar": single_bar}
             yield ViewArrays(view_id, arrays, numbers)
-
-
-def _verified_pixels(left: EyeTruth, record: ViewRecord, config: DatasetConfig) -> UInt32[ndarray, " n"]:
-    digest, pixels = left.digest(), scored_pixels(left.mask, left.depth_m)
-    if digest != record.left or len(pixels) != record.scored_px:
-        raise DatasetError(
-            f"{config.root}: view {record.view_id}: ground truth has digest {digest[:16]} and {len(pixels)} "
-            f"scored pixels, the manifest has {record.left[:16]} and {record.scored_px}; "
-            f"rebar-bench verify {config.root} lists damaged files"
-        )
-    return pixels
 
 
 # Conditions of the paper's Table I: which configs of a dataset its rows may be shown beside. Source: "Benchmarking

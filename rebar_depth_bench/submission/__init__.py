@@ -3,7 +3,7 @@
 from rebar_depth_bench.errors import EntryError
 from rebar_depth_bench.submission.declaration import INPUTS, Declaration, SubmissionMeta
 from rebar_depth_bench.submission.entries import CaptureViews, ExpectedViews
-from rebar_depth_bench.submission.reader import SubmissionReader, check_archive, open_submission
+from rebar_depth_bench.submission.reader import SubmissionReader
 from rebar_depth_bench.submission.writer import SubmissionWriter
 
 __all__ = [
@@ -15,6 +15,4 @@ __all__ = [
     "SubmissionMeta",
     "SubmissionReader",
     "SubmissionWriter",
-    "check_archive",
-    "open_submission",
 ]

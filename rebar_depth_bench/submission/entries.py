@@ -6,7 +6,7 @@ A leading ``./``, with which bsdtar (Windows, macOS, FreeBSD) begins names, is d
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 
@@ -57,80 +57,64 @@ _ANY_SUFFIX = f"one of {', '.join(FORMATS)}"
 _ZIP_HINT = "zip with: zip -r submission.zip submission.json <config> -x '*.DS_Store'"
 
 
-@dataclass(frozen=True, slots=True)
-class MatchedEntries:
-    """Entry indices of the views and of ``submission.json``, and the problems of all other entries.
-
-    ``views`` maps the view_id of each view with exactly one entry to that entry's index; ``metadata`` is the index
-    of ``submission.json``, None if it is missing or duplicated.
-    """
-
-    views: Mapping[str, int]
-    metadata: int | None
-    problems: tuple[Problem, ...]
-
-
-def plain_name(name: str) -> str:
-    """Return an entry name without one leading ``./``."""
-    return name.removeprefix("./")
-
-
-def entry_view_id(name: str, expected: ExpectedViews) -> str | None:
-    """Return the view_id that an entry name denotes, or None if it denotes no expected view."""
-    suffix = PurePosixPath(name).suffix
-    view_id = plain_name(name).removesuffix(suffix)
+def entry_key(name: str, expected: ExpectedViews) -> str | None:
+    """Return the view_id that an entry name denotes, ``METADATA_NAME``, or None for any other name."""
+    plain = name.removeprefix("./")
+    suffix = PurePosixPath(plain).suffix
+    view_id = plain.removesuffix(suffix)
+    if plain == METADATA_NAME:
+        return METADATA_NAME
     return view_id if suffix in FORMATS and view_id in expected else None
 
 
 def max_entry_bytes(name: str, expected: ExpectedViews) -> int | None:
     """Return the largest acceptable uncompressed size of the named entry, in bytes; None for an unknown entry."""
-    if plain_name(name) == METADATA_NAME:
+    key = entry_key(name, expected)
+    if key == METADATA_NAME:
         return MAX_METADATA_BYTES
-    view_id = entry_view_id(name, expected)
-    return None if view_id is None else FORMATS[PurePosixPath(name).suffix].max_bytes(expected[view_id])
+    return None if key is None else FORMATS[PurePosixPath(name).suffix].max_bytes(expected[key])
 
 
-def match_entries(names: Sequence[str], expected: ExpectedViews) -> MatchedEntries:
-    """Assign entry names, in archive order, to the expected views.
+def match_entries(names: Sequence[str], expected: ExpectedViews) -> tuple[dict[str, int], list[Problem]]:
+    """Return the index of the only entry of each view, and of ``METADATA_NAME``, and the problems of all others.
 
-    If all entries lie in one superfluous top-level folder, only that problem is reported.
+    ``names`` are in archive order. If all entries lie in one superfluous top-level folder, only that problem is
+    reported.
     """
-    candidates: dict[str, list[int]] = defaultdict(list)
-    unknown_entries: list[str] = []
+    entries: dict[str, list[int]] = defaultdict(list)
+    unknown: list[str] = []
     folders = {"./", *(f"{prefix}{config_of(view_id)}/" for view_id in expected for prefix in ("", "./"))}
     for index, name in enumerate(names):
-        key = METADATA_NAME if plain_name(name) == METADATA_NAME else entry_view_id(name, expected)
-        if key is not None:
-            candidates[key].append(index)
+        if key := entry_key(name, expected):
+            entries[key].append(index)
         elif name not in folders:
-            unknown_entries.append(name)
-    wrapper_problem = _wrapper_folder_problem(names, expected)
-    if wrapper_problem is not None:
-        return MatchedEntries({}, None, (wrapper_problem,))
-    views = {key: indices[0] for key, indices in candidates.items() if len(indices) == 1 and key != METADATA_NAME}
-    problems = [
-        *_unknown_entry_problems(unknown_entries, expected),
-        *_duplicate_problems(candidates, names),
-        *_missing_problems(candidates, expected),
+            unknown.append(name)
+    if not entries and (wrapper := _wrapper_folder_problem(unknown, expected)):
+        return {}, [wrapper]
+    macos = [name for name in unknown if _is_macos_metadata(name)]
+    problems = [_unknown_entry_problem(name, expected) for name in unknown if not _is_macos_metadata(name)]
+    if macos:
+        found = f"entries made by macOS were found ({len(macos)})"
+        problems.append(Problem("unknown", escape_text(macos[0]), found, f"none; {_ZIP_HINT}"))
+    for key, indices in entries.items():
+        if len(indices) > 1:
+            listed = ", ".join(names[index] for index in indices[:4]) + (", ..." if len(indices) > 4 else "")
+            problems.append(Problem("duplicate", key, f"{len(indices)} entries were found ({listed})", "one"))
+    problems += _missing_problems(entries, expected)
+    return {key: indices[0] for key, indices in entries.items() if len(indices) == 1}, problems
+
+
+def _wrapper_folder_problem(unknown: Sequence[str], expected: ExpectedViews) -> Problem | None:
+    """Return the problem of an archive whose files, all unknown, are valid without one superfluous folder."""
+    files = [
+        name.removeprefix("./") for name in unknown if not name.endswith("/") and not _is_macos_metadata(name)
     ]
-    metadata = candidates.get(METADATA_NAME, [])
-    return MatchedEntries(views, metadata[0] if len(metadata) == 1 else None, tuple(problems))
-
-
-def _wrapper_folder_problem(names: Sequence[str], expected: ExpectedViews) -> Problem | None:
-    """Return the problem of an archive whose valid entries all lie in one superfluous folder, or None."""
-    files = [plain_name(name) for name in names if not name.endswith("/") and not _is_macos_metadata(name)]
     tops = {name.partition("/")[0] for name in files}
     if len(tops) != 1:
         return None
     (top,) = tops
     inner_names = [name.removeprefix(f"{top}/") for name in files]
-    expected_names = [name for name in inner_names if name == METADATA_NAME or entry_view_id(name, expected)]
-    if (
-        len(expected_names) < len(inner_names)
-        or any(entry_view_id(name, expected) for name in files)
-        or METADATA_NAME in files
-    ):
+    if not all(entry_key(name, expected) for name in inner_names):
         return None
     return Problem(
         "unknown",
@@ -140,19 +124,10 @@ def _wrapper_folder_problem(names: Sequence[str], expected: ExpectedViews) -> Pr
     )
 
 
-def _unknown_entry_problems(unknown_entries: Sequence[str], expected: ExpectedViews) -> Iterator[Problem]:
-    macos = [name for name in unknown_entries if _is_macos_metadata(name)]
-    for name in unknown_entries:
-        if not _is_macos_metadata(name):
-            yield _unknown_entry_problem(name, expected)
-    if macos:
-        found = f"entries made by macOS were found ({len(macos)})"
-        yield Problem("unknown", escape_text(macos[0]), found, f"none; {_ZIP_HINT}")
-
-
 def _unknown_entry_problem(name: str, expected: ExpectedViews) -> Problem:
-    path = PurePosixPath(plain_name(name))
-    view_id = plain_name(name).removesuffix(path.suffix)
+    plain = name.removeprefix("./")
+    path = PurePosixPath(plain)
+    view_id = plain.removesuffix(path.suffix)
     configs = sorted({config_of(view) for view in expected})
     found, allowed = "unknown entry", f"{METADATA_NAME} or <view_id> with {_ANY_SUFFIX}"
     if view_id in expected:
@@ -167,37 +142,25 @@ def _unknown_entry_problem(name: str, expected: ExpectedViews) -> Problem:
     return Problem("unknown", escape_text(name), found, allowed)
 
 
-def _duplicate_problems(candidates: Mapping[str, Sequence[int]], names: Sequence[str]) -> Iterator[Problem]:
-    for key, indices in candidates.items():
-        if len(indices) > 1:
-            listed = ", ".join(names[index] for index in indices[:4]) + (", ..." if len(indices) > 4 else "")
-            yield Problem("duplicate", key, f"{len(indices)} entries were found ({listed})", "one")
-
-
-def _missing_problems(candidates: Mapping[str, Sequence[int]], expected: ExpectedViews) -> Iterator[Problem]:
-    if METADATA_NAME not in candidates:
+def _missing_problems(found: Collection[str], expected: ExpectedViews) -> Iterator[Problem]:
+    """Yield a problem for each missing view, and for ``METADATA_NAME``; ``found`` has the keys of all entries."""
+    if METADATA_NAME not in found:
         yield Problem("missing", METADATA_NAME, "missing", '{"method": "name"}')
     split_named_by = (lambda _: None) if isinstance(expected, CaptureViews) else split_of
-    parts = {(config_of(view_id), split_named_by(view_id)) for view_id in candidates if view_id != METADATA_NAME}
+    parts = {(config_of(view_id), split_named_by(view_id)) for view_id in found if view_id != METADATA_NAME}
     if not parts:
         yield Problem("missing", "", "no view was found", f"<view_id> with {_ANY_SUFFIX} of at least one config")
-    for config, splits in _splits_by_config(parts).items():
+    for config in sorted({config for config, _ in parts}):
+        splits = sorted(split or "" for name, split in parts if name == config)
         if len(splits) > 1:
-            found = f"the archive has views of the splits {' and '.join(sorted(splits))}"
-            yield Problem("conflict", config, found, "views of one split")
+            conflict = f"the archive has views of the splits {' and '.join(splits)}"
+            yield Problem("conflict", config, conflict, "views of one split")
     for view in sorted(expected):
         config, split = config_of(view), split_named_by(view)
-        if (config, split) in parts and view not in candidates:
+        if (config, split) in parts and view not in found:
             because = f"because other views of {config if split is None else f'{config}, {split},'} are included"
             yield Problem("missing", view, "missing", f"{_ANY_SUFFIX}, {because}")
 
 
-def _splits_by_config(parts: Iterable[tuple[str, str | None]]) -> dict[str, set[str]]:
-    splits: dict[str, set[str]] = defaultdict(set)
-    for config, split in parts:
-        splits[config].add(split or "")
-    return splits
-
-
 def _is_macos_metadata(name: str) -> bool:
-    return plain_name(name).startswith("__MACOSX/") or PurePosixPath(name).name == ".DS_Store"
+    return name.removeprefix("./").startswith("__MACOSX/") or PurePosixPath(name).name == ".DS_Store"

@@ -26,7 +26,7 @@ from PIL import Image
 
 from rebar_depth_bench.errors import EntryError, Problem, escape_text, format_shape
 from rebar_depth_bench.reading import MemorySource
-from rebar_depth_bench.submission.zip import DirectoryError, check_entries, read_data, read_directory
+from rebar_depth_bench.submission.zip import read_data, read_entries
 
 MAX_HEADER_BYTES = 4096
 """Largest accepted ``.npy`` header, magic string included, in bytes."""
@@ -67,7 +67,21 @@ def _parse_header(
     name: str, data: memoryview, shape: tuple[int, int]
 ) -> tuple[np.dtype[np.floating[Any]], bool, int]:
     """Return the type of the values, whether they are in Fortran order, and the offset of the first."""
-    text, data_offset = _header_text(name, bytes(data[: MAX_HEADER_BYTES + 1]))
+    head = bytes(data[: MAX_HEADER_BYTES + 1])
+    version = head[6] if head.startswith(_MAGIC) and len(head) >= 8 else 0
+    if version not in _LENGTH_BYTES:
+        pickled = head[:1] == b"\x80"
+        actual = "a Python pickle" if pickled else f"bytes that start with {head[:8]!r}"
+        raise EntryError(Problem("syntax", name, f"{actual} was found", "a .npy array of version 1, 2 or 3"))
+    start = 8 + _LENGTH_BYTES[version]
+    end = start + int.from_bytes(head[8:start], "little")
+    if end > MAX_HEADER_BYTES:
+        found = f"the .npy header declares {end - start} bytes"
+        raise EntryError(Problem("size", name, found, f"at most {MAX_HEADER_BYTES - start}"))
+    if end > len(head):
+        found = f"the .npy header is cut off at {len(head)} bytes"
+        raise EntryError(Problem("damaged", name, found, f"{end}"))
+    text = head[start:end].decode("utf-8", "backslashreplace")
     descr, fortran, shapes = (pattern.findall(text) for pattern in (_DESCR, _FORTRAN_ORDER, _SHAPE))
     remainder = _SHAPE.sub("", _FORTRAN_ORDER.sub("", _DESCR.sub("", text)))
     if not len(descr) == len(fortran) == len(shapes) == 1 or re.sub(r"[\s,]", "", remainder) != "{}":
@@ -83,25 +97,7 @@ def _parse_header(
     if actual_shape != [str(size) for size in shape]:
         actual = " x ".join(map(escape_text, actual_shape)) if actual_shape else "a single value"
         raise EntryError(Problem("invalid", name, f"the shape is {actual}", f"{format_shape(shape)} (H x W)"))
-    return np.dtype(descr[0].replace("|", "=")), fortran[0] == "True", data_offset
-
-
-def _header_text(name: str, head: bytes) -> tuple[str, int]:
-    """Return the header's text and the byte offset of the values."""
-    version = head[6] if head.startswith(_MAGIC) and len(head) >= 8 else 0
-    if version not in _LENGTH_BYTES:
-        pickled = head[:1] == b"\x80"
-        actual = "a Python pickle" if pickled else f"bytes that start with {head[:8]!r}"
-        raise EntryError(Problem("syntax", name, f"{actual} was found", "a .npy array of version 1, 2 or 3"))
-    start = 8 + _LENGTH_BYTES[version]
-    length = int.from_bytes(head[8:start], "little")
-    if start + length > MAX_HEADER_BYTES:
-        found = f"the .npy header declares {length} bytes"
-        raise EntryError(Problem("size", name, found, f"at most {MAX_HEADER_BYTES - start}"))
-    if start + length > len(head):
-        found = f"the .npy header is cut off at {len(head)} bytes"
-        raise EntryError(Problem("damaged", name, found, f"{start + length}"))
-    return head[start : start + length].decode("utf-8", "backslashreplace"), start + length
+    return np.dtype(descr[0].replace("|", "=")), fortran[0] == "True", end
 
 
 # More than the one expected array, so that the error message can list the members of a wrong file.
@@ -119,20 +115,20 @@ def decode_npz(name: str, data: memoryview, shape: tuple[int, int], _: float = 1
     """Return the only array of an ``.npz`` file, as ``decode_npy`` does. Raises ``EntryError``."""
     source = MemorySource(data)
     try:
-        directory = read_directory(source, _MAX_NPZ_MEMBERS)
-    except DirectoryError as error:
+        entries = read_entries(source, _MAX_NPZ_MEMBERS, lambda _: max_npy_bytes(shape))
+    except EntryError as error:
         raise _inner_error(name, error.problems) from error
-    members = [escape_text(entry.name) for entry in directory.entries]
+    members = [escape_text(entry.name) for entry in entries]
     if len(members) != 1:
         listed = f" ({', '.join(members[:4])}{', ...' if len(members) > 4 else ''})" if members else ""
         raise EntryError(Problem("invalid", name, f"the .npz holds {len(members)} arrays{listed}", "exactly one"))
-    (checked,) = check_entries(source, directory, lambda _: max_npy_bytes(shape))
-    if checked.problems:
-        raise _inner_error(name, checked.problems)
-    if not checked.entry.name.endswith(".npy"):
+    [entry] = entries
+    if entry.problems:
+        raise _inner_error(name, entry.problems)
+    if not entry.name.endswith(".npy"):
         raise EntryError(Problem("invalid", name, f"the .npz holds {members[0]}", "one .npy array"))
     try:
-        values = read_data(source, checked)
+        values = read_data(source, entry)
     except EntryError as error:
         raise _inner_error(name, error.problems) from error
     return decode_npy(f"{name} ({members[0]})", values, shape)

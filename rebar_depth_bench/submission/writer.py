@@ -11,7 +11,7 @@ from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
-from typing import BinaryIO, Self
+from typing import Any, BinaryIO, Self
 
 import numpy as np
 
@@ -63,7 +63,7 @@ class SubmissionWriter:
         """Check the metadata. Raises ``InputError`` if a reader would reject it."""
         self.path = Path(path)
         self._compression = zipfile.ZIP_DEFLATED if compress else zipfile.ZIP_STORED
-        metadata = {
+        metadata: dict[str, Any] = {
             "method": method,
             "description": description,
             "url": url,
@@ -77,7 +77,15 @@ class SubmissionWriter:
             "notes": None if notes is None else dict(notes),
         }
         self._metadata = {key: value for key, value in metadata.items() if value is not None}
-        _check_metadata(self.path, self._metadata)
+        problems: list[Problem] = []
+        validate_table(SubmissionMeta, self._metadata, problems)
+        try:
+            json.dumps(self._metadata, allow_nan=False, ensure_ascii=False).encode("utf-8")
+        except (TypeError, ValueError) as error:
+            found = f"the metadata is not JSON ({error})"
+            problems.append(Problem("invalid", "", found, "text, finite numbers, lists and objects"))
+        if problems:
+            raise InputError.from_problems(self.path, problems)
         self._seconds: dict[str, float] = {}
         self._view_ids: set[str] = set()
         self._open = ExitStack()
@@ -131,18 +139,15 @@ class SubmissionWriter:
             try:
                 if error is not None:
                     raise error
-                self._write_entry(archive, METADATA_NAME, b"", memoryview(self._metadata_bytes()))
+                values = dict(self._metadata)
+                if self._seconds:
+                    values["runtime"] = {**values.get("runtime", {}), "seconds": self._seconds}
+                content = (json.dumps(values, indent=2, sort_keys=True) + "\n").encode()
+                self._write_entry(archive, METADATA_NAME, b"", memoryview(content))
                 archive.close()
             finally:
                 # Without this, ZipFile would write a directory into the discarded file when it is closed again.
                 archive.fp = None
-
-    def _metadata_bytes(self) -> bytes:
-        values = dict(self._metadata)
-        if self._seconds:
-            runtime = values.get("runtime")
-            values["runtime"] = {**(runtime if isinstance(runtime, dict) else {}), "seconds": self._seconds}
-        return (json.dumps(values, indent=2, sort_keys=True) + "\n").encode("utf-8")
 
     def _write_entry(self, archive: zipfile.ZipFile, name: str, header: bytes, body: memoryview) -> None:
         assert self._file is not None
@@ -186,15 +191,3 @@ def _padding_field(values_offset: int) -> bytes:
     """Return a zip extra field that moves byte ``values_offset`` of the file to a multiple of the alignment."""
     length = -(values_offset + 4) % _ALIGNMENT_BYTES
     return _PADDING_FIELD_ID.to_bytes(2, "little") + length.to_bytes(2, "little") + bytes(length)
-
-
-def _check_metadata(archive: Path, values: Mapping[str, object]) -> None:
-    problems: list[Problem] = []
-    validate_table(SubmissionMeta, values, problems)
-    try:
-        json.dumps(values, allow_nan=False, ensure_ascii=False).encode("utf-8")
-    except (TypeError, ValueError) as error:
-        found = f"the metadata is not JSON ({error})"
-        problems.append(Problem("invalid", "", found, "text, finite numbers, lists and objects"))
-    if problems:
-        raise InputError.from_problems(archive, problems)

@@ -21,7 +21,7 @@ from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.geometry.calibration import read_calibration
 from rebar_depth_bench.methods.onnx.spec import read_onnx_toml
-from rebar_depth_bench.submission import open_submission
+from rebar_depth_bench.submission import SubmissionReader
 from tests.bench.geometry.calibrations import CONF
 from tests.bench.submission.zips import DEPTH, EXPECTED, META, Record, build, npy, npz
 
@@ -133,7 +133,7 @@ def rejected_inputs(folder: Path) -> Mapping[str, Callable[[], object]]:
     (folder / "later" / "manifest.json").write_text(json.dumps({"format": "rebar-depth-dataset-9"}))
 
     def submission(name: str) -> None:
-        with open_submission(folder / name, EXPECTED) as reader:
+        with SubmissionReader(folder / name, EXPECTED) as reader:
             raise InputError.from_problems(folder / name, list(reader.problems()))
 
     return {

@@ -19,7 +19,7 @@ from rebar_depth_bench.methods import METHODS
 from rebar_depth_bench.methods.runner import predict
 from rebar_depth_bench.scoring.bootstrap import half_width
 from rebar_depth_bench.scoring.evaluation import score
-from rebar_depth_bench.scoring.single_bar import SingleBarScore
+from rebar_depth_bench.scoring.score import SingleBarScore
 from tests.examples.scripts import result_of, run, written_files
 from tests.synthetic_dataset import write_split_dataset
 

@@ -24,7 +24,7 @@ from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.views import ConfigViews
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.methods.controls import noisy_depth_m
-from rebar_depth_bench.submission import check_archive
+from rebar_depth_bench.submission import SubmissionReader
 from tests.fuzz.entry_point import EntryPoint, bench, run_options
 from tests.fuzz.workspace import CACHE, CASE, Workspace
 from tests.mat_dataset import write_mat_dataset
@@ -104,7 +104,8 @@ def _predict(workspace: Workspace) -> None:
 def check_predictions(workspace: Workspace) -> None:
     """Check that the archive that was written is valid for the dataset."""
     expected = open_folder(workspace.root / ROOT).expected_views()
-    assert check_archive(workspace.out / "p.zip", expected) == []
+    with SubmissionReader(workspace.out / "p.zip", expected) as submission:
+        assert list(submission.problems()) == []
 
 
 def _load(workspace: Workspace) -> None:

@@ -15,7 +15,7 @@ from rebar_depth_bench.captures.folder import open_capture
 from rebar_depth_bench.captures.image_header import read_image_shape
 from rebar_depth_bench.errors import InputError, Problem
 from rebar_depth_bench.reading import FileSource
-from rebar_depth_bench.submission import EntryError, open_submission
+from rebar_depth_bench.submission import EntryError, SubmissionReader
 from tests.bench.captures.example_capture import write_capture
 
 VIEWS = {"walk/a": (3, 4), "walk/b": (3, 4)}
@@ -52,8 +52,8 @@ def test_archive_that_is_no_file_is_refused(replace: Replace, tmp_path: Path) ->
     replace(tmp_path / "a.zip")
     with pytest.raises(OSError, match="not a regular file"):
         FileSource(tmp_path / "a.zip")
-    with open_submission(tmp_path / "a.zip", VIEWS) as reader:
-        assert locations(reader.structure_problems) == [("kind", "")]
+    with SubmissionReader(tmp_path / "a.zip", VIEWS) as reader:
+        assert locations(reader.structure_problems) == [("unreadable", "")]
 
 
 @pytest.mark.parametrize("replace", [to_pipe, to_device, to_nothing])

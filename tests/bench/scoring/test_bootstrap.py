@@ -15,7 +15,6 @@ from rebar_depth_bench.scoring.bootstrap import (
     MIN_BLOCKS,
     RESAMPLES,
     Resampling,
-    block_length,
     half_width,
     interval,
     protocol_indices,
@@ -53,7 +52,7 @@ def test_resamples_have_equal_size_and_draw_whole_blocks() -> None:
     ],
 )
 def test_block_length_is_one_ring_of_full_protocol(indices: range, length: int) -> None:
-    assert block_length(indices) == length
+    assert resample(indices).length == length
 
 
 @pytest.mark.parametrize("first", [0, 9_990, 99_990])
@@ -126,7 +125,8 @@ def test_resampled_median_equals_numpy() -> None:
 def test_pooled_percentile_weights_samples_by_view_count() -> None:
     view = np.repeat(np.arange(6), [3, 1, 0, 5, 2, 4])
     samples = np.random.default_rng(5).normal(size=len(view))
-    resampling = Resampling(np.array([[0, 2, 1, 1, 0, 0], [1, 1, 1, 1, 1, 1]], dtype=float))
+    counts = np.array([[0, 2, 1, 1, 0, 0], [1, 1, 1, 1, 1, 1]], dtype=float)
+    resampling = Resampling(counts, np.arange(6))
     drawn = np.sort(np.r_[np.repeat(samples[view == 1], 2), samples[view == 3]])
     percentiles = resampling.percentile(samples, view, 95)
     assert percentiles[0] == drawn[math.ceil(0.95 * len(drawn)) - 1]

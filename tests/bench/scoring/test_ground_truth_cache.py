@@ -95,7 +95,7 @@ def test_changed_digit_of_median_is_detected(
 ) -> None:
     expected = score(archive, tiny_root).to_json()
     [path] = empty_cache.iterdir()
-    [*_, median_m] = truth_of(tiny_root, CONFIG).medians_m
+    median_m = truth_of(tiny_root, CONFIG).traits[-1].distance_m
     content = path.read_bytes()
     digits = str(median_m).encode()
     changed = digits.replace(b"0.", b"9.", 1)

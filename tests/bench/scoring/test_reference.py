@@ -13,10 +13,10 @@ from rebar_depth_bench import score
 from rebar_depth_bench.scoring.protocol import scored_pixels
 from rebar_depth_bench.scoring.reference import (
     NO_REFERENCE,
+    UNDEFINED,
     Errors,
     Reference,
     mean_reference,
-    reference_of_numbers,
     view_reference,
 )
 
@@ -93,13 +93,13 @@ def test_neighbours_without_depth_are_skipped() -> None:
     depth_m = np.full((3, 3), 2.0, np.float32)
     depth_m[1, 0], depth_m[1, 2], depth_m[0, 1] = 1.0, 0.0, 0.0
     reference = view_reference(depth_m, np.array([4], np.uint32), 2.0)
-    assert reference == Reference(Errors(0.0, 0.0), Errors(0.25, 50.0))
+    assert reference == (0.0, 0.0, 0.25, 50.0)
     alone = np.zeros((3, 3), np.float32)
     alone[1, 1] = 2.0
     undefined = view_reference(alone, np.array([4], np.uint32), 2.0)
-    assert undefined == Reference(Errors(0.0, 0.0), Errors())
-    assert mean_reference([reference, undefined]) == reference
-    assert reference_of_numbers(undefined.to_numbers()) == undefined
+    assert undefined == (0.0, 0.0, UNDEFINED, UNDEFINED)
+    assert mean_reference([undefined]) == Reference(Errors(0.0, 0.0), Errors())
+    assert mean_reference([reference, undefined]) == Reference(Errors(0.0, 0.0), Errors(0.25, 50.0))
 
 
 def test_no_views_have_no_reference() -> None:

@@ -7,7 +7,6 @@ import os
 import shutil
 import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,8 +16,8 @@ from numpy import ndarray
 import rebar_depth_bench
 from rebar_depth_bench.scoring.groups import ViewTraits
 from rebar_depth_bench.scoring.protocol import scored_pixels
-from rebar_depth_bench.scoring.reference import Reference, view_reference
-from rebar_depth_bench.scoring.score import ViewTruth, score_views
+from rebar_depth_bench.scoring.reference import view_reference
+from rebar_depth_bench.scoring.score import Truth, ViewTruth, score_views
 from rebar_depth_bench.submission.declaration import Declaration
 
 MASK = np.array([[0, 0, 0, 0], [1, 1, 1, 1], [1, 1, 1, 1], [1, 1, 1, 1]], bool)
@@ -26,32 +25,21 @@ DEPTH_M = np.array([[0, 0, 0, 0], [1, 1, 1, 1], [1, 2.0, 4.0, 1], [1, 1, 1, 1]],
 """A view of 4 x 4 pixels, of which two are scored: those of 2 m and 4 m depth."""
 
 
-@dataclass(frozen=True)
-class TruthInMemory:
-    """Views that all show ``DEPTH_M``."""
-
-    view_ids: tuple[str, ...]
-    split: str | None = None
-    truth_sigma_m: float | None = None
-    published: None = None
-
-    @property
-    def references(self) -> list[Reference]:
-        pixels = scored_pixels(MASK, DEPTH_M)
-        return [view_reference(DEPTH_M, pixels, 3.0) for _ in self.view_ids]
-
-    @property
-    def traits(self) -> list[ViewTraits]:
-        return [ViewTraits("wall", 3.0, None) for _ in self.view_ids]
-
-    def view(self, position: int) -> ViewTruth:
-        pixels = scored_pixels(MASK, DEPTH_M)
-        return ViewTruth(self.view_ids[position], pixels, DEPTH_M.ravel()[pixels], 3.0)
+def truth_in_memory(view_ids: tuple[str, ...], split: str | None = None) -> Truth:
+    """Return the ground truth of views that all show ``DEPTH_M``."""
+    pixels = scored_pixels(MASK, DEPTH_M)
+    return Truth(
+        view_ids=view_ids,
+        read=lambda position: ViewTruth(view_ids[position], pixels, DEPTH_M.ravel()[pixels], 3.0),
+        references=[view_reference(DEPTH_M, pixels, 3.0)] * len(view_ids),
+        traits=[ViewTraits("wall", 3.0, None)] * len(view_ids),
+        split=split,
+    )
 
 
 def test_score_of_two_pixels_by_hand() -> None:
     predicted: dict[str, ndarray] = {"a/0000": np.full((4, 4), 2.0), "a/0001": np.full((4, 4), np.nan)}
-    truths = [("a", TruthInMemory(("a/0000", "a/0001")))]
+    truths = [("a", truth_in_memory(("a/0000", "a/0001")))]
     tables, views = score_views(truths, predicted.__getitem__, Declaration(uses_ground_truth=True))
     first, second = views
     assert (first.scored_px, first.coverage, first.scale) == (2, 1.0, 1.5)
@@ -67,7 +55,7 @@ def test_score_of_two_pixels_by_hand() -> None:
 
 
 def test_groups_are_those_of_a_config_with_splits() -> None:
-    truth = TruthInMemory(("a/test-b-0000",), split="test")
+    truth = truth_in_memory(("a/test-b-0000",), split="test")
     tables, _ = score_views([("a", truth)], lambda _: DEPTH_M)
     assert list(tables["a"].groups["family"]) == ["wall"]
     assert tables["a"].groups["distance"]["2-4 m"].rank_error == 0
@@ -105,9 +93,9 @@ from rebar_depth_bench.scoring.result import (
     DatasetIdentity, Result, SoftwareIdentity, SubmissionIdentity, read_result
 )
 from rebar_depth_bench.scoring.score import score_views
-from tests.bench.scoring.test_score_views import DEPTH_M, TruthInMemory
+from tests.bench.scoring.test_score_views import DEPTH_M, truth_in_memory
 
-truth = TruthInMemory(tuple(f"a/{12 * n:04}" for n in range(10)))
+truth = truth_in_memory(tuple(f"a/{12 * n:04}" for n in range(10)))
 dataset = DatasetIdentity("sha256:" + "0" * 64, "1")
 submission, software = SubmissionIdentity("m", "0" * 64), SoftwareIdentity("1")
 results = []

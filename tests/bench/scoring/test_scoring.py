@@ -21,11 +21,12 @@ from hypothesis import strategies as st
 from rebar_depth_bench import DatasetError, SubmissionError, score
 from rebar_depth_bench.data.codecs import decode, encode_depth, encode_png
 from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.data.rows import iterate_rows, truth_columns, truth_from_row
 from rebar_depth_bench.scoring.columns import rounded
 from rebar_depth_bench.scoring.protocol import interior
 from rebar_depth_bench.scoring.score import ViewTruth, score_view, tabulate
 from rebar_depth_bench.scoring.table import Table
-from tests.damage import change_manifest
+from tests.damage import change_manifest, change_rows, first_shard
 from tests.ground_truth import truth_of
 
 Depths = dict[str, np.ndarray]
@@ -132,22 +133,41 @@ def test_json_is_identical_for_workers_and_command_line(
     assert target.read_bytes() == one_worker
 
 
-def test_damaged_entries_reject_whole_archive(
-    tiny_truth: Depths, tiny_root: Path, archive_of: Archive, tmp_path: Path
-) -> None:
-    good = archive_of(tiny_truth)
-    bad = tmp_path / "bad.zip"
-    with zipfile.ZipFile(good) as source, zipfile.ZipFile(bad, "w") as target:
+def damaged(archive: Path, ends: tuple[str, ...]) -> Path:
+    """Write a copy of an archive in which the entries that end with one of ``ends`` are cut off."""
+    bad = archive.with_name("bad.zip")
+    with zipfile.ZipFile(archive) as source, zipfile.ZipFile(bad, "w") as target:
         for name in source.namelist():
             content = source.read(name)
-            broken = name.endswith(("0.npy", "5.npy"))
-            target.writestr(name, content[:-7] if broken else content)
+            target.writestr(name, content[:-7] if name.endswith(ends) else content)
+    return bad
+
+
+def test_damaged_entries_reject_whole_archive(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
     with pytest.raises(SubmissionError) as caught:
-        score(bad, tiny_root)
+        score(damaged(archive_of(tiny_truth), ("0.npy", "5.npy")), tiny_root)
     broken_views = [view for view in tiny_truth if view[-1] in "05"]
     problems = caught.value.problems
-    assert sorted(problem.where for problem in problems) == sorted(f"{view}.npy" for view in broken_views)
+    assert [problem.where for problem in problems] == [f"{view}.npy" for view in sorted(broken_views)]
     assert {problem.code for problem in problems} == {"size"}
+
+
+def test_damaged_entry_of_a_view_without_scored_pixels_rejects_the_archive(
+    tiny_truth: Depths, tiny_root: Path, archive_of: Archive, tmp_path: Path
+) -> None:
+    root = tmp_path / "copy"
+    shutil.copytree(tiny_root, root)
+    config = open_folder(root).config("lattice")
+    no_steel = {"bytes": encode_mask(np.zeros(config.grid, bool)), "path": None}
+    change_rows(first_shard(root, "lattice"), lambda rows: rows[1].update(left_mask=no_steel))
+    _, row, *_ = iterate_rows(config, truth_columns("left"))
+    record = {"left": truth_from_row(row, "left").digest(), "steel_px": 0, "scored_px": 0}
+    change_manifest(root, lambda _, entry: entry["views"][1].update(record))
+    archive, hidden = archive_of(tiny_truth), config.view_ids[1]
+    assert hidden not in {view.view_id for view in score(archive, root).views}
+    with pytest.raises(SubmissionError) as caught:
+        score(damaged(archive, (f"{hidden}.npy",)), root)
+    assert [problem.where for problem in caught.value.problems] == [f"{hidden}.npy"]
 
 
 @settings(max_examples=60, suppress_health_check=[HealthCheck.function_scoped_fixture])

@@ -20,7 +20,7 @@ from rebar_depth_bench.extended.single_bar import single_bar_samples
 from rebar_depth_bench.scoring.columns import METRICS
 from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
 from rebar_depth_bench.scoring.protocol import interior, scored_pixels, single_bar_pixels
-from rebar_depth_bench.scoring.single_bar import SingleBarScore, mean_single_bar, single_bar_scores
+from rebar_depth_bench.scoring.score import SingleBarScore, mean_single_bar, single_bar_scores
 from rebar_depth_bench.scoring.truth import config_truth
 from tests.bench.extended.thin_scenes import random_images, random_prediction, random_truth, steel_truth
 from tests.ground_truth import truth_of
@@ -173,9 +173,10 @@ def test_rendered_views(tiny_root: Path) -> None:
     truths = truth_of(tiny_root, "lattice")
     images = rendered(tiny_root, "lattice")
     shares = []
-    for position, truth in enumerate(truths):
+    for truth in truths:
         bars, inside, _ = images[truth.view_id]
-        single_bar = truths.single_bar(position)
+        single_bar = truth.single_bar
+        assert single_bar is not None
         assert np.array_equal(truth.index, np.flatnonzero(inside))
         assert single_bar.tolist() == expected_pixels(bars, truth.index)
         shares.append(single_bar.mean())
@@ -190,7 +191,7 @@ def test_scores_of_a_config_are_those_of_its_pixels(
     with open_evaluation(archive_of(noisy), tiny_root) as evaluation:
         views = score_evaluation(evaluation).views
         truths = config_truth(evaluation.folder, evaluation.configs[0])
-        scores = single_bar_scores(evaluation.submission, truths, views)
+        scores = single_bar_scores(truths, evaluation.submission.read, views)
     images = rendered(tiny_root, "lattice")
     for view, score in zip(views, scores, strict=True):
         bars, inside, z_m = images[view.view_id]

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from rebar_depth_bench.errors import Problem
-from rebar_depth_bench.submission import check_archive
-from tests.bench.submission.zips import EXPECTED, Record, build
+from tests.bench.submission.zips import EXPECTED, Record, build, check_archive
 
 Check = Callable[[list[Record] | bytes], list[Problem]]
 

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from rebar_depth_bench.errors import Problem, ProblemCode, SubmissionError
-from rebar_depth_bench.submission import EntryError, check_archive, open_submission
+from rebar_depth_bench.submission import EntryError, SubmissionReader
 from tests.bench.submission.conftest import Check, located
 from tests.bench.submission.zips import (
     DEPTH,
@@ -25,6 +25,7 @@ from tests.bench.submission.zips import (
     SECOND,
     Record,
     build,
+    check_archive,
     deflated,
     npy,
     npz,
@@ -166,7 +167,7 @@ def test_archives_of_bsdtar_are_read_like_any_other(tmp_path: Path) -> None:
     records = [Record(b"./", mode=0o40755), *map(_as_bsdtar, (META, Record(b"lattice/"), FIRST, SECOND))]
     path.write_bytes(build(records))
     assert check_archive(path, EXPECTED) == []
-    with open_submission(path, EXPECTED) as reader:
+    with SubmissionReader(path, EXPECTED) as reader:
         assert reader.view_ids == ("lattice/0000", "lattice/0001")
         assert np.array_equal(reader.read("lattice/0000"), DEPTH)
 
@@ -273,14 +274,14 @@ def test_file_that_is_no_zip_is_one_problem(check: Check, content: bytes, code: 
 def test_path_that_is_no_file_is_one_problem(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     paths: list[Path | str] = [tmp_path / "a.zip", tmp_path, tmp_path / "pipe", "a\0b"]
-    codes = ["missing", "kind", "kind", "unreadable"]
+    codes = ["missing", "unreadable", "unreadable", "unreadable"]
     assert [located(check_archive(path, EXPECTED)) for path in paths] == [[(code, "")] for code in codes]
 
 
 def test_reader_in_threads_and_after_closing(tmp_path: Path) -> None:
     path = tmp_path / "s.zip"
     path.write_bytes(build(GOOD))
-    with open_submission(path, EXPECTED) as reader, ThreadPoolExecutor(4) as pool:
+    with SubmissionReader(path, EXPECTED) as reader, ThreadPoolExecutor(4) as pool:
         assert reader.meta is not None
         for array in pool.map(reader.read, reader.view_ids * 50):
             np.testing.assert_array_equal(array, DEPTH)
@@ -298,7 +299,7 @@ def test_stored_view_is_memory_mapped_and_outlives_reader(tmp_path: Path) -> Non
     aligned = -(30 + len(name)) % 4
     path = tmp_path / "s.zip"
     path.write_bytes(build([Record(name, npy(values), local_extra=bytes(aligned)), META]))
-    with open_submission(path, {"lattice/0000": shape}) as reader:
+    with SubmissionReader(path, {"lattice/0000": shape}) as reader:
         array = reader.read("lattice/0000")
     base: object = array
     while isinstance(base, np.ndarray):
@@ -314,14 +315,14 @@ def test_unaligned_values_are_returned_aligned(tmp_path: Path) -> None:
     shape = (200, 300)
     for pad in range(4):
         path.write_bytes(build([META, replace(FIRST, data=npy(np.ones(shape)), local_extra=bytes(pad))]))
-        with open_submission(path, {"lattice/0000": shape}) as reader:
+        with SubmissionReader(path, {"lattice/0000": shape}) as reader:
             assert reader.read("lattice/0000").flags.aligned
 
 
 def test_file_truncated_while_open_raises_entry_error(tmp_path: Path) -> None:
     path = tmp_path / "s.zip"
     path.write_bytes(build(GOOD))
-    with open_submission(path, EXPECTED) as reader:
+    with SubmissionReader(path, EXPECTED) as reader:
         os.truncate(path, 100)
         with pytest.raises(EntryError) as caught:
             reader.read("lattice/0000")
@@ -333,5 +334,5 @@ def test_dropped_reader_closes_its_file(tmp_path: Path) -> None:
     path.write_bytes(build(GOOD))
     before = len(list(Path("/proc/self/fd").iterdir()))
     for _ in range(5):
-        assert open_submission(path, EXPECTED).view_ids
+        assert SubmissionReader(path, EXPECTED).view_ids
     assert len(list(Path("/proc/self/fd").iterdir())) == before

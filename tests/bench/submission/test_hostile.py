@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 from rebar_depth_bench.errors import Problem, ProblemCode
-from rebar_depth_bench.submission import check_archive
 from tests.bench.submission import zips
 from tests.bench.submission.conftest import Check, located
 from tests.bench.submission.zips import (
@@ -25,6 +24,7 @@ from tests.bench.submission.zips import (
     SECOND,
     Record,
     build,
+    check_archive,
     deflated,
     npy,
     npy_header,

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.submission import SubmissionWriter, check_archive, open_submission
+from rebar_depth_bench.submission import SubmissionReader, SubmissionWriter
 from tests.bench.submission.conftest import located
-from tests.bench.submission.zips import DEPTH, EXPECTED, SHAPE, Array
+from tests.bench.submission.zips import DEPTH, EXPECTED, SHAPE, Array, check_archive
 
 
 def write(path: Path, **options: object) -> None:
@@ -41,7 +41,7 @@ def test_written_archive_reads_back(tmp_path: Path, compress: bool) -> None:
         runtime={"gpu": "none"},
     )
     assert check_archive(path, EXPECTED) == []
-    with open_submission(path, EXPECTED) as reader:
+    with SubmissionReader(path, EXPECTED) as reader:
         assert reader.view_ids == ("lattice/0000", "lattice/0001")
         np.testing.assert_array_equal(reader.read("lattice/0000"), DEPTH)
         half = reader.read("lattice/0001")
@@ -113,7 +113,7 @@ def test_invalid_values_and_other_dtypes_are_written(tmp_path: Path) -> None:
     with SubmissionWriter(tmp_path / "s.zip", "m") as writer:
         writer.add("lattice/0000", values)
         writer.add("lattice/0001", np.asfortranarray(DEPTH.astype(">f4")))
-    with open_submission(tmp_path / "s.zip", EXPECTED) as reader:
+    with SubmissionReader(tmp_path / "s.zip", EXPECTED) as reader:
         with np.errstate(over="ignore", under="ignore"):
             np.testing.assert_array_equal(reader.read("lattice/0000"), values.astype(np.float32))
         np.testing.assert_array_equal(reader.read("lattice/0001"), DEPTH)

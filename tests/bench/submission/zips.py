@@ -14,6 +14,9 @@ import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
+from rebar_depth_bench.errors import Problem
+from rebar_depth_bench.submission import ExpectedViews, SubmissionReader
+
 Array = NDArray[Any]
 SHAPE = (3, 4)
 EXPECTED = {"lattice/0000": SHAPE, "lattice/0001": SHAPE, "pile/0000": (2, 5)}
@@ -39,6 +42,12 @@ class Record:
     local_extra: bytes = b""
     local_size: int | None = None
     disk: int = 0
+
+
+def check_archive(path: str | Path, expected: ExpectedViews) -> list[Problem]:
+    """Return all problems of an archive, those of each entry included."""
+    with SubmissionReader(path, expected) as reader:
+        return list(reader.problems())
 
 
 def deflated(name: bytes, data: bytes, level: int = 6) -> Record:
