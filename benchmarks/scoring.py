@@ -28,10 +28,10 @@ import torch
 import rebar_depth_bench as rdb
 from benchmarks.timing import machine_description, median_seconds, print_markdown
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, MeasureFamily
 from rebar_depth_bench.extended.ground_truth import ConfigSteelTruth, load_steel_truth
-from rebar_depth_bench.extended.predictions import SCALED
-from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.extended.measures import SCALED
+from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, MeasureFamily
+from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.protocol import interior
 from rebar_depth_bench.scoring.score import score_view
 from rebar_depth_bench.scoring.truth import config_truth

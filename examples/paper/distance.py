@@ -25,8 +25,8 @@ from outputs import add_outputs, flat_table, number, run_script, write_outputs
 from rebar_depth_bench.console import ProgressBars, add_archive, add_data
 from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.extended.crossings.config import config_reaches
 from rebar_depth_bench.extended.ground_truth import has_bar_ids
+from rebar_depth_bench.extended.registry import config_reaches
 from rebar_depth_bench.reporting.crossing_texts import reach_sentence
 from rebar_depth_bench.scoring import bootstrap
 from rebar_depth_bench.scoring.bootstrap import Resampling, interval, resample_views

@@ -22,10 +22,10 @@ from rebar_depth_bench.detections.result import (
     tabulate_detections,
 )
 from rebar_depth_bench.errors import InputError, escape_text
-from rebar_depth_bench.extended.crossings.judged import shown_bars
 from rebar_depth_bench.extended.ground_truth import SceneBars, has_bar_ids, load_steel_truth
+from rebar_depth_bench.extended.judged import shown_bars
 from rebar_depth_bench.extended.result import CrossingsSource
-from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.geometry.cameras import transform
 from rebar_depth_bench.names import TEST_SPLIT, config_of, split_of
 from rebar_depth_bench.parallel import Progress, map_with_progress, silent

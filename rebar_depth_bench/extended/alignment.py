@@ -13,7 +13,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from rebar_depth_bench.extended.measures import Measure, Samples, finite_sample
-from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.columns import METRICS
 from rebar_depth_bench.scoring.metrics import (
     depth_metrics,

@@ -11,10 +11,12 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float, Float64, Int64
 from numpy import ndarray
 
+from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.columns import Better, Column
+from rebar_depth_bench.scoring.metrics import is_valid_prediction
 
 EXTENDED_PROTOCOL = "rebar-extended-4"
 """Version of the definitions of all extended measures; any change of a definition changes it."""
@@ -98,3 +100,26 @@ def subsample(position: Int64[ndarray, " n"], max_count: int) -> Int64[ndarray, 
     """Return at most ``max_count`` of the positions, evenly strided: of n, the m at floor(i n / m)."""
     count = min(len(position), max_count)
     return np.asarray(position[np.arange(count) * len(position) // max(count, 1)])
+
+
+ONCE, NATIVE, SCALED = "once", "native", "scaled"
+"""Alignments of a prediction (keys of the result's JSON).
+
+``ONCE``: measures that are invariant to scale or apply their own alignment, computed from the native prediction.
+``NATIVE``: the prediction as submitted. ``SCALED``: the prediction times the median scale s.
+"""
+
+
+def aligned_predictions(
+    prediction_m: Float[ndarray, "h w"], truth: SteelTruth, scale: float | None
+) -> dict[str, Float64[ndarray, " n"]]:
+    """Return the prediction under each alignment, metres on ``truth.index``, NaN where missing.
+
+    ``scale`` is the view's median scale s, None if it has none.
+    """
+    predicted_m = prediction_m.ravel().take(truth.index.astype(np.intp))
+    native_m = np.where(is_valid_prediction(predicted_m), predicted_m.astype(np.float64), np.nan)
+    with np.errstate(over="ignore"):
+        scaled_m = native_m * (np.nan if scale is None else scale)
+    scaled_m[~is_valid_prediction(scaled_m)] = np.nan
+    return {ONCE: native_m, NATIVE: native_m, SCALED: scaled_m}

@@ -27,7 +27,7 @@ from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
 from rebar_depth_bench.extended.measures import Measure, Samples, subsample
-from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
 
 TOLERANCES_MM = (1, 2, 5, 10, 20)

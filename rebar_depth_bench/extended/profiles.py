@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
 from rebar_depth_bench.extended.measures import Measure, Samples, finite_sample, subsample
-from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.metrics import is_valid_prediction, median
 
 DISTANCE_EDGES_M = (0.2, 0.25, 0.3, 0.4, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 5.0, 7.0, 10.0, 14.0, 20.0)

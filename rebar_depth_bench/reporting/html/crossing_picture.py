@@ -9,11 +9,11 @@ import numpy as np
 from numpy import ndarray
 
 from rebar_depth_bench.data.manifest import DatasetConfig
-from rebar_depth_bench.extended.crossings.evaluate import fitted_ties, view_crossings
-from rebar_depth_bench.extended.crossings.scene import SceneCrossings
+from rebar_depth_bench.extended.axes import SceneCrossings
+from rebar_depth_bench.extended.crossings import fitted_ties, view_crossings
 from rebar_depth_bench.extended.ground_truth import has_bar_ids, steel_truth
-from rebar_depth_bench.extended.predictions import NATIVE, aligned_predictions
-from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.extended.measures import NATIVE, aligned_predictions
+from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.geometry.cameras import fold_radius, project, transform
 from rebar_depth_bench.reporting.html.assets import data_uri
 from rebar_depth_bench.reporting.html.crossings import CrossingPicture, Mark

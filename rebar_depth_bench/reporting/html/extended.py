@@ -11,20 +11,21 @@ from itertools import pairwise
 from markupsafe import Markup
 
 from rebar_depth_bench.errors import printable
-from rebar_depth_bench.extended.crossings.measures import MISS_DEG
-from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, MeasureFamily
-from rebar_depth_bench.extended.inspection.measures import INSPECTION_MEASURES, MISS_MM, capability_name
-from rebar_depth_bench.extended.inspection.tolerances import (
+from rebar_depth_bench.extended.crossings import MISS_DEG
+from rebar_depth_bench.extended.fits import MISS_MM
+from rebar_depth_bench.extended.inspection import (
+    INSPECTION_MEASURES,
     PROFILES,
     TOLERANCES,
     Tolerance,
     ToleranceProfile,
+    capability_name,
     pass_sample,
 )
-from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, Measure
+from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, NATIVE, ONCE, SCALED, Measure
 from rebar_depth_bench.extended.point_cloud import TOLERANCES_MM
-from rebar_depth_bench.extended.predictions import NATIVE, ONCE, SCALED
 from rebar_depth_bench.extended.profiles import AXES, bin_names
+from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, MeasureFamily
 from rebar_depth_bench.extended.result import ExtendedResult, ExtendedTable, MeasureEstimate
 from rebar_depth_bench.reporting.charts.profile import ProfileBin, profile_chart
 from rebar_depth_bench.reporting.extended_tables import MISSED, UNDEFINED, is_miss, single_bar_sentence

@@ -19,8 +19,8 @@ from rebar_depth_bench.data.schema import ViewRecord
 from rebar_depth_bench.data.verification import truth_problems
 from rebar_depth_bench.data.views import ConfigViews, Views
 from rebar_depth_bench.errors import DatasetError, InputError, SubmissionError
-from rebar_depth_bench.extended.evaluate import score_extended
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
+from rebar_depth_bench.extended.registry import score_extended
 from rebar_depth_bench.methods.base import Method, MethodInfo, MultiViewMethod, Prepared
 from rebar_depth_bench.methods.runner import predict
 from rebar_depth_bench.reporting.figure import figure_content

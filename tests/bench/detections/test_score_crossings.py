@@ -265,7 +265,7 @@ def test_points_on_a_bar_without_axis_and_near_unjudged_crossings_are_ignored(ma
     from rebar_depth_bench.data.manifest import open_folder
     from rebar_depth_bench.detections.score import SeenDetections, compare_view
     from rebar_depth_bench.extended.ground_truth import load_steel_truth
-    from rebar_depth_bench.extended.steel_truth import JudgedCrossings
+    from rebar_depth_bench.extended.steel import JudgedCrossings
 
     folder = open_folder(mat)
     steel = load_steel_truth(folder, folder.config(CONFIG))

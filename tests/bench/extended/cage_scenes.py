@@ -9,10 +9,10 @@ import numpy as np
 
 from rebar_depth_bench.bar_crossings.definition import scene_crossings
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.extended.crossings.judged import judged_crossings
-from rebar_depth_bench.extended.crossings.scene import SceneCrossings, prepared_crossings
-from rebar_depth_bench.extended.inspection.segments import CageTruth, assign_segments, cage_truth
-from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.extended.axes import SceneCrossings, prepared_crossings
+from rebar_depth_bench.extended.judged import judged_crossings
+from rebar_depth_bench.extended.segments import CageTruth, assign_segments, cage_truth
+from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.protocol import interior, single_bar_pixels
 
 WIDTH, HEIGHT, FOCAL_PX = 240, 160, 210.0

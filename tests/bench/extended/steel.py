@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.extended.steel import SteelTruth
 
 
 def steel_truth(depth_m: np.ndarray, bar_id: np.ndarray | None = None, fx: float = 700.0) -> SteelTruth:

@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.extended.evaluate import score_extended
-from rebar_depth_bench.extended.inspection.as_built import MEASURES, OFF_MM, as_built_samples, bar_axes
-from rebar_depth_bench.extended.inspection.evaluate import inspection_samples
-from rebar_depth_bench.extended.inspection.measures import MISS_MM
+from rebar_depth_bench.extended.as_built import MEASURES, OFF_MM, as_built_samples, bar_axes
+from rebar_depth_bench.extended.fits import MISS_MM
+from rebar_depth_bench.extended.inspection import inspection_samples
 from rebar_depth_bench.extended.measures import STATISTICS, Samples
+from rebar_depth_bench.extended.registry import score_extended
 from rebar_depth_bench.geometry.cameras import rotation_matrix
 from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
 from tests.bench.extended.cage_scenes import mat, predicted_m, view

@@ -11,12 +11,17 @@ from hypothesis import strategies as st
 from numpy import ndarray
 
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.extended.crossings.evaluate import ViewCrossings, crossing_samples, view_crossings
-from rebar_depth_bench.extended.crossings.measures import BINNED_MEASURES, MAIN_MEASURES
-from rebar_depth_bench.extended.crossings.scene import prepared_crossings
-from rebar_depth_bench.extended.inspection.cylinder_fit import LATERAL_PRIOR_RADII
+from rebar_depth_bench.extended.axes import prepared_crossings
+from rebar_depth_bench.extended.crossings import (
+    BINNED_MEASURES,
+    MAIN_MEASURES,
+    ViewCrossings,
+    crossing_samples,
+    view_crossings,
+)
+from rebar_depth_bench.extended.fits import LATERAL_PRIOR_RADII
 from rebar_depth_bench.extended.measures import Samples
-from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.extended.steel import SteelTruth
 from tests.bench.extended.cage_scenes import FOCAL_PX, bar, view_with_crossings
 
 D = 0.02

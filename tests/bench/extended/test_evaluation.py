@@ -20,10 +20,9 @@ from rebar_depth_bench import DatasetError, score
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.bars import bars, read_bars, write_bars
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, measures_by_alignment, score_extended
 from rebar_depth_bench.extended.ground_truth import dilate_mask, load_steel_truth
-from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL
-from rebar_depth_bench.extended.predictions import NATIVE, ONCE, SCALED
+from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, NATIVE, ONCE, SCALED
+from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, measures_by_alignment, score_extended
 from rebar_depth_bench.extended.result import ExtendedResult
 from rebar_depth_bench.reporting.extended_tables import print_extended
 from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
@@ -200,6 +199,6 @@ def test_damaged_bars_are_refused(
 
 @pytest.mark.slow
 def test_extended_imports_neither_torch_nor_opencv() -> None:
-    code = "import sys, rebar_depth_bench.extended.evaluate; print({'torch', 'cv2', 'bpy'} & set(sys.modules))"
+    code = "import sys, rebar_depth_bench.extended.registry; print({'torch', 'cv2', 'bpy'} & set(sys.modules))"
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert process.stdout.strip() == "set()"

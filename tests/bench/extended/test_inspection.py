@@ -11,12 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.extended.fits import MISS_MM
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
-from rebar_depth_bench.extended.inspection.evaluate import inspection_samples
-from rebar_depth_bench.extended.inspection.measures import INSPECTION_MEASURES, MISS_MM
-from rebar_depth_bench.extended.inspection.segments import cage_truth
-from rebar_depth_bench.extended.inspection.tolerances import PROFILES, pass_sample
+from rebar_depth_bench.extended.inspection import INSPECTION_MEASURES, PROFILES, inspection_samples, pass_sample
 from rebar_depth_bench.extended.measures import STATISTICS, Samples
+from rebar_depth_bench.extended.segments import cage_truth
 from rebar_depth_bench.geometry.cameras import rotation_matrix
 from tests.bench.extended.cage_scenes import bar, mat, predicted_m, view
 

@@ -13,7 +13,7 @@ from numpy import ndarray
 from rebar_depth_bench.extended import point_cloud
 from rebar_depth_bench.extended.measures import subsample
 from rebar_depth_bench.extended.point_cloud import MAX_POINTS, TOLERANCES_MM, cloud_samples, true_cloud
-from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.extended.steel import SteelTruth
 from tests.bench.extended.thin_scenes import random_prediction, random_truth, steel_truth, with_holes
 
 SEEDS = st.integers(0, 2**32 - 1)

@@ -14,16 +14,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from rebar_depth_bench.extended.evaluate import measures_by_alignment
-from rebar_depth_bench.extended.inspection.measures import (
+from rebar_depth_bench.extended.fits import MISS_MM
+from rebar_depth_bench.extended.inspection import (
     CAPABILITY_MEASURES,
-    MISS_MM,
+    GB_50204,
+    TOLERANCES,
     capability_name,
     defined_capability,
 )
-from rebar_depth_bench.extended.inspection.tolerances import GB_50204, TOLERANCES
-from rebar_depth_bench.extended.measures import Measure
-from rebar_depth_bench.extended.predictions import NATIVE, ONCE, SCALED
+from rebar_depth_bench.extended.measures import NATIVE, ONCE, SCALED, Measure
+from rebar_depth_bench.extended.registry import measures_by_alignment
 from rebar_depth_bench.extended.result import (
     ExtendedResult,
     ExtendedTable,

@@ -7,13 +7,8 @@ import pytest
 
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.errors import DatasetError
-from rebar_depth_bench.extended.inspection import segments as segments_module
-from rebar_depth_bench.extended.inspection.segments import (
-    MAX_MATCH_RADIUS_M,
-    CageTruth,
-    assign_segments,
-    cage_truth,
-)
+from rebar_depth_bench.extended import segments as segments_module
+from rebar_depth_bench.extended.segments import MAX_MATCH_RADIUS_M, CageTruth, assign_segments, cage_truth
 from tests.bench.extended.cage_scenes import bar
 
 

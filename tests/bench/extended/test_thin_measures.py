@@ -13,10 +13,9 @@ from hypothesis import strategies as st
 from numpy import ndarray
 
 from rebar_depth_bench import load
-from rebar_depth_bench.extended import boundary, depth_layers, point_cloud
-from rebar_depth_bench.extended import full_mask as full_mask
+from rebar_depth_bench.extended import boundary, depth_layers, ground_truth, point_cloud, regions
 from rebar_depth_bench.extended.measures import STATISTICS, Measure, Samples
-from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.extended.steel import SteelTruth
 from tests.bench.extended.thin_scenes import random_prediction, random_truth, steel_truth, with_holes
 
 SamplerAndMeasures = tuple[Callable[[ndarray, SteelTruth], Samples], Sequence[Measure]]
@@ -25,7 +24,7 @@ MEASURE_FAMILIES: dict[str, SamplerAndMeasures] = {
     "boundary": (boundary.boundary_samples, boundary.MEASURES),
     "clouds": (point_cloud.cloud_samples, point_cloud.MEASURES),
     "layers": (depth_layers.layer_samples, depth_layers.MEASURES),
-    "full_mask": (full_mask.full_mask_samples, full_mask.MEASURES),
+    "full_mask": (regions.full_mask_samples, regions.FULL_MASK_MEASURES),
 }
 every_family = pytest.mark.parametrize(("sampled", "measures"), MEASURE_FAMILIES.values(), ids=MEASURE_FAMILIES)
 
@@ -92,7 +91,7 @@ def test_rendered_truth_is_perfect(tiny_root: Path) -> None:
     bars, depth_m = row["left_bars"], row["left_depth"]
     index = np.flatnonzero(bars).astype(np.uint32)
     layers_m = np.full((2, bars.size), np.nan, np.float32)
-    layers_m[:, index] = depth_layers.other_layers(depth_m, bars, index, np.full(len(index), 0.007, np.float32))
+    layers_m[:, index] = ground_truth.other_layers(depth_m, bars, index, np.full(len(index), 0.007, np.float32))
     front_m, behind_m = layers_m.reshape(2, *bars.shape)
     assert np.isfinite(front_m).any()
     assert np.isfinite(behind_m).any()

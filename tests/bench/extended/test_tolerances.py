@@ -6,8 +6,8 @@ import math
 
 import pytest
 
-from rebar_depth_bench.extended.inspection.measures import INSPECTION_MEASURES
-from rebar_depth_bench.extended.inspection.tolerances import (
+from rebar_depth_bench.extended.inspection import (
+    INSPECTION_MEASURES,
     PROFILES,
     TOLERANCES,
     pass_sample,

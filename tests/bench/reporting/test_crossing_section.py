@@ -13,8 +13,7 @@ from rich.console import Console
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.data.files import file_sha256
-from rebar_depth_bench.extended.crossings.config import config_reaches
-from rebar_depth_bench.extended.evaluate import score_extended
+from rebar_depth_bench.extended.registry import config_reaches, score_extended
 from rebar_depth_bench.extended.result import ExtendedResult
 from rebar_depth_bench.reporting.crossing_texts import reach_sentence
 from rebar_depth_bench.reporting.extended_tables import print_extended

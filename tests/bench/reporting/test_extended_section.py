@@ -9,11 +9,10 @@ import re
 import numpy as np
 import pytest
 
-from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, measures_by_alignment
-from rebar_depth_bench.extended.inspection.measures import CAPABILITY_MEASURES, MISS_MM
-from rebar_depth_bench.extended.inspection.tolerances import PROFILES
-from rebar_depth_bench.extended.measures import Measure, Statistic
-from rebar_depth_bench.extended.predictions import NATIVE, SCALED
+from rebar_depth_bench.extended.fits import MISS_MM
+from rebar_depth_bench.extended.inspection import CAPABILITY_MEASURES, PROFILES
+from rebar_depth_bench.extended.measures import NATIVE, SCALED, Measure, Statistic
+from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, measures_by_alignment
 from rebar_depth_bench.extended.result import (
     ExtendedResult,
     ExtendedView,

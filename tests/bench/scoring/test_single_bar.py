@@ -14,9 +14,8 @@ from hypothesis import strategies as st
 from numpy import ndarray
 
 import rebar_depth_bench as rdb
-from rebar_depth_bench.extended.full_mask import REGION_NUMBERS, full_mask_samples
 from rebar_depth_bench.extended.profiles import DISTANCE_EDGES_M, MIN_PIXELS, profile_samples
-from rebar_depth_bench.extended.single_bar import single_bar_samples
+from rebar_depth_bench.extended.regions import REGION_NUMBERS, full_mask_samples, single_bar_samples
 from rebar_depth_bench.scoring.columns import METRICS
 from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
 from rebar_depth_bench.scoring.protocol import interior, scored_pixels, single_bar_pixels

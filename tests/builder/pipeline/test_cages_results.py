@@ -12,8 +12,8 @@ from dataset_builder.export import export
 from rebar_depth_bench.cli.main import main as rebar_bench
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.extended.evaluate import score_extended
-from rebar_depth_bench.extended.inspection.as_built import MEASURES
+from rebar_depth_bench.extended.as_built import MEASURES
+from rebar_depth_bench.extended.registry import score_extended
 from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
 from tests.building import RunBuild
 from tests.commands import run_in_process

@@ -18,12 +18,12 @@ from jaxtyping import Bool, Float64
 from numpy import ndarray
 
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.extended.inspection.axis_fits import fit_axes, with_misses
-from rebar_depth_bench.extended.inspection.measures import JUDGED_NOTE, MISSED_NOTE
-from rebar_depth_bench.extended.inspection.segments import CageTruth
-from rebar_depth_bench.extended.inspection.visible_segments import visible_segments
+from rebar_depth_bench.extended.fits import fit_axes, with_misses
+from rebar_depth_bench.extended.inspection import JUDGED_NOTE, MISSED_NOTE
+from rebar_depth_bench.extended.judged import visible_segments
 from rebar_depth_bench.extended.measures import Measure, Samples
-from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.extended.segments import CageTruth
+from rebar_depth_bench.extended.steel import SteelTruth
 
 OFF_MM = 10.0
 """Deviation above which a bar is off: the tolerance of bar spacing in GB 50204 (from a secondary source)."""

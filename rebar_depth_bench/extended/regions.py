@@ -9,6 +9,10 @@ As in the protocol, the four errors are means over the pixels that have a predic
 lower them. They serve to compare the two regions with each other, and their measures have no better direction.
 Coverage and the shares within a tolerance are taken over ALL pixels of the region, where a missing prediction is a
 failure; only these may be compared between methods.
+
+The single-bar interior (``scoring.single_bar``) has the same metrics: where a method's error on it is as large as
+on the whole interior, neighbouring bars do not explain the error. The scale of the scaled evaluation is that of
+all scored pixels.
 """
 
 from __future__ import annotations
@@ -20,7 +24,7 @@ from jaxtyping import Bool, Float64
 from numpy import ndarray
 
 from rebar_depth_bench.extended.measures import Measure, Samples
-from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.columns import METRICS
 from rebar_depth_bench.scoring.metrics import is_valid_prediction, metrics_at_scales
 from rebar_depth_bench.scoring.protocol import PROTOCOL, WITHIN_MM
@@ -108,7 +112,7 @@ def _share_measure(region: Region, metric: str) -> Measure:
     return Measure(name, name, "mean", title, "%", "higher", definition)
 
 
-MEASURES: tuple[Measure, ...] = (
+FULL_MASK_MEASURES: tuple[Measure, ...] = (
     *(region_measure(region, number) for number in REGION_NUMBERS for region in _REGIONS),
     Measure(
         "kept_share",
@@ -121,3 +125,49 @@ MEASURES: tuple[Measure, ...] = (
     ),
 )
 """Full-mask measures in table order."""
+
+
+_VIEWS_ABS_REL = "single_bar_views_abs_rel"
+_REGION = Region("single_bar", "single-bar", "interior pixels whose 3 x 3 neighbourhood belongs to one bar")
+
+
+def single_bar_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
+    """Return a view's share of single-bar pixels and its metrics on them, as ``full_mask_samples`` does.
+
+    ``p_m`` is planar depth on ``truth.index``, metres, NaN where missing. Metrics are empty where the view has no
+    such pixel. ``single_bar_views_abs_rel`` is AbsRel on the whole interior of a view that has AbsRel on them.
+    """
+    count, interior_count = np.count_nonzero(truth.single_bar), np.count_nonzero(truth.interior)
+    share = [count / interior_count] if interior_count else []
+    scores = region_scores(_REGION.prefix, p_m, truth, truth.single_bar)
+    interior = region_scores("interior", p_m, truth, truth.interior)["interior_abs_rel"]
+    return {
+        "single_bar_share": np.array(share, np.float64),
+        **scores,
+        _VIEWS_ABS_REL: interior if len(scores["single_bar_abs_rel"]) else np.empty(0),
+    }
+
+
+SINGLE_BAR_MEASURES: tuple[Measure, ...] = (
+    Measure(
+        "single_bar_share",
+        "single_bar_share",
+        "mean",
+        "Single-bar share of the interior",
+        "%",
+        "",
+        "interior pixels whose 3 x 3 neighbourhood belongs to one bar / interior pixels, by the truth; the other "
+        "pixels have a second bar within one pixel, so that errors on them contain the step between the bars",
+    ),
+    *(region_measure(_REGION, number) for number in REGION_NUMBERS),
+    Measure(
+        _VIEWS_ABS_REL,
+        _VIEWS_ABS_REL,
+        "mean",
+        "AbsRel, whole interior of the same views",
+        "",
+        "",
+        "mean of interior_abs_rel over the views that have single_bar_abs_rel, to set beside it",
+    ),
+)
+"""Single-bar measures in table order."""

@@ -3,30 +3,30 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from functools import partial
+from typing import Any
 
 from jaxtyping import Float, Float64
 from numpy import ndarray
 
+from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.extended import (
     alignment,
+    as_built,
     boundary,
+    crossings,
     depth_layers,
-    full_mask,
+    inspection,
     point_cloud,
     profiles,
-    single_bar,
+    regions,
 )
-from rebar_depth_bench.extended.crossings import measures as crossing_measures
-from rebar_depth_bench.extended.crossings.evaluate import crossing_samples, view_crossings
+from rebar_depth_bench.extended.crossings import crossing_samples, view_crossings
 from rebar_depth_bench.extended.ground_truth import ConfigSteelTruth, SceneBars, has_bar_ids, steel_truth
-from rebar_depth_bench.extended.inspection import as_built
-from rebar_depth_bench.extended.inspection import evaluate as inspection
-from rebar_depth_bench.extended.inspection import measures as inspection_measures
-from rebar_depth_bench.extended.inspection.visible_segments import visible_segments
-from rebar_depth_bench.extended.measures import Measure, Samples
-from rebar_depth_bench.extended.predictions import NATIVE, ONCE, SCALED, aligned_predictions
+from rebar_depth_bench.extended.judged import visible_segments
+from rebar_depth_bench.extended.measures import NATIVE, ONCE, SCALED, Measure, Samples, aligned_predictions
+from rebar_depth_bench.extended.reach import Reach, reaches
 from rebar_depth_bench.extended.result import (
     CrossingsSource,
     ExtendedResult,
@@ -36,7 +36,7 @@ from rebar_depth_bench.extended.result import (
     tabulate_extended,
     view_numbers,
 )
-from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.parallel import Progress, map_with_progress, silent
 from rebar_depth_bench.scoring.bootstrap import resample_views
 from rebar_depth_bench.scoring.evaluation import Evaluation
@@ -108,23 +108,23 @@ MEASURE_FAMILIES: Mapping[str, MeasureFamily] = {
         "Scale against shape", alignment.MEASURES, _per_prediction(alignment.alignment_samples), (ONCE,)
     ),
     "full_mask": MeasureFamily(
-        "Rim included", full_mask.MEASURES, _per_prediction(full_mask.full_mask_samples), _BOTH
+        "Rim included", regions.FULL_MASK_MEASURES, _per_prediction(regions.full_mask_samples), _BOTH
     ),
     "single_bar": MeasureFamily(
-        "Single-bar interior", single_bar.MEASURES, _per_prediction(single_bar.single_bar_samples), _BOTH
+        "Single-bar interior", regions.SINGLE_BAR_MEASURES, _per_prediction(regions.single_bar_samples), _BOTH
     ),
     "boundary": MeasureFamily("Boundary", boundary.MEASURES, _per_prediction(boundary.boundary_samples), (ONCE,)),
     "layers": MeasureFamily("Layers", depth_layers.MEASURES, _per_prediction(depth_layers.layer_samples), _BOTH),
     "clouds": MeasureFamily("Point clouds", point_cloud.MEASURES, _clouds, _BOTH),
     "inspection": MeasureFamily(
         "Inspection, bar by bar",
-        (*inspection_measures.INSPECTION_MEASURES, *inspection_measures.CAPABILITY_MEASURES),
+        (*inspection.INSPECTION_MEASURES, *inspection.CAPABILITY_MEASURES),
         _inspection,
         _BOTH,
     ),
     "as_built": MeasureFamily("As built against as designed", as_built.MEASURES, _as_built, _BOTH),
     "crossings": MeasureFamily(
-        "Crossings", (*crossing_measures.MAIN_MEASURES, *crossing_measures.BINNED_MEASURES), _crossings, _BOTH
+        "Crossings", (*crossings.MAIN_MEASURES, *crossings.BINNED_MEASURES), _crossings, _BOTH
     ),
     "profile": MeasureFamily("Against distance and bar width", profiles.MEASURES, _profile, _BOTH),
 }
@@ -200,3 +200,44 @@ def view_samples(
         for name, of_alignment in zip(family.alignments, samples_by_alignment, strict=True):
             samples[name].update(of_alignment)
     return dict(samples)
+
+
+@dataclass(frozen=True)
+class ConfigReaches:
+    """Reaches of a submission on one config, by alignment, and the file that the crossings come from."""
+
+    source: CrossingsSource
+    by_alignment: Mapping[str, tuple[Reach, ...]]
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON object: the file of the crossings, and the reaches by alignment."""
+        reaches = {name: [reach.to_dict() for reach in of_one] for name, of_one in self.by_alignment.items()}
+        return {"crossings": asdict(self.source), **reaches}
+
+
+def config_reaches(
+    evaluation: Evaluation,
+    config: DatasetConfig,
+    scales: Mapping[str, float | None],
+    *,
+    workers: int | None = None,
+    progress: Progress = silent,
+) -> ConfigReaches:
+    """Return the reaches on a config that ``has_bar_ids``, native and scaled; ``scales`` holds s by view id.
+
+    Raises ``DatasetError`` as ``load_steel_truth``.
+    """
+    steel = steel_truth(evaluation, config, progress)
+
+    def view_samples(position: int) -> dict[str, Samples]:
+        truth = steel.view(position)
+        crossings = view_crossings(truth, steel.bars_by_view[truth.view_id].crossings)
+        prediction_m = evaluation.submission.read(truth.view_id)
+        predictions = aligned_predictions(prediction_m, truth, scales[truth.view_id])
+        return {name: crossing_samples(predictions[name], crossings) for name in (NATIVE, SCALED)}
+
+    task = f"crossings of {config.name}"
+    views = map_with_progress(view_samples, range(len(steel)), workers, progress, task, len(steel))
+    resampling = resample_views(steel.view_ids, by_scene=config.has_splits)
+    found = {name: reaches([samples[name] for samples in views], resampling) for name in (NATIVE, SCALED)}
+    return ConfigReaches(CrossingsSource(steel.crossings_source, steel.crossings_sha256), found)

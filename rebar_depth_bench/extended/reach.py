@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from rebar_depth_bench.extended.crossings.measures import CROSSING_EDGES_M
+from rebar_depth_bench.extended.crossings import CROSSING_EDGES_M
 from rebar_depth_bench.extended.measures import Samples
 from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval
 from rebar_depth_bench.scoring.columns import rounded, rounded_interval
