@@ -227,9 +227,9 @@ def _linked(count: int, links: Int64[ndarray, "l 2"]) -> Int64[ndarray, " n"]:
     return np.asarray(np.argsort(np.argsort(first))[inverse], dtype=np.int64)
 
 
-# Local minima. The distance of two polylines is convex on each pair of segments. A point is a local minimum exactly
-# if it is the minimum of every pair of segments that it belongs to: of one pair in the interior of both segments, of
-# two or four at a vertex.
+# Local minima. The distance of two polylines is convex on each pair of segments. A point is a local minimum
+# exactly if it is the minimum of every pair of segments that it belongs to: of one pair in the interior of both
+# segments, of two or four at a vertex.
 
 
 @dataclass(frozen=True, eq=False)
