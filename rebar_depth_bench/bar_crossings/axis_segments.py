@@ -47,7 +47,7 @@ class AxisSegments:
         starts, vectors, along, before, after, lengths, closed = ([] for _ in range(7))
         first = 0
         for bar in bars:
-            points_m = _without_repeated(np.array(bar.axis_m, dtype=np.float64))
+            points_m = without_repeated(np.array(bar.axis_m, dtype=np.float64))
             steps_m = np.diff(points_m, axis=0)
             step_lengths_m = np.linalg.norm(steps_m, axis=1)
             ends = np.cumsum(step_lengths_m)
@@ -105,7 +105,7 @@ class AxisSegments:
         return np.column_stack([keys // len(pieces), keys % len(pieces)])
 
 
-def _without_repeated(points_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, "m 3"]:
+def without_repeated(points_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, "m 3"]:
     """Return points without those that repeat the point before."""
     if len(points_m) < 2:
         return points_m

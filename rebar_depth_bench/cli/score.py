@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 
 from rich.console import Console
 
@@ -53,10 +52,8 @@ def run(options: argparse.Namespace) -> None:
         raise InputError(f"--html-views is {options.html_views}, expected 0 or more")
     with open_evaluation(options.archive, options.data, expect_digest=options.expect_digest) as evaluation:
         with ProgressBars() as bars:
-            result = score_evaluation(evaluation, workers=options.workers, progress=bars.update)
-            if options.extended or options.extended_csv:
-                extended = score_extended(result, evaluation, workers=options.workers, progress=bars.update)
-                result = replace(result, extended=extended)
+            scorer = score_extended if options.extended or options.extended_csv else score_evaluation
+            result = scorer(evaluation, workers=options.workers, progress=bars.update)
         names = ", ".join(config.name for config in evaluation.configs)
         print_verified(
             evaluation.folder, f"views of {names} verified when their ground truth was stored in the cache"

@@ -137,12 +137,7 @@ class SceneCrossings:
         return len(self.crossings)
 
 
-def no_crossings() -> SceneCrossings:
-    """Return the crossings of a scene without any."""
-    return prepared_crossings(Crossings.none(), (), None)
-
-
-def prepared_crossings(crossings: Crossings, bars: Iterable[Bar], cage: CageTruth | None) -> SceneCrossings:
+def prepared_crossings(crossings: Crossings, bars: Iterable[Bar], cage: CageTruth) -> SceneCrossings:
     """Return the crossings of a scene with the axes of its bars; ``cage`` has its straight runs."""
     bar_id = np.column_stack([crossings.bar_a, crossings.bar_b])
     point_m = np.stack([crossings.point_a_m, crossings.point_b_m], axis=1)
@@ -161,12 +156,10 @@ def prepared_crossings(crossings: Crossings, bars: Iterable[Bar], cage: CageTrut
     return SceneCrossings(crossings, axes, bar_id, diameter_m, point_m, along_m, tangent, straight, match_radius_m)
 
 
-def _match_radius_m(
-    point_m: Float64[ndarray, "k 3"], bar_id: int, cage: CageTruth | None
-) -> Float64[ndarray, " k"]:
+def _match_radius_m(point_m: Float64[ndarray, "k 3"], bar_id: int, cage: CageTruth) -> Float64[ndarray, " k"]:
     """Return the match radius of the run of the bar that is nearest to each point; the largest without a run."""
-    runs = np.flatnonzero(cage.bar_id == bar_id) if cage is not None else np.empty(0, np.int64)
-    if cage is None or not len(runs):
+    runs = np.flatnonzero(cage.bar_id == bar_id)
+    if not len(runs):
         return np.full(len(point_m), MAX_MATCH_RADIUS_M)
     start_m, vector_m = cage.start_m[runs], cage.end_m[runs] - cage.start_m[runs]
     share = (point_m @ vector_m.T - (start_m * vector_m).sum(axis=1)) / (vector_m**2).sum(axis=1)

@@ -8,10 +8,10 @@ that much nearer or farther is one. These measures are defined by this project.
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 from numpy import ndarray
 
-from rebar_depth_bench.extended.measures import Measure, Samples
+from rebar_depth_bench.extended.measures import Measure, MeasureFamily, Samples, share_sample
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
 
@@ -38,57 +38,34 @@ def layer_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
     swallowed = has_behind & (missing | (predicted_m > (z_m + behind_m) / 2))
     pulled = has_front & (missing | (predicted_m < (z_m + front_m) / 2))
     in_sight = has_front | has_behind
+    count = np.count_nonzero
     return {
-        "layer_confusion": _share(swallowed | pulled, in_sight),
-        "layer_swallowed": _share(swallowed, has_behind),
-        "layer_pulled_forward": _share(pulled, has_front),
-        "layers_in_sight": _share(in_sight, np.ones_like(in_sight)),
+        "layer_confusion": share_sample(count(swallowed | pulled), count(in_sight)),
+        "layer_swallowed": share_sample(count(swallowed), count(has_behind)),
+        "layer_pulled_forward": share_sample(count(pulled), count(has_front)),
+        "layers_in_sight": share_sample(count(in_sight), len(in_sight)),
     }
 
 
-def _share(hit: Bool[ndarray, " n"], of: Bool[ndarray, " n"]) -> Float64[ndarray, " one"]:
-    """Return a sample that holds the share of ``of`` pixels that are ``hit``, empty for no such pixel."""
-    total = np.count_nonzero(of)
-    return np.array([np.count_nonzero(hit) / total] if total else [], np.float64)
-
-
-MEASURES: tuple[Measure, ...] = (
+MEASURES = (
     Measure(
-        "layer_confusion",
-        "layer_confusion",
-        "mean",
-        "Layer confusion",
-        "%",
-        "lower",
+        "layer_confusion", "Layer confusion", "%", "lower",
         "share of interior pixels with another layer in sight that are predicted nearer to it than to their own, "
         "|p - other| < |p - z|; missing predictions count as confused",
     ),
     Measure(
-        "layer_swallowed",
-        "layer_swallowed",
-        "mean",
-        "Swallowed by the layer behind",
-        "%",
-        "lower",
+        "layer_swallowed", "Swallowed by the layer behind", "%", "lower",
         "share of interior pixels with a layer behind in sight that are predicted nearer to it or missing",
     ),
     Measure(
-        "layer_pulled_forward",
-        "layer_pulled_forward",
-        "mean",
-        "Pulled to the layer in front",
-        "%",
-        "lower",
+        "layer_pulled_forward", "Pulled to the layer in front", "%", "lower",
         "share of interior pixels with a layer in front in sight that are predicted nearer to it or missing",
     ),
     Measure(
-        "layers_in_sight",
-        "layers_in_sight",
-        "mean",
-        "Pixels with another layer in sight",
-        "%",
-        "",
+        "layers_in_sight", "Pixels with another layer in sight", "%", "",
         "share of interior pixels within 24 px of steel more than a diameter nearer or farther, by the truth",
     ),
-)
+)  # fmt: skip
 """Layer measures in table order."""
+
+FAMILIES = (MeasureFamily("layers", "Layers", 5, MEASURES, layer_samples),)

@@ -9,7 +9,6 @@ failure.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from typing import Literal
@@ -27,12 +26,12 @@ from rebar_depth_bench.extended.judged import (
     VisibleSegments,
     visible_segments,
 )
-from rebar_depth_bench.extended.measures import Measure, Samples
-from rebar_depth_bench.extended.segments import MAX_MATCH_RADIUS_M, CageTruth
+from rebar_depth_bench.extended.measures import Measure, MeasureFamily, Samples
+from rebar_depth_bench.extended.segments import MAX_MATCH_RADIUS_M
 from rebar_depth_bench.extended.steel import SteelTruth
 
 ErrorKind = Literal["spacing", "layer", "cover"]
-"""Kind of error that a tolerance bounds; ``inspection.measures`` defines each kind."""
+"""Kind of error that a tolerance bounds."""
 
 
 @dataclass(frozen=True)
@@ -44,78 +43,58 @@ class Tolerance:
     limit_mm: float
     title: str
 
+    @property
+    def pass_name(self) -> str:
+        """Name of the pass rate, and of its samples: 1 for errors within the tolerance, else 0."""
+        return f"pass_{self.key}"
+
+    @property
+    def capability_name(self) -> str:
+        """Name of the measure that divides the tolerance by the p95 of its error."""
+        return f"capability_{self.key}"
+
 
 @dataclass(frozen=True)
 class ToleranceProfile:
     """Tolerances of one standard; ``source`` is the citation shown beside them."""
 
-    name: str
     title: str
     source: str
     tolerances: tuple[Tolerance, ...]
 
 
-GB_50204 = ToleranceProfile(
-    name="gb50204",
-    title="GB 50204",
-    source="GB 50204 (acceptance of concrete works, China), placing of bars; figures from a secondary source",
-    tolerances=(
-        Tolerance("gb50204_spacing", "spacing", 10.0, "bar spacing"),
-        Tolerance("gb50204_stirrup_spacing", "spacing", 20.0, "stirrup spacing"),
-        Tolerance("gb50204_layers", "layer", 5.0, "distance of layers"),
-        Tolerance("gb50204_cover_slab", "cover", 3.0, "cover, slabs and walls"),
-        Tolerance("gb50204_cover_beam", "cover", 5.0, "cover, beams and columns"),
-    ),
-)
+def _en_13670(number: int, **limits_mm: float) -> ToleranceProfile:
+    """Return the tolerances of cover of one class of EN 13670, by the depth of the section."""
+    return ToleranceProfile(
+        f"EN 13670, class {number}",
+        f"EN 13670 (execution of concrete structures), cover, plus side, tolerance class {number}, growing with "
+        "the depth of the section; figures from a secondary source; held against errors of either sign",
+        tuple(
+            Tolerance(f"en13670_class{number}_cover_{depth}", "cover", limit_mm, f"cover, {depth} sections")
+            for depth, limit_mm in limits_mm.items()
+        ),
+    )
 
-EN_13670_CLASS_1 = ToleranceProfile(
-    name="en13670_class1",
-    title="EN 13670, class 1",
-    source="EN 13670 (execution of concrete structures), cover, plus side, tolerance class 1, growing with the "
-    "depth of the section; figures from a secondary source; held against errors of either sign",
-    tolerances=(
-        Tolerance("en13670_class1_cover_shallow", "cover", 10.0, "cover, shallow sections"),
-        Tolerance("en13670_class1_cover_medium", "cover", 15.0, "cover, medium sections"),
-        Tolerance("en13670_class1_cover_deep", "cover", 25.0, "cover, deep sections"),
-    ),
-)
 
-EN_13670_CLASS_2 = ToleranceProfile(
-    name="en13670_class2",
-    title="EN 13670, class 2",
-    source="EN 13670 (execution of concrete structures), cover, plus side, tolerance class 2, growing with the "
-    "depth of the section; figures from a secondary source; held against errors of either sign",
-    tolerances=(
-        Tolerance("en13670_class2_cover_shallow", "cover", 5.0, "cover, shallow sections"),
-        Tolerance("en13670_class2_cover_medium", "cover", 10.0, "cover, medium sections"),
-        Tolerance("en13670_class2_cover_deep", "cover", 20.0, "cover, deep sections"),
+PROFILES = (
+    ToleranceProfile(
+        "GB 50204",
+        "GB 50204 (acceptance of concrete works, China), placing of bars; figures from a secondary source",
+        (
+            Tolerance("gb50204_spacing", "spacing", 10.0, "bar spacing"),
+            Tolerance("gb50204_stirrup_spacing", "spacing", 20.0, "stirrup spacing"),
+            Tolerance("gb50204_layers", "layer", 5.0, "distance of layers"),
+            Tolerance("gb50204_cover_slab", "cover", 3.0, "cover, slabs and walls"),
+            Tolerance("gb50204_cover_beam", "cover", 5.0, "cover, beams and columns"),
+        ),
     ),
+    _en_13670(1, shallow=10.0, medium=15.0, deep=25.0),
+    _en_13670(2, shallow=5.0, medium=10.0, deep=20.0),
 )
-
-PROFILES: tuple[ToleranceProfile, ...] = (GB_50204, EN_13670_CLASS_1, EN_13670_CLASS_2)
-"""All tolerance profiles, in report order."""
+"""Tolerance profiles of reinforcement standards, in report order."""
 
 TOLERANCES = tuple((profile, tolerance) for profile in PROFILES for tolerance in profile.tolerances)
 """All tolerances with their profiles, in report order."""
-
-
-def pass_sample(tolerance: Tolerance) -> str:
-    """Return the name of a tolerance's 0/1 sample and of the pass-rate measure over it."""
-    return f"pass_{tolerance.key}"
-
-
-def process_capability(tolerance_mm: float, p95_mm: float) -> float:
-    """Return the capability index tolerance / p95 of the absolute error, akin to the process capability Cp.
-
-    It is 1 or more if 95 % of the errors are within the tolerance, and inf for a p95 of 0. Raises ``ValueError``
-    for a tolerance that is not positive and finite, or a p95 that is negative or NaN.
-    """
-    if not 0 < tolerance_mm < math.inf:
-        raise ValueError(f"tolerance_mm is {tolerance_mm}, expected a positive length")
-    if not p95_mm >= 0:
-        raise ValueError(f"p95_mm is {p95_mm}, expected 0 or more")
-    return tolerance_mm / p95_mm if p95_mm > 0 else math.inf
-
 
 MIN_VISIBLE_OVERLAP_DIAMETERS = 2.0
 """Minimum overlap of the visible parts of a judged pair along the axis, in larger diameters."""
@@ -131,25 +110,28 @@ _SEPARATION = (
     "both; neighbouring parallel runs"
 )
 _OVERLAP_NOTE = f"seen side by side for {MIN_VISIBLE_OVERLAP_DIAMETERS:g} diameters or more"
-
-_DEFINITIONS: dict[str, str] = {
-    "spacing": f"{_SEPARATION} whose separation is less than 45 degrees from the image plane, {_OVERLAP_NOTE}",
-    "layer": f"{_SEPARATION} whose separation is 45 degrees or less from the optical axis, {_OVERLAP_NOTE}",
-    "cover": "fitted axis minus true axis along the optical axis, in the middle of what is seen of the run; more "
-    "is further from the camera",
-    "diameter": "diameter of a cylinder fitted with a free radius, minus the nominal one; runs that are "
-    f"{MIN_DIAMETER_FIT_WIDTH_PX:g} pixels wide or more and seen on both sides (a tenth of the pixels "
-    f"beyond {FLANK_RADII_AND_SHARE[0]:g} radii)",
+_KINDS = {
+    "spacing": (
+        "bar spacing",
+        f"{_SEPARATION} whose separation is less than 45 degrees from the image plane, {_OVERLAP_NOTE}",
+    ),
+    "layer": (
+        "layer distance",
+        f"{_SEPARATION} whose separation is 45 degrees or less from the optical axis, {_OVERLAP_NOTE}",
+    ),
+    "cover": (
+        "cover (place in depth)",
+        "fitted axis minus true axis along the optical axis, in the middle of what is seen of the run; more "
+        "is further from the camera",
+    ),
+    "diameter": (
+        "diameter",
+        "diameter of a cylinder fitted with a free radius, minus the nominal one; runs that are "
+        f"{MIN_DIAMETER_FIT_WIDTH_PX:g} pixels wide or more and seen on both sides (a tenth of the pixels "
+        f"beyond {FLANK_RADII_AND_SHARE[0]:g} radii)",
+    ),
 }
-"""Definition of each kind of error."""
-
-_TITLES: dict[str, str] = {
-    "spacing": "bar spacing",
-    "layer": "layer distance",
-    "cover": "cover (place in depth)",
-    "diameter": "diameter",
-}
-"""Title of each kind of error."""
+"""Title and definition of each kind of error."""
 
 
 def _error_measures(kind: str) -> tuple[Measure, ...]:
@@ -157,109 +139,89 @@ def _error_measures(kind: str) -> tuple[Measure, ...]:
 
     Only the last two cover everything judged, so only they have a better direction.
     """
-    title, definition = _TITLES[kind], _DEFINITIONS[kind]
-    found_sample, judged_sample = f"{kind}_error_mm", f"{kind}_judged_mm"
+    title, definition = _KINDS[kind]
+    found, judged = f"{kind}_error_mm", f"{kind}_judged_mm"
     return (
+        Measure(f"{kind}_bias_mm", f"{title}: bias", "mm", "", f"Mean over what was found: {definition}.", found),
         Measure(
-            f"{kind}_bias_mm", found_sample, "mean", f"{title}: bias", "mm", "",
-            f"Mean over what was found: {definition}.",
+            f"{kind}_std_mm", f"{title}: spread", "mm", "",
+            f"Standard deviation over what was found: {definition}.", found, "std",
         ),
         Measure(
-            f"{kind}_std_mm", found_sample, "std", f"{title}: spread", "mm", "",
-            f"Standard deviation over what was found: {definition}.",
+            f"{kind}_median_mm", f"{title}: median error", "mm", "lower",
+            f"Median of the absolute value: {definition}. {MISSED_NOTE}", judged, "median",
         ),
         Measure(
-            f"{kind}_median_mm", judged_sample, "median", f"{title}: median error", "mm", "lower",
-            f"Median of the absolute value: {definition}. {MISSED_NOTE}",
-        ),
-        Measure(
-            f"{kind}_p95_mm", judged_sample, "p95", f"{title}: p95 error", "mm", "lower",
-            f"95th percentile of the absolute value: {definition}. {MISSED_NOTE}",
+            f"{kind}_p95_mm", f"{title}: p95 error", "mm", "lower",
+            f"95th percentile of the absolute value: {definition}. {MISSED_NOTE}", judged, "p95",
         ),
     )  # fmt: skip
 
 
-_POSITION_MEASURES: tuple[Measure, ...] = (
+def capability(limit_mm: float, p95_mm: float) -> float | None:
+    """Return limit / p95 of the absolute error, akin to the process capability Cp; inf for a p95 of 0.
+
+    It is 1 or more if 95 % of the errors are within the limit, and None where the p95 is ``MISS_MM`` or more, the
+    value of a miss.
+    """
+    if p95_mm >= MISS_MM:
+        return None
+    return limit_mm / p95_mm if p95_mm > 0 else math.inf
+
+
+INSPECTION_MEASURES = (
     Measure(
-        "bars_found", "bar_found", "mean", "bars found", "%", "higher",
+        "bars_found", "bars found", "%", "higher",
         f"Share of judged runs with predictions on {MIN_PREDICTED_SHARE:.0%} or more of their pixels whose fitted "
         "cylinder converged, its axis everywhere along what is seen nearer to the true one than half way to the "
         f"nearest parallel run, and within {1000 * MAX_MATCH_RADIUS_M:g} mm. {JUDGED_NOTE}",
+        "bar_found",
     ),
     Measure(
-        "axis_offset_median_mm", "axis_offset_judged_mm", "median", "axis offset: median", "mm", "lower",
+        "axis_offset_median_mm", "axis offset: median", "mm", "lower",
         f"Median distance of the fitted axis from the middle of what is seen of the true one. {MISSED_NOTE}",
+        "axis_offset_judged_mm", "median",
     ),
     Measure(
-        "axis_offset_p95_mm", "axis_offset_judged_mm", "p95", "axis offset: p95", "mm", "lower",
+        "axis_offset_p95_mm", "axis offset: p95", "mm", "lower",
         "95th percentile of the distance of the fitted axis from the middle of what is seen of the true one. "
         + MISSED_NOTE,
+        "axis_offset_judged_mm", "p95",
     ),
     Measure(
-        "axis_offset_found_mm", "axis_offset_mm", "mean", "axis offset of found bars: mean", "mm", "",
+        "axis_offset_found_mm", "axis offset of found bars: mean", "mm", "",
         "Mean distance of the fitted axis from the middle of what is seen of the true one, over found runs.",
+        "axis_offset_mm",
     ),
     Measure(
-        "axis_tilt_deg", "axis_tilt_deg", "mean", "axis tilt of found bars, degrees", "", "",
+        "axis_tilt_deg", "axis tilt of found bars, degrees", "", "",
         "Mean angle between fitted and true axis, over runs that were found.",
     ),
-)  # fmt: skip
-"""Detection rate, axis offset and axis tilt."""
-
-
-def _pass_measures() -> tuple[Measure, ...]:
-    """Return the pass rate of each tolerance."""
-    return tuple(
+    *(measure for kind in _KINDS for measure in _error_measures(kind)),
+    *(
         Measure(
-            pass_sample(tolerance), pass_sample(tolerance), "mean",
-            f"{profile.title}, {tolerance.title}: within {tolerance.limit_mm:g} mm", "%", "higher",
+            tolerance.pass_name, f"{profile.title}, {tolerance.title}: within {tolerance.limit_mm:g} mm",
+            "%", "higher",
             f"Share of all judged with an error of at most {tolerance.limit_mm:g} mm either way; what was not "
-            f"found fails. Error: {_DEFINITIONS[tolerance.kind]}. Tolerance: {profile.source}.",
+            f"found fails. Error: {_KINDS[tolerance.kind][1]}. Tolerance: {profile.source}.",
         )
         for profile, tolerance in TOLERANCES
-    )  # fmt: skip
-
-
-INSPECTION_MEASURES: tuple[Measure, ...] = (
-    *_POSITION_MEASURES,
-    *(measure for kind in _DEFINITIONS for measure in _error_measures(kind)),
-    *_pass_measures(),
-)
+    ),
+)  # fmt: skip
 """All inspection measures except the capabilities, in table order."""
 
-
-def capability_name(tolerance: Tolerance) -> str:
-    """Return the name of the measure that divides a tolerance by the p95 of its error."""
-    return f"capability_{tolerance.key}"
-
-
-def defined_capability(limit_mm: float, p95_mm: float) -> float | None:
-    """Return ``process_capability``; None where the p95 is ``MISS_MM`` or more, the value of a miss.
-
-    Raises ``ValueError`` as ``process_capability`` does.
-    """
-    return None if p95_mm >= MISS_MM else process_capability(limit_mm, p95_mm)
-
-
-def _capability_measure(profile: ToleranceProfile, tolerance: Tolerance) -> Measure:
-    """Return the measure that divides ``tolerance`` by the p95 of the error that it bounds."""
-    [p95] = (measure for measure in INSPECTION_MEASURES if measure.name == f"{tolerance.kind}_p95_mm")
-    return Measure(
-        name=capability_name(tolerance),
-        sample=p95.sample,
-        statistic=p95.statistic,
-        title=f"{profile.title}, {tolerance.title}: {tolerance.limit_mm:g} mm / p95",
-        unit="",
-        better="higher",
-        definition=f"Capability: {tolerance.limit_mm:g} mm / {p95.name}; 1 or more if 95 % of all judged stay "
-        f"within the tolerance; undefined if {p95.name} is {MISS_MM:g} mm, which stands for what was not found.",
-        convert=partial(defined_capability, tolerance.limit_mm),
+CAPABILITY_MEASURES = tuple(
+    Measure(
+        tolerance.capability_name, f"{profile.title}, {tolerance.title}: {tolerance.limit_mm:g} mm / p95",
+        "", "higher",
+        f"Capability: {tolerance.limit_mm:g} mm / {tolerance.kind}_p95_mm; 1 or more if 95 % of all judged stay "
+        f"within the tolerance; undefined if {tolerance.kind}_p95_mm is {MISS_MM:g} mm, which stands for what was "
+        "not found.",
+        f"{tolerance.kind}_judged_mm", "p95", partial(capability, tolerance.limit_mm),
     )
-
-
-CAPABILITY_MEASURES: tuple[Measure, ...] = tuple(_capability_measure(*entry) for entry in TOLERANCES)
+    for profile, tolerance in TOLERANCES
+)  # fmt: skip
 """Capability of each tolerance, in the order of ``TOLERANCES``."""
-
 
 _MM = 1000.0
 
@@ -278,43 +240,43 @@ class _SegmentPairs:
     normal: Float64[ndarray, "m 3"]
 
 
-def inspection_samples(
-    p_m: Float64[ndarray, " n"], truth: SteelTruth, cage: CageTruth, visible: VisibleSegments | None = None
-) -> Samples:
+def inspection_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
     """Return the inspection samples of one view; ``INSPECTION_MEASURES`` defines what each is.
 
     ``p_m`` is the predicted planar depth on ``truth.index`` in metres; values that are not finite and > 0 count
-    as missing. ``visible`` is ``visible_segments(truth, cage)``, if already computed. The lengths of the samples
-    depend on the ground truth alone, except for those of found bars (``..._error_mm``, ``axis_offset_mm``,
-    ``axis_tilt_deg``). Raises ``ValueError`` if the length of ``p_m`` differs from that of ``truth.index``.
+    as missing. The lengths of the samples depend on the ground truth alone, except for those of found bars
+    (``..._error_mm``, ``axis_offset_mm``, ``axis_tilt_deg``).
     """
-    if p_m.shape != truth.index.shape:
-        raise ValueError(f"p_m has shape {p_m.shape}, expected {truth.index.shape} as truth.index has")
-    visible = visible or visible_segments(truth, cage)
+    visible = truth.once(visible_segments)
     fitted = fit_axes(p_m, visible, visible.can_fit_diameter)
-    pairs = _visible_pairs(visible, cage)
-    spacing_m, layer_m = _pair_errors_m(pairs, visible, fitted)
+    spacing_m, layer_m = _pair_errors_m(truth.once(_visible_pairs), visible, fitted)
     cover_m = (fitted.point_m - visible.middle_m)[:, 2]
-    errors_mm: Mapping[ErrorKind, Float64[ndarray, " n"]] = {
+    diameter_m = np.where(fitted.found, fitted.diameter_m - visible.diameter_m, np.nan)
+    errors_mm = {
         "spacing": spacing_m * _MM,
         "layer": layer_m * _MM,
         "cover": np.where(fitted.found, cover_m, np.nan) * _MM,
+        "diameter": diameter_m[visible.can_fit_diameter] * _MM,
     }
-    diameter_error_m = np.where(fitted.found, fitted.diameter_m - visible.diameter_m, np.nan)
+    judged_mm = {kind: with_misses(error_mm) for kind, error_mm in errors_mm.items()}
     return {
         "bar_found": fitted.found.astype(np.float64),
         "axis_offset_mm": fitted.offset_m[fitted.found] * _MM,
         "axis_offset_judged_mm": with_misses(np.where(fitted.found, fitted.offset_m * _MM, np.nan)),
         "axis_tilt_deg": fitted.tilt_deg[fitted.found],
-        **_error_samples(errors_mm),
-        **_error_samples({"diameter": diameter_error_m[visible.can_fit_diameter] * _MM}),
-        **_pass_samples(errors_mm),
+        **{f"{kind}_error_mm": error_mm[~np.isnan(error_mm)] for kind, error_mm in errors_mm.items()},
+        **{f"{kind}_judged_mm": of_kind_mm for kind, of_kind_mm in judged_mm.items()},
+        **{
+            tolerance.pass_name: (judged_mm[tolerance.kind] <= tolerance.limit_mm).astype(np.float64)
+            for _, tolerance in TOLERANCES
+        },
     }
 
 
-def _visible_pairs(visible: VisibleSegments, cage: CageTruth) -> _SegmentPairs:
+def _visible_pairs(truth: SteelTruth) -> _SegmentPairs:
     """Return the neighbour pairs whose segments are both visible and overlap along the first one's axis."""
-    position = np.full(len(cage.segments), -1)
+    visible, cage = truth.once(visible_segments), truth.bars.cage
+    position = np.full(len(cage), -1)
     position[visible.segment] = np.arange(len(visible.segment))
     first, second = position[cage.neighbours].T
     both = (first >= 0) & (second >= 0)
@@ -362,20 +324,12 @@ def _separation_m(
     return np.asarray(intersections_m[1] - intersections_m[0])
 
 
-def _error_samples(
-    errors_mm: Mapping[ErrorKind, Float64[ndarray, " n"]] | Mapping[str, Float64[ndarray, " n"]],
-) -> dict[str, Float64[ndarray, " n"]]:
-    """Return for each kind the signed errors of what was found, and the absolute errors of all that was judged."""
-    samples = {}
-    for kind, error_mm in errors_mm.items():
-        samples[f"{kind}_error_mm"] = error_mm[~np.isnan(error_mm)]
-        samples[f"{kind}_judged_mm"] = with_misses(error_mm)
-    return samples
-
-
-def _pass_samples(errors_mm: Mapping[ErrorKind, Float64[ndarray, " n"]]) -> dict[str, Float64[ndarray, " n"]]:
-    """Return for each tolerance 1 for errors within it, 0 for larger ones and for what was not found."""
-    return {
-        pass_sample(tolerance): (with_misses(errors_mm[tolerance.kind]) <= tolerance.limit_mm).astype(np.float64)
-        for _, tolerance in TOLERANCES
-    }
+FAMILIES = (
+    MeasureFamily(
+        "inspection",
+        "Inspection, bar by bar",
+        7,
+        (*INSPECTION_MEASURES, *CAPABILITY_MEASURES),
+        inspection_samples,
+    ),
+)

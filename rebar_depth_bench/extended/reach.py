@@ -119,7 +119,7 @@ def reaches(by_view: Sequence[Samples], resampling: Resampling) -> tuple[Reach, 
 
 def pooled(by_view: Sequence[Samples], name: str) -> tuple[Float64[ndarray, " m"], ndarray]:
     """Return the samples of all views one after the other, and the position of each one's view."""
-    samples = [samples[name] for samples in by_view]
+    samples = [samples.get(name, np.empty(0)) for samples in by_view]
     return np.concatenate([np.empty(0), *samples]), np.repeat(np.arange(len(samples)), list(map(len, samples)))
 
 

@@ -12,7 +12,7 @@ from jaxtyping import Float64, Int64
 from numpy import ndarray
 
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, STATISTICS, Measure, Samples, Statistic
-from rebar_depth_bench.extended.reach import Reach, reaches
+from rebar_depth_bench.extended.reach import Reach, pooled, reaches
 from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval
 from rebar_depth_bench.scoring.columns import rounded, rounded_interval
 from rebar_depth_bench.scoring.frames import frame_of_values
@@ -112,17 +112,16 @@ class ExtendedResult:
 
 def view_numbers(view: ExtendedView, measures: Mapping[str, Sequence[Measure]]) -> ViewNumbers:
     """Return all measures of a single view, None where it has no sample."""
+
+    def value(measure: Measure, samples: Samples) -> float | None:
+        values = samples.get(measure.sample, np.empty(0))
+        return measure.number(STATISTICS[measure.statistic](values)) if len(values) else None
+
     numbers = {
-        alignment: {measure.name: view_value(view, alignment, measure) for measure in alignment_measures}
-        for alignment, alignment_measures in measures.items()
+        alignment: {measure.name: value(measure, view.samples[alignment]) for measure in of_alignment}
+        for alignment, of_alignment in measures.items()
     }
     return ViewNumbers(view.view_id, numbers)
-
-
-def view_value(view: ExtendedView, alignment: str, measure: Measure) -> float | None:
-    """Return one measure of a single view, None where it has no sample."""
-    samples = view.samples[alignment][measure.sample]
-    return measure.number(STATISTICS[measure.statistic](samples)) if len(samples) else None
 
 
 def tabulate_extended(
@@ -149,7 +148,7 @@ def _estimates(
     for measure in measures:
         key = (measure.sample, measure.statistic)
         if key not in statistics:
-            statistics[key] = estimate(measure, [samples[measure.sample] for samples in by_view], resampling)
+            statistics[key] = estimate(measure, by_view, resampling)
     return {
         measure.name: convert_estimate(measure, statistics[measure.sample, measure.statistic])
         for measure in measures
@@ -172,16 +171,12 @@ def convert_estimate(measure: Measure, statistic: MeasureEstimate) -> MeasureEst
     return MeasureEstimate(value, ends, statistic.samples)
 
 
-def estimate(
-    measure: Measure, by_view: Sequence[Float64[ndarray, " m"]], resampling: Resampling
-) -> MeasureEstimate:
+def estimate(measure: Measure, by_view: Sequence[Samples], resampling: Resampling) -> MeasureEstimate:
     """Return a measure's statistic of the samples of all views, pooled, with its bootstrap interval."""
-    samples = np.concatenate([np.empty(0), *by_view])
+    samples, view = pooled(by_view, measure.sample)
     if not len(samples):
         return MeasureEstimate(None, None, 0)
-    view = np.repeat(np.arange(len(by_view)), [len(view_samples) for view_samples in by_view])
-    draws = _draws(measure, samples, view, resampling)
-    ends = interval(draws, resampling.blocks(view))
+    ends = interval(_draws(measure, samples, view, resampling), resampling.blocks(view))
     return MeasureEstimate(STATISTICS[measure.statistic](samples), ends, len(samples))
 
 

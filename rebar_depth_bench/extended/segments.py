@@ -8,12 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int16, Int64, UInt16
 from numpy import ndarray
 
+from rebar_depth_bench.bar_crossings.axis_segments import without_repeated
 from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.errors import DatasetError
 
@@ -83,11 +83,6 @@ def parallel_pairs(
     return ParallelPairs(np.maximum(apart_m, apart_m.T), low_m, high_m, middle_m)
 
 
-def nearest_parallel_distance_m(pairs: ParallelPairs) -> Float64[ndarray, " r"]:
-    """Return each segment's distance to the nearest parallel one, of any bar; inf without one."""
-    return np.asarray(pairs.apart_m.min(axis=1, initial=np.inf))
-
-
 def overlapping_pairs(
     parallel: ParallelPairs, bar_id: Int64[ndarray, " r"], diameter_m: Float64[ndarray, " r"]
 ) -> Int64[ndarray, "m 2"]:
@@ -145,48 +140,25 @@ Segments are compared pairwise, in memory quadratic in their number: 0.8 GB for 
 """
 
 
-@dataclass(frozen=True)
-class BarSegment:
-    """A straight segment of a bar's centreline (world, metres) and the bar's nominal diameter."""
-
-    bar_id: int
-    diameter_m: float
-    start_m: tuple[float, float, float]
-    end_m: tuple[float, float, float]
-
-
 @dataclass(frozen=True, eq=False)
 class CageTruth:
-    """Straight bar segments of a scene and the pairs of neighbours among them.
+    """Straight bar segments of a scene and the pairs of neighbours among them; world, metres.
 
-    ``neighbours`` holds indices into ``segments``, the lower one first: see ``overlapping_pairs``.
-    ``match_radius_m`` is for each segment half the distance to the nearest parallel one, at most
-    ``MAX_MATCH_RADIUS_M``: a fitted axis farther away than that is attributed to another bar.
+    ``bar_id`` and ``diameter_m`` are those of each segment's bar. ``neighbours`` holds indices of segments, the
+    lower one first: see ``overlapping_pairs``. ``match_radius_m`` is for each segment half the distance to the
+    nearest parallel one of any bar, at most ``MAX_MATCH_RADIUS_M``: a fitted axis farther away than that is
+    attributed to another bar.
     """
 
-    segments: tuple[BarSegment, ...]
+    bar_id: Int64[ndarray, " r"]
+    diameter_m: Float64[ndarray, " r"]
+    start_m: Float64[ndarray, "r 3"]
+    end_m: Float64[ndarray, "r 3"]
     neighbours: Int64[ndarray, "m 2"]
     match_radius_m: Float64[ndarray, " r"]
 
-    @cached_property
-    def start_m(self) -> Float64[ndarray, "r 3"]:
-        """Start of each segment, world, metres."""
-        return np.array([segment.start_m for segment in self.segments], dtype=np.float64).reshape(-1, 3)
-
-    @cached_property
-    def end_m(self) -> Float64[ndarray, "r 3"]:
-        """End of each segment, world, metres."""
-        return np.array([segment.end_m for segment in self.segments], dtype=np.float64).reshape(-1, 3)
-
-    @cached_property
-    def diameter_m(self) -> Float64[ndarray, " r"]:
-        """Nominal diameter of each segment's bar, metres."""
-        return np.array([segment.diameter_m for segment in self.segments], dtype=np.float64)
-
-    @cached_property
-    def bar_id(self) -> Int64[ndarray, " r"]:
-        """Bar id of each segment."""
-        return np.array([segment.bar_id for segment in self.segments], dtype=np.int64)
+    def __len__(self) -> int:
+        return len(self.bar_id)
 
 
 def cage_truth(bars: Iterable[Bar]) -> CageTruth:
@@ -194,16 +166,17 @@ def cage_truth(bars: Iterable[Bar]) -> CageTruth:
 
     Raises ``DatasetError`` if there are more than ``MAX_SEGMENTS``.
     """
-    segments = tuple(segment for bar in with_axis(bars) for segment in _straight_segments(bar))
+    segments = [(bar, *ends_m) for bar in with_axis(bars) for ends_m in _straight_segments(bar)]
     if len(segments) > MAX_SEGMENTS:
         raise DatasetError(f"the bars have {len(segments)} straight runs, expected up to {MAX_SEGMENTS}")
-    start_m = np.array([segment.start_m for segment in segments], dtype=np.float64).reshape(-1, 3)
-    end_m = np.array([segment.end_m for segment in segments], dtype=np.float64).reshape(-1, 3)
-    diameter_m = np.array([segment.diameter_m for segment in segments], dtype=np.float64)
-    bar_id = np.array([segment.bar_id for segment in segments], dtype=np.int64)
+    bar_id = np.array([bar.bar_id for bar, _, _ in segments], dtype=np.int64)
+    diameter_m = np.array([bar.diameter_m for bar, _, _ in segments], dtype=np.float64)
+    start_m = np.array([start_m for _, start_m, _ in segments], dtype=np.float64).reshape(-1, 3)
+    end_m = np.array([end_m for _, _, end_m in segments], dtype=np.float64).reshape(-1, 3)
     parallel = parallel_pairs(start_m, end_m, diameter_m)
-    match_radius_m = np.minimum(nearest_parallel_distance_m(parallel) / 2, MAX_MATCH_RADIUS_M)
-    return CageTruth(segments, overlapping_pairs(parallel, bar_id, diameter_m), match_radius_m)
+    match_radius_m = np.minimum(parallel.apart_m.min(axis=1, initial=np.inf) / 2, MAX_MATCH_RADIUS_M)
+    neighbours = overlapping_pairs(parallel, bar_id, diameter_m)
+    return CageTruth(bar_id, diameter_m, start_m, end_m, neighbours, match_radius_m)
 
 
 def assign_segments(
@@ -213,11 +186,8 @@ def assign_segments(
 
     A point lies on a segment if its foot on the axis is between the segment's ends and its distance from the axis
     is within ``SURFACE_DISTANCE_RADII``; of several segments the one with the nearest axis is assigned. Bends,
-    hooks and the flat ends of bars therefore belong to no segment. Raises ``ValueError`` if the two arrays differ
-    in length.
+    hooks and the flat ends of bars therefore belong to no segment.
     """
-    if points_m.shape != (len(bar_id), 3):
-        raise ValueError(f"points_m has shape {points_m.shape}, expected ({len(bar_id)}, 3) as bar_id has")
     assigned = np.full(len(bar_id), -1, dtype=np.int16)
     nearest_m = np.full(len(bar_id), np.inf)
     order = np.argsort(bar_id, kind="stable")
@@ -247,15 +217,12 @@ def _lies_on_side(
     return foot_inside & (radii >= SURFACE_DISTANCE_RADII[0]) & (radii <= SURFACE_DISTANCE_RADII[1]), distance_m
 
 
-def _straight_segments(bar: Bar) -> Iterator[BarSegment]:
-    """Yield the straight segments of a bar that are long enough, from its first point to its last."""
-    points_m = np.array(bar.axis_m)
-    differs_from_previous = np.linalg.norm(np.diff(points_m, axis=0), axis=1) > 0
-    points_m = points_m[np.concatenate([[True], differs_from_previous])]
+def _straight_segments(bar: Bar) -> Iterator[tuple[Float64[ndarray, " 3"], Float64[ndarray, " 3"]]]:
+    """Yield the ends of the straight segments of a bar that are long enough, from its first point to its last."""
+    points_m = without_repeated(np.array(bar.axis_m))
     for first, last in _straight_pieces(points_m):
-        start_m, end_m = points_m[first], points_m[last]
-        if np.linalg.norm(end_m - start_m) >= MIN_SEGMENT_DIAMETERS * bar.diameter_m:
-            yield BarSegment(bar.bar_id, bar.diameter_m, _as_point(start_m), _as_point(end_m))
+        if np.linalg.norm(points_m[last] - points_m[first]) >= MIN_SEGMENT_DIAMETERS * bar.diameter_m:
+            yield points_m[first], points_m[last]
 
 
 def _straight_pieces(points_m: Float64[ndarray, "n 3"]) -> Iterator[tuple[int, int]]:
@@ -268,8 +235,3 @@ def _straight_pieces(points_m: Float64[ndarray, "n 3"]) -> Iterator[tuple[int, i
         if edge == len(directions) or directions[first] @ directions[edge] < least_cosine:
             yield first, edge
             first = edge
-
-
-def _as_point(point_m: Float64[ndarray, " 3"]) -> tuple[float, float, float]:
-    """Return the point as a tuple of floats."""
-    return (float(point_m[0]), float(point_m[1]), float(point_m[2]))

@@ -28,7 +28,7 @@ from rebar_depth_bench.names import TEST_SPLIT, config_of, split_of
 from rebar_depth_bench.parallel import Progress, map_with_progress, silent
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareIdentity, SubmissionIdentity
-from rebar_depth_bench.scoring.score import ReadDepth, score_views
+from rebar_depth_bench.scoring.score import ReadDepth, UseView, score_views
 from rebar_depth_bench.scoring.table import ViewScore
 from rebar_depth_bench.scoring.truth import config_truth
 from rebar_depth_bench.submission import Declaration, EntryError, SubmissionReader, open_submission
@@ -210,8 +210,17 @@ def score(
         return score_evaluation(evaluation, workers=workers, progress=progress)
 
 
-def score_evaluation(evaluation: Evaluation, *, workers: int | None = None, progress: Progress = silent) -> Result:
-    """Score an open submission as ``score`` does. Raises ``SubmissionError`` if an entry is invalid."""
+def score_evaluation(
+    evaluation: Evaluation,
+    *,
+    workers: int | None = None,
+    progress: Progress = silent,
+    use_view: UseView | None = None,
+) -> Result:
+    """Score an open submission as ``score`` does; ``use_view`` is called on its threads, as in ``score_views``.
+
+    Raises ``SubmissionError`` if an entry is invalid.
+    """
     submission, folder = evaluation.submission, evaluation.folder
     read = _Entries(submission, folder.expected_views())
     truths = ((config.name, config_truth(folder, config, progress)) for config in evaluation.configs)
@@ -219,9 +228,13 @@ def score_evaluation(evaluation: Evaluation, *, workers: int | None = None, prog
     def each(name: str, work: Callable[[int], ViewScore], positions: Sequence[int]) -> list[ViewScore]:
         return map_with_progress(work, positions, workers, progress, f"scoring {name}", len(positions))
 
+    def use_valid(prediction_m: Depth, score: ViewScore) -> None:
+        if use_view is not None and not read.problems:
+            use_view(prediction_m, score)
+
     with ThreadPoolExecutor(1) as pool:
         sha256 = pool.submit(submission.sha256)
-        tables, views = score_views(truths, read.depth, evaluation.declared, each)
+        tables, views = score_views(truths, read.depth, evaluation.declared, each, use_valid)
         read.check([view.view_id for view in views])
         return Result(
             dataset=DatasetIdentity(folder.digest, folder.version),

@@ -35,6 +35,9 @@ from rebar_depth_bench.submission.declaration import NOT_DECLARED, Declaration
 ReadDepth = Callable[[str], Float[ndarray, "h w"]]
 """Function that returns the predicted planar depth of a view in metres, by view id."""
 
+UseView = Callable[[Float[ndarray, "h w"], ViewScore], None]
+"""Function that is given the predicted planar depth of a view, metres, and its score."""
+
 
 @dataclass(frozen=True, eq=False)
 class ViewTruth:
@@ -95,25 +98,30 @@ def score_views(
     read_depth: ReadDepth,
     declared: Declaration = NOT_DECLARED,
     each: Each = _in_turn,
+    use_view: UseView | None = None,
 ) -> tuple[dict[str, Table], list[ViewScore]]:
     """Return the tables by config, and the scores of all views.
 
     ``truths`` are names and ground truth of configs. One view is in memory at a time, unless ``each`` computes
-    several at once.
+    several at once. ``use_view`` is called with each view, for further measures of the same depth.
     """
     tables: dict[str, Table] = {}
     views: list[ViewScore] = []
     for name, truth in truths:
-        scores = list(each(name, _scorer(truth, read_depth), range(len(truth.view_ids))))
+        scores = list(each(name, _scorer(truth, read_depth, use_view), range(len(truth.view_ids))))
         tables[name] = tabulate_config(scores, truth, declared)
         views += scores
     return tables, views
 
 
-def _scorer(truth: Truth, read_depth: ReadDepth) -> Callable[[int], ViewScore]:
+def _scorer(truth: Truth, read_depth: ReadDepth, use_view: UseView | None) -> Callable[[int], ViewScore]:
     def score_at(position: int) -> ViewScore:
         view = truth.view(position)
-        return score_view(view, read_depth(view.view_id))
+        prediction_m = read_depth(view.view_id)
+        score = score_view(view, prediction_m)
+        if use_view is not None:
+            use_view(prediction_m, score)
+        return score
 
     return score_at
 

@@ -25,7 +25,7 @@ from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, NATIVE, ONCE,
 from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, measures_by_alignment, score_extended
 from rebar_depth_bench.extended.result import ExtendedResult
 from rebar_depth_bench.reporting.extended_tables import print_extended
-from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
+from rebar_depth_bench.scoring.evaluation import open_evaluation
 
 Depths = dict[str, np.ndarray]
 Archive = Callable[..., Path]
@@ -33,7 +33,9 @@ Archive = Callable[..., Path]
 
 def extended(archive: Path, root: Path, workers: int = 2) -> ExtendedResult:
     with open_evaluation(archive, root) as evaluation:
-        return score_extended(score_evaluation(evaluation), evaluation, workers=workers)
+        result = score_extended(evaluation, workers=workers).extended
+    assert result is not None
+    return result
 
 
 def values(result: ExtendedResult, alignment: str) -> dict[str, float]:
@@ -164,7 +166,6 @@ def test_folder_without_bars_raises_dataset_error(
     tiny_truth: Depths, tiny_root: Path, archive_of: Archive, tmp_path: Path
 ) -> None:
     archive = archive_of(tiny_truth)
-    result = score(archive, tiny_root)
     for item in tiny_root.iterdir():
         if item.name != "bars.parquet":
             (tmp_path / item.name).symlink_to(item)
@@ -174,7 +175,7 @@ def test_folder_without_bars_raises_dataset_error(
             DatasetError, match=r"has no bars\.parquet, expected a complete dataset folder written by rebar-build"
         ),
     ):
-        score_extended(result, evaluation)
+        score_extended(evaluation)
 
 
 def test_damaged_bars_are_refused(
@@ -184,7 +185,6 @@ def test_damaged_bars_are_refused(
     copy = tmp_path / "copy"
     shutil.copytree(tiny_root, copy)
     archive = archive_of(tiny_truth)
-    result = score(archive, copy)
     scenes = read_bars(copy / "bars.parquet")
     scene, (bar, *others) = next(iter(scenes.items()))
     write_bars(copy / "bars.parquet", {**scenes, scene: (replace(bar, diameter_m=2 * bar.diameter_m), *others)})
@@ -192,7 +192,7 @@ def test_damaged_bars_are_refused(
         open_evaluation(archive, copy) as evaluation,
         pytest.raises(DatasetError, match=r"bars\.parquet: the SHA-256 is"),
     ):
-        score_extended(result, evaluation)
+        score_extended(evaluation)
     with pytest.raises(DatasetError, match=r"bars\.parquet: the SHA-256 is"):
         bars(copy)
 

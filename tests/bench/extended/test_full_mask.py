@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy import ndarray
 
-from rebar_depth_bench.extended.regions import FULL_MASK_MEASURES, full_mask_samples
+from rebar_depth_bench.extended.regions import FULL_MASK_MEASURES, region_samples
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.score import ViewTruth, score_view
 from tests.bench.extended.thin_scenes import random_prediction, random_truth, steel_truth, with_holes
@@ -20,7 +20,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 
 def scores(p_m: ndarray, truth: SteelTruth) -> dict[str, float]:
-    return {name: float(values[0]) for name, values in full_mask_samples(p_m, truth).items() if len(values)}
+    return {name: float(values[0]) for name, values in region_samples(p_m, truth).items() if len(values)}
 
 
 def test_golden_case_by_hand() -> None:

@@ -17,10 +17,9 @@ from rich.console import Console
 from rebar_depth_bench.extended.fits import MISS_MM
 from rebar_depth_bench.extended.inspection import (
     CAPABILITY_MEASURES,
-    GB_50204,
+    PROFILES,
     TOLERANCES,
-    capability_name,
-    defined_capability,
+    capability,
 )
 from rebar_depth_bench.extended.measures import NATIVE, ONCE, SCALED, Measure
 from rebar_depth_bench.extended.registry import measures_by_alignment
@@ -32,13 +31,12 @@ from rebar_depth_bench.extended.result import (
     convert_estimate,
     tabulate_extended,
     view_numbers,
-    view_value,
 )
 from rebar_depth_bench.reporting.extended_tables import extended_csv, print_extended
 from rebar_depth_bench.scoring.bootstrap import resample
 from tests.bench.reporting.results import result, scored_view
 
-SPACING, STIRRUPS = GB_50204.tolerances[:2]
+SPACING, STIRRUPS = PROFILES[0].tolerances[:2]
 BY_NAME = {measure.name: measure for measures in measures_by_alignment().values() for measure in measures}
 VIEWS = 8
 
@@ -69,7 +67,7 @@ def measure_of(tolerance_index: int = 0) -> Measure:
 
 
 def test_each_tolerance_has_one_capability_per_alignment() -> None:
-    names = [capability_name(tolerance) for _, tolerance in TOLERANCES]
+    names = [tolerance.capability_name for _, tolerance in TOLERANCES]
     assert [measure.name for measure in CAPABILITY_MEASURES] == names
     listed = measures_by_alignment()
     for alignment in (NATIVE, SCALED):
@@ -131,7 +129,7 @@ def test_p95_measure_is_not_converted() -> None:
 @given(st.floats(1e-3, 99.0), st.floats(1e-3, 99.0), st.floats(0.1, 1000.0))
 def test_capability_decreases_with_error(one_mm: float, other_mm: float, limit_mm: float) -> None:
     small, large = sorted((one_mm, other_mm))
-    better, worse = defined_capability(limit_mm, small), defined_capability(limit_mm, large)
+    better, worse = capability(limit_mm, small), capability(limit_mm, large)
     assert better is not None
     assert worse is not None
     assert better >= worse > 0
@@ -154,12 +152,16 @@ def test_missing_bars_never_raise_capability() -> None:
     assert values[-1] is None
 
 
+def capability_of(one: ExtendedView) -> float | None:
+    return view_numbers(one, measures_by_alignment()).numbers[NATIVE][SPACING.capability_name]
+
+
 def test_single_view_has_capability() -> None:
     measured = view(0, {"spacing_judged_mm": np.full(10, 4.0)})
-    assert view_value(measured, NATIVE, BY_NAME[capability_name(SPACING)]) == 2.5
+    assert capability_of(measured) == 2.5
     missed = view(0, {"spacing_judged_mm": np.full(10, MISS_MM)})
-    assert view_value(missed, NATIVE, BY_NAME[capability_name(SPACING)]) is None
-    assert view_value(view(0, {}), NATIVE, BY_NAME[capability_name(SPACING)]) is None
+    assert capability_of(missed) is None
+    assert capability_of(view(0, {})) is None
 
 
 def extended_of(filled: list[dict[str, np.ndarray]]) -> ExtendedResult:
@@ -194,7 +196,7 @@ def terminal_text(extended: ExtendedResult, width: int = 100) -> str:
     return console.export_text()
 
 
-def test_terminal_prints_defined_and_undefined_capability() -> None:
+def test_terminal_prints_defined_and_uncapability() -> None:
     text = terminal_text(extended_of(spacings()))
     numbers = table_of(spacings()).numbers[NATIVE]
     line = next(line for line in text.splitlines() if "bar spacing: 10 mm / p95" in line)

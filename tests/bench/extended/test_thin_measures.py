@@ -24,7 +24,7 @@ MEASURE_FAMILIES: dict[str, SamplerAndMeasures] = {
     "boundary": (boundary.boundary_samples, boundary.MEASURES),
     "clouds": (point_cloud.cloud_samples, point_cloud.MEASURES),
     "layers": (depth_layers.layer_samples, depth_layers.MEASURES),
-    "full_mask": (regions.full_mask_samples, regions.FULL_MASK_MEASURES),
+    "full_mask": (regions.region_samples, regions.FULL_MASK_MEASURES),
 }
 every_family = pytest.mark.parametrize(("sampled", "measures"), MEASURE_FAMILIES.values(), ids=MEASURE_FAMILIES)
 
@@ -33,8 +33,10 @@ every_family = pytest.mark.parametrize(("sampled", "measures"), MEASURE_FAMILIES
 def test_every_sample_has_its_measure(sampled: Callable[..., Samples], measures: Sequence[Measure]) -> None:
     truth = random_truth(np.random.default_rng(0))
     samples = sampled(truth.depth_m.astype(np.float64), truth)
-    assert set(samples) == {measure.sample for measure in measures}
-    for values in samples.values():
+    names = {measure.sample for measure in measures}
+    assert names <= set(samples)
+    for values in map(samples.get, names):
+        assert values is not None
         assert values.dtype == np.float64
         assert values.shape == (1,)
 
@@ -58,7 +60,7 @@ def test_holes_never_improve_a_measure(
     p_m = random_prediction(rng, truth)
     before, after = sampled(p_m, truth), sampled(with_holes(rng, p_m, share), truth)
     for measure in measures:
-        if measure.better and len(before[measure.sample]):  # a random truth may have no contour
+        if measure.better and measure.sample in before:  # a random truth may have no contour
             value_before, value_after = (
                 STATISTICS[measure.statistic](samples[measure.sample]) for samples in (before, after)
             )
@@ -70,9 +72,7 @@ def test_holes_never_improve_a_measure(
 @every_family
 def test_no_steel_gives_no_sample(sampled: Callable[..., Samples], measures: Sequence[Measure]) -> None:
     truth = steel_truth(np.ones((3, 3)), np.zeros((3, 3), np.uint16))
-    samples = sampled(np.empty(0), truth)
-    assert set(samples) == {measure.sample for measure in measures}
-    assert all(values.shape == (0,) and values.dtype == np.float64 for values in samples.values())
+    assert not any(len(values) for values in sampled(np.empty(0), truth).values())
 
 
 @every_family

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -46,7 +45,9 @@ def archive_of(path: Path, depths: Depths, shift_mm: dict[int, float], config: s
 
 def extended(archive: Path, root: Path) -> ExtendedResult:
     with open_evaluation(archive, root) as evaluation:
-        return score_extended(score_evaluation(evaluation), evaluation)
+        result = score_extended(evaluation).extended
+    assert result is not None
+    return result
 
 
 def test_measures_of_a_config_pool_its_views(mat: tuple[Path, Depths], tmp_path: Path) -> None:
@@ -80,8 +81,7 @@ def test_report_shows_crossings_by_error(mat: tuple[Path, Depths], tmp_path: Pat
     root, depths = mat
     archive = archive_of(tmp_path / "a.zip", depths, {0: 3.0})
     with open_evaluation(archive, root) as evaluation:
-        result = score_evaluation(evaluation)
-        result = replace(result, extended=score_extended(result, evaluation))
+        result = score_extended(evaluation)
         picture = look_at_views(evaluation, {}, crossings=True).pictures[CONFIG]
         write_report(result, evaluation, tmp_path / "report.html")
     assert (picture.view_id, picture.width, picture.height) == (f"{CONFIG}/0000", WIDTH, HEIGHT)

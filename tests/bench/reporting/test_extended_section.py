@@ -269,7 +269,7 @@ def test_section_keeps_config_order() -> None:
 
 
 def make_measure(unit: str, statistic: Statistic = "mean") -> Measure:
-    return Measure("m", "s", statistic, "M", unit, "", "for this test")
+    return Measure("m", "M", unit, "", "for this test", "s", statistic)
 
 
 @pytest.mark.parametrize(
