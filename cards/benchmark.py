@@ -26,8 +26,8 @@ from cards.templates import render
 from rebar_depth_bench.bar_crossings.definition import crossing_parameters
 from rebar_depth_bench.detections.reading import MAX_ROWS_PER_VIEW
 from rebar_depth_bench.extended.inspection import PROFILES
-from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, ONCE, Measure
-from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, MeasureFamily
+from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, ONCE, Measure, MeasureFamily
+from rebar_depth_bench.extended.registry import MEASURE_FAMILIES
 from rebar_depth_bench.methods import AnyMethod, MultiViewMethod, own_methods
 from rebar_depth_bench.reporting.crossing_texts import FITS_NOTE, REACH_NOTE
 from rebar_depth_bench.scoring.bootstrap import BLOCK_VIEWS, INTERVALS, MIN_BLOCKS, RESAMPLES

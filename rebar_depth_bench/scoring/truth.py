@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, UInt32
+from jaxtyping import UInt32
 from numpy import ndarray
 
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars, with_axis
@@ -24,7 +24,7 @@ from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.scoring.groups import ViewTraits, bar_width_px
 from rebar_depth_bench.scoring.metrics import median
-from rebar_depth_bench.scoring.protocol import PROTOCOL, scored_pixels, single_bar_pixels
+from rebar_depth_bench.scoring.protocol import PROTOCOL, scored_pixels
 from rebar_depth_bench.scoring.reference import (
     REFERENCE_NUMBERS,
     Reference,
@@ -67,10 +67,6 @@ class ConfigTruth:
     def view_ids(self) -> tuple[str, ...]:
         """Ids of the views, in order."""
         return self.cache.view_ids
-
-    def single_bar(self, position: int) -> Bool[ndarray, " n"]:
-        """Return which scored pixels of the view at ``position`` are single-bar: see ``single_bar_pixels``."""
-        return self.cache.view(position).arrays["single_bar"]
 
     @property
     def medians_m(self) -> tuple[float, ...]:
@@ -128,7 +124,7 @@ def config_truth(folder: DatasetFolder, config: DatasetConfig, progress: Progres
     content = CacheContent(
         source=config.root,
         inputs=cache_inputs(config, PROTOCOL, folder.files[BARS_FILE] if has_widths else ""),
-        dtypes={"index": np.uint32, "depth_m": np.float32, "single_bar": np.bool_},
+        dtypes={"index": np.uint32, "depth_m": np.float32},
         view_ids=tuple(scored_px),
         extract=lambda: _extract_views(config, progress, diameters),
         is_sound=is_sound,
@@ -211,9 +207,7 @@ def _extract_views(
                 assert left.bars is not None
                 bar_id, focal_px = left.bars.ravel()[pixels], float(left.camera.K[0, 0])
                 numbers += (bar_width_px(depth_m, bar_id, known_m, focal_px) or _NO_WIDTH,)
-            single_bar = single_bar_pixels(left.bars, pixels)
-            arrays = {"index": pixels, "depth_m": depth_m, "single_bar": single_bar}
-            yield ViewArrays(view_id, arrays, numbers)
+            yield ViewArrays(view_id, {"index": pixels, "depth_m": depth_m}, numbers)
 
 
 def _verified_pixels(left: EyeTruth, record: ViewRecord, config: DatasetConfig) -> UInt32[ndarray, " n"]:

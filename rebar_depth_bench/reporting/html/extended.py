@@ -19,10 +19,10 @@ from rebar_depth_bench.extended.inspection import (
     Tolerance,
     ToleranceProfile,
 )
-from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, NATIVE, ONCE, SCALED, Measure
+from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, NATIVE, ONCE, SCALED, Measure, MeasureFamily
 from rebar_depth_bench.extended.point_cloud import TOLERANCES_MM
 from rebar_depth_bench.extended.profiles import AXES, bins
-from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, MeasureFamily
+from rebar_depth_bench.extended.registry import MEASURE_FAMILIES
 from rebar_depth_bench.extended.result import ExtendedResult, ExtendedTable, MeasureEstimate
 from rebar_depth_bench.reporting.charts.profile import ProfileBin, profile_chart
 from rebar_depth_bench.reporting.extended_tables import MISSED, UNDEFINED, is_miss, single_bar_sentence

@@ -26,6 +26,7 @@ from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, measures_by_al
 from rebar_depth_bench.extended.result import ExtendedResult
 from rebar_depth_bench.reporting.extended_tables import print_extended
 from rebar_depth_bench.scoring.evaluation import open_evaluation
+from rebar_depth_bench.submission import SubmissionReader
 
 Depths = dict[str, np.ndarray]
 Archive = Callable[..., Path]
@@ -195,6 +196,66 @@ def test_damaged_bars_are_refused(
         score_extended(evaluation)
     with pytest.raises(DatasetError, match=r"bars\.parquet: the SHA-256 is"):
         bars(copy)
+
+
+def test_each_prediction_is_read_once(
+    tiny_truth: Depths, tiny_root: Path, archive_of: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read, views = SubmissionReader.read, []
+    monkeypatch.setattr(
+        SubmissionReader, "read", lambda self, view_id: views.append(view_id) or read(self, view_id)
+    )
+    extended(archive_of(tiny_truth), tiny_root)
+    assert sorted(views) == sorted(tiny_truth)
+
+
+NEW_MEASURE = """
+import numpy as np
+from rebar_depth_bench.extended.measures import Measure, MeasureFamily
+
+def samples(p_m, truth):
+    far = truth.interior & (np.abs(p_m - truth.depth_m) > 0.05)
+    return {"far_off": np.array([far.sum() / truth.interior.sum()])}
+
+MEASURES = (Measure("far_off", "Pixels off by 50 mm", "%", "", "share of interior pixels off by over 50 mm"),)
+FAMILIES = (MeasureFamily("far", "Gross errors", 11, MEASURES, samples),)
+"""
+USE_NEW_MEASURE = """
+import sys
+from rebar_depth_bench import extended
+extended.__path__.append(sys.argv.pop(1))
+from rebar_depth_bench.cli.main import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_a_new_measure_is_one_file(
+    tiny_truth: Depths, tiny_root: Path, archive_of: Archive, tmp_path: Path
+) -> None:
+    """A module in the folder of the extended measures is in JSON, CSV, terminal and report."""
+    (tmp_path / "new").mkdir()
+    (tmp_path / "new/gross_errors.py").write_text(NEW_MEASURE)
+    archive = archive_of({view: 1.5 * depth for view, depth in tiny_truth.items()})
+    outputs = {name: tmp_path / f"out.{name}" for name in ("json", "html", "csv")}
+    options = ["--json", outputs["json"], "--html", outputs["html"], "--extended-csv", outputs["csv"]]
+    command = [
+        sys.executable,
+        "-c",
+        USE_NEW_MEASURE,
+        tmp_path / "new",
+        "score",
+        archive,
+        "--data",
+        tiny_root,
+        *options,
+    ]
+    terminal = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    table = json.loads(outputs["json"].read_text())["extended"]["tables"]["lattice"]
+    assert (table["native"]["far_off"]["value"], table["scaled"]["far_off"]["value"]) == (1.0, 0.0)
+    assert "far_off" in outputs["csv"].read_text()
+    for text in (terminal, outputs["html"].read_text()):
+        assert "Gross errors" in text
+        assert "Pixels off by 50 mm" in text
 
 
 @pytest.mark.slow

@@ -14,15 +14,14 @@ from hypothesis import strategies as st
 from numpy import ndarray
 
 import rebar_depth_bench as rdb
+from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.extended.ground_truth import load_steel_truth
 from rebar_depth_bench.extended.profiles import DISTANCE_EDGES_M, MIN_PIXELS, profile_samples
 from rebar_depth_bench.extended.regions import REGION_NUMBERS, region_samples
-from rebar_depth_bench.scoring.columns import METRICS
-from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
+from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, score_extended
+from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.protocol import interior, scored_pixels, single_bar_pixels
-from rebar_depth_bench.scoring.single_bar import SingleBarScore, mean_single_bar, single_bar_scores
-from rebar_depth_bench.scoring.truth import config_truth
 from tests.bench.extended.thin_scenes import random_images, random_prediction, random_truth, steel_truth
-from tests.ground_truth import truth_of
 
 Depths = dict[str, ndarray]
 Archive = Callable[..., Path]
@@ -168,45 +167,43 @@ def rendered(root: Path, config: str) -> Mapping[str, tuple[ndarray, ndarray, nd
 
 
 def test_rendered_views(tiny_root: Path) -> None:
-    truths = truth_of(tiny_root, "lattice")
+    folder = open_folder(tiny_root)
+    steel = load_steel_truth(folder, folder.config("lattice"))
     images = rendered(tiny_root, "lattice")
     shares = []
-    for position, truth in enumerate(truths):
+    for truth in map(steel.view, range(len(steel))):
         bars, inside, _ = images[truth.view_id]
-        single_bar = truths.single_bar(position)
-        assert np.array_equal(truth.index, np.flatnonzero(inside))
-        assert single_bar.tolist() == expected_pixels(bars, truth.index)
+        pixels, single_bar = truth.index[truth.interior], truth.single_bar[truth.interior]
+        assert np.array_equal(pixels, np.flatnonzero(inside))
+        assert single_bar.tolist() == expected_pixels(bars, pixels)
+        assert not truth.single_bar[~truth.interior].any()
         shares.append(single_bar.mean())
     assert min(shares) < max(shares) < 1
 
 
-def test_scores_of_a_config_are_those_of_its_pixels(
+def test_measures_of_a_config_are_those_of_its_pixels(
     tiny_root: Path, tiny_truth: Depths, archive_of: Archive
 ) -> None:
     rng = np.random.default_rng(5)
     noisy = {view: z * rng.uniform(0.8, 1.3, z.shape).astype(np.float32) for view, z in tiny_truth.items()}
     with open_evaluation(archive_of(noisy), tiny_root) as evaluation:
-        views = score_evaluation(evaluation).views
-        truths = config_truth(evaluation.folder, evaluation.configs[0])
-        scores = single_bar_scores(evaluation.submission, truths, views)
+        extended = score_extended(evaluation, [MEASURE_FAMILIES["single_bar"]]).extended
+    assert extended is not None
     images = rendered(tiny_root, "lattice")
-    for view, score in zip(views, scores, strict=True):
+    for view in extended.views:
         bars, inside, z_m = images[view.view_id]
         pixels = np.flatnonzero(inside)
         chosen = pixels[np.array(expected_pixels(bars, pixels))]
-        assert score.share == len(chosen) / len(pixels)
+        native, scaled = view.numbers["native"], view.numbers["scaled"]
+        assert native["single_bar_share"] == len(chosen) / len(pixels)
         if not len(chosen):
-            assert score == SingleBarScore(0.0, None, None, None)
+            assert native["single_bar_abs_rel"] is native["single_bar_coverage"] is None
             continue
         z, p = (image.ravel().astype(np.float64) for image in (z_m, noisy[view.view_id]))
         scale = np.median(z[pixels]) / np.median(p[pixels])
-        assert score.coverage == 1.0
+        assert native["single_bar_coverage"] == 1.0
         errors = [np.mean(np.abs(s * p[chosen] - z[chosen]) / z[chosen]) for s in (1.0, scale)]
-        assert score.native is not None
-        assert score.scaled is not None
-        assert [score.native.abs_rel, score.scaled.abs_rel] == pytest.approx(errors, rel=1e-9)
-    means = mean_single_bar(scores)
-    assert means.share == pytest.approx(np.mean([score.share for score in scores]))
-    for name in METRICS:
-        values = [getattr(score.scaled, name) for score in scores if score.scaled]
-        assert getattr(means.scaled, name) == pytest.approx(np.mean(values))
+        assert [native["single_bar_abs_rel"], scaled["single_bar_abs_rel"]] == pytest.approx(errors, rel=1e-9)
+    values = [number for view in extended.views if (number := view.numbers["scaled"]["single_bar_abs_rel"])]
+    mean = extended.tables["lattice"].numbers["scaled"]["single_bar_abs_rel"]
+    assert (mean.value, mean.samples) == (pytest.approx(np.mean(values)), len(values))
