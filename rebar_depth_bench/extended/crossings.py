@@ -303,7 +303,7 @@ def _binned_samples(shares: Mapping[str, Float64[ndarray, " m"]], view: ViewCros
         "mm": view.ties.gap_m * _MM,
         "px": view.width_px,
     }
-    samples = {}
+    samples: dict[str, Float64[ndarray, " k"]] = {}
     for unit, bins in _BINS.items():
         for low, high in pairwise(bins.edges):
             values = properties[unit]

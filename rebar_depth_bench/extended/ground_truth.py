@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt16, UInt32
@@ -80,8 +80,8 @@ class ConfigSteelTruth:
 
     def view(self, position: int) -> SteelTruth:
         """Return the view at ``position`` in protocol order."""
-        truth = _steel_truth(self.cache.view(position), self.config, self.bars_by_view, self.rays)
-        return replace(truth, judged=self.judged(position))
+        view, judged = self.cache.view(position), self.judged(position)
+        return _steel_truth(view, judged, self.config, self.bars_by_view, self.rays)
 
     def judged(self, position: int) -> JudgedCrossings:
         """Return the judged crossings of the view at ``position``."""
@@ -132,7 +132,7 @@ def load_steel_truth(
 
     def judged_arrays() -> Iterator[ViewArrays]:
         for position in range(len(cache)):
-            truth = _steel_truth(cache.view(position), config, bars_by_view, rays)
+            truth = _steel_truth(cache.view(position), JudgedCrossings.none(), config, bars_by_view, rays)
             judged = judged_crossings(truth)
             arrays = {"crossing": np.repeat(judged.crossing, 2 * SAMPLED_PIXELS), "pixel": judged.pixels.ravel()}
             yield ViewArrays(truth.view_id, arrays, ())
@@ -152,9 +152,13 @@ def load_steel_truth(
 
 
 def _steel_truth(
-    view: ViewArrays, config: DatasetConfig, bars_by_view: Mapping[str, SceneBars], rays: Mapping[Lens, Rays]
+    view: ViewArrays,
+    judged: JudgedCrossings,
+    config: DatasetConfig,
+    bars_by_view: Mapping[str, SceneBars],
+    rays: Mapping[Lens, Rays],
 ) -> SteelTruth:
-    """Return a cached view without its judged crossings."""
+    """Return the ground truth of a cached view."""
     lens, pose = view.numbers[:_LENS_NUMBERS], view.numbers[_LENS_NUMBERS:]
     height, width = config.grid
     return SteelTruth(
@@ -166,6 +170,7 @@ def _steel_truth(
         rays=rays[lens][view.arrays["index"]],
         bars=bars_by_view[view.view_id],
         distortion=np.array(lens[9:]),
+        judged=judged,
         **view.arrays,
     )
 

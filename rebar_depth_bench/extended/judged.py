@@ -155,7 +155,7 @@ def _spread(total: int | Int64[ndarray, "r 1"], count: int) -> Int64[ndarray, " 
     Regular strides can coincide with ribs or with the width of a bar, and sample a single column of it. Multiples
     of the golden ratio avoid such resonance.
     """
-    return np.floor(total * ((np.arange(count) + 0.5) * _GOLDEN % 1.0)).astype(np.int64)
+    return np.asarray(np.floor(total * ((np.arange(count) + 0.5) * _GOLDEN % 1.0)), dtype=np.int64)
 
 
 def _frames(middle_m: Float64[ndarray, "r 3"], direction: Float64[ndarray, "r 3"]) -> Float64[ndarray, "r 3 3"]:

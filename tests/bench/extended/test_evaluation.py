@@ -201,10 +201,13 @@ def test_damaged_bars_are_refused(
 def test_each_prediction_is_read_once(
     tiny_truth: Depths, tiny_root: Path, archive_of: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    read, views = SubmissionReader.read, []
-    monkeypatch.setattr(
-        SubmissionReader, "read", lambda self, view_id: views.append(view_id) or read(self, view_id)
-    )
+    original, views = SubmissionReader.read, []
+
+    def read(reader: SubmissionReader, view_id: str) -> np.ndarray:
+        views.append(view_id)
+        return original(reader, view_id)
+
+    monkeypatch.setattr(SubmissionReader, "read", read)
     extended(archive_of(tiny_truth), tiny_root)
     assert sorted(views) == sorted(tiny_truth)
 
@@ -238,18 +241,9 @@ def test_a_new_measure_is_one_file(
     archive = archive_of({view: 1.5 * depth for view, depth in tiny_truth.items()})
     outputs = {name: tmp_path / f"out.{name}" for name in ("json", "html", "csv")}
     options = ["--json", outputs["json"], "--html", outputs["html"], "--extended-csv", outputs["csv"]]
-    command = [
-        sys.executable,
-        "-c",
-        USE_NEW_MEASURE,
-        tmp_path / "new",
-        "score",
-        archive,
-        "--data",
-        tiny_root,
-        *options,
-    ]
-    terminal = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    start = [sys.executable, "-c", USE_NEW_MEASURE, tmp_path / "new"]
+    command = [*start, "score", archive, "--data", tiny_root, *options]
+    terminal = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=True).stdout
     table = json.loads(outputs["json"].read_text())["extended"]["tables"]["lattice"]
     assert (table["native"]["far_off"]["value"], table["scaled"]["far_off"]["value"]) == (1.0, 0.0)
     assert "far_off" in outputs["csv"].read_text()

@@ -137,11 +137,8 @@ def test_reaches_without_the_other_measures_are_the_same(mat: tuple[Path, Depths
         found = score_extended(evaluation, [MEASURE_FAMILIES["crossings"]]).extended
     assert found is not None
     assert found.tables[CONFIG].reaches == extended(archive, root).tables[CONFIG].reaches
-    assert {measure.name.partition("_")[0] for measure in found.measures["native"]} == {
-        "crossing",
-        "crossings",
-        "tie",
-    }
+    heads = {measure.name.partition("_")[0] for measure in found.measures["native"]}
+    assert heads == {"crossing", "crossings", "tie"}
     content = json.loads(json.dumps(found.to_dict()))
     assert content["crossings"]["file"] == "crossings.parquet"
     reaches = content["tables"][CONFIG]["crossing_reach"]["native"]
