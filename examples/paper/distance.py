@@ -203,7 +203,7 @@ def run(options: argparse.Namespace) -> None:
         result = score_extended(evaluation, families, progress=bars.update)
         assert result.extended is not None
         scores = {view.view_id: view for view in result.views}
-        extended = {view.view_id: view.numbers for view in result.extended.views}
+        extended = result.extended.views
         present = {config.name: config for config in evaluation.configs}
         names = dict.fromkeys(options.config or present)
         if names.keys() - present.keys():

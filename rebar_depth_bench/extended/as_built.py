@@ -44,7 +44,7 @@ def as_built_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
     judged = truth.once(_judged)
     if judged is None:
         return {}
-    fitted = fit_axes(p_m, judged.shown, np.zeros(len(judged.true_m), dtype=bool))
+    fitted = fit_axes(p_m, judged.shown)
     fitted_m = np.where(fitted.found[:, None], fitted.point_m, np.nan)
     measured_m = _across(fitted_m - judged.nominal_m, judged.direction)
     true_mm, measured_mm, error_mm = (

@@ -90,9 +90,8 @@ def neighbour_pairs(
     the left or upper pixel first. The last pixel of a row and the first of the next row are not adjacent.
     """
     left = np.flatnonzero((np.diff(index) == 1) & (index[:-1] % width != width - 1))
-    position = np.zeros(
-        (height + 1) * width, np.int32
-    )  # 1 + position in index, 0: not in it; one empty row below the frame
+    # 1 + position in index, 0: not in it; one empty row below the frame.
+    position = np.zeros((height + 1) * width, np.int32)
     position[index] = np.arange(1, len(index) + 1, dtype=np.int32)
     position_below = position[index + np.uint32(width)]
     upper = np.flatnonzero(position_below)
@@ -115,19 +114,20 @@ def contour_counts(
     z_step, z_second_nearer = _depth_step(z_m[first], z_m[second])
     p_valid_m = np.where(valid, p_m, np.nan)
     p_step, p_second_nearer = _depth_step(p_valid_m[first], p_valid_m[second])
+    # Most pairs lie on one surface: skip them early.
     lowest = 1.0 + THRESHOLDS_PERCENT[0] / 100
-    candidates = np.flatnonzero(
-        (z_step > lowest) | (p_step > lowest)
-    )  # Most pairs lie on one surface: skip them early.
+    candidates = np.flatnonzero((z_step > lowest) | (p_step > lowest))
     z_step, p_step = z_step[candidates], p_step[candidates]
     same_side = z_second_nearer[candidates] == p_second_nearer[candidates]
-    true, predicted, correct = [], [], []
-    for percent in THRESHOLDS_PERCENT:
-        z_contour, p_contour = z_step > 1.0 + percent / 100, p_step > 1.0 + percent / 100
-        true.append(np.count_nonzero(z_contour))
-        predicted.append(np.count_nonzero(p_contour) + missing)
-        correct.append(np.count_nonzero(z_contour & p_contour & same_side))
-    return ContourCounts(len(first), missing, np.array(true), np.array(predicted), np.array(correct))
+    steps = 1.0 + np.array(THRESHOLDS_PERCENT)[:, None] / 100
+    z_contour, p_contour = z_step > steps, p_step > steps
+    return ContourCounts(
+        pairs=len(first),
+        missing=missing,
+        true=np.count_nonzero(z_contour, axis=1),
+        predicted=np.count_nonzero(p_contour, axis=1) + missing,
+        correct=np.count_nonzero(z_contour & p_contour & same_side, axis=1),
+    )
 
 
 def _depth_step(

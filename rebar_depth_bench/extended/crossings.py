@@ -229,7 +229,7 @@ def fitted_ties(p_m: Float64[ndarray, " n"], view: ViewCrossings) -> tuple[Bool[
     positions along its axis are the true ones, and the normal is on the side of the true one. Numbers of crossings
     that are not located have no meaning.
     """
-    fitted = fit_axes(p_m, view.visible, np.zeros(len(view.visible.segment), dtype=bool))
+    fitted = fit_axes(p_m, view.visible)
     with np.errstate(all="ignore"):
         points_m = _closest_points_m(fitted)
         direction = fitted.direction.reshape(-1, 2, 3)

@@ -90,7 +90,11 @@ def fit_cylinders(
     ``fit_radius`` are then fitted further with a free radius, for their diameter. A set without points, or whose
     values overflow, does not converge. All lengths are in metres, in each set's own frame.
     """
-    point_sets = _PointSets.from_points(points_m, used, start_m, half_m, radius_m)
+    across_m, away_m = (
+        np.where(used, points_m[..., column] - start_m[:, column, None], 0.0) for column in range(2)
+    )
+    along = np.where(used, points_m[..., 2] / half_m[:, None], 0.0)
+    point_sets = _PointSets(across_m, away_m, along, used, half_m[:, None], radius_m[:, None])
     with np.errstate(over="ignore", invalid="ignore"):
         line_m, converged = _iterate(point_sets, np.zeros((len(points_m), 5)), POSITION_STEPS, free=4)
         slope = line_m[:, 2:4] / half_m[:, None]
@@ -122,22 +126,6 @@ class _PointSets:
     half_m: Float64[ndarray, "r 1"]
     radius_m: Float64[ndarray, "r 1"]
 
-    @classmethod
-    def from_points(
-        cls,
-        points_m: Float64[ndarray, "r k 3"],
-        used: Bool[ndarray, "r k"],
-        start_m: Float64[ndarray, "r 2"],
-        half_m: Float64[ndarray, " r"],
-        radius_m: Float64[ndarray, " r"],
-    ) -> _PointSets:
-        """Return the points relative to ``start_m``, with ``along`` divided by ``half_m``."""
-        across_m, away_m = (
-            np.where(used, points_m[..., column] - start_m[:, column, None], 0.0) for column in range(2)
-        )
-        along = np.where(used, points_m[..., 2] / half_m[:, None], 0.0)
-        return cls(across_m, away_m, along, used, half_m[:, None], radius_m[:, None])
-
     def of(self, sets: Bool[ndarray, " r"]) -> _PointSets:
         """Return the selected sets."""
         return _PointSets(*(getattr(self, field.name)[sets] for field in fields(self)))
@@ -157,7 +145,8 @@ def _iterate(
         residual_m, jacobian = _linearise(point_sets, unknowns_m)
         if iteration % 2 == 0:
             sigma_m = _sigma_m(residual_m, point_sets.used, 2 * radius_m)
-        weight = _tukey_weights(residual_m, sigma_m) * point_sets.used
+        scaled = residual_m / (TUKEY_CONSTANT * sigma_m)[:, None]
+        weight = np.maximum(1 - scaled**2, 0.0) ** 2 * point_sets.used
         lateral_prior = (sigma_m / (LATERAL_PRIOR_RADII * radius_m)) ** 2
         step_m = _gauss_newton_step(residual_m, jacobian[:, :free], weight, unknowns_m, lateral_prior)
         # The linearisation does not hold for a step longer than the radius plus the noise.
@@ -203,14 +192,6 @@ def _sigma_m(
     middle = used.sum(axis=1) // 2
     median_m = np.take_along_axis(ordered_m, np.minimum(middle, used.shape[1] - 1)[:, None], axis=1)[:, 0]
     return np.maximum(SIGMA_PER_MAD * median_m, MIN_SIGMA_DIAMETERS * diameter_m)
-
-
-def _tukey_weights(
-    residual_m: Float64[ndarray, "r k"], sigma_m: Float64[ndarray, " r"]
-) -> Float64[ndarray, "r k"]:
-    """Return Tukey's biweight of each residual."""
-    scaled = residual_m / (TUKEY_CONSTANT * sigma_m)[:, None]
-    return np.asarray(np.maximum(1 - scaled**2, 0.0) ** 2)
 
 
 def _gauss_newton_step(
@@ -268,18 +249,34 @@ class FittedAxes:
     diameter_m: Float64[ndarray, " r"]
 
 
-def fit_axes(
-    p_m: Float64[ndarray, " n"], visible: VisibleSegments, fit_diameter: Bool[ndarray, " r"]
-) -> FittedAxes:
+def fit_axes(p_m: Float64[ndarray, " n"], visible: VisibleSegments, *, diameters: bool = False) -> FittedAxes:
     """Return the axis of each visible segment, a cylinder of its nominal diameter fitted to predicted depth.
 
     ``p_m`` is planar depth at the pixels of ``SteelTruth``, metres; values that are not finite and > 0 are
-    missing. Where ``fit_diameter`` is set, a cylinder with a free radius is fitted as well, for its diameter.
+    missing. With ``diameters``, where ``can_fit_diameter`` is set, a cylinder with a free radius is fitted as
+    well, for its diameter.
     """
     points_m, predicted = _predicted_points_m(p_m, visible)
     start_m = _initial_offset_m(points_m, predicted, visible)
-    fits = fit_cylinders(points_m, predicted, start_m, visible.half_m, visible.diameter_m / 2, fit_diameter)
-    return _compare_with_truth(fits, predicted, visible)
+    fit_radius = visible.can_fit_diameter & diameters
+    fits = fit_cylinders(points_m, predicted, start_m, visible.half_m, visible.diameter_m / 2, fit_radius)
+    with np.errstate(over="ignore", invalid="ignore"):
+        squared_slope = (fits.slope**2).sum(axis=1)
+        lean_m = (fits.offset_m * fits.slope).sum(axis=1)
+        offset_m = np.sqrt(np.maximum((fits.offset_m**2).sum(axis=1) - lean_m**2 / (1 + squared_slope), 0.0))
+        enough = predicted.sum(axis=1) >= MIN_PREDICTED_SHARE * visible.used.sum(axis=1)
+        to_end_m = fits.slope * visible.half_m[:, None]
+        ends_m = (np.linalg.norm(fits.offset_m + side * to_end_m, axis=1) for side in (-1, 1))
+        farthest_m = np.maximum(offset_m, np.maximum(*ends_m))
+        local = np.column_stack([fits.slope, np.ones(len(fits.slope))]) / np.sqrt(1 + squared_slope)[:, None]
+        return FittedAxes(
+            found=enough & fits.converged & (farthest_m < visible.match_radius_m),
+            point_m=visible.middle_m + np.einsum("rc,rci->ri", fits.offset_m, visible.frame[:, :2]),
+            direction=np.einsum("rc,rci->ri", local, visible.frame),
+            offset_m=offset_m,
+            tilt_deg=np.rad2deg(np.arctan(np.sqrt(squared_slope))),
+            diameter_m=fits.diameter_m,
+        )
 
 
 def with_misses(error: Float64[ndarray, " n"], miss: float = MISS_MM) -> Float64[ndarray, " n"]:
@@ -316,27 +313,3 @@ def _initial_offset_m(
     row = np.arange(len(count))
     median_m = (ordered_m[row, lower] + ordered_m[row, upper]) / 2
     return np.where((count > 0)[:, None], median_m, 0.0)
-
-
-def _compare_with_truth(
-    fits: CylinderFits, predicted: Bool[ndarray, "r k"], visible: VisibleSegments
-) -> FittedAxes:
-    """Return the fitted axes in the camera frame and their deviations from the true ones."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        squared_slope = (fits.slope**2).sum(axis=1)
-        lean_m = (fits.offset_m * fits.slope).sum(axis=1)
-        offset_m = np.sqrt(np.maximum((fits.offset_m**2).sum(axis=1) - lean_m**2 / (1 + squared_slope), 0.0))
-        enough = predicted.sum(axis=1) >= MIN_PREDICTED_SHARE * visible.used.sum(axis=1)
-        to_end_m = fits.slope * visible.half_m[:, None]
-        ends_m = (np.linalg.norm(fits.offset_m + side * to_end_m, axis=1) for side in (-1, 1))
-        farthest_m = np.maximum(offset_m, np.maximum(*ends_m))
-        found = enough & fits.converged & (farthest_m < visible.match_radius_m)
-        local = np.column_stack([fits.slope, np.ones(len(fits.slope))]) / np.sqrt(1 + squared_slope)[:, None]
-        return FittedAxes(
-            found=found,
-            point_m=visible.middle_m + np.einsum("rc,rci->ri", fits.offset_m, visible.frame[:, :2]),
-            direction=np.einsum("rc,rci->ri", local, visible.frame),
-            offset_m=offset_m,
-            tilt_deg=np.rad2deg(np.arctan(np.sqrt(squared_slope))),
-            diameter_m=fits.diameter_m,
-        )

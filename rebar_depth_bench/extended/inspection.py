@@ -248,7 +248,7 @@ def inspection_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Sample
     (``..._error_mm``, ``axis_offset_mm``, ``axis_tilt_deg``).
     """
     visible = truth.once(visible_segments)
-    fitted = fit_axes(p_m, visible, visible.can_fit_diameter)
+    fitted = fit_axes(p_m, visible, diameters=True)
     spacing_m, layer_m = _pair_errors_m(truth.once(_visible_pairs), visible, fitted)
     cover_m = (fitted.point_m - visible.middle_m)[:, 2]
     diameter_m = np.where(fitted.found, fitted.diameter_m - visible.diameter_m, np.nan)

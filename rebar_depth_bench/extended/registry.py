@@ -14,7 +14,7 @@ from jaxtyping import Float, Float64
 from numpy import ndarray
 
 from rebar_depth_bench import extended
-from rebar_depth_bench.extended.ground_truth import ConfigSteelTruth, has_bar_ids, steel_truth
+from rebar_depth_bench.extended.ground_truth import has_bar_ids, steel_truth
 from rebar_depth_bench.extended.measures import (
     NATIVE,
     ONCE,
@@ -27,9 +27,7 @@ from rebar_depth_bench.extended.measures import (
 from rebar_depth_bench.extended.result import (
     CrossingsSource,
     ExtendedResult,
-    ExtendedTable,
-    ExtendedView,
-    ViewNumbers,
+    ViewSamples,
     tabulate_extended,
     view_numbers,
 )
@@ -78,12 +76,13 @@ def score_extended(
     Raises ``DatasetError`` if the dataset folder lacks its bars or contradicts its manifest.
     """
     families = tuple(families)
-    steel: dict[str, ConfigSteelTruth] = {}
-    for config in evaluation.configs:
-        if has_bar_ids(config):
-            steel[config.name] = steel_truth(evaluation, config, progress)
+    steel = {
+        config.name: steel_truth(evaluation, config, progress)
+        for config in evaluation.configs
+        if has_bar_ids(config)
+    }
     places = {view_id: (one, place) for one in steel.values() for place, view_id in enumerate(one.view_ids)}
-    samples: dict[str, Mapping[str, Samples]] = {}
+    samples: dict[str, ViewSamples] = {}
 
     def add(prediction_m: Float[ndarray, "h w"], score: ViewScore) -> None:
         if score.view_id in places:
@@ -92,18 +91,15 @@ def score_extended(
 
     result = score_evaluation(evaluation, workers=workers, progress=progress, use_view=add)
     measures = measures_by_alignment(families)
-    tables: dict[str, ExtendedTable] = {}
-    views: list[ViewNumbers] = []
-    source = None
+    tables, source = {}, None
     for config in evaluation.configs:
-        of_config = steel.get(config.name)
-        view_ids = () if of_config is None else of_config.view_ids
-        config_views = [ExtendedView(view_id, samples[view_id]) for view_id in view_ids]
+        view_ids: tuple[str, ...] = ()
+        if config.name in steel:
+            view_ids, crossings = steel[config.name].view_ids, steel[config.name].crossings
+            source = CrossingsSource(crossings.source, crossings.sha256)
         resampling = resample_views(view_ids, by_scene=config.has_splits and bool(view_ids))
-        tables[config.name] = tabulate_extended(config_views, resampling, measures)
-        views += [view_numbers(view, measures) for view in config_views]
-        if of_config is not None:
-            source = CrossingsSource(of_config.crossings.source, of_config.crossings.sha256)
+        tables[config.name] = tabulate_extended([samples[view_id] for view_id in view_ids], resampling, measures)
+    views = {view_id: view_numbers(samples[view_id], measures) for view_id in places}
     return replace(result, extended=ExtendedResult(measures, tables, views, source))
 
 
@@ -112,7 +108,7 @@ def view_samples(
     truth: SteelTruth,
     scale: float | None,
     families: Iterable[MeasureFamily] = MEASURE_FAMILIES.values(),
-) -> dict[str, Samples]:
+) -> ViewSamples:
     """Return the samples of measure families for one view, by alignment.
 
     ``scale`` is the view's median scale s, None if it has none.

@@ -26,8 +26,8 @@ from rebar_depth_bench.extended.registry import measures_by_alignment
 from rebar_depth_bench.extended.result import (
     ExtendedResult,
     ExtendedTable,
-    ExtendedView,
     MeasureEstimate,
+    ViewSamples,
     convert_estimate,
     tabulate_extended,
     view_numbers,
@@ -41,19 +41,13 @@ BY_NAME = {measure.name: measure for measures in measures_by_alignment().values(
 VIEWS = 8
 
 
-def view(index: int, filled: Mapping[str, np.ndarray]) -> ExtendedView:
+def view(filled: Mapping[str, np.ndarray]) -> ViewSamples:
     """Return a view whose only samples are those of ``filled``, the same for every alignment."""
-    samples = {
-        alignment: {
-            measure.sample: np.asarray(filled.get(measure.sample, np.empty(0)), np.float64) for measure in measures
-        }
-        for alignment, measures in measures_by_alignment().items()
-    }
-    return ExtendedView(f"lattice/{index:04d}", samples)
+    return dict.fromkeys((ONCE, NATIVE, SCALED), filled)
 
 
 def table_of(filled: list[dict[str, np.ndarray]]) -> ExtendedTable:
-    views = [view(100 * index, samples) for index, samples in enumerate(filled)]
+    views = [view(samples) for samples in filled]
     return tabulate_extended(views, resample(range(0, 100 * len(views), 100)), measures_by_alignment())
 
 
@@ -152,26 +146,22 @@ def test_missing_bars_never_raise_capability() -> None:
     assert values[-1] is None
 
 
-def capability_of(one: ExtendedView) -> float | None:
-    return view_numbers(one, measures_by_alignment()).numbers[NATIVE][SPACING.capability_name]
+def capability_of(one: ViewSamples) -> float | None:
+    return view_numbers(one, measures_by_alignment())[NATIVE][SPACING.capability_name]
 
 
 def test_single_view_has_capability() -> None:
-    measured = view(0, {"spacing_judged_mm": np.full(10, 4.0)})
+    measured = view({"spacing_judged_mm": np.full(10, 4.0)})
     assert capability_of(measured) == 2.5
-    missed = view(0, {"spacing_judged_mm": np.full(10, MISS_MM)})
+    missed = view({"spacing_judged_mm": np.full(10, MISS_MM)})
     assert capability_of(missed) is None
-    assert capability_of(view(0, {})) is None
+    assert capability_of(view({})) is None
 
 
 def extended_of(filled: list[dict[str, np.ndarray]]) -> ExtendedResult:
-    views = [view(100 * index, samples) for index, samples in enumerate(filled)]
-    table = tabulate_extended(views, resample(range(0, 100 * len(views), 100)), measures_by_alignment())
-    return ExtendedResult(
-        measures_by_alignment(),
-        {"lattice": table},
-        [view_numbers(item, measures_by_alignment()) for item in views],
-    )
+    measures = measures_by_alignment()
+    views = {f"lattice/{100 * index:04d}": view_numbers(view(one), measures) for index, one in enumerate(filled)}
+    return ExtendedResult(measures, {"lattice": table_of(filled)}, views)
 
 
 def test_json_and_csv_contain_capability() -> None:

@@ -15,8 +15,8 @@ from rebar_depth_bench.extended.measures import NATIVE, SCALED, Measure, Statist
 from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, measures_by_alignment
 from rebar_depth_bench.extended.result import (
     ExtendedResult,
-    ExtendedView,
     MeasureEstimate,
+    ViewSamples,
     tabulate_extended,
     view_numbers,
 )
@@ -61,7 +61,7 @@ LEVELS = {
 """Mean of each view's samples by name; scaled samples are half of it."""
 
 
-def make_view(config: str, index: int, levels: dict[str, float]) -> ExtendedView:
+def make_view(index: int, levels: dict[str, float]) -> ViewSamples:
     rng = np.random.default_rng(index)
     samples = {}
     for alignment, measures in measures_by_alignment().items():
@@ -72,28 +72,19 @@ def make_view(config: str, index: int, levels: dict[str, float]) -> ExtendedView
             spread = 0.0 if level == MISS_MM else 0.01 * level
             samples_by_name[name] = factor * (level + spread * rng.uniform(-1, 1, 4))
         samples[alignment] = samples_by_name
-    return ExtendedView(f"{config}/{index:04d}", samples)
+    return samples
 
 
 def make_extended(*configs: str, levels: dict[str, float] | None = None, views: int = VIEWS) -> ExtendedResult:
     measures = measures_by_alignment()
-    by_config = {
-        config: [make_view(config, index, LEVELS if levels is None else levels) for index in INDICES[:views]]
+    of_config = {index: make_view(index, LEVELS if levels is None else levels) for index in INDICES[:views]}
+    table = tabulate_extended(list(of_config.values()), resample(INDICES[:views]), measures)
+    numbers = {
+        f"{config}/{index:04d}": view_numbers(one, measures)
         for config in configs
+        for index, one in of_config.items()
     }
-    tables = {
-        config: tabulate_extended(config_views, resample(INDICES[:views]), measures)
-        for config, config_views in by_config.items()
-    }
-    return ExtendedResult(
-        measures,
-        tables,
-        [
-            view_numbers(extended_view, measures)
-            for config_views in by_config.values()
-            for extended_view in config_views
-        ],
-    )
+    return ExtendedResult(measures, dict.fromkeys(configs, table), numbers)
 
 
 def result_with_extended(extended: ExtendedResult | None, *configs: str) -> Result:

@@ -190,21 +190,21 @@ def test_measures_of_a_config_are_those_of_its_pixels(
         extended = score_extended(evaluation, [MEASURE_FAMILIES["single_bar"]]).extended
     assert extended is not None
     images = rendered(tiny_root, "lattice")
-    for view in extended.views:
-        bars, inside, z_m = images[view.view_id]
+    for view_id, view in extended.views.items():
+        bars, inside, z_m = images[view_id]
         pixels = np.flatnonzero(inside)
         chosen = pixels[np.array(expected_pixels(bars, pixels))]
-        native, scaled = view.numbers["native"], view.numbers["scaled"]
+        native, scaled = view["native"], view["scaled"]
         assert native["single_bar_share"] == len(chosen) / len(pixels)
         if not len(chosen):
             assert native["single_bar_abs_rel"] is native["single_bar_coverage"] is None
             continue
-        z, p = (image.ravel().astype(np.float64) for image in (z_m, noisy[view.view_id]))
+        z, p = (image.ravel().astype(np.float64) for image in (z_m, noisy[view_id]))
         scale = np.median(z[pixels]) / np.median(p[pixels])
         assert native["single_bar_coverage"] == 1.0
         errors = [np.mean(np.abs(s * p[chosen] - z[chosen]) / z[chosen]) for s in (1.0, scale)]
         assert [native["single_bar_abs_rel"], scaled["single_bar_abs_rel"]] == pytest.approx(errors, rel=1e-9)
-    values = [number for view in extended.views if (number := view.numbers["scaled"]["single_bar_abs_rel"])]
+    values = [number for view in extended.views.values() if (number := view["scaled"]["single_bar_abs_rel"])]
     mean = extended.tables["lattice"].numbers["scaled"]["single_bar_abs_rel"]
     assert mean.value == pytest.approx(np.mean(values))
     assert mean.samples == len(values)
