@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
-from rebar_depth_bench.bar_crossings.axis_segments import AxisSegments
+from rebar_depth_bench.bar_crossings.axis_segments import AxisSegments, pieces
 from rebar_depth_bench.bar_crossings.definition import Crossings
 from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.extended.segments import MAX_MATCH_RADIUS_M, STRAIGHT_DEG, CageTruth
@@ -71,12 +71,8 @@ class Axis:
         """Return a k-d tree of samples along the axis, a quarter of a diameter apart, and their segments."""
         from scipy.spatial import cKDTree
 
-        length_m = np.linalg.norm(self.vector_m, axis=1)
-        counts = np.maximum(np.ceil(length_m / (self.diameter_m / 4)), 1).astype(np.int64)
-        segment = np.repeat(np.arange(len(counts)), counts)
-        number = np.arange(len(segment)) - np.repeat(np.cumsum(counts) - counts, counts)
-        share = (number + 0.5) / counts[segment]
-        return cKDTree(self.start_m[segment] + share[:, None] * self.vector_m[segment]), segment
+        segment, middle_m = pieces(self.start_m, self.vector_m, self.diameter_m / 4)
+        return cKDTree(middle_m), segment
 
     def tangents(self, along_m: Float64[ndarray, " n"]) -> Float64[ndarray, "n 3"]:
         """Return the unit tangent at lengths along the axis; at a vertex, the bisector of its edges."""

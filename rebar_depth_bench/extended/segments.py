@@ -94,28 +94,18 @@ def overlapping_pairs(
     """
     pairs = [np.empty((0, 2), dtype=np.int64)]
     for segment in range(len(bar_id)):
-        others = np.flatnonzero(_is_spaced_neighbour(parallel, segment, bar_id, diameter_m))
+        apart_m = parallel.apart_m[segment]
+        clear_m = apart_m - (diameter_m + diameter_m[segment]) / 2
+        lapped = clear_m < MIN_CLEARANCE_DIAMETERS * np.maximum(diameter_m, diameter_m[segment])
+        others = np.flatnonzero(~lapped & (apart_m <= MAX_SPACING_M) & (bar_id != bar_id[segment]))
         others = others[others > segment]
         at_m = parallel.middle_m[segment, others]
         present = (parallel.low_m[segment][:, None] <= at_m) & (at_m <= parallel.high_m[segment][:, None])
-        farther_m = np.maximum(parallel.apart_m[segment][:, None], parallel.apart_m[:, others])
-        blocked = (present & (farther_m < _NEARER_FACTOR * parallel.apart_m[segment, others])).any(axis=0)
+        farther_m = np.maximum(apart_m[:, None], parallel.apart_m[:, others])
+        blocked = (present & (farther_m < _NEARER_FACTOR * apart_m[others])).any(axis=0)
         free = others[~blocked]
         pairs.append(np.column_stack([np.full(len(free), segment), free]))
     return np.concatenate(pairs)
-
-
-def _is_spaced_neighbour(
-    parallel: ParallelPairs, segment: int, bar_id: Int64[ndarray, " r"], diameter_m: Float64[ndarray, " r"]
-) -> Bool[ndarray, " r"]:
-    """Return which segments can form a pair with ``segment``.
-
-    They belong to another bar, are not lapped with it and are at most ``MAX_SPACING_M`` away.
-    """
-    apart_m = parallel.apart_m[segment]
-    clear_m = apart_m - (diameter_m + diameter_m[segment]) / 2
-    lapped = clear_m < MIN_CLEARANCE_DIAMETERS * np.maximum(diameter_m, diameter_m[segment])
-    return np.asarray(~lapped & (apart_m <= MAX_SPACING_M) & (bar_id != bar_id[segment]))
 
 
 STRAIGHT_DEG = 1.0
