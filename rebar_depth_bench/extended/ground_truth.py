@@ -7,7 +7,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt16, UInt32
+from jaxtyping import Bool, Float64
 from numpy import ndarray
 
 from rebar_depth_bench.bar_crossings.definition import CROSSINGS_PROTOCOL
@@ -17,9 +17,10 @@ from rebar_depth_bench.data.cache import ArrayCache, CacheContent, ViewArrays, o
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder
 from rebar_depth_bench.data.rows import EyeTruth
 from rebar_depth_bench.errors import DatasetError
+from rebar_depth_bench.extended.axes import assign_segments
+from rebar_depth_bench.extended.depth_layers import other_layers
 from rebar_depth_bench.extended.judged import SAMPLED_PIXELS, judged_crossings
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL
-from rebar_depth_bench.extended.segments import assign_segments
 from rebar_depth_bench.extended.steel import JudgedCrossings, SceneBars, SteelTruth
 from rebar_depth_bench.geometry.cameras import pixel_rays
 from rebar_depth_bench.parallel import Progress, silent
@@ -232,56 +233,6 @@ def _steel_arrays(left: EyeTruth, scored: ndarray, rays: Rays, scene: SceneBars)
         "front_m": spread(front_m, np.nan),
         "behind_m": spread(behind_m, np.nan),
     }
-
-
-DIRECTIONS = 16
-"""Number of evenly spaced image directions in which other layers are searched."""
-
-RADII_PX = (3, 6, 12, 24)
-"""Distances in pixels at which other layers are searched, ascending, the same for every image size.
-
-Networks and matching windows confuse surfaces that are pixels apart, whatever the distance in millimetres.
-"""
-
-
-def other_layers(
-    depth_m: Float32[ndarray, "h w"],
-    bars: UInt16[ndarray, "h w"],
-    index: UInt32[ndarray, " n"],
-    gap_m: Float32[ndarray, " n"],
-) -> tuple[Float32[ndarray, " n"], Float32[ndarray, " n"]]:
-    """Return ``front_m`` and ``behind_m``: planar depth of the closest other layers visible beside steel pixels.
-
-    ``depth_m`` is true planar depth (metres, 0 where there is no surface), ``bars`` bar ids (0: no steel),
-    ``index`` flat indices of steel pixels, ``gap_m`` the diameter of each pixel's bar. Neighbours are sampled at
-    ``RADII_PX`` in ``DIRECTIONS`` directions. Steel farther than z + gap is behind and steel nearer than z - gap
-    is in front; of several the one closest to z counts. NaN where there is no such steel.
-
-    The same bar can be another layer (the far side of a hoop), but only where something farther than both pixels
-    is visible between them, so that no straight bar connects them. A bar that runs away from the camera is
-    therefore not its own other layer, even where another bar crosses in front of it.
-    """
-    margin = RADII_PX[-1]
-    width = depth_m.shape[1] + 2 * margin
-    padded_m, padded_bars = np.pad(depth_m, margin).ravel(), np.pad(bars, margin).ravel()
-    row, column = np.divmod(index.astype(np.int64), depth_m.shape[1])
-    centre = (row + margin) * width + column + margin
-    z_m, own = padded_m[centre], padded_bars[centre]
-    front_m, behind_m = np.full(len(index), -np.inf, np.float32), np.full(len(index), np.inf, np.float32)
-    for angle in np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS):
-        # The farthest surface so far in this direction that is not this bar.
-        between_m = np.zeros(len(index), np.float32)
-        for radius in RADII_PX:
-            neighbour = centre + round(radius * np.sin(angle)) * width + round(radius * np.cos(angle))
-            seen_m, seen_bars = padded_m[neighbour], padded_bars[neighbour]
-            is_other = seen_bars != own
-            is_layer = (seen_bars > 0) & (is_other | (between_m > np.maximum(z_m, seen_m)))
-            np.fmin(behind_m, np.where(is_layer & (seen_m > z_m + gap_m), seen_m, np.inf), out=behind_m)
-            np.fmax(front_m, np.where(is_layer & (seen_m < z_m - gap_m), seen_m, -np.inf), out=front_m)
-            far_m = np.where(seen_m > 0, seen_m, np.inf)
-            np.maximum(between_m, np.where(is_other, far_m, 0), out=between_m)
-    front_m[np.isinf(front_m)], behind_m[np.isinf(behind_m)] = np.nan, np.nan
-    return front_m, behind_m
 
 
 def dilate_mask(mask: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:

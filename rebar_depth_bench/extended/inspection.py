@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray
 
+from rebar_depth_bench.extended.axes import MAX_MATCH_RADIUS_M
 from rebar_depth_bench.extended.fits import MIN_PREDICTED_SHARE, MISS_MM, FittedAxes, fit_axes, with_misses
 from rebar_depth_bench.extended.judged import (
     FLANK_RADII_AND_SHARE,
@@ -27,7 +28,6 @@ from rebar_depth_bench.extended.judged import (
     visible_segments,
 )
 from rebar_depth_bench.extended.measures import Measure, MeasureFamily, Samples
-from rebar_depth_bench.extended.segments import MAX_MATCH_RADIUS_M
 from rebar_depth_bench.extended.steel import SteelTruth
 
 ErrorKind = Literal["spacing", "layer", "cover"]

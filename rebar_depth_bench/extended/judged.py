@@ -11,8 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
-from rebar_depth_bench.extended.axes import WINDOW_DIAMETERS, Axis
-from rebar_depth_bench.extended.segments import SURFACE_DISTANCE_RADII
+from rebar_depth_bench.extended.axes import SURFACE_DISTANCE_RADII, WINDOW_DIAMETERS, Axis
 from rebar_depth_bench.extended.steel import JudgedCrossings, SteelTruth
 from rebar_depth_bench.geometry.cameras import fold_radius, project, transform
 

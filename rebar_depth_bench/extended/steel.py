@@ -12,8 +12,7 @@ from numpy import ndarray
 
 from rebar_depth_bench.bar_crossings.definition import Crossings
 from rebar_depth_bench.data.bars import Bar, with_axis
-from rebar_depth_bench.extended.axes import SceneCrossings, prepared_crossings
-from rebar_depth_bench.extended.segments import CageTruth, cage_truth
+from rebar_depth_bench.extended.axes import CageTruth, SceneCrossings, cage_truth, prepared_crossings
 
 _Made = TypeVar("_Made")
 
@@ -82,7 +81,7 @@ class SteelTruth:
     0], rays[:, 1], 1)``. ``run`` is the straight bar segment whose axis is nearest to the true point (an index
     of ``CageTruth``), -1 where the point is on no segment. ``front_m`` and ``behind_m`` are the depths
     of the closest other layer in front of and behind the pixel, NaN where none is visible: see
-    ``ground_truth.other_layers``. ``bars`` are those of the scene. ``distortion`` is that of the grid
+    ``depth_layers.other_layers``. ``bars`` are those of the scene. ``distortion`` is that of the grid
     (``cameras.distort``), zeros on an ideal one.
     """
 

@@ -9,8 +9,8 @@ import numpy as np
 
 from rebar_depth_bench.bar_crossings.definition import scene_crossings
 from rebar_depth_bench.data.bars import Bar, with_axis
+from rebar_depth_bench.extended.axes import assign_segments
 from rebar_depth_bench.extended.judged import judged_crossings
-from rebar_depth_bench.extended.segments import assign_segments
 from rebar_depth_bench.extended.steel import SceneBars, SteelTruth
 from rebar_depth_bench.scoring.protocol import interior, single_bar_pixels
 

@@ -11,8 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy import ndarray
 
-from rebar_depth_bench.extended.depth_layers import layer_samples
-from rebar_depth_bench.extended.ground_truth import DIRECTIONS, RADII_PX, other_layers
+from rebar_depth_bench.extended.depth_layers import DIRECTIONS, RADII_PX, layer_samples, other_layers
 from rebar_depth_bench.extended.steel import SteelTruth
 from tests.bench.extended.thin_scenes import (
     random_images,

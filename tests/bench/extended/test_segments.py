@@ -7,8 +7,8 @@ import pytest
 
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.errors import DatasetError
-from rebar_depth_bench.extended import segments as segments_module
-from rebar_depth_bench.extended.segments import MAX_MATCH_RADIUS_M, CageTruth, assign_segments, cage_truth
+from rebar_depth_bench.extended import axes
+from rebar_depth_bench.extended.axes import MAX_MATCH_RADIUS_M, CageTruth, assign_segments, cage_truth
 from tests.bench.extended.cage_scenes import bar
 
 
@@ -131,6 +131,6 @@ def test_points_of_other_bars_belong_to_no_segment() -> None:
 
 
 def test_too_many_segments_raise_dataset_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(segments_module, "MAX_SEGMENTS", 1)
+    monkeypatch.setattr(axes, "MAX_SEGMENTS", 1)
     with pytest.raises(DatasetError, match="2 straight runs, expected up to 1"):
         cage_truth([L_BAR])

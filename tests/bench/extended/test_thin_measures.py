@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from numpy import ndarray
 
 from rebar_depth_bench import load
-from rebar_depth_bench.extended import boundary, depth_layers, ground_truth, point_cloud, regions
+from rebar_depth_bench.extended import boundary, depth_layers, point_cloud, regions
 from rebar_depth_bench.extended.measures import STATISTICS, Measure, Samples
 from rebar_depth_bench.extended.steel import SteelTruth
 from tests.bench.extended.thin_scenes import random_prediction, random_truth, steel_truth, with_holes
@@ -91,7 +91,7 @@ def test_rendered_truth_is_perfect(tiny_root: Path) -> None:
     bars, depth_m = row["left_bars"], row["left_depth"]
     index = np.flatnonzero(bars).astype(np.uint32)
     layers_m = np.full((2, bars.size), np.nan, np.float32)
-    layers_m[:, index] = ground_truth.other_layers(depth_m, bars, index, np.full(len(index), 0.007, np.float32))
+    layers_m[:, index] = depth_layers.other_layers(depth_m, bars, index, np.full(len(index), 0.007, np.float32))
     front_m, behind_m = layers_m.reshape(2, *bars.shape)
     assert np.isfinite(front_m).any()
     assert np.isfinite(behind_m).any()

@@ -16,7 +16,7 @@ from dataset_builder.scene.model import Assembly
 from dataset_builder.scene.shapes.solids import box
 from dataset_builder.scene.variants.props import make_props
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.extended.segments import cage_truth
+from rebar_depth_bench.extended.axes import cage_truth
 from tests.builder.scene.cages import assembly_of
 
 ROD = Bar(1, "bar", 0.01, ((-0.2, 0.0, 0.1), (0.2, 0.0, 0.1)))
