@@ -324,12 +324,5 @@ def _separation_m(
     return np.asarray(intersections_m[1] - intersections_m[0])
 
 
-FAMILIES = (
-    MeasureFamily(
-        "inspection",
-        "Inspection, bar by bar",
-        7,
-        (*INSPECTION_MEASURES, *CAPABILITY_MEASURES),
-        inspection_samples,
-    ),
-)
+MEASURES = (*INSPECTION_MEASURES, *CAPABILITY_MEASURES)
+FAMILIES = (MeasureFamily("inspection", "Inspection, bar by bar", 7, MEASURES, inspection_samples),)

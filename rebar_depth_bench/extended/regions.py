@@ -49,8 +49,8 @@ def region_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
     ``<region>_<metric>`` has one value each for abs_rel, rmse_cm, mae_cm, delta1 (over predicted pixels; none
     where there is no such pixel) and for coverage and within_<t>mm (shares of all pixels, 0 to 1; none where the
     view has no such pixel). ``kept_share`` is the number of interior pixels over that of mask pixels,
-    ``single_bar_share`` that of single-bar pixels over that of interior pixels. ``single_bar_views_abs_rel`` is
-    AbsRel on the interior of a view that has AbsRel on single-bar pixels. Steel without a bar id is in no region.
+    ``single_bar_share`` that of single-bar pixels over that of scored pixels. ``single_bar_views_abs_rel`` is AbsRel
+    on the scored pixels of a view that has AbsRel on single-bar pixels. Steel without a bar id is in no region.
     """
     pixels = {
         "full_mask": truth.bar_id > 0,
@@ -63,12 +63,16 @@ def region_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
         for region, of_region in pixels.items()
         for name, value in _region_numbers(p_m, truth, of_region).items()
     }
+    scored = np.count_nonzero(truth.interior)
     if "single_bar_abs_rel" in samples:
-        samples["single_bar_views_abs_rel"] = samples["interior_abs_rel"]
+        whole = samples["interior_abs_rel"]
+        if count["interior"] < scored:  # Steel without a bar id is scored, too.
+            whole = np.array([_region_numbers(p_m, truth, truth.interior)["abs_rel"]])
+        samples["single_bar_views_abs_rel"] = whole
     return {
         **samples,
         "kept_share": share_sample(count["interior"], count["full_mask"]),
-        "single_bar_share": share_sample(count["single_bar"], np.count_nonzero(truth.interior)),
+        "single_bar_share": share_sample(count["single_bar"], scored),
     }
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -116,6 +117,18 @@ def test_shift_by_one_pixel_costs_less_on_single_bars() -> None:
     assert samples["single_bar_abs_rel"] == [0.0]
     assert samples["single_bar_views_abs_rel"] == samples["interior_abs_rel"]
     assert samples["interior_abs_rel"][0] > 0.03
+
+
+def test_steel_without_a_bar_id_is_scored_but_in_no_region() -> None:
+    """Imported masks may have steel without a bar id: it counts in the interior that single bars stand beside."""
+    depth_m, bars = np.full((9, 14), 0.5, np.float32), np.ones((9, 14), np.uint16)
+    truth = steel_truth(depth_m, bars)
+    no_id = truth.index % 14 >= 7
+    truth = replace(truth, bar_id=np.where(no_id, 0, truth.bar_id), single_bar=truth.single_bar & ~no_id)
+    samples = region_samples(np.where(no_id, 1.0, 0.5), truth)
+    assert samples["interior_abs_rel"] == samples["single_bar_abs_rel"] == [0.0]
+    assert samples["single_bar_views_abs_rel"] == samples["single_bar_share"] == [0.5]
+    assert samples["full_mask_coverage"] == [1.0]
 
 
 def test_profile_bins_equal_numpy() -> None:
