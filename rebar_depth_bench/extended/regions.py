@@ -49,8 +49,9 @@ def region_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
     ``<region>_<metric>`` has one value each for abs_rel, rmse_cm, mae_cm, delta1 (over predicted pixels; none
     where there is no such pixel) and for coverage and within_<t>mm (shares of all pixels, 0 to 1; none where the
     view has no such pixel). ``kept_share`` is the number of interior pixels over that of mask pixels,
-    ``single_bar_share`` that of single-bar pixels over that of scored pixels. ``single_bar_views_abs_rel`` is AbsRel
-    on the scored pixels of a view that has AbsRel on single-bar pixels. Steel without a bar id is in no region.
+    ``single_bar_share`` that of single-bar pixels over that of scored pixels. ``single_bar_views_abs_rel`` is
+    AbsRel on the scored pixels of a view that has AbsRel on single-bar pixels. Steel without a bar id is in no
+    region.
     """
     pixels = {
         "full_mask": truth.bar_id > 0,
