@@ -35,11 +35,11 @@ import rebar_depth_bench as rdb
 from benchmarks.timing import print_markdown
 from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
 from rebar_depth_bench.detections.score import score_crossings
-from rebar_depth_bench.extended.evaluate import score_extended
-from rebar_depth_bench.extended.predictions import NATIVE
+from rebar_depth_bench.extended.measures import NATIVE
+from rebar_depth_bench.extended.registry import score_extended
 from rebar_depth_bench.names import config_of
 from rebar_depth_bench.scoring.columns import rounded
-from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
+from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.submission import SubmissionReader
 
 OPENING_SHARE = 0.06
@@ -100,7 +100,8 @@ def _renders_text(config: DatasetConfig) -> str:
 def _measures(archive: str, root: str) -> dict[str, Any]:
     """Return the measures at crossings and the reaches of an archive, native, by config."""
     with open_evaluation(archive, root) as evaluation:
-        extended = score_extended(score_evaluation(evaluation), evaluation)
+        extended = score_extended(evaluation).extended
+    assert extended is not None
     return {
         config: {
             "measures": {name: rounded(table.numbers[NATIVE][name].value) for name in MEASURES},

@@ -14,7 +14,7 @@ import json
 import statistics
 import sys
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -24,12 +24,10 @@ from dataset_builder.cli.main import main as rebar_build
 from rebar_depth_bench import score
 from rebar_depth_bench.atomic_io import write_text
 from rebar_depth_bench.cli.main import main as rebar_bench
+from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, score_extended
+from rebar_depth_bench.extended.result import ExtendedTable
 from rebar_depth_bench.names import TEST_SPLIT, config_of
-from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
-from rebar_depth_bench.scoring.metrics import mean
-from rebar_depth_bench.scoring.score import SingleBarScore, mean_single_bar, single_bar_scores
-from rebar_depth_bench.scoring.table import ViewScore
-from rebar_depth_bench.scoring.truth import config_truth
+from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.submission.declaration import METADATA_NAME
 
 
@@ -167,29 +165,21 @@ def _single_bar(archive: Path, root: Path) -> dict[str, dict[str, float | int | 
 
     The share is a mean over all views. The errors are means over the views with a predicted single-bar pixel.
     """
-    means = {}
     with open_evaluation(archive, root) as evaluation:
-        scores = {view.view_id: view for view in score_evaluation(evaluation).views}
-        for config in evaluation.configs:
-            truths = config_truth(evaluation.folder, config)
-            of_config = [scores[view_id] for view_id in truths.view_ids]
-            single_bar = single_bar_scores(truths, evaluation.submission.read, of_config)
-            means[config.name] = _single_bar_means(of_config, single_bar)
-    return means
+        extended = score_extended(evaluation, [MEASURE_FAMILIES["single_bar"]]).extended
+    assert extended is not None
+    return {config: _single_bar_means(table) for config, table in extended.tables.items()}
 
 
-def _single_bar_means(
-    scores: Sequence[ViewScore], single_bar: Sequence[SingleBarScore]
-) -> dict[str, float | int | None]:
-    means = mean_single_bar(single_bar)
-    scored = [score for score, one in zip(scores, single_bar, strict=True) if one.native]
+def _single_bar_means(table: ExtendedTable) -> dict[str, float | int | None]:
+    native, scaled = table.numbers["native"], table.numbers["scaled"]
     return {
-        "share": means.share,
-        "views": len(scored),
-        "native_abs_rel_interior": mean([score.native.abs_rel for score in scored if score.native]),
-        "native_abs_rel_single_bar": means.native.abs_rel if means.native else None,
-        "scaled_abs_rel_interior": mean([score.scaled.abs_rel for score in scored if score.scaled]),
-        "scaled_abs_rel_single_bar": means.scaled.abs_rel if means.scaled else None,
+        "share": native["single_bar_share"].value,
+        "views": native["single_bar_abs_rel"].samples,
+        "native_abs_rel_interior": native["single_bar_views_abs_rel"].value,
+        "native_abs_rel_single_bar": native["single_bar_abs_rel"].value,
+        "scaled_abs_rel_interior": scaled["single_bar_views_abs_rel"].value,
+        "scaled_abs_rel_single_bar": scaled["single_bar_abs_rel"].value,
     }
 
 

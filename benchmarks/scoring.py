@@ -18,6 +18,7 @@ import tempfile
 import zipfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from functools import partial
 from itertools import cycle, islice
 from pathlib import Path
@@ -28,10 +29,10 @@ import torch
 import rebar_depth_bench as rdb
 from benchmarks.timing import machine_description, median_seconds, print_markdown
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, MeasureFamily
-from rebar_depth_bench.extended.ground_truth import ConfigSteelTruth, load_steel_truth
-from rebar_depth_bench.extended.predictions import SCALED
-from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.extended.ground_truth import load_steel_truth
+from rebar_depth_bench.extended.measures import SCALED, MeasureFamily
+from rebar_depth_bench.extended.registry import MEASURE_FAMILIES
+from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.protocol import interior
 from rebar_depth_bench.scoring.score import score_view
 from rebar_depth_bench.scoring.truth import config_truth
@@ -94,17 +95,16 @@ def extended_rows(root: str, config: str, submission: SubmissionReader) -> list[
         views.append((truth, submission.read(truth.view_id).ravel()[truth.index].astype(np.float64)))
     seconds = {"gathering a view's truth": median_seconds(lambda: [*map(steel.view, range(len(steel)))], REPEATS)}
     for family in MEASURE_FAMILIES.values():
-        seconds[family.title] = median_seconds(partial(_evaluate_all, family, steel, views), REPEATS // 3)
+        seconds[family.title] = median_seconds(partial(_evaluate_all, family, views), REPEATS // 3)
     seconds["all"] = sum(seconds.values())
     return [(name, f"{1e3 * value / len(views):.1f}") for name, value in seconds.items()]
 
 
-def _evaluate_all(
-    family: MeasureFamily, steel: ConfigSteelTruth, views: list[tuple[SteelTruth, np.ndarray]]
-) -> None:
+def _evaluate_all(family: MeasureFamily, views: list[tuple[SteelTruth, np.ndarray]]) -> None:
     for truth, p_m in views:
-        predictions = [p_m / 1.1 if alignment == SCALED else p_m for alignment in family.alignments]
-        list(family.evaluate(predictions, truth, steel.bars_by_view[truth.view_id]))
+        fresh = replace(truth)  # What predictions share is computed again in each repetition.
+        for alignment in family.alignments:
+            family.evaluate(p_m / 1.1 if alignment == SCALED else p_m, fresh)
 
 
 def peak_megabytes(archive: Path, root: str) -> float:

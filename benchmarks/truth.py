@@ -15,10 +15,11 @@ import numpy as np
 import rebar_depth_bench as rdb
 from benchmarks.timing import print_markdown
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.extended.evaluate import measures_by_alignment, view_samples
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
-from rebar_depth_bench.extended.predictions import NATIVE, ONCE
-from rebar_depth_bench.extended.result import ExtendedView, tabulate_extended
+from rebar_depth_bench.extended.measures import NATIVE, ONCE
+from rebar_depth_bench.extended.reach import pooled
+from rebar_depth_bench.extended.registry import measures_by_alignment, view_samples
+from rebar_depth_bench.extended.result import tabulate_extended
 from rebar_depth_bench.scoring.bootstrap import resample
 
 COLUMNS = ["view_id", "left_depth"]
@@ -45,17 +46,12 @@ def main(root: str, *configs: str) -> None:
         steel = load_steel_truth(folder, folder.config(config))
         depth_m = {row["view_id"]: row["left_depth"] for row in rdb.load(root, config, columns=COLUMNS)}
         truths = [steel.view(index) for index in range(len(steel))]
-        views = [
-            ExtendedView(
-                truth.view_id, view_samples(depth_m[truth.view_id], truth, steel.bars_by_view[truth.view_id], 1.0)
-            )
-            for truth in truths
-        ]
+        views = [view_samples(depth_m[truth.view_id], truth, 1.0) for truth in truths]
         table = tabulate_extended(views, resample(range(len(views))), measures)
         numbers = {**table.numbers[ONCE], **table.numbers[NATIVE]}
         score_rows.append((config, len(views), *(_value(numbers[name].value) for name in (*SCORES, *BAR_SCORES))))
-        pooled = [np.concatenate([view.samples[NATIVE][name] for view in views]) for name in ERROR_SAMPLES]
-        error_rows.append((config, *map(_spread, pooled)))
+        samples = [pooled([view[NATIVE] for view in views], name)[0] for name in ERROR_SAMPLES]
+        error_rows.append((config, *map(_spread, samples)))
     print_markdown(["config", "views", *SCORES, *BAR_SCORES], score_rows)
     print("\nmm or degrees, over everything judged: median / 95th percentile / largest (how many)\n")
     print_markdown(["config", *ERROR_SAMPLES], error_rows)

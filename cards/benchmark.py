@@ -25,10 +25,9 @@ from cards.steel import STEEL_RESULTS, depth_text, range_text
 from cards.templates import render
 from rebar_depth_bench.bar_crossings.definition import crossing_parameters
 from rebar_depth_bench.detections.reading import MAX_ROWS_PER_VIEW
-from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, MeasureFamily
-from rebar_depth_bench.extended.inspection.tolerances import PROFILES
-from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, Measure
-from rebar_depth_bench.extended.predictions import ONCE
+from rebar_depth_bench.extended.inspection import PROFILES
+from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, ONCE, Measure, MeasureFamily
+from rebar_depth_bench.extended.registry import MEASURE_FAMILIES
 from rebar_depth_bench.methods import AnyMethod, MultiViewMethod, own_methods
 from rebar_depth_bench.reporting.crossing_texts import FITS_NOTE, REACH_NOTE
 from rebar_depth_bench.scoring.bootstrap import BLOCK_VIEWS, INTERVALS, MIN_BLOCKS, RESAMPLES

@@ -12,8 +12,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Mapping
-from dataclasses import asdict
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -25,14 +24,14 @@ from outputs import add_outputs, flat_table, number, run_script, write_outputs
 from rebar_depth_bench.console import add_archive, add_data
 from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.extended.crossings.config import config_reaches
 from rebar_depth_bench.extended.ground_truth import has_bar_ids
+from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, score_extended
 from rebar_depth_bench.reporting.crossing_texts import reach_sentence
 from rebar_depth_bench.scoring import bootstrap
 from rebar_depth_bench.scoring.bootstrap import Resampling, interval, resample_views
-from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation, score_evaluation
+from rebar_depth_bench.scoring.columns import METRICS
+from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation
 from rebar_depth_bench.scoring.metrics import mean
-from rebar_depth_bench.scoring.score import mean_single_bar, single_bar_scores
 from rebar_depth_bench.scoring.table import ViewScore
 from rebar_depth_bench.scoring.truth import config_truth
 from rebar_depth_bench.terminal import ProgressBars
@@ -41,6 +40,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MIN_DISTANCE_RATIO = 1.05  # Of the farthest to the nearest view, for a slope.
+ALIGNMENTS = ("native", "scaled")
 ERRORS = ["native_abs_rel", "scaled_abs_rel"]
 VIEW_COLUMNS = ["view_id", "distance_m", "scale", *ERRORS, "single_bar"]
 
@@ -70,7 +70,40 @@ def resampling_of(views: pd.DataFrame) -> Resampling:
     return bootstrap.resample(views["index"].tolist())
 
 
-def view_table(evaluation: Evaluation, config: DatasetConfig, scored: Mapping[str, ViewScore]) -> pd.DataFrame:
+def single_bar_numbers(view: Mapping[str, Mapping[str, float | None]]) -> dict[str, Any]:
+    """Return share and coverage of a view's single-bar interior, and the metrics on it, None without any.
+
+    ``view`` has the extended measures by alignment, none in a config without bar ids.
+    """
+    if not view:
+        return {"share": 0.0, "coverage": None, "native": None, "scaled": None}
+    metrics = {
+        alignment: {name: view[alignment][f"single_bar_{name}"] for name in METRICS} for alignment in ALIGNMENTS
+    }
+    return {
+        "share": view["native"]["single_bar_share"],
+        "coverage": view["native"]["single_bar_coverage"],
+        **{alignment: one if one["abs_rel"] is not None else None for alignment, one in metrics.items()},
+    }
+
+
+def mean_single_bar(views: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
+    """Return the means over one or more views: the share of all, and the others of those that have a value."""
+    means: dict[str, Any] = {
+        name: mean([view[name] for view in views if view[name] is not None]) for name in ("share", "coverage")
+    }
+    for alignment in ALIGNMENTS:
+        known = [view[alignment] for view in views if view[alignment]]
+        means[alignment] = {name: mean([one[name] for one in known]) for name in METRICS} if known else None
+    return means
+
+
+def view_table(
+    evaluation: Evaluation,
+    config: DatasetConfig,
+    scored: Mapping[str, ViewScore],
+    extended: Mapping[str, Mapping[str, Mapping[str, float | None]]],
+) -> pd.DataFrame:
     """Return one row per scored view of a config; s and errors of views without prediction are NaN."""
     truths = config_truth(evaluation.folder, config)
     scores = [scored[view_id] for view_id in truths.view_ids]
@@ -83,7 +116,7 @@ def view_table(evaluation: Evaluation, config: DatasetConfig, scored: Mapping[st
         "scale": np.array([score.scale for score in scores], np.float64),
         "native_abs_rel": [score.native.abs_rel if score.native else math.nan for score in scores],
         "scaled_abs_rel": [score.scaled.abs_rel if score.scaled else math.nan for score in scores],
-        "single_bar": single_bar_scores(truths, evaluation.submission.read, scores),
+        "single_bar": [single_bar_numbers(extended.get(view_id, {})) for view_id in truths.view_ids],
     }
     return pd.DataFrame(columns)
 
@@ -109,7 +142,7 @@ def one_bin(views: pd.DataFrame, low_m: float, high_m: float) -> dict[str, Any]:
         "scale": estimate(scales.median(), medians, blocks),
         "scale_range": (scales.min(), scales.max()) if len(scales) else None,
         **{name: estimate(mean(errors[scored, k].tolist()), draws[k], blocks) for k, name in enumerate(ERRORS)},
-        "single_bar": asdict(mean_single_bar(views["single_bar"].tolist())),
+        "single_bar": mean_single_bar(views["single_bar"].tolist()),
     }
 
 
@@ -166,15 +199,18 @@ def draw_figure(figure: Figure, views: pd.DataFrame, bins: pd.DataFrame) -> None
 def run(options: argparse.Namespace) -> None:
     """Compute slopes, bins and reaches, write the requested files and print them."""
     with ProgressBars() as bars, open_evaluation(options.archive, options.data) as evaluation:
-        scores = {view.view_id: view for view in score_evaluation(evaluation, progress=bars.update).views}
+        families = [MEASURE_FAMILIES[key] for key in ("single_bar", "crossings")]
+        result = score_extended(evaluation, families, progress=bars.update)
+        assert result.extended is not None
+        scores = {view.view_id: view for view in result.views}
+        extended = result.extended.views
         present = {config.name: config for config in evaluation.configs}
         names = dict.fromkeys(options.config or present)
         if names.keys() - present.keys():
             raise InputError(f"{options.archive}: holds {', '.join(present)}, expected --config with some of them")
-        by_config = {name: view_table(evaluation, present[name], scores) for name in names}
-        scales = {view_id: score.scale for view_id, score in scores.items()}
-        with_bars = [present[name] for name in names if has_bar_ids(present[name])]
-        reaches = {one.name: config_reaches(evaluation, one, scales, progress=bars.update) for one in with_bars}
+        by_config = {name: view_table(evaluation, present[name], scores, extended) for name in names}
+        reaches = {name: result.extended.tables[name].reaches for name in names if has_bar_ids(present[name])}
+        measures = result.extended.to_dict()
         provenance = evaluation.provenance().to_dict() | {"intervals": bootstrap.INTERVALS}
     slopes = [scale_slope(name, {name: of_config}) for name, of_config in by_config.items()]
     slopes += [scale_slope("all", by_config)] if len(by_config) > 1 else []
@@ -186,12 +222,15 @@ def run(options: argparse.Namespace) -> None:
         "bins_per_decade": options.bins_per_decade,
         "slopes": slopes,
         "bins": bin_rows,
-        "crossing_reach": {name: one.to_dict() for name, one in reaches.items()},
-        "views": views[VIEW_COLUMNS].assign(single_bar=views["single_bar"].map(asdict)).to_dict("records"),
+        "crossing_reach": {
+            name: {"crossings": measures["crossings"], **measures["tables"][name]["crossing_reach"]}
+            for name in reaches
+        },
+        "views": views[VIEW_COLUMNS].to_dict("records"),
     }
     notes = ["Slope of log s over log distance:", flat_table(slopes).to_string(index=False, na_rep="-")]
-    for name, one in reaches.items():
-        notes += [f"{name}: {reach_sentence(align, of_one[0])}" for align, of_one in one.by_alignment.items()]
+    for name, found in reaches.items():
+        notes += [f"{name}: {reach_sentence(align, of_one[0])}" for align, of_one in found.items()]
     shown = [name for name in table if not name.startswith("single_bar")]
     write_outputs(options, content, table, shown, notes, lambda figure: draw_figure(figure, views, table))
 

@@ -47,7 +47,7 @@ class AxisSegments:
         starts, vectors, along, before, after, lengths, closed = ([] for _ in range(7))
         first = 0
         for bar in bars:
-            points_m = _without_repeated(np.array(bar.axis_m, dtype=np.float64))
+            points_m = without_repeated(np.array(bar.axis_m, dtype=np.float64))
             steps_m = np.diff(points_m, axis=0)
             step_lengths_m = np.linalg.norm(steps_m, axis=1)
             ends = np.cumsum(step_lengths_m)
@@ -86,26 +86,33 @@ class AxisSegments:
         """
         from scipy.spatial import cKDTree  # A quarter of a second to import.
 
-        lengths_m = np.linalg.norm(self.vector_m, axis=1)
-        if not len(lengths_m):
+        count = len(self.start_m)
+        if not count:
             return np.empty((0, 2), np.int64)
-        piece_m = max(_MIN_PIECE_M, float(lengths_m.sum()) / _MAX_PIECES)
-        pieces = np.maximum(np.ceil(lengths_m / piece_m), 1).astype(np.int64)
-        segment = np.repeat(np.arange(len(pieces)), pieces)
-        number = np.arange(len(segment)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-        share = (number + 0.5) / pieces[segment]
-        middles_m = self.start_m[segment] + share[:, None] * self.vector_m[segment]
+        piece_m = max(_MIN_PIECE_M, float(np.linalg.norm(self.vector_m, axis=1).sum()) / _MAX_PIECES)
+        segment, middles_m = pieces(self.start_m, self.vector_m, piece_m)
         reach_m = piece_m + float(self.diameter_m.max()) + max_gap_m
         tree = cKDTree(middles_m)
         if max_pairs is not None and tree.count_neighbors(tree, reach_m) > 2 * max_pairs:
             raise TooManyNeighboursError
         found = segment[tree.query_pairs(reach_m, output_type="ndarray")].reshape(-1, 2)
         found = np.sort(found[found[:, 0] != found[:, 1]], axis=1)
-        keys = np.unique(found[:, 0] * len(pieces) + found[:, 1])
-        return np.column_stack([keys // len(pieces), keys % len(pieces)])
+        keys = np.unique(found[:, 0] * count + found[:, 1])
+        return np.column_stack([keys // count, keys % count])
 
 
-def _without_repeated(points_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, "m 3"]:
+def pieces(
+    start_m: Float64[ndarray, "s 3"], vector_m: Float64[ndarray, "s 3"], max_m: float
+) -> tuple[Int64[ndarray, " p"], Float64[ndarray, "p 3"]]:
+    """Return segments in equal pieces of at most ``max_m``: the segment of each piece, and its middle."""
+    counts = np.maximum(np.ceil(np.linalg.norm(vector_m, axis=1) / max_m), 1).astype(np.int64)
+    segment = np.repeat(np.arange(len(counts)), counts)
+    number = np.arange(len(segment)) - np.repeat(np.cumsum(counts) - counts, counts)
+    share = (number + 0.5) / counts[segment]
+    return segment, start_m[segment] + share[:, None] * vector_m[segment]
+
+
+def without_repeated(points_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, "m 3"]:
     """Return points without those that repeat the point before."""
     if len(points_m) < 2:
         return points_m

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-from dataclasses import replace
 
 from rich.console import Console
 
@@ -20,6 +19,9 @@ from rebar_depth_bench.console import (
 from rebar_depth_bench.diagnosis.diagnose import diagnose
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.extended.evaluate import score_extended
+from rebar_depth_bench.extended.registry import score_extended
+from rebar_depth_bench.output_options import add_output_file, prints_table
+from rebar_depth_bench.outputs import write_output
 from rebar_depth_bench.reporting.extended_tables import extended_csv, print_extended
 from rebar_depth_bench.reporting.html.page import write_report
 from rebar_depth_bench.reporting.html.views import VIEWS_SHOWN
@@ -60,10 +62,8 @@ def run(options: argparse.Namespace) -> None:
         raise InputError(f"--html-views is {options.html_views}, expected 0 or more")
     with open_evaluation(options.archive, options.data, expect_digest=options.expect_digest) as evaluation:
         with ProgressBars() as bars:
-            result = score_evaluation(evaluation, workers=options.workers, progress=bars.update)
-            if options.extended or options.extended_csv:
-                extended = score_extended(result, evaluation, workers=options.workers, progress=bars.update)
-                result = replace(result, extended=extended)
+            scorer = score_extended if options.extended or options.extended_csv else score_evaluation
+            result = scorer(evaluation, workers=options.workers, progress=bars.update)
         names = ", ".join(config.name for config in evaluation.configs)
         print_verified(
             evaluation.folder, f"views of {names} verified when their ground truth was stored in the cache"

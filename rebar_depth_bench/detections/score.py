@@ -20,10 +20,10 @@ from rebar_depth_bench.detections.result import (
     tabulate_detections,
 )
 from rebar_depth_bench.errors import InputError, escape_text
-from rebar_depth_bench.extended.crossings.judged import shown_bars
-from rebar_depth_bench.extended.ground_truth import SceneBars, has_bar_ids, load_steel_truth
+from rebar_depth_bench.extended.ground_truth import has_bar_ids, load_steel_truth
+from rebar_depth_bench.extended.judged import shown_bars
 from rebar_depth_bench.extended.result import CrossingsSource
-from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.geometry.cameras import transform
 from rebar_depth_bench.names import TEST_SPLIT, config_of, split_of
 from rebar_depth_bench.parallel import Progress, map_with_progress, silent
@@ -56,13 +56,13 @@ def score_crossings(
     source = None
     for config in chosen:
         steel = load_steel_truth(folder, config, progress)
-        source = CrossingsSource(steel.crossings_source, steel.crossings_sha256)
+        source = CrossingsSource(steel.crossings.source, steel.crossings.sha256)
 
         def compare(position: int) -> ViewDetections:
             truth = steel.view(position)  # noqa: B023 - used within this iteration only
             rows = rows_by_view.get(truth.view_id, np.empty(0, np.int64))
             seen = detections_of_view(file.detections, rows, truth)
-            return compare_view(seen, truth, steel.bars_by_view[truth.view_id], confidence)  # noqa: B023
+            return compare_view(seen, truth, confidence)
 
         task = f"crossings of {config.name}"
         found = map_with_progress(compare, range(len(steel)), workers, progress, task, len(steel))
@@ -142,11 +142,9 @@ _FAR_M = 1e6
 """Largest coordinate, metres: larger ones are as far from every crossing, and their squares overflow."""
 
 
-def compare_view(
-    detected: SeenDetections, truth: SteelTruth, bars: SceneBars, least: float | None
-) -> ViewDetections:
+def compare_view(detected: SeenDetections, truth: SteelTruth, least: float | None) -> ViewDetections:
     """Return the detections of one view compared with its crossings; ``least`` is the confidence to match."""
-    scene = bars.crossings.crossings
+    scene = truth.bars.crossings.crossings
     all_m = transform(truth.cam_from_world, scene.tie_point_m)
     judged = truth.judged.crossing
     is_judged = np.zeros(len(scene), dtype=bool)
@@ -156,7 +154,7 @@ def compare_view(
     pairs = matched_pairs(chosen.point_m, true_m)
     left_over = np.ones(len(chosen.point_m), dtype=bool)
     left_over[pairs[:, 0]] = False
-    hidden = left_over & _show_bars_without_axis(chosen.point_m, truth, bars)
+    hidden = left_over & _show_bars_without_axis(chosen.point_m, truth)
     no_priority = np.zeros(len(left_over))
     ignored = hidden | excused(chosen.point_m, left_over & ~hidden, all_m, is_judged, no_priority)
     normal = scene.normal[judged] @ truth.cam_from_world[:3, :3].T
@@ -165,7 +163,7 @@ def compare_view(
     counts, correct = {}, {}
     for limit in AVERAGE_PRECISION_MM:
         matched = greedy_matches(detected.point_m, detected.confidence, true_m, limit / 1000)
-        hidden = ~matched & _show_bars_without_axis(detected.point_m, truth, bars)
+        hidden = ~matched & _show_bars_without_axis(detected.point_m, truth)
         others = excused(detected.point_m, ~matched & ~hidden, all_m, is_judged, detected.confidence)
         counts[limit], correct[limit] = ~(hidden | others), matched
     return ViewDetections(
@@ -184,12 +182,10 @@ def compare_view(
     )
 
 
-def _show_bars_without_axis(
-    point_m: Float64[ndarray, "n 3"], truth: SteelTruth, bars: SceneBars
-) -> Bool[ndarray, " n"]:
+def _show_bars_without_axis(point_m: Float64[ndarray, "n 3"], truth: SteelTruth) -> Bool[ndarray, " n"]:
     """Return which points project onto a pixel of a bar whose axis is not known."""
     shown = shown_bars(truth, point_m)
-    return np.asarray((shown > 0) & np.isnan(bars.diameter_m[shown]))
+    return np.asarray((shown > 0) & np.isnan(truth.bars.diameter_m[shown]))
 
 
 # Matching of the detections of one view with its judged crossings. Frame: the left camera's, metres.

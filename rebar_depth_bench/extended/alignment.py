@@ -12,8 +12,8 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from rebar_depth_bench.extended.measures import Measure, Samples, finite_sample
-from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.extended.measures import ONCE, Measure, MeasureFamily, Samples, finite_sample
+from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.columns import METRICS
 from rebar_depth_bench.scoring.metrics import (
     depth_metrics,
@@ -56,78 +56,52 @@ def alignment_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples
 
     ``p_m`` is the native planar depth on ``truth.index`` in metres, NaN where there is no prediction. Each sample
     has one value, or none where the view has no prediction or the number overflows: ``scale`` (the median scale
-    s) and its logarithm, ``scale_explains`` (the share of AbsRel that s removes), ``log_scaled_*`` (metrics after
-    the least-squares scale in log depth), ``shifted_*`` (metrics after least-squares scale and shift),
-    ``shift_cm`` and ``silog``.
+    s) and its logarithm, ``scale_explains`` (the share of AbsRel that s removes, where AbsRel is above 0),
+    ``log_scaled_*`` (metrics after the least-squares scale in log depth), ``shifted_*`` (metrics after
+    least-squares scale and shift), ``shift_cm`` and ``silog``.
     """
     pixels = truth.interior & is_valid_prediction(p_m)
     p, z = p_m[pixels], truth.depth_m[pixels].astype(np.float64)
-    samples: dict[str, float] = {}
-    if len(p):
-        with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
-            samples = _scale_numbers(p, z) | _log_numbers(p, z) | _shift_numbers(p, z)
-    return {name: finite_sample(samples.get(name)) for name in _SAMPLE_NAMES}
-
-
-def _scale_numbers(p: Float64[ndarray, " n"], z: Float64[ndarray, " n"]) -> dict[str, float]:
-    """Return s, log s and the share of AbsRel that s removes; the last only where AbsRel is above 0."""
-    s = median_scale(p, median(z))
-    native, scaled = depth_metrics(p, z).abs_rel, depth_metrics(p, z, s).abs_rel
-    numbers = {"scale": s, "log_of_scale": math.log(s) if 0 < s < math.inf else math.nan}
-    if native > 0:
-        numbers["scale_explains"] = 1 - scaled / native
-    return numbers
-
-
-def _log_numbers(p: Float64[ndarray, " n"], z: Float64[ndarray, " n"]) -> dict[str, float]:
-    """Return SILog and the metrics after the least-squares scale in log depth."""
-    metrics = depth_metrics(p, z, log_scale(p, z))
-    numbers = {f"log_scaled_{name}": getattr(metrics, name) for name in METRICS}
-    return {"silog": scale_invariant_log(p, z), **numbers}
-
-
-def _shift_numbers(p: Float64[ndarray, " n"], z: Float64[ndarray, " n"]) -> dict[str, float]:
-    """Return the shift b and the metrics after least-squares scale and shift."""
-    a, b_m = scale_and_shift(p, z)
-    metrics = depth_metrics(a * p + b_m, z)
-    return {"shift_cm": 100 * b_m} | {f"shifted_{name}": getattr(metrics, name) for name in METRICS}
-
-
-_SAMPLE_NAMES = (
-    *("scale", "log_of_scale", "scale_explains", "silog", "shift_cm"),
-    *(f"{alignment}_{name}" for alignment in ("log_scaled", "shifted") for name in METRICS),
-)
-"""Names of all samples of a view."""
+    if not len(p):
+        return {}
+    with np.errstate(over="ignore", invalid="ignore", divide="ignore"):
+        s = median_scale(p, median(z))
+        a, b_m = scale_and_shift(p, z)
+        native, scaled = depth_metrics(p, z).abs_rel, depth_metrics(p, z, s).abs_rel
+        aligned = {"log_scaled": depth_metrics(p, z, log_scale(p, z)), "shifted": depth_metrics(a * p + b_m, z)}
+        numbers = {
+            "scale": s,
+            "log_of_scale": math.log(s) if 0 < s < math.inf else None,
+            "scale_explains": 1 - scaled / native if native > 0 else None,
+            "shift_cm": 100 * b_m,
+            "silog": scale_invariant_log(p, z),
+            **{f"{key}_{name}": getattr(of_key, name) for key, of_key in aligned.items() for name in METRICS},
+        }
+    return {name: finite_sample(value) for name, value in numbers.items()}
 
 
 def _aligned_measures(prefix: str, title: str, alignment: str) -> list[Measure]:
     """Return the measures of the metrics after one alignment."""
-    names = [(f"{prefix}_{name}", info.title, info.unit) for name, info in METRICS.items()]
     return [
-        Measure(name, name, "mean", f"{head}, {title}", unit, "", f"{head} after {alignment}, an oracle per view")
-        for name, head, unit in names
-    ]
+        Measure(
+            f"{prefix}_{name}", f"{info.title}, {title}", info.unit, "",
+            f"{info.title} after {alignment}, an oracle per view",
+        )
+        for name, info in METRICS.items()
+    ]  # fmt: skip
 
 
-MEASURES: tuple[Measure, ...] = (
-    Measure("scale_mean", "scale", "mean", "Scale s, mean", "", "", "mean over views of s = median(z)/median(p)"),
+MEASURES = (
+    Measure("scale_mean", "Scale s, mean", "", "", "mean over views of s = median(z)/median(p)", "scale"),
     Measure(
-        "scale_spread",
-        "log_of_scale",
-        "std",
-        "Scale s, spread",
-        "%",
-        "",
+        "scale_spread", "Scale s, spread", "%", "",
         "standard deviation of log s over views: a constant s can be corrected on site, a varying one cannot",
+        "log_of_scale", "std",
     ),
     Measure(
-        "scale_explains",
-        "scale_explains",
-        "median",
-        "Native error that scale explains",
-        "%",
-        "",
+        "scale_explains", "Native error that scale explains", "%", "",
         "1 - scaled AbsRel / native AbsRel, median over views; negative where the median scale makes it worse",
+        statistic="median",
     ),
     *_aligned_measures(
         "log_scaled", "log scale", "the least-squares scale in log depth, exp(mean(log z - log p))"
@@ -135,15 +109,13 @@ MEASURES: tuple[Measure, ...] = (
     *_aligned_measures(
         "shifted", "scale and shift", "least-squares scale and shift in depth, min sum (a p + b - z)^2"
     ),
-    Measure("shift_cm", "shift_cm", "mean", "Shift b", "cm", "", "mean over views of the least-squares shift b"),
+    Measure("shift_cm", "Shift b", "cm", "", "mean over views of the least-squares shift b"),
     Measure(
-        "silog",
-        "silog",
-        "mean",
-        "Scale-invariant log error",
-        "%",
-        "",
+        "silog", "Scale-invariant log error", "%", "",
         "standard deviation of log p - log z over a view's pixels",
     ),
-)
+)  # fmt: skip
 """Alignment measures in table order."""
+
+_NOTE = "own alignment, see the row"
+FAMILIES = (MeasureFamily("alignment", "Scale against shape", 1, MEASURES, alignment_samples, (ONCE,), _NOTE),)

@@ -33,8 +33,8 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt32
 from numpy import ndarray
 
-from rebar_depth_bench.extended.measures import Measure, Samples
-from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.extended.measures import ONCE, Measure, MeasureFamily, Samples, share_sample
+from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
 
 THRESHOLDS_PERCENT = (1, 2, 5, 10, 20)
@@ -62,20 +62,22 @@ def boundary_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
 
     Each of ``boundary_f1``, ``boundary_precision``, ``boundary_recall`` (means over the t that have a true
     contour), ``boundary_f1_<t>pct`` and ``boundary_missing`` (share of pairs with a missing prediction) has one
-    value from 0 to 1. It is empty where the view has no true contour (for ``boundary_missing``: no pair).
+    value from 0 to 1. There is none where the view has no true contour (for ``boundary_missing``: no pair).
     """
     first, second = neighbour_pairs(truth.index, truth.bar_id > 0, truth.height, truth.width)
     counts = contour_counts(p_m, truth.depth_m.astype(np.float64), first, second)
     has_contour = counts.true > 0
-    f1 = 2.0 * counts.correct / np.maximum(counts.predicted + counts.true, 1)
-    precision = counts.correct / np.maximum(counts.predicted, 1)  # 0 where nothing is predicted
-    recall = counts.correct / np.maximum(counts.true, 1)
+    both = counts.predicted + counts.true
+    shares = {
+        "f1": (2.0 * counts.correct / np.maximum(both, 1))[has_contour],
+        "precision": (counts.correct / np.maximum(counts.predicted, 1))[has_contour],  # 0 for nothing predicted
+        "recall": (counts.correct / np.maximum(counts.true, 1))[has_contour],
+    }
+    thresholds = np.array(THRESHOLDS_PERCENT)[has_contour].tolist()
     return {
-        "boundary_f1": _mean(f1[has_contour]),
-        "boundary_precision": _mean(precision[has_contour]),
-        "boundary_recall": _mean(recall[has_contour]),
-        **{f"boundary_f1_{t}pct": f1[i : i + 1][has_contour[i : i + 1]] for i, t in enumerate(THRESHOLDS_PERCENT)},
-        "boundary_missing": np.array([counts.missing / counts.pairs] if counts.pairs else [], np.float64),
+        **{f"boundary_{name}": values.mean(keepdims=True) for name, values in shares.items() if len(values)},
+        **{f"boundary_f1_{t}pct": shares["f1"][i : i + 1] for i, t in enumerate(thresholds)},
+        "boundary_missing": share_sample(counts.missing, counts.pairs),
     }
 
 
@@ -88,9 +90,8 @@ def neighbour_pairs(
     the left or upper pixel first. The last pixel of a row and the first of the next row are not adjacent.
     """
     left = np.flatnonzero((np.diff(index) == 1) & (index[:-1] % width != width - 1))
-    position = np.zeros(
-        (height + 1) * width, np.int32
-    )  # 1 + position in index, 0: not in it; one empty row below the frame
+    # 1 + position in index, 0: not in it; one empty row below the frame.
+    position = np.zeros((height + 1) * width, np.int32)
     position[index] = np.arange(1, len(index) + 1, dtype=np.int32)
     position_below = position[index + np.uint32(width)]
     upper = np.flatnonzero(position_below)
@@ -113,19 +114,20 @@ def contour_counts(
     z_step, z_second_nearer = _depth_step(z_m[first], z_m[second])
     p_valid_m = np.where(valid, p_m, np.nan)
     p_step, p_second_nearer = _depth_step(p_valid_m[first], p_valid_m[second])
+    # Most pairs lie on one surface: skip them early.
     lowest = 1.0 + THRESHOLDS_PERCENT[0] / 100
-    candidates = np.flatnonzero(
-        (z_step > lowest) | (p_step > lowest)
-    )  # Most pairs lie on one surface: skip them early.
+    candidates = np.flatnonzero((z_step > lowest) | (p_step > lowest))
     z_step, p_step = z_step[candidates], p_step[candidates]
     same_side = z_second_nearer[candidates] == p_second_nearer[candidates]
-    true, predicted, correct = [], [], []
-    for percent in THRESHOLDS_PERCENT:
-        z_contour, p_contour = z_step > 1.0 + percent / 100, p_step > 1.0 + percent / 100
-        true.append(np.count_nonzero(z_contour))
-        predicted.append(np.count_nonzero(p_contour) + missing)
-        correct.append(np.count_nonzero(z_contour & p_contour & same_side))
-    return ContourCounts(len(first), missing, np.array(true), np.array(predicted), np.array(correct))
+    steps = 1.0 + np.array(THRESHOLDS_PERCENT)[:, None] / 100
+    z_contour, p_contour = z_step > steps, p_step > steps
+    return ContourCounts(
+        pairs=len(first),
+        missing=missing,
+        true=np.count_nonzero(z_contour, axis=1),
+        predicted=np.count_nonzero(p_contour, axis=1) + missing,
+        correct=np.count_nonzero(z_contour & p_contour & same_side, axis=1),
+    )
 
 
 def _depth_step(
@@ -136,63 +138,27 @@ def _depth_step(
         return np.maximum(first_m, second_m) / np.minimum(first_m, second_m), second_m < first_m
 
 
-def _mean(values: Float64[ndarray, " n"]) -> Float64[ndarray, " one"]:
-    """Return a sample that holds the mean of ``values``, empty for no values."""
-    return np.array([values.mean()] if len(values) else [], np.float64)
-
-
 _PAIRS = "neighbour pixel pairs at the steel, pooled over directions; contour: max/min > 1 + t, same side in front"
 _MISSING = "a pair with a missing prediction counts as a wrong contour"
 _MEAN = f"mean over t = {', '.join(map(str, THRESHOLDS_PERCENT))} % ({_PAIRS}; {_MISSING})"
 
-MEASURES: tuple[Measure, ...] = (
-    Measure(
-        "boundary_f1",
-        "boundary_f1",
-        "mean",
-        "Boundary F1",
-        "%",
-        "higher",
-        f"2 right / (predicted + true), {_MEAN}",
-    ),
-    Measure(
-        "boundary_precision",
-        "boundary_precision",
-        "mean",
-        "Boundary precision",
-        "%",
-        "higher",
-        f"right / predicted contours, {_MEAN}",
-    ),
-    Measure(
-        "boundary_recall",
-        "boundary_recall",
-        "mean",
-        "Boundary recall",
-        "%",
-        "higher",
-        f"right / true contours, {_MEAN}",
-    ),
+MEASURES = (
+    Measure("boundary_f1", "Boundary F1", "%", "higher", f"2 right / (predicted + true), {_MEAN}"),
+    Measure("boundary_precision", "Boundary precision", "%", "higher", f"right / predicted contours, {_MEAN}"),
+    Measure("boundary_recall", "Boundary recall", "%", "higher", f"right / true contours, {_MEAN}"),
     *(
         Measure(
-            f"boundary_f1_{t}pct",
-            f"boundary_f1_{t}pct",
-            "mean",
-            f"Boundary F1, steps over {t} %",
-            "%",
-            "higher",
+            f"boundary_f1_{t}pct", f"Boundary F1, steps over {t} %", "%", "higher",
             f"2 right / (predicted + true) at t = {t} % ({_PAIRS}; {_MISSING})",
         )
         for t in THRESHOLDS_PERCENT
     ),
     Measure(
-        "boundary_missing",
-        "boundary_missing",
-        "mean",
-        "Pairs without prediction",
-        "%",
-        "lower",
+        "boundary_missing", "Pairs without prediction", "%", "lower",
         "share of neighbour pixel pairs at the steel of which a prediction is missing",
     ),
-)
+)  # fmt: skip
 """Boundary measures in table order."""
+
+_NOTE = "independent of scale"
+FAMILIES = (MeasureFamily("boundary", "Boundary", 4, MEASURES, boundary_samples, (ONCE,), _NOTE),)

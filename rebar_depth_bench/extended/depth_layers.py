@@ -8,11 +8,11 @@ that much nearer or farther is one. These measures are defined by this project.
 from __future__ import annotations
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt16, UInt32
+from jaxtyping import Float32, Float64, UInt16, UInt32
 from numpy import ndarray
 
-from rebar_depth_bench.extended.measures import Measure, Samples
-from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.extended.measures import Measure, MeasureFamily, Samples, share_sample
+from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
 
 DIRECTIONS = 16
@@ -50,9 +50,8 @@ def other_layers(
     z_m, own = padded_m[centre], padded_bars[centre]
     front_m, behind_m = np.full(len(index), -np.inf, np.float32), np.full(len(index), np.inf, np.float32)
     for angle in np.arange(DIRECTIONS) * (2 * np.pi / DIRECTIONS):
-        between_m = np.zeros(
-            len(index), np.float32
-        )  # the farthest surface so far in this direction that is not this bar
+        # The farthest surface so far in this direction that is not this bar.
+        between_m = np.zeros(len(index), np.float32)
         for radius in RADII_PX:
             neighbour = centre + round(radius * np.sin(angle)) * width + round(radius * np.cos(angle))
             seen_m, seen_bars = padded_m[neighbour], padded_bars[neighbour]
@@ -62,7 +61,8 @@ def other_layers(
             np.fmax(front_m, np.where(is_layer & (seen_m < z_m - gap_m), seen_m, -np.inf), out=front_m)
             far_m = np.where(seen_m > 0, seen_m, np.inf)
             np.maximum(between_m, np.where(is_other, far_m, 0), out=between_m)
-    return _nan_if_infinite(front_m), _nan_if_infinite(behind_m)
+    front_m[np.isinf(front_m)], behind_m[np.isinf(behind_m)] = np.nan, np.nan
+    return front_m, behind_m
 
 
 def layer_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
@@ -87,62 +87,34 @@ def layer_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
     swallowed = has_behind & (missing | (predicted_m > (z_m + behind_m) / 2))
     pulled = has_front & (missing | (predicted_m < (z_m + front_m) / 2))
     in_sight = has_front | has_behind
+    count = np.count_nonzero
     return {
-        "layer_confusion": _share(swallowed | pulled, in_sight),
-        "layer_swallowed": _share(swallowed, has_behind),
-        "layer_pulled_forward": _share(pulled, has_front),
-        "layers_in_sight": _share(in_sight, np.ones_like(in_sight)),
+        "layer_confusion": share_sample(count(swallowed | pulled), count(in_sight)),
+        "layer_swallowed": share_sample(count(swallowed), count(has_behind)),
+        "layer_pulled_forward": share_sample(count(pulled), count(has_front)),
+        "layers_in_sight": share_sample(count(in_sight), len(in_sight)),
     }
 
 
-def _share(hit: Bool[ndarray, " n"], of: Bool[ndarray, " n"]) -> Float64[ndarray, " one"]:
-    """Return a sample that holds the share of ``of`` pixels that are ``hit``, empty for no such pixel."""
-    total = np.count_nonzero(of)
-    return np.array([np.count_nonzero(hit) / total] if total else [], np.float64)
-
-
-def _nan_if_infinite(values_m: Float32[ndarray, " n"]) -> Float32[ndarray, " n"]:
-    """Return the values with infinities replaced by NaN."""
-    return np.where(np.isinf(values_m), np.float32(np.nan), values_m)
-
-
-MEASURES: tuple[Measure, ...] = (
+MEASURES = (
     Measure(
-        "layer_confusion",
-        "layer_confusion",
-        "mean",
-        "Layer confusion",
-        "%",
-        "lower",
+        "layer_confusion", "Layer confusion", "%", "lower",
         "share of interior pixels with another layer in sight that are predicted nearer to it than to their own, "
         "|p - other| < |p - z|; missing predictions count as confused",
     ),
     Measure(
-        "layer_swallowed",
-        "layer_swallowed",
-        "mean",
-        "Swallowed by the layer behind",
-        "%",
-        "lower",
+        "layer_swallowed", "Swallowed by the layer behind", "%", "lower",
         "share of interior pixels with a layer behind in sight that are predicted nearer to it or missing",
     ),
     Measure(
-        "layer_pulled_forward",
-        "layer_pulled_forward",
-        "mean",
-        "Pulled to the layer in front",
-        "%",
-        "lower",
+        "layer_pulled_forward", "Pulled to the layer in front", "%", "lower",
         "share of interior pixels with a layer in front in sight that are predicted nearer to it or missing",
     ),
     Measure(
-        "layers_in_sight",
-        "layers_in_sight",
-        "mean",
-        "Pixels with another layer in sight",
-        "%",
-        "",
+        "layers_in_sight", "Pixels with another layer in sight", "%", "",
         "share of interior pixels within 24 px of steel more than a diameter nearer or farther, by the truth",
     ),
-)
+)  # fmt: skip
 """Layer measures in table order."""
+
+FAMILIES = (MeasureFamily("layers", "Layers", 5, MEASURES, layer_samples),)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, replace
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -13,19 +12,17 @@ from numpy import ndarray
 
 from rebar_depth_bench.bar_crossings.definition import CROSSINGS_PROTOCOL
 from rebar_depth_bench.bar_crossings.table import FolderCrossings, folder_crossings
-from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars, with_axis
+from rebar_depth_bench.data.bars import BARS_FILE, read_bars
 from rebar_depth_bench.data.cache import ArrayCache, CacheContent, ViewArrays, open_cache
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder
 from rebar_depth_bench.data.rows import EyeTruth
 from rebar_depth_bench.errors import DatasetError
-from rebar_depth_bench.extended.crossings.judged import SAMPLED_PIXELS, judged_crossings
-from rebar_depth_bench.extended.crossings.scene import SceneCrossings, no_crossings, prepared_crossings
+from rebar_depth_bench.extended.axes import assign_segments
 from rebar_depth_bench.extended.depth_layers import other_layers
-from rebar_depth_bench.extended.inspection.as_built import BarAxes, bar_axes
-from rebar_depth_bench.extended.inspection.segments import CageTruth, assign_segments, cage_truth
+from rebar_depth_bench.extended.judged import SAMPLED_PIXELS, judged_crossings
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL
-from rebar_depth_bench.extended.steel_truth import JudgedCrossings, SteelTruth
-from rebar_depth_bench.geometry.cameras import Camera, pixel_rays
+from rebar_depth_bench.extended.steel import JudgedCrossings, SceneBars, SteelTruth
+from rebar_depth_bench.geometry.cameras import pixel_rays
 from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.scoring.protocol import single_bar_pixels
@@ -53,17 +50,9 @@ Lens = tuple[float, ...]
 _LENS_NUMBERS, _CAMERA_NUMBERS = 9 + 5, 9 + 5 + 16
 
 
-@dataclass(frozen=True, eq=False)
-class SceneBars:
-    """Bars of a scene: their segments, nominal diameter by bar id (NaN for ids without a bar), and crossings.
-
-    ``axes`` has the axes of the bars with a nominal axis, by bar id.
-    """
-
-    cage: CageTruth
-    diameter_m: Float64[ndarray, " ids"]
-    axes: Mapping[int, BarAxes]
-    crossings: SceneCrossings
+def has_bar_ids(config: DatasetConfig) -> bool:
+    """Return whether a config has the masks and bar ids that all extended measures need."""
+    return config.absent_columns.isdisjoint(("left_mask", "left_bars"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,18 +60,15 @@ class ConfigSteelTruth:
     """Steel ground truth of all views of a config that have scored pixels.
 
     ``bars_by_view`` holds the bars of each view's scene. ``rays`` holds the rays of each distinct lens (K and
-    distortion), which views share. ``crossings_source`` and ``crossings_sha256`` are the file that the crossings
-    come from and its digest.
+    distortion), which views share. ``crossings`` are those of the folder, with the file that they come from.
     """
 
-    height: int
-    width: int
+    config: DatasetConfig
     bars_by_view: Mapping[str, SceneBars]
     rays: Mapping[Lens, Rays]
+    crossings: FolderCrossings
     cache: ArrayCache
     judged_cache: ArrayCache
-    crossings_source: str
-    crossings_sha256: str
 
     def __len__(self) -> int:
         """Return the number of views."""
@@ -95,35 +81,14 @@ class ConfigSteelTruth:
 
     def view(self, position: int) -> SteelTruth:
         """Return the view at ``position`` in protocol order."""
-        truth = _steel_truth(self.cache.view(position), (self.height, self.width), self.rays)
-        return replace(truth, judged=self.judged(position))
+        view, judged = self.cache.view(position), self.judged(position)
+        return _steel_truth(view, judged, self.config, self.bars_by_view, self.rays)
 
     def judged(self, position: int) -> JudgedCrossings:
         """Return the judged crossings of the view at ``position``."""
         view = self.judged_cache.view(position)
         crossing = view.arrays["crossing"][:: 2 * SAMPLED_PIXELS].astype(np.int64)
         return JudgedCrossings(crossing, view.arrays["pixel"].astype(np.int64).reshape(-1, 2, SAMPLED_PIXELS))
-
-
-def _steel_truth(view: ViewArrays, grid: tuple[int, int], rays: Mapping[Lens, Rays]) -> SteelTruth:
-    """Return a cached view without its judged crossings; ``grid`` is (height, width)."""
-    lens, pose = view.numbers[:_LENS_NUMBERS], view.numbers[_LENS_NUMBERS:]
-    return SteelTruth(
-        view_id=view.view_id,
-        height=grid[0],
-        width=grid[1],
-        K=np.array(lens[:9]).reshape(3, 3),
-        cam_from_world=np.array(pose).reshape(4, 4),
-        rays=rays[lens][view.arrays["index"]],
-        distortion=np.array(lens[9:]),
-        judged=JudgedCrossings.none(),
-        **view.arrays,
-    )
-
-
-def has_bar_ids(config: DatasetConfig) -> bool:
-    """Return whether a config has the masks and bar ids that all extended measures need."""
-    return config.absent_columns.isdisjoint(("left_mask", "left_bars"))
 
 
 def steel_truth(evaluation: Evaluation, config: DatasetConfig, progress: Progress = silent) -> ConfigSteelTruth:
@@ -141,8 +106,13 @@ def load_steel_truth(
     path = folder.verified_file(BARS_FILE)
     bars = read_bars(path)
     found = folder_crossings(folder, bars)
-    bars_by_view = _bars_by_view(path, config, bars, found)
-    height, width = config.grid
+    scenes = {}
+    for scene in config.scenes:
+        of_scene = bars.get(scene.name, None if config.imported is None else ())
+        if of_scene is None:
+            raise DatasetError(f"{path}: has no bars for scene {scene.name!r} of config {config.name}")
+        scenes[scene.name] = SceneBars.of(of_scene, found.by_scene.get(scene.name))
+    bars_by_view = {view_id: scenes[scene] for view_id, scene in config.scene_by_view.items()}
     scored_px = scored_counts(config)
 
     def is_sound(view: ViewArrays) -> bool:
@@ -160,7 +130,20 @@ def load_steel_truth(
         is_sound=is_sound,
     )
     cache = open_cache(content, progress)
-    rays = {lens: _rays(lens, height, width) for lens in {numbers[:_LENS_NUMBERS] for numbers in cache.numbers}}
+    rays = {lens: _rays(lens, config) for lens in {numbers[:_LENS_NUMBERS] for numbers in cache.numbers}}
+
+    def judged_arrays(view_ids: Collection[str] | None) -> Iterator[ViewArrays]:
+        for position, view_id in enumerate(cache.view_ids):
+            if view_ids is None or view_id in view_ids:
+                truth = _steel_truth(cache.view(position), JudgedCrossings.none(), config, bars_by_view, rays)
+                judged = judged_crossings(truth)
+                arrays = {
+                    "crossing": np.repeat(judged.crossing, 2 * SAMPLED_PIXELS),
+                    "pixel": judged.pixels.ravel(),
+                }
+                yield ViewArrays(view_id, arrays, ())
+
+    # An entry of its own: its arrays have other lengths, and it also depends on the definition of crossings.
     protocol = f"{EXTENDED_PROTOCOL} {CROSSINGS_PROTOCOL}"
     judged = CacheContent(
         source=config.root,
@@ -168,49 +151,41 @@ def load_steel_truth(
         inputs=cache_inputs(config, protocol, f"{folder.files[BARS_FILE]} {found.sha256}"),
         dtypes={"crossing": np.uint32, "pixel": np.uint32},
         view_ids=tuple(scored_px),
-        extract=lambda view_ids: _judged_arrays(cache, config, rays, bars_by_view, view_ids),
+        extract=judged_arrays,
         is_sound=lambda view: len(view.arrays["pixel"]) % (2 * SAMPLED_PIXELS) == 0,
     )
-    return ConfigSteelTruth(
-        height, width, bars_by_view, rays, cache, open_cache(judged, progress), found.source, found.sha256
+    return ConfigSteelTruth(config, bars_by_view, rays, found, cache, open_cache(judged, progress))
+
+
+def _steel_truth(
+    view: ViewArrays,
+    judged: JudgedCrossings,
+    config: DatasetConfig,
+    bars_by_view: Mapping[str, SceneBars],
+    rays: Mapping[Lens, Rays],
+) -> SteelTruth:
+    """Return the ground truth of a cached view."""
+    lens, pose = view.numbers[:_LENS_NUMBERS], view.numbers[_LENS_NUMBERS:]
+    height, width = config.grid
+    return SteelTruth(
+        view_id=view.view_id,
+        height=height,
+        width=width,
+        K=np.array(lens[:9]).reshape(3, 3),
+        cam_from_world=np.array(pose).reshape(4, 4),
+        rays=rays[lens][view.arrays["index"]],
+        bars=bars_by_view[view.view_id],
+        distortion=np.array(lens[9:]),
+        judged=judged,
+        **view.arrays,
     )
 
 
-def _bars_by_view(
-    path: Path, config: DatasetConfig, bars_by_scene: Mapping[str, tuple[Bar, ...]], found: FolderCrossings
-) -> dict[str, SceneBars]:
-    """Return the bars of each view's scene, by view id."""
-    scenes = {}
-    for scene in config.scenes:
-        bars = bars_by_scene.get(scene.name, None if config.imported is None else ())
-        if bars is None:
-            raise DatasetError(f"{path}: has no bars for scene {scene.name!r} of config {config.name}")
-        # NaN for bars without a fitted axis, and for ids that images show and the table lacks.
-        diameter_m = np.full(np.iinfo(np.uint16).max + 1, np.nan)
-        measured = with_axis(bars)
-        diameter_m[[bar.bar_id for bar in measured]] = [bar.diameter_m for bar in measured]
-        cage, crossings = cage_truth(bars), found.by_scene.get(scene.name)
-        prepared = no_crossings() if crossings is None else prepared_crossings(crossings, bars, cage)
-        scenes[scene.name] = SceneBars(cage, diameter_m, bar_axes(bars), prepared)
-    return {view_id: scenes[scene] for view_id, scene in config.scene_by_view.items()}
-
-
-def _judged_arrays(
-    cache: ArrayCache,
-    config: DatasetConfig,
-    rays: Mapping[Lens, Rays],
-    bars_by_view: Mapping[str, SceneBars],
-    view_ids: Collection[str] | None,
-) -> Iterator[ViewArrays]:
-    """Yield the judged crossings of some views, or all: their sampled pixels, each with its crossing's index."""
-    for position, view_id in enumerate(cache.view_ids):
-        if view_ids is not None and view_id not in view_ids:
-            continue
-        truth = _steel_truth(cache.view(position), config.grid, rays)
-        judged = judged_crossings(truth, bars_by_view[truth.view_id].crossings)
-        pixel = judged.pixels.ravel()
-        arrays = {"crossing": np.repeat(judged.crossing, 2 * SAMPLED_PIXELS), "pixel": pixel}
-        yield ViewArrays(truth.view_id, arrays, ())
+def _rays(lens: Lens, config: DatasetConfig) -> Rays:
+    """Return x/z and y/z of every pixel's ray, row by row, lens distortion undone."""
+    height, width = config.grid
+    rays = pixel_rays(np.array(lens[:9]).reshape(3, 3), width, height, np.array(lens[9:]))
+    return np.ascontiguousarray(rays[..., :2].reshape(-1, 2))
 
 
 def _view_arrays(
@@ -221,11 +196,12 @@ def _view_arrays(
     for view_id, left, scored in verified_views(config, view_ids):
         if not len(scored):
             continue
-        lens = _lens(left.camera)
+        camera = left.camera
+        lens = (*camera.K.ravel().tolist(), *camera.distortion.tolist())
         if lens not in rays:
-            rays[lens] = _rays(lens, *left.depth_m.shape)
+            rays[lens] = _rays(lens, config)
         arrays = _steel_arrays(left, scored, rays[lens], bars_by_view[view_id])
-        yield ViewArrays(view_id, arrays, (*lens, *left.camera.cam_from_world.ravel().tolist()))
+        yield ViewArrays(view_id, arrays, (*lens, *camera.cam_from_world.ravel().tolist()))
 
 
 def _steel_arrays(left: EyeTruth, scored: ndarray, rays: Rays, scene: SceneBars) -> dict[str, ndarray]:
@@ -241,25 +217,27 @@ def _steel_arrays(left: EyeTruth, scored: ndarray, rays: Rays, scene: SceneBars)
     interior = np.zeros(depth_m.size, dtype=bool)
     interior[scored] = True
     interior = interior[index]
-    arrays: dict[str, ndarray] = {
+
+    def spread(values: ndarray, elsewhere: float) -> ndarray:
+        """Return values of scored pixels on ``index``, with another one beside them."""
+        spread = np.full(len(index), elsewhere, values.dtype)
+        spread[interior] = values
+        return spread
+
+    z_m, own = depth_m.ravel()[scored], bars.ravel()[scored]
+    camera_m, pose = np.column_stack([z_m[:, None] * rays[scored], z_m]), left.camera.cam_from_world
+    run = assign_segments((camera_m - pose[:3, 3]) @ pose[:3, :3], own, scene.cage)
+    front_m, behind_m = other_layers(depth_m, bars, scored, scene.diameter_m[own].astype(np.float32))
+    return {
         "index": index,
         "depth_m": depth_m.ravel()[index],
         "bar_id": bars.ravel()[index],
         "interior": interior,
-        "single_bar": np.zeros(len(index), dtype=bool),
-        "run": np.full(len(index), -1, dtype=np.int16),
-        "front_m": np.full(len(index), np.nan, dtype=np.float32),
-        "behind_m": np.full(len(index), np.nan, dtype=np.float32),
+        "single_bar": spread(single_bar_pixels(bars, scored), False),
+        "run": spread(run, -1),
+        "front_m": spread(front_m, np.nan),
+        "behind_m": spread(behind_m, np.nan),
     }
-    arrays["single_bar"][interior] = single_bar_pixels(bars, scored)
-    own, z_m = arrays["bar_id"][interior], arrays["depth_m"][interior]
-    camera_m = np.column_stack([z_m[:, None] * rays[scored], z_m])
-    pose = left.camera.cam_from_world
-    arrays["run"][interior] = assign_segments((camera_m - pose[:3, 3]) @ pose[:3, :3], own, scene.cage)
-    gap_m = scene.diameter_m[own].astype(np.float32)
-    front_m, behind_m = other_layers(depth_m, bars, scored, gap_m)
-    arrays["front_m"][interior], arrays["behind_m"][interior] = front_m, behind_m
-    return arrays
 
 
 def dilate_mask(mask: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
@@ -271,13 +249,3 @@ def dilate_mask(mask: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
     grown[:, 1:] |= rows[:, :-1]
     grown[:, :-1] |= rows[:, 1:]
     return grown
-
-
-def _lens(camera: Camera) -> Lens:
-    return (*camera.K.ravel().tolist(), *camera.distortion.tolist())
-
-
-def _rays(lens: Lens, height: int, width: int) -> Rays:
-    """Return x/z and y/z of every pixel's ray, row by row, lens distortion undone."""
-    rays = pixel_rays(np.array(lens[:9]).reshape(3, 3), width, height, np.array(lens[9:]))
-    return np.ascontiguousarray(rays[..., :2].reshape(-1, 2))

@@ -1,6 +1,7 @@
 """Extended measure definitions: a view yields samples, and a measure is a statistic of the pooled samples.
 
-Also samples of single values, and pixel subsampling for measures that do not need every pixel.
+A module of ``extended`` that declares ``FAMILIES`` adds its measures to the registry. Also the alignments of a
+prediction, samples of single values, and pixel subsampling for measures that do not need every pixel.
 """
 
 from __future__ import annotations
@@ -11,13 +12,22 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float, Float64, Int64
 from numpy import ndarray
 
+from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.columns import Better, Column
+from rebar_depth_bench.scoring.metrics import is_valid_prediction
 
 EXTENDED_PROTOCOL = "rebar-extended-4"
 """Version of the definitions of all extended measures; any change of a definition changes it."""
+
+ONCE, NATIVE, SCALED = "once", "native", "scaled"
+"""Alignments of a prediction (keys of the result's JSON).
+
+``ONCE``: measures that are invariant to scale or apply their own alignment, computed from the native prediction.
+``NATIVE``: the prediction as submitted. ``SCALED``: the prediction times the median scale s.
+"""
 
 Samples = Mapping[str, Float64[ndarray, " n"]]
 """Samples of one view: float64 values by name, without NaN; empty where the measure does not apply."""
@@ -48,7 +58,6 @@ STATISTICS: Mapping[Statistic, Callable[[Float64[ndarray, " n"]], float]] = {
 }
 """Population statistics of one or more values."""
 
-
 _DECIMALS: Mapping[str, int] = {"mm": 2, "cm": 2, "m": 3, "%": 1, "": 4}
 
 
@@ -56,20 +65,26 @@ _DECIMALS: Mapping[str, int] = {"mm": 2, "cm": 2, "m": 3, "%": 1, "": 4}
 class Measure:
     """Definition of one table entry: ``statistic`` of the samples named ``sample``, pooled over a config's views.
 
-    ``better`` is "lower" or "higher" only if missing pixels, or bars that were not found, count as failures;
-    otherwise "". ``unit`` is "mm", "cm", "%" (samples are shares from 0 to 1, shown times 100), "m" or "".
-    ``definition`` is one sentence with the formula. ``convert``, if set, maps the statistic to the measure's
-    value. It must be decreasing, and returns None where the statistic only reflects that something was missed.
+    ``unit`` is "mm", "cm", "%" (samples are shares from 0 to 1, shown times 100), "m" or "". ``better`` is "lower"
+    or "higher" only if missing pixels, or bars that were not found, count as failures; otherwise "".
+    ``definition`` is one sentence with the formula. ``sample_name`` names the samples if the measure's name does
+    not. ``convert``, if set, maps the statistic to the measure's value. It must be decreasing, and returns None
+    where the statistic only reflects that something was missed.
     """
 
     name: str
-    sample: str
-    statistic: Statistic
     title: str
     unit: str
     better: Better
     definition: str
+    sample_name: str = ""
+    statistic: Statistic = "mean"
     convert: Callable[[float], float | None] | None = None
+
+    @property
+    def sample(self) -> str:
+        """Name of the samples."""
+        return self.sample_name or self.name
 
     @property
     def column(self) -> Column:
@@ -89,9 +104,53 @@ class Measure:
         return statistic if self.convert is None else self.convert(statistic)
 
 
+@dataclass(frozen=True)
+class MeasureFamily:
+    """Related measures under one heading, found by the registry in the ``FAMILIES`` of a module.
+
+    ``evaluate`` returns a view's samples from a prediction: planar depth on ``SteelTruth.index``, metres, NaN
+    where missing; names that it leaves out have no samples. It is called for each of ``alignments``, once for all
+    families that share it. ``note`` explains the single column of measures that are taken ``ONCE``. Reports have
+    the families by ascending ``place``.
+    """
+
+    key: str
+    title: str
+    place: int
+    measures: tuple[Measure, ...]
+    evaluate: Callable[[Float64[ndarray, " n"], SteelTruth], Samples]
+    alignments: tuple[str, ...] = (NATIVE, SCALED)
+    note: str = ""
+
+    @property
+    def by_name(self) -> dict[str, Measure]:
+        """The measures by name."""
+        return {measure.name: measure for measure in self.measures}
+
+
+def aligned_predictions(
+    prediction_m: Float[ndarray, "h w"], truth: SteelTruth, scale: float | None
+) -> dict[str, Float64[ndarray, " n"]]:
+    """Return the prediction under each alignment, metres on ``truth.index``, NaN where missing.
+
+    ``scale`` is the view's median scale s, None if it has none.
+    """
+    predicted_m = prediction_m.ravel().take(truth.index.astype(np.intp))
+    native_m = np.where(is_valid_prediction(predicted_m), predicted_m.astype(np.float64), np.nan)
+    with np.errstate(over="ignore"):
+        scaled_m = native_m * (np.nan if scale is None else scale)
+    scaled_m[~is_valid_prediction(scaled_m)] = np.nan
+    return {ONCE: native_m, NATIVE: native_m, SCALED: scaled_m}
+
+
 def finite_sample(value: float | None) -> Float64[ndarray, " one"]:
     """Return a sample of one value, empty if the value is None or not finite."""
     return np.array([value] if value is not None and math.isfinite(value) else [], dtype=np.float64)
+
+
+def share_sample(count: int | np.integer, total: int | np.integer) -> Float64[ndarray, " one"]:
+    """Return a sample that holds ``count / total``, empty for a total of 0."""
+    return np.array([count / total] if total else [], dtype=np.float64)
 
 
 def subsample(position: Int64[ndarray, " n"], max_count: int) -> Int64[ndarray, " m"]:

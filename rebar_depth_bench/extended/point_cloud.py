@@ -26,8 +26,8 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
-from rebar_depth_bench.extended.measures import Measure, Samples, subsample
-from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.extended.measures import Measure, MeasureFamily, Samples, subsample
+from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
 
 TOLERANCES_MM = (1, 2, 5, 10, 20)
@@ -71,24 +71,23 @@ def true_cloud(truth: SteelTruth) -> TrueCloud:
     return TrueCloud(position, queried, rays[position], depth_m[position], steel_m)
 
 
-def cloud_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth, cloud: TrueCloud | None = None) -> Samples:
+def cloud_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
     """Return a view's point cloud samples; ``p_m`` is planar depth on ``truth.index``, metres, NaN where missing.
 
     Each of ``cloud_accuracy_<t>mm``, ``cloud_completeness_<t>mm`` and ``cloud_f_<t>mm`` has one value from 0 to
-    1, none where the view has no interior pixel. ``cloud`` is ``true_cloud(truth)``, if already computed.
+    1, none where the view has no interior pixel.
     """
-    cloud = cloud or true_cloud(truth)
+    cloud = truth.once(true_cloud)
     count = len(cloud.queried)
-    kinds = dict.fromkeys(("accuracy", "completeness", "f"), np.empty(0))
-    if count:
-        accuracy_m, completeness_m = _distances_m(p_m[cloud.position], cloud)
-        accuracy, completeness = _shares_within(accuracy_m, count), _shares_within(completeness_m, count)
-        both = accuracy + completeness
-        f = np.divide(2.0 * accuracy * completeness, both, out=np.zeros_like(both), where=both > 0)
-        kinds = {"accuracy": accuracy, "completeness": completeness, "f": f}
+    if not count:
+        return {}
+    accuracy_m, completeness_m = _distances_m(p_m[cloud.position], cloud)
+    accuracy, completeness = _shares_within(accuracy_m, count), _shares_within(completeness_m, count)
+    both = accuracy + completeness
+    f = np.divide(2.0 * accuracy * completeness, both, out=np.zeros_like(both), where=both > 0)
     return {
         f"cloud_{kind}_{t}mm": values[i : i + 1]
-        for kind, values in kinds.items()
+        for kind, values in (("accuracy", accuracy), ("completeness", completeness), ("f", f))
         for i, t in enumerate(TOLERANCES_MM)
     }
 
@@ -142,39 +141,33 @@ def _shares_within(distance_m: Float64[ndarray, " m"], count: int) -> Float64[nd
     return np.array([np.count_nonzero(distance_m <= t / 1000) / count for t in TOLERANCES_MM])
 
 
-_KINDS = (
-    (
-        "accuracy",
-        "Cloud accuracy",
-        f"share of interior pixels (at most {MAX_POINTS} a view, evenly) whose predicted point is within {{t}} mm "
-        "of the true point of any steel pixel; a missing one is not; depends on the image size",
-    ),
-    (
-        "completeness",
-        "Cloud completeness",
-        f"share of interior pixels (at most {MAX_POINTS} a view, evenly) whose true point is within {{t}} mm "
-        "of the predicted point of any interior pixel; depends on the image size",
-    ),
-    (
-        "f",
-        "Cloud F-score",
-        "2 a c / (a + c) of accuracy a and completeness c at {t} mm, view by view (Knapitsch et al. 2017)",
-    ),
-)
-"""Key, title and definition of each kind of measure."""
+_POINTS = f"share of interior pixels (at most {MAX_POINTS} a view, evenly)"
 
-
-MEASURES: tuple[Measure, ...] = tuple(
-    Measure(
-        name=f"cloud_{kind}_{t}mm",
-        sample=f"cloud_{kind}_{t}mm",
-        statistic="mean",
-        title=f"{title}, {t} mm",
-        unit="%",
-        better="higher",
-        definition=definition.format(t=t),
-    )
-    for kind, title, definition in _KINDS
-    for t in TOLERANCES_MM
-)
+MEASURES = (
+    *(
+        Measure(
+            f"cloud_accuracy_{t}mm", f"Cloud accuracy, {t} mm", "%", "higher",
+            f"{_POINTS} whose predicted point is within {t} mm of the true point of any steel pixel; a missing "
+            "one is not; depends on the image size",
+        )
+        for t in TOLERANCES_MM
+    ),
+    *(
+        Measure(
+            f"cloud_completeness_{t}mm", f"Cloud completeness, {t} mm", "%", "higher",
+            f"{_POINTS} whose true point is within {t} mm of the predicted point of any interior pixel; depends "
+            "on the image size",
+        )
+        for t in TOLERANCES_MM
+    ),
+    *(
+        Measure(
+            f"cloud_f_{t}mm", f"Cloud F-score, {t} mm", "%", "higher",
+            f"2 a c / (a + c) of accuracy a and completeness c at {t} mm, view by view (Knapitsch et al. 2017)",
+        )
+        for t in TOLERANCES_MM
+    ),
+)  # fmt: skip
 """Point cloud measures in table order."""
+
+FAMILIES = (MeasureFamily("clouds", "Point clouds", 6, MEASURES, cloud_samples),)

@@ -11,14 +11,20 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray
 
-from rebar_depth_bench.extended.crossings.reach import Reach, reaches
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, STATISTICS, Measure, Samples, Statistic
+from rebar_depth_bench.extended.reach import Reach, pooled, reaches
 from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval
 from rebar_depth_bench.scoring.columns import rounded, rounded_interval
 from rebar_depth_bench.scoring.frames import frame_of_values
 
 if TYPE_CHECKING:
     from pandas import DataFrame
+
+ViewSamples = Mapping[str, Samples]
+"""Samples of one view by alignment and name, the input of the tables."""
+
+ViewNumbers = Mapping[str, Mapping[str, float | None]]
+"""Measures of one view by alignment and name."""
 
 _ESTIMATE_COLUMNS = ("config", "alignment", "measure", "unit", "statistic", "value", "low", "high", "samples")
 
@@ -35,21 +41,13 @@ class MeasureEstimate:
     interval: Interval | None
     samples: int
 
-
-@dataclass(frozen=True, eq=False)
-class ExtendedView:
-    """Samples of one view by alignment and sample name, the input of the tables."""
-
-    view_id: str
-    samples: Mapping[str, Samples]
-
-
-@dataclass(frozen=True)
-class ViewNumbers:
-    """Measures of one view by alignment and name, kept after the table of its config is computed."""
-
-    view_id: str
-    numbers: Mapping[str, Mapping[str, float | None]]
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON object of the estimate, rounded."""
+        return {
+            "value": rounded(self.value),
+            "ci95": rounded_interval(self.interval),
+            "samples": self.samples,
+        }
 
 
 @dataclass(frozen=True)
@@ -59,6 +57,17 @@ class ExtendedTable:
     views: int
     numbers: Mapping[str, Mapping[str, MeasureEstimate]]
     reaches: Mapping[str, tuple[Reach, ...]] = field(default_factory=dict)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON object of the table."""
+        numbers = {
+            alignment: {name: estimate.to_dict() for name, estimate in of_alignment.items()}
+            for alignment, of_alignment in self.numbers.items()
+        }
+        reaches = {
+            name: [reach.to_dict() for reach in of_alignment] for name, of_alignment in self.reaches.items()
+        }
+        return {"views": self.views, **numbers, "crossing_reach": reaches}
 
 
 @dataclass(frozen=True)
@@ -73,12 +82,13 @@ class CrossingsSource:
 class ExtendedResult:
     """Extended measures of a submission; ``measures`` holds the definitions of each alignment, in order.
 
-    ``crossings`` is None if no config has bar ids.
+    ``views`` holds the measures of each view by id, alignment and name. ``crossings`` is None if no config has bar
+    ids.
     """
 
     measures: Mapping[str, Sequence[Measure]]
     tables: Mapping[str, ExtendedTable]
-    views: Sequence[ViewNumbers]
+    views: Mapping[str, ViewNumbers]
     crossings: CrossingsSource | None = None
 
     def to_dict(self) -> dict[str, Any]:
@@ -86,8 +96,17 @@ class ExtendedResult:
         return {
             "protocol": EXTENDED_PROTOCOL,
             "crossings": None if self.crossings is None else asdict(self.crossings),
-            "tables": {name: _table_dict(table) for name, table in self.tables.items()},
-            "views": [_view_dict(view) for view in self.views],
+            "tables": {name: table.to_dict() for name, table in self.tables.items()},
+            "views": [
+                {
+                    "view_id": view_id,
+                    **{
+                        alignment: {name: rounded(value) for name, value in of_alignment.items()}
+                        for alignment, of_alignment in numbers.items()
+                    },
+                }
+                for view_id, numbers in self.views.items()
+            ],
         }
 
     def to_pandas(self) -> DataFrame:
@@ -110,35 +129,36 @@ class ExtendedResult:
                     yield config, alignment, measure, table.numbers[alignment][measure.name]
 
 
-def view_numbers(view: ExtendedView, measures: Mapping[str, Sequence[Measure]]) -> ViewNumbers:
+def view_numbers(view: ViewSamples, measures: Mapping[str, Sequence[Measure]]) -> ViewNumbers:
     """Return all measures of a single view, None where it has no sample."""
-    numbers = {
-        alignment: {measure.name: view_value(view, alignment, measure) for measure in alignment_measures}
-        for alignment, alignment_measures in measures.items()
+
+    def value(measure: Measure, samples: Samples) -> float | None:
+        values = samples.get(measure.sample, np.empty(0))
+        return measure.number(STATISTICS[measure.statistic](values)) if len(values) else None
+
+    return {
+        alignment: {measure.name: value(measure, view[alignment]) for measure in of_alignment}
+        for alignment, of_alignment in measures.items()
     }
-    return ViewNumbers(view.view_id, numbers)
-
-
-def view_value(view: ExtendedView, alignment: str, measure: Measure) -> float | None:
-    """Return one measure of a single view, None where it has no sample."""
-    samples = view.samples[alignment][measure.sample]
-    return measure.number(STATISTICS[measure.statistic](samples)) if len(samples) else None
 
 
 def tabulate_extended(
-    views: Sequence[ExtendedView], resampling: Resampling, measures: Mapping[str, Sequence[Measure]]
+    views: Sequence[ViewSamples], resampling: Resampling, measures: Mapping[str, Sequence[Measure]]
 ) -> ExtendedTable:
     """Return a config's table; ``resampling`` are the resamples of the views, from which its intervals follow."""
-    numbers = {
-        alignment: _estimates(alignment_measures, [view.samples[alignment] for view in views], resampling)
-        for alignment, alignment_measures in measures.items()
-    }
-    found = {
-        alignment: reaches([view.samples[alignment] for view in views], resampling)
-        for alignment in measures
-        if views and "crossing_z_m" in views[0].samples[alignment]
-    }
-    return ExtendedTable(len(views), numbers, found)
+    by_alignment = {alignment: [view[alignment] for view in views] for alignment in measures}
+    return ExtendedTable(
+        views=len(views),
+        numbers={
+            alignment: _estimates(of_alignment, by_alignment[alignment], resampling)
+            for alignment, of_alignment in measures.items()
+        },
+        reaches={
+            alignment: reaches(by_view, resampling)
+            for alignment, by_view in by_alignment.items()
+            if by_view and "crossing_z_m" in by_view[0]
+        },
+    )
 
 
 def _estimates(
@@ -149,7 +169,7 @@ def _estimates(
     for measure in measures:
         key = (measure.sample, measure.statistic)
         if key not in statistics:
-            statistics[key] = estimate(measure, [samples[measure.sample] for samples in by_view], resampling)
+            statistics[key] = estimate(measure, by_view, resampling)
     return {
         measure.name: convert_estimate(measure, statistics[measure.sample, measure.statistic])
         for measure in measures
@@ -172,16 +192,12 @@ def convert_estimate(measure: Measure, statistic: MeasureEstimate) -> MeasureEst
     return MeasureEstimate(value, ends, statistic.samples)
 
 
-def estimate(
-    measure: Measure, by_view: Sequence[Float64[ndarray, " m"]], resampling: Resampling
-) -> MeasureEstimate:
+def estimate(measure: Measure, by_view: Sequence[Samples], resampling: Resampling) -> MeasureEstimate:
     """Return a measure's statistic of the samples of all views, pooled, with its bootstrap interval."""
-    samples = np.concatenate([np.empty(0), *by_view])
+    samples, view = pooled(by_view, measure.sample)
     if not len(samples):
         return MeasureEstimate(None, None, 0)
-    view = np.repeat(np.arange(len(by_view)), [len(view_samples) for view_samples in by_view])
-    draws = _draws(measure, samples, view, resampling)
-    ends = interval(draws, resampling.blocks(view))
+    ends = interval(_draws(measure, samples, view, resampling), resampling.blocks(view))
     return MeasureEstimate(STATISTICS[measure.statistic](samples), ends, len(samples))
 
 
@@ -196,31 +212,3 @@ def _draws(
         means, squares = (resampling.pooled_means(deviation**power, view) for power in (1, 2))
         return np.asarray(np.sqrt(np.maximum(squares - means**2, 0.0)))
     return resampling.percentile(samples, view, {"median": 50, "p95": 95}[measure.statistic])
-
-
-def _view_dict(view: ViewNumbers) -> dict[str, Any]:
-    """Return the JSON object of a view's numbers, rounded."""
-    numbers = {
-        alignment: {name: rounded(value) for name, value in alignment_numbers.items()}
-        for alignment, alignment_numbers in view.numbers.items()
-    }
-    return {"view_id": view.view_id, **numbers}
-
-
-def _table_dict(table: ExtendedTable) -> dict[str, Any]:
-    """Return the JSON object of a config's table."""
-    numbers = {
-        alignment: {name: _estimate_dict(entry) for name, entry in alignment_estimates.items()}
-        for alignment, alignment_estimates in table.numbers.items()
-    }
-    found = {name: [reach.to_dict() for reach in of_alignment] for name, of_alignment in table.reaches.items()}
-    return {"views": table.views, **numbers, "crossing_reach": found}
-
-
-def _estimate_dict(entry: MeasureEstimate) -> dict[str, Any]:
-    """Return the JSON object of an estimate, rounded."""
-    return {
-        "value": rounded(entry.value),
-        "ci95": rounded_interval(entry.interval),
-        "samples": entry.samples,
-    }

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from rebar_depth_bench.extended.crossings.reach import MIN_CROSSINGS, MIN_REACH_VIEWS, SHARE, Reach
+from rebar_depth_bench.extended.reach import MIN_CROSSINGS, MIN_REACH_VIEWS, SHARE, Reach
 from rebar_depth_bench.scoring.columns import DASH
 
 FITS_NOTE = (

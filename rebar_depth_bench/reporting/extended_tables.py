@@ -10,11 +10,10 @@ from rich.padding import Padding
 from rich.table import Table as RichTable
 
 from rebar_depth_bench.errors import printable
-from rebar_depth_bench.extended.crossings.measures import MISS_DEG
-from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, MeasureFamily
-from rebar_depth_bench.extended.inspection.measures import MISS_MM
-from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, Measure
-from rebar_depth_bench.extended.predictions import NATIVE, SCALED
+from rebar_depth_bench.extended.crossings import MISS_DEG
+from rebar_depth_bench.extended.fits import MISS_MM
+from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, NATIVE, SCALED, Measure, MeasureFamily
+from rebar_depth_bench.extended.registry import MEASURE_FAMILIES
 from rebar_depth_bench.extended.result import ExtendedResult, ExtendedTable, MeasureEstimate
 from rebar_depth_bench.reporting.crossing_texts import reach_sentence
 from rebar_depth_bench.reporting.tables import frame_csv, plain_text

@@ -27,7 +27,7 @@ from rebar_depth_bench.names import TEST_SPLIT, config_of, split_of
 from rebar_depth_bench.parallel import Progress, map_with_progress, silent
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareIdentity, SubmissionIdentity
-from rebar_depth_bench.scoring.score import ReadDepth, score_views
+from rebar_depth_bench.scoring.score import ReadDepth, UseView, score_views
 from rebar_depth_bench.scoring.truth import config_truth
 from rebar_depth_bench.submission import EntryError, SubmissionMeta, SubmissionReader
 
@@ -185,8 +185,17 @@ def score(
         return score_evaluation(evaluation, workers=workers, progress=progress)
 
 
-def score_evaluation(evaluation: Evaluation, *, workers: int | None = None, progress: Progress = silent) -> Result:
-    """Score an open submission as ``score`` does. Raises ``SubmissionError`` if an entry is invalid."""
+def score_evaluation(
+    evaluation: Evaluation,
+    *,
+    workers: int | None = None,
+    progress: Progress = silent,
+    use_view: UseView | None = None,
+) -> Result:
+    """Score an open submission as ``score`` does; ``use_view`` is called on its threads, as in ``score_views``.
+
+    Raises ``SubmissionError`` if an entry is invalid.
+    """
     submission, folder, meta = evaluation.submission, evaluation.folder, evaluation.meta
     truths = ((config.name, config_truth(folder, config, progress)) for config in evaluation.configs)
     with ThreadPoolExecutor(1) as pool:
@@ -199,6 +208,7 @@ def score_evaluation(evaluation: Evaluation, *, workers: int | None = None, prog
                 lambda name, work, positions: map_with_progress(
                     work, positions, workers, progress, f"scoring {name}", len(positions)
                 ),
+                use_view,
             )
             for view_id in set(submission.view_ids) - {view.view_id for view in views}:
                 submission.read(view_id)  # A view without scored pixels.

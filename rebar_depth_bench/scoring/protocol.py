@@ -37,15 +37,12 @@ def interior(mask: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
     return eroded
 
 
-def single_bar_pixels(bars: UInt16[ndarray, "h w"] | None, pixels: UInt32[ndarray, " n"]) -> Bool[ndarray, " n"]:
+def single_bar_pixels(bars: UInt16[ndarray, "h w"], pixels: UInt32[ndarray, " n"]) -> Bool[ndarray, " n"]:
     """Return which of the scored pixels belong to one bar with their whole 3 x 3 neighbourhood.
 
     ``bars`` holds bar ids and ``pixels`` flat indices, which are never at the border of the image. Extended
-    measures call these pixels the single-bar interior; all other metrics use all scored pixels. Without bar ids,
-    there are none.
+    measures call these pixels the single-bar interior; all other metrics use all scored pixels.
     """
-    if bars is None:
-        return np.zeros(len(pixels), bool)
     width, flat = bars.shape[1], bars.ravel()
     centre = pixels.astype(np.intp)
     own = flat[centre]

@@ -13,13 +13,12 @@ from dataclasses import dataclass, replace
 from functools import partial
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, UInt32
+from jaxtyping import Float, Float32, UInt32
 from numpy import ndarray
 
 from rebar_depth_bench.scoring.columns import COLUMN_BY_PATH, view_intervals
 from rebar_depth_bench.scoring.groups import GROUPINGS, ViewTraits, positions_by_group
 from rebar_depth_bench.scoring.metrics import (
-    DepthMetrics,
     is_valid_prediction,
     mean,
     mean_metrics,
@@ -43,14 +42,16 @@ from rebar_depth_bench.submission.declaration import NOT_DECLARED, Declaration
 ReadDepth = Callable[[str], Float[ndarray, "h w"]]
 """Function that returns the predicted planar depth of a view in metres, by view id."""
 
+UseView = Callable[[Float[ndarray, "h w"], ViewScore], None]
+"""Function that is given the predicted planar depth of a view, metres, and its score."""
+
 
 @dataclass(frozen=True, eq=False)
 class ViewTruth:
     """Scored pixels of one view.
 
     ``index`` holds flat indices into the H x W image, ``depth_m`` their planar depth and ``median_m`` its median,
-    in metres. ``constant`` has ``reference.constant_errors``, and ``single_bar`` marks the pixels of
-    ``protocol.single_bar_pixels``, if they are known.
+    in metres. ``constant`` has ``reference.constant_errors``, if they are known.
     """
 
     view_id: str
@@ -58,7 +59,6 @@ class ViewTruth:
     depth_m: Float32[ndarray, " n"]
     median_m: float
     constant: tuple[float, float] | None = None
-    single_bar: Bool[ndarray, " n"] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,24 +94,29 @@ def score_views(
     read_depth: ReadDepth,
     declared: Declaration = NOT_DECLARED,
     each: Each = lambda _, work, positions: map(work, positions),
+    use_view: UseView | None = None,
 ) -> tuple[dict[str, Table], list[ViewScore]]:
     """Return the tables by config, and the scores of all views.
 
     ``truths`` are names and ground truth of configs. One view is in memory at a time, unless ``each`` computes
-    several at once.
+    several at once. ``use_view`` is called with each view, for further measures of the same depth.
     """
     tables: dict[str, Table] = {}
     views: list[ViewScore] = []
     for name, truth in truths:
-        scores = list(each(name, partial(_score_at, truth, read_depth), range(len(truth.view_ids))))
+        scores = list(each(name, partial(_score_at, truth, read_depth, use_view), range(len(truth.view_ids))))
         tables[name] = tabulate_config(scores, truth, declared)
         views += scores
     return tables, views
 
 
-def _score_at(truth: Truth, read_depth: ReadDepth, position: int) -> ViewScore:
+def _score_at(truth: Truth, read_depth: ReadDepth, use_view: UseView | None, position: int) -> ViewScore:
     view = truth.read(position)
-    return score_view(view, read_depth(view.view_id))
+    prediction_m = read_depth(view.view_id)
+    score = score_view(view, prediction_m)
+    if use_view is not None:
+        use_view(prediction_m, score)
+    return score
 
 
 def score_view(truth: ViewTruth, prediction_m: Float[ndarray, "h w"]) -> ViewScore:
@@ -208,42 +213,3 @@ def tabulate(
 # erodes the union of all bars. Where bars lie side by side in the image, a scored pixel can therefore have another
 # bar beside it, at another depth; a prediction that is exact but shifted by one pixel has a large error there.
 # Errors on the single-bar interior contain no such steps.
-
-
-@dataclass(frozen=True)
-class SingleBarScore:
-    """Share of a view's scored pixels that are single-bar, their coverage, and the metrics of the valid ones.
-
-    ``coverage`` is None without such pixels, ``native`` and ``scaled`` without valid predictions on them.
-    ``scaled`` uses the view's scale, that of all its scored pixels.
-    """
-
-    share: float
-    coverage: float | None
-    native: DepthMetrics | None
-    scaled: DepthMetrics | None
-
-
-def single_bar_scores(truths: Truth, read_depth: ReadDepth, scores: Sequence[ViewScore]) -> list[SingleBarScore]:
-    """Return the scores on single-bar pixels of all views of a config, given their scores in the same order."""
-    found = []
-    for truth, score in zip(truths, scores, strict=True):
-        p_m = read_depth(truth.view_id).ravel().take(truth.index.astype(np.intp))
-        single_bar = np.zeros(len(p_m), bool) if truth.single_bar is None else truth.single_bar
-        chosen = single_bar & is_valid_prediction(p_m)
-        coverage = np.count_nonzero(chosen) / np.count_nonzero(single_bar) if single_bar.any() else None
-        native, scaled = None, None
-        if score.scale is not None and chosen.any():
-            (native, scaled), _ = metrics_at_scales(p_m[chosen], truth.depth_m[chosen], (1.0, score.scale))
-        found.append(SingleBarScore(float(np.mean(single_bar)), coverage, native, scaled))
-    return found
-
-
-def mean_single_bar(scores: Sequence[SingleBarScore]) -> SingleBarScore:
-    """Return the means over one or more views: the share of all, and the others of those that have a value."""
-    return SingleBarScore(
-        share=sum(score.share for score in scores) / len(scores),
-        coverage=mean([score.coverage for score in scores if score.coverage is not None]),
-        native=mean_metrics([score.native for score in scores if score.native]),
-        scaled=mean_metrics([score.scaled for score in scores if score.scaled]),
-    )

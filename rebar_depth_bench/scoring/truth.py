@@ -24,7 +24,7 @@ from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.scoring.groups import ViewTraits, bar_width_px
 from rebar_depth_bench.scoring.metrics import median
-from rebar_depth_bench.scoring.protocol import PROTOCOL, scored_pixels, single_bar_pixels
+from rebar_depth_bench.scoring.protocol import PROTOCOL, scored_pixels
 from rebar_depth_bench.scoring.reference import UNDEFINED, Reference, mean_reference, view_reference
 from rebar_depth_bench.scoring.score import Truth, ViewTruth
 from rebar_depth_bench.scoring.table import PublishedMatch
@@ -52,7 +52,7 @@ def config_truth(folder: DatasetFolder, config: DatasetConfig, progress: Progres
         source=config.root,
         task=f"ground truth of {config.name}",
         inputs=cache_inputs(config, PROTOCOL, folder.files[BARS_FILE] if has_widths else ""),
-        dtypes={"index": np.uint32, "depth_m": np.float32, "single_bar": np.bool_},
+        dtypes={"index": np.uint32, "depth_m": np.float32},
         view_ids=tuple(scored_px),
         extract=lambda view_ids: _extract_views(config, diameters, view_ids),
         is_sound=is_sound,
@@ -77,10 +77,7 @@ def config_truth(folder: DatasetFolder, config: DatasetConfig, progress: Progres
 
 def _view_truth(view: ViewArrays) -> ViewTruth:
     median_m, abs_rel, rmse_cm, *_ = view.numbers
-    arrays = view.arrays
-    return ViewTruth(
-        view.view_id, arrays["index"], arrays["depth_m"], median_m, (abs_rel, rmse_cm), arrays["single_bar"]
-    )
+    return ViewTruth(view.view_id, view.arrays["index"], view.arrays["depth_m"], median_m, (abs_rel, rmse_cm))
 
 
 def _diameters_by_scene(folder: DatasetFolder) -> dict[str, dict[int, float]]:
@@ -163,9 +160,7 @@ def _extract_views(
                 assert left.bars is not None
                 bar_id, focal_px = left.bars.ravel()[pixels], float(left.camera.K[0, 0])
                 numbers += (bar_width_px(depth_m, bar_id, known_m, focal_px) or UNDEFINED,)
-            single_bar = single_bar_pixels(left.bars, pixels)
-            arrays = {"index": pixels, "depth_m": depth_m, "single_bar": single_bar}
-            yield ViewArrays(view_id, arrays, numbers)
+            yield ViewArrays(view_id, {"index": pixels, "depth_m": depth_m}, numbers)
 
 
 # Conditions of the paper's Table I: which configs of a dataset its rows may be shown beside. Source: "Benchmarking

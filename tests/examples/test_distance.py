@@ -19,7 +19,6 @@ from rebar_depth_bench.methods import METHODS
 from rebar_depth_bench.methods.runner import predict
 from rebar_depth_bench.scoring.bootstrap import half_width
 from rebar_depth_bench.scoring.evaluation import score
-from rebar_depth_bench.scoring.score import SingleBarScore
 from tests.examples.scripts import result_of, run, written_files
 from tests.synthetic_dataset import write_split_dataset
 
@@ -44,7 +43,7 @@ def table(distances_m: Sequence[float], scales: Sequence[float], step: int = 1) 
             "scale": scale,
             "native_abs_rel": np.abs(1 / scale - 1),
             "scaled_abs_rel": np.abs(1 / scale - 1),
-            "single_bar": [SingleBarScore(0.5, 1.0, None, None)] * len(scale),
+            "single_bar": [{"share": 0.5, "coverage": 1.0, "native": None, "scaled": None}] * len(scale),
         }
     )
 

@@ -9,11 +9,10 @@ import numpy as np
 from numpy import ndarray
 
 from rebar_depth_bench.data.manifest import DatasetConfig
-from rebar_depth_bench.extended.crossings.evaluate import fitted_ties, view_crossings
-from rebar_depth_bench.extended.crossings.scene import SceneCrossings
+from rebar_depth_bench.extended.crossings import fitted_ties, view_crossings
 from rebar_depth_bench.extended.ground_truth import has_bar_ids, steel_truth
-from rebar_depth_bench.extended.predictions import NATIVE, aligned_predictions
-from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.extended.measures import NATIVE, aligned_predictions
+from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.geometry.cameras import fold_radius, project, transform
 from rebar_depth_bench.reporting.html.assets import data_uri
 from rebar_depth_bench.reporting.html.crossings import CrossingPicture, Mark
@@ -38,20 +37,19 @@ class CrossingView:
 
     position: int
     truth: SteelTruth
-    scene: SceneCrossings
 
     def picture(self, view: View) -> CrossingPicture:
         """Return the picture of the view, which has colour, depth and mask of the left camera."""
-        truth, crossings = self.truth, view_crossings(self.truth, self.scene)
-        fitted = fitted_ties(aligned_predictions(view.prediction_m, truth, None)[NATIVE], crossings)
+        truth, scene, crossings = self.truth, self.truth.bars.crossings, view_crossings(self.truth)
+        is_located, ties = fitted_ties(aligned_predictions(view.prediction_m, truth, None)[NATIVE], crossings)
         with np.errstate(invalid="ignore", over="ignore"):
-            error_mm = 1000 * np.linalg.norm(fitted.ties.tie_point_m - crossings.ties.tie_point_m, axis=1)
-        kinds = dict.fromkeys(range(len(self.scene)), "unjudged")
+            error_mm = 1000 * np.linalg.norm(ties.tie_point_m - crossings.ties.tie_point_m, axis=1)
+        kinds = dict.fromkeys(range(len(scene)), "unjudged")
         kinds |= dict.fromkeys(truth.judged.crossing.tolist(), "bent")
-        located = zip(crossings.crossing.tolist(), fitted.located.tolist(), error_mm.tolist(), strict=True)
+        located = zip(crossings.crossing.tolist(), is_located.tolist(), error_mm.tolist(), strict=True)
         kinds |= {crossing: error_kind(error) if found else "missed" for crossing, found, error in located}
         image = backdrop_image(*(view.cell(f"left_{kind}") for kind in ("rgb", "depth", "mask")))
-        marks = list(_marks(truth, self.scene.crossings.tie_point_m, kinds))
+        marks = list(_marks(truth, scene.crossings.tie_point_m, kinds))
         size = (truth.width, truth.height)
         return CrossingPicture(truth.view_id, data_uri(image, "webp"), *size, marks, _counts(marks))
 
@@ -65,8 +63,7 @@ def crossing_view(evaluation: Evaluation, config: DatasetConfig) -> CrossingView
         return None
     counts = [len(steel.judged(position).crossing) for position in range(len(steel))]
     truth = steel.view(int(np.argmax(counts)))
-    position = config.view_ids.index(truth.view_id)
-    return CrossingView(position, truth, steel.bars_by_view[truth.view_id].crossings)
+    return CrossingView(config.view_ids.index(truth.view_id), truth)
 
 
 def error_kind(error_mm: float) -> str:

@@ -6,9 +6,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from rebar_depth_bench.errors import printable
-from rebar_depth_bench.extended.crossings.measures import BINNED_MEASURES, MAIN_MEASURES
-from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES
-from rebar_depth_bench.extended.predictions import NATIVE, SCALED
+from rebar_depth_bench.extended.crossings import BINNED_MEASURES, MAIN_MEASURES
+from rebar_depth_bench.extended.measures import NATIVE, SCALED
+from rebar_depth_bench.extended.registry import MEASURE_FAMILIES
 from rebar_depth_bench.extended.result import ExtendedResult, ExtendedTable
 from rebar_depth_bench.reporting.crossing_texts import FITS_NOTE, REACH_NOTE, reach_sentence
 from rebar_depth_bench.reporting.html.extended import ExtendedMeasureTable, measure_table

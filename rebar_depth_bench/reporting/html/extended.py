@@ -6,25 +6,23 @@ import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 
 from markupsafe import Markup
 
 from rebar_depth_bench.errors import printable
-from rebar_depth_bench.extended.crossings.measures import MISS_DEG
-from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, MeasureFamily
-from rebar_depth_bench.extended.inspection.measures import INSPECTION_MEASURES, MISS_MM, capability_name
-from rebar_depth_bench.extended.inspection.tolerances import (
+from rebar_depth_bench.extended.crossings import MISS_DEG
+from rebar_depth_bench.extended.fits import MISS_MM
+from rebar_depth_bench.extended.inspection import (
+    INSPECTION_MEASURES,
     PROFILES,
     TOLERANCES,
     Tolerance,
     ToleranceProfile,
-    pass_sample,
 )
-from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, Measure
+from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, NATIVE, ONCE, SCALED, Measure, MeasureFamily
 from rebar_depth_bench.extended.point_cloud import TOLERANCES_MM
-from rebar_depth_bench.extended.predictions import NATIVE, ONCE, SCALED
-from rebar_depth_bench.extended.profiles import AXES, bin_names
+from rebar_depth_bench.extended.profiles import AXES, bins
+from rebar_depth_bench.extended.registry import MEASURE_FAMILIES
 from rebar_depth_bench.extended.result import ExtendedResult, ExtendedTable, MeasureEstimate
 from rebar_depth_bench.reporting.charts.profile import ProfileBin, profile_chart
 from rebar_depth_bench.reporting.extended_tables import MISSED, UNDEFINED, is_miss, single_bar_sentence
@@ -106,15 +104,12 @@ def _interval_text(ends: tuple[float, float] | None, measure: Measure) -> str:
 
 
 _ALIGNMENT_NOTES: Mapping[str, str] = {NATIVE: "no alignment", SCALED: "oracle median scale per view"}
-_ONCE_NOTES: Mapping[str, str] = {
-    "alignment": "own alignment, see the row",
-    "boundary": "independent of scale",
-}
 _AXIS_TITLES: Mapping[str, tuple[str, str]] = {
     "m": ("distance", "m"),
     "px": ("bar width in the picture", "pixels"),
 }
-_FOLDED_FAMILIES = ("as_built", "alignment", "full_mask", "single_bar", "boundary", "layers", "clouds")
+_SHOWN_FAMILIES = ("inspection", "crossings", "profile")
+"""Families that have tables of their own; the others are collapsed, those of the inspection first."""
 
 MAIN_INSPECTION_MEASURES = (
     "bars_found",
@@ -200,11 +195,11 @@ def extended_section(extended: ExtendedResult) -> ExtendedSection:
 
 def _extended_config(name: str, table: ExtendedTable) -> ExtendedConfig:
     inspection = MEASURE_FAMILIES["inspection"]
-    shown = {*MAIN_INSPECTION_MEASURES, *(pass_sample(tolerance) for _, tolerance in TOLERANCES)}
+    shown = {*MAIN_INSPECTION_MEASURES, *(tolerance.pass_name for _, tolerance in TOLERANCES)}
     other = [measure for measure in INSPECTION_MEASURES if measure.name not in shown]
     profile = MEASURE_FAMILIES["profile"]
     folded = [
-        *(_folded_table(table, key) for key in _FOLDED_FAMILIES),
+        *(_folded_table(table, family) for family in _folded_families()),
         measure_table(table, f"{profile.title}: values", profile, profile.measures),
     ]
     charts = [(_AXIS_TITLES[axis][0], _profile_chart(table, axis)) for axis in AXES]
@@ -222,27 +217,31 @@ def _extended_config(name: str, table: ExtendedTable) -> ExtendedConfig:
     )
 
 
-def _folded_table(table: ExtendedTable, key: str) -> ExtendedMeasureTable:
-    family = MEASURE_FAMILIES[key]
-    if key == "clouds":
+def _folded_families() -> list[MeasureFamily]:
+    families = [family for key, family in MEASURE_FAMILIES.items() if key not in _SHOWN_FAMILIES]
+    return sorted(families, key=lambda family: family.key != "as_built")
+
+
+def _folded_table(table: ExtendedTable, family: MeasureFamily) -> ExtendedMeasureTable:
+    if family.key == "clouds":
         return _cloud_table(table, family)
-    return measure_table(table, family.title, family, family.measures, _ONCE_NOTES.get(key, ""))
+    return measure_table(table, family.title, family, family.measures)
 
 
 def measure_table(
-    table: ExtendedTable, title: str, family: MeasureFamily, measures: Sequence[Measure], once_aside: str = ""
+    table: ExtendedTable, title: str, family: MeasureFamily, measures: Sequence[Measure]
 ) -> ExtendedMeasureTable:
     """Return the table of some measures of a family, those without samples left out."""
     rows = measure_rows(table, measures, family.alignments)
     units = {row.unit for row in rows if any(cell.text == MISSED for cell in row.cells)}
     values = " or ".join(f"{MISS_MM:g} mm" if unit else f"{MISS_DEG:g} degrees" for unit in sorted(units)[::-1])
     note = f"{MISSED}: not found, counted as {values}." if units else ""
-    heads = _alignment_heads(family, once_aside)
+    heads = _alignment_heads(family)
     return ExtendedMeasureTable(title, "rows", heads, rows, measure_definitions(measures), note)
 
 
-def _alignment_heads(family: MeasureFamily, once_aside: str = "") -> list[AlignmentHead]:
-    notes = {**_ALIGNMENT_NOTES, ONCE: once_aside}
+def _alignment_heads(family: MeasureFamily) -> list[AlignmentHead]:
+    notes = {**_ALIGNMENT_NOTES, ONCE: family.note}
     return [AlignmentHead(alignment, notes[alignment]) for alignment in family.alignments]
 
 
@@ -267,7 +266,7 @@ def _tolerance_row(table: ExtendedTable, profile: ToleranceProfile, tolerance: T
     measures = MEASURE_FAMILIES["inspection"].by_name
     cells = [
         estimate_cell(table.numbers[alignment][name], measures[name])
-        for name in (pass_sample(tolerance), capability_name(tolerance))
+        for name in (tolerance.pass_name, tolerance.capability_name)
         for alignment in (NATIVE, SCALED)
     ]
     limit_mm = Cell(f"{tolerance.limit_mm:g}", tolerance.limit_mm)
@@ -276,11 +275,10 @@ def _tolerance_row(table: ExtendedTable, profile: ToleranceProfile, tolerance: T
 
 def _profile_chart(table: ExtendedTable, axis: str) -> Markup:
     native, scaled = table.numbers[NATIVE], table.numbers[SCALED]
-    edges = AXES[axis]
-    bins = [
+    shown = [
         ProfileBin(
             low, high, native[f"abs_rel_at_{name}"], scaled[f"abs_rel_at_{name}"], native[f"scale_at_{name}"]
         )
-        for (low, high), name in zip(pairwise(edges), bin_names(axis, edges), strict=True)
+        for low, high, name in bins(axis)
     ]
-    return profile_chart(*_AXIS_TITLES[axis], bins)
+    return profile_chart(*_AXIS_TITLES[axis], shown)

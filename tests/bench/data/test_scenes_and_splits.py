@@ -19,8 +19,8 @@ from rebar_depth_bench.data.schema import ViewRecord
 from rebar_depth_bench.data.verification import truth_problems
 from rebar_depth_bench.data.views import ConfigViews, Views
 from rebar_depth_bench.errors import DatasetError, InputError, SubmissionError
-from rebar_depth_bench.extended.evaluate import score_extended
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
+from rebar_depth_bench.extended.registry import score_extended
 from rebar_depth_bench.methods.base import Method, MethodInfo, MultiViewMethod, Prepared
 from rebar_depth_bench.methods.runner import predict
 from rebar_depth_bench.reporting.figure import figure_content
@@ -302,7 +302,8 @@ def test_extended_measures_use_the_bars_of_each_view_s_scene(root: Path) -> None
 def test_extended_scoring_of_a_split(root: Path, tmp_path: Path) -> None:
     archive = write_truth(root, tmp_path / "a.zip", "validation", factor=1.25)
     with open_evaluation(archive, root) as evaluation:
-        extended = score_extended(score_evaluation(evaluation), evaluation)
+        extended = score_extended(evaluation).extended
+    assert extended is not None
     numbers = extended.tables["cages"].numbers["native"]
     assert extended.tables["cages"].views == SPLIT_VIEWS["validation"]
     assert numbers["single_bar_share"].value == 1.0

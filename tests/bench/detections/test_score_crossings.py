@@ -265,23 +265,22 @@ def test_points_on_a_bar_without_axis_and_near_unjudged_crossings_are_ignored(ma
     from rebar_depth_bench.data.manifest import open_folder
     from rebar_depth_bench.detections.score import SeenDetections, compare_view
     from rebar_depth_bench.extended.ground_truth import load_steel_truth
-    from rebar_depth_bench.extended.steel_truth import JudgedCrossings
+    from rebar_depth_bench.extended.steel import JudgedCrossings
 
     folder = open_folder(mat)
     steel = load_steel_truth(folder, folder.config(CONFIG))
     truth = steel.view(0)
-    bars = steel.bars_by_view[truth.view_id]
-    points = transform(truth.cam_from_world, bars.crossings.crossings.tie_point_m)
+    points = transform(truth.cam_from_world, truth.bars.crossings.crossings.tie_point_m)
     on_bar_1 = transform(truth.cam_from_world, np.array([[-0.06, 0.0, 0.01]]))
     seen = np.concatenate([points, points[:1] + 0.001, on_bar_1])
     detected = SeenDetections(seen, np.full_like(seen, np.nan), np.ones(len(seen)))
-    view = compare_view(detected, truth, bars, None)
+    view = compare_view(detected, truth, None)
     assert (view.matched, view.false, view.ignored) == (4, 2, 0)
-    diameter_m = bars.diameter_m.copy()
+    diameter_m = truth.bars.diameter_m.copy()
     diameter_m[1] = np.nan
-    view = compare_view(detected, truth, replace(bars, diameter_m=diameter_m), None)
+    view = compare_view(detected, replace(truth, bars=replace(truth.bars, diameter_m=diameter_m)), None)
     assert (view.matched, view.false, view.ignored) == (4, 0, 2)  # Both show bar 1.
     unjudged = replace(truth, judged=JudgedCrossings(truth.judged.crossing[1:], truth.judged.pixels[1:]))
-    view = compare_view(detected, unjudged, bars, None)
+    view = compare_view(detected, unjudged, None)
     assert (view.judged, view.matched, view.false, view.ignored) == (3, 3, 2, 1)
     assert [int(view.counts[limit].sum()) for limit in (5, 10, 20)] == [5, 5, 5]

@@ -8,11 +8,10 @@ from dataclasses import replace
 import numpy as np
 
 from rebar_depth_bench.bar_crossings.definition import scene_crossings
-from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.extended.crossings.judged import judged_crossings
-from rebar_depth_bench.extended.crossings.scene import SceneCrossings, prepared_crossings
-from rebar_depth_bench.extended.inspection.segments import CageTruth, assign_segments, cage_truth
-from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.data.bars import Bar, with_axis
+from rebar_depth_bench.extended.axes import assign_segments
+from rebar_depth_bench.extended.judged import judged_crossings
+from rebar_depth_bench.extended.steel import SceneBars, SteelTruth
 from rebar_depth_bench.scoring.protocol import interior, single_bar_pixels
 
 WIDTH, HEIGHT, FOCAL_PX = 240, 160, 210.0
@@ -78,10 +77,10 @@ def cast(bars: Sequence[Bar], cam_from_world: np.ndarray = CAMERA_AT_ORIGIN) -> 
     return np.where(visible, depth_m, 0.0), np.where(visible, ids, 0)
 
 
-def view(bars: Sequence[Bar], cam_from_world: np.ndarray = CAMERA_AT_ORIGIN) -> tuple[SteelTruth, CageTruth]:
-    """Return the truth of one view of bars (steel pixels only) and of their cage."""
-    cage = cage_truth(bars)
-    depth_m, ids = cast(bars, cam_from_world)
+def view(bars: Sequence[Bar], cam_from_world: np.ndarray = CAMERA_AT_ORIGIN) -> SteelTruth:
+    """Return the truth of one view of bars (steel pixels only), with the judged crossings of the bars."""
+    scene = SceneBars.of(bars, scene_crossings(bars))
+    depth_m, ids = cast(with_axis(bars), cam_from_world)
     index = np.flatnonzero(depth_m)
     rays = pixel_directions()[index, :2]
     z_m = depth_m[index].astype(np.float32)
@@ -91,24 +90,15 @@ def view(bars: Sequence[Bar], cam_from_world: np.ndarray = CAMERA_AT_ORIGIN) -> 
     no_layer = np.full(len(index), np.nan, dtype=np.float32)
     inside = interior((ids > 0).reshape(HEIGHT, WIDTH)).ravel()[index]
     K = np.array([[FOCAL_PX, 0, (WIDTH - 1) / 2], [0, FOCAL_PX, (HEIGHT - 1) / 2], [0, 0, 1.0]])
-    run = assign_segments(world_m, bar_id, cage)
+    run = assign_segments(world_m, bar_id, scene.cage)
     single_bar = np.zeros_like(inside)
     scored = index[inside].astype(np.uint32)
     single_bar[inside] = single_bar_pixels(ids.reshape(HEIGHT, WIDTH).astype(np.uint16), scored)
     truth = SteelTruth(
         "lattice/0000", HEIGHT, WIDTH, K, cam_from_world, index.astype(np.uint32), z_m, bar_id, inside,
-        single_bar, rays, run, no_layer, no_layer,
+        single_bar, rays, run, no_layer, no_layer, scene,
     )  # fmt: skip
-    return truth, cage
-
-
-def view_with_crossings(
-    bars: Sequence[Bar], cam_from_world: np.ndarray = CAMERA_AT_ORIGIN
-) -> tuple[SteelTruth, SceneCrossings]:
-    """Return the truth of one view of bars with its judged crossings, and the crossings of the bars."""
-    truth, cage = view([item for item in bars if item.has_axis], cam_from_world)
-    scene = prepared_crossings(scene_crossings(bars), bars, cage)
-    return replace(truth, judged=judged_crossings(truth, scene)), scene
+    return replace(truth, judged=judged_crossings(truth))
 
 
 def predicted_m(moved: Sequence[Bar], truth: SteelTruth) -> np.ndarray:

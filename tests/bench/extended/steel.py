@@ -2,13 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.extended.steel import SceneBars, SteelTruth
 
 
-def steel_truth(depth_m: np.ndarray, bar_id: np.ndarray | None = None, fx: float = 700.0) -> SteelTruth:
-    """Return the truth of a view one pixel high; ``depth_m`` and ``bar_id`` have one value per pixel."""
+def steel_truth(
+    depth_m: np.ndarray, bar_id: np.ndarray | None = None, fx: float = 700.0, diameter_m: np.ndarray | None = None
+) -> SteelTruth:
+    """Return the truth of a view one pixel high; ``depth_m`` and ``bar_id`` have one value per pixel.
+
+    ``diameter_m`` are the diameters of bars by id, metres.
+    """
+    bars = SceneBars.of(())
     count = len(depth_m)
     K = np.array([[fx, 0, (count - 1) / 2], [0, fx, 0], [0, 0, 1.0]])
     return SteelTruth(
@@ -26,4 +34,5 @@ def steel_truth(depth_m: np.ndarray, bar_id: np.ndarray | None = None, fx: float
         run=np.zeros(count, dtype=np.int16),
         front_m=np.full(count, np.nan, dtype=np.float32),
         behind_m=np.full(count, np.nan, dtype=np.float32),
+        bars=bars if diameter_m is None else replace(bars, diameter_m=diameter_m),
     )

@@ -13,13 +13,14 @@ from hypothesis import strategies as st
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.extended.evaluate import score_extended
-from rebar_depth_bench.extended.inspection.as_built import MEASURES, OFF_MM, as_built_samples, bar_axes
-from rebar_depth_bench.extended.inspection.evaluate import inspection_samples
-from rebar_depth_bench.extended.inspection.measures import MISS_MM
+from rebar_depth_bench.extended.as_built import MEASURES, OFF_MM, as_built_samples
+from rebar_depth_bench.extended.fits import MISS_MM
+from rebar_depth_bench.extended.inspection import inspection_samples
 from rebar_depth_bench.extended.measures import STATISTICS, Samples
+from rebar_depth_bench.extended.registry import score_extended
+from rebar_depth_bench.extended.steel import BarAxes, SceneBars
 from rebar_depth_bench.geometry.cameras import rotation_matrix
-from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
+from rebar_depth_bench.scoring.evaluation import open_evaluation
 from tests.bench.extended.cage_scenes import mat, predicted_m, view
 
 BUILT_MM = np.array([(0, 0, 0), (4, 0, 3), (12, 5, 0), (0, 9, -12), (3, -15, 2), (-8, 0, 7)], float)
@@ -35,12 +36,12 @@ def displaced(bar: Bar, by_mm: Sequence[float] | np.ndarray) -> Bar:
 
 
 BARS = [displaced(bar, by_mm) for bar, by_mm in zip(mat(), BUILT_MM, strict=True)]
-TRUTH, CAGE = view(BARS)
+TRUTH = view(BARS)
 EXACT_M = TRUTH.depth_m.astype(np.float64)
 
 
 def samples_of(p_m: np.ndarray, bars: Sequence[Bar] = BARS) -> Samples:
-    return as_built_samples(p_m, TRUTH, CAGE, bar_axes(tuple(bars)))
+    return as_built_samples(p_m, replace(TRUTH, bars=SceneBars.of(bars)))
 
 
 def value(samples: Samples, name: str) -> float:
@@ -91,7 +92,7 @@ def test_bars_without_prediction_are_missed() -> None:
 def test_found_bars_are_those_of_inspection() -> None:
     noisy_m = EXACT_M + 0.02 * np.random.default_rng(5).standard_normal(len(EXACT_M))
     noisy_m[TRUTH.bar_id == 2] = np.nan
-    found = inspection_samples(noisy_m, TRUTH, CAGE)["bar_found"]
+    found = inspection_samples(noisy_m, TRUTH)["bar_found"]
     assert ((samples_of(noisy_m)["deviation_judged_mm"] == MISS_MM) == (found == 0)).all()
 
 
@@ -100,11 +101,10 @@ def test_bars_that_are_in_no_design_are_not_judged() -> None:
     chosen = [1, 2, 4, 5]
     np.testing.assert_allclose(samples_of(EXACT_M, in_design)["deviation_true_mm"], TRUE_MM[chosen])
     none = samples_of(EXACT_M, [replace(bar, nominal_axis_m=()) for bar in BARS])
-    assert set(none) == {measure.sample for measure in MEASURES}
-    assert all(len(values) == 0 for values in none.values())
+    assert none == {}
     points = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     without_length = samples_of(EXACT_M, [replace(bar, nominal_axis_m=points) for bar in BARS])
-    assert len(without_length["deviation_true_mm"]) == 0
+    assert without_length == {}
 
 
 def test_arm_of_a_bent_bar_is_compared_with_the_same_arm() -> None:
@@ -114,8 +114,8 @@ def test_arm_of_a_bent_bar_is_compared_with_the_same_arm() -> None:
     across = ((0.1, 0.0, z + 0.008), (x + 0.006, 0.0, z + 0.008))
     nominal = ((x, y, z), end, *across)
     bars = [replace(built, nominal_axis_m=nominal)]
-    truth, cage = view(bars)
-    samples = as_built_samples(truth.depth_m.astype(float), truth, cage, bar_axes(tuple(bars)))
+    truth = view(bars)
+    samples = as_built_samples(truth.depth_m.astype(float), truth)
     np.testing.assert_allclose(samples["deviation_true_mm"], [10.0], atol=1e-6)
     assert samples["deviation_judged_mm"].max() < 2e-3
 
@@ -127,9 +127,10 @@ def test_bow_of_a_bar_is_measured() -> None:
     nominal = ((0.0, -0.14, 0.4), (0.0, 0.14, 0.4))
     axis_m = tuple((0.0, float(y), 0.4 - float(b)) for y, b in zip(y_m, bow_m, strict=True))
     straight = Bar(1, "bar", 0.02, nominal, nominal)
-    truth, cage = view([straight])
-    axes = bar_axes((replace(straight, axis_m=axis_m),))
-    samples = as_built_samples(truth.depth_m.astype(float), truth, cage, axes)
+    truth = view([straight])
+    axis = BarAxes(np.array(axis_m), np.array(nominal))
+    truth = replace(truth, bars=replace(truth.bars, axes={1: axis}))
+    samples = as_built_samples(truth.depth_m.astype(float), truth)
     np.testing.assert_allclose(samples["deviation_true_mm"], [0.6], atol=0.01)
     np.testing.assert_allclose(samples["deviation_judged_mm"], [0.6], atol=0.01)
 
@@ -152,8 +153,8 @@ def test_samples_do_not_depend_on_the_world_frame(
         replace(bar, axis_m=moved(bar.axis_m), nominal_axis_m=moved(bar.nominal_axis_m))  # type: ignore[arg-type]
         for bar in BARS
     ]
-    truth, cage = view(bars, np.linalg.inv(pose))
-    samples = as_built_samples(truth.depth_m.astype(float) + 0.001, truth, cage, bar_axes(tuple(bars)))
+    truth = view(bars, np.linalg.inv(pose))
+    samples = as_built_samples(truth.depth_m.astype(float) + 0.001, truth)
     expected = samples_of(EXACT_M + 0.001)
     for name, values in samples.items():
         np.testing.assert_allclose(values, expected[name], atol=0.02, err_msg=name)
@@ -165,7 +166,9 @@ def test_configs_without_design_have_null(tmp_path: Path, tiny_root: Path) -> No
         for row in rdb.load(tiny_root, "lattice", columns=["view_id", "left_depth"]):
             writer.add(row["view_id"], row["left_depth"])
     with open_evaluation(archive, tiny_root) as evaluation:
-        extended = score_extended(score_evaluation(evaluation), evaluation).to_dict()
+        result = score_extended(evaluation).extended
+    assert result is not None
+    extended = result.to_dict()
     for measure in MEASURES:
         null = {"value": None, "ci95": None, "samples": 0}
         assert extended["tables"]["lattice"]["native"][measure.name] == null

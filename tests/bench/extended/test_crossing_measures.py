@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,13 +12,17 @@ from hypothesis import strategies as st
 from numpy import ndarray
 
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.extended.crossings.evaluate import ViewCrossings, crossing_samples, view_crossings
-from rebar_depth_bench.extended.crossings.measures import BINNED_MEASURES, MAIN_MEASURES
-from rebar_depth_bench.extended.crossings.scene import prepared_crossings
-from rebar_depth_bench.extended.inspection.cylinder_fit import LATERAL_PRIOR_RADII
+from rebar_depth_bench.extended.crossings import (
+    BINNED_MEASURES,
+    MAIN_MEASURES,
+    ViewCrossings,
+    crossing_samples,
+    view_crossings,
+)
+from rebar_depth_bench.extended.fits import LATERAL_PRIOR_RADII
 from rebar_depth_bench.extended.measures import Samples
-from rebar_depth_bench.extended.steel_truth import SteelTruth
-from tests.bench.extended.cage_scenes import FOCAL_PX, bar, view_with_crossings
+from rebar_depth_bench.extended.steel import SceneBars, SteelTruth
+from tests.bench.extended.cage_scenes import FOCAL_PX, bar, view
 
 D = 0.02
 UPRIGHT = bar(1, (0.0, -0.15, 0.40), (0.0, 0.15, 0.40))
@@ -29,26 +34,27 @@ def turned(angle_deg: float, z_m: float, bar_id: int = 2) -> Bar:
     return bar(bar_id, (-x, -y, z_m), (x, y, z_m))
 
 
-def samples_of(p_m: ndarray, truth: SteelTruth, view: ViewCrossings) -> Samples:
-    samples = crossing_samples(p_m, view)
+def samples_of(p_m: ndarray, truth: SteelTruth) -> Samples:
+    samples = crossing_samples(p_m, truth)
     used = {measure.sample for measure in (*MAIN_MEASURES, *BINNED_MEASURES)}
     assert used | {"crossing_z_m"} == set(samples)
     return samples
 
 
-def exact(bars: list[Bar]) -> tuple[SteelTruth, ViewCrossings, ndarray]:
-    truth, scene = view_with_crossings(bars)
-    return truth, view_crossings(truth, scene), truth.depth_m.astype(np.float64)
+def exact(bars: list[Bar]) -> tuple[SteelTruth, ndarray]:
+    truth = view(bars)
+    return truth, truth.depth_m.astype(np.float64)
 
 
 def test_two_bars_by_hand() -> None:
     """An upright bar 1 mm before a lying one: the tie point is 410.5 mm from the camera, on its axis."""
-    truth, view, depth_m = exact([UPRIGHT, LYING])
-    assert view.crossing.tolist() == [0]
-    np.testing.assert_allclose(view.ties.tie_point_m, [[0, 0, 0.4105]], atol=1e-9)
-    np.testing.assert_allclose(view.ties.normal, [[0, 0, 1]], atol=1e-9)
-    assert view.width_px[0] == pytest.approx(FOCAL_PX * D / 0.4105)
-    samples = samples_of(depth_m, truth, view)
+    truth, depth_m = exact([UPRIGHT, LYING])
+    found = view_crossings(truth)
+    assert found.crossing.tolist() == [0]
+    np.testing.assert_allclose(found.ties.tie_point_m, [[0, 0, 0.4105]], atol=1e-9)
+    np.testing.assert_allclose(found.ties.normal, [[0, 0, 1]], atol=1e-9)
+    assert found.width_px[0] == pytest.approx(FOCAL_PX * D / 0.4105)
+    samples = samples_of(depth_m, truth)
     assert samples["crossings_judged"].tolist() == samples["crossing_located"].tolist() == [1.0]
     assert samples["tie_judged_mm"][0] < 0.02
     assert samples["crossing_gap_judged_mm"][0] < 0.02
@@ -67,34 +73,36 @@ def test_two_bars_by_hand() -> None:
 def test_three_bars_of_one_node_are_judged_where_they_are_seen() -> None:
     """A third bar right behind the lying one: its tie point is hidden, and it shows no pixels beside the first."""
     behind = bar(3, (0.0, -0.15, 0.442), (0.0, 0.15, 0.442))
-    truth, scene = view_with_crossings([UPRIGHT, LYING, behind])
+    truth = view([UPRIGHT, LYING, behind])
+    scene = truth.bars.crossings
     assert list(zip(scene.bar_id.tolist(), scene.crossings.node_id.tolist(), strict=True)) == [
         ([1, 2], 1),
         ([2, 3], 2),
     ]
     assert truth.judged.crossing.tolist() == [0]
-    assert view_crossings(truth, scene).in_scene == 2
+    assert view_crossings(truth).in_scene == 2
     beside = bar(
         3, (0.03, -0.15, 0.442), (0.03, 0.15, 0.442)
     )  # Seen beside the first, its tie point behind bar 2.
-    truth, scene = view_with_crossings([UPRIGHT, LYING, beside])
+    truth = view([UPRIGHT, LYING, beside])
     assert truth.judged.crossing.tolist() == [0, 1]
 
 
 def test_four_bars_have_four_exact_crossings() -> None:
     bars = [bar(i + 1, (x, -0.15, 0.40), (x, 0.15, 0.40)) for i, x in enumerate((-0.05, 0.05))]
     bars += [bar(i + 3, (-0.2, y, 0.4215), (0.2, y, 0.4215)) for i, y in enumerate((-0.04, 0.04))]
-    truth, view, depth_m = exact(bars)
-    assert view.crossing.tolist() == [0, 1, 2, 3]
+    truth, depth_m = exact(bars)
+    found = view_crossings(truth)
+    assert found.crossing.tolist() == [0, 1, 2, 3]
     expected = [(x, y, 0.41075) for x in (-0.05, 0.05) for y in (-0.04, 0.04)]
-    np.testing.assert_allclose(view.ties.tie_point_m, expected, atol=1e-9)
-    samples = samples_of(depth_m, truth, view)
+    np.testing.assert_allclose(found.ties.tie_point_m, expected, atol=1e-9)
+    samples = samples_of(depth_m, truth)
     assert samples["tie_judged_mm"].max() < 0.1
     assert samples["crossing_angle_judged_deg"].max() < 0.3
 
 
 def judged(bars: list[Bar]) -> list[int]:
-    truth, _ = view_with_crossings(bars)
+    truth = view(bars)
     return [int(crossing) for crossing in truth.judged.crossing]
 
 
@@ -116,10 +124,9 @@ def test_crossing_at_the_border_of_the_image_is_not_judged() -> None:
 def test_bars_in_one_image_line_are_not_judged() -> None:
     """Look along the plane of both bars: the rear one is hidden over its whole length."""
     sloping = bar(2, (0.0, -0.1, 0.30), (0.0, 0.1, 0.5421))
-    truth, scene = view_with_crossings([UPRIGHT, sloping])
-    assert (len(scene), truth.judged.crossing.tolist()) == (1, [])
-    view = view_crossings(truth, scene)
-    samples = samples_of(truth.depth_m.astype(np.float64), truth, view)
+    truth = view([UPRIGHT, sloping])
+    assert (len(truth.bars.crossings), truth.judged.crossing.tolist()) == (1, [])
+    samples = samples_of(truth.depth_m.astype(np.float64), truth)
     assert samples["crossings_judged"].tolist() == [0.0]
     assert not any(len(values) for name, values in samples.items() if name != "crossings_judged")
 
@@ -141,24 +148,23 @@ def test_bent_bar_is_judged_but_not_fitted() -> None:
             (x_m + 0.1, 0.1 * math.tan(math.radians(bend_deg)), 0.421),
         )
         bent = Bar(2, "bent", D, axis_m)
-        truth, scene = view_with_crossings(
-            [UPRIGHT, LYING]
-        )  # The picture of the straight bar, the axis of the bent.
-        scene = prepared_crossings(scene.crossings, [UPRIGHT, bent], None)
+        truth = view([UPRIGHT, LYING])
         assert truth.judged.crossing.tolist() == [0]
-        assert view_crossings(truth, scene).crossing.tolist() == expected
+        # The picture of the straight bar, the axis of the bent.
+        bent_truth = replace(truth, bars=SceneBars.of([UPRIGHT, bent], truth.bars.crossings.crossings))
+        assert view_crossings(bent_truth).crossing.tolist() == expected
 
 
 def test_no_crossings_give_empty_samples() -> None:
-    truth, view, depth_m = exact([UPRIGHT])
-    samples = samples_of(depth_m, truth, view)
+    truth, depth_m = exact([UPRIGHT])
+    samples = samples_of(depth_m, truth)
     assert all(len(values) == 0 for values in samples.values())
 
 
 def test_shifted_depth_shifts_the_tie_point() -> None:
     """Move both bars 3 mm away from the camera: the error is along the optical axis, the gap unchanged."""
-    truth, view, depth_m = exact([UPRIGHT, LYING])
-    samples = samples_of(depth_m + 0.003, truth, view)
+    truth, depth_m = exact([UPRIGHT, LYING])
+    samples = samples_of(depth_m + 0.003, truth)
     assert samples["tie_along_error_mm"] == pytest.approx([3.0], abs=0.05)
     assert samples["tie_across_judged_mm"] == pytest.approx([0.0], abs=0.05)
     assert samples["crossing_gap_error_mm"] == pytest.approx([0.0], abs=0.05)
@@ -166,16 +172,16 @@ def test_shifted_depth_shifts_the_tie_point() -> None:
 
 
 def test_one_shifted_bar_moves_tie_point_by_half_and_closes_the_gap() -> None:
-    truth, view, depth_m = exact([UPRIGHT, LYING])
-    samples = samples_of(depth_m + 0.002 * (truth.bar_id == 1), truth, view)
+    truth, depth_m = exact([UPRIGHT, LYING])
+    samples = samples_of(depth_m + 0.002 * (truth.bar_id == 1), truth)
     assert samples["tie_along_error_mm"] == pytest.approx([1.0], abs=0.05)
     assert samples["crossing_gap_error_mm"] == pytest.approx([-2.0], abs=0.05)  # Intersecting cylinders: -1 mm.
 
 
 def test_missing_predictions_are_not_located() -> None:
-    truth, view, depth_m = exact([UPRIGHT, LYING])
+    truth, depth_m = exact([UPRIGHT, LYING])
     for p_m in (np.full(len(depth_m), np.nan), np.where(truth.bar_id == 1, np.nan, depth_m)):
-        samples = samples_of(p_m, truth, view)
+        samples = samples_of(p_m, truth)
         assert samples["crossing_located"].tolist() == [0.0]
         assert samples["tie_judged_mm"].tolist() == samples["crossing_gap_judged_mm"].tolist() == [100.0]
         assert samples["crossing_angle_judged_deg"].tolist() == [90.0]
@@ -186,11 +192,11 @@ def test_missing_predictions_are_not_located() -> None:
 @settings(max_examples=20, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 1e-3, 1.0, 1e6, 1e300]))
 def test_wild_predictions_never_warn(seed: int, size: float) -> None:
-    truth, view, depth_m = exact([UPRIGHT, LYING, turned(50, 0.442, 3)])
+    truth, depth_m = exact([UPRIGHT, LYING, turned(50, 0.442, 3)])
     rng = np.random.default_rng(seed)
     p_m = depth_m + size * rng.standard_normal(len(depth_m))
     p_m[rng.random(len(p_m)) < 0.2] = np.nan
-    samples = samples_of(np.where(p_m > 0, p_m, np.nan), truth, view)
+    samples = samples_of(np.where(p_m > 0, p_m, np.nan), truth)
     assert all(np.isfinite(values).all() for values in samples.values())
     assert samples["tie_judged_mm"].max() <= 100
 
@@ -223,14 +229,15 @@ def predicted_sigma_m(view: ViewCrossings, noise_m: float) -> float:
 @pytest.mark.parametrize("noise_diameters", [0.01, 0.03, 0.1])
 @pytest.mark.parametrize("angle_deg", [0.0, 40.0])
 def test_noise_has_the_effect_that_error_propagation_predicts(noise_diameters: float, angle_deg: float) -> None:
-    truth, view, depth_m = exact([UPRIGHT, turned(angle_deg, 0.421)])
+    truth, depth_m = exact([UPRIGHT, turned(angle_deg, 0.421)])
+    found = view_crossings(truth)
     noise_m, rng = noise_diameters * D, np.random.default_rng(7)
     errors_mm = []
     for _ in range(300):
-        samples = samples_of(depth_m + noise_m * rng.standard_normal(len(depth_m)), truth, view)
+        samples = samples_of(depth_m + noise_m * rng.standard_normal(len(depth_m)), truth)
         errors_mm += samples["tie_along_error_mm"].tolist()
     assert len(errors_mm) >= 294
-    expected_mm = 1000 * predicted_sigma_m(view, noise_m)
+    expected_mm = 1000 * predicted_sigma_m(found, noise_m)
     # Tukey's biweight has an efficiency of 95 %, and 300 draws determine a deviation to 4 %.
     assert 0.92 * expected_mm < np.std(errors_mm) < 1.15 * expected_mm
     assert abs(np.mean(errors_mm)) < 4 * expected_mm / math.sqrt(300) + 0.02 * noise_m * 1000

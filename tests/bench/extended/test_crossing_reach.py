@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy import ndarray
 
-from rebar_depth_bench.extended.crossings.reach import Reach, reaches
+from rebar_depth_bench.extended.reach import Reach, reaches
 from rebar_depth_bench.scoring.bootstrap import Resampling, resample, resample_scenes
 
 VIEWS = 10

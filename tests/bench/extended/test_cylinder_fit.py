@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rebar_depth_bench.extended.inspection.cylinder_fit import CylinderFits, fit_cylinders
+from rebar_depth_bench.extended.fits import CylinderFits, fit_cylinders
 
 RADIUS_M, HALF_M = 0.008, 0.05
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy import ndarray
 
 from rebar_depth_bench.extended.depth_layers import DIRECTIONS, RADII_PX, layer_samples, other_layers
-from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.extended.steel import SteelTruth
 from tests.bench.extended.thin_scenes import (
     random_images,
     random_prediction,

@@ -8,22 +8,22 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from rebar_depth_bench.extended.measures import STATISTICS, Measure, Statistic
+from rebar_depth_bench.extended.measures import STATISTICS, Measure, Samples, Statistic
 from rebar_depth_bench.extended.result import estimate
 from rebar_depth_bench.scoring.bootstrap import resample
 
 RNG = np.random.default_rng(7)
-BY_VIEW = [RNG.normal(3.0, 1.0, size) for size in RNG.integers(0, 30, 300)]
+BY_VIEW = [{"s": RNG.normal(3.0, 1.0, size)} for size in RNG.integers(0, 30, 300)]
 INDICES = range(0, 300 * 12, 12)  # so far apart that each view is a block
 
 
 def measure(statistic: Statistic) -> Measure:
-    return Measure("m", "s", statistic, "M", "mm", "lower", "for this test")
+    return Measure("m", "M", "mm", "lower", "for this test", "s", statistic)
 
 
 @pytest.mark.parametrize("statistic", list(STATISTICS))
 def test_estimate_is_pooled_statistic_within_interval(statistic: Statistic) -> None:
-    pooled = np.concatenate(BY_VIEW)
+    pooled = np.concatenate([samples["s"] for samples in BY_VIEW])
     by_hand: dict[str, Callable[[np.ndarray], float]] = {
         "mean": np.mean,
         "median": np.median,
@@ -42,24 +42,25 @@ def test_estimate_is_pooled_statistic_within_interval(statistic: Statistic) -> N
     ("statistic", "truth"), [("mean", 3.0), ("median", 3.0), ("std", 1.0), ("p95", 3 + 1.6449)]
 )
 def test_interval_width_equals_spread_over_new_samples(statistic: Statistic, truth: float) -> None:
-    bounds = estimate(measure(statistic), BY_VIEW, resample(INDICES)).interval
+    pooled_estimate = estimate(measure(statistic), BY_VIEW, resample(INDICES))
+    bounds, samples = pooled_estimate.interval, pooled_estimate.samples
     assert bounds is not None
     rng = np.random.default_rng(1)
-    values = [STATISTICS[statistic](rng.normal(3, 1, sum(map(len, BY_VIEW)))) for _ in range(300)]
+    values = [STATISTICS[statistic](rng.normal(3, 1, samples)) for _ in range(300)]
     low, high = np.percentile(values, [2.5, 97.5])
     assert bounds[1] - bounds[0] == pytest.approx(high - low, rel=0.25)
     assert abs(np.mean(bounds) - truth) < high - low
 
 
 def test_views_and_tables_without_samples() -> None:
-    no_samples = [np.empty(0)] * 8
+    no_samples: list[Samples] = [{}] * 8
     assert estimate(measure("p95"), no_samples, resample(range(8))) == estimate(measure("mean"), [], resample([]))
-    one_view = [np.ones(3), *no_samples[1:]]
+    one_view = [{"s": np.ones(3)}, *no_samples[1:]]
     estimated = estimate(measure("mean"), one_view, resample(range(8)))
     assert (estimated.value, estimated.interval, estimated.samples) == (1.0, None, 3)
 
 
 def test_infinite_samples_have_no_interval() -> None:
-    samples = [np.array([1.0, math.inf])] * 10
+    samples = [{"s": np.array([1.0, math.inf])}] * 10
     assert estimate(measure("p95"), samples, resample(range(10))).value == math.inf
     assert estimate(measure("p95"), samples, resample(range(10))).interval is None

@@ -20,13 +20,13 @@ from rebar_depth_bench import DatasetError, score
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.bars import bars, read_bars, write_bars
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, measures_by_alignment, score_extended
 from rebar_depth_bench.extended.ground_truth import dilate_mask, load_steel_truth
-from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL
-from rebar_depth_bench.extended.predictions import NATIVE, ONCE, SCALED
+from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, NATIVE, ONCE, SCALED
+from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, measures_by_alignment, score_extended
 from rebar_depth_bench.extended.result import ExtendedResult
 from rebar_depth_bench.reporting.extended_tables import print_extended
-from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
+from rebar_depth_bench.scoring.evaluation import open_evaluation
+from rebar_depth_bench.submission import SubmissionReader
 
 Depths = dict[str, np.ndarray]
 Archive = Callable[..., Path]
@@ -34,7 +34,9 @@ Archive = Callable[..., Path]
 
 def extended(archive: Path, root: Path, workers: int = 2) -> ExtendedResult:
     with open_evaluation(archive, root) as evaluation:
-        return score_extended(score_evaluation(evaluation), evaluation, workers=workers)
+        result = score_extended(evaluation, workers=workers).extended
+    assert result is not None
+    return result
 
 
 def values(result: ExtendedResult, alignment: str) -> dict[str, float]:
@@ -165,7 +167,6 @@ def test_folder_without_bars_raises_dataset_error(
     tiny_truth: Depths, tiny_root: Path, archive_of: Archive, tmp_path: Path
 ) -> None:
     archive = archive_of(tiny_truth)
-    result = score(archive, tiny_root)
     for item in tiny_root.iterdir():
         if item.name != "bars.parquet":
             (tmp_path / item.name).symlink_to(item)
@@ -175,7 +176,7 @@ def test_folder_without_bars_raises_dataset_error(
             DatasetError, match=r"has no bars\.parquet, expected a complete dataset folder written by rebar-build"
         ),
     ):
-        score_extended(result, evaluation)
+        score_extended(evaluation)
 
 
 def test_damaged_bars_are_refused(
@@ -185,7 +186,6 @@ def test_damaged_bars_are_refused(
     copy = tmp_path / "copy"
     shutil.copytree(tiny_root, copy)
     archive = archive_of(tiny_truth)
-    result = score(archive, copy)
     scenes = read_bars(copy / "bars.parquet")
     scene, (bar, *others) = next(iter(scenes.items()))
     write_bars(copy / "bars.parquet", {**scenes, scene: (replace(bar, diameter_m=2 * bar.diameter_m), *others)})
@@ -193,13 +193,67 @@ def test_damaged_bars_are_refused(
         open_evaluation(archive, copy) as evaluation,
         pytest.raises(DatasetError, match=r"bars\.parquet: the SHA-256 is"),
     ):
-        score_extended(result, evaluation)
+        score_extended(evaluation)
     with pytest.raises(DatasetError, match=r"bars\.parquet: the SHA-256 is"):
         bars(copy)
 
 
+def test_each_prediction_is_read_once(
+    tiny_truth: Depths, tiny_root: Path, archive_of: Archive, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original, views = SubmissionReader.read, []
+
+    def read(reader: SubmissionReader, view_id: str) -> np.ndarray:
+        views.append(view_id)
+        return original(reader, view_id)
+
+    monkeypatch.setattr(SubmissionReader, "read", read)
+    extended(archive_of(tiny_truth), tiny_root)
+    assert sorted(views) == sorted(tiny_truth)
+
+
+NEW_MEASURE = """
+import numpy as np
+from rebar_depth_bench.extended.measures import Measure, MeasureFamily
+
+def samples(p_m, truth):
+    far = truth.interior & (np.abs(p_m - truth.depth_m) > 0.05)
+    return {"far_off": np.array([far.sum() / truth.interior.sum()])}
+
+MEASURES = (Measure("far_off", "Pixels off by 50 mm", "%", "", "share of interior pixels off by over 50 mm"),)
+FAMILIES = (MeasureFamily("far", "Gross errors", 11, MEASURES, samples),)
+"""
+USE_NEW_MEASURE = """
+import sys
+from rebar_depth_bench import extended
+extended.__path__.append(sys.argv.pop(1))
+from rebar_depth_bench.cli.main import main
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+def test_a_new_measure_is_one_file(
+    tiny_truth: Depths, tiny_root: Path, archive_of: Archive, tmp_path: Path
+) -> None:
+    """A module in the folder of the extended measures is in JSON, CSV, terminal and report."""
+    (tmp_path / "new").mkdir()
+    (tmp_path / "new/gross_errors.py").write_text(NEW_MEASURE)
+    archive = archive_of({view: 1.5 * depth for view, depth in tiny_truth.items()})
+    outputs = {name: tmp_path / f"out.{name}" for name in ("json", "html", "csv")}
+    options = ["--json", outputs["json"], "--html", outputs["html"], "--extended-csv", outputs["csv"]]
+    start = [sys.executable, "-c", USE_NEW_MEASURE, tmp_path / "new"]
+    command = [*start, "score", archive, "--data", tiny_root, *options]
+    terminal = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=True).stdout
+    table = json.loads(outputs["json"].read_text())["extended"]["tables"]["lattice"]
+    assert (table["native"]["far_off"]["value"], table["scaled"]["far_off"]["value"]) == (1.0, 0.0)
+    assert "far_off" in outputs["csv"].read_text()
+    for text in (terminal, outputs["html"].read_text()):
+        assert "Gross errors" in text
+        assert "Pixels off by 50 mm" in text
+
+
 @pytest.mark.slow
 def test_extended_imports_neither_torch_nor_opencv() -> None:
-    code = "import sys, rebar_depth_bench.extended.evaluate; print({'torch', 'cv2', 'bpy'} & set(sys.modules))"
+    code = "import sys, rebar_depth_bench.extended.registry; print({'torch', 'cv2', 'bpy'} & set(sys.modules))"
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert process.stdout.strip() == "set()"

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy import ndarray
 
-from rebar_depth_bench.extended.full_mask import MEASURES, full_mask_samples
-from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.extended.regions import FULL_MASK_MEASURES, region_samples
+from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.score import ViewTruth, score_view
 from tests.bench.extended.thin_scenes import random_prediction, random_truth, steel_truth, with_holes
 
@@ -20,7 +20,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 
 def scores(p_m: ndarray, truth: SteelTruth) -> dict[str, float]:
-    return {name: float(values[0]) for name, values in full_mask_samples(p_m, truth).items() if len(values)}
+    return {name: float(values[0]) for name, values in region_samples(p_m, truth).items() if len(values)}
 
 
 def test_golden_case_by_hand() -> None:
@@ -72,7 +72,7 @@ def test_holes_never_raise_shares(seed: int, share: float) -> None:
     truth = random_truth(rng)
     p_m = random_prediction(rng, truth)
     before, after = scores(p_m, truth), scores(with_holes(rng, p_m, share), truth)
-    ranked = [measure.sample for measure in MEASURES if measure.better]
+    ranked = [measure.sample for measure in FULL_MASK_MEASURES if measure.better]
     assert len(ranked) == 10
     assert all(after[name] <= before[name] for name in ranked)
 

@@ -11,27 +11,26 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.extended.fits import MISS_MM
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
-from rebar_depth_bench.extended.inspection.evaluate import inspection_samples
-from rebar_depth_bench.extended.inspection.measures import INSPECTION_MEASURES, MISS_MM
-from rebar_depth_bench.extended.inspection.segments import cage_truth
-from rebar_depth_bench.extended.inspection.tolerances import PROFILES, pass_sample
+from rebar_depth_bench.extended.inspection import INSPECTION_MEASURES, PROFILES, inspection_samples
 from rebar_depth_bench.extended.measures import STATISTICS, Samples
+from rebar_depth_bench.extended.steel import SceneBars
 from rebar_depth_bench.geometry.cameras import rotation_matrix
 from tests.bench.extended.cage_scenes import bar, mat, predicted_m, view
 
-TRUTH, CAGE = view(mat())
+TRUTH = view(mat())
 EXACT_M = TRUTH.depth_m.astype(np.float64)
 DETECTED_BARS_ONLY = (
     "axis_offset_mm",
     "axis_tilt_deg",
     *(f"{kind}_error_mm" for kind in ("spacing", "layer", "cover", "diameter")),
 )
-HIGHER_IS_BETTER = ("bar_found", *(pass_sample(t) for profile in PROFILES for t in profile.tolerances))
+HIGHER_IS_BETTER = ("bar_found", *(t.pass_name for profile in PROFILES for t in profile.tolerances))
 
 
 def samples_of(p_m: np.ndarray) -> Samples:
-    return inspection_samples(p_m, TRUTH, CAGE)
+    return inspection_samples(p_m, TRUTH)
 
 
 def test_ground_truth_of_smooth_bars_is_perfect() -> None:
@@ -102,19 +101,19 @@ def test_tilt_of_bar_is_measured() -> None:
 
 @pytest.mark.parametrize(("lean_m", "found"), [(0.018, 1), (0.028, 0)])
 def test_bar_displaced_at_its_ends_is_not_found(lean_m: float, found: int) -> None:
-    truth, cage = view([bar(i, (x, -0.14, 0.4), (x, 0.14, 0.4)) for i, x in ((1, 0.0), (2, 0.04))])
+    truth = view([bar(i, (x, -0.14, 0.4), (x, 0.14, 0.4)) for i, x in ((1, 0.0), (2, 0.04))])
     leaning = bar(1, (0.0, -0.14, 0.4 - lean_m), (0.0, 0.14, 0.4 + lean_m))
     other = bar(2, (0.04, -0.14, 0.4), (0.04, 0.14, 0.4))
-    samples = inspection_samples(predicted_m([leaning, other], truth), truth, cage)
+    samples = inspection_samples(predicted_m([leaning, other], truth), truth)
     # The middle of the bar does not move; half the distance to the other bar is 20 mm.
     assert samples["bar_found"].tolist() == [found, 1]
 
 
 def test_noise_does_not_tilt_a_receding_bar() -> None:
-    truth, cage = view([bar(1, (-0.1, 0.0, 0.4), (0.06, 0.0, 0.8))])
+    truth = view([bar(1, (-0.1, 0.0, 0.4), (0.06, 0.0, 0.8))])
     exact_m = truth.depth_m.astype(np.float64)
     tilts_deg = [
-        inspection_samples(exact_m + 0.05 * rng.standard_normal(len(exact_m)), truth, cage)["axis_tilt_deg"]
+        inspection_samples(exact_m + 0.05 * rng.standard_normal(len(exact_m)), truth)["axis_tilt_deg"]
         for rng in map(np.random.default_rng, range(20))
     ]
     assert np.median(np.concatenate(tilts_deg)) < 2.5
@@ -176,9 +175,9 @@ def test_measures_are_independent_of_world_frame_and_ids(
         ends_m = np.array(steel.axis_m) @ rotation.T + np.array(shift_m)
         moved.append(replace(steel, bar_id=bar_id, axis_m=tuple(map(tuple, ends_m.tolist()))))
     bar_id = np.concatenate([[0], ids])[TRUTH.bar_id].astype(np.uint16)
-    truth = replace(TRUTH, cam_from_world=cam_from_world, bar_id=bar_id)
+    truth = replace(TRUTH, cam_from_world=cam_from_world, bar_id=bar_id, bars=SceneBars.of(moved))
     p_m = EXACT_M * 1.01 + 0.002 * np.random.default_rng(0).standard_normal(len(EXACT_M))
-    before, after = samples_of(p_m), inspection_samples(p_m, truth, cage_truth(moved))
+    before, after = samples_of(p_m), inspection_samples(p_m, truth)
     for name, values in before.items():
         np.testing.assert_allclose(np.sort(after[name]), np.sort(values), atol=1e-6, err_msg=name)
 
@@ -216,13 +215,9 @@ def test_extreme_values_do_not_affect_other_pixels() -> None:
 
 def test_no_visible_segment_gives_empty_samples() -> None:
     truth = replace(TRUTH, run=np.full_like(TRUTH.run, -1))
-    assert all(len(values) == 0 for values in inspection_samples(EXACT_M, truth, CAGE).values())
-    assert all(len(values) == 0 for values in inspection_samples(EXACT_M, truth, cage_truth([])).values())
-
-
-def test_prediction_of_wrong_length_raises_value_error() -> None:
-    with pytest.raises(ValueError, match="p_m has shape"):
-        samples_of(EXACT_M[:-1])
+    assert all(len(values) == 0 for values in inspection_samples(EXACT_M, truth).values())
+    no_bars = replace(truth, bars=SceneBars.of(()))
+    assert all(len(values) == 0 for values in inspection_samples(EXACT_M, no_bars).values())
 
 
 def test_samples_are_deterministic_and_input_is_unchanged() -> None:
@@ -250,8 +245,7 @@ def test_rendered_truth_is_perfect_up_to_ribs(tiny_root: Path) -> None:
     offsets_mm, detected = [], []
     for number in range(len(steel)):
         truth = steel.view(number)
-        cage = steel.bars_by_view[truth.view_id].cage
-        samples = inspection_samples(truth.depth_m.astype(np.float64), truth, cage)
+        samples = inspection_samples(truth.depth_m.astype(np.float64), truth)
         offsets_mm.append(samples["axis_offset_mm"])
         detected.append(samples["bar_found"])
     assert len(np.concatenate(detected)) > 0

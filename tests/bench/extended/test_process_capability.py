@@ -14,48 +14,40 @@ from hypothesis import given
 from hypothesis import strategies as st
 from rich.console import Console
 
-from rebar_depth_bench.extended.evaluate import measures_by_alignment
-from rebar_depth_bench.extended.inspection.measures import (
+from rebar_depth_bench.extended.fits import MISS_MM
+from rebar_depth_bench.extended.inspection import (
     CAPABILITY_MEASURES,
-    MISS_MM,
-    capability_name,
-    defined_capability,
+    PROFILES,
+    TOLERANCES,
+    capability,
 )
-from rebar_depth_bench.extended.inspection.tolerances import GB_50204, TOLERANCES
-from rebar_depth_bench.extended.measures import Measure
-from rebar_depth_bench.extended.predictions import NATIVE, ONCE, SCALED
+from rebar_depth_bench.extended.measures import NATIVE, ONCE, SCALED, Measure
+from rebar_depth_bench.extended.registry import measures_by_alignment
 from rebar_depth_bench.extended.result import (
     ExtendedResult,
     ExtendedTable,
-    ExtendedView,
     MeasureEstimate,
+    ViewSamples,
     convert_estimate,
     tabulate_extended,
     view_numbers,
-    view_value,
 )
 from rebar_depth_bench.reporting.extended_tables import extended_csv, print_extended
 from rebar_depth_bench.scoring.bootstrap import resample
 from tests.bench.reporting.results import result, scored_view
 
-SPACING, STIRRUPS = GB_50204.tolerances[:2]
+SPACING, STIRRUPS = PROFILES[0].tolerances[:2]
 BY_NAME = {measure.name: measure for measures in measures_by_alignment().values() for measure in measures}
 VIEWS = 8
 
 
-def view(index: int, filled: Mapping[str, np.ndarray]) -> ExtendedView:
+def view(filled: Mapping[str, np.ndarray]) -> ViewSamples:
     """Return a view whose only samples are those of ``filled``, the same for every alignment."""
-    samples = {
-        alignment: {
-            measure.sample: np.asarray(filled.get(measure.sample, np.empty(0)), np.float64) for measure in measures
-        }
-        for alignment, measures in measures_by_alignment().items()
-    }
-    return ExtendedView(f"lattice/{index:04d}", samples)
+    return dict.fromkeys((ONCE, NATIVE, SCALED), filled)
 
 
 def table_of(filled: list[dict[str, np.ndarray]]) -> ExtendedTable:
-    views = [view(100 * index, samples) for index, samples in enumerate(filled)]
+    views = [view(samples) for samples in filled]
     return tabulate_extended(views, resample(range(0, 100 * len(views), 100)), measures_by_alignment())
 
 
@@ -69,7 +61,7 @@ def measure_of(tolerance_index: int = 0) -> Measure:
 
 
 def test_each_tolerance_has_one_capability_per_alignment() -> None:
-    names = [capability_name(tolerance) for _, tolerance in TOLERANCES]
+    names = [tolerance.capability_name for _, tolerance in TOLERANCES]
     assert [measure.name for measure in CAPABILITY_MEASURES] == names
     listed = measures_by_alignment()
     for alignment in (NATIVE, SCALED):
@@ -131,7 +123,7 @@ def test_p95_measure_is_not_converted() -> None:
 @given(st.floats(1e-3, 99.0), st.floats(1e-3, 99.0), st.floats(0.1, 1000.0))
 def test_capability_decreases_with_error(one_mm: float, other_mm: float, limit_mm: float) -> None:
     small, large = sorted((one_mm, other_mm))
-    better, worse = defined_capability(limit_mm, small), defined_capability(limit_mm, large)
+    better, worse = capability(limit_mm, small), capability(limit_mm, large)
     assert better is not None
     assert worse is not None
     assert better >= worse > 0
@@ -154,22 +146,22 @@ def test_missing_bars_never_raise_capability() -> None:
     assert values[-1] is None
 
 
+def capability_of(one: ViewSamples) -> float | None:
+    return view_numbers(one, measures_by_alignment())[NATIVE][SPACING.capability_name]
+
+
 def test_single_view_has_capability() -> None:
-    measured = view(0, {"spacing_judged_mm": np.full(10, 4.0)})
-    assert view_value(measured, NATIVE, BY_NAME[capability_name(SPACING)]) == 2.5
-    missed = view(0, {"spacing_judged_mm": np.full(10, MISS_MM)})
-    assert view_value(missed, NATIVE, BY_NAME[capability_name(SPACING)]) is None
-    assert view_value(view(0, {}), NATIVE, BY_NAME[capability_name(SPACING)]) is None
+    measured = view({"spacing_judged_mm": np.full(10, 4.0)})
+    assert capability_of(measured) == 2.5
+    missed = view({"spacing_judged_mm": np.full(10, MISS_MM)})
+    assert capability_of(missed) is None
+    assert capability_of(view({})) is None
 
 
 def extended_of(filled: list[dict[str, np.ndarray]]) -> ExtendedResult:
-    views = [view(100 * index, samples) for index, samples in enumerate(filled)]
-    table = tabulate_extended(views, resample(range(0, 100 * len(views), 100)), measures_by_alignment())
-    return ExtendedResult(
-        measures_by_alignment(),
-        {"lattice": table},
-        [view_numbers(item, measures_by_alignment()) for item in views],
-    )
+    measures = measures_by_alignment()
+    views = {f"lattice/{100 * index:04d}": view_numbers(view(one), measures) for index, one in enumerate(filled)}
+    return ExtendedResult(measures, {"lattice": table_of(filled)}, views)
 
 
 def test_json_and_csv_contain_capability() -> None:
@@ -194,7 +186,7 @@ def terminal_text(extended: ExtendedResult, width: int = 100) -> str:
     return console.export_text()
 
 
-def test_terminal_prints_defined_and_undefined_capability() -> None:
+def test_terminal_prints_defined_and_uncapability() -> None:
     text = terminal_text(extended_of(spacings()))
     numbers = table_of(spacings()).numbers[NATIVE]
     line = next(line for line in text.splitlines() if "bar spacing: 10 mm / p95" in line)

@@ -16,7 +16,7 @@ from tests.bench.extended.steel import steel_truth
 
 
 def bin_values(p: np.ndarray, z: np.ndarray, bar_id: np.ndarray, diameter_m: np.ndarray) -> dict[str, float]:
-    samples = profile_samples(p, steel_truth(z, bar_id), diameter_m)
+    samples = profile_samples(p, steel_truth(z, bar_id, diameter_m=diameter_m))
     return {name: value[0] for name, value in samples.items() if len(value)}
 
 
@@ -60,7 +60,7 @@ def test_every_bin_has_a_measure() -> None:
     names = {measure.sample for measure in MEASURES}
     assert len(names) == len(MEASURES) == 4 * (len(DISTANCE_EDGES_M) - 1) + 2 * (len(WIDTH_EDGES_PX) - 1)
     z = np.full(60, 0.35)
-    assert set(profile_samples(z, steel_truth(z), np.array([np.nan, 0.01]))) == names
+    assert set(profile_samples(z, steel_truth(z, diameter_m=np.array([np.nan, 0.01])))) == names
     for edge in DISTANCE_EDGES_M[:-1]:
         z = np.full(60, np.float32(edge) + np.float32(1e-6))
         assert any(f"{edge:g}-" in name for name in bin_values(z, z, np.ones(60), np.array([np.nan, 1e-6])))

@@ -7,13 +7,8 @@ import pytest
 
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.errors import DatasetError
-from rebar_depth_bench.extended.inspection import segments as segments_module
-from rebar_depth_bench.extended.inspection.segments import (
-    MAX_MATCH_RADIUS_M,
-    CageTruth,
-    assign_segments,
-    cage_truth,
-)
+from rebar_depth_bench.extended import axes
+from rebar_depth_bench.extended.axes import MAX_MATCH_RADIUS_M, CageTruth, assign_segments, cage_truth
 from tests.bench.extended.cage_scenes import bar
 
 
@@ -37,27 +32,27 @@ L_BAR = polyline(np.concatenate([[[0, 0, 0]], BEND, [[0.225, 0.175, 0]]]))
 
 
 def test_bent_bar_has_a_segment_on_each_side_of_bend() -> None:
-    segments = cage_truth([L_BAR]).segments
-    assert [segment.bar_id for segment in segments] == [1, 1]
-    np.testing.assert_allclose([(*segment.start_m, *segment.end_m) for segment in segments], [
+    cage = cage_truth([L_BAR])
+    assert cage.bar_id.tolist() == [1, 1]
+    np.testing.assert_allclose(np.column_stack([cage.start_m, cage.end_m]), [
         (0, 0, 0, 0.2, 0, 0), (0.225, 0.025, 0, 0.225, 0.175, 0),
     ], atol=1e-12)  # fmt: skip
 
 
 def test_collinear_pieces_and_repeated_points_are_merged() -> None:
     points = np.array([[0, 0, 0], [0.1, 0.0005, 0], [0.1, 0.0005, 0], [0.2, 0, 0], [0.5, 0.001, 0]])
-    (segment,) = cage_truth([polyline(points)]).segments
-    assert (segment.start_m, segment.end_m) == ((0, 0, 0), (0.5, 0.001, 0))
+    cage = cage_truth([polyline(points)])
+    assert (cage.start_m.tolist(), cage.end_m.tolist()) == ([[0, 0, 0]], [[0.5, 0.001, 0]])
 
 
 @pytest.mark.parametrize("steps", [72, 720, 7200])
 def test_hoop_has_no_segment_at_any_resolution(steps: int) -> None:
-    assert cage_truth([polyline(arc(0.4, 0, 300, steps))]).segments == ()
+    assert len(cage_truth([polyline(arc(0.4, 0, 300, steps))])) == 0
 
 
 def test_short_straight_pieces_are_no_segments() -> None:
-    assert len(cage_truth([bar(1, (0, 0, 0), (0.041, 0, 0), 0.01)]).segments) == 1
-    assert cage_truth([bar(1, (0, 0, 0), (0.039, 0, 0), 0.01)]).segments == ()
+    assert len(cage_truth([bar(1, (0, 0, 0), (0.041, 0, 0), 0.01)])) == 1
+    assert len(cage_truth([bar(1, (0, 0, 0), (0.039, 0, 0), 0.01)])) == 0
 
 
 def test_grid_neighbours_exclude_diagonals() -> None:
@@ -133,11 +128,9 @@ def test_points_of_other_bars_belong_to_no_segment() -> None:
     assert assign_segments(
         np.array([[0.1, 0, 0.005]]), np.array([1], dtype=np.uint16), cage_truth([])
     ).tolist() == [-1]
-    with pytest.raises(ValueError, match=r"points_m has shape \(1, 3\)"):
-        assign_segments(np.zeros((1, 3)), np.zeros(2, dtype=np.uint16), cage)
 
 
 def test_too_many_segments_raise_dataset_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(segments_module, "MAX_SEGMENTS", 1)
+    monkeypatch.setattr(axes, "MAX_SEGMENTS", 1)
     with pytest.raises(DatasetError, match="2 straight runs, expected up to 1"):
         cage_truth([L_BAR])

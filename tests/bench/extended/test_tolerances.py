@@ -4,30 +4,20 @@ from __future__ import annotations
 
 import math
 
-import pytest
-
-from rebar_depth_bench.extended.inspection.measures import INSPECTION_MEASURES
-from rebar_depth_bench.extended.inspection.tolerances import (
+from rebar_depth_bench.extended.fits import MISS_MM
+from rebar_depth_bench.extended.inspection import (
+    INSPECTION_MEASURES,
     PROFILES,
     TOLERANCES,
-    pass_sample,
-    process_capability,
+    capability,
 )
 
 
 def test_capability_is_tolerance_over_p95() -> None:
-    assert process_capability(10.0, 4.0) == 2.5
-    assert process_capability(5.0, 20.0) == 0.25
-    assert process_capability(5.0, math.inf) == 0.0
-    assert process_capability(5.0, 0.0) == math.inf
-
-
-@pytest.mark.parametrize(
-    "values", [(0.0, 1.0), (-1.0, 1.0), (math.nan, 1.0), (math.inf, 1.0), (5.0, -1.0), (5.0, math.nan)]
-)
-def test_invalid_tolerance_or_error_raises_value_error(values: tuple[float, float]) -> None:
-    with pytest.raises(ValueError, match="expected"):
-        process_capability(*values)
+    assert capability(10.0, 4.0) == 2.5
+    assert capability(5.0, 20.0) == 0.25
+    assert capability(5.0, 0.0) == math.inf
+    assert capability(5.0, MISS_MM) is None
 
 
 def test_tolerances_use_p95_measures_that_count_misses() -> None:
@@ -38,7 +28,7 @@ def test_tolerances_use_p95_measures_that_count_misses() -> None:
         name = f"{tolerance.kind}_p95_mm"
         assert measures[name].statistic == "p95"
         assert measures[name].sample == f"{tolerance.kind}_judged_mm"
-        assert f"{tolerance.limit_mm:g} mm" in measures[pass_sample(tolerance)].title
+        assert f"{tolerance.limit_mm:g} mm" in measures[tolerance.pass_name].title
 
 
 def test_keys_are_unique_and_sources_are_declared() -> None:

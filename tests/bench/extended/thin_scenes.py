@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy import ndarray
 
-from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.geometry.cameras import ideal_K, pixel_rays
 from rebar_depth_bench.scoring.protocol import interior, single_bar_pixels
 

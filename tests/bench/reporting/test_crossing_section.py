@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,14 +12,13 @@ from rich.console import Console
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.data.files import file_sha256
-from rebar_depth_bench.extended.crossings.config import config_reaches
-from rebar_depth_bench.extended.evaluate import score_extended
+from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, score_extended
 from rebar_depth_bench.extended.result import ExtendedResult
 from rebar_depth_bench.reporting.crossing_texts import reach_sentence
 from rebar_depth_bench.reporting.extended_tables import print_extended
 from rebar_depth_bench.reporting.html.crossing_picture import error_kind
 from rebar_depth_bench.reporting.html.page import look_at_views, write_report
-from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
+from rebar_depth_bench.scoring.evaluation import open_evaluation
 from tests.bench.extended.cage_scenes import HEIGHT, WIDTH
 from tests.mat_dataset import CONFIG, VIEWS, write_mat_dataset
 
@@ -47,7 +45,9 @@ def archive_of(path: Path, depths: Depths, shift_mm: dict[int, float], config: s
 
 def extended(archive: Path, root: Path) -> ExtendedResult:
     with open_evaluation(archive, root) as evaluation:
-        return score_extended(score_evaluation(evaluation), evaluation)
+        result = score_extended(evaluation).extended
+    assert result is not None
+    return result
 
 
 def test_measures_of_a_config_pool_its_views(mat: tuple[Path, Depths], tmp_path: Path) -> None:
@@ -81,8 +81,7 @@ def test_report_shows_crossings_by_error(mat: tuple[Path, Depths], tmp_path: Pat
     root, depths = mat
     archive = archive_of(tmp_path / "a.zip", depths, {0: 3.0})
     with open_evaluation(archive, root) as evaluation:
-        result = score_evaluation(evaluation)
-        result = replace(result, extended=score_extended(result, evaluation))
+        result = score_extended(evaluation)
         picture = look_at_views(evaluation, {}, crossings=True).pictures[CONFIG]
         write_report(result, evaluation, tmp_path / "report.html")
     assert (picture.view_id, picture.width, picture.height) == (f"{CONFIG}/0000", WIDTH, HEIGHT)
@@ -135,11 +134,13 @@ def test_reaches_without_the_other_measures_are_the_same(mat: tuple[Path, Depths
     root, depths = mat
     archive = archive_of(tmp_path / "a.zip", depths, {0: 3.0})
     with open_evaluation(archive, root) as evaluation:
-        scales = {view.view_id: view.scale for view in score_evaluation(evaluation).views}
-        [config] = [config for config in evaluation.configs if config.name == CONFIG]
-        found = config_reaches(evaluation, config, scales)
-    assert dict(found.by_alignment) == extended(archive, root).tables[CONFIG].reaches
+        found = score_extended(evaluation, [MEASURE_FAMILIES["crossings"]]).extended
+    assert found is not None
+    assert found.tables[CONFIG].reaches == extended(archive, root).tables[CONFIG].reaches
+    heads = {measure.name.partition("_")[0] for measure in found.measures["native"]}
+    assert heads == {"crossing", "crossings", "tie"}
     content = json.loads(json.dumps(found.to_dict()))
     assert content["crossings"]["file"] == "crossings.parquet"
-    assert [reach["limit_mm"] for reach in content["native"]] == [5, 2]
-    assert sum(one["crossings"] for one in content["native"][0]["bins"]) == 4 * VIEWS
+    reaches = content["tables"][CONFIG]["crossing_reach"]["native"]
+    assert [reach["limit_mm"] for reach in reaches] == [5, 2]
+    assert sum(one["crossings"] for one in reaches[0]["bins"]) == 4 * VIEWS

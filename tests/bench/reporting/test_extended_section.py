@@ -9,15 +9,14 @@ import re
 import numpy as np
 import pytest
 
-from rebar_depth_bench.extended.evaluate import MEASURE_FAMILIES, measures_by_alignment
-from rebar_depth_bench.extended.inspection.measures import CAPABILITY_MEASURES, MISS_MM
-from rebar_depth_bench.extended.inspection.tolerances import PROFILES
-from rebar_depth_bench.extended.measures import Measure, Statistic
-from rebar_depth_bench.extended.predictions import NATIVE, SCALED
+from rebar_depth_bench.extended.fits import MISS_MM
+from rebar_depth_bench.extended.inspection import CAPABILITY_MEASURES, PROFILES
+from rebar_depth_bench.extended.measures import NATIVE, SCALED, Measure, Statistic
+from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, measures_by_alignment
 from rebar_depth_bench.extended.result import (
     ExtendedResult,
-    ExtendedView,
     MeasureEstimate,
+    ViewSamples,
     tabulate_extended,
     view_numbers,
 )
@@ -62,7 +61,7 @@ LEVELS = {
 """Mean of each view's samples by name; scaled samples are half of it."""
 
 
-def make_view(config: str, index: int, levels: dict[str, float]) -> ExtendedView:
+def make_view(index: int, levels: dict[str, float]) -> ViewSamples:
     rng = np.random.default_rng(index)
     samples = {}
     for alignment, measures in measures_by_alignment().items():
@@ -73,28 +72,19 @@ def make_view(config: str, index: int, levels: dict[str, float]) -> ExtendedView
             spread = 0.0 if level == MISS_MM else 0.01 * level
             samples_by_name[name] = factor * (level + spread * rng.uniform(-1, 1, 4))
         samples[alignment] = samples_by_name
-    return ExtendedView(f"{config}/{index:04d}", samples)
+    return samples
 
 
 def make_extended(*configs: str, levels: dict[str, float] | None = None, views: int = VIEWS) -> ExtendedResult:
     measures = measures_by_alignment()
-    by_config = {
-        config: [make_view(config, index, LEVELS if levels is None else levels) for index in INDICES[:views]]
+    of_config = {index: make_view(index, LEVELS if levels is None else levels) for index in INDICES[:views]}
+    table = tabulate_extended(list(of_config.values()), resample(INDICES[:views]), measures)
+    numbers = {
+        f"{config}/{index:04d}": view_numbers(one, measures)
         for config in configs
+        for index, one in of_config.items()
     }
-    tables = {
-        config: tabulate_extended(config_views, resample(INDICES[:views]), measures)
-        for config, config_views in by_config.items()
-    }
-    return ExtendedResult(
-        measures,
-        tables,
-        [
-            view_numbers(extended_view, measures)
-            for config_views in by_config.values()
-            for extended_view in config_views
-        ],
-    )
+    return ExtendedResult(measures, dict.fromkeys(configs, table), numbers)
 
 
 def result_with_extended(extended: ExtendedResult | None, *configs: str) -> Result:
@@ -270,7 +260,7 @@ def test_section_keeps_config_order() -> None:
 
 
 def make_measure(unit: str, statistic: Statistic = "mean") -> Measure:
-    return Measure("m", "s", statistic, "M", unit, "", "for this test")
+    return Measure("m", "M", unit, "", "for this test", "s", statistic)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -14,16 +15,14 @@ from hypothesis import strategies as st
 from numpy import ndarray
 
 import rebar_depth_bench as rdb
-from rebar_depth_bench.extended.full_mask import REGION_NUMBERS, full_mask_samples
+from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.extended.ground_truth import load_steel_truth
 from rebar_depth_bench.extended.profiles import DISTANCE_EDGES_M, MIN_PIXELS, profile_samples
-from rebar_depth_bench.extended.single_bar import single_bar_samples
-from rebar_depth_bench.scoring.columns import METRICS
-from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
+from rebar_depth_bench.extended.regions import REGION_NUMBERS, region_samples
+from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, score_extended
+from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.protocol import interior, scored_pixels, single_bar_pixels
-from rebar_depth_bench.scoring.score import SingleBarScore, mean_single_bar, single_bar_scores
-from rebar_depth_bench.scoring.truth import config_truth
 from tests.bench.extended.thin_scenes import random_images, random_prediction, random_truth, steel_truth
-from tests.ground_truth import truth_of
 
 Depths = dict[str, ndarray]
 Archive = Callable[..., Path]
@@ -58,7 +57,7 @@ def test_pixels_equal_a_loop(seed: int) -> None:
     pixels = scored_pixels(bars > 0, depth_m)
     assert single_bar_pixels(bars, pixels).tolist() == expected_pixels(bars, pixels)
     truth = steel_truth(depth_m, bars)
-    assert all(0 <= share <= 1 for share in single_bar_samples(truth.depth_m, truth)["single_bar_share"])
+    assert all(0 <= share <= 1 for share in region_samples(truth.depth_m, truth)["single_bar_share"])
 
 
 @settings(max_examples=30)
@@ -80,7 +79,7 @@ def test_one_bar_has_the_whole_interior(seed: int) -> None:
     truth = steel_truth(depth_m, one)
     if truth.interior.any():
         p_m = truth.depth_m.astype(np.float64)
-        assert single_bar_samples(p_m, truth)["single_bar_share"] == [1.0]
+        assert region_samples(p_m, truth)["single_bar_share"] == [1.0]
 
 
 @settings(max_examples=40)
@@ -91,13 +90,13 @@ def test_measures_equal_numpy_on_the_chosen_pixels(seed: int) -> None:
     p_m = random_prediction(rng, truth)
     chosen = truth.single_bar
     assert not (chosen & ~truth.interior).any()
-    samples = {name: values.tolist() for name, values in single_bar_samples(p_m, truth).items()}
+    samples = {name: values.tolist() for name, values in region_samples(p_m, truth).items()}
     count = np.count_nonzero(truth.interior)
     assert samples["single_bar_share"] == ([np.count_nonzero(chosen) / count] if count else [])
     with np.errstate(invalid="ignore"):
         valid = chosen & np.isfinite(p_m) & (p_m > 0)
     if not chosen.any():
-        assert all(samples[f"single_bar_{name}"] == [] for name in REGION_NUMBERS)
+        assert not any(f"single_bar_{name}" in samples for name in REGION_NUMBERS)
         return
     assert samples["single_bar_coverage"] == [np.count_nonzero(valid) / np.count_nonzero(chosen)]
     z, p = truth.depth_m[valid].astype(np.float64), p_m[valid]
@@ -114,10 +113,22 @@ def test_shift_by_one_pixel_costs_less_on_single_bars() -> None:
     depth_m[:, 7:13] = 0.8
     truth = steel_truth(depth_m, bars)
     shifted_m = np.roll(depth_m, 1, axis=1).astype(np.float64).ravel()[truth.index]
-    samples = single_bar_samples(shifted_m, truth)
+    samples = region_samples(shifted_m, truth)
     assert samples["single_bar_abs_rel"] == [0.0]
-    assert samples["single_bar_views_abs_rel"] == full_mask_samples(shifted_m, truth)["interior_abs_rel"]
-    assert full_mask_samples(shifted_m, truth)["interior_abs_rel"][0] > 0.03
+    assert samples["single_bar_views_abs_rel"] == samples["interior_abs_rel"]
+    assert samples["interior_abs_rel"][0] > 0.03
+
+
+def test_steel_without_a_bar_id_is_scored_but_in_no_region() -> None:
+    """Imported masks may have steel without a bar id: it counts in the interior that single bars stand beside."""
+    depth_m, bars = np.full((9, 14), 0.5, np.float32), np.ones((9, 14), np.uint16)
+    truth = steel_truth(depth_m, bars)
+    no_id = truth.index % 14 >= 7
+    truth = replace(truth, bar_id=np.where(no_id, 0, truth.bar_id), single_bar=truth.single_bar & ~no_id)
+    samples = region_samples(np.where(no_id, 1.0, 0.5), truth)
+    assert samples["interior_abs_rel"] == samples["single_bar_abs_rel"] == [0.0]
+    assert samples["single_bar_views_abs_rel"] == samples["single_bar_share"] == [0.5]
+    assert samples["full_mask_coverage"] == [1.0]
 
 
 def test_profile_bins_equal_numpy() -> None:
@@ -127,7 +138,7 @@ def test_profile_bins_equal_numpy() -> None:
     truth = steel_truth(z_m, bars)
     p_m = truth.depth_m * rng.uniform(0.9, 1.1, len(truth.index))
     p_m[rng.random(len(p_m)) < 0.2] = math.nan
-    samples = profile_samples(p_m, truth, np.full(70_000, 0.01))
+    samples = profile_samples(p_m, truth)
     filled = 0
     for low, high in pairwise(DISTANCE_EDGES_M):
         inside = truth.interior & (truth.depth_m >= low) & (truth.depth_m < high)
@@ -147,7 +158,7 @@ def test_share_and_error_use_the_same_bins() -> None:
     """A depth at the edge of two bins, which float32 rounds down, is in one bin for both numbers."""
     z_m = np.full((20, 20), np.float32(0.7))
     truth = steel_truth(z_m, np.ones(z_m.shape, np.uint16))
-    samples = profile_samples(truth.depth_m.astype(np.float64), truth, np.full(9, 0.01))
+    samples = profile_samples(truth.depth_m.astype(np.float64), truth)
     filled = {name.rpartition("_")[2] for name, values in samples.items() if len(values) and name.endswith("m")}
     assert filled == {"0.5-0.7m"}
 
@@ -155,10 +166,9 @@ def test_share_and_error_use_the_same_bins() -> None:
 def test_view_without_single_bar_pixels_has_no_errors() -> None:
     bars = np.indices((9, 9)).sum(axis=0).astype(np.uint16) % 2 + 1
     truth = steel_truth(np.ones((9, 9), np.float32), bars)
-    samples = single_bar_samples(truth.depth_m.astype(np.float64), truth)
-    assert {name: values.tolist() for name, values in samples.items() if len(values)} == {
-        "single_bar_share": [0.0]
-    }
+    samples = region_samples(truth.depth_m.astype(np.float64), truth)
+    single_bar = {name: values for name, values in samples.items() if name.startswith("single_bar")}
+    assert single_bar == {"single_bar_share": [0.0]}
 
 
 def rendered(root: Path, config: str) -> Mapping[str, tuple[ndarray, ndarray, ndarray]]:
@@ -170,46 +180,44 @@ def rendered(root: Path, config: str) -> Mapping[str, tuple[ndarray, ndarray, nd
 
 
 def test_rendered_views(tiny_root: Path) -> None:
-    truths = truth_of(tiny_root, "lattice")
+    folder = open_folder(tiny_root)
+    steel = load_steel_truth(folder, folder.config("lattice"))
     images = rendered(tiny_root, "lattice")
     shares = []
-    for truth in truths:
+    for truth in map(steel.view, range(len(steel))):
         bars, inside, _ = images[truth.view_id]
-        single_bar = truth.single_bar
-        assert single_bar is not None
-        assert np.array_equal(truth.index, np.flatnonzero(inside))
-        assert single_bar.tolist() == expected_pixels(bars, truth.index)
+        pixels, single_bar = truth.index[truth.interior], truth.single_bar[truth.interior]
+        assert np.array_equal(pixels, np.flatnonzero(inside))
+        assert single_bar.tolist() == expected_pixels(bars, pixels)
+        assert not truth.single_bar[~truth.interior].any()
         shares.append(single_bar.mean())
     assert min(shares) < max(shares) < 1
 
 
-def test_scores_of_a_config_are_those_of_its_pixels(
+def test_measures_of_a_config_are_those_of_its_pixels(
     tiny_root: Path, tiny_truth: Depths, archive_of: Archive
 ) -> None:
     rng = np.random.default_rng(5)
     noisy = {view: z * rng.uniform(0.8, 1.3, z.shape).astype(np.float32) for view, z in tiny_truth.items()}
     with open_evaluation(archive_of(noisy), tiny_root) as evaluation:
-        views = score_evaluation(evaluation).views
-        truths = config_truth(evaluation.folder, evaluation.configs[0])
-        scores = single_bar_scores(truths, evaluation.submission.read, views)
+        extended = score_extended(evaluation, [MEASURE_FAMILIES["single_bar"]]).extended
+    assert extended is not None
     images = rendered(tiny_root, "lattice")
-    for view, score in zip(views, scores, strict=True):
-        bars, inside, z_m = images[view.view_id]
+    for view_id, view in extended.views.items():
+        bars, inside, z_m = images[view_id]
         pixels = np.flatnonzero(inside)
         chosen = pixels[np.array(expected_pixels(bars, pixels))]
-        assert score.share == len(chosen) / len(pixels)
+        native, scaled = view["native"], view["scaled"]
+        assert native["single_bar_share"] == len(chosen) / len(pixels)
         if not len(chosen):
-            assert score == SingleBarScore(0.0, None, None, None)
+            assert native["single_bar_abs_rel"] is native["single_bar_coverage"] is None
             continue
-        z, p = (image.ravel().astype(np.float64) for image in (z_m, noisy[view.view_id]))
+        z, p = (image.ravel().astype(np.float64) for image in (z_m, noisy[view_id]))
         scale = np.median(z[pixels]) / np.median(p[pixels])
-        assert score.coverage == 1.0
+        assert native["single_bar_coverage"] == 1.0
         errors = [np.mean(np.abs(s * p[chosen] - z[chosen]) / z[chosen]) for s in (1.0, scale)]
-        assert score.native is not None
-        assert score.scaled is not None
-        assert [score.native.abs_rel, score.scaled.abs_rel] == pytest.approx(errors, rel=1e-9)
-    means = mean_single_bar(scores)
-    assert means.share == pytest.approx(np.mean([score.share for score in scores]))
-    for name in METRICS:
-        values = [getattr(score.scaled, name) for score in scores if score.scaled]
-        assert getattr(means.scaled, name) == pytest.approx(np.mean(values))
+        assert [native["single_bar_abs_rel"], scaled["single_bar_abs_rel"]] == pytest.approx(errors, rel=1e-9)
+    values = [number for view in extended.views.values() if (number := view["scaled"]["single_bar_abs_rel"])]
+    mean = extended.tables["lattice"].numbers["scaled"]["single_bar_abs_rel"]
+    assert mean.value == pytest.approx(np.mean(values))
+    assert mean.samples == len(values)

@@ -12,9 +12,9 @@ from dataset_builder.export import export
 from rebar_depth_bench.cli.main import main as rebar_bench
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.extended.evaluate import score_extended
-from rebar_depth_bench.extended.inspection.as_built import MEASURES
-from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
+from rebar_depth_bench.extended.as_built import MEASURES
+from rebar_depth_bench.extended.registry import score_extended
+from rebar_depth_bench.scoring.evaluation import open_evaluation
 from tests.building import RunBuild
 from tests.commands import run_in_process
 from tests.ground_truth import truth_of
@@ -79,7 +79,8 @@ def test_widths_follow_from_bars_and_cameras(root: Path) -> None:
 
 def test_exact_depth_measures_the_deviation_from_the_design(root: Path, tmp_path: Path) -> None:
     with open_evaluation(write_truth(root, tmp_path / "a.zip", "test"), root) as evaluation:
-        extended = score_extended(score_evaluation(evaluation), evaluation)
+        extended = score_extended(evaluation).extended
+    assert extended is not None
     numbers = extended.tables["cages"].numbers["native"]
     judged = numbers["deviation_median_mm"]
     assert 0 < judged.samples <= numbers["bars_found"].samples

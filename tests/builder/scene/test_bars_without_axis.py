@@ -16,7 +16,7 @@ from dataset_builder.scene.model import Assembly
 from dataset_builder.scene.shapes.solids import box
 from dataset_builder.scene.variants.props import make_props
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.extended.inspection.segments import cage_truth
+from rebar_depth_bench.extended.axes import cage_truth
 from tests.builder.scene.cages import assembly_of
 
 ROD = Bar(1, "bar", 0.01, ((-0.2, 0.0, 0.1), (0.2, 0.0, 0.1)))
@@ -50,7 +50,7 @@ def test_props_are_placed_by_known_axes(variant: str) -> None:
 
 
 def test_measures_leave_bar_without_axis_out() -> None:
-    assert cage_truth([ROD, UNKNOWN]).segments == cage_truth([ROD]).segments
+    assert cage_truth([ROD, UNKNOWN]).start_m.tolist() == cage_truth([ROD]).start_m.tolist()
     np.testing.assert_array_equal(axis_points_m([ROD, UNKNOWN]), axis_points_m([ROD]))
     assert axis_points_m([UNKNOWN]).shape == (0, 3)
     assert len(Cylinders.from_bars([ROD, UNKNOWN]).radius_m) == 1

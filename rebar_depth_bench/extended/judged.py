@@ -1,6 +1,6 @@
-"""Visible bar segments of a view: those judged by inspection, and the pixels that they are judged on.
+"""What a view is judged on: visible straight runs of bars and crossings, with the pixels that are used of each.
 
-Determined from the ground truth alone. Frame: the camera's (OpenCV axes), metres.
+Determined from the ground truth of the left eye alone. Frame: the camera's (OpenCV axes), metres.
 """
 
 from __future__ import annotations
@@ -11,8 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
-from rebar_depth_bench.extended.inspection.segments import CageTruth
-from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.extended.axes import SURFACE_DISTANCE_RADII, WINDOW_DIAMETERS, Axis
+from rebar_depth_bench.extended.steel import JudgedCrossings, SteelTruth
+from rebar_depth_bench.geometry.cameras import fold_radius, project, transform
 
 MIN_PIXELS = 30
 """Minimum number of interior pixels of a judged segment."""
@@ -33,7 +34,7 @@ At least this share (second value) of the sampled pixels lies beyond this many r
 either side.
 """
 
-GOLDEN = (np.sqrt(5.0) - 1) / 2
+_GOLDEN = (np.sqrt(5.0) - 1) / 2
 """Golden ratio minus 1."""
 
 
@@ -41,7 +42,7 @@ GOLDEN = (np.sqrt(5.0) - 1) / 2
 class VisibleSegments:
     """The r judged segments of a view, each sampled at up to k pixels.
 
-    ``segment`` holds indices into ``CageTruth.segments``. ``middle_m`` is the axis point in the middle of the
+    ``segment`` holds indices of segments of ``CageTruth``. ``middle_m`` is the axis point in the middle of the
     visible part, ``half_m`` half the length of that part. ``frame`` holds three unit vectors: across the line of
     sight, away from the camera, along the axis. ``pixels`` are positions in the arrays of ``SteelTruth``,
     ``used`` marks which of the k places hold one, ``rays`` are the pixels' rays in ``frame`` per metre of planar
@@ -71,12 +72,13 @@ class VisibleSegments:
         return np.asarray(depth_m[..., None] * self.rays - middle_m[:, None])
 
 
-def visible_segments(truth: SteelTruth, cage: CageTruth) -> VisibleSegments:
+def visible_segments(truth: SteelTruth) -> VisibleSegments:
     """Return the judged segments of a view and their sampled pixels.
 
     Judged are segments with at least ``MIN_PIXELS`` interior pixels that extend over at least
     ``MIN_VISIBLE_DIAMETERS``.
     """
+    cage = truth.bars.cage
     segment, pixels, used = _sampled_pixels(truth)
     rotation, shift_m = truth.cam_from_world[:3, :3], truth.cam_from_world[:3, 3]
     start_m = cage.start_m[segment] @ rotation.T + shift_m
@@ -96,7 +98,7 @@ def visible_segments(truth: SteelTruth, cage: CageTruth) -> VisibleSegments:
 class AxisLines:
     """Straight parts of axes: their bars' diameters, and a point and the unit direction in the camera frame.
 
-    ``segment`` holds indices into ``CageTruth.segments`` or other items, and ``match_radius_m`` is the distance
+    ``segment`` holds indices of segments of ``CageTruth`` or other items, and ``match_radius_m`` is the distance
     within which a fitted axis belongs to the part.
     """
 
@@ -132,11 +134,7 @@ def visible_parts(
 def _sampled_pixels(
     truth: SteelTruth,
 ) -> tuple[Int64[ndarray, " r"], Int64[ndarray, "r k"], Bool[ndarray, "r k"]]:
-    """Return the segments with enough interior pixels, and up to ``MAX_SAMPLES`` pixels of each, evenly spread.
-
-    Regular strides can coincide with the width of a bar and sample a single column of it. Multiples of the golden
-    ratio avoid such resonance.
-    """
+    """Return the segments with enough interior pixels, and up to ``MAX_SAMPLES`` pixels of each, evenly spread."""
     candidates = np.flatnonzero(truth.interior & (truth.run >= 0))
     segments = truth.run.take(candidates)
     by_segment = candidates.take(np.argsort(segments, kind="stable"))
@@ -145,10 +143,18 @@ def _sampled_pixels(
     first = (np.cumsum(counts) - counts)[segment]
     total = counts[segment][:, None]
     slot = np.arange(MAX_SAMPLES)
-    spread = np.floor(total * ((slot + 0.5) * GOLDEN % 1.0)).astype(np.int64)
     used = slot < total
-    chosen = np.where(total > MAX_SAMPLES, spread, np.where(used, slot, 0))
+    chosen = np.where(total > MAX_SAMPLES, _spread(total, MAX_SAMPLES), np.where(used, slot, 0))
     return segment, by_segment.take(first[:, None] + chosen), used
+
+
+def _spread(total: int | Int64[ndarray, "r 1"], count: int) -> Int64[ndarray, " *k"]:
+    """Return ``count`` of ``total`` positions, evenly spread.
+
+    Regular strides can coincide with ribs or with the width of a bar, and sample a single column of it. Multiples
+    of the golden ratio avoid such resonance.
+    """
+    return np.asarray(np.floor(total * ((np.arange(count) + 0.5) * _GOLDEN % 1.0)), dtype=np.int64)
 
 
 def _frames(middle_m: Float64[ndarray, "r 3"], direction: Float64[ndarray, "r 3"]) -> Float64[ndarray, "r 3 3"]:
@@ -176,3 +182,87 @@ def _can_fit_diameter(
     right = (used & (across_m > beyond_m)).sum(axis=1)
     both_sides_visible = np.minimum(left, right) >= share * used.sum(axis=1)
     return np.asarray((focal_px * diameter_m >= MIN_DIAMETER_FIT_WIDTH_PX * depth_m) & both_sides_visible)
+
+
+SAMPLED_PIXELS = MIN_PIXELS
+"""Number of pixels of each bar that are fitted at a crossing, spread evenly along it."""
+
+
+def judged_crossings(truth: SteelTruth) -> JudgedCrossings:
+    """Return the judged crossings of a view, and the sampled pixels of both bars of each.
+
+    A crossing is judged if the pixel of its tie point shows one of its bars, and if each bar has at least
+    ``MIN_PIXELS`` single-bar interior pixels on its side within ``WINDOW_DIAMETERS`` along its axis, on both sides
+    of the crossing and over ``MIN_VISIBLE_DIAMETERS`` or more. Measures of depth further need both bars to be
+    straight there (``SceneCrossings.straight``).
+    """
+    scene = truth.bars.crossings
+    shown = shown_bars(truth, transform(truth.cam_from_world, scene.crossings.tie_point_m))
+    candidates = np.flatnonzero((shown[:, None] == scene.bar_id).any(axis=1))
+    by_bar = np.flatnonzero(truth.single_bar)
+    by_bar = by_bar[np.argsort(truth.bar_id[by_bar], kind="stable")]
+    bar_id = truth.bar_id[by_bar]
+    on_side = {}
+    for bar in np.unique(scene.bar_id[candidates]).tolist():
+        first, last = np.searchsorted(bar_id, [bar, bar + 1])
+        on_side[bar] = _on_side(truth, by_bar[first:last], scene.axes[bar])
+    judged, pixels = [], []
+    for crossing in candidates.tolist():
+        bars = zip(scene.bar_id[crossing].tolist(), scene.along_m[crossing].tolist(), strict=True)
+        sides = [_near_crossing(*on_side[bar], scene.axes[bar], along_m) for bar, along_m in bars]
+        if all(len(side) for side in sides):
+            judged.append(crossing)
+            pixels.append(sides)
+    return JudgedCrossings(
+        np.array(judged, dtype=np.int64), np.array(pixels, dtype=np.int64).reshape(-1, 2, SAMPLED_PIXELS)
+    )
+
+
+def _on_side(
+    truth: SteelTruth, pixels: Int64[ndarray, " n"], axis: Axis
+) -> tuple[Int64[ndarray, " n"], Float64[ndarray, " n"]]:
+    """Return those pixels of a bar that are on its side, and their places along its axis, metres."""
+    rays = np.column_stack([truth.rays[pixels], np.ones(len(pixels))])
+    camera_m = truth.depth_m[pixels].astype(np.float64)[:, None] * rays
+    rotation, shift_m = truth.cam_from_world[:3, :3], truth.cam_from_world[:3, 3]
+    along_m, distance_m = axis.feet((camera_m - shift_m) @ rotation)
+    radii = distance_m / (axis.diameter_m / 2)
+    on_side = (radii >= SURFACE_DISTANCE_RADII[0]) & (radii <= SURFACE_DISTANCE_RADII[1])
+    return pixels[on_side], along_m[on_side]
+
+
+def _near_crossing(
+    pixels: Int64[ndarray, " n"], along_m: Float64[ndarray, " n"], axis: Axis, crossing_m: float
+) -> Int64[ndarray, " k"]:
+    """Return the sampled pixels of a bar near its crossing, none if they do not suffice to judge it.
+
+    ``along_m`` are the places of the pixels along the axis, and ``crossing_m`` that of the crossing.
+    """
+    relative_m = axis.relative_m(along_m, crossing_m)
+    near = np.flatnonzero(np.abs(relative_m) <= WINDOW_DIAMETERS * axis.diameter_m)
+    if len(near) < MIN_PIXELS:
+        return np.empty(0, np.int64)
+    low_m, high_m = relative_m[near].min(), relative_m[near].max()
+    if not low_m < 0 < high_m or high_m - low_m < MIN_VISIBLE_DIAMETERS * axis.diameter_m:
+        return np.empty(0, np.int64)
+    ordered = near[np.argsort(relative_m[near], kind="stable")]
+    return np.asarray(pixels[ordered[_spread(len(ordered), SAMPLED_PIXELS)]])
+
+
+def shown_bars(truth: SteelTruth, points_m: Float64[ndarray, "n 3"]) -> Int64[ndarray, " n"]:
+    """Return the bar id at the nearest pixel of each point (camera frame, metres).
+
+    It is 0 beside the steel, outside of the image and behind the camera.
+    """
+    bars = np.zeros(len(points_m), np.int64)
+    in_front = points_m[:, 2] > 0
+    ray = points_m[:, :2] / np.where(in_front, points_m[:, 2], 1.0)[:, None]
+    in_front &= np.linalg.norm(ray, axis=1) < fold_radius(truth.distortion)
+    pixel = np.floor(project(truth.K, points_m[in_front], truth.distortion) + 0.5)
+    size = np.array([truth.width, truth.height])
+    inside = ((pixel >= 0) & (pixel < size)).all(axis=1)
+    flat = pixel[inside, 1].astype(np.int64) * truth.width + pixel[inside, 0].astype(np.int64)
+    position = np.minimum(np.searchsorted(truth.index, flat), max(len(truth.index) - 1, 0))
+    known = (truth.index[position] == flat) if len(truth.index) else np.zeros(len(flat), bool)
+    bars[np.flatnonzero(in_front)[inside][known]] = truth.bar_id[position[known]]
+    return bars

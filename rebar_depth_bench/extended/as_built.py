@@ -10,20 +10,17 @@ The axis as built is the whole polyline, not its straight segments, which leave 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Float64
 from numpy import ndarray
 
-from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.extended.inspection.axis_fits import fit_axes, with_misses
-from rebar_depth_bench.extended.inspection.measures import JUDGED_NOTE, MISSED_NOTE
-from rebar_depth_bench.extended.inspection.segments import CageTruth
-from rebar_depth_bench.extended.inspection.visible_segments import visible_segments
-from rebar_depth_bench.extended.measures import Measure, Samples
-from rebar_depth_bench.extended.steel_truth import SteelTruth
+from rebar_depth_bench.extended.fits import fit_axes, with_misses
+from rebar_depth_bench.extended.inspection import JUDGED_NOTE, MISSED_NOTE
+from rebar_depth_bench.extended.judged import VisibleSegments, visible_segments
+from rebar_depth_bench.extended.measures import Measure, MeasureFamily, Samples
+from rebar_depth_bench.extended.steel import SteelTruth
 
 OFF_MM = 10.0
 """Deviation above which a bar is off: the tolerance of bar spacing in GB 50204 (from a secondary source)."""
@@ -35,93 +32,70 @@ It keeps the other arms of a bent bar and its bends apart.
 """
 
 _MM = 1000.0
-_SAMPLES = ("deviation_judged_mm", "deviation_excess_mm", "deviation_true_mm", "off_reported", "off_confirmed")
 
 
-@dataclass(frozen=True, eq=False)
-class BarAxes:
-    """Axis of a bar as built and its nominal axis: polylines, world, metres."""
-
-    built_m: Float64[ndarray, "n 3"]
-    nominal_m: Float64[ndarray, "k 3"]
-
-
-@dataclass(frozen=True, eq=False)
-class _Deviations:
-    """Deviations of the judged segments: vectors from the nominal axis, across it, metres.
-
-    ``found`` marks the segments whose axis was fitted; ``measured_m`` is NaN for others.
-    """
-
-    true_m: Float64[ndarray, "r 3"]
-    measured_m: Float64[ndarray, "r 3"]
-    found: Bool[ndarray, " r"]
-
-
-def bar_axes(bars: tuple[Bar, ...]) -> dict[int, BarAxes]:
-    """Return the axes of the bars that have a nominal axis, by bar id."""
-    return {
-        bar.bar_id: BarAxes(np.array(bar.axis_m), np.array(bar.nominal_axis_m))
-        for bar in bars
-        if bar.has_axis and bar.nominal_axis_m
-    }
-
-
-def as_built_samples(
-    p_m: Float64[ndarray, " n"], truth: SteelTruth, cage: CageTruth, axes: Mapping[int, BarAxes]
-) -> Samples:
+def as_built_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
     """Return the samples of one view; ``MEASURES`` defines what each is.
 
     ``p_m`` is the predicted planar depth on ``truth.index`` in metres; values that are not finite and > 0 count as
-    missing. ``axes`` are those of the bars by id; without any there are no samples. Which segments are judged
-    depends on the ground truth alone.
+    missing. Without bars that have a nominal axis there are no samples. Which segments are judged depends on the
+    ground truth alone.
     """
-    deviations = _deviations(p_m, truth, cage, axes) if axes else None
-    if deviations is None:
-        return dict.fromkeys(_SAMPLES, np.empty(0))
+    judged = truth.once(_judged)
+    if judged is None:
+        return {}
+    fitted = fit_axes(p_m, judged.shown)
+    fitted_m = np.where(fitted.found[:, None], fitted.point_m, np.nan)
+    measured_m = _across(fitted_m - judged.nominal_m, judged.direction)
     true_mm, measured_mm, error_mm = (
         np.linalg.norm(vector_m, axis=1) * _MM
-        for vector_m in (deviations.true_m, deviations.measured_m, deviations.measured_m - deviations.true_m)
+        for vector_m in (judged.true_m, measured_m, measured_m - judged.true_m)
     )
     is_off, is_reported = true_mm > OFF_MM, measured_mm > OFF_MM
     return {
         "deviation_judged_mm": with_misses(error_mm),
-        "deviation_excess_mm": (measured_mm - true_mm)[deviations.found],
+        "deviation_excess_mm": (measured_mm - true_mm)[fitted.found],
         "deviation_true_mm": true_mm,
         "off_reported": is_reported[is_off].astype(np.float64),
         "off_confirmed": is_off[is_reported].astype(np.float64),
     }
 
 
-def _deviations(
-    p_m: Float64[ndarray, " n"], truth: SteelTruth, cage: CageTruth, axes: Mapping[int, BarAxes]
-) -> _Deviations | None:
-    """Return the deviations of the visible segments of bars in ``axes``; None if there are none."""
-    visible = visible_segments(truth, cage)
-    visible = visible.of(np.array([int(bar) in axes for bar in cage.bar_id[visible.segment]], bool))
+@dataclass(frozen=True, eq=False)
+class _Judged:
+    """Judged segments of a view: what is seen of them, and the foot and direction of the nominal axis, metres.
+
+    ``true_m`` are the vectors from the nominal axis to the axis as built, across the nominal one.
+    """
+
+    shown: VisibleSegments
+    nominal_m: Float64[ndarray, "r 3"]
+    direction: Float64[ndarray, "r 3"]
+    true_m: Float64[ndarray, "r 3"]
+
+
+def _judged(truth: SteelTruth) -> _Judged | None:
+    """Return the visible segments of bars with a nominal axis; None if there are none."""
+    visible, axes = truth.once(visible_segments), truth.bars.axes
     rotation, shift_m = truth.cam_from_world[:3, :3], truth.cam_from_world[:3, 3]
-    judged, built_m, foot_m, direction = [], [], [], []
-    for row, bar in enumerate(cage.bar_id[visible.segment].tolist()):
+    rows, built_m, foot_m, direction = [], [], [], []
+    for row, bar in enumerate(truth.bars.cage.bar_id[visible.segment].tolist()):
+        if bar not in axes:
+            continue
         middle_m, along = visible.middle_m[row], visible.frame[row, 2]
         built = _nearest_edge(axes[bar].built_m @ rotation.T + shift_m, middle_m, along)
         point_m = middle_m if built is None else built.nearest_m
         nominal = _nearest_edge(axes[bar].nominal_m @ rotation.T + shift_m, point_m, along)
         if nominal is not None:
-            judged.append(row)
+            rows.append(row)
             built_m.append(point_m)
             foot_m.append(nominal.foot_m)
             direction.append(nominal.direction)
-    if not judged:
+    if not rows:
         return None
-    shown = visible.of(np.array(judged))
-    fitted = fit_axes(p_m, shown, np.zeros(len(judged), dtype=bool))
     nominal_m, nominal_direction = np.array(foot_m), np.array(direction)
-    fitted_m = np.where(fitted.found[:, None], fitted.point_m, np.nan)
-    return _Deviations(
-        true_m=_across(np.array(built_m) - nominal_m, nominal_direction),
-        measured_m=_across(fitted_m - nominal_m, nominal_direction),
-        found=fitted.found,
-    )
+    true_m = _across(np.array(built_m) - nominal_m, nominal_direction)
+    return _Judged(visible.of(np.array(rows)), nominal_m, nominal_direction, true_m)
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,37 +135,41 @@ _DEVIATION = (
 )
 _ERROR = "length of the difference of the deviations by the fitted axis and by the axis as built"
 
-MEASURES: tuple[Measure, ...] = (
+MEASURES = (
     Measure(
-        "deviation_median_mm", "deviation_judged_mm", "median", "deviation from the design: median error", "mm",
-        "lower", f"Median {_ERROR}. Deviation: {_DEVIATION}. {MISSED_NOTE} {JUDGED_NOTE}",
+        "deviation_median_mm", "deviation from the design: median error", "mm", "lower",
+        f"Median {_ERROR}. Deviation: {_DEVIATION}. {MISSED_NOTE} {JUDGED_NOTE}", "deviation_judged_mm", "median",
     ),
     Measure(
-        "deviation_p95_mm", "deviation_judged_mm", "p95", "deviation from the design: p95 error", "mm", "lower",
-        f"95th percentile of the {_ERROR}. {MISSED_NOTE}",
+        "deviation_p95_mm", "deviation from the design: p95 error", "mm", "lower",
+        f"95th percentile of the {_ERROR}. {MISSED_NOTE}", "deviation_judged_mm", "p95",
     ),
     Measure(
-        "deviation_bias_mm", "deviation_excess_mm", "mean", "deviation from the design: bias", "mm", "",
+        "deviation_bias_mm", "deviation from the design: bias", "mm", "",
         "Mean length of the deviation by the fitted axis minus that by the axis as built, over found runs.",
+        "deviation_excess_mm",
     ),
     Measure(
-        "deviation_true_median_mm", "deviation_true_mm", "median", "deviation as built: median", "mm", "",
+        "deviation_true_median_mm", "deviation as built: median", "mm", "",
         "Median length of the deviation by the axis as built, from the ground truth alone: the error of a report "
-        "that all bars are as designed.",
+        "that all bars are as designed.", "deviation_true_mm", "median",
     ),
     Measure(
-        "deviation_true_p95_mm", "deviation_true_mm", "p95", "deviation as built: p95", "mm", "",
+        "deviation_true_p95_mm", "deviation as built: p95", "mm", "",
         "95th percentile of the length of the deviation by the axis as built, from the ground truth alone.",
+        "deviation_true_mm", "p95",
     ),
     Measure(
-        "off_recall", "off_reported", "mean", f"bars off by more than {OFF_MM:g} mm: recall", "%", "higher",
+        "off_recall", f"bars off by more than {OFF_MM:g} mm: recall", "%", "higher",
         f"Share of the runs as built more than {OFF_MM:g} mm off the nominal axis whose fitted axis is, too; what "
-        "was not found counts as a failure. The samples are the runs that are off.",
+        "was not found counts as a failure. The samples are the runs that are off.", "off_reported",
     ),
     Measure(
-        "off_precision", "off_confirmed", "mean", f"bars off by more than {OFF_MM:g} mm: precision", "%", "",
+        "off_precision", f"bars off by more than {OFF_MM:g} mm: precision", "%", "",
         f"Share of the runs with a fitted axis more than {OFF_MM:g} mm off the nominal one that are as built, "
-        "too. The samples are the runs that are reported as off.",
+        "too. The samples are the runs that are reported as off.", "off_confirmed",
     ),
 )  # fmt: skip
 """Measures of deviations from the design in table order."""
+
+FAMILIES = (MeasureFamily("as_built", "As built against as designed", 8, MEASURES, as_built_samples),)

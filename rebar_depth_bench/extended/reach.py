@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from rebar_depth_bench.extended.crossings.measures import CROSSING_EDGES_M
+from rebar_depth_bench.extended.crossings import CROSSING_EDGES_M
 from rebar_depth_bench.extended.measures import Samples
 from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval
 from rebar_depth_bench.scoring.columns import rounded, rounded_interval
@@ -119,7 +119,7 @@ def reaches(by_view: Sequence[Samples], resampling: Resampling) -> tuple[Reach, 
 
 def pooled(by_view: Sequence[Samples], name: str) -> tuple[Float64[ndarray, " m"], ndarray]:
     """Return the samples of all views one after the other, and the position of each one's view."""
-    samples = [samples[name] for samples in by_view]
+    samples = [samples.get(name, np.empty(0)) for samples in by_view]
     return np.concatenate([np.empty(0), *samples]), np.repeat(np.arange(len(samples)), list(map(len, samples)))
 
 

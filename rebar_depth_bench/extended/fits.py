@@ -1,4 +1,4 @@
-"""Robust cylinder fits to bar points seen from one side, batched, with a fixed or a free radius.
+"""Axes of visible bars: robust cylinder fits to bar points seen from one side, with a fixed or a free radius.
 
 Frame: each cylinder's own, metres, columns across (perpendicular to the line of sight and the axis), away (from
 the camera), along (the axis). A line has two offsets and two slopes: at position ``t`` along, the axis is at
@@ -25,6 +25,8 @@ from dataclasses import dataclass, fields
 import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
+
+from rebar_depth_bench.extended.judged import VisibleSegments
 
 POSITION_STEPS = 6
 """Gauss-Newton steps on the axis with the radius fixed."""
@@ -88,7 +90,11 @@ def fit_cylinders(
     ``fit_radius`` are then fitted further with a free radius, for their diameter. A set without points, or whose
     values overflow, does not converge. All lengths are in metres, in each set's own frame.
     """
-    point_sets = _PointSets.from_points(points_m, used, start_m, half_m, radius_m)
+    across_m, away_m = (
+        np.where(used, points_m[..., column] - start_m[:, column, None], 0.0) for column in range(2)
+    )
+    along = np.where(used, points_m[..., 2] / half_m[:, None], 0.0)
+    point_sets = _PointSets(across_m, away_m, along, used, half_m[:, None], radius_m[:, None])
     with np.errstate(over="ignore", invalid="ignore"):
         line_m, converged = _iterate(point_sets, np.zeros((len(points_m), 5)), POSITION_STEPS, free=4)
         slope = line_m[:, 2:4] / half_m[:, None]
@@ -120,22 +126,6 @@ class _PointSets:
     half_m: Float64[ndarray, "r 1"]
     radius_m: Float64[ndarray, "r 1"]
 
-    @classmethod
-    def from_points(
-        cls,
-        points_m: Float64[ndarray, "r k 3"],
-        used: Bool[ndarray, "r k"],
-        start_m: Float64[ndarray, "r 2"],
-        half_m: Float64[ndarray, " r"],
-        radius_m: Float64[ndarray, " r"],
-    ) -> _PointSets:
-        """Return the points relative to ``start_m``, with ``along`` divided by ``half_m``."""
-        across_m, away_m = (
-            np.where(used, points_m[..., column] - start_m[:, column, None], 0.0) for column in range(2)
-        )
-        along = np.where(used, points_m[..., 2] / half_m[:, None], 0.0)
-        return cls(across_m, away_m, along, used, half_m[:, None], radius_m[:, None])
-
     def of(self, sets: Bool[ndarray, " r"]) -> _PointSets:
         """Return the selected sets."""
         return _PointSets(*(getattr(self, field.name)[sets] for field in fields(self)))
@@ -155,7 +145,8 @@ def _iterate(
         residual_m, jacobian = _linearise(point_sets, unknowns_m)
         if iteration % 2 == 0:
             sigma_m = _sigma_m(residual_m, point_sets.used, 2 * radius_m)
-        weight = _tukey_weights(residual_m, sigma_m) * point_sets.used
+        scaled = residual_m / (TUKEY_CONSTANT * sigma_m)[:, None]
+        weight = np.maximum(1 - scaled**2, 0.0) ** 2 * point_sets.used
         lateral_prior = (sigma_m / (LATERAL_PRIOR_RADII * radius_m)) ** 2
         step_m = _gauss_newton_step(residual_m, jacobian[:, :free], weight, unknowns_m, lateral_prior)
         # The linearisation does not hold for a step longer than the radius plus the noise.
@@ -203,14 +194,6 @@ def _sigma_m(
     return np.maximum(SIGMA_PER_MAD * median_m, MIN_SIGMA_DIAMETERS * diameter_m)
 
 
-def _tukey_weights(
-    residual_m: Float64[ndarray, "r k"], sigma_m: Float64[ndarray, " r"]
-) -> Float64[ndarray, "r k"]:
-    """Return Tukey's biweight of each residual."""
-    scaled = residual_m / (TUKEY_CONSTANT * sigma_m)[:, None]
-    return np.asarray(np.maximum(1 - scaled**2, 0.0) ** 2)
-
-
 def _gauss_newton_step(
     residual_m: Float64[ndarray, "r k"],
     jacobian: Float64[ndarray, "r u k"],
@@ -234,3 +217,99 @@ def _gauss_newton_step(
     step_m = np.zeros_like(unknowns_m)
     step_m[:, :size] = np.linalg.solve(normal, right_side[..., None])[..., 0]
     return step_m
+
+
+MIN_PREDICTED_SHARE = 0.5
+"""Minimum share of a segment's sampled pixels that must have a prediction for it to be found."""
+
+MISS_MM = 100.0
+"""Error assigned to a bar or pair that was not found in ``..._judged_mm``, and the cap of all errors there.
+
+The position and spacing errors of bars and pairs that were found are smaller.
+"""
+
+MAX_DEPTH_M = 1e6
+"""Upper bound applied to predicted depth, metres, so that its squares do not overflow."""
+
+
+@dataclass(frozen=True, eq=False)
+class FittedAxes:
+    """Fitted axis of each visible segment and its deviation from the true axis.
+
+    ``found`` marks the segments whose axis was accepted. An axis is a point and a unit direction in the camera
+    frame. ``offset_m`` is the distance of the fitted axis from the middle of the visible part of the true one.
+    ``diameter_m`` is NaN where it was not fitted.
+    """
+
+    found: Bool[ndarray, " r"]
+    point_m: Float64[ndarray, "r 3"]
+    direction: Float64[ndarray, "r 3"]
+    offset_m: Float64[ndarray, " r"]
+    tilt_deg: Float64[ndarray, " r"]
+    diameter_m: Float64[ndarray, " r"]
+
+
+def fit_axes(p_m: Float64[ndarray, " n"], visible: VisibleSegments, *, diameters: bool = False) -> FittedAxes:
+    """Return the axis of each visible segment, a cylinder of its nominal diameter fitted to predicted depth.
+
+    ``p_m`` is planar depth at the pixels of ``SteelTruth``, metres; values that are not finite and > 0 are
+    missing. With ``diameters``, where ``can_fit_diameter`` is set, a cylinder with a free radius is fitted as
+    well, for its diameter.
+    """
+    points_m, predicted = _predicted_points_m(p_m, visible)
+    start_m = _initial_offset_m(points_m, predicted, visible)
+    fit_radius = visible.can_fit_diameter & diameters
+    fits = fit_cylinders(points_m, predicted, start_m, visible.half_m, visible.diameter_m / 2, fit_radius)
+    with np.errstate(over="ignore", invalid="ignore"):
+        squared_slope = (fits.slope**2).sum(axis=1)
+        lean_m = (fits.offset_m * fits.slope).sum(axis=1)
+        offset_m = np.sqrt(np.maximum((fits.offset_m**2).sum(axis=1) - lean_m**2 / (1 + squared_slope), 0.0))
+        enough = predicted.sum(axis=1) >= MIN_PREDICTED_SHARE * visible.used.sum(axis=1)
+        to_end_m = fits.slope * visible.half_m[:, None]
+        ends_m = (np.linalg.norm(fits.offset_m + side * to_end_m, axis=1) for side in (-1, 1))
+        farthest_m = np.maximum(offset_m, np.maximum(*ends_m))
+        local = np.column_stack([fits.slope, np.ones(len(fits.slope))]) / np.sqrt(1 + squared_slope)[:, None]
+        return FittedAxes(
+            found=enough & fits.converged & (farthest_m < visible.match_radius_m),
+            point_m=visible.middle_m + np.einsum("rc,rci->ri", fits.offset_m, visible.frame[:, :2]),
+            direction=np.einsum("rc,rci->ri", local, visible.frame),
+            offset_m=offset_m,
+            tilt_deg=np.rad2deg(np.arctan(np.sqrt(squared_slope))),
+            diameter_m=fits.diameter_m,
+        )
+
+
+def with_misses(error: Float64[ndarray, " n"], miss: float = MISS_MM) -> Float64[ndarray, " n"]:
+    """Return absolute errors, capped at ``miss``, and ``miss`` for what was not found (NaN)."""
+    return np.where(np.isnan(error), miss, np.minimum(np.abs(error), miss))
+
+
+def _predicted_points_m(
+    p_m: Float64[ndarray, " n"], visible: VisibleSegments
+) -> tuple[Float64[ndarray, "r k 3"], Bool[ndarray, "r k"]]:
+    """Return the predicted points of each visible segment in its own frame, and which of them exist.
+
+    A point's position along the axis is taken from the true point of its pixel, not from the predicted depth:
+    where a bar runs away from the camera, depth noise would shift points along and away from the camera together
+    and tilt the fitted axis.
+    """
+    depth_m = p_m.take(visible.pixels)
+    with np.errstate(invalid="ignore"):
+        predicted = visible.used & np.isfinite(depth_m) & (depth_m > 0)
+        known_m = np.where(predicted, np.minimum(depth_m, MAX_DEPTH_M), 0.0)
+    points_m = visible.local_points_m(known_m)
+    points_m[..., 2] = visible.truth_m[..., 2]
+    return points_m, predicted
+
+
+def _initial_offset_m(
+    points_m: Float64[ndarray, "r k 3"], predicted: Bool[ndarray, "r k"], visible: VisibleSegments
+) -> Float64[ndarray, "r 2"]:
+    """Return the start of each fit: the median displacement (across, away) of predicted from true points."""
+    displacement_m = np.where(predicted[..., None], (points_m - visible.truth_m)[..., :2], np.inf)
+    ordered_m = np.sort(displacement_m, axis=1)
+    count = predicted.sum(axis=1)
+    lower, upper = np.maximum(count - 1, 0) // 2, np.minimum(count // 2, np.maximum(count - 1, 0))
+    row = np.arange(len(count))
+    median_m = (ordered_m[row, lower] + ordered_m[row, upper]) / 2
+    return np.where((count > 0)[:, None], median_m, 0.0)

@@ -1,0 +1,375 @@
+"""Axes of the bars of a scene: straight segments and their neighbours, places along axes, and crossings.
+
+The segments tell which bars are parallel, how far apart they are, and between which of them a tape measure would
+be applied. Determined from the ground truth alone. Frame: world, metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, Float64, Int16, Int64, UInt16
+from numpy import ndarray
+
+from rebar_depth_bench.bar_crossings.axis_segments import AxisSegments, pieces, without_repeated
+from rebar_depth_bench.bar_crossings.definition import Crossings
+from rebar_depth_bench.data.bars import Bar, with_axis
+from rebar_depth_bench.errors import DatasetError
+
+PARALLEL_DEG = 5.0
+"""Maximum angle between the directions of parallel segments, degrees."""
+
+MIN_OVERLAP_DIAMETERS = 4.0
+"""Minimum overlap of parallel segments along the axis, in diameters of the larger bar."""
+
+MIN_CLEARANCE_DIAMETERS = 0.25
+"""Minimum clear distance of two spaced segments, in diameters of the larger bar.
+
+Segments with less between their surfaces are lapped or bundled, not spaced.
+"""
+
+MAX_SPACING_M = 0.5
+"""Maximum axis distance of neighbours, metres.
+
+This limit is our choice; it exceeds the usual spacing of bars in one layer.
+"""
+
+_NEARER_FACTOR = 1 - 1e-6
+"""A third segment separates a pair only if it is nearer by more than this factor.
+
+It absorbs rounding: segments at equal distances do not separate a pair.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class ParallelPairs:
+    """Pairs of parallel segments that overlap along their axes. All arrays are segments x segments, in metres.
+
+    ``apart_m`` is the distance of the axes in the middle of their overlap, inf for pairs that are not parallel or
+    do not overlap, and on the diagonal. ``low_m`` to ``high_m`` is the extent of segment j projected on the axis
+    of segment i, from its start; ``middle_m`` is the middle of their overlap on that axis.
+    """
+
+    apart_m: Float64[ndarray, "r r"]
+    low_m: Float64[ndarray, "r r"]
+    high_m: Float64[ndarray, "r r"]
+    middle_m: Float64[ndarray, "r r"]
+
+
+def parallel_pairs(
+    start_m: Float64[ndarray, "r 3"], end_m: Float64[ndarray, "r 3"], diameter_m: Float64[ndarray, " r"]
+) -> ParallelPairs:
+    """Return the parallel pairs among segments from ``start_m`` to ``end_m`` (one common frame, metres)."""
+    count = len(diameter_m)
+    apart_m, low_m, high_m, middle_m = (np.empty((count, count)) for _ in range(4))
+    length_m = np.linalg.norm(end_m - start_m, axis=1)
+    direction = (end_m - start_m) / length_m[:, None]
+    for segment in range(count):
+        starts_m = (start_m - start_m[segment]) @ direction[segment]
+        ends_m = (end_m - start_m[segment]) @ direction[segment]
+        low_m[segment], high_m[segment] = np.minimum(starts_m, ends_m), np.maximum(starts_m, ends_m)
+        from_m, to_m = np.maximum(low_m[segment], 0.0), np.minimum(high_m[segment], length_m[segment])
+        middle_m[segment] = (from_m + to_m) / 2
+        cosine = direction @ direction[segment]
+        overlaps = (np.abs(cosine) > np.cos(np.deg2rad(PARALLEL_DEG))) & (
+            to_m - from_m >= MIN_OVERLAP_DIAMETERS * np.maximum(diameter_m, diameter_m[segment])
+        )
+        overlaps[segment] = False
+        along_other_m = (middle_m[segment] - starts_m) / np.where(overlaps, cosine, 1.0)
+        other_point_m = start_m + along_other_m[:, None] * direction
+        own_point_m = start_m[segment] + middle_m[segment][:, None] * direction[segment]
+        apart_m[segment] = np.where(overlaps, np.linalg.norm(other_point_m - own_point_m, axis=1), np.inf)
+    return ParallelPairs(np.maximum(apart_m, apart_m.T), low_m, high_m, middle_m)
+
+
+def overlapping_pairs(
+    parallel: ParallelPairs, bar_id: Int64[ndarray, " r"], diameter_m: Float64[ndarray, " r"]
+) -> Int64[ndarray, "m 2"]:
+    """Return the pairs of neighbouring segments (lower index first, ascending): those to measure the spacing of.
+
+    A pair consists of two parallel, overlapping segments of different bars, not lapped, at most ``MAX_SPACING_M``
+    apart, without a third parallel segment between them: none present at the middle of their overlap is nearer to
+    both than they are to each other (the relative neighbourhood graph: Toussaint, Pattern Recognition 12, 1980).
+    """
+    pairs = [np.empty((0, 2), dtype=np.int64)]
+    for segment in range(len(bar_id)):
+        apart_m = parallel.apart_m[segment]
+        clear_m = apart_m - (diameter_m + diameter_m[segment]) / 2
+        lapped = clear_m < MIN_CLEARANCE_DIAMETERS * np.maximum(diameter_m, diameter_m[segment])
+        others = np.flatnonzero(~lapped & (apart_m <= MAX_SPACING_M) & (bar_id != bar_id[segment]))
+        others = others[others > segment]
+        at_m = parallel.middle_m[segment, others]
+        present = (parallel.low_m[segment][:, None] <= at_m) & (at_m <= parallel.high_m[segment][:, None])
+        farther_m = np.maximum(apart_m[:, None], parallel.apart_m[:, others])
+        blocked = (present & (farther_m < _NEARER_FACTOR * apart_m[others])).any(axis=0)
+        free = others[~blocked]
+        pairs.append(np.column_stack([np.full(len(free), segment), free]))
+    return np.concatenate(pairs)
+
+
+STRAIGHT_DEG = 1.0
+"""A segment ends where the centreline deviates from its first direction by more than this angle, degrees."""
+
+MIN_SEGMENT_DIAMETERS = 4.0
+"""Minimum length of a segment, in diameters; shorter straight pieces belong to bends."""
+
+MAX_MATCH_RADIUS_M = 0.050
+"""Upper bound of ``CageTruth.match_radius_m``, metres: applies to bars without close neighbours."""
+
+SURFACE_DISTANCE_RADII = (0.8, 2.0)
+"""Range of the distance of points on a segment's side from its axis, in nominal radii.
+
+It includes ribs and excludes the flat cut ends.
+"""
+
+MAX_SEGMENTS = 5000
+"""Maximum number of segments per scene.
+
+Segments are compared pairwise, in memory quadratic in their number: 0.8 GB for this many.
+"""
+
+
+@dataclass(frozen=True, eq=False)
+class CageTruth:
+    """Straight bar segments of a scene and the pairs of neighbours among them; world, metres.
+
+    ``bar_id`` and ``diameter_m`` are those of each segment's bar. ``neighbours`` holds indices of segments, the
+    lower one first: see ``overlapping_pairs``. ``match_radius_m`` is for each segment half the distance to the
+    nearest parallel one of any bar, at most ``MAX_MATCH_RADIUS_M``: a fitted axis farther away than that is
+    attributed to another bar.
+    """
+
+    bar_id: Int64[ndarray, " r"]
+    diameter_m: Float64[ndarray, " r"]
+    start_m: Float64[ndarray, "r 3"]
+    end_m: Float64[ndarray, "r 3"]
+    neighbours: Int64[ndarray, "m 2"]
+    match_radius_m: Float64[ndarray, " r"]
+
+    def __len__(self) -> int:
+        return len(self.bar_id)
+
+
+def cage_truth(bars: Iterable[Bar]) -> CageTruth:
+    """Return the straight segments of a scene's bars and their neighbours; bars without an axis have none.
+
+    Raises ``DatasetError`` if there are more than ``MAX_SEGMENTS``.
+    """
+    segments = [(bar, *ends_m) for bar in with_axis(bars) for ends_m in _straight_segments(bar)]
+    if len(segments) > MAX_SEGMENTS:
+        raise DatasetError(f"the bars have {len(segments)} straight runs, expected up to {MAX_SEGMENTS}")
+    bar_id = np.array([bar.bar_id for bar, _, _ in segments], dtype=np.int64)
+    diameter_m = np.array([bar.diameter_m for bar, _, _ in segments], dtype=np.float64)
+    start_m = np.array([start_m for _, start_m, _ in segments], dtype=np.float64).reshape(-1, 3)
+    end_m = np.array([end_m for _, _, end_m in segments], dtype=np.float64).reshape(-1, 3)
+    parallel = parallel_pairs(start_m, end_m, diameter_m)
+    match_radius_m = np.minimum(parallel.apart_m.min(axis=1, initial=np.inf) / 2, MAX_MATCH_RADIUS_M)
+    neighbours = overlapping_pairs(parallel, bar_id, diameter_m)
+    return CageTruth(bar_id, diameter_m, start_m, end_m, neighbours, match_radius_m)
+
+
+def assign_segments(
+    points_m: Float64[ndarray, "n 3"], bar_id: UInt16[ndarray, " n"], cage: CageTruth
+) -> Int16[ndarray, " n"]:
+    """Return for each true surface point (world, metres) the segment of its own bar that it lies on, -1 for none.
+
+    A point lies on a segment if its foot on the axis is between the segment's ends and its distance from the axis
+    is within ``SURFACE_DISTANCE_RADII``; of several segments the one with the nearest axis is assigned. Bends,
+    hooks and the flat ends of bars therefore belong to no segment.
+    """
+    assigned = np.full(len(bar_id), -1, dtype=np.int16)
+    nearest_m = np.full(len(bar_id), np.inf)
+    order = np.argsort(bar_id, kind="stable")
+    first, last = (np.searchsorted(bar_id[order], cage.bar_id, side) for side in ("left", "right"))
+    for segment in np.flatnonzero(last > first):
+        rows = order[first[segment] : last[segment]]
+        on_side, distance_m = _lies_on_side(points_m[rows], cage, int(segment))
+        nearer = on_side & (distance_m < nearest_m[rows])
+        assigned[rows[nearer]] = segment
+        nearest_m[rows[nearer]] = distance_m[nearer]
+    return assigned
+
+
+def _lies_on_side(
+    points_m: Float64[ndarray, "k 3"], cage: CageTruth, segment: int
+) -> tuple[Bool[ndarray, " k"], Float64[ndarray, " k"]]:
+    """Return which points lie on a segment's side, and the distance of all points from its axis (metres)."""
+    line_m = cage.end_m[segment] - cage.start_m[segment]
+    length_m = np.linalg.norm(line_m)
+    direction = line_m / length_m
+    from_start_m = points_m - cage.start_m[segment]
+    along_m = from_start_m @ direction
+    distance_m = np.linalg.norm(from_start_m - along_m[:, None] * direction, axis=1)
+    radii = distance_m / (cage.diameter_m[segment] / 2)
+    slack_m = 1e-6  # rounding of float32 depth
+    foot_inside = (along_m >= -slack_m) & (along_m <= length_m + slack_m)
+    return foot_inside & (radii >= SURFACE_DISTANCE_RADII[0]) & (radii <= SURFACE_DISTANCE_RADII[1]), distance_m
+
+
+def _straight_segments(bar: Bar) -> Iterator[tuple[Float64[ndarray, " 3"], Float64[ndarray, " 3"]]]:
+    """Yield the ends of the straight segments of a bar that are long enough, from its first point to its last."""
+    points_m = without_repeated(np.array(bar.axis_m))
+    for first, last in _straight_pieces(points_m):
+        if np.linalg.norm(points_m[last] - points_m[first]) >= MIN_SEGMENT_DIAMETERS * bar.diameter_m:
+            yield points_m[first], points_m[last]
+
+
+def _straight_pieces(points_m: Float64[ndarray, "n 3"]) -> Iterator[tuple[int, int]]:
+    """Yield (first, last) point index of each stretch whose edges all follow the direction of its first edge."""
+    steps_m = np.diff(points_m, axis=0)
+    directions = steps_m / np.linalg.norm(steps_m, axis=1, keepdims=True)
+    least_cosine = np.cos(np.deg2rad(STRAIGHT_DEG))
+    first = 0
+    for edge in range(1, len(directions) + 1):
+        if edge == len(directions) or directions[first] @ directions[edge] < least_cosine:
+            yield first, edge
+            first = edge
+
+
+_TANGENT_STEP_M = 1e-7
+
+
+@dataclass(frozen=True, eq=False)
+class Axis:
+    """Axis of one bar as a polyline: segments from ``start_m`` by ``vector_m``, ``along_m`` of their starts."""
+
+    start_m: Float64[ndarray, "s 3"]
+    vector_m: Float64[ndarray, "s 3"]
+    along_m: Float64[ndarray, " s"]
+    length_m: float
+    closed: bool
+    diameter_m: float
+
+    @classmethod
+    def of_bar(cls, bar: Bar) -> Axis:
+        """Return the axis of a bar that has one."""
+        segments = AxisSegments.of_bars([bar])
+        return cls(
+            segments.start_m,
+            segments.vector_m,
+            segments.along_m,
+            float(segments.length_m[0]),
+            bool(segments.closed[0]),
+            bar.diameter_m,
+        )
+
+    def feet(self, points_m: Float64[ndarray, "n 3"]) -> tuple[Float64[ndarray, " n"], Float64[ndarray, " n"]]:
+        """Return for each point the length along the axis at the nearest point of the axis, and its distance.
+
+        The nearest of close samples of the axis is found first, then the foot on the segments around it.
+        """
+        tree, segments = self._samples
+        _, nearest = tree.query(points_m)
+        best_along_m, best_m = np.zeros(len(points_m)), np.full(len(points_m), np.inf)
+        for step in (-1, 0, 1):
+            sample = nearest + step
+            segment = segments[sample % len(segments) if self.closed else np.clip(sample, 0, len(segments) - 1)]
+            start_m, vector_m = self.start_m[segment], self.vector_m[segment]
+            squared_m2 = np.einsum("ni,ni->n", vector_m, vector_m)
+            share = np.clip(np.einsum("ni,ni->n", points_m - start_m, vector_m) / squared_m2, 0, 1)
+            distance_m = np.linalg.norm(points_m - start_m - share[:, None] * vector_m, axis=1)
+            closer = distance_m < best_m
+            along_m = self.along_m[segment] + share * np.sqrt(squared_m2)
+            best_along_m, best_m = np.where(closer, along_m, best_along_m), np.minimum(distance_m, best_m)
+        return best_along_m, best_m
+
+    @cached_property
+    def _samples(self) -> tuple[Any, ndarray]:
+        """Return a k-d tree of samples along the axis, a quarter of a diameter apart, and their segments."""
+        from scipy.spatial import cKDTree
+
+        segment, middle_m = pieces(self.start_m, self.vector_m, self.diameter_m / 4)
+        return cKDTree(middle_m), segment
+
+    def tangents(self, along_m: Float64[ndarray, " n"]) -> Float64[ndarray, "n 3"]:
+        """Return the unit tangent at lengths along the axis; at a vertex, the bisector of its edges."""
+        direction = self.vector_m / np.linalg.norm(self.vector_m, axis=1, keepdims=True)
+        before, after = (self._segment_at(along_m + step_m) for step_m in (-_TANGENT_STEP_M, _TANGENT_STEP_M))
+        bisector = direction[before] + direction[after]
+        norm = np.linalg.norm(bisector, axis=1, keepdims=True)
+        return np.where(norm > 1e-6, bisector / np.where(norm > 1e-6, norm, 1.0), direction[after])
+
+    def _segment_at(self, along_m: Float64[ndarray, " n"]) -> ndarray:
+        if self.closed:
+            along_m = along_m % self.length_m
+        return np.clip(np.searchsorted(self.along_m, along_m, side="right") - 1, 0, len(self.along_m) - 1)
+
+    def relative_m(self, along_m: ndarray, origin_m: ndarray | float) -> ndarray:
+        """Return lengths along the axis from ``origin_m``; around a closed axis, the shorter way."""
+        relative_m = np.asarray(along_m - origin_m)
+        if not self.closed:
+            return relative_m
+        return np.asarray((relative_m + self.length_m / 2) % self.length_m - self.length_m / 2)
+
+    def is_straight(
+        self, along_m: Float64[ndarray, " n"], tangent: Float64[ndarray, "n 3"], reach_m: float, max_deg: float
+    ) -> Bool[ndarray, " n"]:
+        """Return where all edges within ``reach_m`` along the axis are at most ``max_deg`` from the tangent."""
+        lengths_m = np.linalg.norm(self.vector_m, axis=1)
+        middle_m = self.relative_m((self.along_m + lengths_m / 2)[None], along_m[:, None])
+        touched = np.abs(middle_m) - lengths_m / 2 < reach_m - _TANGENT_STEP_M
+        cosine = tangent @ (self.vector_m / lengths_m[:, None]).T
+        bends = cosine < np.cos(np.deg2rad(max_deg)) - 1e-12
+        return np.asarray(~(touched & bends).any(axis=1))
+
+
+WINDOW_DIAMETERS = 6.0
+"""Length along a bar on either side of a crossing that is judged and fitted, diameters."""
+
+
+@dataclass(frozen=True, eq=False)
+class SceneCrossings:
+    """The n crossings of a scene; arrays n x 2 have a column for bar a and one for bar b.
+
+    ``axes`` are those of the bars that cross, by bar id. ``along_m`` is the crossing's place along the axis and
+    ``tangent`` the unit tangent there. ``straight`` marks where the axis deviates from it by at most
+    ``STRAIGHT_DEG`` within ``WINDOW_DIAMETERS``. ``match_radius_m`` is that of the run of the bar at the crossing.
+    """
+
+    crossings: Crossings
+    axes: Mapping[int, Axis]
+    bar_id: ndarray  # Int64 n 2
+    diameter_m: Float64[ndarray, "n 2"]
+    point_m: Float64[ndarray, "n 2 3"]
+    along_m: Float64[ndarray, "n 2"]
+    tangent: Float64[ndarray, "n 2 3"]
+    straight: Bool[ndarray, "n 2"]
+    match_radius_m: Float64[ndarray, "n 2"]
+
+    def __len__(self) -> int:
+        return len(self.crossings)
+
+
+def prepared_crossings(crossings: Crossings, bars: Iterable[Bar], cage: CageTruth) -> SceneCrossings:
+    """Return the crossings of a scene with the axes of its bars; ``cage`` has its straight runs."""
+    bar_id = np.column_stack([crossings.bar_a, crossings.bar_b])
+    point_m = np.stack([crossings.point_a_m, crossings.point_b_m], axis=1)
+    crossing = set(bar_id.ravel().tolist())
+    axes = {bar.bar_id: Axis.of_bar(bar) for bar in with_axis(bars) if bar.bar_id in crossing}
+    diameter_m, along_m, match_radius_m = np.zeros((3, *bar_id.shape))
+    tangent, straight = np.zeros((*bar_id.shape, 3)), np.zeros(bar_id.shape, dtype=bool)
+    for number, axis in axes.items():
+        own = bar_id == number
+        diameter_m[own] = axis.diameter_m
+        along_m[own], _ = axis.feet(point_m[own])
+        tangent[own] = axis.tangents(along_m[own])
+        reach_m = WINDOW_DIAMETERS * axis.diameter_m
+        straight[own] = axis.is_straight(along_m[own], tangent[own], reach_m, STRAIGHT_DEG)
+        match_radius_m[own] = _match_radius_m(point_m[own], number, cage)
+    return SceneCrossings(crossings, axes, bar_id, diameter_m, point_m, along_m, tangent, straight, match_radius_m)
+
+
+def _match_radius_m(point_m: Float64[ndarray, "k 3"], bar_id: int, cage: CageTruth) -> Float64[ndarray, " k"]:
+    """Return the match radius of the run of the bar that is nearest to each point; the largest without a run."""
+    runs = np.flatnonzero(cage.bar_id == bar_id)
+    if not len(runs):
+        return np.full(len(point_m), MAX_MATCH_RADIUS_M)
+    start_m, vector_m = cage.start_m[runs], cage.end_m[runs] - cage.start_m[runs]
+    share = (point_m @ vector_m.T - (start_m * vector_m).sum(axis=1)) / (vector_m**2).sum(axis=1)
+    feet_m = start_m + np.clip(share, 0, 1)[..., None] * vector_m
+    distance_m = np.linalg.norm(point_m[:, None] - feet_m, axis=2)
+    return np.asarray(cage.match_radius_m[runs[distance_m.argmin(axis=1)]])

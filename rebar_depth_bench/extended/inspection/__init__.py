@@ -1,1 +1,0 @@
-"""Inspection measures: cylinders fitted to bars, bar spacing, and tolerances of standards."""

@@ -1,0 +1,112 @@
+"""Ground truth of one view as the extended measures see it: steel pixels, a band around them, camera and bars."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypeVar
+
+import numpy as np
+from jaxtyping import Bool, Float32, Float64, Int64, UInt16, UInt32
+from numpy import ndarray
+
+from rebar_depth_bench.bar_crossings.definition import Crossings
+from rebar_depth_bench.data.bars import Bar, with_axis
+from rebar_depth_bench.extended.axes import CageTruth, SceneCrossings, cage_truth, prepared_crossings
+
+_Made = TypeVar("_Made")
+
+
+@dataclass(frozen=True, eq=False)
+class BarAxes:
+    """Axis of a bar as built and its nominal axis: polylines, world, metres."""
+
+    built_m: Float64[ndarray, "n 3"]
+    nominal_m: Float64[ndarray, "k 3"]
+
+
+@dataclass(frozen=True, eq=False)
+class SceneBars:
+    """Bars of a scene: their segments, nominal diameter by bar id (NaN for ids without a bar), and crossings.
+
+    ``axes`` has the axes of the bars with a nominal axis, by bar id.
+    """
+
+    cage: CageTruth
+    diameter_m: Float64[ndarray, " ids"]
+    axes: Mapping[int, BarAxes]
+    crossings: SceneCrossings
+
+    @classmethod
+    def of(cls, bars: Sequence[Bar], crossings: Crossings | None = None) -> SceneBars:
+        """Return the bars of a scene with its crossings (default: none). Raises ``DatasetError`` for too many."""
+        # NaN for bars without a fitted axis, and for ids that images show and the table lacks.
+        diameter_m = np.full(np.iinfo(np.uint16).max + 1, np.nan)
+        measured = with_axis(bars)
+        diameter_m[[bar.bar_id for bar in measured]] = [bar.diameter_m for bar in measured]
+        axes = {
+            bar.bar_id: BarAxes(np.array(bar.axis_m), np.array(bar.nominal_axis_m))
+            for bar in measured
+            if bar.nominal_axis_m
+        }
+        cage = cage_truth(bars)
+        return cls(cage, diameter_m, axes, prepared_crossings(crossings or Crossings.none(), bars, cage))
+
+
+@dataclass(frozen=True, eq=False)
+class JudgedCrossings:
+    """Judged crossings of a view: see ``judged.judged_crossings``.
+
+    ``crossing`` holds indices into the scene's crossings, ascending. ``pixels`` are positions in the arrays of
+    ``SteelTruth``: k sampled pixels of bar a, and of bar b.
+    """
+
+    crossing: Int64[ndarray, " m"]
+    pixels: Int64[ndarray, "m 2 k"]
+
+    @classmethod
+    def none(cls) -> JudgedCrossings:
+        """Return no crossings."""
+        return cls(np.empty(0, np.int64), np.empty((0, 2, 1), np.int64))
+
+
+@dataclass(frozen=True, eq=False)
+class SteelTruth:
+    """Ground truth of one view at the pixels on steel or within one pixel (3 x 3) of it that have true depth > 0.
+
+    ``index`` holds flat indices into the height x width grid, ascending; the other arrays are parallel to it.
+    ``depth_m`` is planar depth, metres. ``bar_id`` is 0 beside the steel; ``interior`` marks the scored pixels of
+    the protocol, and ``single_bar`` those of them whose 3 x 3 neighbourhood belongs to one bar. ``rays`` are x/z
+    and y/z of each pixel's ray in the camera frame (lens distortion undone), so that ``x_cam = depth_m * (rays[:,
+    0], rays[:, 1], 1)``. ``run`` is the straight bar segment whose axis is nearest to the true point (an index
+    of ``CageTruth``), -1 where the point is on no segment. ``front_m`` and ``behind_m`` are the depths
+    of the closest other layer in front of and behind the pixel, NaN where none is visible: see
+    ``depth_layers.other_layers``. ``bars`` are those of the scene. ``distortion`` is that of the grid
+    (``cameras.distort``), zeros on an ideal one.
+    """
+
+    view_id: str
+    height: int
+    width: int
+    K: Float64[ndarray, "3 3"]
+    cam_from_world: Float64[ndarray, "4 4"]
+    index: UInt32[ndarray, " n"]
+    depth_m: Float32[ndarray, " n"]
+    bar_id: UInt16[ndarray, " n"]
+    interior: Bool[ndarray, " n"]
+    single_bar: Bool[ndarray, " n"]
+    rays: Float64[ndarray, "n 2"]
+    run: ndarray  # Int16 n
+    front_m: Float32[ndarray, " n"]
+    behind_m: Float32[ndarray, " n"]
+    bars: SceneBars = field(default_factory=lambda: SceneBars.of(()))
+    distortion: Float64[ndarray, " 5"] = field(default_factory=lambda: np.zeros(5))
+    judged: JudgedCrossings = field(default_factory=JudgedCrossings.none)
+    _made: dict[object, Any] = field(default_factory=dict, init=False, repr=False)
+
+    def once(self, make: Callable[[SteelTruth], _Made]) -> _Made:
+        """Return ``make(self)``, computed at the first call: what several predictions or measures need."""
+        if make not in self._made:
+            self._made[make] = make(self)
+        made: _Made = self._made[make]
+        return made
