@@ -18,10 +18,7 @@ from rebar_depth_bench.console import (
 )
 from rebar_depth_bench.diagnosis.diagnose import diagnose
 from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.extended.evaluate import score_extended
 from rebar_depth_bench.extended.registry import score_extended
-from rebar_depth_bench.output_options import add_output_file, prints_table
-from rebar_depth_bench.outputs import write_output
 from rebar_depth_bench.reporting.extended_tables import extended_csv, print_extended
 from rebar_depth_bench.reporting.html.page import write_report
 from rebar_depth_bench.reporting.html.views import VIEWS_SHOWN
