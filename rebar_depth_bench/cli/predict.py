@@ -18,7 +18,7 @@ from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.methods import METHODS, MultiViewMethod, find_method
 from rebar_depth_bench.methods.onnx.session import VIEW_TIMEOUT_S
 from rebar_depth_bench.methods.registry import FROM_FOLDER
-from rebar_depth_bench.methods.runner import dataset_views, predict_views
+from rebar_depth_bench.methods.run import dataset_views, predict_views
 from rebar_depth_bench.names import SPLITS, TEST_SPLIT
 from rebar_depth_bench.output_options import add_output_file, prints_table
 

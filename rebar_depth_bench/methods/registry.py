@@ -26,19 +26,21 @@ from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.base import AnyMethod, Method, MultiViewMethod
 from rebar_depth_bench.methods.controls import BOARD_PLANE, CONSTANT, NOISY_TRUTH, TRUTH
 from rebar_depth_bench.methods.huggingface.model import DEPTH_PRO, HF_PREFIX, depth_pro_method, hf_method
-from rebar_depth_bench.methods.monocular.hub import folder_method, hub_method
-from rebar_depth_bench.methods.monocular.hub_networks import (
-    DEPTH_ANYTHING_3,
-    DEPTH_ANYTHING_3_MODEL,
-    UNIDEPTH,
-    UNIDEPTH_MODEL,
-)
-from rebar_depth_bench.methods.monocular.metric3d import METRIC3D, cached_metric3d_method, metric3d_method
 from rebar_depth_bench.methods.multiview import COLMAP_ANCHORED, COLMAP_ARUCO, SWEEP_ANCHORED, SWEEP_ARUCO
 from rebar_depth_bench.methods.onnx.model import onnx_method
 from rebar_depth_bench.methods.onnx.session import VIEW_TIMEOUT_S
-from rebar_depth_bench.methods.stereo.foundation_stereo import FOUNDATION_STEREO, foundation_stereo_method
-from rebar_depth_bench.methods.stereo.sgbm import SGBM, SGBM_FILLED
+from rebar_depth_bench.methods.paper.foundation_stereo import FOUNDATION_STEREO, foundation_stereo_method
+from rebar_depth_bench.methods.paper.monocular import (
+    DEPTH_ANYTHING_3,
+    DEPTH_ANYTHING_3_MODEL,
+    METRIC3D,
+    UNIDEPTH,
+    UNIDEPTH_MODEL,
+    cached_metric3d_method,
+    metric3d_method,
+)
+from rebar_depth_bench.methods.paper.third_party import folder_method, hub_method
+from rebar_depth_bench.methods.sgbm import SGBM, SGBM_FILLED
 
 ENTRY_POINT_GROUP = "rebar_depth_bench.methods"
 DISTRIBUTION = "rebar-depth-bench"

@@ -34,7 +34,7 @@ from rebar_depth_bench.diagnosis.views import (
     positions_to_read,
 )
 from rebar_depth_bench.methods import own_methods
-from rebar_depth_bench.methods.runner import predict
+from rebar_depth_bench.methods.run import predict
 from rebar_depth_bench.scoring.evaluation import open_evaluation, read_views
 from tests.commands import run_in_process
 from tests.synthetic_dataset import write_dataset

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from textwrap import dedent
 
-from rebar_depth_bench.methods.monocular.third_party import on_sys_path
+from rebar_depth_bench.methods.paper.third_party import on_sys_path
 
 GAIN = 0.5
 """Factor by which every stand-in multiplies the red channel: its only weight, read from the checkpoint."""

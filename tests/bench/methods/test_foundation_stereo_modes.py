@@ -22,14 +22,14 @@ from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry import rectification
 from rebar_depth_bench.methods import Method, find_method
-from rebar_depth_bench.methods.stereo.disparity import largest_disparity_px, rectified_images
-from rebar_depth_bench.methods.stereo.passes import (
+from rebar_depth_bench.methods.paper.foundation_stereo import (
     SMALL_RATIO,
     Passes,
     choose_passes,
     full_size_disparity_px,
     resized,
 )
+from rebar_depth_bench.methods.sgbm import largest_disparity_px, rectified_images
 from tests.bench.methods import stand_in_models as stand_ins
 from tests.bench.methods.predictors import load_predictor
 from tests.bench.methods.stand_in_views import stereo_row

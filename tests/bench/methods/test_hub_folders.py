@@ -20,8 +20,8 @@ SCRIPT = """
 import sys
 from dataclasses import replace
 from rebar_depth_bench.console import run_command
-from rebar_depth_bench.methods.monocular.hub import hub_method
-from rebar_depth_bench.methods.monocular.hub_networks import UNIDEPTH_MODEL
+from rebar_depth_bench.methods.paper.third_party import hub_method
+from rebar_depth_bench.methods.paper.monocular import UNIDEPTH_MODEL
 
 def show(folder):
     print(*sorted(one.name for one in folder.iterdir()))

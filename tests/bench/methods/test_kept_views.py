@@ -15,7 +15,7 @@ import pytest
 
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.methods.kept_views import KeptViews, PreparationReport
-from rebar_depth_bench.methods.runner import predict
+from rebar_depth_bench.methods.run import predict
 from tests.bench.methods.test_predict import counting_method, orbit_view_ids
 
 GRID = (90, 160)

@@ -11,7 +11,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rebar_depth_bench.methods.monocular.conversions import (
+from rebar_depth_bench.methods.paper.monocular import (
     Letterbox,
     Margins,
     crop_margins,
@@ -23,7 +23,7 @@ from rebar_depth_bench.methods.monocular.conversions import (
     padded,
     positive_or_nan,
 )
-from rebar_depth_bench.methods.stereo.disparity import MIN_PARALLAX_PX, disparity_to_depth_m
+from rebar_depth_bench.methods.sgbm import MIN_PARALLAX_PX, disparity_to_depth_m
 
 METRES = st.floats(0.1, 30)
 FOCAL = st.floats(50, 3000)

@@ -26,8 +26,8 @@ from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry import rectification
 from rebar_depth_bench.methods import METHODS, MultiViewMethod, find_method, own_methods
-from rebar_depth_bench.methods.monocular import metric3d
-from rebar_depth_bench.methods.monocular.conversions import fit_letterbox
+from rebar_depth_bench.methods.paper import monocular as metric3d
+from rebar_depth_bench.methods.paper.monocular import fit_letterbox
 from rebar_depth_bench.methods.registry import FROM_FOLDER
 from tests.bench.methods import stand_in_models as stand_ins
 from tests.bench.methods.predictors import load_predictor

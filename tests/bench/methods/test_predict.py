@@ -29,7 +29,7 @@ from rebar_depth_bench.methods import (
     all_methods,
     find_method,
 )
-from rebar_depth_bench.methods.runner import predict
+from rebar_depth_bench.methods.run import predict
 from rebar_depth_bench.parallel import Progress
 
 USER_METHOD = """

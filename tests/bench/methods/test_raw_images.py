@@ -19,8 +19,7 @@ from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.cameras import pixel_rays
 from rebar_depth_bench.geometry.rectification import raw_depth_m, rectified_pair
 from rebar_depth_bench.methods import Method, MethodInfo
-from rebar_depth_bench.methods.raw_images import rectifying_predictor
-from rebar_depth_bench.methods.runner import predict_views
+from rebar_depth_bench.methods.run import predict_views, rectifying_predictor
 from rebar_depth_bench.submission import SubmissionReader
 from tests.bench.geometry.calibrations import SHIPPED_CALIBRATION
 from tests.bench.geometry.textured_plane import HEIGHT, WIDTH, plane_depth_m, raw_row

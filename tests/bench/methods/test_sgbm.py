@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rebar_depth_bench.methods.stereo.sgbm import MAX_LEFT_RIGHT_DIFFERENCE_PX, left_right_consistent
+from rebar_depth_bench.methods.sgbm import MAX_LEFT_RIGHT_DIFFERENCE_PX, left_right_consistent
 from tests.bench.methods.predictors import load_predictor
 
 

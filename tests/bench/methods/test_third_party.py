@@ -15,7 +15,7 @@ pytest.importorskip("torch")
 
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.base import MethodInfo
-from rebar_depth_bench.methods.monocular.third_party import (
+from rebar_depth_bench.methods.paper.third_party import (
     check_weights_loaded,
     on_sys_path,
     translate_errors,

@@ -26,20 +26,21 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jaxtyping import Float32, UInt8
 from numpy import ndarray
 
 from rebar_depth_bench.errors import MethodError, Problem
 from rebar_depth_bench.geometry.calibration_documents import parse_document
 from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
-from rebar_depth_bench.methods.monocular.conversions import crop_margins, margins_to_multiple, padded
-from rebar_depth_bench.methods.monocular.third_party import (
+from rebar_depth_bench.methods.paper.monocular import crop_margins, margins_to_multiple, padded
+from rebar_depth_bench.methods.paper.third_party import (
     image_tensor,
     import_package,
     import_torch,
@@ -49,7 +50,7 @@ from rebar_depth_bench.methods.monocular.third_party import (
     translate_errors,
     with_weights_digest,
 )
-from rebar_depth_bench.methods.stereo.disparity import (
+from rebar_depth_bench.methods.sgbm import (
     SEARCH_SHARE_OF_WIDTH,
     STEREO_COLUMNS,
     StereoImages,
@@ -57,7 +58,6 @@ from rebar_depth_bench.methods.stereo.disparity import (
     rectified_images,
     stereo_depth_m,
 )
-from rebar_depth_bench.methods.stereo.passes import SMALL_RATIO, choose_passes, full_size_disparity_px, resized
 from rebar_depth_bench.reading import read_file
 from rebar_depth_bench.validation import short_repr
 
@@ -227,3 +227,68 @@ FOUNDATION_STEREO = Method(
     _raise_without_folder,
 )
 """FoundationStereo as in the paper, without a folder; loading raises an error with install instructions."""
+
+
+# Choice of a stereo network's passes and image size from the largest expected disparity, and scaling back.
+#
+# A network's cost volume ends at some disparity, and smaller images have smaller disparities. FoundationStereo's
+# demo (``scripts/run_demo.py``) has two options that extend the range: ``--hiera 1`` starts a pass at full size
+# from the result of a pass at half the size, and ``--scale`` makes the images smaller. The choice is:
+#
+# - One pass at full size, where the volume holds the largest expected disparity.
+# - Two passes (hierarchical) where it holds half of it. The second pass has the full resolution; at disparities
+#   beyond the end of the volume it refines with the correlation of the two images' features alone.
+# - Two passes on smaller images otherwise, as large as the volume of the first pass allows.
+
+SMALL_RATIO = 0.5
+"""Size of the first of two passes, relative to the second."""
+
+
+@dataclass(frozen=True)
+class Passes:
+    """Passes of a network: one or two (``hierarchical``), on images resized by ``scale``, which is at most 1."""
+
+    hierarchical: bool
+    scale: float = 1.0
+
+    @property
+    def mode(self) -> str:
+        """Name of the mode."""
+        return "hierarchical" if self.hierarchical else "single pass"
+
+
+def choose_passes(largest_px: float, volume_px: int) -> Passes:
+    """Return the passes on the largest images for which a volume of ``volume_px`` holds ``largest_px``."""
+    if largest_px <= volume_px:
+        return Passes(hierarchical=False)
+    return Passes(hierarchical=True, scale=min(1.0, volume_px / (SMALL_RATIO * largest_px)))
+
+
+def resized(rgb: UInt8[ndarray, "h w 3"], scale: float) -> UInt8[ndarray, "hs ws 3"]:
+    """Return an image resized by ``scale`` with OpenCV, bilinear as in the demo; sides are rounded down.
+
+    The demo rounds to the nearest whole side; rounding down never enlarges the disparity.
+    """
+    import cv2
+
+    height, width = (max(1, int(side * scale)) for side in rgb.shape[:2])
+    if (height, width) == rgb.shape[:2]:
+        return rgb
+    return np.asarray(cv2.resize(rgb, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
+
+
+def full_size_disparity_px(
+    disparity_px: Float32[ndarray, "hs ws"], grid: tuple[int, int]
+) -> Float32[ndarray, "h w"]:
+    """Return a resized image's disparity on the original ``grid`` = (H, W), in pixels of that grid.
+
+    Each pixel takes the disparity of the resized pixel that contains its centre, because interpolation would place
+    surfaces between a bar and its background. The factor is that of the widths, which rounding moves away from
+    ``scale``.
+    """
+    rows, columns = (
+        ((np.arange(full) + 0.5) * small / full).astype(np.int64)
+        for full, small in zip(grid, disparity_px.shape, strict=True)
+    )
+    factor = np.float32(grid[1] / disparity_px.shape[1])
+    return np.asarray(disparity_px[rows[:, None], columns] * factor, np.float32)
