@@ -10,8 +10,8 @@ TIP 2014, guided by the left image, with left-right consistency as confidence (o
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from types import ModuleType
+from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -47,7 +47,10 @@ class StereoImages:
 
 
 Matcher = Callable[[StereoImages], Float32[ndarray, "h w"]]
-"""Function from rectified images to the disparity of the left one, pixels; <= 0 where there is none."""
+"""Function from rectified images to the disparity of the left one, pixels; <= 0 where there is none.
+
+The match of a pixel must lie inside the right image (``without_invisible``).
+"""
 
 
 def stereo_depth_m(row: Mapping[str, Any], match: Matcher) -> Float32[ndarray, "h w"]:
@@ -94,6 +97,11 @@ def largest_disparity_px(images: StereoImages, nearest_m: float | None = None) -
     return float(np.clip(parallax_px + images.K_left[0, 2] - images.K_right[0, 2], 0, width))
 
 
+def without_invisible(disparity_px: Float32[ndarray, "h w"]) -> Float32[ndarray, "h w"]:
+    """Return a disparity with 0 (none) at pixels whose match would lie left of the right image, and for NaN."""
+    return np.where(np.arange(disparity_px.shape[1]) >= disparity_px, disparity_px, np.float32(0))
+
+
 def disparity_to_depth_m(
     disparity_px: Float32[ndarray, "h w"],
     left_K: Float64[ndarray, "3 3"],
@@ -102,12 +110,10 @@ def disparity_to_depth_m(
 ) -> Float32[ndarray, "h w"]:
     """Return z = fx * B / (disparity - (cx_left - cx_right)), metres; NaN if the parallax is below one pixel.
 
-    Such depths are meaningless because an error of half a pixel halves or doubles them. Pixels whose match would
-    lie outside the right image on the left are NaN as well.
+    Such depths are meaningless because an error of half a pixel halves or doubles them.
     """
-    columns = np.arange(disparity_px.shape[1], dtype=np.float64)
     parallax_px = disparity_px - (left_K[0, 2] - right_K[0, 2])
-    matched = (disparity_px > 0) & (parallax_px >= MIN_PARALLAX_PX) & (columns - disparity_px >= 0)
+    matched = (disparity_px > 0) & (parallax_px >= MIN_PARALLAX_PX)
     depth_m = np.full(disparity_px.shape, np.nan, np.float32)
     depth_m[matched] = left_K[0, 0] * baseline_m / parallax_px[matched]
     return depth_m
@@ -131,32 +137,22 @@ A bar and its background differ by far more.
 """
 
 
-def _loader(*, check_consistency: bool) -> Callable[[], Predictor]:
-    def load() -> Predictor:
-        try:
-            import cv2
-            import cv2.ximgproc
-        except ImportError as error:
-            raise MethodError(
-                f"sgbm needs OpenCV with ximgproc ({error}): pip install 'rebar-depth-bench[methods]'"
-            ) from None
-        return lambda row: stereo_depth_m(
-            row, lambda images: _disparity_px(cv2, images.left_rgb, images.right_rgb, check_consistency)
-        )
+def _load(*, check_consistency: bool) -> Predictor:
+    try:
+        import cv2.ximgproc  # noqa: F401
+    except ImportError as error:
+        raise MethodError(
+            f"sgbm needs OpenCV with ximgproc ({error}): pip install 'rebar-depth-bench[methods]', in an "
+            "environment without opencv-python, which hides it"
+        ) from None
 
-    return load
+    def match(images: StereoImages) -> Float32[ndarray, "h w"]:
+        left_px, right_px = filtered_disparities_px(images.left_rgb, images.right_rgb)
+        if check_consistency:
+            left_px = np.where(left_right_consistent(left_px, right_px), left_px, np.float32(0))
+        return without_invisible(left_px)
 
-
-def _disparity_px(
-    cv2: ModuleType, left_rgb: UInt8[ndarray, "h w 3"], right_rgb: UInt8[ndarray, "h w 3"], check_consistency: bool
-) -> Float32[ndarray, "h w"]:
-    """Return the left view's disparity, pixels; <= 0 if there is none or if it fails the consistency check."""
-    left_px, right_px = filtered_disparities_px(cv2, left_rgb, right_rgb)
-    return (
-        np.where(left_right_consistent(left_px, right_px), left_px, np.float32(0))
-        if check_consistency
-        else left_px
-    )
+    return partial(stereo_depth_m, match=match)
 
 
 def left_right_consistent(
@@ -180,13 +176,15 @@ def left_right_consistent(
 
 
 def filtered_disparities_px(
-    cv2: ModuleType, left_rgb: UInt8[ndarray, "h w 3"], right_rgb: UInt8[ndarray, "h w 3"]
+    left_rgb: UInt8[ndarray, "h w 3"], right_rgb: UInt8[ndarray, "h w 3"]
 ) -> tuple[Float32[ndarray, "h w"], Float32[ndarray, "h w"]]:
     """Return the filtered left disparity and the unfiltered right disparity, pixels; <= 0 where there is none.
 
     OpenCV gives no disparity in the first ``numDisparities`` columns of the left view and in the last ones of the
     right view; both images are therefore padded by as many columns on either side.
     """
+    import cv2
+
     width = left_rgb.shape[1]
     search_px = int(-(-width * SEARCH_SHARE_OF_WIDTH // 16) * 16)
     left, right = (
@@ -216,26 +214,25 @@ def filtered_disparities_px(
     return left_px, -right_px
 
 
-def _sgbm_method(name: str, summary: str, *, check_consistency: bool) -> Method:
-    info = MethodInfo(
-        name=name,
-        summary=summary,
+SGBM = Method(
+    MethodInfo(
+        name="sgbm",
+        summary=(
+            "OpenCV semi-global matching and weighted-least-squares filter on the stereo pair; no prediction "
+            "where the two views disagree"
+        ),
         columns=STEREO_COLUMNS,
         uses_intrinsics=True,
         source="OpenCV StereoSGBM and ximgproc",
         licence="Apache-2.0",
-    )
-    return Method(info, _loader(check_consistency=check_consistency))
-
-
-SGBM = _sgbm_method(
-    "sgbm",
-    "OpenCV semi-global matching and weighted-least-squares filter on the stereo pair; no prediction where the "
-    "two views disagree",
-    check_consistency=True,
+    ),
+    partial(_load, check_consistency=True),
 )
-SGBM_FILLED = _sgbm_method(
-    "sgbm-filled",
-    "semi-global matching as sgbm; where the views disagree, the filter fills in",
-    check_consistency=False,
+SGBM_FILLED = Method(
+    replace(
+        SGBM.info,
+        name="sgbm-filled",
+        summary="semi-global matching as sgbm; where the views disagree, the filter fills in",
+    ),
+    partial(_load, check_consistency=False),
 )

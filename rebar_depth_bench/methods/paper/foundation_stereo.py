@@ -2,11 +2,18 @@
 
 Input images are RGB with values 0 to 255, padded to multiples of 32 by repeating borders; 32 iterations are run,
 as in ``scripts/run_demo.py``. A pixel has no prediction if its match would lie beyond the left border of the right
-image, as in that script, or if its parallax is below one pixel.
+image that the network receives, as in that script, or if its parallax is below one pixel.
 
-The cost volume ends at ``max_disp`` of ``cfg.yaml`` (416 px for ``23-51-11``), the range of its training. A single
-pass, hierarchical mode or smaller images are chosen from the largest expected disparity (``stereo.passes``), which
-comes from one of two sources:
+The cost volume ends at ``max_disp`` of ``cfg.yaml`` (416 px for ``23-51-11``), the range of its training. The demo
+has two options that extend the range: ``--hiera 1`` starts a pass at full size from the result of a pass at half
+the size, and ``--scale`` makes the images smaller. The choice follows from the largest expected disparity:
+
+- One pass at full size, where the volume holds the largest expected disparity.
+- Two passes (hierarchical) where it holds half of it. The second pass has the full resolution; at disparities
+  beyond the end of the volume it refines with the correlation of the two images' features alone.
+- Two passes on smaller images otherwise, as large as the volume of the first pass allows.
+
+The largest expected disparity comes from one of two sources:
 
 - by default half of the image width, the search range of ``sgbm``: at 1280 x 720 this is 640 px, more than the
   volume holds, and the mode is hierarchical, which the authors recommend for images above 1000 px;
@@ -15,10 +22,6 @@ comes from one of two sources:
 Neither is ground truth. The camera distances of a config's protocol are not used, because the poses of scored
 views are ground truth; a distance that the user measured in scored depth, masks, meshes or poses would be as well.
 The paper does not state its mode.
-
-This method has never been run with the real network because the weights could not be downloaded. When the network
-is built, its code may download DINOv2's code (from GitHub, regardless of ``HF_HUB_OFFLINE``) and timm's
-``edgenext_small`` (from the Hub); a notice is printed first if their caches are empty.
 """
 
 from __future__ import annotations
@@ -26,7 +29,7 @@ from __future__ import annotations
 import importlib
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -39,17 +42,7 @@ from rebar_depth_bench.errors import MethodError, Problem
 from rebar_depth_bench.geometry.calibration_documents import parse_document
 from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
-from rebar_depth_bench.methods.paper.monocular import crop_margins, margins_to_multiple, padded
-from rebar_depth_bench.methods.paper.third_party import (
-    image_tensor,
-    import_package,
-    import_torch,
-    load_checkpoint,
-    on_sys_path,
-    torch_device,
-    translate_errors,
-    with_weights_digest,
-)
+from rebar_depth_bench.methods.paper.third_party import Network, image_tensor, on_sys_path, torch_device
 from rebar_depth_bench.methods.sgbm import (
     SEARCH_SHARE_OF_WIDTH,
     STEREO_COLUMNS,
@@ -57,6 +50,7 @@ from rebar_depth_bench.methods.sgbm import (
     largest_disparity_px,
     rectified_images,
     stereo_depth_m,
+    without_invisible,
 )
 from rebar_depth_bench.reading import read_file
 from rebar_depth_bench.validation import short_repr
@@ -69,15 +63,27 @@ INSTALL_HINT = (
     f"Drive) into FoundationStereo/{WEIGHTS_FOLDER.parent}, install its requirements, and pass the clone as "
     f"{NAME}:FoundationStereo"
 )
-SIDE_MULTIPLE_PX, ITERATIONS = 32, 32
-INFO = MethodInfo(
-    name=NAME,
-    summary="FoundationStereo on the stereo pair, as in the paper",
-    columns=STEREO_COLUMNS,
-    uses_intrinsics=True,
-    source="github.com/NVlabs/FoundationStereo, 23-51-11",
-    licence="NVIDIA, research purposes only",
-    untested_note="not tested with the real network: its code and weights were not available",
+DOWNLOADS = (
+    "its code downloads what is not cached: DINOv2's code (https://github.com/facebookresearch/dinov2, even if "
+    "HF_HUB_OFFLINE is set), which is then executed, and timm's edgenext_small (from the Hub)"
+)
+ITERATIONS = 32
+SMALL_RATIO = 0.5
+"""Size of the first of two passes, relative to the second."""
+NETWORK = Network(
+    MethodInfo(
+        name=NAME,
+        summary="FoundationStereo on the stereo pair, as in the paper",
+        columns=STEREO_COLUMNS,
+        uses_intrinsics=True,
+        source="github.com/NVlabs/FoundationStereo, 23-51-11",
+        licence="NVIDIA, research purposes only",
+        untested_note=(
+            "run only with its authors' code and random weights on a CPU, in a single pass: its weights were not "
+            "available"
+        ),
+    ),
+    install="pip install open3d trimesh pandas joblib imageio timm torchvision",
 )
 
 
@@ -91,12 +97,18 @@ class Settings(dict[str, Any]):
             raise AttributeError(f"{SETTINGS_FILE} has no {name}") from None
 
 
-def foundation_stereo_method(folder: Path, nearest_m: float | None = None) -> Method:
+def foundation_stereo_method(folder: Path | None, nearest_m: float | None = None) -> Method:
     """Return FoundationStereo from a clone of its repository, or with other weights in a folder inside a clone.
 
     ``nearest_m`` is the declared distance of the nearest surface, metres, which chooses the mode (see the module).
-    Raises ``MethodError`` if code, checkpoint or ``cfg.yaml`` is missing.
+    Raises ``MethodError`` if code, checkpoint or ``cfg.yaml`` is missing, and with install instructions if
+    ``folder`` is None, because the weights cannot be downloaded automatically.
     """
+    if folder is None:
+        raise MethodError(
+            f"{NAME}: its weights are on Google Drive and cannot be downloaded automatically; to install it: "
+            f"{INSTALL_HINT}"
+        )
     weights = folder if (folder / CHECKPOINT_FILE).is_file() else folder / WEIGHTS_FOLDER
     start = folder.resolve()
     clone = next((candidate for candidate in (start, *start.parents) if (candidate / CODE_FILE).is_file()), None)
@@ -108,43 +120,46 @@ def foundation_stereo_method(folder: Path, nearest_m: float | None = None) -> Me
     for file in files:
         if not file.is_file():
             raise MethodError(f"{NAME}:{folder}: no {file.name} in {weights}; to install it: {INSTALL_HINT}")
-    nearest = "" if nearest_m is None else f", nearest distance {nearest_m} m"
-    info = with_weights_digest(replace(INFO, summary=f"{INFO.summary}{nearest}"), weights.name, files)
-    return Method(info, partial(load_predictor, clone, weights, nearest_m), partial(_notes, weights, nearest_m))
+    declared = "" if nearest_m is None else f", nearest distance {nearest_m} m"
+    info = replace(NETWORK.info, summary=f"{NETWORK.info.summary}{declared}")
+    info = replace(NETWORK, info=info).with_digest(weights.name, files)
+    return Method(info, partial(_load, clone, weights, nearest_m), partial(_notes, weights, nearest_m))
 
 
-def load_predictor(clone: Path, weights: Path, nearest_m: float | None = None) -> Predictor:
+def _load(clone: Path, weights: Path, nearest_m: float | None) -> Predictor:
     """Return the predictor with the code of a clone and a folder of weights, on the GPU if torch finds one.
 
     Raises ``MethodError`` if torch, OpenCV or a module that its code imports is missing, or if the weights are
     incomplete.
     """
-    torch = import_torch(NAME)
-    import_package("cv2", NAME, "pip install 'rebar-depth-bench[methods]'")
+    torch = NETWORK.import_torch()
+    NETWORK.import_package("cv2", "pip install 'rebar-depth-bench[methods]'")
     settings = _read_settings(weights)
-    model = _load_network(torch, clone, weights, settings)
+    print(f"{NAME}: {DOWNLOADS}", file=sys.stderr, flush=True)
+    with NETWORK.errors(f"{weights} cannot be loaded"), on_sys_path(clone):
+        code = importlib.import_module("core.foundation_stereo")
+        if not Path(str(code.__file__)).resolve().is_relative_to(clone.resolve()):
+            raise MethodError(f"{NAME}: core is already imported from {code.__file__}, expected it from {clone}")
+        model = code.FoundationStereo(settings)
+        model = NETWORK.load_checkpoint(model, weights / CHECKPOINT_FILE, "model")
 
-    def match(images: StereoImages) -> ndarray:
-        passes = choose_passes(largest_disparity_px(images, nearest_m), settings.max_disp)
-        left, right = (resized(image, passes.scale) for image in (images.left_rgb, images.right_rgb))
-        margins = margins_to_multiple((left.shape[0], left.shape[1]), SIDE_MULTIPLE_PX)
-        with (
-            translate_errors(NAME, torch, "inference failed"),
-            torch.inference_mode(),
-            torch.autocast("cuda", enabled=torch.cuda.is_available()),
-        ):
-            pair = [image_tensor(torch, padded(image, margins)).to(torch_device(torch)) for image in (left, right)]
-            if passes.hierarchical:  # Spelled so by its authors.
+    def match(images: StereoImages) -> Float32[ndarray, "h w"]:
+        is_hierarchical, scale = choose_passes(largest_disparity_px(images, nearest_m), settings.max_disp)
+        pair = [
+            image_tensor(resized(rgb, scale)).to(torch_device()) for rgb in (images.left_rgb, images.right_rgb)
+        ]
+        padder = code.InputPadder(pair[0].shape, divis_by=32, force_square=False)
+        with torch.autocast("cuda", enabled=torch.cuda.is_available()):
+            if is_hierarchical:  # Spelled so by its authors.
                 disparity_px = model.run_hierachical(
-                    *pair, iters=ITERATIONS, test_mode=True, small_ratio=SMALL_RATIO
+                    *padder.pad(*pair), iters=ITERATIONS, test_mode=True, small_ratio=SMALL_RATIO
                 )
             else:
-                disparity_px = model.forward(*pair, iters=ITERATIONS, test_mode=True)
-            padded_px = disparity_px.float().cpu().numpy().reshape(pair[0].shape[-2:])
-        cropped_px = np.asarray(crop_margins(padded_px, margins), np.float32)
-        return full_size_disparity_px(cropped_px, (images.left_rgb.shape[0], images.left_rgb.shape[1]))
+                disparity_px = model.forward(*padder.pad(*pair), iters=ITERATIONS, test_mode=True)
+        cropped_px = padder.unpad(disparity_px.float()).cpu().numpy().reshape(pair[0].shape[-2:])
+        return full_size_disparity_px(without_invisible(cropped_px), images.left_rgb.shape[:2])
 
-    return partial(stereo_depth_m, match=match)
+    return NETWORK.predictor(partial(stereo_depth_m, match=match))
 
 
 def _read_settings(weights: Path) -> Settings:
@@ -164,104 +179,31 @@ def _read_settings(weights: Path) -> Settings:
     return settings
 
 
-def _load_network(torch: Any, clone: Path, weights: Path, settings: Settings) -> Any:
-    """Return the network with its weights, after a notice of the files that its code may download."""
-    if downloads := _possible_downloads(torch):
-        print(f"{NAME}: its code may download {' and '.join(downloads)}", file=sys.stderr, flush=True)
-    with translate_errors(NAME, torch, f"{weights} cannot be loaded"), on_sys_path(clone):
-        code = importlib.import_module("core.foundation_stereo")
-        if not Path(str(code.__file__)).resolve().is_relative_to(clone.resolve()):
-            raise MethodError(f"{NAME}: core is already imported from {code.__file__}, expected it from {clone}")
-        network = code.FoundationStereo(settings)
-        return load_checkpoint(NAME, torch, network, weights / CHECKPOINT_FILE, "model")
-
-
-def _possible_downloads(torch: Any) -> list[str]:
-    """Return descriptions of the files that the network's code downloads because they are not cached."""
-    from huggingface_hub import constants
-
-    downloads = []
-    if not any(Path(torch.hub.get_dir()).glob("facebookresearch_dinov2_*")):
-        downloads.append(
-            "DINOv2's code (https://github.com/facebookresearch/dinov2, even if HF_HUB_OFFLINE is set), which is "
-            "then executed,"
-        )
-    if not any(Path(constants.HF_HUB_CACHE).glob("models--timm--edgenext_small*")):
-        downloads.append("timm's edgenext_small (from the Hub)")
-    return downloads
-
-
 def _notes(weights: Path, nearest_m: float | None, row: Mapping[str, Any]) -> dict[str, Any]:
     """Return the mode and scale for a row, with the numbers from which they are chosen."""
     volume_px = _read_settings(weights).max_disp
     largest_px = largest_disparity_px(rectified_images(row)[0], nearest_m)
-    passes = choose_passes(largest_px, volume_px)
+    is_hierarchical, scale = choose_passes(largest_px, volume_px)
     declared = (
         f"{SEARCH_SHARE_OF_WIDTH:g} of the width" if nearest_m is None else f"nearest distance {nearest_m} m"
     )
     return {
-        "mode": passes.mode,
-        "scale": round(passes.scale, 4),
+        "mode": "hierarchical" if is_hierarchical else "single pass",
+        "scale": round(scale, 4),
         "largest_disparity_px": round(largest_px, 1),
         "largest_disparity_from": declared,
         "cost_volume_px": volume_px,
     }
 
 
-def _raise_without_folder() -> Predictor:
-    """Raise ``MethodError`` with install instructions; the weights cannot be downloaded automatically."""
-    raise MethodError(
-        f"{NAME}: its weights are on Google Drive and cannot be downloaded automatically; to install it: "
-        f"{INSTALL_HINT}"
-    )
+def choose_passes(largest_px: float, volume_px: int) -> tuple[bool, float]:
+    """Return whether there are two passes (hierarchical), and the largest scale of the images, at most 1.
 
-
-FOUNDATION_STEREO = Method(
-    replace(
-        INFO,
-        summary=(
-            f"{INFO.summary}; hierarchical, and on smaller images, where half of the width or --nearest-distance "
-            f"gives disparities beyond its cost volume; a clone and weights of yours: {NAME}:FOLDER"
-        ),
-    ),
-    _raise_without_folder,
-)
-"""FoundationStereo as in the paper, without a folder; loading raises an error with install instructions."""
-
-
-# Choice of a stereo network's passes and image size from the largest expected disparity, and scaling back.
-#
-# A network's cost volume ends at some disparity, and smaller images have smaller disparities. FoundationStereo's
-# demo (``scripts/run_demo.py``) has two options that extend the range: ``--hiera 1`` starts a pass at full size
-# from the result of a pass at half the size, and ``--scale`` makes the images smaller. The choice is:
-#
-# - One pass at full size, where the volume holds the largest expected disparity.
-# - Two passes (hierarchical) where it holds half of it. The second pass has the full resolution; at disparities
-#   beyond the end of the volume it refines with the correlation of the two images' features alone.
-# - Two passes on smaller images otherwise, as large as the volume of the first pass allows.
-
-SMALL_RATIO = 0.5
-"""Size of the first of two passes, relative to the second."""
-
-
-@dataclass(frozen=True)
-class Passes:
-    """Passes of a network: one or two (``hierarchical``), on images resized by ``scale``, which is at most 1."""
-
-    hierarchical: bool
-    scale: float = 1.0
-
-    @property
-    def mode(self) -> str:
-        """Name of the mode."""
-        return "hierarchical" if self.hierarchical else "single pass"
-
-
-def choose_passes(largest_px: float, volume_px: int) -> Passes:
-    """Return the passes on the largest images for which a volume of ``volume_px`` holds ``largest_px``."""
+    A cost volume of ``volume_px`` then holds ``largest_px``, the largest expected disparity.
+    """
     if largest_px <= volume_px:
-        return Passes(hierarchical=False)
-    return Passes(hierarchical=True, scale=min(1.0, volume_px / (SMALL_RATIO * largest_px)))
+        return False, 1.0
+    return True, min(1.0, volume_px / (SMALL_RATIO * largest_px))
 
 
 def resized(rgb: UInt8[ndarray, "h w 3"], scale: float) -> UInt8[ndarray, "hs ws 3"]:
@@ -272,13 +214,11 @@ def resized(rgb: UInt8[ndarray, "h w 3"], scale: float) -> UInt8[ndarray, "hs ws
     import cv2
 
     height, width = (max(1, int(side * scale)) for side in rgb.shape[:2])
-    if (height, width) == rgb.shape[:2]:
-        return rgb
     return np.asarray(cv2.resize(rgb, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
 
 
 def full_size_disparity_px(
-    disparity_px: Float32[ndarray, "hs ws"], grid: tuple[int, int]
+    disparity_px: Float32[ndarray, "hs ws"], grid: tuple[int, ...]
 ) -> Float32[ndarray, "h w"]:
     """Return a resized image's disparity on the original ``grid`` = (H, W), in pixels of that grid.
 
@@ -292,3 +232,11 @@ def full_size_disparity_px(
     )
     factor = np.float32(grid[1] / disparity_px.shape[1])
     return np.asarray(disparity_px[rows[:, None], columns] * factor, np.float32)
+
+
+FOUNDATION_STEREO = NETWORK.listed(
+    foundation_stereo_method,
+    "hierarchical, and on smaller images, where half of the width or --nearest-distance gives disparities beyond "
+    f"its cost volume; a clone and weights of yours: {NAME}:FOLDER",
+)
+"""FoundationStereo as in the paper, without a folder; loading raises an error with install instructions."""
