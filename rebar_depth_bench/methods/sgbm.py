@@ -191,7 +191,7 @@ def filtered_disparities_px(
         cv2.copyMakeBorder(image, 0, 0, search_px, search_px, cv2.BORDER_REPLICATE)
         for image in (left_rgb, right_rgb)
     )
-    matcher = cv2.StereoSGBM_create(
+    matcher = cv2.StereoSGBM.create(
         minDisparity=0,
         numDisparities=search_px,
         blockSize=BLOCK_PX,
