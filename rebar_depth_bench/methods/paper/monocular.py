@@ -234,7 +234,9 @@ DA3_NETWORK = HubNetwork(
         uses_intrinsics=True,
         source="depth-anything-3, depth-anything/DA3METRIC-LARGE",
         licence="Apache-2.0",
-        untested_note=_UNTESTED,
+        untested_note=(
+            "run only with its package's code and a small random network on a CPU: its weights were not available"
+        ),
     ),
     install="pip install depth-anything-3 addict",
     repository="depth-anything/DA3METRIC-LARGE",
