@@ -13,15 +13,17 @@ from __future__ import annotations
 
 import importlib.util
 import sys
-from collections.abc import Iterator, Mapping
+from collections import UserDict
+from collections.abc import Mapping
 from dataclasses import replace
 from importlib.machinery import PathFinder
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from rebar_depth_bench.data.files import file_sha256
-from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.errors import MethodError, exception_summary
 from rebar_depth_bench.methods.base import VIEW_TIMEOUT_S, AnyMethod, Method, MultiViewMethod, WeightsMethod
 
 ENTRY_POINT_GROUP = "rebar_depth_bench.methods"
@@ -33,41 +35,32 @@ FROM_FOLDER = ("depth-anything-3", "foundation-stereo", "metric3d", "unidepth")
 """Names of the methods that take a folder: ``NAME:FOLDER``."""
 
 
-class _BuiltIn(Mapping[str, AnyMethod]):
-    """Methods by name, from their places: a method's module is imported when the method is looked up."""
-
-    def __init__(self, places: Mapping[str, str]) -> None:
-        self._places = places
+class _BuiltIn(UserDict[str, Any]):
+    """Methods by name, from module and attribute of each; a module is imported when its method is looked up."""
 
     def __getitem__(self, name: str) -> AnyMethod:
-        module, attribute = self._places[name].split(":")
-        method: AnyMethod = getattr(importlib.import_module(f"{__package__}.{module}"), attribute)
+        module, attribute = self.data[name].split(":")
+        method: AnyMethod = getattr(importlib.import_module(module), attribute)
         return method
-
-    def __iter__(self) -> Iterator[str]:
-        return iter(self._places)
-
-    def __len__(self) -> int:
-        return len(self._places)
 
 
 METHODS: Mapping[str, AnyMethod] = _BuiltIn(
     {
-        "sgbm": "sgbm:SGBM",
-        "sgbm-filled": "sgbm:SGBM_FILLED",
-        "foundation-stereo": "paper.foundation_stereo:FOUNDATION_STEREO",
-        "depth-pro": "huggingface.model:DEPTH_PRO",
-        "metric3d": "paper.monocular:METRIC3D",
-        "unidepth": "paper.monocular:UNIDEPTH",
-        "depth-anything-3": "paper.monocular:DEPTH_ANYTHING_3",
-        "colmap-aruco": "multiview:COLMAP_ARUCO",
-        "colmap-anchored": "multiview:COLMAP_ANCHORED",
-        "sweep-aruco": "multiview:SWEEP_ARUCO",
-        "sweep-anchored": "multiview:SWEEP_ANCHORED",
-        "constant": "controls:CONSTANT",
-        "board-plane": "controls:BOARD_PLANE",
-        "noisy-truth": "controls:NOISY_TRUTH",
-        "truth": "controls:TRUTH",
+        "sgbm": "rebar_depth_bench.methods.sgbm:SGBM",
+        "sgbm-filled": "rebar_depth_bench.methods.sgbm:SGBM_FILLED",
+        "foundation-stereo": "rebar_depth_bench.methods.paper.foundation_stereo:FOUNDATION_STEREO",
+        "depth-pro": "rebar_depth_bench.methods.huggingface.model:DEPTH_PRO",
+        "metric3d": "rebar_depth_bench.methods.paper.monocular:METRIC3D",
+        "unidepth": "rebar_depth_bench.methods.paper.monocular:UNIDEPTH",
+        "depth-anything-3": "rebar_depth_bench.methods.paper.monocular:DEPTH_ANYTHING_3",
+        "colmap-aruco": "rebar_depth_bench.methods.multiview:COLMAP_ARUCO",
+        "colmap-anchored": "rebar_depth_bench.methods.multiview:COLMAP_ANCHORED",
+        "sweep-aruco": "rebar_depth_bench.methods.multiview:SWEEP_ARUCO",
+        "sweep-anchored": "rebar_depth_bench.methods.multiview:SWEEP_ANCHORED",
+        "constant": "rebar_depth_bench.methods.controls:CONSTANT",
+        "board-plane": "rebar_depth_bench.methods.controls:BOARD_PLANE",
+        "noisy-truth": "rebar_depth_bench.methods.controls:NOISY_TRUTH",
+        "truth": "rebar_depth_bench.methods.controls:TRUTH",
     }
 )
 """Built-in methods by name."""
@@ -108,10 +101,6 @@ def find_method(name: str, *, view_timeout_s: float = VIEW_TIMEOUT_S, nearest_m:
         from rebar_depth_bench.methods.onnx.model import onnx_method
 
         return onnx_method(Path(name), view_timeout_s)
-    if name == "depth-pro":
-        from rebar_depth_bench.methods.huggingface.model import depth_pro_method
-
-        return depth_pro_method()
     if name in METHODS:
         return _with_weights(name, None)
     entries = _entry_point_methods()
@@ -127,6 +116,10 @@ def find_method(name: str, *, view_timeout_s: float = VIEW_TIMEOUT_S, nearest_m:
 def _with_weights(name: str, folder: Path | None) -> AnyMethod:
     """Return a built-in method, with the weights in a folder, or None: in a cache, if it needs any."""
     method = METHODS[name]
+    if name == "depth-pro":
+        from rebar_depth_bench.methods.huggingface.model import depth_pro_method
+
+        return depth_pro_method()
     return method.with_weights(folder) if isinstance(method, WeightsMethod) else method
 
 
@@ -161,7 +154,7 @@ def _load_entry_point(entry: EntryPoint) -> AnyMethod:
     try:
         value = entry.load()
     except Exception as error:  # Importing third-party modules may raise anything.
-        raise MethodError(f"{entry.name}: {entry.value} cannot be imported: {_error_text(error)}") from error
+        raise MethodError(f"{entry.name}: {entry.value} cannot be imported: {exception_summary(error)}") from error
     return _require_method(entry.name, value)
 
 
@@ -197,7 +190,7 @@ def _import_file(path: Path) -> ModuleType:
     except Exception as error:
         del sys.modules[name]
         sys.path[:] = before
-        raise MethodError(f"{path}: cannot be imported: {_error_text(error)}") from error
+        raise MethodError(f"{path}: cannot be imported: {exception_summary(error)}") from error
     return module
 
 
@@ -216,7 +209,3 @@ def _require_method(name: str, value: object) -> AnyMethod:
     if not isinstance(value, Method | MultiViewMethod):
         raise MethodError(f"{name}: is {type(value).__name__}, expected a rebar_depth_bench.methods.Method")
     return value
-
-
-def _error_text(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}"

@@ -188,8 +188,7 @@ def _first_row_report(method: AnyMethod, views: Views) -> PreparationReport | No
         return None
     row = next(views.rows(*method.info.columns))
     with _wrap_errors(f"{method.info.name}: {views.config}: notes"):
-        notes = _plain_notes(method, views.config, method.notes(row))
-    return PreparationReport(notes=notes, seconds=None)
+        return PreparationReport(notes=_plain_notes(method, views.config, method.notes(row)), seconds=None)
 
 
 def _plain_notes(method: AnyMethod, config: str, notes: Mapping[str, Any]) -> dict[str, Any]:
@@ -273,9 +272,6 @@ _MONO_COLUMNS = ("left_rgb", "left_K", "left_distortion")
 _RECTIFIED_COLUMNS = frozenset(("left_rgb", "right_rgb", "left_K", "right_K", "right_distortion", "baseline_m"))
 """Columns of a rectified row. The poses of a rectified pair are not among them."""
 
-_Rectify = Callable[[Mapping[str, Any]], tuple[dict[str, Any], Callable[[Any], Any]]]
-"""Function from a raw row to the cells of the rectified one, and the function of its depth on the raw grid."""
-
 
 def rectifying_predictor(predictor: Predictor, columns: Sequence[str]) -> tuple[Predictor, tuple[str, ...]]:
     """Return a predictor of raw rows, and the columns that it needs, for a predictor of rectified rows.
@@ -295,20 +291,18 @@ def rectifying_predictor(predictor: Predictor, columns: Sequence[str]) -> tuple[
             f"the images are not rectified, which needs OpenCV ({error}): pip install 'rebar-depth-bench[methods]'"
         ) from None
     is_stereo = any(name.startswith("right_") or name == "baseline_m" for name in columns)
-    rectify, needed = (_rectified_pair, STEREO_COLUMNS) if is_stereo else (_undistorted_left, _MONO_COLUMNS)
-    return partial(_predict, predictor, tuple(columns), rectify), needed
 
+    def predict_raw(row: Mapping[str, Any]) -> Float[ndarray, "h w"]:
+        cells, on_raw_grid = _rectified_pair(row) if is_stereo else _undistorted_left(row)
+        depth_m = predictor({"view_id": row["view_id"], **{name: cells[name] for name in columns}})
+        where = f"{row['view_id']}, rectified"
+        return np.asarray(on_raw_grid(_validated_depth(where, depth_m, cells["left_rgb"].shape[:2])))
 
-def _predict(
-    predictor: Predictor, columns: Sequence[str], rectify: _Rectify, row: Mapping[str, Any]
-) -> Float[ndarray, "h w"]:
-    cells, on_raw_grid = rectify(row)
-    depth_m = predictor({"view_id": row["view_id"], **{name: cells[name] for name in columns}})
-    where = f"{row['view_id']}, rectified"
-    return np.asarray(on_raw_grid(_validated_depth(where, depth_m, cells["left_rgb"].shape[:2])))
+    return predict_raw, STEREO_COLUMNS if is_stereo else _MONO_COLUMNS
 
 
 def _rectified_pair(row: Mapping[str, Any]) -> tuple[dict[str, Any], Callable[[Any], Any]]:
+    """Return the cells of the rectified row of a raw one, and the function of its depth on the raw left grid."""
     from rebar_depth_bench.geometry.rectification import raw_depth_m, rectified_pair
 
     pair = rectified_pair(row)
@@ -324,6 +318,7 @@ def _rectified_pair(row: Mapping[str, Any]) -> tuple[dict[str, Any], Callable[[A
 
 
 def _undistorted_left(row: Mapping[str, Any]) -> tuple[dict[str, Any], Callable[[Any], Any]]:
+    """Return the cells of the undistorted left image of a raw row, as ``_rectified_pair``."""
     from rebar_depth_bench.geometry.undistortion import pinhole_grid, pinhole_image
 
     height, width, _ = row["left_rgb"].shape
