@@ -50,7 +50,7 @@ from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.views import ConfigViews
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.methods import find_method
-from rebar_depth_bench.methods.runner import predict
+from rebar_depth_bench.methods.run import predict
 from rebar_depth_bench.reporting.formatting import scaled_constants
 from rebar_depth_bench.scoring.columns import COVERAGE, NATIVE, RANK_ERROR, SCALED, number, texts
 from rebar_depth_bench.terminal import ProgressBars, duration_text, print_notice

@@ -31,7 +31,7 @@ from rebar_depth_bench.console import InputFile, InputFolder, add_workers
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.geometry.stereo_calibration import Calibration, Lens, MonoCalibration, StereoCalibration
 from rebar_depth_bench.methods import find_method
-from rebar_depth_bench.methods.runner import predict_views
+from rebar_depth_bench.methods.run import predict_views
 from rebar_depth_bench.parallel import map_with_progress
 from rebar_depth_bench.scoring.bootstrap import INTERVALS, interval, resample
 from rebar_depth_bench.scoring.evaluation import Provenance

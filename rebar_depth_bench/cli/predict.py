@@ -9,25 +9,26 @@ from pathlib import Path
 
 from rebar_depth_bench.captures.camera_files import CAMERAS_FILE
 from rebar_depth_bench.captures.folder import is_capture, open_capture
-from rebar_depth_bench.captures.views import ImageViews
 from rebar_depth_bench.console import (
     InputFile,
     OutputArchive,
+    ProgressBars,
     add_data,
     add_expect_digest,
     add_output_file,
     add_seconds,
     positive_number,
+    print_notice,
     print_verified,
     prints_table,
 )
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, open_folder
 from rebar_depth_bench.data.views import Views
 from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.methods import METHODS, MultiViewMethod, find_method
-from rebar_depth_bench.methods.onnx.session import VIEW_TIMEOUT_S
+from rebar_depth_bench.methods import METHODS, AnyMethod, MultiViewMethod, find_method
+from rebar_depth_bench.methods.base import VIEW_TIMEOUT_S
 from rebar_depth_bench.methods.registry import FROM_FOLDER
-from rebar_depth_bench.methods.runner import dataset_views, predict_views
+from rebar_depth_bench.methods.run import dataset_views, predict_views
 from rebar_depth_bench.names import SPLITS, TEST_SPLIT
 from rebar_depth_bench.terminal import ProgressBars, print_notice
 
@@ -85,14 +86,11 @@ def format_note(value: object) -> str:
 def run(options: argparse.Namespace) -> None:
     """Predict into an archive; print the method's notes to standard error and the archive's path."""
     method = find_method(options.method, view_timeout_s=options.view_timeout, nearest_m=options.nearest_distance)
-    views = _open_views(options)
+    views, notices = _open_views(options, method)
     info = method.info
     print_notice(f"{info.name}: {info.summary}; from {info.source}; licence {info.licence}")
-    for one in views:
-        if isinstance(one, ImageViews):
-            print_notice(f"{one.config}: {len(one.view_ids)} views of {one.path}; {one.describe_camera()}")
-            if one.board_is_assumed and isinstance(method, MultiViewMethod):
-                print_notice(f"{one.config}: states no board, so it is taken to be {one.board}")
+    for notice in notices:
+        print_notice(notice)
     with ProgressBars() as bars:
         prepared = predict_views(method, views, options.out, bars.update)
     for config, preparation in prepared.items():
@@ -102,8 +100,8 @@ def run(options: argparse.Namespace) -> None:
         print(options.out)
 
 
-def _open_views(options: argparse.Namespace) -> Sequence[Views]:
-    """Return the views of a dataset, whose verified digests are printed, or of a folder of images.
+def _open_views(options: argparse.Namespace, method: AnyMethod) -> tuple[Sequence[Views], list[str]]:
+    """Return the views of a dataset, whose verified digests are printed, or of a folder of images, with notices.
 
     Raises ``InputError`` for a folder that is neither, and for options of datasets with a folder of images.
     """
@@ -111,7 +109,9 @@ def _open_views(options: argparse.Namespace) -> Sequence[Views]:
     if not path.is_dir() or (path / MANIFEST_FILE).exists():
         folder = open_folder(options.data, expect_digest=options.expect_digest)
         print_verified(folder)
-        return dataset_views(folder, options.config, options.split or TEST_SPLIT)
+        return dataset_views(folder, options.config, options.split or TEST_SPLIT), []
+    # The readers of cameras and calibrations are imported only for images.
+
     if not is_capture(path):
         raise InputError(
             f"{path}: has no {MANIFEST_FILE}, no left/, and no images with {CAMERAS_FILE} or a calibration, "
@@ -121,4 +121,8 @@ def _open_views(options: argparse.Namespace) -> Sequence[Views]:
         if getattr(options, option) is not None:
             name = f"--{option.replace('_', '-')}"
             raise InputError(f"{options.data}: {name} is given, which is for dataset folders only")
-    return [open_capture(path)]
+    images = open_capture(path)
+    notices = [f"{images.config}: {len(images.view_ids)} views of {images.path}; {images.describe_camera()}"]
+    if images.board_is_assumed and isinstance(method, MultiViewMethod):
+        notices.append(f"{images.config}: states no board, so it is taken to be {images.board}")
+    return [images], notices

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -17,13 +17,9 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from numpy import ndarray
 
 from rebar_depth_bench.geometry.cameras import inverse_rigid, pixel_rays, project
-from rebar_depth_bench.geometry.stereo_calibration import (
-    StereoCalibration,
-    calibrated_baseline_m,
-    lens_distortion,
-    lens_K,
-    right_from_left,
-)
+
+if TYPE_CHECKING:
+    from rebar_depth_bench.geometry.stereo_calibration import StereoCalibration
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +42,14 @@ def rectify(calibration: StereoCalibration) -> Rectification:
     Calls ``cv2.stereoRectify`` with zero disparity at infinity and ``alpha=0``, which leaves no pixel outside the
     raw images, as Stereolabs' open capture code does. (Bouguet's method: each camera is rotated by half.)
     """
+    # Predictions, which rectify rows, need no calibrations.
+    from rebar_depth_bench.geometry.stereo_calibration import (
+        calibrated_baseline_m,
+        lens_distortion,
+        lens_K,
+        right_from_left,
+    )
+
     motion = right_from_left(calibration)
     return rectify_pair(
         (lens_K(calibration.left), lens_K(calibration.right)),

@@ -16,6 +16,9 @@ from rebar_depth_bench.parallel import Progress
 Predictor = Callable[[Mapping[str, Any]], Float32[ndarray, "h w"]]
 """Function from a decoded row to planar depth of the left view, metres, on the left grid; NaN: no prediction."""
 
+VIEW_TIMEOUT_S = 600.0
+"""Default time limit on the inference of a view by an ONNX model, seconds."""
+
 
 @dataclass(frozen=True)
 class MethodInfo:
@@ -53,6 +56,18 @@ class Method:
     info: MethodInfo
     load: Callable[[], Predictor]
     notes: Callable[[Mapping[str, Any]], Mapping[str, Any]] | None = None
+
+
+@dataclass(frozen=True)
+class WeightsMethod(Method):
+    """Single-view method whose weights, or code and weights, are not part of this package.
+
+    ``with_weights(folder)`` returns the method with those in a folder (``NAME:FOLDER``), or for None (the bare
+    name) those in a local cache, which are downloaded if they are missing. Their digest or commit is part of its
+    description. Raises ``MethodError`` if they are missing or cannot be downloaded.
+    """
+
+    with_weights: Callable[[Path | None], Method] = field(kw_only=True)
 
 
 @dataclass(frozen=True)

@@ -11,7 +11,8 @@ import math
 import os
 import re
 import stat
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -21,20 +22,20 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from rebar_depth_bench.atomic_io import named_write_errors, write_bytes, write_error, write_text
+from rebar_depth_bench.console import print_notice
+from rebar_depth_bench.data.views import Views
 from rebar_depth_bench.errors import EntryError, InputError, Problem, escape_text
 from rebar_depth_bench.limits import JSON_BYTES
 from rebar_depth_bench.names import NAME_PATTERN
 from rebar_depth_bench.reading import FileSource, parse_json, path_below, read_file, remove_folder
-from rebar_depth_bench.submission.maps import Depth, decode_npy, max_npy_bytes
-from rebar_depth_bench.submission.zip import read_data, read_entries
+from rebar_depth_bench.submission.maps import decode_npy, max_npy_bytes
+from rebar_depth_bench.submission.zip import check_entries, read_data, read_directory
 from rebar_depth_bench.terminal import print_notice
 from rebar_depth_bench.validation import Expected, StrictModel, validate_table
 
-_KEY_FILE = "key.json"
+_RUN_FILE, _WORK_SUFFIX = "run.json", ".work"
 _SECONDS = "seconds"
-_WORK_SUFFIX = ".work"
-_FILES = re.compile(rf"{NAME_PATTERN}\.json|\..*\.tmp")
-_VIEW_FILES = re.compile(rf"{NAME_PATTERN}\.npz|\..*\.tmp")
+_TOP_FILES, _VIEW_FILES = re.compile(r"run\.json|\..*\.tmp"), re.compile(rf"{NAME_PATTERN}\.npz|\..*\.tmp")
 _MAX_ITEM_BYTES = 8
 
 
@@ -48,49 +49,68 @@ class PreparationReport(StrictModel):
     seconds: Annotated[float, Expected("a number of at least 0", lambda value: 0 <= value < math.inf)] | None
 
 
+class _Run(StrictModel):
+    """Content of ``run.json``: everything that determines the predictions, and the reports by config."""
+
+    key: Annotated[dict[str, Any], Expected("a table")]
+    reports: dict[str, PreparationReport]
+
+
 @dataclass(frozen=True)
 class KeptViews:
-    """Folder with one ``.npz`` file per predicted view; files are written atomically.
+    """Folder with ``run.json``, a work folder per config, and one ``.npz`` file per predicted view.
 
-    A file holds two arrays: the depth, named after the view, and the runtime.
+    A view's file holds two arrays: the depth, named after the view, and the runtime. Each file is written
+    atomically, so that an interruption at any time loses at most the view being predicted.
     """
 
     path: Path
+    key: Mapping[str, Any]
+    reports: dict[str, PreparationReport]
+    """Reports of the completed preparations, by config; see ``put_report``."""
 
     @classmethod
     def open(cls, path: Path, key: Mapping[str, Any]) -> KeptViews:
         """Open the folder at ``path``, and empty it if it was made for another ``key``.
 
-        ``key`` holds everything that determines the predictions. Raises ``InputError`` if the folder is a link or
-        holds anything else, and ``OutputError`` if it cannot be written.
+        ``key`` holds everything that determines the predictions, as JSON values. Raises ``InputError`` if the
+        folder is a link or holds anything else, and ``OutputError`` if it cannot be written.
         """
-        key_json = json.dumps(key, sort_keys=True)
+        key = json.loads(json.dumps(key))
         try:
             if os.path.lexists(path):
-                if foreign := _foreign_entry(path):
-                    raise InputError(f"{foreign}, expected a folder with predictions of an interrupted run only")
-                if _is_key(path / _KEY_FILE, key_json):
-                    return cls(path)
+                _refuse_foreign(path)
+                run = _read_run(path / _RUN_FILE)
+                if run is not None and run.key == key:
+                    return cls(path, key, run.reports)
                 views = sum(1 for _ in path.glob("*/*.npz"))
-                print_notice(f"starting over: {path} holds {views} views of another method, dataset or version")
+                found = "another method, dataset or version" if run else f"a run whose {_RUN_FILE} is damaged"
+                print_notice(f"starting over: {path} holds {views} views of {found}")
                 remove_folder(path)
             path.mkdir(parents=True)
         except OSError as error:
             raise write_error(path, error) from None
-        write_text(path / _KEY_FILE, key_json)
-        return cls(path)
+        kept = cls(path, key, {})
+        kept._write_run()
+        return kept
 
-    def check(self, view_ids: Iterable[str], grid: tuple[int, int]) -> tuple[set[str], list[InputError]]:
-        """Return those of the views that can be reused, and the errors of those that are damaged."""
-        usable, errors = set(), []
-        for view_id in view_ids:
-            if self._view_file(view_id).exists():
-                try:
-                    self.get(view_id, grid)
-                    usable.add(view_id)
-                except InputError as error:
-                    errors.append(error)
-        return usable, errors
+    def usable(self, views: Sequence[Views]) -> set[str]:
+        """Return the ids of views that need not be predicted again, with notices on them and on damaged ones."""
+        usable, errors = set(), list[InputError]()
+        for config in views:
+            for view_id in config.view_ids:
+                if self._view_file(view_id).exists():
+                    try:
+                        self.get(view_id, config.grid)
+                        usable.add(view_id)
+                    except InputError as error:
+                        errors.append(error)
+        if usable:
+            print_notice(f"resuming: {len(usable)} views are in {self.path}; delete it to start over")
+        if errors:
+            first = " ".join(str(errors[0]).split())
+            print_notice(f"kept predictions that cannot be used are made again ({len(errors)}): {first}")
+        return usable
 
     def put(self, view_id: str, depth_m: Float[ndarray, "h w"], seconds: float) -> None:
         """Store the depth of a view and its runtime in seconds."""
@@ -103,11 +123,24 @@ class KeptViews:
     def get(self, view_id: str, grid: tuple[int, int]) -> tuple[Float[ndarray, "h w"], float]:
         """Return the stored depth and runtime in seconds of a view.
 
-        Raises ``InputError`` if the file is missing or damaged, or holds another view or depth of another shape.
+        Sizes are checked before anything is allocated. Raises ``InputError`` if the file is missing or damaged, or
+        holds another view or depth of another shape.
         """
-        path = self._view_file(view_id)
+        path, shapes = self._view_file(view_id), {f"{view_id}.npy": grid, f"{_SECONDS}.npy": (1, 1)}
         try:
-            depth_m, seconds = _read_arrays(path, {f"{view_id}.npy": grid, f"{_SECONDS}.npy": (1, 1)})
+            with closing(FileSource(path)) as source:
+                directory = read_directory(source, len(shapes))
+                checked = check_entries(source, directory, lambda name: max_npy_bytes(shapes.get(name, (0, 0))))
+                problems = [problem for check in checked for problem in check.problems]
+                entries = {check.entry.name: check for check in checked}
+                if entries.keys() != shapes.keys():
+                    found = f"the arrays are {escape_text(', '.join(entries))}"
+                    problems.append(Problem("conflict", "", found, ", ".join(shapes)))
+                if problems:
+                    raise EntryError(problems[0])
+                depth_m, seconds = (
+                    decode_npy(name, read_data(source, entries[name]), shape) for name, shape in shapes.items()
+                )
         except EntryError as error:
             raise InputError.from_problems(path, error.problems) from None
         except OSError as error:
@@ -124,23 +157,10 @@ class KeptViews:
             folder.mkdir(exist_ok=True)
         return folder
 
-    def put_preparation(self, config: str, preparation: PreparationReport) -> None:
+    def put_report(self, config: str, report: PreparationReport) -> None:
         """Store the preparation report of a config."""
-        write_text(self._preparation_file(config), json.dumps(preparation.model_dump()))
-
-    def get_preparation(self, config: str) -> PreparationReport | None:
-        """Return the preparation report of a config, or None if its preparation was never completed.
-
-        Raises ``InputError`` if the report is damaged.
-        """
-        path = self._preparation_file(config)
-        if not path.exists():
-            return None
-        values, problems = parse_json(read_file(path, JSON_BYTES, "a preparation report", InputError))
-        report = None if problems else validate_table(PreparationReport, values, problems)
-        if report is None:
-            raise InputError.from_problems(path, problems)
-        return report
+        self.reports[config] = report
+        self._write_run()
 
     def remove(self) -> None:
         """Delete the folder."""
@@ -149,60 +169,33 @@ class KeptViews:
     def _view_file(self, view_id: str) -> Path:
         return path_below(self.path, f"{view_id}.npz")
 
-    def _preparation_file(self, config: str) -> Path:
-        return path_below(self.path, f"{config}.json")
+    def _write_run(self) -> None:
+        run = _Run(key=dict(self.key), reports=self.reports)
+        write_text(self.path / _RUN_FILE, json.dumps(run.model_dump()))
 
 
-def _foreign_entry(path: Path) -> str | None:
-    """Return the place of a file that ``KeptViews`` does not write, with what is wrong; None if there is none."""
-    if not stat.S_ISDIR(path.lstat().st_mode):
-        return f"{path}: is not a folder"
-    entries = list(path.iterdir())
-    foreign = sorted(str(entry) for top in entries for entry in _foreign_files(top))
-    if foreign:
-        return f"{foreign[0]}: is not part of kept predictions"
-    is_ours = any(entry.name == _KEY_FILE for entry in entries) or not any(entry.is_dir() for entry in entries)
-    return None if is_ours else f"{path}: has no {_KEY_FILE}"
-
-
-def _foreign_files(entry: Path) -> list[Path]:
-    """Return an entry of the folder, or files of a config in it, whose name or kind is not ours."""
-    mode = entry.lstat().st_mode
-    if stat.S_ISREG(mode) and _FILES.fullmatch(entry.name):
-        return []
-    if not stat.S_ISDIR(mode) or not re.fullmatch(NAME_PATTERN, entry.name):
-        return [entry]
-    if entry.name.endswith(_WORK_SUFFIX):  # Methods store what they like there.
-        return []
-    return [file for file in entry.iterdir() if not _VIEW_FILES.fullmatch(file.name) or not _is_regular(file)]
-
-
-def _is_regular(path: Path) -> bool:
-    return stat.S_ISREG(path.lstat().st_mode)
-
-
-def _is_key(path: Path, key_json: str) -> bool:
+def _read_run(path: Path) -> _Run | None:
+    """Return the content of ``run.json``, None if it is missing or damaged."""
     try:
-        return read_file(path, JSON_BYTES, "the key of kept predictions", InputError) == key_json.encode()
+        values, problems = parse_json(read_file(path, JSON_BYTES, "the parameters of a run", InputError))
     except InputError:
-        return False
+        return None
+    return None if problems else validate_table(_Run, values, problems)
 
 
-def _read_arrays(path: Path, shapes: Mapping[str, tuple[int, int]]) -> list[Depth]:
-    """Return the arrays of an ``.npz`` file, which has exactly the members of ``shapes``, in their order.
-
-    Sizes are checked before anything is allocated. Raises ``EntryError`` or ``OSError``.
-    """
-    source = FileSource(path)
-    try:
-        found = read_entries(source, len(shapes), lambda name: max_npy_bytes(shapes.get(name, (0, 0))))
-        problems = [problem for entry in found for problem in entry.problems]
-        entries = {entry.name: entry for entry in found}
-        if entries.keys() != shapes.keys():
-            names = f"the arrays are {escape_text(', '.join(entries))}"
-            problems.append(Problem("conflict", "", names, ", ".join(shapes)))
-        if problems:
-            raise EntryError(problems[0])
-        return [decode_npy(name, read_data(source, entries[name]), shape) for name, shape in shapes.items()]
-    finally:
-        source.close()
+def _refuse_foreign(path: Path) -> None:
+    """Raise ``InputError`` if ``path`` is no folder, or holds a file or folder whose name or kind is not ours."""
+    expected = "expected a folder with predictions of an interrupted run only"
+    if not stat.S_ISDIR(path.lstat().st_mode):
+        raise InputError(f"{path}: is not a folder, {expected}")
+    for top, folders, files in os.walk(path):
+        is_top = top == str(path)
+        for entry in sorted(Path(top, name) for name in (*folders, *files)):
+            mode, pattern = entry.lstat().st_mode, _TOP_FILES if is_top else _VIEW_FILES
+            is_our_folder = is_top and stat.S_ISDIR(mode) and re.fullmatch(NAME_PATTERN, entry.name)
+            if not is_our_folder and not (stat.S_ISREG(mode) and pattern.fullmatch(entry.name)):
+                raise InputError(f"{entry}: is not part of kept predictions, {expected}")
+        if is_top and folders and _RUN_FILE not in files:
+            raise InputError(f"{path}: has no {_RUN_FILE}, {expected}")
+        # Methods store what they like in their work folders.
+        folders[:] = [name for name in folders if not name.endswith(_WORK_SUFFIX)]

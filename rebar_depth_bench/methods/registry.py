@@ -13,66 +13,57 @@ from __future__ import annotations
 
 import importlib.util
 import sys
-from collections.abc import Callable, Mapping
+from collections import UserDict
+from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from importlib.machinery import PathFinder
 from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from rebar_depth_bench.data.files import file_sha256
-from rebar_depth_bench.errors import MethodError
-from rebar_depth_bench.methods.base import AnyMethod, Method, MultiViewMethod
-from rebar_depth_bench.methods.controls import BOARD_PLANE, CONSTANT, NOISY_TRUTH, TRUTH
-from rebar_depth_bench.methods.huggingface.model import DEPTH_PRO, HF_PREFIX, depth_pro_method, hf_method
-from rebar_depth_bench.methods.monocular.hub import folder_method, hub_method
-from rebar_depth_bench.methods.monocular.hub_networks import (
-    DEPTH_ANYTHING_3,
-    DEPTH_ANYTHING_3_MODEL,
-    UNIDEPTH,
-    UNIDEPTH_MODEL,
-)
-from rebar_depth_bench.methods.monocular.metric3d import METRIC3D, cached_metric3d_method, metric3d_method
-from rebar_depth_bench.methods.multiview import COLMAP_ANCHORED, COLMAP_ARUCO, SWEEP_ANCHORED, SWEEP_ARUCO
-from rebar_depth_bench.methods.onnx.model import onnx_method
-from rebar_depth_bench.methods.onnx.session import VIEW_TIMEOUT_S
-from rebar_depth_bench.methods.stereo.foundation_stereo import FOUNDATION_STEREO, foundation_stereo_method
-from rebar_depth_bench.methods.stereo.sgbm import SGBM, SGBM_FILLED
+from rebar_depth_bench.errors import MethodError, exception_summary
+from rebar_depth_bench.methods.base import VIEW_TIMEOUT_S, AnyMethod, Method, MultiViewMethod, WeightsMethod
 
 ENTRY_POINT_GROUP = "rebar_depth_bench.methods"
 DISTRIBUTION = "rebar-depth-bench"
 _DIGEST_CHARACTERS = 16
+_HF_PREFIX = "hf:"
 
-METHODS: Mapping[str, AnyMethod] = {
-    method.info.name: method
-    for method in (
-        *(SGBM, SGBM_FILLED, FOUNDATION_STEREO),
-        *(DEPTH_PRO, METRIC3D, UNIDEPTH, DEPTH_ANYTHING_3),
-        *(COLMAP_ARUCO, COLMAP_ANCHORED, SWEEP_ARUCO, SWEEP_ANCHORED),
-        *(CONSTANT, BOARD_PLANE, NOISY_TRUTH, TRUTH),
-    )
-}
+FROM_FOLDER = ("depth-anything-3", "foundation-stereo", "metric3d", "unidepth")
+"""Names of the methods that take a folder: ``NAME:FOLDER``."""
+
+
+class _BuiltIn(UserDict[str, Any]):
+    """Methods by name, from module and attribute of each; a module is imported when its method is looked up."""
+
+    def __getitem__(self, name: str) -> AnyMethod:
+        module, attribute = self.data[name].split(":")
+        method: AnyMethod = getattr(importlib.import_module(module), attribute)
+        return method
+
+
+METHODS: Mapping[str, AnyMethod] = _BuiltIn(
+    {
+        "sgbm": "rebar_depth_bench.methods.sgbm:SGBM",
+        "sgbm-filled": "rebar_depth_bench.methods.sgbm:SGBM_FILLED",
+        "foundation-stereo": "rebar_depth_bench.methods.paper.foundation_stereo:FOUNDATION_STEREO",
+        "depth-pro": "rebar_depth_bench.methods.huggingface.model:DEPTH_PRO",
+        "metric3d": "rebar_depth_bench.methods.paper.monocular:METRIC3D",
+        "unidepth": "rebar_depth_bench.methods.paper.monocular:UNIDEPTH",
+        "depth-anything-3": "rebar_depth_bench.methods.paper.monocular:DEPTH_ANYTHING_3",
+        "colmap-aruco": "rebar_depth_bench.methods.multiview:COLMAP_ARUCO",
+        "colmap-anchored": "rebar_depth_bench.methods.multiview:COLMAP_ANCHORED",
+        "sweep-aruco": "rebar_depth_bench.methods.multiview:SWEEP_ARUCO",
+        "sweep-anchored": "rebar_depth_bench.methods.multiview:SWEEP_ANCHORED",
+        "constant": "rebar_depth_bench.methods.controls:CONSTANT",
+        "board-plane": "rebar_depth_bench.methods.controls:BOARD_PLANE",
+        "noisy-truth": "rebar_depth_bench.methods.controls:NOISY_TRUTH",
+        "truth": "rebar_depth_bench.methods.controls:TRUTH",
+    }
+)
 """Built-in methods by name."""
-
-FROM_FOLDER: Mapping[str, Callable[[Path], Method]] = {
-    "depth-anything-3": partial(folder_method, DEPTH_ANYTHING_3_MODEL),
-    "foundation-stereo": foundation_stereo_method,
-    "metric3d": metric3d_method,
-    "unidepth": partial(folder_method, UNIDEPTH_MODEL),
-}
-"""Constructors of methods whose weights, or code and weights, are in a folder: ``NAME:FOLDER``."""
-
-FROM_HUB: Mapping[str, Callable[[], Method]] = {
-    "depth-anything-3": partial(hub_method, DEPTH_ANYTHING_3_MODEL),
-    "depth-pro": depth_pro_method,
-    "metric3d": cached_metric3d_method,
-    "unidepth": partial(hub_method, UNIDEPTH_MODEL),
-}
-"""Constructors of methods whose weights are looked up when the bare name is requested.
-
-The commit or digest of the weights (and code) becomes part of the summary. Listing methods looks nothing up.
-"""
 
 
 def find_method(name: str, *, view_timeout_s: float = VIEW_TIMEOUT_S, nearest_m: float | None = None) -> AnyMethod:
@@ -81,20 +72,25 @@ def find_method(name: str, *, view_timeout_s: float = VIEW_TIMEOUT_S, nearest_m:
     ``view_timeout_s`` limits the inference of a view by an ONNX model. ``nearest_m`` declares the distance of the
     nearest surface, metres, to FoundationStereo.
 
-    For ``FROM_HUB`` and ``hf:`` names, the files that identify the weights are downloaded if they are not cached.
+    For the bare name of a method whose weights are on the Hub, and for ``hf:`` names, the files that identify the
+    weights are downloaded if they are not cached. Their commit or digest becomes part of the summary.
 
     Raises ``MethodError`` if the name is unknown, if a file or package cannot be imported or holds no method, or
     if ``nearest_m`` is given to another method.
     """
     method_name, _, folder = name.partition(":")
     if nearest_m is not None:
-        if method_name != FOUNDATION_STEREO.info.name or not folder:
-            raise MethodError(f"{name}: has no nearest distance, expected {FOUNDATION_STEREO.info.name}:FOLDER")
+        if method_name != "foundation-stereo" or not folder:
+            raise MethodError(f"{name}: has no nearest distance, expected foundation-stereo:FOLDER")
+        from rebar_depth_bench.methods.paper.foundation_stereo import foundation_stereo_method
+
         return foundation_stereo_method(Path(folder).expanduser(), nearest_m)
-    if name.startswith(HF_PREFIX):
-        return hf_method(name.removeprefix(HF_PREFIX))
+    if name.startswith(_HF_PREFIX):
+        from rebar_depth_bench.methods.huggingface.model import hf_method
+
+        return hf_method(name.removeprefix(_HF_PREFIX))
     if folder and method_name in FROM_FOLDER:
-        return FROM_FOLDER[method_name](Path(folder).expanduser())
+        return _with_weights(method_name, Path(folder).expanduser())
     path, colon, attribute = name.rpartition(":")
     if colon and path.endswith(".py"):
         module = _import_file(Path(path))
@@ -102,11 +98,11 @@ def find_method(name: str, *, view_timeout_s: float = VIEW_TIMEOUT_S, nearest_m:
             raise MethodError(f"{path}: has no {attribute}, expected the name of a method in it")
         return _with_file_digest(Path(path), _require_method(name, getattr(module, attribute)))
     if name.endswith(".toml"):
+        from rebar_depth_bench.methods.onnx.model import onnx_method
+
         return onnx_method(Path(name), view_timeout_s)
-    if name in FROM_HUB:
-        return FROM_HUB[name]()
     if name in METHODS:
-        return METHODS[name]
+        return _with_weights(name, None)
     entries = _entry_point_methods()
     if name in entries:
         return _load_entry_point(entries[name])
@@ -115,6 +111,16 @@ def find_method(name: str, *, view_timeout_s: float = VIEW_TIMEOUT_S, nearest_m:
         f"unknown method {name!r}, expected one of {known}, or my_model.py:METHOD, my_model.toml, hf:ORG/NAME, "
         f"or NAME:FOLDER for one of {', '.join(FROM_FOLDER)}"
     )
+
+
+def _with_weights(name: str, folder: Path | None) -> AnyMethod:
+    """Return a built-in method, with the weights in a folder, or None: in a cache, if it needs any."""
+    method = METHODS[name]
+    if name == "depth-pro":
+        from rebar_depth_bench.methods.huggingface.model import depth_pro_method
+
+        return depth_pro_method()
+    return method.with_weights(folder) if isinstance(method, WeightsMethod) else method
 
 
 def all_methods() -> dict[str, AnyMethod | MethodError]:
@@ -148,7 +154,7 @@ def _load_entry_point(entry: EntryPoint) -> AnyMethod:
     try:
         value = entry.load()
     except Exception as error:  # Importing third-party modules may raise anything.
-        raise MethodError(f"{entry.name}: {entry.value} cannot be imported: {_error_text(error)}") from error
+        raise MethodError(f"{entry.name}: {entry.value} cannot be imported: {exception_summary(error)}") from error
     return _require_method(entry.name, value)
 
 
@@ -184,7 +190,7 @@ def _import_file(path: Path) -> ModuleType:
     except Exception as error:
         del sys.modules[name]
         sys.path[:] = before
-        raise MethodError(f"{path}: cannot be imported: {_error_text(error)}") from error
+        raise MethodError(f"{path}: cannot be imported: {exception_summary(error)}") from error
     return module
 
 
@@ -203,7 +209,3 @@ def _require_method(name: str, value: object) -> AnyMethod:
     if not isinstance(value, Method | MultiViewMethod):
         raise MethodError(f"{name}: is {type(value).__name__}, expected a rebar_depth_bench.methods.Method")
     return value
-
-
-def _error_text(error: Exception) -> str:
-    return f"{type(error).__name__}: {error}"

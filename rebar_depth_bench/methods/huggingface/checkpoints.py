@@ -14,8 +14,7 @@ from typing import Any
 
 from rebar_depth_bench.data.files import files_digest
 from rebar_depth_bench.errors import MethodError
-from rebar_depth_bench.methods.monocular.hub import hub_download, local_copy_hint, snapshot
-from rebar_depth_bench.methods.monocular.third_party import read_json_object
+from rebar_depth_bench.methods.paper.third_party import hub_download, local_copy_hint, read_json_object, snapshot
 
 CONFIG, PREPROCESSOR = "config.json", "preprocessor_config.json"
 _REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")

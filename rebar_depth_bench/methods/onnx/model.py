@@ -20,9 +20,9 @@ from PIL import Image
 
 from rebar_depth_bench.data.files import files_digest
 from rebar_depth_bench.errors import MethodError
-from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
+from rebar_depth_bench.methods.base import VIEW_TIMEOUT_S, Method, MethodInfo, Predictor
 from rebar_depth_bench.methods.onnx.external_data import external_files
-from rebar_depth_bench.methods.onnx.session import VIEW_TIMEOUT_S, OnnxSession, open_session
+from rebar_depth_bench.methods.onnx.session import OnnxSession, open_session
 from rebar_depth_bench.methods.onnx.spec import OUTPUT_MEANINGS, InputSpec, OnnxSpec, OutputSpec, read_onnx_toml
 
 

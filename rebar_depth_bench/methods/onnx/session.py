@@ -27,8 +27,6 @@ _FLOAT_DTYPES: Mapping[str, type] = {
     "tensor(double)": np.float64,
 }
 _LOG_ERRORS_ONLY, _LOG_NOTHING = 3, 4
-VIEW_TIMEOUT_S = 600.0
-"""Default time limit on the inference of a view, seconds."""
 _MAX_ERROR_CHARACTERS = 300
 _OUT_OF_MEMORY = "Available memory of"
 """Part of onnxruntime's message if its memory arena cannot grow any further."""

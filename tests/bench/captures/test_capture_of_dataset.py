@@ -19,7 +19,7 @@ from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.methods import Views
-from rebar_depth_bench.methods.runner import dataset_views
+from rebar_depth_bench.methods.run import dataset_views
 
 STEREO = ("left_rgb", "right_rgb", "left_K", "right_K", "left_distortion", "right_distortion", "baseline_m")
 

@@ -22,7 +22,7 @@ from rebar_depth_bench.errors import DatasetError, InputError, SubmissionError
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
 from rebar_depth_bench.extended.registry import score_extended
 from rebar_depth_bench.methods.base import Method, MethodInfo, MultiViewMethod, Prepared
-from rebar_depth_bench.methods.runner import predict
+from rebar_depth_bench.methods.run import predict
 from rebar_depth_bench.reporting.figure import figure_content
 from rebar_depth_bench.reporting.html.page import look_at_views
 from rebar_depth_bench.reporting.latex import latex_table

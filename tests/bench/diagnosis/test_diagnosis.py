@@ -32,7 +32,7 @@ from rebar_depth_bench.diagnosis.corrections import (
 )
 from rebar_depth_bench.diagnosis.diagnose import diagnose
 from rebar_depth_bench.methods import own_methods
-from rebar_depth_bench.methods.runner import predict
+from rebar_depth_bench.methods.run import predict
 from rebar_depth_bench.scoring.evaluation import open_evaluation, read_views
 from tests.commands import run_in_process
 from tests.synthetic_dataset import write_dataset

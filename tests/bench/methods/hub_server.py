@@ -49,7 +49,8 @@ class HubRequestHandler(BaseHTTPRequestHandler):
                 200, file.read_bytes(), {"ETag": f'"{file_sha1(file)}"', "X-Repo-Commit": COMMIT}, with_body
             )
         else:
-            self.reply(404, b"{}", {"X-Error-Code": "RepoNotFound"}, with_body)
+            code = "EntryNotFound" if path.startswith("/org/model/") else "RepoNotFound"
+            self.reply(404, b"{}", {"X-Error-Code": code}, with_body)
 
     def reply(self, status: int, body: bytes, headers: dict[str, str], with_body: bool) -> None:
         self.send_response(status)

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from textwrap import dedent
 
-from rebar_depth_bench.methods.monocular.third_party import on_sys_path
+from rebar_depth_bench.methods.paper.third_party import on_sys_path
 
 GAIN = 0.5
 """Factor by which every stand-in multiplies the red channel: its only weight, read from the checkpoint."""
@@ -80,8 +80,26 @@ DA3_API = """
             return SimpleNamespace(depth=(self.gain.item() + noise) * red[None], intrinsics=None)
 """
 
+INPUT_PADDER = """
+    import torch.nn.functional as F
+
+    class InputPadder:
+        def __init__(self, dims, mode="sintel", divis_by=8, force_square=False):
+            assert divis_by == 32 and not force_square
+            rows, columns = (-side % divis_by for side in dims[-2:])
+            self.margins = (columns // 2, columns - columns // 2, rows // 2, rows - rows // 2)
+
+        def pad(self, *images):
+            return [F.pad(image, self.margins, mode="replicate") for image in images]
+
+        def unpad(self, image):
+            left, right, top, bottom = self.margins
+            return image[..., top : image.shape[-2] - bottom, left : image.shape[-1] - right]
+"""
+
 FOUNDATION_STEREO = """
     import torch
+    from core.utils.utils import InputPadder
 
     class FoundationStereo(torch.nn.Module):
         def __init__(self, args):
@@ -103,6 +121,7 @@ FOUNDATION_STEREO = """
 STEREO_MATCHER = """
     import torch
     import torch.nn.functional as F
+    from core.utils.utils import InputPadder
 
     class FoundationStereo(torch.nn.Module):
         def __init__(self, args):
@@ -149,9 +168,9 @@ def metric3d_clone(folder: Path, **weights: float) -> Path:
     return folder
 
 
-def unidepth_weights(folder: Path, **weights: float) -> Path:
+def unidepth_weights(folder: Path, encoder: str = "dinov2_vitl14", **weights: float) -> Path:
     """Write UniDepth's files as they are on the Hub, and return the folder."""
-    return _write_hub_folder(folder, {"model": {}}, weights)
+    return _write_hub_folder(folder, {"model": {"pixel_encoder": {"name": encoder}}}, weights)
 
 
 def da3_weights(folder: Path, model_name: str = "da3metric-large", **weights: float) -> Path:
@@ -162,6 +181,7 @@ def da3_weights(folder: Path, model_name: str = "da3metric-large", **weights: fl
 def stereo_clone(folder: Path, *, code: str = FOUNDATION_STEREO, max_disp: object = 416, **weights: float) -> Path:
     """Write a clone of FoundationStereo with its weights folder 23-51-11, and return the folder."""
     _write(folder / "core" / "foundation_stereo.py", code)
+    _write(folder / "core" / "utils" / "utils.py", INPUT_PADDER)
     trained = folder / "pretrained_models" / "23-51-11"
     trained.mkdir(parents=True)
     (trained / "cfg.yaml").write_text(f"max_disp: {max_disp}\nhidden_dims: [128, 128, 128]\n")

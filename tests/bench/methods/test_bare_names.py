@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,7 +17,8 @@ from huggingface_hub import constants
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods import METHODS, find_method
-from rebar_depth_bench.methods.registry import FROM_FOLDER, FROM_HUB
+from rebar_depth_bench.methods.base import WeightsMethod
+from rebar_depth_bench.methods.registry import FROM_FOLDER
 from tests.bench.methods import stand_in_models as stand_ins
 from tests.bench.methods.predictors import load_predictor
 from tests.bench.methods.stand_in_views import BUILDERS, select_columns, stereo_row
@@ -26,6 +26,7 @@ from tests.bench.methods.stand_in_views import BUILDERS, select_columns, stereo_
 COMMITS = ("0123456789abcdef0123456789abcdef01234567", "89abcdef0123456789abcdef0123456789abcdef")
 REPOSITORIES = {
     "depth-anything-3": "depth-anything--DA3METRIC-LARGE",
+    "metric3d": "JUGGHM--Metric3D",
     "unidepth": "lpiccinelli--unidepth-v2-vitl14",
 }
 
@@ -45,14 +46,12 @@ def hub_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.fixture
-def torch_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """Point torch.hub at a cache that holds Metric3D, and return the cache's hub folder."""
+def metric3d_code(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Point torch.hub at a cache that holds Metric3D's code, and return the folder of the code."""
     monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
-    hub = tmp_path / "torch" / "hub"
-    clone = stand_ins.metric3d_clone(hub / "yvanyin_metric3d_main")
-    (hub / "checkpoints").mkdir()
-    (clone / "metric_depth_vit_small_800k.pth").rename(hub / "checkpoints" / "metric_depth_vit_small_800k.pth")
-    return hub
+    code = stand_ins.metric3d_clone(tmp_path / "torch" / "hub" / "yvanyin_metric3d_main")
+    (code / "metric_depth_vit_small_800k.pth").unlink()
+    return code
 
 
 def add_to_hub_cache(name: str, hub_cache: Path, commit: str, gain: float = 0.5) -> Path:
@@ -64,7 +63,7 @@ def add_to_hub_cache(name: str, hub_cache: Path, commit: str, gain: float = 0.5)
     return folder
 
 
-@pytest.mark.parametrize("name", REPOSITORIES)
+@pytest.mark.parametrize("name", ["depth-anything-3", "unidepth"])
 def test_cached_weights_commit_is_reported_and_used(name: str, hub_cache: Path) -> None:
     """A moved main branch gives a different method and does not change one that was found before."""
     add_to_hub_cache(name, hub_cache, COMMITS[0])
@@ -95,30 +94,26 @@ def test_weights_missing_from_cache_raise_on_load(hub_cache: Path) -> None:
 def test_other_da3_model_raises_when_found(hub_cache: Path) -> None:
     folder = add_to_hub_cache("depth-anything-3", hub_cache, COMMITS[0])
     (folder / "config.json").write_text('{"model_name": "da3-large"}')
-    with pytest.raises(MethodError, match=r"names model 'da3-large', expected 'da3metric-large'"):
+    with pytest.raises(MethodError, match=r"model_name in config.json is 'da3-large', expected 'da3metric-large'"):
         find_method("depth-anything-3")
 
 
-def test_metric3d_reports_digests_of_torch_cache(
-    torch_cache: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_metric3d_reports_code_digest_and_weights_commit(
+    metric3d_code: Path, hub_cache: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
+    add_to_hub_cache("metric3d", hub_cache, COMMITS[0])
     first = find_method("metric3d")
     assert first.info.name == "metric3d"
     assert "; code yvanyin_metric3d_main sha256:" in first.info.summary
-    clone = shutil.copytree(torch_cache / "yvanyin_metric3d_main", tmp_path / "own")
-    shutil.copy(torch_cache / "checkpoints" / "metric_depth_vit_small_800k.pth", clone)
-    assert (
-        find_method(f"metric3d:{clone}").info.summary.rpartition("; ")[2] == first.info.summary.rpartition("; ")[2]
-    )
+    assert first.info.summary.endswith(f"; weights commit {COMMITS[0]}")
     np.testing.assert_allclose(
         load_predictor(first)(select_columns("metric3d", stereo_row())), 200 * 0.5 * 87.5 * 6.65 / 1000, rtol=3e-3
     )
     assert "downloading" not in capsys.readouterr().err
-    (torch_cache / "yvanyin_metric3d_main" / "mono").mkdir()
-    (torch_cache / "yvanyin_metric3d_main" / "mono" / "model.py").write_text("")
+    (metric3d_code / "mono").mkdir()
+    (metric3d_code / "mono" / "model.py").write_text("")
     second = find_method("metric3d")
-    stand_ins.metric3d_clone(tmp_path / "other", gain=2.0)
-    shutil.copy(tmp_path / "other" / "metric_depth_vit_small_800k.pth", torch_cache / "checkpoints")
+    add_to_hub_cache("metric3d", hub_cache, COMMITS[1], gain=2.0)
     assert len({first.info, second.info, find_method("metric3d").info}) == 3, "other code, other weights"
     assert str(tmp_path) not in repr(second.info)
 
@@ -134,8 +129,10 @@ def test_methods_listing_needs_no_network(
     monkeypatch.setitem(sys.modules, "torch", None)
     assert main(["methods"]) == 0
     listed = capsys.readouterr().out
-    assert all(name in listed for name in FROM_HUB)
-    assert set(FROM_HUB) | set(FROM_FOLDER) <= set(METHODS)
+    assert all(name in listed for name in METHODS)
+    assert all(METHODS[name].info.name == name for name in METHODS)
+    takes_folder = {name for name, method in METHODS.items() if isinstance(method, WeightsMethod)}
+    assert takes_folder == set(FROM_FOLDER)
 
 
 def test_predict_help_names_weight_folders(capsys: pytest.CaptureFixture[str]) -> None:
@@ -144,20 +141,10 @@ def test_predict_help_names_weight_folders(capsys: pytest.CaptureFixture[str]) -
     assert "NAME:FOLDER (a folder with weights for depth-anything-3," in " ".join(capsys.readouterr().out.split())
 
 
-def test_foundation_stereo_announces_only_uncached_downloads(
-    hub_cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+def test_foundation_stereo_announces_downloads_of_its_code(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setenv("TORCH_HOME", str(tmp_path / "torch"))
-    method = find_method(f"foundation-stereo:{stand_ins.stereo_clone(tmp_path / 'clone')}")
-    load_predictor(method)
+    load_predictor(find_method(f"foundation-stereo:{stand_ins.stereo_clone(tmp_path / 'clone')}"))
     stderr = capsys.readouterr().err
     assert "DINOv2's code (https://github.com/facebookresearch/dinov2, even if HF_HUB_OFFLINE is set)" in stderr
     assert "and timm's edgenext_small (from the Hub)\n" in stderr
-    (hub_cache / "models--timm--edgenext_small.usi_in1k").mkdir(parents=True)
-    load_predictor(method)
-    stderr = capsys.readouterr().err
-    assert "DINOv2's code" in stderr
-    assert "edgenext" not in stderr
-    (tmp_path / "torch" / "hub" / "facebookresearch_dinov2_main").mkdir(parents=True)
-    load_predictor(method)
-    assert "download" not in capsys.readouterr().err

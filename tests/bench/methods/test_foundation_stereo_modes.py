@@ -22,14 +22,13 @@ from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry import rectification
 from rebar_depth_bench.methods import Method, find_method
-from rebar_depth_bench.methods.stereo.disparity import largest_disparity_px, rectified_images
-from rebar_depth_bench.methods.stereo.passes import (
+from rebar_depth_bench.methods.paper.foundation_stereo import (
     SMALL_RATIO,
-    Passes,
     choose_passes,
     full_size_disparity_px,
     resized,
 )
+from rebar_depth_bench.methods.sgbm import largest_disparity_px, rectified_images
 from tests.bench.methods import stand_in_models as stand_ins
 from tests.bench.methods.predictors import load_predictor
 from tests.bench.methods.stand_in_views import stereo_row
@@ -83,23 +82,23 @@ def notes_of(method: Method, row: dict[str, Any]) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("largest_px", "expected"),
     [
-        (0.0, Passes(hierarchical=False)),
-        (416.0, Passes(hierarchical=False)),
-        (416.001, Passes(hierarchical=True)),
-        (832.0, Passes(hierarchical=True)),
-        (1664.0, Passes(hierarchical=True, scale=0.5)),
+        (0.0, (False, 1.0)),
+        (416.0, (False, 1.0)),
+        (416.001, (True, 1.0)),
+        (832.0, (True, 1.0)),
+        (1664.0, (True, 0.5)),
     ],
 )
-def test_mode_at_boundaries(largest_px: float, expected: Passes) -> None:
+def test_mode_at_boundaries(largest_px: float, expected: tuple[bool, float]) -> None:
     assert choose_passes(largest_px, 416) == expected
-    assert choose_passes(832.001, 416).scale < 1
+    assert choose_passes(832.001, 416)[1] < 1
 
 
 @given(st.floats(0, 20_000), st.integers(1, 800), st.integers(40, 5000))
 def test_first_pass_holds_largest_disparity(largest_px: float, volume_px: int, width: int) -> None:
-    passes = choose_passes(largest_px, volume_px)
-    ratio = SMALL_RATIO if passes.hierarchical else 1.0
-    width_px = max(1, int(width * passes.scale))
+    is_hierarchical, scale = choose_passes(largest_px, volume_px)
+    ratio = SMALL_RATIO if is_hierarchical else 1.0
+    width_px = max(1, int(width * scale))
     assert width_px == 1 or largest_px * width_px / width * ratio <= volume_px * (1 + 1e-9)
 
 
@@ -170,17 +169,23 @@ def test_wall_beyond_cost_volume_is_found(
 
 
 @pytest.mark.parametrize(("nearest_m", "scale"), [(None, 1.0), (1e-6, 832 / 1001)])
-def test_match_outside_right_image_gives_nan(nearest_m: float | None, scale: float, tmp_path: Path) -> None:
-    """The stand-in returns half of the red channel, 100 px, as the disparity of the resized image."""
+def test_match_outside_right_image_of_network_gives_nan(
+    nearest_m: float | None, scale: float, tmp_path: Path
+) -> None:
+    """The stand-in returns half of the red channel, 100 px, as the disparity of the resized image.
+
+    As in the authors' demo, its first 100 columns have no match, and thus the columns that are resized to them.
+    """
     row = wall_row(5, (31, 1001))
     row["left_rgb"] = np.full_like(row["left_rgb"], 200)
     method = find_method(f"foundation-stereo:{stand_ins.stereo_clone(tmp_path / 'clone')}", nearest_m=nearest_m)
     assert isinstance(method, Method)
     assert notes_of(method, row)["scale"] == round(scale, 4)
     depth_m = load_predictor(method)(row)
-    disparity_px = 100 * 1001 / int(1001 * scale)
-    assert np.isnan(depth_m[:, : int(np.ceil(disparity_px))]).all()
-    np.testing.assert_allclose(depth_m[:, int(np.ceil(disparity_px)) :], FX_BASELINE / disparity_px, rtol=1e-6)
+    width_px = int(1001 * scale)
+    has_match = (np.arange(1001) + 0.5) * width_px / 1001 >= 100
+    assert np.isnan(depth_m[:, ~has_match]).all()
+    np.testing.assert_allclose(depth_m[:, has_match], FX_BASELINE / (100 * 1001 / width_px), rtol=1e-6)
 
 
 def test_wall_beyond_declared_range_is_not_found(tmp_path: Path) -> None:

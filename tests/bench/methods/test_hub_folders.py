@@ -20,15 +20,16 @@ SCRIPT = """
 import sys
 from dataclasses import replace
 from rebar_depth_bench.console import run_command
-from rebar_depth_bench.methods.monocular.hub import hub_method
-from rebar_depth_bench.methods.monocular.hub_networks import UNIDEPTH_MODEL
+from rebar_depth_bench.methods.paper import monocular, third_party
 
-def show(folder):
+def show(network, folder):
     print(*sorted(one.name for one in folder.iterdir()))
+
+third_party.HubNetwork._load = show
 
 def run():
     package = sys.argv[2]
-    method = hub_method(replace(UNIDEPTH_MODEL, repository=sys.argv[1], package=package, load=show))
+    method = replace(monocular.UNIDEPTH_NETWORK, repository=sys.argv[1], module=package).with_weights(None)
     print(method.info.name, method.info.summary.rpartition("; ")[2])
     print("loading", file=sys.stderr, flush=True)
     method.load()
@@ -107,11 +108,16 @@ def test_model_missing_on_hub_exits_with_status_2(hub: tuple[str, list[str]], tm
     endpoint, _ = hub
     finished = run_method("org/other", tmp_path / "home", endpoint, offline="0")
     assert finished.returncode == 2
-    assert f"org/other: cannot be downloaded from {endpoint}: RepositoryNotFoundError" in finished.stderr
+    assert (
+        f"org/other: config.json cannot be downloaded from {endpoint}: RepositoryNotFoundError" in finished.stderr
+    )
     assert "or a local copy: unidepth:FOLDER" in finished.stderr
     assert "Traceback" not in finished.stderr
     [weights] = tmp_path.glob("model/model.safetensors")
     weights.unlink()
     finished = run_method("org/model", tmp_path / "home", endpoint, offline="0")
     assert finished.returncode == 2
-    assert f"org/model: no model.safetensors at commit {COMMIT}, expected config.json and mo" in finished.stderr
+    assert (
+        f"org/model: model.safetensors cannot be downloaded from {endpoint}: RemoteEntryNotFoundError"
+        in finished.stderr
+    )

@@ -15,7 +15,7 @@ import pytest
 
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.methods.kept_views import KeptViews, PreparationReport
-from rebar_depth_bench.methods.runner import predict
+from rebar_depth_bench.methods.run import predict
 from tests.bench.methods.test_predict import counting_method, orbit_view_ids
 
 GRID = (90, 160)
@@ -117,10 +117,9 @@ def test_every_cut_of_a_kept_prediction_is_noticed(tmp_path: Path) -> None:
     good = file.read_bytes()
     for length in range(0, len(good), 5):
         file.write_bytes(good[:length])
-        usable, errors = views.check(["a/0", "a/1"], (2, 3))
-        assert (usable, len(errors)) == (set(), 1)
+        with pytest.raises(InputError, match=r"0\.npz"):
+            views.get("a/0", (2, 3))
     file.write_bytes(good)
-    assert views.check(["a/0", "a/1"], (2, 3)) == ({"a/0"}, [])
     depth_m, seconds = views.get("a/0", (2, 3))
     assert (depth_m.tolist(), depth_m.dtype, seconds) == ([[1, 1, 1], [1, 1, 1]], np.float16, 0.25)
 
@@ -137,48 +136,64 @@ def test_view_id_cannot_leave_the_folder(view_id: str, tmp_path: Path) -> None:
     views = KeptViews.open(tmp_path / "folder" / "views", {})
     with pytest.raises(InputError, match="is not a path in this folder"):
         views.put(view_id, np.ones((2, 3)), 0.0)
-    assert {path.name for path in tmp_path.rglob("*")} == {"folder", "views", "key.json"}
+    assert {path.name for path in tmp_path.rglob("*")} == {"folder", "views", "run.json"}
 
 
-REPORTS = {
-    "text": b"damaged",
-    "empty": b"",
-    "list": b"[]",
-    "unknown key": b'{"notes": {}, "seconds": 1, "more": 1}',
-    "missing key": b'{"notes": {}}',
-    "notes as list": b'{"notes": [], "seconds": 1}',
-    "negative": b'{"notes": {}, "seconds": -1}',
-    "not a number": b'{"notes": {}, "seconds": NaN}',
-    "huge": b'{"notes": {}, "seconds": 1e999}',
-    "long integer": b'{"notes": {"x": ' + b"9" * 4400 + b'}, "seconds": 1}',
-    "deep": b'{"notes": {"x": ' + b"[" * 100_000 + b"]" * 100_000 + b'}, "seconds": 1}',
-    "twice": b'{"notes": {}, "notes": {}, "seconds": 1}',
-    "not UTF-8": b'{"notes": {"x": "\xff"}, "seconds": 1}',
+def report(notes: str = "{}", seconds: str = "1") -> Callable[[str], bytes]:
+    """Return a function that gives ``run.json`` another report, as text."""
+
+    def replace_report(text: str) -> bytes:
+        run = json.loads(text)
+        table = json.dumps(run | {"reports": {"lattice-orbit": "REPORT"}})
+        return table.replace('"REPORT"', f'{{"notes": {notes}, "seconds": {seconds}}}').encode()
+
+    return replace_report
+
+
+DAMAGED_RUNS: dict[str, Callable[[str], bytes]] = {
+    "text": lambda _: b"damaged",
+    "empty": lambda _: b"",
+    "cut": lambda text: text[:-3].encode(),
+    "list": lambda _: b"[]",
+    "unknown key": lambda text: text.replace("{", '{"more": 1, ', 1).encode(),
+    "missing key": lambda text: text.replace('"key"', '"other"', 1).encode(),
+    "not UTF-8": lambda text: text.encode().replace(b"whole", b"who\xffe"),
+    "other method": lambda text: text.replace("whole", "other").encode(),
+    "notes as list": report(notes="[]"),
+    "negative": report(seconds="-1"),
+    "not a number": report(seconds="NaN"),
+    "huge": report(seconds="1e999"),
+    "long integer": report(notes='{"x": ' + "9" * 4400 + "}"),
+    "deep": report(notes='{"x": ' + "[" * 100_000 + "]" * 100_000 + "}"),
+    "twice": report(notes='{}, "notes": {}'),
 }
 
 
-@pytest.mark.parametrize("content", REPORTS.values(), ids=REPORTS)
-@pytest.mark.parametrize("stop_after", [1, 2])
-def test_damaged_report_is_made_again(
-    content: bytes, stop_after: int, tiny_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+@pytest.mark.parametrize("damage", DAMAGED_RUNS.values(), ids=DAMAGED_RUNS)
+def test_run_with_damaged_or_other_parameters_starts_over(
+    damage: Callable[[str], bytes],
+    interrupted: Path,
+    tiny_root: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    predict_orbit(tiny_root, tmp_path, stop_after)
-    (tmp_path / ".x.zip.views" / "lattice-orbit.json").write_bytes(content)
-    log = predict_orbit(tiny_root, tmp_path)
-    assert log[1:] == ["prepare lattice-orbit True", *orbit_view_ids(tiny_root)[stop_after:]]
-    assert capsys.readouterr().err.count("prepared again") == 1
+    file = interrupted / "run.json"
+    file.write_bytes(damage(file.read_text()))
+    assert predict_orbit(tiny_root, tmp_path)[1:] == ["prepare lattice-orbit False", *orbit_view_ids(tiny_root)]
+    assert f"starting over: {interrupted} holds 1 views of " in capsys.readouterr().err
     with zipfile.ZipFile(tmp_path / "x.zip") as archive:
         metadata = json.loads(archive.read("submission.json"))
     assert metadata["notes"] == {"lattice-orbit": {"counted": 2}}
 
 
-@pytest.mark.parametrize("content", [b"", b"{", b"[" * 100_000, b"\xff", b"x" * 100])
-def test_run_with_damaged_key_starts_over(
-    content: bytes, interrupted: Path, tiny_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    (interrupted / "key.json").write_bytes(content)
-    assert predict_orbit(tiny_root, tmp_path)[1:] == ["prepare lattice-orbit False", *orbit_view_ids(tiny_root)]
-    assert f"starting over: {interrupted}" in capsys.readouterr().err
+def test_sound_report_is_reused(interrupted: Path, tiny_root: Path, tmp_path: Path) -> None:
+    file = interrupted / "run.json"
+    file.write_bytes(report('{"counted": 7}', "2.5")(file.read_text()))
+    predict_orbit(tiny_root, tmp_path)
+    with zipfile.ZipFile(tmp_path / "x.zip") as archive:
+        metadata = json.loads(archive.read("submission.json"))
+    assert metadata["notes"] == {"lattice-orbit": {"counted": 7}}
+    assert metadata["runtime"]["preparing"] == {"lattice-orbit": 2.5}
 
 
 def place_text(path: Path) -> None:
@@ -204,10 +219,9 @@ FOREIGN: dict[str, tuple[str, Callable[[Path, Path], None]]] = {
     "hidden file": (".bashrc", lambda path, _: place_text(path)),
     "folder": ("photos", lambda path, _: place_text(path / "1.jpg")),
     "folder in a folder": ("lattice-orbit/deep", lambda path, _: path.mkdir()),
-    "pipe as key": ("key.json", lambda path, _: place_pipe(path)),
+    "pipe as parameters": ("run.json", lambda path, _: place_pipe(path)),
     "pipe as view": ("lattice-orbit/0001.npz", lambda path, _: place_pipe(path)),
-    "pipe as report": ("lattice-orbit.json", lambda path, _: place_pipe(path)),
-    "link as key": ("key.json", place_link),
+    "link as parameters": ("run.json", place_link),
     "link as view": ("lattice-orbit/0001.npz", place_link),
     "link as config": ("lattice-orbit", place_link),
     "link as work folder": ("lattice-orbit.work", place_link),
@@ -228,7 +242,7 @@ def test_foreign_content_is_refused_and_kept(
     documents.mkdir()
     (documents / "thesis.tex").write_text("text")
     if other_run:
-        (interrupted / "key.json").write_text("{}")
+        (interrupted / "run.json").write_text("{}")
     place(interrupted / name, documents)
     before = sorted(tmp_path.rglob("*"))
     with pytest.raises(InputError) as caught:
@@ -237,7 +251,7 @@ def test_foreign_content_is_refused_and_kept(
     assert sorted(tmp_path.rglob("*")) == before
 
 
-@pytest.mark.parametrize("kind", ["folder", "link", "link to nowhere", "file", "pipe", "views without key"])
+@pytest.mark.parametrize("kind", ["folder", "link", "link to nowhere", "file", "pipe", "views without parameters"])
 def test_folder_of_another_kind_is_refused_and_kept(kind: str, tiny_root: Path, tmp_path: Path) -> None:
     path = tmp_path / ".x.zip.views"
     documents = path if kind == "folder" else tmp_path / "documents"
@@ -249,7 +263,7 @@ def test_folder_of_another_kind_is_refused_and_kept(kind: str, tiny_root: Path, 
         path.write_text("text")
     elif kind == "pipe":
         os.mkfifo(path)
-    elif kind == "views without key":
+    elif kind == "views without parameters":
         (path / "scans").mkdir(parents=True)
         (path / "scans" / "0001.npz").write_text("text")
     before = sorted(tmp_path.rglob("*"))
@@ -261,7 +275,7 @@ def test_folder_of_another_kind_is_refused_and_kept(kind: str, tiny_root: Path, 
 def test_empty_folder_and_remains_of_a_killed_run_are_used(tiny_root: Path, tmp_path: Path) -> None:
     path = tmp_path / ".x.zip.views"
     path.mkdir()
-    (path / ".key.json.abc.tmp").write_text("{")
+    (path / ".run.json.abc.tmp").write_text("{")
     assert len(predict_orbit(tiny_root, tmp_path)) == 4
     assert [file.name for file in tmp_path.iterdir()] == ["x.zip"]
 
@@ -277,9 +291,9 @@ def test_links_in_work_folder_are_not_followed_when_it_is_deleted(
 
 
 def test_report_is_read_as_it_was_written(tmp_path: Path) -> None:
-    views = KeptViews.open(tmp_path / "views", {})
-    assert views.get_preparation("a") is None
+    views = KeptViews.open(tmp_path / "views", {"columns": ("a", "b")})
+    assert views.reports == {}
     for seconds in (None, 0.0, 1.5):
-        report = PreparationReport(notes={"text": "Größe", "list": [1, 2.5, None, True]}, seconds=seconds)
-        views.put_preparation("a", report)
-        assert views.get_preparation("a") == report
+        kept_report = PreparationReport(notes={"text": "Größe", "list": [1, 2.5, None, True]}, seconds=seconds)
+        views.put_report("a", kept_report)
+        assert KeptViews.open(tmp_path / "views", {"columns": ["a", "b"]}).reports == {"a": kept_report}

@@ -22,7 +22,7 @@ from onnx import ModelProto, TensorProto, helper, numpy_helper
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods import find_method
 from rebar_depth_bench.methods.onnx.external_data import MAX_FIELDS, MESSAGE_FIELDS, external_files
-from rebar_depth_bench.methods.runner import predict
+from rebar_depth_bench.methods.run import predict
 from tests.bench.methods.onnx_models import predict_depth, write_mixer_model, write_toml
 
 GREY = np.full((4, 6, 3), 100, np.uint8)

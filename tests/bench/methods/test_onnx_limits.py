@@ -64,7 +64,7 @@ def test_endless_model_ends_at_view_timeout(
     assert "lattice-orbit/" in last
     assert "0.5 s" in last
     assert "--view-timeout" in last
-    assert (tmp_path / ".x.zip.views" / "key.json").is_file(), "the run can be resumed"
+    assert (tmp_path / ".x.zip.views" / "run.json").is_file(), "the run can be resumed"
     assert not (tmp_path / "x.zip").exists()
 
 
@@ -91,7 +91,7 @@ def test_endless_model_can_be_interrupted(tiny_root: Path, tmp_path: Path) -> No
     command = [sys.executable, "-m", "rebar_depth_bench", "predict", str(write_loop_model(tmp_path))]
     command += ["--data", str(tiny_root), "--out", str(tmp_path / "x.zip")]
     running = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    while not (tmp_path / ".x.zip.views" / "key.json").is_file():
+    while not (tmp_path / ".x.zip.views" / "run.json").is_file():
         assert running.poll() is None
         time.sleep(0.05)
     time.sleep(0.5)

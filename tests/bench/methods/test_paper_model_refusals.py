@@ -7,6 +7,7 @@ import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -32,7 +33,8 @@ def site(tmp_path: Path) -> Iterator[Path]:
     ("name", "module", "words"),
     [
         ("unidepth", "unidepth", "pip install 'unidepth @ git+https://github.com/lpiccinelli-eth/UniDepth'"),
-        ("depth-anything-3", "depth_anything_3", "pip install depth-anything-3"),
+        ("depth-anything-3", "depth_anything_3", "pip install depth-anything-3 addict"),
+        ("metric3d", "cv2", "pip install 'rebar-depth-bench[methods]'"),
         ("foundation-stereo", "cv2", "pip install 'rebar-depth-bench[methods]'"),
         *((name, "torch", "pip install 'rebar-depth-bench[torch]'") for name in FROM_FOLDER),
     ],
@@ -58,7 +60,7 @@ def test_weights_of_other_network_raise(name: str, tmp_path: Path) -> None:
     ("name", "spoil", "words"),
     [
         ("metric3d", "hubconf.py", "no hubconf.py in it"),
-        ("metric3d", "metric_depth_vit_small_800k.pth", "expected the file from https://huggingface.co/JUGGHM/"),
+        ("metric3d", "metric_depth_vit_small_800k.pth", "expected the file of https://huggingface.co/JUGGHM/"),
         (
             "unidepth",
             "model.safetensors",
@@ -91,8 +93,17 @@ def test_damaged_checkpoint_raises(name: str, tmp_path: Path) -> None:
 def test_other_da3_model_raises(config: str, tmp_path: Path) -> None:
     folder = stand_ins.da3_weights(tmp_path / "theirs")
     (folder / "config.json").write_text(config)
-    with pytest.raises(MethodError, match=r"expected 'da3metric-large': only its output|config.json: 1 problem"):
+    with pytest.raises(
+        MethodError, match=r"expected 'da3metric-large', the paper's network|config.json: 1 problem"
+    ):
         find_method(f"depth-anything-3:{folder}")
+
+
+@pytest.mark.parametrize("encoder", ["dinov2_vits14", ["dinov2_vitl14"]])
+def test_other_unidepth_encoder_raises(encoder: Any, tmp_path: Path) -> None:
+    folder = stand_ins.unidepth_weights(tmp_path / "theirs", encoder=encoder)
+    with pytest.raises(MethodError, match=r"pixel_encoder.name in config.json is .*, expected 'dinov2_vitl14'"):
+        find_method(f"unidepth:{folder}")
 
 
 def test_cuda_only_code_raises_without_gpu(tmp_path: Path) -> None:
@@ -113,7 +124,9 @@ def test_missing_import_of_model_code_is_named(name: str, code: str, tmp_path: P
     folder = BUILDERS[name](tmp_path / "theirs")
     text = (folder / code).read_text()
     (folder / code).write_text(text.replace("import torch", "import torch, no_such_mmcv", 1))
-    with pytest.raises(MethodError, match=r"No module named 'no_such_mmcv'; install the requirements listed"):
+    with pytest.raises(
+        MethodError, match=r"No module named 'no_such_mmcv'; to install what its code imports: pip install "
+    ):
         load_predictor(f"{name}:{folder}")
 
 
@@ -128,7 +141,13 @@ def test_missing_import_of_model_code_is_named(name: str, code: str, tmp_path: P
             "* rgb[None, :1, 1:]",
             "(1, 1, 89, 160), expec",
         ),
-        ("depth-anything-3", "site/depth_anything_3/api.py", "red[None]", "red", "(280, 504), expected 1 x h x w"),
+        (
+            "depth-anything-3",
+            "site/depth_anything_3/api.py",
+            "red[None]",
+            "red",
+            "(280, 504), expected (1, 280, 504)",
+        ),
     ],
 )
 def test_output_of_wrong_shape_raises(

@@ -29,7 +29,7 @@ from rebar_depth_bench.methods import (
     all_methods,
     find_method,
 )
-from rebar_depth_bench.methods.runner import predict
+from rebar_depth_bench.methods.run import predict
 from rebar_depth_bench.parallel import Progress
 
 USER_METHOD = """
@@ -122,7 +122,7 @@ def test_views_of_different_run_are_not_reused(user_file: Path, tiny_root: Path,
     archive = tmp_path / "out.zip"
     foreign_views = tmp_path / ".out.zip.views"
     (foreign_views / "lattice-orbit").mkdir(parents=True)
-    (foreign_views / "key.json").write_text("{}")
+    (foreign_views / "run.json").write_text("{}")
     view_id = orbit_view_ids(tiny_root)[0]
     np.savez(foreign_views / f"{view_id}.npz", depth_m=np.full((90, 160), 99.0), seconds=0.0)
     predict(find_method(f"{user_file}:METHOD"), tiny_root, archive, configs=["lattice-orbit"])

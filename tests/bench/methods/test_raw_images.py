@@ -19,8 +19,7 @@ from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.cameras import pixel_rays
 from rebar_depth_bench.geometry.rectification import raw_depth_m, rectified_pair
 from rebar_depth_bench.methods import Method, MethodInfo
-from rebar_depth_bench.methods.raw_images import rectifying_predictor
-from rebar_depth_bench.methods.runner import predict_views
+from rebar_depth_bench.methods.run import predict_views, rectifying_predictor
 from rebar_depth_bench.submission import SubmissionReader
 from tests.bench.geometry.calibrations import SHIPPED_CALIBRATION
 from tests.bench.geometry.textured_plane import HEIGHT, WIDTH, plane_depth_m, raw_row
@@ -123,5 +122,5 @@ def test_method_that_needs_what_rectified_images_lack_is_refused(column: str) ->
 @pytest.mark.parametrize("depth", [np.zeros((2, 2), np.float32), np.zeros((HEIGHT, WIDTH), np.int64), None])
 def test_depth_of_another_shape_or_type_is_refused(depth: Any, dataset_row: Row) -> None:
     predictor, needed = rectifying_predictor(lambda _: depth, ("left_rgb", "left_K"))
-    with pytest.raises(MethodError, match=r"capture/0001: .*expected float metres of the rectified image"):
+    with pytest.raises(MethodError, match=r"capture/0001, rectified: .*expected float metres of shape"):
         predictor({name: dataset_row[name] for name in ("view_id", *needed)})

@@ -1,4 +1,4 @@
-"""Left-right consistency check of the semi-global matching methods."""
+"""Semi-global matching: left-right consistency, and disparity to depth, checked against camera geometry."""
 
 from __future__ import annotations
 
@@ -7,8 +7,17 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rebar_depth_bench.methods.stereo.sgbm import MAX_LEFT_RIGHT_DIFFERENCE_PX, left_right_consistent
+from rebar_depth_bench.methods.sgbm import (
+    MAX_LEFT_RIGHT_DIFFERENCE_PX,
+    MIN_PARALLAX_PX,
+    disparity_to_depth_m,
+    left_right_consistent,
+    without_invisible,
+)
 from tests.bench.methods.predictors import load_predictor
+
+METRES = st.floats(0.1, 30)
+FOCAL = st.floats(50, 3000)
 
 
 def test_left_right_check_on_known_row() -> None:
@@ -70,3 +79,33 @@ def test_pixels_seen_by_one_eye_have_no_depth(where: str) -> None:
         hidden = np.isfinite(checked[:, 80:97])  # 22 px are hidden from the right eye.
         assert hidden.mean() < 0.2
         assert np.isfinite(filled).sum() > np.isfinite(checked).sum()
+
+
+def make_K(fx: float, cx: float = 0.0) -> np.ndarray:
+    return np.array([[fx, 0, cx], [0, fx, 0], [0, 0, 1.0]])
+
+
+@given(FOCAL, METRES, st.floats(0.02, 0.4), st.floats(-5, 5), st.floats(-5, 5))
+def test_disparity_of_projected_point_gives_its_depth(
+    fx: float, z_m: float, baseline_m: float, cx_left: float, cx_right: float
+) -> None:
+    """Project a point into both eyes and recover its depth from the difference of its columns."""
+    left = np.array([fx * (x_m := 1.3) / z_m + cx_left])
+    right = fx * (x_m - baseline_m) / z_m + cx_right
+    disparity = np.full((1, 3000), left - right)
+    visible_px = without_invisible(disparity)
+    depth_m = disparity_to_depth_m(visible_px, make_K(fx, cx=cx_left), make_K(fx, cx=cx_right), baseline_m)
+    columns = np.arange(3000)
+    parallax = fx * baseline_m / z_m
+    valid = (columns >= disparity[0]) & (disparity[0] > 0) & (parallax > MIN_PARALLAX_PX * (1 + 1e-9))
+    np.testing.assert_allclose(depth_m[0, valid], z_m, rtol=1e-5)
+    if abs(parallax - MIN_PARALLAX_PX) > 1e-6:
+        assert np.isnan(depth_m[0, ~valid]).all()
+
+
+def test_match_outside_right_image_is_nan() -> None:
+    visible_px = without_invisible(np.full((1, 6), 3.0, np.float32))
+    depth_m = disparity_to_depth_m(visible_px, make_K(10.0), make_K(10.0), 0.6)
+    np.testing.assert_array_equal(depth_m, np.array([[np.nan] * 3 + [2.0] * 3], np.float32))
+    invalid_px = without_invisible(np.array([[np.nan, -2, 0, np.inf, 0.5, 1e-9]], np.float32))
+    assert np.isnan(disparity_to_depth_m(invalid_px, make_K(10.0), make_K(10.0), 0.6)).all()

@@ -15,14 +15,10 @@ pytest.importorskip("torch")
 
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.base import MethodInfo
-from rebar_depth_bench.methods.monocular.third_party import (
-    check_weights_loaded,
-    on_sys_path,
-    translate_errors,
-    with_weights_digest,
-)
+from rebar_depth_bench.methods.paper.third_party import Network, on_sys_path
 
 torch: Any = importlib.import_module("torch")
+NETWORK = Network(MethodInfo("m", "what", (), False, "", ""), install="pip install m's requirements")
 
 
 def make_network() -> Any:
@@ -35,9 +31,9 @@ def make_network() -> Any:
 
 
 def test_missing_token_is_reported_and_shared_weights_count_once(capsys: pytest.CaptureFixture[str]) -> None:
-    assert not check_weights_loaded("m", torch, make_network(), ["tied.weight", "token", "head.unknown"]).training
+    assert not NETWORK.with_loaded_weights(make_network(), ["tied.weight", "token", "head.unknown"]).training
     assert capsys.readouterr().err == ""
-    check_weights_loaded("m", torch, make_network(), ["tied.weight"])
+    NETWORK.with_loaded_weights(make_network(), ["tied.weight"])
     assert capsys.readouterr().err == "m: the weights cover 99.60% of the network, 1 tensors are missing: token\n"
 
 
@@ -45,7 +41,7 @@ def test_missing_body_weights_raise() -> None:
     with pytest.raises(
         MethodError, match=r"m: the weights cover 0.40% .* 1 tensors are missing, first body.weight, exp"
     ):
-        check_weights_loaded("m", torch, make_network(), ["token"])
+        NETWORK.with_loaded_weights(make_network(), ["token"])
 
 
 def print_and_raise() -> None:
@@ -56,30 +52,59 @@ def print_and_raise() -> None:
 def test_third_party_errors_and_output_are_translated(capsys: pytest.CaptureFixture[str]) -> None:
     with (
         pytest.raises(MethodError, match=r"^m: fails: ValueError: two lines$"),
-        translate_errors("m", torch, "fails"),
+        NETWORK.errors("fails"),
     ):
         print_and_raise()
     printed = capsys.readouterr()
     assert (printed.out, printed.err) == ("", "loud\n")
-    with pytest.raises(MethodError, match=r"^mine$"), translate_errors("m", torch, "fails"):
+    with pytest.raises(MethodError, match=r"^mine$"), NETWORK.errors("fails"):
         raise MethodError("mine")
-    with pytest.raises(KeyboardInterrupt), translate_errors("m", torch, "fails"):
+    with pytest.raises(KeyboardInterrupt), NETWORK.errors("fails"):
         raise KeyboardInterrupt
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [
+        (None, "m needs strange .*: pip install strange$"),
+        (
+            "import addict_not_there",
+            "m: strange is installed but cannot be imported: .* No module named 'addict_not_there'; "
+            "to install what its code imports: pip install strange$",
+        ),
+        (
+            "raise RuntimeError('operator torchvision::nms does not exist')",
+            "m: strange is installed but cannot be imported: RuntimeError: operator torchvision::nms does not "
+            "exist; install torch and torchvision of one release",
+        ),
+    ],
+)
+def test_missing_and_broken_packages_are_told_apart(
+    code: str | None, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if code is not None:
+        (tmp_path / "strange.py").write_text(code)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    with pytest.raises(MethodError, match=words):
+        NETWORK.import_package("strange", "pip install strange")
 
 
 def test_weights_digest_depends_on_names_and_content(tmp_path: Path) -> None:
     """The digest is taken over lines like those of ``sha256sum``, with the name first."""
-    info = MethodInfo("m", "what", (), False, "", "")
     digests = []
     for folder, first, second in (("1", b"x", b"y"), ("2", b"x", b"y"), ("3", b"y", b"x")):
         (tmp_path / folder).mkdir()
         files = [tmp_path / folder / "a.pth", tmp_path / folder / "b.yaml"]
         for file, content in zip(files, (first, second), strict=True):
             file.write_bytes(content)
-        digests.append(with_weights_digest(info, "mine", files))
+        digests.append(NETWORK.with_digest("mine", files))
     x, y = (hashlib.sha256(content).hexdigest() for content in (b"x", b"y"))
     expected = hashlib.sha256(f"a.pth {x}\nb.yaml {y}\n".encode()).hexdigest()
-    assert digests[0] == digests[1] == replace(info, name="m:mine", summary=f"what; weights sha256:{expected}")
+    assert (
+        digests[0]
+        == digests[1]
+        == replace(NETWORK.info, name="m:mine", summary=f"what; weights sha256:{expected}")
+    )
     assert digests[2] != digests[0]
 
 

@@ -18,7 +18,7 @@ import pytest
 from dataset_builder.lidar import LIDAR_MOBILE, LIDAR_SURVEY, MOBILE, SURVEY, lidar_method
 from rebar_depth_bench import load, score
 from rebar_depth_bench.methods import MultiViewMethod
-from rebar_depth_bench.methods.runner import predict
+from rebar_depth_bench.methods.run import predict
 
 ENTRY_POINT_GROUP = "rebar_depth_bench.methods"
 NEAR_SPEC = replace(

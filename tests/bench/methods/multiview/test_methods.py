@@ -21,7 +21,7 @@ from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods import METHODS, ConfigViews, MultiViewMethod
 from rebar_depth_bench.methods.multiview import dense
-from rebar_depth_bench.methods.runner import predict
+from rebar_depth_bench.methods.run import predict
 from rebar_depth_bench.parallel import silent
 from tests.data.orbit import write_orbit
 

@@ -10,8 +10,9 @@ import json
 import platform
 import time
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -23,15 +24,20 @@ from rebar_depth_bench import software_version
 from rebar_depth_bench.atomic_io import NO_SPACE, is_stream, link_target, scratch_folder, write_error
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.data.views import Views
-from rebar_depth_bench.errors import DatasetError, InputError, MethodError, RebarDepthError, escape_text
+from rebar_depth_bench.errors import (
+    DatasetError,
+    InputError,
+    MethodError,
+    RebarDepthError,
+    escape_text,
+)
 from rebar_depth_bench.methods import AnyMethod, ConfigViews, Method, MultiViewMethod, Predictor, Prepared
 from rebar_depth_bench.methods.base import input_class
 from rebar_depth_bench.methods.kept_views import KeptViews, PreparationReport
-from rebar_depth_bench.methods.raw_images import rectifying_predictor
+from rebar_depth_bench.methods.sgbm import STEREO_COLUMNS
 from rebar_depth_bench.names import TEST_SPLIT
 from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.submission import SubmissionWriter
-from rebar_depth_bench.terminal import print_notice
 
 
 def predict(
@@ -80,18 +86,21 @@ def predict_views(
     # Loading comes first so that its errors occur before anything is written.
     loaded = _load_method(method) if isinstance(method, Method) else None
     noted = {config.config: report for config in views if (report := _first_row_report(method, config))}
+    key = {
+        "method": vars(method.info),
+        "dataset": {config.config: config.identity for config in views},
+        "software": software_version(),
+    }
     with _kept_views_folder(target) as folder:
-        kept = KeptViews.open(folder, _run_key(method, views))
-        usable = _usable_views(kept, views)
+        kept = KeptViews.open(folder, key)
+        usable = kept.usable(views)
         for config in views:
             done = usable & set(config.view_ids)
-            is_prepared = loaded is not None or _has_preparation(kept, config.config)
-            if len(done) == len(config.view_ids) and is_prepared:
+            if len(done) == len(config.view_ids) and (loaded is not None or config.config in kept.reports):
                 continue
-            predictor = loaded or _prepare_method(method, config, kept, is_prepared, progress)
+            predictor = _prepare_method(method, config, kept, progress) if loaded is None else loaded
             _predict_config(method, predictor, config, kept, done, progress)
-        prepared = {config.config: report for config in views if (report := kept.get_preparation(config.config))}
-        reports = noted | prepared
+        reports = noted | kept.reports
         _write_archive(method, target, kept, views, reports)
         kept.remove()
     return reports
@@ -122,15 +131,6 @@ def dataset_views(
     return chosen
 
 
-def _run_key(method: AnyMethod, views: Sequence[Views]) -> dict[str, Any]:
-    """Return everything that determines the predictions."""
-    return {
-        "method": vars(method.info),
-        "dataset": {config.config: config.identity for config in views},
-        "software": software_version(),
-    }
-
-
 def _predict_config(
     method: AnyMethod,
     predictor: Predictor,
@@ -147,35 +147,9 @@ def _predict_config(
         start = time.perf_counter()
         with _wrap_errors(f"{method.info.name}: {row['view_id']}: the predictor, given {', '.join(row)}"):
             prediction = predictor(row)
-        depth_m = _validated_depth(method, row["view_id"], prediction, views.grid)
+        depth_m = _validated_depth(f"{method.info.name}: {row['view_id']}", prediction, views.grid)
         kept.put(row["view_id"], depth_m, time.perf_counter() - start)
         progress(f"{method.info.name} on {views.config}", count, len(views.view_ids))
-
-
-def _usable_views(kept: KeptViews, views: Sequence[Views]) -> set[str]:
-    """Return the ids of the views that need not be predicted again, with a notice on them and on damaged ones."""
-    checked = [kept.check(config.view_ids, config.grid) for config in views]
-    usable = {view_id for done, _ in checked for view_id in done}
-    if usable:
-        print_notice(f"resuming: {len(usable)} views are in {kept.path}; delete it to start over")
-    if errors := [error for _, damaged in checked for error in damaged]:
-        print_notice(
-            f"kept predictions that cannot be used are made again ({len(errors)}): {_on_one_line(errors[0])}"
-        )
-    return usable
-
-
-def _has_preparation(kept: KeptViews, config: str) -> bool:
-    """Return whether the preparation of a config is completed; print a notice if its report is damaged."""
-    try:
-        return kept.get_preparation(config) is not None
-    except InputError as error:
-        print_notice(f"the kept report cannot be used, {config} is prepared again: {_on_one_line(error)}")
-        return False
-
-
-def _on_one_line(error: InputError) -> str:
-    return " ".join(str(error).split())
 
 
 def _load_method(method: Method) -> Predictor:
@@ -213,8 +187,7 @@ def _first_row_report(method: AnyMethod, views: Views) -> PreparationReport | No
         return None
     row = next(views.rows(*method.info.columns))
     with _wrap_errors(f"{method.info.name}: {views.config}: notes"):
-        notes = _plain_notes(method, views.config, method.notes(row))
-    return PreparationReport(notes=notes, seconds=None)
+        return PreparationReport(notes=_plain_notes(method, views.config, method.notes(row)), seconds=None)
 
 
 def _plain_notes(method: AnyMethod, config: str, notes: Mapping[str, Any]) -> dict[str, Any]:
@@ -229,10 +202,8 @@ def _plain_notes(method: AnyMethod, config: str, notes: Mapping[str, Any]) -> di
     return dict(json.loads(json.dumps(dict(notes))))
 
 
-def _prepare_method(
-    method: AnyMethod, views: Views, kept: KeptViews, is_prepared: bool, progress: Progress
-) -> Predictor:
-    """Return the predictor of a multi-view method for a config, and store its report unless ``is_prepared``."""
+def _prepare_method(method: AnyMethod, views: Views, kept: KeptViews, progress: Progress) -> Predictor:
+    """Return the predictor of a multi-view method for a config, and store its report unless there is one."""
     assert isinstance(method, MultiViewMethod)
     work = kept.work_folder(views.config)
     started_from_scratch = not any(work.iterdir())
@@ -242,21 +213,19 @@ def _prepare_method(
     if not isinstance(prepared, Prepared):
         raise MethodError(f"{method.info.name}: prepare returned {type(prepared).__name__}, expected a Prepared")
     notes = _plain_notes(method, views.config, prepared.notes)
-    if not is_prepared:
+    if views.config not in kept.reports:
         seconds = round(time.perf_counter() - start, 1) if started_from_scratch else None
-        kept.put_preparation(views.config, PreparationReport(notes=notes, seconds=seconds))
+        kept.put_report(views.config, PreparationReport(notes=notes, seconds=seconds))
     return prepared.predict
 
 
-def _validated_depth(
-    method: AnyMethod, view_id: str, depth_m: object, grid: tuple[int, int]
-) -> Float[ndarray, "h w"]:
+def _validated_depth(where: str, depth_m: object, grid: tuple[int, int]) -> Float[ndarray, "h w"]:
     """Return a prediction as an array. Raises ``MethodError`` unless it is floating point of shape ``grid``."""
     array = np.asarray(depth_m)
     if array.shape != grid or array.dtype.kind != "f":
         raise MethodError(
-            f"{method.info.name}: {view_id}: the method returned {array.dtype} of shape {array.shape}, expected "
-            f"float metres of shape {grid}"
+            f"{where}: the method returned {array.dtype} of shape {array.shape}, expected float metres of shape "
+            f"{grid}"
         )
     return array
 
@@ -290,3 +259,67 @@ def _write_archive(
             for view_id in config.view_ids:
                 depth_m, seconds = kept.get(view_id, config.grid)
                 writer.add(view_id, depth_m, round(seconds, 4))
+
+
+# Rectified images for methods that do not read the lens distortion, and their depth on the raw left grid.
+#
+# A method that reads the right image is given the rectified pair (``geometry.rectification``), another one the
+# undistorted left image (``geometry.undistortion``). Its depth is transferred to the raw left image without
+# interpolation. Multi-view methods, and those that read ``left_distortion``, do this themselves.
+
+_MONO_COLUMNS = ("left_rgb", "left_K", "left_distortion")
+_RECTIFIED_COLUMNS = frozenset(("left_rgb", "right_rgb", "left_K", "right_K", "right_distortion", "baseline_m"))
+"""Columns of a rectified row. The poses of a rectified pair are not among them."""
+
+
+def rectifying_predictor(predictor: Predictor, columns: Sequence[str]) -> tuple[Predictor, tuple[str, ...]]:
+    """Return a predictor of raw rows, and the columns that it needs, for a predictor of rectified rows.
+
+    ``columns`` are those that ``predictor`` reads. Raises ``MethodError`` if a rectified row lacks one of them,
+    and if OpenCV is missing.
+    """
+    if others := sorted(set(columns) - _RECTIFIED_COLUMNS):
+        raise MethodError(
+            f"the images are not rectified: the method needs {', '.join(others)}, expected columns among "
+            f"{', '.join(sorted(_RECTIFIED_COLUMNS))}, or left_distortion if it rectifies them itself"
+        )
+    try:
+        import cv2  # noqa: F401
+    except ImportError as error:
+        raise MethodError(
+            f"the images are not rectified, which needs OpenCV ({error}): pip install 'rebar-depth-bench[methods]'"
+        ) from None
+    is_stereo = any(name.startswith("right_") or name == "baseline_m" for name in columns)
+
+    def predict_raw(row: Mapping[str, Any]) -> Float[ndarray, "h w"]:
+        cells, on_raw_grid = _rectified_pair(row) if is_stereo else _undistorted_left(row)
+        depth_m = predictor({"view_id": row["view_id"], **{name: cells[name] for name in columns}})
+        where = f"{row['view_id']}, rectified"
+        return np.asarray(on_raw_grid(_validated_depth(where, depth_m, cells["left_rgb"].shape[:2])))
+
+    return predict_raw, STEREO_COLUMNS if is_stereo else _MONO_COLUMNS
+
+
+def _rectified_pair(row: Mapping[str, Any]) -> tuple[dict[str, Any], Callable[[Any], Any]]:
+    """Return the cells of the rectified row of a raw one, and the function of its depth on the raw left grid."""
+    from rebar_depth_bench.geometry.rectification import raw_depth_m, rectified_pair
+
+    pair = rectified_pair(row)
+    cells = {
+        "left_rgb": pair.left_rgb,
+        "right_rgb": pair.right_rgb,
+        "left_K": pair.K,
+        "right_K": pair.K,
+        "right_distortion": np.zeros(5),
+        "baseline_m": pair.baseline_m,
+    }
+    return cells, partial(raw_depth_m, pair)
+
+
+def _undistorted_left(row: Mapping[str, Any]) -> tuple[dict[str, Any], Callable[[Any], Any]]:
+    """Return the cells of the undistorted left image of a raw row, as ``_rectified_pair``."""
+    from rebar_depth_bench.geometry.undistortion import pinhole_grid, pinhole_image
+
+    height, width, _ = row["left_rgb"].shape
+    grid = pinhole_grid(row, width, height)
+    return {"left_rgb": pinhole_image(row, grid), "left_K": grid.K}, grid.depth_on_left_grid

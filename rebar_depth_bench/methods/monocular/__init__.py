@@ -1,1 +1,0 @@
-"""Monocular networks that run through their authors' own packages or code."""

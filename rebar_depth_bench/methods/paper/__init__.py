@@ -1,0 +1,1 @@
+"""The paper's networks, run with their authors' code and weights that the user provides or downloads."""

@@ -1,0 +1,242 @@
+"""FoundationStereo (``23-51-11``) on the rectified pair, with its authors' code; a raw pair is rectified first.
+
+Input images are RGB with values 0 to 255, padded to multiples of 32 by repeating borders; 32 iterations are run,
+as in ``scripts/run_demo.py``. A pixel has no prediction if its match would lie beyond the left border of the right
+image that the network receives, as in that script, or if its parallax is below one pixel.
+
+The cost volume ends at ``max_disp`` of ``cfg.yaml`` (416 px for ``23-51-11``), the range of its training. The demo
+has two options that extend the range: ``--hiera 1`` starts a pass at full size from the result of a pass at half
+the size, and ``--scale`` makes the images smaller. The choice follows from the largest expected disparity:
+
+- One pass at full size, where the volume holds the largest expected disparity.
+- Two passes (hierarchical) where it holds half of it. The second pass has the full resolution; at disparities
+  beyond the end of the volume it refines with the correlation of the two images' features alone.
+- Two passes on smaller images otherwise, as large as the volume of the first pass allows.
+
+The largest expected disparity comes from one of two sources:
+
+- by default half of the image width, the search range of ``sgbm``: at 1280 x 720 this is 640 px, more than the
+  volume holds, and the mode is hierarchical, which the authors recommend for images above 1000 px;
+- the distance of the nearest surface if the user declares one, from the sensor's range or the planned capture.
+
+Neither is ground truth. The camera distances of a config's protocol are not used, because the poses of scored
+views are ground truth; a distance that the user measured in scored depth, masks, meshes or poses would be as well.
+The paper does not state its mode.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float32, UInt8
+from numpy import ndarray
+
+from rebar_depth_bench.errors import MethodError, Problem
+from rebar_depth_bench.geometry.calibration_documents import parse_document
+from rebar_depth_bench.limits import TOML_BYTES
+from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
+from rebar_depth_bench.methods.paper.third_party import Network, image_tensor, on_sys_path, torch_device
+from rebar_depth_bench.methods.sgbm import (
+    SEARCH_SHARE_OF_WIDTH,
+    STEREO_COLUMNS,
+    StereoImages,
+    largest_disparity_px,
+    rectified_images,
+    stereo_depth_m,
+    without_invisible,
+)
+from rebar_depth_bench.reading import read_file
+from rebar_depth_bench.validation import short_repr
+
+NAME = "foundation-stereo"
+CODE_FILE, SETTINGS_FILE, CHECKPOINT_FILE = "core/foundation_stereo.py", "cfg.yaml", "model_best_bp2.pth"
+WEIGHTS_FOLDER = Path("pretrained_models", "23-51-11")
+INSTALL_HINT = (
+    "git clone https://github.com/NVlabs/FoundationStereo, put the folder 23-51-11 linked in its readme (Google "
+    f"Drive) into FoundationStereo/{WEIGHTS_FOLDER.parent}, install its requirements, and pass the clone as "
+    f"{NAME}:FoundationStereo"
+)
+DOWNLOADS = (
+    "its code downloads what is not cached: DINOv2's code (https://github.com/facebookresearch/dinov2, even if "
+    "HF_HUB_OFFLINE is set), which is then executed, and timm's edgenext_small (from the Hub)"
+)
+ITERATIONS = 32
+SMALL_RATIO = 0.5
+"""Size of the first of two passes, relative to the second."""
+NETWORK = Network(
+    MethodInfo(
+        name=NAME,
+        summary="FoundationStereo on the stereo pair, as in the paper",
+        columns=STEREO_COLUMNS,
+        uses_intrinsics=True,
+        source="github.com/NVlabs/FoundationStereo, 23-51-11",
+        licence="NVIDIA, research purposes only",
+        untested_note=(
+            "run only with its authors' code and random weights on a CPU, in a single pass: its weights were not "
+            "available"
+        ),
+    ),
+    install="pip install open3d trimesh pandas joblib imageio timm torchvision",
+)
+
+
+class Settings(dict[str, Any]):
+    """Dictionary with attribute access, which is all that the network requires of its settings."""
+
+    def __getattr__(self, name: str) -> Any:
+        try:
+            return self[name]
+        except KeyError:
+            raise AttributeError(f"{SETTINGS_FILE} has no {name}") from None
+
+
+def foundation_stereo_method(folder: Path | None, nearest_m: float | None = None) -> Method:
+    """Return FoundationStereo from a clone of its repository, or with other weights in a folder inside a clone.
+
+    ``nearest_m`` is the declared distance of the nearest surface, metres, which chooses the mode (see the module).
+    Raises ``MethodError`` if code, checkpoint or ``cfg.yaml`` is missing, and with install instructions if
+    ``folder`` is None, because the weights cannot be downloaded automatically.
+    """
+    if folder is None:
+        raise MethodError(
+            f"{NAME}: its weights are on Google Drive and cannot be downloaded automatically; to install it: "
+            f"{INSTALL_HINT}"
+        )
+    weights = folder if (folder / CHECKPOINT_FILE).is_file() else folder / WEIGHTS_FOLDER
+    start = folder.resolve()
+    clone = next((candidate for candidate in (start, *start.parents) if (candidate / CODE_FILE).is_file()), None)
+    if not folder.is_dir() or clone is None:
+        raise MethodError(
+            f"{NAME}:{folder}: no clone of FoundationStereo with {CODE_FILE}; to install it: {INSTALL_HINT}"
+        )
+    files = [weights / CHECKPOINT_FILE, weights / SETTINGS_FILE]
+    for file in files:
+        if not file.is_file():
+            raise MethodError(f"{NAME}:{folder}: no {file.name} in {weights}; to install it: {INSTALL_HINT}")
+    declared = "" if nearest_m is None else f", nearest distance {nearest_m} m"
+    info = replace(NETWORK.info, summary=f"{NETWORK.info.summary}{declared}")
+    info = replace(NETWORK, info=info).with_digest(weights.name, files)
+    return Method(info, partial(_load, clone, weights, nearest_m), partial(_notes, weights, nearest_m))
+
+
+def _load(clone: Path, weights: Path, nearest_m: float | None) -> Predictor:
+    """Return the predictor with the code of a clone and a folder of weights, on the GPU if torch finds one.
+
+    Raises ``MethodError`` if torch, OpenCV or a module that its code imports is missing, or if the weights are
+    incomplete.
+    """
+    torch = NETWORK.import_torch()
+    NETWORK.import_package("cv2", "pip install 'rebar-depth-bench[methods]'")
+    settings = _read_settings(weights)
+    print(f"{NAME}: {DOWNLOADS}", file=sys.stderr, flush=True)
+    with NETWORK.errors(f"{weights} cannot be loaded"), on_sys_path(clone):
+        code = importlib.import_module("core.foundation_stereo")
+        if not Path(str(code.__file__)).resolve().is_relative_to(clone.resolve()):
+            raise MethodError(f"{NAME}: core is already imported from {code.__file__}, expected it from {clone}")
+        model = code.FoundationStereo(settings)
+        model = NETWORK.load_checkpoint(model, weights / CHECKPOINT_FILE, "model")
+
+    def match(images: StereoImages) -> Float32[ndarray, "h w"]:
+        is_hierarchical, scale = choose_passes(largest_disparity_px(images, nearest_m), settings.max_disp)
+        pair = [
+            image_tensor(resized(rgb, scale)).to(torch_device()) for rgb in (images.left_rgb, images.right_rgb)
+        ]
+        padder = code.InputPadder(pair[0].shape, divis_by=32, force_square=False)
+        with torch.autocast("cuda", enabled=torch.cuda.is_available()):
+            if is_hierarchical:  # Spelled so by its authors.
+                disparity_px = model.run_hierachical(
+                    *padder.pad(*pair), iters=ITERATIONS, test_mode=True, small_ratio=SMALL_RATIO
+                )
+            else:
+                disparity_px = model.forward(*padder.pad(*pair), iters=ITERATIONS, test_mode=True)
+        cropped_px = padder.unpad(disparity_px.float()).cpu().numpy().reshape(pair[0].shape[-2:])
+        return full_size_disparity_px(without_invisible(cropped_px), images.left_rgb.shape[:2])
+
+    return NETWORK.predictor(partial(stereo_depth_m, match=match))
+
+
+def _read_settings(weights: Path) -> Settings:
+    """Return the network's settings. Raises ``MethodError`` if they or the end of its cost volume are invalid."""
+    path, problems = weights / SETTINGS_FILE, list[Problem]()
+    settings = Settings(
+        parse_document(path.name, read_file(path, TOML_BYTES, "a YAML file", MethodError), problems)
+    )
+    if problems:
+        raise MethodError.from_problems(path, problems)
+    settings.setdefault("vit_size", "vitl")
+    volume_px = settings.get("max_disp")
+    if type(volume_px) is not int or volume_px <= 0:
+        raise MethodError(
+            f"{path}: max_disp is {short_repr(volume_px)}, expected the end of the cost volume, whole pixels"
+        )
+    return settings
+
+
+def _notes(weights: Path, nearest_m: float | None, row: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the mode and scale for a row, with the numbers from which they are chosen."""
+    volume_px = _read_settings(weights).max_disp
+    largest_px = largest_disparity_px(rectified_images(row)[0], nearest_m)
+    is_hierarchical, scale = choose_passes(largest_px, volume_px)
+    declared = (
+        f"{SEARCH_SHARE_OF_WIDTH:g} of the width" if nearest_m is None else f"nearest distance {nearest_m} m"
+    )
+    return {
+        "mode": "hierarchical" if is_hierarchical else "single pass",
+        "scale": round(scale, 4),
+        "largest_disparity_px": round(largest_px, 1),
+        "largest_disparity_from": declared,
+        "cost_volume_px": volume_px,
+    }
+
+
+def choose_passes(largest_px: float, volume_px: int) -> tuple[bool, float]:
+    """Return whether there are two passes (hierarchical), and the largest scale of the images, at most 1.
+
+    A cost volume of ``volume_px`` then holds ``largest_px``, the largest expected disparity.
+    """
+    if largest_px <= volume_px:
+        return False, 1.0
+    return True, min(1.0, volume_px / (SMALL_RATIO * largest_px))
+
+
+def resized(rgb: UInt8[ndarray, "h w 3"], scale: float) -> UInt8[ndarray, "hs ws 3"]:
+    """Return an image resized by ``scale`` with OpenCV, bilinear as in the demo; sides are rounded down.
+
+    The demo rounds to the nearest whole side; rounding down never enlarges the disparity.
+    """
+    import cv2
+
+    height, width = (max(1, int(side * scale)) for side in rgb.shape[:2])
+    return np.asarray(cv2.resize(rgb, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
+
+
+def full_size_disparity_px(
+    disparity_px: Float32[ndarray, "hs ws"], grid: tuple[int, ...]
+) -> Float32[ndarray, "h w"]:
+    """Return a resized image's disparity on the original ``grid`` = (H, W), in pixels of that grid.
+
+    Each pixel takes the disparity of the resized pixel that contains its centre, because interpolation would place
+    surfaces between a bar and its background. The factor is that of the widths, which rounding moves away from
+    ``scale``.
+    """
+    rows, columns = (
+        ((np.arange(full) + 0.5) * small / full).astype(np.int64)
+        for full, small in zip(grid, disparity_px.shape, strict=True)
+    )
+    factor = np.float32(grid[1] / disparity_px.shape[1])
+    return np.asarray(disparity_px[rows[:, None], columns] * factor, np.float32)
+
+
+FOUNDATION_STEREO = NETWORK.listed(
+    foundation_stereo_method,
+    "hierarchical, and on smaller images, where half of the width or --nearest-distance gives disparities beyond "
+    f"its cost volume; a clone and weights of yours: {NAME}:FOLDER",
+)
+"""FoundationStereo as in the paper, without a folder; loading raises an error with install instructions."""

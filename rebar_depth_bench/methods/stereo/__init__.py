@@ -1,1 +1,0 @@
-"""Stereo methods: disparity on a rectified pair, converted to depth."""
