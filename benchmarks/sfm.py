@@ -18,10 +18,14 @@ import pycolmap
 from benchmarks.timing import machine_description, print_markdown
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.methods import ConfigViews
-from rebar_depth_bench.methods.multiview.images import write_left_images
-from rebar_depth_bench.methods.multiview.metric_scale import fit_board
+from rebar_depth_bench.methods.multiview.metric_scale import (
+    aligned_report,
+    board_frame_report,
+    fit_board,
+    similarity_to_world,
+)
 from rebar_depth_bench.methods.multiview.pipeline import reconstruct_images
-from rebar_depth_bench.methods.multiview.pose_errors import aligned_report, board_frame_report, similarity_to_world
+from rebar_depth_bench.methods.multiview.sfm import write_left_images
 
 
 def main(root: str, config: str = "lattice-orbit") -> None:

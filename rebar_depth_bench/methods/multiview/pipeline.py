@@ -14,9 +14,15 @@ from numpy import ndarray
 from rebar_depth_bench.data.views import Views
 from rebar_depth_bench.methods.base import Prepared
 from rebar_depth_bench.methods.multiview.dense import DENSE_METHODS
-from rebar_depth_bench.methods.multiview.images import LeftImages, row_columns, select_pairs, write_left_images
 from rebar_depth_bench.methods.multiview.metric_scale import SCALE_SOURCES
-from rebar_depth_bench.methods.multiview.sfm import SparseReconstruction, reconstruct_sparse
+from rebar_depth_bench.methods.multiview.sfm import (
+    LeftImages,
+    SparseReconstruction,
+    reconstruct_sparse,
+    row_columns,
+    select_pairs,
+    write_left_images,
+)
 from rebar_depth_bench.parallel import Progress, silent
 
 

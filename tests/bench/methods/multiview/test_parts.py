@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.cameras import ideal_K, pixel_rays
 from rebar_depth_bench.geometry.undistortion import pinhole_grid, pinhole_image
-from rebar_depth_bench.methods.multiview.patch_match import read_depth_map
+from rebar_depth_bench.methods.multiview.dense import read_depth_map
 from rebar_depth_bench.methods.multiview.sfm import reconstruct_sparse
 
 ZED_DISTORTION = np.array([-0.175286, 0.0283094, 6.68e-5, -1.50e-4, 0.0])

@@ -15,8 +15,13 @@ from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
 from rebar_depth_bench.geometry.aruco_detection import Corners
 from rebar_depth_bench.geometry.cameras import ideal_K, look_at, project, rigid, transform
-from rebar_depth_bench.methods.multiview.metric_scale import fit_board, triangulate
-from rebar_depth_bench.methods.multiview.pose_errors import Similarity, aligned_report, board_frame_report
+from rebar_depth_bench.methods.multiview.metric_scale import (
+    Similarity,
+    aligned_report,
+    board_frame_report,
+    fit_board,
+    triangulate,
+)
 
 K = ideal_K(1280, 720)
 BOARD = BoardSpec()

@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from rebar_depth_bench.methods.multiview.pose_errors import fit_similarity, rotation_angle_deg
+from rebar_depth_bench.methods.multiview.metric_scale import fit_similarity
+from rebar_depth_bench.methods.multiview.sfm import rotation_angle_deg
 
 ANGLE = st.floats(-3.0, 3.0)
 ROTATION_VECTOR = st.tuples(ANGLE, ANGLE, ANGLE)
