@@ -15,7 +15,7 @@ Source: J. L. Schoenberger, J.-M. Frahm, "Structure-from-Motion Revisited", CVPR
 from __future__ import annotations
 
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -23,7 +23,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pycolmap
-from jaxtyping import Float64, Int64
+from jaxtyping import Float32, Float64, Int64
 from numpy import ndarray
 
 from rebar_depth_bench.atomic_io import write_bytes
@@ -64,6 +64,11 @@ class LeftImages:
     markers: Mapping[str, Corners]
     cam_from_world: Mapping[str, Float64[ndarray, "4 4"]]
 
+    @property
+    def no_depth(self) -> Float32[ndarray, "h w"]:
+        """Depth map without values on the pinhole grid."""
+        return np.full((self.grid.height, self.grid.width), np.nan, np.float32)
+
 
 def write_left_images(views: Views, folder: Path) -> LeftImages:
     """Write all left images, undistorted if the lens has distortion, and detect the markers of the board.
@@ -73,14 +78,12 @@ def write_left_images(views: Views, folder: Path) -> LeftImages:
     """
     folder.mkdir(exist_ok=True)
     height, width = views.grid
-    grid: PinholeGrid | None = None
-    camera: tuple[ndarray, ndarray] | None = None
+    first, grid = None, None
     names, markers, poses = {}, {}, {}
     for row in views.rows(*row_columns(views)):
-        row_camera = (row["left_K"], row["left_distortion"])
-        if grid is None or camera is None:
-            camera, grid = row_camera, pinhole_grid(row, width, height)
-        if not all(np.array_equal(a, b) for a, b in zip(camera, row_camera, strict=True)):
+        if first is None or grid is None:
+            first, grid = row, pinhole_grid(row, width, height)
+        if any(not np.array_equal(row[column], first[column]) for column in ("left_K", "left_distortion")):
             raise MethodError(
                 f"{row['view_id']}: K or distortion differs from the previous view, expected one camera"
             )
@@ -124,6 +127,8 @@ SIFT_PEAK_THRESHOLD = 0.003
 """SIFT contrast threshold; COLMAP's default of 0.0067 finds half as many points on smooth steel and paper."""
 MIN_REGISTERED_VIEWS = 3
 """Smallest number of registered views of a valid reconstruction."""
+CAMERA_MODEL = "PINHOLE"
+"""COLMAP's name of a camera without distortion."""
 COLMAP_PIXEL_CENTRE = 0.5
 """Offset of pixel centres: in COLMAP the centre of the first pixel is (0.5, 0.5)."""
 
@@ -143,43 +148,30 @@ class SparseReconstruction:
         return np.asarray(self.points[self.visible_points[name]] @ pose[2, :3] + pose[2, 3])
 
 
-def reconstruct_sparse(
-    images: Path,
-    names: Sequence[str],
-    K: Float64[ndarray, "3 3"],
-    work: Path,
-    *,
-    pairs: Sequence[tuple[str, str]] | None = None,
-    progress: Progress = silent,
+def reconstruct(
+    left_images: LeftImages, board: BoardSpec | None, work: Path, progress: Progress = silent
 ) -> SparseReconstruction:
-    """Return the largest reconstruction from images of one pinhole camera.
+    """Return the largest reconstruction from the images; markers of the board, if any, select the pairs to match.
 
-    ``K`` is in pixels with pixel centres at integers. ``pairs`` are the names of the images to match (default: all
-    pairs). The result is stored in ``work`` and read from there the next time.
+    The result is stored in ``work`` and read from there the next time.
 
     Raises ``MethodError`` if no two images can be matched or fewer than three are registered.
     """
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
     model = work / "model"
     if not model.is_dir():
-        _run_colmap(images, names, K, work, pairs, progress)
+        _run_colmap(left_images, board, work, progress)
     reconstruction = _from_pycolmap(pycolmap.Reconstruction(model))
     if len(reconstruction.cam_from_sfm) < MIN_REGISTERED_VIEWS:
         raise MethodError(
-            f"COLMAP registered {len(reconstruction.cam_from_sfm)} of {len(names)} images, expected at least "
-            f"{MIN_REGISTERED_VIEWS}"
+            f"COLMAP registered {len(reconstruction.cam_from_sfm)} of {len(left_images.names)} images, "
+            f"expected at least {MIN_REGISTERED_VIEWS}"
         )
     return reconstruction
 
 
-def _run_colmap(
-    images: Path,
-    names: Sequence[str],
-    K: Float64[ndarray, "3 3"],
-    work: Path,
-    pairs: Sequence[tuple[str, str]] | None,
-    progress: Progress,
-) -> None:
+def _run_colmap(left_images: LeftImages, board: BoardSpec | None, work: Path, progress: Progress) -> None:
+    images, names, K = left_images.folder, list(left_images.names.values()), left_images.grid.K
     database, models_folder = work / "database.db", work / "mapped"
     database.unlink(missing_ok=True)
     shutil.rmtree(models_folder, ignore_errors=True)
@@ -189,14 +181,25 @@ def _run_colmap(
     pycolmap.extract_features(
         database,
         images,
-        image_names=list(names),
+        image_names=names,
         camera_mode=pycolmap.CameraMode.SINGLE,
         reader_options=_reader_options(K),
         extraction_options=_extraction_options(),
         device=pycolmap.Device.cpu,
     )
     progress(stages, 1, 3)
-    _match(database, pairs, work)
+    verification = pycolmap.TwoViewGeometryOptions()
+    verification.ransac.random_seed = SEED
+    if board is None:
+        pycolmap.match_exhaustive(database, verification_options=verification, device=pycolmap.Device.cpu)
+    else:
+        pairs = select_pairs(left_images.markers, board, K)
+        pairing = pycolmap.ImportedPairingOptions()
+        pairing.match_list_path = work / "pairs.txt"
+        pairing.match_list_path.write_text("".join(f"{name} {other}\n" for name, other in pairs))
+        pycolmap.match_image_pairs(
+            database, pairing_options=pairing, verification_options=verification, device=pycolmap.Device.cpu
+        )
     progress(stages, 2, 3)
     models = pycolmap.incremental_mapping(database, images, models_folder, options=_mapping_options())
     progress(stages, 3, 3)
@@ -209,11 +212,16 @@ def _run_colmap(
     partial_model.rename(work / "model")
 
 
+def camera_parameters(K: Float64[ndarray, "3 3"]) -> list[float]:
+    """Return fx, fy and the principal point, pixels, of ``CAMERA_MODEL``."""
+    centre = K[:2, 2] + COLMAP_PIXEL_CENTRE
+    return [float(K[0, 0]), float(K[1, 1]), *centre.tolist()]
+
+
 def _reader_options(K: Float64[ndarray, "3 3"]) -> pycolmap.ImageReaderOptions:
     reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = "PINHOLE"
-    centre = (K[0, 2] + COLMAP_PIXEL_CENTRE, K[1, 2] + COLMAP_PIXEL_CENTRE)
-    reader.camera_params = ", ".join(repr(float(value)) for value in (K[0, 0], K[1, 1], *centre))
+    reader.camera_model = CAMERA_MODEL
+    reader.camera_params = ", ".join(map(repr, camera_parameters(K)))
     return reader
 
 
@@ -224,20 +232,6 @@ def _extraction_options() -> pycolmap.FeatureExtractionOptions:
     options.sift.domain_size_pooling = True
     options.sift.peak_threshold = SIFT_PEAK_THRESHOLD
     return options
-
-
-def _match(database: Path, pairs: Sequence[tuple[str, str]] | None, work: Path) -> None:
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = SEED
-    if pairs is None:
-        pycolmap.match_exhaustive(database, verification_options=verification, device=pycolmap.Device.cpu)
-        return
-    pairing = pycolmap.ImportedPairingOptions()
-    pairing.match_list_path = work / "pairs.txt"
-    (work / "pairs.txt").write_text("".join(f"{name} {other}\n" for name, other in pairs))
-    pycolmap.match_image_pairs(
-        database, pairing_options=pairing, verification_options=verification, device=pycolmap.Device.cpu
-    )
 
 
 def _mapping_options() -> pycolmap.IncrementalPipelineOptions:
