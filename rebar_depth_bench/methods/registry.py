@@ -25,7 +25,6 @@ from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.base import AnyMethod, Method, MultiViewMethod
 from rebar_depth_bench.methods.controls import BOARD_PLANE, CONSTANT, NOISY_TRUTH, TRUTH
-from rebar_depth_bench.methods.huggingface.model import DEPTH_PRO, HF_PREFIX, depth_pro_method, hf_method
 from rebar_depth_bench.methods.monocular.hub import folder_method, hub_method
 from rebar_depth_bench.methods.monocular.hub_networks import (
     DEPTH_ANYTHING_3,
@@ -39,6 +38,7 @@ from rebar_depth_bench.methods.onnx.model import onnx_method
 from rebar_depth_bench.methods.onnx.session import VIEW_TIMEOUT_S
 from rebar_depth_bench.methods.stereo.foundation_stereo import FOUNDATION_STEREO, foundation_stereo_method
 from rebar_depth_bench.methods.stereo.sgbm import SGBM, SGBM_FILLED
+from rebar_depth_bench.methods.transformers.model import DEPTH_PRO, HF_PREFIX, depth_pro_method, hf_method
 
 ENTRY_POINT_GROUP = "rebar_depth_bench.methods"
 DISTRIBUTION = "rebar-depth-bench"

@@ -22,7 +22,6 @@ from numpy import ndarray
 from rebar_depth_bench.data.files import files_digest
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
-from rebar_depth_bench.methods.huggingface.families import resized
 from rebar_depth_bench.methods.monocular.conversions import (
     Letterbox,
     crop_margins,
@@ -41,6 +40,7 @@ from rebar_depth_bench.methods.monocular.third_party import (
     translate_errors,
     with_weights_digest,
 )
+from rebar_depth_bench.methods.transformers.families import resized
 
 NAME, HUB_ENTRY_POINT = "metric3d", "metric3d_vit_small"
 REPOSITORY, CACHE_FOLDER = "yvanyin/metric3d:main", "yvanyin_metric3d_main"

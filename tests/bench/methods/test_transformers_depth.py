@@ -20,14 +20,14 @@ from rebar_depth_bench import score
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods import METHODS, find_method
-from rebar_depth_bench.methods.huggingface.families import (
+from rebar_depth_bench.methods.transformers.families import (
     FAMILIES,
     PROCESSING_FACTORIES,
     OutputKind,
     canonical_to_depth_m,
     network_output_to_depth_m,
 )
-from rebar_depth_bench.methods.huggingface.model import hf_method
+from rebar_depth_bench.methods.transformers.model import hf_method
 from tests.bench.methods.predictors import load_predictor
 from tests.bench.methods.tiny_depth_models import LAST_LAYER, MODELS, save_checkpoint
 

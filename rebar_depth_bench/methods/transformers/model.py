@@ -18,13 +18,13 @@ from numpy import ndarray
 
 from rebar_depth_bench.errors import MethodError, exception_summary
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
-from rebar_depth_bench.methods.huggingface.checkpoints import (
+from rebar_depth_bench.methods.transformers.checkpoints import (
     Checkpoint,
     ensure_weights,
     find_checkpoint,
     read_preprocessor_config,
 )
-from rebar_depth_bench.methods.huggingface.families import OutputKind, family_of, network_output_to_depth_m
+from rebar_depth_bench.methods.transformers.families import OutputKind, family_of, network_output_to_depth_m
 
 HF_PREFIX = "hf:"
 DEPTH_PRO_CHECKPOINT = "apple/DepthPro-hf"
@@ -62,7 +62,7 @@ def load_predictor(checkpoint: Checkpoint) -> Predictor:
     family = family_of(checkpoint.config, str(checkpoint.folder / "config.json"))
     torch, transformers = _import_packages()
     ensure_weights(checkpoint)
-    from rebar_depth_bench.methods.huggingface.families import PROCESSING_FACTORIES
+    from rebar_depth_bench.methods.transformers.families import PROCESSING_FACTORIES
 
     model_type = checkpoint.config["model_type"]
     settings = read_preprocessor_config(checkpoint)
