@@ -27,7 +27,7 @@ from rebar_depth_bench.methods.base import MethodInfo, Predictor
 from rebar_depth_bench.methods.monocular.conversions import da3_depth_m, da3_focal_px, positive_or_nan
 from rebar_depth_bench.methods.monocular.hub import CONFIG, HubModel, lazy_hub_method, load_network
 from rebar_depth_bench.methods.monocular.third_party import read_json_object, shape_error, translate_errors
-from rebar_depth_bench.methods.transformers.families import resized
+from rebar_depth_bench.methods.transformers.model import resized
 from rebar_depth_bench.validation import short_repr
 
 UNIDEPTH_NAME, UNIDEPTH_REPOSITORY = "unidepth", "lpiccinelli/unidepth-v2-vitl14"

@@ -40,7 +40,7 @@ from rebar_depth_bench.methods.monocular.third_party import (
     translate_errors,
     with_weights_digest,
 )
-from rebar_depth_bench.methods.transformers.families import resized
+from rebar_depth_bench.methods.transformers.model import resized
 
 NAME, HUB_ENTRY_POINT = "metric3d", "metric3d_vit_small"
 REPOSITORY, CACHE_FOLDER = "yvanyin/metric3d:main", "yvanyin_metric3d_main"
