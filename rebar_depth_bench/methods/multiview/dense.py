@@ -19,7 +19,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pycolmap
-from jaxtyping import Bool, Float32, Float64, UInt8
+from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
 
 from rebar_depth_bench.atomic_io import write_bytes
@@ -217,15 +217,10 @@ def _sweep_view(
     if not neighbours or not len(reconstruction.visible_points[name]):
         return left_images.no_depth
     view, *others = (
-        PosedImage(_read_grey(left_images.folder / image), reconstruction.cam_from_sfm[image])
+        PosedImage(
+            np.asarray(cv2.imread(str(left_images.folder / image), cv2.IMREAD_GRAYSCALE)),
+            reconstruction.cam_from_sfm[image],
+        )
         for image in (name, *neighbours)
     )
     return sweep_depth(view, others, left_images.grid.K, depth_range(reconstruction, name))
-
-
-def _read_grey(path: Path) -> UInt8[ndarray, "h w"]:
-    """Read an image as 8-bit grey. Raises ``MethodError`` if it cannot be read."""
-    grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if grey is None:
-        raise MethodError(f"{path}: cannot be read")
-    return np.asarray(grey)

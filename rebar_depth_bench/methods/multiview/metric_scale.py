@@ -13,6 +13,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float64
 from numpy import ndarray
+from scipy.spatial.transform import Rotation
 
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
@@ -23,7 +24,6 @@ from rebar_depth_bench.methods.multiview.sfm import (
     COLMAP_PIXEL_CENTRE,
     SEED,
     camera_parameters,
-    rotation_angle_deg,
 )
 
 MIN_VIEWS = 3
@@ -155,8 +155,8 @@ def camera_errors(
     best = fit_similarity(centres, true_centres_m)
     world_from_sfm = best if metric is None else metric
     centre_errors_m = np.linalg.norm(world_from_sfm.apply(centres) - true_centres_m, axis=1)
-    rotation_errors_deg = [
-        rotation_angle_deg(cam_from_world[name][:3, :3] @ world_from_sfm.rotation @ pose[:3, :3].T)
+    turns = [
+        cam_from_world[name][:3, :3] @ world_from_sfm.rotation @ pose[:3, :3].T
         for name, pose in cam_from_sfm.items()
     ]
     return {
@@ -164,7 +164,7 @@ def camera_errors(
         "scale_error_percent": round(100 * (scale_m / best.scale - 1), 4),
         "cameras_compared": "after the best similarity" if metric is None else "in the board's frame",
         "centre_error_mm": _median_and_largest(1000 * centre_errors_m),
-        "rotation_error_deg": _median_and_largest(np.array(rotation_errors_deg)),
+        "rotation_error_deg": _median_and_largest(np.degrees(Rotation.from_matrix(turns).magnitude())),
     }
 
 

@@ -25,6 +25,7 @@ import numpy as np
 import pycolmap
 from jaxtyping import Float32, Float64, Int64
 from numpy import ndarray
+from scipy.spatial.transform import Rotation
 
 from rebar_depth_bench.atomic_io import write_bytes
 from rebar_depth_bench.data.views import Views
@@ -34,14 +35,6 @@ from rebar_depth_bench.geometry.aruco_detection import Corners, board_pose, dete
 from rebar_depth_bench.geometry.cameras import rigid
 from rebar_depth_bench.geometry.undistortion import PinholeGrid, pinhole_grid, pinhole_image
 from rebar_depth_bench.parallel import Progress, silent
-
-
-def rotation_angle_deg(rotation: Float64[ndarray, "3 3"]) -> float:
-    """Return the angle of a rotation, degrees."""
-    skew = np.array(
-        [rotation[2, 1] - rotation[1, 2], rotation[0, 2] - rotation[2, 0], rotation[1, 0] - rotation[0, 1]]
-    )
-    return float(np.degrees(np.arctan2(np.linalg.norm(skew), np.trace(rotation) - 1)))
 
 
 def row_columns(views: Views) -> tuple[str, ...]:
@@ -113,12 +106,11 @@ def select_pairs(
     pairs = []
     for name, other in combinations(sorted(markers), 2):
         pose, other_pose = poses[name], poses[other]
-        if (
-            pose is None
-            or other_pose is None
-            or rotation_angle_deg(other_pose[:3, :3] @ pose[:3, :3].T) <= MAX_PAIR_ROTATION_DEG
-        ):
-            pairs.append((name, other))
+        if pose is not None and other_pose is not None:
+            turn = Rotation.from_matrix(other_pose[:3, :3] @ pose[:3, :3].T)
+            if np.degrees(turn.magnitude()) > MAX_PAIR_ROTATION_DEG:
+                continue
+        pairs.append((name, other))
     return pairs
 
 
