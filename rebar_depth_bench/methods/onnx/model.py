@@ -113,7 +113,7 @@ def _sample_axis(
     first, last = _unpadded_cells(span, cells)
     centres = _centres_on_grid(span, cells)
     if not bilinear:
-        return values.take(np.clip(np.floor(centres).astype(np.int64), first, last), axis)
+        return np.asarray(values.take(np.clip(np.floor(centres).astype(np.int64), first, last), axis))
     position = np.clip(centres - 0.5, first, last)
     before = np.floor(position).astype(np.int64)
     weight = position - before

@@ -57,7 +57,7 @@ class OnnxSession:
         import onnxruntime
 
         [image_input] = self.session.get_inputs()
-        inputs = {image_input.name: tensor.astype(_FLOAT_DTYPES[image_input.type])}
+        inputs: dict[str, ndarray] = {image_input.name: tensor.astype(_FLOAT_DTYPES[image_input.type])}
         options = onnxruntime.RunOptions()
         options.log_severity_level = _LOG_NOTHING
         try:
