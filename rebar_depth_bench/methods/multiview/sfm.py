@@ -170,12 +170,19 @@ def _run_colmap(left_images: LeftImages, board: BoardSpec | None, work: Path, pr
     models_folder.mkdir()
     stages = "COLMAP: features, matches, mapping"
     progress(stages, 0, 3)
-    pycolmap.extract_features(
+    # Extraction numbers the images in the order in which its threads finish, and results depend on the numbers.
+    pycolmap.Database.open(database).close()
+    pycolmap.import_images(
         database,
         images,
         image_names=names,
         camera_mode=pycolmap.CameraMode.SINGLE,
-        reader_options=_reader_options(K),
+        options=_reader_options(K),
+    )
+    pycolmap.extract_features(
+        database,
+        images,
+        image_names=names,
         extraction_options=_extraction_options(),
         device=pycolmap.Device.cpu,
     )
