@@ -18,10 +18,11 @@ import pycolmap
 from benchmarks.timing import machine_description, print_markdown
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.methods import ConfigViews
-from rebar_depth_bench.methods.multiview.images import write_left_images
-from rebar_depth_bench.methods.multiview.metric_scale import fit_board
-from rebar_depth_bench.methods.multiview.pipeline import reconstruct_images
-from rebar_depth_bench.methods.multiview.pose_errors import aligned_report, board_frame_report, similarity_to_world
+from rebar_depth_bench.methods.multiview.metric_scale import (
+    camera_errors,
+    fit_board,
+)
+from rebar_depth_bench.methods.multiview.sfm import reconstruct, write_left_images
 
 
 def main(root: str, config: str = "lattice-orbit") -> None:
@@ -30,7 +31,7 @@ def main(root: str, config: str = "lattice-orbit") -> None:
     with tempfile.TemporaryDirectory() as scratch:
         pictures = write_left_images(views, Path(scratch) / "images")
         start = time.perf_counter()
-        structure = reconstruct_images(views, pictures, Path(scratch))
+        structure = reconstruct(pictures, views.board, Path(scratch))
         seconds = time.perf_counter() - start
     rows = [
         ("registered", f"{len(structure.cam_from_sfm)} of {len(pictures.names)}"),
@@ -38,12 +39,11 @@ def main(root: str, config: str = "lattice-orbit") -> None:
         ("mean reprojection error", f"{structure.reprojection_px:.3f} px"),
         ("features, matches, mapping", f"{seconds:.1f} s"),
     ]
-    similarity = similarity_to_world(structure.cam_from_sfm, pictures.cam_from_world)
-    report = aligned_report(structure.cam_from_sfm, pictures.cam_from_world, similarity.scale)
+    report = camera_errors(structure.cam_from_sfm, pictures.cam_from_world, scale_m=1.0)
     rows += _error_rows(report, "after the best similarity")
     if views.board is not None:
         fit = fit_board(pictures.markers, structure.cam_from_sfm, pictures.grid.K, views.board)
-        report = board_frame_report(structure.cam_from_sfm, pictures.cam_from_world, fit.metric)
+        report = camera_errors(structure.cam_from_sfm, pictures.cam_from_world, fit.metric.scale, fit.metric)
         rows += [
             ("markers", f"{len(fit.markers)} of {views.board.markers}, {1000 * fit.rms_m:.3f} mm rms"),
             ("scale from the board", f"{report['scale_error_percent']:+.4f} % off"),

@@ -12,7 +12,6 @@ from rebar_depth_bench.captures.folder import is_capture, open_capture
 from rebar_depth_bench.console import (
     InputFile,
     OutputArchive,
-    ProgressBars,
     add_data,
     add_expect_digest,
     add_output_file,

@@ -86,7 +86,7 @@ def find_method(name: str, *, view_timeout_s: float = VIEW_TIMEOUT_S, nearest_m:
 
         return foundation_stereo_method(Path(folder).expanduser(), nearest_m)
     if name.startswith(_HF_PREFIX):
-        from rebar_depth_bench.methods.huggingface.model import hf_method
+        from rebar_depth_bench.methods.transformers.model import hf_method
 
         return hf_method(name.removeprefix(_HF_PREFIX))
     if folder and method_name in FROM_FOLDER:
@@ -117,7 +117,7 @@ def _with_weights(name: str, folder: Path | None) -> AnyMethod:
     """Return a built-in method, with the weights in a folder, or None: in a cache, if it needs any."""
     method = METHODS[name]
     if name == "depth-pro":
-        from rebar_depth_bench.methods.huggingface.model import depth_pro_method
+        from rebar_depth_bench.methods.transformers.model import depth_pro_method
 
         return depth_pro_method()
     return method.with_weights(folder) if isinstance(method, WeightsMethod) else method

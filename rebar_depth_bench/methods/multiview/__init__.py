@@ -15,16 +15,6 @@ from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.base import MethodInfo, MultiViewMethod, Prepared
 from rebar_depth_bench.parallel import Progress
 
-_DENSE_SUMMARIES = {
-    "colmap": "dense depth by COLMAP's PatchMatch, which needs CUDA",
-    "sweep": "dense depth by a plane sweep on the CPU, which is not COLMAP's",
-}
-_SCALE_SUMMARIES = {
-    "aruco": "metres from the ArUco board",
-    "anchored": "median-anchored to ground truth, no metric result",
-}
-_UNTESTED_NOTES = {"colmap": "PatchMatch is not tested: no CUDA GPU was available", "sweep": ""}
-
 
 def _import_pipeline() -> ModuleType:
     """Return the ``pipeline`` module. Raises ``MethodError`` if pycolmap or OpenCV is not installed."""
@@ -37,24 +27,40 @@ def _import_pipeline() -> ModuleType:
     return pipeline
 
 
-def _method(dense: str, scale_source: str) -> MultiViewMethod:
+def _method(name: str, *, uses_patch_match: bool, is_anchored: bool) -> MultiViewMethod:
+    choices = {"uses_patch_match": uses_patch_match, "is_anchored": is_anchored}
+
+    def check(views: Views) -> None:
+        _import_pipeline().check(views, name, **choices)
+
     def prepare(views: Views, work: Path, progress: Progress) -> Prepared:
-        prepared: Prepared = _import_pipeline().prepare(views, work, progress, dense, scale_source)
+        prepared: Prepared = _import_pipeline().prepare(views, work, progress, **choices)
         return prepared
 
+    if uses_patch_match:
+        dense, source, licence = "COLMAP's PatchMatch, which needs CUDA", "pycolmap", "BSD-3-Clause"
+        untested_note = "PatchMatch is not tested: no CUDA GPU was available"
+    else:
+        dense, source = (
+            "a plane sweep on the CPU, which is not COLMAP's",
+            "pycolmap, and this project's plane sweep",
+        )
+        licence, untested_note = "BSD-3-Clause, Apache-2.0", ""
+    scale = "median-anchored to ground truth, no metric result" if is_anchored else "metres from the ArUco board"
     info = MethodInfo(
-        name=f"{dense}-{scale_source}",
-        summary=f"COLMAP's cameras from the left views, K known; {_DENSE_SUMMARIES[dense]}; "
-        f"{_SCALE_SUMMARIES[scale_source]}",
+        name=name,
+        summary=f"COLMAP's cameras from the left views, K known; dense depth by {dense}; {scale}",
         columns=(),
         uses_intrinsics=True,
-        source="pycolmap" if dense == "colmap" else "pycolmap, and this project's plane sweep",
-        licence="BSD-3-Clause" if dense == "colmap" else "BSD-3-Clause, Apache-2.0",
-        uses_ground_truth=scale_source == "anchored",
-        untested_note=_UNTESTED_NOTES[dense],
+        source=source,
+        licence=licence,
+        uses_ground_truth=is_anchored,
+        untested_note=untested_note,
     )
-    return MultiViewMethod(info, prepare, lambda views: _import_pipeline().check(views, dense, scale_source))
+    return MultiViewMethod(info, prepare, check)
 
 
-COLMAP_ARUCO, COLMAP_ANCHORED = _method("colmap", "aruco"), _method("colmap", "anchored")
-SWEEP_ARUCO, SWEEP_ANCHORED = _method("sweep", "aruco"), _method("sweep", "anchored")
+COLMAP_ARUCO = _method("colmap-aruco", uses_patch_match=True, is_anchored=False)
+COLMAP_ANCHORED = _method("colmap-anchored", uses_patch_match=True, is_anchored=True)
+SWEEP_ARUCO = _method("sweep-aruco", uses_patch_match=False, is_anchored=False)
+SWEEP_ANCHORED = _method("sweep-anchored", uses_patch_match=False, is_anchored=True)

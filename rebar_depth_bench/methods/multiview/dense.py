@@ -3,28 +3,63 @@
 Each method returns a reader: a function from an image name to its depth on the pinhole grid, in the unit of the
 reconstruction. For the plane sweep, neighbouring views and depth ranges are selected from the sparse points, and
 only depth that is consistent with the depth of neighbouring views is kept.
+
+PatchMatch needs CUDA (``pycolmap-cuda12`` instead of ``pycolmap``). It has never been run here because no CUDA
+device was available; only the reader of depth maps is tested. Source: J. L. Schoenberger et al., "Pixelwise View
+Selection for Unstructured Multi-View Stereo", ECCV 2016.
 """
 
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 
 import cv2
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, UInt8
+import pycolmap
+from jaxtyping import Bool, Float32, Float64
 from numpy import ndarray
 
 from rebar_depth_bench.atomic_io import write_bytes
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.cameras import camera_centre, inverse_rigid, pixel_rays, project, transform
-from rebar_depth_bench.methods.multiview.images import LeftImages
-from rebar_depth_bench.methods.multiview.patch_match import patch_match, read_depth_map, require_cuda
-from rebar_depth_bench.methods.multiview.plane_sweep import PlaneSweepSpec, PosedImage, sweep_depth
-from rebar_depth_bench.methods.multiview.sfm import SparseReconstruction
+from rebar_depth_bench.methods.multiview.plane_sweep import PosedImage, sweep_depth
+from rebar_depth_bench.methods.multiview.sfm import LeftImages, SparseReconstruction
 from rebar_depth_bench.parallel import Progress, map_with_progress
+
+_HEADER = re.compile(rb"(\d{1,6})&(\d{1,6})&(\d)&")
+_HEADER_BYTES = 24
+
+
+def require_cuda() -> None:
+    """Raise ``MethodError`` if COLMAP was built without CUDA."""
+    if not pycolmap.has_cuda:
+        raise MethodError(
+            "COLMAP's PatchMatch stereo needs CUDA, but this pycolmap was built without it: on a machine with an "
+            "NVIDIA GPU, pip install pycolmap-cuda12 instead; on a CPU use sweep-aruco or sweep-anchored"
+        )
+
+
+def read_depth_map(path: Path) -> Float32[ndarray, "h w"]:
+    """Return the depth map in a ``.bin`` file of COLMAP, in the unit of the reconstruction.
+
+    Pixels without depth are NaN. The format is the text ``WIDTH&HEIGHT&CHANNELS&`` followed by little-endian
+    float32 values, row by row, plane by plane. Raises ``MethodError`` for any other file.
+    """
+    data = path.read_bytes()
+    header = _HEADER.match(data[:_HEADER_BYTES])
+    width, height, channels = (int(number) for number in header.groups()) if header else (0, 0, 0)
+    body = data[header.end() :] if header else b""
+    if channels != 1 or len(body) != 4 * width * height:
+        raise MethodError(
+            f"{path}: is not a COLMAP depth map: {len(data)} bytes that start with {data[:_HEADER_BYTES]!r}, "
+            "expected WIDTH&HEIGHT&1& and WIDTH x HEIGHT float32 values"
+        )
+    depth = np.frombuffer(body, "<f4").reshape(height, width)
+    return np.where(depth > 0, depth, np.float32(np.nan))
+
 
 MAX_RELATIVE_DIFFERENCE = 0.01
 """Two views are consistent at a point if their depths differ by at most this fraction."""
@@ -114,8 +149,6 @@ def _pair_score(
     return float(np.exp(-(((angle_deg - BEST_ANGLE_DEG) / sigma_deg) ** 2) / 2).sum())
 
 
-SWEEP_SPEC = PlaneSweepSpec()
-"""Parameters of the plane sweep."""
 MIN_CONFIRMATIONS = 1
 """Number of neighbours (of four) that must confirm a pixel of the sweep."""
 
@@ -123,31 +156,37 @@ DepthReader = Callable[[str], Float32[ndarray, "h w"]]
 """Function from an image name to planar depth on the pinhole grid, in the reconstruction's unit; NaN: none."""
 
 
-@dataclass(frozen=True)
-class DenseMethod:
-    """Dense depth method: ``check`` raises ``MethodError`` if it cannot run, ``run`` returns the reader."""
-
-    check: Callable[[], None]
-    run: Callable[[LeftImages, SparseReconstruction, Path, Progress], DepthReader]
-
-
-def _patch_match(
+def patch_match_depth(
     left_images: LeftImages, reconstruction: SparseReconstruction, work: Path, progress: Progress
 ) -> DepthReader:
+    """Run PatchMatch with geometric consistency and return the reader of its depth maps.
+
+    An interrupted run is resumed: COLMAP skips views whose depth maps exist, even if they are damaged, so damaged
+    maps are removed first.
+    """
     progress("COLMAP: PatchMatch stereo", 0, len(reconstruction.cam_from_sfm))
-    maps = patch_match(left_images.folder, work / "model", work)
-    no_depth = np.full((left_images.grid.height, left_images.grid.width), np.nan, np.float32)
+    dense = work / "dense"
+    maps = dense / "stereo" / "depth_maps"
+    for path in maps.glob("*.bin"):
+        try:
+            read_depth_map(path)
+        except MethodError:
+            path.unlink()
+    if not (dense / "stereo" / "fusion.cfg").is_file():
+        pycolmap.undistort_images(dense, work / "model", left_images.folder)
+    pycolmap.patch_match_stereo(dense)
 
     def read(name: str) -> Float32[ndarray, "h w"]:
-        path = maps / f"{name}.geometric.bin"
-        return read_depth_map(path) if path.is_file() else no_depth  # Views without neighbours have no depth map.
+        path = maps / f"{name}.geometric.bin"  # Views without neighbours have no depth map.
+        return read_depth_map(path) if path.is_file() else left_images.no_depth
 
     return read
 
 
-def _plane_sweep(
+def plane_sweep_depth(
     left_images: LeftImages, reconstruction: SparseReconstruction, work: Path, progress: Progress
 ) -> DepthReader:
+    """Sweep all registered views and return the reader of the depth that a neighbour confirms."""
     folder = work / "sweep"
     folder.mkdir(exist_ok=True)
     neighbours = select_neighbours(reconstruction)
@@ -155,9 +194,8 @@ def _plane_sweep(
     def store_depth(name: str) -> None:
         path = folder / f"{name}.npy"
         if not path.is_file():
-            depth = _sweep_view(left_images, reconstruction, name, neighbours[name])
             content = io.BytesIO()
-            np.save(content, depth)
+            np.save(content, _sweep_view(left_images, reconstruction, name, neighbours[name]))
             write_bytes(path, content.getvalue())
 
     names = list(reconstruction.cam_from_sfm)
@@ -177,24 +215,12 @@ def _sweep_view(
     left_images: LeftImages, reconstruction: SparseReconstruction, name: str, neighbours: tuple[str, ...]
 ) -> Float32[ndarray, "h w"]:
     if not neighbours or not len(reconstruction.visible_points[name]):
-        return np.full((left_images.grid.height, left_images.grid.width), np.nan, np.float32)
+        return left_images.no_depth
     view, *others = (
-        PosedImage(_read_grey(left_images.folder / image), reconstruction.cam_from_sfm[image])
+        PosedImage(
+            np.asarray(cv2.imread(str(left_images.folder / image), cv2.IMREAD_GRAYSCALE)),
+            reconstruction.cam_from_sfm[image],
+        )
         for image in (name, *neighbours)
     )
-    return sweep_depth(view, others, left_images.grid.K, depth_range(reconstruction, name), SWEEP_SPEC)
-
-
-def _read_grey(path: Path) -> UInt8[ndarray, "h w"]:
-    """Read an image as 8-bit grey. Raises ``MethodError`` if it cannot be read."""
-    grey = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
-    if grey is None:
-        raise MethodError(f"{path}: cannot be read")
-    return np.asarray(grey)
-
-
-DENSE_METHODS: Mapping[str, DenseMethod] = {
-    "colmap": DenseMethod(require_cuda, _patch_match),
-    "sweep": DenseMethod(lambda: None, _plane_sweep),
-}
-"""Dense depth methods by the first part of a method's name."""
+    return sweep_depth(view, others, left_images.grid.K, depth_range(reconstruction, name))

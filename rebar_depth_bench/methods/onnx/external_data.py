@@ -66,21 +66,21 @@ def external_files(model: Path) -> list[Path]:
     except (_DamagedError, ValueError) as error:  # An empty file cannot be mapped, and locations may not be UTF-8.
         problem = Problem("damaged", "", f"it cannot be read as an ONNX model ({error})", "a protobuf ModelProto")
         raise MethodError.from_problems(model, [problem]) from None
-    problems = [problem for name in sorted(required) for problem in _problems(model.parent, name, required[name])]
+    files, problems = [], []
+    for name, is_required in sorted(required.items()):
+        shown = escape_text(name)
+        if not _is_inside(model.parent, name):
+            expected = "a file in the folder of the model"
+            problems.append(Problem("name", "external data", f"the location is {shown}", expected))
+        elif is_file(path := model.parent / name):
+            files.append(path)
+        elif is_required:
+            problems.append(
+                Problem("missing", "external data", f"{shown} is no regular file", "one beside the model")
+            )
     if problems:
         raise MethodError.from_problems(model, problems)
-    return [path for name in sorted(required) if is_file(path := model.parent / name)]
-
-
-def _problems(folder: Path, name: str, is_required: bool) -> Iterator[Problem]:
-    """Yield the problem of a location of external data."""
-    if not _is_inside(folder, name):
-        found = f"the location is {escape_text(name)}"
-        yield Problem("name", "external data", found, "a file in the folder of the model")
-    elif is_required and not is_file(folder / name):
-        yield Problem(
-            "missing", "external data", f"{escape_text(name)} is no regular file", "one beside the model"
-        )
+    return files
 
 
 def _is_inside(folder: Path, name: str) -> bool:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64, Int64, UInt8
+from jaxtyping import Float, Float32, Float64, UInt8
 from numpy import ndarray
 from PIL import Image
 
@@ -22,7 +22,7 @@ from rebar_depth_bench.data.files import files_digest
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.base import VIEW_TIMEOUT_S, Method, MethodInfo, Predictor
 from rebar_depth_bench.methods.onnx.external_data import external_files
-from rebar_depth_bench.methods.onnx.session import OnnxSession, open_session
+from rebar_depth_bench.methods.onnx.session import open_session
 from rebar_depth_bench.methods.onnx.spec import OUTPUT_MEANINGS, InputSpec, OnnxSpec, OutputSpec, read_onnx_toml
 
 
@@ -30,19 +30,23 @@ from rebar_depth_bench.methods.onnx.spec import OUTPUT_MEANINGS, InputSpec, Onnx
 class AxisPlacement:
     """Placement along one axis, pixels.
 
-    ``image_px`` pixels of the image are resized to ``resized_px`` and placed after ``pad_before_px`` pixels of
-    padding in an input of ``canvas_px``.
+    ``image_px`` pixels of the image are resized to ``resized_px`` and placed in the middle of an input of
+    ``canvas_px``.
     """
 
     image_px: int
     resized_px: int
-    pad_before_px: int
     canvas_px: int
 
     @property
-    def scale(self) -> float:
-        """Return input pixels per image pixel, the factor of the focal length along this axis."""
-        return self.resized_px / self.image_px
+    def pad_before_px(self) -> int:
+        """Padding before the image; with an odd number of pixels, the one after it is larger by one."""
+        return (self.canvas_px - self.resized_px) // 2
+
+    @property
+    def image_slice(self) -> slice:
+        """Input pixels covered by the image."""
+        return slice(self.pad_before_px, self.pad_before_px + self.resized_px)
 
 
 @dataclass(frozen=True)
@@ -54,30 +58,22 @@ class Placement:
 
 
 def place_image(spec: InputSpec, width: int, height: int) -> Placement:
-    """Return the placement of a ``width`` x ``height`` image: stretched, or centred with its aspect ratio kept."""
-    canvas = spec.size_px or _canvas_px(spec, width, height)
+    """Return the placement of a ``width`` x ``height`` image: stretched, or centred with its aspect ratio kept.
+
+    The sides of an input of variable size are the nearest multiples that keep the aspect ratio.
+    """
+    if spec.size_px is not None:
+        canvas = spec.size_px
+    else:
+        ratio, multiple_px = (spec.longest_side or 0) / max(width, height), spec.multiple_of or 1
+        across, down = (max(round(side * ratio / multiple_px), 1) * multiple_px for side in (width, height))
+        canvas = (across, down)
     ratio = min(canvas[0] / width, canvas[1] / height)
-    across, down = (
-        _axis_placement(
-            side,
-            min(max(round(side * ratio), 1), canvas_side) if spec.resize == "pad" else canvas_side,
-            canvas_side,
-        )
-        for side, canvas_side in zip((width, height), canvas, strict=True)
-    )
-    return Placement(across, down)
-
-
-def _canvas_px(spec: InputSpec, width: int, height: int) -> tuple[int, int]:
-    """Return width and height of a variable-size input: nearest multiples that keep the aspect ratio."""
-    ratio = (spec.longest_side or 0) / max(width, height)
-    multiple_px = spec.multiple_of or 1
-    across, down = (max(round(side * ratio / multiple_px), 1) * multiple_px for side in (width, height))
-    return across, down
-
-
-def _axis_placement(image_px: int, resized_px: int, canvas_px: int) -> AxisPlacement:
-    return AxisPlacement(image_px, resized_px, (canvas_px - resized_px) // 2, canvas_px)
+    axes = []
+    for side, canvas_side in zip((width, height), canvas, strict=True):
+        fitted = min(max(round(side * ratio), 1), canvas_side)
+        axes.append(AxisPlacement(side, fitted if spec.resize == "pad" else canvas_side, canvas_side))
+    return Placement(*axes)
 
 
 def input_tensor(
@@ -93,13 +89,8 @@ def input_tensor(
     resized = np.asarray(Image.fromarray(rgb).resize(size, kernel), np.float64)
     normalised = (resized * (spec.range / 255) - np.array(spec.mean)) / np.array(spec.std)
     tensor = np.zeros((1, 3, placement.down.canvas_px, placement.across.canvas_px))
-    tensor[0, :, _image_slice(placement.down), _image_slice(placement.across)] = normalised.transpose(2, 0, 1)
+    tensor[0, :, placement.down.image_slice, placement.across.image_slice] = normalised.transpose(2, 0, 1)
     return tensor
-
-
-def _image_slice(span: AxisPlacement) -> slice:
-    """Return the input pixels covered by the image."""
-    return slice(span.pad_before_px, span.pad_before_px + span.resized_px)
 
 
 def sample_at_image_pixels(
@@ -111,37 +102,25 @@ def sample_at_image_pixels(
     neighbour is NaN; it is smooth, but at the edge of a bar it produces depth that lies neither on the bar nor
     behind it.
     """
-    out_height, out_width = values.shape
+    columns_sampled = _sample_axis(placement.across, values, 1, bilinear)
+    return _sample_axis(placement.down, columns_sampled, 0, bilinear)
+
+
+def _sample_axis(
+    span: AxisPlacement, values: Float[ndarray, "a b"], axis: int, bilinear: bool
+) -> Float[ndarray, "c d"]:
+    cells = values.shape[axis]
+    first, last = _unpadded_cells(span, cells)
+    centres = _centres_on_grid(span, cells)
     if not bilinear:
-        rows, columns = _nearest_cells(placement.down, out_height), _nearest_cells(placement.across, out_width)
-        return np.asarray(values[np.ix_(rows, columns)])
-    top, bottom, bottom_weight = _bilinear_cells(placement.down, out_height)
-    left, right, right_weight = _bilinear_cells(placement.across, out_width)
-    upper, lower = (_blend(values[rows][:, left], values[rows][:, right], right_weight) for rows in (top, bottom))
-    return _blend(upper, lower, bottom_weight[:, None])
-
-
-def _blend(
-    first: Float[ndarray, "a b"], second: Float[ndarray, "a b"], weight: Float64[ndarray, ...]
-) -> Float[ndarray, "a b"]:
-    return np.asarray(first * (1 - weight) + second * weight)
-
-
-def _nearest_cells(span: AxisPlacement, cells: int) -> Int64[ndarray, " n"]:
-    first, last = _unpadded_cells(span, cells)
-    return np.asarray(np.clip(np.floor(_centres_on_grid(span, cells)).astype(np.int64), first, last))
-
-
-def _bilinear_cells(
-    span: AxisPlacement, cells: int
-) -> tuple[Int64[ndarray, " n"], Int64[ndarray, " n"], Float64[ndarray, " n"]]:
-    """Return the cells whose centres lie before and after each pixel centre, and the weight of the latter."""
-    first, last = _unpadded_cells(span, cells)
-    position = np.clip(_centres_on_grid(span, cells) - 0.5, first, last)
+        return np.asarray(values.take(np.clip(np.floor(centres).astype(np.int64), first, last), axis))
+    position = np.clip(centres - 0.5, first, last)
     before = np.floor(position).astype(np.int64)
     weight = position - before
     # At a cell centre the second cell has no weight; it must not contribute NaN either.
-    return before, np.where(weight > 0, np.minimum(before + 1, last), before), weight
+    after = np.where(weight > 0, np.minimum(before + 1, last), before)
+    weight = np.expand_dims(weight, 1 - axis)
+    return np.asarray(values.take(before, axis) * (1 - weight) + values.take(after, axis) * weight)
 
 
 def _centres_on_grid(span: AxisPlacement, cells: int) -> Float64[ndarray, " n"]:
@@ -218,25 +197,22 @@ def _load(spec: OnnxSpec, view_timeout_s: float) -> Predictor:
     # The output shape of a model with dynamic sizes is only known after a run.
     black = np.zeros((height, width, 3), dtype=np.uint8)
     session.run(input_tensor(spec.input, place_image(spec.input, width, height), black), "a black trial image")
-    return lambda row: _predict(spec, session, row)
 
+    def predict(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
+        height, width, _ = row["left_rgb"].shape
+        placement = place_image(spec.input, width, height)
+        tensor = input_tensor(spec.input, placement, row["left_rgb"])
+        values = session.run(tensor, row.get("view_id", "the image"))
+        fx_at_input_px = np.nan
+        if OUTPUT_MEANINGS[spec.output.meaning].canonical:
+            fx_at_input_px = row["left_K"][0, 0] * (placement.across.resized_px / width)
+        # Invalid values become NaN before resampling, so that they are not interpolated with neighbours.
+        is_invalid = np.isnan(output_to_depth_m(values, spec.output, fx_at_input_px))
+        valid = np.where(is_invalid, np.nan, values)
+        sampled = sample_at_image_pixels(placement, valid, bilinear=spec.output.resize == "bilinear")
+        return output_to_depth_m(sampled, spec.output, fx_at_input_px)
 
-def _predict(spec: OnnxSpec, session: OnnxSession, row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
-    height, width, _ = row["left_rgb"].shape
-    placement = place_image(spec.input, width, height)
-    tensor = input_tensor(spec.input, placement, row["left_rgb"])
-    values = session.run(tensor, row.get("view_id", "the image"))
-    canonical = OUTPUT_MEANINGS[spec.output.meaning].canonical
-    fx_at_input_px = row["left_K"][0, 0] * placement.across.scale if canonical else np.nan
-    # Invalid values become NaN before resampling, so that they are not interpolated with neighbours.
-    valid: Float64[ndarray, "out_h out_w"] = np.where(
-        np.isnan(output_to_depth_m(values, spec.output, fx_at_input_px)), np.nan, values
-    )
-    return output_to_depth_m(
-        sample_at_image_pixels(placement, valid, bilinear=spec.output.resize == "bilinear"),
-        spec.output,
-        fx_at_input_px,
-    )
+    return predict
 
 
 def _model_digest(path: Path, model: Path) -> str:

@@ -41,8 +41,6 @@ class OnnxSession:
 
     session: Any
     where: str
-    input_name: str
-    input_dtype: type
     output_name: str
     at_input_size: bool
     timeout_s: float
@@ -53,8 +51,18 @@ class OnnxSession:
         Raises ``MethodError`` if the model fails or exceeds the time limit, or if the output is not a single map
         or, with ``at_input_size``, not of the input's size.
         """
+        import onnxruntime
+
+        [image_input] = self.session.get_inputs()
+        inputs: dict[str, ndarray] = {image_input.name: tensor.astype(_FLOAT_DTYPES[image_input.type])}
+        options = onnxruntime.RunOptions()
+        options.log_severity_level = _LOG_NOTHING
         try:
-            output = self._infer(tensor.astype(self.input_dtype))
+            [output] = call_within(
+                self.timeout_s,
+                lambda: self.session.run([self.output_name], inputs, options),
+                lambda: setattr(options, "terminate", True),  # It stops between two operators.
+            )
         except DeadlineError:
             raise MethodError(f"{self.where}: {view}: {_exceeded(self.timeout_s)}") from None
         except Exception as error:  # The exceptions of onnxruntime have no common base.
@@ -72,19 +80,6 @@ class OnnxSession:
                 f"{name} has the shape {shape}, expected {expected} or [output] at_input_size = false"
             )
         return np.asarray(output, np.float64).reshape(shape[-2:])
-
-    def _infer(self, tensor: Any) -> Any:
-        """Return the output for an input tensor; onnxruntime stops at the time limit, between two operators."""
-        import onnxruntime
-
-        options = onnxruntime.RunOptions()
-        options.log_severity_level = _LOG_NOTHING
-        [output] = call_within(
-            self.timeout_s,
-            lambda: self.session.run([self.output_name], {self.input_name: tensor}, options),
-            lambda: setattr(options, "terminate", True),
-        )
-        return output
 
 
 def open_session(path: Path, input_spec: InputSpec, output_spec: OutputSpec, timeout_s: float) -> OnnxSession:
@@ -123,15 +118,7 @@ def open_session(path: Path, input_spec: InputSpec, output_spec: OutputSpec, tim
     output = _select_output(outputs, output_spec.name_or_index, problems)
     if problems or output is None:
         raise MethodError.from_problems(path, problems)
-    return OnnxSession(
-        session,
-        str(path),
-        inputs[0].name,
-        _FLOAT_DTYPES[inputs[0].type],
-        output.name,
-        output_spec.at_input_size,
-        timeout_s,
-    )
+    return OnnxSession(session, str(path), output.name, output_spec.at_input_size, timeout_s)
 
 
 def _limit_memory(onnxruntime: Any, options: Any) -> None:

@@ -8,6 +8,7 @@ import re
 import sys
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,14 +21,15 @@ from rebar_depth_bench import score
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods import METHODS, find_method
-from rebar_depth_bench.methods.huggingface.families import (
+from rebar_depth_bench.methods.transformers.model import (
     FAMILIES,
-    PROCESSING_FACTORIES,
     OutputKind,
-    canonical_to_depth_m,
+    depth_pro_preprocessing,
+    hf_method,
+    library_preprocessing,
     network_output_to_depth_m,
+    to_left_grid,
 )
-from rebar_depth_bench.methods.huggingface.model import hf_method
 from tests.bench.methods.predictors import load_predictor
 from tests.bench.methods.tiny_depth_models import LAST_LAYER, MODELS, save_checkpoint
 
@@ -102,10 +104,10 @@ def test_canonical_output_to_depth_at_any_image_width(width: int, fx: float, z: 
     """The canonical output equals 1 / z for a camera whose focal length is one image width."""
     K = np.diag([fx, fx, 1.0])
     canonical = np.full((2, width), fx / (z * width))
-    np.testing.assert_allclose(canonical_to_depth_m(canonical, K), np.clip(z, 1e-4, 1e4), rtol=1e-6)
-    np.testing.assert_allclose(
-        canonical_to_depth_m(np.full((1, width), 1 / z), np.diag([width, 1.0, 1.0])), z, rtol=1e-6
-    )
+    depth_m = network_output_to_depth_m(OutputKind.CANONICAL, canonical, K)
+    np.testing.assert_allclose(depth_m, np.clip(z, 1e-4, 1e4), rtol=1e-6)
+    canonical, K = np.full((1, width), 1 / z), np.diag([width, 1.0, 1.0])
+    np.testing.assert_allclose(network_output_to_depth_m(OutputKind.CANONICAL, canonical, K), z, rtol=1e-6)
 
 
 def test_invalid_network_output_is_nan() -> None:
@@ -118,7 +120,7 @@ def test_invalid_network_output_is_nan() -> None:
     assert np.isfinite(metres).tolist() == [[False] * 5 + [True, True]]
 
 
-@pytest.mark.parametrize("kind", ["depth-anything", "dpt", "glpn"])
+@pytest.mark.parametrize("kind", ["depth-anything", "dpt", "dpt-dinov2", "glpn"])
 def test_depth_matches_transformers_pipeline(folders: dict[str, Path], kind: str) -> None:
     transformers = importlib.import_module("transformers")
     processor = transformers.AutoImageProcessor.from_pretrained(folders[kind], backend="pil")
@@ -135,7 +137,7 @@ def test_depth_pro_input_matches_pillow() -> None:
     """For enlargement Pillow's bilinear filter is the same interpolation; values become 2 v / 255 - 1."""
     settings = {**MODELS["depth-pro"][1], "size": {"height": 128, "width": 192}}
     rgb = row()["left_rgb"]
-    network_input = PROCESSING_FACTORIES["depth_pro"](settings, None).to_network_input(rgb).numpy()
+    network_input = depth_pro_preprocessing(settings)(rgb).numpy()
     assert network_input.shape == (1, 3, 128, 192)
     for channel in range(3):
         plane = Image.fromarray(rgb[..., channel].astype(np.float32))
@@ -143,21 +145,22 @@ def test_depth_pro_input_matches_pillow() -> None:
         np.testing.assert_allclose(network_input[0, channel], expected, atol=2e-5)
 
 
-@pytest.mark.parametrize("kind", [kind for kind in MODELS if kind != "depth-pro"])
+@pytest.mark.parametrize("kind", ["depth-anything", "dpt", "glpn", "zoedepth"])
 def test_preprocessing_round_trip_keeps_pixel_positions(folders: dict[str, Path], kind: str) -> None:
     """Ramps over rows and columns, passed through pre- and postprocessing only, keep every pixel in place."""
     transformers = importlib.import_module("transformers")
     processor = transformers.AutoImageProcessor.from_pretrained(folders[kind], backend="pil")
     model_type = json.loads((folders[kind] / "config.json").read_text())["model_type"]
-    processing = PROCESSING_FACTORIES[model_type](MODELS[kind][1], processor)
+    to_network_input = library_preprocessing(processor)
     rows, columns = np.mgrid[:H, :W]
     rgb = np.stack([rows, columns, np.zeros_like(rows)], axis=-1).astype(np.uint8)
     mean, std = (
         np.asarray(MODELS[kind][1].get(f"image_{name}", [x] * 3)) for name, x in (("mean", 0), ("std", 1))
     )
     for channel, expected in ((0, rows), (1, columns)):
-        network_input = processing.to_network_input(rgb)[0, channel]
-        restored = processing.to_left_grid(network_input, (H, W)).numpy() * std[channel] + mean[channel]
+        network_output = SimpleNamespace(predicted_depth=to_network_input(rgb)[:, channel])
+        on_left_grid = to_left_grid(model_type, processor, network_output, (H, W)).numpy()
+        restored = on_left_grid * std[channel] + mean[channel]
         inner = np.s_[12:-12, 12:-12]
         np.testing.assert_allclose(255 * restored[inner], expected[inner], atol=1.5)
 
@@ -280,7 +283,6 @@ def test_invalid_hf_name_raises(name: str) -> None:
 
 
 def test_all_families_are_covered() -> None:
-    assert set(FAMILIES) == set(PROCESSING_FACTORIES)
     assert set(FAMILIES) <= {kind.replace("-", "_") for kind in MODELS}
     assert set(LAST_LAYER) <= set(MODELS)
     assert METHODS["depth-pro"].info.uses_intrinsics

@@ -13,8 +13,7 @@ from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
 from rebar_depth_bench.geometry.aruco_detection import Corners
 from rebar_depth_bench.geometry.cameras import ideal_K, look_at, project, transform
 from rebar_depth_bench.methods.multiview.dense import MAX_NEIGHBOURS, depth_range, select_neighbours
-from rebar_depth_bench.methods.multiview.images import select_pairs
-from rebar_depth_bench.methods.multiview.sfm import SparseReconstruction
+from rebar_depth_bench.methods.multiview.sfm import SparseReconstruction, select_pairs
 
 K = ideal_K(1280, 720)
 BOARD = BoardSpec()

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import json
 import shutil
+import sqlite3
 import zipfile
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +75,14 @@ def read_metadata(archive: Path) -> dict[str, Any]:
     with zipfile.ZipFile(archive) as source:
         content: dict[str, Any] = json.loads(source.read("submission.json"))
     return content
+
+
+def test_images_are_numbered_in_order_of_names(work: Path) -> None:
+    """COLMAP's results depend on the numbers, which would otherwise follow the order of its threads."""
+    with closing(sqlite3.connect(work / "kept" / "database.db")) as database:
+        names = [name for (name,) in database.execute("SELECT name FROM images ORDER BY image_id")]
+    assert len(names) == 24
+    assert names == sorted(names)
 
 
 def test_notes_report_accurate_cameras_and_scale(archive: Path) -> None:

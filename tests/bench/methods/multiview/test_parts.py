@@ -17,9 +17,9 @@ from hypothesis import strategies as st
 
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.cameras import ideal_K, pixel_rays
-from rebar_depth_bench.geometry.undistortion import pinhole_grid, pinhole_image
-from rebar_depth_bench.methods.multiview.patch_match import read_depth_map
-from rebar_depth_bench.methods.multiview.sfm import reconstruct_sparse
+from rebar_depth_bench.geometry.undistortion import PinholeGrid, pinhole_grid, pinhole_image
+from rebar_depth_bench.methods.multiview.dense import read_depth_map
+from rebar_depth_bench.methods.multiview.sfm import LeftImages, reconstruct
 
 ZED_DISTORTION = np.array([-0.175286, 0.0283094, 6.68e-5, -1.50e-4, 0.0])
 WIDTH, HEIGHT = 320, 180
@@ -92,6 +92,8 @@ def test_unrelated_images_raise(tmp_path: Path) -> None:
     for k, name in enumerate(names):
         noise = np.random.default_rng(k).integers(0, 256, (90, 160, 3)).astype(np.uint8)
         cv2.imwrite(str(images / name), noise)
+    grid = PinholeGrid(ideal_K(160, 90), 160, 90, None)
+    left_images = LeftImages(images, {name: name for name in names}, grid, {}, {})
     with pytest.raises(MethodError, match="no matching pair among 3 images"):
-        reconstruct_sparse(images, names, ideal_K(160, 90), tmp_path)
+        reconstruct(left_images, None, tmp_path)
     assert not (tmp_path / "model").exists()

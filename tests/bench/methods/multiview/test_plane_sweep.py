@@ -13,11 +13,16 @@ from numpy import ndarray
 
 from rebar_depth_bench.geometry.cameras import ideal_K, look_at, pixel_rays
 from rebar_depth_bench.methods.multiview.dense import consistency_mask
-from rebar_depth_bench.methods.multiview.plane_sweep import PlaneSweepSpec, PosedImage, inverse_depths, sweep_depth
+from rebar_depth_bench.methods.multiview.plane_sweep import (
+    MIN_PLANES,
+    STEP_PX,
+    PosedImage,
+    inverse_depths,
+    sweep_depth,
+)
 
 WIDTH, HEIGHT = 160, 90
 K = ideal_K(WIDTH, HEIGHT)
-SPEC = PlaneSweepSpec()
 TEXTURE_PX_PER_M = 400
 
 
@@ -52,7 +57,7 @@ OTHERS = [view_pose(0.2, -0.4), view_pose(-0.2, -0.4), view_pose(0.0, -0.2), vie
 
 def test_slanted_plane_is_recovered() -> None:
     neighbours = [PosedImage(render_view(pose), pose) for pose in OTHERS]
-    depth_m = sweep_depth(PosedImage(render_view(VIEW), VIEW), neighbours, K, (0.6, 2.0), SPEC)
+    depth_m = sweep_depth(PosedImage(render_view(VIEW), VIEW), neighbours, K, (0.6, 2.0))
     abs_rel = np.abs(depth_m - true_depth(VIEW)) / true_depth(VIEW)
     known = np.isfinite(depth_m)
     assert known[10:-10, 10:-10].mean() > 0.9
@@ -62,16 +67,14 @@ def test_slanted_plane_is_recovered() -> None:
 
 def test_textureless_image_has_no_depth() -> None:
     plain = np.full((HEIGHT, WIDTH), 90, np.uint8)
-    depth_m = sweep_depth(
-        PosedImage(plain, VIEW), [PosedImage(plain, pose) for pose in OTHERS], K, (0.6, 2.0), SPEC
-    )
+    depth_m = sweep_depth(PosedImage(plain, VIEW), [PosedImage(plain, pose) for pose in OTHERS], K, (0.6, 2.0))
     assert not np.isfinite(depth_m).any()
 
 
 def test_depth_outside_range_is_rejected() -> None:
     """The plane is nearer than 1.5 m, so the best of the swept planes is an end plane or matches badly."""
     neighbours = [PosedImage(render_view(pose), pose) for pose in OTHERS]
-    depth_m = sweep_depth(PosedImage(render_view(VIEW), VIEW), neighbours, K, (3.0, 9.0), SPEC)
+    depth_m = sweep_depth(PosedImage(render_view(VIEW), VIEW), neighbours, K, (3.0, 9.0))
     assert np.isfinite(depth_m).mean() < 0.05
 
 
@@ -80,8 +83,8 @@ def test_planes_are_one_step_apart() -> None:
     baseline_m, near, far = 0.2, 0.6, 2.0
     shift = K @ np.outer([-baseline_m, 0.0, 0.0], [0.0, 0.0, 1.0])
     spread_px = K[0, 0] * baseline_m * (1 / near - 1 / far)
-    planes = inverse_depths([(np.eye(3), shift)], (HEIGHT, WIDTH), (near, far), SPEC)
-    assert len(planes) == max(SPEC.min_planes, int(np.ceil(spread_px / SPEC.step_px)) + 1)
+    planes = inverse_depths([(np.eye(3), shift)], (HEIGHT, WIDTH), (near, far))
+    assert len(planes) == max(MIN_PLANES, int(np.ceil(spread_px / STEP_PX)) + 1)
     assert planes[0] == pytest.approx(1 / far)
     assert planes[-1] == pytest.approx(1 / near)
 

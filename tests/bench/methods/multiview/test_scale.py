@@ -15,8 +15,12 @@ from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
 from rebar_depth_bench.geometry.aruco_detection import Corners
 from rebar_depth_bench.geometry.cameras import ideal_K, look_at, project, rigid, transform
-from rebar_depth_bench.methods.multiview.metric_scale import fit_board, triangulate
-from rebar_depth_bench.methods.multiview.pose_errors import Similarity, aligned_report, board_frame_report
+from rebar_depth_bench.methods.multiview.metric_scale import (
+    Similarity,
+    camera_errors,
+    fit_board,
+    triangulate,
+)
 
 K = ideal_K(1280, 720)
 BOARD = BoardSpec()
@@ -62,7 +66,7 @@ def test_exact_corners_give_exact_similarity(unit_m: float, turn: tuple[float, f
     assert fit.metric.translation == pytest.approx(metric_from_other.translation, abs=1e-6 * max(unit_m, 1))
     assert fit.markers == tuple(range(6))
     assert fit.rms_m < 1e-8
-    report = board_frame_report(poses, TRUTH, fit.metric)
+    report = camera_errors(poses, TRUTH, fit.metric.scale, fit.metric)
     assert abs(report["scale_error_percent"]) < 1e-4
     assert report["centre_error_mm"]["largest"] < 1e-3
     assert report["rotation_error_deg"]["largest"] < 1e-3
@@ -73,12 +77,12 @@ def test_reports_measure_scale_and_camera_errors() -> None:
     poses, _ = reconstruct_in_other_frame(0.07, (0.1, 0.2, 0.3))
     right = fit_board(project_corners(), poses, K, BOARD).metric
     wrong = Similarity(1.02 * right.scale, right.rotation, 1.02 * right.translation)
-    report = board_frame_report(poses, TRUTH, wrong)
+    report = camera_errors(poses, TRUTH, wrong.scale, wrong)
     distances_m = [np.linalg.norm(pose[:3, :3].T @ pose[:3, 3]) for pose in TRUTH.values()]
     assert report["scale_error_percent"] == pytest.approx(2.0, abs=1e-3)
     assert report["centre_error_mm"]["largest"] == pytest.approx(20 * max(distances_m), rel=1e-3)
     assert report["cameras_compared"] == "in the board's frame"
-    aligned = aligned_report(poses, TRUTH, 1.02 * right.scale)
+    aligned = camera_errors(poses, TRUTH, 1.02 * right.scale)
     assert aligned["scale_error_percent"] == pytest.approx(2.0, abs=1e-3)
     assert aligned["centre_error_mm"]["largest"] < 1e-3
     assert aligned["cameras_compared"] == "after the best similarity"

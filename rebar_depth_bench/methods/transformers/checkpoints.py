@@ -16,6 +16,8 @@ from rebar_depth_bench.data.files import files_digest
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.paper.third_party import hub_download, local_copy_hint, read_json_object, snapshot
 
+PREFIX = "hf"
+"""What the names of these methods begin with, before a colon."""
 CONFIG, PREPROCESSOR = "config.json", "preprocessor_config.json"
 _REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 _WEIGHTS = ("*.safetensors", "*.bin")
@@ -47,15 +49,15 @@ def find_checkpoint(name_or_path: str) -> Checkpoint:
     """
     folder = Path(name_or_path).expanduser()
     if name_or_path and folder.is_dir():
-        config = _read_settings(folder / CONFIG)
+        config = read_settings(folder / CONFIG)
         return Checkpoint(folder.resolve().name, folder, None, _weights_digest(folder), config)
     if not _REPOSITORY.fullmatch(name_or_path) or Path(name_or_path).parent.is_dir():
         raise MethodError(
             f"{name_or_path}: is neither a folder nor the name of a model on the Hub, expected a folder with "
             f"{CONFIG}, or ORG/NAME where there is no folder ORG"
         )
-    folder = snapshot(name_or_path, CONFIG, _local_copy_hint(name_or_path))
-    return Checkpoint(name_or_path, folder, name_or_path, f"commit {folder.name}", _read_settings(folder / CONFIG))
+    folder = snapshot(name_or_path, CONFIG, local_copy_hint(PREFIX, name_or_path))
+    return Checkpoint(name_or_path, folder, name_or_path, f"commit {folder.name}", read_settings(folder / CONFIG))
 
 
 def ensure_weights(checkpoint: Checkpoint) -> None:
@@ -71,14 +73,6 @@ def ensure_weights(checkpoint: Checkpoint) -> None:
         raise MethodError(f"{checkpoint.name}: no weights, expected {' or '.join(_WEIGHTS)} beside {CONFIG}")
 
 
-def read_preprocessor_config(checkpoint: Checkpoint) -> dict[str, Any]:
-    """Return ``preprocessor_config.json``. Raises ``MethodError`` if it is missing or unreadable.
-
-    There are no default values: at an input size other than that of training, a network silently performs worse.
-    """
-    return _read_settings(checkpoint.folder / PREPROCESSOR)
-
-
 def _weight_files(folder: Path) -> list[Path]:
     """Return the weight files of the first pattern that matches; empty if there are none."""
     return next((paths for pattern in _WEIGHTS if (paths := sorted(folder.glob(pattern)))), [])
@@ -90,7 +84,11 @@ def _weights_digest(folder: Path) -> str:
     return f"sha256:{files_digest(path for path in files if path.is_file())}"
 
 
-def _read_settings(path: Path) -> dict[str, Any]:
+def read_settings(path: Path) -> dict[str, Any]:
+    """Return the object of a JSON file of a checkpoint. Raises ``MethodError`` if it is missing or unreadable.
+
+    There are no default values: at an input size other than that of training, a network silently performs worse.
+    """
     if not path.exists():
         raise MethodError(
             f"{path.parent}: no {path.name}, expected a checkpoint folder as written by save_pretrained"
@@ -102,7 +100,7 @@ def _fetch_weights(repository: str, commit: str) -> None:
     """Download weights (of one kind only) and settings of a commit into the Hub cache."""
     from huggingface_hub import HfApi, snapshot_download
 
-    with hub_download(repository, "the weights", _local_copy_hint(repository)):
+    with hub_download(repository, "the weights", local_copy_hint(PREFIX, repository)):
         files = HfApi().model_info(repository, revision=commit, files_metadata=True).siblings or []
         sizes = {file.rfilename: file.size or 0 for file in files if "/" not in file.rfilename}
         weight_pattern = next(
@@ -111,8 +109,3 @@ def _fetch_weights(repository: str, commit: str) -> None:
         file_names = [name for name in sizes if Path(name).match(weight_pattern) or name.endswith(".json")]
         print(f"{repository}: {sum(sizes[name] for name in file_names) / 1e6:.1f} MB", file=sys.stderr, flush=True)
         snapshot_download(repository, revision=commit, allow_patterns=file_names)
-
-
-def _local_copy_hint(repository: str) -> str:
-    """Return the hint for error messages on how to use a local copy."""
-    return local_copy_hint("hf", repository)

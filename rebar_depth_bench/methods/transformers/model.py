@@ -1,0 +1,279 @@
+"""Monocular depth models of ``transformers``, named by their checkpoint: ``hf:ORG/NAME`` or ``hf:FOLDER``.
+
+The meaning of the output is derived from ``config.json``, following the models' code in ``transformers`` 5.23;
+this and the conversion to metres do not need torch. Images are processed as the library does: depth is brought
+to the left grid by bilinear interpolation for Depth Pro and by bicubic interpolation for the others. Between a
+bar and its background, interpolation produces depths that lie on neither surface, as these models do for every
+user.
+
+The processing of Depth Pro and the post-processing of ZoeDepth are implemented here, because those of the library
+need torchvision. That of DPT and GLPN is the library's, ``post_process_depth_estimation``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from enum import Enum
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float, Float32, Float64, UInt8
+from numpy import ndarray
+
+from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
+from rebar_depth_bench.methods.monocular.third_party import import_package, translate_errors
+from rebar_depth_bench.methods.paper.third_party import torch_device
+from rebar_depth_bench.methods.transformers.checkpoints import (
+    CONFIG,
+    PREFIX,
+    PREPROCESSOR,
+    Checkpoint,
+    ensure_weights,
+    find_checkpoint,
+    read_settings,
+)
+from rebar_depth_bench.validation import short_repr
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+HF_PREFIX = f"{PREFIX}:"
+_INSTALL = "pip install 'rebar-depth-bench[models]'"
+DEPTH_PRO_CHECKPOINT = "apple/DepthPro-hf"
+INVERSE_DEPTH_BOUNDS_PER_M = (1e-4, 1e4)
+"""Bounds of Depth Pro's inverse depth, 1/m: depth between 0.1 mm and 10 km."""
+ZOE_PADDING_FACTOR = 3
+"""ZoeDepth pads each border by int(3 sqrt(side / 2)) mirrored pixels."""
+
+FAMILIES: Mapping[str, str] = {
+    "depth_anything": "Depth Anything",
+    "depth_pro": "Depth Pro",
+    "dpt": "DPT",
+    "glpn": "GLPN",
+    "zoedepth": "ZoeDepth",
+}
+"""Display names of the supported families by ``model_type`` of ``config.json``."""
+_UNSUPPORTED: Mapping[str, str] = {
+    "chmv2": "it estimates the height of trees, not depth",
+    "prompt_depth_anything": "it completes measured depth, which a single image does not have",
+}
+
+
+class OutputKind(Enum):
+    """Meaning of a network's output; the value is the text shown to users."""
+
+    METRES = "depth in metres, the camera's focal length not given"
+    INVERSE = (
+        "up to scale, and up to a shift of the inverse: the model puts out relative inverse depth, one over it is "
+        "submitted, and only the scaled numbers mean anything"
+    )
+    CANONICAL = "depth in metres, the camera's focal length given"
+
+
+def hf_method(name_or_path: str) -> Method:
+    """Return the method of a checkpoint: ``ORG/NAME`` on the Hub, or a folder written by ``save_pretrained``.
+
+    ``config.json`` is read (and downloaded from the Hub if necessary) immediately because it determines whether
+    the output is metric or relative; weights are downloaded by ``load``. Downloads are announced on standard
+    error.
+
+    Raises ``MethodError`` if there is no such checkpoint or its model type is not supported.
+    """
+    checkpoint = find_checkpoint(name_or_path)
+    model_type = checkpoint.config.get("model_type")
+    family, unsupported = FAMILIES.get(str(model_type)), _UNSUPPORTED.get(str(model_type))
+    if family is None:
+        reason = f" ({unsupported})" if unsupported else ""
+        raise MethodError(
+            f"{checkpoint.folder / CONFIG}: model_type is {short_repr(model_type)}{reason}, expected one of "
+            f"{', '.join(FAMILIES)}"
+        )
+    output = output_kind(checkpoint.config)
+    info = MethodInfo(
+        name=f"{HF_PREFIX}{checkpoint.name}",
+        summary=f"{family} from one picture: {output.value}; weights {checkpoint.version}",
+        columns=("left_rgb", "left_K") if output is OutputKind.CANONICAL else ("left_rgb",),
+        uses_intrinsics=output is OutputKind.CANONICAL,
+        source=f"transformers, {checkpoint.name}",
+        licence="that of the checkpoint",
+    )
+    return Method(info, lambda: _load_predictor(checkpoint, output))
+
+
+DEPTH_PRO = Method(
+    MethodInfo(
+        name="depth-pro",
+        summary=f"Depth Pro from one picture: {OutputKind.CANONICAL.value}, as in the paper; "
+        "own weights: hf:FOLDER",
+        columns=("left_rgb", "left_K"),
+        uses_intrinsics=True,
+        source=f"transformers, {DEPTH_PRO_CHECKPOINT}",
+        licence="Apple's own; it comes with the weights",
+        untested_note="not tested with the real weights: they were not available",
+    ),
+    lambda: hf_method(DEPTH_PRO_CHECKPOINT).load(),
+)
+"""Depth Pro as in the paper; loading takes the weights from the Hub or its cache."""
+
+
+def depth_pro_method() -> Method:
+    """Return Depth Pro as in the paper, with the commit of its weights in the summary.
+
+    Raises like ``hf_method``.
+    """
+    method = hf_method(DEPTH_PRO_CHECKPOINT)
+    return replace(method, info=replace(DEPTH_PRO.info, summary=method.info.summary))
+
+
+def output_kind(config: Mapping[str, Any]) -> OutputKind:
+    """Return the meaning of the output of a supported checkpoint by its ``config.json``.
+
+    Depth Anything has metric and relative checkpoints. DPT is relative (MiDaS) except on DINOv2 backbones:
+    those are the metric heads that the authors of DINOv2 trained on NYU and KITTI.
+    """
+    match config["model_type"]:
+        case "depth_pro":
+            return OutputKind.CANONICAL
+        case "depth_anything":
+            is_metric = config.get("depth_estimation_type", "relative") == "metric"
+        case "dpt":
+            backbone = config.get("backbone_config")
+            is_metric = isinstance(backbone, dict) and backbone.get("model_type") == "dinov2"
+        case _:
+            is_metric = True
+    return OutputKind.METRES if is_metric else OutputKind.INVERSE
+
+
+def network_output_to_depth_m(
+    output: OutputKind, values: Float[ndarray, "h w"], K: Float64[ndarray, "3 3"] | None = None
+) -> Float32[ndarray, "h w"]:
+    """Return planar depth in metres; for relative output, its unit is unknown.
+
+    ``values`` is the network output on the left grid. ``K`` holds the intrinsics of that grid in pixels and is
+    required for canonical output, the inverse depth C of a camera whose focal length equals the image width:
+    z = 1 / (C * W / fx), where W and fx belong to the left grid, not to the square image which the network
+    receives (A. Bochkovskii et al., "Depth Pro", ICLR 2025, and the model's post-processing).
+
+    Depths that are not finite or not above 0 become NaN, which means no prediction.
+    """
+    with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+        if output is OutputKind.CANONICAL:
+            assert K is not None
+            inverse_per_m = values.astype(np.float64) * (values.shape[1] / K[0, 0])
+            values = np.clip(inverse_per_m, *INVERSE_DEPTH_BOUNDS_PER_M)
+        z_m = (values if output is OutputKind.METRES else 1 / values).astype(np.float32)
+    return np.where(np.isfinite(z_m) & (z_m > 0), z_m, np.float32(np.nan))
+
+
+def _load_predictor(checkpoint: Checkpoint, output: OutputKind) -> Predictor:
+    """Return the predictor of a checkpoint, on the GPU if torch finds one.
+
+    Raises ``MethodError`` if torch, ``transformers`` or weights are missing, or if the weights are incomplete.
+    """
+    torch, transformers = (import_package(name, checkpoint.name, _INSTALL) for name in ("torch", "transformers"))
+    ensure_weights(checkpoint)
+    model_type, settings = checkpoint.config["model_type"], read_settings(checkpoint.folder / PREPROCESSOR)
+    with translate_errors(checkpoint.name, torch, "cannot be loaded"):
+        if model_type == "depth_pro":
+            processor, to_network_input = None, depth_pro_preprocessing(settings)
+        else:  # The processors on Pillow give the same results with and without torchvision.
+            processor = transformers.AutoImageProcessor.from_pretrained(checkpoint.folder, backend="pil")
+            to_network_input = library_preprocessing(processor)
+        model = _load_network(transformers, checkpoint).to(torch_device(torch))
+
+    def predict(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
+        rgb = row["left_rgb"]
+        with torch.inference_mode():
+            network_output = model(pixel_values=to_network_input(rgb).to(model.device))
+            network_output.predicted_depth = network_output.predicted_depth.float().cpu()
+            values = to_left_grid(model_type, processor, network_output, rgb.shape[:2])
+        return network_output_to_depth_m(output, np.asarray(values.numpy()), row.get("left_K"))
+
+    return predict
+
+
+ToNetworkInput = Callable[[UInt8[ndarray, "H W 3"]], "Float[Tensor, '1 3 h w']"]
+"""Function from an image to the input of a network."""
+
+
+def depth_pro_preprocessing(settings: Mapping[str, Any]) -> ToNetworkInput:
+    """Return Depth Pro's pre-processing by ``preprocessor_config.json``: normalise, then resize to a square.
+
+    The image is resized bilinearly, as in the authors' code. Raises ``MethodError`` if a setting is missing.
+    """
+    try:
+        size, mean, std = settings["size"], settings["image_mean"], settings["image_std"]
+    except KeyError as error:
+        raise MethodError(f"Depth Pro: preprocessor_config.json has no {error}") from None
+    scale = settings.get("rescale_factor", 1 / 255)
+
+    def to_network_input(rgb: UInt8[ndarray, "H W 3"]) -> Float[Tensor, "1 3 h w"]:
+        import torch
+        from torch.nn import functional
+
+        normal = (rgb * np.float64(scale) - np.asarray(mean)) / np.asarray(std)
+        planes = torch.from_numpy(normal.astype(np.float32).transpose(2, 0, 1).copy())[None]
+        target = (size["height"], size["width"])
+        return functional.interpolate(planes, size=target, mode="bilinear", align_corners=False)
+
+    return to_network_input
+
+
+def library_preprocessing(processor: Any) -> ToNetworkInput:
+    """Return the pre-processing of a processor of ``transformers``."""
+
+    def to_network_input(rgb: UInt8[ndarray, "H W 3"]) -> Float[Tensor, "1 3 h w"]:
+        pixels: Tensor = processor(images=rgb, return_tensors="pt", input_data_format="channels_last").pixel_values
+        return pixels.float()
+
+    return to_network_input
+
+
+def to_left_grid(
+    model_type: str, processor: Any, network_output: Any, grid: tuple[int, int]
+) -> Float[Tensor, "H W"]:
+    """Return the depth of a network's output object on the left grid, (H, W).
+
+    The mirrored borders that the processor of ZoeDepth adds are cropped after resizing.
+    """
+    raw_depth = network_output.predicted_depth[0]
+    if model_type == "depth_pro":
+        return resized(raw_depth, grid, "bilinear")
+    if model_type == "zoedepth":
+        top, left = (int(ZOE_PADDING_FACTOR * np.sqrt(side / 2)) if processor.do_pad else 0 for side in grid)
+        padded = resized(raw_depth, (grid[0] + 2 * top, grid[1] + 2 * left), "bicubic")
+        return padded[top : top + grid[0], left : left + grid[1]]
+    [processed] = processor.post_process_depth_estimation(network_output, target_sizes=[grid])
+    depth: Tensor = processed["predicted_depth"]
+    return depth
+
+
+def resized(values: Float[Tensor, "h w"], grid: tuple[int, int], mode: str) -> Float[Tensor, "H W"]:
+    """Return values resampled to another grid over the same field of view (``align_corners=False``).
+
+    ``mode`` is the interpolation mode of torch.
+    """
+    from torch.nn import functional
+
+    return functional.interpolate(values[None, None], size=grid, mode=mode, align_corners=False)[0, 0]
+
+
+def _load_network(transformers: Any, checkpoint: Checkpoint) -> Any:
+    """Return the network in evaluation mode.
+
+    Raises ``MethodError`` if weights are missing, which ``transformers`` itself would leave at random values.
+    """
+    model, loading_info = transformers.AutoModelForDepthEstimation.from_pretrained(
+        checkpoint.folder, dtype="float32", output_loading_info=True, local_files_only=True
+    )
+    missing = sorted(loading_info["missing_keys"])
+    if missing:
+        raise MethodError(
+            f"{checkpoint.name}: the weights lack {len(missing)} of the network's tensors, first {missing[0]}, "
+            "expected all of them"
+        )
+    if getattr(model, "use_fov_model", False):
+        model.use_fov_model = False  # The field-of-view head estimates the focal length, which is known here.
+    return model.eval()
