@@ -5,13 +5,22 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from importlib import resources
 from math import isclose, radians, tan
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.specs.config_specs import FocalRigSpec, RigSpec
-from rebar_depth_bench.geometry.calibration import read_calibration
+from rebar_depth_bench.captures.calibration import (
+    StereoCalibration,
+    calibrated_baseline_m,
+    lens_distortion,
+    lens_K,
+    right_from_left,
+    scale_calibration,
+)
+from rebar_depth_bench.captures.calibration_files import read_calibration
 from rebar_depth_bench.geometry.cameras import (
     NOMINAL_FOCAL_PX,
     NOMINAL_HEIGHT,
@@ -22,14 +31,9 @@ from rebar_depth_bench.geometry.cameras import (
     right_camera_pose,
     rigid,
 )
-from rebar_depth_bench.geometry.stereo_calibration import (
-    StereoCalibration,
-    calibrated_baseline_m,
-    lens_distortion,
-    lens_K,
-    right_from_left,
-    scale_calibration,
-)
+
+if TYPE_CHECKING:
+    from rebar_depth_bench.geometry.rectification import Rectification
 
 ZED_CALIBRATION = "zed-hd720.conf"
 
@@ -54,7 +58,7 @@ def rig_cameras(rig: RigSpec, cam_from_world: Float64[ndarray, "4 4"]) -> dict[s
 
     ``cam_from_world`` is the pose of the physical left camera, as given by the trajectory. On the ``raw`` grid the
     cameras are the physical lenses including their distortion. On the ``rectified`` grid they are the parallel
-    pinholes of ``rectification.rectify``: the camera centres are the same but the axes are rotated, so the left
+    pinholes of ``rectify``: the camera centres are the same but the axes are rotated, so the left
     pose differs from ``cam_from_world``. A calibration of another image size is scaled to that of the rig.
 
     Raises ``ValueError`` for an unknown grid, for a calibrated grid without a calibration, for the ideal grid with
@@ -83,10 +87,22 @@ def _raw_cameras(rig: RigSpec, left: Pose) -> dict[str, Camera]:
 
 
 def _rectified_cameras(rig: RigSpec, left: Pose) -> dict[str, Camera]:
-    from rebar_depth_bench.geometry.rectification import rectify
-
     rectified = rectify(_scaled_calibration(rig))
     return _pinholes(rig, rectified.K, matrix_product(rigid(rectified.R_left, np.zeros(3)), left))
+
+
+def rectify(calibration: StereoCalibration) -> Rectification:
+    """Return the rectification for the image size of the calibration."""
+    from rebar_depth_bench.geometry.rectification import rectify_pair
+
+    return rectify_pair(
+        (lens_K(calibration.left), lens_K(calibration.right)),
+        (lens_distortion(calibration.left), lens_distortion(calibration.right)),
+        right_from_left(calibration),
+        calibration.width,
+        calibration.height,
+        calibrated_baseline_m(calibration),
+    )
 
 
 def _pinholes(rig: RigSpec, K: Float64[ndarray, "3 3"], left: Pose) -> dict[str, Camera]:

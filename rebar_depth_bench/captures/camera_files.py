@@ -3,8 +3,8 @@
 A folder holds one of these:
 
 - ``cameras.toml``, see below;
-- ``calibration.conf`` (Stereolabs) or ``calibration.toml`` (``geometry.calibration``);
-- calibrations of other programs (``geometry.calibration_programs``): one file ``*.yaml``, ``.yml``, ``.xml`` or
+- ``calibration.conf`` (Stereolabs) or ``calibration.toml`` (``captures.calibration_files``);
+- calibrations of other programs (``captures.programs``): one file ``*.yaml``, ``.yml``, ``.xml`` or
   ``.json`` (OpenCV's FileStorage, a Kalibr camera chain, ROS ``camera_info`` of one camera), or two of them:
   intrinsics and extrinsics of OpenCV, or ``left.*`` and ``right.*`` of ROS.
 
@@ -35,14 +35,13 @@ from jaxtyping import Float64
 from numpy import ndarray
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
+from rebar_depth_bench.captures.calibration import Calibration, StereoCalibration, table_calibration
+from rebar_depth_bench.captures.calibration_files import check_image_size, read_calibration, scaled_calibration
+from rebar_depth_bench.captures.documents import DOCUMENT_SUFFIXES, parse_document
+from rebar_depth_bench.captures.programs import program_calibration
 from rebar_depth_bench.data.rows import camera_array
 from rebar_depth_bench.errors import CalibrationError, InputError, Problem
 from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
-from rebar_depth_bench.geometry.calibration import check_image_size, read_calibration, scaled_calibration
-from rebar_depth_bench.geometry.calibration_documents import DOCUMENT_SUFFIXES, parse_document
-from rebar_depth_bench.geometry.calibration_programs import program_calibration
-from rebar_depth_bench.geometry.calibration_toml import table_calibration
-from rebar_depth_bench.geometry.stereo_calibration import Calibration, StereoCalibration
 from rebar_depth_bench.key_lines import with_lines
 from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.names import NAME_LETTERS, NAME_PATTERN

@@ -8,8 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from rebar_depth_bench.captures.camera_files import CAMERAS_FILE
-from rebar_depth_bench.captures.folder import is_capture, open_capture
-from rebar_depth_bench.captures.views import ImageViews
+from rebar_depth_bench.captures.views import ImageViews, is_capture, open_capture
 from rebar_depth_bench.cli.dataset_options import add_expect_digest, print_verified
 from rebar_depth_bench.console import ProgressBars, add_seconds, positive_number, print_notice
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, open_folder

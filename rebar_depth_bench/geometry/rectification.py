@@ -17,13 +17,6 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from numpy import ndarray
 
 from rebar_depth_bench.geometry.cameras import inverse_rigid, pixel_rays, project
-from rebar_depth_bench.geometry.stereo_calibration import (
-    StereoCalibration,
-    calibrated_baseline_m,
-    lens_distortion,
-    lens_K,
-    right_from_left,
-)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,23 +33,6 @@ class Rectification:
     baseline_m: float
 
 
-def rectify(calibration: StereoCalibration) -> Rectification:
-    """Return the rectification for the image size of the calibration.
-
-    Calls ``cv2.stereoRectify`` with zero disparity at infinity and ``alpha=0``, which leaves no pixel outside the
-    raw images, as Stereolabs' open capture code does. (Bouguet's method: each camera is rotated by half.)
-    """
-    motion = right_from_left(calibration)
-    return rectify_pair(
-        (lens_K(calibration.left), lens_K(calibration.right)),
-        (lens_distortion(calibration.left), lens_distortion(calibration.right)),
-        motion,
-        calibration.width,
-        calibration.height,
-        calibrated_baseline_m(calibration),
-    )
-
-
 def rectify_pair(
     K: tuple[Float64[ndarray, "3 3"], Float64[ndarray, "3 3"]],
     distortion: tuple[Float64[ndarray, 5], Float64[ndarray, 5]],
@@ -65,9 +41,10 @@ def rectify_pair(
     height: int,
     baseline_m: float,
 ) -> Rectification:
-    """Return the rectification of a pair of cameras (left, right), as ``rectify`` does.
+    """Return the rectification of a pair of cameras (left, right); lengths are metres.
 
-    ``K`` and ``distortion`` are those of a dataset row; lengths are metres.
+    Calls ``cv2.stereoRectify`` with zero disparity at infinity and ``alpha=0``, which leaves no pixel outside the
+    raw images, as Stereolabs' open capture code does. (Bouguet's method: each camera is rotated by half.)
     """
     R_left, R_right, P_left, *_ = cv2.stereoRectify(
         K[0],
@@ -189,3 +166,47 @@ def resample(rgb: UInt8[ndarray, "h w 3"], maps: Any) -> UInt8[ndarray, "hc wc 3
     """Resample an image with OpenCV's two coordinate maps; bicubic, border pixels replicated."""
     map_x, map_y = maps
     return np.asarray(cv2.remap(rgb, map_x, map_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
+
+
+# Undistorted images of one camera, and transfer of depth back to the grid of its distorted image.
+
+
+@dataclass(frozen=True, eq=False)
+class PinholeGrid:
+    """Pinhole image grid that contains every pixel of a camera; without distortion, the camera's own grid.
+
+    ``canvas_pixel`` is the pixel (column, row) of this grid for each pixel of the camera, None if both grids are
+    the same. The optical axis is that of the camera, so planar depth is unchanged.
+    """
+
+    K: Float64[ndarray, "3 3"]
+    width: int
+    height: int
+    canvas_pixel: Int64[ndarray, "h w 2"] | None
+
+    def depth_on_left_grid(self, depth: Float32[ndarray, "hc wc"]) -> Float32[ndarray, "h w"]:
+        """Return planar depth (any unit) on the camera's grid, sampled at the pixel that each ray falls on."""
+        if self.canvas_pixel is None:
+            return depth
+        column, row = np.moveaxis(self.canvas_pixel, -1, 0)
+        return np.asarray(depth[row, column])
+
+
+def pinhole_grid(row: Mapping[str, Any], width: int, height: int) -> PinholeGrid:
+    """Return the pinhole grid of a row's ``width`` x ``height`` left camera (``left_K``, ``left_distortion``)."""
+    K, distortion = row["left_K"], row["left_distortion"]
+    if not distortion.any():
+        return PinholeGrid(K, width, height, None)
+    rays = pixel_rays(K, width, height, distortion)
+    wide_K, (wide_width, wide_height) = enclosing_canvas(K, [project(K, rays)])
+    return PinholeGrid(wide_K, wide_width, wide_height, np.rint(project(wide_K, rays)).astype(np.int64))
+
+
+def pinhole_image(row: Mapping[str, Any], grid: PinholeGrid) -> UInt8[ndarray, "hc wc 3"]:
+    """Return a row's left image on its pinhole grid, resampled (bicubic) if the lens has distortion."""
+    if grid.canvas_pixel is None:
+        return np.asarray(row["left_rgb"])
+    maps = cv2.initUndistortRectifyMap(
+        row["left_K"], row["left_distortion"], np.eye(3), grid.K, (grid.width, grid.height), cv2.CV_32FC1
+    )
+    return resample(row["left_rgb"], maps)

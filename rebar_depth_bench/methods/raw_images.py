@@ -1,7 +1,7 @@
 """Rectified images for methods that do not read the lens distortion, and their depth on the raw left grid.
 
 A method that reads the right image is given the rectified pair (``geometry.rectification``), another one the
-undistorted left image (``geometry.undistortion``). Its depth is transferred to the raw left image without
+undistorted left image (``geometry.rectification``). Its depth is transferred to the raw left image without
 interpolation. Multi-view methods, and those that read ``left_distortion``, do this themselves.
 """
 
@@ -79,7 +79,7 @@ def _rectified_pair(row: Mapping[str, Any]) -> tuple[dict[str, Any], Callable[[A
 
 
 def _undistorted_left(row: Mapping[str, Any]) -> tuple[dict[str, Any], Callable[[Any], Any]]:
-    from rebar_depth_bench.geometry.undistortion import pinhole_grid, pinhole_image
+    from rebar_depth_bench.geometry.rectification import pinhole_grid, pinhole_image
 
     height, width, _ = row["left_rgb"].shape
     grid = pinhole_grid(row, width, height)

@@ -34,8 +34,8 @@ from typing import Any
 import numpy as np
 from numpy import ndarray
 
+from rebar_depth_bench.captures.documents import parse_document
 from rebar_depth_bench.errors import MethodError, Problem
-from rebar_depth_bench.geometry.calibration_documents import parse_document
 from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
 from rebar_depth_bench.methods.monocular.conversions import crop_margins, margins_to_multiple, padded

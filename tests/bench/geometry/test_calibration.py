@@ -16,9 +16,7 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rebar_depth_bench.geometry.calibration import read_calibration
-from rebar_depth_bench.geometry.cameras import project
-from rebar_depth_bench.geometry.stereo_calibration import (
+from rebar_depth_bench.captures.calibration import (
     Lens,
     StereoCalibration,
     lens_distortion,
@@ -26,6 +24,8 @@ from rebar_depth_bench.geometry.stereo_calibration import (
     right_from_left,
     scale_calibration,
 )
+from rebar_depth_bench.captures.calibration_files import read_calibration
+from rebar_depth_bench.geometry.cameras import project
 from tests.bench.geometry.calibrations import CONF, SHIPPED_CALIBRATION, TOML, write_and_read
 
 EXPECTED = StereoCalibration(

@@ -9,9 +9,9 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 from numpy import ndarray
 
-from rebar_depth_bench.geometry.calibration import read_calibration
+from rebar_depth_bench.captures.calibration import lens_distortion, lens_K, right_from_left
+from rebar_depth_bench.captures.calibration_files import read_calibration
 from rebar_depth_bench.geometry.cameras import ideal_K, inverse_rigid, pixel_rays, right_camera_pose, rigid
-from rebar_depth_bench.geometry.stereo_calibration import lens_distortion, lens_K, right_from_left
 from tests.bench.geometry.calibrations import SHIPPED_CALIBRATION
 
 WIDTH, HEIGHT = 480, 270

@@ -10,10 +10,17 @@ import pytest
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.cameras.rigs import rig_cameras, zed_rig
+from dataset_builder.cameras.rigs import rectify, rig_cameras, zed_rig
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.scene.raycast import RayCaster
 from dataset_builder.specs.config_specs import RigSpec
+from rebar_depth_bench.captures.calibration import (
+    StereoCalibration,
+    lens_distortion,
+    lens_K,
+    right_from_left,
+    scale_calibration,
+)
 from rebar_depth_bench.geometry.cameras import (
     Camera,
     camera_centre,
@@ -25,14 +32,6 @@ from rebar_depth_bench.geometry.cameras import (
     right_camera_pose,
     rigid,
     transform,
-)
-from rebar_depth_bench.geometry.rectification import rectify
-from rebar_depth_bench.geometry.stereo_calibration import (
-    StereoCalibration,
-    lens_distortion,
-    lens_K,
-    right_from_left,
-    scale_calibration,
 )
 
 POSE = look_at(np.array([0.20, -0.24, 0.15]), np.array([0.0, 0.0, 0.05]))

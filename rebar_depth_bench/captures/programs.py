@@ -21,11 +21,9 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from rebar_depth_bench.captures.calibration import ROTATION_TOLERANCE, Calibration, table_calibration
 from rebar_depth_bench.errors import Problem
-from rebar_depth_bench.geometry.calibration_quantities import ROTATION_TOLERANCE
-from rebar_depth_bench.geometry.calibration_toml import table_calibration
 from rebar_depth_bench.geometry.cameras import rotation_matrix
-from rebar_depth_bench.geometry.stereo_calibration import Calibration
 from rebar_depth_bench.reading import parse_number
 from rebar_depth_bench.validation import format_location, short_repr
 

@@ -1,43 +1,157 @@
-"""Parser of camera calibrations in TOML: of a stereo pair, or of one camera.
+"""Calibration of one camera or of a stereo pair, and its table in TOML.
 
-``calibration.read_calibration`` documents the keys; a file of one camera has the table ``[left]`` alone.
+``calibration_files.read_calibration`` documents the keys; a table of one camera has the table ``[left]`` alone.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Annotated, Any
+from dataclasses import dataclass, replace
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
+from jaxtyping import Float64
+from numpy import ndarray
 from pydantic import Field, Strict, ValidationInfo, field_validator
 
 from rebar_depth_bench.errors import Problem
-from rebar_depth_bench.geometry.calibration_quantities import (
-    ANGLE_RAD,
-    BASELINE_M,
-    DISTORTION,
-    FOCAL_PX,
-    OFFSET_M,
-    ROTATION_TOLERANCE,
-    SIDES_PX,
-    principal_point,
-)
-from rebar_depth_bench.geometry.cameras import rotation_vector
-from rebar_depth_bench.geometry.stereo_calibration import (
-    Calibration,
-    Lens,
-    MonoCalibration,
-    StereoCalibration,
-)
+from rebar_depth_bench.geometry.cameras import rigid, rotation_matrix, rotation_vector, undistort
 from rebar_depth_bench.validation import (
     Expected,
     StrictModel,
     Triple,
     field_error,
+    number,
     validate_table,
     whole_number,
 )
+
+
+@dataclass(frozen=True)
+class Lens:
+    """Intrinsics of one camera: pinhole parameters, pixels, and distortion k1 k2 p1 p2 k3 (OpenCV's order)."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    distortion: tuple[float, float, float, float, float]
+
+
+@dataclass(frozen=True)
+class StereoCalibration:
+    """Calibrated stereo pair, with ``x_right = R(rotation_rad) @ x_left + translation_m`` in OpenCV axes.
+
+    ``rotation_rad`` is a Rodrigues vector; ``translation_m`` is about (-baseline, 0, 0). The intrinsics apply to
+    images of ``width`` x ``height`` pixels.
+    """
+
+    width: int
+    height: int
+    left: Lens
+    right: Lens
+    rotation_rad: tuple[float, float, float]
+    translation_m: tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class MonoCalibration:
+    """Calibrated camera, for images of ``width`` x ``height`` pixels."""
+
+    width: int
+    height: int
+    left: Lens
+
+
+Calibration = StereoCalibration | MonoCalibration
+_AnyCalibration = TypeVar("_AnyCalibration", StereoCalibration, MonoCalibration, Calibration)
+
+
+def lens_K(lens: Lens) -> Float64[ndarray, "3 3"]:
+    """Return the pinhole matrix of a camera, pixels."""
+    return np.array([[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]])
+
+
+def lens_distortion(lens: Lens) -> Float64[ndarray, 5]:
+    """Return the distortion coefficients k1 k2 p1 p2 k3."""
+    return np.array(lens.distortion, dtype=np.float64)
+
+
+def right_from_left(calibration: StereoCalibration) -> Float64[ndarray, "4 4"]:
+    """Return the rigid motion ``x_right = R x_left + T`` as a 4 x 4 matrix, metres."""
+    return rigid(rotation_matrix(calibration.rotation_rad), np.array(calibration.translation_m))
+
+
+def calibrated_baseline_m(calibration: StereoCalibration) -> float:
+    """Return the distance between the camera centres, metres."""
+    return float(np.linalg.norm(calibration.translation_m))
+
+
+def scale_calibration(calibration: _AnyCalibration, width: int, height: int) -> _AnyCalibration:
+    """Return the calibration for another image size that covers the same sensor area.
+
+    Pixel centres are at integers, so scaling a side from W to W' gives cx' = (cx + 0.5) W'/W - 0.5. The distortion
+    coefficients refer to the plane z = 1 and do not change.
+    """
+    scale_x, scale_y = width / calibration.width, height / calibration.height
+    if (scale_x, scale_y) == (1.0, 1.0):
+        return calibration
+
+    def scale_lens(lens: Lens) -> Lens:
+        cx, cy = (lens.cx + 0.5) * scale_x - 0.5, (lens.cy + 0.5) * scale_y - 0.5
+        return replace(lens, fx=lens.fx * scale_x, fy=lens.fy * scale_y, cx=cx, cy=cy)
+
+    scaled = replace(calibration, width=width, height=height, left=scale_lens(calibration.left))
+    return scaled if isinstance(scaled, MonoCalibration) else replace(scaled, right=scale_lens(scaled.right))
+
+
+def check_invertible(lens: Lens, width: int, height: int) -> None:
+    """Check that the distortion can be inverted at all pixels on the rim of a ``width`` x ``height`` image.
+
+    The rim is farthest from the principal point and the model folds at a radius, so that an invertible rim implies
+    an invertible image. Raises ``ValueError`` if it cannot be inverted.
+    """
+    u, v = np.arange(-0.5, width), np.arange(-0.5, height)
+    rim = np.concatenate(
+        [np.stack(np.broadcast_arrays(u, edge), axis=-1) for edge in (v[0], v[-1])]
+        + [np.stack(np.broadcast_arrays(edge, v), axis=-1) for edge in (u[0], u[-1])]
+    )
+    undistort((rim - (lens.cx, lens.cy)) / (lens.fx, lens.fy), lens_distortion(lens))
+
+
+# Bounds of the numbers: image sizes, intrinsics, distortion, and the motion of a pair.
+
+
+SIDES_PX = range(16, 16385)
+"""Accepted widths and heights of images, pixels."""
+MIN_PRINCIPAL_POINT = -0.5
+"""Smallest coordinate of a principal point, pixels: the left edge of the first pixel, whose centre is at 0."""
+ROTATION_TOLERANCE = 1e-6
+"""Largest deviation of ``R @ R.T`` from the identity for a 3 x 3 rotation."""
+
+
+def quantity(low: float, high: float, unit: str) -> Expected:
+    """Return the description of numbers from ``low`` to ``high``."""
+    return number(low, high, f"a number from {low:g} to {high:g} {unit}")
+
+
+def principal_point(side_px: int) -> Expected:
+    """Return the description of a coordinate of the principal point in an image of ``side_px`` pixels."""
+    return quantity(MIN_PRINCIPAL_POINT, side_px - 0.5, "pixels")
+
+
+FOCAL_PX = quantity(1, 1e5, "pixels")
+DISTORTION = number(-1000, 1000)
+ANGLE_RAD = quantity(-0.5, 0.5, "radians")
+BASELINE_MM = quantity(1, 10_000, "millimetres")
+OFFSET_MM = quantity(-1000, 1000, "millimetres")
+BASELINE_M = quantity(0.001, 10, "metres")
+OFFSET_M = quantity(-10, 10, "metres")
+
+
+# Table of a calibration.
+
 
 _Matrix = Annotated[tuple[Triple, Triple, Triple], Strict(False)]
 _Offset = Annotated[float, OFFSET_M]
