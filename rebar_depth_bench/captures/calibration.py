@@ -15,8 +15,8 @@ from jaxtyping import Float64
 from numpy import ndarray
 from pydantic import Field, Strict, ValidationInfo, field_validator
 
-from rebar_depth_bench.errors import Problem
-from rebar_depth_bench.geometry.cameras import rigid, rotation_matrix, rotation_vector, undistort
+from rebar_depth_bench.errors import CalibrationError, Problem
+from rebar_depth_bench.geometry.cameras import is_rotation, rigid, rotation_matrix, rotation_vector, undistort
 from rebar_depth_bench.validation import (
     Expected,
     StrictModel,
@@ -38,6 +38,11 @@ class Lens:
     cy: float
     distortion: tuple[float, float, float, float, float]
 
+    @property
+    def K(self) -> Float64[ndarray, "3 3"]:
+        """Pinhole matrix, pixels."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
 
 @dataclass(frozen=True)
 class StereoCalibration:
@@ -54,6 +59,23 @@ class StereoCalibration:
     rotation_rad: tuple[float, float, float]
     translation_m: tuple[float, float, float]
 
+    @property
+    def right_from_left(self) -> Float64[ndarray, "4 4"]:
+        """Rigid motion ``x_right = R x_left + T`` as a 4 x 4 matrix, metres."""
+        return rigid(rotation_matrix(self.rotation_rad), np.array(self.translation_m))
+
+    @property
+    def baseline_m(self) -> float:
+        """Distance between the camera centres, metres."""
+        return float(np.linalg.norm(self.translation_m))
+
+    @property
+    def is_rectified(self) -> bool:
+        """Whether the cameras have no distortion, are parallel, and differ in x only."""
+        left, right = self.left, self.right
+        moved = (*self.rotation_rad, *self.translation_m[1:], *left.distortion, *right.distortion)
+        return (left.fx, left.fy, left.cy) == (right.fx, right.fy, right.cy) and not any(moved)
+
 
 @dataclass(frozen=True)
 class MonoCalibration:
@@ -63,29 +85,32 @@ class MonoCalibration:
     height: int
     left: Lens
 
+    @property
+    def is_rectified(self) -> bool:
+        """Whether the camera has no distortion."""
+        return not any(self.left.distortion)
+
 
 Calibration = StereoCalibration | MonoCalibration
 _AnyCalibration = TypeVar("_AnyCalibration", StereoCalibration, MonoCalibration, Calibration)
 
 
-def lens_K(lens: Lens) -> Float64[ndarray, "3 3"]:
-    """Return the pinhole matrix of a camera, pixels."""
-    return np.array([[lens.fx, 0.0, lens.cx], [0.0, lens.fy, lens.cy], [0.0, 0.0, 1.0]])
-
-
-def lens_distortion(lens: Lens) -> Float64[ndarray, 5]:
-    """Return the distortion coefficients k1 k2 p1 p2 k3."""
-    return np.array(lens.distortion, dtype=np.float64)
-
-
-def right_from_left(calibration: StereoCalibration) -> Float64[ndarray, "4 4"]:
-    """Return the rigid motion ``x_right = R x_left + T`` as a 4 x 4 matrix, metres."""
-    return rigid(rotation_matrix(calibration.rotation_rad), np.array(calibration.translation_m))
-
-
-def calibrated_baseline_m(calibration: StereoCalibration) -> float:
-    """Return the distance between the camera centres, metres."""
-    return float(np.linalg.norm(calibration.translation_m))
+def camera_columns(calibration: Calibration, left_cam_from_world: Float64[ndarray, "4 4"]) -> dict[str, Any]:
+    """Return the columns of a dataset that describe the calibrated cameras, for a pose of the left one."""
+    left = calibration.left
+    columns = {
+        "left_K": left.K,
+        "left_distortion": np.array(left.distortion),
+        "left_cam_from_world": left_cam_from_world,
+    }
+    if isinstance(calibration, MonoCalibration):
+        return columns
+    return columns | {
+        "right_K": calibration.right.K,
+        "right_distortion": np.array(calibration.right.distortion),
+        "right_cam_from_world": calibration.right_from_left @ left_cam_from_world,
+        "baseline_m": calibration.baseline_m,
+    }
 
 
 def scale_calibration(calibration: _AnyCalibration, width: int, height: int) -> _AnyCalibration:
@@ -106,7 +131,38 @@ def scale_calibration(calibration: _AnyCalibration, width: int, height: int) -> 
     return scaled if isinstance(scaled, MonoCalibration) else replace(scaled, right=scale_lens(scaled.right))
 
 
-def check_invertible(lens: Lens, width: int, height: int) -> None:
+def scaled_calibration(calibration: _AnyCalibration, source: object, width: int, height: int) -> _AnyCalibration:
+    """Return the calibration in the file ``source`` for images of ``width`` x ``height`` pixels.
+
+    Raises ``CalibrationError`` if the right camera is not beside the left one, if a distortion has no inverse, and
+    for images of another aspect ratio.
+    """
+    problems = []
+    eyes = {"left": calibration.left}
+    if isinstance(calibration, StereoCalibration):
+        eyes["right"] = calibration.right
+        x_m, y_m, z_m = calibration.translation_m
+        if max(abs(y_m), abs(z_m)) > abs(x_m) / 2:
+            found = f"the right camera is at {(-x_m, -y_m, -z_m)} m from the left one"
+            problems.append(Problem("conflict", "stereo", found, "an offset mostly along x"))
+    for eye, lens in eyes.items():
+        try:
+            _check_invertible(lens, calibration.width, calibration.height)
+        except ValueError as error:
+            found = f"the distortion cannot be inverted at the image border: {error}"
+            problems.append(Problem("conflict", eye, found))
+    scaled = scale_calibration(calibration, width, height)
+    ratio = scaled.left.fx / scaled.left.fy
+    if not problems and abs(ratio - 1) > _SQUARE_PIXEL_TOLERANCE:
+        found = f"at {width} x {height} pixels fx is {ratio:.3f} times fy"
+        expected = "1: these are the cameras of images of another aspect ratio"
+        problems.append(Problem("conflict", "", found, expected))
+    if problems:
+        raise CalibrationError.from_problems(source, problems)
+    return scaled
+
+
+def _check_invertible(lens: Lens, width: int, height: int) -> None:
     """Check that the distortion can be inverted at all pixels on the rim of a ``width`` x ``height`` image.
 
     The rim is farthest from the principal point and the model folds at a radius, so that an invertible rim implies
@@ -117,18 +173,19 @@ def check_invertible(lens: Lens, width: int, height: int) -> None:
         [np.stack(np.broadcast_arrays(u, edge), axis=-1) for edge in (v[0], v[-1])]
         + [np.stack(np.broadcast_arrays(edge, v), axis=-1) for edge in (u[0], u[-1])]
     )
-    undistort((rim - (lens.cx, lens.cy)) / (lens.fx, lens.fy), lens_distortion(lens))
+    undistort((rim - (lens.cx, lens.cy)) / (lens.fx, lens.fy), np.array(lens.distortion))
 
 
-# Bounds of the numbers: image sizes, intrinsics, distortion, and the motion of a pair.
-
+# Bounds of the numbers.
 
 SIDES_PX = range(16, 16385)
 """Accepted widths and heights of images, pixels."""
-MIN_PRINCIPAL_POINT = -0.5
-"""Smallest coordinate of a principal point, pixels: the left edge of the first pixel, whose centre is at 0."""
-ROTATION_TOLERANCE = 1e-6
-"""Largest deviation of ``R @ R.T`` from the identity for a 3 x 3 rotation."""
+_SQUARE_PIXEL_TOLERANCE = 0.03
+"""Maximum deviation of fx / fy from 1.
+
+Real cameras deviate by a fraction of a per cent; images of a different aspect ratio than the calibration's cause
+larger deviations.
+"""
 
 
 def quantity(low: float, high: float, unit: str) -> Expected:
@@ -137,24 +194,21 @@ def quantity(low: float, high: float, unit: str) -> Expected:
 
 
 def principal_point(side_px: int) -> Expected:
-    """Return the description of a coordinate of the principal point in an image of ``side_px`` pixels."""
-    return quantity(MIN_PRINCIPAL_POINT, side_px - 0.5, "pixels")
+    """Return the description of a coordinate of the principal point: on a pixel, whose centres are integers."""
+    return quantity(-0.5, side_px - 0.5, "pixels")
 
 
 FOCAL_PX = quantity(1, 1e5, "pixels")
 DISTORTION = number(-1000, 1000)
 ANGLE_RAD = quantity(-0.5, 0.5, "radians")
-BASELINE_MM = quantity(1, 10_000, "millimetres")
-OFFSET_MM = quantity(-1000, 1000, "millimetres")
-BASELINE_M = quantity(0.001, 10, "metres")
-OFFSET_M = quantity(-10, 10, "metres")
+_BASELINE_M = quantity(0.001, 10, "metres")
 
 
 # Table of a calibration.
 
 
 _Matrix = Annotated[tuple[Triple, Triple, Triple], Strict(False)]
-_Offset = Annotated[float, OFFSET_M]
+_Offset = Annotated[float, quantity(-10, 10, "metres")]
 _Pixels = Annotated[float, Expected("a number of pixels")]
 _Side = Annotated[int, whole_number(SIDES_PX[0], SIDES_PX[-1])]
 _PINHOLE_ENTRIES: Mapping[str, tuple[int, int]] = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
@@ -164,23 +218,17 @@ _PINHOLE = Expected(
 _TERMS = Expected("[k1, k2, p1, p2] or [k1, k2, p1, p2, k3]", lambda terms: len(terms) in (4, 5))
 
 
-def is_small_rotation(rotation: Triple | _Matrix) -> bool:
+def _is_small_rotation(rotation: Triple | _Matrix) -> bool:
     """Return whether a Rodrigues vector, or a rotation matrix, has a plausible angle."""
     values = np.array(rotation)
     if values.ndim == 1:
         return all(map(ANGLE_RAD.accept, rotation))
-    if not (np.abs(values) <= 1 + ROTATION_TOLERANCE).all():  # The products stay finite; false for NaN.
-        return False
     cosine = (float(np.trace(values)) - 1.0) / 2
-    return bool(
-        np.abs(values @ values.T - np.eye(3)).max() <= ROTATION_TOLERANCE
-        and np.linalg.det(values) >= 0
-        and ANGLE_RAD.accept(math.acos(max(-1.0, min(1.0, cosine))))
-    )
+    return is_rotation(values) and ANGLE_RAD.accept(math.acos(max(-1.0, min(1.0, cosine))))
 
 
 _ROTATION = Expected(
-    f"a Rodrigues vector or a 3 x 3 rotation matrix, each angle {ANGLE_RAD.text}", is_small_rotation
+    f"a Rodrigues vector or a 3 x 3 rotation matrix, each angle {ANGLE_RAD.text}", _is_small_rotation
 )
 
 
@@ -222,7 +270,7 @@ class _StereoTable(StrictModel):
     """Table ``[stereo]``; the baseline is converted to a translation."""
 
     rotation: Annotated[Triple | _Matrix, _ROTATION]
-    baseline_m: Annotated[float, BASELINE_M] | None = None
+    baseline_m: Annotated[float, _BASELINE_M] | None = None
     translation_m: Annotated[
         tuple[_Offset, _Offset, _Offset], Strict(False), Expected("three numbers, metres")
     ] = Field(default=None, validate_default=True)
@@ -238,8 +286,8 @@ class _StereoTable(StrictModel):
     @field_validator("translation_m")
     @classmethod
     def _check_baseline(cls, translation_m: Triple) -> Triple:
-        if not BASELINE_M.accept(-translation_m[0]):
-            raise field_error(f"got {list(translation_m)}", f"[-baseline, y, z], the baseline {BASELINE_M.text}")
+        if not _BASELINE_M.accept(-translation_m[0]):
+            raise field_error(f"got {list(translation_m)}", f"[-baseline, y, z], the baseline {_BASELINE_M.text}")
         return translation_m
 
 
@@ -250,12 +298,25 @@ class _OneCamera(StrictModel):
     height: _Side
     left: _LensTable
 
+    @property
+    def calibration(self) -> Calibration:
+        """Calibration of the table."""
+        return MonoCalibration(self.width, self.height, self.left.lens)
+
 
 class _TwoCameras(_OneCamera):
     """Content of a file of a stereo pair."""
 
     right: _LensTable
     stereo: _StereoTable
+
+    @property
+    def calibration(self) -> StereoCalibration:
+        """Calibration of the tables."""
+        rotation = np.array(self.stereo.rotation)
+        x, y, z = (rotation if rotation.ndim == 1 else rotation_vector(rotation)).tolist()
+        lenses = self.left.lens, self.right.lens
+        return StereoCalibration(self.width, self.height, *lenses, (x, y, z), self.stereo.translation_m)
 
 
 def _check_one_given(values: Mapping[str, object]) -> None:
@@ -278,11 +339,4 @@ def table_calibration(
     values = {**sides_px, **document}
     context = {key: values[key] if values[key] in SIDES_PX else side_px for key, side_px in sides_px.items()}
     table = validate_table(_TwoCameras if is_stereo else _OneCamera, values, problems, context=context)
-    if table is None:
-        return None
-    if not isinstance(table, _TwoCameras):
-        return MonoCalibration(table.width, table.height, table.left.lens)
-    rotation = np.array(table.stereo.rotation)
-    x, y, z = (rotation if rotation.ndim == 1 else rotation_vector(rotation)).tolist()
-    left, right, translation_m = table.left.lens, table.right.lens, table.stereo.translation_m
-    return StereoCalibration(table.width, table.height, left, right, (x, y, z), translation_m)
+    return None if table is None else table.calibration

@@ -4,25 +4,20 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
-from functools import partial
+from collections.abc import Mapping
 from pathlib import Path
-from typing import TypeVar
 
 from rebar_depth_bench.captures.calibration import (
     ANGLE_RAD,
-    BASELINE_MM,
     DISTORTION,
     FOCAL_PX,
-    OFFSET_MM,
     SIDES_PX,
     Calibration,
     Lens,
-    MonoCalibration,
     StereoCalibration,
-    check_invertible,
     principal_point,
-    scale_calibration,
+    quantity,
+    scaled_calibration,
     table_calibration,
 )
 from rebar_depth_bench.errors import MAX_PROBLEMS_SHOWN, CalibrationError, Problem, escape_text
@@ -30,16 +25,6 @@ from rebar_depth_bench.key_lines import with_lines
 from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.reading import parse_number, parse_toml, read_file
 from rebar_depth_bench.validation import Expected, format_location, short_repr
-
-_AnyCalibration = TypeVar("_AnyCalibration", StereoCalibration, MonoCalibration, Calibration)
-Parser = Callable[[bytes, int, int, list[Problem]], StereoCalibration | None]
-
-
-def _read_toml(content: bytes, width: int, height: int, problems: list[Problem]) -> StereoCalibration | None:
-    document, syntax_problems = parse_toml(content)
-    problems += syntax_problems
-    table = None if problems else table_calibration(document, width, height, problems, is_stereo=True)
-    return table if isinstance(table, StereoCalibration) else None
 
 
 def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibration:
@@ -75,20 +60,22 @@ def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibra
         translation_m = [-0.119978, 0.0, 0.0]
 
     Raises ``CalibrationError`` with all problems of the file; also if a distortion model cannot be inverted over
-    the whole image, and if the requested size is not 16 to 16384 pixels each.
+    the whole image, if the requested size is not 16 to 16384 pixels each, and if its aspect ratio is another one.
     """
     path = Path(path)
-    parsers: Mapping[str, Parser] = {".conf": read_conf, ".toml": _read_toml}
-    parser = parsers.get(path.suffix.lower())
-    if parser is None:
-        problem = Problem("invalid", "", f"the file suffix is {path.suffix!r}", " or ".join(parsers))
+    suffix = path.suffix.lower()
+    if suffix not in (".conf", ".toml"):
+        problem = Problem("invalid", "", f"the file suffix is {path.suffix!r}", ".conf or .toml")
         raise CalibrationError.from_problems(path, [problem])
     content = read_file(path, TOML_BYTES, "a calibration file", CalibrationError)
     check_image_size(path, width, height)
     problems: list[Problem] = []
-    calibration = parser(content, width, height, problems)
-    if calibration is None or problems:
-        problems += calibration_problems(calibration)
+    if suffix == ".conf":
+        calibration: Calibration | None = _read_conf(content, width, height, problems)
+    else:
+        document, problems = parse_toml(content)
+        calibration = None if problems else table_calibration(document, width, height, problems, is_stereo=True)
+    if not isinstance(calibration, StereoCalibration):
         raise CalibrationError.from_problems(path, with_lines(problems, content))
     return scaled_calibration(calibration, path, width, height)
 
@@ -101,38 +88,9 @@ def check_image_size(path: object, width: int, height: int) -> None:
         raise CalibrationError.from_problems(path, [problem])
 
 
-def scaled_calibration(calibration: _AnyCalibration, path: object, width: int, height: int) -> _AnyCalibration:
-    """Return a calibration for another image size; raise ``CalibrationError`` with its problems if it has any."""
-    if problems := calibration_problems(calibration):
-        raise CalibrationError.from_problems(path, problems)
-    return scale_calibration(calibration, width, height)
+# Stereolabs' files, an INI format.
 
-
-def calibration_problems(calibration: Calibration | None) -> list[Problem]:
-    """Return what is wrong with a calibration: an offset that is not along x, distortion without an inverse."""
-    if calibration is None:
-        return []
-    problems = []
-    eyes = {"left": calibration.left}
-    if isinstance(calibration, StereoCalibration):
-        eyes["right"] = calibration.right
-        x_m, y_m, z_m = calibration.translation_m
-        if max(abs(y_m), abs(z_m)) > abs(x_m) / 2:
-            found = f"the right camera is at {(-x_m, -y_m, -z_m)} m from the left one"
-            problems.append(Problem("conflict", "stereo", found, "an offset mostly along x"))
-    for eye, lens in eyes.items():
-        try:
-            check_invertible(lens, calibration.width, calibration.height)
-        except ValueError as error:
-            found = f"the distortion cannot be inverted at the image border: {error}"
-            problems.append(Problem("conflict", eye, found))
-    return problems
-
-
-# Parser of Stereolabs' calibration files, an INI format.
-
-
-STEREOLABS_GRIDS: Mapping[str, tuple[int, int]] = {
+_GRIDS: Mapping[str, tuple[int, int]] = {
     "2K": (2208, 1242),
     "FHD": (1920, 1080),
     "FHD1200": (1920, 1200),
@@ -142,44 +100,57 @@ STEREOLABS_GRIDS: Mapping[str, tuple[int, int]] = {
 }
 """Image sizes (width, height) of Stereolabs cameras, pixels, by section suffix."""
 
-Sections = Mapping[str, Mapping[str, tuple[int, str]]]
+_STEREO: Mapping[str, Expected] = {
+    "Baseline": quantity(1, 10_000, "millimetres"),
+    **dict.fromkeys(("TY", "TZ"), quantity(-1000, 1000, "millimetres")),
+    **dict.fromkeys(("RX", "CV", "RZ"), ANGLE_RAD),
+}
+"""Keys of the section ``[STEREO]``."""
+_OPTIONAL = ("p1", "p2", "k3", "TY", "TZ")
+"""Keys that may be missing, which means 0."""
+
+_Sections = Mapping[str, Mapping[str, tuple[int, str]]]
 """Line and text of each key of each section."""
 _COMMENT = re.compile(r"(?:^|\s)[;#]")
 _SEPARATOR = re.compile("[=:]")
 
 
-def read_conf(content: bytes, width: int, height: int, problems: list[Problem]) -> StereoCalibration | None:
+def _camera_keys(width: int, height: int) -> Mapping[str, Expected]:
+    """Return the keys of the section of a camera whose images have ``width`` x ``height`` pixels."""
+    return {
+        **dict.fromkeys(("fx", "fy"), FOCAL_PX),
+        "cx": principal_point(width),
+        "cy": principal_point(height),
+        **dict.fromkeys(("k1", "k2", "p1", "p2", "k3"), DISTORTION),
+    }
+
+
+def _read_conf(content: bytes, width: int, height: int, problems: list[Problem]) -> StereoCalibration | None:
     """Return the calibration of a Stereolabs ``.conf`` file for one of its image sizes; the caller scales it.
 
     The size is that nearest to ``width`` x ``height`` in aspect ratio, then in width. Section names and keys are
-    case-insensitive, unknown keys are ignored.
+    case-insensitive, unknown keys are ignored. Problems are added to ``problems``; the result is None if there are
+    any.
     """
     sections = _read_sections(content, problems)
     suffix = _nearest_suffix(sections, width, height, problems)
     if suffix is None:
         return None
-    width, height = STEREOLABS_GRIDS[suffix]
+    width, height = _GRIDS[suffix]
     names = (f"LEFT_CAM_{suffix}", f"RIGHT_CAM_{suffix}", "STEREO")
     problems += [Problem("missing", name, "missing", "a section") for name in names if name not in sections]
-    value = partial(_conf_number, sections, problems)
-
-    def lens(section: str) -> Lens:
-        fx, fy = value(section, ["fx"], FOCAL_PX), value(section, ["fy"], FOCAL_PX)
-        cx, cy = value(section, ["cx"], principal_point(width)), value(section, ["cy"], principal_point(height))
-        k1, k2 = (value(section, [key], DISTORTION) for key in ("k1", "k2"))
-        p1, p2, k3 = (value(section, [key], DISTORTION, default=0.0) for key in ("p1", "p2", "k3"))
-        return Lens(fx, fy, cx, cy, (k1, k2, p1, p2, k3))
-
-    left, right = lens(names[0]), lens(names[1])
-    baseline_mm = value("STEREO", [f"Baseline_{suffix}", "Baseline"], BASELINE_MM)
-    y_mm, z_mm = (value("STEREO", [f"{key}_{suffix}", key], OFFSET_MM, default=0.0) for key in ("TY", "TZ"))
-    rx, cv, rz = (value("STEREO", [f"{key}_{suffix}", key], ANGLE_RAD) for key in ("RX", "CV", "RZ"))
+    lenses = []
+    for name in names[:2]:
+        keys = _camera_keys(width, height)
+        fx, fy, cx, cy, k1, k2, p1, p2, k3 = _section_numbers(sections, name, keys, suffix, problems)
+        lenses.append(Lens(fx, fy, cx, cy, (k1, k2, p1, p2, k3)))
+    baseline_mm, y_mm, z_mm, rx, cv, rz = _section_numbers(sections, "STEREO", _STEREO, suffix, problems)
     # The whole vector is negated, which keeps it on the line that the vendor's rectification uses.
     translation_m = (0.0 - baseline_mm / 1000, 0.0 - y_mm / 1000, 0.0 - z_mm / 1000)
-    return None if problems else StereoCalibration(width, height, left, right, (rx, cv, rz), translation_m)
+    return None if problems else StereoCalibration(width, height, *lenses, (rx, cv, rz), translation_m)
 
 
-def _read_sections(content: bytes, problems: list[Problem]) -> Sections:
+def _read_sections(content: bytes, problems: list[Problem]) -> _Sections:
     """Return the sections, names in upper and keys in lower case, without the comments after ``;`` and ``#``."""
     try:
         lines = content.decode("utf-8-sig").splitlines()
@@ -210,47 +181,44 @@ def _read_sections(content: bytes, problems: list[Problem]) -> Sections:
     return sections
 
 
-def _nearest_suffix(sections: Sections, width: int, height: int, problems: list[Problem]) -> str | None:
+def _nearest_suffix(sections: _Sections, width: int, height: int, problems: list[Problem]) -> str | None:
     """Return the suffix of the sections whose image size is nearest in aspect ratio, then in width.
 
     Returns None, and adds a problem if there is none yet, if the file has no sections of a known size.
     """
-    present = [name for name in STEREOLABS_GRIDS if {f"LEFT_CAM_{name}", f"RIGHT_CAM_{name}"} & set(sections)]
+    present = [name for name in _GRIDS if {f"LEFT_CAM_{name}", f"RIGHT_CAM_{name}"} & set(sections)]
     if not present and not problems:
         found = escape_text(", ".join(f"[{name}]" for name in sections) or "no section")
-        cameras = ", ".join(f"[LEFT_CAM_{name}]" for name in STEREOLABS_GRIDS)
+        cameras = ", ".join(f"[LEFT_CAM_{name}]" for name in _GRIDS)
         expected = f"one of {cameras} with its [RIGHT_CAM_...] and [STEREO]"
         problems.append(Problem("missing", "", f"the file has {found}", expected))
 
     def distance(suffix: str) -> tuple[float, float]:
-        grid_width, grid_height = STEREOLABS_GRIDS[suffix]
+        grid_width, grid_height = _GRIDS[suffix]
         return abs(math.log(grid_width * height / (width * grid_height))), abs(math.log(grid_width / width))
 
     return min(present, key=distance, default=None)
 
 
-def _conf_number(
-    sections: Sections,
-    problems: list[Problem],
-    section: str,
-    keys: list[str],
-    expected: Expected,
-    default: float | None = None,
-) -> float:
-    """Return the number of the first of ``keys`` in a section, or else ``default`` (NaN if it is None).
+def _section_numbers(
+    sections: _Sections, section: str, keys: Mapping[str, Expected], suffix: str, problems: list[Problem]
+) -> list[float]:
+    """Return the numbers of a section, by keys with the section's suffix or without; 0 for missing ones.
 
-    Add a problem if the number is invalid, or if it is missing from an existing section and has no default.
+    Add a problem for each invalid number, and for each missing one of an existing section unless it is optional.
     """
     values = sections.get(section, {})
-    key = next((key for key in keys if key.lower() in values), None)
-    if key is None:
-        if default is None and section in sections:
-            problems.append(Problem("missing", f"{section}.{keys[-1]}", "missing", expected.text))
-        return math.nan if default is None else default
-    line_number, raw = values[key.lower()]
-    value = parse_number(raw)
-    if not expected.accept(value):
-        problems.append(
-            Problem("invalid", f"{section}.{key}", f"line {line_number}: got {short_repr(raw)}", expected.text)
-        )
-    return value
+    numbers = []
+    for key, expected in keys.items():
+        name = next((name for name in (f"{key}_{suffix}", key) if name.lower() in values), None)
+        if name is None:
+            if section in sections and key not in _OPTIONAL:
+                problems.append(Problem("missing", f"{section}.{key}", "missing", expected.text))
+            numbers.append(0.0)
+            continue
+        line_number, raw = values[name.lower()]
+        numbers.append(parse_number(raw))
+        if not expected.accept(numbers[-1]):
+            found = f"line {line_number}: got {short_repr(raw)}"
+            problems.append(Problem("invalid", f"{section}.{name}", found, expected.text))
+    return numbers

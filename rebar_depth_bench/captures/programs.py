@@ -12,23 +12,25 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from rebar_depth_bench.captures.calibration import ROTATION_TOLERANCE, Calibration, table_calibration
-from rebar_depth_bench.errors import Problem
-from rebar_depth_bench.geometry.cameras import rotation_matrix
+from rebar_depth_bench.captures.calibration import Calibration, table_calibration
+from rebar_depth_bench.errors import Problem, ProblemCode
+from rebar_depth_bench.geometry.cameras import is_rotation, nearest_rotation, rotation_matrix
 from rebar_depth_bench.reading import parse_number
 from rebar_depth_bench.validation import format_location, short_repr
 
 Document = Mapping[str, Any]
 Values = Float64[ndarray, "..."]
+Fields = Mapping[str, Sequence[str]]
+"""Keys of each value that is read; the first one that a document has counts, without case and punctuation."""
 
 _KNOWN_MODEL = "k1 k2 p1 p2 k3 (plumb_bob, radtan); rectify the images first"
 _CAMERAS = ("left", "right")
@@ -40,78 +42,139 @@ _DISTORTION_TERMS = 5
 _MODELS = ("plumb_bob", "radtan", "rational_polynomial", "none", "")
 """Distortion models whose first terms are k1 k2 p1 p2 k3, or of a camera without distortion."""
 
+_ROS: Fields = {
+    "matrix": ("camera_matrix", "K"),
+    "distortion": ("distortion_coefficients", "D"),
+    "model": ("distortion_model",),
+    "size": (),
+    "width": ("image_width", "width"),
+    "height": ("image_height", "height"),
+    "rotation": ("rectification_matrix", "R"),
+    "projection": ("projection_matrix", "P"),
+}
+_KALIBR: Fields = {
+    "matrix": ("intrinsics",),
+    "distortion": ("distortion_coeffs",),
+    "model": ("distortion_model",),
+    "size": ("resolution",),
+    "projection model": ("camera_model",),
+    "motion": ("T_cn_cnm1",),
+}
 
+
+def _opencv_fields(eyes: Sequence[str]) -> Fields:
+    """Return the fields of a camera of OpenCV; ``eyes`` are the spellings of which one, before or after a name."""
+
+    def spellings(*names: str) -> tuple[str, ...]:
+        return tuple(spelling for name in names for eye in eyes for spelling in (name + eye, eye + name))
+
+    return {
+        "matrix": spellings("M", "K", "camera_matrix", "intrinsics", "intrinsic_matrix", "mtx", "cam_matrix"),
+        "distortion": spellings(
+            *("D", "distortion", "distortion_coefficients", "distortion_coeffs"),
+            *("dist", "dist_coeffs", "dist_coeff"),
+        ),
+        "model": ("distortion_model",),
+        "fisheye": ("fisheye_model",),
+        "size": ("image_size", "size", "camera_resolution", "resolution"),
+        "width": ("image_width", "width"),
+        "height": ("image_height", "height"),
+        "rotation": ("R", "rotation", "rotation_matrix", "rmat"),
+        "translation": ("T", "translation", "translation_vector", "tvec"),
+    }
+
+
+_OPENCV = _opencv_fields([""])
+_OPENCV_PAIR = (_opencv_fields(["1", "left", "l"]), _opencv_fields(["2", "right", "r"]))
+
+
+@dataclass(frozen=True)
 class _Reader:
     """Values of a document ``name``; problems are added to ``problems``, in place of which zeros are returned.
 
     ``sources`` names the files of the keys of a document that was put together from several.
     """
 
-    def __init__(
-        self, name: str, document: Document, problems: list[Problem], sources: Mapping[str, str] | None = None
-    ) -> None:
-        self.name, self.document, self._problems, self._sources = name, document, problems, sources or {}
-        self._keys = {_plain(str(key)): key for key in document}
+    name: str
+    document: Document
+    problems: list[Problem]
+    fields: Fields
+    sources: Mapping[str, str] = field(default_factory=dict)
 
-    def key(self, names: Iterable[str]) -> str | None:
-        """Return the first key that the document has, compared without case and punctuation."""
-        return next((self._keys[_plain(name)] for name in names if _plain(name) in self._keys), None)
+    @cached_property
+    def _keys(self) -> Mapping[str, str]:
+        return {_plain(str(key)): key for key in self.document}
 
-    def has(self, names: Iterable[str]) -> bool:
-        """Return whether the document has one of the keys."""
-        return self.key(names) is not None
+    def key(self, name: str) -> str | None:
+        """Return the key of a field in the document, None if it has none."""
+        return next((self._keys[key] for key in map(_plain, self.fields[name]) if key in self._keys), None)
 
-    def numbers(self, names: Sequence[str], shape: tuple[int, ...], default: Values | None = None) -> Values:
-        """Return the numbers of the first key; a side of ``shape`` that is -1 may have any length."""
-        key = self.key(names)
-        if key is None:
-            if default is None:
-                self.problem("missing", names[0], "missing", f"numbers of shape {_shape_text(shape)}")
-            return np.zeros([max(side, 0) for side in shape]) if default is None else default
-        value = self.document[key]
+    def numbers(self, name: str, *shapes: tuple[int, ...], default: Values | None = None) -> Values:
+        """Return the numbers of a field, in one of ``shapes``; a side that is -1 may have any length."""
+        key, zeros = self.key(name), np.zeros([max(side, 0) for side in shapes[0]])
+        texts = [" x ".join("n" if side < 0 else str(side) for side in shape) for shape in shapes]
+        expected = f"numbers of shape {' or '.join(texts)}"
+        if key is None and default is None:
+            self.problem("missing", name, "missing", expected)
+            return zeros
+        value = [] if key is None else self.document[key]
         flat = list(_flattened(value.get("data") if isinstance(value, dict) else value))
         if not flat and default is not None:
             return default
         if flat and len(flat) <= _MAX_NUMBERS and np.isfinite(flat).all():
-            try:
-                return np.array(flat, np.float64).reshape(shape)
-            except ValueError:
-                pass
-        self.problem("invalid", key, f"got {short_repr(value)}", f"numbers of shape {_shape_text(shape)}")
-        return np.zeros([max(side, 0) for side in shape])
+            for shape in shapes:
+                if -1 in shape or math.prod(shape) == len(flat):
+                    return np.array(flat, np.float64).reshape(shape)
+        self.problem("invalid", name, f"got {short_repr(value)}", expected)
+        return zeros
 
-    def table(self, key: str) -> _Reader:
-        """Return the reader of a table in the document."""
-        value = self.document.get(key)
-        if not isinstance(value, dict):
-            self.problem("invalid", key, f"got {short_repr(value)}", "a table")
-            value = {}
-        return _Reader(self.place(key), value, self._problems)
-
-    def lens(self, matrix: Values, distortion: Values, model: object = "") -> dict[str, Any]:
-        """Return the table of a lens for ``table_calibration``."""
+    def lens(self) -> dict[str, Any]:
+        """Return the table of the lens for ``table_calibration``."""
+        if self.fields is _KALIBR:  # Its intrinsics are these four numbers.
+            pinhole = dict(zip(("fx", "fy", "cx", "cy"), self.numbers("matrix", (4,)).tolist(), strict=True))
+        else:
+            pinhole = {"K": self.numbers("matrix", (3, 3)).tolist()}
+        terms = self.numbers("distortion", (-1,), default=np.zeros(_DISTORTION_TERMS))
+        key = self.key("model")
+        model = "" if key is None else self.document[key]
         if str(model).lower() not in _MODELS:
-            self._unknown_model(f"the distortion model is {short_repr(model)}")
-        elif distortion[_DISTORTION_TERMS:].any():
-            self._unknown_model(f"the distortion has {len(distortion)} terms")
-        terms = [*distortion[:_DISTORTION_TERMS].tolist(), *[0.0] * (4 - len(distortion))]
-        return {"K": matrix.tolist(), "distortion": terms}
+            self._refuse_lens(f"the distortion model is {short_repr(model)}")
+        elif terms[_DISTORTION_TERMS:].any():
+            self._refuse_lens(f"the distortion has {len(terms)} terms")
+        distortion = [*terms[:_DISTORTION_TERMS].tolist(), *[0.0] * (4 - len(terms))]
+        return {**pinhole, "distortion": distortion}
 
-    def problem(self, code: Any, key: str, found: str, expected: str) -> None:
-        """Add a problem at a key."""
-        self._problems.append(Problem(code, self.place(key), found, expected))
+    def size(self) -> dict[str, float]:
+        """Return width and height, from one field with both or from two; nothing if the document has none."""
+        if self.key("size"):
+            width, height = self.numbers("size", (2,)).tolist()
+        elif "width" in self.fields and self.key("width") and self.key("height"):
+            width, height = (float(self.numbers(name, (1,))[0]) for name in ("width", "height"))
+        else:
+            return {}
+        sides_px = {"width": width, "height": height}
+        return {key: int(side_px) if side_px.is_integer() else side_px for key, side_px in sides_px.items()}
 
-    def place(self, key: str) -> str:
+    def rotation(self) -> Values:
+        """Return the rotation matrix, which the file may also hold as a rotation vector."""
+        rotation = self.numbers("rotation", (3, 3), (3,))
+        return rotation_matrix(rotation) if rotation.ndim == 1 else rotation
+
+    def problem(self, code: ProblemCode, name: str, found: str, expected: str) -> None:
+        """Add a problem of a field."""
+        self.problems.append(Problem(code, self.place(name), found, expected))
+
+    def place(self, name: str) -> str:
+        """Return the location of a field."""
+        return self.key_place(self.key(name) or self.fields[name][0])
+
+    def key_place(self, key: str) -> str:
         """Return the location of a key."""
-        name = self._sources.get(key, self.name)
+        name = self.sources.get(key, self.name)
         return format_location(name if ": " in name else f"{name}:", key)
 
-    def place_of(self, names: Iterable[str]) -> str:
-        """Return the location of the first key that the document has."""
-        return self.place(self.key(names) or "")
-
-    def _unknown_model(self, found: str) -> None:
-        self._problems.append(Problem("invalid", self.name, found, _KNOWN_MODEL))
+    def _refuse_lens(self, found: str) -> None:
+        self.problems.append(Problem("invalid", self.name, found, _KNOWN_MODEL))
 
 
 def program_calibration(
@@ -122,32 +185,30 @@ def program_calibration(
     ``unit_m`` is the unit of lengths in the documents, metres; ``width`` and ``height`` are the image size where
     the documents state none. Problems are added to ``problems``; the result is None if there are any.
     """
-    readers = [_Reader(name, document, problems) for name, document in documents.items()]
-    if any(one.has(_ROS_MATRIX) and one.has(_ROS_PROJECTION) for one in readers):
-        cameras = _ros(readers, unit_m)
-    else:
+    cameras = [_Reader(name, document, problems, _ROS) for name, document in documents.items()]
+    find_motion = _ros_motion
+    if not any(camera.key("matrix") and camera.key("projection") for camera in cameras):
         merged = _merged(documents, problems)
-        cameras = _kalibr(merged, unit_m) if "cam0" in merged.document else _opencv(merged, unit_m)
+        if "cam0" in merged.document:
+            cameras, find_motion = _kalibr_cameras(merged), _kalibr_motion
+        else:
+            cameras, find_motion = _opencv_cameras(merged), _opencv_motion
+    table: dict[str, Any] = {eye: one.lens() for eye, one in zip(_CAMERAS, cameras, strict=False)}
+    table |= cameras[0].size()
+    if len(cameras) == 2:
+        rotation, translation_m = find_motion(*cameras, unit_m)
+        if not is_rotation(rotation) and is_rotation(rotation, _ROUNDED_ROTATION):
+            rotation = nearest_rotation(rotation)
+        table["stereo"] = {"rotation": rotation.tolist(), "translation_m": translation_m.tolist()}
     if problems:
         return None
     table_problems: list[Problem] = []
-    is_stereo = "stereo" in cameras.table
-    calibration = table_calibration(cameras.table, width, height, table_problems, is_stereo=is_stereo)
-    problems += map(cameras.located, table_problems)
+    calibration = table_calibration(table, width, height, table_problems, is_stereo=len(cameras) == 2)
+    for problem in table_problems:
+        eye, _, key = problem.where.partition(".")
+        place = cameras[eye == _CAMERAS[1]].place("matrix")
+        problems.append(replace(problem, where=place, found=f"{key or eye}: {problem.found}"))
     return calibration
-
-
-@dataclass(frozen=True)
-class _Cameras:
-    """Table of a calibration, as ``calibration_toml`` reads it, and locations of the matrix of each camera."""
-
-    table: Mapping[str, Any]
-    places: Sequence[str]
-
-    def located(self, problem: Problem) -> Problem:
-        """Return a problem of the table with its location in the documents."""
-        part, _, key = problem.where.partition(".")
-        return replace(problem, where=self.places[part == _CAMERAS[1]], found=f"{key or part}: {problem.found}")
 
 
 def _merged(documents: Mapping[str, Document], problems: list[Problem]) -> _Reader:
@@ -161,114 +222,56 @@ def _merged(documents: Mapping[str, Document], problems: list[Problem]) -> _Read
                 problems.append(Problem("duplicate", place, f"differs from that in {sources[key]}", "one value"))
             merged.setdefault(key, value)
             sources.setdefault(key, name)
-    return _Reader(next(iter(documents)), merged, problems, sources)
+    return _Reader(next(iter(documents)), merged, problems, _OPENCV, sources)
 
 
-def _kalibr(chain: _Reader, unit_m: float) -> _Cameras:
-    cameras = [chain.table(name) for name in ("cam0", "cam1") if name in chain.document]
-    table: dict[str, Any] = {}
-    for eye, camera in zip(_CAMERAS, cameras, strict=False):
-        model = camera.document.get("camera_model", "pinhole")
-        if model != "pinhole":
-            camera.problem("invalid", "camera_model", f"got {short_repr(model)}", "pinhole")
-        fx, fy, cx, cy = camera.numbers(_KALIBR_MATRIX, (4,)).tolist()
-        matrix = np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
-        terms = camera.numbers(("distortion_coeffs",), (-1,), np.zeros(4))
-        table[eye] = camera.lens(matrix, terms, camera.document.get("distortion_model", ""))
-    table |= _size(cameras[0], ("resolution",))
-    if len(cameras) == 2:
-        cam1_from_cam0 = cameras[1].numbers(("T_cn_cnm1",), (4, 4))
-        table["stereo"] = _motion(cam1_from_cam0[:3, :3], unit_m * cam1_from_cam0[:3, 3])
-    return _Cameras(table, [camera.place_of(_KALIBR_MATRIX) for camera in cameras])
+def _ros_motion(left: _Reader, right: _Reader, unit_m: float) -> tuple[Values, Values]:
+    """Return rotation and translation (metres) of ``x_right = R x_left + T``."""
+    left_rotation, right_rotation = left.rotation(), right.rotation()
+    row = right.numbers("projection", (3, 4))[0]
+    fx, x = row[0], row[3]
+    if not fx > 0 > x:
+        expected = "fx above 0 and P[0, 3] = -fx * baseline, of the right camera of a calibrated pair"
+        right.problem("invalid", "projection", f"got {short_repr(row.tolist())}", expected)
+        return np.eye(3), np.zeros(3)
+    right_from_rectified = right_rotation.T
+    return right_from_rectified @ left_rotation, right_from_rectified @ np.array([x / fx * unit_m, 0.0, 0.0])
 
 
-_KALIBR_MATRIX = ("intrinsics",)
-_ROS_MATRIX = ("camera_matrix", "K")
-_ROS_PROJECTION = ("projection_matrix", "P")
+def _kalibr_cameras(chain: _Reader) -> list[_Reader]:
+    cameras = []
+    for name in ("cam0", "cam1"):
+        if name in chain.document:
+            table, place = chain.document[name], chain.key_place(name)
+            if not isinstance(table, dict):
+                chain.problems.append(Problem("invalid", place, f"got {short_repr(table)}", "a table"))
+                table = {}
+            cameras.append(_Reader(place, table, chain.problems, _KALIBR))
+            model = table.get("camera_model", "pinhole")
+            if model != "pinhole":
+                cameras[-1].problem("invalid", "projection model", f"got {short_repr(model)}", "pinhole")
+    return cameras
 
 
-def _ros(cameras: Sequence[_Reader], unit_m: float) -> _Cameras:
-    table: dict[str, Any] = {}
-    for eye, camera in zip(_CAMERAS, cameras, strict=False):
-        terms = camera.numbers(("distortion_coefficients", "D"), (-1,), np.zeros(5))
-        model = camera.document.get("distortion_model", "")
-        table[eye] = camera.lens(camera.numbers(_ROS_MATRIX, (3, 3)), terms, model)
-    table |= _size(cameras[0], ("image_width", "width"), ("image_height", "height"))
-    if len(cameras) == 2:
-        rotations = [_rotation(camera, ("rectification_matrix", "R")) for camera in cameras]
-        projection = cameras[1].numbers(_ROS_PROJECTION, (3, 4))
-        fx, x = projection[0, 0], projection[0, 3]
-        if fx > 0 > x:
-            right_from_rectified = rotations[1].T
-            translation_m = right_from_rectified @ np.array([x / fx * unit_m, 0.0, 0.0])
-            table["stereo"] = _motion(right_from_rectified @ rotations[0], translation_m)
-        else:
-            key = cameras[1].key(_ROS_PROJECTION) or _ROS_PROJECTION[0]
-            expected = "fx above 0 and P[0, 3] = -fx * baseline, of the right camera of a calibrated pair"
-            cameras[1].problem("invalid", key, f"got {short_repr(projection[0].tolist())}", expected)
-    return _Cameras(table, [camera.place_of(_ROS_MATRIX) for camera in cameras])
+def _kalibr_motion(_: _Reader, right: _Reader, unit_m: float) -> tuple[Values, Values]:
+    """Return rotation and translation (metres) of ``x_right = R x_left + T``."""
+    right_from_left = right.numbers("motion", (4, 4))
+    return right_from_left[:3, :3], unit_m * right_from_left[:3, 3]
 
 
-def _spellings(*stems: str, eyes: Iterable[str]) -> tuple[str, ...]:
-    """Return the names of a quantity of one camera."""
-    pairs = [(stem, eye) for stem in stems for eye in eyes]
-    return tuple(name for stem, eye in pairs for name in (stem + eye, eye + stem))
+def _opencv_cameras(storage: _Reader) -> list[_Reader]:
+    """Return the readers of both cameras, or of one if the document has no matrix of a right camera."""
+    if float(storage.numbers("fisheye", (1,), default=np.zeros(1))[0]):
+        storage.problem("invalid", "fisheye", "got a fisheye calibration", _KNOWN_MODEL)
+    pair = [replace(storage, fields=fields) for fields in _OPENCV_PAIR]
+    right = pair[1].key("matrix")
+    is_pair = right is not None and isinstance(storage.document[right], dict | list)
+    return pair if is_pair else [storage]
 
 
-_MATRICES = ("M", "K", "camera_matrix", "intrinsics", "intrinsic_matrix", "mtx", "cam_matrix")
-_DISTORTIONS = (
-    *("D", "distortion", "distortion_coefficients", "distortion_coeffs"),
-    *("dist", "dist_coeffs", "dist_coeff"),
-)
-_EYE_SPELLINGS: tuple[Sequence[str], ...] = (("1", "left", "l"), ("2", "right", "r"))
-_NO_EYE: tuple[Sequence[str], ...] = (("",),)
-
-
-def _opencv(storage: _Reader, unit_m: float) -> _Cameras:
-    right = storage.key(_spellings(*_MATRICES, eyes=_EYE_SPELLINGS[1]))
-    is_stereo = right is not None and isinstance(storage.document[right], dict | list)
-    if float(storage.numbers(("fisheye_model",), (1,), np.zeros(1))[0]):
-        storage.problem("invalid", "fisheye_model", "got a fisheye calibration", _KNOWN_MODEL)
-    table: dict[str, Any] = {}
-    places = []
-    for eye, eyes in zip(_CAMERAS, _EYE_SPELLINGS if is_stereo else _NO_EYE, strict=False):
-        names = _spellings(*_MATRICES, eyes=eyes)
-        places.append(storage.place_of(names))
-        matrix = storage.numbers(names, (3, 3))
-        terms = storage.numbers(_spellings(*_DISTORTIONS, eyes=eyes), (-1,), np.zeros(5))
-        table[eye] = storage.lens(matrix, terms, storage.document.get("distortion_model", ""))
-    table |= _size(storage, ("image_size", "size", "camera_resolution", "resolution"))
-    table |= {} if "width" in table else _size(storage, ("image_width", "width"), ("image_height", "height"))
-    if is_stereo:
-        rotation = _rotation(storage, ("R", "rotation", "rotation_matrix", "rmat"))
-        translation = storage.numbers(("T", "translation", "translation_vector", "tvec"), (3,))
-        table["stereo"] = _motion(rotation, unit_m * translation)
-    return _Cameras(table, places)
-
-
-def _size(camera: _Reader, *names: Sequence[str]) -> dict[str, float]:
-    """Return width and height, from one key with both or from two keys; nothing if the document has none."""
-    if not all(map(camera.has, names)):
-        return {}
-    shapes: Callable[[Sequence[str]], Values] = partial(camera.numbers, shape=(2,) if len(names) == 1 else (1,))
-    width, height = np.concatenate([shapes(one) for one in names]).tolist()
-    sides_px = {"width": width, "height": height}
-    return {key: int(side_px) if side_px.is_integer() else side_px for key, side_px in sides_px.items()}
-
-
-def _rotation(camera: _Reader, names: Sequence[str]) -> Values:
-    """Return a rotation matrix, which the file may also hold as a rotation vector."""
-    flat = camera.numbers(names, (-1,))
-    return rotation_matrix(flat) if flat.size == 3 else camera.numbers(names, (3, 3))
-
-
-def _motion(rotation: Values, translation_m: Values) -> dict[str, Any]:
-    """Return the table of a pair's motion; a rotation that was rounded to a few digits is made exact."""
-    error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if ROTATION_TOLERANCE < error <= _ROUNDED_ROTATION:
-        u, _, vt = np.linalg.svd(rotation)
-        rotation = u @ vt
-    return {"rotation": rotation.tolist(), "translation_m": translation_m.tolist()}
+def _opencv_motion(left: _Reader, _: _Reader, unit_m: float) -> tuple[Values, Values]:
+    """Return rotation and translation (metres) of ``x_right = R x_left + T``."""
+    return left.rotation(), unit_m * left.numbers("translation", (3,))
 
 
 def _plain(key: str) -> str:
@@ -281,12 +284,7 @@ def _flattened(value: Any) -> Iterable[float]:
     if isinstance(value, list | tuple):
         for item in value:
             yield from _flattened(item)
-    elif isinstance(value, str):
-        yield parse_number(value)
     else:
-        is_number = isinstance(value, int | float) and not isinstance(value, bool)
-        yield float(value) if is_number and abs(value) <= _MAX_MAGNITUDE else math.nan
-
-
-def _shape_text(shape: tuple[int, ...]) -> str:
-    return " x ".join("n" if side < 0 else str(side) for side in shape)
+        number = parse_number(value) if isinstance(value, str) else value
+        is_number = isinstance(number, int | float) and not isinstance(number, bool)
+        yield float(number) if is_number and abs(number) <= _MAX_MAGNITUDE else math.nan

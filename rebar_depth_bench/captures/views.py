@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -24,15 +24,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from rebar_depth_bench.captures.calibration import (
-    Calibration,
-    MonoCalibration,
-    StereoCalibration,
-    calibrated_baseline_m,
-    lens_distortion,
-    lens_K,
-    right_from_left,
-)
+from rebar_depth_bench.captures.calibration import Calibration, MonoCalibration, StereoCalibration, camera_columns
 from rebar_depth_bench.captures.camera_files import CALIBRATION_SUFFIXES, CAMERAS_FILE, read_cameras
 from rebar_depth_bench.captures.images import (
     IMAGE_SUFFIXES,
@@ -91,12 +83,7 @@ class ImageViews:
     @property
     def rectify(self) -> bool:
         """Whether the images have lens distortion, or are those of a pair that is not parallel."""
-        if not isinstance(self.calibration, StereoCalibration):
-            return any(self.calibration.left.distortion)
-        left, right = self.calibration.left, self.calibration.right
-        same = (left.fx, left.fy, left.cy) == (right.fx, right.fy, right.cy)
-        moved = (*self.calibration.rotation_rad, *self.calibration.translation_m[1:])
-        return not same or any((*left.distortion, *right.distortion, *moved))
+        return not self.calibration.is_rectified
 
     @property
     def identity(self) -> str:
@@ -128,7 +115,7 @@ class ImageViews:
             f"left fx {left.fx:.2f}, fy {left.fy:.2f}, cx {left.cx:.2f}, cy {left.cy:.2f} px at {width} x {height}"
         )
         if isinstance(self.calibration, StereoCalibration):
-            description += f"; baseline {calibrated_baseline_m(self.calibration) * 1000:.2f} mm"
+            description += f"; baseline {self.calibration.baseline_m * 1000:.2f} mm"
         grid = "as they are, not of rectified ones" if self.rectify else "(no lens distortion)"
         return f"{description}. Depth maps are on the grid of the left images {grid}"
 
@@ -151,31 +138,11 @@ class ImageViews:
         self.check_columns(columns, "the method")
         for view_id in self.view_ids:
             if view_id not in skip:
-                yield {
-                    "view_id": view_id,
-                    **{name: self._cells[name](view_id) for name in columns if name != "view_id"},
-                }
-
-    @property
-    def _cells(self) -> Mapping[str, Callable[[str], Any]]:
-        """Functions that return the cell of a view, by column."""
-        left = self.calibration.left
-        cells: dict[str, Callable[[str], Any]] = {
-            "left_rgb": lambda view_id: read_image(self.left[view_id], self.grid),
-            "left_K": lambda _: lens_K(left),
-            "left_distortion": lambda _: lens_distortion(left),
-            "left_cam_from_world": self._pose,
-        }
-        if not isinstance(self.calibration, StereoCalibration):
-            return cells
-        pair, right = self.calibration, self.calibration.right
-        return cells | {
-            "right_rgb": lambda view_id: read_image(self.right[view_id], self.grid),
-            "right_K": lambda _: lens_K(right),
-            "right_distortion": lambda _: lens_distortion(right),
-            "right_cam_from_world": lambda view_id: right_from_left(pair) @ self._pose(view_id),
-            "baseline_m": lambda _: calibrated_baseline_m(pair),
-        }
+                row = {"view_id": view_id, **camera_columns(self.calibration, self._pose(view_id))}
+                for column, files in (("left_rgb", self.left), ("right_rgb", self.right)):
+                    if column in columns:
+                        row[column] = read_image(files[view_id], self.grid)
+                yield {name: row[name] for name in ("view_id", *columns)}
 
     def _pose(self, view_id: str) -> Float64[ndarray, "4 4"]:
         return self.cam_from_world.get(view_id, np.eye(4))
@@ -230,7 +197,7 @@ def open_capture(path: str | os.PathLike[str]) -> ImageViews:
         left={f"{name}/{stem}": left[stem] for stem in sorted(left)},
         right={f"{name}/{stem}": right[stem] for stem in sorted(right)},
         calibration=calibration,
-        board=cameras.board,
-        board_is_assumed=cameras.board_is_assumed,
+        board=cameras.board or BoardSpec(),
+        board_is_assumed=cameras.board is None,
         cam_from_world={f"{name}/{stem}": pose for stem, pose in cameras.cam_from_world.items()},
     )

@@ -7,7 +7,7 @@ rectified optical axis is converted to depth along the raw optical axis with tha
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,32 +19,19 @@ from numpy import ndarray
 from rebar_depth_bench.geometry.cameras import inverse_rigid, pixel_rays, project
 
 
-@dataclass(frozen=True, eq=False)
-class Rectification:
-    """Rectified stereo pair: two parallel pinhole cameras at the centres of the original cameras.
-
-    ``K`` (pixels) applies to both; ``R_left`` and ``R_right`` rotate camera axes into rectified axes,
-    ``x_rectified = R x_cam``. The right camera is ``baseline_m`` along the rectified x axis.
-    """
-
-    K: Float64[ndarray, "3 3"]
-    R_left: Float64[ndarray, "3 3"]
-    R_right: Float64[ndarray, "3 3"]
-    baseline_m: float
-
-
-def rectify_pair(
-    K: tuple[Float64[ndarray, "3 3"], Float64[ndarray, "3 3"]],
-    distortion: tuple[Float64[ndarray, 5], Float64[ndarray, 5]],
+def rectify(
+    K: Sequence[Float64[ndarray, "3 3"]],
+    distortion: Sequence[Float64[ndarray, 5]],
     right_from_left: Float64[ndarray, "4 4"],
     width: int,
     height: int,
-    baseline_m: float,
-) -> Rectification:
-    """Return the rectification of a pair of cameras (left, right); lengths are metres.
+) -> tuple[Float64[ndarray, "3 3"], tuple[Float64[ndarray, "3 3"], Float64[ndarray, "3 3"]]]:
+    """Return K (pixels) of two parallel pinhole cameras at the centres of a pair, and the rotations to their axes.
 
-    Calls ``cv2.stereoRectify`` with zero disparity at infinity and ``alpha=0``, which leaves no pixel outside the
-    raw images, as Stereolabs' open capture code does. (Bouguet's method: each camera is rotated by half.)
+    ``K`` and ``distortion`` are those of the left and the right camera. Each rotation is that of
+    ``x_rectified = R x_cam``; the right rectified camera is along the x axis of the left one. Calls
+    ``cv2.stereoRectify`` with zero disparity at infinity and ``alpha=0``, which leaves no pixel outside the raw
+    images, as Stereolabs' open capture code does. (Bouguet's method: each camera is rotated by half.)
     """
     R_left, R_right, P_left, *_ = cv2.stereoRectify(
         K[0],
@@ -57,7 +44,7 @@ def rectify_pair(
         flags=cv2.CALIB_ZERO_DISPARITY,
         alpha=0,
     )
-    return Rectification(np.asarray(P_left[:, :3]), np.asarray(R_left), np.asarray(R_right), baseline_m)
+    return np.asarray(P_left[:, :3]), (np.asarray(R_left), np.asarray(R_right))
 
 
 _MOTION_DECIMALS = 12
@@ -98,27 +85,27 @@ def is_rectified(row: Mapping[str, Any]) -> bool:
 
 
 def rectified_pair(row: Mapping[str, Any]) -> RectifiedPair:
-    """Rectify the image pair of a dataset row with its K, distortion and poses (``rectify_pair``).
+    """Rectify the image pair of a dataset row with its K, distortion and poses (``rectify``).
 
     Raises ``ValueError`` if a distortion model cannot be inverted.
     """
     height, width, _ = row["left_rgb"].shape
     Ks, distortions = (row["left_K"], row["right_K"]), (row["left_distortion"], row["right_distortion"])
-    rectified = rectify_pair(Ks, distortions, _right_from_left(row), width, height, row["baseline_m"])
+    rectified_K, rotations = rectify(Ks, distortions, _right_from_left(row), width, height)
     rays = [
         pixel_rays(K, width, height, distortion) @ rotation.T
-        for K, distortion, rotation in zip(Ks, distortions, _rotations(rectified), strict=True)
+        for K, distortion, rotation in zip(Ks, distortions, rotations, strict=True)
     ]
-    K, size = enclosing_canvas(rectified.K, [project(rectified.K, eye) for eye in rays])
+    K, size = enclosing_canvas(rectified_K, [project(rectified_K, eye) for eye in rays])
     left, right = (
         cv2.initUndistortRectifyMap(*eye, K, size, cv2.CV_32FC1)
-        for eye in zip(Ks, distortions, _rotations(rectified), strict=True)
+        for eye in zip(Ks, distortions, rotations, strict=True)
     )
     return RectifiedPair(
         left_rgb=resample(row["left_rgb"], left),
         right_rgb=resample(row["right_rgb"], right),
         K=K,
-        baseline_m=rectified.baseline_m,
+        baseline_m=row["baseline_m"],
         seen_by_right=(np.abs(right[0] - (width - 1) / 2) <= width / 2)
         & (np.abs(right[1] - (height - 1) / 2) <= height / 2),
         pixel=np.rint(project(K, rays[0])).astype(np.int64),
@@ -144,10 +131,6 @@ def _right_from_left(row: Mapping[str, Any]) -> Float64[ndarray, "4 4"]:
     """Return the motion of the pair without the rounding errors of its poses, so that it is that of all views."""
     motion = row["right_cam_from_world"] @ inverse_rigid(row["left_cam_from_world"])
     return np.asarray(np.round(motion, _MOTION_DECIMALS))
-
-
-def _rotations(rectified: Rectification) -> tuple[Float64[ndarray, "3 3"], Float64[ndarray, "3 3"]]:
-    return rectified.R_left, rectified.R_right
 
 
 def enclosing_canvas(
