@@ -11,7 +11,8 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.specs.config_specs import FocalRigSpec, RigSpec
-from rebar_depth_bench.geometry.calibration import read_calibration
+from rebar_depth_bench.captures.calibration import StereoCalibration, scale_calibration
+from rebar_depth_bench.captures.calibration_files import read_calibration
 from rebar_depth_bench.geometry.cameras import (
     NOMINAL_FOCAL_PX,
     NOMINAL_HEIGHT,
@@ -21,14 +22,6 @@ from rebar_depth_bench.geometry.cameras import (
     matrix_product,
     right_camera_pose,
     rigid,
-)
-from rebar_depth_bench.geometry.stereo_calibration import (
-    StereoCalibration,
-    calibrated_baseline_m,
-    lens_distortion,
-    lens_K,
-    right_from_left,
-    scale_calibration,
 )
 
 ZED_CALIBRATION = "zed-hd720.conf"
@@ -46,7 +39,7 @@ def zed_rig(width: int = NOMINAL_WIDTH, height: int = NOMINAL_HEIGHT, grid: str 
     resource = resources.files("dataset_builder.cameras").joinpath("calibrations", ZED_CALIBRATION)
     with resources.as_file(resource) as path:
         calibration = read_calibration(path, NOMINAL_WIDTH, NOMINAL_HEIGHT)
-    return RigSpec(width, height, calibrated_baseline_m(calibration), calibration, grid)
+    return RigSpec(width, height, calibration.baseline_m, calibration, grid)
 
 
 def rig_cameras(rig: RigSpec, cam_from_world: Float64[ndarray, "4 4"]) -> dict[str, Camera]:
@@ -74,10 +67,10 @@ def _ideal_cameras(rig: RigSpec, left: Pose) -> dict[str, Camera]:
 
 def _raw_cameras(rig: RigSpec, left: Pose) -> dict[str, Camera]:
     calibration = _scaled_calibration(rig)
-    right = matrix_product(right_from_left(calibration), left)
+    right = matrix_product(calibration.right_from_left, left)
     eyes = {"left": (calibration.left, left), "right": (calibration.right, right)}
     return {
-        eye: Camera(lens_K(lens), lens_distortion(lens), pose, rig.width, rig.height)
+        eye: Camera(lens.K, np.array(lens.distortion), pose, rig.width, rig.height)
         for eye, (lens, pose) in eyes.items()
     }
 
@@ -85,8 +78,11 @@ def _raw_cameras(rig: RigSpec, left: Pose) -> dict[str, Camera]:
 def _rectified_cameras(rig: RigSpec, left: Pose) -> dict[str, Camera]:
     from rebar_depth_bench.geometry.rectification import rectify
 
-    rectified = rectify(_scaled_calibration(rig))
-    return _pinholes(rig, rectified.K, matrix_product(rigid(rectified.R_left, np.zeros(3)), left))
+    pair = _scaled_calibration(rig)
+    raw = _raw_cameras(rig, left).values()
+    Ks, distortions = [camera.K for camera in raw], [camera.distortion for camera in raw]
+    K, (R_left, _) = rectify(Ks, distortions, pair.right_from_left, rig.width, rig.height)
+    return _pinholes(rig, K, matrix_product(rigid(R_left, np.zeros(3)), left))
 
 
 def _pinholes(rig: RigSpec, K: Float64[ndarray, "3 3"], left: Pose) -> dict[str, Camera]:
@@ -101,7 +97,7 @@ def _pinholes(rig: RigSpec, K: Float64[ndarray, "3 3"], left: Pose) -> dict[str,
 def _scaled_calibration(rig: RigSpec) -> StereoCalibration:
     if rig.calibration is None:
         raise ValueError(f"a rig with grid {rig.grid!r} requires a calibration")
-    baseline_m = calibrated_baseline_m(rig.calibration)
+    baseline_m = rig.calibration.baseline_m
     if not isclose(rig.baseline_m, baseline_m, rel_tol=1e-12):
         raise ValueError(f"the rig's baseline_m is {rig.baseline_m}, expected {baseline_m} as in its calibration")
     return scale_calibration(rig.calibration, rig.width, rig.height)

@@ -171,7 +171,7 @@ def _config_entry(source: Import) -> dict[str, Any]:
 
 def _scene_entry(source: Import, key: str) -> dict[str, Any]:
     """Return the manifest entry of the scene without its shards."""
-    board = None if source.views.cameras.board_is_assumed else source.views.cameras.board
+    board = source.views.cameras.board
     return {
         "name": source.name,
         "split": TEST_SPLIT,

@@ -13,10 +13,16 @@ from jaxtyping import Float32, Float64, Shaped, UInt16
 from numpy import ndarray
 
 from dataset_builder.importing.import_layout import DepthTable, MatricesTable, PosesTable
+from rebar_depth_bench.captures.calibration import Calibration, StereoCalibration
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.errors import EntryError, InputError, Problem, escape_text, exception_summary, format_shape
-from rebar_depth_bench.geometry.cameras import inverse_rigid, pixel_rays, swap_camera_axes
-from rebar_depth_bench.geometry.stereo_calibration import Calibration, StereoCalibration
+from rebar_depth_bench.geometry.cameras import (
+    inverse_rigid,
+    is_rigid,
+    nearest_rotation,
+    pixel_rays,
+    swap_camera_axes,
+)
 from rebar_depth_bench.limits import CELL_BYTES, TABLE_BYTES, TOML_BYTES
 from rebar_depth_bench.reading import parse_json, read_file
 from rebar_depth_bench.submission.entries import FORMATS
@@ -104,11 +110,8 @@ def planar_depth_m(
 
 def rectified_pair(calibration: Calibration) -> StereoCalibration:
     """Return the calibration of a rectified pair, to which disparity refers. Raises ``InputError`` for others."""
-    if isinstance(calibration, StereoCalibration):
-        left, right = calibration.left, calibration.right
-        moved = (*calibration.rotation_rad, *calibration.translation_m[1:], *left.distortion, *right.distortion)
-        if (left.fx, left.fy, left.cy) == (right.fx, right.fy, right.cy) and not any(moved):
-            return calibration
+    if isinstance(calibration, StereoCalibration) and calibration.is_rectified:
+        return calibration
     raise InputError("depth.kind is disparity, which needs cameras of a rectified pair")
 
 
@@ -218,14 +221,10 @@ def intrinsics(path: Path, table: MatricesTable) -> Float64[ndarray, "3 3"]:
 def cam_from_world(path: Path, table: PosesTable) -> Float64[ndarray, "4 4"]:
     """Return a pose in OpenCV axes and metres. Raises ``EntryError`` for a matrix that is no rigid pose."""
     pose = _read_matrix(path, table.key, (4, 4))
-    rotation = pose[:3, :3]
-    with np.errstate(over="ignore", invalid="ignore"):
-        error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-    if not (error <= _ROUNDED_ROTATION and np.linalg.det(rotation) > 0 and (pose[3] == (0, 0, 0, 1)).all()):
+    if not is_rigid(pose, _ROUNDED_ROTATION):
         found = f"holds {short_repr(pose.tolist())}"
         raise EntryError(Problem("invalid", path.name, found, "a rotation, a translation, and 0 0 0 1"))
-    u, _, vt = np.linalg.svd(rotation)
-    pose[:3, :3] = u @ vt
+    pose[:3, :3] = nearest_rotation(pose[:3, :3])
     pose[:3, 3] *= UNITS_M[table.unit]
     if table.kind == "world_from_cam":
         pose = inverse_rigid(pose)

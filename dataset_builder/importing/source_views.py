@@ -25,17 +25,11 @@ from dataset_builder.importing.source_files import (
     read_labels,
     rectified_pair,
 )
+from rebar_depth_bench.captures.calibration import camera_columns
 from rebar_depth_bench.captures.camera_files import CaptureCameras, cameras_of_table
-from rebar_depth_bench.captures.image_files import IMAGE_SUFFIXES, common_shape, read_image
+from rebar_depth_bench.captures.images import IMAGE_SUFFIXES, common_shape, read_image
 from rebar_depth_bench.data.schema import EYES, column_kind
 from rebar_depth_bench.errors import EntryError, InputError, Problem, escape_text
-from rebar_depth_bench.geometry.stereo_calibration import (
-    StereoCalibration,
-    calibrated_baseline_m,
-    lens_distortion,
-    lens_K,
-    right_from_left,
-)
 from rebar_depth_bench.names import NAME_LETTERS, NAME_PATTERN
 
 _SUFFIXES: Mapping[str, tuple[str, ...]] = {
@@ -90,22 +84,12 @@ class SourceViews:
         pose = self.cameras.cam_from_world.get(name, np.eye(4))
         if layout.poses is not None:
             pose = cam_from_world(self.file(layout.poses.file, name), layout.poses)
-        K = lens_K(calibration.left)
+        columns = camera_columns(calibration, pose)
         if layout.intrinsics is not None:
-            K = intrinsics(self.file(layout.intrinsics.file, name), layout.intrinsics)
-        columns: dict[str, Any] = {
-            "left_K": K,
-            "left_distortion": lens_distortion(calibration.left),
-            "left_cam_from_world": pose,
-        }
-        if isinstance(calibration, StereoCalibration) and layout.files.has_right:
-            columns |= {
-                "right_K": lens_K(calibration.right),
-                "right_distortion": lens_distortion(calibration.right),
-                "right_cam_from_world": right_from_left(calibration) @ pose,
-                "baseline_m": calibrated_baseline_m(calibration),
-            }
-        return columns
+            columns["left_K"] = intrinsics(self.file(layout.intrinsics.file, name), layout.intrinsics)
+        if layout.files.has_right:
+            return columns
+        return {column: cell for column, cell in columns.items() if column.startswith("left_")}
 
     def _images(self, name: str, cameras: Mapping[str, Any]) -> dict[str, Any]:
         table = self.layout.depth

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from outputs import only_config
-from rebar_depth_bench.captures.folder import is_capture, open_capture
+from rebar_depth_bench.captures.views import is_capture, open_capture
 from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
 from rebar_depth_bench.errors import EntryError, InputError, SubmissionError, printable

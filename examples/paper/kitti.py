@@ -25,11 +25,11 @@ from PIL import Image as Picture
 
 from depth_maps import DepthMaps, open_maps
 from outputs import add_outputs, number, run_script, write_outputs
-from rebar_depth_bench.captures.image_header import read_image_shape
+from rebar_depth_bench.captures.calibration import Calibration, Lens, MonoCalibration, StereoCalibration
+from rebar_depth_bench.captures.images import read_image_shape
 from rebar_depth_bench.captures.views import ImageViews
 from rebar_depth_bench.console import InputFile, InputFolder, add_workers
 from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.geometry.stereo_calibration import Calibration, Lens, MonoCalibration, StereoCalibration
 from rebar_depth_bench.methods import find_method
 from rebar_depth_bench.methods.run import predict_views
 from rebar_depth_bench.parallel import map_with_progress

@@ -3,8 +3,8 @@
 A folder holds one of these:
 
 - ``cameras.toml``, see below;
-- ``calibration.conf`` (Stereolabs) or ``calibration.toml`` (``geometry.calibration``);
-- calibrations of other programs (``geometry.calibration_programs``): one file ``*.yaml``, ``.yml``, ``.xml`` or
+- ``calibration.conf`` (Stereolabs) or ``calibration.toml`` (``captures.calibration_files``);
+- calibrations of other programs (``captures.programs``): one file ``*.yaml``, ``.yml``, ``.xml`` or
   ``.json`` (OpenCV's FileStorage, a Kalibr camera chain, ROS ``camera_info`` of one camera), or two of them:
   intrinsics and extrinsics of OpenCV, or ``left.*`` and ``right.*`` of ROS.
 
@@ -26,23 +26,28 @@ their place::
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, field_validator
 
-from rebar_depth_bench.data.rows import camera_array
+from rebar_depth_bench.captures.calibration import (
+    Calibration,
+    StereoCalibration,
+    scaled_calibration,
+    table_calibration,
+)
+from rebar_depth_bench.captures.calibration_files import check_image_size, read_calibration, scaled_calibration
+from rebar_depth_bench.captures.documents import DOCUMENT_SUFFIXES, parse_document
+from rebar_depth_bench.captures.programs import program_calibration
+from rebar_depth_bench.data.schema import BoardTable
 from rebar_depth_bench.errors import CalibrationError, InputError, Problem
-from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
-from rebar_depth_bench.geometry.calibration import check_image_size, read_calibration, scaled_calibration
-from rebar_depth_bench.geometry.calibration_documents import DOCUMENT_SUFFIXES, parse_document
-from rebar_depth_bench.geometry.calibration_programs import program_calibration
-from rebar_depth_bench.geometry.calibration_toml import table_calibration
-from rebar_depth_bench.geometry.stereo_calibration import Calibration, StereoCalibration
+from rebar_depth_bench.geometry.aruco_board import BoardSpec
+from rebar_depth_bench.geometry.cameras import is_rigid
 from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.names import NAME_LETTERS, NAME_PATTERN
 from rebar_depth_bench.reading import parse_toml, read_file
@@ -51,8 +56,6 @@ from rebar_depth_bench.validation import (
     Expected,
     StrictModel,
     check_unique,
-    field_error,
-    number,
     one_of,
     text,
     validate_table,
@@ -62,65 +65,30 @@ from rebar_depth_bench.validation import (
 CAMERAS_FILE = "cameras.toml"
 CALIBRATION_SUFFIXES = (".conf", *DOCUMENT_SUFFIXES)
 _CALIBRATION_FILES = ("calibration.conf", "calibration.toml")
-_SQUARE_PIXEL_TOLERANCE = 0.03
-"""Maximum deviation of fx / fy from 1.
-
-Real cameras deviate by a fraction of a per cent; images of a different aspect ratio than the calibration's cause
-larger deviations.
-"""
 _CALIBRATION_KEYS = ("width", "height", "left", "right", "stereo")
 
 _FileName = Annotated[str, Field(pattern=f"^{NAME_PATTERN}$"), Expected(f"a file of the folder: {NAME_LETTERS}")]
 _Row = Annotated[list[float], Field(min_length=4, max_length=4), Expected("4 numbers")]
-_Rows = Annotated[list[_Row], Field(min_length=4, max_length=4)]
+_POSE = Expected(
+    "4 rows of 4 numbers: a rotation, a translation in metres, 0 0 0 1", lambda rows: is_rigid(np.array(rows))
+)
 
 
 @dataclass(frozen=True, eq=False)
 class CaptureCameras:
-    """Cameras of a capture: calibration for its image size, its board or None, and poses by image name.
+    """Cameras of a capture: calibration for its image size, its board, and poses by image name.
 
-    ``board_is_assumed`` is True if no file states the board. Without poses, ``cam_from_world`` is empty.
+    ``board`` is None if no file states it. Without poses, ``cam_from_world`` is empty.
     """
 
     calibration: Calibration
     board: BoardSpec | None
-    board_is_assumed: bool
     cam_from_world: Mapping[str, Float64[ndarray, "4 4"]]
-
-
-class _BoardTable(StrictModel):
-    width_m: Annotated[float, number(0, 10)] = BoardSpec.width_m
-    height_m: Annotated[float, number(0, 10)] = BoardSpec.height_m
-    markers: Annotated[int, one_of(6, 12)] = BoardSpec.markers
-    marker_side_m: Annotated[float, number(0, 10)] = BoardSpec.marker_side_m
-    dictionary: Annotated[str, text(40)] = BoardSpec.dictionary
-
-    @model_validator(mode="after")
-    def _check_layout(self) -> _BoardTable:
-        try:
-            marker_corners_m(self.spec)
-        except ValueError as error:
-            raise field_error(str(error), "a board with room for its markers", "conflict") from None
-        return self
-
-    @property
-    def spec(self) -> BoardSpec:
-        """The board."""
-        return BoardSpec(**self.model_dump())
 
 
 class _PoseTable(StrictModel):
     image: Annotated[str, text(100)]
-    cam_from_world: Annotated[_Rows, Expected("4 rows of 4 numbers: a rotation, a translation in metres, 0 0 0 1")]
-
-    @field_validator("cam_from_world")
-    @classmethod
-    def _check_rigid(cls, rows: list[list[float]]) -> list[list[float]]:
-        try:
-            camera_array("cam_from_world", rows)
-        except ValueError as error:
-            raise field_error(str(error).partition(", expected")[0], "a rigid pose of 4 x 4 numbers") from None
-        return rows
+    cam_from_world: Annotated[list[_Row], Field(min_length=4, max_length=4), _POSE]
 
 
 class _CamerasTable(StrictModel):
@@ -131,7 +99,7 @@ class _CamerasTable(StrictModel):
         Expected("the name of a file beside this one, or two"),
     ] = None
     unit: Annotated[str, one_of(*UNITS_M)] = "m"
-    board: _BoardTable | None = None
+    board: BoardTable | None = None
     pose: tuple[_PoseTable, ...] = Field(default=(), strict=False)
     width: Any = None
     height: Any = None
@@ -139,9 +107,14 @@ class _CamerasTable(StrictModel):
     right: Any = None
     stereo: Any = None
 
+    @field_validator("board", mode="before")
+    @classmethod
+    def _add_defaults(cls, fields: Any) -> Any:
+        return {**asdict(BoardSpec()), **fields} if isinstance(fields, Mapping) else fields
+
     @field_validator("pose")
     @classmethod
-    def _check_images(cls, poses: tuple[_PoseTable, ...], _: ValidationInfo) -> tuple[_PoseTable, ...]:
+    def _check_images(cls, poses: tuple[_PoseTable, ...]) -> tuple[_PoseTable, ...]:
         if poses:
             check_unique([pose.image for pose in poses], "image")
         return poses
@@ -155,8 +128,8 @@ def read_cameras(root: Path, images: Sequence[str], width: int, height: int, *, 
     """
     path = root / CAMERAS_FILE
     if not path.exists():
-        calibration = _file_calibration(root, _found_files(root), 1.0, width, height, is_stereo=is_stereo)
-        return CaptureCameras(calibration, BoardSpec(), True, {})
+        calibration = _file_calibration(_found_files(root), 1.0, width, height, is_stereo=is_stereo)
+        return CaptureCameras(calibration, None, {})
     content = read_file(path, TOML_BYTES, "the cameras of a capture", CalibrationError)
     document, problems = parse_toml(content)
     if problems:
@@ -197,15 +170,12 @@ def cameras_of_table(
         content = read_file(path, TOML_BYTES, "the cameras of a capture", CalibrationError)
         raise CalibrationError.from_problems(path, with_lines(located, content))
     if inline is not None:
-        calibration = _fitting(scaled_calibration(inline, path, width, height), path)
+        calibration = scaled_calibration(inline, path, width, height)
     else:
         names = [table.calibration] if isinstance(table.calibration, str) else list(table.calibration or ())
         paths = [path.parent / name for name in names]
-        calibration = _file_calibration(
-            path.parent, paths, UNITS_M[table.unit], width, height, is_stereo=is_stereo
-        )
-    board = None if table.board is None else table.board.spec
-    return CaptureCameras(calibration, board or BoardSpec(), board is None, poses)
+        calibration = _file_calibration(paths, UNITS_M[table.unit], width, height, is_stereo=is_stereo)
+    return CaptureCameras(calibration, None if table.board is None else table.board.spec, poses)
 
 
 def _found_files(root: Path) -> list[Path]:
@@ -222,12 +192,12 @@ def _found_files(root: Path) -> list[Path]:
 
 
 def _file_calibration(
-    root: Path, paths: Sequence[Path], unit_m: float, width: int, height: int, *, is_stereo: bool
+    paths: Sequence[Path], unit_m: float, width: int, height: int, *, is_stereo: bool
 ) -> Calibration:
     """Return the calibration in one or two files, scaled to the image size."""
     source = " and ".join(map(str, paths))
     if paths[0].suffix.lower() not in DOCUMENT_SUFFIXES:
-        return _fitting(read_calibration(paths[0], width, height), source)
+        return read_calibration(paths[0], width, height)
     check_image_size(paths[0], width, height)
     problems: list[Problem] = []
     contents = {path.name: read_file(path, TOML_BYTES, "a calibration file", CalibrationError) for path in paths}
@@ -236,18 +206,8 @@ def _file_calibration(
     if calibration is None:
         for name, content in contents.items():
             problems = with_lines(problems, content, name)
-        raise CalibrationError.from_problems(root, problems)
+        raise CalibrationError.from_problems(paths[0].parent, problems)
     if is_stereo and not isinstance(calibration, StereoCalibration):
         problem = Problem("missing", "", "describes one camera", "the left and the right one")
         raise CalibrationError.from_problems(source, [problem])
-    return _fitting(scaled_calibration(calibration, source, width, height), source)
-
-
-def _fitting(calibration: Calibration, source: object) -> Calibration:
-    """Return a calibration. Raises ``CalibrationError`` if it is for images of another aspect ratio."""
-    lens = calibration.left
-    if abs(lens.fx / lens.fy - 1) > _SQUARE_PIXEL_TOLERANCE:
-        found = f"at {calibration.width} x {calibration.height} pixels fx is {lens.fx / lens.fy:.3f} times fy"
-        problem = Problem("conflict", "", found, "1: these are the cameras of images of another aspect ratio")
-        raise CalibrationError.from_problems(source, [problem])
-    return calibration
+    return scaled_calibration(calibration, source, width, height)

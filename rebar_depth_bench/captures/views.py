@@ -1,9 +1,21 @@
-"""Images of one size and one calibration as views for methods (``data.views.Views``)."""
+"""Captures: folders of images with their cameras and without ground-truth depth.
+
+::
+
+    CAPTURE/
+      left/<name>.png       left image of a view (.png, .jpg or .jpeg)
+      right/<name>.png      right image, with the same stem and size as the left one
+      calibration.conf      Stereolabs calibration file, or another one (``captures.camera_files``)
+
+Images of one camera are in ``left/`` without ``right/``, or in the folder itself. The id of a view is
+``<folder name>/<image stem>``.
+"""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+import os
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -12,17 +24,19 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from rebar_depth_bench.captures.image_files import read_image
-from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.geometry.aruco_board import BoardSpec
-from rebar_depth_bench.geometry.stereo_calibration import (
-    Calibration,
-    StereoCalibration,
-    calibrated_baseline_m,
-    lens_distortion,
-    lens_K,
-    right_from_left,
+from rebar_depth_bench.captures.calibration import Calibration, MonoCalibration, StereoCalibration, camera_columns
+from rebar_depth_bench.captures.camera_files import CALIBRATION_SUFFIXES, CAMERAS_FILE, read_cameras
+from rebar_depth_bench.captures.images import (
+    IMAGE_SUFFIXES,
+    NAME,
+    NAME_RULE,
+    common_shape,
+    entry_name,
+    image_files,
+    read_image,
 )
+from rebar_depth_bench.errors import InputError, Problem
+from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.submission import CaptureViews
 
 _LEFT_COLUMNS = ("left_rgb", "left_K", "left_distortion", "left_cam_from_world")
@@ -69,12 +83,7 @@ class ImageViews:
     @property
     def rectify(self) -> bool:
         """Whether the images have lens distortion, or are those of a pair that is not parallel."""
-        if not isinstance(self.calibration, StereoCalibration):
-            return any(self.calibration.left.distortion)
-        left, right = self.calibration.left, self.calibration.right
-        same = (left.fx, left.fy, left.cy) == (right.fx, right.fy, right.cy)
-        moved = (*self.calibration.rotation_rad, *self.calibration.translation_m[1:])
-        return not same or any((*left.distortion, *right.distortion, *moved))
+        return not self.calibration.is_rectified
 
     @property
     def identity(self) -> str:
@@ -106,7 +115,7 @@ class ImageViews:
             f"left fx {left.fx:.2f}, fy {left.fy:.2f}, cx {left.cx:.2f}, cy {left.cy:.2f} px at {width} x {height}"
         )
         if isinstance(self.calibration, StereoCalibration):
-            description += f"; baseline {calibrated_baseline_m(self.calibration) * 1000:.2f} mm"
+            description += f"; baseline {self.calibration.baseline_m * 1000:.2f} mm"
         grid = "as they are, not of rectified ones" if self.rectify else "(no lens distortion)"
         return f"{description}. Depth maps are on the grid of the left images {grid}"
 
@@ -129,31 +138,66 @@ class ImageViews:
         self.check_columns(columns, "the method")
         for view_id in self.view_ids:
             if view_id not in skip:
-                yield {
-                    "view_id": view_id,
-                    **{name: self._cells[name](view_id) for name in columns if name != "view_id"},
-                }
-
-    @property
-    def _cells(self) -> Mapping[str, Callable[[str], Any]]:
-        """Functions that return the cell of a view, by column."""
-        left = self.calibration.left
-        cells: dict[str, Callable[[str], Any]] = {
-            "left_rgb": lambda view_id: read_image(self.left[view_id], self.grid),
-            "left_K": lambda _: lens_K(left),
-            "left_distortion": lambda _: lens_distortion(left),
-            "left_cam_from_world": self._pose,
-        }
-        if not isinstance(self.calibration, StereoCalibration):
-            return cells
-        pair, right = self.calibration, self.calibration.right
-        return cells | {
-            "right_rgb": lambda view_id: read_image(self.right[view_id], self.grid),
-            "right_K": lambda _: lens_K(right),
-            "right_distortion": lambda _: lens_distortion(right),
-            "right_cam_from_world": lambda view_id: right_from_left(pair) @ self._pose(view_id),
-            "baseline_m": lambda _: calibrated_baseline_m(pair),
-        }
+                row = {"view_id": view_id, **camera_columns(self.calibration, self._pose(view_id))}
+                for column, files in (("left_rgb", self.left), ("right_rgb", self.right)):
+                    if column in columns:
+                        row[column] = read_image(files[view_id], self.grid)
+                yield {name: row[name] for name in ("view_id", *columns)}
 
     def _pose(self, view_id: str) -> Float64[ndarray, "4 4"]:
         return self.cam_from_world.get(view_id, np.eye(4))
+
+
+CAPTURE_LAYOUT = "left/<name>.png|jpg, right/<name>.png|jpg, calibration.conf|toml or another calibration"
+
+
+def is_capture(path: str | os.PathLike[str]) -> bool:
+    """Return whether a folder is meant as a capture.
+
+    It has a folder ``left``, or ``cameras.toml``, or both images and a calibration file.
+    """
+    root = Path(path)
+    if (root / "left").is_dir() or (root / CAMERAS_FILE).is_file():
+        return True
+    suffixes = {entry.suffix.lower() for entry in root.iterdir()} if root.is_dir() else set()
+    return not suffixes.isdisjoint(IMAGE_SUFFIXES) and not suffixes.isdisjoint(CALIBRATION_SUFFIXES)
+
+
+def open_capture(path: str | os.PathLike[str]) -> ImageViews:
+    """Return the views and the calibration of a capture.
+
+    Raises ``InputError`` with all problems of the images, and ``CalibrationError`` for an invalid calibration.
+    """
+    root = Path(path)
+    name = root.resolve().name
+    problems: list[Problem] = []
+    if not NAME.fullmatch(name):
+        problems.append(Problem("name", "", f"the folder is called {name!r}", NAME_RULE))
+    has_left, is_stereo = (root / "left").is_dir(), (root / "right").exists()
+    left = image_files(root / "left" if has_left or is_stereo else root, problems)
+    right = image_files(root / "right", problems) if is_stereo else {}
+    for files, other, other_eye in ((left, right, "right"), (right, left, "left")):
+        unpaired = sorted(files.keys() - other.keys()) if is_stereo else []
+        problems += [
+            Problem("missing", entry_name(files[stem]), f"has no {other_eye}/{stem}") for stem in unpaired
+        ]
+    shape = common_shape([*left.values(), *right.values()], problems)
+    if shape is None and not problems:
+        problems.append(Problem("missing", "left/" if has_left else "", "has no images"))
+    if shape is None or problems:
+        raise InputError.from_problems(f"{root}: expected a capture ({CAPTURE_LAYOUT})", problems)
+    height, width = shape
+    cameras = read_cameras(root, sorted(left), width, height, is_stereo=is_stereo)
+    calibration = cameras.calibration
+    if not is_stereo:
+        calibration = MonoCalibration(width, height, calibration.left)
+    return ImageViews(
+        path=root,
+        config=name,
+        left={f"{name}/{stem}": left[stem] for stem in sorted(left)},
+        right={f"{name}/{stem}": right[stem] for stem in sorted(right)},
+        calibration=calibration,
+        board=cameras.board or BoardSpec(),
+        board_is_assumed=cameras.board is None,
+        cam_from_world={f"{name}/{stem}": pose for stem, pose in cameras.cam_from_world.items()},
+    )

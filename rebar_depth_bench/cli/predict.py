@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from rebar_depth_bench.captures.camera_files import CAMERAS_FILE
-from rebar_depth_bench.captures.folder import is_capture, open_capture
+from rebar_depth_bench.captures.views import is_capture, open_capture
 from rebar_depth_bench.console import (
     InputFile,
     OutputArchive,

@@ -22,14 +22,12 @@ from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.data.schema import column_kind
 from rebar_depth_bench.data.shards import encoded_rows
 from rebar_depth_bench.errors import DatasetError, escape_text
-from rebar_depth_bench.geometry.cameras import Camera
+from rebar_depth_bench.geometry.cameras import Camera, is_rigid
 from rebar_depth_bench.validation import short_repr
 
 CAMERA_KINDS = ("K", "distortion", "cam_from_world")
 """Kinds of the dataset's columns that describe a camera (see ``schema.column_kind``)."""
 _CAMERA_SHAPES = dict(zip(CAMERA_KINDS, ((3, 3), (5,), (4, 4)), strict=True))
-_MAX_ROTATION_ERROR = 1e-6
-"""Largest deviation of a rotation times its transpose from the identity matrix."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,12 +118,8 @@ def camera_array(kind: str, cell: Any) -> Float64[ndarray, ...]:
         raise ValueError(f"it has the shape {array.shape}, expected {_CAMERA_SHAPES[kind]}")
     if not np.isfinite(array).all():
         raise ValueError("it has values that are not finite, expected finite numbers")
-    if kind == "cam_from_world":
-        rotation = array[:3, :3]
-        with np.errstate(over="ignore", invalid="ignore"):
-            error = np.abs(rotation @ rotation.T - np.eye(3)).max()
-        if not (error < _MAX_ROTATION_ERROR and np.linalg.det(rotation) > 0 and (array[3] == (0, 0, 0, 1)).all()):
-            raise ValueError("it is no rigid pose: a rotation, a translation and the last row 0 0 0 1")
+    if kind == "cam_from_world" and not is_rigid(array):
+        raise ValueError("it is no rigid pose: a rotation, a translation and the last row 0 0 0 1")
     return array
 
 

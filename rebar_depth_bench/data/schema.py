@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import pyarrow as pa
 from pydantic import (
@@ -18,7 +18,7 @@ from pydantic import (
 )
 
 from rebar_depth_bench.errors import DatasetError, escape_text
-from rebar_depth_bench.geometry.aruco_board import BoardSpec
+from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
 from rebar_depth_bench.names import NAME_LETTERS, NAME_PATTERN, PATH_PATTERN, SPLITS, VIEW_ID_PATTERN
 from rebar_depth_bench.validation import (
     Expected,
@@ -260,12 +260,27 @@ class Colour(ManifestTable):
     steel_samples: _Count | None = None
 
 
-class _BoardTable(StrictModel):
+class BoardTable(StrictModel):
+    """Entry of a board."""
+
     width_m: _Length
     height_m: _Length
     markers: Annotated[int, one_of(6, 12)]
     marker_side_m: _Length
     dictionary: Name
+
+    @model_validator(mode="after")
+    def _check_layout(self) -> Self:
+        try:
+            marker_corners_m(self.spec)
+        except ValueError as error:
+            raise field_error(str(error), "a board with room for its markers", "conflict") from None
+        return self
+
+    @property
+    def spec(self) -> BoardSpec:
+        """The board."""
+        return BoardSpec(**self.model_dump())
 
 
 class Imported(ManifestTable):
@@ -347,7 +362,7 @@ class Scene(ManifestTable):
     @field_validator("board", mode="before")
     @classmethod
     def _make_board(cls, fields: Any) -> BoardSpec | None:
-        return None if fields is None else BoardSpec(**_BoardTable.model_validate(fields).model_dump())
+        return None if fields is None else BoardTable.model_validate(fields).spec
 
     @field_validator("protocol_views")
     @classmethod

@@ -23,6 +23,9 @@ NOMINAL_HEIGHT = 720
 NOMINAL_FOCAL_PX = 700.0
 """Nominal focal length of the first-generation ZED at HD720, pixels (Stereolabs)."""
 
+ROTATION_TOLERANCE = 1e-6
+"""Largest deviation of ``R @ R.T`` from the identity for a rotation ``R``."""
+
 _NEWTON_STEPS = 50
 _NEWTON_TOLERANCE = 1e-15
 _NEWTON_CHUNK = 8192
@@ -99,6 +102,25 @@ def rigid(rotation: Float[ndarray, "3 3"], translation: Float[ndarray, 3]) -> Fl
 def inverse_rigid(pose: Float[ndarray, "4 4"]) -> Float[ndarray, "4 4"]:
     """Return the inverse of a rigid 4 x 4 matrix, computed by transposition, so that it is rigid as well."""
     return rigid(pose[:3, :3].T, matrix_product(-pose[:3, :3].T, pose[:3, 3]))
+
+
+def is_rotation(matrix: Float[ndarray, "3 3"], tolerance: float = ROTATION_TOLERANCE) -> bool:
+    """Return whether a 3 x 3 matrix times its transpose is the identity within ``tolerance``, and is no mirror."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        error = np.abs(matrix @ matrix.T - np.eye(3)).max()
+    return bool(error <= tolerance and np.linalg.det(matrix) > 0)  # The error of NaN is NaN.
+
+
+def is_rigid(pose: Float[ndarray, "4 4"], tolerance: float = ROTATION_TOLERANCE) -> bool:
+    """Return whether a 4 x 4 matrix holds a rotation (``is_rotation``), a finite translation and 0 0 0 1."""
+    is_motion = np.isfinite(pose).all() and (pose[3] == (0, 0, 0, 1)).all()
+    return bool(is_motion) and is_rotation(pose[:3, :3], tolerance)
+
+
+def nearest_rotation(matrix: Float[ndarray, "3 3"]) -> Float64[ndarray, "3 3"]:
+    """Return the rotation nearest to one that was rounded to a few digits."""
+    u, _, vt = np.linalg.svd(matrix)
+    return np.asarray(u @ vt)
 
 
 def camera_centre(cam_from_world: Float[ndarray, "4 4"]) -> Float[ndarray, 3]:

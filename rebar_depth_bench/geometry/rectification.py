@@ -7,9 +7,9 @@ rectified optical axis is converted to depth along the raw optical axis with tha
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import cv2
 import numpy as np
@@ -18,60 +18,20 @@ from numpy import ndarray
 
 from rebar_depth_bench.geometry.cameras import inverse_rigid, pixel_rays, project
 
-if TYPE_CHECKING:
-    from rebar_depth_bench.geometry.stereo_calibration import StereoCalibration
 
-
-@dataclass(frozen=True, eq=False)
-class Rectification:
-    """Rectified stereo pair: two parallel pinhole cameras at the centres of the original cameras.
-
-    ``K`` (pixels) applies to both; ``R_left`` and ``R_right`` rotate camera axes into rectified axes,
-    ``x_rectified = R x_cam``. The right camera is ``baseline_m`` along the rectified x axis.
-    """
-
-    K: Float64[ndarray, "3 3"]
-    R_left: Float64[ndarray, "3 3"]
-    R_right: Float64[ndarray, "3 3"]
-    baseline_m: float
-
-
-def rectify(calibration: StereoCalibration) -> Rectification:
-    """Return the rectification for the image size of the calibration.
-
-    Calls ``cv2.stereoRectify`` with zero disparity at infinity and ``alpha=0``, which leaves no pixel outside the
-    raw images, as Stereolabs' open capture code does. (Bouguet's method: each camera is rotated by half.)
-    """
-    # Predictions, which rectify rows, need no calibrations.
-    from rebar_depth_bench.geometry.stereo_calibration import (
-        calibrated_baseline_m,
-        lens_distortion,
-        lens_K,
-        right_from_left,
-    )
-
-    motion = right_from_left(calibration)
-    return rectify_pair(
-        (lens_K(calibration.left), lens_K(calibration.right)),
-        (lens_distortion(calibration.left), lens_distortion(calibration.right)),
-        motion,
-        calibration.width,
-        calibration.height,
-        calibrated_baseline_m(calibration),
-    )
-
-
-def rectify_pair(
-    K: tuple[Float64[ndarray, "3 3"], Float64[ndarray, "3 3"]],
-    distortion: tuple[Float64[ndarray, 5], Float64[ndarray, 5]],
+def rectify(
+    K: Sequence[Float64[ndarray, "3 3"]],
+    distortion: Sequence[Float64[ndarray, 5]],
     right_from_left: Float64[ndarray, "4 4"],
     width: int,
     height: int,
-    baseline_m: float,
-) -> Rectification:
-    """Return the rectification of a pair of cameras (left, right), as ``rectify`` does.
+) -> tuple[Float64[ndarray, "3 3"], tuple[Float64[ndarray, "3 3"], Float64[ndarray, "3 3"]]]:
+    """Return K (pixels) of two parallel pinhole cameras at the centres of a pair, and the rotations to their axes.
 
-    ``K`` and ``distortion`` are those of a dataset row; lengths are metres.
+    ``K`` and ``distortion`` are those of the left and the right camera. Each rotation is that of
+    ``x_rectified = R x_cam``; the right rectified camera is along the x axis of the left one. Calls
+    ``cv2.stereoRectify`` with zero disparity at infinity and ``alpha=0``, which leaves no pixel outside the raw
+    images, as Stereolabs' open capture code does. (Bouguet's method: each camera is rotated by half.)
     """
     R_left, R_right, P_left, *_ = cv2.stereoRectify(
         K[0],
@@ -84,7 +44,7 @@ def rectify_pair(
         flags=cv2.CALIB_ZERO_DISPARITY,
         alpha=0,
     )
-    return Rectification(np.asarray(P_left[:, :3]), np.asarray(R_left), np.asarray(R_right), baseline_m)
+    return np.asarray(P_left[:, :3]), (np.asarray(R_left), np.asarray(R_right))
 
 
 _MOTION_DECIMALS = 12
@@ -125,27 +85,27 @@ def is_rectified(row: Mapping[str, Any]) -> bool:
 
 
 def rectified_pair(row: Mapping[str, Any]) -> RectifiedPair:
-    """Rectify the image pair of a dataset row with its K, distortion and poses (``rectify_pair``).
+    """Rectify the image pair of a dataset row with its K, distortion and poses (``rectify``).
 
     Raises ``ValueError`` if a distortion model cannot be inverted.
     """
     height, width, _ = row["left_rgb"].shape
     Ks, distortions = (row["left_K"], row["right_K"]), (row["left_distortion"], row["right_distortion"])
-    rectified = rectify_pair(Ks, distortions, _right_from_left(row), width, height, row["baseline_m"])
+    rectified_K, rotations = rectify(Ks, distortions, _right_from_left(row), width, height)
     rays = [
         pixel_rays(K, width, height, distortion) @ rotation.T
-        for K, distortion, rotation in zip(Ks, distortions, _rotations(rectified), strict=True)
+        for K, distortion, rotation in zip(Ks, distortions, rotations, strict=True)
     ]
-    K, size = enclosing_canvas(rectified.K, [project(rectified.K, eye) for eye in rays])
+    K, size = enclosing_canvas(rectified_K, [project(rectified_K, eye) for eye in rays])
     left, right = (
         cv2.initUndistortRectifyMap(*eye, K, size, cv2.CV_32FC1)
-        for eye in zip(Ks, distortions, _rotations(rectified), strict=True)
+        for eye in zip(Ks, distortions, rotations, strict=True)
     )
     return RectifiedPair(
         left_rgb=resample(row["left_rgb"], left),
         right_rgb=resample(row["right_rgb"], right),
         K=K,
-        baseline_m=rectified.baseline_m,
+        baseline_m=row["baseline_m"],
         seen_by_right=(np.abs(right[0] - (width - 1) / 2) <= width / 2)
         & (np.abs(right[1] - (height - 1) / 2) <= height / 2),
         pixel=np.rint(project(K, rays[0])).astype(np.int64),
@@ -173,10 +133,6 @@ def _right_from_left(row: Mapping[str, Any]) -> Float64[ndarray, "4 4"]:
     return np.asarray(np.round(motion, _MOTION_DECIMALS))
 
 
-def _rotations(rectified: Rectification) -> tuple[Float64[ndarray, "3 3"], Float64[ndarray, "3 3"]]:
-    return rectified.R_left, rectified.R_right
-
-
 def enclosing_canvas(
     K: Float64[ndarray, "3 3"], points_px: list[Float64[ndarray, "h w 2"]]
 ) -> tuple[Float64[ndarray, "3 3"], tuple[int, int]]:
@@ -193,3 +149,47 @@ def resample(rgb: UInt8[ndarray, "h w 3"], maps: Any) -> UInt8[ndarray, "hc wc 3
     """Resample an image with OpenCV's two coordinate maps; bicubic, border pixels replicated."""
     map_x, map_y = maps
     return np.asarray(cv2.remap(rgb, map_x, map_y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE))
+
+
+# Undistorted images of one camera, and transfer of depth back to the grid of its distorted image.
+
+
+@dataclass(frozen=True, eq=False)
+class PinholeGrid:
+    """Pinhole image grid that contains every pixel of a camera; without distortion, the camera's own grid.
+
+    ``canvas_pixel`` is the pixel (column, row) of this grid for each pixel of the camera, None if both grids are
+    the same. The optical axis is that of the camera, so planar depth is unchanged.
+    """
+
+    K: Float64[ndarray, "3 3"]
+    width: int
+    height: int
+    canvas_pixel: Int64[ndarray, "h w 2"] | None
+
+    def depth_on_left_grid(self, depth: Float32[ndarray, "hc wc"]) -> Float32[ndarray, "h w"]:
+        """Return planar depth (any unit) on the camera's grid, sampled at the pixel that each ray falls on."""
+        if self.canvas_pixel is None:
+            return depth
+        column, row = np.moveaxis(self.canvas_pixel, -1, 0)
+        return np.asarray(depth[row, column])
+
+
+def pinhole_grid(row: Mapping[str, Any], width: int, height: int) -> PinholeGrid:
+    """Return the pinhole grid of a row's ``width`` x ``height`` left camera (``left_K``, ``left_distortion``)."""
+    K, distortion = row["left_K"], row["left_distortion"]
+    if not distortion.any():
+        return PinholeGrid(K, width, height, None)
+    rays = pixel_rays(K, width, height, distortion)
+    wide_K, (wide_width, wide_height) = enclosing_canvas(K, [project(K, rays)])
+    return PinholeGrid(wide_K, wide_width, wide_height, np.rint(project(wide_K, rays)).astype(np.int64))
+
+
+def pinhole_image(row: Mapping[str, Any], grid: PinholeGrid) -> UInt8[ndarray, "hc wc 3"]:
+    """Return a row's left image on its pinhole grid, resampled (bicubic) if the lens has distortion."""
+    if grid.canvas_pixel is None:
+        return np.asarray(row["left_rgb"])
+    maps = cv2.initUndistortRectifyMap(
+        row["left_K"], row["left_distortion"], np.eye(3), grid.K, (grid.width, grid.height), cv2.CV_32FC1
+    )
+    return resample(row["left_rgb"], maps)

@@ -318,7 +318,7 @@ def _rectified_pair(row: Mapping[str, Any]) -> tuple[dict[str, Any], Callable[[A
 
 def _undistorted_left(row: Mapping[str, Any]) -> tuple[dict[str, Any], Callable[[Any], Any]]:
     """Return the cells of the undistorted left image of a raw row, as ``_rectified_pair``."""
-    from rebar_depth_bench.geometry.undistortion import pinhole_grid, pinhole_image
+    from rebar_depth_bench.geometry.rectification import pinhole_grid, pinhole_image
 
     height, width, _ = row["left_rgb"].shape
     grid = pinhole_grid(row, width, height)

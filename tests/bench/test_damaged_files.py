@@ -21,7 +21,7 @@ from PIL import Image
 
 from leaderboard.settings import read_settings
 from rebar_depth_bench.captures.camera_files import read_cameras
-from rebar_depth_bench.captures.folder import open_capture
+from rebar_depth_bench.captures.views import open_capture
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.scoring.result import read_result
 from rebar_depth_bench.submission.declaration import parse_metadata

@@ -13,7 +13,7 @@ from dataset_builder.catalog.scene_file import scene_config
 from dataset_builder.scene.mesh_ply import write_mesh_ply
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.user_files.cage_file import cage_file_spec, load_cage, mesh_file_spec
-from rebar_depth_bench.geometry.calibration import read_calibration
+from rebar_depth_bench.captures.calibration_files import read_calibration
 from tests.bench.geometry.calibrations import CONF, TOML
 from tests.building import TWO_BARS
 from tests.fuzz.entry_point import EntryPoint

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from rebar_depth_bench.captures.folder import open_capture
+from rebar_depth_bench.captures.views import open_capture
 from rebar_depth_bench.geometry.rectification import is_rectified
 from tests.bench.methods.predictors import load_predictor
 

@@ -33,7 +33,7 @@ from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.aruco_detection import Corners, board_pose, detected_corners_px
 from rebar_depth_bench.geometry.cameras import rigid
-from rebar_depth_bench.geometry.undistortion import PinholeGrid, pinhole_grid, pinhole_image
+from rebar_depth_bench.geometry.rectification import PinholeGrid, pinhole_grid, pinhole_image
 from rebar_depth_bench.parallel import Progress, silent
 
 

@@ -38,8 +38,8 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from numpy import ndarray
 
+from rebar_depth_bench.captures.documents import parse_document
 from rebar_depth_bench.errors import MethodError, Problem
-from rebar_depth_bench.geometry.calibration_documents import parse_document
 from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
 from rebar_depth_bench.methods.paper.third_party import Network, image_tensor, on_sys_path, torch_device

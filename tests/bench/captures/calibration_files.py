@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from rebar_depth_bench.geometry.calibration import read_calibration
-from rebar_depth_bench.geometry.stereo_calibration import StereoCalibration
+from rebar_depth_bench.captures.calibration import StereoCalibration
+from rebar_depth_bench.captures.calibration_files import read_calibration
 
 WIDTH, HEIGHT = 640, 480
 LEFT_K = np.array([[534.07, 0, 341.53], [0, 534.11, 232.94], [0, 0, 1]])

@@ -14,7 +14,7 @@ from PIL import Image
 
 pytest.importorskip("cv2")
 
-from rebar_depth_bench.captures.folder import open_capture
+from rebar_depth_bench.captures.views import open_capture
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.geometry.aruco_board import BoardSpec

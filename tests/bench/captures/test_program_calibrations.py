@@ -14,9 +14,9 @@ pytest.importorskip("cv2")
 
 import numpy as np
 
+from rebar_depth_bench.captures.calibration import MonoCalibration, StereoCalibration
 from rebar_depth_bench.captures.camera_files import read_cameras
 from rebar_depth_bench.errors import CalibrationError
-from rebar_depth_bench.geometry.stereo_calibration import MonoCalibration, StereoCalibration
 from tests.bench.captures import calibration_files as files
 
 
@@ -182,6 +182,9 @@ HOSTILE = {
     "open.xml": "<opencv_storage><M1>",
     "comments.xml": "<opencv_storage>" + "<!--" * 250_000,
     "other.xml": "<svg/>",
+    "huge.xml": "<opencv_storage>"
+    + "".join(f"<{name}>500 0 320 0 500 240 0 0 1</{name}>" for name in ("M1", "M2"))
+    + "<R>1e300 0 0 0 1 0 0 0 1</R><T>-0.1 0 0</T></opencv_storage>",
     "nested.xml": "<opencv_storage>" + "<a>" * 100_000 + "</a>" * 100_000 + "</opencv_storage>",
     "twice.json": '{"M1": 1, "M1": 2}',
     "nan.json": '{"M1": NaN}',

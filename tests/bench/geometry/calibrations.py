@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from rebar_depth_bench.geometry.calibration import read_calibration
-from rebar_depth_bench.geometry.stereo_calibration import StereoCalibration
+from rebar_depth_bench.captures.calibration import StereoCalibration
+from rebar_depth_bench.captures.calibration_files import read_calibration
 
 SHIPPED_CALIBRATION = Path(__file__).parents[3] / "dataset_builder" / "cameras" / "calibrations" / "zed-hd720.conf"
 

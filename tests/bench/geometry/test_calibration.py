@@ -16,16 +16,13 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rebar_depth_bench.geometry.calibration import read_calibration
-from rebar_depth_bench.geometry.cameras import project
-from rebar_depth_bench.geometry.stereo_calibration import (
+from rebar_depth_bench.captures.calibration import (
     Lens,
     StereoCalibration,
-    lens_distortion,
-    lens_K,
-    right_from_left,
     scale_calibration,
 )
+from rebar_depth_bench.captures.calibration_files import read_calibration
+from rebar_depth_bench.geometry.cameras import project
 from tests.bench.geometry.calibrations import CONF, SHIPPED_CALIBRATION, TOML, write_and_read
 
 EXPECTED = StereoCalibration(
@@ -141,7 +138,7 @@ def test_toml_is_scaled_to_another_grid(tmp_path: Path) -> None:
 
 def test_right_from_left_of_half_turn() -> None:
     turned = replace(EXPECTED, rotation_rad=(pi, 0.0, 0.0))
-    assert right_from_left(turned)[:3, :3] == pytest.approx(np.diag([1.0, -1.0, -1.0]), abs=1e-15)
+    assert turned.right_from_left[:3, :3] == pytest.approx(np.diag([1.0, -1.0, -1.0]), abs=1e-15)
 
 
 @given(
@@ -154,7 +151,7 @@ def test_scaling_keeps_relative_image_position(ray: np.ndarray, width: int, heig
     scaled = scale_calibration(EXPECTED, width, height)
     positions = []
     for calibration in (EXPECTED, scaled):
-        pixel = project(lens_K(calibration.left), ray, lens_distortion(calibration.left))
+        pixel = project(calibration.left.K, ray, np.array(calibration.left.distortion))
         positions.append((pixel + 0.5) / [calibration.width, calibration.height])
     assert positions[1] == pytest.approx(positions[0], abs=1e-12)
     assert scaled.translation_m == EXPECTED.translation_m

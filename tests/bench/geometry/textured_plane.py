@@ -9,9 +9,8 @@ import numpy as np
 from jaxtyping import Float64, UInt8
 from numpy import ndarray
 
-from rebar_depth_bench.geometry.calibration import read_calibration
+from rebar_depth_bench.captures.calibration_files import read_calibration
 from rebar_depth_bench.geometry.cameras import ideal_K, inverse_rigid, pixel_rays, right_camera_pose, rigid
-from rebar_depth_bench.geometry.stereo_calibration import lens_distortion, lens_K, right_from_left
 from tests.bench.geometry.calibrations import SHIPPED_CALIBRATION
 
 WIDTH, HEIGHT = 480, 270
@@ -40,20 +39,20 @@ def texture_rgb(points_m: Float64[ndarray, "h w 3"]) -> UInt8[ndarray, "h w 3"]:
 def raw_row() -> dict[str, Any]:
     """Return the row of a raw pair of the shipped ZED, with the exact depth of the left image (``depth_m``)."""
     calibration = read_calibration(SHIPPED_CALIBRATION, WIDTH, HEIGHT)
-    right_pose = right_from_left(calibration)
-    left = pixel_rays(lens_K(calibration.left), WIDTH, HEIGHT, lens_distortion(calibration.left))
+    right_pose = calibration.right_from_left
+    left = pixel_rays(calibration.left.K, WIDTH, HEIGHT, np.array(calibration.left.distortion))
     left_from_right = inverse_rigid(right_pose)
-    right = pixel_rays(lens_K(calibration.right), WIDTH, HEIGHT, lens_distortion(calibration.right))
+    right = pixel_rays(calibration.right.K, WIDTH, HEIGHT, np.array(calibration.right.distortion))
     right_rays, right_centre_m = right @ left_from_right[:3, :3].T, left_from_right[:3, 3]
     right_depth_m = (OFFSET_M - right_centre_m @ NORMAL_CAM) / (right_rays @ NORMAL_CAM)
     depth_m = plane_depth_m(left)
     return {
         "left_rgb": texture_rgb(left * depth_m[..., None]),
         "right_rgb": texture_rgb(right_rays * right_depth_m[..., None] + right_centre_m),
-        "left_K": lens_K(calibration.left),
-        "right_K": lens_K(calibration.right),
-        "left_distortion": lens_distortion(calibration.left),
-        "right_distortion": lens_distortion(calibration.right),
+        "left_K": calibration.left.K,
+        "right_K": calibration.right.K,
+        "left_distortion": np.array(calibration.left.distortion),
+        "right_distortion": np.array(calibration.right.distortion),
         "left_cam_from_world": LEFT_CAM_FROM_WORLD,
         "right_cam_from_world": right_pose @ LEFT_CAM_FROM_WORLD,
         "baseline_m": float(np.linalg.norm(right_pose[:3, 3])),

@@ -23,11 +23,11 @@ from dataset_builder.scene.raycast import RayCaster
 from dataset_builder.scene.shapes.bar_mesh import plain_bar_mesh
 from dataset_builder.scene.shapes.bending import bent_line_m
 from dataset_builder.specs.config_specs import RigSpec
+from rebar_depth_bench.captures.calibration import Lens, StereoCalibration
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.rows import EyeView
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid, transform
-from rebar_depth_bench.geometry.stereo_calibration import Lens, StereoCalibration
 
 BOARD = BoardSpec()
 PX_PER_M = 6000.0

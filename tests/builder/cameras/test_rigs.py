@@ -14,6 +14,10 @@ from dataset_builder.cameras.rigs import rig_cameras, zed_rig
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.scene.raycast import RayCaster
 from dataset_builder.specs.config_specs import RigSpec
+from rebar_depth_bench.captures.calibration import (
+    StereoCalibration,
+    scale_calibration,
+)
 from rebar_depth_bench.geometry.cameras import (
     Camera,
     camera_centre,
@@ -27,13 +31,6 @@ from rebar_depth_bench.geometry.cameras import (
     transform,
 )
 from rebar_depth_bench.geometry.rectification import rectify
-from rebar_depth_bench.geometry.stereo_calibration import (
-    StereoCalibration,
-    lens_distortion,
-    lens_K,
-    right_from_left,
-    scale_calibration,
-)
 
 POSE = look_at(np.array([0.20, -0.24, 0.15]), np.array([0.0, 0.0, 0.05]))
 CAMERA_NAMES = ("left", "right")
@@ -103,7 +100,8 @@ def test_rectified_cameras_are_parallel_pinholes(width: int, height: int) -> Non
     assert not right.distortion.any()
     assert right.cam_from_world.tobytes() == right_camera_pose(left.cam_from_world, rig.baseline_m).tobytes()
     assert left.cam_from_world[:3, :3] @ left.cam_from_world[:3, :3].T == pytest.approx(np.eye(3), abs=1e-14)
-    turned = rectify(calibration_of(rig)).R_right @ right_from_left(calibration_of(rig))[:3, :3] @ POSE[:3, :3]
+    R_right = rectification_of(calibration_of(rig))[1][1]
+    turned = R_right @ calibration_of(rig).right_from_left[:3, :3] @ POSE[:3, :3]
     assert right.cam_from_world[:3, :3] == pytest.approx(turned, abs=1e-12)  # R2 of stereoRectify
 
 
@@ -124,21 +122,28 @@ def test_raw_to_rectified_matches_opencv_undistort(eye: str) -> None:
     """Compare raw pixel -> ray -> rectified pixel with ``cv2.undistortPointsIter`` in float64."""
     raw = rig_cameras(zed_rig(1280, 720, "raw"), POSE)[eye]
     rectified = rig_cameras(zed_rig(), POSE)[eye]
-    rectification = rectify(calibration_of(zed_rig()))
-    rotation = {"left": rectification.R_left, "right": rectification.R_right}[eye]
+    rectified_K, rotations = rectification_of(calibration_of(zed_rig()))
+    rotation = rotations[CAMERA_NAMES.index(eye)]
     rays = pixel_rays(raw.K, 1280, 720, raw.distortion)[::60, ::80].reshape(-1, 3)
     world = transform(inverse_rigid(raw.cam_from_world), 0.4 * rays)
     projected_px = project(rectified.K, transform(rectified.cam_from_world, world))
     v, u = np.mgrid[:720:60, :1280:80].astype(np.float64)
     pixels = np.stack([u, v], axis=-1).reshape(-1, 1, 2)
     criteria = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 100, 1e-16)
-    expected_px = cv2.undistortPointsIter(pixels, raw.K, raw.distortion, rotation, rectification.K, criteria)
+    expected_px = cv2.undistortPointsIter(pixels, raw.K, raw.distortion, rotation, rectified_K, criteria)
     assert np.abs(projected_px - expected_px[:, 0]).max() < 1e-6
+
+
+def rectification_of(calibration: StereoCalibration) -> tuple[ndarray, tuple[ndarray, ndarray]]:
+    """Return K of the rectified cameras and the rotations of both (``rectify``)."""
+    lenses = (calibration.left, calibration.right)
+    Ks, distortions = [lens.K for lens in lenses], [np.array(lens.distortion) for lens in lenses]
+    return rectify(Ks, distortions, calibration.right_from_left, calibration.width, calibration.height)
 
 
 def opencv_rectify_map(calibration: StereoCalibration, eye: str) -> Float64[ndarray, "h w 2"]:
     """Return the position of each rectified pixel in the raw image, computed by OpenCV."""
-    (Kl, Dl), (Kr, Dr) = ((lens_K(lens), lens_distortion(lens)) for lens in (calibration.left, calibration.right))
+    (Kl, Dl), (Kr, Dr) = ((lens.K, np.array(lens.distortion)) for lens in (calibration.left, calibration.right))
     size = (calibration.width, calibration.height)
     rotation, offset = cv2.Rodrigues(np.array(calibration.rotation_rad))[0], np.array(calibration.translation_m)
     R1, R2, P1, P2, *_ = cv2.stereoRectify(
@@ -153,9 +158,8 @@ def test_sign_of_baseline_does_not_change_rectification() -> None:
     """Check that the vendor's code, which passes the baseline unnegated, gives the same rectification."""
     calibration = calibration_of(zed_rig())
     negated = replace(calibration, translation_m=tuple(-length for length in calibration.translation_m))  # type: ignore[arg-type]
-    original, with_negated = rectify(calibration), rectify(negated)
-    assert original.R_left == pytest.approx(with_negated.R_left, abs=1e-15)
-    assert original.R_right == pytest.approx(with_negated.R_right, abs=1e-15)
+    for original, with_negated in zip(rectification_of(calibration)[1], rectification_of(negated)[1], strict=True):
+        assert original == pytest.approx(with_negated, abs=1e-15)
 
 
 @pytest.mark.parametrize(
@@ -237,6 +241,7 @@ def test_rectified_optical_axis_is_rotated_from_raw_axis() -> None:
     """Check the rotation of about 0.4 degrees by which planar depth of the two grids differs."""
     raw, rectified = (rig_cameras(zed_rig(160, 90, grid), POSE)["left"] for grid in ("raw", "rectified"))
     turn = rectified.cam_from_world @ inverse_rigid(raw.cam_from_world)
-    assert turn == pytest.approx(rigid(rectify(calibration_of(zed_rig())).R_left, np.zeros(3)), abs=1e-13)
+    R_left = rectification_of(calibration_of(zed_rig()))[1][0]
+    assert turn == pytest.approx(rigid(R_left, np.zeros(3)), abs=1e-13)
     cosine = (np.trace(turn[:3, :3]) - 1) / 2
     assert 0.1 < np.degrees(np.arccos(cosine)) < 1.0
