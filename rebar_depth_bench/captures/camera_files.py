@@ -41,7 +41,7 @@ from rebar_depth_bench.captures.calibration import (
     scaled_calibration,
     table_calibration,
 )
-from rebar_depth_bench.captures.calibration_files import check_image_size, read_calibration, scaled_calibration
+from rebar_depth_bench.captures.calibration_files import check_image_size, read_calibration
 from rebar_depth_bench.captures.documents import DOCUMENT_SUFFIXES, parse_document
 from rebar_depth_bench.captures.programs import program_calibration
 from rebar_depth_bench.data.schema import BoardTable

@@ -17,7 +17,6 @@ from rebar_depth_bench.console import (
     add_output_file,
     add_seconds,
     positive_number,
-    print_notice,
     print_verified,
     prints_table,
 )

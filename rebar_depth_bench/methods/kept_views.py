@@ -22,14 +22,13 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from rebar_depth_bench.atomic_io import named_write_errors, write_bytes, write_error, write_text
-from rebar_depth_bench.console import print_notice
 from rebar_depth_bench.data.views import Views
 from rebar_depth_bench.errors import EntryError, InputError, Problem, escape_text
 from rebar_depth_bench.limits import JSON_BYTES
 from rebar_depth_bench.names import NAME_PATTERN
 from rebar_depth_bench.reading import FileSource, parse_json, path_below, read_file, remove_folder
 from rebar_depth_bench.submission.maps import decode_npy, max_npy_bytes
-from rebar_depth_bench.submission.zip import check_entries, read_data, read_directory
+from rebar_depth_bench.submission.zip import read_data, read_entries
 from rebar_depth_bench.terminal import print_notice
 from rebar_depth_bench.validation import Expected, StrictModel, validate_table
 
@@ -129,13 +128,12 @@ class KeptViews:
         path, shapes = self._view_file(view_id), {f"{view_id}.npy": grid, f"{_SECONDS}.npy": (1, 1)}
         try:
             with closing(FileSource(path)) as source:
-                directory = read_directory(source, len(shapes))
-                checked = check_entries(source, directory, lambda name: max_npy_bytes(shapes.get(name, (0, 0))))
-                problems = [problem for check in checked for problem in check.problems]
-                entries = {check.entry.name: check for check in checked}
+                found = read_entries(source, len(shapes), lambda name: max_npy_bytes(shapes.get(name, (0, 0))))
+                problems = [problem for entry in found for problem in entry.problems]
+                entries = {entry.name: entry for entry in found}
                 if entries.keys() != shapes.keys():
-                    found = f"the arrays are {escape_text(', '.join(entries))}"
-                    problems.append(Problem("conflict", "", found, ", ".join(shapes)))
+                    names = f"the arrays are {escape_text(', '.join(entries))}"
+                    problems.append(Problem("conflict", "", names, ", ".join(shapes)))
                 if problems:
                     raise EntryError(problems[0])
                 depth_m, seconds = (

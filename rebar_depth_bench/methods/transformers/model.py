@@ -23,8 +23,7 @@ from numpy import ndarray
 
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
-from rebar_depth_bench.methods.monocular.third_party import import_package, translate_errors
-from rebar_depth_bench.methods.paper.third_party import torch_device
+from rebar_depth_bench.methods.paper.third_party import Network, torch_device
 from rebar_depth_bench.methods.transformers.checkpoints import (
     CONFIG,
     PREFIX,
@@ -99,7 +98,7 @@ def hf_method(name_or_path: str) -> Method:
         source=f"transformers, {checkpoint.name}",
         licence="that of the checkpoint",
     )
-    return Method(info, lambda: _load_predictor(checkpoint, output))
+    return Method(info, lambda: _load_predictor(Network(info, _INSTALL), checkpoint, output))
 
 
 DEPTH_PRO = Method(
@@ -167,21 +166,21 @@ def network_output_to_depth_m(
     return np.where(np.isfinite(z_m) & (z_m > 0), z_m, np.float32(np.nan))
 
 
-def _load_predictor(checkpoint: Checkpoint, output: OutputKind) -> Predictor:
+def _load_predictor(network: Network, checkpoint: Checkpoint, output: OutputKind) -> Predictor:
     """Return the predictor of a checkpoint, on the GPU if torch finds one.
 
     Raises ``MethodError`` if torch, ``transformers`` or weights are missing, or if the weights are incomplete.
     """
-    torch, transformers = (import_package(name, checkpoint.name, _INSTALL) for name in ("torch", "transformers"))
+    torch, transformers = (network.import_package(name, _INSTALL) for name in ("torch", "transformers"))
     ensure_weights(checkpoint)
     model_type, settings = checkpoint.config["model_type"], read_settings(checkpoint.folder / PREPROCESSOR)
-    with translate_errors(checkpoint.name, torch, "cannot be loaded"):
+    with network.errors("cannot be loaded"):
         if model_type == "depth_pro":
             processor, to_network_input = None, depth_pro_preprocessing(settings)
         else:  # The processors on Pillow give the same results with and without torchvision.
             processor = transformers.AutoImageProcessor.from_pretrained(checkpoint.folder, backend="pil")
             to_network_input = library_preprocessing(processor)
-        model = _load_network(transformers, checkpoint).to(torch_device(torch))
+        model = _load_network(transformers, checkpoint).to(torch_device())
 
     def predict(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
         rgb = row["left_rgb"]

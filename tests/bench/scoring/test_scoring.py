@@ -158,7 +158,7 @@ def test_damaged_entry_of_a_view_without_scored_pixels_rejects_the_archive(
     root = tmp_path / "copy"
     shutil.copytree(tiny_root, root)
     config = open_folder(root).config("lattice")
-    no_steel = {"bytes": encode_mask(np.zeros(config.grid, bool)), "path": None}
+    no_steel = {"bytes": encode_png(np.zeros(config.grid, bool)), "path": None}
     change_rows(first_shard(root, "lattice"), lambda rows: rows[1].update(left_mask=no_steel))
     _, row, *_ = iterate_rows(config, truth_columns("left"))
     record = {"left": truth_from_row(row, "left").digest(), "steel_px": 0, "scored_px": 0}

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.cameras import ideal_K, pixel_rays
-from rebar_depth_bench.geometry.rectification import pinhole_grid, pinhole_image
+from rebar_depth_bench.geometry.rectification import PinholeGrid, pinhole_grid, pinhole_image
 from rebar_depth_bench.methods.multiview.dense import read_depth_map
 from rebar_depth_bench.methods.multiview.sfm import LeftImages, reconstruct
 
