@@ -83,7 +83,7 @@ class KeptViews:
                 if run is not None and run.key == key:
                     return cls(path, key, run.reports)
                 views = sum(1 for _ in path.glob("*/*.npz"))
-                found = "another method, dataset or version" if run else f"a run whose {_RUN_FILE} is damaged"
+                found = "another method, dataset or version" if run else f"a run without a readable {_RUN_FILE}"
                 print_notice(f"starting over: {path} holds {views} views of {found}")
                 remove_folder(path)
             path.mkdir(parents=True)
