@@ -49,7 +49,7 @@ METHODS: Mapping[str, AnyMethod] = _BuiltIn(
         "sgbm": "rebar_depth_bench.methods.sgbm:SGBM",
         "sgbm-filled": "rebar_depth_bench.methods.sgbm:SGBM_FILLED",
         "foundation-stereo": "rebar_depth_bench.methods.paper.foundation_stereo:FOUNDATION_STEREO",
-        "depth-pro": "rebar_depth_bench.methods.huggingface.model:DEPTH_PRO",
+        "depth-pro": "rebar_depth_bench.methods.transformers.model:DEPTH_PRO",
         "metric3d": "rebar_depth_bench.methods.paper.monocular:METRIC3D",
         "unidepth": "rebar_depth_bench.methods.paper.monocular:UNIDEPTH",
         "depth-anything-3": "rebar_depth_bench.methods.paper.monocular:DEPTH_ANYTHING_3",
