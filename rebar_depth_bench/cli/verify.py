@@ -6,8 +6,9 @@ import argparse
 
 from rebar_depth_bench.cli.dataset_options import add_expect_digest
 from rebar_depth_bench.console import ProgressBars
+from rebar_depth_bench.data.files import file_problems
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.data.verification import file_problems, truth_problems
+from rebar_depth_bench.data.rows import truth_problems
 from rebar_depth_bench.errors import DatasetError
 
 

@@ -21,8 +21,9 @@ from rebar_depth_bench.data import codecs
 from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.data.schema import column_kind
 from rebar_depth_bench.data.shards import encoded_rows
-from rebar_depth_bench.errors import DatasetError, escape_text
+from rebar_depth_bench.errors import DatasetError, Problem, escape_text
 from rebar_depth_bench.geometry.cameras import Camera
+from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.validation import short_repr
 
 CAMERA_KINDS = ("K", "distortion", "cam_from_world")
@@ -213,3 +214,20 @@ def iterate_rows(
     Raises ``DatasetError`` if a cell is damaged, and as ``encoded_rows``.
     """
     return (decode_row(config, row) for row in encoded_rows(config, columns, view_ids))
+
+
+def truth_problems(config: DatasetConfig, progress: Progress = silent) -> Iterator[Problem]:
+    """Yield a problem for each view whose cameras or ground truth differ from the digests of the manifest.
+
+    Raises ``DatasetError`` for damaged shards and rows that are not the views of the manifest.
+    """
+    records = {record.view_id: record for record in config.views}
+    columns = ("view_id", "scene", *(name for eye in config.truth_eyes for name in truth_columns(eye)))
+    for done, row in enumerate(iterate_rows(config, columns), start=1):
+        record = records[row["view_id"]]
+        for eye in config.truth_eyes:
+            digest, expected = truth_from_row(row, eye).digest(), getattr(record, eye)
+            if digest != expected:
+                found = f"the {eye} ground truth has the digest {digest[:16]}"
+                yield Problem("conflict", record.view_id, found, f"{expected[:16]} as in the manifest")
+        progress(f"ground truth of {config.name}", done, len(records))
