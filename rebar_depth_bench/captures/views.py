@@ -1,4 +1,4 @@
-"""Images of one size and one calibration as views for methods (``data.views.Views``)."""
+"""Images of one size and one calibration as views for methods (``data.rows.Views``)."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from rebar_depth_bench.cli.dataset_options import add_expect_digest, print_verif
 from rebar_depth_bench.console import ProgressBars, add_seconds, positive_number, print_notice
 from rebar_depth_bench.data.files import MANIFEST_FILE
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.data.views import Views
+from rebar_depth_bench.data.rows import Views
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.methods import METHODS, MultiViewMethod, find_method
 from rebar_depth_bench.methods.onnx.session import VIEW_TIMEOUT_S

@@ -22,7 +22,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from rebar_depth_bench.atomic_io import write_bytes
-from rebar_depth_bench.data.views import Views
+from rebar_depth_bench.data.rows import Views
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.aruco_detection import Corners, board_pose, detected_corners_px

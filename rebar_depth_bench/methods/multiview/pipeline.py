@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-from rebar_depth_bench.data.views import Views
+from rebar_depth_bench.data.rows import Views
 from rebar_depth_bench.methods.base import Prepared
 from rebar_depth_bench.methods.multiview.dense import DENSE_METHODS
 from rebar_depth_bench.methods.multiview.images import LeftImages, row_columns, select_pairs, write_left_images
