@@ -47,7 +47,7 @@ import rebar_depth_bench as rdb
 from rebar_depth_bench.atomic_io import atomic_replace, write_text
 from rebar_depth_bench.console import run_command
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.data.views import ConfigViews
+from rebar_depth_bench.data.rows import ConfigViews
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.methods import find_method
 from rebar_depth_bench.methods.run import predict

@@ -23,7 +23,8 @@ from leaderboard.db.submissions import QUEUED, SCORING
 from leaderboard.db.versions import CurrentRankings, VersionReader
 from leaderboard.settings import Settings
 from leaderboard.storage.archive_store import ArchiveStore, delete_abandoned_uploads, make_folder
-from rebar_depth_bench.data.manifest import MANIFEST_FILE, DatasetFolder, open_folder
+from rebar_depth_bench.data.files import MANIFEST_FILE
+from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.names import TEST_SPLIT, config_of
 
 SIMULTANEOUS_CHECKS = 2

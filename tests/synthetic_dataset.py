@@ -15,8 +15,8 @@ import pyarrow.parquet as pq
 from dataset_builder.pipeline.shards import View, encode_view
 from rebar_depth_bench import SubmissionWriter
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, write_bars
-from rebar_depth_bench.data.files import file_sha256, views_digest
-from rebar_depth_bench.data.manifest import MANIFEST_FILE, MANIFEST_FORMAT, OLD_FORMAT
+from rebar_depth_bench.data.files import MANIFEST_FILE, file_sha256, views_digest
+from rebar_depth_bench.data.manifest import MANIFEST_FORMAT, OLD_FORMAT
 from rebar_depth_bench.data.rows import EyeView
 from rebar_depth_bench.data.schema import ViewRecord
 from rebar_depth_bench.geometry.cameras import Camera

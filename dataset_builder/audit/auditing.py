@@ -47,11 +47,10 @@ from dataset_builder.pipeline.plan import BUILD_FOLDER
 from rebar_depth_bench.bar_crossings.definition import Crossings, scene_crossings
 from rebar_depth_bench.bar_crossings.table import CROSSINGS_FILE, folder_crossings
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars
-from rebar_depth_bench.data.files import local_folder
+from rebar_depth_bench.data.files import file_problems, local_folder
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_folder
 from rebar_depth_bench.data.rows import iterate_rows
 from rebar_depth_bench.data.schema import ViewRecord
-from rebar_depth_bench.data.verification import file_problems
 from rebar_depth_bench.errors import DatasetError, InputError
 from rebar_depth_bench.parallel import Progress, silent
 

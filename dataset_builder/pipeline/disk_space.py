@@ -19,7 +19,7 @@ from dataset_builder.pipeline.retained import Finished
 from dataset_builder.scene.variants.registry import image_light
 from dataset_builder.specs.config_specs import RigSpec, SceneConfigSpec
 from rebar_depth_bench.data.bars import BARS_FILE, decoded_bytes
-from rebar_depth_bench.data.manifest import MANIFEST_FILE
+from rebar_depth_bench.data.files import MANIFEST_FILE
 from rebar_depth_bench.errors import InputError, OutputError
 from rebar_depth_bench.limits import JSON_BYTES, TABLE_BYTES
 

@@ -18,9 +18,8 @@ from dataset_builder.pipeline.plan import BUILD_FOLDER, STAGING_KEY, ConfigPlan
 from rebar_depth_bench.atomic_io import exclusive_lock, temporary_target, write_error, write_text
 from rebar_depth_bench.bar_crossings.table import CROSSINGS_FILE
 from rebar_depth_bench.data.bars import BARS_FILE
-from rebar_depth_bench.data.files import file_sha256
+from rebar_depth_bench.data.files import MANIFEST_FILE, file_sha256
 from rebar_depth_bench.data.manifest import (
-    MANIFEST_FILE,
     MANIFEST_FORMAT,
     OLD_FORMAT,
     DatasetFolder,

@@ -45,14 +45,8 @@ from rebar_depth_bench.bar_crossings.table import (
     write_crossings,
 )
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars, write_bars
-from rebar_depth_bench.data.files import file_sha256, parameters_digest, views_digest
-from rebar_depth_bench.data.manifest import (
-    MANIFEST_FILE,
-    MANIFEST_FORMAT,
-    DatasetConfig,
-    DatasetFolder,
-    validated_folder,
-)
+from rebar_depth_bench.data.files import MANIFEST_FILE, file_sha256, parameters_digest, views_digest
+from rebar_depth_bench.data.manifest import MANIFEST_FORMAT, DatasetConfig, DatasetFolder, validated_folder
 from rebar_depth_bench.data.schema import ViewRecord
 from rebar_depth_bench.names import SPLITS, TEST_SPLIT
 from rebar_depth_bench.reading import remove_file

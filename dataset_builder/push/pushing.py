@@ -28,9 +28,8 @@ from huggingface_hub.utils.sha import git_hash
 
 from dataset_builder.push.hub_errors import hub_errors
 from rebar_depth_bench import software_version
-from rebar_depth_bench.data.files import file_sha256, local_folder
-from rebar_depth_bench.data.manifest import MANIFEST_FILE, DatasetFolder, open_folder
-from rebar_depth_bench.data.verification import file_problems
+from rebar_depth_bench.data.files import MANIFEST_FILE, file_problems, file_sha256, local_folder
+from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.errors import (
     DatasetError,
     InputError,

@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 
 from rebar_depth_bench.console import add_expect_digest
+from rebar_depth_bench.data.files import file_problems
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.data.verification import file_problems, truth_problems
+from rebar_depth_bench.data.rows import truth_problems
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.terminal import ProgressBars
 

@@ -1,11 +1,12 @@
-"""Files of a dataset, in a local folder or a Hub repository at one commit, and digests of files and parameters."""
+"""Files of a dataset in a local folder or a Hub repository at one commit: access, digests and verification."""
 
 from __future__ import annotations
 
 import hashlib
 import json
+import os
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
@@ -13,15 +14,18 @@ from typing import TYPE_CHECKING, BinaryIO, cast
 
 from pydantic import ConfigDict
 
-from rebar_depth_bench.errors import DatasetError, InputError, escape_text
+from rebar_depth_bench.errors import DatasetError, InputError, Problem, escape_text
 from rebar_depth_bench.names import PATH_PATTERN
+from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.reading import FileSource, open_regular, path_below
 from rebar_depth_bench.validation import StrictModel
 
 if TYPE_CHECKING:
+    from rebar_depth_bench.data.manifest import DatasetFolder
     from rebar_depth_bench.data.schema import ViewRecord
 
 
+MANIFEST_FILE = "manifest.json"
 _HUB_NAME = "[A-Za-z0-9][A-Za-z0-9_.-]{0,95}"
 _HUB_ROOT_PATTERN = re.compile(rf"(?P<repository>{_HUB_NAME}/{_HUB_NAME})(@(?P<revision>{PATH_PATTERN}))?")
 
@@ -160,3 +164,43 @@ def parameters_digest(parameters: object) -> str:
     """Return the hex SHA-256 of the canonical JSON of ``parameters`` (sorted keys, no whitespace, no NaN)."""
     canonical = json.dumps(parameters, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(canonical.encode()).hexdigest()
+
+
+def file_problems(folder: DatasetFolder, progress: Progress = silent) -> Iterator[Problem]:
+    """Yield a problem for each file of the manifest that is missing or has another SHA-256, and for further files.
+
+    Files of a Hub repository are downloaded first; its further files are not looked for.
+    """
+    for done, (name, sha256) in enumerate(folder.files.items(), start=1):
+        if problem := _file_problem(folder, name, sha256):
+            yield problem
+        progress("files", done, len(folder.files))
+    used = {name for config in folder.config_by_name.values() for name in config.files}
+    for name in sorted(used - set(folder.files)):
+        yield Problem("missing", name, "has no SHA-256 in the manifest, which names it", "one for each file")
+    if folder.local is not None:
+        for name in sorted(_existing_files(folder.local) - set(folder.files) - used - {MANIFEST_FILE}):
+            yield Problem("unknown", escape_text(name), "is not in the manifest")
+
+
+def _file_problem(folder: DatasetFolder, name: str, sha256: str) -> Problem | None:
+    try:
+        actual_sha256 = file_sha256(folder.file(name) if folder.local is None else path_below(folder.local, name))
+    except FileNotFoundError:
+        return Problem("missing", name, "is missing")
+    except OSError as error:
+        return Problem("unreadable", name, f"cannot be read: {error.strerror or error}")
+    except DatasetError as error:  # The file cannot be downloaded.
+        return Problem("unreadable", name, escape_text(str(error)))
+    if actual_sha256 == sha256:
+        return None
+    return Problem("conflict", name, f"SHA-256 is {actual_sha256[:16]}", sha256[:16])
+
+
+def _existing_files(root: Path) -> set[str]:
+    """Return the relative POSIX paths of all files in a folder that are not hidden at its top level."""
+    names = set()
+    for folder, subfolders, files in os.walk(root):
+        links = [name for name in subfolders if Path(folder, name).is_symlink()]
+        names |= {Path(folder, name).relative_to(root).as_posix() for name in (*files, *links)}
+    return {name for name in names if not name.startswith(".")}

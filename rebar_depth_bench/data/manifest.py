@@ -10,7 +10,7 @@ from typing import Annotated, Any, Self
 
 from pydantic import AliasPath, Field, Strict, ValidationInfo, field_validator
 
-from rebar_depth_bench.data.files import Located, file_sha256, parameters_digest, views_digest
+from rebar_depth_bench.data.files import MANIFEST_FILE, Located, file_sha256, parameters_digest, views_digest
 from rebar_depth_bench.data.schema import (
     DIGEST_PATTERN,
     EYES,
@@ -241,7 +241,6 @@ class DatasetConfig(Located):
         return tuple(view.view_id for view in self.views)
 
 
-MANIFEST_FILE = "manifest.json"
 MANIFEST_FORMAT = "rebar-depth-dataset-2"
 OLD_FORMAT = "rebar-depth-dataset-1"
 """Format of folders that ``rebar-build --rewrite-manifest`` converts."""

@@ -1,4 +1,4 @@
-"""Rows of a config: decoding of the cells to arrays, and cameras with their ground truth.
+"""Rows of a config: decoding of the cells, cameras with their ground truth, and the views that methods predict.
 
 The shards are read with pyarrow: ``datasets`` takes a second to import, and imports torch, which takes several, to
 stream.
@@ -11,7 +11,8 @@ import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Any, Protocol
 
 import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8, UInt16
@@ -21,8 +22,10 @@ from rebar_depth_bench.data import codecs
 from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.data.schema import column_kind
 from rebar_depth_bench.data.shards import encoded_rows
-from rebar_depth_bench.errors import DatasetError, escape_text
+from rebar_depth_bench.errors import DatasetError, Problem, escape_text
+from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import Camera, is_rigid
+from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.validation import short_repr
 
 CAMERA_KINDS = ("K", "distortion", "cam_from_world")
@@ -207,3 +210,141 @@ def iterate_rows(
     Raises ``DatasetError`` if a cell is damaged, and as ``encoded_rows``.
     """
     return (decode_row(config, row) for row in encoded_rows(config, columns, view_ids))
+
+
+def truth_problems(config: DatasetConfig, progress: Progress = silent) -> Iterator[Problem]:
+    """Yield a problem for each view whose cameras or ground truth differ from the digests of the manifest.
+
+    Raises ``DatasetError`` for damaged shards and rows that are not the views of the manifest.
+    """
+    records = {record.view_id: record for record in config.views}
+    columns = ("view_id", "scene", *(name for eye in config.truth_eyes for name in truth_columns(eye)))
+    for done, row in enumerate(iterate_rows(config, columns), start=1):
+        record = records[row["view_id"]]
+        for eye in config.truth_eyes:
+            digest, expected = truth_from_row(row, eye).digest(), getattr(record, eye)
+            if digest != expected:
+                found = f"the {eye} ground truth has the digest {digest[:16]}"
+                yield Problem("conflict", record.view_id, found, f"{expected[:16]} as in the manifest")
+        progress(f"ground truth of {config.name}", done, len(records))
+
+
+class Views(Protocol):
+    """Views of one image size. A row has the columns of a dataset (``schema.COLUMNS``), decoded."""
+
+    @property
+    def config(self) -> str:
+        """Name of the config, with split and scene if it has several scenes, or of the capture."""
+
+    @property
+    def view_ids(self) -> tuple[str, ...]:
+        """Ids of the views, in order."""
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Image size (height, width), pixels."""
+
+    @property
+    def board(self) -> BoardSpec | None:
+        """ArUco board under the assembly, or None."""
+
+    @property
+    def mesh(self) -> Path:
+        """Path of the scene's PLY mesh, which is ground truth. Raises ``InputError`` if there is none."""
+
+    @property
+    def has_poses(self) -> bool:
+        """Whether all views have poses in one world frame; else the world frame of a view is its left camera."""
+
+    @property
+    def rectify(self) -> bool:
+        """Whether single-view methods that do not read the lens distortion are given rectified images."""
+
+    @property
+    def identity(self) -> Any:
+        """JSON value that differs for other images or cameras."""
+
+    def by_scene(self) -> Sequence[Views]:
+        """Return the views of each scene."""
+
+    def check_columns(self, columns: Sequence[str], reader: str) -> None:
+        """Raise ``InputError`` if the views lack columns that ``reader`` needs."""
+
+    def rows(self, *columns: str, skip: Collection[str] = ()) -> Iterator[dict[str, Any]]:
+        """Yield the decoded ``view_id`` and named columns of each view that is not in ``skip``, in order.
+
+        Raises ``InputError`` for columns that the views lack, and for damaged images.
+        """
+
+
+@dataclass(frozen=True)
+class ConfigViews:
+    """Views of scenes of a dataset's config; ``board`` and ``mesh`` need a config of one scene (see ``Views``)."""
+
+    source: DatasetConfig
+
+    @property
+    def config(self) -> str:
+        """Name of the config, with split and scene if it has several scenes."""
+        return self.source.label
+
+    @property
+    def view_ids(self) -> tuple[str, ...]:
+        """Ids of the views, in order."""
+        return self.source.view_ids
+
+    @property
+    def grid(self) -> tuple[int, int]:
+        """Image size (height, width), pixels."""
+        return self.source.grid
+
+    @property
+    def board(self) -> BoardSpec | None:
+        """ArUco board under the assembly, or None."""
+        return self.source.scene.board
+
+    @property
+    def mesh(self) -> Path:
+        """Path of the scene's PLY mesh, which is ground truth. Raises ``DatasetError`` if it is missing."""
+        return self.source.file(self.source.mesh)
+
+    @property
+    def has_poses(self) -> bool:
+        """Whether all views of a scene have poses in its world frame."""
+        return self.source.imported is None or self.source.imported.has_poses
+
+    @property
+    def rectify(self) -> bool:
+        """False: on the raw grid of a config, methods see what the camera sees."""
+        return False
+
+    @property
+    def identity(self) -> list[str]:
+        """Key of the build and digest of the ground truth."""
+        return [self.source.key, self.source.ground_truth_digest]
+
+    def by_scene(self) -> tuple[ConfigViews, ...]:
+        """Return the views of each scene."""
+        return tuple(map(ConfigViews, self.source.by_scene()))
+
+    def check_columns(self, columns: Sequence[str], reader: str) -> None:
+        """Raise ``DatasetError`` if ``reader`` needs columns that the config was built or imported without."""
+        needed = [name for name in columns if name in self.source.absent_columns]
+        if not needed:
+            return
+        place = f"{self.source.root}: {reader} needs {', '.join(needed)}, but config {self.source.name} was"
+        if self.source.imported is not None:
+            raise DatasetError(f"{place} imported without them; choose other configs (--config)")
+        raise DatasetError(
+            f"{place} built without colour (rebar-build --no-colour); choose configs with colour (--config), or "
+            "build it with colour"
+        )
+
+    def rows(self, *columns: str, skip: Collection[str] = ()) -> Iterator[dict[str, Any]]:
+        """Yield the decoded ``view_id`` and named columns of each view that is not in ``skip``, in order.
+
+        Raises ``DatasetError`` for columns that the config lacks.
+        """
+        self.check_columns(columns, "the method")
+        wanted = [view_id for view_id in self.view_ids if view_id not in skip] if skip else None
+        return iterate_rows(self.source, ("view_id", *columns), wanted)

@@ -10,7 +10,7 @@ from typing import Any
 from jaxtyping import Float32
 from numpy import ndarray
 
-from rebar_depth_bench.data.views import Views
+from rebar_depth_bench.data.rows import Views
 from rebar_depth_bench.parallel import Progress
 
 Predictor = Callable[[Mapping[str, Any]], Float32[ndarray, "h w"]]

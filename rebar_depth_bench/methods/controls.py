@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from numpy import ndarray
 
-from rebar_depth_bench.data.views import Views
+from rebar_depth_bench.data.rows import Views
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.cameras import pixel_rays
 from rebar_depth_bench.methods.base import Method, MethodInfo, MultiViewMethod, Prepared

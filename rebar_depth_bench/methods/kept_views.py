@@ -22,7 +22,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from rebar_depth_bench.atomic_io import named_write_errors, write_bytes, write_error, write_text
-from rebar_depth_bench.data.views import Views
+from rebar_depth_bench.data.rows import Views
 from rebar_depth_bench.errors import EntryError, InputError, Problem, escape_text
 from rebar_depth_bench.limits import JSON_BYTES
 from rebar_depth_bench.names import NAME_PATTERN

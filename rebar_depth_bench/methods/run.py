@@ -23,14 +23,8 @@ from numpy import ndarray
 from rebar_depth_bench import software_version
 from rebar_depth_bench.atomic_io import NO_SPACE, is_stream, link_target, scratch_folder, write_error
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
-from rebar_depth_bench.data.views import Views
-from rebar_depth_bench.errors import (
-    DatasetError,
-    InputError,
-    MethodError,
-    RebarDepthError,
-    escape_text,
-)
+from rebar_depth_bench.data.rows import Views
+from rebar_depth_bench.errors import DatasetError, InputError, MethodError, RebarDepthError, escape_text
 from rebar_depth_bench.methods import AnyMethod, ConfigViews, Method, MultiViewMethod, Predictor, Prepared
 from rebar_depth_bench.methods.base import input_class
 from rebar_depth_bench.methods.kept_views import KeptViews, PreparationReport

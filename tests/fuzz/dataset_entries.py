@@ -21,7 +21,7 @@ from dataset_builder.specs.config_specs import colour_spec
 from rebar_depth_bench import SubmissionWriter, load
 from rebar_depth_bench.console import EXIT_DONE
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.data.views import ConfigViews
+from rebar_depth_bench.data.rows import ConfigViews
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.methods.controls import noisy_depth_m
 from rebar_depth_bench.submission import SubmissionReader

@@ -10,7 +10,7 @@ from __future__ import annotations
 from pathlib import Path
 from types import ModuleType
 
-from rebar_depth_bench.data.views import Views
+from rebar_depth_bench.data.rows import Views
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.base import MethodInfo, MultiViewMethod, Prepared
 from rebar_depth_bench.parallel import Progress

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-from rebar_depth_bench.data.views import Views
+from rebar_depth_bench.data.rows import Views
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.methods.base import Prepared

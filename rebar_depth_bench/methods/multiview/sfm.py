@@ -28,7 +28,7 @@ from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from rebar_depth_bench.atomic_io import write_bytes
-from rebar_depth_bench.data.views import Views
+from rebar_depth_bench.data.rows import Views
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.aruco_detection import Corners, board_pose, detected_corners_px

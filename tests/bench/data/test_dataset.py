@@ -22,7 +22,6 @@ from rebar_depth_bench.data.schema import References, Survey, Trajectory, featur
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import ideal_K, right_camera_pose
 from rebar_depth_bench.scoring.truth import published_match
-from tests.damage import change_rows, copy_dataset, first_shard
 
 HEIGHT, WIDTH, VIEWS = 90, 160, 9
 
@@ -351,33 +350,6 @@ def test_board_is_read_from_manifest(manifest: Any, tmp_path: Path) -> None:
     folder = open_folder(tmp_path)
     assert folder.config("lattice").scene.board == BoardSpec(markers=12)
     assert folder.config("lattice-orbit").scene.board is None
-
-
-@pytest.mark.parametrize("row_group_size", [1, 3])
-@pytest.mark.parametrize("turned", [False, True])
-def test_rows_of_some_views_are_found_wherever_they_are(
-    tiny_root: Path, tmp_path: Path, row_group_size: int, turned: bool
-) -> None:
-    columns, root = ("view_id", "left_depth"), copy_dataset(tiny_root, tmp_path / "copy")
-    expected = {
-        row["view_id"]: row["left_depth"] for row in iterate_rows(open_folder(root).config("lattice"), columns)
-    }
-    for shard in root.glob("lattice/*.parquet"):
-        change_rows(shard, list.reverse if turned else list.copy, row_group_size=row_group_size)
-    config = open_folder(root).config("lattice")
-    for view_ids in (*([view_id] for view_id in expected), config.view_ids[1::3], config.view_ids):
-        rows = list(iterate_rows(config, columns, view_ids))
-        assert sorted(row["view_id"] for row in rows) == list(view_ids)
-        assert all(np.array_equal(row["left_depth"], expected[row["view_id"]]) for row in rows)
-
-
-def test_missing_row_of_some_views_is_named(tiny_root: Path, tmp_path: Path) -> None:
-    root = copy_dataset(tiny_root, tmp_path / "copy")
-    change_rows(first_shard(root, "lattice"), list.pop)
-    config = open_folder(root).config("lattice")
-    missing = config.view_ids[7]
-    with pytest.raises(rdb.DatasetError, match=f"lattice lacks 1 views, among them {missing}"):
-        list(iterate_rows(config, ("view_id",), [missing]))
 
 
 def test_view_id_of_shard_that_manifest_lacks_is_rejected(tiny_root: Path, tmp_path: Path) -> None:

@@ -13,11 +13,10 @@ import pyarrow.parquet as pq
 import pytest
 
 import rebar_depth_bench as rdb
-from rebar_depth_bench.data.files import views_digest
-from rebar_depth_bench.data.manifest import MANIFEST_FILE, open_folder
+from rebar_depth_bench.data.files import MANIFEST_FILE, views_digest
+from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.data.rows import ConfigViews, Views, truth_problems
 from rebar_depth_bench.data.schema import ViewRecord
-from rebar_depth_bench.data.verification import truth_problems
-from rebar_depth_bench.data.views import ConfigViews, Views
 from rebar_depth_bench.errors import DatasetError, InputError, SubmissionError
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
 from rebar_depth_bench.extended.registry import score_extended

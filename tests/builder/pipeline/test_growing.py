@@ -19,8 +19,8 @@ from dataset_builder.pipeline import folder, retained
 from dataset_builder.pipeline.build import BuildSummary, build
 from dataset_builder.pipeline.plan import BUILD_FOLDER
 from rebar_depth_bench.data.bars import BARS_FILE
-from rebar_depth_bench.data.manifest import MANIFEST_FILE, open_folder
-from rebar_depth_bench.data.verification import file_problems
+from rebar_depth_bench.data.files import MANIFEST_FILE, file_problems
+from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.limits import JSON_BYTES, TABLE_BYTES
 from rebar_depth_bench.parallel import silent
