@@ -35,8 +35,13 @@ from jaxtyping import Float64
 from numpy import ndarray
 from pydantic import Field, field_validator
 
-from rebar_depth_bench.captures.calibration import Calibration, StereoCalibration, table_calibration
-from rebar_depth_bench.captures.calibration_files import check_image_size, read_calibration, scaled_calibration
+from rebar_depth_bench.captures.calibration import (
+    Calibration,
+    StereoCalibration,
+    scaled_calibration,
+    table_calibration,
+)
+from rebar_depth_bench.captures.calibration_files import check_image_size, read_calibration
 from rebar_depth_bench.captures.documents import DOCUMENT_SUFFIXES, parse_document
 from rebar_depth_bench.captures.programs import program_calibration
 from rebar_depth_bench.data.schema import BoardTable
