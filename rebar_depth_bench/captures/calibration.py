@@ -315,8 +315,8 @@ class _TwoCameras(_OneCamera):
         """Calibration of the tables."""
         rotation = np.array(self.stereo.rotation)
         x, y, z = (rotation if rotation.ndim == 1 else rotation_vector(rotation)).tolist()
-        lenses = self.left.lens, self.right.lens
-        return StereoCalibration(self.width, self.height, *lenses, (x, y, z), self.stereo.translation_m)
+        left, right, translation_m = self.left.lens, self.right.lens, self.stereo.translation_m
+        return StereoCalibration(self.width, self.height, left, right, (x, y, z), translation_m)
 
 
 def _check_one_given(values: Mapping[str, object]) -> None:

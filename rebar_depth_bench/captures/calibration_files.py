@@ -146,7 +146,9 @@ def _read_conf(content: bytes, width: int, height: int, problems: list[Problem])
     baseline_mm, y_mm, z_mm, rx, cv, rz = _section_numbers(sections, "STEREO", _STEREO, suffix, problems)
     # The whole vector is negated, which keeps it on the line that the vendor's rectification uses.
     translation_m = (0.0 - baseline_mm / 1000, 0.0 - y_mm / 1000, 0.0 - z_mm / 1000)
-    return None if problems else StereoCalibration(width, height, *lenses, (rx, cv, rz), translation_m)
+    return (
+        None if problems else StereoCalibration(width, height, lenses[0], lenses[1], (rx, cv, rz), translation_m)
+    )
 
 
 def _read_sections(content: bytes, problems: list[Problem]) -> _Sections:

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -46,7 +46,6 @@ _ROS: Fields = {
     "matrix": ("camera_matrix", "K"),
     "distortion": ("distortion_coefficients", "D"),
     "model": ("distortion_model",),
-    "size": (),
     "width": ("image_width", "width"),
     "height": ("image_height", "height"),
     "rotation": ("rectification_matrix", "R"),
@@ -107,7 +106,7 @@ class _Reader:
 
     def key(self, name: str) -> str | None:
         """Return the key of a field in the document, None if it has none."""
-        return next((self._keys[key] for key in map(_plain, self.fields[name]) if key in self._keys), None)
+        return next((self._keys[key] for key in map(_plain, self.fields.get(name, ())) if key in self._keys), None)
 
     def numbers(self, name: str, *shapes: tuple[int, ...], default: Values | None = None) -> Values:
         """Return the numbers of a field, in one of ``shapes``; a side that is -1 may have any length."""
@@ -137,10 +136,11 @@ class _Reader:
         terms = self.numbers("distortion", (-1,), default=np.zeros(_DISTORTION_TERMS))
         key = self.key("model")
         model = "" if key is None else self.document[key]
+        found = f"the distortion has {len(terms)} terms" if terms[_DISTORTION_TERMS:].any() else ""
         if str(model).lower() not in _MODELS:
-            self._refuse_lens(f"the distortion model is {short_repr(model)}")
-        elif terms[_DISTORTION_TERMS:].any():
-            self._refuse_lens(f"the distortion has {len(terms)} terms")
+            found = f"the distortion model is {short_repr(model)}"
+        if found:
+            self.problems.append(Problem("invalid", self.name, found, _KNOWN_MODEL))
         distortion = [*terms[:_DISTORTION_TERMS].tolist(), *[0.0] * (4 - len(terms))]
         return {**pinhole, "distortion": distortion}
 
@@ -148,7 +148,7 @@ class _Reader:
         """Return width and height, from one field with both or from two; nothing if the document has none."""
         if self.key("size"):
             width, height = self.numbers("size", (2,)).tolist()
-        elif "width" in self.fields and self.key("width") and self.key("height"):
+        elif self.key("width") and self.key("height"):
             width, height = (float(self.numbers(name, (1,))[0]) for name in ("width", "height"))
         else:
             return {}
@@ -173,9 +173,6 @@ class _Reader:
         name = self.sources.get(key, self.name)
         return format_location(name if ": " in name else f"{name}:", key)
 
-    def _refuse_lens(self, found: str) -> None:
-        self.problems.append(Problem("invalid", self.name, found, _KNOWN_MODEL))
-
 
 def program_calibration(
     documents: Mapping[str, Document], width: int, height: int, unit_m: float, problems: list[Problem]
@@ -186,7 +183,7 @@ def program_calibration(
     the documents state none. Problems are added to ``problems``; the result is None if there are any.
     """
     cameras = [_Reader(name, document, problems, _ROS) for name, document in documents.items()]
-    find_motion = _ros_motion
+    find_motion: Callable[[_Reader, _Reader, float], tuple[Values, Values]] = _ros_motion
     if not any(camera.key("matrix") and camera.key("projection") for camera in cameras):
         merged = _merged(documents, problems)
         if "cam0" in merged.document:
@@ -196,7 +193,7 @@ def program_calibration(
     table: dict[str, Any] = {eye: one.lens() for eye, one in zip(_CAMERAS, cameras, strict=False)}
     table |= cameras[0].size()
     if len(cameras) == 2:
-        rotation, translation_m = find_motion(*cameras, unit_m)
+        rotation, translation_m = find_motion(cameras[0], cameras[1], unit_m)
         if not is_rotation(rotation) and is_rotation(rotation, _ROUNDED_ROTATION):
             rotation = nearest_rotation(rotation)
         table["stereo"] = {"rotation": rotation.tolist(), "translation_m": translation_m.tolist()}
