@@ -17,7 +17,6 @@ import os
 import re
 import stat
 import struct
-import sys
 import tempfile
 import threading
 import time
@@ -37,7 +36,7 @@ from rebar_depth_bench.data.files import parameters_digest
 from rebar_depth_bench.errors import DatasetError, InputError
 from rebar_depth_bench.limits import CACHE_BYTES
 from rebar_depth_bench.reading import ByteSource, FileSource, MemorySource, check_no_links, remove_file
-from rebar_depth_bench.terminal import terminal_text
+from rebar_depth_bench.terminal import print_notice
 from rebar_depth_bench.validation import StrictModel
 
 FOLDER_NAME = "rebar-depth-bench"
@@ -397,5 +396,4 @@ def _warn_once(message: str) -> None:
 
 
 def _warn(message: str) -> None:
-    sys.stderr.write(f"warning: {terminal_text(message)}\n")  # In one call, so that threads do not mix lines.
-    sys.stderr.flush()
+    print_notice(f"warning: {message}")
