@@ -15,7 +15,7 @@ from __future__ import annotations
 import json
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from typing import Annotated, Any, TypeGuard, TypeVar, get_args
@@ -177,7 +177,8 @@ def _problem(details: ErrorDetails, model: type[BaseModel], where: str) -> Probl
     if kind == "extra_forbidden":
         fields = _model_at(model, location).model_fields
         known = [field.alias or name for name, field in fields.items()]
-        return Problem("unknown", place, "not a known key", _known_keys(str(location[-1]), known))
+        close = get_close_matches(str(location[-1]), known, n=1)
+        return Problem("unknown", place, "not a known key", close[0] if close else f"one of {', '.join(known)}")
     expected = _TYPES.get(
         kind, details["msg"].removeprefix("Input should be ").replace("String should match", "text that matches")
     )
@@ -205,11 +206,6 @@ def _expectation(model: type[BaseModel], key: int | str) -> str:
     if _is_model(field.annotation):
         return "a table"
     return next((item.text for item in field.metadata if isinstance(item, Expected)), "")
-
-
-def _known_keys(key: str, known: Iterable[str]) -> str:
-    close_matches = get_close_matches(key, known, n=1)
-    return close_matches[0] if close_matches else f"one of {', '.join(known)}"
 
 
 def format_location(where: str, *keys: int | str) -> str:

@@ -15,7 +15,6 @@ import os
 import re
 import stat
 import struct
-import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -33,7 +32,7 @@ from rebar_depth_bench.errors import DatasetError, InputError, OutputError
 from rebar_depth_bench.limits import CACHE_BYTES
 from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.reading import FileSource, check_no_links, remove_file
-from rebar_depth_bench.terminal import terminal_text
+from rebar_depth_bench.terminal import print_notice
 from rebar_depth_bench.validation import StrictModel
 
 FOLDER_NAME = "rebar-depth-bench"
@@ -343,5 +342,4 @@ def _warn_once(message: str) -> None:
 
 
 def _warn(message: str) -> None:
-    sys.stderr.write(f"warning: {terminal_text(message)}\n")  # In one call, so that threads do not mix lines.
-    sys.stderr.flush()
+    print_notice(f"warning: {message}")

@@ -21,7 +21,7 @@ from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.data.rows import CAMERA_KINDS
 from rebar_depth_bench.geometry.cameras import Camera
 from rebar_depth_bench.scoring.evaluation import View
-from rebar_depth_bench.scoring.metrics import is_valid_prediction
+from rebar_depth_bench.scoring.metrics import is_valid_prediction, median_scale
 from rebar_depth_bench.scoring.protocol import scored_pixels
 
 Values = Float64[ndarray, " n"]
@@ -122,8 +122,7 @@ def mean_error(p: Values, z_m: Values, scale: float | None = None) -> float:
 def median_ratio(p: Values, z_m: Values) -> float:
     """Return median(z) / median(p) over the valid predictions, NaN without any."""
     valid = is_valid_prediction(p)
-    with np.errstate(over="ignore", under="ignore", divide="ignore"):
-        return float(np.median(z_m[valid]) / np.median(p[valid])) if valid.any() else math.nan
+    return median_scale(p[valid], float(np.median(z_m[valid]))) if valid.any() else math.nan
 
 
 def line_error(p: Values, z_m: Values, of_depth: Callable[[Values], Values]) -> float:
