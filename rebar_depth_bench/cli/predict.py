@@ -17,12 +17,11 @@ from rebar_depth_bench.console import (
     add_output_file,
     add_seconds,
     positive_number,
-    print_notice,
     print_verified,
     prints_table,
 )
 from rebar_depth_bench.data.files import MANIFEST_FILE
-from rebar_depth_bench.data.manifest import MANIFEST_FILE, open_folder
+from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import Views
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.methods import METHODS, AnyMethod, MultiViewMethod, find_method
