@@ -88,7 +88,7 @@ def test_integers_with_missing_values_stay_integers() -> None:
 
 
 def test_csv_without_rows_has_the_header(two_configs: Result) -> None:
-    extended = ExtendedResult(measures={}, tables={}, views=())
+    extended = ExtendedResult(measures={}, tables={}, views={})
     empty = dataclasses.replace(two_configs, tables={}, views=[], extended=extended)
     assert result_csv(empty) == result_csv(two_configs).splitlines(keepends=True)[0]
     compared = comparison_csv([compare(two_configs, two_configs)])
