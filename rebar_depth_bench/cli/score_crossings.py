@@ -13,8 +13,7 @@ from rebar_depth_bench.detections.score import score_crossings
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.output_options import add_output_file, prints_table
 from rebar_depth_bench.outputs import write_output
-from rebar_depth_bench.reporting.detections import detection_page
-from rebar_depth_bench.reporting.table_page import print_page, render_page
+from rebar_depth_bench.reporting.detections import detection_page, print_page, render_page
 from rebar_depth_bench.submission import INPUTS
 
 

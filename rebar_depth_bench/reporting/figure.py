@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from rebar_depth_bench.console import require_extra
 from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.outputs import write_output
-from rebar_depth_bench.reporting.charts.axes import LogAxis, decade_axis, select_spaced, tick_label
+from rebar_depth_bench.reporting.axes import Axis, decade_axis, select_spaced, tick_label
 from rebar_depth_bench.reporting.formatting import (
     CONSTANT_TITLE,
     ONE_PIXEL_TITLE,
@@ -373,7 +373,7 @@ def _draw_panel(axes: Axes, panel: Panel, frame: tuple[float, float], content: F
             axes.annotate("†", place, (-5.5, 3), textcoords="offset points", color=_GREY, fontsize=6.2)
 
 
-def _scales(panel: Panel, width: float, height: float) -> tuple[LogAxis, LogAxis]:
+def _scales(panel: Panel, width: float, height: float) -> tuple[Axis, Axis]:
     """Return the axes of native and scaled errors, which hold the points and references of a panel.
 
     The x axis also covers the y axis, so that the diagonal crosses the panel.
@@ -390,7 +390,7 @@ def _with_margin(values: Sequence[float]) -> list[float]:
     return [min(max(value * factor, low), high) for value in inside for factor in _MARGIN_FACTORS]
 
 
-def _within(value: float, scale: LogAxis) -> float:
+def _within(value: float, scale: Axis) -> float:
     return min(max(value, scale.low), scale.high)
 
 

@@ -17,7 +17,7 @@ from importlib.resources import files
 from markupsafe import Markup
 from pydantic import TypeAdapter
 
-from rebar_depth_bench.reporting.charts.scatter import ScatterPoint, scatter_chart
+from rebar_depth_bench.reporting.charts import ScatterPoint, scatter_chart
 from rebar_depth_bench.reporting.html.rows import Cell, table_row
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.table import Table

@@ -98,6 +98,15 @@ def coverage_percent(share: float | None) -> str:
 
 
 @dataclass(frozen=True)
+class Cell:
+    """Number of a table as text, its value (None if undefined or not finite), and its interval as text or ""."""
+
+    text: str
+    value: float | None = None
+    interval: str = ""
+
+
+@dataclass(frozen=True)
 class Column:
     """Number of a table or view.
 
@@ -140,6 +149,22 @@ class Column:
         """Return the number of a view; None where it is undefined."""
         found: float | None = value_at(view, self.of_view or self.path)
         return found
+
+    def interval(self, table: Any) -> Interval | None:
+        """Return the interval of the number of a table; None where it is undefined."""
+        ends: Interval | None = table.intervals.get(self.path)
+        return ends
+
+    def cell(self, scores: Any) -> Cell:
+        """Return the cell of a number of a table, with its interval, or of a view, which has none."""
+        if not hasattr(scores, "intervals"):
+            return self.value_cell(self.view_value(scores))
+        return self.value_cell(self.value(scores), self.interval(scores))
+
+    def value_cell(self, value: float | None, ends: Interval | None = None) -> Cell:
+        """Return the cell of a value and its interval."""
+        finite = value if value is not None and math.isfinite(value) else None
+        return Cell(self.text(value), finite, self.interval_text(ends))
 
     def text(self, value: float | None) -> str:
         """Return a value as text, a dash if it is undefined."""

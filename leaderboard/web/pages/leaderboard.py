@@ -30,7 +30,7 @@ from leaderboard.web.pages.selection import (
 )
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
-from rebar_depth_bench.reporting.charts.scatter import ScatterPoint, scatter_chart
+from rebar_depth_bench.reporting.charts import ScatterPoint, scatter_chart
 from rebar_depth_bench.reporting.html.rows import Cell, ScoreRow, table_row
 from rebar_depth_bench.reporting.published import (
     OTHER_OPTICS_NOTE,

@@ -28,7 +28,7 @@ from leaderboard.web.pages.leaderboard import NameQuery, disclosed_row
 from leaderboard.web.pages.rendering import PICTURE_TITLES, clean_text, render
 from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.names import config_of
-from rebar_depth_bench.reporting.charts import score_charts
+from rebar_depth_bench.reporting import charts
 from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS
 from rebar_depth_bench.reporting.comparison_tables import COMPARISON_NOTE, comparison_cells, views_note
 from rebar_depth_bench.reporting.formatting import ground_truth_text, inputs_text
@@ -180,7 +180,7 @@ def _config_views(name: str, views: Sequence[ViewScore], list_all: bool) -> Conf
     worst_first = sorted(views, key=attrgetter("rank_error"), reverse=True)
     return ConfigViewTables(
         name=printable(name),
-        chart=score_charts.views_chart(name, views),
+        chart=charts.views_chart(name, views),
         worst=[view_row(view) for view in worst_first[:WORST_SHOWN]],
         all=[view_row(view) for view in worst_first] if list_all else [],
         views=len(views),

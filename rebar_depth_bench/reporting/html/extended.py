@@ -26,7 +26,7 @@ from rebar_depth_bench.extended.point_cloud import TOLERANCES_MM
 from rebar_depth_bench.extended.predictions import NATIVE, ONCE, SCALED
 from rebar_depth_bench.extended.profiles import AXES, bin_names
 from rebar_depth_bench.extended.result import ExtendedResult, ExtendedTable, MeasureEstimate
-from rebar_depth_bench.reporting.charts.profile import ProfileBin, profile_chart
+from rebar_depth_bench.reporting.charts import ProfileBin, profile_chart
 from rebar_depth_bench.reporting.extended_tables import MISSED, UNDEFINED, is_miss, single_bar_sentence
 from rebar_depth_bench.reporting.html.rows import Cell
 from rebar_depth_bench.scoring.columns import ARROWS, DASH

@@ -20,8 +20,7 @@ from rebar_depth_bench.diagnosis.views import COLUMNS, diagnosed_view, positions
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.names import config_of
 from rebar_depth_bench.outputs import write_output
-from rebar_depth_bench.reporting import formatting
-from rebar_depth_bench.reporting.charts import score_charts
+from rebar_depth_bench.reporting import charts, formatting
 from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS
 from rebar_depth_bench.reporting.html.assets import environment, inline_script
 from rebar_depth_bench.reporting.html.crossing_picture import crossing_view
@@ -116,8 +115,8 @@ def results_context(result: Result, views: Mapping[str, Sequence[ViewScore]]) ->
         ),
         "groups": config_groups(result.tables),
         "group_note": formatting.GROUP_NOTE,
-        "alignment_chart": score_charts.alignment_chart(result.tables),
-        "scale_chart": score_charts.scale_chart(result.tables, views),
+        "alignment_chart": charts.alignment_chart(result.tables),
+        "scale_chart": charts.scale_chart(result.tables, views),
     }
 
 
@@ -172,7 +171,7 @@ def _config_views(name: str, views: Sequence[ViewScore]) -> ConfigViewTables:
     worst = sorted(views, key=attrgetter("rank_error"), reverse=True)[:WORST_SHOWN]
     return ConfigViewTables(
         name=printable(name),
-        chart=score_charts.views_chart(name, views),
+        chart=charts.views_chart(name, views),
         worst=[view_row(view) for view in worst],
         all=[view_row(view) for view in views] if len(views) > WORST_SHOWN else [],
         views=len(views),

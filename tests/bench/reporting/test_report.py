@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from rebar_depth_bench.reporting.charts.axes import LogAxis, decade_axis, log_axis_with_one
-from rebar_depth_bench.reporting.charts.score_charts import alignment_chart, scale_chart, views_chart
+from rebar_depth_bench.reporting.axes import Axis, decade_axis, log_axis_with_one
+from rebar_depth_bench.reporting.charts import alignment_chart, scale_chart, views_chart
 from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS
 from rebar_depth_bench.reporting.html.page import WORST_SHOWN, render_report
 from rebar_depth_bench.reporting.html.views import (
@@ -230,11 +230,11 @@ def test_panels_of_different_sizes_raise() -> None:
 
 
 def test_log_axis_positions_and_ticks() -> None:
-    axis = LogAxis(0.01, 1.0, 0.0, 100.0)
+    axis = Axis(0.01, 1.0, 0.0, 100.0)
     assert axis.at(0.1) == pytest.approx(50.0)
     assert (axis.at(0.0), axis.at(math.inf)) == (0.0, 100.0)
     assert axis.ticks() == [0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0]
-    assert LogAxis(1e-6, 1e6, 0, 1).ticks() == [1e-6, 1e-4, 1e-2, 1.0, 1e2, 1e4, 1e6]
+    assert Axis(1e-6, 1e6, 0, 1).ticks() == [1e-6, 1e-4, 1e-2, 1.0, 1e2, 1e4, 1e6]
 
 
 def test_axes_cover_their_values() -> None:
@@ -259,5 +259,5 @@ def test_charts_mark_every_view_and_config() -> None:
     assert "median s 0.562" in strips
     errors = views_chart("lattice", views)
     assert errors.count("h0") == 4
-    assert errors.count("v10") == 1
+    assert errors.count("V18.0") == 1
     assert "3 views of lattice, 1 without any prediction" in errors
