@@ -230,9 +230,9 @@ def scatter_chart(title: str, points: Sequence[ScatterPoint]) -> Markup:
     The dashed line is native = scaled. On it, one scale per view changes nothing; far below it, the error is
     almost entirely one of scale.
     """
-    x_axis = decade_axis(_with_margin((p.native, p.native_interval) for p in points), LEFT, RIGHT)
+    x_axis = decade_axis(_with_margin(((p.native, p.native_interval) for p in points), 0.07), LEFT, RIGHT)
     y_axis = decade_axis(
-        _with_margin((p.scaled, p.scaled_interval) for p in points), _SCATTER_BOTTOM, _SCATTER_TOP
+        _with_margin(((p.scaled, p.scaled_interval) for p in points), 0.07), _SCATTER_BOTTOM, _SCATTER_TOP
     )
     places = [(x_axis.at(p.native), y_axis.at(p.scaled)) for p in points]
     low, high = max(x_axis.low, y_axis.low), min(x_axis.high, y_axis.high)

@@ -151,9 +151,9 @@ class Column:
         return found
 
     def interval(self, table: Any) -> Interval | None:
-        """Return the interval of the number of a table; None where it is undefined."""
+        """Return the interval of the number of a table; None where it is undefined or not finite."""
         ends: Interval | None = table.intervals.get(self.path)
-        return ends
+        return ends if ends is not None and all(map(math.isfinite, ends)) else None
 
     def cell(self, scores: Any) -> Cell:
         """Return the cell of a number of a table, with its interval, or of a view, which has none."""
@@ -283,6 +283,11 @@ COLUMN_BY_PATH: Mapping[str, Column] = {column.path: column for column in VIEW_C
 def with_reference(columns: Sequence[Column]) -> list[Column]:
     """Return the columns of the metrics that have reference errors."""
     return [column for column in columns if column.path.rpartition(".")[2] in REFERENCE_ERRORS]
+
+
+def has_dash(columns: Sequence[Column], scores: Any) -> bool:
+    """Return whether any number of a table or view is undefined."""
+    return any(column.cell(scores).value is None for column in columns)
 
 
 def texts(columns: Sequence[Column], table: Any) -> list[str]:

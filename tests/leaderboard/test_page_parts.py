@@ -22,7 +22,7 @@ from leaderboard.web.pages.leaderboard import make_config_ranking
 from leaderboard.web.pages.rendering import clean_text, error_response, format_size, link_html, time_html
 from leaderboard.web.pages.selection import COLUMNS, RANK, Selection, parse_selection
 from rebar_depth_bench.errors import Problem
-from rebar_depth_bench.reporting.html.rows import table_row
+from rebar_depth_bench.reporting.formatting import table_notes
 from rebar_depth_bench.scoring.result import read_result
 from tests.bench.reporting.results import overflowed_view, result, scored_view, unpredicted_view
 
@@ -204,7 +204,7 @@ def test_result_json_round_trips() -> None:
     read_back = read_result(original.to_json(), "a result")
     assert read_back.to_json() == original.to_json()
     for config, table in original.tables.items():
-        assert table_row(config, read_back.tables[config]).notes == table_row(config, table).notes
+        assert table_notes(read_back.tables[config]) == table_notes(table)
 
 
 def multipart_body(*parts: tuple[str, bytes]) -> bytes:

@@ -24,7 +24,7 @@ from leaderboard.web.api.auth import ServiceDep
 from leaderboard.web.api.schemas import outdated_note
 from leaderboard.web.api.submissions import SubmissionId, get_submission
 from leaderboard.web.cache import NO_STORE, REVALIDATE
-from leaderboard.web.pages.leaderboard import NameQuery, disclosed_row
+from leaderboard.web.pages.leaderboard import NameQuery
 from leaderboard.web.pages.rendering import PICTURE_TITLES, clean_text, render
 from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.names import config_of
@@ -35,11 +35,11 @@ from rebar_depth_bench.reporting.formatting import ground_truth_text, inputs_tex
 from rebar_depth_bench.reporting.html.page import (
     WORST_SHOWN,
     ConfigViewTables,
+    has_dash_in_views,
     paper_context,
     results_context,
     views_by_config,
 )
-from rebar_depth_bench.reporting.html.rows import view_row
 from rebar_depth_bench.reporting.html.views import colour_bar_uri
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.result import Result, read_disclosed, read_result
@@ -154,17 +154,17 @@ def _result_context(service: Service, record: SubmissionModel, full_config: str 
     try:
         if service.settings.hidden_truth:
             disclosed = read_disclosed(data, record.id)
-            rows = [disclosed_row(name, table) for name, table in disclosed.tables.items()]
-            return {**context, "configs": rows}
+            return {**context, "names": list(map(printable, disclosed.tables)), "disclosed": disclosed.tables}
         result = read_result(data, record.id)
     except InputError:
-        return {"scored": False, "reason": _UNREADABLE, "configs": [], "ranks": {}}
+        return {"scored": False, "reason": _UNREADABLE, "names": [], "ranks": {}}
     views = views_by_config(result)
     configs = [_config_views(name, views[name], name == full_config) for name in result.tables]
     return {
         **context,
+        "names": [config.name for config in configs],
         "configs": configs,
-        "dash_in_views": any(row.has_dash() for config in configs for row in config.worst),
+        "dash_in_views": has_dash_in_views(configs),
         "pictured": _pictured_views(service, record.id, result),
         "notes": result_notes(service.database, record.id),
         "others": _others(service, record),
@@ -181,8 +181,8 @@ def _config_views(name: str, views: Sequence[ViewScore], list_all: bool) -> Conf
     return ConfigViewTables(
         name=printable(name),
         chart=charts.views_chart(name, views),
-        worst=[view_row(view) for view in worst_first[:WORST_SHOWN]],
-        all=[view_row(view) for view in worst_first] if list_all else [],
+        worst=worst_first[:WORST_SHOWN],
+        all=worst_first if list_all else [],
         views=len(views),
     )
 
@@ -210,8 +210,7 @@ def _pictured_views(service: Service, submission_id: str, result: Result) -> lis
     views.sort(key=lambda view: (order[config_of(view.view_id)], -view.rank_error))
     return [
         {
-            "row": view_row(view),
-            "view_id": view.view_id,
+            "score": view,
             "facts": facts,
             "kinds": [kind for kind in PICTURE_TITLES if kind in kinds],
         }

@@ -12,8 +12,7 @@ from rebar_depth_bench.extended.predictions import NATIVE, SCALED
 from rebar_depth_bench.extended.result import ExtendedResult, ExtendedTable
 from rebar_depth_bench.reporting.crossing_texts import FITS_NOTE, REACH_NOTE, reach_sentence
 from rebar_depth_bench.reporting.html.extended import ExtendedMeasureTable, measure_table
-from rebar_depth_bench.reporting.html.rows import Cell
-from rebar_depth_bench.scoring.columns import Column
+from rebar_depth_bench.scoring.columns import Cell, Column
 
 _SHARE = Column("share", "judged crossings within a limit", "%", "higher", 1, 100.0)
 

@@ -28,8 +28,7 @@ from rebar_depth_bench.extended.profiles import AXES, bin_names
 from rebar_depth_bench.extended.result import ExtendedResult, ExtendedTable, MeasureEstimate
 from rebar_depth_bench.reporting.charts import ProfileBin, profile_chart
 from rebar_depth_bench.reporting.extended_tables import MISSED, UNDEFINED, is_miss, single_bar_sentence
-from rebar_depth_bench.reporting.html.rows import Cell
-from rebar_depth_bench.scoring.columns import ARROWS, DASH
+from rebar_depth_bench.scoring.columns import ARROWS, DASH, Cell
 
 _TITLE_NUMBER = re.compile(r"\d[\d.]*(?:-[\d.]+)?(?= (?:mm|%|m|px|degrees)(?!\w))")
 """Tolerance, threshold or bin in a measure's title: a number followed by a unit."""
