@@ -23,9 +23,7 @@ from rebar_depth_bench.outputs import write_output
 from rebar_depth_bench.reporting import charts, formatting
 from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS
 from rebar_depth_bench.reporting.html.assets import environment, inline_script
-from rebar_depth_bench.reporting.html.crossing_picture import crossing_view
-from rebar_depth_bench.reporting.html.crossings import CrossingPicture, crossing_section
-from rebar_depth_bench.reporting.html.extended import extended_section
+from rebar_depth_bench.reporting.html.extended import CrossingPicture, crossing_view, extended_context
 from rebar_depth_bench.reporting.html.views import (
     VIEWS_SHOWN,
     ShownView,
@@ -86,8 +84,7 @@ def render_report(
             mistakes=[printable(mistake.text) for mistake in mistakes],
             **results_context(result, views),
             **paper_context(result),
-            extended=None if result.extended is None else extended_section(result.extended),
-            crossings=None if result.extended is None else crossing_section(result.extended, pictures or {}),
+            **extended_context(result.extended, pictures or {}),
             **_browser_context(shown, views),
             **_views_context(result, views),
         )
