@@ -16,8 +16,8 @@ from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.output_options import add_output_file, check_outputs, prints_table
 from rebar_depth_bench.outputs import write_output
 from rebar_depth_bench.reporting.figure import check_figure, figure_bytes, figure_style
-from rebar_depth_bench.reporting.tables import frame_csv
 from rebar_depth_bench.scoring.columns import rounded
+from rebar_depth_bench.scoring.frames import frame_csv
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -11,9 +11,10 @@ from rebar_depth_bench.cli.dataset_options import add_expect_digest
 from rebar_depth_bench.console import ProgressBars, add_data, add_workers
 from rebar_depth_bench.output_options import add_output_file, prints_table
 from rebar_depth_bench.outputs import write_output
-from rebar_depth_bench.reporting.comparison_tables import comparison_csv, print_comparison
+from rebar_depth_bench.reporting.tables import print_comparison
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.evaluation import score
+from rebar_depth_bench.scoring.frames import differences_frame, frame_csv
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -41,10 +42,10 @@ def run(options: argparse.Namespace) -> None:
             for archive in (options.first, *options.others)
         )
     comparisons = [compare(first, other) for other in others]
+    content = [comparison.to_dict() for comparison in comparisons]
     if options.json:
-        content = [comparison.to_dict() for comparison in comparisons]
         write_output(options.json, json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
     if options.csv:
-        write_output(options.csv, comparison_csv(comparisons))
+        write_output(options.csv, frame_csv(differences_frame(content)))
     for comparison in comparisons if prints_table(options) else ():
         print_comparison(comparison, Console())

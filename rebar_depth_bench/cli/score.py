@@ -17,8 +17,9 @@ from rebar_depth_bench.outputs import write_output
 from rebar_depth_bench.reporting.extended_tables import extended_csv, print_extended
 from rebar_depth_bench.reporting.html.page import write_report
 from rebar_depth_bench.reporting.html.views import VIEWS_SHOWN
-from rebar_depth_bench.reporting.tables import groups_csv, print_table, result_csv
+from rebar_depth_bench.reporting.tables import print_table
 from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
+from rebar_depth_bench.scoring.frames import frame_csv
 from rebar_depth_bench.scoring.result import Result
 
 
@@ -68,9 +69,9 @@ def run(options: argparse.Namespace) -> None:
     if options.json:
         write_output(options.json, result.to_json())
     if options.csv:
-        write_output(options.csv, result_csv(result))
+        write_output(options.csv, frame_csv(result.to_pandas()))
     if options.groups_csv:
-        write_output(options.groups_csv, groups_csv(result))
+        write_output(options.groups_csv, frame_csv(result.to_pandas("groups")))
     if options.extended_csv:
         write_output(options.extended_csv, extended_csv(result))
     if prints_table(options):

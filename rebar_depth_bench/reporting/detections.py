@@ -10,9 +10,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from markupsafe import Markup
-from rich import box
 from rich.console import Console
-from rich.table import Table as RichTable
 
 from rebar_depth_bench import software_version
 from rebar_depth_bench.bar_crossings.definition import CROSSINGS_PROTOCOL
@@ -22,7 +20,7 @@ from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.charts import precision_chart
 from rebar_depth_bench.reporting.html.assets import environment
-from rebar_depth_bench.reporting.tables import plain_text, print_unwrapped
+from rebar_depth_bench.reporting.tables import make_grid, plain_text, print_line, print_unwrapped
 from rebar_depth_bench.scoring.columns import ARROWS, DASH, Column
 
 Row = tuple[str, DetectionTable]
@@ -88,20 +86,19 @@ def print_page(page: DetectionPage, console: Console) -> None:
 
     Numbers are never truncated: on a narrow console, lines become longer than the console.
     """
-    console.print(plain_text(page.title, style="bold"))
-    console.print(plain_text("; ".join(f"{label}: {value}" for label, value in page.stamps), style="dim"))
+    print_line(console, page.title, style="bold")
+    print_line(console, "; ".join(f"{label}: {value}" for label, value in page.stamps), style="dim")
     for table in page.tables:
         console.print()
-        console.print(plain_text(table.caption, style="italic"))
-        grid = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
-        for index, (name, unit) in enumerate(table.heads):
-            grid.add_column(plain_text(f"{name}\n{unit}"), justify="right" if index else "left", no_wrap=True)
+        print_line(console, table.caption, style="italic")
+        first, *others = (plain_text(f"{name}\n{unit}") for name, unit in table.heads)
+        grid = make_grid(first, others)
         for row in table.rows:
             grid.add_row(*map(plain_text, row))
         print_unwrapped(console, grid)
     console.print()
     for note in page.notes:
-        console.print(plain_text(note))
+        print_line(console, note)
 
 
 def detection_page(result: DetectionResult) -> DetectionPage:

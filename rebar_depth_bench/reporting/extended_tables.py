@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
-from rich import box
 from rich.console import Console
 from rich.padding import Padding
-from rich.table import Table as RichTable
 
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.extended.crossings.measures import MISS_DEG
@@ -17,9 +16,9 @@ from rebar_depth_bench.extended.inspection.measures import MISS_MM
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, Measure
 from rebar_depth_bench.extended.predictions import NATIVE, SCALED
 from rebar_depth_bench.extended.result import ExtendedResult, ExtendedTable, MeasureEstimate
-from rebar_depth_bench.reporting.tables import frame_csv, plain_text
-from rebar_depth_bench.scoring.bootstrap import Interval
-from rebar_depth_bench.scoring.columns import DASH, number
+from rebar_depth_bench.reporting.tables import make_grid, plain_text, print_line
+from rebar_depth_bench.scoring.columns import DASH, number, range_text
+from rebar_depth_bench.scoring.frames import frame_csv
 from rebar_depth_bench.scoring.result import Result
 
 FITS_NOTE = (
@@ -50,11 +49,8 @@ def print_extended(extended: ExtendedResult, console: Console) -> None:
     wide = console.width >= _MIN_WIDTH_WITH_INTERVALS
     for config, table in extended.tables.items():
         console.print()
-        console.print(plain_text(f"{printable(config)}, {EXTENDED_PROTOCOL}, {table.views} views", style="bold"))
-        grid = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
-        grid.add_column("", overflow="fold")  # Long names are wrapped; numbers are never truncated.
-        for heading in ("native", "95 %", "scaled", "95 %") if wide else ("native", "scaled"):
-            grid.add_column(heading, justify="right", no_wrap=True)
+        print_line(console, f"{printable(config)}, {EXTENDED_PROTOCOL}, {table.views} views", style="bold")
+        grid = make_grid("", ("native", "95 %", "scaled", "95 %") if wide else ("native", "scaled"), fold=True)
         for family in MEASURE_FAMILIES.values():
             rows = [(measure, measure_cells(table, family, measure)) for measure in family.measures]
             known_rows = [(measure, texts) for measure, texts in rows if any(cell != DASH for cell in texts)]
@@ -62,35 +58,25 @@ def print_extended(extended: ExtendedResult, console: Console) -> None:
                 grid.add_section()
                 grid.add_row(plain_text(family.title, style="italic"))
             for measure, texts in known_rows:
-                grid.add_row(
-                    Padding(measure_heading(measure), (0, 0, 0, 2)),
-                    *map(plain_text, texts if wide else texts[::2]),
-                )
+                heading = Padding(measure.column.heading, (0, 0, 0, 2))
+                grid.add_row(heading, *map(plain_text, texts if wide else texts[::2]))
         console.print(grid)
         for alignment, of_alignment in table.reaches.items():
             for reach in of_alignment:
-                console.print(plain_text(reach_sentence(alignment, reach)))
+                print_line(console, reach_sentence(alignment, reach))
     numbers = [(measure, estimate) for _, _, measure, estimate in extended.estimates()]
     if any(is_miss(estimate, measure) for measure, estimate in numbers):
-        console.print(
-            plain_text(f"{MISSED}: not found, recorded as {MISS_MM:g} mm or {MISS_DEG:g} degrees in CSV and JSON.")
-        )
+        note = f"{MISSED}: not found, recorded as {MISS_MM:g} mm or {MISS_DEG:g} degrees in CSV and JSON."
+        print_line(console, note)
     if any(estimate.value is None and estimate.samples for _, estimate in numbers):
-        console.print(plain_text(f"{UNDEFINED}: 5 % or more were not found, so the capability is undefined."))
+        print_line(console, f"{UNDEFINED}: 5 % or more were not found, so the capability is undefined.")
     if not wide:
-        console.print(
-            plain_text(
-                "Intervals: in CSV, JSON and the report, and in terminals with at least "
-                f"{_MIN_WIDTH_WITH_INTERVALS} columns."
-            )
+        width = _MIN_WIDTH_WITH_INTERVALS
+        print_line(
+            console, f"Intervals: in CSV, JSON and the report, and in terminals with at least {width} columns."
         )
     note = "A single number in the first column is independent of scale or uses its own alignment."
-    console.print(plain_text(f"{note} Definitions: cards/BENCHMARK.md."))
-
-
-def measure_heading(measure: Measure) -> str:
-    """Return a measure's title with its unit and better direction."""
-    return measure.column.heading
+    print_line(console, f"{note} Definitions: cards/BENCHMARK.md.")
 
 
 def measure_cells(table: ExtendedTable, family: MeasureFamily, measure: Measure) -> list[str]:
@@ -107,7 +93,7 @@ def measure_cells(table: ExtendedTable, family: MeasureFamily, measure: Measure)
             defined = estimate.value is not None or not estimate.samples
             texts += [
                 format_value(estimate.value, measure) if defined else UNDEFINED,
-                _interval_text(estimate.interval, measure),
+                range_text(estimate.interval, partial(format_value, measure=measure, digits=3)),
             ]
     return texts + [""] * (4 - len(texts))
 
@@ -158,24 +144,15 @@ def reach_text(reach: Reach) -> str:
     return f"{reach.verdict} {reach.distance_m:g} m"
 
 
-def reach_interval_text(reach: Reach) -> str:
-    """Return the 95 % interval of a reach; its lower end is 0 where no bin is met."""
-    return DASH if reach.interval is None else f"{reach.interval[0]:g} to {reach.interval[1]:g}"
-
-
-def tested_text(reach: Reach) -> str:
-    """Return the range of the tested bins that follow each other, metres."""
-    return DASH if reach.tested_m is None else f"{reach.tested_m[0]:g} to {reach.tested_m[1]:g}"
-
-
 def reach_sentence(alignment: str, reach: Reach) -> str:
     """Return the reach under one alignment as a sentence."""
     head = f"{alignment.capitalize()}: {100 * SHARE:g} % of the judged crossings within {reach.limit_mm} mm"
     if reach.verdict == "none tested":
         return f"{head}: none tested."
     informative = reach.interval is not None and reach.interval[0] < reach.interval[1]
-    interval = f"95 % interval {reach_interval_text(reach)} m; " if informative else ""
-    return f"{head} {reach_text(reach)} ({interval}tested {tested_text(reach)} m)."
+    ends, tested = (range_text(edges_m, "{:g}".format) for edges_m in (reach.interval, reach.tested_m))
+    interval = f"95 % interval {ends} m; " if informative else ""
+    return f"{head} {reach_text(reach)} ({interval}tested {tested} m)."
 
 
 def extended_csv(result: Result) -> str:
@@ -189,7 +166,3 @@ def extended_csv(result: Result) -> str:
     frame["submission_sha256"] = result.submission.sha256
     frame["software_version"] = result.software.version
     return frame_csv(frame)
-
-
-def _interval_text(ends: Interval | None, measure: Measure) -> str:
-    return DASH if ends is None else " to ".join(format_value(end, measure, 3) for end in ends)

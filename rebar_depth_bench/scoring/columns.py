@@ -187,6 +187,11 @@ class Column:
         return separator.join(as_text(end) for end in ends)
 
 
+def range_text(ends: Interval | None, as_text: Callable[[float], str]) -> str:
+    """Return an interval as text, a dash if it is undefined."""
+    return DASH if ends is None else " to ".join(map(as_text, ends))
+
+
 def value_at(source: Any, path: str) -> Any:
     """Return the value at a path of attributes and keys; None where one of them is None or missing."""
     for key in path.split("."):

@@ -103,7 +103,7 @@ class ConfigRanking:
     """Table and plot of a config.
 
     ``row_count`` is the number of rows that pass the filters, ``lines`` the rows of the page, ``references`` the
-    rows of reference errors (name, native and scaled cells), ``published`` the rows of the paper and ``distance``
+    rows of reference errors (name, texts by path), ``published`` the rows of the paper and ``distance``
     their camera distance. ``plotted`` is the number of points of submissions.
     """
 
@@ -111,7 +111,7 @@ class ConfigRanking:
     selection: Selection
     row_count: int
     pages: int
-    references: list[tuple[str, list[str], list[str]]]
+    references: list[tuple[str, dict[str, str]]]
     lines: list[RankingLine]
     published: list[PaperRow]
     distance: str

@@ -30,7 +30,6 @@ from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.names import config_of
 from rebar_depth_bench.reporting import charts
 from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS
-from rebar_depth_bench.reporting.comparison_tables import COMPARISON_NOTE, comparison_cells, views_note
 from rebar_depth_bench.reporting.formatting import ground_truth_text, inputs_text
 from rebar_depth_bench.reporting.html.page import (
     WORST_SHOWN,
@@ -41,6 +40,7 @@ from rebar_depth_bench.reporting.html.page import (
     views_by_config,
 )
 from rebar_depth_bench.reporting.html.views import colour_bar_uri
+from rebar_depth_bench.reporting.tables import COMPARISON_NOTE, comparison_cells, views_note
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.result import Result, read_disclosed, read_result
 from rebar_depth_bench.scoring.table import ViewScore

@@ -103,9 +103,9 @@ def results_context(result: Result, views: Mapping[str, Sequence[ViewScore]]) ->
             for note in (*formatting.table_notes(table), *formatting.reference_findings(table))
         ],
         "references": [
-            (f"{printable(config)}: {name}", native, scaled)
+            (f"{printable(config)}: {name}", errors)
             for config, table in result.tables.items()
-            for name, native, scaled in formatting.reference_rows([("", table)])
+            for name, errors in formatting.reference_rows([("", table)])
         ],
         "dash_in_results": any(has_dash(VIEW_COLUMNS, table) for table in result.tables.values()),
         "interval_note": formatting.interval_note(result.tables.values()) if has_intervals else "",

@@ -49,7 +49,7 @@ def test_constants_of_results_on_other_pixels_are_named() -> None:
         "constant, b, c\N{REPLACEMENT CHARACTER}": (0.0529, 2.05),
     }
     assert formatting.scaled_constants(rows[1:3]) == {"constant": (0.0529, 2.05)}
-    titles = [title for title, _, _ in formatting.reference_rows(rows)]
+    titles = [title for title, _ in formatting.reference_rows(rows)]
     assert titles == [*formatting.scaled_constants(rows), "one pixel"]
     without = dataclasses.replace(rows[0][1], reference=REFERENCE)
     assert formatting.reference_rows([("x", without)])[0][0] == "one pixel"
