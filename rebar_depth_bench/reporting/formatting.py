@@ -62,11 +62,6 @@ def ground_truth_text(declared: Declaration) -> str:
     return "used, as declared" if declared.uses_ground_truth else "not used, as declared"
 
 
-def declaration_text(declared: Declaration) -> str:
-    """Return a submission's declaration in one line."""
-    return f"inputs: {declared.inputs or 'not declared'}; ground truth: {ground_truth_text(declared)}"
-
-
 def interval_note(tables: Iterable[Table]) -> str:
     """Return the sentence on intervals: how those of configs of one scene, and of several, are determined."""
     by_scene = {table.split is not None for table in tables}
@@ -89,20 +84,12 @@ def table_notes(table: Table) -> list[str]:
             f"The ground truth was measured, with a standard deviation of {1000 * table.truth_sigma_m:.3g} mm, as "
             "its authors state; smaller errors cannot be told from errors of the ground truth."
         )
-    if reason := unranked_reason(table):
+    if not table.ranked:
+        reason = "the submission declares that it uses ground truth" if table.views else "no views"
         notes.append(f"Not ranked: {reason}.")
     if reasons := incomparable_reasons(table):
         notes.append(f"Errors of valid predictions are not compared with those of others: {'; '.join(reasons)}.")
     return notes
-
-
-def unranked_reason(table: Table) -> str:
-    """Return the reason why a config's row is not ranked; empty for a ranked row."""
-    if table.ranked:
-        return ""
-    if table.views == 0:
-        return "no views"
-    return "the submission declares that it uses ground truth"
 
 
 def incomparable_reasons(table: Table) -> list[str]:

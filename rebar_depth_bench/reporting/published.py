@@ -22,7 +22,6 @@ from rebar_depth_bench.reporting.formatting import config_title
 from rebar_depth_bench.scoring.bootstrap import Interval
 from rebar_depth_bench.scoring.columns import NATIVE, PAPER_COLUMNS, SCALED, Cell
 from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.scoring.table import Table
 
 
 @dataclass(frozen=True)
@@ -123,38 +122,32 @@ class PaperScene:
 
 def paper_scenes(result: Result) -> list[PaperScene]:
     """Return the scenes of Table I for which the result has configs, in the paper's order."""
-    tables_by_scene: dict[str, dict[str, Table]] = {}
-    for config, table in result.tables.items():
-        if table.published is not None:
-            tables_by_scene.setdefault(table.published.scene, {})[config] = table
-    scenes = load_published().scenes
-    return [
-        _paper_scene(name, scene, tables_by_scene[name])
-        for name, scene in scenes.items()
-        if name in tables_by_scene
-    ]
-
-
-def _paper_scene(name: str, scene: PublishedScene, tables: Mapping[str, Table]) -> PaperScene:
-    rows = [_own_row(str(number), *config) for number, config in enumerate(tables.items(), 1)]
-    rows += published_table(scene)
-    heading = scene.title if scene.title.lower() == name else f"{scene.title} ({name})"
-    chart = scatter_chart(f"{heading}: native and scaled AbsRel", scatter_points(rows))
-    other_optics = any(table.published and not table.published.same_optics for table in tables.values())
-    return PaperScene(heading, scene.distance, chart, rows, other_optics)
-
-
-def _own_row(mark: str, config: str, table: Table) -> PaperRow:
-    match = table.published
-    optics = "" if match is None or match.same_optics else f" {OTHER_OPTICS_MARK}"
-    return PaperRow(
-        mark=mark,
-        name=config_title(config, table.split) + optics,
-        published=False,
-        dagger=False,
-        cells=[column.cell(table) for column in PAPER_COLUMNS],
-        intervals=(NATIVE[0].interval(table), SCALED[0].interval(table)),
-    )
+    scenes = []
+    for name, scene in load_published().scenes.items():
+        own = [
+            (config, table, table.published)
+            for config, table in result.tables.items()
+            if table.published is not None and table.published.scene == name
+        ]
+        if own:
+            rows = [
+                PaperRow(
+                    mark=str(number),
+                    name=config_title(config, table.split)
+                    + ("" if match.same_optics else f" {OTHER_OPTICS_MARK}"),
+                    published=False,
+                    dagger=False,
+                    cells=[column.cell(table) for column in PAPER_COLUMNS],
+                    intervals=(NATIVE[0].interval(table), SCALED[0].interval(table)),
+                )
+                for number, (config, table, match) in enumerate(own, 1)
+            ]
+            rows += published_table(scene)
+            heading = scene.title if scene.title.lower() == name else f"{scene.title} ({name})"
+            chart = scatter_chart(f"{heading}: native and scaled AbsRel", scatter_points(rows))
+            other_optics = any(not match.same_optics for _, _, match in own)
+            scenes.append(PaperScene(heading, scene.distance, chart, rows, other_optics))
+    return scenes
 
 
 def published_table(scene: PublishedScene) -> list[PaperRow]:

@@ -124,7 +124,8 @@ def print_table(result: Result, console: Console) -> None:
         f"archive {formatting.short_digest(result.submission.sha256)}, software {result.software.version}",
         style="dim",
     )
-    print_line(console, formatting.declaration_text(result.declared), style="dim")
+    declared = (formatting.inputs_text(result.declared), formatting.ground_truth_text(result.declared))
+    print_line(console, "inputs: {}; ground truth: {}".format(*declared), style="dim")
     _print_rows(_config_rows(result.tables), console, _LAYOUTS, "config")
     for config, table in result.tables.items():
         if table.groups:

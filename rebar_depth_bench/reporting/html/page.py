@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from operator import attrgetter
 from pathlib import Path
 
 from markupsafe import Markup
@@ -32,6 +31,7 @@ from rebar_depth_bench.reporting.html.views import (
     shown_view,
     sorted_views,
     views_to_show,
+    worst_first,
 )
 from rebar_depth_bench.reporting.published import OTHER_OPTICS_NOTE, load_published, paper_scenes
 from rebar_depth_bench.scoring.columns import VIEW_COLUMNS, has_dash
@@ -53,8 +53,8 @@ class ConfigViewTables:
 
     name: str
     chart: Markup
-    worst: list[ViewScore]
-    all: list[ViewScore]
+    worst: Sequence[ViewScore]
+    all: Sequence[ViewScore]
     views: int
 
 
@@ -86,7 +86,7 @@ def render_report(
             **paper_context(result),
             **extended_context(result.extended, pictures or {}),
             **_browser_context(shown, views),
-            **_views_context(result, views),
+            **views_context(views, {name: of for name, of in views.items() if len(of) > WORST_SHOWN}),
         )
     )
 
@@ -154,15 +154,22 @@ def _browser_context(shown: Sequence[ShownView], views: Mapping[str, Sequence[Vi
     }
 
 
-def _views_context(result: Result, views: Mapping[str, Sequence[ViewScore]]) -> dict[str, object]:
-    """Return the context of ``part_views.html.j2``."""
-    configs = [_config_views(name, views[name]) for name in result.tables]
-    return {"configs": configs, "dash_in_views": has_dash_in_views(configs)}
-
-
-def has_dash_in_views(configs: Iterable[ConfigViewTables]) -> bool:
-    """Return whether a number of the worst views is undefined."""
-    return any(has_dash(VIEW_COLUMNS, view) for config in configs for view in config.worst)
+def views_context(
+    views: Mapping[str, Sequence[ViewScore]], listed: Mapping[str, Sequence[ViewScore]]
+) -> dict[str, object]:
+    """Return the context of ``part_views.html.j2``; ``listed`` has the configs of which all views are listed."""
+    configs = [
+        ConfigViewTables(
+            name=printable(name),
+            chart=charts.views_chart(name, scores),
+            worst=worst_first(scores)[:WORST_SHOWN],
+            all=listed.get(name, ()),
+            views=len(scores),
+        )
+        for name, scores in views.items()
+    ]
+    undefined = any(has_dash(VIEW_COLUMNS, view) for config in configs for view in config.worst)
+    return {"configs": configs, "dash_in_views": undefined}
 
 
 def _provenance(result: Result) -> list[tuple[str, str]]:
@@ -183,17 +190,6 @@ def views_by_config(result: Result) -> Mapping[str, list[ViewScore]]:
     for view in result.views:
         views.setdefault(config_of(view.view_id), []).append(view)
     return views
-
-
-def _config_views(name: str, views: Sequence[ViewScore]) -> ConfigViewTables:
-    worst = sorted(views, key=attrgetter("rank_error"), reverse=True)[:WORST_SHOWN]
-    return ConfigViewTables(
-        name=printable(name),
-        chart=charts.views_chart(name, views),
-        worst=worst,
-        all=list(views) if len(views) > WORST_SHOWN else [],
-        views=len(views),
-    )
 
 
 _COLUMNS = ("left_rgb", "left_depth", "left_mask")

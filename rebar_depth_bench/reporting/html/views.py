@@ -43,7 +43,7 @@ class ViewPanels:
 
     ``rgb`` is uint8 H x W x 3, None in a config without colour; ``truth_m`` float32 metres, 0 without a surface;
     ``prediction_m`` float metres, not finite or <= 0 without a prediction; ``steel`` bool, rim included; ``score``
-    holds the view's numbers. Raises ``ValueError`` if the shapes differ.
+    holds the view's numbers.
     """
 
     rgb: UInt8[ndarray, "h w 3"] | None
@@ -51,14 +51,6 @@ class ViewPanels:
     prediction_m: Float[ndarray, "h w"]
     steel: Bool[ndarray, "h w"]
     score: ViewScore
-
-    def __post_init__(self) -> None:
-        size = self.truth_m.shape
-        shapes = [image.shape[:2] for image in (self.rgb, self.prediction_m, self.steel) if image is not None]
-        if any(shape != size for shape in shapes):
-            raise ValueError(
-                f"{self.score.view_id}: the images of a view must share H x W = {size}, found {shapes}"
-            )
 
 
 @dataclass(frozen=True)
@@ -261,6 +253,11 @@ VIEWS_SHOWN = 12
 """Default number of views of a config shown with images, about 150 kB each at 1280 x 720."""
 
 
+def worst_first(views: Iterable[ViewScore]) -> list[ViewScore]:
+    """Return the views sorted by falling rank error."""
+    return sorted(views, key=attrgetter("rank_error"), reverse=True)
+
+
 def views_to_show(views: Sequence[ViewScore], count: int) -> list[ViewScore]:
     """Return ``count`` views, worst first: half are the worst, the rest evenly spaced from there to the best.
 
@@ -269,12 +266,12 @@ def views_to_show(views: Sequence[ViewScore], count: int) -> list[ViewScore]:
     """
     if count < 0:
         raise InputError(f"views to show: {count}, expected 0 or more of each config")
-    worst_first = sorted(views, key=attrgetter("rank_error"), reverse=True)
-    if len(worst_first) <= count:
-        return worst_first
+    ordered = worst_first(views)
+    if len(ordered) <= count:
+        return ordered
     worst = (count + 1) // 2
-    rest, spread = worst_first[worst:], count - worst
-    return worst_first[:worst] + [rest[(n + 1) * len(rest) // spread - 1] for n in range(spread)]
+    rest, spread = ordered[worst:], count - worst
+    return ordered[:worst] + [rest[(n + 1) * len(rest) // spread - 1] for n in range(spread)]
 
 
 def sorted_views(views: Iterable[ShownView], configs: Sequence[str]) -> list[ShownView]:

@@ -222,11 +222,6 @@ def test_large_panels_sample_depth_and_average_colour() -> None:
     assert abs(int(_decode(images.colour)[180, 320, 0]) - 100) <= 3
 
 
-def test_panels_of_different_sizes_raise() -> None:
-    with pytest.raises(ValueError, match=r"lattice/0000: .* share H x W = \(40, 60\)"):
-        dataclasses.replace(panels(), steel=np.ones((2, 2), bool))
-
-
 def test_log_axis_positions_and_ticks() -> None:
     axis = Axis(0.01, 1.0, 0.0, 100.0)
     assert axis.at(0.1) == pytest.approx(50.0)

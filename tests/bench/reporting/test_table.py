@@ -136,7 +136,7 @@ def test_extreme_numbers_use_scientific_notation() -> None:
 
 
 def test_no_views_is_an_unranked_reason() -> None:
-    assert formatting.unranked_reason(tabulate([])) == "no views"
+    assert "Not ranked: no views." in formatting.table_notes(tabulate([]))
 
 
 def test_csv_matches_json(two_configs: Result) -> None:
