@@ -11,10 +11,8 @@ from rebar_depth_bench.cli.dataset_options import add_expect_digest, print_verif
 from rebar_depth_bench.console import ProgressBars, add_archive, add_data, add_workers, print_notice
 from rebar_depth_bench.diagnosis.diagnose import diagnose
 from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.extended.evaluate import score_extended
 from rebar_depth_bench.output_options import add_output_file, prints_table
 from rebar_depth_bench.outputs import write_output
-from rebar_depth_bench.reporting.extended_tables import extended_csv, print_extended
 from rebar_depth_bench.reporting.html.page import write_report
 from rebar_depth_bench.reporting.html.views import VIEWS_SHOWN
 from rebar_depth_bench.reporting.tables import print_table
@@ -56,6 +54,9 @@ def run(options: argparse.Namespace) -> None:
         with ProgressBars() as bars:
             result = score_evaluation(evaluation, workers=options.workers, progress=bars.update)
             if options.extended or options.extended_csv:
+                # A third of the package, which other scores do not need.
+                from rebar_depth_bench.extended.evaluate import score_extended
+
                 extended = score_extended(result, evaluation, workers=options.workers, progress=bars.update)
                 result = replace(result, extended=extended)
         names = ", ".join(config.name for config in evaluation.configs)
@@ -73,6 +74,8 @@ def run(options: argparse.Namespace) -> None:
     if options.groups_csv:
         write_output(options.groups_csv, frame_csv(result.to_pandas("groups")))
     if options.extended_csv:
+        from rebar_depth_bench.reporting.extended_tables import extended_csv
+
         write_output(options.extended_csv, extended_csv(result))
     if prints_table(options):
         _print_tables(result)
@@ -83,4 +86,6 @@ def run(options: argparse.Namespace) -> None:
 def _print_tables(result: Result) -> None:
     print_table(result, Console())
     if result.extended is not None:
+        from rebar_depth_bench.reporting.extended_tables import print_extended
+
         print_extended(result.extended, Console())

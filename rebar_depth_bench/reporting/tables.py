@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import TYPE_CHECKING
 
 from rich import box
 from rich.console import Console
@@ -42,10 +43,12 @@ from rebar_depth_bench.scoring.columns import (
     texts,
     with_reference,
 )
-from rebar_depth_bench.scoring.comparison import Comparison, Difference
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.table import PublishedMatch, Table
+
+if TYPE_CHECKING:
+    from rebar_depth_bench.scoring.comparison import Comparison, Difference
 
 _UNBOUNDED = 10_000
 

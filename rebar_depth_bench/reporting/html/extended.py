@@ -115,12 +115,9 @@ class ExtendedConfig:
         return any(cell.text == UNDEFINED for _, _, cells in self.tolerances for cell in cells)
 
 
-def extended_context(
-    extended: ExtendedResult | None, pictures: Mapping[str, CrossingPicture]
-) -> dict[str, object]:
+def extended_context(extended: ExtendedResult, pictures: Mapping[str, CrossingPicture]) -> dict[str, object]:
     """Return the context of the templates of extended measures and crossings; ``pictures`` are by config."""
-    tables = {} if extended is None else extended.tables
-    source = None if extended is None else extended.crossings
+    tables, source = extended.tables, extended.crossings
     crossings = [
         _crossing_config(name, table, pictures.get(name))
         for name, table in tables.items()

@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from markupsafe import Markup
 
@@ -22,7 +23,6 @@ from rebar_depth_bench.outputs import write_output
 from rebar_depth_bench.reporting import charts, formatting
 from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS
 from rebar_depth_bench.reporting.html.assets import environment, inline_script
-from rebar_depth_bench.reporting.html.extended import CrossingPicture, crossing_view, extended_context
 from rebar_depth_bench.reporting.html.views import (
     VIEWS_SHOWN,
     ShownView,
@@ -39,6 +39,9 @@ from rebar_depth_bench.scoring.evaluation import Evaluation, View
 from rebar_depth_bench.scoring.groups import GROUPINGS
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.table import Table, ViewScore
+
+if TYPE_CHECKING:
+    from rebar_depth_bench.reporting.html.extended import CrossingPicture
 
 WORST_SHOWN = 10
 """Number of views of a config that are listed openly; the full list is collapsed."""
@@ -84,7 +87,7 @@ def render_report(
             mistakes=[printable(mistake.text) for mistake in mistakes],
             **results_context(result, views),
             **paper_context(result),
-            **extended_context(result.extended, pictures or {}),
+            **_extended_context(result, pictures or {}),
             **_browser_context(shown, views),
             **views_context(views, {name: of for name, of in views.items() if len(of) > WORST_SHOWN}),
         )
@@ -138,6 +141,16 @@ def paper_context(result: Result) -> dict[str, object]:
         "paper_part": published.parts["synthetic"],
         "other_optics_note": OTHER_OPTICS_NOTE,
     }
+
+
+def _extended_context(result: Result, pictures: Mapping[str, CrossingPicture]) -> dict[str, object]:
+    """Return the context of ``part_extended.html.j2`` and ``part_crossings.html.j2``."""
+    if result.extended is None:
+        return {"extended": [], "crossings": []}
+    # The extended measures are a third of the package, which other reports do not need.
+    from rebar_depth_bench.reporting.html.extended import extended_context
+
+    return extended_context(result.extended, pictures)
 
 
 def _browser_context(shown: Sequence[ShownView], views: Mapping[str, Sequence[ViewScore]]) -> dict[str, object]:
@@ -220,7 +233,11 @@ def look_at_views(
         scores = {view.view_id: view for view in chosen.get(config.name, ())}
         positions = {position for position, view_id in enumerate(config.view_ids) if view_id in scores}
         diagnosed_at = positions_to_read(config)
-        pictured = crossing_view(evaluation, config) if crossings else None
+        pictured = None
+        if crossings:
+            from rebar_depth_bench.reporting.html.extended import crossing_view
+
+            pictured = crossing_view(evaluation, config)
         wanted = {*positions, *diagnosed_at, *({pictured.position} if pictured else ())}
         columns = dict.fromkeys((*_COLUMNS, *(COLUMNS if diagnosed_at else ())))
         diagnosed = []
