@@ -6,7 +6,7 @@ A table has submitted rows, and the paper's rows, which are unranked.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Annotated
@@ -38,7 +38,7 @@ from rebar_depth_bench.reporting.published import (
     published_table,
     scatter_points,
 )
-from rebar_depth_bench.scoring.columns import COVERAGE, RANK_ERROR, VIEW_COLUMNS, has_dash
+from rebar_depth_bench.scoring.columns import COVERAGE, RANK_ERROR, VIEW_COLUMNS, Cell
 from rebar_depth_bench.scoring.result import DECIMALS as DISCLOSED_DECIMALS
 from rebar_depth_bench.scoring.result import DisclosedTable
 from rebar_depth_bench.scoring.table import Table, read_table
@@ -53,6 +53,8 @@ _CACHED_ROWS = 4096
 MISSING_ERROR = 1.0
 """Rank error that counts where a submission lacks a config: that of no prediction at all."""
 _DECIMALS, _SIGNIFICANT_DIGITS = 4, 12
+DISCLOSED_COLUMNS = (replace(RANK_ERROR, decimals=DISCLOSED_DECIMALS), COVERAGE)
+"""Columns of the numbers that are shown if the ground truth is hidden."""
 
 
 @router.get("/", name="board_page")
@@ -92,10 +94,11 @@ def leaderboard_page(
 
 @dataclass(frozen=True)
 class RankingLine:
-    """A submitted row and its table, of which little is disclosed if the ground truth is hidden."""
+    """A submitted row, its table (None if the ground truth is hidden), and the cells of its numbers by path."""
 
     entry: LeaderboardEntry
-    table: Table | DisclosedTable
+    table: Table | None
+    cells: Mapping[str, Cell]
 
 
 @dataclass(frozen=True)
@@ -119,25 +122,19 @@ class ConfigRanking:
     plotted: int
 
     @property
-    def tables(self) -> list[Table]:
-        """Tables of the rows; empty if the ground truth is hidden."""
-        return [line.table for line in self.lines if isinstance(line.table, Table)]
-
-    @property
     def interval(self) -> bool:
         """Whether any number is shown with a confidence interval."""
-        return any(column.interval(table) for table in self.tables for column in VIEW_COLUMNS)
+        return any(cell.interval for line in self.lines for cell in line.cells.values())
 
     @property
     def interval_note(self) -> str:
         """Explanation of the confidence intervals."""
-        return formatting.interval_note(self.tables)
+        return formatting.interval_note(line.table for line in self.lines if line.table)
 
     @property
     def dash(self) -> bool:
         """Whether any number is shown as undefined."""
-        columns = VIEW_COLUMNS if self.tables else (RANK_ERROR, COVERAGE)
-        return any(has_dash(columns, line.table) for line in self.lines)
+        return any(cell.value is None for line in self.lines for cell in line.cells.values())
 
 
 def make_config_ranking(
@@ -154,8 +151,8 @@ def make_config_ranking(
     """
     rows = [entry for entry in ranking.entries if selection.matches(entry)]
     shown, selection, pages = selection.page_of(selection.sorted(rows), page_rows)
-    lines = [RankingLine(entry, _table(entry.table_json, hidden_truth)) for entry in shown]
-    tables = [(line.entry.method, line.table) for line in lines if isinstance(line.table, Table)]
+    lines = [RankingLine(entry, *_row(entry.table_json, hidden_truth)) for entry in shown]
+    tables = [(line.entry.method, line.table) for line in lines if line.table]
     published, distance = _published([table for _, table in tables])
     points = _plot_points(rows)
     chart = None
@@ -177,11 +174,13 @@ def make_config_ranking(
 
 
 @lru_cache(maxsize=_CACHED_ROWS)
-def _table(table_json: str, hidden_truth: bool) -> Table | DisclosedTable:
-    """Return the table of a row; cached, because it depends on the arguments only."""
+def _row(table_json: str, hidden_truth: bool) -> tuple[Table | None, Mapping[str, Cell]]:
+    """Return table and cells of a row as in ``RankingLine``; cached, because they depend on the arguments only."""
     if hidden_truth:
-        return DisclosedTable.model_validate_json(table_json)
-    return read_table(json.loads(table_json))
+        disclosed = DisclosedTable.model_validate_json(table_json)
+        return None, {column.path: column.cell(disclosed) for column in DISCLOSED_COLUMNS}
+    table = read_table(json.loads(table_json))
+    return table, {column.path: column.cell(table) for column in VIEW_COLUMNS}
 
 
 def _plot_points(rows: Sequence[LeaderboardEntry]) -> list[ScatterPoint]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from datetime import UTC, datetime
 from typing import Any
 from urllib.parse import urlsplit
@@ -22,9 +22,9 @@ from rebar_depth_bench.errors import MAX_PROBLEMS_SHOWN, Problem, printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.html.assets import environment
 from rebar_depth_bench.reporting.published import load_published
-from rebar_depth_bench.scoring.columns import RANK_ERROR, number
+from rebar_depth_bench.scoring.columns import number
 from rebar_depth_bench.scoring.protocol import PROTOCOL
-from rebar_depth_bench.scoring.result import COVERAGE_RULE, DECIMALS
+from rebar_depth_bench.scoring.result import COVERAGE_RULE
 from rebar_depth_bench.submission.declaration import INPUTS, is_http_url
 
 
@@ -85,15 +85,12 @@ def _common_context(request: Request, service: Service) -> dict[str, Any]:
             ("Software", f"rebar-depth-bench {software_version()}"),
         ],
         "hidden_truth": settings.hidden_truth,
-        "rank_error": DISCLOSED_RANK_ERROR if settings.hidden_truth else RANK_ERROR,
         "contact": printable(settings.contact),
         "service": service,
         "view_counts": service.view_counts,
     }
 
 
-DISCLOSED_RANK_ERROR = replace(RANK_ERROR, decimals=DECIMALS)
-"""Column of rank errors where the ground truth is hidden."""
 MAX_INTERVALS_PLOTTED = 60
 """Number of points up to which a plot has their intervals."""
 PICTURE_TITLES = {"colour": "Colour", "truth": "Ground truth", "prediction": "Prediction", "error": "Native error"}

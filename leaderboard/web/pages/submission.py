@@ -22,7 +22,7 @@ from leaderboard.web.api.auth import ServiceDep
 from leaderboard.web.api.schemas import outdated_note
 from leaderboard.web.api.submissions import SubmissionId, get_submission
 from leaderboard.web.cache import NO_STORE, REVALIDATE
-from leaderboard.web.pages.leaderboard import NameQuery
+from leaderboard.web.pages.leaderboard import DISCLOSED_COLUMNS, NameQuery
 from leaderboard.web.pages.rendering import PICTURE_TITLES, clean_text, render
 from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.names import config_of
@@ -148,7 +148,12 @@ def _result_context(service: Service, record: SubmissionModel, full_config: str 
     try:
         if service.settings.hidden_truth:
             disclosed = read_disclosed(data, record.id)
-            return {**context, "names": list(map(printable, disclosed.tables)), "disclosed": disclosed.tables}
+            return {
+                **context,
+                "names": list(map(printable, disclosed.tables)),
+                "disclosed": disclosed.tables,
+                "shown_columns": DISCLOSED_COLUMNS,
+            }
         result = read_result(data, record.id)
     except InputError:
         return {"scored": False, "reason": _UNREADABLE, "names": [], "ranks": {}}
