@@ -34,6 +34,7 @@ from rebar_depth_bench.reporting.published import (
     load_published,
     published_rows,
 )
+from rebar_depth_bench.scoring.columns import NATIVE, SCALED
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.table import Table
@@ -182,10 +183,8 @@ def _panel(config: str, results: Sequence[Result], *, published: bool) -> Panel:
 
 def _errors(table: Table) -> tuple[float, float] | None:
     """Return the native and scaled AbsRel, or None if either is undefined (null in the JSON)."""
-    if table.native is None or table.scaled is None:
-        return None
-    errors = table.native.abs_rel, table.scaled.abs_rel
-    return errors if all(map(math.isfinite, errors)) else None
+    native, scaled = (column.cell(table).value for column in (NATIVE[0], SCALED[0]))
+    return None if native is None or scaled is None else (native, scaled)
 
 
 def _name(result: Result) -> str:

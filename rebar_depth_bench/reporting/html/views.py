@@ -99,7 +99,8 @@ def shown_view(view: ViewPanels) -> ShownView:
     scaled_m = signed_error(view, math.nan if view.score.scale is None else view.score.scale)
     native_limit, scaled_limit = (error_limit_cm(error_m, scored) for error_m in (native_m, scaled_m))
     truth, steel = depth_image(view.truth_m[::step, ::step], near_m, far_m), view.steel[::step, ::step]
-    rgb = None if view.rgb is None else reduced_colour(view.rgb, step)
+    # Colour is averaged over blocks of pixels; depth and error maps must be sampled instead.
+    rgb = None if view.rgb is None else np.asarray(Image.fromarray(view.rgb).reduce(step))
     return ShownView(
         score=view.score,
         width=truth.shape[1],
@@ -214,14 +215,6 @@ def hatching(
     stripe = (rows + columns) // _HATCH_PX % 2
     image: ndarray = np.array((first, second), dtype=np.uint8)[stripe]
     return image
-
-
-def reduced_colour(rgb: UInt8[ndarray, "h w 3"], step: int) -> UInt8[ndarray, "h w 3"]:
-    """Return a colour image averaged over blocks of ``step`` x ``step`` pixels.
-
-    Depth and error maps must be sampled instead of averaged.
-    """
-    return np.asarray(Image.fromarray(rgb).reduce(step))
 
 
 def colour_bar_uri(colours: UInt8[ndarray, "n 3"]) -> str:
