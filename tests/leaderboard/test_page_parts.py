@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from leaderboard.db.engine import Database
 from leaderboard.db.models import LeaderboardRowModel, ResultModel, SubmissionModel, TokenModel
-from leaderboard.db.rankings import LeaderboardEntry, queue_position, read_ranking
+from leaderboard.db.rankings import LeaderboardEntry, Ranking, queue_position, read_ranking
 from leaderboard.uploads.multipart import MAX_FIELD_BYTES, UploadForm, UploadRejectedError
 from leaderboard.web.pages.leaderboard import make_config_ranking
 from leaderboard.web.pages.rendering import clean_text, error_response, format_size, link_html, time_html
@@ -294,3 +294,13 @@ def test_error_response_lists_text_and_details_in_same_order(limit: int | None, 
     assert [Problem(**detail) for detail in content["problem_details"]] == problems[:shown]
     assert content["problems"][:shown] == [str(problem) for problem in problems[:shown]]
     assert content["problems"][shown:] == (["... and 3 more"] if limit else [])
+
+
+def test_interval_with_an_overflowed_end_is_not_plotted() -> None:
+    tables = [result(scored_view("lattice/0000")).to_dict()["tables"]["lattice"] for _ in range(2)]
+    tables[0]["ci95"]["native"]["abs_rel"] = [0.7, None]
+    tables[1]["ci95"]["native"]["abs_rel"] = [0.7, 0.8]
+    ranking = Ranking(tuple(entry_of(f"m{k}", table) for k, table in enumerate(tables)))
+    chart = make_config_ranking(ranking, "lattice", Selection(), False).chart
+    assert chart is not None
+    assert chart.count('class="bars"') == 1
