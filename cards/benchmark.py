@@ -29,7 +29,7 @@ from rebar_depth_bench.extended.inspection import PROFILES
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, ONCE, Measure, MeasureFamily
 from rebar_depth_bench.extended.registry import MEASURE_FAMILIES
 from rebar_depth_bench.methods import AnyMethod, MultiViewMethod, own_methods
-from rebar_depth_bench.reporting.crossing_texts import FITS_NOTE, REACH_NOTE
+from rebar_depth_bench.reporting.extended_tables import FITS_NOTE, REACH_NOTE
 from rebar_depth_bench.scoring.bootstrap import BLOCK_VIEWS, INTERVALS, MIN_BLOCKS, RESAMPLES
 from rebar_depth_bench.scoring.columns import SIGNIFICANT_DIGITS
 from rebar_depth_bench.scoring.groups import GROUPINGS

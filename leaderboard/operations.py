@@ -29,7 +29,7 @@ from rebar_depth_bench.data.files import file_problems
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import InputError, StorageError, problem_summary
 from rebar_depth_bench.reporting.formatting import counted
-from rebar_depth_bench.reporting.tables import csv_text
+from rebar_depth_bench.scoring.frames import csv_text
 
 _LOG = structlog.get_logger("worker")
 Cell = str | float | None

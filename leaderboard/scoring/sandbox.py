@@ -116,13 +116,13 @@ def views_to_picture(views: Sequence[ViewScore], count: int) -> list[ViewScore]:
 
 
 def _picture(shown: ShownView) -> ViewPicture:
-    size = {"width": shown.images.width, "height": shown.images.height}
+    size = {"width": shown.width, "height": shown.height}
     facts = {**size, "near": shown.near, "far": shown.far, "limit": shown.native_limit}
     images = {
-        "colour": shown.images.colour,
-        "truth": shown.images.truth,
-        "prediction": shown.images.prediction,
-        "error": shown.images.native_error,
+        "colour": shown.colour,
+        "truth": shown.truth,
+        "prediction": shown.prediction,
+        "error": shown.native_error,
     }
     stored = {kind: webp for kind, webp in images.items() if webp is not None}
-    return ViewPicture(shown.view_id, json.dumps(facts), stored)
+    return ViewPicture(shown.score.view_id, json.dumps(facts), stored)

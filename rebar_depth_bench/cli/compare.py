@@ -16,9 +16,10 @@ from rebar_depth_bench.console import (
     add_workers,
     prints_table,
 )
-from rebar_depth_bench.reporting.comparison_tables import comparison_csv, print_comparison
+from rebar_depth_bench.reporting.tables import print_comparison
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.evaluation import score
+from rebar_depth_bench.scoring.frames import differences_frame, frame_csv
 from rebar_depth_bench.terminal import ProgressBars
 
 
@@ -47,10 +48,10 @@ def run(options: argparse.Namespace) -> None:
             for archive in (options.first, *options.others)
         )
     comparisons = [compare(first, other) for other in others]
+    content = [comparison.to_dict() for comparison in comparisons]
     if options.json:
-        content = [comparison.to_dict() for comparison in comparisons]
         write_output(options.json, json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
     if options.csv:
-        write_output(options.csv, comparison_csv(comparisons))
+        write_output(options.csv, frame_csv(differences_frame(content)))
     for comparison in comparisons if prints_table(options) else ():
         print_comparison(comparison, Console())

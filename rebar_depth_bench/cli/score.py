@@ -18,12 +18,11 @@ from rebar_depth_bench.console import (
 )
 from rebar_depth_bench.diagnosis.diagnose import diagnose
 from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.extended.registry import score_extended
-from rebar_depth_bench.reporting.extended_tables import extended_csv, print_extended
 from rebar_depth_bench.reporting.html.page import write_report
 from rebar_depth_bench.reporting.html.views import VIEWS_SHOWN
-from rebar_depth_bench.reporting.tables import groups_csv, print_table, result_csv
+from rebar_depth_bench.reporting.tables import print_table
 from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
+from rebar_depth_bench.scoring.frames import frame_csv
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.terminal import ProgressBars, print_notice
 
@@ -59,8 +58,13 @@ def run(options: argparse.Namespace) -> None:
         raise InputError(f"--html-views is {options.html_views}, expected 0 or more")
     with open_evaluation(options.archive, options.data, expect_digest=options.expect_digest) as evaluation:
         with ProgressBars() as bars:
-            scorer = score_extended if options.extended or options.extended_csv else score_evaluation
-            result = scorer(evaluation, workers=options.workers, progress=bars.update)
+            if options.extended or options.extended_csv:
+                # A third of the package, which other scores do not need.
+                from rebar_depth_bench.extended.registry import score_extended
+
+                result = score_extended(evaluation, workers=options.workers, progress=bars.update)
+            else:
+                result = score_evaluation(evaluation, workers=options.workers, progress=bars.update)
         names = ", ".join(config.name for config in evaluation.configs)
         print_verified(
             evaluation.folder, f"views of {names} verified when their ground truth was stored in the cache"
@@ -72,10 +76,12 @@ def run(options: argparse.Namespace) -> None:
     if options.json:
         write_output(options.json, result.to_json())
     if options.csv:
-        write_output(options.csv, result_csv(result))
+        write_output(options.csv, frame_csv(result.to_pandas()))
     if options.groups_csv:
-        write_output(options.groups_csv, groups_csv(result))
+        write_output(options.groups_csv, frame_csv(result.to_pandas("groups")))
     if options.extended_csv:
+        from rebar_depth_bench.reporting.extended_tables import extended_csv
+
         write_output(options.extended_csv, extended_csv(result))
     if prints_table(options):
         _print_tables(result)
@@ -86,4 +92,6 @@ def run(options: argparse.Namespace) -> None:
 def _print_tables(result: Result) -> None:
     print_table(result, Console())
     if result.extended is not None:
+        from rebar_depth_bench.reporting.extended_tables import print_extended
+
         print_extended(result.extended, Console())

@@ -11,8 +11,7 @@ from rebar_depth_bench.atomic_io import write_output
 from rebar_depth_bench.console import InputFile, add_data, add_output_file, add_workers, prints_table
 from rebar_depth_bench.detections.score import score_crossings
 from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.reporting.detections import detection_page
-from rebar_depth_bench.reporting.table_page import print_page, render_page
+from rebar_depth_bench.reporting.detections import detection_page, print_page, render_page
 from rebar_depth_bench.submission import INPUTS
 from rebar_depth_bench.terminal import ProgressBars, print_notice
 

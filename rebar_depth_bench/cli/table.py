@@ -15,12 +15,12 @@ from rebar_depth_bench.console import (
     add_workers,
     prints_table,
 )
-from rebar_depth_bench.reporting.comparison_tables import disambiguate_method_names, print_paper_table
 from rebar_depth_bench.reporting.figure import check_figure, write_figure
 from rebar_depth_bench.reporting.latex import latex_table
-from rebar_depth_bench.reporting.tables import results_csv
+from rebar_depth_bench.reporting.tables import disambiguate_method_names, print_paper_table
 from rebar_depth_bench.scoring.comparison import check_same_splits
 from rebar_depth_bench.scoring.evaluation import score
+from rebar_depth_bench.scoring.frames import frame_csv, tables_frame
 from rebar_depth_bench.terminal import ProgressBars, print_notice
 
 
@@ -59,7 +59,7 @@ def run(options: argparse.Namespace) -> None:
     if options.latex:
         write_output(options.latex, latex_table(results, published=published, intervals=options.intervals))
     if options.csv:
-        write_output(options.csv, results_csv(results))
+        write_output(options.csv, frame_csv(tables_frame(results)))
     if options.figure:
         for note in write_figure(results, options.figure, published=published):
             print_notice(note)

@@ -1,9 +1,16 @@
-"""Page and terminal tables of a detector of crossings: numbers with intervals, and precision over recall."""
+"""Page and terminal tables of a detector of crossings: numbers with intervals, and precision over recall.
+
+The page is self-contained HTML, without scripts or requests, and the same bytes for the same input. All text
+passes through Jinja's escaping, and names of a submission or a dataset through ``errors.printable`` before.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from functools import partial
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from markupsafe import Markup
+from rich.console import Console
 
 from rebar_depth_bench import software_version
 from rebar_depth_bench.bar_crossings.definition import CROSSINGS_PROTOCOL
@@ -11,8 +18,9 @@ from rebar_depth_bench.detections.result import AVERAGE_PRECISION_MM, DetectionR
 from rebar_depth_bench.detections.score import MATCH_M
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
-from rebar_depth_bench.reporting.charts.lines import HEIGHT, LEFT, RIGHT, TOP, ChartText, LinearAxis, Series, chart
-from rebar_depth_bench.reporting.table_page import Columns, PageFigure, PageTable, TablePage, page_table
+from rebar_depth_bench.reporting.charts import precision_chart
+from rebar_depth_bench.reporting.html.assets import environment
+from rebar_depth_bench.reporting.tables import make_grid, plain_text, print_line, print_unwrapped
 from rebar_depth_bench.scoring.columns import ARROWS, DASH, Column
 
 Row = tuple[str, DetectionTable]
@@ -36,7 +44,64 @@ _ERRORS = (
 )
 
 
-def detection_page(result: DetectionResult) -> TablePage:
+_COUNTS = (
+    ("Crossings", "judged"),
+    ("Nodes", "judged"),
+    ("Detections", ""),
+    ("Matched", ""),
+    ("False", ""),
+    ("Ignored", ""),
+)
+"""Headings of the numbers of crossings and detections, whose keys are the names in lower case."""
+
+
+@dataclass(frozen=True)
+class PageTable:
+    """Table of the page: headings (name, unit), and rows with as many cells, the first of which is its name."""
+
+    caption: str
+    heads: Sequence[tuple[str, str]]
+    rows: Sequence[Sequence[str]]
+
+
+@dataclass(frozen=True)
+class DetectionPage:
+    """Contents of the page; ``stamps`` are (name, value), ``figures`` are (SVG, title, caption)."""
+
+    title: str
+    lead: str
+    stamps: Sequence[tuple[str, str]]
+    figures: Sequence[tuple[Markup, str, str]]
+    tables: Sequence[PageTable]
+    notes: Sequence[str]
+
+
+def render_page(page: DetectionPage) -> str:
+    """Return the page as HTML; it follows the reader's light or dark mode and needs no network."""
+    return environment().get_template("detections.html.j2").render(page=page)
+
+
+def print_page(page: DetectionPage, console: Console) -> None:
+    """Print title, stamps, tables and notes.
+
+    Numbers are never truncated: on a narrow console, lines become longer than the console.
+    """
+    print_line(console, page.title, style="bold")
+    print_line(console, "; ".join(f"{label}: {value}" for label, value in page.stamps), style="dim")
+    for table in page.tables:
+        console.print()
+        print_line(console, table.caption, style="italic")
+        first, *others = (plain_text(f"{name}\n{unit}") for name, unit in table.heads)
+        grid = make_grid(first, others)
+        for row in table.rows:
+            grid.add_row(*map(plain_text, row))
+        print_unwrapped(console, grid)
+    console.print()
+    for note in page.notes:
+        print_line(console, note)
+
+
+def detection_page(result: DetectionResult) -> DetectionPage:
     """Return the page of a result; its tables are also those of the terminal."""
     rows: list[Row] = list(result.tables.items())
     if len(rows) > 1:
@@ -44,8 +109,7 @@ def detection_page(result: DetectionResult) -> TablePage:
     threshold = result.least_confidence
     matched = "all detections" if threshold is None else f"detections with a confidence of {threshold:g} or more"
     method = printable(result.meta.method)
-    return TablePage(
-        subject="crossings",
+    return DetectionPage(
         title=f"{method}: detected crossings of bars",
         lead=f"Crossings that the left image shows well enough are to be found. Matched within "
         f"{1000 * MATCH_M:g} mm: {matched}.",
@@ -80,57 +144,43 @@ def _stamps(result: DetectionResult) -> list[tuple[str, str]]:
     ]
 
 
-def _number_table(caption: str, numbers: Sequence[Column], rows: list[Row]) -> PageTable:
+def _number_table(caption: str, columns: Sequence[Column], rows: list[Row]) -> PageTable:
     """Return the table of some numbers, each beside its interval."""
-    columns: list[tuple[str, str, Callable[[Row], str]]] = [("Config", "", lambda row: printable(row[0]))]
-    for column in numbers:
+    heads = [("Config", "")]
+    for column in columns:
         title = f"{column.title} {ARROWS[column.better]}"
-        columns += [
-            (title, column.unit, partial(_value, column)),
-            (title, "95 % interval", partial(_ends, column)),
-        ]
-    return page_table(caption, columns, rows)
+        heads += [(title, column.unit), (title, "95 % interval")]
+    cells = [
+        [printable(name), *(text for column in columns for text in _texts(column, table))] for name, table in rows
+    ]
+    return PageTable(caption, heads, cells)
 
 
-def _value(column: Column, row: Row) -> str:
-    return column.text(row[1].numbers[column.path])
-
-
-def _ends(column: Column, row: Row) -> str:
-    return column.interval_text(row[1].intervals[column.path], " to ") or DASH
-
-
-def _count(name: str) -> Callable[[Row], str]:
-    return lambda row: str(row[1].counts[name])
+def _texts(column: Column, table: DetectionTable) -> tuple[str, str]:
+    """Return the number of a table and its interval as text."""
+    ends = column.interval_text(table.intervals[column.path], " to ")
+    return column.text(table.numbers[column.path]), ends or DASH
 
 
 def _count_table(rows: list[Row]) -> PageTable:
-    columns: Columns[Row] = (
-        ("Config", "", lambda row: printable(row[0])),
-        ("Views", "", lambda row: str(row[1].views)),
-        ("Crossings", "judged", _count("crossings")),
-        ("Nodes", "judged", _count("nodes")),
-        ("Detections", "", _count("detections")),
-        ("Matched", "", _count("matched")),
-        ("False", "", _count("false")),
-        ("Ignored", "", _count("ignored")),
-    )
-    return page_table("Numbers over all views.", columns, rows)
-
-
-def _curve_figure(name: str, table: DetectionTable) -> PageFigure:
-    series = [
-        Series(f"{limit} mm", colour, line=[(0.0, curve[0][1]), *curve] if curve else [])
-        for colour, (limit, curve) in enumerate(table.curves.items())
+    cells = [
+        [printable(name), str(table.views), *(str(table.counts[count.lower()]) for count, _ in _COUNTS)]
+        for name, table in rows
     ]
+    return PageTable("Numbers over all views.", [("Config", ""), ("Views", ""), *_COUNTS], cells)
+
+
+def _curve_figure(name: str, table: DetectionTable) -> tuple[Markup, str, str]:
+    curves = {
+        f"{limit} mm": [(0.0, curve[0][1]), *curve] if curve else [] for limit, curve in table.curves.items()
+    }
     average = "; ".join(
-        f"average precision at {limit} mm: {_value(column, (name, table))} %"
+        f"average precision at {limit} mm: {_texts(column, table)[0]} %"
         for limit, column in zip(AVERAGE_PRECISION_MM, _AVERAGES, strict=True)
     )
-    labels = ChartText(f"Precision over recall, {name}", average, "recall", "precision")
-    svg = chart(series, LinearAxis(0, 1, LEFT, RIGHT), LinearAxis(0, 1, HEIGHT, TOP), labels)
+    svg = precision_chart(f"Precision over recall, {name}", average, curves)
     caption = f"By the distance within which a detection is correct; {average}."
-    return PageFigure(svg, f"{printable(name)}: precision over recall.", caption)
+    return svg, f"{printable(name)}: precision over recall.", caption
 
 
 def _notes(result: DetectionResult) -> list[str]:

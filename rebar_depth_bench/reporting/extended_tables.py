@@ -3,23 +3,32 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
-from rich import box
 from rich.console import Console
 from rich.padding import Padding
-from rich.table import Table as RichTable
 
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.extended.crossings import MISS_DEG
 from rebar_depth_bench.extended.fits import MISS_MM
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, NATIVE, SCALED, Measure, MeasureFamily
+from rebar_depth_bench.extended.reach import MIN_CROSSINGS, MIN_REACH_VIEWS, SHARE, Reach
 from rebar_depth_bench.extended.registry import MEASURE_FAMILIES
 from rebar_depth_bench.extended.result import ExtendedResult, ExtendedTable, MeasureEstimate
-from rebar_depth_bench.reporting.crossing_texts import reach_sentence
-from rebar_depth_bench.reporting.tables import frame_csv, plain_text
-from rebar_depth_bench.scoring.bootstrap import Interval
-from rebar_depth_bench.scoring.columns import DASH, number
+from rebar_depth_bench.reporting.tables import make_grid, plain_text, print_line
+from rebar_depth_bench.scoring.columns import DASH, number, range_text
+from rebar_depth_bench.scoring.frames import frame_csv
 from rebar_depth_bench.scoring.result import Result
+
+FITS_NOTE = (
+    "The fits take from the ground truth which pixels show which bar, the radius of each bar, and each pixel's "
+    "position along the bar. A method that has to find the bars itself can only be worse."
+)
+
+REACH_NOTE = (
+    f"Bins by the true depth of the tie point. A bin is tested if it has {MIN_CROSSINGS} judged crossings or more "
+    f"from {MIN_REACH_VIEWS} views or more; what is not located fails."
+)
 
 UNDEFINED = "n/a"
 """Text of an undefined capability: 5 % or more of the bars were not found, so that p95 is the error of a miss."""
@@ -39,11 +48,8 @@ def print_extended(extended: ExtendedResult, console: Console) -> None:
     wide = console.width >= _MIN_WIDTH_WITH_INTERVALS
     for config, table in extended.tables.items():
         console.print()
-        console.print(plain_text(f"{printable(config)}, {EXTENDED_PROTOCOL}, {table.views} views", style="bold"))
-        grid = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
-        grid.add_column("", overflow="fold")  # Long names are wrapped; numbers are never truncated.
-        for heading in ("native", "95 %", "scaled", "95 %") if wide else ("native", "scaled"):
-            grid.add_column(heading, justify="right", no_wrap=True)
+        print_line(console, f"{printable(config)}, {EXTENDED_PROTOCOL}, {table.views} views", style="bold")
+        grid = make_grid("", ("native", "95 %", "scaled", "95 %") if wide else ("native", "scaled"), fold=True)
         for family in MEASURE_FAMILIES.values():
             rows = [(measure, measure_cells(table, family, measure)) for measure in family.measures]
             known_rows = [(measure, texts) for measure, texts in rows if any(cell != DASH for cell in texts)]
@@ -51,35 +57,25 @@ def print_extended(extended: ExtendedResult, console: Console) -> None:
                 grid.add_section()
                 grid.add_row(plain_text(family.title, style="italic"))
             for measure, texts in known_rows:
-                grid.add_row(
-                    Padding(measure_heading(measure), (0, 0, 0, 2)),
-                    *map(plain_text, texts if wide else texts[::2]),
-                )
+                heading = Padding(measure.column.heading, (0, 0, 0, 2))
+                grid.add_row(heading, *map(plain_text, texts if wide else texts[::2]))
         console.print(grid)
         for alignment, of_alignment in table.reaches.items():
             for reach in of_alignment:
-                console.print(plain_text(reach_sentence(alignment, reach)))
+                print_line(console, reach_sentence(alignment, reach))
     numbers = [(measure, estimate) for _, _, measure, estimate in extended.estimates()]
     if any(is_miss(estimate, measure) for measure, estimate in numbers):
-        console.print(
-            plain_text(f"{MISSED}: not found, recorded as {MISS_MM:g} mm or {MISS_DEG:g} degrees in CSV and JSON.")
-        )
+        note = f"{MISSED}: not found, recorded as {MISS_MM:g} mm or {MISS_DEG:g} degrees in CSV and JSON."
+        print_line(console, note)
     if any(estimate.value is None and estimate.samples for _, estimate in numbers):
-        console.print(plain_text(f"{UNDEFINED}: 5 % or more were not found, so the capability is undefined."))
+        print_line(console, f"{UNDEFINED}: 5 % or more were not found, so the capability is undefined.")
     if not wide:
-        console.print(
-            plain_text(
-                "Intervals: in CSV, JSON and the report, and in terminals with at least "
-                f"{_MIN_WIDTH_WITH_INTERVALS} columns."
-            )
+        width = _MIN_WIDTH_WITH_INTERVALS
+        print_line(
+            console, f"Intervals: in CSV, JSON and the report, and in terminals with at least {width} columns."
         )
     note = "A single number in the first column is independent of scale or uses its own alignment."
-    console.print(plain_text(f"{note} Definitions: cards/BENCHMARK.md."))
-
-
-def measure_heading(measure: Measure) -> str:
-    """Return a measure's title with its unit and better direction."""
-    return measure.column.heading
+    print_line(console, f"{note} Definitions: cards/BENCHMARK.md.")
 
 
 def measure_cells(table: ExtendedTable, family: MeasureFamily, measure: Measure) -> list[str]:
@@ -96,7 +92,7 @@ def measure_cells(table: ExtendedTable, family: MeasureFamily, measure: Measure)
             defined = estimate.value is not None or not estimate.samples
             texts += [
                 format_value(estimate.value, measure) if defined else UNDEFINED,
-                _interval_text(estimate.interval, measure),
+                range_text(estimate.interval, partial(format_value, measure=measure, digits=3)),
             ]
     return texts + [""] * (4 - len(texts))
 
@@ -138,6 +134,26 @@ def single_bar_sentence(table: ExtendedTable) -> str:
     )
 
 
+def reach_text(reach: Reach) -> str:
+    """Return a reach in a few words, such as ``at least 0.4 m``."""
+    if reach.verdict == "none tested":
+        return "none tested"
+    if reach.verdict == "not met":
+        return f"not met from {reach.bins_tested[0].low_m:g} m on"
+    return f"{reach.verdict} {reach.distance_m:g} m"
+
+
+def reach_sentence(alignment: str, reach: Reach) -> str:
+    """Return the reach under one alignment as a sentence."""
+    head = f"{alignment.capitalize()}: {100 * SHARE:g} % of the judged crossings within {reach.limit_mm} mm"
+    if reach.verdict == "none tested":
+        return f"{head}: none tested."
+    informative = reach.interval is not None and reach.interval[0] < reach.interval[1]
+    ends, tested = (range_text(edges_m, "{:g}".format) for edges_m in (reach.interval, reach.tested_m))
+    interval = f"95 % interval {ends} m; " if informative else ""
+    return f"{head} {reach_text(reach)} ({interval}tested {tested} m)."
+
+
 def extended_csv(result: Result) -> str:
     r"""Return the extended tables as tidy CSV: one row per config, alignment and measure, ``\n`` line ends."""
     if result.extended is None:
@@ -149,7 +165,3 @@ def extended_csv(result: Result) -> str:
     frame["submission_sha256"] = result.submission.sha256
     frame["software_version"] = result.software.version
     return frame_csv(frame)
-
-
-def _interval_text(ends: Interval | None, measure: Measure) -> str:
-    return DASH if ends is None else " to ".join(format_value(end, measure, 3) for end in ends)

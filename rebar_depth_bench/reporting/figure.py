@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from rebar_depth_bench.atomic_io import write_output
 from rebar_depth_bench.errors import InputError, printable, require_extra
-from rebar_depth_bench.reporting.charts.axes import LogAxis, decade_axis, select_spaced, tick_label
+from rebar_depth_bench.reporting.axes import Axis, decade_axis, select_spaced, tick_label
 from rebar_depth_bench.reporting.formatting import (
     CONSTANT_TITLE,
     ONE_PIXEL_TITLE,
@@ -33,6 +33,7 @@ from rebar_depth_bench.reporting.published import (
     load_published,
     published_rows,
 )
+from rebar_depth_bench.scoring.columns import NATIVE, SCALED
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.table import Table
@@ -181,10 +182,8 @@ def _panel(config: str, results: Sequence[Result], *, published: bool) -> Panel:
 
 def _errors(table: Table) -> tuple[float, float] | None:
     """Return the native and scaled AbsRel, or None if either is undefined (null in the JSON)."""
-    if table.native is None or table.scaled is None:
-        return None
-    errors = table.native.abs_rel, table.scaled.abs_rel
-    return errors if all(map(math.isfinite, errors)) else None
+    native, scaled = (column.cell(table).value for column in (NATIVE[0], SCALED[0]))
+    return None if native is None or scaled is None else (native, scaled)
 
 
 def _name(result: Result) -> str:
@@ -372,7 +371,7 @@ def _draw_panel(axes: Axes, panel: Panel, frame: tuple[float, float], content: F
             axes.annotate("†", place, (-5.5, 3), textcoords="offset points", color=_GREY, fontsize=6.2)
 
 
-def _scales(panel: Panel, width: float, height: float) -> tuple[LogAxis, LogAxis]:
+def _scales(panel: Panel, width: float, height: float) -> tuple[Axis, Axis]:
     """Return the axes of native and scaled errors, which hold the points and references of a panel.
 
     The x axis also covers the y axis, so that the diagonal crosses the panel.
@@ -389,7 +388,7 @@ def _with_margin(values: Sequence[float]) -> list[float]:
     return [min(max(value * factor, low), high) for value in inside for factor in _MARGIN_FACTORS]
 
 
-def _within(value: float, scale: LogAxis) -> float:
+def _within(value: float, scale: Axis) -> float:
     return min(max(value, scale.low), scale.high)
 
 

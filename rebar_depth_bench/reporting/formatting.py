@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
 from rebar_depth_bench.errors import printable
@@ -11,12 +11,13 @@ from rebar_depth_bench.scoring.columns import (
     CONSTANT,
     COVERAGE,
     DASH,
-    METRICS,
     NATIVE,
-    REFERENCE_ERRORS,
+    PAPER_COLUMNS,
     SCALED,
     SCALED_CONSTANT,
+    Column,
     texts,
+    with_reference,
 )
 from rebar_depth_bench.scoring.groups import GROUPINGS
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE
@@ -26,10 +27,6 @@ if TYPE_CHECKING:
     from rebar_depth_bench.submission.declaration import Declaration
 
 DASH_NOTE = f"{DASH}: undefined, because no pixel has a prediction or a number overflowed."
-
-NATIVE_TITLE = "native (no alignment)"
-SCALED_TITLE = "scaled (oracle median scale per view, s = median(z)/median(p))"
-WITHIN_TITLE = "within t mm (native): share of all scored pixels with |p - z| <= t"
 
 RANK_ERROR_NOTE = "Rank error: mean over all scored pixels of |p - z| / max(p, z), 1 without a valid prediction."
 
@@ -65,11 +62,6 @@ def ground_truth_text(declared: Declaration) -> str:
     return "used, as declared" if declared.uses_ground_truth else "not used, as declared"
 
 
-def declaration_text(declared: Declaration) -> str:
-    """Return a submission's declaration in one line."""
-    return f"inputs: {declared.inputs or 'not declared'}; ground truth: {ground_truth_text(declared)}"
-
-
 def interval_note(tables: Iterable[Table]) -> str:
     """Return the sentence on intervals: how those of configs of one scene, and of several, are determined."""
     by_scene = {table.split is not None for table in tables}
@@ -92,20 +84,12 @@ def table_notes(table: Table) -> list[str]:
             f"The ground truth was measured, with a standard deviation of {1000 * table.truth_sigma_m:.3g} mm, as "
             "its authors state; smaller errors cannot be told from errors of the ground truth."
         )
-    if reason := unranked_reason(table):
+    if not table.ranked:
+        reason = "the submission declares that it uses ground truth" if table.views else "no views"
         notes.append(f"Not ranked: {reason}.")
     if reasons := incomparable_reasons(table):
         notes.append(f"Errors of valid predictions are not compared with those of others: {'; '.join(reasons)}.")
     return notes
-
-
-def unranked_reason(table: Table) -> str:
-    """Return the reason why a config's row is not ranked; empty for a ranked row."""
-    if table.ranked:
-        return ""
-    if table.views == 0:
-        return "no views"
-    return "the submission declares that it uses ground truth"
 
 
 def incomparable_reasons(table: Table) -> list[str]:
@@ -149,26 +133,27 @@ def scaled_constants(results: Sequence[tuple[str, Table]]) -> dict[str, tuple[fl
     return {titles[shown] if len(found) > 1 else CONSTANT_TITLE: errors for shown, errors in found.items()}
 
 
-def reference_rows(results: Sequence[tuple[str, Table]]) -> list[tuple[str, list[str], list[str]]]:
-    """Return name, native and scaled cells (of ``METRICS``, empty if they do not apply) of each reference.
+def reference_rows(results: Sequence[tuple[str, Table]]) -> list[tuple[str, dict[str, str]]]:
+    """Return the name of each reference, and its errors as text by path of the column that they are compared with.
 
     ``results`` are as in ``scaled_constants``.
     """
-    empty = [""] * len(METRICS)
-    rows = [
-        (title, empty, _reference_cells(dict(zip(REFERENCE_ERRORS, errors, strict=True))))
-        for title, errors in scaled_constants(results).items()
-    ]
+    rows = [(title, _reference_texts(SCALED, errors)) for title, errors in scaled_constants(results).items()]
     shifted = [table.reference.one_pixel for _, table in results if table.reference.one_pixel.abs_rel is not None]
-    return rows + [(ONE_PIXEL_TITLE, _reference_cells(vars(errors)), empty) for errors in shifted[:1]]
+    return rows + [
+        (ONE_PIXEL_TITLE, _reference_texts(NATIVE, (errors.abs_rel, errors.rmse_cm))) for errors in shifted[:1]
+    ]
+
+
+def _reference_texts(columns: Sequence[Column], errors: tuple[float | None, float | None]) -> dict[str, str]:
+    shown = zip(with_reference(columns), errors, strict=True)
+    return {column.path: column.text(error) for column, error in shown}
 
 
 def paper_reference_rows(results: Sequence[tuple[str, Table]]) -> list[tuple[str, list[str]]]:
     """Return name and cells of each reference for ``PAPER_COLUMNS``, empty where they do not apply."""
-    abs_rel, rmse_cm = list(METRICS).index("abs_rel"), list(METRICS).index("rmse_cm")
     return [
-        (name, [native[rmse_cm], native[abs_rel], scaled[abs_rel], ""])
-        for name, native, scaled in reference_rows(results)
+        (name, [shown.get(column.path, "") for column in PAPER_COLUMNS]) for name, shown in reference_rows(results)
     ]
 
 
@@ -196,15 +181,6 @@ def reference_findings(table: Table) -> list[str]:
             f"({scaled.text(constant)}): a plane at one depth describes the shape better."
         )
     return findings
-
-
-def _reference_cells(values: Mapping[str, float | None]) -> list[str]:
-    return [metric.text(values[name]) if name in values else "" for name, metric in METRICS.items()]
-
-
-def has_dash(rows: Iterable[Iterable[str]]) -> bool:
-    """Return whether any cell is undefined, so that ``DASH_NOTE`` must be shown."""
-    return any(cell == DASH for row in rows for cell in row)
 
 
 def plural(noun: str, count: int) -> str:

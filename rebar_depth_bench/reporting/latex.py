@@ -6,7 +6,6 @@ XeLaTeX or LuaLaTeX.
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 
@@ -15,8 +14,8 @@ from jinja2 import PackageLoader, Template
 from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.html.assets import environment
-from rebar_depth_bench.reporting.published import PublishedRow, load_published, published_rows
-from rebar_depth_bench.scoring.columns import DASH, PAPER_COLUMNS, RANK_ERROR, rounded, texts
+from rebar_depth_bench.reporting.published import load_published, published_rows
+from rebar_depth_bench.scoring.columns import DASH, PAPER_COLUMNS, RANK_ERROR, rounded
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.table import PublishedMatch, Table
@@ -24,8 +23,7 @@ from rebar_depth_bench.scoring.table import PublishedMatch, Table
 CONFIGS_PER_BLOCK = 2
 """Number of configs side by side that fit into a page width of 17 cm; further configs follow in blocks below."""
 
-_TABLE_COLUMNS = (RANK_ERROR, *PAPER_COLUMNS)
-_COLUMNS = len(_TABLE_COLUMNS)
+_COLUMNS = (RANK_ERROR, *PAPER_COLUMNS)
 _MISSING = "--"
 _UNRANKED_MARK = r"$^{\ddagger}$"
 _OTHER_OPTICS_MARK = r"$^{\S}$"
@@ -66,11 +64,11 @@ def latex_table(results: Sequence[Result], *, published: bool, intervals: bool =
     configs = list(tables)
     configs_per_block = 1 if intervals else CONFIGS_PER_BLOCK
     blocks = [configs[start : start + configs_per_block] for start in range(0, len(configs), configs_per_block)]
-    matches = {config: tables[config].published if published else None for config in configs}
-    paper_rows = [row for match in matches.values() for row in _paper_rows(match)]
+    matches = {config: table.published for config, table in tables.items() if published and table.published}
+    paper_rows = [row for match in matches.values() for row in published_rows(match.scene)]
     return _template().render(
         protocol=PROTOCOL,
-        columns=_COLUMNS,
+        columns=len(_COLUMNS),
         version=results[0].dataset.version,
         digest=formatting.short_digest(results[0].dataset.digest, 16),
         view_counts=[
@@ -85,15 +83,15 @@ def latex_table(results: Sequence[Result], *, published: bool, intervals: bool =
         anchored=any(row.median_anchored for row in paper_rows),
         anchored_mark=_ANCHORED_MARK,
         published=bool(paper_rows),
-        other_optics=any(match is not None and not match.same_optics for match in matches.values()),
+        other_optics=any(not match.same_optics for match in matches.values()),
         other_optics_mark=_OTHER_OPTICS_MARK,
         paper=load_published(),
         blocks=[
             {
                 "titles": [_config_title(config, tables[config]) for config in block],
                 "rows": _result_rows(results, block, intervals),
-                "reference_rows": _reference_rows(results, block),
-                "published_rows": _published_rows({config: matches[config] for config in block}),
+                "reference_rows": _merged([_reference_rows(results, config) for config in block], ""),
+                "published_rows": _merged([_published_rows(matches.get(config)) for config in block], _MISSING),
             }
             for block in blocks
         ],
@@ -132,7 +130,7 @@ def _config_title(config: str, table: Table) -> str:
 
 
 def _result_rows(results: Sequence[Result], configs: Sequence[str], intervals: bool) -> list[list[str]]:
-    """Return the rows of a block, each a name and four cells for each config."""
+    """Return the rows of a block, each a name and the cells of each config."""
     best = {config: _best_texts([result.tables.get(config) for result in results]) for config in configs}
     shown = [result for result in results if any(name in result.tables for name in configs)]
     return [
@@ -151,81 +149,53 @@ def _sort_key(table: Table | None) -> tuple[bool, bool, float]:
     return False, not table.ranked, rounded(table.rank_error) or 0.0
 
 
-def _reference_rows(results: Sequence[Result], configs: Sequence[str]) -> list[list[str]]:
-    """Return the rows of reference errors of a block, each a name and the cells of each config."""
-    rows_by_config = {}
-    for config in configs:
-        shown = [(result.method, result.tables[config]) for result in results if config in result.tables]
-        rows_by_config[config] = dict(formatting.paper_reference_rows(shown))
-    names = dict.fromkeys(name for rows in rows_by_config.values() for name in rows)
-    empty = [""] * (_COLUMNS - 1)
-    return [
-        [escape_latex(name), *(cell for rows in rows_by_config.values() for cell in ("", *rows.get(name, empty)))]
-        for name in names
-    ]
+def _best_texts(tables: Iterable[Table | None]) -> dict[str, str]:
+    """Return the formatted lowest rank error, RMSE, AbsRel and AbsRel_s of the ranked tables by path.
 
-
-def _cells(table: Table | None, best: Sequence[str | None], intervals: bool) -> list[str]:
-    """Return a config's cells; ``best`` holds the formatted best number of each column, or None."""
-    if table is None:
-        return [_MISSING] * _COLUMNS
-    cells = []
-    interval_texts = _interval_texts(table) if intervals else [""] * _COLUMNS
-    for text, best_text, interval in zip(_number_texts(table), best, interval_texts, strict=True):
-        number = rf"\textbf{{{text}}}" if table.ranked and text == best_text else text
-        cells.append(number + (rf" {{\tiny[{interval}]}}" if interval else ""))
-    return cells if table.ranked else [cells[0] + _UNRANKED_MARK, *cells[1:]]
-
-
-def _number_texts(table: Table) -> list[str]:
-    return [_MISSING if text == DASH else text for text in texts(_TABLE_COLUMNS, table)]
-
-
-def _interval_texts(table: Table) -> list[str]:
-    return [column.interval_text(table.intervals.get(column.path), ", ") for column in _TABLE_COLUMNS]
-
-
-def _best_texts(tables: Iterable[Table | None]) -> list[str | None]:
-    """Return the formatted lowest rank error, RMSE, AbsRel and AbsRel_s of the ranked tables, and None for s.
-
-    All are None if fewer than two tables are ranked, and all but the first if not all of these are comparable.
+    There are none if fewer than two tables are ranked, and only the first if not all of these are comparable.
     """
     ranked = [table for table in tables if table is not None and table.ranked]
     if len(ranked) < 2:
-        return [None] * _COLUMNS
-    columns = 4 if all(table.is_comparable for table in ranked) else 1
-    best = [
-        _number_texts(min(ranked, key=lambda table: _errors(table)[column]))[column] for column in range(columns)
-    ]
-    return [*best, *[None] * (_COLUMNS - columns)]
+        return {}
+    columns = _COLUMNS[:-1] if all(table.is_comparable for table in ranked) else _COLUMNS[:1]
+    return {column.path: column.text(min(column.value(table) for table in ranked)) for column in columns}
 
 
-def _errors(table: Table) -> list[float]:
-    """Return rank error, RMSE and AbsRel, native, and AbsRel after the oracle scale; infinity where undefined."""
-    values = [column.value(table) for column in _TABLE_COLUMNS[:-1]]
-    return [math.inf if value is None else value for value in values]
+def _cells(table: Table | None, best: Mapping[str, str], intervals: bool) -> list[str]:
+    """Return a config's cells; ``best`` holds the formatted best number of columns."""
+    if table is None:
+        return [_MISSING] * len(_COLUMNS)
+    cells = []
+    for column in _COLUMNS:
+        number = column.text(column.value(table)).replace(DASH, _MISSING)
+        interval = column.interval_text(column.interval(table), ", ") if intervals else ""
+        shown = rf"\textbf{{{number}}}" if table.ranked and number == best.get(column.path) else number
+        cells.append(shown + (rf" {{\tiny[{interval}]}}" if interval else ""))
+    return cells if table.ranked else [cells[0] + _UNRANKED_MARK, *cells[1:]]
 
 
-def _paper_rows(match: PublishedMatch | None) -> tuple[PublishedRow, ...]:
-    return published_rows(match.scene) if match else ()
+def _reference_rows(results: Sequence[Result], config: str) -> dict[str, list[str]]:
+    """Return the cells of each reference of a config."""
+    shown = [(result.method, result.tables[config]) for result in results if config in result.tables]
+    return {name: ["", *cells] for name, cells in formatting.paper_reference_rows(shown)}
 
 
-def _published_rows(matches: Mapping[str, PublishedMatch | None]) -> list[list[str]]:
-    by_config = {
-        config: {
-            row.method: _published_cells(row, match is None or match.same_optics) for row in _paper_rows(match)
-        }
-        for config, match in matches.items()
+def _published_rows(match: PublishedMatch | None) -> dict[str, list[str]]:
+    """Return the cells of each published row of the scene that a config shows."""
+    if match is None:
+        return {}
+    optics = "" if match.same_optics else _OTHER_OPTICS_MARK
+    return {
+        row.method: ["", row.rmse_cm + (_ANCHORED_MARK if row.median_anchored else "") + optics, *row.cells[1:]]
+        for row in published_rows(match.scene)
     }
-    methods = dict.fromkeys(method for rows in by_config.values() for method in rows)
-    missing = [_MISSING] * _COLUMNS
+
+
+def _merged(rows_by_config: Sequence[Mapping[str, list[str]]], missing: str) -> list[list[str]]:
+    """Return a row for each name, with the cells of each config, which are ``missing`` where it lacks the row."""
+    names = dict.fromkeys(name for rows in rows_by_config for name in rows)
+    empty = [missing] * len(_COLUMNS)
     return [
-        [escape_latex(method), *(cell for rows in by_config.values() for cell in rows.get(method, missing))]
-        for method in methods
+        [escape_latex(name), *(cell for rows in rows_by_config for cell in rows.get(name, empty))]
+        for name in names
     ]
-
-
-def _published_cells(row: PublishedRow, same_optics: bool) -> list[str]:
-    rmse_cm, *others = row.cells
-    marks = (_ANCHORED_MARK if row.median_anchored else "") + ("" if same_optics else _OTHER_OPTICS_MARK)
-    return ["", rmse_cm + marks, *others]

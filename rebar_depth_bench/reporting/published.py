@@ -8,19 +8,20 @@ numbers wherever they are shown. Numbers are kept as strings, so that they are p
 from __future__ import annotations
 
 import json
-import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
+from string import ascii_uppercase
 
 from markupsafe import Markup
 from pydantic import TypeAdapter
 
-from rebar_depth_bench.reporting.charts.scatter import ScatterPoint, scatter_chart
-from rebar_depth_bench.reporting.html.rows import Cell, table_row
+from rebar_depth_bench.reporting.charts import ScatterPoint, scatter_chart
+from rebar_depth_bench.reporting.formatting import config_title
+from rebar_depth_bench.scoring.bootstrap import Interval
+from rebar_depth_bench.scoring.columns import NATIVE, PAPER_COLUMNS, SCALED, Cell
 from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.scoring.table import Table
 
 
 @dataclass(frozen=True)
@@ -92,18 +93,20 @@ def published_rows(scene: str) -> tuple[PublishedRow, ...]:
 
 # Paper section of the report: a result beside the published rows of the same scene, not ranked with them.
 
-_FIRST_LETTER = ord("A")
-
 
 @dataclass(frozen=True)
 class PaperRow:
-    """Row of a scene's table: RMSE (cm), AbsRel, AbsRel_s, s; ``mark`` labels its point in the chart."""
+    """Row of a scene's table: cells of ``PAPER_COLUMNS``; ``mark`` labels its point in the chart.
+
+    ``intervals`` are those of AbsRel, native and scaled.
+    """
 
     mark: str
     name: str
     published: bool
     dagger: bool
     cells: list[Cell]
+    intervals: tuple[Interval | None, Interval | None] = (None, None)
 
 
 @dataclass(frozen=True)
@@ -119,59 +122,47 @@ class PaperScene:
 
 def paper_scenes(result: Result) -> list[PaperScene]:
     """Return the scenes of Table I for which the result has configs, in the paper's order."""
-    tables_by_scene: dict[str, dict[str, Table]] = {}
-    for config, table in result.tables.items():
-        if table.published is not None:
-            tables_by_scene.setdefault(table.published.scene, {})[config] = table
-    scenes = load_published().scenes
+    scenes = []
+    for name, scene in load_published().scenes.items():
+        own = [
+            (config, table, table.published)
+            for config, table in result.tables.items()
+            if table.published is not None and table.published.scene == name
+        ]
+        if own:
+            rows = [
+                PaperRow(
+                    mark=str(number),
+                    name=config_title(config, table.split)
+                    + ("" if match.same_optics else f" {OTHER_OPTICS_MARK}"),
+                    published=False,
+                    dagger=False,
+                    cells=[column.cell(table) for column in PAPER_COLUMNS],
+                    intervals=(NATIVE[0].interval(table), SCALED[0].interval(table)),
+                )
+                for number, (config, table, match) in enumerate(own, 1)
+            ]
+            rows += published_table(scene)
+            heading = scene.title if scene.title.lower() == name else f"{scene.title} ({name})"
+            chart = scatter_chart(f"{heading}: native and scaled AbsRel", scatter_points(rows))
+            other_optics = any(not match.same_optics for _, _, match in own)
+            scenes.append(PaperScene(heading, scene.distance, chart, rows, other_optics))
+    return scenes
+
+
+def published_table(scene: PublishedScene) -> list[PaperRow]:
+    """Return the rows of a scene, printed as published; their marks are capital letters."""
     return [
-        _paper_scene(name, scene, tables_by_scene[name])
-        for name, scene in scenes.items()
-        if name in tables_by_scene
+        PaperRow(mark, row.method, True, row.median_anchored, [Cell(text, float(text)) for text in row.cells])
+        for mark, row in zip(ascii_uppercase, scene.rows, strict=False)
     ]
 
 
-def _paper_scene(name: str, scene: PublishedScene, tables: Mapping[str, Table]) -> PaperScene:
-    rows = [_own_row(str(index + 1), config) for index, config in enumerate(tables.items())]
-    rows += [published_row(published_mark(index), row) for index, row in enumerate(scene.rows)]
-    heading = scene.title if scene.title.lower() == name else f"{scene.title} ({name})"
-    chart = scatter_chart(f"{heading}: native and scaled AbsRel", scatter_points(rows, tables))
-    other_optics = any(table.published and not table.published.same_optics for table in tables.values())
-    return PaperScene(heading, scene.distance, chart, rows, other_optics)
-
-
-def published_mark(index: int) -> str:
-    """Return the capital letter of a published row; rows of submissions have numbers."""
-    return chr(_FIRST_LETTER + index) if index < 26 else f"A{index - 25}"
-
-
-def _own_row(mark: str, config: tuple[str, Table]) -> PaperRow:
-    row, match = table_row(*config), config[1].published
-    name = row.name if match is None or match.same_optics else f"{row.name} {OTHER_OPTICS_MARK}"
-    return PaperRow(mark, name, False, False, [row.native[1], row.native[0], row.scaled[0], row.scale])
-
-
-def published_row(mark: str, row: PublishedRow) -> PaperRow:
-    """Return the table row of a published row, printed as published; ``mark`` labels its point in the chart."""
-    return PaperRow(mark, row.method, True, row.median_anchored, [Cell(text, float(text)) for text in row.cells])
-
-
-def scatter_points(rows: Iterable[PaperRow], tables: Mapping[str, Table]) -> list[ScatterPoint]:
-    """Return the points of the rows with both values; rows that are not published are those of ``tables``."""
-    intervals = [table.intervals for table in tables.values()]
+def scatter_points(rows: Iterable[PaperRow]) -> list[ScatterPoint]:
+    """Return the points of the rows with both values."""
     points = []
-    for index, row in enumerate(rows):
-        row_intervals = {} if row.published else intervals[index]
+    for row in rows:
         native, scaled = row.cells[1].value, row.cells[2].value
         if native is not None and scaled is not None:
-            interval_pair = (
-                finite_interval(row_intervals.get("native.abs_rel")),
-                finite_interval(row_intervals.get("scaled.abs_rel")),
-            )
-            points.append(ScatterPoint(row.mark, row.name, native, scaled, row.published, *interval_pair))
+            points.append(ScatterPoint(row.mark, row.name, native, scaled, row.published, *row.intervals))
     return points
-
-
-def finite_interval(interval: tuple[float, float] | None) -> tuple[float, float] | None:
-    """Return the interval if both ends are finite, else None."""
-    return interval if interval and all(map(math.isfinite, interval)) else None

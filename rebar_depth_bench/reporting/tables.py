@@ -1,12 +1,10 @@
-"""Result tables in the terminal, adapted to its width, and as tidy CSV."""
+"""Tables in the terminal: of one result, of the comparison of two, and of several as in the paper's Table I."""
 
 from __future__ import annotations
 
-import csv
-import io
-import json
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from rich import box
@@ -16,138 +14,66 @@ from rich.segment import Segments
 from rich.table import Table as RichTable
 from rich.text import Text
 
+from rebar_depth_bench import software_version
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
+from rebar_depth_bench.reporting.published import (
+    OTHER_OPTICS_MARK,
+    OTHER_OPTICS_NOTE,
+    load_published,
+    published_rows,
+)
+from rebar_depth_bench.scoring.bootstrap import BLOCK_VIEWS, MIN_BLOCKS
 from rebar_depth_bench.scoring.columns import (
     COVERAGE,
     NATIVE,
     ONE_PIXEL,
+    PAPER_COLUMNS,
     RANK_ERROR,
     SCALE,
     SCALED,
     SCALED_CONSTANT,
+    VIEW_COLUMNS,
     VIEWS_SCORED,
     WITHIN,
     Column,
+    has_dash,
+    range_text,
+    rounded,
     texts,
     with_reference,
 )
-from rebar_depth_bench.scoring.frames import tables_frame
+from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.scoring.table import Table
+from rebar_depth_bench.scoring.table import PublishedMatch, Table
 from rebar_depth_bench.terminal import terminal_text
 
 if TYPE_CHECKING:
-    from pandas import DataFrame
+    from rebar_depth_bench.scoring.comparison import Comparison, Difference
 
 _UNBOUNDED = 10_000
-_FORMULA_STARTS = ("=", "+", "-", "@")
-
-
-@dataclass(frozen=True)
-class _ColumnGroup:
-    """Columns that are printed together, under a title that states their alignment."""
-
-    title: str
-    columns: Sequence[Column]
-
-    def cells(self, table: Table) -> list[str]:
-        """Return the cells of a config; a rank error that does not rank is marked."""
-        marks = ["‡" if column is RANK_ERROR and not table.ranked else "" for column in self.columns]
-        return [text + mark for text, mark in zip(texts(self.columns, table), marks, strict=True)]
-
-
-@dataclass(frozen=True)
-class _Row:
-    """Row of a config or of a group of its views; ``references`` are rows of reference errors below it."""
-
-    name: str
-    table: Table
-    references: Sequence[tuple[str, list[str], list[str]]] = ()
-
-
-_BASE = _ColumnGroup("", [VIEWS_SCORED, COVERAGE, RANK_ERROR])
-_NATIVE = _ColumnGroup(formatting.NATIVE_TITLE, NATIVE)
-_SCALED = _ColumnGroup(formatting.SCALED_TITLE, [*SCALED, SCALE])
-_WITHIN = _ColumnGroup(formatting.WITHIN_TITLE, WITHIN)
-_LAYOUTS = (
-    [[_BASE, _NATIVE, _SCALED, _WITHIN]],
-    [[_NATIVE, _SCALED], [_BASE, _WITHIN]],
-    [[_BASE, _NATIVE], [_SCALED], [_WITHIN]],
-)
-"""Column groups of each table to print, from the widest to the narrowest layout."""
-
-_GROUP_NATIVE, _GROUP_SCALED = (_ColumnGroup("", with_reference(columns)) for columns in (NATIVE, SCALED))
-_GROUP_ONE_PIXEL = _ColumnGroup("", ONE_PIXEL)
-_GROUP_CONSTANT = _ColumnGroup("", [*SCALED_CONSTANT, SCALE])
-_GROUP_LAYOUTS = (
-    [[_BASE, _GROUP_NATIVE, _GROUP_ONE_PIXEL, _GROUP_SCALED, _GROUP_CONSTANT]],
-    [[_BASE, _GROUP_NATIVE, _GROUP_ONE_PIXEL], [_GROUP_SCALED, _GROUP_CONSTANT]],
-)
-"""Column groups of the tables of groups of views."""
-
-
-def print_table(result: Result, console: Console) -> None:
-    """Print one row per config, followed by its reference errors: in one table if it fits, else in two or three.
-
-    The groups of views of a config with splits follow, one row per group. Numbers are never truncated: a console
-    narrower than the narrowest layout gets longer lines.
-    """
-    _print_line(console, _headline(result), style="bold")
-    _print_line(console, _provenance(result), style="dim")
-    _print_line(console, formatting.declaration_text(result.declared), style="dim")
-    config_rows = _config_rows(result.tables)
-    for groups in _fitting_layout(config_rows, console, _LAYOUTS):
-        console.print()
-        for group in groups:
-            if group.title:
-                _print_line(console, group.title, style="italic")
-        print_unwrapped(console, _rich_table(config_rows, groups))
-    for config, table in result.tables.items():
-        if table.groups:
-            _print_groups(config, table, console)
-    _print_notes(result, console)
-
-
-def result_csv(result: Result) -> str:
-    r"""Return the tables as CSV with one row per config and ``\n`` line ends.
-
-    Columns are the JSON's numbers, the ends of their intervals, and provenance. Undefined numbers are empty. Text
-    that a spreadsheet would execute as a formula gets a leading apostrophe, and control characters become U+FFFD.
-    """
-    return results_csv([result])
-
-
-def groups_csv(result: Result) -> str:
-    """Return the tables of groups of views as CSV, one row per group, in the format of ``result_csv``."""
-    return frame_csv(result.to_pandas("groups"))
-
-
-def results_csv(results: Sequence[Result]) -> str:
-    """Return the tables of several results as one CSV, in the format of ``result_csv``."""
-    return frame_csv(tables_frame(results))
-
-
-def _headline(result: Result) -> str:
-    return f"{printable(result.method)}, protocol {result.protocol}"
-
-
-def _provenance(result: Result) -> str:
-    digest = formatting.short_digest(result.dataset.digest)
-    return (
-        f"dataset {printable(result.dataset.version)} ({digest}), "
-        f"archive {formatting.short_digest(result.submission.sha256)}, software {result.software.version}"
-    )
-
-
-def _print_line(console: Console, line: str, style: str = "") -> None:
-    """Print plain text, wrapped at words, without markup or highlighting of numbers."""
-    console.print(plain_text(line, style))
 
 
 def plain_text(text: str, style: str = "") -> Text:
     """Return text for the terminal, without markup; control characters of names in it are shown as escapes."""
     return Text(terminal_text(text), style=style)
+
+
+def print_line(console: Console, line: str, style: str = "") -> None:
+    """Print plain text, wrapped at words, without markup or highlighting of numbers."""
+    console.print(plain_text(line, style))
+
+
+def make_grid(name: str | Text, heads: Sequence[str | Text], *, fold: bool = False, left: int = 0) -> RichTable:
+    """Return a table without rows: a column of names, and right-aligned columns, which are never truncated.
+
+    Long names are wrapped if ``fold``. ``left`` is the number of spaces on the left of each column.
+    """
+    grid = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, left), show_edge=False)
+    grid.add_column(name, no_wrap=not fold, overflow="fold" if fold else "ellipsis")
+    for head in heads:
+        grid.add_column(head, justify="right", no_wrap=True)
+    return grid
 
 
 def print_unwrapped(console: Console, table: RichTable) -> None:
@@ -157,110 +83,252 @@ def print_unwrapped(console: Console, table: RichTable) -> None:
     console.print(Segments(list(console.render(table, options))), soft_wrap=True, end="")
 
 
-def _print_notes(result: Result, console: Console) -> None:
-    console.print()
-    _print_line(
-        console, "Means over views; s: median over views. z: truth, p: prediction. ↓ lower, ↑ higher is better."
-    )
-    _print_line(console, f"{formatting.RANK_ERROR_NOTE} {formatting.REFERENCE_NOTE} ‡: not ranked.")
-    for name, table in result.tables.items():
-        for note in (*formatting.table_notes(table), *formatting.reference_findings(table)):
-            _print_line(console, f"{printable(name)}: {note}", style="yellow")
-    if any(table.groups for table in result.tables.values()):
-        _print_line(console, f"{formatting.GROUP_NOTE} Intervals: in JSON and the report.")
-    [all_groups] = _LAYOUTS[0]
-    if formatting.has_dash(group.cells(table) for group in all_groups for table in result.tables.values()):
-        _print_line(console, formatting.DASH_NOTE)
-
-
-def _config_rows(tables: Mapping[str, Table]) -> list[_Row | str]:
-    return [
-        _Row(formatting.config_title(name, table.split), table, formatting.reference_rows([("", table)]))
-        for name, table in tables.items()
-    ]
-
-
-def _print_groups(config: str, table: Table, console: Console) -> None:
-    """Print the groups of views of a config, a section for each grouping."""
-    rows: list[_Row | str] = []
-    for grouping, groups_of_views in table.groups.items():
-        rows.append(formatting.grouping_title(grouping))
-        rows += [_Row(f"  {printable(group)}", of_group) for group, of_group in groups_of_views.items()]
-    console.print()
-    _print_line(console, f"{formatting.config_title(config, table.split)}: groups of views", style="bold")
-    for groups in _fitting_layout(rows, console, _GROUP_LAYOUTS):
-        console.print()
-        print_unwrapped(console, _rich_table(rows, groups, "group"))
-
-
-def _fitting_layout(
-    rows: Sequence[_Row | str], console: Console, layouts: Sequence[list[list[_ColumnGroup]]]
-) -> list[list[_ColumnGroup]]:
-    """Return the layout with as few tables as the console's width allows."""
-    for layout in layouts[:-1]:
-        if all(_width(_rich_table(rows, groups), console) <= console.width for groups in layout):
-            return layout
-    return layouts[-1]
-
-
-def _rich_table(rows: Sequence[_Row | str], groups: Sequence[_ColumnGroup], head: str = "config") -> RichTable:
-    """Return the table of rows; a text among the rows is the heading of a section."""
-    table = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
-    heads = [column.head for group in groups for column in group.columns]
-    lines = max(head.count("\n") for head in heads)
-    table.add_column(_header(head, lines), no_wrap=True)
-    for column_head in heads:
-        table.add_column(_header(column_head, lines), justify="right", no_wrap=True)
-    for row in rows:
-        if isinstance(row, str):
-            table.add_section()
-            table.add_row(plain_text(row, style="italic"))
-            continue
-        cells = [cell for group in groups for cell in group.cells(row.table)]
-        table.add_row(*map(plain_text, [row.name, *cells]))
-        for title, native, scaled in row.references:
-            errors = {_NATIVE.title: native, _SCALED.title: scaled}
-            filled = [errors.get(group.title, []) for group in groups]
-            if any(map(any, filled)):
-                cells = [
-                    cell
-                    for group, shown in zip(groups, filled, strict=True)
-                    for cell in [*shown, *[""] * (len(group.columns) - len(shown))]
-                ]
-                table.add_row(*map(plain_text, [f"  {title}", *cells]), style="dim")
-    return table
-
-
-def _header(head: str, lines: int) -> Text:
-    """Return a heading padded at the top with empty lines to ``lines`` + 1 lines."""
-    return Text("\n" * (lines - head.count("\n")) + head)
-
-
 def _width(table: RichTable, console: Console) -> int:
     """Return the width at which nothing in ``table`` is wrapped or truncated, characters."""
     return Measurement.get(console, console.options.update(max_width=_UNBOUNDED), table).maximum
 
 
-def frame_csv(frame: DataFrame) -> str:
-    r"""Return a frame as CSV with ``\n`` line ends; undefined numbers are empty."""
-    if frame.columns.empty:
-        return ""
-    cells = frame.astype(object).where(frame.notna(), None)
-    return csv_text([list(frame.columns), *cells.itertuples(index=False, name=None)])
+# Table of one result.
+
+Columns = Sequence[Column]
+Row = tuple[str, Mapping[str, str], str]
+"""Row of a table: name, texts by path of the column that they are shown in, and style. A heading has no texts."""
+
+_BASE = (VIEWS_SCORED, COVERAGE, RANK_ERROR)
+_ALL_SCALED = (*SCALED, SCALE)
+_LAYOUTS: Sequence[Sequence[Columns]] = (
+    [[*_BASE, *NATIVE, *_ALL_SCALED, *WITHIN]],
+    [[*NATIVE, *_ALL_SCALED], [*_BASE, *WITHIN]],
+    [[*_BASE, *NATIVE], _ALL_SCALED, WITHIN],
+)
+"""Columns of each table to print, from the widest to the narrowest layout."""
+_TITLES = (
+    (NATIVE[0], "native (no alignment)"),
+    (SCALED[0], "scaled (oracle median scale per view, s = median(z)/median(p))"),
+    (WITHIN[0], "within t mm (native): share of all scored pixels with |p - z| <= t"),
+)
+"""First column of each group of columns, and a title that states their alignment."""
+
+_GROUP_NATIVE = (*_BASE, *with_reference(NATIVE), *ONE_PIXEL)
+_GROUP_SCALED = (*with_reference(SCALED), *SCALED_CONSTANT, SCALE)
+_GROUP_LAYOUTS: Sequence[Sequence[Columns]] = ([[*_GROUP_NATIVE, *_GROUP_SCALED]], [_GROUP_NATIVE, _GROUP_SCALED])
+"""Columns of the tables of groups of views."""
 
 
-def csv_text(rows: Iterable[Iterable[str | float | bool | None]]) -> str:
-    r"""Return rows of values, the first of which is the header, as CSV with ``\n`` line ends."""
-    out = io.StringIO()
-    csv.writer(out, lineterminator="\n").writerows([csv_cell(value) for value in row] for row in rows)
-    return out.getvalue()
+def print_table(result: Result, console: Console) -> None:
+    """Print one row per config, followed by its reference errors: in one table if it fits, else in two or three.
+
+    The groups of views of a config with splits follow, one row per group. Numbers are never truncated: a console
+    narrower than the narrowest layout gets longer lines.
+    """
+    print_line(console, f"{printable(result.method)}, protocol {result.protocol}", style="bold")
+    print_line(
+        console,
+        f"dataset {printable(result.dataset.version)} ({formatting.short_digest(result.dataset.digest)}), "
+        f"archive {formatting.short_digest(result.submission.sha256)}, software {result.software.version}",
+        style="dim",
+    )
+    declared = (formatting.inputs_text(result.declared), formatting.ground_truth_text(result.declared))
+    print_line(console, "inputs: {}; ground truth: {}".format(*declared), style="dim")
+    _print_rows(_config_rows(result.tables), console, _LAYOUTS, "config")
+    for config, table in result.tables.items():
+        if table.groups:
+            console.print()
+            print_line(console, f"{formatting.config_title(config, table.split)}: groups of views", style="bold")
+            _print_rows(_group_rows(table), console, _GROUP_LAYOUTS, "group")
+    _print_notes(result, console)
 
 
-def csv_cell(value: str | float | bool | None) -> str:
-    """Return a value as a CSV cell: empty for None, text without formulas and control characters."""
-    if value is None:
-        return ""
-    if isinstance(value, str):
-        clean = printable(value, limit=_UNBOUNDED)
-        return f"'{clean}" if clean.startswith(_FORMULA_STARTS) else clean
-    return json.dumps(value)
+def _config_rows(tables: Mapping[str, Table]) -> list[Row]:
+    rows: list[Row] = []
+    for name, table in tables.items():
+        rows.append((formatting.config_title(name, table.split), _row_texts(table), ""))
+        rows += [(f"  {title}", shown, "dim") for title, shown in formatting.reference_rows([("", table)])]
+    return rows
+
+
+def _group_rows(table: Table) -> list[Row]:
+    """Return the rows of the groups of views of a config, with a heading for each grouping."""
+    rows: list[Row] = []
+    for grouping, groups in table.groups.items():
+        rows.append((formatting.grouping_title(grouping), {}, "italic"))
+        rows += [(f"  {printable(group)}", _row_texts(of_group), "") for group, of_group in groups.items()]
+    return rows
+
+
+def _row_texts(table: Table) -> dict[str, str]:
+    """Return the numbers of a table as text by path; a rank error that does not rank is marked."""
+    columns = (VIEWS_SCORED, *VIEW_COLUMNS, *ONE_PIXEL, *SCALED_CONSTANT)
+    shown = dict(zip((column.path for column in columns), texts(columns, table), strict=True))
+    return shown if table.ranked else {**shown, RANK_ERROR.path: shown[RANK_ERROR.path] + "‡"}
+
+
+def _print_rows(rows: Sequence[Row], console: Console, layouts: Sequence[Sequence[Columns]], head: str) -> None:
+    """Print rows in the layout with as few tables as the console's width allows."""
+    for layout in layouts:
+        tables = [_rich_table(rows, columns, head) for columns in layout]
+        if all(_width(table, console) <= console.width for table in tables):
+            break
+    for columns, table in zip(layout, tables, strict=True):
+        console.print()
+        for first, title in _TITLES if layouts is _LAYOUTS else ():
+            if first in columns:
+                print_line(console, title, style="italic")
+        print_unwrapped(console, table)
+
+
+def _rich_table(rows: Sequence[Row], columns: Columns, head: str) -> RichTable:
+    """Return the table of headings, and of the rows that have a text in any of the columns."""
+    lines = max(column.head.count("\n") for column in columns)
+    heads = [Text("\n" * (lines - one.count("\n")) + one) for one in (head, *(column.head for column in columns))]
+    table = make_grid(heads[0], heads[1:])
+    for name, shown, style in rows:
+        cells = [shown.get(column.path, "") for column in columns]
+        if not shown:
+            table.add_section()
+        if any(cells) or not shown:
+            table.add_row(*map(plain_text, [name, *cells]), style=style)
+    return table
+
+
+def _print_notes(result: Result, console: Console) -> None:
+    console.print()
+    print_line(
+        console, "Means over views; s: median over views. z: truth, p: prediction. ↓ lower, ↑ higher is better."
+    )
+    print_line(console, f"{formatting.RANK_ERROR_NOTE} {formatting.REFERENCE_NOTE} ‡: not ranked.")
+    for name, table in result.tables.items():
+        for note in (*formatting.table_notes(table), *formatting.reference_findings(table)):
+            print_line(console, f"{printable(name)}: {note}", style="yellow")
+    if any(table.groups for table in result.tables.values()):
+        print_line(console, f"{formatting.GROUP_NOTE} Intervals: in JSON and the report.")
+    if any(has_dash(VIEW_COLUMNS, table) for table in result.tables.values()):
+        print_line(console, formatting.DASH_NOTE)
+
+
+# Table of a paired comparison of two submissions.
+
+COMPARISON_NOTE = (
+    "B - A: mean over the views that both have. 95 % interval: bootstrap of blocks of neighbouring views "
+    f"({BLOCK_VIEWS} steps of the protocol), of whole scenes in configs with splits; none with fewer than "
+    f"{MIN_BLOCKS} blocks or, with splits, scenes. B is called better "
+    "or worse if the interval excludes zero, which happens by chance in about one of twenty comparisons. "
+    "Errors of valid predictions are not compared if either submission has a coverage below 95 %, a view "
+    "without prediction or an overflow; the rank error counts every scored pixel."
+)
+"""Explanation of the numbers of a comparison."""
+
+
+def print_comparison(comparison: Comparison, console: Console) -> None:
+    """Print a table per config: both submissions, their paired difference, its interval and the verdict."""
+    first, other = (printable(archive.method) for archive in comparison.provenance.archives)
+    print_line(console, f"B: {other}, against A: {first}", style="bold")
+    content = comparison.to_dict()
+    dataset = content["dataset"]
+    archives = (
+        f"{letter} {formatting.short_digest(submission['sha256'])}"
+        for letter, submission in zip("AB", content["submissions"], strict=True)
+    )
+    print_line(
+        console,
+        f"protocol {content['protocol']}, dataset {printable(dataset['version'])} "
+        f"({formatting.short_digest(dataset['digest'])}), archives {', '.join(archives)}, "
+        f"software {content['software']['version']}",
+        style="dim",
+    )
+    for config, rows in comparison.configs.items():
+        console.print()
+        print_line(console, f"{printable(config)}, {views_note(rows)}", style="italic")
+        table = make_grid("number", ("A", "B", "B - A", "95 % interval"), left=1)
+        table.add_column("B is")
+        for row in rows:
+            table.add_row(*map(plain_text, comparison_cells(row)))
+        console.print(table)
+    console.print()
+    print_line(console, COMPARISON_NOTE)
+
+
+def views_note(rows: Sequence[Difference]) -> str:
+    """Return the number of views that the differences are computed on, as text."""
+    counts = sorted({row.views for row in rows})
+    if len(counts) == 1:
+        return f"{counts[0]} views"
+    return f"{counts[-1]} views; errors and scale on the {counts[0]} where both have a prediction"
+
+
+def comparison_cells(row: Difference) -> list[str]:
+    """Return title, both values, difference, interval and verdict as text."""
+    column = row.column
+    first, other = (column.number_text(value) for value in (row.first, row.other))
+    interval = range_text(row.interval, column.signed_text)
+    return [column.heading, first, other, column.signed_text(row.difference), interval, row.verdict]
+
+
+# Table of several results in the layout of the paper's Table I.
+
+_HEADS = ("rank err. ↓", "RMSE cm ↓", "AbsRel ↓", "AbsRel_s ↓", "s")
+
+
+def disambiguate_method_names(results: Sequence[Result]) -> list[Result]:
+    """Return the results with unique method names.
+
+    A name that occurs more than once gets the first eight digits of its submission's SHA-256 appended.
+    """
+    names = Counter(result.method for result in results)
+    return [
+        replace(
+            result,
+            submission=replace(result.submission, method=f"{result.method} ({result.submission.sha256[:8]})"),
+        )
+        if names[result.method] > 1
+        else result
+        for result in results
+    ]
+
+
+def print_paper_table(results: Sequence[Result], console: Console, *, published: bool) -> None:
+    """Print a table per config: one row per result, sorted by rank error, then the rows that are not ranked.
+
+    The reference errors of the config follow.
+
+    ``results`` must not be empty and must belong to one dataset. With ``published``, the paper's rows of the same
+    scene follow; they are marked and not compared with the results.
+    """
+    dataset = results[0].dataset
+    digest, version = formatting.short_digest(dataset.digest), printable(dataset.version)
+    line = f"protocol {PROTOCOL}, dataset {version} ({digest}), software {software_version()}"
+    print_line(console, line, style="dim")
+    for config in dict.fromkeys(name for result in results for name in result.tables):
+        rows = [(result, result.tables[config]) for result in results if config in result.tables]
+        table = rows[0][1]
+        title = formatting.config_title(config, table.split)
+        console.print()
+        print_line(console, f"{title}, {formatting.counted(table.views, 'view')}", style="italic")
+        rows.sort(key=lambda row: (not row[1].ranked, rounded(row[1].rank_error) or 0.0))
+        console.print(_paper_table(rows, table.published if published else None))
+    console.print()
+    print_line(console, "RMSE, AbsRel: native (no alignment). AbsRel_s: scaled (oracle median scale per view).")
+    print_line(
+        console,
+        "s: median over views of median(z)/median(p). ‡: not ranked (declares the use of ground truth). "
+        "?: use of ground truth not declared.",
+    )
+    print_line(console, f"{formatting.RANK_ERROR_NOTE} {formatting.REFERENCE_NOTE}")
+    if published and any(table.published for result in results for table in result.tables.values()):
+        mark = load_published().parts["synthetic"].mark
+        print_line(console, f"The paper's rows: {mark}. †: median-anchored. {OTHER_OPTICS_NOTE}")
+
+
+def _paper_table(rows: Sequence[tuple[Result, Table]], match: PublishedMatch | None) -> RichTable:
+    paper = make_grid("", _HEADS, fold=True, left=1)
+    for result, table in rows:
+        name = printable(result.method, 40) + formatting.rank_mark(result.declared, table)
+        paper.add_row(*map(plain_text, [name, *texts((RANK_ERROR, *PAPER_COLUMNS), table)]))
+    for title, cells in formatting.paper_reference_rows([(result.method, table) for result, table in rows]):
+        paper.add_row(*map(plain_text, [f"reference: {title}", "", *cells]), style="dim")
+    if match is not None:
+        paper.add_section()
+        for row in published_rows(match.scene):
+            mark = (" †" if row.median_anchored else "") + ("" if match.same_optics else f" {OTHER_OPTICS_MARK}")
+            paper.add_row(*map(plain_text, [f"paper: {row.method}{mark}", "", *row.cells]), style="dim")
+    return paper

@@ -98,6 +98,15 @@ def coverage_percent(share: float | None) -> str:
 
 
 @dataclass(frozen=True)
+class Cell:
+    """Number of a table as text, its value (None if undefined or not finite), and its interval as text or ""."""
+
+    text: str
+    value: float | None = None
+    interval: str = ""
+
+
+@dataclass(frozen=True)
 class Column:
     """Number of a table or view.
 
@@ -141,6 +150,22 @@ class Column:
         found: float | None = value_at(view, self.of_view or self.path)
         return found
 
+    def interval(self, table: Any) -> Interval | None:
+        """Return the interval of the number of a table; None where it is undefined or not finite."""
+        ends: Interval | None = table.intervals.get(self.path)
+        return ends if ends is not None and all(map(math.isfinite, ends)) else None
+
+    def cell(self, scores: Any) -> Cell:
+        """Return the cell of a number of a table, with its interval, or of a view, which has none."""
+        if not hasattr(scores, "intervals"):
+            return self.value_cell(self.view_value(scores))
+        return self.value_cell(self.value(scores), self.interval(scores))
+
+    def value_cell(self, value: float | None, ends: Interval | None = None) -> Cell:
+        """Return the cell of a value and its interval."""
+        finite = value if value is not None and math.isfinite(value) else None
+        return Cell(self.text(value), finite, self.interval_text(ends))
+
     def text(self, value: float | None) -> str:
         """Return a value as text, a dash if it is undefined."""
         return self.number_text(value) if self.as_text is None else self.as_text(value)
@@ -160,6 +185,11 @@ class Column:
             return ""
         as_text = self.number_text if self.as_text is None or self.as_text is percent else self.as_text
         return separator.join(as_text(end) for end in ends)
+
+
+def range_text(ends: Interval | None, as_text: Callable[[float], str]) -> str:
+    """Return an interval as text, a dash if it is undefined."""
+    return DASH if ends is None else " to ".join(map(as_text, ends))
 
 
 def value_at(source: Any, path: str) -> Any:
@@ -258,6 +288,11 @@ COLUMN_BY_PATH: Mapping[str, Column] = {column.path: column for column in VIEW_C
 def with_reference(columns: Sequence[Column]) -> list[Column]:
     """Return the columns of the metrics that have reference errors."""
     return [column for column in columns if column.path.rpartition(".")[2] in REFERENCE_ERRORS]
+
+
+def has_dash(columns: Sequence[Column], scores: Any) -> bool:
+    """Return whether any number of a table or view is undefined."""
+    return any(column.cell(scores).value is None for column in columns)
 
 
 def texts(columns: Sequence[Column], table: Any) -> list[str]:

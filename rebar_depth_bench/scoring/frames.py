@@ -1,13 +1,17 @@
-"""Results as pandas data frames, with the rounded numbers of their JSON.
+"""Results as pandas data frames and as CSV, with the rounded numbers of their JSON.
 
 pandas takes half a second to import, which commands without CSV output do not need, so functions import it on use.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import csv
+import io
+import json
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from rebar_depth_bench.errors import printable
 from rebar_depth_bench.names import config_of
 from rebar_depth_bench.scoring.columns import TABLE_COLUMNS, VIEW_COLUMNS, rounded, rounded_interval
 
@@ -17,6 +21,8 @@ if TYPE_CHECKING:
     from rebar_depth_bench.scoring.result import Result
     from rebar_depth_bench.scoring.table import Table, ViewScore
 
+_MAX_TEXT_CHARACTERS = 10_000
+_FORMULA_STARTS = ("=", "+", "-", "@")
 _DECLARED_COLUMNS = ("protocol", "method", "inputs", "uses_ground_truth")
 _NUMBER_COLUMNS = (
     *(column.name for column in TABLE_COLUMNS),
@@ -118,3 +124,32 @@ def differences_frame(documents: Sequence[Mapping[str, Any]]) -> DataFrame:
                 for difference in differences
             ]
     return frame_of_values(_DIFFERENCE_COLUMNS, rows)
+
+
+def frame_csv(frame: DataFrame) -> str:
+    r"""Return a frame as CSV with ``\n`` line ends; undefined numbers are empty.
+
+    Text that a spreadsheet would execute as a formula gets a leading apostrophe, and control characters become
+    U+FFFD.
+    """
+    if frame.columns.empty:
+        return ""
+    cells = frame.astype(object).where(frame.notna(), None)
+    return csv_text([list(frame.columns), *cells.itertuples(index=False, name=None)])
+
+
+def csv_text(rows: Iterable[Iterable[str | float | bool | None]]) -> str:
+    r"""Return rows of values, the first of which is the header, as CSV with ``\n`` line ends."""
+    out = io.StringIO()
+    csv.writer(out, lineterminator="\n").writerows([_csv_cell(value) for value in row] for row in rows)
+    return out.getvalue()
+
+
+def _csv_cell(value: str | float | bool | None) -> str:
+    """Return a value as a CSV cell: empty for None, text without formulas and control characters."""
+    if value is None:
+        return ""
+    if isinstance(value, str):
+        clean = printable(value, limit=_MAX_TEXT_CHARACTERS)
+        return f"'{clean}" if clean.startswith(_FORMULA_STARTS) else clean
+    return json.dumps(value)

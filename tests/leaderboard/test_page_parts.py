@@ -16,13 +16,13 @@ from hypothesis import strategies as st
 
 from leaderboard.db.engine import Database
 from leaderboard.db.models import LeaderboardRowModel, ResultModel, SubmissionModel, TokenModel
-from leaderboard.db.rankings import LeaderboardEntry, queue_position, read_ranking
+from leaderboard.db.rankings import LeaderboardEntry, Ranking, queue_position, read_ranking
 from leaderboard.uploads.multipart import MAX_FIELD_BYTES, UploadForm, UploadRejectedError
 from leaderboard.web.pages.leaderboard import make_config_ranking
 from leaderboard.web.pages.rendering import clean_text, error_response, format_size, link_html, time_html
 from leaderboard.web.pages.selection import COLUMNS, RANK, Selection, parse_selection
 from rebar_depth_bench.errors import Problem
-from rebar_depth_bench.reporting.html.rows import table_row
+from rebar_depth_bench.reporting.formatting import table_notes
 from rebar_depth_bench.scoring.result import read_result
 from tests.bench.reporting.results import overflowed_view, result, scored_view, unpredicted_view
 
@@ -204,7 +204,7 @@ def test_result_json_round_trips() -> None:
     read_back = read_result(original.to_json(), "a result")
     assert read_back.to_json() == original.to_json()
     for config, table in original.tables.items():
-        assert table_row(config, read_back.tables[config]).notes == table_row(config, table).notes
+        assert table_notes(read_back.tables[config]) == table_notes(table)
 
 
 def multipart_body(*parts: tuple[str, bytes]) -> bytes:
@@ -294,3 +294,13 @@ def test_error_response_lists_text_and_details_in_same_order(limit: int | None, 
     assert [Problem(**detail) for detail in content["problem_details"]] == problems[:shown]
     assert content["problems"][:shown] == [str(problem) for problem in problems[:shown]]
     assert content["problems"][shown:] == (["... and 3 more"] if limit else [])
+
+
+def test_interval_with_an_overflowed_end_is_not_plotted() -> None:
+    tables = [result(scored_view("lattice/0000")).to_dict()["tables"]["lattice"] for _ in range(2)]
+    tables[0]["ci95"]["native"]["abs_rel"] = [0.7, None]
+    tables[1]["ci95"]["native"]["abs_rel"] = [0.7, 0.8]
+    ranking = Ranking(tuple(entry_of(f"m{k}", table) for k, table in enumerate(tables)))
+    chart = make_config_ranking(ranking, "lattice", Selection(), False).chart
+    assert chart is not None
+    assert chart.count('class="bars"') == 1

@@ -11,7 +11,7 @@ from typing import Any
 import httpx2
 import pytest
 
-from rebar_depth_bench.reporting.comparison_tables import comparison_cells
+from rebar_depth_bench.reporting.tables import comparison_cells
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.result import read_result
 from tests.bench.reporting.pages import Page

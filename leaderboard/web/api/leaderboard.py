@@ -13,8 +13,8 @@ from leaderboard.service import Service
 from leaderboard.web.api.auth import WITHOUT_TOKEN, OptionalToken, ServiceDep
 from leaderboard.web.api.schemas import Leaderboard, LeaderboardRow, Responses, errors
 from leaderboard.web.cache import NO_STORE, REVALIDATE
-from rebar_depth_bench.reporting.tables import csv_text
 from rebar_depth_bench.scoring.columns import TABLE_COLUMNS
+from rebar_depth_bench.scoring.frames import csv_text
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.scoring.result import DisclosedTable
 

@@ -6,7 +6,7 @@ A table has submitted rows, and the paper's rows, which are unranked.
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Annotated
@@ -30,19 +30,15 @@ from leaderboard.web.pages.selection import (
 )
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
-from rebar_depth_bench.reporting.charts.scatter import ScatterPoint, scatter_chart
-from rebar_depth_bench.reporting.html.rows import Cell, ScoreRow, table_row
+from rebar_depth_bench.reporting.charts import ScatterPoint, scatter_chart
 from rebar_depth_bench.reporting.published import (
     OTHER_OPTICS_NOTE,
     PaperRow,
-    finite_interval,
     load_published,
-    published_mark,
-    published_row,
+    published_table,
     scatter_points,
 )
-from rebar_depth_bench.scoring.columns import COVERAGE, METRICS, number
-from rebar_depth_bench.scoring.protocol import WITHIN_MM
+from rebar_depth_bench.scoring.columns import COVERAGE, RANK_ERROR, VIEW_COLUMNS, Cell
 from rebar_depth_bench.scoring.result import DECIMALS as DISCLOSED_DECIMALS
 from rebar_depth_bench.scoring.result import DisclosedTable
 from rebar_depth_bench.scoring.table import Table, read_table
@@ -57,6 +53,8 @@ _CACHED_ROWS = 4096
 MISSING_ERROR = 1.0
 """Rank error that counts where a submission lacks a config: that of no prediction at all."""
 _DECIMALS, _SIGNIFICANT_DIGITS = 4, 12
+DISCLOSED_COLUMNS = (replace(RANK_ERROR, decimals=DISCLOSED_DECIMALS), COVERAGE)
+"""Columns of the numbers that are shown if the ground truth is hidden."""
 
 
 @router.get("/", name="board_page")
@@ -89,18 +87,18 @@ def leaderboard_page(
         selection=selection,
         overview=make_overview(rankings, configs, selection, hidden_truth) if several else None,
         rankings=[make_config_ranking(rankings.of(name), name, shown, hidden_truth, *limits) for name in configs],
-        columns={"native": NATIVE, "scaled": SCALED, "within": WITHIN},
+        sortable={"native": NATIVE, "scaled": SCALED, "within": WITHIN},
         paper_part=load_published().parts["synthetic"],
     )
 
 
 @dataclass(frozen=True)
 class RankingLine:
-    """A submitted row, its formatted numbers, and its table unless the ground truth is hidden."""
+    """A submitted row, its table (None if the ground truth is hidden), and the cells of its numbers by path."""
 
     entry: LeaderboardEntry
-    row: ScoreRow
     table: Table | None
+    cells: Mapping[str, Cell]
 
 
 @dataclass(frozen=True)
@@ -108,7 +106,7 @@ class ConfigRanking:
     """Table and plot of a config.
 
     ``row_count`` is the number of rows that pass the filters, ``lines`` the rows of the page, ``references`` the
-    rows of reference errors (name, native and scaled cells), ``published`` the rows of the paper and ``distance``
+    rows of reference errors (name, texts by path), ``published`` the rows of the paper and ``distance``
     their camera distance. ``plotted`` is the number of points of submissions.
     """
 
@@ -116,7 +114,7 @@ class ConfigRanking:
     selection: Selection
     row_count: int
     pages: int
-    references: list[tuple[str, list[str], list[str]]]
+    references: list[tuple[str, dict[str, str]]]
     lines: list[RankingLine]
     published: list[PaperRow]
     distance: str
@@ -126,7 +124,7 @@ class ConfigRanking:
     @property
     def interval(self) -> bool:
         """Whether any number is shown with a confidence interval."""
-        return any(line.row.has_interval() for line in self.lines)
+        return any(cell.interval for line in self.lines for cell in line.cells.values())
 
     @property
     def interval_note(self) -> str:
@@ -136,7 +134,7 @@ class ConfigRanking:
     @property
     def dash(self) -> bool:
         """Whether any number is shown as undefined."""
-        return any(line.row.has_dash() for line in self.lines)
+        return any(cell.value is None for line in self.lines for cell in line.cells.values())
 
 
 def make_config_ranking(
@@ -153,20 +151,20 @@ def make_config_ranking(
     """
     rows = [entry for entry in ranking.entries if selection.matches(entry)]
     shown, selection, pages = selection.page_of(selection.sorted(rows), page_rows)
-    lines = [RankingLine(entry, *_formatted(entry.method, entry.table_json, hidden_truth)) for entry in shown]
-    tables = [line.table for line in lines if line.table]
-    published, distance = _published(tables)
+    lines = [RankingLine(entry, *_row(entry.table_json, hidden_truth)) for entry in shown]
+    tables = [(line.entry.method, line.table) for line in lines if line.table]
+    published, distance = _published([table for _, table in tables])
     points = _plot_points(rows)
     chart = None
     if points and (max_plotted is None or len(points) <= max_plotted):
         title = f"{printable(config)}: native and scaled AbsRel"
-        chart = scatter_chart(title, [*points, *scatter_points(published, {})])
+        chart = scatter_chart(title, [*points, *scatter_points(published)])
     return ConfigRanking(
         config=printable(config),
         selection=selection,
         row_count=len(rows),
         pages=pages,
-        references=formatting.reference_rows([(line.entry.method, line.table) for line in lines if line.table]),
+        references=formatting.reference_rows(tables),
         lines=lines,
         published=published,
         distance=distance,
@@ -176,31 +174,13 @@ def make_config_ranking(
 
 
 @lru_cache(maxsize=_CACHED_ROWS)
-def _formatted(method: str, table_json: str, hidden_truth: bool) -> tuple[ScoreRow, Table | None]:
-    """Return the formatted numbers of a row; cached, because they depend on the arguments only."""
+def _row(table_json: str, hidden_truth: bool) -> tuple[Table | None, Mapping[str, Cell]]:
+    """Return table and cells of a row as in ``RankingLine``; cached, because they depend on the arguments only."""
     if hidden_truth:
-        return disclosed_row(method, DisclosedTable.model_validate_json(table_json)), None
+        disclosed = DisclosedTable.model_validate_json(table_json)
+        return None, {column.path: column.cell(disclosed) for column in DISCLOSED_COLUMNS}
     table = read_table(json.loads(table_json))
-    return table_row(method, replace(table, split=None)), table
-
-
-def disclosed_row(name: str, table: DisclosedTable) -> ScoreRow:
-    """Return the row of a config or submission; the cells of numbers that are not disclosed are empty."""
-    empty = Cell("", None)
-    metrics = [empty] * len(METRICS)
-    return ScoreRow(
-        name=printable(name),
-        views=empty,
-        coverage=Cell(COVERAGE.text(table.coverage), table.coverage),
-        rank_error=Cell(number(table.rank_error, DISCLOSED_DECIMALS), table.rank_error),
-        ranked=table.ranked and table.rank_error is not None,
-        notes=[],
-        findings=[],
-        native=metrics,
-        scaled=metrics,
-        scale=empty,
-        within=[empty] * len(WITHIN_MM),
-    )
+    return table, {column.path: column.cell(table) for column in VIEW_COLUMNS}
 
 
 def _plot_points(rows: Sequence[LeaderboardEntry]) -> list[ScatterPoint]:
@@ -211,7 +191,7 @@ def _plot_points(rows: Sequence[LeaderboardEntry]) -> list[ScatterPoint]:
         if native is None or scaled is None:
             continue
         intervals = [
-            finite_interval(column.interval(entry.table)) if len(rows) <= MAX_INTERVALS_PLOTTED else None
+            column.interval(entry.table) if len(rows) <= MAX_INTERVALS_PLOTTED else None
             for column in (NATIVE[0], SCALED[0])
         ]
         mark = "–" if entry.rank is None else str(entry.rank)
@@ -225,8 +205,7 @@ def _published(tables: Sequence[Table]) -> tuple[list[PaperRow], str]:
     scene = load_published().scenes.get(match.scene) if match else None
     if match is None or scene is None:
         return [], ""
-    rows = [published_row(published_mark(k), row) for k, row in enumerate(scene.rows)]
-    return rows, scene.distance if match.same_optics else f"{scene.distance} {OTHER_OPTICS_NOTE}"
+    return published_table(scene), scene.distance if match.same_optics else f"{scene.distance} {OTHER_OPTICS_NOTE}"
 
 
 @dataclass(frozen=True)

@@ -21,10 +21,9 @@ from rebar_depth_bench import software_version
 from rebar_depth_bench.errors import MAX_PROBLEMS_SHOWN, Problem, printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.html.assets import environment
-from rebar_depth_bench.reporting.html.rows import METRIC_HEADS
 from rebar_depth_bench.reporting.published import load_published
 from rebar_depth_bench.scoring.columns import number
-from rebar_depth_bench.scoring.protocol import PROTOCOL, WITHIN_MM
+from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.scoring.result import COVERAGE_RULE
 from rebar_depth_bench.submission.declaration import INPUTS, is_http_url
 
@@ -36,17 +35,13 @@ def make_templates() -> Environment:
         clean=clean_text,
         link=link_html,
         number=number,
-        printable=printable,
+        notes=formatting.table_notes,
         scripts=confused_scripts,
         size=format_size,
         time=time_html,
     )
     templates.globals.update(
         protocol=PROTOCOL,
-        metric_heads=METRIC_HEADS,
-        tolerances=WITHIN_MM,
-        dash_note=formatting.DASH_NOTE,
-        reference_note=formatting.REFERENCE_NOTE,
         input_classes=INPUTS,
         plural=formatting.plural,
         is_degenerate=lambda interval: len(set(interval.split(" – "))) == 1,

@@ -43,7 +43,7 @@ class SortedColumn:
     def interval(self, table: Mapping[str, Any]) -> tuple[float, float] | None:
         """Return the 95 % interval of the value, or None if there is none."""
         found = self.column.value(table.get("ci95", {}))
-        return (found[0], found[1]) if isinstance(found, list) and len(found) == 2 else None
+        return (found[0], found[1]) if isinstance(found, list) and len(found) == 2 and None not in found else None
 
 
 def _sorted(columns: Sequence[Column]) -> tuple[SortedColumn, ...]:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from operator import attrgetter
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, HTTPException, Path, Query, Request, Response
@@ -24,26 +22,22 @@ from leaderboard.web.api.auth import ServiceDep
 from leaderboard.web.api.schemas import outdated_note
 from leaderboard.web.api.submissions import SubmissionId, get_submission
 from leaderboard.web.cache import NO_STORE, REVALIDATE
-from leaderboard.web.pages.leaderboard import NameQuery, disclosed_row
+from leaderboard.web.pages.leaderboard import DISCLOSED_COLUMNS, NameQuery
 from leaderboard.web.pages.rendering import PICTURE_TITLES, clean_text, render
 from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.names import config_of
-from rebar_depth_bench.reporting.charts import score_charts
 from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS
-from rebar_depth_bench.reporting.comparison_tables import COMPARISON_NOTE, comparison_cells, views_note
 from rebar_depth_bench.reporting.formatting import ground_truth_text, inputs_text
 from rebar_depth_bench.reporting.html.page import (
-    WORST_SHOWN,
-    ConfigViewTables,
     paper_context,
     results_context,
     views_by_config,
+    views_context,
 )
-from rebar_depth_bench.reporting.html.rows import view_row
-from rebar_depth_bench.reporting.html.views import colour_bar_uri
+from rebar_depth_bench.reporting.html.views import colour_bar_uri, worst_first
+from rebar_depth_bench.reporting.tables import COMPARISON_NOTE, comparison_cells, views_note
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.result import Result, read_disclosed, read_result
-from rebar_depth_bench.scoring.table import ViewScore
 from rebar_depth_bench.submission import Declaration
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
@@ -154,17 +148,20 @@ def _result_context(service: Service, record: SubmissionModel, full_config: str 
     try:
         if service.settings.hidden_truth:
             disclosed = read_disclosed(data, record.id)
-            rows = [disclosed_row(name, table) for name, table in disclosed.tables.items()]
-            return {**context, "configs": rows}
+            return {
+                **context,
+                "names": list(map(printable, disclosed.tables)),
+                "disclosed": disclosed.tables,
+                "shown_columns": DISCLOSED_COLUMNS,
+            }
         result = read_result(data, record.id)
     except InputError:
-        return {"scored": False, "reason": _UNREADABLE, "configs": [], "ranks": {}}
+        return {"scored": False, "reason": _UNREADABLE, "names": [], "ranks": {}}
     views = views_by_config(result)
-    configs = [_config_views(name, views[name], name == full_config) for name in result.tables]
+    listed = {name: worst_first(scores) for name, scores in views.items() if name == full_config}
     return {
         **context,
-        "configs": configs,
-        "dash_in_views": any(row.has_dash() for config in configs for row in config.worst),
+        "names": list(map(printable, result.tables)),
         "pictured": _pictured_views(service, record.id, result),
         "notes": result_notes(service.database, record.id),
         "others": _others(service, record),
@@ -172,19 +169,8 @@ def _result_context(service: Service, record: SubmissionModel, full_config: str 
         "error_bar": colour_bar_uri(ERROR_COLOURS),
         **results_context(result, views),
         **paper_context(result),
+        **views_context(views, listed),
     }
-
-
-def _config_views(name: str, views: Sequence[ViewScore], list_all: bool) -> ConfigViewTables:
-    """Return the chart and the worst views of a config, and, if ``list_all``, all views, sorted worst first."""
-    worst_first = sorted(views, key=attrgetter("rank_error"), reverse=True)
-    return ConfigViewTables(
-        name=printable(name),
-        chart=score_charts.views_chart(name, views),
-        worst=[view_row(view) for view in worst_first[:WORST_SHOWN]],
-        all=[view_row(view) for view in worst_first] if list_all else [],
-        views=len(views),
-    )
 
 
 def _entries(service: Service, record: SubmissionModel) -> dict[str, LeaderboardEntry]:
@@ -210,8 +196,7 @@ def _pictured_views(service: Service, submission_id: str, result: Result) -> lis
     views.sort(key=lambda view: (order[config_of(view.view_id)], -view.rank_error))
     return [
         {
-            "row": view_row(view),
-            "view_id": view.view_id,
+            "score": view,
             "facts": facts,
             "kinds": [kind for kind in PICTURE_TITLES if kind in kinds],
         }

@@ -10,6 +10,10 @@ from importlib.resources import files
 from jinja2 import BaseLoader, ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from rebar_depth_bench.errors import printable
+from rebar_depth_bench.reporting import formatting
+from rebar_depth_bench.scoring import columns
+
 
 @dataclass(frozen=True)
 class InlineScript:
@@ -35,7 +39,8 @@ def inline_script(*names: str) -> InlineScript:
 def environment(*loaders: BaseLoader) -> Environment:
     """Return the Jinja environment of pages, which looks templates up in ``loaders``, then in this package.
 
-    All values are escaped, and undefined names raise an error.
+    All values are escaped, and undefined names raise an error. Templates make the cells of tables from
+    ``columns``.
     """
     pages = Environment(
         loader=ChoiceLoader([*loaders, PackageLoader("rebar_depth_bench.reporting", "html")]),
@@ -45,10 +50,16 @@ def environment(*loaders: BaseLoader) -> Environment:
         lstrip_blocks=True,
         keep_trailing_newline=True,
     )
-    pages.filters["data_uri"] = data_uri
+    pages.globals.update(columns=columns, dash_note=formatting.DASH_NOTE, reference_note=formatting.REFERENCE_NOTE)
+    pages.filters.update(data_uri=data_uri, printable=printable, thousands=thousands)
     return pages
 
 
 def data_uri(image: bytes, kind: str) -> str:
     """Return an encoded image as a data URI; ``kind`` is the part of its media type after ``image/``."""
     return f"data:image/{kind};base64,{base64.b64encode(image).decode()}"
+
+
+def thousands(count: int) -> str:
+    """Return a number with spaces between its thousands."""
+    return f"{count:,}".replace(",", "\N{NARROW NO-BREAK SPACE}")

@@ -10,8 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from operator import attrgetter
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from markupsafe import Markup
 
@@ -20,29 +20,28 @@ from rebar_depth_bench.diagnosis.corrections import COLUMNS, diagnosed_view, pos
 from rebar_depth_bench.diagnosis.diagnose import PossibleMistake, diagnose_config
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.names import config_of
-from rebar_depth_bench.reporting import formatting
-from rebar_depth_bench.reporting.charts import score_charts
+from rebar_depth_bench.reporting import charts, formatting
 from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS
 from rebar_depth_bench.reporting.html.assets import environment, inline_script
-from rebar_depth_bench.reporting.html.crossing_picture import crossing_view
-from rebar_depth_bench.reporting.html.crossings import CrossingPicture, crossing_section
-from rebar_depth_bench.reporting.html.extended import extended_section
-from rebar_depth_bench.reporting.html.rows import METRIC_HEADS, ScoreRow, config_groups, table_row, view_row
 from rebar_depth_bench.reporting.html.views import (
     VIEWS_SHOWN,
     ShownView,
     ViewPanels,
     colour_bar_uri,
-    shown_counts,
     shown_view,
     sorted_views,
     views_to_show,
+    worst_first,
 )
 from rebar_depth_bench.reporting.published import OTHER_OPTICS_NOTE, load_published, paper_scenes
+from rebar_depth_bench.scoring.columns import VIEW_COLUMNS, has_dash
 from rebar_depth_bench.scoring.evaluation import Evaluation, View
-from rebar_depth_bench.scoring.protocol import WITHIN_MM
+from rebar_depth_bench.scoring.groups import GROUPINGS
 from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.scoring.table import ViewScore
+from rebar_depth_bench.scoring.table import Table, ViewScore
+
+if TYPE_CHECKING:
+    from rebar_depth_bench.reporting.html.extended import CrossingPicture
 
 WORST_SHOWN = 10
 """Number of views of a config that are listed openly; the full list is collapsed."""
@@ -50,15 +49,15 @@ WORST_SHOWN = 10
 
 @dataclass(frozen=True)
 class ConfigViewTables:
-    """View tables of one config: chart, rows of the worst views, and rows of all views in protocol order.
+    """View tables of one config: chart, the worst views, and all views in the order of their table.
 
-    ``all`` is empty if the worst views are all views.
+    ``all`` is empty if that table is not shown; ``views`` is the number of views.
     """
 
     name: str
     chart: Markup
-    worst: list[ScoreRow]
-    all: list[ScoreRow]
+    worst: Sequence[ViewScore]
+    all: Sequence[ViewScore]
     views: int
 
 
@@ -86,39 +85,51 @@ def render_report(
             script=script.text,
             policy=script.policy,
             mistakes=[printable(mistake.text) for mistake in mistakes],
-            metric_heads=METRIC_HEADS,
-            tolerances=WITHIN_MM,
-            dash_note=formatting.DASH_NOTE,
             **results_context(result, views),
             **paper_context(result),
-            extended=None if result.extended is None else extended_section(result.extended),
-            crossings=None if result.extended is None else crossing_section(result.extended, pictures or {}),
+            **_extended_context(result, pictures or {}),
             **_browser_context(shown, views),
-            **_views_context(result, views),
+            **views_context(views, {name: of for name, of in views.items() if len(of) > WORST_SHOWN}),
         )
     )
 
 
 def results_context(result: Result, views: Mapping[str, Sequence[ViewScore]]) -> dict[str, object]:
     """Return the context of ``part_results.html.j2``."""
-    rows = [table_row(name, table) for name, table in result.tables.items()]
+    rows = [(formatting.config_title(name, table.split), table) for name, table in result.tables.items()]
+    has_intervals = any(column.interval(table) for _, table in rows for column in VIEW_COLUMNS)
     return {
         "rows": rows,
-        "references": [
-            (f"{printable(config)}: {name}", native, scaled)
-            for config, table in result.tables.items()
-            for name, native, scaled in formatting.reference_rows([("", table)])
+        "row_notes": [
+            (name, note)
+            for name, table in rows
+            for note in (*formatting.table_notes(table), *formatting.reference_findings(table))
         ],
-        "reference_note": formatting.REFERENCE_NOTE,
-        "dash_in_results": any(row.has_dash() for row in rows),
-        "interval_note": (
-            formatting.interval_note(result.tables.values()) if any(row.has_interval() for row in rows) else ""
-        ),
-        "groups": config_groups(result.tables),
+        "references": [
+            (f"{printable(config)}: {name}", errors)
+            for config, table in result.tables.items()
+            for name, errors in formatting.reference_rows([("", table)])
+        ],
+        "dash_in_results": any(has_dash(VIEW_COLUMNS, table) for table in result.tables.values()),
+        "interval_note": formatting.interval_note(result.tables.values()) if has_intervals else "",
+        "groups": [(name, _groupings(table)) for name, table in rows if any(table.groups.values())],
         "group_note": formatting.GROUP_NOTE,
-        "alignment_chart": score_charts.alignment_chart(result.tables),
-        "scale_chart": score_charts.scale_chart(result.tables, views),
+        "alignment_chart": charts.alignment_chart(result.tables),
+        "scale_chart": charts.scale_chart(result.tables, views),
     }
+
+
+def _groupings(table: Table) -> list[tuple[str, str, Mapping[str, Table]]]:
+    """Return title, definition ("" if a later version has defined it) and tables of each grouping of a config."""
+    return [
+        (
+            formatting.grouping_title(grouping),
+            GROUPINGS[grouping].definition if grouping in GROUPINGS else "",
+            tables,
+        )
+        for grouping, tables in table.groups.items()
+        if tables
+    ]
 
 
 def paper_context(result: Result) -> dict[str, object]:
@@ -132,20 +143,46 @@ def paper_context(result: Result) -> dict[str, object]:
     }
 
 
+def _extended_context(result: Result, pictures: Mapping[str, CrossingPicture]) -> dict[str, object]:
+    """Return the context of ``part_extended.html.j2`` and ``part_crossings.html.j2``."""
+    if result.extended is None:
+        return {"extended": [], "crossings": []}
+    # The extended measures are a third of the package, which other reports do not need.
+    from rebar_depth_bench.reporting.html.extended import extended_context
+
+    return extended_context(result.extended, pictures)
+
+
 def _browser_context(shown: Sequence[ShownView], views: Mapping[str, Sequence[ViewScore]]) -> dict[str, object]:
-    """Return the context of ``part_browser.html.j2``."""
+    """Return the context of ``part_browser.html.j2``; ``shown_counts`` has a config's numbers of views."""
+    configs = [view.config for view in shown]
+    names = {printable(name): len(scores) for name, scores in views.items()}
+    counts = [(name, configs.count(name), total) for name, total in names.items() if name in configs]
     return {
         "shown": shown,
-        "shown_counts": shown_counts(shown, {name: len(scores) for name, scores in views.items()}),
+        "shown_counts": counts,
+        "partly_shown": any(count < total for _, count, total in counts),
         "depth_bar": colour_bar_uri(DEPTH_COLOURS[::-1]),
         "error_bar": colour_bar_uri(ERROR_COLOURS),
     }
 
 
-def _views_context(result: Result, views: Mapping[str, Sequence[ViewScore]]) -> dict[str, object]:
-    """Return the context of ``part_views.html.j2``."""
-    configs = [_config_views(name, views[name]) for name in result.tables]
-    return {"configs": configs, "dash_in_views": any(row.has_dash() for config in configs for row in config.worst)}
+def views_context(
+    views: Mapping[str, Sequence[ViewScore]], listed: Mapping[str, Sequence[ViewScore]]
+) -> dict[str, object]:
+    """Return the context of ``part_views.html.j2``; ``listed`` has the configs of which all views are listed."""
+    configs = [
+        ConfigViewTables(
+            name=printable(name),
+            chart=charts.views_chart(name, scores),
+            worst=worst_first(scores)[:WORST_SHOWN],
+            all=listed.get(name, ()),
+            views=len(scores),
+        )
+        for name, scores in views.items()
+    ]
+    undefined = any(has_dash(VIEW_COLUMNS, view) for config in configs for view in config.worst)
+    return {"configs": configs, "dash_in_views": undefined}
 
 
 def _provenance(result: Result) -> list[tuple[str, str]]:
@@ -166,17 +203,6 @@ def views_by_config(result: Result) -> Mapping[str, list[ViewScore]]:
     for view in result.views:
         views.setdefault(config_of(view.view_id), []).append(view)
     return views
-
-
-def _config_views(name: str, views: Sequence[ViewScore]) -> ConfigViewTables:
-    worst = sorted(views, key=attrgetter("rank_error"), reverse=True)[:WORST_SHOWN]
-    return ConfigViewTables(
-        name=printable(name),
-        chart=score_charts.views_chart(name, views),
-        worst=[view_row(view) for view in worst],
-        all=[view_row(view) for view in views] if len(views) > WORST_SHOWN else [],
-        views=len(views),
-    )
 
 
 _COLUMNS = ("left_rgb", "left_depth", "left_mask")
@@ -207,7 +233,11 @@ def look_at_views(
         scores = {view.view_id: view for view in chosen.get(config.name, ())}
         positions = {position for position, view_id in enumerate(config.view_ids) if view_id in scores}
         diagnosed_at = positions_to_read(config)
-        pictured = crossing_view(evaluation, config) if crossings else None
+        pictured = None
+        if crossings:
+            from rebar_depth_bench.reporting.html.extended import crossing_view
+
+            pictured = crossing_view(evaluation, config)
         wanted = {*positions, *diagnosed_at, *({pictured.position} if pictured else ())}
         columns = dict.fromkeys((*_COLUMNS, *(COLUMNS if diagnosed_at else ())))
         diagnosed = []
@@ -240,4 +270,4 @@ def view_panels(view: View, score: ViewScore) -> ViewPanels:
     """Return the arrays of a view that are rendered."""
     truth_m, mask = view.cell("left_depth"), view.cell("left_mask")
     steel = truth_m > 0 if mask is None else mask
-    return ViewPanels(view.view_id, view.cell("left_rgb"), truth_m, view.prediction_m, steel, score)
+    return ViewPanels(view.cell("left_rgb"), truth_m, view.prediction_m, steel, score)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import io
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from operator import attrgetter
 
@@ -21,7 +21,6 @@ from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.names import config_of
 from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS, colour_indices, robust_range
 from rebar_depth_bench.reporting.html.assets import data_uri
-from rebar_depth_bench.reporting.html.rows import ScoreRow, view_row
 from rebar_depth_bench.scoring.protocol import scored_pixels
 from rebar_depth_bench.scoring.table import ViewScore
 
@@ -44,33 +43,27 @@ class ViewPanels:
 
     ``rgb`` is uint8 H x W x 3, None in a config without colour; ``truth_m`` float32 metres, 0 without a surface;
     ``prediction_m`` float metres, not finite or <= 0 without a prediction; ``steel`` bool, rim included; ``score``
-    holds the view's numbers. Raises ``ValueError`` if the shapes differ.
+    holds the view's numbers.
     """
 
-    view_id: str
     rgb: UInt8[ndarray, "h w 3"] | None
     truth_m: Float32[ndarray, "h w"]
     prediction_m: Float[ndarray, "h w"]
     steel: Bool[ndarray, "h w"]
     score: ViewScore
 
-    def __post_init__(self) -> None:
-        size = self.truth_m.shape
-        shapes = [image.shape[:2] for image in (self.rgb, self.prediction_m, self.steel) if image is not None]
-        if any(shape != size for shape in shapes):
-            raise ValueError(f"{self.view_id}: the images of a view must share H x W = {size}, found {shapes}")
-
 
 @dataclass(frozen=True)
-class ViewImages:
-    """Encoded panels of one view as WebP, and the ranges of their colour bars.
+class ShownView:
+    """View shown with images: its numbers, its panels as WebP, and the texts of their colour bars.
 
-    ``colour`` is None in a config without colour.
-    Depth colours run from ``near_m`` to ``far_m`` for both ground truth and prediction, error colours from minus
-    to plus ``native_limit_cm`` or ``scaled_limit_cm`` (None if no scored pixel has an error). ``predicted_m`` is
-    the robust range of the prediction on scored pixels, which may lie outside the colour bar.
+    ``colour`` is None in a config without colour. Depth colours run from ``near`` to ``far`` for both ground truth
+    and prediction, error colours from minus to plus ``native_limit`` or ``scaled_limit`` ("" if no scored pixel
+    has an error). ``predicted`` is the robust range of the prediction on scored pixels ("" without any), which is
+    ``off_scale`` if it lies outside the colour bar.
     """
 
+    score: ViewScore
     width: int
     height: int
     colour: bytes | None
@@ -78,24 +71,38 @@ class ViewImages:
     prediction: bytes
     native_error: bytes
     scaled_error: bytes
-    near_m: float
-    far_m: float
-    predicted_m: tuple[float, float] | None
-    native_limit_cm: float | None
-    scaled_limit_cm: float | None
+    near: str
+    far: str
+    predicted: str
+    off_scale: bool
+    native_limit: str
+    scaled_limit: str
+
+    @property
+    def name(self) -> str:
+        """Printable id of the view."""
+        return printable(self.score.view_id)
+
+    @property
+    def config(self) -> str:
+        """Printable name of the view's config."""
+        return printable(config_of(self.score.view_id))
 
 
-def view_images(view: ViewPanels) -> ViewImages:
-    """Return the encoded panels of a view, about ``PANEL_WIDTH`` pixels wide."""
+def shown_view(view: ViewPanels) -> ShownView:
+    """Return a view with its encoded panels, which are about ``PANEL_WIDTH`` pixels wide."""
     step = max(1, round(view.truth_m.shape[1] / PANEL_WIDTH))
     scored = scored_pixels(view.steel, view.truth_m)
     near_m, far_m = depth_range(view.truth_m, scored)
+    predicted_m = predicted_range(view.prediction_m, scored)
     native_m = signed_error(view, 1.0)
     scaled_m = signed_error(view, math.nan if view.score.scale is None else view.score.scale)
     native_limit, scaled_limit = (error_limit_cm(error_m, scored) for error_m in (native_m, scaled_m))
     truth, steel = depth_image(view.truth_m[::step, ::step], near_m, far_m), view.steel[::step, ::step]
-    rgb = None if view.rgb is None else reduced_colour(view.rgb, step)
-    return ViewImages(
+    # Colour is averaged over blocks of pixels; depth and error maps must be sampled instead.
+    rgb = None if view.rgb is None else np.asarray(Image.fromarray(view.rgb).reduce(step))
+    return ShownView(
+        score=view.score,
         width=truth.shape[1],
         height=truth.shape[0],
         colour=None if rgb is None else _webp(rgb, lossless=False),
@@ -103,12 +110,21 @@ def view_images(view: ViewPanels) -> ViewImages:
         prediction=_webp(depth_image(view.prediction_m[::step, ::step], near_m, far_m)),
         native_error=_webp(error_image(native_m[::step, ::step], steel, rgb, native_limit)),
         scaled_error=_webp(error_image(scaled_m[::step, ::step], steel, rgb, scaled_limit)),
-        near_m=near_m,
-        far_m=far_m,
-        predicted_m=predicted_range(view.prediction_m, scored),
-        native_limit_cm=native_limit,
-        scaled_limit_cm=scaled_limit,
+        near=_metres(near_m),
+        far=_metres(far_m),
+        predicted=" to ".join(map(_metres, predicted_m or ())),
+        off_scale=predicted_m is not None and (predicted_m[0] > far_m or predicted_m[1] < near_m),
+        native_limit=_centimetres(native_limit),
+        scaled_limit=_centimetres(scaled_limit),
     )
+
+
+def _metres(value: float) -> str:
+    return f"{value:#.3g} m" if 0.01 <= abs(value) < 1000 else f"{value:.3g} m"
+
+
+def _centimetres(value: float | None) -> str:
+    return "" if value is None else f"{value:g} cm"
 
 
 def backdrop_image(
@@ -201,14 +217,6 @@ def hatching(
     return image
 
 
-def reduced_colour(rgb: UInt8[ndarray, "h w 3"], step: int) -> UInt8[ndarray, "h w 3"]:
-    """Return a colour image averaged over blocks of ``step`` x ``step`` pixels.
-
-    Depth and error maps must be sampled instead of averaged.
-    """
-    return np.asarray(Image.fromarray(rgb).reduce(step))
-
-
 def colour_bar_uri(colours: UInt8[ndarray, "n 3"]) -> str:
     """Return a colour map as the data URI of a one-row PNG, first colour on the left."""
     out = io.BytesIO()
@@ -238,39 +246,9 @@ VIEWS_SHOWN = 12
 """Default number of views of a config shown with images, about 150 kB each at 1280 x 720."""
 
 
-@dataclass(frozen=True)
-class ShownView:
-    """View shown with images: its numbers, images and the texts of their colour bars.
-
-    ``error`` is its rank error, ``label`` the text of its thumbnail.
-    """
-
-    view_id: str
-    error: float
-    config: str
-    label: str
-    row: ScoreRow
-    images: ViewImages
-    near: str
-    far: str
-    predicted: str
-    off_scale: bool
-    native_limit: str
-    scaled_limit: str
-
-
-@dataclass(frozen=True)
-class ShownCount:
-    """Number of a config's views that are shown, and of all its views."""
-
-    config: str
-    shown: int
-    views: int
-
-    @property
-    def partly(self) -> bool:
-        """Whether some of the views are not shown."""
-        return self.shown < self.views
+def worst_first(views: Iterable[ViewScore]) -> list[ViewScore]:
+    """Return the views sorted by falling rank error."""
+    return sorted(views, key=attrgetter("rank_error"), reverse=True)
 
 
 def views_to_show(views: Sequence[ViewScore], count: int) -> list[ViewScore]:
@@ -281,55 +259,18 @@ def views_to_show(views: Sequence[ViewScore], count: int) -> list[ViewScore]:
     """
     if count < 0:
         raise InputError(f"views to show: {count}, expected 0 or more of each config")
-    worst_first = sorted(views, key=attrgetter("rank_error"), reverse=True)
-    if len(worst_first) <= count:
-        return worst_first
+    ordered = worst_first(views)
+    if len(ordered) <= count:
+        return ordered
     worst = (count + 1) // 2
-    rest, spread = worst_first[worst:], count - worst
-    return worst_first[:worst] + [rest[(n + 1) * len(rest) // spread - 1] for n in range(spread)]
+    rest, spread = ordered[worst:], count - worst
+    return ordered[:worst] + [rest[(n + 1) * len(rest) // spread - 1] for n in range(spread)]
 
 
 def sorted_views(views: Iterable[ShownView], configs: Sequence[str]) -> list[ShownView]:
     """Return encoded views in the order of ``configs``, the worst view of each config first."""
-    rank = {config: number for number, config in enumerate(configs)}
+    rank = {printable(config): number for number, config in enumerate(configs)}
     return sorted(
-        views, key=lambda view: (rank.get(config_of(view.view_id), len(rank)), -view.error, view.view_id)
+        views,
+        key=lambda view: (rank.get(view.config, len(rank)), -view.score.rank_error, view.score.view_id),
     )
-
-
-def shown_counts(shown: Sequence[ShownView], views: Mapping[str, int]) -> list[ShownCount]:
-    """Return the counts of every config with shown views; ``views`` holds the number of views by config."""
-    shown_configs = [view.config for view in shown]
-    counts = [
-        ShownCount(printable(name), shown_configs.count(printable(name)), total) for name, total in views.items()
-    ]
-    return [count for count in counts if count.shown]
-
-
-def shown_view(view: ViewPanels) -> ShownView:
-    """Return the encoded images of a view with its numbers and the texts of the colour bars."""
-    images = view_images(view)
-    predicted = images.predicted_m
-    row = view_row(view.score)
-    return ShownView(
-        view_id=view.view_id,
-        error=view.score.rank_error,
-        config=printable(config_of(view.view_id)),
-        label=f"{row.name}\n{row.native[0].text}",
-        row=row,
-        images=images,
-        near=_metres(images.near_m),
-        far=_metres(images.far_m),
-        predicted=f"{_metres(predicted[0])} to {_metres(predicted[1])}" if predicted else "",
-        off_scale=predicted is not None and (predicted[0] > images.far_m or predicted[1] < images.near_m),
-        native_limit=_centimetres(images.native_limit_cm),
-        scaled_limit=_centimetres(images.scaled_limit_cm),
-    )
-
-
-def _metres(value: float) -> str:
-    return f"{value:#.3g} m" if 0.01 <= abs(value) < 1000 else f"{value:.3g} m"
-
-
-def _centimetres(value: float | None) -> str:
-    return "" if value is None else f"{value:g} cm"

@@ -125,7 +125,7 @@ def test_report_shows_views_of_the_split(root: Path, tmp_path: Path) -> None:
     with open_evaluation(write_truth(root, tmp_path / "a.zip", "train"), root) as evaluation:
         result = score_evaluation(evaluation)
         shown = look_at_views(evaluation, {"cages": list(result.views)}).shown
-    assert [view.view_id for view in shown] == view_ids("train")
+    assert [view.score.view_id for view in shown] == view_ids("train")
 
 
 INFO = MethodInfo("shifted", "test", ("left_depth", "scene"), False, "here", "none")

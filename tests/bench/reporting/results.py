@@ -83,7 +83,7 @@ def panels(view_id: str = "lattice/0000", score: ViewScore | None = None, factor
     steel[:, 20:30] = True
     truth[steel] = 0.5
     rgb = np.full((40, 60, 3), 128, np.uint8)
-    return ViewPanels(view_id, rgb, truth, truth * np.float32(factor), steel, score or scored_view(view_id))
+    return ViewPanels(rgb, truth, truth * np.float32(factor), steel, score or scored_view(view_id))
 
 
 def shown(view_id: str = "lattice/0000", score: ViewScore | None = None, factor: float = 1.6) -> ShownView:

@@ -14,9 +14,8 @@ import rebar_depth_bench as rdb
 from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, score_extended
 from rebar_depth_bench.extended.result import ExtendedResult
-from rebar_depth_bench.reporting.crossing_texts import reach_sentence
-from rebar_depth_bench.reporting.extended_tables import print_extended
-from rebar_depth_bench.reporting.html.crossing_picture import error_kind
+from rebar_depth_bench.reporting.extended_tables import print_extended, reach_sentence
+from rebar_depth_bench.reporting.html.extended import error_kind
 from rebar_depth_bench.reporting.html.page import look_at_views, write_report
 from rebar_depth_bench.scoring.evaluation import open_evaluation
 from tests.bench.extended.cage_scenes import HEIGHT, WIDTH
@@ -86,7 +85,7 @@ def test_report_shows_crossings_by_error(mat: tuple[Path, Depths], tmp_path: Pat
         write_report(result, evaluation, tmp_path / "report.html")
     assert (picture.view_id, picture.width, picture.height) == (f"{CONFIG}/0000", WIDTH, HEIGHT)
     assert [(kind, count) for kind, _, count in picture.counts] == [("within5", 4)]
-    assert all(0 < mark.x_px < WIDTH and 0 < mark.y_px < HEIGHT for mark in picture.marks)
+    assert all(0 < x < WIDTH and 0 < y < HEIGHT for _, x, y in picture.marks)
     page = (tmp_path / "report.html").read_text()
     section = page[page.index('<h2 id="crossings">') :]
     assert "<b>By distance</b>" in section

@@ -23,7 +23,7 @@ from rebar_depth_bench.extended.result import (
 from rebar_depth_bench.reporting.html.extended import (
     MAIN_INSPECTION_MEASURES,
     estimate_cell,
-    extended_section,
+    extended_config,
     measure_definitions,
 )
 from rebar_depth_bench.reporting.html.page import render_report
@@ -254,9 +254,10 @@ def test_rendering_is_deterministic(lattice: ExtendedResult) -> None:
 
 
 def test_section_keeps_config_order() -> None:
-    section = extended_section(make_extended("pile", "lattice"))
-    assert [config.name for config in section.configs] == ["pile", "lattice"]
-    assert all(len(config.tolerances) == len(CAPABILITY_MEASURES) for config in section.configs)
+    tables = make_extended("pile", "lattice").tables
+    configs = [extended_config(name, table) for name, table in tables.items()]
+    assert [config.name for config in configs] == ["pile", "lattice"]
+    assert all(len(config.tolerances) == len(CAPABILITY_MEASURES) for config in configs)
 
 
 def make_measure(unit: str, statistic: Statistic = "mean") -> Measure:
@@ -292,23 +293,18 @@ def test_capability_is_formatted_as_ratio() -> None:
 
 
 def test_definitions_differing_only_in_step_are_merged() -> None:
-    definitions = {
-        entry.name: entry.definition for entry in measure_definitions(MEASURE_FAMILIES["clouds"].measures)
-    }
+    definitions = dict(measure_definitions(MEASURE_FAMILIES["clouds"].measures))
     assert list(definitions) == ["Cloud accuracy, N mm", "Cloud completeness, N mm", "Cloud F-score, N mm"]
     assert definitions["Cloud accuracy, N mm"].endswith("; N: 1, 2, 5, 10, 20")
-    boundary = {
-        entry.name: entry.definition for entry in measure_definitions(MEASURE_FAMILIES["boundary"].measures)
-    }
+    boundary = dict(measure_definitions(MEASURE_FAMILIES["boundary"].measures))
     assert "at t = N % (" in boundary["Boundary F1, steps over N %"]
     assert "max/min > 1 + t" in boundary["Boundary F1, steps over N %"], "what is no step stays"
     assert "t = 1, 2, 5, 10, 20 %" in boundary["Boundary F1"]
     similar_measures = [
         dataclasses.replace(make_measure("%"), title=f"In {t} mm", definition=f"{t} mm, 24 px off") for t in (3, 5)
     ]
-    assert [entry.definition for entry in measure_definitions(similar_measures)] == ["N mm, 24 px off; N: 3, 5"]
-    profile_names = [entry.name for entry in measure_definitions(MEASURE_FAMILIES["profile"].measures)]
-    assert profile_names == [
+    assert [definition for _, definition in measure_definitions(similar_measures)] == ["N mm, 24 px off; N: 3, 5"]
+    assert list(dict(measure_definitions(MEASURE_FAMILIES["profile"].measures))) == [
         "Scale s at N m",
         "AbsRel at N m",
         "Scale s on bars of N px",

@@ -12,7 +12,8 @@ from rich.console import Console
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.html.page import render_report
 from rebar_depth_bench.reporting.latex import latex_table
-from rebar_depth_bench.reporting.tables import groups_csv, print_table
+from rebar_depth_bench.reporting.tables import print_table
+from rebar_depth_bench.scoring.frames import frame_csv
 from rebar_depth_bench.scoring.reference import Errors, Reference
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.score import tabulate
@@ -83,13 +84,13 @@ def test_names_of_groups_are_escaped() -> None:
     assert page.count("script") == 1, "the report's own"
     assert "\x1b" not in page.text
     assert "\x1b[31m" not in "\n".join(printed(shown, 120))
-    [line] = [line for line in groups_csv(shown).splitlines() if "evil.example" in line]
+    [line] = [line for line in frame_csv(shown.to_pandas("groups")).splitlines() if "evil.example" in line]
     assert "'=" in line
 
 
 def test_csv_has_one_row_for_each_group() -> None:
     shown = split_result()
-    rows = list(csv.DictReader(io.StringIO(groups_csv(shown))))
+    rows = list(csv.DictReader(io.StringIO(frame_csv(shown.to_pandas("groups")))))
     assert [(row["config"], row["split"], row["grouping"], row["group"]) for row in rows] == [
         ("cages", "test", "family", "wall"),
         ("cages", "test", "family", "slab"),
@@ -100,7 +101,7 @@ def test_csv_has_one_row_for_each_group() -> None:
     assert float(rows[0]["constant_abs_rel"]) == group["reference"]["constant"]["abs_rel"]
     assert float(rows[0]["scaled_constant_abs_rel"]) == group["reference"]["scaled_constant"]["abs_rel"] == 0.0571
     assert rows[1]["native_abs_rel"] == ""
-    [header] = groups_csv(result(scored_view("lattice/0000"))).splitlines()
+    [header] = frame_csv(result(scored_view("lattice/0000")).to_pandas("groups")).splitlines()
     assert header.split(",")[:8] == list(rows[0])[:8]
 
 

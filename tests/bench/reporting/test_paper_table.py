@@ -13,8 +13,8 @@ import pytest
 from rich.console import Console
 
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.reporting.comparison_tables import print_paper_table
 from rebar_depth_bench.reporting.published import load_published, published_rows
+from rebar_depth_bench.reporting.tables import print_paper_table
 from tests.bench.reporting.results import HOSTILE, result, scored_view, unpredicted_view
 
 

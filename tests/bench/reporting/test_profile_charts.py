@@ -10,8 +10,8 @@ import pytest
 
 from rebar_depth_bench.extended.profiles import DISTANCE_EDGES_M
 from rebar_depth_bench.extended.result import MeasureEstimate
-from rebar_depth_bench.reporting.charts.axes import LogAxis, select_spaced
-from rebar_depth_bench.reporting.charts.profile import ProfileBin, profile_chart
+from rebar_depth_bench.reporting.axes import Axis, select_spaced
+from rebar_depth_bench.reporting.charts import ProfileBin, profile_chart
 
 
 def make_estimate(value: float) -> MeasureEstimate:
@@ -50,7 +50,7 @@ def test_no_chart_without_values() -> None:
 
 
 def test_select_spaced_keeps_first_label_and_min_distance() -> None:
-    axis = LogAxis(1.0, 100.0, 0.0, 100.0)
+    axis = Axis(1.0, 100.0, 0.0, 100.0)
     assert select_spaced([10.0, 1.0, 11.0, 100.0], axis, 40.0) == [10.0, 1.0, 100.0]
 
 
@@ -68,6 +68,6 @@ def test_marks_are_placed_by_axes() -> None:
     assert near[1] < far[1], "a larger error is higher"
     assert all(native[1] < ring[1] for native, ring in zip((near, far), rings, strict=True))
     assert (near[1] - far[1]) == pytest.approx(rings[0][1] - rings[1][1], abs=0.2), "logarithmic"
-    unit_scale_y = float(re.search(r'class="one" d="M52 ([\d.]+)H', chart)[1])  # type: ignore[index]
+    unit_scale_y = float(re.search(r'class="one" d="M52.0 ([\d.]+)H', chart)[1])  # type: ignore[index]
     assert far_scale[1] < unit_scale_y < near_scale[1], "s above 1 is above the line"
     assert chart.count("V") >= 6, "an interval each"

@@ -11,8 +11,9 @@ from rich.console import Console
 
 from rebar_depth_bench.errors import printable
 from rebar_depth_bench.reporting import formatting
-from rebar_depth_bench.reporting.tables import print_table, result_csv
+from rebar_depth_bench.reporting.tables import print_table
 from rebar_depth_bench.scoring.columns import DASH, coverage_percent, number
+from rebar_depth_bench.scoring.frames import frame_csv
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.score import tabulate
 from tests.bench.reporting.results import HOSTILE, overflowed_view, result, scored_view, unpredicted_view
@@ -135,11 +136,11 @@ def test_extreme_numbers_use_scientific_notation() -> None:
 
 
 def test_no_views_is_an_unranked_reason() -> None:
-    assert formatting.unranked_reason(tabulate([])) == "no views"
+    assert "Not ranked: no views." in formatting.table_notes(tabulate([]))
 
 
 def test_csv_matches_json(two_configs: Result) -> None:
-    rows = list(csv.DictReader(io.StringIO(result_csv(two_configs))))
+    rows = list(csv.DictReader(io.StringIO(frame_csv(two_configs.to_pandas()))))
     written = json.loads(two_configs.to_json())
     assert [row["config"] for row in rows] == ["lattice", "lattice-zed-raw"]
     for row in rows:
@@ -161,7 +162,7 @@ def test_csv_matches_json(two_configs: Result) -> None:
 
 
 def test_csv_nulls_are_empty_and_newlines_are_unix() -> None:
-    content = result_csv(result(unpredicted_view("pier/0000"), method="a\rb\nc"))
+    content = frame_csv(result(unpredicted_view("pier/0000"), method="a\rb\nc").to_pandas())
     assert "\r\n" not in content
     assert content.endswith("\n")
     row = next(csv.DictReader(io.StringIO(content, newline="")))
@@ -171,5 +172,6 @@ def test_csv_nulls_are_empty_and_newlines_are_unix() -> None:
 
 @pytest.mark.parametrize("method", [HOSTILE, "+1", "-1", "@x"])
 def test_csv_quotes_spreadsheet_formulas(method: str) -> None:
-    row = next(csv.DictReader(io.StringIO(result_csv(result(scored_view("lattice/0000"), method=method)))))
+    frame = result(scored_view("lattice/0000"), method=method).to_pandas()
+    row = next(csv.DictReader(io.StringIO(frame_csv(frame))))
     assert row["method"] == "'" + printable(method)

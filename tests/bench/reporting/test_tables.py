@@ -14,13 +14,11 @@ from hypothesis import strategies as st
 
 from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.reporting import formatting
-from rebar_depth_bench.reporting.charts.scatter import ScatterPoint, place_labels, scatter_chart
-from rebar_depth_bench.reporting.charts.score_charts import alignment_chart
+from rebar_depth_bench.reporting.charts import ScatterPoint, alignment_chart, place_labels, scatter_chart
 from rebar_depth_bench.reporting.html.page import render_report
-from rebar_depth_bench.reporting.html.rows import table_row, view_row
 from rebar_depth_bench.reporting.html.views import views_to_show
 from rebar_depth_bench.reporting.published import paper_scenes
-from rebar_depth_bench.scoring.columns import COVERAGE, RANK_ERROR
+from rebar_depth_bench.scoring.columns import COVERAGE, NATIVE, RANK_ERROR, SCALE, SCALED, WITHIN, Cell
 from rebar_depth_bench.scoring.reference import Errors
 from rebar_depth_bench.scoring.result import Result
 from tests.bench.reporting.results import (
@@ -51,7 +49,7 @@ def test_constants_of_results_on_other_pixels_are_named() -> None:
         "constant, b, c\N{REPLACEMENT CHARACTER}": (0.0529, 2.05),
     }
     assert formatting.scaled_constants(rows[1:3]) == {"constant": (0.0529, 2.05)}
-    titles = [title for title, _, _ in formatting.reference_rows(rows)]
+    titles = [title for title, _ in formatting.reference_rows(rows)]
     assert titles == [*formatting.scaled_constants(rows), "one pixel"]
     without = dataclasses.replace(rows[0][1], reference=REFERENCE)
     assert formatting.reference_rows([("x", without)])[0][0] == "one pixel"
@@ -66,15 +64,14 @@ def test_scaled_error_is_compared_with_the_constant_on_the_same_pixels() -> None
 
 
 def test_cells_sort_by_full_precision_and_skip_undefined() -> None:
-    row = view_row(scored_view("lattice/0000", abs_rel=0.123456789))
-    assert (row.native[0].text, row.native[0].value) == ("0.1235", 0.123456789)
-    assert row.views.value == 43210
-    empty = view_row(unpredicted_view("lattice/0000"))
-    assert [cell.value for cell in (*empty.native, *empty.scaled, empty.scale)] == [None] * 9
-    assert view_row(overflowed_view("pier/0000")).native[1].value is None, "infinite"
+    assert NATIVE[0].cell(scored_view("lattice/0000", abs_rel=0.123456789)) == Cell("0.1235", 0.123456789)
+    empty = unpredicted_view("lattice/0000")
+    assert {column.cell(empty) for column in (*NATIVE, *SCALED, SCALE)} == {Cell("–")}
+    assert NATIVE[1].cell(overflowed_view("pier/0000")) == Cell("–"), "infinite"
     page = render_report(result(overflowed_view("pier/0000"), scored_view("pier/0001", abs_rel=0.123456789)), [])
     assert '<td class="first" data-value="0.123456789">0.1235</td>' in page
     assert "<td>–</td>" in page
+    assert '<td class="first" data-value="43210">43\N{NARROW NO-BREAK SPACE}210</td>' in page
     assert 'data-value="inf"' not in page
 
 
@@ -83,13 +80,15 @@ def test_intervals_use_decimals_of_their_numbers() -> None:
     ends = {"native__abs_rel": (0.70123, 0.79987), "scaled__delta1": (0.9, 1.0), "coverage": (0.94999, 1.0)}
     more = {"within_mm__3": (0.01, 0.02), "scale_median": (0.6, 0.7), "native__rmse_cm": None}
     shown = _with_intervals(result(*views), **ends, **more)
-    row = table_row("lattice", shown.tables["lattice"])
-    assert row.native[0].interval == "0.7012 – 0.7999"
-    assert row.native[1].interval == "", "none"
-    assert row.scaled[3].interval == "0.900 – 1.000"
-    assert row.coverage.interval == "94.9 – 100.0", "rounded down as coverage is"
-    assert row.within[0].interval == "1.0 – 2.0"
-    assert row.scale.interval == "0.600 – 0.700"
+    columns = (NATIVE[0], NATIVE[1], SCALED[3], COVERAGE, WITHIN[0], SCALE)
+    assert [column.cell(shown.tables["lattice"]).interval for column in columns] == [
+        "0.7012 – 0.7999",
+        "",
+        "0.900 – 1.000",
+        "94.9 – 100.0",  # Rounded down as coverage is.
+        "1.0 – 2.0",
+        "0.600 – 0.700",
+    ]
     page = render_report(shown, [])
     assert '0.7500<span class="interval">0.7012 – 0.7999</span>' in page
     assert formatting.INTERVAL_NOTE in page
@@ -108,7 +107,8 @@ def test_charts_draw_intervals_as_bars() -> None:
     shown = _with_intervals(plain, native__abs_rel=(0.7, 0.8), scaled__abs_rel=(0.06, 0.07))
     assert alignment_chart(shown.tables).count("interval") == 2
     assert "interval" not in alignment_chart(_with_intervals(plain).tables)
-    assert paper_scenes(shown)[0].chart.count('class="bars"') == 2
+    [bars] = re.findall(r'class="bars" d="(.*?)"', paper_scenes(shown)[0].chart)
+    assert (bars.count("H"), bars.count("V")) == (1, 1)
 
 
 def test_published_rows_are_marked_and_not_sortable() -> None:

@@ -11,9 +11,8 @@ import pytest
 from rich.console import Console
 
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.reporting.comparison_tables import print_comparison, print_paper_table
-from rebar_depth_bench.reporting.table_page import PageTable, TablePage, print_page
-from rebar_depth_bench.reporting.tables import print_table
+from rebar_depth_bench.reporting.detections import DetectionPage, PageTable, print_page
+from rebar_depth_bench.reporting.tables import print_comparison, print_paper_table, print_table
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareIdentity
 from tests.bench.reporting.results import result, scored_view
@@ -33,9 +32,8 @@ def hostile_result() -> Result:
     )
 
 
-def page() -> TablePage:
-    return TablePage(
-        subject="crossings",
+def page() -> DetectionPage:
+    return DetectionPage(
         title=NAME,
         lead=NAME,
         stamps=[(NAME, NAME)],

@@ -16,9 +16,10 @@ from rich.console import Console
 
 from rebar_depth_bench import InputError, score
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.reporting.comparison_tables import comparison_csv, print_comparison
+from rebar_depth_bench.reporting.tables import print_comparison
 from rebar_depth_bench.scoring.columns import COLUMN_BY_PATH, VIEW_COLUMNS
 from rebar_depth_bench.scoring.comparison import Difference, compare
+from rebar_depth_bench.scoring.frames import frame_csv
 from rebar_depth_bench.scoring.metrics import DepthMetrics
 from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareIdentity, SubmissionIdentity
 from rebar_depth_bench.scoring.score import tabulate
@@ -140,7 +141,7 @@ def test_table_is_80_columns_and_names_every_number() -> None:
     assert "B: =B, against A: A [red]" in text
     assert all(column.heading in text for column in VIEW_COLUMNS)
     assert max(map(len, text.splitlines())) <= 80
-    rows = list(csv.DictReader(io.StringIO(comparison_csv([comparison]))))
+    rows = list(csv.DictReader(io.StringIO(frame_csv(comparison.to_pandas()))))
     assert [row["number"] for row in rows] == list(COLUMN_BY_PATH)
     assert rows[0]["other_method"] == "'=B"
     assert float(rows[1]["low"]) <= float(rows[1]["difference"]) <= float(rows[1]["high"])

@@ -18,12 +18,10 @@ import rebar_depth_bench as rdb
 from rebar_depth_bench.data.bars import read_bars, write_bars
 from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.extended.result import ExtendedResult
-from rebar_depth_bench.reporting.comparison_tables import comparison_csv
 from rebar_depth_bench.reporting.extended_tables import extended_csv
-from rebar_depth_bench.reporting.tables import frame_csv, result_csv
 from rebar_depth_bench.scoring.columns import TABLE_COLUMNS, VIEW_COLUMNS
 from rebar_depth_bench.scoring.comparison import compare
-from rebar_depth_bench.scoring.frames import frame_of_values
+from rebar_depth_bench.scoring.frames import differences_frame, frame_csv, frame_of_values
 from rebar_depth_bench.scoring.result import Result, read_result
 from tests.bench.reporting.pages import Page
 from tests.bench.reporting.results import HOSTILE, result, scored_view, unpredicted_view
@@ -90,9 +88,9 @@ def test_integers_with_missing_values_stay_integers() -> None:
 def test_csv_without_rows_has_the_header(two_configs: Result) -> None:
     extended = ExtendedResult(measures={}, tables={}, views={})
     empty = dataclasses.replace(two_configs, tables={}, views=[], extended=extended)
-    assert result_csv(empty) == result_csv(two_configs).splitlines(keepends=True)[0]
-    compared = comparison_csv([compare(two_configs, two_configs)])
-    assert comparison_csv([]) == compared.splitlines(keepends=True)[0]
+    assert frame_csv(empty.to_pandas()) == frame_csv(two_configs.to_pandas()).splitlines(keepends=True)[0]
+    compared = frame_csv(compare(two_configs, two_configs).to_pandas())
+    assert frame_csv(differences_frame([])) == compared.splitlines(keepends=True)[0]
     assert extended_csv(empty) == (
         "method,config,alignment,measure,unit,statistic,value,low,high,samples,"
         "protocol,dataset_digest,submission_sha256,software_version\n"

@@ -86,8 +86,7 @@ VIEW_COLUMNS = (COVERAGE, RANK_ERROR, BIAS,""",
 
 SCORE = """
 import csv, io, json
-from rebar_depth_bench.reporting.comparison_tables import comparison_csv
-from rebar_depth_bench.reporting.tables import result_csv
+from rebar_depth_bench.scoring.frames import differences_frame, frame_csv
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.result import (
     DatasetIdentity, Result, SoftwareIdentity, SubmissionIdentity, read_result
@@ -105,8 +104,8 @@ for shift_m in (-0.002, 0.003):
     results.append(Result(dataset=dataset, submission=submission, software=software, tables=tables, views=views))
 written = results[0].to_json()
 assert read_result(written, "x").to_json() == written
-[row] = csv.DictReader(io.StringIO(result_csv(results[0])))
-rows = csv.DictReader(io.StringIO(comparison_csv([compare(*results)])))
+[row] = csv.DictReader(io.StringIO(frame_csv(results[0].to_pandas())))
+rows = csv.DictReader(io.StringIO(frame_csv(differences_frame([compare(*results).to_dict()]))))
 print(json.dumps([json.loads(written), row, next(row for row in rows if row["number"] == "bias_mm")]))
 """
 

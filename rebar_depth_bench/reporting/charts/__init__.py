@@ -1,1 +1,0 @@
-"""Inline SVG charts of reports and pages of tables."""
