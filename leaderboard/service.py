@@ -19,8 +19,8 @@ from sqlalchemy import func, not_, select
 from leaderboard.db import jobs
 from leaderboard.db.engine import Database
 from leaderboard.db.models import SubmissionModel
+from leaderboard.db.rankings import CurrentRankings
 from leaderboard.db.submissions import QUEUED, SCORING
-from leaderboard.db.versions import CurrentRankings, VersionReader
 from leaderboard.settings import Settings
 from leaderboard.storage.archive_store import ArchiveStore, delete_abandoned_uploads, make_folder
 from rebar_depth_bench.data.manifest import MANIFEST_FILE, DatasetFolder, open_folder
@@ -45,7 +45,6 @@ class Service:
     database: Database
     archives: ArchiveStore
     spool: Path
-    versions: VersionReader
     rankings: CurrentRankings
     dataset_name: str
     dataset_licence: str
@@ -80,15 +79,13 @@ def open_service(settings: Settings) -> Iterator[Service]:
         database.migrate()
         if requeued := jobs.requeue_stale(database, folder.digest, archives.ids(), settings.rescore):
             _LOG.info("results of another dataset or definition; submissions requeued", submissions=requeued)
-        versions = stack.enter_context(closing(VersionReader(database)))
         yield Service(
             settings=settings,
             folder=folder,
             database=database,
             archives=archives,
             spool=settings.spool,
-            versions=versions,
-            rankings=CurrentRankings(database, versions, folder.digest),
+            rankings=CurrentRankings(database, folder.digest),
             dataset_name=name,
             dataset_licence=licence,
             manifest_state=manifest,

@@ -9,6 +9,7 @@ returned.
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
@@ -160,6 +161,27 @@ def _ranks(entries: Sequence[LeaderboardEntry]) -> dict[str, int]:
     first: dict[float | None, int] = {}
     places = enumerate(entries, start=1)
     return {entry.id: first.setdefault(entry.rank_error, place) for place, entry in places}
+
+
+class CurrentRankings:
+    """Rankings of a dataset's public rows, each read from the database once per content version; thread-safe."""
+
+    def __init__(self, database: Database, dataset_digest: str) -> None:
+        self._database, self._dataset_digest = database, dataset_digest
+        self._lock = threading.Lock()
+        self._version, self._by_config = -1, dict[str, Ranking]()
+
+    def of(self, config: str, viewer: TokenModel | None = None) -> Ranking:
+        """Return the current ranking of a config, with the rows of ``viewer``."""
+        if viewer is not None:
+            return read_ranking(self._database, config, self._dataset_digest, viewer)
+        with self._lock:
+            version = self._database.content_version()
+            if version != self._version:
+                self._version, self._by_config = version, {}
+            if config not in self._by_config:
+                self._by_config[config] = read_ranking(self._database, config, self._dataset_digest)
+            return self._by_config[config]
 
 
 def picture_facts(database: Database, submission_id: str) -> dict[str, tuple[dict[str, Any], list[str]]]:

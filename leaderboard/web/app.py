@@ -58,9 +58,9 @@ def make_app(service: Service) -> FastAPI:
     for router in (submissions, leaderboard, status, board, submission, submit, account, static):
         app.include_router(router.router)
     identity = f"{software_version()} {service.folder.digest} {settings.model_dump_json()}"
-    app.add_middleware(CacheMiddleware, versions=service.versions, identity=identity)
-    # Outside the cache, whose responses are compressed already.
+    # Inside the cache, so that a kept response is compressed once.
     app.add_middleware(GZipMiddleware, minimum_size=_MIN_GZIP_BYTES, compresslevel=5)
+    app.add_middleware(CacheMiddleware, database=service.database, identity=identity)
     if host := urlsplit(settings.public_url).hostname:
         app.add_middleware(TrustedHostMiddleware, allowed_hosts=[host, *_LOCAL_HOSTS], www_redirect=False)
     app.add_middleware(

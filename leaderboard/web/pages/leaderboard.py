@@ -15,8 +15,7 @@ from fastapi import APIRouter, HTTPException, Query, Request
 from fastapi.responses import HTMLResponse
 from markupsafe import Markup
 
-from leaderboard.db.rankings import LeaderboardEntry, Ranking
-from leaderboard.db.versions import CurrentRankings
+from leaderboard.db.rankings import CurrentRankings, LeaderboardEntry, Ranking
 from leaderboard.web.api.auth import ServiceDep
 from leaderboard.web.pages.rendering import MAX_INTERVALS_PLOTTED, render
 from leaderboard.web.pages.selection import (
