@@ -41,7 +41,8 @@ class TokenModel(Base):
 class SubmissionModel(Base):
     """An accepted archive and its status. Deleted submissions keep their rows, which count for the quota.
 
-    ``details`` is a JSON object with what the submitter says of the method; ``archive_deleted_at`` is set when the
+    ``details`` is a JSON object with what the submitter says of the method (``MethodDetails``), and the declared
+    seconds per view, without what is not given; ``archive_deleted_at`` is set when the
     archive of a submission that stays was deleted.
     """
 
@@ -55,8 +56,6 @@ class SubmissionModel(Base):
     id: Mapped[str] = mapped_column(String(32), primary_key=True)
     token_id: Mapped[int] = mapped_column(ForeignKey("tokens.id"))
     method: Mapped[str] = mapped_column(String(200))
-    description: Mapped[str | None] = mapped_column(Text)
-    url: Mapped[str | None] = mapped_column(Text)
     inputs: Mapped[str | None] = mapped_column(String(20))
     uses_ground_truth: Mapped[bool | None]
     archive_sha256: Mapped[str] = mapped_column(String(64))

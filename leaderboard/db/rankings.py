@@ -46,7 +46,7 @@ class LeaderboardEntry:
     config: str
     method: str
     submitter: str
-    url: str | None
+    details: str
     inputs: str | None
     uses_ground_truth: bool | None
     created_at: float
@@ -58,6 +58,12 @@ class LeaderboardEntry:
     rank: int | None = None
     class_rank: int | None = None
     rank_range: tuple[int, int] | None = None
+
+    @property
+    def url(self) -> str | None:
+        """Page or paper of the method."""
+        url: str | None = json.loads(self.details).get("url")
+        return url
 
     @property
     def table(self) -> dict[str, Any]:
@@ -77,7 +83,7 @@ _COLUMNS = (
     LeaderboardRowModel.config,
     SubmissionModel.method,
     TokenModel.name,
-    SubmissionModel.url,
+    SubmissionModel.details,
     SubmissionModel.inputs,
     SubmissionModel.uses_ground_truth,
     SubmissionModel.created_at,

@@ -139,7 +139,9 @@ def test_every_change_of_shown_content_increments_the_version(database: Database
     submission_id = add_scored_submission(database, token, "m", 1.0)
     assert version_after(lambda: add_scored_submission(database, token, "n", 1.0)) > 0
     assert version_after(lambda: submissions.change(database, submission_id, {"public": False})) > 0
-    assert version_after(lambda: submissions.change(database, submission_id, {"description": "x"})) > 0
+    assert (
+        version_after(lambda: submissions.change(database, submission_id, {"details": '{"licence": "MIT"}'})) > 0
+    )
     assert version_after(lambda: jobs.requeue_stale(database, "sha256:1", {submission_id}, True)) > 0
     assert version_after(lambda: finish_scoring(database, submission_id, "m", 2.0)) > 0
     assert version_after(lambda: submissions.remove(database, submission_id)) > 0

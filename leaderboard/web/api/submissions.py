@@ -143,9 +143,7 @@ def edit_submission(service: Service, record: SubmissionModel, change: Submissio
     values = change.model_dump(include=change.model_fields_set)
     if values.get("public") is False and service.settings.default_visibility == "always":
         raise HTTPException(403, "every submission of this leaderboard is public")
-    columns: dict[str, Any] = {
-        name: values.pop(name) for name in ("public", "description", "url") if name in values
-    }
+    columns: dict[str, Any] = {"public": values.pop("public")} if "public" in values else {}
     details = {**json.loads(record.details), **values}
     columns["details"] = json.dumps({name: value for name, value in details.items() if value is not None})
     submissions.change(service.database, record.id, columns)
@@ -175,12 +173,13 @@ def _accepted(request: Request, response: Response, accepted: tuple[SubmissionMo
 
 
 def _schema(request: Request, record: SubmissionModel, result: dict[str, Any] | None = None) -> Submission:
+    details = json.loads(record.details)
     return Submission.model_validate(
         {
             **{column.key: getattr(record, column.key) for column in SubmissionModel.__table__.columns},
-            **json.loads(record.details),
+            **details,
             "url": page_url(request, record),
-            "method_url": record.url,
+            "method_url": details.get("url"),
             "archive_kept": record.archive_deleted_at is None,
             "outdated": outdated_note(record, service_of(request).folder.digest),
             "result": result,

@@ -31,10 +31,11 @@ from leaderboard.web.api.submissions import (
 from leaderboard.web.cache import NO_STORE
 from leaderboard.web.pages.rendering import render
 from rebar_depth_bench.errors import printable
+from rebar_depth_bench.submission.declaration import MethodDetails
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
-EDITABLE = ("description", "url", "code_url", "licence", "training_data", "parameters")
+EDITABLE = tuple(MethodDetails.model_fields)
 
 
 @router.get("/account", name="account_page")
@@ -70,10 +71,7 @@ async def account(request: Request, service: ServiceDep) -> HTMLResponse:
         token=text,
         name=token.name,
         message=message,
-        own=[
-            (record, {"description": record.description, "url": record.url, **json.loads(record.details)})
-            for record in records
-        ],
+        own=[(record, json.loads(record.details)) for record in records],
         editable=EDITABLE,
     )
 

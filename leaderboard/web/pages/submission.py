@@ -45,6 +45,7 @@ from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.result import Result, read_disclosed, read_result
 from rebar_depth_bench.scoring.table import ViewScore
 from rebar_depth_bench.submission import Declaration
+from rebar_depth_bench.submission.declaration import MethodDetails
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
@@ -132,18 +133,19 @@ def _cache_control(public: bool) -> str:
 
 
 def _details(record: SubmissionModel) -> dict[str, Any]:
-    """Return what the submitter says about the method: texts by heading, and the URL of the code."""
-    declared, details = Declaration(record.inputs, record.uses_ground_truth), json.loads(record.details)
-    parameters, seconds = details.get("parameters"), details.get("seconds_per_view")
+    """Return what the submitter says about the method, with texts by heading."""
+    declared = Declaration(record.inputs, record.uses_ground_truth)
+    details = {**dict.fromkeys(MethodDetails.model_fields), **json.loads(record.details)}
+    parameters, seconds = details["parameters"], details.get("seconds_per_view")
     texts = {
         "Inputs": inputs_text(declared),
         "Ground truth": ground_truth_text(declared),
-        "Training data": clean_text(details.get("training_data")),
+        "Training data": clean_text(details["training_data"]),
         "Parameters": f"{parameters:,}" if isinstance(parameters, int) else printable(str(parameters or "")),
         "Runtime per view": "" if seconds is None else f"{seconds:.3g} s",
-        "Licence": printable(details.get("licence") or ""),
+        "Licence": printable(details["licence"] or ""),
     }
-    return {"texts": {name: text for name, text in texts.items() if text}, "code_url": details.get("code_url")}
+    return {**details, "texts": {name: text for name, text in texts.items() if text}}
 
 
 def _result_context(service: Service, record: SubmissionModel, full_config: str | None) -> dict[str, Any]:
