@@ -14,6 +14,7 @@ from leaderboard.db import submissions
 from leaderboard.db.models import SubmissionModel, TokenModel
 from leaderboard.db.submissions import Quota, QuotaExceededError, Upload
 from leaderboard.names import name_problem, normalised
+from leaderboard.refusals import RefusedError, too_large
 from leaderboard.scoring.isolation import (
     ProcessEndedError,
     TimeLimitError,
@@ -25,7 +26,6 @@ from leaderboard.scoring.sandbox import check
 from leaderboard.service import Service
 from leaderboard.settings import Settings
 from leaderboard.storage.archive_store import upload_file
-from leaderboard.uploads.multipart import UploadRejectedError, too_large
 from rebar_depth_bench.errors import RebarDepthError, SubmissionError
 from rebar_depth_bench.reporting.formatting import counted
 from rebar_depth_bench.submission import SubmissionMeta
@@ -44,7 +44,7 @@ async def accept_upload(
 
     It is not new if the token has sent the same archive before. Uploads with one token are received one after the
     other, so that they do not fill the disk. The quota is checked before the archive is read, and only accepted
-    archives count. Raises ``UploadRejectedError``.
+    archives count. Raises ``RefusedError``.
     """
     async with service.upload_locks[token.id]:
         try:
@@ -57,16 +57,16 @@ async def accept_upload(
                 )
         except QuotaExceededError as error:
             message = f"the quota of {error} is used up; rejected archives do not count"
-            raise UploadRejectedError(429, message) from None
+            raise RefusedError(429, message) from None
         except (OSError, RebarDepthError, UnavailableError) as error:
             _LOG.error("upload failed: service unavailable", error=str(error))
-            raise UploadRejectedError(503, UNAVAILABLE_MESSAGE) from None
+            raise RefusedError(503, UNAVAILABLE_MESSAGE) from None
 
 
 async def _receive(archive: AsyncIterator[bytes], file: IO[bytes], settings: Settings) -> tuple[str, int]:
     """Write an archive to ``file``; return its SHA-256 in hexadecimal and its size in bytes.
 
-    Raises ``UploadRejectedError``: 413 if it is too large, 408 if it takes too long.
+    Raises ``RefusedError``: 413 if it is too large, 408 if it takes too long.
     """
     sha256, size, waiting = hashlib.sha256(), 0, bytearray()
 
@@ -95,7 +95,7 @@ async def _receive(archive: AsyncIterator[bytes], file: IO[bytes], settings: Set
                     await to_thread.run_sync(flush)
             await to_thread.run_sync(flush)
     except TimeoutError:
-        raise UploadRejectedError(408, f"the upload was ended, because {limit}") from None
+        raise RefusedError(408, f"the upload was ended, because {limit}") from None
     return sha256.hexdigest(), size
 
 
@@ -112,7 +112,7 @@ def _check_and_store(
     except SubmissionError as error:
         _LOG.info("upload rejected", token=token.name, problems=len(error.problems))
         detail = f"the archive is invalid: {counted(len(error.problems), 'problem')}"
-        raise UploadRejectedError(422, detail, error.problems) from None
+        raise RefusedError(422, detail, error.problems) from None
     submission_id = submissions.new_id()
     upload = Upload(meta, sha256, size, service.folder.digest)
     public = settings.default_visibility == "always"

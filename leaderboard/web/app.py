@@ -14,8 +14,8 @@ from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import ClientDisconnect
 
 from leaderboard.db.engine import DATABASE_UNAVAILABLE
+from leaderboard.refusals import RefusedError
 from leaderboard.service import Service
-from leaderboard.uploads.multipart import UploadRejectedError
 from leaderboard.web.api import leaderboard, status, submissions
 from leaderboard.web.api.schemas import DATABASE_UNAVAILABLE_MESSAGE
 from leaderboard.web.cache import CacheMiddleware
@@ -70,7 +70,7 @@ def make_app(service: Service) -> FastAPI:
     )
     app.add_middleware(EarlyResponseMiddleware)
     app.add_exception_handler(HTTPException, _handle_http_exception)
-    app.add_exception_handler(UploadRejectedError, _handle_rejected_upload)
+    app.add_exception_handler(RefusedError, _handle_refusal)
     app.add_exception_handler(ClientDisconnect, _handle_client_disconnect)
     for error_type in DATABASE_UNAVAILABLE:
         app.add_exception_handler(error_type, _handle_database_unavailable)
@@ -78,8 +78,8 @@ def make_app(service: Service) -> FastAPI:
     return app
 
 
-async def _handle_rejected_upload(request: Request, error: Exception) -> Response:
-    assert isinstance(error, UploadRejectedError)
+async def _handle_refusal(request: Request, error: Exception) -> Response:
+    assert isinstance(error, RefusedError)
     headers = {"Retry-After": "60"} if error.status == 503 else None
     return error_response(request, error.status, error.detail, headers, error.problems)
 

@@ -10,9 +10,9 @@ from fastapi import APIRouter, HTTPException, Query, Response
 from leaderboard.db.models import TokenModel
 from leaderboard.db.rankings import LeaderboardEntry
 from leaderboard.service import Service
-from leaderboard.web.api.auth import WITHOUT_TOKEN, OptionalToken, ServiceDep
 from leaderboard.web.api.schemas import Leaderboard, LeaderboardRow, Responses, errors
 from leaderboard.web.cache import NO_STORE, REVALIDATE
+from leaderboard.web.dependencies import WITHOUT_TOKEN, OptionalToken, ServiceDep
 from rebar_depth_bench.reporting.tables import csv_text
 from rebar_depth_bench.scoring.columns import TABLE_COLUMNS
 from rebar_depth_bench.scoring.protocol import PROTOCOL

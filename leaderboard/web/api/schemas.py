@@ -11,10 +11,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from leaderboard.db.models import SubmissionModel
-from leaderboard.db.submissions import SCORED
 from rebar_depth_bench.errors import Problem
-from rebar_depth_bench.submission.declaration import MethodDetails
 
 _ID = "5f0c9a7e2b4d4c1f8e6a3d2b1c0f9e8d"
 _PROBLEM = Problem("invalid", "lattice/0042.npy", "the dtype is <i4", "float16, float32 or float64")
@@ -117,19 +114,6 @@ class Token(BaseModel):
     write_rate_limit: str = Field(examples=["60/minute"])
 
 
-class SubmissionChange(MethodDetails):
-    """Change of a submission: its visibility on the leaderboard and what is said about the method.
-
-    Values that are absent stay; null removes a value. Declarations and scores cannot be changed.
-    """
-
-    model_config = ConfigDict(
-        extra="forbid", strict=True, defer_build=False, json_schema_extra={"example": {"public": True}}
-    )
-
-    public: bool = False
-
-
 class LeaderboardRow(BaseModel):
     """Leaderboard row; ``table`` is the table of the config in the result JSON of the submission."""
 
@@ -158,14 +142,6 @@ class Leaderboard(BaseModel):
     protocol: str
     dataset: dict[str, str]
     rows: list[LeaderboardRow]
-
-
-def outdated_note(record: SubmissionModel, dataset_digest: str) -> str | None:
-    """Return why a result is not of the dataset with ``dataset_digest``, or None if it is."""
-    if record.status != SCORED or record.dataset_digest == dataset_digest:
-        return None
-    reason = "its archive is not kept, so that it is neither scored against the present dataset nor ranked"
-    return f"the result belongs to the dataset {record.dataset_digest}; {reason}"
 
 
 Responses = dict[int | str, dict[str, Any]]

@@ -16,7 +16,7 @@ from fastapi.responses import HTMLResponse
 from markupsafe import Markup
 
 from leaderboard.db.rankings import CurrentRankings, LeaderboardEntry, Ranking
-from leaderboard.web.api.auth import ServiceDep
+from leaderboard.web.dependencies import ServiceDep
 from leaderboard.web.pages.rendering import MAX_INTERVALS_PLOTTED, render
 from leaderboard.web.pages.selection import (
     NATIVE,

@@ -10,6 +10,7 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, HTTPException, Path, Query, Request, Response
 from fastapi.responses import HTMLResponse
 
+from leaderboard.changes import get_submission, outdated_note
 from leaderboard.db.models import SubmissionModel
 from leaderboard.db.rankings import (
     LeaderboardEntry,
@@ -20,10 +21,8 @@ from leaderboard.db.rankings import (
 )
 from leaderboard.db.submissions import QUEUED, SCORED, SCORING, result_json, result_notes
 from leaderboard.service import Service
-from leaderboard.web.api.auth import ServiceDep
-from leaderboard.web.api.schemas import outdated_note
-from leaderboard.web.api.submissions import SubmissionId, get_submission
 from leaderboard.web.cache import NO_STORE, REVALIDATE
+from leaderboard.web.dependencies import ID_PATTERN, ServiceDep, SubmissionId
 from leaderboard.web.pages.leaderboard import NameQuery, disclosed_row
 from leaderboard.web.pages.rendering import PICTURE_TITLES, clean_text, render
 from rebar_depth_bench.errors import InputError, printable
@@ -52,7 +51,7 @@ router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 MAX_OTHERS = 50
 """Number of submissions offered for a comparison."""
 _UNREADABLE = "The stored result was written by another version of this software, which must show it."
-_IdQuery = Annotated[str, Query(min_length=1, max_length=32, pattern=r"^[A-Za-z0-9_-]+$")]
+_IdQuery = Annotated[str, Query(min_length=1, max_length=32, pattern=ID_PATTERN)]
 PathPart = Annotated[str, Path(max_length=100, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
 
 
