@@ -89,7 +89,8 @@ class ResultModel(Base):
 class LeaderboardRowModel(Base):
     """A submission's leaderboard row of one config: the table's JSON and the columns for filtering and sorting.
 
-    ``view_errors`` are the rank errors of the views, as ``view_errors.view_errors`` packs them.
+    ``view_errors`` are the rank errors of the views, as ``view_errors.view_errors`` returns them. The row is derived
+    from the result.
     """
 
     __tablename__ = "board_rows"
@@ -99,7 +100,7 @@ class LeaderboardRowModel(Base):
     ranked: Mapped[bool]
     rank_error: Mapped[float | None]
     json: Mapped[str] = mapped_column(Text)
-    view_errors: Mapped[bytes | None] = mapped_column(LargeBinary)
+    view_errors: Mapped[str | None] = mapped_column(Text)
 
 
 class PictureModel(Base):

@@ -53,7 +53,7 @@ class LeaderboardEntry:
     public: bool
     may_rank: bool
     rank_error: float | None
-    view_errors: bytes | None
+    view_errors: str | None
     table_json: str
     rank: int | None = None
     class_rank: int | None = None
