@@ -89,8 +89,8 @@ class ResultModel(Base):
 class LeaderboardRowModel(Base):
     """A submission's leaderboard row of one config: the table's JSON and the columns for filtering and sorting.
 
-    ``view_errors`` are the rank errors of the views, as ``view_errors.view_errors`` returns them. The row is derived
-    from the result.
+    ``view_errors`` are the rank errors of the views, as ``view_errors.view_errors`` returns them. The row is
+    derived from the result.
     """
 
     __tablename__ = "board_rows"

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -31,6 +31,9 @@ from rebar_depth_bench.scoring.result import DisclosedTable, disclosed_number
 from rebar_depth_bench.submission.declaration import INPUTS
 
 _CACHED_TABLES = 4096
+MISSING_ERROR = 1.0
+"""Rank error that counts where a submission lacks a config: that of no prediction at all."""
+_SIGNIFICANT_DIGITS = 12
 
 
 @dataclass(frozen=True)
@@ -164,9 +167,57 @@ def _with_ranks(entries: Sequence[LeaderboardEntry]) -> Iterator[LeaderboardEntr
 
 def _ranks(entries: Sequence[LeaderboardEntry]) -> dict[str, int]:
     """Return the ranks of entries in ascending order by submission id; equal errors share a rank."""
+    ranks = _shared_ranks([entry.rank_error for entry in entries])
+    return {entry.id: rank for entry, rank in zip(entries, ranks, strict=True)}
+
+
+def _shared_ranks(values: Sequence[float | None]) -> list[int]:
+    """Return the ranks of values in ascending order; equal values share a rank."""
     first: dict[float | None, int] = {}
-    places = enumerate(entries, start=1)
-    return {entry.id: first.setdefault(entry.rank_error, place) for place, entry in places}
+    return [first.setdefault(value, place) for place, value in enumerate(values, start=1)]
+
+
+@dataclass(frozen=True)
+class OverallEntry:
+    """A submission, its mean rank error over all configs, and its entries by config; ``rank`` None: not ranked."""
+
+    mean: float
+    entries: dict[str, LeaderboardEntry]
+    rank: int | None = None
+
+    @property
+    def first(self) -> LeaderboardEntry:
+        """An entry of the submission."""
+        return next(iter(self.entries.values()))
+
+    @property
+    def is_ranked(self) -> bool:
+        """Whether the submission is ranked in any config."""
+        return any(entry.rank is not None for entry in self.entries.values())
+
+
+def overall_ranking(rankings: Sequence[tuple[str, Ranking]]) -> list[OverallEntry]:
+    """Return the submissions in order of their mean rank error over the configs of ``rankings``.
+
+    A config that a submission lacks counts ``MISSING_ERROR``; results of different submissions are not combined.
+    Submissions that are ranked in no config come last.
+    """
+    by_id: dict[str, dict[str, LeaderboardEntry]] = {}
+    for config, ranking in rankings:
+        for entry in ranking.entries:
+            by_id.setdefault(entry.id, {})[config] = entry
+    all_entries = [OverallEntry(_mean_error(entries, len(rankings)), entries) for entries in by_id.values()]
+    ranked = [one for one in all_entries if one.is_ranked]
+    ranked.sort(key=lambda one: (one.mean, one.first.created_at))
+    ranks = _shared_ranks([one.mean for one in ranked])
+    unranked = [one for one in all_entries if not one.is_ranked]
+    return [*(replace(one, rank=rank) for one, rank in zip(ranked, ranks, strict=True)), *unranked]
+
+
+def _mean_error(entries: Mapping[str, LeaderboardEntry], configs: int) -> float:
+    errors = [MISSING_ERROR if entry.rank_error is None else entry.rank_error for entry in entries.values()]
+    mean = (sum(errors) + MISSING_ERROR * (configs - len(entries))) / configs
+    return float(f"{mean:.{_SIGNIFICANT_DIGITS}g}")
 
 
 class CurrentRankings:

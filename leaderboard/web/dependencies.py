@@ -13,7 +13,7 @@ from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
 from leaderboard.db.models import SubmissionModel, TokenModel
 from leaderboard.db.tokens import find_token
-from leaderboard.refusals import too_large
+from leaderboard.refusals import RefusedError, too_large
 from leaderboard.service import Service
 from leaderboard.uploads.multipart import MAX_OVERHEAD_BYTES
 
@@ -65,6 +65,13 @@ OptionalToken = Annotated[TokenModel | None, Depends(optional_token)]
 RequiredToken = Annotated[TokenModel, Depends(required_token)]
 
 SubmissionId = Annotated[str, Path(min_length=1, max_length=32, pattern=ID_PATTERN)]
+
+
+def check_config(service: Service, config: str) -> None:
+    """Raise ``RefusedError`` (404) if the dataset has no such config."""
+    if config not in service.folder.configs:
+        known = ", ".join(service.folder.configs)
+        raise RefusedError(404, f"the dataset has no config {config!r}, expected one of {known}")
 
 
 def check_length(request: Request) -> None:

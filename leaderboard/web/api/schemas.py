@@ -114,16 +114,11 @@ class Token(BaseModel):
     write_rate_limit: str = Field(examples=["60/minute"])
 
 
-class LeaderboardRow(BaseModel):
-    """Leaderboard row; ``table`` is the table of the config in the result JSON of the submission."""
+class SubmissionOfRow(BaseModel):
+    """What a row states of its submission."""
 
     model_config = ConfigDict(from_attributes=True)
 
-    rank: int | None = Field(description="rank by rank error, shared by equal errors; null if not ranked")
-    rank_range: tuple[int, int] | None = Field(
-        description="first and last rank that the paired 95 % differences of the rank error allow"
-    )
-    class_rank: int | None = Field(description="rank among the rows with the same declared inputs")
     id: str
     method: str
     submitter: str
@@ -132,6 +127,16 @@ class LeaderboardRow(BaseModel):
     uses_ground_truth: bool | None = Field(description="as declared; such rows are not ranked")
     created_at: datetime
     public: bool
+
+
+class LeaderboardRow(SubmissionOfRow):
+    """Leaderboard row; ``table`` is the table of the config in the result JSON of the submission."""
+
+    rank: int | None = Field(description="rank by rank error, shared by equal errors; null if not ranked")
+    rank_range: tuple[int, int] | None = Field(
+        description="first and last rank that the paired 95 % differences of the rank error allow"
+    )
+    class_rank: int | None = Field(description="rank among the rows with the same declared inputs")
     table: dict[str, Any]
 
 
@@ -142,6 +147,22 @@ class Leaderboard(BaseModel):
     protocol: str
     dataset: dict[str, str]
     rows: list[LeaderboardRow]
+
+
+class OverallRow(SubmissionOfRow):
+    """A submission and its mean rank error over all configs; a config that it lacks, null, counts 1."""
+
+    rank: int | None = Field(description="rank by mean rank error, shared by equal errors; null if not ranked")
+    mean_rank_error: float
+    rank_errors: dict[str, float | None] = Field(description="rank error by config")
+
+
+class OverallRanking(BaseModel):
+    """Submissions by mean rank error, ranked ones first."""
+
+    protocol: str
+    dataset: dict[str, str]
+    rows: list[OverallRow]
 
 
 Responses = dict[int | str, dict[str, Any]]
