@@ -10,7 +10,6 @@ _EXTRA_MODULES = (
     "fastapi",
     "limits",
     "multipart",
-    "pydantic_settings",
     "sqlalchemy",
     "structlog",
     "uvicorn",

@@ -18,8 +18,8 @@ from leaderboard.db.engine import Database, sqlite_path, without_password
 from leaderboard.db.models import SubmissionModel, TokenModel
 from leaderboard.db.submissions import DELETED, archive_rows
 from leaderboard.db.tokens import create_token, list_tokens, replace_token, revoke_token
+from leaderboard.health import disk_problem, queue_problems
 from leaderboard.scoring.worker import process_queue
-from leaderboard.service import disk_problem, queue_problems
 from leaderboard.settings import Settings
 from leaderboard.storage import retention
 from leaderboard.storage.archive_store import ArchiveStore, archive_problem

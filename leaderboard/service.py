@@ -1,10 +1,8 @@
-"""Service context shared by the routes: settings, dataset, database, archives, limits; and its checks."""
+"""Service context shared by the routes: settings, dataset, database, archives, limits."""
 
 from __future__ import annotations
 
-import shutil
 import threading
-import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
 from contextlib import ExitStack, closing, contextmanager
@@ -14,13 +12,10 @@ from pathlib import Path
 import structlog
 from anyio import CapacityLimiter, Lock
 from huggingface_hub.repocard import metadata_load
-from sqlalchemy import func, not_, select
 
 from leaderboard.db import jobs
 from leaderboard.db.engine import Database
-from leaderboard.db.models import SubmissionModel
-from leaderboard.db.submissions import QUEUED, SCORING
-from leaderboard.db.versions import CurrentRankings, VersionReader
+from leaderboard.db.rankings import CurrentRankings
 from leaderboard.settings import Settings
 from leaderboard.storage.archive_store import ArchiveStore, delete_abandoned_uploads, make_folder
 from rebar_depth_bench.data.files import MANIFEST_FILE
@@ -28,9 +23,6 @@ from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.names import TEST_SPLIT, config_of
 
 SIMULTANEOUS_CHECKS = 2
-MIN_FREE_BYTES = 1 << 30
-STALLED_S = 600.0
-"""Time without a lease after which a queued submission shows that no worker takes it."""
 _LOG = structlog.get_logger("service")
 
 
@@ -46,7 +38,6 @@ class Service:
     database: Database
     archives: ArchiveStore
     spool: Path
-    versions: VersionReader
     rankings: CurrentRankings
     dataset_name: str
     dataset_licence: str
@@ -81,15 +72,13 @@ def open_service(settings: Settings) -> Iterator[Service]:
         database.migrate()
         if requeued := jobs.requeue_stale(database, folder.digest, archives.ids(), settings.rescore):
             _LOG.info("results of another dataset or definition; submissions requeued", submissions=requeued)
-        versions = stack.enter_context(closing(VersionReader(database)))
         yield Service(
             settings=settings,
             folder=folder,
             database=database,
             archives=archives,
             spool=settings.spool,
-            versions=versions,
-            rankings=CurrentRankings(database, versions, folder.digest),
+            rankings=CurrentRankings(database, folder.digest),
             dataset_name=name,
             dataset_licence=licence,
             manifest_state=manifest,
@@ -115,39 +104,3 @@ def manifest_state(data: str) -> tuple[int, int] | None:
     except OSError:
         return None
     return status.st_size, status.st_mtime_ns
-
-
-def service_problems(service: Service) -> list[str]:
-    """Return what is wrong with a running service. Raises the errors of an unavailable database."""
-    problems = [*_dataset_problems(service), *disk_problem(service.spool)]
-    expected, running = service.settings.workers, sum(worker.is_alive() for worker in service.workers)
-    if running < expected:
-        problems.append(f"{running} of {expected} local workers are running")
-    return problems + queue_problems(service.database)
-
-
-def _dataset_problems(service: Service) -> list[str]:
-    """Return whether the dataset folder is gone or its manifest was replaced; a Hub dataset is not checked."""
-    found = manifest_state(service.settings.data)
-    if found == service.manifest_state:
-        return []
-    return [
-        "the manifest of the dataset " + ("cannot be read" if found is None else "has changed since the start")
-    ]
-
-
-def disk_problem(folder: Path, name: str = "the state folder") -> list[str]:
-    """Return whether the disk of a folder is nearly full."""
-    free = shutil.disk_usage(folder).free
-    return [] if free >= MIN_FREE_BYTES else [f"the disk of {name} has {free >> 20} MiB left"]
-
-
-def queue_problems(database: Database) -> list[str]:
-    """Return whether the oldest queued submission waits although no submission is being scored."""
-    oldest = select(func.min(SubmissionModel.created_at)).where(SubmissionModel.status == QUEUED)
-    active = select(func.count()).where(SubmissionModel.status == SCORING, not_(jobs.is_free(time.time())))
-    with database.read() as session:
-        queued_since, scoring = session.scalar(oldest), session.scalar(active)
-    if queued_since is None or scoring or time.time() - queued_since < STALLED_S:
-        return []
-    return [f"no worker scores, and a submission has waited for {time.time() - queued_since:.0f} s"]

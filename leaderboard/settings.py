@@ -2,33 +2,34 @@
 
 from __future__ import annotations
 
+import os
 import re
 from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import urlsplit
 
 from limits import parse_many
-from pydantic import ByteSize, Field, ValidationError, ValidationInfo, field_validator
+from pydantic import BaseModel, ByteSize, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 from pydantic_core import ErrorDetails
-from pydantic_settings import BaseSettings, SettingsConfigDict
 from sqlalchemy import make_url
 from sqlalchemy.exc import ArgumentError
 
-from rebar_depth_bench.errors import InputError, Problem
+from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.reading import parse_toml, read_file
 from rebar_depth_bench.submission.declaration import is_http_url
 from rebar_depth_bench.validation import format_location, short_repr
 
+ENVIRONMENT_PREFIX = "REBAR_LEADERBOARD_"
 GIB = 1 << 30
 MAX_LEASE_S = 600.0
 """Largest setting ``lease_seconds``; a lease that ends much later was made by a clock that was wrong."""
 
 
-class Settings(BaseSettings):
+class Settings(BaseModel):
     """All settings with their defaults. Sizes are in bytes (``8GiB`` is accepted too), times in seconds."""
 
-    model_config = SettingsConfigDict(env_prefix="REBAR_LEADERBOARD_", extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
     data: str = Field(description="dataset folder or Hub repository id")
     state_dir: Path = Field(
@@ -173,27 +174,17 @@ def read_settings(file: Path | None, overrides: dict[str, Any]) -> Settings:
 
     Raises ``InputError``, naming every invalid setting, and if ``file`` cannot be read as TOML.
     """
-    file_values = {} if file is None else _read_file(file)
+    variables = {name: os.environ.get(f"{ENVIRONMENT_PREFIX}{name.upper()}") for name in Settings.model_fields}
+    values: dict[str, Any] = {name: value for name, value in variables.items() if value is not None}
+    if file is not None:
+        content, problems = parse_toml(read_file(file, TOML_BYTES, "a TOML file with settings", InputError))
+        if problems:
+            raise InputError.from_problems(file, problems)
+        values |= content
     try:
-        return Settings(**{**file_values, **overrides})
+        return Settings.model_validate(values | overrides)
     except ValidationError as error:
         raise InputError("settings: " + "; ".join(_format_error(details) for details in error.errors())) from None
-
-
-def _read_file(file: Path) -> dict[str, Any]:
-    """Return the values of a TOML file.
-
-    Unknown names are refused here, because ``BaseSettings`` has parameters that are no settings (``_env_file``).
-    """
-    content, problems = parse_toml(read_file(file, TOML_BYTES, "a TOML file with settings", InputError))
-    problems += [
-        Problem("unknown", format_location("", name), "there is no such setting")
-        for name in content
-        if name not in Settings.model_fields
-    ]
-    if problems:
-        raise InputError.from_problems(file, problems)
-    return content
 
 
 _SECRET_SETTINGS = ("db",)
@@ -202,9 +193,11 @@ _SECRET_SETTINGS = ("db",)
 
 def _format_error(error: ErrorDetails) -> str:
     """Return the message for an invalid setting; its value is included unless it may contain a secret."""
-    name = ".".join(map(str, error["loc"]))
+    name = format_location("", ".".join(map(str, error["loc"])))
     if error["type"] == "missing":
         return f"{name}: is not given, expected {Settings.model_fields[name].description}"
+    if error["type"] == "extra_forbidden":
+        return f"{name}: there is no such setting"
     message = error["msg"].removeprefix("Value error, ")
     return f"{name}: {message}" + (
         "" if error["loc"][0] in _SECRET_SETTINGS else f", got {short_repr(error['input'])}"

@@ -15,7 +15,7 @@ from sqlalchemy.exc import ArgumentError, DatabaseError, InterfaceError, NoSuchM
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from sqlalchemy.orm import Session
 
-from leaderboard.db.models import Base, ResultModel
+from leaderboard.db.models import Base, ContentVersionModel, ResultModel
 from rebar_depth_bench.errors import InputError, StorageError
 
 MIGRATIONS = Path(__file__).parent / "migrations"
@@ -25,6 +25,7 @@ DATABASE_UNAVAILABLE = (OperationalError, InterfaceError, PoolTimeoutError)
 _POSTGRESQL_TIMEOUTS = {"connect_timeout": 10, "tcp_user_timeout": 30_000}
 """Timeouts for an unresponsive PostgreSQL server: connect in seconds, unacknowledged TCP data in ms."""
 _IMMEDIATE = "immediate"
+_CONTENT_VERSION = select(ContentVersionModel.value)
 _OWN_TABLES = frozenset({"alembic_version", *Base.metadata.tables})
 
 
@@ -62,6 +63,11 @@ class Database:
         """Yield a session that is committed durably when the block ends, or rolled back if it raises."""
         with Session(self._write_engine, expire_on_commit=False) as session, session.begin():
             yield session
+
+    def content_version(self) -> int:
+        """Return the version of everything that pages show, apart from queue positions."""
+        with self._engine.connect() as connection:
+            return int(connection.scalar(_CONTENT_VERSION) or 0)
 
     @property
     def has_row_locks(self) -> bool:

@@ -41,7 +41,8 @@ class TokenModel(Base):
 class SubmissionModel(Base):
     """An accepted archive and its status. Deleted submissions keep their rows, which count for the quota.
 
-    ``details`` is a JSON object with what the submitter says of the method; ``archive_deleted_at`` is set when the
+    ``details`` is a JSON object with what the submitter says of the method (``MethodDetails``), and the declared
+    seconds per view, without what is not given; ``archive_deleted_at`` is set when the
     archive of a submission that stays was deleted.
     """
 
@@ -55,8 +56,6 @@ class SubmissionModel(Base):
     id: Mapped[str] = mapped_column(String(32), primary_key=True)
     token_id: Mapped[int] = mapped_column(ForeignKey("tokens.id"))
     method: Mapped[str] = mapped_column(String(200))
-    description: Mapped[str | None] = mapped_column(Text)
-    url: Mapped[str | None] = mapped_column(Text)
     inputs: Mapped[str | None] = mapped_column(String(20))
     uses_ground_truth: Mapped[bool | None]
     archive_sha256: Mapped[str] = mapped_column(String(64))
@@ -90,7 +89,8 @@ class ResultModel(Base):
 class LeaderboardRowModel(Base):
     """A submission's leaderboard row of one config: the table's JSON and the columns for filtering and sorting.
 
-    ``view_errors`` are the rank errors of the views, as ``view_errors.view_errors`` packs them.
+    ``view_errors`` are the rank errors of the views, as ``view_errors.view_errors`` returns them. The row is
+    derived from the result.
     """
 
     __tablename__ = "board_rows"
@@ -100,7 +100,7 @@ class LeaderboardRowModel(Base):
     ranked: Mapped[bool]
     rank_error: Mapped[float | None]
     json: Mapped[str] = mapped_column(Text)
-    view_errors: Mapped[bytes | None] = mapped_column(LargeBinary)
+    view_errors: Mapped[str | None] = mapped_column(Text)
 
 
 class PictureModel(Base):

@@ -9,7 +9,8 @@ returned.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+import threading
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -30,6 +31,9 @@ from rebar_depth_bench.scoring.result import DisclosedTable, disclosed_number
 from rebar_depth_bench.submission.declaration import INPUTS
 
 _CACHED_TABLES = 4096
+MISSING_ERROR = 1.0
+"""Rank error that counts where a submission lacks a config: that of no prediction at all."""
+_SIGNIFICANT_DIGITS = 12
 
 
 @dataclass(frozen=True)
@@ -45,18 +49,24 @@ class LeaderboardEntry:
     config: str
     method: str
     submitter: str
-    url: str | None
+    details: str
     inputs: str | None
     uses_ground_truth: bool | None
     created_at: float
     public: bool
     may_rank: bool
     rank_error: float | None
-    view_errors: bytes | None
+    view_errors: str | None
     table_json: str
     rank: int | None = None
     class_rank: int | None = None
     rank_range: tuple[int, int] | None = None
+
+    @property
+    def url(self) -> str | None:
+        """Page or paper of the method."""
+        url: str | None = json.loads(self.details).get("url")
+        return url
 
     @property
     def table(self) -> dict[str, Any]:
@@ -76,7 +86,7 @@ _COLUMNS = (
     LeaderboardRowModel.config,
     SubmissionModel.method,
     TokenModel.name,
-    SubmissionModel.url,
+    SubmissionModel.details,
     SubmissionModel.inputs,
     SubmissionModel.uses_ground_truth,
     SubmissionModel.created_at,
@@ -157,9 +167,78 @@ def _with_ranks(entries: Sequence[LeaderboardEntry]) -> Iterator[LeaderboardEntr
 
 def _ranks(entries: Sequence[LeaderboardEntry]) -> dict[str, int]:
     """Return the ranks of entries in ascending order by submission id; equal errors share a rank."""
+    ranks = _shared_ranks([entry.rank_error for entry in entries])
+    return {entry.id: rank for entry, rank in zip(entries, ranks, strict=True)}
+
+
+def _shared_ranks(values: Sequence[float | None]) -> list[int]:
+    """Return the ranks of values in ascending order; equal values share a rank."""
     first: dict[float | None, int] = {}
-    places = enumerate(entries, start=1)
-    return {entry.id: first.setdefault(entry.rank_error, place) for place, entry in places}
+    return [first.setdefault(value, place) for place, value in enumerate(values, start=1)]
+
+
+@dataclass(frozen=True)
+class OverallEntry:
+    """A submission, its mean rank error over all configs, and its entries by config; ``rank`` None: not ranked."""
+
+    mean: float
+    entries: dict[str, LeaderboardEntry]
+    rank: int | None = None
+
+    @property
+    def first(self) -> LeaderboardEntry:
+        """An entry of the submission."""
+        return next(iter(self.entries.values()))
+
+    @property
+    def is_ranked(self) -> bool:
+        """Whether the submission is ranked in any config."""
+        return any(entry.rank is not None for entry in self.entries.values())
+
+
+def overall_ranking(rankings: Sequence[tuple[str, Ranking]]) -> list[OverallEntry]:
+    """Return the submissions in order of their mean rank error over the configs of ``rankings``.
+
+    A config that a submission lacks counts ``MISSING_ERROR``; results of different submissions are not combined.
+    Submissions that are ranked in no config come last.
+    """
+    by_id: dict[str, dict[str, LeaderboardEntry]] = {}
+    for config, ranking in rankings:
+        for entry in ranking.entries:
+            by_id.setdefault(entry.id, {})[config] = entry
+    all_entries = [OverallEntry(_mean_error(entries, len(rankings)), entries) for entries in by_id.values()]
+    ranked = [one for one in all_entries if one.is_ranked]
+    ranked.sort(key=lambda one: (one.mean, one.first.created_at))
+    ranks = _shared_ranks([one.mean for one in ranked])
+    unranked = [one for one in all_entries if not one.is_ranked]
+    return [*(replace(one, rank=rank) for one, rank in zip(ranked, ranks, strict=True)), *unranked]
+
+
+def _mean_error(entries: Mapping[str, LeaderboardEntry], configs: int) -> float:
+    errors = [MISSING_ERROR if entry.rank_error is None else entry.rank_error for entry in entries.values()]
+    mean = (sum(errors) + MISSING_ERROR * (configs - len(entries))) / configs
+    return float(f"{mean:.{_SIGNIFICANT_DIGITS}g}")
+
+
+class CurrentRankings:
+    """Rankings of a dataset's public rows, each read from the database once per content version; thread-safe."""
+
+    def __init__(self, database: Database, dataset_digest: str) -> None:
+        self._database, self._dataset_digest = database, dataset_digest
+        self._lock = threading.Lock()
+        self._version, self._by_config = -1, dict[str, Ranking]()
+
+    def of(self, config: str, viewer: TokenModel | None = None) -> Ranking:
+        """Return the current ranking of a config, with the rows of ``viewer``."""
+        if viewer is not None:
+            return read_ranking(self._database, config, self._dataset_digest, viewer)
+        with self._lock:
+            version = self._database.content_version()
+            if version != self._version:
+                self._version, self._by_config = version, {}
+            if config not in self._by_config:
+                self._by_config[config] = read_ranking(self._database, config, self._dataset_digest)
+            return self._by_config[config]
 
 
 def picture_facts(database: Database, submission_id: str) -> dict[str, tuple[dict[str, Any], list[str]]]:

@@ -24,6 +24,7 @@ from leaderboard.db.models import (
 )
 from rebar_depth_bench.scoring.result import disclosed_json
 from rebar_depth_bench.submission import SubmissionMeta
+from rebar_depth_bench.submission.declaration import MethodDetails
 
 QUEUED, SCORING, SCORED, FAILED, DELETED = "queued", "scoring", "scored", "failed", "deleted"
 DAY_S = 86400
@@ -78,11 +79,12 @@ def accept(
         if duplicate := find_duplicate(session, token, upload.sha256):
             return duplicate
         check_quota(session, token, quota, upload.size)
-        declared = ("method", "description", "url", "inputs", "uses_ground_truth")
         record = SubmissionModel(
             id=submission_id,
             token_id=token.id,
-            **{name: getattr(upload.meta, name) for name in declared},
+            method=upload.meta.method,
+            inputs=upload.meta.inputs,
+            uses_ground_truth=upload.meta.uses_ground_truth,
             archive_sha256=upload.sha256,
             archive_bytes=upload.size,
             status=QUEUED,
@@ -97,8 +99,8 @@ def accept(
 
 
 def _details_json(meta: SubmissionMeta) -> str:
-    """Return what the columns do not hold of what the submitter says about the method."""
-    details = meta.model_dump(include={"code_url", "licence", "training_data", "parameters"}, exclude_none=True)
+    """Return what the submitter says about the method."""
+    details = meta.model_dump(include=set(MethodDetails.model_fields), exclude_none=True)
     if (seconds := meta.seconds_per_view) is not None:
         details["seconds_per_view"] = seconds
     return json.dumps(details)
@@ -206,4 +208,4 @@ def remove(database: Database, submission_id: str) -> None:
         increment_content_version(session)
         record.status, record.public, record.details = DELETED, False, "{}"
         record.method, record.archive_sha256 = "", ""
-        record.description = record.url = record.reason = None
+        record.reason = None

@@ -1,4 +1,4 @@
-"""Rank errors of the views of a submission, packed for the database, and the ranks that they allow.
+"""Rank errors of the views of a submission as they are stored, and the ranks that they allow.
 
 Two submissions are compared on the same views, as ``rebar-bench compare`` does: one is better if the 95 % interval
 of the paired difference of their rank errors excludes zero.
@@ -6,7 +6,9 @@ of the paired difference of their rank errors excludes zero.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
 
@@ -14,9 +16,8 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from rebar_depth_bench.names import config_of, scene_of
+from rebar_depth_bench.names import config_of, split_of
 from rebar_depth_bench.scoring import bootstrap
-from rebar_depth_bench.scoring.bootstrap import protocol_indices
 
 _CLEAR, _UNCLEAR = 1.6, 0.6
 """Differences in half widths from which a pair is decided, and below which it is undecided, without draws."""
@@ -24,68 +25,55 @@ _CHUNK_PAIRS = 2_000
 _CACHED_ROWS = 2048
 
 
-def view_errors(result: Mapping[str, Any], config: str) -> bytes | None:
-    """Return the rank errors of the views of a config, packed, or None if a view has none.
+def view_errors(result: Mapping[str, Any], config: str) -> str | None:
+    """Return the ids and the rank errors of the views of a config as JSON, or None if a view has no error.
 
-    ``result`` is the result JSON. The indices of the views in their protocol (int32) are followed by the rank
-    errors (float64), both little-endian. In a config of several scenes, the number -1 - i of the view's scene i
-    takes the place of the index.
+    ``result`` is the result JSON.
     """
     views = [view for view in result["views"] if config_of(view["view_id"]) == config]
     errors = [view.get("rank_error") for view in views]
     if not errors or None in errors:
         return None
-    view_ids = [view["view_id"] for view in views]
-    by_scene = result["tables"][config].get("split") is not None
-    indices = np.array(_scene_numbers(view_ids) if by_scene else protocol_indices(view_ids), "<i4")
-    return indices.tobytes() + np.array(errors, "<f8").tobytes()
+    return json.dumps([[view["view_id"] for view in views], errors])
 
 
-def _scene_numbers(view_ids: Sequence[str]) -> list[int]:
-    """Return -1 - i for the views of scene i, in the order of their first views."""
-    number = {scene: -1 - index for index, scene in enumerate(dict.fromkeys(map(scene_of, view_ids)))}
-    return [number[scene_of(view_id)] for view_id in view_ids]
-
-
-def unpack_view_errors(packed: bytes) -> tuple[bytes, Float64[ndarray, " n"]]:
-    """Return the packed indices of the views, and their rank errors."""
-    size = _indices_size(packed)
-    return packed[:size], np.frombuffer(packed[size:], "<f8")
-
-
-def _indices_size(packed: bytes) -> int:
-    return len(packed) // 12 * 4
-
-
-def rank_ranges(packed: Sequence[bytes | None]) -> list[tuple[int, int] | None]:
+def rank_ranges(rows: Sequence[str | None]) -> list[tuple[int, int] | None]:
     """Return the first and last rank of each submission that the paired differences allow.
 
     The first rank is 1 + the number of submissions that are better, the last one is the number of submissions that
     are not worse. None stands for submissions without view errors or with other views than the first one.
     """
-    views = next((one[: _indices_size(one)] for one in packed if one), b"")
-    same_views = [(i, one) for i, one in enumerate(packed) if one and one[: _indices_size(one)] == views]
-    rows = [index for index, _ in same_views]
-    ranges: list[tuple[int, int] | None] = [None] * len(packed)
-    if len(rows) < 2:
+    resampled = [None if row is None else _resampled(row) for row in rows]
+    views = next((one.view_ids for one in resampled if one), ())
+    compared = [(index, one) for index, one in enumerate(resampled) if one and one.view_ids == views]
+    ranges: list[tuple[int, int] | None] = [None] * len(rows)
+    if len(compared) < 2:
         return ranges
-    better = _is_better(np.array([_resampled_means(one) for _, one in same_views]), _resampling(views).blocks())
-    for row, index in enumerate(rows):
-        ranges[index] = (1 + int(better[:, row].sum()), len(rows) - int(better[row].sum()))
+    better = _is_better(np.array([one.means for _, one in compared]), _resampling(views).blocks())
+    for place, (index, _) in enumerate(compared):
+        ranges[index] = (1 + int(better[:, place].sum()), len(compared) - int(better[place].sum()))
     return ranges
 
 
+@dataclass(frozen=True)
+class _Resampled:
+    """Views of a submission, and its mean rank error in each resample of them."""
+
+    view_ids: tuple[str, ...]
+    means: Float64[ndarray, " draws"]
+
+
 @lru_cache(maxsize=_CACHED_ROWS)
-def _resampled_means(packed: bytes) -> Float64[ndarray, " draws"]:
-    """Return the mean rank error in each resample; cached, because other submissions stay the same."""
-    indices, errors = unpack_view_errors(packed)
-    return _resampling(indices).means(errors[:, None])[:, 0]
+def _resampled(row: str) -> _Resampled:
+    """Return the resampled means of a row; cached, because other submissions stay the same."""
+    view_ids, errors = json.loads(row)
+    means = _resampling(tuple(view_ids)).means(np.array(errors)[:, None])[:, 0]
+    return _Resampled(tuple(view_ids), means)
 
 
 @lru_cache(maxsize=4)
-def _resampling(indices: bytes) -> bootstrap.Resampling:
-    numbers: list[int] = np.frombuffer(indices, "<i4").tolist()
-    return bootstrap.resample_scenes(list(map(str, numbers))) if min(numbers) < 0 else bootstrap.resample(numbers)
+def _resampling(view_ids: tuple[str, ...]) -> bootstrap.Resampling:
+    return bootstrap.resample_views(view_ids, by_scene=split_of(view_ids[0]) is not None)
 
 
 def _is_better(means: Float64[ndarray, "n draws"], blocks: int) -> ndarray:

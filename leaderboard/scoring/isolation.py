@@ -14,6 +14,7 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
+from rebar_depth_bench.errors import Problem, ProblemCode, RebarDepthError, SubmissionError
 from rebar_depth_bench.limits import limit_process
 
 POLL_INTERVAL_S = 1.0
@@ -26,7 +27,7 @@ T = TypeVar("T")
 
 
 class UnavailableError(Exception):
-    """Raised by a function, and in the calling process, if its work is impossible for now."""
+    """Raised if the work of a function is impossible for now."""
 
 
 class ProcessEndedError(Exception):
@@ -59,8 +60,8 @@ def call_isolated(
     """Return the value of ``function(*arguments)``, which runs in a new process.
 
     ``memory`` is its limit in bytes; ``should_continue`` is called about every ``step_s`` seconds. Raises
-    ``TimeLimitError``, ``StoppedError``, ``ProcessEndedError``, and ``UnavailableError`` also if no process can be
-    started.
+    ``TimeLimitError``, ``StoppedError`` and ``ProcessEndedError``; ``SubmissionError`` if the function does, or
+    needs more memory; and ``UnavailableError`` for its other errors, and if no process can be started.
     """
     receiver, sender = _SPAWN.Pipe(duplex=False)
     process = _SPAWN.Process(target=_run, args=(sender, memory, os.getpid(), function, arguments))
@@ -77,7 +78,7 @@ def call_isolated(
                     raise TimeLimitError
                 if not should_continue():
                     raise StoppedError
-            value: T | UnavailableError = receiver.recv()
+            value: T | UnavailableError | SubmissionError = receiver.recv()
         except EOFError:
             process.join()
             raise ProcessEndedError(process.exitcode) from None
@@ -85,7 +86,7 @@ def call_isolated(
             process.kill()
             process.join()
             process.close()
-    if isinstance(value, UnavailableError):
+    if isinstance(value, UnavailableError | SubmissionError):
         raise value
     return value
 
@@ -93,16 +94,28 @@ def call_isolated(
 def _run(
     sender: Connection, memory: int, parent: int, function: Callable[..., object], arguments: tuple[Any, ...]
 ) -> None:
-    """Send the value of the function from a process whose output is discarded, because it could fill the log.
+    """Send the value or the error of the function.
 
-    Its priority is lowered, so that it does not slow down the server.
+    The output of the process is discarded, because it could fill the log. Its priority is lowered, so that it does
+    not slow down the server.
     """
     with open(os.devnull, "w") as null:  # noqa: PTH123
         for stream in (1, 2):
             os.dup2(null.fileno(), stream)
     os.nice(NICENESS)
     limit_process(parent, max(memory, MIN_MEMORY_BYTES))
+    value: object
     try:
-        sender.send(function(*arguments))
-    except UnavailableError as error:
-        sender.send(error)
+        value = function(*arguments)
+    except SubmissionError as error:
+        value = error
+    except MemoryError:
+        value = archive_error("size", "the archive needs more memory than this service allows")
+    except (RebarDepthError, OSError) as error:  # Dataset, cache or disk, not the archive.
+        value = UnavailableError(str(error))
+    sender.send(value)
+
+
+def archive_error(code: ProblemCode, found: str, location: str = "", expected: str = "") -> SubmissionError:
+    """Return the error of an archive with one problem."""
+    return SubmissionError.from_problems("the archive", [Problem(code, location, found, expected)])

@@ -7,26 +7,20 @@ them, so they are only for leaderboards with public ground truth.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import wraps
 from operator import attrgetter
 from pathlib import Path
-from typing import TYPE_CHECKING, ParamSpec, TypeVar
+from typing import TYPE_CHECKING
 
-from leaderboard.scoring.isolation import UnavailableError
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.errors import DatasetError, Problem, RebarDepthError, SubmissionError
+from rebar_depth_bench.errors import DatasetError, Problem, SubmissionError
 from rebar_depth_bench.names import TEST_SPLIT, config_of, split_of
 from rebar_depth_bench.scoring.table import ViewScore
 from rebar_depth_bench.submission import SubmissionMeta, SubmissionReader
 
 if TYPE_CHECKING:
     from rebar_depth_bench.reporting.html.views import ShownView
-
-P = ParamSpec("P")
-T = TypeVar("T")
-Problems = tuple[Problem, ...]
 
 
 @dataclass(frozen=True)
@@ -49,29 +43,11 @@ class Outcome:
     archive_missing: bool = False
 
 
-def _with_problems(task: Callable[P, T]) -> Callable[P, T | Problems]:
-    """Return ``task`` with the problems of an archive as a value, and ``UnavailableError`` for other errors."""
-
-    @wraps(task)
-    def call(*arguments: P.args, **options: P.kwargs) -> T | Problems:
-        try:
-            return task(*arguments, **options)
-        except SubmissionError as error:
-            return tuple(error.problems)
-        except MemoryError:
-            return (Problem("size", "", "the archive needs more memory than this service allows"),)
-        except (RebarDepthError, OSError) as error:  # Dataset, cache or disk, not the archive.
-            raise UnavailableError(str(error)) from None
-
-    return call
-
-
-@_with_problems
-def check(archive: Path, data: str) -> SubmissionMeta | Problems:
-    """Return the content of ``submission.json`` if the archive is valid, otherwise all problems."""
+def check(archive: Path, data: str) -> SubmissionMeta:
+    """Return the content of ``submission.json`` of an archive. Raises ``SubmissionError`` with all problems."""
     with SubmissionReader(archive, open_folder(data).expected_views()) as submission:
-        if problems := tuple(_split_problems(submission.view_ids)) or tuple(submission.problems()):
-            return problems
+        if problems := list(_split_problems(submission.view_ids)) or list(submission.problems()):
+            raise SubmissionError.from_problems("the archive", problems)
         assert submission.meta is not None
         return submission.meta
 
@@ -83,11 +59,10 @@ def _split_problems(view_ids: Iterable[str]) -> Iterator[Problem]:
             yield Problem("conflict", config, f"the archive covers the split {split}", f"the split {TEST_SPLIT}")
 
 
-@_with_problems
 def score(archive: Path, data: str, dataset_digest: str, error_maps: int, hidden_truth: bool) -> Outcome:
     """Return result, notes, and pictures of the ``error_maps`` worst views and the median view of each config.
 
-    With ``hidden_truth``, archives with a view of low coverage have a problem.
+    Raises ``SubmissionError``, with ``hidden_truth`` also for a view of low coverage, and ``DatasetError``.
     """
     # Half a second to import, which a check does not need.
     from rebar_depth_bench.reporting.html.page import look_at_views, views_by_config

@@ -30,7 +30,7 @@ from leaderboard.scoring.isolation import (
 from leaderboard.scoring.sandbox import Outcome, score
 from leaderboard.settings import Settings
 from leaderboard.storage.archive_store import ArchiveNotFoundError, ArchiveStore
-from rebar_depth_bench.errors import problem_summary
+from rebar_depth_bench.errors import SubmissionError, problem_summary
 
 RETRY_INTERVAL_S = 1.0
 RENEWALS_PER_LEASE = 4
@@ -117,10 +117,13 @@ class _Worker:
         """Return the outcome, or None if the process was killed from outside or should not continue."""
         settings = self.settings
         try:
-            found = call_isolated(
+            return call_isolated(
                 score,
-                *(self.archives.path(record.id), settings.data, record.dataset_digest),
-                *(settings.error_maps, settings.hidden_truth),
+                self.archives.path(record.id),
+                settings.data,
+                record.dataset_digest,
+                settings.error_maps,
+                settings.hidden_truth,
                 memory=settings.score_memory,
                 time_limit_s=settings.score_time,
                 step_s=min(settings.lease_seconds / RENEWALS_PER_LEASE, POLL_INTERVAL_S),
@@ -128,6 +131,8 @@ class _Worker:
             )
         except ArchiveNotFoundError:
             return Outcome(reason="the archive is no longer in the archive storage", archive_missing=True)
+        except SubmissionError as error:
+            return Outcome(reason=problem_summary(error.problems))
         except TimeLimitError:
             return Outcome(reason=f"scoring took longer than the limit of {settings.score_time:g} s")
         except StoppedError:
@@ -135,7 +140,6 @@ class _Worker:
         except ProcessEndedError as error:
             _LOG.error("scoring process ended", submission=record.id[:6], status=error.status)
             return None if error.was_killed else Outcome(reason=f"{error} without a result")
-        return found if isinstance(found, Outcome) else Outcome(reason=problem_summary(found))
 
     def _keeps_lease(self, submission_id: str) -> bool:
         """Renew the lease; return whether scoring should continue."""

@@ -14,13 +14,19 @@ from leaderboard.db import submissions
 from leaderboard.db.models import SubmissionModel, TokenModel
 from leaderboard.db.submissions import Quota, QuotaExceededError, Upload
 from leaderboard.names import name_problem, normalised
-from leaderboard.scoring.isolation import ProcessEndedError, TimeLimitError, UnavailableError, call_isolated
-from leaderboard.scoring.sandbox import Problems, check
+from leaderboard.refusals import RefusedError, too_large
+from leaderboard.scoring.isolation import (
+    ProcessEndedError,
+    TimeLimitError,
+    UnavailableError,
+    archive_error,
+    call_isolated,
+)
+from leaderboard.scoring.sandbox import check
 from leaderboard.service import Service
 from leaderboard.settings import Settings
 from leaderboard.storage.archive_store import upload_file
-from leaderboard.uploads.multipart import UploadRejectedError, too_large
-from rebar_depth_bench.errors import Problem, RebarDepthError
+from rebar_depth_bench.errors import RebarDepthError, SubmissionError
 from rebar_depth_bench.reporting.formatting import counted
 from rebar_depth_bench.submission import SubmissionMeta
 
@@ -38,7 +44,7 @@ async def accept_upload(
 
     It is not new if the token has sent the same archive before. Uploads with one token are received one after the
     other, so that they do not fill the disk. The quota is checked before the archive is read, and only accepted
-    archives count. Raises ``UploadRejectedError``.
+    archives count. Raises ``RefusedError``.
     """
     async with service.upload_locks[token.id]:
         try:
@@ -51,16 +57,16 @@ async def accept_upload(
                 )
         except QuotaExceededError as error:
             message = f"the quota of {error} is used up; rejected archives do not count"
-            raise UploadRejectedError(429, message) from None
+            raise RefusedError(429, message) from None
         except (OSError, RebarDepthError, UnavailableError) as error:
             _LOG.error("upload failed: service unavailable", error=str(error))
-            raise UploadRejectedError(503, UNAVAILABLE_MESSAGE) from None
+            raise RefusedError(503, UNAVAILABLE_MESSAGE) from None
 
 
 async def _receive(archive: AsyncIterator[bytes], file: IO[bytes], settings: Settings) -> tuple[str, int]:
     """Write an archive to ``file``; return its SHA-256 in hexadecimal and its size in bytes.
 
-    Raises ``UploadRejectedError``: 413 if it is too large, 408 if it takes too long.
+    Raises ``RefusedError``: 413 if it is too large, 408 if it takes too long.
     """
     sha256, size, waiting = hashlib.sha256(), 0, bytearray()
 
@@ -89,7 +95,7 @@ async def _receive(archive: AsyncIterator[bytes], file: IO[bytes], settings: Set
                     await to_thread.run_sync(flush)
             await to_thread.run_sync(flush)
     except TimeoutError:
-        raise UploadRejectedError(408, f"the upload was ended, because {limit}") from None
+        raise RefusedError(408, f"the upload was ended, because {limit}") from None
     return sha256.hexdigest(), size
 
 
@@ -101,12 +107,14 @@ def _check_and_store(
         duplicate = submissions.find_duplicate(session, token, sha256)
     if duplicate is not None:
         return duplicate, False
-    verdict = _checked_name(_check_archive(path, settings))
-    if not isinstance(verdict, SubmissionMeta):
-        _LOG.info("upload rejected", token=token.name, problems=len(verdict))
-        raise UploadRejectedError(422, f"the archive is invalid: {counted(len(verdict), 'problem')}", verdict)
+    try:
+        meta = _checked_archive(path, settings)
+    except SubmissionError as error:
+        _LOG.info("upload rejected", token=token.name, problems=len(error.problems))
+        detail = f"the archive is invalid: {counted(len(error.problems), 'problem')}"
+        raise RefusedError(422, detail, error.problems) from None
     submission_id = submissions.new_id()
-    upload = Upload(verdict, sha256, size, service.folder.digest)
+    upload = Upload(meta, sha256, size, service.folder.digest)
     public = settings.default_visibility == "always"
     service.archives.put(submission_id, path)
     try:
@@ -121,30 +129,28 @@ def _check_and_store(
     return record, True
 
 
-def _check_archive(path: Path, settings: Settings) -> SubmissionMeta | Problems:
-    """Return the content of ``submission.json``, or the problems of the archive. Raises ``UnavailableError``."""
+def _checked_archive(path: Path, settings: Settings) -> SubmissionMeta:
+    """Return the content of ``submission.json`` with the method's name normalised.
+
+    Raises ``SubmissionError`` with the problems of the archive, and ``UnavailableError``.
+    """
     for _ in range(2):  # A process that was killed from outside says nothing about the archive.
         try:
-            return call_isolated(
-                *(check, path, settings.data), memory=settings.score_memory, time_limit_s=settings.check_time
+            meta = call_isolated(
+                check, path, settings.data, memory=settings.score_memory, time_limit_s=settings.check_time
             )
         except TimeLimitError:
-            return (Problem("size", "", f"the check took longer than {settings.check_time:g} s"),)
+            raise archive_error("size", f"the check took longer than {settings.check_time:g} s") from None
         except ProcessEndedError as error:
             _LOG.error("checking process ended", status=error.status)
             if not error.was_killed:
                 break
-    return (Problem("damaged", "", "the archive cannot be read: the process that reads it crashed"),)
-
-
-def _checked_name(verdict: SubmissionMeta | Problems) -> SubmissionMeta | Problems:
-    """Return the verdict with the method's name normalised, or the problem of this name."""
-    if not isinstance(verdict, SubmissionMeta):
-        return verdict
-    method = normalised(verdict.method)
-    if problem := name_problem(method):
-        return (Problem("invalid", "submission.json: method", problem, "visible characters"),)
-    return verdict.model_copy(update={"method": method})
+        else:
+            method = normalised(meta.method)
+            if problem := name_problem(method):
+                raise archive_error("invalid", problem, "submission.json: method", "visible characters")
+            return meta.model_copy(update={"method": method})
+    raise archive_error("damaged", "the archive cannot be read: the process that reads it crashed")
 
 
 def _check_quota(service: Service, token: TokenModel) -> None:

@@ -1,12 +1,12 @@
-"""Multipart form of an upload, read as a stream: its token and its archive; and the rejection of an upload."""
+"""Multipart form of an upload, read as a stream: its token and its archive."""
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Sequence
+from collections.abc import AsyncIterator
 
 from multipart import MultipartError, MultipartSegment, PushMultipartParser, parse_options_header
 
-from rebar_depth_bench.errors import Problem
+from leaderboard.refusals import RefusedError
 
 ARCHIVE_FIELD, TOKEN_FIELD = "archive", "token"
 MAX_FIELD_BYTES = 1 << 10
@@ -15,27 +15,10 @@ MAX_OVERHEAD_BYTES = 64 << 10
 """Maximum size in bytes of everything in the body except the content of the archive."""
 
 
-class UploadRejectedError(Exception):
-    """Raised when an upload is rejected.
-
-    Holds the HTTP status, the detail message and, for status 422 only, all problems.
-    """
-
-    def __init__(self, status: int, detail: str, problems: Sequence[Problem] = ()) -> None:
-        self.status, self.detail = status, detail
-        self.problems = (problems or (Problem("syntax", "", detail),)) if status == 422 else ()
-        super().__init__(detail)
-
-
-def too_large(max_bytes: int) -> UploadRejectedError:
-    """Return the rejection of an archive of more than ``max_bytes`` bytes."""
-    return UploadRejectedError(413, f"the archive is larger than {max_bytes} bytes, the limit of this service")
-
-
 class UploadForm:
     """Reader of a form whose field ``archive`` is consumed as a stream.
 
-    Raises ``UploadRejectedError`` (422) for a body that is not valid multipart, lacks the field, has it twice or
+    Raises ``RefusedError`` (422) for a body that is not valid multipart, lacks the field, has it twice or
     has too much else.
     """
 
@@ -59,7 +42,7 @@ class UploadForm:
             if name == ARCHIVE_FIELD and content:
                 yield content
         if not self._archives:
-            raise UploadRejectedError(422, f"the body has no field {ARCHIVE_FIELD!r}, expected a zip file in it")
+            raise RefusedError(422, f"the body has no field {ARCHIVE_FIELD!r}, expected a zip file in it")
 
     async def _parse(self, boundary: str) -> AsyncIterator[tuple[str, bytes]]:
         """Yield the name of a field and its content in parts, of which the first is empty."""
@@ -78,13 +61,13 @@ class UploadForm:
                             yield name, bytes(event)
                     self._check()
         except MultipartError as error:
-            raise UploadRejectedError(422, f"the body is not valid multipart/form-data: {error}") from None
+            raise RefusedError(422, f"the body is not valid multipart/form-data: {error}") from None
 
     def _check(self) -> None:
         if self._archives > 1:
-            raise UploadRejectedError(422, f"the body has the field {ARCHIVE_FIELD!r} twice, expected once")
+            raise RefusedError(422, f"the body has the field {ARCHIVE_FIELD!r} twice, expected once")
         if self._overhead > MAX_OVERHEAD_BYTES:  # Including preamble and epilogue.
-            raise UploadRejectedError(
+            raise RefusedError(
                 422, f"the body has more than {MAX_OVERHEAD_BYTES} bytes outside the field {ARCHIVE_FIELD!r}"
             )
 
@@ -93,7 +76,7 @@ def _boundary_of(content_type: str) -> str:
     kind, options = parse_options_header(content_type)
     boundary = options.get("boundary")
     if kind != "multipart/form-data" or not boundary:
-        raise UploadRejectedError(
+        raise RefusedError(
             422, f"the content type is {content_type!r}, expected multipart/form-data with a boundary"
         )
     return str(boundary)

@@ -14,8 +14,8 @@ from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import ClientDisconnect
 
 from leaderboard.db.engine import DATABASE_UNAVAILABLE
+from leaderboard.refusals import RefusedError
 from leaderboard.service import Service
-from leaderboard.uploads.multipart import UploadRejectedError
 from leaderboard.web.api import leaderboard, status, submissions
 from leaderboard.web.api.schemas import DATABASE_UNAVAILABLE_MESSAGE
 from leaderboard.web.cache import CacheMiddleware
@@ -58,9 +58,9 @@ def make_app(service: Service) -> FastAPI:
     for router in (submissions, leaderboard, status, board, submission, submit, account, static):
         app.include_router(router.router)
     identity = f"{software_version()} {service.folder.digest} {settings.model_dump_json()}"
-    app.add_middleware(CacheMiddleware, versions=service.versions, identity=identity)
-    # Outside the cache, whose responses are compressed already.
+    # Inside the cache, so that a kept response is compressed once.
     app.add_middleware(GZipMiddleware, minimum_size=_MIN_GZIP_BYTES, compresslevel=5)
+    app.add_middleware(CacheMiddleware, database=service.database, identity=identity)
     if host := urlsplit(settings.public_url).hostname:
         app.add_middleware(TrustedHostMiddleware, allowed_hosts=[host, *_LOCAL_HOSTS], www_redirect=False)
     app.add_middleware(
@@ -70,7 +70,7 @@ def make_app(service: Service) -> FastAPI:
     )
     app.add_middleware(EarlyResponseMiddleware)
     app.add_exception_handler(HTTPException, _handle_http_exception)
-    app.add_exception_handler(UploadRejectedError, _handle_rejected_upload)
+    app.add_exception_handler(RefusedError, _handle_refusal)
     app.add_exception_handler(ClientDisconnect, _handle_client_disconnect)
     for error_type in DATABASE_UNAVAILABLE:
         app.add_exception_handler(error_type, _handle_database_unavailable)
@@ -78,8 +78,8 @@ def make_app(service: Service) -> FastAPI:
     return app
 
 
-async def _handle_rejected_upload(request: Request, error: Exception) -> Response:
-    assert isinstance(error, UploadRejectedError)
+async def _handle_refusal(request: Request, error: Exception) -> Response:
+    assert isinstance(error, RefusedError)
     headers = {"Retry-After": "60"} if error.status == 503 else None
     return error_response(request, error.status, error.detail, headers, error.problems)
 

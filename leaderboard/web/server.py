@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import socket
 import sys
+from ipaddress import ip_address
 
 import structlog
 import uvicorn
@@ -45,6 +46,9 @@ def serve(settings: Settings) -> None:
         host, port = listener.getsockname()[:2]
         url_host = f"[{host}]" if ":" in host else host
         print(f"http://{url_host}:{port}", file=sys.stderr, flush=True)
+        if not (settings.public_url or ip_address(host.partition("%")[0]).is_loopback):
+            risk = "tokens are sent without TLS, and every Host header is accepted"
+            _LOG.warning(f"{risk}: set public_url, and run a proxy with TLS before the service", host=host)
         server = uvicorn.Server(config)
         # While pages are rendered in threads, the event loop gets the interpreter back after this time.
         sys.setswitchinterval(_SWITCH_INTERVAL_S)

@@ -6,7 +6,7 @@ import math
 import re
 import statistics
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal, get_args
 from urllib.parse import urlsplit
 
 from pydantic import ConfigDict
@@ -60,7 +60,8 @@ _Parameters = Annotated[
 ]
 
 
-INPUTS = ("rgb", "rgb+K", "stereo", "multi-view", "lidar")
+InputClass = Literal["rgb", "rgb+K", "stereo", "multi-view", "lidar"]
+INPUTS: tuple[str, ...] = get_args(InputClass)
 """Input classes of methods, within which submissions are ranked too."""
 
 

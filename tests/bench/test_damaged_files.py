@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 pytest.importorskip("cv2")
-pytest.importorskip("pydantic_settings")
+pytest.importorskip("sqlalchemy")
 
 import numpy as np
 from PIL import Image

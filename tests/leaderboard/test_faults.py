@@ -50,7 +50,7 @@ def kill_everywhere(
 def change_and_die(settings: Settings, submission_id: str) -> None:
     """Change a row of a backup, as a server that is killed does: the change is in the write-ahead log only."""
     with opened(settings) as (database, _):
-        submissions.change(database, submission_id, {"description": "changed in the backup"})
+        submissions.change(database, submission_id, {"reason": "changed in the backup"})
         os.kill(os.getpid(), signal.SIGKILL)
 
 
@@ -90,7 +90,7 @@ def test_killed_backup_is_whole_and_can_be_repeated(tmp_path: Path, prune: bool)
         assert others == []
         if found == earlier:
             with closing(sqlite3.connect(target / "leaderboard.sqlite.1")) as former:
-                query = "SELECT description FROM submissions WHERE id = ?"
+                query = "SELECT reason FROM submissions WHERE id = ?"
                 assert former.execute(query, (kept,)).fetchone() == ("changed in the backup",)
 
     kill_everywhere(back_up, check, prepare)

@@ -126,7 +126,7 @@ def test_concurrent_migrations_succeed(url: str, engine: Engine) -> None:
 @pytest.mark.parametrize(
     ("change", "found"),
     [
-        ("UPDATE alembic_version SET version_num = '0002'", "the schema of revision 0002"),
+        ("UPDATE alembic_version SET version_num = '0003'", "the schema of revision 0003"),
         ("DELETE FROM alembic_version", "a schema without a revision"),
         ("DROP TABLE alembic_version", "a schema without a revision"),
     ],
@@ -137,7 +137,7 @@ def test_database_of_another_revision_is_refused(url: str, engine: Engine, chang
         connection.exec_driver_sql(change)
     with closing(Database(url)) as database:
         for use in (database.migrate, database.check_schema):
-            with pytest.raises(InputError, match=f"the database has {found}, expected 0003, or a new database"):
+            with pytest.raises(InputError, match=f"the database has {found}, expected 0004, or a new database"):
                 use()
     with engine.connect() as connection:
         tables = inspect(connection).get_table_names()
@@ -153,4 +153,4 @@ def test_tables_of_other_programs_are_left_alone(url: str, engine: Engine) -> No
 
 def test_migrations_have_one_base() -> None:
     scripts = ScriptDirectory(str(MIGRATIONS))
-    assert (scripts.get_heads(), scripts.get_bases()) == (["0003"], ["0003"])
+    assert (scripts.get_heads(), scripts.get_bases()) == (["0004"], ["0004"])

@@ -123,7 +123,7 @@ def test_responses_match_openapi_document(
     # Without a token no submission exists for stateful tests.
     phases = ALL_PHASES if who == "token" else ("coverage",)
     output = fuzz(server, hooks, tmp_path, tokens.get(who), repetitions(4, 30), *phases)
-    assert re.search(r"Operations: +11 selected / 11 total", output)
+    assert re.search(r"Operations: +12 selected / 12 total", output)
     new_responses = api_responses(server.log[num_lines_before:])
     assert new_responses >= EXPECTED[who]
     assert not any(status >= "500" for _, status in new_responses)

@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 from leaderboard.db.engine import Database
 from leaderboard.db.models import LeaderboardRowModel, ResultModel, SubmissionModel, TokenModel
 from leaderboard.db.rankings import LeaderboardEntry, Ranking, queue_position, read_ranking
-from leaderboard.uploads.multipart import MAX_FIELD_BYTES, UploadForm, UploadRejectedError
+from leaderboard.refusals import RefusedError
+from leaderboard.uploads.multipart import MAX_FIELD_BYTES, UploadForm
 from leaderboard.web.pages.leaderboard import make_config_ranking
 from leaderboard.web.pages.rendering import clean_text, error_response, format_size, link_html, time_html
 from leaderboard.web.pages.selection import COLUMNS, RANK, Selection, parse_selection
@@ -253,16 +254,16 @@ def test_token_after_the_archive_or_too_long_is_empty(parts: list[tuple[str, byt
 
 
 def test_form_without_or_with_two_archives_is_rejected() -> None:
-    with pytest.raises(UploadRejectedError, match="no field 'archive'"):
+    with pytest.raises(RefusedError, match="no field 'archive'"):
         read_form(multipart_body(("token", b"x")), 10)
-    with pytest.raises(UploadRejectedError, match="twice"):
+    with pytest.raises(RefusedError, match="twice"):
         read_form(multipart_body(("archive", b"a"), ("archive", b"b")), 10)
 
 
 def test_non_multipart_body_is_rejected() -> None:
-    with pytest.raises(UploadRejectedError, match="expected multipart/form-data"):
+    with pytest.raises(RefusedError, match="expected multipart/form-data"):
         read_form(b"{}", 10, "application/json")
-    with pytest.raises(UploadRejectedError, match="not valid multipart/form-data"):
+    with pytest.raises(RefusedError, match="not valid multipart/form-data"):
         read_form(b"hello", 10)
 
 

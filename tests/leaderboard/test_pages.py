@@ -204,6 +204,12 @@ def test_overview_orders_by_the_mean_over_configs(board: SharedServer) -> None:
         assert f'<td class="first">{mean:.4f}</td>' in line[: line.index("</tr>")]
     assert board.ids["far"] not in errors["lattice-orbit"], "a config that is missing counts 1"
     assert means[board.ids["far"]] > 0.5
+    overall = httpx2.get(f"{board.url}/api/v1/overall").json()["rows"]
+    assert [row["id"] for row in overall] == shown
+    assert {row["id"]: row["mean_rank_error"] for row in overall if row["rank"]} == pytest.approx(means)
+    assert all(
+        row["rank_errors"][config] == errors[config].get(row["id"]) for row in overall for config in CONFIGS
+    )
 
 
 def test_comparison_page_shows_the_numbers_of_the_command_line(board: SharedServer) -> None:

@@ -192,6 +192,15 @@ def proxied(
         yield started
 
 
+def test_host_of_other_machines_without_public_url_is_warned_of(
+    proxied: Server, tiny_root: Path, tmp_path: Path, running_server: RunServer
+) -> None:
+    assert not any("without TLS" in line for line in proxied.log)
+    with running_server(tiny_root, tmp_path / "state", workers=0, host="0.0.0.0") as server:
+        httpx2.get(f"{server.url}/healthz")
+        assert any("tokens are sent without TLS" in line for line in server.log)
+
+
 def test_public_url_is_used_whatever_the_client_says(proxied: Server, write_archive: WriteArchive) -> None:
     archive = write_archive("linked", configs=("lattice-orbit",))
     response = proxied.submit(archive, proxied.token("alice"))

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from leaderboard.db import view_errors as view_errors_module
-from leaderboard.db.view_errors import rank_ranges, unpack_view_errors, view_errors
+from leaderboard.db.view_errors import rank_ranges, view_errors
 from rebar_depth_bench.scoring.bootstrap import interval, resample
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.result import Result
@@ -96,8 +97,4 @@ def test_rows_without_view_errors_or_with_other_views_have_no_range() -> None:
     assert rank_ranges([*packed, None])[2:] == [None, None]
     assert rank_ranges(packed)[:2] == [(1, 2), (1, 2)]
     assert rank_ranges(packed[:1]) == [None]
-    indices, errors = unpack_view_errors(packed[2] or b"")
-    assert (np.frombuffer(indices, "<i4").tolist(), errors.tolist()) == (
-        [0],
-        [pytest.approx(part.views[0].rank_error)],
-    )
+    assert json.loads(packed[2] or "") == [["lattice/0000"], [part.to_dict()["views"][0]["rank_error"]]]

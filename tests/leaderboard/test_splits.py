@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import rebar_depth_bench as rdb
-from leaderboard.scoring.sandbox import Outcome, check, score
+from leaderboard.scoring.sandbox import check, score
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.submission import SubmissionMeta
+from rebar_depth_bench.errors import SubmissionError
 from tests.synthetic_dataset import write_split_dataset
 
 
@@ -30,20 +30,19 @@ def write_archive(root: Path, archive: Path, split: str) -> Path:
 
 @pytest.mark.slow
 def test_only_the_split_test_is_accepted(root: Path, tmp_path: Path) -> None:
-    refused = check(write_archive(root, tmp_path / "train.zip", "train"), str(root))
-    assert isinstance(refused, tuple)
-    [problem] = refused
+    with pytest.raises(SubmissionError) as refused:
+        check(write_archive(root, tmp_path / "train.zip", "train"), str(root))
+    [problem] = refused.value.problems
     assert (problem.code, problem.where) == ("conflict", "cages")
     assert "split train" in str(problem)
     accepted = check(write_archive(root, tmp_path / "test.zip", "test"), str(root))
-    assert isinstance(accepted, SubmissionMeta)
+    assert accepted.method == "exact"
 
 
 @pytest.mark.slow
 def test_scored_archive_has_the_groups_of_the_command_line(root: Path, tmp_path: Path) -> None:
     archive = write_archive(root, tmp_path / "test.zip", "test")
     outcome = score(archive, str(root), open_folder(root).digest, 0, False)
-    assert isinstance(outcome, Outcome)
     expected = rdb.score(archive, root).to_json()
     assert outcome.result == expected
     assert list(json.loads(expected)["tables"]["cages"]["groups"]["family"]) == ["wall"]

@@ -2,14 +2,22 @@
 
 from __future__ import annotations
 
+import ast
 import os
 import re
 import subprocess
 import sys
+import tomllib
+from importlib import metadata
 from importlib.util import find_spec
+from itertools import chain
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+PACKAGES = ("cards", "dataset_builder", "leaderboard", "rebar_depth_bench")
 
 SCORING_IMPORTS = (
     "import rebar_depth_bench as rdb; rdb.score; rdb.load; rdb.SubmissionWriter; "
@@ -116,6 +124,29 @@ def test_unknown_name_raises_attribute_error() -> None:
 
     with pytest.raises(AttributeError, match="has no attribute 'lod'"):
         rebar_depth_bench.lod  # noqa: B018
+
+
+_IN_BLENDER = {"_cycles", "mathutils"}
+"""Modules that come with bpy."""
+
+
+def test_every_imported_package_is_declared() -> None:
+    root = Path(__file__).parents[2]
+    imported = set[str]()
+    for path in (path for package in PACKAGES for path in (root / package).rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.Import):
+                imported |= {alias.name.partition(".")[0] for alias in node.names}
+            elif isinstance(node, ast.ImportFrom) and node.level == 0:
+                imported.add((node.module or "").partition(".")[0])
+    project = tomllib.loads((root / "pyproject.toml").read_text())["project"]
+    requirements = [*project["dependencies"], *chain(*project["optional-dependencies"].values())]
+    declared = {canonicalize_name(Requirement(text).name) for text in requirements}
+    distributions = metadata.packages_distributions()
+    others = imported - set(sys.stdlib_module_names) - set(PACKAGES) - _IN_BLENDER
+    found = {name: {canonicalize_name(one) for one in distributions.get(name, [name])} for name in others}
+    assert len(found) > 20
+    assert sorted(name for name, of_name in found.items() if not of_name & declared) == []
 
 
 def test_packages_without_which_tests_are_skipped_are_installed() -> None:

@@ -1,22 +1,31 @@
-"""Endpoints ``/api/v1/leaderboard`` (JSON) and ``/api/v1/leaderboard.csv``: the rows of a config."""
+"""Endpoints of rows: those of a config (``leaderboard``, JSON and CSV), and those of all configs (``overall``)."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Annotated
 
-from fastapi import APIRouter, HTTPException, Query, Response
+from fastapi import APIRouter, Query, Response
 
 from leaderboard.db.models import TokenModel
-from leaderboard.db.rankings import LeaderboardEntry
+from leaderboard.db.rankings import LeaderboardEntry, overall_ranking
 from leaderboard.service import Service
-from leaderboard.web.api.auth import WITHOUT_TOKEN, OptionalToken, ServiceDep
-from leaderboard.web.api.schemas import Leaderboard, LeaderboardRow, Responses, errors
+from leaderboard.web.api.schemas import (
+    Leaderboard,
+    LeaderboardRow,
+    OverallRanking,
+    OverallRow,
+    Responses,
+    SubmissionOfRow,
+    errors,
+)
 from leaderboard.web.cache import NO_STORE, REVALIDATE
+from leaderboard.web.dependencies import WITHOUT_TOKEN, OptionalToken, ServiceDep, check_config
 from rebar_depth_bench.scoring.columns import TABLE_COLUMNS
 from rebar_depth_bench.scoring.frames import csv_text
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.scoring.result import DisclosedTable
+from rebar_depth_bench.submission.declaration import InputClass
 
 
 def entries_to_csv(rows: Sequence[LeaderboardEntry], hidden_truth: bool = False) -> str:
@@ -49,7 +58,7 @@ ConfigName = Annotated[str, Query(max_length=100, description="name of the confi
 _ERROR_RESPONSES = errors(401, 404, 422)
 _CSV_RESPONSE: Responses = {200: {"content": {"text/csv": {"schema": {"type": "string"}}}}}
 InputsQuery = Annotated[
-    Literal["rgb", "rgb+K", "stereo", "multi-view", "lidar"] | None,
+    InputClass | None,
     Query(description="only the rows that declare this input class"),
 ]
 
@@ -79,11 +88,28 @@ def leaderboard_csv(
     return _response(entries_to_csv(rows, service.settings.hidden_truth), CSV, token)
 
 
+@router.get("/overall", response_model=OverallRanking)
+def overall(service: ServiceDep) -> Response:
+    """Return the public submissions in order of their mean rank error over all configs, as the pages show them."""
+    configs = service.folder.configs
+    entries = overall_ranking([(config, service.rankings.of(config)) for config in configs])
+    rows = [
+        OverallRow(
+            rank=one.rank,
+            mean_rank_error=one.mean,
+            rank_errors={name: one.entries[name].rank_error if name in one.entries else None for name in configs},
+            **{name: getattr(one.first, name) for name in SubmissionOfRow.model_fields},
+        )
+        for one in entries
+    ]
+    dataset = {"digest": service.folder.digest, "version": service.folder.version}
+    content = OverallRanking(protocol=PROTOCOL, dataset=dataset, rows=rows)
+    return _response(content.model_dump_json(), "application/json", None)
+
+
 def _rows(service: Service, config: str, inputs: str | None, token: TokenModel | None) -> list[LeaderboardEntry]:
     """Return the rows with declared ``inputs`` (None: all). Raises status 404 for an unknown config."""
-    if config not in service.folder.configs:
-        known = ", ".join(service.folder.configs)
-        raise HTTPException(404, f"the dataset has no config {config!r}, expected one of {known}")
+    check_config(service, config)
     return service.rankings.of(config, token).of_class(inputs)
 
 

@@ -11,10 +11,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from leaderboard.db.models import SubmissionModel
-from leaderboard.db.submissions import SCORED
 from rebar_depth_bench.errors import Problem
-from rebar_depth_bench.submission.declaration import MethodDetails
 
 _ID = "5f0c9a7e2b4d4c1f8e6a3d2b1c0f9e8d"
 _PROBLEM = Problem("invalid", "lattice/0042.npy", "the dtype is <i4", "float16, float32 or float64")
@@ -117,29 +114,11 @@ class Token(BaseModel):
     write_rate_limit: str = Field(examples=["60/minute"])
 
 
-class SubmissionChange(MethodDetails):
-    """Change of a submission: its visibility on the leaderboard and what is said about the method.
-
-    Values that are absent stay; null removes a value. Declarations and scores cannot be changed.
-    """
-
-    model_config = ConfigDict(
-        extra="forbid", strict=True, defer_build=False, json_schema_extra={"example": {"public": True}}
-    )
-
-    public: bool = False
-
-
-class LeaderboardRow(BaseModel):
-    """Leaderboard row; ``table`` is the table of the config in the result JSON of the submission."""
+class SubmissionOfRow(BaseModel):
+    """What a row states of its submission."""
 
     model_config = ConfigDict(from_attributes=True)
 
-    rank: int | None = Field(description="rank by rank error, shared by equal errors; null if not ranked")
-    rank_range: tuple[int, int] | None = Field(
-        description="first and last rank that the paired 95 % differences of the rank error allow"
-    )
-    class_rank: int | None = Field(description="rank among the rows with the same declared inputs")
     id: str
     method: str
     submitter: str
@@ -148,6 +127,16 @@ class LeaderboardRow(BaseModel):
     uses_ground_truth: bool | None = Field(description="as declared; such rows are not ranked")
     created_at: datetime
     public: bool
+
+
+class LeaderboardRow(SubmissionOfRow):
+    """Leaderboard row; ``table`` is the table of the config in the result JSON of the submission."""
+
+    rank: int | None = Field(description="rank by rank error, shared by equal errors; null if not ranked")
+    rank_range: tuple[int, int] | None = Field(
+        description="first and last rank that the paired 95 % differences of the rank error allow"
+    )
+    class_rank: int | None = Field(description="rank among the rows with the same declared inputs")
     table: dict[str, Any]
 
 
@@ -160,12 +149,20 @@ class Leaderboard(BaseModel):
     rows: list[LeaderboardRow]
 
 
-def outdated_note(record: SubmissionModel, dataset_digest: str) -> str | None:
-    """Return why a result is not of the dataset with ``dataset_digest``, or None if it is."""
-    if record.status != SCORED or record.dataset_digest == dataset_digest:
-        return None
-    reason = "its archive is not kept, so that it is neither scored against the present dataset nor ranked"
-    return f"the result belongs to the dataset {record.dataset_digest}; {reason}"
+class OverallRow(SubmissionOfRow):
+    """A submission and its mean rank error over all configs; a config that it lacks, null, counts 1."""
+
+    rank: int | None = Field(description="rank by mean rank error, shared by equal errors; null if not ranked")
+    mean_rank_error: float
+    rank_errors: dict[str, float | None] = Field(description="rank error by config")
+
+
+class OverallRanking(BaseModel):
+    """Submissions by mean rank error, ranked ones first."""
+
+    protocol: str
+    dataset: dict[str, str]
+    rows: list[OverallRow]
 
 
 Responses = dict[int | str, dict[str, Any]]

@@ -8,9 +8,9 @@ from fastapi import APIRouter
 from fastapi.responses import JSONResponse
 
 from leaderboard.db.submissions import quota_used
-from leaderboard.service import service_problems
-from leaderboard.web.api.auth import RequiredToken, ServiceDep
+from leaderboard.health import service_problems
 from leaderboard.web.api.schemas import Token, errors
+from leaderboard.web.dependencies import RequiredToken, ServiceDep
 from rebar_depth_bench import software_version
 
 router = APIRouter()

@@ -6,30 +6,37 @@ The docstrings of the endpoints are part of the OpenAPI document.
 from __future__ import annotations
 
 import json
-from typing import Annotated, Any
+from typing import Any
 
-from fastapi import APIRouter, HTTPException, Path, Request, Response
+from fastapi import APIRouter, HTTPException, Request, Response
 
-from leaderboard.db import submissions
-from leaderboard.db.models import SubmissionModel, TokenModel
-from leaderboard.service import Service
-from leaderboard.storage.retention import delete_archives
-from leaderboard.uploads.accept import accept_upload
-from leaderboard.uploads.multipart import MAX_OVERHEAD_BYTES, UploadForm, too_large
-from leaderboard.web.api.auth import WITHOUT_TOKEN, OptionalToken, RequiredToken, ServiceDep, service_of
-from leaderboard.web.api.schemas import (
-    Responses,
-    Submission,
+from leaderboard.changes import (
     SubmissionChange,
-    SubmissionList,
-    errors,
+    delete_submission,
+    edit_submission,
+    get_own_submission,
+    get_submission,
     outdated_note,
 )
+from leaderboard.db import submissions
+from leaderboard.db.models import SubmissionModel
+from leaderboard.uploads.accept import accept_upload
+from leaderboard.uploads.multipart import UploadForm
+from leaderboard.web.api.schemas import Responses, Submission, SubmissionList, errors
+from leaderboard.web.dependencies import (
+    MAX_PATCH_BYTES,
+    WITHOUT_TOKEN,
+    OptionalToken,
+    RequiredToken,
+    ServiceDep,
+    SubmissionId,
+    check_length,
+    page_url,
+    service_of,
+)
 
-MAX_PATCH_BYTES = 32 << 10
 router = APIRouter(prefix="/api/v1/submissions", tags=["submissions"], responses=errors(429, 503))
 
-SubmissionId = Annotated[str, Path(min_length=1, max_length=32, pattern=r"^[A-Za-z0-9_-]+$")]
 _BINARY = {"type": "string", "format": "binary"}
 _UPLOAD_REQUEST_BODY = {
     "requestBody": {
@@ -138,35 +145,6 @@ def delete(submission_id: SubmissionId, service: ServiceDep, token: RequiredToke
     delete_submission(service, get_own_submission(service, submission_id, token))
 
 
-def edit_submission(service: Service, record: SubmissionModel, change: SubmissionChange) -> None:
-    """Make the owner's change of a submission. Raises status 403 if the visibility cannot be changed."""
-    values = change.model_dump(include=change.model_fields_set)
-    if values.get("public") is False and service.settings.default_visibility == "always":
-        raise HTTPException(403, "every submission of this leaderboard is public")
-    columns: dict[str, Any] = {
-        name: values.pop(name) for name in ("public", "description", "url") if name in values
-    }
-    details = {**json.loads(record.details), **values}
-    columns["details"] = json.dumps({name: value for name, value in details.items() if value is not None})
-    submissions.change(service.database, record.id, columns)
-
-
-def delete_submission(service: Service, record: SubmissionModel) -> None:
-    """Delete a submission, its archive and its results."""
-    submissions.remove(service.database, record.id)
-    delete_archives(service.archives, [record.id])
-
-
-def check_length(request: Request) -> None:
-    """Raise ``UploadRejectedError`` (413) if the body is declared to be larger than that of any upload.
-
-    A client that waits for 100 Continue then sends nothing of it.
-    """
-    length, max_upload = request.headers.get("content-length", ""), service_of(request).settings.max_upload
-    if length.isdecimal() and int(length) > max_upload + MAX_OVERHEAD_BYTES:
-        raise too_large(max_upload)
-
-
 def _accepted(request: Request, response: Response, accepted: tuple[SubmissionModel, bool]) -> Submission:
     record, is_new = accepted
     response.status_code = 202 if is_new else 200
@@ -175,38 +153,15 @@ def _accepted(request: Request, response: Response, accepted: tuple[SubmissionMo
 
 
 def _schema(request: Request, record: SubmissionModel, result: dict[str, Any] | None = None) -> Submission:
+    details = json.loads(record.details)
     return Submission.model_validate(
         {
             **{column.key: getattr(record, column.key) for column in SubmissionModel.__table__.columns},
-            **json.loads(record.details),
+            **details,
             "url": page_url(request, record),
-            "method_url": record.url,
+            "method_url": details.get("url"),
             "archive_kept": record.archive_deleted_at is None,
             "outdated": outdated_note(record, service_of(request).folder.digest),
             "result": result,
         }
     )
-
-
-def get_submission(service: Service, submission_id: str) -> SubmissionModel:
-    """Return the row of a submission. Raises status 404 if it does not exist."""
-    record = submissions.find(service.database, submission_id)
-    if record is None:
-        raise HTTPException(404, "no such submission")
-    return record
-
-
-def get_own_submission(service: Service, submission_id: str, token: TokenModel) -> SubmissionModel:
-    """Return the row of a submission. Raises status 404 if it does not exist, 403 if another token owns it."""
-    record = get_submission(service, submission_id)
-    if record.token_id != token.id:
-        raise HTTPException(403, "you are not the owner of this submission")
-    return record
-
-
-def page_url(request: Request, record: SubmissionModel) -> str:
-    """Return the URL of a submission's page, below the public URL if the settings have one."""
-    url = service_of(request).settings.public_url
-    if url:
-        return f"{url}/submissions/{record.id}"
-    return str(request.url_for("submission_page", submission_id=record.id))

@@ -12,29 +12,25 @@ from typing import Any
 from urllib.parse import parse_qsl
 
 from anyio import to_thread
-from fastapi import APIRouter, HTTPException, Request
+from fastapi import APIRouter, Request
 from fastapi.responses import HTMLResponse
 from pydantic import ValidationError
 
+from leaderboard.changes import SubmissionChange, delete_submission, edit_submission, get_own_submission
 from leaderboard.db import submissions
 from leaderboard.db.models import TokenModel
 from leaderboard.db.tokens import find_token
+from leaderboard.refusals import RefusedError
 from leaderboard.service import Service
-from leaderboard.web.api.auth import ServiceDep
-from leaderboard.web.api.schemas import SubmissionChange
-from leaderboard.web.api.submissions import (
-    MAX_PATCH_BYTES,
-    delete_submission,
-    edit_submission,
-    get_own_submission,
-)
 from leaderboard.web.cache import NO_STORE
+from leaderboard.web.dependencies import MAX_PATCH_BYTES, ServiceDep
 from leaderboard.web.pages.rendering import render
 from rebar_depth_bench.errors import printable
+from rebar_depth_bench.submission.declaration import MethodDetails
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
-EDITABLE = ("description", "url", "code_url", "licence", "training_data", "parameters")
+EDITABLE = tuple(MethodDetails.model_fields)
 
 
 @router.get("/account", name="account_page")
@@ -70,10 +66,7 @@ async def account(request: Request, service: ServiceDep) -> HTMLResponse:
         token=text,
         name=token.name,
         message=message,
-        own=[
-            (record, {"description": record.description, "url": record.url, **json.loads(record.details)})
-            for record in records
-        ],
+        own=[(record, json.loads(record.details)) for record in records],
         editable=EDITABLE,
     )
 
@@ -89,8 +82,8 @@ def _change(service: Service, token: TokenModel, fields: Mapping[str, str]) -> t
             delete_submission(service, record)
             return 200, f"{printable(record.method)} is deleted."
         edit_submission(service, record, _change_of(action, fields))
-    except HTTPException as error:
-        return error.status_code, f"Not changed: {error.detail}."
+    except RefusedError as error:
+        return error.status, f"Not changed: {error.detail}."
     except ValidationError as error:
         wrong = "; ".join(f"{'.'.join(map(str, one['loc']))}: {one['msg']}" for one in error.errors())
         return 422, f"Not changed: {printable(wrong, 500)}."
@@ -102,6 +95,6 @@ def _change_of(action: str, fields: Mapping[str, str]) -> SubmissionChange:
     if action in ("publish", "withdraw"):
         return SubmissionChange(public=action == "publish")
     if action != "edit":
-        raise HTTPException(422, "there is no such action")
+        raise RefusedError(422, "there is no such action")
     values: dict[str, Any] = {name: fields[name].strip() or None for name in EDITABLE if name in fields}
     return SubmissionChange.model_validate(values)

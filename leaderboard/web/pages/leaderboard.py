@@ -11,13 +11,12 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Annotated
 
-from fastapi import APIRouter, HTTPException, Query, Request
+from fastapi import APIRouter, Query, Request
 from fastapi.responses import HTMLResponse
 from markupsafe import Markup
 
-from leaderboard.db.rankings import LeaderboardEntry, Ranking
-from leaderboard.db.versions import CurrentRankings
-from leaderboard.web.api.auth import ServiceDep
+from leaderboard.db.rankings import CurrentRankings, LeaderboardEntry, OverallEntry, Ranking, overall_ranking
+from leaderboard.web.dependencies import ServiceDep, check_config
 from leaderboard.web.pages.rendering import MAX_INTERVALS_PLOTTED, render
 from leaderboard.web.pages.selection import (
     NATIVE,
@@ -50,9 +49,7 @@ _PageQuery = Annotated[int | None, Query(ge=1, le=1_000_000)]
 _FIRST_ROWS, _FIRST_PLOTTED = 10, 300
 """Rows and plotted points per config on the page of several configs, which links to the full rankings."""
 _CACHED_ROWS = 4096
-MISSING_ERROR = 1.0
-"""Rank error that counts where a submission lacks a config: that of no prediction at all."""
-_DECIMALS, _SIGNIFICANT_DIGITS = 4, 12
+_DECIMALS = 4
 DISCLOSED_COLUMNS = (replace(RANK_ERROR, decimals=DISCLOSED_DECIMALS), COVERAGE)
 """Columns of the numbers that are shown if the ground truth is hidden."""
 
@@ -72,8 +69,8 @@ def leaderboard_page(
     The other parameters are those of ``parse_selection``.
     """
     all_configs, rankings = service.folder.configs, service.rankings
-    if config is not None and config not in all_configs:
-        raise HTTPException(404, f"the dataset has no config {config!r}, expected one of {', '.join(all_configs)}")
+    if config is not None:
+        check_config(service, config)
     configs = all_configs if config is None else (config,)
     selection = parse_selection(sort, inputs, q, page)
     several, hidden_truth = len(configs) > 1, service.settings.hidden_truth
@@ -209,61 +206,24 @@ def _published(tables: Sequence[Table]) -> tuple[list[PaperRow], str]:
 
 
 @dataclass(frozen=True)
-class OverviewLine:
-    """A submission, its mean rank error over all configs, and its entries by config; ``rank`` None: not ranked."""
-
-    mean: float
-    entries: dict[str, LeaderboardEntry]
-    rank: int | None = None
-
-    @property
-    def first(self) -> LeaderboardEntry:
-        """An entry of the submission."""
-        return next(iter(self.entries.values()))
-
-    @property
-    def is_ranked(self) -> bool:
-        """Whether the submission is ranked in any config."""
-        return any(entry.rank is not None for entry in self.entries.values())
-
-
-@dataclass(frozen=True)
 class Overview:
     """Rows of a page of the overview, the number of rows that pass the filters, and the decimals of errors."""
 
     selection: Selection
     row_count: int
     pages: int
-    lines: Sequence[OverviewLine]
+    lines: Sequence[OverallEntry]
     decimals: int
 
 
 def make_overview(
     rankings: CurrentRankings, configs: Sequence[str], selection: Selection, hidden_truth: bool
 ) -> Overview:
-    """Return the overview, ordered by the mean rank error over ``configs``.
-
-    A config that a submission lacks counts ``MISSING_ERROR``; results of different submissions are not combined.
-    """
-    by_id: dict[str, dict[str, LeaderboardEntry]] = {}
-    for config in configs:
-        for entry in rankings.of(config).entries:
-            by_id.setdefault(entry.id, {})[config] = entry
-    all_lines = [OverviewLine(_mean_error(entries, configs), entries) for entries in by_id.values()]
-    ranked = [line for line in all_lines if line.is_ranked]
-    ranked.sort(key=lambda line: (line.mean, line.first.created_at))
-    first: dict[float, int] = {}
-    lines = [replace(line, rank=first.setdefault(line.mean, place)) for place, line in enumerate(ranked, 1)]
-    lines += [line for line in all_lines if not line.is_ranked]
+    """Return the rows of the overview that are selected, in the order of ``overall_ranking``."""
+    lines = overall_ranking([(config, rankings.of(config)) for config in configs])
     if selection.order == RANK and selection.inverted:
         lines.reverse()
     lines = [line for line in lines if selection.matches(line.first)]
     shown, selection, pages = selection.page_of(lines)
     decimals = DISCLOSED_DECIMALS if hidden_truth else _DECIMALS
     return Overview(selection, len(lines), pages, shown, decimals)
-
-
-def _mean_error(entries: dict[str, LeaderboardEntry], configs: Sequence[str]) -> float:
-    errors = [entries[config].rank_error if config in entries else None for config in configs]
-    mean = sum(MISSING_ERROR if error is None else error for error in errors) / len(configs)
-    return float(f"{mean:.{_SIGNIFICANT_DIGITS}g}")

@@ -12,7 +12,7 @@ from importlib.resources import files
 from fastapi import APIRouter, HTTPException, Request, Response
 from PIL import Image
 
-from leaderboard.web.api.auth import ServiceDep
+from leaderboard.web.dependencies import ServiceDep
 from rebar_depth_bench.data.manifest import DatasetFolder
 from rebar_depth_bench.data.rows import iterate_rows
 

@@ -8,6 +8,7 @@ from typing import Annotated, Any, Literal
 from fastapi import APIRouter, HTTPException, Path, Query, Request, Response
 from fastapi.responses import HTMLResponse
 
+from leaderboard.changes import get_submission, outdated_note
 from leaderboard.db.models import SubmissionModel
 from leaderboard.db.rankings import (
     LeaderboardEntry,
@@ -18,10 +19,8 @@ from leaderboard.db.rankings import (
 )
 from leaderboard.db.submissions import QUEUED, SCORED, SCORING, result_json, result_notes
 from leaderboard.service import Service
-from leaderboard.web.api.auth import ServiceDep
-from leaderboard.web.api.schemas import outdated_note
-from leaderboard.web.api.submissions import SubmissionId, get_submission
 from leaderboard.web.cache import NO_STORE, REVALIDATE
+from leaderboard.web.dependencies import ID_PATTERN, ServiceDep, SubmissionId
 from leaderboard.web.pages.leaderboard import DISCLOSED_COLUMNS, NameQuery
 from leaderboard.web.pages.rendering import PICTURE_TITLES, clean_text, render
 from rebar_depth_bench.errors import InputError, printable
@@ -39,13 +38,14 @@ from rebar_depth_bench.reporting.tables import COMPARISON_NOTE, comparison_cells
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.result import Result, read_disclosed, read_result
 from rebar_depth_bench.submission import Declaration
+from rebar_depth_bench.submission.declaration import MethodDetails
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
 MAX_OTHERS = 50
 """Number of submissions offered for a comparison."""
 _UNREADABLE = "The stored result was written by another version of this software, which must show it."
-_IdQuery = Annotated[str, Query(min_length=1, max_length=32, pattern=r"^[A-Za-z0-9_-]+$")]
+_IdQuery = Annotated[str, Query(min_length=1, max_length=32, pattern=ID_PATTERN)]
 PathPart = Annotated[str, Path(max_length=100, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
 
 
@@ -126,18 +126,19 @@ def _cache_control(public: bool) -> str:
 
 
 def _details(record: SubmissionModel) -> dict[str, Any]:
-    """Return what the submitter says about the method: texts by heading, and the URL of the code."""
-    declared, details = Declaration(record.inputs, record.uses_ground_truth), json.loads(record.details)
-    parameters, seconds = details.get("parameters"), details.get("seconds_per_view")
+    """Return what the submitter says about the method, with texts by heading."""
+    declared = Declaration(record.inputs, record.uses_ground_truth)
+    details = {**dict.fromkeys(MethodDetails.model_fields), **json.loads(record.details)}
+    parameters, seconds = details["parameters"], details.get("seconds_per_view")
     texts = {
         "Inputs": inputs_text(declared),
         "Ground truth": ground_truth_text(declared),
-        "Training data": clean_text(details.get("training_data")),
+        "Training data": clean_text(details["training_data"]),
         "Parameters": f"{parameters:,}" if isinstance(parameters, int) else printable(str(parameters or "")),
         "Runtime per view": "" if seconds is None else f"{seconds:.3g} s",
-        "Licence": printable(details.get("licence") or ""),
+        "Licence": printable(details["licence"] or ""),
     }
-    return {"texts": {name: text for name, text in texts.items() if text}, "code_url": details.get("code_url")}
+    return {**details, "texts": {name: text for name, text in texts.items() if text}}
 
 
 def _result_context(service: Service, record: SubmissionModel, full_config: str | None) -> dict[str, Any]:

@@ -11,12 +11,12 @@ from fastapi.responses import HTMLResponse, RedirectResponse
 
 from leaderboard.db.models import SubmissionModel
 from leaderboard.db.tokens import find_token
+from leaderboard.refusals import RefusedError
 from leaderboard.service import Service
 from leaderboard.uploads.accept import accept_upload
-from leaderboard.uploads.multipart import UploadForm, UploadRejectedError
-from leaderboard.web.api.auth import ServiceDep, service_of
-from leaderboard.web.api.submissions import check_length, page_url
+from leaderboard.uploads.multipart import UploadForm
 from leaderboard.web.cache import NO_STORE, REVALIDATE
+from leaderboard.web.dependencies import ServiceDep, check_length, page_url, service_of
 from leaderboard.web.pages.rendering import clean_text, problem_lines, render
 from rebar_depth_bench.names import TEST_SPLIT
 
@@ -39,7 +39,7 @@ async def submit(request: Request, service: ServiceDep) -> Response:
     try:
         check_length(request)
         record = await _accept_form_upload(service, request)
-    except UploadRejectedError as error:
+    except RefusedError as error:
         return _how_to_page(request, error.status, error.detail, problem_lines(error.problems))
     # Path only: behind a proxy, Content-Security-Policy form-action rejects a scheme other than the browser's.
     return RedirectResponse(urlsplit(page_url(request, record)).path, 303)
@@ -68,14 +68,14 @@ def _how_to_page(
 async def _accept_form_upload(service: Service, request: Request) -> SubmissionModel:
     """Accept the archive of the form; the token is checked before any of the archive is stored.
 
-    Raises ``UploadRejectedError``.
+    Raises ``RefusedError``.
     """
     form = UploadForm(request.stream(), request.headers.get("content-type", ""))
     text = (await form.token()).strip()
     if not text:
-        raise UploadRejectedError(401, "no token, expected the token that you received from the operator")
+        raise RefusedError(401, "no token, expected the token that you received from the operator")
     token = await to_thread.run_sync(find_token, service.database, text)
     if token is None:
-        raise UploadRejectedError(401, "the token is unknown")
+        raise RefusedError(401, "the token is unknown")
     record, _ = await accept_upload(service, token, form.archive())
     return record

@@ -1,4 +1,4 @@
-"""Bearer-token authentication dependencies.
+"""Dependencies of routes: the service, the token of a request, and parameters of addresses.
 
 They are coroutines, because FastAPI runs other functions in worker threads, which takes longer than what they do.
 """
@@ -8,13 +8,18 @@ from __future__ import annotations
 from typing import Annotated, Any
 
 from anyio import to_thread
-from fastapi import Depends, HTTPException, Request
+from fastapi import Depends, HTTPException, Path, Request
 from fastapi.security import HTTPAuthorizationCredentials, HTTPBearer
 
-from leaderboard.db.models import TokenModel
+from leaderboard.db.models import SubmissionModel, TokenModel
 from leaderboard.db.tokens import find_token
+from leaderboard.refusals import RefusedError, too_large
 from leaderboard.service import Service
+from leaderboard.uploads.multipart import MAX_OVERHEAD_BYTES
 
+MAX_PATCH_BYTES = 32 << 10
+"""Maximum size in bytes of a change of a submission."""
+ID_PATTERN = r"^[A-Za-z0-9_-]+$"
 _BEARER = HTTPBearer(auto_error=False, description="A token created by `rebar-leaderboard token NAME`.")
 _Credentials = Annotated[HTTPAuthorizationCredentials | None, Depends(_BEARER)]
 
@@ -58,3 +63,30 @@ WITHOUT_TOKEN: dict[str, Any] = {"security": [{}]}
 
 OptionalToken = Annotated[TokenModel | None, Depends(optional_token)]
 RequiredToken = Annotated[TokenModel, Depends(required_token)]
+
+SubmissionId = Annotated[str, Path(min_length=1, max_length=32, pattern=ID_PATTERN)]
+
+
+def check_config(service: Service, config: str) -> None:
+    """Raise ``RefusedError`` (404) if the dataset has no such config."""
+    if config not in service.folder.configs:
+        known = ", ".join(service.folder.configs)
+        raise RefusedError(404, f"the dataset has no config {config!r}, expected one of {known}")
+
+
+def check_length(request: Request) -> None:
+    """Raise ``UploadRejectedError`` (413) if the body is declared to be larger than that of any upload.
+
+    A client that waits for 100 Continue then sends nothing of it.
+    """
+    length, max_upload = request.headers.get("content-length", ""), service_of(request).settings.max_upload
+    if length.isdecimal() and int(length) > max_upload + MAX_OVERHEAD_BYTES:
+        raise too_large(max_upload)
+
+
+def page_url(request: Request, record: SubmissionModel) -> str:
+    """Return the URL of a submission's page, below the public URL if the settings have one."""
+    url = service_of(request).settings.public_url
+    if url:
+        return f"{url}/submissions/{record.id}"
+    return str(request.url_for("submission_page", submission_id=record.id))
