@@ -162,7 +162,7 @@ def test_missing_values_are_sorted_last_in_both_orders(errors: list[float | None
 
 def entry_of(name: str, table: dict[str, Any]) -> LeaderboardEntry:
     return LeaderboardEntry(
-        *(name, "lattice", name, "alice", None, None, None, 0.0, True, True, None, None, json.dumps(table))
+        *(name, "lattice", name, "alice", "{}", None, None, 0.0, True, True, None, None, json.dumps(table))
     )
 
 
