@@ -60,8 +60,7 @@ DepthMap = Float[ndarray, "h w"]
 def argument_parser() -> argparse.ArgumentParser:
     """Return the parser of the script's arguments."""
     parser = argparse.ArgumentParser(description="check a method on KITTI's Eigen split")
-    maps = "one depth map per image"
-    parser.add_argument("--predictions", type=InputFolder, required=True, metavar="DIR_OR_ZIP", help=maps)
+    parser.add_argument("--predictions", type=InputFolder, required=True, metavar="DIR_OR_ZIP", help="depth maps")
     parser.add_argument("--method", type=InputFile, help="method to run first, which writes --predictions")
     parser.add_argument("--kitti", type=InputFolder, required=True, metavar="ROOT", help="raw data or depth maps")
     parser.add_argument("--ground-truth", required=True, choices=("raw", "improved"), help="one scan, or several")
