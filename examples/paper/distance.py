@@ -28,7 +28,6 @@ from rebar_depth_bench.extended.ground_truth import has_bar_ids
 from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, score_extended
 from rebar_depth_bench.reporting.extended_tables import reach_sentence
 from rebar_depth_bench.scoring import bootstrap
-from rebar_depth_bench.scoring.bootstrap import Resampling, interval, resample_views
 from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation
 from rebar_depth_bench.scoring.metrics import mean
 from rebar_depth_bench.scoring.result import Result
@@ -57,13 +56,13 @@ def argument_parser() -> argparse.ArgumentParser:
 
 def estimate(value: float | None, draws: Float64[ndarray, " draws"], blocks: int) -> dict[str, Any]:
     """Return a value with its 95 % interval over resamples of blocks; the interval is None for few blocks."""
-    return {"value": value, "interval": interval(draws, blocks)}
+    return {"value": value, "interval": bootstrap.interval(draws, blocks)}
 
 
-def resampling_of(views: pd.DataFrame) -> Resampling:
+def resampling_of(views: pd.DataFrame) -> bootstrap.Resampling:
     """Return the resamples of views of one config: of whole scenes if it has several."""
     if views["by_scene"].any():
-        return resample_views(views["view_id"].tolist(), by_scene=True)
+        return bootstrap.resample_views(views["view_id"].tolist(), by_scene=True)
     return bootstrap.resample(views["index"].tolist())
 
 
@@ -127,7 +126,7 @@ def scale_slope(name: str, configs: Mapping[str, pd.DataFrame]) -> dict[str, Any
         resamplings = [resampling_of(views) for views in usable]
         sums = [one.counts @ one.sums(of_views) for one, of_views in zip(resamplings, moments, strict=True)]
         fewest = min(one.blocks() for one in resamplings)
-        slope_interval = interval(least_squares_slopes(np.sum(sums, axis=0)), fewest)
+        slope_interval = bootstrap.interval(least_squares_slopes(np.sum(sums, axis=0)), fewest)
         value = least_squares_slopes(np.sum([one.sum(axis=0) for one in moments], axis=0)[None]).item()
     row = {"config": name, "views": len(distances_m), "nearest_m": nearest_m, "farthest_m": farthest_m}
     return row | {"slope": {"value": value, "interval": slope_interval}}

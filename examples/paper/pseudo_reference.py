@@ -15,7 +15,6 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
-from itertools import permutations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -100,7 +99,7 @@ def score_frame(
     predictions, pseudo = ({name: read(one) for name, one in maps.items()} for maps in (methods, references))
     exact = {} if exact_m is None else {EXACT: clip(exact_m)}
     maps = pseudo | exact
-    agreements = [agreement((a, b), maps[a], maps[b]) for a, b in permutations(maps, 2) if a != EXACT]
+    agreements = [agreement((a, b), maps[a], maps[b]) for a in maps for b in maps if a not in (b, EXACT)]
     for label, pseudo_m in pseudo.items() if exact else ():
         maps[f"{EXACT} where {label} has depth"] = np.where(np.isnan(pseudo_m), np.nan, exact[EXACT])
     scores: dict[Pair, ViewScore | None] = {}
