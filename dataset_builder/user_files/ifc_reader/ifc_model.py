@@ -19,7 +19,13 @@ import ifcopenshell
 import numpy as np
 from ifcopenshell import entity_instance, ifcopenshell_wrapper
 
-from dataset_builder.user_files.ifc_reader.step_text import StepText, class_name, same_tokens, split_arguments
+from dataset_builder.user_files.ifc_reader.step_text import (
+    StepText,
+    class_name,
+    same_tokens,
+    split_arguments,
+    tokens,
+)
 from rebar_depth_bench.errors import MeshError, escape_text
 
 Entity = Any
@@ -131,7 +137,7 @@ class Model:
 
     def __init__(self, file: Any, schema: Any, step: StepText) -> None:
         self.file, self._schema, self._step = file, schema, step
-        self._attributes: dict[str, list[_Attribute]] = {}
+        self._attributes: dict[tuple[str, tuple[str, ...]], list[_Attribute]] = {}
         self._checked: set[tuple[int, tuple[str, ...]]] = set()
         self._seen: set[int] = set()
         self._dimensions: dict[int, frozenset[int]] = {}
@@ -151,11 +157,7 @@ class Model:
 
     def _checked_references(self, entity: Entity, names: tuple[str, ...]) -> list[Entity]:
         """Check the attributes ``names`` of an instance, or all; return the instances that they refer to."""
-        used = [
-            attribute
-            for attribute in self._class_attributes(entity.is_a())
-            if attribute.accepts and (not names or attribute.name in names)
-        ]
+        used = self._used_attributes(entity.is_a(), names)
         source, written = self._step.instance(entity.id()), entity.to_string(True).partition("=")[2]
         if source != written:
             self._compare(entity, used, source, written)
@@ -209,14 +211,17 @@ class Model:
 
     def _compare(self, entity: Entity, used: list[_Attribute], source: str, written: str) -> None:
         """Raise ``MeshError`` if used attributes of an instance differ between its text and what was read."""
-        given, read = split_arguments(source) or [], split_arguments(written) or []
-        attributes = self._class_attributes(entity.is_a())
+        given_tokens, read_tokens = tokens(source), tokens(written)
+        if given_tokens and same_tokens(given_tokens, read_tokens):
+            return
+        given, read = split_arguments(given_tokens), split_arguments(read_tokens)
+        attributes = len(read)
         # Lists of points have the attribute TagList in IFC4x3 only; exporters mix the versions up.
         if entity.is_a() in ("IfcCartesianPointList2D", "IfcCartesianPointList3D"):
             given, read = given[:1], read[:1]
         if class_name(source) != class_name(written) or not given or len(given) != len(read):
             raise MeshError(
-                f"#{entity.id()} is {escape_text(source)}, expected {len(attributes)} readable attributes of "
+                f"#{entity.id()} is {escape_text(source)}, expected {attributes} readable attributes of "
                 f"{entity.is_a()}"
             )
         for attribute in used:
@@ -227,17 +232,15 @@ class Model:
                     f"expected {shorten(attribute.kind, 80)}"
                 )
 
-    def _class_attributes(self, name: str) -> list[_Attribute]:
-        """Return the attributes of a class."""
-        if name not in self._attributes:
+    def _used_attributes(self, name: str, names: tuple[str, ...]) -> list[_Attribute]:
+        """Return the attributes ``names`` of a class, or all, that have an influence on a bar."""
+        if (name, names) not in self._attributes:
             entity = self._schema.declaration_by_name(name).as_entity()
-            self._attributes[name] = [
-                self._attribute(index, declared, derived)
-                for index, (declared, derived) in enumerate(
-                    zip(entity.all_attributes(), entity.derived(), strict=True)
-                )
-            ]
-        return self._attributes[name]
+            declared = zip(entity.all_attributes(), entity.derived(), strict=True)
+            attributes = [self._attribute(index, *one) for index, one in enumerate(declared)]
+            used = (one for one in attributes if one.accepts and (not names or one.name in names))
+            self._attributes[name, names] = list(used)
+        return self._attributes[name, names]
 
     def _attribute(self, index: int, declared: Any, derived: bool) -> _Attribute:
         kind, name = declared.type_of_attribute(), str(declared.name())
@@ -253,12 +256,11 @@ def _where(entity: Entity, attribute: _Attribute) -> str:
 
 def _references(value: Any) -> Iterator[Entity]:
     """Yield the numbered instances in an attribute's value."""
-    if isinstance(value, entity_instance):
-        if value.id():
-            yield value
-    elif isinstance(value, tuple):
-        for item in value:
+    for item in value if isinstance(value, tuple) else (value,):
+        if isinstance(item, tuple):
             yield from _references(item)
+        elif isinstance(item, entity_instance) and item.id():
+            yield item
 
 
 def _or_null(accepts: Callable[[Any], bool]) -> Callable[[Any], bool]:

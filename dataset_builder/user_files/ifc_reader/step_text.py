@@ -33,12 +33,9 @@ _FOOTER = re.compile(rf"{_GAP}ENDSEC{_GAP};{_GAP}END-ISO-10303-21{_GAP};\s*+\Z")
 _CLASS = re.compile(rf"(!?+[A-Za-z]\w*+){_GAP}", re.ASCII)
 # ISO 10303-21 requires a digit before the point; the parser reads numbers without it after a sign only.
 _NUMBER = r"[-+]?+(?:\d++(?:\.\d*+)?+|\.\d++)(?:[Ee][-+]?+\d++)?+"
-_IS_NUMBER = re.compile(_NUMBER, re.ASCII)
-_TOKEN = re.compile(
-    rf"{_GAP}({_STRING}|\#\d++|{_NUMBER}|\.[A-Za-z]\w*+\."
-    rf"|[A-Za-z]\w*+(?={_GAP}\()|\"[0-9A-Fa-f]*+\"|[$*(),]){_GAP}",
-    re.ASCII,
-)
+_VALUE = rf"{_STRING}|\#\d++|{_NUMBER}|\.[A-Za-z]\w*+\.|[A-Za-z]\w*+(?={_GAP}\()|\"[0-9A-Fa-f]*+\"|[$*(),]"
+_TOKEN = re.compile(rf"{_GAP}({_VALUE}){_GAP}", re.ASCII)
+_TOKENS = re.compile(rf"(?:{_GAP}(?:{_VALUE}){_GAP})*+", re.ASCII)
 
 
 class StepText:
@@ -109,34 +106,40 @@ def class_name(instance: str) -> str:
     return found[1].upper() if found else ""
 
 
-def split_arguments(instance: str) -> list[list[str]] | None:
-    """Return the tokens of each argument of an instance's text, or None if it is not a list of tokens."""
+def tokens(instance: str) -> list[str]:
+    """Return the class of an instance's text and the tokens of its arguments; none if it has anything else."""
     found = _CLASS.match(instance)
-    position = found.end() if found else 0
+    if not found or not _TOKENS.fullmatch(instance, found.end()):
+        return []
+    return [found[1], *_TOKEN.findall(instance, found.end())]
+
+
+def split_arguments(instance: list[str]) -> list[list[str]]:
+    """Return the tokens of each argument of an instance's tokens; no argument if they are not in parentheses."""
     arguments: list[list[str]] = [[]]
-    depth = 0
-    while token := _TOKEN.match(instance, position):
-        value, position = token[1], token.end()
-        if value == ")":
-            depth -= 1
-            if depth == 0:
-                break
-        if value == "," and depth == 1:
+    depth = 1
+    for token in instance[2:-1]:
+        depth += (token == "(") - (token == ")")
+        if depth == 0:
+            return []
+        if token == "," and depth == 1:
             arguments.append([])
-        elif value != "(" or depth > 0:
-            arguments[-1].append(value)
-        depth += value == "("
-    return arguments if depth == 0 and position == len(instance) else None
+        else:
+            arguments[-1].append(token)
+    return arguments if depth == 1 and (instance[1:2], instance[-1:]) == (["("], [")"]) else []
 
 
 def same_tokens(first: list[str], second: list[str]) -> bool:
     """Return whether two lists of tokens have the same values; the content of strings is not compared."""
-    return len(first) == len(second) and all(map(_same_token, first, second))
+    return len(first) == len(second) and all(
+        a == b or _same_token(a, b) for a, b in zip(first, second, strict=True)
+    )
 
 
 def _same_token(first: str, second: str) -> bool:
-    if first == second or first[0] == second[0] == "'":  # Writers encode the same string in different ways.
+    if first[0] == second[0] == "'":  # Writers encode the same string in different ways.
         return True
-    if _IS_NUMBER.fullmatch(first) and _IS_NUMBER.fullmatch(second):
+    try:
         return float(first) == float(second)
-    return first.upper() == second.upper()
+    except ValueError:
+        return first.upper() == second.upper()
