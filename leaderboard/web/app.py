@@ -20,8 +20,7 @@ from leaderboard.web.api import leaderboard, status, submissions
 from leaderboard.web.api.schemas import DATABASE_UNAVAILABLE_MESSAGE
 from leaderboard.web.cache import CacheMiddleware
 from leaderboard.web.middleware import EarlyResponseMiddleware, RequestMiddleware
-from leaderboard.web.pages import account, static, submission, submit
-from leaderboard.web.pages import leaderboard as board
+from leaderboard.web.pages import account, ranking, static, submission_page, upload_form
 from leaderboard.web.pages.rendering import error_response, make_templates
 from rebar_depth_bench import software_version
 from rebar_depth_bench.errors import Problem
@@ -55,7 +54,7 @@ def make_app(service: Service) -> FastAPI:
     )
     app.state.service = service
     app.state.templates = make_templates()
-    for router in (submissions, leaderboard, status, board, submission, submit, account, static):
+    for router in (submissions, leaderboard, status, ranking, submission_page, upload_form, account, static):
         app.include_router(router.router)
     identity = f"{software_version()} {service.folder.digest} {settings.model_dump_json()}"
     # Inside the cache, so that a kept response is compressed once.

@@ -19,7 +19,7 @@ from leaderboard.db.models import LeaderboardRowModel, ResultModel, SubmissionMo
 from leaderboard.db.rankings import LeaderboardEntry, Ranking, queue_position, read_ranking
 from leaderboard.refusals import RefusedError
 from leaderboard.uploads.multipart import MAX_FIELD_BYTES, UploadForm
-from leaderboard.web.pages.leaderboard import make_config_ranking
+from leaderboard.web.pages.ranking import make_config_ranking
 from leaderboard.web.pages.rendering import clean_text, error_response, format_size, link_html, time_html
 from leaderboard.web.pages.selection import COLUMNS, RANK, Selection, parse_selection
 from rebar_depth_bench.errors import Problem

@@ -21,7 +21,7 @@ from leaderboard.db.submissions import QUEUED, SCORED, SCORING, result_json, res
 from leaderboard.service import Service
 from leaderboard.web.cache import NO_STORE, REVALIDATE
 from leaderboard.web.dependencies import ID_PATTERN, ServiceDep, SubmissionId
-from leaderboard.web.pages.leaderboard import DISCLOSED_COLUMNS, NameQuery
+from leaderboard.web.pages.ranking import DISCLOSED_COLUMNS, NameQuery
 from leaderboard.web.pages.rendering import PICTURE_TITLES, clean_text, render
 from rebar_depth_bench.errors import InputError, printable
 from rebar_depth_bench.names import config_of
