@@ -28,12 +28,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, Self
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from rebar_depth_bench.captures.calibration import (
     Calibration,
@@ -46,7 +46,7 @@ from rebar_depth_bench.captures.documents import DOCUMENT_SUFFIXES, parse_docume
 from rebar_depth_bench.captures.programs import program_calibration
 from rebar_depth_bench.data.schema import BoardTable
 from rebar_depth_bench.errors import CalibrationError, InputError, Problem
-from rebar_depth_bench.geometry.aruco_board import BoardSpec
+from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
 from rebar_depth_bench.geometry.cameras import is_rigid
 from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.names import NAME_LETTERS, NAME_PATTERN
@@ -56,6 +56,7 @@ from rebar_depth_bench.validation import (
     Expected,
     StrictModel,
     check_unique,
+    field_error,
     one_of,
     text,
     validate_table,
@@ -91,6 +92,18 @@ class _PoseTable(StrictModel):
     cam_from_world: Annotated[list[_Row], Field(min_length=4, max_length=4), _POSE]
 
 
+class _Board(BoardTable):
+    """Board as a person states it."""
+
+    @model_validator(mode="after")
+    def _check_layout(self) -> Self:
+        try:
+            marker_corners_m(self.spec)
+        except ValueError as error:
+            raise field_error(str(error), "a board with room for its markers", "conflict") from None
+        return self
+
+
 class _CamerasTable(StrictModel):
     """Content of ``cameras.toml``; ``table_calibration`` reads the keys of ``calibration.toml``."""
 
@@ -99,7 +112,7 @@ class _CamerasTable(StrictModel):
         Expected("the name of a file beside this one, or two"),
     ] = None
     unit: Annotated[str, one_of(*UNITS_M)] = "m"
-    board: BoardTable | None = None
+    board: _Board | None = None
     pose: tuple[_PoseTable, ...] = Field(default=(), strict=False)
     width: Any = None
     height: Any = None

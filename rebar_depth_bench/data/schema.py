@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any
 
 import pyarrow as pa
 from pydantic import (
@@ -18,7 +18,7 @@ from pydantic import (
 )
 
 from rebar_depth_bench.errors import DatasetError, escape_text
-from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
+from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.names import NAME_LETTERS, NAME_PATTERN, PATH_PATTERN, SPLITS, VIEW_ID_PATTERN
 from rebar_depth_bench.validation import (
     Expected,
@@ -268,14 +268,6 @@ class BoardTable(StrictModel):
     markers: Annotated[int, one_of(6, 12)]
     marker_side_m: _Length
     dictionary: Name
-
-    @model_validator(mode="after")
-    def _check_layout(self) -> Self:
-        try:
-            marker_corners_m(self.spec)
-        except ValueError as error:
-            raise field_error(str(error), "a board with room for its markers", "conflict") from None
-        return self
 
     @property
     def spec(self) -> BoardSpec:
