@@ -12,7 +12,7 @@ from __future__ import annotations
 import argparse
 import math
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -20,7 +20,7 @@ import pandas as pd
 from jaxtyping import Float64
 from numpy import ndarray
 
-from outputs import add_outputs, flat_table, number, run_script, write_outputs
+from outputs import add_outputs, flat_table, number, run_script, single_bar_means, write_outputs
 from rebar_depth_bench.console import add_archive, add_data
 from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.errors import InputError
@@ -29,10 +29,9 @@ from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, score_extended
 from rebar_depth_bench.reporting.crossing_texts import reach_sentence
 from rebar_depth_bench.scoring import bootstrap
 from rebar_depth_bench.scoring.bootstrap import Resampling, interval, resample_views
-from rebar_depth_bench.scoring.columns import METRICS
 from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation
 from rebar_depth_bench.scoring.metrics import mean
-from rebar_depth_bench.scoring.table import ViewScore
+from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.truth import config_truth
 from rebar_depth_bench.terminal import ProgressBars
 
@@ -40,15 +39,13 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 MIN_DISTANCE_RATIO = 1.05  # Of the farthest to the nearest view, for a slope.
-ALIGNMENTS = ("native", "scaled")
 ERRORS = ["native_abs_rel", "scaled_abs_rel"]
-VIEW_COLUMNS = ["view_id", "distance_m", "scale", *ERRORS, "single_bar"]
+VIEW_COLUMNS = ["view_id", "distance_m", "scale", *ERRORS]
 
 
 def argument_parser() -> argparse.ArgumentParser:
     """Return the parser of the script's arguments."""
-    description = "scale and error of predictions over distance, reach at crossings"
-    parser = argparse.ArgumentParser(description=description)
+    parser = argparse.ArgumentParser(description="scale and error of predictions by distance, reach at crossings")
     add_archive(parser)
     add_data(parser)
     parser.add_argument("--config", nargs="+", metavar="NAME", help="configs (default: all in the archive)")
@@ -70,43 +67,11 @@ def resampling_of(views: pd.DataFrame) -> Resampling:
     return bootstrap.resample(views["index"].tolist())
 
 
-def single_bar_numbers(view: Mapping[str, Mapping[str, float | None]]) -> dict[str, Any]:
-    """Return share and coverage of a view's single-bar interior, and the metrics on it, None without any.
-
-    ``view`` has the extended measures by alignment, none in a config without bar ids.
-    """
-    if not view:
-        return {"share": 0.0, "coverage": None, "native": None, "scaled": None}
-    metrics = {
-        alignment: {name: view[alignment][f"single_bar_{name}"] for name in METRICS} for alignment in ALIGNMENTS
-    }
-    return {
-        "share": view["native"]["single_bar_share"],
-        "coverage": view["native"]["single_bar_coverage"],
-        **{alignment: one if one["abs_rel"] is not None else None for alignment, one in metrics.items()},
-    }
-
-
-def mean_single_bar(views: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Return the means over one or more views: the share of all, and the others of those that have a value."""
-    means: dict[str, Any] = {
-        name: mean([view[name] for view in views if view[name] is not None]) for name in ("share", "coverage")
-    }
-    for alignment in ALIGNMENTS:
-        known = [view[alignment] for view in views if view[alignment]]
-        means[alignment] = {name: mean([one[name] for one in known]) for name in METRICS} if known else None
-    return means
-
-
-def view_table(
-    evaluation: Evaluation,
-    config: DatasetConfig,
-    scored: Mapping[str, ViewScore],
-    extended: Mapping[str, Mapping[str, Mapping[str, float | None]]],
-) -> pd.DataFrame:
+def view_table(evaluation: Evaluation, config: DatasetConfig, result: Result) -> pd.DataFrame:
     """Return one row per scored view of a config; s and errors of views without prediction are NaN."""
+    assert result.extended is not None
     truths = config_truth(evaluation.folder, config)
-    scores = [scored[view_id] for view_id in truths.view_ids]
+    scores = [view for view in result.views if view.view_id.startswith(f"{config.name}/")]
     columns = {
         "config": config.name,
         "by_scene": config.has_splits,
@@ -116,7 +81,7 @@ def view_table(
         "scale": np.array([score.scale for score in scores], np.float64),
         "native_abs_rel": [score.native.abs_rel if score.native else math.nan for score in scores],
         "scaled_abs_rel": [score.scaled.abs_rel if score.scaled else math.nan for score in scores],
-        "single_bar": [single_bar_numbers(extended.get(view_id, {})) for view_id in truths.view_ids],
+        "single_bar": [result.extended.views.get(view_id, {}) for view_id in truths.view_ids],
     }
     return pd.DataFrame(columns)
 
@@ -142,7 +107,7 @@ def one_bin(views: pd.DataFrame, low_m: float, high_m: float) -> dict[str, Any]:
         "scale": estimate(scales.median(), medians, blocks),
         "scale_range": (scales.min(), scales.max()) if len(scales) else None,
         **{name: estimate(mean(errors[scored, k].tolist()), draws[k], blocks) for k, name in enumerate(ERRORS)},
-        "single_bar": mean_single_bar(views["single_bar"].tolist()),
+        "single_bar": single_bar_means(views["single_bar"].tolist()),
     }
 
 
@@ -202,31 +167,28 @@ def run(options: argparse.Namespace) -> None:
         families = [MEASURE_FAMILIES[key] for key in ("single_bar", "crossings")]
         result = score_extended(evaluation, families, progress=bars.update)
         assert result.extended is not None
-        scores = {view.view_id: view for view in result.views}
-        extended = result.extended.views
         present = {config.name: config for config in evaluation.configs}
         names = dict.fromkeys(options.config or present)
         if names.keys() - present.keys():
             raise InputError(f"{options.archive}: holds {', '.join(present)}, expected --config with some of them")
-        by_config = {name: view_table(evaluation, present[name], scores, extended) for name in names}
+        by_config = {name: view_table(evaluation, present[name], result) for name in names}
         reaches = {name: result.extended.tables[name].reaches for name in names if has_bar_ids(present[name])}
         measures = result.extended.to_dict()
+        source = {"crossings": measures["crossings"]}
         provenance = evaluation.provenance().to_dict() | {"intervals": bootstrap.INTERVALS}
     slopes = [scale_slope(name, {name: of_config}) for name, of_config in by_config.items()]
     slopes += [scale_slope("all", by_config)] if len(by_config) > 1 else []
     bin_rows = [row for one in by_config.values() for row in distance_bins(one, options.bins_per_decade)]
     views, table = pd.concat(by_config.values()), flat_table(bin_rows)
+    single_bars = [single_bar_means([one]) for one in views["single_bar"]]
     content = {
         "study": "distance",
         **provenance,
         "bins_per_decade": options.bins_per_decade,
         "slopes": slopes,
         "bins": bin_rows,
-        "crossing_reach": {
-            name: {"crossings": measures["crossings"], **measures["tables"][name]["crossing_reach"]}
-            for name in reaches
-        },
-        "views": views[VIEW_COLUMNS].to_dict("records"),
+        "crossing_reach": {name: source | measures["tables"][name]["crossing_reach"] for name in reaches},
+        "views": views[VIEW_COLUMNS].assign(single_bar=single_bars).to_dict("records"),
     }
     notes = ["Slope of log s over log distance:", flat_table(slopes).to_string(index=False, na_rep="-")]
     for name, found in reaches.items():

@@ -14,9 +14,11 @@ from rebar_depth_bench.atomic_io import write_output
 from rebar_depth_bench.console import add_output_file, prints_table, run_program
 from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.errors import InputError, printable
+from rebar_depth_bench.extended.result import ViewNumbers
 from rebar_depth_bench.reporting.figure import check_figure, figure_bytes, figure_style
 from rebar_depth_bench.reporting.tables import frame_csv
-from rebar_depth_bench.scoring.columns import rounded
+from rebar_depth_bench.scoring.columns import METRICS, rounded
+from rebar_depth_bench.scoring.metrics import mean
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -80,6 +82,18 @@ def flat_table(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
         table.insert(place + 1, f"{stem}_high", [high for _, high in ends])
         table = table.drop(columns=name)
     return table
+
+
+def single_bar_means(views: Sequence[ViewNumbers]) -> dict[str, Any]:
+    """Return share, coverage and metrics of the single-bar interior, means of the views that have a value."""
+
+    def mean_of(align: str, name: str) -> float | None:
+        values = [view[align][f"single_bar_{name}"] for view in views if view]
+        return mean([value for value in values if value is not None])
+
+    metrics = {align: {name: mean_of(align, name) for name in METRICS} for align in ("native", "scaled")}
+    known = {align: one if one["abs_rel"] is not None else None for align, one in metrics.items()}
+    return {"share": mean_of("native", "share") or 0.0, "coverage": mean_of("native", "coverage"), **known}
 
 
 def write_outputs(

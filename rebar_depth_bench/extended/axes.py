@@ -230,6 +230,9 @@ def _straight_pieces(points_m: Float64[ndarray, "n 3"]) -> Iterator[tuple[int, i
             first = edge
 
 
+WINDOW_DIAMETERS = 6.0
+"""Length along a bar on either side of a crossing that is judged and fitted, diameters."""
+
 _TANGENT_STEP_M = 1e-7
 
 
@@ -306,19 +309,15 @@ class Axis:
         return np.asarray((relative_m + self.length_m / 2) % self.length_m - self.length_m / 2)
 
     def is_straight(
-        self, along_m: Float64[ndarray, " n"], tangent: Float64[ndarray, "n 3"], reach_m: float, max_deg: float
+        self, along_m: Float64[ndarray, " n"], tangent: Float64[ndarray, "n 3"]
     ) -> Bool[ndarray, " n"]:
-        """Return where all edges within ``reach_m`` along the axis are at most ``max_deg`` from the tangent."""
+        """Return where all edges within the window of a point are at most ``STRAIGHT_DEG`` from the tangent."""
         lengths_m = np.linalg.norm(self.vector_m, axis=1)
         middle_m = self.relative_m((self.along_m + lengths_m / 2)[None], along_m[:, None])
-        touched = np.abs(middle_m) - lengths_m / 2 < reach_m - _TANGENT_STEP_M
+        touched = np.abs(middle_m) - lengths_m / 2 < WINDOW_DIAMETERS * self.diameter_m - _TANGENT_STEP_M
         cosine = tangent @ (self.vector_m / lengths_m[:, None]).T
-        bends = cosine < np.cos(np.deg2rad(max_deg)) - 1e-12
+        bends = cosine < np.cos(np.deg2rad(STRAIGHT_DEG)) - 1e-12
         return np.asarray(~(touched & bends).any(axis=1))
-
-
-WINDOW_DIAMETERS = 6.0
-"""Length along a bar on either side of a crossing that is judged and fitted, diameters."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -357,8 +356,7 @@ def prepared_crossings(crossings: Crossings, bars: Iterable[Bar], cage: CageTrut
         diameter_m[own] = axis.diameter_m
         along_m[own], _ = axis.feet(point_m[own])
         tangent[own] = axis.tangents(along_m[own])
-        reach_m = WINDOW_DIAMETERS * axis.diameter_m
-        straight[own] = axis.is_straight(along_m[own], tangent[own], reach_m, STRAIGHT_DEG)
+        straight[own] = axis.is_straight(along_m[own], tangent[own])
         match_radius_m[own] = _match_radius_m(point_m[own], number, cage)
     return SceneCrossings(crossings, axes, bar_id, diameter_m, point_m, along_m, tangent, straight, match_radius_m)
 

@@ -43,7 +43,7 @@ def table(distances_m: Sequence[float], scales: Sequence[float], step: int = 1) 
             "scale": scale,
             "native_abs_rel": np.abs(1 / scale - 1),
             "scaled_abs_rel": np.abs(1 / scale - 1),
-            "single_bar": [{"share": 0.5, "coverage": 1.0, "native": None, "scaled": None}] * len(scale),
+            "single_bar": [{}] * len(scale),
         }
     )
 
