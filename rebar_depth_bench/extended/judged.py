@@ -80,14 +80,12 @@ def visible_segments(truth: SteelTruth) -> VisibleSegments:
     """
     cage = truth.bars.cage
     segment, pixels, used = _sampled_pixels(truth)
-    rotation, shift_m = truth.cam_from_world[:3, :3], truth.cam_from_world[:3, 3]
-    start_m = cage.start_m[segment] @ rotation.T + shift_m
-    axis_m = (cage.end_m[segment] - cage.start_m[segment]) @ rotation.T
+    axis_m = (cage.end_m[segment] - cage.start_m[segment]) @ truth.cam_from_world[:3, :3].T
     runs = AxisLines(
         segment,
         cage.diameter_m[segment],
         cage.match_radius_m[segment],
-        start_m,
+        transform(truth.cam_from_world, cage.start_m[segment]),
         axis_m / np.linalg.norm(axis_m, axis=1, keepdims=True),
     )
     visible = visible_parts(truth, runs, pixels, used)

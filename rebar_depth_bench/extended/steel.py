@@ -18,23 +18,15 @@ _Made = TypeVar("_Made")
 
 
 @dataclass(frozen=True, eq=False)
-class BarAxes:
-    """Axis of a bar as built and its nominal axis: polylines, world, metres."""
-
-    built_m: Float64[ndarray, "n 3"]
-    nominal_m: Float64[ndarray, "k 3"]
-
-
-@dataclass(frozen=True, eq=False)
 class SceneBars:
     """Bars of a scene: their segments, nominal diameter by bar id (NaN for ids without a bar), and crossings.
 
-    ``axes`` has the axes of the bars with a nominal axis, by bar id.
+    ``designed`` has the bars with a nominal axis, by id.
     """
 
     cage: CageTruth
     diameter_m: Float64[ndarray, " ids"]
-    axes: Mapping[int, BarAxes]
+    designed: Mapping[int, Bar]
     crossings: SceneCrossings
 
     @classmethod
@@ -44,13 +36,9 @@ class SceneBars:
         diameter_m = np.full(np.iinfo(np.uint16).max + 1, np.nan)
         measured = with_axis(bars)
         diameter_m[[bar.bar_id for bar in measured]] = [bar.diameter_m for bar in measured]
-        axes = {
-            bar.bar_id: BarAxes(np.array(bar.axis_m), np.array(bar.nominal_axis_m))
-            for bar in measured
-            if bar.nominal_axis_m
-        }
+        designed = {bar.bar_id: bar for bar in measured if bar.nominal_axis_m}
         cage = cage_truth(bars)
-        return cls(cage, diameter_m, axes, prepared_crossings(crossings or Crossings.none(), bars, cage))
+        return cls(cage, diameter_m, designed, prepared_crossings(crossings or Crossings.none(), bars, cage))
 
 
 @dataclass(frozen=True, eq=False)
