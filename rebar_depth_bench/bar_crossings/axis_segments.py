@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -42,7 +43,7 @@ class AxisSegments:
     diameter_m: Float64[ndarray, " b"]
 
     @classmethod
-    def of_bars(cls, bars: Sequence[Bar]) -> AxisSegments:
+    def of_bars(cls, bars: Sequence[Bar]) -> Self:
         """Return the segments of bars that have an axis; repeated points of an axis are left out."""
         starts, vectors, along, before, after, lengths, closed = ([] for _ in range(7))
         first = 0

@@ -236,29 +236,8 @@ WINDOW_DIAMETERS = 6.0
 _TANGENT_STEP_M = 1e-7
 
 
-@dataclass(frozen=True, eq=False)
-class Axis:
-    """Axis of one bar as a polyline: segments from ``start_m`` by ``vector_m``, ``along_m`` of their starts."""
-
-    start_m: Float64[ndarray, "s 3"]
-    vector_m: Float64[ndarray, "s 3"]
-    along_m: Float64[ndarray, " s"]
-    length_m: float
-    closed: bool
-    diameter_m: float
-
-    @classmethod
-    def of_bar(cls, bar: Bar) -> Axis:
-        """Return the axis of a bar that has one."""
-        segments = AxisSegments.of_bars([bar])
-        return cls(
-            segments.start_m,
-            segments.vector_m,
-            segments.along_m,
-            float(segments.length_m[0]),
-            bool(segments.closed[0]),
-            bar.diameter_m,
-        )
+class Axis(AxisSegments):
+    """Axis of one bar: the arrays of the bar, such as ``diameter_m``, have one value."""
 
     def feet(self, points_m: Float64[ndarray, "n 3"]) -> tuple[Float64[ndarray, " n"], Float64[ndarray, " n"]]:
         """Return for each point the length along the axis at the nearest point of the axis, and its distance.
@@ -285,7 +264,7 @@ class Axis:
         """Return a k-d tree of samples along the axis, a quarter of a diameter apart, and their segments."""
         from scipy.spatial import cKDTree
 
-        segment, middle_m = pieces(self.start_m, self.vector_m, self.diameter_m / 4)
+        segment, middle_m = pieces(self.start_m, self.vector_m, self.diameter_m.item() / 4)
         return cKDTree(middle_m), segment
 
     def tangents(self, along_m: Float64[ndarray, " n"]) -> Float64[ndarray, "n 3"]:
@@ -348,7 +327,7 @@ def prepared_crossings(crossings: Crossings, bars: Iterable[Bar], cage: CageTrut
     bar_id = np.column_stack([crossings.bar_a, crossings.bar_b])
     point_m = np.stack([crossings.point_a_m, crossings.point_b_m], axis=1)
     crossing = set(bar_id.ravel().tolist())
-    axes = {bar.bar_id: Axis.of_bar(bar) for bar in with_axis(bars) if bar.bar_id in crossing}
+    axes = {bar.bar_id: Axis.of_bars([bar]) for bar in with_axis(bars) if bar.bar_id in crossing}
     diameter_m, along_m, match_radius_m = np.zeros((3, *bar_id.shape))
     tangent, straight = np.zeros((*bar_id.shape, 3)), np.zeros(bar_id.shape, dtype=bool)
     for number, axis in axes.items():
