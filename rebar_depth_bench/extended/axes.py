@@ -187,46 +187,41 @@ def assign_segments(
     first, last = (np.searchsorted(bar_id[order], cage.bar_id, side) for side in ("left", "right"))
     for segment in np.flatnonzero(last > first):
         rows = order[first[segment] : last[segment]]
-        on_side, distance_m = _lies_on_side(points_m[rows], cage, int(segment))
+        line_m = cage.end_m[segment] - cage.start_m[segment]
+        length_m = np.linalg.norm(line_m)
+        direction = line_m / length_m
+        from_start_m = points_m[rows] - cage.start_m[segment]
+        along_m = from_start_m @ direction
+        distance_m = np.linalg.norm(from_start_m - along_m[:, None] * direction, axis=1)
+        slack_m = 1e-6  # rounding of float32 depth
+        foot_inside = (along_m >= -slack_m) & (along_m <= length_m + slack_m)
+        on_side = foot_inside & is_on_surface(distance_m, cage.diameter_m[segment])
         nearer = on_side & (distance_m < nearest_m[rows])
         assigned[rows[nearer]] = segment
         nearest_m[rows[nearer]] = distance_m[nearer]
     return assigned
 
 
-def _lies_on_side(
-    points_m: Float64[ndarray, "k 3"], cage: CageTruth, segment: int
-) -> tuple[Bool[ndarray, " k"], Float64[ndarray, " k"]]:
-    """Return which points lie on a segment's side, and the distance of all points from its axis (metres)."""
-    line_m = cage.end_m[segment] - cage.start_m[segment]
-    length_m = np.linalg.norm(line_m)
-    direction = line_m / length_m
-    from_start_m = points_m - cage.start_m[segment]
-    along_m = from_start_m @ direction
-    distance_m = np.linalg.norm(from_start_m - along_m[:, None] * direction, axis=1)
-    radii = distance_m / (cage.diameter_m[segment] / 2)
-    slack_m = 1e-6  # rounding of float32 depth
-    foot_inside = (along_m >= -slack_m) & (along_m <= length_m + slack_m)
-    return foot_inside & (radii >= SURFACE_DISTANCE_RADII[0]) & (radii <= SURFACE_DISTANCE_RADII[1]), distance_m
+def is_on_surface(distance_m: Float64[ndarray, " n"], diameter_m: float) -> Bool[ndarray, " n"]:
+    """Return which distances from the axis of a bar are within ``SURFACE_DISTANCE_RADII``."""
+    radii = distance_m / (diameter_m / 2)
+    return np.asarray((radii >= SURFACE_DISTANCE_RADII[0]) & (radii <= SURFACE_DISTANCE_RADII[1]))
 
 
 def _straight_segments(bar: Bar) -> Iterator[tuple[Float64[ndarray, " 3"], Float64[ndarray, " 3"]]]:
-    """Yield the ends of the straight segments of a bar that are long enough, from its first point to its last."""
+    """Yield the ends of the straight segments of a bar that are long enough, from its first point to its last.
+
+    All edges of a segment follow the direction of its first one.
+    """
     points_m = without_repeated(np.array(bar.axis_m))
-    for first, last in _straight_pieces(points_m):
-        if np.linalg.norm(points_m[last] - points_m[first]) >= MIN_SEGMENT_DIAMETERS * bar.diameter_m:
-            yield points_m[first], points_m[last]
-
-
-def _straight_pieces(points_m: Float64[ndarray, "n 3"]) -> Iterator[tuple[int, int]]:
-    """Yield (first, last) point index of each stretch whose edges all follow the direction of its first edge."""
     steps_m = np.diff(points_m, axis=0)
     directions = steps_m / np.linalg.norm(steps_m, axis=1, keepdims=True)
     least_cosine = np.cos(np.deg2rad(STRAIGHT_DEG))
     first = 0
     for edge in range(1, len(directions) + 1):
         if edge == len(directions) or directions[first] @ directions[edge] < least_cosine:
-            yield first, edge
+            if np.linalg.norm(points_m[edge] - points_m[first]) >= MIN_SEGMENT_DIAMETERS * bar.diameter_m:
+                yield points_m[first], points_m[edge]
             first = edge
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -61,6 +61,7 @@ class ConfigSteelTruth:
 
     ``bars_by_view`` holds the bars of each view's scene. ``rays`` holds the rays of each distinct lens (K and
     distortion), which views share. ``crossings`` are those of the folder, with the file that they come from.
+    Without ``judged_cache``, no crossings are judged.
     """
 
     config: DatasetConfig
@@ -68,7 +69,7 @@ class ConfigSteelTruth:
     rays: Mapping[Lens, Rays]
     crossings: FolderCrossings
     cache: ArrayCache
-    judged_cache: ArrayCache
+    judged_cache: ArrayCache | None = None
 
     def __len__(self) -> int:
         """Return the number of views."""
@@ -81,11 +82,26 @@ class ConfigSteelTruth:
 
     def view(self, position: int) -> SteelTruth:
         """Return the view at ``position`` in protocol order."""
-        view, judged = self.cache.view(position), self.judged(position)
-        return _steel_truth(view, judged, self.config, self.bars_by_view, self.rays)
+        view = self.cache.view(position)
+        lens, pose = view.numbers[:_LENS_NUMBERS], view.numbers[_LENS_NUMBERS:]
+        height, width = self.config.grid
+        return SteelTruth(
+            view_id=view.view_id,
+            height=height,
+            width=width,
+            K=np.array(lens[:9]).reshape(3, 3),
+            cam_from_world=np.array(pose).reshape(4, 4),
+            rays=self.rays[lens][view.arrays["index"]],
+            bars=self.bars_by_view[view.view_id],
+            distortion=np.array(lens[9:]),
+            judged=self.judged(position),
+            **view.arrays,
+        )
 
     def judged(self, position: int) -> JudgedCrossings:
         """Return the judged crossings of the view at ``position``."""
+        if self.judged_cache is None:
+            return JudgedCrossings.none()
         view = self.judged_cache.view(position)
         crossing = view.arrays["crossing"][:: 2 * SAMPLED_PIXELS].astype(np.int64)
         return JudgedCrossings(crossing, view.arrays["pixel"].astype(np.int64).reshape(-1, 2, SAMPLED_PIXELS))
@@ -131,12 +147,12 @@ def load_steel_truth(
     )
     cache = open_cache(content, progress)
     rays = {lens: _rays(lens, config) for lens in {numbers[:_LENS_NUMBERS] for numbers in cache.numbers}}
+    steel = ConfigSteelTruth(config, bars_by_view, rays, found, cache)
 
     def judged_arrays(view_ids: Collection[str] | None) -> Iterator[ViewArrays]:
         for position, view_id in enumerate(cache.view_ids):
             if view_ids is None or view_id in view_ids:
-                truth = _steel_truth(cache.view(position), JudgedCrossings.none(), config, bars_by_view, rays)
-                judged = judged_crossings(truth)
+                judged = judged_crossings(steel.view(position))
                 arrays = {
                     "crossing": np.repeat(judged.crossing, 2 * SAMPLED_PIXELS),
                     "pixel": judged.pixels.ravel(),
@@ -154,31 +170,7 @@ def load_steel_truth(
         extract=judged_arrays,
         is_sound=lambda view: len(view.arrays["pixel"]) % (2 * SAMPLED_PIXELS) == 0,
     )
-    return ConfigSteelTruth(config, bars_by_view, rays, found, cache, open_cache(judged, progress))
-
-
-def _steel_truth(
-    view: ViewArrays,
-    judged: JudgedCrossings,
-    config: DatasetConfig,
-    bars_by_view: Mapping[str, SceneBars],
-    rays: Mapping[Lens, Rays],
-) -> SteelTruth:
-    """Return the ground truth of a cached view."""
-    lens, pose = view.numbers[:_LENS_NUMBERS], view.numbers[_LENS_NUMBERS:]
-    height, width = config.grid
-    return SteelTruth(
-        view_id=view.view_id,
-        height=height,
-        width=width,
-        K=np.array(lens[:9]).reshape(3, 3),
-        cam_from_world=np.array(pose).reshape(4, 4),
-        rays=rays[lens][view.arrays["index"]],
-        bars=bars_by_view[view.view_id],
-        distortion=np.array(lens[9:]),
-        judged=judged,
-        **view.arrays,
-    )
+    return replace(steel, judged_cache=open_cache(judged, progress))
 
 
 def _rays(lens: Lens, config: DatasetConfig) -> Rays:

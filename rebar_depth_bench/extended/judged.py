@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
-from rebar_depth_bench.extended.axes import SURFACE_DISTANCE_RADII, WINDOW_DIAMETERS, Axis
+from rebar_depth_bench.extended.axes import WINDOW_DIAMETERS, Axis, is_on_surface
 from rebar_depth_bench.extended.steel import JudgedCrossings, SteelTruth
 from rebar_depth_bench.geometry.cameras import fold_radius, project, transform
 
@@ -224,8 +224,7 @@ def _on_side(
     camera_m = truth.depth_m[pixels].astype(np.float64)[:, None] * rays
     rotation, shift_m = truth.cam_from_world[:3, :3], truth.cam_from_world[:3, 3]
     along_m, distance_m = axis.feet((camera_m - shift_m) @ rotation)
-    radii = distance_m / (axis.diameter_m / 2)
-    on_side = (radii >= SURFACE_DISTANCE_RADII[0]) & (radii <= SURFACE_DISTANCE_RADII[1])
+    on_side = is_on_surface(distance_m, axis.diameter_m.item())
     return pixels[on_side], along_m[on_side]
 
 
