@@ -35,45 +35,31 @@ CROSSING_EDGES_M = (0.1, 0.15, *DISTANCE_EDGES_M)
 """Bin edges of the true depth of tie points, metres."""
 
 
-@dataclass(frozen=True)
-class _Bins:
-    """Bins of crossings by one property: their edges, texts in titles and definitions, and shares that are stated.
-
-    A bin includes its lower edge, and the last one its upper edge. ``below`` are the texts of a bin without a
-    lower edge.
-    """
-
-    edges: tuple[float, ...]
-    title: str
-    where: str
-    shares: tuple[str, ...] = ("located", "within_5mm")
-    below: tuple[str, str] = ("", "")
-
-
-_BINS: Mapping[str, _Bins] = {
-    "m": _Bins(CROSSING_EDGES_M, "At {} m", "at a true depth of {} m", ("within_2mm", "within_5mm")),
-    "deg": _Bins((20.0, 30.0, 45.0, 60.0, 75.0, 90.0), "Angle of {} degrees", "at an angle of {} degrees"),
-    "mm": _Bins(
-        (-math.inf, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0),
-        "Gap of {} mm",
-        "with a gap of {} mm",
-        below=("Intersecting bars", "with a negative gap"),
-    ),
-    "px": _Bins(WIDTH_EDGES_PX, "Bars of {} px", "whose thinner bar is {} px wide in the image"),
+_BINS: Mapping[str, tuple[tuple[float, ...], str, str]] = {
+    "m": (CROSSING_EDGES_M, "At {} m", "at a true depth of {} m"),
+    "deg": ((20.0, 30.0, 45.0, 60.0, 75.0, 90.0), "Angle of {} degrees", "at an angle of {} degrees"),
+    "mm": ((-math.inf, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0), "Gap of {} mm", "with a gap of {} mm"),
+    "px": (WIDTH_EDGES_PX, "Bars of {} px", "whose thinner bar is {} px wide in the image"),
 }
-"""Bins by true depth of the tie point, angle, gap, and width of the thinner bar in the image, by unit."""
+"""Bins by true depth of the tie point, angle, gap, and width of the thinner bar in the image, by unit.
 
-_SHARE_TEXTS: Mapping[str, tuple[str, str]] = {
+Each has edges, and texts for titles and definitions. A bin includes its lower edge, the last one both edges.
+"""
+
+_BELOW = "Intersecting bars", "with a negative gap"
+"""Texts of the bin without a lower edge."""
+
+_WITHIN = "whose tie point is within {} mm; what is not located fails"
+_SHARES: Mapping[str, tuple[str, str]] = {
     "located": ("located", "that are located"),
-    **{
-        f"within_{limit}mm": (
-            f"within {limit} mm",
-            f"whose tie point is within {limit} mm; what is not located fails",
-        )
-        for limit in WITHIN_MM
-    },
+    **{f"within_{limit}mm": (f"within {limit} mm", _WITHIN.format(limit)) for limit in WITHIN_MM},
 }
 """Title and definition of each share of judged crossings."""
+
+
+def _shares_of_bins(unit: str) -> tuple[str, ...]:
+    """Return the shares that are stated for the bins of a unit."""
+    return ("within_2mm" if unit == "m" else "located", "within_5mm")
 
 
 def _bin_name(share: str, unit: str, low: float, high: float) -> str:
@@ -152,7 +138,7 @@ MAIN_MEASURES = (
     *(
         Measure(
             f"tie_within_{limit}mm", f"tie point within {limit} mm", "%", "higher",
-            f"Share of judged crossings whose tie point is within {limit} mm; what is not located fails",
+            f"Share of judged crossings {_WITHIN.format(limit)}",
         )
         for limit in WITHIN_MM
     ),
@@ -162,12 +148,12 @@ MAIN_MEASURES = (
 
 def _binned_measures() -> Iterator[Measure]:
     """Yield the shares of each bin; shares of one kind are together."""
-    for unit, bins in _BINS.items():
-        for share in bins.shares:
-            head, text = _SHARE_TEXTS[share]
-            for low, high in pairwise(bins.edges):
+    for unit, (edges, in_title, in_text) in _BINS.items():
+        for share in _shares_of_bins(unit):
+            head, text = _SHARES[share]
+            for low, high in pairwise(edges):
                 step = f"{low:g}-{high:g}"
-                title, where = (bins.title, bins.where) if math.isfinite(low) else bins.below
+                title, where = (in_title, in_text) if math.isfinite(low) else _BELOW
                 definition = f"Share of judged crossings {where.format(step)} {text}"
                 name = _bin_name(share, unit, low, high)
                 yield Measure(name, f"{title.format(step)}: {head}", "%", "higher", definition)
@@ -304,11 +290,11 @@ def _binned_samples(shares: Mapping[str, Float64[ndarray, " m"]], view: ViewCros
         "px": view.width_px,
     }
     samples: dict[str, Float64[ndarray, " k"]] = {}
-    for unit, bins in _BINS.items():
-        for low, high in pairwise(bins.edges):
+    for unit, (edges, _, _) in _BINS.items():
+        for low, high in pairwise(edges):
             values = properties[unit]
-            inside = (values >= low) & ((values < high) | ((values == high) & (high == bins.edges[-1])))
-            samples |= {_bin_name(share, unit, low, high): shares[share][inside] for share in bins.shares}
+            inside = (values >= low) & ((values < high) | ((values == high) & (high == edges[-1])))
+            samples |= {_bin_name(name, unit, low, high): shares[name][inside] for name in _shares_of_bins(unit)}
     return samples
 
 

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float64
 from numpy import ndarray
 
 from rebar_depth_bench.bar_crossings.definition import CROSSINGS_PROTOCOL
-from rebar_depth_bench.bar_crossings.table import FolderCrossings, folder_crossings
+from rebar_depth_bench.bar_crossings.table import CrossingsSource, folder_crossings
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars
 from rebar_depth_bench.data.cache import ArrayCache, CacheContent, ViewArrays, open_cache
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder
@@ -60,14 +60,14 @@ class ConfigSteelTruth:
     """Steel ground truth of all views of a config that have scored pixels.
 
     ``bars_by_view`` holds the bars of each view's scene. ``rays`` holds the rays of each distinct lens (K and
-    distortion), which views share. ``crossings`` are those of the folder, with the file that they come from.
+    distortion), which views share. ``source`` is the file that the crossings come from.
     Without ``judged_cache``, no crossings are judged.
     """
 
     config: DatasetConfig
     bars_by_view: Mapping[str, SceneBars]
     rays: Mapping[Lens, Rays]
-    crossings: FolderCrossings
+    source: CrossingsSource
     cache: ArrayCache
     judged_cache: ArrayCache | None = None
 
@@ -121,13 +121,13 @@ def load_steel_truth(
     """
     path = folder.verified_file(BARS_FILE)
     bars = read_bars(path)
-    found = folder_crossings(folder, bars)
+    crossings, source = folder_crossings(folder, bars)
     scenes = {}
     for scene in config.scenes:
         of_scene = bars.get(scene.name, None if config.imported is None else ())
         if of_scene is None:
             raise DatasetError(f"{path}: has no bars for scene {scene.name!r} of config {config.name}")
-        scenes[scene.name] = SceneBars.of(of_scene, found.by_scene.get(scene.name))
+        scenes[scene.name] = SceneBars.of(of_scene, crossings.get(scene.name))
     bars_by_view = {view_id: scenes[scene] for view_id, scene in config.scene_by_view.items()}
     scored_px = scored_counts(config)
 
@@ -147,7 +147,7 @@ def load_steel_truth(
     )
     cache = open_cache(content, progress)
     rays = {lens: _rays(lens, config) for lens in {numbers[:_LENS_NUMBERS] for numbers in cache.numbers}}
-    steel = ConfigSteelTruth(config, bars_by_view, rays, found, cache)
+    steel = ConfigSteelTruth(config, bars_by_view, rays, source, cache)
 
     def judged_arrays(view_ids: Collection[str] | None) -> Iterator[ViewArrays]:
         for position, view_id in enumerate(cache.view_ids):
@@ -164,7 +164,7 @@ def load_steel_truth(
     judged = CacheContent(
         source=config.root,
         task=f"crossings in the views of {config.name}",
-        inputs=cache_inputs(config, protocol, f"{folder.files[BARS_FILE]} {found.sha256}"),
+        inputs=cache_inputs(config, protocol, f"{folder.files[BARS_FILE]} {source.sha256}"),
         dtypes={"crossing": np.uint32, "pixel": np.uint32},
         view_ids=tuple(scored_px),
         extract=judged_arrays,

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray
 
+from rebar_depth_bench.bar_crossings.table import CrossingsSource
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, STATISTICS, Measure, Samples, Statistic
 from rebar_depth_bench.extended.reach import Reach, pooled, reaches
 from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval
@@ -68,14 +69,6 @@ class ExtendedTable:
             name: [reach.to_dict() for reach in of_alignment] for name, of_alignment in self.reaches.items()
         }
         return {"views": self.views, **numbers, "crossing_reach": reaches}
-
-
-@dataclass(frozen=True)
-class CrossingsSource:
-    """File of the dataset folder that the crossings come from, and its hex SHA-256."""
-
-    file: str
-    sha256: str
 
 
 @dataclass(frozen=True, eq=False)
