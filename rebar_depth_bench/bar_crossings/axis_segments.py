@@ -113,6 +113,20 @@ def pieces(
     return segment, start_m[segment] + share[:, None] * vector_m[segment]
 
 
+def nearest_points(
+    points_m: Float64[ndarray, "*n 3"], start_m: Float64[ndarray, "*n 3"], vector_m: Float64[ndarray, "*n 3"]
+) -> tuple[Float64[ndarray, "*n 3"], Float64[ndarray, " *n"], Float64[ndarray, " *n"]]:
+    """Return the nearest points on segments to points, their places from the starts, and their distances, metres.
+
+    The arrays broadcast. On a segment without a length, the nearest point is its start.
+    """
+    length_m = np.linalg.norm(vector_m, axis=-1)
+    direction = vector_m / np.where(length_m > 0, length_m, 1.0)[..., None]
+    place_m = np.clip(np.einsum("...i,...i->...", points_m - start_m, direction), 0.0, length_m)
+    nearest_m = start_m + place_m[..., None] * direction
+    return nearest_m, place_m, np.linalg.norm(points_m - nearest_m, axis=-1)
+
+
 def without_repeated(points_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, "m 3"]:
     """Return points without those that repeat the point before."""
     if len(points_m) < 2:

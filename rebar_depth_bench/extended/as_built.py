@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from rebar_depth_bench.bar_crossings.axis_segments import nearest_points
 from rebar_depth_bench.extended.fits import fit_axes, with_misses
 from rebar_depth_bench.extended.inspection import JUDGED_NOTE, MISSED_NOTE
 from rebar_depth_bench.extended.judged import VisibleSegments, visible_segments
@@ -107,12 +108,10 @@ def _nearest_edge(
 
     Edges within ``MAX_TURN_DEG`` of ``along`` count; None without any.
     """
-    start_m, step_m = line_m[:-1], np.diff(line_m, axis=0)
-    length_m = np.linalg.norm(step_m, axis=1)
-    direction = step_m / np.where(length_m > 0, length_m, 1.0)[:, None]
-    position_m = np.einsum("ei,ei->e", point_m - start_m, direction)
-    nearest_m = start_m + np.clip(position_m, 0.0, length_m)[:, None] * direction
-    distance_m = np.linalg.norm(point_m - nearest_m, axis=1)
+    step_m = np.diff(line_m, axis=0)
+    length_m = np.linalg.norm(step_m, axis=1, keepdims=True)
+    direction = step_m / np.where(length_m > 0, length_m, 1.0)
+    nearest_m, _, distance_m = nearest_points(point_m, line_m[:-1], step_m)
     aligned = np.abs(direction @ along) >= np.cos(np.deg2rad(MAX_TURN_DEG))
     if not aligned.any():
         return None

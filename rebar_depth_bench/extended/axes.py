@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int16, Int64, UInt16
 from numpy import ndarray
 
-from rebar_depth_bench.bar_crossings.axis_segments import AxisSegments, pieces, without_repeated
+from rebar_depth_bench.bar_crossings.axis_segments import AxisSegments, nearest_points, pieces, without_repeated
 from rebar_depth_bench.bar_crossings.definition import Crossings
 from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.errors import DatasetError
@@ -245,13 +245,9 @@ class Axis(AxisSegments):
         for step in (-1, 0, 1):
             sample = nearest + step
             segment = segments[sample % len(segments) if self.closed else np.clip(sample, 0, len(segments) - 1)]
-            start_m, vector_m = self.start_m[segment], self.vector_m[segment]
-            squared_m2 = np.einsum("ni,ni->n", vector_m, vector_m)
-            share = np.clip(np.einsum("ni,ni->n", points_m - start_m, vector_m) / squared_m2, 0, 1)
-            distance_m = np.linalg.norm(points_m - start_m - share[:, None] * vector_m, axis=1)
-            closer = distance_m < best_m
-            along_m = self.along_m[segment] + share * np.sqrt(squared_m2)
-            best_along_m, best_m = np.where(closer, along_m, best_along_m), np.minimum(distance_m, best_m)
+            _, place_m, distance_m = nearest_points(points_m, self.start_m[segment], self.vector_m[segment])
+            best_along_m = np.where(distance_m < best_m, self.along_m[segment] + place_m, best_along_m)
+            best_m = np.minimum(distance_m, best_m)
         return best_along_m, best_m
 
     @cached_property
@@ -340,8 +336,6 @@ def _match_radius_m(point_m: Float64[ndarray, "k 3"], bar_id: int, cage: CageTru
     runs = np.flatnonzero(cage.bar_id == bar_id)
     if not len(runs):
         return np.full(len(point_m), MAX_MATCH_RADIUS_M)
-    start_m, vector_m = cage.start_m[runs], cage.end_m[runs] - cage.start_m[runs]
-    share = (point_m @ vector_m.T - (start_m * vector_m).sum(axis=1)) / (vector_m**2).sum(axis=1)
-    feet_m = start_m + np.clip(share, 0, 1)[..., None] * vector_m
-    distance_m = np.linalg.norm(point_m[:, None] - feet_m, axis=2)
+    vector_m = cage.end_m[runs] - cage.start_m[runs]
+    _, _, distance_m = nearest_points(point_m[:, None], cage.start_m[runs], vector_m)
     return np.asarray(cage.match_radius_m[runs[distance_m.argmin(axis=1)]])

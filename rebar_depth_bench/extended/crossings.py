@@ -19,7 +19,7 @@ from numpy import ndarray
 
 from rebar_depth_bench.bar_crossings.definition import TiePoints, tie_points
 from rebar_depth_bench.extended.fits import MISS_MM, FittedAxes, fit_axes, with_misses
-from rebar_depth_bench.extended.judged import AxisLines, VisibleSegments, visible_parts
+from rebar_depth_bench.extended.judged import VisibleSegments, visible_parts
 from rebar_depth_bench.extended.measures import Measure, MeasureFamily, Samples, share_sample
 from rebar_depth_bench.extended.profiles import DISTANCE_EDGES_M, WIDTH_EDGES_PX
 from rebar_depth_bench.extended.steel import SteelTruth
@@ -189,14 +189,16 @@ def view_crossings(truth: SteelTruth) -> ViewCrossings:
     crossing, pixels = truth.judged.crossing[straight], truth.judged.pixels[straight]
     pixels = pixels.reshape(2 * len(crossing), pixels.shape[2])
     rotation = truth.cam_from_world[:3, :3]
-    lines = AxisLines(
+    visible = visible_parts(
+        truth,
+        pixels,
+        np.ones(pixels.shape, dtype=bool),
         segment=np.repeat(crossing, 2),
         diameter_m=scene.diameter_m[crossing].ravel(),
         match_radius_m=scene.match_radius_m[crossing].ravel(),
-        start_m=transform(truth.cam_from_world, scene.point_m[crossing].reshape(-1, 3)),
+        point_m=transform(truth.cam_from_world, scene.point_m[crossing].reshape(-1, 3)),
         direction=scene.tangent[crossing].reshape(-1, 3) @ rotation.T,
     )
-    visible = visible_parts(truth, lines, pixels, np.ones(pixels.shape, dtype=bool))
     found = scene.crossings
     ties = TiePoints(
         transform(truth.cam_from_world, found.tie_point_m[crossing]),
