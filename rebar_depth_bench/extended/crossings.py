@@ -178,7 +178,6 @@ class ViewCrossings:
     crossing: Int64[ndarray, " m"]
     visible: VisibleSegments
     ties: TiePoints
-    radius_m: Float64[ndarray, "m 2"]
     width_px: Float64[ndarray, " m"]
 
 
@@ -207,7 +206,7 @@ def view_crossings(truth: SteelTruth) -> ViewCrossings:
         found.angle_deg[crossing],
     )
     width_px = truth.K[0, 0] * scene.diameter_m[crossing].min(axis=1, initial=np.inf) / ties.tie_point_m[:, 2]
-    return ViewCrossings(len(scene), crossing, visible, ties, scene.diameter_m[crossing] / 2, width_px)
+    return ViewCrossings(len(scene), crossing, visible, ties, width_px)
 
 
 def fitted_ties(p_m: Float64[ndarray, " n"], view: ViewCrossings) -> tuple[Bool[ndarray, " m"], TiePoints]:
@@ -220,10 +219,8 @@ def fitted_ties(p_m: Float64[ndarray, " n"], view: ViewCrossings) -> tuple[Bool[
     fitted = fit_axes(p_m, view.visible)
     with np.errstate(all="ignore"):
         points_m = _closest_points_m(fitted)
-        direction = fitted.direction.reshape(-1, 2, 3)
-        ties = tie_points(
-            points_m[0], points_m[1], direction[:, 0], direction[:, 1], view.radius_m, towards=view.ties.normal
-        )
+        direction, radius_m = fitted.direction.reshape(-1, 2, 3), view.visible.diameter_m.reshape(-1, 2) / 2
+        ties = tie_points(*points_m, direction[:, 0], direction[:, 1], radius_m, towards=view.ties.normal)
     return fitted.found.reshape(-1, 2).all(axis=1), ties
 
 
