@@ -15,12 +15,7 @@ from numpy import ndarray
 from rebar_depth_bench.extended.measures import ONCE, Measure, MeasureFamily, Samples, finite_sample
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.columns import METRICS
-from rebar_depth_bench.scoring.metrics import (
-    depth_metrics,
-    is_valid_prediction,
-    median,
-    median_scale,
-)
+from rebar_depth_bench.scoring.metrics import depth_metrics, is_valid_prediction, median, median_scale
 
 
 def log_scale(p_m: Float64[ndarray, " n"], z_m: Float64[ndarray, " n"]) -> float:

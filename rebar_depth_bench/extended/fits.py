@@ -27,6 +27,7 @@ from jaxtyping import Bool, Float64
 from numpy import ndarray
 
 from rebar_depth_bench.extended.judged import VisibleSegments
+from rebar_depth_bench.scoring.metrics import is_valid_prediction
 
 POSITION_STEPS = 6
 """Gauss-Newton steps on the axis with the radius fixed."""
@@ -294,10 +295,8 @@ def _predicted_points_m(
     and tilt the fitted axis.
     """
     depth_m = p_m.take(visible.pixels)
-    with np.errstate(invalid="ignore"):
-        predicted = visible.used & np.isfinite(depth_m) & (depth_m > 0)
-        known_m = np.where(predicted, np.minimum(depth_m, MAX_DEPTH_M), 0.0)
-    points_m = visible.local_points_m(known_m)
+    predicted = visible.used & is_valid_prediction(depth_m)
+    points_m = visible.local_points_m(np.where(predicted, np.minimum(depth_m, MAX_DEPTH_M), 0.0))
     points_m[..., 2] = visible.truth_m[..., 2]
     return points_m, predicted
 

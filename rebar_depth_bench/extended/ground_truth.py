@@ -25,7 +25,7 @@ from rebar_depth_bench.extended.steel import JudgedCrossings, SceneBars, SteelTr
 from rebar_depth_bench.geometry.cameras import pixel_rays
 from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.scoring.evaluation import Evaluation
-from rebar_depth_bench.scoring.protocol import single_bar_pixels
+from rebar_depth_bench.scoring.protocol import interior, single_bar_pixels
 from rebar_depth_bench.scoring.truth import are_pixels_inside, cache_inputs, scored_counts, verified_views
 
 _DTYPES: Mapping[str, type] = {
@@ -206,14 +206,14 @@ def _steel_arrays(left: EyeTruth, scored: ndarray, rays: Rays, scene: SceneBars)
     assert bars is not None  # ``has_bar_ids``
     assert mask is not None
     index = np.flatnonzero(dilate_mask(mask) & (depth_m > 0))
-    interior = np.zeros(depth_m.size, dtype=bool)
-    interior[scored] = True
-    interior = interior[index]
+    is_scored = np.zeros(depth_m.size, dtype=bool)
+    is_scored[scored] = True
+    is_scored = is_scored[index]
 
     def spread(values: ndarray, elsewhere: float) -> ndarray:
         """Return values of scored pixels on ``index``, with another one beside them."""
         spread = np.full(len(index), elsewhere, values.dtype)
-        spread[interior] = values
+        spread[is_scored] = values
         return spread
 
     z_m, own = depth_m.ravel()[scored], bars.ravel()[scored]
@@ -224,7 +224,7 @@ def _steel_arrays(left: EyeTruth, scored: ndarray, rays: Rays, scene: SceneBars)
         "index": index,
         "depth_m": depth_m.ravel()[index],
         "bar_id": bars.ravel()[index],
-        "interior": interior,
+        "interior": is_scored,
         "single_bar": spread(single_bar_pixels(bars, scored), False),
         "run": spread(run, -1),
         "front_m": spread(front_m, np.nan),
@@ -233,11 +233,5 @@ def _steel_arrays(left: EyeTruth, scored: ndarray, rays: Rays, scene: SceneBars)
 
 
 def dilate_mask(mask: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
-    """Return a mask dilated by one pixel in all eight directions (3 x 3)."""
-    rows = mask.copy()
-    rows[1:] |= mask[:-1]
-    rows[:-1] |= mask[1:]
-    grown = rows.copy()
-    grown[:, 1:] |= rows[:, :-1]
-    grown[:, :-1] |= rows[:, 1:]
-    return grown
+    """Return a mask dilated by one pixel in all eight directions (3 x 3): what is not eroded of its complement."""
+    return ~interior(np.pad(~mask, 1, constant_values=True))[1:-1, 1:-1]

@@ -132,9 +132,7 @@ def visible_parts(
     )  # fmt: skip
 
 
-def _sampled_pixels(
-    truth: SteelTruth,
-) -> tuple[Int64[ndarray, " r"], Int64[ndarray, "r k"], Bool[ndarray, "r k"]]:
+def _sampled_pixels(truth: SteelTruth) -> tuple[Int64[ndarray, " r"], Int64[ndarray, "r k"], Bool[ndarray, "r k"]]:
     """Return the segments with enough interior pixels, and up to ``MAX_SAMPLES`` pixels of each, evenly spread."""
     candidates = np.flatnonzero(truth.interior & (truth.run >= 0))
     segments = truth.run.take(candidates)

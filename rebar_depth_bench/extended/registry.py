@@ -24,12 +24,7 @@ from rebar_depth_bench.extended.measures import (
     Samples,
     aligned_predictions,
 )
-from rebar_depth_bench.extended.result import (
-    ExtendedResult,
-    ViewSamples,
-    tabulate_extended,
-    view_numbers,
-)
+from rebar_depth_bench.extended.result import ExtendedResult, ViewSamples, tabulate_extended, view_numbers
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.scoring.bootstrap import resample_views

@@ -44,11 +44,7 @@ class MeasureEstimate:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object of the estimate, rounded."""
-        return {
-            "value": rounded(self.value),
-            "ci95": rounded_interval(self.interval),
-            "samples": self.samples,
-        }
+        return {"value": rounded(self.value), "ci95": rounded_interval(self.interval), "samples": self.samples}
 
 
 @dataclass(frozen=True)
