@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Self
 
 import numpy as np
@@ -21,6 +21,15 @@ _MAX_PIECES = 200_000
 
 class TooManyNeighboursError(Exception):
     """So many bars are close to each other that they are not compared."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Dataclass of arrays that have a row for each of the same items."""
+
+    def of(self, rows: ndarray) -> Self:
+        """Return the rows that a mask or positions choose."""
+        return type(self)(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float64, Int16, Int64, UInt16
 from numpy import ndarray
 
 from rebar_depth_bench.bar_crossings.axis_segments import AxisSegments, nearest_points, pieces, without_repeated
-from rebar_depth_bench.bar_crossings.definition import Crossings
+from rebar_depth_bench.bar_crossings.definition import Crossings, bisectors
 from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.errors import DatasetError
 
@@ -45,25 +45,15 @@ It absorbs rounding: segments at equal distances do not separate a pair.
 """
 
 
-@dataclass(frozen=True, eq=False)
-class ParallelPairs:
-    """Pairs of parallel segments that overlap along their axes. All arrays are segments x segments, in metres.
+def parallel_pairs(
+    start_m: Float64[ndarray, "r 3"], end_m: Float64[ndarray, "r 3"], diameter_m: Float64[ndarray, " r"]
+) -> tuple[Float64[ndarray, "r r"], ...]:
+    """Return ``apart_m``, ``low_m``, ``high_m`` and ``middle_m`` of segments from ``start_m`` to ``end_m``.
 
     ``apart_m`` is the distance of the axes in the middle of their overlap, inf for pairs that are not parallel or
     do not overlap, and on the diagonal. ``low_m`` to ``high_m`` is the extent of segment j projected on the axis
-    of segment i, from its start; ``middle_m`` is the middle of their overlap on that axis.
+    of segment i, from its start; ``middle_m`` is the middle of their overlap on that axis. One frame, metres.
     """
-
-    apart_m: Float64[ndarray, "r r"]
-    low_m: Float64[ndarray, "r r"]
-    high_m: Float64[ndarray, "r r"]
-    middle_m: Float64[ndarray, "r r"]
-
-
-def parallel_pairs(
-    start_m: Float64[ndarray, "r 3"], end_m: Float64[ndarray, "r 3"], diameter_m: Float64[ndarray, " r"]
-) -> ParallelPairs:
-    """Return the parallel pairs among segments from ``start_m`` to ``end_m`` (one common frame, metres)."""
     count = len(diameter_m)
     apart_m, low_m, high_m, middle_m = (np.empty((count, count)) for _ in range(4))
     length_m = np.linalg.norm(end_m - start_m, axis=1)
@@ -83,28 +73,32 @@ def parallel_pairs(
         other_point_m = start_m + along_other_m[:, None] * direction
         own_point_m = start_m[segment] + middle_m[segment][:, None] * direction[segment]
         apart_m[segment] = np.where(overlaps, np.linalg.norm(other_point_m - own_point_m, axis=1), np.inf)
-    return ParallelPairs(np.maximum(apart_m, apart_m.T), low_m, high_m, middle_m)
+    return np.maximum(apart_m, apart_m.T), low_m, high_m, middle_m
 
 
 def overlapping_pairs(
-    parallel: ParallelPairs, bar_id: Int64[ndarray, " r"], diameter_m: Float64[ndarray, " r"]
+    parallel_m: tuple[Float64[ndarray, "r r"], ...],
+    bar_id: Int64[ndarray, " r"],
+    diameter_m: Float64[ndarray, " r"],
 ) -> Int64[ndarray, "m 2"]:
     """Return the pairs of neighbouring segments (lower index first, ascending): those to measure the spacing of.
 
     A pair consists of two parallel, overlapping segments of different bars, not lapped, at most ``MAX_SPACING_M``
     apart, without a third parallel segment between them: none present at the middle of their overlap is nearer to
     both than they are to each other (the relative neighbourhood graph: Toussaint, Pattern Recognition 12, 1980).
+    ``parallel_m`` are the ``parallel_pairs``.
     """
+    all_apart_m, low_m, high_m, middle_m = parallel_m
     pairs = [np.empty((0, 2), dtype=np.int64)]
     for segment in range(len(bar_id)):
-        apart_m = parallel.apart_m[segment]
+        apart_m = all_apart_m[segment]
         clear_m = apart_m - (diameter_m + diameter_m[segment]) / 2
         lapped = clear_m < MIN_CLEARANCE_DIAMETERS * np.maximum(diameter_m, diameter_m[segment])
         others = np.flatnonzero(~lapped & (apart_m <= MAX_SPACING_M) & (bar_id != bar_id[segment]))
         others = others[others > segment]
-        at_m = parallel.middle_m[segment, others]
-        present = (parallel.low_m[segment][:, None] <= at_m) & (at_m <= parallel.high_m[segment][:, None])
-        farther_m = np.maximum(apart_m[:, None], parallel.apart_m[:, others])
+        at_m = middle_m[segment, others]
+        present = (low_m[segment][:, None] <= at_m) & (at_m <= high_m[segment][:, None])
+        farther_m = np.maximum(apart_m[:, None], all_apart_m[:, others])
         blocked = (present & (farther_m < _NEARER_FACTOR * apart_m[others])).any(axis=0)
         free = others[~blocked]
         pairs.append(np.column_stack([np.full(len(free), segment), free]))
@@ -166,9 +160,9 @@ def cage_truth(bars: Iterable[Bar]) -> CageTruth:
     diameter_m = np.array([bar.diameter_m for bar, _, _ in segments], dtype=np.float64)
     start_m = np.array([start_m for _, start_m, _ in segments], dtype=np.float64).reshape(-1, 3)
     end_m = np.array([end_m for _, _, end_m in segments], dtype=np.float64).reshape(-1, 3)
-    parallel = parallel_pairs(start_m, end_m, diameter_m)
-    match_radius_m = np.minimum(parallel.apart_m.min(axis=1, initial=np.inf) / 2, MAX_MATCH_RADIUS_M)
-    neighbours = overlapping_pairs(parallel, bar_id, diameter_m)
+    parallel_m = parallel_pairs(start_m, end_m, diameter_m)
+    match_radius_m = np.minimum(parallel_m[0].min(axis=1, initial=np.inf) / 2, MAX_MATCH_RADIUS_M)
+    neighbours = overlapping_pairs(parallel_m, bar_id, diameter_m)
     return CageTruth(bar_id, diameter_m, start_m, end_m, neighbours, match_radius_m)
 
 
@@ -262,9 +256,7 @@ class Axis(AxisSegments):
         """Return the unit tangent at lengths along the axis; at a vertex, the bisector of its edges."""
         direction = self.vector_m / np.linalg.norm(self.vector_m, axis=1, keepdims=True)
         before, after = (self._segment_at(along_m + step_m) for step_m in (-_TANGENT_STEP_M, _TANGENT_STEP_M))
-        bisector = direction[before] + direction[after]
-        norm = np.linalg.norm(bisector, axis=1, keepdims=True)
-        return np.where(norm > 1e-6, bisector / np.where(norm > 1e-6, norm, 1.0), direction[after])
+        return bisectors(direction[after], direction[before])
 
     def _segment_at(self, along_m: Float64[ndarray, " n"]) -> ndarray:
         if self.closed:

@@ -20,12 +20,13 @@ of equations is singular.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
+from rebar_depth_bench.bar_crossings.axis_segments import Rows
 from rebar_depth_bench.extended.judged import VisibleSegments
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
 
@@ -113,7 +114,7 @@ def fit_cylinders(
 
 
 @dataclass(frozen=True, eq=False)
-class _PointSets:
+class _PointSets(Rows):
     """Points relative to the start of their set: ``across_m``, ``away_m``, and ``along`` in half lengths.
 
     Unused points are 0. The columns are separate arrays because numpy is several times slower on arrays whose
@@ -126,10 +127,6 @@ class _PointSets:
     used: Bool[ndarray, "r k"]
     half_m: Float64[ndarray, "r 1"]
     radius_m: Float64[ndarray, "r 1"]
-
-    def of(self, sets: Bool[ndarray, " r"]) -> _PointSets:
-        """Return the selected sets."""
-        return _PointSets(*(getattr(self, field.name)[sets] for field in fields(self)))
 
 
 def _iterate(

@@ -5,12 +5,13 @@ Determined from the ground truth of the left eye alone. Frame: the camera's (Ope
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
+from rebar_depth_bench.bar_crossings.axis_segments import Rows
 from rebar_depth_bench.extended.axes import WINDOW_DIAMETERS, Axis, is_on_surface
 from rebar_depth_bench.extended.steel import JudgedCrossings, SteelTruth
 from rebar_depth_bench.geometry.cameras import fold_radius, project, transform
@@ -39,7 +40,7 @@ _GOLDEN = (np.sqrt(5.0) - 1) / 2
 
 
 @dataclass(frozen=True, eq=False)
-class VisibleSegments:
+class VisibleSegments(Rows):
     """The r judged segments of a view, each sampled at up to k pixels.
 
     ``segment`` holds indices of segments of ``CageTruth``, or of crossings. ``match_radius_m`` is the distance
@@ -62,10 +63,6 @@ class VisibleSegments:
     rays: Float64[ndarray, "r k 3"]
     truth_m: Float64[ndarray, "r k 3"]
     can_fit_diameter: Bool[ndarray, " r"]
-
-    def of(self, rows: Bool[ndarray, " r"] | Int64[ndarray, " s"]) -> VisibleSegments:
-        """Return the selected segments."""
-        return VisibleSegments(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     def local_points_m(self, depth_m: Float64[ndarray, "r k"]) -> Float64[ndarray, "r k 3"]:
         """Return the points at planar ``depth_m`` on the rays of ``pixels``, in ``frame`` from ``middle_m``."""

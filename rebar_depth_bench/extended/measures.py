@@ -99,10 +99,6 @@ class Measure:
             factor=100.0 if self.unit == "%" else 1.0,
         )
 
-    def number(self, statistic: float) -> float | None:
-        """Return the measure's value from the statistic of its samples; None where it is undefined."""
-        return statistic if self.convert is None else self.convert(statistic)
-
 
 @dataclass(frozen=True)
 class MeasureFamily:

@@ -123,7 +123,10 @@ def view_numbers(view: ViewSamples, measures: Mapping[str, Sequence[Measure]]) -
 
     def value(measure: Measure, samples: Samples) -> float | None:
         values = samples.get(measure.sample, np.empty(0))
-        return measure.number(STATISTICS[measure.statistic](values)) if len(values) else None
+        if not len(values):
+            return None
+        statistic = STATISTICS[measure.statistic](values)
+        return statistic if measure.convert is None else measure.convert(statistic)
 
     return {
         alignment: {measure.name: value(measure, view[alignment]) for measure in of_alignment}
