@@ -20,7 +20,7 @@ from numpy import ndarray
 from rebar_depth_bench.bar_crossings.definition import TiePoints, tie_points
 from rebar_depth_bench.extended.fits import MISS_MM, FittedAxes, fit_axes, with_misses
 from rebar_depth_bench.extended.judged import VisibleSegments, visible_parts
-from rebar_depth_bench.extended.measures import Measure, MeasureFamily, Samples, share_sample
+from rebar_depth_bench.extended.measures import Measure, MeasureFamily, Samples, median_and_p95, share_sample
 from rebar_depth_bench.extended.profiles import DISTANCE_EDGES_M, WIDTH_EDGES_PX
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.geometry.cameras import transform
@@ -70,19 +70,9 @@ def _bin_name(share: str, unit: str, low: float, high: float) -> str:
 
 def _judged_pair(name: str, title: str, unit: str, definition: str) -> tuple[Measure, ...]:
     """Return median and 95th percentile of an absolute error over all judged crossings; ``unit`` is mm or deg."""
-    shown, in_unit = ("mm", "") if unit == "mm" else ("", ", degrees")
-    note = f"What is not located counts as {f'{MISS_MM:g} mm' if unit == 'mm' else f'{MISS_DEG:g} degrees'}."
-    sample = f"{name}_judged_{unit}"
-    return (
-        Measure(
-            f"{name}_median_{unit}", f"{title}: median{in_unit}", shown, "lower",
-            f"Median of the {definition}. {note}", sample, "median",
-        ),
-        Measure(
-            f"{name}_p95_{unit}", f"{title}: p95{in_unit}", shown, "lower",
-            f"95th percentile of the {definition}. {note}", sample, "p95",
-        ),
-    )  # fmt: skip
+    miss, suffix = (f"{MISS_MM:g} mm", "") if unit == "mm" else (f"{MISS_DEG:g} degrees", ", degrees")
+    text = f"{definition}. What is not located counts as {miss}."
+    return median_and_p95(name, title, unit, text, suffix)
 
 
 def _bias(name: str, title: str, definition: str) -> Measure:
@@ -169,12 +159,11 @@ _MM = 1000.0
 class ViewCrossings:
     """The m crossings of a view on which depth is judged: judged ones between bars that are straight there.
 
-    ``crossing`` holds indices into the scene's crossings, whose number is ``in_scene``. ``visible`` are the
-    parts of bar a and bar b of the first crossing, then of the second, and so on. ``ties`` are the true tie
-    points in the camera frame, and ``width_px`` the width of the thinner bar in the image.
+    ``crossing`` holds indices into the scene's crossings. ``visible`` are the parts of bar a and bar b of the
+    first crossing, then of the second, and so on. ``ties`` are the true tie points in the camera frame, and
+    ``width_px`` the width of the thinner bar in the image.
     """
 
-    in_scene: int
     crossing: Int64[ndarray, " m"]
     visible: VisibleSegments
     ties: TiePoints
@@ -206,7 +195,7 @@ def view_crossings(truth: SteelTruth) -> ViewCrossings:
         found.angle_deg[crossing],
     )
     width_px = truth.K[0, 0] * scene.diameter_m[crossing].min(axis=1, initial=np.inf) / ties.tie_point_m[:, 2]
-    return ViewCrossings(len(scene), crossing, visible, ties, width_px)
+    return ViewCrossings(crossing, visible, ties, width_px)
 
 
 def fitted_ties(p_m: Float64[ndarray, " n"], view: ViewCrossings) -> tuple[Bool[ndarray, " m"], TiePoints]:
@@ -265,7 +254,7 @@ def crossing_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
         **{f"within_{limit}mm": (error_mm <= limit).astype(np.float64) for limit in WITHIN_MM},
     }
     return {
-        "crossings_judged": share_sample(len(located), view.in_scene),
+        "crossings_judged": share_sample(len(located), len(truth.bars.crossings)),
         "crossing_located": shares["located"],
         "tie_judged_mm": error_mm,
         "tie_along_judged_mm": with_misses(offset_mm[:, 2]),

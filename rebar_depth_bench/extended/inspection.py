@@ -28,7 +28,7 @@ from rebar_depth_bench.extended.judged import (
     VisibleSegments,
     visible_segments,
 )
-from rebar_depth_bench.extended.measures import Measure, MeasureFamily, Samples
+from rebar_depth_bench.extended.measures import Measure, MeasureFamily, Samples, median_and_p95
 from rebar_depth_bench.extended.steel import SteelTruth
 
 ErrorKind = Literal["spacing", "layer", "cover"]
@@ -141,21 +141,14 @@ def _error_measures(kind: str) -> tuple[Measure, ...]:
     Only the last two cover everything judged, so only they have a better direction.
     """
     title, definition = _KINDS[kind]
-    found, judged = f"{kind}_error_mm", f"{kind}_judged_mm"
+    found = f"{kind}_error_mm"
     return (
         Measure(f"{kind}_bias_mm", f"{title}: bias", "mm", "", f"Mean over what was found: {definition}.", found),
         Measure(
             f"{kind}_std_mm", f"{title}: spread", "mm", "",
             f"Standard deviation over what was found: {definition}.", found, "std",
         ),
-        Measure(
-            f"{kind}_median_mm", f"{title}: median error", "mm", "lower",
-            f"Median of the absolute value: {definition}. {MISSED_NOTE}", judged, "median",
-        ),
-        Measure(
-            f"{kind}_p95_mm", f"{title}: p95 error", "mm", "lower",
-            f"95th percentile of the absolute value: {definition}. {MISSED_NOTE}", judged, "p95",
-        ),
+        *median_and_p95(kind, title, "mm", f"absolute value: {definition}. {MISSED_NOTE}", " error"),
     )  # fmt: skip
 
 
