@@ -107,12 +107,6 @@ class Crossings:
     angle_deg: Float64[ndarray, " n"]
     normal: Float64[ndarray, "n 3"]
 
-    @classmethod
-    def none(cls) -> Crossings:
-        """Return the crossings of a scene that has none."""
-        ids, points, numbers = np.empty(0, np.int64), np.empty((0, 3)), np.empty(0)
-        return cls(ids, ids, ids, points, points, points, numbers, numbers, points)
-
     def __len__(self) -> int:
         return len(self.bar_a)
 

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt16, UInt32
 from numpy import ndarray
 
-from rebar_depth_bench.bar_crossings.definition import Crossings
+from rebar_depth_bench.bar_crossings.definition import Crossings, scene_crossings
 from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.extended.axes import CageTruth, SceneCrossings, cage_truth, prepared_crossings
 
@@ -37,8 +37,8 @@ class SceneBars:
         measured = with_axis(bars)
         diameter_m[[bar.bar_id for bar in measured]] = [bar.diameter_m for bar in measured]
         designed = {bar.bar_id: bar for bar in measured if bar.nominal_axis_m}
-        cage = cage_truth(bars)
-        return cls(cage, diameter_m, designed, prepared_crossings(crossings or Crossings.none(), bars, cage))
+        cage, crossings = cage_truth(bars), scene_crossings(()) if crossings is None else crossings
+        return cls(cage, diameter_m, designed, prepared_crossings(crossings, bars, cage))
 
 
 @dataclass(frozen=True, eq=False)
