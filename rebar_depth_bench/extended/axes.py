@@ -288,7 +288,8 @@ class SceneCrossings:
 
     ``axes`` are those of the bars that cross, by bar id. ``along_m`` is the crossing's place along the axis and
     ``tangent`` the unit tangent there. ``straight`` marks where the axis deviates from it by at most
-    ``STRAIGHT_DEG`` within ``WINDOW_DIAMETERS``. ``match_radius_m`` is that of the run of the bar at the crossing.
+    ``STRAIGHT_DEG`` within ``WINDOW_DIAMETERS``. ``match_radius_m`` is that of the nearest run of the bar, the
+    largest one without a run.
     """
 
     crossings: Crossings
@@ -311,7 +312,8 @@ def prepared_crossings(crossings: Crossings, bars: Iterable[Bar], cage: CageTrut
     point_m = np.stack([crossings.point_a_m, crossings.point_b_m], axis=1)
     crossing = set(bar_id.ravel().tolist())
     axes = {bar.bar_id: Axis.of_bars([bar]) for bar in with_axis(bars) if bar.bar_id in crossing}
-    diameter_m, along_m, match_radius_m = np.zeros((3, *bar_id.shape))
+    diameter_m, along_m = np.zeros((2, *bar_id.shape))
+    match_radius_m = np.full(bar_id.shape, MAX_MATCH_RADIUS_M)
     tangent, straight = np.zeros((*bar_id.shape, 3)), np.zeros(bar_id.shape, dtype=bool)
     for number, axis in axes.items():
         own = bar_id == number
@@ -319,15 +321,9 @@ def prepared_crossings(crossings: Crossings, bars: Iterable[Bar], cage: CageTrut
         along_m[own], _ = axis.feet(point_m[own])
         tangent[own] = axis.tangents(along_m[own])
         straight[own] = axis.is_straight(along_m[own], tangent[own])
-        match_radius_m[own] = _match_radius_m(point_m[own], number, cage)
+        runs = np.flatnonzero(cage.bar_id == number)
+        if len(runs):
+            vector_m = cage.end_m[runs] - cage.start_m[runs]
+            _, _, distance_m = nearest_points(point_m[own][:, None], cage.start_m[runs], vector_m)
+            match_radius_m[own] = cage.match_radius_m[runs[distance_m.argmin(axis=1)]]
     return SceneCrossings(crossings, axes, bar_id, diameter_m, point_m, along_m, tangent, straight, match_radius_m)
-
-
-def _match_radius_m(point_m: Float64[ndarray, "k 3"], bar_id: int, cage: CageTruth) -> Float64[ndarray, " k"]:
-    """Return the match radius of the run of the bar that is nearest to each point; the largest without a run."""
-    runs = np.flatnonzero(cage.bar_id == bar_id)
-    if not len(runs):
-        return np.full(len(point_m), MAX_MATCH_RADIUS_M)
-    vector_m = cage.end_m[runs] - cage.start_m[runs]
-    _, _, distance_m = nearest_points(point_m[:, None], cage.start_m[runs], vector_m)
-    return np.asarray(cage.match_radius_m[runs[distance_m.argmin(axis=1)]])
