@@ -74,7 +74,7 @@ def check_crossings(folder: DatasetFolder, bars: Mapping[str, tuple[Bar, ...]]) 
     """Check that the table of crossings holds the crossings of the bars, to ``_CROSSING_TOLERANCE_M``."""
     if CROSSINGS_FILE not in folder.files:
         return Check("crossings of the bars", "none", f"the folder has no {CROSSINGS_FILE}")
-    stored = folder_crossings(folder, bars).by_scene
+    stored, _ = folder_crossings(folder, bars)
     expected = {
         scene: crossings for scene, of_scene in bars.items() if len(crossings := scene_crossings(of_scene))
     }

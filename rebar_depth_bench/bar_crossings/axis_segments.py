@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
+from typing import Self
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -20,6 +21,15 @@ _MAX_PIECES = 200_000
 
 class TooManyNeighboursError(Exception):
     """So many bars are close to each other that they are not compared."""
+
+
+@dataclass(frozen=True, eq=False)
+class Rows:
+    """Dataclass of arrays that have a row for each of the same items."""
+
+    def of(self, rows: ndarray) -> Self:
+        """Return the rows that a mask or positions choose."""
+        return type(self)(*(getattr(self, field.name)[rows] for field in fields(self)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +52,7 @@ class AxisSegments:
     diameter_m: Float64[ndarray, " b"]
 
     @classmethod
-    def of_bars(cls, bars: Sequence[Bar]) -> AxisSegments:
+    def of_bars(cls, bars: Sequence[Bar]) -> Self:
         """Return the segments of bars that have an axis; repeated points of an axis are left out."""
         starts, vectors, along, before, after, lengths, closed = ([] for _ in range(7))
         first = 0
@@ -110,6 +120,20 @@ def pieces(
     number = np.arange(len(segment)) - np.repeat(np.cumsum(counts) - counts, counts)
     share = (number + 0.5) / counts[segment]
     return segment, start_m[segment] + share[:, None] * vector_m[segment]
+
+
+def nearest_points(
+    points_m: Float64[ndarray, "*n 3"], start_m: Float64[ndarray, "*n 3"], vector_m: Float64[ndarray, "*n 3"]
+) -> tuple[Float64[ndarray, "*n 3"], Float64[ndarray, " *n"], Float64[ndarray, " *n"]]:
+    """Return the nearest points on segments to points, their places from the starts, and their distances, metres.
+
+    The arrays broadcast. On a segment without a length, the nearest point is its start.
+    """
+    length_m = np.linalg.norm(vector_m, axis=-1)
+    direction = vector_m / np.where(length_m > 0, length_m, 1.0)[..., None]
+    place_m = np.clip(np.einsum("...i,...i->...", points_m - start_m, direction), 0.0, length_m)
+    nearest_m = start_m + place_m[..., None] * direction
+    return nearest_m, place_m, np.linalg.norm(points_m - nearest_m, axis=-1)
 
 
 def without_repeated(points_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, "m 3"]:

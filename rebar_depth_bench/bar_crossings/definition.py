@@ -12,14 +12,14 @@ in the middle). Frame: world, metres.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
-from rebar_depth_bench.bar_crossings.axis_segments import ROUNDING_M, AxisSegments
+from rebar_depth_bench.bar_crossings.axis_segments import ROUNDING_M, AxisSegments, Rows
 from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.geometry.segments import closest_on_segments
 
@@ -51,7 +51,7 @@ def crossing_parameters() -> dict[str, Any]:
 
 
 @dataclass(frozen=True, eq=False)
-class TiePoints:
+class TiePoints(Rows):
     """Tie points of pairs of axes: see ``tie_points``. ``normal`` is a unit vector from a to b."""
 
     tie_point_m: Float64[ndarray, "n 3"]
@@ -107,12 +107,6 @@ class Crossings:
     angle_deg: Float64[ndarray, " n"]
     normal: Float64[ndarray, "n 3"]
 
-    @classmethod
-    def none(cls) -> Crossings:
-        """Return the crossings of a scene that has none."""
-        ids, points, numbers = np.empty(0, np.int64), np.empty((0, 3)), np.empty(0)
-        return cls(ids, ids, ids, points, points, points, numbers, numbers, points)
-
     def __len__(self) -> int:
         return len(self.bar_a)
 
@@ -141,18 +135,18 @@ def scene_crossings(bars: Sequence[Bar], max_gap_m: float = MAX_GAP_M) -> Crossi
     arguments = (found.point_a_m, found.point_b_m, found.tangent_a, found.tangent_b)
     ties = tie_points(*arguments, radius_m)
     chosen = _middle_minima(found, ties.tie_point_m, 2 * radius_m.max(axis=1, initial=0.0))
-    found, tie_point_m = found.of(chosen), ties.tie_point_m[chosen]
+    found, ties = found.of(chosen), ties.of(chosen)
     ids = np.array([bar.bar_id for bar in measured], dtype=np.int64)
     return Crossings(
-        node_id=node_ids(tie_point_m, 2 * radius_m[chosen].max(axis=1, initial=0.0)),
+        node_id=node_ids(ties.tie_point_m, 2 * radius_m[chosen].max(axis=1, initial=0.0)),
         bar_a=ids[found.bar_a],
         bar_b=ids[found.bar_b],
         point_a_m=_rounded(found.point_a_m),
         point_b_m=_rounded(found.point_b_m),
-        tie_point_m=_rounded(tie_point_m),
-        gap_m=_rounded(ties.gap_m[chosen]),
-        angle_deg=_rounded(ties.angle_deg[chosen]),
-        normal=_rounded(ties.normal[chosen]),
+        tie_point_m=_rounded(ties.tie_point_m),
+        gap_m=_rounded(ties.gap_m),
+        angle_deg=_rounded(ties.angle_deg),
+        normal=_rounded(ties.normal),
     )
 
 
@@ -233,7 +227,7 @@ def _linked(count: int, links: Int64[ndarray, "l 2"]) -> Int64[ndarray, " n"]:
 
 
 @dataclass(frozen=True, eq=False)
-class Minima:
+class Minima(Rows):
     """Local minima of the distance of axes a and b, interior to both; a point may occur more than once.
 
     ``bar_a`` and ``bar_b`` are positions of bars, ``along_a_m`` and ``along_b_m`` lengths along their axes,
@@ -251,10 +245,6 @@ class Minima:
     tangent_a: Float64[ndarray, "m 3"]
     tangent_b: Float64[ndarray, "m 3"]
     least_angle_deg: Float64[ndarray, " m"]
-
-    def of(self, chosen: ndarray) -> Minima:
-        """Return the chosen minima, by a mask or by positions."""
-        return Minima(*(getattr(self, field.name)[chosen] for field in fields(self)))
 
 
 def local_minima(axes: AxisSegments, max_gap_m: float) -> Minima:
@@ -315,10 +305,7 @@ def _minima(
     points_m = axes.start_m[pairs] + share[..., None] * axes.vector_m[pairs]
     edges = np.stack([axes.vector_m[pairs], axes.vector_m[np.where(others < 0, pairs, others)]], axis=2)
     edges /= np.linalg.norm(edges, axis=-1, keepdims=True)
-    tangents = edges.sum(axis=2)
-    lengths = np.linalg.norm(tangents, axis=-1, keepdims=True)
-    # A vertex at which the axis turns back has no bisector.
-    tangents = np.where(lengths > 1e-6, tangents / np.where(lengths > 1e-6, lengths, 1.0), edges[:, :, 0])
+    tangents = bisectors(edges[:, :, 0], edges[:, :, 1])
     angles_deg = np.stack([angle_deg(edges[:, 0, a], edges[:, 1, b]) for a in (0, 1) for b in (0, 1)], axis=-1)
     return Minima(
         bar_a=axes.bar[pairs[:, 0]],
@@ -331,6 +318,13 @@ def _minima(
         tangent_b=tangents[:, 1],
         least_angle_deg=angles_deg.min(axis=-1, initial=90.0),
     )
+
+
+def bisectors(a: Float64[ndarray, "*n 3"], b: Float64[ndarray, "*n 3"]) -> Float64[ndarray, "*n 3"]:
+    """Return the unit bisectors of unit vectors; opposite ones, where an axis turns back, have none: a."""
+    sums = a + b
+    length = np.linalg.norm(sums, axis=-1, keepdims=True)
+    return np.where(length > 1e-6, sums / np.where(length > 1e-6, length, 1.0), a)
 
 
 def angle_deg(a: Float64[ndarray, "n 3"], b: Float64[ndarray, "n 3"]) -> Float64[ndarray, " n"]:

@@ -49,19 +49,17 @@ _MIN_ROW_BYTES = 100
 _UNIT_TOLERANCE = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
-class FolderCrossings:
-    """Crossings of the scenes of a dataset folder, and the file that they come from, with its hex SHA-256.
+@dataclass(frozen=True)
+class CrossingsSource:
+    """File of the dataset folder that the crossings come from, and its hex SHA-256."""
 
-    ``source`` is ``crossings.parquet``, or ``bars.parquet`` in folders without that file.
-    """
-
-    by_scene: Mapping[str, Crossings]
-    source: str
+    file: str
     sha256: str
 
 
-def folder_crossings(folder: DatasetFolder, bars: Mapping[str, Sequence[Bar]] | None = None) -> FolderCrossings:
+def folder_crossings(
+    folder: DatasetFolder, bars: Mapping[str, Sequence[Bar]] | None = None
+) -> tuple[dict[str, Crossings], CrossingsSource]:
     """Return the crossings of all scenes, read from ``crossings.parquet`` or else computed from ``bars.parquet``.
 
     ``bars`` are those of ``bars.parquet``, if already read. Raises ``DatasetError`` if a file cannot be read or
@@ -70,7 +68,7 @@ def folder_crossings(folder: DatasetFolder, bars: Mapping[str, Sequence[Bar]] | 
     bars = read_bars(folder.verified_file(BARS_FILE)) if bars is None else bars
     if CROSSINGS_FILE not in folder.files:
         computed = {scene: scene_crossings(of_scene) for scene, of_scene in bars.items()}
-        return FolderCrossings(computed, BARS_FILE, folder.files[BARS_FILE])
+        return computed, CrossingsSource(BARS_FILE, folder.files[BARS_FILE])
     path = folder.verified_file(CROSSINGS_FILE)
     by_scene = read_crossings(path)
     for scene, crossings in by_scene.items():
@@ -78,7 +76,7 @@ def folder_crossings(folder: DatasetFolder, bars: Mapping[str, Sequence[Bar]] | 
         if unknown := sorted({*crossings.bar_a.tolist(), *crossings.bar_b.tolist()} - known):
             where = f"{path}: scene {short_repr(scene)}"
             raise DatasetError(f"{where} has a crossing of bar {unknown[0]}, expected bars with an axis")
-    return FolderCrossings(by_scene, CROSSINGS_FILE, folder.files[CROSSINGS_FILE])
+    return by_scene, CrossingsSource(CROSSINGS_FILE, folder.files[CROSSINGS_FILE])
 
 
 def write_crossings(
@@ -124,7 +122,7 @@ def crossings(root: str | Path) -> DataFrame:
     """
     import pandas as pd  # Half a second to import, which reading crossings for scoring does not need.
 
-    by_scene = folder_crossings(open_folder(root)).by_scene
+    by_scene, _ = folder_crossings(open_folder(root))
     rows = [row for scene, of_scene in sorted(by_scene.items()) for row in _rows(scene, of_scene)]
     frame = pd.DataFrame(rows, columns=CROSSINGS_SCHEMA.names)
     for name in _POINTS:

@@ -13,8 +13,8 @@ from numpy import ndarray
 
 from rebar_depth_bench import software_version
 from rebar_depth_bench.bar_crossings.definition import CROSSINGS_PROTOCOL
+from rebar_depth_bench.bar_crossings.table import CrossingsSource
 from rebar_depth_bench.extended.measures import percentile
-from rebar_depth_bench.extended.result import CrossingsSource
 from rebar_depth_bench.scoring.bootstrap import INTERVALS, MIN_BLOCKS, Interval, Resampling, interval
 from rebar_depth_bench.scoring.columns import rounded, rounded_interval
 from rebar_depth_bench.submission.declaration import SubmissionMeta

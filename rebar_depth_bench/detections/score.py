@@ -22,7 +22,6 @@ from rebar_depth_bench.detections.result import (
 from rebar_depth_bench.errors import InputError, escape_text
 from rebar_depth_bench.extended.ground_truth import has_bar_ids, load_steel_truth
 from rebar_depth_bench.extended.judged import shown_bars
-from rebar_depth_bench.extended.result import CrossingsSource
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.geometry.cameras import transform
 from rebar_depth_bench.names import TEST_SPLIT, config_of, split_of
@@ -56,7 +55,7 @@ def score_crossings(
     source = None
     for config in chosen:
         steel = load_steel_truth(folder, config, progress)
-        source = CrossingsSource(steel.crossings.source, steel.crossings.sha256)
+        source = steel.source
 
         def compare(position: int) -> ViewDetections:
             truth = steel.view(position)  # noqa: B023 - used within this iteration only

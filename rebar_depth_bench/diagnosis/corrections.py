@@ -36,10 +36,7 @@ MAX_PIXELS = 4000
 MIN_PIXELS = 50
 """Scored pixels that a view must have to be looked at."""
 
-COLUMNS = (
-    *("left_depth", "left_mask", "right_depth", "right_mask"),
-    *(f"left_{kind}" for kind in CAMERA_KINDS),
-)
+COLUMNS = (*("left_depth", "left_mask", "right_depth", "right_mask"), *(f"left_{kind}" for kind in CAMERA_KINDS))
 """Columns that are looked at."""
 
 

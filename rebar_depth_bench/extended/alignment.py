@@ -15,12 +15,7 @@ from numpy import ndarray
 from rebar_depth_bench.extended.measures import ONCE, Measure, MeasureFamily, Samples, finite_sample
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.columns import METRICS
-from rebar_depth_bench.scoring.metrics import (
-    depth_metrics,
-    is_valid_prediction,
-    median,
-    median_scale,
-)
+from rebar_depth_bench.scoring.metrics import depth_metrics, is_valid_prediction, median, median_scale
 
 
 def log_scale(p_m: Float64[ndarray, " n"], z_m: Float64[ndarray, " n"]) -> float:
@@ -80,16 +75,11 @@ def alignment_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples
     return {name: finite_sample(value) for name, value in numbers.items()}
 
 
-def _aligned_measures(prefix: str, title: str, alignment: str) -> list[Measure]:
-    """Return the measures of the metrics after one alignment."""
-    return [
-        Measure(
-            f"{prefix}_{name}", f"{info.title}, {title}", info.unit, "",
-            f"{info.title} after {alignment}, an oracle per view",
-        )
-        for name, info in METRICS.items()
-    ]  # fmt: skip
-
+_ALIGNMENTS = {
+    "log_scaled": ("log scale", "the least-squares scale in log depth, exp(mean(log z - log p))"),
+    "shifted": ("scale and shift", "least-squares scale and shift in depth, min sum (a p + b - z)^2"),
+}
+"""Title and description of the alignments whose metrics are measures."""
 
 MEASURES = (
     Measure("scale_mean", "Scale s, mean", "", "", "mean over views of s = median(z)/median(p)", "scale"),
@@ -103,11 +93,13 @@ MEASURES = (
         "1 - scaled AbsRel / native AbsRel, median over views; negative where the median scale makes it worse",
         statistic="median",
     ),
-    *_aligned_measures(
-        "log_scaled", "log scale", "the least-squares scale in log depth, exp(mean(log z - log p))"
-    ),
-    *_aligned_measures(
-        "shifted", "scale and shift", "least-squares scale and shift in depth, min sum (a p + b - z)^2"
+    *(
+        Measure(
+            f"{key}_{name}", f"{info.title}, {title}", info.unit, "",
+            f"{info.title} after {alignment}, an oracle per view",
+        )
+        for key, (title, alignment) in _ALIGNMENTS.items()
+        for name, info in METRICS.items()
     ),
     Measure("shift_cm", "Shift b", "cm", "", "mean over views of the least-squares shift b"),
     Measure(

@@ -16,11 +16,13 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from rebar_depth_bench.bar_crossings.axis_segments import nearest_points
 from rebar_depth_bench.extended.fits import fit_axes, with_misses
 from rebar_depth_bench.extended.inspection import JUDGED_NOTE, MISSED_NOTE
 from rebar_depth_bench.extended.judged import VisibleSegments, visible_segments
 from rebar_depth_bench.extended.measures import Measure, MeasureFamily, Samples
 from rebar_depth_bench.extended.steel import SteelTruth
+from rebar_depth_bench.geometry.cameras import transform
 
 OFF_MM = 10.0
 """Deviation above which a bar is off: the tolerance of bar spacing in GB 50204 (from a secondary source)."""
@@ -63,7 +65,7 @@ def as_built_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
 
 @dataclass(frozen=True, eq=False)
 class _Judged:
-    """Judged segments of a view: what is seen of them, and the foot and direction of the nominal axis, metres.
+    """Judged segments of a view: what is seen of them, and a point and the direction of the nominal axis, metres.
 
     ``true_m`` are the vectors from the nominal axis to the axis as built, across the nominal one.
     """
@@ -76,52 +78,45 @@ class _Judged:
 
 def _judged(truth: SteelTruth) -> _Judged | None:
     """Return the visible segments of bars with a nominal axis; None if there are none."""
-    visible, axes = truth.once(visible_segments), truth.bars.axes
-    rotation, shift_m = truth.cam_from_world[:3, :3], truth.cam_from_world[:3, 3]
-    rows, built_m, foot_m, direction = [], [], [], []
-    for row, bar in enumerate(truth.bars.cage.bar_id[visible.segment].tolist()):
-        if bar not in axes:
+    visible, designed = truth.once(visible_segments), truth.bars.designed
+    rows, built, nominal = [], [], []
+    for row, bar_id in enumerate(truth.bars.cage.bar_id[visible.segment].tolist()):
+        if bar_id not in designed:
             continue
-        middle_m, along = visible.middle_m[row], visible.frame[row, 2]
-        built = _nearest_edge(axes[bar].built_m @ rotation.T + shift_m, middle_m, along)
-        point_m = middle_m if built is None else built.nearest_m
-        nominal = _nearest_edge(axes[bar].nominal_m @ rotation.T + shift_m, point_m, along)
-        if nominal is not None:
+        bar, along = designed[bar_id], visible.frame[row, 2]
+        axis_m, nominal_axis_m = (
+            transform(truth.cam_from_world, np.array(line_m)) for line_m in (bar.axis_m, bar.nominal_axis_m)
+        )
+        edge = _nearest_edge(axis_m, visible.middle_m[row], along)
+        built_m = visible.middle_m[row] if edge is None else edge[0]
+        if nominal_edge := _nearest_edge(nominal_axis_m, built_m, along):
             rows.append(row)
-            built_m.append(point_m)
-            foot_m.append(nominal.foot_m)
-            direction.append(nominal.direction)
+            built.append(built_m)
+            nominal.append(nominal_edge)
     if not rows:
         return None
-    nominal_m, nominal_direction = np.array(foot_m), np.array(direction)
-    true_m = _across(np.array(built_m) - nominal_m, nominal_direction)
-    return _Judged(visible.of(np.array(rows)), nominal_m, nominal_direction, true_m)
-
-
-@dataclass(frozen=True, eq=False)
-class _Edge:
-    """Edge of a polyline near a point: its unit direction, its nearest point, and the foot on its line, metres."""
-
-    direction: Float64[ndarray, " 3"]
-    nearest_m: Float64[ndarray, " 3"]
-    foot_m: Float64[ndarray, " 3"]
+    nominal_m, direction = np.array(nominal).transpose(1, 0, 2)
+    return _Judged(
+        visible.of(np.array(rows)), nominal_m, direction, _across(np.array(built) - nominal_m, direction)
+    )
 
 
 def _nearest_edge(
     line_m: Float64[ndarray, "n 3"], point_m: Float64[ndarray, " 3"], along: Float64[ndarray, " 3"]
-) -> _Edge | None:
-    """Return the edge nearest to a point among those within ``MAX_TURN_DEG`` of ``along``; None without any."""
-    start_m, step_m = line_m[:-1], np.diff(line_m, axis=0)
-    length_m = np.linalg.norm(step_m, axis=1)
-    direction = step_m / np.where(length_m > 0, length_m, 1.0)[:, None]
-    position_m = np.einsum("ei,ei->e", point_m - start_m, direction)
-    nearest_m = start_m + np.clip(position_m, 0.0, length_m)[:, None] * direction
-    distance_m = np.linalg.norm(point_m - nearest_m, axis=1)
+) -> tuple[Float64[ndarray, " 3"], Float64[ndarray, " 3"]] | None:
+    """Return the nearest point and the unit direction of the edge of a polyline that is nearest to a point.
+
+    Edges within ``MAX_TURN_DEG`` of ``along`` count; None without any.
+    """
+    step_m = np.diff(line_m, axis=0)
+    length_m = np.linalg.norm(step_m, axis=1, keepdims=True)
+    direction = step_m / np.where(length_m > 0, length_m, 1.0)
+    nearest_m, _, distance_m = nearest_points(point_m, line_m[:-1], step_m)
     aligned = np.abs(direction @ along) >= np.cos(np.deg2rad(MAX_TURN_DEG))
     if not aligned.any():
         return None
     edge = int(np.argmin(np.where(aligned, distance_m, np.inf)))
-    return _Edge(direction[edge], nearest_m[edge], start_m[edge] + position_m[edge] * direction[edge])
+    return nearest_m[edge], direction[edge]
 
 
 def _across(vector_m: Float64[ndarray, "r 3"], direction: Float64[ndarray, "r 3"]) -> Float64[ndarray, "r 3"]:

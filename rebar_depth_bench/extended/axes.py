@@ -15,8 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int16, Int64, UInt16
 from numpy import ndarray
 
-from rebar_depth_bench.bar_crossings.axis_segments import AxisSegments, pieces, without_repeated
-from rebar_depth_bench.bar_crossings.definition import Crossings
+from rebar_depth_bench.bar_crossings.axis_segments import AxisSegments, nearest_points, pieces, without_repeated
+from rebar_depth_bench.bar_crossings.definition import Crossings, bisectors
 from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.errors import DatasetError
 
@@ -45,25 +45,15 @@ It absorbs rounding: segments at equal distances do not separate a pair.
 """
 
 
-@dataclass(frozen=True, eq=False)
-class ParallelPairs:
-    """Pairs of parallel segments that overlap along their axes. All arrays are segments x segments, in metres.
+def parallel_pairs(
+    start_m: Float64[ndarray, "r 3"], end_m: Float64[ndarray, "r 3"], diameter_m: Float64[ndarray, " r"]
+) -> tuple[Float64[ndarray, "r r"], ...]:
+    """Return ``apart_m``, ``low_m``, ``high_m`` and ``middle_m`` of segments from ``start_m`` to ``end_m``.
 
     ``apart_m`` is the distance of the axes in the middle of their overlap, inf for pairs that are not parallel or
     do not overlap, and on the diagonal. ``low_m`` to ``high_m`` is the extent of segment j projected on the axis
-    of segment i, from its start; ``middle_m`` is the middle of their overlap on that axis.
+    of segment i, from its start; ``middle_m`` is the middle of their overlap on that axis. One frame, metres.
     """
-
-    apart_m: Float64[ndarray, "r r"]
-    low_m: Float64[ndarray, "r r"]
-    high_m: Float64[ndarray, "r r"]
-    middle_m: Float64[ndarray, "r r"]
-
-
-def parallel_pairs(
-    start_m: Float64[ndarray, "r 3"], end_m: Float64[ndarray, "r 3"], diameter_m: Float64[ndarray, " r"]
-) -> ParallelPairs:
-    """Return the parallel pairs among segments from ``start_m`` to ``end_m`` (one common frame, metres)."""
     count = len(diameter_m)
     apart_m, low_m, high_m, middle_m = (np.empty((count, count)) for _ in range(4))
     length_m = np.linalg.norm(end_m - start_m, axis=1)
@@ -83,28 +73,32 @@ def parallel_pairs(
         other_point_m = start_m + along_other_m[:, None] * direction
         own_point_m = start_m[segment] + middle_m[segment][:, None] * direction[segment]
         apart_m[segment] = np.where(overlaps, np.linalg.norm(other_point_m - own_point_m, axis=1), np.inf)
-    return ParallelPairs(np.maximum(apart_m, apart_m.T), low_m, high_m, middle_m)
+    return np.maximum(apart_m, apart_m.T), low_m, high_m, middle_m
 
 
 def overlapping_pairs(
-    parallel: ParallelPairs, bar_id: Int64[ndarray, " r"], diameter_m: Float64[ndarray, " r"]
+    parallel_m: tuple[Float64[ndarray, "r r"], ...],
+    bar_id: Int64[ndarray, " r"],
+    diameter_m: Float64[ndarray, " r"],
 ) -> Int64[ndarray, "m 2"]:
     """Return the pairs of neighbouring segments (lower index first, ascending): those to measure the spacing of.
 
     A pair consists of two parallel, overlapping segments of different bars, not lapped, at most ``MAX_SPACING_M``
     apart, without a third parallel segment between them: none present at the middle of their overlap is nearer to
     both than they are to each other (the relative neighbourhood graph: Toussaint, Pattern Recognition 12, 1980).
+    ``parallel_m`` are the ``parallel_pairs``.
     """
+    all_apart_m, low_m, high_m, middle_m = parallel_m
     pairs = [np.empty((0, 2), dtype=np.int64)]
     for segment in range(len(bar_id)):
-        apart_m = parallel.apart_m[segment]
+        apart_m = all_apart_m[segment]
         clear_m = apart_m - (diameter_m + diameter_m[segment]) / 2
         lapped = clear_m < MIN_CLEARANCE_DIAMETERS * np.maximum(diameter_m, diameter_m[segment])
         others = np.flatnonzero(~lapped & (apart_m <= MAX_SPACING_M) & (bar_id != bar_id[segment]))
         others = others[others > segment]
-        at_m = parallel.middle_m[segment, others]
-        present = (parallel.low_m[segment][:, None] <= at_m) & (at_m <= parallel.high_m[segment][:, None])
-        farther_m = np.maximum(apart_m[:, None], parallel.apart_m[:, others])
+        at_m = middle_m[segment, others]
+        present = (low_m[segment][:, None] <= at_m) & (at_m <= high_m[segment][:, None])
+        farther_m = np.maximum(apart_m[:, None], all_apart_m[:, others])
         blocked = (present & (farther_m < _NEARER_FACTOR * apart_m[others])).any(axis=0)
         free = others[~blocked]
         pairs.append(np.column_stack([np.full(len(free), segment), free]))
@@ -166,9 +160,9 @@ def cage_truth(bars: Iterable[Bar]) -> CageTruth:
     diameter_m = np.array([bar.diameter_m for bar, _, _ in segments], dtype=np.float64)
     start_m = np.array([start_m for _, start_m, _ in segments], dtype=np.float64).reshape(-1, 3)
     end_m = np.array([end_m for _, _, end_m in segments], dtype=np.float64).reshape(-1, 3)
-    parallel = parallel_pairs(start_m, end_m, diameter_m)
-    match_radius_m = np.minimum(parallel.apart_m.min(axis=1, initial=np.inf) / 2, MAX_MATCH_RADIUS_M)
-    neighbours = overlapping_pairs(parallel, bar_id, diameter_m)
+    parallel_m = parallel_pairs(start_m, end_m, diameter_m)
+    match_radius_m = np.minimum(parallel_m[0].min(axis=1, initial=np.inf) / 2, MAX_MATCH_RADIUS_M)
+    neighbours = overlapping_pairs(parallel_m, bar_id, diameter_m)
     return CageTruth(bar_id, diameter_m, start_m, end_m, neighbours, match_radius_m)
 
 
@@ -187,46 +181,41 @@ def assign_segments(
     first, last = (np.searchsorted(bar_id[order], cage.bar_id, side) for side in ("left", "right"))
     for segment in np.flatnonzero(last > first):
         rows = order[first[segment] : last[segment]]
-        on_side, distance_m = _lies_on_side(points_m[rows], cage, int(segment))
+        line_m = cage.end_m[segment] - cage.start_m[segment]
+        length_m = np.linalg.norm(line_m)
+        direction = line_m / length_m
+        from_start_m = points_m[rows] - cage.start_m[segment]
+        along_m = from_start_m @ direction
+        distance_m = np.linalg.norm(from_start_m - along_m[:, None] * direction, axis=1)
+        slack_m = 1e-6  # rounding of float32 depth
+        foot_inside = (along_m >= -slack_m) & (along_m <= length_m + slack_m)
+        on_side = foot_inside & is_on_surface(distance_m, cage.diameter_m[segment])
         nearer = on_side & (distance_m < nearest_m[rows])
         assigned[rows[nearer]] = segment
         nearest_m[rows[nearer]] = distance_m[nearer]
     return assigned
 
 
-def _lies_on_side(
-    points_m: Float64[ndarray, "k 3"], cage: CageTruth, segment: int
-) -> tuple[Bool[ndarray, " k"], Float64[ndarray, " k"]]:
-    """Return which points lie on a segment's side, and the distance of all points from its axis (metres)."""
-    line_m = cage.end_m[segment] - cage.start_m[segment]
-    length_m = np.linalg.norm(line_m)
-    direction = line_m / length_m
-    from_start_m = points_m - cage.start_m[segment]
-    along_m = from_start_m @ direction
-    distance_m = np.linalg.norm(from_start_m - along_m[:, None] * direction, axis=1)
-    radii = distance_m / (cage.diameter_m[segment] / 2)
-    slack_m = 1e-6  # rounding of float32 depth
-    foot_inside = (along_m >= -slack_m) & (along_m <= length_m + slack_m)
-    return foot_inside & (radii >= SURFACE_DISTANCE_RADII[0]) & (radii <= SURFACE_DISTANCE_RADII[1]), distance_m
+def is_on_surface(distance_m: Float64[ndarray, " n"], diameter_m: float) -> Bool[ndarray, " n"]:
+    """Return which distances from the axis of a bar are within ``SURFACE_DISTANCE_RADII``."""
+    radii = distance_m / (diameter_m / 2)
+    return np.asarray((radii >= SURFACE_DISTANCE_RADII[0]) & (radii <= SURFACE_DISTANCE_RADII[1]))
 
 
 def _straight_segments(bar: Bar) -> Iterator[tuple[Float64[ndarray, " 3"], Float64[ndarray, " 3"]]]:
-    """Yield the ends of the straight segments of a bar that are long enough, from its first point to its last."""
+    """Yield the ends of the straight segments of a bar that are long enough, from its first point to its last.
+
+    All edges of a segment follow the direction of its first one.
+    """
     points_m = without_repeated(np.array(bar.axis_m))
-    for first, last in _straight_pieces(points_m):
-        if np.linalg.norm(points_m[last] - points_m[first]) >= MIN_SEGMENT_DIAMETERS * bar.diameter_m:
-            yield points_m[first], points_m[last]
-
-
-def _straight_pieces(points_m: Float64[ndarray, "n 3"]) -> Iterator[tuple[int, int]]:
-    """Yield (first, last) point index of each stretch whose edges all follow the direction of its first edge."""
     steps_m = np.diff(points_m, axis=0)
     directions = steps_m / np.linalg.norm(steps_m, axis=1, keepdims=True)
     least_cosine = np.cos(np.deg2rad(STRAIGHT_DEG))
     first = 0
     for edge in range(1, len(directions) + 1):
         if edge == len(directions) or directions[first] @ directions[edge] < least_cosine:
-            yield first, edge
+            if np.linalg.norm(points_m[edge] - points_m[first]) >= MIN_SEGMENT_DIAMETERS * bar.diameter_m:
+                yield points_m[first], points_m[edge]
             first = edge
 
 
@@ -236,29 +225,8 @@ WINDOW_DIAMETERS = 6.0
 _TANGENT_STEP_M = 1e-7
 
 
-@dataclass(frozen=True, eq=False)
-class Axis:
-    """Axis of one bar as a polyline: segments from ``start_m`` by ``vector_m``, ``along_m`` of their starts."""
-
-    start_m: Float64[ndarray, "s 3"]
-    vector_m: Float64[ndarray, "s 3"]
-    along_m: Float64[ndarray, " s"]
-    length_m: float
-    closed: bool
-    diameter_m: float
-
-    @classmethod
-    def of_bar(cls, bar: Bar) -> Axis:
-        """Return the axis of a bar that has one."""
-        segments = AxisSegments.of_bars([bar])
-        return cls(
-            segments.start_m,
-            segments.vector_m,
-            segments.along_m,
-            float(segments.length_m[0]),
-            bool(segments.closed[0]),
-            bar.diameter_m,
-        )
+class Axis(AxisSegments):
+    """Axis of one bar: the arrays of the bar, such as ``diameter_m``, have one value."""
 
     def feet(self, points_m: Float64[ndarray, "n 3"]) -> tuple[Float64[ndarray, " n"], Float64[ndarray, " n"]]:
         """Return for each point the length along the axis at the nearest point of the axis, and its distance.
@@ -271,13 +239,9 @@ class Axis:
         for step in (-1, 0, 1):
             sample = nearest + step
             segment = segments[sample % len(segments) if self.closed else np.clip(sample, 0, len(segments) - 1)]
-            start_m, vector_m = self.start_m[segment], self.vector_m[segment]
-            squared_m2 = np.einsum("ni,ni->n", vector_m, vector_m)
-            share = np.clip(np.einsum("ni,ni->n", points_m - start_m, vector_m) / squared_m2, 0, 1)
-            distance_m = np.linalg.norm(points_m - start_m - share[:, None] * vector_m, axis=1)
-            closer = distance_m < best_m
-            along_m = self.along_m[segment] + share * np.sqrt(squared_m2)
-            best_along_m, best_m = np.where(closer, along_m, best_along_m), np.minimum(distance_m, best_m)
+            _, place_m, distance_m = nearest_points(points_m, self.start_m[segment], self.vector_m[segment])
+            best_along_m = np.where(distance_m < best_m, self.along_m[segment] + place_m, best_along_m)
+            best_m = np.minimum(distance_m, best_m)
         return best_along_m, best_m
 
     @cached_property
@@ -285,16 +249,14 @@ class Axis:
         """Return a k-d tree of samples along the axis, a quarter of a diameter apart, and their segments."""
         from scipy.spatial import cKDTree
 
-        segment, middle_m = pieces(self.start_m, self.vector_m, self.diameter_m / 4)
+        segment, middle_m = pieces(self.start_m, self.vector_m, self.diameter_m.item() / 4)
         return cKDTree(middle_m), segment
 
     def tangents(self, along_m: Float64[ndarray, " n"]) -> Float64[ndarray, "n 3"]:
         """Return the unit tangent at lengths along the axis; at a vertex, the bisector of its edges."""
         direction = self.vector_m / np.linalg.norm(self.vector_m, axis=1, keepdims=True)
         before, after = (self._segment_at(along_m + step_m) for step_m in (-_TANGENT_STEP_M, _TANGENT_STEP_M))
-        bisector = direction[before] + direction[after]
-        norm = np.linalg.norm(bisector, axis=1, keepdims=True)
-        return np.where(norm > 1e-6, bisector / np.where(norm > 1e-6, norm, 1.0), direction[after])
+        return bisectors(direction[after], direction[before])
 
     def _segment_at(self, along_m: Float64[ndarray, " n"]) -> ndarray:
         if self.closed:
@@ -326,7 +288,8 @@ class SceneCrossings:
 
     ``axes`` are those of the bars that cross, by bar id. ``along_m`` is the crossing's place along the axis and
     ``tangent`` the unit tangent there. ``straight`` marks where the axis deviates from it by at most
-    ``STRAIGHT_DEG`` within ``WINDOW_DIAMETERS``. ``match_radius_m`` is that of the run of the bar at the crossing.
+    ``STRAIGHT_DEG`` within ``WINDOW_DIAMETERS``. ``match_radius_m`` is that of the nearest run of the bar, the
+    largest one without a run.
     """
 
     crossings: Crossings
@@ -348,8 +311,9 @@ def prepared_crossings(crossings: Crossings, bars: Iterable[Bar], cage: CageTrut
     bar_id = np.column_stack([crossings.bar_a, crossings.bar_b])
     point_m = np.stack([crossings.point_a_m, crossings.point_b_m], axis=1)
     crossing = set(bar_id.ravel().tolist())
-    axes = {bar.bar_id: Axis.of_bar(bar) for bar in with_axis(bars) if bar.bar_id in crossing}
-    diameter_m, along_m, match_radius_m = np.zeros((3, *bar_id.shape))
+    axes = {bar.bar_id: Axis.of_bars([bar]) for bar in with_axis(bars) if bar.bar_id in crossing}
+    diameter_m, along_m = np.zeros((2, *bar_id.shape))
+    match_radius_m = np.full(bar_id.shape, MAX_MATCH_RADIUS_M)
     tangent, straight = np.zeros((*bar_id.shape, 3)), np.zeros(bar_id.shape, dtype=bool)
     for number, axis in axes.items():
         own = bar_id == number
@@ -357,17 +321,9 @@ def prepared_crossings(crossings: Crossings, bars: Iterable[Bar], cage: CageTrut
         along_m[own], _ = axis.feet(point_m[own])
         tangent[own] = axis.tangents(along_m[own])
         straight[own] = axis.is_straight(along_m[own], tangent[own])
-        match_radius_m[own] = _match_radius_m(point_m[own], number, cage)
+        runs = np.flatnonzero(cage.bar_id == number)
+        if len(runs):
+            vector_m = cage.end_m[runs] - cage.start_m[runs]
+            _, _, distance_m = nearest_points(point_m[own][:, None], cage.start_m[runs], vector_m)
+            match_radius_m[own] = cage.match_radius_m[runs[distance_m.argmin(axis=1)]]
     return SceneCrossings(crossings, axes, bar_id, diameter_m, point_m, along_m, tangent, straight, match_radius_m)
-
-
-def _match_radius_m(point_m: Float64[ndarray, "k 3"], bar_id: int, cage: CageTruth) -> Float64[ndarray, " k"]:
-    """Return the match radius of the run of the bar that is nearest to each point; the largest without a run."""
-    runs = np.flatnonzero(cage.bar_id == bar_id)
-    if not len(runs):
-        return np.full(len(point_m), MAX_MATCH_RADIUS_M)
-    start_m, vector_m = cage.start_m[runs], cage.end_m[runs] - cage.start_m[runs]
-    share = (point_m @ vector_m.T - (start_m * vector_m).sum(axis=1)) / (vector_m**2).sum(axis=1)
-    feet_m = start_m + np.clip(share, 0, 1)[..., None] * vector_m
-    distance_m = np.linalg.norm(point_m[:, None] - feet_m, axis=2)
-    return np.asarray(cage.match_radius_m[runs[distance_m.argmin(axis=1)]])

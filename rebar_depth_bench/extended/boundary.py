@@ -27,8 +27,6 @@ so a scaled prediction has the same numbers: evaluate the native prediction once
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt32
 from numpy import ndarray
@@ -41,22 +39,6 @@ THRESHOLDS_PERCENT = (1, 2, 5, 10, 20)
 """Relative depth steps t of a contour, ascending, in percent."""
 
 
-@dataclass(frozen=True, eq=False)
-class ContourCounts:
-    """Contour counts over ``pairs`` neighbour pixel pairs, one count per threshold.
-
-    ``true`` counts contours of the ground truth, ``predicted`` those of the prediction plus the ``missing`` pairs
-    (those with a missing prediction), ``correct`` those that are both true and predicted with the same side in
-    front.
-    """
-
-    pairs: int
-    missing: int
-    true: Int64[ndarray, " t"]
-    predicted: Int64[ndarray, " t"]
-    correct: Int64[ndarray, " t"]
-
-
 def boundary_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
     """Return a view's boundary samples; ``p_m`` is planar depth on ``truth.index``, metres, NaN where missing.
 
@@ -65,19 +47,18 @@ def boundary_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
     value from 0 to 1. There is none where the view has no true contour (for ``boundary_missing``: no pair).
     """
     first, second = neighbour_pairs(truth.index, truth.bar_id > 0, truth.height, truth.width)
-    counts = contour_counts(p_m, truth.depth_m.astype(np.float64), first, second)
-    has_contour = counts.true > 0
-    both = counts.predicted + counts.true
+    missing, true, predicted, correct = contour_counts(p_m, truth.depth_m.astype(np.float64), first, second)
+    has_contour = true > 0
     shares = {
-        "f1": (2.0 * counts.correct / np.maximum(both, 1))[has_contour],
-        "precision": (counts.correct / np.maximum(counts.predicted, 1))[has_contour],  # 0 for nothing predicted
-        "recall": (counts.correct / np.maximum(counts.true, 1))[has_contour],
+        "f1": (2.0 * correct / np.maximum(predicted + true, 1))[has_contour],
+        "precision": (correct / np.maximum(predicted, 1))[has_contour],  # 0 for nothing predicted
+        "recall": (correct / np.maximum(true, 1))[has_contour],
     }
     thresholds = np.array(THRESHOLDS_PERCENT)[has_contour].tolist()
     return {
         **{f"boundary_{name}": values.mean(keepdims=True) for name, values in shares.items() if len(values)},
         **{f"boundary_f1_{t}pct": shares["f1"][i : i + 1] for i, t in enumerate(thresholds)},
-        "boundary_missing": share_sample(counts.missing, counts.pairs),
+        "boundary_missing": share_sample(missing, len(first)),
     }
 
 
@@ -106,8 +87,12 @@ def contour_counts(
     z_m: Float64[ndarray, " n"],
     first: Int64[ndarray, " m"],
     second: Int64[ndarray, " m"],
-) -> ContourCounts:
-    """Count contours among pairs of positions in ``p_m`` (prediction) and ``z_m`` (true, > 0), both metres."""
+) -> tuple[int, Int64[ndarray, " t"], Int64[ndarray, " t"], Int64[ndarray, " t"]]:
+    """Count contours among pairs of positions in ``p_m`` (prediction) and ``z_m`` (true, > 0), both metres.
+
+    Returned are the pairs with a missing prediction, and per threshold the contours of the ground truth, those of
+    the prediction plus the missing pairs, and those that are both with the same side in front.
+    """
     valid = is_valid_prediction(p_m)
     both_valid = valid[first] & valid[second]
     missing = len(both_valid) - int(np.count_nonzero(both_valid))
@@ -121,13 +106,10 @@ def contour_counts(
     same_side = z_second_nearer[candidates] == p_second_nearer[candidates]
     steps = 1.0 + np.array(THRESHOLDS_PERCENT)[:, None] / 100
     z_contour, p_contour = z_step > steps, p_step > steps
-    return ContourCounts(
-        pairs=len(first),
-        missing=missing,
-        true=np.count_nonzero(z_contour, axis=1),
-        predicted=np.count_nonzero(p_contour, axis=1) + missing,
-        correct=np.count_nonzero(z_contour & p_contour & same_side, axis=1),
+    true, predicted, correct = (
+        np.count_nonzero(contour, axis=1) for contour in (z_contour, p_contour, z_contour & p_contour & same_side)
     )
+    return missing, true, predicted + missing, correct
 
 
 def _depth_step(

@@ -19,8 +19,8 @@ from numpy import ndarray
 
 from rebar_depth_bench.bar_crossings.definition import TiePoints, tie_points
 from rebar_depth_bench.extended.fits import MISS_MM, FittedAxes, fit_axes, with_misses
-from rebar_depth_bench.extended.judged import AxisLines, VisibleSegments, visible_parts
-from rebar_depth_bench.extended.measures import Measure, MeasureFamily, Samples, share_sample
+from rebar_depth_bench.extended.judged import VisibleSegments, visible_parts
+from rebar_depth_bench.extended.measures import Measure, MeasureFamily, Samples, median_and_p95, share_sample
 from rebar_depth_bench.extended.profiles import DISTANCE_EDGES_M, WIDTH_EDGES_PX
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.geometry.cameras import transform
@@ -35,45 +35,31 @@ CROSSING_EDGES_M = (0.1, 0.15, *DISTANCE_EDGES_M)
 """Bin edges of the true depth of tie points, metres."""
 
 
-@dataclass(frozen=True)
-class _Bins:
-    """Bins of crossings by one property: their edges, texts in titles and definitions, and shares that are stated.
-
-    A bin includes its lower edge, and the last one its upper edge. ``below`` are the texts of a bin without a
-    lower edge.
-    """
-
-    edges: tuple[float, ...]
-    title: str
-    where: str
-    shares: tuple[str, ...] = ("located", "within_5mm")
-    below: tuple[str, str] = ("", "")
-
-
-_BINS: Mapping[str, _Bins] = {
-    "m": _Bins(CROSSING_EDGES_M, "At {} m", "at a true depth of {} m", ("within_2mm", "within_5mm")),
-    "deg": _Bins((20.0, 30.0, 45.0, 60.0, 75.0, 90.0), "Angle of {} degrees", "at an angle of {} degrees"),
-    "mm": _Bins(
-        (-math.inf, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0),
-        "Gap of {} mm",
-        "with a gap of {} mm",
-        below=("Intersecting bars", "with a negative gap"),
-    ),
-    "px": _Bins(WIDTH_EDGES_PX, "Bars of {} px", "whose thinner bar is {} px wide in the image"),
+_BINS: Mapping[str, tuple[tuple[float, ...], str, str]] = {
+    "m": (CROSSING_EDGES_M, "At {} m", "at a true depth of {} m"),
+    "deg": ((20.0, 30.0, 45.0, 60.0, 75.0, 90.0), "Angle of {} degrees", "at an angle of {} degrees"),
+    "mm": ((-math.inf, 0.0, 1.0, 2.0, 3.0, 4.0, 5.0), "Gap of {} mm", "with a gap of {} mm"),
+    "px": (WIDTH_EDGES_PX, "Bars of {} px", "whose thinner bar is {} px wide in the image"),
 }
-"""Bins by true depth of the tie point, angle, gap, and width of the thinner bar in the image, by unit."""
+"""Bins by true depth of the tie point, angle, gap, and width of the thinner bar in the image, by unit.
 
-_SHARE_TEXTS: Mapping[str, tuple[str, str]] = {
+Each has edges, and texts for titles and definitions. A bin includes its lower edge, the last one both edges.
+"""
+
+_BELOW = "Intersecting bars", "with a negative gap"
+"""Texts of the bin without a lower edge."""
+
+_WITHIN = "whose tie point is within {} mm; what is not located fails"
+_SHARES: Mapping[str, tuple[str, str]] = {
     "located": ("located", "that are located"),
-    **{
-        f"within_{limit}mm": (
-            f"within {limit} mm",
-            f"whose tie point is within {limit} mm; what is not located fails",
-        )
-        for limit in WITHIN_MM
-    },
+    **{f"within_{limit}mm": (f"within {limit} mm", _WITHIN.format(limit)) for limit in WITHIN_MM},
 }
 """Title and definition of each share of judged crossings."""
+
+
+def _shares_of_bins(unit: str) -> tuple[str, ...]:
+    """Return the shares that are stated for the bins of a unit."""
+    return ("within_2mm" if unit == "m" else "located", "within_5mm")
 
 
 def _bin_name(share: str, unit: str, low: float, high: float) -> str:
@@ -84,19 +70,9 @@ def _bin_name(share: str, unit: str, low: float, high: float) -> str:
 
 def _judged_pair(name: str, title: str, unit: str, definition: str) -> tuple[Measure, ...]:
     """Return median and 95th percentile of an absolute error over all judged crossings; ``unit`` is mm or deg."""
-    shown, in_unit = ("mm", "") if unit == "mm" else ("", ", degrees")
-    note = f"What is not located counts as {f'{MISS_MM:g} mm' if unit == 'mm' else f'{MISS_DEG:g} degrees'}."
-    sample = f"{name}_judged_{unit}"
-    return (
-        Measure(
-            f"{name}_median_{unit}", f"{title}: median{in_unit}", shown, "lower",
-            f"Median of the {definition}. {note}", sample, "median",
-        ),
-        Measure(
-            f"{name}_p95_{unit}", f"{title}: p95{in_unit}", shown, "lower",
-            f"95th percentile of the {definition}. {note}", sample, "p95",
-        ),
-    )  # fmt: skip
+    miss, suffix = (f"{MISS_MM:g} mm", "") if unit == "mm" else (f"{MISS_DEG:g} degrees", ", degrees")
+    text = f"{definition}. What is not located counts as {miss}."
+    return median_and_p95(name, title, unit, text, suffix)
 
 
 def _bias(name: str, title: str, definition: str) -> Measure:
@@ -152,7 +128,7 @@ MAIN_MEASURES = (
     *(
         Measure(
             f"tie_within_{limit}mm", f"tie point within {limit} mm", "%", "higher",
-            f"Share of judged crossings whose tie point is within {limit} mm; what is not located fails",
+            f"Share of judged crossings {_WITHIN.format(limit)}",
         )
         for limit in WITHIN_MM
     ),
@@ -162,12 +138,12 @@ MAIN_MEASURES = (
 
 def _binned_measures() -> Iterator[Measure]:
     """Yield the shares of each bin; shares of one kind are together."""
-    for unit, bins in _BINS.items():
-        for share in bins.shares:
-            head, text = _SHARE_TEXTS[share]
-            for low, high in pairwise(bins.edges):
+    for unit, (edges, in_title, in_text) in _BINS.items():
+        for share in _shares_of_bins(unit):
+            head, text = _SHARES[share]
+            for low, high in pairwise(edges):
                 step = f"{low:g}-{high:g}"
-                title, where = (bins.title, bins.where) if math.isfinite(low) else bins.below
+                title, where = (in_title, in_text) if math.isfinite(low) else _BELOW
                 definition = f"Share of judged crossings {where.format(step)} {text}"
                 name = _bin_name(share, unit, low, high)
                 yield Measure(name, f"{title.format(step)}: {head}", "%", "higher", definition)
@@ -183,16 +159,14 @@ _MM = 1000.0
 class ViewCrossings:
     """The m crossings of a view on which depth is judged: judged ones between bars that are straight there.
 
-    ``crossing`` holds indices into the scene's crossings, whose number is ``in_scene``. ``visible`` are the
-    parts of bar a and bar b of the first crossing, then of the second, and so on. ``ties`` are the true tie
-    points in the camera frame, and ``width_px`` the width of the thinner bar in the image.
+    ``crossing`` holds indices into the scene's crossings. ``visible`` are the parts of bar a and bar b of the
+    first crossing, then of the second, and so on. ``ties`` are the true tie points in the camera frame, and
+    ``width_px`` the width of the thinner bar in the image.
     """
 
-    in_scene: int
     crossing: Int64[ndarray, " m"]
     visible: VisibleSegments
     ties: TiePoints
-    radius_m: Float64[ndarray, "m 2"]
     width_px: Float64[ndarray, " m"]
 
 
@@ -203,14 +177,16 @@ def view_crossings(truth: SteelTruth) -> ViewCrossings:
     crossing, pixels = truth.judged.crossing[straight], truth.judged.pixels[straight]
     pixels = pixels.reshape(2 * len(crossing), pixels.shape[2])
     rotation = truth.cam_from_world[:3, :3]
-    lines = AxisLines(
+    visible = visible_parts(
+        truth,
+        pixels,
+        np.ones(pixels.shape, dtype=bool),
         segment=np.repeat(crossing, 2),
         diameter_m=scene.diameter_m[crossing].ravel(),
         match_radius_m=scene.match_radius_m[crossing].ravel(),
-        start_m=transform(truth.cam_from_world, scene.point_m[crossing].reshape(-1, 3)),
+        point_m=transform(truth.cam_from_world, scene.point_m[crossing].reshape(-1, 3)),
         direction=scene.tangent[crossing].reshape(-1, 3) @ rotation.T,
     )
-    visible = visible_parts(truth, lines, pixels, np.ones(pixels.shape, dtype=bool))
     found = scene.crossings
     ties = TiePoints(
         transform(truth.cam_from_world, found.tie_point_m[crossing]),
@@ -219,7 +195,7 @@ def view_crossings(truth: SteelTruth) -> ViewCrossings:
         found.angle_deg[crossing],
     )
     width_px = truth.K[0, 0] * scene.diameter_m[crossing].min(axis=1, initial=np.inf) / ties.tie_point_m[:, 2]
-    return ViewCrossings(len(scene), crossing, visible, ties, scene.diameter_m[crossing] / 2, width_px)
+    return ViewCrossings(crossing, visible, ties, width_px)
 
 
 def fitted_ties(p_m: Float64[ndarray, " n"], view: ViewCrossings) -> tuple[Bool[ndarray, " m"], TiePoints]:
@@ -232,10 +208,8 @@ def fitted_ties(p_m: Float64[ndarray, " n"], view: ViewCrossings) -> tuple[Bool[
     fitted = fit_axes(p_m, view.visible)
     with np.errstate(all="ignore"):
         points_m = _closest_points_m(fitted)
-        direction = fitted.direction.reshape(-1, 2, 3)
-        ties = tie_points(
-            points_m[0], points_m[1], direction[:, 0], direction[:, 1], view.radius_m, towards=view.ties.normal
-        )
+        direction, radius_m = fitted.direction.reshape(-1, 2, 3), view.visible.diameter_m.reshape(-1, 2) / 2
+        ties = tie_points(*points_m, direction[:, 0], direction[:, 1], radius_m, towards=view.ties.normal)
     return fitted.found.reshape(-1, 2).all(axis=1), ties
 
 
@@ -280,7 +254,7 @@ def crossing_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
         **{f"within_{limit}mm": (error_mm <= limit).astype(np.float64) for limit in WITHIN_MM},
     }
     return {
-        "crossings_judged": share_sample(len(located), view.in_scene),
+        "crossings_judged": share_sample(len(located), len(truth.bars.crossings)),
         "crossing_located": shares["located"],
         "tie_judged_mm": error_mm,
         "tie_along_judged_mm": with_misses(offset_mm[:, 2]),
@@ -304,11 +278,11 @@ def _binned_samples(shares: Mapping[str, Float64[ndarray, " m"]], view: ViewCros
         "px": view.width_px,
     }
     samples: dict[str, Float64[ndarray, " k"]] = {}
-    for unit, bins in _BINS.items():
-        for low, high in pairwise(bins.edges):
+    for unit, (edges, _, _) in _BINS.items():
+        for low, high in pairwise(edges):
             values = properties[unit]
-            inside = (values >= low) & ((values < high) | ((values == high) & (high == bins.edges[-1])))
-            samples |= {_bin_name(share, unit, low, high): shares[share][inside] for share in bins.shares}
+            inside = (values >= low) & ((values < high) | ((values == high) & (high == edges[-1])))
+            samples |= {_bin_name(name, unit, low, high): shares[name][inside] for name in _shares_of_bins(unit)}
     return samples
 
 

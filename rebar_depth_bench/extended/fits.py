@@ -20,13 +20,15 @@ of equations is singular.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
+from rebar_depth_bench.bar_crossings.axis_segments import Rows
 from rebar_depth_bench.extended.judged import VisibleSegments
+from rebar_depth_bench.scoring.metrics import is_valid_prediction
 
 POSITION_STEPS = 6
 """Gauss-Newton steps on the axis with the radius fixed."""
@@ -112,7 +114,7 @@ def fit_cylinders(
 
 
 @dataclass(frozen=True, eq=False)
-class _PointSets:
+class _PointSets(Rows):
     """Points relative to the start of their set: ``across_m``, ``away_m``, and ``along`` in half lengths.
 
     Unused points are 0. The columns are separate arrays because numpy is several times slower on arrays whose
@@ -125,10 +127,6 @@ class _PointSets:
     used: Bool[ndarray, "r k"]
     half_m: Float64[ndarray, "r 1"]
     radius_m: Float64[ndarray, "r 1"]
-
-    def of(self, sets: Bool[ndarray, " r"]) -> _PointSets:
-        """Return the selected sets."""
-        return _PointSets(*(getattr(self, field.name)[sets] for field in fields(self)))
 
 
 def _iterate(
@@ -294,10 +292,8 @@ def _predicted_points_m(
     and tilt the fitted axis.
     """
     depth_m = p_m.take(visible.pixels)
-    with np.errstate(invalid="ignore"):
-        predicted = visible.used & np.isfinite(depth_m) & (depth_m > 0)
-        known_m = np.where(predicted, np.minimum(depth_m, MAX_DEPTH_M), 0.0)
-    points_m = visible.local_points_m(known_m)
+    predicted = visible.used & is_valid_prediction(depth_m)
+    points_m = visible.local_points_m(np.where(predicted, np.minimum(depth_m, MAX_DEPTH_M), 0.0))
     points_m[..., 2] = visible.truth_m[..., 2]
     return points_m, predicted
 

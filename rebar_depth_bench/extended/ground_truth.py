@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
 from rebar_depth_bench.bar_crossings.definition import CROSSINGS_PROTOCOL
-from rebar_depth_bench.bar_crossings.table import FolderCrossings, folder_crossings
+from rebar_depth_bench.bar_crossings.table import CrossingsSource, folder_crossings
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars
 from rebar_depth_bench.data.cache import ArrayCache, CacheContent, ViewArrays, open_cache
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder
@@ -25,7 +25,7 @@ from rebar_depth_bench.extended.steel import JudgedCrossings, SceneBars, SteelTr
 from rebar_depth_bench.geometry.cameras import pixel_rays
 from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.scoring.evaluation import Evaluation
-from rebar_depth_bench.scoring.protocol import single_bar_pixels
+from rebar_depth_bench.scoring.protocol import interior, single_bar_pixels
 from rebar_depth_bench.scoring.truth import are_pixels_inside, cache_inputs, scored_counts, verified_views
 
 _DTYPES: Mapping[str, type] = {
@@ -60,15 +60,16 @@ class ConfigSteelTruth:
     """Steel ground truth of all views of a config that have scored pixels.
 
     ``bars_by_view`` holds the bars of each view's scene. ``rays`` holds the rays of each distinct lens (K and
-    distortion), which views share. ``crossings`` are those of the folder, with the file that they come from.
+    distortion), which views share. ``source`` is the file that the crossings come from.
+    Without ``judged_cache``, no crossings are judged.
     """
 
     config: DatasetConfig
     bars_by_view: Mapping[str, SceneBars]
     rays: Mapping[Lens, Rays]
-    crossings: FolderCrossings
+    source: CrossingsSource
     cache: ArrayCache
-    judged_cache: ArrayCache
+    judged_cache: ArrayCache | None = None
 
     def __len__(self) -> int:
         """Return the number of views."""
@@ -81,11 +82,26 @@ class ConfigSteelTruth:
 
     def view(self, position: int) -> SteelTruth:
         """Return the view at ``position`` in protocol order."""
-        view, judged = self.cache.view(position), self.judged(position)
-        return _steel_truth(view, judged, self.config, self.bars_by_view, self.rays)
+        view = self.cache.view(position)
+        lens, pose = view.numbers[:_LENS_NUMBERS], view.numbers[_LENS_NUMBERS:]
+        height, width = self.config.grid
+        return SteelTruth(
+            view_id=view.view_id,
+            height=height,
+            width=width,
+            K=np.array(lens[:9]).reshape(3, 3),
+            cam_from_world=np.array(pose).reshape(4, 4),
+            rays=self.rays[lens][view.arrays["index"]],
+            bars=self.bars_by_view[view.view_id],
+            distortion=np.array(lens[9:]),
+            judged=self.judged(position),
+            **view.arrays,
+        )
 
     def judged(self, position: int) -> JudgedCrossings:
         """Return the judged crossings of the view at ``position``."""
+        if self.judged_cache is None:
+            return JudgedCrossings.none()
         view = self.judged_cache.view(position)
         crossing = view.arrays["crossing"][:: 2 * SAMPLED_PIXELS].astype(np.int64)
         return JudgedCrossings(crossing, view.arrays["pixel"].astype(np.int64).reshape(-1, 2, SAMPLED_PIXELS))
@@ -105,13 +121,13 @@ def load_steel_truth(
     """
     path = folder.verified_file(BARS_FILE)
     bars = read_bars(path)
-    found = folder_crossings(folder, bars)
+    crossings, source = folder_crossings(folder, bars)
     scenes = {}
     for scene in config.scenes:
         of_scene = bars.get(scene.name, None if config.imported is None else ())
         if of_scene is None:
             raise DatasetError(f"{path}: has no bars for scene {scene.name!r} of config {config.name}")
-        scenes[scene.name] = SceneBars.of(of_scene, found.by_scene.get(scene.name))
+        scenes[scene.name] = SceneBars.of(of_scene, crossings.get(scene.name))
     bars_by_view = {view_id: scenes[scene] for view_id, scene in config.scene_by_view.items()}
     scored_px = scored_counts(config)
 
@@ -131,12 +147,12 @@ def load_steel_truth(
     )
     cache = open_cache(content, progress)
     rays = {lens: _rays(lens, config) for lens in {numbers[:_LENS_NUMBERS] for numbers in cache.numbers}}
+    steel = ConfigSteelTruth(config, bars_by_view, rays, source, cache)
 
     def judged_arrays(view_ids: Collection[str] | None) -> Iterator[ViewArrays]:
         for position, view_id in enumerate(cache.view_ids):
             if view_ids is None or view_id in view_ids:
-                truth = _steel_truth(cache.view(position), JudgedCrossings.none(), config, bars_by_view, rays)
-                judged = judged_crossings(truth)
+                judged = judged_crossings(steel.view(position))
                 arrays = {
                     "crossing": np.repeat(judged.crossing, 2 * SAMPLED_PIXELS),
                     "pixel": judged.pixels.ravel(),
@@ -148,37 +164,13 @@ def load_steel_truth(
     judged = CacheContent(
         source=config.root,
         task=f"crossings in the views of {config.name}",
-        inputs=cache_inputs(config, protocol, f"{folder.files[BARS_FILE]} {found.sha256}"),
+        inputs=cache_inputs(config, protocol, f"{folder.files[BARS_FILE]} {source.sha256}"),
         dtypes={"crossing": np.uint32, "pixel": np.uint32},
         view_ids=tuple(scored_px),
         extract=judged_arrays,
         is_sound=lambda view: len(view.arrays["pixel"]) % (2 * SAMPLED_PIXELS) == 0,
     )
-    return ConfigSteelTruth(config, bars_by_view, rays, found, cache, open_cache(judged, progress))
-
-
-def _steel_truth(
-    view: ViewArrays,
-    judged: JudgedCrossings,
-    config: DatasetConfig,
-    bars_by_view: Mapping[str, SceneBars],
-    rays: Mapping[Lens, Rays],
-) -> SteelTruth:
-    """Return the ground truth of a cached view."""
-    lens, pose = view.numbers[:_LENS_NUMBERS], view.numbers[_LENS_NUMBERS:]
-    height, width = config.grid
-    return SteelTruth(
-        view_id=view.view_id,
-        height=height,
-        width=width,
-        K=np.array(lens[:9]).reshape(3, 3),
-        cam_from_world=np.array(pose).reshape(4, 4),
-        rays=rays[lens][view.arrays["index"]],
-        bars=bars_by_view[view.view_id],
-        distortion=np.array(lens[9:]),
-        judged=judged,
-        **view.arrays,
-    )
+    return replace(steel, judged_cache=open_cache(judged, progress))
 
 
 def _rays(lens: Lens, config: DatasetConfig) -> Rays:
@@ -214,14 +206,14 @@ def _steel_arrays(left: EyeTruth, scored: ndarray, rays: Rays, scene: SceneBars)
     assert bars is not None  # ``has_bar_ids``
     assert mask is not None
     index = np.flatnonzero(dilate_mask(mask) & (depth_m > 0))
-    interior = np.zeros(depth_m.size, dtype=bool)
-    interior[scored] = True
-    interior = interior[index]
+    is_scored = np.zeros(depth_m.size, dtype=bool)
+    is_scored[scored] = True
+    is_scored = is_scored[index]
 
     def spread(values: ndarray, elsewhere: float) -> ndarray:
         """Return values of scored pixels on ``index``, with another one beside them."""
         spread = np.full(len(index), elsewhere, values.dtype)
-        spread[interior] = values
+        spread[is_scored] = values
         return spread
 
     z_m, own = depth_m.ravel()[scored], bars.ravel()[scored]
@@ -232,7 +224,7 @@ def _steel_arrays(left: EyeTruth, scored: ndarray, rays: Rays, scene: SceneBars)
         "index": index,
         "depth_m": depth_m.ravel()[index],
         "bar_id": bars.ravel()[index],
-        "interior": interior,
+        "interior": is_scored,
         "single_bar": spread(single_bar_pixels(bars, scored), False),
         "run": spread(run, -1),
         "front_m": spread(front_m, np.nan),
@@ -241,11 +233,5 @@ def _steel_arrays(left: EyeTruth, scored: ndarray, rays: Rays, scene: SceneBars)
 
 
 def dilate_mask(mask: Bool[ndarray, "h w"]) -> Bool[ndarray, "h w"]:
-    """Return a mask dilated by one pixel in all eight directions (3 x 3)."""
-    rows = mask.copy()
-    rows[1:] |= mask[:-1]
-    rows[:-1] |= mask[1:]
-    grown = rows.copy()
-    grown[:, 1:] |= rows[:, :-1]
-    grown[:, :-1] |= rows[:, 1:]
-    return grown
+    """Return a mask dilated by one pixel in all eight directions (3 x 3): what is not eroded of its complement."""
+    return ~interior(np.pad(~mask, 1, constant_values=True))[1:-1, 1:-1]

@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray
 
+from rebar_depth_bench.bar_crossings.axis_segments import Rows
 from rebar_depth_bench.extended.axes import MAX_MATCH_RADIUS_M
 from rebar_depth_bench.extended.fits import MIN_PREDICTED_SHARE, MISS_MM, FittedAxes, fit_axes, with_misses
 from rebar_depth_bench.extended.judged import (
@@ -27,7 +28,7 @@ from rebar_depth_bench.extended.judged import (
     VisibleSegments,
     visible_segments,
 )
-from rebar_depth_bench.extended.measures import Measure, MeasureFamily, Samples
+from rebar_depth_bench.extended.measures import Measure, MeasureFamily, Samples, median_and_p95
 from rebar_depth_bench.extended.steel import SteelTruth
 
 ErrorKind = Literal["spacing", "layer", "cover"]
@@ -140,21 +141,14 @@ def _error_measures(kind: str) -> tuple[Measure, ...]:
     Only the last two cover everything judged, so only they have a better direction.
     """
     title, definition = _KINDS[kind]
-    found, judged = f"{kind}_error_mm", f"{kind}_judged_mm"
+    found = f"{kind}_error_mm"
     return (
         Measure(f"{kind}_bias_mm", f"{title}: bias", "mm", "", f"Mean over what was found: {definition}.", found),
         Measure(
             f"{kind}_std_mm", f"{title}: spread", "mm", "",
             f"Standard deviation over what was found: {definition}.", found, "std",
         ),
-        Measure(
-            f"{kind}_median_mm", f"{title}: median error", "mm", "lower",
-            f"Median of the absolute value: {definition}. {MISSED_NOTE}", judged, "median",
-        ),
-        Measure(
-            f"{kind}_p95_mm", f"{title}: p95 error", "mm", "lower",
-            f"95th percentile of the absolute value: {definition}. {MISSED_NOTE}", judged, "p95",
-        ),
+        *median_and_p95(kind, title, "mm", f"absolute value: {definition}. {MISSED_NOTE}", " error"),
     )  # fmt: skip
 
 
@@ -227,15 +221,13 @@ _MM = 1000.0
 
 
 @dataclass(frozen=True, eq=False)
-class _SegmentPairs:
-    """Neighbouring segments that are both visible, side by side.
+class _SegmentPairs(Rows):
+    """Neighbouring segments that are both visible, side by side: two positions among the visible segments.
 
-    ``first`` and ``second`` are positions among the visible segments. ``middle_m`` and ``normal`` define the
-    plane that is intersected with both axes.
+    ``middle_m`` and ``normal`` define the plane that is intersected with both axes.
     """
 
-    first: Int64[ndarray, " m"]
-    second: Int64[ndarray, " m"]
+    segments: Int64[ndarray, "m 2"]
     middle_m: Float64[ndarray, "m 3"]
     normal: Float64[ndarray, "m 3"]
 
@@ -278,9 +270,9 @@ def _visible_pairs(truth: SteelTruth) -> _SegmentPairs:
     visible, cage = truth.once(visible_segments), truth.bars.cage
     position = np.full(len(cage), -1)
     position[visible.segment] = np.arange(len(visible.segment))
-    first, second = position[cage.neighbours].T
-    both = (first >= 0) & (second >= 0)
-    first, second = first[both], second[both]
+    segments = position[cage.neighbours]
+    segments = segments[(segments >= 0).all(axis=1)]
+    first, second = segments.T
     normal = visible.frame[first, 2]
     between_m = np.einsum("mi,mi->m", visible.middle_m[second] - visible.middle_m[first], normal)
     low_m = np.maximum(-visible.half_m[first], between_m - visible.half_m[second])
@@ -289,7 +281,7 @@ def _visible_pairs(truth: SteelTruth) -> _SegmentPairs:
         visible.diameter_m[first], visible.diameter_m[second]
     )
     middle_m = visible.middle_m[first] + ((low_m + high_m) / 2)[:, None] * normal
-    return _SegmentPairs(first[overlapping], second[overlapping], middle_m[overlapping], normal[overlapping])
+    return _SegmentPairs(segments, middle_m, normal).of(overlapping)
 
 
 def _pair_errors_m(
@@ -306,8 +298,7 @@ def _pair_errors_m(
     true_direction = true_m / distance_m[:, None]
     with np.errstate(all="ignore"):
         fitted_m = np.einsum("mi,mi->m", _separation_m(pairs, fitted.point_m, fitted.direction), true_direction)
-        both = fitted.found[pairs.first] & fitted.found[pairs.second]
-        error_m = np.where(both, fitted_m - distance_m, np.nan)
+        error_m = np.where(fitted.found[pairs.segments].all(axis=1), fitted_m - distance_m, np.nan)
     is_layer = np.abs(true_direction[:, 2]) >= np.sqrt(0.5)
     return error_m[~is_layer], error_m[is_layer]
 
@@ -317,7 +308,7 @@ def _separation_m(
 ) -> Float64[ndarray, "m 3"]:
     """Return the vector from the first line's intersection with each pair's plane to the second line's."""
     intersections_m = []
-    for segment in (pairs.first, pairs.second):
+    for segment in pairs.segments.T:
         to_plane_m = np.einsum("mi,mi->m", pairs.middle_m - point_m[segment], pairs.normal)
         rate = np.einsum("mi,mi->m", direction[segment], pairs.normal)
         intersections_m.append(point_m[segment] + (to_plane_m / rate)[:, None] * direction[segment])

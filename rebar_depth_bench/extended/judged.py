@@ -5,13 +5,14 @@ Determined from the ground truth of the left eye alone. Frame: the camera's (Ope
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
-from rebar_depth_bench.extended.axes import SURFACE_DISTANCE_RADII, WINDOW_DIAMETERS, Axis
+from rebar_depth_bench.bar_crossings.axis_segments import Rows
+from rebar_depth_bench.extended.axes import WINDOW_DIAMETERS, Axis, is_on_surface
 from rebar_depth_bench.extended.steel import JudgedCrossings, SteelTruth
 from rebar_depth_bench.geometry.cameras import fold_radius, project, transform
 
@@ -39,15 +40,16 @@ _GOLDEN = (np.sqrt(5.0) - 1) / 2
 
 
 @dataclass(frozen=True, eq=False)
-class VisibleSegments:
+class VisibleSegments(Rows):
     """The r judged segments of a view, each sampled at up to k pixels.
 
-    ``segment`` holds indices of segments of ``CageTruth``. ``middle_m`` is the axis point in the middle of the
-    visible part, ``half_m`` half the length of that part. ``frame`` holds three unit vectors: across the line of
-    sight, away from the camera, along the axis. ``pixels`` are positions in the arrays of ``SteelTruth``,
-    ``used`` marks which of the k places hold one, ``rays`` are the pixels' rays in ``frame`` per metre of planar
-    depth: see ``local_points_m``. ``truth_m`` are the true points in ``frame``, from ``middle_m``.
-    ``can_fit_diameter`` marks the segments whose diameter can be measured.
+    ``segment`` holds indices of segments of ``CageTruth``, or of crossings. ``match_radius_m`` is the distance
+    within which a fitted axis belongs to the segment. ``middle_m`` is the axis point in the middle of the visible
+    part, ``half_m`` half the length of that part. ``frame`` holds three unit vectors: across the line of sight,
+    away from the camera, along the axis. ``pixels`` are positions in the arrays of ``SteelTruth``, ``used`` marks
+    which of the k places hold one, ``rays`` are the pixels' rays in ``frame`` per metre of planar depth: see
+    ``local_points_m``. ``truth_m`` are the true points in ``frame``, from ``middle_m``. ``can_fit_diameter`` marks
+    the segments whose diameter can be measured: wide enough in the image, and visible on both sides of the axis.
     """
 
     segment: Int64[ndarray, " r"]
@@ -61,10 +63,6 @@ class VisibleSegments:
     rays: Float64[ndarray, "r k 3"]
     truth_m: Float64[ndarray, "r k 3"]
     can_fit_diameter: Bool[ndarray, " r"]
-
-    def of(self, rows: Bool[ndarray, " r"] | Int64[ndarray, " s"]) -> VisibleSegments:
-        """Return the selected segments."""
-        return VisibleSegments(*(getattr(self, field.name)[rows] for field in fields(self)))
 
     def local_points_m(self, depth_m: Float64[ndarray, "r k"]) -> Float64[ndarray, "r k 3"]:
         """Return the points at planar ``depth_m`` on the rays of ``pixels``, in ``frame`` from ``middle_m``."""
@@ -80,60 +78,58 @@ def visible_segments(truth: SteelTruth) -> VisibleSegments:
     """
     cage = truth.bars.cage
     segment, pixels, used = _sampled_pixels(truth)
-    rotation, shift_m = truth.cam_from_world[:3, :3], truth.cam_from_world[:3, 3]
-    start_m = cage.start_m[segment] @ rotation.T + shift_m
-    axis_m = (cage.end_m[segment] - cage.start_m[segment]) @ rotation.T
-    runs = AxisLines(
-        segment,
-        cage.diameter_m[segment],
-        cage.match_radius_m[segment],
-        start_m,
-        axis_m / np.linalg.norm(axis_m, axis=1, keepdims=True),
+    axis_m = (cage.end_m[segment] - cage.start_m[segment]) @ truth.cam_from_world[:3, :3].T
+    visible = visible_parts(
+        truth,
+        pixels,
+        used,
+        segment=segment,
+        diameter_m=cage.diameter_m[segment],
+        match_radius_m=cage.match_radius_m[segment],
+        point_m=transform(truth.cam_from_world, cage.start_m[segment]),
+        direction=axis_m / np.linalg.norm(axis_m, axis=1, keepdims=True),
     )
-    visible = visible_parts(truth, runs, pixels, used)
     return visible.of(2 * visible.half_m >= MIN_VISIBLE_DIAMETERS * visible.diameter_m)
 
 
-@dataclass(frozen=True, eq=False)
-class AxisLines:
-    """Straight parts of axes: their bars' diameters, and a point and the unit direction in the camera frame.
-
-    ``segment`` holds indices of segments of ``CageTruth`` or other items, and ``match_radius_m`` is the distance
-    within which a fitted axis belongs to the part.
-    """
-
-    segment: Int64[ndarray, " r"]
-    diameter_m: Float64[ndarray, " r"]
-    match_radius_m: Float64[ndarray, " r"]
-    start_m: Float64[ndarray, "r 3"]
-    direction: Float64[ndarray, "r 3"]
-
-
 def visible_parts(
-    truth: SteelTruth, lines: AxisLines, pixels: Int64[ndarray, "r k"], used: Bool[ndarray, "r k"]
+    truth: SteelTruth,
+    pixels: Int64[ndarray, "r k"],
+    used: Bool[ndarray, "r k"],
+    *,
+    segment: Int64[ndarray, " r"],
+    diameter_m: Float64[ndarray, " r"],
+    match_radius_m: Float64[ndarray, " r"],
+    point_m: Float64[ndarray, "r 3"],
+    direction: Float64[ndarray, "r 3"],
 ) -> VisibleSegments:
-    """Return the visible part of each line as its ``pixels`` show it: positions in the arrays of ``truth``."""
-    direction = lines.direction
+    """Return the visible part of each straight axis as its ``pixels`` show it.
+
+    ``pixels`` are positions in the arrays of ``truth``. An axis is given by a point and its unit direction, camera
+    frame.
+    """
     rays = np.concatenate([truth.rays.take(pixels, axis=0), np.ones((*pixels.shape, 1))], axis=-1)
     depth_m = truth.depth_m.take(pixels).astype(np.float64)
-    start_along_m = np.einsum("ri,ri->r", lines.start_m, direction)
+    start_along_m = np.einsum("ri,ri->r", point_m, direction)
     along_m = depth_m * (rays @ direction[..., None])[..., 0] - start_along_m[:, None]
     low_m = np.where(used, along_m, np.inf).min(axis=1, initial=np.inf)
     high_m = np.where(used, along_m, -np.inf).max(axis=1, initial=-np.inf)
-    middle_m = lines.start_m + ((low_m + high_m) / 2)[:, None] * direction
+    middle_m = point_m + ((low_m + high_m) / 2)[:, None] * direction
     frame = _frames(middle_m, direction)
     local_rays = rays @ frame.transpose(0, 2, 1)
     truth_m = depth_m[..., None] * local_rays - np.einsum("rij,rj->ri", frame, middle_m)[:, None]
-    focal_px, diameter_m = float(truth.K[0, 0]), lines.diameter_m
+    is_wide = truth.K[0, 0] * diameter_m >= MIN_DIAMETER_FIT_WIDTH_PX * middle_m[:, 2]
+    radii, share = FLANK_RADII_AND_SHARE
+    across_m, flank_m = truth_m[..., 0], (radii * diameter_m / 2)[:, None]
+    left, right = ((used & beyond).sum(axis=1) for beyond in (across_m < -flank_m, across_m > flank_m))
+    can_fit_diameter = is_wide & (np.minimum(left, right) >= share * used.sum(axis=1))
     return VisibleSegments(
-        lines.segment, diameter_m, lines.match_radius_m, middle_m, (high_m - low_m) / 2, frame, pixels, used,
-        local_rays, truth_m, _can_fit_diameter(truth_m[..., 0], used, diameter_m, focal_px, middle_m[:, 2]),
+        segment, diameter_m, match_radius_m, middle_m, (high_m - low_m) / 2, frame, pixels, used, local_rays,
+        truth_m, can_fit_diameter,
     )  # fmt: skip
 
 
-def _sampled_pixels(
-    truth: SteelTruth,
-) -> tuple[Int64[ndarray, " r"], Int64[ndarray, "r k"], Bool[ndarray, "r k"]]:
+def _sampled_pixels(truth: SteelTruth) -> tuple[Int64[ndarray, " r"], Int64[ndarray, "r k"], Bool[ndarray, "r k"]]:
     """Return the segments with enough interior pixels, and up to ``MAX_SAMPLES`` pixels of each, evenly spread."""
     candidates = np.flatnonzero(truth.interior & (truth.run >= 0))
     segments = truth.run.take(candidates)
@@ -166,22 +162,6 @@ def _frames(middle_m: Float64[ndarray, "r 3"], direction: Float64[ndarray, "r 3"
     away = np.where((away_norm > 1e-9)[:, None], away, any_side)
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     return np.stack([np.cross(away, direction), away, direction], axis=1)
-
-
-def _can_fit_diameter(
-    across_m: Float64[ndarray, "r k"],
-    used: Bool[ndarray, "r k"],
-    diameter_m: Float64[ndarray, " r"],
-    focal_px: float,
-    depth_m: Float64[ndarray, " r"],
-) -> Bool[ndarray, " r"]:
-    """Return which segments are wide enough in the image and visible on both sides of the axis."""
-    radii, share = FLANK_RADII_AND_SHARE
-    beyond_m = (radii * diameter_m / 2)[:, None]
-    left = (used & (across_m < -beyond_m)).sum(axis=1)
-    right = (used & (across_m > beyond_m)).sum(axis=1)
-    both_sides_visible = np.minimum(left, right) >= share * used.sum(axis=1)
-    return np.asarray((focal_px * diameter_m >= MIN_DIAMETER_FIT_WIDTH_PX * depth_m) & both_sides_visible)
 
 
 SAMPLED_PIXELS = MIN_PIXELS
@@ -226,8 +206,7 @@ def _on_side(
     camera_m = truth.depth_m[pixels].astype(np.float64)[:, None] * rays
     rotation, shift_m = truth.cam_from_world[:3, :3], truth.cam_from_world[:3, 3]
     along_m, distance_m = axis.feet((camera_m - shift_m) @ rotation)
-    radii = distance_m / (axis.diameter_m / 2)
-    on_side = (radii >= SURFACE_DISTANCE_RADII[0]) & (radii <= SURFACE_DISTANCE_RADII[1])
+    on_side = is_on_surface(distance_m, axis.diameter_m.item())
     return pixels[on_side], along_m[on_side]
 
 

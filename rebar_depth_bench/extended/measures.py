@@ -99,9 +99,25 @@ class Measure:
             factor=100.0 if self.unit == "%" else 1.0,
         )
 
-    def number(self, statistic: float) -> float | None:
-        """Return the measure's value from the statistic of its samples; None where it is undefined."""
-        return statistic if self.convert is None else self.convert(statistic)
+
+def median_and_p95(
+    name: str, title: str, unit: str, definition: str, title_suffix: str = ""
+) -> tuple[Measure, Measure]:
+    """Return median and 95th percentile of an absolute error over all that is judged, misses included.
+
+    ``unit`` is that of the samples, "mm" or "deg", and ``definition`` continues "Median of the".
+    """
+    shown, sample = "mm" if unit == "mm" else "", f"{name}_judged_{unit}"
+    return (
+        Measure(
+            f"{name}_median_{unit}", f"{title}: median{title_suffix}", shown, "lower",
+            f"Median of the {definition}", sample, "median",
+        ),
+        Measure(
+            f"{name}_p95_{unit}", f"{title}: p95{title_suffix}", shown, "lower",
+            f"95th percentile of the {definition}", sample, "p95",
+        ),
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -143,31 +143,29 @@ def _shares_within(distance_m: Float64[ndarray, " m"], count: int) -> Float64[nd
 
 _POINTS = f"share of interior pixels (at most {MAX_POINTS} a view, evenly)"
 
-MEASURES = (
-    *(
-        Measure(
-            f"cloud_accuracy_{t}mm", f"Cloud accuracy, {t} mm", "%", "higher",
-            f"{_POINTS} whose predicted point is within {t} mm of the true point of any steel pixel; a missing "
-            "one is not; depends on the image size",
-        )
-        for t in TOLERANCES_MM
+_KINDS = {
+    "accuracy": (
+        "accuracy",
+        f"{_POINTS} whose predicted point is within {{}} mm of the true point of any steel pixel; a missing one "
+        "is not; depends on the image size",
     ),
-    *(
-        Measure(
-            f"cloud_completeness_{t}mm", f"Cloud completeness, {t} mm", "%", "higher",
-            f"{_POINTS} whose true point is within {t} mm of the predicted point of any interior pixel; depends "
-            "on the image size",
-        )
-        for t in TOLERANCES_MM
+    "completeness": (
+        "completeness",
+        f"{_POINTS} whose true point is within {{}} mm of the predicted point of any interior pixel; depends on "
+        "the image size",
     ),
-    *(
-        Measure(
-            f"cloud_f_{t}mm", f"Cloud F-score, {t} mm", "%", "higher",
-            f"2 a c / (a + c) of accuracy a and completeness c at {t} mm, view by view (Knapitsch et al. 2017)",
-        )
-        for t in TOLERANCES_MM
+    "f": (
+        "F-score",
+        "2 a c / (a + c) of accuracy a and completeness c at {} mm, view by view (Knapitsch et al. 2017)",
     ),
-)  # fmt: skip
+}
+"""Title and definition of each share."""
+
+MEASURES = tuple(
+    Measure(f"cloud_{kind}_{t}mm", f"Cloud {title}, {t} mm", "%", "higher", definition.format(t))
+    for kind, (title, definition) in _KINDS.items()
+    for t in TOLERANCES_MM
+)
 """Point cloud measures in table order."""
 
 FAMILIES = (MeasureFamily("clouds", "Point clouds", 6, MEASURES, cloud_samples),)

@@ -24,13 +24,7 @@ from rebar_depth_bench.extended.measures import (
     Samples,
     aligned_predictions,
 )
-from rebar_depth_bench.extended.result import (
-    CrossingsSource,
-    ExtendedResult,
-    ViewSamples,
-    tabulate_extended,
-    view_numbers,
-)
+from rebar_depth_bench.extended.result import ExtendedResult, ViewSamples, tabulate_extended, view_numbers
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.scoring.bootstrap import resample_views
@@ -95,8 +89,7 @@ def score_extended(
     for config in evaluation.configs:
         view_ids: tuple[str, ...] = ()
         if config.name in steel:
-            view_ids, crossings = steel[config.name].view_ids, steel[config.name].crossings
-            source = CrossingsSource(crossings.source, crossings.sha256)
+            view_ids, source = steel[config.name].view_ids, steel[config.name].source
         resampling = resample_views(view_ids, by_scene=config.has_splits and bool(view_ids))
         tables[config.name] = tabulate_extended([samples[view_id] for view_id in view_ids], resampling, measures)
     views = {view_id: view_numbers(samples[view_id], measures) for view_id in places}

@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray
 
+from rebar_depth_bench.bar_crossings.table import CrossingsSource
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, STATISTICS, Measure, Samples, Statistic
 from rebar_depth_bench.extended.reach import Reach, pooled, reaches
 from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval
@@ -43,11 +44,7 @@ class MeasureEstimate:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object of the estimate, rounded."""
-        return {
-            "value": rounded(self.value),
-            "ci95": rounded_interval(self.interval),
-            "samples": self.samples,
-        }
+        return {"value": rounded(self.value), "ci95": rounded_interval(self.interval), "samples": self.samples}
 
 
 @dataclass(frozen=True)
@@ -68,14 +65,6 @@ class ExtendedTable:
             name: [reach.to_dict() for reach in of_alignment] for name, of_alignment in self.reaches.items()
         }
         return {"views": self.views, **numbers, "crossing_reach": reaches}
-
-
-@dataclass(frozen=True)
-class CrossingsSource:
-    """File of the dataset folder that the crossings come from, and its hex SHA-256."""
-
-    file: str
-    sha256: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +123,10 @@ def view_numbers(view: ViewSamples, measures: Mapping[str, Sequence[Measure]]) -
 
     def value(measure: Measure, samples: Samples) -> float | None:
         values = samples.get(measure.sample, np.empty(0))
-        return measure.number(STATISTICS[measure.statistic](values)) if len(values) else None
+        if not len(values):
+            return None
+        statistic = STATISTICS[measure.statistic](values)
+        return statistic if measure.convert is None else measure.convert(statistic)
 
     return {
         alignment: {measure.name: value(measure, view[alignment]) for measure in of_alignment}

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt16, UInt32
 from numpy import ndarray
 
-from rebar_depth_bench.bar_crossings.definition import Crossings
+from rebar_depth_bench.bar_crossings.definition import Crossings, scene_crossings
 from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.extended.axes import CageTruth, SceneCrossings, cage_truth, prepared_crossings
 
@@ -18,23 +18,15 @@ _Made = TypeVar("_Made")
 
 
 @dataclass(frozen=True, eq=False)
-class BarAxes:
-    """Axis of a bar as built and its nominal axis: polylines, world, metres."""
-
-    built_m: Float64[ndarray, "n 3"]
-    nominal_m: Float64[ndarray, "k 3"]
-
-
-@dataclass(frozen=True, eq=False)
 class SceneBars:
     """Bars of a scene: their segments, nominal diameter by bar id (NaN for ids without a bar), and crossings.
 
-    ``axes`` has the axes of the bars with a nominal axis, by bar id.
+    ``designed`` has the bars with a nominal axis, by id.
     """
 
     cage: CageTruth
     diameter_m: Float64[ndarray, " ids"]
-    axes: Mapping[int, BarAxes]
+    designed: Mapping[int, Bar]
     crossings: SceneCrossings
 
     @classmethod
@@ -44,13 +36,9 @@ class SceneBars:
         diameter_m = np.full(np.iinfo(np.uint16).max + 1, np.nan)
         measured = with_axis(bars)
         diameter_m[[bar.bar_id for bar in measured]] = [bar.diameter_m for bar in measured]
-        axes = {
-            bar.bar_id: BarAxes(np.array(bar.axis_m), np.array(bar.nominal_axis_m))
-            for bar in measured
-            if bar.nominal_axis_m
-        }
-        cage = cage_truth(bars)
-        return cls(cage, diameter_m, axes, prepared_crossings(crossings or Crossings.none(), bars, cage))
+        designed = {bar.bar_id: bar for bar in measured if bar.nominal_axis_m}
+        cage, crossings = cage_truth(bars), scene_crossings(()) if crossings is None else crossings
+        return cls(cage, diameter_m, designed, prepared_crossings(crossings, bars, cage))
 
 
 @dataclass(frozen=True, eq=False)

@@ -17,6 +17,7 @@ import rebar_depth_bench as rdb
 from rebar_depth_bench.bar_crossings.definition import Crossings, crossing_parameters, scene_crossings
 from rebar_depth_bench.bar_crossings.table import (
     CROSSINGS_SCHEMA,
+    CrossingsSource,
     folder_crossings,
     read_crossings,
     write_crossings,
@@ -69,15 +70,15 @@ def test_built_folder_has_table_parameters_and_digest(tiny_root: Path) -> None:
     assert manifest["files"]["crossings.parquet"] == sha256
     file = {"file": "crossings.parquet", "digest": f"sha256:{sha256}"}
     assert manifest["crossings"] == {**crossing_parameters(), **file}
-    found = folder_crossings(open_folder(tiny_root))
-    assert (found.source, found.sha256) == ("crossings.parquet", sha256)
-    assert_equal(found.by_scene["lattice"], scene_crossings(read_bars(tiny_root / "bars.parquet")["lattice"]))
+    by_scene, source = folder_crossings(open_folder(tiny_root))
+    assert source == CrossingsSource("crossings.parquet", sha256)
+    assert_equal(by_scene["lattice"], scene_crossings(read_bars(tiny_root / "bars.parquet")["lattice"]))
 
 
 def test_older_folder_has_crossings_of_its_bars(tiny_root: Path, older: Path) -> None:
-    found = folder_crossings(open_folder(older))
-    assert (found.source, found.sha256) == ("bars.parquet", file_sha256(older / "bars.parquet"))
-    assert_equal(found.by_scene["lattice"], read_crossings(tiny_root / "crossings.parquet")["lattice"])
+    by_scene, source = folder_crossings(open_folder(older))
+    assert source == CrossingsSource("bars.parquet", file_sha256(older / "bars.parquet"))
+    assert_equal(by_scene["lattice"], read_crossings(tiny_root / "crossings.parquet")["lattice"])
 
 
 def test_crossings_are_a_frame(tiny_root: Path, older: Path) -> None:

@@ -18,7 +18,7 @@ from rebar_depth_bench.extended.fits import MISS_MM
 from rebar_depth_bench.extended.inspection import inspection_samples
 from rebar_depth_bench.extended.measures import STATISTICS, Samples
 from rebar_depth_bench.extended.registry import score_extended
-from rebar_depth_bench.extended.steel import BarAxes, SceneBars
+from rebar_depth_bench.extended.steel import SceneBars
 from rebar_depth_bench.geometry.cameras import rotation_matrix
 from rebar_depth_bench.scoring.evaluation import open_evaluation
 from tests.bench.extended.cage_scenes import mat, predicted_m, view
@@ -128,8 +128,7 @@ def test_bow_of_a_bar_is_measured() -> None:
     axis_m = tuple((0.0, float(y), 0.4 - float(b)) for y, b in zip(y_m, bow_m, strict=True))
     straight = Bar(1, "bar", 0.02, nominal, nominal)
     truth = view([straight])
-    axis = BarAxes(np.array(axis_m), np.array(nominal))
-    truth = replace(truth, bars=replace(truth.bars, axes={1: axis}))
+    truth = replace(truth, bars=replace(truth.bars, designed={1: replace(straight, axis_m=axis_m)}))
     samples = as_built_samples(truth.depth_m.astype(float), truth)
     np.testing.assert_allclose(samples["deviation_true_mm"], [0.6], atol=0.01)
     np.testing.assert_allclose(samples["deviation_judged_mm"], [0.6], atol=0.01)

@@ -80,7 +80,7 @@ def test_three_bars_of_one_node_are_judged_where_they_are_seen() -> None:
         ([2, 3], 2),
     ]
     assert truth.judged.crossing.tolist() == [0]
-    assert view_crossings(truth).in_scene == 2
+    assert samples_of(truth.depth_m.astype(float), truth)["crossings_judged"].tolist() == [0.5]
     beside = bar(
         3, (0.03, -0.15, 0.442), (0.03, 0.15, 0.442)
     )  # Seen beside the first, its tie point behind bar 2.
