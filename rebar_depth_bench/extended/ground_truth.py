@@ -121,7 +121,6 @@ def load_steel_truth(
         return has_camera and has_counts and are_pixels_inside(view, config)
 
     content = CacheContent(
-        source=config.root,
         task=f"bars in the views of {config.name}",
         inputs=cache_inputs(config, EXTENDED_PROTOCOL, folder.files[BARS_FILE]),
         dtypes=_DTYPES,
@@ -146,7 +145,6 @@ def load_steel_truth(
     # An entry of its own: its arrays have other lengths, and it also depends on the definition of crossings.
     protocol = f"{EXTENDED_PROTOCOL} {CROSSINGS_PROTOCOL}"
     judged = CacheContent(
-        source=config.root,
         task=f"crossings in the views of {config.name}",
         inputs=cache_inputs(config, protocol, f"{folder.files[BARS_FILE]} {found.sha256}"),
         dtypes={"crossing": np.uint32, "pixel": np.uint32},

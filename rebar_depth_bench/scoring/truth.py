@@ -49,7 +49,6 @@ def config_truth(folder: DatasetFolder, config: DatasetConfig, progress: Progres
         return has_counts and len(view.numbers) == _REFERENCE.stop + has_widths and are_pixels_inside(view, config)
 
     content = CacheContent(
-        source=config.root,
         task=f"ground truth of {config.name}",
         inputs=cache_inputs(config, PROTOCOL, folder.files[BARS_FILE] if has_widths else ""),
         dtypes={"index": np.uint32, "depth_m": np.float32},
