@@ -11,6 +11,7 @@ structure of Thrift's compact protocol. Structures become dicts by field number;
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -22,7 +23,7 @@ import pyarrow.parquet as pq
 
 from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.data.manifest import DatasetConfig
-from rebar_depth_bench.data.schema import ROW_SCHEMA, column_kind, validated_columns
+from rebar_depth_bench.data.schema import CAMERA_SHAPES, ROW_SCHEMA, column_kind, validated_columns
 from rebar_depth_bench.errors import DatasetError, InputError, escape_text
 from rebar_depth_bench.limits import CELL_BYTES
 from rebar_depth_bench.reading import open_regular
@@ -277,10 +278,6 @@ def _check_schema(found: pa.Schema, table: Table) -> None:
             raise ParquetError(f"column {column.name} is {str(found_type)[:60]}, expected {column.type}") from None
 
 
-_VALUES = {"K": 9, "distortion": 5, "cam_from_world": 16}
-"""Numbers in a cell, by column kind; the other columns have one value per cell."""
-
-
 def check_shards(config: DatasetConfig) -> None:
     """Check the footers of a local config's shards; those of the Hub are checked when they are read.
 
@@ -372,7 +369,7 @@ def rows_table(columns: Sequence[str], max_rows: int) -> Table:
         pa.schema([ROW_SCHEMA.field(name) for name in dict.fromkeys(columns)]),
         max_rows=max_rows,
         max_bytes=max_rows * len(columns) * CELL_BYTES.value(),
-        max_values={name: _VALUES.get(column_kind(name), 1) for name in columns},
+        max_values={name: math.prod(CAMERA_SHAPES.get(column_kind(name), ())) for name in columns},
     )
 
 

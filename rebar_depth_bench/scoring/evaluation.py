@@ -19,7 +19,8 @@ from numpy import ndarray
 
 from rebar_depth_bench import software_version
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_folder
-from rebar_depth_bench.data.rows import CAMERA_KINDS, camera_from_row, decode_row
+from rebar_depth_bench.data.rows import camera_from_row, decode_row
+from rebar_depth_bench.data.schema import CAMERA_SHAPES
 from rebar_depth_bench.data.shards import encoded_rows
 from rebar_depth_bench.errors import SubmissionError
 from rebar_depth_bench.geometry.cameras import Camera
@@ -86,7 +87,7 @@ class View:
 
     def camera(self, eye: str) -> Camera:
         """Return the camera of one eye."""
-        cells = {f"{eye}_{kind}": self.cell(f"{eye}_{kind}") for kind in CAMERA_KINDS}
+        cells = {f"{eye}_{kind}": self.cell(f"{eye}_{kind}") for kind in CAMERA_SHAPES}
         return camera_from_row(cells, eye, self.config.grid)
 
 
