@@ -110,7 +110,7 @@ def stage_published_rows(shard: Path, targets: Mapping[str, Path], records: Mapp
     """
     rows: list[pa.Table] = []
     table = rows_table(ROW_SCHEMA.names, VIEWS_PER_SHARD)
-    with suppress(OSError, ValueError), open_regular(shard) as stream, open_parquet(stream, table) as (file, _):
+    with suppress(OSError, ValueError), open_regular(shard) as stream, open_parquet(stream, table) as file:
         rows += [file.read_row_group(group) for group in range(file.num_row_groups)]
     for row in rows:
         if row.schema.equals(ROW_SCHEMA) and row.num_rows == 1:
@@ -122,7 +122,7 @@ def stage_published_rows(shard: Path, targets: Mapping[str, Path], records: Mapp
 def _read_staged_row(path: Path, view_id: str) -> tuple[pa.Table, ViewRecord]:
     """Return the staged row of a view and its record. Raises ``InputError`` if the file has no such row."""
     try:
-        with open_regular(path) as stream, open_parquet(stream, rows_table(ROW_SCHEMA.names, 1)) as (file, _):
+        with open_regular(path) as stream, open_parquet(stream, rows_table(ROW_SCHEMA.names, 1)) as file:
             row = file.read()
     except (OSError, ValueError) as error:
         raise _damaged_row(path, Problem("damaged", "", f"no Parquet file: {escape_text(str(error))}")) from None

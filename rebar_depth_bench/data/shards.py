@@ -218,8 +218,8 @@ class Table:
 
 
 @contextmanager
-def open_parquet(stream: BinaryIO, table: Table) -> Iterator[tuple[pq.ParquetFile, int]]:
-    """Yield the Parquet file in ``stream`` and its number of rows, after checking that it declares ``table``.
+def open_parquet(stream: BinaryIO, table: Table) -> Iterator[pq.ParquetFile]:
+    """Yield the Parquet file in ``stream``, after checking that it declares ``table``.
 
     Raises ``ParquetError``, or another ``ValueError``, ``OSError`` or ``pa.ArrowException`` for a damaged file.
     """
@@ -229,7 +229,7 @@ def open_parquet(stream: BinaryIO, table: Table) -> Iterator[tuple[pq.ParquetFil
     limits = {"thrift_string_size_limit": _MAX_STRING_BYTES, "thrift_container_size_limit": max_elements}
     with pq.ParquetFile(stream, **limits) as file:
         _check_schema(file.schema_arrow, table)
-        yield file, footer.rows
+        yield file
 
 
 def read_rows(
@@ -251,7 +251,7 @@ def read_table(path: Path, table: Table, what: str) -> Iterator[dict[str, Any]]:
     Raises ``DatasetError`` if the file is missing, damaged, or does not hold ``table``.
     """
     try:
-        with open_regular(path) as stream, open_parquet(stream, table) as (file, _):
+        with open_regular(path) as stream, open_parquet(stream, table) as file:
             yield from read_rows(file, table.schema, batch_rows=1000)
     except Exception as error:  # pyarrow raises many types, which depend on the damage.
         reason = escape_text(str(error) or type(error).__name__)
@@ -284,10 +284,10 @@ def check_shards(config: DatasetConfig) -> None:
     Raises ``DatasetError`` for a missing or damaged shard, and if the manifest has another number of views.
     """
     if config.local is not None:
-        table, rows = _shard_table(config, ROW_SCHEMA.names), 0
+        table, rows = rows_table(ROW_SCHEMA.names, len(config.views)), 0
         for shard in config.shards:
-            with _open_shard(config, shard, table) as (_, shard_rows):
-                rows += shard_rows
+            with _open_shard(config, shard, table) as file:
+                rows += file.metadata.num_rows
         if rows != (views := len(config.views)):
             found = f"config {config.name} has {rows} rows"
             raise DatasetError(f"{config.root}: {found}, expected the manifest's {views} views")
@@ -343,14 +343,14 @@ def shard_rows(
     Of a shard with one row group for each view, as the builder writes it, only the wanted rows are read. Raises
     ``DatasetError`` for a damaged shard.
     """
-    table = _shard_table(config, ("view_id", *columns))
+    table = rows_table(("view_id", *columns), len(config.views))
     for shard in shards:
-        with _open_shard(config, shard, table) as (file, count):
+        with _open_shard(config, shard, table) as file:
             groups = None
             if view_ids is not None:
                 stored = file.read(columns=["view_id"])["view_id"].to_pylist()
                 wanted = [index for index, view_id in enumerate(stored) if view_id in view_ids]
-                groups = wanted if not wanted or file.num_row_groups == count else None
+                groups = wanted if not wanted or file.num_row_groups == len(stored) else None
             for row in read_rows(file, table.schema, row_groups=groups):
                 if view_ids is None or row["view_id"] in view_ids:
                     yield {name: row[name] for name in columns}
@@ -373,15 +373,11 @@ def rows_table(columns: Sequence[str], max_rows: int) -> Table:
     )
 
 
-def _shard_table(config: DatasetConfig, columns: Sequence[str]) -> Table:
-    return rows_table(columns, len(config.views))
-
-
 @contextmanager
-def _open_shard(config: DatasetConfig, shard: str, table: Table) -> Iterator[tuple[pq.ParquetFile, int]]:
+def _open_shard(config: DatasetConfig, shard: str, table: Table) -> Iterator[pq.ParquetFile]:
     try:
-        with config.open(shard) as stream, open_parquet(stream, table) as file_and_rows:
-            yield file_and_rows
+        with config.open(shard) as stream, open_parquet(stream, table) as file:
+            yield file
     except InputError:
         raise
     except Exception as error:  # pyarrow and the Hub's client raise many types, which depend on the damage.

@@ -91,18 +91,6 @@ class View:
         return camera_from_row(cells, eye, self.config.grid)
 
 
-def read_views(
-    config: DatasetConfig, columns: Sequence[str], positions: Collection[int], read_depth: ReadDepth
-) -> Iterator[View]:
-    """Yield the views at ``positions`` of a config, one at a time; only their rows are read.
-
-    Raises ``DatasetError`` for a damaged shard.
-    """
-    position_by_view = {config.view_ids[position]: position for position in positions}
-    for row in encoded_rows(config, ("view_id", *columns), position_by_view):
-        yield View(config, row["view_id"], position_by_view[row["view_id"]], row, read_depth)
-
-
 @dataclass(frozen=True)
 class Evaluation:
     """Submission whose structure is valid, and the dataset folder it is evaluated against."""
@@ -135,8 +123,14 @@ class Evaluation:
         return found
 
     def views(self, config: DatasetConfig, columns: Sequence[str], positions: Collection[int]) -> Iterator[View]:
-        """Yield the views at ``positions`` of a config as ``read_views``."""
-        return read_views(config, columns, positions, self.submission.read)
+        """Yield the views at ``positions`` of a config, one at a time; only their rows are read.
+
+        Raises ``DatasetError`` for a damaged shard.
+        """
+        position_by_view = {config.view_ids[position]: position for position in positions}
+        for row in encoded_rows(config, ("view_id", *columns), position_by_view):
+            view_id = row["view_id"]
+            yield View(config, view_id, position_by_view[view_id], row, self.submission.read)
 
     def check_entries(self, progress: Progress = silent) -> None:
         """Decode every entry. Raises ``SubmissionError`` with all problems."""

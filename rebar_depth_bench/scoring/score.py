@@ -207,9 +207,3 @@ def tabulate(
         truth_sigma_m=truth_sigma_m,
         intervals=view_intervals(views, by_scene=split is not None) if views else dict.fromkeys(COLUMN_BY_PATH),
     )
-
-
-# Single-bar interior: scored pixels whose 3 x 3 neighbourhood belongs to one bar. The interior of the protocol
-# erodes the union of all bars. Where bars lie side by side in the image, a scored pixel can therefore have another
-# bar beside it, at another depth; a prediction that is exact but shifted by one pixel has a large error there.
-# Errors on the single-bar interior contain no such steps.
