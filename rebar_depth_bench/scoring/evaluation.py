@@ -9,7 +9,7 @@ import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
@@ -39,21 +39,19 @@ _Found = TypeVar("_Found")
 class Provenance:
     """Provenance of the numbers of a comparison, or of an analysis of archives.
 
-    ``protocol`` names the definitions of the numbers; changed definitions have a new name. ``dataset_digest`` and
-    ``dataset_version`` are None if the reference is not a dataset folder.
+    ``protocol`` names the definitions of the numbers; changed definitions have a new name. ``dataset`` is None if
+    the reference is not a dataset folder.
     """
 
     protocol: str
-    dataset_digest: str | None
-    dataset_version: str | None
+    dataset: DatasetIdentity | None
     archives: Sequence[SubmissionIdentity]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the provenance entries of a JSON object."""
-        dataset = {"digest": self.dataset_digest, "version": self.dataset_version}
         return {
             "protocol": self.protocol,
-            "dataset": dataset if self.dataset_digest is not None else None,
+            "dataset": None if self.dataset is None else asdict(self.dataset),
             "submissions": [{"method": archive.method, "sha256": archive.sha256} for archive in self.archives],
             "software": {"version": software_version()},
         }
@@ -141,7 +139,7 @@ class Evaluation:
     def provenance(self) -> Provenance:
         """Return the provenance of an analysis of the submission."""
         archive = SubmissionIdentity(self.meta.method, self.submission.sha256())
-        return Provenance(PROTOCOL, self.folder.digest, self.folder.version, [archive])
+        return Provenance(PROTOCOL, DatasetIdentity(self.folder.digest, self.folder.version), [archive])
 
 
 @contextmanager
