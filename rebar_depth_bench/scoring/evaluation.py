@@ -153,7 +153,7 @@ def open_evaluation(
     """
     folder = open_folder(root, expect_digest=expect_digest)
     with SubmissionReader(archive, folder.expected_views()) as submission:
-        if submission.meta is None or submission.structure_problems:
+        if submission.structure_problems:
             raise SubmissionError.from_problems(archive, list(submission.problems()))
         yield Evaluation(folder, submission)
 
