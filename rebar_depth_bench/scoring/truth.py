@@ -69,7 +69,7 @@ def config_truth(folder: DatasetFolder, config: DatasetConfig, progress: Progres
         references=references,
         traits=traits,
         split=config.scenes[0].split if config.has_splits else None,
-        truth_sigma_m=config.truth_sigma_m,
+        truth_sigma_m=None if config.imported is None else config.imported.truth_sigma_m,
         published=published_match(config),
     )
 
