@@ -30,13 +30,13 @@ from rebar_depth_bench.console import run_command
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars, with_axis
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.data.rows import (
-    CAMERA_KINDS,
     EyeTruth,
     camera_from_row,
     iterate_rows,
     truth_columns,
     truth_from_row,
 )
+from rebar_depth_bench.data.schema import CAMERA_SHAPES
 from rebar_depth_bench.errors import InputError, SubmissionError, escape_text, printable
 from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid, transform
 from rebar_depth_bench.names import config_of
@@ -46,7 +46,7 @@ from rebar_depth_bench.scoring.protocol import scored_pixels
 from rebar_depth_bench.submission import EntryError
 from rebar_depth_bench.terminal import print_notice
 
-COLUMNS = ("left_rgb", "right_rgb", *truth_columns("left"), *(f"right_{kind}" for kind in CAMERA_KINDS))
+COLUMNS = ("left_rgb", "right_rgb", *truth_columns("left"), *(f"right_{kind}" for kind in CAMERA_SHAPES))
 COLOURS = np.array([[0, 114, 178], [213, 94, 0], [0, 158, 115], [160, 72, 138]], np.uint8)  # Of archives.
 MAX_TRUTH_RATIO, MAX_PREDICTION_RATIO = 1.25, 4.0
 """Multiples of the largest depth of steel beyond which points are left out: they would shrink the picture."""

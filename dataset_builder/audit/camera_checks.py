@@ -26,8 +26,7 @@ from dataset_builder.scene.model import NOT_STEEL, Assembly, Mesh, Part
 from dataset_builder.specs.manifest_specs import rig_spec, trajectory_spec
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.manifest import DatasetConfig
-from rebar_depth_bench.data.rows import CAMERA_KINDS
-from rebar_depth_bench.data.schema import EYES
+from rebar_depth_bench.data.schema import CAMERA_SHAPES, EYES
 from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.geometry.cameras import Camera, camera_centre
 from rebar_depth_bench.names import scene_prefix, view_id
@@ -126,7 +125,7 @@ def view_list_problems(config: DatasetConfig, views: Sequence[ExpectedView]) -> 
 def camera_problems(row: Mapping[str, Any], expected: ExpectedView) -> Iterator[str]:
     """Yield the differences of a decoded row's cameras and baseline from the expected ones."""
     for eye, camera in expected.cameras.items():
-        for kind in CAMERA_KINDS:
+        for kind in CAMERA_SHAPES:
             deviation = float(np.abs(row[f"{eye}_{kind}"] - getattr(camera, kind)).max())
             if not deviation <= CAMERA_TOLERANCE:
                 yield f"{eye}_{kind} differs by {deviation:.1e} from the value given by the protocol and the rig"

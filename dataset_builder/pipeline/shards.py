@@ -21,8 +21,8 @@ import pyarrow.parquet as pq
 
 from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.data import codecs
-from rebar_depth_bench.data.rows import CAMERA_KINDS, EyeView, absent_cell, truth_from_row
-from rebar_depth_bench.data.schema import COLUMNS, ROW_SCHEMA, ViewRecord, column_kind, features
+from rebar_depth_bench.data.rows import EyeView, absent_cell, truth_from_row
+from rebar_depth_bench.data.schema import CAMERA_SHAPES, COLUMNS, ROW_SCHEMA, ViewRecord, column_kind, features
 from rebar_depth_bench.data.shards import open_parquet, rows_table
 from rebar_depth_bench.errors import InputError, Problem, escape_text
 from rebar_depth_bench.reading import open_regular, parse_json
@@ -110,7 +110,7 @@ def stage_published_rows(shard: Path, targets: Mapping[str, Path], records: Mapp
     """
     rows: list[pa.Table] = []
     table = rows_table(ROW_SCHEMA.names, VIEWS_PER_SHARD)
-    with suppress(OSError, ValueError), open_regular(shard) as stream, open_parquet(stream, table) as (file, _):
+    with suppress(OSError, ValueError), open_regular(shard) as stream, open_parquet(stream, table) as file:
         rows += [file.read_row_group(group) for group in range(file.num_row_groups)]
     for row in rows:
         if row.schema.equals(ROW_SCHEMA) and row.num_rows == 1:
@@ -122,7 +122,7 @@ def stage_published_rows(shard: Path, targets: Mapping[str, Path], records: Mapp
 def _read_staged_row(path: Path, view_id: str) -> tuple[pa.Table, ViewRecord]:
     """Return the staged row of a view and its record. Raises ``InputError`` if the file has no such row."""
     try:
-        with open_regular(path) as stream, open_parquet(stream, rows_table(ROW_SCHEMA.names, 1)) as (file, _):
+        with open_regular(path) as stream, open_parquet(stream, rows_table(ROW_SCHEMA.names, 1)) as file:
             row = file.read()
     except (OSError, ValueError) as error:
         raise _damaged_row(path, Problem("damaged", "", f"no Parquet file: {escape_text(str(error))}")) from None
@@ -153,7 +153,7 @@ def encode_view(view: View) -> tuple[pa.Table, ViewRecord]:
     columns: dict[str, Any] = {"view_id": view.view_id, "scene": view.scene, "baseline_m": view.baseline_m}
     for name, eye in (("left", view.left), ("right", view.right)):
         columns |= {f"{name}_{kind}": getattr(eye, kind) for kind in ("rgb", "mask", "bars")}
-        columns |= {f"{name}_{kind}": getattr(eye.camera, kind) for kind in CAMERA_KINDS}
+        columns |= {f"{name}_{kind}": getattr(eye.camera, kind) for kind in CAMERA_SHAPES}
         columns[f"{name}_depth"] = eye.depth_m
     return encode_row(columns)
 
@@ -191,7 +191,7 @@ _ENCODERS: Mapping[str, Callable[[Any], Any]] = {
     "depth": codecs.encode_depth,
     "mask": lambda mask: _image_cell(codecs.encode_png(mask)),
     "bars": lambda bars: _image_cell(codecs.encode_png(bars)),
-    **dict.fromkeys(CAMERA_KINDS, lambda array: array.tolist()),
+    **dict.fromkeys(CAMERA_SHAPES, lambda array: array.tolist()),
 }
 """Encoders of cells by column kind; values of other kinds are stored as they are."""
 

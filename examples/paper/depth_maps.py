@@ -17,6 +17,7 @@ from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
 from rebar_depth_bench.errors import EntryError, InputError, SubmissionError, printable
 from rebar_depth_bench.names import config_of, split_of
 from rebar_depth_bench.reading import FileSource
+from rebar_depth_bench.scoring.result import DatasetIdentity
 from rebar_depth_bench.scoring.truth import verified_views
 from rebar_depth_bench.submission import ExpectedViews, SubmissionReader
 from rebar_depth_bench.submission.declaration import METADATA_NAME, parse_metadata
@@ -122,15 +123,14 @@ def masked(depth_m: Depth, near_m: float, far_m: float) -> Depth:
 class Data:
     """Capture, or config of a dataset folder: (H, W) of the views to score, and of all that archives may hold.
 
-    ``digest`` and ``version`` are those of a dataset folder, ``camera`` describes the camera of a capture.
+    ``dataset`` is the identity of a dataset folder, ``camera`` describes the camera of a capture.
     """
 
     name: str
     views: ExpectedViews
     archive_views: ExpectedViews
     config: DatasetConfig | None = None
-    digest: str | None = None
-    version: str | None = None
+    dataset: DatasetIdentity | None = None
     camera: str | None = None
 
     @property
@@ -173,7 +173,8 @@ def open_data(path: str, wanted: str | None) -> Data:
     folder = open_folder(path)
     config = only_config(path, [*folder.config_by_name.values()], wanted)
     of_config = dict.fromkeys(config.view_ids, config.grid)
-    return Data(f"config {config.name}", of_config, folder.expected_views(), config, folder.digest, folder.version)
+    dataset = DatasetIdentity(folder.digest, folder.version)
+    return Data(f"config {config.name}", of_config, folder.expected_views(), config, dataset)
 
 
 def labelled(sources: Sequence[DepthMaps], reserved: str) -> dict[str, DepthMaps]:

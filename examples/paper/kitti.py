@@ -232,7 +232,7 @@ def run(options: argparse.Namespace) -> None:
         raise InputError(f"{options.kitti}: no image has ground truth inside the crop {options.crop}")
     protocol = {"ground_truth": kind, "crop": options.crop, "cap_m": options.cap}
     content = {
-        **Provenance(PROTOCOL, None, None, [SubmissionIdentity(source.method, source.sha256)]).to_dict(),
+        **Provenance(PROTOCOL, None, [SubmissionIdentity(source.method, source.sha256)]).to_dict(),
         "intervals": INTERVALS,
         "method": source.method,
         "kitti": protocol | {"lidar_depth": options.lidar_depth, "found": len(images), "missing": [*missing]},

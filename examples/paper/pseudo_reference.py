@@ -176,7 +176,7 @@ def run(options: argparse.Namespace) -> None:
     agreed = pd.DataFrame([row for *_, rows in outcomes for row in rows], columns=[*PAIR, *OVER_VIEWS])
     archives = [SubmissionIdentity(name, source.sha256) for name, source in sources.items()]
     content = {
-        **Provenance(PROTOCOL, data.digest, data.version, archives).to_dict(),
+        **Provenance(PROTOCOL, data.dataset, archives).to_dict(),
         "intervals": INTERVALS,
         "data": data.name,
         "camera": data.camera,

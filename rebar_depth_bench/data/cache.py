@@ -121,12 +121,11 @@ class ViewArrays:
 class CacheContent:
     """Content of an entry and how it is computed.
 
-    ``inputs``, a value of JSON, contains everything that the arrays depend on. ``extract`` yields the views of
-    some ids, or for None all of ``view_ids``, in any order; ``is_sound`` returns whether the data of a view are in
-    their range. ``source`` is the dataset, for messages, and ``task`` the name of the computation in a progress.
+    ``inputs``, a value of JSON, contains everything that the arrays depend on. ``extract`` yields each view of
+    some ids, or for None of ``view_ids``, in any order; ``is_sound`` returns whether the data of a stored view are
+    in their range. ``task`` is the name of the computation in a progress.
     """
 
-    source: str
     task: str
     inputs: Mapping[str, Any]
     dtypes: Mapping[str, type]
@@ -149,24 +148,14 @@ class CacheContent:
     def compute(
         self, view_ids: Collection[str] | None = None, progress: Progress = silent
     ) -> Iterator[ViewArrays]:
-        """Yield the views of some ids, or all, with arrays of ``dtypes``.
-
-        Raises ``DatasetError`` if a view is out of range or missing.
-        """
-        missing = set(self.view_ids if view_ids is None else view_ids)
-        total = len(missing)
-        for view in self.extract(view_ids):
+        """Yield the views of some ids, or all, with arrays of ``dtypes``. Raises what ``extract`` raises."""
+        total = len(self.view_ids if view_ids is None else view_ids)
+        for done, view in enumerate(self.extract(view_ids), start=1):
             arrays: dict[str, ndarray] = {
                 name: np.ascontiguousarray(view.arrays[name], dtype) for name, dtype in self.dtypes.items()
             }
-            computed = ViewArrays(view.view_id, arrays, view.numbers)
-            if not self.is_sound(computed):
-                raise DatasetError(f"{self.source}: the ground truth of view {view.view_id} is out of range")
-            missing.remove(view.view_id)
-            yield computed
-            progress(self.task, total - len(missing), total)
-        if missing:
-            raise DatasetError(f"{self.source}: the ground truth of view {min(missing)} is missing")
+            yield ViewArrays(view.view_id, arrays, view.numbers)
+            progress(self.task, done, total)
 
 
 class _Block(StrictModel):
@@ -242,8 +231,8 @@ def _read_entry(path: Path, content: CacheContent) -> _Entry | None:
 def _write_entry(path: Path, content: CacheContent, progress: Progress) -> _Entry:
     """Write an entry and open it. It appears complete or not at all, without locks between processes.
 
-    Raises ``DatasetError`` as ``CacheContent.compute``, and ``OSError``, ``OutputError`` or ``InputError`` if it
-    cannot be written.
+    Raises what ``CacheContent.compute`` raises, and ``OSError``, ``OutputError`` or ``InputError`` if it cannot be
+    written.
     """
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     blocks = []
@@ -297,7 +286,7 @@ class ArrayCache:
     def view(self, position: int) -> ViewArrays:
         """Return the view at ``position`` as arrays that must not be changed; thread-safe.
 
-        Raises ``DatasetError`` if it is computed and is out of range or missing.
+        Raises ``DatasetError`` if it has to be computed and cannot be.
         """
         view_id = self.view_ids[position]
         if self.entry is not None:
@@ -315,7 +304,7 @@ def open_cache(content: CacheContent, progress: Progress = silent) -> ArrayCache
     """Open the entry of ``content``; if it is missing or damaged, it is written first, one view at a time.
 
     If it cannot be written, each view is computed whenever it is needed, with a warning: a score never fails for
-    want of a cache. Raises ``DatasetError`` if a view is out of range or missing.
+    want of a cache. Raises ``DatasetError`` if a view cannot be computed.
     """
     CACHE_BYTES.value()  # An invalid variable is reported before the work.
     try:
@@ -333,13 +322,9 @@ def open_cache(content: CacheContent, progress: Progress = silent) -> ArrayCache
 
 def _warn_of_damage(path: Path, damage: Exception) -> None:
     reason = f"{getattr(damage, 'strerror', None) or damage}".partition("\n")[0]
-    _warn(f"{path}: the cache is damaged, and its values are computed again: {reason}")
+    print_notice(f"warning: {path}: the cache is damaged, and its values are computed again: {reason}")
 
 
 @cache
 def _warn_once(message: str) -> None:
-    _warn(message)
-
-
-def _warn(message: str) -> None:
     print_notice(f"warning: {message}")

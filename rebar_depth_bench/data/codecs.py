@@ -101,8 +101,6 @@ def open_picture(kind: str, content: bytes, grid: tuple[int, int]) -> Picture:
     no base class, for other content.
     """
     expected, (height, width) = PICTURE_KINDS[kind], grid
-    if not isinstance(content, bytes):
-        raise ValueError("the cell holds no bytes")
     if len(content) > CELL_BYTES.value():
         raise ValueError(f"it has {len(content)} bytes, expected {CELL_BYTES.allowed()}")
     plugin = next((plugin for start, plugin in _plugins().items() if content.startswith(start)), None)

@@ -18,8 +18,8 @@ from datasets import Features, Image, List, Value
 
 from rebar_depth_bench.data.codecs import PICTURE_KINDS, Picture
 from rebar_depth_bench.data.manifest import DatasetConfig
-from rebar_depth_bench.data.rows import CAMERA_KINDS, is_absent, open_cell, picture_place
-from rebar_depth_bench.data.schema import column_kind, features
+from rebar_depth_bench.data.rows import is_absent, open_cell, picture_place
+from rebar_depth_bench.data.schema import CAMERA_SHAPES, column_kind, features
 
 STORED_MODES = {"depth": "F", "preview": "RGB"}
 """Modes of ``datasets.Image`` by kind of column; the images of the other kinds are stored in their modes."""
@@ -34,7 +34,7 @@ def decoding_features(config: DatasetConfig, columns: Sequence[str], *, to_array
     for name in columns:
         if column_kind(name) in PICTURE_KINDS:
             by_name[name] = _Images(config.root, config.grid, name, to_arrays)
-        elif column_kind(name) in CAMERA_KINDS:
+        elif column_kind(name) in CAMERA_SHAPES:
             by_name[name] = _Matrices(by_name[name].feature, by_name[name].length)
             by_name[name].to_arrays = to_arrays
         else:

@@ -226,11 +226,6 @@ class DatasetConfig(Located):
         return tuple(eye for eye in EYES if f"{eye}_depth" not in self.absent_columns)
 
     @property
-    def truth_sigma_m(self) -> float | None:
-        """Standard deviation of the ground truth's depth, metres, None if it is exact."""
-        return None if self.imported is None else self.imported.truth_sigma_m
-
-    @property
     def grid(self) -> tuple[int, int]:
         """Image size (height, width), pixels."""
         return self.rig.height, self.rig.width

@@ -20,17 +20,13 @@ from numpy import ndarray
 
 from rebar_depth_bench.data import codecs
 from rebar_depth_bench.data.manifest import DatasetConfig
-from rebar_depth_bench.data.schema import column_kind
+from rebar_depth_bench.data.schema import CAMERA_SHAPES, column_kind
 from rebar_depth_bench.data.shards import encoded_rows
 from rebar_depth_bench.errors import DatasetError, Problem, escape_text
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import Camera, is_rigid
 from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.validation import short_repr
-
-CAMERA_KINDS = ("K", "distortion", "cam_from_world")
-"""Kinds of the dataset's columns that describe a camera (see ``schema.column_kind``)."""
-_CAMERA_SHAPES = dict(zip(CAMERA_KINDS, ((3, 3), (5,), (4, 4)), strict=True))
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +72,7 @@ class EyeView(EyeTruth):
 
 def truth_columns(eye: str) -> tuple[str, ...]:
     """Return the names of the columns that ``truth_from_row`` requires for ``left`` or ``right``."""
-    return tuple(f"{eye}_{kind}" for kind in ("depth", "mask", "bars", *CAMERA_KINDS))
+    return tuple(f"{eye}_{kind}" for kind in ("depth", "mask", "bars", *CAMERA_SHAPES))
 
 
 def truth_from_row(row: Mapping[str, Any], eye: str) -> EyeTruth:
@@ -91,17 +87,17 @@ def camera_from_row(row: Mapping[str, Any], eye: str, grid: tuple[int, int]) -> 
 
     Raises ``ValueError`` for arrays that ``camera_array`` rejects.
     """
-    K, distortion, cam_from_world = (camera_array(kind, row[f"{eye}_{kind}"]) for kind in CAMERA_KINDS)
+    K, distortion, cam_from_world = (camera_array(kind, row[f"{eye}_{kind}"]) for kind in CAMERA_SHAPES)
     height, width = grid
     return Camera(K, distortion, cam_from_world, width, height)
 
 
 def absent_cell(kind: str) -> list[Any] | None:
-    """Return the cell of an absent column: null, or NaN for ``CAMERA_KINDS``.
+    """Return the cell of an absent column: null, or NaN for ``CAMERA_SHAPES``.
 
     Parquet readers of Arrow fail on null lists of a fixed size.
     """
-    return np.full(_CAMERA_SHAPES[kind], np.nan).tolist() if kind in CAMERA_KINDS else None
+    return np.full(CAMERA_SHAPES[kind], np.nan).tolist() if kind in CAMERA_SHAPES else None
 
 
 def is_absent(cell: Any) -> bool:
@@ -110,15 +106,15 @@ def is_absent(cell: Any) -> bool:
 
 
 def camera_array(kind: str, cell: Any) -> Float64[ndarray, ...]:
-    """Return a cell of one of ``CAMERA_KINDS`` as an array; arrays are returned unchanged.
+    """Return a cell of one of ``CAMERA_SHAPES`` as an array; arrays are returned unchanged.
 
     Raises ``ValueError`` unless it holds finite numbers of the kind's shape; a pose has to be rigid.
     """
     if isinstance(cell, ndarray):
         return cell
     array = np.array(cell, dtype=np.float64)
-    if array.shape != _CAMERA_SHAPES[kind]:
-        raise ValueError(f"it has the shape {array.shape}, expected {_CAMERA_SHAPES[kind]}")
+    if array.shape != CAMERA_SHAPES[kind]:
+        raise ValueError(f"it has the shape {array.shape}, expected {CAMERA_SHAPES[kind]}")
     if not np.isfinite(array).all():
         raise ValueError("it has values that are not finite, expected finite numbers")
     if kind == "cam_from_world" and not is_rigid(array):
@@ -183,7 +179,7 @@ def _decode(config: DatasetConfig, column: str, cell: Any, view: str) -> Any:
             return None
         if kind in codecs.PICTURE_KINDS:
             return codecs.decode(kind, _content(kind, cell), config.grid)
-        if kind in CAMERA_KINDS:
+        if kind in CAMERA_SHAPES:
             return camera_array(kind, cell)
         if kind == "view_id" and cell not in config.scene_by_view:
             raise ValueError("it is not in the manifest")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import reduce
 from typing import TYPE_CHECKING, Annotated, Any
 
 import pyarrow as pa
@@ -24,7 +25,6 @@ from rebar_depth_bench.validation import (
     Expected,
     StrictModel,
     Triple,
-    check_unique,
     field_error,
     number,
     one_of,
@@ -39,12 +39,14 @@ if TYPE_CHECKING:
 
 
 EYES = ("left", "right")
+CAMERA_SHAPES: Mapping[str, tuple[int, ...]] = {"K": (3, 3), "distortion": (5,), "cam_from_world": (4, 4)}
+"""Shapes of the arrays that describe a camera, by kind of column (see ``column_kind``)."""
 COLUMNS = (
     "view_id",
     "scene",
     *(f"{eye}_{kind}" for kind in ("rgb", "depth", "mask", "bars") for eye in EYES),
     "left_preview",
-    *(f"{eye}_{kind}" for kind in ("K", "distortion", "cam_from_world") for eye in EYES),
+    *(f"{eye}_{kind}" for kind in CAMERA_SHAPES for eye in EYES),
     "baseline_m",
 )
 """Names of the columns, in order."""
@@ -94,9 +96,7 @@ _ARROW_TYPES: Mapping[str, pa.DataType] = {
     **dict.fromkeys(("view_id", "scene"), pa.string()),
     **dict.fromkeys(("rgb", "mask", "bars", "preview"), _IMAGE_CELL),
     "depth": pa.binary(),
-    "K": pa.list_(pa.list_(pa.float64(), 3), 3),
-    "distortion": pa.list_(pa.float64(), 5),
-    "cam_from_world": pa.list_(pa.list_(pa.float64(), 4), 4),
+    **{kind: reduce(pa.list_, reversed(shape), pa.float64()) for kind, shape in CAMERA_SHAPES.items()},
     "baseline_m": pa.float64(),
 }
 ROW_SCHEMA = pa.schema([(name, _ARROW_TYPES[column_kind(name)]) for name in COLUMNS])
@@ -342,7 +342,7 @@ class Scene(ManifestTable):
     aim_point_m: Annotated[Triple, three_numbers(-1e9, 1e9, "three numbers, [x, y, z]")] | None = None
     key: Annotated[str, StringConstraints(max_length=200)]
     mesh: RelativePath | None
-    shards: Annotated[tuple[RelativePath, ...], Strict(False)]
+    shards: Annotated[tuple[RelativePath, ...], Strict(False), Expected("a list of one path or more", bool)]
     bytes: _Count
     entry: dict[str, Any] = Field(repr=False)
 
@@ -363,12 +363,6 @@ class Scene(ManifestTable):
         if trajectory is not None and protocol_views != trajectory.views:
             raise field_error(f"got {protocol_views}", f"the trajectory's {trajectory.views} views", "conflict")
         return protocol_views
-
-    @field_validator("shards")
-    @classmethod
-    def _check_shards(cls, shards: tuple[str, ...]) -> tuple[str, ...]:
-        check_unique(shards, "shard")
-        return shards
 
 
 class Rig(ManifestTable):

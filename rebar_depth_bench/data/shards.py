@@ -11,6 +11,7 @@ structure of Thrift's compact protocol. Structures become dicts by field number;
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -22,7 +23,7 @@ import pyarrow.parquet as pq
 
 from rebar_depth_bench.atomic_io import atomic_replace
 from rebar_depth_bench.data.manifest import DatasetConfig
-from rebar_depth_bench.data.schema import ROW_SCHEMA, column_kind, validated_columns
+from rebar_depth_bench.data.schema import CAMERA_SHAPES, ROW_SCHEMA, column_kind, validated_columns
 from rebar_depth_bench.errors import DatasetError, InputError, escape_text
 from rebar_depth_bench.limits import CELL_BYTES
 from rebar_depth_bench.reading import open_regular
@@ -217,8 +218,8 @@ class Table:
 
 
 @contextmanager
-def open_parquet(stream: BinaryIO, table: Table) -> Iterator[tuple[pq.ParquetFile, int]]:
-    """Yield the Parquet file in ``stream`` and its number of rows, after checking that it declares ``table``.
+def open_parquet(stream: BinaryIO, table: Table) -> Iterator[pq.ParquetFile]:
+    """Yield the Parquet file in ``stream``, after checking that it declares ``table``.
 
     Raises ``ParquetError``, or another ``ValueError``, ``OSError`` or ``pa.ArrowException`` for a damaged file.
     """
@@ -228,7 +229,7 @@ def open_parquet(stream: BinaryIO, table: Table) -> Iterator[tuple[pq.ParquetFil
     limits = {"thrift_string_size_limit": _MAX_STRING_BYTES, "thrift_container_size_limit": max_elements}
     with pq.ParquetFile(stream, **limits) as file:
         _check_schema(file.schema_arrow, table)
-        yield file, footer.rows
+        yield file
 
 
 def read_rows(
@@ -250,7 +251,7 @@ def read_table(path: Path, table: Table, what: str) -> Iterator[dict[str, Any]]:
     Raises ``DatasetError`` if the file is missing, damaged, or does not hold ``table``.
     """
     try:
-        with open_regular(path) as stream, open_parquet(stream, table) as (file, _):
+        with open_regular(path) as stream, open_parquet(stream, table) as file:
             yield from read_rows(file, table.schema, batch_rows=1000)
     except Exception as error:  # pyarrow raises many types, which depend on the damage.
         reason = escape_text(str(error) or type(error).__name__)
@@ -277,20 +278,16 @@ def _check_schema(found: pa.Schema, table: Table) -> None:
             raise ParquetError(f"column {column.name} is {str(found_type)[:60]}, expected {column.type}") from None
 
 
-_VALUES = {"K": 9, "distortion": 5, "cam_from_world": 16}
-"""Numbers in a cell, by column kind; the other columns have one value per cell."""
-
-
 def check_shards(config: DatasetConfig) -> None:
     """Check the footers of a local config's shards; those of the Hub are checked when they are read.
 
     Raises ``DatasetError`` for a missing or damaged shard, and if the manifest has another number of views.
     """
     if config.local is not None:
-        table, rows = _shard_table(config, ROW_SCHEMA.names), 0
+        table, rows = rows_table(ROW_SCHEMA.names, len(config.views)), 0
         for shard in config.shards:
-            with _open_shard(config, shard, table) as (_, shard_rows):
-                rows += shard_rows
+            with _open_shard(config, shard, table) as file:
+                rows += file.metadata.num_rows
         if rows != (views := len(config.views)):
             found = f"config {config.name} has {rows} rows"
             raise DatasetError(f"{config.root}: {found}, expected the manifest's {views} views")
@@ -346,14 +343,14 @@ def shard_rows(
     Of a shard with one row group for each view, as the builder writes it, only the wanted rows are read. Raises
     ``DatasetError`` for a damaged shard.
     """
-    table = _shard_table(config, ("view_id", *columns))
+    table = rows_table(("view_id", *columns), len(config.views))
     for shard in shards:
-        with _open_shard(config, shard, table) as (file, count):
+        with _open_shard(config, shard, table) as file:
             groups = None
             if view_ids is not None:
                 stored = file.read(columns=["view_id"])["view_id"].to_pylist()
                 wanted = [index for index, view_id in enumerate(stored) if view_id in view_ids]
-                groups = wanted if not wanted or file.num_row_groups == count else None
+                groups = wanted if not wanted or file.num_row_groups == len(stored) else None
             for row in read_rows(file, table.schema, row_groups=groups):
                 if view_ids is None or row["view_id"] in view_ids:
                     yield {name: row[name] for name in columns}
@@ -372,19 +369,15 @@ def rows_table(columns: Sequence[str], max_rows: int) -> Table:
         pa.schema([ROW_SCHEMA.field(name) for name in dict.fromkeys(columns)]),
         max_rows=max_rows,
         max_bytes=max_rows * len(columns) * CELL_BYTES.value(),
-        max_values={name: _VALUES.get(column_kind(name), 1) for name in columns},
+        max_values={name: math.prod(CAMERA_SHAPES.get(column_kind(name), ())) for name in columns},
     )
 
 
-def _shard_table(config: DatasetConfig, columns: Sequence[str]) -> Table:
-    return rows_table(columns, len(config.views))
-
-
 @contextmanager
-def _open_shard(config: DatasetConfig, shard: str, table: Table) -> Iterator[tuple[pq.ParquetFile, int]]:
+def _open_shard(config: DatasetConfig, shard: str, table: Table) -> Iterator[pq.ParquetFile]:
     try:
-        with config.open(shard) as stream, open_parquet(stream, table) as file_and_rows:
-            yield file_and_rows
+        with config.open(shard) as stream, open_parquet(stream, table) as file:
+            yield file
     except InputError:
         raise
     except Exception as error:  # pyarrow and the Hub's client raise many types, which depend on the damage.

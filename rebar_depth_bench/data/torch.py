@@ -19,9 +19,6 @@ from rebar_depth_bench.errors import DatasetError, InputError, MethodError, Prob
 
 Row = Mapping[str, Any]
 
-IMAGE_KINDS = ("rgb", "depth", "mask", "bars")
-"""Kinds of columns that hold an image of a view, H x W or H x W x 3."""
-
 _MIRROR_X = np.diag([-1.0, 1.0, 1.0, 1.0])
 FLIP_PROBABILITY = 0.5
 
@@ -104,7 +101,7 @@ def flip_row(row: Row) -> Row:
 
 def _mirrored(value: Any, kind: str, width: int) -> Any:
     """Return the value of a column of one eye for the mirrored image of ``width`` pixels."""
-    if kind in IMAGE_KINDS:
+    if kind in PICTURE_KINDS:
         return value[:, ::-1]
     if kind == "cam_from_world":
         return _MIRROR_X @ value
@@ -116,7 +113,7 @@ def _mirrored(value: Any, kind: str, width: int) -> Any:
 
 
 def _is_image(row: Row, name: str) -> bool:
-    return column_kind(name) in IMAGE_KINDS and row[name] is not None
+    return column_kind(name) in PICTURE_KINDS and row[name] is not None
 
 
 try:

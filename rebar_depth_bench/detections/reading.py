@@ -261,7 +261,7 @@ def _read_parquet(path: Path, problems: list[Problem]) -> RawDetections | None:
     optional = frozenset((VIEW_ID, *NUMBERS))
     table = Table(_SCHEMA, max_bytes // 32, max_bytes, optional=optional)
     try:
-        with open_regular(path) as stream, open_parquet(stream, table) as (file, rows):
+        with open_regular(path) as stream, open_parquet(stream, table) as file:
             names = file.schema_arrow.names
             if faults := column_problems(names):
                 problems += faults
@@ -278,7 +278,7 @@ def _read_parquet(path: Path, problems: list[Problem]) -> RawDetections | None:
         name: read[name].to_numpy(zero_copy_only=False).astype(np.float64) for name in columns if name != VIEW_ID
     }
     view_ids = ["" if view_id is None else view_id for view_id in read[VIEW_ID].to_pylist()]
-    return RawDetections(view_ids, numbers, range(1, rows + 1), metadata, "row")
+    return RawDetections(view_ids, numbers, range(1, len(view_ids) + 1), metadata, "row")
 
 
 def _parquet_metadata(stored: Mapping[bytes, bytes]) -> dict[str, str]:

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Float32, Float64, Int64
 from numpy import ndarray
 
 from rebar_depth_bench.data.manifest import DatasetConfig
-from rebar_depth_bench.data.rows import CAMERA_KINDS
+from rebar_depth_bench.data.schema import CAMERA_SHAPES
 from rebar_depth_bench.geometry.cameras import Camera
 from rebar_depth_bench.scoring.evaluation import View
 from rebar_depth_bench.scoring.metrics import is_valid_prediction, median_scale
@@ -36,7 +36,7 @@ MAX_PIXELS = 4000
 MIN_PIXELS = 50
 """Scored pixels that a view must have to be looked at."""
 
-COLUMNS = (*("left_depth", "left_mask", "right_depth", "right_mask"), *(f"left_{kind}" for kind in CAMERA_KINDS))
+COLUMNS = (*("left_depth", "left_mask", "right_depth", "right_mask"), *(f"left_{kind}" for kind in CAMERA_SHAPES))
 """Columns that are looked at."""
 
 

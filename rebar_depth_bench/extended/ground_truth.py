@@ -137,7 +137,6 @@ def load_steel_truth(
         return has_camera and has_counts and are_pixels_inside(view, config)
 
     content = CacheContent(
-        source=config.root,
         task=f"bars in the views of {config.name}",
         inputs=cache_inputs(config, EXTENDED_PROTOCOL, folder.files[BARS_FILE]),
         dtypes=_DTYPES,
@@ -162,7 +161,6 @@ def load_steel_truth(
     # An entry of its own: its arrays have other lengths, and it also depends on the definition of crossings.
     protocol = f"{EXTENDED_PROTOCOL} {CROSSINGS_PROTOCOL}"
     judged = CacheContent(
-        source=config.root,
         task=f"crossings in the views of {config.name}",
         inputs=cache_inputs(config, protocol, f"{folder.files[BARS_FILE]} {source.sha256}"),
         dtypes={"crossing": np.uint32, "pixel": np.uint32},

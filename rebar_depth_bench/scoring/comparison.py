@@ -96,9 +96,8 @@ def compare(first: Result, other: Result) -> Comparison:
             f"{first.method} has {', '.join(first.tables)} and {other.method} has {', '.join(other.tables)}: "
             "expected a config that is in both"
         )
-    archives = (first.submission, other.submission)
     return Comparison(
-        provenance=Provenance(PROTOCOL, first.dataset.digest, first.dataset.version, archives),
+        provenance=Provenance(PROTOCOL, first.dataset, (first.submission, other.submission)),
         configs={config: _config_differences(first, other, config) for config in shared},
     )
 

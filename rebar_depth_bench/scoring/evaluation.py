@@ -9,7 +9,7 @@ import os
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
@@ -19,7 +19,8 @@ from numpy import ndarray
 
 from rebar_depth_bench import software_version
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_folder
-from rebar_depth_bench.data.rows import CAMERA_KINDS, camera_from_row, decode_row
+from rebar_depth_bench.data.rows import camera_from_row, decode_row
+from rebar_depth_bench.data.schema import CAMERA_SHAPES
 from rebar_depth_bench.data.shards import encoded_rows
 from rebar_depth_bench.errors import SubmissionError
 from rebar_depth_bench.geometry.cameras import Camera
@@ -38,21 +39,19 @@ _Found = TypeVar("_Found")
 class Provenance:
     """Provenance of the numbers of a comparison, or of an analysis of archives.
 
-    ``protocol`` names the definitions of the numbers; changed definitions have a new name. ``dataset_digest`` and
-    ``dataset_version`` are None if the reference is not a dataset folder.
+    ``protocol`` names the definitions of the numbers; changed definitions have a new name. ``dataset`` is None if
+    the reference is not a dataset folder.
     """
 
     protocol: str
-    dataset_digest: str | None
-    dataset_version: str | None
+    dataset: DatasetIdentity | None
     archives: Sequence[SubmissionIdentity]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the provenance entries of a JSON object."""
-        dataset = {"digest": self.dataset_digest, "version": self.dataset_version}
         return {
             "protocol": self.protocol,
-            "dataset": dataset if self.dataset_digest is not None else None,
+            "dataset": None if self.dataset is None else asdict(self.dataset),
             "submissions": [{"method": archive.method, "sha256": archive.sha256} for archive in self.archives],
             "software": {"version": software_version()},
         }
@@ -86,20 +85,8 @@ class View:
 
     def camera(self, eye: str) -> Camera:
         """Return the camera of one eye."""
-        cells = {f"{eye}_{kind}": self.cell(f"{eye}_{kind}") for kind in CAMERA_KINDS}
+        cells = {f"{eye}_{kind}": self.cell(f"{eye}_{kind}") for kind in CAMERA_SHAPES}
         return camera_from_row(cells, eye, self.config.grid)
-
-
-def read_views(
-    config: DatasetConfig, columns: Sequence[str], positions: Collection[int], read_depth: ReadDepth
-) -> Iterator[View]:
-    """Yield the views at ``positions`` of a config, one at a time; only their rows are read.
-
-    Raises ``DatasetError`` for a damaged shard.
-    """
-    position_by_view = {config.view_ids[position]: position for position in positions}
-    for row in encoded_rows(config, ("view_id", *columns), position_by_view):
-        yield View(config, row["view_id"], position_by_view[row["view_id"]], row, read_depth)
 
 
 @dataclass(frozen=True)
@@ -134,8 +121,14 @@ class Evaluation:
         return found
 
     def views(self, config: DatasetConfig, columns: Sequence[str], positions: Collection[int]) -> Iterator[View]:
-        """Yield the views at ``positions`` of a config as ``read_views``."""
-        return read_views(config, columns, positions, self.submission.read)
+        """Yield the views at ``positions`` of a config, one at a time; only their rows are read.
+
+        Raises ``DatasetError`` for a damaged shard.
+        """
+        position_by_view = {config.view_ids[position]: position for position in positions}
+        for row in encoded_rows(config, ("view_id", *columns), position_by_view):
+            view_id = row["view_id"]
+            yield View(config, view_id, position_by_view[view_id], row, self.submission.read)
 
     def check_entries(self, progress: Progress = silent) -> None:
         """Decode every entry. Raises ``SubmissionError`` with all problems."""
@@ -146,7 +139,7 @@ class Evaluation:
     def provenance(self) -> Provenance:
         """Return the provenance of an analysis of the submission."""
         archive = SubmissionIdentity(self.meta.method, self.submission.sha256())
-        return Provenance(PROTOCOL, self.folder.digest, self.folder.version, [archive])
+        return Provenance(PROTOCOL, DatasetIdentity(self.folder.digest, self.folder.version), [archive])
 
 
 @contextmanager
@@ -160,7 +153,7 @@ def open_evaluation(
     """
     folder = open_folder(root, expect_digest=expect_digest)
     with SubmissionReader(archive, folder.expected_views()) as submission:
-        if submission.meta is None or submission.structure_problems:
+        if submission.structure_problems:
             raise SubmissionError.from_problems(archive, list(submission.problems()))
         yield Evaluation(folder, submission)
 

@@ -50,16 +50,14 @@ class Grouping:
     order: tuple[str, ...] = ()
 
 
-def bin_names(edges: Sequence[float], unit: str) -> tuple[str, ...]:
-    """Return the names of the bins between ``edges``, such as ``0.5-1 m``; the last bin is ``4+ m``."""
-    return tuple(f"{low:g}{f'-{high:g}' if math.isfinite(high) else '+'} {unit}" for low, high in pairwise(edges))
-
-
 def _bins(
     title: str, definition: str, value_of: Callable[[ViewTraits], float | None], edges: Sequence[float], unit: str
 ) -> Grouping:
-    """Return the grouping by the bin of a value; views without one belong to no group."""
-    names = bin_names(edges, unit)
+    """Return the grouping by the bin of a value, such as ``0.5-1 m`` or, for the last one, ``4+ m``.
+
+    Views without a value belong to no group.
+    """
+    names = tuple(f"{low:g}{f'-{high:g}' if math.isfinite(high) else '+'} {unit}" for low, high in pairwise(edges))
 
     def group_of(view: ViewTraits) -> str | None:
         value = value_of(view)

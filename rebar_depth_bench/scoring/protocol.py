@@ -41,7 +41,9 @@ def single_bar_pixels(bars: UInt16[ndarray, "h w"], pixels: UInt32[ndarray, " n"
     """Return which of the scored pixels belong to one bar with their whole 3 x 3 neighbourhood.
 
     ``bars`` holds bar ids and ``pixels`` flat indices, which are never at the border of the image. Extended
-    measures call these pixels the single-bar interior; all other metrics use all scored pixels.
+    measures call these pixels the single-bar interior; all other metrics use all scored pixels. These erode the
+    union of all bars: where bars lie side by side in the image, a scored pixel can have another bar beside it, at
+    another depth, and a prediction that is exact but shifted by one pixel has a large error there.
     """
     width, flat = bars.shape[1], bars.ravel()
     centre = pixels.astype(np.intp)

@@ -151,19 +151,18 @@ def score_view(truth: ViewTruth, prediction_m: Float[ndarray, "h w"]) -> ViewSco
 
 def tabulate_config(scores: Sequence[ViewScore], truth: Truth, declared: Declaration) -> Table:
     """Return the table of a config, with the tables of groups of its views if it has splits."""
-    reference = mean_reference(truth.references)
-    table = tabulate(scores, declared, reference, truth.published, truth.split, truth.truth_sigma_m)
+
+    def table_of(positions: Sequence[int]) -> Table:
+        views = [scores[position] for position in positions]
+        reference = mean_reference([truth.references[position] for position in positions])
+        return tabulate(views, declared, reference, truth.published, truth.split, truth.truth_sigma_m)
+
+    table = table_of(range(len(scores)))
     if truth.split is None:
         return table
-
-    def of_group(positions: Sequence[int]) -> Table:
-        reference = mean_reference([truth.references[position] for position in positions])
-        group = [scores[position] for position in positions]
-        return tabulate(group, declared, reference, None, truth.split, truth.truth_sigma_m)
-
     groups = {
         key: {
-            group: of_group(positions) for group, positions in positions_by_group(grouping, truth.traits).items()
+            group: table_of(positions) for group, positions in positions_by_group(grouping, truth.traits).items()
         }
         for key, grouping in GROUPINGS.items()
     }
@@ -207,9 +206,3 @@ def tabulate(
         truth_sigma_m=truth_sigma_m,
         intervals=view_intervals(views, by_scene=split is not None) if views else dict.fromkeys(COLUMN_BY_PATH),
     )
-
-
-# Single-bar interior: scored pixels whose 3 x 3 neighbourhood belongs to one bar. The interior of the protocol
-# erodes the union of all bars. Where bars lie side by side in the image, a scored pixel can therefore have another
-# bar beside it, at another depth; a prediction that is exact but shifted by one pixel has a large error there.
-# Errors on the single-bar interior contain no such steps.

@@ -49,7 +49,6 @@ def config_truth(folder: DatasetFolder, config: DatasetConfig, progress: Progres
         return has_counts and len(view.numbers) == _REFERENCE.stop + has_widths and are_pixels_inside(view, config)
 
     content = CacheContent(
-        source=config.root,
         task=f"ground truth of {config.name}",
         inputs=cache_inputs(config, PROTOCOL, folder.files[BARS_FILE] if has_widths else ""),
         dtypes={"index": np.uint32, "depth_m": np.float32},
@@ -70,7 +69,7 @@ def config_truth(folder: DatasetFolder, config: DatasetConfig, progress: Progres
         references=references,
         traits=traits,
         split=config.scenes[0].split if config.has_splits else None,
-        truth_sigma_m=config.truth_sigma_m,
+        truth_sigma_m=None if config.imported is None else config.imported.truth_sigma_m,
         published=published_match(config),
     )
 

@@ -142,7 +142,7 @@ def _inner_error(name: str, problems: Sequence[Problem]) -> EntryError:
 
 _EXR_MAGIC = b"\x76\x2f\x31\x01"
 _TILED, _LONG_NAMES, _DEEP, _MULTI_PART = 0x200, 0x400, 0x800, 0x1000
-_MAX_HEADER_BYTES = 256 * 1024
+_MAX_EXR_HEADER_BYTES = 256 * 1024
 _MAX_NAME_BYTES = 255
 _PIXEL_TYPES = {0: "UINT", 1: "HALF", 2: "FLOAT"}
 _MAX_TILE_PX = 1024
@@ -154,7 +154,7 @@ def max_exr_bytes(shape: tuple[int, int]) -> int:
     The bound allows uncompressed FLOAT values, an eight-byte offset and an eight-byte block header per scan line,
     and the file header.
     """
-    return shape[0] * shape[1] * 4 + shape[0] * 16 + _MAX_HEADER_BYTES
+    return shape[0] * shape[1] * 4 + shape[0] * 16 + _MAX_EXR_HEADER_BYTES
 
 
 def decode_exr(name: str, data: memoryview, shape: tuple[int, int], _: float = 1.0) -> Depth:
@@ -180,7 +180,7 @@ def decode_exr(name: str, data: memoryview, shape: tuple[int, int], _: float = 1
 
 
 def _check_exr_header(name: str, data: memoryview, shape: tuple[int, int]) -> None:
-    head = bytes(data[:_MAX_HEADER_BYTES])
+    head = bytes(data[:_MAX_EXR_HEADER_BYTES])
     if len(head) < 8 or not head.startswith(_EXR_MAGIC):
         raise EntryError(Problem("syntax", name, f"the bytes start with {head[:8]!r}", "an OpenEXR file"))
     flags = int.from_bytes(head[4:8], "little")

@@ -25,7 +25,7 @@ from rebar_depth_bench.data.cache import (
     entries,
     open_cache,
 )
-from rebar_depth_bench.errors import DatasetError, InputError
+from rebar_depth_bench.errors import InputError
 
 DTYPES = {"index": np.uint32, "inside": np.bool_}
 COUNT = 4
@@ -49,7 +49,6 @@ def content(
     inputs: Any = "a",
 ) -> CacheContent:
     return CacheContent(
-        source="dataset",
         task="ground truth",
         inputs={"digest": inputs},
         dtypes=DTYPES,
@@ -190,23 +189,6 @@ def test_entry_truncated_while_open_is_read_from_the_dataset(folder: Path, size:
     cache = open_cache(content())
     os.truncate(only_file(folder), size)
     assert indices(cache) == EXPECTED
-
-
-def test_missing_views_raise_dataset_error(folder: Path) -> None:
-    extractions = iter([views(), iter(())])
-    cache = open_cache(content(lambda _: next(extractions)))
-    flip(only_file(folder), 0)
-    with pytest.raises(DatasetError, match="dataset: the ground truth of view lattice/0003 is missing"):
-        cache.view(COUNT - 1)
-
-
-def test_values_out_of_range_raise_dataset_error(folder: Path) -> None:
-    def extract(_: Collection[str] | None) -> Iterator[ViewArrays]:
-        yield ViewArrays("lattice/0000", {"index": np.array([100]), "inside": np.array([True])}, ())
-
-    with pytest.raises(DatasetError, match="dataset: the ground truth of view lattice/0000 is out of range"):
-        open_cache(content(extract, count=1))
-    assert [*folder.iterdir()] == []
 
 
 def test_failed_extraction_leaves_no_file(folder: Path) -> None:

@@ -246,7 +246,7 @@ def test_survey_is_a_trajectory(manifest: Any, tmp_path: Path) -> None:
         ),
         (lambda _, config: config.update(name="pile"), "conflict", "configs.lattice.name"),
         (lambda _, config: scene_of(config).update(shards=[]), "invalid", f"{SCENE} shards"),
-        (lambda _, config: scene_of(config)["shards"].append(FIRST_SHARD), "duplicate", f"{SCENE} shards"),
+        (lambda _, config: scene_of(config)["shards"].append(FIRST_SHARD), "duplicate", "configs.lattice.scenes"),
         (lambda _, config: config.update(views=[]), "invalid", "configs.lattice.views"),
         (lambda _, config: scene_of(config).update(mesh="meshes/other.ply"), "conflict", ORBIT_SCENES),
         *(

@@ -33,7 +33,7 @@ from rebar_depth_bench.diagnosis.corrections import (
 from rebar_depth_bench.diagnosis.diagnose import diagnose
 from rebar_depth_bench.methods import own_methods
 from rebar_depth_bench.methods.run import predict
-from rebar_depth_bench.scoring.evaluation import open_evaluation, read_views
+from rebar_depth_bench.scoring.evaluation import open_evaluation
 from tests.commands import run_in_process
 from tests.synthetic_dataset import write_dataset
 
@@ -207,7 +207,9 @@ def test_report_of_a_sound_submission_has_no_section_of_mistakes(
     assert "mistake" not in page.read_text()
 
 
-def test_at_most_eight_evenly_spaced_views_with_steel_are_read(tmp_path: Path) -> None:
+def test_at_most_eight_evenly_spaced_views_with_steel_are_read(
+    tmp_path: Path, archive_of: Callable[..., Path]
+) -> None:
     root = tmp_path / "dataset"
     write_dataset(root, ["lattice"], 30)
     config = open_folder(root).config("lattice")
@@ -215,10 +217,9 @@ def test_at_most_eight_evenly_spaced_views_with_steel_are_read(tmp_path: Path) -
     assert len(positions) == MAX_VIEWS
     assert set(np.diff(positions)) <= {3, 4}
 
-    def read(view_id: str) -> np.ndarray:
-        return np.full((90, 160), float(view_id[-4:]))
-
-    views = [diagnosed_view(view) for view in read_views(config, COLUMNS, positions, read)]
+    archive = archive_of({view_id: np.full((90, 160), float(view_id[-4:])) for view_id in config.view_ids})
+    with open_evaluation(archive, root) as evaluation:
+        views = [diagnosed_view(view) for view in evaluation.views(config, COLUMNS, positions)]
     assert [view.position for view in views] == positions
     assert all((view.prediction == view.position).all() for view in views)
 

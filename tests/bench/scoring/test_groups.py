@@ -27,7 +27,6 @@ from rebar_depth_bench.scoring.groups import (
     WIDTH_EDGES_PX,
     ViewTraits,
     bar_width_px,
-    bin_names,
     positions_by_group,
 )
 from rebar_depth_bench.scoring.result import Result, disclosed_json, read_result
@@ -292,10 +291,10 @@ def test_groups_are_a_partition_of_the_views_that_have_the_property(views: list[
         assert list(groups) == (known or sorted(groups))
 
 
-@pytest.mark.parametrize(("edges", "unit"), [(DISTANCE_EDGES_M, "m"), (WIDTH_EDGES_PX, "px")])
-def test_bins_include_their_lower_edge(edges: tuple[float, ...], unit: str) -> None:
-    names = bin_names(edges, unit)
-    grouping = GROUPINGS["distance" if unit == "m" else "bar_width"]
+@pytest.mark.parametrize(("key", "edges"), [("distance", DISTANCE_EDGES_M), ("bar_width", WIDTH_EDGES_PX)])
+def test_bins_include_their_lower_edge(key: str, edges: tuple[float, ...]) -> None:
+    grouping = GROUPINGS[key]
+    names = grouping.order
     for name, edge in zip(names[1:], edges[1:-1], strict=True):
         below = math.nextafter(edge, 0)
         at, before = (grouping.group_of(ViewTraits("wall", value, value)) for value in (edge, below))
