@@ -49,7 +49,7 @@ METHODS: Mapping[str, AnyMethod] = _BuiltIn(
         "sgbm": "rebar_depth_bench.methods.sgbm:SGBM",
         "sgbm-filled": "rebar_depth_bench.methods.sgbm:SGBM_FILLED",
         "foundation-stereo": "rebar_depth_bench.methods.paper.foundation_stereo:FOUNDATION_STEREO",
-        "depth-pro": "rebar_depth_bench.methods.transformers.model:DEPTH_PRO",
+        "depth-pro": "rebar_depth_bench.methods.transformers:DEPTH_PRO",
         "metric3d": "rebar_depth_bench.methods.paper.monocular:METRIC3D",
         "unidepth": "rebar_depth_bench.methods.paper.monocular:UNIDEPTH",
         "depth-anything-3": "rebar_depth_bench.methods.paper.monocular:DEPTH_ANYTHING_3",
@@ -86,7 +86,7 @@ def find_method(name: str, *, view_timeout_s: float = VIEW_TIMEOUT_S, nearest_m:
 
         return foundation_stereo_method(Path(folder).expanduser(), nearest_m)
     if name.startswith(_HF_PREFIX):
-        from rebar_depth_bench.methods.transformers.model import hf_method
+        from rebar_depth_bench.methods.transformers import hf_method
 
         return hf_method(name.removeprefix(_HF_PREFIX))
     if folder and method_name in FROM_FOLDER:
@@ -117,7 +117,7 @@ def _with_weights(name: str, folder: Path | None) -> AnyMethod:
     """Return a built-in method, with the weights in a folder, or None: in a cache, if it needs any."""
     method = METHODS[name]
     if name == "depth-pro":
-        from rebar_depth_bench.methods.transformers.model import depth_pro_method
+        from rebar_depth_bench.methods.transformers import depth_pro_method
 
         return depth_pro_method()
     return method.with_weights(folder) if isinstance(method, WeightsMethod) else method

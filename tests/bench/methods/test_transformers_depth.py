@@ -21,7 +21,7 @@ from rebar_depth_bench import score
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods import METHODS, find_method
-from rebar_depth_bench.methods.transformers.model import (
+from rebar_depth_bench.methods.transformers import (
     FAMILIES,
     OutputKind,
     depth_pro_preprocessing,

@@ -12,11 +12,11 @@ from jaxtyping import Float64, UInt8
 from numpy import ndarray
 
 from rebar_depth_bench.geometry.cameras import ideal_K, look_at, pixel_rays
-from rebar_depth_bench.methods.multiview.dense import consistency_mask
-from rebar_depth_bench.methods.multiview.plane_sweep import (
+from rebar_depth_bench.methods.multiview.dense import (
     MIN_PLANES,
     STEP_PX,
     PosedImage,
+    consistency_mask,
     inverse_depths,
     sweep_depth,
 )
