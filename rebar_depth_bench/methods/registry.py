@@ -29,7 +29,6 @@ from rebar_depth_bench.methods.base import VIEW_TIMEOUT_S, AnyMethod, Method, Mu
 ENTRY_POINT_GROUP = "rebar_depth_bench.methods"
 DISTRIBUTION = "rebar-depth-bench"
 _DIGEST_CHARACTERS = 16
-_HF_PREFIX = "hf:"
 
 FROM_FOLDER = ("depth-anything-3", "foundation-stereo", "metric3d", "unidepth")
 """Names of the methods that take a folder: ``NAME:FOLDER``."""
@@ -78,17 +77,17 @@ def find_method(name: str, *, view_timeout_s: float = VIEW_TIMEOUT_S, nearest_m:
     Raises ``MethodError`` if the name is unknown, if a file or package cannot be imported or holds no method, or
     if ``nearest_m`` is given to another method.
     """
-    method_name, _, folder = name.partition(":")
+    method_name, colon, folder = name.partition(":")
     if nearest_m is not None:
         if method_name != "foundation-stereo" or not folder:
             raise MethodError(f"{name}: has no nearest distance, expected foundation-stereo:FOLDER")
         from rebar_depth_bench.methods.paper.foundation_stereo import foundation_stereo_method
 
         return foundation_stereo_method(Path(folder).expanduser(), nearest_m)
-    if name.startswith(_HF_PREFIX):
+    if method_name == "hf" and colon:
         from rebar_depth_bench.methods.transformers import hf_method
 
-        return hf_method(name.removeprefix(_HF_PREFIX))
+        return hf_method(folder)
     if folder and method_name in FROM_FOLDER:
         return _with_weights(method_name, Path(folder).expanduser())
     path, colon, attribute = name.rpartition(":")

@@ -26,7 +26,7 @@ from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.data.rows import Views
 from rebar_depth_bench.errors import DatasetError, InputError, MethodError, RebarDepthError, escape_text
 from rebar_depth_bench.methods import AnyMethod, ConfigViews, Method, MultiViewMethod, Predictor, Prepared
-from rebar_depth_bench.methods.base import input_class
+from rebar_depth_bench.methods.base import import_optional, input_class
 from rebar_depth_bench.methods.kept_views import KeptViews, PreparationReport
 from rebar_depth_bench.methods.sgbm import STEREO_COLUMNS
 from rebar_depth_bench.names import TEST_SPLIT
@@ -277,12 +277,7 @@ def rectifying_predictor(predictor: Predictor, columns: Sequence[str]) -> tuple[
             f"the images are not rectified: the method needs {', '.join(others)}, expected columns among "
             f"{', '.join(sorted(_RECTIFIED_COLUMNS))}, or left_distortion if it rectifies them itself"
         )
-    try:
-        import cv2  # noqa: F401
-    except ImportError as error:
-        raise MethodError(
-            f"the images are not rectified, which needs OpenCV ({error}): pip install 'rebar-depth-bench[methods]'"
-        ) from None
+    import_optional("cv2", "the images are not rectified, which needs OpenCV", "methods")
     is_stereo = any(name.startswith("right_") or name == "baseline_m" for name in columns)
 
     def predict_raw(row: Mapping[str, Any]) -> Float[ndarray, "h w"]:

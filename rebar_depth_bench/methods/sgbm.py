@@ -18,8 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 from numpy import ndarray
 
-from rebar_depth_bench.errors import MethodError
-from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
+from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor, import_optional
 
 if TYPE_CHECKING:
     from rebar_depth_bench.geometry.rectification import RectifiedPair
@@ -138,13 +137,8 @@ A bar and its background differ by far more.
 
 
 def _load(*, check_consistency: bool) -> Predictor:
-    try:
-        import cv2.ximgproc  # noqa: F401
-    except ImportError as error:
-        raise MethodError(
-            f"sgbm needs OpenCV with ximgproc ({error}): pip install 'rebar-depth-bench[methods]', in an "
-            "environment without opencv-python, which hides it"
-        ) from None
+    need = "sgbm needs OpenCV with ximgproc, in an environment without opencv-python, which hides it"
+    import_optional("cv2.ximgproc", need, "methods")
 
     def match(images: StereoImages) -> Float32[ndarray, "h w"]:
         left_px, right_px = filtered_disparities_px(images.left_rgb, images.right_rgb)

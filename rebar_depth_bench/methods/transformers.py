@@ -28,12 +28,15 @@ from numpy import ndarray
 
 from rebar_depth_bench.data.files import files_digest
 from rebar_depth_bench.errors import MethodError
-from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
+from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor, positive_or_nan
 from rebar_depth_bench.methods.paper.third_party import (
+    CONFIG,
     Network,
     hub_download,
+    image_tensor,
     local_copy_hint,
     read_json_object,
+    resampled,
     snapshot,
     torch_device,
 )
@@ -45,7 +48,7 @@ if TYPE_CHECKING:
 
 PREFIX = "hf"
 """What the names of these methods begin with, before a colon."""
-CONFIG, PREPROCESSOR = "config.json", "preprocessor_config.json"
+PREPROCESSOR = "preprocessor_config.json"
 _REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
 _WEIGHTS = ("*.safetensors", "*.bin")
 """File patterns of weights in order of preference; a checkpoint with both kinds holds the same weights twice."""
@@ -138,7 +141,6 @@ def _fetch_weights(repository: str, commit: str) -> None:
         snapshot_download(repository, revision=commit, allow_patterns=file_names)
 
 
-HF_PREFIX = f"{PREFIX}:"
 _INSTALL = "pip install 'rebar-depth-bench[models]'"
 DEPTH_PRO_CHECKPOINT = "apple/DepthPro-hf"
 INVERSE_DEPTH_BOUNDS_PER_M = (1e-4, 1e4)
@@ -191,7 +193,7 @@ def hf_method(name_or_path: str) -> Method:
         )
     output = output_kind(checkpoint.config)
     info = MethodInfo(
-        name=f"{HF_PREFIX}{checkpoint.name}",
+        name=f"{PREFIX}:{checkpoint.name}",
         summary=f"{family} from one picture: {output.value}; weights {checkpoint.version}",
         columns=("left_rgb", "left_K") if output is OutputKind.CANONICAL else ("left_rgb",),
         uses_intrinsics=output is OutputKind.CANONICAL,
@@ -262,8 +264,8 @@ def network_output_to_depth_m(
             assert K is not None
             inverse_per_m = values.astype(np.float64) * (values.shape[1] / K[0, 0])
             values = np.clip(inverse_per_m, *INVERSE_DEPTH_BOUNDS_PER_M)
-        z_m = (values if output is OutputKind.METRES else 1 / values).astype(np.float32)
-    return np.where(np.isfinite(z_m) & (z_m > 0), z_m, np.float32(np.nan))
+        z_m = values if output is OutputKind.METRES else 1 / values
+    return positive_or_nan(z_m)
 
 
 def _load_predictor(network: Network, checkpoint: Checkpoint, output: OutputKind) -> Predictor:
@@ -271,7 +273,8 @@ def _load_predictor(network: Network, checkpoint: Checkpoint, output: OutputKind
 
     Raises ``MethodError`` if torch, ``transformers`` or weights are missing, or if the weights are incomplete.
     """
-    torch, transformers = (network.import_package(name, _INSTALL) for name in ("torch", "transformers"))
+    network.import_package("torch", _INSTALL)
+    transformers = network.import_package("transformers", _INSTALL)
     ensure_weights(checkpoint)
     model_type, settings = checkpoint.config["model_type"], read_settings(checkpoint.folder / PREPROCESSOR)
     with network.errors("cannot be loaded"):
@@ -282,15 +285,14 @@ def _load_predictor(network: Network, checkpoint: Checkpoint, output: OutputKind
             to_network_input = library_preprocessing(processor)
         model = _load_network(transformers, checkpoint).to(torch_device())
 
-    def predict(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
+    def infer(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
         rgb = row["left_rgb"]
-        with torch.inference_mode():
-            network_output = model(pixel_values=to_network_input(rgb).to(model.device))
-            network_output.predicted_depth = network_output.predicted_depth.float().cpu()
-            values = to_left_grid(model_type, processor, network_output, rgb.shape[:2])
+        network_output = model(pixel_values=to_network_input(rgb).to(model.device))
+        network_output.predicted_depth = network_output.predicted_depth.float().cpu()
+        values = to_left_grid(model_type, processor, network_output, rgb.shape[:2])
         return network_output_to_depth_m(output, np.asarray(values.numpy()), row.get("left_K"))
 
-    return predict
+    return network.predictor(infer)
 
 
 ToNetworkInput = Callable[[UInt8[ndarray, "H W 3"]], "Float[Tensor, '1 3 h w']"]
@@ -309,11 +311,9 @@ def depth_pro_preprocessing(settings: Mapping[str, Any]) -> ToNetworkInput:
     scale = settings.get("rescale_factor", 1 / 255)
 
     def to_network_input(rgb: UInt8[ndarray, "H W 3"]) -> Float[Tensor, "1 3 h w"]:
-        import torch
         from torch.nn import functional
 
-        normal = (rgb * np.float64(scale) - np.asarray(mean)) / np.asarray(std)
-        planes = torch.from_numpy(normal.astype(np.float32).transpose(2, 0, 1).copy())[None]
+        planes = image_tensor((rgb * np.float64(scale) - np.asarray(mean)) / np.asarray(std)).contiguous()
         target = (size["height"], size["width"])
         return functional.interpolate(planes, size=target, mode="bilinear", align_corners=False)
 
@@ -339,24 +339,14 @@ def to_left_grid(
     """
     raw_depth = network_output.predicted_depth[0]
     if model_type == "depth_pro":
-        return resized(raw_depth, grid, "bilinear")
+        return resampled(raw_depth, grid, "bilinear")
     if model_type == "zoedepth":
         top, left = (int(ZOE_PADDING_FACTOR * np.sqrt(side / 2)) if processor.do_pad else 0 for side in grid)
-        padded = resized(raw_depth, (grid[0] + 2 * top, grid[1] + 2 * left), "bicubic")
+        padded = resampled(raw_depth, (grid[0] + 2 * top, grid[1] + 2 * left), "bicubic")
         return padded[top : top + grid[0], left : left + grid[1]]
     [processed] = processor.post_process_depth_estimation(network_output, target_sizes=[grid])
     depth: Tensor = processed["predicted_depth"]
     return depth
-
-
-def resized(values: Float[Tensor, "h w"], grid: tuple[int, int], mode: str) -> Float[Tensor, "H W"]:
-    """Return values resampled to another grid over the same field of view (``align_corners=False``).
-
-    ``mode`` is the interpolation mode of torch.
-    """
-    from torch.nn import functional
-
-    return functional.interpolate(values[None, None], size=grid, mode=mode, align_corners=False)[0, 0]
 
 
 def _load_network(transformers: Any, checkpoint: Checkpoint) -> Any:

@@ -22,7 +22,14 @@ from PIL import Image
 from rebar_depth_bench.data.files import files_digest
 from rebar_depth_bench.errors import MethodError, Problem
 from rebar_depth_bench.limits import ONNX_MEMORY_BYTES, DeadlineError, call_within
-from rebar_depth_bench.methods.base import VIEW_TIMEOUT_S, Method, MethodInfo, Predictor
+from rebar_depth_bench.methods.base import (
+    VIEW_TIMEOUT_S,
+    Method,
+    MethodInfo,
+    Predictor,
+    import_optional,
+    positive_or_nan,
+)
 from rebar_depth_bench.methods.onnx.external_data import external_files
 from rebar_depth_bench.methods.onnx.spec import OUTPUT_MEANINGS, InputSpec, OnnxSpec, OutputSpec, read_onnx_toml
 
@@ -186,10 +193,8 @@ def output_to_depth_m(
     scaled = np.asarray(values, np.float64) * output.scale
     with np.errstate(all="ignore"):
         depth_m = np.asarray(factor / scaled if meaning.inverse else factor * scaled)
-        single = depth_m.astype(np.float32)
-    valid = np.isfinite(scaled) & np.isfinite(single) & (single > 0)
-    valid &= (depth_m >= output.min_m) & (depth_m <= output.max_m)
-    return np.where(valid, single, np.float32(np.nan))
+    valid = np.isfinite(scaled) & (depth_m >= output.min_m) & (depth_m <= output.max_m)
+    return positive_or_nan(np.where(valid, depth_m, np.nan))
 
 
 def _load(spec: OnnxSpec, view_timeout_s: float) -> Predictor:
@@ -294,12 +299,7 @@ def open_session(path: Path, input_spec: InputSpec, output_spec: OutputSpec, tim
     ``timeout_s`` limits opening, where onnxruntime computes constants, and each inference. Raises ``MethodError``
     if onnxruntime is missing or cannot open the file, or if input or output do not match.
     """
-    try:
-        import onnxruntime
-    except ImportError as error:
-        raise MethodError(
-            f"an ONNX model needs onnxruntime ({error}): pip install 'rebar-depth-bench[onnx]'"
-        ) from None
+    onnxruntime = import_optional("onnxruntime", "an ONNX model needs onnxruntime", "onnx")
     onnxruntime.set_default_logger_severity(_LOG_ERRORS_ONLY)
     options = onnxruntime.SessionOptions()
     options.log_severity_level = _LOG_ERRORS_ONLY

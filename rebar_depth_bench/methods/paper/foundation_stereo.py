@@ -35,14 +35,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32
 from numpy import ndarray
 
 from rebar_depth_bench.captures.documents import parse_document
 from rebar_depth_bench.errors import MethodError, Problem
 from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
-from rebar_depth_bench.methods.paper.third_party import Network, image_tensor, on_sys_path, torch_device
+from rebar_depth_bench.methods.paper.third_party import (
+    Network,
+    image_tensor,
+    on_sys_path,
+    scaled_image,
+    torch_device,
+)
 from rebar_depth_bench.methods.sgbm import (
     SEARCH_SHARE_OF_WIDTH,
     STEREO_COLUMNS,
@@ -145,8 +151,10 @@ def _load(clone: Path, weights: Path, nearest_m: float | None) -> Predictor:
 
     def match(images: StereoImages) -> Float32[ndarray, "h w"]:
         is_hierarchical, scale = choose_passes(largest_disparity_px(images, nearest_m), settings.max_disp)
+        # The demo rounds to the nearest whole side; rounding down never enlarges the disparity.
         pair = [
-            image_tensor(resized(rgb, scale)).to(torch_device()) for rgb in (images.left_rgb, images.right_rgb)
+            image_tensor(scaled_image(rgb, scale)).to(torch_device())
+            for rgb in (images.left_rgb, images.right_rgb)
         ]
         padder = code.InputPadder(pair[0].shape, divis_by=32, force_square=False)
         with torch.autocast("cuda", enabled=torch.cuda.is_available()):
@@ -204,17 +212,6 @@ def choose_passes(largest_px: float, volume_px: int) -> tuple[bool, float]:
     if largest_px <= volume_px:
         return False, 1.0
     return True, min(1.0, volume_px / (SMALL_RATIO * largest_px))
-
-
-def resized(rgb: UInt8[ndarray, "h w 3"], scale: float) -> UInt8[ndarray, "hs ws 3"]:
-    """Return an image resized by ``scale`` with OpenCV, bilinear as in the demo; sides are rounded down.
-
-    The demo rounds to the nearest whole side; rounding down never enlarges the disparity.
-    """
-    import cv2
-
-    height, width = (max(1, int(side * scale)) for side in rgb.shape[:2])
-    return np.asarray(cv2.resize(rgb, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
 
 
 def full_size_disparity_px(

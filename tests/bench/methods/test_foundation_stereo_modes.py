@@ -26,8 +26,8 @@ from rebar_depth_bench.methods.paper.foundation_stereo import (
     SMALL_RATIO,
     choose_passes,
     full_size_disparity_px,
-    resized,
 )
+from rebar_depth_bench.methods.paper.third_party import scaled_image
 from rebar_depth_bench.methods.sgbm import largest_disparity_px, rectified_images
 from tests.bench.methods import stand_in_models as stand_ins
 from tests.bench.methods.predictors import load_predictor
@@ -131,7 +131,7 @@ def test_raw_pair_counts_in_pixels_of_rectified_images(tmp_path: Path) -> None:
 def test_disparity_returns_to_full_size_in_place(grid: tuple[int, int], scale: float) -> None:
     """A disparity that grows over columns and rows is at most half a pixel of the smaller image away."""
     rows, columns = np.mgrid[: grid[0], : grid[1]].astype(np.float64)
-    small = resized(np.zeros((*grid, 3), np.uint8), scale).shape[:2]
+    small = scaled_image(np.zeros((*grid, 3), np.uint8), scale).shape[:2]
     row_step, column_step = grid[0] / small[0], grid[1] / small[1]
     small_rows, small_columns = np.mgrid[: small[0], : small[1]]
     seen = ((small_rows + 0.5) * row_step + 2 * (small_columns + 0.5) * column_step - 1.5) / column_step
