@@ -28,7 +28,7 @@ from rebar_depth_bench.errors import DatasetError, InputError, MethodError, Reba
 from rebar_depth_bench.methods import AnyMethod, ConfigViews, Method, MultiViewMethod, Predictor, Prepared
 from rebar_depth_bench.methods.base import import_optional, input_class
 from rebar_depth_bench.methods.kept_views import KeptViews, PreparationReport
-from rebar_depth_bench.methods.sgbm import STEREO_COLUMNS
+from rebar_depth_bench.methods.sgbm import RECTIFIED_COLUMNS, STEREO_COLUMNS, pair_row
 from rebar_depth_bench.names import TEST_SPLIT
 from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.submission import SubmissionWriter
@@ -262,8 +262,6 @@ def _write_archive(
 # interpolation. Multi-view methods, and those that read ``left_distortion``, do this themselves.
 
 _MONO_COLUMNS = ("left_rgb", "left_K", "left_distortion")
-_RECTIFIED_COLUMNS = frozenset(("left_rgb", "right_rgb", "left_K", "right_K", "right_distortion", "baseline_m"))
-"""Columns of a rectified row. The poses of a rectified pair are not among them."""
 
 
 def rectifying_predictor(predictor: Predictor, columns: Sequence[str]) -> tuple[Predictor, tuple[str, ...]]:
@@ -272,10 +270,10 @@ def rectifying_predictor(predictor: Predictor, columns: Sequence[str]) -> tuple[
     ``columns`` are those that ``predictor`` reads. Raises ``MethodError`` if a rectified row lacks one of them,
     and if OpenCV is missing.
     """
-    if others := sorted(set(columns) - _RECTIFIED_COLUMNS):
+    if others := sorted(set(columns) - RECTIFIED_COLUMNS):
         raise MethodError(
             f"the images are not rectified: the method needs {', '.join(others)}, expected columns among "
-            f"{', '.join(sorted(_RECTIFIED_COLUMNS))}, or left_distortion if it rectifies them itself"
+            f"{', '.join(sorted(RECTIFIED_COLUMNS))}, or left_distortion if it rectifies them itself"
         )
     import_optional("cv2", "the images are not rectified, which needs OpenCV", "methods")
     is_stereo = any(name.startswith("right_") or name == "baseline_m" for name in columns)
@@ -294,15 +292,7 @@ def _rectified_pair(row: Mapping[str, Any]) -> tuple[dict[str, Any], Callable[[A
     from rebar_depth_bench.geometry.rectification import raw_depth_m, rectified_pair
 
     pair = rectified_pair(row)
-    cells = {
-        "left_rgb": pair.left_rgb,
-        "right_rgb": pair.right_rgb,
-        "left_K": pair.K,
-        "right_K": pair.K,
-        "right_distortion": np.zeros(5),
-        "baseline_m": pair.baseline_m,
-    }
-    return cells, partial(raw_depth_m, pair)
+    return pair_row(pair), partial(raw_depth_m, pair)
 
 
 def _undistorted_left(row: Mapping[str, Any]) -> tuple[dict[str, Any], Callable[[Any], Any]]:

@@ -19,7 +19,6 @@ from jaxtyping import Float, Float32, Float64, UInt8
 from numpy import ndarray
 from PIL import Image
 
-from rebar_depth_bench.data.files import files_digest
 from rebar_depth_bench.errors import MethodError, Problem
 from rebar_depth_bench.limits import ONNX_MEMORY_BYTES, DeadlineError, call_within
 from rebar_depth_bench.methods.base import (
@@ -30,7 +29,7 @@ from rebar_depth_bench.methods.base import (
     import_optional,
     positive_or_nan,
 )
-from rebar_depth_bench.methods.onnx.external_data import external_files
+from rebar_depth_bench.methods.onnx.external_data import model_digest
 from rebar_depth_bench.methods.onnx.spec import OUTPUT_MEANINGS, InputSpec, OnnxSpec, OutputSpec, read_onnx_toml
 
 
@@ -57,12 +56,8 @@ class AxisPlacement:
         return slice(self.pad_before_px, self.pad_before_px + self.resized_px)
 
 
-@dataclass(frozen=True)
-class Placement:
-    """Placement of an image in the model input: ``across`` is the x axis, ``down`` the y axis."""
-
-    across: AxisPlacement
-    down: AxisPlacement
+Placement = tuple[AxisPlacement, AxisPlacement]
+"""Placement of an image in the model input, along the x axis (across) and along the y axis (down)."""
 
 
 def place_image(spec: InputSpec, width: int, height: int) -> Placement:
@@ -77,11 +72,12 @@ def place_image(spec: InputSpec, width: int, height: int) -> Placement:
         across, down = (max(round(side * ratio / multiple_px), 1) * multiple_px for side in (width, height))
         canvas = (across, down)
     ratio = min(canvas[0] / width, canvas[1] / height)
-    axes = []
-    for side, canvas_side in zip((width, height), canvas, strict=True):
+
+    def along(side: int, canvas_side: int) -> AxisPlacement:
         fitted = min(max(round(side * ratio), 1), canvas_side)
-        axes.append(AxisPlacement(side, fitted if spec.resize == "pad" else canvas_side, canvas_side))
-    return Placement(*axes)
+        return AxisPlacement(side, fitted if spec.resize == "pad" else canvas_side, canvas_side)
+
+    return along(width, canvas[0]), along(height, canvas[1])
 
 
 def input_tensor(
@@ -92,12 +88,13 @@ def input_tensor(
     The 8-bit image is resized with Pillow, which antialiases when shrinking, unlike the default resize functions
     of OpenCV and torch.
     """
-    size = (placement.across.resized_px, placement.down.resized_px)
+    across, down = placement
+    size = (across.resized_px, down.resized_px)
     kernel = Image.Resampling.BICUBIC if spec.interpolation == "bicubic" else Image.Resampling.BILINEAR
     resized = np.asarray(Image.fromarray(rgb).resize(size, kernel), np.float64)
     normalised = (resized * (spec.range / 255) - np.array(spec.mean)) / np.array(spec.std)
-    tensor = np.zeros((1, 3, placement.down.canvas_px, placement.across.canvas_px))
-    tensor[0, :, placement.down.image_slice, placement.across.image_slice] = normalised.transpose(2, 0, 1)
+    tensor = np.zeros((1, 3, down.canvas_px, across.canvas_px))
+    tensor[0, :, down.image_slice, across.image_slice] = normalised.transpose(2, 0, 1)
     return tensor
 
 
@@ -110,8 +107,8 @@ def sample_at_image_pixels(
     neighbour is NaN; it is smooth, but at the edge of a bar it produces depth that lies neither on the bar nor
     behind it.
     """
-    columns_sampled = _sample_axis(placement.across, values, 1, bilinear)
-    return _sample_axis(placement.down, columns_sampled, 0, bilinear)
+    across, down = placement
+    return _sample_axis(down, _sample_axis(across, values, 1, bilinear), 0, bilinear)
 
 
 def _sample_axis(
@@ -153,7 +150,6 @@ def _unpadded_cells(span: AxisPlacement, cells: int) -> tuple[int, int]:
 
 TRIAL_SIZE_PX = (1280, 720)
 """Width and height, pixels, of the black image on which a model is run once when it is loaded."""
-_DIGEST_CHARACTERS = 16
 
 
 def onnx_method(path: Path, view_timeout_s: float = VIEW_TIMEOUT_S) -> Method:
@@ -172,7 +168,7 @@ def onnx_method(path: Path, view_timeout_s: float = VIEW_TIMEOUT_S) -> Method:
         summary=spec.summary or f"ONNX model {model.name}; its output: {meaning.description}",
         columns=("left_rgb", "left_K") if meaning.canonical else ("left_rgb",),
         uses_intrinsics=meaning.canonical,
-        source=f"{spec.source or model.name} (sha256:{_model_digest(path, model)})",
+        source=f"{spec.source or model.name} (sha256:{model_digest(path, model)})",
         licence=spec.licence,
     )
     return Method(info, lambda: _load(spec, view_timeout_s))
@@ -198,11 +194,10 @@ def output_to_depth_m(
 
 
 def _load(spec: OnnxSpec, view_timeout_s: float) -> Predictor:
-    session = open_session(Path(spec.model), spec.input, spec.output, view_timeout_s)
-    width, height = TRIAL_SIZE_PX
+    session = open_session(spec, view_timeout_s)
     # The output shape of a model with dynamic sizes is only known after a run.
-    black = np.zeros((height, width, 3), dtype=np.uint8)
-    session.run(input_tensor(spec.input, place_image(spec.input, width, height), black), "a black trial image")
+    placement, black = place_image(spec.input, *TRIAL_SIZE_PX), np.zeros((*TRIAL_SIZE_PX[::-1], 3), np.uint8)
+    session.run(input_tensor(spec.input, placement, black), "a black trial image")
 
     def predict(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
         height, width, _ = row["left_rgb"].shape
@@ -211,7 +206,7 @@ def _load(spec: OnnxSpec, view_timeout_s: float) -> Predictor:
         values = session.run(tensor, row.get("view_id", "the image"))
         fx_at_input_px = np.nan
         if OUTPUT_MEANINGS[spec.output.meaning].canonical:
-            fx_at_input_px = row["left_K"][0, 0] * (placement.across.resized_px / width)
+            fx_at_input_px = row["left_K"][0, 0] * (placement[0].resized_px / width)
         # Invalid values become NaN before resampling, so that they are not interpolated with neighbours.
         is_invalid = np.isnan(output_to_depth_m(values, spec.output, fx_at_input_px))
         valid = np.where(is_invalid, np.nan, values)
@@ -219,15 +214,6 @@ def _load(spec: OnnxSpec, view_timeout_s: float) -> Predictor:
         return output_to_depth_m(sampled, spec.output, fx_at_input_px)
 
     return predict
-
-
-def _model_digest(path: Path, model: Path) -> str:
-    """Return the digest of the TOML file, the model and its external data."""
-    files = (path, model, *external_files(model))
-    try:
-        return files_digest(files)[:_DIGEST_CHARACTERS]
-    except OSError as error:
-        raise MethodError(f"{error.filename}: cannot be read: {error.strerror}") from None
 
 
 PROVIDERS = ("CUDAExecutionProvider", "CPUExecutionProvider")
@@ -243,17 +229,16 @@ _OUT_OF_MEMORY = "Available memory of"
 """Part of onnxruntime's message if its memory arena cannot grow any further."""
 
 
+# Inference sessions for models with one image input and one map output.
+
+
 @dataclass(frozen=True)
 class OnnxSession:
-    """Open model with one RGB image as input; ``where`` is the file name for error messages.
-
-    ``at_input_size`` is True if the output must have the size of the input. ``timeout_s`` limits each inference.
-    """
+    """Open model with one RGB image as input; ``timeout_s`` limits each inference."""
 
     session: Any
-    where: str
+    spec: OnnxSpec
     output_name: str
-    at_input_size: bool
     timeout_s: float
 
     def run(self, tensor: Float64[ndarray, "1 3 h w"], view: str) -> Float64[ndarray, "out_h out_w"]:
@@ -275,17 +260,17 @@ class OnnxSession:
                 lambda: setattr(options, "terminate", True),  # It stops between two operators.
             )
         except DeadlineError:
-            raise MethodError(f"{self.where}: {view}: {_exceeded(self.timeout_s)}") from None
+            raise MethodError(f"{self.spec.model}: {view}: {_exceeded(self.timeout_s)}") from None
         except Exception as error:  # The exceptions of onnxruntime have no common base.
             size = " x ".join(map(str, tensor.shape))
-            raise MethodError(f"{self.where}: fails on an input of {size}: {_error_text(error)}") from None
+            raise MethodError(f"{self.spec.model}: fails on an input of {size}: {_error_text(error)}") from None
         shape = tuple(np.shape(output))
-        name = f"{self.where}: output {self.output_name!r}"
+        name = f"{self.spec.model}: output {self.output_name!r}"
         if len(shape) < 2 or set(shape[:-2]) - {1} or not np.size(output):
             raise MethodError(
                 f"{name} has the shape {shape}, expected H x W, with optional leading dimensions of 1"
             )
-        if self.at_input_size and shape[-2:] != tensor.shape[-2:]:
+        if self.spec.output.at_input_size and shape[-2:] != tensor.shape[-2:]:
             expected = " x ".join(map(str, tensor.shape[-2:]))
             raise MethodError(
                 f"{name} has the shape {shape}, expected {expected} or [output] at_input_size = false"
@@ -293,7 +278,7 @@ class OnnxSession:
         return np.asarray(output, np.float64).reshape(shape[-2:])
 
 
-def open_session(path: Path, input_spec: InputSpec, output_spec: OutputSpec, timeout_s: float) -> OnnxSession:
+def open_session(spec: OnnxSpec, timeout_s: float) -> OnnxSession:
     """Open a model and check that its input and output match the TOML file.
 
     ``timeout_s`` limits opening, where onnxruntime computes constants, and each inference. Raises ``MethodError``
@@ -311,20 +296,20 @@ def open_session(path: Path, input_spec: InputSpec, output_spec: OutputSpec, tim
     try:
         session = call_within(
             timeout_s,
-            lambda: onnxruntime.InferenceSession(str(path), options, providers=providers),
+            lambda: onnxruntime.InferenceSession(spec.model, options, providers=providers),
             # Versions before 1.21 do not have it.
             lambda: getattr(options, "set_load_cancellation_flag", bool)(True),
         )
     except DeadlineError:
-        raise MethodError(f"{path}: opening the model {_exceeded(timeout_s)}") from None
+        raise MethodError(f"{spec.model}: opening the model {_exceeded(timeout_s)}") from None
     except Exception as error:
-        raise MethodError(f"{path}: onnxruntime cannot open this model: {_error_text(error)}") from None
+        raise MethodError(f"{spec.model}: onnxruntime cannot open this model: {_error_text(error)}") from None
     inputs, outputs = session.get_inputs(), session.get_outputs()
-    problems = _input_problems(inputs, input_spec)
-    output = _select_output(outputs, output_spec.name_or_index, problems)
+    problems = _input_problems(inputs, spec.input)
+    output = _select_output(outputs, spec.output, problems)
     if problems or output is None:
-        raise MethodError.from_problems(path, problems)
-    return OnnxSession(session, str(path), output.name, output_spec.at_input_size, timeout_s)
+        raise MethodError.from_problems(spec.model, problems)
+    return OnnxSession(session, spec, output.name, timeout_s)
 
 
 def _limit_memory(onnxruntime: Any, options: Any) -> None:
@@ -380,18 +365,20 @@ def _is_fixed(side: int | str | None) -> bool:
     return isinstance(side, int) and side > 0
 
 
-def _select_output(outputs: Sequence[Any], name_or_index: str | int | None, problems: list[Problem]) -> Any:
+def _select_output(outputs: Sequence[Any], spec: OutputSpec, problems: list[Problem]) -> Any:
     """Return the output that the TOML file selects; if it does not exist, append to ``problems``, return None."""
     expected = f"one of {', '.join(repr(output.name) for output in outputs)}"
-    if name_or_index is None and len(outputs) != 1:
+    if spec.name is None and spec.index is None and len(outputs) != 1:
         problems.append(Problem("missing", "output.name", f"the model has {len(outputs)} outputs", expected))
         return None
-    if isinstance(name_or_index, str):
-        where, matches = "output.name", [output for output in outputs if output.name == name_or_index]
+    if spec.name is not None:
+        matches = [output for output in outputs if output.name == spec.name]
+        missing = Problem("unknown", "output.name", f"the model has no output {spec.name!r}", expected)
     else:
-        where, matches = "output.index", list(outputs[name_or_index or 0 :][:1])
+        matches = list(outputs[spec.index or 0 :][:1])
+        missing = Problem("unknown", "output.index", f"the model has no output {spec.index}", expected)
     if not matches:
-        problems.append(Problem("unknown", where, f"the model has no output {name_or_index!r}", expected))
+        problems.append(missing)
         return None
     problems += _dtype_problems("output", matches[0])
     return matches[0]

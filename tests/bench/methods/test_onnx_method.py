@@ -155,7 +155,7 @@ def test_bilinear_sampling_matches_map_coordinates(
     place = place_image(spec_of((wide, high), pad=pad), width, height)
     values = np.random.default_rng(7).uniform(1, 2, cells)
     clipped, ranges = [], []
-    for span, count in ((place.down, cells[0]), (place.across, cells[1])):
+    for span, count in zip(reversed(place), cells, strict=True):
         centres = np.linspace(span.pad_before_px, span.pad_before_px + span.resized_px, 2 * span.image_px + 1)[
             1::2
         ]
