@@ -135,12 +135,12 @@ def all_methods() -> dict[str, AnyMethod | MethodError]:
 
 def own_methods() -> dict[str, AnyMethod]:
     """Return the methods of this distribution by name: built-in ones and its own entry points."""
-    entries = {
-        name: entry
+    own = {
+        name: _load_entry_point(entry)
         for name, entry in _entry_point_methods().items()
         if entry.dist and entry.dist.name == DISTRIBUTION
     }
-    return {**METHODS, **{name: _load_entry_point(entry) for name, entry in entries.items()}}
+    return {**METHODS, **own}
 
 
 def _entry_point_methods() -> dict[str, EntryPoint]:

@@ -282,7 +282,12 @@ def _load_predictor(network: Network, checkpoint: Checkpoint, output: OutputKind
             processor, to_network_input = None, depth_pro_preprocessing(settings)
         else:  # The processors on Pillow give the same results with and without torchvision.
             processor = transformers.AutoImageProcessor.from_pretrained(checkpoint.folder, backend="pil")
-            to_network_input = library_preprocessing(processor)
+            options = {"return_tensors": "pt", "input_data_format": "channels_last"}
+
+            def to_network_input(rgb: UInt8[ndarray, "H W 3"]) -> Float[Tensor, "1 3 h w"]:
+                pixels: Tensor = processor(images=rgb, **options).pixel_values
+                return pixels.float()
+
         model = _load_network(transformers, checkpoint).to(torch_device())
 
     def infer(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
@@ -295,11 +300,9 @@ def _load_predictor(network: Network, checkpoint: Checkpoint, output: OutputKind
     return network.predictor(infer)
 
 
-ToNetworkInput = Callable[[UInt8[ndarray, "H W 3"]], "Float[Tensor, '1 3 h w']"]
-"""Function from an image to the input of a network."""
-
-
-def depth_pro_preprocessing(settings: Mapping[str, Any]) -> ToNetworkInput:
+def depth_pro_preprocessing(
+    settings: Mapping[str, Any],
+) -> Callable[[UInt8[ndarray, "H W 3"]], Float[Tensor, "1 3 h w"]]:
     """Return Depth Pro's pre-processing by ``preprocessor_config.json``: normalise, then resize to a square.
 
     The image is resized bilinearly, as in the authors' code. Raises ``MethodError`` if a setting is missing.
@@ -316,16 +319,6 @@ def depth_pro_preprocessing(settings: Mapping[str, Any]) -> ToNetworkInput:
         planes = image_tensor((rgb * np.float64(scale) - np.asarray(mean)) / np.asarray(std)).contiguous()
         target = (size["height"], size["width"])
         return functional.interpolate(planes, size=target, mode="bilinear", align_corners=False)
-
-    return to_network_input
-
-
-def library_preprocessing(processor: Any) -> ToNetworkInput:
-    """Return the pre-processing of a processor of ``transformers``."""
-
-    def to_network_input(rgb: UInt8[ndarray, "H W 3"]) -> Float[Tensor, "1 3 h w"]:
-        pixels: Tensor = processor(images=rgb, return_tensors="pt", input_data_format="channels_last").pixel_values
-        return pixels.float()
 
     return to_network_input
 

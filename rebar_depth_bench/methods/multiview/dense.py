@@ -205,15 +205,6 @@ _HEADER = re.compile(rb"(\d{1,6})&(\d{1,6})&(\d)&")
 _HEADER_BYTES = 24
 
 
-def require_cuda() -> None:
-    """Raise ``MethodError`` if COLMAP was built without CUDA."""
-    if not pycolmap.has_cuda:
-        raise MethodError(
-            "COLMAP's PatchMatch stereo needs CUDA, but this pycolmap was built without it: on a machine with an "
-            "NVIDIA GPU, pip install pycolmap-cuda12 instead; on a CPU use sweep-aruco or sweep-anchored"
-        )
-
-
 def read_depth_map(path: Path) -> Float32[ndarray, "h w"]:
     """Return the depth map in a ``.bin`` file of COLMAP, in the unit of the reconstruction.
 
@@ -242,9 +233,8 @@ def consistency_mask(
     cam_from_sfm: Float64[ndarray, "4 4"],
     neighbours: Sequence[tuple[Float32[ndarray, "h w"], Float64[ndarray, "4 4"]]],
     K: Float64[ndarray, "3 3"],
-    min_confirmations: int,
 ) -> Bool[ndarray, "h w"]:
-    """Return a mask of pixels whose depth is confirmed by at least ``min_confirmations`` of the neighbours.
+    """Return a mask of pixels whose depth is confirmed by at least one of the neighbours.
 
     ``neighbours`` holds depth and pose (``cam_from_sfm``) of each. The 3-D point of a pixel is projected into each
     neighbour and compared with the depth there.
@@ -255,7 +245,7 @@ def consistency_mask(
         inverse_rigid(cam_from_sfm),
         pixel_rays(K, width, height)[has_depth] * depth[has_depth][:, None].astype(np.float64),
     )
-    votes = np.zeros(len(points), np.int64)
+    confirmed = np.zeros(len(points), bool)
     for other_depth, neighbour_from_sfm in neighbours:
         points_cam = transform(neighbour_from_sfm, points)
         in_front = points_cam[:, 2] > 0
@@ -266,10 +256,10 @@ def consistency_mask(
         neighbour_depth = np.full(len(points), np.nan)
         neighbour_depth[inside] = other_depth[v[inside], u[inside]]
         with np.errstate(invalid="ignore"):
-            votes += np.abs(neighbour_depth - points_cam[:, 2]) <= MAX_RELATIVE_DIFFERENCE * points_cam[:, 2]
-    confirmed = np.zeros(depth.shape, bool)
-    confirmed[has_depth] = votes >= min_confirmations
-    return confirmed
+            confirmed |= np.abs(neighbour_depth - points_cam[:, 2]) <= MAX_RELATIVE_DIFFERENCE * points_cam[:, 2]
+    consistent = has_depth.copy()
+    consistent[has_depth] = confirmed
+    return consistent
 
 
 MAX_NEIGHBOURS = 4
@@ -320,9 +310,6 @@ def _pair_score(
     sigma_deg = np.where(angle_deg < BEST_ANGLE_DEG, SIGMA_BELOW_DEG, SIGMA_ABOVE_DEG)
     return float(np.exp(-(((angle_deg - BEST_ANGLE_DEG) / sigma_deg) ** 2) / 2).sum())
 
-
-MIN_CONFIRMATIONS = 1
-"""Number of neighbours (of four) that must confirm a pixel of the sweep."""
 
 DepthReader = Callable[[str], Float32[ndarray, "h w"]]
 """Function from an image name to planar depth on the pinhole grid, in the reconstruction's unit; NaN: none."""
@@ -377,7 +364,7 @@ def plane_sweep_depth(
         poses = reconstruction.cam_from_sfm
         depth = np.load(folder / f"{name}.npy")
         others = [(np.load(folder / f"{other}.npy"), poses[other]) for other in neighbours[name]]
-        consistent = consistency_mask(depth, poses[name], others, left_images.grid.K, MIN_CONFIRMATIONS)
+        consistent = consistency_mask(depth, poses[name], others, left_images.grid.K)
         return np.where(consistent, depth, np.float32(np.nan))
 
     return read

@@ -27,7 +27,6 @@ from rebar_depth_bench.methods.multiview.dense import (
     DepthReader,
     patch_match_depth,
     plane_sweep_depth,
-    require_cuda,
 )
 from rebar_depth_bench.methods.multiview.sfm import (
     CAMERA_MODEL,
@@ -198,8 +197,11 @@ def check(views: Views, name: str, *, uses_patch_match: bool, is_anchored: bool)
     Raises ``DatasetError`` if the config has no colour, or no ground truth for an anchored scale.
     """
     views.check_columns(row_columns(views), name)
-    if uses_patch_match:
-        require_cuda()
+    if uses_patch_match and not pycolmap.has_cuda:
+        raise MethodError(
+            "COLMAP's PatchMatch stereo needs CUDA, but this pycolmap was built without it: on a machine with an "
+            "NVIDIA GPU, pip install pycolmap-cuda12 instead; on a CPU use sweep-aruco or sweep-anchored"
+        )
     if is_anchored:
         views.check_columns(_TRUTH_COLUMNS, "a scale anchored to the ground truth")
     elif views.board is None:

@@ -175,20 +175,16 @@ def onnx_method(path: Path, view_timeout_s: float = VIEW_TIMEOUT_S) -> Method:
 
 
 def output_to_depth_m(
-    values: Float[ndarray, "*grid"], output: OutputSpec, fx_at_input_px: float = np.nan
+    values: Float[ndarray, "*grid"], output: OutputSpec, factor: float = 1.0
 ) -> Float32[ndarray, "*grid"]:
     """Return planar depth in metres of output values.
 
-    Depth is v or 1 / v, where v is the value times ``scale``; for canonical meanings it is multiplied by fx /
-    focal_canonical (Yin et al., "Metric3D", ICCV 2023, section 3.2). ``fx_at_input_px`` is the focal length of the
-    resized image that the model receives. Depth is NaN where the value is not finite, or the depth is not finite
-    and above 0 or lies outside ``min_m`` to ``max_m``.
+    Depth is v or 1 / v, where v is the value times ``scale``, multiplied by ``factor``. It is NaN where the value
+    is not finite, or the depth is not finite and above 0 or lies outside ``min_m`` to ``max_m``.
     """
-    meaning = OUTPUT_MEANINGS[output.meaning]
-    factor = fx_at_input_px / (output.focal_canonical_px or np.nan) if meaning.canonical else 1.0
     scaled = np.asarray(values, np.float64) * output.scale
     with np.errstate(all="ignore"):
-        depth_m = np.asarray(factor / scaled if meaning.inverse else factor * scaled)
+        depth_m = np.asarray(factor / scaled if OUTPUT_MEANINGS[output.meaning].inverse else factor * scaled)
     valid = np.isfinite(scaled) & (depth_m >= output.min_m) & (depth_m <= output.max_m)
     return positive_or_nan(np.where(valid, depth_m, np.nan))
 
@@ -204,14 +200,15 @@ def _load(spec: OnnxSpec, view_timeout_s: float) -> Predictor:
         placement = place_image(spec.input, width, height)
         tensor = input_tensor(spec.input, placement, row["left_rgb"])
         values = session.run(tensor, row.get("view_id", "the image"))
-        fx_at_input_px = np.nan
-        if OUTPUT_MEANINGS[spec.output.meaning].canonical:
-            fx_at_input_px = row["left_K"][0, 0] * (placement[0].resized_px / width)
+        factor = 1.0
+        if focal_px := spec.output.focal_canonical_px:
+            # That of the resized image that the model receives (Yin et al., "Metric3D", ICCV 2023, section 3.2).
+            factor = row["left_K"][0, 0] * (placement[0].resized_px / width) / focal_px
         # Invalid values become NaN before resampling, so that they are not interpolated with neighbours.
-        is_invalid = np.isnan(output_to_depth_m(values, spec.output, fx_at_input_px))
+        is_invalid = np.isnan(output_to_depth_m(values, spec.output, factor))
         valid = np.where(is_invalid, np.nan, values)
         sampled = sample_at_image_pixels(placement, valid, bilinear=spec.output.resize == "bilinear")
-        return output_to_depth_m(sampled, spec.output, fx_at_input_px)
+        return output_to_depth_m(sampled, spec.output, factor)
 
     return predict
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +73,7 @@ def metric3d_with_weights(folder: Path | None) -> Method:
         code = _metric3d_code()
         cached = snapshot(METRIC3D_REPOSITORY, METRIC3D_CHECKPOINT, METRIC3D_LOCAL_COPY)
         versions = f"code {METRIC3D_CACHE} sha256:{files_digest(sorted(code.rglob('*.py')))}"
-        info = replace(network.info, summary=f"{network.info.summary}; {versions}; weights commit {cached.name}")
+        info = network.described(f"{versions}; weights commit {cached.name}")
         return Method(info, lambda: _load_metric3d(code, cached / METRIC3D_CHECKPOINT))
     network.check_folder(folder, METRIC3D_CODE)
     candidates = (folder / METRIC3D_CHECKPOINT, folder / "weight" / METRIC3D_CHECKPOINT)

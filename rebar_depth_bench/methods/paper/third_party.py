@@ -46,18 +46,23 @@ class Network:
     info: MethodInfo
     install: str
 
+    def described(self, addition: str) -> MethodInfo:
+        """Return the description with an addition to its summary."""
+        return replace(self.info, summary=f"{self.info.summary}; {addition}")
+
     def listed(self, with_weights: Callable[[Path | None], Method], addition: str) -> WeightsMethod:
         """Return the method for listings, with ``addition`` to its summary; nothing is looked up for it."""
-        info = replace(self.info, summary=f"{self.info.summary}; {addition}")
-        return WeightsMethod(info, lambda: with_weights(None).load(), with_weights=with_weights)
+        return WeightsMethod(
+            self.described(addition), lambda: with_weights(None).load(), with_weights=with_weights
+        )
 
     def with_digest(self, label: str, files: Sequence[Path]) -> MethodInfo:
         """Return the description with ``label`` in the name and the digest of the weights in the summary.
 
         Different weights are thus a different method, and an interrupted prediction is not resumed with them.
         """
-        summary = f"{self.info.summary}; weights sha256:{files_digest(files)}"
-        return replace(self.info, name=f"{self.info.name}:{label}", summary=summary)
+        info = self.described(f"weights sha256:{files_digest(files)}")
+        return replace(info, name=f"{info.name}:{label}")
 
     def check_folder(self, folder: Path, *required_files: str) -> None:
         """Raise ``MethodError`` unless a folder contains these files."""
@@ -182,7 +187,7 @@ class HubNetwork(Network):
         local_hint = local_copy_hint(name, self.repository)
         cached = snapshot(self.repository, CONFIG, local_hint)
         self._check_variant(cached)
-        info = replace(self.info, summary=f"{self.info.summary}; weights commit {cached.name}")
+        info = self.described(f"weights commit {cached.name}")
         return Method(info, lambda: self._load(snapshot(self.repository, WEIGHTS, local_hint, cached.name)))
 
     def _load(self, folder: Path) -> Predictor:
