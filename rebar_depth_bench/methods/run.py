@@ -90,11 +90,11 @@ def predict_views(
         usable = kept.usable(views)
         for config in views:
             done = usable & set(config.view_ids)
-            if len(done) == len(config.view_ids) and (loaded is not None or config.config in kept.reports):
+            if len(done) == len(config.view_ids) and (loaded is not None or config.config in kept.run.reports):
                 continue
             predictor = _prepare_method(method, config, kept, progress) if loaded is None else loaded
             _predict_config(method, predictor, config, kept, done, progress)
-        reports = noted | kept.reports
+        reports = noted | kept.run.reports
         _write_archive(method, target, kept, views, reports)
         kept.remove()
     return reports
@@ -208,7 +208,7 @@ def _prepare_method(method: AnyMethod, views: Views, kept: KeptViews, progress: 
     if not isinstance(prepared, Prepared):
         raise MethodError(f"{method.info.name}: prepare returned {type(prepared).__name__}, expected a Prepared")
     notes = _plain_notes(method, views.config, prepared.notes)
-    if views.config not in kept.reports:
+    if views.config not in kept.run.reports:
         seconds = round(time.perf_counter() - start, 1) if started_from_scratch else None
         kept.put_report(views.config, PreparationReport(notes=notes, seconds=seconds))
     return prepared.predict

@@ -95,7 +95,7 @@ def largest_disparity_px(rectified: Mapping[str, Any], nearest_m: float | None =
     """
     width = rectified["left_rgb"].shape[1]
     if nearest_m is None:
-        return SEARCH_SHARE_OF_WIDTH * width
+        return float(SEARCH_SHARE_OF_WIDTH * width)
     left_K, right_K = rectified["left_K"], rectified["right_K"]
     parallax_px = left_K[0, 0] * rectified["baseline_m"] / nearest_m
     return float(np.clip(parallax_px + left_K[0, 2] - right_K[0, 2], 0, width))

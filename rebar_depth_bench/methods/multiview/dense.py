@@ -257,7 +257,7 @@ def consistency_mask(
         neighbour_depth[inside] = other_depth[v[inside], u[inside]]
         with np.errstate(invalid="ignore"):
             confirmed |= np.abs(neighbour_depth - points_cam[:, 2]) <= MAX_RELATIVE_DIFFERENCE * points_cam[:, 2]
-    consistent = has_depth.copy()
+    consistent = np.zeros(depth.shape, bool)
     consistent[has_depth] = confirmed
     return consistent
 

@@ -33,6 +33,7 @@ from rebar_depth_bench.methods.multiview.sfm import (
     COLMAP_PIXEL_CENTRE,
     SEED,
     LeftImages,
+    Poses,
     SparseReconstruction,
     camera_parameters,
     reconstruct,
@@ -93,7 +94,7 @@ class BoardFit:
 
 def fit_board(
     detections: Mapping[str, Corners],
-    cam_from_sfm: Mapping[str, Float64[ndarray, "4 4"]],
+    cam_from_sfm: Poses,
     K: Float64[ndarray, "3 3"],
     board: BoardSpec,
 ) -> BoardFit:
@@ -137,11 +138,11 @@ def triangulate(
     """
     if len(pixels) < MIN_VIEWS:
         return None
-    options = pycolmap.EstimateTriangulationOptions()
-    options.min_tri_angle = np.radians(MIN_RAY_ANGLE_DEG)
-    options.residual_type = pycolmap.TriangulationResidualType.REPROJECTION_ERROR
-    options.ransac.max_error = MAX_REPROJECTION_ERROR_PX
-    options.ransac.random_seed = SEED
+    options = pycolmap.EstimateTriangulationOptions(
+        min_tri_angle=np.radians(MIN_RAY_ANGLE_DEG),
+        residual_type=pycolmap.TriangulationResidualType.REPROJECTION_ERROR,
+        ransac={"max_error": MAX_REPROJECTION_ERROR_PX, "random_seed": SEED},
+    )
     camera = pycolmap.Camera(model=CAMERA_MODEL, params=camera_parameters(K))
     found = pycolmap.estimate_triangulation(
         np.array(pixels) + COLMAP_PIXEL_CENTRE,
@@ -150,10 +151,6 @@ def triangulate(
         options,
     )
     return None if found is None or found["inliers"].sum() < MIN_VIEWS else found["xyz"].reshape(3)
-
-
-Poses = Mapping[str, Float64[ndarray, "4 4"]]
-"""Camera poses (cam_from_...) by image name."""
 
 
 def camera_errors(
