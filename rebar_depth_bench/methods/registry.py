@@ -38,8 +38,7 @@ class _BuiltIn(UserDict[str, Any]):
     """Methods by name, from module and attribute of each; a module is imported when its method is looked up."""
 
     def __getitem__(self, name: str) -> AnyMethod:
-        module, attribute = self.data[name].split(":")
-        method: AnyMethod = getattr(importlib.import_module(module), attribute)
+        method: AnyMethod = EntryPoint(name, self.data[name], ENTRY_POINT_GROUP).load()
         return method
 
 
