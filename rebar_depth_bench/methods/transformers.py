@@ -91,15 +91,25 @@ def find_checkpoint(name_or_path: str) -> Checkpoint:
 
 
 def ensure_weights(checkpoint: Checkpoint) -> None:
-    """Download weights and settings of a Hub checkpoint if they are not cached, after a notice on standard error.
+    """Download weights (of one kind only) and settings of a Hub checkpoint if they are not cached, after a notice.
 
     Raises ``MethodError`` if the download fails or the checkpoint has no weights.
     """
-    if checkpoint.repository and not (
-        _weight_files(checkpoint.folder) and (checkpoint.folder / PREPROCESSOR).is_file()
-    ):
-        _fetch_weights(checkpoint.repository, checkpoint.folder.name)
-    if not _weight_files(checkpoint.folder):
+    repository, folder = checkpoint.repository, checkpoint.folder
+    is_complete = _weight_files(folder) and (folder / PREPROCESSOR).is_file()
+    if repository and not is_complete:
+        from huggingface_hub import HfApi, snapshot_download
+
+        with hub_download(repository, "the weights", local_copy_hint(PREFIX, repository)):
+            files = HfApi().model_info(repository, revision=folder.name, files_metadata=True).siblings or []
+            sizes = {file.rfilename: file.size or 0 for file in files if "/" not in file.rfilename}
+            found = (pattern for pattern in _WEIGHTS if any(Path(name).match(pattern) for name in sizes))
+            pattern = next(found, _WEIGHTS[0])
+            names = [name for name in sizes if Path(name).match(pattern) or name.endswith(".json")]
+            megabytes = sum(sizes[name] for name in names) / 1e6
+            print(f"{repository}: {megabytes:.1f} MB", file=sys.stderr, flush=True)
+            snapshot_download(repository, revision=folder.name, allow_patterns=names)
+    if not _weight_files(folder):
         raise MethodError(f"{checkpoint.name}: no weights, expected {' or '.join(_WEIGHTS)} beside {CONFIG}")
 
 
@@ -124,21 +134,6 @@ def read_settings(path: Path) -> dict[str, Any]:
             f"{path.parent}: no {path.name}, expected a checkpoint folder as written by save_pretrained"
         )
     return read_json_object(path)
-
-
-def _fetch_weights(repository: str, commit: str) -> None:
-    """Download weights (of one kind only) and settings of a commit into the Hub cache."""
-    from huggingface_hub import HfApi, snapshot_download
-
-    with hub_download(repository, "the weights", local_copy_hint(PREFIX, repository)):
-        files = HfApi().model_info(repository, revision=commit, files_metadata=True).siblings or []
-        sizes = {file.rfilename: file.size or 0 for file in files if "/" not in file.rfilename}
-        weight_pattern = next(
-            (pattern for pattern in _WEIGHTS if any(Path(name).match(pattern) for name in sizes)), _WEIGHTS[0]
-        )
-        file_names = [name for name in sizes if Path(name).match(weight_pattern) or name.endswith(".json")]
-        print(f"{repository}: {sum(sizes[name] for name in file_names) / 1e6:.1f} MB", file=sys.stderr, flush=True)
-        snapshot_download(repository, revision=commit, allow_patterns=file_names)
 
 
 _INSTALL = "pip install 'rebar-depth-bench[models]'"
