@@ -18,7 +18,7 @@ import pycolmap
 from benchmarks.timing import machine_description, print_markdown
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.methods import ConfigViews
-from rebar_depth_bench.methods.multiview.metric_scale import (
+from rebar_depth_bench.methods.multiview.pipeline import (
     camera_errors,
     fit_board,
 )

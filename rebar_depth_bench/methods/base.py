@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from jaxtyping import Float32
+import numpy as np
+from jaxtyping import Float, Float32
 from numpy import ndarray
 
 from rebar_depth_bench.data.rows import Views
+from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.parallel import Progress
 
 Predictor = Callable[[Mapping[str, Any]], Float32[ndarray, "h w"]]
@@ -114,3 +117,21 @@ def input_class(method: AnyMethod) -> str | None:
     if "left_rgb" in info.columns:
         return "rgb+K" if info.uses_intrinsics else "rgb"
     return None
+
+
+def positive_or_nan(depth_m: Float[ndarray, "*grid"]) -> Float32[ndarray, "*grid"]:
+    """Return depth as float32, with NaN (no prediction) where it is not finite or not above 0."""
+    with np.errstate(over="ignore"):
+        single = depth_m.astype(np.float32)
+    return np.where(np.isfinite(single) & (single > 0), single, np.float32(np.nan))
+
+
+def import_optional(module: str, need: str, extra: str) -> Any:
+    """Import and return a module that an extra installs, or that imports packages of it.
+
+    Raises ``MethodError`` with ``need``, who needs what, and install instructions if a package is missing.
+    """
+    try:
+        return importlib.import_module(module)
+    except ImportError as error:
+        raise MethodError(f"{need} ({error}): pip install 'rebar-depth-bench[{extra}]'") from None

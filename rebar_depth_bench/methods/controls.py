@@ -21,7 +21,14 @@ from numpy import ndarray
 from rebar_depth_bench.data.rows import Views
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.cameras import pixel_rays
-from rebar_depth_bench.methods.base import Method, MethodInfo, MultiViewMethod, Prepared
+from rebar_depth_bench.methods.base import (
+    Method,
+    MethodInfo,
+    MultiViewMethod,
+    Prepared,
+    import_optional,
+    positive_or_nan,
+)
 from rebar_depth_bench.parallel import Progress
 
 CONSTANT_DEPTH_M = 1.0
@@ -95,18 +102,13 @@ def plane_depth_m(
     """
     normal, origin_m = cam_from_board[:3, 2], cam_from_board[:3, 3]
     with np.errstate(divide="ignore", over="ignore"):
-        depth_m = np.asarray(normal @ origin_m / (rays_cam @ normal), np.float32)
-    return np.where(np.isfinite(depth_m) & (depth_m > 0), depth_m, np.float32(np.nan))
+        depth_m = np.asarray(normal @ origin_m / (rays_cam @ normal))
+    return positive_or_nan(depth_m)
 
 
 def _check_board_plane(views: Views) -> None:
     """Raise ``MethodError`` if OpenCV is missing or the config's scene has no board."""
-    try:
-        import cv2  # noqa: F401
-    except ImportError as error:
-        raise MethodError(
-            f"board-plane needs OpenCV ({error}): pip install 'rebar-depth-bench[methods]'"
-        ) from None
+    import_optional("cv2", "board-plane needs OpenCV", "methods")
     if views.board is None:
         raise MethodError(
             f"{views.config}: the scene has no ArUco board; name configs that have one (--config lattice pile)"

@@ -48,8 +48,11 @@ class PreparationReport(StrictModel):
     seconds: Annotated[float, Expected("a number of at least 0", lambda value: 0 <= value < math.inf)] | None
 
 
-class _Run(StrictModel):
-    """Content of ``run.json``: everything that determines the predictions, and the reports by config."""
+class Run(StrictModel):
+    """Content of ``run.json``: everything that determines the predictions, and the reports by config.
+
+    The reports are those of completed preparations; see ``KeptViews.put_report``.
+    """
 
     key: Annotated[dict[str, Any], Expected("a table")]
     reports: dict[str, PreparationReport]
@@ -64,9 +67,7 @@ class KeptViews:
     """
 
     path: Path
-    key: Mapping[str, Any]
-    reports: dict[str, PreparationReport]
-    """Reports of the completed preparations, by config; see ``put_report``."""
+    run: Run
 
     @classmethod
     def open(cls, path: Path, key: Mapping[str, Any]) -> KeptViews:
@@ -75,13 +76,13 @@ class KeptViews:
         ``key`` holds everything that determines the predictions, as JSON values. Raises ``InputError`` if the
         folder is a link or holds anything else, and ``OutputError`` if it cannot be written.
         """
-        key = json.loads(json.dumps(key))
+        stored_key: dict[str, Any] = json.loads(json.dumps(key))
         try:
             if os.path.lexists(path):
                 _refuse_foreign(path)
                 run = _read_run(path / _RUN_FILE)
-                if run is not None and run.key == key:
-                    return cls(path, key, run.reports)
+                if run is not None and run.key == stored_key:
+                    return cls(path, run)
                 views = sum(1 for _ in path.glob("*/*.npz"))
                 found = "another method, dataset or version" if run else f"a run without a readable {_RUN_FILE}"
                 print_notice(f"starting over: {path} holds {views} views of {found}")
@@ -89,7 +90,7 @@ class KeptViews:
             path.mkdir(parents=True)
         except OSError as error:
             raise write_error(path, error) from None
-        kept = cls(path, key, {})
+        kept = cls(path, Run(key=stored_key, reports={}))
         kept._write_run()
         return kept
 
@@ -157,7 +158,7 @@ class KeptViews:
 
     def put_report(self, config: str, report: PreparationReport) -> None:
         """Store the preparation report of a config."""
-        self.reports[config] = report
+        self.run.reports[config] = report
         self._write_run()
 
     def remove(self) -> None:
@@ -168,17 +169,16 @@ class KeptViews:
         return path_below(self.path, f"{view_id}.npz")
 
     def _write_run(self) -> None:
-        run = _Run(key=dict(self.key), reports=self.reports)
-        write_text(self.path / _RUN_FILE, json.dumps(run.model_dump()))
+        write_text(self.path / _RUN_FILE, json.dumps(self.run.model_dump()))
 
 
-def _read_run(path: Path) -> _Run | None:
+def _read_run(path: Path) -> Run | None:
     """Return the content of ``run.json``, None if it is missing or damaged."""
     try:
         values, problems = parse_json(read_file(path, JSON_BYTES, "the parameters of a run", InputError))
     except InputError:
         return None
-    return None if problems else validate_table(_Run, values, problems)
+    return None if problems else validate_table(Run, values, problems)
 
 
 def _refuse_foreign(path: Path) -> None:

@@ -29,7 +29,6 @@ from rebar_depth_bench.methods.base import VIEW_TIMEOUT_S, AnyMethod, Method, Mu
 ENTRY_POINT_GROUP = "rebar_depth_bench.methods"
 DISTRIBUTION = "rebar-depth-bench"
 _DIGEST_CHARACTERS = 16
-_HF_PREFIX = "hf:"
 
 FROM_FOLDER = ("depth-anything-3", "foundation-stereo", "metric3d", "unidepth")
 """Names of the methods that take a folder: ``NAME:FOLDER``."""
@@ -39,8 +38,7 @@ class _BuiltIn(UserDict[str, Any]):
     """Methods by name, from module and attribute of each; a module is imported when its method is looked up."""
 
     def __getitem__(self, name: str) -> AnyMethod:
-        module, attribute = self.data[name].split(":")
-        method: AnyMethod = getattr(importlib.import_module(module), attribute)
+        method: AnyMethod = EntryPoint(name, self.data[name], ENTRY_POINT_GROUP).load()
         return method
 
 
@@ -49,7 +47,7 @@ METHODS: Mapping[str, AnyMethod] = _BuiltIn(
         "sgbm": "rebar_depth_bench.methods.sgbm:SGBM",
         "sgbm-filled": "rebar_depth_bench.methods.sgbm:SGBM_FILLED",
         "foundation-stereo": "rebar_depth_bench.methods.paper.foundation_stereo:FOUNDATION_STEREO",
-        "depth-pro": "rebar_depth_bench.methods.transformers.model:DEPTH_PRO",
+        "depth-pro": "rebar_depth_bench.methods.transformers:DEPTH_PRO",
         "metric3d": "rebar_depth_bench.methods.paper.monocular:METRIC3D",
         "unidepth": "rebar_depth_bench.methods.paper.monocular:UNIDEPTH",
         "depth-anything-3": "rebar_depth_bench.methods.paper.monocular:DEPTH_ANYTHING_3",
@@ -78,17 +76,17 @@ def find_method(name: str, *, view_timeout_s: float = VIEW_TIMEOUT_S, nearest_m:
     Raises ``MethodError`` if the name is unknown, if a file or package cannot be imported or holds no method, or
     if ``nearest_m`` is given to another method.
     """
-    method_name, _, folder = name.partition(":")
+    method_name, colon, folder = name.partition(":")
     if nearest_m is not None:
         if method_name != "foundation-stereo" or not folder:
             raise MethodError(f"{name}: has no nearest distance, expected foundation-stereo:FOLDER")
         from rebar_depth_bench.methods.paper.foundation_stereo import foundation_stereo_method
 
         return foundation_stereo_method(Path(folder).expanduser(), nearest_m)
-    if name.startswith(_HF_PREFIX):
-        from rebar_depth_bench.methods.transformers.model import hf_method
+    if method_name == "hf" and colon:
+        from rebar_depth_bench.methods.transformers import hf_method
 
-        return hf_method(name.removeprefix(_HF_PREFIX))
+        return hf_method(folder)
     if folder and method_name in FROM_FOLDER:
         return _with_weights(method_name, Path(folder).expanduser())
     path, colon, attribute = name.rpartition(":")
@@ -117,7 +115,7 @@ def _with_weights(name: str, folder: Path | None) -> AnyMethod:
     """Return a built-in method, with the weights in a folder, or None: in a cache, if it needs any."""
     method = METHODS[name]
     if name == "depth-pro":
-        from rebar_depth_bench.methods.transformers.model import depth_pro_method
+        from rebar_depth_bench.methods.transformers import depth_pro_method
 
         return depth_pro_method()
     return method.with_weights(folder) if isinstance(method, WeightsMethod) else method
@@ -136,12 +134,12 @@ def all_methods() -> dict[str, AnyMethod | MethodError]:
 
 def own_methods() -> dict[str, AnyMethod]:
     """Return the methods of this distribution by name: built-in ones and its own entry points."""
-    entries = {
-        name: entry
+    own = {
+        name: _load_entry_point(entry)
         for name, entry in _entry_point_methods().items()
         if entry.dist and entry.dist.name == DISTRIBUTION
     }
-    return {**METHODS, **{name: _load_entry_point(entry) for name, entry in entries.items()}}
+    return {**METHODS, **own}
 
 
 def _entry_point_methods() -> dict[str, EntryPoint]:

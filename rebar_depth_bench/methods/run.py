@@ -10,7 +10,7 @@ import json
 import platform
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -26,9 +26,9 @@ from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.data.rows import Views
 from rebar_depth_bench.errors import DatasetError, InputError, MethodError, RebarDepthError, escape_text
 from rebar_depth_bench.methods import AnyMethod, ConfigViews, Method, MultiViewMethod, Predictor, Prepared
-from rebar_depth_bench.methods.base import input_class
+from rebar_depth_bench.methods.base import import_optional, input_class
 from rebar_depth_bench.methods.kept_views import KeptViews, PreparationReport
-from rebar_depth_bench.methods.sgbm import STEREO_COLUMNS
+from rebar_depth_bench.methods.sgbm import RECTIFIED_COLUMNS, STEREO_COLUMNS, pair_row
 from rebar_depth_bench.names import TEST_SPLIT
 from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.submission import SubmissionWriter
@@ -90,11 +90,11 @@ def predict_views(
         usable = kept.usable(views)
         for config in views:
             done = usable & set(config.view_ids)
-            if len(done) == len(config.view_ids) and (loaded is not None or config.config in kept.reports):
+            if len(done) == len(config.view_ids) and (loaded is not None or config.config in kept.run.reports):
                 continue
             predictor = _prepare_method(method, config, kept, progress) if loaded is None else loaded
             _predict_config(method, predictor, config, kept, done, progress)
-        reports = noted | kept.reports
+        reports = noted | kept.run.reports
         _write_archive(method, target, kept, views, reports)
         kept.remove()
     return reports
@@ -186,14 +186,15 @@ def _first_row_report(method: AnyMethod, views: Views) -> PreparationReport | No
 
 def _plain_notes(method: AnyMethod, config: str, notes: Mapping[str, Any]) -> dict[str, Any]:
     """Return notes as they are read from JSON. Raises ``MethodError`` unless all are plain JSON values."""
+    plain: dict[str, Any] = {}
     for key, value in notes.items():
         try:
-            json.dumps({key: value}, allow_nan=False)
+            plain |= json.loads(json.dumps({key: value}, allow_nan=False))
         except (TypeError, ValueError) as error:
             raise MethodError(
                 f"{method.info.name}: {config}: the note {key!r} is not a plain JSON value: {error}"
             ) from None
-    return dict(json.loads(json.dumps(dict(notes))))
+    return plain
 
 
 def _prepare_method(method: AnyMethod, views: Views, kept: KeptViews, progress: Progress) -> Predictor:
@@ -207,7 +208,7 @@ def _prepare_method(method: AnyMethod, views: Views, kept: KeptViews, progress: 
     if not isinstance(prepared, Prepared):
         raise MethodError(f"{method.info.name}: prepare returned {type(prepared).__name__}, expected a Prepared")
     notes = _plain_notes(method, views.config, prepared.notes)
-    if views.config not in kept.reports:
+    if views.config not in kept.run.reports:
         seconds = round(time.perf_counter() - start, 1) if started_from_scratch else None
         kept.put_report(views.config, PreparationReport(notes=notes, seconds=seconds))
     return prepared.predict
@@ -258,12 +259,10 @@ def _write_archive(
 # Rectified images for methods that do not read the lens distortion, and their depth on the raw left grid.
 #
 # A method that reads the right image is given the rectified pair (``geometry.rectification``), another one the
-# undistorted left image (``geometry.undistortion``). Its depth is transferred to the raw left image without
-# interpolation. Multi-view methods, and those that read ``left_distortion``, do this themselves.
+# undistorted left image. Its depth is transferred to the raw left image without interpolation. Multi-view methods,
+# and those that read ``left_distortion``, do this themselves.
 
 _MONO_COLUMNS = ("left_rgb", "left_K", "left_distortion")
-_RECTIFIED_COLUMNS = frozenset(("left_rgb", "right_rgb", "left_K", "right_K", "right_distortion", "baseline_m"))
-"""Columns of a rectified row. The poses of a rectified pair are not among them."""
 
 
 def rectifying_predictor(predictor: Predictor, columns: Sequence[str]) -> tuple[Predictor, tuple[str, ...]]:
@@ -272,48 +271,27 @@ def rectifying_predictor(predictor: Predictor, columns: Sequence[str]) -> tuple[
     ``columns`` are those that ``predictor`` reads. Raises ``MethodError`` if a rectified row lacks one of them,
     and if OpenCV is missing.
     """
-    if others := sorted(set(columns) - _RECTIFIED_COLUMNS):
+    if others := sorted(set(columns) - RECTIFIED_COLUMNS):
         raise MethodError(
             f"the images are not rectified: the method needs {', '.join(others)}, expected columns among "
-            f"{', '.join(sorted(_RECTIFIED_COLUMNS))}, or left_distortion if it rectifies them itself"
+            f"{', '.join(sorted(RECTIFIED_COLUMNS))}, or left_distortion if it rectifies them itself"
         )
-    try:
-        import cv2  # noqa: F401
-    except ImportError as error:
-        raise MethodError(
-            f"the images are not rectified, which needs OpenCV ({error}): pip install 'rebar-depth-bench[methods]'"
-        ) from None
+    rectification = import_optional(
+        "rebar_depth_bench.geometry.rectification", "the images are not rectified, which needs OpenCV", "methods"
+    )
     is_stereo = any(name.startswith("right_") or name == "baseline_m" for name in columns)
 
     def predict_raw(row: Mapping[str, Any]) -> Float[ndarray, "h w"]:
-        cells, on_raw_grid = _rectified_pair(row) if is_stereo else _undistorted_left(row)
+        if is_stereo:
+            pair = rectification.rectified_pair(row)
+            cells, on_raw_grid = pair_row(pair), partial(rectification.raw_depth_m, pair)
+        else:
+            height, width, _ = row["left_rgb"].shape
+            grid = rectification.pinhole_grid(row, width, height)
+            cells = {"left_rgb": rectification.pinhole_image(row, grid), "left_K": grid.K}
+            on_raw_grid = grid.depth_on_left_grid
         depth_m = predictor({"view_id": row["view_id"], **{name: cells[name] for name in columns}})
         where = f"{row['view_id']}, rectified"
         return np.asarray(on_raw_grid(_validated_depth(where, depth_m, cells["left_rgb"].shape[:2])))
 
     return predict_raw, STEREO_COLUMNS if is_stereo else _MONO_COLUMNS
-
-
-def _rectified_pair(row: Mapping[str, Any]) -> tuple[dict[str, Any], Callable[[Any], Any]]:
-    """Return the cells of the rectified row of a raw one, and the function of its depth on the raw left grid."""
-    from rebar_depth_bench.geometry.rectification import raw_depth_m, rectified_pair
-
-    pair = rectified_pair(row)
-    cells = {
-        "left_rgb": pair.left_rgb,
-        "right_rgb": pair.right_rgb,
-        "left_K": pair.K,
-        "right_K": pair.K,
-        "right_distortion": np.zeros(5),
-        "baseline_m": pair.baseline_m,
-    }
-    return cells, partial(raw_depth_m, pair)
-
-
-def _undistorted_left(row: Mapping[str, Any]) -> tuple[dict[str, Any], Callable[[Any], Any]]:
-    """Return the cells of the undistorted left image of a raw row, as ``_rectified_pair``."""
-    from rebar_depth_bench.geometry.rectification import pinhole_grid, pinhole_image
-
-    height, width, _ = row["left_rgb"].shape
-    grid = pinhole_grid(row, width, height)
-    return {"left_rgb": pinhole_image(row, grid), "left_K": grid.K}, grid.depth_on_left_grid

@@ -10,7 +10,7 @@ TIP 2014, guided by the left image, with left-right consistency as confidence (o
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -18,8 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 from numpy import ndarray
 
-from rebar_depth_bench.errors import MethodError
-from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
+from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor, import_optional
 
 if TYPE_CHECKING:
     from rebar_depth_bench.geometry.rectification import RectifiedPair
@@ -33,21 +32,12 @@ STEREO_COLUMNS = (
     *("left_cam_from_world", "right_cam_from_world", "baseline_m"),
 )
 """Dataset columns that stereo methods read."""
+RECTIFIED_COLUMNS = frozenset(("left_rgb", "right_rgb", "left_K", "right_K", "right_distortion", "baseline_m"))
+"""Columns of a rectified row. The poses of a rectified pair are not among them."""
 
 
-@dataclass(frozen=True, eq=False)
-class StereoImages:
-    """Rectified left and right RGB images of the same size, with their pinhole matrices (pixels) and baseline."""
-
-    left_rgb: UInt8[ndarray, "h w 3"]
-    right_rgb: UInt8[ndarray, "h w 3"]
-    K_left: Float64[ndarray, "3 3"]
-    K_right: Float64[ndarray, "3 3"]
-    baseline_m: float
-
-
-Matcher = Callable[[StereoImages], Float32[ndarray, "h w"]]
-"""Function from rectified images to the disparity of the left one, pixels; <= 0 where there is none.
+Matcher = Callable[[Mapping[str, Any]], Float32[ndarray, "h w"]]
+"""Function from a rectified row to the disparity of its left image, pixels; <= 0 where there is none.
 
 The match of a pixel must lie inside the right image (``without_invisible``).
 """
@@ -61,40 +51,54 @@ def stereo_depth_m(row: Mapping[str, Any], match: Matcher) -> Float32[ndarray, "
     """
     from rebar_depth_bench.geometry import rectification
 
-    images, pair = rectified_images(row)
-    disparity_px = match(images)
-    depth_m = disparity_to_depth_m(disparity_px, images.K_left, images.K_right, images.baseline_m)
+    rectified, pair = rectified_row(row)
+    disparity_px = match(rectified)
+    depth_m = disparity_to_depth_m(
+        disparity_px, rectified["left_K"], rectified["right_K"], rectified["baseline_m"]
+    )
     if pair is None:
         return depth_m
     depth_m[~rectification.matched_in_right(pair, disparity_px)] = np.nan
     return rectification.raw_depth_m(pair, depth_m)
 
 
-def rectified_images(row: Mapping[str, Any]) -> tuple[StereoImages, RectifiedPair | None]:
-    """Return the rectified images of a row with ``STEREO_COLUMNS``, and the mapping back to a raw left image.
+def rectified_row(row: Mapping[str, Any]) -> tuple[Mapping[str, Any], RectifiedPair | None]:
+    """Return a row with ``STEREO_COLUMNS`` as a rectified row, and the mapping back to its raw left image.
 
-    The mapping is None if the row's own images are rectified. Needs OpenCV.
+    They are the row itself and None if its images are rectified. Needs OpenCV.
     """
     from rebar_depth_bench.geometry import rectification
 
     if rectification.is_rectified(row):
-        names = ("left_rgb", "right_rgb", "left_K", "right_K", "baseline_m")
-        return StereoImages(*(row[name] for name in names)), None
+        return row, None
     pair = rectification.rectified_pair(row)
-    return StereoImages(pair.left_rgb, pair.right_rgb, pair.K, pair.K, pair.baseline_m), pair
+    return pair_row(pair), pair
 
 
-def largest_disparity_px(images: StereoImages, nearest_m: float | None = None) -> float:
+def pair_row(pair: RectifiedPair) -> dict[str, Any]:
+    """Return the ``RECTIFIED_COLUMNS`` of a rectified pair."""
+    return {
+        "left_rgb": pair.left_rgb,
+        "right_rgb": pair.right_rgb,
+        "left_K": pair.K,
+        "right_K": pair.K,
+        "right_distortion": np.zeros(5),
+        "baseline_m": pair.baseline_m,
+    }
+
+
+def largest_disparity_px(rectified: Mapping[str, Any], nearest_m: float | None = None) -> float:
     """Return the largest expected disparity, pixels: that of a surface at ``nearest_m``, at most the image width.
 
     Without a nearest distance it is ``SEARCH_SHARE_OF_WIDTH`` of the width. No pixel has a match at a disparity
     beyond the width.
     """
-    width = images.left_rgb.shape[1]
+    width = rectified["left_rgb"].shape[1]
     if nearest_m is None:
-        return SEARCH_SHARE_OF_WIDTH * width
-    parallax_px = images.K_left[0, 0] * images.baseline_m / nearest_m
-    return float(np.clip(parallax_px + images.K_left[0, 2] - images.K_right[0, 2], 0, width))
+        return float(SEARCH_SHARE_OF_WIDTH * width)
+    left_K, right_K = rectified["left_K"], rectified["right_K"]
+    parallax_px = left_K[0, 0] * rectified["baseline_m"] / nearest_m
+    return float(np.clip(parallax_px + left_K[0, 2] - right_K[0, 2], 0, width))
 
 
 def without_invisible(disparity_px: Float32[ndarray, "h w"]) -> Float32[ndarray, "h w"]:
@@ -138,16 +142,11 @@ A bar and its background differ by far more.
 
 
 def _load(*, check_consistency: bool) -> Predictor:
-    try:
-        import cv2.ximgproc  # noqa: F401
-    except ImportError as error:
-        raise MethodError(
-            f"sgbm needs OpenCV with ximgproc ({error}): pip install 'rebar-depth-bench[methods]', in an "
-            "environment without opencv-python, which hides it"
-        ) from None
+    need = "sgbm needs OpenCV with ximgproc, in an environment without opencv-python, which hides it"
+    import_optional("cv2.ximgproc", need, "methods")
 
-    def match(images: StereoImages) -> Float32[ndarray, "h w"]:
-        left_px, right_px = filtered_disparities_px(images.left_rgb, images.right_rgb)
+    def match(rectified: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
+        left_px, right_px = filtered_disparities_px(rectified["left_rgb"], rectified["right_rgb"])
         if check_consistency:
             left_px = np.where(left_right_consistent(left_px, right_px), left_px, np.float32(0))
         return without_invisible(left_px)

@@ -7,34 +7,26 @@ comes from the ArUco board, or from the median of ground truth, which is not a m
 
 from __future__ import annotations
 
+import importlib
 from pathlib import Path
-from types import ModuleType
 
 from rebar_depth_bench.data.rows import Views
-from rebar_depth_bench.errors import MethodError
-from rebar_depth_bench.methods.base import MethodInfo, MultiViewMethod, Prepared
+from rebar_depth_bench.methods.base import MethodInfo, MultiViewMethod, Prepared, import_optional
 from rebar_depth_bench.parallel import Progress
 
-
-def _import_pipeline() -> ModuleType:
-    """Return the ``pipeline`` module. Raises ``MethodError`` if pycolmap or OpenCV is not installed."""
-    try:
-        from rebar_depth_bench.methods.multiview import pipeline
-    except ImportError as error:
-        raise MethodError(
-            f"multi-view methods need pycolmap and OpenCV ({error}): pip install 'rebar-depth-bench[multiview]'"
-        ) from None
-    return pipeline
+PIPELINE = "rebar_depth_bench.methods.multiview.pipeline"
+"""Module that needs pycolmap and OpenCV; it is imported when a method is used."""
 
 
 def _method(name: str, *, uses_patch_match: bool, is_anchored: bool) -> MultiViewMethod:
     choices = {"uses_patch_match": uses_patch_match, "is_anchored": is_anchored}
 
     def check(views: Views) -> None:
-        _import_pipeline().check(views, name, **choices)
+        pipeline = import_optional(PIPELINE, "multi-view methods need pycolmap and OpenCV", "multiview")
+        pipeline.check(views, name, **choices)
 
     def prepare(views: Views, work: Path, progress: Progress) -> Prepared:
-        prepared: Prepared = _import_pipeline().prepare(views, work, progress, **choices)
+        prepared: Prepared = importlib.import_module(PIPELINE).prepare(views, work, progress, **choices)
         return prepared
 
     if uses_patch_match:

@@ -43,6 +43,10 @@ def row_columns(views: Views) -> tuple[str, ...]:
     return (*columns, "left_cam_from_world") if views.has_poses else columns
 
 
+Poses = Mapping[str, Float64[ndarray, "4 4"]]
+"""Camera poses (cam_from_...) by image name."""
+
+
 @dataclass(frozen=True, eq=False)
 class LeftImages:
     """Undistorted images in ``folder``, with the pinhole grid that they share.
@@ -55,7 +59,7 @@ class LeftImages:
     names: Mapping[str, str]
     grid: PinholeGrid
     markers: Mapping[str, Corners]
-    cam_from_world: Mapping[str, Float64[ndarray, "4 4"]]
+    cam_from_world: Poses
 
     @property
     def no_depth(self) -> Float32[ndarray, "h w"]:
@@ -129,7 +133,7 @@ COLMAP_PIXEL_CENTRE = 0.5
 class SparseReconstruction:
     """Sparse points, and poses of registered views and the indices of the points they observe, by image name."""
 
-    cam_from_sfm: Mapping[str, Float64[ndarray, "4 4"]]
+    cam_from_sfm: Poses
     points: Float64[ndarray, "n 3"]
     visible_points: Mapping[str, Int64[ndarray, " m"]]
     reprojection_px: float
@@ -177,30 +181,40 @@ def _run_colmap(left_images: LeftImages, board: BoardSpec | None, work: Path, pr
         images,
         image_names=names,
         camera_mode=pycolmap.CameraMode.SINGLE,
-        options=_reader_options(K),
+        options=pycolmap.ImageReaderOptions(
+            camera_model=CAMERA_MODEL, camera_params=", ".join(map(repr, camera_parameters(K)))
+        ),
     )
+    # With affine shape estimation: rods turn away from the camera within a few views.
+    sift = {"estimate_affine_shape": True, "domain_size_pooling": True, "peak_threshold": SIFT_PEAK_THRESHOLD}
     pycolmap.extract_features(
         database,
         images,
         image_names=names,
-        extraction_options=_extraction_options(),
+        extraction_options=pycolmap.FeatureExtractionOptions(sift=sift),
         device=pycolmap.Device.cpu,
     )
     progress(stages, 1, 3)
-    verification = pycolmap.TwoViewGeometryOptions()
-    verification.ransac.random_seed = SEED
+    verification = pycolmap.TwoViewGeometryOptions(ransac={"random_seed": SEED})
     if board is None:
         pycolmap.match_exhaustive(database, verification_options=verification, device=pycolmap.Device.cpu)
     else:
         pairs = select_pairs(left_images.markers, board, K)
-        pairing = pycolmap.ImportedPairingOptions()
-        pairing.match_list_path = work / "pairs.txt"
-        pairing.match_list_path.write_text("".join(f"{name} {other}\n" for name, other in pairs))
+        match_list = work / "pairs.txt"
+        match_list.write_text("".join(f"{name} {other}\n" for name, other in pairs))
+        pairing = pycolmap.ImportedPairingOptions(match_list_path=match_list)
         pycolmap.match_image_pairs(
             database, pairing_options=pairing, verification_options=verification, device=pycolmap.Device.cpu
         )
     progress(stages, 2, 3)
-    models = pycolmap.incremental_mapping(database, images, models_folder, options=_mapping_options())
+    mapping = pycolmap.IncrementalPipelineOptions(
+        ba_refine_focal_length=False,
+        ba_refine_extra_params=False,
+        mapper={"abs_pose_refine_focal_length": False, "abs_pose_refine_extra_params": False},
+        random_seed=SEED,
+        num_threads=1,  # Results are not reproducible with more threads.
+    )
+    models = pycolmap.incremental_mapping(database, images, models_folder, options=mapping)
     progress(stages, 3, 3)
     if not models:
         raise MethodError(f"COLMAP found no matching pair among {len(names)} images")
@@ -215,34 +229,6 @@ def camera_parameters(K: Float64[ndarray, "3 3"]) -> list[float]:
     """Return fx, fy and the principal point, pixels, of ``CAMERA_MODEL``."""
     centre = K[:2, 2] + COLMAP_PIXEL_CENTRE
     return [float(K[0, 0]), float(K[1, 1]), *centre.tolist()]
-
-
-def _reader_options(K: Float64[ndarray, "3 3"]) -> pycolmap.ImageReaderOptions:
-    reader = pycolmap.ImageReaderOptions()
-    reader.camera_model = CAMERA_MODEL
-    reader.camera_params = ", ".join(map(repr, camera_parameters(K)))
-    return reader
-
-
-def _extraction_options() -> pycolmap.FeatureExtractionOptions:
-    """Return SIFT options with affine shape estimation: rods turn away from the camera within a few views."""
-    options = pycolmap.FeatureExtractionOptions()
-    options.sift.estimate_affine_shape = True
-    options.sift.domain_size_pooling = True
-    options.sift.peak_threshold = SIFT_PEAK_THRESHOLD
-    return options
-
-
-def _mapping_options() -> pycolmap.IncrementalPipelineOptions:
-    """Return mapping options with fixed intrinsics."""
-    options = pycolmap.IncrementalPipelineOptions()
-    options.ba_refine_focal_length = False
-    options.ba_refine_extra_params = False
-    options.mapper.abs_pose_refine_focal_length = False
-    options.mapper.abs_pose_refine_extra_params = False
-    options.random_seed = SEED
-    options.num_threads = 1  # Results are not reproducible with more threads.
-    return options
 
 
 def _from_pycolmap(model: pycolmap.Reconstruction) -> SparseReconstruction:

@@ -12,6 +12,7 @@ import mmap
 from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePosixPath
 
+from rebar_depth_bench.data.files import files_digest
 from rebar_depth_bench.errors import MethodError, Problem, escape_text
 from rebar_depth_bench.methods.onnx.spec import is_file
 from rebar_depth_bench.reading import open_regular
@@ -40,6 +41,7 @@ _KEY, _VALUE = 1, 2
 _VARINT, _BYTES, _FIXED_LENGTHS = 0, 2, {1: 8, 5: 4}
 _MAX_TAG = 0xFFFFFFFF
 """Largest tag; the protobuf library drops higher bits, which would make it another field."""
+_DIGEST_CHARACTERS = 16
 _ORT_FORMAT = ".ort"
 """Suffix of files in onnxruntime's own format, which have no external data."""
 
@@ -49,6 +51,15 @@ _Field = tuple[int, int | slice]
 
 class _DamagedError(Exception):
     """Bytes that are no protobuf message."""
+
+
+def model_digest(path: Path, model: Path) -> str:
+    """Return the digest of the TOML file, the model and its external data."""
+    files = (path, model, *external_files(model))
+    try:
+        return files_digest(files)[:_DIGEST_CHARACTERS]
+    except OSError as error:
+        raise MethodError(f"{error.filename}: cannot be read: {error.strerror}") from None
 
 
 def external_files(model: Path) -> list[Path]:

@@ -8,7 +8,8 @@ i to i + 1 with its centre at i + 0.5.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import os
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,11 +19,17 @@ from jaxtyping import Float, Float32, Float64, UInt8
 from numpy import ndarray
 from PIL import Image
 
-from rebar_depth_bench.data.files import files_digest
-from rebar_depth_bench.errors import MethodError
-from rebar_depth_bench.methods.base import VIEW_TIMEOUT_S, Method, MethodInfo, Predictor
-from rebar_depth_bench.methods.onnx.external_data import external_files
-from rebar_depth_bench.methods.onnx.session import open_session
+from rebar_depth_bench.errors import MethodError, Problem
+from rebar_depth_bench.limits import ONNX_MEMORY_BYTES, DeadlineError, call_within
+from rebar_depth_bench.methods.base import (
+    VIEW_TIMEOUT_S,
+    Method,
+    MethodInfo,
+    Predictor,
+    import_optional,
+    positive_or_nan,
+)
+from rebar_depth_bench.methods.onnx.external_data import model_digest
 from rebar_depth_bench.methods.onnx.spec import OUTPUT_MEANINGS, InputSpec, OnnxSpec, OutputSpec, read_onnx_toml
 
 
@@ -49,12 +56,8 @@ class AxisPlacement:
         return slice(self.pad_before_px, self.pad_before_px + self.resized_px)
 
 
-@dataclass(frozen=True)
-class Placement:
-    """Placement of an image in the model input: ``across`` is the x axis, ``down`` the y axis."""
-
-    across: AxisPlacement
-    down: AxisPlacement
+Placement = tuple[AxisPlacement, AxisPlacement]
+"""Placement of an image in the model input, along the x axis (across) and along the y axis (down)."""
 
 
 def place_image(spec: InputSpec, width: int, height: int) -> Placement:
@@ -69,11 +72,12 @@ def place_image(spec: InputSpec, width: int, height: int) -> Placement:
         across, down = (max(round(side * ratio / multiple_px), 1) * multiple_px for side in (width, height))
         canvas = (across, down)
     ratio = min(canvas[0] / width, canvas[1] / height)
-    axes = []
-    for side, canvas_side in zip((width, height), canvas, strict=True):
+
+    def along(side: int, canvas_side: int) -> AxisPlacement:
         fitted = min(max(round(side * ratio), 1), canvas_side)
-        axes.append(AxisPlacement(side, fitted if spec.resize == "pad" else canvas_side, canvas_side))
-    return Placement(*axes)
+        return AxisPlacement(side, fitted if spec.resize == "pad" else canvas_side, canvas_side)
+
+    return along(width, canvas[0]), along(height, canvas[1])
 
 
 def input_tensor(
@@ -84,12 +88,13 @@ def input_tensor(
     The 8-bit image is resized with Pillow, which antialiases when shrinking, unlike the default resize functions
     of OpenCV and torch.
     """
-    size = (placement.across.resized_px, placement.down.resized_px)
+    across, down = placement
+    size = (across.resized_px, down.resized_px)
     kernel = Image.Resampling.BICUBIC if spec.interpolation == "bicubic" else Image.Resampling.BILINEAR
     resized = np.asarray(Image.fromarray(rgb).resize(size, kernel), np.float64)
     normalised = (resized * (spec.range / 255) - np.array(spec.mean)) / np.array(spec.std)
-    tensor = np.zeros((1, 3, placement.down.canvas_px, placement.across.canvas_px))
-    tensor[0, :, placement.down.image_slice, placement.across.image_slice] = normalised.transpose(2, 0, 1)
+    tensor = np.zeros((1, 3, down.canvas_px, across.canvas_px))
+    tensor[0, :, down.image_slice, across.image_slice] = normalised.transpose(2, 0, 1)
     return tensor
 
 
@@ -102,8 +107,8 @@ def sample_at_image_pixels(
     neighbour is NaN; it is smooth, but at the edge of a bar it produces depth that lies neither on the bar nor
     behind it.
     """
-    columns_sampled = _sample_axis(placement.across, values, 1, bilinear)
-    return _sample_axis(placement.down, columns_sampled, 0, bilinear)
+    across, down = placement
+    return _sample_axis(down, _sample_axis(across, values, 1, bilinear), 0, bilinear)
 
 
 def _sample_axis(
@@ -145,7 +150,6 @@ def _unpadded_cells(span: AxisPlacement, cells: int) -> tuple[int, int]:
 
 TRIAL_SIZE_PX = (1280, 720)
 """Width and height, pixels, of the black image on which a model is run once when it is loaded."""
-_DIGEST_CHARACTERS = 16
 
 
 def onnx_method(path: Path, view_timeout_s: float = VIEW_TIMEOUT_S) -> Method:
@@ -164,61 +168,221 @@ def onnx_method(path: Path, view_timeout_s: float = VIEW_TIMEOUT_S) -> Method:
         summary=spec.summary or f"ONNX model {model.name}; its output: {meaning.description}",
         columns=("left_rgb", "left_K") if meaning.canonical else ("left_rgb",),
         uses_intrinsics=meaning.canonical,
-        source=f"{spec.source or model.name} (sha256:{_model_digest(path, model)})",
+        source=f"{spec.source or model.name} (sha256:{model_digest(path, model)})",
         licence=spec.licence,
     )
     return Method(info, lambda: _load(spec, view_timeout_s))
 
 
 def output_to_depth_m(
-    values: Float[ndarray, "*grid"], output: OutputSpec, fx_at_input_px: float = np.nan
+    values: Float[ndarray, "*grid"], output: OutputSpec, factor: float = 1.0
 ) -> Float32[ndarray, "*grid"]:
     """Return planar depth in metres of output values.
 
-    Depth is v or 1 / v, where v is the value times ``scale``; for canonical meanings it is multiplied by fx /
-    focal_canonical (Yin et al., "Metric3D", ICCV 2023, section 3.2). ``fx_at_input_px`` is the focal length of the
-    resized image that the model receives. Depth is NaN where the value is not finite, or the depth is not finite
-    and above 0 or lies outside ``min_m`` to ``max_m``.
+    Depth is v or 1 / v, where v is the value times ``scale``, multiplied by ``factor``. It is NaN where the value
+    is not finite, or the depth is not finite and above 0 or lies outside ``min_m`` to ``max_m``.
     """
-    meaning = OUTPUT_MEANINGS[output.meaning]
-    factor = fx_at_input_px / (output.focal_canonical_px or np.nan) if meaning.canonical else 1.0
     scaled = np.asarray(values, np.float64) * output.scale
     with np.errstate(all="ignore"):
-        depth_m = np.asarray(factor / scaled if meaning.inverse else factor * scaled)
-        single = depth_m.astype(np.float32)
-    valid = np.isfinite(scaled) & np.isfinite(single) & (single > 0)
-    valid &= (depth_m >= output.min_m) & (depth_m <= output.max_m)
-    return np.where(valid, single, np.float32(np.nan))
+        depth_m = np.asarray(factor / scaled if OUTPUT_MEANINGS[output.meaning].inverse else factor * scaled)
+    valid = np.isfinite(scaled) & (depth_m >= output.min_m) & (depth_m <= output.max_m)
+    return positive_or_nan(np.where(valid, depth_m, np.nan))
 
 
 def _load(spec: OnnxSpec, view_timeout_s: float) -> Predictor:
-    session = open_session(Path(spec.model), spec.input, spec.output, view_timeout_s)
-    width, height = TRIAL_SIZE_PX
+    session = open_session(spec, view_timeout_s)
     # The output shape of a model with dynamic sizes is only known after a run.
-    black = np.zeros((height, width, 3), dtype=np.uint8)
-    session.run(input_tensor(spec.input, place_image(spec.input, width, height), black), "a black trial image")
+    placement, black = place_image(spec.input, *TRIAL_SIZE_PX), np.zeros((*TRIAL_SIZE_PX[::-1], 3), np.uint8)
+    session.run(input_tensor(spec.input, placement, black), "a black trial image")
 
     def predict(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
         height, width, _ = row["left_rgb"].shape
         placement = place_image(spec.input, width, height)
         tensor = input_tensor(spec.input, placement, row["left_rgb"])
         values = session.run(tensor, row.get("view_id", "the image"))
-        fx_at_input_px = np.nan
-        if OUTPUT_MEANINGS[spec.output.meaning].canonical:
-            fx_at_input_px = row["left_K"][0, 0] * (placement.across.resized_px / width)
+        factor = 1.0
+        if focal_px := spec.output.focal_canonical_px:
+            # That of the resized image that the model receives (Yin et al., "Metric3D", ICCV 2023, section 3.2).
+            factor = row["left_K"][0, 0] * (placement[0].resized_px / width) / focal_px
         # Invalid values become NaN before resampling, so that they are not interpolated with neighbours.
-        is_invalid = np.isnan(output_to_depth_m(values, spec.output, fx_at_input_px))
+        is_invalid = np.isnan(output_to_depth_m(values, spec.output, factor))
         valid = np.where(is_invalid, np.nan, values)
         sampled = sample_at_image_pixels(placement, valid, bilinear=spec.output.resize == "bilinear")
-        return output_to_depth_m(sampled, spec.output, fx_at_input_px)
+        return output_to_depth_m(sampled, spec.output, factor)
 
     return predict
 
 
-def _model_digest(path: Path, model: Path) -> str:
-    """Return the digest of the TOML file, the model and its external data."""
-    files = (path, model, *external_files(model))
+PROVIDERS = ("CUDAExecutionProvider", "CPUExecutionProvider")
+"""Execution providers in order of preference; those that onnxruntime does not offer are skipped."""
+_FLOAT_DTYPES: Mapping[str, type] = {
+    "tensor(float)": np.float32,
+    "tensor(float16)": np.float16,
+    "tensor(double)": np.float64,
+}
+_LOG_ERRORS_ONLY, _LOG_NOTHING = 3, 4
+_MAX_ERROR_CHARACTERS = 300
+_OUT_OF_MEMORY = "Available memory of"
+"""Part of onnxruntime's message if its memory arena cannot grow any further."""
+
+
+# Inference sessions for models with one image input and one map output.
+
+
+@dataclass(frozen=True)
+class OnnxSession:
+    """Open model with one RGB image as input; ``timeout_s`` limits each inference."""
+
+    session: Any
+    spec: OnnxSpec
+    output_name: str
+    timeout_s: float
+
+    def run(self, tensor: Float64[ndarray, "1 3 h w"], view: str) -> Float64[ndarray, "out_h out_w"]:
+        """Return the output map for one normalised image; ``view`` names it in error messages.
+
+        Raises ``MethodError`` if the model fails or exceeds the time limit, or if the output is not a single map
+        or, with ``at_input_size``, not of the input's size.
+        """
+        import onnxruntime
+
+        [image_input] = self.session.get_inputs()
+        inputs: dict[str, ndarray] = {image_input.name: tensor.astype(_FLOAT_DTYPES[image_input.type])}
+        options = onnxruntime.RunOptions()
+        options.log_severity_level = _LOG_NOTHING
+        try:
+            [output] = call_within(
+                self.timeout_s,
+                lambda: self.session.run([self.output_name], inputs, options),
+                lambda: setattr(options, "terminate", True),  # It stops between two operators.
+            )
+        except DeadlineError:
+            raise MethodError(f"{self.spec.model}: {view}: {_exceeded(self.timeout_s)}") from None
+        except Exception as error:  # The exceptions of onnxruntime have no common base.
+            size = " x ".join(map(str, tensor.shape))
+            raise MethodError(f"{self.spec.model}: fails on an input of {size}: {_error_text(error)}") from None
+        shape = tuple(np.shape(output))
+        name = f"{self.spec.model}: output {self.output_name!r}"
+        if len(shape) < 2 or set(shape[:-2]) - {1} or not np.size(output):
+            raise MethodError(
+                f"{name} has the shape {shape}, expected H x W, with optional leading dimensions of 1"
+            )
+        if self.spec.output.at_input_size and shape[-2:] != tensor.shape[-2:]:
+            expected = " x ".join(map(str, tensor.shape[-2:]))
+            raise MethodError(
+                f"{name} has the shape {shape}, expected {expected} or [output] at_input_size = false"
+            )
+        return np.asarray(output, np.float64).reshape(shape[-2:])
+
+
+def open_session(spec: OnnxSpec, timeout_s: float) -> OnnxSession:
+    """Open a model and check that its input and output match the TOML file.
+
+    ``timeout_s`` limits opening, where onnxruntime computes constants, and each inference. Raises ``MethodError``
+    if onnxruntime is missing or cannot open the file, or if input or output do not match.
+    """
+    onnxruntime = import_optional("onnxruntime", "an ONNX model needs onnxruntime", "onnx")
+    onnxruntime.set_default_logger_severity(_LOG_ERRORS_ONLY)
+    options = onnxruntime.SessionOptions()
+    options.log_severity_level = _LOG_ERRORS_ONLY
+    # Without a number, it pins threads to processors and prints an error for each that the process may not use.
+    options.intra_op_num_threads = len(os.sched_getaffinity(0))
+    _limit_memory(onnxruntime, options)
+    available = onnxruntime.get_available_providers()
+    providers = [name for name in PROVIDERS if name in available]
     try:
-        return files_digest(files)[:_DIGEST_CHARACTERS]
-    except OSError as error:
-        raise MethodError(f"{error.filename}: cannot be read: {error.strerror}") from None
+        session = call_within(
+            timeout_s,
+            lambda: onnxruntime.InferenceSession(spec.model, options, providers=providers),
+            # Versions before 1.21 do not have it.
+            lambda: getattr(options, "set_load_cancellation_flag", bool)(True),
+        )
+    except DeadlineError:
+        raise MethodError(f"{spec.model}: opening the model {_exceeded(timeout_s)}") from None
+    except Exception as error:
+        raise MethodError(f"{spec.model}: onnxruntime cannot open this model: {_error_text(error)}") from None
+    inputs, outputs = session.get_inputs(), session.get_outputs()
+    problems = _input_problems(inputs, spec.input)
+    output = _select_output(outputs, spec.output, problems)
+    if problems or output is None:
+        raise MethodError.from_problems(spec.model, problems)
+    return OnnxSession(session, spec, output.name, timeout_s)
+
+
+def _limit_memory(onnxruntime: Any, options: Any) -> None:
+    """Give sessions a common CPU memory arena that cannot grow past the limit or the machine's memory."""
+    max_bytes = min(ONNX_MEMORY_BYTES.value(), os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    arena, default = onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR, onnxruntime.OrtMemType.DEFAULT
+    onnxruntime.create_and_register_allocator(
+        onnxruntime.OrtMemoryInfo("Cpu", arena, 0, default), onnxruntime.OrtArenaCfg(max_bytes, -1, -1, -1)
+    )
+    options.add_session_config_entry("session.use_env_allocators", "1")
+
+
+def _exceeded(timeout_s: float) -> str:
+    return f"takes longer than the limit of {timeout_s:g} s, which --view-timeout changes"
+
+
+def _input_problems(inputs: Sequence[Any], spec: InputSpec) -> list[Problem]:
+    """Return problems of the model's inputs: exactly one, floating point, of the expected shape."""
+    if len(inputs) != 1:
+        names = ", ".join(repr(entry.name) for entry in inputs) or "none"
+        return [Problem("invalid", "input", f"the model takes {len(inputs)} ({names})", "one: the image")]
+    [image_input] = inputs
+    # The shape is empty if the model leaves even the rank undefined.
+    shape_problems = _shape_problems(image_input.shape, spec) if image_input.shape else []
+    return [*_dtype_problems("input", image_input), *shape_problems]
+
+
+def _dtype_problems(where: str, entry: Any) -> list[Problem]:
+    """Return the problem of an input or output that is not floating point."""
+    found, expected = f"{entry.name!r} is {entry.type}", f"one of {', '.join(_FLOAT_DTYPES)}"
+    return [] if entry.type in _FLOAT_DTYPES else [Problem("invalid", where, found, expected)]
+
+
+def _shape_problems(shape: Sequence[int | str | None], spec: InputSpec) -> list[Problem]:
+    """Return problems of an input shape; sides that are not positive integers are dynamic."""
+    found = f"the model takes {' x '.join(str(side) if _is_fixed(side) else '?' for side in shape)}"
+    if len(shape) != 4:
+        return [Problem("invalid", "input", found, "1 x 3 x H x W")]
+    batch, channels, *sides = shape
+    configured = (None, None) if spec.size_px is None else spec.size_px[::-1]
+    channels_last = shape[-1] == 3 != channels and configured[1] != 3
+    if channels_last or (_is_fixed(batch) and batch != 1) or (_is_fixed(channels) and channels != 3):
+        hint = ": channels come before height and width" if channels_last else ""
+        return [Problem("invalid", "input", found, f"1 x 3 x H x W{hint}")]
+    return [
+        Problem("size", f"input.{name}", f"got {got or 'a variable size (longest_side)'}, {found}", str(side))
+        for name, side, got in zip(("height", "width"), sides, configured, strict=True)
+        if _is_fixed(side) and side != got
+    ]
+
+
+def _is_fixed(side: int | str | None) -> bool:
+    return isinstance(side, int) and side > 0
+
+
+def _select_output(outputs: Sequence[Any], spec: OutputSpec, problems: list[Problem]) -> Any:
+    """Return the output that the TOML file selects; if it does not exist, append to ``problems``, return None."""
+    expected = f"one of {', '.join(repr(output.name) for output in outputs)}"
+    if spec.name is None and spec.index is None and len(outputs) != 1:
+        problems.append(Problem("missing", "output.name", f"the model has {len(outputs)} outputs", expected))
+        return None
+    if spec.name is not None:
+        matches = [output for output in outputs if output.name == spec.name]
+        missing = Problem("unknown", "output.name", f"the model has no output {spec.name!r}", expected)
+    else:
+        matches = list(outputs[spec.index or 0 :][:1])
+        missing = Problem("unknown", "output.index", f"the model has no output {spec.index}", expected)
+    if not matches:
+        problems.append(missing)
+        return None
+    problems += _dtype_problems("output", matches[0])
+    return matches[0]
+
+
+def _error_text(error: Exception) -> str:
+    """Return the message of an exception on one line, truncated."""
+    message = " ".join(str(error).split())
+    hint = f"; {ONNX_MEMORY_BYTES.variable} raises the limit" if _OUT_OF_MEMORY in message else ""
+    return f"{message[:_MAX_ERROR_CHARACTERS]}{' ...' if len(message) > _MAX_ERROR_CHARACTERS else ''}{hint}"

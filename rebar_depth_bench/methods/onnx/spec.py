@@ -156,11 +156,6 @@ class OutputSpec(StrictModel):  # Order matters: validators read the fields abov
     at_input_size: Flag = True
     resize: Annotated[str, one_of("nearest", "bilinear")] = "nearest"
 
-    @property
-    def name_or_index(self) -> str | int | None:
-        """Name or index of the output; None: the model's only one."""
-        return self.index if self.name is None else self.name
-
     @field_validator("focal_canonical_px")
     @classmethod
     def _check_focal(cls, focal_px: float | None, info: ValidationInfo) -> float | None:

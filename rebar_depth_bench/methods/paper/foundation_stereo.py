@@ -35,20 +35,25 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Float32
 from numpy import ndarray
 
 from rebar_depth_bench.captures.documents import parse_document
 from rebar_depth_bench.errors import MethodError, Problem
 from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
-from rebar_depth_bench.methods.paper.third_party import Network, image_tensor, on_sys_path, torch_device
+from rebar_depth_bench.methods.paper.third_party import (
+    Network,
+    image_tensor,
+    on_sys_path,
+    scaled_image,
+    torch_device,
+)
 from rebar_depth_bench.methods.sgbm import (
     SEARCH_SHARE_OF_WIDTH,
     STEREO_COLUMNS,
-    StereoImages,
     largest_disparity_px,
-    rectified_images,
+    rectified_row,
     stereo_depth_m,
     without_invisible,
 )
@@ -143,10 +148,12 @@ def _load(clone: Path, weights: Path, nearest_m: float | None) -> Predictor:
         model = code.FoundationStereo(settings)
         model = NETWORK.load_checkpoint(model, weights / CHECKPOINT_FILE, "model")
 
-    def match(images: StereoImages) -> Float32[ndarray, "h w"]:
-        is_hierarchical, scale = choose_passes(largest_disparity_px(images, nearest_m), settings.max_disp)
+    def match(rectified: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
+        is_hierarchical, scale = choose_passes(largest_disparity_px(rectified, nearest_m), settings.max_disp)
+        # The demo rounds to the nearest whole side; rounding down never enlarges the disparity.
         pair = [
-            image_tensor(resized(rgb, scale)).to(torch_device()) for rgb in (images.left_rgb, images.right_rgb)
+            image_tensor(scaled_image(rectified[name], scale)).to(torch_device())
+            for name in ("left_rgb", "right_rgb")
         ]
         padder = code.InputPadder(pair[0].shape, divis_by=32, force_square=False)
         with torch.autocast("cuda", enabled=torch.cuda.is_available()):
@@ -157,7 +164,7 @@ def _load(clone: Path, weights: Path, nearest_m: float | None) -> Predictor:
             else:
                 disparity_px = model.forward(*padder.pad(*pair), iters=ITERATIONS, test_mode=True)
         cropped_px = padder.unpad(disparity_px.float()).cpu().numpy().reshape(pair[0].shape[-2:])
-        return full_size_disparity_px(without_invisible(cropped_px), images.left_rgb.shape[:2])
+        return full_size_disparity_px(without_invisible(cropped_px), rectified["left_rgb"].shape[:2])
 
     return NETWORK.predictor(partial(stereo_depth_m, match=match))
 
@@ -182,7 +189,7 @@ def _read_settings(weights: Path) -> Settings:
 def _notes(weights: Path, nearest_m: float | None, row: Mapping[str, Any]) -> dict[str, Any]:
     """Return the mode and scale for a row, with the numbers from which they are chosen."""
     volume_px = _read_settings(weights).max_disp
-    largest_px = largest_disparity_px(rectified_images(row)[0], nearest_m)
+    largest_px = largest_disparity_px(rectified_row(row)[0], nearest_m)
     is_hierarchical, scale = choose_passes(largest_px, volume_px)
     declared = (
         f"{SEARCH_SHARE_OF_WIDTH:g} of the width" if nearest_m is None else f"nearest distance {nearest_m} m"
@@ -204,17 +211,6 @@ def choose_passes(largest_px: float, volume_px: int) -> tuple[bool, float]:
     if largest_px <= volume_px:
         return False, 1.0
     return True, min(1.0, volume_px / (SMALL_RATIO * largest_px))
-
-
-def resized(rgb: UInt8[ndarray, "h w 3"], scale: float) -> UInt8[ndarray, "hs ws 3"]:
-    """Return an image resized by ``scale`` with OpenCV, bilinear as in the demo; sides are rounded down.
-
-    The demo rounds to the nearest whole side; rounding down never enlarges the disparity.
-    """
-    import cv2
-
-    height, width = (max(1, int(side * scale)) for side in rgb.shape[:2])
-    return np.asarray(cv2.resize(rgb, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
 
 
 def full_size_disparity_px(

@@ -2,42 +2,29 @@
 
 from __future__ import annotations
 
-import importlib
 from collections.abc import Mapping
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float32, UInt8
 from numpy import ndarray
 
 from rebar_depth_bench.data.files import files_digest
 from rebar_depth_bench.errors import MethodError
-from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
+from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor, positive_or_nan
 from rebar_depth_bench.methods.paper.third_party import (
     HubNetwork,
     Network,
     hub_download,
     image_tensor,
+    resampled,
+    scaled_image,
     snapshot,
     torch_device,
 )
 
 _UNTESTED = "run only with its authors' code and random weights on a CPU: its weights were not available"
-
-
-def positive_or_nan(depth_m: Float[ndarray, "h w"]) -> Float32[ndarray, "h w"]:
-    """Return depth as float32, with NaN (no prediction) where it is not finite or not above 0."""
-    with np.errstate(over="ignore"):
-        single = depth_m.astype(np.float32)
-    return np.where(np.isfinite(single) & (single > 0), single, np.float32(np.nan))
-
-
-def _bilinear(values: Any, grid: tuple[int, int]) -> Float32[ndarray, "H W"]:
-    """Return a tensor of shape h x w resampled bilinearly to another grid over the same field of view."""
-    functional = importlib.import_module("torch").nn.functional
-    return np.asarray(functional.interpolate(values[None, None], size=grid, mode="bilinear")[0, 0])
 
 
 # Metric3D v2 (M. Hu et al., TPAMI 2024) gets the focal length. As in ``hubconf.py`` of its repository, the image
@@ -86,7 +73,7 @@ def metric3d_with_weights(folder: Path | None) -> Method:
         code = _metric3d_code()
         cached = snapshot(METRIC3D_REPOSITORY, METRIC3D_CHECKPOINT, METRIC3D_LOCAL_COPY)
         versions = f"code {METRIC3D_CACHE} sha256:{files_digest(sorted(code.rglob('*.py')))}"
-        info = replace(network.info, summary=f"{network.info.summary}; {versions}; weights commit {cached.name}")
+        info = network.described(f"{versions}; weights commit {cached.name}")
         return Method(info, lambda: _load_metric3d(code, cached / METRIC3D_CHECKPOINT))
     network.check_folder(folder, METRIC3D_CODE)
     candidates = (folder / METRIC3D_CHECKPOINT, folder / "weight" / METRIC3D_CHECKPOINT)
@@ -133,7 +120,7 @@ def _load_metric3d(code: Path, checkpoint: Path) -> Predictor:
         output = model.inference({"input": image.to(torch_device())})[0]
         padded = output.float().cpu().reshape(output.shape[-2:])
         network.check_shape(padded.shape, METRIC3D_INPUT_PX)
-        canonical = _bilinear(padded[inside], row["left_rgb"].shape[:2])
+        canonical = np.asarray(resampled(padded[inside], row["left_rgb"].shape[:2], "bilinear"))
         # fx * scale is the focal length of the network's input image.
         z_m = canonical * np.float32(row["left_K"][0, 0] * scale / METRIC3D_FOCAL_PX)
         return positive_or_nan(np.clip(z_m, 0, METRIC3D_MAX_M))
@@ -150,14 +137,12 @@ def metric3d_input(rgb: UInt8[ndarray, "H W 3"]) -> tuple[Any, tuple[slice, slic
     import cv2
 
     scale = min(full / side for full, side in zip(METRIC3D_INPUT_PX, rgb.shape[:2], strict=True))
-    height, width = (max(1, int(side * scale)) for side in rgb.shape[:2])
+    small = scaled_image(rgb, scale)
+    height, width, _ = small.shape
     rows, columns = METRIC3D_INPUT_PX[0] - height, METRIC3D_INPUT_PX[1] - width
     top, left = rows // 2, columns // 2
     padded = cv2.copyMakeBorder(
-        cv2.resize(rgb, (width, height), interpolation=cv2.INTER_LINEAR),
-        *(top, rows - top, left, columns - left),
-        cv2.BORDER_CONSTANT,
-        value=METRIC3D_MEAN_RGB,
+        small, top, rows - top, left, columns - left, cv2.BORDER_CONSTANT, value=METRIC3D_MEAN_RGB
     )
     mean, std = (np.array(values, np.float32) for values in (METRIC3D_MEAN_RGB, METRIC3D_STD_RGB))
     return image_tensor((padded - mean) / std), np.s_[top : top + height, left : left + width], scale
@@ -173,7 +158,9 @@ METRIC3D = METRIC3D_NETWORK.listed(metric3d_with_weights, "own clone and weights
 
 
 def _unidepth_m(model: Any, row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
-    planes = importlib.import_module("torch").from_numpy(row["left_rgb"].transpose(2, 0, 1).copy())
+    import torch
+
+    planes = torch.from_numpy(row["left_rgb"].transpose(2, 0, 1).copy())
     depth_m = np.asarray(model.infer(planes)["depth"].float().cpu())
     UNIDEPTH_NETWORK.check_shape(depth_m.shape, (1, 1, *row["left_rgb"].shape[:2]))
     return positive_or_nan(depth_m[0, 0])
@@ -212,7 +199,8 @@ DA3_FOCAL_PX = 300.0
 
 
 def _depth_anything_3_m(model: Any, row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
-    torch = importlib.import_module("torch")
+    import torch
+
     with torch.random.fork_rng(range(torch.cuda.device_count())):
         torch.manual_seed(DA3_SEED)
         output = np.asarray(model.inference([row["left_rgb"]]).depth, np.float32)
@@ -220,7 +208,7 @@ def _depth_anything_3_m(model: Any, row: Mapping[str, Any]) -> Float32[ndarray, 
     grid, K = row["left_rgb"].shape[:2], row["left_K"]
     # Of the network's input image, whose sides are resized by slightly different factors.
     focal_px = (K[0, 0] * output.shape[2] / grid[1] + K[1, 1] * output.shape[1] / grid[0]) / 2
-    values = _bilinear(torch.from_numpy(output[0]), grid)
+    values = np.asarray(resampled(torch.from_numpy(output[0]), grid, "bilinear"))
     return positive_or_nan(values.astype(np.float64) * (focal_px / DA3_FOCAL_PX))
 
 

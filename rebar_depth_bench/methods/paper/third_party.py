@@ -15,10 +15,10 @@ from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float32, Num
+from jaxtyping import Float, Float32, Num, UInt8
 from numpy import ndarray
 
 from rebar_depth_bench.data.files import files_digest
@@ -27,6 +27,9 @@ from rebar_depth_bench.limits import JSON_BYTES
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor, WeightsMethod
 from rebar_depth_bench.reading import parse_json, read_file
 from rebar_depth_bench.validation import short_repr
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 MIN_LOADED_FRACTION = 0.99
 """Smallest fraction of a network's parameters that a checkpoint must contain; an unused token may be missing."""
@@ -43,18 +46,23 @@ class Network:
     info: MethodInfo
     install: str
 
+    def described(self, addition: str) -> MethodInfo:
+        """Return the description with an addition to its summary."""
+        return replace(self.info, summary=f"{self.info.summary}; {addition}")
+
     def listed(self, with_weights: Callable[[Path | None], Method], addition: str) -> WeightsMethod:
         """Return the method for listings, with ``addition`` to its summary; nothing is looked up for it."""
-        info = replace(self.info, summary=f"{self.info.summary}; {addition}")
-        return WeightsMethod(info, lambda: with_weights(None).load(), with_weights=with_weights)
+        return WeightsMethod(
+            self.described(addition), lambda: with_weights(None).load(), with_weights=with_weights
+        )
 
     def with_digest(self, label: str, files: Sequence[Path]) -> MethodInfo:
         """Return the description with ``label`` in the name and the digest of the weights in the summary.
 
         Different weights are thus a different method, and an interrupted prediction is not resumed with them.
         """
-        summary = f"{self.info.summary}; weights sha256:{files_digest(files)}"
-        return replace(self.info, name=f"{self.info.name}:{label}", summary=summary)
+        info = self.described(f"weights sha256:{files_digest(files)}")
+        return replace(info, name=f"{info.name}:{label}")
 
     def check_folder(self, folder: Path, *required_files: str) -> None:
         """Raise ``MethodError`` unless a folder contains these files."""
@@ -121,13 +129,15 @@ class Network:
 
     def load_checkpoint(self, model: Any, path: Path, key: str, *, strict: bool = True) -> Any:
         """Return a model with the weights under ``key`` of a pickled checkpoint; see ``with_loaded_weights``."""
-        weights = self.import_torch().load(path, map_location="cpu", weights_only=False)[key]
+        import torch
+
+        weights = torch.load(path, map_location="cpu", weights_only=False)[key]
         model.load_state_dict(weights, strict=strict)
         return self.with_loaded_weights(model, weights)
 
     def predictor(self, infer: Callable[[Mapping[str, Any]], Float32[ndarray, "h w"]]) -> Predictor:
         """Return ``infer``, which runs the network on a row, without gradients and with translated errors."""
-        torch = self.import_torch()
+        import torch
 
         def predict(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
             with self.errors("inference failed"), torch.inference_mode():
@@ -177,7 +187,7 @@ class HubNetwork(Network):
         local_hint = local_copy_hint(name, self.repository)
         cached = snapshot(self.repository, CONFIG, local_hint)
         self._check_variant(cached)
-        info = replace(self.info, summary=f"{self.info.summary}; weights commit {cached.name}")
+        info = self.described(f"weights commit {cached.name}")
         return Method(info, lambda: self._load(snapshot(self.repository, WEIGHTS, local_hint, cached.name)))
 
     def _load(self, folder: Path) -> Predictor:
@@ -232,12 +242,34 @@ def on_sys_path(folder: Path) -> Iterator[None]:
 
 def torch_device() -> str:
     """Return the name of the torch device to use."""
-    return "cuda" if importlib.import_module("torch").cuda.is_available() else "cpu"
+    import torch
+
+    return "cuda" if torch.cuda.is_available() else "cpu"
 
 
-def image_tensor(rgb: Num[ndarray, "h w 3"]) -> Any:
-    """Return an image as a 1 x 3 x h x w float32 tensor with the same values. Needs torch."""
-    return importlib.import_module("torch").from_numpy(rgb.transpose(2, 0, 1).astype(np.float32))[None]
+def image_tensor(rgb: Num[ndarray, "h w 3"]) -> Float[Tensor, "1 3 h w"]:
+    """Return an image as a float32 tensor with the same values. Needs torch."""
+    import torch
+
+    return torch.from_numpy(rgb.transpose(2, 0, 1).astype(np.float32))[None]
+
+
+def scaled_image(rgb: UInt8[ndarray, "h w 3"], scale: float) -> UInt8[ndarray, "hs ws 3"]:
+    """Return an image resized by ``scale`` with OpenCV, bilinear; sides are rounded down."""
+    import cv2
+
+    height, width = (max(1, int(side * scale)) for side in rgb.shape[:2])
+    return np.asarray(cv2.resize(rgb, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
+
+
+def resampled(values: Float[Tensor, "h w"], grid: tuple[int, int], mode: str) -> Float[Tensor, "H W"]:
+    """Return values resampled to another grid over the same field of view (``align_corners=False``).
+
+    ``mode`` is the interpolation mode of torch.
+    """
+    from torch.nn import functional
+
+    return functional.interpolate(values[None, None], size=grid, mode=mode, align_corners=False)[0, 0]
 
 
 def read_json_object(path: Path) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from starlette.responses import Response
 import rebar_depth_bench as rdb
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.errors import MethodError
-from rebar_depth_bench.methods.transformers.checkpoints import find_checkpoint
+from rebar_depth_bench.methods.transformers import find_checkpoint
 from tests.hub_server import HubServer, folder_files, running_hub
 
 REVISIONS = ("main", "v1.0", "refs/pr/1")

@@ -12,7 +12,7 @@ pytest.importorskip("transformers")
 
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods import find_method
-from rebar_depth_bench.methods.transformers.model import hf_method
+from rebar_depth_bench.methods.transformers import hf_method
 from tests.bench.methods import stand_in_models as stand_ins
 from tests.bench.methods.predictors import load_predictor
 from tests.bench.methods.tiny_depth_models import save_checkpoint

@@ -26,9 +26,9 @@ from rebar_depth_bench.methods.paper.foundation_stereo import (
     SMALL_RATIO,
     choose_passes,
     full_size_disparity_px,
-    resized,
 )
-from rebar_depth_bench.methods.sgbm import largest_disparity_px, rectified_images
+from rebar_depth_bench.methods.paper.third_party import scaled_image
+from rebar_depth_bench.methods.sgbm import largest_disparity_px, rectified_row
 from tests.bench.methods import stand_in_models as stand_ins
 from tests.bench.methods.predictors import load_predictor
 from tests.bench.methods.stand_in_views import stereo_row
@@ -106,18 +106,18 @@ def test_first_pass_holds_largest_disparity(largest_px: float, volume_px: int, w
     ("nearest_m", "expected"), [(None, 100.5), (0.25, 40.0), (0.05, 200.0), (0.01, 201.0), (1000.0, 0.01)]
 )
 def test_largest_disparity_of_default_and_declared_distance(nearest_m: float | None, expected: float) -> None:
-    images, pair = rectified_images(wall_row(5))
+    rectified, pair = rectified_row(wall_row(5))
     assert pair is None
-    assert largest_disparity_px(images, nearest_m) == pytest.approx(expected)
+    assert largest_disparity_px(rectified, nearest_m) == pytest.approx(expected)
 
 
 def test_principal_points_shift_largest_disparity() -> None:
     row = wall_row(5)
     row["right_K"] = row["left_K"] - np.array([[0, 0, 6.0], [0, 0, 0], [0, 0, 0]])
-    assert largest_disparity_px(rectified_images(row)[0], 0.25) == pytest.approx(46)
+    assert largest_disparity_px(rectified_row(row)[0], 0.25) == pytest.approx(46)
 
 
-def test_raw_pair_counts_in_pixels_of_rectified_images(tmp_path: Path) -> None:
+def test_raw_pair_counts_in_pixels_of_rectified_row(tmp_path: Path) -> None:
     row = wall_row(5) | {"left_distortion": np.array([0.1, 0, 0, 0, 0])}
     pair = rectification.rectified_pair(row)
     assert pair.left_rgb.shape[1] != 201
@@ -131,7 +131,7 @@ def test_raw_pair_counts_in_pixels_of_rectified_images(tmp_path: Path) -> None:
 def test_disparity_returns_to_full_size_in_place(grid: tuple[int, int], scale: float) -> None:
     """A disparity that grows over columns and rows is at most half a pixel of the smaller image away."""
     rows, columns = np.mgrid[: grid[0], : grid[1]].astype(np.float64)
-    small = resized(np.zeros((*grid, 3), np.uint8), scale).shape[:2]
+    small = scaled_image(np.zeros((*grid, 3), np.uint8), scale).shape[:2]
     row_step, column_step = grid[0] / small[0], grid[1] / small[1]
     small_rows, small_columns = np.mgrid[: small[0], : small[1]]
     seen = ((small_rows + 0.5) * row_step + 2 * (small_columns + 0.5) * column_step - 1.5) / column_step

@@ -292,8 +292,8 @@ def test_links_in_work_folder_are_not_followed_when_it_is_deleted(
 
 def test_report_is_read_as_it_was_written(tmp_path: Path) -> None:
     views = KeptViews.open(tmp_path / "views", {"columns": ("a", "b")})
-    assert views.reports == {}
+    assert views.run.reports == {}
     for seconds in (None, 0.0, 1.5):
         kept_report = PreparationReport(notes={"text": "Größe", "list": [1, 2.5, None, True]}, seconds=seconds)
         views.put_report("a", kept_report)
-        assert KeptViews.open(tmp_path / "views", {"columns": ["a", "b"]}).reports == {"a": kept_report}
+        assert KeptViews.open(tmp_path / "views", {"columns": ["a", "b"]}).run.reports == {"a": kept_report}

@@ -122,7 +122,7 @@ def test_invalid_output_becomes_nan(tmp_path: Path) -> None:
 def test_any_output_gives_depth_within_bounds(values: list[float], meaning: str, scale: float) -> None:
     focal_px = 1000.0 if OUTPUT_MEANINGS[meaning].canonical else None
     spec = OutputSpec(meaning=meaning, focal_canonical_px=focal_px, scale=scale, min_m=0.1, max_m=30.0)
-    depth_m = output_to_depth_m(np.array(values, np.float32), spec, 700.0)
+    depth_m = output_to_depth_m(np.array(values, np.float32), spec, 0.7)
     known = ~np.isnan(depth_m)
     assert (depth_m[known] >= np.float32(0.1)).all()
     assert (depth_m[known] <= np.float32(30.0)).all()
@@ -155,7 +155,7 @@ def test_bilinear_sampling_matches_map_coordinates(
     place = place_image(spec_of((wide, high), pad=pad), width, height)
     values = np.random.default_rng(7).uniform(1, 2, cells)
     clipped, ranges = [], []
-    for span, count in ((place.down, cells[0]), (place.across, cells[1])):
+    for span, count in zip(reversed(place), cells, strict=True):
         centres = np.linspace(span.pad_before_px, span.pad_before_px + span.resized_px, 2 * span.image_px + 1)[
             1::2
         ]

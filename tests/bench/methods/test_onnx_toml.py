@@ -137,7 +137,7 @@ def test_example_in_docstring_is_valid(tmp_path: Path) -> None:
     path.write_text(dedent((onnx_toml.__doc__ or "").split("::\n", 1)[1]))
     spec = onnx_toml.read_onnx_toml(path)
     assert spec.input.size_px == (1064, 616)
-    assert (spec.output.focal_canonical_px, spec.output.name_or_index) == (1000, "predicted_depth")
+    assert (spec.output.focal_canonical_px, spec.output.name) == (1000, "predicted_depth")
 
 
 @pytest.mark.parametrize(

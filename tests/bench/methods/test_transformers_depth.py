@@ -21,12 +21,11 @@ from rebar_depth_bench import score
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods import METHODS, find_method
-from rebar_depth_bench.methods.transformers.model import (
+from rebar_depth_bench.methods.transformers import (
     FAMILIES,
     OutputKind,
     depth_pro_preprocessing,
     hf_method,
-    library_preprocessing,
     network_output_to_depth_m,
     to_left_grid,
 )
@@ -151,14 +150,14 @@ def test_preprocessing_round_trip_keeps_pixel_positions(folders: dict[str, Path]
     transformers = importlib.import_module("transformers")
     processor = transformers.AutoImageProcessor.from_pretrained(folders[kind], backend="pil")
     model_type = json.loads((folders[kind] / "config.json").read_text())["model_type"]
-    to_network_input = library_preprocessing(processor)
     rows, columns = np.mgrid[:H, :W]
     rgb = np.stack([rows, columns, np.zeros_like(rows)], axis=-1).astype(np.uint8)
+    pixels = processor(images=rgb, return_tensors="pt", input_data_format="channels_last").pixel_values.float()
     mean, std = (
         np.asarray(MODELS[kind][1].get(f"image_{name}", [x] * 3)) for name, x in (("mean", 0), ("std", 1))
     )
     for channel, expected in ((0, rows), (1, columns)):
-        network_output = SimpleNamespace(predicted_depth=to_network_input(rgb)[:, channel])
+        network_output = SimpleNamespace(predicted_depth=pixels[:, channel])
         on_left_grid = to_left_grid(model_type, processor, network_output, (H, W)).numpy()
         restored = on_left_grid * std[channel] + mean[channel]
         inner = np.s_[12:-12, 12:-12]

@@ -12,11 +12,11 @@ from jaxtyping import Float64, UInt8
 from numpy import ndarray
 
 from rebar_depth_bench.geometry.cameras import ideal_K, look_at, pixel_rays
-from rebar_depth_bench.methods.multiview.dense import consistency_mask
-from rebar_depth_bench.methods.multiview.plane_sweep import (
+from rebar_depth_bench.methods.multiview.dense import (
     MIN_PLANES,
     STEP_PX,
     PosedImage,
+    consistency_mask,
     inverse_depths,
     sweep_depth,
 )
@@ -95,9 +95,9 @@ def test_consistency_mask_accepts_only_true_depth() -> None:
     spoiled = truth.copy()
     spoiled[:, 70:90] *= 1.1
     spoiled[:5] = np.nan
-    consistent = consistency_mask(spoiled, VIEW, others, K, 3)
+    consistent = consistency_mask(spoiled, VIEW, others, K)
     assert consistent[20:70, 20:60].mean() > 0.99
     assert not consistent[:, 70:90].any()
     assert not consistent[:5].any()
     empty = [(np.full_like(depth, np.nan), pose) for depth, pose in others]
-    assert not consistency_mask(truth, VIEW, empty, K, 1).any()
+    assert not consistency_mask(truth, VIEW, empty, K).any()

@@ -15,7 +15,7 @@ from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
 from rebar_depth_bench.geometry.aruco_detection import Corners
 from rebar_depth_bench.geometry.cameras import ideal_K, look_at, project, rigid, transform
-from rebar_depth_bench.methods.multiview.metric_scale import (
+from rebar_depth_bench.methods.multiview.pipeline import (
     Similarity,
     camera_errors,
     fit_board,

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from rebar_depth_bench.methods.multiview.metric_scale import fit_similarity
+from rebar_depth_bench.methods.multiview.pipeline import fit_similarity
 
 ANGLE = st.floats(-3.0, 3.0)
 ROTATION_VECTOR = st.tuples(ANGLE, ANGLE, ANGLE)

@@ -8,37 +8,134 @@ user.
 
 The processing of Depth Pro and the post-processing of ZoeDepth are implemented here, because those of the library
 need torchvision. That of DPT and GLPN is the library's, ``post_process_depth_estimation``.
+
+Downloads from the Hub are always announced on standard error.
 """
 
 from __future__ import annotations
 
+import re
+import sys
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import Enum
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Float, Float32, Float64, UInt8
 from numpy import ndarray
 
+from rebar_depth_bench.data.files import files_digest
 from rebar_depth_bench.errors import MethodError
-from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
-from rebar_depth_bench.methods.paper.third_party import Network, torch_device
-from rebar_depth_bench.methods.transformers.checkpoints import (
+from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor, positive_or_nan
+from rebar_depth_bench.methods.paper.third_party import (
     CONFIG,
-    PREFIX,
-    PREPROCESSOR,
-    Checkpoint,
-    ensure_weights,
-    find_checkpoint,
-    read_settings,
+    Network,
+    hub_download,
+    image_tensor,
+    local_copy_hint,
+    read_json_object,
+    resampled,
+    snapshot,
+    torch_device,
 )
 from rebar_depth_bench.validation import short_repr
 
 if TYPE_CHECKING:
     from torch import Tensor
 
-HF_PREFIX = f"{PREFIX}:"
+
+PREFIX = "hf"
+"""What the names of these methods begin with, before a colon."""
+PREPROCESSOR = "preprocessor_config.json"
+_REPOSITORY = re.compile(r"[A-Za-z0-9][\w.-]*/[A-Za-z0-9][\w.-]*")
+_WEIGHTS = ("*.safetensors", "*.bin")
+"""File patterns of weights in order of preference; a checkpoint with both kinds holds the same weights twice."""
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """Folder with ``config.json``, and its parsed content.
+
+    ``repository`` is the name on the Hub if the folder is a cached snapshot, else None. ``version`` is the digest
+    of a local folder or the commit of a snapshot.
+    """
+
+    name: str
+    folder: Path
+    repository: str | None
+    version: str
+    config: Mapping[str, Any]
+
+
+def find_checkpoint(name_or_path: str) -> Checkpoint:
+    """Return the checkpoint in a local folder, or ``ORG/NAME`` on the Hub.
+
+    At most ``config.json`` is downloaded here. The version of a local folder is the digest of its weights, that of
+    a Hub checkpoint its commit.
+
+    Raises ``MethodError`` if neither exists, or it has no readable ``config.json``.
+    """
+    folder = Path(name_or_path).expanduser()
+    if name_or_path and folder.is_dir():
+        config = read_settings(folder / CONFIG)
+        return Checkpoint(folder.resolve().name, folder, None, _weights_digest(folder), config)
+    if not _REPOSITORY.fullmatch(name_or_path) or Path(name_or_path).parent.is_dir():
+        raise MethodError(
+            f"{name_or_path}: is neither a folder nor the name of a model on the Hub, expected a folder with "
+            f"{CONFIG}, or ORG/NAME where there is no folder ORG"
+        )
+    folder = snapshot(name_or_path, CONFIG, local_copy_hint(PREFIX, name_or_path))
+    return Checkpoint(name_or_path, folder, name_or_path, f"commit {folder.name}", read_settings(folder / CONFIG))
+
+
+def ensure_weights(checkpoint: Checkpoint) -> None:
+    """Download weights (of one kind only) and settings of a Hub checkpoint if they are not cached, after a notice.
+
+    Raises ``MethodError`` if the download fails or the checkpoint has no weights.
+    """
+    repository, folder = checkpoint.repository, checkpoint.folder
+    is_complete = _weight_files(folder) and (folder / PREPROCESSOR).is_file()
+    if repository and not is_complete:
+        from huggingface_hub import HfApi, snapshot_download
+
+        with hub_download(repository, "the weights", local_copy_hint(PREFIX, repository)):
+            files = HfApi().model_info(repository, revision=folder.name, files_metadata=True).siblings or []
+            sizes = {file.rfilename: file.size or 0 for file in files if "/" not in file.rfilename}
+            found = (pattern for pattern in _WEIGHTS if any(Path(name).match(pattern) for name in sizes))
+            pattern = next(found, _WEIGHTS[0])
+            names = [name for name in sizes if Path(name).match(pattern) or name.endswith(".json")]
+            megabytes = sum(sizes[name] for name in names) / 1e6
+            print(f"{repository}: {megabytes:.1f} MB", file=sys.stderr, flush=True)
+            snapshot_download(repository, revision=folder.name, allow_patterns=names)
+    if not _weight_files(folder):
+        raise MethodError(f"{checkpoint.name}: no weights, expected {' or '.join(_WEIGHTS)} beside {CONFIG}")
+
+
+def _weight_files(folder: Path) -> list[Path]:
+    """Return the weight files of the first pattern that matches; empty if there are none."""
+    return next((paths for pattern in _WEIGHTS if (paths := sorted(folder.glob(pattern)))), [])
+
+
+def _weights_digest(folder: Path) -> str:
+    """Return the digest of config, pre-processing settings and weights, which determine the predictions."""
+    files = [folder / CONFIG, folder / PREPROCESSOR, *_weight_files(folder)]
+    return f"sha256:{files_digest(path for path in files if path.is_file())}"
+
+
+def read_settings(path: Path) -> dict[str, Any]:
+    """Return the object of a JSON file of a checkpoint. Raises ``MethodError`` if it is missing or unreadable.
+
+    There are no default values: at an input size other than that of training, a network silently performs worse.
+    """
+    if not path.exists():
+        raise MethodError(
+            f"{path.parent}: no {path.name}, expected a checkpoint folder as written by save_pretrained"
+        )
+    return read_json_object(path)
+
+
 _INSTALL = "pip install 'rebar-depth-bench[models]'"
 DEPTH_PRO_CHECKPOINT = "apple/DepthPro-hf"
 INVERSE_DEPTH_BOUNDS_PER_M = (1e-4, 1e4)
@@ -91,7 +188,7 @@ def hf_method(name_or_path: str) -> Method:
         )
     output = output_kind(checkpoint.config)
     info = MethodInfo(
-        name=f"{HF_PREFIX}{checkpoint.name}",
+        name=f"{PREFIX}:{checkpoint.name}",
         summary=f"{family} from one picture: {output.value}; weights {checkpoint.version}",
         columns=("left_rgb", "left_K") if output is OutputKind.CANONICAL else ("left_rgb",),
         uses_intrinsics=output is OutputKind.CANONICAL,
@@ -162,8 +259,8 @@ def network_output_to_depth_m(
             assert K is not None
             inverse_per_m = values.astype(np.float64) * (values.shape[1] / K[0, 0])
             values = np.clip(inverse_per_m, *INVERSE_DEPTH_BOUNDS_PER_M)
-        z_m = (values if output is OutputKind.METRES else 1 / values).astype(np.float32)
-    return np.where(np.isfinite(z_m) & (z_m > 0), z_m, np.float32(np.nan))
+        z_m = values if output is OutputKind.METRES else 1 / values
+    return positive_or_nan(z_m)
 
 
 def _load_predictor(network: Network, checkpoint: Checkpoint, output: OutputKind) -> Predictor:
@@ -171,7 +268,8 @@ def _load_predictor(network: Network, checkpoint: Checkpoint, output: OutputKind
 
     Raises ``MethodError`` if torch, ``transformers`` or weights are missing, or if the weights are incomplete.
     """
-    torch, transformers = (network.import_package(name, _INSTALL) for name in ("torch", "transformers"))
+    network.import_package("torch", _INSTALL)
+    transformers = network.import_package("transformers", _INSTALL)
     ensure_weights(checkpoint)
     model_type, settings = checkpoint.config["model_type"], read_settings(checkpoint.folder / PREPROCESSOR)
     with network.errors("cannot be loaded"):
@@ -179,25 +277,27 @@ def _load_predictor(network: Network, checkpoint: Checkpoint, output: OutputKind
             processor, to_network_input = None, depth_pro_preprocessing(settings)
         else:  # The processors on Pillow give the same results with and without torchvision.
             processor = transformers.AutoImageProcessor.from_pretrained(checkpoint.folder, backend="pil")
-            to_network_input = library_preprocessing(processor)
+            options = {"return_tensors": "pt", "input_data_format": "channels_last"}
+
+            def to_network_input(rgb: UInt8[ndarray, "H W 3"]) -> Float[Tensor, "1 3 h w"]:
+                pixels: Tensor = processor(images=rgb, **options).pixel_values
+                return pixels.float()
+
         model = _load_network(transformers, checkpoint).to(torch_device())
 
-    def predict(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
+    def infer(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
         rgb = row["left_rgb"]
-        with torch.inference_mode():
-            network_output = model(pixel_values=to_network_input(rgb).to(model.device))
-            network_output.predicted_depth = network_output.predicted_depth.float().cpu()
-            values = to_left_grid(model_type, processor, network_output, rgb.shape[:2])
+        network_output = model(pixel_values=to_network_input(rgb).to(model.device))
+        network_output.predicted_depth = network_output.predicted_depth.float().cpu()
+        values = to_left_grid(model_type, processor, network_output, rgb.shape[:2])
         return network_output_to_depth_m(output, np.asarray(values.numpy()), row.get("left_K"))
 
-    return predict
+    return network.predictor(infer)
 
 
-ToNetworkInput = Callable[[UInt8[ndarray, "H W 3"]], "Float[Tensor, '1 3 h w']"]
-"""Function from an image to the input of a network."""
-
-
-def depth_pro_preprocessing(settings: Mapping[str, Any]) -> ToNetworkInput:
+def depth_pro_preprocessing(
+    settings: Mapping[str, Any],
+) -> Callable[[UInt8[ndarray, "H W 3"]], Float[Tensor, "1 3 h w"]]:
     """Return Depth Pro's pre-processing by ``preprocessor_config.json``: normalise, then resize to a square.
 
     The image is resized bilinearly, as in the authors' code. Raises ``MethodError`` if a setting is missing.
@@ -209,23 +309,11 @@ def depth_pro_preprocessing(settings: Mapping[str, Any]) -> ToNetworkInput:
     scale = settings.get("rescale_factor", 1 / 255)
 
     def to_network_input(rgb: UInt8[ndarray, "H W 3"]) -> Float[Tensor, "1 3 h w"]:
-        import torch
         from torch.nn import functional
 
-        normal = (rgb * np.float64(scale) - np.asarray(mean)) / np.asarray(std)
-        planes = torch.from_numpy(normal.astype(np.float32).transpose(2, 0, 1).copy())[None]
+        planes = image_tensor((rgb * np.float64(scale) - np.asarray(mean)) / np.asarray(std)).contiguous()
         target = (size["height"], size["width"])
         return functional.interpolate(planes, size=target, mode="bilinear", align_corners=False)
-
-    return to_network_input
-
-
-def library_preprocessing(processor: Any) -> ToNetworkInput:
-    """Return the pre-processing of a processor of ``transformers``."""
-
-    def to_network_input(rgb: UInt8[ndarray, "H W 3"]) -> Float[Tensor, "1 3 h w"]:
-        pixels: Tensor = processor(images=rgb, return_tensors="pt", input_data_format="channels_last").pixel_values
-        return pixels.float()
 
     return to_network_input
 
@@ -239,24 +327,14 @@ def to_left_grid(
     """
     raw_depth = network_output.predicted_depth[0]
     if model_type == "depth_pro":
-        return resized(raw_depth, grid, "bilinear")
+        return resampled(raw_depth, grid, "bilinear")
     if model_type == "zoedepth":
         top, left = (int(ZOE_PADDING_FACTOR * np.sqrt(side / 2)) if processor.do_pad else 0 for side in grid)
-        padded = resized(raw_depth, (grid[0] + 2 * top, grid[1] + 2 * left), "bicubic")
+        padded = resampled(raw_depth, (grid[0] + 2 * top, grid[1] + 2 * left), "bicubic")
         return padded[top : top + grid[0], left : left + grid[1]]
     [processed] = processor.post_process_depth_estimation(network_output, target_sizes=[grid])
     depth: Tensor = processed["predicted_depth"]
     return depth
-
-
-def resized(values: Float[Tensor, "h w"], grid: tuple[int, int], mode: str) -> Float[Tensor, "H W"]:
-    """Return values resampled to another grid over the same field of view (``align_corners=False``).
-
-    ``mode`` is the interpolation mode of torch.
-    """
-    from torch.nn import functional
-
-    return functional.interpolate(values[None, None], size=grid, mode=mode, align_corners=False)[0, 0]
 
 
 def _load_network(transformers: Any, checkpoint: Checkpoint) -> Any:

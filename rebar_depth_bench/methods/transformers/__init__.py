@@ -1,1 +1,0 @@
-"""Monocular depth checkpoints that run through ``transformers``."""
