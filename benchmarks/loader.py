@@ -18,11 +18,11 @@ from typing import Any
 
 import rebar_depth_bench as rdb
 from benchmarks.timing import machine_description, median_seconds, print_markdown
+from rebar_depth_bench.base.names import TEST_SPLIT
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import decode_row
 from rebar_depth_bench.data.schema import COLUMNS
 from rebar_depth_bench.data.shards import encoded_rows
-from rebar_depth_bench.names import TEST_SPLIT
 
 REPEATS = 7
 WORKERS = (0, 1, 2)

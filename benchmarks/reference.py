@@ -22,11 +22,11 @@ from typing import Any
 from cards.reference import results_file
 from dataset_builder.cli.main import main as rebar_build
 from rebar_depth_bench import score
-from rebar_depth_bench.atomic_io import write_text
+from rebar_depth_bench.base.names import TEST_SPLIT, config_of
+from rebar_depth_bench.base.writing import write_text
 from rebar_depth_bench.cli.main import main as rebar_bench
 from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, score_extended
 from rebar_depth_bench.extended.result import ExtendedTable
-from rebar_depth_bench.names import TEST_SPLIT, config_of
 from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.submission.declaration import METADATA_NAME
 

@@ -20,13 +20,13 @@ import numpy as np
 from benchmarks.timing import print_markdown
 from cards.steel import range_text
 from dataset_builder.cameras.steel_distance import Cylinders
-from rebar_depth_bench.atomic_io import write_text
+from rebar_depth_bench.base.names import TEST_SPLIT
+from rebar_depth_bench.base.writing import write_text
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars
 from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
 from rebar_depth_bench.data.rows import iterate_rows
 from rebar_depth_bench.data.schema import CENTRE
 from rebar_depth_bench.geometry.cameras import camera_centre
-from rebar_depth_bench.names import TEST_SPLIT
 from rebar_depth_bench.scoring.protocol import scored_pixels, single_bar_pixels
 
 HEADS = ["config", "radius, m", "views", "scored", "nearest steel, m", "steel depth, m", "steel, %", "interior, %"]

@@ -10,6 +10,7 @@ from huggingface_hub import DatasetCardData
 
 from cards.steel import depth_text, steel_by_config
 from cards.templates import render
+from rebar_depth_bench.base.names import TEST_SPLIT
 from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.data.schema import (
     CENTRE,
@@ -25,7 +26,6 @@ from rebar_depth_bench.data.schema import (
     column_kind,
     features,
 )
-from rebar_depth_bench.names import TEST_SPLIT
 from rebar_depth_bench.scoring.columns import DASH
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 

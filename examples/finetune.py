@@ -44,16 +44,16 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 import rebar_depth_bench as rdb
-from rebar_depth_bench.atomic_io import atomic_replace, write_text
-from rebar_depth_bench.console import run_command
+from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.terminal import ProgressBars, duration_text, print_notice
+from rebar_depth_bench.base.writing import atomic_replace, write_text
+from rebar_depth_bench.cli.console import run_command
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import ConfigViews
-from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.methods import find_method
 from rebar_depth_bench.methods.run import predict
 from rebar_depth_bench.reporting.formatting import scaled_constants
 from rebar_depth_bench.scoring.columns import COVERAGE, NATIVE, RANK_ERROR, SCALED, number, texts
-from rebar_depth_bench.terminal import ProgressBars, duration_text, print_notice
 
 CONFIG = "cages"
 TARGETS = ((CONFIG, "validation"), ("lattice", "test"), ("pile", "test"))

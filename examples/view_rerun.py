@@ -25,8 +25,11 @@ import rerun.blueprint as rrb
 from jaxtyping import UInt8
 from numpy import ndarray
 
-from rebar_depth_bench.atomic_io import write_output
-from rebar_depth_bench.console import run_command
+from rebar_depth_bench.base.errors import InputError, SubmissionError, escape_text, printable
+from rebar_depth_bench.base.names import config_of
+from rebar_depth_bench.base.terminal import print_notice
+from rebar_depth_bench.base.writing import write_output
+from rebar_depth_bench.cli.console import run_command
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars, with_axis
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.data.rows import (
@@ -37,14 +40,11 @@ from rebar_depth_bench.data.rows import (
     truth_from_row,
 )
 from rebar_depth_bench.data.schema import CAMERA_SHAPES
-from rebar_depth_bench.errors import InputError, SubmissionError, escape_text, printable
 from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid, transform
-from rebar_depth_bench.names import config_of
 from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.metrics import is_valid_prediction, median, median_scale
 from rebar_depth_bench.scoring.protocol import scored_pixels
 from rebar_depth_bench.submission import EntryError
-from rebar_depth_bench.terminal import print_notice
 
 COLUMNS = ("left_rgb", "right_rgb", *truth_columns("left"), *(f"right_{kind}" for kind in CAMERA_SHAPES))
 COLOURS = np.array([[0, 114, 178], [213, 94, 0], [0, 158, 115], [160, 72, 138]], np.uint8)  # Of archives.

@@ -18,8 +18,8 @@ _EXTRA_MODULES = (
 
 def main() -> int:
     """Run the command line; return its exit status."""
-    from rebar_depth_bench.console import run_command
-    from rebar_depth_bench.errors import require_extra
+    from rebar_depth_bench.base.errors import require_extra
+    from rebar_depth_bench.cli.console import run_command
 
     if status := run_command(lambda: require_extra("server", _EXTRA_MODULES)):
         return status

@@ -14,8 +14,8 @@ from leaderboard.db.engine import database_errors, sqlite_path
 from leaderboard.log_setup import set_up_logs
 from leaderboard.settings import Settings, read_settings
 from leaderboard.storage.archive_store import make_folder, state_lock
-from rebar_depth_bench.console import Command, program_parser, run_program
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.cli.console import Command, program_parser, run_program
 
 _STORED = ("state_dir", "db")
 _WITH_ARCHIVES = (*_STORED, "archives")

@@ -25,9 +25,9 @@ from leaderboard.storage import retention
 from leaderboard.storage.archive_store import ArchiveStore, archive_problem
 from leaderboard.storage.backup import back_up
 from rebar_depth_bench import software_version
+from rebar_depth_bench.base.errors import InputError, StorageError, problem_summary
 from rebar_depth_bench.data.files import file_problems
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.errors import InputError, StorageError, problem_summary
 from rebar_depth_bench.reporting.formatting import counted
 from rebar_depth_bench.scoring.frames import csv_text
 

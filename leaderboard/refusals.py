@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from rebar_depth_bench.errors import Problem
+from rebar_depth_bench.base.errors import Problem
 
 
 class RefusedError(Exception):

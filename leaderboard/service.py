@@ -18,9 +18,9 @@ from leaderboard.db.engine import Database
 from leaderboard.db.rankings import CurrentRankings
 from leaderboard.settings import Settings
 from leaderboard.storage.archive_store import ArchiveStore, delete_abandoned_uploads, make_folder
+from rebar_depth_bench.base.names import TEST_SPLIT, config_of
 from rebar_depth_bench.data.files import MANIFEST_FILE
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
-from rebar_depth_bench.names import TEST_SPLIT, config_of
 
 SIMULTANEOUS_CHECKS = 2
 _LOG = structlog.get_logger("service")

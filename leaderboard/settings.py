@@ -14,11 +14,11 @@ from pydantic_core import ErrorDetails
 from sqlalchemy import make_url
 from sqlalchemy.exc import ArgumentError
 
-from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.limits import TOML_BYTES
-from rebar_depth_bench.reading import parse_toml, read_file
+from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.limits import TOML_BYTES
+from rebar_depth_bench.base.reading import parse_toml, read_file
+from rebar_depth_bench.base.validation import format_location, short_repr
 from rebar_depth_bench.submission.declaration import is_http_url
-from rebar_depth_bench.validation import format_location, short_repr
 
 ENVIRONMENT_PREFIX = "REBAR_LEADERBOARD_"
 GIB = 1 << 30

@@ -6,11 +6,7 @@ from importlib import import_module, metadata
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rebar_depth_bench.bar_crossings.table import crossings
-    from rebar_depth_bench.data.bars import bars
-    from rebar_depth_bench.data.loading import load
-    from rebar_depth_bench.data.torch import torch_loader
-    from rebar_depth_bench.errors import (
+    from rebar_depth_bench.base.errors import (
         CalibrationError,
         DatasetError,
         InputError,
@@ -19,6 +15,10 @@ if TYPE_CHECKING:
         RebarDepthError,
         SubmissionError,
     )
+    from rebar_depth_bench.crossings.table import crossings
+    from rebar_depth_bench.data.bars import bars
+    from rebar_depth_bench.data.loading import load
+    from rebar_depth_bench.data.torch import torch_loader
     from rebar_depth_bench.scoring.evaluation import score
     from rebar_depth_bench.scoring.result import Result
     from rebar_depth_bench.scoring.table import Table, ViewScore
@@ -45,7 +45,7 @@ __all__ = [
 
 _MODULE_BY_NAME = {
     "bars": "data.bars",
-    "crossings": "bar_crossings.table",
+    "crossings": "crossings.table",
     "load": "data.loading",
     "score": "scoring.evaluation",
     "torch_loader": "data.torch",
@@ -76,4 +76,4 @@ def __getattr__(name: str) -> Any:
     """
     if name not in __all__:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_MODULE_BY_NAME.get(name, 'errors')}"), name)
+    return getattr(import_module(f"{__name__}.{_MODULE_BY_NAME.get(name, 'base.errors')}"), name)

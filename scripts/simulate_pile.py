@@ -29,9 +29,9 @@ from dataset_builder.scene.assemblies.pile import RIBS, Pose, points_in_world_m,
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
 from dataset_builder.scene.shapes.bending import resample_polyline_m
 from dataset_builder.specs.config_specs import PileSpec
-from rebar_depth_bench.atomic_io import write_text
-from rebar_depth_bench.console import run_command
-from rebar_depth_bench.errors import BuildError
+from rebar_depth_bench.base.errors import BuildError
+from rebar_depth_bench.base.writing import write_text
+from rebar_depth_bench.cli.console import run_command
 from rebar_depth_bench.geometry.aruco_board import MARKER_MODULES, BoardSpec, marker_corners_m
 
 _COVERAGE_STEP_M = 0.002

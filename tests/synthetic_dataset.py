@@ -14,13 +14,13 @@ import pyarrow.parquet as pq
 
 from dataset_builder.pipeline.shards import View, encode_view
 from rebar_depth_bench import SubmissionWriter
+from rebar_depth_bench.base.names import config_of
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, write_bars
 from rebar_depth_bench.data.files import MANIFEST_FILE, file_sha256, views_digest
 from rebar_depth_bench.data.manifest import MANIFEST_FORMAT, OLD_FORMAT
 from rebar_depth_bench.data.rows import EyeView
 from rebar_depth_bench.data.schema import ViewRecord
 from rebar_depth_bench.geometry.cameras import Camera
-from rebar_depth_bench.names import config_of
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 
 HEIGHT, WIDTH = 90, 160

@@ -24,12 +24,12 @@ from dataset_builder.cameras.trajectories import aim_point_m, poses, subset
 from dataset_builder.scene.mesh_ply import read_mesh_ply
 from dataset_builder.scene.model import NOT_STEEL, Assembly, Mesh, Part
 from dataset_builder.specs.manifest_specs import rig_spec, trajectory_spec
+from rebar_depth_bench.base.errors import DatasetError
+from rebar_depth_bench.base.names import scene_prefix, view_id
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.data.schema import CAMERA_SHAPES, EYES
-from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.geometry.cameras import Camera, camera_centre
-from rebar_depth_bench.names import scene_prefix, view_id
 
 CAMERA_TOLERANCE = 1e-12
 """Largest absolute difference of any entry of K, distortion or pose.

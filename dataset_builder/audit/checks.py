@@ -15,10 +15,10 @@ from rich.table import Table
 
 from dataset_builder.scene.model import ESTIMATED_ROLE
 from dataset_builder.scene.variants.registry import PROPS_SLOT, variants_of_slot
+from rebar_depth_bench.base.errors import problem_summary
 from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.data.rows import EyeTruth, truth_from_row
 from rebar_depth_bench.data.schema import COLUMNS, EYES, ViewRecord
-from rebar_depth_bench.errors import problem_summary
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid, transform
 from rebar_depth_bench.scoring.protocol import scored_pixels

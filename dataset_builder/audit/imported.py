@@ -24,12 +24,12 @@ from dataset_builder.audit.checks import (
 )
 from dataset_builder.audit.geometry import axis_distances_m
 from dataset_builder.audit.independent_depth import project_into
+from rebar_depth_bench.base.parallel import Progress
 from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.data.rows import EyeTruth, iterate_rows
 from rebar_depth_bench.data.schema import Imported
 from rebar_depth_bench.geometry.cameras import camera_centre
-from rebar_depth_bench.parallel import Progress
 from rebar_depth_bench.scoring.protocol import interior
 
 SIGMAS = 4.0

@@ -14,7 +14,7 @@ from numpy import ndarray
 
 from dataset_builder.audit.checks import AuditedConfig, AuditedEye, AuditedView, Check, EyeWithRays
 from dataset_builder.pipeline.blender_process import BlenderProcesses, DepthTask
-from rebar_depth_bench.atomic_io import scratch_folder
+from rebar_depth_bench.base.writing import scratch_folder
 from rebar_depth_bench.data.bars import with_axis
 from rebar_depth_bench.geometry.cameras import project, transform
 from rebar_depth_bench.scoring.protocol import interior

@@ -12,7 +12,7 @@ from contextlib import suppress
 from typing import Any, BinaryIO
 
 from dataset_builder.pipeline.blender_process import ERRORS, DepthTask, DevicesTask, RenderTask
-from rebar_depth_bench.atomic_io import WRITE_ERRORS, write_error
+from rebar_depth_bench.base.writing import WRITE_ERRORS, write_error
 
 Report = Callable[[Mapping[str, Any]], None]
 """Function that sends one event to the parent process."""

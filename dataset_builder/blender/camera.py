@@ -15,8 +15,8 @@ from jaxtyping import Float64
 from mathutils import Matrix
 from numpy import ndarray
 
-from rebar_depth_bench.atomic_io import scratch_folder
-from rebar_depth_bench.errors import BuildError
+from rebar_depth_bench.base.errors import BuildError
+from rebar_depth_bench.base.writing import scratch_folder
 from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid, swap_camera_axes
 
 SHADER = "brown_conrady.osl"

@@ -29,7 +29,7 @@ from dataset_builder.blender.render import (
 )
 from dataset_builder.scene.raycast import steel_box
 from dataset_builder.specs.config_specs import ColourSpec
-from rebar_depth_bench.errors import BuildError
+from rebar_depth_bench.base.errors import BuildError
 from rebar_depth_bench.geometry.cameras import Camera
 
 BOX_MARGIN_PX = 4

@@ -14,8 +14,8 @@ from mathutils import Vector
 from dataset_builder.blender.shader_nodes import NodeTreeBuilder, Socket, WorldBuilder
 from dataset_builder.scene.environments.light_rigs import LightRig, Panel, Sky, Spot, Sun
 from dataset_builder.scene.variants.registry import ImageLight
+from rebar_depth_bench.base.errors import BuildError
 from rebar_depth_bench.data.files import file_sha256
-from rebar_depth_bench.errors import BuildError
 
 PANORAMAS = Path("datafiles", "studiolights", "world")
 """Folder of the panoramas, below the local resources of Blender."""

@@ -16,8 +16,8 @@ from numpy import ndarray
 
 from dataset_builder.blender.camera import place_camera
 from dataset_builder.scene.raycast import PixelBox
-from rebar_depth_bench.atomic_io import named_write_errors
-from rebar_depth_bench.errors import BuildError
+from rebar_depth_bench.base.errors import BuildError
+from rebar_depth_bench.base.writing import named_write_errors
 from rebar_depth_bench.geometry.cameras import Camera
 
 DEPTH_CHANNEL = "ViewLayer.Depth.Z"

@@ -37,9 +37,9 @@ from dataset_builder.scene.variants.sensor import recorded
 from dataset_builder.specs.config_specs import CPU, GPU_TYPES, ConfigSpec
 from dataset_builder.specs.file_specs import PinnedFile
 from dataset_builder.user_files.make_assembly import make_assembly
-from rebar_depth_bench.atomic_io import write_bytes
+from rebar_depth_bench.base.errors import BuildError, InputError
+from rebar_depth_bench.base.writing import write_bytes
 from rebar_depth_bench.data.files import file_sha256
-from rebar_depth_bench.errors import BuildError, InputError
 
 Seconds = defaultdict[str, float]
 """Wall-clock seconds by stage."""

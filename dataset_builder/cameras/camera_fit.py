@@ -11,7 +11,7 @@ from dataset_builder.scene.environments.surroundings import LIFE_SIZE_ENVIRONMEN
 from dataset_builder.scene.model import Assembly
 from dataset_builder.scene.variants.registry import SCREEN_DISTANCE, SHADOWS
 from dataset_builder.specs.config_specs import ConfigSpec, RandomViewsSpec, SurveySpec, TrajectorySpec
-from rebar_depth_bench.errors import InputError, MeshError
+from rebar_depth_bench.base.errors import InputError, MeshError
 
 _BOARD_TOLERANCE_M = 0.001
 """Depth below z = 0 that an assembly may reach, metres."""

@@ -23,8 +23,8 @@ from dataset_builder.scene.raycast import RayCaster
 from dataset_builder.scene.shapes.point_sets import SurfaceSampler, covering_points, farthest_points, short_path
 from dataset_builder.scene.shapes.solids import merge_meshes, world_mesh
 from dataset_builder.specs.config_specs import RandomViewsSpec, RigSpec, RolledStation, Station, SurveySpec
+from rebar_depth_bench.base.errors import InputError, Problem
 from rebar_depth_bench.data.schema import EYES
-from rebar_depth_bench.errors import InputError, Problem
 from rebar_depth_bench.geometry.cameras import inverse_rigid
 
 NEAR = 0.5

@@ -22,7 +22,7 @@ from dataset_builder.specs.config_specs import (
     SceneConfigSpec,
     SceneSpec,
 )
-from rebar_depth_bench.names import SPLITS, TEST_SPLIT
+from rebar_depth_bench.base.names import SPLITS, TEST_SPLIT
 
 CAGES = "cages"
 """Name of the config; it is built only if it is named."""

@@ -28,10 +28,10 @@ from dataset_builder.specs.config_specs import (
     SceneSpec,
 )
 from dataset_builder.specs.file_specs import MeshFileSpec
+from rebar_depth_bench.base.errors import InputError, Problem
+from rebar_depth_bench.base.names import SPLITS
 from rebar_depth_bench.data.schema import NEAREST_STEEL
-from rebar_depth_bench.errors import InputError, Problem
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
-from rebar_depth_bench.names import SPLITS
 
 if TYPE_CHECKING:
     from dataset_builder.scene.assemblies.cage import Cage

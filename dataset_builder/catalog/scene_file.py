@@ -35,10 +35,10 @@ from dataset_builder.user_files.cage_file import cage_file_spec, mesh_file_spec,
 from dataset_builder.user_files.make_assembly import make_assembly
 from dataset_builder.user_files.mesh_import import SUFFIXES as MESH_SUFFIXES
 from dataset_builder.user_files.scene_schema import SCENE_NAME, SceneToml, read_scene_toml
-from rebar_depth_bench.errors import InputError, MeshError
+from rebar_depth_bench.base.errors import InputError, MeshError
+from rebar_depth_bench.base.limits import TOML_BYTES
+from rebar_depth_bench.base.reading import read_file
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
-from rebar_depth_bench.limits import TOML_BYTES
-from rebar_depth_bench.reading import read_file
 
 RESERVED_NAMES = (*CONFIGS, *SWEEPS, CAGES, "meshes", "pictures", "scenes")
 """Names that a user scene cannot have: names of configs and of other entries of the dataset folder."""

@@ -24,9 +24,9 @@ from dataset_builder.specs.config_specs import (
     ColourSpec,
     colour_spec,
 )
-from rebar_depth_bench.errors import InputError, printable, require_extra
-from rebar_depth_bench.names import SPLITS
-from rebar_depth_bench.terminal import ProgressBars, Rate
+from rebar_depth_bench.base.errors import InputError, printable, require_extra
+from rebar_depth_bench.base.names import SPLITS
+from rebar_depth_bench.base.terminal import ProgressBars, Rate
 
 if TYPE_CHECKING:
     from dataset_builder.pipeline.blender_process import Submit

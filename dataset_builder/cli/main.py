@@ -11,8 +11,11 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from rebar_depth_bench.atomic_io import write_output
-from rebar_depth_bench.console import (
+from rebar_depth_bench.base.errors import InputError, escape_text
+from rebar_depth_bench.base.names import PATH_PATTERN, SPLITS
+from rebar_depth_bench.base.terminal import ProgressBars, print_notice
+from rebar_depth_bench.base.writing import write_output
+from rebar_depth_bench.cli.console import (
     Command,
     InputFile,
     add_output_file,
@@ -21,9 +24,6 @@ from rebar_depth_bench.console import (
     program_parser,
     run_program,
 )
-from rebar_depth_bench.errors import InputError, escape_text
-from rebar_depth_bench.names import PATH_PATTERN, SPLITS
-from rebar_depth_bench.terminal import ProgressBars, print_notice
 
 BUILD = "build"
 _STRAY_SHOWN = 5

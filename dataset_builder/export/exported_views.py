@@ -13,13 +13,13 @@ from jaxtyping import Bool, Float32
 from numpy import ndarray
 from PIL import Image
 
+from rebar_depth_bench.base.errors import DatasetError
+from rebar_depth_bench.base.names import scene_of
 from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.data.rows import camera_from_row, decode_row, truth_columns, truth_from_row
 from rebar_depth_bench.data.schema import EYES, ViewRecord
 from rebar_depth_bench.data.shards import encoded_rows
-from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.geometry.cameras import Camera
-from rebar_depth_bench.names import scene_of
 
 _COLUMNS = ("view_id", "baseline_m", *(name for eye in EYES for name in (f"{eye}_rgb", *truth_columns(eye))))
 

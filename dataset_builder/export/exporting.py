@@ -17,12 +17,12 @@ from dataset_builder.export.exported_views import (
 )
 from dataset_builder.export.metadata import cameras_json, readme_txt
 from dataset_builder.export.target import ExportedPart, export_target
-from rebar_depth_bench.atomic_io import write_bytes, write_error, write_text
+from rebar_depth_bench.base.errors import DatasetError, InputError
+from rebar_depth_bench.base.parallel import Progress, silent
+from rebar_depth_bench.base.writing import write_bytes, write_error, write_text
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars
 from rebar_depth_bench.data.files import local_folder
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_folder
-from rebar_depth_bench.errors import DatasetError, InputError
-from rebar_depth_bench.parallel import Progress, silent
 
 _FOLDERS = (".", "sparse/0", *sorted({file.folder for file in EXPORT_FILES.values()}))
 """Folders with files, relative to that of a config, which is "."."""

@@ -8,12 +8,12 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Annotated
 
-from rebar_depth_bench.atomic_io import exclusive_lock, temporary_target, write_error, write_text
+from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.limits import JSON_BYTES
+from rebar_depth_bench.base.reading import check_no_links, parse_json, read_file, remove_file
+from rebar_depth_bench.base.validation import StrictModel, one_of, validate_table
+from rebar_depth_bench.base.writing import exclusive_lock, temporary_target, write_error, write_text
 from rebar_depth_bench.data.manifest import DatasetFolder
-from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.limits import JSON_BYTES
-from rebar_depth_bench.reading import check_no_links, parse_json, read_file, remove_file
-from rebar_depth_bench.validation import StrictModel, one_of, validate_table
 
 MARKER = "export.json"
 """File in the target folder that identifies an export."""

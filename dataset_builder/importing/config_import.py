@@ -19,13 +19,13 @@ from dataset_builder.pipeline.publish import StagedScene, publish, remove_leftov
 from dataset_builder.pipeline.retained import Finished, check_retained
 from dataset_builder.pipeline.shards import Staging, encode_row, stage_row
 from dataset_builder.user_files.scene_schema import SCENE_NAME
+from rebar_depth_bench.base.errors import InputError, escape_text
+from rebar_depth_bench.base.names import TEST_SPLIT, view_id
+from rebar_depth_bench.base.parallel import Progress, silent
+from rebar_depth_bench.base.reading import remove_folder
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.files import file_sha256, parameters_digest
 from rebar_depth_bench.data.schema import OPTIONAL_COLUMNS
-from rebar_depth_bench.errors import InputError, escape_text
-from rebar_depth_bench.names import TEST_SPLIT, view_id
-from rebar_depth_bench.parallel import Progress, silent
-from rebar_depth_bench.reading import remove_folder
 
 _ROLE = "not surveyed"
 """Role of bars that images show and no file of bars describes."""

@@ -45,10 +45,10 @@ from typing import Annotated, Any
 
 from pydantic import Strict, model_validator
 
-from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.limits import TOML_BYTES
-from rebar_depth_bench.reading import is_below, parse_toml, read_file
-from rebar_depth_bench.validation import (
+from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.limits import TOML_BYTES
+from rebar_depth_bench.base.reading import is_below, parse_toml, read_file
+from rebar_depth_bench.base.validation import (
     UNITS_M,
     Expected,
     StrictModel,

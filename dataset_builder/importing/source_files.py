@@ -13,9 +13,19 @@ from jaxtyping import Float32, Float64, Shaped, UInt16
 from numpy import ndarray
 
 from dataset_builder.importing.import_layout import DepthTable, MatricesTable, PosesTable
+from rebar_depth_bench.base.errors import (
+    EntryError,
+    InputError,
+    Problem,
+    escape_text,
+    exception_summary,
+    format_shape,
+)
+from rebar_depth_bench.base.limits import CELL_BYTES, TABLE_BYTES, TOML_BYTES
+from rebar_depth_bench.base.reading import parse_json, read_file
+from rebar_depth_bench.base.validation import UNITS_M, short_repr
 from rebar_depth_bench.captures.calibration import Calibration, StereoCalibration
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.errors import EntryError, InputError, Problem, escape_text, exception_summary, format_shape
 from rebar_depth_bench.geometry.cameras import (
     inverse_rigid,
     is_rigid,
@@ -23,10 +33,7 @@ from rebar_depth_bench.geometry.cameras import (
     pixel_rays,
     swap_camera_axes,
 )
-from rebar_depth_bench.limits import CELL_BYTES, TABLE_BYTES, TOML_BYTES
-from rebar_depth_bench.reading import parse_json, read_file
 from rebar_depth_bench.submission.entries import FORMATS
-from rebar_depth_bench.validation import UNITS_M, short_repr
 
 Grid = tuple[int, int]
 """Height and width of an image, pixels."""

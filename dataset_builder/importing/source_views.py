@@ -25,12 +25,12 @@ from dataset_builder.importing.source_files import (
     read_labels,
     rectified_pair,
 )
+from rebar_depth_bench.base.errors import EntryError, InputError, Problem, escape_text
+from rebar_depth_bench.base.names import NAME_LETTERS, NAME_PATTERN
 from rebar_depth_bench.captures.calibration import camera_columns
 from rebar_depth_bench.captures.camera_files import CaptureCameras, cameras_of_table
 from rebar_depth_bench.captures.images import IMAGE_SUFFIXES, common_shape, read_image
 from rebar_depth_bench.data.schema import EYES, column_kind
-from rebar_depth_bench.errors import EntryError, InputError, Problem, escape_text
-from rebar_depth_bench.names import NAME_LETTERS, NAME_PATTERN
 
 _SUFFIXES: Mapping[str, tuple[str, ...]] = {
     "rgb": IMAGE_SUFFIXES,

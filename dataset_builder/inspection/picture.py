@@ -16,7 +16,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from dataset_builder.inspection.summary import Inspection, diameter_mm
 from dataset_builder.scene.assemblies.cage import CageBar
-from rebar_depth_bench.errors import printable
+from rebar_depth_bench.base.errors import printable
 from rebar_depth_bench.reporting.formatting import counted
 
 FONT_FILE = "DejaVuSans-subset.ttf"

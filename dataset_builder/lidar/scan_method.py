@@ -34,10 +34,10 @@ from dataset_builder.lidar.scanner import (
 )
 from dataset_builder.scene.mesh_ply import read_mesh_ply
 from dataset_builder.scene.raycast import RayCaster
-from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.base.errors import MethodError
+from rebar_depth_bench.base.parallel import Progress
 from rebar_depth_bench.geometry.cameras import Camera, fold_radius, project
 from rebar_depth_bench.methods import MethodInfo, MultiViewMethod, Prepared, Views
-from rebar_depth_bench.parallel import Progress
 
 _COLUMNS = ("left_K", "left_distortion", "left_cam_from_world")
 """Dataset columns that the method reads."""

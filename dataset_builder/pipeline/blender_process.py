@@ -26,9 +26,9 @@ from typing import Any
 from dataset_builder.pipeline.shards import Staging
 from dataset_builder.pipeline.work_units import UnitResult, WorkUnit
 from dataset_builder.specs.config_specs import CPU, GPU_TYPES
-from rebar_depth_bench.atomic_io import scratch_folder
+from rebar_depth_bench.base.errors import BuildError, InputError, OutputError, RebarDepthError, RenderProcessError
+from rebar_depth_bench.base.writing import scratch_folder
 from rebar_depth_bench.data.files import file_sha256
-from rebar_depth_bench.errors import BuildError, InputError, OutputError, RebarDepthError, RenderProcessError
 from rebar_depth_bench.geometry.cameras import Camera
 
 

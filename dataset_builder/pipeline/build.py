@@ -30,9 +30,9 @@ from dataset_builder.pipeline.retained import Finished, check_retained, kept_sce
 from dataset_builder.pipeline.work_units import UnitResult, WorkUnit, accept_result, remaining_units
 from dataset_builder.specs.config_specs import SceneConfigSpec
 from dataset_builder.specs.file_specs import CageFileSpec, MeshFileSpec
-from rebar_depth_bench.atomic_io import write_bytes
-from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.parallel import Progress, silent
+from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.parallel import Progress, silent
+from rebar_depth_bench.base.writing import write_bytes
 
 
 @dataclass

@@ -12,7 +12,7 @@ from numpy import ndarray
 from PIL import Image, ImageDraw
 
 from dataset_builder.cameras.trajectories import subset
-from rebar_depth_bench.atomic_io import write_bytes
+from rebar_depth_bench.base.writing import write_bytes
 from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.data.rows import iterate_rows
 

@@ -40,7 +40,7 @@ from dataset_builder.pipeline.plan import generator_versions
 from dataset_builder.pipeline.shards import Staging
 from dataset_builder.pipeline.work_units import UnitResult, WorkUnit, with_files
 from dataset_builder.specs.config_specs import CPU
-from rebar_depth_bench.errors import BuildError, InputError, RenderProcessError
+from rebar_depth_bench.base.errors import BuildError, InputError, RenderProcessError
 
 _CONNECT_S = 10
 

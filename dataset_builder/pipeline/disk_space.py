@@ -18,10 +18,10 @@ from dataset_builder.pipeline.plan import ConfigPlan, by_config, config_paramete
 from dataset_builder.pipeline.retained import Finished
 from dataset_builder.scene.variants.registry import image_light
 from dataset_builder.specs.config_specs import RigSpec, SceneConfigSpec
+from rebar_depth_bench.base.errors import InputError, OutputError
+from rebar_depth_bench.base.limits import JSON_BYTES, TABLE_BYTES
 from rebar_depth_bench.data.bars import BARS_FILE, decoded_bytes
 from rebar_depth_bench.data.files import MANIFEST_FILE
-from rebar_depth_bench.errors import InputError, OutputError
-from rebar_depth_bench.limits import JSON_BYTES, TABLE_BYTES
 
 _MEASURED_PIXELS = 640 * 360
 _COLOUR_BYTES, _TRUTH_BYTES = 1.61, 2.11

@@ -24,11 +24,11 @@ from dataset_builder.scene.variants.sensor import sensor_spec
 from dataset_builder.specs.config_specs import ConfigSpec, GeneratedCageSpec, RandomViewsSpec, SceneConfigSpec
 from dataset_builder.user_files.make_assembly import assembly_bars, make_assembly
 from rebar_depth_bench import software_version
+from rebar_depth_bench.base.errors import printable
+from rebar_depth_bench.base.parallel import Progress, silent
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.files import parameters_digest
 from rebar_depth_bench.data.schema import ROW_SCHEMA
-from rebar_depth_bench.errors import printable
-from rebar_depth_bench.parallel import Progress, silent
 
 if TYPE_CHECKING:
     from dataset_builder.scene.assemblies.cage import Cage

@@ -18,13 +18,13 @@ from dataset_builder.pipeline.work_units import stage_mesh_digest
 from dataset_builder.scene.model import Note
 from dataset_builder.specs.config_specs import SceneConfigSpec
 from dataset_builder.specs.manifest_specs import cage_spec
-from rebar_depth_bench.atomic_io import write_bytes
+from rebar_depth_bench.base.errors import DatasetError, InputError, Problem
+from rebar_depth_bench.base.names import TEST_SPLIT
+from rebar_depth_bench.base.validation import format_location, short_repr
+from rebar_depth_bench.base.writing import write_bytes
 from rebar_depth_bench.data.files import MANIFEST_FILE, file_sha256
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_folder
 from rebar_depth_bench.data.schema import RANDOM_VIEWS, ViewRecord
-from rebar_depth_bench.errors import DatasetError, InputError, Problem
-from rebar_depth_bench.names import TEST_SPLIT
-from rebar_depth_bench.validation import format_location, short_repr
 
 _SHOWN_DIFFERENCES = 5
 

@@ -19,16 +19,16 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from rebar_depth_bench.atomic_io import atomic_replace
+from rebar_depth_bench.base.errors import InputError, Problem, escape_text
+from rebar_depth_bench.base.reading import open_regular, parse_json
+from rebar_depth_bench.base.validation import validate_table
+from rebar_depth_bench.base.writing import atomic_replace
 from rebar_depth_bench.data import codecs
 from rebar_depth_bench.data.rows import EyeView, absent_cell, truth_from_row
 from rebar_depth_bench.data.schema import CAMERA_SHAPES, COLUMNS, ROW_SCHEMA, ViewRecord, column_kind, features
 from rebar_depth_bench.data.shards import open_parquet, rows_table
-from rebar_depth_bench.errors import InputError, Problem, escape_text
-from rebar_depth_bench.reading import open_regular, parse_json
 from rebar_depth_bench.reporting.colormap import depth_preview
 from rebar_depth_bench.scoring.protocol import scored_pixels
-from rebar_depth_bench.validation import validate_table
 
 ViewT = TypeVar("ViewT")
 VIEWS_PER_SHARD = 8

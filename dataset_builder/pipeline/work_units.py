@@ -21,11 +21,11 @@ from pathlib import Path
 from dataset_builder.pipeline.plan import ConfigPlan
 from dataset_builder.pipeline.shards import VIEWS_PER_SHARD, Staging, split_into_shards
 from dataset_builder.specs.config_specs import ConfigSpec
-from rebar_depth_bench.atomic_io import write_bytes, write_text
+from rebar_depth_bench.base.errors import BuildError, InputError
+from rebar_depth_bench.base.limits import TOML_BYTES
+from rebar_depth_bench.base.reading import read_file
+from rebar_depth_bench.base.writing import write_bytes, write_text
 from rebar_depth_bench.data.files import file_sha256
-from rebar_depth_bench.errors import BuildError, InputError
-from rebar_depth_bench.limits import TOML_BYTES
-from rebar_depth_bench.reading import read_file
 
 VIEWS_WITHOUT_COLOUR = 4 * VIEWS_PER_SHARD
 """Views of a work unit without colour."""

@@ -15,8 +15,8 @@ from contextlib import contextmanager
 from huggingface_hub import constants, get_token
 from huggingface_hub.errors import HfHubHTTPError
 
-from rebar_depth_bench.errors import HubError, InputError, RebarDepthError, escape_text, exception_summary
-from rebar_depth_bench.terminal import terminal_text
+from rebar_depth_bench.base.errors import HubError, InputError, RebarDepthError, escape_text, exception_summary
+from rebar_depth_bench.base.terminal import terminal_text
 
 _OTHER_CHANGE = "no other change of the repository at the same time; run the command again"
 _EXPECTED: Mapping[int, tuple[type[RebarDepthError], str]] = {

@@ -28,9 +28,7 @@ from huggingface_hub.utils.sha import git_hash
 
 from dataset_builder.push.hub_errors import hub_errors
 from rebar_depth_bench import software_version
-from rebar_depth_bench.data.files import MANIFEST_FILE, file_problems, file_sha256, local_folder
-from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
-from rebar_depth_bench.errors import (
+from rebar_depth_bench.base.errors import (
     DatasetError,
     InputError,
     Problem,
@@ -39,8 +37,10 @@ from rebar_depth_bench.errors import (
     printable,
     problem_summary,
 )
-from rebar_depth_bench.parallel import Progress, silent
-from rebar_depth_bench.reading import parse_json
+from rebar_depth_bench.base.parallel import Progress, silent
+from rebar_depth_bench.base.reading import parse_json
+from rebar_depth_bench.data.files import MANIFEST_FILE, file_problems, file_sha256, local_folder
+from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 
 _FILES_AT_ONCE = 8
 _IGNORE_NOTHING = "# Every file of the commit is uploaded.\n"

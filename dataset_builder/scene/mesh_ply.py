@@ -15,10 +15,10 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.scene.model import WorldMesh
-from rebar_depth_bench.atomic_io import atomic_replace
-from rebar_depth_bench.errors import DatasetError
-from rebar_depth_bench.limits import MESH_BYTES
-from rebar_depth_bench.reading import read_file
+from rebar_depth_bench.base.errors import DatasetError
+from rebar_depth_bench.base.limits import MESH_BYTES
+from rebar_depth_bench.base.reading import read_file
+from rebar_depth_bench.base.writing import atomic_replace
 
 COMMENT = (
     "comment rebar-depth-bench mesh: world frame, right-handed, z up, board at z = 0;"

@@ -18,8 +18,8 @@ from jaxtyping import Bool, Float64, Int32, UInt16
 from numpy import ndarray
 
 from dataset_builder.scene.model import WorldMesh
+from rebar_depth_bench.base.errors import BuildError
 from rebar_depth_bench.data.rows import EyeView
-from rebar_depth_bench.errors import BuildError
 from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid, matrix_product
 from rebar_depth_bench.geometry.segments import closest_points_m
 

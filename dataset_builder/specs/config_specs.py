@@ -10,11 +10,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 
 from dataset_builder.specs.file_specs import CageFileSpec, MeshFileSpec
+from rebar_depth_bench.base.names import TEST_SPLIT, scene_prefix, view_id
 from rebar_depth_bench.captures.calibration import StereoCalibration
 from rebar_depth_bench.data.schema import CENTRE, RANDOM_VIEWS, SURVEY
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import NOMINAL_FOCAL_PX
-from rebar_depth_bench.names import TEST_SPLIT, scene_prefix, view_id
 
 
 @dataclass(frozen=True)

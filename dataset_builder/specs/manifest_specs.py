@@ -9,10 +9,10 @@ from typing import Any, TypeVar, cast, get_args
 from pydantic import create_model
 
 from dataset_builder.specs.config_specs import FocalRigSpec, GeneratedCageSpec, RigSpec, TrajectorySpec
+from rebar_depth_bench.base.errors import DatasetError, Problem
+from rebar_depth_bench.base.validation import StrictModel, format_location, validate_table
 from rebar_depth_bench.data.files import MANIFEST_FILE
 from rebar_depth_bench.data.manifest import DatasetConfig
-from rebar_depth_bench.errors import DatasetError, Problem
-from rebar_depth_bench.validation import StrictModel, format_location, validate_table
 
 _Spec = TypeVar("_Spec")
 _TRAJECTORIES: Mapping[str, type[TrajectorySpec]] = {spec.kind: spec for spec in get_args(TrajectorySpec)}

@@ -29,11 +29,11 @@ from dataset_builder.user_files.ifc_file import ifc_cage
 from dataset_builder.user_files.mesh_import import SUFFIXES as MESH_SUFFIXES
 from dataset_builder.user_files.mesh_import import mesh_cage
 from dataset_builder.user_files.scene_schema import read_scene_toml
+from rebar_depth_bench.base.errors import InputError, MeshError, Problem
+from rebar_depth_bench.base.limits import IFC_BYTES, MESH_BYTES, TOML_BYTES
+from rebar_depth_bench.base.reading import read_file
+from rebar_depth_bench.base.validation import UNITS_M
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.errors import InputError, MeshError, Problem
-from rebar_depth_bench.limits import IFC_BYTES, MESH_BYTES, TOML_BYTES
-from rebar_depth_bench.reading import read_file
-from rebar_depth_bench.validation import UNITS_M
 
 _Kind = Literal["cage", "mesh"]
 _SUFFIXES: Mapping[_Kind, Sequence[str]] = {"cage": (".toml", ".ifc"), "mesh": MESH_SUFFIXES}

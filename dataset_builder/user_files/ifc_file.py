@@ -40,9 +40,9 @@ from dataset_builder.user_files.ifc_records import (
     read_records,
 )
 from dataset_builder.user_files.mesh_import import connected_components, fitted_bar
+from rebar_depth_bench.base.errors import InputError, MeshError, Problem
+from rebar_depth_bench.base.limits import IFC_MEMORY_BYTES, IFC_SECONDS
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.errors import InputError, MeshError, Problem
-from rebar_depth_bench.limits import IFC_MEMORY_BYTES, IFC_SECONDS
 
 COMMAND = (sys.executable, "-P", "-m", "dataset_builder.user_files.ifc_reader")
 """Command of the process; the id of this process, the memory limit and both time limits follow."""

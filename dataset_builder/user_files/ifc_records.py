@@ -14,8 +14,8 @@ import numpy as np
 from numpy import ndarray
 from pydantic import Field, TypeAdapter, ValidationError
 
-from rebar_depth_bench.reading import parse_json
-from rebar_depth_bench.validation import StrictModel
+from rebar_depth_bench.base.reading import parse_json
+from rebar_depth_bench.base.validation import StrictModel
 
 MAX_MESSAGE = 1000
 """Largest number of characters of the reason for a failure."""

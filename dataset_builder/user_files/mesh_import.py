@@ -38,8 +38,8 @@ from dataset_builder.user_files.mesh_formats.ply import read_ply
 from dataset_builder.user_files.mesh_formats.stl_obj import read_obj, read_stl
 from dataset_builder.user_files.tubes.tube_fit import fit_tube
 from dataset_builder.user_files.tubes.tube_surface import component_labels
+from rebar_depth_bench.base.errors import DatasetError, MeshError, escape_text
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.errors import DatasetError, MeshError, escape_text
 
 if TYPE_CHECKING:
     import trimesh

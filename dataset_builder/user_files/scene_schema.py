@@ -54,9 +54,9 @@ from dataset_builder.scene.model import MAX_BARS, to_metres
 from dataset_builder.scene.variants.registry import VARIANTS
 from dataset_builder.specs.config_specs import DomeSpec, RigSpec, RingSpec, SurveySpec
 from dataset_builder.specs.file_specs import KEYS, Origin, PlacementSpec, Selection, Trust, Up
-from rebar_depth_bench.errors import InputError, Problem
-from rebar_depth_bench.reading import is_below, parse_toml
-from rebar_depth_bench.validation import (
+from rebar_depth_bench.base.errors import InputError, Problem
+from rebar_depth_bench.base.reading import is_below, parse_toml
+from rebar_depth_bench.base.validation import (
     UNITS_M,
     Expected,
     Flag,

@@ -23,15 +23,15 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from outputs import add_outputs, number, only_config, run_script, write_outputs
-from rebar_depth_bench.console import add_archive, add_data
-from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.parallel import map_with_progress
+from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.parallel import map_with_progress
+from rebar_depth_bench.base.terminal import ProgressBars
+from rebar_depth_bench.cli.console import add_archive, add_data
 from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
 from rebar_depth_bench.scoring.score import ViewTruth
 from rebar_depth_bench.scoring.truth import config_truth
 from rebar_depth_bench.submission import SubmissionReader
-from rebar_depth_bench.terminal import ProgressBars
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from outputs import only_config
+from rebar_depth_bench.base.errors import EntryError, InputError, SubmissionError, printable
+from rebar_depth_bench.base.names import config_of, split_of
+from rebar_depth_bench.base.reading import FileSource
 from rebar_depth_bench.captures.views import is_capture, open_capture
 from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
-from rebar_depth_bench.errors import EntryError, InputError, SubmissionError, printable
-from rebar_depth_bench.names import config_of, split_of
-from rebar_depth_bench.reading import FileSource
 from rebar_depth_bench.scoring.result import DatasetIdentity
 from rebar_depth_bench.scoring.truth import verified_views
 from rebar_depth_bench.submission import ExpectedViews, SubmissionReader

@@ -21,9 +21,10 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from outputs import add_outputs, flat_table, number, run_script, single_bar_means, write_outputs
-from rebar_depth_bench.console import add_archive, add_data
+from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.terminal import ProgressBars
+from rebar_depth_bench.cli.console import add_archive, add_data
 from rebar_depth_bench.data.manifest import DatasetConfig
-from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.extended.ground_truth import has_bar_ids
 from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, score_extended
 from rebar_depth_bench.reporting.extended_tables import reach_sentence
@@ -32,7 +33,6 @@ from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation
 from rebar_depth_bench.scoring.metrics import mean
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.truth import config_truth
-from rebar_depth_bench.terminal import ProgressBars
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -25,20 +25,20 @@ from PIL import Image as Picture
 
 from depth_maps import DepthMaps, open_maps
 from outputs import add_outputs, number, run_script, write_outputs
+from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.parallel import map_with_progress
+from rebar_depth_bench.base.terminal import ProgressBars
 from rebar_depth_bench.captures.calibration import Calibration, Lens, MonoCalibration, StereoCalibration
 from rebar_depth_bench.captures.images import read_image_shape
 from rebar_depth_bench.captures.views import ImageViews
-from rebar_depth_bench.console import InputFile, InputFolder, add_workers
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.cli.console import InputFile, InputFolder, add_workers
 from rebar_depth_bench.methods import find_method
 from rebar_depth_bench.methods.run import predict_views
-from rebar_depth_bench.parallel import map_with_progress
 from rebar_depth_bench.scoring.bootstrap import INTERVALS, interval, resample
 from rebar_depth_bench.scoring.evaluation import Provenance
 from rebar_depth_bench.scoring.metrics import is_valid_prediction, mean, median_scale
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE
 from rebar_depth_bench.scoring.result import SubmissionIdentity
-from rebar_depth_bench.terminal import ProgressBars
 
 PROTOCOL = "rebar-kitti-eigen-1"
 EIGEN_SPLIT = Path(__file__).with_name("kitti_eigen_test_697.txt")  # As distributed with Monodepth.

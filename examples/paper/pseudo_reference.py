@@ -25,9 +25,10 @@ from scipy.stats import kendalltau
 
 from depth_maps import DepthMaps, labelled, masked, open_data
 from outputs import add_outputs, flat_table, number, plain_name, run_script, write_outputs
-from rebar_depth_bench.console import InputFolder, add_data, add_workers
-from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.parallel import map_with_progress
+from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.parallel import map_with_progress
+from rebar_depth_bench.base.terminal import ProgressBars
+from rebar_depth_bench.cli.console import InputFolder, add_data, add_workers
 from rebar_depth_bench.scoring.bootstrap import INTERVALS
 from rebar_depth_bench.scoring.columns import METRICS
 from rebar_depth_bench.scoring.evaluation import Provenance
@@ -35,7 +36,6 @@ from rebar_depth_bench.scoring.metrics import mean
 from rebar_depth_bench.scoring.result import SubmissionIdentity
 from rebar_depth_bench.scoring.score import ViewTruth, score_view, tabulate
 from rebar_depth_bench.scoring.table import ViewScore
-from rebar_depth_bench.terminal import ProgressBars
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -16,7 +16,7 @@ from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from sqlalchemy.orm import Session
 
 from leaderboard.db.models import Base, ContentVersionModel, ResultModel
-from rebar_depth_bench.errors import InputError, StorageError
+from rebar_depth_bench.base.errors import InputError, StorageError
 
 MIGRATIONS = Path(__file__).parent / "migrations"
 SQLITE_BUSY_TIMEOUT_S = 30

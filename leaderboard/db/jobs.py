@@ -31,7 +31,7 @@ from leaderboard.db.submissions import FAILED, QUEUED, SCORED, SCORING, delete_r
 from leaderboard.db.view_errors import view_errors
 from leaderboard.scoring.sandbox import Outcome
 from leaderboard.settings import MAX_LEASE_S
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.scoring.bootstrap import INTERVALS
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 

@@ -15,8 +15,8 @@ from leaderboard.db.engine import Database
 from leaderboard.db.models import SubmissionModel, TokenModel
 from leaderboard.db.submissions import DELETED
 from leaderboard.names import name_problem, normalised
-from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.validation import short_repr
+from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.validation import short_repr
 
 PREFIX = "rdb_"
 MAX_NAME = 100

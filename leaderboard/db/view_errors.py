@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from rebar_depth_bench.names import config_of, split_of
+from rebar_depth_bench.base.names import config_of, split_of
 from rebar_depth_bench.scoring import bootstrap
 
 _CLEAR, _UNCLEAR = 1.6, 0.6

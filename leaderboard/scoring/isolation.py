@@ -14,8 +14,8 @@ from collections.abc import Callable
 from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
-from rebar_depth_bench.errors import Problem, ProblemCode, RebarDepthError, SubmissionError
-from rebar_depth_bench.limits import limit_process
+from rebar_depth_bench.base.errors import Problem, ProblemCode, RebarDepthError, SubmissionError
+from rebar_depth_bench.base.limits import limit_process
 
 POLL_INTERVAL_S = 1.0
 NICENESS = 10

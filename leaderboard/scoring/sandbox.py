@@ -13,9 +13,9 @@ from operator import attrgetter
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from rebar_depth_bench.base.errors import DatasetError, Problem, SubmissionError
+from rebar_depth_bench.base.names import TEST_SPLIT, config_of, split_of
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.errors import DatasetError, Problem, SubmissionError
-from rebar_depth_bench.names import TEST_SPLIT, config_of, split_of
 from rebar_depth_bench.scoring.table import ViewScore
 from rebar_depth_bench.submission import SubmissionMeta, SubmissionReader
 

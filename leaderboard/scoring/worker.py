@@ -30,7 +30,7 @@ from leaderboard.scoring.isolation import (
 from leaderboard.scoring.sandbox import Outcome, score
 from leaderboard.settings import Settings
 from leaderboard.storage.archive_store import ArchiveNotFoundError, ArchiveStore
-from rebar_depth_bench.errors import SubmissionError, problem_summary
+from rebar_depth_bench.base.errors import SubmissionError, problem_summary
 
 RETRY_INTERVAL_S = 1.0
 RENEWALS_PER_LEASE = 4

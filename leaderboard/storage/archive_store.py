@@ -12,9 +12,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
-from rebar_depth_bench.atomic_io import atomic_replace, exclusive_lock, fsync_path, write_error
+from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.writing import atomic_replace, exclusive_lock, fsync_path, write_error
 from rebar_depth_bench.data.files import file_sha256
-from rebar_depth_bench.errors import InputError
 
 FILE_MODE = 0o600
 

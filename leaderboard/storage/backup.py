@@ -22,8 +22,8 @@ from leaderboard.storage.archive_store import (
     state_lock,
 )
 from leaderboard.storage.retention import delete_archives, unneeded_archives
-from rebar_depth_bench.atomic_io import atomic_replace, write_error
-from rebar_depth_bench.errors import InputError, StorageError, problem_summary
+from rebar_depth_bench.base.errors import InputError, StorageError, problem_summary
+from rebar_depth_bench.base.writing import atomic_replace, write_error
 
 DATABASE, FORMER, ARCHIVES = "leaderboard.sqlite", "leaderboard.sqlite.1", "archives"
 Rows = Mapping[str, tuple[str, int] | None]

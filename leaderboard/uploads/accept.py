@@ -26,7 +26,7 @@ from leaderboard.scoring.sandbox import check
 from leaderboard.service import Service
 from leaderboard.settings import Settings
 from leaderboard.storage.archive_store import upload_file
-from rebar_depth_bench.errors import RebarDepthError, SubmissionError
+from rebar_depth_bench.base.errors import RebarDepthError, SubmissionError
 from rebar_depth_bench.reporting.formatting import counted
 from rebar_depth_bench.submission import SubmissionMeta
 

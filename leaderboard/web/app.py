@@ -23,7 +23,7 @@ from leaderboard.web.middleware import EarlyResponseMiddleware, RequestMiddlewar
 from leaderboard.web.pages import account, ranking, static, submission_page, upload_form
 from leaderboard.web.pages.rendering import error_response, make_templates
 from rebar_depth_bench import software_version
-from rebar_depth_bench.errors import Problem
+from rebar_depth_bench.base.errors import Problem
 
 _LOG = structlog.get_logger("http")
 DESCRIPTION = """Accepts prediction archives and scores them exactly as `rebar-bench score` does.

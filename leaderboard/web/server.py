@@ -18,7 +18,7 @@ from leaderboard.storage.retention import archive_retention
 from leaderboard.web.app import make_app
 from leaderboard.web.connections import limited_protocol, new_connection_counts
 from rebar_depth_bench import software_version
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.base.errors import InputError
 
 SHUTDOWN_GRACE_S = 10
 _SWITCH_INTERVAL_S = 0.0005

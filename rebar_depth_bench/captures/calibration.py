@@ -15,9 +15,8 @@ from jaxtyping import Float64
 from numpy import ndarray
 from pydantic import Field, Strict, ValidationInfo, field_validator
 
-from rebar_depth_bench.errors import CalibrationError, Problem
-from rebar_depth_bench.geometry.cameras import is_rotation, rigid, rotation_matrix, rotation_vector, undistort
-from rebar_depth_bench.validation import (
+from rebar_depth_bench.base.errors import CalibrationError, Problem
+from rebar_depth_bench.base.validation import (
     Expected,
     StrictModel,
     Triple,
@@ -26,6 +25,7 @@ from rebar_depth_bench.validation import (
     validate_table,
     whole_number,
 )
+from rebar_depth_bench.geometry.cameras import is_rotation, rigid, rotation_matrix, rotation_vector, undistort
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,10 @@ import re
 from collections.abc import Mapping
 from pathlib import Path
 
+from rebar_depth_bench.base.errors import MAX_PROBLEMS_SHOWN, CalibrationError, Problem, escape_text
+from rebar_depth_bench.base.limits import TOML_BYTES
+from rebar_depth_bench.base.reading import parse_number, parse_toml, read_file
+from rebar_depth_bench.base.validation import Expected, format_location, short_repr, with_lines
 from rebar_depth_bench.captures.calibration import (
     ANGLE_RAD,
     DISTORTION,
@@ -20,10 +24,6 @@ from rebar_depth_bench.captures.calibration import (
     scaled_calibration,
     table_calibration,
 )
-from rebar_depth_bench.errors import MAX_PROBLEMS_SHOWN, CalibrationError, Problem, escape_text
-from rebar_depth_bench.limits import TOML_BYTES
-from rebar_depth_bench.reading import parse_number, parse_toml, read_file
-from rebar_depth_bench.validation import Expected, format_location, short_repr, with_lines
 
 
 def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibration:

@@ -35,23 +35,11 @@ from jaxtyping import Float64
 from numpy import ndarray
 from pydantic import Field, field_validator, model_validator
 
-from rebar_depth_bench.captures.calibration import (
-    Calibration,
-    StereoCalibration,
-    scaled_calibration,
-    table_calibration,
-)
-from rebar_depth_bench.captures.calibration_files import check_image_size, read_calibration
-from rebar_depth_bench.captures.documents import DOCUMENT_SUFFIXES, parse_document
-from rebar_depth_bench.captures.programs import program_calibration
-from rebar_depth_bench.data.schema import BoardTable
-from rebar_depth_bench.errors import CalibrationError, InputError, Problem
-from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
-from rebar_depth_bench.geometry.cameras import is_rigid
-from rebar_depth_bench.limits import TOML_BYTES
-from rebar_depth_bench.names import NAME_LETTERS, NAME_PATTERN
-from rebar_depth_bench.reading import parse_toml, read_file
-from rebar_depth_bench.validation import (
+from rebar_depth_bench.base.errors import CalibrationError, InputError, Problem
+from rebar_depth_bench.base.limits import TOML_BYTES
+from rebar_depth_bench.base.names import NAME_LETTERS, NAME_PATTERN
+from rebar_depth_bench.base.reading import parse_toml, read_file
+from rebar_depth_bench.base.validation import (
     UNITS_M,
     Expected,
     StrictModel,
@@ -62,6 +50,18 @@ from rebar_depth_bench.validation import (
     validate_table,
     with_lines,
 )
+from rebar_depth_bench.captures.calibration import (
+    Calibration,
+    StereoCalibration,
+    scaled_calibration,
+    table_calibration,
+)
+from rebar_depth_bench.captures.calibration_files import check_image_size, read_calibration
+from rebar_depth_bench.captures.documents import DOCUMENT_SUFFIXES, parse_document
+from rebar_depth_bench.captures.programs import program_calibration
+from rebar_depth_bench.data.schema import BoardTable
+from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
+from rebar_depth_bench.geometry.cameras import is_rigid
 
 CAMERAS_FILE = "cameras.toml"
 CALIBRATION_SUFFIXES = (".conf", *DOCUMENT_SUFFIXES)

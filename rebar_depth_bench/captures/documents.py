@@ -11,8 +11,8 @@ from pathlib import PurePath
 from typing import Any
 from xml.etree import ElementTree
 
-from rebar_depth_bench.errors import Problem, escape_text
-from rebar_depth_bench.reading import MAX_NESTING, parse_json
+from rebar_depth_bench.base.errors import Problem, escape_text
+from rebar_depth_bench.base.reading import MAX_NESTING, parse_json
 
 _OPENCV_HEADER = re.compile(r"\A\ufeff?%YAML[: ][0-9.]+[^\n]*\n")
 """First line of OpenCV's YAML; its older form, ``%YAML:1.0``, is not YAML."""

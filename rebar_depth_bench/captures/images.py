@@ -14,10 +14,10 @@ from typing import BinaryIO
 from jaxtyping import UInt8
 from numpy import ndarray
 
+from rebar_depth_bench.base.errors import EntryError, InputError, Problem, escape_text, format_shape
+from rebar_depth_bench.base.limits import CELL_BYTES, IMAGE_PIXELS
+from rebar_depth_bench.base.reading import open_regular, read_file
 from rebar_depth_bench.data.codecs import decode
-from rebar_depth_bench.errors import EntryError, InputError, Problem, escape_text, format_shape
-from rebar_depth_bench.limits import CELL_BYTES, IMAGE_PIXELS
-from rebar_depth_bench.reading import open_regular, read_file
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")

@@ -21,11 +21,11 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from rebar_depth_bench.base.errors import Problem, ProblemCode
+from rebar_depth_bench.base.reading import parse_number
+from rebar_depth_bench.base.validation import format_location, short_repr
 from rebar_depth_bench.captures.calibration import Calibration, table_calibration
-from rebar_depth_bench.errors import Problem, ProblemCode
 from rebar_depth_bench.geometry.cameras import is_rotation, nearest_rotation, rotation_matrix
-from rebar_depth_bench.reading import parse_number
-from rebar_depth_bench.validation import format_location, short_repr
 
 Document = Mapping[str, Any]
 Values = Float64[ndarray, "..."]

@@ -24,6 +24,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from rebar_depth_bench.base.errors import InputError, Problem
 from rebar_depth_bench.captures.calibration import Calibration, MonoCalibration, StereoCalibration, camera_columns
 from rebar_depth_bench.captures.camera_files import CALIBRATION_SUFFIXES, CAMERAS_FILE, read_cameras
 from rebar_depth_bench.captures.images import (
@@ -35,7 +36,6 @@ from rebar_depth_bench.captures.images import (
     image_files,
     read_image,
 )
-from rebar_depth_bench.errors import InputError, Problem
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.submission import CaptureViews
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import argparse
 
+from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.limits import CACHE_BYTES
 from rebar_depth_bench.data.cache import cache_folder, clear, entries, total_bytes
-from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.limits import CACHE_BYTES
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

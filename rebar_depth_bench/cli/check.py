@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import argparse
 
-from rebar_depth_bench.console import add_archive, add_data, add_expect_digest, print_verified
+from rebar_depth_bench.base.errors import SubmissionError
+from rebar_depth_bench.base.terminal import ProgressBars, print_notice
+from rebar_depth_bench.cli.console import add_archive, add_data, add_expect_digest, print_verified
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.diagnosis.diagnose import diagnose
-from rebar_depth_bench.errors import SubmissionError
 from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.submission import SubmissionReader
-from rebar_depth_bench.terminal import ProgressBars, print_notice
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

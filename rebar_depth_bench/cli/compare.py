@@ -7,8 +7,9 @@ import json
 
 from rich.console import Console
 
-from rebar_depth_bench.atomic_io import write_output
-from rebar_depth_bench.console import (
+from rebar_depth_bench.base.terminal import ProgressBars
+from rebar_depth_bench.base.writing import write_output
+from rebar_depth_bench.cli.console import (
     InputFile,
     add_data,
     add_expect_digest,
@@ -20,7 +21,6 @@ from rebar_depth_bench.reporting.tables import print_comparison
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.evaluation import score
 from rebar_depth_bench.scoring.frames import differences_frame, frame_csv
-from rebar_depth_bench.terminal import ProgressBars
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -13,15 +13,15 @@ from pathlib import Path
 
 from rich.console import Console
 
-from rebar_depth_bench.atomic_io import write_bytes
-from rebar_depth_bench.console import EXIT_INPUT
-from rebar_depth_bench.errors import BuildError, InputError, require_extra
+from rebar_depth_bench.base.errors import BuildError, InputError, require_extra
+from rebar_depth_bench.base.terminal import ProgressBars, print_notice
+from rebar_depth_bench.base.writing import write_bytes
+from rebar_depth_bench.cli.console import EXIT_INPUT
 from rebar_depth_bench.methods import METHODS
 from rebar_depth_bench.methods.run import predict
 from rebar_depth_bench.reporting.html.page import write_report
 from rebar_depth_bench.reporting.tables import print_table
 from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
-from rebar_depth_bench.terminal import ProgressBars, print_notice
 
 DEMO_CONFIG = "lattice"
 DEMO_METHODS = ("sgbm", "sgbm-filled", "constant")

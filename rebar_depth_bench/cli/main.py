@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Mapping, Sequence
 
-from rebar_depth_bench.console import Command, module_command, program_parser, run_program
+from rebar_depth_bench.cli.console import Command, module_command, program_parser, run_program
 
 _CLI = "rebar_depth_bench.cli"
 COMMANDS: Mapping[str, Command] = {

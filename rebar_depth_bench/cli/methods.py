@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.base.errors import MethodError
 from rebar_depth_bench.methods import AnyMethod, MultiViewMethod, all_methods
 from rebar_depth_bench.methods.base import input_class
 from rebar_depth_bench.reporting.tables import plain_text

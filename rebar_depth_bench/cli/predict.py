@@ -7,9 +7,12 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
+from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.names import SPLITS, TEST_SPLIT
+from rebar_depth_bench.base.terminal import ProgressBars, print_notice
 from rebar_depth_bench.captures.camera_files import CAMERAS_FILE
 from rebar_depth_bench.captures.views import is_capture, open_capture
-from rebar_depth_bench.console import (
+from rebar_depth_bench.cli.console import (
     InputFile,
     OutputArchive,
     add_data,
@@ -23,13 +26,10 @@ from rebar_depth_bench.console import (
 from rebar_depth_bench.data.files import MANIFEST_FILE
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import Views
-from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.methods import METHODS, AnyMethod, MultiViewMethod, find_method
 from rebar_depth_bench.methods.base import VIEW_TIMEOUT_S
 from rebar_depth_bench.methods.registry import FROM_FOLDER
 from rebar_depth_bench.methods.run import dataset_views, predict_views
-from rebar_depth_bench.names import SPLITS, TEST_SPLIT
-from rebar_depth_bench.terminal import ProgressBars, print_notice
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

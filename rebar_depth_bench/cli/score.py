@@ -6,8 +6,10 @@ import argparse
 
 from rich.console import Console
 
-from rebar_depth_bench.atomic_io import write_output
-from rebar_depth_bench.console import (
+from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.terminal import ProgressBars, print_notice
+from rebar_depth_bench.base.writing import write_output
+from rebar_depth_bench.cli.console import (
     add_archive,
     add_data,
     add_expect_digest,
@@ -17,14 +19,12 @@ from rebar_depth_bench.console import (
     prints_table,
 )
 from rebar_depth_bench.diagnosis.diagnose import diagnose
-from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.reporting.html.page import write_report
 from rebar_depth_bench.reporting.html.views import VIEWS_SHOWN
 from rebar_depth_bench.reporting.tables import print_table
 from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
 from rebar_depth_bench.scoring.frames import frame_csv
 from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.terminal import ProgressBars, print_notice
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

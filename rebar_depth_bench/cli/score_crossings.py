@@ -7,13 +7,13 @@ import math
 
 from rich.console import Console
 
-from rebar_depth_bench.atomic_io import write_output
-from rebar_depth_bench.console import InputFile, add_data, add_output_file, add_workers, prints_table
+from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.terminal import ProgressBars, print_notice
+from rebar_depth_bench.base.writing import write_output
+from rebar_depth_bench.cli.console import InputFile, add_data, add_output_file, add_workers, prints_table
 from rebar_depth_bench.detections.score import score_crossings
-from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.reporting.detections import detection_page, print_page, render_page
 from rebar_depth_bench.submission import INPUTS
-from rebar_depth_bench.terminal import ProgressBars, print_notice
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

@@ -10,14 +10,14 @@ from pathlib import Path
 
 from rich.console import Console
 
-from rebar_depth_bench.atomic_io import write_output
-from rebar_depth_bench.console import InputFile, add_archive, add_output_file, add_seconds, prints_table
-from rebar_depth_bench.errors import InputError, printable
-from rebar_depth_bench.leaderboard_client import WAIT_S, LeaderboardClient
+from rebar_depth_bench.base.errors import InputError, printable
+from rebar_depth_bench.base.terminal import ProgressBars
+from rebar_depth_bench.base.writing import write_output
+from rebar_depth_bench.cli.console import InputFile, add_archive, add_output_file, add_seconds, prints_table
+from rebar_depth_bench.remote.leaderboard_client import WAIT_S, LeaderboardClient
 from rebar_depth_bench.reporting.tables import print_table
 from rebar_depth_bench.scoring.columns import COVERAGE, number
 from rebar_depth_bench.scoring.result import DECIMALS, DisclosedResult, Result
-from rebar_depth_bench.terminal import ProgressBars
 
 TOKEN_VARIABLE = "REBAR_LEADERBOARD_TOKEN"
 """Environment variable that holds the token."""

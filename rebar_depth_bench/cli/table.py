@@ -6,8 +6,9 @@ import argparse
 
 from rich.console import Console
 
-from rebar_depth_bench.atomic_io import write_output
-from rebar_depth_bench.console import (
+from rebar_depth_bench.base.terminal import ProgressBars, print_notice
+from rebar_depth_bench.base.writing import write_output
+from rebar_depth_bench.cli.console import (
     InputFile,
     add_data,
     add_expect_digest,
@@ -21,7 +22,6 @@ from rebar_depth_bench.reporting.tables import disambiguate_method_names, print_
 from rebar_depth_bench.scoring.comparison import check_same_splits
 from rebar_depth_bench.scoring.evaluation import score
 from rebar_depth_bench.scoring.frames import frame_csv, tables_frame
-from rebar_depth_bench.terminal import ProgressBars, print_notice
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

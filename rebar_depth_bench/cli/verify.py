@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import argparse
 
-from rebar_depth_bench.console import add_expect_digest
+from rebar_depth_bench.base.errors import DatasetError
+from rebar_depth_bench.base.terminal import ProgressBars
+from rebar_depth_bench.cli.console import add_expect_digest
 from rebar_depth_bench.data.files import file_problems
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import truth_problems
-from rebar_depth_bench.errors import DatasetError
-from rebar_depth_bench.terminal import ProgressBars
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:

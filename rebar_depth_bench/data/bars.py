@@ -13,13 +13,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyarrow as pa
 
+from rebar_depth_bench.base.errors import DatasetError, escape_text
+from rebar_depth_bench.base.limits import TABLE_BYTES
+from rebar_depth_bench.base.names import NAME_LETTERS, NAME_PATTERN
+from rebar_depth_bench.base.reading import open_regular
+from rebar_depth_bench.base.validation import short_repr
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.shards import Table, read_footer, read_table, write_table
-from rebar_depth_bench.errors import DatasetError, escape_text
-from rebar_depth_bench.limits import TABLE_BYTES
-from rebar_depth_bench.names import NAME_LETTERS, NAME_PATTERN
-from rebar_depth_bench.reading import open_regular
-from rebar_depth_bench.validation import short_repr
 
 if TYPE_CHECKING:
     from pandas import DataFrame

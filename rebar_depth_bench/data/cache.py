@@ -26,14 +26,14 @@ import numpy as np
 from numpy import ndarray
 from zlib_ng import zlib_ng
 
-from rebar_depth_bench.atomic_io import atomic_replace, temporary_target
+from rebar_depth_bench.base.errors import DatasetError, InputError, OutputError
+from rebar_depth_bench.base.limits import CACHE_BYTES
+from rebar_depth_bench.base.parallel import Progress, silent
+from rebar_depth_bench.base.reading import FileSource, check_no_links, remove_file
+from rebar_depth_bench.base.terminal import print_notice
+from rebar_depth_bench.base.validation import StrictModel
+from rebar_depth_bench.base.writing import atomic_replace, temporary_target
 from rebar_depth_bench.data.files import parameters_digest
-from rebar_depth_bench.errors import DatasetError, InputError, OutputError
-from rebar_depth_bench.limits import CACHE_BYTES
-from rebar_depth_bench.parallel import Progress, silent
-from rebar_depth_bench.reading import FileSource, check_no_links, remove_file
-from rebar_depth_bench.terminal import print_notice
-from rebar_depth_bench.validation import StrictModel
 
 FOLDER_NAME = "rebar-depth-bench"
 _ENTRY = re.compile(r"[0-9a-f]{64}\.truth")

@@ -17,7 +17,7 @@ from numpy import ndarray
 from PIL import Image
 from PIL.ImageFile import ImageFile
 
-from rebar_depth_bench.limits import CELL_BYTES
+from rebar_depth_bench.base.limits import CELL_BYTES
 
 _TIFF_PREDICTOR, _FLOATING_POINT = 317, 3
 _TIFF_ROWS_PER_STRIP, _TIFF_TILE_WIDTH = 278, 322

@@ -14,11 +14,11 @@ from typing import TYPE_CHECKING, BinaryIO, cast
 
 from pydantic import ConfigDict
 
-from rebar_depth_bench.errors import DatasetError, InputError, Problem, escape_text
-from rebar_depth_bench.names import PATH_PATTERN
-from rebar_depth_bench.parallel import Progress, silent
-from rebar_depth_bench.reading import FileSource, open_regular, path_below
-from rebar_depth_bench.validation import StrictModel
+from rebar_depth_bench.base.errors import DatasetError, InputError, Problem, escape_text
+from rebar_depth_bench.base.names import PATH_PATTERN
+from rebar_depth_bench.base.parallel import Progress, silent
+from rebar_depth_bench.base.reading import FileSource, open_regular, path_below
+from rebar_depth_bench.base.validation import StrictModel
 
 if TYPE_CHECKING:
     from rebar_depth_bench.data.manifest import DatasetFolder

@@ -8,12 +8,12 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
+from rebar_depth_bench.base.errors import DatasetError, InputError, escape_text
+from rebar_depth_bench.base.names import TEST_SPLIT
 from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
 from rebar_depth_bench.data.rows import row_of_pictures
 from rebar_depth_bench.data.schema import COLUMNS, validated_columns
 from rebar_depth_bench.data.shards import check_shards, damaged_error, shard_rows
-from rebar_depth_bench.errors import DatasetError, InputError, escape_text
-from rebar_depth_bench.names import TEST_SPLIT
 
 if TYPE_CHECKING:
     from datasets import Dataset, Features, IterableDataset

@@ -10,6 +10,19 @@ from typing import Annotated, Any, Self
 
 from pydantic import AliasPath, Field, Strict, ValidationInfo, field_validator
 
+from rebar_depth_bench.base.errors import DatasetError, InputError, Problem, escape_text
+from rebar_depth_bench.base.limits import JSON_BYTES
+from rebar_depth_bench.base.names import SPLITS, TEST_SPLIT, scene_prefix
+from rebar_depth_bench.base.reading import parse_json, read_file
+from rebar_depth_bench.base.validation import (
+    check_unique,
+    field_error,
+    format_location,
+    one_of,
+    short_repr,
+    text,
+    validate_table,
+)
 from rebar_depth_bench.data.files import MANIFEST_FILE, Located, file_sha256, parameters_digest, views_digest
 from rebar_depth_bench.data.schema import (
     DIGEST_PATTERN,
@@ -25,19 +38,6 @@ from rebar_depth_bench.data.schema import (
     Scene,
     Sha256,
     ViewRecord,
-)
-from rebar_depth_bench.errors import DatasetError, InputError, Problem, escape_text
-from rebar_depth_bench.limits import JSON_BYTES
-from rebar_depth_bench.names import SPLITS, TEST_SPLIT, scene_prefix
-from rebar_depth_bench.reading import parse_json, read_file
-from rebar_depth_bench.validation import (
-    check_unique,
-    field_error,
-    format_location,
-    one_of,
-    short_repr,
-    text,
-    validate_table,
 )
 
 

@@ -18,15 +18,15 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8, UInt16
 from numpy import ndarray
 
+from rebar_depth_bench.base.errors import DatasetError, Problem, escape_text
+from rebar_depth_bench.base.parallel import Progress, silent
+from rebar_depth_bench.base.validation import short_repr
 from rebar_depth_bench.data import codecs
 from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.data.schema import CAMERA_SHAPES, column_kind
 from rebar_depth_bench.data.shards import encoded_rows
-from rebar_depth_bench.errors import DatasetError, Problem, escape_text
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import Camera, is_rigid
-from rebar_depth_bench.parallel import Progress, silent
-from rebar_depth_bench.validation import short_repr
 
 
 @dataclass(frozen=True, eq=False)

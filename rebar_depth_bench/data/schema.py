@@ -18,10 +18,9 @@ from pydantic import (
     model_validator,
 )
 
-from rebar_depth_bench.errors import DatasetError, escape_text
-from rebar_depth_bench.geometry.aruco_board import BoardSpec
-from rebar_depth_bench.names import NAME_LETTERS, NAME_PATTERN, PATH_PATTERN, SPLITS, VIEW_ID_PATTERN
-from rebar_depth_bench.validation import (
+from rebar_depth_bench.base.errors import DatasetError, escape_text
+from rebar_depth_bench.base.names import NAME_LETTERS, NAME_PATTERN, PATH_PATTERN, SPLITS, VIEW_ID_PATTERN
+from rebar_depth_bench.base.validation import (
     Expected,
     StrictModel,
     Triple,
@@ -33,6 +32,7 @@ from rebar_depth_bench.validation import (
     three_numbers,
     whole_number,
 )
+from rebar_depth_bench.geometry.aruco_board import BoardSpec
 
 if TYPE_CHECKING:
     from datasets import Features

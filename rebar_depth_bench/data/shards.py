@@ -21,12 +21,12 @@ from typing import Any, BinaryIO
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from rebar_depth_bench.atomic_io import atomic_replace
+from rebar_depth_bench.base.errors import DatasetError, InputError, escape_text
+from rebar_depth_bench.base.limits import CELL_BYTES
+from rebar_depth_bench.base.reading import open_regular
+from rebar_depth_bench.base.writing import atomic_replace
 from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.data.schema import CAMERA_SHAPES, ROW_SCHEMA, column_kind, validated_columns
-from rebar_depth_bench.errors import DatasetError, InputError, escape_text
-from rebar_depth_bench.limits import CELL_BYTES
-from rebar_depth_bench.reading import open_regular
 
 _TAIL_BYTES = 8
 """Length of the end of a file: the number of bytes of the footer (32 bits, little-endian), and ``PAR1``."""

@@ -11,11 +11,11 @@ import numpy as np
 import PIL.Image
 from datasets import Dataset, Image, IterableDataset, Value
 
+from rebar_depth_bench.base.errors import DatasetError, InputError, MethodError, Problem
 from rebar_depth_bench.data.codecs import PICTURE_KINDS
 from rebar_depth_bench.data.decoding_features import STORED_MODES
 from rebar_depth_bench.data.rows import is_absent
 from rebar_depth_bench.data.schema import EYES, column_kind
-from rebar_depth_bench.errors import DatasetError, InputError, MethodError, Problem
 
 Row = Mapping[str, Any]
 

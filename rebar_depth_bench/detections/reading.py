@@ -16,14 +16,14 @@ import pyarrow as pa
 from jaxtyping import Float64
 from numpy import ndarray
 
+from rebar_depth_bench.base.errors import Problem, SubmissionError, escape_text
+from rebar_depth_bench.base.limits import DETECTIONS_BYTES
+from rebar_depth_bench.base.names import config_of, split_of
+from rebar_depth_bench.base.reading import open_regular, parse_number, read_file
+from rebar_depth_bench.base.validation import validate_table
 from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.data.shards import Table, open_parquet
-from rebar_depth_bench.errors import Problem, SubmissionError, escape_text
-from rebar_depth_bench.limits import DETECTIONS_BYTES
-from rebar_depth_bench.names import config_of, split_of
-from rebar_depth_bench.reading import open_regular, parse_number, read_file
 from rebar_depth_bench.submission.declaration import SubmissionMeta
-from rebar_depth_bench.validation import validate_table
 
 # Columns of a file of detections, and its content as arrays in the order of the file.
 

@@ -11,6 +11,9 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
+from rebar_depth_bench.base.errors import InputError, escape_text
+from rebar_depth_bench.base.names import TEST_SPLIT, config_of, split_of
+from rebar_depth_bench.base.parallel import Progress, map_with_progress, silent
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_folder
 from rebar_depth_bench.detections.reading import DetectionFile, Detections, read_detections
 from rebar_depth_bench.detections.result import (
@@ -19,13 +22,10 @@ from rebar_depth_bench.detections.result import (
     ViewDetections,
     tabulate_detections,
 )
-from rebar_depth_bench.errors import InputError, escape_text
 from rebar_depth_bench.extended.ground_truth import has_bar_ids, load_steel_truth
 from rebar_depth_bench.extended.judged import shown_bars
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.geometry.cameras import transform
-from rebar_depth_bench.names import TEST_SPLIT, config_of, split_of
-from rebar_depth_bench.parallel import Progress, map_with_progress, silent
 from rebar_depth_bench.scoring.bootstrap import resample_views
 
 

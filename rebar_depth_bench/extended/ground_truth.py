@@ -10,20 +10,20 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
-from rebar_depth_bench.bar_crossings.definition import CROSSINGS_PROTOCOL
-from rebar_depth_bench.bar_crossings.table import CrossingsSource, folder_crossings
+from rebar_depth_bench.base.errors import DatasetError
+from rebar_depth_bench.base.parallel import Progress, silent
+from rebar_depth_bench.crossings.definition import CROSSINGS_PROTOCOL
+from rebar_depth_bench.crossings.table import CrossingsSource, folder_crossings
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars
 from rebar_depth_bench.data.cache import ArrayCache, CacheContent, ViewArrays, open_cache
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder
 from rebar_depth_bench.data.rows import EyeTruth
-from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.extended.axes import assign_segments
 from rebar_depth_bench.extended.depth_layers import other_layers
 from rebar_depth_bench.extended.judged import SAMPLED_PIXELS, judged_crossings
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL
 from rebar_depth_bench.extended.steel import JudgedCrossings, SceneBars, SteelTruth
 from rebar_depth_bench.geometry.cameras import pixel_rays
-from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.scoring.protocol import interior, single_bar_pixels
 from rebar_depth_bench.scoring.truth import are_pixels_inside, cache_inputs, scored_counts, verified_views

@@ -14,6 +14,7 @@ from jaxtyping import Float, Float64
 from numpy import ndarray
 
 from rebar_depth_bench import extended
+from rebar_depth_bench.base.parallel import Progress, silent
 from rebar_depth_bench.extended.ground_truth import has_bar_ids, steel_truth
 from rebar_depth_bench.extended.measures import (
     NATIVE,
@@ -26,7 +27,6 @@ from rebar_depth_bench.extended.measures import (
 )
 from rebar_depth_bench.extended.result import ExtendedResult, ViewSamples, tabulate_extended, view_numbers
 from rebar_depth_bench.extended.steel import SteelTruth
-from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.scoring.bootstrap import resample_views
 from rebar_depth_bench.scoring.evaluation import Evaluation, score_evaluation
 from rebar_depth_bench.scoring.result import Result

@@ -12,9 +12,9 @@ import numpy as np
 from jaxtyping import Float, Float32
 from numpy import ndarray
 
+from rebar_depth_bench.base.errors import MethodError
+from rebar_depth_bench.base.parallel import Progress
 from rebar_depth_bench.data.rows import Views
-from rebar_depth_bench.errors import MethodError
-from rebar_depth_bench.parallel import Progress
 
 Predictor = Callable[[Mapping[str, Any]], Float32[ndarray, "h w"]]
 """Function from a decoded row to planar depth of the left view, metres, on the left grid; NaN: no prediction."""

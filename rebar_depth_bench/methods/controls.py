@@ -18,8 +18,9 @@ import numpy as np
 from jaxtyping import Float32, Float64
 from numpy import ndarray
 
+from rebar_depth_bench.base.errors import MethodError
+from rebar_depth_bench.base.parallel import Progress
 from rebar_depth_bench.data.rows import Views
-from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.cameras import pixel_rays
 from rebar_depth_bench.methods.base import (
     Method,
@@ -29,7 +30,6 @@ from rebar_depth_bench.methods.base import (
     import_optional,
     positive_or_nan,
 )
-from rebar_depth_bench.parallel import Progress
 
 CONSTANT_DEPTH_M = 1.0
 

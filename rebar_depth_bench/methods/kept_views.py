@@ -21,16 +21,16 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from rebar_depth_bench.atomic_io import named_write_errors, write_bytes, write_error, write_text
+from rebar_depth_bench.base.errors import EntryError, InputError, Problem, escape_text
+from rebar_depth_bench.base.limits import JSON_BYTES
+from rebar_depth_bench.base.names import NAME_PATTERN
+from rebar_depth_bench.base.reading import FileSource, parse_json, path_below, read_file, remove_folder
+from rebar_depth_bench.base.terminal import print_notice
+from rebar_depth_bench.base.validation import Expected, StrictModel, validate_table
+from rebar_depth_bench.base.writing import named_write_errors, write_bytes, write_error, write_text
 from rebar_depth_bench.data.rows import Views
-from rebar_depth_bench.errors import EntryError, InputError, Problem, escape_text
-from rebar_depth_bench.limits import JSON_BYTES
-from rebar_depth_bench.names import NAME_PATTERN
-from rebar_depth_bench.reading import FileSource, parse_json, path_below, read_file, remove_folder
 from rebar_depth_bench.submission.maps import decode_npy, max_npy_bytes
 from rebar_depth_bench.submission.zip import read_data, read_entries
-from rebar_depth_bench.terminal import print_notice
-from rebar_depth_bench.validation import Expected, StrictModel, validate_table
 
 _RUN_FILE, _WORK_SUFFIX = "run.json", ".work"
 _SECONDS = "seconds"

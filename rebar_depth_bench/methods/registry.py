@@ -22,8 +22,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from rebar_depth_bench.base.errors import MethodError, exception_summary
 from rebar_depth_bench.data.files import file_sha256
-from rebar_depth_bench.errors import MethodError, exception_summary
 from rebar_depth_bench.methods.base import VIEW_TIMEOUT_S, AnyMethod, Method, MultiViewMethod, WeightsMethod
 
 ENTRY_POINT_GROUP = "rebar_depth_bench.methods"

@@ -21,16 +21,16 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from rebar_depth_bench import software_version
-from rebar_depth_bench.atomic_io import NO_SPACE, is_stream, link_target, scratch_folder, write_error
+from rebar_depth_bench.base.errors import DatasetError, InputError, MethodError, RebarDepthError, escape_text
+from rebar_depth_bench.base.names import TEST_SPLIT
+from rebar_depth_bench.base.parallel import Progress, silent
+from rebar_depth_bench.base.writing import NO_SPACE, is_stream, link_target, scratch_folder, write_error
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.data.rows import Views
-from rebar_depth_bench.errors import DatasetError, InputError, MethodError, RebarDepthError, escape_text
 from rebar_depth_bench.methods import AnyMethod, ConfigViews, Method, MultiViewMethod, Predictor, Prepared
 from rebar_depth_bench.methods.base import import_optional, input_class
 from rebar_depth_bench.methods.kept_views import KeptViews, PreparationReport
 from rebar_depth_bench.methods.sgbm import RECTIFIED_COLUMNS, STEREO_COLUMNS, pair_row
-from rebar_depth_bench.names import TEST_SPLIT
-from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.submission import SubmissionWriter
 
 

@@ -26,8 +26,9 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, UInt8
 from numpy import ndarray
 
+from rebar_depth_bench.base.errors import MethodError
+from rebar_depth_bench.base.validation import short_repr
 from rebar_depth_bench.data.files import files_digest
-from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor, positive_or_nan
 from rebar_depth_bench.methods.paper.third_party import (
     CONFIG,
@@ -40,7 +41,6 @@ from rebar_depth_bench.methods.paper.third_party import (
     snapshot,
     torch_device,
 )
-from rebar_depth_bench.validation import short_repr
 
 if TYPE_CHECKING:
     from torch import Tensor

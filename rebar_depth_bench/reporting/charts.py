@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING
 
 from markupsafe import Markup, escape
 
-from rebar_depth_bench.errors import printable
+from rebar_depth_bench.base.errors import printable
 from rebar_depth_bench.reporting.axes import Axis, decade_axis, log_axis_with_one, select_spaced, tick_label
 from rebar_depth_bench.scoring.bootstrap import Interval
 from rebar_depth_bench.scoring.columns import NATIVE, SCALE, SCALED, number

@@ -8,7 +8,7 @@ from functools import partial
 from rich.console import Console
 from rich.padding import Padding
 
-from rebar_depth_bench.errors import printable
+from rebar_depth_bench.base.errors import printable
 from rebar_depth_bench.extended.crossings import MISS_DEG
 from rebar_depth_bench.extended.fits import MISS_MM
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, NATIVE, SCALED, Measure, MeasureFamily

@@ -16,8 +16,8 @@ from io import BytesIO
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rebar_depth_bench.atomic_io import write_output
-from rebar_depth_bench.errors import InputError, printable, require_extra
+from rebar_depth_bench.base.errors import InputError, printable, require_extra
+from rebar_depth_bench.base.writing import write_output
 from rebar_depth_bench.reporting.axes import Axis, decade_axis, select_spaced, tick_label
 from rebar_depth_bench.reporting.formatting import (
     CONSTANT_TITLE,

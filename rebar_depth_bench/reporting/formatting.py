@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from typing import TYPE_CHECKING
 
-from rebar_depth_bench.errors import printable
+from rebar_depth_bench.base.errors import printable
 from rebar_depth_bench.scoring.bootstrap import MIN_BLOCKS
 from rebar_depth_bench.scoring.columns import (
     CONSTANT,

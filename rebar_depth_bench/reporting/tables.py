@@ -15,7 +15,8 @@ from rich.table import Table as RichTable
 from rich.text import Text
 
 from rebar_depth_bench import software_version
-from rebar_depth_bench.errors import printable
+from rebar_depth_bench.base.errors import printable
+from rebar_depth_bench.base.terminal import terminal_text
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.published import (
     OTHER_OPTICS_MARK,
@@ -46,7 +47,6 @@ from rebar_depth_bench.scoring.columns import (
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.table import PublishedMatch, Table
-from rebar_depth_bench.terminal import terminal_text
 
 if TYPE_CHECKING:
     from rebar_depth_bench.scoring.comparison import Comparison, Difference

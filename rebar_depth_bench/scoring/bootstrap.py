@@ -29,7 +29,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray
 
-from rebar_depth_bench.names import scene_of
+from rebar_depth_bench.base.names import scene_of
 
 RESAMPLES = 2000
 """Number of bootstrap resamples (draws)."""

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.names import config_of
+from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.names import config_of
 from rebar_depth_bench.scoring.bootstrap import INTERVALS, Interval, resample_views
 from rebar_depth_bench.scoring.columns import (
     COLUMN_BY_PATH,

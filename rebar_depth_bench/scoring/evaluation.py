@@ -18,14 +18,14 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from rebar_depth_bench import software_version
+from rebar_depth_bench.base.errors import SubmissionError
+from rebar_depth_bench.base.names import TEST_SPLIT, config_of, split_of
+from rebar_depth_bench.base.parallel import Progress, map_with_progress, silent
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_folder
 from rebar_depth_bench.data.rows import camera_from_row, decode_row
 from rebar_depth_bench.data.schema import CAMERA_SHAPES
 from rebar_depth_bench.data.shards import encoded_rows
-from rebar_depth_bench.errors import SubmissionError
 from rebar_depth_bench.geometry.cameras import Camera
-from rebar_depth_bench.names import TEST_SPLIT, config_of, split_of
-from rebar_depth_bench.parallel import Progress, map_with_progress, silent
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareIdentity, SubmissionIdentity
 from rebar_depth_bench.scoring.score import ReadDepth, UseView, score_views

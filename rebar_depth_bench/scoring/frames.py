@@ -11,8 +11,8 @@ import json
 from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
-from rebar_depth_bench.errors import printable
-from rebar_depth_bench.names import config_of
+from rebar_depth_bench.base.errors import printable
+from rebar_depth_bench.base.names import config_of
 from rebar_depth_bench.scoring.columns import TABLE_COLUMNS, VIEW_COLUMNS, rounded, rounded_interval
 
 if TYPE_CHECKING:

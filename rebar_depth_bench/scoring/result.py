@@ -23,10 +23,11 @@ from pydantic import (
 )
 from pydantic_core import core_schema
 
-from rebar_depth_bench.errors import InputError, Problem, SubmissionError, printable
-from rebar_depth_bench.limits import JSON_BYTES
-from rebar_depth_bench.names import config_of
-from rebar_depth_bench.reading import parse_json
+from rebar_depth_bench.base.errors import InputError, Problem, SubmissionError, printable
+from rebar_depth_bench.base.limits import JSON_BYTES
+from rebar_depth_bench.base.names import config_of
+from rebar_depth_bench.base.reading import parse_json
+from rebar_depth_bench.base.validation import StrictModel, field_error, one_of, validate_document, validate_table
 from rebar_depth_bench.scoring import frames
 from rebar_depth_bench.scoring.bootstrap import INTERVALS
 from rebar_depth_bench.scoring.columns import Share
@@ -43,7 +44,6 @@ from rebar_depth_bench.scoring.table import (
     check_tables,
 )
 from rebar_depth_bench.submission.declaration import INPUTS, Declaration
-from rebar_depth_bench.validation import StrictModel, field_error, one_of, validate_document, validate_table
 
 if TYPE_CHECKING:
     from pandas import DataFrame

@@ -22,8 +22,9 @@ from pydantic import (
     create_model,
 )
 
-from rebar_depth_bench.errors import InputError, Problem
-from rebar_depth_bench.names import SPLITS
+from rebar_depth_bench.base.errors import InputError, Problem
+from rebar_depth_bench.base.names import SPLITS
+from rebar_depth_bench.base.validation import Expected, field_error, one_of, text, validate_document
 from rebar_depth_bench.scoring.bootstrap import Interval
 from rebar_depth_bench.scoring.columns import (
     COLUMN_BY_PATH,
@@ -37,7 +38,6 @@ from rebar_depth_bench.scoring.columns import (
 from rebar_depth_bench.scoring.metrics import DepthMetrics
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, WITHIN_MM
 from rebar_depth_bench.scoring.reference import Reference
-from rebar_depth_bench.validation import Expected, field_error, one_of, text, validate_document
 
 if TYPE_CHECKING:
     from pydantic import SerializerFunctionWrapHandler

@@ -15,13 +15,13 @@ import numpy as np
 from jaxtyping import UInt32
 from numpy import ndarray
 
+from rebar_depth_bench.base.errors import DatasetError
+from rebar_depth_bench.base.parallel import Progress, silent
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars, with_axis
 from rebar_depth_bench.data.cache import CacheContent, ViewArrays, open_cache
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder
 from rebar_depth_bench.data.rows import EyeTruth, iterate_rows, truth_columns, truth_from_row
 from rebar_depth_bench.data.schema import NEAREST_STEEL, Assembly, Trajectory
-from rebar_depth_bench.errors import DatasetError
-from rebar_depth_bench.parallel import Progress, silent
 from rebar_depth_bench.scoring.groups import ViewTraits, bar_width_px
 from rebar_depth_bench.scoring.metrics import median
 from rebar_depth_bench.scoring.protocol import PROTOCOL, scored_pixels

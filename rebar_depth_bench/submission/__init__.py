@@ -1,6 +1,6 @@
 """Submission archives: writing, validation and reading of predictions."""
 
-from rebar_depth_bench.errors import EntryError
+from rebar_depth_bench.base.errors import EntryError
 from rebar_depth_bench.submission.declaration import INPUTS, Declaration, SubmissionMeta
 from rebar_depth_bench.submission.entries import CaptureViews, ExpectedViews
 from rebar_depth_bench.submission.reader import SubmissionReader

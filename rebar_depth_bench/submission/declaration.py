@@ -11,9 +11,9 @@ from urllib.parse import urlsplit
 
 from pydantic import ConfigDict
 
-from rebar_depth_bench.errors import Problem
-from rebar_depth_bench.reading import parse_json
-from rebar_depth_bench.validation import Expected, Flag, StrictModel, one_of, text, validate_table
+from rebar_depth_bench.base.errors import Problem
+from rebar_depth_bench.base.reading import parse_json
+from rebar_depth_bench.base.validation import Expected, Flag, StrictModel, one_of, text, validate_table
 
 METADATA_NAME = "submission.json"
 DEPTH_SCALE = f"{METADATA_NAME}: depth_scale"

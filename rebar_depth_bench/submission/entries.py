@@ -10,8 +10,8 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import PurePosixPath
 
-from rebar_depth_bench.errors import Problem, escape_text
-from rebar_depth_bench.names import config_of, split_of
+from rebar_depth_bench.base.errors import Problem, escape_text
+from rebar_depth_bench.base.names import config_of, split_of
 from rebar_depth_bench.submission.declaration import MAX_METADATA_BYTES, METADATA_NAME
 from rebar_depth_bench.submission.maps import (
     Depth,

@@ -24,8 +24,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from rebar_depth_bench.errors import EntryError, Problem, escape_text, format_shape
-from rebar_depth_bench.reading import MemorySource
+from rebar_depth_bench.base.errors import EntryError, Problem, escape_text, format_shape
+from rebar_depth_bench.base.reading import MemorySource
 from rebar_depth_bench.submission.zip import read_data, read_entries
 
 MAX_HEADER_BYTES = 4096

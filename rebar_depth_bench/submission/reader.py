@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path, PurePosixPath
 
-from rebar_depth_bench.errors import EntryError, Problem
-from rebar_depth_bench.parallel import Progress, silent
-from rebar_depth_bench.reading import FileSource
+from rebar_depth_bench.base.errors import EntryError, Problem
+from rebar_depth_bench.base.parallel import Progress, silent
+from rebar_depth_bench.base.reading import FileSource
 from rebar_depth_bench.submission.declaration import DEPTH_SCALE, METADATA_NAME, SubmissionMeta, parse_metadata
 from rebar_depth_bench.submission.entries import FORMATS, ExpectedViews, match_entries, max_entry_bytes
 from rebar_depth_bench.submission.maps import Depth

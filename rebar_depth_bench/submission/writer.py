@@ -15,12 +15,12 @@ from typing import Any, BinaryIO, Self
 
 import numpy as np
 
-from rebar_depth_bench.atomic_io import output_file
-from rebar_depth_bench.errors import InputError, Problem, escape_text
-from rebar_depth_bench.names import VIEW_ID_PATTERN
+from rebar_depth_bench.base.errors import InputError, Problem, escape_text
+from rebar_depth_bench.base.names import VIEW_ID_PATTERN
+from rebar_depth_bench.base.validation import validate_table
+from rebar_depth_bench.base.writing import output_file
 from rebar_depth_bench.submission.declaration import METADATA_NAME, SubmissionMeta
 from rebar_depth_bench.submission.maps import Depth
-from rebar_depth_bench.validation import validate_table
 
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 _UNIX_MODE = 0o100644

@@ -18,8 +18,8 @@ from dataclasses import dataclass, replace
 
 from zlib_ng import zlib_ng
 
-from rebar_depth_bench.errors import EntryError, Problem, ProblemCode, escape_text
-from rebar_depth_bench.reading import ByteSource
+from rebar_depth_bench.base.errors import EntryError, Problem, ProblemCode, escape_text
+from rebar_depth_bench.base.reading import ByteSource
 
 _END_RECORD = struct.Struct("<4s4H2LH")
 _ZIP64_END_LOCATOR = struct.Struct("<4sLQL")

@@ -20,13 +20,13 @@ import numpy as np
 from PIL import Image
 
 from leaderboard.settings import read_settings
+from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.terminal import terminal_text
 from rebar_depth_bench.captures.camera_files import read_cameras
 from rebar_depth_bench.captures.views import open_capture
-from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.scoring.result import read_result
 from rebar_depth_bench.submission.declaration import parse_metadata
 from rebar_depth_bench.submission.entries import FORMATS
-from rebar_depth_bench.terminal import terminal_text
 from tests.bench.captures import calibration_files as calibrations
 from tests.bench.captures.example_capture import write_capture
 from tests.bench.captures.test_cameras_toml import BOARD, POSES

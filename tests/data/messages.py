@@ -16,10 +16,10 @@ import numpy as np
 from dataset_builder.catalog.named_configs import BuildRequest
 from dataset_builder.user_files.cage_file import cage_file_spec, load_cage
 from dataset_builder.user_files.scene_schema import read_scene_toml
+from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.captures.calibration_files import read_calibration
 from rebar_depth_bench.captures.views import open_capture
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.methods.onnx.spec import read_onnx_toml
 from rebar_depth_bench.submission import SubmissionReader
 from tests.bench.geometry.calibrations import CONF

@@ -10,7 +10,7 @@ import pytest
 
 from depth_maps import open_maps
 from rebar_depth_bench import SubmissionWriter
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.base.errors import InputError
 from tests.bench.submission.zips import exr, npz, png
 
 DEPTH = np.linspace(0.5, 2.0, 12).reshape(3, 4).astype(np.float32)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rebar_depth_bench.console import EXIT_DONE
+from rebar_depth_bench.cli.console import EXIT_DONE
 from tests.fuzz.damage import damage_content
 from tests.fuzz.entry_point import EntryPoint
 from tests.fuzz.oracle import Expectation, Observation, failures, observe

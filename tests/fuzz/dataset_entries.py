@@ -19,10 +19,10 @@ from dataset_builder.cli.main import argument_parser as builder_parser
 from dataset_builder.pipeline.build import build
 from dataset_builder.specs.config_specs import colour_spec
 from rebar_depth_bench import SubmissionWriter, load
-from rebar_depth_bench.console import EXIT_DONE
+from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.cli.console import EXIT_DONE
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import ConfigViews
-from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.methods.controls import noisy_depth_m
 from rebar_depth_bench.submission import SubmissionReader
 from tests.fuzz.entry_point import EntryPoint, bench, run_options

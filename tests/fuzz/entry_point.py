@@ -7,8 +7,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from rebar_depth_bench.cli.console import EXIT_DONE, EXIT_INPUT, check_outputs
 from rebar_depth_bench.cli.main import argument_parser
-from rebar_depth_bench.console import EXIT_DONE, EXIT_INPUT, check_outputs
 from tests.fuzz.workspace import Workspace
 
 

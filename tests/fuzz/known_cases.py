@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pyarrow.parquet as pq
 
-from rebar_depth_bench.console import EXIT_INPUT
+from rebar_depth_bench.cli.console import EXIT_INPUT
 from rebar_depth_bench.data.codecs import encode_depth
 from tests.bench.captures.example_capture import write_capture
 from tests.bench.methods.onnx_models import write_mixer_model, write_toml

@@ -13,9 +13,9 @@ from pathlib import Path
 import onnx
 
 from leaderboard.settings import read_settings
-from rebar_depth_bench.console import EXIT_DONE, EXIT_INPUT, EXIT_OTHER
+from rebar_depth_bench.base.errors import MethodError
+from rebar_depth_bench.cli.console import EXIT_DONE, EXIT_INPUT, EXIT_OTHER
 from rebar_depth_bench.data.files import file_sha256
-from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods import find_method
 from tests.bench.methods.onnx_models import write_mixer_model, write_toml
 from tests.fuzz.capture_entries import write_result

@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
 
-from rebar_depth_bench.console import EXIT_DONE, EXIT_INPUT, run_command
-from rebar_depth_bench.errors import RebarDepthError
+from rebar_depth_bench.base.errors import RebarDepthError
+from rebar_depth_bench.cli.console import EXIT_DONE, EXIT_INPUT, run_command
 from tests.commands import run_in_process
 from tests.fuzz.workspace import CACHE, OUT, Workspace, changes
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rebar_depth_bench.errors import InputError, Problem, RebarDepthError
+from rebar_depth_bench.base.errors import InputError, Problem, RebarDepthError
 from tests.fuzz.campaign import table, write_log
 from tests.fuzz.cases import Outcome
 from tests.fuzz.damage import damage_content

@@ -20,7 +20,7 @@ import httpx2
 import pytest
 
 from rebar_depth_bench import load
-from rebar_depth_bench.errors import Problem
+from rebar_depth_bench.base.errors import Problem
 from tests import requirements
 from tests.leaderboard.conftest import SharedServer, WriteArchive, filled_board
 from tests.leaderboard.postgres import Postgres

@@ -17,8 +17,8 @@ import pytest
 from leaderboard.storage.archive_store import ArchiveNotFoundError, ArchiveStore
 from leaderboard.storage.retention import ORPHAN_AGE_S
 from leaderboard.uploads.accept import UNAVAILABLE_MESSAGE
-from rebar_depth_bench.atomic_io import atomic_replace
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.writing import atomic_replace
 from tests.leaderboard.serving import RunServer, make_token, running_scorer
 from tests.processes import wait_until
 

@@ -23,7 +23,7 @@ from leaderboard.settings import Settings
 from leaderboard.storage.archive_store import state_lock
 from leaderboard.storage.backup import back_up
 from leaderboard.storage.retention import prune_archives
-from rebar_depth_bench.errors import InputError, StorageError
+from rebar_depth_bench.base.errors import InputError, StorageError
 from tests.leaderboard.boards import (
     add_submission,
     assert_sound,

@@ -12,8 +12,8 @@ from typing import Any
 
 import pytest
 
-from rebar_depth_bench.errors import InputError, SubmissionError
-from rebar_depth_bench.leaderboard_client import LeaderboardClient, ServiceError
+from rebar_depth_bench.base.errors import InputError, SubmissionError
+from rebar_depth_bench.remote.leaderboard_client import LeaderboardClient, ServiceError
 from tests.leaderboard.conftest import SharedServer, WriteArchive
 from tests.leaderboard.serving import RunServer, Server
 

@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from rebar_depth_bench import load
-from rebar_depth_bench.errors import MAX_PROBLEMS_SHOWN, Problem
+from rebar_depth_bench.base.errors import MAX_PROBLEMS_SHOWN, Problem
 from tests.ground_truth import truth_of
 from tests.leaderboard.hostile_zips import (
     KINDS,

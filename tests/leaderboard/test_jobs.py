@@ -20,7 +20,7 @@ from leaderboard.db.submissions import Quota, QuotaExceededError, Upload
 from leaderboard.db.tokens import create_token, find_token, list_tokens, replace_token, revoke_token
 from leaderboard.scoring.sandbox import Outcome, ViewPicture
 from leaderboard.settings import MAX_LEASE_S, read_settings
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.submission import SubmissionMeta
 from tests.bench.reporting.results import result, scored_view
 

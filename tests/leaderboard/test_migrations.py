@@ -20,7 +20,7 @@ from leaderboard.db.engine import MIGRATIONS, Database
 from leaderboard.db.models import Base
 from leaderboard.db.tokens import create_token, find_token
 from leaderboard.settings import Settings
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.base.errors import InputError
 
 _MIGRATE = """
 import sys

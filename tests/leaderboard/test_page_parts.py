@@ -22,7 +22,7 @@ from leaderboard.uploads.multipart import MAX_FIELD_BYTES, UploadForm
 from leaderboard.web.pages.ranking import make_config_ranking
 from leaderboard.web.pages.rendering import clean_text, error_response, format_size, link_html, time_html
 from leaderboard.web.pages.selection import COLUMNS, RANK, Selection, parse_selection
-from rebar_depth_bench.errors import Problem
+from rebar_depth_bench.base.errors import Problem
 from rebar_depth_bench.reporting.formatting import table_notes
 from rebar_depth_bench.scoring.result import read_result
 from tests.bench.reporting.results import overflowed_view, result, scored_view, unpredicted_view

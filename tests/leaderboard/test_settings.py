@@ -19,7 +19,7 @@ from pydantic import ByteSize
 from leaderboard.cli import COMMANDS, argument_parser
 from leaderboard.settings import Settings, read_settings
 from leaderboard.storage.archive_store import ArchiveStore
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.base.errors import InputError
 
 PASSWORD = "Hunter2"
 PREFIX = "REBAR_LEADERBOARD_"

@@ -10,8 +10,8 @@ import pytest
 
 import rebar_depth_bench as rdb
 from leaderboard.scoring.sandbox import check, score
+from rebar_depth_bench.base.errors import SubmissionError
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.errors import SubmissionError
 from tests.synthetic_dataset import write_split_dataset
 
 

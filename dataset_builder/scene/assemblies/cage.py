@@ -16,8 +16,8 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.scene.model import Mesh, Note, axis_of
+from rebar_depth_bench.base.errors import Problem
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.errors import Problem
 
 _NO_MESH = Mesh(np.zeros((0, 3)), np.zeros((0, 3), np.int32))
 """What is packed for a bar whose mesh is swept along its axis."""

@@ -25,9 +25,9 @@ from dataset_builder.scene.cages.families.walls import wall
 from dataset_builder.scene.model import Assembly, Mesh, axis_of
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
 from dataset_builder.specs.config_specs import GeneratedCageSpec
+from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.names import SPLITS
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.names import SPLITS
 
 VERSION = 1
 """Version of the generator: it changes when the same seed gives another cage."""

@@ -25,7 +25,7 @@ from dataset_builder.scene.environments.light_rigs import (
 from dataset_builder.scene.environments.outdoors import outdoors
 from dataset_builder.scene.model import Part
 from dataset_builder.scene.variants.registry import IMAGE_LIGHTS, LIGHT_SLOT, VARIANTS
-from rebar_depth_bench.errors import InputError, Problem
+from rebar_depth_bench.base.errors import InputError, Problem
 
 GROUND_CLEARANCE_M = 0.1
 """Least height of an eye above the ground, or above objects that stand there, metres."""

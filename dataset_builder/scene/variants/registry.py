@@ -13,7 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dataset_builder.specs.config_specs import SceneSpec
-from rebar_depth_bench.errors import InputError, Problem
+from rebar_depth_bench.base.errors import InputError, Problem
 
 LIGHT_SLOT, STEEL_SLOT, PROPS_SLOT, SENSOR_SLOT = "light", "steel", "things", "sensor"
 EXCLUSIVE_SLOTS = (LIGHT_SLOT, STEEL_SLOT)

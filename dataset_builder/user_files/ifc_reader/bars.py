@@ -55,7 +55,7 @@ from dataset_builder.user_files.ifc_records import (
     StepRecord,
     SurfaceRecord,
 )
-from rebar_depth_bench.errors import MeshError
+from rebar_depth_bench.base.errors import MeshError
 
 MAX_POINTS = 20_000_000
 """Largest number of points of all axes and surfaces of a model, which maps can multiply: 480 MB."""

@@ -26,7 +26,7 @@ from dataset_builder.user_files.ifc_reader.step_text import (
     split_arguments,
     tokens,
 )
-from rebar_depth_bench.errors import MeshError, escape_text
+from rebar_depth_bench.base.errors import MeshError, escape_text
 
 Entity = Any
 """An ``ifcopenshell.entity_instance``, with the attributes of its IFC class."""

@@ -18,7 +18,7 @@ from ifcopenshell.util.unit import get_prefix_multiplier
 from dataset_builder.specs.file_specs import Selection
 from dataset_builder.user_files.ifc_reader.ifc_model import Entity, Model
 from dataset_builder.user_files.ifc_records import LeftOutRecord, Source
-from rebar_depth_bench.errors import MeshError, escape_text
+from rebar_depth_bench.base.errors import MeshError, escape_text
 
 CLASSES = ("IfcReinforcingBar", "IfcReinforcingMesh", "IfcTendon")
 """Classes of reinforcement, which is read without a selection."""

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Int64
 from numpy import ndarray
 
-from rebar_depth_bench.errors import MeshError, escape_text
+from rebar_depth_bench.base.errors import MeshError, escape_text
 
 MAX_SCHEMA_NAME = 64
 """Largest length of a schema's name; ifcopenshell crashes on one of 1,000 letters."""

@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float, Float64, Int64
 from numpy import ndarray
 
-from rebar_depth_bench.errors import Problem, ProblemCode, escape_text
+from rebar_depth_bench.base.errors import Problem, ProblemCode, escape_text
 
 Surface = tuple[Float[ndarray, "v 3"], Int64[ndarray, "n 3"]]
 """Vertices in the file's unit and axes, and triangles, whose corners are indices of these vertices.

@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from rebar_depth_bench.errors import Problem
+from rebar_depth_bench.base.errors import Problem
 
 _ID = "5f0c9a7e2b4d4c1f8e6a3d2b1c0f9e8d"
 _PROBLEM = Problem("invalid", "lattice/0042.npy", "the dtype is <i4", "float16, float32 or float64")

@@ -25,7 +25,7 @@ from leaderboard.service import Service
 from leaderboard.web.cache import NO_STORE
 from leaderboard.web.dependencies import MAX_PATCH_BYTES, ServiceDep
 from leaderboard.web.pages.rendering import render
-from rebar_depth_bench.errors import printable
+from rebar_depth_bench.base.errors import printable
 from rebar_depth_bench.submission.declaration import MethodDetails
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)

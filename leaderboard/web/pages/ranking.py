@@ -27,7 +27,7 @@ from leaderboard.web.pages.selection import (
     Selection,
     parse_selection,
 )
-from rebar_depth_bench.errors import printable
+from rebar_depth_bench.base.errors import printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.charts import ScatterPoint, scatter_chart
 from rebar_depth_bench.reporting.published import (

@@ -18,7 +18,7 @@ from leaderboard.service import Service
 from leaderboard.web.cache import NO_STORE, REVALIDATE
 from leaderboard.web.pages.static import static_path
 from rebar_depth_bench import software_version
-from rebar_depth_bench.errors import MAX_PROBLEMS_SHOWN, Problem, printable
+from rebar_depth_bench.base.errors import MAX_PROBLEMS_SHOWN, Problem, printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.html.assets import environment
 from rebar_depth_bench.reporting.published import load_published

@@ -23,8 +23,8 @@ from leaderboard.web.cache import NO_STORE, REVALIDATE
 from leaderboard.web.dependencies import ID_PATTERN, ServiceDep, SubmissionId
 from leaderboard.web.pages.ranking import DISCLOSED_COLUMNS, NameQuery
 from leaderboard.web.pages.rendering import PICTURE_TITLES, clean_text, render
-from rebar_depth_bench.errors import InputError, printable
-from rebar_depth_bench.names import config_of
+from rebar_depth_bench.base.errors import InputError, printable
+from rebar_depth_bench.base.names import config_of
 from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS
 from rebar_depth_bench.reporting.formatting import ground_truth_text, inputs_text
 from rebar_depth_bench.reporting.html.page import (

@@ -18,7 +18,7 @@ from leaderboard.uploads.multipart import UploadForm
 from leaderboard.web.cache import NO_STORE, REVALIDATE
 from leaderboard.web.dependencies import ServiceDep, check_length, page_url, service_of
 from leaderboard.web.pages.rendering import clean_text, problem_lines, render
-from rebar_depth_bench.names import TEST_SPLIT
+from rebar_depth_bench.base.names import TEST_SPLIT
 
 router = APIRouter(include_in_schema=False)
 

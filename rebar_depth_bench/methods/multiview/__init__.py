@@ -10,9 +10,9 @@ from __future__ import annotations
 import importlib
 from pathlib import Path
 
+from rebar_depth_bench.base.parallel import Progress
 from rebar_depth_bench.data.rows import Views
 from rebar_depth_bench.methods.base import MethodInfo, MultiViewMethod, Prepared, import_optional
-from rebar_depth_bench.parallel import Progress
 
 PIPELINE = "rebar_depth_bench.methods.multiview.pipeline"
 """Module that needs pycolmap and OpenCV; it is imported when a method is used."""

@@ -23,11 +23,11 @@ import pycolmap
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from numpy import ndarray
 
-from rebar_depth_bench.atomic_io import write_bytes
-from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.base.errors import MethodError
+from rebar_depth_bench.base.parallel import Progress, map_with_progress
+from rebar_depth_bench.base.writing import write_bytes
 from rebar_depth_bench.geometry.cameras import camera_centre, inverse_rigid, pixel_rays, project, transform
 from rebar_depth_bench.methods.multiview.sfm import LeftImages, SparseReconstruction
-from rebar_depth_bench.parallel import Progress, map_with_progress
 
 # Plane sweep on a CPU with normalised cross-correlation over neighbouring views. Planes are parallel to the image
 # and evenly spaced in inverse depth. Each pixel takes the plane with the highest mean correlation of two

@@ -17,8 +17,9 @@ from jaxtyping import Float32, Float64
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
+from rebar_depth_bench.base.errors import MethodError
+from rebar_depth_bench.base.parallel import Progress
 from rebar_depth_bench.data.rows import Views
-from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
 from rebar_depth_bench.geometry.aruco_detection import Corners
 from rebar_depth_bench.geometry.cameras import camera_centre
@@ -40,7 +41,6 @@ from rebar_depth_bench.methods.multiview.sfm import (
     row_columns,
     write_left_images,
 )
-from rebar_depth_bench.parallel import Progress
 from rebar_depth_bench.scoring.protocol import interior
 
 MIN_VIEWS = 3

@@ -27,14 +27,14 @@ from jaxtyping import Float32, Float64, Int64
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
-from rebar_depth_bench.atomic_io import write_bytes
+from rebar_depth_bench.base.errors import MethodError
+from rebar_depth_bench.base.parallel import Progress, silent
+from rebar_depth_bench.base.writing import write_bytes
 from rebar_depth_bench.data.rows import Views
-from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.aruco_detection import Corners, board_pose, detected_corners_px
 from rebar_depth_bench.geometry.cameras import rigid
 from rebar_depth_bench.geometry.rectification import PinholeGrid, pinhole_grid, pinhole_image
-from rebar_depth_bench.parallel import Progress, silent
 
 
 def row_columns(views: Views) -> tuple[str, ...]:

@@ -12,10 +12,10 @@ import mmap
 from collections.abc import Iterator, Mapping
 from pathlib import Path, PurePosixPath
 
+from rebar_depth_bench.base.errors import MethodError, Problem, escape_text
+from rebar_depth_bench.base.reading import open_regular
 from rebar_depth_bench.data.files import files_digest
-from rebar_depth_bench.errors import MethodError, Problem, escape_text
 from rebar_depth_bench.methods.onnx.spec import is_file
-from rebar_depth_bench.reading import open_regular
 
 MAX_FIELDS = 1_000_000
 """Largest number of fields that are walked; a large model has some 100,000. Each takes some microseconds."""

@@ -19,8 +19,8 @@ from jaxtyping import Float, Float32, Float64, UInt8
 from numpy import ndarray
 from PIL import Image
 
-from rebar_depth_bench.errors import MethodError, Problem
-from rebar_depth_bench.limits import ONNX_MEMORY_BYTES, DeadlineError, call_within
+from rebar_depth_bench.base.errors import MethodError, Problem
+from rebar_depth_bench.base.limits import ONNX_MEMORY_BYTES, DeadlineError, call_within
 from rebar_depth_bench.methods.base import (
     VIEW_TIMEOUT_S,
     Method,

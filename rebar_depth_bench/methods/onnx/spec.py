@@ -38,11 +38,10 @@ from typing import Annotated
 
 from pydantic import Field, ValidationInfo, field_validator
 
-from rebar_depth_bench.errors import MethodError
-from rebar_depth_bench.limits import TOML_BYTES
-from rebar_depth_bench.reading import parse_toml, read_file
-from rebar_depth_bench.submission.declaration import MAX_METHOD_CHARACTERS
-from rebar_depth_bench.validation import (
+from rebar_depth_bench.base.errors import MethodError
+from rebar_depth_bench.base.limits import TOML_BYTES
+from rebar_depth_bench.base.reading import parse_toml, read_file
+from rebar_depth_bench.base.validation import (
     Expected,
     Flag,
     StrictModel,
@@ -56,6 +55,7 @@ from rebar_depth_bench.validation import (
     validate_table,
     whole_number,
 )
+from rebar_depth_bench.submission.declaration import MAX_METHOD_CHARACTERS
 
 MAX_SIDE_PX = 8192
 

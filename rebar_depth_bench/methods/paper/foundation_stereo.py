@@ -38,9 +38,11 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
+from rebar_depth_bench.base.errors import MethodError, Problem
+from rebar_depth_bench.base.limits import TOML_BYTES
+from rebar_depth_bench.base.reading import read_file
+from rebar_depth_bench.base.validation import short_repr
 from rebar_depth_bench.captures.documents import parse_document
-from rebar_depth_bench.errors import MethodError, Problem
-from rebar_depth_bench.limits import TOML_BYTES
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
 from rebar_depth_bench.methods.paper.third_party import (
     Network,
@@ -57,8 +59,6 @@ from rebar_depth_bench.methods.sgbm import (
     stereo_depth_m,
     without_invisible,
 )
-from rebar_depth_bench.reading import read_file
-from rebar_depth_bench.validation import short_repr
 
 NAME = "foundation-stereo"
 CODE_FILE, SETTINGS_FILE, CHECKPOINT_FILE = "core/foundation_stereo.py", "cfg.yaml", "model_best_bp2.pth"

@@ -21,12 +21,12 @@ import numpy as np
 from jaxtyping import Float, Float32, Num, UInt8
 from numpy import ndarray
 
+from rebar_depth_bench.base.errors import MethodError, Problem, exception_summary
+from rebar_depth_bench.base.limits import JSON_BYTES
+from rebar_depth_bench.base.reading import parse_json, read_file
+from rebar_depth_bench.base.validation import short_repr
 from rebar_depth_bench.data.files import files_digest
-from rebar_depth_bench.errors import MethodError, Problem, exception_summary
-from rebar_depth_bench.limits import JSON_BYTES
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor, WeightsMethod
-from rebar_depth_bench.reading import parse_json, read_file
-from rebar_depth_bench.validation import short_repr
 
 if TYPE_CHECKING:
     from torch import Tensor

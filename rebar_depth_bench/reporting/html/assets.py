@@ -10,7 +10,7 @@ from importlib.resources import files
 from jinja2 import BaseLoader, ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
-from rebar_depth_bench.errors import printable
+from rebar_depth_bench.base.errors import printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.scoring import columns
 

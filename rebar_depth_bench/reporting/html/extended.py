@@ -11,8 +11,8 @@ import numpy as np
 from markupsafe import Markup
 from numpy import ndarray
 
+from rebar_depth_bench.base.errors import printable
 from rebar_depth_bench.data.manifest import DatasetConfig
-from rebar_depth_bench.errors import printable
 from rebar_depth_bench.extended.crossings import (
     BINNED_MEASURES,
     MAIN_MEASURES,

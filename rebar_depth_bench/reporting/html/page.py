@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING
 
 from markupsafe import Markup
 
-from rebar_depth_bench.atomic_io import write_output
+from rebar_depth_bench.base.errors import printable
+from rebar_depth_bench.base.names import config_of
+from rebar_depth_bench.base.writing import write_output
 from rebar_depth_bench.diagnosis.corrections import COLUMNS, diagnosed_view, positions_to_read
 from rebar_depth_bench.diagnosis.diagnose import PossibleMistake, diagnose_config
-from rebar_depth_bench.errors import printable
-from rebar_depth_bench.names import config_of
 from rebar_depth_bench.reporting import charts, formatting
 from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS
 from rebar_depth_bench.reporting.html.assets import environment, inline_script

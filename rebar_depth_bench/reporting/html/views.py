@@ -17,8 +17,8 @@ from jaxtyping import Bool, Float, Float32, Float64, UInt8
 from numpy import ndarray
 from PIL import Image
 
-from rebar_depth_bench.errors import InputError, printable
-from rebar_depth_bench.names import config_of
+from rebar_depth_bench.base.errors import InputError, printable
+from rebar_depth_bench.base.names import config_of
 from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS, colour_indices, robust_range
 from rebar_depth_bench.reporting.html.assets import data_uri
 from rebar_depth_bench.scoring.protocol import scored_pixels

@@ -11,8 +11,8 @@ pytest.importorskip("cv2")
 import numpy as np
 from PIL import Image
 
+from rebar_depth_bench.base.errors import CalibrationError, InputError
 from rebar_depth_bench.captures.views import ImageViews, open_capture
-from rebar_depth_bench.errors import CalibrationError, InputError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import inverse_rigid
 from tests.bench.captures import calibration_files as files

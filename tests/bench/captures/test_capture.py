@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from rebar_depth_bench.base.errors import CalibrationError, InputError
 from rebar_depth_bench.captures.views import is_capture, open_capture
-from rebar_depth_bench.errors import CalibrationError, InputError
 from tests.bench.captures.example_capture import ZED_CALIBRATION, write_capture
 
 

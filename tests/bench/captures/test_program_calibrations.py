@@ -14,9 +14,9 @@ pytest.importorskip("cv2")
 
 import numpy as np
 
+from rebar_depth_bench.base.errors import CalibrationError
 from rebar_depth_bench.captures.calibration import MonoCalibration, StereoCalibration
 from rebar_depth_bench.captures.camera_files import read_cameras
-from rebar_depth_bench.errors import CalibrationError
 from tests.bench.captures import calibration_files as files
 
 

@@ -11,10 +11,10 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
+from rebar_depth_bench.base.errors import InputError, Problem
+from rebar_depth_bench.base.reading import FileSource
 from rebar_depth_bench.captures.images import read_image_shape
 from rebar_depth_bench.captures.views import open_capture
-from rebar_depth_bench.errors import InputError, Problem
-from rebar_depth_bench.reading import FileSource
 from rebar_depth_bench.submission import EntryError, SubmissionReader
 from tests.bench.captures.example_capture import write_capture
 

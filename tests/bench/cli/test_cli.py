@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 from rebar_depth_bench import score
+from rebar_depth_bench.base.errors import MAX_PROBLEMS_SHOWN
 from rebar_depth_bench.cli import check
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.errors import MAX_PROBLEMS_SHOWN
 from tests.commands import run_in_process
 
 Depths = dict[str, np.ndarray]

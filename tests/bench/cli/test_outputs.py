@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from rebar_depth_bench import InputError
+from rebar_depth_bench.cli.console import InputFile, InputFolder, OutputArchive, OutputFile, check_outputs
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.console import InputFile, InputFolder, OutputArchive, OutputFile, check_outputs
 
 
 def test_output_that_is_an_input_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

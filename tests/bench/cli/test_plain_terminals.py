@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from rebar_depth_bench.base.terminal import plain_characters, use_plain_characters
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.terminal import plain_characters, use_plain_characters
 from tests.commands import run_in_process
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from rebar_depth_bench.terminal import MAX_SILENCE_S, ProgressBars, Rate, duration_text
+from rebar_depth_bench.base.terminal import MAX_SILENCE_S, ProgressBars, Rate, duration_text
 
 
 @pytest.mark.parametrize(
@@ -46,7 +46,7 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     clock = Clock()
-    monkeypatch.setattr("rebar_depth_bench.terminal.time.monotonic", clock)
+    monkeypatch.setattr("rebar_depth_bench.base.terminal.time.monotonic", clock)
     return clock
 
 

@@ -16,10 +16,10 @@ import numpy as np
 import pytest
 
 from rebar_depth_bench import InputError, SubmissionWriter
-from rebar_depth_bench.atomic_io import STANDARD_OUTPUT, output_file, write_output
+from rebar_depth_bench.base.errors import OutputError
+from rebar_depth_bench.base.writing import STANDARD_OUTPUT, output_file, write_output
+from rebar_depth_bench.cli.console import InputFile, OutputFile, check_outputs
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.console import InputFile, OutputFile, check_outputs
-from rebar_depth_bench.errors import OutputError
 from tests.commands import run_in_process
 
 BENCH = [sys.executable, "-m", "rebar_depth_bench"]

@@ -14,8 +14,9 @@ import pyarrow.parquet as pq
 import pytest
 
 import rebar_depth_bench as rdb
-from rebar_depth_bench.bar_crossings.definition import Crossings, crossing_parameters, scene_crossings
-from rebar_depth_bench.bar_crossings.table import (
+from rebar_depth_bench.base.errors import DatasetError
+from rebar_depth_bench.crossings.definition import Crossings, crossing_parameters, scene_crossings
+from rebar_depth_bench.crossings.table import (
     CROSSINGS_SCHEMA,
     CrossingsSource,
     folder_crossings,
@@ -25,7 +26,6 @@ from rebar_depth_bench.bar_crossings.table import (
 from rebar_depth_bench.data.bars import Bar, read_bars
 from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.errors import DatasetError
 
 X = Bar(3, "x", 0.02, ((-0.1, 0.0, 0.0), (0.1, 0.0, 0.0)))
 Y = Bar(9, "y", 0.01, ((0.0, -0.1, 0.018), (0.0, 0.1, 0.018)))

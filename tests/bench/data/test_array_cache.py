@@ -16,6 +16,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.data.cache import (
     ArrayCache,
     CacheContent,
@@ -25,7 +26,6 @@ from rebar_depth_bench.data.cache import (
     entries,
     open_cache,
 )
-from rebar_depth_bench.errors import InputError
 
 DTYPES = {"index": np.uint32, "inside": np.bool_}
 COUNT = 4

@@ -11,8 +11,8 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from rebar_depth_bench.base.errors import DatasetError
 from rebar_depth_bench.data.bars import BARS_SCHEMA, Bar, read_bars, with_axis, write_bars
-from rebar_depth_bench.errors import DatasetError
 
 STRAIGHT = Bar(1, "tie", 0.016, ((0.0, 0.0, 0.0), (0.0, 0.0, 1.5)))
 BENT = Bar(65535, "hoop", 0.01, ((0.1, 0.0, 0.0), (0.2, 0.0, 0.0), (0.2, 0.3, 0.0)))

@@ -22,13 +22,13 @@ import pytest
 from PIL import Image
 
 import rebar_depth_bench as rdb
+from rebar_depth_bench.base.limits import CELL_BYTES, TABLE_BYTES
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.bars import BARS_SCHEMA, read_bars
 from rebar_depth_bench.data.codecs import encode_depth, encode_png
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import iterate_rows
 from rebar_depth_bench.data.schema import COLUMNS
-from rebar_depth_bench.limits import CELL_BYTES, TABLE_BYTES
 from tests.commands import run_in_process
 from tests.damage import change_manifest, change_rows, copy_dataset, first_shard
 

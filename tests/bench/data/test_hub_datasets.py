@@ -16,8 +16,8 @@ pytest.importorskip("uvicorn")
 from starlette.responses import Response
 
 import rebar_depth_bench as rdb
+from rebar_depth_bench.base.errors import MethodError
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods.transformers import find_checkpoint
 from tests.hub_server import HubServer, folder_files, running_hub
 

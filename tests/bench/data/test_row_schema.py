@@ -8,11 +8,11 @@ import datasets
 import numpy as np
 import pytest
 
+from rebar_depth_bench.base.errors import DatasetError
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import iterate_rows
 from rebar_depth_bench.data.schema import COLUMNS, ROW_SCHEMA, features
 from rebar_depth_bench.data.shards import encoded_rows
-from rebar_depth_bench.errors import DatasetError
 from tests.damage import change_rows, copy_dataset, first_shard
 
 

@@ -13,11 +13,11 @@ import pyarrow.parquet as pq
 import pytest
 
 import rebar_depth_bench as rdb
+from rebar_depth_bench.base.errors import DatasetError, InputError, SubmissionError
 from rebar_depth_bench.data.files import MANIFEST_FILE, views_digest
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import ConfigViews, Views, truth_problems
 from rebar_depth_bench.data.schema import ViewRecord
-from rebar_depth_bench.errors import DatasetError, InputError, SubmissionError
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
 from rebar_depth_bench.extended.registry import score_extended
 from rebar_depth_bench.methods.base import Method, MethodInfo, MultiViewMethod, Prepared

@@ -12,8 +12,8 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 import rebar_depth_bench as rdb
+from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.data.torch import Augmentation, flip_row
-from rebar_depth_bench.errors import InputError
 
 torch = pytest.importorskip("torch")
 

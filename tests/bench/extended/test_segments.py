@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from rebar_depth_bench.base.errors import DatasetError
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.extended import axes
 from rebar_depth_bench.extended.axes import MAX_MATCH_RADIUS_M, CageTruth, assign_segments, cage_truth
 from tests.bench.extended.cage_scenes import bar

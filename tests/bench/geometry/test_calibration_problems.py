@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
+from rebar_depth_bench.base.errors import CalibrationError, InputError, Problem
 from rebar_depth_bench.captures.calibration_files import read_calibration
-from rebar_depth_bench.errors import CalibrationError, InputError, Problem
 from tests.bench.geometry.calibrations import CONF, TOML, write_and_read
 
 

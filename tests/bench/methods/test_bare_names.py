@@ -14,8 +14,8 @@ import huggingface_hub
 import numpy as np
 from huggingface_hub import constants
 
+from rebar_depth_bench.base.errors import MethodError
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods import METHODS, find_method
 from rebar_depth_bench.methods.base import WeightsMethod
 from rebar_depth_bench.methods.registry import FROM_FOLDER

@@ -19,7 +19,7 @@ from tests.bench.methods.tiny_depth_models import save_checkpoint
 LOAD = """
 import sys
 import numpy as np
-from rebar_depth_bench.console import run_command
+from rebar_depth_bench.cli.console import run_command
 from rebar_depth_bench.methods import find_method
 
 def run():

@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("torch")
 pytest.importorskip("transformers")
 
-from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.base.errors import MethodError
 from rebar_depth_bench.methods import find_method
 from rebar_depth_bench.methods.transformers import hf_method
 from tests.bench.methods import stand_in_models as stand_ins

@@ -18,8 +18,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from rebar_depth_bench.base.errors import MethodError
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry import rectification
 from rebar_depth_bench.methods import Method, find_method
 from rebar_depth_bench.methods.paper.foundation_stereo import (

@@ -19,7 +19,7 @@ from tests.bench.methods.stand_in_models import unidepth_weights
 SCRIPT = """
 import sys
 from dataclasses import replace
-from rebar_depth_bench.console import run_command
+from rebar_depth_bench.cli.console import run_command
 from rebar_depth_bench.methods.paper import monocular, third_party
 
 def show(network, folder):

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.methods.kept_views import KeptViews, PreparationReport
 from rebar_depth_bench.methods.run import predict
 from tests.bench.methods.test_predict import counting_method, orbit_view_ids

@@ -19,7 +19,7 @@ import onnx
 import onnxruntime
 from onnx import ModelProto, TensorProto, helper, numpy_helper
 
-from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.base.errors import MethodError
 from rebar_depth_bench.methods import find_method
 from rebar_depth_bench.methods.onnx.external_data import MAX_FIELDS, MESSAGE_FIELDS, external_files
 from rebar_depth_bench.methods.run import predict

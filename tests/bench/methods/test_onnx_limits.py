@@ -17,9 +17,9 @@ pytest.importorskip("onnxruntime")
 import numpy as np
 from onnx import TensorProto, helper
 
+from rebar_depth_bench.base.errors import MethodError
+from rebar_depth_bench.base.limits import DeadlineError, call_within
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.errors import MethodError
-from rebar_depth_bench.limits import DeadlineError, call_within
 from rebar_depth_bench.methods import find_method
 from tests.bench.methods.onnx_models import PLAIN_INPUT, predict_depth, write_model, write_toml
 from tests.bench.methods.predictors import load_predictor
@@ -104,7 +104,7 @@ def test_endless_model_can_be_interrupted(tiny_root: Path, tmp_path: Path) -> No
 LONG_OPERATOR = """
 import sys, time
 from pathlib import Path
-from rebar_depth_bench.limits import DeadlineError, call_within
+from rebar_depth_bench.base.limits import DeadlineError, call_within
 import onnxruntime
 options = onnxruntime.SessionOptions()
 session = onnxruntime.InferenceSession(sys.argv[1], options, providers=["CPUExecutionProvider"])

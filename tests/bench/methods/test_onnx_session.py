@@ -15,7 +15,7 @@ pytest.importorskip("onnxruntime")
 import numpy as np
 from onnx import TensorProto, helper
 
-from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.base.errors import MethodError
 from rebar_depth_bench.methods import find_method
 from tests.bench.methods.onnx_models import (
     DEPTH_OUTPUT,

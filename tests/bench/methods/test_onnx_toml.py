@@ -14,11 +14,8 @@ pytest.importorskip("onnxruntime")
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.errors import MethodError, Problem
-from rebar_depth_bench.methods import find_method
-from rebar_depth_bench.methods.onnx import spec as onnx_toml
-from rebar_depth_bench.validation import (
+from rebar_depth_bench.base.errors import MethodError, Problem
+from rebar_depth_bench.base.validation import (
     StrictModel,
     Triple,
     number,
@@ -28,6 +25,9 @@ from rebar_depth_bench.validation import (
     validate_table,
     whole_number,
 )
+from rebar_depth_bench.cli.main import main
+from rebar_depth_bench.methods import find_method
+from rebar_depth_bench.methods.onnx import spec as onnx_toml
 from tests.bench.methods.onnx_models import write_mixer_model, write_toml
 
 NO_SIZE = "expected width and height, or longest_side"

@@ -14,7 +14,7 @@ import pytest
 pytest.importorskip("cv2")
 pytest.importorskip("torch")
 
-from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.base.errors import MethodError
 from rebar_depth_bench.methods import find_method
 from rebar_depth_bench.methods.registry import FROM_FOLDER
 from tests.bench.methods import stand_in_models as stand_ins

@@ -22,8 +22,8 @@ import cv2
 import numpy as np
 
 from rebar_depth_bench import score
+from rebar_depth_bench.base.errors import MethodError
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry import rectification
 from rebar_depth_bench.methods import METHODS, MultiViewMethod, find_method, own_methods
 from rebar_depth_bench.methods.paper.monocular import metric3d_input

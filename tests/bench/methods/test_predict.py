@@ -17,8 +17,9 @@ import numpy as np
 import pytest
 
 from rebar_depth_bench import score
+from rebar_depth_bench.base.errors import InputError, MethodError
+from rebar_depth_bench.base.parallel import Progress
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.errors import InputError, MethodError
 from rebar_depth_bench.methods import (
     METHODS,
     Method,
@@ -30,7 +31,6 @@ from rebar_depth_bench.methods import (
     find_method,
 )
 from rebar_depth_bench.methods.run import predict
-from rebar_depth_bench.parallel import Progress
 
 USER_METHOD = """
 import time

@@ -14,8 +14,8 @@ pytest.importorskip("torch")
 import numpy as np
 from PIL import Image
 
+from rebar_depth_bench.base.errors import MethodError
 from rebar_depth_bench.captures.views import open_capture
-from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.geometry.cameras import pixel_rays
 from rebar_depth_bench.geometry.rectification import raw_depth_m, rectified_pair
 from rebar_depth_bench.methods import Method, MethodInfo

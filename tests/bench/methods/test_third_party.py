@@ -13,7 +13,7 @@ import pytest
 
 pytest.importorskip("torch")
 
-from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.base.errors import MethodError
 from rebar_depth_bench.methods.base import MethodInfo
 from rebar_depth_bench.methods.paper.third_party import Network, on_sys_path
 

@@ -18,8 +18,8 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from rebar_depth_bench import score
+from rebar_depth_bench.base.errors import MethodError
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods import METHODS, find_method
 from rebar_depth_bench.methods.transformers import (
     FAMILIES,

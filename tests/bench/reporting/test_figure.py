@@ -24,8 +24,8 @@ from matplotlib.figure import Figure
 from matplotlib.text import Text
 
 import rebar_depth_bench as rdb
+from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.reporting.figure import (
     _STYLE,
     _marker,
@@ -309,7 +309,7 @@ def test_table_command_draws_archives(
 def test_missing_extra_is_named_before_scoring(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr("rebar_depth_bench.errors.find_spec", lambda _: None)
+    monkeypatch.setattr("rebar_depth_bench.base.errors.find_spec", lambda _: None)
     assert main(["table", "nowhere.zip", "--data", "nowhere", "--figure", str(tmp_path / "a.pdf")]) == 2
     assert "matplotlib; expected the plot extra: pip install 'rebar-depth-bench[plot]'" in capsys.readouterr().err
 

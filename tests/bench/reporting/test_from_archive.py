@@ -11,9 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.data import codecs
 from rebar_depth_bench.diagnosis.corrections import MAX_VIEWS
-from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.reporting.html.page import write_report
 from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.reporting.latex import escape_latex, latex_table
 from rebar_depth_bench.scoring.result import DatasetIdentity, Result
 from rebar_depth_bench.submission.declaration import NOT_DECLARED, Declaration

@@ -9,7 +9,7 @@ import json
 import pytest
 from rich.console import Console
 
-from rebar_depth_bench.errors import printable
+from rebar_depth_bench.base.errors import printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.tables import print_table
 from rebar_depth_bench.scoring.columns import DASH, coverage_percent, number

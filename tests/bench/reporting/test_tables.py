@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.charts import ScatterPoint, alignment_chart, place_labels, scatter_chart
 from rebar_depth_bench.reporting.html.page import render_report

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rebar_depth_bench.names import view_id
+from rebar_depth_bench.base.names import view_id
 from rebar_depth_bench.scoring.bootstrap import (
     MIN_BLOCKS,
     RESAMPLES,

@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from rebar_depth_bench.errors import InputError, SubmissionError
+from rebar_depth_bench.base.errors import InputError, SubmissionError
 from rebar_depth_bench.scoring.result import check_view_coverage, disclosed_json, is_disclosed, read_disclosed
 from tests.bench.reporting.results import result, scored_view
 

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from scipy.ndimage import binary_erosion
 
 import rebar_depth_bench as rdb
+from rebar_depth_bench.base.errors import DatasetError
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars, write_bars
 from rebar_depth_bench.data.files import file_sha256
-from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.scoring.bootstrap import end_percents, resample_scenes
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.groups import (

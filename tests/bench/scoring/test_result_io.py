@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.scoring.result import read_result
 from rebar_depth_bench.scoring.table import read_table
 from tests.bench.reporting.results import overflowed_view, result, scored_view, unpredicted_view

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from rebar_depth_bench.errors import Problem
+from rebar_depth_bench.base.errors import Problem
 from tests.bench.submission.zips import EXPECTED, Record, build, check_archive
 
 Check = Callable[[list[Record] | bytes], list[Problem]]

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rebar_depth_bench.errors import Problem, ProblemCode, SubmissionError
+from rebar_depth_bench.base.errors import Problem, ProblemCode, SubmissionError
 from rebar_depth_bench.submission import EntryError, SubmissionReader
 from tests.bench.submission.conftest import Check, located
 from tests.bench.submission.zips import (

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rebar_depth_bench.errors import Problem, ProblemCode
+from rebar_depth_bench.base.errors import Problem, ProblemCode
 from tests.bench.submission import zips
 from tests.bench.submission.conftest import Check, located
 from tests.bench.submission.zips import (

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from rebar_depth_bench.errors import ProblemCode
+from rebar_depth_bench.base.errors import ProblemCode
 from rebar_depth_bench.submission.declaration import SubmissionMeta, parse_metadata
 from tests.bench.submission.conftest import Check, located
 from tests.bench.submission.zips import DEPTH, FIRST, SECOND, Record, deflated, png

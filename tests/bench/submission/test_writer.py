@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.submission import SubmissionReader, SubmissionWriter
 from tests.bench.submission.conftest import located
 from tests.bench.submission.zips import DEPTH, EXPECTED, SHAPE, Array, check_archive

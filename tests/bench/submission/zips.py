@@ -14,7 +14,7 @@ import numpy as np
 import OpenEXR
 from numpy.typing import NDArray
 
-from rebar_depth_bench.errors import Problem
+from rebar_depth_bench.base.errors import Problem
 from rebar_depth_bench.submission import ExpectedViews, SubmissionReader
 
 Array = NDArray[Any]

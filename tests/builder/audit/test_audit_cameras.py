@@ -27,10 +27,10 @@ from dataset_builder.scene.mesh_ply import write_mesh_ply
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.specs.config_specs import DomeSpec, RandomViewsSpec, RingSpec
 from dataset_builder.specs.manifest_specs import rig_spec, trajectory_spec
+from rebar_depth_bench.base.errors import DatasetError
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
 from rebar_depth_bench.data.schema import Scene, ViewRecord, trajectory_of
-from rebar_depth_bench.errors import DatasetError
 from rebar_depth_bench.geometry.cameras import Camera, camera_centre, right_camera_pose
 from tests.builder.audit.audit_scene import RIGS
 

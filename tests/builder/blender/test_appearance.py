@@ -31,7 +31,7 @@ from dataset_builder.scene.variants.registry import (
 )
 from dataset_builder.scene.variants.sensor import recorded
 from dataset_builder.specs.config_specs import AppearanceSpec, ColourSpec, LatticeSpec, SceneSpec
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import Camera, ideal_K, look_at
 from tests.builder.blender.cages import cage

@@ -26,7 +26,7 @@ from dataset_builder.scene.variants.registry import (
     image_light,
 )
 from dataset_builder.specs.config_specs import AppearanceSpec, ColourSpec, LatticeSpec, SceneSpec
-from rebar_depth_bench.errors import BuildError
+from rebar_depth_bench.base.errors import BuildError
 from rebar_depth_bench.geometry.cameras import Camera, look_at
 from tests.builder.blender.probe import RunProbe
 

@@ -17,7 +17,7 @@ from dataset_builder.scene.environments.surroundings import CameraSpace
 from dataset_builder.scene.model import Assembly
 from dataset_builder.specs.config_specs import FocalRigSpec, GeneratedCageSpec, RandomViewsSpec
 from dataset_builder.user_files.make_assembly import make_assembly
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.geometry.cameras import camera_centre, ideal_K
 
 SPACE = CameraSpace(20.0, clear_radius_m=20.0)

@@ -25,7 +25,7 @@ from dataset_builder.scene.shapes.solids import merge_meshes
 from dataset_builder.specs.config_specs import ConfigSpec, RigSpec, SurveySpec
 from dataset_builder.user_files.cage_file import cage_file_spec, load_cage
 from dataset_builder.user_files.make_assembly import make_assembly
-from rebar_depth_bench.errors import InputError, MeshError
+from rebar_depth_bench.base.errors import InputError, MeshError
 from rebar_depth_bench.geometry.cameras import camera_centre, inverse_rigid
 from tests.builder.cameras.survey_cages import (
     bar_table,

@@ -16,7 +16,7 @@ from dataset_builder.scene.raycast import RayCaster
 from dataset_builder.scene.shapes.solids import merge_meshes
 from dataset_builder.specs.config_specs import ConfigSpec
 from dataset_builder.user_files.make_assembly import make_assembly
-from rebar_depth_bench.errors import MeshError
+from rebar_depth_bench.base.errors import MeshError
 from rebar_depth_bench.geometry.cameras import (
     camera_centre,
     ideal_K,

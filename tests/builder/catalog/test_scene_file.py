@@ -30,8 +30,8 @@ from dataset_builder.specs.file_specs import CageFileSpec, MeshFileSpec
 from dataset_builder.user_files.cage_file import cage_file_spec, load_cage
 from dataset_builder.user_files.make_assembly import make_assembly
 from dataset_builder.user_files.scene_schema import read_scene_toml
+from rebar_depth_bench.base.errors import InputError, MeshError
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.errors import InputError, MeshError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from tests.builder.catalog.scene_files import BAR, MM, write_scene
 from tests.builder.scene.cages import assembly_of

@@ -18,7 +18,7 @@ from dataset_builder.scene.environments.surroundings import (
 )
 from dataset_builder.scene.variants.registry import LIGHT_SLOT, PROPS_SLOT, VARIANTS
 from dataset_builder.specs.config_specs import DomeSpec, SurveySpec
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.base.errors import InputError
 from tests.builder.catalog.scene_files import BAR, MM, write_scene
 
 SMALL_SURVEY = '[cameras]\nkind = "survey"\ndistances = [1000]\nviews_per_distance = 4\n'

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 
 from dataset_builder.export import export
-from rebar_depth_bench.errors import DatasetError, InputError
+from rebar_depth_bench.base.errors import DatasetError, InputError
 from tests.damage import change_manifest
 
 SMALL_CONFIG = ("lattice-orbit",)
@@ -65,7 +65,7 @@ def test_killed_export_resumes_to_same_bytes(tiny_root: Path, exported: Path, tm
 def test_write_failure_is_reported(tiny_root: Path, tmp_path: Path) -> None:
     process = run_export(tiny_root, tmp_path / "x", "resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))")
     last_line = process.stderr.splitlines()[-1]
-    assert last_line.startswith(f"rebar_depth_bench.errors.OutputError: {tmp_path / 'x'}/")
+    assert last_line.startswith(f"rebar_depth_bench.base.errors.OutputError: {tmp_path / 'x'}/")
     assert "cannot be written: " in last_line
     assert "File too large" in last_line
     assert not list((tmp_path / "x").rglob("*.tmp"))

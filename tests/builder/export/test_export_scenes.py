@@ -13,7 +13,7 @@ import rebar_depth_bench as rdb
 from dataset_builder.cli.main import main
 from dataset_builder.export import export
 from dataset_builder.export.target import MARKER
-from rebar_depth_bench.errors import DatasetError, InputError
+from rebar_depth_bench.base.errors import DatasetError, InputError
 from tests.synthetic_dataset import write_dataset, write_split_dataset
 
 SCENES = {"a": "train", "b-1": "train", "c": "validation", "d": "test"}

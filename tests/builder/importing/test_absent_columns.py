@@ -15,8 +15,8 @@ import pytest
 
 import rebar_depth_bench as rdb
 from dataset_builder.importing.config_import import plan_import, run_import
+from rebar_depth_bench.base.errors import DatasetError
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.errors import DatasetError
 from tests.builder.importing import source_data as data
 
 Entry = dict[str, Any]

@@ -17,10 +17,10 @@ from cards.dataset import dataset_card
 from dataset_builder.audit import audit
 from dataset_builder.cli.main import main as build_main
 from dataset_builder.importing.config_import import plan_import, run_import
+from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.cli.main import main as bench_main
 from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
-from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.geometry.cameras import inverse_rigid
 from tests.builder.importing import source_data as data
 from tests.builder.importing.source_data import FILES, NAMES, Row

@@ -14,8 +14,8 @@ import pytest
 from dataset_builder.cli.main import main
 from dataset_builder.importing.config_import import plan_import, run_import
 from dataset_builder.pipeline.retained import Finished
+from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.errors import InputError
 from tests.bench.damage import damaged
 from tests.builder.importing import source_data as data
 from tests.builder.importing.source_data import NAMES, Row

@@ -57,7 +57,7 @@ def test_missing_embreex_names_pip_extra() -> None:
 import sys
 sys.modules["embreex"] = None
 from dataset_builder.lidar import LIDAR_SURVEY
-from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.base.errors import MethodError
 assert not {"bpy", "trimesh", "torch", "cv2"} & set(sys.modules)
 try:
     LIDAR_SURVEY.check(None)

@@ -24,8 +24,8 @@ from dataset_builder.pipeline.retained import Finished, check_retained
 from dataset_builder.pipeline.shards import Staging, pack_shard
 from dataset_builder.pipeline.work_units import remaining_units
 from dataset_builder.specs.config_specs import ColourSpec
+from rebar_depth_bench.base.errors import DatasetError, InputError
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.errors import DatasetError, InputError
 from tests.commands import run_in_process
 
 REQUEST = BuildRequest(configs=("pile",), views=1, width=16, height=16, colour=ColourSpec(1, 1))

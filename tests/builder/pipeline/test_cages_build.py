@@ -23,10 +23,10 @@ from dataset_builder.pipeline.plan import BUILD_FOLDER, plan_config
 from dataset_builder.scene.cages import generate as generate_module
 from dataset_builder.scene.cages.generate import drawn_family
 from dataset_builder.specs.config_specs import ColourSpec, GeneratedCageSpec, SceneConfigSpec
+from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars
 from rebar_depth_bench.data.files import MANIFEST_FILE
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.errors import InputError
 from rebar_depth_bench.scoring.truth import reference_errors
 from tests.building import RunBuild, StartBuild, contents, staged_rows
 from tests.dask_cluster import NewCluster

@@ -23,7 +23,7 @@ from dataset_builder.pipeline.plan import BUILD_FOLDER, generator_versions, plan
 from dataset_builder.pipeline.shards import Staging
 from dataset_builder.pipeline.work_units import remaining_units
 from dataset_builder.specs.config_specs import ColourSpec
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.base.errors import InputError
 from tests.building import (
     TINY,
     TWO_BARS,

@@ -10,7 +10,7 @@ from dataset_builder.catalog.named_configs import CONFIGS, BuildRequest
 from dataset_builder.pipeline.blender_process import AUTO, available_devices, choose_device
 from dataset_builder.pipeline.plan import config_parameters, plan_config
 from dataset_builder.specs.config_specs import CPU, GPU_TYPES, ColourSpec
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.base.errors import InputError
 from tests.building import TINY, TWO_BARS, RunBuild
 
 NVIDIA = {"cpu": ["AMD EPYC"], "cuda": ["NVIDIA L4"] * 2, "optix": ["NVIDIA L4"] * 2}

@@ -22,8 +22,8 @@ from dataset_builder.pipeline.disk_space import (
 )
 from dataset_builder.pipeline.plan import plan_config
 from dataset_builder.specs.config_specs import RigSpec
+from rebar_depth_bench.base.errors import OutputError
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.errors import OutputError
 from tests.commands import run_in_process
 
 SMALL = BuildRequest(configs=("pile",), views=10, width=64, height=36)

@@ -84,7 +84,7 @@ UNPRIVILEGED = """
 import os, sys
 from pathlib import Path
 from dataset_builder.pipeline.folder import check_target
-from rebar_depth_bench.errors import OutputError
+from rebar_depth_bench.base.errors import OutputError
 
 if os.geteuid() == 0:
     os.setgroups([])

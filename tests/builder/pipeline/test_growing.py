@@ -18,12 +18,12 @@ from dataset_builder.catalog.named_configs import BuildRequest
 from dataset_builder.pipeline import folder, retained
 from dataset_builder.pipeline.build import BuildSummary, build
 from dataset_builder.pipeline.plan import BUILD_FOLDER
+from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.limits import JSON_BYTES, TABLE_BYTES
+from rebar_depth_bench.base.parallel import silent
 from rebar_depth_bench.data.bars import BARS_FILE
 from rebar_depth_bench.data.files import MANIFEST_FILE, file_problems
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.limits import JSON_BYTES, TABLE_BYTES
-from rebar_depth_bench.parallel import silent
 from tests.building import contents
 
 SIZE: dict[str, Any] = {"width": 32, "height": 18, "colour": None}

@@ -18,11 +18,11 @@ from dataset_builder.catalog.named_configs import BuildRequest
 from dataset_builder.export import export
 from dataset_builder.pipeline.contact_sheet import TILE_PX
 from dataset_builder.pipeline.plan import BUILD_FOLDER
+from rebar_depth_bench.base.errors import DatasetError
 from rebar_depth_bench.cli.main import main as rebar_bench
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import ConfigViews
 from rebar_depth_bench.data.schema import COLUMNS
-from rebar_depth_bench.errors import DatasetError
 from tests.building import TINY, TINY_VIEWS, TWO_BARS, RunBuild, contents
 from tests.commands import run_in_process
 

@@ -13,10 +13,10 @@ import pytest
 from dataset_builder.cli.main import main
 from dataset_builder.importing.config_import import plan_import, run_import
 from dataset_builder.pipeline.folder import manifest_text
+from rebar_depth_bench.base.errors import DatasetError
 from rebar_depth_bench.cli.main import main as rebar_bench
 from rebar_depth_bench.data.files import MANIFEST_FILE
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.errors import DatasetError
 from tests.builder.importing import source_data
 from tests.building import contents
 from tests.commands import run_in_process

@@ -19,7 +19,7 @@ from dataset_builder.pipeline.work_units import (
     remaining_units,
     with_files,
 )
-from rebar_depth_bench.errors import BuildError
+from rebar_depth_bench.base.errors import BuildError
 
 MESH = b"ply: the mesh that rays were cast against"
 

@@ -36,8 +36,8 @@ from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
 from dataset_builder.scene.shapes.capsules import NEAR_M, Clearances
 from dataset_builder.specs.config_specs import GeneratedCageSpec
 from dataset_builder.user_files.make_assembly import make_assembly
-from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.names import SPLITS
+from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.names import SPLITS
 from tests.builder.scene.test_pile import segment_distances_m
 
 Line = Float64[ndarray, "n 3"]

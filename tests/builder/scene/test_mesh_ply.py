@@ -13,7 +13,7 @@ from numpy import ndarray
 
 from dataset_builder.scene.mesh_ply import has_mesh_ply_header, parse_mesh_ply, read_mesh_ply, write_mesh_ply
 from dataset_builder.scene.model import WorldMesh
-from rebar_depth_bench.errors import DatasetError
+from rebar_depth_bench.base.errors import DatasetError
 
 
 def random_mesh(seed: int = 0, vertices: int = 50, faces: int = 80) -> WorldMesh:

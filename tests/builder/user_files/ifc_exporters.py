@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
 
-from rebar_depth_bench.errors import MeshError
+from rebar_depth_bench.base.errors import MeshError
 from tests.builder.user_files.ifc_step_text import FEET, GRADS, INCHES, METRES, MILLIMETRES, RADIANS, Step
 from tests.builder.user_files.ifc_writer import bars_in_process
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rebar_depth_bench.errors import MeshError
+from rebar_depth_bench.base.errors import MeshError
 from tests.builder.scene.cages import assembly_of
 from tests.builder.user_files.ifc_damage import damaged_bytes, damaged_token, differs_in_values_only
 from tests.builder.user_files.ifc_writer import Ifc, bars_in_process, extruded_square

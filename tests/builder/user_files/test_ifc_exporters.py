@@ -12,7 +12,7 @@ from dataset_builder.specs.file_specs import Trust
 from dataset_builder.user_files.ifc_file import Answer
 from dataset_builder.user_files.ifc_reader import bars as reader_bars
 from dataset_builder.user_files.ifc_reader.__main__ import write_answer
-from rebar_depth_bench.errors import MeshError
+from rebar_depth_bench.base.errors import MeshError
 from tests.builder.scene.cages import assembly_of
 from tests.builder.user_files.ifc_exporters import STYLES, revit, u_curve
 from tests.builder.user_files.ifc_step_text import METRES, MILLIMETRES, Step

@@ -23,8 +23,8 @@ from dataset_builder.user_files import ifc_file
 from dataset_builder.user_files.ifc_file import Answer, ifc_cage
 from dataset_builder.user_files.ifc_reader.bars import SECONDS_PER_SHAPE, limited_time
 from dataset_builder.user_files.ifc_records import MAX_ARRAY_BYTES, AnswerError
-from rebar_depth_bench.errors import InputError, MeshError
-from rebar_depth_bench.limits import IFC_MEMORY_BYTES, IFC_SECONDS
+from rebar_depth_bench.base.errors import InputError, MeshError
+from rebar_depth_bench.base.limits import IFC_MEMORY_BYTES, IFC_SECONDS
 from tests.builder.user_files.ifc_step_text import MILLIMETRES, Step
 from tests.builder.user_files.ifc_writer import Ifc, extruded_circle
 from tests.processes import is_running, wait_until

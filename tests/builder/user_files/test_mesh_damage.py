@@ -15,8 +15,8 @@ from dataset_builder.scene.model import Mesh
 from dataset_builder.specs.file_specs import MeshFileSpec
 from dataset_builder.user_files.cage_file import cage_problems, raise_problems
 from dataset_builder.user_files.mesh_import import read_parts
+from rebar_depth_bench.base.errors import MeshError
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.errors import MeshError
 from tests.builder.user_files.test_mesh_file import obj_bytes
 from tests.requirements import Repetitions
 

@@ -16,7 +16,7 @@ from dataset_builder.scene.mesh_ply import write_mesh_ply
 from dataset_builder.scene.model import Assembly, WorldMesh
 from dataset_builder.specs.config_specs import LatticeSpec
 from dataset_builder.user_files.cage_file import load_cage, mesh_file_spec, read_cage
-from rebar_depth_bench.errors import MeshError
+from rebar_depth_bench.base.errors import MeshError
 from tests.builder.user_files.tube_shapes import CENTRELINES_M, length_m, swept
 
 ALONG_X = np.array([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])

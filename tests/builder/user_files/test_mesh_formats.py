@@ -13,7 +13,7 @@ import pytest
 import trimesh
 
 from dataset_builder.user_files.cage_file import load_cage, mesh_file_spec
-from rebar_depth_bench.errors import MeshError
+from rebar_depth_bench.base.errors import MeshError
 from tests.builder.user_files.test_mesh_file import RODS, load_content, obj_bytes
 
 STL = trimesh.exchange.stl.export_stl_ascii(RODS[0])

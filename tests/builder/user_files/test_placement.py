@@ -19,8 +19,8 @@ from dataset_builder.specs.file_specs import Origin, PlacementSpec, Up
 from dataset_builder.user_files.cage_file import cage_assembly
 from dataset_builder.user_files.cage_placement import placed
 from dataset_builder.user_files.make_assembly import make_assembly
+from rebar_depth_bench.base.errors import InputError, MeshError
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.errors import InputError, MeshError
 from tests.builder.catalog.scene_files import BAR, MM, write_scene
 
 COORDINATE = st.floats(-1e6, 1e6)

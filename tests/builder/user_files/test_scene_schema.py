@@ -17,7 +17,7 @@ from dataset_builder.specs.config_specs import DomeSpec, SurveySpec
 from dataset_builder.user_files import scene_schema
 from dataset_builder.user_files.cage_file import cage_file_spec, load_cage
 from dataset_builder.user_files.scene_schema import read_scene_toml
-from rebar_depth_bench.errors import InputError, MeshError
+from rebar_depth_bench.base.errors import InputError, MeshError
 from tests.builder.catalog.scene_files import BAR, MM, write_scene
 
 SURVEY = "[cameras]\nkind = 'survey'\n"

@@ -11,7 +11,7 @@ from dataset_builder.catalog.scene_file import scene_cage, scene_config
 from dataset_builder.scene.assemblies.cage import Cage
 from dataset_builder.user_files.cage_file import cage_assembly
 from dataset_builder.user_files.make_assembly import make_assembly
-from rebar_depth_bench.errors import MeshError
+from rebar_depth_bench.base.errors import MeshError
 from tests.builder.catalog.scene_files import write_scene
 from tests.builder.user_files.site_model import (
     COLUMN_BARS,

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from rebar_depth_bench import leaderboard_client, score
+from rebar_depth_bench import score
+from rebar_depth_bench.remote import leaderboard_client
 from tests.leaderboard.client.requests import TOKEN, TOKEN_INFO, submission
 from tests.leaderboard.client.scripted_server import ScriptedServer, answer, scripted_server
 from tests.leaderboard.conftest import WriteArchive

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from rebar_depth_bench.errors import SubmissionError
-from rebar_depth_bench.leaderboard_client import LeaderboardClient
+from rebar_depth_bench.base.errors import SubmissionError
+from rebar_depth_bench.remote.leaderboard_client import LeaderboardClient
 from tests.leaderboard.client.requests import ESCAPES, TOKEN, TOKEN_INFO, URL, check_refused
 from tests.leaderboard.client.scripted_server import ID, ScriptedServer, answer
 

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from rebar_depth_bench import leaderboard_client
+from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.leaderboard_client import AnswerError, LeaderboardClient, ServiceError
+from rebar_depth_bench.remote import leaderboard_client
+from rebar_depth_bench.remote.leaderboard_client import AnswerError, LeaderboardClient, ServiceError
 from tests.leaderboard.client.requests import TOKEN, check_refused, submission, submit
 from tests.leaderboard.client.scripted_server import ID, ScriptedServer, Send, answer, scripted_server
 

@@ -19,12 +19,12 @@ import numpy as np
 import pycolmap
 
 from rebar_depth_bench import load, score
+from rebar_depth_bench.base.errors import MethodError
+from rebar_depth_bench.base.parallel import silent
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.errors import MethodError
 from rebar_depth_bench.methods import METHODS, ConfigViews, MultiViewMethod
 from rebar_depth_bench.methods.multiview import dense
 from rebar_depth_bench.methods.run import predict
-from rebar_depth_bench.parallel import silent
 from tests.data.orbit import write_orbit
 
 pytestmark = pytest.mark.slow

@@ -15,7 +15,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.base.errors import MethodError
 from rebar_depth_bench.geometry.cameras import ideal_K, pixel_rays
 from rebar_depth_bench.geometry.rectification import PinholeGrid, pinhole_grid, pinhole_image
 from rebar_depth_bench.methods.multiview.dense import read_depth_map

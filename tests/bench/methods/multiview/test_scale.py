@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from rebar_depth_bench.errors import MethodError
+from rebar_depth_bench.base.errors import MethodError
 from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
 from rebar_depth_bench.geometry.aruco_detection import Corners
 from rebar_depth_bench.geometry.cameras import ideal_K, look_at, project, rigid, transform

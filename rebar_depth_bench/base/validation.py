@@ -23,8 +23,8 @@ from typing import Annotated, Any, TypeGuard, TypeVar, get_args
 from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, Strict, TypeAdapter, ValidationError
 from pydantic_core import CoreSchema, ErrorDetails, PydanticCustomError, core_schema
 
-from rebar_depth_bench.errors import Problem, ProblemCode
-from rebar_depth_bench.reading import MAX_NESTING
+from rebar_depth_bench.base.errors import Problem, ProblemCode
+from rebar_depth_bench.base.reading import MAX_NESTING
 
 Model = TypeVar("Model", bound=BaseModel)
 Document = TypeVar("Document")

@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterable, Iterator
 
 import pytest
 
-from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.parallel import map_with_progress, silent
+from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.parallel import map_with_progress, silent
 
 
 def mapped(work: Callable[[int], int], items: Iterable[int], workers: int | None) -> list[int]:

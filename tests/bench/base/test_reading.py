@@ -10,10 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from rebar_depth_bench import limits
-from rebar_depth_bench.atomic_io import write_text
-from rebar_depth_bench.errors import InputError
-from rebar_depth_bench.reading import (
+from rebar_depth_bench.base import limits
+from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.reading import (
     MAX_NESTING,
     check_no_links,
     open_regular,
@@ -24,7 +23,8 @@ from rebar_depth_bench.reading import (
     remove_file,
     remove_folder,
 )
-from rebar_depth_bench.terminal import terminal_text
+from rebar_depth_bench.base.terminal import terminal_text
+from rebar_depth_bench.base.writing import write_text
 
 
 def test_file_above_the_limit_is_not_read(tmp_path: Path) -> None:

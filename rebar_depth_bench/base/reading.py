@@ -21,9 +21,9 @@ from collections import Counter
 from pathlib import Path, PurePosixPath
 from typing import Any, BinaryIO, NoReturn, Protocol
 
-from rebar_depth_bench.errors import InputError, Problem, ProblemCode, escape_text
-from rebar_depth_bench.limits import Limit
-from rebar_depth_bench.names import NAME_LETTERS, PATH_PATTERN
+from rebar_depth_bench.base.errors import InputError, Problem, ProblemCode, escape_text
+from rebar_depth_bench.base.limits import Limit
+from rebar_depth_bench.base.names import NAME_LETTERS, PATH_PATTERN
 
 MAX_NESTING = 64
 """Largest number of JSON or TOML containers inside each other."""

@@ -17,7 +17,7 @@ from typing import Annotated, Any, BinaryIO, Self, TypeVar
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
-from rebar_depth_bench.errors import (
+from rebar_depth_bench.base.errors import (
     MAX_PROBLEMS_SHOWN,
     InputError,
     Problem,
@@ -28,11 +28,11 @@ from rebar_depth_bench.errors import (
     problem_summary,
     require_extra,
 )
-from rebar_depth_bench.limits import JSON_BYTES, DeadlineError, call_until
-from rebar_depth_bench.parallel import Progress, silent
-from rebar_depth_bench.reading import open_regular, parse_json
+from rebar_depth_bench.base.limits import JSON_BYTES, DeadlineError, call_until
+from rebar_depth_bench.base.parallel import Progress, silent
+from rebar_depth_bench.base.reading import open_regular, parse_json
+from rebar_depth_bench.base.validation import Expected, StrictModel, one_of, validate_table, whole_number
 from rebar_depth_bench.scoring.result import DisclosedResult, Result, is_disclosed, read_disclosed, read_result
-from rebar_depth_bench.validation import Expected, StrictModel, one_of, validate_table, whole_number
 
 POLL_INTERVAL_S = 2.0
 """Time between two status requests, seconds."""

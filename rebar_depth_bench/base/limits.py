@@ -20,7 +20,7 @@ from dataclasses import dataclass
 from threading import Thread
 from typing import TypeVar
 
-from rebar_depth_bench.errors import InputError, escape_text
+from rebar_depth_bench.base.errors import InputError, escape_text
 
 _MIB, _GIB = 1 << 20, 1 << 30
 _PR_SET_PDEATHSIG = 1

@@ -13,7 +13,7 @@ import pytest
 
 from tests.processes import is_running, wait_until
 
-LIMIT = "import os, sys, time; from rebar_depth_bench.limits import limit_process; "
+LIMIT = "import os, sys, time; from rebar_depth_bench.base.limits import limit_process; "
 MIB = 1 << 20
 
 

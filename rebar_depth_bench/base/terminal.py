@@ -17,7 +17,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
 from rich.progress import TimeRemainingColumn as Remaining
 
-from rebar_depth_bench.errors import printable
+from rebar_depth_bench.base.errors import printable
 
 _REPLACEMENTS = str.maketrans(
     {

@@ -6,8 +6,8 @@ import time
 
 import pytest
 
-from rebar_depth_bench.errors import Problem
-from rebar_depth_bench.validation import with_lines
+from rebar_depth_bench.base.errors import Problem
+from rebar_depth_bench.base.validation import with_lines
 
 TOML = '''\
 # left.fx = 1, and [right]

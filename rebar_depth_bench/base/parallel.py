@@ -9,7 +9,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import islice
 from typing import TypeVar
 
-from rebar_depth_bench.errors import InputError
+from rebar_depth_bench.base.errors import InputError
 
 Progress = Callable[[str, int, int], None]
 """Callback with the arguments: name of the task, number of steps done, total number of steps."""

@@ -16,7 +16,10 @@ from pathlib import Path, PosixPath
 from typing import TYPE_CHECKING
 
 from rebar_depth_bench import software_version
-from rebar_depth_bench.atomic_io import (
+from rebar_depth_bench.base.errors import InputError, OutputError, RebarDepthError
+from rebar_depth_bench.base.reading import parse_number
+from rebar_depth_bench.base.terminal import print_notice, use_plain_characters
+from rebar_depth_bench.base.writing import (
     STANDARD_OUTPUT,
     WRITE_ERRORS,
     is_standard_output,
@@ -24,9 +27,6 @@ from rebar_depth_bench.atomic_io import (
     link_target,
     open_descriptor,
 )
-from rebar_depth_bench.errors import InputError, OutputError, RebarDepthError
-from rebar_depth_bench.reading import parse_number
-from rebar_depth_bench.terminal import print_notice, use_plain_characters
 
 if TYPE_CHECKING:
     from rebar_depth_bench.data.manifest import DatasetFolder

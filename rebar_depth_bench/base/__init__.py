@@ -1,0 +1,1 @@
+"""Errors, validation, files, limits and names that all packages use."""
