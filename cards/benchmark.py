@@ -23,7 +23,7 @@ from cards.reference import (
 )
 from cards.steel import STEEL_RESULTS, depth_text, range_text
 from cards.templates import render
-from rebar_depth_bench.crossings.definition import crossing_parameters
+from rebar_depth_bench.bar_crossings.definition import crossing_parameters
 from rebar_depth_bench.detections.reading import MAX_ROWS_PER_VIEW
 from rebar_depth_bench.extended.inspection import PROFILES
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, ONCE, Measure, MeasureFamily

@@ -6,6 +6,7 @@ from importlib import import_module, metadata
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from rebar_depth_bench.bar_crossings.table import crossings
     from rebar_depth_bench.base.errors import (
         CalibrationError,
         DatasetError,
@@ -15,7 +16,6 @@ if TYPE_CHECKING:
         RebarDepthError,
         SubmissionError,
     )
-    from rebar_depth_bench.crossings.table import crossings
     from rebar_depth_bench.data.bars import bars
     from rebar_depth_bench.data.loading import load
     from rebar_depth_bench.data.torch import torch_loader
@@ -45,7 +45,7 @@ __all__ = [
 
 _MODULE_BY_NAME = {
     "bars": "data.bars",
-    "crossings": "crossings.table",
+    "crossings": "bar_crossings.table",
     "load": "data.loading",
     "score": "scoring.evaluation",
     "torch_loader": "data.torch",

@@ -12,7 +12,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.scene.assemblies.cage import Cage, CageBar
-from rebar_depth_bench.crossings.axis_segments import AxisSegments, TooManyNeighboursError
+from rebar_depth_bench.bar_crossings.axis_segments import AxisSegments, TooManyNeighboursError
 from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.geometry.segments import closest_points_m
 

@@ -36,16 +36,16 @@ from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, config_param
 from dataset_builder.pipeline.shards import Staging, pack_shard, split_into_shards
 from dataset_builder.specs.config_specs import SceneConfigSpec
 from rebar_depth_bench import software_version
-from rebar_depth_bench.base.names import SPLITS, TEST_SPLIT
-from rebar_depth_bench.base.reading import remove_file
-from rebar_depth_bench.base.writing import write_bytes, write_text
-from rebar_depth_bench.crossings.definition import Crossings, crossing_parameters
-from rebar_depth_bench.crossings.table import (
+from rebar_depth_bench.bar_crossings.definition import Crossings, crossing_parameters
+from rebar_depth_bench.bar_crossings.table import (
     CROSSINGS_FILE,
     crossings_entry,
     read_crossings,
     write_crossings,
 )
+from rebar_depth_bench.base.names import SPLITS, TEST_SPLIT
+from rebar_depth_bench.base.reading import remove_file
+from rebar_depth_bench.base.writing import write_bytes, write_text
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars, write_bars
 from rebar_depth_bench.data.files import MANIFEST_FILE, file_sha256, parameters_digest, views_digest
 from rebar_depth_bench.data.manifest import MANIFEST_FORMAT, DatasetConfig, DatasetFolder, validated_folder

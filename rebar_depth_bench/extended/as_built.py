@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from rebar_depth_bench.crossings.axis_segments import nearest_points
+from rebar_depth_bench.bar_crossings.axis_segments import nearest_points
 from rebar_depth_bench.extended.fits import fit_axes, with_misses
 from rebar_depth_bench.extended.inspection import JUDGED_NOTE, MISSED_NOTE
 from rebar_depth_bench.extended.judged import VisibleSegments, visible_segments

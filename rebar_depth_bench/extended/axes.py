@@ -15,9 +15,9 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int16, Int64, UInt16
 from numpy import ndarray
 
+from rebar_depth_bench.bar_crossings.axis_segments import AxisSegments, nearest_points, pieces, without_repeated
+from rebar_depth_bench.bar_crossings.definition import Crossings, bisectors
 from rebar_depth_bench.base.errors import DatasetError
-from rebar_depth_bench.crossings.axis_segments import AxisSegments, nearest_points, pieces, without_repeated
-from rebar_depth_bench.crossings.definition import Crossings, bisectors
 from rebar_depth_bench.data.bars import Bar, with_axis
 
 PARALLEL_DEG = 5.0

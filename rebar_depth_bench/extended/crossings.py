@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
-from rebar_depth_bench.crossings.definition import TiePoints, tie_points
+from rebar_depth_bench.bar_crossings.definition import TiePoints, tie_points
 from rebar_depth_bench.extended.fits import MISS_MM, FittedAxes, fit_axes, with_misses
 from rebar_depth_bench.extended.judged import VisibleSegments, visible_parts
 from rebar_depth_bench.extended.measures import Measure, MeasureFamily, Samples, median_and_p95, share_sample

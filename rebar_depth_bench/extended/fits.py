@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
-from rebar_depth_bench.crossings.axis_segments import Rows
+from rebar_depth_bench.bar_crossings.axis_segments import Rows
 from rebar_depth_bench.extended.judged import VisibleSegments
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
 

@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
+from rebar_depth_bench.bar_crossings.definition import CROSSINGS_PROTOCOL
+from rebar_depth_bench.bar_crossings.table import CrossingsSource, folder_crossings
 from rebar_depth_bench.base.errors import DatasetError
 from rebar_depth_bench.base.parallel import Progress, silent
-from rebar_depth_bench.crossings.definition import CROSSINGS_PROTOCOL
-from rebar_depth_bench.crossings.table import CrossingsSource, folder_crossings
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars
 from rebar_depth_bench.data.cache import ArrayCache, CacheContent, ViewArrays, open_cache
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder

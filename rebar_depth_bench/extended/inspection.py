@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray
 
-from rebar_depth_bench.crossings.axis_segments import Rows
+from rebar_depth_bench.bar_crossings.axis_segments import Rows
 from rebar_depth_bench.extended.axes import MAX_MATCH_RADIUS_M
 from rebar_depth_bench.extended.fits import MIN_PREDICTED_SHARE, MISS_MM, FittedAxes, fit_axes, with_misses
 from rebar_depth_bench.extended.judged import (

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
-from rebar_depth_bench.crossings.axis_segments import Rows
+from rebar_depth_bench.bar_crossings.axis_segments import Rows
 from rebar_depth_bench.extended.axes import WINDOW_DIAMETERS, Axis, is_on_surface
 from rebar_depth_bench.extended.steel import JudgedCrossings, SteelTruth
 from rebar_depth_bench.geometry.cameras import fold_radius, project, transform

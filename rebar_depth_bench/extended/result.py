@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray
 
-from rebar_depth_bench.crossings.table import CrossingsSource
+from rebar_depth_bench.bar_crossings.table import CrossingsSource
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, STATISTICS, Measure, Samples, Statistic
 from rebar_depth_bench.extended.reach import Reach, pooled, reaches
 from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval

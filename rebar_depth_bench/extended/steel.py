@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt16, UInt32
 from numpy import ndarray
 
-from rebar_depth_bench.crossings.definition import Crossings, scene_crossings
+from rebar_depth_bench.bar_crossings.definition import Crossings, scene_crossings
 from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.extended.axes import CageTruth, SceneCrossings, cage_truth, prepared_crossings
 

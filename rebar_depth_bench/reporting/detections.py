@@ -13,8 +13,8 @@ from markupsafe import Markup
 from rich.console import Console
 
 from rebar_depth_bench import software_version
+from rebar_depth_bench.bar_crossings.definition import CROSSINGS_PROTOCOL
 from rebar_depth_bench.base.errors import printable
-from rebar_depth_bench.crossings.definition import CROSSINGS_PROTOCOL
 from rebar_depth_bench.detections.result import AVERAGE_PRECISION_MM, DetectionResult, DetectionTable
 from rebar_depth_bench.detections.score import MATCH_M
 from rebar_depth_bench.reporting import formatting

@@ -25,10 +25,10 @@ from dataset_builder.importing.import_layout import read_layout
 from dataset_builder.scene.variants.registry import VARIANTS
 from dataset_builder.user_files.scene_schema import read_scene_toml
 from leaderboard.cli import argument_parser as board_parser
+from rebar_depth_bench.bar_crossings.table import CROSSINGS_SCHEMA
 from rebar_depth_bench.base import limits
 from rebar_depth_bench.base.limits import Limit
 from rebar_depth_bench.cli.main import argument_parser as bench_parser
-from rebar_depth_bench.crossings.table import CROSSINGS_SCHEMA
 from rebar_depth_bench.data.bars import BARS_SCHEMA
 from rebar_depth_bench.data.schema import COLUMN_DESCRIPTIONS, COLUMNS, column_kind
 from rebar_depth_bench.methods import find_method, own_methods

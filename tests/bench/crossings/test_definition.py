@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy import ndarray
 
-from rebar_depth_bench.crossings.definition import MAX_GAP_M, Crossings, scene_crossings
+from rebar_depth_bench.bar_crossings.definition import MAX_GAP_M, Crossings, scene_crossings
 from rebar_depth_bench.data.bars import Bar
 
 D = 0.02

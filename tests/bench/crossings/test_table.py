@@ -14,15 +14,15 @@ import pyarrow.parquet as pq
 import pytest
 
 import rebar_depth_bench as rdb
-from rebar_depth_bench.base.errors import DatasetError
-from rebar_depth_bench.crossings.definition import Crossings, crossing_parameters, scene_crossings
-from rebar_depth_bench.crossings.table import (
+from rebar_depth_bench.bar_crossings.definition import Crossings, crossing_parameters, scene_crossings
+from rebar_depth_bench.bar_crossings.table import (
     CROSSINGS_SCHEMA,
     CrossingsSource,
     folder_crossings,
     read_crossings,
     write_crossings,
 )
+from rebar_depth_bench.base.errors import DatasetError
 from rebar_depth_bench.data.bars import Bar, read_bars
 from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.data.manifest import open_folder

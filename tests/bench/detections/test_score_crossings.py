@@ -13,9 +13,9 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
+from rebar_depth_bench.bar_crossings.definition import scene_crossings
 from rebar_depth_bench.base.errors import InputError, SubmissionError
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.crossings.definition import scene_crossings
 from rebar_depth_bench.detections.reading import MAX_ROWS_PER_VIEW, read_detections
 from rebar_depth_bench.detections.result import ViewDetections, tabulate_detections
 from rebar_depth_bench.detections.score import score_crossings

@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from rebar_depth_bench.crossings.definition import scene_crossings
+from rebar_depth_bench.bar_crossings.definition import scene_crossings
 from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.extended.axes import assign_segments
 from rebar_depth_bench.extended.judged import judged_crossings

@@ -19,7 +19,7 @@ import rebar_depth_bench as rdb
 from dataset_builder.audit import audit
 from dataset_builder.audit.auditing import VIEW_CHECKS, check_crossings, row_problems
 from dataset_builder.audit.checks import RayCache, view_from_row
-from rebar_depth_bench.crossings.table import write_crossings
+from rebar_depth_bench.bar_crossings.table import write_crossings
 from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.data.manifest import open_folder
 

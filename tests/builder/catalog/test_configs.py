@@ -22,8 +22,8 @@ from dataset_builder.catalog.named_configs import CONFIGS, BuildRequest
 from dataset_builder.pipeline.contact_sheet import STRIP_PANEL_PX, TILE_PX
 from dataset_builder.specs.config_specs import ColourSpec, DomeSpec, RigSpec, RingSpec, colour_spec
 from dataset_builder.user_files.make_assembly import make_assembly
+from rebar_depth_bench.bar_crossings.table import read_crossings
 from rebar_depth_bench.base.errors import InputError
-from rebar_depth_bench.crossings.table import read_crossings
 from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import ideal_K

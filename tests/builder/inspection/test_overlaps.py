@@ -8,7 +8,7 @@ import pytest
 from dataset_builder.inspection import summary as module
 from dataset_builder.inspection.summary import MIN_OVERLAP_M, overlaps
 from dataset_builder.scene.model import axis_of
-from rebar_depth_bench.crossings.axis_segments import TooManyNeighboursError
+from rebar_depth_bench.bar_crossings.axis_segments import TooManyNeighboursError
 from rebar_depth_bench.data.bars import Bar
 
 

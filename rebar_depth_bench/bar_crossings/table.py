@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import pyarrow as pa
 
+from rebar_depth_bench.bar_crossings.definition import Crossings, crossing_parameters, scene_crossings
 from rebar_depth_bench.base.errors import DatasetError
 from rebar_depth_bench.base.limits import TABLE_BYTES
 from rebar_depth_bench.base.validation import short_repr
-from rebar_depth_bench.crossings.definition import Crossings, crossing_parameters, scene_crossings
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars
 from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder

@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
-from rebar_depth_bench.crossings.axis_segments import ROUNDING_M, AxisSegments, Rows
+from rebar_depth_bench.bar_crossings.axis_segments import ROUNDING_M, AxisSegments, Rows
 from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.geometry.segments import closest_on_segments
 
