@@ -14,7 +14,7 @@ import yaml
 from fastapi.routing import APIRoute
 
 from leaderboard.cli import COMMANDS, argument_parser
-from leaderboard.settings import Settings
+from leaderboard.settings import Settings, read_settings
 from leaderboard.web.api import leaderboard, status, submissions
 
 ROOT = Path(__file__).parents[2]
@@ -94,7 +94,7 @@ def test_compose_services_have_valid_settings(
     for name, value in environment.items():
         monkeypatch.setenv(name, value.replace("${POSTGRES_PASSWORD}", "a-password"))
     options = argument_parser().parse_args(compose["services"][service]["command"])
-    settings = Settings()  # type: ignore[call-arg]
+    settings = read_settings(None, {})
     assert options.command in ("serve", "score")
     assert settings.database_url == "postgresql+psycopg://board:a-password@database/board"
     assert settings.data == "/data"
@@ -111,7 +111,7 @@ def test_web_service_has_no_workers(compose: dict[str, Any]) -> None:
 def test_ports_volumes_and_database_are_consistent(compose: dict[str, Any]) -> None:
     services = compose["services"]
     port = str(Settings.model_fields["port"].default)
-    assert services["web"]["ports"] == [f"{port}:{port}"]
+    assert services["web"]["ports"] == [f"127.0.0.1:{port}:{port}"]
     assert instructions("EXPOSE") == [port]
     assert f"127.0.0.1:{port}/healthz" in CONTAINERFILE.read_text()
     assert services["scorer"]["ports"] == [], "scorers beside the web server cannot have its port"
@@ -130,7 +130,7 @@ def test_systemd_units_run_commands_that_exist(monkeypatch: pytest.MonkeyPatch) 
     text = "".join(file.read_text() for file in sorted((ROOT / "deploy").glob("*.service")))
     for name, value in re.findall(rf"^Environment=({PREFIX}\w+)=(.+)$", text, re.MULTILINE):
         monkeypatch.setenv(name, value)
-    settings = Settings()  # type: ignore[call-arg]
+    settings = read_settings(None, {})
     commands = re.findall(r"^ExecStart=/opt/leaderboard/bin/rebar-leaderboard (.+)$", text, re.MULTILINE)
     options = [argument_parser().parse_args(shlex.split(command)) for command in commands]
     assert [one.command for one in options] == ["backup", "check", "serve"]
