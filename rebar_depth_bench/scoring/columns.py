@@ -1,7 +1,8 @@
 """Columns of tables: one description of every number of a result, from which all of its forms are made.
 
-JSON, CSV, terminal, LaTeX, HTML, comparisons and intervals are made from ``VIEW_COLUMNS`` and ``TABLE_COLUMNS``. A
-number of a new kind needs a column here, a field of the classes in ``result`` and its computation in ``score``.
+CSV, data frames, comparisons and intervals have all of ``VIEW_COLUMNS`` and ``TABLE_COLUMNS``; terminal, LaTeX and
+HTML show the groups that they place, such as ``NATIVE``. A number of a new kind needs a column here, a field of the
+classes in ``table``, its computation in ``score``, and a place in ``reporting``.
 """
 
 from __future__ import annotations
