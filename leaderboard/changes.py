@@ -1,4 +1,4 @@
-"""Rules for submissions: who finds, changes and deletes one."""
+"""Rules for submissions: who finds, changes and deletes one, and when a result is outdated."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ def service_problems(service: Service) -> list[str]:
 
 
 def _dataset_problems(service: Service) -> list[str]:
-    """Return whether the dataset folder is gone or its manifest was replaced; a Hub dataset is not checked."""
+    """Return the problem if the dataset folder is gone or its manifest was replaced; not for a Hub dataset."""
     found = manifest_state(service.settings.data)
     if found == service.manifest_state:
         return []
@@ -39,13 +39,13 @@ def _dataset_problems(service: Service) -> list[str]:
 
 
 def disk_problem(folder: Path, name: str = "the state folder") -> list[str]:
-    """Return whether the disk of a folder is nearly full."""
+    """Return the problem if the disk of a folder is nearly full."""
     free = shutil.disk_usage(folder).free
     return [] if free >= MIN_FREE_BYTES else [f"the disk of {name} has {free >> 20} MiB left"]
 
 
 def queue_problems(database: Database) -> list[str]:
-    """Return whether the oldest queued submission waits although no submission is being scored."""
+    """Return the problem if the oldest queued submission waits although none is being scored."""
     oldest = select(func.min(SubmissionModel.created_at)).where(SubmissionModel.status == QUEUED)
     active = select(func.count()).where(SubmissionModel.status == SCORING, not_(jobs.is_free(time.time())))
     with database.read() as session:

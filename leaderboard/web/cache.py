@@ -1,8 +1,8 @@
 """Cache of responses, which are valid until the content version in the database changes.
 
 The version is looked up for every request, because other processes change the content, too. A response is rendered
-and compressed once per version, and a browser that has the current version gets status 304. Cached responses do
-not pass through the routing of the application.
+once per version, and once more for clients without gzip, and a browser that has the current version gets status
+304. Cached responses do not pass through the routing of the application.
 """
 
 from __future__ import annotations

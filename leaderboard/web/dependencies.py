@@ -1,6 +1,7 @@
-"""Dependencies of routes: the service, the token of a request, and parameters of addresses.
+"""Dependencies of routes (the service, the token of a request), and the checks and addresses that routes share.
 
-They are coroutines, because FastAPI runs other functions in worker threads, which takes longer than what they do.
+The dependencies are coroutines, because FastAPI runs other functions in worker threads, which takes longer than
+what they do.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ def check_config(service: Service, config: str) -> None:
 
 
 def check_length(request: Request) -> None:
-    """Raise ``UploadRejectedError`` (413) if the body is declared to be larger than that of any upload.
+    """Raise ``RefusedError`` (413) if the body is declared to be larger than that of any upload.
 
     A client that waits for 100 Continue then sends nothing of it.
     """

@@ -199,6 +199,8 @@ def remove_folder(path: Path) -> None:
         shutil.rmtree(path, ignore_errors=True)
 
 
+# Sources of bytes that are read at positions: files and memory.
+
 # For smaller reads, pread is cheaper than a mapping and its page faults.
 _MIN_MAPPED_BYTES = 64 * 1024
 

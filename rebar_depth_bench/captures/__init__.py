@@ -1,1 +1,1 @@
-"""Images with known cameras that are no dataset folder: captures and image folders."""
+"""Pictures without ground truth, and their cameras: captures, image files, calibrations."""

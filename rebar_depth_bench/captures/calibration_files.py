@@ -144,7 +144,6 @@ def _read_conf(content: bytes, width: int, height: int, problems: list[Problem])
         fx, fy, cx, cy, k1, k2, p1, p2, k3 = _section_numbers(sections, name, keys, suffix, problems)
         lenses.append(Lens(fx, fy, cx, cy, (k1, k2, p1, p2, k3)))
     baseline_mm, y_mm, z_mm, rx, cv, rz = _section_numbers(sections, "STEREO", _STEREO, suffix, problems)
-    # The whole vector is negated, which keeps it on the line that the vendor's rectification uses.
     translation_m = (0.0 - baseline_mm / 1000, 0.0 - y_mm / 1000, 0.0 - z_mm / 1000)
     return (
         None if problems else StereoCalibration(width, height, lenses[0], lenses[1], (rx, cv, rz), translation_m)

@@ -1,1 +1,1 @@
-"""Dataset folders: manifest, rows, codecs, digests, bars, ground truth and its array cache."""
+"""Dataset folders: manifest, shards, rows, codecs, digests, bars, array cache."""

@@ -20,10 +20,11 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, cached_property
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy import ndarray
+from pydantic import Field
 from zlib_ng import zlib_ng
 
 from rebar_depth_bench.base.errors import DatasetError, InputError, OutputError
@@ -100,6 +101,8 @@ def total_bytes(files: Iterable[CacheFile]) -> int:
     return sum(file.size_bytes for file in files)
 
 
+# One entry: its file, and the views in it.
+
 _FORMAT = "rebar-cache-3"
 _ALIGNMENT = 8
 _TRAILER = struct.Struct("<32sQ")
@@ -162,9 +165,9 @@ class _Block(StrictModel):
     """Place of a view's arrays, which have ``count`` values each, and the checksum of their bytes."""
 
     view_id: str
-    start: int
-    size: int
-    count: int
+    start: Annotated[int, Field(ge=0)]
+    size: Annotated[int, Field(ge=0)]
+    count: Annotated[int, Field(ge=0)]
     crc32: int
     numbers: tuple[float, ...]
 
@@ -216,7 +219,8 @@ def _read_entry(path: Path, content: CacheContent) -> _Entry | None:
         if hashlib.sha256(encoded).digest() != digest:
             raise ValueError("its index does not match its checksum")
         index = _Index.model_validate_json(bytes(encoded))
-        if index.key != content.key:
+        blocks = {block.view_id: block for block in index.blocks}
+        if index.key != content.key or blocks.keys() != set(content.view_ids):
             raise ValueError("it holds other views")
     except (FileNotFoundError, NotADirectoryError):
         return None
@@ -225,7 +229,7 @@ def _read_entry(path: Path, content: CacheContent) -> _Entry | None:
         return None
     with suppress(OSError):
         os.utime(path)
-    return _Entry(path, content, source, {block.view_id: block for block in index.blocks})
+    return _Entry(path, content, source, blocks)
 
 
 def _write_entry(path: Path, content: CacheContent, progress: Progress) -> _Entry:

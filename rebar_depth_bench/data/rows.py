@@ -208,6 +208,9 @@ def iterate_rows(
     return (decode_row(config, row) for row in encoded_rows(config, columns, view_ids))
 
 
+# Comparison of the rows with the manifest, for ``rebar-bench verify``.
+
+
 def truth_problems(config: DatasetConfig, progress: Progress = silent) -> Iterator[Problem]:
     """Yield a problem for each view whose cameras or ground truth differ from the digests of the manifest.
 
@@ -223,6 +226,9 @@ def truth_problems(config: DatasetConfig, progress: Progress = silent) -> Iterat
                 found = f"the {eye} ground truth has the digest {digest[:16]}"
                 yield Problem("conflict", record.view_id, found, f"{expected[:16]} as in the manifest")
         progress(f"ground truth of {config.name}", done, len(records))
+
+
+# Views for methods: those of a dataset, or pictures without ground truth.
 
 
 class Views(Protocol):

@@ -171,6 +171,8 @@ def _read_varint(content: bytes, position: int) -> tuple[int, int]:
     return value | byte << shift, position + 1
 
 
+# Tables and rows of Parquet files.
+
 _COMPRESSIONS = {0: "none", 1: "snappy"}
 _MAX_STRING_BYTES = 1 << 22
 
@@ -298,8 +300,8 @@ def encoded_rows(
 ) -> Iterator[dict[str, Any]]:
     """Yield the rows of a config, or those of some views, one at a time, with images and depth encoded.
 
-    Raises ``DatasetError`` for a damaged shard, and unless each of the views occurs exactly once; if all are read,
-    no others may occur.
+    Raises ``DatasetError`` for a damaged shard, and if a view is missing; if all are read, also if one occurs
+    twice or is not in the manifest.
     """
     columns = validated_columns(columns)
     known = frozenset(config.view_ids if view_ids is None else view_ids)

@@ -7,7 +7,7 @@ import io
 import math
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
 
@@ -319,17 +319,3 @@ def _metadata(
     values |= given
     values.setdefault("method", path.stem)
     return validate_table(SubmissionMeta, values, problems, "metadata")
-
-
-def with_confidence(detections: Detections, least: float | None) -> Detections:
-    """Return the detections with at least a confidence; all of them for None."""
-    if least is None:
-        return detections
-    kept = np.flatnonzero(detections.confidence >= least)
-    return replace(
-        detections,
-        view_ids=[detections.view_ids[row] for row in kept.tolist()],
-        point_m=detections.point_m[kept],
-        normal=detections.normal[kept],
-        confidence=detections.confidence[kept],
-    )

@@ -55,7 +55,7 @@ class PossibleMistake:
 def diagnose(evaluation: Evaluation) -> list[PossibleMistake]:
     """Return the possible mistakes in a submission, those of ``diagnose_config`` for each config.
 
-    Up to ``views.MAX_VIEWS`` views of each config in a local folder are read. Raises ``EntryError`` and
+    Up to ``corrections.MAX_VIEWS`` views of each config in a local folder are read. Raises ``EntryError`` and
     ``DatasetError`` for entries and shards that scoring refuses.
     """
     mistakes = []

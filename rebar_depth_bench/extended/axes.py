@@ -105,6 +105,8 @@ def overlapping_pairs(
     return np.concatenate(pairs)
 
 
+# Straight segments of bars, from axes that bend.
+
 STRAIGHT_DEG = 1.0
 """A segment ends where the centreline deviates from its first direction by more than this angle, degrees."""
 
@@ -218,6 +220,8 @@ def _straight_segments(bar: Bar) -> Iterator[tuple[Float64[ndarray, " 3"], Float
                 yield points_m[first], points_m[edge]
             first = edge
 
+
+# Windows of both bars around a crossing.
 
 WINDOW_DIAMETERS = 6.0
 """Length along a bar on either side of a crossing that is judged and fitted, diameters."""

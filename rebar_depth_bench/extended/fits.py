@@ -217,6 +217,8 @@ def _gauss_newton_step(
     return step_m
 
 
+# Fits of the segments of a view.
+
 MIN_PREDICTED_SHARE = 0.5
 """Minimum share of a segment's sampled pixels that must have a prediction for it to be found."""
 

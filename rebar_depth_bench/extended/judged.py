@@ -164,6 +164,8 @@ def _frames(middle_m: Float64[ndarray, "r 3"], direction: Float64[ndarray, "r 3"
     return np.stack([np.cross(away, direction), away, direction], axis=1)
 
 
+# Crossings that a view can be judged by.
+
 SAMPLED_PIXELS = MIN_PIXELS
 """Number of pixels of each bar that are fitted at a crossing, spread evenly along it."""
 

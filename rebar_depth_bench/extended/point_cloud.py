@@ -41,7 +41,7 @@ _SEARCH_RADIUS_M = 1.001 * TOLERANCES_MM[-1] / 1000  # the tree's bound is exclu
 
 @dataclass(frozen=True, eq=False)
 class TrueCloud:
-    """Asked pixels and true points of a view; they do not depend on a prediction.
+    """Queried pixels and true points of a view; they do not depend on a prediction.
 
     ``position`` holds the positions of the interior pixels in ``SteelTruth.index``, and ``queried`` those of the
     queried pixels among them. ``rays`` are ``(x/z, y/z, 1)`` of the interior pixels and ``z_m`` their true depth.

@@ -1,1 +1,1 @@
-"""Camera geometry: projection, calibration, rectification, ArUco boards."""
+"""Camera geometry: projection, lenses, rectification, ArUco boards."""

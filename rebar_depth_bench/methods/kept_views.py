@@ -186,7 +186,11 @@ def _refuse_foreign(path: Path) -> None:
     expected = "expected a folder with predictions of an interrupted run only"
     if not stat.S_ISDIR(path.lstat().st_mode):
         raise InputError(f"{path}: is not a folder, {expected}")
-    for top, folders, files in os.walk(path):
+
+    def refuse(error: OSError) -> None:
+        raise InputError(f"{error.filename}: cannot be read: {error.strerror}")
+
+    for top, folders, files in os.walk(path, onerror=refuse):
         is_top = top == str(path)
         for entry in sorted(Path(top, name) for name in (*folders, *files)):
             mode, pattern = entry.lstat().st_mode, _TOP_FILES if is_top else _VIEW_FILES

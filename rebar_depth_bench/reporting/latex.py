@@ -15,7 +15,7 @@ from rebar_depth_bench.base.errors import InputError, printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.html.assets import environment
 from rebar_depth_bench.reporting.published import load_published, published_rows
-from rebar_depth_bench.scoring.columns import DASH, PAPER_COLUMNS, RANK_ERROR, rounded
+from rebar_depth_bench.scoring.columns import DASH, OTHERS, PAPER_COLUMNS, RANK_ERROR, Better, Column, rounded
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.table import PublishedMatch, Table
@@ -23,8 +23,17 @@ from rebar_depth_bench.scoring.table import PublishedMatch, Table
 CONFIGS_PER_BLOCK = 2
 """Number of configs side by side that fit into a page width of 17 cm; further configs follow in blocks below."""
 
-_COLUMNS = (RANK_ERROR, *PAPER_COLUMNS)
+_COLUMNS = (RANK_ERROR, *PAPER_COLUMNS, *OTHERS)
+_HEADS: Mapping[str, str] = {
+    "rank_error": "$E$",
+    "native.rmse_cm": "RMSE",
+    "native.abs_rel": "AbsRel",
+    "scaled.abs_rel": "AbsRel$_s$",
+    "scale_median": "$s$",
+}
+_ARROWS: Mapping[Better, str] = {"lower": r" $\downarrow$", "higher": r" $\uparrow$", "": ""}
 _MISSING = "--"
+_NO_OTHERS = [""] * len(OTHERS)
 _UNRANKED_MARK = r"$^{\ddagger}$"
 _OTHER_OPTICS_MARK = r"$^{\S}$"
 _ANCHORED_MARK = r"$^{\dagger}$"
@@ -46,7 +55,7 @@ _LIGATURE = re.compile(r"([-',])(?=\1)")
 
 
 def latex_table(results: Sequence[Result], *, published: bool, intervals: bool = False) -> str:
-    r"""Return ``results`` as a LaTeX ``table*`` with one row per result and four columns per config.
+    r"""Return ``results`` as a LaTeX ``table*`` with one row per result and the same columns per config.
 
     RMSE (cm) and AbsRel are native, AbsRel_s is computed after the oracle scale, s is its median over views. The
     best number of a column is bold if the column has two or more ranked rows; a row that is not ranked is marked
@@ -68,7 +77,7 @@ def latex_table(results: Sequence[Result], *, published: bool, intervals: bool =
     paper_rows = [row for match in matches.values() for row in published_rows(match.scene)]
     return _template().render(
         protocol=PROTOCOL,
-        columns=len(_COLUMNS),
+        heads=[_head(column) for column in _COLUMNS],
         version=results[0].dataset.version,
         digest=formatting.short_digest(results[0].dataset.digest, 16),
         view_counts=[
@@ -142,6 +151,12 @@ def _result_rows(results: Sequence[Result], configs: Sequence[str], intervals: b
     ]
 
 
+def _head(column: Column) -> str:
+    """Return the heading of a column; that of the paper's table, if it has one."""
+    unit = f", {column.unit}" if column.unit else ""
+    return _HEADS.get(column.path, escape_latex(f"{column.title}{unit}")) + _ARROWS[column.better]
+
+
 def _sort_key(table: Table | None) -> tuple[bool, bool, float]:
     """Return the sort key of a row by the block's first config: ranked rows by rank error, the others last."""
     if table is None:
@@ -157,8 +172,13 @@ def _best_texts(tables: Iterable[Table | None]) -> dict[str, str]:
     ranked = [table for table in tables if table is not None and table.ranked]
     if len(ranked) < 2:
         return {}
-    columns = _COLUMNS[:-1] if all(table.is_comparable for table in ranked) else _COLUMNS[:1]
-    return {column.path: column.text(min(column.value(table) for table in ranked)) for column in columns}
+    columns = _COLUMNS if all(table.is_comparable for table in ranked) else _COLUMNS[:1]
+    best = {"lower": min, "higher": max}
+    return {
+        column.path: column.text(best[column.better](column.value(table) for table in ranked))
+        for column in columns
+        if column.better
+    }
 
 
 def _cells(table: Table | None, best: Mapping[str, str], intervals: bool) -> list[str]:
@@ -177,7 +197,7 @@ def _cells(table: Table | None, best: Mapping[str, str], intervals: bool) -> lis
 def _reference_rows(results: Sequence[Result], config: str) -> dict[str, list[str]]:
     """Return the cells of each reference of a config."""
     shown = [(result.method, result.tables[config]) for result in results if config in result.tables]
-    return {name: ["", *cells] for name, cells in formatting.paper_reference_rows(shown)}
+    return {name: ["", *cells, *_NO_OTHERS] for name, cells in formatting.paper_reference_rows(shown)}
 
 
 def _published_rows(match: PublishedMatch | None) -> dict[str, list[str]]:
@@ -186,7 +206,12 @@ def _published_rows(match: PublishedMatch | None) -> dict[str, list[str]]:
         return {}
     optics = "" if match.same_optics else _OTHER_OPTICS_MARK
     return {
-        row.method: ["", row.rmse_cm + (_ANCHORED_MARK if row.median_anchored else "") + optics, *row.cells[1:]]
+        row.method: [
+            "",
+            row.rmse_cm + (_ANCHORED_MARK if row.median_anchored else "") + optics,
+            *row.cells[1:],
+            *_NO_OTHERS,
+        ]
         for row in published_rows(match.scene)
     }
 

@@ -29,6 +29,7 @@ from rebar_depth_bench.scoring.columns import (
     COVERAGE,
     NATIVE,
     ONE_PIXEL,
+    OTHERS,
     PAPER_COLUMNS,
     RANK_ERROR,
     SCALE,
@@ -96,10 +97,11 @@ Row = tuple[str, Mapping[str, str], str]
 
 _BASE = (VIEWS_SCORED, COVERAGE, RANK_ERROR)
 _ALL_SCALED = (*SCALED, SCALE)
+_WITHIN = (*WITHIN, *OTHERS)
 _LAYOUTS: Sequence[Sequence[Columns]] = (
-    [[*_BASE, *NATIVE, *_ALL_SCALED, *WITHIN]],
-    [[*NATIVE, *_ALL_SCALED], [*_BASE, *WITHIN]],
-    [[*_BASE, *NATIVE], _ALL_SCALED, WITHIN],
+    [[*_BASE, *NATIVE, *_ALL_SCALED, *_WITHIN]],
+    [[*NATIVE, *_ALL_SCALED], [*_BASE, *_WITHIN]],
+    [[*_BASE, *NATIVE], _ALL_SCALED, _WITHIN],
 )
 """Columns of each table to print, from the widest to the narrowest layout."""
 _TITLES = (
@@ -179,8 +181,9 @@ def _print_rows(rows: Sequence[Row], console: Console, layouts: Sequence[Sequenc
 
 def _rich_table(rows: Sequence[Row], columns: Columns, head: str) -> RichTable:
     """Return the table of headings, and of the rows that have a text in any of the columns."""
-    lines = max(column.head.count("\n") for column in columns)
-    heads = [Text("\n" * (lines - one.count("\n")) + one) for one in (head, *(column.head for column in columns))]
+    heads = [head, *(column.head or f"{column.title}\n{column.unit}" for column in columns)]
+    lines = max(one.count("\n") for one in heads)
+    heads = ["\n" * (lines - one.count("\n")) + one for one in heads]
     table = make_grid(heads[0], heads[1:])
     for name, shown, style in rows:
         cells = [shown.get(column.path, "") for column in columns]

@@ -1,8 +1,8 @@
 """Columns of tables: one description of every number of a result, from which all of its forms are made.
 
 CSV, data frames, comparisons and intervals have all of ``VIEW_COLUMNS`` and ``TABLE_COLUMNS``; terminal, LaTeX and
-HTML show the groups that they place, such as ``NATIVE``. A number of a new kind needs a column here, a field of the
-classes in ``table``, its computation in ``score``, and a place in ``reporting``.
+HTML show their groups. A number of a new kind needs a column in ``OTHERS``, a field of the classes in ``table``
+and its computation in ``score``.
 """
 
 from __future__ import annotations
@@ -269,7 +269,9 @@ WITHIN = tuple(
     )
     for tolerance_mm in WITHIN_MM
 )
-VIEW_COLUMNS = (COVERAGE, RANK_ERROR, *NATIVE, *SCALED, SCALE, *WITHIN)
+OTHERS: tuple[Column, ...] = ()
+"""Columns of further numbers that every view has; tables and pages show them behind those within a tolerance."""
+VIEW_COLUMNS = (COVERAGE, RANK_ERROR, *NATIVE, *SCALED, SCALE, *WITHIN, *OTHERS)
 """Columns of the numbers that every view has, and a table with an interval, in the order of the JSON."""
 CONSTANT, ONE_PIXEL, SCALED_CONSTANT = (
     tuple(_reference(kind, name) for name in REFERENCE_ERRORS)

@@ -213,6 +213,8 @@ def _load(spec: OnnxSpec, view_timeout_s: float) -> Predictor:
     return predict
 
 
+# Inference sessions for models with one image input and one map output.
+
 PROVIDERS = ("CUDAExecutionProvider", "CPUExecutionProvider")
 """Execution providers in order of preference; those that onnxruntime does not offer are skipped."""
 _FLOAT_DTYPES: Mapping[str, type] = {
@@ -224,9 +226,6 @@ _LOG_ERRORS_ONLY, _LOG_NOTHING = 3, 4
 _MAX_ERROR_CHARACTERS = 300
 _OUT_OF_MEMORY = "Available memory of"
 """Part of onnxruntime's message if its memory arena cannot grow any further."""
-
-
-# Inference sessions for models with one image input and one map output.
 
 
 @dataclass(frozen=True)

@@ -1,1 +1,1 @@
-"""HTML reports and pages of tables: contexts, templates, scripts and style sheets."""
+"""HTML report and page of detections: contexts, templates, scripts and style sheets."""

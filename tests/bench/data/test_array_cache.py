@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import json
 import os
 import signal
 import subprocess
@@ -121,6 +123,23 @@ def test_every_changed_byte_is_detected(folder: Path, capsys: pytest.CaptureFixt
         open_cache(content())
         assert path.read_bytes() == intact
         assert capsys.readouterr().err.count("\n") == 1
+
+
+@pytest.mark.parametrize("change", [lambda blocks: blocks.pop(), lambda blocks: blocks[1].update(count=-1)])
+def test_index_with_a_valid_checksum_is_checked(
+    folder: Path, change: Callable[[list[dict[str, Any]]], object], capsys: pytest.CaptureFixture[str]
+) -> None:
+    open_cache(content())
+    path = only_file(folder)
+    data = path.read_bytes()
+    length = int.from_bytes(data[-8:], "little")
+    index = json.loads(data[-40 - length : -40])
+    change(index["blocks"])
+    encoded = json.dumps(index).encode()
+    trailer = hashlib.sha256(encoded).digest() + len(encoded).to_bytes(8, "little")
+    path.write_bytes(data[: -40 - length] + encoded + trailer)
+    assert indices(open_cache(content())) == EXPECTED
+    assert "the cache is damaged" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("damage", ["cut", "empty", "longer", "trailer", "other", "folder", "link", "pipe"])

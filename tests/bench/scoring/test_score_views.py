@@ -63,8 +63,7 @@ def test_groups_are_those_of_a_config_with_splits() -> None:
 
 BIAS = {
     "columns.py": {
-        "VIEW_COLUMNS = (COVERAGE, RANK_ERROR,": """BIAS = Column("bias_mm", "bias", "mm", decimals=1)
-VIEW_COLUMNS = (COVERAGE, RANK_ERROR, BIAS,""",
+        "OTHERS: tuple[Column, ...] = ()": """OTHERS = (Column("bias_mm", "bias", "mm", decimals=1),)""",
     },
     "table.py": {
         "    Field,\n": "    Field,\n    PlainSerializer,\n",
@@ -86,6 +85,10 @@ VIEW_COLUMNS = (COVERAGE, RANK_ERROR, BIAS,""",
 
 SCORE = """
 import csv, io, json
+from rich.console import Console
+from rebar_depth_bench.reporting.html.page import render_report
+from rebar_depth_bench.reporting.latex import latex_table
+from rebar_depth_bench.reporting.tables import print_table
 from rebar_depth_bench.scoring.frames import differences_frame, frame_csv
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.result import (
@@ -106,7 +109,10 @@ written = results[0].to_json()
 assert read_result(written, "x").to_json() == written
 [row] = csv.DictReader(io.StringIO(frame_csv(results[0].to_pandas())))
 rows = csv.DictReader(io.StringIO(frame_csv(differences_frame([compare(*results).to_dict()]))))
-print(json.dumps([json.loads(written), row, next(row for row in rows if row["number"] == "bias_mm")]))
+terminal = io.StringIO()
+print_table(results[0], Console(file=terminal, width=200))
+shown = [terminal.getvalue(), latex_table(results, published=False, intervals=True), render_report(results[0], [])]
+print(json.dumps([json.loads(written), row, next(row for row in rows if row["number"] == "bias_mm"), shown]))
 """
 
 
@@ -127,7 +133,7 @@ def test_signed_number_with_interval_is_added_in_three_files(tmp_path: Path) -> 
         command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False, timeout=120
     )
     assert finished.returncode == 0, finished.stderr
-    document, row, difference = json.loads(finished.stdout)
+    document, row, difference, shown = json.loads(finished.stdout)
     table = document["tables"]["a"]
     assert document["views"][0]["bias_mm"] == pytest.approx(-2, abs=0.001)
     assert table["bias_mm"] == pytest.approx(-2.054, abs=0.001)
@@ -140,3 +146,7 @@ def test_signed_number_with_interval_is_added_in_three_files(tmp_path: Path) -> 
     ]
     assert float(difference["difference"]) == pytest.approx(5, abs=0.001)
     assert difference["verdict"] == "", "neither direction of a signed number is better"
+    for text in shown:
+        assert "bias" in text
+        assert "-2.1" in text
+    assert "[-2.1, -2.0]" in shown[1], "LaTeX has the interval"
