@@ -1,4 +1,4 @@
-"""What a view is judged on: visible straight runs of bars and crossings, with the pixels that are used of each.
+"""Judged parts of a view: visible straight segments of bars, and crossings, with the pixels used of each.
 
 Determined from the ground truth of the left eye alone. Frame: the camera's (OpenCV axes), metres.
 """

@@ -1,6 +1,6 @@
 """Files that an ONNX model reads: the external data of its tensors.
 
-The model is walked as protobuf messages, because the package ``onnx`` is no dependency and loads all weights; of a
+The model is read as protobuf messages, because the package ``onnx`` is no dependency and loads all weights; of a
 file of empty messages it makes 75 times as much memory.
 Field numbers are those of ``onnx.proto``. External data must lie in the folder of the model, because its locations
 come from the file.
@@ -18,7 +18,7 @@ from rebar_depth_bench.data.files import files_digest
 from rebar_depth_bench.methods.onnx.spec import is_file
 
 MAX_FIELDS = 1_000_000
-"""Largest number of fields that are walked; a large model has some 100,000. Each takes some microseconds."""
+"""Largest number of fields that are read; a large model has some 100,000. Each takes some microseconds."""
 MESSAGE_FIELDS: Mapping[str, Mapping[int, str]] = {
     "ModelProto": {7: "GraphProto", 20: "TrainingInfoProto", 25: "FunctionProto"},
     "TrainingInfoProto": {1: "GraphProto", 2: "GraphProto"},
