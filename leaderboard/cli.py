@@ -1,49 +1,45 @@
-"""Command-line interface ``rebar-leaderboard``."""
+"""Command-line interface ``rebar-leaderboard``: the server, and what operators do to its database and archives."""
 
 from __future__ import annotations
 
 import argparse
+import signal
 import stat
-from collections.abc import Sequence
-from contextlib import ExitStack
+import sys
+import threading
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from leaderboard.db.engine import database_errors, sqlite_path
+import structlog
+from sqlalchemy import select
+
+from leaderboard.db import jobs, submissions
+from leaderboard.db.engine import Database, database_errors, sqlite_path, without_password
+from leaderboard.db.models import SubmissionModel, TokenModel
+from leaderboard.db.submissions import DELETED, archive_rows
+from leaderboard.db.tokens import create_token, list_tokens, replace_token, revoke_token
+from leaderboard.health import disk_problem, queue_problems
 from leaderboard.log_setup import set_up_logs
+from leaderboard.scoring.worker import process_queue
 from leaderboard.settings import Settings, read_settings
-from leaderboard.storage.archive_store import make_folder, state_lock
-from rebar_depth_bench.base.errors import InputError
+from leaderboard.storage import retention
+from leaderboard.storage.archive_store import ArchiveStore, archive_problem, make_folder, state_lock
+from leaderboard.storage.backup import back_up
+from rebar_depth_bench import software_version
+from rebar_depth_bench.base.errors import InputError, StorageError, problem_summary
 from rebar_depth_bench.cli.console import Command, program_parser, run_program
+from rebar_depth_bench.data.files import file_problems
+from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.reporting.formatting import counted
+from rebar_depth_bench.scoring.frames import csv_text
 
-_STORED = ("state_dir", "db")
-_WITH_ARCHIVES = (*_STORED, "archives")
-_SCORING = ("score_time", "score_memory", "lease_seconds", "error_maps", "hidden_truth")
-COMMANDS: dict[str, tuple[str, tuple[str, ...]]] = {
-    "serve": ("run the web server and its local scoring workers", tuple(Settings.model_fields)),
-    "score": (
-        "run a scoring worker for a server that uses the same database and archive storage",
-        ("data", *_WITH_ARCHIVES, *_SCORING),
-    ),
-    "token": ("create a token for a submitter and print it", _STORED),
-    "tokens": ("list the tokens with their submissions and bytes as CSV", _STORED),
-    "submissions": ("list the submissions of all tokens as CSV", _STORED),
-    "prune": (
-        "delete archives of ended submissions by age and rank, as the settings say, or those without a submission",
-        ("data", *_WITH_ARCHIVES, "archive_days", "archive_ranks"),
-    ),
-    "check": (
-        "check dataset, database, archives, disk and queue, and print what is wrong; nothing is changed",
-        ("data", *_WITH_ARCHIVES),
-    ),
-    "remove": ("delete a submission of any owner, with its archive and results", _WITH_ARCHIVES),
-    "backup": ("copy the database and the archives to a folder while the service is running", _WITH_ARCHIVES),
-}
-"""Help texts of the commands, and the settings that each accepts as options.
-
-All settings can also be set in a TOML file or the environment.
-"""
+_LOG = structlog.get_logger("worker")
+Cell = str | float | None
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -51,49 +47,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     return run_program(argument_parser(), arguments)
 
 
-def _run(options: argparse.Namespace) -> None:
-    _, names = COMMANDS[options.command]
-    values = {name: getattr(options, name, None) for name in names}
-    overrides: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
-    needs_data = "data" in names and not getattr(options, "orphans", False)
-    settings = read_settings(options.settings, overrides if needs_data else {**overrides, "data": ""})
-    set_up_logs()
-    database = sqlite_path(settings.database_url)
-    is_missing = database is not None and not database.is_file() and options.command not in ("serve", "token")
-    with ExitStack() as stack:
-        if options.command != "check" and (settings.state_dir.exists() or not is_missing):  # It writes nothing.
-            _make_state_dir(settings.state_dir)
-            stack.enter_context(state_lock(settings.state_dir))
-        if is_missing:
-            raise InputError(f"{database}: the database does not exist, expected the database of a leaderboard")
-        stack.enter_context(database_errors(settings.database_url))
-        if options.command == "serve":
-            from leaderboard.web.server import serve
-
-            serve(settings)
-        else:
-            from leaderboard.operations import run_operation
-
-            run_operation(options.command, settings, options)
-
-
-def _make_state_dir(folder: Path) -> None:
-    """Create the state folder with mode 0700, because the ids in it give access to unpublished submissions.
-
-    Raises ``InputError`` if others may read an existing folder, and the errors of ``make_folder``.
-    """
-    make_folder(folder, "the state folder")
-    mode = stat.S_IMODE(folder.stat().st_mode)
-    if mode & 0o077:
-        raise InputError(f"the state folder {folder}: has mode {mode:04o}, expected 0700; run: chmod 700 {folder}")
-
-
 def argument_parser() -> argparse.ArgumentParser:
     """Return the argument parser with all commands."""
     parser = program_parser(
         "rebar-leaderboard",
         "Leaderboard server that scores prediction archives exactly as rebar-bench does.",
-        {name: Command(summary, partial(_add_arguments, name), _run) for name, (summary, _) in COMMANDS.items()},
+        {name: Command(one.summary, partial(_add_arguments, name), _run) for name, one in COMMANDS.items()},
         epilog="Each setting can also be given as the environment variable REBAR_LEADERBOARD_NAME or as "
         "name = value in a TOML file (--settings). The command line takes precedence over the file, and the file "
         "over the environment.",
@@ -105,7 +64,7 @@ def argument_parser() -> argparse.ArgumentParser:
 def _add_arguments(name: str, command: argparse.ArgumentParser) -> None:
     command.set_defaults(command=name)
     command.add_argument("--settings", type=Path, metavar="FILE", help="TOML file with settings")
-    for setting in COMMANDS[name][1]:
+    for setting in COMMANDS[name].settings:
         _add_setting(command, setting)
     if name == "token":
         command.add_argument("name", metavar="NAME", help="name of the submitter, shown on the leaderboard")
@@ -134,3 +93,220 @@ def _add_setting(command: argparse.ArgumentParser, name: str) -> None:
         help=f"{field.description}{default_text}".replace("%", "%%"),
         **flag,
     )
+
+
+def _run(options: argparse.Namespace) -> None:
+    """Run a command with its settings, while the state folder is locked and has the right mode."""
+    command = COMMANDS[options.command]
+    values = {name: getattr(options, name, None) for name in command.settings}
+    overrides: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
+    needs_data = "data" in command.settings and not getattr(options, "orphans", False)
+    settings = read_settings(options.settings, overrides if needs_data else {**overrides, "data": ""})
+    set_up_logs()
+    database = sqlite_path(settings.database_url)
+    is_missing = database is not None and not database.is_file() and options.command not in ("serve", "token")
+    with ExitStack() as stack:
+        if options.command != "check" and (settings.state_dir.exists() or not is_missing):  # It writes nothing.
+            _make_state_dir(settings.state_dir)
+            stack.enter_context(state_lock(settings.state_dir))
+        if is_missing:
+            raise InputError(f"{database}: the database does not exist, expected the database of a leaderboard")
+        stack.enter_context(database_errors(settings.database_url))
+        command.run(settings, options)
+
+
+def _make_state_dir(folder: Path) -> None:
+    """Create the state folder with mode 0700, because the ids in it give access to unpublished submissions.
+
+    Raises ``InputError`` if others may read an existing folder, and the errors of ``make_folder``.
+    """
+    make_folder(folder, "the state folder")
+    mode = stat.S_IMODE(folder.stat().st_mode)
+    if mode & 0o077:
+        raise InputError(f"the state folder {folder}: has mode {mode:04o}, expected 0700; run: chmod 700 {folder}")
+
+
+@contextmanager
+def _migrated(settings: Settings) -> Iterator[Database]:
+    """Yield the database of the settings, with the newest schema."""
+    with closing(Database(settings.database_url)) as database:
+        database.migrate()
+        yield database
+
+
+def _serve(settings: Settings, _: argparse.Namespace) -> None:
+    from leaderboard.web.server import serve  # Takes a second to import, which no other command needs.
+
+    serve(settings)
+
+
+def _score(settings: Settings, _: argparse.Namespace) -> None:
+    """Score queued submissions until SIGTERM or SIGINT; then requeue the current job."""
+    stop = threading.Event()
+    for signal_number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(signal_number, lambda *_: stop.set())
+    url = without_password(settings.database_url)
+    _LOG.info("waiting for submissions", database=url, version=software_version())
+    with _migrated(settings) as database:
+        process_queue(database, settings, stop)
+
+
+def _token(settings: Settings, options: argparse.Namespace) -> None:
+    with _migrated(settings) as database:
+        if options.revoke:
+            revoke_token(database, options.name)
+            return
+        print((replace_token if options.replace else create_token)(database, options.name))
+    print("The token is not shown again; only its hash is stored.", file=sys.stderr)
+
+
+def _tokens(settings: Settings, _: argparse.Namespace) -> None:
+    with _migrated(settings) as database:
+        tokens = list_tokens(database)
+    rows = [(name, _time(created), _time(revoked), count, size) for name, created, revoked, count, size in tokens]
+    _print_csv(["name", "created", "revoked", "submissions", "bytes"], rows)
+
+
+def _submissions(settings: Settings, _: argparse.Namespace) -> None:
+    query = (
+        select(SubmissionModel, TokenModel.name)
+        .join(TokenModel, TokenModel.id == SubmissionModel.token_id)
+        .where(SubmissionModel.status != DELETED)
+        .order_by(SubmissionModel.created_at)
+    )
+    with _migrated(settings) as database, database.read() as session:
+        rows = [
+            (
+                *(one.id, name, one.method, one.status, one.public, _time(one.created_at)),
+                *(one.archive_bytes, _time(one.archive_deleted_at)),
+            )
+            for one, name in session.execute(query)
+        ]
+    head = ["id", "submitter", "method", "status", "public", "created", "bytes", "archive_deleted"]
+    _print_csv(head, rows)
+
+
+def _remove(settings: Settings, options: argparse.Namespace) -> None:
+    with _migrated(settings) as database:
+        if not options.id.isascii() or submissions.find(database, options.id) is None:
+            raise InputError(f"there is no submission {options.id!r}")
+        submissions.remove(database, options.id)
+    retention.delete_archives(ArchiveStore(settings.archive_dir), [options.id])
+
+
+def _prune(settings: Settings, options: argparse.Namespace) -> None:
+    archives = ArchiveStore(settings.archive_dir)
+    with _migrated(settings) as database:
+        if options.orphans:
+            pruned = retention.orphaned_archives(database, archives)
+            if not options.dry_run:
+                retention.delete_archives(archives, pruned)
+        elif settings.archive_days:
+            pruned = retention.expired_archives(database, open_folder(settings.data), settings)
+            if not options.dry_run:
+                retention.prune_archives(database, archives, pruned)
+        else:
+            raise InputError("archive_days is 0, which keeps every archive; expected --archive-days DAYS")
+    for submission_id in pruned:
+        print(submission_id)
+
+
+def _back_up(settings: Settings, options: argparse.Namespace) -> None:
+    if sqlite_path(settings.database_url) is None:
+        note = "only archives are copied; save the rows with pg_dump before, so that each has its archive"
+        print(f"the database is PostgreSQL: {note}", file=sys.stderr)
+    back_up(settings, options.target, options.prune)
+    print(options.target)
+
+
+def _check(settings: Settings, options: argparse.Namespace) -> None:
+    """Print that all is well; nothing is written or created.
+
+    Raises ``StorageError`` with everything that is wrong, and ``InputError`` if only the dataset is.
+    """
+    archives = ArchiveStore(settings.archive_dir, create=False)
+    with closing(Database(settings.database_url, read_only=True)) as database:
+        database.check_schema()
+        problems = [*database.problems(), *_archive_problems(database, archives, options.hash_archives)]
+        problems += queue_problems(database)
+        of_dataset = _dataset_problems(database, settings, archives)
+    for name, folder in (("the state folder", settings.state_dir), ("the archives", settings.archive_dir)):
+        problems += disk_problem(folder, name) if folder.is_dir() else []
+    if problems or of_dataset:
+        raise (StorageError if problems else InputError)(problem_summary([*problems, *of_dataset]))
+    print(f"dataset, database, {counted(len(archives.ids()), 'archive')}, disk and queue are in order")
+
+
+def _archive_problems(database: Database, archives: ArchiveStore, hashed: bool) -> Iterator[str]:
+    rows = archive_rows(database)
+    found = {name: archive_problem(archives.file(name), row, hashed) for name, row in rows.items() if row}
+    rows = archive_rows(database)  # Again, because archives may have been deleted meanwhile.
+    for name, problem in found.items():
+        if problem and rows[name]:
+            yield f"the archive of submission {name} {problem}"
+    for name in retention.unneeded_archives(rows, archives):
+        yield f"the archive {name}.zip exists, but its row says deleted; serve deletes it within an hour"
+    for name in retention.orphaned_archives(database, archives):
+        yield f"the archive {name}.zip has no submission; prune --orphans deletes it"
+
+
+def _dataset_problems(database: Database, settings: Settings, archives: ArchiveStore) -> list[str]:
+    try:
+        folder = open_folder(settings.data)
+    except InputError as error:
+        return [str(error)]
+    with database.read() as session:
+        stale = jobs.stale_submissions(session, folder.digest, archives.ids())
+    others = sum(record.dataset_digest != folder.digest for record in stale)
+    text = f"{counted(others, 'submission')} of another dataset than {folder.digest}"
+    return [*map(str, file_problems(folder)), *([text] if others else [])]
+
+
+def _print_csv(head: Sequence[str], rows: Sequence[Sequence[Cell]]) -> None:
+    print(csv_text([head, *rows]), end="")
+
+
+def _time(seconds: float | None) -> str:
+    return "" if seconds is None else datetime.fromtimestamp(seconds, UTC).strftime("%Y-%m-%dT%H:%M:%SZ")
+
+
+@dataclass(frozen=True)
+class _Operation:
+    """Command: its help, the settings that it accepts as options, and what runs it."""
+
+    summary: str
+    settings: tuple[str, ...]
+    run: Callable[[Settings, argparse.Namespace], None]
+
+
+_STORED = ("state_dir", "db")
+_WITH_ARCHIVES = (*_STORED, "archives")
+_SCORING = ("score_time", "score_memory", "lease_seconds", "error_maps", "hidden_truth")
+COMMANDS = {
+    "serve": _Operation("run the web server and its local scoring workers", tuple(Settings.model_fields), _serve),
+    "score": _Operation(
+        "run a scoring worker for a server that uses the same database and archive storage",
+        ("data", *_WITH_ARCHIVES, *_SCORING),
+        _score,
+    ),
+    "token": _Operation("create a token for a submitter and print it", _STORED, _token),
+    "tokens": _Operation("list the tokens with their submissions and bytes as CSV", _STORED, _tokens),
+    "submissions": _Operation("list the submissions of all tokens as CSV", _STORED, _submissions),
+    "prune": _Operation(
+        "delete archives of ended submissions by age and rank, as the settings say, or those without a submission",
+        ("data", *_WITH_ARCHIVES, "archive_days", "archive_ranks"),
+        _prune,
+    ),
+    "check": _Operation(
+        "check dataset, database, archives, disk and queue, and print what is wrong; nothing is changed",
+        ("data", *_WITH_ARCHIVES),
+        _check,
+    ),
+    "remove": _Operation(
+        "delete a submission of any owner, with its archive and results", _WITH_ARCHIVES, _remove
+    ),
+    "backup": _Operation(
+        "copy the database and the archives to a folder while the service is running", _WITH_ARCHIVES, _back_up
+    ),
+}
+"""Commands by name. All settings can also be set in a TOML file or the environment."""

@@ -238,12 +238,12 @@ def test_help_shows_every_setting_with_its_default(command: str, capsys: pytest.
         argument_parser().parse_args([command, "--help"])
     assert end.value.code == 0
     shown = " ".join(capsys.readouterr().out.split())
-    for name in COMMANDS[command][1]:
+    for name in COMMANDS[command].settings:
         default = Settings.model_fields[name].default
         assert f"--{name.replace('_', '-')} " in shown
         if default not in ("", None) and not Settings.model_fields[name].is_required():
             assert f"(default: {default})" in shown, name
-    assert command != "serve" or set(COMMANDS["serve"][1]) == set(Settings.model_fields)
+    assert command != "serve" or set(COMMANDS["serve"].settings) == set(Settings.model_fields)
 
 
 @pytest.mark.parametrize("rate", ["600/minute", "10/second", "1 per 2 hours", "5/day"])
