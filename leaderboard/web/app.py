@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from typing import Any
 from urllib.parse import urlsplit
 
 import structlog
@@ -12,6 +13,7 @@ from starlette.exceptions import HTTPException
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.requests import ClientDisconnect
+from starlette.staticfiles import StaticFiles
 
 from leaderboard.db.engine import DATABASE_UNAVAILABLE
 from leaderboard.refusals import RefusedError
@@ -20,7 +22,7 @@ from leaderboard.web.api import leaderboard, status, submissions
 from leaderboard.web.api.schemas import DATABASE_UNAVAILABLE_MESSAGE
 from leaderboard.web.cache import CacheMiddleware
 from leaderboard.web.middleware import EarlyResponseMiddleware, RequestMiddleware
-from leaderboard.web.pages import account, ranking, static, submission_page, upload_form
+from leaderboard.web.pages import account, ranking, submission_page, upload_form
 from leaderboard.web.pages.rendering import error_response, make_templates
 from rebar_depth_bench import software_version
 from rebar_depth_bench.base.errors import Problem
@@ -39,6 +41,17 @@ three decimals, and ranks use these rounded numbers."""
 _LOCAL_HOSTS = ("localhost", "127.0.0.1", "[::1]")
 """Hosts that are always allowed: health checks of the machine itself name them."""
 _MIN_GZIP_BYTES = 1024
+STATIC_FOLDERS = [("leaderboard.web.pages", "static"), ("rebar_depth_bench.reporting.html", "static")]
+"""Packages and their folders with style sheets, scripts and the icon: of the pages, and of the report."""
+
+
+class _StaticFiles(StaticFiles):
+    """Files that browsers keep, and ask for again each time; status 304 if they have not changed."""
+
+    def file_response(self, *arguments: Any, **options: Any) -> Response:
+        response = super().file_response(*arguments, **options)
+        response.headers["Cache-Control"] = "public, no-cache"  # Not REVALIDATE: the cache has its own ETag.
+        return response
 
 
 def make_app(service: Service) -> FastAPI:
@@ -54,8 +67,9 @@ def make_app(service: Service) -> FastAPI:
     )
     app.state.service = service
     app.state.templates = make_templates()
-    for router in (submissions, leaderboard, status, ranking, submission_page, upload_form, account, static):
+    for router in (submissions, leaderboard, status, ranking, submission_page, upload_form, account):
         app.include_router(router.router)
+    app.mount("/static", _StaticFiles(packages=STATIC_FOLDERS))
     identity = f"{software_version()} {service.folder.digest} {settings.model_dump_json()}"
     # Inside the cache, so that a kept response is compressed once.
     app.add_middleware(GZipMiddleware, minimum_size=_MIN_GZIP_BYTES, compresslevel=5)

@@ -1,19 +1,21 @@
-"""Page of the leaderboard: tables and plots of configs, and the overview of ranks across them.
+"""Page of the leaderboard: tables, plots and pictures of configs, and the overview of ranks across them.
 
 A table has submitted rows, and the paper's rows, which are unranked.
 """
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Request
+from fastapi import APIRouter, HTTPException, Query, Request, Response
 from fastapi.responses import HTMLResponse
 from markupsafe import Markup
+from PIL import Image
 
 from leaderboard.db.rankings import CurrentRankings, LeaderboardEntry, OverallEntry, Ranking, overall_ranking
 from leaderboard.web.dependencies import ServiceDep, check_config
@@ -28,6 +30,8 @@ from leaderboard.web.pages.selection import (
     parse_selection,
 )
 from rebar_depth_bench.base.errors import printable
+from rebar_depth_bench.data.manifest import DatasetFolder
+from rebar_depth_bench.data.rows import iterate_rows
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.charts import ScatterPoint, scatter_chart
 from rebar_depth_bench.reporting.published import (
@@ -50,6 +54,8 @@ _FIRST_ROWS, _FIRST_PLOTTED = 10, 300
 """Rows and plotted points per config on the page of several configs, which links to the full rankings."""
 _CACHED_ROWS = 4096
 _DECIMALS = 4
+_SCENE_WIDTH, _SCENE_AGE_S = 480, 3600
+"""Width of the pictures of configs in pixels, and the time for which browsers keep them in seconds."""
 DISCLOSED_COLUMNS = (replace(RANK_ERROR, decimals=DISCLOSED_DECIMALS), COVERAGE)
 """Columns of the numbers that are shown if the ground truth is hidden."""
 
@@ -227,3 +233,32 @@ def make_overview(
     shown, selection, pages = selection.page_of(lines)
     decimals = DISCLOSED_DECIMALS if hidden_truth else _DECIMALS
     return Overview(selection, len(lines), pages, shown, decimals)
+
+
+@router.get("/scenes/{config}.webp")
+def scene(config: str, service: ServiceDep) -> Response:
+    """Return a picture of a config. Raises status 404 if the config is unknown or has no colour."""
+    if config in service.folder.configs and config not in service.scenes:
+        service.scenes[config] = _scene_webp(service.folder, config)
+    webp = service.scenes.get(config)
+    if webp is None:
+        raise HTTPException(404, "there is no such config, or it has no colour")
+    headers = {"Cache-Control": f"public, max-age={_SCENE_AGE_S}"}
+    return Response(webp, media_type="image/webp", headers=headers)
+
+
+def _scene_webp(folder: DatasetFolder, config: str) -> bytes | None:
+    """Return the left image of the first view, reduced, as WebP, or None if the config has no colour.
+
+    Raises ``DatasetError`` if the shard cannot be read.
+    """
+    shown = folder.config(config)
+    row = next(iterate_rows(shown, ("view_id", "left_rgb")), None)
+    rgb = None if row is None else row["left_rgb"]
+    if rgb is None:
+        return None
+    image = Image.fromarray(rgb)
+    image.thumbnail((_SCENE_WIDTH, _SCENE_WIDTH))
+    out = io.BytesIO()
+    image.save(out, "WEBP", quality=80)
+    return out.getvalue()

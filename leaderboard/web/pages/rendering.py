@@ -16,7 +16,6 @@ from markupsafe import Markup
 from leaderboard.names import confused_scripts
 from leaderboard.service import Service
 from leaderboard.web.cache import NO_STORE, REVALIDATE
-from leaderboard.web.pages.static import static_path
 from rebar_depth_bench import software_version
 from rebar_depth_bench.base.errors import MAX_PROBLEMS_SHOWN, Problem, printable
 from rebar_depth_bench.reporting import formatting
@@ -75,7 +74,6 @@ def _common_context(request: Request, service: Service) -> dict[str, Any]:
     settings = service.settings
     return {
         "root": root,
-        "static": lambda name: root + static_path(name),
         "site": printable(settings.title),
         "settings": settings,
         "stamps": [

@@ -74,7 +74,7 @@ def render_report(
     """
     views = views_by_config(result)
     shown = sorted_views(shown, list(result.tables))
-    script = inline_script("sortable.js", "browser.js")
+    script = inline_script("static/sortable.js", "browser.js")
     return (
         environment()
         .get_template("report.html.j2")

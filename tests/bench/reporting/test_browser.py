@@ -45,7 +45,7 @@ def _run_in_browser(browser: str, page: str, operations: str, folder: Path) -> A
 
 
 def test_sortable_table_sorts_numerically_with_dashes_last(chromium_program: str, tmp_path: Path) -> None:
-    script = files("rebar_depth_bench.reporting.html").joinpath("sortable.js").read_text(encoding="utf-8")
+    script = files("rebar_depth_bench.reporting.html").joinpath("static/sortable.js").read_text(encoding="utf-8")
     page = f"<title>t</title>{_TABLE}<script>{script}</script>"
     orders = _run_in_browser(
         chromium_program,
@@ -121,7 +121,7 @@ def test_content_security_policy_blocks_foreign_scripts(chromium_program: str, t
 
 
 def test_inline_script_joins_files_and_updates_policy() -> None:
-    both, first = inline_script("sortable.js", "browser.js"), inline_script("sortable.js")
+    both, first = inline_script("static/sortable.js", "browser.js"), inline_script("static/sortable.js")
     assert both.text.startswith(first.text)
     assert both.policy != first.policy
     assert "</script" not in both.text.lower()
