@@ -1,245 +1,347 @@
-"""Benchmark of the leaderboard under load by 50 readers, with and without concurrent uploads and scoring.
+"""Benchmark of the leaderboard: its speed beside a bare FastAPI app, and reads during uploads and scoring.
 
-python -m benchmarks.leaderboard [--data ROOT --archive ZIP] [--db URL] [--rows N] [--json FILE]
+python -m benchmarks.leaderboard ROOT ARCHIVE [--rows N] [--seconds S] [--repeats N] [--uploaders N] [--db URL]
 
-The real server runs in a separate process, the client in this one. Without ``--data`` a small synthetic dataset
-and archive are used. ``--db`` names an empty database, which is filled and not cleared afterwards; without it the
-server uses SQLite. By default every reader sends its next request immediately after a response, so that reads
-alone saturate the server: the rates are its maximum throughput, the latencies those of 50 concurrent readers.
+The real server runs in a process of its own, with scored submissions that differ from the result of ARCHIVE by a
+factor of their errors. The bare app returns the same bytes from memory, without middleware; both are measured by
+turns. Then 50 readers send their next request immediately after a response, alone and beside uploaders, so that
+the rates are the maximum throughput. ``--db`` names an empty database, which is filled; default: SQLite.
 """
 
 from __future__ import annotations
 
 import argparse
-import itertools
+import asyncio
 import json
+import os
+import random
+import re
 import statistics
+import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import closing
-from dataclasses import asdict, astuple, dataclass, replace
+import time
+import urllib.request
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
+
+from sqlalchemy import func, select
 
 import rebar_depth_bench as rdb
-from benchmarks import filled_board
-from benchmarks.filled_board import ServerProcess, add_scored_submissions, new_tokens, running_server
-from benchmarks.http_load import LoadPlan, LoadResult, run_load
 from benchmarks.timing import machine_description, print_markdown
+from leaderboard.db import jobs, submissions
 from leaderboard.db.engine import Database
-from leaderboard.db.submissions import SCORED
+from leaderboard.db.models import SubmissionModel, TokenModel
+from leaderboard.db.submissions import QUEUED, SCORED, SCORING, Quota, Upload
+from leaderboard.db.tokens import create_token, find_token
+from leaderboard.scoring.sandbox import Outcome
 from leaderboard.settings import read_settings
-from rebar_depth_bench.data.manifest import open_folder
-from tests.leaderboard.serving import distinct_archive
-from tests.synthetic_dataset import write_archive, write_dataset
+from rebar_depth_bench.submission import SubmissionMeta
 
-CONFIGS, VIEWS = ("lattice", "pile"), 24
-SEED = 7
-COPIES = 50
-ALL = "all"
-ALONE, BUSY = "reads alone", "with uploads and scoring"
-WARM_UP_S = 3.0
+CLIENTS = (1, 50)
+START_S, UPLOAD_PAUSE_S = 120.0, 5.0
+WITHOUT_LIMIT = 1_000_000_000
+_STREAM_LIMIT_BYTES = 1 << 22
+_BARE_APP = """
+import sys
+from pathlib import Path
+import uvicorn
+from fastapi import FastAPI
+from fastapi.responses import Response
+
+app = FastAPI()
+
+def add_route(number: int, content: bytes) -> None:
+    @app.get(f"/{number}")
+    async def get() -> Response:
+        return Response(content, media_type="text/html")
+
+for number, path in enumerate(sorted(Path(sys.argv[1]).iterdir())):
+    add_route(number, path.read_bytes())
+config = uvicorn.Config(app, port=0, http="h11", access_log=False, log_level="warning")
+listener = config.bind_socket()
+print(f"http://127.0.0.1:{listener.getsockname()[1]}", file=sys.stderr, flush=True)
+uvicorn.Server(config).run(sockets=[listener])
+"""
 
 
 @dataclass(frozen=True)
-class Latency:
-    """Reads of a route: rate per second, and percentiles and maximum of the latency in milliseconds."""
+class Served:
+    """Running server: its port on this machine and its process id."""
 
-    per_s: float
-    p50_ms: float
-    p99_ms: float
-    max_ms: float
+    port: int
+    pid: int
 
+    def cpu_s(self) -> float:
+        """Return the user and system CPU seconds of the server process (Linux only)."""
+        fields = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
+        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
-@dataclass(frozen=True)
-class LoadWindow:
-    """Measurements of one load window.
-
-    ``reads`` are by route. ``unchanged`` is the share of responses with status 304. ``client_cores`` and
-    ``server_cores`` are the CPU use of the client and the server process in cores.
-    """
-
-    reads: Mapping[str, Latency]
-    accepted_per_min: float
-    scored_per_min: float
-    upload_p50_ms: float
-    unchanged: float
-    client_cores: float
-    server_cores: float
-    errors: tuple[str, ...]
+    def body(self, path: str) -> bytes:
+        """Return the body of a page."""
+        with urllib.request.urlopen(f"http://127.0.0.1:{self.port}{path}") as response:
+            content: bytes = response.read()
+        return content
 
 
-def main(arguments: Sequence[str] | None = None) -> int:
-    options = _parser().parse_args(arguments)
+@dataclass
+class Load:
+    """Measurements of a load: response times, wall-clock and server CPU seconds, and submissions scored."""
+
+    read_s: list[float] = field(default_factory=list)
+    upload_s: list[float] = field(default_factory=list)
+    wall_s: float = 0.0
+    server_cpu_s: float = 0.0
+    scored: int = 0
+
+    @property
+    def reads_per_s(self) -> float:
+        """Return the reads per second."""
+        return len(self.read_s) / self.wall_s
+
+    @property
+    def cpu_ms(self) -> float:
+        """Return the processor time of the server for a read in milliseconds."""
+        return 1000 * self.server_cpu_s / len(self.read_s)
+
+    def read_ms(self, share: float) -> float:
+        """Return a quantile of the response times in milliseconds, by nearest rank."""
+        ordered = sorted(self.read_s)
+        return 1000 * ordered[min(len(ordered) - 1, int(share * len(ordered)))]
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser("python -m benchmarks.leaderboard")
+    parser.add_argument("data", type=Path, metavar="ROOT", help="a dataset folder")
+    parser.add_argument("archive", type=Path, metavar="ARCHIVE", help="an archive of it")
+    parser.add_argument("--rows", type=int, default=200, help="scored rows on the leaderboard")
+    parser.add_argument("--seconds", type=float, default=5.0, help="length of a measurement")
+    parser.add_argument("--repeats", type=int, default=3, help="measurements of each kind, by turns")
+    parser.add_argument("--uploaders", type=int, default=4)
+    parser.add_argument("--db", default="", metavar="URL", help="an empty database; default: SQLite")
+    options = parser.parse_args(arguments)
+    print(f"{options.rows} rows; {machine_description()}; medians of {options.repeats}")
     with tempfile.TemporaryDirectory() as scratch:
-        data, archive = _dataset_and_archive(options, Path(scratch))
-        state = Path(scratch) / "state"
+        state, bodies = Path(scratch) / "state", Path(scratch) / "bodies"
         state.mkdir(mode=0o700)
-        settings = read_settings(None, {"data": str(data), "state_dir": state, "db": options.db})
+        bodies.mkdir()
+        result = json.loads(rdb.score(options.archive, options.data).to_json())
+        settings = read_settings(None, {"data": str(options.data), "state_dir": state, "db": options.db})
         with closing(Database(settings.database_url)) as database:
             database.migrate()
-            if filled_board.count_submissions(database):
-                print("the database holds submissions, expected an empty one", file=sys.stderr)
-                return 2
-            ids = add_scored_submissions(database, rdb.score(archive, data).to_json(), options.rows, SEED)
-            print(
-                f"{options.rows} rows on {'PostgreSQL' if options.db else 'SQLite'}; {machine_description()}\n",
-                flush=True,
-            )
-            with running_server(data, state, options.db, options.workers) as served:
-                config = open_folder(data).configs[0]
-                plan = replace(_plan(options, served, config, ids), archives=_distinct(archive))
-                before_mb = served.megabytes()
-                windows = _measure(plan, served, database, ids, options)
-                memory_mb = (before_mb, served.megabytes())
-    _print_report(windows, memory_mb)
-    if options.json:
-        options.json.write_text(json.dumps(_to_json_object(windows, memory_mb), indent=1) + "\n")
-    return 1 if any(window.errors for same_kind in windows.values() for window in same_kind) else 0
+            if _count(database):
+                sys.exit("the database holds submissions, expected an empty one")
+            ids = add_scored_submissions(database, result, options.rows)
+            config = next(iter(result["tables"]))
+            targets = ("/", f"/?config={config}", f"/api/v1/leaderboard?config={config}", f"/submissions/{ids[0]}")
+            with leaderboard(options.data, state, options.db) as served:
+                for number, path in enumerate(targets):
+                    (bodies / f"{number:02d}").write_bytes(served.body(path))
+                with started([sys.executable, "-c", _BARE_APP, str(bodies)], state / "bare.log") as bare:
+                    _print_overhead(served, bare, targets, options)
+                _print_reads(served, database, targets, ids, options)
 
 
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        "python -m benchmarks.leaderboard", description=(__doc__ or "").partition("\n")[0]
-    )
-    parser.add_argument("--data", type=Path, metavar="ROOT", help="a dataset folder")
-    parser.add_argument("--archive", type=Path, metavar="ZIP", help="an archive of it")
-    parser.add_argument("--db", default="", metavar="URL", help="an empty database; default: SQLite")
-    parser.add_argument("--rows", type=int, default=200, help="scored rows on the board")
-    parser.add_argument("--readers", type=int, default=50)
-    parser.add_argument("--uploaders", type=int, default=8)
-    parser.add_argument("--workers", type=int, default=1)
-    parser.add_argument("--pause", type=float, default=0.0, help="seconds a reader waits between requests")
-    parser.add_argument("--upload-pause", type=float, default=5.0, help="seconds an uploader waits")
-    parser.add_argument("--conditional", action="store_true", help="readers keep what they have, as browsers do")
-    parser.add_argument("--seconds", type=float, default=15.0, help="length of a window")
-    parser.add_argument("--repeats", type=int, default=3, help="windows of each kind, by turns")
-    parser.add_argument("--json", type=Path, metavar="FILE", help="write every window here")
-    return parser
+def _print_overhead(served: Served, bare: Served, targets: Sequence[str], options: argparse.Namespace) -> None:
+    """Print the rate of each page beside that of the bare app."""
+    rows = []
+    for number, path in enumerate(targets):
+        size = len(bare.body(f"/{number}"))
+        for clients in CLIENTS:
+            loads: dict[Served, list[Load]] = {served: [], bare: []}
+            for _ in range(options.repeats):
+                for server, page in ((served, path), (bare, f"/{number}")):
+                    loads[server].append(run_load(server, [page], clients, options.seconds))
+            rates = [statistics.median(load.reads_per_s for load in of_one) for of_one in loads.values()]
+            times_ms = [statistics.median(load.cpu_ms for load in of_one) for of_one in loads.values()]
+            cells = (*(f"{rate:.0f}" for rate in rates), f"{rates[0] / rates[1]:.0%}")
+            cells += (*(f"{ms:.2f}" for ms in times_ms), f"{times_ms[1] / times_ms[0]:.0%}")
+            rows.append((f"`{path}`", f"{size / 1000:.0f}", clients, *cells))
+    heads = ["page", "kB", "clients", "leaderboard/s", "bare/s", "share"]
+    print()
+    print_markdown([*heads, "leaderboard ms", "bare ms", "share by processor time"], rows)
 
 
-def _dataset_and_archive(options: argparse.Namespace, scratch: Path) -> tuple[Path, Path]:
-    """Return the dataset and archive paths from the options, or those of synthetic ones written to ``scratch``."""
-    if (options.data is None) != (options.archive is None):
-        _parser().error("--data and --archive go together")
-    if options.data is not None:
-        return options.data, options.archive
-    data, archive = scratch / "dataset", scratch / "archive.zip"
-    write_dataset(data, CONFIGS, VIEWS)
-    write_archive(archive, CONFIGS, VIEWS, "benchmark", SEED)
-    return data, archive
-
-
-def _distinct(archive: Path) -> Iterator[bytes]:
-    """Yield copies of the archive that differ, because a leaderboard scores the same archive once."""
-    copies = [distinct_archive(archive, number).read_bytes() for number in range(COPIES)]
-    for number in itertools.count():
-        yield copies[number] if number < COPIES else distinct_archive(archive, number).read_bytes()
-
-
-def _plan(options: argparse.Namespace, served: ServerProcess, config: str, ids: Sequence[str]) -> LoadPlan:
-    targets = (
-        ("/", "/"),
-        ("/?config=", f"/?config={config}"),
-        ("/api/v1/leaderboard", f"/api/v1/leaderboard?config={config}"),
-        *(("/submissions/ID", f"/submissions/{submission_id}") for submission_id in ids[:1]),
-    )
-    return LoadPlan(
-        host=served.host,
-        port=served.port,
-        targets=targets,
-        readers=options.readers,
-        seconds=options.seconds,
-        pause_s=options.pause,
-        conditional=options.conditional,
-        upload_pause_s=options.upload_pause,
-    )
-
-
-def _measure(
-    plan: LoadPlan, served: ServerProcess, database: Database, ids: Sequence[str], options: argparse.Namespace
-) -> dict[str, list[LoadWindow]]:
-    tokens = new_tokens(database, options.uploaders)
-    windows: dict[str, list[LoadWindow]] = {ALONE: [], BUSY: []}
-    run_load(replace(plan, seconds=WARM_UP_S), SEED)
-    for turn in range(options.repeats):
-        for name, with_tokens in ((ALONE, ()), (BUSY, tokens)):
-            scored, cpu_s = filled_board.count_submissions(database, SCORED), served.cpu_s()
-            result = run_load(replace(plan, tokens=with_tokens), SEED + 1000 * turn)
-            scored, cpu_s = filled_board.count_submissions(database, SCORED) - scored, served.cpu_s() - cpu_s
-            filled_board.clear_queue(database)
-            filled_board.remove_scored_except(database, ids)
-            windows[name].append(_window(result, scored, cpu_s))
-    return windows
-
-
-def _window(result: LoadResult, scored: int, server_cpu_s: float) -> LoadWindow:
-    by_route = {ALL: result.all_read_s, **result.read_s}
-    return LoadWindow(
-        reads={route: _latency(route_seconds, result.wall_s) for route, route_seconds in by_route.items()},
-        accepted_per_min=60 * len(result.upload_s) / result.wall_s,
-        scored_per_min=60 * scored / result.wall_s,
-        upload_p50_ms=1e3 * statistics.median(result.upload_s) if result.upload_s else 0.0,
-        unchanged=result.unchanged / max(1, len(result.all_read_s)),
-        client_cores=result.client_cores,
-        server_cores=server_cpu_s / result.wall_s,
-        errors=tuple(result.errors),
-    )
-
-
-def _latency(seconds: Sequence[float], wall_s: float) -> Latency:
-    """Return the latency statistics of a route's reads, with nearest-rank percentiles."""
-    ordered = sorted(seconds) or [0.0]
-    p50, p99 = (ordered[min(len(ordered) - 1, int(share * len(ordered)))] for share in (0.5, 0.99))
-    return Latency(len(seconds) / wall_s, 1e3 * p50, 1e3 * p99, 1e3 * ordered[-1])
-
-
-def _print_report(windows: Mapping[str, Sequence[LoadWindow]], memory_mb: tuple[float, float]) -> None:
-    repeats = len(windows[ALONE])
-    print(f"Medians of {repeats} windows:\n")
-    routes = windows[ALONE][0].reads
-    rows = [
-        (f"`{route}`", name, *_cells(same_kind, route)) for route in routes for name, same_kind in windows.items()
-    ]
-    print_markdown(["route", "", "a second", "p50 ms", "p99 ms", "max ms"], rows)
-    busy = windows[BUSY]
-    ratios = [
-        with_uploads.reads[ALL].p99_ms / alone.reads[ALL].p99_ms
-        for alone, with_uploads in zip(windows[ALONE], busy, strict=True)
-    ]
-    errors = [error for same_kind in windows.values() for w in same_kind for error in w.errors]
-    print(f"\np99 with uploads and scoring over p99 without: {statistics.median(ratios):.2f}")
-    print(
-        f"uploads accepted a minute: {_median_of(busy, lambda w: w.accepted_per_min):.0f}, "
-        f"median {_median_of(busy, lambda w: w.upload_p50_ms):.0f} ms each; "
-        f"scored a minute: {_median_of(busy, lambda w: w.scored_per_min):.0f}"
-    )
-    print(f"answers 304: {_median_of(busy, lambda w: w.unchanged):.0%}; errors: {len(errors)} {errors[:3] or ''}")
-    cpu_ms = _median_of(windows[ALONE], lambda w: 1e3 * w.server_cores / w.reads[ALL].per_s)
-    print(f"processor time of the server for a read: {cpu_ms:.2f} ms")
-    client = max(w.client_cores for same_kind in windows.values() for w in same_kind)
-    print(f"the client took {client:.0%} of a core at most")
-    print(f"memory of the server's process: {memory_mb[0]:.0f} MB before, {memory_mb[1]:.0f} MB after")
-
-
-def _cells(windows: Sequence[LoadWindow], route: str) -> list[str]:
-    figures = [astuple(window.reads[route]) for window in windows]
-    return [f"{statistics.median(column):.0f}" for column in zip(*figures, strict=True)]
-
-
-def _median_of(windows: Sequence[LoadWindow], figure: Callable[[LoadWindow], float]) -> float:
-    return statistics.median(map(figure, windows))
-
-
-def _to_json_object(
-    windows: Mapping[str, Sequence[LoadWindow]], memory_mb: tuple[float, float]
-) -> dict[str, object]:
-    return {
-        "machine": machine_description(),
-        "windows": {name: [asdict(window) for window in same_kind] for name, same_kind in windows.items()},
-        "server_mb": {"before": memory_mb[0], "after": memory_mb[1]},
+def _print_reads(
+    served: Served, database: Database, targets: Sequence[str], ids: Sequence[str], options: argparse.Namespace
+) -> None:
+    """Print the reads of 50 readers, alone and beside uploads and scoring."""
+    tokens = [_new_token(database)[0] for _ in range(options.uploaders)]
+    archives = _distinct(options.archive.read_bytes())
+    loads: dict[str, list[Load]] = {"alone": [], "with uploads and scoring": []}
+    for _ in range(options.repeats):
+        for name, uploading in zip(loads, ([], tokens), strict=True):
+            before = _count(database, SCORED)
+            load = run_load(served, targets, CLIENTS[-1], options.seconds, uploading, archives)
+            load.scored = _count(database, SCORED) - before
+            _remove_others(database, ids)
+            loads[name].append(load)
+    columns = {
+        "reads a second": lambda load: load.reads_per_s,
+        "p50 ms": lambda load: load.read_ms(0.5),
+        "p99 ms": lambda load: load.read_ms(0.99),
+        "max ms": lambda load: load.read_ms(1.0),
+        "uploads a minute": lambda load: 60 * len(load.upload_s) / load.wall_s,
+        "scored a minute": lambda load: 60 * load.scored / load.wall_s,
     }
+    print()
+    print_markdown(
+        ["reads", *columns],
+        [
+            (name, *(f"{statistics.median(map(of_load, windows)):.0f}" for of_load in columns.values()))
+            for name, windows in loads.items()
+        ],
+    )
+
+
+def add_scored_submissions(database: Database, result: dict[str, Any], rows: int) -> list[str]:
+    """Add ``rows`` scored submissions with varied errors, in the way a scoring worker does; return their ids."""
+    rng = random.Random(0)
+    token = _new_token(database)[1]
+    ids = []
+    for number in range(rows):
+        submission_id, method = submissions.new_id(), f"method {number:04d}"
+        meta = SubmissionMeta(method=method, url="https://example.org/method" if number % 2 else None)
+        upload = Upload(meta, f"{number:064x}", 1, result["dataset"]["digest"])
+        submissions.accept(database, submission_id, token, upload, Quota(WITHOUT_LIMIT, WITHOUT_LIMIT), True)
+        jobs.claim(database, "benchmark", 60.0)
+        varied = _with_errors(result, rng.uniform(0.2, 5.0))
+        varied["submission"]["method"] = method
+        jobs.finish(database, submission_id, "benchmark", Outcome(json.dumps(varied).encode()))
+        ids.append(submission_id)
+    return ids
+
+
+def _with_errors(part: Any, factor: float, name: str = "") -> Any:
+    """Return part of a result with the ratio of its rank errors to 1 - rank error multiplied by ``factor``."""
+    if isinstance(part, dict):
+        return {key: _with_errors(value, factor, key) for key, value in part.items()}
+    if isinstance(part, list):
+        return [_with_errors(value, factor, name) for value in part]
+    return part * factor / (1 - part + part * factor) if name == "rank_error" and part is not None else part
+
+
+def _new_token(database: Database) -> tuple[str, TokenModel]:
+    token = create_token(database, f"benchmark {random.getrandbits(64)}")
+    record = find_token(database, token)
+    assert record is not None
+    return token, record
+
+
+def _count(database: Database, *statuses: str) -> int:
+    """Return the number of submissions with one of the statuses, or of all submissions if none is given."""
+    query = select(func.count()).select_from(SubmissionModel)
+    with database.read() as session:
+        return session.scalar(query.where(SubmissionModel.status.in_(statuses)) if statuses else query) or 0
+
+
+def _remove_others(database: Database, ids: Sequence[str]) -> None:
+    """Remove uploaded submissions, so that each measurement has the same rows; running ones end before."""
+    for status in (QUEUED, SCORED):
+        while _count(database, SCORING):
+            time.sleep(0.2)
+        with database.read() as session:
+            found = session.scalars(select(SubmissionModel.id).where(SubmissionModel.status == status)).all()
+        for submission_id in set(found) - set(ids):
+            submissions.remove(database, submission_id)
+
+
+@contextmanager
+def leaderboard(data: Path, state: Path, db: str) -> Iterator[Served]:
+    """Run ``rebar-leaderboard serve`` with one worker, and rate limits and quota too high to take effect."""
+    command = [sys.executable, "-m", "leaderboard", "serve", "--data", str(data), "--state-dir", str(state)]
+    command += ["--port", "0", "--quota", str(WITHOUT_LIMIT), "--quota-bytes", "1TiB"]
+    command += ["--max-connections-per-address", "0", *(["--db", db] if db else [])]
+    command += ["--read-rate-limit", f"{WITHOUT_LIMIT}/minute", "--write-rate-limit", f"{WITHOUT_LIMIT}/minute"]
+    with started(command, state / "log") as served:
+        yield served
+
+
+@contextmanager
+def started(command: Sequence[str], log: Path) -> Iterator[Served]:
+    """Run a server, which prints its address to standard error, until the block ends."""
+    with log.open("w") as stream:
+        process = subprocess.Popen(command, stderr=stream)
+    try:
+        deadline = time.monotonic() + START_S
+        while (address := re.search(r"^http://\S+:(\d+)$", log.read_text(), re.MULTILINE)) is None:
+            if process.poll() is not None or time.monotonic() > deadline:
+                raise RuntimeError(f"the server did not start:\n{log.read_text()}")
+            time.sleep(0.05)
+        yield Served(int(address[1]), process.pid)
+    finally:
+        process.terminate()
+        process.wait()
+
+
+def run_load(
+    server: Served,
+    paths: Sequence[str],
+    readers: int,
+    seconds: float,
+    tokens: Sequence[str] = (),
+    archives: Iterator[bytes] | None = None,
+) -> Load:
+    """Send requests for random ``paths`` by ``readers``, and uploads of ``archives`` by an uploader per token.
+
+    The requests are written to plain streams, so that the server, not the client, limits the rate.
+    """
+    load = Load()
+    start, cpu_s = time.perf_counter(), server.cpu_s()
+    end = start + seconds
+
+    async def read(number: int) -> None:
+        choose = random.Random(number)
+        reader, writer = await asyncio.open_connection("127.0.0.1", server.port, limit=_STREAM_LIMIT_BYTES)
+        while (sent := time.perf_counter()) < end:
+            writer.write(f"GET {choose.choice(paths)} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode())
+            assert await _status(reader) == 200
+            load.read_s.append(time.perf_counter() - sent)
+        writer.close()
+
+    async def upload(token: str) -> None:
+        while (sent := time.perf_counter()) < end:
+            assert archives is not None
+            content = next(archives)
+            reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
+            head = f"PUT /api/v1/submissions HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {token}\r\n"
+            writer.write(f"{head}Content-Length: {len(content)}\r\n\r\n".encode() + content)
+            await writer.drain()
+            assert await _status(reader) == 202
+            load.upload_s.append(time.perf_counter() - sent)
+            writer.close()
+            await asyncio.sleep(UPLOAD_PAUSE_S)
+
+    async def send() -> None:
+        await asyncio.gather(*map(read, range(readers)), *map(upload, tokens))
+
+    asyncio.run(send())
+    load.wall_s, load.server_cpu_s = time.perf_counter() - start, server.cpu_s() - cpu_s
+    return load
+
+
+async def _status(reader: asyncio.StreamReader) -> int:
+    """Return the status of a response, after its body was read."""
+    head = (await reader.readuntil(b"\r\n\r\n")).decode("latin-1")
+    length = re.search(r"\r\ncontent-length: (\d+)\r\n", head, re.IGNORECASE)
+    assert length is not None, head
+    await reader.readexactly(int(length[1]))
+    return int(head.split()[1])
+
+
+def _distinct(archive: bytes) -> Iterator[bytes]:
+    """Yield copies of an archive that differ in the comment of the zip file, so that each is scored."""
+    assert archive[-2:] == b"\0\0", "the archive has a comment"
+    number = 0
+    while True:
+        comment = f"copy {number}".encode()
+        yield archive[:-2] + len(comment).to_bytes(2, "little") + comment
+        number += 1
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

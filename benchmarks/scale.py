@@ -19,7 +19,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -31,7 +30,6 @@ from benchmarks.timing import machine_description, print_markdown
 from dataset_builder.audit import audit
 from dataset_builder.catalog.cages_config import CAGES, CagesRequest
 from dataset_builder.catalog.named_configs import BuildRequest
-from dataset_builder.pipeline.blender_process import OnViewDone
 from dataset_builder.pipeline.build import plan_build
 from dataset_builder.pipeline.disk_space import check_readable, spaces_by_config
 from dataset_builder.pipeline.folder import remove_build_folder, remove_stagings
@@ -39,12 +37,10 @@ from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, ScenePlan
 from dataset_builder.pipeline.publish import publish_plans
 from dataset_builder.pipeline.retained import Finished, kept_scenes
 from dataset_builder.pipeline.shards import Staging, View, encode_view, stage_row
-from dataset_builder.pipeline.work_units import UnitResult, WorkUnit
 from dataset_builder.scene.mesh_ply import write_mesh_ply
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.specs.config_specs import ConfigSpec, RandomViewsSpec
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import EyeView
 from rebar_depth_bench.geometry.cameras import Camera, ideal_K
@@ -55,23 +51,6 @@ BARS = tuple(Bar(i + 1, "bar", 0.02, ((0.1 * i, 0.0, 0.0), (0.1 * i, 0.0, 1.0)))
 _STATION = ((0.15, -2.0, 0.5), (0.15, 0.0, 0.5), 0.0)
 _HEADS = ["scenes", "step", "s", "ms per scene", "files opened", "per scene"]
 _Result = TypeVar("_Result")
-
-
-class PreparedRows:
-    """Renderer whose views have bars at a depth that follows from their indices, without rendering anything."""
-
-    def __init__(self) -> None:
-        self.rendered: list[str] = []
-
-    def submit(self, unit: WorkUnit, staging: Staging, on_view_done: OnViewDone) -> Future[UnitResult]:
-        """Stage the views and the mesh of a unit at once."""
-        result: Future[UnitResult] = Future()
-        stage_prepared(unit.config, unit.indices, staging)
-        for index in unit.indices:
-            on_view_done(index)
-        self.rendered += map(unit.config.view_id, unit.indices)
-        result.set_result(UnitResult("prepared rows", {}, file_sha256(staging.mesh)))
-        return result
 
 
 def stage_prepared(config: ConfigSpec, indices: Sequence[int], staging: Staging) -> None:

@@ -75,7 +75,7 @@ def _camera_view(row: Mapping[str, Any], config: DatasetConfig) -> CameraView:
 
 
 _PNG_LEVEL = 1
-"""Compression level: three times faster than the default 6, files a fifth larger (``benchmarks/codecs.py``)."""
+"""Compression level: three times faster than the default 6, files a fifth larger."""
 
 _EXR_CHANNEL = "Y"
 """Channel name: OpenCV reads a single channel Y or R correctly, but one named Z silently as zeros."""
