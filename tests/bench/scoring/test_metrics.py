@@ -1,23 +1,71 @@
-"""Tests of the protocol's metrics: hand-computed cases and properties of every prediction."""
+"""Scored pixels, depth metrics and rank error: hand-computed cases, definitions and properties."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from numpy import ndarray
 
+from rebar_depth_bench import score
+from rebar_depth_bench.scoring.columns import rounded
 from rebar_depth_bench.scoring.metrics import (
     depth_metrics,
     is_valid_prediction,
     median,
     median_scale,
     metrics_at_scales,
+    rank_error,
 )
+from rebar_depth_bench.scoring.protocol import interior, scored_pixels
+from rebar_depth_bench.scoring.score import ViewTruth, score_view, tabulate
+from rebar_depth_bench.scoring.table import ViewScore
+
+MASKS = hnp.arrays(bool, st.tuples(st.integers(1, 12), st.integers(1, 12)))
+
+
+def eroded_by_definition(mask: np.ndarray) -> np.ndarray:
+    height, width = mask.shape
+    eroded = np.zeros_like(mask)
+    for v in range(height):
+        for u in range(width):
+            neighbourhood = [
+                0 <= v + dv < height and 0 <= u + du < width and mask[v + dv, u + du]
+                for dv in (-1, 0, 1)
+                for du in (-1, 0, 1)
+            ]
+            eroded[v, u] = all(neighbourhood)
+    return eroded
+
+
+@given(MASKS)
+def test_interior_is_erosion_by_3_x_3(mask: np.ndarray) -> None:
+    assert np.array_equal(interior(mask), eroded_by_definition(mask))
+
+
+def test_image_border_is_never_scored() -> None:
+    eroded = interior(np.ones((5, 7), bool))
+    assert eroded.sum() == 3 * 5
+    assert not eroded[0].any()
+    assert not eroded[:, -1].any()
+
+
+@pytest.mark.slow
+@given(MASKS)
+def test_scored_pixels_require_depth(mask: np.ndarray) -> None:
+    depth_m = np.where(np.arange(mask.size).reshape(mask.shape) % 3, 1.0, 0.0).astype(np.float32)
+    expected = np.flatnonzero(eroded_by_definition(mask) & (depth_m > 0))
+    pixels = scored_pixels(mask, depth_m)
+    assert pixels.dtype == np.uint32
+    assert np.array_equal(pixels, expected)
+
 
 DEPTHS = hnp.arrays(np.float64, st.integers(1, 40), elements=st.floats(0.05, 50.0))
 
@@ -147,3 +195,87 @@ def test_valid_prediction_is_finite_and_positive() -> None:
 def test_overflow_gives_infinity_without_warning(huge: float) -> None:
     z = np.array([1.0, 2.0, 3.0])
     assert math.isinf(depth_metrics(np.full(3, huge), z).rmse_cm)
+
+
+INVALID = (np.nan, 0.0, -0.0, -1.0, np.inf, -np.inf)
+
+
+def scored(p_m: ndarray, z_m: ndarray) -> ViewScore:
+    truth = ViewTruth("lattice/0000", np.arange(len(z_m), dtype=np.uint32), z_m, float(np.median(z_m)))
+    return score_view(truth, p_m.reshape(1, -1))
+
+
+def ranked_value(*views: ViewScore) -> float:
+    """Return the number that ranks: the mean over views, rounded as in the JSON."""
+    value = rounded(tabulate(views).rank_error)
+    assert value is not None
+    return value
+
+
+def noisy_view(seed: int, pixels: int = 300) -> tuple[ndarray, ndarray]:
+    rng = np.random.default_rng(seed)
+    z_m = rng.uniform(0.2, 17.0, pixels).astype(np.float32)
+    p_m = (z_m * rng.lognormal(0, rng.choice([0.001, 0.1, 2.0]), pixels)).astype(np.float32)
+    p_m[rng.uniform(size=pixels) < 0.2] = rng.choice(INVALID)
+    return p_m, z_m
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_rank_error_equals_the_sum_in_pixel_order(dtype: type) -> None:
+    p_m, z_m = noisy_view(1, 20_000)
+    p_m = p_m.astype(dtype)
+    total = 0.0
+    for p, z in zip(p_m.astype(float).tolist(), z_m.astype(float).tolist(), strict=True):
+        total += abs(p - z) / max(p, z) if 0 < p < float("inf") else 1.0
+    assert rank_error(p_m, z_m, is_valid_prediction(p_m)) == total / len(z_m)
+
+
+@pytest.mark.parametrize(
+    ("p", "expected"),
+    [(1.0, 0.0), (2.0, 0.5), (0.5, 0.5), (1e308, 1.0), (5e-324, 1.0), *((value, 1.0) for value in INVALID)],
+)
+def test_rank_error_of_one_pixel(p: float, expected: float) -> None:
+    assert scored(np.array([p]), np.ones(1, np.float32)).rank_error == expected
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(0, 1), st.sampled_from(INVALID))
+def test_no_removal_lowers_the_rank_error(seed: int, share: float, invalid: float) -> None:
+    p_m, z_m = noisy_view(seed)
+    removed = p_m.copy()
+    removed[np.random.default_rng(seed + 1).uniform(size=len(p_m)) < share] = invalid
+    worst = p_m.copy()
+    worst[np.argsort(-np.abs(p_m - z_m))[: int(share * len(p_m))]] = invalid
+    other = scored(*noisy_view(seed + 2))
+    assert ranked_value(scored(p_m, z_m), other) <= ranked_value(scored(removed, z_m), other)
+    assert ranked_value(scored(p_m, z_m), other) <= ranked_value(scored(worst, z_m), other)
+
+
+@given(st.integers(0, 2**32 - 1), st.floats(5e-324, 1e308))
+def test_filling_holes_never_raises_the_rank_error(seed: int, fill: float) -> None:
+    p_m, z_m = noisy_view(seed)
+    filled = np.where(is_valid_prediction(p_m), p_m.astype(np.float64), fill)
+    value = ranked_value(scored(filled, z_m))
+    assert 0 <= value <= ranked_value(scored(p_m, z_m))
+
+
+def test_omitting_the_worst_pixels_lowers_abs_rel_but_not_the_rank_error(
+    tiny_truth: dict[str, ndarray], tiny_root: Path, archive_of: Callable[..., Path]
+) -> None:
+    """Omit the worst 4.5 % of the pixels: AbsRel on valid pixels falls to a fifth."""
+    rng = np.random.default_rng(0)
+    whole, partial = {}, {}
+    for view_id, depth_m in tiny_truth.items():
+        is_far = rng.uniform(size=depth_m.shape) < 0.045
+        whole[view_id] = np.where(is_far, 3 * depth_m, 1.01 * depth_m).astype(np.float32)
+        partial[view_id] = np.where(is_far, np.nan, whole[view_id]).astype(np.float32)
+    complete, omitted = (
+        score(archive_of(depths, f"{name}.zip"), tiny_root).tables["lattice"]
+        for name, depths in (("whole", whole), ("partial", partial))
+    )
+    assert complete.native is not None
+    assert omitted.native is not None
+    assert omitted.is_comparable
+    assert omitted.native.abs_rel < complete.native.abs_rel / 5
+    assert complete.rank_error is not None
+    assert omitted.rank_error is not None
+    assert omitted.rank_error > complete.rank_error

@@ -1,8 +1,9 @@
-"""Tests of ``score`` on a rendered dataset: exact results, determinism and rejected archives."""
+"""Scores of a rendered dataset and of views in memory: exact results, references and rejected archives."""
 
 from __future__ import annotations
 
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -17,15 +18,27 @@ import pyarrow.parquet as pq
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from numpy import ndarray
 
+import rebar_depth_bench
 from rebar_depth_bench import DatasetError, SubmissionError, score
 from rebar_depth_bench.data.codecs import decode, encode_depth, encode_png
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import iterate_rows, truth_columns, truth_from_row
 from rebar_depth_bench.scoring.columns import rounded
-from rebar_depth_bench.scoring.protocol import interior
-from rebar_depth_bench.scoring.score import ViewTruth, score_view, tabulate
+from rebar_depth_bench.scoring.groups import ViewTraits
+from rebar_depth_bench.scoring.protocol import interior, scored_pixels
+from rebar_depth_bench.scoring.reference import (
+    NO_REFERENCE,
+    UNDEFINED,
+    Errors,
+    Reference,
+    mean_reference,
+    view_reference,
+)
+from rebar_depth_bench.scoring.score import Truth, ViewTruth, score_view, score_views, tabulate
 from rebar_depth_bench.scoring.table import Table
+from rebar_depth_bench.submission.declaration import Declaration
 from tests.damage import change_manifest, change_rows, first_shard
 from tests.ground_truth import truth_of
 
@@ -234,3 +247,221 @@ def test_ground_truth_images_of_other_size_name_view(
     pq.write_table(pa.Table.from_pylist(rows, table.schema), shard)
     with pytest.raises(DatasetError, match=f"view {rows[1]['view_id']}: {column} is damaged: its size is"):
         truth_of(copy, "lattice-orbit")
+
+
+def independent_reference(depth_m: ndarray, is_scored: ndarray) -> list[float]:
+    """Return the four errors of a view from whole images in float64."""
+    image = depth_m.astype(np.float64)
+    z = image[is_scored]
+    errors = [np.abs(np.median(z) - z)]
+    values = [float(np.mean(errors[0] / z)), float(100 * np.sqrt(np.mean(errors[0] ** 2)))]
+    shifted = []
+    for axis, step in ((1, 1), (1, -1), (0, 1), (0, -1)):
+        neighbour = np.roll(image, step, axis)[is_scored]
+        known = neighbour > 0
+        if known.any():
+            error = np.abs(neighbour[known] - z[known])
+            shifted.append([np.mean(error / z[known]), 100 * np.sqrt(np.mean(error**2))])
+    return [*values, *np.mean(shifted, axis=0).tolist()]
+
+
+def test_tables_have_the_reference_errors_of_the_dataset(
+    tiny_truth: dict[str, ndarray],
+    tiny_masks: dict[str, ndarray],
+    tiny_root: Path,
+    archive_of: Callable[..., Path],
+) -> None:
+    result = score(archive_of(tiny_truth), tiny_root)
+    expected = []
+    for view_id, depth_m in tiny_truth.items():
+        is_scored = np.zeros(depth_m.size, bool)
+        is_scored[scored_pixels(tiny_masks[view_id], depth_m)] = True
+        expected.append(independent_reference(depth_m, is_scored.reshape(depth_m.shape)))
+    found = result.to_dict()["tables"]["lattice"]["reference"]
+    assert list(found) == ["constant", "one_pixel", "scaled_constant"]
+    assert found["scaled_constant"] == found["constant"], "of complete predictions"
+    numbers = [value for errors in (found["constant"], found["one_pixel"]) for value in errors.values()]
+    assert numbers == pytest.approx(np.mean(expected, axis=0).tolist(), rel=1e-11)
+    again = score(archive_of(tiny_truth), tiny_root)  # From the cache.
+    assert again.to_json() == result.to_json()
+
+
+def test_scaled_constant_is_on_the_predicted_pixels(
+    tiny_truth: dict[str, ndarray],
+    tiny_masks: dict[str, ndarray],
+    tiny_root: Path,
+    archive_of: Callable[..., Path],
+) -> None:
+    """Predict the nearer half of each view, and nothing in the first view."""
+    predictions: dict[str, ndarray] = {}
+    expected = []
+    for view_id, depth_m in tiny_truth.items():
+        pixels = scored_pixels(tiny_masks[view_id], depth_m)
+        near = depth_m <= np.median(depth_m.ravel()[pixels])
+        predictions[view_id] = np.where(near & bool(predictions), 1.7 * depth_m, np.nan)
+        z = depth_m.ravel()[pixels][near.ravel()[pixels]].astype(np.float64)
+        error = np.abs(np.median(z) - z)
+        expected.append((np.mean(error / z), 100 * np.sqrt(np.mean(error**2))))
+    table = score(archive_of(predictions), tiny_root).to_dict()["tables"]["lattice"]
+    found = table["reference"]["scaled_constant"]
+    assert list(found.values()) == pytest.approx(np.mean(expected[1:], axis=0).tolist(), rel=1e-11)
+    assert found["abs_rel"] < 0.8 * table["reference"]["constant"]["abs_rel"]
+
+
+def test_nothing_predicted_has_no_scaled_constant(
+    tiny_truth: dict[str, ndarray], tiny_root: Path, archive_of: Callable[..., Path]
+) -> None:
+    nothing = {view_id: np.zeros_like(depth_m) for view_id, depth_m in tiny_truth.items()}
+    reference = score(archive_of(nothing), tiny_root).to_dict()["tables"]["lattice"]["reference"]
+    assert reference["scaled_constant"] == {"abs_rel": None, "rmse_cm": None}
+    assert reference["constant"]["abs_rel"] > 0
+
+
+def test_neighbours_without_depth_are_skipped() -> None:
+    depth_m = np.full((3, 3), 2.0, np.float32)
+    depth_m[1, 0], depth_m[1, 2], depth_m[0, 1] = 1.0, 0.0, 0.0
+    reference = view_reference(depth_m, np.array([4], np.uint32), 2.0)
+    assert reference == (0.0, 0.0, 0.25, 50.0)
+    alone = np.zeros((3, 3), np.float32)
+    alone[1, 1] = 2.0
+    undefined = view_reference(alone, np.array([4], np.uint32), 2.0)
+    assert undefined == (0.0, 0.0, UNDEFINED, UNDEFINED)
+    assert mean_reference([undefined]) == Reference(Errors(0.0, 0.0), Errors())
+    assert mean_reference([reference, undefined]) == Reference(Errors(0.0, 0.0), Errors(0.25, 50.0))
+
+
+def test_no_views_have_no_reference() -> None:
+    assert mean_reference([]) == NO_REFERENCE
+    assert NO_REFERENCE.to_dict()["constant"] == {"abs_rel": None, "rmse_cm": None}
+
+
+MASK = np.array([[0, 0, 0, 0], [1, 1, 1, 1], [1, 1, 1, 1], [1, 1, 1, 1]], bool)
+DEPTH_M = np.array([[0, 0, 0, 0], [1, 1, 1, 1], [1, 2.0, 4.0, 1], [1, 1, 1, 1]], np.float32)
+"""A view of 4 x 4 pixels, of which two are scored: those of 2 m and 4 m depth."""
+
+
+def truth_in_memory(view_ids: tuple[str, ...], split: str | None = None) -> Truth:
+    """Return the ground truth of views that all show ``DEPTH_M``."""
+    pixels = scored_pixels(MASK, DEPTH_M)
+    return Truth(
+        view_ids=view_ids,
+        read=lambda position: ViewTruth(view_ids[position], pixels, DEPTH_M.ravel()[pixels], 3.0),
+        references=[view_reference(DEPTH_M, pixels, 3.0)] * len(view_ids),
+        traits=[ViewTraits("wall", 3.0, None)] * len(view_ids),
+        split=split,
+    )
+
+
+def test_score_of_two_pixels_by_hand() -> None:
+    predicted: dict[str, ndarray] = {"a/0000": np.full((4, 4), 2.0), "a/0001": np.full((4, 4), np.nan)}
+    truths = [("a", truth_in_memory(("a/0000", "a/0001")))]
+    tables, views = score_views(truths, predicted.__getitem__, Declaration(uses_ground_truth=True))
+    first, second = views
+    assert (first.scored_px, first.coverage, first.scale) == (2, 1.0, 1.5)
+    assert first.rank_error == (0 + (4 - 2) / 4) / 2
+    assert first.native is not None
+    assert (first.native.abs_rel, first.native.mae_cm) == ((0 + 2 / 4) / 2, 100.0)
+    assert (second.coverage, second.rank_error, second.native) == (0.0, 1.0, None)
+    table = tables["a"]
+    assert (table.views, table.views_scored, table.coverage, table.ranked) == (2, 1, 0.5, False)
+    assert table.rank_error == (0.25 + 1) / 2
+    assert table.reference.constant.abs_rel == ((3 - 2) / 2 + (4 - 3) / 4) / 2
+    assert table.reference.scaled_constant == table.reference.constant
+
+
+def test_groups_are_those_of_a_config_with_splits() -> None:
+    truth = truth_in_memory(("a/test-b-0000",), split="test")
+    tables, _ = score_views([("a", truth)], lambda _: DEPTH_M)
+    assert list(tables["a"].groups["family"]) == ["wall"]
+    assert tables["a"].groups["distance"]["2-4 m"].rank_error == 0
+
+
+BIAS = {
+    "columns.py": {
+        "OTHERS: tuple[Column, ...] = ()": """OTHERS = (Column("bias_mm", "bias", "mm", decimals=1),)""",
+    },
+    "table.py": {
+        "    Field,\n": "    Field,\n    PlainSerializer,\n",
+        "    scaled_constant: Annotated[": """    bias_mm: Annotated[float | None, PlainSerializer(rounded)] = None
+    scaled_constant: Annotated[""",
+        "    reference: Reference\n": """    bias_mm: Annotated[float | None, PlainSerializer(rounded)] = None
+    reference: Reference
+""",
+    },
+    "score.py": {
+        "scaled_constant=constant or": """bias_mm=1000 * float(np.mean(p_m.astype(np.float64) - z_m)),
+        scaled_constant=constant or""",
+        "        published=published,\n": """        bias_mm=mean([view.bias_mm for view in predicted]),
+        published=published,
+""",
+    },
+}
+"""Changes of three files that add a signed number outside the depth metrics: new text by old text."""
+
+SCORE = """
+import csv, io, json
+from rich.console import Console
+from rebar_depth_bench.reporting.html.page import render_report
+from rebar_depth_bench.reporting.latex import latex_table
+from rebar_depth_bench.reporting.tables import print_table
+from rebar_depth_bench.scoring.frames import differences_frame, frame_csv
+from rebar_depth_bench.scoring.comparison import compare
+from rebar_depth_bench.scoring.result import (
+    DatasetIdentity, Result, SoftwareIdentity, SubmissionIdentity, read_result
+)
+from rebar_depth_bench.scoring.score import score_views
+from tests.bench.scoring.test_scoring import DEPTH_M, truth_in_memory
+
+truth = truth_in_memory(tuple(f"a/{12 * n:04}" for n in range(10)))
+dataset = DatasetIdentity("sha256:" + "0" * 64, "1")
+submission, software = SubmissionIdentity("m", "0" * 64), SoftwareIdentity("1")
+results = []
+for shift_m in (-0.002, 0.003):
+    read = lambda view_id: DEPTH_M + shift_m - int(view_id[2:]) / 1e6
+    tables, views = score_views([("a", truth)], read)
+    results.append(Result(dataset=dataset, submission=submission, software=software, tables=tables, views=views))
+written = results[0].to_json()
+assert read_result(written, "x").to_json() == written
+[row] = csv.DictReader(io.StringIO(frame_csv(results[0].to_pandas())))
+rows = csv.DictReader(io.StringIO(frame_csv(differences_frame([compare(*results).to_dict()]))))
+terminal = io.StringIO()
+print_table(results[0], Console(file=terminal, width=200))
+shown = [terminal.getvalue(), latex_table(results, published=False, intervals=True), render_report(results[0], [])]
+print(json.dumps([json.loads(written), row, next(row for row in rows if row["number"] == "bias_mm"), shown]))
+"""
+
+
+@pytest.mark.slow
+def test_signed_number_with_interval_is_added_in_three_files(tmp_path: Path) -> None:
+    package = Path(rebar_depth_bench.__file__).parent
+    shutil.copytree(package, tmp_path / package.name, ignore=shutil.ignore_patterns("__pycache__"))
+    for name, changes in BIAS.items():
+        path = tmp_path / package.name / "scoring" / name
+        content = path.read_text()
+        for old, new in changes.items():
+            assert content.count(old) == 1, (name, old)
+            content = content.replace(old, new)
+        path.write_text(content)
+    command = [sys.executable, "-c", SCORE]
+    environment = {**os.environ, "PYTHONPATH": f"{tmp_path}:{package.parent}"}
+    finished = subprocess.run(
+        command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False, timeout=120
+    )
+    assert finished.returncode == 0, finished.stderr
+    document, row, difference, shown = json.loads(finished.stdout)
+    table = document["tables"]["a"]
+    assert document["views"][0]["bias_mm"] == pytest.approx(-2, abs=0.001)
+    assert table["bias_mm"] == pytest.approx(-2.054, abs=0.001)
+    low, high = table["ci95"]["bias_mm"]
+    assert low < table["bias_mm"] < high
+    assert [float(row[name]) for name in ("bias_mm", "bias_mm_low", "bias_mm_high")] == [
+        table["bias_mm"],
+        low,
+        high,
+    ]
+    assert float(difference["difference"]) == pytest.approx(5, abs=0.001)
+    assert difference["verdict"] == "", "neither direction of a signed number is better"
+    for text in shown:
+        assert "bias" in text
+        assert "-2.1" in text
+    assert "[-2.1, -2.0]" in shown[1], "LaTeX has the interval"
