@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import csv
-import dataclasses
 import io
 import json
 import math
-import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -34,34 +32,26 @@ from rebar_depth_bench.scoring.metrics import DepthMetrics
 from rebar_depth_bench.scoring.result import (
     DatasetIdentity,
     Result,
-    SoftwareIdentity,
-    SubmissionIdentity,
     read_result,
 )
 from rebar_depth_bench.scoring.score import tabulate
 from rebar_depth_bench.scoring.table import ViewScore
 from tests.bench.reporting.pages import Page
 from tests.bench.reporting.results import HOSTILE, result, scored_view, unpredicted_view
+from tests.damage import change_manifest, copy_dataset
 
 
 def result_of(errors: np.ndarray, method: str = "m", config: str = "lattice", digest: str = "sha256:1") -> Result:
     views, step = [], 12 if len(errors) < 100 else 1  # Few views are those of a sparse subset.
     for n, error in enumerate(errors):
-        metrics = None if math.isnan(error) else DepthMetrics(error, 10 * error, 9 * error, 1 - error / 10)
-        scale = None if metrics is None else 1.0 + error
-        within = dict.fromkeys((3, 5, 10, 20), 0.0 if metrics is None else 1 - error / 2)
-        covered = 0.0 if metrics is None else 1.0
-        rank_error = 1.0 if metrics is None else error / (1 + error)
-        views.append(
-            ViewScore(f"{config}/{step * n:04}", 100, covered, rank_error, scale, metrics, metrics, within)
-        )
-    return Result(
-        dataset=DatasetIdentity(digest, "1"),
-        submission=SubmissionIdentity(method, "ab" * 32),
-        software=SoftwareIdentity("2"),
-        tables={config: tabulate(views)},
-        views=views,
-    )
+        view_id = f"{config}/{step * n:04}"
+        if math.isnan(error):
+            views.append(unpredicted_view(view_id))
+            continue
+        metrics = DepthMetrics(error, 10 * error, 9 * error, 1 - error / 10)
+        within = dict.fromkeys((3, 5, 10, 20), 1 - error / 2)
+        views.append(ViewScore(view_id, 100, 1.0, error / (1 + error), 1.0 + error, metrics, metrics, within))
+    return replace(result(*views, method=method), dataset=DatasetIdentity(digest, "1"))
 
 
 def difference(first: Result, other: Result, name: str = "native.abs_rel") -> Difference:
@@ -95,11 +85,11 @@ def test_paired_difference_below_view_spread_is_decided() -> None:
 def test_equal_quality_is_rarely_decided() -> None:
     rng = np.random.default_rng(2)
     decided_count = 0
-    for _ in range(40):
-        view_errors = rng.uniform(0.1, 0.5, 252)
-        first, other = (result_of(view_errors + rng.normal(0, 0.01, 252)) for _ in range(2))
+    for _ in range(20):
+        view_errors = rng.uniform(0.1, 0.5, 120)
+        first, other = (result_of(view_errors + rng.normal(0, 0.01, 120)) for _ in range(2))
         decided_count += difference(first, other).verdict != "undecided"
-    assert decided_count <= 6
+    assert decided_count <= 3
 
 
 def test_submission_equals_itself() -> None:
@@ -162,6 +152,7 @@ def test_table_is_80_columns_and_names_every_number() -> None:
     rows = list(csv.DictReader(io.StringIO(frame_csv(comparison.to_pandas()))))
     assert [row["number"] for row in rows] == list(COLUMN_BY_PATH)
     assert rows[0]["other_method"] == "'=B"
+    assert {row["verdict"] for row in rows} <= {"equal", "worse", "better", "no verdict", "undecided", ""}
     assert float(rows[1]["low"]) <= float(rows[1]["difference"]) <= float(rows[1]["high"])
 
 
@@ -232,13 +223,6 @@ def test_unknown_or_missing_rows_raise_value_error(two_configs: Result) -> None:
             two_configs.to_pandas(rows)  # type: ignore[arg-type]
 
 
-def test_comparison_has_one_row_per_metric(two_configs: Result) -> None:
-    comparison = compare(two_configs, two_configs)
-    frame = comparison.to_pandas()
-    assert frame["number"].tolist() == 2 * [column.path for column in VIEW_COLUMNS]
-    assert set(frame["verdict"]) <= {"equal", "no verdict", "undecided", ""}
-
-
 def test_integers_with_missing_values_stay_integers() -> None:
     frame = frame_of_values(("count", "text"), [(3, "a"), (None, None)])
     assert isinstance(frame["count"].dtype, pd.Int64Dtype)
@@ -248,7 +232,7 @@ def test_integers_with_missing_values_stay_integers() -> None:
 
 def test_csv_without_rows_has_the_header(two_configs: Result) -> None:
     extended = ExtendedResult(measures={}, tables={}, views={})
-    empty = dataclasses.replace(two_configs, tables={}, views=[], extended=extended)
+    empty = replace(two_configs, tables={}, views=[], extended=extended)
     assert frame_csv(empty.to_pandas()) == frame_csv(two_configs.to_pandas()).splitlines(keepends=True)[0]
     compared = frame_csv(compare(two_configs, two_configs).to_pandas())
     assert frame_csv(differences_frame([])) == compared.splitlines(keepends=True)[0]
@@ -259,12 +243,12 @@ def test_csv_without_rows_has_the_header(two_configs: Result) -> None:
 
 
 def test_bars_of_a_dataset_folder(tiny_root: Path, tmp_path: Path) -> None:
-    root = shutil.copytree(tiny_root, tmp_path / "dataset")
-    path, manifest = root / "bars.parquet", root / "manifest.json"
-    before, bars = file_sha256(path), list(read_bars(path)["lattice"])
-    bars[0] = dataclasses.replace(bars[0], nominal_axis_m=((0.0, 0.0, 0.5), (1.0, 0.0, 0.5)))
+    root = copy_dataset(tiny_root, tmp_path / "dataset")
+    path = root / "bars.parquet"
+    bars = list(read_bars(path)["lattice"])
+    bars[0] = replace(bars[0], nominal_axis_m=((0.0, 0.0, 0.5), (1.0, 0.0, 0.5)))
     write_bars(path, {"lattice": tuple(bars)})
-    manifest.write_text(manifest.read_text().replace(before, file_sha256(path)))
+    change_manifest(root, lambda manifest, _: manifest["files"].update({path.name: file_sha256(path)}))
     frame = rdb.bars(root)
     assert (len(frame), set(frame["scene"])) == (len(bars), {"lattice"})
     assert frame["bar_id"].tolist() == [bar.bar_id for bar in bars]

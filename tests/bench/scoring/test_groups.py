@@ -36,19 +36,9 @@ from tests.ground_truth import truth_of
 from tests.synthetic_dataset import write_archive, write_dataset, write_split_dataset
 
 # The depth of a bar is 0.3 m + 0.01 m times ten times the number of its scene, and more downwards.
+_NUMBERS_OF_FAMILY = {"a": (1, 5, 10, 25, 3, 5, 1, 26), "b": (2, 9, 18, 38)}
 NUMBERS = {
-    "a1": 1,
-    "b1": 2,
-    "a2": 5,
-    "b2": 9,
-    "a3": 10,
-    "b3": 18,
-    "a4": 25,
-    "b4": 38,
-    "a5": 3,
-    "a6": 5,
-    "a7": 1,
-    "a8": 26,
+    f"{key}{n}": number for key, numbers in _NUMBERS_OF_FAMILY.items() for n, number in enumerate(numbers, 1)
 }
 FAMILIES = {name: {"a": "wall", "b": "beam"}[name[0]] for name in NUMBERS}
 DIAMETERS_M = {name: 0.006 * number for number, name in enumerate(NUMBERS, start=1)}
