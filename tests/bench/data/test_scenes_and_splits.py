@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +13,8 @@ import pytest
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.base.errors import DatasetError, InputError, SubmissionError
-from rebar_depth_bench.data.files import MANIFEST_FILE, views_digest
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import ConfigViews, Views, truth_problems
-from rebar_depth_bench.data.schema import ViewRecord
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
 from rebar_depth_bench.extended.registry import score_extended
 from rebar_depth_bench.methods.base import Method, MethodInfo, MultiViewMethod, Prepared
@@ -223,71 +220,6 @@ def test_rows_under_another_scene_are_refused(tmp_path: Path) -> None:
     ):
         with pytest.raises(DatasetError, match="scene is damaged: got 'e', expected d"):
             list(read())
-
-
-Entry = dict[str, Any]
-
-
-def swap_split(entry: Entry) -> None:
-    entry["scenes"][3]["split"] = "train"
-
-
-def share_shard(entry: Entry) -> None:
-    entry["scenes"][1]["shards"] = entry["scenes"][0]["shards"]
-
-
-def repeat_scene(entry: Entry) -> None:
-    entry["scenes"][1]["name"] = "a"
-
-
-def unknown_split(entry: Entry) -> None:
-    entry["scenes"][0]["split"] = "hidden"
-
-
-def escaping_mesh(entry: Entry) -> None:
-    entry["scenes"][2]["mesh"] = "../x.ply"
-
-
-def no_scenes(entry: Entry) -> None:
-    entry["scenes"] = []
-
-
-def scenes_that_are_none(entry: Entry) -> None:
-    entry["scenes"] = {"a": 1}
-
-
-def index_without_digits(entry: Entry) -> None:
-    entry["views"][0]["view_id"] = "cages/train-a-x"
-
-
-def scene_without_views(entry: Entry) -> None:
-    entry["views"] = [view for view in entry["views"] if "train-a-" not in view["view_id"]]
-    entry["ground_truth_digest"] = views_digest(ViewRecord(**view) for view in entry["views"])
-
-
-@pytest.mark.parametrize(
-    ("change", "code", "where"),
-    [
-        (scene_without_views, "missing", "configs.cages.views"),
-        (swap_split, "invalid", "configs.cages.views"),
-        (share_shard, "duplicate", "configs.cages.scenes"),
-        (repeat_scene, "duplicate", "configs.cages.scenes"),
-        (unknown_split, "invalid", "configs.cages.scenes 1: split"),
-        (escaping_mesh, "invalid", "configs.cages.scenes 3: mesh"),
-        (no_scenes, "invalid", "configs.cages.scenes"),
-        (scenes_that_are_none, "invalid", "configs.cages.scenes"),
-        (index_without_digits, "invalid", "configs.cages.views"),
-    ],
-)
-def test_invalid_scenes_of_a_manifest(
-    root: Path, tmp_path: Path, change: Callable[[Entry], None], code: str, where: str
-) -> None:
-    manifest = json.loads((root / MANIFEST_FILE).read_text())
-    change(manifest["configs"]["cages"])
-    (tmp_path / MANIFEST_FILE).write_text(json.dumps(manifest))
-    with pytest.raises(DatasetError) as caught:
-        open_folder(tmp_path)
-    assert (code, where) in [(problem.code, problem.where) for problem in caught.value.problems]
 
 
 def test_extended_measures_use_the_bars_of_each_view_s_scene(root: Path) -> None:

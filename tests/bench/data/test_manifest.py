@@ -1,168 +1,22 @@
-"""Tests of the dataset folder read with plain ``datasets`` and with ``rebar_depth_bench.load``."""
+"""Manifest of a dataset folder: what is read from it, and the problems of a damaged one."""
 
 from __future__ import annotations
 
 import json
-import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import datasets
-import numpy as np
-import pyarrow as pa
-import pyarrow.parquet as pq
 import pytest
 from pydantic import ValidationError
 
 import rebar_depth_bench as rdb
+from rebar_depth_bench.base.errors import DatasetError
+from rebar_depth_bench.data.files import MANIFEST_FILE, views_digest
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.data.rows import iterate_rows
-from rebar_depth_bench.data.schema import References, Survey, Trajectory, features
+from rebar_depth_bench.data.schema import References, Survey, Trajectory, ViewRecord
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
-from rebar_depth_bench.geometry.cameras import ideal_K, right_camera_pose
 from rebar_depth_bench.scoring.truth import published_match
-
-HEIGHT, WIDTH, VIEWS = 90, 160, 9
-
-
-def test_plain_datasets_loads_folder(tiny_root: Path) -> None:
-    loaded = datasets.load_dataset(str(tiny_root), "lattice", split="test")
-    assert loaded.features == features()
-    assert len(loaded) == VIEWS
-    row = loaded[0]
-    assert row["left_rgb"].size == (WIDTH, HEIGHT)
-    assert row["left_mask"].mode == "1"
-    assert row["left_bars"].mode.startswith("I;16")
-    assert row["left_preview"].mode == "P"
-
-
-def test_view_ids_are_indices_of_the_full_protocol(tiny_root: Path) -> None:
-    view_ids = rdb.load(tiny_root, "lattice", columns=["view_id"])["view_id"]
-    assert list(view_ids) == [f"lattice/{(2 * i + 1) * 504 // 18:04d}" for i in range(VIEWS)]
-
-
-def test_rows_decode_to_contract_dtypes_and_shapes(tiny_root: Path) -> None:
-    row = rdb.load(tiny_root, "lattice")[4]
-    assert list(row) == list(features())
-    for eye in ("left", "right"):
-        for kind, dtype, shape in (
-            ("rgb", np.uint8, (HEIGHT, WIDTH, 3)),
-            ("depth", np.float32, (HEIGHT, WIDTH)),
-            ("mask", np.bool_, (HEIGHT, WIDTH)),
-            ("bars", np.uint16, (HEIGHT, WIDTH)),
-            ("K", np.float64, (3, 3)),
-            ("distortion", np.float64, (5,)),
-            ("cam_from_world", np.float64, (4, 4)),
-        ):
-            array = row[f"{eye}_{kind}"]
-            assert (array.dtype, array.shape) == (dtype, shape), f"{eye}_{kind}"
-        assert np.array_equal(row[f"{eye}_K"], ideal_K(WIDTH, HEIGHT))
-        assert np.array_equal(row[f"{eye}_mask"], row[f"{eye}_bars"] > 0)
-        assert 0.03 < row[f"{eye}_mask"].mean() < 0.3
-    assert row["baseline_m"] == 0.12
-    assert np.array_equal(row["right_cam_from_world"], right_camera_pose(row["left_cam_from_world"], 0.12))
-
-
-def test_streaming_gives_the_same_rows(tiny_root: Path) -> None:
-    loaded = rdb.load(tiny_root, "lattice")
-    streamed = list(rdb.load(tiny_root, "lattice", streaming=True))
-    assert len(streamed) == VIEWS
-    for a, b in zip(loaded, streamed, strict=True):
-        assert list(a) == list(b)
-        for name in a:
-            assert np.array_equal(a[name], b[name]), name
-
-
-@pytest.mark.parametrize("streaming", [False, True])
-@pytest.mark.parametrize("num_workers", [0, 2])
-def test_torch_batch_shapes_and_dtypes(tiny_root: Path, streaming: bool, num_workers: int) -> None:
-    torch = pytest.importorskip("torch")
-    ds = rdb.load(tiny_root, "lattice", streaming=streaming)
-    loaded_ids: list[str] = []
-    for batch in rdb.torch_loader(ds, batch_size=4, num_workers=num_workers):
-        count = len(batch["view_id"])
-        assert batch["rgb"].shape == (count, 3, HEIGHT, WIDTH)
-        assert batch["depth"].shape == (count, 1, HEIGHT, WIDTH)
-        assert batch["mask"].shape == (count, 1, HEIGHT, WIDTH)
-        assert batch["K"].shape == (count, 3, 3)
-        assert batch["poses"].shape == (count, 4, 4)
-        types = [batch[key].dtype for key in ("rgb", "depth", "mask", "K", "poses")]
-        assert types == [torch.uint8, torch.float32, torch.bool, torch.float64, torch.float64]
-        loaded_ids += batch["view_id"]
-    assert sorted(loaded_ids) == sorted(rdb.load(tiny_root, "lattice", columns=["view_id"])["view_id"])
-
-
-def test_torch_batch_equals_row_values(tiny_root: Path) -> None:
-    pytest.importorskip("torch")
-    row = rdb.load(tiny_root, "lattice")[0]
-    batch = next(iter(rdb.torch_loader(rdb.load(tiny_root, "lattice"), stereo=True)))
-    assert np.array_equal(batch["rgb"][0].permute(1, 2, 0).numpy(), row["left_rgb"])
-    assert np.array_equal(batch["right_depth"][0, 0].numpy(), row["right_depth"])
-    assert np.array_equal(batch["right_poses"][0].numpy(), row["right_cam_from_world"])
-    assert batch["baseline_m"].tolist() == [0.12]
-
-
-def test_load_errors_name_expected_values(tiny_root: Path, tmp_path: Path) -> None:
-    with pytest.raises(rdb.DatasetError, match=r"no config 'lattise', expected one of lattice, lattice-orbit"):
-        rdb.load(tiny_root, "lattise")
-    with pytest.raises(rdb.DatasetError, match=r"no column 'depth', expected some of view_id, scene, left_rgb"):
-        rdb.load(tiny_root, "lattice", columns=["depth"])
-    with pytest.raises(
-        rdb.DatasetError, match=r"has no manifest.json, expected a complete dataset folder written by rebar-build"
-    ):
-        rdb.load(tmp_path, "lattice")
-    with pytest.raises(rdb.DatasetError, match="no such folder"):
-        rdb.load(tmp_path / "missing", "lattice")
-
-
-@pytest.mark.parametrize("streaming", [False, True])
-@pytest.mark.parametrize(("part", "positions"), [("[:2]", range(2)), ("[50%:]", range(4, 9)), ("[-1:]", [8])])
-def test_part_of_a_split(tiny_root: Path, part: str, positions: Sequence[int], streaming: bool) -> None:
-    view_ids = open_folder(tiny_root).config("lattice").view_ids
-    loaded = rdb.load(tiny_root, "lattice", split=f"test{part}", streaming=streaming, columns=["view_id"])
-    assert [row["view_id"] for row in loaded] == [view_ids[position] for position in positions]
-
-
-@pytest.mark.parametrize("split", ["test[", "test[a]", "test[:2]+test[3:]", "tests[:2]", "test+test", "[:2]"])
-def test_text_that_is_no_part_of_a_split_is_refused(tiny_root: Path, split: str) -> None:
-    with pytest.raises(rdb.DatasetError, match=r"has no split .*, expected test|expected one as test\[:10\]"):
-        rdb.load(tiny_root, "lattice", split=split)
-
-
-def test_unavailable_hub_repository_raises_dataset_error() -> None:
-    with pytest.raises(
-        rdb.DatasetError, match=r"not a local folder, and its manifest\.json cannot be downloaded from the Hub"
-    ):
-        rdb.load("nobody/nothing-here", "lattice")
-
-
-def test_manifest_lists_every_view(tiny_root: Path) -> None:
-    folder = open_folder(tiny_root)
-    assert folder.configs == ("lattice", "lattice-orbit")
-    assert len(folder.expected_views()) == VIEWS + 2
-    assert set(folder.expected_views().values()) == {(HEIGHT, WIDTH)}
-    assert folder.digest.startswith("sha256:")
-
-
-def test_loading_columns_writes_no_further_cache_file(tiny_root: Path) -> None:
-    ds = rdb.load(tiny_root, "lattice", columns=["view_id", "left_depth", "left_rgb"])
-    assert ds[0]["left_rgb"].dtype == np.uint8
-    assert ds.cache_files
-    assert not [file for file in ds.cache_files if "cache-" in Path(file["filename"]).name]
-
-
-@pytest.mark.parametrize("damage", ["truncated", "missing"])
-def test_damaged_shard_raises_dataset_error(tiny_root: Path, tmp_path: Path, damage: str) -> None:
-    copy = tmp_path / "dataset"
-    shutil.copytree(tiny_root, copy)
-    for shard in copy.glob("lattice/*.parquet"):
-        if damage == "missing":
-            shard.unlink()
-        else:
-            shard.write_bytes(shard.read_bytes()[:-100])
-    with pytest.raises(rdb.DatasetError, match=r"dataset: (config lattice cannot be read|has no lattice/)"):
-        list(iterate_rows(open_folder(copy).config("lattice"), ["view_id"]))
 
 
 @pytest.fixture
@@ -352,32 +206,73 @@ def test_board_is_read_from_manifest(manifest: Any, tmp_path: Path) -> None:
     assert folder.config("lattice-orbit").scene.board is None
 
 
-def test_view_id_of_shard_that_manifest_lacks_is_rejected(tiny_root: Path, tmp_path: Path) -> None:
-    copy = shutil.copytree(tiny_root, tmp_path / "copy")
-    shard = next(copy.glob("lattice-orbit/*.parquet"))
-    table = pq.read_table(shard)
-    rows = [row | {"view_id": "../../../x/evil"} for row in table.to_pylist()]
-    pq.write_table(pa.Table.from_pylist(rows, table.schema), shard)
-    with pytest.raises(rdb.DatasetError, match=r"view \.\./\.\./\.\./x/evil is not in the manifest"):
-        list(iterate_rows(open_folder(copy).config("lattice-orbit"), ["view_id", "left_K"]))
-
-
-@pytest.mark.parametrize("streaming", [True, False])
-def test_load_with_missing_shard_raises_dataset_error(tiny_root: Path, tmp_path: Path, streaming: bool) -> None:
-    copy = shutil.copytree(tiny_root, tmp_path / "copy")
-    next(copy.glob("lattice/test-00000-*.parquet")).unlink()
-    load: Any = rdb.load
-    with pytest.raises(rdb.DatasetError, match="has no lattice/test-00000"):
-        load(copy, "lattice", streaming=streaming)
-
-
-def test_columns_given_as_text_are_rejected(tiny_root: Path) -> None:
-    with pytest.raises(rdb.DatasetError, match="columns is 'left_rgb', expected a list"):
-        rdb.load(tiny_root, "lattice", columns="left_rgb")
-
-
 def test_reference_errors_may_be_zero_but_not_negative() -> None:
     zero = {"abs_rel": 0.0, "rmse_cm": 0.0}
     assert References.model_validate({"constant": zero, "one_pixel": zero}).constant.abs_rel == 0.0
     with pytest.raises(ValidationError):
         References.model_validate({"constant": {**zero, "rmse_cm": -1.0}, "one_pixel": zero})
+
+
+Entry = dict[str, Any]
+
+
+def swap_split(entry: Entry) -> None:
+    entry["scenes"][3]["split"] = "train"
+
+
+def share_shard(entry: Entry) -> None:
+    entry["scenes"][1]["shards"] = entry["scenes"][0]["shards"]
+
+
+def repeat_scene(entry: Entry) -> None:
+    entry["scenes"][1]["name"] = "a"
+
+
+def unknown_split(entry: Entry) -> None:
+    entry["scenes"][0]["split"] = "hidden"
+
+
+def escaping_mesh(entry: Entry) -> None:
+    entry["scenes"][2]["mesh"] = "../x.ply"
+
+
+def no_scenes(entry: Entry) -> None:
+    entry["scenes"] = []
+
+
+def scenes_that_are_none(entry: Entry) -> None:
+    entry["scenes"] = {"a": 1}
+
+
+def index_without_digits(entry: Entry) -> None:
+    entry["views"][0]["view_id"] = "cages/train-a-x"
+
+
+def scene_without_views(entry: Entry) -> None:
+    entry["views"] = [view for view in entry["views"] if "train-a-" not in view["view_id"]]
+    entry["ground_truth_digest"] = views_digest(ViewRecord(**view) for view in entry["views"])
+
+
+@pytest.mark.parametrize(
+    ("change", "code", "where"),
+    [
+        (scene_without_views, "missing", "configs.cages.views"),
+        (swap_split, "invalid", "configs.cages.views"),
+        (share_shard, "duplicate", "configs.cages.scenes"),
+        (repeat_scene, "duplicate", "configs.cages.scenes"),
+        (unknown_split, "invalid", "configs.cages.scenes 1: split"),
+        (escaping_mesh, "invalid", "configs.cages.scenes 3: mesh"),
+        (no_scenes, "invalid", "configs.cages.scenes"),
+        (scenes_that_are_none, "invalid", "configs.cages.scenes"),
+        (index_without_digits, "invalid", "configs.cages.views"),
+    ],
+)
+def test_invalid_scenes_of_a_manifest(
+    root: Path, tmp_path: Path, change: Callable[[Entry], None], code: str, where: str
+) -> None:
+    manifest = json.loads((root / MANIFEST_FILE).read_text())
+    change(manifest["configs"]["cages"])
+    (tmp_path / MANIFEST_FILE).write_text(json.dumps(manifest))
+    with pytest.raises(DatasetError) as caught:
+        open_folder(tmp_path)
+    assert (code, where) in [(problem.code, problem.where) for problem in caught.value.problems]
