@@ -43,6 +43,7 @@ def project(K: ndarray, cam_from_world: ndarray, points_m: ndarray) -> Float64[n
     return np.concatenate([uvw[:, :2] / uvw[:, 2:], cam_m[:, 2:]], axis=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("options", [{"crop": CROP}, {"flip": True}, {"crop": CROP, "flip": True}])
 def test_points_of_the_world_are_seen_where_they_are_projected(tiny_root: Path, options: dict[str, Any]) -> None:
     original = {row["view_id"]: row for row in rdb.load(tiny_root, "lattice")}
@@ -86,6 +87,7 @@ def test_single_view_is_mirrored_in_place(tiny_root: Path) -> None:
     assert np.array_equal(flip_row(mirrored)["left_K"], row["left_K"])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_workers", [0, 2])
 @pytest.mark.parametrize("streaming", [False, True])
 def test_crops_and_flips_depend_on_seed_epoch_and_view(tiny_root: Path, num_workers: int, streaming: bool) -> None:
@@ -100,6 +102,7 @@ def test_crops_and_flips_depend_on_seed_epoch_and_view(tiny_root: Path, num_work
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("streaming", [False, True])
 def test_epochs_have_different_orders_and_crops_that_can_be_repeated(tiny_root: Path, streaming: bool) -> None:
     def two_epochs() -> list[list[dict[str, Any]]]:
@@ -116,6 +119,7 @@ def test_epochs_have_different_orders_and_crops_that_can_be_repeated(tiny_root: 
     assert any(not torch.equal(crops[0][view_id], crops[1][view_id]) for view_id in unshuffled)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("streaming", [False, True])
 def test_plain_and_saved_datasets_give_the_same_batches(tiny_root: Path, tmp_path: Path, streaming: bool) -> None:
     options: dict[str, Any] = {"stereo": True, "crop": CROP, "flip": True, "seed": 3}
@@ -208,6 +212,7 @@ def epochs(root: Path, count: int, *, streaming: bool, shuffle: bool, num_worker
     ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("num_workers", [0, 2])
 @pytest.mark.parametrize("shuffle", [False, True])
 @pytest.mark.parametrize("streaming", [False, True])
@@ -221,6 +226,7 @@ def test_workers_load_each_view_once(root: Path, streaming: bool, shuffle: bool,
     assert (first != second) == shuffle
 
 
+@pytest.mark.slow
 def test_streamed_shards_are_divided_among_workers(root: Path) -> None:
     """Batches come from the workers in turn: scenes a and c from the first one, b from the second one."""
     [found] = epochs(root, 1, streaming=True, shuffle=False, num_workers=2)
@@ -228,11 +234,13 @@ def test_streamed_shards_are_divided_among_workers(root: Path) -> None:
     assert scenes == ["aa", "bb", "aa", "bb", "cc", "cc"]
 
 
+@pytest.mark.slow
 def test_streamed_scenes_have_another_order_in_each_epoch(root: Path) -> None:
     found = epochs(root, 8, streaming=True, shuffle=True, num_workers=0)
     assert len({epoch[0][0] for epoch in found}) > 1
 
 
+@pytest.mark.slow
 def test_more_workers_than_scenes_load_each_view_once(root: Path) -> None:
     views = rdb.load(root, "cages", split="validation", streaming=True)
     found = [batch["view_id"][0] for batch in rdb.torch_loader(views, 1, 2, shuffle=True)]
