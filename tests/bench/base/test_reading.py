@@ -260,14 +260,8 @@ XML = """\
     [
         (TOML, {"left": 6, "left.K": 6, "left.cx": 6, "left.cy": None, "left.fx": None, "title": 2, "fx": None}),
         (TOML, {"right": 8, "right.fx": 8, "right.stereo.rotation 2: 1": 11, "right.stereo.angle": 15}),
-        (
-            TOML,
-            {"pose": 16, "pose 1: image": 17, "pose 2": 20, "pose 2: image": 21, "pose 3: x": 16},
-        ),
-        (
-            TOML,
-            {"pose 1: more.x": 19, "pose 2: more.x": 23, "pose.x": None, "lists.item 2: x": 25},
-        ),
+        (TOML, {"pose": 16, "pose 1: image": 17, "pose 2": 20, "pose 2: image": 21, "pose 3: x": 16}),
+        (TOML, {"pose 1: more.x": 19, "pose 2: more.x": 23, "pose.x": None, "lists.item 2: x": 25}),
         (YAML, {"cam0.intrinsics": 5, "cam0.fx": None, "cam1.fx": 10, "cam1": 7, "size": 11, "fx": None}),
         (JSON, {"left.cx": 1, "right.cx": 3, "left.fx": None, "right": 2, "right.fx": 3, "width": 6, "size 2": 4}),
         (XML, {"M1": 8, "M2.rows": 5, "M2.data": 6, "M1.data": None, "empty": 8, "rows": None}),

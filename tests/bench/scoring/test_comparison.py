@@ -29,11 +29,7 @@ from rebar_depth_bench.scoring.columns import COLUMN_BY_PATH, TABLE_COLUMNS, VIE
 from rebar_depth_bench.scoring.comparison import Difference, compare
 from rebar_depth_bench.scoring.frames import differences_frame, frame_csv, frame_of_values
 from rebar_depth_bench.scoring.metrics import DepthMetrics
-from rebar_depth_bench.scoring.result import (
-    DatasetIdentity,
-    Result,
-    read_result,
-)
+from rebar_depth_bench.scoring.result import DatasetIdentity, Result, read_result
 from rebar_depth_bench.scoring.score import tabulate
 from rebar_depth_bench.scoring.table import ViewScore
 from tests.bench.reporting.pages import Page

@@ -180,10 +180,7 @@ def independent_reference(depth_m: ndarray, is_scored: ndarray) -> list[float]:
 
 
 def test_tables_have_the_reference_errors_of_the_dataset(
-    tiny_truth: Depths,
-    tiny_masks: Depths,
-    tiny_root: Path,
-    archive_of: Archive,
+    tiny_truth: Depths, tiny_masks: Depths, tiny_root: Path, archive_of: Archive
 ) -> None:
     result = score(archive_of(tiny_truth), tiny_root)
     expected = []
@@ -201,10 +198,7 @@ def test_tables_have_the_reference_errors_of_the_dataset(
 
 
 def test_scaled_constant_is_on_the_predicted_pixels(
-    tiny_truth: Depths,
-    tiny_masks: Depths,
-    tiny_root: Path,
-    archive_of: Archive,
+    tiny_truth: Depths, tiny_masks: Depths, tiny_root: Path, archive_of: Archive
 ) -> None:
     """Predict the nearer half of each view, and nothing in the first view."""
     predictions: dict[str, ndarray] = {}
@@ -280,7 +274,7 @@ def test_groups_are_those_of_a_config_with_splits() -> None:
 
 BIAS = {
     "columns.py": {
-        "OTHERS: tuple[Column, ...] = ()": """OTHERS = (Column("bias_mm", "bias", "mm", decimals=1),)""",
+        "OTHERS: tuple[Column, ...] = ()": """OTHERS = (Column("bias_mm", "bias", "mm", decimals=1),)"""
     },
     "table.py": {
         "    Field,\n": "    Field,\n    PlainSerializer,\n",
