@@ -75,37 +75,31 @@ def test_negative_predictions_have_null_metrics_and_rank_error_one(
 def test_score_agrees_with_independent_evaluation(
     tiny_truth: Depths, tiny_masks: Depths, tiny_root: Path, archive_of: Archive
 ) -> None:
+    """A tenth of the pixels have no prediction."""
     rng = np.random.default_rng(5)
     predictions = {
         view: (depth * rng.uniform(0.7, 1.6) + rng.normal(0, 0.01, depth.shape)).astype(np.float32)
         for view, depth in tiny_truth.items()
     }
-    table = score(archive_of(predictions), tiny_root).tables["lattice"]
     rows = []
     for view, prediction in predictions.items():
+        prediction[rng.random(prediction.shape) < 0.1] = np.nan
         scored = interior(tiny_masks[view]) & (tiny_truth[view] > 0)
-        z = tiny_truth[view][scored].astype(float)
-        p = prediction[scored].astype(float)
+        valid = scored & ~np.isnan(prediction)
+        z, p = tiny_truth[view][valid].astype(float), prediction[valid].astype(float)
         s = np.median(z) / np.median(p)
-        rows.append(
-            [
-                np.mean(np.abs(p - z) / z),
-                100 * np.sqrt(np.mean((p - z) ** 2)),
-                100 * np.mean(np.abs(p - z)),
-                np.mean(np.maximum(p / z, z / p) < 1.25),
-                np.mean(np.abs(s * p - z) / z),
-                np.mean(np.abs(p - z) <= 0.01),
-                np.mean(1 - np.minimum(p / z, z / p)),
-                s,
-            ]
-        )
-    means = np.mean(rows, axis=0)
+        native = [np.mean(np.abs(p - z) / z), 100 * np.sqrt(np.mean((p - z) ** 2)), 100 * np.mean(np.abs(p - z))]
+        delta1, share = np.mean(np.maximum(p / z, z / p) < 1.25), valid.sum() / scored.sum()
+        ranked = share * np.mean(1 - np.minimum(p / z, z / p)) + 1 - share
+        within = share * np.mean(np.abs(p - z) <= 0.01)
+        rows.append([*native, delta1, np.mean(np.abs(s * p - z) / z), within, share, ranked, s])
+    table = score(archive_of(predictions), tiny_root).tables["lattice"]
     assert table.native is not None
     assert table.scaled is not None
-    native = [table.native.abs_rel, table.native.rmse_cm, table.native.mae_cm, table.native.delta1]
-    others = [table.scaled.abs_rel, table.within_mm[10], table.rank_error]
-    assert [*native, *others] == pytest.approx(means[:7].tolist(), rel=1e-12)
-    assert table.scale_median == pytest.approx(np.median([row[7] for row in rows]), rel=1e-12)
+    errors = [table.native.abs_rel, table.native.rmse_cm, table.native.mae_cm, table.native.delta1]
+    found = [*errors, table.scaled.abs_rel, table.within_mm[10], table.coverage, table.rank_error]
+    assert found == pytest.approx(np.mean(rows, axis=0)[:-1].tolist(), rel=1e-12)
+    assert table.scale_median == pytest.approx(np.median([row[-1] for row in rows]), rel=1e-12)
 
 
 def test_json_is_identical_for_workers_and_command_line(
