@@ -48,7 +48,6 @@ def test_file_above_the_limit_is_not_read(tmp_path: Path) -> None:
         (b'{"x": [{"a": 1, "b": {}, "a": 1}]}', "duplicate"),
         (b"[1e999]", "syntax"),
         (b"[NaN]", "syntax"),
-        (b"[-Infinity]", "syntax"),
         (b'["\\ud800"]', "syntax"),
         (b'"\xff"', "syntax"),
         (b"\xef\xbb\xbf{}", "syntax"),
@@ -66,10 +65,11 @@ def test_unclear_or_hostile_json_is_refused(content: bytes, code: str) -> None:
     assert str(problem).isprintable()
 
 
-def test_json_at_the_nesting_limit_is_read() -> None:
+def test_json_at_the_nesting_limit_is_read_and_constants_are_named() -> None:
     value, problems = parse_json(b"[" * MAX_NESTING + b"]" * MAX_NESTING)
     assert isinstance(value, list)
     assert problems == []
+    assert "-Infinity is not JSON" in parse_json(b"[-Infinity]")[1][0].found
 
 
 @pytest.mark.parametrize(
@@ -92,9 +92,7 @@ def test_toml_that_takes_tomllib_seconds_is_refused_at_once(content: str) -> Non
 
 
 def test_long_lists_of_numbers_are_sound_toml() -> None:
-    values, problems = parse_toml(b"a = [" + b"-1.25, " * 50_000 + b"]")
-    assert problems == []
-    assert values == {"a": [-1.25] * 50_000}
+    assert parse_toml(b"a = [" + b"-1.25, " * 50_000 + b"]") == ({"a": [-1.25] * 50_000}, [])
 
 
 def test_only_regular_files_and_links_to_them_are_opened(tmp_path: Path) -> None:
@@ -133,35 +131,13 @@ def test_variable_raises_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
             limits.TOML_BYTES.value()
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "",
-        ".",
-        "..",
-        "../x",
-        "a/../x",
-        "/x",
-        "a//b",
-        "a/",
-        ".x",
-        "a/.x",
-        "a\\b",
-        "a\0",
-        "a\n",
-        "é",
-        "a" * 201,
-        "a/" * 10 + "a",
-    ],
-)
-def test_name_that_is_no_path_below_a_folder_is_refused(name: str) -> None:
-    with pytest.raises(InputError):
-        path_below(Path("/root"), name)
-
-
-def test_names_become_paths_below_a_folder() -> None:
+def test_only_names_below_a_folder_become_paths() -> None:
     assert path_below(Path("/root"), "lattice/0000") == Path("/root/lattice/0000")
     assert path_below(Path("/root"), "pier-2/test-00000-of-00001.parquet").parts[-2] == "pier-2"
+    escaping = ["", ".", "..", "../x", "a/../x", "/x", "a//b", "a/", ".x", "a/.x"]
+    for name in (*escaping, "a\\b", "a\0", "a\n", "é", "a" * 201, "a/" * 10 + "a"):
+        with pytest.raises(InputError):
+            path_below(Path("/root"), name)
 
 
 def test_links_are_never_written_through_or_deleted(tmp_path: Path) -> None:
@@ -289,10 +265,10 @@ def test_lines_are_those_of_the_key_in_its_table(text: str, lines: dict[str, int
     ],
 )
 def test_time_does_not_grow_with_the_square_of_the_file(line: str, is_key: bool) -> None:
-    count = 20_000
+    count = 10_000
     text = "".join(line.format(index) for index in range(count))
     problems = [Problem("unknown", f"key{index}", "not a known key") for index in range(count)]
     start = time.process_time()
     located = with_lines(problems, text.encode())
-    assert time.process_time() - start < 10  # 0.4 s; with a search for each problem more than 60 s.
+    assert time.process_time() - start < 10  # 0.2 s; with a search for each problem more than 15 s.
     assert located[-1].found.startswith(f"line {count}: ") == is_key
