@@ -64,16 +64,6 @@ def test_rows_decode_to_contract_dtypes_and_shapes(tiny_root: Path) -> None:
     assert np.array_equal(row["right_cam_from_world"], right_camera_pose(row["left_cam_from_world"], 0.12))
 
 
-def test_streaming_gives_the_same_rows(tiny_root: Path) -> None:
-    loaded = rdb.load(tiny_root, "lattice")
-    streamed = list(rdb.load(tiny_root, "lattice", streaming=True))
-    assert len(streamed) == VIEWS
-    for a, b in zip(loaded, streamed, strict=True):
-        assert list(a) == list(b)
-        for name in a:
-            assert np.array_equal(a[name], b[name]), name
-
-
 def test_load_errors_name_expected_values(tiny_root: Path, tmp_path: Path) -> None:
     with pytest.raises(rdb.DatasetError, match=r"no config 'lattise', expected one of lattice, lattice-orbit"):
         rdb.load(tiny_root, "lattise")

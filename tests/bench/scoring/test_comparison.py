@@ -77,17 +77,6 @@ def test_paired_difference_below_view_spread_is_decided() -> None:
     assert difference(first, other, "scale_median").verdict == ""
 
 
-@pytest.mark.slow
-def test_equal_quality_is_rarely_decided() -> None:
-    rng = np.random.default_rng(2)
-    decided_count = 0
-    for _ in range(20):
-        view_errors = rng.uniform(0.1, 0.5, 120)
-        first, other = (result_of(view_errors + rng.normal(0, 0.01, 120)) for _ in range(2))
-        decided_count += difference(first, other).verdict != "undecided"
-    assert decided_count <= 3
-
-
 def test_submission_equals_itself() -> None:
     same = result_of(np.linspace(0.1, 0.9, 20))
     for rows in compare(same, same).configs.values():

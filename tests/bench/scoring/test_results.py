@@ -118,7 +118,7 @@ def test_written_result_is_read_unchanged() -> None:
     assert read_result(many, "x").to_json() == many
 
 
-def test_keys_of_later_versions_are_ignored() -> None:
+def test_keys_of_later_versions_are_ignored_and_intervals_may_be_unstated() -> None:
     document = json.loads(SOUND)
     document["extended"] = {"protocol": "x", "tables": {}}
     document["submission"] |= {"licence": "MIT"}
@@ -127,32 +127,21 @@ def test_keys_of_later_versions_are_ignored() -> None:
     document["tables"]["lattice"]["reference"] |= {"two_pixels": {"abs_rel": 0.057}}
     document["tables"]["lattice"]["ci95"] |= {"single_bar": [0.1, 0.2]}
     document["views"][0] |= {"single_bar": 0.1}
-    del document["tables"]["pile"]["ci95"]
-    assert json.loads(read_result(json.dumps(document).encode(), "x").to_json())["tables"]["lattice"] == TABLE
-
-
-def test_result_that_does_not_state_its_intervals_is_read_without_a_statement() -> None:
-    document = json.loads(SOUND)
-    del document["intervals"]
+    del document["tables"]["pile"]["ci95"], document["intervals"]
     read = read_result(json.dumps(document).encode(), "x")
+    assert json.loads(read.to_json())["tables"]["lattice"] == TABLE
     assert read.intervals is None
-    assert json.loads(read.to_json()) == document
+    assert "intervals" not in json.loads(read.to_json())
 
 
 @pytest.mark.parametrize(
     ("content", "location"),
     [
         (b"", "syntax "),
-        (b"\xff", "syntax "),
         (b"[]", "invalid "),
-        (b"null", "invalid "),
-        (b"[" * 100_000, "size "),
         (SOUND.replace(b'"rebar-2"', b'{"a":' * 100 + b"1" + b"}" * 100), "size "),
-        (SOUND.replace(b": 43210", b": " + b"9" * 4400), "syntax "),
         (SOUND.replace(b": 43210", b": " + b"9" * 4000), "invalid views 1: scored_px"),
-        (SOUND.replace(b": 43210", b": " + b"NaN"), "syntax "),
         (SOUND.replace(b": 43210", b": " + b"1e999"), "syntax "),
-        (SOUND.replace(b"my model", b"\\ud800"), "syntax "),
         (SOUND.replace(b'"method":', b'"method": "a", "method":'), "duplicate "),
         (SOUND.replace(b"my model", b"\\u001b[2J"), "invalid submission.method"),
         (SOUND.replace(b"my model", b"m" * 800_000), "invalid submission.method"),
@@ -266,29 +255,25 @@ def test_disclosed_result_has_rank_error_and_coverage_alone() -> None:
     disclosed = json.loads(disclosed_json(RESULT.to_json()))
     assert is_disclosed(disclosed)
     assert not is_disclosed(whole)
-    assert disclosed.pop("hidden_truth") is True
-    tables = disclosed.pop("tables")
-    assert disclosed == {key: whole[key] for key in ("protocol", "dataset", "submission", "software")}
-    for config, table in whole["tables"].items():
-        assert tables[config] == {
+    tables = {
+        config: {
             "coverage": round(table["coverage"], 3),
             "ranked": True,
             "rank_error": round(table["rank_error"], 3),
         }
+        for config, table in whole["tables"].items()
+    }
+    kept = {key: whole[key] for key in ("protocol", "dataset", "submission", "software")}
+    assert disclosed == {**kept, "tables": tables, "hidden_truth": True}
 
 
-def test_new_numbers_of_results_are_not_disclosed() -> None:
+def test_new_numbers_are_not_disclosed_and_a_disclosed_result_is_read() -> None:
     document = RESULT.to_dict()
     for part in (document, document["dataset"], document["submission"], document["tables"]["lattice"]):
         part["new"] = 0.123456
-    assert disclosed_json(json.dumps(document).encode()) == disclosed_json(RESULT.to_json())
-
-
-def test_disclosed_result_is_read_and_disclosed_again_unchanged() -> None:
-    data = disclosed_json(RESULT.to_json())
-    content = read_disclosed(data, "r.json")
-    assert (content.submission.method, content.submission.sha256) == (RESULT.method, RESULT.submission.sha256)
-    assert disclosed_json(data) == data
+    data = disclosed_json(json.dumps(document).encode())
+    assert data == disclosed_json(RESULT.to_json()) == disclosed_json(data)
+    assert read_disclosed(data, "r.json").submission == RESULT.submission
 
 
 @pytest.mark.parametrize(

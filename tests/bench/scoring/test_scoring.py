@@ -259,65 +259,50 @@ def test_score_of_two_pixels_by_hand() -> None:
     assert table.reference.scaled_constant == table.reference.constant
 
 
-def test_groups_are_those_of_a_config_with_splits() -> None:
-    truth = truth_in_memory(("a/test-b-0000",), split="test")
-    tables, _ = score_views([("a", truth)], lambda _: DEPTH_M)
-    assert list(tables["a"].groups["family"]) == ["wall"]
-    assert tables["a"].groups["distance"]["2-4 m"].rank_error == 0
-
-
-BIAS = {
-    "columns.py": {
-        "OTHERS: tuple[Column, ...] = ()": """OTHERS = (Column("bias_mm", "bias", "mm", decimals=1),)"""
-    },
-    "table.py": {
-        "    Field,\n": "    Field,\n    PlainSerializer,\n",
-        "    scaled_constant: Annotated[": """    bias_mm: Annotated[float | None, PlainSerializer(rounded)] = None
-    scaled_constant: Annotated[""",
-        "    reference: Reference\n": """    bias_mm: Annotated[float | None, PlainSerializer(rounded)] = None
-    reference: Reference
-""",
-    },
-    "score.py": {
-        "scaled_constant=constant or": """bias_mm=1000 * float(np.mean(p_m.astype(np.float64) - z_m)),
-        scaled_constant=constant or""",
-        "        published=published,\n": """        bias_mm=mean([view.bias_mm for view in predicted]),
-        published=published,
-""",
-    },
-}
-"""Changes of three files that add a signed number outside the depth metrics: new text by old text."""
+BIAS_FIELD = "    bias_mm: Annotated[float | None, PlainSerializer(rounded)] = None\n"
+BIAS_CHANGES = (
+    ("columns.py", "OTHERS: tuple[Column, ...] = ()", 'OTHERS = (Column("bias_mm", "bias", "mm", decimals=1),)'),
+    ("table.py", "    Field,\n", "    Field,\n    PlainSerializer,\n"),
+    ("table.py", "    scaled_constant: Annotated[", f"{BIAS_FIELD}    scaled_constant: Annotated["),
+    ("table.py", "    reference: Reference\n", f"{BIAS_FIELD}    reference: Reference\n"),
+    (
+        "score.py",
+        "scaled_constant=constant",
+        "bias_mm=1000 * np.mean(p_m - z_m.astype(float)), scaled_constant=constant",
+    ),
+    (
+        "score.py",
+        "published=published,\n",
+        "published=published, bias_mm=mean([view.bias_mm for view in predicted]),\n",
+    ),
+)
+"""Changes of three files that add a signed number outside the depth metrics: old and new text."""
 
 SCORE = """
 import csv, io, json
+from dataclasses import replace
 from rich.console import Console
 from rebar_depth_bench.reporting.html.page import render_report
 from rebar_depth_bench.reporting.latex import latex_table
 from rebar_depth_bench.reporting.tables import print_table
-from rebar_depth_bench.scoring.frames import differences_frame, frame_csv
 from rebar_depth_bench.scoring.comparison import compare
-from rebar_depth_bench.scoring.result import (
-    DatasetIdentity, Result, SoftwareIdentity, SubmissionIdentity, read_result
-)
+from rebar_depth_bench.scoring.frames import frame_csv
+from rebar_depth_bench.scoring.result import read_result
 from rebar_depth_bench.scoring.score import score_views
+from tests.bench.reporting.results import result as result_of
 from tests.bench.scoring.test_scoring import DEPTH_M, truth_in_memory
 
 truth = truth_in_memory(tuple(f"a/{12 * n:04}" for n in range(10)))
-dataset = DatasetIdentity("sha256:" + "0" * 64, "1")
-submission, software = SubmissionIdentity("m", "0" * 64), SoftwareIdentity("1")
-results = []
-for shift_m in (-0.002, 0.003):
-    read = lambda view_id: DEPTH_M + shift_m - int(view_id[2:]) / 1e6
-    tables, views = score_views([("a", truth)], read)
-    results.append(Result(dataset=dataset, submission=submission, software=software, tables=tables, views=views))
-written = results[0].to_json()
+tables, views = score_views([("a", truth)], lambda view_id: DEPTH_M - 0.002 - int(view_id[2:]) / 1e6)
+result = replace(result_of(), tables=tables, views=views)
+written = result.to_json()
 assert read_result(written, "x").to_json() == written
-[row] = csv.DictReader(io.StringIO(frame_csv(results[0].to_pandas())))
-rows = csv.DictReader(io.StringIO(frame_csv(differences_frame([compare(*results).to_dict()]))))
+[row] = csv.DictReader(io.StringIO(frame_csv(result.to_pandas())))
+[compared] = [row for row in compare(result, result).to_dict()["configs"]["a"] if row["name"] == "bias_mm"]
 terminal = io.StringIO()
-print_table(results[0], Console(file=terminal, width=200))
-shown = [terminal.getvalue(), latex_table(results, published=False, intervals=True), render_report(results[0], [])]
-print(json.dumps([json.loads(written), row, next(row for row in rows if row["number"] == "bias_mm"), shown]))
+print_table(result, Console(file=terminal, width=200))
+shown = [terminal.getvalue(), latex_table([result], published=False, intervals=True), render_report(result, [])]
+print(json.dumps([json.loads(written), row, compared, shown]))
 """
 
 
@@ -325,33 +310,23 @@ print(json.dumps([json.loads(written), row, next(row for row in rows if row["num
 def test_signed_number_with_interval_is_added_in_three_files(tmp_path: Path) -> None:
     package = Path(rebar_depth_bench.__file__).parent
     shutil.copytree(package, tmp_path / package.name, ignore=shutil.ignore_patterns("__pycache__"))
-    for name, changes in BIAS.items():
+    for name, old, new in BIAS_CHANGES:
         path = tmp_path / package.name / "scoring" / name
         content = path.read_text()
-        for old, new in changes.items():
-            assert content.count(old) == 1, (name, old)
-            content = content.replace(old, new)
-        path.write_text(content)
-    command = [sys.executable, "-c", SCORE]
+        assert content.count(old) == 1, (name, old)
+        path.write_text(content.replace(old, new))
     environment = {**os.environ, "PYTHONPATH": f"{tmp_path}:{package.parent}"}
     finished = subprocess.run(
-        command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False, timeout=120
+        [sys.executable, "-c", SCORE], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
     )
     assert finished.returncode == 0, finished.stderr
-    document, row, difference, shown = json.loads(finished.stdout)
+    document, row, compared, shown = json.loads(finished.stdout)
     table = document["tables"]["a"]
     assert document["views"][0]["bias_mm"] == pytest.approx(-2, abs=0.001)
     assert table["bias_mm"] == pytest.approx(-2.054, abs=0.001)
     low, high = table["ci95"]["bias_mm"]
     assert low < table["bias_mm"] < high
-    assert [float(row[name]) for name in ("bias_mm", "bias_mm_low", "bias_mm_high")] == [
-        table["bias_mm"],
-        low,
-        high,
-    ]
-    assert float(difference["difference"]) == pytest.approx(5, abs=0.001)
-    assert difference["verdict"] == "", "neither direction of a signed number is better"
-    for text in shown:
-        assert "bias" in text
-        assert "-2.1" in text
+    assert [float(row[f"bias_mm{end}"]) for end in ("", "_low", "_high")] == [table["bias_mm"], low, high]
+    assert compared["verdict"] == "", "neither direction of a signed number is better"
+    assert all("bias" in text and "-2.1" in text for text in shown)
     assert "[-2.1, -2.0]" in shown[1], "LaTeX has the interval"

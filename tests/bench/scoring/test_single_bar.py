@@ -37,17 +37,6 @@ def expected_pixels(bars: ndarray, pixels: ndarray) -> list[bool]:
     return chosen
 
 
-def test_two_bars_side_by_side() -> None:
-    bars = np.zeros((7, 8), np.uint16)
-    bars[:, 1:4], bars[:, 4:7] = 1, 2
-    pixels = scored_pixels(bars > 0, np.ones(bars.shape, np.float32))
-    chosen = pixels[single_bar_pixels(bars, pixels)]
-    # The union of the bars keeps the columns 2 to 5; of these, 3 and 4 touch the other bar.
-    assert sorted({int(pixel) % 8 for pixel in pixels}) == [2, 3, 4, 5]
-    assert sorted({int(pixel) % 8 for pixel in chosen}) == [2, 5]
-    assert len(chosen) == 10
-
-
 @settings(max_examples=30)
 @given(SEEDS)
 def test_pixels_equal_a_loop(seed: int) -> None:
