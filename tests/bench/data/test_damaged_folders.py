@@ -169,6 +169,20 @@ def test_truncated_or_missing_shard_is_named(copy: Path, is_missing: bool) -> No
         assert f"dataset: config {CONFIG} cannot be read" in refusal(copy)
 
 
+@pytest.mark.parametrize(
+    ("footer", "said"),
+    [
+        (b"\x1c" * 200, "the footer is nested too deep"),
+        (b"\x1d\0", "the footer has a value of type 13, which no Parquet file has"),
+        (b"\x17" + bytes(9), r"the footer is damaged \("),
+    ],
+)
+def test_damaged_footer_of_a_shard_is_refused(copy: Path, footer: bytes, said: str) -> None:
+    first_shard(copy).write_bytes(b"PAR1" + footer + len(footer).to_bytes(4, "little") + b"PAR1")
+    with pytest.raises(DatasetError, match=said):
+        read_all(copy)
+
+
 READ_HUGE_IMAGES = """
 import resource, sys
 import rebar_depth_bench as rdb

@@ -221,6 +221,7 @@ def test_rows_under_another_scene_are_refused(tmp_path: Path) -> None:
 def test_extended_measures_of_a_split_use_the_bars_of_each_scene(root: Path, tmp_path: Path) -> None:
     folder = open_folder(root)
     steel = load_steel_truth(folder, folder.config("cages").of_split("train"))
+    assert len(steel) == SPLIT_VIEWS["train"]
     diameters = {view_id: bars.diameter_m[1] for view_id, bars in steel.bars_by_view.items()}
     assert diameters == {view_id: 0.001 if "train-a-" in view_id else 0.002 for view_id in view_ids("train")}
     archive = write_truth(root, tmp_path / "a.zip", "validation", factor=1.25)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import runpy
 import shutil
 import subprocess
 import sys
@@ -17,7 +18,6 @@ from numpy import ndarray
 
 import rebar_depth_bench
 from rebar_depth_bench import DatasetError, SubmissionError, score
-from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.codecs import encode_png
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import iterate_rows, truth_columns, truth_from_row
@@ -34,7 +34,6 @@ from rebar_depth_bench.scoring.reference import (
 )
 from rebar_depth_bench.scoring.score import Truth, ViewTruth, score_views
 from rebar_depth_bench.submission.declaration import Declaration
-from tests.commands import run_in_process
 from tests.damage import change_manifest, change_rows, copy_dataset, first_shard
 
 Depths = dict[str, ndarray]
@@ -103,13 +102,16 @@ def test_score_agrees_with_independent_evaluation(
 
 
 def test_json_is_identical_for_workers_and_command_line(
-    tiny_truth: Depths, tiny_root: Path, archive_of: Archive, tmp_path: Path
+    tiny_truth: Depths, tiny_root: Path, archive_of: Archive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     archive = archive_of({view: 1.1 * depth for view, depth in tiny_truth.items()})
     one_worker, four_workers = (score(archive, tiny_root, workers=workers).to_json() for workers in (1, 4))
     assert one_worker == four_workers
     target = tmp_path / "result.json"
-    assert run_in_process(main, "score", archive, "--data", tiny_root, "--json", target).returncode == 0
+    command = ["rebar-bench", "score", str(archive), "--data", str(tiny_root), "--json", str(target)]
+    monkeypatch.setattr("sys.argv", command)
+    with pytest.raises(SystemExit, match="0"):
+        runpy.run_module("rebar_depth_bench", run_name="__main__")
     assert target.read_bytes() == one_worker
 
 

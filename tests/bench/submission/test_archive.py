@@ -212,6 +212,7 @@ def test_missing_views_and_metadata_are_reported() -> None:
     assert (problem.code, problem.where) == ("missing", "lattice/0001")
     assert problem.expected.startswith(SUFFIXES)
     assert located(problems_of([FIRST, SECOND])) == [("missing", "submission.json")]
+    assert located(problems_of([replace(META, method=8), FIRST, SECOND])) == [("damaged", "submission.json")]
     assert located(problems_of([META])) == [("missing", "")]
     assert located(problems_of([])) == [("missing", "submission.json"), ("missing", "")]
 
@@ -243,6 +244,8 @@ def test_error_shows_20_problems_and_count_of_the_rest() -> None:
         (build(GOOD) + b"x", "damaged"),
         (build(GOOD, count=2), "damaged"),
         (build(GOOD, count=4), "damaged"),
+        (build(GOOD).replace(b"PK\1\2", b"PK\1\3"), "damaged"),
+        (build(GOOD).replace(struct.pack("<H8x", len(ENTRY)), struct.pack("<H8x", 60_000)), "damaged"),
         (build(GOOD, disk=1), "kind"),
         (build(GOOD, count=60_000), "size"),
     ],
