@@ -174,7 +174,7 @@ def test_truncated_or_missing_shard_is_named(copy: Path, is_missing: bool) -> No
     [
         (b"\x1c" * 200, "the footer is nested too deep"),
         (b"\x1d\0", "the footer has a value of type 13, which no Parquet file has"),
-        (b"\x17" + bytes(9), r"the footer is damaged \("),
+        (b"\x07\x02" + bytes(9), r"the footer is damaged \("),
     ],
 )
 def test_damaged_footer_of_a_shard_is_refused(copy: Path, footer: bytes, said: str) -> None:

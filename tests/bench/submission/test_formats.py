@@ -229,6 +229,7 @@ def test_invalid_exr_is_rejected(tmp_path: Path) -> None:
         (good.replace(channel_list, b"Z\0" + struct.pack("<iI2i", 2, 0, 2, 2), 1), "invalid"),
         (good.replace(b"dataWindow", b"dataWindov", 1), "damaged"),
         (good[:8] + b"twice\0int\0\4\0\0\0\1\0\0\0" * 2 + good[8:], "damaged"),
+        (good[:8] + b"long\0int\0\xff\xff\xff\x7f" + good[8:], "damaged"),
         (good[:60], "damaged"),
         (good[:-3], "damaged"),
         (flat[:-8] + b"\xff" * 8, "damaged"),
