@@ -12,6 +12,7 @@ import textwrap
 import time
 from collections.abc import Callable, Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -124,7 +125,7 @@ def test_round_trip_extracts_once(folder: Path, capsys: pytest.CaptureFixture[st
         open_cache(content(inputs=inputs))
     assert len([*folder.iterdir()]) == 2, "other inputs make another entry"
     for count in (0, 1):
-        open_cache(content(lambda _, count=count: views(count=count), count=count))
+        open_cache(content(partial(views, count=count), count=count))
         check_that_it_is_not_extracted(count=count)
 
 
@@ -180,7 +181,11 @@ def test_what_is_no_entry_is_not_read(
         (entry.parent / content(inputs="b").file_name).replace(entry)
     else:
         entry.rename(target)
-        make = {"link": lambda: entry.symlink_to(target), "folder": entry.mkdir, "pipe": lambda: os.mkfifo(entry)}
+        make: dict[str, Callable[[], object]] = {
+            "link": partial(entry.symlink_to, target),
+            "folder": entry.mkdir,
+            "pipe": partial(os.mkfifo, entry),
+        }
         make[kind]()
     assert indices(open_cache(content())) == EXPECTED
     if kind in ("folder", "pipe"):  # They are never deleted, so the entry cannot be written.

@@ -107,7 +107,12 @@ def test_errors_use_common_views_and_shares_use_all_views() -> None:
         assert (row.views, row.verdict) == (20, "worse"), name
 
 
-def test_few_views_have_a_difference_but_no_verdict() -> None:
+def test_chance_differences_and_those_of_few_views_are_undecided() -> None:
+    errors = np.linspace(0.3, 0.5, 20)
+    row = difference(result_of(errors), result_of(errors + 0.01 * (-1.0) ** np.arange(20)))
+    assert row.interval is not None
+    assert row.interval[0] < 0 < row.interval[1]
+    assert row.verdict == "undecided"
     row = difference(result_of(np.full(3, 0.1)), result_of(np.full(3, 0.9)))
     assert row.difference == pytest.approx(0.8)
     assert (row.interval, row.verdict) == (None, "undecided")
