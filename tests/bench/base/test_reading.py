@@ -1,4 +1,4 @@
-"""Strict JSON and TOML, regular files only, and names that stay in their folder."""
+"""Strict JSON and TOML, regular files only, names that stay in their folder, and lines of keys."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from rebar_depth_bench.base import limits
-from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.errors import InputError, Problem
 from rebar_depth_bench.base.reading import (
     MAX_NESTING,
     check_no_links,
@@ -24,6 +24,7 @@ from rebar_depth_bench.base.reading import (
     remove_folder,
 )
 from rebar_depth_bench.base.terminal import terminal_text
+from rebar_depth_bench.base.validation import with_lines
 from rebar_depth_bench.base.writing import write_text
 
 
@@ -47,7 +48,6 @@ def test_file_above_the_limit_is_not_read(tmp_path: Path) -> None:
         (b'{"x": [{"a": 1, "b": {}, "a": 1}]}', "duplicate"),
         (b"[1e999]", "syntax"),
         (b"[NaN]", "syntax"),
-        (b"[-Infinity]", "syntax"),
         (b'["\\ud800"]', "syntax"),
         (b'"\xff"', "syntax"),
         (b"\xef\xbb\xbf{}", "syntax"),
@@ -65,10 +65,11 @@ def test_unclear_or_hostile_json_is_refused(content: bytes, code: str) -> None:
     assert str(problem).isprintable()
 
 
-def test_json_at_the_nesting_limit_is_read() -> None:
+def test_json_at_the_nesting_limit_is_read_and_constants_are_named() -> None:
     value, problems = parse_json(b"[" * MAX_NESTING + b"]" * MAX_NESTING)
     assert isinstance(value, list)
     assert problems == []
+    assert "-Infinity is not JSON" in parse_json(b"[-Infinity]")[1][0].found
 
 
 @pytest.mark.parametrize(
@@ -91,9 +92,7 @@ def test_toml_that_takes_tomllib_seconds_is_refused_at_once(content: str) -> Non
 
 
 def test_long_lists_of_numbers_are_sound_toml() -> None:
-    values, problems = parse_toml(b"a = [" + b"-1.25, " * 50_000 + b"]")
-    assert problems == []
-    assert values == {"a": [-1.25] * 50_000}
+    assert parse_toml(b"a = [" + b"-1.25, " * 50_000 + b"]") == ({"a": [-1.25] * 50_000}, [])
 
 
 def test_only_regular_files_and_links_to_them_are_opened(tmp_path: Path) -> None:
@@ -132,35 +131,13 @@ def test_variable_raises_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
             limits.TOML_BYTES.value()
 
 
-@pytest.mark.parametrize(
-    "name",
-    [
-        "",
-        ".",
-        "..",
-        "../x",
-        "a/../x",
-        "/x",
-        "a//b",
-        "a/",
-        ".x",
-        "a/.x",
-        "a\\b",
-        "a\0",
-        "a\n",
-        "é",
-        "a" * 201,
-        "a/" * 10 + "a",
-    ],
-)
-def test_name_that_is_no_path_below_a_folder_is_refused(name: str) -> None:
-    with pytest.raises(InputError):
-        path_below(Path("/root"), name)
-
-
-def test_names_become_paths_below_a_folder() -> None:
+def test_only_names_below_a_folder_become_paths() -> None:
     assert path_below(Path("/root"), "lattice/0000") == Path("/root/lattice/0000")
     assert path_below(Path("/root"), "pier-2/test-00000-of-00001.parquet").parts[-2] == "pier-2"
+    escaping = ["", ".", "..", "../x", "a/../x", "/x", "a//b", "a/", ".x", "a/.x"]
+    for name in (*escaping, "a\\b", "a\0", "a\n", "é", "a" * 201, "a/" * 10 + "a"):
+        with pytest.raises(InputError):
+            path_below(Path("/root"), name)
 
 
 def test_links_are_never_written_through_or_deleted(tmp_path: Path) -> None:
@@ -198,3 +175,100 @@ def test_output_never_replaces_a_device_or_a_pipe(tmp_path: Path) -> None:
             write_text(target, "content")
     assert pipe.is_fifo()
     assert link.is_symlink()
+
+
+TOML = '''\
+# left.fx = 1, and [right]
+title = """
+[right]
+fx = 2
+"""
+left = { K = [1], "cx" = 3 }  # cy = 4
+note = "fx: 3"
+right.fx = 8
+
+[right.stereo]
+rotation = [
+  [1, 0],
+  [0, 1]
+]
+angle = 15
+[[pose]]
+image = "a"
+[pose.more]
+x = 19
+[[pose]]
+  image = "b"
+[pose.more]
+x = 23
+[lists]
+item = [{ x = 25 }, { x = 25 }]
+'''
+YAML = """\
+%YAML:1.0
+cam0:
+  # fx: 3
+  model: "fx: 4"
+  intrinsics: [1, 2,
+    3]
+cam1:
+  T_cn_cnm1:
+  - [1, 0]
+  fx: 10
+size: 11
+"""
+JSON = '{"left": {"cx": [1, {"deep": 2}]},\n "right":\n  {"cx": "fx:", "fx": 3},\n "size": [\n4,\n5], "width": 6}'
+XML = """\
+<?xml version="1.0"?>
+<opencv_storage>
+<!-- <M1>3</M1>
+-->
+<M2 type_id="opencv-matrix"><rows>5</rows>
+  <data>6 6
+  </data></M2>
+<empty/><M1><rows>8</rows></M1>
+</opencv_storage>
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "lines"),
+    [
+        (TOML, {"left": 6, "left.K": 6, "left.cx": 6, "left.cy": None, "left.fx": None, "title": 2, "fx": None}),
+        (TOML, {"right": 8, "right.fx": 8, "right.stereo.rotation 2: 1": 11, "right.stereo.angle": 15}),
+        (TOML, {"pose": 16, "pose 1: image": 17, "pose 2": 20, "pose 2: image": 21, "pose 3: x": 16}),
+        (TOML, {"pose 1: more.x": 19, "pose 2: more.x": 23, "pose.x": None, "lists.item 2: x": 25}),
+        (YAML, {"cam0.intrinsics": 5, "cam0.fx": None, "cam1.fx": 10, "cam1": 7, "size": 11, "fx": None}),
+        (JSON, {"left.cx": 1, "right.cx": 3, "left.fx": None, "right": 2, "right.fx": 3, "width": 6, "size 2": 4}),
+        (XML, {"M1": 8, "M2.rows": 5, "M2.data": 6, "M1.data": None, "empty": 8, "rows": None}),
+    ],
+)
+def test_lines_are_those_of_the_key_in_its_table(text: str, lines: dict[str, int | None]) -> None:
+    problems = [Problem("invalid", f"a: {where}", "got 1") for where in lines]
+    expected = ["got 1" if line is None else f"line {line}: got 1" for line in lines.values()]
+    assert dict(zip(lines, [one.found for one in with_lines(problems, text.encode(), "a")], strict=True)) == dict(
+        zip(lines, expected, strict=True)
+    )
+
+
+@pytest.mark.parametrize(
+    ("line", "is_key"),
+    [
+        ("key{} = 1\n", True),
+        ("{{a{}: 1, ", False),
+        ("<a{}>", False),
+        ("'''\n{}\"\"\"", False),
+        ("<!-- {}", False),
+        ('"\\"{}', False),
+        ("[a{}.b.c]\n", False),
+        ("  a{}:", False),
+    ],
+)
+def test_time_does_not_grow_with_the_square_of_the_file(line: str, is_key: bool) -> None:
+    count = 10_000
+    text = "".join(line.format(index) for index in range(count))
+    problems = [Problem("unknown", f"key{index}", "not a known key") for index in range(count)]
+    start = time.process_time()
+    located = with_lines(problems, text.encode())
+    assert time.process_time() - start < 10  # 0.2 s; with a search for each problem more than 15 s.
+    assert located[-1].found.startswith(f"line {count}: ") == is_key

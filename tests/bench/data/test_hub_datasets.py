@@ -42,6 +42,13 @@ sys.exit(main(["score", f"{work}/a.zip", "--data", root]))
 """
 
 
+OPEN = """
+import sys
+from rebar_depth_bench.data.manifest import open_folder
+open_folder(sys.argv[1])
+"""
+
+
 @pytest.fixture(scope="module")
 def reading_hub(tiny_root: Path) -> Iterator[HubServer]:
     """Serve the tiny dataset as ``org/data``, at a commit of its own for each revision."""
@@ -52,25 +59,32 @@ def reading_hub(tiny_root: Path) -> Iterator[HubServer]:
         yield server
 
 
-def run_script(root: str, home: Path, endpoint: str) -> subprocess.CompletedProcess[str]:
+def run_script(root: str, home: Path, endpoint: str, script: str = SCRIPT) -> subprocess.CompletedProcess[str]:
     settings = {"HF_HOME": str(home), "HF_ENDPOINT": endpoint, "HF_HUB_OFFLINE": "0", "HF_HUB_DISABLE_XET": "1"}
     quiet = {"HF_HUB_DISABLE_PROGRESS_BARS": "1", "HF_HUB_DISABLE_TELEMETRY": "1", "NO_PROXY": "127.0.0.1"}
-    command = [sys.executable, "-c", SCRIPT, root, str(home.parent)]
+    command = [sys.executable, "-c", script, root, str(home.parent)]
     environment = os.environ | settings | quiet
     return subprocess.run(command, env=environment, capture_output=True, text=True, timeout=300, check=False)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("revision", ["", "@refs/pr/1"])
-def test_revision_selects_the_commit_of_all_files(reading_hub: HubServer, tmp_path: Path, revision: str) -> None:
-    reading_hub.requests.clear()
-    finished = run_script(f"org/data{revision}", tmp_path / "home", reading_hub.url)
+@pytest.fixture(scope="module")
+def filled_home(reading_hub: HubServer, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a cache of the Hub from which everything was read at the revision ``main``."""
+    home = tmp_path_factory.mktemp("hub") / "home"
+    check_reading(reading_hub, "org/data", home, "main")
+    return home
+
+
+def check_reading(hub: HubServer, root: str, home: Path, revision: str) -> None:
+    """Check that all files that the script reads are those of the commit of a revision."""
+    hub.requests.clear()
+    finished = run_script(root, home, hub.url)
     assert finished.returncode == 0, finished.stderr
-    commit = reading_hub.repositories["datasets/org/data"].branches[revision[1:] or "main"]
+    commit = hub.repositories["datasets/org/data"].branches[revision]
     lines = finished.stdout.splitlines()
     assert lines[:3] == [f"{commit} 2", "2", "2"]
     assert "no problem found in 10 files" in lines[3]
-    requests = [request.path for request in reading_hub.requests]
+    requests = [request.path for request in hub.requests]
     shards = [request for request in requests if request.endswith(".parquet")]
     assert shards
     assert all(f"/{commit}/" in request for request in shards)
@@ -78,8 +92,11 @@ def test_revision_selects_the_commit_of_all_files(reading_hub: HubServer, tmp_pa
 
 
 @pytest.mark.slow
-def test_unknown_revision_is_refused(reading_hub: HubServer, tmp_path: Path) -> None:
-    finished = run_script("org/data@v2", tmp_path / "home", reading_hub.url)
+def test_revision_selects_the_commit_of_all_files(
+    reading_hub: HubServer, filled_home: Path, tmp_path: Path
+) -> None:
+    check_reading(reading_hub, "org/data@refs/pr/1", tmp_path / "home", "refs/pr/1")
+    finished = run_script("org/data@v2", filled_home, reading_hub.url, OPEN)
     assert "DatasetError: org/data@v2: not a local folder, and its manifest.json cannot" in finished.stderr
 
 
@@ -102,15 +119,15 @@ def test_hub_without_answer_is_asked_once(hub: HubServer, monkeypatch: pytest.Mo
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("status", "is_read"), [(503, True), (404, False), (401, False)])
+@pytest.mark.parametrize(
+    ("status", "script", "is_read"), [(503, SCRIPT, True), (401, OPEN, False), (404, OPEN, False)]
+)
 def test_cached_manifest_is_read_only_without_an_answer(
-    reading_hub: HubServer, tmp_path: Path, status: int, is_read: bool
+    reading_hub: HubServer, filled_home: Path, status: int, script: str, is_read: bool
 ) -> None:
-    home = tmp_path / "home"
-    assert run_script("org/data", home, reading_hub.url).returncode == 0
     reading_hub.faults["HEAD *"] = lambda _: Response(status_code=status)
     try:
-        finished = run_script("org/data", home, reading_hub.url)
+        finished = run_script("org/data", filled_home, reading_hub.url, script)
     finally:
         reading_hub.faults.clear()
     assert (finished.returncode == 0) == is_read, finished.stderr
@@ -128,6 +145,13 @@ def test_missing_folder_in_a_folder_is_not_asked_at_the_hub(
     with pytest.raises(MethodError, match=r"^org/model: .*, or ORG/NAME where there is no folder ORG"):
         find_checkpoint("org/model")
     assert not [request for request in hub.requests if "/resolve/" in request.path]
+
+
+def test_repository_without_a_connection_is_named() -> None:
+    with pytest.raises(
+        rdb.DatasetError, match=r"not a local folder, and its manifest\.json cannot be downloaded from the Hub"
+    ):
+        rdb.load("nobody/nothing-here", "lattice")
 
 
 @pytest.mark.parametrize(

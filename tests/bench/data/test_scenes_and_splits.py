@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -14,10 +13,8 @@ import pytest
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.base.errors import DatasetError, InputError, SubmissionError
-from rebar_depth_bench.data.files import MANIFEST_FILE, views_digest
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import ConfigViews, Views, truth_problems
-from rebar_depth_bench.data.schema import ViewRecord
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
 from rebar_depth_bench.extended.registry import score_extended
 from rebar_depth_bench.methods.base import Method, MethodInfo, MultiViewMethod, Prepared
@@ -59,31 +56,36 @@ def write_truth(root: Path, archive: Path, split: str, *, leave_out: int = 0, fa
     return archive
 
 
+@pytest.fixture(scope="module")
+def archives(root: Path) -> dict[str, Path]:
+    """Write the ground truth of each split as an archive."""
+    return {split: write_truth(root, root.parent / f"{split}.zip", split) for split in SPLIT_VIEWS}
+
+
 @pytest.mark.parametrize("streaming", [False, True])
-@pytest.mark.parametrize("split", SPLIT_VIEWS)
-def test_load_returns_the_views_of_a_split(root: Path, split: str, streaming: bool) -> None:
-    loaded = rdb.load(root, "cages", split=split, streaming=streaming, columns=["view_id", "scene"])
-    assert str(loaded.split) == split
+@pytest.mark.parametrize("options", [{}, *({"split": split} for split in SPLIT_VIEWS)])
+def test_load_returns_the_views_of_a_split_or_of_test(root: Path, options: Any, streaming: bool) -> None:
+    loaded = rdb.load(root, "cages", streaming=streaming, columns=["view_id", "scene"], **options)
+    expected = options.get("split", "test")
+    assert str(loaded.split) == expected
     rows = list(loaded)
-    assert [row["view_id"] for row in rows] == view_ids(split)
-    assert all(row["view_id"] == f"cages/{split}-{row['scene']}-{row['view_id'][-4:]}" for row in rows)
+    assert [row["view_id"] for row in rows] == view_ids(expected)
+    assert all(row["view_id"] == f"cages/{expected}-{row['scene']}-{row['view_id'][-4:]}" for row in rows)
 
 
-def test_default_split_is_test(root: Path) -> None:
-    assert [row["view_id"] for row in rdb.load(root, "cages", columns=["view_id"])] == view_ids("test")
-
-
-def test_missing_split_is_refused(root: Path, tmp_path: Path) -> None:
+def test_missing_split_and_one_scene_of_several_are_refused(root: Path, tmp_path: Path) -> None:
     write_dataset(tmp_path / "one", ["lattice"], 2)
     with pytest.raises(DatasetError, match="no split train, expected test"):
         rdb.load(tmp_path / "one", "lattice", split="train")
     with pytest.raises(DatasetError, match=r"no split '\\x1b\[m'"):
         rdb.load(root, "cages", split="\x1b[m")
+    with pytest.raises(DatasetError, match="cages has 5 scenes, expected one"):
+        open_folder(root).config("cages").scene  # noqa: B018
 
 
 @pytest.mark.parametrize("split", SPLIT_VIEWS)
-def test_truth_of_one_split_is_perfect(root: Path, tmp_path: Path, split: str) -> None:
-    result = rdb.score(write_truth(root, tmp_path / "a.zip", split), root)
+def test_truth_of_one_split_is_perfect(root: Path, archives: dict[str, Path], split: str) -> None:
+    result = rdb.score(archives[split], root)
     table = result.tables["cages"]
     assert (table.split, table.views, table.rank_error) == (split, SPLIT_VIEWS[split], 0.0)
     assert json.loads(result.to_json())["tables"]["cages"]["split"] == split
@@ -108,24 +110,20 @@ def test_split_that_is_present_must_be_complete(root: Path, tmp_path: Path) -> N
     assert [(problem.code, problem.where) for problem in caught.value.problems] == missing
 
 
-def test_results_of_different_splits_are_not_compared(root: Path, tmp_path: Path) -> None:
-    results = [rdb.score(write_truth(root, tmp_path / f"{split}.zip", split), root) for split in ("train", "test")]
+def test_results_of_different_splits_are_not_compared(root: Path, archives: dict[str, Path]) -> None:
+    results = [rdb.score(archives[split], root) for split in ("train", "test")]
     with pytest.raises(InputError, match="covers the split test of cages, expected train"):
         compare(*results)
 
 
-def test_reports_name_the_split(root: Path, tmp_path: Path) -> None:
-    result = rdb.score(write_truth(root, tmp_path / "a.zip", "validation"), root)
+def test_reports_name_the_split_and_show_its_views(root: Path, archives: dict[str, Path]) -> None:
+    with open_evaluation(archives["validation"], root) as evaluation:
+        result = score_evaluation(evaluation)
+        shown = look_at_views(evaluation, {"cages": list(result.views)}).shown
+    assert [view.score.view_id for view in shown] == view_ids("validation")
     [panel] = figure_content([result], published=True).panels
     assert panel.title == "cages (validation), 3 views"
     assert latex_table([result], published=True).count("cages (validation)") == 2  # Caption and heading.
-
-
-def test_report_shows_views_of_the_split(root: Path, tmp_path: Path) -> None:
-    with open_evaluation(write_truth(root, tmp_path / "a.zip", "train"), root) as evaluation:
-        result = score_evaluation(evaluation)
-        shown = look_at_views(evaluation, {"cages": list(result.views)}).shown
-    assert [view.score.view_id for view in shown] == view_ids("train")
 
 
 INFO = MethodInfo("shifted", "test", ("left_depth", "scene"), False, "here", "none")
@@ -196,11 +194,6 @@ def test_prediction_of_a_split_that_no_config_has_is_refused(tmp_path: Path) -> 
     assert sorted(path.name for path in tmp_path.iterdir()) == ["one"]
 
 
-def test_what_needs_one_scene_refuses_several(root: Path) -> None:
-    with pytest.raises(DatasetError, match="cages has 5 scenes, expected one"):
-        open_folder(root).config("cages").scene  # noqa: B018
-
-
 @pytest.mark.parametrize("streaming", [False, True])
 def test_shards_without_the_column_scene_are_refused(tmp_path: Path, streaming: bool) -> None:
     write_dataset(tmp_path / "new", ["lattice"], 2)
@@ -225,80 +218,12 @@ def test_rows_under_another_scene_are_refused(tmp_path: Path) -> None:
             list(read())
 
 
-Entry = dict[str, Any]
-
-
-def swap_split(entry: Entry) -> None:
-    entry["scenes"][3]["split"] = "train"
-
-
-def share_shard(entry: Entry) -> None:
-    entry["scenes"][1]["shards"] = entry["scenes"][0]["shards"]
-
-
-def repeat_scene(entry: Entry) -> None:
-    entry["scenes"][1]["name"] = "a"
-
-
-def unknown_split(entry: Entry) -> None:
-    entry["scenes"][0]["split"] = "hidden"
-
-
-def escaping_mesh(entry: Entry) -> None:
-    entry["scenes"][2]["mesh"] = "../x.ply"
-
-
-def no_scenes(entry: Entry) -> None:
-    entry["scenes"] = []
-
-
-def scenes_that_are_none(entry: Entry) -> None:
-    entry["scenes"] = {"a": 1}
-
-
-def index_without_digits(entry: Entry) -> None:
-    entry["views"][0]["view_id"] = "cages/train-a-x"
-
-
-def scene_without_views(entry: Entry) -> None:
-    entry["views"] = [view for view in entry["views"] if "train-a-" not in view["view_id"]]
-    entry["ground_truth_digest"] = views_digest(ViewRecord(**view) for view in entry["views"])
-
-
-@pytest.mark.parametrize(
-    ("change", "code", "where"),
-    [
-        (scene_without_views, "missing", "configs.cages.views"),
-        (swap_split, "invalid", "configs.cages.views"),
-        (share_shard, "duplicate", "configs.cages.scenes"),
-        (repeat_scene, "duplicate", "configs.cages.scenes"),
-        (unknown_split, "invalid", "configs.cages.scenes 1: split"),
-        (escaping_mesh, "invalid", "configs.cages.scenes 3: mesh"),
-        (no_scenes, "invalid", "configs.cages.scenes"),
-        (scenes_that_are_none, "invalid", "configs.cages.scenes"),
-        (index_without_digits, "invalid", "configs.cages.views"),
-    ],
-)
-def test_invalid_scenes_of_a_manifest(
-    root: Path, tmp_path: Path, change: Callable[[Entry], None], code: str, where: str
-) -> None:
-    manifest = json.loads((root / MANIFEST_FILE).read_text())
-    change(manifest["configs"]["cages"])
-    (tmp_path / MANIFEST_FILE).write_text(json.dumps(manifest))
-    with pytest.raises(DatasetError) as caught:
-        open_folder(tmp_path)
-    assert (code, where) in [(problem.code, problem.where) for problem in caught.value.problems]
-
-
-def test_extended_measures_use_the_bars_of_each_view_s_scene(root: Path) -> None:
+def test_extended_measures_of_a_split_use_the_bars_of_each_scene(root: Path, tmp_path: Path) -> None:
     folder = open_folder(root)
-    config = folder.config("cages").of_split("train")
-    steel = load_steel_truth(folder, config)
+    steel = load_steel_truth(folder, folder.config("cages").of_split("train"))
+    assert len(steel) == SPLIT_VIEWS["train"]
     diameters = {view_id: bars.diameter_m[1] for view_id, bars in steel.bars_by_view.items()}
     assert diameters == {view_id: 0.001 if "train-a-" in view_id else 0.002 for view_id in view_ids("train")}
-
-
-def test_extended_scoring_of_a_split(root: Path, tmp_path: Path) -> None:
     archive = write_truth(root, tmp_path / "a.zip", "validation", factor=1.25)
     with open_evaluation(archive, root) as evaluation:
         extended = score_extended(evaluation).extended

@@ -7,14 +7,11 @@ from statistics import NormalDist
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from rebar_depth_bench.base.names import view_id
 from rebar_depth_bench.scoring.bootstrap import (
     MIN_BLOCKS,
     RESAMPLES,
-    Resampling,
     half_width,
     interval,
     protocol_indices,
@@ -63,19 +60,11 @@ def test_blocks_do_not_depend_on_the_digits_of_view_ids(first: int) -> None:
     np.testing.assert_array_equal(resample_views(view_ids, by_scene=False).counts, expected.counts)
 
 
-def test_independent_views_give_normal_interval() -> None:
-    values = np.random.default_rng(3).normal(5.0, 2.0, 500)
-    bounds = mean_interval(values, range(0, 6000, 12))
-    assert bounds is not None
-    error = 1.96 * values.std() / math.sqrt(500)
-    assert bounds == pytest.approx((values.mean() - error, values.mean() + error), abs=0.02)
-
-
 @pytest.mark.parametrize(("blocks", "t"), [(8, 2.364624), (10, 2.262157), (24, 2.068658), (61, 2.000298)])
 def test_ends_are_those_of_students_interval(blocks: int, t: float) -> None:
     """Resamples of normal means give the interval mean +- t s / sqrt(n); t is from printed tables."""
     assert half_width(blocks) == pytest.approx(math.sqrt(blocks / (blocks - 1)) * t, rel=1e-6)
-    draws = np.array([NormalDist(3.0, 0.5).inv_cdf((k + 0.5) / 200_000) for k in range(200_000)])
+    draws = np.array([NormalDist(3.0, 0.5).inv_cdf((k + 0.5) / 100_000) for k in range(100_000)])
     error = t * 0.5 * math.sqrt(blocks / (blocks - 1))
     assert interval(draws, blocks) == pytest.approx((3 - error, 3 + error), abs=1e-3)
 
@@ -122,17 +111,6 @@ def test_resampled_median_equals_numpy() -> None:
     assert resampling.percentile(values, np.arange(11), 50) == pytest.approx(by_hand)
 
 
-def test_pooled_percentile_weights_samples_by_view_count() -> None:
-    view = np.repeat(np.arange(6), [3, 1, 0, 5, 2, 4])
-    samples = np.random.default_rng(5).normal(size=len(view))
-    counts = np.array([[0, 2, 1, 1, 0, 0], [1, 1, 1, 1, 1, 1]], dtype=float)
-    resampling = Resampling(counts, np.arange(6))
-    drawn = np.sort(np.r_[np.repeat(samples[view == 1], 2), samples[view == 3]])
-    percentiles = resampling.percentile(samples, view, 95)
-    assert percentiles[0] == drawn[math.ceil(0.95 * len(drawn)) - 1]
-    assert percentiles[1] == np.sort(samples)[math.ceil(0.95 * len(samples)) - 1]
-
-
 def test_few_infinite_or_nan_views_have_no_interval() -> None:
     few, enough = (range(0, 12 * count, 12) for count in (MIN_BLOCKS - 1, MIN_BLOCKS))
     assert mean_interval(np.ones(MIN_BLOCKS - 1), few) is None
@@ -140,31 +118,11 @@ def test_few_infinite_or_nan_views_have_no_interval() -> None:
     assert mean_interval(np.r_[np.ones(9), np.inf], range(0, 120, 12)) is None
     assert mean_interval(np.full(10, np.nan), range(0, 120, 12)) is None
     assert mean_interval(np.ones(84), range(84)) is None  # seven blocks
-    assert np.isnan(resample([]).percentile(np.empty(0), np.empty(0, np.int64), 50)).all()
-
-
-def test_nan_views_are_excluded() -> None:
     values = np.array([np.nan, *np.ones(8), np.nan])
     assert mean_interval(values, range(0, 120, 12)) == (1.0, 1.0)
     values[3] = np.nan
     assert mean_interval(values, range(0, 120, 12)) is None  # seven values
-
-
-@settings(max_examples=30)
-@given(st.lists(st.floats(-1e6, 1e6), min_size=MIN_BLOCKS, max_size=40), st.floats(0.1, 10), st.floats(-100, 100))
-def test_interval_is_within_values_and_follows_their_unit(
-    values: list[float], factor: float, shift: float
-) -> None:
-    indices = range(0, 12 * len(values), 12)
-    bounds = mean_interval(np.array(values), indices)
-    moved_bounds = mean_interval(factor * np.array(values) + shift, indices)
-    assert bounds is not None
-    assert moved_bounds is not None
-    slack = 1e-9 * (1 + max(map(abs, values)))
-    assert min(values) - slack <= bounds[0] <= bounds[1] <= max(values) + slack
-    assert moved_bounds == pytest.approx(
-        [factor * bound + shift for bound in bounds], rel=1e-6, abs=1e-6 + 1e3 * slack
-    )
+    assert np.isnan(resample([]).percentile(np.empty(0), np.empty(0, np.int64), 50)).all()
 
 
 SCENES = np.repeat(np.arange(7), [3, 1, 4, 2, 2, 5, 1])
@@ -207,20 +165,6 @@ def test_few_scenes_have_no_interval_however_many_views() -> None:
         for estimates in (means, medians, scenes.pooled_means(values, view)):
             assert (interval(estimates, scenes.blocks()) is not None) == has_interval
     assert interval(resample_scenes([]).medians(np.empty(0)), 0) is None
-
-
-def test_scenes_give_the_interval_of_clustered_means() -> None:
-    """Errors that views of a scene share make the interval as wide as that of the means of the scenes."""
-    rng = np.random.default_rng(9)
-    of_scene = rng.normal(size=60)
-    values = np.repeat(of_scene, 8) + 0.01 * rng.normal(size=480)
-    by_scene = interval(resample_scenes([str(n // 8) for n in range(480)]).means(values[:, None])[:, 0], 60)
-    by_block = mean_interval(values, range(0, 480 * 12, 12))
-    assert by_scene is not None
-    assert by_block is not None
-    error = 2.001 * of_scene.std(ddof=1) / math.sqrt(60)
-    assert by_scene == pytest.approx((values.mean() - error, values.mean() + error), abs=0.03)
-    assert by_block[1] - by_block[0] < 0.5 * (by_scene[1] - by_scene[0])
 
 
 def test_view_counts_repeat_those_of_the_scenes_of_the_views() -> None:

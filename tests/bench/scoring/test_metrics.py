@@ -1,34 +1,54 @@
-"""Tests of the protocol's metrics: hand-computed cases and properties of every prediction."""
+"""Scored pixels, depth metrics and rank error: hand-computed cases, definitions and properties."""
 
 from __future__ import annotations
 
 import math
 from fractions import Fraction
+from itertools import product
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from numpy import ndarray
 
+from rebar_depth_bench.scoring.columns import rounded
 from rebar_depth_bench.scoring.metrics import (
     depth_metrics,
     is_valid_prediction,
     median,
     median_scale,
     metrics_at_scales,
+    rank_error,
 )
+from rebar_depth_bench.scoring.protocol import interior, scored_pixels
+from rebar_depth_bench.scoring.score import ViewTruth, score_view, tabulate
+from rebar_depth_bench.scoring.table import ViewScore
 
-DEPTHS = hnp.arrays(np.float64, st.integers(1, 40), elements=st.floats(0.05, 50.0))
+MASKS = hnp.arrays(bool, st.tuples(st.integers(1, 12), st.integers(1, 12)))
+INVALID = (np.nan, 0.0, -0.0, -1.0, np.inf, -np.inf)
 
 
-def depth_pairs() -> st.SearchStrategy[tuple[np.ndarray, np.ndarray]]:
-    return st.integers(1, 40).flatmap(
-        lambda n: st.tuples(
-            hnp.arrays(np.float64, n, elements=st.floats(0.05, 50.0)),
-            hnp.arrays(np.float64, n, elements=st.floats(0.05, 50.0)),
-        )
-    )
+@settings(max_examples=50)
+@example(np.ones((5, 7), bool))
+@given(MASKS)
+def test_scored_pixels_are_those_with_depth_and_steel_all_around(mask: ndarray) -> None:
+    """The border of the image is never scored."""
+    height, width = mask.shape
+    inside = np.zeros_like(mask)
+    for v, u in product(range(1, height - 1), range(1, width - 1)):
+        inside[v, u] = mask[v - 1 : v + 2, u - 1 : u + 2].all()
+    assert np.array_equal(interior(mask), inside)
+    depth_m = np.where(np.arange(mask.size).reshape(mask.shape) % 3, 1.0, 0.0).astype(np.float32)
+    pixels = scored_pixels(mask, depth_m)
+    assert pixels.dtype == np.uint32
+    assert np.array_equal(pixels, np.flatnonzero(inside & (depth_m > 0)))
+
+
+def depth_pairs() -> st.SearchStrategy[tuple[ndarray, ndarray]]:
+    arrays = [hnp.arrays(np.float64, st.shared(st.integers(1, 40)), elements=st.floats(0.05, 50.0))] * 2
+    return st.tuples(*arrays)
 
 
 def test_golden_case_by_hand() -> None:
@@ -48,16 +68,9 @@ def test_delta1_is_strict_at_its_threshold() -> None:
     assert depth_metrics(p, z).delta1 == pytest.approx(1 / 3)
 
 
-def test_exact_prediction_has_zero_error() -> None:
-    z = np.linspace(0.1, 17, 101)
-    metrics = depth_metrics(z.copy(), z)
-    assert (metrics.abs_rel, metrics.rmse_cm, metrics.mae_cm, metrics.delta1) == (0.0, 0.0, 0.0, 1.0)
-    assert median_scale(z.copy(), float(np.median(z))) == 1.0
-
-
 @pytest.mark.slow
 @given(depth_pairs())
-def test_metrics_agree_with_exact_rational_arithmetic(pair: tuple[np.ndarray, np.ndarray]) -> None:
+def test_metrics_agree_with_exact_rational_arithmetic(pair: tuple[ndarray, ndarray]) -> None:
     p, z = pair
     n = len(z)
     errors = [abs(Fraction(a) - Fraction(b)) for a, b in zip(p.tolist(), z.tolist(), strict=True)]
@@ -66,36 +79,6 @@ def test_metrics_agree_with_exact_rational_arithmetic(pair: tuple[np.ndarray, np
     assert metrics.abs_rel == pytest.approx(float(abs_rel), rel=1e-12, abs=1e-15)
     assert metrics.mae_cm == pytest.approx(100 * float(sum(errors) / n), rel=1e-12, abs=1e-13)
     assert metrics.rmse_cm == pytest.approx(100 * math.sqrt(sum(e * e for e in errors) / n), rel=1e-12, abs=1e-13)
-
-
-@pytest.mark.slow
-@given(depth_pairs(), st.floats(1e-3, 1e3))
-def test_scaled_error_is_independent_of_unit(pair: tuple[np.ndarray, np.ndarray], unit: float) -> None:
-    p, z = pair
-    first = depth_metrics(median_scale(p, float(np.median(z))) * p, z)
-    second = depth_metrics(median_scale(unit * p, float(np.median(z))) * (unit * p), z)
-    assert first.abs_rel == pytest.approx(second.abs_rel, rel=1e-9, abs=1e-12)
-    assert first.rmse_cm == pytest.approx(second.rmse_cm, rel=1e-9, abs=1e-12)
-
-
-@given(depth_pairs())
-def test_metric_bounds_and_monotonic_tolerances(pair: tuple[np.ndarray, np.ndarray]) -> None:
-    p, z = pair
-    metrics = depth_metrics(p, z)
-    assert 0.0 <= metrics.delta1 <= 1.0
-    assert 0.0 <= metrics.mae_cm <= metrics.rmse_cm * (1 + 1e-12)
-    _, counts = metrics_at_scales(p, z, (1.0,), (3, 5, 10, 20))
-    assert list(counts.values()) == sorted(counts.values())
-    assert all(0 <= count <= len(z) for count in counts.values())
-
-
-@given(DEPTHS, st.integers(0, 2**32 - 1))
-def test_metrics_are_independent_of_pixel_order(z: np.ndarray, seed: int) -> None:
-    p = z[::-1] + 0.5
-    order = np.random.default_rng(seed).permutation(len(z))
-    first, second = depth_metrics(p, z), depth_metrics(p[order], z[order])
-    assert first.abs_rel == pytest.approx(second.abs_rel, rel=1e-12)
-    assert median_scale(p, 1.0) == median_scale(p[order], 1.0)
 
 
 def test_tolerance_is_inclusive_and_uses_first_scale() -> None:
@@ -147,3 +130,66 @@ def test_valid_prediction_is_finite_and_positive() -> None:
 def test_overflow_gives_infinity_without_warning(huge: float) -> None:
     z = np.array([1.0, 2.0, 3.0])
     assert math.isinf(depth_metrics(np.full(3, huge), z).rmse_cm)
+
+
+def scored(p_m: ndarray, z_m: ndarray) -> ViewScore:
+    truth = ViewTruth("lattice/0000", np.arange(len(z_m), dtype=np.uint32), z_m, float(np.median(z_m)))
+    return score_view(truth, p_m.reshape(1, -1))
+
+
+def ranked_value(*views: ViewScore) -> float:
+    """Return the number that ranks: the mean over views, rounded as in the JSON."""
+    value = rounded(tabulate(views).rank_error)
+    assert value is not None
+    return value
+
+
+def noisy_view(seed: int, pixels: int = 300) -> tuple[ndarray, ndarray]:
+    rng = np.random.default_rng(seed)
+    z_m = rng.uniform(0.2, 17.0, pixels).astype(np.float32)
+    p_m = (z_m * rng.lognormal(0, rng.choice([0.001, 0.1, 2.0]), pixels)).astype(np.float32)
+    p_m[rng.uniform(size=pixels) < 0.2] = rng.choice(INVALID)
+    return p_m, z_m
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_rank_error_equals_the_sum_in_pixel_order(dtype: type) -> None:
+    p_m, z_m = noisy_view(1, 20_000)
+    p_m = p_m.astype(dtype)
+    total = 0.0
+    for p, z in zip(p_m.astype(float).tolist(), z_m.astype(float).tolist(), strict=True):
+        total += abs(p - z) / max(p, z) if 0 < p < float("inf") else 1.0
+    assert rank_error(p_m, z_m, is_valid_prediction(p_m)) == total / len(z_m)
+
+
+@pytest.mark.parametrize(
+    ("p", "expected"),
+    [(1.0, 0.0), (2.0, 0.5), (0.5, 0.5), (1e308, 1.0), (5e-324, 1.0), *((value, 1.0) for value in INVALID)],
+)
+def test_rank_error_of_one_pixel(p: float, expected: float) -> None:
+    assert scored(np.array([p]), np.ones(1, np.float32)).rank_error == expected
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 2**32 - 1), st.floats(0, 1), st.sampled_from(INVALID))
+def test_no_removal_improves_what_ranks_or_coverage_or_tolerances(seed: int, share: float, invalid: float) -> None:
+    p_m, z_m = noisy_view(seed)
+    removed = p_m.copy()
+    removed[np.random.default_rng(seed + 1).uniform(size=len(p_m)) < share] = invalid
+    worst = p_m.copy()
+    worst[np.argsort(-np.abs(p_m - z_m))[: int(share * len(p_m))]] = invalid
+    other = scored(*noisy_view(seed + 2))
+    complete = scored(p_m, z_m)
+    for reduced in (scored(removed, z_m), scored(worst, z_m)):
+        assert ranked_value(complete, other) <= ranked_value(reduced, other)
+        assert reduced.coverage <= complete.coverage
+        assert all(reduced.within_mm[t] <= complete.within_mm[t] for t in complete.within_mm)
+
+
+@settings(max_examples=40)
+@given(st.integers(0, 2**32 - 1), st.floats(5e-324, 1e308))
+def test_filling_holes_never_raises_the_rank_error(seed: int, fill: float) -> None:
+    p_m, z_m = noisy_view(seed)
+    filled = np.where(is_valid_prediction(p_m), p_m.astype(np.float64), fill)
+    value = ranked_value(scored(filled, z_m))
+    assert 0 <= value <= ranked_value(scored(p_m, z_m))

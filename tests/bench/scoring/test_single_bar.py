@@ -15,8 +15,6 @@ from hypothesis import strategies as st
 from numpy import ndarray
 
 import rebar_depth_bench as rdb
-from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.extended.ground_truth import load_steel_truth
 from rebar_depth_bench.extended.profiles import DISTANCE_EDGES_M, MIN_PIXELS, profile_samples
 from rebar_depth_bench.extended.regions import REGION_NUMBERS, region_samples
 from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, score_extended
@@ -39,21 +37,12 @@ def expected_pixels(bars: ndarray, pixels: ndarray) -> list[bool]:
     return chosen
 
 
-def test_two_bars_side_by_side() -> None:
-    bars = np.zeros((7, 8), np.uint16)
-    bars[:, 1:4], bars[:, 4:7] = 1, 2
-    pixels = scored_pixels(bars > 0, np.ones(bars.shape, np.float32))
-    chosen = pixels[single_bar_pixels(bars, pixels)]
-    # The union of the bars keeps the columns 2 to 5; of these, 3 and 4 touch the other bar.
-    assert sorted({int(pixel) % 8 for pixel in pixels}) == [2, 3, 4, 5]
-    assert sorted({int(pixel) % 8 for pixel in chosen}) == [2, 5]
-    assert len(chosen) == 10
-
-
-@settings(max_examples=60)
+@settings(max_examples=30)
 @given(SEEDS)
 def test_pixels_equal_a_loop(seed: int) -> None:
-    depth_m, bars = random_images(np.random.default_rng(seed))
+    rng = np.random.default_rng(seed)
+    depth_m, bars = random_images(rng)
+    bars = np.concatenate([[0], rng.permutation(np.arange(1, 60_000))]).astype(np.uint16)[bars]
     pixels = scored_pixels(bars > 0, depth_m)
     assert single_bar_pixels(bars, pixels).tolist() == expected_pixels(bars, pixels)
     truth = steel_truth(depth_m, bars)
@@ -61,28 +50,6 @@ def test_pixels_equal_a_loop(seed: int) -> None:
 
 
 @settings(max_examples=30)
-@given(SEEDS)
-def test_other_ids_choose_the_same_pixels(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    depth_m, bars = random_images(rng)
-    names = np.concatenate([[0], rng.permutation(np.arange(1, 60_000))]).astype(np.uint16)
-    pixels = scored_pixels(bars > 0, depth_m)
-    assert np.array_equal(single_bar_pixels(names[bars], pixels), single_bar_pixels(bars, pixels))
-
-
-@settings(max_examples=30)
-@given(SEEDS)
-def test_one_bar_has_the_whole_interior(seed: int) -> None:
-    depth_m, bars = random_images(np.random.default_rng(seed))
-    one = (bars > 0).astype(np.uint16)
-    assert single_bar_pixels(one, scored_pixels(one > 0, depth_m)).all()
-    truth = steel_truth(depth_m, one)
-    if truth.interior.any():
-        p_m = truth.depth_m.astype(np.float64)
-        assert region_samples(p_m, truth)["single_bar_share"] == [1.0]
-
-
-@settings(max_examples=40)
 @given(SEEDS)
 def test_measures_equal_numpy_on_the_chosen_pixels(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -104,19 +71,6 @@ def test_measures_equal_numpy_on_the_chosen_pixels(seed: int) -> None:
         assert samples["single_bar_abs_rel"] == pytest.approx([np.mean(np.abs(p - z) / z)], rel=1e-12)
         assert samples["single_bar_rmse_cm"] == pytest.approx([100 * math.sqrt(np.mean((p - z) ** 2))], rel=1e-12)
         assert samples["single_bar_delta1"] == [np.mean(np.maximum(p / z, z / p) < 1.25)]
-
-
-def test_shift_by_one_pixel_costs_less_on_single_bars() -> None:
-    """Exact depth shifted by one pixel is exact on flat bars, but not where another bar is within one pixel."""
-    depth_m, bars = np.full((9, 14), 0.5, np.float32), np.zeros((9, 14), np.uint16)
-    bars[:, 1:7], bars[:, 7:13] = 1, 2
-    depth_m[:, 7:13] = 0.8
-    truth = steel_truth(depth_m, bars)
-    shifted_m = np.roll(depth_m, 1, axis=1).astype(np.float64).ravel()[truth.index]
-    samples = region_samples(shifted_m, truth)
-    assert samples["single_bar_abs_rel"] == [0.0]
-    assert samples["single_bar_views_abs_rel"] == samples["interior_abs_rel"]
-    assert samples["interior_abs_rel"][0] > 0.03
 
 
 def test_steel_without_a_bar_id_is_scored_but_in_no_region() -> None:
@@ -177,21 +131,6 @@ def rendered(root: Path, config: str) -> Mapping[str, tuple[ndarray, ndarray, nd
         row["view_id"]: (row["left_bars"], interior(row["left_mask"]), row["left_depth"])
         for row in rdb.load(root, config, streaming=True, columns=columns)
     }
-
-
-def test_rendered_views(tiny_root: Path) -> None:
-    folder = open_folder(tiny_root)
-    steel = load_steel_truth(folder, folder.config("lattice"))
-    images = rendered(tiny_root, "lattice")
-    shares = []
-    for truth in map(steel.view, range(len(steel))):
-        bars, inside, _ = images[truth.view_id]
-        pixels, single_bar = truth.index[truth.interior], truth.single_bar[truth.interior]
-        assert np.array_equal(pixels, np.flatnonzero(inside))
-        assert single_bar.tolist() == expected_pixels(bars, pixels)
-        assert not truth.single_bar[~truth.interior].any()
-        shares.append(single_bar.mean())
-    assert min(shares) < max(shares) < 1
 
 
 def test_measures_of_a_config_are_those_of_its_pixels(

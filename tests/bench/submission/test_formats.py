@@ -19,8 +19,18 @@ from PIL import Image
 
 from rebar_depth_bench.submission.entries import FORMATS
 from tests.bench.submission import zips
-from tests.bench.submission.conftest import Check
-from tests.bench.submission.zips import DEPTH, SHAPE, Array, chunk, npy, npy_header, npz, png, with_view
+from tests.bench.submission.zips import (
+    DEPTH,
+    SHAPE,
+    Array,
+    chunk,
+    npy,
+    npy_header,
+    npz,
+    png,
+    problems_of,
+    with_view,
+)
 
 NAME = "lattice/0000"
 UNITS = np.arange(12, dtype=np.uint16).reshape(SHAPE) * 5000
@@ -104,10 +114,6 @@ def test_tiled_exr_is_decoded(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("data", "code"),
     [
-        (
-            npy(np.array([[{}]], object), allow_pickle=True),
-            "invalid",
-        ),
         (pickle.dumps(DEPTH), "syntax"),
         (npy(DEPTH.astype(int)), "invalid"),
         (npy(DEPTH.astype(complex)), "invalid"),
@@ -115,36 +121,28 @@ def test_tiled_exr_is_decoded(tmp_path: Path) -> None:
         (npy(DEPTH.T), "invalid"),
         (npy(DEPTH[None]), "invalid"),
         (npy(np.array(3.0)), "invalid"),
-        (
-            npy_header(HEADER.format("'<f4'", "(400000, 400000)")) + VALUES,
-            "invalid",
-        ),
+        (npy_header(HEADER.format("'<f4'", "(400000, 400000)")) + VALUES, "invalid"),
         (npy(DEPTH)[:-1], "size"),
         (npy(DEPTH) + b"x", "size"),
         (npy(DEPTH)[:40], "damaged"),
         (npy(DEPTH)[:8], "damaged"),
         (npy_header(" " * 4090, b"\2\0"), "size"),
         (npy_header("", b"\2\0")[:8] + b"\xff\xff\xff\xff", "size"),
-        (
-            npy_header("__import__('os')"),
-            "syntax",
-        ),
-        (
-            npy_header(HEADER.format("'<f4'", "(3, 4)") + "; x") + VALUES,
-            "syntax",
-        ),
+        (npy_header("__import__('os')"), "syntax"),
+        (npy_header(HEADER.format("'<f4'", "(3, 4)") + "; x") + VALUES, "syntax"),
         (npy_header("{'shape': (3, 4)}" + VALUES.hex()), "syntax"),
         (b"\x93NUMPY\x09\0" + VALUES, "syntax"),
         (b"", "syntax"),
     ],
 )
-def test_invalid_npy_is_rejected(check: Check, data: bytes, code: str) -> None:
-    (problem,) = check(with_view(".npy", data))
+def test_invalid_npy_is_rejected(data: bytes, code: str) -> None:
+    (problem,) = problems_of(with_view(".npy", data))
     assert (problem.code, problem.where) == (code, "lattice/0000.npy")
 
 
-def test_pickled_objects_are_named(check: Check) -> None:
-    (problem,) = check(with_view(".npy", npy(np.array([[{}]], object), allow_pickle=True)))
+def test_pickled_objects_are_named() -> None:
+    (problem,) = problems_of(with_view(".npy", npy(np.array([[{}]], object), allow_pickle=True)))
+    assert (problem.code, problem.where) == ("invalid", "lattice/0000.npy")
     assert "pickled Python objects" in problem.found
 
 
@@ -157,25 +155,19 @@ INNER = zips.Record(b"depth.npy", npy(DEPTH))
         (npz(a=DEPTH, b=DEPTH), "invalid"),
         (npz(), "invalid"),
         (npz(a=DEPTH.T), "invalid"),
-        (
-            npz(a=np.zeros((300, 300))),
-            "size",
-        ),
+        (npz(a=np.zeros((300, 300))), "size"),
         (b"not a zip at all, nor long", "syntax"),
         (npz(a=DEPTH)[:-5], "damaged"),
         (zips.build([INNER, INNER]), "invalid"),
         (zips.build([zips.Record(b"a.txt", b"x")]), "invalid"),
-        (
-            zips.build([replace(INNER, flags=1)]),
-            "kind",
-        ),
+        (zips.build([replace(INNER, flags=1)]), "kind"),
         (zips.build([replace(INNER, crc=1)]), "damaged"),
         (zips.build([replace(INNER, name=b"../a.npy")]), "name"),
         (zips.build([INNER], count=7), "damaged"),
     ],
 )
-def test_invalid_npz_is_rejected(check: Check, data: bytes, code: str) -> None:
-    (problem,) = check(with_view(".npz", data))
+def test_invalid_npz_is_rejected(data: bytes, code: str) -> None:
+    (problem,) = problems_of(with_view(".npz", data))
     assert problem.code == code
     assert problem.where.startswith("lattice/0000.npz")
 
@@ -196,10 +188,7 @@ IEND = chunk(b"IEND", b"")
         (GOOD_PNG[:20], "damaged"),
         (GOOD_PNG + b"x", "damaged"),
         (GOOD_PNG[:50] + b"\xff" + GOOD_PNG[51:], "damaged"),
-        (
-            png(UNITS, idat=zlib.compress(ROWS[:-9])),
-            "size",
-        ),
+        (png(UNITS, idat=zlib.compress(ROWS[:-9])), "size"),
         (png(UNITS, idat=zlib.compress(ROWS)[:-4]), "size"),
         (png(UNITS, idat=zlib.compress(bytes(10**6))), "size"),
         (png(UNITS, idat=b"nonsense"), "damaged"),
@@ -209,17 +198,17 @@ IEND = chunk(b"IEND", b"")
         (b"GIF89a..", "syntax"),
     ],
 )
-def test_invalid_png_is_rejected(check: Check, data: bytes, code: str) -> None:
-    (problem,) = check(with_view(".png", data))
+def test_invalid_png_is_rejected(data: bytes, code: str) -> None:
+    (problem,) = problems_of(with_view(".png", data))
     assert (problem.code, problem.where) == (code, "lattice/0000.png")
 
 
-def test_png_ancillary_chunks_never_reach_pillow(check: Check) -> None:
+def test_png_ancillary_chunks_never_reach_pillow() -> None:
     bomb = chunk(b"zTXt", b"k\0\0" + zlib.compress(bytes(10**7))) + chunk(b"acTL", struct.pack(">2I", 9, 9))
-    assert check(with_view(".png", GOOD_PNG[:33] + bomb + GOOD_PNG[33:])) == []
+    assert problems_of(with_view(".png", GOOD_PNG[:33] + bomb + GOOD_PNG[33:])) == []
 
 
-def test_invalid_exr_is_rejected(check: Check, tmp_path: Path) -> None:
+def test_invalid_exr_is_rejected(tmp_path: Path) -> None:
     def exr(channels: dict[str, Array], **header: object) -> bytes:
         return zips.exr(tmp_path / "a.exr", channels, **header)
 
@@ -237,16 +226,15 @@ def test_invalid_exr_is_rejected(check: Check, tmp_path: Path) -> None:
         (good[:5] + b"\x08" + good[6:], "invalid"),
         (good[:4] + b"\x01" + good[5:], "invalid"),
         (good.replace(window, struct.pack("<4i", 0, 0, 2**31 - 2, 2**31 - 2), 1), "invalid"),
-        (
-            good.replace(channel_list, b"Z\0" + struct.pack("<iI2i", 2, 0, 2, 2), 1),
-            "invalid",
-        ),
+        (good.replace(channel_list, b"Z\0" + struct.pack("<iI2i", 2, 0, 2, 2), 1), "invalid"),
         (good.replace(b"dataWindow", b"dataWindov", 1), "damaged"),
+        (good[:8] + b"twice\0int\0\4\0\0\0\1\0\0\0" * 2 + good[8:], "damaged"),
+        (good[:8] + b"long\0int\0\xff\xff\xff\x7f" + good[8:], "damaged"),
         (good[:60], "damaged"),
         (good[:-3], "damaged"),
         (flat[:-8] + b"\xff" * 8, "damaged"),
         (b"nothing", "syntax"),
     ]
     for data, code in cases:
-        (problem,) = check(with_view(".exr", data))
+        (problem,) = problems_of(with_view(".exr", data))
         assert (problem.code, problem.where) == (code, "lattice/0000.exr")

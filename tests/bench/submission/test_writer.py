@@ -1,4 +1,4 @@
-"""Tests of ``SubmissionWriter``: archive contents, atomicity and validation of its input."""
+"""``SubmissionWriter`` and ``submission.json``: what is written, read and refused."""
 
 from __future__ import annotations
 
@@ -8,38 +8,41 @@ import struct
 import time
 import zipfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
-from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.errors import InputError, ProblemCode
 from rebar_depth_bench.submission import SubmissionReader, SubmissionWriter
-from tests.bench.submission.conftest import located
-from tests.bench.submission.zips import DEPTH, EXPECTED, SHAPE, Array, check_archive
+from rebar_depth_bench.submission.declaration import SubmissionMeta, parse_metadata
+from tests.bench.submission.zips import (
+    DEPTH,
+    EXPECTED,
+    FIRST,
+    SECOND,
+    SHAPE,
+    Array,
+    Record,
+    check_archive,
+    deflated,
+    located,
+    png,
+    problems_of,
+)
 
 
 def write(path: Path, **options: object) -> None:
     with SubmissionWriter(path, "my model", **options) as writer:  # type: ignore[arg-type]
-        writer.add("lattice/0000", DEPTH)
+        writer.add("lattice/0000", DEPTH, seconds=0.25)
         writer.add("lattice/0001", DEPTH[::-1].astype(np.float16))
-
-
-def interrupt(path: Path) -> None:
-    with SubmissionWriter(path, "other") as writer:
-        writer.add("lattice/0000", DEPTH)
-        raise KeyboardInterrupt
 
 
 @pytest.mark.parametrize("compress", [False, True])
 def test_written_archive_reads_back(tmp_path: Path, compress: bool) -> None:
     path = tmp_path / "s.zip"
-    write(
-        path,
-        compress=compress,
-        description="d",
-        url="https://x.org/a",
-        runtime={"gpu": "none"},
-    )
+    about: dict[str, Any] = {"description": "d", "url": "https://x.org/a"}
+    write(path, compress=compress, **about, runtime={"gpu": "none"})
     assert check_archive(path, EXPECTED) == []
     with SubmissionReader(path, EXPECTED) as reader:
         assert reader.view_ids == ("lattice/0000", "lattice/0001")
@@ -47,19 +50,15 @@ def test_written_archive_reads_back(tmp_path: Path, compress: bool) -> None:
         half = reader.read("lattice/0001")
         assert half.dtype == np.float16
         np.testing.assert_array_equal(half, DEPTH[::-1].astype(np.float16))
-        meta = reader.meta
-    assert meta is not None
-    assert (meta.method, meta.description, meta.url) == ("my model", "d", "https://x.org/a")
-    assert (meta.runtime, meta.depth_scale) == ({"gpu": "none"}, None)
-
-
-def test_zipfile_and_numpy_read_written_archive(tmp_path: Path) -> None:
-    write(tmp_path / "s.zip")
-    with zipfile.ZipFile(tmp_path / "s.zip") as archive:
+        runtime = {"gpu": "none", "seconds": {"lattice/0000": 0.25}}
+        assert reader.meta == SubmissionMeta(method="my model", **about, runtime=runtime)
+    with zipfile.ZipFile(path) as archive:
         assert archive.testzip() is None
         assert [info.external_attr >> 16 for info in archive.infolist()] == [0o100644] * 3
         with archive.open("lattice/0000.npy") as entry:
             np.testing.assert_array_equal(np.load(entry), DEPTH)
+    if not compress:
+        assert path.read_bytes().index(DEPTH.tobytes()) % 64 == 0, "stored values are aligned"
 
 
 @pytest.mark.parametrize("compress", [False, True])
@@ -76,64 +75,37 @@ def test_same_predictions_give_identical_bytes(
     assert (tmp_path / "a.zip").read_bytes() == (tmp_path / "b.zip").read_bytes()
 
 
-def test_stored_values_are_64_byte_aligned_in_file(tmp_path: Path) -> None:
-    write(tmp_path / "s.zip")
-    content = (tmp_path / "s.zip").read_bytes()
-    assert content.index(DEPTH.tobytes()) % 64 == 0
-
-
-def test_exception_keeps_existing_archive_and_leaves_no_file(tmp_path: Path) -> None:
-    path = tmp_path / "s.zip"
-    write(path)
-    before = path.read_bytes()
-    with pytest.raises(KeyboardInterrupt):
-        interrupt(path)
-    assert path.read_bytes() == before
-    assert list(tmp_path.iterdir()) == [path]
-
-
-def test_archive_appears_only_on_exit(tmp_path: Path) -> None:
+def test_archive_appears_on_exit_alone_and_replaces_none_after_an_exception(tmp_path: Path) -> None:
     path = tmp_path / "s.zip"
     with SubmissionWriter(path, "m") as writer:
         writer.add("lattice/0000", DEPTH)
         assert not path.exists()
-    assert path.exists()
+    before = path.read_bytes()
+    with pytest.raises(ZeroDivisionError), SubmissionWriter(path, "other") as writer:
+        writer.add("lattice/0000", DEPTH, seconds=1 / 0)
+    assert path.read_bytes() == before
+    assert list(tmp_path.iterdir()) == [path]
 
 
-def test_seconds_are_stored_in_runtime(tmp_path: Path) -> None:
-    with SubmissionWriter(tmp_path / "s.zip", "m", runtime={"gpu": "x"}) as writer:
-        writer.add("lattice/0000", DEPTH, seconds=0.25)
-    with zipfile.ZipFile(tmp_path / "s.zip") as archive:
-        runtime = json.loads(archive.read("submission.json"))["runtime"]
-    assert runtime == {"gpu": "x", "seconds": {"lattice/0000": 0.25}}
+class Tensor:
+    def __array__(self, dtype: object = None, copy: object = None) -> Array:
+        return np.asfortranarray(DEPTH.astype(">f4"))
 
 
-def test_invalid_values_and_other_dtypes_are_written(tmp_path: Path) -> None:
+def test_invalid_values_lists_and_array_interfaces_are_written(tmp_path: Path) -> None:
     values = np.array([[np.nan, np.inf, -np.inf, 0.0], [-1.0, 1e300, 1e-300, 2.0], [1, 2, 3, 4]])
     with SubmissionWriter(tmp_path / "s.zip", "m") as writer:
-        writer.add("lattice/0000", values)
-        writer.add("lattice/0001", np.asfortranarray(DEPTH.astype(">f4")))
+        writer.add("lattice/0000", values.tolist())
+        writer.add("lattice/0001", Tensor())
     with SubmissionReader(tmp_path / "s.zip", EXPECTED) as reader:
         with np.errstate(over="ignore", under="ignore"):
             np.testing.assert_array_equal(reader.read("lattice/0000"), values.astype(np.float32))
         np.testing.assert_array_equal(reader.read("lattice/0001"), DEPTH)
 
 
-class Tensor:
-    def __array__(self, dtype: object = None, copy: object = None) -> Array:
-        return DEPTH
-
-
 class GpuTensor:
     def __array__(self, dtype: object = None, copy: object = None) -> Array:
         raise TypeError("can't convert cuda:0 device type tensor to numpy")
-
-
-def test_add_accepts_array_interface_and_lists(tmp_path: Path) -> None:
-    with SubmissionWriter(tmp_path / "s.zip", "m") as writer:
-        writer.add("lattice/0000", Tensor())
-        writer.add("lattice/0001", DEPTH.tolist())
-    assert check_archive(tmp_path / "s.zip", EXPECTED) == []
 
 
 @pytest.mark.parametrize(
@@ -209,3 +181,70 @@ def test_archive_past_zip64_limit_reads_back(tmp_path: Path, monkeypatch: pytest
     assert b"PK\x06\x06" in content
     assert struct.pack("<L", 0xFFFFFFFF) in content
     assert check_archive(path, views) == []
+
+
+def test_optional_and_unknown_keys_are_accepted() -> None:
+    for text in (b'{"method": "m", "colour": [1]}', b'{"method": "m", "url": null, "depth_scale": null}'):
+        assert parse_metadata(text) == (SubmissionMeta(method="m"), [])
+    full: dict[str, Any] = {"method": "Größe 2", "description": "d", "url": "http://x.org", "inputs": "rgb+K"}
+    full |= {"uses_ground_truth": False, "depth_scale": 1, "runtime": {"seconds": 1.5}}
+    assert parse_metadata(json.dumps(full).encode()) == (SubmissionMeta(**full), [])
+
+
+@pytest.mark.parametrize("runtime", ["3", "1.5", '"fast"', '{"seconds": [1, null]}', "1" + "0" * 400])
+def test_runtime_is_kept_unchanged(runtime: str) -> None:
+    meta, _ = parse_metadata(f'{{"method": "m", "runtime": {runtime}}}'.encode())
+    assert meta is not None
+    assert json.dumps(meta.runtime) == runtime
+
+
+@pytest.mark.parametrize(
+    ("text", "code", "key"),
+    [
+        ("", "syntax", ""),
+        ("[]", "invalid", ""),
+        ('{"method": "m", "runtime": {"a": 1, "a": 2}}', "duplicate", ""),
+        ("{}", "missing", ": method"),
+        ('{"method": null}', "missing", ": method"),
+        ('{"method": 3}', "invalid", ": method"),
+        ('{"method": "  "}', "invalid", ": method"),
+        ('{"method": "a\\u0000b"}', "invalid", ": method"),
+        ('{"method": "' + "m" * 201 + '"}', "invalid", ": method"),
+        ('{"method": "m", "description": 3}', "invalid", ": description"),
+        ('{"method": "m", "description": "a\\u0000b"}', "invalid", ": description"),
+        ('{"method": "m", "url": "javascript:alert(1)"}', "invalid", ": url"),
+        ('{"method": "m", "url": "http://[::1"}', "invalid", ": url"),
+        ('{"method": "m", "url": true}', "invalid", ": url"),
+        ('{"method": "m", "inputs": "sonar"}', "invalid", ": inputs"),
+        ('{"method": "m", "inputs": ["rgb"]}', "invalid", ": inputs"),
+        ('{"method": "m", "uses_ground_truth": "no"}', "invalid", ": uses_ground_truth"),
+        ('{"method": "m", "depth_scale": 0}', "invalid", ": depth_scale"),
+        ('{"method": "m", "depth_scale": true}', "invalid", ": depth_scale"),
+        ('{"method": "m", "depth_scale": "0.001"}', "invalid", ": depth_scale"),
+        ('{"method": "m", "depth_scale": 1' + "0" * 400 + "}", "invalid", ": depth_scale"),
+        ('{"method": "m", "x": 1' + "0" * 5000 + "}", "syntax", ""),
+        ('{"method": "m", "runtime": [1]}', "invalid", ": runtime"),
+        ('{"method": "m", "runtime": true}', "invalid", ": runtime"),
+    ],
+)
+def test_invalid_metadata_is_rejected(text: str, code: ProblemCode, key: str) -> None:
+    (problem,) = problems_of([Record(b"submission.json", text.encode()), FIRST, SECOND])
+    assert (problem.code, problem.where) == (code, f"submission.json{key}")
+    assert str(problem).isprintable()
+
+
+def test_oversized_metadata_and_all_problems_are_reported_at_once() -> None:
+    problems = problems_of([deflated(b"submission.json", bytes(5_000_000)), FIRST, SECOND])
+    assert located(problems) == located(parse_metadata(bytes(5_000_000))[1]) == [("size", "submission.json")]
+    meta, problems = parse_metadata(b'{"method": 1, "url": 2, "depth_scale": -1}')
+    assert meta is None
+    keys = ("depth_scale", "method", "url")
+    assert sorted(problem.where for problem in problems) == [f"submission.json: {key}" for key in keys]
+
+
+def test_png_without_depth_scale_is_one_problem() -> None:
+    units = (DEPTH * 1000).astype("u2")
+    views = [Record(f"lattice/000{index}.png".encode(), png(units)) for index in range(2)]
+    (problem,) = problems_of([Record(b"submission.json", b'{"method": "m"}'), *views])
+    assert (problem.code, problem.where) == ("missing", "submission.json: depth_scale")
+    assert "2 entries are PNG (first lattice/0000.png)" in problem.expected

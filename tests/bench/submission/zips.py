@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import io
 import struct
+import tempfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -139,3 +140,16 @@ def with_first(**changes: object) -> list[Record]:
 def with_view(suffix: str, data: bytes) -> list[Record]:
     """Return the records of ``GOOD`` with an entry of another suffix and content for the first view."""
     return [META, Record(b"lattice/0000" + suffix.encode(), data), SECOND]
+
+
+def problems_of(archive: list[Record] | bytes, expected: ExpectedViews = EXPECTED) -> list[Problem]:
+    """Return the problems of an archive with this content."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "submission.zip"
+        path.write_bytes(archive if isinstance(archive, bytes) else build(archive))
+        return check_archive(path, expected)
+
+
+def located(problems: Iterable[Problem]) -> list[tuple[str, str]]:
+    """Return code and location of every problem."""
+    return [(problem.code, problem.where) for problem in problems]

@@ -1,0 +1,137 @@
+"""Dataset folders read with datasets, with load and row by row."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import datasets
+import numpy as np
+import pytest
+
+import rebar_depth_bench as rdb
+from rebar_depth_bench.base.errors import DatasetError
+from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.data.rows import iterate_rows
+from rebar_depth_bench.data.schema import COLUMNS, ROW_SCHEMA, features
+from rebar_depth_bench.data.shards import encoded_rows
+from rebar_depth_bench.geometry.cameras import ideal_K, right_camera_pose
+from tests.damage import change_rows, copy_dataset, first_shard
+
+HEIGHT, WIDTH, VIEWS = 90, 160, 9
+
+
+def test_plain_datasets_loads_folder(tiny_root: Path) -> None:
+    loaded = datasets.load_dataset(str(tiny_root), "lattice", split="test")
+    assert loaded.features == features()
+    assert len(loaded) == VIEWS
+    row = loaded[0]
+    assert row["left_rgb"].size == (WIDTH, HEIGHT)
+    assert row["left_mask"].mode == "1"
+    assert row["left_bars"].mode.startswith("I;16")
+    assert row["left_preview"].mode == "P"
+
+
+def test_view_ids_of_the_manifest_are_indices_of_the_full_protocol(tiny_root: Path) -> None:
+    folder = open_folder(tiny_root)
+    assert folder.configs == ("lattice", "lattice-orbit")
+    assert len(folder.expected_views()) == VIEWS + 2
+    assert set(folder.expected_views().values()) == {(HEIGHT, WIDTH)}
+    assert folder.digest.startswith("sha256:")
+    view_ids = rdb.load(tiny_root, "lattice", columns=["view_id"])["view_id"]
+    assert list(view_ids) == [f"lattice/{(2 * i + 1) * 504 // 18:04d}" for i in range(VIEWS)]
+
+
+def test_rows_decode_to_contract_dtypes_and_shapes(tiny_root: Path) -> None:
+    row = rdb.load(tiny_root, "lattice")[4]
+    assert list(row) == list(features())
+    for eye in ("left", "right"):
+        for kind, dtype, shape in (
+            ("rgb", np.uint8, (HEIGHT, WIDTH, 3)),
+            ("depth", np.float32, (HEIGHT, WIDTH)),
+            ("mask", np.bool_, (HEIGHT, WIDTH)),
+            ("bars", np.uint16, (HEIGHT, WIDTH)),
+            ("K", np.float64, (3, 3)),
+            ("distortion", np.float64, (5,)),
+            ("cam_from_world", np.float64, (4, 4)),
+        ):
+            array = row[f"{eye}_{kind}"]
+            assert (array.dtype, array.shape) == (dtype, shape), f"{eye}_{kind}"
+        assert np.array_equal(row[f"{eye}_K"], ideal_K(WIDTH, HEIGHT))
+        assert np.array_equal(row[f"{eye}_mask"], row[f"{eye}_bars"] > 0)
+        assert 0.03 < row[f"{eye}_mask"].mean() < 0.3
+    assert row["baseline_m"] == 0.12
+    assert np.array_equal(row["right_cam_from_world"], right_camera_pose(row["left_cam_from_world"], 0.12))
+
+
+def test_load_errors_name_expected_values(tiny_root: Path, tmp_path: Path) -> None:
+    with pytest.raises(rdb.DatasetError, match=r"no config 'lattise', expected one of lattice, lattice-orbit"):
+        rdb.load(tiny_root, "lattise")
+    with pytest.raises(rdb.DatasetError, match=r"no column 'depth', expected some of view_id, scene, left_rgb"):
+        rdb.load(tiny_root, "lattice", columns=["depth"])
+    with pytest.raises(
+        rdb.DatasetError, match=r"has no manifest.json, expected a complete dataset folder written by rebar-build"
+    ):
+        rdb.load(tmp_path, "lattice")
+    with pytest.raises(rdb.DatasetError, match="columns is 'left_rgb', expected a list"):
+        rdb.load(tiny_root, "lattice", columns="left_rgb")
+    with pytest.raises(rdb.DatasetError, match="no such folder"):
+        rdb.load(tmp_path / "missing", "lattice")
+
+
+@pytest.mark.parametrize("streaming", [False, True])
+@pytest.mark.parametrize(("part", "positions"), [("[:2]", range(2)), ("[50%:]", range(4, 9)), ("[-1:]", [8])])
+def test_part_of_a_split(tiny_root: Path, part: str, positions: Sequence[int], streaming: bool) -> None:
+    view_ids = open_folder(tiny_root).config("lattice").view_ids
+    loaded = rdb.load(tiny_root, "lattice", split=f"test{part}", streaming=streaming, columns=["view_id"])
+    assert [row["view_id"] for row in loaded] == [view_ids[position] for position in positions]
+
+
+@pytest.mark.parametrize("split", ["test[", "test[a]", "test[:2]+test[3:]", "tests[:2]", "test+test", "[:2]"])
+def test_text_that_is_no_part_of_a_split_is_refused(tiny_root: Path, split: str) -> None:
+    with pytest.raises(rdb.DatasetError, match=r"has no split .*, expected test|expected one as test\[:10\]"):
+        rdb.load(tiny_root, "lattice", split=split)
+
+
+def test_loading_columns_writes_no_further_cache_file(tiny_root: Path) -> None:
+    ds = rdb.load(tiny_root, "lattice", columns=["view_id", "left_depth", "left_rgb"])
+    assert ds[0]["left_rgb"].dtype == np.uint8
+    assert ds.cache_files
+    assert not [file for file in ds.cache_files if "cache-" in Path(file["filename"]).name]
+
+
+def test_row_schema_is_that_of_the_features() -> None:
+    assert ROW_SCHEMA.equals(features().arrow_schema.remove_metadata())
+
+
+def test_local_rows_equal_those_of_datasets(tiny_root: Path) -> None:
+    config = open_folder(tiny_root).config("lattice")
+    loaded = datasets.load_dataset(str(tiny_root), "lattice", split="test")
+    assert list(encoded_rows(config, COLUMNS)) == loaded.data.to_pylist()
+
+
+@pytest.mark.parametrize("row_group_size", [1, 3])
+@pytest.mark.parametrize("turned", [False, True])
+def test_rows_of_some_views_are_found_wherever_they_are(
+    tiny_root: Path, tmp_path: Path, row_group_size: int, turned: bool
+) -> None:
+    columns, root = ("view_id", "left_depth"), copy_dataset(tiny_root, tmp_path / "copy")
+    expected = {
+        row["view_id"]: row["left_depth"] for row in iterate_rows(open_folder(root).config("lattice"), columns)
+    }
+    for shard in root.glob("lattice/*.parquet"):
+        change_rows(shard, list.reverse if turned else list.copy, row_group_size=row_group_size)
+    config = open_folder(root).config("lattice")
+    for view_ids in (*([view_id] for view_id in expected), config.view_ids[1::3], config.view_ids):
+        rows = list(iterate_rows(config, columns, view_ids))
+        assert sorted(row["view_id"] for row in rows) == list(view_ids)
+        assert all(np.array_equal(row["left_depth"], expected[row["view_id"]]) for row in rows)
+
+
+def test_missing_row_of_some_views_is_named(tiny_root: Path, tmp_path: Path) -> None:
+    root = copy_dataset(tiny_root, tmp_path / "copy")
+    change_rows(first_shard(root, "lattice"), list.pop)
+    config = open_folder(root).config("lattice")
+    missing = config.view_ids[7]
+    with pytest.raises(DatasetError, match=f"lattice lacks 1 views, among them {missing}"):
+        list(iterate_rows(config, ("view_id",), [missing]))
