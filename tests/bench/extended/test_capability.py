@@ -1,4 +1,4 @@
-"""Tests of process capability (tolerance over p95), from samples to table, JSON, CSV and terminal."""
+"""Estimates over views, tolerances and process capability, from samples to JSON, CSV and terminal."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import csv
 import dataclasses
 import io
 import math
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 
 import numpy as np
 import pytest
@@ -17,11 +17,12 @@ from rich.console import Console
 from rebar_depth_bench.extended.fits import MISS_MM
 from rebar_depth_bench.extended.inspection import (
     CAPABILITY_MEASURES,
+    INSPECTION_MEASURES,
     PROFILES,
     TOLERANCES,
     capability,
 )
-from rebar_depth_bench.extended.measures import NATIVE, ONCE, SCALED, Measure
+from rebar_depth_bench.extended.measures import NATIVE, ONCE, SCALED, STATISTICS, Measure, Samples, Statistic
 from rebar_depth_bench.extended.registry import measures_by_alignment
 from rebar_depth_bench.extended.result import (
     ExtendedResult,
@@ -29,6 +30,7 @@ from rebar_depth_bench.extended.result import (
     MeasureEstimate,
     ViewSamples,
     convert_estimate,
+    estimate,
     tabulate_extended,
     view_numbers,
 )
@@ -36,8 +38,95 @@ from rebar_depth_bench.reporting.extended_tables import extended_csv, print_exte
 from rebar_depth_bench.scoring.bootstrap import resample
 from tests.bench.reporting.results import result, scored_view
 
+RNG = np.random.default_rng(7)
+
+
+BY_VIEW = [{"s": RNG.normal(3.0, 1.0, size)} for size in RNG.integers(0, 30, 300)]
+
+
+INDICES = range(0, 300 * 12, 12)  # so far apart that each view is a block
+
+
+def measure(statistic: Statistic) -> Measure:
+    return Measure("m", "M", "mm", "lower", "for this test", "s", statistic)
+
+
+@pytest.mark.parametrize("statistic", list(STATISTICS))
+def test_estimate_is_pooled_statistic_within_interval(statistic: Statistic) -> None:
+    pooled = np.concatenate([samples["s"] for samples in BY_VIEW])
+    by_hand: dict[str, Callable[[np.ndarray], float]] = {
+        "mean": np.mean,
+        "median": np.median,
+        "std": np.std,
+        "p95": lambda x: float(np.percentile(x, 95)),
+    }
+    pooled_estimate = estimate(measure(statistic), BY_VIEW, resample(INDICES))
+    assert pooled_estimate.samples == len(pooled)
+    assert pooled_estimate.value == pytest.approx(by_hand[statistic](pooled), rel=2e-3)
+    assert pooled_estimate.interval is not None
+    assert pooled_estimate.value is not None
+    assert pooled_estimate.interval[0] < pooled_estimate.value < pooled_estimate.interval[1]
+
+
+@pytest.mark.parametrize(
+    ("statistic", "truth"), [("mean", 3.0), ("median", 3.0), ("std", 1.0), ("p95", 3 + 1.6449)]
+)
+def test_interval_width_equals_spread_over_new_samples(statistic: Statistic, truth: float) -> None:
+    pooled_estimate = estimate(measure(statistic), BY_VIEW, resample(INDICES))
+    bounds, samples = pooled_estimate.interval, pooled_estimate.samples
+    assert bounds is not None
+    rng = np.random.default_rng(1)
+    values = [STATISTICS[statistic](rng.normal(3, 1, samples)) for _ in range(300)]
+    low, high = np.percentile(values, [2.5, 97.5])
+    assert bounds[1] - bounds[0] == pytest.approx(high - low, rel=0.25)
+    assert abs(np.mean(bounds) - truth) < high - low
+
+
+def test_views_and_tables_without_samples() -> None:
+    no_samples: list[Samples] = [{}] * 8
+    assert estimate(measure("p95"), no_samples, resample(range(8))) == estimate(measure("mean"), [], resample([]))
+    one_view = [{"s": np.ones(3)}, *no_samples[1:]]
+    estimated = estimate(measure("mean"), one_view, resample(range(8)))
+    assert (estimated.value, estimated.interval, estimated.samples) == (1.0, None, 3)
+
+
+def test_infinite_samples_have_no_interval() -> None:
+    samples = [{"s": np.array([1.0, math.inf])}] * 10
+    assert estimate(measure("p95"), samples, resample(range(10))).value == math.inf
+    assert estimate(measure("p95"), samples, resample(range(10))).interval is None
+
+
+def test_capability_is_tolerance_over_p95() -> None:
+    assert capability(10.0, 4.0) == 2.5
+    assert capability(5.0, 20.0) == 0.25
+    assert capability(5.0, 0.0) == math.inf
+    assert capability(5.0, MISS_MM) is None
+
+
+def test_tolerances_use_p95_measures_that_count_misses() -> None:
+    measures = {measure.name: measure for measure in INSPECTION_MEASURES}
+    tolerances = [tolerance for profile in PROFILES for tolerance in profile.tolerances]
+    assert [tolerance for _, tolerance in TOLERANCES] == tolerances
+    for tolerance in tolerances:
+        name = f"{tolerance.kind}_p95_mm"
+        assert measures[name].statistic == "p95"
+        assert measures[name].sample == f"{tolerance.kind}_judged_mm"
+        assert f"{tolerance.limit_mm:g} mm" in measures[tolerance.pass_name].title
+
+
+def test_keys_are_unique_and_sources_are_declared() -> None:
+    keys = [tolerance.key for _, tolerance in TOLERANCES]
+    assert len(set(keys)) == len(keys)
+    assert all("secondary source" in profile.source for profile in PROFILES)
+    assert not any("ACI" in profile.source for profile in PROFILES)
+
+
 SPACING, STIRRUPS = PROFILES[0].tolerances[:2]
+
+
 BY_NAME = {measure.name: measure for measures in measures_by_alignment().values() for measure in measures}
+
+
 VIEWS = 8
 
 

@@ -1,0 +1,387 @@
+"""Boundary F1 and depth layers: cases by hand, independent formulas, and invariances."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy import ndarray
+
+from rebar_depth_bench.extended.boundary import THRESHOLDS_PERCENT, boundary_samples, neighbour_pairs
+from rebar_depth_bench.extended.depth_layers import DIRECTIONS, RADII_PX, layer_samples, other_layers
+from rebar_depth_bench.extended.steel import SteelTruth
+from tests.bench.extended.thin_scenes import (
+    random_images,
+    random_prediction,
+    random_truth,
+    steel_truth,
+    with_holes,
+)
+
+# Boundary F1.
+
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def boundary_scores(p_m: ndarray, truth: object) -> dict[str, float]:
+    return {name: float(values[0]) for name, values in boundary_samples(p_m, truth).items() if len(values)}  # type: ignore[arg-type]
+
+
+def test_boundary_by_hand() -> None:
+    # Board, bar, bar, board in one row: the pairs' true ratios are 2, 1 and 1.5, so two contours at every t.
+    truth = steel_truth(np.array([[2.0, 1.0, 1.0, 1.5]]), np.array([[0, 1, 1, 0]]))
+    # Ratio 1.03, correct side in front: detected at 1 and 2 %. Ratio 1.11, wrong side: a wrong contour up to 10 %.
+    measured = boundary_scores(np.array([1.03, 1.0, 1.0, 0.9]), truth)
+    # t = 1 and 2 %: 1 correct of 2 predicted and 2 true. t = 5 and 10 %: 1 wrong. t = 20 %: none predicted.
+    assert measured == pytest.approx(
+        {
+            "boundary_f1": (0.5 + 0.5) / 5,
+            "boundary_precision": (0.5 + 0.5) / 5,
+            "boundary_recall": (0.5 + 0.5) / 5,
+            "boundary_f1_1pct": 0.5,
+            "boundary_f1_2pct": 0.5,
+            "boundary_f1_5pct": 0.0,
+            "boundary_f1_10pct": 0.0,
+            "boundary_f1_20pct": 0.0,
+            "boundary_missing": 0.0,
+        }
+    )
+
+
+def test_missing_prediction_counts_as_wrong_contour() -> None:
+    truth = steel_truth(np.array([[2.0, 1.0, 1.0, 1.5]]), np.array([[0, 1, 1, 0]]))
+    measured = boundary_scores(np.array([2.0, 1.0, 1.0, np.nan]), truth)
+    assert measured["boundary_precision"] == pytest.approx(1 / 2)
+    assert measured["boundary_recall"] == pytest.approx(1 / 2)
+    assert measured["boundary_f1"] == pytest.approx(2 * 1 / (2 + 2))
+    assert measured["boundary_missing"] == pytest.approx(1 / 3)
+
+
+def dense_scores(p_m: ndarray, z_m: ndarray, steel: ndarray) -> dict[str, float]:
+    """Return the boundary_scores from whole images as the papers define them: over four directions."""
+    p_m = np.where(np.isfinite(p_m) & (p_m > 0), p_m, np.nan)
+    f1, precision, recall = {}, [], []
+    for t in THRESHOLDS_PERCENT:
+        true = predicted = correct = 0
+        for axis in (0, 1):
+            for ahead in (True, False):
+                (z_a, p_a, s_a), (z_b, p_b, s_b) = (
+                    [np.moveaxis(image, axis, 0)[part] for image in (z_m, p_m, steel)]
+                    for part in ((slice(None, -1), slice(1, None)) if ahead else (slice(1, None), slice(None, -1)))
+                )
+                counted = (s_a | s_b) & (z_a > 0) & (z_b > 0)
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    z_contour, p_contour = z_b / z_a > 1 + t / 100, p_b / p_a > 1 + t / 100
+                missing = np.isnan(p_a + p_b)
+                true += np.sum(z_contour & counted)
+                correct += np.sum(z_contour & p_contour & counted)
+                predicted += np.sum(p_contour & counted) + np.sum(missing & counted) / 2  # counted from both sides
+        if true:
+            f1[f"boundary_f1_{t}pct"] = float(2 * correct / (true + predicted))
+            precision.append(correct / predicted if predicted else 0.0)
+            recall.append(correct / true)
+    means = {"boundary_precision": precision, "boundary_recall": recall, "boundary_f1": list(f1.values())}
+    return {**f1, **{name: float(np.mean(values)) for name, values in means.items() if values}}
+
+
+@settings(max_examples=60)
+@given(SEEDS)
+def test_scores_agree_with_dense_formula(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    depth_m, bars = random_images(rng)
+    truth = steel_truth(depth_m, bars)
+    p_m = random_prediction(rng, truth)
+    image_m = np.full(depth_m.size, np.nan)
+    image_m[truth.index] = p_m
+    measured = boundary_scores(p_m, truth)
+    expected = dense_scores(image_m.reshape(depth_m.shape), depth_m.astype(np.float64), bars > 0)
+    assert {name: value for name, value in measured.items() if name != "boundary_missing"} == pytest.approx(
+        expected
+    )
+
+
+@settings(max_examples=60)
+@given(SEEDS, st.floats(0.001, 1.0))
+def test_holes_never_raise_scores(seed: int, share: float) -> None:
+    rng = np.random.default_rng(seed)
+    truth = random_truth(rng)
+    before_m = random_prediction(rng, truth)
+    before, after = boundary_scores(before_m, truth), boundary_scores(with_holes(rng, before_m, share), truth)
+    assert before.keys() == after.keys()
+    assert all(after[name] <= before[name] for name in before if name != "boundary_missing")
+    assert after["boundary_missing"] >= before["boundary_missing"]
+
+
+@settings(max_examples=30)
+@given(SEEDS, st.integers(-40, 40))
+def test_scores_are_independent_of_unit(seed: int, exponent: int) -> None:
+    rng = np.random.default_rng(seed)
+    truth = random_truth(rng)
+    p_m = random_prediction(rng, truth)
+    assert boundary_scores(p_m * 2.0**exponent, truth) == boundary_scores(p_m, truth)
+
+
+@settings(max_examples=30)
+@given(SEEDS)
+def test_scores_are_invariant_to_flip_and_transpose(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    depth_m, bars = random_images(rng)
+    image_m = depth_m * np.exp(rng.normal(0, 0.03, depth_m.shape))
+    turned = [
+        boundary_scores(view[0].ravel()[truth.index], truth)
+        for view in (
+            (image_m, depth_m, bars),
+            (image_m[:, ::-1], depth_m[:, ::-1], bars[:, ::-1]),
+            (image_m.T, depth_m.T, bars.T),
+        )
+        for truth in [steel_truth(view[1], view[2])]
+    ]
+    assert turned[0] == turned[1] == turned[2]
+
+
+@settings(max_examples=30)
+@given(SEEDS, st.lists(st.floats(0.0, 1.0), min_size=2, max_size=2))
+def test_flattening_removes_contours_and_adds_none(seed: int, flat: list[float]) -> None:
+    """Check ratios raised to a power a <= 1: the larger a, the more contours remain, and all are correct."""
+    truth = random_truth(np.random.default_rng(seed))
+    z_m = truth.depth_m.astype(np.float64)
+    less, more = (boundary_scores(z_m ** (0.999 * power), truth) for power in sorted(flat))
+    assert less["boundary_recall"] <= more["boundary_recall"]
+    assert less["boundary_f1"] <= more["boundary_f1"]
+    f1 = [value for name, value in more.items() if name.endswith("pct")]
+    assert more["boundary_precision"] == pytest.approx(np.mean(np.array(f1) > 0))  # none predicted: 0, else 1
+
+
+def test_ground_truth_is_perfect_and_plane_scores_zero() -> None:
+    truth = random_truth(np.random.default_rng(3))
+    perfect = boundary_scores(truth.depth_m.astype(np.float64), truth)
+    assert perfect == {name: 0.0 if name == "boundary_missing" else 1.0 for name in perfect}
+    plane = boundary_scores(np.ones(len(truth.index)), truth)
+    assert set(plane.values()) == {0.0}
+
+
+def test_neighbour_pairs_stay_in_image_and_touch_steel() -> None:
+    index = np.arange(6, dtype=np.uint32)
+    first, second = neighbour_pairs(index, np.ones(6, bool), 2, 3)
+    pairs = sorted(zip(first.tolist(), second.tolist(), strict=True))
+    assert pairs == [(0, 1), (0, 3), (1, 2), (1, 4), (2, 5), (3, 4), (4, 5)]  # 2 and 3 lie in different rows
+    first, second = neighbour_pairs(index[[0, 1, 3, 5]], np.array([False, True, False, True]), 2, 3)
+    assert list(zip(first.tolist(), second.tolist(), strict=True)) == [(0, 1)]  # neither 0 nor 3 is steel
+
+
+def test_view_without_steel_or_contour_has_no_scores() -> None:
+    empty = steel_truth(np.ones((3, 3)), np.zeros((3, 3), np.uint16))
+    assert all(len(values) == 0 for values in boundary_samples(np.empty(0), empty).values())
+    flat = steel_truth(np.ones((3, 3)), np.ones((3, 3), np.uint16))
+    measured = boundary_samples(np.linspace(1, 2, 9), flat)
+    assert {name for name, values in measured.items() if len(values)} == {"boundary_missing"}
+
+
+def test_extreme_values_give_shares_without_warning() -> None:
+    rng = np.random.default_rng(5)
+    truth = random_truth(rng)
+    p_m = rng.choice([1e308, 5e-324, np.inf, -np.inf, np.nan, 0.0, -0.0, -1e308, 1.0], len(truth.index))
+    assert all(0.0 <= value <= 1.0 for value in boundary_scores(p_m, truth).values())
+
+
+# Depth layers and their confusion.
+
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+NAN = float("nan")
+
+
+def layers_at(depth_m: ndarray, bars: ndarray, row: int, column: int, gap_m: float) -> tuple[float, float]:
+    index = np.array([row * depth_m.shape[1] + column], np.uint32)
+    front_m, behind_m = other_layers(
+        depth_m.astype(np.float32), bars.astype(np.uint16), index, np.array([gap_m], np.float32)
+    )
+    return float(front_m[0]), float(behind_m[0])
+
+
+def cross() -> tuple[ndarray, ndarray]:
+    """Return depth and bar ids of a vertical bar at 0.25 m before a horizontal one at 0.5 m and a board at 1 m."""
+    depth_m, bars = np.ones((64, 64)), np.zeros((64, 64), int)
+    depth_m[30:33], bars[30:33] = 0.5, 2
+    depth_m[:, 30:33], bars[:, 30:33] = 0.25, 1
+    return depth_m, bars
+
+
+def test_crossing_bars_by_hand() -> None:
+    depth_m, bars = cross()
+    assert layers_at(depth_m, bars, 31, 31, 0.01) == pytest.approx((NAN, 0.5), nan_ok=True)
+    assert layers_at(depth_m, bars, 31, 55, 0.01) == pytest.approx((0.25, NAN), nan_ok=True)  # 24 px to the right
+    assert layers_at(depth_m, bars, 31, 60, 0.01) == pytest.approx((NAN, NAN), nan_ok=True)  # out of range
+    assert layers_at(depth_m, bars, 31, 31, 0.25) == pytest.approx(
+        (NAN, NAN), nan_ok=True
+    )  # the gap must be exceeded
+    assert layers_at(depth_m, np.minimum(bars, 1), 2, 31, 0.01) == pytest.approx((NAN, NAN), nan_ok=True)
+
+
+def test_nearest_of_several_layers_is_returned() -> None:
+    depth_m, bars = cross()
+    for column, z_m in ((20, 0.5), (42, 0.375), (36, 0.125), (27, 0.1875)):
+        depth_m[:, column - 1 : column + 2], bars[:, column - 1 : column + 2] = z_m, column
+    assert layers_at(depth_m, bars, 10, 31, 0.01) == (0.1875, 0.375)
+
+
+def test_receding_bar_is_not_its_own_layer() -> None:
+    depth_m, bars = np.ones((64, 64)), np.zeros((64, 64), int)
+    depth_m[30:33], bars[30:33] = 0.25 + 0.005 * np.arange(64), 1
+    assert layers_at(depth_m, bars, 31, 31, 0.01) == pytest.approx((NAN, NAN), nan_ok=True)
+    # A bar that crosses in front is a layer; the part of the first bar that is visible beyond it is not.
+    depth_m[:, 36:39], bars[:, 36:39] = 0.125, 2
+    assert layers_at(depth_m, bars, 31, 31, 0.01) == pytest.approx((0.125, NAN), nan_ok=True)
+
+
+@pytest.mark.parametrize("between_m", [1.0, 0.0])
+def test_far_side_of_hoop_is_a_layer(between_m: float) -> None:
+    """Check with the board or an empty background visible between the two sides."""
+    depth_m, bars = np.full((64, 64), between_m), np.zeros((64, 64), int)
+    depth_m[30:33], bars[30:33] = 0.25, 1
+    depth_m[42:45], bars[42:45] = 0.5, 1
+    assert layers_at(depth_m, bars, 31, 31, 0.01) == pytest.approx((NAN, 0.5), nan_ok=True)
+    assert layers_at(depth_m, bars, 43, 31, 0.01) == pytest.approx((0.25, NAN), nan_ok=True)
+
+
+def reference_layers(
+    depth_m: ndarray, bars: ndarray, row: int, column: int, gap_m: np.float32
+) -> tuple[float, float]:
+    """Return the front and rear depth of one pixel, computed by a plain loop."""
+    z_m, own = depth_m[row, column], bars[row, column]
+    front: list[float] = []
+    behind: list[float] = []
+    for step in range(DIRECTIONS):
+        between: list[float] = []
+        for radius in RADII_PX:
+            angle = 2 * math.pi * step / DIRECTIONS
+            y, x = row + round(radius * math.sin(angle)), column + round(radius * math.cos(angle))
+            if not (0 <= y < depth_m.shape[0] and 0 <= x < depth_m.shape[1]):
+                break
+            seen_m, same = depth_m[y, x], bars[y, x] == own
+            joined = same and not any(m == 0 or m > max(z_m, seen_m) for m in between)
+            if bars[y, x] and not joined:
+                (behind if seen_m > z_m + gap_m else front if seen_m < z_m - gap_m else []).append(float(seen_m))
+            if not same:
+                between.append(seen_m)
+    return max(front, default=NAN), min(behind, default=NAN)
+
+
+@settings(max_examples=20)
+@given(SEEDS)
+def test_layers_agree_with_reference_loop(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    depth_m, bars = random_images(rng, 40, 50)
+    bars[bars > 3] -= 2  # the same bar in several places
+    index = np.flatnonzero(bars)[:: int(rng.integers(5, 9))].astype(np.uint32)
+    gap_m = rng.uniform(0.001, 0.1, len(index)).astype(np.float32)
+    layers_m = np.column_stack(other_layers(depth_m, bars, index, gap_m))
+    expected = [
+        reference_layers(depth_m, bars, i // 50, i % 50, gap) for i, gap in zip(index.tolist(), gap_m, strict=True)
+    ]
+    np.testing.assert_array_equal(layers_m, np.array(expected, np.float32).reshape(-1, 2))
+
+
+@settings(max_examples=15)
+@given(SEEDS)
+def test_layers_follow_flip_and_transpose(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    depth_m, bars = random_images(rng, 40, 40)
+    images = []
+    for transform in (lambda a: a, np.fliplr, np.flipud, np.transpose):
+        transformed_m, ids = np.ascontiguousarray(transform(depth_m)), np.ascontiguousarray(transform(bars))
+        index = np.flatnonzero(ids).astype(np.uint32)
+        image = np.full((2, 40, 40), np.nan, np.float32)
+        for layer, values in zip(
+            image, other_layers(transformed_m, ids, index, np.full(len(index), 0.02, np.float32)), strict=True
+        ):
+            layer.ravel()[index] = values
+        images.append(np.stack([transform(layer) for layer in image]))
+    for image in images[1:]:
+        np.testing.assert_array_equal(image, images[0])
+
+
+def test_image_without_steel_has_no_layers() -> None:
+    no_pixels = np.empty(0, np.uint32), np.empty(0, np.float32)
+    front_m, behind_m = other_layers(np.ones((4, 4), np.float32), np.zeros((4, 4), np.uint16), *no_pixels)
+    assert (len(front_m), len(behind_m)) == (0, 0)
+    assert front_m.dtype == behind_m.dtype == np.float32
+
+
+def layer_scores(p_m: ndarray, truth: SteelTruth) -> dict[str, float]:
+    return {name: float(values[0]) for name, values in layer_samples(p_m, truth).items() if len(values)}
+
+
+def truth_of_pixels(z_m: list[float], front_m: list[float], behind_m: list[float]) -> SteelTruth:
+    truth = steel_truth(
+        np.array([z_m]), np.ones((1, len(z_m)), np.uint16), np.array([front_m]), np.array([behind_m])
+    )
+    return replace(truth, interior=np.ones(len(z_m), bool))
+
+
+def test_confusion_by_hand() -> None:
+    truth = truth_of_pixels([2.0] * 6, [1.0, 1.0, NAN, NAN, 1.0, NAN], [4.0, NAN, 4.0, 4.0, 4.0, NAN])
+    measured = layer_scores(np.array([1.4, 1.6, 2.9, 3.1, NAN, 9.0]), truth)
+    assert measured == pytest.approx(
+        {
+            "layer_confusion": 3 / 5,  # the first, the fourth and the missing pixel
+            "layer_swallowed": 2 / 4,  # the fourth and the missing pixel, of those with a layer behind
+            "layer_pulled_forward": 2 / 3,  # the first and the missing pixel
+            "layers_in_sight": 5 / 6,
+        }
+    )
+
+
+def test_midpoint_is_not_confused_and_extremes_are() -> None:
+    truth = truth_of_pixels([2.0, 2.0], [1.0, NAN], [NAN, 4.0])
+    assert layer_scores(np.array([1.5, 3.0]), truth)["layer_confusion"] == 0.0
+    assert layer_scores(np.array([5e-324, 1e308]), truth)["layer_confusion"] == 1.0
+    assert layer_scores(np.array([np.inf, -1.0]), truth)["layer_confusion"] == 1.0  # both missing
+
+
+@settings(max_examples=40)
+@given(SEEDS)
+def test_confusion_agrees_with_its_definition(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    truth = random_truth(rng)
+    p_m = random_prediction(rng, truth, holes=0.0)
+    confused = in_sight = 0
+    for p, z, front, behind, inside in zip(
+        p_m, truth.depth_m.astype(float), truth.front_m, truth.behind_m, truth.interior, strict=True
+    ):
+        others = [float(other) for other in (front, behind) if inside and not math.isnan(other)]
+        in_sight += bool(others)
+        confused += any(abs(p - other) < abs(p - z) for other in others)
+    assert layer_scores(p_m, truth)["layer_confusion"] == pytest.approx(confused / in_sight)
+
+
+@settings(max_examples=40)
+@given(SEEDS, st.floats(0.001, 1.0), st.floats(1.0, 3.0))
+def test_holes_and_larger_errors_never_lower_confusion(seed: int, share: float, further: float) -> None:
+    rng = np.random.default_rng(seed)
+    truth = random_truth(rng)
+    p_m = random_prediction(rng, truth)
+    before, with_missing = layer_scores(p_m, truth), layer_scores(with_holes(rng, p_m, share), truth)
+    z_m = truth.depth_m.astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        farther = layer_scores(np.where(p_m > 0, z_m + further * (p_m - z_m), p_m), truth)
+    for name in ("layer_confusion", "layer_swallowed", "layer_pulled_forward"):
+        assert with_missing[name] >= before[name]
+        assert farther[name] >= before[name]
+    assert with_missing["layers_in_sight"] == before["layers_in_sight"]
+
+
+def test_ground_truth_has_no_confusion() -> None:
+    truth = random_truth(np.random.default_rng(4))
+    assert layer_scores(truth.depth_m.astype(np.float64), truth)["layer_confusion"] == 0.0
+    alone = steel_truth(np.ones((5, 5)), np.ones((5, 5), np.uint16))
+    assert layer_scores(np.ones(25), alone) == {"layers_in_sight": 0.0}
+    bare = steel_truth(np.ones((2, 2)), np.ones((2, 2), np.uint16))
+    assert layer_scores(np.ones(4), bare) == {}
