@@ -19,7 +19,7 @@ from rebar_depth_bench.extended.measures import subsample
 from rebar_depth_bench.extended.point_cloud import MAX_POINTS, TOLERANCES_MM, cloud_samples
 from rebar_depth_bench.extended.steel import SteelTruth
 from tests.bench.extended.cage_scenes import bar
-from tests.bench.extended.thin_scenes import random_prediction, random_truth, steel_truth, with_holes
+from tests.bench.extended.thin_scenes import pixel_truth, random_prediction, random_truth, steel_truth
 
 # Straight segments and their neighbours.
 
@@ -259,11 +259,6 @@ def test_random_points_never_raise_or_warn(seed: int, size_m: float) -> None:
     assert np.isfinite(fits.offset_m[fits.converged]).all()
 
 
-def test_fit_is_deterministic() -> None:
-    points_m = half_cylinder(64) + 0.002 * np.random.default_rng(5).standard_normal((64, 3))
-    assert fit(points_m).offset_m.tobytes() == fit(points_m.copy()).offset_m.tobytes()
-
-
 # Point clouds.
 
 
@@ -272,19 +267,11 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 def cloud_scores(p_m: ndarray, truth: SteelTruth) -> dict[str, float]:
     fresh = replace(truth)  # The true points are computed once, and some tests change their number.
-    return {name: float(values[0]) for name, values in cloud_samples(p_m, fresh).items()}
-
-
-def points_on_rays(depth_m: list[float], rays: list[tuple[float, float]]) -> SteelTruth:
-    """Return the truth of interior pixels with these depths (metres) and rays (x/z, y/z)."""
-    bare = steel_truth(np.ones((1, len(depth_m))), np.ones((1, len(depth_m)), np.uint16))
-    return replace(
-        bare, depth_m=np.array(depth_m, np.float32), rays=np.array(rays), interior=np.ones(len(depth_m), bool)
-    )
+    return {name: float(values[0]) for name, values in cloud_samples(p_m, fresh).items() if len(values)}
 
 
 def test_clouds_by_hand() -> None:
-    truth = points_on_rays([1.0, 2.0, 3.0, 4.0], [(0, 0)] * 4)
+    truth = pixel_truth([1.0, 2.0, 3.0, 4.0], rays=[(0, 0)] * 4)
     measured = cloud_scores(np.array([1.0015, 2.0, np.nan, 4.0075]), truth)
     accuracy = {1: 1 / 4, 2: 2 / 4, 5: 2 / 4, 10: 3 / 4, 20: 3 / 4}
     for t, share in accuracy.items():
@@ -294,7 +281,7 @@ def test_clouds_by_hand() -> None:
 
 
 def test_point_may_match_point_of_another_pixel() -> None:
-    truth = points_on_rays([1.0, 2.0], [(0, 0), (0, 0)])
+    truth = pixel_truth([1.0, 2.0], rays=[(0, 0), (0, 0)])
     measured = cloud_scores(np.array([2.0, 2.0]), truth)  # both predicted points equal the second true point
     assert measured["cloud_accuracy_1mm"] == 1.0
     assert measured["cloud_completeness_1mm"] == 0.5
@@ -302,14 +289,14 @@ def test_point_may_match_point_of_another_pixel() -> None:
 
 
 def test_distance_is_euclidean_not_along_axis() -> None:
-    truth = points_on_rays([1.0], [(3.0, 4.0)])  # a ray of length sqrt(26) = 5.1
+    truth = pixel_truth([1.0], rays=[(3.0, 4.0)])  # a ray of length sqrt(26) = 5.1
     measured = cloud_scores(np.array([1.003]), truth)  # 15.3 mm
     assert measured["cloud_accuracy_10mm"] == 0.0
     assert measured["cloud_accuracy_20mm"] == 1.0
 
 
 def test_tolerance_is_inclusive() -> None:
-    truth = points_on_rays([1 / 32], [(0, 0)])
+    truth = pixel_truth([1 / 32], rays=[(0, 0)])
     p_m = np.array([1 / 32 - 0.02])  # exact, as 0.02 lies between half and twice 1/32
     assert cloud_scores(p_m, truth)["cloud_accuracy_20mm"] == 1.0
     assert cloud_scores(np.nextafter(p_m, 0), truth)["cloud_accuracy_20mm"] == 0.0
@@ -363,31 +350,6 @@ def test_number_of_queries_does_not_set_the_distances(monkeypatch: pytest.Monkey
     assert few == pytest.approx(all_points, abs=0.05)
 
 
-@settings(max_examples=40)
-@given(SEEDS, st.floats(0.001, 1.0))
-def test_holes_and_distant_points_never_raise_scores(seed: int, share: float) -> None:
-    rng = np.random.default_rng(seed)
-    truth = random_truth(rng)
-    p_m = random_prediction(rng, truth)
-    before = cloud_scores(p_m, truth)
-    far_m = np.where(rng.random(len(p_m)) < share, rng.choice([1e-9, 50.0, 1e300], len(p_m)), p_m)
-    for damaged_m in (with_holes(rng, p_m, share), far_m):
-        after = cloud_scores(damaged_m, truth)
-        assert all(after[name] <= before[name] for name in before)
-
-
-@settings(max_examples=20)
-@given(SEEDS)
-def test_shares_increase_with_tolerance(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    truth = random_truth(rng)
-    measured = cloud_scores(random_prediction(rng, truth), truth)
-    for kind in ("accuracy", "completeness", "f"):
-        ascending = [measured[f"cloud_{kind}_{t}mm"] for t in TOLERANCES_MM]
-        assert ascending == sorted(ascending)
-        assert 0.0 <= ascending[0] <= ascending[-1] <= 1.0
-
-
 def test_subsampling_is_even_and_equal_for_both_clouds() -> None:
     assert np.array_equal(subsample(np.arange(7) * 3, MAX_POINTS), np.arange(7) * 3)
     subsampled = subsample(np.arange(MAX_POINTS * 5 // 2), MAX_POINTS)
@@ -398,32 +360,11 @@ def test_subsampling_is_even_and_equal_for_both_clouds() -> None:
     assert set(cloud_scores(truth.depth_m.astype(np.float64), truth).values()) == {1.0}
 
 
-@pytest.mark.parametrize("value", [0.0, -0.001])
-def test_invalid_prediction_near_true_point_is_ignored(value: float) -> None:
-    assert set(cloud_scores(np.array([value]), points_on_rays([0.0005], [(0, 0)])).values()) == {0.0}
-
-
-def test_view_without_interior_has_no_scores() -> None:
-    truth = steel_truth(np.ones((2, 2)), np.ones((2, 2), np.uint16))
-    assert all(len(values) == 0 for values in cloud_samples(np.ones(4), truth).values())
-
-
-@pytest.mark.parametrize("value", [1e308, 5e-324, np.inf, -np.inf, np.nan, 0.0, -1.0])
+@pytest.mark.parametrize("value", [1e308, 5e-324, np.inf, -np.inf, np.nan, 0.0, -0.001])
 def test_extreme_values_match_no_point(value: float) -> None:
     truth = steel_truth(np.full((5, 5), 0.5), np.ones((5, 5), np.uint16))
     assert set(cloud_scores(np.full(25, value), truth).values()) == {0.0}
-
-
-def test_skipped_lookups_do_not_change_scores(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Check that the cloud_scores are the same if the nearest point is looked up for every point."""
-    rng = np.random.default_rng(2)
-    truth = random_truth(rng)
-    p_m = random_prediction(rng, truth)
-    before = cloud_scores(p_m, truth)
-    nearest_m = point_cloud._nearest_m
-    monkeypatch.setattr(
-        point_cloud,
-        "_nearest_m",
-        lambda tree, points, own, _: nearest_m(tree, points, own, np.ones(len(own), bool)),
-    )
-    assert cloud_scores(p_m, truth) == before
+    if not 0 < value < 1:
+        assert set(cloud_scores(np.array([value]), pixel_truth([0.0005], rays=[(0, 0)])).values()) == {0.0}
+    no_interior = steel_truth(np.ones((2, 2)), np.ones((2, 2), np.uint16))
+    assert cloud_scores(np.full(4, value), no_interior) == {}

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import asdict
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +12,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy import ndarray
 
-from rebar_depth_bench import load
 from rebar_depth_bench.extended import boundary, depth_layers, point_cloud, regions
 from rebar_depth_bench.extended.alignment import MEASURES as ALIGNMENT_MEASURES
 from rebar_depth_bench.extended.alignment import (
@@ -23,7 +20,7 @@ from rebar_depth_bench.extended.alignment import (
     scale_and_shift,
     scale_invariant_log,
 )
-from rebar_depth_bench.extended.measures import STATISTICS, Measure, Samples
+from rebar_depth_bench.extended.measures import Measure, Samples
 from rebar_depth_bench.extended.profiles import (
     DISTANCE_EDGES_M,
     MIN_PIXELS,
@@ -31,7 +28,7 @@ from rebar_depth_bench.extended.profiles import (
     profile_samples,
 )
 from rebar_depth_bench.extended.profiles import MEASURES as PROFILE_MEASURES
-from rebar_depth_bench.extended.regions import FULL_MASK_MEASURES, region_samples
+from rebar_depth_bench.extended.regions import region_samples
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.score import ViewTruth, score_view
 from tests.bench.extended.thin_scenes import pixel_truth, random_prediction, random_truth, steel_truth, with_holes
@@ -39,10 +36,7 @@ from tests.bench.extended.thin_scenes import pixel_truth, random_prediction, ran
 # Rules for the families of boundary, point clouds, depth layers and full mask.
 
 
-SamplerAndMeasures = tuple[Callable[[ndarray, SteelTruth], Samples], Sequence[Measure]]
-
-
-MEASURE_FAMILIES: dict[str, SamplerAndMeasures] = {
+FAMILIES: dict[str, tuple[Callable[..., Samples], Sequence[Measure]]] = {
     "boundary": (boundary.boundary_samples, boundary.MEASURES),
     "clouds": (point_cloud.cloud_samples, point_cloud.MEASURES),
     "layers": (depth_layers.layer_samples, depth_layers.MEASURES),
@@ -50,27 +44,20 @@ MEASURE_FAMILIES: dict[str, SamplerAndMeasures] = {
 }
 
 
-every_family = pytest.mark.parametrize(("sampled", "measures"), MEASURE_FAMILIES.values(), ids=MEASURE_FAMILIES)
+every_family = pytest.mark.parametrize(("sampled", "measures"), FAMILIES.values(), ids=FAMILIES)
 
 
 @every_family
-def test_every_sample_has_its_measure(sampled: Callable[..., Samples], measures: Sequence[Measure]) -> None:
+def test_samples_are_those_of_the_measures_and_leave_inputs_alone(
+    sampled: Callable[..., Samples], measures: Sequence[Measure]
+) -> None:
     truth = random_truth(np.random.default_rng(0))
-    samples = sampled(truth.depth_m.astype(np.float64), truth)
-    names = {measure.sample for measure in measures}
-    assert names <= set(samples)
-    for values in map(samples.get, names):
-        assert values is not None
-        assert values.dtype == np.float64
-        assert values.shape == (1,)
-
-
-def test_names_are_unique_and_definitions_present() -> None:
-    measures = [measure for _, family in MEASURE_FAMILIES.values() for measure in family]
-    assert max(Counter(measure.name for measure in measures).values()) == 1
-    assert max(Counter(measure.title for measure in measures).values()) == 1
-    assert not {"abs_rel", "rmse_cm", "mae_cm", "delta1", "coverage"} & {measure.name for measure in measures}
-    assert all(measure.definition and not measure.definition.endswith(".") for measure in measures)
+    p_m = truth.depth_m.astype(np.float64)
+    for array in (p_m, truth.index, truth.depth_m, truth.bar_id, truth.interior, truth.rays, truth.front_m):
+        array.flags.writeable = False  # Writing raises.
+    samples = sampled(p_m, truth)
+    for name in {measure.sample for measure in measures}:
+        assert (samples[name].dtype, samples[name].shape) == (np.float64, (1,)), name
 
 
 @every_family
@@ -84,49 +71,15 @@ def test_holes_never_improve_a_measure(
     p_m = random_prediction(rng, truth)
     before, after = sampled(p_m, truth), sampled(with_holes(rng, p_m, share), truth)
     for measure in measures:
-        if measure.better and measure.sample in before:  # a random truth may have no contour
-            value_before, value_after = (
-                STATISTICS[measure.statistic](samples[measure.sample]) for samples in (before, after)
-            )
-            assert value_after <= value_before if measure.better == "higher" else value_after >= value_before, (
-                measure.name
-            )
+        if measure.better and measure.sample in before:  # A random truth may have no contour.
+            [gain] = after[measure.sample] - before[measure.sample]
+            assert gain <= 0 if measure.better == "higher" else gain >= 0, measure.name
 
 
 @every_family
 def test_no_steel_gives_no_sample(sampled: Callable[..., Samples], measures: Sequence[Measure]) -> None:
     truth = steel_truth(np.ones((3, 3)), np.zeros((3, 3), np.uint16))
     assert not any(len(values) for values in sampled(np.empty(0), truth).values())
-
-
-@every_family
-def test_inputs_are_not_modified(sampled: Callable[..., Samples], measures: Sequence[Measure]) -> None:
-    del measures
-    rng = np.random.default_rng(6)
-    truth = random_truth(rng)
-    p_m = random_prediction(rng, truth)
-    for array in (p_m, truth.index, truth.depth_m, truth.bar_id, truth.interior, truth.rays, truth.front_m):
-        array.flags.writeable = False  # writing raises
-    assert sampled(p_m, truth)
-
-
-def test_rendered_truth_is_perfect(tiny_root: Path) -> None:
-    row = next(iter(load(tiny_root, "lattice", streaming=True)))
-    bars, depth_m = row["left_bars"], row["left_depth"]
-    index = np.flatnonzero(bars).astype(np.uint32)
-    layers_m = np.full((2, bars.size), np.nan, np.float32)
-    layers_m[:, index] = depth_layers.other_layers(depth_m, bars, index, np.full(len(index), 0.007, np.float32))
-    front_m, behind_m = layers_m.reshape(2, *bars.shape)
-    assert np.isfinite(front_m).any()
-    assert np.isfinite(behind_m).any()
-    truth = steel_truth(depth_m, bars, front_m, behind_m)
-    for sampled, measures in MEASURE_FAMILIES.values():
-        samples = sampled(truth.depth_m.astype(np.float64), truth)
-        for measure in measures:
-            if measure.better:
-                assert samples[measure.sample].tolist() == [1.0 if measure.better == "higher" else 0.0], (
-                    measure.name
-                )
 
 
 # Full mask and interior.
@@ -181,26 +134,6 @@ def test_interior_measures_equal_rebar_1(seed: int) -> None:
     assert {t: measured[f"interior_within_{t}mm"] for t in expected.within_mm} == expected.within_mm
 
 
-@settings(max_examples=40)
-@given(SEEDS, st.floats(0.001, 1.0))
-def test_holes_never_raise_shares(seed: int, share: float) -> None:
-    rng = np.random.default_rng(seed)
-    truth = random_truth(rng)
-    p_m = random_prediction(rng, truth)
-    before, after = mask_scores(p_m, truth), mask_scores(with_holes(rng, p_m, share), truth)
-    ranked = [measure.sample for measure in FULL_MASK_MEASURES if measure.better]
-    assert len(ranked) == 10
-    assert all(after[name] <= before[name] for name in ranked)
-
-
-def test_pixels_off_steel_are_ignored() -> None:
-    rng = np.random.default_rng(8)
-    truth = random_truth(rng)
-    p_m = random_prediction(rng, truth)
-    assert np.any(truth.bar_id == 0)
-    assert mask_scores(np.where(truth.bar_id == 0, 5.0, p_m), truth) == mask_scores(p_m, truth)
-
-
 def test_empty_masks_have_no_samples() -> None:
     rim = steel_truth(np.ones((2, 2)), np.ones((2, 2), np.uint16))
     measured = mask_scores(np.ones(4), rim)
@@ -209,8 +142,6 @@ def test_empty_masks_have_no_samples() -> None:
     unpredicted = mask_scores(np.full(4, np.nan), rim)
     assert "full_mask_abs_rel" not in unpredicted
     assert unpredicted["full_mask_coverage"] == unpredicted["full_mask_within_20mm"] == 0.0
-    empty = steel_truth(np.ones((2, 2)), np.zeros((2, 2), np.uint16))
-    assert mask_scores(np.empty(0), empty) == {}
 
 
 # Alignments.
@@ -282,23 +213,10 @@ def test_aligned_measures_are_independent_of_unit(seed: int, unit: float) -> Non
             assert in_other_unit[name] == pytest.approx(in_metres[name], rel=1e-6, abs=1e-9)
 
 
-@given(SEEDS, st.floats(0.005, 0.05))
-def test_more_noise_increases_error(seed: int, noise_m: float) -> None:
-    z = depths(seed)
-    noise = np.random.default_rng(seed).normal(0, 1, len(z))
-    little, much = aligned(z + noise_m * noise, z), aligned(z + 3 * noise_m * noise, z)
-    assert little["silog"] < much["silog"]
-    assert little["shifted_rmse_cm"] < much["shifted_rmse_cm"]
-
-
-def test_constant_prediction_is_only_shifted() -> None:
-    z = depths(3)
-    assert scale_and_shift(np.full(len(z), 2.0), z) == pytest.approx((1.0, z.mean() - 2.0))
-
-
-def test_missing_prediction_has_no_samples_extremes_no_warning() -> None:
+def test_missing_constant_and_extreme_predictions_are_aligned_without_warning() -> None:
     z = depths(4)
     assert aligned(np.full(len(z), np.nan), z) == {}
+    assert scale_and_shift(np.full(len(z), 2.0), z) == pytest.approx((1.0, z.mean() - 2.0))
     assert set(aligned(np.full(len(z), 1e300), z)) <= {measure.sample for measure in ALIGNMENT_MEASURES}
     assert aligned(np.full(len(z), 1e-300), z)["scale"] > 1e299
 
@@ -308,9 +226,8 @@ def test_aligned_ground_truth_is_perfect() -> None:
     measured = aligned(z, z)
     assert measured["scale"] == 1.0
     assert "scale_explains" not in measured  # there is no error to explain
-    assert all(
-        measured[name] == pytest.approx(0, abs=1e-9) for name in measured if "abs_rel" in name or "_cm" in name
-    )
+    errors = [measured[name] for name in measured if "abs_rel" in name or "_cm" in name]
+    assert errors == pytest.approx([0] * len(errors), abs=1e-9)
     assert measured["log_scaled_delta1"] == measured["shifted_delta1"] == 1.0
 
 
