@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from itertools import permutations
 from pathlib import Path
 from typing import Any
@@ -20,9 +21,19 @@ from numpy import ndarray
 from rebar_depth_bench.bar_crossings.definition import scene_crossings
 from rebar_depth_bench.base.errors import InputError, SubmissionError
 from rebar_depth_bench.cli.main import main
+from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.detections.reading import MAX_ROWS_PER_VIEW, read_detections
 from rebar_depth_bench.detections.result import RankedDetections, ViewDetections, tabulate_detections
-from rebar_depth_bench.detections.score import excused, greedy_matches, matched_pairs, score_crossings
+from rebar_depth_bench.detections.score import (
+    SeenDetections,
+    compare_view,
+    excused,
+    greedy_matches,
+    matched_pairs,
+    score_crossings,
+)
+from rebar_depth_bench.extended.ground_truth import load_steel_truth
+from rebar_depth_bench.extended.steel import JudgedCrossings
 from rebar_depth_bench.geometry.cameras import transform
 from rebar_depth_bench.scoring.bootstrap import resample
 from tests.mat_dataset import CAGES, CONFIG, SCENES, VIEWS, mat_bars, poses, write_mat_dataset
@@ -47,7 +58,7 @@ def test_limit_is_ten_millimetres_inclusive() -> None:
     assert matched_pairs(on_line(), on_line(0.0)).shape == matched_pairs(on_line(0.0), on_line()).shape == (0, 2)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(SEEDS)
 def test_matching_agrees_with_brute_force(seed: int) -> None:
     rng = np.random.default_rng(seed)
@@ -113,9 +124,6 @@ def test_average_precision_by_hand() -> None:
     # Equal confidences are one point of the curve: precision 2/3 at recall 2/3, in any order.
     for correct in ([True, False, True], [False, True, True]):
         assert ranked([0.5] * 3, correct, [3], [0] * 3).average() == pytest.approx(4 / 9)
-
-
-def test_average_precision_without_detections_or_crossings() -> None:
     assert ranked([], [], [3], []).average() == 0
     assert ranked([0.5], [False], [0], [0]).average() is None
     assert ranked([], [], [3], []).drawn_points() == []
@@ -131,9 +139,6 @@ def test_interval_of_average_precision_covers_different_views() -> None:
     assert found.average() == pytest.approx(0.25)  # Precision and recall of a half.
     same = ranked([0.5] * views, [True] * views, [1] * views, list(range(views)))
     assert same.interval(resample(range(0, 100 * views, 100))) == (1.0, 1.0)
-
-
-pytestmark = pytest.mark.slow
 
 
 Rows = list[dict[str, Any]]
@@ -173,6 +178,7 @@ def write_parquet(path: Path, rows: Rows, metadata: dict[str, str] | None = None
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", [False, True])
 @pytest.mark.parametrize("write", [write_csv, write_parquet])
 def test_exact_detections_are_perfect(
@@ -188,6 +194,7 @@ def test_exact_detections_are_perfect(
     assert result["dataset"]["crossings"]["file"] == "crossings.parquet"
 
 
+@pytest.mark.slow
 def test_counts_pool_over_views_by_hand(mat: Path, tmp_path: Path) -> None:
     """Keep the crossings of the first view, one of them 6 mm off and one 30 mm off, and add a point in the air."""
     rows = exact_rows()[:4]
@@ -233,6 +240,7 @@ def test_intervals_need_eight_blocks_with_values() -> None:
         assert intervals["normal_deg"] is None
 
 
+@pytest.mark.slow
 def test_confidence_selects_matches_but_not_average_precision(mat: Path, tmp_path: Path) -> None:
     rows = [{**row, "confidence": 0.2 + 0.1 * (number % 4)} for number, row in enumerate(exact_rows())]
     path = write_csv(tmp_path / "a.csv", rows)
@@ -241,6 +249,7 @@ def test_confidence_selects_matches_but_not_average_precision(mat: Path, tmp_pat
     assert all_["average_precision"] == some["average_precision"] == {"5": 1.0, "10": 1.0, "20": 1.0}
 
 
+@pytest.mark.slow
 def test_views_without_rows_and_configs_of_several_scenes(mat: Path, tmp_path: Path) -> None:
     found = scene_crossings(mat_bars((-0.06, 0.0)))
     pose = poses(2)[0]
@@ -262,6 +271,7 @@ def test_views_without_rows_and_configs_of_several_scenes(mat: Path, tmp_path: P
         score_crossings(tmp_path / "a.csv", mat, configs=[CONFIG])
 
 
+@pytest.mark.slow
 def test_metadata_of_file_and_options(mat: Path, tmp_path: Path) -> None:
     rows = exact_rows()
     head = "# method: my detector\n# inputs: rgb+K\n# uses_ground_truth: false\n# note: anything\n"
@@ -278,6 +288,7 @@ def test_metadata_of_file_and_options(mat: Path, tmp_path: Path) -> None:
 
 
 def problems(path: Path) -> list[tuple[str, str]]:
+    """Return code and place of every problem of a file."""
     ids = [f"{CONFIG}/{index:04d}" for index in range(VIEWS)]
     ids += [f"{CAGES}/{split}-{scene}-0000" for scene, split in SCENES.items()]
     with pytest.raises(SubmissionError) as raised:
@@ -321,21 +332,18 @@ def test_hostile_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert problems(path) == [("syntax", "")]
     path.write_bytes(b"PAR1 and no more")
     assert problems(path) == [("damaged", "")]
-    too_many = [{"view_id": "mat/0000", "x": 0.0, "y": 0.0, "z": 1.0}] * (MAX_ROWS_PER_VIEW + 1)
-    assert problems(write_parquet(path, too_many)) == [("size", "mat/0000")]
-    text = [{"view_id": "mat/0000", "x": "a", "y": 0.0, "z": 1.0}]
-    assert problems(write_parquet(path, text)) == [("damaged", "")]
-    nulls = [{"view_id": None, "x": None, "y": 0.0, "z": 1.0}]
-    pq.write_table(
-        pa.Table.from_pylist(nulls, pa.schema([("view_id", pa.string()), *((n, pa.float64()) for n in "xyz")])),
-        path,
-    )
+    row = {"view_id": "mat/0000", "x": 0.0, "y": 0.0, "z": 1.0}
+    assert problems(write_parquet(path, [row] * (MAX_ROWS_PER_VIEW + 1))) == [("size", "mat/0000")]
+    assert problems(write_parquet(path, [{**row, "x": "a"}])) == [("damaged", "")]
+    schema = pa.schema([("view_id", pa.string()), *((name, pa.float64()) for name in "xyz")])
+    pq.write_table(pa.Table.from_pylist([{**row, "view_id": None, "x": None}], schema), path)
     assert problems(path) == [("invalid", "row 1"), ("unknown", "row 1")]
     monkeypatch.setenv("REBAR_MAX_DETECTIONS_BYTES", "10")
     path.write_text("view_id,x,y,z\n")
     assert problems(path) == [("size", "")]
 
 
+@pytest.mark.slow
 def test_command_writes_json_table_and_page(mat: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = [{**row, "confidence": 0.5 + 0.01 * number} for number, row in enumerate(exact_rows())]
     rows[0]["z"] += 0.02
@@ -357,6 +365,7 @@ def test_command_writes_json_table_and_page(mat: Path, tmp_path: Path, capsys: p
     assert (tmp_path / "a.json").read_bytes() == first
 
 
+@pytest.mark.slow
 def test_command_refuses_bad_files_without_output(
     mat: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -369,15 +378,9 @@ def test_command_refuses_bad_files_without_output(
     assert main(["score-crossings", str(path), "--data", str(mat), "--confidence", "nan"]) == 2
 
 
+@pytest.mark.slow
 def test_points_on_a_bar_without_axis_and_near_unjudged_crossings_are_ignored(mat: Path, tmp_path: Path) -> None:
     """Score the mat with a table of bars in which bar 1 has no axis: its crossings are not known."""
-    from dataclasses import replace
-
-    from rebar_depth_bench.data.manifest import open_folder
-    from rebar_depth_bench.detections.score import SeenDetections, compare_view
-    from rebar_depth_bench.extended.ground_truth import load_steel_truth
-    from rebar_depth_bench.extended.steel import JudgedCrossings
-
     folder = open_folder(mat)
     steel = load_steel_truth(folder, folder.config(CONFIG))
     truth = steel.view(0)

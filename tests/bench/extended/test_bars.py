@@ -29,10 +29,13 @@ from tests.bench.extended.cage_scenes import bar, mat, predicted_m, view
 # Inspection.
 
 
+Point = tuple[float, float, float]
+
 TRUTH = view(mat())
 
 
 EXACT_M = TRUTH.depth_m.astype(np.float64)
+EXACT_M.flags.writeable = False  # Measures that change their input raise.
 
 
 DETECTED_BARS_ONLY = (
@@ -43,6 +46,27 @@ DETECTED_BARS_ONLY = (
 
 
 HIGHER_IS_BETTER = ("bar_found", *(t.pass_name for profile in PROFILES for t in profile.tolerances))
+
+BUILT_MM = np.array([(0, 0, 0), (4, 0, 3), (12, 5, 0), (0, 9, -12), (3, -15, 2), (-8, 0, 7)], float)
+"""Displacement of each bar of ``mat`` from its nominal axis."""
+ALONG = np.array([(0, 1, 0)] * 3 + [(1, 0, 0)] * 2 + [(0, 1, 0)], float)
+TRUE_MM = np.linalg.norm(BUILT_MM * (1 - ALONG), axis=1)
+
+
+def moved(points_m: Sequence[Sequence[float]], rotation: np.ndarray, shift_m: np.ndarray) -> tuple[Point, ...]:
+    """Return points of an axis after a rotation and a shift."""
+    return tuple(map(tuple, (np.array(points_m) @ rotation.T + shift_m).tolist()))
+
+
+def displaced(bar: Bar, by_mm: Sequence[float] | np.ndarray) -> Bar:
+    """Return a bar displaced as built, whose nominal axis is where it was."""
+    axis_m = moved(bar.axis_m, np.eye(3), np.divide(by_mm, 1000))
+    return replace(bar, axis_m=axis_m, nominal_axis_m=bar.axis_m)
+
+
+BARS = [displaced(bar, by_mm) for bar, by_mm in zip(mat(), BUILT_MM, strict=True)]
+BUILT_TRUTH = view(BARS)
+BUILT_EXACT_M = BUILT_TRUTH.depth_m.astype(np.float64)
 
 
 def samples_of(p_m: np.ndarray) -> Samples:
@@ -161,41 +185,37 @@ def test_missing_bars_count_as_failures() -> None:
     assert without_one["pass_gb50204_cover_beam"].sum() == 5
 
 
-@settings(max_examples=25)
-@given(st.integers(0, 2**32 - 1), st.floats(0.0, 1.0), st.floats(0.0, 0.03))
-def test_noise_and_holes_never_improve_measures(seed: int, left_out: float, noise_m: float) -> None:
-    rng = np.random.default_rng(seed)
-    damaged_m = EXACT_M + noise_m * rng.standard_normal(len(EXACT_M))
-    damaged_m[rng.random(len(EXACT_M)) < left_out] = np.nan
-    once, twice = samples_of(damaged_m), samples_of(np.where(rng.random(len(EXACT_M)) < 0.6, np.nan, damaged_m))
-    whole = samples_of(EXACT_M)
-    for name in HIGHER_IS_BETTER:
-        assert once[name].mean() <= whole[name].mean()
-    # Without 60 % of its pixels, more than half, no bar has enough predictions.
-    assert twice["bar_found"].sum() <= once["bar_found"].sum()
-
-
-@settings(max_examples=15)
+@settings(max_examples=5)
 @given(
     st.tuples(*[st.floats(-3.0, 3.0)] * 3), st.tuples(*[st.floats(-20.0, 20.0)] * 3), st.permutations(range(1, 7))
 )
 def test_measures_are_independent_of_world_frame_and_ids(
-    rotation_rad: tuple[float, float, float], shift_m: tuple[float, float, float], ids: list[int]
+    rotation_rad: tuple[float, float, float], shift: tuple[float, float, float], ids: list[int]
 ) -> None:
-    rotation = rotation_matrix(rotation_rad)
+    rotation, shift_m = rotation_matrix(rotation_rad), np.array(shift)
     cam_from_world = np.eye(4)
     cam_from_world[:3, :3] = rotation.T
-    cam_from_world[:3, 3] = -rotation.T @ np.array(shift_m)
-    moved = []
-    for steel, bar_id in zip(mat(), ids, strict=True):
-        ends_m = np.array(steel.axis_m) @ rotation.T + np.array(shift_m)
-        moved.append(replace(steel, bar_id=bar_id, axis_m=tuple(map(tuple, ends_m.tolist()))))
-    bar_id = np.concatenate([[0], ids])[TRUTH.bar_id].astype(np.uint16)
-    truth = replace(TRUTH, cam_from_world=cam_from_world, bar_id=bar_id, bars=SceneBars.of(moved))
-    p_m = EXACT_M * 1.01 + 0.002 * np.random.default_rng(0).standard_normal(len(EXACT_M))
-    before, after = samples_of(p_m), inspection_samples(p_m, truth)
-    for name, values in before.items():
-        np.testing.assert_allclose(np.sort(after[name]), np.sort(values), atol=1e-6, err_msg=name)
+    cam_from_world[:3, 3] = -rotation.T @ shift_m
+    noise_m = 0.002 * np.random.default_rng(0).standard_normal(len(EXACT_M))
+    for bars, truth, samples_of_view in (
+        (mat(), TRUTH, inspection_samples),
+        (BARS, BUILT_TRUTH, as_built_samples),
+    ):
+        p_m = truth.depth_m * 1.01 + noise_m[: len(truth.depth_m)]
+        elsewhere = [
+            replace(
+                steel,
+                bar_id=bar_id,
+                axis_m=moved(steel.axis_m, rotation, shift_m),
+                nominal_axis_m=moved(steel.nominal_axis_m, rotation, shift_m) if steel.nominal_axis_m else (),
+            )
+            for steel, bar_id in zip(bars, ids, strict=True)
+        ]
+        bar_id = np.concatenate([[0], ids])[truth.bar_id].astype(np.uint16)
+        other = replace(truth, cam_from_world=cam_from_world, bar_id=bar_id, bars=SceneBars.of(elsewhere))
+        before, after = samples_of_view(p_m, truth), samples_of_view(p_m, other)
+        for name, values in before.items():
+            np.testing.assert_allclose(np.sort(after[name]), np.sort(values), atol=1e-6, err_msg=name)
 
 
 def test_noise_larger_than_bars_averages_out() -> None:
@@ -206,12 +226,16 @@ def test_noise_larger_than_bars_averages_out() -> None:
     assert np.abs(samples["cover_error_mm"]).max() < 6.0
 
 
-def test_one_third_outliers_do_not_move_a_bar() -> None:
+def test_outliers_and_extreme_values_do_not_move_a_bar() -> None:
     rng = np.random.default_rng(2)
     is_outlier = rng.random(len(EXACT_M)) < 0.33
-    samples = samples_of(np.where(is_outlier, EXACT_M + rng.uniform(0.05, 2.0, len(EXACT_M)), EXACT_M))
-    assert samples["bar_found"].all()
-    assert samples["axis_offset_mm"].max() < 0.5
+    outliers_m = np.where(is_outlier, EXACT_M + rng.uniform(0.05, 2.0, len(EXACT_M)), EXACT_M)
+    extreme_m = EXACT_M.copy()
+    extreme_m[::9], extreme_m[4::9], extreme_m[7::9] = 1e300, -np.inf, 1e-300
+    for p_m, offset_mm in ((outliers_m, 0.5), (extreme_m, 0.05)):
+        samples = samples_of(p_m)
+        assert samples["bar_found"].all()
+        assert samples["axis_offset_mm"].max() < offset_mm
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 0.0, -1.0, 1e-320, 1e300, np.finfo(float).max])
@@ -221,14 +245,6 @@ def test_uniform_prediction_finds_no_bar(value: float) -> None:
     assert all(np.isfinite(values).all() for values in samples.values())
 
 
-def test_extreme_values_do_not_affect_other_pixels() -> None:
-    spoilt = EXACT_M.copy()
-    spoilt[::9], spoilt[4::9], spoilt[7::9] = 1e300, -np.inf, 1e-300
-    samples = samples_of(spoilt)
-    assert samples["bar_found"].all()
-    assert samples["axis_offset_mm"].max() < 0.05
-
-
 def test_no_visible_segment_gives_empty_samples() -> None:
     truth = replace(TRUTH, run=np.full_like(TRUTH.run, -1))
     assert all(len(values) == 0 for values in inspection_samples(EXACT_M, truth).values())
@@ -236,23 +252,11 @@ def test_no_visible_segment_gives_empty_samples() -> None:
     assert all(len(values) == 0 for values in inspection_samples(EXACT_M, no_bars).values())
 
 
-def test_samples_are_deterministic_and_input_is_unchanged() -> None:
-    p_m = 1.01 * EXACT_M
-    original_m = p_m.copy()
-    first, second = samples_of(p_m), samples_of(p_m)
-    assert all(first[name].tobytes() == second[name].tobytes() for name in first)
-    assert p_m.tobytes() == original_m.tobytes()
-
-
-def test_measures_have_samples_and_unique_names() -> None:
+def test_measures_have_samples_and_those_without_missed_bars_no_direction() -> None:
     samples = samples_of(EXACT_M)
-    assert {measure.sample for measure in INSPECTION_MEASURES} <= set(samples)
-    assert len({measure.name for measure in INSPECTION_MEASURES}) == len(INSPECTION_MEASURES)
-    assert all(
-        np.isfinite(STATISTICS[measure.statistic](samples[measure.sample])) for measure in INSPECTION_MEASURES
-    )
-    # A measure that omits missed bars has no better direction.
-    assert all(measure.better == "" for measure in INSPECTION_MEASURES if measure.sample in DETECTED_BARS_ONLY)
+    for measure in INSPECTION_MEASURES:
+        assert np.isfinite(STATISTICS[measure.statistic](samples[measure.sample])), measure.name
+        assert measure.better == "" or measure.sample not in DETECTED_BARS_ONLY, measure.name
 
 
 def test_rendered_truth_is_perfect_up_to_ribs(tiny_root: Path) -> None:
@@ -271,31 +275,6 @@ def test_rendered_truth_is_perfect_up_to_ribs(tiny_root: Path) -> None:
 
 
 # Deviation from the design.
-
-
-BUILT_MM = np.array([(0, 0, 0), (4, 0, 3), (12, 5, 0), (0, 9, -12), (3, -15, 2), (-8, 0, 7)], float)
-"""Displacement of each bar of ``mat`` from its nominal axis."""
-
-
-ALONG = np.array([(0, 1, 0)] * 3 + [(1, 0, 0)] * 2 + [(0, 1, 0)], float)
-
-
-TRUE_MM = np.linalg.norm(BUILT_MM * (1 - ALONG), axis=1)
-
-
-def displaced(bar: Bar, by_mm: Sequence[float] | np.ndarray) -> Bar:
-    """Return a bar displaced as built, whose nominal axis is where it was."""
-    axis_m = tuple(tuple(float(v) for v in np.add(point, np.divide(by_mm, 1000))) for point in bar.axis_m)
-    return replace(bar, axis_m=axis_m, nominal_axis_m=bar.axis_m)  # type: ignore[arg-type]
-
-
-BARS = [displaced(bar, by_mm) for bar, by_mm in zip(mat(), BUILT_MM, strict=True)]
-
-
-BUILT_TRUTH = view(BARS)
-
-
-BUILT_EXACT_M = BUILT_TRUTH.depth_m.astype(np.float64)
 
 
 def deviation_samples(p_m: np.ndarray, bars: Sequence[Bar] = BARS) -> Samples:
@@ -392,31 +371,6 @@ def test_bow_of_a_bar_is_measured() -> None:
     samples = as_built_samples(truth.depth_m.astype(float), truth)
     np.testing.assert_allclose(samples["deviation_true_mm"], [0.6], atol=0.01)
     np.testing.assert_allclose(samples["deviation_judged_mm"], [0.6], atol=0.01)
-
-
-@settings(max_examples=15)
-@given(
-    st.tuples(*[st.floats(-3, 3)] * 3),
-    st.tuples(*[st.floats(-5, 5)] * 3),
-)
-def test_samples_do_not_depend_on_the_world_frame(
-    turn: tuple[float, float, float], shift_m: tuple[float, float, float]
-) -> None:
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = rotation_matrix(np.array(turn)), shift_m
-
-    def moved(points: Sequence[Sequence[float]]) -> tuple[tuple[float, ...], ...]:
-        return tuple(map(tuple, (np.array(points) @ pose[:3, :3].T + pose[:3, 3]).tolist()))
-
-    bars = [
-        replace(bar, axis_m=moved(bar.axis_m), nominal_axis_m=moved(bar.nominal_axis_m))  # type: ignore[arg-type]
-        for bar in BARS
-    ]
-    truth = view(bars, np.linalg.inv(pose))
-    samples = as_built_samples(truth.depth_m.astype(float) + 0.001, truth)
-    expected = deviation_samples(BUILT_EXACT_M + 0.001)
-    for name, values in samples.items():
-        np.testing.assert_allclose(values, expected[name], atol=0.02, err_msg=name)
 
 
 def test_configs_without_design_have_null(tmp_path: Path, tiny_root: Path) -> None:
