@@ -89,9 +89,8 @@ def test_four_bars_of_a_mat_by_hand() -> None:
     found = scene_crossings([along_x(1), along_x(2, y=0.2), along_y(3, z=0.02), along_y(4, x=0.3, z=0.022)])
     assert pairs(found) == [(1, 3), (1, 4), (2, 3), (2, 4)]
     np.testing.assert_allclose(1e3 * found.gap_m, [0, 2, 0, 2], atol=1e-9)
-    np.testing.assert_allclose(
-        found.tie_point_m[:, :2], [[0.0, 0.0], [0.3, 0.0], [0.0, 0.2], [0.3, 0.2]], atol=1e-12
-    )
+    corners_m = [[0.0, 0.0], [0.3, 0.0], [0.0, 0.2], [0.3, 0.2]]
+    np.testing.assert_allclose(found.tie_point_m[:, :2], corners_m, atol=1e-12)
     assert found.node_id.tolist() == [1, 2, 3, 4]
 
 
