@@ -15,10 +15,13 @@ _EMBEDDED = {
 
 
 def without_embedded(page: str) -> str:
-    """Return a page without its style sheet, scripts and image data, for a golden text."""
+    """Return a page without its style sheet, scripts and image data, for a golden text.
+
+    The values by which cells are sorted are rounded, since the last digits depend on the processor.
+    """
     for pattern, shown in _EMBEDDED.items():
         page = re.sub(pattern, shown, page, flags=re.DOTALL)
-    return page
+    return re.sub(r'data-value="([^"]*)"', lambda value: f'data-value="{float(value[1]):.6g}"', page)
 
 
 class Page(HTMLParser):
