@@ -278,7 +278,7 @@ def test_table_command_draws_archives(
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    orbit = {row["view_id"]: row["left_depth"] for row in rdb.load(tiny_root, "lattice-orbit")}
+    orbit = {row["view_id"]: row["left_depth"] for row in rdb.load(tiny_root, "lattice-orbit", streaming=True)}
     archives = [
         archive_of({view_id: 1.5 * depth for view_id, depth in {**tiny_truth, **orbit}.items()}, "a.zip"),
         archive_of({view_id: 0 * depth for view_id, depth in tiny_truth.items()}, "b.zip"),
