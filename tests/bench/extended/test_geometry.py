@@ -368,3 +368,18 @@ def test_extreme_values_match_no_point(value: float) -> None:
         assert set(cloud_scores(np.array([value]), pixel_truth([0.0005], rays=[(0, 0)])).values()) == {0.0}
     no_interior = steel_truth(np.ones((2, 2)), np.ones((2, 2), np.uint16))
     assert cloud_scores(np.full(4, value), no_interior) == {}
+
+
+def test_skipped_lookups_do_not_change_scores(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Check that the scores are the same if the nearest point is looked up for every point."""
+    rng = np.random.default_rng(2)
+    truth = random_truth(rng)
+    p_m = random_prediction(rng, truth)
+    before = cloud_scores(p_m, truth)
+    nearest_m = point_cloud._nearest_m
+    monkeypatch.setattr(
+        point_cloud,
+        "_nearest_m",
+        lambda tree, points, own, _: nearest_m(tree, points, own, np.ones(len(own), bool)),
+    )
+    assert cloud_scores(p_m, truth) == before
