@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from tests.hub_server import HubServer
 
 TINY_DATASET = Path(__file__).parent / "data" / "tiny"
+GOLDEN_TEXTS = Path(__file__).parent / "data" / "golden"
 
 FIXTURE_MARKERS = {
     "blender": "blender",
@@ -61,13 +62,16 @@ TIERS = {
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add ``--tier``."""
+    """Add ``--tier`` and ``--update-golden``."""
     parser.addoption(
         "--tier",
         choices=TIERS,
         default="test",
         help="quick: no Blender, server, database, cluster or browser, and nothing slow; "
         "test: all but long stress tests (default); nightly: everything, with full repetitions",
+    )
+    parser.addoption(
+        "--update-golden", action="store_true", help="write the texts of tests/data/golden instead of comparing"
     )
 
 
@@ -111,6 +115,18 @@ def repetitions(request: pytest.FixtureRequest) -> Repetitions:
     """Choose how often a stress test repeats: ``repetitions(few, many)`` is ``many`` in the nightly tier."""
     is_nightly = request.config.getoption("--tier") == "nightly"
     return lambda few, many: many if is_nightly else few
+
+
+@pytest.fixture(scope="session")
+def check_golden(request: pytest.FixtureRequest) -> Callable[[str, str], None]:
+    """Compare a text with the file of that name in ``tests/data/golden``, which ``--update-golden`` writes."""
+
+    def check(name: str, text: str) -> None:
+        if request.config.getoption("--update-golden"):
+            (GOLDEN_TEXTS / name).write_bytes(text.encode())
+        assert text == (GOLDEN_TEXTS / name).read_bytes().decode(), f"see {name}, and --update-golden"
+
+    return check
 
 
 @pytest.fixture(scope="session", autouse=True)

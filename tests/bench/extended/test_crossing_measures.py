@@ -1,4 +1,4 @@
-"""Tests of crossing measures: judged crossings of scenes solved by hand, exact and displaced depth, and noise."""
+"""Crossings in depth: judged crossings, measures of exact, displaced and noisy depth, and reach."""
 
 from __future__ import annotations
 
@@ -21,11 +21,17 @@ from rebar_depth_bench.extended.crossings import (
 )
 from rebar_depth_bench.extended.fits import LATERAL_PRIOR_RADII
 from rebar_depth_bench.extended.measures import Samples
+from rebar_depth_bench.extended.reach import Reach, reaches
 from rebar_depth_bench.extended.steel import SceneBars, SteelTruth
+from rebar_depth_bench.scoring.bootstrap import Resampling, resample, resample_scenes
 from tests.bench.extended.cage_scenes import FOCAL_PX, bar, view
 
 D = 0.02
+
+
 UPRIGHT = bar(1, (0.0, -0.15, 0.40), (0.0, 0.15, 0.40))
+
+
 LYING = bar(2, (-0.2, 0.0, 0.421), (0.2, 0.0, 0.421))
 
 
@@ -41,14 +47,14 @@ def samples_of(p_m: ndarray, truth: SteelTruth) -> Samples:
     return samples
 
 
-def exact(bars: list[Bar]) -> tuple[SteelTruth, ndarray]:
+def exact_depth(bars: list[Bar]) -> tuple[SteelTruth, ndarray]:
     truth = view(bars)
     return truth, truth.depth_m.astype(np.float64)
 
 
 def test_two_bars_by_hand() -> None:
     """An upright bar 1 mm before a lying one: the tie point is 410.5 mm from the camera, on its axis."""
-    truth, depth_m = exact([UPRIGHT, LYING])
+    truth, depth_m = exact_depth([UPRIGHT, LYING])
     found = view_crossings(truth)
     assert found.crossing.tolist() == [0]
     np.testing.assert_allclose(found.ties.tie_point_m, [[0, 0, 0.4105]], atol=1e-9)
@@ -91,7 +97,7 @@ def test_three_bars_of_one_node_are_judged_where_they_are_seen() -> None:
 def test_four_bars_have_four_exact_crossings() -> None:
     bars = [bar(i + 1, (x, -0.15, 0.40), (x, 0.15, 0.40)) for i, x in enumerate((-0.05, 0.05))]
     bars += [bar(i + 3, (-0.2, y, 0.4215), (0.2, y, 0.4215)) for i, y in enumerate((-0.04, 0.04))]
-    truth, depth_m = exact(bars)
+    truth, depth_m = exact_depth(bars)
     found = view_crossings(truth)
     assert found.crossing.tolist() == [0, 1, 2, 3]
     expected = [(x, y, 0.41075) for x in (-0.05, 0.05) for y in (-0.04, 0.04)]
@@ -101,42 +107,37 @@ def test_four_bars_have_four_exact_crossings() -> None:
     assert samples["crossing_angle_judged_deg"].max() < 0.3
 
 
-def judged(bars: list[Bar]) -> list[int]:
-    truth = view(bars)
-    return [int(crossing) for crossing in truth.judged.crossing]
+def at_border(offset_m: float) -> list[Bar]:
+    """Return two bars that cross at a distance from the right border of the image, metres to its right."""
+    x = 0.4 * 120 / FOCAL_PX + offset_m
+    return [bar(1, (x, -0.15, 0.4), (x, 0.15, 0.4)), bar(2, (x - 0.1, 0, 0.421), (x + 0.1, 0, 0.421))]
 
 
-def test_hidden_crossing_is_not_judged() -> None:
-    cover = bar(3, (-0.03, 0.0, 0.30), (0.03, 0.0, 0.30), 0.03)
-    assert judged([UPRIGHT, LYING, cover]) == []
-    assert judged([UPRIGHT, LYING, Bar(3, "bar", 0.01, ((0.03, -0.1, 0.3), (0.03, 0.1, 0.3)))]) == [0]
-
-
-def test_crossing_at_the_border_of_the_image_is_not_judged() -> None:
-    """Move the crossing to the right: both sides of the lying bar must be in the image, and the tie point."""
-    right_m = 0.4 * 120 / FOCAL_PX
-    for offset_m, expected in ((-0.06, [0]), (-0.005, []), (0.005, []), (0.05, [])):
-        x = right_m + offset_m
-        bars = [bar(1, (x, -0.15, 0.4), (x, 0.15, 0.4)), bar(2, (x - 0.1, 0, 0.421), (x + 0.1, 0, 0.421))]
-        assert judged(bars) == expected, offset_m
-
-
-def test_bars_in_one_image_line_are_not_judged() -> None:
-    """Look along the plane of both bars: the rear one is hidden over its whole length."""
-    sloping = bar(2, (0.0, -0.1, 0.30), (0.0, 0.1, 0.5421))
-    truth = view([UPRIGHT, sloping])
-    assert (len(truth.bars.crossings), truth.judged.crossing.tolist()) == (1, [])
-    samples = samples_of(truth.depth_m.astype(np.float64), truth)
-    assert samples["crossings_judged"].tolist() == [0.0]
-    assert not any(len(values) for name, values in samples.items() if name != "crossings_judged")
-
-
-def test_bar_on_one_side_or_too_short_is_not_judged() -> None:
-    one_side = bar(2, (-0.001, 0.0, 0.421), (0.2, 0.0, 0.421))
-    assert judged([UPRIGHT, one_side]) == []
-    short = bar(2, (-0.029, 0.0, 0.421), (0.029, 0.0, 0.421))  # 58 mm: the interior spans less than 3 d = 60 mm.
-    assert judged([UPRIGHT, short]) == []
-    assert judged([UPRIGHT, bar(2, (-0.04, 0.0, 0.421), (0.04, 0.0, 0.421))]) == [0]
+@pytest.mark.parametrize(
+    ("bars", "judged"),
+    [
+        ([UPRIGHT, LYING, bar(3, (-0.03, 0.0, 0.30), (0.03, 0.0, 0.30), 0.03)], []),
+        ([UPRIGHT, LYING, bar(3, (0.03, -0.1, 0.3), (0.03, 0.1, 0.3), 0.01)], [0]),
+        (at_border(-0.06), [0]),
+        (at_border(-0.005), []),
+        (at_border(0.005), []),
+        (at_border(0.05), []),
+        ([UPRIGHT, bar(2, (-0.001, 0.0, 0.421), (0.2, 0.0, 0.421))], []),
+        ([UPRIGHT, bar(2, (-0.029, 0.0, 0.421), (0.029, 0.0, 0.421))], []),  # The interior spans less than 3 d.
+        ([UPRIGHT, bar(2, (-0.04, 0.0, 0.421), (0.04, 0.0, 0.421))], [0]),
+        ([UPRIGHT, bar(2, (0.0, -0.1, 0.30), (0.0, 0.1, 0.5421))], []),
+    ],
+    ids=[
+        *("hidden", "beside a bar", "inside", "one side at the border", "tie point outside", "outside"),
+        *("on one side", "too short", "long enough", "in one image line"),
+    ],
+)
+def test_crossings_are_judged_where_both_bars_are_seen(bars: list[Bar], judged: list[int]) -> None:
+    truth, depth_m = exact_depth(bars)
+    assert truth.judged.crossing.tolist() == judged
+    samples = samples_of(depth_m, truth)
+    assert samples["crossings_judged"].tolist() == [len(judged) / len(truth.bars.crossings)]
+    assert bool(judged) == any(len(values) for name, values in samples.items() if name != "crossings_judged")
 
 
 def test_bent_bar_is_judged_but_not_fitted() -> None:
@@ -156,30 +157,26 @@ def test_bent_bar_is_judged_but_not_fitted() -> None:
 
 
 def test_no_crossings_give_empty_samples() -> None:
-    truth, depth_m = exact([UPRIGHT])
+    truth, depth_m = exact_depth([UPRIGHT])
     samples = samples_of(depth_m, truth)
     assert all(len(values) == 0 for values in samples.values())
 
 
 def test_shifted_depth_shifts_the_tie_point() -> None:
-    """Move both bars 3 mm away from the camera: the error is along the optical axis, the gap unchanged."""
-    truth, depth_m = exact([UPRIGHT, LYING])
+    """Both bars 3 mm too far leave the gap; one 2 mm too far moves the tie point by half and closes the gap."""
+    truth, depth_m = exact_depth([UPRIGHT, LYING])
     samples = samples_of(depth_m + 0.003, truth)
     assert samples["tie_along_error_mm"] == pytest.approx([3.0], abs=0.05)
     assert samples["tie_across_judged_mm"] == pytest.approx([0.0], abs=0.05)
     assert samples["crossing_gap_error_mm"] == pytest.approx([0.0], abs=0.05)
     assert [samples[f"tie_within_{limit}mm"].tolist() for limit in (2, 5, 10)] == [[0.0], [1.0], [1.0]]
-
-
-def test_one_shifted_bar_moves_tie_point_by_half_and_closes_the_gap() -> None:
-    truth, depth_m = exact([UPRIGHT, LYING])
     samples = samples_of(depth_m + 0.002 * (truth.bar_id == 1), truth)
     assert samples["tie_along_error_mm"] == pytest.approx([1.0], abs=0.05)
     assert samples["crossing_gap_error_mm"] == pytest.approx([-2.0], abs=0.05)  # Intersecting cylinders: -1 mm.
 
 
 def test_missing_predictions_are_not_located() -> None:
-    truth, depth_m = exact([UPRIGHT, LYING])
+    truth, depth_m = exact_depth([UPRIGHT, LYING])
     for p_m in (np.full(len(depth_m), np.nan), np.where(truth.bar_id == 1, np.nan, depth_m)):
         samples = samples_of(p_m, truth)
         assert samples["crossing_located"].tolist() == [0.0]
@@ -189,10 +186,11 @@ def test_missing_predictions_are_not_located() -> None:
         assert len(samples["tie_along_error_mm"]) == 0
 
 
-@settings(max_examples=20, deadline=None)
+@pytest.mark.slow
+@settings(max_examples=20)
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.0, 1e-3, 1.0, 1e6, 1e300]))
 def test_wild_predictions_never_warn(seed: int, size: float) -> None:
-    truth, depth_m = exact([UPRIGHT, LYING, turned(50, 0.442, 3)])
+    truth, depth_m = exact_depth([UPRIGHT, LYING, turned(50, 0.442, 3)])
     rng = np.random.default_rng(seed)
     p_m = depth_m + size * rng.standard_normal(len(depth_m))
     p_m[rng.random(len(p_m)) < 0.2] = np.nan
@@ -229,7 +227,7 @@ def predicted_sigma_m(view: ViewCrossings, noise_m: float) -> float:
 @pytest.mark.parametrize("noise_diameters", [0.01, 0.03, 0.1])
 @pytest.mark.parametrize("angle_deg", [0.0, 40.0])
 def test_noise_has_the_effect_that_error_propagation_predicts(noise_diameters: float, angle_deg: float) -> None:
-    truth, depth_m = exact([UPRIGHT, turned(angle_deg, 0.421)])
+    truth, depth_m = exact_depth([UPRIGHT, turned(angle_deg, 0.421)])
     found = view_crossings(truth)
     noise_m, rng = noise_diameters * D, np.random.default_rng(7)
     errors_mm = []
@@ -241,3 +239,88 @@ def test_noise_has_the_effect_that_error_propagation_predicts(noise_diameters: f
     # Tukey's biweight has an efficiency of 95 %, and 300 draws determine a deviation to 4 %.
     assert 0.92 * expected_mm < np.std(errors_mm) < 1.15 * expected_mm
     assert abs(np.mean(errors_mm)) < 4 * expected_mm / math.sqrt(300) + 0.02 * noise_m * 1000
+
+
+# Reach.
+
+
+REACH_VIEWS = 10
+
+
+def crossings_of_view(bins: dict[float, tuple[int, float]], view: int) -> dict[str, ndarray]:
+    """Return a view's crossings by depth: their number, and the share of views with 3 mm of error, else 9 mm."""
+    z_m = [z for z, (count, _) in bins.items() for _ in range(count)]
+    error_mm = [3.0 if view < share * REACH_VIEWS else 9.0 for count, share in bins.values() for _ in range(count)]
+    return {"crossing_z_m": np.array(z_m), "tie_judged_mm": np.array(error_mm)}
+
+
+def reach_of(
+    bins: dict[float, tuple[int, float]], views: int = REACH_VIEWS, resampling: Resampling | None = None
+) -> Reach:
+    by_view = [crossings_of_view(bins, view) for view in range(views)]
+    five, two = reaches(by_view, resampling or resample([100 * index for index in range(views)]))
+    assert (five.limit_mm, two.limit_mm) == (5, 2)
+    assert two.verdict in ("not met", "none tested")  # 3 mm is never within 2 mm.
+    return five
+
+
+def test_reach_ends_before_the_first_bin_that_fails() -> None:
+    found = reach_of({0.22: (6, 1), 0.27: (6, 1), 0.35: (6, 0.9), 0.45: (6, 1)})
+    assert (found.verdict, found.distance_m, found.tested_m) == ("up to", 0.3, (0.2, 0.5))
+    assert [(one.low_m, one.crossings, one.views) for one in found.bins] == [
+        (0.2, 60, 10), (0.25, 60, 10), (0.3, 60, 10), (0.4, 60, 10),
+    ]  # fmt: skip
+    assert found.bins[2].share == pytest.approx(0.9)
+    assert found.interval is not None
+    # Views of which a tenth fails in the third bin: some resamples have none of them, and all bins are met.
+    assert found.interval == (0.3, 0.5)
+
+
+def test_reach_of_all_tested_bins_is_a_lower_bound() -> None:
+    found = reach_of({0.22: (6, 1), 0.27: (6, 1), 0.35: (4, 0)})  # 40 crossings: the third bin is not tested.
+    assert (found.verdict, found.distance_m, found.interval) == ("at least", 0.3, (0.3, 0.3))
+    assert [one.tested for one in found.bins] == [True, True, False]
+
+
+def test_share_of_exactly_95_percent_fulfils() -> None:
+    by_view = [
+        {"crossing_z_m": np.full(20, 0.22), "tie_judged_mm": np.r_[np.full(19, 5.0), 5.1]} for _ in range(5)
+    ]
+    found = reaches(by_view, resample(range(0, 500, 100)))[0]
+    assert (found.verdict, found.distance_m) == ("at least", 0.25)
+
+
+def test_untested_gap_ends_the_reach() -> None:
+    found = reach_of({0.22: (6, 1), 0.45: (6, 1)})
+    assert (found.verdict, found.distance_m, found.tested_m) == ("at least", 0.25, (0.2, 0.25))
+    found = reach_of({0.22: (1, 0), 0.27: (6, 1)})  # Ten crossings nearer than the nearest tested bin say nothing.
+    assert (found.verdict, found.distance_m, found.tested_m) == ("at least", 0.3, (0.25, 0.3))
+
+
+def test_reach_is_not_met_in_the_first_tested_bin() -> None:
+    found = reach_of({0.22: (6, 0.5), 0.27: (6, 1)})
+    assert (found.verdict, found.distance_m, found.interval) == ("not met", None, (0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("bins", "views"), [({}, 10), ({0.22: (20, 1.0)}, 4), ({0.22: (4, 1.0)}, 10), ({30.0: (9, 1.0)}, 10)]
+)
+def test_reach_of_no_tested_bin_is_none(bins: dict[float, tuple[int, float]], views: int) -> None:
+    found = reach_of(bins, views)
+    assert (found.verdict, found.distance_m, found.interval, found.tested_m) == ("none tested", None, None, None)
+
+
+def test_reach_is_in_json_terms() -> None:
+    found = reach_of({0.22: (6, 1), 0.27: (6, 0)}).to_dict()
+    assert {name: value for name, value in found.items() if name != "bins"} == {
+        "limit_mm": 5, "verdict": "up to", "distance_m": 0.25, "ci95": [0.25, 0.25], "tested_m": [0.2, 0.3],
+    }  # fmt: skip
+    assert found["bins"][0] == {
+        "low_m": 0.2, "high_m": 0.25, "crossings": 60, "views": 10, "share": 1.0, "ci95": [1.0, 1.0],
+    }  # fmt: skip
+
+
+def test_interval_of_few_scenes_is_unknown() -> None:
+    few = resample_scenes(["a"] * 5 + ["b"] * 5)
+    found = reach_of({0.22: (6, 1)}, resampling=few)
+    assert (found.verdict, found.distance_m, found.interval) == ("at least", 0.25, None)

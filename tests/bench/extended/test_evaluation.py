@@ -1,4 +1,4 @@
-"""End-to-end tests of the extended measures on a rendered dataset folder."""
+"""Extended measures of archives of a rendered dataset, from the folder to JSON, CSV, terminal and report."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from rebar_depth_bench import DatasetError, score
+from rebar_depth_bench import DatasetError, SubmissionWriter, score
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.bars import bars, read_bars, write_bars
 from rebar_depth_bench.data.manifest import open_folder
@@ -44,19 +44,33 @@ def values(result: ExtendedResult, alignment: str) -> dict[str, float]:
     return {name: estimate.value for name, estimate in numbers.items() if estimate.value is not None}
 
 
-def test_measure_names_are_unique_and_documented() -> None:
+@pytest.fixture(scope="module")
+def archive_of_truth(tiny_truth: Depths, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("truth") / "truth.zip"
+    with SubmissionWriter(path, method="test") as writer:
+        for view_id, depth_m in tiny_truth.items():
+            writer.add(view_id, depth_m)
+    return path
+
+
+@pytest.fixture(scope="module")
+def of_truth(archive_of_truth: Path, tiny_root: Path) -> ExtendedResult:
+    return extended(archive_of_truth, tiny_root)
+
+
+def test_measures_have_names_titles_and_definitions_of_their_own() -> None:
     for measures in measures_by_alignment().values():
-        names = [measure.name for measure in measures]
-        assert len(set(names)) == len(names)
-        assert all(measure.title and measure.definition for measure in measures)
+        names = {measure.name for measure in measures}
+        assert len(names) == len({measure.title for measure in measures}) == len(measures)
+        assert not {"abs_rel", "rmse_cm", "mae_cm", "delta1", "coverage"} & names
+        assert all(measure.definition for measure in measures)
+    for family in ("boundary", "clouds", "layers", "full_mask"):
+        assert not any(measure.definition.endswith(".") for measure in MEASURE_FAMILIES[family].measures)
 
 
-def test_ground_truth_is_perfect_in_every_measure(
-    tiny_truth: Depths, tiny_root: Path, archive_of: Archive
-) -> None:
-    result = extended(archive_of(tiny_truth), tiny_root)
-    once, native = values(result, ONCE), values(result, NATIVE)
-    assert native == values(result, SCALED)
+def test_ground_truth_is_perfect_in_every_measure(of_truth: ExtendedResult) -> None:
+    once, native = values(of_truth, ONCE), values(of_truth, NATIVE)
+    assert native == values(of_truth, SCALED)
     assert once["scale_mean"] == 1.0
     assert once["scale_spread"] == 0.0
     for name in once:
@@ -71,16 +85,22 @@ def test_ground_truth_is_perfect_in_every_measure(
                 assert native[measure.name] == (1.0 if measure.better == "higher" else 0.0), measure.name
     assert all(value == 0 for name, value in native.items() if "abs_rel" in name)
     assert native["kept_share"] < 1
+    console = Console(width=100, record=True, file=io.StringIO())
+    print_extended(of_truth, console)
+    text = console.export_text()
+    shown = {key for key, family in MEASURE_FAMILIES.items() if family.title in text}
+    assert shown == MEASURE_FAMILIES.keys() - {"as_built"}, "the lattice has no design"
 
 
-def test_doubled_depth_is_corrected_by_scale(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
+def test_doubled_depth_is_corrected_by_scale(
+    tiny_truth: Depths, tiny_root: Path, archive_of: Archive, of_truth: ExtendedResult
+) -> None:
     result = extended(archive_of({view: 2 * depth for view, depth in tiny_truth.items()}), tiny_root)
     once = values(result, ONCE)
     assert once["scale_mean"] == 0.5
     assert once["scale_spread"] == pytest.approx(0, abs=1e-12)
     assert once["scale_explains"] == 1.0
-    truth = extended(archive_of(tiny_truth, "truth.zip"), tiny_root)
-    assert values(result, SCALED) == values(truth, NATIVE)
+    assert values(result, SCALED) == values(of_truth, NATIVE)
 
 
 def test_missing_pixels_never_improve_a_measure(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
@@ -103,12 +123,21 @@ def test_missing_pixels_never_improve_a_measure(tiny_truth: Depths, tiny_root: P
     assert gains == {}
 
 
-def test_result_is_identical_for_any_number_of_workers(
-    tiny_truth: Depths, tiny_root: Path, archive_of: Archive
+def test_predictions_are_read_once_and_the_number_of_workers_changes_nothing(
+    tiny_truth: Depths, tiny_root: Path, archive_of: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    original, views = SubmissionReader.read, []
+
+    def read(reader: SubmissionReader, view_id: str) -> np.ndarray:
+        views.append(view_id)
+        return original(reader, view_id)
+
     archive = archive_of({view: 1.05 * depth + np.float32(0.002) for view, depth in tiny_truth.items()})
-    one_worker, four_workers = (extended(archive, tiny_root, workers=workers).to_dict() for workers in (1, 4))
+    four_workers = extended(archive, tiny_root, workers=4).to_dict()
+    monkeypatch.setattr(SubmissionReader, "read", read)
+    one_worker = extended(archive, tiny_root, workers=1).to_dict()
     assert json.dumps(one_worker) == json.dumps(four_workers)
+    assert sorted(views) == sorted(tiny_truth)
 
 
 def test_steel_truth_matches_dataset_folder(tiny_root: Path, tiny_truth: Depths, tiny_masks: Depths) -> None:
@@ -135,9 +164,9 @@ def test_dilate_mask_by_hand() -> None:
 
 
 def test_score_command_writes_extended_json_and_csv(
-    tiny_truth: Depths, tiny_root: Path, archive_of: Archive, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    tiny_truth: Depths, tiny_root: Path, archive_of_truth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    archive = archive_of(tiny_truth)
+    archive = archive_of_truth
     out, table = tmp_path / "out.json", tmp_path / "out.csv"
     command = ["score", str(archive), "--data", str(tiny_root), "--json", str(out), "--extended-csv", str(table)]
     assert main(command) == 0
@@ -154,62 +183,24 @@ def test_score_command_writes_extended_json_and_csv(
     assert "Boundary" in capsys.readouterr().out
 
 
-def test_table_is_at_most_100_columns(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
-    console = Console(width=100, record=True, file=io.StringIO())
-    print_extended(extended(archive_of(tiny_truth), tiny_root), console)
-    text = console.export_text()
-    shown = {key for key, family in MEASURE_FAMILIES.items() if family.title in text}
-    assert shown == MEASURE_FAMILIES.keys() - {"as_built"}, "the lattice has no design"
-    assert max(map(len, text.splitlines())) <= 100
-
-
-def test_folder_without_bars_raises_dataset_error(
-    tiny_truth: Depths, tiny_root: Path, archive_of: Archive, tmp_path: Path
-) -> None:
-    archive = archive_of(tiny_truth)
-    for item in tiny_root.iterdir():
-        if item.name != "bars.parquet":
-            (tmp_path / item.name).symlink_to(item)
-    with (
-        open_evaluation(archive, tmp_path) as evaluation,
-        pytest.raises(
-            DatasetError, match=r"has no bars\.parquet, expected a complete dataset folder written by rebar-build"
-        ),
-    ):
-        score_extended(evaluation)
-
-
-def test_damaged_bars_are_refused(
-    tiny_truth: Depths, tiny_root: Path, archive_of: Archive, tmp_path: Path
-) -> None:
-    """Check that bars which contradict the manifest are not used, since they would change the measures."""
+def test_missing_and_damaged_bars_are_refused(tiny_root: Path, archive_of_truth: Path, tmp_path: Path) -> None:
+    """Bars that contradict the manifest are not used, since they would change the measures."""
     copy = tmp_path / "copy"
     shutil.copytree(tiny_root, copy)
-    archive = archive_of(tiny_truth)
     scenes = read_bars(copy / "bars.parquet")
     scene, (bar, *others) = next(iter(scenes.items()))
     write_bars(copy / "bars.parquet", {**scenes, scene: (replace(bar, diameter_m=2 * bar.diameter_m), *others)})
     with (
-        open_evaluation(archive, copy) as evaluation,
+        open_evaluation(archive_of_truth, copy) as evaluation,
         pytest.raises(DatasetError, match=r"bars\.parquet: the SHA-256 is"),
     ):
         score_extended(evaluation)
     with pytest.raises(DatasetError, match=r"bars\.parquet: the SHA-256 is"):
         bars(copy)
-
-
-def test_each_prediction_is_read_once(
-    tiny_truth: Depths, tiny_root: Path, archive_of: Archive, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    original, views = SubmissionReader.read, []
-
-    def read(reader: SubmissionReader, view_id: str) -> np.ndarray:
-        views.append(view_id)
-        return original(reader, view_id)
-
-    monkeypatch.setattr(SubmissionReader, "read", read)
-    extended(archive_of(tiny_truth), tiny_root)
-    assert sorted(views) == sorted(tiny_truth)
+    (copy / "bars.parquet").unlink()
+    expected = r"has no bars\.parquet, expected a complete dataset folder written by rebar-build"
+    with open_evaluation(archive_of_truth, copy) as evaluation, pytest.raises(DatasetError, match=expected):
+        score_extended(evaluation)
 
 
 NEW_MEASURE = """
@@ -228,10 +219,13 @@ import sys
 from rebar_depth_bench import extended
 extended.__path__.append(sys.argv.pop(1))
 from rebar_depth_bench.cli.main import main
-sys.exit(main(sys.argv[1:]))
+status = main(sys.argv[1:])
+assert not {"torch", "cv2", "bpy"} & set(sys.modules)
+sys.exit(status)
 """
 
 
+@pytest.mark.slow
 def test_a_new_measure_is_one_file(
     tiny_truth: Depths, tiny_root: Path, archive_of: Archive, tmp_path: Path
 ) -> None:
@@ -250,10 +244,3 @@ def test_a_new_measure_is_one_file(
     for text in (terminal, outputs["html"].read_text()):
         assert "Gross errors" in text
         assert "Pixels off by 50 mm" in text
-
-
-@pytest.mark.slow
-def test_extended_imports_neither_torch_nor_opencv() -> None:
-    code = "import sys, rebar_depth_bench.extended.registry; print({'torch', 'cv2', 'bpy'} & set(sys.modules))"
-    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert process.stdout.strip() == "set()"

@@ -1,11 +1,14 @@
-"""Small synthetic views for the tests of thin-structure measures."""
+"""Small synthetic views for the tests of measures over pixels."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy import ndarray
 
-from rebar_depth_bench.extended.steel import SteelTruth
+from rebar_depth_bench.extended.steel import SceneBars, SteelTruth
 from rebar_depth_bench.geometry.cameras import ideal_K, pixel_rays
 from rebar_depth_bench.scoring.protocol import interior, single_bar_pixels
 
@@ -41,6 +44,36 @@ def steel_truth(
         run=np.full(len(index), -1, np.int16),
         front_m=(no_layer if front_m is None else front_m).ravel()[index].astype(np.float32),
         behind_m=(no_layer if behind_m is None else behind_m).ravel()[index].astype(np.float32),
+    )
+
+
+def pixel_truth(
+    depth_m: Sequence[float] | ndarray,
+    bar_id: ndarray | None = None,
+    *,
+    rays: Sequence[tuple[float, float]] | None = None,
+    front_m: Sequence[float] | None = None,
+    behind_m: Sequence[float] | None = None,
+    diameter_m: ndarray | None = None,
+) -> SteelTruth:
+    """Return the truth of a view one pixel high, all of it interior; all but ``diameter_m`` has a value per pixel.
+
+    ``diameter_m`` are the diameters of bars by id, metres. The focal length is 700 px.
+    """
+    count = len(depth_m)
+    layers = (None if layer_m is None else np.array([layer_m]) for layer_m in (front_m, behind_m))
+    truth = steel_truth(np.array([depth_m]), np.ones((1, count), np.uint16), *layers)
+    K = np.array([[700.0, 0, (count - 1) / 2], [0, 700.0, 0], [0, 0, 1.0]])
+    bars = SceneBars.of(())
+    return replace(
+        truth,
+        K=K,
+        bar_id=truth.bar_id if bar_id is None else bar_id.astype(np.uint16),
+        interior=np.ones(count, bool),
+        single_bar=np.ones(count, bool),
+        rays=np.array(rays or [((u - K[0, 2]) / 700.0, 0.0) for u in range(count)]),
+        run=np.zeros(count, np.int16),
+        bars=bars if diameter_m is None else replace(bars, diameter_m=diameter_m),
     )
 
 

@@ -1,8 +1,9 @@
-"""Example results for the report tests: scores of views, tabulated by the scorer's ``tabulate``."""
+"""Example results, for tables, reports and the leaderboard: scores of views in the scorer's tables."""
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 
@@ -12,10 +13,11 @@ from rebar_depth_bench.scoring.reference import Errors, Reference
 from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareIdentity, SubmissionIdentity
 from rebar_depth_bench.scoring.score import tabulate
 from rebar_depth_bench.scoring.table import PublishedMatch, ViewScore
-from rebar_depth_bench.submission.declaration import Declaration
+from rebar_depth_bench.submission.declaration import NOT_DECLARED, Declaration
 
 DECLARED = Declaration("rgb+K", uses_ground_truth=False)
 REFERENCE = Reference(Errors(0.0571, 2.21), Errors(0.0062, 0.71))
+NEAR_REFERENCE = Reference(Errors(0.2222, 7.89), Errors(0.0333, 4.56))
 
 HOSTILE = '=<script src="//evil.example/x.js">alert(1)</script>[red]\x1b[31m\u202e&amp;'
 
@@ -74,6 +76,42 @@ def result(
         tables=tables,
         views=list(views),
     )
+
+
+def split_result(group: str = "wall", grouping: str = "family", scenes: int = 8) -> Result:
+    """Return a result of the split ``test`` of ``cages`` in groups; its last scene is in one of its own."""
+    views = [scored_view(f"cages/test-s{scene}-0000", 0.1 + 0.01 * scene) for scene in range(scenes)]
+    last = unpredicted_view(f"cages/test-s{scenes}-0000")
+    table = tabulate([*views, last], reference=REFERENCE, split="test")
+    groups = {
+        grouping: {
+            group: tabulate(views, reference=NEAR_REFERENCE, split="test"),
+            "slab": tabulate([last], reference=REFERENCE, split="test"),
+        },
+        "distance": {"0.5-1 m": tabulate([*views, last], reference=REFERENCE, split="test")},
+    }
+    return replace(result(), tables={"cages": replace(table, groups=groups)}, views=[*views, last])
+
+
+def example() -> Result:
+    """Return the result of the golden texts: configs with intervals, gaps, overflow and groups."""
+    lattice = [scored_view(f"lattice/{12 * index:04d}", 0.0215 + 0.003 * index) for index in range(8)]
+    gaps = [scored_view("lattice-raw/0000", coverage=0.94996), unpredicted_view("lattice-raw/0001")]
+    of_scenes = result(*lattice, *gaps, overflowed_view("pier/0000"))
+    split = split_result()
+    return replace(of_scenes, tables={**of_scenes.tables, **split.tables}, views=[*of_scenes.views, *split.views])
+
+
+def examples() -> list[Result]:
+    """Return the example and results that are compared with it: a better one, and ones not declared alike."""
+    lattice = [scored_view(f"lattice/{12 * index:04d}", 0.02, 0.99) for index in range(8)]
+    truth = Declaration("rgb", uses_ground_truth=True)
+    return [
+        example(),
+        result(*lattice, scored_view("pier/0000"), method="a_b"),
+        result(*lattice, method="oracle", declared=truth),
+        result(*lattice, method="unknown", declared=NOT_DECLARED),
+    ]
 
 
 def panels(view_id: str = "lattice/0000", score: ViewScore | None = None, factor: float = 1.6) -> ViewPanels:

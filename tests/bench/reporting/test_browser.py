@@ -29,25 +29,28 @@ _TABLE = """
 """
 
 
-def _run_in_browser(browser: str, page: str, operations: str, folder: Path) -> Any:
-    """Load ``page`` in Chromium and return the value of ``operations``, the body of a JavaScript function."""
-    script = f"<script>document.title = JSON.stringify((() => {{ {operations} }})());</script>"
+def dom_of(browser: str, page: str, folder: Path) -> str:
+    """Load a page in Chromium and return the document after its scripts."""
     file = folder / "page.html"
-    file.write_text(f"{page}{script}", encoding="utf-8")
+    file.write_text(page, encoding="utf-8")
     profile = f"--user-data-dir={folder / 'profile'}"
     options = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", profile]
-    completed = subprocess.run(
-        [browser, *options, "--dump-dom", file.as_uri()], capture_output=True, text=True, timeout=120, check=True
-    )
-    title = re.search(r"<title>(.*?)</title>", completed.stdout, re.DOTALL)
-    assert title, completed.stderr
+    command = [browser, *options, "--dump-dom", file.as_uri()]
+    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stdout
+
+
+def run_in_browser(browser: str, page: str, operations: str, folder: Path) -> Any:
+    """Load ``page`` in Chromium and return the value of ``operations``, the body of a JavaScript function."""
+    script = f"<script>document.title = JSON.stringify((() => {{ {operations} }})());</script>"
+    title = re.search(r"<title>(.*?)</title>", dom_of(browser, f"{page}{script}", folder), re.DOTALL)
+    assert title
     return json.loads(html.unescape(title[1]))
 
 
 def test_sortable_table_sorts_numerically_with_dashes_last(chromium_program: str, tmp_path: Path) -> None:
     script = files("rebar_depth_bench.reporting.html").joinpath("static/sortable.js").read_text(encoding="utf-8")
     page = f"<title>t</title>{_TABLE}<script>{script}</script>"
-    orders = _run_in_browser(
+    orders = run_in_browser(
         chromium_program,
         page,
         """
@@ -73,7 +76,7 @@ def test_view_browser_navigates_by_button_key_and_thumbnail(chromium_program: st
     ]
     page = render_report(result(*views), [images_of(view.view_id, view) for view in views])
     page = re.sub(r"<meta http-equiv=[^>]*>", "", page)  # The policy would block the test's own script.
-    states = _run_in_browser(
+    states = run_in_browser(
         chromium_program,
         page.replace("</body>\n</html>\n", ""),
         """
@@ -109,13 +112,8 @@ def test_view_browser_navigates_by_button_key_and_thumbnail(chromium_program: st
 
 def test_content_security_policy_blocks_foreign_scripts(chromium_program: str, tmp_path: Path) -> None:
     page = render_report(result(scored_view("lattice/0000"), overflowed_view("pier/0000")), [images_of()])
-    file = tmp_path / "page.html"
-    file.write_text(
-        page.replace("</body>", "<script>document.title = 'stranger'</script></body>"), encoding="utf-8"
-    )
-    options = ["--headless", "--no-sandbox", "--disable-gpu", f"--user-data-dir={tmp_path / 'profile'}"]
-    command = [chromium_program, *options, "--dump-dom", file.as_uri()]
-    dom = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True).stdout
+    foreign = page.replace("</body>", "<script>document.title = 'stranger'</script></body>")
+    dom = dom_of(chromium_program, foreign, tmp_path)
     assert 'class="browser browsing"' in dom
     assert "<title>stranger" not in dom
 

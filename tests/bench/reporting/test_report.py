@@ -1,77 +1,97 @@
-"""HTML report: page contents, view images, axes and charts."""
+"""HTML report and page of a detector: golden texts, structure, escaping, views shown, and reports of archives."""
 
 from __future__ import annotations
 
 import base64
 import dataclasses
 import hashlib
-import io
 import math
 import re
+from collections import Counter
+from collections.abc import Callable
+from itertools import pairwise
+from operator import attrgetter
+from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from rebar_depth_bench.reporting.axes import Axis, decade_axis, log_axis_with_one
-from rebar_depth_bench.reporting.charts import alignment_chart, scale_chart, views_chart
-from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS
-from rebar_depth_bench.reporting.html.page import WORST_SHOWN, render_report
-from rebar_depth_bench.reporting.html.views import (
-    ViewPanels,
-    depth_image,
-    depth_range,
-    error_image,
-    error_limit_cm,
-    shown_view,
-    signed_error,
+from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.data import codecs
+from rebar_depth_bench.diagnosis.corrections import MAX_VIEWS
+from rebar_depth_bench.reporting import formatting
+from rebar_depth_bench.reporting.charts import precision_chart
+from rebar_depth_bench.reporting.detections import DetectionPage, PageTable, render_page
+from rebar_depth_bench.reporting.html.page import WORST_SHOWN, render_report, write_report
+from rebar_depth_bench.reporting.html.views import shown_view, views_to_show
+from rebar_depth_bench.reporting.published import paper_scenes
+from rebar_depth_bench.scoring.columns import COVERAGE, NATIVE, RANK_ERROR, SCALE, SCALED, WITHIN, Cell
+from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
+from tests.bench.reporting.pages import Page, without_embedded
+from tests.bench.reporting.results import (
+    HOSTILE,
+    example,
+    overflowed_view,
+    panels,
+    result,
+    scored_view,
+    split_result,
+    unpredicted_view,
 )
-from tests.bench.reporting.pages import Page
-from tests.bench.reporting.results import HOSTILE, overflowed_view, panels, result, scored_view, unpredicted_view
 from tests.bench.reporting.results import shown as images_of
 
-
-def _decode(webp: bytes) -> np.ndarray[tuple[int, ...], np.dtype[np.uint8]]:
-    return np.asarray(Image.open(io.BytesIO(webp)).convert("RGB"))
-
-
-def test_page_shows_numbers_provenance_and_alignment() -> None:
-    page = Page(render_report(result(scored_view("lattice/0000"), unpredicted_view("pile/0000")), [images_of()]))
-    for stated in (
-        *("0.7500", "20.09", "18.71", "0.123", "0.0613", "1.52", "1.17", "0.988", "0.625"),
-        *("1.2", "4.6", "7.9", "13.6"),
-        *("my model", "rebar-2", "1.2.3", "sha256:" + "fedcba9876543210" * 4, "0123456789abcdef" * 4),
-        "Native (no alignment) and scaled (oracle median scale per view, s = median(z)/median(p))",
-        "not compared with those of others: 1 of 1 view without any prediction; coverage 0.0 % is below 95 %.",
-        "43\N{NARROW NO-BREAK SPACE}210 scored pixels",
-    ):
-        assert stated in page.text
+REMOTE = r"https?://|<link|<iframe|@import|url\(|javascript:|fetch|import\(|XMLHttp|innerHTML"
+"""What a page would load or run something with."""
 
 
-def test_hostile_names_are_escaped() -> None:
-    hostile = result(scored_view("<b>x/0000"), method=HOSTILE)
-    rendered = render_report(hostile, [images_of("<b>x/0000")])
-    page = Page(rendered)
-    assert len(page.attributes_of("script")) == 1, "the page's own"
-    benign = Page(render_report(result(scored_view("beam/0000")), [images_of("beam/0000")]))
-    assert len(page.attributes_of("b")) == len(benign.attributes_of("b"))
-    assert "<b>x" not in rendered
-    assert '=<script src="//evil.example/x.js">alert(1)</script>[red]' in page.text
-    assert "\x1b" not in rendered
-    assert "\u202e" not in rendered
+@pytest.fixture(scope="module")
+def rendered() -> str:
+    """Return the report of the example with two views."""
+    shown = example()
+    return render_report(shown, [images_of(view.view_id, view) for view in (shown.views[0], shown.views[9])])
 
 
-def test_page_is_self_contained_with_one_hashed_script() -> None:
-    rendered = render_report(result(scored_view("lattice/0000")), [images_of()])
-    page = Page(rendered)
-    assert not re.search(
-        r"https?://|<link|<iframe|@import|url\(|javascript:|fetch|import\(|XMLHttp|innerHTML", rendered
+def detection_page(text: str = "plain") -> DetectionPage:
+    """Return a page with a chart, a table and a note, which have ``text`` in all places."""
+    chart = precision_chart(text, text, {text: [(0.0, 1.0), (0.5, 0.5)], "b": []})
+    return DetectionPage(
+        title=f"{text}: one scale for all",
+        lead=f"lead {text}",
+        stamps=[("Protocol", "rebar-2"), (f"Archive of {text}", "sha256:12")],
+        figures=[(chart, f"Figure {text}", f"caption {text}")],
+        tables=[PageTable(f"table {text}", [("k", "views"), (text, "")], [["1", text], ["2", "−0.5"]])],
+        notes=[f"note {text}"],
     )
-    scripts = re.findall(r"<script[^>]*>(.*?)</script>", rendered, re.DOTALL)
-    assert len(scripts) == len(page.attributes_of("script")) == 1
+
+
+def test_pages_are_the_golden_texts(rendered: str, check_golden: Callable[[str, str], None]) -> None:
+    check_golden("report.html", without_embedded(rendered))
+    check_golden("detections.html", without_embedded(render_page(detection_page())))
+
+
+def test_page_is_well_formed_with_alternative_texts(rendered: str) -> None:
+    page = Page(rendered)
+    assert page.count("h1") == 1
+    assert page.attributes_of("html") == [{"lang": "en"}]
+    assert page.count("svg") == page.count("desc")
+    assert page.count("article") == 2
+    assert page.count("img") == 2 * 5 + 4 + 3, "panels, and the colour bars of their scales"
+    alts = [image["alt"] for image in page.attributes_of("img") if image["alt"]]
+    assert len(alts) == len(set(alts)) == 2 * 5
+    ids = [attributes["id"] for _, attributes in page.tags if "id" in attributes]
+    assert len(ids) == len(set(ids))
+    hidden = [(name, attributes) for name, attributes in page.tags if "hidden" in attributes]
+    assert hidden == [("div", {"class": "controls", "hidden": None})], "buttons that do nothing without script"
+
+
+def test_page_is_self_contained_with_one_hashed_script(rendered: str) -> None:
+    page = Page(rendered)
+    assert not re.search(REMOTE, rendered)
+    [script] = re.findall(r"<script[^>]*>(.*?)</script>", rendered, re.DOTALL)
     assert page.attributes_of("script") == [{}], "inline: no source"
-    digest = base64.b64encode(hashlib.sha256(scripts[0].encode()).digest()).decode()
-    assert len(page.attributes_of("img")) == 5 + 4, "five panels, four colour bars"
+    digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode()
     assert all((image["src"] or "").startswith("data:image/") for image in page.attributes_of("img"))
     assert not [name for _, attributes in page.tags for name in attributes if name.startswith("on")]
     policy = [meta for meta in page.attributes_of("meta") if meta.get("http-equiv") == "Content-Security-Policy"]
@@ -80,42 +100,40 @@ def test_page_is_self_contained_with_one_hashed_script() -> None:
     )
 
 
-def test_page_is_complete_without_script() -> None:
-    views = [scored_view(f"lattice/{index:04d}", abs_rel=0.1 * (index + 1)) for index in range(3)]
-    page = Page(render_report(result(*views), [images_of(view.view_id, view) for view in views]))
-    assert len(page.attributes_of("article")) == 3
-    assert [tags for tags in page.attributes_of("div") if tags.get("class") == "controls"] == [
-        {"class": "controls", "hidden": None}
-    ], "buttons that do nothing do not show"
-    hidden = [attributes for name, attributes in page.tags if "hidden" in attributes and name != "div"]
-    assert hidden == []
-    assert "3 of 3 views of lattice" in page.text
+def test_page_of_a_detector_is_self_contained_and_escaped() -> None:
+    rendered, hostile = render_page(detection_page()), render_page(detection_page(HOSTILE))
+    plain, escaped = Page(rendered), Page(hostile)
+    assert not re.search(rf"{REMOTE}|<script", rendered)
+    assert not [name for _, attributes in plain.tags for name in attributes if name.startswith("on")]
+    assert "prefers-color-scheme: dark" in rendered
+    assert [tag for tag, _ in escaped.tags] == [tag for tag, _ in plain.tags]
+    assert "<script" not in hostile
+    assert escaped.text.count("<script") >= 10
 
 
-def test_page_is_well_formed_with_alternative_texts() -> None:
-    page = Page(render_report(result(scored_view("lattice/0000"), scored_view("pile/0000")), [images_of()]))
-    assert len(page.attributes_of("h1")) == 1
-    assert page.attributes_of("html") == [{"lang": "en"}]
-    assert len(page.attributes_of("svg")) == len(page.attributes_of("desc")) == 6
-    alts = [image["alt"] for image in page.attributes_of("img")]
-    assert sum(bool(alt) for alt in alts) == 5
-    assert len({alt for alt in alts if alt}) == 5
-    ids = [attributes["id"] for _, attributes in page.tags if "id" in attributes]
-    assert len(ids) == len(set(ids))
+def test_hostile_names_are_escaped() -> None:
+    hostile = result(scored_view("<b>x/0000"), method=HOSTILE)
+    rendered = render_report(hostile, [images_of("<b>x/0000")])
+    page = Page(rendered)
+    benign = Page(render_report(result(scored_view("beam/0000")), [images_of("beam/0000")]))
+    assert page.count("script") == 1, "the page's own"
+    assert page.count("b") == benign.count("b")
+    assert "<b>x" not in rendered
+    assert '=<script src="//evil.example/x.js">alert(1)</script>[red]' in page.text
+    groups = render_report(split_result(HOSTILE, "<b>\x1b[31m"), [])
+    assert Page(groups).count("script") == 1
+    for character in "\x1b\u202e":
+        assert character not in rendered + groups
 
 
-def test_rendering_is_deterministic() -> None:
-    shown = result(scored_view("lattice/0000"), unpredicted_view("pile/0000"))
-    assert render_report(shown, [images_of()]) == render_report(shown, [images_of()])
+def test_sections_without_content_are_left_out() -> None:
+    page = render_report(result(scored_view("beam/0000")), [])
+    for absent in ("<article", "<img", 'id="paper"', "Groups of views", "Extended measures", "Small figures"):
+        assert absent not in page
+    assert "Extended measures" not in render_report(example(), [])
 
 
-def test_no_view_section_without_panels() -> None:
-    page = Page(render_report(result(scored_view("lattice/0000")), []))
-    assert not page.attributes_of("article")
-    assert not page.attributes_of("img")
-
-
-def test_worst_views_first_then_all_in_protocol_order() -> None:
+def test_worst_views_come_first_then_all_in_protocol_order() -> None:
     views = [
         scored_view(f"lattice/{index:04d}", abs_rel=0.1 * (index % 7 + 1)) for index in range(WORST_SHOWN + 5)
     ]
@@ -124,133 +142,144 @@ def test_worst_views_first_then_all_in_protocol_order() -> None:
     ids = re.findall(r"lattice/\d{4}", page.text)
     assert ids[:3] == ["lattice/0003", "lattice/0006", "lattice/0013"]
     assert ids[WORST_SHOWN:] == [view.view_id for view in views]
-    assert len(page.attributes_of("details")) == 1
-    assert not Page(render_report(result(*views[:WORST_SHOWN]), [])).attributes_of("details")
+    assert page.count("details") == 1
+    assert not Page(render_report(result(*views[:WORST_SHOWN]), [])).count("details")
 
 
 def test_overflow_and_zero_errors_render() -> None:
     perfect = dataclasses.replace(scored_view("lattice/0000"), native=None, scaled=None, scale=None)
     exact = scored_view("lattice/0001", abs_rel=0.0, scale=1.0)
     shown = result(overflowed_view("pier/0000"), perfect, exact)
-    text = Page(render_report(shown, [images_of(factor=1e30), images_of(factor=math.nan)])).text
-    assert "not compared with those of others: a number overflowed." in text
-    assert "no prediction on scored pixels" in text
-    assert "off the scale" in text
-
-
-def test_depth_image_clips_to_range_and_greys_missing() -> None:
-    near, far = 0.5, 1.0
-    image = depth_image(np.array([[0.5, 1.0, 0.75, 9.0, 0.1, 0.0, np.nan]]), near, far)
-    assert image[0, 0].tolist() == DEPTH_COLOURS[254].tolist(), "near is bright"
-    assert image[0, 1].tolist() == image[0, 3].tolist() == DEPTH_COLOURS[0].tolist()
-    assert image[0, 2].tolist() == DEPTH_COLOURS[127].tolist()
-    assert image[0, 4].tolist() == image[0, 0].tolist()
-    for missing in (image[0, 5], image[0, 6]):
-        assert len(set(missing.tolist())) == 1, "neutral grey"
-
-
-def test_error_image_signs_steel_and_stripes_missing() -> None:
-    view = panels(factor=1.02)
-    view.prediction_m[0] = np.nan
-    view.prediction_m[1] = 0.49
-    error = signed_error(view, 1.0)
-    assert np.isnan(error[:, :20]).all()
-    assert error[5, 25] == pytest.approx(0.01, abs=1e-6)
-    image = error_image(error, view.steel, view.rgb, 1.0)
-    assert image[5, 25].tolist() == ERROR_COLOURS[254].tolist(), "too far, at the limit"
-    assert image[1, 25].tolist() == ERROR_COLOURS[0].tolist(), "too near, at the limit"
-    assert {tuple(pixel) for pixel in image[0, 20:30].tolist()} == {(240, 200, 0), (16, 16, 16)}
-    assert image[5, 5].tolist() == [44, 44, 44], "dimmed scene"
+    page = render_report(shown, [images_of(factor=1e30), images_of(factor=math.nan)])
+    assert "no prediction on scored pixels" in page
+    assert "off the scale" in page
+    assert 'data-value="inf"' not in page
 
 
 def test_view_without_colour_has_other_panels() -> None:
-    view = dataclasses.replace(panels(factor=1.02), rgb=None)
-    images, with_colour = shown_view(view), shown_view(panels(factor=1.02))
-    assert images.colour is None
-    assert (images.width, images.truth) == (with_colour.width, with_colour.truth)
-    image = error_image(signed_error(view, 1.0), view.steel, None, 1.0)
-    assert (image[5, 25].tolist(), image[5, 5].tolist()) == (ERROR_COLOURS[254].tolist(), [0, 0, 0])
-    text = render_report(result(scored_view("lattice/0000")), [shown_view(view)])
+    view = shown_view(dataclasses.replace(panels(factor=1.02), rgb=None))
+    text = render_report(result(scored_view("lattice/0000")), [view])
     assert "<strong>Colour</strong>" not in text
     assert "<strong>Native error</strong>" in text
 
 
-def test_scaled_error_uses_scale_of_view() -> None:
-    view = panels(factor=1.6)
-    assert signed_error(view, 0.625)[5, 25] == pytest.approx(0.0, abs=1e-6)
-    images = shown_view(view)
-    assert (images.native_limit, images.scaled_limit) == ("30 cm", "0.01 cm")
-    assert _decode(images.scaled_error)[5, 25].tolist() == ERROR_COLOURS[127].tolist()
-    assert images.predicted == "0.800 m to 0.800 m"
+def test_cells_sort_by_full_precision_and_skip_undefined() -> None:
+    assert NATIVE[0].cell(scored_view("lattice/0000", abs_rel=0.123456789)) == Cell("0.1235", 0.123456789)
+    empty = unpredicted_view("lattice/0000")
+    assert {column.cell(empty) for column in (*NATIVE, *SCALED, SCALE)} == {Cell("–")}
+    assert NATIVE[1].cell(overflowed_view("pier/0000")) == Cell("–"), "infinite"
+    page = render_report(result(scored_view("pier/0001", abs_rel=0.123456789)), [])
+    assert '<td class="first" data-value="0.123456789">0.1235</td>' in page
 
 
-@pytest.mark.parametrize(
-    ("error_cm", "limit"), [(0.0, 0.01), (0.11, 0.2), (2.01, 3.0), (7.0, 7.0), (71.0, 100.0), (1e300, 1e9)]
-)
-def test_error_limit_is_round_and_covers_errors(error_cm: float, limit: float) -> None:
-    assert error_limit_cm(np.full((1, 20), -error_cm / 100), np.arange(20)) == limit
+def test_intervals_use_the_decimals_of_their_numbers() -> None:
+    ends = {
+        "native.abs_rel": (0.70123, 0.79987),
+        "scaled.delta1": (0.9, 1.0),
+        "coverage": (0.94999, 1.0),
+        "within_mm.3": (0.01, 0.02),
+        "scale_median": (0.6, 0.7),
+        "native.rmse_cm": None,
+    }
+    table = dataclasses.replace(result(scored_view("lattice/0000")).tables["lattice"], intervals=ends)
+    columns = (NATIVE[0], NATIVE[1], SCALED[3], COVERAGE, WITHIN[0], SCALE)
+    assert [column.cell(table).interval for column in columns] == [
+        "0.7012 – 0.7999",
+        "",
+        "0.900 – 1.000",
+        "94.9 – 100.0",  # Rounded down as coverage is.
+        "1.0 – 2.0",
+        "0.600 – 0.700",
+    ]
+    assert RANK_ERROR.interval_text((0.1, math.inf)) == ""
+    assert RANK_ERROR.interval_text((math.nan, 1.0)) == ""
+    assert COVERAGE.interval_text(None) == ""
 
 
-def test_error_limit_ignores_worst_5_percent() -> None:
-    error = np.full((1, 100), 0.02)
-    error[0, :5] = 1.0
-    assert error_limit_cm(error, np.arange(100)) == 2.0
-    error[0, 5] = 1.0
-    assert error_limit_cm(error, np.arange(100)) == 100.0
-    assert error_limit_cm(np.full((1, 4), np.nan), np.arange(4)) is None
+def test_intervals_are_explained_by_what_is_resampled(rendered: str) -> None:
+    split = split_result()
+    assert formatting.interval_note(example().tables.values()) in rendered
+    assert formatting.interval_note(split.tables.values()) in render_report(split, [])
 
 
-def test_depth_range_uses_scored_pixels_only() -> None:
-    view = panels()
-    scored_px = np.flatnonzero(view.steel.ravel())
-    assert depth_range(view.truth_m, scored_px) == pytest.approx((0.495, 0.505))
+def test_published_rows_are_marked_and_not_sortable(rendered: str) -> None:
+    section = rendered[rendered.index('<section aria-labelledby="paper">') :].partition("</section>")[0]
+    assert section.count('<tr class="published">') == 12
+    assert "sortable" not in section, "sorting would rank them"
+    [scene] = paper_scenes(result(unpredicted_view("pile/0000"), scored_view("lattice-zed/0000")))
+    assert [cell.text for cell in scene.rows[0].cells] == ["–"] * 4
+    assert scene.chart.count("<circle") == 6, "no point of the config without values"
+    assert 'class="native fill"' not in scene.chart
 
 
-@pytest.mark.slow
-def test_large_panels_sample_depth_and_average_colour() -> None:
-    truth = np.full((720, 1280), 2.0, np.float32)
-    truth[::2, ::2] = 1.0
-    rgb = np.zeros((720, 1280, 3), np.uint8)
-    rgb[::2] = 200
-    steel = np.ones((720, 1280), bool)
-    images = shown_view(ViewPanels(rgb, truth, truth, steel, scored_view("lattice/0000")))
-    assert (images.width, images.height) == (640, 360)
-    depth = _decode(images.truth).reshape(-1, 3)
-    assert len(np.unique(depth, axis=0)) == 1, "an average would have made depths that do not exist"
-    assert depth[0].tolist() == DEPTH_COLOURS[round((2.1 - 1.0) / 1.2 * 254)].tolist()
-    assert images.colour is not None
-    assert abs(int(_decode(images.colour)[180, 320, 0]) - 100) <= 3
+def test_views_to_show_takes_worst_half_then_even_steps() -> None:
+    views = [scored_view(f"lattice/{index:04d}", abs_rel=(index + 1) / 100) for index in range(100)]
+    views[50] = unpredicted_view("lattice/0050")
+    shown = [int(view.view_id[-4:]) for view in views_to_show(views, 12)]
+    assert shown[:6] == [50, 99, 98, 97, 96, 95]
+    assert shown[-1] == 0, "the best"
+    gaps = [first - second for first, second in pairwise(shown[6:])]
+    assert all(15 <= gap <= 17 for gap in gaps)
 
 
-def test_log_axis_positions_and_ticks() -> None:
-    axis = Axis(0.01, 1.0, 0.0, 100.0)
-    assert axis.at(0.1) == pytest.approx(50.0)
-    assert (axis.at(0.0), axis.at(math.inf)) == (0.0, 100.0)
-    assert axis.ticks() == [0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0]
-    assert Axis(1e-6, 1e6, 0, 1).ticks() == [1e-6, 1e-4, 1e-2, 1.0, 1e2, 1e4, 1e6]
+@settings(max_examples=40)
+@given(st.integers(0, 40), st.integers(0, 40))
+def test_views_to_show_has_requested_count_and_no_repeats(count: int, total: int) -> None:
+    views = [scored_view(f"lattice/{index:04d}", abs_rel=(index * 7 % 41 + 1) / 100) for index in range(total)]
+    shown = views_to_show(views, count)
+    assert len({view.view_id for view in shown}) == len(shown) == min(count, total)
+    errors = [view.native.abs_rel for view in shown if view.native]
+    assert errors == sorted(errors, reverse=True)
+    if 1 < count <= total:
+        assert errors[-1] == min(view.native.abs_rel for view in views if view.native)
 
 
-def test_axes_cover_their_values() -> None:
-    axis = decade_axis([0.0, math.inf, 0.013, 0.7], 0, 1)
-    assert (axis.low, axis.high) == (0.01, 1.0)
-    unit = log_axis_with_one([0.998, 1.003], 0, 1)
-    assert unit.low < 0.998 < 1.003 < unit.high
-    assert 1.0 in unit.ticks()
-    assert len(unit.ticks()) >= 3
-    for extreme in ([], [5e-324], [1e308], [1e-300, 1e300]):
-        assert len(decade_axis(extreme, 0, 1).ticks()) >= 2
-        assert len(log_axis_with_one(extreme, 0, 1).ticks()) >= 2
+def test_templates_and_scripts_are_package_data() -> None:
+    shipped = {path.suffix for path in Path("rebar_depth_bench/reporting/html").iterdir()} - {".py", ""}
+    declared = Path("pyproject.toml").read_text(encoding="utf-8").split("[tool.setuptools.package-data]")[1]
+    assert all(f'"*{suffix}"' in declared.splitlines()[1] for suffix in shipped)
 
 
-def test_charts_mark_every_view_and_config() -> None:
-    views = [scored_view("lattice/0000"), scored_view("lattice/0001", scale=0.5), unpredicted_view("lattice/0002")]
-    tables = result(*views, scored_view("pile/0000")).tables
-    dumbbell, strips = alignment_chart(tables), scale_chart(tables, {"lattice": views})
-    assert dumbbell.count("<circle") == 4
-    assert "lattice: native 0.7500, scaled 0.0613" in dumbbell
-    assert strips.count("h0") == 2
-    assert "median s 0.562" in strips
-    errors = views_chart("lattice", views)
-    assert errors.count("h0") == 4
-    assert errors.count("V18.0") == 1
-    assert "3 views of lattice, 1 without any prediction" in errors
+def test_report_of_an_archive_embeds_requested_views_worst_first(
+    tiny_root: Path, tiny_truth: dict[str, np.ndarray], archive_of: Callable[..., Path], tmp_path: Path
+) -> None:
+    factors = 1.1 + 0.05 * np.random.default_rng(3).permutation(len(tiny_truth))
+    archive = archive_of(
+        {view: depth_m * factor for (view, depth_m), factor in zip(tiny_truth.items(), factors, strict=True)}
+    )
+    with open_evaluation(archive, tiny_root) as evaluation:
+        shown = score_evaluation(evaluation)
+        worst_first = [view.view_id for view in sorted(shown.views, key=attrgetter("rank_error"), reverse=True)]
+        page = tmp_path / "page.html"
+        write_report(shown, evaluation, page, views_shown=3)
+        text = page.read_text(encoding="utf-8")
+        assert re.findall(r"<h3>(lattice/\d+)</h3>", text) == [*worst_first[:2], worst_first[-1]]
+        assert f"3 of {len(tiny_truth)} views of <b>lattice</b>" in text
+        write_report(shown, evaluation, page, views_shown=0)
+        assert "<article" not in page.read_text(encoding="utf-8")
+        with pytest.raises(InputError, match="views to show: -1, expected 0 or more"):
+            write_report(shown, evaluation, page, views_shown=-1)
+
+
+def test_views_are_decoded_once_for_diagnosis_and_report(
+    tiny_root: Path,
+    tiny_truth: dict[str, np.ndarray],
+    archive_of: Callable[..., Path],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    archive = archive_of({view: 1.1 * depth_m for view, depth_m in tiny_truth.items()})
+    decoded: Counter[bytes] = Counter()
+    decode = codecs.decode
+
+    def count(kind: str, content: bytes, grid: tuple[int, int]) -> np.ndarray:
+        decoded[content] += kind == "depth"
+        return decode(kind, content, grid)
+
+    with open_evaluation(archive, tiny_root) as evaluation:
+        shown = score_evaluation(evaluation)
+        monkeypatch.setattr(codecs, "decode", count)
+        write_report(shown, evaluation, tmp_path / "page.html", views_shown=1)
+    diagnosed = min(len(tiny_truth), MAX_VIEWS)
+    assert set(decoded.values()) <= {0, 1}
+    assert 2 * diagnosed <= sum(decoded.values()) <= 2 * diagnosed + 1, "both eyes, and the view that is shown"

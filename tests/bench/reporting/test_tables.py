@@ -1,42 +1,111 @@
-"""Tables of the HTML report: sort values, intervals, published rows, scatter charts and view selection."""
+"""Tables in the terminal and as CSV: golden texts, widths, notes, escaping, and published rows of the paper."""
 
 from __future__ import annotations
 
-import dataclasses
-import math
-import re
-from itertools import pairwise
+import csv
+import io
+import json
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from rich.console import Console
 
-from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench import software_version
+from rebar_depth_bench.base.errors import printable
+from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.reporting import formatting
-from rebar_depth_bench.reporting.charts import ScatterPoint, alignment_chart, place_labels, scatter_chart
-from rebar_depth_bench.reporting.html.page import render_report
-from rebar_depth_bench.reporting.html.views import views_to_show
-from rebar_depth_bench.reporting.published import paper_scenes
-from rebar_depth_bench.scoring.columns import COVERAGE, NATIVE, RANK_ERROR, SCALE, SCALED, WITHIN, Cell
+from rebar_depth_bench.reporting.detections import DetectionPage, PageTable, print_page
+from rebar_depth_bench.reporting.latex import latex_table
+from rebar_depth_bench.reporting.published import load_published, published_rows
+from rebar_depth_bench.reporting.tables import print_comparison, print_paper_table, print_table
+from rebar_depth_bench.scoring.columns import DASH, coverage_percent, number
+from rebar_depth_bench.scoring.comparison import compare
+from rebar_depth_bench.scoring.frames import frame_csv
 from rebar_depth_bench.scoring.reference import Errors
-from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareIdentity
+from rebar_depth_bench.scoring.score import tabulate
 from tests.bench.reporting.results import (
     HOSTILE,
     REFERENCE,
-    overflowed_view,
+    example,
+    examples,
     result,
     scored_view,
-    unpredicted_view,
+    split_result,
 )
 
+Show = Callable[[Console], None]
 
-def _with_intervals(shown: Result, **intervals: tuple[float, float] | None) -> Result:
-    intervals_by_metric = {name.replace("__", "."): ends for name, ends in intervals.items()}
-    tables = {
-        name: dataclasses.replace(table, intervals=intervals_by_metric) for name, table in shown.tables.items()
+GOLDEN: dict[str, tuple[int, Show]] = {
+    "score-80.txt": (80, lambda console: print_table(example(), console)),
+    "score-160.txt": (160, lambda console: print_table(example(), console)),
+    "table.txt": (80, lambda console: print_paper_table(examples(), console, published=True)),
+}
+NAME = "[link=x]a[/link]\x1b[2J\x9b2J\u202e\x07[/]"
+MARKUP = "[link=x]a[/link]"
+
+
+def printed(show: Show, width: int, *, terminal: bool = False) -> str:
+    console = Console(width=width, file=io.StringIO(), force_terminal=terminal, color_system=None)
+    show(console)
+    return console.file.getvalue()  # type: ignore[attr-defined, no-any-return]
+
+
+def printed_result(shown: Result, width: int) -> str:
+    return printed(lambda console: print_table(shown, console), width)
+
+
+@pytest.mark.parametrize("name", GOLDEN)
+def test_terminal_tables_are_the_golden_texts(name: str, check_golden: Callable[[str, str], None]) -> None:
+    width, show = GOLDEN[name]
+    text = printed(show, width)
+    assert max(map(len, text.splitlines())) <= width
+    check_golden(name, text.replace(software_version(), "VERSION"))
+
+
+def test_csv_is_the_golden_text(check_golden: Callable[[str, str], None]) -> None:
+    check_golden("score.csv", frame_csv(example().to_pandas()))
+    check_golden("groups.csv", frame_csv(example().to_pandas("groups")))
+    [header] = frame_csv(result(scored_view("lattice/0000")).to_pandas("groups")).splitlines()
+    assert header == frame_csv(example().to_pandas("groups")).partition("\n")[0]
+
+
+@pytest.mark.parametrize(("width", "tables"), [(40, 3), (80, 3), (100, 2), (140, 2), (160, 1), (200, 1)])
+def test_table_splits_on_a_narrow_console_and_has_all_numbers(width: int, tables: int) -> None:
+    text = printed_result(result(scored_view("lattice/0000"), scored_view("lattice/0001")), width)
+    assert sum(line.startswith("config") for line in text.splitlines()) == tables
+    rows = [line.split() for line in text.splitlines() if line.split()[:1] == ["lattice"]]
+    assert {cell for row in rows for cell in row[1:]} == {
+        *("2/2", "100.0", "0.4286", "0.7500", "20.09", "18.71", "0.123"),
+        *("0.0613", "1.52", "1.17", "0.988", "0.625", "1.2", "4.6", "7.9", "13.6"),
     }
-    return dataclasses.replace(shown, tables=tables)
+
+
+def test_notes_and_published_rows_appear_only_where_they_apply() -> None:
+    text = printed_result(result(scored_view("lattice/0000")), 160)
+    assert DASH not in text
+    assert "group" not in text
+    assert "Errors of valid predictions" not in text
+    own = printed(
+        lambda console: print_paper_table([result(scored_view("pier/0000"))], console, published=False), 80
+    )
+    assert "paper" not in own
+    assert "Not ranked: no views." in formatting.table_notes(tabulate([]))
+
+
+def test_notes_state_what_is_resampled() -> None:
+    one_scene = result(*(scored_view(f"lattice/{12 * index:04d}") for index in range(8)))
+    split = split_result()
+    both = replace(split, tables={**split.tables, **one_scene.tables}, views=[*split.views, *one_scene.views])
+    assert formatting.interval_note(one_scene.tables.values()) == formatting.INTERVAL_NOTE
+    assert "views" not in formatting.interval_note(split.tables.values())
+    assert formatting.interval_note(both.tables.values()).startswith(formatting.INTERVAL_NOTE)
+    latex = [latex_table([shown], published=False, intervals=True) for shown in (one_scene, split, both)]
+    phrases = ("block bootstrap over views", "bootstrap over scenes", "over views, with splits over scenes")
+    assert all(phrase in " ".join(text.split()) for phrase, text in zip(phrases, latex, strict=True))
 
 
 def test_constants_of_results_on_other_pixels_are_named() -> None:
@@ -51,170 +120,159 @@ def test_constants_of_results_on_other_pixels_are_named() -> None:
     assert formatting.scaled_constants(rows[1:3]) == {"constant": (0.0529, 2.05)}
     titles = [title for title, _ in formatting.reference_rows(rows)]
     assert titles == [*formatting.scaled_constants(rows), "one pixel"]
-    without = dataclasses.replace(rows[0][1], reference=REFERENCE)
+    without = replace(rows[0][1], reference=REFERENCE)
     assert formatting.reference_rows([("x", without)])[0][0] == "one pixel"
 
 
 def test_scaled_error_is_compared_with_the_constant_on_the_same_pixels() -> None:
     table = result(scored_view("lattice/0000", coverage=0.9)).tables["lattice"]
     assert any("above that of a constant (0.0529)" in finding for finding in formatting.reference_findings(table))
-    reference = dataclasses.replace(REFERENCE, scaled_constant=Errors(0.07, 2.6))
-    between = dataclasses.replace(table, reference=reference)
+    between = replace(table, reference=replace(REFERENCE, scaled_constant=Errors(0.07, 2.6)))
     assert not any("constant" in finding for finding in formatting.reference_findings(between))
 
 
-def test_cells_sort_by_full_precision_and_skip_undefined() -> None:
-    assert NATIVE[0].cell(scored_view("lattice/0000", abs_rel=0.123456789)) == Cell("0.1235", 0.123456789)
-    empty = unpredicted_view("lattice/0000")
-    assert {column.cell(empty) for column in (*NATIVE, *SCALED, SCALE)} == {Cell("–")}
-    assert NATIVE[1].cell(overflowed_view("pier/0000")) == Cell("–"), "infinite"
-    page = render_report(result(overflowed_view("pier/0000"), scored_view("pier/0001", abs_rel=0.123456789)), [])
-    assert '<td class="first" data-value="0.123456789">0.1235</td>' in page
-    assert "<td>–</td>" in page
-    assert '<td class="first" data-value="43210">43\N{NARROW NO-BREAK SPACE}210</td>' in page
-    assert 'data-value="inf"' not in page
+@pytest.mark.parametrize(
+    ("shown", "text"),
+    [
+        (coverage_percent(0.94999), "94.9"),
+        (coverage_percent(0.99999), "99.9"),
+        (coverage_percent(0.283), "28.3"),
+        (coverage_percent(1.0), "100.0"),
+        (number(0.00004, 4), "4.0e-05"),
+        (number(0.00005, 4), "0.0001"),
+        (number(0.0, 4), "0.0000"),
+        (number(2e6, 2), "2.0e+06"),
+        (number(float("nan"), 2), DASH),
+    ],
+)
+def test_coverage_is_rounded_down_and_extreme_numbers_are_scientific(shown: str, text: str) -> None:
+    assert shown == text
 
 
-def test_intervals_use_decimals_of_their_numbers() -> None:
-    views = [scored_view("lattice/0000")]
-    ends = {"native__abs_rel": (0.70123, 0.79987), "scaled__delta1": (0.9, 1.0), "coverage": (0.94999, 1.0)}
-    more = {"within_mm__3": (0.01, 0.02), "scale_median": (0.6, 0.7), "native__rmse_cm": None}
-    shown = _with_intervals(result(*views), **ends, **more)
-    columns = (NATIVE[0], NATIVE[1], SCALED[3], COVERAGE, WITHIN[0], SCALE)
-    assert [column.cell(shown.tables["lattice"]).interval for column in columns] == [
-        "0.7012 – 0.7999",
-        "",
-        "0.900 – 1.000",
-        "94.9 – 100.0",  # Rounded down as coverage is.
-        "1.0 – 2.0",
-        "0.600 – 0.700",
+@pytest.mark.parametrize("method", [HOSTILE, "+1", "-1", "@x", "a\rb\nc"])
+def test_csv_has_neither_formulas_nor_control_characters(method: str) -> None:
+    content = frame_csv(result(scored_view("lattice/0000"), method=method).to_pandas())
+    row = next(csv.DictReader(io.StringIO(content, newline="")))
+    assert row["method"] == ("" if method.startswith("a") else "'") + printable(method)
+    [group] = [
+        line for line in frame_csv(split_result(HOSTILE).to_pandas("groups")).splitlines() if "evil" in line
     ]
-    page = render_report(shown, [])
-    assert '0.7500<span class="interval">0.7012 – 0.7999</span>' in page
-    assert formatting.INTERVAL_NOTE in page
-    assert "block bootstrap over views" in page
-    assert formatting.INTERVAL_NOTE not in render_report(_with_intervals(result(*views)), [])
+    assert "'=" in group
 
 
-def test_overflowed_intervals_are_omitted() -> None:
-    assert RANK_ERROR.interval_text((0.1, math.inf)) == ""
-    assert RANK_ERROR.interval_text((math.nan, 1.0)) == ""
-    assert COVERAGE.interval_text(None) == ""
-
-
-def test_charts_draw_intervals_as_bars() -> None:
-    plain = result(scored_view("lattice/0000"))
-    shown = _with_intervals(plain, native__abs_rel=(0.7, 0.8), scaled__abs_rel=(0.06, 0.07))
-    assert alignment_chart(shown.tables).count("interval") == 2
-    assert "interval" not in alignment_chart(_with_intervals(plain).tables)
-    [bars] = re.findall(r'class="bars" d="(.*?)"', paper_scenes(shown)[0].chart)
-    assert (bars.count("H"), bars.count("V")) == (1, 1)
-
-
-def test_published_rows_are_marked_and_not_sortable() -> None:
-    shown = result(
-        scored_view("pier/0000"),
-        scored_view("lattice/0000"),
-        scored_view("lattice-zed/0000"),
-        scored_view("beam/0000"),
+def hostile_result() -> Result:
+    """Return a result whose texts are all hostile."""
+    shown = result(scored_view(f"{NAME.replace('/', '|')}/0000"), method=NAME)
+    return replace(
+        shown,
+        dataset=DatasetIdentity(NAME, NAME),
+        submission=replace(shown.submission, sha256=NAME),
+        software=SoftwareIdentity(NAME),
     )
-    scenes = paper_scenes(shown)
-    assert [(scene.heading, scene.distance) for scene in scenes] == [
-        ("Lattice", "0.22–0.43 m"),
-        ("Pier", "8–17 m"),
+
+
+def hostile_page() -> DetectionPage:
+    """Return a page of a detector whose texts are all hostile."""
+    table = PageTable(NAME, [("k", NAME), (NAME, "")], [["1", NAME]])
+    return DetectionPage(NAME, NAME, stamps=[(NAME, NAME)], figures=[], tables=[table], notes=[NAME])
+
+
+@pytest.mark.parametrize(
+    "show",
+    [
+        lambda console: print_table(hostile_result(), console),
+        lambda console: print_table(split_result(NAME, NAME), console),
+        lambda console: print_paper_table([hostile_result()], console, published=True),
+        lambda console: print_comparison(compare(hostile_result(), hostile_result()), console),
+        lambda console: print_page(hostile_page(), console),
+    ],
+    ids=["score", "groups", "table", "compare", "score-crossings"],
+)
+@pytest.mark.parametrize("width", [60, 160])
+def test_names_print_as_plain_text(show: Show, width: int) -> None:
+    text = printed(show, width, terminal=True)
+    assert all(line.isprintable() for line in text.split("\n")), text
+    assert MARKUP in "".join(text.split()) or MARKUP.replace("/", "|") in "".join(text.split())
+
+
+METHOD = """
+from dataclasses import replace
+from rebar_depth_bench.methods import METHODS
+constant = METHODS["constant"]
+METHOD = replace(constant, info=replace(constant.info, summary=NAME, source=NAME, licence=NAME))
+"""
+
+
+def test_methods_and_their_errors_print_as_plain_text(
+    tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    info = tmp_path / "theirs-1.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: theirs\nVersion: 1\n")
+    entries = "[rebar_depth_bench.methods]\n[/bold] = their_method:METHOD\n[/red] = nowhere_at_all:X\n"
+    (info / "entry_points.txt").write_text(entries)
+    (tmp_path / "their_method.py").write_text(f"NAME = {NAME!r}\n{METHOD}")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    assert main(["methods"]) == 0
+    text = capsys.readouterr().out
+    assert all(line.isprintable() for line in text.split("\n")), text
+    assert "[/bold]" in text
+    assert "[/red]" in text
+    out = tmp_path / "out.zip"
+    arguments = ["predict", f"{tmp_path / 'their_method.py'}:METHOD", "--data", str(tiny_root), "--out", str(out)]
+    assert main([*arguments, "--config", "lattice"]) == 0
+    noted = capsys.readouterr().err
+    assert all(line.isprintable() for line in noted.split("\n")), noted
+
+
+def test_table_command_writes_latex_and_csv(
+    tiny_truth: dict[str, np.ndarray],
+    tiny_root: Path,
+    archive_of: Callable[..., Path],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    archives = [
+        str(archive_of({view: factor * depth for view, depth in tiny_truth.items()}, f"{factor}.zip"))
+        for factor in (1.0, 1.5)
     ]
-    lattice = scenes[0].rows
-    assert [(row.mark, row.name, row.published) for row in lattice[:2]] == [
-        ("1", "lattice", False),
-        ("A", "FoundationStereo", True),
-    ]
-    assert [cell.text for cell in lattice[4].cells] == ["91.19", "3.145", "0.029", "0.25"]
-    assert [cell.text for cell in lattice[0].cells] == ["20.09", "0.7500", "0.0613", "0.625"]
-    assert [row.name for row in scenes[1].rows if row.dagger] == ["COLMAP+ArUco"]
-    page = render_report(shown, [])
-    section = page[
-        page.index('<section aria-labelledby="paper">') : page.index('<section aria-labelledby="by-view">')
-    ]
-    assert section.count('<tr class="published">') == 12
-    assert "sortable" not in section, "sorting would rank them"
-    assert "measured on the authors&#39; renders, which are not the renders of this dataset" in section
-    assert "206.7<sup>†</sup>" in section
-    assert ">1143<" in section
-    assert 'id="paper"' not in render_report(result(scored_view("beam/0000")), [])
+    latex, table = tmp_path / "table.tex", tmp_path / "table.csv"
+    command = ["table", *archives, "--data", str(tiny_root), "--latex", str(latex), "--csv", str(table)]
+    assert main(command) == 0
+    rows = list(csv.DictReader(io.StringIO(table.read_text())))
+    assert [float(row["native_abs_rel"]) for row in rows] == pytest.approx([0, 0.5], abs=1e-6)
+    assert [json.loads(row["ranked"]) for row in rows] == [True, True]
+    assert r"\begin{tabular}" in latex.read_text()
+    assert "AbsRel_s" in capsys.readouterr().out
+    assert main(["table", "nowhere.zip", "--data", str(tiny_root)]) == 2
+    assert "does not exist" in capsys.readouterr().err
 
 
-def test_config_without_values_has_row_but_no_point() -> None:
-    scene = paper_scenes(result(unpredicted_view("pile/0000")))[0]
-    assert [cell.text for cell in scene.rows[0].cells] == ["–"] * 4
-    assert scene.chart.count("<circle") == 6
-    assert 'class="native fill"' not in scene.chart
+# Table I of the paper, transcribed independently of published.json; columns: lattice, disordered, pier.
+TABLE_1 = """
+FoundationStereo 1.13 0.021 0.022 1.00 1.53 0.009 0.010 1.00 312.8 0.105 0.103 0.97
+COLMAP+ArUco 1.60 0.021 0.028 1.01 2.03 0.012 0.011 1.00 206.7 0.078 0.083 0.98
+Metric3D_v2 20.09 0.750 0.061 0.63 20.46 0.275 0.058 1.36 1143 0.888 0.186 12.58
+Depth_Pro 91.19 3.145 0.029 0.25 15.46 0.262 0.043 0.92 1151 0.901 0.179 12.17
+Depth_Anything_3_Metric 96.93 3.469 0.043 0.23 35.31 0.644 0.051 0.72 1073 0.832 0.147 6.60
+UniDepth_v2 151.5 5.883 0.030 0.16 18.52 0.264 0.038 1.25 869.4 0.654 0.154 3.16
+"""
 
 
-def test_scatter_chart_positions_and_describes_points() -> None:
-    points = [
-        ScatterPoint("1", "published one", 0.01, 0.01, published=True),
-        ScatterPoint("A", HOSTILE, 1.0, 0.1, published=False, native_interval=(0.9, 1.1)),
-    ]
-    chart = scatter_chart("title", points)
-    hollow = re.search(r'<circle class="published ring" cx="([\d.]+)" cy="([\d.]+)"', chart)
-    solid = re.search(r'<circle class="native fill" cx="([\d.]+)" cy="([\d.]+)"', chart)
-    assert hollow
-    assert solid
-    assert float(solid[1]) > float(hollow[1]), "larger native error to the right"
-    assert float(solid[2]) < float(hollow[2]), "larger scaled error above"
-    bar = re.search(r'class="bars" d="M([\d.]+) [\d.]+H([\d.]+)"', chart)
-    assert bar
-    assert float(bar[1]) < float(solid[1]) < float(bar[2])
-    assert "1: published one, published, native 0.0100, scaled 0.0100; A: =" in chart
-    assert "<script" not in chart
+@pytest.mark.parametrize(("scene", "column"), [("lattice", 1), ("pile", 5), ("pier", 9)])
+def test_published_rows_are_those_of_the_paper(scene: str, column: int) -> None:
+    expected = [line.split() for line in TABLE_1.split("\n") if line]
+    rows = published_rows(scene)
+    assert [row.method.replace(" ", "_") for row in rows] == [line[0] for line in expected]
+    for row, line in zip(rows, expected, strict=True):
+        values = [row.rmse_cm, row.abs_rel, row.abs_rel_scaled, row.scale]
+        assert values == line[column : column + 4]
+        assert row.median_anchored == (scene == "pier" and row.method == "COLMAP+ArUco")
 
 
-_PIXELS = st.tuples(st.floats(60, 440), st.floats(20, 280))
-
-
-@given(st.lists(_PIXELS, max_size=30))
-def test_scatter_labels_touch_their_points_and_do_not_overlap(places: list[tuple[float, float]]) -> None:
-    labels = place_labels(places)
-    assert len(labels) == len(places)
-    shown = [label for label in labels if label is not None]
-    for place, label in zip(places, labels, strict=True):
-        assert label is None or max(abs(label[0] - place[0]), abs(label[1] - place[1])) < 15
-    for index, label in enumerate(shown):
-        for other in [*places, *shown[:index], *shown[index + 1 :]]:
-            assert abs(label[0] - other[0]) >= 9 or abs(label[1] - other[1]) >= 9
-
-
-def test_lonely_scatter_point_has_a_label() -> None:
-    assert place_labels([(200, 150)]) == [(214, 150)]
-
-
-def test_views_to_show_takes_worst_half_then_even_steps() -> None:
-    views = [scored_view(f"lattice/{index:04d}", abs_rel=(index + 1) / 100) for index in range(100)]
-    views[50] = unpredicted_view("lattice/0050")
-    shown = [int(view.view_id[-4:]) for view in views_to_show(views, 12)]
-    assert shown[:6] == [50, 99, 98, 97, 96, 95]
-    assert shown[-1] == 0, "the best"
-    gaps = [first - second for first, second in pairwise(shown[6:])]
-    assert all(15 <= gap <= 17 for gap in gaps)
-
-
-@given(st.integers(0, 40), st.integers(0, 40))
-def test_views_to_show_has_requested_count_and_no_repeats(count: int, total: int) -> None:
-    views = [scored_view(f"lattice/{index:04d}", abs_rel=(index * 7 % 41 + 1) / 100) for index in range(total)]
-    shown = views_to_show(views, count)
-    assert len({view.view_id for view in shown}) == len(shown) == min(count, total)
-    errors = [view.native.abs_rel for view in shown if view.native]
-    assert errors == sorted(errors, reverse=True)
-    if 1 < count <= total:
-        assert errors[-1] == min(view.native.abs_rel for view in views if view.native)
-
-
-def test_negative_view_count_raises() -> None:
-    with pytest.raises(InputError, match="views to show: -1, expected 0 or more"):
-        views_to_show([], -1)
-
-
-def test_templates_and_scripts_are_package_data() -> None:
-    shipped = {path.suffix for path in Path("rebar_depth_bench/reporting/html").iterdir()} - {".py", ""}
-    declared = Path("pyproject.toml").read_text(encoding="utf-8").split("[tool.setuptools.package-data]")[1]
-    assert all(f'"*{suffix}"' in declared.splitlines()[1] for suffix in shipped)
+def test_published_parts_state_place_and_origin() -> None:
+    published = load_published()
+    assert published.title.startswith("Benchmarking Metric Depth for Construction Perception")
+    assert {name: part.place for name, part in published.parts.items()} == {"synthetic": "Table I"}
+    renders = "measured on the authors' renders, which are not the renders of this dataset"
+    assert published.parts["synthetic"].mark == renders

@@ -1,10 +1,12 @@
-"""Tests of ``score-crossings``: hand-made detections of a mat, files with problems, and outputs."""
+"""Scores of detected crossings: matching, average precision, files with problems, and outputs."""
 
 from __future__ import annotations
 
 import csv
 import json
 from collections.abc import Callable, Sequence
+from dataclasses import replace
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
@@ -12,18 +14,132 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy import ndarray
 
 from rebar_depth_bench.bar_crossings.definition import scene_crossings
 from rebar_depth_bench.base.errors import InputError, SubmissionError
 from rebar_depth_bench.cli.main import main
+from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.detections.reading import MAX_ROWS_PER_VIEW, read_detections
-from rebar_depth_bench.detections.result import ViewDetections, tabulate_detections
-from rebar_depth_bench.detections.score import score_crossings
+from rebar_depth_bench.detections.result import RankedDetections, ViewDetections, tabulate_detections
+from rebar_depth_bench.detections.score import (
+    SeenDetections,
+    compare_view,
+    excused,
+    greedy_matches,
+    matched_pairs,
+    score_crossings,
+)
+from rebar_depth_bench.extended.ground_truth import load_steel_truth
+from rebar_depth_bench.extended.steel import JudgedCrossings
 from rebar_depth_bench.geometry.cameras import transform
 from rebar_depth_bench.scoring.bootstrap import resample
 from tests.mat_dataset import CAGES, CONFIG, SCENES, VIEWS, mat_bars, poses, write_mat_dataset
 
-pytestmark = pytest.mark.slow
+SEEDS = st.integers(0, 2**32 - 1)
+
+
+def on_line(*millimetres: float) -> ndarray:
+    return np.array([[value / 1000, 0.0, 0.5] for value in millimetres]).reshape(-1, 3)
+
+
+def test_most_pairs_come_before_least_distance() -> None:
+    """Detection 0 is nearest to tie point 0, which is the only one that detection 1 reaches."""
+    pairs = matched_pairs(on_line(1.0, -9.0), on_line(0.0, 9.0))
+    assert pairs.tolist() == [[0, 1], [1, 0]]
+    assert matched_pairs(on_line(1.0), on_line(0.0, 9.0)).tolist() == [[0, 0]]
+
+
+def test_limit_is_ten_millimetres_inclusive() -> None:
+    assert matched_pairs(on_line(10.0), on_line(0.0)).tolist() == [[0, 0]]
+    assert matched_pairs(on_line(10.01), on_line(0.0)).tolist() == []
+    assert matched_pairs(on_line(), on_line(0.0)).shape == matched_pairs(on_line(0.0), on_line()).shape == (0, 2)
+
+
+@settings(max_examples=40)
+@given(SEEDS)
+def test_matching_agrees_with_brute_force(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    detected, true = (rng.uniform(0, 0.02, (int(rng.integers(1, 6)), 3)) for _ in range(2))
+    pairs = matched_pairs(detected, true)
+    distance = np.linalg.norm(detected[:, None] - true, axis=2)
+    found = (-len(pairs), distance[pairs[:, 0], pairs[:, 1]].sum())
+    small, large = sorted((len(detected), len(true)))
+    table = distance if len(detected) <= len(true) else distance.T
+    best = (0, 0.0)
+    for columns in permutations(range(large), small):
+        used = [table[row, column] for row, column in enumerate(columns) if table[row, column] <= 0.010]
+        best = min(best, (-len(used), sum(used)))
+    assert found == pytest.approx(best)
+    assert len(np.unique(pairs[:, 0])) == len(np.unique(pairs[:, 1])) == len(pairs)
+
+
+def test_greedy_takes_the_most_confident_first() -> None:
+    """The confident detection takes the tie point that the other one needs."""
+    detected, true = on_line(4.0, 0.0), on_line(3.0)
+    assert greedy_matches(detected, np.array([0.9, 0.8]), true, 0.005).tolist() == [True, False]
+    assert greedy_matches(detected, np.array([0.8, 0.9]), true, 0.005).tolist() == [False, True]
+    assert greedy_matches(detected, np.ones(2), true, 0.005).tolist() == [True, False]  # Equal: the nearest.
+
+
+@given(SEEDS)
+def test_order_of_rows_has_no_effect(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    detected, true = rng.uniform(0, 0.04, (12, 3)), rng.uniform(0, 0.04, (6, 3))
+    confidence = rng.integers(0, 3, 12).astype(float)
+    order = rng.permutation(12)
+    for limit in (0.005, 0.02):
+        expected = greedy_matches(detected, confidence, true, limit)[order]
+        assert greedy_matches(detected[order], confidence[order], true, limit).tolist() == expected.tolist()
+
+
+def test_each_unjudged_crossing_excuses_one_detection() -> None:
+    """Three detections near an unjudged crossing at 100 mm, one near a judged one, one far from all."""
+    all_m, judged = on_line(0.0, 100.0, 130.0), np.array([True, False, False])
+    detected = on_line(2.0, 101.0, 99.5, 108.0, 50.0, 125.0)
+    left_over = np.ones(6, dtype=bool)
+    found = excused(detected, left_over, all_m, judged, np.zeros(6))
+    assert found.tolist() == [False, False, True, False, False, True]
+    found = excused(detected, left_over, all_m, judged, np.array([0, 0.2, 0.1, 0.9, 0, 0]))
+    assert found.tolist() == [False, False, False, True, False, True]
+    assert not excused(on_line(), np.empty(0, bool), all_m, judged, np.empty(0)).any()
+    assert not excused(detected, left_over, on_line(), np.empty(0, bool), np.zeros(6)).any()
+
+
+def ranked(
+    confidence: list[float], correct: list[bool], positives: list[int], view: list[int]
+) -> RankedDetections:
+    return RankedDetections(np.array(confidence), np.array(correct), np.array(view, int), np.array(positives))
+
+
+def test_average_precision_by_hand() -> None:
+    """Correct, false, correct of three crossings: precision 1 to recall 1/3, then 2/3 to recall 2/3."""
+    found = ranked([0.9, 0.8, 0.7], [True, False, True], [3], [0, 0, 0])
+    recall, precision = found.curve()
+    assert recall == pytest.approx([1 / 3, 1 / 3, 2 / 3])
+    assert precision == pytest.approx([1, 1 / 2, 2 / 3])
+    assert found.average() == pytest.approx(1 / 3 + 2 / 9)
+    # Equal confidences are one point of the curve: precision 2/3 at recall 2/3, in any order.
+    for correct in ([True, False, True], [False, True, True]):
+        assert ranked([0.5] * 3, correct, [3], [0] * 3).average() == pytest.approx(4 / 9)
+    assert ranked([], [], [3], []).average() == 0
+    assert ranked([0.5], [False], [0], [0]).average() is None
+    assert ranked([], [], [3], []).drawn_points() == []
+
+
+def test_interval_of_average_precision_covers_different_views() -> None:
+    views = 20
+    correct = [view % 2 == 0 for view in range(views)]
+    found = ranked([0.5] * views, correct, [1] * views, list(range(views)))
+    ends = found.interval(resample(range(0, 100 * views, 100)))
+    assert ends is not None
+    assert ends[0] < 0.25 < ends[1]
+    assert found.average() == pytest.approx(0.25)  # Precision and recall of a half.
+    same = ranked([0.5] * views, [True] * views, [1] * views, list(range(views)))
+    assert same.interval(resample(range(0, 100 * views, 100))) == (1.0, 1.0)
+
 
 Rows = list[dict[str, Any]]
 
@@ -62,6 +178,7 @@ def write_parquet(path: Path, rows: Rows, metadata: dict[str, str] | None = None
     return path
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("world", [False, True])
 @pytest.mark.parametrize("write", [write_csv, write_parquet])
 def test_exact_detections_are_perfect(
@@ -77,6 +194,7 @@ def test_exact_detections_are_perfect(
     assert result["dataset"]["crossings"]["file"] == "crossings.parquet"
 
 
+@pytest.mark.slow
 def test_counts_pool_over_views_by_hand(mat: Path, tmp_path: Path) -> None:
     """Keep the crossings of the first view, one of them 6 mm off and one 30 mm off, and add a point in the air."""
     rows = exact_rows()[:4]
@@ -122,6 +240,7 @@ def test_intervals_need_eight_blocks_with_values() -> None:
         assert intervals["normal_deg"] is None
 
 
+@pytest.mark.slow
 def test_confidence_selects_matches_but_not_average_precision(mat: Path, tmp_path: Path) -> None:
     rows = [{**row, "confidence": 0.2 + 0.1 * (number % 4)} for number, row in enumerate(exact_rows())]
     path = write_csv(tmp_path / "a.csv", rows)
@@ -130,6 +249,7 @@ def test_confidence_selects_matches_but_not_average_precision(mat: Path, tmp_pat
     assert all_["average_precision"] == some["average_precision"] == {"5": 1.0, "10": 1.0, "20": 1.0}
 
 
+@pytest.mark.slow
 def test_views_without_rows_and_configs_of_several_scenes(mat: Path, tmp_path: Path) -> None:
     found = scene_crossings(mat_bars((-0.06, 0.0)))
     pose = poses(2)[0]
@@ -151,6 +271,7 @@ def test_views_without_rows_and_configs_of_several_scenes(mat: Path, tmp_path: P
         score_crossings(tmp_path / "a.csv", mat, configs=[CONFIG])
 
 
+@pytest.mark.slow
 def test_metadata_of_file_and_options(mat: Path, tmp_path: Path) -> None:
     rows = exact_rows()
     head = "# method: my detector\n# inputs: rgb+K\n# uses_ground_truth: false\n# note: anything\n"
@@ -167,6 +288,7 @@ def test_metadata_of_file_and_options(mat: Path, tmp_path: Path) -> None:
 
 
 def problems(path: Path) -> list[tuple[str, str]]:
+    """Return code and place of every problem of a file."""
     ids = [f"{CONFIG}/{index:04d}" for index in range(VIEWS)]
     ids += [f"{CAGES}/{split}-{scene}-0000" for scene, split in SCENES.items()]
     with pytest.raises(SubmissionError) as raised:
@@ -210,21 +332,18 @@ def test_hostile_files_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     assert problems(path) == [("syntax", "")]
     path.write_bytes(b"PAR1 and no more")
     assert problems(path) == [("damaged", "")]
-    too_many = [{"view_id": "mat/0000", "x": 0.0, "y": 0.0, "z": 1.0}] * (MAX_ROWS_PER_VIEW + 1)
-    assert problems(write_parquet(path, too_many)) == [("size", "mat/0000")]
-    text = [{"view_id": "mat/0000", "x": "a", "y": 0.0, "z": 1.0}]
-    assert problems(write_parquet(path, text)) == [("damaged", "")]
-    nulls = [{"view_id": None, "x": None, "y": 0.0, "z": 1.0}]
-    pq.write_table(
-        pa.Table.from_pylist(nulls, pa.schema([("view_id", pa.string()), *((n, pa.float64()) for n in "xyz")])),
-        path,
-    )
+    row = {"view_id": "mat/0000", "x": 0.0, "y": 0.0, "z": 1.0}
+    assert problems(write_parquet(path, [row] * (MAX_ROWS_PER_VIEW + 1))) == [("size", "mat/0000")]
+    assert problems(write_parquet(path, [{**row, "x": "a"}])) == [("damaged", "")]
+    schema = pa.schema([("view_id", pa.string()), *((name, pa.float64()) for name in "xyz")])
+    pq.write_table(pa.Table.from_pylist([{**row, "view_id": None, "x": None}], schema), path)
     assert problems(path) == [("invalid", "row 1"), ("unknown", "row 1")]
     monkeypatch.setenv("REBAR_MAX_DETECTIONS_BYTES", "10")
     path.write_text("view_id,x,y,z\n")
     assert problems(path) == [("size", "")]
 
 
+@pytest.mark.slow
 def test_command_writes_json_table_and_page(mat: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     rows = [{**row, "confidence": 0.5 + 0.01 * number} for number, row in enumerate(exact_rows())]
     rows[0]["z"] += 0.02
@@ -246,6 +365,7 @@ def test_command_writes_json_table_and_page(mat: Path, tmp_path: Path, capsys: p
     assert (tmp_path / "a.json").read_bytes() == first
 
 
+@pytest.mark.slow
 def test_command_refuses_bad_files_without_output(
     mat: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -258,15 +378,9 @@ def test_command_refuses_bad_files_without_output(
     assert main(["score-crossings", str(path), "--data", str(mat), "--confidence", "nan"]) == 2
 
 
+@pytest.mark.slow
 def test_points_on_a_bar_without_axis_and_near_unjudged_crossings_are_ignored(mat: Path, tmp_path: Path) -> None:
     """Score the mat with a table of bars in which bar 1 has no axis: its crossings are not known."""
-    from dataclasses import replace
-
-    from rebar_depth_bench.data.manifest import open_folder
-    from rebar_depth_bench.detections.score import SeenDetections, compare_view
-    from rebar_depth_bench.extended.ground_truth import load_steel_truth
-    from rebar_depth_bench.extended.steel import JudgedCrossings
-
     folder = open_folder(mat)
     steel = load_steel_truth(folder, folder.config(CONFIG))
     truth = steel.view(0)

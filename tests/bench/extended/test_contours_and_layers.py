@@ -1,9 +1,8 @@
-"""Tests of front and rear depth layers and of layer confusion: hand-made scenes, a reference loop, damage."""
+"""Boundary F1 and depth layers: cases by hand, independent formulas, and invariances."""
 
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,17 +10,136 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy import ndarray
 
+from rebar_depth_bench.extended.boundary import THRESHOLDS_PERCENT, boundary_samples, neighbour_pairs
 from rebar_depth_bench.extended.depth_layers import DIRECTIONS, RADII_PX, layer_samples, other_layers
 from rebar_depth_bench.extended.steel import SteelTruth
 from tests.bench.extended.thin_scenes import (
+    pixel_truth,
     random_images,
     random_prediction,
     random_truth,
     steel_truth,
-    with_holes,
 )
 
+# Boundary F1.
+
+
 SEEDS = st.integers(0, 2**32 - 1)
+
+
+def boundary_scores(p_m: ndarray, truth: object) -> dict[str, float]:
+    return {name: float(values[0]) for name, values in boundary_samples(p_m, truth).items() if len(values)}  # type: ignore[arg-type]
+
+
+def test_boundary_by_hand() -> None:
+    # Board, bar, bar, board in one row: the pairs' true ratios are 2, 1 and 1.5, so two contours at every t.
+    truth = steel_truth(np.array([[2.0, 1.0, 1.0, 1.5]]), np.array([[0, 1, 1, 0]]))
+    # Ratio 1.03, correct side in front: detected at 1 and 2 %. Ratio 1.11, wrong side: a wrong contour up to 10 %.
+    measured = boundary_scores(np.array([1.03, 1.0, 1.0, 0.9]), truth)
+    # t = 1 and 2 %: 1 correct of 2 predicted and 2 true. t = 5 and 10 %: 1 wrong. t = 20 %: none predicted.
+    assert measured == pytest.approx(
+        {
+            "boundary_f1": (0.5 + 0.5) / 5,
+            "boundary_precision": (0.5 + 0.5) / 5,
+            "boundary_recall": (0.5 + 0.5) / 5,
+            "boundary_f1_1pct": 0.5,
+            "boundary_f1_2pct": 0.5,
+            "boundary_f1_5pct": 0.0,
+            "boundary_f1_10pct": 0.0,
+            "boundary_f1_20pct": 0.0,
+            "boundary_missing": 0.0,
+        }
+    )
+
+
+def test_missing_prediction_counts_as_wrong_contour() -> None:
+    truth = steel_truth(np.array([[2.0, 1.0, 1.0, 1.5]]), np.array([[0, 1, 1, 0]]))
+    measured = boundary_scores(np.array([2.0, 1.0, 1.0, np.nan]), truth)
+    assert measured["boundary_precision"] == pytest.approx(1 / 2)
+    assert measured["boundary_recall"] == pytest.approx(1 / 2)
+    assert measured["boundary_f1"] == pytest.approx(2 * 1 / (2 + 2))
+    assert measured["boundary_missing"] == pytest.approx(1 / 3)
+
+
+def dense_scores(p_m: ndarray, z_m: ndarray, steel: ndarray) -> dict[str, float]:
+    """Return the boundary_scores from whole images as the papers define them: over four directions."""
+    p_m = np.where(np.isfinite(p_m) & (p_m > 0), p_m, np.nan)
+    f1, precision, recall = {}, [], []
+    for t in THRESHOLDS_PERCENT:
+        true = predicted = correct = 0
+        for axis in (0, 1):
+            for ahead in (True, False):
+                (z_a, p_a, s_a), (z_b, p_b, s_b) = (
+                    [np.moveaxis(image, axis, 0)[part] for image in (z_m, p_m, steel)]
+                    for part in ((slice(None, -1), slice(1, None)) if ahead else (slice(1, None), slice(None, -1)))
+                )
+                counted = (s_a | s_b) & (z_a > 0) & (z_b > 0)
+                with np.errstate(divide="ignore", invalid="ignore"):
+                    z_contour, p_contour = z_b / z_a > 1 + t / 100, p_b / p_a > 1 + t / 100
+                missing = np.isnan(p_a + p_b)
+                true += np.sum(z_contour & counted)
+                correct += np.sum(z_contour & p_contour & counted)
+                predicted += np.sum(p_contour & counted) + np.sum(missing & counted) / 2  # counted from both sides
+        if true:
+            f1[f"boundary_f1_{t}pct"] = float(2 * correct / (true + predicted))
+            precision.append(correct / predicted if predicted else 0.0)
+            recall.append(correct / true)
+    means = {"boundary_precision": precision, "boundary_recall": recall, "boundary_f1": list(f1.values())}
+    return {**f1, **{name: float(np.mean(values)) for name, values in means.items() if values}}
+
+
+@settings(max_examples=60)
+@given(SEEDS)
+def test_scores_agree_with_dense_formula(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    depth_m, bars = random_images(rng)
+    truth = steel_truth(depth_m, bars)
+    p_m = random_prediction(rng, truth)
+    image_m = np.full(depth_m.size, np.nan)
+    image_m[truth.index] = p_m
+    measured = boundary_scores(p_m, truth)
+    expected = dense_scores(image_m.reshape(depth_m.shape), depth_m.astype(np.float64), bars > 0)
+    assert {name: value for name, value in measured.items() if name != "boundary_missing"} == pytest.approx(
+        expected
+    )
+
+
+def test_ground_truth_is_perfect_and_plane_scores_zero() -> None:
+    truth = random_truth(np.random.default_rng(3))
+    perfect = boundary_scores(truth.depth_m.astype(np.float64), truth)
+    assert perfect == {name: 0.0 if name == "boundary_missing" else 1.0 for name in perfect}
+    plane = boundary_scores(np.ones(len(truth.index)), truth)
+    assert set(plane.values()) == {0.0}
+
+
+def test_neighbour_pairs_stay_in_image_and_touch_steel() -> None:
+    index = np.arange(6, dtype=np.uint32)
+    first, second = neighbour_pairs(index, np.ones(6, bool), 2, 3)
+    pairs = sorted(zip(first.tolist(), second.tolist(), strict=True))
+    assert pairs == [(0, 1), (0, 3), (1, 2), (1, 4), (2, 5), (3, 4), (4, 5)]  # 2 and 3 lie in different rows
+    first, second = neighbour_pairs(index[[0, 1, 3, 5]], np.array([False, True, False, True]), 2, 3)
+    assert list(zip(first.tolist(), second.tolist(), strict=True)) == [(0, 1)]  # neither 0 nor 3 is steel
+
+
+def test_view_without_contour_has_no_scores() -> None:
+    flat = steel_truth(np.ones((3, 3)), np.ones((3, 3), np.uint16))
+    measured = boundary_samples(np.linspace(1, 2, 9), flat)
+    assert {name for name, values in measured.items() if len(values)} == {"boundary_missing"}
+
+
+def test_extreme_values_give_shares_without_warning() -> None:
+    rng = np.random.default_rng(5)
+    truth = random_truth(rng)
+    p_m = rng.choice([1e308, 5e-324, np.inf, -np.inf, np.nan, 0.0, -0.0, -1e308, 1.0], len(truth.index))
+    assert all(0.0 <= value <= 1.0 for value in boundary_scores(p_m, truth).values())
+
+
+# Depth layers and their confusion.
+
+
+SEEDS = st.integers(0, 2**32 - 1)
+
+
 NAN = float("nan")
 
 
@@ -135,27 +253,13 @@ def test_layers_follow_flip_and_transpose(seed: int) -> None:
         np.testing.assert_array_equal(image, images[0])
 
 
-def test_image_without_steel_has_no_layers() -> None:
-    no_pixels = np.empty(0, np.uint32), np.empty(0, np.float32)
-    front_m, behind_m = other_layers(np.ones((4, 4), np.float32), np.zeros((4, 4), np.uint16), *no_pixels)
-    assert (len(front_m), len(behind_m)) == (0, 0)
-    assert front_m.dtype == behind_m.dtype == np.float32
-
-
-def scores(p_m: ndarray, truth: SteelTruth) -> dict[str, float]:
+def layer_scores(p_m: ndarray, truth: SteelTruth) -> dict[str, float]:
     return {name: float(values[0]) for name, values in layer_samples(p_m, truth).items() if len(values)}
 
 
-def truth_of_pixels(z_m: list[float], front_m: list[float], behind_m: list[float]) -> SteelTruth:
-    truth = steel_truth(
-        np.array([z_m]), np.ones((1, len(z_m)), np.uint16), np.array([front_m]), np.array([behind_m])
-    )
-    return replace(truth, interior=np.ones(len(z_m), bool))
-
-
 def test_confusion_by_hand() -> None:
-    truth = truth_of_pixels([2.0] * 6, [1.0, 1.0, NAN, NAN, 1.0, NAN], [4.0, NAN, 4.0, 4.0, 4.0, NAN])
-    measured = scores(np.array([1.4, 1.6, 2.9, 3.1, NAN, 9.0]), truth)
+    truth = pixel_truth([2.0] * 6, front_m=[1.0, 1.0, NAN, NAN, 1.0, NAN], behind_m=[4.0, NAN, 4.0, 4.0, 4.0, NAN])
+    measured = layer_scores(np.array([1.4, 1.6, 2.9, 3.1, NAN, 9.0]), truth)
     assert measured == pytest.approx(
         {
             "layer_confusion": 3 / 5,  # the first, the fourth and the missing pixel
@@ -167,10 +271,10 @@ def test_confusion_by_hand() -> None:
 
 
 def test_midpoint_is_not_confused_and_extremes_are() -> None:
-    truth = truth_of_pixels([2.0, 2.0], [1.0, NAN], [NAN, 4.0])
-    assert scores(np.array([1.5, 3.0]), truth)["layer_confusion"] == 0.0
-    assert scores(np.array([5e-324, 1e308]), truth)["layer_confusion"] == 1.0
-    assert scores(np.array([np.inf, -1.0]), truth)["layer_confusion"] == 1.0  # both missing
+    truth = pixel_truth([2.0, 2.0], front_m=[1.0, NAN], behind_m=[NAN, 4.0])
+    assert layer_scores(np.array([1.5, 3.0]), truth)["layer_confusion"] == 0.0
+    assert layer_scores(np.array([5e-324, 1e308]), truth)["layer_confusion"] == 1.0
+    assert layer_scores(np.array([np.inf, -1.0]), truth)["layer_confusion"] == 1.0  # both missing
 
 
 @settings(max_examples=40)
@@ -186,29 +290,13 @@ def test_confusion_agrees_with_its_definition(seed: int) -> None:
         others = [float(other) for other in (front, behind) if inside and not math.isnan(other)]
         in_sight += bool(others)
         confused += any(abs(p - other) < abs(p - z) for other in others)
-    assert scores(p_m, truth)["layer_confusion"] == pytest.approx(confused / in_sight)
-
-
-@settings(max_examples=40)
-@given(SEEDS, st.floats(0.001, 1.0), st.floats(1.0, 3.0))
-def test_holes_and_larger_errors_never_lower_confusion(seed: int, share: float, further: float) -> None:
-    rng = np.random.default_rng(seed)
-    truth = random_truth(rng)
-    p_m = random_prediction(rng, truth)
-    before, with_missing = scores(p_m, truth), scores(with_holes(rng, p_m, share), truth)
-    z_m = truth.depth_m.astype(np.float64)
-    with np.errstate(invalid="ignore"):
-        farther = scores(np.where(p_m > 0, z_m + further * (p_m - z_m), p_m), truth)
-    for name in ("layer_confusion", "layer_swallowed", "layer_pulled_forward"):
-        assert with_missing[name] >= before[name]
-        assert farther[name] >= before[name]
-    assert with_missing["layers_in_sight"] == before["layers_in_sight"]
+    assert layer_scores(p_m, truth)["layer_confusion"] == pytest.approx(confused / in_sight)
 
 
 def test_ground_truth_has_no_confusion() -> None:
     truth = random_truth(np.random.default_rng(4))
-    assert scores(truth.depth_m.astype(np.float64), truth)["layer_confusion"] == 0.0
+    assert layer_scores(truth.depth_m.astype(np.float64), truth)["layer_confusion"] == 0.0
     alone = steel_truth(np.ones((5, 5)), np.ones((5, 5), np.uint16))
-    assert scores(np.ones(25), alone) == {"layers_in_sight": 0.0}
+    assert layer_scores(np.ones(25), alone) == {"layers_in_sight": 0.0}
     bare = steel_truth(np.ones((2, 2)), np.ones((2, 2), np.uint16))
-    assert scores(np.ones(4), bare) == {}
+    assert layer_scores(np.ones(4), bare) == {}

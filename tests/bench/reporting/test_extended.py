@@ -1,0 +1,330 @@
+"""Extended measures in report and terminal: golden texts, formatting of numbers, and crossings of a dataset."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+import json
+import math
+import re
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from rich.console import Console
+
+import rebar_depth_bench as rdb
+from rebar_depth_bench.data.files import file_sha256
+from rebar_depth_bench.extended.fits import MISS_MM
+from rebar_depth_bench.extended.inspection import CAPABILITY_MEASURES
+from rebar_depth_bench.extended.measures import SCALED, Measure, Statistic
+from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, measures_by_alignment, score_extended
+from rebar_depth_bench.extended.result import (
+    ExtendedResult,
+    MeasureEstimate,
+    ViewSamples,
+    tabulate_extended,
+    view_numbers,
+)
+from rebar_depth_bench.reporting.extended_tables import print_extended, reach_sentence
+from rebar_depth_bench.reporting.html.extended import (
+    error_kind,
+    estimate_cell,
+    extended_config,
+    measure_definitions,
+)
+from rebar_depth_bench.reporting.html.page import look_at_views, render_report, write_report
+from rebar_depth_bench.scoring.bootstrap import resample
+from rebar_depth_bench.scoring.evaluation import open_evaluation
+from tests.bench.extended.cage_scenes import HEIGHT, WIDTH
+from tests.bench.reporting.pages import Page, without_embedded
+from tests.bench.reporting.results import HOSTILE, result, scored_view
+from tests.mat_dataset import CONFIG, VIEWS, write_mat_dataset
+
+INDICES = range(0, 800, 100)
+"""Indices of the views, so far apart that each is a block."""
+LEVELS = {
+    "bar_found": 0.875,
+    "spacing_error_mm": -1.25,
+    "spacing_judged_mm": 4.0,
+    "layer_judged_mm": MISS_MM,
+    "cover_judged_mm": 12.5,
+    "pass_gb50204_spacing": 0.625,
+    "scale": 0.97,
+    "boundary_f1": 0.4375,
+    "layer_confusion": 0.0625,
+    "interior_abs_rel": 0.0517,
+    "single_bar_share": 0.125,
+    "single_bar_abs_rel": 0.0317,
+    "single_bar_views_abs_rel": 0.0517,
+    **{
+        f"cloud_{kind}_{t}mm": 0.1 + t / 40
+        for kind in ("accuracy", "completeness", "f")
+        for t in (1, 2, 5, 10, 20)
+    },
+    **{f"abs_rel_at_{name}": level for name, level in (("0.3-0.4m", 0.02), ("0.4-0.5m", 0.04), ("8-12px", 0.03))},
+    **{f"scale_at_{name}": level for name, level in (("0.3-0.4m", 0.99), ("0.4-0.5m", 1.01), ("8-12px", 0.98))},
+}
+"""Mean of each view's samples by name; scaled samples are half of it."""
+
+
+def make_view(index: int, levels: dict[str, float]) -> ViewSamples:
+    rng = np.random.default_rng(index)
+    samples = {}
+    for alignment, measures in measures_by_alignment().items():
+        factor = 0.5 if alignment == SCALED else 1.0
+        samples_by_name: dict[str, np.ndarray] = {measure.sample: np.empty(0) for measure in measures}
+        for name in [name for name in samples_by_name if name in levels]:  # In order, for the random numbers.
+            level = levels[name]
+            spread = 0.0 if level == MISS_MM else 0.01 * level
+            samples_by_name[name] = factor * (level + spread * rng.uniform(-1, 1, 4))
+        samples[alignment] = samples_by_name
+    return samples
+
+
+def make_extended(*configs: str, levels: dict[str, float] | None = None, views: int = 8) -> ExtendedResult:
+    measures = measures_by_alignment()
+    of_config = {index: make_view(index, LEVELS if levels is None else levels) for index in INDICES[:views]}
+    table = tabulate_extended(list(of_config.values()), resample(INDICES[:views]), measures)
+    numbers = {
+        f"{config}/{index:04d}": view_numbers(one, measures)
+        for config in configs
+        for index, one in of_config.items()
+    }
+    return ExtendedResult(measures, dict.fromkeys(configs, table), numbers)
+
+
+def section_of(extended: ExtendedResult, *configs: str) -> str:
+    """Return the section of extended measures in the report of configs."""
+    views = [scored_view(f"{config}/{index:04d}") for config in configs for index in INDICES]
+    page = render_report(dataclasses.replace(result(*views), extended=extended), [])
+    return page[page.index('<section aria-labelledby="extended"') :].partition("</section>")[0]
+
+
+@pytest.fixture(scope="module")
+def section() -> str:
+    return section_of(make_extended("lattice"), "lattice")
+
+
+def test_section_and_terminal_tables_are_the_golden_texts(
+    section: str, check_golden: Callable[[str, str], None]
+) -> None:
+    check_golden("extended.html", without_embedded(section))
+    for width in (80, 100):
+        console = Console(width=width, file=io.StringIO(), record=True)
+        print_extended(make_extended("lattice"), console)
+        text = console.export_text()
+        assert max(map(len, text.splitlines())) <= width
+        check_golden(f"extended-{width}.txt", text)
+
+
+def test_families_are_collapsed_and_definitions_listed(section: str) -> None:
+    assert "<details open" not in section
+    text = Page(f"{section}</section>").text
+    for key in ("full_mask", "single_bar", "boundary", "layers", "clouds", "alignment"):
+        assert f"<summary>{MEASURE_FAMILIES[key].title} <" in section
+        for measure in MEASURE_FAMILIES[key].measures if key in ("layers", "alignment") else ():
+            assert re.sub(r"\s+", " ", measure.definition) in text, measure.name
+    assert "title=" not in section, "reached by touch and keyboard, not by hovering"
+
+
+def test_measures_without_values_are_explained() -> None:
+    none = section_of(make_extended("lattice", levels={**LEVELS, "single_bar_share": 0.0}), "lattice")
+    assert "every scored pixel has a second bar within one pixel" in none
+    nothing = section_of(make_extended("lattice", levels={}), "lattice")
+    assert "No bar of these views is straight, long and wide enough to be judged." in nothing
+    assert "<svg" not in nothing
+    few = section_of(make_extended("lattice", views=2), "lattice")
+    assert 'class="interval"' not in few
+    assert "slim interval" not in few
+
+
+def test_hostile_name_of_a_config_is_escaped() -> None:
+    name = HOSTILE.replace("/", "")
+    page = Page(f"{section_of(make_extended('lattice', name), 'lattice', name)}</section>")
+    assert page.count("script") == 0
+    assert "\x1b" not in page.text
+    ids = [attributes["id"] for _, attributes in page.tags if "id" in attributes]
+    assert len(ids) == len(set(ids))
+
+
+def test_section_keeps_config_order() -> None:
+    tables = make_extended("pile", "lattice").tables
+    configs = [extended_config(name, table) for name, table in tables.items()]
+    assert [config.name for config in configs] == ["pile", "lattice"]
+    assert all(len(config.tolerances) == len(CAPABILITY_MEASURES) for config in configs)
+
+
+def make_measure(unit: str, statistic: Statistic = "mean") -> Measure:
+    return Measure("m", "M", unit, "", "for this test", "s", statistic)
+
+
+@pytest.mark.parametrize(
+    ("estimate", "unit", "text", "interval"),
+    [
+        (MeasureEstimate(0.1234, (0.1, 0.2), 9), "%", "12.3", "10.0 – 20.0"),
+        (MeasureEstimate(-1.005, (-2.0, 0.5), 9), "mm", "−1.00", "−2.00 to 0.50"),
+        (MeasureEstimate(1e-9, None, 9), "", "1.0e−09", ""),
+        (MeasureEstimate(math.inf, (1.0, math.inf), 9), "cm", "–", ""),
+        (MeasureEstimate(None, None, 0), "mm", "–", ""),
+    ],
+)
+def test_estimate_cell_formats_by_unit(estimate: MeasureEstimate, unit: str, text: str, interval: str) -> None:
+    cell = estimate_cell(estimate, make_measure(unit))
+    assert (cell.text, cell.interval) == (text, interval)
+
+
+def test_capability_is_formatted_as_ratio() -> None:
+    texts = [
+        estimate_cell(estimate, CAPABILITY_MEASURES[0]).text
+        for estimate in (
+            MeasureEstimate(2.5, None, 9),
+            MeasureEstimate(math.inf, None, 9),
+            MeasureEstimate(None, None, 9),
+            MeasureEstimate(None, None, 0),
+        )
+    ]
+    assert texts == ["2.50", "∞", "n/a", "–"]
+
+
+def test_definitions_differing_only_in_step_are_merged() -> None:
+    definitions = dict(measure_definitions(MEASURE_FAMILIES["clouds"].measures))
+    assert list(definitions) == ["Cloud accuracy, N mm", "Cloud completeness, N mm", "Cloud F-score, N mm"]
+    assert definitions["Cloud accuracy, N mm"].endswith("; N: 1, 2, 5, 10, 20")
+    boundary = dict(measure_definitions(MEASURE_FAMILIES["boundary"].measures))
+    assert "at t = N % (" in boundary["Boundary F1, steps over N %"]
+    assert "max/min > 1 + t" in boundary["Boundary F1, steps over N %"], "what is no step stays"
+    assert "t = 1, 2, 5, 10, 20 %" in boundary["Boundary F1"]
+    similar_measures = [
+        dataclasses.replace(make_measure("%"), title=f"In {t} mm", definition=f"{t} mm, 24 px off") for t in (3, 5)
+    ]
+    assert [definition for _, definition in measure_definitions(similar_measures)] == ["N mm, 24 px off; N: 3, 5"]
+    assert list(dict(measure_definitions(MEASURE_FAMILIES["profile"].measures))) == [
+        "Scale s at N m",
+        "AbsRel at N m",
+        "Scale s on bars of N px",
+        "AbsRel on bars of N px",
+        "Single-bar share at N m",
+        "AbsRel, single-bar, at N m",
+    ]
+
+
+@dataclasses.dataclass(frozen=True)
+class Mat:
+    """Dataset of a mat, with the depth of its views by id."""
+
+    root: Path
+    depths_m: dict[str, np.ndarray]
+
+    def archive(self, shift_mm: dict[int, float], config: str = CONFIG) -> Path:
+        """Write the depth of a config's test views, shifted by millimetres by the index of the view."""
+        path = self.root.parent / "a.zip"
+        with rdb.SubmissionWriter(path, method="shifted") as writer:
+            for view_id, depth_m in self.depths_m.items():
+                if view_id.startswith(config) and "train" not in view_id:
+                    shifted_m = depth_m + np.float32(shift_mm.get(int(view_id[-4:]), 0.0) / 1000)
+                    writer.add(view_id, np.where(depth_m > 0, shifted_m, 0.0).astype(np.float32))
+        return path
+
+
+@pytest.fixture(scope="module")
+def mat(tmp_path_factory: pytest.TempPathFactory) -> Mat:
+    root = tmp_path_factory.mktemp("mat") / "dataset"
+    root.mkdir()
+    return Mat(root, write_mat_dataset(root))
+
+
+def extended(archive: Path, root: Path, *families: str) -> ExtendedResult:
+    """Return the extended measures of an archive, all or those of some families."""
+    chosen = [MEASURE_FAMILIES[name] for name in families or MEASURE_FAMILIES]
+    with open_evaluation(archive, root) as evaluation:
+        found = score_extended(evaluation, chosen).extended
+    assert found is not None
+    return found
+
+
+@pytest.mark.slow
+def test_measures_of_a_config_pool_its_views(mat: Mat) -> None:
+    archive = mat.archive({0: 3.0, 1: 7.0, 2: 60.0})
+    found = extended(archive, mat.root)
+    table = found.tables[CONFIG]
+    numbers = table.numbers["native"]
+    assert numbers["crossings_judged"].value == 1.0
+    assert numbers["crossings_located"].value == pytest.approx(5 / VIEWS)  # A bar 60 mm away is none of ours.
+    assert [numbers[f"tie_within_{limit}mm"].value for limit in (2, 5, 10)] == pytest.approx([3 / 6, 4 / 6, 5 / 6])
+    assert numbers["tie_p95_mm"].value == 100.0
+    assert numbers["tie_along_bias_mm"].value == pytest.approx((3 + 7) / 5, abs=0.2)
+    assert numbers["tie_within_5mm"].samples == 4 * VIEWS
+    console = Console(record=True, width=120, file=io.StringIO())
+    print_extended(found, console)
+    text = " ".join(console.export_text().split())
+    assert "tie point: median, mm" in text
+    assert reach_sentence("scaled", table.reaches["scaled"][1]) in text
+
+    alone = extended(archive, mat.root, "crossings")
+    assert alone.tables[CONFIG].reaches == table.reaches
+    heads = {measure.name.partition("_")[0] for measure in alone.measures["native"]}
+    assert heads == {"crossing", "crossings", "tie"}
+    content = alone.to_dict()
+    assert content["crossings"] == {
+        "file": "crossings.parquet",
+        "sha256": file_sha256(mat.root / "crossings.parquet"),
+    }
+    reaches = json.loads(json.dumps(content))["tables"][CONFIG]["crossing_reach"]["native"]
+    assert [(reach["limit_mm"], reach["verdict"]) for reach in reaches] == [(5, "none tested"), (2, "none tested")]
+    assert sum(one["crossings"] for one in reaches[0]["bins"]) == 4 * VIEWS
+
+
+@pytest.mark.slow
+def test_older_folder_is_stamped_with_its_bars(mat: Mat, tmp_path: Path) -> None:
+    older = tmp_path / "older"
+    older.mkdir()
+    write_mat_dataset(older, with_crossings=False)
+    archive = mat.archive({})
+    found, expected = extended(archive, older), extended(archive, mat.root)
+    assert found.crossings is not None
+    assert (found.crossings.file, found.crossings.sha256) == ("bars.parquet", file_sha256(older / "bars.parquet"))
+    assert found.to_dict()["tables"] == expected.to_dict()["tables"]
+
+
+@pytest.mark.slow
+def test_report_shows_crossings_by_error(mat: Mat, tmp_path: Path) -> None:
+    archive = mat.archive({0: 3.0})
+    with open_evaluation(archive, mat.root) as evaluation:
+        scored = score_extended(evaluation)
+        picture = look_at_views(evaluation, {}, crossings=True).pictures[CONFIG]
+        write_report(scored, evaluation, tmp_path / "report.html")
+    assert (picture.view_id, picture.width, picture.height) == (f"{CONFIG}/0000", WIDTH, HEIGHT)
+    assert [(kind, count) for kind, _, count in picture.counts] == [("within5", 4)]
+    assert all(0 < x < WIDTH and 0 < y < HEIGHT for _, x, y in picture.marks)
+    page = (tmp_path / "report.html").read_text()
+    shown = page[page.index('<h2 id="crossings">') :].partition("</section>")[0]
+    assert "<b>By distance</b>" in shown
+    assert len(re.findall(r'<circle class="within5" cx="\d', shown)) == 5  # Four crossings and the legend.
+    assert "crossings.parquet, SHA-256" in shown
+    assert "Native: 95 % of the judged crossings within 5 mm: none tested." in shown
+    assert "Crossings by angle, gap and bar width" in shown
+    assert "<script" not in shown
+
+
+@pytest.mark.slow
+def test_config_of_several_scenes_has_crossings_of_each(mat: Mat) -> None:
+    numbers = extended(mat.archive({1: 60.0}, "cages"), mat.root).tables["cages"].numbers["native"]
+    assert numbers["tie_within_5mm"].samples == 16  # Two scenes of two views in the split test.
+    assert numbers["crossings_located"].value == 0.5
+
+
+@pytest.mark.parametrize(
+    ("error_mm", "kind"),
+    [
+        (0.0, "within2"),
+        (2.0, "within2"),
+        (2.1, "within5"),
+        (9.9, "within10"),
+        (10.1, "beyond"),
+        (np.inf, "beyond"),
+    ],
+)
+def test_marks_have_the_colour_of_their_error(error_mm: float, kind: str) -> None:
+    assert error_kind(error_mm) == kind
