@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -17,38 +16,16 @@ from dataset_builder.scene.model import Assembly, WorldMesh
 from dataset_builder.specs.config_specs import LatticeSpec
 from dataset_builder.user_files.cage_file import load_cage, mesh_file_spec, read_cage
 from rebar_depth_bench.base.errors import MeshError
-from tests.builder.user_files.tube_shapes import CENTRELINES_M, length_m, swept
-
-ALONG_X = np.array([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
-
-
-def rod(diameter_m: float, y_m: float = 0.0) -> trimesh.Trimesh:
-    """Return a closed rod of 0.5 m along x."""
-    body = trimesh.creation.cylinder(diameter_m / 2, 0.5, sections=64, transform=ALONG_X)
-    body.apply_translation([0.25, y_m, 0.1])
-    return body
-
-
-RODS = tuple(rod(diameter_m, y_m) for diameter_m, y_m in ((0.016, 0.0), (0.010, 0.1), (0.020, 0.2)))
-
-
-def concatenate_meshes(bodies: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
-    arrays = trimesh.util.append_faces([body.vertices for body in bodies], [body.faces for body in bodies])
-    return trimesh.Trimesh(*arrays, process=False)
-
-
-def obj_bytes(bodies: Sequence[trimesh.Trimesh], names: Sequence[str], per_metre: float = 1.0) -> bytes:
-    lines, start = ["mtllib missing.mtl"], 1
-    for body, name in zip(bodies, names, strict=True):
-        lines += [f"o {name}", *(f"v {x!r} {y!r} {z!r}" for x, y, z in (body.vertices * per_metre).tolist())]
-        lines += ["vn 0 0 1", "usemtl steel", *(f"f {a}//1 {b}//1 {c}//1" for a, b, c in body.faces + start)]
-        start += len(body.vertices)
-    return "\n".join(lines).encode()
-
-
-def load_content(folder: Path, name: str, content: bytes | str, unit: str | float = "m") -> Assembly:
-    (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
-    return load_cage(mesh_file_spec(folder / name, unit))
+from tests.builder.user_files.tube_shapes import (
+    CENTRELINES_M,
+    RODS,
+    concatenated,
+    length_m,
+    load_content,
+    obj_bytes,
+    rod,
+    swept,
+)
 
 
 def diameters_mm(assembly: Assembly) -> list[int]:
@@ -62,7 +39,7 @@ def test_lattice_round_trips_through_every_format(tmp_path: Path, suffix: str) -
     meshes = [part.mesh for part in lattice.parts]
     bodies = [trimesh.Trimesh(mesh.vertices_m, mesh.faces, process=False) for mesh in meshes]
     names = [f"rod {number}" for number in range(1, 13)]  # Natural order: "rod 10" after "rod 9".
-    whole, path = concatenate_meshes(bodies), tmp_path / f"a{suffix}"
+    whole, path = concatenated(bodies), tmp_path / f"a{suffix}"
     if suffix == ".ply":
         bar_id = np.repeat(range(1, 13), [len(body.faces) for body in bodies])
         write_mesh_ply(path, WorldMesh(whole.vertices, whole.faces, bar_id))
@@ -91,7 +68,7 @@ def test_dataset_ply_keeps_bar_ids_and_skips_board(tmp_path: Path) -> None:
     inside_out = RODS[1].copy()
     inside_out.invert()
     bodies = (RODS[0], trimesh.creation.box((2, 2, 0.01)), inside_out)
-    whole = concatenate_meshes(bodies)
+    whole = concatenated(bodies)
     bar_id = np.repeat([40_000, 0, 7], [len(body.faces) for body in bodies])
     write_mesh_ply(tmp_path / "a.ply", WorldMesh(whole.vertices, whole.faces, bar_id))
     parts = load_cage(mesh_file_spec(tmp_path / "a.ply", "m")).parts
@@ -137,7 +114,7 @@ def test_objects_are_numbered_by_name(tmp_path: Path) -> None:
 
 
 def test_object_of_two_pieces_is_one_bar(tmp_path: Path) -> None:
-    lines = obj_bytes((concatenate_meshes(RODS[:2]), RODS[2]), "ab").split(b"\n")
+    lines = obj_bytes((concatenated(RODS[:2]), RODS[2]), "ab").split(b"\n")
     content = b"\n".join([*lines[:400], b"usemtl paint", b"g group", *lines[400:]])
     assert [len(part.mesh.faces) for part in load_content(tmp_path, "a.obj", content).parts] == [512, 256]
 
@@ -184,7 +161,7 @@ def test_parts_that_are_no_round_bar_have_no_axis_and_are_named(tmp_path: Path) 
     u_bar = swept(line_m, 12)
     bodies = (
         trimesh.Trimesh(ends, faces),
-        concatenate_meshes(RODS[:2]),
+        concatenated(RODS[:2]),
         trimesh.Trimesh(u_bar.vertices_m, u_bar.faces),
         RODS[2],
     )

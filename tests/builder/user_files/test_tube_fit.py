@@ -11,15 +11,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from dataset_builder.scene.model import Mesh
+from dataset_builder.scene.shapes.bar_mesh import ribbed_bar_mesh
 from dataset_builder.scene.shapes.solids import ring_faces
 from dataset_builder.user_files.tubes.tube_fit import MAX_TRIANGLES, Tube, fit_tube
 from tests.builder.user_files.tube_shapes import (
     CENTRELINES_M,
     DIAMETER_M,
-    TESSELLATIONS,
     divided,
     length_m,
     line_distance_m,
+    remeshed,
     swept,
 )
 
@@ -40,6 +41,12 @@ def test_swept_bars_are_recovered(shape: str, facets: int) -> None:
     assert (tube.axis_m[0] == tube.axis_m[-1]).all() == (shape == "closed hoop")
 
 
+TESSELLATIONS = {
+    "24, divided": lambda line_m: divided(swept(line_m, 24)),
+    "12, remeshed": lambda line_m: remeshed(line_m, 12),
+    "24, remeshed": lambda line_m: remeshed(line_m, 24),
+    "ribbed": lambda line_m: ribbed_bar_mesh(line_m, DIAMETER_M),
+}
 HOOP_AND_SPIRAL = ("closed hoop", "spiral")
 """Shapes without a ribbed mesh: ribbed bars have two ends, and the ribbed spiral takes seconds."""
 
