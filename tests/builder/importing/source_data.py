@@ -190,6 +190,15 @@ DEPTH_FORMATS: Mapping[str, tuple[str, str, Encode, float]] = {
 """Suffix, keys of ``[depth]``, encoder of the left depth, and largest error in metres, by name."""
 
 
+def write_depth_format(folder: Path, rows: list[Row], name: str) -> Path:
+    """Write the left depth of the views in one of ``DEPTH_FORMATS``; return the layout file that names it."""
+    suffix, keys, encode, _ = DEPTH_FORMATS[name]
+    for view, row in zip(NAMES, rows, strict=True):
+        write(folder / f"other/{view}{suffix}", encode(folder, row))
+    files, tables = {"left_depth": f"other/{{view}}{suffix}"}, f"{STEREO}\n[depth]\n{keys}\n"
+    return write_layout(folder, ("left_depth", "left_rgb", "right_rgb"), tables=tables, files=files)
+
+
 def _npz(depth: np.ndarray) -> bytes:
     stream = io.BytesIO()
     np.savez_compressed(stream, depth=depth)
