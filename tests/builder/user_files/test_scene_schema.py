@@ -21,7 +21,10 @@ from rebar_depth_bench.base.errors import InputError, MeshError
 from tests.builder.catalog.scene_files import BAR, MM, write_scene
 
 SURVEY = "[cameras]\nkind = 'survey'\n"
-INVALID_COUNT_AND_SEED = "invalid cameras.views_per_distance, invalid cameras.seed"
+RING = "[cameras]\nkind = 'ring'\n"
+DOME = "[cameras]\nkind = 'dome'\n"
+SELECT = "ifc = 'a.ifc'\n[[select]]\n"
+RING_RADIUS_AND_ELEVATION = "missing cameras.radius, missing cameras.elevation_deg"
 INVALID_SCENES = [
     ("", "missing unit, missing"),
     (BAR, "missing unit"),
@@ -29,129 +32,105 @@ INVALID_SCENES = [
     ("unit = 5\n" + BAR, "invalid unit"),
     (MM + "nmae = 'x'\n" + BAR, "unknown nmae"),
     (MM + "zzz = 1\n" + BAR, "unknown zzz"),
-    (MM + "name = 'My Beam'\n" + BAR, "invalid name"),
-    (MM + "name = 'lattice-dusk'\n" + BAR, "invalid name"),
-    (MM + "name = 'lattice'\n" + BAR, "conflict name"),
-    (MM + "name = 'meshes'\n" + BAR, "conflict name"),
-    (MM + "name = 'scenes'\n" + BAR, "conflict name"),
-    (MM + "name = '../x'\n" + BAR, "invalid name"),
-    (MM + "name = ''\n" + BAR, "invalid name"),
-    (MM + "name = '" + "a" * 64 + "'\n" + BAR, "invalid name"),
-    (MM + "name = true\n" + BAR, "invalid name"),
     (MM + "mesh = 'a.stl'\n" + BAR, "conflict"),
     (MM + "mesh = 'a.stl'\nifc = 'b.ifc'", "conflict"),
     (MM + "mesh = 3", "invalid mesh"),
     (MM + "mesh = ''", "invalid mesh"),
-    (MM + "bar = 3", "invalid bar"),
-    (MM + "up = 'x'\n" + BAR, "invalid up"),
-    (MM + "origin = 'center'\n" + BAR, "invalid origin"),
-    (MM + "rotate_deg = 361\n" + BAR, "invalid rotate_deg"),
-    (MM + "translate = [1, 2]\n" + BAR, "invalid translate"),
-    (MM + "translate = [1, 2, nan]\n" + BAR, "invalid translate"),
     (MM + "trust = 'geometry'\n" + BAR, "conflict trust"),
     ("ifc = 'a.ifc'\ntrust = 'me'\n", "invalid trust"),
     (MM + BAR + "[[select]]\nname = 'a'\n", "conflict select"),
     ("ifc = 'a.ifc'\nselect = []\n", "invalid select"),
     ("ifc = 'a.ifc'\nselect = 'a'\n", "invalid select"),
-    ("ifc = 'a.ifc'\n[[select]]\n", "missing select 1"),
-    ("ifc = 'a.ifc'\n[[select]]\nclas = 'a'\n", "unknown select 1: clas"),
-    ("ifc = 'a.ifc'\n[[select]]\nname = ''\n", "invalid select 1: name"),
-    ("ifc = 'a.ifc'\n[[select]]\nbox = [[0, 0, 0]]\n", "invalid select 1: box"),
+    (SELECT, "missing select 1"),
+    (SELECT + "clas = 'a'\n", "unknown select 1: clas"),
+    (SELECT + "name = ''\n", "invalid select 1: name"),
+    (SELECT + "box = [[0, 0, 0]]\n", "invalid select 1: box"),
     (MM + "mesh = 'a.stl'\n[[select]]\nname = 'a'\nstorey = 'b'\n", "conflict select 1"),
+    (MM + "bar = 3", "invalid bar"),
     (MM + "bar = []", "invalid bar"),
     (MM + "bar = [1]", "invalid bar 1"),
     (MM + "[bar]\ndiameter = 10", "invalid bar"),
-    (MM + "environment = 'moon'\n" + BAR, "invalid environment"),
-    (MM + "board = true\n" + BAR, "invalid board"),
-    (MM + "board = 7\n" + BAR, "invalid board"),
-    (MM + "board = 6.0\n" + BAR, "invalid board"),
     (MM + "cameras = 3\n" + BAR, "invalid cameras"),
-    (MM + BAR + "[cameras]\n", "missing cameras.kind"),
-    (MM + BAR + "[cameras]\nkind = 'x'\n", "invalid cameras.kind"),
-    (MM + BAR + "[cameras]\nkind = ['survey']\n", "invalid cameras.kind"),
-    (MM + BAR + SURVEY + "azimuths = 3\n", "unknown cameras.azimuths"),
-    (MM + BAR + SURVEY + "distances = []\n", "invalid cameras.distances"),
-    (MM + BAR + SURVEY + "distances = 500\n", "invalid cameras.distances"),
-    (MM + BAR + SURVEY + "distances = [500, 0]\n", "invalid cameras.distances 2"),
-    (MM + BAR + SURVEY + "distances = [500, 119]\n", "conflict cameras.distances 2"),
-    (MM + BAR + SURVEY + "views_per_distance = 0\n", "invalid cameras.views_per_distance"),
-    (MM + BAR + SURVEY + "views_per_distance = 2.0\nseed = -1\n", INVALID_COUNT_AND_SEED),
-    (MM + BAR + SURVEY + "views_per_distance = 2501\n", "conflict cameras"),
-    (MM + BAR + SURVEY + f"distances = {[500] * 80}\n", "conflict cameras"),
-    (MM + BAR + SURVEY + "views_per_distance = 10001\n", "invalid cameras.views_per_distance"),
-    (MM + BAR + SURVEY + "stations = []\n", "unknown cameras.stations"),
-    (
-        MM + BAR + "[cameras]\nkind = 'ring'\n",
-        "missing cameras.azimuths, missing cameras.radius, missing cameras.elevation_deg",
-    ),
-    (
-        MM + BAR + "[cameras]\nkind = 'ring'\nradii = [1]\n",
-        "missing cameras.azimuths, missing cameras.radius, missing cameras.elevation_deg, unknown cameras.radii",
-    ),
-    (
-        MM + BAR + "[cameras]\nkind = 'dome'\nradii = []\n",
-        "missing cameras.azimuths, invalid cameras.radii, missing cameras.elevations_deg",
-    ),
-    (
-        MM + BAR + "[cameras]\nkind = 'dome'\nradii = [400, -1]\n",
-        "missing cameras.azimuths, invalid cameras.radii 2, missing cameras.elevations_deg",
-    ),
-    (
-        MM + BAR + "[cameras]\nkind = 'dome'\nelevations_deg = [90]\n",
-        "missing cameras.azimuths, missing cameras.radii, invalid cameras.elevations_deg 1",
-    ),
-    (
-        MM + BAR + "[cameras]\nkind = 'ring'\nazimuths = 2.5\n",
-        "invalid cameras.azimuths, missing cameras.radius, missing cameras.elevation_deg",
-    ),
-    (
-        MM + BAR + "[cameras]\nkind = 'ring'\nazimuths = true\n",
-        "invalid cameras.azimuths, missing cameras.radius, missing cameras.elevation_deg",
-    ),
-    (
-        MM + BAR + "[cameras]\nkind = 'ring'\nradius = 50\nelevation_deg = 9\nazimuths = 3\n",
-        "conflict cameras.radius",
-    ),
-    (
-        MM + BAR + "[cameras]\nkind = 'dome'\nradii = [400, 500]\nelevations_deg = [5, 9]\nazimuths = 3600\n",
-        "conflict cameras",
-    ),
     (MM + "[[bar]]\n", "missing bar 1: diameter, missing bar 1: points"),
-    (MM + BAR + "dia = 3\n", "unknown bar 1: dia"),
-    (MM + BAR + "ribs = 1\n", "invalid bar 1: ribs"),
-    (MM + BAR + "id = 0\n", "invalid bar 1: id"),
-    (MM + BAR + "id = 65536\n", "invalid bar 1: id"),
-    (
-        MM + BAR + "id = 5\n" + BAR + "id = 5\n",
-        "duplicate bar 2: id",
-    ),
-    (MM + BAR + "role = ''\n", "invalid bar 1: role"),
-    (MM + BAR + 'role = "a\\nb"\n', "invalid bar 1: role"),
-    (MM + BAR + "role = '" + "x" * 61 + "'\n", "invalid bar 1: role"),
-    (MM + BAR + "bend_diameter = 9\n", "conflict bar 1: bend_diameter"),
-    (MM + BAR + "bend_diameter = -4\n", "invalid bar 1: bend_diameter"),
-    (MM + BAR.replace("= 10", "= 0"), "invalid bar 1: diameter"),
-    (MM + BAR.replace("= 10", "= nan"), "invalid bar 1: diameter"),
-    (MM + BAR.replace("= 10", "= inf"), "invalid bar 1: diameter"),
-    (MM + BAR.replace("= 10", "= '10'"), "invalid bar 1: diameter"),
-    (MM + BAR.replace("= 10", "= true"), "invalid bar 1: diameter"),
-    (MM + BAR.replace("= 10", "= 1" + "0" * 400), "invalid bar 1: diameter"),
-    (MM + BAR.replace("= 10", "= 2020-01-01"), "invalid bar 1: diameter"),
-    (
-        MM + BAR.replace("[100, 0, 50]", "[100, 0]"),
-        "invalid bar 1: points 2",
-    ),
-    (MM + BAR.replace("[100, 0, 50]", "[100, 0, nan]"), "invalid bar 1: points 2"),
-    (MM + BAR.replace("[100, 0, 50]", "[100, 0, '5']"), "invalid bar 1: points 2"),
-    (MM + BAR.replace("[100, 0, 50]", "7"), "invalid bar 1: points 2"),
-    (MM + BAR.replace("[100, 0, 50]", "[1e300, 0, 5]"), "invalid bar 1: points 2"),
-    (MM + BAR.replace(", [100, 0, 50]", ""), "invalid bar 1: points"),
+    (MM + BAR + "id = 5\n" + BAR + "id = 5\n", "duplicate bar 2: id"),
     ("unit = ", "syntax"),
     ("x = " + "[" * 5000, "size"),
     ("x = " + "9" * 5000, "syntax"),
     ("a = 1\na = 2\n", "syntax"),
     ("\x00", "syntax"),
 ]
+INVALID_KEYS = [
+    ("name = 'My Beam'", "invalid name"),
+    ("name = 'lattice-dusk'", "invalid name"),
+    ("name = 'lattice'", "conflict name"),
+    ("name = 'meshes'", "conflict name"),
+    ("name = 'scenes'", "conflict name"),
+    ("name = '../x'", "invalid name"),
+    ("name = ''", "invalid name"),
+    (f"name = '{'a' * 64}'", "invalid name"),
+    ("name = true", "invalid name"),
+    ("up = 'x'", "invalid up"),
+    ("origin = 'center'", "invalid origin"),
+    ("rotate_deg = 361", "invalid rotate_deg"),
+    ("translate = [1, 2]", "invalid translate"),
+    ("translate = [1, 2, nan]", "invalid translate"),
+    ("environment = 'moon'", "invalid environment"),
+    ("board = true", "invalid board"),
+    ("board = 7", "invalid board"),
+    ("board = 6.0", "invalid board"),
+]
+INVALID_CAMERAS = [
+    ("[cameras]\n", "missing cameras.kind"),
+    ("[cameras]\nkind = 'x'\n", "invalid cameras.kind"),
+    ("[cameras]\nkind = ['survey']\n", "invalid cameras.kind"),
+    (SURVEY + "azimuths = 3\n", "unknown cameras.azimuths"),
+    (SURVEY + "distances = []\n", "invalid cameras.distances"),
+    (SURVEY + "distances = 500\n", "invalid cameras.distances"),
+    (SURVEY + "distances = [500, 0]\n", "invalid cameras.distances 2"),
+    (SURVEY + "distances = [500, 119]\n", "conflict cameras.distances 2"),
+    (SURVEY + "views_per_distance = 0\n", "invalid cameras.views_per_distance"),
+    (
+        SURVEY + "views_per_distance = 2.0\nseed = -1\n",
+        "invalid cameras.views_per_distance, invalid cameras.seed",
+    ),
+    (SURVEY + "views_per_distance = 2501\n", "conflict cameras"),
+    (SURVEY + f"distances = {[500] * 80}\n", "conflict cameras"),
+    (SURVEY + "views_per_distance = 10001\n", "invalid cameras.views_per_distance"),
+    (SURVEY + "stations = []\n", "unknown cameras.stations"),
+    (RING, f"missing cameras.azimuths, {RING_RADIUS_AND_ELEVATION}"),
+    (RING + "radii = [1]\n", f"missing cameras.azimuths, {RING_RADIUS_AND_ELEVATION}, unknown cameras.radii"),
+    (RING + "azimuths = 2.5\n", f"invalid cameras.azimuths, {RING_RADIUS_AND_ELEVATION}"),
+    (RING + "azimuths = true\n", f"invalid cameras.azimuths, {RING_RADIUS_AND_ELEVATION}"),
+    (RING + "radius = 50\nelevation_deg = 9\nazimuths = 3\n", "conflict cameras.radius"),
+    (DOME + "radii = []\nelevations_deg = [9]\nazimuths = 3\n", "invalid cameras.radii"),
+    (
+        DOME + "radii = [400, -1]\n",
+        "missing cameras.azimuths, invalid cameras.radii 2, missing cameras.elevations_deg",
+    ),
+    (DOME + "radii = [400]\nelevations_deg = [90]\nazimuths = 3\n", "invalid cameras.elevations_deg 1"),
+    (DOME + "radii = [400, 500]\nelevations_deg = [5, 9]\nazimuths = 3600\n", "conflict cameras"),
+]
+INVALID_BAR_KEYS = [
+    ("dia = 3", "unknown bar 1: dia"),
+    ("ribs = 1", "invalid bar 1: ribs"),
+    ("id = 0", "invalid bar 1: id"),
+    ("id = 65536", "invalid bar 1: id"),
+    ("role = ''", "invalid bar 1: role"),
+    ('role = "a\\nb"', "invalid bar 1: role"),
+    (f"role = '{'x' * 61}'", "invalid bar 1: role"),
+    ("bend_diameter = 9", "conflict bar 1: bend_diameter"),
+    ("bend_diameter = -4", "invalid bar 1: bend_diameter"),
+]
+INVALID_DIAMETERS = ("0", "nan", "inf", "'10'", "true", "1" + "0" * 400, "2020-01-01")
+INVALID_POINTS = ("[100, 0]", "[100, 0, nan]", "[100, 0, '5']", "7", "[1e300, 0, 5]")
+INVALID_SCENES += [(f"{MM}{key}\n{BAR}", problems) for key, problems in INVALID_KEYS]
+INVALID_SCENES += [(MM + BAR + table, problems) for table, problems in INVALID_CAMERAS]
+INVALID_SCENES += [(f"{MM}{BAR}{key}\n", problems) for key, problems in INVALID_BAR_KEYS]
+INVALID_SCENES += [
+    (MM + BAR.replace("= 10", f"= {text}"), "invalid bar 1: diameter") for text in INVALID_DIAMETERS
+]
+INVALID_SCENES += [(MM + BAR.replace("[100, 0, 50]", text), "invalid bar 1: points 2") for text in INVALID_POINTS]
+INVALID_SCENES += [(MM + BAR.replace(", [100, 0, 50]", ""), "invalid bar 1: points")]
 
 
 def codes_and_places(error: InputError) -> list[str]:
