@@ -192,11 +192,10 @@ def site_from_world_m() -> Float64[ndarray, "4 4"]:
 
 
 def write_site_model(path: Path, schema: str = "IFC4") -> Path:
-    """Write a wall and a column of life size at site coordinates, with objects that are no reinforcement.
+    """Write a wall, a column and a fitting of life size at site coordinates, with a slab.
 
     The bars of the wall are parts of it (as Tekla writes them), those of the column are contained in a storey (as
-    Revit does), and a fitting is a proxy whose body is extruded circles (as precast suppliers write them), in this
-    order of their ids.
+    Revit does), and the fitting is a proxy whose body is extruded circles (as precast suppliers write them).
     """
     ifc = Ifc(schema)
     turn = np.deg2rad(SITE_TURN_DEG)
@@ -205,52 +204,47 @@ def write_site_model(path: Path, schema: str = "IFC4") -> Path:
         ifc.rooted("IfcBuildingStorey", Name=name, ObjectPlacement=ifc.at((0, 0, z), parent=placement))
         for name, z in (("EG Erdgeschoss", 0), ("Level 1", 4000))
     )
-    wall = _wall(ifc, ground)
-    column = _column(ifc, upper)
-    fitting = _fitting(ifc, ground)
-    slab = _product(ifc, "IfcSlab", "Slab", ground, [_block(ifc, (8000, 8000, 200))], "SweptSolid")
+    wall = _product(ifc, "IfcWall", "W-1", ground, [_block(ifc, (6000, 250, 3000))])
+    ifc.rooted("IfcRelAggregates", RelatingObject=wall, RelatedObjects=_bars_of_wall(ifc, ground))
+    column = _bars_of_column(ifc, upper)
+    circles = [extruded_circle(ifc, 8.0, x) for x in (3000.0, 3100.0)]
+    fitting = _product(ifc, "IfcBuildingElementProxy", "Rebar fitting", ground, circles)
+    slab = _product(ifc, "IfcSlab", "Slab", ground, [_block(ifc, (8000, 8000, 200))])
     for storey, parts in ((ground, [wall, slab, fitting]), (upper, column)):
         ifc.rooted("IfcRelContainedInSpatialStructure", RelatedElements=parts, RelatingStructure=storey)
     ifc.file.write(str(path))
     return path
 
 
-def _wall(ifc: Ifc, storey: Any) -> Any:
-    wall = _product(ifc, "IfcWall", "W-1", storey, [_block(ifc, (6000, 250, 3000))], "SweptSolid")
+def _bars_of_wall(ifc: Ifc, storey: Any) -> list[Any]:
     bars = []
     for y, inward in ((41, 12), (209, -12)):
         uprights = [((x, y, 40), (x, y, 2960)) for x in range(75, 6000, 300)]
         flat = [((40, y - inward, z), (5960, y - inward, z)) for z in range(75, 3000, 300)]
         bars += [_bar(ifc, ends, 12, storey) for ends in (*uprights, *flat)]
-    ifc.rooted("IfcRelAggregates", RelatingObject=wall, RelatedObjects=bars)
-    return wall
-
-
-def _column(ifc: Ifc, storey: Any) -> list[Any]:
-    """Return the bars of a column of 0.4 x 0.4 x 3 m whose middle is at x = 7 m, y = 1 m."""
-    corners = [(7000 + x, 1000 + y) for x, y in ((-150, -150), (150, -150), (150, 150), (-150, 150))]
-    bars = [_bar(ifc, ((x, y, 20), (x, y, 3020)), 25, storey) for x, y in corners]
-    for z in range(70, 3000, 300):
-        around = [(7000 + x, 1000 + y, z) for x, y in ((-168, -168), (168, -168), (168, 168), (-168, 168))]
-        bars.append(_bar(ifc, around, 10, storey))
-    shapes = [bar.Representation.Representations[0] for bar in bars[4:]]
-    ifc.new("IfcPresentationLayerAssignment", "Stirrups", None, shapes, None)
     return bars
 
 
-def _fitting(ifc: Ifc, storey: Any) -> Any:
-    circles = [extruded_circle(ifc, 8.0, x) for x in (3000.0, 3100.0)]
-    return _product(ifc, "IfcBuildingElementProxy", "Rebar fitting", storey, circles, "SweptSolid")
+def _bars_of_column(ifc: Ifc, storey: Any) -> list[Any]:
+    """Return the bars of a column of 0.4 x 0.4 x 3 m whose middle is at x = 7 m, y = 1 m."""
+    signs = ((-1, -1), (1, -1), (1, 1), (-1, 1))
+    corners = [(7000 + 150 * x, 1000 + 150 * y) for x, y in signs]
+    uprights = [_bar(ifc, ((x, y, 20), (x, y, 3020)), 25, storey) for x, y in corners]
+    around = [[(7000 + 168 * x, 1000 + 168 * y, z) for x, y in signs] for z in range(70, 3000, 300)]
+    stirrups = [_bar(ifc, points, 10, storey) for points in around]
+    shapes = [bar.Representation.Representations[0] for bar in stirrups]
+    ifc.new("IfcPresentationLayerAssignment", "Stirrups", None, shapes, None)
+    return [*uprights, *stirrups]
 
 
 def _bar(ifc: Ifc, points: Sequence[Numbers], diameter_mm: float, storey: Any) -> Any:
     disc = ifc.disc(ifc.polyline(*points), diameter_mm / 2)
-    bar = _product(ifc, "IfcReinforcingBar", f"Bar {diameter_mm:g}", storey, [disc], "AdvancedSweptSolid")
+    bar = _product(ifc, "IfcReinforcingBar", f"Bar {diameter_mm:g}", storey, [disc], shape="AdvancedSweptSolid")
     bar.NominalDiameter = float(diameter_mm)
     return bar
 
 
-def _product(ifc: Ifc, kind: str, name: str, storey: Any, items: list[Any], shape: str) -> Any:
+def _product(ifc: Ifc, kind: str, name: str, storey: Any, items: list[Any], shape: str = "SweptSolid") -> Any:
     body = ifc.new("IfcProductDefinitionShape", Representations=[ifc.shape(*items, kind=shape)])
     place = ifc.at((0, 0, 0), parent=storey.ObjectPlacement)
     return ifc.rooted(kind, Name=name, ObjectPlacement=place, Representation=body)

@@ -8,7 +8,7 @@ import unicodedata
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dataset_builder.catalog.named_configs import CONFIGS, BuildRequest
@@ -151,13 +151,8 @@ def test_all_problems_are_reported_together(tmp_path: Path) -> None:
     head, *lines = str(raised.value).splitlines()
     assert head == f"{tmp_path}/my-beam.toml: 5 problems"
     assert lines == [f"  - {problem}" for problem in raised.value.problems]
-    assert codes_and_places(raised.value) == [
-        "invalid unit",
-        "invalid bar 1: diameter",
-        "unknown bar 1: rips",
-        "invalid board",
-        "unknown foo",
-    ]
+    in_bar = ["invalid bar 1: diameter", "unknown bar 1: rips"]
+    assert codes_and_places(raised.value) == ["invalid unit", *in_bar, "invalid board", "unknown foo"]
     with pytest.raises(MeshError) as raised_by_cage:
         load_cage(cage_file_spec(write_scene(tmp_path, content)))
     assert raised_by_cage.value.problems == raised.value.problems
@@ -199,14 +194,8 @@ def test_documented_example_is_valid() -> None:
     assert (scene.name, scene.board, scene.cameras) == ("my-beam", 6, DomeSpec((0.3, 0.4), (15.0, 45.0), 12))
     corners_m = ((-0.15, 0.0, 0.005), (0.15, 0.0, 0.005), (0.15, 0.0, 0.08))
     [bar] = scene.bars
-    assert bar.model_dump() == {
-        "bar_id": 7,
-        "role": "main",
-        "diameter_m": 0.01,
-        "corners_m": corners_m,
-        "mandrel_m": 0.04,
-        "ribs": True,
-    }
+    assert (bar.bar_id, bar.role, bar.diameter_m, bar.mandrel_m, bar.ribs) == (7, "main", 0.01, 0.04, True)
+    assert bar.corners_m == corners_m
 
 
 def test_survey_has_defaults_in_metres_and_distances_in_the_unit() -> None:
@@ -251,21 +240,16 @@ def test_steel_below_board_or_around_cameras_is_rejected(tmp_path: Path) -> None
 
 
 def test_unreadable_or_misnamed_files_are_rejected(tmp_path: Path) -> None:
-    for name, words in (
-        ("a.yaml", "unsupported scene file type '.yaml'"),
-        ("a.toml", "cannot be read: No such file"),
-    ):
-        with pytest.raises(InputError, match=words):
-            scene_config(tmp_path / name)
+    with pytest.raises(InputError, match=r"unsupported scene file type '.yaml'"):
+        scene_config(tmp_path / "a.yaml")
+    with pytest.raises(InputError, match="cannot be read: No such file"):
+        scene_config(tmp_path / "a.toml")
     with pytest.raises(InputError) as raised:
         scene_config(write_scene(tmp_path, b"\xff\xfe"))
     assert codes_and_places(raised.value) == ["syntax"]
     with pytest.raises(MeshError, match=r"my-beam.toml: ifc: .*gone.ifc: 1 problem\n  - cannot be read"):
         scene_config(write_scene(tmp_path, 'ifc = "gone.ifc"'))
     assert scene_config(write_scene(tmp_path, "\ufeff" + (MM + BAR).replace("\n", "\r\n"))).name == "my-beam"
-    builtin_name = next(iter(CONFIGS))
-    with pytest.raises(InputError, match=f"would be named '{builtin_name}'"):
-        scene_config(write_scene(tmp_path, MM + BAR, f"{builtin_name}.toml"))
 
 
 @pytest.mark.parametrize(
@@ -285,6 +269,7 @@ def test_scene_names_come_from_file_names(file: str, name: str) -> None:
     assert scene_name_of(Path(unicodedata.normalize("NFD", file))) == name
 
 
+@settings(max_examples=50)
 @given(st.text(min_size=1))
 def test_derived_scene_names_are_valid_or_refused(stem: str) -> None:
     name = scene_name_of(Path("folder", f"a{stem.replace('/', '')}.ifc"))
@@ -293,10 +278,10 @@ def test_derived_scene_names_are_valid_or_refused(stem: str) -> None:
 
 
 def test_file_names_without_a_scene_name_are_refused(tmp_path: Path) -> None:
-    assert scene_config(write_scene(tmp_path, MM + BAR, "My Beam.toml")).name == "my-beam"
     for file, name in (
         ("\u9244\u7b4b.toml", ""),
         ("Lattice Orbit.toml", "lattice-orbit"),
+        (f"{next(iter(CONFIGS))}.toml", next(iter(CONFIGS))),
         (f"{'x' * 64}.toml", "x" * 64),
         ("Beam Dusk.toml", "beam-dusk"),
     ):
@@ -304,6 +289,7 @@ def test_file_names_without_a_scene_name_are_refused(tmp_path: Path) -> None:
             scene_config(write_scene(tmp_path, MM + BAR, file))
 
 
+@pytest.mark.slow
 def test_ifc_file_may_have_a_name_that_a_scene_file_cannot_name(tmp_path: Path) -> None:
     """A path in a scene file must not begin with a tilde, but an IFC file that is the scene itself may."""
     path = tmp_path / "~x.ifc"
@@ -312,8 +298,8 @@ def test_ifc_file_may_have_a_name_that_a_scene_file_cannot_name(tmp_path: Path) 
 
 
 def test_files_that_give_the_same_scene_name_are_refused(tmp_path: Path) -> None:
-    scenes = tuple(
-        scene_config(write_scene(tmp_path, MM + BAR, file)) for file in ("My Beam.toml", "my_beam.toml")
-    )
+    files = [write_scene(tmp_path, MM + BAR, name) for name in ("My Beam.toml", "my_beam.toml")]
+    scenes = tuple(map(scene_config, files))
+    assert scenes[0].name == "my-beam"
     with pytest.raises(InputError, match="more than one config is named my-beam"):
         BuildRequest(configs=(), scenes=scenes).config_specs()
