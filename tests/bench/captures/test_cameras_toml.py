@@ -112,11 +112,6 @@ def test_invalid_table_is_refused_with_its_line(
     assert line is None or problem.found.startswith(f"line {line}: ")
 
 
-def test_missing_file_of_the_calibration_is_named(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match=r"absent\.yml"):
-        stereo(tmp_path / "site", 'calibration = "absent.yml"\n')
-
-
 def test_intrinsics_of_images_of_another_shape_are_refused(tmp_path: Path) -> None:
     root = tmp_path / "site"
     write_images(root, "left", "right", size=(640, 360))
@@ -126,14 +121,14 @@ def test_intrinsics_of_images_of_another_shape_are_refused(tmp_path: Path) -> No
     assert [problem.code for problem in caught.value.problems] == ["conflict"]
 
 
-def test_several_calibrations_without_cameras_toml_are_refused(tmp_path: Path) -> None:
-    root = tmp_path / "site"
-    write_images(root, "left", "right")
-    files.write_opencv(root, "yml")
-    files.write_opencv(root, "xml")
-    files.write_opencv(root, "json")
+def test_absent_and_several_calibrations_are_refused_and_named(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match=r"absent\.yml"):
+        stereo(tmp_path, 'calibration = "absent.yml"\n')
+    (tmp_path / "cameras.toml").unlink()
+    for suffix in ("yml", "xml", "json"):
+        files.write_opencv(tmp_path, suffix)
     with pytest.raises(InputError, match=r"stereo\.json, stereo\.xml, stereo\.yml"):
-        open_capture(root)
+        open_capture(tmp_path)
 
 
 def read(folder: Path, width: int = files.WIDTH, height: int = files.HEIGHT, *, is_stereo: bool = True) -> Any:
@@ -202,13 +197,12 @@ def test_one_ros_camera_serves_images_of_one_camera_only(tmp_path: Path) -> None
 
 def write_all(folder: Path, name: str) -> None:
     """Write the files of the program whose file is called ``name``."""
-    if name == "chain.yaml":
-        (folder / name).write_text(files.kalibr_text())
-    elif name == "stereo.yml":
+    if name == "stereo.yml":
         files.write_opencv(folder, "yml")
-    else:
-        for file, text in files.ros_texts(as_message=False).items():
-            (folder / file).write_text(text)
+        return
+    texts = {name: files.kalibr_text()} if name == "chain.yaml" else files.ros_texts(as_message=False)
+    for file, text in texts.items():
+        (folder / file).write_text(text)
 
 
 def edit(path: Path, old: str, new: str) -> None:
@@ -252,11 +246,8 @@ def test_invalid_file_is_refused_with_its_line(
 @pytest.mark.parametrize(
     ("name", "old", "new"),
     [
-        (
-            "right.yaml",
-            FIVE_TERMS,
-            r"cols: 8\n  data: [\1, 0.0, 0.0, 0.0]",
-        ),  # rational_polynomial, fitted as plumb_bob
+        # rational_polynomial, fitted as plumb_bob
+        ("right.yaml", FIVE_TERMS, r"cols: 8\n  data: [\1, 0.0, 0.0, 0.0]"),
         ("stereo.yml", "rows: 5", "rows: 1"),
         ("stereo.yml", "M1: ", "fisheye_model: 0\nM1: "),
         ("chain.yaml", "cam_overlaps", "timeshift_cam_imu: 0.1\n  cam_overlaps"),
@@ -271,14 +262,12 @@ def test_what_says_nothing_about_the_cameras_is_ignored(name: str, old: str, new
 
 def test_two_files_with_different_values_of_a_key_are_refused(tmp_path: Path) -> None:
     for name, focal in (("a.yml", 500), ("b.yml", 501)):
-        (tmp_path / name).write_text(
-            f"%YAML:1.0\n---\ncamera_matrix: [{focal}, 0, 320, 0, {focal}, 240, 0, 0, 1]\n"
-        )
+        matrix = [focal, 0, 320, 0, focal, 240, 0, 0, 1]
+        (tmp_path / name).write_text(f"%YAML:1.0\n---\ncamera_matrix: {matrix}\n")
     with pytest.raises(CalibrationError) as caught:
         read(tmp_path, is_stereo=False)
-    assert [(problem.code, problem.where) for problem in caught.value.problems] == [
-        ("duplicate", "b.yml: camera_matrix")
-    ]
+    [problem] = caught.value.problems
+    assert (problem.code, problem.where) == ("duplicate", "b.yml: camera_matrix")
 
 
 LAUGHS = "a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]\n"

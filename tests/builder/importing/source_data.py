@@ -84,10 +84,8 @@ def write_source(folder: Path, rows: list[Row], tiny_root: Path) -> Path:
             write(folder / f"{eye}/{name}.png", png(row[f"{eye}_rgb"]))
             write(folder / f"mask/{name}_{eye}.png", png(row[f"{eye}_mask"].astype(np.uint8) * 255))
             write(folder / f"ids/{name}_{eye}.png", png(row[f"{eye}_bars"]))
-        pose = row["left_cam_from_world"]
-        write(
-            folder / f"poses/{name}.txt", "\n".join(" ".join(map(repr, line)) for line in pose.tolist()).encode()
-        )
+        pose = "\n".join(" ".join(map(repr, line)) for line in row["left_cam_from_world"].tolist())
+        write(folder / f"poses/{name}.txt", pose.encode())
     lines = ["bar_id,role,diameter_m,x_m,y_m,z_m"]
     for bar in read_bars(tiny_root / "bars.parquet")["lattice"]:
         for x, y, z in bar.axis_m:
@@ -124,9 +122,8 @@ def opencv(values: np.ndarray, suffix: str) -> bytes:
 def exr(folder: Path, channels: Mapping[str, np.ndarray]) -> bytes:
     """Return an EXR file with these channels."""
     path = folder / "one.exr"
-    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, dict(channels)).write(
-        str(path)
-    )
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, dict(channels)).write(str(path))
     content = path.read_bytes()
     path.unlink()
     return content

@@ -161,14 +161,10 @@ def test_all_problems_are_reported_together(tmp_path: Path) -> None:
 
 
 def test_conflicts_are_reported_with_other_problems(tmp_path: Path) -> None:
-    content = (
-        MM
-        + "name = 'pile'\nmesh = 'a.stl'\nboard = 7\n"
-        + (BAR + "id = 5\nbend_diameter = 9\nrips = 1\n") * 2
-        + "[[bar]]\nid = 5\n"
-        + f"[[bar]]\nid = 0x{'f' * 6000}\n" * 2
-        + "[cameras]\nkind = 'dome'\nradii = [400, 50]\nelevations_deg = [5, 90]\nazimuths = 3600\nfoo = 1\n"
-    )
+    bars = (BAR + "id = 5\nbend_diameter = 9\nrips = 1\n") * 2 + "[[bar]]\nid = 5\n"
+    bars += f"[[bar]]\nid = 0x{'f' * 6000}\n" * 2
+    cameras = DOME + "radii = [400, 50]\nelevations_deg = [5, 90]\nazimuths = 3600\nfoo = 1\n"
+    content = f"{MM}name = 'pile'\nmesh = 'a.stl'\nboard = 7\n{bars}{cameras}"
     with pytest.raises(InputError) as raised:
         scene_config(write_scene(tmp_path, content))
     codes = [code for code in codes_and_places(raised.value) if not code.startswith(("missing", "unknown"))]
