@@ -31,6 +31,7 @@ from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
 from rebar_depth_bench.geometry.cameras import camera_centre, inverse_rigid, look_at, project, transform
 
+pytestmark = pytest.mark.slow
 Rows = dict[str, dict[str, Any]]
 CAMERA_NAMES = ("left", "right")
 

@@ -253,6 +253,7 @@ def scenes_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_plain_export_has_a_folder_for_each_scene(scenes_root: Path, tmp_path: Path) -> None:
     summary = export(scenes_root, tmp_path / "out")
     assert [(part.config, part.views) for part in summary] == [(name, VIEWS) for name in FOLDERS.values()]
@@ -305,6 +306,7 @@ def test_link_in_place_of_the_folder_of_a_scene_is_refused(scenes_root: Path, tm
     assert not list(outside.iterdir())
 
 
+@pytest.mark.slow
 def test_command_exports_a_split(scenes_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["export", str(scenes_root), "--out", str(tmp_path / "out"), "--split", "train", "--views", "1"]
     assert main(command) == 0

@@ -25,7 +25,7 @@ from rebar_depth_bench.geometry.cameras import inverse_rigid
 from tests.builder.importing import source_data as data
 from tests.builder.importing.source_data import FILES, NAMES, Row
 
-MINIMUM = ("left_depth",)
+pytestmark = pytest.mark.slow
 SIZE = "width = 160\nheight = 90\n"
 
 
@@ -102,7 +102,6 @@ def test_card_states_licence_and_origin_of_each_config(complete: Path, tiny_root
     assert "The rendered data: CC BY 4.0." in both
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", data.DEPTH_FORMATS)
 def test_depth_format_is_read(name: str, rows: list[Row], folder: Path, tmp_path: Path) -> None:
     tolerance_m = data.DEPTH_FORMATS[name][3]
@@ -113,7 +112,6 @@ def test_depth_format_is_read(name: str, rows: list[Row], folder: Path, tmp_path
         assert np.abs(read["left_depth"] - expected).max() <= tolerance_m
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("table", "write"),
     [
@@ -162,7 +160,6 @@ PARTS = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", PARTS)
 def test_absent_parts_are_null_and_every_command_works(
     name: str, folder: Path, rows: list[Row], tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -255,7 +252,6 @@ def test_streamed_rows_are_the_loaded_ones(one_camera: Path) -> None:
             assert (value is None) == (name in absent)
 
 
-@pytest.mark.slow
 def test_torch_batches_leave_absent_parts_out(one_camera: Path) -> None:
     batch = next(iter(rdb.torch_loader(rdb.load(one_camera, "mock-up"), batch_size=2, stereo=True)))
     assert set(batch) == {"rgb", "depth", "K", "poses", "view_id"}

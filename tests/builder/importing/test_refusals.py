@@ -124,6 +124,7 @@ def test_invalid_file_is_refused_and_named(
     assert any(view in message for view in NAMES) or "left_bars" in message
 
 
+@pytest.mark.slow
 def test_repaired_source_is_imported(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     layout, pose = data.write_layout(folder), folder / f"poses/{THIRD}.txt"
     pose.rename(tmp_path / "kept")

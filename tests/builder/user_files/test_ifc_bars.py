@@ -30,6 +30,7 @@ from tests.builder.user_files.ifc_writer import Ifc, Numbers, bars_in_process, e
 COLUMN = Path("examples/column.ifc")
 
 
+@pytest.mark.slow
 def test_example_column_equals_same_cage_in_toml(tmp_path: Path) -> None:
     script = runpy.run_path("examples/make_column_ifc.py")
     foot, head = script["FOOT"], script["HEAD"]
@@ -50,6 +51,7 @@ def test_example_column_equals_same_cage_in_toml(tmp_path: Path) -> None:
         np.testing.assert_allclose(ifc_part.mesh.vertices_m, toml_part.mesh.vertices_m, rtol=0, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_example_column_script_reproduces_file(tmp_path: Path) -> None:
     subprocess.run([sys.executable, "examples/make_column_ifc.py", tmp_path / "a.ifc"], check=True)
     assert (tmp_path / "a.ifc").read_bytes() == COLUMN.read_bytes()

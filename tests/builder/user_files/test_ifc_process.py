@@ -273,6 +273,7 @@ def test_missing_ifcopenshell_names_pip_extra(monkeypatch: pytest.MonkeyPatch) -
         scene_config(COLUMN)
 
 
+@pytest.mark.slow
 def test_this_process_does_not_import_ifcopenshell() -> None:
     code = """
 import sys

@@ -61,6 +61,7 @@ def test_centred_cage_is_the_same_wherever_the_file_has_it(
     assert -1e-9 <= vertices_m[:, 2].min() <= 0.001 + 1e-9
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(
     COORDINATE, COORDINATE, st.floats(-360, 360), st.sampled_from(["z", "y"]), st.sampled_from(["centre", "keep"])
@@ -85,6 +86,7 @@ def test_order_is_up_centre_rotation_translation() -> None:
     assert 2.0 <= foot[2] - 0.006 <= 2.002
 
 
+@pytest.mark.slow
 def test_sound_cage_at_the_origin_is_not_moved(tmp_path: Path) -> None:
     kept = scene_cage(write_scene(tmp_path, MM + BAR))
     np.testing.assert_array_equal(kept.world_from_source, np.diag([0.001, 0.001, 0.001, 1]))
@@ -144,6 +146,7 @@ def test_mesh_file_alone_keeps_its_coordinates(tmp_path: Path) -> None:
     np.testing.assert_array_equal(cage.world_from_source, np.diag([0.01, 0.01, 0.01, 1]))
 
 
+@pytest.mark.slow
 def test_gltf_is_refused_with_a_conversion_that_keeps_bars_and_height(tmp_path: Path) -> None:
     """Follow the message: nodes with transforms become objects of an OBJ file, whose vertical axis is y."""
     rod = trimesh.creation.cylinder(0.006, segment=[[0.0, 0.0, 0.0], [0.0, 0.5, 0.0]], sections=24)
