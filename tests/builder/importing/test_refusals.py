@@ -184,8 +184,8 @@ def test_file_without_bars_is_refused(content: bytes, folder: Path) -> None:
         plan_import(data.write_layout(folder), "mock-up")
 
 
-DAMAGED_FORMATS = ("npy float64", "npz", "EXR", "EXR of several channels", "TIFF compressed", "TIFF millimetres")
-DAMAGED_FORMATS += ("PNG millimetres", "PFM", "disparity")
+DAMAGED_FORMATS = ["npy float64", "npz", "EXR", "EXR of several channels", "TIFF compressed", "TIFF millimetres"]
+DAMAGED_FORMATS += ["PNG millimetres", "PFM", "disparity"]
 
 
 @pytest.mark.slow

@@ -373,7 +373,9 @@ def test_site_coordinates_that_are_kept_are_refused(model: Path) -> None:
 @pytest.mark.slow
 def test_ifc_file_alone_is_centred_and_surveyed(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def fewer_views(*arguments: Any) -> SurveySpec:
-        return replace(default(*arguments), distances_m=(2.0,), views_per_distance=4)
+        survey = default(*arguments)
+        assert isinstance(survey, SurveySpec)
+        return replace(survey, distances_m=(2.0,), views_per_distance=4)
 
     default: Any = scene_file._default_trajectory
     monkeypatch.setattr(scene_file, "_default_trajectory", fewer_views)
