@@ -86,6 +86,7 @@ UNREAD = "which cannot be read"
         (POINT, "#24=IFCCARTESIANPOINT((-46.,-46.,0,1));", "#24 .*Coordinates is .*, expected <list .1:3. of"),
         (POINT, "#24=IFCCARTESIANPOINT((-46.,-46.));", "#26 .*refers to points of 2 and 3 coordinates"),
         (POINT, "#24=IFCCARTESIANPOINT($);", "#24 .*Coordinates is null"),
+        (POINT, "#24=IFCCARTESIANPOINT((-46.,-46.,0.1)));", "#24 is .* expected . readable"),
         ("#133=IFCCARTESIANPOINT((0.,0.,100.))", "#133=IFCCARTESIANPOINT((0.,0.))", "#134 .*points of 2 coord"),
         ("#26,4.,$,$,$)", "#26,4 5.,$,$,$)", f"#27 .*Radius is 45., {UNREAD}"),
         ("#26,4.,$,$,$)", "#26,'4',$,$,$)", "#27 .*Radius is 4, expected"),

@@ -244,11 +244,9 @@ INVALID_STL: dict[str, tuple[bytes | str, str]] = {
     "letter in a number": (STL.replace("vertex 0", "vertex O", 1), "triangle [0-9]+: got O.*, expected a number"),
     "inf in a second solid": (STL + "\n" + STL.replace("vertex 0.0", "vertex inf", 1), "finite"),
 }
-NO_FACES = "element face 0\nproperty list uchar int a\nend_header\n0 0 0\n"
 LINES = "element face 1\nproperty list uchar int a\nend_header\n0 0 0\n2 0 0\n"
-HUGE_LIST = (HEADER + "element face 1\nproperty list uint64 double vertex_indices\nend_header\n").replace(
-    "ascii", "binary_little_endian"
-)
+HUGE_LIST = HEADER.replace("ascii", "binary_little_endian")
+HUGE_LIST += "element face 1\nproperty list uint64 double vertex_indices\nend_header\n"
 TWICE = "header: an element or property occurs twice"
 INVALID_PLY: dict[str, tuple[bytes | str, str]] = {
     "empty": ("", "no PLY header"),
@@ -267,7 +265,7 @@ INVALID_PLY: dict[str, tuple[bytes | str, str]] = {
     "long binary": (BINARY_PLY + b"a", "1 bytes after the last row"),
     "huge binary": (BINARY_PLY.replace(b"vertex 130", b"vertex 99999999999999"), "within the 99999999999999 rows"),
     "huge list": (HUGE_LIST.encode() + bytes(12) + b"\xff" * 8, "the file ends within the 1 rows of face"),
-    "no faces": (HEADER + NO_FACES, "no triangle"),
+    "no faces": (HEADER + "element face 0\nproperty list uchar int a\nend_header\n0 0 0\n", "no triangle"),
     "lines": (HEADER + LINES, "face 0: 2 corners, expected three or more"),
     "element twice": (HEADER + "element vertex 1\nend_header\n", TWICE),
     "property twice": (HEADER + "property int x\nend_header\n", TWICE),
@@ -349,8 +347,14 @@ def test_files_of_other_programs_are_read(tmp_path: Path, suffix: str, content: 
     assert len(assembly.parts[0].mesh.faces) == len(RODS[0].faces)
 
 
-def test_polygons_of_different_sizes_are_read(tmp_path: Path) -> None:
-    mesh = load_content(tmp_path, "a.ply", big_endian_ply()).parts[0].mesh
+OBJ_POLYGONS = "".join(f"v {x} {y} .1\n" for x, y in ((1, 0), (2, 0), (2, 1), (1, 2), (0, 2), (0, 1), (1, 0)))
+OBJ_POLYGONS += "f 1 2 3\nf 1 3 4 5\nf 1 5 6 7 2\n"
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".obj"])
+def test_polygons_of_different_sizes_are_read(tmp_path: Path, suffix: str) -> None:
+    content = big_endian_ply() if suffix == ".ply" else OBJ_POLYGONS
+    mesh = load_content(tmp_path, "a" + suffix, content).parts[0].mesh
     assert (len(mesh.faces), len(mesh.vertices_m)) == (6, 6)  # The first and last vertex are the same point.
     assert np.unique(mesh.vertices_m[:, 2]).tolist() == [0.1]
 
