@@ -1,4 +1,4 @@
-"""Example capture: blank stereo pairs with a ZED calibration, and depth maps of its views."""
+"""Example captures: blank stereo pairs with a ZED calibration and depth maps of its views, and random images."""
 
 from __future__ import annotations
 
@@ -46,6 +46,16 @@ def write_capture(root: Path, views: int = VIEWS, size: tuple[int, int] = (WIDTH
             Image.new("L", size).save(root / eye / f"{view:06d}.png")
     (root / "calibration.conf").write_text(ZED_CALIBRATION)
     return root
+
+
+def write_images(root: Path, *folders: str, size: tuple[int, int] = (640, 480)) -> None:
+    """Write two images, each of one random colour, into each folder."""
+    rng = np.random.default_rng(3)
+    for folder in folders:
+        (root / folder).mkdir(parents=True, exist_ok=True)
+        for name in ("0001", "0002"):
+            colour = tuple(rng.integers(0, 255, 3).tolist())
+            Image.new("RGB", size, colour).save(root / folder / f"{name}.png")
 
 
 def exact_depth(view: int) -> Depth:

@@ -1,8 +1,12 @@
-"""``cameras.toml``: cameras, board and poses of a capture, and what is refused."""
+"""Cameras of a capture from ``cameras.toml`` and from calibrations of other programs, and what is refused."""
 
 from __future__ import annotations
 
+import re
+import time
+from dataclasses import astuple, replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -12,10 +16,13 @@ import numpy as np
 from PIL import Image
 
 from rebar_depth_bench.base.errors import CalibrationError, InputError
+from rebar_depth_bench.captures.calibration import MonoCalibration, StereoCalibration
+from rebar_depth_bench.captures.camera_files import read_cameras
 from rebar_depth_bench.captures.views import ImageViews, open_capture
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import inverse_rigid
 from tests.bench.captures import calibration_files as files
+from tests.bench.captures.example_capture import write_images
 
 POSES = """
 [[pose]]
@@ -26,16 +33,6 @@ image = "0002"
 cam_from_world = [[1, 0, 0, 0.3], [0, 1, 0, 0], [0, 0, 1, 0.5], [0, 0, 0, 1]]
 """
 BOARD = '[board]\nmarkers = 12\nmarker_side_m = 0.03\ndictionary = "DICT_4X4_50"\n'
-
-
-def write_images(root: Path, *folders: str, size: tuple[int, int] = (files.WIDTH, files.HEIGHT)) -> None:
-    """Write two images of random colour into each folder."""
-    rng = np.random.default_rng(3)
-    for folder in folders:
-        (root / folder).mkdir(parents=True, exist_ok=True)
-        for name in ("0001", "0002"):
-            pixels = rng.integers(0, 255, (size[1], size[0], 3), np.uint8)
-            Image.fromarray(pixels).save(root / folder / f"{name}.png")
 
 
 def stereo(root: Path, text: str) -> ImageViews:
@@ -115,11 +112,6 @@ def test_invalid_table_is_refused_with_its_line(
     assert line is None or problem.found.startswith(f"line {line}: ")
 
 
-def test_missing_file_of_the_calibration_is_named(tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match=r"absent\.yml"):
-        stereo(tmp_path / "site", 'calibration = "absent.yml"\n')
-
-
 def test_intrinsics_of_images_of_another_shape_are_refused(tmp_path: Path) -> None:
     root = tmp_path / "site"
     write_images(root, "left", "right", size=(640, 360))
@@ -129,11 +121,187 @@ def test_intrinsics_of_images_of_another_shape_are_refused(tmp_path: Path) -> No
     assert [problem.code for problem in caught.value.problems] == ["conflict"]
 
 
-def test_several_calibrations_without_cameras_toml_are_refused(tmp_path: Path) -> None:
-    root = tmp_path / "site"
-    write_images(root, "left", "right")
-    files.write_opencv(root, "yml")
-    files.write_opencv(root, "xml")
-    files.write_opencv(root, "json")
+def test_absent_and_several_calibrations_are_refused_and_named(tmp_path: Path) -> None:
+    with pytest.raises(CalibrationError, match=r"absent\.yml"):
+        stereo(tmp_path, 'calibration = "absent.yml"\n')
+    (tmp_path / "cameras.toml").unlink()
+    for suffix in ("yml", "xml", "json"):
+        files.write_opencv(tmp_path, suffix)
     with pytest.raises(InputError, match=r"stereo\.json, stereo\.xml, stereo\.yml"):
-        open_capture(root)
+        open_capture(tmp_path)
+
+
+def read(folder: Path, width: int = files.WIDTH, height: int = files.HEIGHT, *, is_stereo: bool = True) -> Any:
+    return read_cameras(folder, ["a"], width, height, is_stereo=is_stereo).calibration
+
+
+def flat(calibration: StereoCalibration) -> np.ndarray:
+    lenses = [astuple(lens) for lens in (calibration.left, calibration.right)]
+    numbers = [number for lens in lenses for item in lens for number in np.ravel(item)]
+    size = (calibration.width, calibration.height)
+    return np.array([*size, *numbers, *calibration.rotation_rad, *calibration.translation_m])
+
+
+@pytest.mark.parametrize("suffix", ["yml", "yaml", "xml", "json"])
+def test_opencv_file_is_read(suffix: str, tmp_path: Path) -> None:
+    files.write_opencv(tmp_path, suffix)
+    assert np.allclose(flat(read(tmp_path)), flat(files.expected_calibration(tmp_path)), rtol=0, atol=1e-12)
+
+
+def test_two_files_of_the_opencv_sample_are_read_with_the_unit_of_their_squares(tmp_path: Path) -> None:
+    files.write_opencv_sample(tmp_path)
+    (tmp_path / "cameras.toml").write_text('calibration = ["intrinsics.yml", "extrinsics.yml"]\nunit = "cm"\n')
+    expected = files.expected_calibration(tmp_path)
+    x_m, y_m, z_m = expected.translation_m
+    in_squares = (x_m * 0.4, y_m * 0.4, z_m * 0.4)  # 1 cm is 0.4 squares.
+    assert np.allclose(flat(read(tmp_path)), flat(replace(expected, translation_m=in_squares)), rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("as_message", [False, True])
+def test_ros_camera_info_is_read(as_message: bool, tmp_path: Path) -> None:
+    for name, text in files.ros_texts(as_message=as_message).items():
+        (tmp_path / name).write_text(text)
+    assert np.allclose(flat(read(tmp_path)), flat(files.expected_calibration(tmp_path)), rtol=0, atol=1e-7)
+
+
+def test_kalibr_chain_is_read(tmp_path: Path) -> None:
+    (tmp_path / "camchain-left-right.yaml").write_text(files.kalibr_text())
+    expected = files.expected_calibration(tmp_path)
+    left, right = (
+        replace(lens, distortion=(*lens.distortion[:4], 0.0)) for lens in (expected.left, expected.right)
+    )
+    expected = replace(expected, left=left, right=right)
+    assert np.allclose(flat(read(tmp_path)), flat(expected), rtol=0, atol=1e-12)
+
+
+def test_calibration_is_scaled_to_the_images(tmp_path: Path) -> None:
+    files.write_opencv(tmp_path, "yml")
+    with pytest.raises(CalibrationError, match=r"fx is 0\.\d+ times fy|cx"):  # The file does not state its size.
+        read(tmp_path, 320, 240)
+    (tmp_path / "stereo.yml").unlink()
+    (tmp_path / "chain.yaml").write_text(files.kalibr_text())
+    half = files.expected_calibration(tmp_path, 320, 240)
+    assert np.allclose(read(tmp_path, 320, 240).left.fx, half.left.fx)
+    assert read(tmp_path, 320, 240).width == 320
+
+
+def test_one_ros_camera_serves_images_of_one_camera_only(tmp_path: Path) -> None:
+    (tmp_path / "ost.yaml").write_text(files.ros_texts(as_message=False)["left.yaml"])
+    calibration = read(tmp_path, is_stereo=False)
+    assert isinstance(calibration, MonoCalibration)
+    assert calibration.left == files.expected_calibration(tmp_path).left
+    with pytest.raises(CalibrationError) as caught:
+        read(tmp_path)
+    assert [problem.code for problem in caught.value.problems] == ["missing"]
+
+
+def write_all(folder: Path, name: str) -> None:
+    """Write the files of the program whose file is called ``name``."""
+    if name == "stereo.yml":
+        files.write_opencv(folder, "yml")
+        return
+    texts = {name: files.kalibr_text()} if name == "chain.yaml" else files.ros_texts(as_message=False)
+    for file, text in texts.items():
+        (folder / file).write_text(text)
+
+
+def edit(path: Path, old: str, new: str) -> None:
+    text = path.read_text()
+    assert re.search(old, text)
+    path.write_text(re.sub(old, new, text, count=1))
+
+
+FIVE_TERMS = r"cols: 5\n  data: \[(.*?)\]"
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "key", "line"),
+    [
+        ("chain.yaml", "distortion_model: radtan", "distortion_model: equidistant", "cam0", 1),
+        ("chain.yaml", "camera_model: pinhole", "camera_model: omni", "cam0.camera_model", 3),
+        ("chain.yaml", r"intrinsics: \[.*\]", "intrinsics: [1, 2]", "cam0.intrinsics", 6),
+        ("chain.yaml", r"341\.53", "900", "cam0.intrinsics", 6),
+        ("chain.yaml", r"resolution: \[640, 480\]", "resolution: [640.5, 480]", "cam0.intrinsics", 6),
+        ("right.yaml", r"data: \[(\S+), 0\.0+, (\S+), -", r"data: [\1, 0.0, \2, ", "projection_matrix", 17),
+        ("right.yaml", FIVE_TERMS, r"cols: 8\n  data: [\1, 0.1, 0.2, 0.3]", "", None),
+        ("right.yaml", "camera_matrix", "camera", "camera_matrix", None),
+        ("stereo.yml", r"534\.07\d*", ".Nan", "M1", 3),
+        ("stereo.yml", "T: ", "X: ", "T", None),
+        ("stereo.yml", "M1: ", "fisheye_model: 1\nM1: ", "fisheye_model", 3),
+    ],
+)
+def test_invalid_file_is_refused_with_its_line(
+    name: str, old: str, new: str, key: str, line: int | None, tmp_path: Path
+) -> None:
+    write_all(tmp_path, name)
+    edit(tmp_path / name, old, new)
+    with pytest.raises(CalibrationError) as caught:
+        read(tmp_path)
+    problem = caught.value.problems[0]
+    assert problem.where == (f"{name}: {key}" if key else name)
+    stated = re.match(r"line (\d+): ", problem.found)
+    assert (stated and int(stated[1])) == line
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new"),
+    [
+        # rational_polynomial, fitted as plumb_bob
+        ("right.yaml", FIVE_TERMS, r"cols: 8\n  data: [\1, 0.0, 0.0, 0.0]"),
+        ("stereo.yml", "rows: 5", "rows: 1"),
+        ("stereo.yml", "M1: ", "fisheye_model: 0\nM1: "),
+        ("chain.yaml", "cam_overlaps", "timeshift_cam_imu: 0.1\n  cam_overlaps"),
+    ],
+)
+def test_what_says_nothing_about_the_cameras_is_ignored(name: str, old: str, new: str, tmp_path: Path) -> None:
+    write_all(tmp_path, name)
+    before = flat(read(tmp_path))
+    edit(tmp_path / name, old, new)
+    assert np.array_equal(flat(read(tmp_path)), before)
+
+
+def test_two_files_with_different_values_of_a_key_are_refused(tmp_path: Path) -> None:
+    for name, focal in (("a.yml", 500), ("b.yml", 501)):
+        matrix = [focal, 0, 320, 0, focal, 240, 0, 0, 1]
+        (tmp_path / name).write_text(f"%YAML:1.0\n---\ncamera_matrix: {matrix}\n")
+    with pytest.raises(CalibrationError) as caught:
+        read(tmp_path, is_stereo=False)
+    [problem] = caught.value.problems
+    assert (problem.code, problem.where) == ("duplicate", "b.yml: camera_matrix")
+
+
+LAUGHS = "a: &a [x, x]\nb: &b [*a, *a]\nc: [*b, *b]\n"
+HOSTILE = {
+    "aliases.yaml": LAUGHS,
+    "python.yaml": "M1: !!python/object/apply:os.system ['true']\n",
+    "nested.yaml": "M1: " + "[" * 5000 + "]" * 5000,
+    "tabs.yaml": "M1:\t[1\n",
+    "list.yaml": "- 1\n- 2\n",
+    "empty.yaml": "",
+    "huge.yaml": f"M1: [{'9' * 5000}, 0, 1, 0, 1, 1, 0, 0, 1]\nD1: [0, 0, 0, 0]\n",
+    "anchor.xml": '<!DOCTYPE x [<!ENTITY a "b">]><opencv_storage><M1>&a;</M1></opencv_storage>',
+    "file.xml": '<!DOCTYPE x [<!ENTITY a SYSTEM "file:///etc/passwd">]><opencv_storage><M1>&a;</M1></opencv_storage>',
+    "open.xml": "<opencv_storage><M1>",
+    "comments.xml": "<opencv_storage>" + "<!--" * 250_000,
+    "other.xml": "<svg/>",
+    "huge.xml": "<opencv_storage>"
+    + "".join(f"<{name}>500 0 320 0 500 240 0 0 1</{name}>" for name in ("M1", "M2"))
+    + "<R>1e300 0 0 0 1 0 0 0 1</R><T>-0.1 0 0</T></opencv_storage>",
+    "nested.xml": "<opencv_storage>" + "<a>" * 100_000 + "</a>" * 100_000 + "</opencv_storage>",
+    "twice.json": '{"M1": 1, "M1": 2}',
+    "nan.json": '{"M1": NaN}',
+    "nested.json": "[" * 100_000,
+    "binary.yml": "\udcff\udcfe\0",
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_file_is_refused(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_bytes(HOSTILE[name].encode(errors="surrogateescape"))
+    start = time.process_time()
+    with pytest.raises(CalibrationError) as caught:
+        read(tmp_path, is_stereo=False)
+    assert time.process_time() - start < 10  # 1 s; a time that grows with the square of the size is minutes.
+    assert caught.value.problems
+    assert name in str(caught.value)
+    assert len(str(caught.value)) < 5000

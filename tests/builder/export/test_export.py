@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from PIL import Image
 from scipy.spatial.transform import Rotation
 
+from dataset_builder.cameras.rigs import rig_cameras, zed_rig
 from dataset_builder.export import export
 from dataset_builder.export.camera_formats import (
     cameras_txt,
@@ -28,16 +29,9 @@ from dataset_builder.export.exported_views import CameraView, depth_exr, depth_m
 from rebar_depth_bench import load
 from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
-from rebar_depth_bench.geometry.cameras import (
-    Camera,
-    camera_centre,
-    inverse_rigid,
-    look_at,
-    project,
-    rigid,
-    transform,
-)
+from rebar_depth_bench.geometry.cameras import camera_centre, inverse_rigid, look_at, project, transform
 
+pytestmark = pytest.mark.slow
 Rows = dict[str, dict[str, Any]]
 CAMERA_NAMES = ("left", "right")
 
@@ -66,21 +60,10 @@ def known_points_m(tiny_root: Path) -> np.ndarray:
 
 def zed_views() -> list[CameraView]:
     """Return two raw views of a real first-generation ZED: both lenses distorted, the right camera rotated."""
-    left_K = np.array([[701.88, 0, 641.285], [0, 701.70, 344.1835], [0, 0, 1]])
-    right_K = np.array([[700.965, 0, 633.515], [0, 701.11, 359.3135], [0, 0, 1]])
-    left = np.array([-0.175286, 0.0283094, 6.68e-5, -1.50e-4, 1e-10])
-    right = np.array([-0.172795, 0.0265223, 1.64e-4, 1.02e-5, 0.0])
-    right_from_left = rigid(
-        cv2.Rodrigues(np.array([-9.17e-4, 6.24e-3, 7.70e-4]))[0], np.array([-0.119978, 0.0, 0.0])
-    )
-    views = []
+    rig, views = zed_rig(grid="raw"), []
     for number, centre_m in enumerate(([0.3, -0.2, 0.25], [-0.1, 0.35, 0.2])):
-        pose = look_at(np.array(centre_m), np.array([0.0, 0.0, 0.05]))
-        cameras = {
-            "left": Camera(left_K, left, cam_from_world=pose, width=1280, height=720),
-            "right": Camera(right_K, right, cam_from_world=right_from_left @ pose, width=1280, height=720),
-        }
-        views.append(CameraView(f"lattice-zed-raw/{number:04d}", 0.119978, cameras))
+        cameras = rig_cameras(rig, look_at(np.array(centre_m), np.array([0.0, 0.0, 0.05])))
+        views.append(CameraView(f"lattice-zed-raw/{number:04d}", rig.baseline_m, cameras))
     return views
 
 
@@ -98,15 +81,19 @@ def test_colour_bars_and_masks_round_trip(exported: Path, rows: Rows, eye: str) 
             assert np.array_equal(np.asarray(mask), row[f"{eye}_mask"] * np.uint8(255))
 
 
+def exr_depth(path: Path) -> np.ndarray:
+    (channel,) = OpenEXR.File(str(path), separate_channels=True).channels().values()
+    return np.asarray(channel.pixels)
+
+
 @pytest.mark.parametrize("eye", CAMERA_NAMES)
 def test_exr_depth_is_bit_exact_in_openexr_and_opencv(
     exported: Path, rows: Rows, eye: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("OPENCV_IO_ENABLE_OPENEXR", "1")  # OpenCV reads it at its first EXR file.
     for number, row in rows.items():
-        path = str(exported / f"lattice/depth/{number}_{eye}.exr")
-        (channel,) = OpenEXR.File(path, separate_channels=True).channels().values()
-        for depth_m in (channel.pixels, cv2.imread(path, cv2.IMREAD_UNCHANGED)):
+        path = exported / f"lattice/depth/{number}_{eye}.exr"
+        for depth_m in (exr_depth(path), cv2.imread(str(path), cv2.IMREAD_UNCHANGED)):
             assert depth_m.dtype == np.float32
             assert depth_m.tobytes() == row[f"{eye}_depth"].tobytes()
 
@@ -114,8 +101,7 @@ def test_exr_depth_is_bit_exact_in_openexr_and_opencv(
 def test_exr_preserves_all_positive_floats(tmp_path: Path) -> None:
     bits = np.random.default_rng(0).integers(0, 0x7F800000, (45, 80), dtype=np.uint32)  # below infinity
     (tmp_path / "depth.exr").write_bytes(depth_exr(bits.view(np.float32)))
-    (channel,) = OpenEXR.File(str(tmp_path / "depth.exr"), separate_channels=True).channels().values()
-    assert np.array_equal(channel.pixels.view(np.uint32), bits)
+    assert np.array_equal(exr_depth(tmp_path / "depth.exr").view(np.uint32), bits)
 
 
 def test_depth_mm_is_rounded_without_overflow(exported: Path, rows: Rows, tmp_path: Path) -> None:
@@ -204,13 +190,8 @@ def test_colmap_extracts_features_only_inside_mask(exported: Path, tmp_path: Pat
     reader = pycolmap.ImageReaderOptions()
     reader.mask_path = exported / "lattice/masks"
     pycolmap.logging.minloglevel = pycolmap.logging.Level.ERROR.value
-    pycolmap.extract_features(
-        tmp_path / "features.db",
-        exported / "lattice/images",
-        image_names=[name],
-        reader_options=reader,
-        device=pycolmap.Device.cpu,
-    )
+    options = {"image_names": [name], "reader_options": reader, "device": pycolmap.Device.cpu}
+    pycolmap.extract_features(tmp_path / "features.db", exported / "lattice/images", **options)
     with pycolmap.Database.open(tmp_path / "features.db") as database:
         column, row = database.read_keypoints(1)[:, :2].astype(int).T
     with Image.open(exported / "lattice/masks" / name) as mask:
@@ -266,9 +247,8 @@ def test_nerfstudio_intrinsics_are_per_frame_if_different() -> None:
     views = zed_views()
     meta = json.loads(transforms_json(views))
     assert not {"fl_x", "k1", "w"} & set(meta)
-    for frame, (view, eye) in zip(
-        meta["frames"], [(view, eye) for view in views for eye in CAMERA_NAMES], strict=True
-    ):
+    images = [(view, eye) for view in views for eye in CAMERA_NAMES]
+    for frame, (view, eye) in zip(meta["frames"], images, strict=True):
         camera = view.cameras[eye]
         assert frame["file_path"] == f"images/{view.stem(eye)}.png"
         assert [frame[k] for k in ("k1", "k2", "p1", "p2", "k3")] == camera.distortion.tolist()

@@ -1,4 +1,4 @@
-"""Export folder: resumption, extension, locking and rejected targets."""
+"""Export folder: resumption, extension, locking, rejected targets, and folders of scenes with splits."""
 
 from __future__ import annotations
 
@@ -11,16 +11,21 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from PIL import Image
 
+import rebar_depth_bench as rdb
+from dataset_builder.cli.main import main
 from dataset_builder.export import export
+from dataset_builder.export.target import MARKER
 from rebar_depth_bench.base.errors import DatasetError, InputError
 from tests.damage import change_manifest
+from tests.synthetic_dataset import write_dataset, write_split_dataset
 
 SMALL_CONFIG = ("lattice-orbit",)
 """Config with two views, quick to export."""
 IMAGES_PER_VIEW = 10
-MARKER = "export.json"
 
 
 @pytest.fixture(scope="module")
@@ -52,9 +57,8 @@ def test_killed_export_resumes_to_same_bytes(tiny_root: Path, exported: Path, tm
     to = tmp_path / "export"
     process = run_export(tiny_root, to, "os.kill(os.getpid(), signal.SIGKILL)")
     assert process.returncode == -signal.SIGKILL, process.stderr
-    (to / "lattice-orbit/depth/.0075_left.exr.abcd_123.tmp").write_bytes(
-        b"half"
-    )  # as left by a kill while writing
+    # As left by a kill while writing.
+    (to / "lattice-orbit/depth/.0075_left.exr.abcd_123.tmp").write_bytes(b"half")
     (to / "lattice-orbit/bars/0025_right.png").unlink()
     (summary,) = export(tiny_root, to, SMALL_CONFIG)
     assert (summary.kept, summary.written) == (IMAGES_PER_VIEW - 1, IMAGES_PER_VIEW + 1)
@@ -97,15 +101,6 @@ def test_export_is_extended_by_views_and_configs(tiny_root: Path, exported: Path
     assert orbit_files == {name: data for name, data in content(exported).items() if name != MARKER}
 
 
-def write_edited_record(exported: Path, to: Path, change: Callable[[dict[str, Any]], object]) -> Path:
-    """Write the changed record of an export into the new folder ``to`` and return the folder."""
-    marker = json.loads((exported / MARKER).read_text())
-    change(marker)
-    to.mkdir()
-    (to / MARKER).write_text(json.dumps(marker))
-    return to
-
-
 def test_foreign_folder_is_rejected_and_unchanged(tiny_root: Path, tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work")
     with pytest.raises(InputError, match=r"not empty \(it contains thesis.tex\) and has no export.json"):
@@ -118,12 +113,6 @@ def test_foreign_folder_is_rejected_and_unchanged(tiny_root: Path, tmp_path: Pat
     assert not (tiny_root / "raw").exists()
 
 
-def test_folder_with_only_partial_record_counts_as_empty(tiny_root: Path, tmp_path: Path) -> None:
-    (tmp_path / ".export.json.abcd_123.tmp").write_bytes(b"{")  # as left by a kill at the start
-    export(tiny_root, tmp_path, SMALL_CONFIG, views=1)
-    assert not list(tmp_path.glob("*.tmp"))
-
-
 @pytest.mark.slow
 def test_export_imports_no_renderer() -> None:
     code = "import sys, dataset_builder.export; print(*sys.modules)"
@@ -132,23 +121,33 @@ def test_export_imports_no_renderer() -> None:
     assert not {"bpy", "embreex", "trimesh", "pycolmap", "torch"} & set(process.stdout.split())
 
 
-def test_export_of_other_dataset_is_rejected(tiny_root: Path, exported: Path, tmp_path: Path) -> None:
-    other_dataset = write_edited_record(
-        exported, tmp_path / "other", lambda marker: marker.update(dataset="sha256:00")
-    )
-    with pytest.raises(InputError, match=r"contains an export of dataset sha256:00, expected sha256:.* as in"):
-        export(tiny_root, other_dataset)
-    other_build = write_edited_record(
-        exported, tmp_path / "b", lambda marker: marker["configs"]["lattice-orbit"].update(key="0" * 64)
-    )
-    with pytest.raises(InputError, match="contains config lattice-orbit of another build"):
-        export(tiny_root, other_build)
-    other_format = write_edited_record(
-        exported, tmp_path / "future", lambda marker: marker.update(format="rebar-depth-export-9")
-    )
-    with pytest.raises(InputError, match=r"format: got 'rebar-depth-export-9', expected .rebar-depth-export-1."):
-        export(tiny_root, other_format)
-    assert all(set(content(to)) == {MARKER} for to in (other_dataset, other_build, other_format))
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (
+            lambda record: record.update(dataset="sha256:00"),
+            r"contains an export of dataset sha256:00, expected sha256:.* as in",
+        ),
+        (
+            lambda record: record["configs"]["lattice-orbit"].update(key="0" * 64),
+            "contains config lattice-orbit of another build",
+        ),
+        (
+            lambda record: record.update(format="rebar-depth-export-9"),
+            r"format: got 'rebar-depth-export-9', expected .rebar-depth-export-1.",
+        ),
+    ],
+    ids=["dataset", "build", "format"],
+)
+def test_folder_with_another_export_is_refused(
+    change: Callable[[dict[str, Any]], object], words: str, tiny_root: Path, exported: Path, tmp_path: Path
+) -> None:
+    record = json.loads((exported / MARKER).read_text())
+    change(record)
+    (tmp_path / MARKER).write_text(json.dumps(record))
+    with pytest.raises(InputError, match=words):
+        export(tiny_root, tmp_path)
+    assert set(content(tmp_path)) == {MARKER}
 
 
 @pytest.mark.parametrize(
@@ -163,9 +162,8 @@ def test_damaged_record_is_rejected(tiny_root: Path, exported: Path, tmp_path: P
 
 
 def test_fewer_views_than_exported_is_rejected(tiny_root: Path, exported: Path) -> None:
-    with pytest.raises(
-        InputError, match="contains 2 views of lattice-orbit, 1 of which are not among the 1 requested"
-    ):
+    words = "contains 2 views of lattice-orbit, 1 of which are not among the 1 requested"
+    with pytest.raises(InputError, match=words):
         export(tiny_root, exported, SMALL_CONFIG, views=1)
 
 
@@ -181,12 +179,18 @@ def test_invalid_configs_roots_and_view_counts_are_rejected(tiny_root: Path, tmp
     assert not (tmp_path / "x").exists()
 
 
+def test_folder_with_only_partial_record_counts_as_empty(tiny_root: Path, tmp_path: Path) -> None:
+    (tmp_path / ".export.json.abcd_123.tmp").write_bytes(b"{")  # As left by a kill at the start.
+    export(tiny_root, tmp_path, SMALL_CONFIG, views=1)
+    assert not list(tmp_path.glob("*.tmp"))
+
+
 def test_concurrent_export_to_same_folder_is_rejected(tiny_root: Path, tmp_path: Path) -> None:
     def second(*_: object) -> None:
         with pytest.raises(InputError, match="another export is using this folder"):
-            export(tiny_root, tmp_path / "x", SMALL_CONFIG)
+            export(tiny_root, tmp_path, SMALL_CONFIG)
 
-    assert export(tiny_root, tmp_path / "x", SMALL_CONFIG, views=1, progress=second)[0].written
+    assert export(tiny_root, tmp_path, SMALL_CONFIG, views=1, progress=second)[0].written
 
 
 def test_data_contradicting_manifest_is_not_exported(tiny_root: Path, tmp_path: Path) -> None:
@@ -235,3 +239,78 @@ def test_only_temporary_files_of_exports_are_deleted(tiny_root: Path, exported: 
     export(tiny_root, to, SMALL_CONFIG)
     assert set(content(to)) == {*content(exported), *others}
     assert (tmp_path / "linked/.a.png.abcd_123.tmp").exists()
+
+
+SCENES = {"a": "train", "b-1": "train", "c": "validation", "d": "test"}
+FOLDERS = {scene: f"cages/{split}-{scene}" for scene, split in SCENES.items()}
+VIEWS = 3
+
+
+@pytest.fixture(scope="module")
+def scenes_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("scenes") / "dataset"
+    write_split_dataset(folder, SCENES, VIEWS, families={"a": "wall"})
+    return folder
+
+
+@pytest.mark.slow
+def test_plain_export_has_a_folder_for_each_scene(scenes_root: Path, tmp_path: Path) -> None:
+    summary = export(scenes_root, tmp_path / "out")
+    assert [(part.config, part.views) for part in summary] == [(name, VIEWS) for name in FOLDERS.values()]
+    for scene, name in FOLDERS.items():
+        folder = tmp_path / "out" / name
+        cameras = json.loads((folder / "cameras.json").read_text())
+        assert (cameras["config"], cameras["scene"], cameras["split"]) == ("cages", scene, SCENES[scene])
+        assert cameras["parameters"].get("family") == ("wall" if scene == "a" else None)
+        assert len(cameras["cameras"]) == 2 * VIEWS
+        assert {path for path in content(folder) if path.startswith("images/")} == {
+            f"images/{index:04d}_{eye}.png" for index in range(VIEWS) for eye in ("left", "right")
+        }
+        bar_points = (folder / "sparse/0/points3D.txt").read_text().splitlines()
+        assert len(bar_points) > 100, "on the bar of the scene"
+    for row in rdb.load(scenes_root, "cages", split="train", columns=["view_id", "left_mask", "scene"]):
+        path = tmp_path / "out" / FOLDERS[row["scene"]] / f"masks/{row['view_id'][-4:]}_left.png"
+        assert np.array_equal(np.asarray(Image.open(path)) > 0, row["left_mask"])
+
+
+@pytest.mark.slow
+def test_export_is_resumed_and_extended_by_splits(scenes_root: Path, tmp_path: Path) -> None:
+    first = export(scenes_root, tmp_path / "out", split="validation", views=2)
+    assert [(part.config, part.views) for part in first] == [(FOLDERS["c"], 2)]
+    second = export(scenes_root, tmp_path / "out")
+    assert {part.config: part.kept > 0 for part in second} == {
+        name: name == FOLDERS["c"] for name in FOLDERS.values()
+    }
+    assert {path.split("/", 1)[0] for path in content(tmp_path / "out")} == {"cages", MARKER}
+    export(scenes_root, tmp_path / "whole")
+    assert content(tmp_path / "out").keys() == content(tmp_path / "whole").keys()
+
+
+def test_splits_that_do_not_exist_are_refused(scenes_root: Path, tmp_path: Path) -> None:
+    write_dataset(tmp_path / "one", ["lattice"], 1)
+    with pytest.raises(DatasetError, match="no config has the split train"):
+        export(tmp_path / "one", tmp_path / "out", split="train")
+    with pytest.raises(DatasetError, match="lattice has no split train"):
+        export(tmp_path / "one", tmp_path / "out", ["lattice"], split="train")
+    assert not (tmp_path / "out").exists()
+
+
+def test_link_in_place_of_the_folder_of_a_scene_is_refused(scenes_root: Path, tmp_path: Path) -> None:
+    outside = tmp_path / "outside"
+    outside.mkdir()
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "cages").symlink_to(outside)
+    (tmp_path / "out" / MARKER).write_text("{}")
+    with pytest.raises(InputError, match="is a symbolic link"):
+        export(scenes_root, tmp_path / "out")
+    assert not list(outside.iterdir())
+
+
+@pytest.mark.slow
+def test_command_exports_a_split(scenes_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    command = ["export", str(scenes_root), "--out", str(tmp_path / "out"), "--split", "train", "--views", "1"]
+    assert main(command) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.partition(":")[0] for line in lines[:2]] == [FOLDERS["a"], FOLDERS["b-1"]]
+    with pytest.raises(SystemExit):
+        main([*command[:-3], "hidden"])

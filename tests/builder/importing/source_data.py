@@ -84,10 +84,8 @@ def write_source(folder: Path, rows: list[Row], tiny_root: Path) -> Path:
             write(folder / f"{eye}/{name}.png", png(row[f"{eye}_rgb"]))
             write(folder / f"mask/{name}_{eye}.png", png(row[f"{eye}_mask"].astype(np.uint8) * 255))
             write(folder / f"ids/{name}_{eye}.png", png(row[f"{eye}_bars"]))
-        pose = row["left_cam_from_world"]
-        write(
-            folder / f"poses/{name}.txt", "\n".join(" ".join(map(repr, line)) for line in pose.tolist()).encode()
-        )
+        pose = "\n".join(" ".join(map(repr, line)) for line in row["left_cam_from_world"].tolist())
+        write(folder / f"poses/{name}.txt", pose.encode())
     lines = ["bar_id,role,diameter_m,x_m,y_m,z_m"]
     for bar in read_bars(tiny_root / "bars.parquet")["lattice"]:
         for x, y, z in bar.axis_m:
@@ -124,9 +122,8 @@ def opencv(values: np.ndarray, suffix: str) -> bytes:
 def exr(folder: Path, channels: Mapping[str, np.ndarray]) -> bytes:
     """Return an EXR file with these channels."""
     path = folder / "one.exr"
-    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, dict(channels)).write(
-        str(path)
-    )
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    OpenEXR.File(header, dict(channels)).write(str(path))
     content = path.read_bytes()
     path.unlink()
     return content
@@ -188,6 +185,15 @@ DEPTH_FORMATS: Mapping[str, tuple[str, str, Encode, float]] = {
     "invalid values": (".npy", "invalid = [-1, 1000]", lambda _, row: npy(_marked(row)), 0.0),
 }
 """Suffix, keys of ``[depth]``, encoder of the left depth, and largest error in metres, by name."""
+
+
+def write_depth_format(folder: Path, rows: list[Row], name: str) -> Path:
+    """Write the left depth of the views in one of ``DEPTH_FORMATS``; return the layout file that names it."""
+    suffix, keys, encode, _ = DEPTH_FORMATS[name]
+    for view, row in zip(NAMES, rows, strict=True):
+        write(folder / f"other/{view}{suffix}", encode(folder, row))
+    files, tables = {"left_depth": f"other/{{view}}{suffix}"}, f"{STEREO}\n[depth]\n{keys}\n"
+    return write_layout(folder, ("left_depth", "left_rgb", "right_rgb"), tables=tables, files=files)
 
 
 def _npz(depth: np.ndarray) -> bytes:

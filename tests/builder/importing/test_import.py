@@ -25,25 +25,8 @@ from rebar_depth_bench.geometry.cameras import inverse_rigid
 from tests.builder.importing import source_data as data
 from tests.builder.importing.source_data import FILES, NAMES, Row
 
-MINIMUM = ("left_depth",)
+pytestmark = pytest.mark.slow
 SIZE = "width = 160\nheight = 90\n"
-
-
-@pytest.fixture(scope="module")
-def rows(tiny_root: Path) -> list[Row]:
-    return data.sample_rows(tiny_root)
-
-
-@pytest.fixture(scope="module")
-def source(rows: list[Row], tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a folder with all files; tests write their own layouts and outputs elsewhere."""
-    return data.write_source(tmp_path_factory.mktemp("source"), rows, tiny_root)
-
-
-@pytest.fixture
-def folder(source: Path, tmp_path: Path) -> Path:
-    """Return a copy of the source that a test may change."""
-    return Path(shutil.copytree(source, tmp_path / "source"))
 
 
 def imported(layout: Path, out: Path, name: str = "mock-up") -> DatasetConfig:
@@ -70,14 +53,11 @@ def test_rows_are_those_that_the_files_were_made_from(complete: Path, rows: list
         assert row["baseline_m"] == pytest.approx(expected["baseline_m"], abs=1e-12)
 
 
-def test_imported_folder_passes_verification_and_audit(complete: Path) -> None:
+def test_imported_folder_is_verified_audited_and_loaded_by_plain_datasets(complete: Path, rows: list[Row]) -> None:
     assert bench_main(["verify", str(complete)]) == 0
     report = audit(complete)
     assert not report.failures
     assert [check.name for check in report.checks if check.skipped] == ["mock-up: depth against a second source"]
-
-
-def test_plain_datasets_load_the_folder(complete: Path, rows: list[Row]) -> None:
     loaded = datasets.load_dataset(str(complete), "mock-up", split="test")
     assert len(loaded) == len(rows)
     assert np.array_equal(np.asarray(loaded[0]["left_rgb"]), rows[0]["left_rgb"])
@@ -122,16 +102,10 @@ def test_card_states_licence_and_origin_of_each_config(complete: Path, tiny_root
     assert "The rendered data: CC BY 4.0." in both
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", data.DEPTH_FORMATS)
 def test_depth_format_is_read(name: str, rows: list[Row], folder: Path, tmp_path: Path) -> None:
-    suffix, keys, encode, tolerance_m = data.DEPTH_FORMATS[name]
-    for view, row in zip(NAMES, rows, strict=True):
-        data.write(folder / f"other/{view}{suffix}", encode(tmp_path, row))
-    columns = ("left_depth", "left_rgb", "right_rgb")
-    files = {"left_depth": f"other/{{view}}{suffix}"}
-    layout = data.write_layout(folder, columns, tables=f"{data.STEREO}\n[depth]\n{keys}\n", files=files)
-    imported(layout, tmp_path / "out")
+    tolerance_m = data.DEPTH_FORMATS[name][3]
+    imported(data.write_depth_format(folder, rows, name), tmp_path / "out")
     for read, row in zip(rdb.load(tmp_path / "out", "mock-up"), rows, strict=True):
         expected = row["left_depth"]
         assert np.array_equal(read["left_depth"] > 0, expected > 0)
@@ -186,13 +160,11 @@ PARTS = {
 }
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("name", PARTS)
 def test_absent_parts_are_null_and_every_command_works(
-    name: str, source: Path, rows: list[Row], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    name: str, folder: Path, rows: list[Row], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     columns, tables = PARTS[name]
-    folder = Path(shutil.copytree(source, tmp_path / "source"))
     layout = data.write_layout(folder, columns, tables=tables)
     if "left_rgb" not in columns:
         layout.write_text(SIZE + layout.read_text())
@@ -204,9 +176,8 @@ def test_absent_parts_are_null_and_every_command_works(
     assert absent.isdisjoint(columns)
     if "left_bars" in columns:
         assert np.array_equal(row["left_mask"], rows[0]["left_mask"])
-    scored = rows[0]["left_depth"] > 0 if "left_mask" in absent else None
-    if scored is not None:
-        assert config.views[0].scored_px == np.count_nonzero(scored)
+    if "left_mask" in absent:
+        assert config.views[0].scored_px == np.count_nonzero(rows[0]["left_depth"] > 0)
         assert config.views[0].steel_px is None
     assert not audit(out).failures
     assert bench_main(["verify", str(out)]) == 0
@@ -269,3 +240,19 @@ def test_dry_run_writes_nothing(source: Path, tmp_path: Path, capsys: pytest.Cap
     assert "3 views of 160 x 90" in printed
     assert "right_rgb" in printed
     assert not out.exists()
+
+
+def test_streamed_rows_are_the_loaded_ones(one_camera: Path) -> None:
+    loaded, streamed = rdb.load(one_camera, "mock-up"), rdb.load(one_camera, "mock-up", streaming=True)
+    absent = open_folder(one_camera).config("mock-up").absent_columns
+    for row, other in zip(loaded, streamed, strict=True):
+        assert row.keys() == other.keys()
+        for name, value in row.items():
+            assert np.array_equal(value, other[name]), name
+            assert (value is None) == (name in absent)
+
+
+def test_torch_batches_leave_absent_parts_out(one_camera: Path) -> None:
+    batch = next(iter(rdb.torch_loader(rdb.load(one_camera, "mock-up"), batch_size=2, stereo=True)))
+    assert set(batch) == {"rgb", "depth", "K", "poses", "view_id"}
+    assert tuple(batch["depth"].shape) == (2, 1, 90, 160)

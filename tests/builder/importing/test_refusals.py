@@ -1,36 +1,31 @@
-"""``rebar-build import`` of invalid layouts, and of damaged or hostile files: refused, and nothing is written."""
+"""Refusals of ``rebar-build import``, and of imported folders that contradict themselves."""
 
 from __future__ import annotations
 
+import json
 import pickle
 import random
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+import rebar_depth_bench as rdb
 from dataset_builder.cli.main import main
 from dataset_builder.importing.config_import import plan_import, run_import
 from dataset_builder.pipeline.retained import Finished
-from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.errors import DatasetError, InputError
 from rebar_depth_bench.data.manifest import open_folder
 from tests.bench.damage import damaged
 from tests.builder.importing import source_data as data
 from tests.builder.importing.source_data import NAMES, Row
+from tests.damage import change_rows
 
-CASES = 150
-
-
-@pytest.fixture(scope="module")
-def rows(tiny_root: Path) -> list[Row]:
-    return data.sample_rows(tiny_root)
-
-
-@pytest.fixture
-def folder(rows: list[Row], tiny_root: Path, tmp_path: Path) -> Path:
-    return data.write_source(tmp_path / "source", rows, tiny_root)
+Entry = dict[str, Any]
+CASES = 100
 
 
 def refused(layout: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> str:
@@ -97,77 +92,46 @@ def test_name_that_is_no_config_is_refused(name: str, folder: Path) -> None:
         plan_import(data.write_layout(folder), name)
 
 
-def missing_image(folder: Path) -> None:
-    (folder / f"right/{NAMES[1]}.png").unlink()
+FIRST, SECOND, THIRD = NAMES
+INVALID_FILES: dict[str, tuple[str, bytes | str | None]] = {
+    "missing image": (f"right/{SECOND}.png", None),
+    "image of another size": (f"right/{SECOND}.png", data.png(np.zeros((45, 80, 3), np.uint8))),
+    "empty image": (f"left/{FIRST}.png", b""),
+    "depth of another size": (f"depth/{THIRD}_left.npy", data.npy(np.ones((45, 80), np.float32))),
+    "pickle": (f"depth/{THIRD}_left.npy", pickle.dumps(np.ones((90, 160)))),
+    "array of objects": (f"depth/{THIRD}_left.npy", data.npy(np.full((90, 160), None))),
+    "device": (f"depth/{FIRST}_left.npy", "/dev/zero"),
+    "mask in colour": (f"mask/{FIRST}_left.png", data.png(np.zeros((90, 160, 3), np.uint8))),
+    "ids beside the steel": (f"mask/{FIRST}_left.png", data.png(np.zeros((90, 160), np.uint8))),
+    "sheared pose": (f"poses/{FIRST}.txt", b"1 0.1 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n"),
+    "mirrored pose": (f"poses/{FIRST}.txt", b"1 0 0 0\n0 -1 0 0\n0 0 1 0\n0 0 0 1\n"),
+    "short pose": (f"poses/{FIRST}.txt", b"1 2 3\n"),
+}
+"""File and its content: bytes, the target of a link, or None for no file, by what is invalid."""
 
 
-def other_size(folder: Path) -> None:
-    data.write(folder / f"right/{NAMES[1]}.png", data.png(np.zeros((45, 80, 3), np.uint8)))
-
-
-def other_depth_size(folder: Path) -> None:
-    data.write(folder / f"depth/{NAMES[2]}_left.npy", data.npy(np.ones((45, 80), np.float32)))
-
-
-def pickled(folder: Path) -> None:
-    data.write(folder / f"depth/{NAMES[2]}_left.npy", pickle.dumps(np.ones((90, 160))))
-
-
-def objects(folder: Path) -> None:
-    data.write(folder / f"depth/{NAMES[2]}_left.npy", data.npy(np.full((90, 160), None)))
-
-
-def colour_mask(folder: Path) -> None:
-    data.write(folder / f"mask/{NAMES[0]}_left.png", data.png(np.zeros((90, 160, 3), np.uint8)))
-
-
-def ids_beside_steel(folder: Path) -> None:
-    data.write(folder / f"mask/{NAMES[0]}_left.png", data.png(np.zeros((90, 160), np.uint8)))
-
-
-def sheared_pose(folder: Path) -> None:
-    (folder / f"poses/{NAMES[0]}.txt").write_text("1 0.1 0 0\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
-
-
-def mirrored_pose(folder: Path) -> None:
-    (folder / f"poses/{NAMES[0]}.txt").write_text("1 0 0 0\n0 -1 0 0\n0 0 1 0\n0 0 0 1\n")
-
-
-def short_pose(folder: Path) -> None:
-    (folder / f"poses/{NAMES[0]}.txt").write_text("1 2 3\n")
-
-
-def empty_image(folder: Path) -> None:
-    (folder / f"left/{NAMES[0]}.png").write_bytes(b"")
-
-
-def device(folder: Path) -> None:
-    (folder / f"depth/{NAMES[0]}_left.npy").unlink()
-    (folder / f"depth/{NAMES[0]}_left.npy").symlink_to("/dev/zero")
-
-
-@pytest.mark.parametrize(
-    "damage",
-    [
-        *(missing_image, other_size, other_depth_size, pickled, objects, colour_mask, ids_beside_steel),
-        *(sheared_pose, mirrored_pose, short_pose, empty_image, device),
-    ],
-)
+@pytest.mark.parametrize(("name", "content"), INVALID_FILES.values(), ids=INVALID_FILES)
 def test_invalid_file_is_refused_and_named(
-    damage: Callable[[Path], None],
-    folder: Path,
-    rows: list[Row],
-    tiny_root: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    name: str, content: bytes | str | None, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     layout = data.write_layout(folder)
-    damage(folder)
+    (folder / name).unlink()
+    if isinstance(content, bytes):
+        (folder / name).write_bytes(content)
+    elif content is not None:
+        (folder / name).symlink_to(content)
     message = refused(layout, tmp_path / "out", capsys)
-    assert any(name in message for name in NAMES) or "left_bars" in message
-    shutil.rmtree(folder)
-    data.write_layout(data.write_source(folder, rows, tiny_root))
-    run_import(plan_import(layout, "mock-up"), tmp_path / "out")  # What is repaired is imported.
+    assert any(view in message for view in NAMES) or "left_bars" in message
+
+
+@pytest.mark.slow
+def test_repaired_source_is_imported(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    layout, pose = data.write_layout(folder), folder / f"poses/{THIRD}.txt"
+    pose.rename(tmp_path / "kept")
+    refused(layout, tmp_path / "out", capsys)
+    (tmp_path / "kept").rename(pose)
+    run_import(plan_import(layout, "mock-up"), tmp_path / "out")
+    assert open_folder(tmp_path / "out").config("mock-up").views
 
 
 @pytest.mark.parametrize(
@@ -220,20 +184,19 @@ def test_file_without_bars_is_refused(content: bytes, folder: Path) -> None:
         plan_import(data.write_layout(folder), "mock-up")
 
 
+DAMAGED_FORMATS = ["npy float64", "npz", "EXR", "EXR of several channels", "TIFF compressed", "TIFF millimetres"]
+DAMAGED_FORMATS += ["PNG millimetres", "PFM", "disparity"]
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["layout.toml", "bars.csv", *(f"{kind}" for kind in data.DEPTH_FORMATS)])
+@pytest.mark.parametrize("name", ["layout.toml", "bars.csv", *DAMAGED_FORMATS])
 def test_damaged_file_is_refused_or_read(name: str, rows: list[Row], folder: Path, tmp_path: Path) -> None:
     """Damage one of the files many times; whatever is read has finite depth."""
-    if name in data.DEPTH_FORMATS:
-        suffix, keys, encode, _ = data.DEPTH_FORMATS[name]
-        for view, row in zip(NAMES, rows, strict=True):
-            data.write(folder / f"other/{view}{suffix}", encode(tmp_path, row))
-        files, tables = {"left_depth": f"other/{{view}}{suffix}"}, f"{data.STEREO}\n[depth]\n{keys}\n"
-        layout = data.write_layout(folder, ("left_depth", "left_rgb", "right_rgb"), tables=tables, files=files)
-        path = folder / f"other/{NAMES[0]}{suffix}"
+    if name in DAMAGED_FORMATS:
+        layout = data.write_depth_format(folder, rows, name)
+        [path] = folder.glob(f"other/{FIRST}.*")
     else:
-        layout = data.write_layout(folder)
-        path = folder / name
+        layout, path = data.write_layout(folder), folder / name
     sound, rng, outcomes = path.read_bytes(), random.Random(name), []
     for _ in range(CASES):
         path.write_bytes(damaged(sound, rng))
@@ -266,3 +229,66 @@ def test_rendered_config_is_not_replaced(
     monkeypatch.setattr(Finished, "configs", rendered)
     with pytest.raises(InputError, match="config mock-up was rendered"):
         run_import(plan_import(data.write_layout(folder), "mock-up"), tmp_path / "out")
+
+
+@pytest.fixture
+def root(one_camera: Path, tmp_path: Path) -> Path:
+    """Return a copy of an imported folder without most columns, which a test may change."""
+    return Path(shutil.copytree(one_camera, tmp_path / "copy"))
+
+
+CONTRADICTIONS: Entry = {
+    "left_mask": {"bytes": data.png(np.ones((90, 160), np.uint8)), "path": None},
+    "right_K": np.eye(3).tolist(),
+    "baseline_m": 0.1,
+    "left_depth": None,
+    "left_rgb": None,
+    "left_K": np.full((3, 3), np.nan).tolist(),
+}
+"""Values of columns that are absent in the manifest, and none of columns that are present."""
+
+
+@pytest.mark.parametrize(("column", "value"), CONTRADICTIONS.items(), ids=CONTRADICTIONS)
+def test_row_that_contradicts_the_manifest_is_refused(column: str, value: object, root: Path) -> None:
+    for path in root.glob("mock-up/*.parquet"):
+        change_rows(path, lambda rows: [row.update({column: value}) for row in rows])
+    with pytest.raises(DatasetError, match=r"mock-up/0000: \w+ is damaged"):
+        list(rdb.load(root, "mock-up"))
+
+
+def set_imported(key: str, value: object) -> Callable[[Entry], None]:
+    return lambda entry: entry["imported"].update({key: value})
+
+
+def set_view(key: str, value: object) -> Callable[[Entry], None]:
+    return lambda entry: entry["views"][0].update({key: value})
+
+
+ALL_BUT_BARS = ["left_mask", "right_mask", "right_bars", "right_depth", "right_rgb", "right_K"]
+
+
+@pytest.mark.parametrize(
+    ("change", "where"),
+    [
+        (lambda entry: entry.pop("imported"), "scenes"),
+        (set_imported("truth_sigma_m", 0), "imported.truth_sigma_m"),
+        (set_imported("truth_sigma_m", None), "imported.truth_sigma_m"),
+        (set_imported("absent_columns", ["left_depth"]), "imported.absent_columns"),
+        (set_imported("absent_columns", ["left_K"]), "imported.absent_columns"),
+        (set_imported("absent_columns", ALL_BUT_BARS), "imported.absent_columns"),
+        (set_imported("absent_columns", []), "views"),
+        (set_view("steel_px", 5), "views"),
+        (set_view("right", "0" * 64), "views"),
+        (set_view("left", None), "views 1: left"),
+    ],
+)
+def test_manifest_that_contradicts_itself_is_refused(
+    change: Callable[[Entry], Any], where: str, root: Path
+) -> None:
+    path = root / "manifest.json"
+    manifest = json.loads(path.read_bytes())
+    change(manifest["configs"]["mock-up"])
+    path.write_text(json.dumps(manifest))
+    with pytest.raises(DatasetError) as caught:
+        open_folder(root)
+    assert f"configs.mock-up.{where}" in [problem.where for problem in caught.value.problems]

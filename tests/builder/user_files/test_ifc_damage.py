@@ -2,24 +2,31 @@
 
 from __future__ import annotations
 
-import random
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from rebar_depth_bench.base.errors import MeshError
+from rebar_depth_bench.data.bars import Bar
 from tests.builder.scene.cages import assembly_of
-from tests.builder.user_files.ifc_damage import damaged_bytes, damaged_token, differs_in_values_only
 from tests.builder.user_files.ifc_writer import Ifc, bars_in_process, extruded_square
 
 COLUMN = Path("examples/column.ifc")
 
 
-def assert_rejected(content: str | bytes, words: str) -> None:
+def assert_rejected(content: str, words: str) -> None:
     with pytest.raises(MeshError, match=f"^a.ifc: .*{words}"):
-        bars_in_process(content.encode() if isinstance(content, str) else content)
+        bars_in_process(content.encode())
+
+
+def bars_of(content: str) -> list[Bar]:
+    return [cage_bar.bar for cage_bar in bars_in_process(content.encode())]
+
+
+@pytest.fixture(scope="module")
+def sound() -> list[Bar]:
+    return bars_of(COLUMN.read_text())
 
 
 def column_with(old: str, new: str) -> str:
@@ -79,6 +86,7 @@ UNREAD = "which cannot be read"
         (POINT, "#24=IFCCARTESIANPOINT((-46.,-46.,0,1));", "#24 .*Coordinates is .*, expected <list .1:3. of"),
         (POINT, "#24=IFCCARTESIANPOINT((-46.,-46.));", "#26 .*refers to points of 2 and 3 coordinates"),
         (POINT, "#24=IFCCARTESIANPOINT($);", "#24 .*Coordinates is null"),
+        (POINT, "#24=IFCCARTESIANPOINT((-46.,-46.,0.1)));", "#24 is .* expected . readable"),
         ("#133=IFCCARTESIANPOINT((0.,0.,100.))", "#133=IFCCARTESIANPOINT((0.,0.))", "#134 .*points of 2 coord"),
         ("#26,4.,$,$,$)", "#26,4 5.,$,$,$)", f"#27 .*Radius is 45., {UNREAD}"),
         ("#26,4.,$,$,$)", "#26,'4',$,$,$)", "#27 .*Radius is 4, expected"),
@@ -109,45 +117,35 @@ def test_attribute_that_is_not_read_as_written_is_refused(old: str, new: str, wo
         "/* #900=IFCREINFORCINGBAR(); */\r\n #901 =\n ifcWall ( 'x',$,$,$,$,$,$,$,$ ) ;",
     ],
 )
-def test_damage_and_unknown_classes_beside_the_bars_are_accepted(instances: str) -> None:
-    sound = [cage_bar.bar for cage_bar in bars_in_process(COLUMN.read_bytes())]
-    content = column_with("DATA;", f"DATA;\n{instances}")
-    assert [cage_bar.bar for cage_bar in bars_in_process(content.encode())] == sound
+def test_damage_and_unknown_classes_beside_the_bars_are_accepted(instances: str, sound: list[Bar]) -> None:
+    assert bars_of(column_with("DATA;", f"DATA;\n{instances}")) == sound
 
 
-def test_other_spellings_of_the_same_values_are_accepted() -> None:
-    sound = [cage_bar.bar for cage_bar in bars_in_process(COLUMN.read_bytes())]
+def test_other_spellings_of_the_same_values_are_accepted(sound: list[Bar]) -> None:
     text = column_with(POINT, "#24 = IfcCartesianPoint ( ( -4.60E+001 , /* y */ -46,\n +0.10 ) ) ;")
     text = text.replace("(0.,0.,0.)", "(-.0,0,0.E0)").replace("#26,4.,", "#26,+.4e1,")
     text = text.replace("'Upright 2'", r"'\X2\00FC\X0\'")
-    assert [cage_bar.bar for cage_bar in bars_in_process(text.encode())] == sound
+    assert bars_of(text) == sound
 
 
 def test_last_attribute_of_another_version_of_ifc_is_accepted() -> None:
-    for schema, end, other in [
-        ("IFC4", "(500.,100.,0.)))", "(500.,100.,0.)),$)"),
-        ("IFC4X3_ADD2", "(500.,100.,0.)),$)", "(500.,100.,0.)))"),
-    ]:
+    short, long = "(500.,100.,0.)))", "(500.,100.,0.)),$)"
+    for schema, end, other in (("IFC4", short, long), ("IFC4X3_ADD2", long, short)):
         ifc = Ifc(schema)
         points = ifc.new("IfcCartesianPointList3D", [(0.0, 100.0, 0.0), (500.0, 100.0, 0.0)])
         ifc.bar(ifc.disc(ifc.new("IfcIndexedPolyCurve", points)))
         text = ifc.file.to_string()
         assert end in text
-        [cage_bar] = bars_in_process(text.replace(end, other).encode())
-        assert cage_bar.bar.axis_m == ((0.0, 0.1, 0.0), (0.5, 0.1, 0.0))
+        [bar] = bars_of(text.replace(end, other))
+        assert bar.axis_m == ((0.0, 0.1, 0.0), (0.5, 0.1, 0.0))
 
 
-def test_null_in_place_of_attributes_that_ifc2x3_requires_is_accepted() -> None:
+def test_nulls_that_ifc2x3_forbids_and_two_dimensional_points_are_accepted() -> None:
     ifc = Ifc("IFC2X3")
-    ifc.bar(ifc.disc(ifc.polyline((0, 0, 0), (500, 0, 0))), Name="Foot")
+    ifc.bar(ifc.disc(ifc.polyline((0, 0), (500, 100))), Name="Foot")
     [cage_bar] = ifc.bars()
     assert cage_bar.bar.role == "Foot"
-
-
-def test_polyline_of_two_dimensional_points_is_accepted() -> None:
-    ifc = Ifc()
-    ifc.bar(ifc.disc(ifc.polyline((0, 0), (500, 100))))
-    np.testing.assert_allclose(ifc.axis_m(), [(0, 0, 0), (0.5, 0.1, 0)], atol=1e-12)
+    np.testing.assert_allclose(cage_bar.bar.axis_m, [(0, 0, 0), (0.5, 0.1, 0)], atol=1e-12)
 
 
 def test_lost_type_relation_is_refused() -> None:
@@ -157,9 +155,8 @@ def test_lost_type_relation_is_refused() -> None:
     ifc.rooted("IfcRelDefinesByType", RelatedObjects=[bar], RelatingType=kind)
     assert ifc.bars()[0].bar.role == "shear"
     text = ifc.file.to_string()
-    assert_rejected(
-        text.replace(f"(#{bar.id()})", f"(c{bar.id()})"), "expected 6 readable attributes of IfcRelDefinesByType"
-    )
+    unread = text.replace(f"(#{bar.id()})", f"(c{bar.id()})")
+    assert_rejected(unread, "expected 6 readable attributes of IfcRelDefinesByType")
     assert_rejected(text.replace(".SHEAR.", ".SHEAX."), "PredefinedType is .SHEAX., which cannot be read")
 
 
@@ -182,10 +179,8 @@ def test_damaged_instances_of_tessellated_objects_are_refused() -> None:
 @pytest.mark.slow
 def test_exponential_maps_and_placement_cycles_are_refused() -> None:
     ifc = Ifc()
-    origin, identity = (
-        ifc.axes((0, 0, 0)),
-        ifc.new("IfcCartesianTransformationOperator3D", LocalOrigin=ifc.point((0, 0, 0))),
-    )
+    origin = ifc.axes((0, 0, 0))
+    identity = ifc.new("IfcCartesianTransformationOperator3D", LocalOrigin=ifc.point((0, 0, 0)))
     item = ifc.mapped(identity, origin, ifc.disc(ifc.polyline((0, 0, 0), (500, 0, 0))))
     for _ in range(40):  # Each map contains the previous one twice: 2^40 bars.
         item = ifc.mapped(identity, origin, item, item)
@@ -208,24 +203,3 @@ def test_exponential_maps_and_placement_cycles_are_refused() -> None:
 def test_implausible_dimensions_are_rejected(old: str, new: str, words: str) -> None:
     with pytest.raises(MeshError, match=words):
         assembly_of(bars_in_process(column_with(old, new).encode()), "a.ifc")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("damage", [damaged_bytes, damaged_token])
-def test_random_damage_is_refused_or_harmless(damage: Callable[[str, random.Random], str]) -> None:
-    """Check that each damaged file is refused, or has the same bars or other values, but no lost or moved bar."""
-    text = COLUMN.read_text()
-    sound = [cage_bar.bar for cage_bar in bars_in_process(text.encode())]
-    rng = random.Random(7)
-    outcomes = {"refused": 0, "same": 0, "values": 0}
-    for _ in range(60):
-        damaged = damage(text, rng)
-        try:
-            bars = [cage_bar.bar for cage_bar in bars_in_process(damaged.encode())]
-        except MeshError:
-            outcomes["refused"] += 1
-            continue
-        outcomes["same" if bars == sound else "values"] += 1
-        assert bars == sound or differs_in_values_only(text, damaged)
-    assert outcomes["refused"] > 30
-    assert outcomes["same"] > 0

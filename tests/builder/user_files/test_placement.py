@@ -1,20 +1,27 @@
-"""Placement of cages: up, centring, rotation and translation, for bars, IFC models and meshes."""
+"""Selection and placement of cages: up, centring, rotation and translation, for bars, IFC models and meshes."""
 
 from __future__ import annotations
 
 import re
 import subprocess
 import sys
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from jaxtyping import Float64
+from numpy import ndarray
 
+from dataset_builder.catalog import scene_file
 from dataset_builder.catalog.scene_file import scene_cage, scene_config
 from dataset_builder.scene.assemblies.cage import Cage, CageBar
+from dataset_builder.specs.config_specs import SurveySpec
 from dataset_builder.specs.file_specs import Origin, PlacementSpec, Up
 from dataset_builder.user_files.cage_file import cage_assembly
 from dataset_builder.user_files.cage_placement import placed
@@ -22,8 +29,11 @@ from dataset_builder.user_files.make_assembly import make_assembly
 from rebar_depth_bench.base.errors import InputError, MeshError
 from rebar_depth_bench.data.bars import Bar
 from tests.builder.catalog.scene_files import BAR, MM, write_scene
+from tests.builder.user_files.ifc_writer import Ifc, Numbers, extruded_circle
+from tests.builder.user_files.tube_shapes import RODS, concatenated, obj_bytes
 
 COORDINATE = st.floats(-1e6, 1e6)
+NAMES = ("Rod 0", "Rod 1")
 
 
 def cage_of(*axes_m: tuple[tuple[float, float, float], ...], diameter_m: float = 0.012) -> Cage:
@@ -35,6 +45,8 @@ def rods_at(x: float, y: float, z: float) -> Cage:
     return cage_of(((x, y, z), (x + 1.5, y, z + 0.1)), ((x, y + 0.3, z), (x, y + 0.3, z + 0.7)))
 
 
+@pytest.mark.slow
+@settings(max_examples=25)
 @given(COORDINATE, COORDINATE, COORDINATE, st.sampled_from(["z", "y"]), st.floats(-360, 360))
 def test_centred_cage_is_the_same_wherever_the_file_has_it(
     x: float, y: float, z: float, up: Up, rotate_deg: float
@@ -49,6 +61,8 @@ def test_centred_cage_is_the_same_wherever_the_file_has_it(
     assert -1e-9 <= vertices_m[:, 2].min() <= 0.001 + 1e-9
 
 
+@pytest.mark.slow
+@settings(max_examples=40)
 @given(
     COORDINATE, COORDINATE, st.floats(-360, 360), st.sampled_from(["z", "y"]), st.sampled_from(["centre", "keep"])
 )
@@ -72,6 +86,7 @@ def test_order_is_up_centre_rotation_translation() -> None:
     assert 2.0 <= foot[2] - 0.006 <= 2.002
 
 
+@pytest.mark.slow
 def test_sound_cage_at_the_origin_is_not_moved(tmp_path: Path) -> None:
     kept = scene_cage(write_scene(tmp_path, MM + BAR))
     np.testing.assert_array_equal(kept.world_from_source, np.diag([0.001, 0.001, 0.001, 1]))
@@ -86,22 +101,13 @@ def test_bars_of_a_scene_file_can_be_placed(tmp_path: Path) -> None:
     np.testing.assert_allclose(bar.bar.axis_m, [(0, -0.09, 0.006), (0, 0.11, 0.006)], atol=0.0012)
 
 
-def write_rods(path: Path, offset_m: float, dtype: str = "<f8") -> Path:
+def write_rods(path: Path, offset_m: float) -> Path:
     """Write two rods as OBJ (64-bit numbers), or as STL (32-bit)."""
-    rods = [
-        trimesh.creation.cylinder(0.006, segment=[[0.0, y, 0.1], [0.5, y, 0.1]], sections=24) for y in (0.0, 0.1)
-    ]
+    rods = [rod.copy() for rod in RODS[:2]]
     for rod in rods:
         rod.vertices += offset_m
-    if path.suffix == ".stl":
-        trimesh.util.concatenate(rods).export(path)
-        return path
-    lines, first = [], 1
-    for number, rod in enumerate(rods):
-        lines += [f"o Rod {number}", *(f"v {x!r} {y!r} {z!r}" for x, y, z in rod.vertices.tolist())]
-        lines += ["f " + " ".join(str(corner + first) for corner in face) for face in rod.faces.tolist()]
-        first += len(rod.vertices)
-    path.write_text("\n".join(lines) + "\n")
+    is_obj = path.suffix == ".obj"
+    path.write_bytes(obj_bytes(rods, NAMES) if is_obj else trimesh.exchange.stl.export_stl(concatenated(rods)))
     return path
 
 
@@ -140,6 +146,7 @@ def test_mesh_file_alone_keeps_its_coordinates(tmp_path: Path) -> None:
     np.testing.assert_array_equal(cage.world_from_source, np.diag([0.01, 0.01, 0.01, 1]))
 
 
+@pytest.mark.slow
 def test_gltf_is_refused_with_a_conversion_that_keeps_bars_and_height(tmp_path: Path) -> None:
     """Follow the message: nodes with transforms become objects of an OBJ file, whose vertical axis is y."""
     rod = trimesh.creation.cylinder(0.006, segment=[[0.0, 0.0, 0.0], [0.0, 0.5, 0.0]], sections=24)
@@ -170,3 +177,215 @@ def test_placement_is_part_of_the_spec(tmp_path: Path) -> None:
         specs.append(config.scene.assembly)
         assert make_assembly(config.scene.assembly).world_from_source is not None
     assert len(set(specs)) == 3
+
+
+SITE_MM = (4_512_345_678.0, 5_432_109_876.0, 215_000.0)
+SITE_TURN_DEG = 31.0
+WALL_BARS, COLUMN_BARS, FITTING_BARS = 60, 4 + 10, 2
+BOTH = WALL_BARS + COLUMN_BARS
+
+
+def site_from_world_m() -> Float64[ndarray, "4 4"]:
+    """Return the transform from the project's frame to that of the site, both in metres."""
+    cosine, sine = np.cos(np.deg2rad(SITE_TURN_DEG)), np.sin(np.deg2rad(SITE_TURN_DEG))
+    matrix = np.eye(4)
+    matrix[:2, :2] = [[cosine, sine], [-sine, cosine]]
+    matrix[:3, 3] = -matrix[:3, :3] @ (np.array(SITE_MM) / 1000)
+    return matrix
+
+
+def write_site_model(path: Path, schema: str = "IFC4") -> Path:
+    """Write a wall, a column and a fitting of life size at site coordinates, with a slab.
+
+    The bars of the wall are parts of it (as Tekla writes them), those of the column are contained in a storey (as
+    Revit does), and the fitting is a proxy whose body is extruded circles (as precast suppliers write them).
+    """
+    ifc = Ifc(schema)
+    turn = np.deg2rad(SITE_TURN_DEG)
+    placement = ifc.at(SITE_MM, (0, 0, 1), (np.cos(turn), np.sin(turn), 0))
+    ground, upper = (
+        ifc.rooted("IfcBuildingStorey", Name=name, ObjectPlacement=ifc.at((0, 0, z), parent=placement))
+        for name, z in (("EG Erdgeschoss", 0), ("Level 1", 4000))
+    )
+    wall = _product(ifc, "IfcWall", "W-1", ground, [_block(ifc, (6000, 250, 3000))])
+    ifc.rooted("IfcRelAggregates", RelatingObject=wall, RelatedObjects=_bars_of_wall(ifc, ground))
+    column = _bars_of_column(ifc, upper)
+    circles = [extruded_circle(ifc, 8.0, x) for x in (3000.0, 3100.0)]
+    fitting = _product(ifc, "IfcBuildingElementProxy", "Rebar fitting", ground, circles)
+    slab = _product(ifc, "IfcSlab", "Slab", ground, [_block(ifc, (8000, 8000, 200))])
+    for storey, parts in ((ground, [wall, slab, fitting]), (upper, column)):
+        ifc.rooted("IfcRelContainedInSpatialStructure", RelatedElements=parts, RelatingStructure=storey)
+    ifc.file.write(str(path))
+    return path
+
+
+def _bars_of_wall(ifc: Ifc, storey: Any) -> list[Any]:
+    bars = []
+    for y, inward in ((41, 12), (209, -12)):
+        uprights = [((x, y, 40), (x, y, 2960)) for x in range(75, 6000, 300)]
+        flat = [((40, y - inward, z), (5960, y - inward, z)) for z in range(75, 3000, 300)]
+        bars += [_bar(ifc, ends, 12, storey) for ends in (*uprights, *flat)]
+    return bars
+
+
+def _bars_of_column(ifc: Ifc, storey: Any) -> list[Any]:
+    """Return the bars of a column of 0.4 x 0.4 x 3 m whose middle is at x = 7 m, y = 1 m."""
+    signs = ((-1, -1), (1, -1), (1, 1), (-1, 1))
+    corners = [(7000 + 150 * x, 1000 + 150 * y) for x, y in signs]
+    uprights = [_bar(ifc, ((x, y, 20), (x, y, 3020)), 25, storey) for x, y in corners]
+    around = [[(7000 + 168 * x, 1000 + 168 * y, z) for x, y in signs] for z in range(70, 3000, 300)]
+    stirrups = [_bar(ifc, points, 10, storey) for points in around]
+    shapes = [bar.Representation.Representations[0] for bar in stirrups]
+    ifc.new("IfcPresentationLayerAssignment", "Stirrups", None, shapes, None)
+    return [*uprights, *stirrups]
+
+
+def _bar(ifc: Ifc, points: Sequence[Numbers], diameter_mm: float, storey: Any) -> Any:
+    disc = ifc.disc(ifc.polyline(*points), diameter_mm / 2)
+    bar = _product(ifc, "IfcReinforcingBar", f"Bar {diameter_mm:g}", storey, [disc], shape="AdvancedSweptSolid")
+    bar.NominalDiameter = float(diameter_mm)
+    return bar
+
+
+def _product(ifc: Ifc, kind: str, name: str, storey: Any, items: list[Any], shape: str = "SweptSolid") -> Any:
+    body = ifc.new("IfcProductDefinitionShape", Representations=[ifc.shape(*items, kind=shape)])
+    place = ifc.at((0, 0, 0), parent=storey.ObjectPlacement)
+    return ifc.rooted(kind, Name=name, ObjectPlacement=place, Representation=body)
+
+
+def _block(ifc: Ifc, sides: Numbers) -> Any:
+    middle = ifc.new("IfcAxis2Placement2D", ifc.point((sides[0] / 2, sides[1] / 2)))
+    profile = ifc.new("IfcRectangleProfileDef", "AREA", None, middle, float(sides[0]), float(sides[1]))
+    return ifc.new("IfcExtrudedAreaSolid", profile, ifc.axes((0, 0, 0)), ifc.direction((0, 0, 1)), float(sides[2]))
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_site_model(tmp_path_factory.mktemp("site") / "Site Model.ifc")
+
+
+def cage_with(model: Path, content: str) -> Cage:
+    return scene_cage(write_scene(model.parent, f'ifc = "{model.name}"\n{content}', "scene.toml"))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("tables", "bars"),
+    [
+        ("", BOTH),
+        ("[[select]]\nhost = 'W-*'", WALL_BARS),
+        ("[[select]]\nstorey = 'EG*'", WALL_BARS),
+        ("[[select]]\nstorey = 'Level ?'", COLUMN_BARS),
+        ("[[select]]\nlayer = 'Stirrups'", COLUMN_BARS - 4),
+        ("[[select]]\nname = 'Bar 25'\n[[select]]\nname = 'Bar 10'", COLUMN_BARS),
+        ("[[select]]\nname = 'Bar 1?'\nstorey = 'Level 1'", COLUMN_BARS - 4),
+        ("[[select]]\nclass = 'ifcbuildingelement*'", FITTING_BARS),
+        ("[[select]]\nclass = 'IfcReinforcing*'", BOTH),
+        ("[[select]]\nname = '*'", BOTH),
+        ("[[select]]\nname = 'bar 25'\n[[select]]\nname = '*5'", 4),
+    ],
+)
+def test_selected_bars(model: Path, tables: str, bars: int) -> None:
+    cage = cage_with(model, tables)
+    assert len(cage.bars) == bars
+    assert [bar.bar.bar_id for bar in cage.bars] == list(range(1, bars + 1))
+    assert not cage.problems
+    left_out = {record.source for record in cage.left_out}
+    assert not left_out & {bar.source for bar in cage.bars}
+    taken = {bar.source for bar in cage.bars}
+    assert len(left_out) == BOTH + 3 - len(taken)  # Also the wall, the slab and the fitting.
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("schema", ["IFC4", "IFC2X3", "IFC4X3"])
+def test_bars_have_hosts_and_storeys(tmp_path: Path, schema: str) -> None:
+    bars = scene_cage(write_site_model(tmp_path / "a.ifc", schema)).bars
+    assert {(bar.host, bar.storey) for bar in bars[:WALL_BARS]} == {("W-1", "EG Erdgeschoss")}
+    assert {(bar.host, bar.storey) for bar in bars[WALL_BARS:]} == {(None, "Level 1")}
+
+
+@pytest.mark.slow
+def test_box_takes_the_objects_that_are_wholly_inside(model: Path) -> None:
+    from_site = np.linalg.inv(site_from_world_m())
+    around_m = (from_site @ np.array([7.0, 1.0, 5.5, 1.0]))[:3]
+    for half_m, expected in ((2.0, COLUMN_BARS), (0.5, 3), (0.05, 0)):
+        lower, upper = ((around_m + sign * half_m) * 1000 for sign in (-1, 1))
+        table = f"[[select]]\nbox = [{upper.tolist()}, {lower.tolist()}]"
+        if expected:
+            assert len(cage_with(model, table).bars) == expected
+        else:
+            with pytest.raises(MeshError, match="no object is inside the box"):
+                cage_with(model, table)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("tables", ["[[select]]\nname = 'x'", "[[select]]\nclass = 'IfcDoor'"])
+def test_selection_of_nothing_names_what_there_is(model: Path, tables: str) -> None:
+    with pytest.raises(MeshError, match=rf"no object is selected.*{BOTH} IfcReinforcingBar.*1 IfcWall"):
+        cage_with(model, tables)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("keys", "rotate_deg", "move_m"),
+    [
+        ("", 0.0, (0, 0, 0)),
+        (f"rotate_deg = {-SITE_TURN_DEG}\ntranslate = [1, -2.5, 0.25]\n", -SITE_TURN_DEG, (1, -2.5, 0.25)),
+    ],
+)
+def test_cage_is_centred_by_whole_millimetres(
+    model: Path, keys: str, rotate_deg: float, move_m: tuple[float, float, float]
+) -> None:
+    """Compare the axes with those of the site's frame, which the placement does not know."""
+    keys += "[[select]]\nhost = 'W-1'\n"
+    cage = cage_with(model, keys)
+    vertices_m = cage_assembly(cage, str(model)).vertices_m - move_m
+    lower_m, upper_m = vertices_m.min(axis=0), vertices_m.max(axis=0)
+    assert 0 <= lower_m[2] <= 0.001
+    assert np.abs(lower_m + upper_m)[:2].max() / 2 <= (0.0006 if not rotate_deg else 0.002)
+    source_from_world = np.linalg.inv(cage.world_from_source)
+    for bar in cage.bars[:3]:
+        points = np.column_stack([bar.bar.axis_m, np.ones(len(bar.bar.axis_m))])
+        source_mm = (points @ source_from_world.T)[:, :3]
+        site_m = np.column_stack([source_mm / 1000, np.ones(len(points))]) @ site_from_world_m().T
+        number = bar.bar.bar_id - 1
+        expected_m = [[0.075 + 0.3 * number, 0.041, z_m] for z_m in (0.04, 2.96)]
+        np.testing.assert_allclose(site_m[:, :3], expected_m, rtol=0, atol=2e-6)
+    lengths_m = [bar.bar.length_m for bar in cage.bars]
+    np.testing.assert_allclose(lengths_m[:20], 2.92, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(lengths_m[20:30], 5.92, rtol=0, atol=1e-6)
+    if rotate_deg:  # The wall is parallel to the x axis again.
+        assert np.ptp(vertices_m[:, 0]) == pytest.approx(5.92, abs=0.02)
+        assert np.ptp(vertices_m[:, 1]) == pytest.approx(0.204, abs=0.01)
+    rotation = cage.world_from_source[:3, :3] * 1000
+    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+
+
+@pytest.mark.slow
+def test_site_coordinates_that_are_kept_are_refused(model: Path) -> None:
+    cage = cage_with(model, 'origin = "keep"\n[[select]]\nhost = "W-1"\n')
+    assert len(cage.problems) == WALL_BARS
+    np.testing.assert_array_equal(cage.world_from_source, np.diag([0.001, 0.001, 0.001, 1]))
+    with pytest.raises(MeshError, match="from the world's origin"):
+        scene_config(model.parent / "scene.toml")
+
+
+@pytest.mark.slow
+def test_ifc_file_alone_is_centred_and_surveyed(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fewer_views(*arguments: Any) -> SurveySpec:
+        survey = default(*arguments)
+        assert isinstance(survey, SurveySpec)
+        return replace(survey, distances_m=(2.0,), views_per_distance=4)
+
+    default: Any = scene_file._default_trajectory
+    monkeypatch.setattr(scene_file, "_default_trajectory", fewer_views)
+    config = scene_config(model)
+    assert (config.name, config.scene.environment) == ("site-model", "outdoors")
+    assert config.protocol.kind == "survey"  # The dome would be too large.
+    cage = scene_cage(model)
+    assembly = cage_assembly(cage, str(model))
+    assert 0 <= assembly.vertices_m[:, 2].min() <= 0.001
+    assert assembly.world_from_source is cage.world_from_source
+    codes = [note.code for note in assembly.notes]
+    assert codes == ["left-out"]
+    assert "1 (IfcWall: not reinforcement)" in assembly.notes[0].text

@@ -8,7 +8,7 @@ import unicodedata
 from pathlib import Path
 
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dataset_builder.catalog.named_configs import CONFIGS, BuildRequest
@@ -21,7 +21,10 @@ from rebar_depth_bench.base.errors import InputError, MeshError
 from tests.builder.catalog.scene_files import BAR, MM, write_scene
 
 SURVEY = "[cameras]\nkind = 'survey'\n"
-INVALID_COUNT_AND_SEED = "invalid cameras.views_per_distance, invalid cameras.seed"
+RING = "[cameras]\nkind = 'ring'\n"
+DOME = "[cameras]\nkind = 'dome'\n"
+SELECT = "ifc = 'a.ifc'\n[[select]]\n"
+RING_RADIUS_AND_ELEVATION = "missing cameras.radius, missing cameras.elevation_deg"
 INVALID_SCENES = [
     ("", "missing unit, missing"),
     (BAR, "missing unit"),
@@ -29,129 +32,105 @@ INVALID_SCENES = [
     ("unit = 5\n" + BAR, "invalid unit"),
     (MM + "nmae = 'x'\n" + BAR, "unknown nmae"),
     (MM + "zzz = 1\n" + BAR, "unknown zzz"),
-    (MM + "name = 'My Beam'\n" + BAR, "invalid name"),
-    (MM + "name = 'lattice-dusk'\n" + BAR, "invalid name"),
-    (MM + "name = 'lattice'\n" + BAR, "conflict name"),
-    (MM + "name = 'meshes'\n" + BAR, "conflict name"),
-    (MM + "name = 'scenes'\n" + BAR, "conflict name"),
-    (MM + "name = '../x'\n" + BAR, "invalid name"),
-    (MM + "name = ''\n" + BAR, "invalid name"),
-    (MM + "name = '" + "a" * 64 + "'\n" + BAR, "invalid name"),
-    (MM + "name = true\n" + BAR, "invalid name"),
     (MM + "mesh = 'a.stl'\n" + BAR, "conflict"),
     (MM + "mesh = 'a.stl'\nifc = 'b.ifc'", "conflict"),
     (MM + "mesh = 3", "invalid mesh"),
     (MM + "mesh = ''", "invalid mesh"),
-    (MM + "bar = 3", "invalid bar"),
-    (MM + "up = 'x'\n" + BAR, "invalid up"),
-    (MM + "origin = 'center'\n" + BAR, "invalid origin"),
-    (MM + "rotate_deg = 361\n" + BAR, "invalid rotate_deg"),
-    (MM + "translate = [1, 2]\n" + BAR, "invalid translate"),
-    (MM + "translate = [1, 2, nan]\n" + BAR, "invalid translate"),
     (MM + "trust = 'geometry'\n" + BAR, "conflict trust"),
     ("ifc = 'a.ifc'\ntrust = 'me'\n", "invalid trust"),
     (MM + BAR + "[[select]]\nname = 'a'\n", "conflict select"),
     ("ifc = 'a.ifc'\nselect = []\n", "invalid select"),
     ("ifc = 'a.ifc'\nselect = 'a'\n", "invalid select"),
-    ("ifc = 'a.ifc'\n[[select]]\n", "missing select 1"),
-    ("ifc = 'a.ifc'\n[[select]]\nclas = 'a'\n", "unknown select 1: clas"),
-    ("ifc = 'a.ifc'\n[[select]]\nname = ''\n", "invalid select 1: name"),
-    ("ifc = 'a.ifc'\n[[select]]\nbox = [[0, 0, 0]]\n", "invalid select 1: box"),
+    (SELECT, "missing select 1"),
+    (SELECT + "clas = 'a'\n", "unknown select 1: clas"),
+    (SELECT + "name = ''\n", "invalid select 1: name"),
+    (SELECT + "box = [[0, 0, 0]]\n", "invalid select 1: box"),
     (MM + "mesh = 'a.stl'\n[[select]]\nname = 'a'\nstorey = 'b'\n", "conflict select 1"),
+    (MM + "bar = 3", "invalid bar"),
     (MM + "bar = []", "invalid bar"),
     (MM + "bar = [1]", "invalid bar 1"),
     (MM + "[bar]\ndiameter = 10", "invalid bar"),
-    (MM + "environment = 'moon'\n" + BAR, "invalid environment"),
-    (MM + "board = true\n" + BAR, "invalid board"),
-    (MM + "board = 7\n" + BAR, "invalid board"),
-    (MM + "board = 6.0\n" + BAR, "invalid board"),
     (MM + "cameras = 3\n" + BAR, "invalid cameras"),
-    (MM + BAR + "[cameras]\n", "missing cameras.kind"),
-    (MM + BAR + "[cameras]\nkind = 'x'\n", "invalid cameras.kind"),
-    (MM + BAR + "[cameras]\nkind = ['survey']\n", "invalid cameras.kind"),
-    (MM + BAR + SURVEY + "azimuths = 3\n", "unknown cameras.azimuths"),
-    (MM + BAR + SURVEY + "distances = []\n", "invalid cameras.distances"),
-    (MM + BAR + SURVEY + "distances = 500\n", "invalid cameras.distances"),
-    (MM + BAR + SURVEY + "distances = [500, 0]\n", "invalid cameras.distances 2"),
-    (MM + BAR + SURVEY + "distances = [500, 119]\n", "conflict cameras.distances 2"),
-    (MM + BAR + SURVEY + "views_per_distance = 0\n", "invalid cameras.views_per_distance"),
-    (MM + BAR + SURVEY + "views_per_distance = 2.0\nseed = -1\n", INVALID_COUNT_AND_SEED),
-    (MM + BAR + SURVEY + "views_per_distance = 2501\n", "conflict cameras"),
-    (MM + BAR + SURVEY + f"distances = {[500] * 80}\n", "conflict cameras"),
-    (MM + BAR + SURVEY + "views_per_distance = 10001\n", "invalid cameras.views_per_distance"),
-    (MM + BAR + SURVEY + "stations = []\n", "unknown cameras.stations"),
-    (
-        MM + BAR + "[cameras]\nkind = 'ring'\n",
-        "missing cameras.azimuths, missing cameras.radius, missing cameras.elevation_deg",
-    ),
-    (
-        MM + BAR + "[cameras]\nkind = 'ring'\nradii = [1]\n",
-        "missing cameras.azimuths, missing cameras.radius, missing cameras.elevation_deg, unknown cameras.radii",
-    ),
-    (
-        MM + BAR + "[cameras]\nkind = 'dome'\nradii = []\n",
-        "missing cameras.azimuths, invalid cameras.radii, missing cameras.elevations_deg",
-    ),
-    (
-        MM + BAR + "[cameras]\nkind = 'dome'\nradii = [400, -1]\n",
-        "missing cameras.azimuths, invalid cameras.radii 2, missing cameras.elevations_deg",
-    ),
-    (
-        MM + BAR + "[cameras]\nkind = 'dome'\nelevations_deg = [90]\n",
-        "missing cameras.azimuths, missing cameras.radii, invalid cameras.elevations_deg 1",
-    ),
-    (
-        MM + BAR + "[cameras]\nkind = 'ring'\nazimuths = 2.5\n",
-        "invalid cameras.azimuths, missing cameras.radius, missing cameras.elevation_deg",
-    ),
-    (
-        MM + BAR + "[cameras]\nkind = 'ring'\nazimuths = true\n",
-        "invalid cameras.azimuths, missing cameras.radius, missing cameras.elevation_deg",
-    ),
-    (
-        MM + BAR + "[cameras]\nkind = 'ring'\nradius = 50\nelevation_deg = 9\nazimuths = 3\n",
-        "conflict cameras.radius",
-    ),
-    (
-        MM + BAR + "[cameras]\nkind = 'dome'\nradii = [400, 500]\nelevations_deg = [5, 9]\nazimuths = 3600\n",
-        "conflict cameras",
-    ),
     (MM + "[[bar]]\n", "missing bar 1: diameter, missing bar 1: points"),
-    (MM + BAR + "dia = 3\n", "unknown bar 1: dia"),
-    (MM + BAR + "ribs = 1\n", "invalid bar 1: ribs"),
-    (MM + BAR + "id = 0\n", "invalid bar 1: id"),
-    (MM + BAR + "id = 65536\n", "invalid bar 1: id"),
-    (
-        MM + BAR + "id = 5\n" + BAR + "id = 5\n",
-        "duplicate bar 2: id",
-    ),
-    (MM + BAR + "role = ''\n", "invalid bar 1: role"),
-    (MM + BAR + 'role = "a\\nb"\n', "invalid bar 1: role"),
-    (MM + BAR + "role = '" + "x" * 61 + "'\n", "invalid bar 1: role"),
-    (MM + BAR + "bend_diameter = 9\n", "conflict bar 1: bend_diameter"),
-    (MM + BAR + "bend_diameter = -4\n", "invalid bar 1: bend_diameter"),
-    (MM + BAR.replace("= 10", "= 0"), "invalid bar 1: diameter"),
-    (MM + BAR.replace("= 10", "= nan"), "invalid bar 1: diameter"),
-    (MM + BAR.replace("= 10", "= inf"), "invalid bar 1: diameter"),
-    (MM + BAR.replace("= 10", "= '10'"), "invalid bar 1: diameter"),
-    (MM + BAR.replace("= 10", "= true"), "invalid bar 1: diameter"),
-    (MM + BAR.replace("= 10", "= 1" + "0" * 400), "invalid bar 1: diameter"),
-    (MM + BAR.replace("= 10", "= 2020-01-01"), "invalid bar 1: diameter"),
-    (
-        MM + BAR.replace("[100, 0, 50]", "[100, 0]"),
-        "invalid bar 1: points 2",
-    ),
-    (MM + BAR.replace("[100, 0, 50]", "[100, 0, nan]"), "invalid bar 1: points 2"),
-    (MM + BAR.replace("[100, 0, 50]", "[100, 0, '5']"), "invalid bar 1: points 2"),
-    (MM + BAR.replace("[100, 0, 50]", "7"), "invalid bar 1: points 2"),
-    (MM + BAR.replace("[100, 0, 50]", "[1e300, 0, 5]"), "invalid bar 1: points 2"),
-    (MM + BAR.replace(", [100, 0, 50]", ""), "invalid bar 1: points"),
+    (MM + BAR + "id = 5\n" + BAR + "id = 5\n", "duplicate bar 2: id"),
     ("unit = ", "syntax"),
     ("x = " + "[" * 5000, "size"),
     ("x = " + "9" * 5000, "syntax"),
     ("a = 1\na = 2\n", "syntax"),
     ("\x00", "syntax"),
 ]
+INVALID_KEYS = [
+    ("name = 'My Beam'", "invalid name"),
+    ("name = 'lattice-dusk'", "invalid name"),
+    ("name = 'lattice'", "conflict name"),
+    ("name = 'meshes'", "conflict name"),
+    ("name = 'scenes'", "conflict name"),
+    ("name = '../x'", "invalid name"),
+    ("name = ''", "invalid name"),
+    (f"name = '{'a' * 64}'", "invalid name"),
+    ("name = true", "invalid name"),
+    ("up = 'x'", "invalid up"),
+    ("origin = 'center'", "invalid origin"),
+    ("rotate_deg = 361", "invalid rotate_deg"),
+    ("translate = [1, 2]", "invalid translate"),
+    ("translate = [1, 2, nan]", "invalid translate"),
+    ("environment = 'moon'", "invalid environment"),
+    ("board = true", "invalid board"),
+    ("board = 7", "invalid board"),
+    ("board = 6.0", "invalid board"),
+]
+INVALID_CAMERAS = [
+    ("[cameras]\n", "missing cameras.kind"),
+    ("[cameras]\nkind = 'x'\n", "invalid cameras.kind"),
+    ("[cameras]\nkind = ['survey']\n", "invalid cameras.kind"),
+    (SURVEY + "azimuths = 3\n", "unknown cameras.azimuths"),
+    (SURVEY + "distances = []\n", "invalid cameras.distances"),
+    (SURVEY + "distances = 500\n", "invalid cameras.distances"),
+    (SURVEY + "distances = [500, 0]\n", "invalid cameras.distances 2"),
+    (SURVEY + "distances = [500, 119]\n", "conflict cameras.distances 2"),
+    (SURVEY + "views_per_distance = 0\n", "invalid cameras.views_per_distance"),
+    (
+        SURVEY + "views_per_distance = 2.0\nseed = -1\n",
+        "invalid cameras.views_per_distance, invalid cameras.seed",
+    ),
+    (SURVEY + "views_per_distance = 2501\n", "conflict cameras"),
+    (SURVEY + f"distances = {[500] * 80}\n", "conflict cameras"),
+    (SURVEY + "views_per_distance = 10001\n", "invalid cameras.views_per_distance"),
+    (SURVEY + "stations = []\n", "unknown cameras.stations"),
+    (RING, f"missing cameras.azimuths, {RING_RADIUS_AND_ELEVATION}"),
+    (RING + "radii = [1]\n", f"missing cameras.azimuths, {RING_RADIUS_AND_ELEVATION}, unknown cameras.radii"),
+    (RING + "azimuths = 2.5\n", f"invalid cameras.azimuths, {RING_RADIUS_AND_ELEVATION}"),
+    (RING + "azimuths = true\n", f"invalid cameras.azimuths, {RING_RADIUS_AND_ELEVATION}"),
+    (RING + "radius = 50\nelevation_deg = 9\nazimuths = 3\n", "conflict cameras.radius"),
+    (DOME + "radii = []\nelevations_deg = [9]\nazimuths = 3\n", "invalid cameras.radii"),
+    (
+        DOME + "radii = [400, -1]\n",
+        "missing cameras.azimuths, invalid cameras.radii 2, missing cameras.elevations_deg",
+    ),
+    (DOME + "radii = [400]\nelevations_deg = [90]\nazimuths = 3\n", "invalid cameras.elevations_deg 1"),
+    (DOME + "radii = [400, 500]\nelevations_deg = [5, 9]\nazimuths = 3600\n", "conflict cameras"),
+]
+INVALID_BAR_KEYS = [
+    ("dia = 3", "unknown bar 1: dia"),
+    ("ribs = 1", "invalid bar 1: ribs"),
+    ("id = 0", "invalid bar 1: id"),
+    ("id = 65536", "invalid bar 1: id"),
+    ("role = ''", "invalid bar 1: role"),
+    ('role = "a\\nb"', "invalid bar 1: role"),
+    (f"role = '{'x' * 61}'", "invalid bar 1: role"),
+    ("bend_diameter = 9", "conflict bar 1: bend_diameter"),
+    ("bend_diameter = -4", "invalid bar 1: bend_diameter"),
+]
+INVALID_DIAMETERS = ("0", "nan", "inf", "'10'", "true", "1" + "0" * 400, "2020-01-01")
+INVALID_POINTS = ("[100, 0]", "[100, 0, nan]", "[100, 0, '5']", "7", "[1e300, 0, 5]")
+INVALID_SCENES += [(f"{MM}{key}\n{BAR}", problems) for key, problems in INVALID_KEYS]
+INVALID_SCENES += [(MM + BAR + table, problems) for table, problems in INVALID_CAMERAS]
+INVALID_SCENES += [(f"{MM}{BAR}{key}\n", problems) for key, problems in INVALID_BAR_KEYS]
+INVALID_SCENES += [
+    (MM + BAR.replace("= 10", f"= {text}"), "invalid bar 1: diameter") for text in INVALID_DIAMETERS
+]
+INVALID_SCENES += [(MM + BAR.replace("[100, 0, 50]", text), "invalid bar 1: points 2") for text in INVALID_POINTS]
+INVALID_SCENES += [(MM + BAR.replace(", [100, 0, 50]", ""), "invalid bar 1: points")]
 
 
 def codes_and_places(error: InputError) -> list[str]:
@@ -172,13 +151,8 @@ def test_all_problems_are_reported_together(tmp_path: Path) -> None:
     head, *lines = str(raised.value).splitlines()
     assert head == f"{tmp_path}/my-beam.toml: 5 problems"
     assert lines == [f"  - {problem}" for problem in raised.value.problems]
-    assert codes_and_places(raised.value) == [
-        "invalid unit",
-        "invalid bar 1: diameter",
-        "unknown bar 1: rips",
-        "invalid board",
-        "unknown foo",
-    ]
+    in_bar = ["invalid bar 1: diameter", "unknown bar 1: rips"]
+    assert codes_and_places(raised.value) == ["invalid unit", *in_bar, "invalid board", "unknown foo"]
     with pytest.raises(MeshError) as raised_by_cage:
         load_cage(cage_file_spec(write_scene(tmp_path, content)))
     assert raised_by_cage.value.problems == raised.value.problems
@@ -187,14 +161,10 @@ def test_all_problems_are_reported_together(tmp_path: Path) -> None:
 
 
 def test_conflicts_are_reported_with_other_problems(tmp_path: Path) -> None:
-    content = (
-        MM
-        + "name = 'pile'\nmesh = 'a.stl'\nboard = 7\n"
-        + (BAR + "id = 5\nbend_diameter = 9\nrips = 1\n") * 2
-        + "[[bar]]\nid = 5\n"
-        + f"[[bar]]\nid = 0x{'f' * 6000}\n" * 2
-        + "[cameras]\nkind = 'dome'\nradii = [400, 50]\nelevations_deg = [5, 90]\nazimuths = 3600\nfoo = 1\n"
-    )
+    bars = (BAR + "id = 5\nbend_diameter = 9\nrips = 1\n") * 2 + "[[bar]]\nid = 5\n"
+    bars += f"[[bar]]\nid = 0x{'f' * 6000}\n" * 2
+    cameras = DOME + "radii = [400, 50]\nelevations_deg = [5, 90]\nazimuths = 3600\nfoo = 1\n"
+    content = f"{MM}name = 'pile'\nmesh = 'a.stl'\nboard = 7\n{bars}{cameras}"
     with pytest.raises(InputError) as raised:
         scene_config(write_scene(tmp_path, content))
     codes = [code for code in codes_and_places(raised.value) if not code.startswith(("missing", "unknown"))]
@@ -220,14 +190,8 @@ def test_documented_example_is_valid() -> None:
     assert (scene.name, scene.board, scene.cameras) == ("my-beam", 6, DomeSpec((0.3, 0.4), (15.0, 45.0), 12))
     corners_m = ((-0.15, 0.0, 0.005), (0.15, 0.0, 0.005), (0.15, 0.0, 0.08))
     [bar] = scene.bars
-    assert bar.model_dump() == {
-        "bar_id": 7,
-        "role": "main",
-        "diameter_m": 0.01,
-        "corners_m": corners_m,
-        "mandrel_m": 0.04,
-        "ribs": True,
-    }
+    assert (bar.bar_id, bar.role, bar.diameter_m, bar.mandrel_m, bar.ribs) == (7, "main", 0.01, 0.04, True)
+    assert bar.corners_m == corners_m
 
 
 def test_survey_has_defaults_in_metres_and_distances_in_the_unit() -> None:
@@ -272,21 +236,16 @@ def test_steel_below_board_or_around_cameras_is_rejected(tmp_path: Path) -> None
 
 
 def test_unreadable_or_misnamed_files_are_rejected(tmp_path: Path) -> None:
-    for name, words in (
-        ("a.yaml", "unsupported scene file type '.yaml'"),
-        ("a.toml", "cannot be read: No such file"),
-    ):
-        with pytest.raises(InputError, match=words):
-            scene_config(tmp_path / name)
+    with pytest.raises(InputError, match=r"unsupported scene file type '.yaml'"):
+        scene_config(tmp_path / "a.yaml")
+    with pytest.raises(InputError, match="cannot be read: No such file"):
+        scene_config(tmp_path / "a.toml")
     with pytest.raises(InputError) as raised:
         scene_config(write_scene(tmp_path, b"\xff\xfe"))
     assert codes_and_places(raised.value) == ["syntax"]
     with pytest.raises(MeshError, match=r"my-beam.toml: ifc: .*gone.ifc: 1 problem\n  - cannot be read"):
         scene_config(write_scene(tmp_path, 'ifc = "gone.ifc"'))
     assert scene_config(write_scene(tmp_path, "\ufeff" + (MM + BAR).replace("\n", "\r\n"))).name == "my-beam"
-    builtin_name = next(iter(CONFIGS))
-    with pytest.raises(InputError, match=f"would be named '{builtin_name}'"):
-        scene_config(write_scene(tmp_path, MM + BAR, f"{builtin_name}.toml"))
 
 
 @pytest.mark.parametrize(
@@ -306,6 +265,7 @@ def test_scene_names_come_from_file_names(file: str, name: str) -> None:
     assert scene_name_of(Path(unicodedata.normalize("NFD", file))) == name
 
 
+@settings(max_examples=50)
 @given(st.text(min_size=1))
 def test_derived_scene_names_are_valid_or_refused(stem: str) -> None:
     name = scene_name_of(Path("folder", f"a{stem.replace('/', '')}.ifc"))
@@ -314,10 +274,10 @@ def test_derived_scene_names_are_valid_or_refused(stem: str) -> None:
 
 
 def test_file_names_without_a_scene_name_are_refused(tmp_path: Path) -> None:
-    assert scene_config(write_scene(tmp_path, MM + BAR, "My Beam.toml")).name == "my-beam"
     for file, name in (
         ("\u9244\u7b4b.toml", ""),
         ("Lattice Orbit.toml", "lattice-orbit"),
+        (f"{next(iter(CONFIGS))}.toml", next(iter(CONFIGS))),
         (f"{'x' * 64}.toml", "x" * 64),
         ("Beam Dusk.toml", "beam-dusk"),
     ):
@@ -325,6 +285,7 @@ def test_file_names_without_a_scene_name_are_refused(tmp_path: Path) -> None:
             scene_config(write_scene(tmp_path, MM + BAR, file))
 
 
+@pytest.mark.slow
 def test_ifc_file_may_have_a_name_that_a_scene_file_cannot_name(tmp_path: Path) -> None:
     """A path in a scene file must not begin with a tilde, but an IFC file that is the scene itself may."""
     path = tmp_path / "~x.ifc"
@@ -333,8 +294,8 @@ def test_ifc_file_may_have_a_name_that_a_scene_file_cannot_name(tmp_path: Path) 
 
 
 def test_files_that_give_the_same_scene_name_are_refused(tmp_path: Path) -> None:
-    scenes = tuple(
-        scene_config(write_scene(tmp_path, MM + BAR, file)) for file in ("My Beam.toml", "my_beam.toml")
-    )
+    files = [write_scene(tmp_path, MM + BAR, name) for name in ("My Beam.toml", "my_beam.toml")]
+    scenes = tuple(map(scene_config, files))
+    assert scenes[0].name == "my-beam"
     with pytest.raises(InputError, match="more than one config is named my-beam"):
         BuildRequest(configs=(), scenes=scenes).config_specs()

@@ -1,12 +1,9 @@
-"""Bent bars with exact centrelines, tessellated in several ways, and a table of what is fitted to them.
-
-``python -m tests.builder.user_files.tube_shapes`` prints the table.
-"""
+"""Bent bars with exact centrelines, tessellated in several ways, and straight rods as mesh files."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 import trimesh
@@ -15,10 +12,9 @@ from numpy import ndarray
 from scipy.spatial import Delaunay
 
 from dataset_builder.audit.geometry import polyline_distance_m
-from dataset_builder.scene.model import Mesh
-from dataset_builder.scene.shapes.bar_mesh import ribbed_bar_mesh
+from dataset_builder.scene.model import Assembly, Mesh
 from dataset_builder.scene.shapes.bending import bend_radius_m, bent_line_m
-from dataset_builder.user_files.tubes.tube_fit import fit_tube
+from dataset_builder.user_files.cage_file import load_cage, mesh_file_spec
 
 DIAMETER_M = 0.012
 Line = Float64[ndarray, "n 3"]
@@ -97,12 +93,6 @@ def swept(line_m: Line, facets: int, diameter_m: float = DIAMETER_M) -> Mesh:
     return Mesh(np.concatenate(rings_m), np.concatenate(faces).astype(np.int32))
 
 
-def unwelded(mesh: Mesh) -> Mesh:
-    """Return the triangles with corners of their own, in a random order, as STL files have them."""
-    faces = np.random.default_rng(0).permutation(mesh.faces)
-    return Mesh(mesh.vertices_m[faces].reshape(-1, 3), np.arange(faces.size, dtype=np.int32).reshape(-1, 3))
-
-
 def divided(mesh: Mesh, edge_m: float = 0.02) -> Mesh:
     """Return triangles divided until no edge is longer than ``edge_m``; new vertices are on the old sides."""
     vertices, faces = trimesh.remesh.subdivide_to_size(mesh.vertices_m, mesh.faces, edge_m, max_iter=12)
@@ -140,22 +130,6 @@ def remeshed(line_m: Line, facets: int = 24) -> Mesh:
     return Mesh(vertices_m, faces.astype(np.int32))
 
 
-def ribbed(line_m: Line) -> Mesh:
-    return ribbed_bar_mesh(line_m, DIAMETER_M)
-
-
-TESSELLATIONS: Mapping[str, Callable[[Line], Mesh]] = {
-    "8 facets": lambda line_m: swept(line_m, 8),
-    "12 facets": lambda line_m: swept(line_m, 12),
-    "24 facets": lambda line_m: swept(line_m, 24),
-    "24, unwelded": lambda line_m: unwelded(swept(line_m, 24)),
-    "24, divided": lambda line_m: divided(swept(line_m, 24)),
-    "12, remeshed": lambda line_m: remeshed(line_m, 12),
-    "24, remeshed": lambda line_m: remeshed(line_m, 24),
-    "ribbed": ribbed,
-}
-
-
 def line_distance_m(first_m: Line, second_m: Line) -> float:
     """Return the largest distance of points of either polyline from the other, metres."""
 
@@ -170,27 +144,36 @@ def line_distance_m(first_m: Line, second_m: Line) -> float:
     )
 
 
-def main() -> None:
-    """Print the table of fitted against exact centrelines, with the time of each fit on this machine."""
-    print("| shape | tessellation | triangles | diameter, % | length, % | largest distance, mm | CPU ms |")
-    print("|---|---|---|---|---|---|---|")
-    for shape, line_m in CENTRELINES_M.items():
-        for name, tessellate in TESSELLATIONS.items():
-            if (shape, name) != ("closed hoop", "ribbed"):  # Ribbed bars have two ends.
-                print(f"| {shape} | {name} | {_row(line_m, tessellate(line_m))} |")
+ALONG_X = np.array([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
 
 
-def _row(line_m: Line, mesh: Mesh) -> str:
-    start = time.process_time()
-    tube = fit_tube(mesh.vertices_m, mesh.faces)
-    if tube is None:
-        return f"{len(mesh.faces)} | no tube | | |"
-    cpu_ms = 1000 * (time.process_time() - start)
-    diameter = 100 * (tube.diameter_m / DIAMETER_M - 1)
-    length = 100 * (length_m(tube.axis_m) / length_m(line_m) - 1)
-    distance_mm = 1000 * line_distance_m(tube.axis_m, line_m)
-    return f"{len(mesh.faces)} | {diameter:+.2f} | {length:+.2f} | {distance_mm:.2f} | {cpu_ms:.0f}"
+def rod(diameter_m: float, y_m: float = 0.0) -> trimesh.Trimesh:
+    """Return a closed rod of 0.5 m along x."""
+    body = trimesh.creation.cylinder(diameter_m / 2, 0.5, sections=64, transform=ALONG_X)
+    body.apply_translation([0.25, y_m, 0.1])
+    return body
 
 
-if __name__ == "__main__":
-    main()
+RODS = tuple(rod(diameter_m, y_m) for diameter_m, y_m in ((0.016, 0.0), (0.010, 0.1), (0.020, 0.2)))
+
+
+def concatenated(bodies: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+    """Return bodies as one mesh that keeps their vertices and faces."""
+    arrays = trimesh.util.append_faces([body.vertices for body in bodies], [body.faces for body in bodies])
+    return trimesh.Trimesh(*arrays, process=False)
+
+
+def obj_bytes(bodies: Sequence[trimesh.Trimesh], names: Sequence[str], per_metre: float = 1.0) -> bytes:
+    """Return an OBJ file with an object for each body."""
+    lines, start = ["mtllib missing.mtl"], 1
+    for body, name in zip(bodies, names, strict=True):
+        lines += [f"o {name}", *(f"v {x!r} {y!r} {z!r}" for x, y, z in (body.vertices * per_metre).tolist())]
+        lines += ["vn 0 0 1", "usemtl steel", *(f"f {a}//1 {b}//1 {c}//1" for a, b, c in body.faces + start)]
+        start += len(body.vertices)
+    return "\n".join(lines).encode()
+
+
+def load_content(folder: Path, name: str, content: bytes | str, unit: str | float = "m") -> Assembly:
+    """Write a mesh file and return its cage."""
+    (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
+    return load_cage(mesh_file_spec(folder / name, unit))
