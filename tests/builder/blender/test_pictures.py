@@ -65,7 +65,7 @@ def photometric_problems(config: AuditedConfig, views: Sequence[AuditedView]) ->
     costs, counts = zip(*(shift_costs(config, view) for view in views), strict=True)
     if sum(counts) < 1000:
         return None
-    together_px = [best_shift_px(cost) for cost in sum(costs)]
+    together_px = [best_shift_px(cost) for cost in np.sum(costs, axis=0)]
     is_off = np.abs(together_px).max() > 0.1 + 6 / sum(counts) ** 0.5
     problems = [f"all views match best at an offset of {together_px} px"] if is_off else []
     for view, cost, count in zip(views, costs, counts, strict=True):

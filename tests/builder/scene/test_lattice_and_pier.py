@@ -19,7 +19,7 @@ from dataset_builder.scene.assemblies.pier import pier_assembly
 from dataset_builder.scene.cages.design import STANDING_M
 from dataset_builder.scene.model import Assembly, Part
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m, plain_outer_radius_m
-from dataset_builder.specs.config_specs import LatticeSpec, PierSpec
+from dataset_builder.specs.config_specs import AssemblySpec, LatticeSpec, PierSpec
 from dataset_builder.user_files.make_assembly import make_assembly
 from tests.builder.scene.cages import (
     Line,
@@ -31,7 +31,7 @@ from tests.builder.scene.cages import (
     segments_m,
 )
 
-SPECS = {"lattice": LatticeSpec(), "pier": PierSpec()}
+SPECS: dict[str, AssemblySpec] = {"lattice": LatticeSpec(), "pier": PierSpec()}
 RADIUS_M: dict[str, Callable[[float], float]] = {"lattice": outer_radius_m, "pier": plain_outer_radius_m}
 ROLES = {
     "lattice": [("x-rod", 25), ("y-rod", 25), ("z-rod", 25)],
