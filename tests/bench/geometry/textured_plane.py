@@ -19,9 +19,15 @@ NORMAL_CAM, OFFSET_M = np.array([0.15, -0.1, 1.0]), 0.45
 """Plane n . x = offset (metres) in the frame of the left raw camera, tilted in both directions."""
 
 
-def plane_depth_m(rays_left: Float64[ndarray, "h w 3"]) -> Float64[ndarray, "h w"]:
-    """Return the planar depth of the plane along rays of the left camera."""
-    return np.asarray(OFFSET_M / (rays_left @ NORMAL_CAM))
+def plane_depth_m(
+    rays_left: Float64[ndarray, "h w 3"], centre_m: Float64[ndarray, " 3"] | None = None
+) -> Float64[ndarray, "h w"]:
+    """Return the multiple of each ray at which it meets the plane: planar depth for rays of the left camera.
+
+    Rays and their centre, by default that of the left camera, are in its frame.
+    """
+    before_m = 0.0 if centre_m is None else float(centre_m @ NORMAL_CAM)
+    return np.asarray((OFFSET_M - before_m) / (rays_left @ NORMAL_CAM))
 
 
 def texture_rgb(points_m: Float64[ndarray, "h w 3"]) -> UInt8[ndarray, "h w 3"]:
@@ -39,43 +45,22 @@ def texture_rgb(points_m: Float64[ndarray, "h w 3"]) -> UInt8[ndarray, "h w 3"]:
 def raw_row() -> dict[str, Any]:
     """Return the row of a raw pair of the shipped ZED, with the exact depth of the left image (``depth_m``)."""
     calibration = read_calibration(SHIPPED_CALIBRATION, WIDTH, HEIGHT)
-    right_pose = calibration.right_from_left
-    left = pixel_rays(calibration.left.K, WIDTH, HEIGHT, np.array(calibration.left.distortion))
-    left_from_right = inverse_rigid(right_pose)
-    right = pixel_rays(calibration.right.K, WIDTH, HEIGHT, np.array(calibration.right.distortion))
-    right_rays, right_centre_m = right @ left_from_right[:3, :3].T, left_from_right[:3, 3]
-    right_depth_m = (OFFSET_M - right_centre_m @ NORMAL_CAM) / (right_rays @ NORMAL_CAM)
-    depth_m = plane_depth_m(left)
-    return {
-        "left_rgb": texture_rgb(left * depth_m[..., None]),
-        "right_rgb": texture_rgb(right_rays * right_depth_m[..., None] + right_centre_m),
-        "left_K": calibration.left.K,
-        "right_K": calibration.right.K,
-        "left_distortion": np.array(calibration.left.distortion),
-        "right_distortion": np.array(calibration.right.distortion),
-        "left_cam_from_world": LEFT_CAM_FROM_WORLD,
-        "right_cam_from_world": right_pose @ LEFT_CAM_FROM_WORLD,
-        "baseline_m": float(np.linalg.norm(right_pose[:3, 3])),
-        "depth_m": depth_m,
-    }
+    left, right = calibration.left, calibration.right
+    return _row([(lens.K, np.array(lens.distortion)) for lens in (left, right)], calibration.right_from_left)
 
 
 def ideal_row() -> dict[str, Any]:
     """Return the same of a pair of ideal pinholes."""
-    K = ideal_K(WIDTH, HEIGHT)
-    rays = pixel_rays(K, WIDTH, HEIGHT)
-    right_centre_m = np.array([0.12, 0.0, 0.0])
-    right_depth_m = (OFFSET_M - right_centre_m @ NORMAL_CAM) / (rays @ NORMAL_CAM)
-    depth_m = plane_depth_m(rays)
-    return {
-        "left_rgb": texture_rgb(rays * depth_m[..., None]),
-        "right_rgb": texture_rgb(rays * right_depth_m[..., None] + right_centre_m),
-        "left_K": K,
-        "right_K": K,
-        "left_distortion": np.zeros(5),
-        "right_distortion": np.zeros(5),
-        "left_cam_from_world": LEFT_CAM_FROM_WORLD,
-        "right_cam_from_world": right_camera_pose(LEFT_CAM_FROM_WORLD, 0.12),
-        "baseline_m": 0.12,
-        "depth_m": depth_m,
-    }
+    return _row([(ideal_K(WIDTH, HEIGHT), np.zeros(5))] * 2, right_camera_pose(np.eye(4), 0.12))
+
+
+def _row(lenses: list[tuple[ndarray, ndarray]], right_from_left: Float64[ndarray, "4 4"]) -> dict[str, Any]:
+    """Return the row of a pair whose lenses have these K and distortions."""
+    row: dict[str, Any] = {"baseline_m": float(np.linalg.norm(right_from_left[:3, 3]))}
+    for eye, (K, distortion), pose in zip(("left", "right"), lenses, (np.eye(4), right_from_left), strict=True):
+        left_from_eye = inverse_rigid(pose)
+        rays, centre_m = pixel_rays(K, WIDTH, HEIGHT, distortion) @ left_from_eye[:3, :3].T, left_from_eye[:3, 3]
+        points_m = centre_m + rays * plane_depth_m(rays, centre_m)[..., None]
+        row |= {f"{eye}_rgb": texture_rgb(points_m), f"{eye}_K": K, f"{eye}_distortion": distortion}
+        row[f"{eye}_cam_from_world"] = pose @ LEFT_CAM_FROM_WORLD
+    return row | {"depth_m": plane_depth_m(pixel_rays(lenses[0][0], WIDTH, HEIGHT, lenses[0][1]))}

@@ -1,32 +1,63 @@
-"""Pile assembly: six bent stirrups at rest that intersect neither each other nor the board."""
+"""Pile: bent stirrups at rest that intersect neither each other nor the board, and the simulated fall."""
 
 from __future__ import annotations
 
 import hashlib
 import json
-from itertools import combinations
+import platform
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
 
+import mujoco
 import numpy as np
 import pytest
 import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from jaxtyping import Float64
-from numpy import ndarray
 
-from dataset_builder.scene.assemblies.pile import RIBS, STATES_DIR, load_settled_poses, pile_assembly
+from dataset_builder.scene.assemblies.pile import (
+    RIBS,
+    STATES_DIR,
+    Pose,
+    load_settled_poses,
+    pile_assembly,
+    points_in_world_m,
+    spec_centreline_m,
+)
 from dataset_builder.scene.model import Assembly
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
+from dataset_builder.scene.shapes.bending import resample_polyline_m
 from dataset_builder.scene.shapes.links import SELF_GAP_M, hook_extension_m, stirrup_centreline_m
 from dataset_builder.specs.config_specs import PileSpec
 from dataset_builder.user_files.make_assembly import make_assembly
 from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
+from scripts import simulate_pile
+from scripts.simulate_pile import (
+    PHYSICS,
+    DropSpec,
+    SettledPile,
+    drop_pile,
+    drop_poses,
+    find_problems,
+    free_markers,
+    simulate_drop,
+)
+from tests.builder.scene.cages import (
+    Line,
+    least_gap_m,
+    line_length_m,
+    point_distances_m,
+    segment_distances_m,
+    segments_m,
+)
 
 SPEC = PileSpec()
 RADIUS_M = outer_radius_m(SPEC.diameter_m, RIBS)
-STORED = json.loads((STATES_DIR / "pile-0.json").read_text())
-
-Polyline = Float64[ndarray, "n 3"]
+STATE = STATES_DIR / "pile-0.json"
+STORED = json.loads(STATE.read_text())
 
 
 @pytest.fixture(scope="module")
@@ -35,37 +66,8 @@ def pile() -> Assembly:
 
 
 @pytest.fixture(scope="module")
-def lines_m(pile: Assembly) -> list[Polyline]:
+def lines_m(pile: Assembly) -> list[Line]:
     return [np.array(bar.axis_m) for bar in pile.bars]
-
-
-def segment_distances_m(a: Polyline, b: Polyline) -> Float64[ndarray, "n k"]:
-    """Return the exact distance between every segment of one polyline and every segment of another.
-
-    The minimum is on the common perpendicular inside both segments, or at an end of one of them.
-    """
-    a0, a1, b0, b1 = a[:-1, None], a[1:, None], b[None, :-1], b[None, 1:]
-    u, v, w = a1 - a0, b1 - b0, a0 - b0
-    uu, uv, vv, uw, vw = ((x * y).sum(-1) for x, y in ((u, u), (u, v), (v, v), (u, w), (v, w)))
-    area = uu * vv - uv * uv
-    with np.errstate(divide="ignore", invalid="ignore"):
-        s, t = (uv * vw - vv * uw) / area, (uu * vw - uv * uw) / area
-        inside = np.linalg.norm(w + s[..., None] * u - t[..., None] * v, axis=-1)
-    crossing = (area > 1e-12 * uu * vv) & (s >= 0) & (s <= 1) & (t >= 0) & (t <= 1)
-    ends = [point_distances_m(a0, b0, b1), point_distances_m(a1, b0, b1)]
-    ends += [point_distances_m(b0, a0, a1), point_distances_m(b1, a0, a1)]
-    return np.asarray(np.where(crossing, inside, np.min(ends, axis=0)))
-
-
-def point_distances_m(point: ndarray, start: ndarray, end: ndarray) -> Float64[ndarray, "n k"]:
-    segment = end - start
-    fraction = np.clip(((point - start) * segment).sum(-1) / (segment * segment).sum(-1), 0, 1)
-    return np.asarray(np.linalg.norm(point - start - fraction[..., None] * segment, axis=-1))
-
-
-def directions(line: Polyline) -> Polyline:
-    steps = np.diff(line, axis=0)
-    return np.asarray(steps / np.linalg.norm(steps, axis=1, keepdims=True))
 
 
 def test_six_stirrups_are_numbered_in_order(pile: Assembly) -> None:
@@ -80,29 +82,25 @@ def test_six_stirrups_are_numbered_in_order(pile: Assembly) -> None:
     )
 
 
-def test_stirrup_meshes_are_closed_around_their_axes(pile: Assembly, lines_m: list[Polyline]) -> None:
+@pytest.mark.slow
+def test_stirrup_meshes_are_closed_around_their_axes(pile: Assembly, lines_m: list[Line]) -> None:
     for part, line_m in zip(pile.parts, lines_m, strict=True):
         solid = trimesh.Trimesh(part.mesh.vertices_m, part.mesh.faces, process=False)
         assert solid.is_watertight
         assert solid.is_winding_consistent
         assert len(part.mesh.faces) < 60_000
-        length_m = np.linalg.norm(np.diff(line_m, axis=0), axis=1).sum()
-        assert solid.volume == pytest.approx(np.pi / 4 * SPEC.diameter_m**2 * length_m, rel=0.01)
-        sampled_m = part.mesh.vertices_m[::97, None]
-        off_axis_m = point_distances_m(sampled_m, line_m[None, :-1], line_m[None, 1:]).min(axis=1)
-        assert off_axis_m.max() < RADIUS_M + 1e-9
+        assert solid.volume == pytest.approx(np.pi / 4 * SPEC.diameter_m**2 * line_length_m(line_m), rel=0.01)
+        assert point_distances_m(part.mesh.vertices_m[::97], segments_m(line_m)).max() < RADIUS_M + 1e-9
 
 
-def test_bars_touch_without_intersection(lines_m: list[Polyline], pile: Assembly) -> None:
-    gaps_m = [segment_distances_m(a, b).min() - 2 * RADIUS_M for a, b in combinations(lines_m, 2)]
-    assert min(gaps_m) > -1e-4
-    assert min(gaps_m) < 1e-4, "a heap whose bars do not lie on each other"
+def test_bars_touch_without_intersection(lines_m: list[Line], pile: Assembly) -> None:
+    assert -1e-4 < least_gap_m(pile, lambda _: RADIUS_M) < 1e-4, "a heap whose bars do not lie on each other"
     lowest_m = min(line[:, 2].min() for line in lines_m) - RADIUS_M
     assert -1e-4 < lowest_m < 1e-4
     assert min(part.mesh.vertices_m[:, 2].min() for part in pile.parts) >= lowest_m
 
 
-def test_pile_is_tilted_and_leaves_four_markers_free(lines_m: list[Polyline], pile: Assembly) -> None:
+def test_pile_is_tilted_and_leaves_four_markers_free(lines_m: list[Line], pile: Assembly) -> None:
     vertices_m = np.concatenate([part.mesh.vertices_m for part in pile.parts])
     assert np.abs(vertices_m[:, :2]).max() <= 0.17
     assert vertices_m[:, 2].max() > 0.03
@@ -128,13 +126,6 @@ def developed_length_m(size_m: tuple[float, float], diameter_m: float) -> float:
     return float(planar_length_m * np.hypot(1.0, outer_m / loop_length_m))
 
 
-def resample_polyline_m(line: Polyline) -> Polyline:
-    """Return points about every 5 mm along a polyline."""
-    along_m = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(line, axis=0), axis=1))])
-    sample_m = np.linspace(0.0, along_m[-1], int(along_m[-1] / 0.005))
-    return np.stack([np.interp(sample_m, along_m, column) for column in line.T], axis=1)
-
-
 @settings(max_examples=30)
 @given(
     st.sampled_from([0.006, 0.008, 0.010, 0.012]),
@@ -147,10 +138,10 @@ def test_stirrup_has_specified_size_length_and_hooks(diameter_m: float, length_m
     line = stirrup_centreline_m(size_m, diameter_m, outer_m)
     np.testing.assert_allclose(np.ptp(line[:, :2], axis=0) + diameter_m, size_m, atol=1e-12)
     legs_m = np.linalg.norm(np.diff(line, axis=0), axis=1)
-    assert legs_m.sum() == pytest.approx(developed_length_m(size_m, diameter_m), rel=4e-4)
+    assert line_length_m(line) == pytest.approx(developed_length_m(size_m, diameter_m), rel=4e-4)
     np.testing.assert_allclose(np.average((line[:-1] + line[1:]) / 2, axis=0, weights=legs_m), 0.0, atol=1e-12)
 
-    flat = directions(line * [1.0, 1.0, 0.0])
+    flat = np.diff(line[:, :2], axis=0)
     heading_deg = np.rad2deg(np.unwrap(np.arctan2(flat[:, 1], flat[:, 0])))
     straight_deg = heading_deg[legs_m > 0.9 * hook_extension_m(diameter_m)]
     # Tip, hook, three corners, hook, tip: all bends are to the left.
@@ -165,10 +156,10 @@ def test_stirrup_has_specified_size_length_and_hooks(diameter_m: float, length_m
 def test_stirrup_does_not_intersect_itself(size_m: tuple[float, float], diameter_m: float) -> None:
     outer_m = outer_radius_m(diameter_m, RIBS)
     line = stirrup_centreline_m(size_m, diameter_m, outer_m)
-    fine = resample_polyline_m(line)
+    fine = resample_polyline_m(line, 0.005)
     index = np.arange(len(fine) - 1)
     not_adjacent = np.abs(index[:, None] - index) > 16  # 80 mm along the bar, which is longer than a bend
-    own_gap_m = segment_distances_m(fine, fine)[not_adjacent].min() - 2 * outer_m
+    own_gap_m = segment_distances_m(segments_m(fine), segments_m(fine))[not_adjacent].min() - 2 * outer_m
     assert 0.5 * SELF_GAP_M < own_gap_m < 1.5 * SELF_GAP_M
 
 
@@ -192,7 +183,9 @@ def test_invalid_stirrups_are_rejected(size_m: tuple[float, float], diameter_m: 
         stirrup_centreline_m(size_m, diameter_m, outer_radius_m(diameter_m, RIBS))
 
 
-def test_stored_state_belongs_to_the_stirrups() -> None:
+def test_stored_state_is_the_known_one_and_belongs_to_the_stirrups() -> None:
+    digest = hashlib.sha256(STATE.read_bytes()).hexdigest()
+    assert digest == "e55162bfe0a5931671a22bbdb5d9640775eb7caeec72cc007b0984c9dcd86932"
     stirrups = {"stirrups": SPEC.stirrups, "diameter_m": SPEC.diameter_m, "size_m": list(SPEC.size_m)}
     assert stirrups.items() <= STORED["pile"].items()
     poses = load_settled_poses(SPEC)
@@ -201,6 +194,107 @@ def test_stored_state_belongs_to_the_stirrups() -> None:
     np.testing.assert_allclose(norms, 1, atol=1e-9)
 
 
-def test_stored_state_has_known_digest() -> None:
-    digest = hashlib.sha256((STATES_DIR / "pile-0.json").read_bytes()).hexdigest()
-    assert digest == "e55162bfe0a5931671a22bbdb5d9640775eb7caeec72cc007b0984c9dcd86932"
+def max_displacement_m(poses: Sequence[Pose], other_poses: Sequence[Pose]) -> float:
+    """Return the largest displacement of any centreline point between two sets of poses, metres."""
+    line_m = spec_centreline_m(SPEC)
+    pairs = zip(poses, other_poses, strict=True)
+    return float(
+        max(
+            np.linalg.norm(points_in_world_m(line_m, a) - points_in_world_m(line_m, b), axis=1).max()
+            for a, b in pairs
+        )
+    )
+
+
+@pytest.fixture(scope="module")
+def resettled() -> SettledPile:
+    """Return the stored pile after another half second of simulation."""
+    return simulate_drop(SPEC, load_settled_poses(SPEC), replace(PHYSICS, rest_for_s=0.5, limit_s=0.5))
+
+
+@pytest.mark.slow
+def test_stored_pile_is_at_rest(resettled: SettledPile) -> None:
+    assert max_displacement_m(resettled.poses, load_settled_poses(SPEC)) < 1e-6
+    assert max(*resettled.speeds, *resettled.spins) < PHYSICS.rest_speed
+    assert find_problems(resettled, SPEC) == []
+
+
+@pytest.mark.slow
+def test_lifted_pile_falls() -> None:
+    lifted = [
+        replace(pose, position_m=(*pose.position_m[:2], pose.position_m[2] + 0.02))
+        for pose in load_settled_poses(SPEC)
+    ]
+    fallen = simulate_drop(SPEC, lifted, replace(PHYSICS, rest_for_s=0.5, limit_s=0.2))
+    assert max_displacement_m(fallen.poses, lifted) > 0.01
+
+
+@pytest.mark.slow
+def test_drop_depends_only_on_seed() -> None:
+    line_m = spec_centreline_m(SPEC)
+    spec = replace(SPEC, stirrups=3)
+    physics = replace(PHYSICS, limit_s=0.25)
+
+    def drop(seed: int) -> SettledPile:
+        return simulate_drop(spec, drop_poses(DropSpec(), line_m, 3, np.random.default_rng(seed)), physics)
+
+    assert drop(7) == drop(7)
+    assert max_displacement_m(drop(7).poses, drop(8).poses) > 1e-3
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(
+    mujoco.__version__ != STORED["mujoco"] or platform.machine() != STORED["machine"],
+    reason="another MuJoCo or processor gives other last digits, and a fall magnifies them",
+)
+def test_stored_pile_is_reproduced_from_seed() -> None:
+    pile = drop_pile(SPEC, STORED["seed"])
+    assert max_displacement_m(pile.poses, load_settled_poses(SPEC)) < 1e-9
+    assert pile.gap_m == pytest.approx(STORED["least_gap_m"], abs=1e-9)
+
+
+@pytest.mark.slow
+def test_problems_are_reported(resettled: SettledPile) -> None:
+    level = Pose((0.0, 0.0, 0.02), (1.0, 0.0, 0.0, 0.0))
+    far = replace(level, position_m=(0.04, 0.0, 0.02))
+    calm = (0.0,) * 6
+
+    def problems_with(**change: object) -> str:
+        return "; ".join(find_problems(replace(resettled, **change), SPEC))  # type: ignore[arg-type]
+
+    assert "still moves at 2.0e-01" in problems_with(speeds=(*calm[1:], 0.2))
+    assert "still moves at 3.0e-01" in problems_with(spins=(*calm[1:], 0.3))
+    assert "overlaps by 1.1e-04 m" in problems_with(gap_m=-1.1e-4)
+    assert "overlapped by 6.0e-03 m on the way" in problems_with(deepest_m=6e-3)
+    assert "tilts by 0.0 degrees" in problems_with(poses=(level,) * 6)
+    assert "reaches 0.200 m" in problems_with(poses=(far,) * 6)
+    assert "leaves only the markers (0, 2, 4) free" in problems_with(poses=(far,) * 6)
+
+
+def test_marker_is_free_unless_steel_is_near() -> None:
+    board = BoardSpec()
+    all_markers = (0, 1, 2, 3, 4, 5)
+    line_m = np.array([[0.05, -0.1, 0.3], [0.05, 0.1, 0.3]])
+    assert free_markers([line_m], 0.005, board) == all_markers
+    edge_m = 0.172 - 0.025 - 0.05 / 6 - 0.005
+    assert free_markers([line_m * [0, 1, 1] + [edge_m - 1e-6, 0, 0]], 0.005, board) == all_markers
+    assert free_markers([line_m * [0, 1, 1] + [edge_m + 1e-6, 0, 0]], 0.005, board) == (0, 2, 4)
+
+
+def test_initial_stirrups_are_vertically_separated() -> None:
+    line_m = spec_centreline_m(SPEC)
+    for seed in range(50):
+        starts = drop_poses(DropSpec(tilt_deg=10.0), line_m, 6, np.random.default_rng(seed))
+        heights_m = [points_in_world_m(line_m, pose)[:, 2] for pose in starts]
+        assert heights_m[0].min() > 0.006
+        assert all(above.min() - below.max() > 0.011 for below, above in pairwise(heights_m))
+
+
+def test_command_rejects_negative_seed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["simulate_pile", "--seed", "-1", "--out", str(tmp_path / "x.json")])
+    with pytest.raises(SystemExit, match="2"):
+        simulate_pile.main()
+    assert "-1 is not a valid seed" in capsys.readouterr().err
+    assert not (tmp_path / "x.json").exists()

@@ -1,12 +1,16 @@
-"""Sensor model: noise, vignetting, demosaicing and JPEG against formulas computed here independently."""
+"""Printed board, whose markers OpenCV finds in their places, and sensor model, against independent formulas."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
+from jaxtyping import Float64
+from numpy import ndarray
 
+from dataset_builder.scene.board_texture import board_texture
 from dataset_builder.scene.variants.sensor import (
     SensorSpec,
     apply_sensor,
@@ -19,10 +23,74 @@ from dataset_builder.scene.variants.sensor import (
     sensor_spec,
 )
 from dataset_builder.specs.config_specs import AppearanceSpec, LatticeSpec, SceneSpec
+from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
+
+PX_PER_M = 6000.0
+FOOTPRINT_M = 0.05
+BOARDS = pytest.mark.parametrize("board", [BoardSpec(markers=6), BoardSpec(markers=12)], ids=["6", "12"])
 
 SPEC = SensorSpec()
 PLAIN = replace(SPEC, corner_illumination=1.0, jpeg_quality=100, jpeg_subsampling="4:4:4")
 """Noise and demosaicing alone, with the least compression."""
+
+
+def expected_px(board: BoardSpec, corners_m: Float64[ndarray, "4 3"]) -> Float64[ndarray, "4 2"]:
+    """Return world corners in texture pixels: columns along +x, rows along -y, integer pixel centres."""
+    edge_m = np.stack([corners_m[:, 0] + board.width_m / 2, board.height_m / 2 - corners_m[:, 1]], axis=1)
+    return np.asarray(edge_m * PX_PER_M - 0.5)
+
+
+@BOARDS
+def test_opencv_detects_markers_at_layout_positions(board: BoardSpec) -> None:
+    texture = board_texture(board, PX_PER_M)
+    assert (texture.shape, texture.dtype) == ((1782, 2520), np.uint8)
+    assert (texture == 255).mean() > 0.75
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    detections, ids, _ = cv2.aruco.ArucoDetector(dictionary).detectMarkers(texture)
+    layout = marker_corners_m(board)
+    assert sorted(ids.ravel().tolist()) == sorted(layout) == list(range(board.markers))
+    for marker_id, detected in zip(ids.ravel().tolist(), detections, strict=True):
+        # The detector reports corner pixels, up to half a pixel inside the edge.
+        np.testing.assert_allclose(detected[0], expected_px(board, layout[marker_id]), atol=0.6)
+
+
+@BOARDS
+def test_marker_edges_are_exact_to_the_pixel(board: BoardSpec) -> None:
+    texture = board_texture(board, PX_PER_M)
+    for corners_m in marker_corners_m(board).values():
+        left, top = np.round(expected_px(board, corners_m)[0] + 0.5).astype(int)
+        side = round(board.marker_side_m * PX_PER_M)
+        module = side // 6
+        marker = texture[top : top + side, left : left + side]
+        frame = np.concatenate([marker[0], marker[-1], marker[:, 0], marker[:, -1]])
+        assert (frame == 0).all()
+        around = texture[top - module : top + side + module, left - module : left + side + module].copy()
+        assert around.shape == (side + 2 * module, side + 2 * module)
+        around[module:-module, module:-module] = 255
+        assert (around == 255).all()
+
+
+@BOARDS
+def test_markers_are_on_sheet_and_clear_of_steel(board: BoardSpec) -> None:
+    for corners_m in marker_corners_m(board).values():
+        assert (corners_m[:, 2] == 0.0).all()
+        assert (np.abs(corners_m[:, 0]) <= board.width_m / 2).all()
+        assert (np.abs(corners_m[:, 1]) <= board.height_m / 2).all()
+        nearest_m = np.abs(corners_m[:, :2]).min(axis=0) * (np.ptp(np.sign(corners_m[:, :2]), axis=0) == 0)
+        assert nearest_m.max() > FOOTPRINT_M + 0.02
+        np.testing.assert_allclose(np.linalg.norm(np.diff(corners_m, axis=0), axis=1), board.marker_side_m)
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        ({"markers": 7}, "6 or 12"),
+        ({"markers": 12, "marker_side_m": 0.084}, "quiet zone"),
+    ],
+)
+def test_invalid_boards_are_rejected(change: dict[str, int], reason: str) -> None:
+    with pytest.raises(ValueError, match=reason):
+        board_texture(replace(BoardSpec(), **change), PX_PER_M)  # type: ignore[arg-type]
 
 
 def flat(level: int | tuple[int, int, int], height: int = 120, width: int = 160) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The command ``rebar-build inspect``: what it prints and writes for sound, damaged and hostile files."""
+"""The command ``rebar-build inspect``: its table, files and picture, and the overlaps of bars."""
 
 from __future__ import annotations
 
@@ -13,16 +13,19 @@ import pytest
 import trimesh
 from PIL import Image, ImageDraw
 from rich.console import Console
+from scipy.spatial import cKDTree
 
 from dataset_builder.cli.main import main
+from dataset_builder.inspection import summary as summary_module
 from dataset_builder.inspection.picture import _draw_scale_bar, font, inspection_picture
 from dataset_builder.inspection.report import inspection_json, print_inspection
-from dataset_builder.inspection.summary import bar_box_m, inspect_cage
+from dataset_builder.inspection.summary import MIN_OVERLAP_M, bar_box_m, inspect_cage, overlaps
 from dataset_builder.pipeline.plan import MAX_NOTES, print_notes
 from dataset_builder.scene.assemblies.bar_meshes import bar_mesh
 from dataset_builder.scene.assemblies.cage import Cage, CageBar, LeftOut
 from dataset_builder.scene.model import Mesh, Note, axis_of
 from dataset_builder.scene.shapes.bending import bent_line_m
+from rebar_depth_bench.bar_crossings.axis_segments import TooManyNeighboursError
 from rebar_depth_bench.data.bars import Bar
 from tests.builder.catalog.scene_files import BAR, MM, write_scene
 from tests.builder.user_files.ifc_writer import Ifc
@@ -40,6 +43,7 @@ def rods(folder: Path) -> Path:
     return folder / "Rods.stl"
 
 
+@pytest.mark.slow
 def test_json_lists_every_bar(tmp_path: Path) -> None:
     outputs = tmp_path / "a.json", tmp_path / "a.png"
     completed = run_in_process(main, "inspect", COLUMN, "--json", outputs[0], "--picture", outputs[1])
@@ -76,6 +80,7 @@ def test_dash_suppresses_the_table(tmp_path: Path) -> None:
     assert "steel:" in run_in_process(main, "inspect", scene).stdout
 
 
+@pytest.mark.slow
 def test_problems_are_told_after_everything_else(tmp_path: Path) -> None:
     ifc = Ifc()
     ifc.bar(ifc.disc(ifc.polyline((0, 0, 0), (500, 0, 0)), 8.0), NominalDiameter=32.0)
@@ -92,7 +97,7 @@ def test_problems_are_told_after_everything_else(tmp_path: Path) -> None:
     ("name", "content", "words"),
     [
         ("a.toml", "x", "a.toml"),
-        ("a.ifc", "ISO-10303-21;", "a.ifc"),
+        pytest.param("a.ifc", "ISO-10303-21;", "a.ifc", marks=pytest.mark.slow),
         ("a.stl", "solid x", "a.stl"),
         ("a.txt", "", "a.txt"),
         ("a.toml", 'ifc = "missing.ifc"', "missing.ifc"),
@@ -208,3 +213,52 @@ def test_font_has_the_letters_of_names() -> None:
         return bytes(font(40).getmask(character))
 
     assert all(drawn(character) != drawn("\U0010ffff") for character in "…–éßΩЖ\N{REPLACEMENT CHARACTER}")
+
+
+def rod(bar_id: int, start: tuple[float, ...], end: tuple[float, ...], diameter_m: float = 0.012) -> Bar:
+    return Bar(bar_id, "bar", diameter_m, axis_of(np.array([start, end], dtype=np.float64)))
+
+
+def test_overlaps_are_those_of_sampled_axes() -> None:
+    random = np.random.default_rng(3)
+    bars = [
+        Bar(number, "bar", float(random.uniform(0.02, 0.06)), axis_of(random.uniform(0, 1, (4, 3))))
+        for number in range(1, 19)
+    ]
+    at = np.linspace(0, 3, 3000)
+    samples_m = [
+        np.stack([np.interp(at, range(4), xyz) for xyz in zip(*bar.axis_m, strict=True)], 1) for bar in bars
+    ]
+    expected = {}
+    for index, a in enumerate(bars):
+        tree = cKDTree(samples_m[index])
+        for b, points_m in zip(bars[index + 1 :], samples_m[index + 1 :], strict=True):
+            depth_m = (a.diameter_m + b.diameter_m) / 2 - tree.query(points_m, distance_upper_bound=0.1)[0].min()
+            if depth_m > MIN_OVERLAP_M:
+                expected[a.bar_id, b.bar_id] = depth_m
+    found = {(pair.bar_a, pair.bar_b): pair.depth_m for pair in overlaps(bars)}
+    assert len(expected) > 20
+    assert expected.keys() <= found.keys()
+    for pair, depth_m in found.items():
+        sampled_m = expected.get(pair, MIN_OVERLAP_M)
+        assert sampled_m - 1e-9 <= depth_m <= sampled_m + 1.5e-3  # Samples are up to 1.7 mm apart.
+    assert list(found.values()) == sorted(found.values(), reverse=True)
+
+
+def test_bars_that_touch_do_not_overlap() -> None:
+    long, across = rod(1, (-2, 0, 0), (2, 0, 0)), rod(2, (0, -2, 0.012), (0, 2, 0.012))
+    assert overlaps([long, across]) == []
+    (pair,) = overlaps([long, rod(2, (0, -2, 0.011), (0, 2, 0.011))])
+    assert (pair.bar_a, pair.bar_b, round(pair.depth_m, 9)) == (1, 2, 0.001)
+    np.testing.assert_allclose(pair.point_m, (0, 0, 0.0055), atol=1e-9)
+
+
+def test_bars_without_axis_and_single_bars_have_no_overlaps() -> None:
+    assert overlaps([rod(1, (0, 0, 0), (1, 0, 0)), Bar.without_axis(2, "imported")]) == []
+
+
+def test_too_many_neighbours_are_not_compared(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(summary_module, "MAX_PAIRS", 1000)
+    crowd = [rod(number, (0, 0, 0), (0.05, 0, 0)) for number in range(1, 100)]
+    with pytest.raises(TooManyNeighboursError):
+        overlaps(crowd)
