@@ -27,15 +27,7 @@ from tests.builder.push.published import (
     visible,
     write_publishable,
 )
-from tests.hub_server import (
-    GITATTRIBUTES,
-    LFS_SUFFIXES,
-    READ_TOKEN,
-    TOKEN,
-    HubServer,
-    folder_files,
-    running_hub,
-)
+from tests.hub_server import GITATTRIBUTES, LFS_SUFFIXES, READ_TOKEN, TOKEN, HubServer, folder_files, running_hub
 from tests.synthetic_dataset import write_dataset
 
 READ_BACK = """
