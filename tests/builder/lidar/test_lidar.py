@@ -74,9 +74,8 @@ def test_sub_rays_have_gaussian_beam_width_at_any_range(
     offsets_m = (origins + range_m * directions - range_m * directions_from_angles(*angles)[:, None])[0]
     assert offsets_m.mean(axis=0) == pytest.approx(np.zeros(3), abs=1e-12)
     assert np.abs(offsets_m @ directions_from_angles(*angles)[0]).max() < 1e-9
-    mean_square_radius_m2 = (
-        (offsets_m**2).sum(axis=1).mean()
-    )  # ISO 11146: d = 2 sqrt(2) times the root mean square radius
+    # ISO 11146: d = 2 sqrt(2) times the root mean square radius
+    mean_square_radius_m2 = (offsets_m**2).sum(axis=1).mean()
     assert 8 * mean_square_radius_m2 == pytest.approx(0.004**2 + (0.01 * range_m) ** 2, rel=1e-9)
 
 
@@ -98,10 +97,8 @@ def test_visible_sector_contains_all_pixels_at_any_depth(depth_m: float, right_m
     x, y, z = np.moveaxis(depth_m * rays - np.array([right_m, down_m, 0.0]), -1, 0)
     column = np.floor(np.arctan2(x, z) / 0.01)
     row = np.floor(np.arctan2(-y, np.hypot(x, z)) / 0.01)
-    assert column.min() >= columns.min()
-    assert column.max() <= columns.max()
-    assert row.min() >= rows.min()
-    assert row.max() <= rows.max()
+    assert columns.min() <= column.min() <= column.max() <= columns.max()
+    assert rows.min() <= row.min() <= row.max() <= rows.max()
 
 
 def test_rows_are_limited_to_scanner_field_of_view() -> None:
@@ -228,9 +225,8 @@ def reference_range_m(spec: ScannerSpec, range_m: np.ndarray, cosines: np.ndarra
 
 
 RANGE_VALUES_M = st.sampled_from([0.2, 0.9, 1.0, 1.1, 1.2, 2.0, 30.0, math.inf])
-CHAINED_RANGES_M = np.tile(
-    [0.9, 1.0, 1.1, 1.2, 2.0, math.inf], (3, 1)
-)  # Neighbours are within the resolution, the ends are not.
+# Neighbours are within the resolution, the ends are not.
+CHAINED_RANGES_M = np.tile([0.9, 1.0, 1.1, 1.2, 2.0, math.inf], (3, 1))
 
 
 @pytest.mark.slow

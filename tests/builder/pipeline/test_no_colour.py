@@ -13,16 +13,14 @@ from PIL import Image
 
 import rebar_depth_bench as rdb
 from dataset_builder.audit import audit
-from dataset_builder.cli.main import main
 from dataset_builder.export import export
 from dataset_builder.pipeline.contact_sheet import TILE_PX
-from dataset_builder.pipeline.plan import BUILD_FOLDER
 from rebar_depth_bench.base.errors import DatasetError
 from rebar_depth_bench.cli.main import main as rebar_bench
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import ConfigViews
 from rebar_depth_bench.data.schema import COLUMNS
-from tests.building import TINY, TINY_VIEWS, RunBuild, contents
+from tests.building import TINY, TINY_VIEWS, RunBuild
 from tests.commands import run_in_process
 
 SIZE = TINY[:4]
@@ -105,17 +103,6 @@ def test_method_that_asks_for_colour_later_is_refused(root: Path) -> None:
     assert len(list(views.rows("left_depth"))) == TINY_VIEWS
     with pytest.raises(DatasetError, match="right_rgb"):
         next(views.rows("left_depth", "right_rgb"))
-
-
-def test_config_with_colour_is_not_replaced(tiny_root: Path) -> None:
-    before = contents(tiny_root)
-    options = ("--config", "pile", "lattice", *SIZE, "--no-colour")
-    process = run_in_process(main, "--out", tiny_root, *options)
-    assert process.returncode == 2
-    assert "config lattice: 9 finished views would be lost" in process.stderr
-    assert "colour is {'samples': 2, 'steel_samples': 8" in process.stderr
-    assert contents(tiny_root) == before
-    assert not (tiny_root / BUILD_FOLDER).exists()
 
 
 def test_audit_contact_sheet_and_export_have_depth_alone(root: Path, tmp_path: Path) -> None:
