@@ -87,6 +87,13 @@ def test_growing_config_renders_only_new_views(
     assert not (tmp_path / "grown" / BUILD_FOLDER).exists()
 
 
+def test_build_without_colour_keeps_staged_views_that_may_have_colour(tmp_path: Path) -> None:
+    staged = tmp_path / BUILD_FOLDER / "lattice-0123456789abcdef" / "rows"
+    staged.mkdir(parents=True)
+    assert built(tmp_path, lattice(2))[1].built == ["lattice"]
+    assert staged.is_dir()
+
+
 def test_views_that_are_not_among_more_views_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     built(tmp_path, lattice(2))
     assert capsys.readouterr().err == ""
