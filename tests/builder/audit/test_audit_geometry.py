@@ -36,6 +36,8 @@ from dataset_builder.scene.model import ESTIMATED_ROLE
 from dataset_builder.scene.shapes.bending import bent_line_m
 from tests.builder.audit.audit_scene import RIGS, config, scene, view, with_depth
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("rig", RIGS)
 def test_correct_depth_passes_and_wrong_depth_fails_on_every_grid(rig: str) -> None:
@@ -156,7 +158,6 @@ def test_points_beyond_lens_model_are_not_in_frame() -> None:
     assert not behind.inside.any()
 
 
-@pytest.mark.slow
 @settings(max_examples=30)
 @given(st.integers(0, 2**32 - 1), st.integers(2, 9), st.sampled_from([0.1, 5.0]))
 def test_polyline_distance_is_that_of_nearest_segment(seed: int, corners: int, size_m: float) -> None:

@@ -55,6 +55,8 @@ from tests.builder.cameras.survey_cages import (
 )
 from tests.builder.catalog.scene_files import write_scene
 
+pytestmark = pytest.mark.slow
+
 DISTANCES_M = (0.5, 1.0, 4.0)
 VIEWS = 20
 KEYS = f"distances = [500, 1000, 4000]\nviews_per_distance = {VIEWS}"
@@ -104,7 +106,6 @@ def placed(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     return place(tmp_path_factory.mktemp("survey"), scene(bars(), KEYS))
 
 
-@pytest.mark.slow
 def test_cameras_have_stated_distances_from_steel_that_they_aim_at(placed: Placed) -> None:
     assert view_count(placed.survey) == len(placed.survey.stations) == 3 * VIEWS
     assert placed.survey.distances_m == DISTANCES_M
@@ -122,7 +123,6 @@ def test_cameras_have_stated_distances_from_steel_that_they_aim_at(placed: Place
         assert z > 0
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("eye", ["left", "right"])
 def test_eyes_are_above_ground_and_clear_of_all_steel(placed: Placed, eye: str) -> None:
     eyes_m = placed.eyes_m(eye)
@@ -133,7 +133,6 @@ def test_eyes_are_above_ground_and_clear_of_all_steel(placed: Placed, eye: str) 
     assert np.hypot(*eyes_m[:, :2].T).max() <= 20.5
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("eye", ["left", "right"])
 def test_lines_of_sight_are_free(placed: Placed, eye: str) -> None:
     for eye_m, aimed_m in zip(placed.eyes_m(eye), placed.aimed_m, strict=True):
@@ -143,7 +142,6 @@ def test_lines_of_sight_are_free(placed: Placed, eye: str) -> None:
         assert surface_distance_m(line_m, placed.assembly.bars).min() > 0
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("eye", ["left", "right"])
 def test_near_steel_covers_little_of_each_image(placed: Placed, eye: str) -> None:
     """March the rays of another image to half the distance; the shares differ by up to 2 % of the image."""
@@ -163,7 +161,6 @@ def test_near_steel_covers_little_of_each_image(placed: Placed, eye: str) -> Non
         assert is_near.mean() <= 0.04
 
 
-@pytest.mark.slow
 def test_points_are_spread_evenly(placed: Placed) -> None:
     """Compare with as many random points of the surface: least distances, and distances of the steel from them."""
     sampler = SurfaceSampler(merge_meshes([part.mesh for part in placed.assembly.parts]))
@@ -181,7 +178,6 @@ def test_points_are_spread_evenly(placed: Placed) -> None:
         assert left_out_m < np.median(random[:, 1])
 
 
-@pytest.mark.slow
 def test_consecutive_cameras_are_close_to_each_other(placed: Placed) -> None:
     rng = np.random.default_rng(2)
     for centres_m in np.split(placed.left_m, 3):
@@ -189,7 +185,6 @@ def test_consecutive_cameras_are_close_to_each_other(placed: Placed) -> None:
         assert np.linalg.norm(np.diff(centres_m, axis=0), axis=1).sum() < 0.75 * min(random_m)
 
 
-@pytest.mark.slow
 def test_stations_depend_on_scene_and_seed_only(placed: Placed) -> None:
     survey = replace(placed.survey, stations=())
     assert with_stations(survey, placed.assembly, SITE, RigSpec(), "a") == placed.survey
@@ -197,7 +192,6 @@ def test_stations_depend_on_scene_and_seed_only(placed: Placed) -> None:
     assert not set(other.stations) & set(placed.survey.stations)
 
 
-@pytest.mark.slow
 def test_cameras_within_reach_fit_and_screen_among_them_does_not(placed: Placed) -> None:
     reach_m = np.linalg.norm(placed.assembly.vertices_m - aim_point_m(placed.assembly), axis=1).max()
     assert reach_m > np.linalg.norm(placed.left_m - aim_point_m(placed.assembly), axis=1).min()
@@ -209,7 +203,6 @@ def test_cameras_within_reach_fit_and_screen_among_them_does_not(placed: Placed)
         check_fits(placed.assembly, replace(shadows, protocol=survey))
 
 
-@pytest.mark.slow
 def test_cage_of_12_m_gets_a_survey_outdoors_by_default(tmp_path: Path) -> None:
     placed = place(tmp_path, scene(girder(12_000)))
     assert replace(placed.survey, stations=()) == SurveySpec()
@@ -220,7 +213,6 @@ def test_cage_of_12_m_gets_a_survey_outdoors_by_default(tmp_path: Path) -> None:
     assert surface_distance_m(placed.left_m, placed.assembly.bars).min() >= 0.25
 
 
-@pytest.mark.slow
 def test_survey_of_small_cage_is_in_the_laboratory_above_the_objects_on_its_bench(tmp_path: Path) -> None:
     bars = girder(700)
     placed = place(tmp_path, scene(bars, "distances = [300, 800]\nviews_per_distance = 30"))
@@ -238,7 +230,6 @@ def test_survey_of_small_cage_is_in_the_laboratory_above_the_objects_on_its_benc
         place(tmp_path, f'environment = "laboratory"\n{far}')
 
 
-@pytest.mark.slow
 def test_too_few_places_are_told_with_distance_and_numbers(tmp_path: Path) -> None:
     content = scene(girder(12_000), "distances = [1000, 200000, 300000]\nviews_per_distance = 7")
     path = write_scene(tmp_path, content)
@@ -251,7 +242,6 @@ def test_too_few_places_are_told_with_distance_and_numbers(tmp_path: Path) -> No
     assert str(raised.value).startswith(f"{path}: 2 problems")
 
 
-@pytest.mark.slow
 def test_steel_behind_other_steel_is_not_aimed_at(tmp_path: Path) -> None:
     """Put a bar inside a closed drum of bars that touch: only the drum can be seen."""
     feet_mm = [(300 * cos(radians(turn)), 300 * sin(radians(turn))) for turn in range(0, 360, 3)]

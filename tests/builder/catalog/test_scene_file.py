@@ -183,6 +183,7 @@ def test_large_cage_is_outdoors_and_rejected_in_laboratory(tmp_path: Path) -> No
         scene_config(write_scene(tmp_path, 'environment = "laboratory"\n' + MM + BAR + far))
 
 
+@pytest.mark.slow
 def test_mesh_and_ifc_paths_are_relative_to_scene_file(tmp_path: Path) -> None:
     (tmp_path / "parts").mkdir()
     part = load_cage_text(tmp_path, MM + BAR).parts[0]

@@ -32,11 +32,12 @@ from tests.builder.lidar.lidar_scenes import (
     wall,
 )
 
+pytestmark = pytest.mark.slow
+
 DISTORTION = np.array([-0.175, 0.028, 6.7e-5, -1.5e-4, 0.0])
 STEPS_RAD = st.floats(0.01, 0.1)
 
 
-@pytest.mark.slow
 @settings(max_examples=20)
 @given(st.floats(0.2, 20), STEPS_RAD, STEPS_RAD, st.floats(-0.1, 0.1), st.floats(-0.1, 0.1), st.booleans())
 def test_wall_depth_is_exact_and_complete_at_any_step(
@@ -48,7 +49,6 @@ def test_wall_depth_is_exact_and_complete_at_any_step(
     assert depths_m == pytest.approx(np.full((HEIGHT, WIDTH), depth_m), rel=2e-7)
 
 
-@pytest.mark.slow
 @settings(max_examples=15)
 @given(st.floats(0.2, 1), st.floats(0.005, 0.05), st.floats(-0.35, 0.35), st.floats(-0.06, 0.06), st.booleans())
 @example(0.2, 0.05, 0.35, -0.06, False)
@@ -137,7 +137,6 @@ def test_entry_points_have_summaries_of_simulation_and_minimum_range(
     assert method.info.uses_intrinsics
 
 
-@pytest.mark.slow
 def test_missing_embreex_names_pip_extra() -> None:
     code = """
 import sys
@@ -156,7 +155,6 @@ except MethodError as error:
     )
 
 
-@pytest.mark.slow
 def test_lidar_predictions_of_rendered_dataset_score(tiny_root: Path, tmp_path: Path) -> None:
     archive = tmp_path / "near.zip"
     notes = predict(NEAR_METHOD, tiny_root, archive, configs=["lattice-orbit"])["lattice-orbit"].notes
@@ -178,7 +176,6 @@ def test_lidar_predictions_of_rendered_dataset_score(tiny_root: Path, tmp_path: 
     assert predictions(repeated) == predictions(archive)
 
 
-@pytest.mark.slow
 def test_lattice_is_below_minimum_range_of_mobile_lidar(tiny_root: Path, tmp_path: Path) -> None:
     archive = tmp_path / "mobile.zip"
     coarse = lidar_method("coarse", replace(MOBILE, rays_per_beam=2), "fewer rays, for the test")
@@ -189,7 +186,6 @@ def test_lattice_is_below_minimum_range_of_mobile_lidar(tiny_root: Path, tmp_pat
     assert not table.ranked
 
 
-@pytest.mark.slow
 def test_thin_noiseless_beams_match_ground_truth(tiny_root: Path, tmp_path: Path) -> None:
     """Scan with thin noiseless beams from the camera centre: the remaining error is the size of a cell."""
     thin = replace(

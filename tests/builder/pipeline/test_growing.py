@@ -27,6 +27,8 @@ from rebar_depth_bench.data.files import MANIFEST_FILE, file_problems
 from rebar_depth_bench.data.manifest import open_folder
 from tests.building import contents
 
+pytestmark = pytest.mark.slow
+
 SIZE: dict[str, Any] = {"width": 32, "height": 18, "colour": None}
 
 
@@ -242,7 +244,6 @@ def first_depth(root: Path) -> list[bytes]:
     return [plain, rdb.load(root, "cages", split="train", columns=["left_depth"])[0]["left_depth"].tobytes()]
 
 
-@pytest.mark.slow
 def test_added_and_rebuilt_scenes_are_loaded_in_place_of_cached_ones(tmp_path: Path) -> None:
     """Load with the caches of ``datasets``, which know folders by their paths."""
     root = tmp_path / "dataset"
