@@ -90,9 +90,10 @@ def test_growing_config_renders_only_new_views(
 
 
 def test_build_without_colour_keeps_staged_views_that_may_have_colour(tmp_path: Path) -> None:
+    built(tmp_path, lattice(2))
     staged = tmp_path / BUILD_FOLDER / "lattice-0123456789abcdef" / "rows"
     staged.mkdir(parents=True)
-    assert built(tmp_path, lattice(2))[1].built == ["lattice"]
+    assert built(tmp_path, lattice(6))[1].built == ["lattice"]
     assert staged.is_dir()
 
 
