@@ -18,10 +18,11 @@ from dataset_builder.audit.checks import AuditedConfig, AuditedEye, AuditedView
 from dataset_builder.cameras.rigs import rig_cameras
 from dataset_builder.cameras.trajectories import look_at_with_rig
 from dataset_builder.scene.board_texture import board_texture
-from dataset_builder.scene.model import WorldMesh
+from dataset_builder.scene.model import Mesh, axis_of
 from dataset_builder.scene.raycast import RayCaster
 from dataset_builder.scene.shapes.bar_mesh import plain_bar_mesh
 from dataset_builder.scene.shapes.bending import bent_line_m
+from dataset_builder.scene.shapes.solids import world_mesh
 from dataset_builder.specs.config_specs import RigSpec
 from rebar_depth_bench.captures.calibration import Lens, StereoCalibration
 from rebar_depth_bench.data.bars import Bar
@@ -71,20 +72,11 @@ def scene() -> Scene:
         np.array([[0.0, -0.05, 0.04], [0.0, 0.12, 0.04]]),
         bent_axis_m,
     ]
-    steel = tuple(
-        Bar(n, "bar", 0.010, tuple((float(x), float(y), float(z)) for x, y, z in axis_m))
-        for n, axis_m in enumerate(axes_m, start=1)
-    )
+    steel = tuple(Bar(n, "bar", 0.010, axis_of(axis_m)) for n, axis_m in enumerate(axes_m, start=1))
     meshes = [plain_bar_mesh(axis_m, 0.010) for axis_m in axes_m]
     floor_m = np.array([[-9.0, -9.0, 0.0], [9.0, -9.0, 0.0], [9.0, 9.0, 0.0], [-9.0, 9.0, 0.0]])
-    vertices = [*(mesh.vertices_m for mesh in meshes), floor_m]
-    faces = [*(mesh.faces for mesh in meshes), np.array([[0, 1, 2], [0, 2, 3]])]
-    vertex_offsets = np.cumsum([0, *(len(part) for part in vertices)])
-    ids = np.repeat([1, 2, 3, 0], [len(part) for part in faces]).astype(np.uint16)
-    all_faces = np.concatenate([part + start for part, start in zip(faces, vertex_offsets, strict=False)]).astype(
-        np.int32
-    )
-    return Scene(steel, RayCaster(WorldMesh(np.concatenate(vertices), all_faces, ids)))
+    floor = Mesh(floor_m, np.array([[0, 1, 2], [0, 2, 3]], np.int32))
+    return Scene(steel, RayCaster(world_mesh([*meshes, floor], [1, 2, 3, 0])))
 
 
 def config(board: BoardSpec | None = BOARD, variants: tuple[str, ...] = ()) -> AuditedConfig:

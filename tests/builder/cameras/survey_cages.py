@@ -8,6 +8,9 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from dataset_builder.scene.model import Assembly
+from dataset_builder.scene.raycast import RayCaster
+from dataset_builder.scene.shapes.solids import world_mesh
 from rebar_depth_bench.data.bars import Bar
 
 Corners = Sequence[tuple[float, float, float]]
@@ -78,3 +81,8 @@ def surface_distance_m(points_m: Float64[ndarray, "n 3"], bars: Sequence[Bar]) -
     share = np.einsum("nsk,sk->ns", points_m[:, None] - starts_m, along_m) / (along_m**2).sum(axis=1)
     nearest_m = starts_m + np.clip(share, 0, 1)[..., None] * along_m
     return np.asarray((np.linalg.norm(points_m[:, None] - nearest_m, axis=2) - radii_m).min(axis=1))
+
+
+def steel_caster(assembly: Assembly) -> RayCaster:
+    """Return a ray caster of the steel of an assembly as one bar."""
+    return RayCaster(world_mesh([part.mesh for part in assembly.parts], [1] * len(assembly.parts)))

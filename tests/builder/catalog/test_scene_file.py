@@ -1,4 +1,4 @@
-"""User scenes as TOML: bar geometry, units and default cameras."""
+"""User scenes as TOML: bar geometry, units, default cameras, surroundings, and the files that they name."""
 
 from __future__ import annotations
 
@@ -17,15 +17,23 @@ from scipy.spatial import cKDTree
 
 from dataset_builder.cameras.camera_fit import check_fits
 from dataset_builder.cameras.trajectories import aim_point_m, view_count
-from dataset_builder.catalog.named_configs import LATTICE_DOME
+from dataset_builder.catalog.named_configs import LATTICE_DOME, BuildRequest
 from dataset_builder.catalog.scene_file import NEAREST_RADIUS_PER_REACH, scene_config
 from dataset_builder.scene.assemblies.bar_meshes import MAX_RIBS_PER_ROW
 from dataset_builder.scene.assemblies.cage import CageBar
 from dataset_builder.scene.assemblies.lattice import lattice_assembly
+from dataset_builder.scene.cages.generate import FAMILIES
+from dataset_builder.scene.environments.surroundings import (
+    FORMWORK_FAMILIES,
+    LIFE_SIZE_ENVIRONMENTS,
+    SURROUNDINGS,
+    check_suitable,
+)
 from dataset_builder.scene.mesh_ply import write_mesh_ply
 from dataset_builder.scene.model import Assembly, WorldMesh
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
-from dataset_builder.specs.config_specs import DomeSpec, LatticeSpec, RingSpec
+from dataset_builder.scene.variants.registry import LIGHT_SLOT, PROPS_SLOT, VARIANTS
+from dataset_builder.specs.config_specs import DomeSpec, LatticeSpec, RingSpec, SurveySpec
 from dataset_builder.specs.file_specs import CageFileSpec, MeshFileSpec
 from dataset_builder.user_files.cage_file import cage_file_spec, load_cage
 from dataset_builder.user_files.make_assembly import make_assembly
@@ -55,11 +63,9 @@ def sample_axis_m(bar: Bar, step_m: float = 5e-4) -> ndarray:
 def test_examples_are_above_board_without_touching_bars(name: str) -> None:
     config = scene_config(EXAMPLES / name)
     assembly = make_assembly(config.scene.assembly)
-    vertices_m = np.concatenate([part.mesh.vertices_m for part in assembly.parts])
-    assert 0 < vertices_m[:, 2].min() < 0.001
+    assert 0 < assembly.vertices_m[:, 2].min() < 0.001
     # The quiet zones of the markers begin at x = 0.139 m.
-    assert np.abs(vertices_m[:, 0]).max() < 0.139
-    assert np.abs(vertices_m[:, 1]).max() < 0.07
+    assert (np.abs(assembly.vertices_m).max(axis=0)[:2] < [0.139, 0.07]).all()
     lines = [sample_axis_m(bar) for bar in assembly.bars]
     trees = [cKDTree(line) for line in lines]
     radii_m = [outer_radius_m(bar.diameter_m) for bar in assembly.bars]
@@ -71,9 +77,7 @@ def test_examples_are_above_board_without_touching_bars(name: str) -> None:
 
 
 def test_bars_have_specified_geometry(tmp_path: Path) -> None:
-    content = (
-        MM
-        + """
+    content = """
 [[bar]]
 diameter = 9
 points = [[-100, 7, 50.5], [100, 7, 50.5]]
@@ -91,8 +95,7 @@ diameter = 10
 bend_diameter = 100
 points = [[0, 200, 20], [300, 200, 20], [300, 400, 20]]
 """
-    )
-    assembly = load_cage_text(tmp_path, content)
+    assembly = load_cage_text(tmp_path, MM + content)
     first, second, third, fourth = assembly.bars
     assert first == Bar(2, "edge bar", 0.009, ((-0.1, 0.007, 0.0505), (0.1, 0.007, 0.0505)))
     assert second == Bar(1, "bar", 0.016, ((0.0, 0.0, 0.003), (0.0, 0.0, 0.3)))
@@ -133,8 +136,7 @@ def test_default_dome_scales_with_steel_extent(tmp_path: Path) -> None:
     ratio = np.array(config.protocol.radii_m) / np.array(LATTICE_DOME.radii_m)
     np.testing.assert_allclose(ratio, ratio[0], atol=0.003)
     lattice = lattice_assembly(LatticeSpec())
-    vertices_m = np.concatenate([part.mesh.vertices_m for part in lattice.parts])
-    reach_m = float(np.linalg.norm(vertices_m - aim_point_m(lattice), axis=1).max())
+    reach_m = float(np.linalg.norm(lattice.vertices_m - aim_point_m(lattice), axis=1).max())
     assert min(LATTICE_DOME.radii_m) == pytest.approx(NEAREST_RADIUS_PER_REACH * reach_m, rel=0.08)
 
 
@@ -181,6 +183,7 @@ def test_large_cage_is_outdoors_and_rejected_in_laboratory(tmp_path: Path) -> No
         scene_config(write_scene(tmp_path, 'environment = "laboratory"\n' + MM + BAR + far))
 
 
+@pytest.mark.slow
 def test_mesh_and_ifc_paths_are_relative_to_scene_file(tmp_path: Path) -> None:
     (tmp_path / "parts").mkdir()
     part = load_cage_text(tmp_path, MM + BAR).parts[0]
@@ -197,15 +200,15 @@ def test_mesh_and_ifc_paths_are_relative_to_scene_file(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["/etc/passwd", "../a.ply", "parts/../../a.ply", "~/a.ply", "a\\u001bb.ply", "."])
-@pytest.mark.parametrize("key", ["mesh", "ifc"])
-def test_files_outside_the_folder_of_the_scene_are_not_opened(tmp_path: Path, key: str, name: str) -> None:
+def test_files_outside_the_folder_of_the_scene_are_not_opened(tmp_path: Path, name: str) -> None:
     (tmp_path / "a.ply").write_text("secret")
     (tmp_path / "scene").mkdir()
-    with pytest.raises(InputError) as caught:
-        scene_config(write_scene(tmp_path / "scene", f'{MM}{key} = "{name}"\n'))
-    assert [(problem.code, problem.where) for problem in caught.value.problems] == [("invalid", key)]
-    assert "in the folder of this file" in str(caught.value)
-    assert "secret" not in str(caught.value)
+    for key in ("mesh", "ifc"):
+        with pytest.raises(InputError) as caught:
+            scene_config(write_scene(tmp_path / "scene", f'{MM}{key} = "{name}"\n'))
+        assert [(problem.code, problem.where) for problem in caught.value.problems] == [("invalid", key)]
+        assert "in the folder of this file" in str(caught.value)
+        assert "secret" not in str(caught.value)
 
 
 def test_errors_of_named_files_name_scene_and_key(tmp_path: Path) -> None:
@@ -270,3 +273,62 @@ def test_straight_segments_next_to_bends_keep_section(tmp_path: Path) -> None:
     rings = np.unique(np.round(straight[:, 0], 9))
     # One diameter before the bend, which begins at 275 mm, and perpendicular to the segment.
     assert rings.tolist() == [0.0, 0.265]
+
+
+SMALL_SURVEY = '[cameras]\nkind = "survey"\ndistances = [1000]\nviews_per_distance = 4\n'
+
+
+def test_tables_name_environments_and_families() -> None:
+    assert set(LIFE_SIZE_ENVIRONMENTS) < set(SURROUNDINGS)
+    assert set(FORMWORK_FAMILIES) < set(FAMILIES)
+    for name in LIFE_SIZE_ENVIRONMENTS:
+        surroundings = SURROUNDINGS[name]
+        assert surroundings.steel_radius_m > 3, "cages have diagonals of 5 m"
+        assert set(surroundings.variants(PROPS_SLOT)) == {
+            variant.name for variant in VARIANTS.values() if variant.slot == PROPS_SLOT
+        }
+
+
+@pytest.mark.parametrize("place", ["hall", "deck"])
+def test_shadows_suit_only_places_with_room_for_the_screen(place: str, tmp_path: Path) -> None:
+    assert "shadows" not in SURROUNDINGS[place].variants(LIGHT_SLOT)
+    assert "dusk" in SURROUNDINGS[place].variants(LIGHT_SLOT)
+    with pytest.raises(InputError) as raised:
+        check_suitable(place, ("dusk", "shadows"))
+    assert [(problem.code, problem.where) for problem in raised.value.problems] == [("conflict", "'shadows'")]
+    config = scene_config(write_scene(tmp_path, f'environment = "{place}"\n' + MM + BAR))
+    BuildRequest(configs=(), variants=("dusk",), scenes=(config,)).config_specs()
+    with pytest.raises(InputError, match="laboratory, outdoors"):
+        BuildRequest(configs=(), variants=("shadows",), scenes=(config,)).config_specs()
+
+
+@pytest.mark.parametrize(("place", "limit_m"), [("hall", 10.4), ("deck", 8.3)])
+def test_scene_file_names_hall_or_deck(place: str, limit_m: float, tmp_path: Path) -> None:
+    head = f'environment = "{place}"\n' + MM
+    config = scene_config(write_scene(tmp_path, head + BAR))
+    assert isinstance(config.protocol, DomeSpec)
+    assert (config.scene.environment, config.scene.board) == (place, None)
+    ring = f'[cameras]\nkind = "ring"\nradius = {1000 * limit_m + 200:g}\nelevation_deg = 5\nazimuths = 4\n'
+    with pytest.raises(
+        InputError, match=rf"cameras are .* m from the world's origin, expected at most {limit_m} m in .* {place}"
+    ):
+        scene_config(write_scene(tmp_path, head + BAR + ring))
+    high = '[cameras]\nkind = "ring"\nradius = 9000\nelevation_deg = 80\nazimuths = 4\n'
+    with pytest.raises(InputError, match=r"cameras are .* m high, expected at most"):
+        scene_config(write_scene(tmp_path, head + BAR + high))
+    with pytest.raises(
+        InputError, match=rf"the steel extends 6 m from the world's origin, expected at most 5 m in .* {place}"
+    ):
+        scene_config(write_scene(tmp_path, head + BAR.replace("100", "6000") + SMALL_SURVEY))
+
+
+@pytest.mark.slow
+def test_survey_in_the_hall_stays_below_its_ceiling(tmp_path: Path) -> None:
+    """Survey a bar whose dome does not fit; half of the views above it would be above the ceiling."""
+    bar = "[[bar]]\ndiameter = 32\npoints = [[0, 0, 50], [0, 0, 6000]]\n"
+    survey = '[cameras]\nkind = "survey"\ndistances = [1000, 4000]\nviews_per_distance = 12\n'
+    config = scene_config(write_scene(tmp_path, 'environment = "hall"\n' + MM + bar + survey))
+    assert isinstance(config.protocol, SurveySpec)
+    heights_m = np.array([centre_m[2] for centre_m, _ in config.protocol.stations])
+    assert len(heights_m) == 24
+    assert heights_m.max() <= SURROUNDINGS["hall"].cameras.ceiling_m

@@ -8,8 +8,9 @@ import numpy as np
 
 from dataset_builder.lidar.scan_method import scan_depth_m
 from dataset_builder.lidar.scanner import SURVEY, ScannerSpec
-from dataset_builder.scene.model import WorldMesh
+from dataset_builder.scene.model import Mesh, WorldMesh
 from dataset_builder.scene.raycast import RayCaster
+from dataset_builder.scene.shapes.solids import world_mesh
 from rebar_depth_bench.geometry.cameras import Camera, ideal_K
 
 WIDTH, HEIGHT = 64, 36
@@ -29,30 +30,17 @@ PERFECT = replace(
 """Scanner with infinitely thin beams and without noise."""
 
 
-def quad(corners: list[tuple[float, float, float]]) -> WorldMesh:
-    """Return a planar quadrilateral."""
-    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
-    return WorldMesh(np.array(corners, dtype=float), faces, np.zeros(2, np.uint16))
-
-
 def wall(depth_m: float, left_m: float = -FAR_M, right_m: float = FAR_M, slope: float = 0.0) -> WorldMesh:
     """Return a wall of planar depth ``depth_m + slope * x`` that covers the whole height of the view."""
     near, far = depth_m + slope * left_m, depth_m + slope * right_m
-    return quad(
-        [(left_m, -FAR_M, near), (right_m, -FAR_M, far), (right_m, FAR_M, far), (left_m, FAR_M, near)],
-    )
+    corners_m = [(left_m, -FAR_M, near), (right_m, -FAR_M, far), (right_m, FAR_M, far), (left_m, FAR_M, near)]
+    faces = np.array([[0, 1, 2], [0, 2, 3]], np.int32)
+    return WorldMesh(np.array(corners_m), faces, np.zeros(2, np.uint16))
 
 
 def concatenate_meshes(*meshes: WorldMesh) -> WorldMesh:
     """Return the union of several meshes."""
-    vertex_offsets = np.cumsum([0, *(len(mesh.vertices_m) for mesh in meshes)])
-    return WorldMesh(
-        np.concatenate([mesh.vertices_m for mesh in meshes]),
-        np.concatenate([mesh.faces + offset for mesh, offset in zip(meshes, vertex_offsets, strict=False)]).astype(
-            np.int32
-        ),
-        np.concatenate([mesh.face_bar_id for mesh in meshes]),
-    )
+    return world_mesh([Mesh(mesh.vertices_m, mesh.faces) for mesh in meshes], [0] * len(meshes))
 
 
 def camera(distortion: np.ndarray | None = None) -> Camera:

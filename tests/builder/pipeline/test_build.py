@@ -6,6 +6,8 @@ import json
 import os
 import shutil
 import signal
+import subprocess
+import sys
 import time
 from functools import partial
 from pathlib import Path
@@ -17,9 +19,11 @@ import pytest
 import rebar_depth_bench as rdb
 from dataset_builder.catalog.named_configs import BuildRequest
 from dataset_builder.catalog.scene_file import read_scene
+from dataset_builder.cli.main import main
+from dataset_builder.pipeline.blender_process import DepthTask, _send_task, available_devices
 from dataset_builder.pipeline.build import build
 from dataset_builder.pipeline.plan import BUILD_FOLDER
-from dataset_builder.specs.config_specs import colour_spec
+from dataset_builder.specs.config_specs import CPU, colour_spec
 from dataset_builder.user_files.cage_file import mesh_file_spec
 from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.data.manifest import open_folder
@@ -34,6 +38,9 @@ from tests.building import (
     render_processes_of,
     staged_rows,
 )
+from tests.commands import run_in_process
+from tests.data import orbit
+from tests.data.render import render, render_orbit
 from tests.processes import wait_until
 from tests.requirements import Repetitions
 
@@ -50,27 +57,29 @@ def small_root(tmp_path_factory: pytest.TempPathFactory, run_build: RunBuild) ->
     return root
 
 
-@pytest.fixture(scope="module", params=[SMALL, WITHOUT_COLOUR], ids=["colour", "no colour"])
-def whole_build(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory, run_build: RunBuild
-) -> tuple[tuple[str, ...], Path]:
-    """Return the options of a build, and the folder that it makes without interruption."""
-    if request.param == SMALL:
-        return SMALL, request.getfixturevalue("small_root")
+@pytest.fixture(scope="module")
+def whole_without_colour(tmp_path_factory: pytest.TempPathFactory, run_build: RunBuild) -> Path:
     root = tmp_path_factory.mktemp("no-colour") / "dataset"
     process = run_build("--out", root, *WITHOUT_COLOUR)
     assert process.returncode == 0, process.stderr
-    return WITHOUT_COLOUR, root
+    return root
 
 
+@pytest.mark.parametrize(
+    ("options", "whole"),
+    [(SMALL, "small_root"), (WITHOUT_COLOUR, "whole_without_colour")],
+    ids=["colour", "no colour"],
+)
 def test_killed_builds_resume_to_same_bytes(
-    whole_build: tuple[tuple[str, ...], Path],
+    request: pytest.FixtureRequest,
     tmp_path: Path,
     run_build: RunBuild,
     start_build: StartBuild,
     repetitions: Repetitions,
+    options: tuple[str, ...],
+    whole: str,
 ) -> None:
-    options, whole_root = whole_build
+    whole_root = request.getfixturevalue(whole)
     root = tmp_path / "dataset"
     rng = np.random.default_rng(11)
     for kill in range(repetitions(1, 6)):
@@ -89,34 +98,22 @@ def test_killed_builds_resume_to_same_bytes(
     assert not (root / BUILD_FOLDER).exists()
 
 
-def test_killed_build_leaves_no_render_process(tmp_path: Path, start_build: StartBuild) -> None:
-    build = start_build(tmp_path / "dataset", *SMALL)
-    wait_until(lambda: render_processes_of(build.pid))
-    process_dirs = [Path(f"/proc/{pid}") for pid in render_processes_of(build.pid)]
-    assert all(process_dir.exists() for process_dir in process_dirs)
-    os.kill(build.pid, signal.SIGKILL)
-    build.communicate()
-    wait_until(lambda: not any(process_dir.exists() for process_dir in process_dirs))
-    assert not any(process_dir.exists() for process_dir in process_dirs)
-
-
-def test_worker_count_does_not_change_bytes(
-    whole_build: tuple[tuple[str, ...], Path], tmp_path: Path, run_build: RunBuild
+def test_running_build_locks_its_folder_and_leaves_no_render_process_when_killed(
+    tmp_path: Path, run_build: RunBuild, start_build: StartBuild
 ) -> None:
-    options, whole_root = whole_build
     root = tmp_path / "dataset"
-    process = run_build("--out", root, *options, "--workers", "2")
-    assert process.returncode == 0, process.stderr
-    assert contents(root) == contents(whole_root)
-
-
-def test_second_build_is_up_to_date(small_root: Path, run_build: RunBuild) -> None:
-    before = contents(small_root)
-    mtimes_ns = {path: path.stat().st_mtime_ns for path in small_root.rglob("*.parquet")}
-    process = run_build("build", "--out", small_root, *SMALL)
-    assert "up to date: two-bars" in process.stdout
-    assert contents(small_root) == before
-    assert mtimes_ns == {path: path.stat().st_mtime_ns for path in small_root.rglob("*.parquet")}
+    build = start_build(root, *SMALL)
+    try:
+        wait_until(lambda: render_processes_of(build.pid))
+        second = run_build("--out", root, *SMALL)
+        process_dirs = [Path(f"/proc/{pid}") for pid in render_processes_of(build.pid)]
+        assert [process_dir.exists() for process_dir in process_dirs] == [True]
+    finally:
+        os.kill(build.pid, signal.SIGKILL)
+        build.communicate()
+    assert second.returncode == 2
+    assert "another rebar-build process is using this folder" in second.stderr
+    wait_until(lambda: not any(process_dir.exists() for process_dir in process_dirs))
 
 
 def test_render_process_is_retried_once_then_reported(tmp_path: Path, start_build: StartBuild) -> None:
@@ -145,39 +142,9 @@ def test_build_survives_single_render_crash(small_root: Path, tmp_path: Path, st
     assert contents(root) == contents(small_root)
 
 
-def test_rebuild_with_other_size_invalidates_cache(tmp_path: Path, run_build: RunBuild) -> None:
-    root = tmp_path / "dataset"
-    small = ("--scene", str(TWO_BARS), "--views", "2", "--samples", "1", "--overwrite", "two-bars")
-    assert run_build("--out", root, *small, "--width", "96", "--height", "54").returncode == 0
-    first = datasets.load_dataset(str(root), "two-bars", split="test")
-    assert first[0]["left_rgb"].size == (96, 54)
-    old_shards = set(root.glob("two-bars/*.parquet"))
-    assert run_build("--out", root, *small, "--width", "64", "--height", "36").returncode == 0
-    second = datasets.load_dataset(str(root), "two-bars", split="test")
-    assert second[0]["left_rgb"].size == (64, 36)
-    assert rdb.load(root, "two-bars")[1]["left_depth"].shape == (36, 64)
-    assert not old_shards & set(root.glob("two-bars/*.parquet"))
-
-
-def test_mesh_import_of_lattice_reproduces_ground_truth(
-    tiny_root: Path, tmp_path: Path, run_build: RunBuild
+def test_two_workers_make_the_same_bytes_from_a_scene_file_that_is_read_once(
+    small_root: Path, tmp_path: Path, blender: None
 ) -> None:
-    mesh = tiny_root / "meshes" / "lattice.ply"
-    views = ("--config", "lattice", "--views", "3", *TINY)  # Three of the nine of the sample data.
-    process = run_build("--out", tmp_path / "again", *views, "--mesh", mesh, "--mesh-unit", "m")
-    assert process.returncode == 0, process.stderr
-    original, imported = open_folder(tiny_root), open_folder(tmp_path / "again")
-    assert len(imported.config("lattice").views) == 3
-    assert set(imported.config("lattice").views) <= set(original.config("lattice").views)
-    assert imported.config("lattice").scene.entry["assembly"]["path"] == "lattice.ply"
-    bars = (read_bars(root / "bars.parquet")["lattice"] for root in (tiny_root, tmp_path / "again"))
-    for bar, imported_bar in zip(*bars, strict=True):
-        assert imported_bar.bar_id == bar.bar_id
-        assert imported_bar.diameter_m == pytest.approx(bar.diameter_m, rel=0.01)
-        assert np.array(imported_bar.axis_m) == pytest.approx(np.array(bar.axis_m), abs=1e-4)
-
-
-def test_file_of_a_scene_is_read_once(small_root: Path, tmp_path: Path) -> None:
     file = Path(shutil.copy(TWO_BARS, tmp_path))
     scene = read_scene(file)
     file.unlink()
@@ -193,33 +160,57 @@ def test_file_of_a_scene_is_read_once(small_root: Path, tmp_path: Path) -> None:
     assert contents(tmp_path / "dataset") == contents(small_root)
 
 
-def test_mesh_file_is_read_once_for_all_configs(tmp_path: Path, tiny_root: Path, blender: None) -> None:
-    file = Path(shutil.copy(tiny_root / "meshes" / "lattice.ply", tmp_path))
-    request = BuildRequest(("lattice", "lattice-orbit"), 1, 64, 36, None, mesh=mesh_file_spec(file, "m"))
+def test_two_workers_make_the_same_bytes_without_colour(
+    whole_without_colour: Path, tmp_path: Path, run_build: RunBuild
+) -> None:
+    process = run_build("--out", tmp_path / "dataset", *WITHOUT_COLOUR, "--workers", "2")
+    assert process.returncode == 0, process.stderr
+    assert contents(tmp_path / "dataset") == contents(whole_without_colour)
+
+
+def test_imported_mesh_of_the_lattice_is_read_once_and_reproduces_ground_truth(
+    tiny_root: Path, tmp_path: Path, blender: None
+) -> None:
+    file, root = Path(shutil.copy(tiny_root / "meshes" / "lattice.ply", tmp_path)), tmp_path / "again"
+    # Three of the nine views and one of the two of the sample data.
+    request = BuildRequest(("lattice", "lattice-orbit"), 3, 160, 90, None, mesh=mesh_file_spec(file, "m"))
 
     def remove_file(*_: object) -> None:
         file.unlink(missing_ok=True)
 
-    summary = build(request, tmp_path / "dataset", progress=remove_file)
-    assert summary.built == ["lattice", "lattice-orbit"]
+    assert build(request, root, progress=remove_file).built == ["lattice", "lattice-orbit"]
     assert not file.exists()
+    original, imported = open_folder(tiny_root), open_folder(root)
+    assert len(imported.config("lattice").views) == 3
+    assert set(imported.config("lattice").views) <= set(original.config("lattice").views)
+    assert imported.config("lattice").scene.entry["assembly"]["path"] == "lattice.ply"
+    bars = (read_bars(folder / "bars.parquet")["lattice"] for folder in (tiny_root, root))
+    for bar, imported_bar in zip(*bars, strict=True):
+        assert imported_bar.bar_id == bar.bar_id
+        assert imported_bar.diameter_m == pytest.approx(bar.diameter_m, rel=0.01)
+        assert np.array(imported_bar.axis_m) == pytest.approx(np.array(bar.axis_m), abs=1e-4)
 
 
-def test_concurrent_build_is_rejected(tmp_path: Path, run_build: RunBuild, start_build: StartBuild) -> None:
-    root = tmp_path / "dataset"
-    build = start_build(root, *SMALL)
-    try:
-        wait_until(lambda: render_processes_of(build.pid))
-        process = run_build("--out", root, *SMALL)
-        assert process.returncode == 2
-        assert "another rebar-build process is using this folder" in process.stderr
-    finally:
-        os.killpg(build.pid, signal.SIGKILL)
-        build.communicate()
+def test_colour_and_other_sizes_replace_a_config_also_in_caches(tmp_path: Path, run_build: RunBuild) -> None:
+    root, other = tmp_path / "dataset", tmp_path / "other"
+    views = ("--scene", str(TWO_BARS), "--views", "2")
+    colour = (*views, "--width", "64", "--height", "36", "--samples", "1", "--overwrite", "two-bars")
+    assert run_build("--out", root, *views, "--width", "96", "--height", "54", "--no-colour").returncode == 0
+    first = datasets.load_dataset(str(root), "two-bars", split="test")
+    assert (first[0]["left_rgb"], first[0]["left_preview"].size) == (None, (96, 54))
+    old_shards = set(root.glob("two-bars/*.parquet"))
+    assert "built: two-bars" in run_build("--out", root, *colour).stdout
+    second = datasets.load_dataset(str(root), "two-bars", split="test")
+    assert second[0]["left_rgb"].size == (64, 36)
+    assert rdb.load(root, "two-bars")[1]["left_depth"].shape == (36, 64)
+    assert not old_shards & set(root.glob("two-bars/*.parquet"))
+    assert run_build("--out", other, *colour[:-2]).returncode == 0
+    assert contents(root) == contents(other)
 
 
-def test_config_with_other_scene_parameters_is_rejected(tiny_root: Path, run_build: RunBuild) -> None:
-    process = run_build("--out", tiny_root, "--config", "lattice", *TINY, "--seed", "5", "--overwrite", "lattice")
+def test_config_with_other_scene_parameters_is_rejected(tiny_root: Path) -> None:
+    options = ("--config", "lattice", *TINY, "--seed", "5", "--overwrite", "lattice")
+    process = run_in_process(main, "--out", tiny_root, *options)
     assert process.returncode == 2
     assert "config lattice-orbit was built with other parameters of scene 'lattice'" in process.stderr
 
@@ -238,62 +229,28 @@ def test_manifest_and_card_describe_dataset(tiny_root: Path) -> None:
     )
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (("--config", "latice"), "--config: got 'latice', expected one of lattice"),
-        (("--views", "0"), "--views: got 0, expected 1 to"),
-        (("--width", "2", "--samples", "0"), "--width: got 2, expected 16 to 8192\n  - --samples: got 0"),
-        (("--quality", "high", "--samples", "4"), "--samples: not allowed with argument --quality"),
-        (("--sampling", "best"), "invalid choice: 'best' (choose from 'steel-first', 'uniform')"),
-        (("--workers", "0"), "--workers is 0, expected 1 or more"),
-        (("--no-colour", "--samples", "4"), "--no-colour is combined with --samples 4, expected only one"),
-        (
-            ("--no-colour", "--quality", "high", "--sampling", "uniform", "--device", "cpu"),
-            "--no-colour is combined with --sampling uniform, --quality high, --device cpu, expected only one",
-        ),
-        (("--config", "lattice", "audit", "ROOT"), "--config is followed by the command audit"),
-        (("--views", "3", "audit", "tiny"), "unrecognized arguments: audit tiny"),
-        (("--mesh", "nothing.stl"), "nothing.stl"),
-        (("--mesh", __file__), "unsupported mesh file type '.py', expected"),
-    ],
-)
-def test_invalid_options_exit_2_and_write_nothing(
-    tmp_path: Path, arguments: tuple[str, ...], words: str, run_build: RunBuild
-) -> None:
-    root = tmp_path / "dataset"
-    process = run_build("--out", root, *arguments)
-    assert process.returncode == 2
-    assert words in process.stderr
-    assert "Traceback" not in process.stderr
-    assert not root.exists()
-
-
-@pytest.mark.parametrize("marker", ["notes.txt", ".build/state", "manifest.json", ".rebar-build/state"])
-def test_foreign_folder_is_rejected_and_unchanged(tmp_path: Path, marker: str, run_build: RunBuild) -> None:
-    foreign = [marker, "meshes/mine.ply", "lattice/test-0-of-1.parquet", ".draft.tmp"]
-    for name in foreign:
-        (tmp_path / name).parent.mkdir(exist_ok=True)
-        (tmp_path / name).write_text("mine")
-    process = run_build("--out", tmp_path, *SMALL)
-    assert process.returncode == 2
-    assert "Traceback" not in process.stderr
-    assert sorted(
-        path.relative_to(tmp_path).as_posix() for path in tmp_path.rglob("*") if path.is_file()
-    ) == sorted(foreign)
-
-
-def test_leftovers_of_kill_after_publishing_are_repaired(small_root: Path, run_build: RunBuild) -> None:
-    """Remove the staging folder of a published config and restore files that contradict the manifest."""
+def test_finished_folder_is_up_to_date_and_repaired(small_root: Path, run_build: RunBuild) -> None:
+    """Remove the staging folder of a published config and restore files that a killed build has not written."""
     before = contents(small_root)
+    mtimes_ns = {path: path.stat().st_mtime_ns for path in small_root.rglob("*.parquet")}
+    dry_run = run_build("--out", small_root, *SMALL, "--dry-run").stdout
+    assert "up to date" in dry_run
+    assert "0 of 9 views to render" in dry_run
+    assert {path.name for path in small_root.iterdir() if path.name.startswith(".")} == set()
+    # Without a GPU, the device "auto" is the one of the build.
+    device = ("--device", "auto") if set(available_devices()) == {CPU} else ()
+    assert "up to date: two-bars" in run_build("build", "--out", small_root, *SMALL, *device).stdout
+    assert contents(small_root) == before
+    assert mtimes_ns == {path: path.stat().st_mtime_ns for path in small_root.rglob("*.parquet")}
+
     key = json.loads((small_root / "manifest.json").read_text())["configs"]["two-bars"]["scenes"][0]["key"]
     for name in (key[:16], "0123456789abcdef"):
         (small_root / BUILD_FOLDER / f"two-bars-{name}" / "rows").mkdir(parents=True)
-    assert "up to date" in run_build("--out", small_root, *SMALL).stdout
+    assert "up to date" in run_in_process(main, "--out", small_root, *SMALL).stdout
     assert not (small_root / BUILD_FOLDER).exists()
     for name in ("README.md", "bars.parquet", "crossings.parquet"):
         (small_root / name).unlink()
-        assert "up to date" in run_build("--out", small_root, *SMALL).stdout
+        assert "up to date" in run_in_process(main, "--out", small_root, *SMALL).stdout
         assert contents(small_root) == before
 
 
@@ -311,9 +268,26 @@ def test_folder_of_earlier_version_loads_and_gets_its_files(tiny_root: Path, tmp
     assert contents(root) == before
 
 
-def test_damaged_shard_is_rebuilt(small_root: Path, run_build: RunBuild) -> None:
-    before = contents(small_root)
-    shard = next(small_root.glob("two-bars/*-00001-of-*.parquet"))
-    shard.write_bytes(shard.read_bytes()[:-1] + b"!")
-    assert "built: two-bars" in run_build("--out", small_root, *SMALL).stdout
-    assert contents(small_root) == before
+def test_process_exit_before_reading_task_raises_no_error() -> None:
+    """Send a task to a dead process: a ``BrokenPipeError`` would end the build as if its output were closed."""
+    with subprocess.Popen([sys.executable, "-c", ""], stdin=subprocess.PIPE) as process:
+        process.wait()
+        _send_task(process.stdin, DepthTask(Path("mesh.ply"), (), Path("out"), 1))
+    assert process.returncode == 0
+
+
+@pytest.mark.nightly
+@pytest.mark.usefixtures("blender")
+def test_sample_data_equals_fresh_render(tiny_root: Path, tmp_path: Path) -> None:
+    render(tmp_path / "dataset")
+    assert contents(tmp_path / "dataset") == contents(tiny_root), "run `make sample-data`"
+
+
+@pytest.mark.nightly
+@pytest.mark.usefixtures("blender")
+def test_dataset_of_stored_images_equals_fresh_render(tiny_root: Path, tmp_path: Path) -> None:
+    images = render_orbit(tmp_path / "rendered")
+    assert images == {path.name: path.read_bytes() for path in orbit.IMAGES.iterdir()}, "run `make sample-data`"
+    orbit.write_orbit(tmp_path / "stored", tiny_root / "meshes" / "lattice.ply")
+    rendered, stored = (open_folder(tmp_path / name).digest for name in ("rendered", "stored"))
+    assert stored == rendered

@@ -1,14 +1,15 @@
-"""Builds on a local dask cluster with separate processes and scratch folders."""
+"""Work units and the results that workers return, and builds on a local dask cluster of separate processes."""
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -19,23 +20,149 @@ import trimesh
 from dataset_builder.catalog.named_configs import CONFIGS
 from dataset_builder.pipeline import dask_renderer
 from dataset_builder.pipeline.dask_renderer import check_software_versions, connect_to_cluster
-from dataset_builder.pipeline.plan import BUILD_FOLDER, generator_versions, plan_config
+from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, generator_versions, plan_config
 from dataset_builder.pipeline.shards import Staging
-from dataset_builder.pipeline.work_units import remaining_units
-from dataset_builder.specs.config_specs import ColourSpec
-from rebar_depth_bench.base.errors import InputError
-from tests.building import (
-    TINY,
-    TWO_BARS,
-    RunBuild,
-    StartBuild,
-    contents,
-    render_processes_of,
-    staged_rows,
+from dataset_builder.pipeline.work_units import (
+    ReceivedFile,
+    UnitResult,
+    WorkUnit,
+    accept_result,
+    remaining_units,
+    with_files,
 )
+from dataset_builder.specs.config_specs import ColourSpec
+from rebar_depth_bench.base.errors import BuildError, InputError
+from tests.building import TINY, TWO_BARS, RunBuild, StartBuild, contents, render_processes_of, staged_rows
 from tests.dask_cluster import Cluster, NewCluster
 from tests.processes import wait_until
 
+MESH = b"ply: the mesh that rays were cast against"
+
+
+def sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def make_row(index: int) -> ReceivedFile:
+    content = f"row {index}".encode()
+    return ReceivedFile(f"rows/{index:04d}.parquet", content, sha256(content))
+
+
+def make_result(unit: WorkUnit) -> UnitResult:
+    mesh = [ReceivedFile("mesh.ply", MESH, sha256(MESH))] if unit.with_mesh else []
+    return UnitResult("tcp://far:1", {"colour": 1.0}, sha256(MESH), (*map(make_row, unit.indices), *mesh))
+
+
+def staged_files(plan: ConfigPlan) -> dict[str, bytes]:
+    root = plan.staging.root
+    return {path.relative_to(root).as_posix(): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+
+
+@pytest.fixture
+def plan(tmp_path: Path) -> ConfigPlan:
+    """Return a plan of 17 views: two shards of eight and one of one."""
+    return plan_config(CONFIGS["lattice"](), 17, tmp_path)
+
+
+def test_units_cover_views_once_and_request_one_mesh(plan: ConfigPlan) -> None:
+    units = remaining_units(plan)
+    assert [len(unit.indices) for unit in units] == [8, 8, 1]
+    assert sum((unit.indices for unit in units), ()) == plan.indices
+    assert [unit.with_mesh for unit in units] == [True, False, False]
+    assert {unit.mesh_sha256 for unit in units} == {None}
+
+
+def test_units_without_colour_cover_several_shards(tmp_path: Path) -> None:
+    plan = plan_config(replace(CONFIGS["lattice"](), colour=None), 70, tmp_path)
+    units = remaining_units(plan)
+    assert [(unit.shard, len(unit.indices)) for unit in units] == [(0, 32), (4, 32), (8, 6)]
+    assert sum((unit.indices for unit in units), ()) == plan.indices
+
+
+def test_staged_views_are_not_planned_again(plan: ConfigPlan) -> None:
+    first, second, third = remaining_units(plan)
+    accept_result(second, make_result(second), plan.staging)
+    accept_result(third, make_result(third), plan.staging)
+    plan.staging.row(first.indices[3]).write_bytes(b"staged before a kill")
+    (remaining,) = remaining_units(plan)
+    assert remaining.shard == 0
+    assert remaining.indices == first.indices[:3] + first.indices[4:]
+    assert remaining.with_mesh
+    assert remaining.mesh_sha256 == sha256(MESH)
+    accept_result(remaining, make_result(remaining), plan.staging)
+    assert remaining_units(plan) == []
+    assert plan.staging.mesh.read_bytes() == MESH
+    assert plan.staging.row(first.indices[3]).read_bytes() == b"staged before a kill"
+    assert plan.staging.row(first.indices[2]).read_bytes() == f"row {first.indices[2]}".encode()
+
+
+def test_missing_mesh_is_planned_alone(plan: ConfigPlan) -> None:
+    for unit in remaining_units(plan):
+        accept_result(unit, make_result(unit), plan.staging)
+    plan.staging.mesh.unlink()
+    (unit,) = remaining_units(plan)
+    assert (unit.indices, unit.with_mesh, unit.label) == ((), True, "the mesh of lattice")
+
+
+Files = list[ReceivedFile]
+ANOTHER = ReceivedFile("mesh.ply", b"another", sha256(b"another"))
+
+
+def changed(position: int, content: bytes) -> Callable[[Files], Files]:
+    """Return a function that changes the content of one of the files, but not its digest."""
+    return lambda files: [replace(file, content=content) if file is files[position] else file for file in files]
+
+
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (changed(0, b"row 1!"), "rows/0014.parquet was received with sha256"),
+        (changed(0, b""), f"was received with sha256 {sha256(b'')}, expected"),
+        (changed(-1, MESH + b" "), "mesh.ply was received with sha256"),
+        (lambda files: [*files[:-1], ANOTHER], f"its mesh has sha256 {sha256(b'another')}, expected"),
+        (lambda files: files[1:], "rows/0014.parquet is missing"),
+        (lambda files: files[:-1], "mesh.ply is missing"),
+        (lambda files: [*files, make_row(3)], "rows/0003.parquet was not requested"),
+    ],
+)
+def test_result_that_does_not_match_unit_is_rejected(
+    plan: ConfigPlan, spoil: Callable[[Files], Files], words: str
+) -> None:
+    first, second, _ = remaining_units(plan)
+    accept_result(second, make_result(second), plan.staging)
+    before = staged_files(plan)
+    result = make_result(first)
+    files = tuple(spoil([*result.files]))
+    mesh_sha256 = ANOTHER.sha256 if ANOTHER in files else result.mesh_sha256
+    with pytest.raises(BuildError) as raised:
+        accept_result(first, replace(result, files=files, mesh_sha256=mesh_sha256), plan.staging)
+    message = str(raised.value)
+    assert (
+        f"lattice views {first.indices[0]} to {first.indices[-1]}, rendered by tcp://far:1: rejected: " in message
+    )
+    assert words in message
+    assert staged_files(plan) == before
+    accept_result(first, make_result(first), plan.staging)
+    assert len(staged_files(plan)) == len(before) + 9
+
+
+def test_local_result_without_payload_needs_staged_rows(plan: ConfigPlan) -> None:
+    first, *_ = remaining_units(plan)
+    local_result = UnitResult("this machine", {}, sha256(MESH))
+    plan.staging.mesh.parent.mkdir(parents=True)
+    plan.staging.mesh.write_bytes(MESH)
+    with pytest.raises(BuildError, match=rf"rows/{first.indices[-1]:04d}\.parquet is missing"):
+        accept_result(first, local_result, plan.staging)
+    plan.staging.row(14).parent.mkdir()
+    for index in first.indices:
+        plan.staging.row(index).write_bytes(make_row(index).content)
+    accept_result(first, local_result, plan.staging)
+    assert with_files(local_result, first, plan.staging) == replace(
+        make_result(first), worker="this machine", seconds={}
+    )
+
+
+NOWHERE = "tcp://127.0.0.1:1"
 VIEWS = 9
 """Number of views: a shard of eight and one of one, that is two work units."""
 SMALL = ("--scene", str(TWO_BARS), "--views", str(VIEWS), *TINY)
@@ -82,16 +209,6 @@ def test_cluster_build_equals_local_build(
     assert "two-bars: 4 of 9" in process.stderr, "no progress within a unit"
 
 
-def test_cluster_build_without_colour_equals_local_build(
-    cluster: Cluster, tmp_path: Path, run_build: RunBuild
-) -> None:
-    request = (*SMALL[:-2], "--no-colour")
-    for out, options in (("here", ()), ("away", ("--cluster", cluster.address))):
-        process = run_build("--out", tmp_path / out, *request, *options)
-        assert process.returncode == 0, process.stderr
-    assert contents(tmp_path / "away") == contents(tmp_path / "here")
-
-
 def write_two_bars(path: Path) -> None:
     """Write a mesh of two vertical rods on the board, 10 mm in diameter and 80 mm high."""
     rods = [trimesh.creation.cylinder(radius=0.005, height=0.080, sections=24) for _ in range(2)]
@@ -100,10 +217,12 @@ def write_two_bars(path: Path) -> None:
     trimesh.util.concatenate(rods).export(path)
 
 
-def test_local_mesh_file_is_built_on_cluster(cluster: Cluster, tmp_path: Path, run_build: RunBuild) -> None:
+def test_local_mesh_file_is_built_without_colour_on_cluster(
+    cluster: Cluster, tmp_path: Path, run_build: RunBuild
+) -> None:
     mesh = tmp_path / "my cage.stl"
     write_two_bars(mesh)
-    request = ("--config", "lattice", "--views", "2", *TINY, "--mesh", mesh, "--mesh-unit", "m")
+    request = ("--config", "lattice", "--views", "9", *TINY[:4], "--no-colour", "--mesh", mesh, "--mesh-unit", "m")
     for out, cluster_options in (("here", ()), ("away", ("--cluster", cluster.address))):
         process = run_build("--out", tmp_path / out, *request, *cluster_options)
         assert process.returncode == 0, process.stderr
@@ -227,29 +346,23 @@ def test_unusable_cluster_is_rejected_and_nothing_written(
 ) -> None:
     with new_cluster(tmp_path) as idle:
         idle.start_scheduler()
-        expected_messages = {
-            "tcp://127.0.0.1:1": "--cluster tcp://127.0.0.1:1: no dask scheduler responds at this address",
-            "nonsense": "--cluster nonsense: is not a valid address (missing port number in address 'nonsense')",
-            idle.address: f"--cluster {idle.address}: the scheduler has no workers after 10 s",
+        expected = {
+            (
+                "nonsense",
+            ): "--cluster nonsense: is not a valid address (missing port number in address 'nonsense')",
+            (idle.address,): f"--cluster {idle.address}: the scheduler has no workers after 10 s",
         }
+        for dry_run in ((), ("--dry-run",)):
+            expected[NOWHERE, *dry_run] = f"--cluster {NOWHERE}: no dask scheduler responds at this address"
         builds = {
-            address: start_build(tmp_path / "dataset", *SMALL, "--cluster", address)
-            for address in expected_messages
+            options: start_build(tmp_path / "dataset", *SMALL, "--cluster", *options) for options in expected
         }
-        stderr_by_address = {
-            address: build.communicate(timeout=120)[1].decode() for address, build in builds.items()
-        }
-    for address, words in expected_messages.items():
-        assert words in stderr_by_address[address]
-        assert "Traceback" not in stderr_by_address[address]
-        assert builds[address].returncode == 2
+        messages = {options: build.communicate(timeout=120)[1].decode() for options, build in builds.items()}
+    for options, words in expected.items():
+        assert words in messages[options]
+        assert "Traceback" not in messages[options]
+        assert builds[options].returncode == 2
     assert not (tmp_path / "dataset").exists()
-
-
-def test_workers_with_cluster_is_rejected(tmp_path: Path, run_build: RunBuild) -> None:
-    process = run_build("--out", tmp_path / "dataset", "--cluster", "tcp://127.0.0.1:1", "--workers", "2")
-    assert process.returncode == 2
-    assert "--workers 2 is combined with --cluster tcp://127.0.0.1:1, expected only one of them" in process.stderr
 
 
 def run_cli(prepare: str, *arguments: str) -> subprocess.CompletedProcess[str]:
@@ -260,7 +373,7 @@ def run_cli(prepare: str, *arguments: str) -> subprocess.CompletedProcess[str]:
 
 @pytest.mark.slow
 def test_missing_distributed_names_pip_extra(tmp_path: Path) -> None:
-    arguments = ("--out", str(tmp_path / "dataset"), "--cluster", "tcp://127.0.0.1:1")
+    arguments = ("--out", str(tmp_path / "dataset"), "--cluster", NOWHERE)
     process = run_cli("sys.modules['distributed'] = None", *arguments)
     assert process.returncode == 2, process.stderr
     assert "pip install 'rebar-depth-bench[cluster]'" in process.stderr

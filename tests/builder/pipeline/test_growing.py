@@ -8,6 +8,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+import datasets
 import pytest
 
 import rebar_depth_bench as rdb
@@ -25,6 +26,8 @@ from rebar_depth_bench.data.bars import BARS_FILE
 from rebar_depth_bench.data.files import MANIFEST_FILE, file_problems
 from rebar_depth_bench.data.manifest import open_folder
 from tests.building import contents
+
+pytestmark = pytest.mark.slow
 
 SIZE: dict[str, Any] = {"width": 32, "height": 18, "colour": None}
 
@@ -84,6 +87,14 @@ def test_growing_config_renders_only_new_views(
     assert contents(tmp_path / "grown") == contents(tmp_path / "at-once")
     assert built(tmp_path / "grown", then)[0] == []
     assert not (tmp_path / "grown" / BUILD_FOLDER).exists()
+
+
+def test_build_without_colour_keeps_staged_views_that_may_have_colour(tmp_path: Path) -> None:
+    built(tmp_path, lattice(2))
+    staged = tmp_path / BUILD_FOLDER / "lattice-0123456789abcdef" / "rows"
+    staged.mkdir(parents=True)
+    assert built(tmp_path, lattice(6))[1].built == ["lattice"]
+    assert staged.is_dir()
 
 
 def test_views_that_are_not_among_more_views_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -218,6 +229,41 @@ def test_publication_that_was_interrupted_after_writing_bars_is_continued(tmp_pa
     (root / MANIFEST_FILE).write_bytes(manifest)
     built(root, cages(1))
     assert contents(root) == contents(whole)
+
+
+def loaded_ids(root: Path) -> list[list[str]]:
+    """Return the view ids of ``train`` as plain ``datasets`` and ``load`` return them, streaming and not."""
+    return [
+        [row["view_id"] for row in load(str(root), "cages", split="train", streaming=streaming)]
+        for streaming in (False, True)
+        for load in (datasets.load_dataset, rdb.load)
+    ]
+
+
+def first_depth(root: Path) -> list[bytes]:
+    plain = datasets.load_dataset(str(root), "cages", split="train")[0]["left_depth"]
+    return [plain, rdb.load(root, "cages", split="train", columns=["left_depth"])[0]["left_depth"].tobytes()]
+
+
+def test_added_and_rebuilt_scenes_are_loaded_in_place_of_cached_ones(tmp_path: Path) -> None:
+    """Load with the caches of ``datasets``, which know folders by their paths."""
+    root = tmp_path / "dataset"
+
+    def expected() -> list[str]:
+        return list(open_folder(root).config("cages").of_split("train").view_ids)
+
+    built(root, cages(1, 1, "train"))
+    depth = first_depth(root)
+    assert loaded_ids(root) == [expected()] * 4
+    built(root, cages(2, 1, "train"))
+    assert len(expected()) == 2
+    assert loaded_ids(root) == [expected()] * 4
+    assert first_depth(root) == depth
+    shutil.rmtree(root)
+    built(root, cages(1, 1, "train", seed=1, width=64))
+    assert loaded_ids(root) == [expected()] * 4
+    assert all(new != old for new, old in zip(first_depth(root), depth, strict=True))
+    assert 'load_dataset("PATH_OR_HUB_ID", "cages", split="train")' in (root / "README.md").read_text()
 
 
 @pytest.mark.parametrize(("limit", "value"), [(JSON_BYTES, 5000), (TABLE_BYTES, 1000)])

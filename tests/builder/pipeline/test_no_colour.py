@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
-from typing import Any
 
 import datasets
 import numpy as np
@@ -14,21 +13,18 @@ from PIL import Image
 
 import rebar_depth_bench as rdb
 from dataset_builder.audit import audit
-from dataset_builder.catalog.named_configs import BuildRequest
 from dataset_builder.export import export
 from dataset_builder.pipeline.contact_sheet import TILE_PX
-from dataset_builder.pipeline.plan import BUILD_FOLDER
 from rebar_depth_bench.base.errors import DatasetError
 from rebar_depth_bench.cli.main import main as rebar_bench
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import ConfigViews
 from rebar_depth_bench.data.schema import COLUMNS
-from tests.building import TINY, TINY_VIEWS, TWO_BARS, RunBuild, contents
+from tests.building import TINY, TINY_VIEWS, RunBuild
 from tests.commands import run_in_process
 
 SIZE = TINY[:4]
 COLOUR_COLUMNS = ("left_rgb", "right_rgb")
-TWO_VIEWS = ("--scene", str(TWO_BARS), "--views", "2")
 
 
 @pytest.fixture(scope="module")
@@ -39,11 +35,6 @@ def root(tmp_path_factory: pytest.TempPathFactory, run_build: RunBuild) -> Path:
         process = run_build("--out", root, "--config", config, "--views", str(views), *SIZE, "--no-colour")
         assert process.returncode == 0, process.stderr
     return root
-
-
-def manifest(root: Path) -> dict[str, Any]:
-    loaded: dict[str, Any] = json.loads((root / "manifest.json").read_text())
-    return loaded
 
 
 def bench(*arguments: str | Path) -> str:
@@ -71,19 +62,14 @@ def test_plain_datasets_loads_null_colour(root: Path) -> None:
 
 
 @pytest.mark.parametrize("streaming", [False, True])
-def test_rows_have_no_colour_and_equal_others(root: Path, tiny_root: Path, streaming: bool) -> None:
-    for row, other in zip(
-        rdb.load(root, "lattice", streaming=streaming), rdb.load(tiny_root, "lattice"), strict=True
-    ):
+def test_rows_and_batches_have_no_colour_and_equal_others(root: Path, tiny_root: Path, streaming: bool) -> None:
+    rows, others = rdb.load(root, "lattice", streaming=streaming), rdb.load(tiny_root, "lattice")
+    for row, other in zip(rows, others, strict=True):
         assert list(row) == list(other)
         assert row["left_rgb"] is row["right_rgb"] is None
         assert all(np.array_equal(row[name], other[name]) for name in COLUMNS if name not in COLOUR_COLUMNS)
-
-
-@pytest.mark.parametrize("streaming", [False, True])
-def test_batches_have_no_colour(root: Path, streaming: bool) -> None:
     torch_loader = pytest.importorskip("rebar_depth_bench.data.torch").torch_loader
-    batch = next(iter(torch_loader(rdb.load(root, "lattice", streaming=streaming), batch_size=2, stereo=True)))
+    batch = next(iter(torch_loader(rows, batch_size=2, stereo=True)))
     assert not {"rgb", "right_rgb"} & set(batch)
     assert batch["depth"].shape == batch["right_depth"].shape == (2, 1, 90, 160)
 
@@ -119,63 +105,13 @@ def test_method_that_asks_for_colour_later_is_refused(root: Path) -> None:
         next(views.rows("left_depth", "right_rgb"))
 
 
-def test_audit_needs_no_colour(root: Path) -> None:
-    assert all(check.passed for check in audit(root, depth_views=1).checks)
-
-
-def test_config_with_colour_is_not_replaced(tiny_root: Path, tmp_path: Path, run_build: RunBuild) -> None:
-    before = contents(tiny_root)
-    process = run_build("--out", tiny_root, "--config", "pile", "lattice", *SIZE, "--no-colour")
-    assert process.returncode == 2
-    assert "config lattice: 9 finished views would be lost" in process.stderr
-    assert "colour is {'samples': 2, 'steel_samples': 8" in process.stderr
-    assert contents(tiny_root) == before
-    assert not (tiny_root / BUILD_FOLDER).exists()
-
-
-def test_estimate_without_colour(tmp_path: Path, run_build: RunBuild) -> None:
-    process = run_build("--out", tmp_path / "dataset", "--config", "lattice", *SIZE, "--no-colour", "--dry-run")
-    assert process.returncode == 0, process.stderr
-    assert "  colour: none" in process.stdout.splitlines()
-    assert not (tmp_path / "dataset").exists()
-
-
-def test_colour_replaces_build_without(tmp_path: Path, run_build: RunBuild) -> None:
-    colour, root = tmp_path / "colour", tmp_path / "dataset"
-    assert run_build("--out", colour, *TWO_VIEWS, *TINY).returncode == 0
-    assert run_build("--out", root, *TWO_VIEWS, *SIZE, "--no-colour").returncode == 0
-    assert contents(root) != contents(colour)
-    assert "built: two-bars" in run_build("--out", root, *TWO_VIEWS, *TINY, "--overwrite", "two-bars").stdout
-    assert contents(root) == contents(colour)
-
-
-def test_both_kinds_share_a_folder_and_staged_colour_is_kept(
-    tiny_root: Path, tmp_path: Path, run_build: RunBuild
-) -> None:
-    root = tmp_path / "dataset"
-    shutil.copytree(tiny_root, root)
-    staged = root / BUILD_FOLDER / "two-bars-0123456789abcdef" / "rows"
-    staged.mkdir(parents=True)
-    process = run_build("--out", root, *TWO_VIEWS, *SIZE, "--no-colour")
-    assert process.returncode == 0, process.stderr
-    assert staged.is_dir(), "views of an interrupted build with colour"
-    card = (root / "README.md").read_text()
-    assert "`two-bars`: built without colour; `left_rgb` and `right_rgb` are null in every row." in card
-    assert "![two-bars: depth](pictures/two-bars.webp)" in card
-    assert "![lattice: colour, and depth below it]" in card
-    bench("predict", "sgbm", "--data", root, "--config", "lattice", "--out", tmp_path / "a.zip")
-    first = [
-        datasets.load_dataset(str(root), name, split="test")[0]["left_rgb"] for name in ("lattice", "two-bars")
+def test_audit_contact_sheet_and_export_have_depth_alone(root: Path, tmp_path: Path) -> None:
+    checks = audit(root, depth_views=0).checks
+    assert [check.name for check in checks if not check.passed] == [
+        f"{name}: depth compared with Cycles" for name in ("lattice", "lattice-orbit")
     ]
-    assert [cell is None for cell in first] == [False, True]
-
-
-def test_contact_sheet_shows_depth_alone(root: Path) -> None:
     with Image.open(root / "pictures" / "lattice-orbit.webp") as sheet:
         assert sheet.size == (2 * TILE_PX[0], TILE_PX[1])
-
-
-def test_export_leaves_out_what_describes_images(root: Path, tmp_path: Path) -> None:
     summary = export(root, tmp_path / "export", ["lattice-orbit"])
     assert [(config.views, config.written, config.kept) for config in summary] == [(2, 16, 0)]
     folder = tmp_path / "export" / "lattice-orbit"
@@ -191,29 +127,21 @@ def test_export_leaves_out_what_describes_images(root: Path, tmp_path: Path) -> 
     )
 
 
-@pytest.mark.parametrize("colour", [None, {"samples": 1}])
-def test_rows_that_contradict_manifest_are_damaged(
-    root: Path, tiny_root: Path, tmp_path: Path, colour: dict[str, int] | None
+@pytest.mark.parametrize(
+    ("colour", "words"),
+    [
+        (None, r"view lattice/\d+: left_rgb is damaged"),
+        ({"samples": 1}, r"view lattice/\d+: left_rgb is damaged"),
+        ("none", r"configs\.lattice\.colour: "),
+    ],
+)
+def test_manifest_that_contradicts_its_rows_is_damaged(
+    root: Path, tiny_root: Path, tmp_path: Path, colour: object, words: str
 ) -> None:
     """Load images of a config that has none, and null of one that has."""
-    copy = tmp_path / "dataset"
-    shutil.copytree(tiny_root if colour is None else root, copy)
-    edited = manifest(copy)
-    edited["configs"]["lattice"]["colour"] = colour
-    (copy / "manifest.json").write_text(json.dumps(edited))
-    with pytest.raises(DatasetError, match=r"view lattice/\d+: left_rgb is damaged"):
+    copy = Path(shutil.copytree(root if isinstance(colour, dict) else tiny_root, tmp_path / "dataset"))
+    manifest = json.loads((copy / "manifest.json").read_text())
+    manifest["configs"]["lattice"]["colour"] = colour
+    (copy / "manifest.json").write_text(json.dumps(manifest))
+    with pytest.raises(DatasetError, match=words):
         rdb.load(copy, "lattice")[0]
-
-
-def test_colour_of_manifest_is_checked(tiny_root: Path, tmp_path: Path) -> None:
-    edited = manifest(tiny_root)
-    edited["configs"]["lattice"]["colour"] = "none"
-    (tmp_path / "manifest.json").write_text(json.dumps(edited))
-    with pytest.raises(DatasetError) as caught:
-        open_folder(tmp_path)
-    assert [problem.where for problem in caught.value.problems] == ["configs.lattice.colour"]
-
-
-def test_request_without_colour_has_no_parameters_of_it() -> None:
-    [spec] = BuildRequest(("pier",), colour=None).config_specs()
-    assert spec.colour is None

@@ -1,32 +1,49 @@
-"""Survey cameras: properties of the stations, computed without the placement's ray caster and points."""
+"""Survey cameras and random ones round generated cages: properties of the stations, from bars and meshes."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from math import cos, radians, sin
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from numpy import ndarray
 from scipy.spatial import cKDTree
 
 from dataset_builder.cameras.camera_fit import check_fits
-from dataset_builder.cameras.camera_placement import NEAR, SIGHT_TOLERANCE_M, SURVEY_RULES, with_stations
-from dataset_builder.cameras.rigs import rig_cameras
-from dataset_builder.cameras.trajectories import aim_point_m, camera_offsets_m, poses, view_count
+from dataset_builder.cameras.camera_placement import (
+    MAX_ROLL_DEG,
+    NEAR,
+    RANDOM_RULES,
+    SIGHT_TOLERANCE_M,
+    SURVEY_RULES,
+    with_random_stations,
+    with_stations,
+)
+from dataset_builder.cameras.rigs import STEREO_CAMERAS, focal_of_view_px, rig_cameras
+from dataset_builder.cameras.trajectories import aim_point_m, camera_offsets_m, look_at_with_rig, poses, view_count
 from dataset_builder.catalog.named_configs import BuildRequest
 from dataset_builder.catalog.scene_file import scene_config
+from dataset_builder.scene.cages.generate import FAMILIES
 from dataset_builder.scene.environments.surroundings import GROUND_CLEARANCE_M, CameraSpace
 from dataset_builder.scene.model import Assembly
 from dataset_builder.scene.shapes.point_sets import SurfaceSampler
 from dataset_builder.scene.shapes.solids import merge_meshes
-from dataset_builder.specs.config_specs import ConfigSpec, RigSpec, SurveySpec
+from dataset_builder.specs.config_specs import (
+    ConfigSpec,
+    FocalRigSpec,
+    GeneratedCageSpec,
+    RandomViewsSpec,
+    RigSpec,
+    SurveySpec,
+)
 from dataset_builder.user_files.cage_file import cage_file_spec, load_cage
 from dataset_builder.user_files.make_assembly import make_assembly
 from rebar_depth_bench.base.errors import InputError, MeshError
-from rebar_depth_bench.geometry.cameras import camera_centre, inverse_rigid
+from rebar_depth_bench.geometry.cameras import camera_centre, ideal_K, inverse_rigid
 from tests.builder.cameras.survey_cages import (
     bar_table,
     column,
@@ -37,6 +54,8 @@ from tests.builder.cameras.survey_cages import (
     wall,
 )
 from tests.builder.catalog.scene_files import write_scene
+
+pytestmark = pytest.mark.slow
 
 DISTANCES_M = (0.5, 1.0, 4.0)
 VIEWS = 20
@@ -87,7 +106,6 @@ def placed(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFact
     return place(tmp_path_factory.mktemp("survey"), scene(bars(), KEYS))
 
 
-@pytest.mark.slow
 def test_cameras_have_stated_distances_from_steel_that_they_aim_at(placed: Placed) -> None:
     assert view_count(placed.survey) == len(placed.survey.stations) == 3 * VIEWS
     assert placed.survey.distances_m == DISTANCES_M
@@ -105,7 +123,6 @@ def test_cameras_have_stated_distances_from_steel_that_they_aim_at(placed: Place
         assert z > 0
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("eye", ["left", "right"])
 def test_eyes_are_above_ground_and_clear_of_all_steel(placed: Placed, eye: str) -> None:
     eyes_m = placed.eyes_m(eye)
@@ -116,7 +133,6 @@ def test_eyes_are_above_ground_and_clear_of_all_steel(placed: Placed, eye: str) 
     assert np.hypot(*eyes_m[:, :2].T).max() <= 20.5
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("eye", ["left", "right"])
 def test_lines_of_sight_are_free(placed: Placed, eye: str) -> None:
     for eye_m, aimed_m in zip(placed.eyes_m(eye), placed.aimed_m, strict=True):
@@ -126,7 +142,6 @@ def test_lines_of_sight_are_free(placed: Placed, eye: str) -> None:
         assert surface_distance_m(line_m, placed.assembly.bars).min() > 0
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("eye", ["left", "right"])
 def test_near_steel_covers_little_of_each_image(placed: Placed, eye: str) -> None:
     """March the rays of another image to half the distance; the shares differ by up to 2 % of the image."""
@@ -146,7 +161,6 @@ def test_near_steel_covers_little_of_each_image(placed: Placed, eye: str) -> Non
         assert is_near.mean() <= 0.04
 
 
-@pytest.mark.slow
 def test_points_are_spread_evenly(placed: Placed) -> None:
     """Compare with as many random points of the surface: least distances, and distances of the steel from them."""
     sampler = SurfaceSampler(merge_meshes([part.mesh for part in placed.assembly.parts]))
@@ -164,7 +178,6 @@ def test_points_are_spread_evenly(placed: Placed) -> None:
         assert left_out_m < np.median(random[:, 1])
 
 
-@pytest.mark.slow
 def test_consecutive_cameras_are_close_to_each_other(placed: Placed) -> None:
     rng = np.random.default_rng(2)
     for centres_m in np.split(placed.left_m, 3):
@@ -172,7 +185,6 @@ def test_consecutive_cameras_are_close_to_each_other(placed: Placed) -> None:
         assert np.linalg.norm(np.diff(centres_m, axis=0), axis=1).sum() < 0.75 * min(random_m)
 
 
-@pytest.mark.slow
 def test_stations_depend_on_scene_and_seed_only(placed: Placed) -> None:
     survey = replace(placed.survey, stations=())
     assert with_stations(survey, placed.assembly, SITE, RigSpec(), "a") == placed.survey
@@ -180,7 +192,6 @@ def test_stations_depend_on_scene_and_seed_only(placed: Placed) -> None:
     assert not set(other.stations) & set(placed.survey.stations)
 
 
-@pytest.mark.slow
 def test_cameras_within_reach_fit_and_screen_among_them_does_not(placed: Placed) -> None:
     reach_m = np.linalg.norm(placed.assembly.vertices_m - aim_point_m(placed.assembly), axis=1).max()
     assert reach_m > np.linalg.norm(placed.left_m - aim_point_m(placed.assembly), axis=1).min()
@@ -192,7 +203,6 @@ def test_cameras_within_reach_fit_and_screen_among_them_does_not(placed: Placed)
         check_fits(placed.assembly, replace(shadows, protocol=survey))
 
 
-@pytest.mark.slow
 def test_cage_of_12_m_gets_a_survey_outdoors_by_default(tmp_path: Path) -> None:
     placed = place(tmp_path, scene(girder(12_000)))
     assert replace(placed.survey, stations=()) == SurveySpec()
@@ -203,7 +213,6 @@ def test_cage_of_12_m_gets_a_survey_outdoors_by_default(tmp_path: Path) -> None:
     assert surface_distance_m(placed.left_m, placed.assembly.bars).min() >= 0.25
 
 
-@pytest.mark.slow
 def test_survey_of_small_cage_is_in_the_laboratory_above_the_objects_on_its_bench(tmp_path: Path) -> None:
     bars = girder(700)
     placed = place(tmp_path, scene(bars, "distances = [300, 800]\nviews_per_distance = 30"))
@@ -221,7 +230,6 @@ def test_survey_of_small_cage_is_in_the_laboratory_above_the_objects_on_its_benc
         place(tmp_path, f'environment = "laboratory"\n{far}')
 
 
-@pytest.mark.slow
 def test_too_few_places_are_told_with_distance_and_numbers(tmp_path: Path) -> None:
     content = scene(girder(12_000), "distances = [1000, 200000, 300000]\nviews_per_distance = 7")
     path = write_scene(tmp_path, content)
@@ -234,7 +242,6 @@ def test_too_few_places_are_told_with_distance_and_numbers(tmp_path: Path) -> No
     assert str(raised.value).startswith(f"{path}: 2 problems")
 
 
-@pytest.mark.slow
 def test_steel_behind_other_steel_is_not_aimed_at(tmp_path: Path) -> None:
     """Put a bar inside a closed drum of bars that touch: only the drum can be seen."""
     feet_mm = [(300 * cos(radians(turn)), 300 * sin(radians(turn))) for turn in range(0, 360, 3)]
@@ -264,3 +271,103 @@ def test_space_for_cameras() -> None:
     assert space.contains(points_m).tolist() == [True, False, True, False, True, True, False]
     below_roof = replace(space, ceiling_m=5.0)
     assert below_roof.contains(np.array([[0, 0, 5.0], [0, 0, 5.01]])).tolist() == [True, False]
+
+
+SPACE = CameraSpace(20.0, clear_radius_m=20.0)
+RANDOM_VIEWS = 6
+SPEC = RandomViewsSpec(RANDOM_VIEWS, seed=4)
+RIG = STEREO_CAMERAS["Luxonis OAK-D"]
+
+
+@pytest.fixture(scope="module")
+def cages() -> Mapping[str, Assembly]:
+    return {family: make_assembly(GeneratedCageSpec("train", 0, 3, family)) for family in FAMILIES}
+
+
+@pytest.fixture(scope="module")
+def views(cages: Mapping[str, Assembly]) -> Mapping[str, RandomViewsSpec]:
+    return {name: randomly_placed(SPEC, cage) for name, cage in cages.items()}
+
+
+def randomly_placed(spec: RandomViewsSpec, cage: Assembly, space: CameraSpace = SPACE) -> RandomViewsSpec:
+    return with_random_stations(spec, cage, space, RIG, "cage")
+
+
+def steel(assembly: Assembly) -> trimesh.Trimesh:
+    return trimesh.util.concatenate(
+        [trimesh.Trimesh(part.mesh.vertices_m, part.mesh.faces, process=False) for part in assembly.parts]
+    )
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_eyes_are_clear_of_steel_and_see_it(
+    cages: Mapping[str, Assembly], views: Mapping[str, RandomViewsSpec], family: str
+) -> None:
+    mesh, cage = steel(cages[family]), cages[family]
+    rays = 40, 30
+    rig = FocalRigSpec(*rays, baseline_m=RIG.baseline_m, camera=RIG.camera, focal_px=RIG.focal_px)
+    assert view_count(views[family]) == RANDOM_VIEWS
+    for pose in poses(views[family], np.zeros(3), RIG, cage.bars):
+        for camera in rig_cameras(rig, pose).values():
+            eye_m = camera_centre(camera.cam_from_world)
+            assert np.linalg.norm(mesh.vertices - eye_m, axis=1).min() > RANDOM_RULES.clearance_m(
+                SPEC.distances_m[0]
+            )
+            assert eye_m[2] >= 0.1
+            directions = camera.rays().reshape(-1, 3) @ camera.cam_from_world[:3, :3]
+            is_hit = mesh.ray.intersects_any(np.tile(eye_m, (len(directions), 1)), directions)
+            assert is_hit.mean() > RANDOM_RULES.min_steel_share / 2  # Other rays than those of the placement.
+
+
+def test_views_of_a_longer_list_begin_with_those_of_a_shorter_one(
+    cages: Mapping[str, Assembly], views: Mapping[str, RandomViewsSpec]
+) -> None:
+    family = next(iter(FAMILIES))
+    fewer = randomly_placed(replace(SPEC, views=2), cages[family])
+    assert fewer.stations == views[family].stations[:2]
+    other = randomly_placed(RandomViewsSpec(2, seed=5), cages[family])
+    assert not set(other.stations) & set(views[family].stations)
+
+
+def test_distances_aims_and_rolls_vary(views: Mapping[str, RandomViewsSpec]) -> None:
+    stations = [station for spec in views.values() for station in spec.stations]
+    rolls_deg = np.array([roll_deg for _, _, roll_deg in stations])
+    assert rolls_deg.std() > 5
+    assert (np.abs((rolls_deg + 45) % 90 - 45) <= MAX_ROLL_DEG).all()
+    distances_m = [np.linalg.norm(np.subtract(centre, aimed)) for centre, aimed, _ in stations]
+    assert min(distances_m) < 0.7
+    assert max(distances_m) > 3
+    offsets = [camera_offsets_m(spec, np.ones(3), ()) for spec in views.values()]
+    assert np.allclose(np.concatenate(offsets) + 1, [centre for centre, _, _ in stations])
+
+
+def test_cage_without_space_for_cameras_is_refused(cages: Mapping[str, Assembly]) -> None:
+    cage = next(iter(cages.values()))
+    with pytest.raises(InputError, match="view 0"):
+        randomly_placed(SPEC, cage, CameraSpace(0.01, clear_radius_m=0.01))
+
+
+def test_rolled_rig_turns_about_its_line_of_sight() -> None:
+    centre_m, target_m, baseline_m = np.array([2.0, 1.0, 1.5]), np.array([0.1, 0.2, 0.3]), 0.1
+    upright = look_at_with_rig(centre_m, target_m, baseline_m)
+    rolled = look_at_with_rig(centre_m, target_m, baseline_m, 90.0)
+    for pose in (upright, rolled):
+        np.testing.assert_allclose(camera_centre(pose), centre_m, atol=1e-12)
+        seen_m = pose[:3, :3] @ target_m + pose[:3, 3]
+        np.testing.assert_allclose(seen_m[:2], [baseline_m / 2, 0.0], atol=1e-12)
+    # A camera turned clockwise by 90 degrees has its x axis where its y axis, downwards, was.
+    np.testing.assert_allclose(rolled[0, :3] @ upright[1, :3], 1.0, atol=0.01)
+
+
+@pytest.mark.parametrize("camera", STEREO_CAMERAS.values(), ids=STEREO_CAMERAS)
+def test_rig_of_a_named_camera_has_its_focal_length(camera: FocalRigSpec) -> None:
+    eyes = rig_cameras(camera, np.eye(4))
+    assert eyes["left"].K[0, 0] == eyes["left"].K[1, 1] == camera.focal_px
+    assert eyes["right"].cam_from_world[0, 3] == -camera.baseline_m
+    half = ideal_K(640, 360, camera.focal_px)
+    assert (half[0, 0], half[0, 2]) == (camera.focal_px / 2, 319.5)
+
+
+def test_field_of_view_gives_the_focal_length() -> None:
+    assert focal_of_view_px(90.0) == 640.0
+    assert focal_of_view_px(2 * np.degrees(np.arctan(640 / 882.5))) == 882.5
