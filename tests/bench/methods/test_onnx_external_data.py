@@ -17,10 +17,12 @@ import onnxruntime
 from onnx import ModelProto, TensorProto, helper, numpy_helper
 
 from rebar_depth_bench.base.errors import MethodError
+from rebar_depth_bench.base.parallel import Progress
 from rebar_depth_bench.methods import find_method
 from rebar_depth_bench.methods.onnx.external_data import MAX_FIELDS, MESSAGE_FIELDS, external_files
 from rebar_depth_bench.methods.run import predict
 from tests.bench.methods.onnx_models import predict_depth, write_mixer_model, write_toml
+from tests.bench.methods.predictors import stop_after
 
 GREY = np.full((4, 6, 3), 100, np.uint8)
 WEIGHTS = np.array([1, 0, 0], np.float32)
@@ -116,25 +118,17 @@ def test_walked_fields_are_those_of_the_schema_that_lead_to_tensors() -> None:
 
 
 def test_interrupted_run_is_not_resumed_with_other_external_data(tiny_root: Path, tmp_path: Path) -> None:
-    path = write_external_model(tmp_path, "weights.bin")
-    (tmp_path / "weights.bin").write_bytes(WEIGHTS.tobytes())
+    path, done = write_external_model(tmp_path, "weights.bin"), list[int]()
 
-    def stop(_: str, done: int, __: int) -> None:
-        if done == 1:
-            raise KeyboardInterrupt
+    def run(weights: np.ndarray, progress: Progress) -> None:
+        (tmp_path / "weights.bin").write_bytes(weights.tobytes())
+        predict(
+            find_method(str(path)), tiny_root, tmp_path / "x.zip", configs=["lattice-orbit"], progress=progress
+        )
 
     with pytest.raises(KeyboardInterrupt):
-        predict(find_method(str(path)), tiny_root, tmp_path / "x.zip", configs=["lattice-orbit"], progress=stop)
-    (tmp_path / "weights.bin").write_bytes((2 * WEIGHTS).tobytes())
-    done: list[int] = []
-    with_other_data = find_method(str(path))
-    predict(
-        with_other_data,
-        tiny_root,
-        tmp_path / "x.zip",
-        configs=["lattice-orbit"],
-        progress=lambda _, count, __: done.append(count),
-    )
+        run(WEIGHTS, stop_after(1))
+    run(2 * WEIGHTS, lambda _, count, __: done.append(count))
     assert done == [1, 2]
 
 

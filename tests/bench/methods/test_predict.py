@@ -190,16 +190,11 @@ def test_ground_truth_controls_score_as_expected(tiny_root: Path, tmp_path: Path
     assert noisy.scaled.abs_rel == pytest.approx(mean_of_gaussian, rel=0.05)
 
 
-def counting_method(log: list[str], *, unfit: str = "") -> MultiViewMethod:
-    """Return a multi-view method that predicts the number of views of a config and logs its calls.
-
-    Its check fails for the config ``unfit``.
-    """
+def counting_method(log: list[str]) -> MultiViewMethod:
+    """Return a multi-view method that predicts the number of views of a config and logs its calls."""
 
     def check(views: Views) -> None:
         log.append(f"check {views.config}")
-        if views.config == unfit:
-            raise MethodError(f"{views.config}: does not fit")
 
     def prepare(views: Views, work: Path, progress: Progress) -> Prepared:
         log.append(f"prepare {views.config} {(work / 'kept').exists()}")
@@ -296,14 +291,6 @@ METHOD = Method(MethodInfo("own", "a test", ("left_rgb",), False, "here", "MIT")
     assert sys.modules["json"] is json
 
 
-def test_failing_check_stops_run_before_prediction(tiny_root: Path, tmp_path: Path) -> None:
-    log: list[str] = []
-    with pytest.raises(MethodError, match="lattice-orbit: does not fit"):
-        predict(counting_method(log, unfit="lattice-orbit"), tiny_root, tmp_path / "whole.zip")
-    assert log == ["check lattice", "check lattice-orbit"]
-    assert not list(tmp_path.iterdir())
-
-
 def test_changed_user_file_gives_different_source(user_file: Path) -> None:
     before = find_method(f"{user_file}:METHOD").info
     assert find_method(f"{user_file}:METHOD").info == before
@@ -372,15 +359,20 @@ def test_notes_of_single_view_method_are_checked_first(
     assert not list(tmp_path.iterdir())
 
 
-def test_notes_and_check_of_multi_view_method_are_checked(tiny_root: Path, tmp_path: Path) -> None:
+def test_check_and_notes_of_multi_view_method_stop_the_run(tiny_root: Path, tmp_path: Path) -> None:
     log: list[str] = []
     method = counting_method(log)
+
+    def check(views: Views) -> None:
+        method.check(views)
+        assert views.config == "lattice", "does not fit"
 
     def prepare(*arguments: Any) -> Prepared:
         return replace(method.prepare(*arguments), notes={"bad": float("nan")})
 
-    with pytest.raises(MethodError, match="whole: lattice: check: raised ZeroDivisionError"):
-        predict(replace(method, check=lambda _: print(1 // 0)), tiny_root, tmp_path / "whole.zip")
+    with pytest.raises(MethodError, match="whole: lattice-orbit: check: raised AssertionError: does not fit"):
+        predict(replace(method, check=check), tiny_root, tmp_path / "whole.zip")
+    assert log == ["check lattice", "check lattice-orbit"]
     assert not list(tmp_path.iterdir())
     with pytest.raises(MethodError, match="whole: lattice: the note 'bad' is not a plain JSON value"):
         predict(replace(method, prepare=prepare), tiny_root, tmp_path / "whole.zip")
@@ -405,16 +397,12 @@ def test_folder_as_archive_is_rejected_before_prediction(tiny_root: Path, tmp_pa
         *(("metric3d", "rgb+K"), ("sweep-aruco", "multi-view"), ("lidar-mobile", "lidar"), ("truth", None)),
     ],
 )
-def test_class_of_a_bundled_method(name: str, expected: str | None) -> None:
+def test_input_class_of_a_bundled_method(name: str, expected: str | None) -> None:
     assert input_class(own_methods()[name]) == expected
 
 
-def test_every_method_that_reads_images_has_a_class() -> None:
+def test_methods_that_read_images_have_a_class_unless_they_declare_one() -> None:
     for method in own_methods().values():
         reads_images = isinstance(method, MultiViewMethod) or "left_rgb" in method.info.columns
         assert (input_class(method) in INPUTS) or not reads_images
-
-
-def test_declared_class_replaces_the_derived_one() -> None:
-    sgbm = METHODS["sgbm"]
-    assert input_class(replace(sgbm, info=replace(sgbm.info, inputs="lidar"))) == "lidar"
+        assert input_class(replace(method, info=replace(method.info, inputs="lidar"))) == "lidar"

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 
 pytest.importorskip("cv2")
-pytest.importorskip("torch")
 
 import numpy as np
 from PIL import Image

@@ -30,12 +30,9 @@ def test_left_right_check_on_known_row() -> None:
 
 @given(st.integers(1, 30), st.integers(0, 2**32 - 1))
 def test_consistent_plane_is_confirmed_where_both_see_it(disparity: int, seed: int) -> None:
-    noise = (
-        np.random.default_rng(seed)
-        .uniform(-MAX_LEFT_RIGHT_DIFFERENCE_PX / 2, MAX_LEFT_RIGHT_DIFFERENCE_PX / 2, (2, 4, 64))
-        .astype(np.float32)
-    )
-    left, right = np.float32(disparity + 1.5) + noise
+    half_px = MAX_LEFT_RIGHT_DIFFERENCE_PX / 2
+    noise = np.random.default_rng(seed).uniform(-half_px, half_px, (2, 4, 64))
+    left, right = (disparity + 1.5 + noise).astype(np.float32)
     consistent = left_right_consistent(left, right)
     assert consistent[:, disparity + 3 :].all()
     assert not consistent[:, : max(disparity - 1, 0)].any()
@@ -52,17 +49,14 @@ def test_pixels_seen_by_one_eye_have_no_depth(where: str) -> None:
     if where == "bar":
         left[:, 100:120], right[:, 70:90] = bar[:, :20], bar[:, :20]  # The bar has 30 px.
     K = np.array([[700.0, 0, 99.5], [0, 700.0, 29.5], [0, 0, 1.0]])
-    left_cam_from_world = np.eye(4)
     right_cam_from_world = np.eye(4)
     right_cam_from_world[0, 3] = -0.12
     row = {
         "left_rgb": left,
         "right_rgb": right,
-        "left_K": K,
-        "right_K": K,
-        "left_distortion": np.zeros(5),
-        "right_distortion": np.zeros(5),
-        "left_cam_from_world": left_cam_from_world,
+        **dict.fromkeys(("left_K", "right_K"), K),
+        **dict.fromkeys(("left_distortion", "right_distortion"), np.zeros(5)),
+        "left_cam_from_world": np.eye(4),
         "right_cam_from_world": right_cam_from_world,
         "baseline_m": 0.12,
     }
