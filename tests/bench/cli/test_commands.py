@@ -238,18 +238,23 @@ def test_right_depth_that_differs_from_its_digest_is_listed(copy: Path) -> None:
     assert run_bench("verify", copy, "--files-only").returncode == 0
 
 
+def reading_commands(archive: Path, data: Path, out: Path) -> list[list[str | Path]]:
+    """Return a command line of each command that reads a dataset; results are written beside or at ``out``."""
+    return [
+        ["score", archive, "--data", data, "--json", out],
+        ["check", archive, "--data", data],
+        ["predict", "constant", "--data", data, "--out", out, "--config", "lattice-orbit"],
+        ["table", archive, "--data", data, "--csv", out],
+        ["compare", archive, archive, "--data", data, "--csv", out],
+        ["verify", data, "--files-only"],
+    ]
+
+
 def test_other_dataset_than_expected_is_refused(
     tiny_root: Path, tiny_truth: dict[str, np.ndarray], archive_of: Callable[..., Path], tmp_path: Path
 ) -> None:
-    archive, digest, out = archive_of(tiny_truth), open_folder(tiny_root).digest, tmp_path / "out"
-    commands: list[list[str | Path]] = [
-        ["score", archive, "--data", tiny_root, "--json", out],
-        ["check", archive, "--data", tiny_root],
-        ["predict", "constant", "--data", tiny_root, "--out", out, "--config", "lattice-orbit"],
-        ["table", archive, "--data", tiny_root, "--csv", out],
-        ["compare", archive, archive, "--data", tiny_root, "--csv", out],
-        ["verify", tiny_root, "--files-only"],
-    ]
+    archive, digest = archive_of(tiny_truth), open_folder(tiny_root).digest
+    commands = reading_commands(archive, tiny_root, tmp_path / "out")
     other = "sha256:" + "0" * 64
     for command in commands:
         for wrong, said in ((other, f"has the digest {digest}, expected {other}"), ("md5:1", "expected sha256:")):
@@ -272,17 +277,10 @@ def test_other_dataset_than_expected_is_refused(
 def test_false_digest_is_refused_by_every_command(
     copy: Path, tiny_truth: dict[str, np.ndarray], archive_of: Callable[..., Path]
 ) -> None:
-    archive = archive_of(tiny_truth)
     manifest = (copy / "manifest.json").read_text()
     (copy / "manifest.json").write_text(manifest.replace(open_folder(copy).digest, "sha256:" + "0" * 64))
-    commands: list[list[str | Path]] = [
-        ["score", archive, "--data", copy],
-        ["table", archive, "--data", copy],
-        ["check", archive, "--data", copy],
-        ["predict", "constant", "--data", copy, "--out", copy.with_name("out")],
-        ["verify", copy],
-    ]
-    for command in commands:
+    commands = reading_commands(archive_of(tiny_truth), copy, copy.with_name("out"))[:-1]
+    for command in [*commands, ["verify", copy]]:
         finished = run_bench(*command)
         assert (finished.returncode, finished.stdout) == (2, "")
         assert "ground_truth.digest" in finished.stderr
