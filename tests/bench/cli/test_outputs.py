@@ -36,6 +36,14 @@ def archive(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.fixture(scope="module")
+def whole_archive(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return an archive of both configs."""
+    path = tmp_path_factory.mktemp("outputs") / "whole.zip"
+    assert run_in_process(main, "predict", "constant", "--data", tiny_root, "--out", path).returncode == 0
+    return path
+
+
 def test_output_that_is_an_input_is_rejected(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     archive, data = tmp_path / "a.zip", tmp_path / "data"
     archive.write_bytes(b"precious")
@@ -297,7 +305,7 @@ def test_prediction_on_a_full_disk_is_finished_by_a_later_run(new_disk: NewDisk,
     ],
 )
 def test_outputs_on_full_and_read_only_disks(
-    new_disk: NewDisk, archive: Path, tiny_root: Path, command: str, option: str, suffix: str
+    new_disk: NewDisk, whole_archive: Path, tiny_root: Path, command: str, option: str, suffix: str
 ) -> None:
     if option == "--figure":
         pytest.importorskip("matplotlib")
@@ -305,7 +313,7 @@ def test_outputs_on_full_and_read_only_disks(
     target = disk.root / f"out.{suffix}"
     target.write_text("old")
     (disk.root / "other").write_bytes(bytes(4 * KIB))
-    arguments: tuple[str | Path, ...] = (*command.split(), archive, "--data", tiny_root, option, target)
+    arguments: tuple[str | Path, ...] = (command, whole_archive, "--data", tiny_root, option, target)
     assert_refused(run_in_process(main, *arguments), target, "No space left on device")
     assert target.read_text() == "old"
     assert disk.files() == {target.name, "other"}

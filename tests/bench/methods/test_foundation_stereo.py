@@ -184,17 +184,22 @@ END = "expected the end of the cost volume"
 @pytest.mark.parametrize(
     ("settings", "words"),
     [
-        *((f"max_disp: {value}", END) for value in ("0", "-416", "true", "416.0", "'416'", "[]", "null")),
-        ("hidden_dims: [1]", END),
-        ("a: &a [x, x]\nb: *a\n", "1 problem"),
-        ("- 1\n", "1 problem"),
-        ("max_disp: \0", "1 problem"),
+        *((f"max_disp: {value}".encode(), END) for value in ("0", "-416", "true", "416.0", "'416'", "[]", "null")),
+        (b"hidden_dims: [1]", END),
+        (b"a: &a [x, x]\nb: *a\n", "an alias"),
+        (b"- 1\n", "holds list"),
+        (b"{", "not valid YAML"),
+        (b"!!python/object/apply:os.system ['true']", "not valid YAML"),
+        (b"a: \0", "not valid YAML"),
+        (b"a: \xff\xff", "not UTF-8"),
+        (b"a: 9999-99-99", "1 problem"),
+        (b"".join(b" " * level + b"a:\n" for level in range(500)), "nested too deep"),
     ],
 )
-def test_invalid_settings_are_refused(settings: str, words: str, tmp_path: Path) -> None:
+def test_invalid_settings_are_refused(settings: bytes, words: str, tmp_path: Path) -> None:
     method, path = stereo_method(tmp_path), tmp_path / "clone" / "pretrained_models" / "23-51-11" / "cfg.yaml"
-    path.write_text(settings)
-    with pytest.raises(MethodError, match=f"^{re.escape(str(path))}: .*{words}"):
+    path.write_bytes(settings)
+    with pytest.raises(MethodError, match=f"(?s)^{re.escape(str(path))}: .*{words}"):
         method.load()
 
 

@@ -33,8 +33,8 @@ def external(location: str) -> TensorProto:
     tensor = numpy_helper.from_array(WEIGHTS.reshape(1, 3, 1, 1), "w")
     tensor.ClearField("raw_data")
     tensor.data_location = TensorProto.EXTERNAL
-    entry = tensor.external_data.add()
-    entry.key, entry.value = "location", location
+    tensor.external_data.add(key="offset", value="0")
+    tensor.external_data.add(key="location", value=location)
     return tensor
 
 

@@ -162,7 +162,7 @@ def test_method_that_reads_no_distortion_is_given_the_rectified_pair(dataset_row
     depth_m = predictor({name: dataset_row[name] for name in ("view_id", *needed)})
     pair = rectified_pair(dataset_row)
     images = {"left_rgb": pair.left_rgb, "right_rgb": pair.right_rgb, "left_K": pair.K, "right_K": pair.K}
-    expected = {"view_id": "capture/0001", "baseline_m": pair.baseline_m, **images}
+    expected: Row = {"view_id": "capture/0001", "baseline_m": pair.baseline_m, **images}
     assert given.keys() == expected.keys()
     assert all(np.array_equal(given[name], value) for name, value in expected.items())
     assert np.array_equal(depth_m, raw_depth_m(pair, method(given)), equal_nan=True)
