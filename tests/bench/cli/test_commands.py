@@ -58,6 +58,7 @@ def is_number(text: str) -> bool:
     return True
 
 
+@pytest.mark.slow
 def test_score_writes_table_json_csv_and_report(constant: Path, tiny_root: Path, tmp_path: Path) -> None:
     targets = {kind: tmp_path / f"out.{kind}" for kind in ("json", "csv", "html")}
     options = [part for kind, path in targets.items() for part in (f"--{kind}", path)]
@@ -250,6 +251,7 @@ def reading_commands(archive: Path, data: Path, out: Path) -> list[list[str | Pa
     ]
 
 
+@pytest.mark.slow
 def test_other_dataset_than_expected_is_refused(
     tiny_root: Path, tiny_truth: dict[str, np.ndarray], archive_of: Callable[..., Path], tmp_path: Path
 ) -> None:

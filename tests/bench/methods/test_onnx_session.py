@@ -187,6 +187,7 @@ def test_endless_model_ends_at_view_timeout(
     assert not (tmp_path / "x.zip").exists()
 
 
+@pytest.mark.slow
 def test_time_limit_does_not_change_results(tmp_path: Path) -> None:
     path = write_loop_model(tmp_path)
     assert np.isnan(predict_depth(path, BLACK)).all()
