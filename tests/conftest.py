@@ -219,6 +219,8 @@ def hub(monkeypatch: pytest.MonkeyPatch) -> Iterator[HubServer]:
 
     with running_hub() as server:
         settings_of_hub = {"ENDPOINT": server.url, "HF_HUB_OFFLINE": False, "HF_HUB_DISABLE_XET": True}
+        template = f"{server.url}/{{repo_id}}/resolve/{{revision}}/{{filename}}"
+        settings_of_hub |= {"HUGGINGFACE_CO_URL_TEMPLATE": template}
         for name, value in settings_of_hub.items():
             monkeypatch.setattr(constants, name, value)
         monkeypatch.setenv("HF_TOKEN", TOKEN)

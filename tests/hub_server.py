@@ -163,8 +163,9 @@ class HubServer:
 
     async def _revision(self, _: Request, key: str, repository: StoredRepository, argument: str) -> Response:
         commit, _path = self._at(repository, argument or "main")
+        siblings = [{"rfilename": name, "size": len(data)} for name, data in repository.commits[commit].items()]
         name = key.partition("/")[2]
-        return JSONResponse({"id": name, "sha": commit, "private": repository.private, "siblings": []})
+        return JSONResponse({"id": name, "sha": commit, "private": repository.private, "siblings": siblings})
 
     async def _tree(self, request: Request, _: str, repository: StoredRepository, argument: str) -> Response:
         commit, folder = self._at(repository, argument)

@@ -2,8 +2,7 @@
 
 A stand-in has the public interface of the original network and returns the red channel times its only weight. The
 tests write its code into a folder with the layout of the original; none of it comes from the original authors. The
-tests therefore cover only what this project does around a network: the input image, the focal length, the margins,
-the resampling to the left grid, and the units.
+tests therefore cover only what this project does around a network: units, resizing and back, and missing parts.
 """
 
 from __future__ import annotations
@@ -11,15 +10,19 @@ from __future__ import annotations
 import importlib
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from textwrap import dedent
+from typing import Any
+
+import numpy as np
 
 from rebar_depth_bench.methods.paper.third_party import on_sys_path
 
 GAIN = 0.5
 """Factor by which every stand-in multiplies the red channel: its only weight, read from the checkpoint."""
+FX, FY, BASELINE_M = 87.5, 80.0, 0.12
 
 METRIC3D_HUBCONF = """
     dependencies = ["torch"]
@@ -33,7 +36,6 @@ METRIC3D_HUBCONF = """
         def inference(self, data):
             pixels = data["input"]
             assert pixels.shape == (1, 3, 616, 1064) and pixels.dtype == torch.float32
-            print("as talkative as the original")
             red = pixels[:, :1] * 58.395 + 123.675
             return self.gain * red, torch.ones_like(red), {}
 
@@ -55,29 +57,6 @@ UNIDEPTH_MODELS = """
             assert rgb.dtype == torch.uint8 and rgb.ndim == 3 and rgb.shape[0] == 3 and camera is None
             depth = self.gain * rgb[None, :1].float()
             return {"depth": depth, "radius": 1.2 * depth, "intrinsics": torch.eye(3)[None]}
-"""
-
-DA3_API = """
-    from types import SimpleNamespace
-    import numpy as np
-    import torch
-    from huggingface_hub import PyTorchModelHubMixin
-    from PIL import Image
-
-    class DepthAnything3(torch.nn.Module, PyTorchModelHubMixin):
-        def __init__(self, model_name="da3-large", **kwargs):
-            super().__init__()
-            self.gain = torch.nn.Parameter(torch.zeros(()))
-
-        def inference(self, image, extrinsics=None, intrinsics=None, process_res=504):
-            [rgb] = image
-            assert isinstance(rgb, np.ndarray) and rgb.dtype == np.uint8
-            height, width = rgb.shape[:2]
-            scale = process_res / max(height, width)
-            w, h = (14 * round(side * scale / 14) for side in (width, height))
-            red = np.asarray(Image.fromarray(rgb[..., 0]).resize((w, h), Image.Resampling.BILINEAR), np.float32)
-            noise = 1e-3 * torch.rand(1).item()  # as the original's sample of the sky
-            return SimpleNamespace(depth=(self.gain.item() + noise) * red[None], intrinsics=None)
 """
 
 INPUT_PADDER = """
@@ -115,92 +94,76 @@ FOUNDATION_STEREO = """
 
         def run_hierachical(self, image1, image2, iters=12, test_mode=False, low_memory=False, small_ratio=0.5):
             assert small_ratio == 0.5
-            return self.forward(image1, image2, iters, test_mode=test_mode)
+            return 2 * self.forward(image1, image2, iters, test_mode=test_mode)
 """
-
-STEREO_MATCHER = """
-    import torch
-    import torch.nn.functional as F
-    from core.utils.utils import InputPadder
-
-    class FoundationStereo(torch.nn.Module):
-        def __init__(self, args):
-            super().__init__()
-            self.gain = torch.nn.Parameter(torch.zeros(()))
-            self.volume_px = args.max_disp
-
-        def forward(self, image1, image2, iters=12, flow_init=None, test_mode=False, init_disp=None):
-            assert image1.shape == image2.shape and image1.shape[2] % 32 == image1.shape[3] % 32 == 0
-            assert iters == 32 and test_mode
-            if init_disp is None:
-                start, steps = torch.zeros_like(image1[:, :1]), range(self.volume_px)
-            else:
-                start, steps = init_disp.round(), range(-4, 5)
-            columns = torch.arange(image1.shape[3]).expand_as(start)
-            best, disparity = torch.full_like(start, torch.inf), torch.zeros_like(start)
-            for step in steps:
-                match = (columns - start - step).clamp(0, image1.shape[3] - 1).long()
-                seen = image2.gather(3, match.expand_as(image2))
-                cost = F.avg_pool2d((image1 - seen).abs().mean(1, keepdim=True), 9, 1, 4)
-                disparity = torch.where(cost < best, start + step, disparity)
-                best = torch.minimum(cost, best)
-            return disparity
-
-        def run_hierachical(self, image1, image2, iters=12, test_mode=False, low_memory=False, small_ratio=0.5):
-            height, width = image1.shape[2:]
-            pair = [F.interpolate(image, scale_factor=small_ratio, mode="bilinear") for image in (image1, image2)]
-            rows, columns = pair[0].shape[2:]
-            smaller = [F.pad(image, (0, -columns % 32, 0, -rows % 32), mode="replicate") for image in pair]
-            first = self.forward(*smaller, iters, test_mode=True)[:, :, :rows, :columns]
-            first = F.interpolate(first, size=(height, width), mode="bilinear") / small_ratio
-            return self.forward(image1, image2, iters, test_mode=test_mode, init_disp=first)
-"""
-"""Code of a stand-in for FoundationStereo that finds disparities below ``max_disp`` by block matching.
-
-It stands in for the modes of the original: a second pass searches near the result of the first.
-"""
+"""Code of a stand-in for FoundationStereo, whose hierarchical mode returns twice the disparity."""
 
 
-def metric3d_clone(folder: Path, **weights: float) -> Path:
+def metric3d_clone(folder: Path, gain: float = GAIN, key: str = "gain") -> Path:
     """Write a clone of Metric3D that contains its checkpoint, and return the folder."""
     _write(folder / "hubconf.py", METRIC3D_HUBCONF)
-    _pickle(folder / "metric_depth_vit_small_800k.pth", "model_state_dict", weights)
+    _pickle(folder / "metric_depth_vit_small_800k.pth", {"model_state_dict": _tensors(gain, key)})
     return folder
 
 
-def unidepth_weights(folder: Path, encoder: str = "dinov2_vitl14", **weights: float) -> Path:
+def unidepth_weights(folder: Path, gain: float = GAIN, key: str = "gain") -> Path:
     """Write UniDepth's files as they are on the Hub, and return the folder."""
-    return _write_hub_folder(folder, {"model": {"pixel_encoder": {"name": encoder}}}, weights)
+    return _write_hub_folder(folder, {"model": {"pixel_encoder": {"name": "dinov2_vitl14"}}}, gain, key)
 
 
-def da3_weights(folder: Path, model_name: str = "da3metric-large", **weights: float) -> Path:
+def da3_weights(folder: Path, gain: float = GAIN, key: str = "gain") -> Path:
     """Write Depth Anything 3's files as they are on the Hub, and return the folder."""
-    return _write_hub_folder(folder, {"model_name": model_name}, weights)
+    return _write_hub_folder(folder, {"model_name": "da3metric-large"}, gain, key)
 
 
-def stereo_clone(folder: Path, *, code: str = FOUNDATION_STEREO, max_disp: object = 416, **weights: float) -> Path:
+def stereo_clone(folder: Path, gain: float = GAIN, key: str = "gain") -> Path:
     """Write a clone of FoundationStereo with its weights folder 23-51-11, and return the folder."""
-    _write(folder / "core" / "foundation_stereo.py", code)
+    _write(folder / "core" / "foundation_stereo.py", FOUNDATION_STEREO)
     _write(folder / "core" / "utils" / "utils.py", INPUT_PADDER)
     trained = folder / "pretrained_models" / "23-51-11"
-    trained.mkdir(parents=True)
-    (trained / "cfg.yaml").write_text(f"max_disp: {max_disp}\nhidden_dims: [128, 128, 128]\n")
-    _pickle(trained / "model_best_bp2.pth", "model", weights)
+    _write(trained / "cfg.yaml", "max_disp: 416\nhidden_dims: [128, 128, 128]\n")
+    _pickle(trained / "model_best_bp2.pth", {"model": _tensors(gain, key), "global_step": 1})
     return folder
+
+
+BUILDERS: Mapping[str, Callable[..., Path]] = {
+    "depth-anything-3": da3_weights,
+    "foundation-stereo": stereo_clone,
+    "metric3d": metric3d_clone,
+    "unidepth": unidepth_weights,
+}
+"""Writers of the folder of each method that takes ``NAME:FOLDER``."""
 
 
 @contextmanager
 def stand_in_packages(site: Path) -> Iterator[Path]:
-    """Write stand-in packages into ``site`` and make them importable; remove their modules on exit."""
+    """Write the stand-in package into ``site`` and make it importable; remove the modules of stand-ins on exit."""
     _write(site / "unidepth" / "models.py", UNIDEPTH_MODELS)
-    _write(site / "depth_anything_3" / "api.py", DA3_API)
     with on_sys_path(site):
         importlib.invalidate_caches()
         yield site
-    for name in [
-        module for module in sys.modules if module.split(".")[0] in ("unidepth", "depth_anything_3", "core")
-    ]:
+    for name in [module for module in sys.modules if module.split(".")[0] in ("unidepth", "core")]:
         del sys.modules[name]
+
+
+def stereo_row(red: np.ndarray, fx: float = FX) -> dict[str, Any]:
+    """Return a stereo view whose left eye has the given red channel; the other channels are noise."""
+    height, width = red.shape
+    left, right = np.random.default_rng(1).integers(0, 256, (2, height, width, 3), np.uint8)
+    left[..., 0] = red
+    K = np.array([[fx, 0, (width - 1) / 2], [0, FY, (height - 1) / 2], [0, 0, 1]])
+    right_cam_from_world = np.eye(4)
+    right_cam_from_world[0, 3] = -BASELINE_M
+    return {
+        "view_id": "a/0",
+        "left_rgb": left,
+        "right_rgb": right,
+        **dict.fromkeys(("left_K", "right_K"), K),
+        **dict.fromkeys(("left_distortion", "right_distortion"), np.zeros(5)),
+        "left_cam_from_world": np.eye(4),
+        "right_cam_from_world": right_cam_from_world,
+        "baseline_m": BASELINE_M,
+    }
 
 
 def _write(path: Path, code: str) -> None:
@@ -208,16 +171,17 @@ def _write(path: Path, code: str) -> None:
     path.write_text(dedent(code))
 
 
-def _pickle(path: Path, key: str, weights: dict[str, float]) -> None:
-    torch = importlib.import_module("torch")
-    tensors = {name: torch.tensor(value) for name, value in (weights or {"gain": GAIN}).items()}
-    torch.save({key: tensors, "global_step": 1, "epoch": 1}, path)
+def _tensors(gain: float, key: str) -> dict[str, Any]:
+    return {key: importlib.import_module("torch").tensor(gain)}
 
 
-def _write_hub_folder(folder: Path, config: dict[str, object], weights: dict[str, float]) -> Path:
-    torch = importlib.import_module("torch")
+def _pickle(path: Path, content: dict[str, Any]) -> None:
+    importlib.import_module("torch").save(content, path)
+
+
+def _write_hub_folder(folder: Path, config: dict[str, object], gain: float, key: str) -> Path:
     folder.mkdir(parents=True)
     (folder / "config.json").write_text(json.dumps(config))
-    tensors = {name: torch.tensor(value) for name, value in (weights or {"gain": GAIN}).items()}
-    importlib.import_module("safetensors.torch").save_file(tensors, folder / "model.safetensors")
+    save_file = importlib.import_module("safetensors.torch").save_file
+    save_file(_tensors(gain, key), folder / "model.safetensors")
     return folder

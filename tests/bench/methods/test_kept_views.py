@@ -9,40 +9,32 @@ import shutil
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.methods.kept_views import KeptViews, PreparationReport
-from rebar_depth_bench.methods.run import predict
-from tests.bench.methods.test_predict import counting_method, orbit_view_ids
 
-GRID = (90, 160)
+KEY = {"method": "whole", "columns": ("a", "b")}
+VIEW, GRID = "orbit/0001", (90, 160)
+REPORT = PreparationReport(notes={"text": "Größe", "list": [1, 2.5, None, True]}, seconds=1.5)
 
 
 @pytest.fixture
-def interrupted(tiny_root: Path, tmp_path: Path) -> Path:
-    """Return the folder of a run of ``lattice-orbit`` that was interrupted after the first of two views."""
-    predict_orbit(tiny_root, tmp_path, stop_after=1)
-    return tmp_path / ".x.zip.views"
+def kept(tmp_path: Path) -> KeptViews:
+    """Return the kept view, report and work folder of an interrupted run."""
+    views = KeptViews.open(tmp_path / "views", KEY)
+    views.put(VIEW, np.ones(GRID, np.float32), 0.25)
+    views.put_report("orbit", REPORT)
+    (views.work_folder("orbit") / "any").touch()
+    return views
 
 
-def predict_orbit(root: Path, folder: Path, stop_after: int = 0) -> list[str]:
-    """Predict ``lattice-orbit`` until ``stop_after`` views are done, and return the log of the method."""
-    log: list[str] = []
-
-    def stop(task: str, done: int, _: int) -> None:
-        if task.startswith("whole on") and done == stop_after:
-            raise KeyboardInterrupt
-
-    method, archive = counting_method(log), folder / "x.zip"
-    if stop_after:
-        with pytest.raises(KeyboardInterrupt):
-            predict(method, root, archive, configs=["lattice-orbit"], progress=stop)
-    else:
-        predict(method, root, archive, configs=["lattice-orbit"], progress=stop)
-    return log
+def tree(folder: Path) -> list[Path]:
+    """Return all files and folders below a folder."""
+    return sorted(folder.rglob("*"))
 
 
 def npz(**arrays: object) -> bytes:
@@ -51,100 +43,72 @@ def npz(**arrays: object) -> bytes:
     return stream.getvalue()
 
 
-def kept(view_id: str, depth: object = None, seconds: object = 0.5) -> bytes:
+def stored(depth: object = None, seconds: object = 0.5, view_id: str = VIEW) -> bytes:
     """Return the content of a kept prediction, whose parts can be replaced."""
     depth = np.full(GRID, 9, np.float32) if depth is None else depth
     return npz(**{view_id: depth, "seconds": np.array([[seconds]])})
 
 
-def declared_shape(view_id: str, shape: str) -> bytes:
+def with_declared_shape(shape: str) -> bytes:
     """Return a kept prediction whose header declares another shape, with right checksums."""
-    stream = io.BytesIO()
-    with zipfile.ZipFile(io.BytesIO(kept(view_id))) as source, zipfile.ZipFile(stream, "w") as target:
+    stream, old = io.BytesIO(), f"{GRID}, }}".encode()
+    with zipfile.ZipFile(io.BytesIO(stored())) as source, zipfile.ZipFile(stream, "w") as target:
         for name in source.namelist():
-            target.writestr(
-                name, source.read(name).replace(b"(90, 160), }" + b" " * (len(shape) - 9), shape.encode() + b", }")
-            )
+            padded = old + b" " * (len(shape) - len(str(GRID)))
+            target.writestr(name, source.read(name).replace(padded, f"{shape}, }}".encode()))
     return stream.getvalue()
 
 
-DAMAGED: dict[str, Callable[[str], bytes]] = {
-    "another shape": lambda view: kept(view, np.zeros((3, 4), np.float32)),
-    "another rank": lambda view: kept(view, np.zeros((90, 160, 1), np.float32)),
-    "integers": lambda view: kept(view, np.zeros(GRID, np.int32)),
-    "objects": lambda view: kept(view, np.full(GRID, None)),
-    "declared huge": lambda view: declared_shape(view, "(900000000, 160000000)"),
-    "another view": lambda _: kept("lattice-orbit/0099"),
-    "no runtime": lambda view: npz(**{view: np.zeros(GRID, np.float32)}),
-    "negative runtime": lambda view: kept(view, seconds=-1.0),
-    "infinite runtime": lambda view: kept(view, seconds=np.inf),
-    "undefined runtime": lambda view: kept(view, seconds=np.nan),
-    "runtime as text": lambda view: kept(view, seconds="soon"),
-    "three arrays": lambda view: npz(**{view: np.zeros(GRID), "seconds": np.zeros((1, 1)), "more": np.zeros(9)}),
-    "old names": lambda _: npz(depth_m=np.zeros(GRID, np.float32), seconds=0.0),
-    "empty": lambda _: b"",
-    "text": lambda _: b"damaged",
-    "truncated": lambda view: kept(view)[:-100],
-    "a flipped bit": lambda view: kept(view)[:30_000] + b"\x99" + kept(view)[30_001:],
-    "a pickle": lambda _: b"\x80\x04cos\nsystem\n.",
+DAMAGED = {
+    "another shape": stored(np.zeros((3, 4), np.float32)),
+    "another rank": stored(np.zeros((90, 160, 1), np.float32)),
+    "integers": stored(np.zeros(GRID, np.int32)),
+    "objects": stored(np.full(GRID, None)),
+    "declared huge": with_declared_shape("(900000000, 160000000)"),
+    "another view": stored(view_id="orbit/0099"),
+    "no runtime": npz(**{VIEW: np.zeros(GRID, np.float32)}),
+    "negative runtime": stored(seconds=-1.0),
+    "infinite runtime": stored(seconds=np.inf),
+    "undefined runtime": stored(seconds=np.nan),
+    "runtime as text": stored(seconds="soon"),
+    "three arrays": npz(**{VIEW: np.zeros(GRID), "seconds": np.zeros((1, 1)), "more": np.zeros(9)}),
+    "empty": b"",
+    "text": b"damaged",
+    "truncated": stored()[:-100],
+    "cut in the end record": stored()[:-10],
+    "a flipped bit": stored()[:30_000] + b"\x99" + stored()[30_001:],
+    "a pickle": b"\x80\x04cos\nsystem\n.",
 }
 
 
 @pytest.mark.parametrize("content", DAMAGED.values(), ids=DAMAGED)
-def test_damaged_prediction_is_predicted_again(
-    content: Callable[[str], bytes],
-    interrupted: Path,
-    tiny_root: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    views = orbit_view_ids(tiny_root)
-    (interrupted / f"{views[0]}.npz").write_bytes(content(views[0]))
-    log = predict_orbit(tiny_root, tmp_path)
-    assert log[-2:] == views
-    [notice] = [line for line in capsys.readouterr().err.splitlines() if "again" in line]
-    assert f"{views[0]}.npz" in notice
-    with zipfile.ZipFile(tmp_path / "x.zip") as archive:
-        depths = [np.load(io.BytesIO(archive.read(f"{view}.npy"))) for view in views]
-    assert all((depth == 2).all() and depth.shape == GRID for depth in depths)
-    assert [path.name for path in tmp_path.iterdir()] == ["x.zip"]
-
-
-def test_every_cut_of_a_kept_prediction_is_noticed(tmp_path: Path) -> None:
-    views = KeptViews.open(tmp_path / "views", {})
-    views.put("a/0", np.ones((2, 3), np.float16), 0.25)
-    file = tmp_path / "views" / "a" / "0.npz"
-    good = file.read_bytes()
-    for length in range(0, len(good), 5):
-        file.write_bytes(good[:length])
-        with pytest.raises(InputError, match=r"0\.npz"):
-            views.get("a/0", (2, 3))
-    file.write_bytes(good)
-    depth_m, seconds = views.get("a/0", (2, 3))
-    assert (depth_m.tolist(), depth_m.dtype, seconds) == ([[1, 1, 1], [1, 1, 1]], np.float16, 0.25)
+def test_damaged_prediction_is_refused(content: bytes, kept: KeptViews) -> None:
+    (kept.path / f"{VIEW}.npz").write_bytes(content)
+    with pytest.raises(InputError, match=r"0001\.npz"):
+        kept.get(VIEW, GRID)
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64, np.longdouble, ">f4"])
-def test_float_types_can_be_read_again(dtype: str, tmp_path: Path) -> None:
-    views = KeptViews.open(tmp_path / "views", {})
-    views.put("a/0", np.asfortranarray(np.arange(6).reshape(2, 3).astype(dtype)), 0.0)
-    assert views.get("a/0", (2, 3))[0].tolist() == [[0, 1, 2], [3, 4, 5]]
+def test_float_types_can_be_read_again(dtype: Any, kept: KeptViews) -> None:
+    kept.put("a/0", np.asfortranarray(np.arange(6).reshape(2, 3).astype(dtype)), 0.25)
+    depth_m, seconds = kept.get("a/0", (2, 3))
+    assert (depth_m.tolist(), seconds) == ([[0, 1, 2], [3, 4, 5]], 0.25)
+    assert depth_m.dtype == (np.float32 if dtype is np.longdouble else np.dtype(dtype).newbyteorder("="))
 
 
 @pytest.mark.parametrize("view_id", ["../x", "a/../../x", "/x", "a/b\0", "a/.hidden", "", "a//b"])
-def test_view_id_cannot_leave_the_folder(view_id: str, tmp_path: Path) -> None:
-    views = KeptViews.open(tmp_path / "folder" / "views", {})
+def test_view_id_cannot_leave_the_folder(view_id: str, kept: KeptViews, tmp_path: Path) -> None:
+    before = tree(tmp_path)
     with pytest.raises(InputError, match="is not a path in this folder"):
-        views.put(view_id, np.ones((2, 3)), 0.0)
-    assert {path.name for path in tmp_path.rglob("*")} == {"folder", "views", "run.json"}
+        kept.put(view_id, np.ones((2, 3)), 0.0)
+    assert tree(tmp_path) == before
 
 
 def report(notes: str = "{}", seconds: str = "1") -> Callable[[str], bytes]:
     """Return a function that gives ``run.json`` another report, as text."""
 
     def replace_report(text: str) -> bytes:
-        run = json.loads(text)
-        table = json.dumps(run | {"reports": {"lattice-orbit": "REPORT"}})
+        table = json.dumps(json.loads(text) | {"reports": {"orbit": "REPORT"}})
         return table.replace('"REPORT"', f'{{"notes": {notes}, "seconds": {seconds}}}').encode()
 
     return replace_report
@@ -171,129 +135,99 @@ DAMAGED_RUNS: dict[str, Callable[[str], bytes]] = {
 
 @pytest.mark.parametrize("damage", DAMAGED_RUNS.values(), ids=DAMAGED_RUNS)
 def test_run_with_damaged_or_other_parameters_starts_over(
-    damage: Callable[[str], bytes],
-    interrupted: Path,
-    tiny_root: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
+    damage: Callable[[str], bytes], kept: KeptViews, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    file = interrupted / "run.json"
+    file = kept.path / "run.json"
     file.write_bytes(damage(file.read_text()))
-    assert predict_orbit(tiny_root, tmp_path)[1:] == ["prepare lattice-orbit False", *orbit_view_ids(tiny_root)]
-    assert f"starting over: {interrupted} holds 1 views of " in capsys.readouterr().err
-    with zipfile.ZipFile(tmp_path / "x.zip") as archive:
-        metadata = json.loads(archive.read("submission.json"))
-    assert metadata["notes"] == {"lattice-orbit": {"counted": 2}}
+    assert KeptViews.open(kept.path, KEY).run.reports == {}
+    assert f"starting over: {kept.path} holds 1 views of " in capsys.readouterr().err
+    assert tree(kept.path) == [file]
 
 
-def test_sound_report_is_reused(interrupted: Path, tiny_root: Path, tmp_path: Path) -> None:
-    file = interrupted / "run.json"
-    file.write_bytes(report('{"counted": 7}', "2.5")(file.read_text()))
-    predict_orbit(tiny_root, tmp_path)
-    with zipfile.ZipFile(tmp_path / "x.zip") as archive:
-        metadata = json.loads(archive.read("submission.json"))
-    assert metadata["notes"] == {"lattice-orbit": {"counted": 7}}
-    assert metadata["runtime"]["preparing"] == {"lattice-orbit": 2.5}
+def test_report_is_read_as_it_was_written(kept: KeptViews) -> None:
+    kept.put_report("other", PreparationReport(notes={}, seconds=None))
+    again = KeptViews.open(kept.path, json.loads(json.dumps(KEY)))
+    assert again.run.reports == {"orbit": REPORT, "other": PreparationReport(notes={}, seconds=None)}
 
 
-def place_text(path: Path) -> None:
+def place_text(path: Path, _: Path) -> None:
     path.parent.mkdir(exist_ok=True)
     path.write_text("text")
 
 
-def place_pipe(path: Path) -> None:
-    path.unlink(missing_ok=True)
+def place_file(path: Path, documents: Path) -> None:
+    remove(path)
+    place_text(path, documents)
+
+
+def place_pipe(path: Path, _: Path) -> None:
+    remove(path)
     os.mkfifo(path)
 
 
-def place_link(path: Path, target: Path) -> None:
+def place_link(path: Path, documents: Path) -> None:
+    remove(path)
+    path.symlink_to(documents)
+
+
+def remove(path: Path) -> None:
+    """Remove a file or folder if it exists."""
     if path.is_dir():
         shutil.rmtree(path)
     path.unlink(missing_ok=True)
-    path.symlink_to(target)
+
+
+def place_views_without_parameters(path: Path, _: Path) -> None:
+    remove(path)
+    (path / "scans").mkdir(parents=True)
+    (path / "scans" / "0001.npz").write_text("text")
 
 
 FOREIGN: dict[str, tuple[str, Callable[[Path, Path], None]]] = {
-    "document": ("thesis.tex", lambda path, _: place_text(path)),
-    "document beside views": ("lattice-orbit/notes.txt", lambda path, _: place_text(path)),
-    "hidden file": (".bashrc", lambda path, _: place_text(path)),
-    "folder": ("photos", lambda path, _: place_text(path / "1.jpg")),
-    "folder in a folder": ("lattice-orbit/deep", lambda path, _: path.mkdir()),
-    "pipe as parameters": ("run.json", lambda path, _: place_pipe(path)),
-    "pipe as view": ("lattice-orbit/0001.npz", lambda path, _: place_pipe(path)),
+    "document": ("thesis.tex", place_text),
+    "document beside views": ("orbit/notes.txt", place_text),
+    "hidden file": (".bashrc", place_text),
+    "file in a folder": ("photos/1.jpg", place_text),
+    "folder in a folder": ("orbit/deep", lambda path, _: path.mkdir()),
+    "pipe as parameters": ("run.json", place_pipe),
+    "pipe as view": ("orbit/0001.npz", place_pipe),
     "link as parameters": ("run.json", place_link),
-    "link as view": ("lattice-orbit/0001.npz", place_link),
-    "link as config": ("lattice-orbit", place_link),
-    "link as work folder": ("lattice-orbit.work", place_link),
+    "link as view": ("orbit/0001.npz", place_link),
+    "link as config": ("orbit", place_link),
+    "link as work folder": ("orbit.work", place_link),
+    "link": ("", place_link),
+    "link to nowhere": ("", lambda path, documents: place_link(path, documents / "nowhere")),
+    "file": ("", place_file),
+    "pipe": ("", place_pipe),
+    "views without parameters": ("", place_views_without_parameters),
 }
 
 
-@pytest.mark.parametrize("other_run", [False, True])
 @pytest.mark.parametrize(("name", "place"), FOREIGN.values(), ids=FOREIGN)
 def test_foreign_content_is_refused_and_kept(
-    name: str,
-    place: Callable[[Path, Path], None],
-    other_run: bool,
-    interrupted: Path,
-    tiny_root: Path,
-    tmp_path: Path,
+    name: str, place: Callable[[Path, Path], None], kept: KeptViews, tmp_path: Path
 ) -> None:
     documents = tmp_path / "documents"
     documents.mkdir()
     (documents / "thesis.tex").write_text("text")
-    if other_run:
-        (interrupted / "run.json").write_text("{}")
-    place(interrupted / name, documents)
-    before = sorted(tmp_path.rglob("*"))
-    with pytest.raises(InputError) as caught:
-        predict_orbit(tiny_root, tmp_path)
-    assert str(interrupted / name.split("/")[0]) in str(caught.value)
-    assert sorted(tmp_path.rglob("*")) == before
+    place(kept.path / name, documents)
+    before = tree(tmp_path)
+    for key in (KEY, {}):
+        with pytest.raises(InputError) as caught:
+            KeptViews.open(kept.path, key)
+        assert str(kept.path / name.split("/")[0]) in str(caught.value)
+    assert tree(tmp_path) == before
 
 
-@pytest.mark.parametrize("kind", ["folder", "link", "link to nowhere", "file", "pipe", "views without parameters"])
-def test_folder_of_another_kind_is_refused_and_kept(kind: str, tiny_root: Path, tmp_path: Path) -> None:
-    path = tmp_path / ".x.zip.views"
-    documents = path if kind == "folder" else tmp_path / "documents"
-    documents.mkdir()
-    (documents / "thesis.tex").write_text("text")
-    if kind.startswith("link"):
-        path.symlink_to(documents if kind == "link" else tmp_path / "nowhere")
-    elif kind == "file":
-        path.write_text("text")
-    elif kind == "pipe":
-        os.mkfifo(path)
-    elif kind == "views without parameters":
-        (path / "scans").mkdir(parents=True)
-        (path / "scans" / "0001.npz").write_text("text")
-    before = sorted(tmp_path.rglob("*"))
-    with pytest.raises(InputError, match=r"\.x\.zip\.views"):
-        predict_orbit(tiny_root, tmp_path)
-    assert sorted(tmp_path.rglob("*")) == before
+def test_empty_folder_and_remains_of_a_killed_run_are_used(tmp_path: Path) -> None:
+    (tmp_path / ".run.json.abc.tmp").write_text("{")
+    assert KeptViews.open(tmp_path, KEY).run.reports == {}
+    assert tree(tmp_path) == [tmp_path / "run.json"]
 
 
-def test_empty_folder_and_remains_of_a_killed_run_are_used(tiny_root: Path, tmp_path: Path) -> None:
-    path = tmp_path / ".x.zip.views"
-    path.mkdir()
-    (path / ".run.json.abc.tmp").write_text("{")
-    assert len(predict_orbit(tiny_root, tmp_path)) == 4
-    assert [file.name for file in tmp_path.iterdir()] == ["x.zip"]
-
-
-def test_links_in_work_folder_are_not_followed_when_it_is_deleted(
-    interrupted: Path, tiny_root: Path, tmp_path: Path
-) -> None:
+def test_links_in_work_folder_are_not_followed_when_it_is_deleted(kept: KeptViews, tmp_path: Path) -> None:
     (tmp_path / "documents").mkdir()
     (tmp_path / "documents" / "thesis.tex").write_text("text")
-    (interrupted / "lattice-orbit.work" / "pictures").symlink_to(tmp_path / "documents")
-    predict_orbit(tiny_root, tmp_path)
-    assert {path.name for path in tmp_path.rglob("*")} == {"x.zip", "documents", "thesis.tex"}
-
-
-def test_report_is_read_as_it_was_written(tmp_path: Path) -> None:
-    views = KeptViews.open(tmp_path / "views", {"columns": ("a", "b")})
-    assert views.run.reports == {}
-    for seconds in (None, 0.0, 1.5):
-        kept_report = PreparationReport(notes={"text": "Größe", "list": [1, 2.5, None, True]}, seconds=seconds)
-        views.put_report("a", kept_report)
-        assert KeptViews.open(tmp_path / "views", {"columns": ["a", "b"]}).run.reports == {"a": kept_report}
+    (kept.work_folder("orbit") / "pictures").symlink_to(tmp_path / "documents")
+    KeptViews.open(kept.path, KEY).remove()
+    assert {path.name for path in tmp_path.rglob("*")} == {"documents", "thesis.tex"}

@@ -65,9 +65,7 @@ def test_model_input_is_normalised_rgb(
     white: int, mean: tuple[float, ...], std: tuple[float, ...], tmp_path: Path
 ) -> None:
     write_mixer_model(tmp_path, (1, 10, 100), offset=5000)
-    input_table = (
-        f"width = 6\nheight = 4\nresize = 'stretch'\nrange = {white}\nmean = {list(mean)}\nstd = {list(std)}"
-    )
+    input_table = f"{PLAIN_INPUT}\nmean = {list(mean)}\nstd = {list(std)}".replace("255", str(white), 1)
     sums = predict_depth(write_toml(tmp_path, input_table), make_image(6, 4, lambda u, v: (200, 10 * u, 30 * v)))
     for v, u in np.ndindex(4, 6):
         channels = [(c / 255 * white - m) / s for c, m, s in zip((200, 10 * u, 30 * v), mean, std, strict=True)]
@@ -86,22 +84,9 @@ def test_output_meaning_converts_to_metres(tmp_path: Path) -> None:
         # Depth Pro: 1 / z = C W / f, with W and f of the image; its canonical focal length is its input width.
         "meaning = 'canonical-inverse-depth'\nfocal_canonical_px = 6": 1 / (2.5 * 24 / 700),
     }
-    for output, depth_m in expected.items():
-        assert np.unique(predict_depth(write_toml(tmp_path, output_table=output), rgb, 700.0)) == pytest.approx(
-            [depth_m]
-        ), output
-
-
-def test_metric3d_conversion(tmp_path: Path) -> None:
-    """Metric3D's formula: 1280 x 720 is fitted into 1064 x 616, and depth is multiplied by fx * scale / 1000."""
-    write_constant_model(tmp_path, np.full((1, 1, 616, 1064), 3.0))
-    input_table = "width = 1064\nheight = 616\nresize = 'pad'\nrange = 255"
-    path = write_toml(tmp_path, input_table, "meaning = 'canonical-depth'\nfocal_canonical_px = 1000")
-    depth_m = predict_depth(path, np.zeros((720, 1280, 3), np.uint8), 700.0)
-    assert np.unique(depth_m) == pytest.approx([3.0 * 700 * min(616 / 720, 1064 / 1280) / 1000], rel=1e-6)
-    info = find_method(str(path)).info
-    assert info.uses_intrinsics
-    assert "left_K" in info.columns
+    for output, expected_m in expected.items():
+        depth_m = predict_depth(write_toml(tmp_path, output_table=output), rgb, 700.0)
+        assert np.unique(depth_m) == pytest.approx([expected_m]), output
 
 
 def test_invalid_output_becomes_nan(tmp_path: Path) -> None:
@@ -156,17 +141,16 @@ def test_bilinear_sampling_matches_map_coordinates(
     values = np.random.default_rng(7).uniform(1, 2, cells)
     clipped, ranges = [], []
     for span, count in zip(reversed(place), cells, strict=True):
-        centres = np.linspace(span.pad_before_px, span.pad_before_px + span.resized_px, 2 * span.image_px + 1)[
-            1::2
-        ]
-        inside = [i for i in range(count) if span.pad_before_px <= i * span.canvas_px / count + 1e-9]
-        inside = [
-            i for i in inside if (i + 1) * span.canvas_px / count - 1e-9 <= span.pad_before_px + span.resized_px
-        ]
-        ranges.append(inside)
-        clipped.append(
-            np.clip(centres * count / span.canvas_px - 0.5, *((inside[0], inside[-1]) if inside else (0, 0)))
+        first_px, end_px, cell_px = (
+            span.pad_before_px,
+            span.pad_before_px + span.resized_px,
+            span.canvas_px / count,
         )
+        centres = np.linspace(first_px, end_px, 2 * span.image_px + 1)[1::2]
+        inside = [i for i in range(count) if first_px <= i * cell_px + 1e-9 and (i + 1) * cell_px - 1e-9 <= end_px]
+        ranges.append(inside)
+        bounds = (inside[0], inside[-1]) if inside else (0, 0)
+        clipped.append(np.clip(centres / cell_px - 0.5, *bounds))
     if not all(ranges):  # Every cell of this coarse grid overlaps the padding.
         assert sample_at_image_pixels(place, values, bilinear=True).shape == (height, width)
         return
@@ -182,9 +166,8 @@ def test_identity_model_returns_image_in_place(resize: str, tmp_path: Path) -> N
     input_table = f"width = 40\nheight = 40\nresize = '{resize}'\nrange = 255"
     path = write_toml(tmp_path, input_table, f"{DEPTH_OUTPUT}\nresize = 'bilinear'")
     rgb = make_image(80, 50, lambda u, v: (2 * u + v, 0, 0))
-    assert (
-        np.abs(predict_depth(path, rgb)[3:-3, 3:-3] - 1 - rgb[3:-3, 3:-3, 0]).max() < 0.6
-    )  # Grey levels are rounded.
+    difference = predict_depth(path, rgb) - 1 - rgb[..., 0]
+    assert np.abs(difference[3:-3, 3:-3]).max() < 0.6, "grey levels are rounded"
 
 
 def test_padding_is_mean_and_never_sampled(tmp_path: Path) -> None:
@@ -237,17 +220,12 @@ def test_input_size_from_longest_side_and_multiple(size: tuple[int, int], expect
 
 
 def test_dynamic_size_and_half_precision(tmp_path: Path) -> None:
-    mixer_half = [
+    nodes = [
         helper.make_node("ReduceMean", ["x"], ["mean"], axes=[1]),
         helper.make_node("Add", ["mean", "one"], ["y"]),
     ]
-    write_model(
-        tmp_path,
-        mixer_half,
-        constants={"one": np.array(1, np.float16)},
-        input_type=TensorProto.FLOAT16,
-        output_type=TensorProto.FLOAT16,
-    )
+    half = {"input_type": TensorProto.FLOAT16, "output_type": TensorProto.FLOAT16}
+    write_model(tmp_path, nodes, constants={"one": np.array(1, np.float16)}, **half)
     path = write_toml(tmp_path, "longest_side = 6\nresize = 'stretch'\nrange = 1")
     assert np.unique(predict_depth(path, np.full((4, 6, 3), 255, np.uint8))) == pytest.approx([2.0])
 
@@ -258,6 +236,9 @@ def test_method_info_and_coverage_of_its_digest(tmp_path: Path) -> None:
     info = find_method(str(path)).info
     assert (info.name, info.licence, info.columns, info.uses_intrinsics) == ("tiny", "MIT", ("left_rgb",), False)
     assert "metres" in info.summary
+    write_toml(tmp_path, output_table="meaning = 'canonical-depth'\nfocal_canonical_px = 1000")
+    canonical = find_method(str(path)).info
+    assert (canonical.columns, canonical.uses_intrinsics) == (("left_rgb", "left_K"), True)
     assert info.source.startswith("a paper (sha256:")
     write_toml(tmp_path, PLAIN_INPUT + "\nstd = [2, 2, 2]", top_level="source = 'a paper'")
     other_settings = find_method(str(path)).info.source

@@ -1,9 +1,12 @@
-"""Loading of ONNX models that do not match their TOML file: errors before the first view."""
+"""Loading and limits of ONNX models: mismatches with the TOML file, time for each view, and memory."""
 
 from __future__ import annotations
 
 import re
+import signal
+import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +19,11 @@ import numpy as np
 from onnx import TensorProto, helper
 
 from rebar_depth_bench.base.errors import MethodError
+from rebar_depth_bench.base.limits import DeadlineError, call_within
+from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.methods import find_method
 from tests.bench.methods.onnx_models import (
     DEPTH_OUTPUT,
-    OPEN_SHAPE,
     PLAIN_INPUT,
     predict_depth,
     write_constant_model,
@@ -29,114 +33,79 @@ from tests.bench.methods.onnx_models import (
 )
 from tests.bench.methods.predictors import load_predictor
 
+BLACK = np.zeros((4, 6, 3), np.uint8)
+VARIABLE_INPUT = "longest_side = 6\nresize = 'stretch'\nrange = 1"
 CHANNEL_MEAN = helper.make_node("ReduceMean", ["x"], ["y"], axes=[1])
+NEGATED = helper.make_node("Neg", ["x"], ["y"])
+NUMBER = helper.make_node("ReduceMean", ["x"], ["y"], keepdims=0)
+SHAPE = helper.make_node("Shape", ["x"], ["y"])
 SUM_OF_TWO_INPUTS = helper.make_node("Sum", ["x", "k"], ["y"])
 FAILING_RESHAPE = helper.make_node("Reshape", ["x", "to"], ["y"])
-Mismatch = tuple[dict[str, Any], str, str, str]
-MISMATCHES: dict[str, Mismatch] = {
-    "two inputs": (
-        {"nodes": [SUM_OF_TWO_INPUTS], "more_inputs": ["k"]},
-        PLAIN_INPUT,
-        DEPTH_OUTPUT,
-        "invalid input: the model takes 2 ('x', 'k'), expected one",
-    ),
-    "channels last": (
-        {"nodes": [CHANNEL_MEAN], "input_shape": (1, "h", "w", 3)},
-        PLAIN_INPUT,
-        DEPTH_OUTPUT,
-        "invalid input: the model takes 1 x ? x ? x 3, expected 1 x 3 x H x W",
-    ),
-    "channels last, fixed": (
-        {"nodes": [CHANNEL_MEAN], "input_shape": (1, 4, 6, 3)},
-        PLAIN_INPUT,
-        DEPTH_OUTPUT,
-        "invalid input: the model takes 1 x 4 x 6 x 3, expected 1 x 3 x H x W: channels come before",
-    ),
-    "no batch": (
-        {"nodes": [CHANNEL_MEAN], "input_shape": (3, 4, 6)},
-        PLAIN_INPUT,
-        DEPTH_OUTPUT,
-        "invalid input: the model takes 3 x 4 x 6, expected 1 x 3 x H",
-    ),
-    "a batch of two": (
-        {"nodes": [CHANNEL_MEAN], "input_shape": (2, 3, 4, 6)},
-        PLAIN_INPUT,
-        DEPTH_OUTPUT,
-        "invalid input: the model takes 2 x 3 x 4 x 6, expected",
-    ),
-    "another width": (
-        {"nodes": [CHANNEL_MEAN], "input_shape": (1, 3, "h", 8)},
-        PLAIN_INPUT,
-        DEPTH_OUTPUT,
-        "size input.width: got 6, the model takes 1 x 3 x ? x 8, expected 8",
-    ),
-    "a fixed size for an open one": (
-        {"nodes": [CHANNEL_MEAN], "input_shape": (1, 3, 4, 6)},
-        "longest_side = 6\nresize = 'stretch'\nrange = 1",
-        DEPTH_OUTPUT,
-        "size input.height: got a variable size (longest_side), the model takes 1 x 3 x 4 x 6, expected 4",
-    ),
-    "whole numbers in": (
-        {"nodes": [helper.make_node("Neg", ["x"], ["y"])]}
-        | {"input_type": TensorProto.INT32, "output_type": TensorProto.INT32},
-        PLAIN_INPUT,
-        DEPTH_OUTPUT,
-        "invalid input: 'x' is tensor(int32), expected one of tensor(float)",
-    ),
-    "whole numbers out": (
-        {"nodes": [helper.make_node("Shape", ["x"], ["y"])], "output_type": TensorProto.INT64},
-        PLAIN_INPUT,
-        DEPTH_OUTPUT,
-        "invalid output: 'y' is tensor(int64), expected one of tensor(float)",
-    ),
-    "two outputs": (
-        {"nodes": [CHANNEL_MEAN, helper.make_node("Neg", ["x"], ["z"])], "outputs": ["y", "z"]},
-        PLAIN_INPUT,
-        DEPTH_OUTPUT,
-        "missing output.name: the model has 2 outputs, expected one of 'y', 'z'",
-    ),
-    "an unknown output": (
-        {"nodes": [CHANNEL_MEAN]},
-        PLAIN_INPUT,
-        f"{DEPTH_OUTPUT}\nname = 'q'",
-        "unknown output.name: the model has no output 'q', expected one of 'y'",
-    ),
-    "an output too far": (
-        {"nodes": [CHANNEL_MEAN]},
-        PLAIN_INPUT,
-        f"{DEPTH_OUTPUT}\nindex = 1",
-        "unknown output.index: the model has no output 1, expected one of 'y'",
-    ),
-    "three channels out": (
-        {"nodes": [helper.make_node("Neg", ["x"], ["y"])]},
-        PLAIN_INPUT,
-        DEPTH_OUTPUT,
-        "output 'y' has the shape (1, 3, 4, 6), expected H x W, with optional leading dimensions of 1",
-    ),
-    "one number out": (
-        {"nodes": [helper.make_node("ReduceMean", ["x"], ["y"], keepdims=0)]},
-        PLAIN_INPUT,
-        DEPTH_OUTPUT,
-        "output 'y' has the shape (), expected H x W",
-    ),
-    "fails when it runs": (
-        {"nodes": [FAILING_RESHAPE], "constants": {"to": np.array([5, 5])}},
-        PLAIN_INPUT,
-        DEPTH_OUTPUT,
-        "model.onnx: fails on an input of 1 x 3 x 4 x 6: ",
-    ),
-}
+TWO_OUTPUTS = [CHANNEL_MEAN, helper.make_node("Neg", ["x"], ["z"])]
+INT32 = {"input_type": TensorProto.INT32, "output_type": TensorProto.INT32}
 
 
-@pytest.mark.parametrize("case", MISMATCHES.values(), ids=MISMATCHES)
-def test_mismatched_model_raises_on_load(case: Mismatch, tmp_path: Path) -> None:
-    model, input_table, output_table, message = case
-    write_model(tmp_path, **{"input_shape": OPEN_SHAPE, **model})
-    method = find_method(str(write_toml(tmp_path, input_table, output_table)))
+def mismatch(
+    words: str, node: Any = CHANNEL_MEAN, *, input_table: str = PLAIN_INPUT, output: str = "", **model: Any
+) -> Any:
+    """Return the parameters of a case: message, tables of the TOML file, and the model of one node."""
+    return pytest.param(words, input_table, output, {"nodes": [node], **model}, id=words[:60])
+
+
+@pytest.mark.parametrize(
+    ("words", "input_table", "output", "model"),
+    [
+        mismatch(
+            "invalid input: the model takes 2 ('x', 'k'), expected one", SUM_OF_TWO_INPUTS, more_inputs=["k"]
+        ),
+        mismatch(
+            "invalid input: the model takes 1 x ? x ? x 3, expected 1 x 3 x H x W", input_shape=(1, "h", "w", 3)
+        ),
+        mismatch(
+            "invalid input: the model takes 1 x 4 x 6 x 3, expected 1 x 3 x H x W: channels come before",
+            input_shape=(1, 4, 6, 3),
+        ),
+        mismatch("invalid input: the model takes 3 x 4 x 6, expected 1 x 3 x H", input_shape=(3, 4, 6)),
+        mismatch("invalid input: the model takes 2 x 3 x 4 x 6, expected", input_shape=(2, 3, 4, 6)),
+        mismatch("size input.width: got 6, the model takes 1 x 3 x ? x 8, expected 8", input_shape=(1, 3, "h", 8)),
+        mismatch(
+            "size input.height: got a variable size (longest_side), the model takes 1 x 3 x 4 x 6, expected 4",
+            input_table=VARIABLE_INPUT,
+            input_shape=(1, 3, 4, 6),
+        ),
+        mismatch("invalid input: 'x' is tensor(int32), expected one of tensor(float)", NEGATED, **INT32),
+        mismatch(
+            "invalid output: 'y' is tensor(int64), expected one of tensor(float)",
+            SHAPE,
+            output_type=TensorProto.INT64,
+        ),
+        mismatch(
+            "missing output.name: the model has 2 outputs, expected one of 'y', 'z'",
+            nodes=TWO_OUTPUTS,
+            outputs=["y", "z"],
+        ),
+        mismatch("unknown output.name: the model has no output 'q', expected one of 'y'", output="name = 'q'"),
+        mismatch("unknown output.index: the model has no output 1, expected one of 'y'", output="index = 1"),
+        mismatch(
+            "output 'y' has the shape (1, 3, 4, 6), expected H x W, with optional leading dimensions of 1", NEGATED
+        ),
+        mismatch("output 'y' has the shape (), expected H x W", NUMBER),
+        mismatch(
+            "model.onnx: fails on an input of 1 x 3 x 4 x 6: ",
+            FAILING_RESHAPE,
+            constants={"to": np.array([5, 5])},
+        ),
+    ],
+)
+def test_mismatched_model_is_refused_on_load(
+    words: str, input_table: str, output: str, model: dict[str, Any], tmp_path: Path
+) -> None:
+    write_model(tmp_path, **model)
+    method = find_method(str(write_toml(tmp_path, input_table, f"{DEPTH_OUTPUT}\n{output}")))
     with pytest.raises(MethodError) as caught:
         load_predictor(method)
     problems = "".join(f"{problem.code} {problem}\n" for problem in caught.value.problems)
-    assert message in (problems or str(caught.value))
+    assert words in (problems or str(caught.value))
     assert "model.onnx: " in str(caught.value)
 
 
@@ -163,15 +132,8 @@ def test_output_is_selected_by_name_or_index(tmp_path: Path) -> None:
     nodes = [helper.make_node("Neg", ["x"], ["no"]), helper.make_node("ReduceMax", ["x"], ["y"], axes=[1])]
     write_model(tmp_path, nodes, outputs=["no", "y"])
     for selection in ("name = 'y'", "index = 1"):
-        assert (
-            np.unique(
-                predict_depth(
-                    write_toml(tmp_path, output_table=f"{DEPTH_OUTPUT}\n{selection}"),
-                    np.full((4, 6, 3), 9, np.uint8),
-                )
-            )
-            == 9
-        )
+        path = write_toml(tmp_path, output_table=f"{DEPTH_OUTPUT}\n{selection}")
+        assert np.unique(predict_depth(path, BLACK + 9)) == 9
 
 
 def test_invalid_model_file_raises(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -187,3 +149,119 @@ def test_missing_onnxruntime_names_extra_to_install(tmp_path: Path, monkeypatch:
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(MethodError, match=re.escape("pip install 'rebar-depth-bench[onnx]'")):
         load_predictor(method)
+
+
+def write_loop_model(folder: Path) -> Path:
+    """Write a model that returns the mean of the colours; for an image that is not black it loops for ever."""
+    value, floats, bools = helper.make_tensor_value_info, TensorProto.FLOAT, TensorProto.BOOL
+    body = helper.make_graph(
+        [helper.make_node("Identity", ["go"], ["go_on"]), helper.make_node("Identity", ["v"], ["next"])],
+        "body",
+        [value("i", TensorProto.INT64, ()), value("go", bools, ()), value("v", floats, None)],
+        [value("go_on", bools, ()), value("next", floats, None)],
+    )
+    nodes = [
+        helper.make_node("ReduceMax", ["x"], ["brightest"], keepdims=0),
+        helper.make_node("Greater", ["brightest", "zero"], ["bright"]),
+        helper.make_node("ReduceMean", ["x"], ["mean"], axes=[1]),
+        helper.make_node("Loop", ["", "bright", "mean"], ["y"], body=body),
+    ]
+    write_model(folder, nodes, constants={"zero": np.array(0, np.float32)})
+    return write_toml(folder, PLAIN_INPUT)
+
+
+@pytest.mark.slow
+def test_endless_model_ends_at_view_timeout(
+    tiny_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    path = write_loop_model(tmp_path)
+    start = time.monotonic()
+    command = ["predict", str(path), "--data", str(tiny_root), "--out", str(tmp_path / "x.zip")]
+    assert main([*command, "--view-timeout", "0.5", "--config", "lattice-orbit"]) == 2
+    assert time.monotonic() - start < 30
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert "lattice-orbit/" in last
+    assert "0.5 s" in last
+    assert "--view-timeout" in last
+    assert (tmp_path / ".x.zip.views" / "run.json").is_file(), "the run can be resumed"
+    assert not (tmp_path / "x.zip").exists()
+
+
+@pytest.mark.slow
+def test_time_limit_does_not_change_results(tmp_path: Path) -> None:
+    path = write_loop_model(tmp_path)
+    assert np.isnan(predict_depth(path, BLACK)).all()
+    predictor = load_predictor(find_method(str(path), view_timeout_s=0.3))
+    for _ in range(2):  # The session can be used again after an inference that was stopped.
+        with pytest.raises(MethodError, match=r"one: takes longer than the limit of 0\.3 s"):
+            predictor({"view_id": "one", "left_rgb": BLACK + 1})
+        assert np.isnan(predictor({"view_id": "two", "left_rgb": BLACK})).all()
+
+
+@pytest.mark.slow
+def test_endless_model_can_be_interrupted(tiny_root: Path, tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "rebar_depth_bench", "predict", str(write_loop_model(tmp_path))]
+    command += ["--data", str(tiny_root), "--out", str(tmp_path / "x.zip")]
+    running = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    while not (tmp_path / ".x.zip.views" / "run.json").is_file():
+        assert running.poll() is None
+        time.sleep(0.05)
+    time.sleep(0.5)
+    running.send_signal(signal.SIGINT)
+    _, stderr = running.communicate(timeout=60)
+    assert running.returncode == 1
+    assert stderr.splitlines()[-1] == "interrupted; run the same command again to resume"
+
+
+LONG_OPERATOR = """
+import sys, time
+from pathlib import Path
+from rebar_depth_bench.base.limits import DeadlineError, call_within
+import onnxruntime
+options = onnxruntime.SessionOptions()
+session = onnxruntime.InferenceSession(sys.argv[1], options, providers=["CPUExecutionProvider"])
+import numpy as np
+start = time.monotonic()
+try:
+    call_within(0.5, lambda: session.run(None, {"x": np.ones((1, 3, 4, 6), np.float32)}))
+except DeadlineError:
+    print(time.monotonic() - start < 20)
+    sys.exit(2)
+"""
+
+
+@pytest.mark.slow
+def test_operator_that_cannot_be_stopped_does_not_keep_process(tmp_path: Path) -> None:
+    nodes = [
+        helper.make_node("ReduceMean", ["x"], ["mean"], keepdims=0),
+        helper.make_node("Expand", ["mean", "size"], ["matrix"]),
+        helper.make_node("MatMul", ["matrix", "matrix"], ["y"]),
+    ]
+    model = write_model(tmp_path, nodes, constants={"size": np.array([20_000, 20_000])})
+    finished = subprocess.run(
+        [sys.executable, "-c", LONG_OPERATOR, str(model)], capture_output=True, text=True, check=False, timeout=60
+    )
+    assert (finished.returncode, finished.stdout) == (2, "True\n")
+
+
+def test_memory_of_model_is_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    nodes = [
+        helper.make_node("ReduceMean", ["x"], ["mean"], keepdims=0),
+        helper.make_node("Expand", ["mean", "size"], ["huge"]),
+        helper.make_node("ReduceMax", ["huge"], ["most"], keepdims=0),
+        helper.make_node("Mul", ["x", "most"], ["y"]),
+    ]
+    write_model(tmp_path, nodes, constants={"size": np.array([1000, 1_000_000])})
+    monkeypatch.setenv("REBAR_MAX_ONNX_MEMORY_BYTES", str(1 << 30))
+    with pytest.raises(MethodError, match="REBAR_MAX_ONNX_MEMORY_BYTES raises the limit"):
+        load_predictor(str(write_toml(tmp_path)))
+
+
+def test_deadline_returns_result_and_raises_errors_of_function() -> None:
+    assert call_within(10, lambda: 7) == 7
+    with pytest.raises(ZeroDivisionError):
+        call_within(10, lambda: 1 // 0)
+    stopped: list[Any] = []
+    with pytest.raises(DeadlineError):
+        call_within(0.05, lambda: time.sleep(0.2), lambda: stopped.append(1))
+    assert stopped == [1]

@@ -11,7 +11,7 @@ import pytest
 pytest.importorskip("onnx")
 pytest.importorskip("onnxruntime")
 
-from hypothesis import HealthCheck, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from rebar_depth_bench.base.errors import MethodError, Problem
@@ -25,12 +25,12 @@ from rebar_depth_bench.base.validation import (
     validate_table,
     whole_number,
 )
-from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.methods import find_method
 from rebar_depth_bench.methods.onnx import spec as onnx_toml
 from tests.bench.methods.onnx_models import write_mixer_model, write_toml
 
 NO_SIZE = "expected width and height, or longest_side"
+LONGEST = "longest_side = 50"
 INVALID_EDITS = [
     ("licence = 'MIT'", "", "missing licence", "expected the licence of the model's weights"),
     ("'MIT'", "'  '", "invalid licence", "got ' '"),
@@ -50,12 +50,7 @@ INVALID_EDITS = [
     ("width = 6", "width = true", "invalid input.width", "got True"),
     ("height = 4", "height = 0", "invalid input.height", "got 0"),
     ("height = 4", "height = 9999", "invalid input.height", "got 9999"),
-    (
-        "width = 6\nheight = 4",
-        "longest_side = 50\nmultiple_of = 14",
-        "invalid input.longest_side",
-        "multiple_of, 14",
-    ),
+    ("width = 6\nheight = 4", f"{LONGEST}\nmultiple_of = 14", "invalid input.longest_side", "multiple_of, 14"),
     ("width = 6\nheight = 4", "multiple_of = 14", "missing input.longest_side", NO_SIZE),
     ("'stretch'", "'crop'", "invalid input.resize", 'got \'crop\', expected "stretch" or "pad"'),
     ("range = 255", "range = 256", "invalid input.range", "got 256, expected 1 or 255"),
@@ -74,12 +69,7 @@ INVALID_EDITS = [
     ("'depth'", "'depth'\nscale = inf", "invalid output.scale", "got inf"),
     ("'depth'", "'depth'\nscale = '1'", "invalid output.scale", "got '1'"),
     ("'depth'", "'depth'\nmin_m = 3\nmax_m = 2", "conflict output.min_m", "got 3, expected less than max_m, 2"),
-    (
-        "'depth'",
-        "'depth'\nname = 'y'\nindex = 0",
-        "conflict output.index",
-        "got name and index, expected one of them",
-    ),
+    ("'depth'", "'depth'\nname = 'y'\nindex = 0", "conflict output.index", "got name and index, expected one"),
     ("'depth'", "'depth'\nindex = -1", "invalid output.index", "got -1, expected a whole number from 0"),
     ("'depth'", "'depth'\nat_input_size = 1", "invalid output.at_input_size", "got 1, expected true or false"),
     ("'depth'", "'depth'\nresize = 'area'", "invalid output.resize", 'expected "nearest" or "bilinear"'),
@@ -115,20 +105,20 @@ def test_invalid_toml_raises_with_reason(old: str, new: str, locations: str, wor
     [
         (
             "nmae = 1\n[output]\n",
-            ["missing model", "missing licence", "missing input", "missing output.meaning", "unknown nmae"],
+            "missing model, missing licence, missing input, missing output.meaning, unknown nmae",
         ),
         (
             "model = 3\nlicence = 'MIT'\n[input]\nwidth = 0\nrange = 3\nresize = 'pad'\n",
-            ["invalid model", "invalid input.width", "invalid input.range", "missing output"],
+            "invalid model, invalid input.width, invalid input.range, missing output",
         ),
     ],
 )
-def test_all_problems_are_reported_at_once(content: str, locations: list[str], tmp_path: Path) -> None:
+def test_all_problems_are_reported_at_once(content: str, locations: str, tmp_path: Path) -> None:
     path = tmp_path / "bad.toml"
     path.write_text(content)
     with pytest.raises(MethodError) as caught:
         find_method(str(path))
-    assert located(caught.value.problems) == locations
+    assert located(caught.value.problems) == locations.split(", ")
 
 
 def test_example_in_docstring_is_valid(tmp_path: Path) -> None:
@@ -146,7 +136,7 @@ def test_example_in_docstring_is_valid(tmp_path: Path) -> None:
         (
             None,
             "missing",
-            "cannot be read: No such file or directory, expected a TOML file that describes an ONNX model",
+            "cannot be read: No such file or directory, expected a TOML file that describes an ONNX",
         ),
         (b"\xff\xfe", "syntax", "byte 0 is not UTF-8"),
         (b"#" * (1 << 21), "size", "at most 1048576 bytes"),
@@ -183,23 +173,10 @@ class Fields(StrictModel):
     triple: Annotated[Triple, three_numbers(0, 1)] = (0, 0, 0)
 
 
+@settings(max_examples=50)
 @given(value=VALUES, key=st.sampled_from([*Fields.model_fields]))
 def test_any_value_is_accepted_or_gives_one_line(value: object, key: str) -> None:
     problems: list[Problem] = []
     parsed = validate_table(Fields, {key: value}, problems, "t")
     assert located(tuple(problems)) == ([f"invalid t.{key}"] if parsed is None else [])
     assert all(problem.found.startswith("got ") and "\n" not in str(problem) for problem in problems)
-
-
-@settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=60)
-@given(content=st.binary(max_size=200) | st.text(alphabet="[]\"'=.{}\n\\ab1,#", max_size=80).map(str.encode))
-def test_random_bytes_raise_method_error(content: bytes, tmp_path: Path) -> None:
-    (tmp_path / "x.toml").write_bytes(content)
-    with pytest.raises(MethodError):
-        find_method(str(tmp_path / "x.toml"))
-
-
-def test_predict_with_bad_toml_exits_with_status_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = write_toml(tmp_path)
-    assert main(["predict", str(path), "--data", str(tmp_path), "--out", str(tmp_path / "a.zip")]) == 2
-    assert "model: no such file" in capsys.readouterr().err

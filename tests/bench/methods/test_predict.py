@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import io
 import json
 import re
-import signal
-import subprocess
+import shutil
 import sys
 import zipfile
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -29,18 +30,21 @@ from rebar_depth_bench.methods import (
     Views,
     all_methods,
     find_method,
+    own_methods,
 )
+from rebar_depth_bench.methods.base import input_class
 from rebar_depth_bench.methods.run import predict
+from rebar_depth_bench.submission import INPUTS
+from tests.bench.methods.predictors import stop_after
+from tests.damage import change_manifest, copy_dataset
 
 USER_METHOD = """
-import time
 import numpy as np
 from rebar_depth_bench.methods import Method, MethodInfo
 
 def load():
     def run(row):
         assert set(row) == {"view_id", "left_rgb", "left_K"}
-        time.sleep(SECONDS)
         with open(LOG, "a") as log:
             print(row["view_id"], file=log)
         return np.full(row["left_rgb"].shape[:2], row["left_K"][0, 0] / 200, np.float32)
@@ -54,79 +58,29 @@ NOTHING = "no method"
 @pytest.fixture
 def user_file(tmp_path: Path) -> Path:
     """Write a user's file with a method that logs the id of every view it predicts."""
-    return write_user_file(tmp_path, 0.0)
-
-
-def write_user_file(folder: Path, seconds: float) -> Path:
-    """Write ``own.py`` with a method that takes ``seconds`` per view and logs view ids into ``log``."""
-    path = folder / "own.py"
-    path.write_text(USER_METHOD.replace("SECONDS", str(seconds)).replace("LOG", repr(str(folder / "log"))))
+    path = tmp_path / "own.py"
+    path.write_text(USER_METHOD.replace("LOG", repr(str(tmp_path / "log"))))
     return path
 
 
-def runtime_of(archive: Path) -> dict[str, dict[str, float]]:
-    """Return ``runtime`` of an archive's metadata."""
+def metadata_of(archive: Path) -> dict[str, Any]:
+    """Return the metadata of an archive."""
     with zipfile.ZipFile(archive) as source:
-        runtime: dict[str, dict[str, float]] = json.loads(source.read("submission.json"))["runtime"]
-    return runtime
+        metadata: dict[str, Any] = json.loads(source.read("submission.json"))
+    return metadata
 
 
 def test_user_file_is_usable_as_method(user_file: Path, tiny_root: Path, tmp_path: Path) -> None:
     archive = tmp_path / "own.zip"
-    command = [
-        "predict",
-        f"{user_file}:METHOD",
-        "--data",
-        str(tiny_root),
-        "--config",
-        "lattice",
-        "--out",
-        str(archive),
-    ]
-    assert main(command) == 0
+    command = ["predict", f"{user_file}:METHOD", "--data", str(tiny_root), "--out", str(archive)]
+    assert main([*command, "--config", "lattice"]) == 0
     result = score(archive, tiny_root)
     assert result.method == "own"
     assert result.tables["lattice"].ranked
-    seconds = runtime_of(archive)["seconds"]
+    seconds = metadata_of(archive)["runtime"]["seconds"]
     assert list(seconds) == (tmp_path / "log").read_text().split()
     assert all(0 <= value < 60 for value in seconds.values())
     assert sorted(path.name for path in tmp_path.iterdir()) == ["log", "own.py", "own.zip"]
-
-
-@pytest.mark.slow
-def test_interrupted_prediction_resumes_with_missing_views(tiny_root: Path, tmp_path: Path) -> None:
-    user_file, archive = write_user_file(tmp_path, 0.5), tmp_path / "own.zip"
-    command = [sys.executable, "-m", "rebar_depth_bench", "predict", f"{user_file}:METHOD", "--config", "lattice"]
-    command += ["--data", str(tiny_root), "--out", str(archive)]
-    running = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
-    assert running.stderr is not None
-    while "3 of 9" not in running.stderr.readline():
-        pass
-    running.send_signal(signal.SIGINT)
-    _, stderr = running.communicate(timeout=60)
-    assert running.returncode == 1
-    assert "interrupted" in stderr
-    assert "Traceback" not in stderr
-    assert not archive.exists()
-    before = (tmp_path / "log").read_text().split()
-    assert subprocess.run(command, check=False, capture_output=True).returncode == 0
-    after = (tmp_path / "log").read_text().split()
-    assert len(set(after)) == 9
-    assert len(after) - 9 <= 1, "only the view that was interrupted is predicted again"
-    assert after[: len(before)] == before
-    assert len(runtime_of(archive)["seconds"]) == 9
-    assert not list(tmp_path.glob(".*"))
-
-
-def test_views_of_different_run_are_not_reused(user_file: Path, tiny_root: Path, tmp_path: Path) -> None:
-    archive = tmp_path / "out.zip"
-    foreign_views = tmp_path / ".out.zip.views"
-    (foreign_views / "lattice-orbit").mkdir(parents=True)
-    (foreign_views / "run.json").write_text("{}")
-    view_id = orbit_view_ids(tiny_root)[0]
-    np.savez(foreign_views / f"{view_id}.npz", depth_m=np.full((90, 160), 99.0), seconds=0.0)
-    predict(find_method(f"{user_file}:METHOD"), tiny_root, archive, configs=["lattice-orbit"])
-    assert view_id in (tmp_path / "log").read_text()
 
 
 def orbit_view_ids(root: Path) -> list[str]:
@@ -138,10 +92,7 @@ def orbit_view_ids(root: Path) -> list[str]:
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        (
-            "magic",
-            "unknown method 'magic', expected one of sgbm, sgbm-filled, ",
-        ),
+        ("magic", "unknown method 'magic', expected one of sgbm, sgbm-filled, "),
         ("nowhere.py:METHOD", "nowhere.py: no such file"),
         ("OWN:NOTHING", "is str, expected a rebar_depth_bench.methods.Method"),
         ("OWN:ABSENT", "own.py: has no ABSENT, expected the name of a method in it"),
@@ -165,22 +116,20 @@ def test_invalid_prediction_stops_run(returned: str, user_file: Path, tiny_root:
     assert not (tmp_path / "x.zip").exists()
 
 
-def test_entry_point_methods_are_listed(
+def test_entry_point_methods_are_listed_as_plain_text(
     user_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    site = tmp_path / "site"
-    info = site / "stranger-1.0.dist-info"
+    info = tmp_path / "site" / "stranger-1.0.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: stranger\nVersion: 1.0\n")
-    lines = [
-        "[rebar_depth_bench.methods]",
-        "theirs = own_copy:METHOD",
-        "bad = own_copy:NOTHING",
-        "gone = nowhere:X",
-    ]
-    (info / "entry_points.txt").write_text("\n".join(lines))
-    (site / "own_copy.py").write_text(user_file.read_text())
-    monkeypatch.syspath_prepend(str(site))
+    entries = {"theirs": "own_copy:METHOD", "bad": "own_copy:NOTHING", "gone": "nowhere:X", "wrong": "bad_code:X"}
+    lines = [f"{name} = {value}" for name, value in entries.items()]
+    (info / "entry_points.txt").write_text("\n".join(["[rebar_depth_bench.methods]", *lines]))
+    code = user_file.read_text().replace('"a test"', r'"[red]a\x1b[2J[/]"').replace('"here"', '"[/nothing]"')
+    (tmp_path / "site" / "own_copy.py").write_text(code)
+    (tmp_path / "site" / "bad_code.py").write_text("raise ImportError('pip install x[onnx] [/end]')")
+    monkeypatch.syspath_prepend(str(tmp_path / "site"))
+    monkeypatch.setenv("COLUMNS", "300")
     assert find_method("theirs").info.licence == "MIT"
     methods = all_methods()
     assert list(methods)[: len(METHODS)] == list(METHODS)
@@ -188,26 +137,8 @@ def test_entry_point_methods_are_listed(
     assert "cannot be imported: ModuleNotFoundError" in str(methods["gone"])
     assert main(["methods"]) == 0
     listed = capsys.readouterr().out
-    assert "theirs" in listed
-    assert "cannot be" in listed
-
-
-def test_listed_text_of_packages_is_plain(
-    user_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
-    site = tmp_path / "site"
-    info = site / "odd-1.0.dist-info"
-    info.mkdir(parents=True)
-    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: odd\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[rebar_depth_bench.methods]\nodd = odd_code:METHOD\nbad = bad_code:X")
-    code = user_file.read_text().replace('"a test"', r'"[red]a\x1b[2J[/]"').replace('"here"', '"[/nothing]"')
-    (site / "odd_code.py").write_text(code)
-    (site / "bad_code.py").write_text("raise ImportError('pip install x[onnx] [/end]')")
-    monkeypatch.syspath_prepend(str(site))
-    monkeypatch.setenv("COLUMNS", "300")
-    assert main(["methods"]) == 0
-    listed = capsys.readouterr().out
-    assert all(words in listed for words in (r"[red]a\x1b[2J[/]", "[/nothing]", "pip install x[onnx] [/end]"))
+    shown = ("theirs", r"[red]a\x1b[2J[/]", "[/nothing]", "cannot be", "pip install x[onnx] [/end]")
+    assert all(words in listed for words in shown)
     assert "\x1b" not in listed
 
 
@@ -223,21 +154,15 @@ def test_ground_truth_controls_score_as_expected(tiny_root: Path, tmp_path: Path
     assert noisy.scaled is not None
     assert noisy.scale_median == pytest.approx(0.8, rel=2e-3)
     assert noisy.native.abs_rel == pytest.approx(0.25, rel=0.01)
-    assert noisy.scaled.abs_rel == pytest.approx(
-        0.01 * (2 / np.pi) ** 0.5, rel=0.05
-    )  # Mean absolute value of a Gaussian.
+    mean_of_gaussian = 0.01 * (2 / np.pi) ** 0.5
+    assert noisy.scaled.abs_rel == pytest.approx(mean_of_gaussian, rel=0.05)
 
 
-def counting_method(log: list[str], *, unfit: str = "") -> MultiViewMethod:
-    """Return a multi-view method that predicts the number of views of a config and logs its calls.
-
-    Its check fails for the config ``unfit``.
-    """
+def counting_method(log: list[str]) -> MultiViewMethod:
+    """Return a multi-view method that predicts the number of views of a config and logs its calls."""
 
     def check(views: Views) -> None:
         log.append(f"check {views.config}")
-        if views.config == unfit:
-            raise MethodError(f"{views.config}: does not fit")
 
     def prepare(views: Views, work: Path, progress: Progress) -> Prepared:
         log.append(f"prepare {views.config} {(work / 'kept').exists()}")
@@ -263,28 +188,35 @@ def test_multi_view_method_is_prepared_once_per_config(tiny_root: Path, tmp_path
     assert log[:3] == ["check lattice", "check lattice-orbit", "prepare lattice False"]
     assert log.count("prepare lattice False") == log.count("prepare lattice-orbit False") == 1
     assert len(log) == 4 + 9 + 2
-    assert {name: config_prepared.notes for name, config_prepared in prepared.items()} == {
-        "lattice": {"counted": 9},
-        "lattice-orbit": {"counted": 2},
-    }
-    with zipfile.ZipFile(archive) as source:
-        metadata = json.loads(source.read("submission.json"))
-    assert metadata["notes"] == {"lattice": {"counted": 9}, "lattice-orbit": {"counted": 2}}
+    notes = {"lattice": {"counted": 9}, "lattice-orbit": {"counted": 2}}
+    assert {name: report.notes for name, report in prepared.items()} == notes
+    metadata = metadata_of(archive)
+    assert metadata["notes"] == notes
     assert set(metadata["runtime"]["preparing"]) == {"lattice", "lattice-orbit"}
     assert score(archive, tiny_root).tables["lattice"].ranked
 
 
-def test_resumed_run_keeps_work_and_finished_configs(tiny_root: Path, tmp_path: Path) -> None:
-    def stop(what: str, done: int, _: int) -> None:
-        if what == "whole on lattice-orbit" and done == 1:
-            raise KeyboardInterrupt
-
+def test_resumed_run_keeps_work_finished_configs_and_sound_views(
+    tiny_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    archive, views = tmp_path / "whole.zip", orbit_view_ids(tiny_root)
     with pytest.raises(KeyboardInterrupt):
-        predict(counting_method([]), tiny_root, tmp_path / "whole.zip", progress=stop)
+        predict(counting_method([]), tiny_root, archive, progress=stop_after(1, "on lattice-orbit"))
+    kept = tmp_path / ".whole.zip.views"
+    shutil.copytree(kept, tmp_path / "before")
     log: list[str] = []
-    prepared = predict(counting_method(log), tiny_root, tmp_path / "whole.zip")
-    assert log[2:] == ["prepare lattice-orbit True", orbit_view_ids(tiny_root)[1]]
+    prepared = predict(counting_method(log), tiny_root, archive)
+    assert log[2:] == ["prepare lattice-orbit True", views[1]]
     assert set(prepared) == {"lattice", "lattice-orbit"}
+    (tmp_path / "before").rename(kept)
+    (kept / f"{views[0]}.npz").write_bytes(b"damaged")
+    predict(counting_method(log), tiny_root, archive)
+    assert log[-2:] == views
+    [notice] = [line for line in capsys.readouterr().err.splitlines() if "again" in line]
+    assert f"{views[0]}.npz" in notice
+    with zipfile.ZipFile(archive) as source:
+        depths_m = [np.load(io.BytesIO(source.read(f"{view}.npy"))) for view in views]
+    assert all((depth_m == 2).all() for depth_m in depths_m)
     assert [path.name for path in tmp_path.iterdir()] == ["whole.zip"]
 
 
@@ -326,14 +258,6 @@ METHOD = Method(MethodInfo("own", "a test", ("left_rgb",), False, "here", "MIT")
     assert sys.modules["json"] is json
 
 
-def test_failing_check_stops_run_before_prediction(tiny_root: Path, tmp_path: Path) -> None:
-    log: list[str] = []
-    with pytest.raises(MethodError, match="lattice-orbit: does not fit"):
-        predict(counting_method(log, unfit="lattice-orbit"), tiny_root, tmp_path / "whole.zip")
-    assert log == ["check lattice", "check lattice-orbit"]
-    assert not list(tmp_path.iterdir())
-
-
 def test_changed_user_file_gives_different_source(user_file: Path) -> None:
     before = find_method(f"{user_file}:METHOD").info
     assert find_method(f"{user_file}:METHOD").info == before
@@ -343,55 +267,45 @@ def test_changed_user_file_gives_different_source(user_file: Path) -> None:
     assert after.source != before.source
 
 
-def test_dataset_with_other_render_key_is_predicted_again(
+def test_interrupted_run_is_resumed_on_the_same_images_only(
     user_file: Path, tiny_root: Path, tmp_path: Path
 ) -> None:
     """Other lights or sample counts leave the ground truth unchanged, but not the images."""
-
-    def stop(_: str, done: int, __: int) -> None:
-        if done == 1:
-            raise KeyboardInterrupt
-
-    def run(root: Path, progress: Progress) -> None:
-        predict(
-            find_method(f"{user_file}:METHOD"),
-            root,
-            tmp_path / "out.zip",
-            configs=["lattice-orbit"],
-            progress=progress,
-        )
-
-    with pytest.raises(KeyboardInterrupt):
-        run(tiny_root, stop)
-    other = tmp_path / "other"
-    other.mkdir()
-    for path in tiny_root.iterdir():
-        (other / path.name).symlink_to(path)
-    manifest = json.loads((tiny_root / "manifest.json").read_text())
-    manifest["configs"]["lattice-orbit"]["scenes"][0]["key"] = "another"
-    (other / "manifest.json").unlink()
-    (other / "manifest.json").write_text(json.dumps(manifest))
-    run(other, lambda *_: None)
-    first, second = orbit_view_ids(tiny_root)
-    assert (tmp_path / "log").read_text().split() == [first, first, second]
+    archive, (first, second) = tmp_path / "out.zip", orbit_view_ids(tiny_root)
+    run = partial(predict, find_method(f"{user_file}:METHOD"), archive=archive, configs=["lattice-orbit"])
+    other = copy_dataset(tiny_root, tmp_path / "other")
+    change_manifest(other, lambda manifest, _: manifest["configs"]["lattice-orbit"]["scenes"][0].update(key="x"))
+    for root, predicted in ((tiny_root, [first, second]), (other, [first, first, second])):
+        (tmp_path / "log").unlink(missing_ok=True)
+        with pytest.raises(KeyboardInterrupt):
+            run(root=tiny_root, progress=stop_after(1))
+        assert not archive.exists()
+        run(root=root)
+        assert (tmp_path / "log").read_text().split() == predicted
+        assert len(metadata_of(archive)["runtime"]["seconds"]) == 2
+        assert not list(tmp_path.glob(".*"))
+        archive.unlink()
 
 
-FAILING_CODE = {
-    "load returned NoneType, expected a function of a row": "def load():\n    pass",
-    "load: raised FileNotFoundError: weights.pth": "def load():\n    raise FileNotFoundError('weights.pth')",
-    "lattice-orbit/0025: the predictor, given view_id, left_rgb: raised KeyError: 'left_depth'": (
-        "def load():\n    return lambda row: row['left_depth']"
-    ),
-}
-
-
-@pytest.mark.parametrize(("words", "code"), FAILING_CODE.items(), ids=["no predictor", "load", "predictor"])
+@pytest.mark.parametrize(
+    ("words", "code"),
+    [
+        ("load returned NoneType, expected a function of a row", "pass"),
+        ("load: raised FileNotFoundError: weights.pth", "raise FileNotFoundError('weights.pth')"),
+        (
+            "lattice-orbit/0025: the predictor, given view_id, left_rgb: raised KeyError: 'left_depth'",
+            "return lambda row: row['left_depth']",
+        ),
+    ],
+)
 def test_error_in_user_code_names_its_location(
     words: str, code: str, tiny_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "wrong.py"
     info = "MethodInfo('wrong', 'a test', ('left_rgb',), False, 'here', 'MIT')"
-    path.write_text(f"from rebar_depth_bench.methods import *\n{code}\nMETHOD = Method({info}, load)\n")
+    path.write_text(
+        f"from rebar_depth_bench.methods import *\ndef load():\n    {code}\nMETHOD = Method({info}, load)\n"
+    )
     command = ["predict", f"{path}:METHOD", "--data", str(tiny_root), "--out", str(tmp_path / "out.zip")]
     assert main([*command, "--config", "lattice-orbit"]) == 2
     stderr = capsys.readouterr().err
@@ -419,22 +333,24 @@ def test_notes_of_single_view_method_are_checked_first(
     assert not list(tmp_path.iterdir())
 
 
-def test_notes_that_are_not_json_raise(tiny_root: Path, tmp_path: Path) -> None:
+def test_check_and_notes_of_multi_view_method_stop_the_run(tiny_root: Path, tmp_path: Path) -> None:
     log: list[str] = []
     method = counting_method(log)
-    with_bad_notes = replace(
-        method, prepare=lambda *args: replace(method.prepare(*args), notes={"bad": float("nan")})
-    )
-    with pytest.raises(MethodError, match="whole: lattice: the note 'bad' is not a plain JSON value"):
-        predict(with_bad_notes, tiny_root, tmp_path / "whole.zip")
-    assert log[-1].startswith("prepare")
 
+    def check(views: Views) -> None:
+        method.check(views)
+        assert views.config == "lattice", "does not fit"
 
-def test_exception_in_check_is_reported(tiny_root: Path, tmp_path: Path) -> None:
-    method = replace(counting_method([]), check=lambda _: print(1 // 0))
-    with pytest.raises(MethodError, match="whole: lattice: check: raised ZeroDivisionError"):
-        predict(method, tiny_root, tmp_path / "whole.zip")
+    def prepare(*arguments: Any) -> Prepared:
+        return replace(method.prepare(*arguments), notes={"bad": float("nan")})
+
+    with pytest.raises(MethodError, match="whole: lattice-orbit: check: raised AssertionError: does not fit"):
+        predict(replace(method, check=check), tiny_root, tmp_path / "whole.zip")
+    assert log == ["check lattice", "check lattice-orbit"]
     assert not list(tmp_path.iterdir())
+    with pytest.raises(MethodError, match="whole: lattice: the note 'bad' is not a plain JSON value"):
+        predict(replace(method, prepare=prepare), tiny_root, tmp_path / "whole.zip")
+    assert log[-1].startswith("prepare")
 
 
 def test_columns_given_as_string_raise_type_error() -> None:
@@ -446,3 +362,21 @@ def test_folder_as_archive_is_rejected_before_prediction(tiny_root: Path, tmp_pa
     with pytest.raises(InputError, match="is a folder, expected the name of the archive"):
         predict(find_method("truth"), tiny_root, tmp_path, configs=["lattice-orbit"])
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        *(("sgbm", "stereo"), ("foundation-stereo", "stereo"), ("constant", "rgb"), ("unidepth", "rgb")),
+        *(("metric3d", "rgb+K"), ("sweep-aruco", "multi-view"), ("lidar-mobile", "lidar"), ("truth", None)),
+    ],
+)
+def test_input_class_of_a_bundled_method(name: str, expected: str | None) -> None:
+    assert input_class(own_methods()[name]) == expected
+
+
+def test_methods_that_read_images_have_a_class_unless_they_declare_one() -> None:
+    for method in own_methods().values():
+        reads_images = isinstance(method, MultiViewMethod) or "left_rgb" in method.info.columns
+        assert (input_class(method) in INPUTS) or not reads_images
+        assert input_class(replace(method, info=replace(method.info, inputs="lidar"))) == "lidar"

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import importlib
 import json
+import os
 import re
 import sys
 import zipfile
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
+from huggingface_hub import constants
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
@@ -30,7 +33,8 @@ from rebar_depth_bench.methods.transformers import (
     to_left_grid,
 )
 from tests.bench.methods.predictors import load_predictor
-from tests.bench.methods.tiny_depth_models import LAST_LAYER, MODELS, save_checkpoint
+from tests.bench.methods.tiny_depth_models import IMAGENET, LAST_LAYER, MODELS, save_checkpoint
+from tests.hub_server import HubServer, folder_files
 
 pytestmark = pytest.mark.slow  # torch and transformers take seconds to import
 
@@ -59,8 +63,7 @@ def test_families_predict_deterministically_on_left_grid(folders: dict[str, Path
     method = find_method(f"hf:{folders[kind]}")
     inputs = {name: row()[name] for name in method.info.columns}
     first, second = load_predictor(method)(inputs), load_predictor(method)(inputs)
-    assert first.shape == (H, W)
-    assert first.dtype == np.float32
+    assert (first.shape, first.dtype) == ((H, W), np.float32)
     assert np.array_equal(first, second, equal_nan=True)
     known = first[np.isfinite(first)]
     assert known.size > 0.3 * first.size
@@ -68,6 +71,8 @@ def test_families_predict_deterministically_on_left_grid(folders: dict[str, Path
     assert known.std() > 1e-3 * known.mean(), "the network looks at the picture"
     assert method.info.name == f"hf:{kind}"
     assert str(folders[kind]) not in json.dumps(vars(method.info))
+    assert ("up to scale" in method.info.summary) == (kind in ("depth-anything", "dpt"))
+    assert method.info.uses_intrinsics == (kind == "depth-pro")
 
 
 @pytest.mark.parametrize(
@@ -88,14 +93,6 @@ def test_known_output_becomes_expected_metres(
 ) -> None:
     depth_m = hf_method(str(save_checkpoint(tmp_path, kind, bias, **changes))).load()(row())
     np.testing.assert_allclose(depth_m, np.full((H, W), expected), rtol=1e-5)
-
-
-def test_depth_pro_depth_scales_with_focal_length(folders: dict[str, Path]) -> None:
-    predictor = hf_method(str(folders["depth-pro"])).load()
-    near, far = predictor(row(fx=70.0)), predictor(row(fx=140.0))
-    unclipped = (near > 2e-4) & (far < 9e3)  # Exclude depths clipped to the model's bounds.
-    assert unclipped.mean() > 0.3
-    np.testing.assert_allclose(far[unclipped], 2 * near[unclipped], rtol=1e-6)
 
 
 @given(st.integers(1, 40), st.floats(10, 2000), st.floats(0.3, 30))
@@ -144,34 +141,25 @@ def test_depth_pro_input_matches_pillow() -> None:
         np.testing.assert_allclose(network_input[0, channel], expected, atol=2e-5)
 
 
-@pytest.mark.parametrize("kind", ["depth-anything", "dpt", "glpn", "zoedepth"])
-def test_preprocessing_round_trip_keeps_pixel_positions(folders: dict[str, Path], kind: str) -> None:
+def test_zoedepth_round_trip_keeps_pixel_positions(folders: dict[str, Path]) -> None:
     """Ramps over rows and columns, passed through pre- and postprocessing only, keep every pixel in place."""
     transformers = importlib.import_module("transformers")
-    processor = transformers.AutoImageProcessor.from_pretrained(folders[kind], backend="pil")
-    model_type = json.loads((folders[kind] / "config.json").read_text())["model_type"]
+    processor = transformers.AutoImageProcessor.from_pretrained(folders["zoedepth"], backend="pil")
     rows, columns = np.mgrid[:H, :W]
     rgb = np.stack([rows, columns, np.zeros_like(rows)], axis=-1).astype(np.uint8)
     pixels = processor(images=rgb, return_tensors="pt", input_data_format="channels_last").pixel_values.float()
-    mean, std = (
-        np.asarray(MODELS[kind][1].get(f"image_{name}", [x] * 3)) for name, x in (("mean", 0), ("std", 1))
-    )
+    inner = np.s_[12:-12, 12:-12]
     for channel, expected in ((0, rows), (1, columns)):
         network_output = SimpleNamespace(predicted_depth=pixels[:, channel])
-        on_left_grid = to_left_grid(model_type, processor, network_output, (H, W)).numpy()
-        restored = on_left_grid * std[channel] + mean[channel]
-        inner = np.s_[12:-12, 12:-12]
+        on_left_grid = to_left_grid("zoedepth", processor, network_output, (H, W)).numpy()
+        restored = on_left_grid * IMAGENET["image_std"][channel] + IMAGENET["image_mean"][channel]
         np.testing.assert_allclose(255 * restored[inner], expected[inner], atol=1.5)
 
 
-def test_summary_states_scale_ambiguity(tmp_path: Path, folders: dict[str, Path]) -> None:
-    metric = save_checkpoint(tmp_path / "metric", "depth-anything", depth_estimation_type="metric")
-    summaries = {kind: hf_method(str(folder)).info.summary for kind, folder in folders.items()}
-    assert {kind for kind, text in summaries.items() if "up to scale" in text} == {"depth-anything", "dpt"}
-    assert "metres" in hf_method(str(metric)).info.summary
-    assert {kind for kind, folder in folders.items() if hf_method(str(folder)).info.uses_intrinsics} == {
-        "depth-pro"
-    }
+@pytest.mark.parametrize("backbone", ["[]", '["x"]', '"dinov2"', "3", "null"])
+def test_backbone_of_wrong_type_is_not_dinov2(backbone: str, tmp_path: Path) -> None:
+    (tmp_path / "config.json").write_text(f'{{"model_type": "dpt", "backbone_config": {backbone}}}')
+    assert "up to scale" in find_method(f"hf:{tmp_path}").info.summary
 
 
 def test_legacy_weights_and_settings_are_read(tmp_path: Path) -> None:
@@ -212,57 +200,78 @@ def test_predict_command_runs_hf_folder(
     assert re.search(r"focal length given; weights sha256:[0-9a-f]{64}$", metadata["description"])
 
 
-def break_config(folder: Path) -> None:
-    (folder / "config.json").write_text("{")
-
-
-def set_unsupported_type(folder: Path) -> None:
-    (folder / "config.json").write_text('{"model_type": "bert"}')
-
-
-def set_depth_completion_type(folder: Path) -> None:
-    (folder / "config.json").write_text('{"model_type": "prompt_depth_anything"}')
-
-
-def delete_file(name: str) -> Any:
-    return lambda folder: (folder / name).unlink()
-
-
-def truncate_weights(folder: Path) -> None:
-    path = folder / "model.safetensors"
-    path.write_bytes(path.read_bytes()[:1000])
-
-
-def drop_tensor(folder: Path) -> None:
-    load_file = importlib.import_module("safetensors.torch").load_file
-    tensors = load_file(folder / "model.safetensors")
+def drop_tensor(path: Path) -> None:
+    safetensors = importlib.import_module("safetensors.torch")
+    tensors = safetensors.load_file(path)
     del tensors["head.conv3.weight"]
-    importlib.import_module("safetensors.torch").save_file(
-        tensors, folder / "model.safetensors", metadata={"format": "pt"}
-    )
+    safetensors.save_file(tensors, path, metadata={"format": "pt"})
+
+
+def write(content: bytes) -> Callable[[Path], None]:
+    """Return a function that writes a file with this content."""
+
+    def write_file(path: Path) -> None:
+        path.write_bytes(content)
+
+    return write_file
+
+
+LONG_NAME = b'{"model_type": "' + b"x" * 10_000 + rb'\u001b[31m"}'
 
 
 @pytest.mark.parametrize(
-    ("spoil", "words"),
+    ("name", "spoil", "words"),
     [
-        (delete_file("config.json"), "no config.json, expected a checkpoint folder"),
-        (break_config, "config.json: 1 problem\n  - the text is not valid JSON"),
+        ("config.json", Path.unlink, "no config.json, expected a checkpoint folder"),
+        ("config.json", write(b"{"), "config.json: 1 problem\n  - the text is not valid JSON"),
+        ("config.json", write(b"[]"), "config.json: 1 problem\n  - got [], expected a JSON object"),
         (
-            set_unsupported_type,
-            "model_type is 'bert', expected one of depth_anything, depth_pro, dpt, glpn, zoedepth",
+            "config.json",
+            write(b'{"model_type": "bert"}'),
+            "model_type is 'bert', expected one of depth_anything, dep",
         ),
-        (set_depth_completion_type, "(it completes measured depth, which a single image does not have)"),
-        (delete_file("preprocessor_config.json"), "no preprocessor_config.json"),
-        (delete_file("model.safetensors"), "no weights, expected *.safetensors or *.bin beside config.json"),
-        (truncate_weights, "cannot be loaded: SafetensorError"),
-        (drop_tensor, "the weights lack 1 of the network's tensors, first head.conv3.weight"),
+        ("config.json", write(b'{"model_type": ["x"]}'), "model_type is ['x'], expected one of depth_anything"),
+        ("config.json", write(LONG_NAME), "model_type is 'xxxxxxxxx"),
+        (
+            "config.json",
+            write(b'{"model_type": "prompt_depth_anything"}'),
+            "(it completes measured depth, which a single image does not have)",
+        ),
+        ("preprocessor_config.json", Path.unlink, "no preprocessor_config.json"),
+        (
+            "preprocessor_config.json",
+            write(b"null"),
+            "preprocessor_config.json: 1 problem\n  - got None, expected a",
+        ),
+        ("model.safetensors", Path.unlink, "no weights, expected *.safetensors or *.bin beside config.json"),
+        ("model.safetensors", write(b"{}" * 500), "cannot be loaded: SafetensorError"),
+        ("model.safetensors", drop_tensor, "the weights lack 1 of the network's tensors, first head.conv3.weight"),
     ],
 )
-def test_unusable_checkpoint_raises_with_reason(tmp_path: Path, spoil: Any, words: str) -> None:
+def test_unusable_checkpoint_is_refused_with_reason(
+    name: str, spoil: Callable[[Path], None], words: str, tmp_path: Path
+) -> None:
     folder = save_checkpoint(tmp_path / "checkpoint", "depth-anything")
-    spoil(folder)
-    with pytest.raises(MethodError, match=re.escape(words)):
+    spoil(folder / name)
+    with pytest.raises(MethodError, match=re.escape(words)) as caught:
         hf_method(str(folder)).load()
+    assert len(str(caught.value)) < 600
+    assert all(line.isprintable() for line in str(caught.value).splitlines())
+
+
+@pytest.mark.parametrize("prefix", ["hf", "depth-anything-3"])
+def test_named_pipe_and_large_file_are_refused(
+    prefix: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "model.safetensors").touch()
+    (tmp_path / "config.json").write_text(f'{{"x": "{"x" * 1000}"}}')
+    monkeypatch.setenv("REBAR_MAX_JSON_BYTES", "1000")
+    with pytest.raises(MethodError, match=r"at most 1000 bytes|REBAR_MAX_JSON_BYTES"):
+        find_method(f"{prefix}:{tmp_path}")
+    (tmp_path / "config.json").unlink()
+    os.mkfifo(tmp_path / "config.json")
+    with pytest.raises(MethodError, match=r"named pipe|no config\.json"):
+        find_method(f"{prefix}:{tmp_path}")
 
 
 @pytest.mark.parametrize("package", ["torch", "transformers"])
@@ -273,6 +282,57 @@ def test_missing_package_names_extra_to_install(
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(MethodError, match=re.escape("pip install 'rebar-depth-bench[models]'")):
         method.load()
+
+
+def test_hub_checkpoint_is_fetched_once_then_read_from_cache(
+    folders: dict[str, Path],
+    hub: HubServer,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    """Weights in one format are enough, and what is in the cache is not asked for."""
+    monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
+    files = folder_files(folders["glpn"])
+    repository = hub.add("models/org/model", {**files, "pytorch_model.bin": b"the same once more"})
+    method = find_method("hf:org/model")
+    assert method.info.name == "hf:org/model"
+    assert method.info.summary.endswith(f"weights commit {repository.branches['main']}")
+    depth_m = load_predictor(method)(row())
+    assert np.array_equal(depth_m, hf_method(str(folders["glpn"])).load()(row()), equal_nan=True)
+    stderr = capsys.readouterr().err
+    megabytes = sum(map(len, files.values())) / 1e6
+    assert f"org/model: downloading config.json from {hub.url}\n" in stderr
+    assert f"org/model: downloading the weights from {hub.url}\norg/model: {megabytes:.1f} MB\n" in stderr
+    assert [request for request in hub.requests if "model.safetensors" in request.path]
+    assert not [request for request in hub.requests if "pytorch_model.bin" in request.path]
+    del hub.requests[:]
+    for is_offline in (False, True):
+        monkeypatch.setattr(constants, "HF_HUB_OFFLINE", is_offline)
+        assert np.array_equal(load_predictor("hf:org/model")(row()), depth_m, equal_nan=True)
+    assert (hub.requests, "downloading" in capsys.readouterr().err) == ([], False)
+    [weights] = tmp_path.glob("cache/models--*/snapshots/*/model.safetensors")
+    weights.unlink()
+    with pytest.raises(MethodError, match="org/model: the weights must be downloaded, but HF_HUB_OFFLINE is set"):
+        load_predictor("hf:org/model")
+
+
+@pytest.mark.parametrize(
+    ("name", "repository"), [("hf:org/other", "org/other"), ("depth-pro", "apple/DepthPro-hf")]
+)
+def test_offline_and_missing_hub_checkpoint_names_local_copy(
+    name: str, repository: str, hub: HubServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = f"{repository}: config.json cannot be downloaded from {hub.url}: RepositoryNotFoundError"
+    with pytest.raises(MethodError, match=words) as caught:
+        find_method(name)
+    assert "(and HF_TOKEN if the model is not public), or a local copy: hf" in str(caught.value)
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    with pytest.raises(
+        MethodError, match=f"^{repository}: config.json must be downloaded, but HF_HUB_OFF"
+    ) as caught:
+        load_predictor(find_method(name))
+    assert str(caught.value).endswith(f"hf:FOLDER (hf download {repository} --local-dir FOLDER)")
 
 
 @pytest.mark.parametrize("name", ["no/such/folder", "./nowhere", "word", "~/nowhere", "", "a/b:c"])

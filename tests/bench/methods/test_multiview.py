@@ -8,7 +8,6 @@ import sqlite3
 import zipfile
 from contextlib import closing
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -22,9 +21,12 @@ from rebar_depth_bench import load, score
 from rebar_depth_bench.base.errors import MethodError
 from rebar_depth_bench.base.parallel import silent
 from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.geometry.cameras import pixel_rays
 from rebar_depth_bench.methods import METHODS, ConfigViews, MultiViewMethod
 from rebar_depth_bench.methods.multiview import dense
 from rebar_depth_bench.methods.run import predict
+from tests.bench.methods.predictors import stop_after
+from tests.damage import change_manifest, copy_dataset
 from tests.data.orbit import write_orbit
 
 pytestmark = pytest.mark.slow
@@ -42,11 +44,7 @@ def orbit_root(tmp_path_factory: pytest.TempPathFactory, tiny_root: Path) -> Pat
 def work(orbit_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder of a run that was interrupted at the fifth view, before ``sweep-aruco.zip`` exists."""
     folder = tmp_path_factory.mktemp("sweep")
-
-    def stop(what: str, done: int, _: int) -> None:
-        if what == "sweep-aruco on lattice-orbit" and done == 5:
-            raise KeyboardInterrupt
-
+    stop = stop_after(5, "sweep-aruco on lattice-orbit")
     with pytest.raises(KeyboardInterrupt):
         predict(multi_view_method("sweep-aruco"), orbit_root, folder / "sweep-aruco.zip", progress=stop)
     assert not (folder / "sweep-aruco.zip").exists()
@@ -71,12 +69,6 @@ def multi_view_method(name: str) -> MultiViewMethod:
     return method
 
 
-def read_metadata(archive: Path) -> dict[str, Any]:
-    with zipfile.ZipFile(archive) as source:
-        content: dict[str, Any] = json.loads(source.read("submission.json"))
-    return content
-
-
 def test_images_are_numbered_in_order_of_names(work: Path) -> None:
     """COLMAP's results depend on the numbers, which would otherwise follow the order of its threads."""
     with closing(sqlite3.connect(work / "kept" / "database.db")) as database:
@@ -86,7 +78,9 @@ def test_images_are_numbered_in_order_of_names(work: Path) -> None:
 
 
 def test_notes_report_accurate_cameras_and_scale(archive: Path) -> None:
-    notes = read_metadata(archive)["notes"]["lattice-orbit"]
+    with zipfile.ZipFile(archive) as source:
+        metadata = json.loads(source.read("submission.json"))
+    notes = metadata["notes"]["lattice-orbit"]
     assert notes["views_registered"] == notes["views"] == 24
     assert abs(notes["scale_error_percent"]) < 1
     assert notes["markers"] == [0, 1, 2, 3, 4, 5]
@@ -94,7 +88,7 @@ def test_notes_report_accurate_cameras_and_scale(archive: Path) -> None:
     assert notes["centre_error_mm"]["median"] < 8
     assert notes["rotation_error_deg"]["median"] < 1
     assert notes["cameras_compared"] == "in the board's frame"
-    assert read_metadata(archive)["runtime"]["preparing"]["lattice-orbit"] > 0
+    assert metadata["runtime"]["preparing"]["lattice-orbit"] > 0
 
 
 def test_swept_depth_is_metric(archive: Path, orbit_root: Path) -> None:
@@ -128,12 +122,8 @@ def test_board_plane_matches_visible_board(orbit_root: Path) -> None:
         predicted_m = predictor(row)
         truth_m = row["left_depth"]
         height, width = truth_m.shape
-        rows, columns = np.indices((height, width))
         K, pose = row["left_K"], row["left_cam_from_world"]
-        rays = np.stack(
-            [(columns - K[0, 2]) / K[0, 0], (rows - K[1, 2]) / K[1, 1], np.ones_like(truth_m)], axis=-1
-        )
-        points = (rays * truth_m[..., None] - pose[:3, 3]) @ pose[:3, :3]
+        points = (pixel_rays(K, width, height) * truth_m[..., None] - pose[:3, 3]) @ pose[:3, :3]
         on_board = (np.abs(points) < [0.2, 0.14, 1e-4]).all(axis=-1)
         assert on_board.mean() > 0.1
         errors_m.append(np.median(np.abs(predicted_m - truth_m)[on_board]))
@@ -145,23 +135,12 @@ def test_board_plane_matches_visible_board(orbit_root: Path) -> None:
 
 @pytest.mark.parametrize("name", ["sweep-aruco", "board-plane"])
 def test_scene_without_board_raises_before_work(name: str, tiny_root: Path, tmp_path: Path) -> None:
-    root = copy_without_board(tiny_root, tmp_path)
+    root = copy_dataset(tiny_root, tmp_path / "dataset")
+    for config in ("lattice", "lattice-orbit"):
+        change_manifest(root, lambda _, entry: entry["scenes"][0].update(board=None), config)
     with pytest.raises(MethodError, match=r"lattice: the scene has no ArUco board.*--config lattice pile"):
         predict(METHODS[name], root, tmp_path / "out.zip")
     assert [path.name for path in tmp_path.iterdir()] == ["dataset"]
-
-
-def copy_without_board(root: Path, folder: Path) -> Path:
-    copy = folder / "dataset"
-    copy.mkdir()
-    for path in root.iterdir():
-        (copy / path.name).symlink_to(path)
-    manifest = json.loads((root / "manifest.json").read_text())
-    for config in manifest["configs"].values():
-        config["scenes"][0]["board"] = None
-    (copy / "manifest.json").unlink()
-    (copy / "manifest.json").write_text(json.dumps(manifest))
-    return copy
 
 
 @pytest.mark.skipif(pycolmap.has_cuda, reason="this pycolmap has CUDA: PatchMatch would run")

@@ -1,0 +1,289 @@
+"""Tests of the ``rebar-bench`` commands: results, exit statuses and messages."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+import subprocess
+import sys
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import huggingface_hub
+import numpy as np
+import pytest
+
+import rebar_depth_bench as rdb
+from rebar_depth_bench.base.errors import MAX_PROBLEMS_SHOWN
+from rebar_depth_bench.cli import check
+from rebar_depth_bench.cli.main import main
+from rebar_depth_bench.data.codecs import encode_depth
+from rebar_depth_bench.data.files import file_sha256
+from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.methods import METHODS, MultiViewMethod, own_methods
+from rebar_depth_bench.methods.base import WeightsMethod
+from rebar_depth_bench.methods.registry import FROM_FOLDER
+from tests.commands import run_in_process
+from tests.damage import change_manifest, change_rows, copy_dataset, first_shard
+
+
+def run_bench(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
+    """Run ``rebar-bench`` in this process."""
+    return run_in_process(main, *arguments)
+
+
+def predict(method: str, root: Path, folder: Path) -> Path:
+    """Run a method on the tiny lattice and return its archive."""
+    archive = folder / f"{method}.zip"
+    finished = run_bench("predict", method, "--data", root, "--out", archive, "--config", "lattice")
+    assert finished.returncode == 0, finished.stderr
+    assert finished.stdout.strip() == str(archive)
+    return archive
+
+
+@pytest.fixture(scope="module")
+def constant(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the archive that ``constant`` predicts on the tiny lattice."""
+    return predict("constant", tiny_root, tmp_path_factory.mktemp("predicted"))
+
+
+def is_number(text: str) -> bool:
+    """Return whether a CSV field is a number."""
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True
+
+
+@pytest.mark.slow
+def test_score_writes_table_json_csv_and_report(constant: Path, tiny_root: Path, tmp_path: Path) -> None:
+    targets = {kind: tmp_path / f"out.{kind}" for kind in ("json", "csv", "html")}
+    options = [part for kind, path in targets.items() for part in (f"--{kind}", path)]
+    finished = run_bench("score", constant, "--data", tiny_root, *options)
+    assert finished.returncode == 0, finished.stderr
+    result = json.loads(targets["json"].read_text())
+    table = result["tables"]["lattice"]
+    assert f"{table['native']['abs_rel']:.4f}" in finished.stdout
+    assert f"{table['scaled']['abs_rel']:.4f}" in finished.stdout
+    assert "native (no alignment)" in finished.stdout
+    assert "s = median(z)/median(p)" in finished.stdout
+    row = next(csv.DictReader(targets["csv"].read_text().splitlines()))
+    assert table["native"]["abs_rel"] in {float(value) for value in row.values() if is_number(value)}
+    page = targets["html"].read_text()
+    assert page.startswith("<!DOCTYPE html>")
+    assert all(view["view_id"] in page for view in result["views"])
+
+
+def test_sgbm_is_metric_and_constant_needs_scaling(constant: Path, tiny_root: Path, tmp_path: Path) -> None:
+    pytest.importorskip("cv2")
+    stereo = rdb.score(predict("sgbm", tiny_root, tmp_path), tiny_root).tables["lattice"]
+    assert stereo.native is not None
+    # At 160 x 90 one disparity step is centimetres of depth.
+    assert stereo.scale_median == pytest.approx(1, abs=0.15)
+    table = rdb.score(constant, tiny_root).tables["lattice"]
+    assert table.native is not None
+    assert table.scaled is not None
+    assert table.scale_median == pytest.approx(0.33, abs=0.1)
+    assert table.scaled.abs_rel < 0.1 * table.native.abs_rel
+
+
+def test_predicting_twice_gives_identical_depth_entries(constant: Path, tiny_root: Path, tmp_path: Path) -> None:
+    entries = []
+    for archive in (constant, predict("constant", tiny_root, tmp_path)):
+        with zipfile.ZipFile(archive) as source:
+            names = [name for name in source.namelist() if name != "submission.json"]  # It holds run times.
+            entries.append({name: source.read(name) for name in names})
+    assert entries[0] == entries[1]
+    assert len(entries[0]) == 9
+
+
+def test_check_reads_the_manifest_once(
+    constant: Path, tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    root = shutil.copytree(tiny_root, tmp_path / "dataset")
+    # Another manifest would not have the expected digest.
+    monkeypatch.setattr(check, "print_verified", lambda _: (root / "manifest.json").unlink())
+    finished = run_bench("check", constant, "--data", root, "--expect-digest", open_folder(root).digest)
+    assert (finished.returncode, finished.stderr.count("error: ")) == (0, 0), finished.stderr
+    assert finished.stdout == f"{constant}: no problem found\n"
+
+
+@pytest.mark.parametrize("command", ["score", "check"])
+def test_invalid_archive_exits_2_and_lists_problems(command: str, tiny_root: Path, tmp_path: Path) -> None:
+    archive = tmp_path / "bad.zip"
+    with zipfile.ZipFile(archive, "w") as target:
+        target.writestr("lattice/0028.npy", b"no array")
+        for n in range(30):
+            target.writestr(f"stranger-{n}.npy", b"")
+    finished = run_bench(command, archive, "--data", tiny_root)
+    assert (finished.returncode, finished.stdout) == (2, "")
+    assert "Traceback" not in finished.stderr
+    assert finished.stderr.count("\n  - ") == MAX_PROBLEMS_SHOWN
+    assert "more" in finished.stderr.splitlines()[-1]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("score nothing.zip --data ROOT", "does not exist"),
+        ("score nothing.zip --data /nowhere", "no such folder"),
+        ("predict magic --data ROOT --out x.zip", "unknown method 'magic', expected one of"),
+        ("predict sgbm --data ROOT --out x.zip --config pier", "no config 'pier'"),
+        ("score", "usage:"),
+        ("", "usage:"),
+        *(
+            (
+                f"predict x --nearest-distance={metres}",
+                f"--nearest-distance: '{metres}' is not a distance above 0 m",
+            )
+            for metres in ("0", "-1", "nan", "inf", "near")
+        ),
+        *(
+            (f"predict x --view-timeout={seconds}", f"--view-timeout: '{seconds}' is not a number above 0, up to")
+            for seconds in ("0", "-1", "nan", "inf", "1e7", "soon", "")
+        ),
+    ],
+)
+def test_usage_and_input_errors_exit_2(arguments: str, words: str, tiny_root: Path) -> None:
+    finished = run_bench(*arguments.replace("ROOT", str(tiny_root)).split())
+    assert finished.returncode == 2
+    assert words in finished.stderr
+    assert "Traceback" not in finished.stderr
+    assert not Path("x.zip").exists()
+
+
+def test_methods_are_listed_without_network_and_packages(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "600")
+    for function in ("hf_hub_download", "snapshot_download"):
+        monkeypatch.setattr(huggingface_hub, function, None)
+    monkeypatch.setitem(sys.modules, "torch", None)
+    finished = run_bench("methods")
+    listed = finished.stdout
+    assert (finished.returncode, finished.stderr) == (0, "")
+    assert all(name in listed and METHODS[name].info.name == name for name in METHODS)
+    assert {name for name, method in METHODS.items() if isinstance(method, WeightsMethod)} == set(FROM_FOLDER)
+    for name in FROM_FOLDER:
+        assert METHODS[name].info.untested_note
+        assert f"({METHODS[name].info.untested_note})" in listed
+        assert METHODS[name].info.licence in listed
+    multi_view_methods = [method for method in own_methods().values() if isinstance(method, MultiViewMethod)]
+    assert listed.count("(prepares a whole config before it predicts any view)") == len(multi_view_methods) > 0
+    assert "both rgb, both" in listed
+    assert "left_depth" in listed
+    assert "right_rgb" not in listed
+
+
+def test_predict_help_names_weight_folders() -> None:
+    shown = " ".join(run_bench("predict", "--help").stdout.split())
+    assert "NAME:FOLDER (a folder with weights for depth-anything-3," in shown
+
+
+@pytest.fixture
+def copy(tiny_root: Path, tmp_path: Path) -> Path:
+    return copy_dataset(tiny_root, tmp_path / "dataset")
+
+
+def test_sound_folder_passes_with_one_line(copy: Path) -> None:
+    digest = open_folder(copy).digest
+    finished = run_bench("verify", copy)
+    assert (finished.returncode, finished.stdout.count("\n")) == (0, 1), finished.stderr
+    assert f"no problem found in 10 files, 11 views; dataset {digest}" in finished.stdout
+    assert "files: 10 of 10" in finished.stderr
+    files_only = run_bench("verify", copy, "--files-only")
+    assert "views" not in files_only.stdout
+
+
+def test_file_that_builds_no_longer_write_is_verified_if_it_is_listed(copy: Path) -> None:
+    (copy / "eval.yaml").write_text("name: Industrial rebar metric depth\n")
+    sha256 = file_sha256(copy / "eval.yaml")
+    change_manifest(copy, lambda manifest, _: manifest["files"].update({"eval.yaml": sha256}))
+    assert "no problem found in 11 files" in run_bench("verify", copy).stdout
+    (copy / "eval.yaml").write_text("name: another\n")
+    finished = run_bench("verify", copy)
+    assert finished.returncode == 2
+    assert "eval.yaml: SHA-256 is " in finished.stderr
+
+
+def test_changed_missing_and_further_files_are_listed(copy: Path) -> None:
+    shard = first_shard(copy)
+    shard.write_bytes(shard.read_bytes()[:-100])
+    (copy / "bars.parquet").unlink()
+    (copy / "lattice" / "extra\x1b[2J").write_text("")
+    (copy / "meshes" / "link").symlink_to("/tmp")
+    change_manifest(copy, lambda manifest, _: manifest["files"].pop("meshes/lattice.ply"))
+    finished = run_bench("verify", copy)
+    assert (finished.returncode, finished.stdout) == (2, "")
+    problems = [line[4:] for line in finished.stderr.splitlines() if line.startswith("  - ")]
+    assert problems[0] == "bars.parquet: is missing"
+    assert problems[1].startswith(f"{shard.relative_to(copy)}: SHA-256 is ")
+    assert problems[2].startswith("meshes/lattice.ply: has no SHA-256 in the manifest")
+    assert problems[3:] == [
+        "'lattice/extra\\x1b[2J': is not in the manifest",
+        "meshes/link: is not in the manifest",
+    ]
+
+
+def test_right_depth_that_differs_from_its_digest_is_listed(copy: Path) -> None:
+    """Refuse other ground truth, also where the SHA-256 of the file was changed with it."""
+    depth = encode_depth(np.ones((90, 160), np.float32))
+    shard = first_shard(copy)
+    change_rows(shard, lambda rows: rows[1].update(right_depth=depth))
+    name = shard.relative_to(copy).as_posix()
+    change_manifest(copy, lambda manifest, _: manifest["files"].update({name: file_sha256(shard)}))
+    finished = run_bench("verify", copy)
+    assert finished.returncode == 2
+    assert "lattice-orbit/0075: the right ground truth has the digest" in finished.stderr
+    assert run_bench("verify", copy, "--files-only").returncode == 0
+
+
+def reading_commands(archive: Path, data: Path, out: Path) -> list[list[str | Path]]:
+    """Return a command line of each command that reads a dataset; results are written beside or at ``out``."""
+    return [
+        ["score", archive, "--data", data, "--json", out],
+        ["check", archive, "--data", data],
+        ["predict", "constant", "--data", data, "--out", out, "--config", "lattice-orbit"],
+        ["table", archive, "--data", data, "--csv", out],
+        ["compare", archive, archive, "--data", data, "--csv", out],
+        ["verify", data, "--files-only"],
+    ]
+
+
+@pytest.mark.slow
+def test_other_dataset_than_expected_is_refused(
+    tiny_root: Path, tiny_truth: dict[str, np.ndarray], archive_of: Callable[..., Path], tmp_path: Path
+) -> None:
+    archive, digest = archive_of(tiny_truth), open_folder(tiny_root).digest
+    commands = reading_commands(archive, tiny_root, tmp_path / "out")
+    other = "sha256:" + "0" * 64
+    for command in commands:
+        for wrong, said in ((other, f"has the digest {digest}, expected {other}"), ("md5:1", "expected sha256:")):
+            finished = run_bench(*command, "--expect-digest", wrong)
+            assert (finished.returncode, finished.stdout) == (2, ""), command
+            assert said in finished.stderr
+        assert not list(tmp_path.glob("*out*"))
+    for command in commands:
+        finished = run_bench(*command, "--expect-digest", digest)
+        assert finished.returncode == 0, finished.stderr
+        notes = [
+            line for line in finished.stderr.splitlines() if line.startswith(f"dataset {digest} of {tiny_root}: ")
+        ]
+        assert len(notes) == (command[0] in ("score", "check", "predict"))
+    with pytest.raises(rdb.DatasetError, match=f"expected {other}"):
+        rdb.score(archive, tiny_root, expect_digest=other)
+    assert rdb.score(archive, tiny_root, expect_digest=digest).dataset.digest == digest
+
+
+def test_false_digest_is_refused_by_every_command(
+    copy: Path, tiny_truth: dict[str, np.ndarray], archive_of: Callable[..., Path]
+) -> None:
+    manifest = (copy / "manifest.json").read_text()
+    (copy / "manifest.json").write_text(manifest.replace(open_folder(copy).digest, "sha256:" + "0" * 64))
+    commands = reading_commands(archive_of(tiny_truth), copy, copy.with_name("out"))
+    for command in commands:
+        arguments = [argument for argument in command if argument != "--files-only"]
+        finished = run_bench(*arguments)
+        assert (finished.returncode, finished.stdout) == (2, "")
+        assert "ground_truth.digest" in finished.stderr
