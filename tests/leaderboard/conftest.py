@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,10 +14,8 @@ import pytest
 from playwright.sync_api import Browser, sync_playwright
 
 from rebar_depth_bench import SubmissionWriter, load
-from tests.leaderboard import postgres as postgres_server
 from tests.leaderboard import serving
-from tests.leaderboard.postgres import Postgres, RunPostgres
-from tests.leaderboard.serving import RunScorer, RunServer, Server, distinct_archive, make_token
+from tests.leaderboard.serving import Postgres, RunPostgres, RunScorer, RunServer, Server, make_token
 
 HOSTILE = "<script>alert(1)</script>\"'&amp;{{ 7 * 7 }}"
 DESCRIPTION = "first line\n<b>second</b>\u202egnp\x1b[31m"
@@ -76,21 +74,32 @@ def small_archive(write_archive: WriteArchive) -> Path:
 
 
 @pytest.fixture(scope="session")
-def running_server() -> RunServer:
-    """Run ``rebar-leaderboard serve`` until a block ends."""
-    return serving.running_server
+def running_server(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> RunServer:
+    """Run ``rebar-leaderboard serve`` until a block ends: of the tiny dataset and in a new folder unless given.
+
+    Its rate limits are never reached unless they are given.
+    """
+    often = "1000000/minute"
+
+    def run(
+        state: Path | None = None, *, root: Path = tiny_root, **options: Any
+    ) -> AbstractContextManager[Server]:
+        options = {"read_rate_limit": often, "write_rate_limit": often, **options}
+        return serving.running_server(root, state or tmp_path_factory.mktemp("board") / "state", **options)
+
+    return run
 
 
 @pytest.fixture(scope="session")
-def running_scorer() -> RunScorer:
-    """Run ``rebar-leaderboard score`` until a block ends."""
-    return serving.running_scorer
+def running_scorer(tiny_root: Path) -> RunScorer:
+    """Run ``rebar-leaderboard score`` until a block ends: of the tiny dataset unless another is given."""
+    return lambda state, root=tiny_root: serving.running_scorer(root, state)
 
 
 @pytest.fixture(scope="session")
 def running_postgres() -> RunPostgres:
     """Run a PostgreSQL server of its own until a block ends."""
-    return postgres_server.running_postgres
+    return serving.running_postgres
 
 
 @pytest.fixture(scope="session")
@@ -110,9 +119,7 @@ def new_database(request: pytest.FixtureRequest) -> Callable[[], str]:
 
 
 @contextmanager
-def filled_board(
-    running_server: RunServer, root: Path, state: Path, write_archive: WriteArchive, db: str
-) -> Iterator[SharedServer]:
+def filled_board(running_server: RunServer, write_archive: WriteArchive, db: str = "") -> Iterator[SharedServer]:
     """Run a server that scores, with five scored submissions and error maps of two views."""
     archives = {
         "good": write_archive("good", 1.01, url="https://example.org/good", description="plain words"),
@@ -121,7 +128,7 @@ def filled_board(
         "holes": write_archive("holes", 1.0, 0.3, inputs="stereo", uses_ground_truth=True),
         "hostile": write_archive(HOSTILE, 1.4, description=DESCRIPTION, url="https://example.org/?a=1&b=<i>"),
     }
-    with running_server(root, state, db=db, error_maps=2, quota=100, read_rate_limit="60000/minute") as server:
+    with running_server(db=db, error_maps=2, quota=100) as server:
         token = server.token("Müller & <Söhne>")
         ids = {name: server.submit_accepted(path, token) for name, path in archives.items()}
         for submission_id in ids.values():
@@ -130,42 +137,27 @@ def filled_board(
 
 
 @pytest.fixture(scope="session")
-def board(
-    tiny_root: Path,
-    write_archive: WriteArchive,
-    tmp_path_factory: pytest.TempPathFactory,
-    running_server: RunServer,
-) -> Iterator[SharedServer]:
+def board(write_archive: WriteArchive, running_server: RunServer) -> Iterator[SharedServer]:
     """Run the server with five submissions on SQLite."""
-    state = tmp_path_factory.mktemp("board") / "state"
-    with filled_board(running_server, tiny_root, state, write_archive, "") as shared:
+    with filled_board(running_server, write_archive) as shared:
         yield shared
 
 
 @pytest.fixture(scope="session")
 def waiting(
-    tiny_root: Path,
-    write_archive: WriteArchive,
-    tmp_path_factory: pytest.TempPathFactory,
-    running_server: RunServer,
+    write_archive: WriteArchive, tmp_path_factory: pytest.TempPathFactory, running_server: RunServer
 ) -> Iterator[SharedServer]:
     """A server that scores nothing, where owners publish: a failed, a scored and two queued submissions."""
     state = tmp_path_factory.mktemp("waiting") / "state"
-    token = make_token(state, "bob")
+    token, archive = make_token(state, "bob"), write_archive("slow")
     common: dict[str, Any] = {"default_visibility": "owner", "error_maps": 1}
-    archive = write_archive("slow")
-    with running_server(tiny_root, state, score_time=0.01, **common) as server:
-        failed = server.submit_accepted(archive, token)
-        assert server.wait_until_ended(failed)["status"] == "failed"
-    with running_server(tiny_root, state, **common) as server:
-        scored = server.submit_accepted(archive, token)
-        assert server.wait_until_ended(scored)["status"] == "scored"
-    with running_server(tiny_root, state, workers=0, quota=5, max_upload=2_000_000, **common) as server:
-        ids = {"failed": failed, "scored": scored}
-        ids |= {
-            name: server.submit_accepted(distinct_archive(archive, number), token)
-            for number, name in enumerate(("next", "later"))
-        }
+    ids = {}
+    for name, limits in (("failed", {"score_time": 0.01}), ("scored", {})):
+        with running_server(state, **limits, **common) as server:
+            ids[name] = server.submit_accepted(archive, token)
+            assert server.wait_until_ended(ids[name])["status"] == name
+    with running_server(state, workers=0, quota=5, max_upload=2_000_000, **common) as server:
+        ids |= {name: server.submit_accepted(archive, token) for name in ("next", "later")}
         yield SharedServer(server, token, ids)
 
 

@@ -23,8 +23,7 @@ from rebar_depth_bench import load
 from rebar_depth_bench.base.errors import Problem
 from tests import requirements
 from tests.leaderboard.conftest import SharedServer, WriteArchive, filled_board
-from tests.leaderboard.postgres import Postgres
-from tests.leaderboard.serving import RunServer, Server, distinct_archive
+from tests.leaderboard.serving import Postgres, RunServer, Server, distinct_archive
 
 API = "/api/v1/submissions"
 QUOTA = 6
@@ -58,10 +57,7 @@ def board(
 
 @pytest.fixture(scope="session")
 def private_server(
-    tiny_root: Path,
-    tmp_path_factory: pytest.TempPathFactory,
-    new_database: Callable[[], str],
-    running_server: RunServer,
+    tmp_path_factory: pytest.TempPathFactory, new_database: Callable[[], str], running_server: RunServer
 ) -> Iterator[Server]:
     """Return a server whose submissions are private by default, with a quota of six per day and token."""
     state = tmp_path_factory.mktemp("owners") / "state"
@@ -71,7 +67,7 @@ def private_server(
         "quota": QUOTA,
         "write_rate_limit": "1000/minute",
     }
-    with running_server(tiny_root, state, **settings) as server:
+    with running_server(state, **settings) as server:
         yield server
 
 
@@ -360,9 +356,9 @@ def test_head_requests_return_the_headers_of_get(board: SharedServer, path: str)
     assert [head.headers.get(name) for name in same] == [get.headers.get(name) for name in same]
 
 
-def test_requests_over_rate_limit_are_429(tiny_root: Path, tmp_path: Path, running_server: RunServer) -> None:
+def test_requests_over_rate_limit_are_429(tmp_path: Path, running_server: RunServer) -> None:
     settings: dict[str, Any] = {"read_rate_limit": "5/hour", "write_rate_limit": "2/hour", "workers": 0}
-    with running_server(tiny_root, tmp_path / "state", **settings) as server:
+    with running_server(tmp_path / "state", **settings) as server:
         reads = [call(server, "GET", "/openapi.json").status_code for _ in range(7)]
         assert reads == [200] * 5 + [429] * 2
         writes = [call(server, "POST", API).status_code for _ in range(4)]
@@ -375,21 +371,17 @@ def test_requests_over_rate_limit_are_429(tiny_root: Path, tmp_path: Path, runni
 
 
 def test_archive_damaged_in_storage_fails_alone(
-    tiny_root: Path,
-    tmp_path: Path,
-    small_archive: Path,
-    new_database: Callable[[], str],
-    running_server: RunServer,
+    tmp_path: Path, small_archive: Path, new_database: Callable[[], str], running_server: RunServer
 ) -> None:
     state, db = tmp_path / "state", new_database()
-    with running_server(tiny_root, state, db=db, workers=0) as server:
+    with running_server(state, db=db, workers=0) as server:
         token = server.token("alice")
         ids = [server.submit_accepted(small_archive, token) for _ in range(3)]
     stored_archive = state / "archives" / f"{ids[1]}.zip"
     content = bytearray(stored_archive.read_bytes())
     content[2000:2100] = bytes(100)
     stored_archive.write_bytes(content)
-    with running_server(tiny_root, state, db=db) as server:
+    with running_server(state, db=db) as server:
         submissions = [server.wait_until_ended(submission_id) for submission_id in ids]
         assert [submission["status"] for submission in submissions] == ["scored", "failed", "scored"]
         assert "lattice-orbit/" in submissions[1]["reason"]

@@ -134,16 +134,16 @@ def test_concurrent_uploads_are_all_stored(folder: Path, new_file: Callable[[], 
 
 
 def test_service_uses_another_folder(
-    tiny_root: Path, tmp_path: Path, small_archive: Path, folder: Path, running_server: RunServer
+    tmp_path: Path, small_archive: Path, folder: Path, running_server: RunServer
 ) -> None:
     state = tmp_path / "state"
     token = make_token(state, "alice")
-    with running_server(tiny_root, state, workers=0, archives=folder) as server:
+    with running_server(state, workers=0, archives=folder) as server:
         submission = server.submit_accepted(small_archive, token)
     for name, age_s in (("orphan", 2 * ORPHAN_AGE_S), ("young", 0.0)):
         (folder / f"{name}.zip").write_bytes(CONTENT)
         os.utime(folder / f"{name}.zip", (time.time() - age_s,) * 2)
-    with running_server(tiny_root, state, archives=folder) as server:
+    with running_server(state, archives=folder) as server:
         assert {path.name for path in folder.iterdir()} == {"orphan.zip", "young.zip", f"{submission}.zip"}
         for name in ("orphan", "young"):
             (folder / f"{name}.zip").unlink()
@@ -157,10 +157,10 @@ def test_service_uses_another_folder(
 
 
 def test_storage_outage_keeps_quota_and_requeues_job(
-    tiny_root: Path, tmp_path: Path, small_archive: Path, running_server: RunServer
+    tmp_path: Path, small_archive: Path, running_server: RunServer
 ) -> None:
     state, archives = tmp_path / "state", tmp_path / "state" / "archives"
-    with running_server(tiny_root, state, quota=1, workers=0) as server:
+    with running_server(state, quota=1, workers=0) as server:
         token = server.token("alice")
         archives.rename(tmp_path / "away")
         response = server.submit(small_archive, token)
@@ -168,6 +168,6 @@ def test_storage_outage_keeps_quota_and_requeues_job(
         (tmp_path / "away").rename(archives)
         submission = server.submit_accepted(small_archive, token)
         assert not list((state / "spool").iterdir())
-        with running_scorer(tiny_root, state) as log:
+        with running_scorer(state) as log:
             wait_until(lambda: any("waiting for submissions" in line for line in log), "the scorer has started")
             assert server.wait_until_ended(submission)["status"] == "scored"

@@ -141,13 +141,11 @@ def test_folder_that_is_used_is_refused(board: tuple[Settings, str], tmp_path: P
             back_up(shared, folder, prune=False)
 
 
-def test_served_backup_is_refused_while_it_is_served(
-    tiny_root: Path, tmp_path: Path, running_server: RunServer
-) -> None:
+def test_served_backup_is_refused_while_it_is_served(tmp_path: Path, running_server: RunServer) -> None:
     settings = board_settings(tmp_path / "state")
     make_board(settings)
     back_up(settings, tmp_path / "backup", prune=False)
-    with running_server(tiny_root, tmp_path / "backup", workers=0):
+    with running_server(tmp_path / "backup", workers=0):
         process = run("backup", tmp_path / "backup", "--state-dir", settings.state_dir)
     assert process.returncode == 2
     assert "a server, a worker or another command uses it" in process.stderr

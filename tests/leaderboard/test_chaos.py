@@ -24,8 +24,15 @@ import pytest
 
 from leaderboard.db.jobs import MAX_ATTEMPTS
 from tests.leaderboard.conftest import WriteArchive
-from tests.leaderboard.postgres import Postgres, RunPostgres
-from tests.leaderboard.serving import SCORING, RunServer, Server, distinct_archive, make_token
+from tests.leaderboard.serving import (
+    SCORING,
+    Postgres,
+    RunPostgres,
+    RunServer,
+    Server,
+    distinct_archive,
+    make_token,
+)
 from tests.leaderboard.test_operations import run
 from tests.processes import descendants, is_running, processes_below, wait_until
 from tests.requirements import Repetitions

@@ -35,12 +35,10 @@ def run(*arguments: str | Path, token: str | None = None) -> subprocess.Complete
 
 
 @pytest.fixture(scope="module")
-def strict_server(
-    tiny_root: Path, tmp_path_factory: pytest.TempPathFactory, running_server: RunServer
-) -> Iterator[Server]:
+def strict_server(tmp_path_factory: pytest.TempPathFactory, running_server: RunServer) -> Iterator[Server]:
     """Return a server with a quota of one, a small size limit and a scoring time limit that always expires."""
     settings: dict[str, Any] = {"quota": 1, "max_upload": 2_000_000, "score_time": 0.01}
-    with running_server(tiny_root, tmp_path_factory.mktemp("strict") / "state", **settings) as server:
+    with running_server(tmp_path_factory.mktemp("strict") / "state", **settings) as server:
         yield server
 
 

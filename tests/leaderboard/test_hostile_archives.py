@@ -1,14 +1,16 @@
-"""Hundreds of hostile archives: readable rejections, no files written elsewhere and no memory growth."""
+"""Hostile and huge archives: readable rejections, no files written elsewhere and bounded memory."""
 
 from __future__ import annotations
 
 import contextlib
 import io
 import json
+import struct
 import sys
+import threading
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -16,6 +18,7 @@ import httpx2
 import numpy as np
 import pytest
 
+from leaderboard.settings import read_settings
 from rebar_depth_bench import load
 from rebar_depth_bench.base.errors import MAX_PROBLEMS_SHOWN, Problem
 from tests.ground_truth import truth_of
@@ -26,15 +29,16 @@ from tests.leaderboard.hostile_zips import (
     pickle_payload_npy,
     unusual_valid_archives,
 )
-from tests.leaderboard.serving import ENDED, RunServer, Server
-from tests.processes import children, memory_bytes, num_open_files
+from tests.leaderboard.serving import API, ENDED, RunServer, Server, bearer
+from tests.processes import children, descendants, memory_bytes, num_open_files
 from tests.requirements import Repetitions
 
 CLIENTS = 4
-NUM_WARM_UP = 60
+NUM_WARM_UP = 20
 """Number of archives after which one-time allocations of the server are done."""
 MAX_GROWTH_BYTES = 24 << 20
 """Bound on memory growth: a fifth of the bodies of the 1,000 archives."""
+MAX_MEMORY_BYTES = 300_000_000
 SEED = 20261122
 REPOSITORY = Path(__file__).parents[2]
 
@@ -65,10 +69,7 @@ class AttackResult:
 
 @pytest.fixture(scope="module")
 def attack(
-    tiny_root: Path,
-    tmp_path_factory: pytest.TempPathFactory,
-    running_server: RunServer,
-    repetitions: Repetitions,
+    tiny_root: Path, tmp_path_factory: pytest.TempPathFactory, running_server: RunServer, repetitions: Repetitions
 ) -> Iterator[AttackResult]:
     folder = tmp_path_factory.mktemp("siege")
     truth_of(tiny_root, "lattice-orbit")  # The attack finds the cache complete.
@@ -77,52 +78,36 @@ def attack(
         (folder / name).mkdir()
     rows = load(tiny_root, "lattice-orbit", columns=["view_id", "left_depth"])
     valid = ValidArchive({row["view_id"]: row["left_depth"] for row in rows}, folder / "forbidden")
-    archives = malformed_archives(np.random.default_rng(SEED), valid, repetitions(200, 1000))
-    settings: dict[str, Any] = {
-        "quota": 10**6,
-        "read_rate_limit": "1000000/minute",
-        "write_rate_limit": "1000000/minute",
-    }
+    archives = malformed_archives(np.random.default_rng(SEED), valid, repetitions(60, 1000))
     environment = {"HOME": str(folder / "home"), "TMPDIR": str(folder / "tmp"), "PYTHONPATH": str(REPOSITORY)}
     with contextlib.ExitStack() as stack:
         with contextlib.chdir(folder / "cwd"):
-            server = stack.enter_context(
-                running_server(tiny_root, state, environment=environment, workers=2, **settings)
-            )
+            started = running_server(state, environment=environment, workers=2, quota=10**6)
+            server = stack.enter_context(started)
         first_listing = listing([folder, tiny_root], state)
         token = server.token("stranger")
-        first_answers = upload_concurrently(server, token, archives[:NUM_WARM_UP])
+        answers = upload_concurrently(server, token, archives[:NUM_WARM_UP])
         settled_footprint = footprint(server)
-        answers = first_answers + upload_concurrently(server, token, archives[NUM_WARM_UP:])
-        final_footprint = footprint(server)
-        valid_answers = [
-            answer
-            for _, answer in upload_concurrently(
-                server, token, [("sound", data) for data in unusual_valid_archives(valid)]
-            )
-        ]
-        accepted = [
-            response.json()["id"]
-            for response in [*valid_answers, *(response for _, response in answers)]
-            if response.status_code == 202
-        ]
+        answers += upload_concurrently(server, token, archives[NUM_WARM_UP:])
+        footprints = settled_footprint, footprint(server)
+        unusual = [("sound", data) for data in unusual_valid_archives(valid)]
+        sound = [response for _, response in upload_concurrently(server, token, unusual)]
+        responses = [*sound, *(response for _, response in answers)]
+        accepted = [response.json()["id"] for response in responses if response.status_code == 202]
         ended = {submission_id: server.wait_until_ended(submission_id) for submission_id in accepted}
         listings = first_listing, listing([folder, tiny_root], state)
-        yield AttackResult(
-            server, answers, valid_answers, ended, (settled_footprint, final_footprint), listings, valid.forbidden
-        )
+        yield AttackResult(server, answers, sound, ended, footprints, listings, valid.forbidden)
 
 
 def upload_concurrently(
     server: Server, token: str, archives: Sequence[tuple[str, bytes]]
 ) -> list[tuple[str, httpx2.Response]]:
     """Upload archives from several clients concurrently; return the kind and the response of each."""
-    headers = {"Authorization": f"Bearer {token}"}
-    with httpx2.Client(headers=headers, timeout=120) as client, ThreadPoolExecutor(CLIENTS) as pool:
+    with httpx2.Client(headers=bearer(token), timeout=120) as client, ThreadPoolExecutor(CLIENTS) as pool:
 
         def upload(archive: tuple[str, bytes]) -> tuple[str, httpx2.Response]:
             files = {"archive": ("../../a.zip", archive[1])}
-            return archive[0], client.post(f"{server.url}/api/v1/submissions", files=files)
+            return archive[0], client.post(server.url + API, files=files)
 
         return list(pool.map(upload, archives))
 
@@ -147,7 +132,7 @@ def _size_and_mtime_ns(path: Path) -> tuple[int, int]:
 
 
 def test_no_archive_causes_server_error(attack: AttackResult, repetitions: Repetitions) -> None:
-    assert len(attack.answers) == repetitions(200, 1000)
+    assert len(attack.answers) == repetitions(60, 1000)
     assert {response.status_code for _, response in attack.answers} <= {202, 422}
     assert {kind for kind, response in attack.answers if response.status_code == 422} == set(KINDS)
     lines = [json.loads(line) for line in attack.server.log if line.startswith("{")]
@@ -156,15 +141,8 @@ def test_no_archive_causes_server_error(attack: AttackResult, repetitions: Repet
 
 
 def test_rejections_list_readable_problems_without_secrets(attack: AttackResult, tiny_root: Path) -> None:
-    secrets = (
-        str(attack.server.state),
-        str(tiny_root),
-        str(REPOSITORY),
-        sys.prefix,
-        "Traceback",
-        'File "',
-        ".upload",
-    )
+    folders = (str(attack.server.state), str(tiny_root), str(REPOSITORY), sys.prefix)
+    secrets = (*folders, "Traceback", 'File "', ".upload")
     for kind, response in attack.answers:
         if response.status_code == 422:
             content = response.json()
@@ -186,9 +164,9 @@ def test_unusual_valid_archives_are_scored(attack: AttackResult) -> None:
         assert submission["status"] in ENDED
         assert (submission["status"] == "failed") == bool(submission["reason"])
         if submission["status"] == "scored":
-            result = httpx2.get(f"{attack.server.url}/api/v1/submissions/{submission_id}/result.json")
+            result = attack.server.get(f"{API}/{submission_id}/result.json")
             json.loads(result.content, parse_constant=reject_constant)
-        page = httpx2.get(f"{attack.server.url}/submissions/{submission_id}", headers={"Accept": "text/html"})
+        page = attack.server.get(f"/submissions/{submission_id}", headers={"Accept": "text/html"})
         assert page.status_code == 200
     assert all(attack.ended[response.json()["id"]]["status"] == "scored" for response in attack.sound)
 
@@ -198,18 +176,17 @@ def reject_constant(constant: str) -> NoReturn:
 
 
 def test_server_still_responds(attack: AttackResult) -> None:
-    assert httpx2.get(f"{attack.server.url}/healthz").json()["status"] == "ok"
+    assert attack.server.get("/healthz").json()["status"] == "ok"
     for path in ("/", "/api/v1/leaderboard?config=lattice-orbit", "/api/v1/leaderboard.csv?config=lattice-orbit"):
-        assert httpx2.get(attack.server.url + path, timeout=60).status_code == 200
+        assert attack.server.get(path).status_code == 200
 
 
 def test_only_accepted_archives_are_stored(attack: AttackResult) -> None:
     state = attack.server.state
     assert {path.stem for path in (state / "archives").iterdir()} == set(attack.ended)
-    assert {path.name for path in state.iterdir()} <= {
-        "archives", "spool", "leaderboard.sqlite", "leaderboard.sqlite-wal", "leaderboard.sqlite-shm"
-    }  # fmt: skip
-    assert not list((state / "spool").iterdir())
+    database = {f"leaderboard.sqlite{suffix}" for suffix in ("", "-wal", "-shm")}
+    assert {path.name for path in state.iterdir()} <= {"archives", "spool", *database}
+    assert attack.server.spool_files() == []
 
 
 def test_no_file_is_written_elsewhere_and_no_pickle_runs(attack: AttackResult, tmp_path: Path) -> None:
@@ -232,3 +209,73 @@ def test_memory_does_not_grow(attack: AttackResult) -> None:
     before, after = attack.footprints
     assert after.server_bytes - before.server_bytes < MAX_GROWTH_BYTES, attack.footprints
     assert after.children_bytes - before.children_bytes < MAX_GROWTH_BYTES, attack.footprints
+
+
+@dataclass
+class MemoryWatch:
+    """Sampler of the peak memory, in bytes, of a process and its descendants until the block ends."""
+
+    pid: int
+    peaks: dict[int, int] = field(default_factory=dict)
+
+    def __enter__(self) -> MemoryWatch:
+        self._ended = threading.Event()
+        self._thread = threading.Thread(target=self._sample, daemon=True)
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._ended.set()
+        self._thread.join()
+
+    def _sample(self) -> None:
+        while not self._ended.wait(0.05):
+            for pid in [self.pid, *descendants(self.pid)]:
+                try:
+                    self.peaks[pid] = max(self.peaks.get(pid, 0), memory_bytes(pid))
+                except (OSError, AssertionError):
+                    continue  # The process has just ended.
+
+
+def split_with_gap(archive: bytes, gap: int) -> tuple[bytes, bytes]:
+    """Split a valid archive into two parts that stay valid with ``gap`` unused bytes between them."""
+    directory_offset = struct.unpack_from("<L", archive, len(archive) - 6)[0]
+    last_record = archive.rindex(b"PK\1\2")
+    (entry_offset,) = struct.unpack_from("<L", archive, last_record + 42)
+    shifted = bytearray(archive)
+    struct.pack_into("<L", shifted, last_record + 42, entry_offset + gap)
+    struct.pack_into("<L", shifted, len(archive) - 6, directory_offset + gap)
+    return archive[:entry_offset], bytes(shifted[entry_offset:])
+
+
+def test_large_upload_is_scored_with_bounded_memory(
+    running_server: RunServer, small_archive: Path, repetitions: Repetitions
+) -> None:
+    gap_bytes, chunk = repetitions(600_000_000, 2_000_000_000), bytes(1 << 20)
+    archive = small_archive.read_bytes()
+    first, second = split_with_gap(archive, gap_bytes)
+
+    def body() -> Iterator[bytes]:
+        yield first
+        yield from (chunk for _ in range(gap_bytes // len(chunk)))
+        yield bytes(gap_bytes % len(chunk)) + second
+
+    with running_server() as server, MemoryWatch(server.process.pid) as watch:
+        token, archives = server.token("patient"), server.state / "archives"
+        headers = {"Content-Type": "application/zip"}
+        response = server.call("PUT", API, token, content=body(), headers=headers)
+        assert response.status_code == 202, response.text
+        submission = response.json()["id"]
+        assert (archives / f"{submission}.zip").stat().st_size == len(archive) + gap_bytes
+        assert server.wait_until_ended(submission)["status"] == "scored"
+        assert memory_bytes(server.process.pid, "VmHWM") < MAX_MEMORY_BYTES, watch.peaks
+        assert server.call("DELETE", f"{API}/{submission}", token).status_code == 204
+        assert list(archives.iterdir()) == server.spool_files() == []
+    assert len(watch.peaks) >= 4  # server, checker, scorer and scoring process
+    assert max(watch.peaks.values()) < MAX_MEMORY_BYTES, watch.peaks
+
+
+def test_archive_of_the_full_protocols_fits_the_default_limit() -> None:
+    """Float32 depth of six configs of 504 views and one of 100 views, 1280 x 720, stored without compression."""
+    full = (6 * 504 + 100) * (1280 * 720 * 4 + 128)
+    assert full < read_settings(None, {"data": "ROOT"}).max_upload

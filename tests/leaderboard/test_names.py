@@ -12,8 +12,7 @@ from leaderboard.names import confused_scripts, name_problem, normalised
 
 
 @pytest.mark.parametrize(
-    "name",
-    ["sgbm", "Müller & Söhne", "深度估计 v2", "метод", "Nguyễn", "depth/3 (K)", "e\u0301", "שיטה", "ไทย"],
+    "name", ["sgbm", "Müller & Söhne", "深度估计 v2", "метод", "Nguyễn", "depth/3 (K)", "e\u0301", "שיטה", "ไทย"]
 )
 def test_names_of_many_languages_are_accepted(name: str) -> None:
     assert name_problem(normalised(name)) is None

@@ -12,8 +12,7 @@ from urllib.parse import urlsplit
 import httpx2
 import pytest
 
-from tests.leaderboard.postgres import Postgres, RunPostgres
-from tests.leaderboard.serving import RunServer, Server
+from tests.leaderboard.serving import Postgres, RunPostgres, RunServer, Server
 from tests.processes import wait_until
 
 PASSWORD = "correct-horse-battery"
@@ -63,7 +62,6 @@ def restart_database(server: Server, database: Postgres, page: str) -> tuple[tup
 
 @pytest.fixture(scope="module")
 def run(
-    tiny_root: Path,
     small_archive: Path,
     tmp_path_factory: pytest.TempPathFactory,
     running_server: RunServer,
@@ -73,9 +71,7 @@ def run(
     (folder / "broken.zip").write_bytes(b"no zip")
     with running_postgres() as database:
         db = with_password(database.url)
-        with running_server(
-            tiny_root, folder / "state", db=db, default_visibility="owner", lease_seconds=5
-        ) as server:
+        with running_server(folder / "state", db=db, default_visibility="owner", lease_seconds=5) as server:
             token = server.token("alice")
             first = server.submit_accepted(small_archive, token)
             assert server.submit(small_archive, WRONG_TOKEN).status_code == 401

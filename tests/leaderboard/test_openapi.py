@@ -47,13 +47,10 @@ schemathesis.openapi.format("binary", st.sampled_from([sound, sound[:-9], sound[
 
 
 @pytest.fixture(scope="module")
-def server(
-    tiny_root: Path, tmp_path_factory: pytest.TempPathFactory, running_server: RunServer
-) -> Iterator[Server]:
+def server(tmp_path_factory: pytest.TempPathFactory, running_server: RunServer) -> Iterator[Server]:
     state = tmp_path_factory.mktemp("openapi") / "state"
     often = "1000000/minute"
     with running_server(
-        tiny_root,
         state,
         read_rate_limit=often,
         write_rate_limit=often,

@@ -20,14 +20,7 @@ import httpx2
 import pytest
 
 from tests.leaderboard.conftest import WriteArchive
-from tests.leaderboard.serving import (
-    SCORING,
-    RunServer,
-    Server,
-    distinct_archive,
-    make_token,
-    submission_row,
-)
+from tests.leaderboard.serving import SCORING, RunServer, Server, distinct_archive, make_token, submission_row
 from tests.processes import is_running, processes_below, wait_until
 
 NUM_UPLOADS = 2
@@ -92,15 +85,15 @@ def is_receiving(state: Path) -> bool:
 
 
 def test_backup_during_uploads_serves_same_leaderboard(
-    tiny_root: Path, tmp_path: Path, write_archive: WriteArchive, small_archive: Path, running_server: RunServer
+    tmp_path: Path, write_archive: WriteArchive, small_archive: Path, running_server: RunServer
 ) -> None:
     state, backup = tmp_path / "state", tmp_path / "backup"
-    with running_server(tiny_root, state) as server:
+    with running_server(state) as server:
         token = server.token("alice")
         scored = server.submit_accepted(write_archive("good", configs=("lattice",)), token)
         server.wait_until_ended(scored)
         expected = leaderboard_bytes(server, "lattice")
-    with running_server(tiny_root, state, workers=0) as server, ThreadPoolExecutor() as threads:
+    with running_server(state, workers=0) as server, ThreadPoolExecutor() as threads:
         uploads = [threads.submit(server.submit_accepted, small_archive, token) for _ in range(NUM_UPLOADS)]
         wait_until(lambda: len(statuses(state)) > 1, "the first upload is in")
         process = run_command("backup", backup, "--state-dir", state)
@@ -110,7 +103,7 @@ def test_backup_during_uploads_serves_same_leaderboard(
     assert scored in copied
     assert copied <= accepted
     assert "queued" in statuses(backup)
-    with running_server(tiny_root, backup) as server:
+    with running_server(backup) as server:
         assert leaderboard_bytes(server, "lattice") == expected
         for submission_id in copied:
             assert server.wait_until_ended(submission_id)["status"] == "scored"
@@ -118,10 +111,10 @@ def test_backup_during_uploads_serves_same_leaderboard(
 
 
 def test_second_backup_copies_only_new_archives(
-    tiny_root: Path, tmp_path: Path, small_archive: Path, running_server: RunServer
+    tmp_path: Path, small_archive: Path, running_server: RunServer
 ) -> None:
     state, backup = tmp_path / "state", tmp_path / "backup"
-    with running_server(tiny_root, state, workers=0) as server:
+    with running_server(state, workers=0) as server:
         token = server.token("alice")
         first = server.submit_accepted(small_archive, token)
         assert run_command("backup", backup, "--state-dir", state).returncode == 0
@@ -151,11 +144,9 @@ def test_second_backup_copies_only_new_archives(
     assert [path.stat().st_mode & 0o077 for path in (state, backup)] == [0, 0]
 
 
-def test_removed_submission_is_404(
-    tiny_root: Path, tmp_path: Path, small_archive: Path, running_server: RunServer
-) -> None:
+def test_removed_submission_is_404(tmp_path: Path, small_archive: Path, running_server: RunServer) -> None:
     state = tmp_path / "state"
-    with running_server(tiny_root, state, workers=0) as server:
+    with running_server(state, workers=0) as server:
         submission = server.submit_accepted(small_archive, server.token("alice"))
         removed = run_command("remove", submission, "--state-dir", state)
         assert (removed.returncode, removed.stderr) == (0, "")
@@ -181,10 +172,10 @@ def test_backup_into_foreign_folder_is_rejected(tmp_path: Path) -> None:
 
 
 def test_sigterm_finishes_requests_and_requeues_job(
-    tiny_root: Path, tmp_path: Path, small_archive: Path, running_server: RunServer
+    tmp_path: Path, small_archive: Path, running_server: RunServer
 ) -> None:
     state, go_on = tmp_path / "state", threading.Event()
-    with running_server(tiny_root, state) as server, ThreadPoolExecutor() as threads:
+    with running_server(state) as server, ThreadPoolExecutor() as threads:
         token = server.token("alice")
         in_progress = server.submit_accepted(small_archive, token)
         wait_until(lambda: processes_below(server.process.pid, SCORING), "scoring begins")
@@ -208,18 +199,18 @@ def test_sigterm_finishes_requests_and_requeues_job(
     assert not list((state / "spool").iterdir())
     assert sorted(path.name for path in state.iterdir()) == ["archives", "leaderboard.sqlite", "spool"]
     assert not Path(f"/proc/{scoring}").exists()
-    with running_server(tiny_root, state) as server:
+    with running_server(state) as server:
         for submission_id in (in_progress, uploaded):
             assert server.wait_until_ended(submission_id)["status"] == "scored"
     assert submission_row(state, in_progress)["attempts"] == 1
 
 
 def test_next_server_clears_spool_of_killed_server(
-    tiny_root: Path, tmp_path: Path, small_archive: Path, running_server: RunServer
+    tmp_path: Path, small_archive: Path, running_server: RunServer
 ) -> None:
     state, go_on = tmp_path / "state", threading.Event()
     token = make_token(state, "alice")
-    with running_server(tiny_root, state) as server, ThreadPoolExecutor() as threads:
+    with running_server(state) as server, ThreadPoolExecutor() as threads:
         server.submit_accepted(small_archive, token)
         wait_until(lambda: processes_below(server.process.pid, SCORING), "scoring begins")
         scoring = processes_below(server.process.pid, SCORING)
@@ -232,20 +223,20 @@ def test_next_server_clears_spool_of_killed_server(
         with pytest.raises(httpx2.TransportError):
             future.result(60)
     assert is_receiving(state), "the killed server left nothing: the test shows too little"
-    with running_server(tiny_root, state, workers=0) as server:
+    with running_server(state, workers=0) as server:
         assert not list((state / "spool").iterdir())
         server.submit_accepted(distinct_archive(small_archive, 2), token)
 
 
 def test_running_services_keep_each_others_spools(
-    tiny_root: Path, tmp_path: Path, small_archive: Path, running_server: RunServer
+    tmp_path: Path, small_archive: Path, running_server: RunServer
 ) -> None:
     state, go_on = tmp_path / "state", threading.Event()
     token = make_token(state, "alice")
-    with running_server(tiny_root, state, workers=0) as first, ThreadPoolExecutor() as threads:
+    with running_server(state, workers=0) as first, ThreadPoolExecutor() as threads:
         future = threads.submit(SlowUpload(first, token, small_archive, go_on))
         wait_until(lambda: is_receiving(state), "the upload is under way")
-        with running_server(tiny_root, state, workers=0) as second:
+        with running_server(state, workers=0) as second:
             go_on.set()
             response = future.result(60)
             assert response.status_code == 202, response.text

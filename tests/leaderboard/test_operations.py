@@ -34,13 +34,9 @@ def table(process: subprocess.CompletedProcess[str]) -> list[dict[str, str]]:
 
 
 @pytest.fixture(scope="module")
-def server(
-    tiny_root: Path,
-    tmp_path_factory: pytest.TempPathFactory,
-    running_server: RunServer,
-) -> Iterator[Server]:
+def server(tmp_path_factory: pytest.TempPathFactory, running_server: RunServer) -> Iterator[Server]:
     state = tmp_path_factory.mktemp("operations") / "state"
-    with running_server(tiny_root, state, default_visibility="owner") as started:
+    with running_server(state, default_visibility="owner") as started:
         yield started
 
 
@@ -204,17 +200,17 @@ def test_older_database_keeps_newer_archives(
     tiny_root: Path, tmp_path: Path, small_archive: Path, running_server: RunServer
 ) -> None:
     state = tmp_path / "state"
-    with running_server(tiny_root, state, workers=0) as server:
+    with running_server(state, workers=0) as server:
         token = server.token("alice")
         old = server.submit_accepted(small_archive, token)
     shutil.copy(state / "leaderboard.sqlite", tmp_path / "older.sqlite")
-    with running_server(tiny_root, state, workers=0) as server:
+    with running_server(state, workers=0) as server:
         newer = server.submit_accepted(small_archive, token)
         assert server.process.poll() is None
     shutil.copy(tmp_path / "older.sqlite", state / "leaderboard.sqlite")
     archive = state / "archives" / f"{newer}.zip"
     os.utime(archive, (0, 0))
-    with running_server(tiny_root, state, workers=0) as server:
+    with running_server(state, workers=0) as server:
         assert run("check", "--state-dir", state, "--data", tiny_root).stderr.count(newer) == 1
     assert {path.stem for path in (state / "archives").iterdir()} == {old, newer}
 

@@ -236,9 +236,9 @@ def test_pages_name_dataset_licence_and_scenes(board: SharedServer) -> None:
     assert get(f"{board.url}/scenes/nope.webp").status_code == 404
 
 
-def test_links_of_dataset_and_paper_are_shown(tiny_root: Path, tmp_path: Path, running_server: RunServer) -> None:
+def test_links_of_dataset_and_paper_are_shown(tmp_path: Path, running_server: RunServer) -> None:
     links = {"dataset_url": "https://example.org/data", "paper_url": "https://example.org/paper"}
-    with running_server(tiny_root, tmp_path / "state", workers=0, **links) as server:
+    with running_server(tmp_path / "state", workers=0, **links) as server:
         for path in ("/", "/how-to-submit"):
             _, parsed = page(server.url + path)
             addresses = {link["href"] for link in parsed.attributes_of("a")}

@@ -41,7 +41,7 @@ def test_other_dataset_is_rejected_without_rescore_option(tmp_path: Path, runnin
     write_dataset(first, ["lattice"], 3)
     write_dataset(second, ["lattice", "pile"], 3)
     write_archive(archive, ["lattice"], 3, "m", 1)
-    with running_server(first, state, db=db) as server:
+    with running_server(state, root=first, db=db) as server:
         token = server.token("alice")
         ids = [server.submit_accepted(archive, token) for _ in range(2)]
         before = [server.wait_until_ended(submission_id)["result"] for submission_id in ids]
@@ -65,12 +65,12 @@ def test_other_dataset_is_rejected_without_rescore_option(tmp_path: Path, runnin
     assert "2 submissions of this leaderboard belong to another dataset" in process.stderr
     assert "--rescore true" in process.stderr
     assert "Traceback" not in process.stderr
-    with running_server(second, state, db=db, rescore=True, workers=0) as server:
+    with running_server(state, root=second, db=db, rescore=True, workers=0) as server:
         assert ids_and_ranks(server) == []
         submission = httpx2.get(f"{server.url}/api/v1/submissions/{ids[0]}", timeout=60).json()
         assert (submission["status"], submission["result"]) == ("queued", None)
         assert httpx2.get(f"{server.url}/submissions/{ids[0]}", timeout=60).status_code == 200
-    with running_server(second, state, db=db) as server:
+    with running_server(state, root=second, db=db) as server:
         after = [server.wait_until_ended(submission_id)["result"] for submission_id in ids]
         digest = json.loads((second / "manifest.json").read_text())["ground_truth"]["digest"]
         assert [result["dataset"]["digest"] for result in after] == [digest, digest]
@@ -86,7 +86,7 @@ def test_pruned_submission_keeps_its_result_and_leaves_the_ranking(
     write_dataset(first, ["lattice"], 3)
     write_dataset(second, ["lattice", "pile"], 3)
     write_archive(archive, ["lattice"], 3, "m", 1)
-    with running_server(first, state) as server:
+    with running_server(state, root=first) as server:
         token = server.token("alice")
         pruned, lost, kept = [server.submit_accepted(archive, token) for _ in range(3)]
         before = {name: server.wait_until_ended(name)["result"] for name in (pruned, lost, kept)}
@@ -95,9 +95,9 @@ def test_pruned_submission_keeps_its_result_and_leaves_the_ranking(
         prune_archives(database, archives, [pruned])
         (settings.archive_dir / f"{lost}.zip").unlink()
     digest = before[pruned]["dataset"]["digest"]
-    with running_server(second, state, rescore=True) as server:
+    with running_server(state, root=second, rescore=True) as server:
         assert server.wait_until_ended(kept)["result"]["dataset"]["digest"] != digest
-    with running_server(second, state) as server:  # No submission is stale any more.
+    with running_server(state, root=second) as server:  # No submission is stale any more.
         assert ids_and_ranks(server) == [(kept, 1)]
         for name in (pruned, lost):
             shown = server.wait_until_ended(name)
@@ -107,7 +107,7 @@ def test_pruned_submission_keeps_its_result_and_leaves_the_ranking(
             assert page.status_code == 200
             assert shown["outdated"] in page.text
         assert server.wait_until_ended(kept)["outdated"] is None
-    with running_server(first, state, rescore=True) as server:  # The dataset is back.
+    with running_server(state, root=first, rescore=True) as server:  # The dataset is back.
         server.wait_until_ended(kept)
         assert {name for name, _ in ids_and_ranks(server)} == {pruned, lost, kept}
 
@@ -136,7 +136,7 @@ def test_results_of_other_definitions_are_scored_again_or_stay(
     root, state, archive = tmp_path / "root", tmp_path / "state", tmp_path / "archive.zip"
     write_dataset(root, ["lattice"], 2)
     write_archive(archive, ["lattice"], 2, "m", 1)
-    with running_server(root, state) as server:
+    with running_server(state, root=root) as server:
         kept, lost = (server.submit_accepted(archive, server.token(name)) for name in ("alice", "bob"))
         before = [server.wait_until_ended(submission_id)["result"] for submission_id in (kept, lost)]
     earlier = before[0] | {"protocol": "rebar-0"} if changed == "protocol" else before[0].copy()
@@ -144,7 +144,7 @@ def test_results_of_other_definitions_are_scored_again_or_stay(
     with closing(sqlite3.connect(state / "leaderboard.sqlite")) as connection, connection:
         connection.execute("UPDATE results SET json = ?", (json.dumps(earlier).encode(),))
     (state / "archives" / f"{lost}.zip").unlink()
-    with running_server(root, state) as server:
+    with running_server(state, root=root) as server:
         assert server.wait_until_ended(kept)["result"] == before[0]
         assert server.wait_until_ended(lost)["result"] == earlier
         assert ids_and_ranks(server) == [(kept, 1), (lost, 1)]
@@ -161,16 +161,16 @@ def test_scorer_with_other_dataset_releases_job(
     write_dataset(first, ["lattice"], 2)
     write_dataset(second, ["lattice", "pile"], 2)
     write_archive(archive, ["lattice"], 2, "m", 1)
-    with running_server(first, state, workers=0) as server:
+    with running_server(state, root=first, workers=0) as server:
         submission_id = server.submit_accepted(archive, server.token("alice"))
-        with running_scorer(second, state) as log:
+        with running_scorer(state, root=second) as log:
             wait_until(lambda: any('"event": "job requeued"' in line for line in log), "the job is requeued")
         assert any("expected sha256:" in line for line in log)
         assert (
             submission_row(state, submission_id)["status"],
             submission_row(state, submission_id)["attempts"],
         ) == ("queued", 0)
-        with running_scorer(first, state):
+        with running_scorer(state, root=first):
             assert server.wait_until_ended(submission_id)["status"] == "scored"
 
 
@@ -178,7 +178,7 @@ def test_missing_dataset_is_503_and_fails_no_submission(tmp_path: Path, running_
     root, state, archive = tmp_path / "root", tmp_path / "state", tmp_path / "archive.zip"
     write_dataset(root, ["lattice"], 2)
     write_archive(archive, ["lattice"], 2, "m", 1)
-    with running_server(root, state, lease_seconds=2) as server:
+    with running_server(state, root=root, lease_seconds=2) as server:
         token = server.token("alice")
         root.rename(tmp_path / "elsewhere")
         response = server.submit(archive, token)
