@@ -1,8 +1,9 @@
-"""Servers that most of these tests share, with submissions of every kind, and the browser."""
+"""Servers that most of these tests share, with submissions of every kind, archives, and the browser."""
 
 from __future__ import annotations
 
 import secrets
+import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
@@ -13,14 +14,25 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, sync_playwright
 
-from rebar_depth_bench import SubmissionWriter, load
+from rebar_depth_bench import SubmissionWriter, load, score
+from rebar_depth_bench.remote import leaderboard_client
 from tests.leaderboard import serving
+from tests.leaderboard.scripted_server import (
+    TOKEN,
+    TOKEN_INFO,
+    ScriptedServer,
+    answer,
+    scripted_server,
+    submission,
+)
 from tests.leaderboard.serving import Postgres, RunPostgres, RunScorer, RunServer, Server, make_token
 
 HOSTILE = "<script>alert(1)</script>\"'&amp;{{ 7 * 7 }}"
 DESCRIPTION = "first line\n<b>second</b>\u202egnp\x1b[31m"
 
 WriteArchive = Callable[..., Path]
+Refused = Callable[..., str]
+"""Types of the functions that the fixtures of the same names return."""
 
 
 @dataclass(frozen=True)
@@ -159,6 +171,50 @@ def waiting(
     with running_server(state, workers=0, quota=5, max_upload=2_000_000, **common) as server:
         ids |= {name: server.submit_accepted(archive, token) for name in ("next", "later")}
         yield SharedServer(server, token, ids)
+
+
+@pytest.fixture(scope="session")
+def small_result(small_archive: Path, tiny_root: Path) -> bytes:
+    """Return the result of ``small_archive`` as JSON."""
+    return score(small_archive, tiny_root).to_json()
+
+
+@pytest.fixture
+def scripted(
+    small_archive: Path, small_result: bytes, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[ScriptedServer]:
+    """Run a server that accepts and scores ``small_archive``; tests replace its answers."""
+    monkeypatch.setattr(leaderboard_client, "POLL_INTERVAL_S", 0.01)
+    monkeypatch.setenv("REBAR_LEADERBOARD_TOKEN", TOKEN)
+    with scripted_server() as script:
+        script.answers = {
+            "token": [answer(TOKEN_INFO)],
+            "submit": [answer(submission(small_archive), 202)],
+            "status": [answer(submission(small_archive, status=status)) for status in ("queued", "scored")],
+            "result": [answer(small_result)],
+        }
+        yield script
+
+
+@pytest.fixture
+def refused(
+    scripted: ScriptedServer, small_archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> Refused:
+    """Submit to the scripted server, and check exit status and that nothing is written; return the message."""
+
+    def check(status: int = 1) -> str:
+        start = time.monotonic()
+        assert scripted.submit(small_archive, "--json", str(tmp_path / "r.json")) == status
+        assert time.monotonic() - start < 20
+        assert list(tmp_path.iterdir()) == []
+        captured = capsys.readouterr()
+        assert captured.out == ""
+        assert all(line.isprintable() and len(line) < 3000 for line in captured.err.split("\n"))
+        assert len(captured.err) < 30_000
+        assert TOKEN not in captured.err
+        return captured.err[captured.err.index("error: ") :]
+
+    return check
 
 
 @pytest.fixture(scope="module")
