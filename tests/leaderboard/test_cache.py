@@ -126,15 +126,6 @@ def test_private_rows_of_token_are_not_cached(apps: list[FastAPI], database: Dat
     assert get_response(apps[0], f"/submissions/{submission_id}")[0] == 404
 
 
-def test_cache_separates_urls_and_sort_orders(apps: list[FastAPI], database: Database, token: str) -> None:
-    for number in range(3):
-        add_scored_submission(database, token, f"m{number}", 1.0 + number)
-    addresses = ["/", BOARD, f"{BOARD}&sort=-rmse", "/?config=pile", API, CSV]
-    bodies = [get_response(apps[0], address)[2] for address in addresses]
-    assert len(set(bodies)) == len(bodies)
-    assert [get_response(apps[0], address)[2] for address in addresses] == bodies
-
-
 @dataclass
 class Renderer:
     """ASGI application whose responses state the path and how often it was called."""
@@ -181,12 +172,6 @@ def test_other_responses_are_passed_on(database: Database, cache_control: bytes,
     answers = [get_response(app, "/a") for _ in range(2)]
     assert [(found, body) for found, _, body in answers] == [(status, b"/a 1 end"), (status, b"/a 2 end")]
     assert all("etag" not in headers for _, headers, _ in answers)
-
-
-def test_request_with_token_is_passed_on(database: Database) -> None:
-    app, _ = cached(database)
-    get_response(app, "/a")
-    assert get_response(app, "/a", authorization="Bearer x")[2] == b"/a 2 end"
 
 
 def test_full_cache_is_emptied_and_stays_correct(database: Database) -> None:

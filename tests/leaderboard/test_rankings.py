@@ -14,7 +14,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from leaderboard.db import view_errors as view_errors_module
 from leaderboard.db.engine import Database
 from leaderboard.db.models import LeaderboardRowModel, ResultModel, SubmissionModel, TokenModel
 from leaderboard.db.rankings import LeaderboardEntry, Ranking, queue_position, read_ranking
@@ -237,6 +236,7 @@ def compared_range(index: int, results: Sequence[Result], config: str) -> tuple[
     return (1 + verdicts.count("better"), len(results) - verdicts.count("worse")), verdicts
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spread", [0.0, 0.01, 0.05])
 def test_ranges_agree_with_the_paired_comparison(spread: float) -> None:
     results = random_results(8, spread, seed=3)
@@ -244,19 +244,23 @@ def test_ranges_agree_with_the_paired_comparison(spread: float) -> None:
     assert ranges == [compared_range(index, results, "lattice")[0] for index in range(len(results))]
 
 
+@pytest.mark.slow
 def test_pairs_on_few_skewed_views_are_those_of_the_interval() -> None:
     """Pairs that are decided without draws are those whose interval excludes zero, also for eight blocks."""
+    ids = [f"lattice/{index:04d}" for index in range(0, 96, 12)]
     resampling = resample(range(0, 96, 12))
     for seed in range(30):
         rng = np.random.default_rng(seed)
         spread = np.where(np.arange(12) % 2, 0.1, 0.03)[:, None]
         errors = rng.exponential(0.1, 8) + 0.03 * np.arange(12)[:, None] + spread * rng.exponential(size=(12, 8))
         means = resampling.means(errors.T).T
-        better = view_errors_module._is_better(means, resampling.blocks())
         intervals = [[interval(a - b, resampling.blocks()) for b in means] for a in means]
-        assert better.tolist() == [[bounds is not None and bounds[1] < 0 for bounds in row] for row in intervals]
+        better = np.array([[bounds is not None and bounds[1] < 0 for bounds in row] for row in intervals])
+        expected = list(zip(1 + better.sum(0), len(means) - better.sum(1), strict=True))
+        assert rank_ranges([json.dumps([ids, row.tolist()]) for row in errors]) == expected
 
 
+@pytest.mark.slow
 def test_range_contains_the_rank() -> None:
     results = random_results(60, 0.002, seed=5)
     errors = [one.tables["lattice"].rank_error or 0.0 for one in results]
