@@ -26,12 +26,14 @@ from typing import Any
 from urllib.parse import urlsplit
 
 import httpx2
+import pytest
 import structlog
 
 from leaderboard.cli import main
 from leaderboard.db.engine import Database
 from leaderboard.db.tokens import create_token
 from leaderboard.settings import read_settings
+from rebar_depth_bench.cli.main import main as bench
 from tests.commands import run_in_process
 from tests.processes import children, wait_until
 
@@ -159,6 +161,15 @@ def run(*arguments: object) -> subprocess.CompletedProcess[str]:
         root.handlers[:], root.level, sys.excepthook = handlers, level, hook
         logging.captureWarnings(False)
         structlog.reset_defaults()
+
+
+def run_bench(*arguments: object, token: str | None = None) -> subprocess.CompletedProcess[str]:
+    """Run ``rebar-bench`` in this process, with ``token`` in its environment."""
+    variable = "REBAR_LEADERBOARD_TOKEN"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("COLUMNS", "200")
+        patch.delenv(variable, raising=False) if token is None else patch.setenv(variable, token)
+        return run_in_process(bench, *map(str, arguments))
 
 
 @contextmanager

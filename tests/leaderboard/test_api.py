@@ -19,11 +19,9 @@ import pytest
 
 from rebar_depth_bench import load
 from rebar_depth_bench.base.errors import Problem
-from rebar_depth_bench.cli.main import main
 from tests import requirements
-from tests.commands import run_in_process
 from tests.leaderboard.conftest import SharedServer, WriteArchive, filled_board
-from tests.leaderboard.serving import API, Postgres, RunServer, Server, distinct_archive
+from tests.leaderboard.serving import API, Postgres, RunServer, Server, distinct_archive, run_bench
 
 QUOTA = 6
 
@@ -62,7 +60,7 @@ def test_result_json_equals_command_line_output(
     postgres_board: SharedServer, tiny_root: Path, tmp_path: Path, kind: str
 ) -> None:
     stored_archive = postgres_board.server.state / "archives" / f"{postgres_board.ids[kind]}.zip"
-    run_in_process(main, "score", stored_archive, "--data", tiny_root, "--json", tmp_path / "own.json")
+    run_bench("score", stored_archive, "--data", tiny_root, "--json", tmp_path / "own.json")
     expected = (tmp_path / "own.json").read_bytes()
     assert postgres_board.server.get(f"{API}/{postgres_board.ids[kind]}/result.json").content == expected
     assert postgres_board.server.get(f"{API}/{postgres_board.ids[kind]}").json()["result"] == json.loads(expected)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import re
-import subprocess
 import time
 from io import BufferedIOBase
 from pathlib import Path
@@ -16,7 +15,6 @@ from rebar_depth_bench.base.errors import InputError, SubmissionError
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.remote import leaderboard_client
 from rebar_depth_bench.remote.leaderboard_client import AnswerError, LeaderboardClient, ServiceError
-from tests.commands import run_in_process
 from tests.leaderboard.conftest import Refused, SharedServer, WriteArchive
 from tests.leaderboard.scripted_server import (
     ID,
@@ -28,27 +26,20 @@ from tests.leaderboard.scripted_server import (
     scripted_server,
     submission,
 )
+from tests.leaderboard.serving import run_bench
 
 TOKEN_VARIABLE = "REBAR_LEADERBOARD_TOKEN"
-
-
-def run(*arguments: str | Path, token: str | None = None) -> subprocess.CompletedProcess[str]:
-    """Run ``rebar-bench``."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("COLUMNS", "200")
-        patch.delenv(TOKEN_VARIABLE, raising=False) if token is None else patch.setenv(TOKEN_VARIABLE, token)
-        return run_in_process(main, *arguments)
 
 
 def test_submit_prints_same_table_as_score(
     board: SharedServer, tiny_root: Path, write_archive: WriteArchive, tmp_path: Path
 ) -> None:
     archive = write_archive("by command", 1.3)
-    submitted = run(
+    submitted = run_bench(
         "submit", archive, "--url", f"{board.url}/", "--json", tmp_path / "sent.json", token=board.token
     )
     assert submitted.returncode == 0, submitted.stderr
-    scored = run("score", archive, "--data", tiny_root, "--json", tmp_path / "own.json")
+    scored = run_bench("score", archive, "--data", tiny_root, "--json", tmp_path / "own.json")
     assert submitted.stdout == scored.stdout
     assert "by command" in submitted.stdout
     assert (tmp_path / "sent.json").read_bytes() == (tmp_path / "own.json").read_bytes()
@@ -62,7 +53,7 @@ def test_submit_prints_same_table_as_score(
 def test_no_wait_prints_submission_id(board: SharedServer, write_archive: WriteArchive, tmp_path: Path) -> None:
     (tmp_path / "token").write_text(f"{board.token}\n")
     archive = write_archive("impatient", configs=("lattice-orbit",))
-    submitted = run("submit", archive, "--url", board.url, "--token-file", tmp_path / "token", "--no-wait")
+    submitted = run_bench("submit", archive, "--url", board.url, "--token-file", tmp_path / "token", "--no-wait")
     assert submitted.returncode == 0, submitted.stderr
     assert board.server.wait_until_ended(submitted.stdout.strip())["method"] == "impatient"
 
@@ -70,8 +61,8 @@ def test_no_wait_prints_submission_id(board: SharedServer, write_archive: WriteA
 def test_rejected_archive_has_same_message_as_check(board: SharedServer, tiny_root: Path, tmp_path: Path) -> None:
     broken = tmp_path / "broken.zip"
     broken.write_bytes(b"PK no zip")
-    submitted = run("submit", broken, "--url", board.url, token=board.token)
-    checked = run("check", broken, "--data", tiny_root)
+    submitted = run_bench("submit", broken, "--url", board.url, token=board.token)
+    checked = run_bench("check", broken, "--data", tiny_root)
     assert (submitted.returncode, checked.returncode) == (2, 2)
     reasons = [line.removeprefix("error: ") for line in checked.stderr.splitlines() if "zip" in line]
     assert reasons
@@ -89,7 +80,7 @@ def test_rejected_archive_has_same_message_as_check(board: SharedServer, tiny_ro
 def test_wrong_token_or_url_is_reported_before_upload(
     board: SharedServer, small_archive: Path, path: str, token: str | None, words: str
 ) -> None:
-    process = run("submit", small_archive, "--url", f"{board.url}{path}", token=token)
+    process = run_bench("submit", small_archive, "--url", f"{board.url}{path}", token=token)
     assert process.returncode == 2
     assert words in process.stderr
     assert "uploading" not in process.stderr
@@ -99,7 +90,7 @@ def test_wrong_token_or_url_is_reported_before_upload(
 def test_token_file_without_a_token_exits_2(tmp_path: Path, content: str) -> None:
     token = tmp_path / "token"
     token.write_text(content)
-    process = run("submit", tmp_path / "a.zip", "--url", "http://127.0.0.1:9", "--token-file", token)
+    process = run_bench("submit", tmp_path / "a.zip", "--url", "http://127.0.0.1:9", "--token-file", token)
     assert process.returncode == 2
     assert f"{token}: " in process.stderr
 
@@ -109,7 +100,7 @@ def test_token_file_without_a_token_exits_2(tmp_path: Path, content: str) -> Non
     [("http://127.0.0.1:9", 1), ("localhost:80", 2), ("no address", 2), ("ftp://127.0.0.1/", 2), ("http://[", 1)],
 )
 def test_unreachable_service_or_invalid_url_is_reported(small_archive: Path, url: str, status: int) -> None:
-    process = run("submit", small_archive, "--url", url, token="rdb_x")
+    process = run_bench("submit", small_archive, "--url", url, token="rdb_x")
     assert process.returncode == status
     assert process.stderr.splitlines()[-1].startswith("error: ")
 

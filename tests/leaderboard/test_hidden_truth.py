@@ -5,19 +5,15 @@ from __future__ import annotations
 import csv
 import io
 import json
-import os
 import random
 import re
 import sqlite3
-import subprocess
-import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import httpx2
 import numpy as np
 import pytest
 from fastapi import FastAPI
@@ -32,7 +28,7 @@ from leaderboard.web.app import make_app
 from rebar_depth_bench import SubmissionWriter, load
 from rebar_depth_bench.scoring.protocol import scored_pixels
 from tests.leaderboard.boards import add_scored_submission, board_settings, digest_of_board, get_response
-from tests.leaderboard.serving import API, RunServer, Server
+from tests.leaderboard.serving import API, RunServer, Server, run_bench
 from tests.synthetic_dataset import write_dataset
 
 CONFIG, VIEWS = "lattice", 9
@@ -56,13 +52,9 @@ class Probes:
     results: Mapping[str, dict[str, Any]]
     printed: str
 
-    def get(self, path: str) -> httpx2.Response:
-        """Return the response to a request without a token."""
-        return self.server.get(path)
-
     def submission(self, name: str) -> dict[str, Any]:
         """Return the JSON of a submission."""
-        return dict(self.get(f"{API}/{self.ids[name]}").json())
+        return dict(self.server.get(f"{API}/{self.ids[name]}").json())
 
     def table(self, name: str) -> dict[str, Any]:
         """Return what is returned of the table of a submission."""
@@ -87,13 +79,7 @@ def write_constant(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) ->
 
 
 @pytest.fixture(scope="module")
-def probes(
-    tiny_root: Path,
-    tmp_path_factory: pytest.TempPathFactory,
-    running_server: RunServer,
-    write_constant: Callable[..., Path],
-) -> Iterator[Probes]:
-    state = tmp_path_factory.mktemp("hidden") / "state"
+def probes(tiny_root: Path, running_server: RunServer, write_constant: Callable[..., Path]) -> Iterator[Probes]:
     rows = load(tiny_root, CONFIG, columns=["view_id", "left_depth", "left_mask"])
     probed = next(row for row in rows if row["view_id"] == PROBED)
     pixel = int(scored_pixels(probed["left_mask"], probed["left_depth"])[0])
@@ -109,10 +95,9 @@ def probes(
     def omitted(view_id: str, depth_m: np.ndarray) -> np.ndarray:
         return np.zeros_like(depth_m) if view_id == OMITTED else depth_m
 
-    common: dict[str, Any] = {"quota": 6}
     ids: dict[str, str] = {}
     results: dict[str, dict[str, Any]] = {}
-    with running_server(state, error_maps=1, **common) as server:
+    with running_server(error_maps=1, quota=6) as server:
         token = server.token("attacker")
 
         def score_now(name: str, archive: Path) -> None:
@@ -123,19 +108,11 @@ def probes(
         scales = {view["view_id"]: view["scale"] for view in results["constant"]["views"]}
         score_now("corrected", write_constant(scales))
         score_now("omitted before", write_constant(1.0, omitted))
-    with running_server(state, hidden_truth=True, **common) as server:
+    with running_server(server.state, hidden_truth=True, quota=6) as server:
         for name, change in (("pixel", one_pixel), ("omitted", omitted)):
             ids[name] = server.submit_accepted(write_constant(1.0, change), token)
             server.wait_until_ended(ids[name])
-        command = [sys.executable, "-m", "rebar_depth_bench", "submit", str(write_constant(1.0, one_view))]
-        submitted = subprocess.run(
-            [*command, "--url", server.url],
-            env={**os.environ, "REBAR_LEADERBOARD_TOKEN": token},
-            capture_output=True,
-            text=True,
-            timeout=120,
-            check=True,
-        )
+        submitted = run_bench("submit", write_constant(1.0, one_view), "--url", server.url, token=token)
         ids["view"] = re.findall(r"/submissions/(\w+)", submitted.stderr)[0]
         yield Probes(server, token, ids, results, submitted.stdout)
 
@@ -154,16 +131,16 @@ def test_result_has_rank_error_and_coverage_alone(probes: Probes) -> None:
         CONFIG: {"ranked": True, **{key: round(table[key], 3) for key in ("coverage", "rank_error")}}
     }
     expected["hidden_truth"] = True
-    assert probes.get(f"{API}/{probes.ids['constant']}/result.json").json() == expected
+    assert probes.server.get(f"{API}/{probes.ids['constant']}/result.json").json() == expected
     assert probes.submission("constant")["result"] == expected
-    row = next(row for row in probes.get(ROWS).json()["rows"] if row["id"] == probes.ids["constant"])
+    row = next(row for row in probes.server.get(ROWS).json()["rows"] if row["id"] == probes.ids["constant"])
     assert row["table"] == expected["tables"][CONFIG]
     assert (row["inputs"], row["uses_ground_truth"]) == ("rgb", False)
 
 
 def get_paths(probes: Probes) -> Iterator[str]:
     """Yield every path that can be read: those of the OpenAPI document, with all ids, and the pages."""
-    document = probes.get("/openapi.json").json()
+    document = probes.server.get("/openapi.json").json()
     for path, operations in document["paths"].items():
         if "{submission_id}" in path and "get" in operations:
             yield from (path.replace("{submission_id}", submission_id) for submission_id in probes.ids.values())
@@ -255,22 +232,22 @@ def test_responses_contain_no_stored_number(probes: Probes, texts: Mapping[str, 
 
 def test_page_and_csv_show_disclosed_numbers(probes: Probes) -> None:
     table = probes.table("constant")
-    page = probes.get(f"/submissions/{probes.ids['constant']}").text
+    page = probes.server.get(f"/submissions/{probes.ids['constant']}").text
     for value in (table["rank_error"], table["coverage"]):
         assert f'data-value="{value}"' in page
-    assert f"{table['rank_error']:.3f}<" in probes.get(f"/?config={CONFIG}").text
-    rows = list(csv.DictReader(io.StringIO(probes.get(CSV).text)))
+    assert f"{table['rank_error']:.3f}<" in probes.server.get(f"/?config={CONFIG}").text
+    rows = list(csv.DictReader(io.StringIO(probes.server.get(CSV).text)))
     assert list(rows[0])[-4:] == ["config", "coverage", "ranked", "rank_error"]
     assert {row["id"]: float(row["rank_error"]) for row in rows}[probes.ids["constant"]] == table["rank_error"]
 
 
 def test_one_pixel_changes_nothing(probes: Probes) -> None:
     assert probes.table("pixel") == probes.table("constant")
-    rows = {row["id"]: row for row in probes.get(ROWS).json()["rows"]}
+    rows = {row["id"]: row for row in probes.server.get(ROWS).json()["rows"]}
     own, constant = (rows[probes.ids[name]] for name in ("pixel", "constant"))
     changed = {key for key in own if own[key] != constant[key]}
     assert changed == {"id", "created_at"}, "equal errors share a rank"
-    pages = [probes.get(f"/submissions/{probes.ids[name]}").text for name in ("pixel", "constant")]
+    pages = [probes.server.get(f"/submissions/{probes.ids[name]}").text for name in ("pixel", "constant")]
     assert len({re.search(r"<h2 id=.results.*?</section>", page, re.DOTALL)[0] for page in pages}) == 1  # type: ignore[index]
 
 
@@ -286,7 +263,7 @@ def test_view_of_low_coverage_fails_without_details(probes: Probes) -> None:
     assert "predictions for at least 50 % of the scored pixels of each view" in submission["reason"]
     assert CONFIG not in submission["reason"]
     assert re.findall(r"\d+", submission["reason"]) == ["1", "50"]
-    assert probes.ids["omitted"] not in probes.get(ROWS).text
+    assert probes.ids["omitted"] not in probes.server.get(ROWS).text
     token = probes.server.get("/api/v1/token", probes.token).json()
     assert token["quota_left"] == 0, "a failed submission counts"
 
@@ -297,8 +274,8 @@ def test_scores_from_before_are_kept(probes: Probes) -> None:
 
 
 def test_ranks_of_pages_are_those_of_the_board(probes: Probes) -> None:
-    for row in probes.get(ROWS).json()["rows"]:
-        assert f"{CONFIG} rank {row['rank']}." in probes.get(f"/submissions/{row['id']}").text
+    for row in probes.server.get(ROWS).json()["rows"]:
+        assert f"{CONFIG} rank {row['rank']}." in probes.server.get(f"/submissions/{row['id']}").text
 
 
 def test_command_prints_disclosed_numbers(probes: Probes) -> None:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import contextlib
-import io
 import json
+import pickle
+import stat
 import struct
 import sys
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -21,28 +22,130 @@ import pytest
 from leaderboard.settings import read_settings
 from rebar_depth_bench import load
 from rebar_depth_bench.base.errors import MAX_PROBLEMS_SHOWN, Problem
+from tests.bench.submission.zips import Array, Record, build, deflated, npy, npy_header
 from tests.ground_truth import truth_of
-from tests.leaderboard.hostile_zips import (
-    KINDS,
-    ValidArchive,
-    malformed_archives,
-    pickle_payload_npy,
-    unusual_valid_archives,
-)
 from tests.leaderboard.serving import API, ENDED, RunServer, Server, bearer
 from tests.processes import children, descendants, memory_bytes, num_open_files
 from tests.requirements import Repetitions
 
 CLIENTS = 4
-NUM_WARM_UP = 20
+NUM_WARM_UP = 16
 """Number of archives after which one-time allocations of the server are done."""
 MAX_GROWTH_BYTES = 24 << 20
-"""Bound on memory growth: a fifth of the bodies of the 1,000 archives."""
+"""Bound on memory growth over all archives."""
 MAX_MEMORY_BYTES = 300_000_000
-SEED = 20261122
 REPOSITORY = Path(__file__).parents[2]
 
 Listing = Mapping[str, tuple[int, int]]
+
+
+META = b'{"method": "hostile"}'
+
+
+@dataclass(frozen=True)
+class ValidArchive:
+    """Valid archive to be damaged: true depth in metres by view id, and a folder that must stay empty."""
+
+    depths: Mapping[str, Array]
+    forbidden: Path
+
+    @property
+    def names(self) -> list[str]:
+        return sorted(self.depths)
+
+    def records(self, meta: bytes = META) -> list[Record]:
+        """Return the entries of the archive: the metadata and the views."""
+        views = [Record(f"{name}.npy".encode(), npy(self.depths[name])) for name in self.names]
+        return [Record(b"submission.json", meta), *views]
+
+    @property
+    def depth_m(self) -> Array:
+        return self.depths[self.names[0]]
+
+
+class Payload:
+    """Pickle payload that creates a file when it is loaded."""
+
+    def __init__(self, marker: Path) -> None:
+        self._marker = marker
+
+    def __reduce__(self) -> tuple[Callable[..., object], tuple[object, ...]]:
+        return Path.touch, (self._marker,)
+
+
+def hostile_archives(valid: ValidArchive) -> dict[str, bytes]:
+    """Return malformed and malicious archives by what they are: the server must reject each.
+
+    The readers of archives have tests and fuzz cases of their own.
+    """
+    sound, depth_m, marker = build(valid.records()), valid.depth_m, valid.forbidden / "unpickled"
+    first, second = (f"{name}.npy".encode() for name in valid.names)
+    header = "{{'descr': '{}', 'fortran_order': False, 'shape': {}, }}"
+    bomb = deflated(second, bytes(50_000_000), level=1)
+    pickled = pickle.dumps(Payload(marker))
+    entries = {
+        "bomb": bomb,
+        "bomb of a true size": replace(bomb, size=len(npy(depth_m))),
+        "encrypted": Record(second, npy(depth_m), flags=1),
+        "forged size": Record(second, npy(depth_m), size=0x7FFFFFFF),
+        "forged offset": Record(second, npy(depth_m), offset=0xFFFFFFFE),
+        "forged checksum": Record(second, npy(depth_m), crc=1),
+        "nested": Record(second.replace(b"npy", b"npz"), sound),
+        "pickle": Record(second, pickled),
+        "pickle in npy": Record(second, npy(np.array([Payload(marker)], dtype=object), allow_pickle=True)),
+        "pickle under a header": Record(second, npy_header(header.format("|O", depth_m.shape)) + pickled),
+        "huge shape": Record(second, npy_header(header.format("<f4", (400_000, 400_000)))),
+        "code as a shape": Record(second, npy_header(header.format("<f4", "__import__('os').abort()"))),
+        "deep header": Record(second, npy_header("(" * 3000)),
+        "integers": Record(second, npy(depth_m.astype("i4"))),
+        "other shape": Record(second, npy(depth_m.T)),
+        **{
+            f"named {name[:20]!r}": Record(name.encode(), npy(depth_m))
+            for name in (
+                *(f"{valid.forbidden}/absolute.npy", "../" * 20 + f"{valid.forbidden}/climbed.npy", "..\\up.npy"),
+                *("a\0b.npy", "\x1b[31m.npy", "\u202egnp.npy", "x" * 60_000, "", "<script>alert(1)</script>"),
+            )
+        },
+        **{
+            f"a {kind:#o}": Record(second, str(valid.forbidden).encode(), mode=kind | 0o777)
+            for kind in (stat.S_IFLNK, stat.S_IFDIR, stat.S_IFCHR, stat.S_IFIFO)
+        },
+    }
+    metadata = {
+        "deep metadata": b"[" * 100_000,
+        "no metadata": b"",
+        "metadata of a surrogate": b'{"method": "\\ud800"}',
+        "metadata of a long number": b'{"method": "m", "x": ' + b"9" * 5000 + b"}",
+        "metadata of a script": b'{"method": "m", "url": "javascript:alert(1)"}',
+        "metadata of 5 MB": json.dumps({"method": "m", "description": "x" * 5_000_000}).encode(),
+    }
+    return {
+        "empty": b"",
+        "no zip": b"<html>" * 100,
+        "cut off": sound[:-30],
+        "cut out": sound[:5000] + sound[6000:],
+        "other bytes": sound[:-200] + bytes(100) + sound[-100:],
+        "twice": build([*valid.records(), Record(first, npy(depth_m))]),
+        "many": build([Record(b"%05d" % number) for number in range(1500)]),
+        "many declared": build(valid.records(), count=65_535),
+        **{name: build([*valid.records()[:2], entry]) for name, entry in entries.items()},
+        **{name: build(valid.records(meta)) for name, meta in metadata.items()},
+    }
+
+
+def unusual_valid_archives(valid: ValidArchive) -> Sequence[bytes]:
+    """Return unusual but valid archives: each must be accepted and scored."""
+    unusual_m = np.full(valid.depth_m.shape, np.nan)
+    unusual_m.flat[:4] = [np.inf, -1.0, 1e308, 5e-324]
+    first, *views = valid.records()
+    return [
+        *(
+            build([first, *(replace(one, data=npy(depths_m)) for one in views)])
+            for depths_m in (unusual_m, np.asfortranarray(valid.depth_m), valid.depth_m.astype(">f8"))
+        ),
+        build(valid.records(json.dumps({"method": "x", "description": "x" * 1_000_000}).encode())),
+        build(valid.records(), comment=b"PK\5\6" * 100),
+    ]
 
 
 @dataclass(frozen=True)
@@ -78,7 +181,7 @@ def attack(
         (folder / name).mkdir()
     rows = load(tiny_root, "lattice-orbit", columns=["view_id", "left_depth"])
     valid = ValidArchive({row["view_id"]: row["left_depth"] for row in rows}, folder / "forbidden")
-    archives = malformed_archives(np.random.default_rng(SEED), valid, repetitions(60, 1000))
+    archives = [*hostile_archives(valid).items()] * repetitions(1, 20)
     environment = {"HOME": str(folder / "home"), "TMPDIR": str(folder / "tmp"), "PYTHONPATH": str(REPOSITORY)}
     with contextlib.ExitStack() as stack:
         with contextlib.chdir(folder / "cwd"):
@@ -131,13 +234,14 @@ def _size_and_mtime_ns(path: Path) -> tuple[int, int]:
     return (path.stat().st_size, path.stat().st_mtime_ns) if path.is_file() else (0, 0)
 
 
-def test_no_archive_causes_server_error(attack: AttackResult, repetitions: Repetitions) -> None:
-    assert len(attack.answers) == repetitions(60, 1000)
-    assert {response.status_code for _, response in attack.answers} <= {202, 422}
-    assert {kind for kind, response in attack.answers if response.status_code == 422} == set(KINDS)
+def test_hostile_archives_are_rejected_without_server_error(attack: AttackResult) -> None:
+    assert {(kind, response.status_code) for kind, response in attack.answers} == {
+        (kind, 422) for kind, _ in attack.answers
+    }
     lines = [json.loads(line) for line in attack.server.log if line.startswith("{")]
     assert {line["level"] for line in lines} == {"info"}
     assert not any("Traceback" in line for line in attack.server.log)
+    assert attack.server.get("/healthz").json()["status"] == "ok"
 
 
 def test_rejections_list_readable_problems_without_secrets(attack: AttackResult, tiny_root: Path) -> None:
@@ -175,12 +279,6 @@ def reject_constant(constant: str) -> NoReturn:
     raise AssertionError(f"the result holds {constant}, which is no JSON")
 
 
-def test_server_still_responds(attack: AttackResult) -> None:
-    assert attack.server.get("/healthz").json()["status"] == "ok"
-    for path in ("/", "/api/v1/leaderboard?config=lattice-orbit", "/api/v1/leaderboard.csv?config=lattice-orbit"):
-        assert attack.server.get(path).status_code == 200
-
-
 def test_only_accepted_archives_are_stored(attack: AttackResult) -> None:
     state = attack.server.state
     assert {path.stem for path in (state / "archives").iterdir()} == set(attack.ended)
@@ -194,7 +292,7 @@ def test_no_file_is_written_elsewhere_and_no_pickle_runs(attack: AttackResult, t
     assert after == before
     assert not list(attack.forbidden.iterdir())
     marker = tmp_path / "ran"  # The payload works when unpickled.
-    np.load(io.BytesIO(pickle_payload_npy(marker)), allow_pickle=True)
+    pickle.loads(pickle.dumps(Payload(marker)))
     assert marker.exists()
 
 
