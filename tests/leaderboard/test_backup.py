@@ -120,6 +120,7 @@ def _accept_and_die(settings: Settings, token: str) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
 
 
+@pytest.mark.slow
 def test_upload_to_a_served_backup_is_not_replaced(board: tuple[Settings, str], tmp_path: Path) -> None:
     settings, token = board
     target = tmp_path / "backup"
@@ -202,6 +203,7 @@ def test_backup_has_the_modes_of_a_state_folder(board: tuple[Settings, str], tmp
     }
 
 
+@pytest.mark.slow
 def test_damaged_archive_replaces_nothing_and_missing_one_is_named(
     board: tuple[Settings, str], tmp_path: Path
 ) -> None:

@@ -71,6 +71,7 @@ def test_version_counts_changes_of_shown_content_alone(database: Database, token
     assert changes(lambda: submissions.remove(database, one))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("address", ["/", BOARD, API, CSV])
 def test_change_by_one_process_is_visible_in_other(
     apps: list[FastAPI], database: Database, token: str, address: str
@@ -86,6 +87,7 @@ def test_change_by_one_process_is_visible_in_other(
     assert all(b"first method" not in get_response(app, address)[2] for app in apps)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("address", ["/", BOARD, API, CSV, "/submissions/{}"])
 def test_etag_returns_304_until_leaderboard_changes(
     apps: list[FastAPI], database: Database, token: str, address: str

@@ -140,7 +140,7 @@ def test_redirect_is_not_followed(
 
 def test_too_large_archive_is_not_sent(scripted: ScriptedServer, small_archive: Path, refused: Refused) -> None:
     scripted.answers["token"] = [answer({**TOKEN_INFO, "max_upload_bytes": 2000})]
-    assert f"the archive has {small_archive.stat().st_size} bytes, expected at most 2000" in refused(2)
+    assert f"has {small_archive.stat().st_size} bytes, expected at most 2000" in refused(2)
     assert scripted.endpoints() == ["token"]
 
 

@@ -175,6 +175,7 @@ def status_and_reason(database: Database, submission_id: str) -> tuple[str, str 
     return record.status, record.reason
 
 
+@pytest.mark.slow
 def test_each_job_is_claimed_by_one_scorer(database: Database, alice: str) -> None:
     ids = queue(database, alice, 40)
 

@@ -310,6 +310,7 @@ def apps(state: Path) -> Iterator[list[FastAPI]]:
         yield [make_app(stack.enter_context(open_service(one))) for one in settings]
 
 
+@pytest.mark.slow
 def test_order_and_ranks_use_rounded_errors(boards: list[Database]) -> None:
     database, hidden = boards
     token = create_token(database, "alice")
@@ -332,6 +333,7 @@ def test_order_and_ranks_use_rounded_errors(boards: list[Database]) -> None:
     )
 
 
+@pytest.mark.slow
 def test_option_changes_responses_of_the_same_database_and_their_etags(
     apps: list[FastAPI], boards: list[Database]
 ) -> None:
@@ -365,6 +367,7 @@ def test_stored_pictures_are_not_returned(apps: list[FastAPI], boards: list[Data
     assert [get_response(app, path)[0] for app in apps] == [200, 404, 200]
 
 
+@pytest.mark.slow
 def test_results_of_other_protocols_are_shown_without_error(apps: list[FastAPI], boards: list[Database]) -> None:
     app, database = apps[1], boards[0]
     token = create_token(database, "alice")

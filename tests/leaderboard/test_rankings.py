@@ -270,6 +270,7 @@ def test_range_contains_the_rank() -> None:
         assert rank_range[0] <= 1 + sum(other < error for other in errors) <= rank_range[1]
 
 
+@pytest.mark.slow
 def test_scenes_are_resampled_in_a_config_with_splits() -> None:
     """Views of a scene share their error: two submissions that differ in few scenes are not told apart."""
     rng = np.random.default_rng(4)
