@@ -176,6 +176,12 @@ def test_other_responses_are_passed_on(database: Database, cache_control: bytes,
     assert all("etag" not in headers for _, headers, _ in answers)
 
 
+def test_request_with_token_is_passed_on(database: Database) -> None:
+    app, _ = cached(database)
+    get_response(app, "/a")
+    assert get_response(app, "/a", authorization="Bearer x")[2] == b"/a 2 end"
+
+
 def test_full_cache_is_emptied_and_stays_correct(database: Database) -> None:
     app, renderer = cached(database, size=20, max_bytes=250)
     for name in "aabcab":
