@@ -222,6 +222,7 @@ def test_token_is_printed_once_and_stored_as_hash(tmp_path: Path) -> None:
     assert first.returncode == 0
     assert re.fullmatch(r"rdb_[\w-]{43}\n", first.stdout), "the token alone goes to standard output"
     assert token not in first.stderr
+    assert state.stat().st_mode & 0o077 == 0
     second = run("token", "alice", "--state-dir", state)
     assert (second.returncode, second.stdout) == (2, "")
     assert second.stderr.startswith("error: a token for 'alice' already exists")

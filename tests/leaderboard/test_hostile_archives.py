@@ -24,7 +24,7 @@ from rebar_depth_bench import load
 from rebar_depth_bench.base.errors import MAX_PROBLEMS_SHOWN, Problem
 from tests.bench.submission.zips import Array, Record, build, deflated, npy, npy_header
 from tests.ground_truth import truth_of
-from tests.leaderboard.serving import API, ENDED, RunServer, Server, bearer
+from tests.leaderboard.serving import API, END, ENDED, MULTIPART, RunServer, Server, bearer, multipart_part
 from tests.processes import children, descendants, memory_bytes, num_open_files
 from tests.requirements import Repetitions
 
@@ -353,15 +353,16 @@ def test_large_upload_is_scored_with_bounded_memory(
     archive = small_archive.read_bytes()
     first, second = split_with_gap(archive, gap_bytes)
 
+    before, after = (multipart_part(b"|") + END).split(b"|")
+
     def body() -> Iterator[bytes]:
-        yield first
+        yield before + first
         yield from (chunk for _ in range(gap_bytes // len(chunk)))
-        yield bytes(gap_bytes % len(chunk)) + second
+        yield bytes(gap_bytes % len(chunk)) + second + after
 
     with running_server() as server, MemoryWatch(server.process.pid) as watch:
         token, archives = server.token("patient"), server.state / "archives"
-        headers = {"Content-Type": "application/zip"}
-        response = server.call("PUT", API, token, content=body(), headers=headers)
+        response = server.call("POST", API, token, content=body(), headers={"Content-Type": MULTIPART})
         assert response.status_code == 202, response.text
         submission = response.json()["id"]
         assert (archives / f"{submission}.zip").stat().st_size == len(archive) + gap_bytes

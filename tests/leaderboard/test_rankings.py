@@ -226,7 +226,7 @@ def random_results(count: int, spread: float, seed: int) -> list[Result]:
 
 def compared_range(index: int, results: Sequence[Result], config: str) -> tuple[tuple[int, int], list[str]]:
     """Return the ranks of a result that the verdicts of ``compare`` with the others allow, and these verdicts."""
-    verdicts = [
+    verdicts: list[str] = [
         next(
             row for row in compare(results[index], one).configs[config] if row.column.path == "rank_error"
         ).verdict
