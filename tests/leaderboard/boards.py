@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import json
 import multiprocessing
@@ -14,7 +15,9 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
+import httpx2
 from sqlalchemy import Engine, event, select
+from starlette.types import ASGIApp
 
 from leaderboard.db import jobs, submissions
 from leaderboard.db.engine import Database
@@ -24,9 +27,12 @@ from leaderboard.db.tokens import create_token, find_token
 from leaderboard.scoring.sandbox import Outcome
 from leaderboard.settings import Settings, read_settings
 from leaderboard.storage.archive_store import ArchiveStore
+from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.submission import SubmissionMeta
 from tests.bench.reporting.results import result, scored_view
+from tests.synthetic_dataset import scale_errors
 
+NO_LIMIT = Quota(10_000, 1 << 40)
 DIGEST, OTHER_DIGEST = "sha256:" + "0" * 64, "sha256:" + "1" * 64
 _PROCESSES = multiprocessing.get_context("forkserver")
 _OPERATIONS = ("os.rename", "os.remove", "os.chmod", "shutil.copyfile", "sqlite3.connect")
@@ -52,6 +58,68 @@ def make_board(settings: Settings) -> str:
         return create_token(database, "alice")
 
 
+def accept(
+    database: Database,
+    token: str,
+    *,
+    method: str = "m",
+    digest: str = DIGEST,
+    sha256: str = "",
+    size: int = 5,
+    quota: Quota = NO_LIMIT,
+    public: bool = True,
+) -> str:
+    """Insert a queued submission, as a server does; return its id, or that of the same archive."""
+    record = find_token(database, token)
+    assert record is not None
+    submission_id = submissions.new_id()
+    upload = Upload(SubmissionMeta(method=method), sha256 or submission_id * 2, size, digest)
+    return submissions.accept(database, submission_id, record, upload, quota, public).id
+
+
+def add_scored_submission(
+    database: Database, token: str, method: str, error: float, *, public: bool = True
+) -> str:
+    """Insert a submission of ``lattice`` and ``pile`` that is scored; its errors are scaled by ``error``."""
+    submission_id = accept(database, token, method=method, digest=digest_of_board(database), public=public)
+    finish_scoring(database, submission_id, method, error)
+    return submission_id
+
+
+def digest_of_board(database: Database) -> str:
+    """Return the digest of the dataset that is beside the state folder, if there is one."""
+    assert database.file is not None
+    root = database.file.parents[1] / "dataset"
+    return open_folder(root).digest if root.is_dir() else DIGEST
+
+
+def finish_scoring(database: Database, submission_id: str, method: str, error: float) -> None:
+    """Score the queued submission, as a worker does."""
+    assert jobs.claim(database, "scorer", 60) == submission_id
+    views = (scored_view("lattice/0000"), scored_view("pile/0000"))
+    content = json.dumps(scale_errors(result(*views, method=method).to_dict(), error)).encode()
+    assert jobs.finish(database, submission_id, "scorer", Outcome(content))
+
+
+def get_response(app: ASGIApp, address: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
+    """Call an ASGI application directly; return status, headers and body."""
+    return asyncio.run(call(app, address, **headers))
+
+
+async def call(app: ASGIApp, address: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
+    """Call an ASGI application in a running event loop, as ``get_response`` does."""
+    transport = httpx2.ASGITransport(app=app)
+    fields = {"accept-encoding": "", **{name.replace("_", "-"): value for name, value in headers.items()}}
+    async with httpx2.AsyncClient(transport=transport, base_url="http://localhost", headers=fields) as client:
+        request = client.build_request("GET", address)
+        response = await client.send(request, stream=True)
+        return (
+            response.status_code,
+            dict(response.headers),
+            b"".join([part async for part in response.aiter_raw()]),
+        )
+
+
 def add_submission(settings: Settings, token: str, content: bytes, *, scored: bool = True) -> str:
     """Add a submission whose archive is ``content``, as a server and a worker do; return its id."""
     with opened(settings) as (database, archives):
@@ -63,7 +131,7 @@ def add_submission(settings: Settings, token: str, content: bytes, *, scored: bo
         file.write_bytes(content)
         archives.put(submission_id, file)
         upload = Upload(SubmissionMeta(method="m"), hashlib.sha256(content).hexdigest(), len(content), DIGEST)
-        submissions.accept(database, submission_id, record, upload, Quota(10_000, 1 << 40), True)
+        submissions.accept(database, submission_id, record, upload, NO_LIMIT, True)
         if scored:
             score_all(database)
     return submission_id

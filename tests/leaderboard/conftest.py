@@ -1,10 +1,11 @@
-"""Servers that most of these tests share, with submissions of every kind, and the browser."""
+"""Servers that most of these tests share, with submissions of every kind, archives, and the browser."""
 
 from __future__ import annotations
 
 import secrets
+import time
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,16 +14,25 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, sync_playwright
 
-from rebar_depth_bench import SubmissionWriter, load
-from tests.leaderboard import postgres as postgres_server
+from rebar_depth_bench import SubmissionWriter, load, score
+from rebar_depth_bench.remote import leaderboard_client
 from tests.leaderboard import serving
-from tests.leaderboard.postgres import Postgres, RunPostgres
-from tests.leaderboard.serving import RunScorer, RunServer, Server, distinct_archive, make_token
+from tests.leaderboard.scripted_server import (
+    TOKEN,
+    TOKEN_INFO,
+    ScriptedServer,
+    answer,
+    scripted_server,
+    submission,
+)
+from tests.leaderboard.serving import Postgres, RunPostgres, RunScorer, RunServer, Server, make_token
 
 HOSTILE = "<script>alert(1)</script>\"'&amp;{{ 7 * 7 }}"
 DESCRIPTION = "first line\n<b>second</b>\u202egnp\x1b[31m"
 
 WriteArchive = Callable[..., Path]
+Refused = Callable[..., str]
+"""Types of the functions that the fixtures of the same names return."""
 
 
 @dataclass(frozen=True)
@@ -76,21 +86,32 @@ def small_archive(write_archive: WriteArchive) -> Path:
 
 
 @pytest.fixture(scope="session")
-def running_server() -> RunServer:
-    """Run ``rebar-leaderboard serve`` until a block ends."""
-    return serving.running_server
+def running_server(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> RunServer:
+    """Run ``rebar-leaderboard serve`` until a block ends: of the tiny dataset and in a new folder unless given.
+
+    Its rate limits are never reached unless they are given.
+    """
+    often = "1000000/minute"
+
+    def run(
+        state: Path | None = None, *, root: Path = tiny_root, **options: Any
+    ) -> AbstractContextManager[Server]:
+        options = {"read_rate_limit": often, "write_rate_limit": often, **options}
+        return serving.running_server(root, state or tmp_path_factory.mktemp("board") / "state", **options)
+
+    return run
 
 
 @pytest.fixture(scope="session")
-def running_scorer() -> RunScorer:
-    """Run ``rebar-leaderboard score`` until a block ends."""
-    return serving.running_scorer
+def running_scorer(tiny_root: Path) -> RunScorer:
+    """Run ``rebar-leaderboard score`` until a block ends: of the tiny dataset unless another is given."""
+    return lambda state, root=tiny_root: serving.running_scorer(root, state)
 
 
 @pytest.fixture(scope="session")
 def running_postgres() -> RunPostgres:
     """Run a PostgreSQL server of its own until a block ends."""
-    return postgres_server.running_postgres
+    return serving.running_postgres
 
 
 @pytest.fixture(scope="session")
@@ -110,9 +131,7 @@ def new_database(request: pytest.FixtureRequest) -> Callable[[], str]:
 
 
 @contextmanager
-def filled_board(
-    running_server: RunServer, root: Path, state: Path, write_archive: WriteArchive, db: str
-) -> Iterator[SharedServer]:
+def filled_board(running_server: RunServer, write_archive: WriteArchive, db: str = "") -> Iterator[SharedServer]:
     """Run a server that scores, with five scored submissions and error maps of two views."""
     archives = {
         "good": write_archive("good", 1.01, url="https://example.org/good", description="plain words"),
@@ -121,7 +140,7 @@ def filled_board(
         "holes": write_archive("holes", 1.0, 0.3, inputs="stereo", uses_ground_truth=True),
         "hostile": write_archive(HOSTILE, 1.4, description=DESCRIPTION, url="https://example.org/?a=1&b=<i>"),
     }
-    with running_server(root, state, db=db, error_maps=2, quota=100, read_rate_limit="60000/minute") as server:
+    with running_server(db=db, error_maps=2, quota=100) as server:
         token = server.token("Müller & <Söhne>")
         ids = {name: server.submit_accepted(path, token) for name, path in archives.items()}
         for submission_id in ids.values():
@@ -130,43 +149,72 @@ def filled_board(
 
 
 @pytest.fixture(scope="session")
-def board(
-    tiny_root: Path,
-    write_archive: WriteArchive,
-    tmp_path_factory: pytest.TempPathFactory,
-    running_server: RunServer,
-) -> Iterator[SharedServer]:
+def board(write_archive: WriteArchive, running_server: RunServer) -> Iterator[SharedServer]:
     """Run the server with five submissions on SQLite."""
-    state = tmp_path_factory.mktemp("board") / "state"
-    with filled_board(running_server, tiny_root, state, write_archive, "") as shared:
+    with filled_board(running_server, write_archive) as shared:
         yield shared
 
 
 @pytest.fixture(scope="session")
 def waiting(
-    tiny_root: Path,
-    write_archive: WriteArchive,
-    tmp_path_factory: pytest.TempPathFactory,
-    running_server: RunServer,
+    write_archive: WriteArchive, tmp_path_factory: pytest.TempPathFactory, running_server: RunServer
 ) -> Iterator[SharedServer]:
     """A server that scores nothing, where owners publish: a failed, a scored and two queued submissions."""
     state = tmp_path_factory.mktemp("waiting") / "state"
-    token = make_token(state, "bob")
+    token, archive = make_token(state, "bob"), write_archive("slow")
     common: dict[str, Any] = {"default_visibility": "owner", "error_maps": 1}
-    archive = write_archive("slow")
-    with running_server(tiny_root, state, score_time=0.01, **common) as server:
-        failed = server.submit_accepted(archive, token)
-        assert server.wait_until_ended(failed)["status"] == "failed"
-    with running_server(tiny_root, state, **common) as server:
-        scored = server.submit_accepted(archive, token)
-        assert server.wait_until_ended(scored)["status"] == "scored"
-    with running_server(tiny_root, state, workers=0, quota=5, max_upload=2_000_000, **common) as server:
-        ids = {"failed": failed, "scored": scored}
-        ids |= {
-            name: server.submit_accepted(distinct_archive(archive, number), token)
-            for number, name in enumerate(("next", "later"))
-        }
+    ids = {}
+    for name, limits in (("failed", {"score_time": 0.01}), ("scored", {})):
+        with running_server(state, **limits, **common) as server:
+            ids[name] = server.submit_accepted(archive, token)
+            assert server.wait_until_ended(ids[name])["status"] == name
+    with running_server(state, workers=0, quota=5, max_upload=2_000_000, **common) as server:
+        ids |= {name: server.submit_accepted(archive, token) for name in ("next", "later")}
         yield SharedServer(server, token, ids)
+
+
+@pytest.fixture(scope="session")
+def small_result(small_archive: Path, tiny_root: Path) -> bytes:
+    """Return the result of ``small_archive`` as JSON."""
+    return score(small_archive, tiny_root).to_json()
+
+
+@pytest.fixture
+def scripted(
+    small_archive: Path, small_result: bytes, monkeypatch: pytest.MonkeyPatch
+) -> Iterator[ScriptedServer]:
+    """Run a server that accepts and scores ``small_archive``; tests replace its answers."""
+    monkeypatch.setattr(leaderboard_client, "POLL_INTERVAL_S", 0.01)
+    monkeypatch.setenv("REBAR_LEADERBOARD_TOKEN", TOKEN)
+    with scripted_server() as script:
+        script.answers = {
+            "token": [answer(TOKEN_INFO)],
+            "submit": [answer(submission(small_archive), 202)],
+            "status": [answer(submission(small_archive, status=status)) for status in ("queued", "scored")],
+            "result": [answer(small_result)],
+        }
+        yield script
+
+
+@pytest.fixture
+def refused(
+    scripted: ScriptedServer, small_archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> Refused:
+    """Submit to the scripted server, and check exit status and that nothing is written; return the message."""
+
+    def check(status: int = 1) -> str:
+        start = time.monotonic()
+        assert scripted.submit(small_archive, "--json", str(tmp_path / "r.json")) == status
+        assert time.monotonic() - start < 20
+        assert list(tmp_path.iterdir()) == []
+        captured = capsys.readouterr()
+        assert captured.out == ""
+        assert all(line.isprintable() and len(line) < 3000 for line in captured.err.split("\n"))
+        assert len(captured.err) < 30_000
+        assert TOKEN not in captured.err
+        return captured.err[captured.err.index("error: ") :]
+
+    return check
 
 
 @pytest.fixture(scope="module")

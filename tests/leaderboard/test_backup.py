@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import signal
 import sqlite3
@@ -10,7 +11,7 @@ import stat
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, suppress
 from pathlib import Path
 
@@ -33,8 +34,9 @@ from tests.leaderboard.boards import (
     make_board,
     opened,
 )
-from tests.leaderboard.serving import RunServer
-from tests.leaderboard.test_operations import run
+from tests.leaderboard.conftest import WriteArchive
+from tests.leaderboard.serving import Postgres, RunServer, run
+from tests.processes import wait_until
 
 
 def tree(folder: Path) -> dict[str, bytes]:
@@ -46,6 +48,11 @@ def tree(folder: Path) -> dict[str, bytes]:
 
 def names(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
+
+
+def back_up_by_command(settings: Settings, target: Path, *options: object) -> subprocess.CompletedProcess[str]:
+    """Run ``rebar-leaderboard backup``."""
+    return run("backup", target, "--state-dir", settings.state_dir, "--db", settings.db, *options)
 
 
 @pytest.fixture
@@ -113,6 +120,7 @@ def _accept_and_die(settings: Settings, token: str) -> None:
         os.kill(os.getpid(), signal.SIGKILL)
 
 
+@pytest.mark.slow
 def test_upload_to_a_served_backup_is_not_replaced(board: tuple[Settings, str], tmp_path: Path) -> None:
     settings, token = board
     target = tmp_path / "backup"
@@ -139,16 +147,41 @@ def test_folder_that_is_used_is_refused(board: tuple[Settings, str], tmp_path: P
     for folder in (shared.state_dir, tmp_path / "shared", shared.archive_dir):
         with pytest.raises(InputError, match="is in use by the service"):
             back_up(shared, folder, prune=False)
+    precious = tmp_path / "foreign" / "precious.txt"
+    precious.parent.mkdir()
+    precious.write_text("mine")
+    process = back_up_by_command(settings, precious.parent)
+    assert process.returncode == 2
+    assert "contains other files, expected a new folder or an earlier backup" in process.stderr
+    assert names(precious.parent) == {"precious.txt"}
 
 
-def test_served_backup_is_refused_while_it_is_served(
-    tiny_root: Path, tmp_path: Path, running_server: RunServer
+def test_board_is_backed_up_while_it_is_served(
+    tmp_path: Path, write_archive: WriteArchive, small_archive: Path, running_server: RunServer
 ) -> None:
-    settings = board_settings(tmp_path / "state")
-    make_board(settings)
-    back_up(settings, tmp_path / "backup", prune=False)
-    with running_server(tiny_root, tmp_path / "backup", workers=0):
-        process = run("backup", tmp_path / "backup", "--state-dir", settings.state_dir)
+    target, paths = tmp_path / "backup", [f"/api/v1/leaderboard{kind}?config=lattice" for kind in ("", ".csv")]
+    with running_server() as server:
+        token = server.token("alice")
+        scored = server.submit_accepted(write_archive("good", configs=("lattice",)), token)
+        server.wait_until_ended(scored)
+        expected = [server.get(path).content for path in paths]
+    settings = board_settings(server.state)
+    with running_server(server.state, workers=0) as server, ThreadPoolExecutor() as threads:
+        uploads = [threads.submit(server.submit_accepted, small_archive, token) for _ in range(2)]
+        wait_until(lambda: len(facts(settings)) > 1, "the first upload is in")
+        process = back_up_by_command(settings, target)
+        assert (process.returncode, process.stdout) == (0, f"{target}\n"), process.stderr
+        accepted = {scored, *(upload.result() for upload in uploads)}
+    copied = {path.stem for path in (target / "archives").iterdir()}
+    assert scored in copied
+    assert copied <= accepted
+    assert "queued" in {status for status, *_ in facts(board_settings(target)).values()}
+    with running_server(target) as server:
+        assert [server.get(path).content for path in paths] == expected
+        for submission_id in copied:
+            assert server.wait_until_ended(submission_id)["status"] == "scored"
+        assert server.get(f"/api/v1/submissions/{scored}/result.json").status_code == 200
+        process = back_up_by_command(settings, target)
     assert process.returncode == 2
     assert "a server, a worker or another command uses it" in process.stderr
 
@@ -170,6 +203,7 @@ def test_backup_has_the_modes_of_a_state_folder(board: tuple[Settings, str], tmp
     }
 
 
+@pytest.mark.slow
 def test_damaged_archive_replaces_nothing_and_missing_one_is_named(
     board: tuple[Settings, str], tmp_path: Path
 ) -> None:
@@ -187,8 +221,9 @@ def test_damaged_archive_replaces_nothing_and_missing_one_is_named(
         assert (target / "leaderboard.sqlite").read_bytes() == database
         assert not (target / "archives" / f"{damaged}.zip").exists()
     archive.unlink()
-    with pytest.raises(StorageError, match=f"has all the rest, but 1 problem\n.*{damaged} is missing"):
-        back_up(settings, target, prune=False)
+    process = back_up_by_command(settings, target)
+    assert process.returncode == 1
+    assert re.search(f"has all the rest, but 1 problem\n.*{damaged} is missing", process.stderr)
     assert len(facts(board_settings(target))) == 3
     assert (target / "archives" / f"{sound}.zip").read_bytes() == b"three"
     (target / "archives" / f"{sound}.zip").write_bytes(b"thr")
@@ -204,22 +239,21 @@ def test_backup_keeps_what_was_removed_until_it_is_pruned(board: tuple[Settings,
     (settings.archive_dir / "orphan.zip").write_bytes(b"of nobody")
     back_up(settings, target, prune=False)
     (target / "archives" / "orphan.zip").write_bytes(b"of nobody")
+    copies = {path: (path.stat().st_ino, path.stat().st_mtime_ns) for path in (target / "archives").iterdir()}
     with opened(settings) as (database, archives):
         submissions.remove(database, removed)
         prune_archives(database, archives, [pruned])
     assert names(settings.archive_dir) == {f"{kept}.zip", "orphan.zip"}
     back_up(settings, target, prune=False)
     assert names(target / "archives") == {f"{name}.zip" for name in (removed, pruned, kept, "orphan")}
+    assert all((path.stat().st_ino, path.stat().st_mtime_ns) == file for path, file in copies.items())
     back_up(settings, target, prune=True)
     assert names(target / "archives") == {f"{kept}.zip", "orphan.zip"}
     assert facts(board_settings(target)) == facts(settings)
 
 
 @pytest.mark.slow
-def test_backup_of_postgresql_is_restored_from_dump_and_archives(
-    tmp_path: Path, request: pytest.FixtureRequest
-) -> None:
-    postgres = request.getfixturevalue("postgres")
+def test_backup_of_postgresql_is_restored_from_dump_and_archives(tmp_path: Path, postgres: Postgres) -> None:
     url = postgres.new_database(f"dumped_{time.time_ns()}")
     settings = board_settings(tmp_path / "state", db=url)
     token, dump, target = make_board(settings), tmp_path / "board.dump", tmp_path / "backup"
@@ -227,7 +261,7 @@ def test_backup_of_postgresql_is_restored_from_dump_and_archives(
     add_submission(settings, token, b"two")
     postgres.run("pg_dump", "--format", "custom", "--dbname", url, output=dump)
     later = add_submission(settings, token, b"three")
-    process = run("backup", target, "--state-dir", settings.state_dir, "--db", url)
+    process = back_up_by_command(settings, target)
     assert process.returncode == 0, process.stderr
     assert "save the rows with pg_dump before" in process.stderr
     assert names(target) == {"archives"}
@@ -243,7 +277,7 @@ def test_backup_of_postgresql_is_restored_from_dump_and_archives(
     assert facts(restored) == {name: fact for name, fact in facts(settings).items() if name != later}
     with opened(settings) as (database, archives):
         prune_archives(database, archives, [first])
-    assert run("backup", target, "--state-dir", settings.state_dir, "--db", url, "--prune").returncode == 0
+    assert back_up_by_command(settings, target, "--prune").returncode == 0
     assert names(target / "archives") == names(settings.archive_dir)
     with opened(settings) as (database, _), database.write() as session:
         session.execute(update(ResultModel).values(json=b"x"))
@@ -262,12 +296,9 @@ PAGE = Path(__file__).parents[2] / "docs" / "leaderboard-operator.md"
 
 @pytest.mark.slow
 @pytest.mark.parametrize("block", range(2))
-def test_restore_runs_as_written(
-    block: int, tiny_root: Path, tmp_path: Path, make_shell: Callable[[Path], Callable[[str], str]]
-) -> None:
+def test_restore_runs_as_written(block: int, tiny_root: Path, tmp_path: Path) -> None:
     settings = board_settings(tmp_path / "board")
     token, target = make_board(settings), tmp_path / "backups" / "board"
-    shell = make_shell(tiny_root)
     add_submission(settings, token, b"one")
     back_up(settings, target, prune=False)
     before = facts(settings)
@@ -277,33 +308,14 @@ def test_restore_runs_as_written(
     if block:
         back_up(settings, target, prune=False)
     damage(settings.state_dir / "leaderboard.sqlite")
-    printed = shell(shell_of(PAGE, "Restore")[block])
+    commands = shell_of(PAGE, "Restore")[block]
+    commands = commands.replace("/backups", str(tmp_path / "backups")).replace("ROOT", str(tiny_root))
+    environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
+    shell = ["bash", "-u", "-c", commands]
+    finished = subprocess.run(shell, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
     assert facts(settings) == before
     assert_sound(settings)
     assert stat.S_IMODE(settings.state_dir.stat().st_mode) == 0o700
     if block:
-        assert f"{newer}.zip has no submission" in printed
+        assert f"{newer}.zip has no submission" in finished.stdout + finished.stderr
         assert archive.read_bytes() == b"two"
-
-
-@pytest.fixture
-def make_shell(tmp_path: Path) -> Callable[[Path], Callable[[str], str]]:
-    """Return a function that runs commands of the page with the folders of a test, and returns what they print."""
-
-    def make(root: Path) -> Callable[[str], str]:
-        def shell(commands: str) -> str:
-            text = commands.replace("/backups", str(tmp_path / "backups")).replace("ROOT", str(root))
-            environment = {**os.environ, "PATH": f"{Path(sys.executable).parent}:{os.environ['PATH']}"}
-            finished = subprocess.run(
-                ["bash", "-u", "-c", text],
-                cwd=tmp_path,
-                env=environment,
-                capture_output=True,
-                text=True,
-                check=False,
-            )
-            return finished.stdout + finished.stderr
-
-        return shell
-
-    return make

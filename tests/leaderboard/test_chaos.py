@@ -1,4 +1,4 @@
-"""kill -9 of server, scorers, database and backups, prune, restore: what is accepted is scored exactly once."""
+"""Kills of server, scorers, database and backups: what is accepted is scored once, health and logs tell of it."""
 
 from __future__ import annotations
 
@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import httpx2
 import numpy as np
@@ -24,9 +23,19 @@ import pytest
 
 from leaderboard.db.jobs import MAX_ATTEMPTS
 from tests.leaderboard.conftest import WriteArchive
-from tests.leaderboard.postgres import Postgres, RunPostgres
-from tests.leaderboard.serving import SCORING, RunServer, Server, distinct_archive, make_token
-from tests.leaderboard.test_operations import run
+from tests.leaderboard.serving import (
+    API,
+    SCORING,
+    Postgres,
+    RunPostgres,
+    RunServer,
+    Server,
+    bearer,
+    distinct_archive,
+    exchange,
+    make_token,
+    run,
+)
 from tests.processes import descendants, is_running, processes_below, wait_until
 from tests.requirements import Repetitions
 
@@ -34,13 +43,7 @@ UPLOADERS = 2
 PAUSE_S = (0.05, 1.5)
 REST_S = 0.5
 WAIT_S = 120.0
-SETTINGS: dict[str, Any] = {
-    "quota": 10_000,
-    "lease_seconds": 2,
-    "read_rate_limit": "1000000/minute",
-    "write_rate_limit": "1000000/minute",
-    "workers": 2,
-}
+SETTINGS = {"quota": 10_000, "lease_seconds": 2, "workers": 2}
 
 
 @dataclass
@@ -61,12 +64,8 @@ class Uploads:
             archive = distinct_archive(self.archive, next(self.numbers))
             with archive.open("rb") as stream, suppress(httpx2.HTTPError):
                 self.begun.append(self.address())
-                response = httpx2.post(
-                    f"{self.address()}/api/v1/submissions",
-                    files={"archive": stream},
-                    headers={"Authorization": f"Bearer {self.token}"},
-                    timeout=60,
-                )
+                address, files = self.address() + API, {"archive": stream}
+                response = httpx2.post(address, files=files, headers=bearer(self.token), timeout=60)
                 self.answers.append(response.status_code)
                 if response.status_code == 202:
                     self.accepted.append(response.json()["id"])
@@ -97,9 +96,7 @@ class Service:
 
     def start(self) -> None:
         self.running = ExitStack()
-        self.server = self.running.enter_context(
-            self.running_server(self.root, self.state, db=self.db, **SETTINGS)
-        )
+        self.server = self.running.enter_context(self.running_server(self.state, db=self.db, **SETTINGS))
         self.logs.append(self.server.log)
 
     def times_ended(self) -> Counter[str]:
@@ -251,3 +248,116 @@ def test_accepted_submissions_are_scored_once(
     folders = (service.backup, service.state)
     backed_up, stored = ({path.name for path in (folder / "archives").iterdir()} for folder in folders)
     assert backed_up <= stored
+
+
+PASSWORD = "correct-horse-battery"
+WRONG_TOKEN = "rdb_nobody-ever-made-this-token"
+
+
+@dataclass(frozen=True)
+class ServiceRun:
+    """Service on PostgreSQL that has accepted and rejected uploads and survived a database outage."""
+
+    server: Server
+    token: str
+    ids: tuple[str, ...]
+    health: tuple[int, ...]
+    away: httpx2.Response
+
+
+def health(server: Server) -> int:
+    return int(server.get("/healthz").status_code)
+
+
+def restart_database(server: Server, database: Postgres, page: str) -> tuple[tuple[int, ...], httpx2.Response]:
+    before = health(server)
+    database.kill()
+    try:
+        away, during = server.get(page), health(server)
+        wait_until(lambda: any("database unavailable" in line for line in server.log), "the loss is logged")
+    finally:
+        database.start()
+    wait_until(lambda: health(server) == 200, "the database is found again")
+    return (before, during, health(server)), away
+
+
+@pytest.fixture(scope="module")
+def observed(
+    small_archive: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    running_server: RunServer,
+    running_postgres: RunPostgres,
+) -> Iterator[ServiceRun]:
+    broken = tmp_path_factory.mktemp("observing") / "broken.zip"
+    broken.write_bytes(b"no zip")
+    with running_postgres() as database:
+        db = database.url.replace("board@", f"board:{PASSWORD}@")  # The server ignores the password.
+        with running_server(db=db, default_visibility="owner", lease_seconds=5) as server:
+            token = server.token("alice")
+            first = server.submit_accepted(small_archive, token)
+            assert server.submit(small_archive, WRONG_TOKEN).status_code == 401
+            assert server.submit(broken, token).status_code == 422
+            invalid = f"GET / HTTP/9.9 {WRONG_TOKEN}\r\nAuthorization: Bearer {WRONG_TOKEN}\r\n\r\n"
+            exchange(server.url, invalid.encode())
+            assert server.wait_until_ended(first)["status"] == "scored"
+            page = f"{API}/{first}"
+            health_codes, away = restart_database(server, database, page)
+            second = server.submit_accepted(small_archive, token)
+            assert server.wait_until_ended(second)["status"] == "scored"
+            assert server.call("DELETE", page, token).status_code == 204
+            # A request is logged after its response has been sent.
+            wait_until(lambda: any('"status": 204' in line for line in server.log), "the deletion is logged")
+            yield ServiceRun(server, token, (first, second), health_codes, away)
+
+
+def test_health_is_503_during_database_outage(observed: ServiceRun) -> None:
+    assert observed.health == (200, 503, 200)
+    assert observed.away.status_code == 503
+    assert observed.away.headers["Retry-After"] == "10"
+    assert "try again" in observed.away.json()["detail"]
+    assert PASSWORD not in observed.away.text
+
+
+def test_logs_are_json_lines_without_secrets(observed: ServiceRun) -> None:
+    log = [line for line in observed.server.log if line]
+    assert log[0] == observed.server.url
+    events = [json.loads(line) for line in log[1:]]
+    for event in events:
+        assert {"event", "level", "timestamp"} <= set(event), event
+    text = "\n".join(log)
+    for secret in (
+        observed.token,
+        observed.token[4:],
+        WRONG_TOKEN,
+        PASSWORD,
+        "Authorization",
+        "Bearer",
+        *observed.ids,
+    ):
+        assert secret not in text, f"{secret} is in the log"
+
+
+def test_logs_contain_expected_events(observed: ServiceRun) -> None:
+    events = [json.loads(line) for line in observed.server.log[1:] if line]
+    event_names = {event["event"] for event in events}
+    uploads = {"upload accepted", "upload rejected", "scoring started", "scoring finished"}
+    assert {"request", "database unavailable", *uploads} <= event_names
+    assert any("nvalid HTTP request" in name for name in event_names), "messages of uvicorn are not logged"
+    accepted = [event for event in events if event["event"] == "upload accepted"]
+    assert [event["submission"] for event in accepted] == [submission_id[:6] for submission_id in observed.ids]
+    assert {event["token"] for event in accepted} == {"alice"}
+    statuses = {event["status"] for event in events if event["event"] == "request"}
+    assert {200, 202, 204, 401, 422, 503} <= statuses
+
+
+def test_health_tells_of_a_lost_dataset(tiny_root: Path, tmp_path: Path, running_server: RunServer) -> None:
+    data = tmp_path / "data"
+    data.mkdir()
+    for path in tiny_root.iterdir():
+        (data / path.name).symlink_to(path)
+    with running_server(root=data, workers=1) as server:
+        assert server.get("/healthz").json()["status"] == "ok"
+        (data / "manifest.json").unlink()
+        response = server.get("/healthz")
+        assert (response.status_code, response.json()["status"]) == (503, "failing")
+        assert response.json()["problems"] == ["the manifest of the dataset cannot be read"]

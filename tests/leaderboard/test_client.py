@@ -1,58 +1,45 @@
-"""``rebar-bench submit`` against a real server."""
+"""``rebar-bench submit`` against a real server, and its limits: redirects, time, size, and what it sends."""
 
 from __future__ import annotations
 
 import json
 import os
-import subprocess
-import sys
-from collections.abc import Iterator
+import re
+import time
+from io import BufferedIOBase
 from pathlib import Path
-from typing import Any
 
 import pytest
 
 from rebar_depth_bench.base.errors import InputError, SubmissionError
-from rebar_depth_bench.remote.leaderboard_client import LeaderboardClient, ServiceError
-from tests.leaderboard.conftest import SharedServer, WriteArchive
-from tests.leaderboard.serving import RunServer, Server
+from rebar_depth_bench.cli.main import main
+from rebar_depth_bench.remote import leaderboard_client
+from rebar_depth_bench.remote.leaderboard_client import AnswerError, LeaderboardClient, ServiceError
+from tests.leaderboard.conftest import Refused, SharedServer, WriteArchive
+from tests.leaderboard.scripted_server import (
+    ID,
+    TOKEN,
+    TOKEN_INFO,
+    ScriptedServer,
+    Send,
+    answer,
+    scripted_server,
+    submission,
+)
+from tests.leaderboard.serving import run_bench
 
-TOKEN = "REBAR_LEADERBOARD_TOKEN"
-
-
-def run(*arguments: str | Path, token: str | None = None) -> subprocess.CompletedProcess[str]:
-    environment = {name: value for name, value in os.environ.items() if name != TOKEN}
-    command = [sys.executable, "-m", "rebar_depth_bench", *map(str, arguments)]
-    return subprocess.run(
-        command,
-        env={**environment, "COLUMNS": "200", **({} if token is None else {TOKEN: token})},
-        stdin=subprocess.DEVNULL,
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=120,
-    )
-
-
-@pytest.fixture(scope="module")
-def strict_server(
-    tiny_root: Path, tmp_path_factory: pytest.TempPathFactory, running_server: RunServer
-) -> Iterator[Server]:
-    """Return a server with a quota of one, a small size limit and a scoring time limit that always expires."""
-    settings: dict[str, Any] = {"quota": 1, "max_upload": 2_000_000, "score_time": 0.01}
-    with running_server(tiny_root, tmp_path_factory.mktemp("strict") / "state", **settings) as server:
-        yield server
+TOKEN_VARIABLE = "REBAR_LEADERBOARD_TOKEN"
 
 
 def test_submit_prints_same_table_as_score(
     board: SharedServer, tiny_root: Path, write_archive: WriteArchive, tmp_path: Path
 ) -> None:
     archive = write_archive("by command", 1.3)
-    submitted = run(
+    submitted = run_bench(
         "submit", archive, "--url", f"{board.url}/", "--json", tmp_path / "sent.json", token=board.token
     )
     assert submitted.returncode == 0, submitted.stderr
-    scored = run("score", archive, "--data", tiny_root, "--json", tmp_path / "own.json")
+    scored = run_bench("score", archive, "--data", tiny_root, "--json", tmp_path / "own.json")
     assert submitted.stdout == scored.stdout
     assert "by command" in submitted.stdout
     assert (tmp_path / "sent.json").read_bytes() == (tmp_path / "own.json").read_bytes()
@@ -66,7 +53,7 @@ def test_submit_prints_same_table_as_score(
 def test_no_wait_prints_submission_id(board: SharedServer, write_archive: WriteArchive, tmp_path: Path) -> None:
     (tmp_path / "token").write_text(f"{board.token}\n")
     archive = write_archive("impatient", configs=("lattice-orbit",))
-    submitted = run("submit", archive, "--url", board.url, "--token-file", tmp_path / "token", "--no-wait")
+    submitted = run_bench("submit", archive, "--url", board.url, "--token-file", tmp_path / "token", "--no-wait")
     assert submitted.returncode == 0, submitted.stderr
     assert board.server.wait_until_ended(submitted.stdout.strip())["method"] == "impatient"
 
@@ -74,8 +61,8 @@ def test_no_wait_prints_submission_id(board: SharedServer, write_archive: WriteA
 def test_rejected_archive_has_same_message_as_check(board: SharedServer, tiny_root: Path, tmp_path: Path) -> None:
     broken = tmp_path / "broken.zip"
     broken.write_bytes(b"PK no zip")
-    submitted = run("submit", broken, "--url", board.url, token=board.token)
-    checked = run("check", broken, "--data", tiny_root)
+    submitted = run_bench("submit", broken, "--url", board.url, token=board.token)
+    checked = run_bench("check", broken, "--data", tiny_root)
     assert (submitted.returncode, checked.returncode) == (2, 2)
     reasons = [line.removeprefix("error: ") for line in checked.stderr.splitlines() if "zip" in line]
     assert reasons
@@ -83,68 +70,39 @@ def test_rejected_archive_has_same_message_as_check(board: SharedServer, tiny_ro
 
 
 @pytest.mark.parametrize(
-    ("token", "words"),
-    [(None, f"no token: set {TOKEN}, or give --token-file FILE"), ("rdb_wrong", "the token is unknown")],
+    ("path", "token", "words"),
+    [
+        ("", None, f"no token: set {TOKEN_VARIABLE}, or give --token-file FILE"),
+        ("", "rdb_wrong", "the token is unknown"),
+        ("/nope", "rdb_wrong", "Not Found"),
+    ],
 )
-def test_missing_or_unknown_token_exits_2(
-    board: SharedServer, write_archive: WriteArchive, token: str | None, words: str
+def test_wrong_token_or_url_is_reported_before_upload(
+    board: SharedServer, small_archive: Path, path: str, token: str | None, words: str
 ) -> None:
-    process = run("submit", write_archive("x"), "--url", board.url, token=token)
+    process = run_bench("submit", small_archive, "--url", f"{board.url}{path}", token=token)
     assert process.returncode == 2
     assert words in process.stderr
-    assert "Traceback" not in process.stderr
+    assert "uploading" not in process.stderr
 
 
 @pytest.mark.parametrize("content", ["", " \n", "\x1b[2J"])
 def test_token_file_without_a_token_exits_2(tmp_path: Path, content: str) -> None:
     token = tmp_path / "token"
     token.write_text(content)
-    process = run("submit", tmp_path / "a.zip", "--url", "http://127.0.0.1:9", "--token-file", token)
+    process = run_bench("submit", tmp_path / "a.zip", "--url", "http://127.0.0.1:9", "--token-file", token)
     assert process.returncode == 2
     assert f"{token}: " in process.stderr
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("url", "status"),
     [("http://127.0.0.1:9", 1), ("localhost:80", 2), ("no address", 2), ("ftp://127.0.0.1/", 2), ("http://[", 1)],
 )
-def test_unreachable_service_or_invalid_url_is_reported(
-    write_archive: WriteArchive, url: str, status: int
-) -> None:
-    process = run("submit", write_archive("x"), "--url", url, token="rdb_x")
+def test_unreachable_service_or_invalid_url_is_reported(small_archive: Path, url: str, status: int) -> None:
+    process = run_bench("submit", small_archive, "--url", url, token="rdb_x")
     assert process.returncode == status
     assert process.stderr.splitlines()[-1].startswith("error: ")
-    assert "Traceback" not in process.stderr
-
-
-@pytest.mark.parametrize(("path", "token"), [("", "rdb_wrong"), ("/nope", None)])
-def test_wrong_token_or_url_is_reported_before_upload(
-    board: SharedServer, write_archive: WriteArchive, path: str, token: str | None
-) -> None:
-    process = run("submit", write_archive("x"), "--url", f"{board.url}{path}", token=token or board.token)
-    assert process.returncode == 2
-    assert "uploading" not in process.stderr
-
-
-def test_scoring_failure_and_exceeded_quota_are_reported(strict_server: Server, small_archive: Path) -> None:
-    token = strict_server.token("alice")
-    failed = run("submit", small_archive, "--url", strict_server.url, token=token)
-    assert failed.returncode == 2
-    assert "scoring failed: scoring took longer than the limit of 0.01 s" in failed.stderr
-    over_quota = run("submit", small_archive, "--url", strict_server.url, token=token)
-    assert over_quota.returncode == 2
-    assert "the quota of 1 submissions per day (UTC) is used up" in over_quota.stderr
-
-
-def test_too_large_archive_is_reported(strict_server: Server, tmp_path: Path) -> None:
-    large = tmp_path / "large.zip"
-    large.write_bytes(bytes(2_200_000))
-    with (
-        LeaderboardClient(strict_server.url, strict_server.token("bob")) as leaderboard,
-        pytest.raises(InputError, match="expected at most 2000000"),
-    ):
-        leaderboard.submit(large)
 
 
 def test_client_library_raises_errors_of_command(board: SharedServer, tmp_path: Path) -> None:
@@ -165,3 +123,160 @@ def test_client_library_raises_errors_of_command(board: SharedServer, tmp_path: 
         pytest.raises(ServiceError, match="no response"),
     ):
         unreachable.result("x")
+
+
+@pytest.mark.parametrize("status", [300, 301, 302, 303, 307, 308])
+@pytest.mark.parametrize("endpoint", ["token", "submit", "status", "result"])
+def test_redirect_is_not_followed(
+    endpoint: str, status: int, scripted: ScriptedServer, small_archive: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(leaderboard_client, "MAX_FAILED_POLLS", 0)
+    with scripted_server() as other:
+        other.answers = dict(scripted.answers)
+        scripted.answers[endpoint] = [answer(b"", status, {"Location": f"{other.url}/api/v1/token"})]
+        assert scripted.submit(small_archive) == 1
+        assert other.requests == []
+
+
+def test_too_large_archive_is_not_sent(scripted: ScriptedServer, small_archive: Path, refused: Refused) -> None:
+    scripted.answers["token"] = [answer({**TOKEN_INFO, "max_upload_bytes": 2000})]
+    assert f"has {small_archive.stat().st_size} bytes, expected at most 2000" in refused(2)
+    assert scripted.endpoints() == ["token"]
+
+
+def test_token_is_sent_to_the_leaderboard_only(scripted: ScriptedServer, small_archive: Path) -> None:
+    assert scripted.submit(small_archive) == 0
+    assert all(f"Bearer {TOKEN}" in head for _, head in scripted.requests)
+    assert all(re.search("accept-encoding: identity", head, re.IGNORECASE) for _, head in scripted.requests)
+
+
+def endless(prefix: bytes, chunk: bytes, pause_s: float = 0.0) -> Send:
+    """Return an answer that never ends: ``prefix`` and then ``chunk`` again and again."""
+
+    def send(stream: BufferedIOBase) -> None:
+        stream.write(prefix)
+        while True:
+            stream.write(chunk)
+            stream.flush()
+            time.sleep(pause_s)
+
+    return send
+
+
+def silent(stream: BufferedIOBase) -> None:
+    time.sleep(60)
+
+
+HEAD = b"HTTP/1.1 200 OK\r\n"
+CHUNKED = HEAD + b"Transfer-Encoding: chunked\r\n\r\n"
+ENDLESS: dict[str, Send] = {
+    "body": endless(HEAD + b"Content-Length: 10000000000\r\n\r\n", b"[" * 65536),
+    "body without length": endless(HEAD + b"\r\n", b" " * 65536),
+    "chunks": endless(CHUNKED, b"10000\r\n" + b" " * 65536 + b"\r\n"),
+    "small chunks": endless(CHUNKED, b"1\r\n \r\n" * 1000),
+    "headers": endless(HEAD, b"X: y\r\n" * 1000),
+    "early answers": endless(b"", b"HTTP/1.1 100 Continue\r\n\r\n" * 100),
+    "slow body": endless(HEAD + b"Content-Length: 1000\r\n\r\n", b" ", 0.1),
+    "slow headers": endless(HEAD, b"X", 0.1),
+    "slow chunks": endless(CHUNKED, b"1\r\n \r\n", 0.1),
+    "nothing": silent,
+}
+
+
+ENDLESS_CASES = [
+    *(("token", kind) for kind in ENDLESS),
+    *((endpoint, kind) for endpoint in ("submit", "status", "result") for kind in ("chunks", "slow headers")),
+]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("endpoint", "kind"), ENDLESS_CASES)
+def test_endless_answer_ends_with_an_error(
+    endpoint: str, kind: str, scripted: ScriptedServer, refused: Refused, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("REQUEST_TIMEOUT_S", "RESULT_TIMEOUT_S", "UPLOAD_TIMEOUT_S"):
+        monkeypatch.setattr(leaderboard_client, name, 0.8)
+    monkeypatch.setattr(leaderboard_client, "MAX_FAILED_POLLS", 1)
+    monkeypatch.setenv("REBAR_MAX_JSON_BYTES", "10000000")
+    scripted.answers[endpoint] = [ENDLESS[kind]]
+    assert re.search("time limit|too large|no response", refused())
+
+
+def test_unknown_states_are_asked_once_and_failures_again(
+    scripted: ScriptedServer, small_archive: Path, tmp_path: Path
+) -> None:
+    """A proxy may fail for a while; a leaderboard that answers with an unknown status will do so again."""
+    good = submission(small_archive)
+    failures = [answer(b"<html>", 502), answer(b"<html>"), b"", answer({"detail": "slow down"}, 429)]
+    scripted.answers["status"] = [*failures, answer(good), answer({**good, "status": "scored"})]
+    assert scripted.submit(small_archive) == 0
+    assert scripted.endpoints().count("status") == len(failures) + 2
+    scripted.answers["status"] = [answer({**good, "status": "paused"})]
+    with LeaderboardClient(scripted.url, TOKEN) as client, pytest.raises(AnswerError, match="paused"):
+        client.wait(ID)
+
+
+@pytest.mark.parametrize("status", ["queued", "scoring"])
+def test_wait_ends_after_its_limit(
+    status: str, scripted: ScriptedServer, small_archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scripted.answers["status"] = [answer(submission(small_archive, status=status))]
+    start = time.monotonic()
+    assert scripted.submit(small_archive, "--wait", "0.5", "--json", str(tmp_path / "r.json")) == 1
+    assert 0.5 <= time.monotonic() - start < 10
+    message = capsys.readouterr().err.splitlines()[-1]
+    assert f"{scripted.url}/submissions/{ID}" in message
+    assert f"still {status}" in message
+    assert not (tmp_path / "r.json").exists()
+
+
+def test_wait_limit_holds_for_a_request(scripted: ScriptedServer, small_archive: Path) -> None:
+    scripted.answers["status"] = [silent]
+    start = time.monotonic()
+    assert scripted.submit(small_archive, "--wait", "0.5") == 1
+    assert time.monotonic() - start < 10
+
+
+@pytest.mark.parametrize(
+    "options",
+    [("--wait", "5", "--no-wait"), ("--wait", "0"), ("--wait", "-1"), ("--wait", "x"), ("--wait", "nan")],
+)
+def test_invalid_wait_exits_2(options: tuple[str, ...], small_archive: Path) -> None:
+    with pytest.raises(SystemExit) as caught:
+        main(["submit", str(small_archive), "--url", "http://127.0.0.1:9", *options])
+    assert caught.value.code == 2
+
+
+@pytest.mark.parametrize("submission_id", ["../token", "a/b", "", "a?b", "\x1b", "a" * 200])
+def test_id_that_is_no_part_of_a_url_is_refused(submission_id: str, scripted: ScriptedServer) -> None:
+    with LeaderboardClient(scripted.url, TOKEN) as client:
+        for call in (client.wait, client.result):
+            with pytest.raises(InputError, match="is not the id of a submission"):
+                call(submission_id)
+    assert scripted.requests == []
+
+
+@pytest.mark.parametrize("token", ["ä", "a\nb", "a\x1b", "\ud800"])
+def test_token_that_is_no_header_is_refused(token: str) -> None:
+    with pytest.raises(InputError, match="printable ASCII"):
+        LeaderboardClient("http://127.0.0.1:9", token)
+
+
+def test_archive_that_is_no_file_is_refused(
+    scripted: ScriptedServer, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    os.mkfifo(tmp_path / "pipe.zip")
+    for path in (tmp_path / "pipe.zip", tmp_path, Path("/dev/zero")):
+        assert scripted.submit(path) == 2
+        assert "cannot be read" in capsys.readouterr().err
+    assert scripted.endpoints() == ["token"] * 3
+
+
+def test_result_of_another_archive_is_refused_by_library(
+    scripted: ScriptedServer, small_archive: Path, small_result: bytes
+) -> None:
+    with LeaderboardClient(scripted.url, TOKEN) as client:
+        accepted = client.submit(small_archive)
+        assert client.result(accepted.id, accepted.archive_sha256)[1] == small_result
+        with pytest.raises(ServiceError, match="is of the archive"):
+            client.result(accepted.id, "0" * 64)

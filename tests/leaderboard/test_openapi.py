@@ -14,11 +14,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import httpx2
 import pytest
 
-from tests.leaderboard.conftest import WriteArchive
-from tests.leaderboard.serving import RunServer, Server
+from tests.leaderboard.serving import API, RunServer, Server
 from tests.requirements import Repetitions
 
 EXCLUDED_CHECKS = (
@@ -47,33 +45,19 @@ schemathesis.openapi.format("binary", st.sampled_from([sound, sound[:-9], sound[
 
 
 @pytest.fixture(scope="module")
-def server(
-    tiny_root: Path, tmp_path_factory: pytest.TempPathFactory, running_server: RunServer
-) -> Iterator[Server]:
-    state = tmp_path_factory.mktemp("openapi") / "state"
-    often = "1000000/minute"
-    with running_server(
-        tiny_root,
-        state,
-        read_rate_limit=often,
-        write_rate_limit=often,
-        quota=1_000_000,
-        max_upload=1_000_000,
-        default_visibility="owner",
-    ) as started:
+def server(running_server: RunServer) -> Iterator[Server]:
+    with running_server(quota=1_000_000, max_upload=1_000_000, default_visibility="owner") as started:
         yield started
 
 
 @pytest.fixture(scope="module")
-def tokens(server: Server) -> dict[str, str]:
-    return {"token": server.token("schemathesis"), "unknown token": "nobody's"}
+def document(server: Server) -> dict[str, Any]:
+    return dict(server.get("/openapi.json").json())
 
 
 @pytest.fixture(scope="module")
-def hooks(write_archive: WriteArchive, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("hooks") / "hooks.py"
-    path.write_text(UPLOAD_HOOKS.format(archive=str(write_archive("fuzzed", configs=("lattice-orbit",)))))
-    return path
+def token(server: Server) -> str:
+    return server.token("schemathesis")
 
 
 def api_responses(log: list[str]) -> set[tuple[str, str]]:
@@ -86,47 +70,63 @@ def api_responses(log: list[str]) -> set[tuple[str, str]]:
     }
 
 
-def fuzz(server: Server, hooks: Path, folder: Path, token: str | None, max_examples: int, *phases: str) -> str:
+def fuzz(server: Server, hooks: Path, token: str, max_examples: int) -> str:
     """Run ``schemathesis run`` and return its output; fail if it reports a problem."""
     command = [sys.executable, "-m", "schemathesis.cli", "run", f"{server.url}/openapi.json", "--no-color"]
     command += ["--checks", "all", "--exclude-checks", ",".join(EXCLUDED_CHECKS), "--continue-on-failure"]
-    command += ["--generation-deterministic", "--max-examples", str(max_examples), "--phases", ",".join(phases)]
-    command += [] if token is None else ["--header", f"Authorization: Bearer {token}"]
-    environment = {**os.environ, "SCHEMATHESIS_HOOKS": str(hooks)}
+    command += ["--generation-deterministic", "--max-examples", str(max_examples)]
+    command += ["--header", f"Authorization: Bearer {token}"]
     process = subprocess.run(
-        command, capture_output=True, text=True, cwd=folder, check=False, timeout=1800, env=environment
+        command,
+        capture_output=True,
+        text=True,
+        cwd=hooks.parent,
+        check=False,
+        timeout=1800,
+        env={**os.environ, "SCHEMATHESIS_HOOKS": str(hooks)},
     )
     assert process.returncode == 0, process.stdout + process.stderr
     return process.stdout
 
 
-ALL_PHASES = ("examples", "coverage", "fuzzing", "stateful")
 EXPECTED = {
-    "token": {
-        *(("POST", status) for status in ("202", "422")),
-        *(("PUT", status) for status in ("200", "422")),
-        *(("GET", status) for status in ("200", "404", "422")),
-        *(("PATCH", status) for status in ("200", "404", "422")),
-        *(("DELETE", status) for status in ("204", "404", "422")),
-    },
-    "unknown token": {(method, "401") for method in ("POST", "GET", "PATCH", "DELETE")},
-    "nobody": {(method, "401") for method in ("POST", "PATCH", "DELETE")} | {("GET", "200"), ("GET", "404")},
+    *(("POST", status) for status in ("202", "422")),
+    *(("PUT", status) for status in ("200", "422")),
+    *(("GET", status) for status in ("200", "404", "422")),
+    *(("PATCH", status) for status in ("200", "404", "422")),
+    *(("DELETE", status) for status in ("204", "404", "422")),
 }
 """Responses that must occur; otherwise the requests did not reach the code under test."""
 
 
-@pytest.mark.parametrize("who", EXPECTED)
 def test_responses_match_openapi_document(
-    server: Server, tokens: dict[str, str], hooks: Path, tmp_path: Path, who: str, repetitions: Repetitions
+    server: Server, token: str, small_archive: Path, tmp_path: Path, repetitions: Repetitions
 ) -> None:
-    num_lines_before = len(server.log)
-    # Without a token no submission exists for stateful tests.
-    phases = ALL_PHASES if who == "token" else ("coverage",)
-    output = fuzz(server, hooks, tmp_path, tokens.get(who), repetitions(4, 30), *phases)
+    hooks = tmp_path / "hooks.py"
+    hooks.write_text(UPLOAD_HOOKS.format(archive=str(small_archive)))
+    output = fuzz(server, hooks, token, repetitions(4, 30))
     assert re.search(r"Operations: +12 selected / 12 total", output)
-    new_responses = api_responses(server.log[num_lines_before:])
-    assert new_responses >= EXPECTED[who]
-    assert not any(status >= "500" for _, status in new_responses)
+    responses = api_responses(server.log)
+    assert responses >= EXPECTED
+    assert not any(status >= "500" for _, status in responses)
+
+
+@pytest.mark.parametrize("header", [None, "Bearer nobody's"])
+def test_requests_without_a_known_token_are_401_as_documented(
+    server: Server, document: dict[str, Any], header: str | None
+) -> None:
+    headers = {} if header is None else {"Authorization": header}
+    for path, operations in document["paths"].items():
+        for method, operation in operations.items():
+            address = f"{path.replace('{submission_id}', 'some')}?config=lattice"
+            response = server.call(method.upper(), address, headers=headers)
+            needs_token = {"HTTPBearer": []} in operation.get("security", []) and {} not in operation["security"]
+            if needs_token or (header and operation.get("security")):
+                assert (response.status_code, list(response.json())) == (401, ["detail"]), (method, path)
+                assert "401" in operation["responses"]
+            else:
+                assert response.status_code != 401, (method, path)
+            assert str(response.status_code) in operation["responses"], (method, path)
 
 
 @pytest.mark.parametrize(
@@ -134,19 +134,17 @@ def test_responses_match_openapi_document(
     [(b"\xc3", 400), (b"", 422), (b"{", 422), (b'{"public": 1}', 422), (b'{"public": true, "id": "x"}', 422)],
 )
 def test_invalid_patch_is_rejected_as_documented(
-    server: Server, tokens: dict[str, str], body: bytes, status: int
+    server: Server, document: dict[str, Any], token: str, body: bytes, status: int
 ) -> None:
-    headers = {"Authorization": f"Bearer {tokens['token']}", "Content-Type": "application/json"}
-    response = httpx2.patch(f"{server.url}/api/v1/submissions/some", content=body, headers=headers)
+    headers = {"Content-Type": "application/json"}
+    response = server.call("PATCH", f"{API}/some", token, content=body, headers=headers)
     assert response.status_code == status
-    document = httpx2.get(f"{server.url}/openapi.json").json()
     documented = document["paths"]["/api/v1/submissions/{submission_id}"]["patch"]["responses"][str(status)]
     model = documented["content"]["application/json"]["schema"]["$ref"].split("/")[-1]
     assert set(response.json()) == set(document["components"]["schemas"][model]["required"])
 
 
-def test_models_have_examples_and_operations_descriptions(server: Server) -> None:
-    document: dict[str, Any] = httpx2.get(f"{server.url}/openapi.json").json()
+def test_models_have_examples_and_operations_descriptions(document: dict[str, Any]) -> None:
     for name in ("ErrorResponse", "RejectedResponse", "Submission", "SubmissionChange"):
         assert document["components"]["schemas"][name]["example"]
     operations = [operation for path in document["paths"].values() for operation in path.values()]
@@ -154,8 +152,19 @@ def test_models_have_examples_and_operations_descriptions(server: Server) -> Non
     assert all(response["description"] for operation in operations for response in operation["responses"].values())
 
 
-def test_unsupported_method_is_405_with_allow_header(server: Server) -> None:
-    response = httpx2.put(f"{server.url}/api/v1/submissions/some")
-    assert (response.status_code, response.headers["allow"]) == (405, "DELETE, GET, PATCH")
-    response = httpx2.put(f"{server.url}/how-to-submit")
-    assert (response.status_code, response.headers["allow"]) == (405, "GET")
+def test_page_of_submitters_lists_every_request(document: dict[str, Any]) -> None:
+    served = {
+        f"{method.upper()} {path.replace('{submission_id}', 'ID')}"
+        for path, operations in document["paths"].items()
+        for method in operations
+    }
+    page = (Path(__file__).parents[2] / "docs/leaderboard-submitter.md").read_text()
+    listed = re.findall(r"^\| `([A-Z]+ [^`?]+)", page, re.MULTILINE)
+    assert {*listed, "GET /api/v1/leaderboard.csv"} == served
+    assert "`leaderboard.csv`" in page
+
+
+@pytest.mark.parametrize(("path", "allowed"), [(f"{API}/some", "DELETE, GET, PATCH"), ("/how-to-submit", "GET")])
+def test_unsupported_method_is_405_with_allow_header(server: Server, path: str, allowed: str) -> None:
+    response = server.call("PUT", path)
+    assert (response.status_code, response.headers["allow"]) == (405, allowed)

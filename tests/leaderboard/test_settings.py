@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import json
-import os
 import re
+import signal
 import socket
-import subprocess
-import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,10 +13,10 @@ from typing import Any
 import pytest
 from pydantic import ByteSize
 
-from leaderboard.cli import COMMANDS, argument_parser
 from leaderboard.settings import Settings, read_settings
 from leaderboard.storage.archive_store import ArchiveStore
 from rebar_depth_bench.base.errors import InputError
+from tests.leaderboard.serving import run
 
 PASSWORD = "Hunter2"
 PREFIX = "REBAR_LEADERBOARD_"
@@ -72,16 +69,10 @@ CASES = {
     "TOML that is not UTF-8": Case("latin: .*\n.*not UTF-8", "--settings HERE/latin"),
     "no TOML file": Case("none: .*\n.*cannot be read: No such file", "--settings HERE/none"),
     "folder as TOML file": Case("cannot be read: it is a folder", "--settings HERE"),
-    "rate in words": Case("read_rate_limit: expected a rate such as .*'many'", "--read-rate-limit many"),
-    "rate of nothing": Case("write_rate_limit: expected a rate", "--write-rate-limit 0/minute"),
-    "two rates": Case("write_rate_limit: expected a rate", "--write-rate-limit 1/second;9/minute"),
-    "empty rate": Case("read_rate_limit: expected a rate", "", environment={f"{PREFIX}READ_RATE_LIMIT": ""}),
     "no data": Case("data: is not given", f"--db postgresql://u:{PASSWORD}@h/x", COMMAND_WITHOUT_DATA),
     "dataset missing": Case("no such folder", "--data HERE/none", COMMAND_WITHOUT_DATA),
     "dataset empty": Case("no manifest.json", "--data HERE", COMMAND_WITHOUT_DATA),
-    "no URL": Case("db: expected sqlite", f"--db u:{PASSWORD}@h/x"),
     "another database": Case("db: expected sqlite", f"--db mysql://u:{PASSWORD}@h/x"),
-    "database in memory": Case("db: expected sqlite", "--db sqlite://"),
     "database's port": Case("db: expected sqlite", f"--db postgresql://u:{PASSWORD}@h:port/x"),
     "database unavailable": Case("database is unavailable", f"--db postgresql://u:{PASSWORD}@127.0.0.1:1/x"),
     "database unavailable, token": Case(
@@ -103,78 +94,44 @@ CASES = {
     "backup of nothing": Case("database does not exist", "--state-dir HERE", "backup HERE/b"),
 }
 
-_RUNNER = """
-import contextlib, io, json, os, signal, sys, traceback
-from leaderboard.storage.archive_store import ArchiveStore
-from leaderboard.cli import main
-signal.signal(signal.SIGALRM, lambda *_: sys.exit("the command did not fail within 30 s"))
-answers = []
-for arguments, environment in json.load(sys.stdin):
-    said, clean = io.StringIO(), dict(os.environ)
-    os.environ.update(environment)
-    signal.alarm(30)
-    with contextlib.redirect_stderr(said):
-        try:
-            status = main(arguments)
-        except SystemExit as end:
-            status = end.code
-        except BaseException:
-            status = traceback.print_exc()
-    signal.alarm(0)
-    os.environ.clear()
-    os.environ.update(clean)
-    answers.append([status, said.getvalue()])
-json.dump(answers, sys.stdout)
-"""
-"""Script that runs all commands in a single process, because each process takes seconds to start."""
-
 
 @pytest.fixture(scope="module")
-def outcomes(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, tuple[int | str | None, str]]:
-    """Return exit status and standard error of every case."""
+def places(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, str]]:
+    """Yield what ``DATA``, ``HERE`` and ``TAKEN`` stand for."""
     folder = tmp_path_factory.mktemp("settings")
     for name, content in FILES.items():
         (folder / name).write_bytes(content)
     with socket.create_server(("127.0.0.1", 0)) as taken:
-        values = {"DATA": str(tiny_root), "HERE": str(folder), "TAKEN": str(taken.getsockname()[1])}
+        yield {"DATA": str(tiny_root), "HERE": str(folder), "TAKEN": str(taken.getsockname()[1])}
 
-        def arguments(case: Case) -> list[str]:
-            words = f"{case.command} {case.options}".split()
-            return [re.sub("DATA|HERE|TAKEN", lambda match: values[match[0]], word) for word in words]
 
-        process = subprocess.run(
-            [sys.executable, "-c", _RUNNER],
-            input=json.dumps([(arguments(case), case.environment) for case in CASES.values()]),
-            capture_output=True,
-            text=True,
-            timeout=120,
-            env={name: value for name, value in os.environ.items() if not name.startswith(PREFIX)},
-        )
-    assert process.returncode == 0, process.stderr
-    return dict(zip(CASES, json.loads(process.stdout), strict=True))
+@pytest.fixture
+def _time_limit() -> Iterator[None]:
+    """Fail a command that serves instead of failing."""
+    former = signal.signal(signal.SIGALRM, lambda *_: pytest.fail("the command did not fail within 60 s"))
+    signal.alarm(60)
+    yield
+    signal.alarm(0)
+    signal.signal(signal.SIGALRM, former)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.usefixtures("_time_limit")
+@pytest.mark.parametrize("case", CASES.values(), ids=CASES)
 def test_invalid_settings_exit_2_with_message(
-    name: str, outcomes: dict[str, tuple[int | str | None, str]]
+    case: Case, places: dict[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    status, stderr = outcomes[name]
-    assert status == 2, stderr
-    lines = [line for line in stderr.splitlines() if not line.startswith("{")]
-    assert lines[0].startswith("error: "), stderr
+    for name, value in case.environment.items():
+        monkeypatch.setenv(name, value)
+    words = f"{case.command} {case.options}".split()
+    process = run(*(re.sub("DATA|HERE|TAKEN", lambda match: places[match[0]], word) for word in words))
+    assert process.returncode == 2, process.stderr
+    lines = [line for line in process.stderr.splitlines() if not line.startswith("{")]
+    assert lines[0].startswith("error: "), process.stderr
     assert sum(line.startswith("error:") for line in lines) == 1
-    assert re.search(CASES[name].words, stderr), stderr
-    assert "Traceback" not in stderr
-    assert PASSWORD not in stderr
-
-
-@pytest.mark.slow
-def test_token_command_creates_database(tmp_path: Path) -> None:
-    command = [sys.executable, "-m", "leaderboard", "token", "me", "--state-dir", str(tmp_path / "new")]
-    process = subprocess.run(command, capture_output=True, text=True, check=True)
-    assert re.fullmatch(r"rdb_[\w-]{43}\n", process.stdout), "the token alone goes to standard output"
-    assert (tmp_path / "new" / "leaderboard.sqlite").is_file()
+    assert re.search(case.words, process.stderr), process.stderr
+    assert "Traceback" not in process.stderr
+    assert PASSWORD not in process.stderr
 
 
 @pytest.fixture
@@ -208,15 +165,32 @@ def example_value(name: str) -> str:
     return special.get(name, "17" if kind in (int, float, ByteSize) else "something")
 
 
+@pytest.fixture
+def served(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[..., Settings]:
+    """Return the settings with which the command ``serve`` starts the server, which does not run here."""
+    started: list[Settings] = []
+    monkeypatch.setattr("leaderboard.web.server.serve", started.append)
+
+    def serve(*options: str) -> Settings:
+        process = run("serve", "--data", "x", "--state-dir", tmp_path / "state", *options)
+        assert process.returncode == 0, process.stderr
+        return started[-1]
+
+    return serve
+
+
+def test_switches_need_no_value(served: Callable[..., Settings]) -> None:
+    settings = served("--hidden-truth", "--rescore")
+    assert (settings.hidden_truth, settings.rescore) == (True, True)
+
+
 @pytest.mark.parametrize("name", Settings.model_fields)
 def test_every_setting_is_read_from_every_source(
-    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, served: Callable[..., Settings], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    value = example_value(name)
     rest: dict[str, Any] = {} if name == "data" else {"data": "x"}
-    option = f"--{name.replace('_', '-')}"
-    parsed = getattr(argument_parser().parse_args(["serve", option, value]), name)
-    by_command = getattr(read_settings(None, {**rest, name: parsed}), name)
+    value = example_value(name).replace("/elsewhere", str(tmp_path / "elsewhere"))
+    by_command = getattr(served(f"--{name.replace('_', '-')}", value), name)
     (tmp_path / "one.toml").write_text(f"{name} = {value if value.isdigit() else repr(value)}\n")
     assert getattr(read_settings(tmp_path / "one.toml", rest), name) == by_command
     monkeypatch.setenv(PREFIX + name.upper(), value)
@@ -225,25 +199,28 @@ def test_every_setting_is_read_from_every_source(
     assert Settings.model_fields[name].default != by_command
 
 
-@pytest.mark.parametrize("option", ["--hidden-truth", "--rescore"])
-def test_switches_need_no_value(option: str) -> None:
-    parsed = argument_parser().parse_args(["serve", option, "--data", "x"])
-    name = option.removeprefix("--").replace("-", "_")
-    assert getattr(read_settings(None, {"data": parsed.data, name: getattr(parsed, name)}), name) is True
+def help_of(*command: str) -> str:
+    """Return the help of a command on one line."""
+    process = run(*command, "--help")
+    assert process.returncode == 0
+    return " ".join(process.stdout.split())
 
 
-@pytest.mark.parametrize("command", COMMANDS)
-def test_help_shows_every_setting_with_its_default(command: str, capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as end:
-        argument_parser().parse_args([command, "--help"])
-    assert end.value.code == 0
-    shown = " ".join(capsys.readouterr().out.split())
-    for name in COMMANDS[command].settings:
-        default = Settings.model_fields[name].default
-        assert f"--{name.replace('_', '-')} " in shown
-        if default not in ("", None) and not Settings.model_fields[name].is_required():
-            assert f"(default: {default})" in shown, name
-    assert command != "serve" or set(COMMANDS["serve"].settings) == set(Settings.model_fields)
+def test_help_shows_every_setting_with_its_default() -> None:
+    shown = {command: help_of(command) for command in re.findall(r"^    ([a-z]+)", run("--help").stdout, re.M)}
+    assert {"serve", "score", "token", "tokens", "submissions", "prune", "check", "remove", "backup"} == set(shown)
+    for name, field_info in Settings.model_fields.items():
+        default, option = field_info.default, f"--{name.replace('_', '-')} "
+        assert option in shown["serve"]
+        for command, text in shown.items():
+            if option in text and default not in ("", None) and not field_info.is_required():
+                assert f"(default: {default})" in text, (command, name)
+
+
+@pytest.mark.parametrize("rate", ["0/minute", "1/second;9/minute", "many", ""])
+def test_invalid_rate_limits_are_rejected(rate: str) -> None:
+    with pytest.raises(InputError, match="write_rate_limit: expected a rate"):
+        read_settings(None, {"data": "x", "write_rate_limit": rate})
 
 
 @pytest.mark.parametrize("rate", ["600/minute", "10/second", "1 per 2 hours", "5/day"])
@@ -258,7 +235,10 @@ def test_postgresql_urls_use_psycopg(url: str) -> None:
     assert database_url.split("://")[1] == url.split("://")[1]
 
 
-@pytest.mark.parametrize("url", [f"postgres://u:{PASSWORD}@h/x", "sqlite:///", "sqlite:///?mode=memory"])
+@pytest.mark.parametrize(
+    "url",
+    [f"postgres://u:{PASSWORD}@h/x", f"u:{PASSWORD}@h/x", "sqlite://", "sqlite:///", "sqlite:///?mode=memory"],
+)
 def test_invalid_database_urls_are_rejected(url: str) -> None:
     with pytest.raises(InputError, match="db: expected sqlite:///PATH or postgresql://") as refusal:
         read_settings(None, {"data": "x", "db": url})

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import re
 import socketserver
@@ -10,10 +11,23 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from io import BufferedIOBase
+from pathlib import Path
+from typing import Any
+
+from rebar_depth_bench.cli.main import main
 
 Send = Callable[[BufferedIOBase], None]
 """Function that writes an answer to a connection."""
 ID = "5f0c9a7e2b4d4c1f8e6a3d2b1c0f9e8d"
+TOKEN = "rdb_secret-of-the-user"
+URL = f"https://example.org/submissions/{ID}"
+TOKEN_INFO = {
+    "name": "alice",
+    "quota": 10,
+    "quota_left": 9,
+    "max_upload_bytes": 1 << 30,
+    "read_rate_limit": "9/minute",
+}
 
 
 @dataclass
@@ -31,6 +45,10 @@ class ScriptedServer:
         """Return the endpoints that were asked, in order."""
         return [endpoint for endpoint, _ in self.requests]
 
+    def submit(self, archive: Path, *options: str) -> int:
+        """Run ``rebar-bench submit`` in this process; return its exit status."""
+        return main(["submit", str(archive), "--url", self.url, *options])
+
 
 def answer(
     content: object, status: int = 200, headers: Mapping[str, str] | None = None, reason: str = "Answer"
@@ -40,6 +58,13 @@ def answer(
     lines = {"Content-Length": str(len(body)), "Connection": "close", **(headers or {})}
     head = "".join(f"{name}: {value}\r\n" for name, value in lines.items())
     return f"HTTP/1.1 {status} {reason}\r\n{head}\r\n".encode() + body
+
+
+def submission(archive: Path, **changes: Any) -> dict[str, Any]:
+    """Return the JSON of an accepted submission with some values changed; a value of ``...`` is left out."""
+    sha256 = hashlib.sha256(archive.read_bytes()).hexdigest()
+    values = {"id": ID, "status": "queued", "url": URL, "method": "m", "reason": None, "archive_sha256": sha256}
+    return {key: value for key, value in {**values, **changes}.items() if value is not ...}
 
 
 @contextmanager

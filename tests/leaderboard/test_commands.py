@@ -1,18 +1,23 @@
-"""Commands of operators: tokens, submissions, prune, check."""
+"""Commands of operators, and shutdown and recovery of the service."""
 
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import os
+import re
 import shutil
+import signal
 import sqlite3
 import subprocess
-import sys
 import time
 from collections.abc import Iterator
-from contextlib import closing
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from pathlib import Path
+from threading import Event
 
 import httpx2
 import pytest
@@ -20,12 +25,8 @@ import pytest
 from rebar_depth_bench.data.manifest import open_folder
 from tests.leaderboard.boards import add_submission, board_settings, make_board
 from tests.leaderboard.conftest import WriteArchive
-from tests.leaderboard.serving import RunServer, Server
-
-
-def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "leaderboard", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, check=False)
+from tests.leaderboard.serving import API, SCORING, RunServer, Server, distinct_archive, run
+from tests.processes import is_running, processes_below, wait_until
 
 
 def table(process: subprocess.CompletedProcess[str]) -> list[dict[str, str]]:
@@ -34,13 +35,8 @@ def table(process: subprocess.CompletedProcess[str]) -> list[dict[str, str]]:
 
 
 @pytest.fixture(scope="module")
-def server(
-    tiny_root: Path,
-    tmp_path_factory: pytest.TempPathFactory,
-    running_server: RunServer,
-) -> Iterator[Server]:
-    state = tmp_path_factory.mktemp("operations") / "state"
-    with running_server(tiny_root, state, default_visibility="owner") as started:
+def server(running_server: RunServer) -> Iterator[Server]:
+    with running_server(default_visibility="owner") as started:
         yield started
 
 
@@ -48,16 +44,12 @@ def server(
 def scored(server: Server, write_archive: WriteArchive) -> dict[str, str]:
     """Return the ids of three scored submissions by their method, of which two are public."""
     token = server.token("alice")
-    scales = {"best": 1.0, "middle": 1.2, "worst": 2.0}
-    ids = {
-        name: server.submit_accepted(write_archive(name, scale, configs=("lattice-orbit",)), token)
-        for name, scale in scales.items()
-    }
-    for submission_id in ids.values():
-        assert server.wait_until_ended(submission_id)["status"] == "scored"
+    ids = {}
+    for name, scale in {"best": 1.0, "middle": 1.2, "worst": 2.0}.items():
+        ids[name] = server.submit_accepted(write_archive(name, scale, configs=("lattice-orbit",)), token)
+        assert server.wait_until_ended(ids[name])["status"] == "scored"
     for name in ("best", "worst"):
-        address, headers = f"{server.url}/api/v1/submissions/{ids[name]}", {"Authorization": f"Bearer {token}"}
-        assert httpx2.patch(address, json={"public": True}, headers=headers).status_code == 200
+        assert server.call("PATCH", f"{API}/{ids[name]}", token, json={"public": True}).status_code == 200
     return ids
 
 
@@ -204,17 +196,14 @@ def test_older_database_keeps_newer_archives(
     tiny_root: Path, tmp_path: Path, small_archive: Path, running_server: RunServer
 ) -> None:
     state = tmp_path / "state"
-    with running_server(tiny_root, state, workers=0) as server:
+    with running_server(state, workers=0) as server:
         token = server.token("alice")
         old = server.submit_accepted(small_archive, token)
-    shutil.copy(state / "leaderboard.sqlite", tmp_path / "older.sqlite")
-    with running_server(tiny_root, state, workers=0) as server:
+        run("backup", tmp_path / "backup", "--state-dir", state)
         newer = server.submit_accepted(small_archive, token)
-        assert server.process.poll() is None
-    shutil.copy(tmp_path / "older.sqlite", state / "leaderboard.sqlite")
-    archive = state / "archives" / f"{newer}.zip"
-    os.utime(archive, (0, 0))
-    with running_server(tiny_root, state, workers=0) as server:
+    shutil.copy(tmp_path / "backup" / "leaderboard.sqlite", state / "leaderboard.sqlite")
+    os.utime(state / "archives" / f"{newer}.zip", (0, 0))
+    with running_server(state, workers=0):
         assert run("check", "--state-dir", state, "--data", tiny_root).stderr.count(newer) == 1
     assert {path.stem for path in (state / "archives").iterdir()} == {old, newer}
 
@@ -224,3 +213,124 @@ def test_permissive_state_folder_is_refused(tmp_path: Path) -> None:
     process = run("tokens", "--state-dir", tmp_path / "state")
     assert process.returncode == 2
     assert "has mode 0755, expected 0700" in process.stderr
+
+
+def test_token_is_printed_once_and_stored_as_hash(tmp_path: Path) -> None:
+    state = tmp_path / "new"
+    first = run("token", "alice", "--state-dir", state)
+    token = first.stdout.strip()
+    assert first.returncode == 0
+    assert re.fullmatch(r"rdb_[\w-]{43}\n", first.stdout), "the token alone goes to standard output"
+    assert token not in first.stderr
+    assert state.stat().st_mode & 0o077 == 0
+    second = run("token", "alice", "--state-dir", state)
+    assert (second.returncode, second.stdout) == (2, "")
+    assert second.stderr.startswith("error: a token for 'alice' already exists")
+    stored = b"".join(path.read_bytes() for path in state.rglob("*") if path.is_file())
+    assert hashlib.sha256(token.encode()).hexdigest().encode() in stored
+    for part in (token, token.removeprefix("rdb_")):
+        assert part.encode() not in stored
+
+
+def test_removed_submission_is_404(small_archive: Path, running_server: RunServer) -> None:
+    with running_server(workers=0) as server:
+        submission = server.submit_accepted(small_archive, server.token("alice"))
+        removed = run("remove", submission, "--state-dir", server.state)
+        assert (removed.returncode, removed.stderr) == (0, "")
+        assert server.get(f"{API}/{submission}").status_code == 404
+        assert not list((server.state / "archives").iterdir())
+        again = run("remove", submission, "--state-dir", server.state)
+        assert (again.returncode, again.stderr) == (2, f"error: there is no submission {submission!r}\n")
+
+
+@dataclass
+class SlowUpload:
+    """Client that uploads an archive but waits for the event ``go_on`` before the last bytes."""
+
+    server: Server
+    token: str
+    archive: Path
+    go_on: Event
+
+    def __call__(self) -> httpx2.Response:
+        headers = {"Content-Type": "application/zip"}
+        return self.server.call("PUT", API, self.token, content=self._body(), headers=headers)
+
+    def _body(self) -> Iterator[bytes]:
+        content = self.archive.read_bytes()
+        yield content[:-100]
+        self.go_on.wait(60)
+        yield content[-100:]
+
+
+@contextmanager
+def upload_under_way(server: Server, token: str, archive: Path) -> Iterator[tuple[Event, Future[httpx2.Response]]]:
+    """Begin an upload; yield the event for which it waits, and its future response."""
+    go_on = Event()
+    with ThreadPoolExecutor() as threads:
+        response = threads.submit(SlowUpload(server, token, archive, go_on))
+        wait_until(lambda: any((server.state / "spool").glob("*.upload")), "the upload is under way")
+        try:
+            yield go_on, response
+        finally:
+            go_on.set()
+
+
+def test_sigterm_finishes_requests_and_requeues_job(small_archive: Path, running_server: RunServer) -> None:
+    with running_server() as server:
+        state, token = server.state, server.token("alice")
+        in_progress = server.submit_accepted(small_archive, token)
+        wait_until(lambda: processes_below(server.process.pid, SCORING), "scoring begins")
+        (scoring,) = processes_below(server.process.pid, SCORING)
+        os.kill(scoring, signal.SIGSTOP)  # It cannot finish before the service stops.
+        assert server.row(in_progress)["attempts"] == 1
+        with upload_under_way(server, token, distinct_archive(small_archive, 1)) as (go_on, future):
+            server.process.send_signal(signal.SIGTERM)
+            time.sleep(1)
+            assert server.process.poll() is None, "it did not wait for the upload"
+            go_on.set()
+            response = future.result(60)
+        assert response.status_code == 202, response.text
+        assert server.process.wait(30) == 0
+        assert not any("Traceback" in line for line in server.log), server.log
+    uploaded = response.json()["id"]
+    row = server.row(in_progress)
+    assert (row["status"], row["attempts"], row["scorer"], row["lease_until"]) == ("queued", 0, None, None)
+    assert server.row(uploaded)["status"] == "queued"
+    assert server.spool_files() == []
+    assert sorted(path.name for path in state.iterdir()) == ["archives", "leaderboard.sqlite", "spool"]
+    assert not Path(f"/proc/{scoring}").exists()
+    with running_server(state) as server:
+        for submission_id in (in_progress, uploaded):
+            assert server.wait_until_ended(submission_id)["status"] == "scored"
+    assert server.row(in_progress)["attempts"] == 1
+
+
+def test_next_server_clears_spool_of_killed_server(small_archive: Path, running_server: RunServer) -> None:
+    with running_server() as server:
+        token = server.token("alice")
+        server.submit_accepted(small_archive, token)
+        wait_until(lambda: processes_below(server.process.pid, SCORING), "scoring begins")
+        scoring = processes_below(server.process.pid, SCORING)
+        with upload_under_way(server, token, distinct_archive(small_archive, 1)) as (go_on, future):
+            server.process.kill()
+            server.process.wait()
+            wait_until(lambda: not any(map(is_running, scoring)), "its processes end", 20)
+            go_on.set()
+            with pytest.raises(httpx2.TransportError):
+                future.result(60)
+    assert server.spool_files(), "the killed server left nothing: the test shows too little"
+    with running_server(server.state, workers=0) as server:
+        assert server.spool_files() == []
+        server.submit_accepted(distinct_archive(small_archive, 2), token)
+
+
+def test_running_services_keep_each_others_spools(small_archive: Path, running_server: RunServer) -> None:
+    with running_server(workers=0) as first:
+        token = first.token("alice")
+        upload = upload_under_way(first, token, small_archive)
+        with upload as (go_on, future), running_server(first.state, workers=0) as second:
+            go_on.set()
+            response = future.result(60)
+            assert response.status_code == 202, response.text
+            assert second.get(f"{API}/{response.json()['id']}").status_code == 200

@@ -1,0 +1,356 @@
+"""Database on SQLite and PostgreSQL: schema, migration, tokens, quota, and the queue of jobs."""
+
+from __future__ import annotations
+
+import json
+import sqlite3
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing, contextmanager, suppress
+from pathlib import Path
+
+import pytest
+from alembic.autogenerate import compare_metadata
+from alembic.migration import MigrationContext
+from alembic.script import ScriptDirectory
+from sqlalchemy import Column, Engine, MetaData, String, create_engine, inspect
+
+from leaderboard.db import jobs, submissions
+from leaderboard.db.engine import MIGRATIONS, Database
+from leaderboard.db.jobs import MAX_ATTEMPTS
+from leaderboard.db.models import Base
+from leaderboard.db.rankings import picture_facts, picture_webp, read_ranking
+from leaderboard.db.submissions import Quota, QuotaExceededError
+from leaderboard.db.tokens import create_token, find_token, list_tokens, replace_token, revoke_token
+from leaderboard.scoring.sandbox import Outcome, ViewPicture
+from leaderboard.settings import MAX_LEASE_S
+from rebar_depth_bench.base.errors import InputError
+from tests.bench.reporting.results import result, scored_view
+from tests.leaderboard.boards import DIGEST, accept, board_settings, result_bytes
+
+LEASE_S = 60.0
+_MIGRATE = """
+import sys
+from leaderboard.db.engine import Database
+database = Database(sys.argv[1])
+print("ready", flush=True)
+sys.stdin.readline()
+database.migrate()
+"""
+
+
+@pytest.fixture
+def url(new_database: Callable[[], str], tmp_path: Path) -> str:
+    """Return the SQLAlchemy URL of an empty database."""
+    return board_settings(tmp_path, db=new_database()).database_url
+
+
+@pytest.fixture
+def database(url: str) -> Iterator[Database]:
+    with closing(Database(url)) as opened:
+        opened.migrate()
+        yield opened
+
+
+@pytest.fixture
+def alice(database: Database) -> str:
+    return create_token(database, "alice")
+
+
+@pytest.fixture
+def engine(url: str) -> Iterator[Engine]:
+    """Yield a separate engine for the database."""
+    new_engine = create_engine(url)
+    yield new_engine
+    new_engine.dispose()
+
+
+def differences(engine: Engine, metadata: MetaData) -> list[object]:
+    """Return the changes, including types and defaults, that Alembic would need to match ``metadata``."""
+    with engine.connect() as connection:
+        options = {"compare_type": True, "compare_server_default": True}
+        return list(compare_metadata(MigrationContext.configure(connection, opts=options), metadata))
+
+
+def test_migrated_schema_matches_models(url: str, engine: Engine) -> None:
+    """The comparison finds missing tables and columns; tables of other programs are left alone."""
+    with engine.begin() as connection:
+        connection.exec_driver_sql("CREATE TABLE foreign_table (id INTEGER)")
+    assert len(differences(engine, Base.metadata)) > len(Base.metadata.tables), "an empty database lacks them all"
+    for _ in range(2):
+        with closing(Database(url)) as database:
+            database.migrate()
+    tables = {*Base.metadata.tables, "alembic_version", "foreign_table"}
+    assert set(inspect(engine).get_table_names()) == tables
+    with engine.begin() as connection:
+        connection.exec_driver_sql("DROP TABLE foreign_table")
+    assert differences(engine, Base.metadata) == []
+    changed = MetaData()
+    for table in Base.metadata.tables.values():
+        table.to_metadata(changed)
+    changed.tables["tokens"].append_column(Column("forgotten", String(10)))
+    assert [step[0] for step in differences(engine, changed)] == ["add_column"]  # type: ignore[index]
+
+
+def test_repeated_migration_keeps_rows(url: str, database: Database, alice: str) -> None:
+    database.migrate()
+    with closing(Database(url)) as again:
+        again.migrate()
+        record = find_token(again, alice)
+    assert record is not None
+    assert record.name == "alice"
+
+
+@contextmanager
+def sqlite_write_lock(engine: Engine) -> Iterator[None]:
+    """Hold SQLite's write lock so that all concurrent migrations start before any of them can write."""
+    if engine.dialect.name != "sqlite":
+        yield
+        return
+    with closing(sqlite3.connect(str(engine.url.database), isolation_level=None)) as connection:
+        connection.execute("PRAGMA journal_mode=WAL")
+        connection.execute("BEGIN IMMEDIATE")
+        yield
+        time.sleep(1)
+        connection.execute("ROLLBACK")
+
+
+@pytest.mark.slow
+def test_concurrent_migrations_succeed(url: str, engine: Engine) -> None:
+    arguments, pipe = [sys.executable, "-c", _MIGRATE, url], subprocess.PIPE
+    processes = [subprocess.Popen(arguments, stdin=pipe, stdout=pipe, stderr=pipe, text=True) for _ in range(3)]
+    try:
+        for process in processes:
+            assert process.stdout is not None
+            assert process.stdout.readline() == "ready\n"
+        with sqlite_write_lock(engine):
+            for process in processes:
+                assert process.stdin is not None
+                process.stdin.write("\n")
+                process.stdin.flush()
+        for process in processes:
+            _, stderr = process.communicate(timeout=60)
+            assert process.returncode == 0, stderr
+    finally:
+        for process in processes:
+            process.kill()
+            process.communicate()
+    assert differences(engine, Base.metadata) == []
+
+
+@pytest.mark.parametrize(
+    ("change", "found"),
+    [
+        ("UPDATE alembic_version SET version_num = '0003'", "the schema of revision 0003"),
+        ("DELETE FROM alembic_version", "a schema without a revision"),
+        ("DROP TABLE alembic_version", "a schema without a revision"),
+    ],
+)
+def test_database_of_another_revision_is_refused(
+    database: Database, engine: Engine, change: str, found: str
+) -> None:
+    with engine.begin() as connection:
+        connection.exec_driver_sql(change)
+    for use in (database.migrate, database.check_schema):
+        with pytest.raises(InputError, match=f"the database has {found}, expected 0004, or a new database"):
+            use()
+    assert set(Base.metadata.tables) <= set(inspect(engine).get_table_names())
+
+
+def test_migrations_have_one_base() -> None:
+    scripts = ScriptDirectory(str(MIGRATIONS))
+    assert (scripts.get_heads(), scripts.get_bases()) == (["0004"], ["0004"])
+
+
+def queue(database: Database, token: str, count: int) -> list[str]:
+    return [accept(database, token) for _ in range(count)]
+
+
+def status_and_reason(database: Database, submission_id: str) -> tuple[str, str | None]:
+    record = submissions.find(database, submission_id)
+    assert record is not None
+    return record.status, record.reason
+
+
+@pytest.mark.slow
+def test_each_job_is_claimed_by_one_scorer(database: Database, alice: str) -> None:
+    ids = queue(database, alice, 40)
+
+    def take(name: str) -> list[str]:
+        claimed = []
+        while submission_id := jobs.claim(database, name, LEASE_S):
+            claimed.append(submission_id)
+            assert jobs.renew(database, submission_id, name, LEASE_S)
+            assert jobs.finish(database, submission_id, name, Outcome(reason=name))
+        return claimed
+
+    with ThreadPoolExecutor(8) as pool:
+        claimed_by_scorer = list(pool.map(take, [f"s{k}" for k in range(8)]))
+    assert sorted(submission_id for claimed in claimed_by_scorer for submission_id in claimed) == sorted(ids)
+    for k, claimed in enumerate(claimed_by_scorer):
+        assert {status_and_reason(database, submission_id)[1] for submission_id in claimed} <= {f"s{k}"}
+
+
+def test_scorer_with_expired_lease_cannot_finish(database: Database, alice: str) -> None:
+    [submission_id] = queue(database, alice, 1)
+    assert jobs.claim(database, "slow", 0.05) == submission_id
+    time.sleep(0.1)
+    assert jobs.claim(database, "quick", LEASE_S) == submission_id
+    assert not jobs.renew(database, submission_id, "slow", LEASE_S)
+    assert not jobs.finish(database, submission_id, "slow", Outcome(reason="slow"))
+    jobs.release(database, submission_id, "slow")
+    assert status_and_reason(database, submission_id)[0] == "scoring"
+    assert jobs.finish(database, submission_id, "quick", Outcome(reason="quick"))
+    assert not jobs.finish(database, submission_id, "quick", Outcome(reason="twice"))
+    assert status_and_reason(database, submission_id) == ("failed", "quick")
+
+
+def test_expired_unclaimed_lease_can_be_renewed(database: Database, alice: str) -> None:
+    [submission_id] = queue(database, alice, 1)
+    assert jobs.claim(database, "s", 0.01) == submission_id
+    time.sleep(0.05)
+    assert jobs.renew(database, submission_id, "s", LEASE_S)
+    assert jobs.claim(database, "other", LEASE_S) is None
+
+
+def test_job_fails_after_max_attempts_and_next_is_claimed(database: Database, alice: str) -> None:
+    [bad] = queue(database, alice, 1)
+    for _ in range(MAX_ATTEMPTS):
+        assert jobs.claim(database, "s", 0.0) == bad
+        time.sleep(0.01)
+    [good] = queue(database, alice, 1)
+    assert [jobs.claim(database, "s", LEASE_S) for _ in range(2)] == [good, None]
+    reason = f"scoring was started {MAX_ATTEMPTS} times but never finished"
+    assert status_and_reason(database, bad) == ("failed", reason)
+
+
+def test_jobs_are_claimed_by_age_and_that_of_a_dead_scorer_last(database: Database, alice: str) -> None:
+    bad, second, third = queue(database, alice, 3)
+    assert jobs.claim(database, "s", 0.0) == bad
+    time.sleep(0.01)
+    assert [jobs.claim(database, "s", LEASE_S) for _ in range(4)] == [second, third, bad, None]
+
+
+def test_released_job_costs_no_attempt(database: Database, alice: str) -> None:
+    [submission_id] = queue(database, alice, 1)
+    for _ in range(3 * MAX_ATTEMPTS):
+        assert jobs.claim(database, "s", LEASE_S) == submission_id
+        jobs.release(database, submission_id, "s")
+    record = submissions.find(database, submission_id)
+    assert record is not None
+    assert (record.status, record.attempts) == ("queued", 0)
+
+
+def test_released_job_with_wait_is_claimed_later(database: Database, alice: str) -> None:
+    first, second = queue(database, alice, 2)
+    assert jobs.claim(database, "s", LEASE_S) == first
+    jobs.release(database, first, "s", wait_s=0.2)
+    assert [jobs.claim(database, "s", LEASE_S) for _ in range(2)] == [second, None]
+    time.sleep(0.3)
+    assert jobs.claim(database, "s", LEASE_S) == first
+
+
+def test_job_scored_twice_has_one_result(database: Database, alice: str) -> None:
+    [submission_id] = queue(database, alice, 1)
+    first, second = (result(scored_view("lattice/0000", error)).to_json() for error in (0.5, 0.25))
+    jobs.claim(database, "a", 0.0)
+    time.sleep(0.01)
+    jobs.claim(database, "b", LEASE_S)
+    pictures = [ViewPicture("lattice/0000", '{"near": "1 m"}', {"error": b"webp", "truth": b"true"})]
+    assert jobs.finish(database, submission_id, "b", Outcome(second, ["a note"], pictures))
+    assert not jobs.finish(database, submission_id, "a", Outcome(result=first))
+    assert submissions.result_json(database, submission_id) == second
+    assert submissions.result_notes(database, submission_id) == ["a note"]
+    assert picture_facts(database, submission_id) == {"lattice/0000": ({"near": "1 m"}, ["error", "truth"])}
+    assert picture_webp(database, submission_id, "lattice/0000", "truth") == b"true"
+    [row] = read_ranking(database, "lattice", DIGEST).entries
+    assert json.loads(row.table_json) == json.loads(second)["tables"]["lattice"]
+
+
+def test_submission_deleted_while_scoring_stays_deleted(database: Database, alice: str) -> None:
+    [submission_id] = queue(database, alice, 1)
+    jobs.claim(database, "s", LEASE_S)
+    submissions.remove(database, submission_id)
+    assert not jobs.renew(database, submission_id, "s", LEASE_S)
+    assert not jobs.finish(database, submission_id, "s", Outcome(result=result_bytes(DIGEST)))
+    assert submissions.find(database, submission_id) is None
+    assert submissions.result_json(database, submission_id) is None
+    assert read_ranking(database, "lattice", DIGEST).entries == ()
+
+
+@pytest.mark.parametrize("status", ["queued", "scoring"])
+def test_clock_that_was_set_back_blocks_no_job(
+    database: Database, alice: str, monkeypatch: pytest.MonkeyPatch, status: str
+) -> None:
+    [submission_id] = queue(database, alice, 1)
+    assert jobs.claim(database, "s", MAX_LEASE_S) == submission_id
+    if status == "queued":
+        jobs.release(database, submission_id, "s", wait_s=MAX_LEASE_S)
+    assert jobs.claim(database, "other", 1.0) is None, "a lease of another worker may be longer"
+    yesterday = time.time() - 86400
+    monkeypatch.setattr(time, "time", lambda: yesterday)
+    assert status_and_reason(database, submission_id)[0] == status
+    assert jobs.claim(database, "other", LEASE_S) == submission_id
+
+
+def test_quota_holds_for_concurrent_uploads_and_counts_bytes(database: Database, alice: str) -> None:
+    def try_one(_: int) -> bool:
+        with suppress(QuotaExceededError):
+            accept(database, alice, quota=Quota(3, 1000))
+            return True
+        return False
+
+    with ThreadPoolExecutor(12) as pool:
+        assert sum(pool.map(try_one, range(12))) == 3
+    with pytest.raises(QuotaExceededError, match="19 bytes"):
+        accept(database, alice, quota=Quota(1000, 19))
+    accept(database, alice, quota=Quota(1000, 20))
+
+
+def test_concurrent_uploads_of_one_archive_are_one_submission(database: Database, alice: str) -> None:
+    with ThreadPoolExecutor(8) as pool:
+        assert len(set(pool.map(lambda _: accept(database, alice, sha256="ab" * 32), range(8)))) == 1
+    record = find_token(database, alice)
+    assert record is not None
+    assert len(submissions.of_token(database, record)) == 1
+
+
+def test_failed_and_deleted_archives_may_be_sent_again(database: Database, alice: str) -> None:
+    first = accept(database, alice, sha256="ab" * 32)
+    assert jobs.claim(database, "s", LEASE_S) == first
+    jobs.finish(database, first, "s", Outcome(reason="no time"))
+    second = accept(database, alice, sha256="ab" * 32)
+    submissions.remove(database, second)
+    assert len({first, second, accept(database, alice, sha256="ab" * 32)}) == 3
+
+
+def test_token_is_found_only_by_exact_value(database: Database, alice: str) -> None:
+    assert find_token(database, alice) is not None
+    others = (alice[:-1], alice + "x", alice.lower(), "", "alice")
+    assert [find_token(database, other) for other in others] == [None] * 5
+
+
+def test_revoked_or_replaced_token_is_void(database: Database, alice: str) -> None:
+    revoke_token(database, "alice")
+    assert find_token(database, alice) is None
+    [(name, _, revoked_at, *amounts)] = list_tokens(database)
+    assert (name, revoked_at is None, amounts) == ("alice", False, [0, 0])
+    second = replace_token(database, "alice")
+    third = replace_token(database, "alice")
+    record = find_token(database, third)
+    assert record is not None
+    assert (record.name, find_token(database, second)) == ("alice", None)
+    for change in (revoke_token, replace_token):
+        with pytest.raises(InputError, match="no token for 'eve'"):
+            change(database, "eve")
+
+
+@pytest.mark.parametrize("name", ["", " ", "x" * 101, "a\udcff", "a\0"])
+def test_impossible_token_names_are_refused_in_words(database: Database, name: str) -> None:
+    for make in (create_token, replace_token, revoke_token):
+        with pytest.raises(InputError, match="the token name is"):
+            make(database, name)
+    assert list_tokens(database) == []

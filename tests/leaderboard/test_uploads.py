@@ -1,0 +1,334 @@
+"""Malformed and refused uploads: each client gets a response, also one that still sends, and no file is left."""
+
+from __future__ import annotations
+
+import subprocess
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import httpx2
+import numpy as np
+import pytest
+
+from tests import requirements
+from tests.leaderboard.serving import (
+    API,
+    BOUNDARY,
+    DISPOSITION,
+    END,
+    MULTIPART,
+    RawResponse,
+    RunServer,
+    Server,
+    chunked,
+    connect,
+    exchange,
+    multipart_part,
+    read_response,
+    request_head,
+)
+from tests.processes import wait_until
+
+QUOTA, MAX_UPLOAD_BYTES = 3, 4_000_000
+CHUNK = bytes(1 << 16)
+BEFORE, AFTER = (multipart_part(b"|") + END).split(b"|")
+"""Bytes before and after the content of the archive in a multipart body."""
+FIELD = 'Content-Disposition: form-data; name="{}"'
+NOTE, TOKEN = FIELD.format("note"), FIELD.format("token")
+
+
+@dataclass(frozen=True)
+class UploadServer:
+    """Server without workers, a token, one whose quota is used up, and a valid archive."""
+
+    server: Server
+    token: str
+    spent: str
+    sound: bytes
+
+    def post(
+        self, body: bytes, *headers: str, kind: str = MULTIPART, path: str = API, length: int | None = None
+    ) -> RawResponse:
+        """Post a body, with Content-Length unless ``headers`` are given; missing bytes are not sent."""
+        length_headers = () if headers else (f"Content-Length: {len(body) if length is None else length}",)
+        lines = (f"Authorization: Bearer {self.token}", f"Content-Type: {kind}", *length_headers, *headers)
+        ends = length is not None and length > len(body)
+        return exchange(self.server.url, request_head(path, lines) + body, ends=ends)
+
+
+@pytest.fixture(scope="module")
+def uploads(small_archive: Path, running_server: RunServer) -> Iterator[UploadServer]:
+    with running_server(workers=0, quota=QUOTA, max_upload=MAX_UPLOAD_BYTES) as server:
+        spent = server.token("spent")
+        for _ in range(QUOTA):
+            server.submit_accepted(small_archive, spent)
+        yield UploadServer(server, server.token("stranger"), spent, small_archive.read_bytes())
+        assert not any("Traceback" in line or '"error"' in line for line in server.log)
+
+
+@pytest.fixture(autouse=True)
+def _leaves_nothing(uploads: UploadServer) -> Iterator[None]:
+    yield  # A broken connection is noticed with a delay.
+    wait_until(lambda: not uploads.server.spool_files(), "the spool is empty", 10)
+    assert uploads.server.get("/healthz").status_code == 200
+
+
+@pytest.mark.parametrize(
+    ("kind", "words"),
+    [
+        ("multipart/form-data", "expected multipart/form-data"),
+        ('multipart/form-data; boundary=""', "expected multipart/form-data"),
+        ("multipart/form-data; boundary*=utf-8''XX", "expected multipart/form-data"),
+        ("multipart/form-data; boundary=" + "X" * 10_000, "bytes outside the field"),
+        ("multipart/form-data; boundary=YY", "bytes outside the field"),
+        ("multipart/mixed; boundary=XX", "expected multipart/form-data"),
+        ("\xff\xfe", "expected multipart/form-data"),
+        ("", "expected multipart/form-data"),
+    ],
+)
+def test_non_multipart_content_type_is_422(uploads: UploadServer, kind: str, words: str) -> None:
+    response = uploads.post(multipart_part(uploads.sound) + END, kind=kind)
+    assert response.status == 422
+    assert words in response.text
+
+
+BAD_BODIES = {
+    "empty": b"",
+    "no part": END,
+    "no field archive": multipart_part(b"x", FIELD.format("file")) + END,
+    "no disposition": multipart_part(b"x", "Content-Type: application/zip") + END,
+    "name of another spelling": multipart_part(b"x", "Content-Disposition: form-data; name*=utf-8''archive") + END,
+    "field twice": multipart_part(b"x") + multipart_part(b"x") + END,
+    "field twice, the second empty": multipart_part(b"x") + multipart_part(b"") + END,
+    "70 KB of another field": multipart_part(b"x" * 70_000, NOTE) + multipart_part(b"x") + END,
+    "2000 fields": multipart_part(b"", NOTE) * 2000 + multipart_part(b"x") + END,
+    "70 KB after the end": multipart_part(b"x") + END + b"y" * 70_000,
+    "header of 300 KB": multipart_part(b"x", "X: " + "y" * 300_000, DISPOSITION) + END,
+    "1000 headers": multipart_part(b"x", *[f"X-{number}: y" for number in range(1000)], DISPOSITION) + END,
+    "header without colon": multipart_part(b"x", "Content-Disposition") + END,
+    "NUL in a header's name": multipart_part(b"x", "Content\0Disposition: form-data") + END,
+    "bare line feeds": (multipart_part(b"x") + END).replace(b"\r\n", b"\n"),
+    "junk in front": b"junk" + multipart_part(b"x") + END,
+    "end missing": multipart_part(b"x"),
+    "end in a header": multipart_part(b"x")[:30],
+    "end in the boundary": multipart_part(b"x") + END[:3],
+    "content that is no zip": multipart_part(b"x") + END,
+    "boundary inside": multipart_part(f"a\r\n--{BOUNDARY}--\r\nb".encode()) + END,
+}
+
+
+@pytest.mark.parametrize("body", BAD_BODIES.values(), ids=BAD_BODIES)
+def test_malformed_multipart_body_is_422(uploads: UploadServer, body: bytes) -> None:
+    pieces = (body[start : start + 999] for start in range(0, len(body), 999))
+    for response in (uploads.post(body), uploads.post(chunked(*pieces), "Transfer-Encoding: chunked")):
+        assert response.status == 422, response.text
+        assert '"problems":["' in response.text
+    form = uploads.post(multipart_part(uploads.token.encode(), TOKEN) + body, path="/submit")
+    assert form.status in (401, 422)  # 401 if the body ends before the token does.
+    assert "<html" in form.text
+
+
+@pytest.mark.parametrize(
+    "disposition",
+    [
+        'Content-Disposition: form-data; name="archive"; filename="../../../../../../tmp/escaped.zip"',
+        'Content-Disposition: form-data; name="archive"; filename="C:\\up.zip"; filename*=utf-8\'\'%2e%2e%2fup',
+        "content-disposition: form-data; name=archive",
+        'CONTENT-DISPOSITION:form-data;name="archive";x="' + "y" * 3000 + '"',
+    ],
+)
+def test_file_names_extra_fields_and_epilogue_are_ignored(uploads: UploadServer, disposition: str) -> None:
+    note = multipart_part(b"y" * 20_000, NOTE)
+    body = note + multipart_part(uploads.sound, disposition) + note + END + b"epilogue"
+    assert uploads.post(body).status in (200, 202)
+    assert not list(Path("/tmp").glob("escaped*"))
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        (("Content-Length: -1",), 400),
+        (("Content-Length: ten",), 400),
+        (("Content-Length: 10", "Content-Length: 11"), 400),
+        (("Content-Length: 9" + "9" * 18,), 413),
+        (("Content-Length: 9" + "9" * 300,), 400),
+        (("Transfer-Encoding: gzip",), 400),
+        (("Transfer-Encoding: chunked", "Transfer-Encoding: chunked"), 400),
+        (("X: " + "y" * 1_000_000, "Content-Length: 0"), 400),
+    ],
+)
+def test_invalid_lengths_are_rejected(uploads: UploadServer, headers: tuple[str, ...], status: int) -> None:
+    assert uploads.post(multipart_part(b"x") + END, *headers).status == status
+
+
+@pytest.mark.parametrize(
+    "body", [b"zz\r\nxx\r\n0\r\n\r\n", b"3\r\nxxxxxx\r\n0\r\n\r\n", b"-1\r\nx\r\n", b"5;" + b"y" * 100_000]
+)
+def test_invalid_chunks_are_400(uploads: UploadServer, body: bytes) -> None:
+    assert uploads.post(body, "Transfer-Encoding: chunked").status == 400
+
+
+def test_wrong_content_length_is_rejected(uploads: UploadServer) -> None:
+    body = multipart_part(uploads.sound) + END
+    assert uploads.post(body, length=len(body) - 60).status == 422
+    assert uploads.post(body, length=len(body) + 60).status is None  # It was closed before a response.
+
+
+@pytest.mark.parametrize(
+    ("after", "status", "words"),
+    [
+        (b"\r\n" + END + b"y" * 10_000_000, 422, "more than 65536 bytes outside"),
+        (b"y" * 10_000_000, 413, f"larger than {MAX_UPLOAD_BYTES} bytes"),
+        (b"\r\n" + multipart_part(b"", NOTE) * 100_000, 422, "more than 65536 bytes outside"),
+    ],
+    ids=["after the end", "in the archive", "in other fields"],
+)
+def test_body_size_is_limited_everywhere(uploads: UploadServer, after: bytes, status: int, words: str) -> None:
+    body = BEFORE + uploads.sound + after
+    pieces = [body[offset : offset + 60_000] for offset in range(0, len(body), 60_000)]
+    response = uploads.post(chunked(*pieces), "Transfer-Encoding: chunked")
+    assert response.status == status
+    assert words in response.text
+
+
+def test_randomly_damaged_body_is_422(uploads: UploadServer) -> None:
+    random = np.random.default_rng(20261122)
+    valid_body = multipart_part(b"PK\3\4", DISPOSITION, "Content-Type: application/zip") + END
+    for _ in range(40):
+        body = bytearray(valid_body)
+        for position in random.integers(len(body), size=random.integers(1, 6)):
+            body[position] = random.choice(np.frombuffer(b'\0\r\n:;="-\\ \t\xffX', np.uint8))
+        assert uploads.post(bytes(body)).status == 422, bytes(body)
+
+
+@dataclass(frozen=True)
+class Refused:
+    """Upload that is refused before it is complete: its response, token, bytes, and whether they are chunked."""
+
+    status: int
+    words: str
+    token: str
+    size: int
+    is_chunked: bool = False
+
+    def send(self, uploads: UploadServer) -> tuple[bytes, list[bytes], list[str]]:
+        """Return the head of the request, the pieces of its body, and the headers."""
+        token = {"nobody": "nobody's", "spent": uploads.spent, "stranger": uploads.token}[self.token]
+        length = f"Content-Length: {len(BEFORE) + self.size + len(AFTER)}"
+        headers = [
+            f"Authorization: Bearer {token}",
+            f"Content-Type: {MULTIPART}",
+            "Transfer-Encoding: chunked" if self.is_chunked else length,
+        ]
+        body = [BEFORE, *[CHUNK] * (self.size // len(CHUNK)), bytes(self.size % len(CHUNK)), AFTER]
+        return request_head(API, headers), body, headers
+
+
+SMALL, LARGE = MAX_UPLOAD_BYTES // 2, 5 * MAX_UPLOAD_BYTES
+TOO_LARGE = f"the archive is larger than {MAX_UPLOAD_BYTES} bytes"
+USED_UP = f"the quota of {QUOTA} submissions per day (UTC) is used up"
+REFUSED = {
+    "unknown token": Refused(401, "the token is unknown", "nobody", SMALL),
+    "unknown token, large": Refused(401, "the token is unknown", "nobody", LARGE),
+    "unknown token, chunked": Refused(401, "the token is unknown", "nobody", LARGE, True),
+    "too large": Refused(413, TOO_LARGE, "stranger", LARGE),
+    "too large, chunked": Refused(413, TOO_LARGE, "stranger", LARGE, True),
+    "no quota": Refused(429, USED_UP, "spent", SMALL),
+    "no quota, large": Refused(429, USED_UP, "spent", LARGE, True),
+}
+
+
+def upload_by_socket(uploads: UploadServer, refused: Refused, _: Path, pause_s: float = 0.0) -> RawResponse:
+    """Upload with a client that sends the whole body before it reads the response."""
+    head, pieces, _headers = refused.send(uploads)
+    with connect(uploads.server.url) as connection:
+        try:
+            connection.sendall(head)
+            for piece in pieces:
+                time.sleep(pause_s)
+                connection.sendall(b"%x\r\n%s\r\n" % (len(piece), piece) if refused.is_chunked else piece)
+            connection.sendall(b"0\r\n\r\n" if refused.is_chunked else b"")
+        except ConnectionError:
+            assert not pause_s, "a slow client is cut off before it has read the response"
+        return read_response(connection)
+
+
+def upload_by_httpx(uploads: UploadServer, refused: Refused, _: Path) -> RawResponse:
+    _head, pieces, headers = refused.send(uploads)
+    response = httpx2.post(
+        uploads.server.url + API,
+        content=iter(pieces) if refused.is_chunked else b"".join(pieces),
+        headers=dict(line.split(": ") for line in headers[:2]),
+        timeout=60,
+    )
+    return RawResponse(response.status_code, response.text)
+
+
+def upload_by_curl(uploads: UploadServer, refused: Refused, folder: Path, *more: str) -> RawResponse:
+    """Upload with the curl command of the page; curl waits for 100 Continue before a large body."""
+    requirements.require("uploads")
+    archive, response_file = folder / "a.zip", folder / "said.json"
+    with archive.open("wb") as file:
+        file.truncate(refused.size)
+    command = ["curl", "-sS", "-o", str(response_file), "-w", "%{http_code}", "-F", f"archive=@{archive}", *more]
+    authorization, _, length = refused.send(uploads)[2]
+    command += ["-H", authorization, *(["-H", length] if refused.is_chunked else []), uploads.server.url + API]
+    process = subprocess.run(command, capture_output=True, text=True, check=False, timeout=60)
+    assert process.returncode == 0, process.stderr
+    return RawResponse(int(process.stdout), response_file.read_text())
+
+
+CLIENTS: Mapping[str, Callable[[UploadServer, Refused, Path], RawResponse]] = {
+    "socket": upload_by_socket,
+    "httpx2": upload_by_httpx,
+    "curl": upload_by_curl,
+    "curl at once": lambda uploads, refused, folder: upload_by_curl(uploads, refused, folder, "-H", "Expect:"),
+}
+
+
+@pytest.mark.parametrize("client", CLIENTS.values(), ids=CLIENTS)
+@pytest.mark.parametrize("refused", REFUSED.values(), ids=REFUSED)
+def test_refusal_reaches_client_that_is_still_sending(
+    uploads: UploadServer, tmp_path: Path, refused: Refused, client: Callable[..., RawResponse]
+) -> None:
+    response = client(uploads, refused, tmp_path)
+    assert response.status == refused.status
+    assert refused.words in response.text
+    assert uploads.server.spool_files() == []
+
+
+@pytest.mark.parametrize("why", ["unknown token", "no quota"])
+def test_slow_client_is_not_cut_off_after_refusal(uploads: UploadServer, tmp_path: Path, why: str) -> None:
+    """Send slowly: many clients report a connection broken while sending and never read the response."""
+    assert upload_by_socket(uploads, REFUSED[why], tmp_path, 0.03).status == REFUSED[why].status
+
+
+@pytest.mark.parametrize(
+    ("method", "headers", "status", "words"),
+    [
+        ("POST", ("Authorization: Bearer nobody's", "Expect: 100-continue"), 401, "the token is unknown"),
+        ("PUT", (), 401, "no token"),
+        ("POST", ("Authorization: Bearer {}",), 413, "the limit of this service"),
+        ("PUT", ("Authorization: Bearer {}",), 413, "the limit of this service"),
+    ],
+)
+def test_refusal_comes_before_the_body(
+    uploads: UploadServer, method: str, headers: tuple[str, ...], status: int, words: str
+) -> None:
+    kind = MULTIPART if method == "POST" else "application/zip"
+    lines = [line.format(uploads.token) for line in headers]
+    lines += [f"Content-Type: {kind}", "Content-Length: 99000000000"]
+    response = exchange(uploads.server.url, request_head(API, lines, method=method), ends=True)
+    assert (response.status, words in response.text) == (status, True), response.text
+    assert "connection: close" in response.text.lower()
+    assert "100 Continue" not in response.text
+
+
+def test_curl_uploads_the_raw_archive(uploads: UploadServer, small_archive: Path) -> None:
+    authorization = f"Authorization: Bearer {uploads.server.token('curl')}"
+    command = ["curl", "-sS", "-H", authorization, "-T", str(small_archive), f"{uploads.server.url}{API}"]
+    first, second = (subprocess.run(command, capture_output=True, text=True, check=True) for _ in range(2))
+    assert '"status":"queued"' in first.stdout
+    assert first.stdout == second.stdout, "the same archive is the same submission"
