@@ -114,7 +114,7 @@ def main() -> None:
     """Answer requests until standard input ends."""
     import faulthandler
 
-    from tests.fuzz.entry_points import ENTRY_POINTS
+    from tests.fuzz.cases import ENTRY_POINTS
 
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY_BYTES, MEMORY_BYTES))
     answers = os.fdopen(os.dup(1), "w")
