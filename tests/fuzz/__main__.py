@@ -24,7 +24,7 @@ def main() -> int:
     """Run the cases; return 1 if a case failed, else 0."""
     parser = argparse.ArgumentParser(prog="python -m tests.fuzz", description="Damage inputs and read them.")
     parser.add_argument("entries", nargs="*", metavar="ENTRY", help=f"default: all of {', '.join(ENTRY_POINTS)}")
-    parser.add_argument("--cases", type=int, default=200, help="number of cases in all (default: %(default)s)")
+    parser.add_argument("--cases", type=int, default=300, help="number of cases in all (default: %(default)s)")
     parser.add_argument("--case", type=int, help="run only the case of this number")
     parser.add_argument("--seed", type=int, default=0, help="seed of the damage (default: %(default)s)")
     parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="default: %(default)s")

@@ -104,7 +104,8 @@ VIOLATIONS: dict[str, Callable[[Workspace], object]] = {
     "outside": lambda work: (work.case / "victim" / "notes.txt").unlink(),
     "partial output": lambda work: _write_and_refuse(work.out / "r.json"),
     "control characters": lambda _: print("\x1b[2J"),
-    "long output": lambda _: print("a" * 60_000),
+    "long output": lambda _: print("a\n" * 30_000),
+    "long line": lambda _: print("a" * 1_001),
     "warning": lambda _: print("a.py:7: RuntimeWarning: divide by zero", file=sys.stderr),
     "no file name": lambda _: _raise(InputError("it cannot be read")),
 }

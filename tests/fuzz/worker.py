@@ -56,7 +56,8 @@ class Worker:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, value: object, traceback: TracebackType | None) -> None:
-        self._stop()
+        if self.process is not None:
+            self.process.communicate()  # It ends when its input does.
         self._base.cleanup()
 
     def run(self, entry: str, seed: int, case: int) -> Outcome:
