@@ -145,7 +145,7 @@ def test_missing_packages_are_installed_or_named(
         write_program(tmp_path / name, f'echo "{name} $*" >> "{tmp_path}/calls"\nprintf "{output}"')
     for name in ("bash", "dirname", "grep"):
         (tmp_path / name).symlink_to(f"/usr/bin/{name}")
-    command = ["/bin/bash", ROOT / "scripts" / "system_packages.sh", *uses.split()]
+    command = ["/bin/bash", str(ROOT / "scripts" / "system_packages.sh"), *uses.split()]
     finished = subprocess.run(command, capture_output=True, text=True, check=False, env={"PATH": str(tmp_path)})
     assert finished.returncode == status
     assert finished.stderr.startswith(words)
@@ -180,7 +180,7 @@ def test_ci_keeps_only_variables_of_package_clients(tmp_path: Path) -> None:
 
 def versions(*arguments: str, **variables: str) -> subprocess.CompletedProcess[str]:
     """Run the script of ``make versions``."""
-    command = [ROOT / "scripts" / "versions.sh", *arguments]
+    command = [str(ROOT / "scripts" / "versions.sh"), *arguments]
     inherited = {name: text for name, text in requirements.pip_environment().items() if name[:7] != "PYTEST_"}
     environment = inherited | variables
     return subprocess.run(command, capture_output=True, text=True, env=environment, timeout=3600, check=False)
