@@ -15,7 +15,7 @@ from tests.fuzz.damage import SPECIAL_FILES, damage_content, replace_by_special_
 from tests.fuzz.dataset_entries import DATASET_ENTRIES
 from tests.fuzz.file_entries import FILE_ENTRIES
 from tests.fuzz.model_entries import MODEL_ENTRIES
-from tests.fuzz.oracle import CPU_LIMIT_S, QUICK_CPU_LIMIT_S, Expectation, Observation, failures, observe
+from tests.fuzz.oracle import Expectation, Observation, failures, observe
 from tests.fuzz.workspace import CASE, ELSEWHERE, EntryPoint, Workspace
 
 ENTRY_POINTS: Mapping[str, EntryPoint] = {
@@ -112,8 +112,8 @@ class CaseRunner:
 
 def _expectation(entry: EntryPoint, file: str) -> Expectation:
     """Return what may happen if ``file`` is damaged: messages name it or its folder."""
-    cpu_s = QUICK_CPU_LIMIT_S if entry.is_quick else CPU_LIMIT_S
-    return Expectation(entry.statuses, (CASE, file, *entry.names), entry.kept_outputs, entry.may_change, cpu_s)
+    names = (CASE, file, *entry.names)
+    return Expectation(entry.statuses, names, entry.kept_outputs, entry.may_change, entry.cpu_s)
 
 
 def _damage(entry: EntryPoint, workspace: Workspace, rng: np.random.Generator) -> str:

@@ -220,6 +220,7 @@ def _reader(
     *,
     share: int = 2,
     is_quick: bool = True,
+    cpu_s: float = 1.0,
     shows_truncation: bool = False,
     special_files: bool = True,
     names: Sequence[str] = (),
@@ -237,6 +238,7 @@ def _reader(
         targets=(f"{CASE}/{file}",),
         result=lambda workspace: (workspace.out / "result").read_bytes(),
         is_quick=is_quick,
+        cpu_s=cpu_s,
         shows_truncation=shows_truncation,
         special_files=special_files,
         names=names,
@@ -249,7 +251,7 @@ _cameras = partial(_reader, read=_read_cameras)
 _picture = partial(_reader, write=_write_capture_image, read=_open_capture)
 _content = partial(_reader, special_files=False)
 _depth = partial(_content, read=_decode_depth)
-_imported = partial(_reader, read=_import)
+_imported = partial(_reader, read=_import, cpu_s=10.0)
 
 
 def _imported_depth(kind: str, suffix: str, content: bytes) -> EntryPoint:
@@ -259,7 +261,14 @@ def _imported_depth(kind: str, suffix: str, content: bytes) -> EntryPoint:
 
 FILE_ENTRIES = (
     _reader("scene TOML", "scene.toml", partial(_copy, TWO_BARS), scene_config, share=8),
-    _reader("scene TOML: beam", "beam.toml", partial(_copy, EXAMPLES / "beam.toml"), scene_config, is_quick=False),
+    _reader(
+        "scene TOML: beam",
+        "beam.toml",
+        partial(_copy, EXAMPLES / "beam.toml"),
+        scene_config,
+        is_quick=False,
+        cpu_s=10.0,
+    ),
     _reader(
         "IFC",
         "c.ifc",
@@ -267,6 +276,7 @@ FILE_ENTRIES = (
         _read_cage,
         share=5,
         is_quick=False,
+        cpu_s=10.0,
         shows_truncation=True,
     ),
     _mesh("mesh: dataset PLY", "a.ply", _dataset_ply),

@@ -19,7 +19,7 @@ from rebar_depth_bench.cli.console import EXIT_DONE, EXIT_INPUT, run_command
 from tests.commands import run_in_process
 from tests.fuzz.workspace import CACHE, OUT, Workspace, changes
 
-CPU_LIMIT_S, QUICK_CPU_LIMIT_S = 10.0, 1.0
+CPU_LIMIT_S = 10.0
 MEMORY_LIMIT_BYTES = 300 << 20
 """Largest growth of the resident memory; the largest sound input takes a third of it."""
 MAX_OUTPUT_CHARACTERS, MAX_LINE_CHARACTERS = 50_000, 1000

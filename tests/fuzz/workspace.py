@@ -104,7 +104,7 @@ class EntryPoint:
     ``prepare`` writes sound inputs into the folder of a workspace and may run commands; ``run`` reads them and
     raises ``RebarDepthError`` for unsound ones. ``targets`` are glob patterns, below the work folder, of the files
     to damage. ``share`` is its share of the cases of a campaign. If it ``is_quick``, it reads one file within
-    milliseconds, and ``make test`` runs at least 100 of its cases.
+    milliseconds, and ``make test`` runs at least 100 of its cases. ``cpu_s`` is the allowed processor time.
 
     ``result`` returns what an accepted case has found. It equals that of the sound inputs in every case if a
     digest covers the targets (``covered``), and in cases with a truncated file if the format of the targets
@@ -121,6 +121,7 @@ class EntryPoint:
     targets: Sequence[str]
     result: Callable[[Workspace], bytes] | None = None
     is_quick: bool = False
+    cpu_s: float = 10.0
     covered: bool = False
     shows_truncation: bool = False
     check: Callable[[Workspace], object] | None = None
