@@ -12,7 +12,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from benchmarks.diagnosis import SOUND, learned_like, mistakes, mistakes_named
 from rebar_depth_bench import SubmissionWriter, score
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.manifest import open_folder
@@ -36,6 +35,7 @@ from rebar_depth_bench.methods import own_methods
 from rebar_depth_bench.methods.run import predict
 from rebar_depth_bench.scoring.evaluation import open_evaluation
 from tests.commands import run_in_process
+from tests.mistakes import SOUND, learned_like, mistakes, mistakes_named
 from tests.synthetic_dataset import write_dataset
 
 pytestmark = pytest.mark.slow

@@ -22,7 +22,7 @@ from rebar_depth_bench import SubmissionWriter
 from rebar_depth_bench.base.errors import SubmissionError
 from rebar_depth_bench.scoring.evaluation import score
 from rebar_depth_bench.scoring.metrics import depth_metrics
-from tests.examples.scripts import result_of, run, written_files
+from tests.examples.scripts import refusal, repeated_files, result_of, run
 
 Depths = dict[str, np.ndarray]
 Archive = Callable[..., Path]
@@ -84,8 +84,8 @@ def test_views_without_prediction_are_excluded(
     assert study["given"]["abs_rel"] == pytest.approx(native.abs_rel, rel=1e-9)
     assert "without prediction: 1 of 9 views" in capsys.readouterr().out
     nothing = archive_of({view: -depth_m for view, depth_m in noisy.items()}, "nothing.zip")
-    assert run(anchor, nothing, "--data", tiny_root, "--num-anchor-views", "2", "3") == 2
-    assert "0 of 9 views of lattice have a prediction, expected at least 2" in capsys.readouterr().err
+    message = refusal(anchor, capsys, nothing, "--data", tiny_root, "--num-anchor-views", "2", "3")
+    assert "0 of 9 views of lattice have a prediction, expected at least 2" in message
 
 
 def test_bad_archive_is_refused_as_by_score(
@@ -99,8 +99,7 @@ def test_bad_archive_is_refused_as_by_score(
     for archive in (bad, tmp_path / "none.zip"):
         with pytest.raises(SubmissionError) as by_score:
             score(archive, tiny_root)
-        assert run(anchor, archive, "--data", tiny_root) == 2
-        assert capsys.readouterr().err.endswith(f"error: {by_score.value}\n")
+        assert refusal(anchor, capsys, archive, "--data", tiny_root).endswith(f"error: {by_score.value}\n")
 
 
 def test_archive_of_several_configs_needs_config_option(
@@ -114,8 +113,8 @@ def test_archive_of_several_configs_needs_config_option(
             for view in config["views"]:
                 writer.add(view["view_id"], np.ones(shape, np.float32))
     for wanted in ((), ("--config", "pier")):
-        assert run(anchor, archive, "--data", tiny_root, *wanted) == 2
-        assert "holds lattice, lattice-orbit, expected --config with one of them" in capsys.readouterr().err
+        message = refusal(anchor, capsys, archive, "--data", tiny_root, *wanted)
+        assert "holds lattice, lattice-orbit, expected --config with one of them" in message
     options = ("--config", "lattice-orbit", "--num-anchor-views", "1")
     assert result_of(anchor, tmp_path, archive, "--data", tiny_root, *options)["views"] == 2
 
@@ -139,15 +138,12 @@ def test_outputs_are_deterministic_and_inputs_are_kept(
 ) -> None:
     archive = archive_of(noisy)
     arguments = (archive, "--data", tiny_root, "--num-anchor-views", "1", "5")
-    files = written_files(anchor, tmp_path, *arguments)
-    assert files == written_files(anchor, tmp_path, *arguments)
+    files = repeated_files(anchor, tmp_path, *arguments)
     assert files["png"].startswith(b"\x89PNG")
     content = json.loads(files["json"])
     assert [len(row["draws"]) for row in content["rows"]] == [24, 24]
-    assert (
-        content["dataset"]["digest"]
-        == json.loads((tiny_root / "manifest.json").read_text())["ground_truth"]["digest"]
-    )
+    manifest = json.loads((tiny_root / "manifest.json").read_text())
+    assert content["dataset"]["digest"] == manifest["ground_truth"]["digest"]
     header, first, _ = files["csv"].decode().splitlines()
     row = dict(zip(header.split(","), first.split(","), strict=True))
     assert float(row["scale_mean"]) == content["rows"][0]["scale"]["mean"]

@@ -20,8 +20,8 @@ import kitti
 pytest.importorskip("cv2")
 
 from rebar_depth_bench import SubmissionWriter
-from tests.examples import kitti_folder as folder_of
-from tests.examples.scripts import result_of, run, written_files
+from tests.examples import scripts as folder_of
+from tests.examples.scripts import refusal, repeated_files, result_of
 
 COUNT = 96
 FACTORS = np.linspace(0.4, 1.6, COUNT)
@@ -111,16 +111,8 @@ def test_nearest_lidar_point_wins_and_halves_round_to_even(tmp_path: Path) -> No
     folder_of.write_day(tmp_path / image.date, cam, "R: 1 0 0 0 1 0 0 0 1\nT: 0 0 0\n")
     path = folder_of.scan_path(tmp_path, image)
     path.parent.mkdir(parents=True)
-    points = [
-        [8, 4, 6, 0],
-        [4, 2, 3, 0],
-        [12, 6, 9, 0],
-        [2, 1, 3, 0],
-        [1, 1, 90, 0],
-        [5, 3.5, 3, 0],
-        [1, 1, -3, 0],
-    ]
-    np.array(points, "<f4").tofile(path)
+    points = np.array([[8, 4, 6], [4, 2, 3], [12, 6, 9], [2, 1, 3], [1, 1, 90], [5, 3.5, 3], [1, 1, -3]])
+    np.insert(points, 3, 0, axis=1).astype("<f4").tofile(path)
     # 3 * 4/3 = 4 -> column 3; 3 * 2/3 = 2 -> row 1: depths 6, 3 and 9. Then (2, 1, 3): column 1, row 0, depth 3.
     # (1, 1, 90) rounds to -1, (5, 3.5, 3) to column 4 of 4: outside; the last is behind the camera.
     assert truth_of(tmp_path, image).tolist() == [[0, 3, 0, 0], [0, 0, 0, 3]]
@@ -211,8 +203,7 @@ def test_list_of_images_is_not_overwritten(root: Path, tmp_path: Path, capsys: p
     listed = tmp_path / "list.txt"
     listed.write_text("precious")
     words = ("--predictions", root, "--kitti", root, "--ground-truth", "raw", "--images", listed, "--json", listed)
-    assert run(kitti, *words) == 2
-    assert "which is an input" in capsys.readouterr().err
+    assert "which is an input" in refusal(kitti, capsys, *words)
     assert listed.read_text() == "precious"
 
 
@@ -273,11 +264,21 @@ def test_outputs_are_deterministic(
 ) -> None:
     folder = write_npy(tmp_path / "mono", predictions(truths, NOISE))
     arguments = ("--predictions", folder, "--kitti", root, "--ground-truth", "raw", "--lidar-depth", "velodyne")
-    files = written_files(kitti, tmp_path, *arguments)
-    assert files == written_files(kitti, tmp_path, *arguments, "--workers", "1")
+    files = repeated_files(kitti, tmp_path, *arguments, again=("--workers", "1"))
     assert json.loads(files["json"])["protocol"] == "rebar-kitti-eigen-1"
     assert files["csv"].startswith(b"alignment,abs_rel,rmse_m,log_rmse,delta1,delta2,delta3\nnative,")
     assert "Metric3D v2 AbsRel 0.0926" in capsys.readouterr().out
+
+
+@pytest.fixture(scope="module")
+def folders(truths: Depths, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Write sound predictions, and folders with a single one, none, and images of another size."""
+    folder = tmp_path_factory.mktemp("predictions")
+    write_npy(folder / "mono", predictions(truths))
+    write_npy(folder / "short", dict(list(predictions(truths).items())[:1]))
+    write_npy(folder / "large", dict.fromkeys(list(truths), np.ones((20, 30), np.float32)))
+    (folder / "empty").mkdir()
+    return folder
 
 
 @pytest.mark.parametrize(
@@ -286,10 +287,7 @@ def test_outputs_are_deterministic(
         (("--predictions", "nowhere.zip"), "does not exist"),
         (("--kitti", "nowhere"), "nowhere: has no raw ground truth of the 697 images"),
         (("--ground-truth", "improved"), "has no improved ground truth"),
-        (
-            ("--predictions", "short"),
-            "95 views have no file, among them kitti/2011_09_26_drive_0002_sync_0000000003_l",
-        ),
+        (("--predictions", "short"), "95 views have no file, among them kitti/2011_09_26_drive_0002_sync_00000"),
         (("--predictions", "empty"), "no depth file of any view was found"),
         (("--predictions", "large"), r"2011_09_26_drive_0002_sync_0000000000_l.npy: "),
     ],
@@ -298,18 +296,10 @@ def test_bad_input_exits_with_status_2(
     change: tuple[str, str],
     words: str,
     root: Path,
-    truths: Depths,
-    tmp_path: Path,
+    folders: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.chdir(tmp_path)
-    write_npy(tmp_path / "mono", predictions(truths))
-    write_npy(tmp_path / "short", dict(list(predictions(truths).items())[:1]))
-    write_npy(tmp_path / "large", {name: np.ones((375, 1242), np.float32) for name in truths})
-    (tmp_path / "empty").mkdir()
+    monkeypatch.chdir(folders)
     options = {"--predictions": "mono", "--kitti": str(root), "--ground-truth": "raw"} | dict([change])
-    assert run(kitti, *(part for pair in options.items() for part in pair)) == 2
-    printed = capsys.readouterr()
-    assert words in printed.err
-    assert printed.out == ""
+    assert words in refusal(kitti, capsys, *(part for pair in options.items() for part in pair))

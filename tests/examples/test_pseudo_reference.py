@@ -1,4 +1,4 @@
-"""Table II on captures and on a rendered dataset: known scale, noise and gaps; bad input."""
+"""Table II on captures and on a rendered dataset, and the depth maps of folders and archives that it reads."""
 
 from __future__ import annotations
 
@@ -13,8 +13,9 @@ import pytest
 
 import pseudo_reference
 import rebar_depth_bench as rdb
-from depth_maps import masked
+from depth_maps import masked, open_maps
 from pseudo_reference import agreement
+from rebar_depth_bench.base.errors import InputError
 from tests.bench.captures.example_capture import (
     HEIGHT,
     VIEWS,
@@ -24,7 +25,8 @@ from tests.bench.captures.example_capture import (
     write_capture,
     write_depths,
 )
-from tests.examples.scripts import result_of, run, written_files
+from tests.bench.submission.zips import exr, npz, png
+from tests.examples.scripts import refusal, repeated_files, result_of, written_files
 from tests.synthetic_dataset import write_split_dataset
 
 NOISE = 0.1
@@ -163,9 +165,8 @@ def test_equal_names_are_made_unique(lab: Path, tmp_path: Path) -> None:
     assert methods == ["mono (mono)", "mono (mono) #2", "stereo (stereo)"]
     assert [reference["name"] for reference in result["references"]] == ["stereo (stereo) #2", "colmap"]
     assert row_of(result, "stereo (stereo)", "stereo (stereo) #2")["native"]["abs_rel"] == 0
-    assert (
-        row_of(result, "stereo (stereo)", "colmap")["ratio"]["native"] is None
-    )  # The error to divide by is zero.
+    # The error to divide by is zero.
+    assert row_of(result, "stereo (stereo)", "colmap")["ratio"]["native"] is None
 
 
 def test_agreement_of_references_without_common_pixels_is_undefined() -> None:
@@ -212,8 +213,8 @@ def test_data_are_restricted_to_the_split_of_the_maps(tmp_path: Path, capsys: py
     for row in result["rows"]:
         assert (row["views"], row["coverage"]) == (6, 1.0)
         assert row["native"]["abs_rel"] == pytest.approx(0.25)
-    assert run(pseudo_reference, a, "--reference", c, "--data", root) == 2
-    assert "the splits of the maps are test, train, expected one" in capsys.readouterr().err
+    message = refusal(pseudo_reference, capsys, a, "--reference", c, "--data", root)
+    assert "the splits of the maps are test, train, expected one" in message
 
 
 @pytest.mark.slow
@@ -232,8 +233,7 @@ def test_names_of_methods_are_plain_text(lab: Path, tmp_path: Path, capsys: pyte
 @pytest.mark.slow
 def test_outputs_are_deterministic(lab: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = (lab / "mono", lab / "other", "--reference", lab / "stereo", lab / "colmap", "--data", lab / "zed")
-    files = written_files(pseudo_reference, tmp_path, *arguments)
-    assert files == written_files(pseudo_reference, tmp_path, *arguments, "--workers", "1")
+    files = repeated_files(pseudo_reference, tmp_path, *arguments, again=("--workers", "1"))
     content = json.loads(files["json"])
     assert (content["protocol"], content["dataset"]) == ("rebar-pseudo-reference-1", None)
     assert "baseline 119.98 mm" in content["camera"]
@@ -266,7 +266,63 @@ def test_bad_input_exits_with_status_2(
     monkeypatch.chdir(tmp_path)
     write_depths(tmp_path / "strange", {99: exact_depth(0)})
     options = {"--reference": str(lab / "stereo"), "--data": str(lab / "zed")} | change
-    assert run(pseudo_reference, lab / "mono", *(part for pair in options.items() for part in pair)) == 2
-    printed = capsys.readouterr()
-    assert words in printed.err
-    assert printed.out == ""
+    arguments = (part for pair in options.items() for part in pair)
+    assert words in refusal(pseudo_reference, capsys, lab / "mono", *arguments)
+
+
+DEPTH = np.linspace(0.5, 2.0, 12).reshape(3, 4).astype(np.float32)
+MAPS = {"walk/a": (3, 4), "walk/b": (3, 4)}
+
+
+def test_folder_reads_every_format(tmp_path: Path) -> None:
+    units = np.round(DEPTH.astype(np.float64) * 1000)
+    (tmp_path / "submission.json").write_text('{"method": "mine", "depth_scale": 0.001}')
+    (tmp_path / "walk").mkdir()
+    files: dict[str, Callable[[Path], object]] = {
+        "a.npy": lambda path: np.save(path, DEPTH),
+        "a.npz": lambda path: path.write_bytes(npz(depth=DEPTH)),
+        "walk/a.exr": lambda path: exr(path, {"Z": DEPTH}),
+        "a.png": lambda path: path.write_bytes(png(units)),
+    }
+    for name, write in files.items():
+        path = tmp_path / name
+        write(path)
+        with open_maps(tmp_path, MAPS) as source:
+            assert (source.method, source.view_ids) == ("mine", ("walk/a",))
+            expected = units * 0.001 if name == "a.png" else DEPTH
+            assert np.array_equal(source.read("walk/a"), expected), name
+        path.unlink()
+
+
+def test_folder_and_archive_are_read_alike(tmp_path: Path) -> None:
+    archive, folder = tmp_path / "a.zip", tmp_path / "method-x"
+    folder.mkdir()
+    with rdb.SubmissionWriter(archive, method="method-y") as writer:
+        for view_id in MAPS:
+            writer.add(view_id, DEPTH)
+            np.save(folder / f"{view_id.partition('/')[2]}.npy", DEPTH)
+    with open_maps(archive, MAPS) as from_archive, open_maps(folder, MAPS) as from_folder:
+        assert (from_archive.method, from_folder.method) == ("method-y", "method-x")
+        assert from_archive.view_ids == from_folder.view_ids == tuple(MAPS)
+        assert np.array_equal(from_archive.read("walk/b"), from_folder.read("walk/b"))
+        before = from_folder.sha256
+    np.save(folder / "b.npy", 2 * DEPTH)
+    with open_maps(folder, MAPS) as changed:
+        assert changed.sha256 != before
+
+
+@pytest.mark.parametrize(
+    ("files", "words"),
+    [
+        ({"c.npy": b""}, "no depth file of any view was found"),
+        ({"a.npy": b"", "a.npz": b""}, r"walk/a has the files a\.npy, a\.npz, expected one"),
+        ({"a.png": b""}, "expected their depth_scale"),
+        ({"a.npy": b"", "submission.json": b"{"}, "submission.json"),
+        ({"a.npy": b"none"}, r"a\.npy"),
+    ],
+)
+def test_unusable_folder_is_refused(files: dict[str, bytes], words: str, tmp_path: Path) -> None:
+    for name, content in files.items():
+        (tmp_path / name).write_bytes(content)
+    with pytest.raises(InputError, match=words), open_maps(tmp_path, MAPS) as source:
+        source.read("walk/a")

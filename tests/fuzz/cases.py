@@ -1,24 +1,36 @@
-"""One fuzz case: sound inputs of an entry point, damaged by a seeded generator, read and observed."""
+"""Registry of entry points, and one fuzz case: sound inputs, damaged by a seeded generator, read and observed."""
 
 from __future__ import annotations
 
 import os
 import zlib
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from rebar_depth_bench.cli.console import EXIT_DONE
-from tests.fuzz.damage import damage_content
-from tests.fuzz.entry_point import EntryPoint
+from tests.fuzz.damage import SPECIAL_FILES, damage_content, replace_by_special_file
+from tests.fuzz.dataset_entries import DATASET_ENTRIES
+from tests.fuzz.file_entries import FILE_ENTRIES
+from tests.fuzz.model_entries import MODEL_ENTRIES
 from tests.fuzz.oracle import Expectation, Observation, failures, observe
-from tests.fuzz.special_files import SPECIAL_FILES, replace_by_special_file
-from tests.fuzz.workspace import CASE, ELSEWHERE, Workspace
+from tests.fuzz.workspace import CASE, ELSEWHERE, EntryPoint, Workspace
 
+ENTRY_POINTS: Mapping[str, EntryPoint] = {
+    entry.name: entry for entry in (*DATASET_ENTRIES, *FILE_ENTRIES, *MODEL_ENTRIES)
+}
+"""Entry points by name."""
 _SPECIAL_SHARE, _TRUNCATED_SHARE, _SECOND_DAMAGE_SHARE = 0.15, 0.08, 0.15
 _LEAST_TRUNCATION_BYTES = 20
 """A text format cannot show that its last number has lost a digit."""
+
+
+def number_of_cases(total: int, entries: Sequence[str]) -> dict[str, int]:
+    """Return how many of ``total`` cases each of the named entry points gets by its share, at least one."""
+    shares = sum(ENTRY_POINTS[name].share for name in entries)
+    return {name: max(1, round(total * ENTRY_POINTS[name].share / shares)) for name in entries}
 
 
 def work_folder(base: Path) -> Path:
@@ -100,7 +112,8 @@ class CaseRunner:
 
 def _expectation(entry: EntryPoint, file: str) -> Expectation:
     """Return what may happen if ``file`` is damaged: messages name it or its folder."""
-    return Expectation(entry.statuses, (CASE, file, *entry.names), entry.kept_outputs, entry.may_change)
+    names = (CASE, file, *entry.names)
+    return Expectation(entry.statuses, names, entry.kept_outputs, entry.may_change, entry.cpu_s)
 
 
 def _damage(entry: EntryPoint, workspace: Workspace, rng: np.random.Generator) -> str:

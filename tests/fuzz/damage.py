@@ -1,21 +1,24 @@
-"""Seeded generators that damage the content of a file at the level of bytes, tokens and values.
+"""Seeded generators that damage the content of a file at the level of bytes, tokens and values; special files.
 
-Each takes the content of a sound file and a random generator, and returns other content.
+Each generator takes the content of a sound file and a random generator, and returns other content. Special files
+(pipes, devices, folders, links, and empty, huge or missing files) take the place of an input.
 """
 
 from __future__ import annotations
 
 import copy
 import json
+import os
 import re
+import shutil
 import tomllib
 from collections.abc import Callable, Mapping
-from pathlib import PurePath
+from pathlib import Path, PurePath
 from typing import Any
 
 import numpy as np
 
-from tests.fuzz import containers, hostile
+from tests.fuzz import hostile
 
 Damage = Callable[[bytes, np.random.Generator], bytes]
 _HEAD_BYTES = 256
@@ -184,19 +187,21 @@ def _choose(values: tuple[bytes, ...], rng: np.random.Generator) -> bytes:
 
 
 def _damage_archive(content: bytes, rng: np.random.Generator) -> bytes:
-    return containers.damage_zip(content, rng, damage_content)
+    return hostile.damage_zip(content, rng, damage_content)
 
 
 def _damage_table(content: bytes, rng: np.random.Generator) -> bytes:
-    return containers.damage_parquet(content, rng, damage_bytes)
+    return hostile.damage_parquet(content, rng, damage_bytes)
 
 
 _TEXT: Mapping[str, Damage] = {"tokens": damage_tokens}
 _JSON: Mapping[str, Damage] = {**_TEXT, "values": damage_json}
 _ARCHIVE: Mapping[str, Damage] = {"entries": _damage_archive}
-_IMAGE: Mapping[str, Damage] = {"size": containers.damage_image_size}
+_IMAGE: Mapping[str, Damage] = {"size": hostile.damage_image_size}
 _LEVELS: Mapping[str, Mapping[str, Damage]] = {
     ".conf": _TEXT,
+    ".csv": _TEXT,
+    ".exr": _TEXT,
     ".ifc": _TEXT,
     ".json": _JSON,
     ".md": _TEXT,
@@ -204,13 +209,54 @@ _LEVELS: Mapping[str, Mapping[str, Damage]] = {
     ".npz": _ARCHIVE,
     ".obj": _TEXT,
     ".parquet": {"cells": _damage_table},
+    ".pfm": _TEXT,
     ".ply": _TEXT,
     ".png": _IMAGE,
     ".stl": _TEXT,
+    ".tif": _IMAGE,
     ".toml": {**_TEXT, "values": damage_toml},
     ".token": _TEXT,
     ".txt": _TEXT,
     ".webp": _IMAGE,
+    ".xml": _TEXT,
+    ".yaml": _TEXT,
+    ".yml": _TEXT,
     ".zip": _ARCHIVE,
 }
 """Generators beyond ``damage_bytes`` by the suffix of a file."""
+
+
+HUGE_BYTES = 1 << 30
+
+
+def replace_by_special_file(path: Path, kind: str, elsewhere: Path) -> None:
+    """Replace a file by a special one of ``kind``; ``elsewhere`` is a folder for the file and targets of links."""
+    elsewhere.mkdir(exist_ok=True)
+    shutil.move(path, elsewhere / path.name)
+    SPECIAL_FILES[kind](path, elsewhere)
+
+
+def _link_to_pipe(path: Path, elsewhere: Path) -> None:
+    os.mkfifo(elsewhere / "pipe")
+    path.symlink_to(elsewhere / "pipe")
+
+
+def _huge_file(path: Path, elsewhere: Path) -> None:
+    shutil.copy(elsewhere / path.name, path)
+    os.truncate(path, path.stat().st_size + HUGE_BYTES)
+
+
+SPECIAL_FILES: Mapping[str, Callable[[Path, Path], object]] = {
+    "missing": lambda *_: None,
+    "empty": lambda path, _: path.touch(),
+    "folder": lambda path, _: path.mkdir(),
+    "pipe": lambda path, _: os.mkfifo(path),
+    "link to a pipe": _link_to_pipe,
+    "link to /dev/zero": lambda path, _: path.symlink_to("/dev/zero"),
+    "link to itself": lambda path, _: path.symlink_to(path.name),
+    "link to nothing": lambda path, elsewhere: path.symlink_to(elsewhere / "nothing"),
+    "link to a folder": lambda path, elsewhere: path.symlink_to(elsewhere),
+    "link to the file": lambda path, elsewhere: path.symlink_to(elsewhere / path.name),
+    "huge": _huge_file,
+}
+"""Functions that make a special file, by its kind."""

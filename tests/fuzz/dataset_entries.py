@@ -25,8 +25,7 @@ from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import ConfigViews
 from rebar_depth_bench.methods.controls import noisy_depth_m
 from rebar_depth_bench.submission import SubmissionReader
-from tests.fuzz.entry_point import EntryPoint, bench, run_options
-from tests.fuzz.workspace import CACHE, CASE, Workspace
+from tests.fuzz.workspace import CACHE, CASE, EntryPoint, Workspace, bench, run_options
 from tests.mat_dataset import write_mat_dataset
 from tests.synthetic_dataset import write_earlier_manifest, write_split_dataset
 
@@ -62,6 +61,12 @@ def write_dataset_and_archive(workspace: Workspace) -> None:
     with SubmissionWriter(workspace.case / "a.zip", "noisy-truth") as writer:
         for row in views.rows("left_depth"):
             writer.add(row["view_id"], noisy_depth_m(row))
+
+
+def write_result(workspace: Workspace, path: Path) -> None:
+    """Write the dataset, an archive of one of its configs, and the result JSON of the archive to ``path``."""
+    write_dataset_and_archive(workspace)
+    bench("score", workspace.case / "a.zip", *_data(workspace), "--json", path)
 
 
 def _write_scenes_and_archive(workspace: Workspace) -> None:

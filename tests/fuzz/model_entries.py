@@ -1,4 +1,4 @@
-"""Entry points that read models, kept predictions, answers of a leaderboard and its settings."""
+"""Entry points that predict, with models, kept predictions and captures, and that submit to a leaderboard."""
 
 from __future__ import annotations
 
@@ -12,16 +12,14 @@ from pathlib import Path
 
 import onnx
 
-from leaderboard.settings import read_settings
 from rebar_depth_bench.base.errors import MethodError
 from rebar_depth_bench.cli.console import EXIT_DONE, EXIT_INPUT, EXIT_OTHER
 from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.methods import find_method
+from tests.bench.captures.example_capture import write_capture
 from tests.bench.methods.onnx_models import write_mixer_model, write_toml
-from tests.fuzz.capture_entries import write_result
-from tests.fuzz.dataset_entries import CONFIG, ROOT, check_predictions, write_dataset
-from tests.fuzz.entry_point import EntryPoint, bench
-from tests.fuzz.workspace import CASE, OUT, Workspace
+from tests.fuzz.dataset_entries import CONFIG, ROOT, check_predictions, write_dataset, write_result
+from tests.fuzz.workspace import CASE, OUT, EntryPoint, Workspace, bench
 
 _STOPPING_METHOD = """
 from pathlib import Path
@@ -47,22 +45,15 @@ _SUBMISSION = {
 }
 _TOKEN = {"name": "a", "quota": 10, "quota_left": 9, "max_upload_bytes": 1 << 30}
 _RATES = {"read_rate_limit": "600/minute", "write_rate_limit": "60/minute"}
-_SETTINGS = """
-data = "dataset"
-state_dir = "state"
-db = "sqlite:///board.sqlite"
-port = 8000
-quota = 5
-max_upload = "2GiB"
-score_time = 60.5
-read_rate_limit = "600/minute"
-rescore = true
-"""
 
 
 def _predict(workspace: Workspace, method: str) -> None:
     data = ("--data", workspace.root / ROOT, "--config", CONFIG)
     bench("predict", method, *data, "--out", workspace.out / "p.zip")
+
+
+def _predict_capture(workspace: Workspace) -> None:
+    bench("predict", "sgbm", "--data", workspace.case / "zed", "--out", workspace.out / "a.zip")
 
 
 def _write_model(workspace: Workspace) -> None:
@@ -176,6 +167,14 @@ def _submit(workspace: Workspace) -> None:
 
 MODEL_ENTRIES = (
     EntryPoint(
+        "predict: capture",
+        8,
+        lambda workspace: write_capture(workspace.case / "zed", 2),
+        _predict_capture,
+        (f"{CASE}/zed/**/*",),
+        kept_outputs=(".a.zip.views*",),
+    ),
+    EntryPoint(
         "predict: ONNX",
         8,
         _write_model,
@@ -212,13 +211,5 @@ MODEL_ENTRIES = (
     ),
     EntryPoint(  # A token may come from the user's own pipe, which is waited for.
         "submit: token file", 2, _write_answers, _submit, (f"{CASE}/my.token",), special_files=False
-    ),
-    EntryPoint(
-        "leaderboard settings",
-        4,
-        lambda workspace: (workspace.case / "s.toml").write_text(_SETTINGS),
-        lambda workspace: read_settings(workspace.case / "s.toml", {}),
-        (f"{CASE}/s.toml",),
-        names=("settings: ",),
     ),
 )

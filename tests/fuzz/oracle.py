@@ -22,7 +22,7 @@ from tests.fuzz.workspace import CACHE, OUT, Workspace, changes
 CPU_LIMIT_S = 10.0
 MEMORY_LIMIT_BYTES = 300 << 20
 """Largest growth of the resident memory; the largest sound input takes a third of it."""
-MAX_OUTPUT_CHARACTERS = 50_000
+MAX_OUTPUT_CHARACTERS, MAX_LINE_CHARACTERS = 50_000, 1000
 _KIB = 1024
 
 
@@ -45,13 +45,14 @@ class Expectation:
     """What may happen.
 
     ``names`` are texts of which one is in every error message, ``kept_outputs`` patterns of outputs that may stay
-    after a failure, ``may_change`` patterns of paths that may change.
+    after a failure, ``may_change`` patterns of paths that may change, and ``cpu_s`` the processor time in seconds.
     """
 
     statuses: Sequence[int] = (EXIT_DONE, EXIT_INPUT)
     names: Sequence[str] = ()
     kept_outputs: Sequence[str] = ()
     may_change: Sequence[str] = ()
+    cpu_s: float = CPU_LIMIT_S
 
 
 def observe(action: Callable[[], object], workspace: Workspace) -> Observation:
@@ -96,12 +97,13 @@ def failures(seen: Observation, expected: Expectation) -> list[str]:
     checks = {
         "traceback": seen.crash or ("Traceback" in output and output[-2000:]),
         "status": not seen.crash and seen.status not in expected.statuses and f"{seen.status}: {output[-300:]}",
-        "time": seen.cpu_s > CPU_LIMIT_S and f"{seen.cpu_s:.1f} s of processor time",
+        "time": seen.cpu_s > expected.cpu_s and f"{seen.cpu_s:.1f} s of processor time",
         "memory": seen.peak_bytes > MEMORY_LIMIT_BYTES and f"{seen.peak_bytes >> 20} MiB",
         "outside": outside and ", ".join(outside[:5]),
         "partial output": seen.status != EXIT_DONE and partial and ", ".join(partial[:5]),
         "control characters": controls and ascii("".join(controls[:9])),
         "long output": len(output) > MAX_OUTPUT_CHARACTERS and f"{len(output)} characters",
+        "long line": any(len(line) > MAX_LINE_CHARACTERS for line in output.splitlines()) and output[:200],
         "warning": re.search(r":[0-9]+: \w*Warning: ", seen.stderr) and seen.stderr[-500:],
         "no file name": refused and not any(name in seen.stderr for name in expected.names) and seen.stderr[:300],
     }

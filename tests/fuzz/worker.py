@@ -56,7 +56,8 @@ class Worker:
         return self
 
     def __exit__(self, kind: type[BaseException] | None, value: object, traceback: TracebackType | None) -> None:
-        self._stop()
+        if self.process is not None:
+            self.process.communicate()  # It ends when its input does.
         self._base.cleanup()
 
     def run(self, entry: str, seed: int, case: int) -> Outcome:
@@ -114,7 +115,7 @@ def main() -> None:
     """Answer requests until standard input ends."""
     import faulthandler
 
-    from tests.fuzz.entry_points import ENTRY_POINTS
+    from tests.fuzz.cases import ENTRY_POINTS
 
     resource.setrlimit(resource.RLIMIT_DATA, (MEMORY_BYTES, MEMORY_BYTES))
     answers = os.fdopen(os.dup(1), "w")

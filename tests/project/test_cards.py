@@ -1,26 +1,32 @@
-"""Dataset and benchmark cards: agreement with the code and the dataset folder."""
+"""Cards of dataset and benchmark, and the stored results that they show, agree with the code and each other."""
 
 from __future__ import annotations
 
+import json
+import subprocess
+import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 import yaml
 
 import rebar_depth_bench as rdb
-from benchmarks import steel_coverage
 from cards.benchmark import benchmark_card
 from cards.dataset import column_rows, dataset_card
+from cards.reference import CAGES, FULL_SETS, SUBSET, reference_context, results_file
 from cards.steel import steel_by_config
-from dataset_builder.cameras.steel_distance import Cylinders
 from dataset_builder.cameras.trajectories import view_count
 from dataset_builder.catalog.named_configs import CONFIGS, SWEEPS
 from dataset_builder.specs.config_specs import DomeSpec
-from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.schema import CENTRE, NEAREST_STEEL, features
 from rebar_depth_bench.methods import own_methods
+from tests.conftest import TINY_DATASET
+
+PUBLISHED = (SUBSET, *FULL_SETS, CAGES)
+STORED: dict[str, dict[str, Any]] = {name: json.loads(results_file(name).read_text()) for name in PUBLISHED}
 
 
 def test_benchmark_card_in_repository_is_up_to_date() -> None:
@@ -81,29 +87,23 @@ def test_steel_on_cards_is_of_all_views_of_all_configs() -> None:
         assert entry["distance_to"] == (protocol.distance_to if isinstance(protocol, DomeSpec) else CENTRE)
 
 
-def test_steel_of_a_folder_is_measured(
-    tiny_root: Path, tiny_masks: dict[str, np.ndarray], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    config = open_folder(tiny_root).config("lattice")
-    bars = read_bars(tiny_root / "bars.parquet")["lattice"]
-    views = steel_coverage.measure_views(config, Cylinders.from_bars(bars))
-    entry = steel_coverage.summary(config, views)
-    shares = [mask.mean() for mask in tiny_masks.values()]
-    assert entry["coverage"] == pytest.approx(
-        {"mean": np.mean(shares), "least": min(shares), "most": max(shares)}, rel=1e-5
-    )
-    assert entry["interior"] == pytest.approx(
-        np.mean([view.scored_px / (view.steel_px or np.nan) for view in config.views]), rel=1e-5
-    )
-    assert entry["scored_views"] == len(config.views)
-    assert entry["reference"] == config.references["test"].model_dump()
-    nearest_m, near_m, far_m = views[:, :3].T
-    assert (nearest_m > 0.1).all()
-    assert (near_m > 0.75 * nearest_m).all()
-    assert entry["depth_m"] == pytest.approx([near_m.min(), far_m.max()], rel=1e-5)
-    steel_coverage.main(str(tiny_root), str(tmp_path / "steel.json"))
-    assert "| lattice | all | 9 | 9 |" in capsys.readouterr().out
-    assert '"configs": {}' in (tmp_path / "steel.json").read_text(), "the folder has 9 of 504 views"
+@pytest.mark.slow
+def test_steel_of_a_folder_is_measured(tiny_masks: dict[str, np.ndarray], tmp_path: Path) -> None:
+    """The last numbers of a row are the share of steel in its views, and of steel pixels that are scored."""
+    out = tmp_path / "steel.json"
+    command = [sys.executable, "-m", "benchmarks.steel_coverage", str(TINY_DATASET), str(out)]
+    finished = subprocess.run(command, capture_output=True, text=True, check=True)
+    [row] = [line for line in finished.stdout.splitlines() if line.startswith("| lattice |")]
+    *counts, nearest, depths, steel, interior = [cell.strip() for cell in row.strip("|").split("|")]
+    assert counts == ["lattice", "all", "9", "9"]
+    percent = 100 * np.array([mask.mean() for mask in tiny_masks.values()])
+    assert steel == f"{percent.mean():.1f} ({percent.min():.1f}-{percent.max():.1f})"
+    views = open_folder(TINY_DATASET).config("lattice").views
+    assert interior == f"{100 * np.mean([view.scored_px / (view.steel_px or np.nan) for view in views]):.1f}"
+    nearest_m, depth_m = (np.array(text.split("-"), float) for text in (nearest, depths))
+    assert nearest_m[0] > 0.1
+    assert (depth_m > 0.75 * nearest_m).all()
+    assert '"configs": {}' in out.read_text(), "the folder has 9 of 504 views"
 
 
 def test_card_states_what_distances_are_to(tiny_root: Path) -> None:
@@ -122,3 +122,60 @@ def test_card_states_what_distances_are_to(tiny_root: Path) -> None:
     }
     assert "| 0.22-0.43 m, nearest steel | 7.4-26.3 m |" in rows["pier"]
     assert "| 0.22-0.43 m | – |" in rows["older"]
+
+
+def test_every_cpu_method_has_a_stored_run() -> None:
+    untested = {name for name, method in own_methods().items() if method.info.untested_note}
+    assert set(own_methods()) - untested - set(STORED[SUBSET]["results"]) == {"lidar-survey"}
+    tables = {name: set(result["tables"]) for name, result in STORED[SUBSET]["results"].items()}
+    assert all(tables[name] == {"lattice", "pile", "pier"} for name in ("sgbm", "constant", "truth"))
+    assert tables["board-plane"] == tables["sweep-aruco"] == {"lattice", "pile"}, "the pier has no board"
+    assert tables["lidar-mobile"] == {"pier"}, "the others are too near for a scanner"
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_stored_set_is_of_one_dataset(name: str) -> None:
+    renders, results = STORED[name]["renders"], STORED[name]["results"]
+    assert (renders["width"], renders["height"]) == (640, 360)
+    assert renders["views"] == (504 if name in FULL_SETS else renders["views"])
+    for method, result in results.items():
+        assert set(result["tables"]) <= ({"lattice", "pile", "pier"} if name == SUBSET else {name})
+        assert result["submission"]["method"] == method
+        assert all(table["views"] <= renders["views"] for table in result["tables"].values())
+        assert result["dataset"] == results["truth"]["dataset"]
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_truth_has_zero_error_and_noise_has_specified_error(name: str) -> None:
+    results = STORED[name]["results"]
+    for config, table in results["truth"]["tables"].items():
+        assert table["native"]["abs_rel"] == table["rank_error"] == 0, config
+        assert not table["ranked"]
+    for table in results["noisy-truth"]["tables"].values():
+        assert table["native"]["abs_rel"] == pytest.approx(0.25, abs=0.003)
+        assert table["scale_median"] == pytest.approx(1 / 1.25, abs=0.003)
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_reference_errors_do_not_depend_on_the_method(name: str) -> None:
+    results = STORED[name]["results"]
+    for config, errors in reference_context(name)["errors"].items():
+        tables = [result["tables"][config] for result in results.values() if config in result["tables"]]
+        assert all(table["reference"] == tables[0]["reference"] for table in tables)
+        assert errors["constant"][0] == f"{tables[0]['reference']['constant']['abs_rel']:.4f}"
+
+
+@pytest.mark.parametrize("name", PUBLISHED)
+def test_card_rows_match_stored_results(name: str) -> None:
+    results = STORED[name]["results"]
+    config = next(iter(results["sgbm"]["tables"]))
+    rows = {row["method"]: row for row in reference_context(name)["rows"][config]}
+    assert set(rows) == {method for method, result in results.items() if config in result["tables"]}
+    table = results["sgbm-filled"]["tables"][config]
+    row = rows["sgbm-filled"]
+    low, high = table["ci95"]["native"]["abs_rel"]
+    assert row["abs_rel"] == f"{table['native']['abs_rel']:.4f} ({low:.3f}-{high:.3f})"
+    assert row["rmse"] == f"{table['native']['rmse_cm']:.2f} cm"
+    assert row["coverage"] == f"{100 * table['coverage']:.1f} %"
+    assert row["rank_error"] == f"{table['rank_error']:.4f}"
+    assert row["within"] == f"{100 * table['within_mm']['5']:.1f} %"

@@ -37,6 +37,7 @@ from rebar_depth_bench.submission import SubmissionMeta
 from scripts.diagrams import PACKAGE_EDGES, diagrams
 from tests.bench.methods.predictors import load_predictor
 from tests.project.pages import (
+    DOCS,
     PAGES,
     ROOT,
     anchors,
@@ -48,7 +49,6 @@ from tests.project.pages import (
     shell_lines,
 )
 
-DOCS = ROOT / "docs"
 CURRENT_PAGES = [page for page in PAGES if page.name != "CHANGELOG.md"]
 """Pages about this version; the changelog also names what earlier versions had."""
 PACKAGES = ("dataset_builder", "rebar_depth_bench", "leaderboard", "cards")
@@ -61,30 +61,24 @@ MAX_PICTURE_BYTES = 150_000
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
-def commands() -> list[str]:
+def commands(start: str | tuple[str, ...]) -> list[str]:
     lines = [line for page in PAGES for line in shell_lines(page)]
-    return sorted({line for line in lines if line.startswith(tuple(PARSERS))})
+    return sorted({line for line in lines if line.startswith(start)})
 
 
-@pytest.mark.parametrize("command", commands())
+@pytest.mark.parametrize("command", [*commands(tuple(PARSERS)), *commands("python examples/paper/")])
 def test_documented_commands_parse(command: str) -> None:
     program, *arguments = shlex.split(command, comments=True)
-    assert PARSERS[program].parse_args(with_command(arguments) if program == "rebar-build" else arguments)
-
-
-def script_commands() -> list[str]:
-    lines = [line for page in PAGES for line in shell_lines(page)]
-    return sorted({line for line in lines if line.startswith("python examples/paper/")})
-
-
-@pytest.mark.parametrize("command", script_commands())
-def test_documented_commands_of_the_paper_parse(command: str) -> None:
-    _, script, *arguments = shlex.split(command, comments=True)
-    assert import_module(Path(script).stem).argument_parser().parse_args(arguments)
+    if program == "python":
+        script, *arguments = arguments
+        parser = import_module(Path(script).stem).argument_parser()
+    else:
+        parser = PARSERS[program]
+    assert parser.parse_args(with_command(arguments) if program == "rebar-build" else arguments)
 
 
 def test_every_script_of_the_paper_is_listed_and_short() -> None:
-    scripts = {Path(shlex.split(command)[1]).name for command in script_commands()}
+    scripts = {Path(shlex.split(command)[1]).name for command in commands("python examples/paper/")}
     assert scripts == {"anchor.py", "distance.py", "kitti.py", "pseudo_reference.py"}
     page = (DOCS / "paper.md").read_text()
     for path in (ROOT / "examples" / "paper").glob("*.py"):
@@ -118,31 +112,29 @@ def test_mentioned_commands_and_options_exist(page: Path) -> None:
     ]
 
 
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_documented_modules_and_scripts_exist(page: Path) -> None:
-    code = "\n".join([*shell_lines(page), *inline_code(page)])
-    modules = re.findall(r"python -m ([\w.]+)", code)
-    scripts = re.findall(r"python ((?:examples|scripts)/[\w./]+)", code)
-    assert all(find_spec(module) for module in modules)
-    assert all((ROOT / script).is_file() for script in scripts)
+def test_documented_modules_scripts_and_make_targets_exist() -> None:
+    lines = [line for page in PAGES for line in [*shell_lines(page), *inline_code(page)]]
+    code = "\n".join(lines)
+    assert all(find_spec(module) for module in re.findall(r"python -m ([\w.]+)", code))
+    assert all((ROOT / script).is_file() for script in re.findall(r"python ((?:examples|scripts)/[\w./]+)", code))
+    targets = set(re.findall(r"^([a-z-]+):.*##", (ROOT / "Makefile").read_text(), flags=re.MULTILINE))
+    shown = {match[1] for line in lines if (match := re.match(r"make ([a-z-]+)\b", line))}
+    assert {"demo", "docs", "test"} <= shown <= targets
 
 
-@pytest.mark.parametrize("page", CURRENT_PAGES, ids=name_of)
-def test_extras_are_installed_from_the_repository(page: Path) -> None:
-    text = page.read_text()
+def test_extras_are_installed_from_the_repository_and_listed() -> None:
+    text = "\n".join(page.read_text() for page in CURRENT_PAGES)
     assert "pip install rebar-depth-bench" not in text
-    extras = re.findall(r"\.\[([\w,]+)\]'", text)
-    assert {name for group in extras for name in group.split(",")} <= set(PROJECT["optional-dependencies"])
-
-
-def test_quick_start_lists_every_extra() -> None:
-    assert set(PROJECT["optional-dependencies"]) == set(first_column(DOCS / "quick-start.md"))
+    extras = set(PROJECT["optional-dependencies"])
+    assert {name for group in re.findall(r"\.\[([\w,]+)\]'", text) for name in group.split(",")} <= extras
+    assert set(first_column(DOCS / "quick-start.md")) == extras
 
 
 def pages_with_python() -> list[ParameterSet]:
     """Return the pages with Python; the one that imports and scores 96 views takes seconds."""
     slow = {"docs/score-by-hand.md": pytest.mark.slow}
     pages = {name_of(page): page for page in PAGES if blocks(page, "python")}
+    assert {"README.md", "docs/score.md"} <= set(pages)
     return [pytest.param(page, id=name, marks=slow.get(name, ())) for name, page in pages.items()]
 
 
@@ -162,11 +154,6 @@ def test_documented_python_runs(
         assert {"rgb", "depth", "mask", "K", "poses", "view_id", "right_rgb", "baseline_m"} <= set(batch)
 
 
-def test_readme_and_score_page_run_python() -> None:
-    assert blocks(ROOT / "README.md", "python")
-    assert len(blocks(DOCS / "score.md", "python")) > 1
-
-
 def test_method_template_works(tmp_path: Path) -> None:
     [template] = blocks(DOCS / "methods.md", "py")
     path = tmp_path / "my_model.py"
@@ -177,24 +164,17 @@ def test_method_template_works(tmp_path: Path) -> None:
     assert set(method.info.columns) == set(row)
 
 
-def test_tables_list_configs_variants_and_methods() -> None:
-    build = DOCS / "build.md"
-    assert set(first_column(build)) == {*CONFIGS, *SWEEPS, *VARIANTS}
-    assert all(
-        f"| `{variant.name}` | {variant.description} |" in build.read_text() for variant in VARIANTS.values()
-    )
-    assert set(first_column(DOCS / "methods.md")) == {*own_methods(), *OUTPUT_MEANINGS}
-    meanings = (DOCS / "methods.md").read_text()
-    assert all(f"| `{name}` | {meaning.description} |" in meanings for name, meaning in OUTPUT_MEANINGS.items())
-
-
-def test_formats_list_columns_and_keys() -> None:
-    page = DOCS / "formats.md"
-    listed = first_column(page)
-    assert {*COLUMNS, *BARS_SCHEMA.names, *CROSSINGS_SCHEMA.names} <= set(listed)
-    assert set(SubmissionMeta.model_fields) <= set(listed)
+def test_tables_list_what_the_code_has() -> None:
+    text = {name: (DOCS / f"{name}.md").read_text() for name in ("build", "methods", "formats")}
+    listed = {name: set(first_column(DOCS / f"{name}.md")) for name in text}
+    assert listed["build"] == {*CONFIGS, *SWEEPS, *VARIANTS}
+    assert listed["methods"] == {*own_methods(), *OUTPUT_MEANINGS}
+    columns = {*COLUMNS, *BARS_SCHEMA.names, *CROSSINGS_SCHEMA.names}
+    assert columns | set(SubmissionMeta.model_fields) <= listed["formats"]
+    for page, described in (("build", VARIANTS), ("methods", OUTPUT_MEANINGS)):
+        assert all(f"| `{name}` | {item.description} |" in text[page] for name, item in described.items())
     descriptions = {COLUMN_DESCRIPTIONS[column_kind(name)] for name in COLUMNS}
-    assert all(f"| {description} |" in page.read_text() for description in descriptions)
+    assert all(f"| {description} |" in text["formats"] for description in descriptions)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
@@ -203,13 +183,6 @@ def test_local_links_and_anchors_exist(page: Path) -> None:
         target = (page.parent / path).resolve() if path else page
         assert target.exists(), path
         assert not anchor or anchor in anchors(target), f"{path}#{anchor}"
-
-
-def test_documented_make_targets_exist() -> None:
-    targets = set(re.findall(r"^([a-z-]+):.*##", (ROOT / "Makefile").read_text(), flags=re.MULTILINE))
-    code = [line for page in PAGES for line in [*shell_lines(page), *inline_code(page)]]
-    shown = {match[1] for line in code if (match := re.match(r"make ([a-z-]+)\b", line))}
-    assert {"demo", "docs", "test"} <= shown <= targets
 
 
 def test_security_lists_every_limit() -> None:
@@ -227,25 +200,16 @@ def default_text(limit: Limit) -> str:
     return f"{limit.default >> (10 * power)} {('B', 'KiB', 'MiB', 'GiB')[power]}"
 
 
-def test_documented_layout_files_are_valid(tmp_path: Path) -> None:
-    layouts = blocks(DOCS / "import.md", "toml")
+def test_documented_toml_and_json_are_valid(tmp_path: Path) -> None:
+    layouts, scenes = blocks(DOCS / "import.md", "toml"), blocks(DOCS / "cages.md", "toml")
     assert layouts
-    for block in layouts:
-        path = tmp_path / "layout.toml"
-        path.write_text(block)
-        assert read_layout(path).truth_sigma_m > 0
-
-
-def test_documented_scene_files_are_valid() -> None:
-    scenes = blocks(DOCS / "cages.md", "toml")
     assert scenes
-    assert all(read_scene_toml(block.encode(), "page") for block in scenes)
-
-
-@pytest.mark.parametrize("page", PAGES, ids=name_of)
-def test_documented_toml_and_json_parse(page: Path) -> None:
-    assert all(tomllib.loads(block) for block in blocks(page, "toml"))
-    assert all(json.loads(block) for block in blocks(page, "json"))
+    for layout in layouts:
+        (tmp_path / "layout.toml").write_text(layout)
+        assert read_layout(tmp_path / "layout.toml").truth_sigma_m > 0
+    assert all(read_scene_toml(scene.encode(), "page") for scene in scenes)
+    assert all(tomllib.loads(block) for page in PAGES for block in blocks(page, "toml"))
+    assert all(json.loads(block) for page in PAGES for block in blocks(page, "json"))
 
 
 def test_architecture_table_and_diagram_have_the_real_imports() -> None:

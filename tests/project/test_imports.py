@@ -1,8 +1,9 @@
-"""Modules loaded by imports in a fresh interpreter."""
+"""Imports in a fresh interpreter, declared packages, public names and messages about rejected inputs."""
 
 from __future__ import annotations
 
 import ast
+import json
 import os
 import re
 import subprocess
@@ -11,18 +12,17 @@ import tomllib
 from importlib import metadata
 from importlib.util import find_spec
 from itertools import chain
-from pathlib import Path
 
 import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
-PACKAGES = ("cards", "dataset_builder", "leaderboard", "rebar_depth_bench")
+import rebar_depth_bench
+from tests.data.messages import messages
+from tests.project.pages import ROOT
 
-SCORING_IMPORTS = (
-    "import rebar_depth_bench as rdb; rdb.score; rdb.load; rdb.SubmissionWriter; "
-    "from rebar_depth_bench.cli.main import argument_parser; argument_parser()"
-)
+REVIEWED = ROOT / "tests" / "data" / "messages.txt"
+PACKAGES = ("cards", "dataset_builder", "leaderboard", "rebar_depth_bench")
 
 BUILDER_MODULES = [
     "catalog.named_configs",
@@ -33,64 +33,68 @@ BUILDER_MODULES = [
     "user_files.cage_file",
     "scene.variants.props",
 ]
-"""Packages, and modules that could take part in circular imports."""
+"""Modules that could take part in circular imports."""
 
 
-def modules_after(statement: str) -> set[str]:
-    code = f"{statement}\nimport sys\nprint(*sys.modules)"
+MODULES_AFTER = """
+import json, sys
+def added():
+    return sorted(set(sys.modules) - before)
+before, found = set(sys.modules), {}
+"""
+"""Start of a script that notes the modules that each of several statements has added."""
+
+
+def modules_after(**statements: str) -> dict[str, set[str]]:
+    """Return, by name, the modules that are loaded after each statement, run in order in a new interpreter."""
+    steps = [f"{statement}\nfound[{name!r}] = added()\n" for name, statement in statements.items()]
+    code = f"{MODULES_AFTER}{''.join(steps)}print(json.dumps(found))"
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    return set(process.stdout.split())
+    return {name: set(modules) for name, modules in json.loads(process.stdout).items()}
 
 
 @pytest.mark.slow
-def test_loading_and_scoring_import_no_heavy_packages() -> None:
-    modules = modules_after(SCORING_IMPORTS)
-    assert "rebar_depth_bench.scoring.score" in modules
+def test_bench_imports_what_a_command_needs_and_no_heavy_package() -> None:
+    parse = "from rebar_depth_bench.cli.main import argument_parser; argument_parser([{!r}])"
+    found = modules_after(
+        package="import rebar_depth_bench as rdb",
+        version=parse.format("--version"),
+        help=parse.format("--help"),
+        cache=parse.format("cache"),
+        scoring="rdb.score; rdb.load; rdb.SubmissionWriter; argument_parser()",
+    )
+    assert not found["package"] & {"datasets", "pyarrow", "numpy", "torch"}
+    commands = {
+        name: {one.removeprefix("rebar_depth_bench.cli.") for one in modules if "rebar_depth_bench.cli." in one}
+        for name, modules in found.items()
+    }
+    assert commands["version"] == commands["help"] == {"main", "console"}
+    assert commands["cache"] == {"main", "console", "cache"}
+    assert not found["help"] & {"numpy", "pyarrow", "pydantic", "jinja2"}
+    assert "rebar_depth_bench.scoring.score" in found["scoring"]
     heavy = {"torch", "bpy", "mathutils", "cv2", "embreex", "trimesh", "fastapi", "dataset_builder", "leaderboard"}
     heavy |= {"datasets", "huggingface_hub", "pandas", "scipy", "yaml"}  # Imported on use: each is slow to import.
-    assert not modules & heavy
-
-
-def test_package_import_is_lightweight() -> None:
-    assert not modules_after("import rebar_depth_bench") & {"datasets", "pyarrow", "numpy", "torch"}
-
-
-@pytest.mark.parametrize(
-    ("words", "commands"),
-    [("--version", set()), ("--help", set()), ("cache", {"cache"})],
-)
-def test_a_command_line_imports_only_its_command(words: str, commands: set[str]) -> None:
-    modules = modules_after(
-        f"from rebar_depth_bench.cli.main import argument_parser; argument_parser([{words!r}])"
-    )
-    names = {name.removeprefix("rebar_depth_bench.cli.") for name in modules if "rebar_depth_bench.cli." in name}
-    assert names == {"main", "console", *commands}
-    assert commands or not modules & {"numpy", "pyarrow", "pydantic", "jinja2"}
-
-
-def test_options_of_a_command_load_no_other_command() -> None:
-    modules = modules_after("from dataset_builder.cli.main import argument_parser; argument_parser(['export'])")
-    assert {name for name in modules if name.startswith("dataset_builder")} == {
-        "dataset_builder",
-        "dataset_builder.cli",
-        "dataset_builder.cli.main",
-    }
-    assert not modules & {"numpy", "pyarrow"}
+    assert not found["scoring"] & heavy
 
 
 @pytest.mark.slow
-def test_build_planning_does_not_import_blender() -> None:
-    modules = modules_after(
-        "import dataset_builder.cli.main, dataset_builder.pipeline.build, dataset_builder.audit"
+def test_builder_imports_what_a_command_needs_and_plans_without_blender() -> None:
+    found = modules_after(
+        export="from dataset_builder.cli.main import argument_parser; argument_parser(['export'])",
+        planning="import dataset_builder.cli.main, dataset_builder.pipeline.build, dataset_builder.audit",
     )
-    assert "dataset_builder.pipeline.build" in modules
-    assert not modules & {"bpy", "mathutils", "torch"}
+    own = {name for name in found["export"] if name.startswith("dataset_builder")}
+    assert own == {"dataset_builder", "dataset_builder.cli", "dataset_builder.cli.main"}
+    assert not found["export"] & {"numpy", "pyarrow"}
+    assert "dataset_builder.pipeline.build" in found["planning"]
+    assert not found["planning"] & {"bpy", "mathutils", "torch"}
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", BUILDER_MODULES)
-def test_builder_modules_can_be_imported_first(name: str) -> None:
-    assert f"dataset_builder.{name}" in modules_after(f"import dataset_builder.{name}")
+def test_each_builder_module_can_be_imported_first() -> None:
+    forget = "[sys.modules.pop(name) for name in list(sys.modules) if name.startswith('dataset_builder')]"
+    found = modules_after(**{name: f"{forget}\nimport dataset_builder.{name}" for name in BUILDER_MODULES})
+    assert all(f"dataset_builder.{name}" in modules for name, modules in found.items())
 
 
 def test_missing_build_extra_is_named() -> None:
@@ -109,37 +113,33 @@ sys.exit(main(["--out", "nowhere"]))
     )
 
 
-@pytest.mark.parametrize(
-    "name", ["load", "score", "SubmissionWriter", "torch_loader", "Result", "SubmissionError"]
-)
-def test_public_names_exist(name: str) -> None:
-    import rebar_depth_bench
-
-    assert name in rebar_depth_bench.__all__
-    assert getattr(rebar_depth_bench, name).__name__ == name
-
-
-def test_unknown_name_raises_attribute_error() -> None:
-    import rebar_depth_bench
-
+@pytest.mark.slow
+def test_public_names_exist_and_others_raise_attribute_error() -> None:
+    names = {"load", "score", "SubmissionWriter", "torch_loader", "Result", "SubmissionError"}
+    assert names <= set(rebar_depth_bench.__all__)
+    assert all(getattr(rebar_depth_bench, name).__name__ == name for name in names)
     with pytest.raises(AttributeError, match="has no attribute 'lod'"):
         rebar_depth_bench.lod  # noqa: B018
+
+
+def test_messages_about_rejected_inputs_equal_reviewed_ones() -> None:
+    assert "\n".join(messages()) == REVIEWED.read_text(), "python -m tests.data.messages > tests/data/messages.txt"
 
 
 _IN_BLENDER = {"_cycles", "mathutils"}
 """Modules that come with bpy."""
 
 
+@pytest.mark.slow
 def test_every_imported_package_is_declared() -> None:
-    root = Path(__file__).parents[2]
     imported = set[str]()
-    for path in (path for package in PACKAGES for path in (root / package).rglob("*.py")):
+    for path in (path for package in PACKAGES for path in (ROOT / package).rglob("*.py")):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.Import):
                 imported |= {alias.name.partition(".")[0] for alias in node.names}
             elif isinstance(node, ast.ImportFrom) and node.level == 0:
                 imported.add((node.module or "").partition(".")[0])
-    project = tomllib.loads((root / "pyproject.toml").read_text())["project"]
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     requirements = [*project["dependencies"], *chain(*project["optional-dependencies"].values())]
     declared = {canonicalize_name(Requirement(text).name) for text in requirements}
     distributions = metadata.packages_distributions()
@@ -151,7 +151,7 @@ def test_every_imported_package_is_declared() -> None:
 
 def test_packages_without_which_tests_are_skipped_are_installed() -> None:
     """Where ``CI`` is true, no file of tests is skipped because its extra was not installed."""
-    files = Path(__file__).parents[1].rglob("test_*.py")
+    files = (ROOT / "tests").rglob("test_*.py")
     calls = [re.findall(r"^\s*(?:\w+ = )?pytest\.importorskip\(\"(\w+)", path.read_text(), re.M) for path in files]
     names = {name for found in calls for name in found}
     assert {"cv2", "onnx", "torch"} <= names

@@ -157,6 +157,9 @@ def test_repository_without_a_connection_is_named() -> None:
 @pytest.mark.parametrize(
     "root", ["org/data@", "org/data@../x", "org/data@a@b", "../data", "org/data@x y", "a/b/c@d"]
 )
-def test_text_that_is_no_folder_or_hub_id_is_refused(root: str) -> None:
+def test_text_that_is_no_folder_or_hub_id_is_refused(
+    root: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)  # A folder data may lie beside the checkout.
     with pytest.raises(rdb.DatasetError, match="no such folder, expected a dataset folder or a Hub repository id"):
         open_folder(root)

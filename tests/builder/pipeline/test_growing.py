@@ -12,7 +12,6 @@ import datasets
 import pytest
 
 import rebar_depth_bench as rdb
-from benchmarks.scale import PreparedRows, placed
 from dataset_builder.audit import audit, auditing
 from dataset_builder.catalog.cages_config import CagesRequest
 from dataset_builder.catalog.named_configs import BuildRequest
@@ -26,6 +25,7 @@ from rebar_depth_bench.data.bars import BARS_FILE
 from rebar_depth_bench.data.files import MANIFEST_FILE, file_problems
 from rebar_depth_bench.data.manifest import open_folder
 from tests.building import contents
+from tests.prepared_rows import PreparedRows, placed
 
 pytestmark = pytest.mark.slow
 
