@@ -1,7 +1,13 @@
-"""Predictions with one mistake each, as users make them, and what the diagnosis says about them."""
+"""Predictions with one mistake each, as users make them, and what the diagnosis says about them.
+
+``python -m tests.mistakes ROOT CONFIG [ARCHIVE ...]`` takes the predictions of each archive, and those of a
+made-up learned method, makes every mistake, and prints which mistake is named: "yes" for the right one, its name
+for another, "-" for none. A sound prediction must have "-".
+"""
 
 from __future__ import annotations
 
+import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -13,12 +19,29 @@ from numpy import ndarray
 from scipy.ndimage import gaussian_filter, shift
 
 from rebar_depth_bench import SubmissionWriter
+from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.data.rows import iterate_rows
 from rebar_depth_bench.diagnosis.corrections import UNITS
 from rebar_depth_bench.diagnosis.diagnose import diagnose
 from rebar_depth_bench.scoring.evaluation import open_evaluation
 
 Image = Float[ndarray, "h w"]
 SOUND = "sound"
+
+
+def main(root: Path, config: str, archives: Sequence[Path]) -> None:
+    """Print the table."""
+    columns = ("view_id", "left_depth", "left_K", "baseline_m")
+    rows = list(iterate_rows(open_folder(root).config(config), columns))
+    predictions = {"learned": learned_like([row["left_depth"] for row in rows])}
+    for archive in archives:
+        with open_evaluation(archive, root) as evaluation:
+            images = [evaluation.submission.read(row["view_id"]) for row in rows]
+            predictions[evaluation.meta.method] = [np.array(image, np.float32) for image in images]
+    cells = {name: mistakes_named(root, rows, images) for name, images in predictions.items()}
+    print(f"| mistake | {' | '.join(cells)} |\n|{'---|' * (1 + len(cells))}")
+    for name in mistakes(rows):
+        print(f"| {name} | {' | '.join(named[name] for named in cells.values())} |")
 
 
 def mistakes_named(root: Path, rows: Sequence[Mapping[str, ndarray]], images: Sequence[Image]) -> dict[str, str]:
@@ -115,3 +138,9 @@ def _seen_from_the_right(depth_m: Image, focal_baseline: float) -> Image:
 def _range_per_depth(K: Float[ndarray, "3 3"], height: int, width: int) -> Image:
     v, u = np.ogrid[:height, :width]
     return np.asarray(np.sqrt(1 + ((u - K[0, 2]) / K[0, 0]) ** 2 + ((v - K[1, 2]) / K[1, 1]) ** 2))
+
+
+if __name__ == "__main__":
+    if len(sys.argv) < 3:
+        sys.exit("usage: python -m tests.mistakes ROOT CONFIG [ARCHIVE ...]")
+    main(Path(sys.argv[1]), sys.argv[2], [Path(name) for name in sys.argv[3:]])

@@ -41,7 +41,10 @@ three decimals, and ranks use these rounded numbers."""
 _LOCAL_HOSTS = ("localhost", "127.0.0.1", "[::1]")
 """Hosts that are always allowed: health checks of the machine itself name them."""
 _MIN_GZIP_BYTES = 1024
-STATIC_FOLDERS = [("leaderboard.web.pages", "static"), ("rebar_depth_bench.reporting.html", "static")]
+_STATIC_FOLDERS: list[str | tuple[str, str]] = [
+    ("leaderboard.web.pages", "static"),
+    ("rebar_depth_bench.reporting.html", "static"),
+]
 """Packages and their folders with style sheets, scripts and the icon: of the pages, and of the report."""
 
 
@@ -69,7 +72,7 @@ def make_app(service: Service) -> FastAPI:
     app.state.templates = make_templates()
     for router in (submissions, leaderboard, status, ranking, submission_page, upload_form, account):
         app.include_router(router.router)
-    app.mount("/static", _StaticFiles(packages=STATIC_FOLDERS))
+    app.mount("/static", _StaticFiles(packages=_STATIC_FOLDERS))
     identity = f"{software_version()} {service.folder.digest} {settings.model_dump_json()}"
     # Inside the cache, so that a kept response is compressed once.
     app.add_middleware(GZipMiddleware, minimum_size=_MIN_GZIP_BYTES, compresslevel=5)

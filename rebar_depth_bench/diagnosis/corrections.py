@@ -277,7 +277,7 @@ def shape_corrections(views: Sequence[DiagnosedView], read: ReadPrediction, coun
     dv, du = best_shift(views)
     ray = "distances along the rays instead of depth along the optical axis"
     # Range and shift change most pixels by less than the errors of a method. The sound predictions of those in
-    # "benchmarks.diagnosis" are not better than 0.98 after these corrections.
+    # "tests.mistakes" are not better than 0.98 after these corrections.
     corrections = [
         Correction("range", ray, _SCALED, _range_errors, clearly_better=0.95),
         Correction("inverse", "disparity or inverse depth instead of depth", _FITTED, _inverse_errors),

@@ -85,6 +85,7 @@ file = "pose-{view}.txt"
 [bars]
 file = "bars.csv"
 """
+_MILLIMETRES = '[depth]\nunit = "mm"\n'
 _BARS = """bar_id,role,diameter_m,x_m,y_m,z_m
 1,main,0.016,0.0,0.1,0.2
 1,main,0.016,0.5,0.1,0.2
@@ -186,10 +187,10 @@ def _pfm(depth_m: np.ndarray) -> bytes:
     return f"Pf\n{width} {height}\n-1.0\n".encode() + depth_m[::-1].astype("<f4").tobytes()
 
 
-def _write_import(path: Path, depth: bytes = npy(IMPORTED_M), suffix: str = "npy") -> None:
-    """Write a layout, its bars and one view, the depth of which has the content ``depth``."""
+def _write_import(path: Path, depth: bytes = npy(IMPORTED_M), suffix: str = "npy", table: str = "") -> None:
+    """Write a layout with a further ``table``, its bars and one view, whose depth has the content ``depth``."""
     folder = path.parent
-    (folder / "layout.toml").write_text(_LAYOUT.replace("{suffix}", suffix))
+    (folder / "layout.toml").write_text(_LAYOUT.replace("{suffix}", suffix) + table)
     (folder / "bars.csv").write_text(_BARS)
     (folder / f"depth-a.{suffix}").write_bytes(depth)
     Image.new("RGB", (16, 16)).save(folder / "rgb-a.png")
@@ -254,8 +255,8 @@ _depth = partial(_content, read=_decode_depth)
 _imported = partial(_reader, read=_import, cpu_s=10.0)
 
 
-def _imported_depth(kind: str, suffix: str, content: bytes) -> EntryPoint:
-    write = partial(_write_import, depth=content, suffix=suffix)
+def _imported_depth(kind: str, suffix: str, content: bytes, table: str = "") -> EntryPoint:
+    write = partial(_write_import, depth=content, suffix=suffix, table=table)
     return _imported(f"import: {kind}", f"depth-a.{suffix}", write)
 
 
@@ -315,4 +316,6 @@ FILE_ENTRIES = (
     _imported_depth("npz", "npz", npz(depth=IMPORTED_M)),
     _imported_depth("TIFF", "tif", _tiff(IMPORTED_M)),
     _imported_depth("PFM", "pfm", _pfm(IMPORTED_M)),
+    _imported("import: EXR", "depth-a.exr", lambda path: _write_import(path, exr(path, {"V": IMPORTED_M}), "exr")),
+    _imported_depth("PNG", "png", png(np.round(1000 * IMPORTED_M)), _MILLIMETRES),
 )

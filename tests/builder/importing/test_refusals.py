@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import pickle
-import random
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -19,9 +18,8 @@ from dataset_builder.importing.config_import import plan_import, run_import
 from dataset_builder.pipeline.retained import Finished
 from rebar_depth_bench.base.errors import DatasetError, InputError
 from rebar_depth_bench.data.manifest import open_folder
-from tests.bench.damage import damaged
 from tests.builder.importing import source_data as data
-from tests.builder.importing.source_data import NAMES, Row
+from tests.builder.importing.source_data import NAMES
 from tests.damage import change_rows
 
 Entry = dict[str, Any]
@@ -182,34 +180,6 @@ def test_file_without_bars_is_refused(content: bytes, folder: Path) -> None:
     (folder / "bars.csv").write_bytes(content)
     with pytest.raises(InputError, match=r"bars\.csv"):
         plan_import(data.write_layout(folder), "mock-up")
-
-
-DAMAGED_FORMATS = ["npy float64", "npz", "EXR", "EXR of several channels", "TIFF compressed", "TIFF millimetres"]
-DAMAGED_FORMATS += ["PNG millimetres", "PFM", "disparity"]
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["layout.toml", "bars.csv", *DAMAGED_FORMATS])
-def test_damaged_file_is_refused_or_read(name: str, rows: list[Row], folder: Path, tmp_path: Path) -> None:
-    """Damage one of the files many times; whatever is read has finite depth."""
-    if name in DAMAGED_FORMATS:
-        layout = data.write_depth_format(folder, rows, name)
-        [path] = folder.glob(f"other/{FIRST}.*")
-    else:
-        layout, path = data.write_layout(folder), folder / name
-    sound, rng, outcomes = path.read_bytes(), random.Random(name), []
-    for _ in range(CASES):
-        path.write_bytes(damaged(sound, rng))
-        try:
-            columns = plan_import(layout, "mock-up").views.decode(NAMES[0])
-        except InputError:
-            outcomes.append("refused")
-        else:
-            assert np.isfinite(columns["left_depth"]).all()
-            assert (columns["left_depth"] >= 0).all()
-            outcomes.append("read")
-    assert set(outcomes) <= {"refused", "read"}
-    assert "refused" in outcomes
 
 
 def test_folder_that_is_no_dataset_is_refused(
