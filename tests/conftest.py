@@ -45,6 +45,8 @@ GOLDEN_TEXTS = Path(__file__).parent / "data" / "golden"
 FIXTURE_MARKERS = {
     "blender": "blender",
     "running_server": "server",
+    "scripted": "server",
+    "hub": "server",
     "running_scorer": "server",
     "running_postgres": "postgres",
     "new_cluster": "dask",

@@ -118,6 +118,7 @@ def workspace(tmp_path: Path) -> Workspace:
     return made
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", VIOLATIONS)
 def test_violated_property_is_found(kind: str, workspace: Workspace) -> None:
     seen = observe(lambda: VIOLATIONS[kind](workspace), workspace)

@@ -212,6 +212,7 @@ def test_documented_toml_and_json_are_valid(tmp_path: Path) -> None:
     assert all(json.loads(block) for page in PAGES for block in blocks(page, "json"))
 
 
+@pytest.mark.slow
 def test_architecture_table_and_diagram_have_the_real_imports() -> None:
     graph = grimp.build_graph(*PACKAGES, exclude_type_checking_imports=True)
     imports = {

@@ -251,6 +251,7 @@ def test_lines_are_those_of_the_key_in_its_table(text: str, lines: dict[str, int
     )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("line", "is_key"),
     [

@@ -295,6 +295,7 @@ HOSTILE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", HOSTILE)
 def test_hostile_file_is_refused(name: str, tmp_path: Path) -> None:
     (tmp_path / name).write_bytes(HOSTILE[name].encode(errors="surrogateescape"))

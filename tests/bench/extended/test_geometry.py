@@ -323,6 +323,7 @@ def brute_force_scores(p_m: ndarray, truth: SteelTruth, queries: int = MAX_POINT
     return expected
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(SEEDS)
 def test_scores_agree_with_brute_force(seed: int) -> None:
@@ -335,6 +336,7 @@ def test_scores_agree_with_brute_force(seed: int) -> None:
         assert cloud_scores(p_m, truth) == pytest.approx(brute_force_scores(p_m, truth, 7))
 
 
+@pytest.mark.slow
 def test_number_of_queries_does_not_set_the_distances(monkeypatch: pytest.MonkeyPatch) -> None:
     """A cylinder across the view, 2 % too far: two fifths of its points are within 5 mm of its surface."""
     y = (np.arange(120) - 59.5) / 60

@@ -203,6 +203,7 @@ def test_alignments_agree_with_independent_solvers(seed: int) -> None:
     assert scale_invariant_log(p, z) == pytest.approx(np.sqrt(np.mean(d**2) - np.mean(d) ** 2))
 
 
+@pytest.mark.slow
 @given(SEEDS, st.floats(0.1, 10))
 def test_aligned_measures_are_independent_of_unit(seed: int, unit: float) -> None:
     z = depths(seed)

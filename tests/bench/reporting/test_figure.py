@@ -240,6 +240,7 @@ def test_hostile_names_are_texts(tmp_path: Path) -> None:
     assert {*names[1:]} <= {*shown}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("suffix", ["svg", "png", "pdf"])
 def test_settings_of_the_user_do_not_count(suffix: str, tmp_path: Path) -> None:
     results = [result(view("mine/0000", 0.04, 0.03), method="near")]

@@ -240,6 +240,7 @@ def test_templates_and_scripts_are_package_data() -> None:
     assert all(f'"*{suffix}"' in declared.splitlines()[1] for suffix in shipped)
 
 
+@pytest.mark.slow
 def test_report_of_an_archive_embeds_requested_views_worst_first(
     tiny_root: Path, tiny_truth: dict[str, np.ndarray], archive_of: Callable[..., Path], tmp_path: Path
 ) -> None:

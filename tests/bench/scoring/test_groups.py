@@ -77,6 +77,7 @@ def scored(root: Path, archive: Path) -> Result:
     return rdb.score(archive, root)
 
 
+@pytest.mark.slow
 def test_views_are_grouped_by_family_distance_and_width(scored: Result) -> None:
     """Depth grows by 1 mm from row to row, from the first to the last of the 88 scored rows."""
     groups = scored.tables["cages"].groups
@@ -106,6 +107,7 @@ def counts_of_bins(values: list[float], edges: tuple[float, ...], unit: str) -> 
     return {name: int(count) for name, count in zip(names, counts, strict=True) if count}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("key", "group"), [("family", "wall"), ("family", "beam"), ("distance", "0.5-1 m"), ("distance", "4+ m")]
 )
@@ -212,6 +214,7 @@ traits = st.builds(
 )
 
 
+@pytest.mark.slow
 @given(st.lists(traits, max_size=30))
 def test_groups_are_a_partition_of_the_views_that_have_the_property(views: list[ViewTraits]) -> None:
     values: dict[str, list[object]] = {

@@ -166,6 +166,7 @@ def set_groups(groups: object) -> Change:
     return set_at("tables", "lattice", "groups", value=groups)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("change", "location"),
     [

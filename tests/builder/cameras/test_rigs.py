@@ -99,6 +99,7 @@ def test_rectified_cameras_are_parallel_pinholes(width: int, height: int) -> Non
     assert 0.1 < np.degrees(np.arccos((np.trace(turn[:3, :3]) - 1) / 2)) < 1.0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("width", "height"), SIZES)
 @pytest.mark.parametrize("eye", CAMERA_NAMES)
 def test_rectified_to_raw_projection_matches_opencv_map(width: int, height: int, eye: str) -> None:
