@@ -46,6 +46,7 @@ START_S, UPLOAD_PAUSE_S = 120.0, 5.0
 WITHOUT_LIMIT = 1_000_000_000
 _STREAM_LIMIT_BYTES = 1 << 22
 _BARE_APP = """
+import socket
 import sys
 from pathlib import Path
 import uvicorn
@@ -61,10 +62,10 @@ def add_route(number: int, content: bytes) -> None:
 
 for number, path in enumerate(sorted(Path(sys.argv[1]).iterdir())):
     add_route(number, path.read_bytes())
-config = uvicorn.Config(app, port=0, http="h11", access_log=False, log_level="warning")
-listener = config.bind_socket()
+listener = socket.create_server(("127.0.0.1", 0), backlog=512)
+listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # As asyncio does for its own sockets.
 print(f"http://127.0.0.1:{listener.getsockname()[1]}", file=sys.stderr, flush=True)
-uvicorn.Server(config).run(sockets=[listener])
+uvicorn.Server(uvicorn.Config(app, http="h11", access_log=False, log_level="warning")).run(sockets=[listener])
 """
 
 
