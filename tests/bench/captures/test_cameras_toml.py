@@ -148,6 +148,12 @@ def test_opencv_file_is_read(suffix: str, tmp_path: Path) -> None:
     assert np.allclose(flat(read(tmp_path)), flat(files.expected_calibration(tmp_path)), rtol=0, atol=1e-12)
 
 
+def test_rounded_rotation_is_read_as_the_nearest_rotation(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(files, "ROTATION", files.ROTATION.round(5))
+    files.write_opencv(tmp_path, "yml")
+    assert np.allclose(read(tmp_path).rotation_rad, files.ROTATION_RAD, rtol=0, atol=1e-5)
+
+
 def test_two_files_of_the_opencv_sample_are_read_with_the_unit_of_their_squares(tmp_path: Path) -> None:
     files.write_opencv_sample(tmp_path)
     (tmp_path / "cameras.toml").write_text('calibration = ["intrinsics.yml", "extrinsics.yml"]\nunit = "cm"\n')
