@@ -152,6 +152,7 @@ def test_views_have_scores_and_true_distances(
     assert study["crossing_reach"]["lattice"]["native"][0]["limit_mm"] == 5
 
 
+@pytest.mark.slow
 def test_whole_scenes_are_resampled(tmp_path: Path, archive_of: Archive) -> None:
     """The six views of a split are enough for an interval, its two scenes are not."""
     root = tmp_path / "dataset"

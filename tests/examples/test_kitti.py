@@ -207,6 +207,7 @@ def test_list_of_images_is_not_overwritten(root: Path, tmp_path: Path, capsys: p
     assert listed.read_text() == "precious"
 
 
+@pytest.mark.slow
 def test_archive_and_png_folder_score_alike(root: Path, truths: Depths, tmp_path: Path) -> None:
     depths = {name: np.round(depth_m * 256).clip(1, 65535) / 256 for name, depth_m in predictions(truths).items()}
     archive, other = tmp_path / "mono.zip", folder_of.first_images(COUNT + 1)[-1].name

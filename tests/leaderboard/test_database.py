@@ -244,6 +244,7 @@ def test_released_job_costs_no_attempt(database: Database, alice: str) -> None:
     assert (record.status, record.attempts) == ("queued", 0)
 
 
+@pytest.mark.slow
 def test_released_job_with_wait_is_claimed_later(database: Database, alice: str) -> None:
     first, second = queue(database, alice, 2)
     assert jobs.claim(database, "s", LEASE_S) == first

@@ -29,10 +29,12 @@ PUBLISHED = (SUBSET, *FULL_SETS, CAGES)
 STORED: dict[str, dict[str, Any]] = {name: json.loads(results_file(name).read_text()) for name in PUBLISHED}
 
 
+@pytest.mark.slow
 def test_benchmark_card_in_repository_is_up_to_date() -> None:
     assert Path("cards/BENCHMARK.md").read_text() == benchmark_card(), "run `make cards`"
 
 
+@pytest.mark.slow
 def test_benchmark_card_names_every_method_and_rule() -> None:
     card = benchmark_card()
     assert all(f"| `{name}`" in card for name in own_methods())
@@ -41,6 +43,7 @@ def test_benchmark_card_names_every_method_and_rule() -> None:
     assert "at least 0.95" in card
 
 
+@pytest.mark.slow
 def test_names_of_bins_stand_for_their_numbers_only() -> None:
     row = next(line for line in benchmark_card().splitlines() if line.startswith("| `single_bar_within_Nmm`"))
     assert "3 x 3 neighbourhood belongs to one bar with |p - z| <= N mm" in row.replace("\\|", "|")

@@ -97,6 +97,7 @@ def test_each_builder_module_can_be_imported_first() -> None:
     assert all(f"dataset_builder.{name}" in modules for name, modules in found.items())
 
 
+@pytest.mark.slow
 def test_missing_build_extra_is_named() -> None:
     code = """
 import importlib.util, sys

@@ -100,6 +100,7 @@ def test_predicting_twice_gives_identical_depth_entries(constant: Path, tiny_roo
     assert len(entries[0]) == 9
 
 
+@pytest.mark.slow
 def test_check_reads_the_manifest_once(
     constant: Path, tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

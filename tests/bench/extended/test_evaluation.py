@@ -103,6 +103,7 @@ def test_doubled_depth_is_corrected_by_scale(
     assert values(result, SCALED) == values(of_truth, NATIVE)
 
 
+@pytest.mark.slow
 def test_missing_pixels_never_improve_a_measure(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
     """Remove a random half of all predictions: no measure that has a better direction may improve."""
     rng = np.random.default_rng(4)
@@ -123,6 +124,7 @@ def test_missing_pixels_never_improve_a_measure(tiny_truth: Depths, tiny_root: P
     assert gains == {}
 
 
+@pytest.mark.slow
 def test_predictions_are_read_once_and_the_number_of_workers_changes_nothing(
     tiny_truth: Depths, tiny_root: Path, archive_of: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -163,6 +165,7 @@ def test_dilate_mask_by_hand() -> None:
     assert ["".join("1" if cell else "." for cell in row) for row in dilate_mask(mask)] == expected
 
 
+@pytest.mark.slow
 def test_score_command_writes_extended_json_and_csv(
     tiny_truth: Depths, tiny_root: Path, archive_of_truth: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

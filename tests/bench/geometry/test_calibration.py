@@ -235,6 +235,7 @@ def test_unreadable_path_raises_calibration_error(tmp_path: Path, name: str, cod
     assert words in str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "text",
     [

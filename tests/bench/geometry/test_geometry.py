@@ -257,6 +257,7 @@ def grid_distance_m(a: np.ndarray, b: np.ndarray) -> float:
     return float(np.linalg.norm(on_a[:, None] - on_b[None], axis=2).min())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["random", "parallel", "collinear", "crossing", "points", "point and segment"])
 def test_distance_is_that_of_the_nearest_points(kind: str) -> None:
     random = np.random.default_rng(7)

@@ -272,6 +272,7 @@ def test_png_has_the_size_of_print_and_the_colours_of_points(tmp_path: Path) -> 
     assert pixels[0, 0].tolist() == [255, 255, 255]
 
 
+@pytest.mark.slow
 def test_table_command_draws_archives(
     tiny_truth: dict[str, np.ndarray],
     tiny_root: Path,

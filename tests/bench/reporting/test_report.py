@@ -262,6 +262,7 @@ def test_report_of_an_archive_embeds_requested_views_worst_first(
             write_report(shown, evaluation, page, views_shown=-1)
 
 
+@pytest.mark.slow
 def test_views_are_decoded_once_for_diagnosis_and_report(
     tiny_root: Path,
     tiny_truth: dict[str, np.ndarray],

@@ -101,6 +101,7 @@ def test_score_agrees_with_independent_evaluation(
     assert table.scale_median == pytest.approx(np.median([row[-1] for row in rows]), rel=1e-12)
 
 
+@pytest.mark.slow
 def test_json_is_identical_for_workers_and_command_line(
     tiny_truth: Depths, tiny_root: Path, archive_of: Archive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -133,6 +133,7 @@ def rendered(root: Path, config: str) -> Mapping[str, tuple[ndarray, ndarray, nd
     }
 
 
+@pytest.mark.slow
 def test_measures_of_a_config_are_those_of_its_pixels(
     tiny_root: Path, tiny_truth: Depths, archive_of: Archive
 ) -> None:

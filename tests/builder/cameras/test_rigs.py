@@ -112,6 +112,7 @@ def test_rectified_to_raw_projection_matches_opencv_map(width: int, height: int,
     assert np.abs(projected_px - opencv_px).max() < 1e-6 + 2e-7 * width  # The maps are float32.
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("eye", CAMERA_NAMES)
 def test_raw_to_rectified_matches_opencv_undistort(eye: str) -> None:
     """Compare raw pixel -> ray -> rectified pixel with ``cv2.undistortPointsIter`` in float64."""

@@ -219,6 +219,7 @@ def rod(bar_id: int, start: tuple[float, ...], end: tuple[float, ...], diameter_
     return Bar(bar_id, "bar", diameter_m, axis_of(np.array([start, end], dtype=np.float64)))
 
 
+@pytest.mark.slow
 def test_overlaps_are_those_of_sampled_axes() -> None:
     random = np.random.default_rng(3)
     bars = [
