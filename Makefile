@@ -18,7 +18,7 @@ demo: ## Render a small lattice set, predict, score, and write the report
 quick: env-dev ## Format, lint, types, import contracts, and the fast tests that need no Blender, server, database or browser
 	scripts/check.sh $(BIN) quick
 
-test: system-packages env-dev ## Everything that CI runs: quick, and real renders, servers, databases and browser
+test: system-packages env-dev ## Quick, and real renders, servers, databases and browser: all tests but the nightly ones
 	scripts/check.sh $(BIN) test
 
 nightly: system-packages env-dev ## Everything, with the long stress tests and 10,000 damaged inputs

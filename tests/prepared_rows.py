@@ -1,4 +1,7 @@
-"""Renderer of prepared rows, for builds whose views need not show anything."""
+"""Renderer of prepared rows, for builds whose views need not show anything.
+
+The rows are those of ``benchmarks/scale.py``, which tests do not import.
+"""
 
 from __future__ import annotations
 

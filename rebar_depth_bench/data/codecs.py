@@ -1,6 +1,6 @@
 """Lossless codecs of the dataset's images and depth maps.
 
-The formats were chosen by measurements on rendered views (docs/design.md).
+docs/design.md has the reasons for these formats.
 """
 
 from __future__ import annotations

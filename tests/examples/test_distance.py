@@ -153,7 +153,7 @@ def test_views_have_scores_and_true_distances(
 
 
 @pytest.mark.slow
-def test_whole_scenes_are_resampled(tmp_path: Path, archive_of: Archive) -> None:
+def test_whole_scenes_are_resampled(tmp_path: Path) -> None:
     """The six views of a split are enough for an interval, its two scenes are not."""
     root = tmp_path / "dataset"
     write_split_dataset(root, {"a": "train", "b": "train", "c": "test"}, 3)

@@ -1,14 +1,14 @@
-"""Entry points of the fuzz tests, and the folders of one case: inputs, outputs, home and bystanders.
+"""Entry points of the fuzz tests, and the folders of one case: inputs, outputs, home and files of others.
 
 ::
 
     work/               everything that a case may see
       home/             HOME, with the user's cache in .cache
-      victim/notes.txt  bystander; others are below a/ and b/
+      victim/notes.txt  file of others; more are below a/ and b/
       a/b/case/         inputs of the entry point, its working folder
       a/b/case/out/     outputs
 
-The inputs lie deep enough that names with ``..`` end at a bystander and not outside.
+The inputs lie deep enough that names with ``..`` end at a file of others and not outside.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from rebar_depth_bench.cli.main import argument_parser
 
 HOME, CASE, OUT, ELSEWHERE = "home", "a/b/case", "a/b/case/out", "elsewhere"
 CACHE = f"{HOME}/.cache"
-_BYSTANDERS = tuple(f"{folder}victim" for folder in ("", "a/", "a/b/", f"{HOME}/", f"{CASE}/"))
+_OF_OTHERS = tuple(f"{folder}victim" for folder in ("", "a/", "a/b/", f"{HOME}/", f"{CASE}/"))
 
 Snapshot = dict[str, tuple[int, int, int, str]]
 """Type, size, time of change and link target of every path below a folder; size and time of files only."""
@@ -49,11 +49,11 @@ class Workspace:
         return self.root / OUT
 
     def make(self) -> None:
-        """Write the folders and the bystanders, without inputs."""
+        """Write the folders and the files of others, without inputs."""
         shutil.rmtree(self.root, ignore_errors=True)
-        for folder in (OUT, CACHE, *_BYSTANDERS):
+        for folder in (OUT, CACHE, *_OF_OTHERS):
             (self.root / folder).mkdir(parents=True)
-        for folder in _BYSTANDERS:
+        for folder in _OF_OTHERS:
             (self.root / folder / "notes.txt").write_text("Not to be changed.\n")
 
     def environment(self, temporary: Path) -> dict[str, str]:
@@ -103,7 +103,7 @@ class EntryPoint:
 
     ``prepare`` writes sound inputs into the folder of a workspace and may run commands; ``run`` reads them and
     raises ``RebarDepthError`` for unsound ones. ``targets`` are glob patterns, below the work folder, of the files
-    to damage. ``share`` is its share of the cases of a campaign. If it ``is_quick``, it reads one file within
+    to damage. ``share`` is its share of the cases of a run. If it ``is_quick``, it reads one file within
     milliseconds, and ``make test`` runs at least 100 of its cases. ``cpu_s`` is the allowed processor time.
 
     ``result`` returns what an accepted case has found. It equals that of the sound inputs in every case if a

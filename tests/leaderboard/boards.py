@@ -1,4 +1,4 @@
-"""Boards that are filled without a server, kills of their operations, and the state that they must keep."""
+"""Leaderboards that are filled without a server, kills of their operations, and the state that they must keep."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def board_settings(state: Path, **values: object) -> Settings:
 
 @contextmanager
 def opened(settings: Settings) -> Iterator[tuple[Database, ArchiveStore]]:
-    """Yield database and archives of a board, which is made if there is none."""
+    """Yield database and archives of a leaderboard, which is made if there is none."""
     settings.state_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
     with closing(Database(settings.database_url)) as database:
         database.migrate()
@@ -53,7 +53,7 @@ def opened(settings: Settings) -> Iterator[tuple[Database, ArchiveStore]]:
 
 
 def make_board(settings: Settings) -> str:
-    """Make a board, and return a token of it."""
+    """Make a leaderboard, and return a token of it."""
     with opened(settings) as (database, _):
         return create_token(database, "alice")
 

@@ -1,4 +1,4 @@
-"""Backup: what it refuses, what it keeps, and how a board is restored from it."""
+"""Backup: what it refuses, what it keeps, and how a leaderboard is restored from it."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def back_up_by_command(settings: Settings, target: Path, *options: object) -> su
 
 @pytest.fixture
 def board(tmp_path: Path) -> tuple[Settings, str]:
-    """Return the settings of a board, and a token of it."""
+    """Return the settings of a leaderboard, and a token of it."""
     settings = board_settings(tmp_path / "state")
     return settings, make_board(settings)
 

@@ -33,7 +33,7 @@ BOARD, API, CSV = (f"{path}?config=lattice" for path in ("/", "/api/v1/leaderboa
 
 @pytest.fixture
 def database(tmp_path: Path) -> Iterator[Database]:
-    """Yield the database of a board whose dataset is beside the state folder."""
+    """Yield the database of a leaderboard whose dataset is beside the state folder."""
     write_dataset(tmp_path / "dataset", ["lattice", "pile"], 1)
     with closing(Database(f"sqlite:///{tmp_path / 'state' / 'leaderboard.sqlite'}")) as opened:
         opened.migrate()

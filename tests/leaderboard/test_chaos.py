@@ -1,4 +1,4 @@
-"""Kills of server, scorers, database and backups: what is accepted is scored once, health and logs tell of it."""
+"""Kills of server, scorers, database and backups: what is accepted is scored once, and failures are reported."""
 
 from __future__ import annotations
 

@@ -202,9 +202,7 @@ def test_endless_answer_ends_with_an_error(
     assert re.search("time limit|too large|no response", refused())
 
 
-def test_unknown_states_are_asked_once_and_failures_again(
-    scripted: ScriptedServer, small_archive: Path, tmp_path: Path
-) -> None:
+def test_unknown_states_are_asked_once_and_failures_again(scripted: ScriptedServer, small_archive: Path) -> None:
     """A proxy may fail for a while; a leaderboard that answers with an unknown status will do so again."""
     good = submission(small_archive)
     failures = [answer(b"<html>", 502), answer(b"<html>"), b"", answer({"detail": "slow down"}, 429)]

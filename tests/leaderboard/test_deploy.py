@@ -42,7 +42,7 @@ def instructions(name: str) -> list[str]:
 
 
 def parses(words: list[str]) -> bool:
-    """Return whether ``rebar-leaderboard`` knows all words of a command line: it runs with a wrong one more."""
+    """Return whether ``rebar-leaderboard`` knows all words: an unknown option after them is the only error."""
     error = run(*words, "--nothing-such").stderr
     return "unrecognized arguments: --nothing-such\n" in error
 

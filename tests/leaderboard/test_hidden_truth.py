@@ -40,7 +40,7 @@ Change = Callable[[str, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Probes:
-    """A server that hides the ground truth of a board that did not, its token, and submissions by what they are.
+    """A server that hides the ground truth of a leaderboard that showed it, its token, and submissions by kind.
 
     ``results`` are those of the submissions that were scored before the option was given, and ``printed`` is what
     ``rebar-bench submit`` printed for the submission ``view``.
@@ -294,7 +294,7 @@ def state(tmp_path: Path) -> Path:
 
 @pytest.fixture
 def boards(state: Path) -> Iterator[list[Database]]:
-    """Yield one database as a board opens it that shows the ground truth, and one that hides it."""
+    """Yield the database as a leaderboard opens it that shows the ground truth, and as one that hides it."""
     url = f"sqlite:///{state / 'leaderboard.sqlite'}"
     with closing(Database(url)) as database, closing(Database(url, hidden_truth=True)) as hidden:
         database.migrate()

@@ -202,7 +202,7 @@ def test_interpreter_that_does_not_start_is_passed_over(tmp_path: Path) -> None:
 
 @pytest.mark.nightly
 @pytest.mark.parametrize("version", [version for version in VERSIONS if version != "3.11"])
-def test_core_works(version: str, tmp_path: Path) -> None:
+def test_quick_tests_of_the_core_pass_on_other_versions_of_python(version: str, tmp_path: Path) -> None:
     if versions("--find", version).returncode:
         pytest.skip(f"no interpreter of Python {version} was found")
     requirements.require_index(tmp_path / "downloads")

@@ -160,6 +160,6 @@ def test_repository_without_a_connection_is_named() -> None:
 def test_text_that_is_no_folder_or_hub_id_is_refused(
     root: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.chdir(tmp_path)  # A folder data may lie beside the checkout.
+    monkeypatch.chdir(tmp_path)  # The checkout may contain a folder "data".
     with pytest.raises(rdb.DatasetError, match="no such folder, expected a dataset folder or a Hub repository id"):
         open_folder(root)

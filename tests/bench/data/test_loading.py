@@ -81,7 +81,9 @@ def test_load_errors_name_expected_values(tiny_root: Path, tmp_path: Path) -> No
 
 @pytest.mark.parametrize("streaming", [False, True])
 @pytest.mark.parametrize(("part", "positions"), [("[:2]", range(2)), ("[50%:]", range(4, 9)), ("[-1:]", [8])])
-def test_part_of_a_split(tiny_root: Path, part: str, positions: Sequence[int], streaming: bool) -> None:
+def test_part_of_a_split_has_its_views_in_order(
+    tiny_root: Path, part: str, positions: Sequence[int], streaming: bool
+) -> None:
     view_ids = open_folder(tiny_root).config("lattice").view_ids
     loaded = rdb.load(tiny_root, "lattice", split=f"test{part}", streaming=streaming, columns=["view_id"])
     assert [row["view_id"] for row in loaded] == [view_ids[position] for position in positions]

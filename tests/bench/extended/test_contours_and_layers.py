@@ -62,7 +62,7 @@ def test_missing_prediction_counts_as_wrong_contour() -> None:
 
 
 def dense_scores(p_m: ndarray, z_m: ndarray, steel: ndarray) -> dict[str, float]:
-    """Return the boundary_scores from whole images as the papers define them: over four directions."""
+    """Return the scores of boundaries from whole images as the papers define them: over four directions."""
     p_m = np.where(np.isfinite(p_m) & (p_m > 0), p_m, np.nan)
     f1, precision, recall = {}, [], []
     for t in THRESHOLDS_PERCENT:

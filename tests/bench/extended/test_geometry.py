@@ -303,7 +303,7 @@ def test_tolerance_is_inclusive() -> None:
 
 
 def brute_force_scores(p_m: ndarray, truth: SteelTruth, queries: int = MAX_POINTS) -> dict[str, float]:
-    """Return the cloud_scores from the distances of all pairs of a queried and any other point."""
+    """Return the scores of point clouds from the distances of all pairs of a queried point and any other."""
     rays = np.column_stack([truth.rays, np.ones(len(truth.rays))])
     true_m = truth.depth_m.astype(np.float64)[:, None] * rays
     predicted_m = np.where(np.isfinite(p_m) & (p_m > 0), p_m, np.nan)[:, None] * rays

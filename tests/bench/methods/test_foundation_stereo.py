@@ -99,7 +99,9 @@ def test_mode_and_scale_keep_metres(nearest_m: float | None, mode: str, scale: f
         (1664.0, (True, 0.5)),
     ],
 )
-def test_mode_at_boundaries(largest_px: float, expected: tuple[bool, float]) -> None:
+def test_larger_disparities_need_two_passes_then_a_smaller_image(
+    largest_px: float, expected: tuple[bool, float]
+) -> None:
     assert choose_passes(largest_px, 416) == expected
     assert choose_passes(832.001, 416)[1] < 1
 

@@ -11,7 +11,9 @@ from typing import Any
 
 import pytest
 
+pytest.importorskip("starlette")
 pytest.importorskip("torch")
+pytest.importorskip("uvicorn")
 
 from huggingface_hub import constants
 

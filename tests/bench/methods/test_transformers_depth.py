@@ -13,8 +13,14 @@ from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-import numpy as np
 import pytest
+
+pytest.importorskip("starlette")
+pytest.importorskip("torch")
+pytest.importorskip("transformers")
+pytest.importorskip("uvicorn")
+
+import numpy as np
 from huggingface_hub import constants
 from hypothesis import given
 from hypothesis import strategies as st

@@ -131,7 +131,7 @@ def test_ticks_have_their_numbers_and_the_diagonal_joins_equal_errors(low: float
     assert ends.tolist() == [[limit, limit] for limit in axes.get_ylim()]
 
 
-def test_marks_of_the_tables() -> None:
+def test_legend_has_the_marks_of_the_tables() -> None:
     scores = [
         result(view("pier/0000", 0.5, 0.1), view("lattice/0000", 0.5, 0.1), method=name, declared=declared)
         for name, declared in (

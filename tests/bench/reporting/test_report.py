@@ -43,7 +43,7 @@ from tests.bench.reporting.results import (
 from tests.bench.reporting.results import shown as images_of
 
 REMOTE = r"https?://|<link|<iframe|@import|url\(|javascript:|fetch|import\(|XMLHttp|innerHTML"
-"""What a page would load or run something with."""
+"""Parts of a page that would load or run something from outside."""
 
 
 @pytest.fixture(scope="module")

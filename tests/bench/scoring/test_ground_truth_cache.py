@@ -21,7 +21,6 @@ from tests.commands import run_in_process
 from tests.damage import change_manifest, change_rows, copy_dataset
 from tests.ground_truth import truth_of
 
-GRID = (90, 160)
 CONFIG = "lattice-orbit"
 
 

@@ -58,7 +58,7 @@ DEPTH_TOLERANCE = 0.03
 
 
 def photometric_problems(config: AuditedConfig, views: Sequence[AuditedView]) -> list[str] | None:
-    """Report a shift of all views together of a tenth of a pixel, more for few pixels, and of one view of a pixel.
+    """Report a common shift of all views above 0.1 px, more with few pixels, or of a single view above a pixel.
 
     Correct renders give under 0.05 px at 1280 x 720, and 0.1 px in three noisy views of 160 x 90.
     """
@@ -151,7 +151,7 @@ def is_visible(
 
 
 def marker_problems(config: AuditedConfig, views: Sequence[AuditedView]) -> list[str] | None:
-    """Report few detected markers, corners off their projections, and poses of ``solvePnP`` off the stored."""
+    """Report few markers, corners away from their projections, and poses of ``solvePnP`` unlike the stored."""
     board, eyes = config.board, [eye for view in views for eye in view.eyes.values()]
     expected = [] if board is None else [visible_corners_px(eye, board) for eye in eyes]
     count = sum(map(len, expected))

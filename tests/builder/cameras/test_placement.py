@@ -263,7 +263,7 @@ def test_steel_below_ground_or_beyond_the_site_is_refused_before_placement(tmp_p
         scene_config(write_scene(tmp_path, scene(girder(42_000))))
 
 
-def test_space_for_cameras() -> None:
+def test_space_leaves_out_objects_floor_and_roof() -> None:
     space = CameraSpace(2.0, clear_radius_m=1.0, objects_m=0.3)
     points_m = np.array(
         [[0, 0, 0.1], [0, 0, 0.09], [0, 1.0, 0.1], [0, 1.01, 0.1], [0, -1.01, 0.4], [2, 0, 0.4], [1.5, 1.5, 5]]

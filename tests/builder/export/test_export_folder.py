@@ -286,7 +286,7 @@ def test_export_is_resumed_and_extended_by_splits(scenes_root: Path, tmp_path: P
     assert content(tmp_path / "out").keys() == content(tmp_path / "whole").keys()
 
 
-def test_splits_that_do_not_exist_are_refused(scenes_root: Path, tmp_path: Path) -> None:
+def test_splits_that_do_not_exist_are_refused(tmp_path: Path) -> None:
     write_dataset(tmp_path / "one", ["lattice"], 1)
     with pytest.raises(DatasetError, match="no config has the split train"):
         export(tmp_path / "one", tmp_path / "out", split="train")

@@ -136,7 +136,7 @@ def test_pose_convention_is_read(table: str, write: Any, rows: list[Row], folder
         assert np.allclose(read["left_cam_from_world"], row["left_cam_from_world"], rtol=0, atol=1e-12)
 
 
-def test_intrinsics_of_each_view(rows: list[Row], folder: Path, tmp_path: Path) -> None:
+def test_each_view_may_have_its_own_intrinsics(rows: list[Row], folder: Path, tmp_path: Path) -> None:
     """They also convert range along the ray to planar depth."""
     for n, (view, row) in enumerate(zip(NAMES, rows, strict=True)):
         K = row["left_K"] * [[1 + n, 1, 1], [1, 1 + n, 1], [1, 1, 1]]

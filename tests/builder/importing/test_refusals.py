@@ -23,7 +23,6 @@ from tests.builder.importing.source_data import NAMES
 from tests.damage import change_rows
 
 Entry = dict[str, Any]
-CASES = 100
 
 
 def refused(layout: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> str:

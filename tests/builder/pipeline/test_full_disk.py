@@ -1,4 +1,4 @@
-"""Builds, exports and audits on a full disk: told in words with exit status 1, and finished by a later run."""
+"""Builds, exports and audits on a full disk: reported with exit status 1, and finished by a later run."""
 
 from __future__ import annotations
 

@@ -257,7 +257,9 @@ def test_token_that_the_hub_does_not_accept(
     assert hub.repositories == {}
 
 
-def test_unreachable_hub(root: Path, hub: HubServer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unreachable_hub_is_named_with_status_1(
+    root: Path, hub: HubServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(constants, "ENDPOINT", "http://127.0.0.1:9")
     refused(root, words="http://127.0.0.1:9", status=1)
 
@@ -283,7 +285,9 @@ def test_answers_that_are_not_those_of_a_hub(
 
 @pytest.mark.parametrize("status", [400, 409, 500, 507])
 @pytest.mark.parametrize("request_pattern", [READING[0], "POST /api/repos/create", "POST */commit/main"])
-def test_statuses_of_failure(hub: HubServer, root: Path, request_pattern: str, status: int) -> None:
+def test_refusal_of_the_hub_is_reported_with_its_status(
+    hub: HubServer, root: Path, request_pattern: str, status: int
+) -> None:
     message = "Storage quota of org is used up \x1b[2J"
     answer = JSONResponse({"error": f"{message} {TOKEN}"}, status)
     hub.faults[request_pattern] = lambda _: answer

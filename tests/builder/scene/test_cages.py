@@ -52,7 +52,7 @@ ENVIRONMENTS = (
     {"OPENBLAS_CORETYPE": "Sandybridge"},
     {"OPENBLAS_CORETYPE": "Haswell"},
 )
-"""Kernels of OpenBLAS that run on every processor with AVX2, the oldest with NumPy's own functions for it."""
+"""Kernels of OpenBLAS that run on every processor with AVX2; the first also without NumPy's vector functions."""
 
 EVERY_FAMILY = pytest.mark.parametrize("family", FAMILIES)
 

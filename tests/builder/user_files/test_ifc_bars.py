@@ -203,7 +203,7 @@ def test_all_encodings_of_bend_give_same_axis(kind: str) -> None:
     np.testing.assert_allclose(ifc.axis_m() * 1000, [(0, 0, 0), *bend, (240, 140, 0)], atol=1e-9)
 
 
-def test_bar_roles_and_order() -> None:
+def test_bars_keep_their_order_and_take_roles_from_types_and_names() -> None:
     ifc = Ifc()
     expected = [
         ("main", {"PredefinedType": "MAIN"}),

@@ -285,7 +285,7 @@ def cage_with(model: Path, content: str) -> Cage:
         ("[[select]]\nname = 'bar 25'\n[[select]]\nname = '*5'", 4),
     ],
 )
-def test_selected_bars(model: Path, tables: str, bars: int) -> None:
+def test_only_selected_bars_are_in_the_cage(model: Path, tables: str, bars: int) -> None:
     cage = cage_with(model, tables)
     assert len(cage.bars) == bars
     assert [bar.bar.bar_id for bar in cage.bars] == list(range(1, bars + 1))
