@@ -38,7 +38,7 @@ from tests.commands import run_in_process
 from tests.processes import children, wait_until
 
 API = "/api/v1/submissions"
-_COPIES = itertools.count(1000)
+_COPIES = itertools.count(1001)
 ENDED = ("scored", "failed")
 SCORING = b"multiprocessing.spawn"
 """Part of the command line of the process that reads one archive."""

@@ -130,12 +130,13 @@ def _details(record: SubmissionModel) -> dict[str, Any]:
     declared = Declaration(record.inputs, record.uses_ground_truth)
     details = {**dict.fromkeys(MethodDetails.model_fields), **json.loads(record.details)}
     parameters, seconds = details["parameters"], details.get("seconds_per_view")
+    digits = ".3g" if seconds is None or seconds < 100 else ",.0f"
     texts = {
         "Inputs": inputs_text(declared),
         "Ground truth": ground_truth_text(declared),
         "Training data": clean_text(details["training_data"]),
         "Parameters": f"{parameters:,}" if isinstance(parameters, int) else printable(str(parameters or "")),
-        "Runtime per view": "" if seconds is None else f"{seconds:.3g} s",
+        "Runtime per view": "" if seconds is None else f"{seconds:{digits}} s",
         "Licence": printable(details["licence"] or ""),
     }
     return {**details, "texts": {name: text for name, text in texts.items() if text}}
