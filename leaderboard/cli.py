@@ -96,7 +96,10 @@ def _add_setting(command: argparse.ArgumentParser, name: str) -> None:
 
 
 def _run(options: argparse.Namespace) -> None:
-    """Run a command with its settings, while the state folder is locked and has the right mode."""
+    """Run a command with its settings, while the state folder is locked and has the right mode.
+
+    Raises ``InputError``, and ``StorageError`` for stored data that are missing or damaged.
+    """
     command = COMMANDS[options.command]
     values = {name: getattr(options, name, None) for name in command.settings}
     overrides: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
@@ -135,7 +138,7 @@ def _migrated(settings: Settings) -> Iterator[Database]:
 
 
 def _serve(settings: Settings, _: argparse.Namespace) -> None:
-    from leaderboard.web.server import serve  # Takes a second to import, which no other command needs.
+    from leaderboard.web.server import serve  # Slow to import, and no other command needs it.
 
     serve(settings)
 
@@ -145,9 +148,9 @@ def _score(settings: Settings, _: argparse.Namespace) -> None:
     stop = threading.Event()
     for signal_number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(signal_number, lambda *_: stop.set())
-    url = without_password(settings.database_url)
-    _LOG.info("waiting for submissions", database=url, version=software_version())
     with _migrated(settings) as database:
+        url = without_password(settings.database_url)
+        _LOG.info("waiting for submissions", database=url, version=software_version())
         process_queue(database, settings, stop)
 
 
