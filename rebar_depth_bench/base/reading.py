@@ -6,6 +6,7 @@ folders are refused without blocking.
 
 from __future__ import annotations
 
+import codecs
 import errno
 import hashlib
 import json
@@ -72,18 +73,29 @@ def read_file(path: Path, limit: Limit, expected: str, error_type: type[InputErr
     return content
 
 
+def decode_text(content: bytes, where: str = "") -> tuple[str, list[Problem]]:
+    """Return a UTF-8 text without its byte order mark, or an empty text and the problem at the location ``where``."""
+    try:
+        return content.decode("utf-8-sig"), []
+    except UnicodeDecodeError as error:
+        is_utf16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        found = "the text is UTF-16" if is_utf16 else f"byte {error.start} is not UTF-8"
+        return "", [Problem("syntax", where, found, "UTF-8 text")]
+
+
 def parse_json(content: bytes, where: str = "") -> tuple[Any, list[Problem]]:
     """Return the value of a JSON text, or None and its problem.
 
     Stricter than ``json``: the text is UTF-8, no object has a key twice, numbers are finite, strings can be
     encoded, and at most ``MAX_NESTING`` containers are inside each other. ``where`` is the location in problems.
     """
+    text, problems = decode_text(content, where)
+    if problems:
+        return None, problems
     try:
-        value = json.loads(content.decode(), object_pairs_hook=_unique_keys, parse_constant=_refuse_constant)
+        value = json.loads(text, object_pairs_hook=_unique_keys, parse_constant=_refuse_constant)
         # json.loads accepts numbers like 1e999 and lone surrogates, which cannot be written as JSON again.
         json.dumps(value, allow_nan=False, ensure_ascii=False).encode()
-    except UnicodeDecodeError as error:
-        return None, [Problem("syntax", where, f"byte {error.start} is not UTF-8", "UTF-8 text")]
     except RecursionError:
         return None, [_nesting_problem(where)]
     except _DuplicateKeyError as error:
@@ -101,10 +113,11 @@ def parse_toml(content: bytes) -> tuple[dict[str, Any], list[Problem]]:
     lines = _DECIMAL_NUMBER.sub(b"", content).splitlines()
     if sum(line.count(b".") ** 2 for line in lines) > _MAX_KEY_COST:
         return {}, [Problem("size", "", "the keys have too many parts", "a few parts")]
+    text, problems = decode_text(content)
+    if problems:
+        return {}, problems
     try:
-        values = tomllib.loads(content.decode("utf-8-sig"))
-    except UnicodeDecodeError as error:
-        return {}, [Problem("syntax", "", f"byte {error.start} is not UTF-8", "a TOML file")]
+        values = tomllib.loads(text)
     except RecursionError:
         return {}, [_nesting_problem("")]
     except ValueError as error:

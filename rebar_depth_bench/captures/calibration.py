@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
@@ -49,7 +49,7 @@ class StereoCalibration:
     """Calibrated stereo pair, with ``x_right = R(rotation_rad) @ x_left + translation_m`` in OpenCV axes.
 
     ``rotation_rad`` is a Rodrigues vector; ``translation_m`` is about (-baseline, 0, 0). The intrinsics apply to
-    images of ``width`` x ``height`` pixels.
+    images of ``width`` x ``height`` pixels. ``notes`` say what was left out of the file that states it.
     """
 
     width: int
@@ -58,6 +58,7 @@ class StereoCalibration:
     right: Lens
     rotation_rad: tuple[float, float, float]
     translation_m: tuple[float, float, float]
+    notes: tuple[str, ...] = field(default=(), compare=False, repr=False)
 
     @property
     def right_from_left(self) -> Float64[ndarray, "4 4"]:
@@ -79,11 +80,12 @@ class StereoCalibration:
 
 @dataclass(frozen=True)
 class MonoCalibration:
-    """Calibrated camera, for images of ``width`` x ``height`` pixels."""
+    """Calibrated camera, for images of ``width`` x ``height`` pixels; ``notes`` as those of a stereo pair."""
 
     width: int
     height: int
     left: Lens
+    notes: tuple[str, ...] = field(default=(), compare=False, repr=False)
 
     @property
     def is_rectified(self) -> bool:

@@ -190,7 +190,7 @@ def open_capture(path: str | os.PathLike[str]) -> ImageViews:
     cameras = read_cameras(root, sorted(left), width, height, is_stereo=is_stereo)
     calibration = cameras.calibration
     if not is_stereo:
-        calibration = MonoCalibration(width, height, calibration.left)
+        calibration = MonoCalibration(width, height, calibration.left, calibration.notes)
     return ImageViews(
         path=root,
         config=name,

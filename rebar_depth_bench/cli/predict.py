@@ -122,6 +122,7 @@ def _open_views(options: argparse.Namespace, method: AnyMethod) -> tuple[Sequenc
             raise InputError(f"{options.data}: {name} is given, which is for dataset folders only")
     images = open_capture(path)
     notices = [f"{images.config}: {len(images.view_ids)} views of {images.path}; {images.describe_camera()}"]
+    notices += images.calibration.notes
     if images.board_is_assumed and isinstance(method, MultiViewMethod):
         notices.append(f"{images.config}: states no board, so it is taken to be {images.board}")
     return [images], notices

@@ -138,7 +138,7 @@ def test_example_in_docstring_is_valid(tmp_path: Path) -> None:
             "missing",
             "cannot be read: No such file or directory, expected a TOML file that describes an ONNX",
         ),
-        (b"\xff\xfe", "syntax", "byte 0 is not UTF-8"),
+        (b"\xff\xfe", "syntax", "the text is UTF-16"),
         (b"#" * (1 << 21), "size", "at most 1048576 bytes"),
         (b"\x00", "syntax", "not a valid TOML file"),
     ],
