@@ -5,16 +5,18 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 from rebar_depth_bench.base.errors import MAX_PROBLEMS_SHOWN, CalibrationError, Problem, escape_text
 from rebar_depth_bench.base.limits import TOML_BYTES
-from rebar_depth_bench.base.reading import parse_number, parse_toml, read_file
+from rebar_depth_bench.base.reading import decode_text, parse_number, parse_toml, read_file
 from rebar_depth_bench.base.validation import Expected, format_location, short_repr, with_lines
 from rebar_depth_bench.captures.calibration import (
     ANGLE_RAD,
     DISTORTION,
     FOCAL_PX,
+    KNOWN_LENS,
     SIDES_PX,
     Calibration,
     Lens,
@@ -24,18 +26,18 @@ from rebar_depth_bench.captures.calibration import (
     scaled_calibration,
     table_calibration,
 )
+from rebar_depth_bench.captures.fields import Field, FileFormat
 
 
 def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibration:
     """Read a stereo calibration from a ``.conf`` or ``.toml`` file, for images of ``width`` x ``height`` pixels.
 
-    ``.conf`` is Stereolabs' INI file: sections ``LEFT_CAM_2K``, ``_FHD``, ``_HD``, ``_VGA`` (and ``RIGHT_CAM_``)
-    with fx fy cx cy k1 k2 and, if given, p1 p2 k3; ``STEREO`` with Baseline, TY, TZ (millimetres; 0 where TY or
-    TZ is missing) and RX, CV, RZ (radians), each with or without the section's suffix. If the file has no sections
-    for the requested size, those nearest in aspect ratio and then in width are read and passed to
-    ``scale_calibration``, which assumes that both sizes cover the same sensor area. The motion is
-    ``x_right = R x_left + T`` with R = Rodrigues(RX, CV, RZ) and T = -(Baseline, TY, TZ): the whole vector is
-    negated, which keeps it on the line that the vendor's rectification uses.
+    ``.conf`` is Stereolabs' INI file, whose keys docs/formats.md lists: sections ``LEFT_CAM_X``, ``RIGHT_CAM_X``
+    for each image size X, such as HD, and ``STEREO``. If the file has no sections for the requested size, those
+    nearest in aspect ratio and then in width are read and passed to ``scale_calibration``, which assumes that both
+    sizes cover the same sensor area; a file that shows that they do not, or has sections of unknown sizes, is
+    refused. The motion is ``x_right = R x_left + T`` with R = Rodrigues(RX, CV, RZ) and T = -(Baseline, TY, TZ):
+    the whole vector is negated, which keeps it on the line that the vendor's rectification uses.
 
     In TOML, ``K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]`` may replace the four numbers, ``rotation`` may be a
     3 x 3 matrix, and ``baseline_m = 0.12`` may replace ``translation_m = [-0.12, 0, 0]``::
@@ -70,7 +72,7 @@ def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibra
     check_image_size(path, width, height)
     problems: list[Problem] = []
     if suffix == ".conf":
-        calibration: Calibration | None = _read_conf(content, width, height, problems)
+        calibration: Calibration | None = _read_conf(path.name, content, width, height, problems)
     else:
         document, problems = parse_toml(content)
         calibration = None if problems else table_calibration(document, width, height, problems, is_stereo=True)
@@ -96,70 +98,161 @@ _GRIDS: Mapping[str, tuple[int, int]] = {
     "HD": (1280, 720),
     "SVGA": (960, 600),
     "VGA": (672, 376),
+    "4K": (3840, 2160),
+    "QHDPLUS": (3200, 1800),
+    "HD1536": (1920, 1536),
+    "XVGA": (960, 768),
+    "TXGA": (640, 512),
 }
 """Image sizes (width, height) of Stereolabs cameras, pixels, by section suffix."""
+_SAME_VIEW = 1.01
+"""Largest ratio of the focal lengths, in image widths, of two sizes that show the same part of the sensor."""
 
+_TERMS = ("k1", "k2", "p1", "p2", "k3")
+_OTHER_TERMS = ("k4", "k5", "k6", "s1", "s2", "s3", "s4", "tauX", "tauY")
 _STEREO: Mapping[str, Expected] = {
     "Baseline": quantity(1, 10_000, "millimetres"),
     **dict.fromkeys(("TY", "TZ"), quantity(-1000, 1000, "millimetres")),
     **dict.fromkeys(("RX", "CV", "RZ"), ANGLE_RAD),
 }
-"""Keys of the section ``[STEREO]``."""
 _OPTIONAL = ("p1", "p2", "k3", "TY", "TZ")
-"""Keys that may be missing, which means 0."""
+"""Fields that may be missing, which means 0."""
+
+
+def _lens_keys(name: str) -> tuple[str, ...]:
+    return f"EYE_DISTO.{name}", f"EYE_CAM_X.{name}"
+
+
+ZED_CONF = FileFormat(
+    "Stereolabs' `*.conf`",
+    (
+        *(Field(name, (f"EYE_CAM_X.{name}",), "used", "pixels") for name in ("fx", "fy", "cx", "cy")),
+        *(
+            Field(name, _lens_keys(name), "used", "distortion; if both sections have it, they agree")
+            for name in _TERMS
+        ),
+        *(Field(name, _lens_keys(name), "checked", "absent or 0: another lens model") for name in _OTHER_TERMS),
+        *(
+            Field(name, (f"STEREO.{name}_X", f"STEREO.{name}"), "used", expected.text.removeprefix("a number "))
+            for name, expected in _STEREO.items()
+        ),
+        Field("miscellaneous", ("MISC",), "harmless", "such as the kind of sensor"),
+    ),
+)
+"""Fields by section and key. EYE stands for LEFT or RIGHT, X for the name of an image size."""
 
 _Sections = Mapping[str, Mapping[str, tuple[int, str]]]
 """Line and text of each key of each section."""
 _COMMENT = re.compile(r"(?:^|\s)[;#]")
 _SEPARATOR = re.compile("[=:]")
+_CAMERA = re.compile("(?:LEFT_|RIGHT_)?CAM(?:_|$)")
 
 
-def _camera_keys(width: int, height: int) -> Mapping[str, Expected]:
-    """Return the keys of the section of a camera whose images have ``width`` x ``height`` pixels."""
-    return {
-        **dict.fromkeys(("fx", "fy"), FOCAL_PX),
-        "cx": principal_point(width),
-        "cy": principal_point(height),
-        **dict.fromkeys(("k1", "k2", "p1", "p2", "k3"), DISTORTION),
-    }
+@dataclass(frozen=True)
+class _SizeReader:
+    """Values of the image size ``suffix`` in the sections of a file; problems are added to ``problems``."""
+
+    sections: _Sections
+    suffix: str
+    problems: list[Problem]
+
+    def lens(self, eye: str) -> Lens:
+        """Return the lens of the camera ``eye``."""
+        self._check_model(eye)
+        width, height = _GRIDS[self.suffix]
+        fx, fy = self.numbers({"fx": FOCAL_PX, "fy": FOCAL_PX}, eye)
+        cx, cy = self.numbers({"cx": principal_point(width), "cy": principal_point(height)}, eye)
+        k1, k2, p1, p2, k3 = self.numbers(dict.fromkeys(_TERMS, DISTORTION), eye)
+        return Lens(fx, fy, cx, cy, (k1, k2, p1, p2, k3))
+
+    def numbers(self, fields: Mapping[str, Expected], eye: str = "") -> list[float]:
+        """Return the numbers of fields; 0 and a problem for an invalid one, and for a missing one of a section."""
+        numbers = []
+        for name, expected in fields.items():
+            entries = self._entries(name, eye)
+            place, line, raw = (*entries, (_place(ZED_CONF.keys(name)[-1], eye, self.suffix), 0, "0"))[0]
+            numbers.append(parse_number(raw))
+            if not entries and place.partition(".")[0] in self.sections and name not in _OPTIONAL:
+                self.problems.append(Problem("missing", place, "missing", expected.text))
+            elif entries and not expected.accept(numbers[-1]):
+                found = f"line {line}: got {short_repr(raw)}"
+                self.problems.append(Problem("invalid", place, found, expected.text))
+            elif name in _TERMS and any(parse_number(other) != numbers[-1] for _, _, other in entries[1:]):
+                self.problems.append(Problem("conflict", place, f"differs from {entries[1][0]}", "one lens model"))
+        return numbers
+
+    def _check_model(self, eye: str) -> None:
+        """Add a problem if the lens has other terms than k1 k2 p1 p2 k3, or the four terms of a fisheye model."""
+        other = [entry for name in _OTHER_TERMS for entry in self._entries(name, eye)]
+        is_fisheye = bool(self._entries("k4", eye)) and not self._entries("p1", eye) + self._entries("p2", eye)
+        terms = [entry for entry in other if is_fisheye or parse_number(entry[2]) != 0]
+        if terms:
+            stated = ", ".join(f"{place.partition('.')[2]} = {escape_text(raw)}" for place, _, raw in terms)
+            found = f"{'fisheye' if is_fisheye else 'rational, fisheye or thin prism'} distortion ({stated})"
+            self.problems.append(Problem("invalid", terms[0][0].partition(".")[0], found, KNOWN_LENS))
+
+    def _entries(self, name: str, eye: str) -> list[tuple[str, int, str]]:
+        """Return place, line and text of the keys of a field that the file has."""
+        places = [_place(key, eye, self.suffix).split(".") for key in ZED_CONF.keys(name)]
+        return [
+            (f"{section}.{key}", *self.sections[section][key.lower()])
+            for section, key in places
+            if key.lower() in self.sections.get(section, {})
+        ]
 
 
-def _read_conf(content: bytes, width: int, height: int, problems: list[Problem]) -> StereoCalibration | None:
+def _place(key: str, eye: str, suffix: str) -> str:
+    """Return a key of the table for one camera and one image size."""
+    return key.replace("EYE", eye).replace("_X", f"_{suffix}")
+
+
+def _read_conf(
+    name: str, content: bytes, width: int, height: int, problems: list[Problem]
+) -> StereoCalibration | None:
     """Return the calibration of a Stereolabs ``.conf`` file for one of its image sizes; the caller scales it.
 
     The size is that nearest to ``width`` x ``height`` in aspect ratio, then in width. Section names and keys are
-    case-insensitive, unknown keys are ignored. Problems are added to ``problems``; the result is None if there are
-    any.
+    case-insensitive. Problems are added to ``problems``; the result is None if there are any.
     """
     sections = _read_sections(content, problems)
     suffix = _nearest_suffix(sections, width, height, problems)
     if suffix is None:
         return None
-    width, height = _GRIDS[suffix]
     names = (f"LEFT_CAM_{suffix}", f"RIGHT_CAM_{suffix}", "STEREO")
-    problems += [Problem("missing", name, "missing", "a section") for name in names if name not in sections]
-    lenses = []
-    for name in names[:2]:
-        keys = _camera_keys(width, height)
-        fx, fy, cx, cy, k1, k2, p1, p2, k3 = _section_numbers(sections, name, keys, suffix, problems)
-        lenses.append(Lens(fx, fy, cx, cy, (k1, k2, p1, p2, k3)))
-    baseline_mm, y_mm, z_mm, rx, cv, rz = _section_numbers(sections, "STEREO", _STEREO, suffix, problems)
+    problems += [Problem("missing", one, "missing", "a section") for one in names if one not in sections]
+    reader = _SizeReader(sections, suffix, problems)
+    left, right = reader.lens("LEFT"), reader.lens("RIGHT")
+    baseline_mm, y_mm, z_mm, rx, cv, rz = reader.numbers(_STEREO)
     translation_m = (0.0 - baseline_mm / 1000, 0.0 - y_mm / 1000, 0.0 - z_mm / 1000)
-    return (
-        None if problems else StereoCalibration(width, height, lenses[0], lenses[1], (rx, cv, rz), translation_m)
-    )
+    if problems:
+        return None
+    notes = _notes(name, sections)
+    if _GRIDS[suffix] != (width, height):
+        size = " x ".join(map(str, _GRIDS[suffix]))
+        notes.append(f"{name}: scaled from {suffix}, {size}, as if both sizes showed the same part of the sensor")
+    return StereoCalibration(*_GRIDS[suffix], left, right, (rx, cv, rz), translation_m, tuple(notes))
+
+
+def _notes(name: str, sections: _Sections) -> list[str]:
+    """Return the note that names the sections, and the keys of known ones, that ``ZED_CONF`` does not list."""
+    keys = [key for field in ZED_CONF.fields for key in field.keys]
+    listed = {_place(key, eye, suffix).upper() for key in keys for eye in ("LEFT", "RIGHT") for suffix in _GRIDS}
+    known = {place.partition(".")[0] for place in listed} - listed
+    places = [
+        place
+        for section, keys in sections.items()
+        for place in ([f"{section}.{key}" for key in keys] if section in known else [section])
+    ]
+    return ZED_CONF.notes(name, [place for place in places if place.upper() not in listed])
 
 
 def _read_sections(content: bytes, problems: list[Problem]) -> _Sections:
     """Return the sections, names in upper and keys in lower case, without the comments after ``;`` and ``#``."""
-    try:
-        lines = content.decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        problems.append(Problem("syntax", "", f"byte {error.start} is not UTF-8", "an INI file"))
-        return {}
+    content_text, text_problems = decode_text(content)
+    problems += text_problems
     sections: dict[str, dict[str, tuple[int, str]]] = {}
     section = ""
-    for line_number, line in enumerate(lines, start=1):
+    for line_number, line in enumerate(content_text.splitlines(), start=1):
         if len(problems) == MAX_PROBLEMS_SHOWN:
             break
         text = _COMMENT.split(line, maxsplit=1)[0].strip()
@@ -184,7 +277,8 @@ def _read_sections(content: bytes, problems: list[Problem]) -> _Sections:
 def _nearest_suffix(sections: _Sections, width: int, height: int, problems: list[Problem]) -> str | None:
     """Return the suffix of the sections whose image size is nearest in aspect ratio, then in width.
 
-    Returns None, and adds a problem if there is none yet, if the file has no sections of a known size.
+    Returns None, and adds a problem if there is none yet, if the file has no sections of a known size, and if it
+    has none of this size and does not show which part of the sensor the images show.
     """
     present = [name for name in _GRIDS if {f"LEFT_CAM_{name}", f"RIGHT_CAM_{name}"} & set(sections)]
     if not present and not problems:
@@ -195,30 +289,25 @@ def _nearest_suffix(sections: _Sections, width: int, height: int, problems: list
 
     def distance(suffix: str) -> tuple[float, float]:
         grid_width, grid_height = _GRIDS[suffix]
-        return abs(math.log(grid_width * height / (width * grid_height))), abs(math.log(grid_width / width))
+        ratio = grid_width * height / (width * grid_height)
+        return round(abs(math.log(ratio)), 9), abs(math.log(grid_width / width))
 
-    return min(present, key=distance, default=None)
-
-
-def _section_numbers(
-    sections: _Sections, section: str, keys: Mapping[str, Expected], suffix: str, problems: list[Problem]
-) -> list[float]:
-    """Return the numbers of a section, by keys with the section's suffix or without; 0 for missing ones.
-
-    Add a problem for each invalid number, and for each missing one of an existing section unless it is optional.
-    """
-    values = sections.get(section, {})
-    numbers = []
-    for key, expected in keys.items():
-        name = next((name for name in (f"{key}_{suffix}", key) if name.lower() in values), None)
-        if name is None:
-            if section in sections and key not in _OPTIONAL:
-                problems.append(Problem("missing", f"{section}.{key}", "missing", expected.text))
-            numbers.append(0.0)
-            continue
-        line_number, raw = values[name.lower()]
-        numbers.append(parse_number(raw))
-        if not expected.accept(numbers[-1]):
-            found = f"line {line_number}: got {short_repr(raw)}"
-            problems.append(Problem("invalid", f"{section}.{name}", found, expected.text))
-    return numbers
+    nearest = min(present, key=distance, default=None)
+    if nearest is None or _GRIDS[nearest] == (width, height):
+        return nearest
+    known = {f"{eye}_CAM_{name}" for eye in ("LEFT", "RIGHT") for name in _GRIDS}
+    unknown = [f"[{escape_text(name)}]" for name in sections if _CAMERA.match(name) and name not in known]
+    alike = [name for name in present if distance(name)[0] == distance(nearest)[0]]
+    fx = [sections.get(f"LEFT_CAM_{name}", {}).get("fx", (0, ""))[1] for name in alike]
+    focal = [parse_number(raw) / _GRIDS[name][0] for raw, name in zip(fx, alike, strict=True)]
+    if unknown:
+        found = f"no section is of {width} x {height} pixels, as far as known: {', '.join(unknown[:10])} may be"
+    elif max(focal) > _SAME_VIEW * min(focal):
+        found = (
+            f"no section is of {width} x {height} pixels, and {', '.join(alike)} show unlike parts of the sensor"
+        )
+    else:
+        return nearest
+    expected = "only sections of the size that the images were scaled from, or calibration.toml with that size"
+    problems.append(Problem("conflict", "", found, expected))
+    return None

@@ -3,7 +3,7 @@
 A folder holds one of these:
 
 - ``cameras.toml``, see below;
-- ``calibration.conf`` (Stereolabs) or ``calibration.toml`` (``captures.calibration_files``);
+- one file ``*.conf`` (Stereolabs) or ``calibration.toml`` (``captures.calibration_files``);
 - calibrations of other programs (``captures.programs``): one file ``*.yaml``, ``.yml``, ``.xml`` or
   ``.json`` (OpenCV's FileStorage, a Kalibr camera chain, ROS ``camera_info`` of one camera), or two of them:
   intrinsics and extrinsics of OpenCV, or ``left.*`` and ``right.*`` of ROS.
@@ -193,13 +193,16 @@ def cameras_of_table(
 
 def _found_files(root: Path) -> list[Path]:
     """Return the calibration files of a folder. Raises ``InputError`` unless there is one, or a pair."""
-    own = [root / name for name in _CALIBRATION_FILES if (root / name).exists()]
-    others = sorted(path for path in root.iterdir() if path.suffix.lower() in DOCUMENT_SUFFIXES)
-    if len(own) == 1 or (not own and 1 <= len(others) <= 2):
-        return own or others
+    files = sorted(path for path in root.iterdir() if not path.name.startswith("."))
+    own = [path for path in files if path.suffix.lower() == ".conf" or path.name in _CALIBRATION_FILES]
+    others = [path for path in files if path.suffix.lower() in DOCUMENT_SUFFIXES]
+    if len(own) == 1 and (own[0].name in _CALIBRATION_FILES or not others):
+        return own
+    if not own and 1 <= len(others) <= 2:
+        return others
     found = ", ".join(path.name for path in (*own, *others)[:5]) or "none"
     raise InputError(
-        f"{root}: the calibration files are {found}, expected {CAMERAS_FILE}, {', '.join(_CALIBRATION_FILES)}, or "
+        f"{root}: the calibration files are {found}, expected {CAMERAS_FILE}, calibration.toml, one *.conf, or "
         f"one or two of *{', *'.join(DOCUMENT_SUFFIXES)}"
     )
 

@@ -31,6 +31,7 @@ from rebar_depth_bench.captures.images import (
     IMAGE_SUFFIXES,
     NAME,
     NAME_RULE,
+    OTHER_SUFFIXES,
     common_shape,
     entry_name,
     image_files,
@@ -160,7 +161,9 @@ def is_capture(path: str | os.PathLike[str]) -> bool:
     if (root / "left").is_dir() or (root / CAMERAS_FILE).is_file():
         return True
     suffixes = {entry.suffix.lower() for entry in root.iterdir()} if root.is_dir() else set()
-    return not suffixes.isdisjoint(IMAGE_SUFFIXES) and not suffixes.isdisjoint(CALIBRATION_SUFFIXES)
+    return not suffixes.isdisjoint((*IMAGE_SUFFIXES, *OTHER_SUFFIXES)) and not suffixes.isdisjoint(
+        CALIBRATION_SUFFIXES
+    )
 
 
 def open_capture(path: str | os.PathLike[str]) -> ImageViews:
