@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from rebar_depth_bench.base.errors import MAX_PROBLEMS_SHOWN, CalibrationError, Problem, escape_text
 from rebar_depth_bench.base.limits import TOML_BYTES
@@ -105,11 +106,11 @@ _GRIDS: Mapping[str, tuple[int, int]] = {
     "TXGA": (640, 512),
 }
 """Image sizes (width, height) of Stereolabs cameras, pixels, by section suffix."""
+_CAMERAS = ("LEFT_CAM_", "RIGHT_CAM_")
 _SAME_VIEW = 1.01
 """Largest ratio of the focal lengths, in image widths, of two sizes that show the same part of the sensor."""
 
 _TERMS = ("k1", "k2", "p1", "p2", "k3")
-_OTHER_TERMS = ("k4", "k5", "k6", "s1", "s2", "s3", "s4", "tauX", "tauY")
 _STEREO: Mapping[str, Expected] = {
     "Baseline": quantity(1, 10_000, "millimetres"),
     **dict.fromkeys(("TY", "TZ"), quantity(-1000, 1000, "millimetres")),
@@ -119,33 +120,33 @@ _OPTIONAL = ("p1", "p2", "k3", "TY", "TZ")
 """Fields that may be missing, which means 0."""
 
 
-def _lens_keys(name: str) -> tuple[str, ...]:
-    return f"EYE_DISTO.{name}", f"EYE_CAM_X.{name}"
+def _fields(names: Iterable[str], keys: str, use: Literal["used", "checked"], meaning: str) -> list[Field]:
+    return [Field(name, tuple(keys.replace("#", name).split()), use, meaning) for name in names]
 
 
+_SIZES = ", ".join(f"{name} ({width} x {height})" for name, (width, height) in _GRIDS.items())
 ZED_CONF = FileFormat(
     "Stereolabs' `*.conf`",
     (
-        *(Field(name, (f"EYE_CAM_X.{name}",), "used", "pixels") for name in ("fx", "fy", "cx", "cy")),
-        *(
-            Field(name, _lens_keys(name), "used", "distortion; if both sections have it, they agree")
-            for name in _TERMS
+        *_fields(
+            ("fx", "fy", "cx", "cy"), "EYE_CAM_X.#", "used", f"pixels; EYE is LEFT or RIGHT, X one of {_SIZES}"
         ),
-        *(Field(name, _lens_keys(name), "checked", "absent or 0: another lens model") for name in _OTHER_TERMS),
-        *(
-            Field(name, (f"STEREO.{name}_X", f"STEREO.{name}"), "used", expected.text.removeprefix("a number "))
-            for name, expected in _STEREO.items()
+        *_fields(_TERMS, "EYE_DISTO.# EYE_CAM_X.#", "used", "distortion; equal if in both sections"),
+        *_fields(
+            ("k4", "k5", "k6", "s1", "s2", "s3", "s4", "tauX", "tauY"),
+            *("EYE_DISTO.# EYE_CAM_X.#", "checked", "absent or 0: terms of other lens models"),
         ),
+        *_fields(("Baseline", "TY", "TZ"), "STEREO.#_X STEREO.#", "used", "T = -(Baseline, TY, TZ), millimetres"),
+        *_fields(("RX", "CV", "RZ"), "STEREO.#_X STEREO.#", "used", "R = Rodrigues(RX, CV, RZ), radians"),
         Field("miscellaneous", ("MISC",), "harmless", "such as the kind of sensor"),
     ),
 )
-"""Fields by section and key. EYE stands for LEFT or RIGHT, X for the name of an image size."""
+"""Fields by section and key, in which EYE and X stand for names of an eye and of an image size."""
 
 _Sections = Mapping[str, Mapping[str, tuple[int, str]]]
 """Line and text of each key of each section."""
 _COMMENT = re.compile(r"(?:^|\s)[;#]")
 _SEPARATOR = re.compile("[=:]")
-_CAMERA = re.compile("(?:LEFT_|RIGHT_)?CAM(?:_|$)")
 
 
 @dataclass(frozen=True)
@@ -183,7 +184,8 @@ class _SizeReader:
 
     def _check_model(self, eye: str) -> None:
         """Add a problem if the lens has other terms than k1 k2 p1 p2 k3, or the four terms of a fisheye model."""
-        other = [entry for name in _OTHER_TERMS for entry in self._entries(name, eye)]
+        checked = [field.name for field in ZED_CONF.fields if field.use == "checked"]
+        other = [entry for name in checked for entry in self._entries(name, eye)]
         is_fisheye = bool(self._entries("k4", eye)) and not self._entries("p1", eye) + self._entries("p2", eye)
         terms = [entry for entry in other if is_fisheye or parse_number(entry[2]) != 0]
         if terms:
@@ -280,7 +282,7 @@ def _nearest_suffix(sections: _Sections, width: int, height: int, problems: list
     Returns None, and adds a problem if there is none yet, if the file has no sections of a known size, and if it
     has none of this size and does not show which part of the sensor the images show.
     """
-    present = [name for name in _GRIDS if {f"LEFT_CAM_{name}", f"RIGHT_CAM_{name}"} & set(sections)]
+    present = [name for name in _GRIDS if {camera + name for camera in _CAMERAS} & set(sections)]
     if not present and not problems:
         found = escape_text(", ".join(f"[{name}]" for name in sections) or "no section")
         cameras = ", ".join(f"[LEFT_CAM_{name}]" for name in _GRIDS)
@@ -295,8 +297,8 @@ def _nearest_suffix(sections: _Sections, width: int, height: int, problems: list
     nearest = min(present, key=distance, default=None)
     if nearest is None or _GRIDS[nearest] == (width, height):
         return nearest
-    known = {f"{eye}_CAM_{name}" for eye in ("LEFT", "RIGHT") for name in _GRIDS}
-    unknown = [f"[{escape_text(name)}]" for name in sections if _CAMERA.match(name) and name not in known]
+    known = {camera + name for camera in _CAMERAS for name in _GRIDS}
+    unknown = [f"[{escape_text(name)}]" for name in sections if name.startswith(_CAMERAS) and name not in known]
     alike = [name for name in present if distance(name)[0] == distance(nearest)[0]]
     fx = [sections.get(f"LEFT_CAM_{name}", {}).get("fx", (0, ""))[1] for name in alike]
     focal = [parse_number(raw) / _GRIDS[name][0] for raw, name in zip(fx, alike, strict=True)]

@@ -95,8 +95,8 @@ def common_shape(images: Sequence[Path], problems: list[Problem]) -> tuple[int, 
 def check_upright(stream: BinaryIO, where: str = "") -> None:
     """Check that a PNG, JPEG or TIFF file does not ask viewers to turn its pixels; damaged metadata do not.
 
-    Raises ``EntryError`` with the location ``where`` for an EXIF orientation other than 1: a calibration may be that
-    of the turned or of the stored pixels.
+    Raises ``EntryError`` with the location ``where`` for an EXIF orientation other than 1: a calibration may be
+    that of the turned or of the stored pixels.
     """
     from PIL.JpegImagePlugin import JpegImageFile
     from PIL.PngImagePlugin import PngImageFile

@@ -161,9 +161,8 @@ def is_capture(path: str | os.PathLike[str]) -> bool:
     if (root / "left").is_dir() or (root / CAMERAS_FILE).is_file():
         return True
     suffixes = {entry.suffix.lower() for entry in root.iterdir()} if root.is_dir() else set()
-    return not suffixes.isdisjoint((*IMAGE_SUFFIXES, *OTHER_SUFFIXES)) and not suffixes.isdisjoint(
-        CALIBRATION_SUFFIXES
-    )
+    pictures = {*IMAGE_SUFFIXES, *OTHER_SUFFIXES}
+    return not suffixes.isdisjoint(pictures) and not suffixes.isdisjoint(CALIBRATION_SUFFIXES)
 
 
 def open_capture(path: str | os.PathLike[str]) -> ImageViews:
