@@ -159,11 +159,11 @@ class _SizeReader:
 
     def lens(self, eye: str) -> Lens:
         """Return the lens of the camera ``eye``."""
-        self._check_model(eye)
         width, height = _GRIDS[self.suffix]
         fx, fy = self.numbers({"fx": FOCAL_PX, "fy": FOCAL_PX}, eye)
         cx, cy = self.numbers({"cx": principal_point(width), "cy": principal_point(height)}, eye)
-        k1, k2, p1, p2, k3 = self.numbers(dict.fromkeys(_TERMS, DISTORTION), eye)
+        terms = dict.fromkeys(_TERMS, DISTORTION) if self._has_known_model(eye) else {}
+        k1, k2, p1, p2, k3 = self.numbers(terms, eye) or [0.0] * len(_TERMS)
         return Lens(fx, fy, cx, cy, (k1, k2, p1, p2, k3))
 
     def numbers(self, fields: Mapping[str, Expected], eye: str = "") -> list[float]:
@@ -182,8 +182,8 @@ class _SizeReader:
                 self.problems.append(Problem("conflict", place, f"differs from {entries[1][0]}", "one lens model"))
         return numbers
 
-    def _check_model(self, eye: str) -> None:
-        """Add a problem if the lens has other terms than k1 k2 p1 p2 k3, or the four terms of a fisheye model."""
+    def _has_known_model(self, eye: str) -> bool:
+        """Return whether the lens has only the terms k1 k2 p1 p2 k3, not the four of a fisheye model; or a problem."""
         checked = [field.name for field in ZED_CONF.fields if field.use == "checked"]
         other = [entry for name in checked for entry in self._entries(name, eye)]
         is_fisheye = bool(self._entries("k4", eye)) and not self._entries("p1", eye) + self._entries("p2", eye)
@@ -192,6 +192,7 @@ class _SizeReader:
             stated = ", ".join(f"{place.partition('.')[2]} = {escape_text(raw)}" for place, _, raw in terms)
             found = f"{'fisheye' if is_fisheye else 'rational, fisheye or thin prism'} distortion ({stated})"
             self.problems.append(Problem("invalid", terms[0][0].partition(".")[0], found, KNOWN_LENS))
+        return not terms
 
     def _entries(self, name: str, eye: str) -> list[tuple[str, int, str]]:
         """Return place, line and text of the keys of a field that the file has."""
