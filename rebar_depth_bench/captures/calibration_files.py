@@ -183,7 +183,7 @@ class _SizeReader:
         return numbers
 
     def _has_known_model(self, eye: str) -> bool:
-        """Return whether the lens has only the terms k1 k2 p1 p2 k3, not the four of a fisheye model; or a problem."""
+        """Return whether the lens has no terms but k1 k2 p1 p2 k3 and is no fisheye one; add a problem if not."""
         checked = [field.name for field in ZED_CONF.fields if field.use == "checked"]
         other = [entry for name in checked for entry in self._entries(name, eye)]
         is_fisheye = bool(self._entries("k4", eye)) and not self._entries("p1", eye) + self._entries("p2", eye)

@@ -1,7 +1,7 @@
 """Stereolabs' calibration files: sections of every image size, lens models, scaling, and notes of unlisted keys.
 
 The files are those of stereolabs/zed-opencv-calibration (StereoCalib::saveCalibZED) for the sensors AR0234 (ZED X)
-and IMX678 (4K), whose sizes are crops of one another, and that of a ZED with several sizes as Stereolabs delivers it.
+and IMX678 (4K), whose sizes are crops of one another, and that of a ZED as Stereolabs delivers it.
 """
 
 from __future__ import annotations
