@@ -128,9 +128,7 @@ _SIZES = ", ".join(f"{name} ({width} x {height})" for name, (width, height) in _
 ZED_CONF = FileFormat(
     "Stereolabs' `*.conf`",
     (
-        *_fields(
-            ("fx", "fy", "cx", "cy"), "EYE_CAM_X.#", "used", f"pixels; EYE is LEFT or RIGHT, X one of {_SIZES}"
-        ),
+        *_fields(("fx", "fy", "cx", "cy"), "EYE_CAM_X.#", "used", f"pixels; EYE: LEFT or RIGHT; X: {_SIZES}"),
         *_fields(_TERMS, "EYE_DISTO.# EYE_CAM_X.#", "used", "distortion; equal if in both sections"),
         *_fields(
             ("k4", "k5", "k6", "s1", "s2", "s3", "s4", "tauX", "tauY"),
@@ -141,7 +139,7 @@ ZED_CONF = FileFormat(
         Field("miscellaneous", ("MISC",), "harmless", "such as the kind of sensor"),
     ),
 )
-"""Fields by section and key, in which EYE and X stand for names of an eye and of an image size."""
+"""Fields by section and key, in which EYE and X stand for the names of an eye and of an image size."""
 
 _Sections = Mapping[str, Mapping[str, tuple[int, str]]]
 """Line and text of each key of each section."""
@@ -304,11 +302,9 @@ def _nearest_suffix(sections: _Sections, width: int, height: int, problems: list
     fx = [sections.get(f"LEFT_CAM_{name}", {}).get("fx", (0, ""))[1] for name in alike]
     focal = [parse_number(raw) / _GRIDS[name][0] for raw, name in zip(fx, alike, strict=True)]
     if unknown:
-        found = f"no section is of {width} x {height} pixels, as far as known: {', '.join(unknown[:10])} may be"
+        found = f"no section is known to be of {width} x {height} pixels; {', '.join(unknown[:10])} may be"
     elif max(focal) > _SAME_VIEW * min(focal):
-        found = (
-            f"no section is of {width} x {height} pixels, and {', '.join(alike)} show unlike parts of the sensor"
-        )
+        found = f"no section is of {width} x {height} pixels; {', '.join(alike)} show unlike parts of the sensor"
     else:
         return nearest
     expected = "only sections of the size that the images were scaled from, or calibration.toml with that size"

@@ -24,10 +24,7 @@ from rebar_depth_bench.base.reading import open_regular, read_file
 from rebar_depth_bench.data.codecs import decode
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
-OTHER_SUFFIXES = (
-    *(".tif", ".tiff", ".bmp", ".webp", ".gif", ".exr", ".ppm", ".pgm", ".pnm", ".pfm"),
-    *(".jp2", ".jfif", ".heic", ".heif", ".avif", ".dng"),
-)
+OTHER_SUFFIXES = (".tif", ".tiff", ".bmp", ".webp", ".gif", ".exr", ".ppm", ".pgm", ".jp2", ".heic", ".avif")
 """Suffixes of pictures that are not read."""
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 NAME_RULE = "a name of 1 to 100 letters, digits, . _ -"
