@@ -17,6 +17,9 @@ from jaxtyping import UInt8
 from numpy import ndarray
 from PIL.ExifTags import Base
 from PIL.Image import Image
+from PIL.JpegImagePlugin import JpegImageFile
+from PIL.PngImagePlugin import PngImageFile
+from PIL.TiffImagePlugin import TiffImageFile
 
 from rebar_depth_bench.base.errors import EntryError, InputError, Problem, escape_text, format_shape
 from rebar_depth_bench.base.limits import CELL_BYTES, IMAGE_PIXELS
@@ -95,10 +98,6 @@ def check_upright(stream: BinaryIO, where: str = "") -> None:
     Raises ``EntryError`` with the location ``where`` for an EXIF orientation other than 1: a calibration may be
     that of the turned or of the stored pixels.
     """
-    from PIL.JpegImagePlugin import JpegImageFile
-    from PIL.PngImagePlugin import PngImageFile
-    from PIL.TiffImagePlugin import TiffImageFile
-
     orientation: object = None
     is_small = stream.seek(0, os.SEEK_END) <= CELL_BYTES.value()  # Larger files are not read.
     for plugin in (PngImageFile, JpegImageFile, TiffImageFile) if is_small else ():
@@ -110,10 +109,8 @@ def check_upright(stream: BinaryIO, where: str = "") -> None:
             orientation = Image.getexif(image).get(Base.Orientation)
     if orientation in range(2, 9):
         found = f"the EXIF orientation is {orientation}: viewers turn the pixels"
-        expected = (
-            "1: save turned pixels (mogrify -auto-orient) if the calibration is of these, "
-            "or else remove the tag (exiftool -Orientation=)"
-        )
+        remedy = "save the turned pixels (mogrify -auto-orient), or remove the tag (exiftool -Orientation=)"
+        expected = f"1, as the calibration may be of either: {remedy}"
         raise EntryError(Problem("invalid", where, found, expected))
 
 
