@@ -184,12 +184,16 @@ class _SizeReader:
         """Return whether the lens has no terms but k1 k2 p1 p2 k3 and is no fisheye one; add a problem if not."""
         checked = [field.name for field in ZED_CONF.fields if field.use == "checked"]
         other = [entry for name in checked for entry in self._entries(name, eye)]
-        is_fisheye = bool(self._entries("k4", eye)) and not self._entries("p1", eye) + self._entries("p2", eye)
-        terms = [entry for entry in other if is_fisheye or parse_number(entry[2]) != 0]
+        tangential = self._entries("p1", eye) + self._entries("p2", eye)
+        has_four = bool(self._entries("k4", eye)) and not tangential
+        terms = [entry for entry in other if has_four or parse_number(entry[2]) != 0]
         if terms:
+            further = [raw for *_, raw in tangential + self._entries("k5", eye) + self._entries("k6", eye)]
+            section, _, name = terms[0][0].partition(".")
+            radial = "rational" if any(map(parse_number, further)) else "fisheye"
+            kind = {"s": "thin prism", "t": "tilted"}.get(name[0], radial)
             stated = ", ".join(f"{place.partition('.')[2]} = {escape_text(raw)}" for place, _, raw in terms)
-            found = f"{'fisheye' if is_fisheye else 'rational, fisheye or thin prism'} distortion ({stated})"
-            self.problems.append(Problem("invalid", terms[0][0].partition(".")[0], found, KNOWN_LENS))
+            self.problems.append(Problem("invalid", section, f"{kind} distortion ({stated})", KNOWN_LENS))
         return not terms
 
     def _entries(self, name: str, eye: str) -> list[tuple[str, int, str]]:
