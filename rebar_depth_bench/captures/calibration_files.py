@@ -107,8 +107,6 @@ _GRIDS: Mapping[str, tuple[int, int]] = {
 }
 """Image sizes (width, height) of Stereolabs cameras, pixels, by section suffix."""
 _CAMERAS = ("LEFT_CAM_", "RIGHT_CAM_")
-_SAME_VIEW = 1.01
-"""Largest ratio of the focal lengths, in image widths, of two sizes that show the same part of the sensor."""
 
 _TERMS = ("k1", "k2", "p1", "p2", "k3")
 _STEREO: Mapping[str, Expected] = {
@@ -283,7 +281,7 @@ def _nearest_suffix(sections: _Sections, width: int, height: int, problems: list
     """Return the suffix of the sections whose image size is nearest in aspect ratio, then in width.
 
     Returns None, and adds a problem if there is none yet, if the file has no sections of a known size, and if it
-    has none of this size and does not show which part of the sensor the images show.
+    has none of this size and one of an unknown size.
     """
     present = [name for name in _GRIDS if {camera + name for camera in _CAMERAS} & set(sections)]
     if not present and not problems:
@@ -302,15 +300,9 @@ def _nearest_suffix(sections: _Sections, width: int, height: int, problems: list
         return nearest
     known = {camera + name for camera in _CAMERAS for name in _GRIDS}
     unknown = [f"[{escape_text(name)}]" for name in sections if name.startswith(_CAMERAS) and name not in known]
-    alike = [name for name in present if distance(name)[0] == distance(nearest)[0]]
-    fx = [sections.get(f"LEFT_CAM_{name}", {}).get("fx", (0, ""))[1] for name in alike]
-    focal = [parse_number(raw) / _GRIDS[name][0] for raw, name in zip(fx, alike, strict=True)]
-    if unknown:
-        found = f"no section is known to be of {width} x {height} pixels; {', '.join(unknown[:10])} may be"
-    elif max(focal) > _SAME_VIEW * min(focal):
-        found = f"no section is of {width} x {height} pixels; {', '.join(alike)} show unlike parts of the sensor"
-    else:
+    if not unknown:
         return nearest
+    found = f"no section is known to be of {width} x {height} pixels; {', '.join(unknown[:10])} may be"
     expected = "only sections of the size that the images were scaled from, or calibration.toml with that size"
     problems.append(Problem("conflict", "", found, expected))
     return None

@@ -1,4 +1,4 @@
-"""Fields of the files of other programs: those that a reader uses, checks, or leaves because they change no number.
+"""Fields of the files of other programs: those that a reader uses or checks, and those that change no number.
 
 A reader looks up its values in the table of its format and names every field that the table does not list.
 """
@@ -19,8 +19,8 @@ _MAX_NAMED = 10
 class Field:
     """Field of a format: its keys in files, of which the first one present counts, and what a reader does with it.
 
-    ``use`` is "used" if the value becomes part of the result, "checked" if a file is refused unless the value is as
-    ``meaning`` says, and "harmless" if it changes no number.
+    ``use`` is "used" if the value becomes part of the result, "checked" if a file is refused unless the value is
+    as ``meaning`` says, and "harmless" if it changes no number.
     """
 
     name: str
@@ -41,7 +41,7 @@ class FileFormat:
         return next(field.keys for field in self.fields if field.name == name)
 
     def notes(self, source: str, keys: Iterable[str]) -> list[str]:
-        """Return a note that names the ``keys`` of the file ``source`` that the format does not list; none if none."""
+        """Return a note that names the ``keys`` of the file ``source`` that are not listed; none if all are."""
         listed = {plain_key(key) for field in self.fields for key in field.keys}
         unlisted = [escape_text(key) for key in keys if plain_key(key) not in listed]
         if not unlisted:

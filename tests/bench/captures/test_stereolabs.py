@@ -184,12 +184,9 @@ def test_incomplete_and_contradicting_distortion_is_refused(
         # A size that no table has may be the one of the images.
         (ar0234(BROWN).replace("SVGA", "WVGA"), (960, 600), "[LEFT_CAM_WVGA], [RIGHT_CAM_WVGA] may be"),
         (imx678(BROWN).replace("CAM_QHDPLUS", "CAM_QHD+"), (3200, 1800), "[LEFT_CAM_QHD+]"),
-        # 1280 x 720 pixels of the IMX678 may be a third of 4k or of its crop QHDPLUS.
-        (imx678(BROWN), (1280, 720), "FHD, 4K, QHDPLUS show unlike parts of the sensor"),
-        (conf(FACTORY, {}, BROWN), (640, 360), "2K, FHD, HD show unlike parts of the sensor"),
     ],
 )
-def test_file_that_does_not_show_the_view_of_a_size_is_not_scaled(
+def test_file_with_sections_of_unknown_sizes_is_not_scaled(
     tmp_path: Path, text: str, size: tuple[int, int], words: str
 ) -> None:
     [problem] = refusal(tmp_path, text, size)
@@ -203,7 +200,7 @@ def test_file_that_does_not_show_the_view_of_a_size_is_not_scaled(
         # FHD1200 and SVGA show the same columns; 480 x 300 is half of SVGA: cx = (480.65 + 0.5) / 2 - 0.5.
         (ar0234(BROWN), (480, 300), (185.525, 240.075, 150.55), "SVGA, 960 x 600"),
         (ar0234(BROWN), (1280, 720), (494.7333333, 640.7, 361.9666667), "FHD, 1920 x 1080"),
-        (conf({"HD": FACTORY["HD"]}, {}, BROWN), (640, 360), (350.94, 320.3925, 171.84175), "HD, 1280 x 720"),
+        (conf(FACTORY, {}, BROWN), (640, 360), (350.94, 320.3925, 171.84175), "HD, 1280 x 720"),
     ],
 )
 def test_other_sizes_are_scaled_with_a_note(
