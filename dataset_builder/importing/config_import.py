@@ -115,14 +115,14 @@ def _key_inputs(source: Import, progress: Progress) -> list[Any]:
     for done, path in enumerate(files, start=1):
         digests.append(file_sha256(path))
         progress("files read", done, len(files))
-    calibration = asdict(source.views.cameras.calibration)
+    calibrations = [asdict(one) for one in dict.fromkeys(source.views.cameras.calibrations.values())]
     poses = {name: pose.tolist() for name, pose in source.views.cameras.cam_from_world.items()}
     bars = [asdict(bar) for bar in source.bars]
     return [
         source.layout.model_dump(),
         source.views.names,
         digests,
-        calibration,
+        calibrations,
         poses,
         bars,
         generator_versions(),

@@ -19,7 +19,7 @@ All files are named relative to its folder; ``{view}`` in a name stands for the 
     channel = "R"                     # of EXR files with several channels
 
     [cameras]                         # the keys of cameras.toml, see ``captures.camera_files``
-    calibration = "stereo.yml"
+    calibration = "stereo.yml"        # or views = "scene_camera.json", see ``view_cameras``
 
     [poses]                           # of the left camera, for each view; or [[cameras.pose]]
     file = "poses/{view}.txt"         # 4 x 4 numbers: .txt, .npy, .json
@@ -43,7 +43,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Strict, model_validator
+from pydantic import Strict, field_validator, model_validator
 
 from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.base.limits import TOML_BYTES
@@ -55,6 +55,7 @@ from rebar_depth_bench.base.validation import (
     field_error,
     number,
     one_of,
+    short_repr,
     text,
     validate_table,
     whole_number,
@@ -171,13 +172,35 @@ class Layout(StrictModel):
     masks: MasksTable = MasksTable()
     bars: BarsTable | None = None
 
+    @property
+    def views(self) -> str | None:
+        """Name of the file with the cameras of all views, if there is one."""
+        name: str | None = self.cameras.get("views")
+        return name
+
+    @field_validator("cameras")
+    @classmethod
+    def _check_views(cls, cameras: dict[str, Any]) -> dict[str, Any]:
+        name, *others = cameras.get("views", ""), *(key for key in cameras if key != "views")
+        if "views" in cameras and others:
+            raise field_error(
+                f"got views and {', '.join(others)}", "views alone: it states all cameras", "conflict"
+            )
+        if "views" in cameras and not (isinstance(name, str) and is_below(name)):
+            raise field_error(f"got views = {short_repr(name)}", "a file in or below the layout's folder")
+        return cameras
+
     @model_validator(mode="after")
     def _check_sizes(self) -> Layout:
         if self.files.left_rgb is None and (self.width is None or self.height is None):
             raise field_error("width or height is missing", "both, or files.left_rgb", "missing")
         if self.poses is not None and "pose" in self.cameras:
             raise field_error("got poses and cameras.pose", "one of them", "conflict")
-        if self.bars is not None and self.poses is None and "pose" not in self.cameras:
+        has_one = not self.files.has_right and self.depth.kind != "disparity"
+        if self.views is not None and not (has_one and self.poses is self.intrinsics is None):
+            found = "got cameras.views and poses, intrinsics, a right camera or disparity"
+            raise field_error(found, "cameras.views alone, for images of one camera", "conflict")
+        if self.bars is not None and self.poses is None and not {"pose", "views"} & set(self.cameras):
             raise field_error("got bars without poses", "poses in the frame of the bars", "conflict")
         if self.intrinsics is not None and (self.files.has_right or self.depth.kind == "disparity"):
             other = "a right camera" if self.files.has_right else "disparity"

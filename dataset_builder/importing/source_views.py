@@ -25,10 +25,11 @@ from dataset_builder.importing.source_files import (
     read_labels,
     rectified_pair,
 )
+from dataset_builder.importing.view_cameras import ViewCameras, read_view_cameras
 from rebar_depth_bench.base.errors import EntryError, InputError, Problem, escape_text
 from rebar_depth_bench.base.names import NAME_LETTERS, NAME_PATTERN
 from rebar_depth_bench.captures.calibration import camera_columns
-from rebar_depth_bench.captures.camera_files import CaptureCameras, cameras_of_table
+from rebar_depth_bench.captures.camera_files import cameras_of_table
 from rebar_depth_bench.captures.images import IMAGE_SUFFIXES, common_shape, read_image
 from rebar_depth_bench.data.schema import EYES, column_kind
 
@@ -52,7 +53,7 @@ class SourceViews:
     layout: Layout
     names: tuple[str, ...]
     grid: tuple[int, int]
-    cameras: CaptureCameras
+    cameras: ViewCameras
 
     @property
     def has_poses(self) -> bool:
@@ -61,8 +62,9 @@ class SourceViews:
 
     @property
     def files(self) -> list[Path]:
-        """Files of all views."""
-        return [self.file(pattern, name) for pattern in _patterns(self.layout).values() for name in self.names]
+        """Files of all views, and that of their cameras."""
+        files = [self.file(pattern, name) for pattern in _patterns(self.layout).values() for name in self.names]
+        return files if self.layout.views is None else [*files, self.root / self.layout.views]
 
     def file(self, pattern: str, name: str) -> Path:
         """Return the file of a view."""
@@ -80,7 +82,7 @@ class SourceViews:
             raise InputError.from_problems(f"{self.root}: view {name}", error.problems) from None
 
     def _cameras(self, name: str) -> dict[str, Any]:
-        layout, calibration = self.layout, self.cameras.calibration
+        layout, calibration = self.layout, self.cameras.calibrations[name]
         pose = self.cameras.cam_from_world.get(name, np.eye(4))
         if layout.poses is not None:
             pose = cam_from_world(self.file(layout.poses.file, name), layout.poses)
@@ -99,9 +101,10 @@ class SourceViews:
             if kind == "rgb":
                 columns[column] = read_image(path, self.grid)
             elif kind == "depth":
-                values = read_depth(path, self.grid, table)
+                values = read_depth(path, self.grid, table, self.cameras.depth_unit_m.get(name, table.factor))
                 K, distortion = cameras[f"{eye}_K"], cameras[f"{eye}_distortion"]
-                columns[column] = planar_depth_m(values, table.kind, self.cameras.calibration, K, distortion)
+                calibration = self.cameras.calibrations[name]
+                columns[column] = planar_depth_m(values, table.kind, calibration, K, distortion)
             else:
                 values = read_labels(path, self.grid)
                 columns[column] = self._mask(values) if kind == "mask" else bar_ids(path, values)
@@ -152,12 +155,17 @@ def open_views(path: Path, layout: Layout) -> SourceViews:
     if problems:
         raise InputError.from_problems(path, problems)
     height, width = grid if grid is not None else (layout.height or 0, layout.width or 0)
+    if layout.views is not None:
+        by_view = read_view_cameras(root / layout.views, layout, names, (height, width))
+        return SourceViews(root, layout, tuple(names), (height, width), by_view)
     cameras = cameras_of_table(
         path, layout.cameras, names, width, height, is_stereo=layout.files.has_right, where="cameras"
     )
     if layout.depth.kind == "disparity":
         rectified_pair(cameras.calibration)
-    return SourceViews(root, layout, tuple(names), (height, width), cameras)
+    calibrations = dict.fromkeys(names, cameras.calibration)
+    shared = ViewCameras(calibrations, cameras.cam_from_world, {}, cameras.board, cameras.calibration.notes)
+    return SourceViews(root, layout, tuple(names), (height, width), shared)
 
 
 def _patterns(layout: Layout) -> dict[str, str]:
