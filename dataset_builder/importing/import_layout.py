@@ -43,7 +43,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import Strict, field_validator, model_validator
+from pydantic import Strict, model_validator
 
 from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.base.limits import TOML_BYTES
@@ -174,21 +174,8 @@ class Layout(StrictModel):
 
     @property
     def views(self) -> str | None:
-        """Name of the file with the cameras of all views, if there is one."""
-        name: str | None = self.cameras.get("views")
-        return name
-
-    @field_validator("cameras")
-    @classmethod
-    def _check_views(cls, cameras: dict[str, Any]) -> dict[str, Any]:
-        name, *others = cameras.get("views", ""), *(key for key in cameras if key != "views")
-        if "views" in cameras and others:
-            raise field_error(
-                f"got views and {', '.join(others)}", "views alone: it states all cameras", "conflict"
-            )
-        if "views" in cameras and not (isinstance(name, str) and is_below(name)):
-            raise field_error(f"got views = {short_repr(name)}", "a file in or below the layout's folder")
-        return cameras
+        """Name of the file with the cameras of all views, or None."""
+        return str(self.cameras["views"]) if "views" in self.cameras else None
 
     @model_validator(mode="after")
     def _check_sizes(self) -> Layout:
@@ -196,14 +183,22 @@ class Layout(StrictModel):
             raise field_error("width or height is missing", "both, or files.left_rgb", "missing")
         if self.poses is not None and "pose" in self.cameras:
             raise field_error("got poses and cameras.pose", "one of them", "conflict")
-        has_one = not self.files.has_right and self.depth.kind != "disparity"
-        if self.views is not None and not (has_one and self.poses is self.intrinsics is None):
-            found = "got cameras.views and poses, intrinsics, a right camera or disparity"
-            raise field_error(found, "cameras.views alone, for images of one camera", "conflict")
+        shared = {"a right camera": self.files.has_right, "disparity": self.depth.kind == "disparity"}
+        if self.views is not None:
+            tables = {"poses": self.poses is not None, "intrinsics": self.intrinsics is not None}
+            others = [name for name, is_given in {**tables, **shared}.items() if is_given]
+            others += [f"cameras.{key}" for key in self.cameras if key != "views"]
+            if others:
+                raise field_error(
+                    f"got cameras.views and {others[0]}", "cameras.views alone, for one camera", "conflict"
+                )
+            if not isinstance(self.cameras["views"], str) or not is_below(self.views):
+                found = f"cameras.views is {short_repr(self.cameras['views'])}"
+                raise field_error(found, "the name of a file in or below the layout's folder")
         if self.bars is not None and self.poses is None and not {"pose", "views"} & set(self.cameras):
             raise field_error("got bars without poses", "poses in the frame of the bars", "conflict")
-        if self.intrinsics is not None and (self.files.has_right or self.depth.kind == "disparity"):
-            other = "a right camera" if self.files.has_right else "disparity"
+        if self.intrinsics is not None and any(shared.values()):
+            other = next(name for name, is_given in shared.items() if is_given)
             raise field_error(f"got intrinsics of each view and {other}", "one calibration", "conflict")
         return self
 
