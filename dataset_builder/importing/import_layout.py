@@ -183,15 +183,13 @@ class Layout(StrictModel):
             raise field_error("width or height is missing", "both, or files.left_rgb", "missing")
         if self.poses is not None and "pose" in self.cameras:
             raise field_error("got poses and cameras.pose", "one of them", "conflict")
+        tables = {"poses": self.poses, "intrinsics": self.intrinsics}
         shared = {"a right camera": self.files.has_right, "disparity": self.depth.kind == "disparity"}
         if self.views is not None:
-            tables = {"poses": self.poses is not None, "intrinsics": self.intrinsics is not None}
-            others = [name for name, is_given in {**tables, **shared}.items() if is_given]
-            others += [f"cameras.{key}" for key in self.cameras if key != "views"]
-            if others:
-                raise field_error(
-                    f"got cameras.views and {others[0]}", "cameras.views alone, for one camera", "conflict"
-                )
+            others = [f"cameras.{key}" for key in self.cameras if key != "views"]
+            if others := [*others, *(name for name, given in {**tables, **shared}.items() if given)]:
+                found = f"got cameras.views and {others[0]}"
+                raise field_error(found, "cameras.views alone, for one camera", "conflict")
             if not isinstance(self.cameras["views"], str) or not is_below(self.views):
                 found = f"cameras.views is {short_repr(self.cameras['views'])}"
                 raise field_error(found, "the name of a file in or below the layout's folder")

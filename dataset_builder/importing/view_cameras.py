@@ -13,7 +13,6 @@ import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from itertools import chain
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import Any, NamedTuple
 
@@ -58,14 +57,11 @@ NERFSTUDIO = FileFormat(
         Field("fy", ("fl_y",), "used", "focal length, pixels; default: that of x"),
         Field("angle_x", ("camera_angle_x",), "used", "field of view, radians; checked beside `fl_x`"),
         Field("angle_y", ("camera_angle_y",), "used", "field of view, radians; left out beside `fl_y`"),
-        Field("cx", ("cx",), "used", "principal point, pixels; default: the middle of the image"),
-        Field("cy", ("cy",), "used", "principal point, pixels; default: the middle of the image"),
+        *(Field(key, (key,), "used", "principal point, pixels; default: the middle") for key in ("cx", "cy")),
         *(Field(key, (key,), "used", "lens distortion of OpenCV") for key in ("k1", "k2", "p1", "p2", "k3")),
-        *(Field(key, (key,), "used", "size of the images, that of the views") for key in ("w", "h")),
+        *(Field(key, (key,), "used", "size, which is that of the images") for key in ("w", "h")),
         Field("model", ("camera_model",), "used", f"{', '.join(_MODELS)}; {_LENS}"),
-        Field(
-            "lens", ("k4", "k5", "k6", "is_fisheye", "ftheta_p0", "latlong", "equirectangular"), "checked", _LENS
-        ),
+        Field("k4", ("k4", "k5", "k6", "is_fisheye", "ftheta_p0", "latlong", "equirectangular"), "checked", _LENS),
         Field("fov", ("x_fov", "y_fov"), "checked", "fl_x and fl_y in its place"),
         Field("shutter", ("rolling_shutter", "transform_matrix_start"), "checked", "one pose for each image"),
         Field("axes", ("from_na", "normal_mts_args"), "checked", "none: OpenGL axes"),
@@ -110,9 +106,7 @@ def read_view_cameras(
         found = list[Problem]()
         try:
             values = _values(file_format, whole, entries[where])
-            lens, pose, unit_m = (
-                _bop(values, layout) if is_bop else _nerfstudio(values, layout, name, width, height)
-            )
+            lens, pose, unit_m = _bop(values, layout) if is_bop else _nerfstudio(values, layout, name, grid)
             calibration = table_calibration({"left": lens}, width, height, found, is_stereo=False)
             if calibration is not None:
                 cameras[name] = ViewCamera(scaled_calibration(calibration, path, width, height), pose, unit_m)
@@ -128,9 +122,8 @@ def read_view_cameras(
         problems.append(Problem("missing", "", reason, "poses of all views, or of none in a layout without bars"))
     if problems:
         raise InputError.from_problems(path, with_lines(problems, content))
-    notes = file_format.notes(
-        path.name, dict.fromkeys([*whole, *chain(*(entries[where] for where in places.values()))])
-    )
+    keys = dict.fromkeys([*whole, *(key for where in places.values() for key in entries[where])])
+    notes = file_format.notes(path.name, keys)
     if _UNIT in {**whole, **entries[where]} and unit_m is None:
         notes.append(f"{path.name}: {_UNIT} is that of other depth maps, depth_file_path; [depth] states the unit")
     if len(entries) > len(names):
@@ -252,13 +245,13 @@ def _bop(values: Mapping[str, Any], layout: Layout) -> _Parts:
     return lens, pose, None if unit_mm is None else unit_mm * UNITS_M["mm"]
 
 
-def _nerfstudio(values: Mapping[str, Any], layout: Layout, name: str, width: int, height: int) -> _Parts:
+def _nerfstudio(values: Mapping[str, Any], layout: Layout, name: str, grid: Grid) -> _Parts:
     """Return the parts of a camera by nerfstudio's values. Raises ``EntryError``."""
     if (model := values.get("camera_model", _MODELS[0])) not in _MODELS:
         expected = f"{', '.join(_MODELS)}; {_LENS}"
         raise EntryError(Problem("invalid", "camera_model", f"got {short_repr(model)}", expected))
     lens: dict[str, Any] = {"distortion": [_number(values, key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]}
-    for axis, side, side_px in (("x", "w", width), ("y", "h", height)):
+    for axis, side, side_px in (("x", "w", grid[1]), ("y", "h", grid[0])):
         if _number(values, side, side_px) != side_px:
             expected = f"{side_px} as the images: scale them, or w, h, fl_x, fl_y, cx and cy"
             raise EntryError(Problem("size", side, f"got {short_repr(values[side])}", expected))

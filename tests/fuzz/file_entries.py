@@ -98,10 +98,12 @@ _BOP = """{
     "cam_R_w2c": [1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0], "cam_t_w2c": [10.0, -20.0, 500.0]},
   "1": {"cam_K": [20.0, 0.0, 7.5, 0.0, 20.0, 7.5, 0.0, 0.0, 1.0], "depth_scale": 1000.0, "view_level": 2}
 }"""
-_NERFSTUDIO = """{"camera_model": "OPENCV", "w": 16, "h": 16, "fl_x": 20.0, "cx": 8.0, "cy": 8.0, "k1": 0.01, "p2": 0.001,
+_NERFSTUDIO = """{
+  "camera_model": "OPENCV", "w": 16, "h": 16, "fl_x": 20.0, "cx": 8.0, "cy": 8.0, "k1": 0.01, "p2": 0.001,
   "depth_unit_scale_factor": 1.0, "applied_scale": 0.5, "frames": [
-  {"file_path": "./images/0.png", "transform_matrix": [[1, 0, 0, 0.5], [0, 0, 1, 0.1], [0, -1, 0, 2.0], [0, 0, 0, 1]]},
-  {"file_path": "./images/1.png", "fl_y": 20.5}]}
+    {"file_path": "./images/0.png",
+      "transform_matrix": [[1, 0, 0, 0.5], [0, 0, 1, 0.1], [0, -1, 0, 2.0], [0, 0, 0, 1]]},
+    {"file_path": "./images/1.png", "fl_y": 20.5}]}
 """
 _MILLIMETRES = '[depth]\nunit = "mm"\n'
 _BARS = """bar_id,role,diameter_m,x_m,y_m,z_m
