@@ -194,7 +194,7 @@ def test_poses_that_were_scaled_are_in_metres(tmp_path: Path) -> None:
 def test_unit_of_depth_is_that_of_the_depth_map_that_the_frame_names(
     stated: str | None, unit_m: float, noted: bool, tmp_path: Path
 ) -> None:
-    keys = {} if stated is None else {"depth_file_path": stated}
+    keys: Document = {} if stated is None else {"depth_file_path": stated}
     document = nerfstudio(frames=[frame("000000.png", **keys)], depth_unit_scale_factor=0.01)
     views = planned(write_layout(tmp_path, document, ("000000",))).views
     assert views.decode("000000")["left_depth"][0, 1] == pytest.approx(2 * unit_m)
@@ -230,12 +230,12 @@ def test_export_of_a_config_is_imported_again(tiny_root: Path, tmp_path: Path) -
 def test_other_cameras_are_other_data(tmp_path: Path) -> None:
     document = {"0": bop_entry(), "1": bop_entry()}
     run_import(planned(write_layout(tmp_path, document)), tmp_path / "out")
-    document["1"] = bop_entry(fx=41.0)
+    document["1"] = bop_entry(scale=0.2)
     layout = write_layout(tmp_path, document)
     with pytest.raises(InputError, match="other data"):
         run_import(planned(layout), tmp_path / "out")
     run_import(planned(layout), tmp_path / "out", overwrite=["mock-up"])
-    assert rdb.load(tmp_path / "out", "mock-up")[1]["left_K"][0, 0] == 41
+    assert rdb.load(tmp_path / "out", "mock-up")[1]["left_depth"][0, 0] == pytest.approx(0.0002)
 
 
 def test_unknown_fields_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
