@@ -22,8 +22,8 @@ from tests.builder.importing import source_data as data
 
 WIDTH, HEIGHT = 32, 24
 POSES = (look_at(np.array([0.3, -1.2, 0.4]), np.zeros(3)), look_at(np.array([-0.5, -0.9, 0.7]), np.zeros(3)))
-UNITS = np.arange(1, WIDTH * HEIGHT + 1).reshape(HEIGHT, WIDTH).astype(np.uint16)
-"""Depth maps before scaling: every pixel is another one, all have depth."""
+UNITS = (500 + np.arange(WIDTH * HEIGHT) % 200).reshape(HEIGHT, WIDTH).astype(np.uint16)
+"""Depth maps before scaling: 500, 501, ... in the first row."""
 GL = np.diag([1.0, -1.0, -1.0, 1.0])
 Document = dict[str, Any]
 
@@ -106,14 +106,14 @@ def test_bop_without_poses_converts_range_by_the_camera_of_each_view(tmp_path: P
     for name, fx, unit_mm in (("12", 40.0, 0.1), ("0003", 20.0, 1.0)):
         columns = source.views.decode(name)
         ray = math.sqrt(1 + (15.5 / fx) ** 2 + (11.5 / fx) ** 2)  # Of the pixel (0, 0), whose centre is (0, 0).
-        assert columns["left_depth"][0, 0] == pytest.approx(1 * unit_mm / 1000 / ray, rel=1e-6)
+        assert columns["left_depth"][0, 0] == pytest.approx(500 * unit_mm / 1000 / ray, rel=1e-6)
         assert np.array_equal(columns["left_cam_from_world"], np.eye(4))
 
 
 def test_unit_of_the_layout_is_used_if_the_file_states_none(tmp_path: Path) -> None:
     document = {"0": bop_entry(scale=None), "1": bop_entry(scale=None)}
     columns = planned(write_layout(tmp_path, document, tables="[depth]\nunit = 'cm'\n")).views.decode("000000")
-    assert columns["left_depth"][0, 1] == pytest.approx(0.02)
+    assert columns["left_depth"][0, 1] == pytest.approx(5.01)
 
 
 def test_output_of_ns_process_data_is_read(tmp_path: Path) -> None:
@@ -126,7 +126,7 @@ def test_output_of_ns_process_data_is_read(tmp_path: Path) -> None:
         assert columns["left_K"].tolist() == [[40, 0, 15.5], [0, 41, 12.0], [0, 0, 1]]
         assert columns["left_distortion"].tolist() == [-0.05, 0.01, 0.001, -0.002, 0]
         assert columns["left_cam_from_world"] == pytest.approx(pose, abs=1e-12)
-        assert columns["left_depth"][0, 0] == np.float32(0.001)
+        assert columns["left_depth"][0, 0] == np.float32(0.5)
 
 
 def test_synthetic_scene_of_nerf_is_read(tmp_path: Path) -> None:
@@ -197,7 +197,7 @@ def test_unit_of_depth_is_that_of_the_depth_map_that_the_frame_names(
     keys: Document = {} if stated is None else {"depth_file_path": stated}
     document = nerfstudio(frames=[frame("000000.png", **keys)], depth_unit_scale_factor=0.01)
     views = planned(write_layout(tmp_path, document, ("000000",))).views
-    assert views.decode("000000")["left_depth"][0, 1] == pytest.approx(2 * unit_m)
+    assert views.decode("000000")["left_depth"][0, 1] == pytest.approx(501 * unit_m)
     assert ("views.json: depth_unit_scale_factor is that of other depth maps" in " ".join(views.notes)) == noted
 
 
@@ -235,7 +235,7 @@ def test_other_cameras_are_other_data(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="other data"):
         run_import(planned(layout), tmp_path / "out")
     run_import(planned(layout), tmp_path / "out", overwrite=["mock-up"])
-    assert rdb.load(tmp_path / "out", "mock-up")[1]["left_depth"][0, 0] == pytest.approx(0.0002)
+    assert rdb.load(tmp_path / "out", "mock-up")[1]["left_depth"][0, 0] == pytest.approx(0.1)
 
 
 def test_unknown_fields_are_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
