@@ -17,9 +17,11 @@ from dataset_builder.importing.source_files import (
     DEPTH_SUFFIXES,
     LABEL_SUFFIXES,
     MATRIX_SUFFIXES,
+    DepthTally,
     bar_ids,
     cam_from_world,
     intrinsics,
+    limited_depth_m,
     planar_depth_m,
     read_depth,
     read_labels,
@@ -68,14 +70,15 @@ class SourceViews:
         """Return the file of a view."""
         return self.root / pattern.replace(VIEW, name)
 
-    def decode(self, name: str) -> dict[str, Any]:
+    def decode(self, name: str, tally: DepthTally | None = None) -> dict[str, Any]:
         """Return the arrays of a view by column; columns that the layout does not have are left out.
 
-        Raises ``InputError`` with the problems of the view's files.
+        What is left out of the depth maps is added to ``tally``. Raises ``InputError`` with the problems of the
+        view's files.
         """
         try:
             cameras = self._cameras(name)
-            return {**cameras, **self._images(name, cameras)}
+            return {**cameras, **self._images(name, cameras, DepthTally() if tally is None else tally)}
         except EntryError as error:
             raise InputError.from_problems(f"{self.root}: view {name}", error.problems) from None
 
@@ -91,7 +94,7 @@ class SourceViews:
             return columns
         return {column: cell for column, cell in columns.items() if column.startswith("left_")}
 
-    def _images(self, name: str, cameras: Mapping[str, Any]) -> dict[str, Any]:
+    def _images(self, name: str, cameras: Mapping[str, Any], tally: DepthTally) -> dict[str, Any]:
         table = self.layout.depth
         columns: dict[str, Any] = {}
         for column, pattern in self.layout.files.patterns.items():
@@ -99,9 +102,11 @@ class SourceViews:
             if kind == "rgb":
                 columns[column] = read_image(path, self.grid)
             elif kind == "depth":
-                values = read_depth(path, self.grid, table)
+                units = read_depth(path, self.grid, table, tally)
                 K, distortion = cameras[f"{eye}_K"], cameras[f"{eye}_distortion"]
-                columns[column] = planar_depth_m(values, table.kind, self.cameras.calibration, K, distortion)
+                calibration = self.cameras.calibration
+                depth_m = planar_depth_m(units, table.factor, table.kind, calibration, K, distortion)
+                columns[column] = limited_depth_m(path, units, depth_m, table.max_m, tally)
             else:
                 values = read_labels(path, self.grid)
                 columns[column] = self._mask(values) if kind == "mask" else bar_ids(path, values)
