@@ -24,7 +24,7 @@ from rebar_depth_bench.base.errors import (
     format_shape,
 )
 from rebar_depth_bench.base.limits import CELL_BYTES, TOML_BYTES
-from rebar_depth_bench.base.reading import decode_text, parse_json, parse_number, read_file
+from rebar_depth_bench.base.reading import decode_text, parse_json, read_file
 from rebar_depth_bench.base.validation import UNITS_M, short_repr
 from rebar_depth_bench.captures.calibration import Calibration, StereoCalibration
 from rebar_depth_bench.geometry.cameras import (
@@ -73,7 +73,7 @@ def _damage(path: Path, expected: str) -> Iterator[None]:
 
 @dataclass
 class DepthTally:
-    """What is left out of depth maps: values of ``depth.invalid`` that occur, and pixels beyond ``depth.max_m``."""
+    """What is left out of depth maps: values of ``depth.invalid`` that occur, pixels beyond ``depth.max_m``."""
 
     invalid: set[float] = field(default_factory=set)
     beyond_px: int = 0
@@ -174,7 +174,7 @@ def limited_depth_m(
             value = float(values[counts.argmax()])
             named = f"{value:.9g}" if float(np.float32(value)) == value else repr(value)
             found = f"{outside.sum()} pixels have depth {what}, most often the value {named}"
-            remedy = f"the unit of depth, or the values without depth in depth.invalid, for example [{named}]"
+            remedy = f'depth.unit (for example "mm"), or depth.invalid with the values without depth, as [{named}]'
             raise EntryError(
                 Problem("invalid", path.name, found, remedy + (_OR_MAX_M if outside is beyond else ""))
             )
@@ -282,8 +282,8 @@ def _raw_tiff(path: Path, content: bytes) -> Shaped[ndarray, "h w"]:
     if sum(sizes) != shape[0] * shape[1] * stored.itemsize or sum(sizes) > len(content):
         raise ValueError(f"{sum(sizes)} bytes of values for {format_shape(shape)} {stored}")
     data = b"".join(content[start : start + size] for start, size in zip(starts, sizes, strict=True))
-    order = "<" if content[:2] == b"II" else ">"
-    return np.frombuffer(data, stored.newbyteorder(order)).reshape(shape).astype(stored)
+    in_file = stored.newbyteorder("<" if content[:2] == b"II" else ">")
+    return np.frombuffer(data, in_file).reshape(shape).astype(stored)
 
 
 def _exr_channel(path: Path, channel: str) -> Shaped[ndarray, "h w"]:
@@ -304,7 +304,7 @@ def _read_matrix(path: Path, key: str | None, shape: tuple[int, int]) -> Float64
     ``key`` is that of a JSON object. Raises ``EntryError`` for anything but finite numbers.
     """
     content, suffix = read_file(path, TOML_BYTES, "a matrix", InputError), path.suffix.lower()
-    with _damage(path, "numbers"):
+    with _damage(path, "numbers with decimal points"):
         if suffix == ".npy":
             numbers: object = _npy(path, content)
         elif suffix == ".json":
@@ -330,11 +330,8 @@ def _text_numbers(path: Path, content: bytes) -> list[float]:
         raise EntryError(problems[0])
     text = re.sub("#.*", "", text)
     if re.search(r"\d,\d", text) and re.search(r"\d[ \t;]+[-+.\d]", text):
-        raise EntryError(Problem("syntax", path.name, "has decimal commas, or mixed separators", "decimal points"))
-    words = [word for word in re.split(r"[\s,;\[\]()]+", text) if word]
-    if invalid := [word for word in words if np.isnan(parse_number(word))]:
-        raise EntryError(Problem("syntax", path.name, f"holds {escape_text(invalid[0])}", "numbers"))
-    return [parse_number(word) for word in words]
+        raise ValueError("it has decimal commas, or several separators")
+    return [float(word) for word in re.split(r"[\s,;\[\]()]+", text) if word]
 
 
 def _json_value(content: bytes, key: str | None) -> object:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float64, Int64
+from jaxtyping import Float64
 from numpy import ndarray
 
 from rebar_depth_bench.base.errors import InputError, Problem, escape_text
@@ -19,40 +18,31 @@ from rebar_depth_bench.captures.fields import plain_key
 from rebar_depth_bench.data.bars import Bar
 
 _NUMBERS = ("bar_id", "diameter_m", "x_m", "y_m", "z_m")
+_LENGTHS = _NUMBERS[1:]
 _ROLE, _DEFAULT_ROLE = "role", "surveyed"
+_LINE = "line"
+_DELIMITERS = ",;\t"
+_MAX_PROBLEMS = 100
 _MAX_BAR_ID = np.iinfo(np.uint16).max
 _MAX_DIAMETER_M = 0.5
 _MAX_COORDINATE_M = 1e6
-_DELIMITERS = ",;\t"
-_MAX_PROBLEMS = 100
-_FORMAT = (
-    f"the columns {', '.join(_NUMBERS)} and, if wanted, {_ROLE}, with commas, semicolons or tabs between them;"
-    " lengths in metres"
-)
+_HEADER = f"the columns {', '.join(_NUMBERS)}, lengths in metres, between commas, semicolons or tabs"
 _OFFSET = (
-    f"less than {_MAX_COORDINATE_M:g} m: subtract one offset from all points of this file and from the camera centres"
-    " of all poses (to R t of a pose cam_from_world, add R times the offset to t)"
+    f"less than {_MAX_COORDINATE_M:g} m: subtract one offset from all points of this file and from all camera"
+    " centres of the poses (of a pose cam_from_world with R and t, add R times the offset to t)"
 )
-
-
-@dataclass(frozen=True, eq=False)
-class _Lines:
-    """Cells of the lines of a file, one list for each column, and the number of each line."""
-
-    columns: dict[str, list[str]]
-    numbers: list[int]
 
 
 def read_bars_file(path: Path) -> tuple[Bar, ...]:
     """Return the bars of a CSV file with the columns bar_id, diameter_m, x_m, y_m, z_m and, if wanted, role.
 
-    Each line is a point of an axis, in order. Commas, semicolons or tabs are between the columns; beside the latter
-    two, numbers may have decimal commas. Raises ``InputError`` with the first problems, which name the line.
+    Each line is a point of an axis, in order. Commas, semicolons or tabs are between the columns; beside the
+    latter two, numbers may have decimal commas. Raises ``InputError`` with the first problems and their lines.
     """
     content = read_file(path, TABLE_BYTES, "a CSV file of bars", InputError)
     text, problems = decode_text(content)
-    lines = None if problems else _lines(text, problems)
-    bars = () if lines is None or problems else _bars(lines, problems)
+    columns = {} if problems else _columns(text, problems)
+    bars = () if problems else _bars(columns, problems)
     if not problems and not bars:
         problems.append(Problem("missing", "", "has no bars", "one or more"))
     if problems:
@@ -60,86 +50,70 @@ def read_bars_file(path: Path) -> tuple[Bar, ...]:
     return bars
 
 
-def _lines(text: str, problems: list[Problem]) -> _Lines | None:
-    """Return the cells of a file; problems are added to ``problems``."""
+def _columns(text: str, problems: list[Problem]) -> dict[str, list[str]]:
+    """Return the cells of each column, and the number of each line; problems are added to ``problems``."""
     lines = text.splitlines()
     # Excel states the delimiter in a line before the header.
-    first = next((n for n, line in enumerate(lines) if line.strip() and not re.match("sep=", line, re.I)), 0)
-    header_line = lines[first] if lines else ""
-    delimiter = max(_DELIMITERS, key=header_line.count)
+    first = next((n for n, line in enumerate(lines) if line.strip() and not line.lower().startswith("sep=")), 0)
+    header = lines[first] if lines else ""
+    delimiter = max(_DELIMITERS, key=header.count)
     reader = csv.reader(lines[first:], delimiter=delimiter, skipinitialspace=True, strict=True)
     try:
         rows = [(first + reader.line_num, [cell.strip() for cell in row]) for row in reader]
     except csv.Error as error:
-        problems.append(Problem("syntax", "", f"line {first + reader.line_num}: {escape_text(str(error))}", "CSV"))
-        return None
+        problems.append(Problem("syntax", "", f"line {first + reader.line_num}: {error}", "a CSV file"))
+        return {}
     names = [plain_key(name) for name in rows[0][1]] if rows else []
     places = {name: names.index(plain_key(name)) for name in (*_NUMBERS, _ROLE) if plain_key(name) in names}
     if missing := [name for name in _NUMBERS if name not in places]:
-        found = f"line {first + 1} is {escape_text(header_line)}, without {', '.join(missing)}"
-        problems.append(Problem("missing", "", found, _FORMAT))
-    elif twice := [name for name in places if names.count(plain_key(name)) > 1]:
-        problems.append(Problem("duplicate", twice[0], "occurs twice in the header", "each column once"))
-    if problems:
-        return None
-    columns: dict[str, list[str]] = {name: [] for name in places}
-    numbers = []
+        found = f"line {first + 1} is {escape_text(header)}, without {', '.join(missing)}"
+        problems.append(Problem("missing", "", found, _HEADER))
+    problems += [
+        Problem("duplicate", name, "occurs twice in the header", "each column once")
+        for name in places
+        if names.count(plain_key(name)) > 1
+    ]
+    columns: dict[str, list[str]] = {name: [] for name in (*places, _LINE)}
     for number, row in rows[1:]:
         cells = row if any(row[len(names) :]) else row[: len(names)]
-        if not any(cells):
+        if len(problems) >= _MAX_PROBLEMS or not any(cells):
             continue
         if len(cells) != len(names):
             expected = f"{len(names)} as in the header; decimal commas need semicolons or tabs between the columns"
             problems.append(Problem("invalid", "", f"line {number} has {len(cells)} cells", expected))
-            if len(problems) >= _MAX_PROBLEMS:
-                break
             continue
-        numbers.append(number)
+        columns[_LINE].append(str(number))
         for name, place in places.items():
             columns[name].append(cells[place])
     if delimiter != "," and not problems:
-        _replace_decimal_commas(columns, problems)
-    return _Lines(columns, numbers)
+        cells = [cell for name in _LENGTHS for cell in columns[name]]
+        if any("," in cell for cell in cells) and any("." in cell for cell in cells):
+            problems.append(Problem("conflict", "", "has numbers with commas and with points", "decimal points"))
+        columns |= {name: [cell.replace(",", ".") for cell in columns[name]] for name in _LENGTHS}
+    return columns
 
 
-def _replace_decimal_commas(columns: dict[str, list[str]], problems: list[Problem]) -> None:
-    """Replace the decimal commas of lengths by points, unless some numbers have points."""
-    lengths = [name for name in _NUMBERS if name != "bar_id"]
-    if not any("," in cell for name in lengths for cell in columns[name]):
-        return
-    if any("." in cell for name in lengths for cell in columns[name]):
-        problems.append(
-            Problem("conflict", "", "has numbers with points and numbers with commas", "decimal points")
-        )
-    for name in lengths:
-        columns[name] = [cell.replace(",", ".") for cell in columns[name]]
-
-
-def _bars(lines: _Lines, problems: list[Problem]) -> tuple[Bar, ...]:
+def _bars(columns: Mapping[str, list[str]], problems: list[Problem]) -> tuple[Bar, ...]:
     """Return the bars of the lines of a file; problems are added to ``problems``."""
-    values = np.array([[parse_number(cell) for cell in lines.columns[name]] for name in _NUMBERS])
+    values = np.array([[parse_number(cell) for cell in columns[name]] for name in _NUMBERS])
     ids, sizes = values[0], values[1:].T
-    sound_id = (ids == np.round(ids)) & (ids >= 1) & (ids <= _MAX_BAR_ID)
-    checks = (
-        (~sound_id | ~np.isfinite(sizes).all(axis=1), f"a bar_id from 1 to {_MAX_BAR_ID}, and decimal numbers"),
-        (~((sizes[:, 0] > 0) & (sizes[:, 0] <= _MAX_DIAMETER_M)), f"a diameter of up to {_MAX_DIAMETER_M} metres"),
-        ((np.abs(sizes) >= _MAX_COORDINATE_M).any(axis=1), _OFFSET),
-    )
-    for is_wrong, expected in checks:
-        if problems:
-            return ()
-        for row in np.flatnonzero(is_wrong)[:_MAX_PROBLEMS].tolist():
-            cells = ", ".join(lines.columns[name][row] for name in _NUMBERS)
-            found = f"line {lines.numbers[row]}: got {escape_text(cells)}"
-            problems.append(Problem("invalid", "", found, expected))
+    is_id = (ids == np.round(ids)) & (ids >= 1) & (ids <= _MAX_BAR_ID)
+    is_sound = is_id & np.isfinite(sizes).all(axis=1) & (sizes[:, 0] > 0)
+    for is_right, expected in (
+        (is_sound, f"a bar_id from 1 to {_MAX_BAR_ID}, a diameter above 0, and numbers with decimal points"),
+        (~is_sound | (sizes[:, 0] <= _MAX_DIAMETER_M), f"a diameter of at most {_MAX_DIAMETER_M} m"),
+        (~is_sound | (np.abs(sizes) < _MAX_COORDINATE_M).all(axis=1), _OFFSET),
+    ):
+        for row in np.flatnonzero(~is_right)[:_MAX_PROBLEMS].tolist():
+            cells = escape_text(", ".join(columns[name][row] for name in _NUMBERS))
+            problems.append(Problem("invalid", "", f"line {columns[_LINE][row]}: got {cells}", expected))
     if problems or not len(ids):
         return ()
     order = np.argsort(ids, kind="stable")
-    groups: Sequence[Int64[ndarray, " n"]] = np.split(order, np.flatnonzero(np.diff(ids[order])) + 1)
-    roles = lines.columns.get(_ROLE)
+    roles = columns.get(_ROLE, [_DEFAULT_ROLE] * len(ids))
     return tuple(
-        _bar(int(ids[rows[0]]), _DEFAULT_ROLE if roles is None else roles[rows[0]], sizes[rows], problems)
-        for rows in groups
+        _bar(int(ids[rows[0]]), roles[rows[0]], sizes[rows], problems)
+        for rows in np.split(order, np.flatnonzero(np.diff(ids[order])) + 1)
     )
 
 
