@@ -172,7 +172,8 @@ def limited_depth_m(
         if outside.any():
             values, counts = np.unique(units[outside], return_counts=True)
             value = float(values[counts.argmax()])
-            named = f"{value:.9g}" if float(np.float32(value)) == value else repr(value)
+            with np.errstate(over="ignore"):
+                named = f"{value:.9g}" if float(np.float32(value)) == value else repr(value)
             found = f"{outside.sum()} pixels have depth {what}, most often the value {named}"
             remedy = f'depth.unit (for example "mm"), or depth.invalid with the values without depth, as [{named}]'
             raise EntryError(

@@ -29,7 +29,7 @@ from dataset_builder.importing.source_files import (
 )
 from rebar_depth_bench.base.errors import EntryError, InputError, Problem, escape_text
 from rebar_depth_bench.base.names import NAME_LETTERS, NAME_PATTERN
-from rebar_depth_bench.captures.calibration import camera_columns
+from rebar_depth_bench.captures.calibration import Lens, MonoCalibration, camera_columns, scaled_calibration
 from rebar_depth_bench.captures.camera_files import CaptureCameras, cameras_of_table
 from rebar_depth_bench.captures.images import IMAGE_SUFFIXES, common_shape, read_image
 from rebar_depth_bench.data.schema import EYES, column_kind
@@ -89,7 +89,11 @@ class SourceViews:
             pose = cam_from_world(self.file(layout.poses.file, name), layout.poses)
         columns = camera_columns(calibration, pose)
         if layout.intrinsics is not None:
-            columns["left_K"] = intrinsics(self.file(layout.intrinsics.file, name), layout.intrinsics)
+            path = self.file(layout.intrinsics.file, name)
+            K = columns["left_K"] = intrinsics(path, layout.intrinsics)
+            lens = Lens(K[0, 0], K[1, 1], K[0, 2], K[1, 2], calibration.left.distortion)
+            height, width = self.grid
+            scaled_calibration(MonoCalibration(width, height, lens), path, width, height)
         if layout.files.has_right:
             return columns
         return {column: cell for column, cell in columns.items() if column.startswith("left_")}
