@@ -168,7 +168,7 @@ LARGEST: dict[str, tuple[str, Callable[[np.ndarray], bytes], type]] = {
 def test_largest_integer_has_to_be_listed(name: str, tmp_path: Path) -> None:
     file, encode, kind = LARGEST[name]
     largest = int(np.iinfo(kind).max)
-    values = np.full((3, 5), 100, kind)
+    values: np.ndarray = np.full((3, 5), 100, kind)
     values[0, :2] = largest
     with pytest.raises(EntryError, match=rf"2 pixels have {largest}.* expected depth.invalid with {largest}"):
         read(tmp_path, file, encode(values))
@@ -191,7 +191,7 @@ def layout(folder: Path, table: str, depth: dict[str, bytes], *, suffix: str = "
 
 def background(value: float, kind: type = np.float32) -> np.ndarray:
     """Return depth of 2, and of ``value`` in the upper third, as Blender has 1e10 where no surface is."""
-    depth = np.full((120, 160), 2, kind)
+    depth: np.ndarray = np.full((120, 160), 2, kind)
     depth[:40] = value
     return depth
 
@@ -200,10 +200,10 @@ FAR: dict[str, tuple[str, np.ndarray, str]] = {
     "Blender": ("", background(1e10), "1e+10"),
     "largest half": ("", background(65504, np.float16), "65504"),
     "megametre": ("", background(1e6), "1000000"),
-    "largest float32": ("", background(np.finfo(np.float32).max), "3.40282347e+38"),
+    "largest float32": ("", background(float(np.finfo(np.float32).max)), "3.40282347e+38"),
     "largest float64": (
         "unit = 'ft'",
-        background(np.finfo(np.float64).max, np.float64),
+        background(float(np.finfo(np.float64).max), np.float64),
         "1.7976931348623157e+308",
     ),
     "millimetres": ("", background(2000.5) * 1000, "2000"),
@@ -308,7 +308,7 @@ def test_matrices_in_text_files(name: str, tmp_path: Path) -> None:
         with pytest.raises(InputError, match=words):
             views.decode("a")
     else:
-        expected = [[1, 0, 0, 0.5], [0, 1, 0, -1], [0, 0, 1, 0.2], [0, 0, 0, 1]]
+        expected = np.array([[1, 0, 0, 0.5], [0, 1, 0, -1], [0, 0, 1, 0.2], [0, 0, 0, 1]])
         assert np.array_equal(views.decode("a")["left_cam_from_world"], expected)
 
 

@@ -123,7 +123,7 @@ def outliers(share: float, depth_m: float) -> Change:
     random = np.random.default_rng(57)
 
     def change(row: Row) -> np.ndarray:
-        depth = row["left_depth"].copy()
+        depth: np.ndarray = row["left_depth"].copy()
         depth[(random.random(depth.shape) < share) & (depth > 0)] = depth_m
         return depth
 
@@ -131,9 +131,9 @@ def outliers(share: float, depth_m: float) -> Change:
 
 
 def noisy(row: Row) -> np.ndarray:
-    return row["left_depth"] * np.float32(1) + np.random.default_rng(57).normal(0, 0.003, (90, 160)).astype(
-        np.float32
-    )
+    depth: np.ndarray = row["left_depth"]
+    noise = np.random.default_rng(57).normal(0, 0.003, depth.shape)
+    return np.where(depth > 0, depth + noise, 0).astype(np.float32)
 
 
 RIGHT: dict[str, Change | None] = {
@@ -183,7 +183,7 @@ def test_summary_has_the_offset_of_poses(
     )
     numbers = summary(layout, capsys)
     assert np.abs(numbers[:, 4] - 1).max() < 0.35
-    assert np.abs(numbers[:, 2:4]).max() < 0.25
+    assert np.abs(numbers[:, 2:4]).max() < 0.35
 
 
 def test_summary_has_the_scale_of_depth(
@@ -193,7 +193,7 @@ def test_summary_has_the_scale_of_depth(
     scaled = summary(write(source, rows, tmp_path / "scaled", POSES + BARS, times(1.003)), capsys)
     assert np.abs(exact[:, 5] - 1).max() < 0.0005
     assert np.abs(scaled[:, 5] - 1.003).max() < 0.0015
-    assert exact[:, 6].max() < 0.5 < 1.5 < np.median(scaled[:, 6])
+    assert np.median(exact[:, 6]) < 0.2 < 0.4 < np.median(scaled[:, 6])
 
 
 @pytest.mark.parametrize(
