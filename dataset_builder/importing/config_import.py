@@ -169,7 +169,10 @@ def _stage_views(source: Import, staging: Staging, progress: Progress) -> tuple[
     if depth.max_m is not None:
         summary.append(f"depth beyond depth.max_m = {depth.max_m:g} m: {tally.beyond_px} pixels left out")
     unmatched = [value for value in depth.invalid if value not in tally.invalid]
-    notes = [f"depth.invalid: no pixel of any view has the value {value:.15g}, in units of the files" for value in unmatched]
+    notes = [
+        f"depth.invalid: no pixel of any view has the value {value:.15g}, in units of the files"
+        for value in unmatched
+    ]
     return ids, ImportFindings(tuple(summary), tuple(notes))
 
 

@@ -67,21 +67,27 @@ class SurveyCheck:
         """
         if not self.bars or "left_bars" not in columns:
             return
-        ids, depth_m, K = columns["left_bars"], columns["left_depth"], columns["left_K"]
-        inside, found = interior(columns["left_mask"]), set(np.unique(ids).tolist())
-        seen = [k for k, bar in enumerate(self.bars) if bar.bar_id in found]
-        for k in seen:
-            on_bar = (ids == self.bars[k].bar_id) & (depth_m > 0)
-            pixels = np.flatnonzero(on_bar & inside if (on_bar & inside).any() else on_bar)
-            count = min(len(pixels), max(1, _MAX_POINTS // (self.views * len(seen))))
-            row, column = np.divmod(pixels[np.linspace(0, len(pixels) - 1, count).astype(np.intp)], ids.shape[1])
-            plane = np.stack([(column - K[0, 2]) / K[0, 0], (row - K[1, 2]) / K[1, 1]], axis=-1)
-            try:
-                rays = np.insert(undistort(plane, columns["left_distortion"]), 2, 1.0, axis=-1)
-            except ValueError as error:
-                raise EntryError(Problem("invalid", "K", str(error), "a lens that sees every pixel")) from None
-            poses = np.broadcast_to(columns["left_cam_from_world"], (count, 4, 4))
-            self.parts.append(_Pixels(depth_m[row, column].astype(np.float64), rays, poses, np.full(count, k)))
+        ids, depth_m, K = columns["left_bars"].ravel(), columns["left_depth"].ravel(), columns["left_K"]
+        inside = interior(columns["left_mask"]).ravel()
+        place = {bar.bar_id: k for k, bar in enumerate(self.bars)}
+        usable = np.flatnonzero(np.isin(ids, list(place)) & (depth_m > 0))
+        usable = usable[np.argsort(ids[usable], kind="stable")]
+        of_bars = np.split(usable, np.flatnonzero(np.diff(ids[usable])) + 1)
+        limit, chosen = max(1, _MAX_POINTS // (self.views * len(of_bars))), []
+        for pixels in of_bars:
+            inner = pixels[inside[pixels]]
+            pixels = inner if len(inner) else pixels
+            chosen.append(pixels[np.linspace(0, len(pixels) - 1, min(limit, len(pixels))).astype(np.intp)])
+        pixels = np.concatenate(chosen)
+        row, column = np.divmod(pixels, columns["left_bars"].shape[1])
+        plane = np.stack([(column - K[0, 2]) / K[0, 0], (row - K[1, 2]) / K[1, 1]], axis=-1)
+        try:
+            rays = np.insert(undistort(plane, columns["left_distortion"]), 2, 1.0, axis=-1)
+        except ValueError as error:
+            raise EntryError(Problem("invalid", "K", str(error), "a lens that sees every pixel")) from None
+        poses = np.broadcast_to(columns["left_cam_from_world"], (len(pixels), 4, 4))
+        bars = np.array([place[bar_id] for bar_id in ids[pixels].tolist()], dtype=np.int64)
+        self.parts.append(_Pixels(depth_m[pixels].astype(np.float64), rays, poses, bars))
 
     def pixels(self) -> _Pixels:
         """Return the pixels of all views; there may be none."""
