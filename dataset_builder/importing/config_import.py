@@ -109,7 +109,11 @@ def run_import(
         try:
             check_retained(out, finished, [], [source.name])
             remove_leftovers(out, finished.folder)
-            ids, findings = _stage_views(source, staging, progress)
+            try:
+                ids, findings = _stage_views(source, staging, progress)
+            except InputError:
+                remove_folder(staging.root)  # With another layout or other files, the views are staged elsewhere.
+                raise
             bars = {bar.bar_id: bar for bar in source.bars}
             bars |= {bar_id: Bar.without_axis(bar_id, _ROLE) for bar_id in sorted(ids - bars.keys())}
             views = {view_id(source.name, index): index for index in range(len(source.views.names))}

@@ -48,9 +48,10 @@ LABEL_SUFFIXES = (".png", ".tif", ".tiff", ".npy")
 MATRIX_SUFFIXES = (".txt", ".npy", ".json")
 
 _MIN_DEPTH_M, _MAX_DEPTH_M = 1e-4, 1000.0
-_OR_MAX_M = ", or depth.max_m to drop what lies beyond it"
 _ORIENTATION = 274
 _BIG_TIFF = 43
+_TIFF_INTEGERS = ("L", "I;16", "I;16B", "I")
+"""Pillow's modes of integers in TIFF files."""
 _PFM_SCALES = (1.0, 0.003922)
 """Scales in headers of PFM files by which no program multiplies: none, and that of all files of Middlebury."""
 
@@ -98,7 +99,7 @@ def read_depth(path: Path, grid: Grid, table: DepthTable, tally: DepthTally) -> 
         units = values.astype(np.float64)
         marks = np.array(table.invalid, dtype=values.dtype if values.dtype.kind == "f" else np.float64)
     for value, mark in zip(table.invalid, marks.astype(np.float64).tolist(), strict=True):
-        if np.isclose(units, mark, rtol=0, atol=0, equal_nan=True).any():
+        if (units == mark).any() or (np.isnan(mark) and np.isnan(units).any()):
             tally.invalid.add(value)
     units[~np.isfinite(units) | (units <= 0) | np.isin(units, marks)] = np.nan
     return units
@@ -155,7 +156,7 @@ def limited_depth_m(
     path: Path,
     units: Float64[ndarray, "h w"],
     depth_m: Float64[ndarray, "h w"],
-    max_m: float | None,
+    table: DepthTable,
     tally: DepthTally,
 ) -> Float32[ndarray, "h w"]:
     """Return planar depth as it is stored, 0 without depth; pixels beyond ``max_m`` are left out and counted.
@@ -163,8 +164,8 @@ def limited_depth_m(
     Raises ``EntryError`` for depth that no camera measures, below ``_MIN_DEPTH_M`` or, without ``max_m``, beyond
     ``_MAX_DEPTH_M``: the most frequent value of these pixels is named.
     """
-    beyond = depth_m > (_MAX_DEPTH_M if max_m is None else max_m)
-    if max_m is not None:
+    beyond = depth_m > (_MAX_DEPTH_M if table.max_m is None else table.max_m)
+    if table.max_m is not None:
         tally.beyond_px += int(np.count_nonzero(beyond))
         depth_m, beyond = np.where(beyond, np.nan, depth_m), np.zeros_like(beyond)
     for outside, what in ((beyond, f"beyond {_MAX_DEPTH_M:g} m"), (depth_m < _MIN_DEPTH_M, "below 0.1 mm")):
@@ -175,10 +176,10 @@ def limited_depth_m(
             with np.errstate(over="ignore"):
                 named = f"{value:.9g}" if float(np.float32(value)) == value else repr(value)
             found = f"{outside.sum()} pixels have depth {what}, most often the value {named}"
-            remedy = f'depth.unit (for example "mm"), or depth.invalid with the values without depth, as [{named}]'
-            raise EntryError(
-                Problem("invalid", path.name, found, remedy + (_OR_MAX_M if outside is beyond else ""))
-            )
+            unit = "depth.scale" if table.kind == "disparity" else 'depth.unit (for example "mm")'
+            remedy = f"{unit}, or depth.invalid with the values without depth, as [{named}]"
+            remedy += ", or depth.max_m to drop what lies beyond it" if outside is beyond else ""
+            raise EntryError(Problem("invalid", path.name, found, remedy))
     return np.where(depth_m > 0, depth_m, 0).astype(np.float32)
 
 
@@ -237,6 +238,7 @@ def _pixels(path: Path, content: bytes, depth: DepthTable | None = None) -> Shap
                 turned = image.getexif().get(_ORIENTATION, 1)
                 tags, scale = dict(getattr(image, "tag_v2", {})), image.info.get("scale", 1.0)
                 values, mode = np.asarray(image), image.mode
+                stored = _tiff_type(tags) if tags and mode in _TIFF_INTEGERS else values.dtype.newbyteorder("=")
         except UnidentifiedImageError:
             if image_format != "TIFF":
                 raise
@@ -253,7 +255,6 @@ def _pixels(path: Path, content: bytes, depth: DepthTable | None = None) -> Shap
         )
         raise EntryError(Problem("invalid", path.name, f"states the scale {scale:g} in its header", expected))
     values = values.astype(values.dtype.newbyteorder("="))
-    stored = _tiff_type(tags) if tags and values.dtype.kind in "ui" and mode != "P" else values.dtype
     # Pillow has signed integers of 32 bits for unsigned ones and for those of 16 bits, and bytes for signed ones.
     return values.view(stored) if stored.itemsize == values.itemsize else values.astype(stored)
 
@@ -261,9 +262,11 @@ def _pixels(path: Path, content: bytes, depth: DepthTable | None = None) -> Shap
 def _tiff_type(tags: Mapping[int, Any]) -> np.dtype[Any]:
     """Return the type of the values of a TIFF image by its tags BitsPerSample (258) and SampleFormat (339)."""
     bits, sample_format = tags.get(258, (1,))[0], tags.get(339, (1,))[0]
-    if bits < 8:  # Pillow stretches them to the range of a byte.
-        raise ValueError(f"its values have {bits} bits, expected 8 or more")
-    kind = {2: "i", 3: "f"}.get(sample_format, "u")
+    if bits < 8 or (bits == 8 and tags.get(262) == 0):  # Pillow stretches or inverts them.
+        raise ValueError(f"it has grey shades of {bits} bits, expected numbers")
+    kind = {1: "u", 2: "i", 3: "f"}.get(sample_format)
+    if kind is None:
+        raise ValueError(f"its values have the SampleFormat {sample_format}, expected 1, 2 or 3")
     return np.dtype(f"{kind}{2 ** (bits - 1).bit_length() // 8}")  # 12 bits are read as 16.
 
 

@@ -110,7 +110,7 @@ class SourceViews:
                 K, distortion = cameras[f"{eye}_K"], cameras[f"{eye}_distortion"]
                 calibration = self.cameras.calibration
                 depth_m = planar_depth_m(units, table.factor, table.kind, calibration, K, distortion)
-                columns[column] = limited_depth_m(path, units, depth_m, table.max_m, tally)
+                columns[column] = limited_depth_m(path, units, depth_m, table, tally)
             else:
                 values = read_labels(path, self.grid)
                 columns[column] = self._mask(values) if kind == "mask" else bar_ids(path, values)

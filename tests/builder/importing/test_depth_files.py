@@ -114,6 +114,9 @@ REFUSED: dict[str, tuple[str, bytes, str]] = {
     "TIFF turned": ("a.tif", saved(Image.fromarray(VALUES.astype(np.float32)), "TIFF", tiffinfo={274: 3}), "EXIF"),
     "TIFF of compressed float64": ("a.tif", tiff(VALUES.astype("f8"), tags={259: 5}), "uncompressed; or float32"),
     "TIFF of three channels": ("a.tif", tiff(VALUES.astype("f8"), tags={277: 3}), "3 channels"),
+    "TIFF of four bits": ("a.tif", tiff(VALUES.astype("u1"), tags={258: 4}), "grey shades of 4 bits"),
+    "TIFF with white as zero": ("a.tif", tiff(VALUES.astype("u1"), tags={262: 0}), "grey shades of 8 bits"),
+    "TIFF of complex numbers": ("a.tif", tiff(VALUES.astype("f8"), tags={339: 6}), "SampleFormat 6"),
     "TIFF of other sizes": ("a.tif", tiff(VALUES.astype("f8"), tags={257: 4}), "cannot be read"),
     "npy of truth values": ("a.npy", data.npy(VALUES > 400), "expected integers, float16"),
     "npy of complex numbers": ("a.npy", data.npy(VALUES.astype(complex)), "expected integers, float16"),
@@ -216,14 +219,14 @@ def test_depth_beyond_a_kilometre_is_refused_with_its_value(
     name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     table, depth, value = FAR[name]
-    path = layout(tmp_path, table, {"a": data.npy(depth)})
+    path = layout(tmp_path, table, {"0": data.npy(np.full_like(depth, 2)), "a": data.npy(depth)})
     assert main(["import", str(path), "--out", str(tmp_path / "out"), "--config", "mock-up"]) == 2
     message = capsys.readouterr().err
     assert f"a.npy: {19200 if name == 'millimetres' else 6400} pixels have depth beyond 1000 m" in message
     assert f"the value {value}, expected" in message
     assert "depth.invalid" in message
     assert "depth.max_m" in message
-    assert not (tmp_path / "out" / "manifest.json").exists()
+    assert not list((tmp_path / "out").rglob("*"))
 
 
 def test_huge_disparity_is_refused_as_depth_that_no_camera_measures(tmp_path: Path) -> None:

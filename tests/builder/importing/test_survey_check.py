@@ -115,7 +115,7 @@ def test_mistake_is_named_and_nothing_is_published(
     layout = write(source, rows, tmp_path / "data", tables, depth, pose)
     assert run(layout) == 2
     assert f"expected {line} in the layout\n" in capsys.readouterr().err
-    assert not (layout.parent / "out" / "manifest.json").exists()
+    assert not list((layout.parent / "out").rglob("*"))
 
 
 def outliers(share: float, depth_m: float) -> Change:
