@@ -167,7 +167,11 @@ def _import(options: argparse.Namespace) -> None:
         print(f"surveyed bars: {len(source.bars)}")
     if not options.dry_run:
         with ProgressBars() as bars:
-            run_import(source, options.out, bars.update, overwrite=options.overwrite)
+            findings = run_import(source, options.out, bars.update, overwrite=options.overwrite)
+        for note in findings.notes:
+            print_notice(note)
+        for line in findings.summary:
+            print(line)
         print(options.out)
 
 

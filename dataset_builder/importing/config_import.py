@@ -11,8 +11,10 @@ import numpy as np
 
 from dataset_builder.catalog.scene_file import RESERVED_NAMES, scene_name_of
 from dataset_builder.importing.import_layout import Layout, read_layout
-from dataset_builder.importing.source_files import read_bars_file
+from dataset_builder.importing.source_files import DepthTally
 from dataset_builder.importing.source_views import SourceViews, open_views
+from dataset_builder.importing.survey_check import SurveyCheck
+from dataset_builder.importing.surveyed_bars import read_bars_file
 from dataset_builder.pipeline.folder import build_lock, check_target, remove_build_folder
 from dataset_builder.pipeline.plan import BUILD_FOLDER, KEY_CHARACTERS, generator_versions
 from dataset_builder.pipeline.publish import StagedScene, publish, remove_leftovers
@@ -68,10 +70,21 @@ def plan_import(path: Path, name: str) -> Import:
     return Import(name, views, bars)
 
 
-def run_import(source: Import, out: Path, progress: Progress = silent, *, overwrite: Collection[str] = ()) -> None:
+@dataclass(frozen=True)
+class ImportFindings:
+    """What an import found out: lines of its summary, and notes on the layout."""
+
+    summary: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+
+
+def run_import(
+    source: Import, out: Path, progress: Progress = silent, *, overwrite: Collection[str] = ()
+) -> ImportFindings:
     """Write the config into the dataset folder ``out``, or continue an interrupted import.
 
-    Raises ``InputError`` for images that cannot be read, for a folder that is none of a dataset, and for a config
+    There are no findings if the config was there. Raises ``InputError`` for images that cannot be read, for a
+    mistake of the layout that the surveyed bars reveal, for a folder that is none of a dataset, and for a config
     of this name that was rendered or, unless it is among ``overwrite``, imported from other data; nothing is
     published then.
     """
@@ -86,7 +99,7 @@ def run_import(source: Import, out: Path, progress: Progress = silent, *, overwr
                 f"{out}: config {source.name} was rendered, expected another --config for imported data"
             )
         if published.key == key and all(map(finished.matches, published.files)):
-            return
+            return ImportFindings()
         if published.key != key and source.name not in overwrite:
             raise InputError(
                 f"{out}: config {source.name} has {len(published.views)} finished views, which were imported from "
@@ -96,7 +109,11 @@ def run_import(source: Import, out: Path, progress: Progress = silent, *, overwr
         try:
             check_retained(out, finished, [], [source.name])
             remove_leftovers(out, finished.folder)
-            ids = _stage_views(source, staging, progress)
+            try:
+                ids, findings = _stage_views(source, staging, progress)
+            except InputError:
+                remove_folder(staging.root)  # With another layout or other files, the views are staged elsewhere.
+                raise
             bars = {bar.bar_id: bar for bar in source.bars}
             bars |= {bar_id: Bar.without_axis(bar_id, _ROLE) for bar_id in sorted(ids - bars.keys())}
             views = {view_id(source.name, index): index for index in range(len(source.views.names))}
@@ -106,6 +123,7 @@ def run_import(source: Import, out: Path, progress: Progress = silent, *, overwr
             remove_folder(staging.root)
         finally:
             remove_build_folder(out / BUILD_FOLDER)
+    return findings
 
 
 def _key_inputs(source: Import, progress: Progress) -> list[Any]:
@@ -130,14 +148,17 @@ def _key_inputs(source: Import, progress: Progress) -> list[Any]:
     ]
 
 
-def _stage_views(source: Import, staging: Staging, progress: Progress) -> set[int]:
-    """Stage the rows of all views; return the bar ids in the left images.
+def _stage_views(source: Import, staging: Staging, progress: Progress) -> tuple[set[int], ImportFindings]:
+    """Stage the rows of all views; return the bar ids in the left images, and what was found out.
 
-    All views are decoded, as those of an interrupted import are compared as well.
+    All views are decoded, as those of an interrupted import are compared as well. Raises ``InputError`` for files
+    that cannot be read, and for a mistake of the layout that the surveyed bars reveal.
     """
     ids: set[int] = set()
+    tally, survey = DepthTally(), SurveyCheck(source.layout, source.bars, len(source.views.names))
     for index, name in enumerate(source.views.names):
-        columns = source.views.decode(name)
+        columns = source.views.decode(name, tally)
+        survey.add(columns)
         if "left_bars" in columns:
             ids |= set(np.unique(columns["left_bars"]).tolist()) - {0}
         path = staging.row(index)
@@ -147,7 +168,17 @@ def _stage_views(source: Import, staging: Staging, progress: Progress) -> set[in
             row, record = encode_row({**dict.fromkeys(OPTIONAL_COLUMNS), **identity, **columns})
             stage_row(path, row, record)
         progress(f"import of {source.name}", index + 1, len(source.views.names))
-    return ids
+    if mistake := survey.mistake():
+        raise InputError.from_problems(source.views.root, [mistake])
+    depth, summary = source.layout.depth, survey.lines()
+    if depth.max_m is not None:
+        summary.append(f"depth beyond depth.max_m = {depth.max_m:g} m: {tally.beyond_px} pixels left out")
+    unmatched = [value for value in depth.invalid if value not in tally.invalid]
+    notes = [
+        f"depth.invalid: no pixel of any view has the value {value:.15g}, in units of the files"
+        for value in unmatched
+    ]
+    return ids, ImportFindings(tuple(summary), tuple(notes))
 
 
 def _config_entry(source: Import) -> dict[str, Any]:

@@ -16,6 +16,7 @@ All files are named relative to its folder; ``{view}`` in a name stands for the 
     unit = "mm"                       # or scale = 0.001, metres of one unit; default: "m"
     kind = "z"                        # "z", "range" along the ray, or "disparity" in pixels
     invalid = [65535]                 # values without depth, beside those that are not finite or not above 0
+    max_m = 20                        # largest depth that is kept, metres; without it, 1000 m is an error
     channel = "R"                     # of EXR files with several channels
 
     [cameras]                         # the keys of cameras.toml, see ``captures.camera_files``
@@ -64,6 +65,7 @@ from rebar_depth_bench.base.validation import (
 
 VIEW = "{view}"
 _MAX_SIDE_PX = 16384
+_MAX_DEPTH_M = 10_000.0
 
 
 def _is_pattern(name: str) -> bool:
@@ -102,6 +104,8 @@ class FilesTable(StrictModel):
     def _check_eyes(self) -> FilesTable:
         if self.right_depth is None and (self.right_mask or self.right_bars):
             raise field_error("right_depth is missing", "right_depth beside right_mask and right_bars", "conflict")
+        if self.right_rgb is not None and self.left_rgb is None:
+            raise field_error("left_rgb is missing", "left_rgb beside right_rgb", "conflict")
         return self
 
 
@@ -112,6 +116,7 @@ class DepthTable(StrictModel):
     scale: Annotated[float, number(1e-9, 1e6)] | None = None
     kind: Annotated[str, one_of("z", "range", "disparity")] = "z"
     invalid: _Values = ()
+    max_m: Annotated[float, number(0, _MAX_DEPTH_M)] | None = None
     channel: Annotated[str, text(100)] | None = None
 
     @model_validator(mode="after")

@@ -1,12 +1,15 @@
-"""Readers of files of other programs: depth maps, labels, matrices and surveyed bars."""
+"""Readers of files of other programs: depth maps, labels and matrices."""
 
 from __future__ import annotations
 
 import io
+import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float32, Float64, Shaped, UInt16
@@ -18,15 +21,13 @@ from rebar_depth_bench.base.errors import (
     InputError,
     Problem,
     escape_text,
-    exception_summary,
     format_shape,
 )
-from rebar_depth_bench.base.limits import CELL_BYTES, TABLE_BYTES, TOML_BYTES
-from rebar_depth_bench.base.reading import parse_json, read_file
+from rebar_depth_bench.base.limits import CELL_BYTES, TOML_BYTES
+from rebar_depth_bench.base.reading import decode_text, parse_json, read_file
 from rebar_depth_bench.base.validation import UNITS_M, short_repr
 from rebar_depth_bench.captures.calibration import Calibration, StereoCalibration
 from rebar_depth_bench.captures.images import check_upright
-from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.geometry.cameras import (
     inverse_rigid,
     is_rigid,
@@ -35,6 +36,7 @@ from rebar_depth_bench.geometry.cameras import (
     swap_camera_axes,
 )
 from rebar_depth_bench.submission.entries import FORMATS
+from rebar_depth_bench.submission.maps import NUMBERS, decode_exr, decode_npy, decode_npz, decode_png
 
 Grid = tuple[int, int]
 """Height and width of an image, pixels."""
@@ -46,11 +48,16 @@ DEPTH_SUFFIXES = (*FORMATS, *(suffix for suffix in _IMAGE_FORMATS if suffix not 
 LABEL_SUFFIXES = (".png", ".tif", ".tiff", ".npy")
 MATRIX_SUFFIXES = (".txt", ".npy", ".json")
 
+_MIN_DEPTH_M, _MAX_DEPTH_M = 1e-4, 1000.0
+_BIG_TIFF = 43
+_TIFF_INTEGERS = ("L", "I;16", "I;16B", "I")
+"""Pillow's modes of integers in TIFF files."""
+_PFM_SCALES = (1.0, 0.003922)
+"""Scales in headers of PFM files by which no program multiplies: none, and that of all files of Middlebury."""
+
 _MAX_BAR_ID = np.iinfo(np.uint16).max
 _ROUNDED_ROTATION = 1e-3
 """Largest deviation of ``R @ R.T`` from the identity in files with few digits; the rotation is made exact."""
-_BAR_NUMBERS = ("diameter_m", "x_m", "y_m", "z_m")
-_DEFAULT_ROLE = "surveyed"
 
 
 @contextmanager
@@ -65,41 +72,72 @@ def _damage(path: Path, expected: str) -> Iterator[None]:
         raise EntryError(Problem("damaged", path.name, f"cannot be read: {reason}", expected)) from None
 
 
-def read_depth(path: Path, grid: Grid, table: DepthTable, factor: float) -> Float64[ndarray, "h w"]:
-    """Return the values of a depth map of ``grid`` times ``factor``; NaN where there is none.
+@dataclass
+class DepthTally:
+    """What is left out of depth maps: values of ``depth.invalid`` that occur, pixels beyond ``depth.max_m``."""
 
-    Raises ``EntryError`` for a damaged file, and for one of another size.
+    invalid: set[float] = field(default_factory=set)
+    beyond_px: int = 0
+
+
+def read_depth(path: Path, grid: Grid, table: DepthTable, tally: DepthTally) -> Float64[ndarray, "h w"]:
+    """Return the values of a depth map of ``grid`` in units of the file; NaN where there is none.
+
+    Values of ``depth.invalid`` are rounded to the type of the file before they are compared, and those that occur
+    are added to ``tally``. Raises ``EntryError`` for a damaged file, for one of another size, and for the largest
+    value of an integer type, which marks pixels without depth, unless it is among the invalid ones.
     """
+    values = _depth_values(path, grid, table)
+    _check_grid(path, values, grid)
+    if values.dtype.kind in "iu":
+        largest = np.iinfo(values.dtype).max
+        count = int(np.count_nonzero(values == largest))
+        if count and float(largest) not in table.invalid:
+            found = f"{count} pixels have {largest}, the largest value of {values.dtype}, which marks no depth"
+            raise EntryError(Problem("invalid", path.name, found, f"depth.invalid with {largest}"))
+    with np.errstate(invalid="ignore", over="ignore"):  # A damaged file may hold NaN that signal.
+        units = values.astype(np.float64)
+        marks = np.array(table.invalid, dtype=values.dtype if values.dtype.kind == "f" else np.float64)
+    for value, mark in zip(table.invalid, marks.astype(np.float64).tolist(), strict=True):
+        if (units == mark).any() or (np.isnan(mark) and np.isnan(units).any()):
+            tally.invalid.add(value)
+    units[~np.isfinite(units) | (units <= 0) | np.isin(units, marks)] = np.nan
+    return units
+
+
+def _depth_values(path: Path, grid: Grid, table: DepthTable) -> Shaped[ndarray, "h w"]:
+    """Return the values of a depth map in the type of the file."""
     suffix = path.suffix.lower()
     content = read_file(path, CELL_BYTES, "a depth map", InputError)
     check_upright(io.BytesIO(content), path.name)
-    if suffix == ".exr" and table.channel is not None:
-        values = _exr_channel(path, table.channel)
-    elif suffix in FORMATS:
-        values = FORMATS[suffix].decode(path.name, memoryview(content), grid, 1.0)
-    else:
-        values = _pixels(path, content)
-    _check_grid(path, values, grid)
-    with np.errstate(invalid="ignore"):  # A damaged file may hold NaN that signal.
-        units = values.astype(np.float64)
-    units[~np.isfinite(units) | (units <= 0) | np.isin(units, table.invalid)] = np.nan
-    with np.errstate(over="ignore"):
-        return np.asarray(units * factor)
+    if suffix == ".exr":
+        if table.channel is not None:
+            return _exr_channel(path, table.channel)
+        return decode_exr(path.name, memoryview(content), grid)
+    if suffix == ".png":
+        return decode_png(path.name, memoryview(content), grid).astype(np.uint16)
+    if suffix in (".npy", ".npz"):
+        decode = decode_npy if suffix == ".npy" else decode_npz
+        return decode(path.name, memoryview(content), grid, types=NUMBERS)
+    return _pixels(path, content, table)
 
 
 def planar_depth_m(
-    values: Float64[ndarray, "h w"],
+    units: Float64[ndarray, "h w"],
+    factor: float,
     kind: str,
     calibration: Calibration,
     K: Float64[ndarray, "3 3"],
     distortion: Float64[ndarray, " 5"],
-) -> Float32[ndarray, "h w"]:
-    """Return the values of a depth map as planar depth, metres, 0 without depth.
+) -> Float64[ndarray, "h w"]:
+    """Return the values of a depth map times ``factor`` as planar depth, metres, NaN without depth.
 
     Range is divided by the length of the ray (x, y, 1) of its pixel in the camera with ``K`` and ``distortion``.
     Disparity d is that of the left pixel to the right: z = fx B / (d + cx_right - cx_left). Raises ``InputError``
     as ``rectified_pair`` does, and ``EntryError`` for a lens model that cannot be inverted at a pixel.
     """
+    with np.errstate(over="ignore"):
+        values = units * factor
     if kind == "range":
         height, width = values.shape
         try:
@@ -112,9 +150,38 @@ def planar_depth_m(
         with np.errstate(divide="ignore", over="ignore"):
             offset_px = pair.right.cx - pair.left.cx
             values = pair.left.fx * -pair.translation_m[0] / (values + offset_px)
-    with np.errstate(over="ignore"):
-        stored = values.astype(np.float32)
-    return np.where(np.isfinite(stored) & (stored > 0), stored, np.float32(0))
+    return values
+
+
+def limited_depth_m(
+    path: Path,
+    units: Float64[ndarray, "h w"],
+    depth_m: Float64[ndarray, "h w"],
+    table: DepthTable,
+    tally: DepthTally,
+) -> Float32[ndarray, "h w"]:
+    """Return planar depth as it is stored, 0 without depth; pixels beyond ``max_m`` are left out and counted.
+
+    Raises ``EntryError`` for depth that no camera measures, below ``_MIN_DEPTH_M`` or, without ``max_m``, beyond
+    ``_MAX_DEPTH_M``: the most frequent value of these pixels is named.
+    """
+    beyond = depth_m > (_MAX_DEPTH_M if table.max_m is None else table.max_m)
+    if table.max_m is not None:
+        tally.beyond_px += int(np.count_nonzero(beyond))
+        depth_m, beyond = np.where(beyond, np.nan, depth_m), np.zeros_like(beyond)
+    for outside, what in ((beyond, f"beyond {_MAX_DEPTH_M:g} m"), (depth_m < _MIN_DEPTH_M, "below 0.1 mm")):
+        outside &= depth_m > 0
+        if outside.any():
+            values, counts = np.unique(units[outside], return_counts=True)
+            value = float(values[counts.argmax()])
+            with np.errstate(over="ignore"):
+                named = f"{value:.9g}" if float(np.float32(value)) == value else repr(value)
+            found = f"{outside.sum()} pixels have depth {what}, most often the value {named}"
+            unit = "depth.scale" if table.kind == "disparity" else 'depth.unit (for example "mm")'
+            remedy = f"{unit}, or depth.invalid with the values without depth, as [{named}]"
+            remedy += ", or depth.max_m to drop what lies beyond it" if outside is beyond else ""
+            raise EntryError(Problem("invalid", path.name, found, remedy))
+    return np.where(depth_m > 0, depth_m, 0).astype(np.float32)
 
 
 def rectified_pair(calibration: Calibration) -> StereoCalibration:
@@ -158,19 +225,67 @@ def _npy(path: Path, content: bytes) -> ndarray:
         return np.asarray(np.load(io.BytesIO(content), allow_pickle=False))
 
 
-def _pixels(path: Path, content: bytes) -> Shaped[ndarray, "h w"]:
-    """Return the values of a TIFF, PNG or PFM image with one channel. Raises ``EntryError`` for other images."""
-    from PIL import Image
+def _pixels(path: Path, content: bytes, depth: DepthTable | None = None) -> Shaped[ndarray, "h w"]:
+    """Return the values of a TIFF, PNG or PFM image with one channel, in the type of the file.
+
+    Raises ``EntryError`` for other images. As ``depth``, pictures of a palette or of single bits are refused too.
+    """
+    from PIL import Image, UnidentifiedImageError
 
     image_format = _IMAGE_FORMATS[path.suffix.lower()]
     with _damage(path, image_format), warnings.catch_warnings():
         warnings.simplefilter("error")  # Pillow warns of huge images before it decodes them.
-        with Image.open(io.BytesIO(content), formats=[image_format]) as image:
-            values = np.asarray(image)
-    if values.ndim != 2 or values.dtype.kind not in "buif":
-        found = f"has values of type {values.dtype} and shape {values.shape}"
-        raise EntryError(Problem("invalid", path.name, found, "one channel"))
-    return values
+        try:
+            with Image.open(io.BytesIO(content), formats=[image_format]) as image:
+                tags, scale = dict(getattr(image, "tag_v2", {})), image.info.get("scale", 1.0)
+                values, mode = np.asarray(image), image.mode
+                stored = _tiff_type(tags) if tags and mode in _TIFF_INTEGERS else values.dtype.newbyteorder("=")
+        except UnidentifiedImageError:
+            if image_format != "TIFF":
+                raise
+            return _raw_tiff(path, content)
+    if values.ndim != 2 or values.dtype.kind not in "buif" or (depth is not None and mode in ("1", "P")):
+        found = f"has values of type {values.dtype} and shape {values.shape}, Pillow's mode {mode}"
+        raise EntryError(Problem("invalid", path.name, found, "one channel of numbers"))
+    if depth is not None and scale not in _PFM_SCALES and depth.unit is None and depth.scale is None:
+        expected = (
+            f"depth.scale, since programs differ: 1 for the values as they are, or {scale:g} to multiply them"
+        )
+        raise EntryError(Problem("invalid", path.name, f"states the scale {scale:g} in its header", expected))
+    values = values.astype(values.dtype.newbyteorder("="))
+    # Pillow has signed integers of 32 bits for unsigned ones and for those of 16 bits, and bytes for signed ones.
+    return values.view(stored) if stored.itemsize == values.itemsize else values.astype(stored)
+
+
+def _tiff_type(tags: Mapping[int, Any]) -> np.dtype[Any]:
+    """Return the type of the values of a TIFF image by its tags BitsPerSample (258) and SampleFormat (339)."""
+    bits, sample_format = tags.get(258, (1,))[0], tags.get(339, (1,))[0]
+    if bits < 8 or (bits == 8 and tags.get(262) == 0):  # Pillow stretches or inverts them.
+        raise ValueError(f"it has grey shades of {bits} bits, expected numbers")
+    kind = {1: "u", 2: "i", 3: "f"}.get(sample_format)
+    if kind is None:
+        raise ValueError(f"its values have the SampleFormat {sample_format}, expected 1, 2 or 3")
+    return np.dtype(f"{kind}{2 ** (bits - 1).bit_length() // 8}")  # 12 bits are read as 16.
+
+
+def _raw_tiff(path: Path, content: bytes) -> Shaped[ndarray, "h w"]:
+    """Return the values of a TIFF image of a type that Pillow does not know, such as float16 and float64."""
+    from PIL.TiffImagePlugin import ImageFileDirectory_v2
+
+    stream = io.BytesIO(content)
+    tags = ImageFileDirectory_v2(content[: 16 if content[2] == _BIG_TIFF else 8])
+    stream.seek(tags.next)
+    tags.load(stream)
+    stored, shape = _tiff_type(tags), (tags[257], tags[256])
+    starts, sizes = tags.get(273, ()), tags.get(279, ())
+    if tags.get(277, 1) != 1 or tags.get(259, 1) != 1 or not starts:
+        found = f"is a TIFF file of {stored} with {tags.get(277, 1)} channels, compressed or in tiles"
+        raise EntryError(Problem("invalid", path.name, found, "one channel, uncompressed; or float32, or .npy"))
+    if sum(sizes) != shape[0] * shape[1] * stored.itemsize or sum(sizes) > len(content):
+        raise ValueError(f"{sum(sizes)} bytes of values for {format_shape(shape)} {stored}")
+    data = b"".join(content[start : start + size] for start, size in zip(starts, sizes, strict=True))
+    in_file = stored.newbyteorder("<" if content[:2] == b"II" else ">")
+    return np.frombuffer(data, in_file).reshape(shape).astype(stored)
 
 
 def _exr_channel(path: Path, channel: str) -> Shaped[ndarray, "h w"]:
@@ -191,13 +306,13 @@ def _read_matrix(path: Path, key: str | None, shape: tuple[int, int]) -> Float64
     ``key`` is that of a JSON object. Raises ``EntryError`` for anything but finite numbers.
     """
     content, suffix = read_file(path, TOML_BYTES, "a matrix", InputError), path.suffix.lower()
-    with _damage(path, "numbers"):
+    with _damage(path, "numbers with decimal points"):
         if suffix == ".npy":
             numbers: object = _npy(path, content)
         elif suffix == ".json":
             numbers = _json_value(content, key)
         else:
-            numbers = np.loadtxt(io.StringIO(content.decode().replace(",", " ")), ndmin=2)
+            numbers = _text_numbers(path, content)
         values = np.asarray(numbers, dtype=np.float64)
     if values.size == 12 and shape == (4, 4):
         shape = 3, 4
@@ -205,6 +320,20 @@ def _read_matrix(path: Path, key: str | None, shape: tuple[int, int]) -> Float64
         found = f"holds {values.size} numbers"
         raise EntryError(Problem("invalid", path.name, found, f"{shape[0]} x {shape[1]} finite numbers"))
     return values.reshape(shape)
+
+
+def _text_numbers(path: Path, content: bytes) -> list[float]:
+    """Return numbers that blanks, commas, semicolons or brackets separate; the rest of a line after # is left out.
+
+    Commas between digits are refused where other characters separate numbers: they may be decimal commas.
+    """
+    text, problems = decode_text(content, path.name)
+    if problems:
+        raise EntryError(problems[0])
+    text = re.sub("#.*", "", text)
+    if re.search(r"\d,\d", text) and re.search(r"\d[ \t;]+[-+.\d]", text):
+        raise ValueError("it has decimal commas, or several separators")
+    return [float(word) for word in re.split(r"[\s,;\[\]()]+", text) if word]
 
 
 def _json_value(content: bytes, key: str | None) -> object:
@@ -254,55 +383,3 @@ def checked_pose(
     if kind == "world_from_cam":
         pose = inverse_rigid(pose)
     return swap_camera_axes(pose) if axes == "opengl" else pose
-
-
-def read_bars_file(path: Path) -> tuple[Bar, ...]:
-    """Return the bars of a CSV file with the columns bar_id, diameter_m, x_m, y_m, z_m and, if wanted, role.
-
-    Each line is a point of an axis, in order. Raises ``InputError`` with all problems, which name the line.
-    """
-    import pandas as pd
-
-    content = read_file(path, TABLE_BYTES, "a CSV file of bars", InputError)
-    try:
-        table = pd.read_csv(io.BytesIO(content), dtype=str, keep_default_na=False, skipinitialspace=True)
-    except ValueError as error:  # Errors of pandas' parser and of decoding are ValueErrors.
-        problem = Problem("syntax", "", f"no CSV file: {escape_text(exception_summary(error))}")
-        raise InputError.from_problems(path, [problem]) from None
-    problems = [
-        Problem("missing", name, "missing", "a column") for name in ("bar_id", *_BAR_NUMBERS) if name not in table
-    ]
-    if problems:
-        raise InputError.from_problems(path, problems)
-    numbers = table[["bar_id", *_BAR_NUMBERS]].apply(pd.to_numeric, errors="coerce").to_numpy(np.float64)
-    ids, sizes = numbers[:, 0], numbers[:, 1:]
-    sound_id = np.isfinite(ids) & (ids == np.round(ids)) & (ids >= 1) & (ids <= _MAX_BAR_ID)
-    sound = sound_id & np.isfinite(sizes).all(axis=1) & (sizes[:, 0] > 0) & (np.abs(sizes) < 1e6).all(axis=1)
-    for row in np.flatnonzero(~sound):
-        expected = f"a bar_id from 1 to {_MAX_BAR_ID}, a diameter above 0 and finite coordinates"
-        found = f"line {row + 2}: got {escape_text(','.join(table.iloc[row]))}"
-        problems.append(Problem("invalid", "", found, expected))
-    roles = table.get("role")
-    bars = []
-    for bar_id in [] if problems else np.unique(ids).astype(int).tolist():
-        rows = np.flatnonzero(ids == bar_id)
-        role = _DEFAULT_ROLE if roles is None else roles.iloc[rows[0]]
-        bars.append(_bar(bar_id, role, sizes[rows], problems))
-    if not problems and not bars:
-        problems.append(Problem("missing", "", "has no bars", "one or more"))
-    if problems:
-        raise InputError.from_problems(path, problems)
-    return tuple(bars)
-
-
-def _bar(bar_id: int, role: str, sizes: Float64[ndarray, "n 4"], problems: list[Problem]) -> Bar:
-    """Return a bar of the diameter and the points in ``sizes``; problems are added to ``problems``."""
-    diameters_m, axis_m = sizes[:, 0], sizes[:, 1:]
-    if len(set(diameters_m.tolist())) > 1:
-        problems.append(Problem("conflict", f"bar {bar_id}", "has several diameters", "one"))
-    if len(axis_m) < 2 or not np.diff(axis_m, axis=0).any(axis=1).all():
-        problems.append(
-            Problem("invalid", f"bar {bar_id}", f"has {len(axis_m)} points", "two or more, no two the same")
-        )
-    points = tuple((float(x), float(y), float(z)) for x, y, z in axis_m)
-    return Bar(bar_id, role, float(diameters_m[0]), points)

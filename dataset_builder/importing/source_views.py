@@ -17,9 +17,11 @@ from dataset_builder.importing.source_files import (
     DEPTH_SUFFIXES,
     LABEL_SUFFIXES,
     MATRIX_SUFFIXES,
+    DepthTally,
     bar_ids,
     cam_from_world,
     intrinsics,
+    limited_depth_m,
     planar_depth_m,
     read_depth,
     read_labels,
@@ -28,7 +30,7 @@ from dataset_builder.importing.source_files import (
 from dataset_builder.importing.view_cameras import ViewCamera, read_view_cameras
 from rebar_depth_bench.base.errors import EntryError, InputError, Problem, escape_text
 from rebar_depth_bench.base.names import NAME_LETTERS, NAME_PATTERN
-from rebar_depth_bench.captures.calibration import camera_columns
+from rebar_depth_bench.captures.calibration import Lens, MonoCalibration, camera_columns, scaled_calibration
 from rebar_depth_bench.captures.camera_files import cameras_of_table
 from rebar_depth_bench.captures.images import IMAGE_SUFFIXES, common_shape, read_image
 from rebar_depth_bench.data.schema import EYES, column_kind
@@ -74,14 +76,15 @@ class SourceViews:
         """Return the file of a view."""
         return self.root / pattern.replace(VIEW, name)
 
-    def decode(self, name: str) -> dict[str, Any]:
+    def decode(self, name: str, tally: DepthTally | None = None) -> dict[str, Any]:
         """Return the arrays of a view by column; columns that the layout does not have are left out.
 
-        Raises ``InputError`` with the problems of the view's files.
+        What is left out of the depth maps is added to ``tally``. Raises ``InputError`` with the problems of the
+        view's files.
         """
         try:
             cameras = self._cameras(name)
-            return {**cameras, **self._images(name, cameras)}
+            return {**cameras, **self._images(name, cameras, DepthTally() if tally is None else tally)}
         except EntryError as error:
             raise InputError.from_problems(f"{self.root}: view {name}", error.problems) from None
 
@@ -92,12 +95,16 @@ class SourceViews:
             pose = cam_from_world(self.file(layout.poses.file, name), layout.poses)
         columns = camera_columns(camera.calibration, pose)
         if layout.intrinsics is not None:
-            columns["left_K"] = intrinsics(self.file(layout.intrinsics.file, name), layout.intrinsics)
+            path = self.file(layout.intrinsics.file, name)
+            K = columns["left_K"] = intrinsics(path, layout.intrinsics)
+            lens = Lens(K[0, 0], K[1, 1], K[0, 2], K[1, 2], camera.calibration.left.distortion)
+            height, width = self.grid
+            scaled_calibration(MonoCalibration(width, height, lens), path, width, height)
         if layout.files.has_right:
             return columns
         return {column: cell for column, cell in columns.items() if column.startswith("left_")}
 
-    def _images(self, name: str, cameras: Mapping[str, Any]) -> dict[str, Any]:
+    def _images(self, name: str, cameras: Mapping[str, Any], tally: DepthTally) -> dict[str, Any]:
         table = self.layout.depth
         columns: dict[str, Any] = {}
         for column, pattern in self.layout.files.patterns.items():
@@ -106,9 +113,11 @@ class SourceViews:
                 columns[column] = read_image(path, self.grid)
             elif kind == "depth":
                 calibration, _, unit_m = self.cameras[name]
-                values = read_depth(path, self.grid, table, table.factor if unit_m is None else unit_m)
+                factor = table.factor if unit_m is None else unit_m
+                units = read_depth(path, self.grid, table, tally)
                 K, distortion = cameras[f"{eye}_K"], cameras[f"{eye}_distortion"]
-                columns[column] = planar_depth_m(values, table.kind, calibration, K, distortion)
+                depth_m = planar_depth_m(units, factor, table.kind, calibration, K, distortion)
+                columns[column] = limited_depth_m(path, units, depth_m, table, tally)
             else:
                 values = read_labels(path, self.grid)
                 columns[column] = self._mask(values) if kind == "mask" else bar_ids(path, values)

@@ -8,6 +8,7 @@ from dataclasses import astuple
 from functools import partial
 from pathlib import Path
 
+import cv2
 import numpy as np
 import trimesh
 from PIL import Image
@@ -105,7 +106,7 @@ _NERFSTUDIO = """{
       "transform_matrix": [[1, 0, 0, 0.5], [0, 0, 1, 0.1], [0, -1, 0, 2.0], [0, 0, 0, 1]]},
     {"file_path": "./images/1.png", "fl_y": 20.5}]}
 """
-_MILLIMETRES = '[depth]\nunit = "mm"\n'
+_MILLIMETRES = '[depth]\nunit = "mm"\ninvalid = [65535, 65.535]\nmax_m = 1.8\n'
 _BARS = """bar_id,role,diameter_m,x_m,y_m,z_m
 1,main,0.016,0.0,0.1,0.2
 1,main,0.016,0.5,0.1,0.2
@@ -113,6 +114,7 @@ _BARS = """bar_id,role,diameter_m,x_m,y_m,z_m
 2,stirrup,0.01,0.0,0.2,0.0
 2,stirrup,0.01,0.1,0.3,0.1
 """
+_SPREADSHEET = "\ufeffsep=;\r\n" + _BARS.upper().replace(",", ";").replace(".", ",").replace("\n", "\r\n")
 
 
 def _rods() -> trimesh.Trimesh:
@@ -195,6 +197,12 @@ def _write_result(path: Path) -> None:
     path.write_bytes(result(*views).to_json())
 
 
+def _tiff_float64(depth_m: np.ndarray) -> bytes:
+    """Return a TIFF file as OpenCV writes float64 values, which Pillow does not read."""
+    content: bytes = cv2.imencode(".tiff", depth_m.astype(np.float64))[1].tobytes()
+    return content
+
+
 def _tiff(depth_m: np.ndarray) -> bytes:
     stream = io.BytesIO()
     Image.fromarray(depth_m).save(stream, "TIFF")
@@ -207,11 +215,13 @@ def _pfm(depth_m: np.ndarray) -> bytes:
     return f"Pf\n{width} {height}\n-1.0\n".encode() + depth_m[::-1].astype("<f4").tobytes()
 
 
-def _write_import(path: Path, depth: bytes = npy(IMPORTED_M), suffix: str = "npy", table: str = "") -> None:
+def _write_import(
+    path: Path, depth: bytes = npy(IMPORTED_M), suffix: str = "npy", table: str = "", bars: str = _BARS
+) -> None:
     """Write a layout with a further ``table``, its bars and one view, whose depth has the content ``depth``."""
     folder = path.parent
     (folder / "layout.toml").write_text(_LAYOUT.replace("{suffix}", suffix) + table)
-    (folder / "bars.csv").write_text(_BARS)
+    (folder / "bars.csv").write_text(bars)
     (folder / f"depth-a.{suffix}").write_bytes(depth)
     Image.new("RGB", (16, 16)).save(folder / "rgb-a.png")
     np.savetxt(folder / "pose-a.txt", np.eye(4))
@@ -362,9 +372,13 @@ FILE_ENTRIES = (
         cpu_s=10.0,
     ),
     _imported("import: bars", "bars.csv", _write_import),
+    _imported("import: bars of a spreadsheet", "bars.csv", partial(_write_import, bars=_SPREADSHEET)),
     _imported_depth("npy", "npy", npy(IMPORTED_M)),
     _imported_depth("npz", "npz", npz(depth=IMPORTED_M)),
+    _imported_depth("npy of integers", "npy", npy(np.round(1000 * IMPORTED_M).astype(np.int32)), _MILLIMETRES),
     _imported_depth("TIFF", "tif", _tiff(IMPORTED_M)),
+    _imported_depth("TIFF of float64", "tif", _tiff_float64(IMPORTED_M)),
+    _imported_depth("TIFF of integers", "tif", _tiff(np.round(1000 * IMPORTED_M).astype(np.uint16)), _MILLIMETRES),
     _imported_depth("PFM", "pfm", _pfm(IMPORTED_M)),
     _imported("import: EXR", "depth-a.exr", lambda path: _write_import(path, exr(path, {"V": IMPORTED_M}), "exr")),
     _imported_depth("PNG", "png", png(np.round(1000 * IMPORTED_M)), _MILLIMETRES),
