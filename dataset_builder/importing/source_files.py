@@ -36,7 +36,7 @@ from rebar_depth_bench.geometry.cameras import (
     swap_camera_axes,
 )
 from rebar_depth_bench.submission.entries import FORMATS
-from rebar_depth_bench.submission.maps import NUMBERS, decode_exr, decode_npy, decode_npz, decode_png
+from rebar_depth_bench.submission.maps import decode_exr, decode_npy, decode_npz, decode_png
 
 Grid = tuple[int, int]
 """Height and width of an image, pixels."""
@@ -118,7 +118,7 @@ def _depth_values(path: Path, grid: Grid, table: DepthTable) -> Shaped[ndarray, 
         return decode_png(path.name, memoryview(content), grid).astype(np.uint16)
     if suffix in (".npy", ".npz"):
         decode = decode_npy if suffix == ".npy" else decode_npz
-        return decode(path.name, memoryview(content), grid, types=NUMBERS)
+        return decode(path.name, memoryview(content), grid, ints=True)
     return _pixels(path, content, table)
 
 

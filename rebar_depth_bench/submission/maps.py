@@ -39,9 +39,8 @@ _LENGTH_BYTES = {1: 2, 2: 4, 3: 4}
 _DESCR = re.compile(r"'descr'\s*:\s*(?:'([^']*)'|\[[^]]*\])")
 _FORTRAN_ORDER = re.compile(r"'fortran_order'\s*:\s*(True|False)")
 _SHAPE = re.compile(r"'shape'\s*:\s*\(([0-9L,\s]*)\)")
-FLOATS = re.compile(r"[<>=|]?f[248]")
-"""Types of the values of depth in an archive, as the header of ``.npy`` states them."""
-NUMBERS = re.compile(r"[<>=|]?(?:f[248]|[iu][1248])")
+_FLOAT_DESCR = re.compile(r"[<>=|]?f[248]")
+_INTEGER_DESCR = re.compile(r"[<>=|]?[iu][1248]")
 
 
 def max_npy_bytes(shape: tuple[int, int]) -> int:
@@ -49,15 +48,13 @@ def max_npy_bytes(shape: tuple[int, int]) -> int:
     return shape[0] * shape[1] * 8 + MAX_HEADER_BYTES
 
 
-def decode_npy(
-    name: str, data: memoryview, shape: tuple[int, int], _: float = 1.0, *, types: re.Pattern[str] = FLOATS
-) -> Depth:
+def decode_npy(name: str, data: memoryview, shape: tuple[int, int], _: float = 1.0, ints: bool = False) -> Depth:
     """Return the depth array in ``data``, in metres: (H, W), float16, float32 or float64 in native byte order.
 
-    The array is a read-only view on ``data``, or a copy if its bytes had to be swapped or aligned. ``types`` may
-    be ``NUMBERS`` in place of ``FLOATS``. Raises ``EntryError`` if the data is damaged or has another shape or type.
+    The array is a read-only view on ``data``, or a copy if its bytes had to be swapped or aligned.
+    Integers are read with ``ints`` only. Raises ``EntryError`` if data are damaged or have another shape or dtype.
     """
-    dtype, fortran_order, offset = _parse_header(name, data, shape, types)
+    dtype, fortran_order, offset = _parse_header(name, data, shape, ints)
     actual_bytes, expected_bytes = len(data) - offset, shape[0] * shape[1] * dtype.itemsize
     if actual_bytes != expected_bytes:
         expected = f"{expected_bytes} for {format_shape(shape)} {dtype.name}"
@@ -68,7 +65,7 @@ def decode_npy(
 
 
 def _parse_header(
-    name: str, data: memoryview, shape: tuple[int, int], types: re.Pattern[str]
+    name: str, data: memoryview, shape: tuple[int, int], ints: bool
 ) -> tuple[np.dtype[np.floating[Any]], bool, int]:
     """Return the type of the values, whether they are in Fortran order, and the offset of the first."""
     head = bytes(data[: MAX_HEADER_BYTES + 1])
@@ -94,9 +91,9 @@ def _parse_header(
     if descr[0].lstrip("<>=|").startswith("O"):
         found = "the array holds pickled Python objects (dtype object)"
         raise EntryError(Problem("invalid", name, found, "float16/32/64"))
-    if not types.fullmatch(descr[0]):
+    if not _FLOAT_DESCR.fullmatch(descr[0]) and not (ints and _INTEGER_DESCR.fullmatch(descr[0])):
         actual = escape_text(descr[0]) if descr[0] else "structured"
-        expected = f"{'integers, ' if types is NUMBERS else ''}float16, float32 or float64"
+        expected = f"{'integers, ' if ints else ''}float16, float32 or float64"
         raise EntryError(Problem("invalid", name, f"the dtype is {actual}", expected))
     actual_shape = shapes[0].replace("L", "").replace(",", " ").split()
     if actual_shape != [str(size) for size in shape]:
@@ -116,9 +113,7 @@ def max_npz_bytes(shape: tuple[int, int]) -> int:
     return values + values // 1024 + _MAX_NPZ_OVERHEAD_BYTES
 
 
-def decode_npz(
-    name: str, data: memoryview, shape: tuple[int, int], _: float = 1.0, *, types: re.Pattern[str] = FLOATS
-) -> Depth:
+def decode_npz(name: str, data: memoryview, shape: tuple[int, int], _: float = 1.0, ints: bool = False) -> Depth:
     """Return the only array of an ``.npz`` file, as ``decode_npy`` does. Raises ``EntryError``."""
     source = MemorySource(data)
     try:
@@ -138,7 +133,7 @@ def decode_npz(
         values = read_data(source, entry)
     except EntryError as error:
         raise _inner_error(name, error.problems) from error
-    return decode_npy(f"{name} ({members[0]})", values, shape, types=types)
+    return decode_npy(f"{name} ({members[0]})", values, shape, ints=ints)
 
 
 def _inner_error(name: str, problems: Sequence[Problem]) -> EntryError:

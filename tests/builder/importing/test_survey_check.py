@@ -65,6 +65,18 @@ def turned(row: Row) -> np.ndarray:
     return np.asarray(OPENGL @ row["left_cam_from_world"])
 
 
+def outliers(share: float, depth_m: float) -> Change:
+    """Return depth of which a share is that of the background, as where a segmentation is wrong."""
+    random = np.random.default_rng(57)
+
+    def change(row: Row) -> np.ndarray:
+        depth: np.ndarray = row["left_depth"].copy()
+        depth[(random.random(depth.shape) < share) & (depth > 0)] = depth_m
+        return depth
+
+    return change
+
+
 BARS, POSES = data.BARS, data.POSES
 MISTAKES: dict[str, tuple[str, Change | None, Change | None, str]] = {
     "metres as millimetres": (POSES + BARS + "[depth]\nunit = 'mm'\n", None, None, 'depth.unit = "m"'),
@@ -96,6 +108,7 @@ MISTAKES: dict[str, tuple[str, Change | None, Change | None, str]] = {
         data.opengl_world_from_cam,
         'poses.kind = "world_from_cam"',
     ),
+    "outliers": (POSES + BARS, outliers(0.04, 30.0), inverted, 'poses.kind = "world_from_cam"'),
     "poses in millimetres": (POSES + BARS, None, moved(1000), 'poses.unit = "mm"'),
     "depth and poses": (POSES + BARS, times(100), moved(1000), 'depth.unit = "cm" and poses.unit = "mm"'),
     "range and poses": (
@@ -116,18 +129,6 @@ def test_mistake_is_named_and_nothing_is_published(
     assert run(layout) == 2
     assert f"expected {line} in the layout\n" in capsys.readouterr().err
     assert not list((layout.parent / "out").rglob("*"))
-
-
-def outliers(share: float, depth_m: float) -> Change:
-    """Return depth of which a share is that of the background, as where a segmentation is wrong."""
-    random = np.random.default_rng(57)
-
-    def change(row: Row) -> np.ndarray:
-        depth: np.ndarray = row["left_depth"].copy()
-        depth[(random.random(depth.shape) < share) & (depth > 0)] = depth_m
-        return depth
-
-    return change
 
 
 def noisy(row: Row) -> np.ndarray:
