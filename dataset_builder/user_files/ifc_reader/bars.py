@@ -1,9 +1,10 @@
 """Shapes of the reinforcement in an IFC model, as modelled: the project's frame, metres.
 
 Every IfcReinforcingBar, IfcReinforcingMesh and IfcTendon is read, or every object that a selection chooses, in the
-order of the instance numbers. Each sweep of a circle in its Body (an IfcSweptDiskSolid or a straight
-IfcExtrudedAreaSolid), directly or through IfcMappedItem, is one bar, since some programs write a whole row of bars
-as one object. Only other solids are tessellated, each once for all of its uses. All other objects are left out.
+order of the instance numbers. Each sweep of a circle in its Body (an IfcSweptDiskSolid, a straight
+IfcExtrudedAreaSolid or an IfcRevolvedAreaSolid), directly or through IfcMappedItem, is one bar, since some programs
+write a whole row of bars as one object; sweeps that continue each other are one bar. Only other solids are
+tessellated, each once for all of its uses. All other objects are left out.
 
 The project's coordinates are world coordinates; a context's coordinate system and map projections are ignored.
 """
@@ -24,7 +25,7 @@ from numpy import ndarray
 
 from dataset_builder.scene.model import MAX_BARS
 from dataset_builder.specs.file_specs import Selection
-from dataset_builder.user_files.ifc_reader.bodies import body_items, placement_matrix
+from dataset_builder.user_files.ifc_reader.bodies import BodyItem, body_items, placement_matrix
 from dataset_builder.user_files.ifc_reader.ifc_model import Entity, Model, open_model
 from dataset_builder.user_files.ifc_reader.objects import (
     DAMAGE,
@@ -36,7 +37,7 @@ from dataset_builder.user_files.ifc_reader.objects import (
     source_record,
     type_objects,
 )
-from dataset_builder.user_files.ifc_reader.sweeps import Sweep, read_sweep
+from dataset_builder.user_files.ifc_reader.sweeps import Sweep, joined_sweeps, read_sweep
 from dataset_builder.user_files.ifc_records import (
     BarRecord,
     ProjectRecord,
@@ -95,7 +96,7 @@ class _Reader:
         self._model = model
         self.units = project_units(model)
         self._placements: dict[int, Float64[ndarray, "4 4"]] = {}
-        self._sweeps: dict[int, Sweep | None] = {}
+        self._sweeps: dict[tuple[int, float | None], Sweep | None] = {}
         self._meshes: dict[int, tuple[Float64[ndarray, "v 3"], Int32[ndarray, "f 3"]]] = {}
         self._num_shapes = self._num_points = 0
 
@@ -117,45 +118,53 @@ class _Reader:
             bar_role = role(entity, types)
             items = body_items(self._model, entity, types)
             world_from_object = placement_matrix(entity.ObjectPlacement, self._placements)
-            sweeps = [self._sweep(item.item) for item in items]
+            matrices = [world_from_object @ item.object_from_item for item in items]
+            sweeps = [
+                self._sweep(item, matrix, source.length_m) for item, matrix in zip(items, matrices, strict=True)
+            ]
+            bars = joined_sweeps(sweeps, [item.use for item in items], source.length_m)
         except MeshError as error:
             raise MeshError(f"{label}: {error}") from error
         except DAMAGE as error:
             reason = shorten(str(error), 400) or type(error).__name__
             raise MeshError(f"{label} has no readable shape: {reason}") from error
-        unit_m = self.units.length_m
         shapes: list[_Shape] = []
-        for item, sweep in zip(items, sweeps, strict=True):
-            matrix = world_from_object @ item.object_from_item
-            turn, origin = matrix[:3, :3], matrix[:3, 3]
-            if sweep is not None:
-                axis_m = (sweep.axis @ turn.T + origin) * unit_m
+        for number, (item, matrix) in enumerate(zip(items, matrices, strict=True)):
+            if number in bars:
+                sweep = bars[number]
                 bar = BarRecord(
                     source=source,
                     notes=sweep.notes,
                     role=bar_role,
-                    diameter_m=sweep.diameter * item.scale * unit_m,
-                    points=len(axis_m),
+                    diameter_m=sweep.diameter,
+                    points=len(sweep.axis),
                 )
-                shapes.append((bar, (axis_m,)))
-            else:
+                shapes.append((bar, (sweep.axis,)))
+            elif sweeps[number] is None:
                 if item.item.id() not in self._meshes:
                     step = StepRecord(label=label, reason=f"the body is a {item.item.is_a()}")
                     yield step, ()
                     self._meshes[item.item.id()] = _tessellated(item.item, step)
                 mesh_vertices_m, faces = self._meshes[item.item.id()]
+                turn, origin = matrix[:3, :3], matrix[:3, 3]
                 if np.linalg.det(turn) < 0:  # A reflection turns the triangles inside out.
                     faces = faces[:, ::-1]
-                vertices_m = mesh_vertices_m @ turn.T + origin * unit_m
+                vertices_m = mesh_vertices_m @ turn.T + origin * self.units.length_m
                 surface = SurfaceRecord(source=source, vertices=len(vertices_m), faces=len(faces))
                 shapes.append((surface, (vertices_m, faces)))
+            else:  # It is joined to an earlier one.
+                continue
             self._count(label, len(shapes[-1][1][0]))
         return shapes
 
-    def _sweep(self, solid: Entity) -> Sweep | None:
-        if solid.id() not in self._sweeps:
-            self._sweeps[solid.id()] = read_sweep(solid, self.units)
-        return self._sweeps[solid.id()]
+    def _sweep(self, item: BodyItem, matrix: Float64[ndarray, "4 4"], declared_m: float | None) -> Sweep | None:
+        """Return the sweep (world frame, metres) that an item is; ``matrix`` is ``world_from_item``."""
+        unit_m = self.units.length_m
+        key = item.item.id(), None if declared_m is None else declared_m / unit_m / item.scale
+        if key not in self._sweeps:
+            self._sweeps[key] = read_sweep(item.item, self.units, key[1])
+        sweep = self._sweeps[key]
+        return None if sweep is None else sweep.placed(matrix, item.scale, unit_m)
 
     def _count(self, label: str, num_points: int) -> None:
         """Count a shape of the object ``label``; raise ``MeshError`` if there are too many shapes or points."""

@@ -7,6 +7,7 @@ define them. Anything else raises ``ValueError``.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -61,12 +62,19 @@ class Sampled:
 
 @dataclass(frozen=True, eq=False)
 class Leg(Sampled):
-    """Straight leg; ``parameters`` is its parameter range: 1 in a polyline, else a multiple of a line's vector."""
+    """Straight leg; ``parameters`` is its parameter range: 1 in a polyline, else a multiple of a line's vector.
+
+    ``legs`` is the number of legs of its polyline, 1 for a line.
+    """
+
+    legs: int = 1
 
     @classmethod
-    def between(cls, start: Float64[ndarray, " 3"], end: Float64[ndarray, " 3"], parameters: float = 1.0) -> Leg:
+    def between(
+        cls, start: Float64[ndarray, " 3"], end: Float64[ndarray, " 3"], parameters: float = 1.0, legs: int = 1
+    ) -> Leg:
         """Return the leg between two points."""
-        return cls(np.array([start, end]), np.array([0.0, 1.0]), parameters)
+        return cls(np.array([start, end]), np.array([0.0, 1.0]), parameters, legs)
 
     @property
     def length(self) -> float:
@@ -177,8 +185,34 @@ def curve_pieces(curve: Any, angle_rad: float, depth: int = 0) -> list[Piece]:
     return pieces
 
 
+def directrix(solid: Any, angle_rad: float) -> tuple[list[Piece], float, float | None]:
+    """Return the pieces of the curve of an IfcSweptDiskSolid, and the parameters from and to which it is swept.
+
+    A line, and the part of a circle or an ellipse that is swept, begin at the parameter 0. The end is None if it is
+    that of the curve. Raises ``ValueError`` as ``curve_pieces`` does, and if a part of an endless curve has no end.
+    """
+    curve, start, end = solid.Directrix, solid.StartParam, solid.EndParam
+    is_line, is_conic = curve.is_a("IfcLine"), curve.is_a("IfcConic")
+    size = math.nan if start is None or end is None else float(end) - float(start)
+    if is_line and not 0 < size < math.inf:
+        raise ValueError(
+            f"the disc is swept along an IfcLine, which has no ends, from StartParam {start} to EndParam {end}, "
+            "expected both, the second above the first"
+        )
+    if is_line:
+        origin, along = _origin_and_vector(curve)
+        return [Leg.between(origin + start * along, origin + end * along, size)], 0.0, size
+    # From 0 to 1, and from 0 to a turn or more, programs mean the whole curve.
+    if is_conic and size > 0 and (start or (end != 1 and size * angle_rad < _FULL_TURN_RAD - _ANGLE_NOISE_RAD)):
+        if size * angle_rad > _FULL_TURN_RAD + _ANGLE_NOISE_RAD:
+            raise ValueError(f"the disc is swept from {start} to {end} along a circle, expected at most one turn")
+        arc = replace(_conic(curve, angle_rad), first_rad=start * angle_rad, turn_rad=size * angle_rad)
+        return [replace(arc, parameters=size)], 0.0, size
+    return curve_pieces(curve, angle_rad), float(start or 0.0), None if end is None else float(end)
+
+
 def _legs(points: Float64[ndarray, "n 3"]) -> list[Piece]:
-    return [Leg.between(start, end) for start, end in pairwise(points)]
+    return [Leg.between(start, end, legs=len(points) - 1) for start, end in pairwise(points)]
 
 
 def _indexed_curve(curve: Any, angle_rad: float) -> list[Piece]:
@@ -234,13 +268,17 @@ def _trimmed_curve(curve: Any, angle_rad: float, depth: int) -> list[Piece]:
 
 
 def _trimmed_line(curve: Any, line: Any) -> Leg:
-    start = np.array(point_xyz(line.Pnt))
-    along = unit_vector(line.Dir.Orientation) * line.Dir.Magnitude
+    start, along = _origin_and_vector(line)
     first, last = (
         _trim_parameter(curve, trim, lambda point: float((point - start) @ along / (along @ along)), 1.0)
         for trim in "12"
     )
     return Leg.between(start + first * along, start + last * along, abs(last - first))
+
+
+def _origin_and_vector(line: Any) -> tuple[Float64[ndarray, " 3"], Float64[ndarray, " 3"]]:
+    """Return the points of an IfcLine at the parameter 0, and its vector to that at 1."""
+    return np.array(point_xyz(line.Pnt)), unit_vector(line.Dir.Orientation) * line.Dir.Magnitude
 
 
 def _trimmed_conic(curve: Any, conic: Any, angle_rad: float) -> Arc:
