@@ -2,7 +2,7 @@
 
 Every IfcReinforcingBar, IfcReinforcingMesh and IfcTendon is read, or every object that a selection chooses, in the
 order of the instance numbers. Each sweep of a circle in its Body (an IfcSweptDiskSolid, a straight
-IfcExtrudedAreaSolid or an IfcRevolvedAreaSolid), directly or through IfcMappedItem, is one bar, since some programs
+IfcExtrudedAreaSolid or an IfcRevolvedAreaSolid), directly or through IfcMappedItem, is one bar, since programs
 write a whole row of bars as one object; sweeps that continue each other are one bar. Only other solids are
 tessellated, each once for all of its uses. All other objects are left out.
 

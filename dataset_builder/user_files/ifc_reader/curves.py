@@ -186,28 +186,30 @@ def curve_pieces(curve: Any, angle_rad: float, depth: int = 0) -> list[Piece]:
 
 
 def directrix(solid: Any, angle_rad: float) -> tuple[list[Piece], float, float | None]:
-    """Return the pieces of the curve of an IfcSweptDiskSolid, and the parameters from and to which it is swept.
+    """Return the pieces of an IfcSweptDiskSolid's curve, and the parameters from and to which it is swept.
 
-    A line, and the part of a circle or an ellipse that is swept, begin at the parameter 0. The end is None if it is
-    that of the curve. Raises ``ValueError`` as ``curve_pieces`` does, and if a part of an endless curve has no end.
+    Of a line, a circle and an ellipse they are the swept part, from 0. The end is None if it is that of the curve.
+    Raises ``ValueError`` as ``curve_pieces`` does, and if a line has no ends or a circle is swept beyond a turn.
     """
     curve, start, end = solid.Directrix, solid.StartParam, solid.EndParam
-    is_line, is_conic = curve.is_a("IfcLine"), curve.is_a("IfcConic")
     size = math.nan if start is None or end is None else float(end) - float(start)
-    if is_line and not 0 < size < math.inf:
-        raise ValueError(
-            f"the disc is swept along an IfcLine, which has no ends, from StartParam {start} to EndParam {end}, "
-            "expected both, the second above the first"
-        )
-    if is_line:
+    turn_rad = size * angle_rad
+    if curve.is_a("IfcLine"):
+        if not 0 < size < math.inf:
+            found = f"the disc is swept along an IfcLine from StartParam {start} to EndParam {end}"
+            raise ValueError(f"{found}, expected both, the second above the first: a line has no ends")
         origin, along = _origin_and_vector(curve)
         return [Leg.between(origin + start * along, origin + end * along, size)], 0.0, size
     # From 0 to 1, and from 0 to a turn or more, programs mean the whole curve.
-    if is_conic and size > 0 and (start or (end != 1 and size * angle_rad < _FULL_TURN_RAD - _ANGLE_NOISE_RAD)):
-        if size * angle_rad > _FULL_TURN_RAD + _ANGLE_NOISE_RAD:
+    if (
+        curve.is_a("IfcConic")
+        and size > 0
+        and (start or (end != 1 and turn_rad < _FULL_TURN_RAD - _ANGLE_NOISE_RAD))
+    ):
+        if turn_rad > _FULL_TURN_RAD + _ANGLE_NOISE_RAD:
             raise ValueError(f"the disc is swept from {start} to {end} along a circle, expected at most one turn")
-        arc = replace(_conic(curve, angle_rad), first_rad=start * angle_rad, turn_rad=size * angle_rad)
-        return [replace(arc, parameters=size)], 0.0, size
+        arc = replace(_conic(curve, angle_rad), first_rad=start * angle_rad, turn_rad=turn_rad, parameters=size)
+        return [arc], 0.0, size
     return curve_pieces(curve, angle_rad), float(start or 0.0), None if end is None else float(end)
 
 

@@ -263,7 +263,7 @@ def _joined(
 ) -> Float64[ndarray, "k 3"]:
     """Return lines, whose ends are moved, as one with joints in the middle of gaps; note a gap.
 
-    Raises ``ValueError`` if no line is given, they have no length or a gap is wider than ``_CLOSED_GAP`` diameters.
+    Raises ``ValueError`` if there is no line, no length or a gap wider than ``_CLOSED_GAP`` diameters.
     """
     if not lines:
         raise ValueError("the swept part of the curve is empty")
