@@ -159,6 +159,7 @@ TEXTS: list[tuple[str, str, Callable[[Path], object]]] = [
     ("rows.csv", "view_id,x,y,z\nmat/0,1,2,3\n", lambda path: read_detections(path, {})),
     ("board.toml", "port = false\n", lambda path: read_settings(path, {})),
     ("cage.toml", "x = 1\n", lambda path: load_cage(cage_file_spec(path))),
+    ("cage.ifc", "ISO-10303-21;\n", lambda path: load_cage(cage_file_spec(path))),
 ]
 
 
