@@ -140,7 +140,7 @@ class _Reader:
                     points=len(sweep.axis),
                 )
                 shapes.append((bar, (sweep.axis,)))
-            elif sweeps[number] is None:
+            elif sweeps[number] is None:  # Others are joined to an earlier one.
                 if item.item.id() not in self._meshes:
                     step = StepRecord(label=label, reason=f"the body is a {item.item.is_a()}")
                     yield step, ()
@@ -152,9 +152,7 @@ class _Reader:
                 vertices_m = mesh_vertices_m @ turn.T + origin * self.units.length_m
                 surface = SurfaceRecord(source=source, vertices=len(vertices_m), faces=len(faces))
                 shapes.append((surface, (vertices_m, faces)))
-            else:  # It is joined to an earlier one.
-                continue
-            self._count(label, len(shapes[-1][1][0]))
+                self._count(len(vertices_m), f"{label}: ")
         return shapes
 
     def _sweep(self, item: BodyItem, matrix: Float64[ndarray, "4 4"], declared_m: float | None) -> Sweep | None:
@@ -164,14 +162,17 @@ class _Reader:
         if key not in self._sweeps:
             self._sweeps[key] = read_sweep(item.item, self.units, key[1])
         sweep = self._sweeps[key]
-        return None if sweep is None else sweep.placed(matrix, item.scale, unit_m)
+        if sweep is None:
+            return None
+        self._count(len(sweep.axis))
+        return sweep.placed(matrix, item.scale, unit_m)
 
-    def _count(self, label: str, num_points: int) -> None:
-        """Count a shape of the object ``label``; raise ``MeshError`` if there are too many shapes or points."""
+    def _count(self, num_points: int, where: str = "") -> None:
+        """Count a shape; raise ``MeshError`` if there are too many shapes or points up to this one."""
         self._num_shapes, self._num_points = self._num_shapes + 1, self._num_points + num_points
         if self._num_shapes > MAX_BARS or self._num_points > MAX_POINTS:
             raise MeshError(
-                f"{label}: {self._num_shapes} bars of {self._num_points} points up to this object, "
+                f"{where}{self._num_shapes} bars of {self._num_points} points up to this object, "
                 f"expected at most {MAX_BARS} and {MAX_POINTS}"
             )
 
