@@ -11,8 +11,6 @@ from pathlib import Path
 
 import pytest
 
-from dataset_builder.user_files.cage_file import cage_file_spec, load_cage, mesh_file_spec
-from leaderboard.settings import read_settings
 from rebar_depth_bench.base import limits
 from rebar_depth_bench.base.errors import InputError, Problem
 from rebar_depth_bench.base.reading import (
@@ -35,6 +33,7 @@ from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.detections.reading import read_detections
 from rebar_depth_bench.methods.onnx.external_data import external_files
+from rebar_depth_bench.methods.onnx.spec import read_onnx_toml
 
 
 def test_file_above_the_limit_is_not_read(tmp_path: Path) -> None:
@@ -139,8 +138,6 @@ LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:" + b"4d" * 32 + 
         ("left.jpg", lambda path: read_image(path, (3, 4))),
         ("rig.toml", lambda path: read_calibration(path, 4, 3)),
         ("rows.csv", lambda path: read_detections(path, {})),
-        ("cage.ifc", lambda path: load_cage(cage_file_spec(path))),
-        ("cage.obj", lambda path: load_cage(mesh_file_spec(path, "m"))),
     ],
 )
 def test_pointer_of_git_lfs_is_named(tmp_path: Path, name: str, read: Callable[[Path], object]) -> None:
@@ -157,9 +154,7 @@ def test_pointer_of_git_lfs_is_named(tmp_path: Path, name: str, read: Callable[[
 TEXTS: list[tuple[str, str, Callable[[Path], object]]] = [
     ("manifest.json", "{}", lambda path: open_folder(path.parent)),
     ("rows.csv", "view_id,x,y,z\nmat/0,1,2,3\n", lambda path: read_detections(path, {})),
-    ("board.toml", "port = false\n", lambda path: read_settings(path, {})),
-    ("cage.toml", "x = 1\n", lambda path: load_cage(cage_file_spec(path))),
-    ("cage.ifc", "ISO-10303-21;\n", lambda path: load_cage(cage_file_spec(path))),
+    ("model.toml", "sumary = 1\n", read_onnx_toml),
 ]
 
 
