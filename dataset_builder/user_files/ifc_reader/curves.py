@@ -43,6 +43,11 @@ class Sampled:
     shares: Float64[ndarray, " n"]
     parameters: float
 
+    @property
+    def length(self) -> float:
+        """Length of the line through the samples."""
+        return float(np.linalg.norm(np.diff(self.line, axis=0), axis=1).sum())
+
     def points(self) -> Float64[ndarray, "n 3"]:
         """Return the sampled points."""
         return self.line
@@ -76,11 +81,6 @@ class Leg(Sampled):
         """Return the leg between two points."""
         return cls(np.array([start, end]), np.array([0.0, 1.0]), parameters, legs)
 
-    @property
-    def length(self) -> float:
-        """Length of the leg."""
-        return float(np.linalg.norm(self.line[1] - self.line[0]))
-
 
 @dataclass(frozen=True, eq=False)
 class Arc:
@@ -96,6 +96,11 @@ class Arc:
     first_rad: float
     turn_rad: float
     parameters: float
+
+    @property
+    def length(self) -> float:
+        """Length of the arc of a circle; that of an ellipse is by its first half axis."""
+        return abs(self.turn_rad) * float(np.linalg.norm(self.x_axis))
 
     def points(self) -> Float64[ndarray, "n 3"]:
         """Return points at most ``ARC_STEP_DEG`` apart, including both ends."""

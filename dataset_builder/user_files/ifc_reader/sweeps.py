@@ -24,10 +24,13 @@ _FOOT_M = 0.3048
 _SAME = 1e-6
 """Largest relative difference of parameters and diameters that are taken to be equal."""
 
-_AGREES, _DIFFERS = 0.03, 0.01
+_AGREES, _DIFFERS = 0.03, 0.002
 """Largest difference of a length from the declared one, and least one of two ways of counting, relative."""
 
-_WAYS = "legs 1", "legs by length", "legs in feet", "legs and arcs 1", "the curve 1", "polylines 1", "segments 1"
+_WAYS = (
+    *("legs 1", "legs by length", "legs in feet", "legs and arcs 1", "the curve 1"),
+    *("polylines 1", "segments 1", "legs and arcs by length"),
+)
 """Ways of counting parameters along a curve, in the order of ``_swept_pieces``."""
 
 _CLOSED_GAP = 0.25
@@ -144,7 +147,7 @@ def _swept_pieces(solid: Any, units: Units, declared: float | None, notes: dict[
     in the project's unit), also with legs counted by their length in the file's unit or in feet; an end beyond the
     largest of these. Any other parameters cut the curve: they count as in the rule, or else in the first of the
     other ways that ends at the end parameter, or at least reaches it. If only another of all ways, which include
-    polylines or segments that count 1, agrees with the ``declared`` length, it is taken.
+    polylines or segments that count 1, and arcs by length, agrees with the ``declared`` length, it is taken.
     """
     pieces, start, end = directrix(solid, units.angle_rad)
     by_rule = [piece.parameters for piece in pieces]
@@ -172,6 +175,7 @@ def _swept_pieces(solid: Any, units: Units, declared: float | None, notes: dict[
     counts += [
         [size / number for size, number in zip(by_rule, legs, strict=True)],
         [1 / number for number in legs],
+        [piece.length for piece in pieces],
     ]
     length, words = _length(part), f"the parameters {start:g} to {end:g}"
     others = [
@@ -241,7 +245,7 @@ def _partners(sweeps: Sequence[Sweep], uses: Sequence[int], declared: float | No
     outward = np.concatenate([sweep.outward for sweep in sweeps])
     diameters, use = np.repeat([sweep.diameter for sweep in sweeps], 2), np.repeat(uses, 2)
     sizes = [np.linalg.norm(np.diff(sweep.axis, axis=0), axis=1).sum() for sweep in sweeps]
-    is_bar = [declared is not None and abs(size / declared - 1) <= _DIFFERS for size in sizes]
+    is_bar = [declared is not None and abs(size / declared - 1) <= _AGREES for size in sizes]
     nearest: dict[int, int] = {}
     for end, diameter in enumerate(diameters):
         gaps = np.linalg.norm(points - points[end], axis=1)

@@ -171,6 +171,7 @@ def arc_and_legs(step: Step, end: float) -> str:
         (lambda step: bent_bar(step, 92.5), WHOLE_MM - 100, WHOLE_MM - 100, {"cut", "parameters"}),
         (lambda step: bent_bar(step, 93.0, 1.0), WHOLE_MM - 300, WHOLE_MM - 300, {"cut", "parameters"}),
         (lambda step: bent_bar(step, 4.0, 2.0), 600.0, 600.0, {"cut", "parameters"}),
+        (lambda step: bent_bar(step, WHOLE_MM), WHOLE_MM, WHOLE_MM, {"parameters"}),
         (lambda step: arc_and_legs(step, 91.0), QUARTER_MM + 120, QUARTER_MM + 120, {"parameters"}),
         (lambda step: arc_and_legs(step, 91.0), QUARTER_MM + 40, QUARTER_MM + 40, {"cut"}),
         (lambda step: indexed(step, 0.0, 92.0), 500 + QUARTER_MM, 500 + QUARTER_MM, {"parameters"}),
