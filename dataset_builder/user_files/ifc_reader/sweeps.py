@@ -177,25 +177,27 @@ def _swept_pieces(solid: Any, units: Units, declared: float | None, notes: dict[
         [1 / number for number in legs],
         [piece.length for piece in pieces],
     ]
-    length, words = _length(part), f"the parameters {start:g} to {end:g}"
+    length, wanted = _length(part), declared or math.nan  # Comparisons with NaN are false.
+    off = abs(length / wanted - 1)
+    if not length or off <= _DIFFERS or (part is pieces and not declared):
+        counts = []
     others = [
-        (way, other, _length(other), abs(end - sum(count)) <= _SAME * end)
-        for way, count in zip(_WAYS, counts, strict=True)
+        (other, _length(other), way, abs(end - sum(count)) <= _SAME * end)
+        for count, way in zip(counts, _WAYS, strict=False)
         if end <= sum(count) * (1 + _SAME) and (other := cut(pieces, count, start, end))
     ]
-    usual = ("", part, length, False)
-    way, other, size, _ = min(others, key=lambda other: abs(other[2] - (declared or 0.0)), default=usual)
-    off, usual_off = (abs(size / declared - 1) if declared else math.inf for size in (size, length))
-    if off <= _AGREES and usual_off > off + _DIFFERS:
-        notes["parameters"] = f"{words} count {way}, which gives the declared length, not {length:.6g}"
-        part, length = other, size
-    elif usual_off > _AGREES:
-        for way, _, size, is_whole in others:
-            if is_whole and abs(size / length - 1) > _DIFFERS:
-                notes["parameters"] = (
-                    f"{words} may count {way}, which gives the length {size:.6g}, not {length:.6g}"
-                )
-    if (share := length / _length(pieces)) < 1 - _SAME:
+    words = f"the parameters {start:g} to {end:g}"
+    if others:
+        other, size, way, _ = min(others, key=lambda other: abs(other[1] - wanted))
+        if abs(size / wanted - 1) <= min(_AGREES, off - _DIFFERS):
+            notes["parameters"] = (
+                f"{words} count {way}, which gives the declared length, not {length / size:.1%} of it"
+            )
+            part, length, others = other, size, []
+    for _, size, way, is_whole in others:
+        if is_whole and not off <= _AGREES and abs(size / length - 1) > _DIFFERS:
+            notes["parameters"] = f"{words} may count {way}, which gives {size / length:.1%} of the length built"
+    if length and (share := length / _length(pieces)) < 1 - _SAME:
         notes["cut"] = f"the curve is swept from {solid.StartParam} to {solid.EndParam}, {share:.1%} of its length"
     return part
 
