@@ -46,7 +46,7 @@ _STRAIGHT = math.cos(math.radians(1.0))
 """Smallest cosine of the angle between two solids that continue each other."""
 
 _END_SHARE = 1e-4
-"""Share of a curve at its end whose chord is taken for the tangent."""
+"""Share of an arc at its end whose chord is taken for the tangent."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,9 +95,20 @@ def _swept_disc(solid: Any, units: Units, declared: float | None) -> Sweep:
 def _outward(pieces: Sequence[Piece]) -> Float64[ndarray, "2 3"]:
     """Return the unit vectors along connected pieces that point out of their start and their end."""
     pieces = [piece for piece in pieces if _length([piece])]
-    start, end = pieces[0].part(0.0, _END_SHARE).points(), pieces[-1].part(1 - _END_SHARE, 1.0).points()
-    chords = np.array([start[0] - start[-1], end[-1] - end[0]])
-    return np.asarray(chords / np.linalg.norm(chords, axis=1, keepdims=True))
+    first, last = pieces[0], pieces[-1]
+    start = (first.part(0.0, _END_SHARE) if isinstance(first, Arc) else first).points()
+    end = (last.part(1 - _END_SHARE, 1.0) if isinstance(last, Arc) else last).points()
+    return -np.array([_tangent(start[:3]), _tangent(end[::-1][:3])])
+
+
+def _tangent(points: Float64[ndarray, "n 3"]) -> Float64[ndarray, " 3"]:
+    """Return the unit tangent at the first of two points, or of three on a circle, towards the others.
+
+    It differs from the chord a to the second point as the chord b to the last one does from that c between them.
+    """
+    chords = points[1] - points[0], points[-1] - points[0], points[-1] - points[-2]
+    a, b, c = (chord / np.linalg.norm(chord) for chord in chords)
+    return np.asarray((a @ c) * b + (b @ c) * a - (a @ b) * c)
 
 
 def _diameter(radius: float) -> float:
@@ -252,7 +263,7 @@ def _partners(sweeps: Sequence[Sweep], uses: Sequence[int], declared: float | No
     for end, diameter in enumerate(diameters):
         gaps = np.linalg.norm(points - points[end], axis=1)
         is_like = (use == use[end]) & (abs(diameters - diameter) <= _SAME * diameter)
-        gaps[~is_like | (outward @ outward[end] > -_STRAIGHT)] = np.inf
+        gaps[~(is_like & (outward @ outward[end] <= -_STRAIGHT))] = np.inf
         gaps[end ^ 1] = np.inf
         # Where solids are written twice, it is unknown which of them continue each other.
         if gaps.min() <= _CLOSED_GAP * diameter and (gaps <= gaps.min() + _NOTED_GAP * diameter).sum() == 1:

@@ -269,6 +269,17 @@ def test_solids_of_other_classes_are_joined() -> None:
     assert ends == [(0, 0, 0), (250, 0, 350)]
 
 
+def test_bend_that_is_a_spline_is_joined() -> None:
+    """A quarter circle is a rational quadratic B-spline whose middle weight is cos 45 degrees."""
+    step = Step(MILLIMETRES, "IFC4")
+    control = ",".join(step.point((x, y, 0)) for x, y in ((500, 0), (550, 0), (550, 50)))
+    knots = f".UNSPECIFIED.,.F.,.F.,(3,3),(0.,1.),.UNSPECIFIED.,(1.,{math.sqrt(0.5)!r},1.)"
+    spline = step.add(f"IFCRATIONALBSPLINECURVEWITHKNOTS(2,({control}),{knots})")
+    legs = [leg(step, (0, 0, 0), (500, 0, 0)), leg(step, (550, 350, 0), (550, 50, 0))]
+    step.bar([*legs, step.disc(spline, 6.0, "$", "$")], 0.012, None)
+    check_sizes(bars_of(step), (12.0, 800 + QUARTER_MM))
+
+
 @pytest.mark.slow
 def test_revolved_circle_is_that_of_the_geometry_kernel() -> None:
     step = Step(MILLIMETRES, "IFC4")
