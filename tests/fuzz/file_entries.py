@@ -100,6 +100,24 @@ def _rods() -> trimesh.Trimesh:
     return trimesh.util.concatenate(_RODS)
 
 
+def _ifc_of_solids() -> str:
+    """Return a bar of two legs and a bend, each a solid, one along an endless line, and a curve that is cut."""
+    step = Step(MILLIMETRES, "IFC4")
+    vector = step.add(f"IFCVECTOR({step.direction((1, 0, 0))},2.)")
+    endless = step.add(f"IFCLINE({step.point((0, 0, 0))},{vector})")
+    bend = step.arc((500, 50, 0), 50.0, 1.5 * np.pi, 2 * np.pi)
+    legs = [
+        step.disc(endless, 6.0, 0.0, 250.0),
+        step.disc(step.polyline((550, 300, 0), (550, 50, 0)), 6.0, "$", "$"),
+    ]
+    step.bar([*legs, step.disc(bend, 6.0, "$", "$")], 0.012, 0.82854)
+    curve = step.composite(
+        step.polyline((0, 0, 90), (100, 0, 90), (200, 0, 90)), step.polyline((200, 0, 90), (400, 0, 90))
+    )
+    step.bar([step.disc(curve, 6.0, 0.0, 2.0)], 0.012, 0.4)
+    return step.text()
+
+
 def _dataset_ply(path: Path) -> None:
     bar_id = np.repeat(range(1, len(_RODS) + 1), [len(rod.faces) for rod in _RODS])
     write_mesh_ply(path, WorldMesh(np.asarray(_rods().vertices), np.asarray(_rods().faces), bar_id))
@@ -204,24 +222,6 @@ def _import(path: Path) -> object:
     assert np.isfinite(depth_m).all()
     assert (depth_m >= 0).all()
     return source.bars, depth_m.tolist()
-
-
-def _ifc_of_solids() -> str:
-    """Return a bar of two legs and a bend, each a solid, one along an endless line, and a curve that is cut."""
-    step = Step(MILLIMETRES, "IFC4")
-    vector = step.add(f"IFCVECTOR({step.direction((1, 0, 0))},2.)")
-    endless = step.add(f"IFCLINE({step.point((0, 0, 0))},{vector})")
-    bend = step.arc((500, 50, 0), 50.0, 1.5 * np.pi, 2 * np.pi)
-    legs = [
-        step.disc(endless, 6.0, 0.0, 250.0),
-        step.disc(step.polyline((550, 300, 0), (550, 50, 0)), 6.0, "$", "$"),
-    ]
-    step.bar([*legs, step.disc(bend, 6.0, "$", "$")], 0.012, 0.82854)
-    curve = step.composite(
-        step.polyline((0, 0, 90), (100, 0, 90), (200, 0, 90)), step.polyline((200, 0, 90), (400, 0, 90))
-    )
-    step.bar([step.disc(curve, 6.0, 0.0, 2.0)], 0.012, 0.4)
-    return step.text()
 
 
 def _copy(source: Path, path: Path) -> None:
