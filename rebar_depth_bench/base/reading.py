@@ -32,13 +32,16 @@ _MAX_KEY_COST = 10_000_000
 """Largest sum over the lines of a TOML file of the squared number of dots; tomllib needs about 10 ns for each."""
 _DECIMAL_NUMBER = re.compile(rb"(?<![\w.\"'-])[-+]?\d+\.\d+(?=[\s,\]}eE]|$)")
 _NUMBER = re.compile(r"[-+]?([0-9]++(\.[0-9]*+)?|\.[0-9]++)([eE][-+]?[0-9]++)?")
+LFS_POINTER = "it is a pointer of git LFS, not the file itself (git lfs pull downloads it)"
+"""What was found in place of a file that ``is_lfs_pointer``."""
+_LFS_PREFIX = b"version https://git-lfs.github.com/spec/v1"
 _KINDS = {stat.S_IFDIR: "a folder", stat.S_IFIFO: "a named pipe", stat.S_IFSOCK: "a socket"}
 
 
 def open_regular(path: Path) -> BinaryIO:
     """Open a regular file, or a link to one, for reading in binary mode.
 
-    Raises ``OSError``, whose ``strerror`` can be shown to users, for anything else.
+    Raises ``OSError``, whose ``strerror`` can be shown to users, for anything else, and for a pointer of git LFS.
     """
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
@@ -48,8 +51,17 @@ def open_regular(path: Path) -> BinaryIO:
     if not stat.S_ISREG(mode):
         os.close(descriptor)
         found = _KINDS.get(stat.S_IFMT(mode), "a device")
-        raise OSError(errno.EINVAL, f"it is {found}, not a regular file")
-    return os.fdopen(descriptor, "rb")
+        raise OSError(errno.EINVAL, f"it is {found}, not a regular file", str(path))
+    stream = os.fdopen(descriptor, "rb")
+    if is_lfs_pointer(os.pread(descriptor, len(_LFS_PREFIX), 0)):
+        stream.close()
+        raise OSError(errno.EINVAL, LFS_POINTER, str(path))
+    return stream
+
+
+def is_lfs_pointer(content: bytes | memoryview) -> bool:
+    """Return whether the content of a file begins as the text that git LFS stores in its place."""
+    return content[: len(_LFS_PREFIX)] == _LFS_PREFIX
 
 
 def read_file(path: Path, limit: Limit, expected: str, error_type: type[InputError]) -> bytes:

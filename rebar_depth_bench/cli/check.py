@@ -27,6 +27,8 @@ def run(options: argparse.Namespace) -> None:
         with ProgressBars() as bars:
             problems = list(submission.problems(bars.update))
         print_verified(folder)
+        for note in submission.notes:
+            print_notice(note)
         if problems:
             raise SubmissionError.from_problems(options.archive, problems)
         print(f"{options.archive}: no problem found")

@@ -85,6 +85,8 @@ def run(options: argparse.Namespace) -> None:
         write_output(options.extended_csv, extended_csv(result))
     if prints_table(options):
         _print_tables(result)
+    for note in evaluation.submission.notes:
+        print_notice(note)
     for mistake in mistakes:
         print_notice(f"possible mistake: {mistake.text}")
 

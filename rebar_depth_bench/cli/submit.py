@@ -11,6 +11,7 @@ from pathlib import Path
 from rich.console import Console
 
 from rebar_depth_bench.base.errors import InputError, printable
+from rebar_depth_bench.base.reading import decode_text
 from rebar_depth_bench.base.terminal import ProgressBars
 from rebar_depth_bench.base.writing import write_output
 from rebar_depth_bench.cli.console import InputFile, add_archive, add_output_file, add_seconds, prints_table
@@ -21,7 +22,7 @@ from rebar_depth_bench.scoring.result import DECIMALS, DisclosedResult, Result
 
 TOKEN_VARIABLE = "REBAR_LEADERBOARD_TOKEN"
 """Environment variable that holds the token."""
-_MAX_TOKEN_CHARACTERS = 10_000
+_MAX_TOKEN_BYTES = 10_000
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -88,10 +89,13 @@ def read_token(file: str | None) -> str:
     """
     if file is not None:
         try:
-            with Path(file).open(encoding="utf-8") as stream:  # It may be a pipe of the user's own.
-                token = stream.read(_MAX_TOKEN_CHARACTERS).strip()
+            with Path(file).open("rb") as stream:  # It may be a pipe of the user's own.
+                text, problems = decode_text(stream.read(_MAX_TOKEN_BYTES))
         except (OSError, ValueError) as error:
             raise InputError(f"{file}: cannot be read: {error}") from None
+        if problems:
+            raise InputError.from_problems(file, problems)
+        token = text.strip()
         if not token or not token.isprintable():
             found = "has characters that are not printable" if token else "is empty"
             raise InputError(f"{file}: {found}, expected a token on one line")

@@ -19,7 +19,7 @@ from numpy import ndarray
 from rebar_depth_bench.base.errors import Problem, SubmissionError, escape_text
 from rebar_depth_bench.base.limits import DETECTIONS_BYTES
 from rebar_depth_bench.base.names import config_of, split_of
-from rebar_depth_bench.base.reading import open_regular, parse_number, read_file
+from rebar_depth_bench.base.reading import decode_text, open_regular, parse_number, read_file
 from rebar_depth_bench.base.validation import validate_table
 from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.data.shards import Table, open_parquet
@@ -189,11 +189,9 @@ def _read(path: Path, problems: list[Problem]) -> RawDetections | None:
 
 def _read_csv(path: Path, problems: list[Problem]) -> RawDetections | None:
     content = read_file(path, DETECTIONS_BYTES, "a CSV or Parquet file of detections", SubmissionError)
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        found = f"byte {error.start} is not UTF-8"
-        problems.append(Problem("syntax", "", found, "a Parquet file, or a CSV file in UTF-8"))
+    text, undecoded = decode_text(content)
+    if undecoded:
+        problems += undecoded
         return None
     metadata, first = _csv_metadata(text)
     reader = csv.reader(islice(io.StringIO(text), first, None), strict=True)

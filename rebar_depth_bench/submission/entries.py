@@ -5,6 +5,7 @@ A leading ``./``, with which bsdtar (Windows, macOS, FreeBSD) begins names, is d
 
 from __future__ import annotations
 
+import re
 from collections import defaultdict
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -54,7 +55,6 @@ FORMATS: Mapping[str, Format] = {
 """Formats of entries by the suffix of their names."""
 
 _ANY_SUFFIX = f"one of {', '.join(FORMATS)}"
-_ZIP_HINT = "zip with: zip -r submission.zip submission.json <config> -x '*.DS_Store'"
 
 
 def entry_key(name: str, expected: ExpectedViews) -> str | None:
@@ -67,10 +67,19 @@ def entry_key(name: str, expected: ExpectedViews) -> str | None:
     return view_id if suffix in FORMATS and view_id in expected else None
 
 
+def is_system_file(name: str, expected: ExpectedViews) -> bool:
+    """Return whether an entry is one that macOS adds to folders and archives, which is ignored."""
+    plain = name.removeprefix("./")
+    is_system = (
+        plain.startswith("__MACOSX/") or re.match(r"\._|\.DS_Store$", PurePosixPath(plain).name) is not None
+    )
+    return is_system and entry_key(name, expected) is None
+
+
 def max_entry_bytes(name: str, expected: ExpectedViews) -> int | None:
     """Return the largest acceptable uncompressed size of the named entry, in bytes; None for an unknown entry."""
     key = entry_key(name, expected)
-    if key == METADATA_NAME:
+    if key == METADATA_NAME or is_system_file(name, expected):
         return MAX_METADATA_BYTES
     return None if key is None else FORMATS[PurePosixPath(name).suffix].max_bytes(expected[key])
 
@@ -91,11 +100,7 @@ def match_entries(names: Sequence[str], expected: ExpectedViews) -> tuple[dict[s
             unknown.append(name)
     if not entries and (wrapper := _wrapper_folder_problem(unknown, expected)):
         return {}, [wrapper]
-    macos = [name for name in unknown if _is_macos_metadata(name)]
-    problems = [_unknown_entry_problem(name, expected) for name in unknown if not _is_macos_metadata(name)]
-    if macos:
-        found = f"entries made by macOS were found ({len(macos)})"
-        problems.append(Problem("unknown", escape_text(macos[0]), found, f"none; {_ZIP_HINT}"))
+    problems = [_unknown_entry_problem(name, expected) for name in unknown]
     for key, indices in entries.items():
         if len(indices) > 1:
             listed = ", ".join(names[index] for index in indices[:4]) + (", ..." if len(indices) > 4 else "")
@@ -106,9 +111,7 @@ def match_entries(names: Sequence[str], expected: ExpectedViews) -> tuple[dict[s
 
 def _wrapper_folder_problem(unknown: Sequence[str], expected: ExpectedViews) -> Problem | None:
     """Return the problem of an archive whose files, all unknown, are valid without one superfluous folder."""
-    files = [
-        name.removeprefix("./") for name in unknown if not name.endswith("/") and not _is_macos_metadata(name)
-    ]
+    files = [name.removeprefix("./") for name in unknown if not name.endswith("/")]
     tops = {name.partition("/")[0] for name in files}
     if len(tops) != 1:
         return None
@@ -160,7 +163,3 @@ def _missing_problems(found: Collection[str], expected: ExpectedViews) -> Iterat
         if (config, split) in parts and view not in found:
             because = f"because other views of {config if split is None else f'{config}, {split},'} are included"
             yield Problem("missing", view, "missing", f"{_ANY_SUFFIX}, {because}")
-
-
-def _is_macos_metadata(name: str) -> bool:
-    return name.removeprefix("./").startswith("__MACOSX/") or PurePosixPath(name).name == ".DS_Store"

@@ -11,7 +11,13 @@ from rebar_depth_bench.base.errors import EntryError, Problem
 from rebar_depth_bench.base.parallel import Progress, silent
 from rebar_depth_bench.base.reading import FileSource
 from rebar_depth_bench.submission.declaration import DEPTH_SCALE, METADATA_NAME, SubmissionMeta, parse_metadata
-from rebar_depth_bench.submission.entries import FORMATS, ExpectedViews, match_entries, max_entry_bytes
+from rebar_depth_bench.submission.entries import (
+    FORMATS,
+    ExpectedViews,
+    is_system_file,
+    match_entries,
+    max_entry_bytes,
+)
 from rebar_depth_bench.submission.maps import Depth
 from rebar_depth_bench.submission.zip import ZipEntry, read_data, read_entries
 
@@ -22,12 +28,14 @@ class SubmissionReader(AbstractContextManager["SubmissionReader"]):
     ``expected`` has every view of the dataset folder. An invalid archive raises no error: ``structure_problems``
     are those that are detected without decoding a view, in a fixed order. ``meta`` is the content of
     ``submission.json``, None if that is missing or invalid. ``view_ids`` are the sorted ids of the views whose
-    entries have no structural problem. ``read`` is thread-safe. The file must not be written to while it is open.
+    entries have no structural problem. ``notes`` say which entries are ignored. ``read`` is thread-safe. The file
+    must not be written to while it is open.
     """
 
     def __init__(self, path: str | os.PathLike[str], expected: ExpectedViews) -> None:
         self.path = Path(path)
         self.meta: SubmissionMeta | None = None
+        self.notes: tuple[str, ...] = ()
         self._expected = expected
         self._entries: dict[str, ZipEntry] = {}
         self._source: FileSource | None = None
@@ -54,9 +62,13 @@ class SubmissionReader(AbstractContextManager["SubmissionReader"]):
         for entry in entries:
             yield from entry.problems
         named = [entry for entry in entries if all(problem.code != "name" for problem in entry.problems)]
-        matched, problems = match_entries([entry.name for entry in named], self._expected)
+        used = [entry for entry in named if not is_system_file(entry.name, self._expected)]
+        if ignored := len(named) - len(used):
+            files = "__MACOSX, ._* and .DS_Store"
+            self.notes = (f"{self.path}: entries that macOS adds are ignored: {ignored} ({files})",)
+        matched, problems = match_entries([entry.name for entry in used], self._expected)
         yield from problems
-        sound = {key: named[index] for key, index in matched.items() if not named[index].problems}
+        sound = {key: used[index] for key, index in matched.items() if not used[index].problems}
         metadata = sound.pop(METADATA_NAME, None)
         self._entries = sound
         if metadata is None:

@@ -5,6 +5,9 @@ the data of any entry is read. Reading a checked entry bounds the inflated size 
 
 ``zipfile`` is not used for reading: it allocates the sizes that the directory declares, cuts names at NUL and
 accepts archives whose entries overlap. All later checks use the records of this parser.
+
+Backslashes in names separate folders only if the record says that MS-DOS made the entry, as Compress-Archive of
+Windows PowerShell 5.1 does (.NET Framework before 4.6.1); elsewhere they are a letter, and refused.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ from dataclasses import dataclass, replace
 from zlib_ng import zlib_ng
 
 from rebar_depth_bench.base.errors import EntryError, Problem, ProblemCode, escape_text
-from rebar_depth_bench.base.reading import ByteSource
+from rebar_depth_bench.base.reading import LFS_POINTER, ByteSource, is_lfs_pointer
 
 _END_RECORD = struct.Struct("<4s4H2LH")
 _ZIP64_END_LOCATOR = struct.Struct("<4sLQL")
@@ -31,6 +34,7 @@ _FULL32 = 0xFFFFFFFF
 _FULL_FIELDS = (_FULL16, _FULL16, _FULL16, _FULL16, _FULL32, _FULL32)
 _ZIP64_FIELD = 1
 _UTF8_NAME = 0x800
+_MSDOS_HOST = 0
 _MAX_BYTES_PER_RECORD = 512
 STORED = 0
 DEFLATED = 8
@@ -163,7 +167,7 @@ def _parse_record(data: bytes, start: int, index: int) -> tuple[ZipEntry, int]:
         found = f"no zip directory record was found for entry {index}"
         raise EntryError(Problem("damaged", "", found, f"one at +{start}"))
     fields = _DIRECTORY_RECORD.unpack_from(data, start)
-    flags, method = fields[5], fields[6]
+    host, flags, method = fields[2], fields[5], fields[6]
     crc, compressed, size, name_length, extra_length, comment_length, disk = fields[9:16]
     attributes, offset = fields[17], fields[18]
     name_end = start + _DIRECTORY_RECORD.size + name_length
@@ -172,7 +176,9 @@ def _parse_record(data: bytes, start: int, index: int) -> tuple[ZipEntry, int]:
         found = f"the zip directory record of entry {index} extends past the directory's end"
         raise EntryError(Problem("damaged", "", found))
     raw_name = data[start + _DIRECTORY_RECORD.size : name_end]
-    name = raw_name.decode("utf-8" if flags & _UTF8_NAME else "cp437", errors="backslashreplace")
+    # In both encodings of names, the byte of a backslash is no part of another character.
+    plain_name = raw_name.replace(b"\\", b"/") if host == _MSDOS_HOST else raw_name
+    name = plain_name.decode("utf-8" if flags & _UTF8_NAME else "cp437", errors="backslashreplace")
     if _FULL32 in (size, compressed, offset):
         extra = data[name_end:extra_end]
         size, compressed, offset = _zip64_sizes((size, compressed, offset), extra, index)
@@ -306,6 +312,8 @@ def read_data(source: ByteSource, entry: ZipEntry) -> memoryview:
     if crc != entry.crc:
         found = f"the data is corrupt: its checksum is {crc:08x}"
         raise EntryError(entry.problem("damaged", found, f"{entry.crc:08x}"))
+    if is_lfs_pointer(data):
+        raise EntryError(entry.problem("kind", LFS_POINTER))
     return data
 
 

@@ -31,6 +31,7 @@ from tests.bench.captures.example_capture import write_capture
 from tests.bench.geometry.calibrations import CONF, CONF_OF_SIZES, TOML
 from tests.bench.reporting.results import overflowed_view, result, scored_view, unpredicted_view
 from tests.bench.submission.zips import exr, npy, npz, png
+from tests.builder.user_files.ifc_step_text import MILLIMETRES, Step
 from tests.building import TWO_BARS
 from tests.fuzz.workspace import CASE, EntryPoint, Workspace
 
@@ -119,6 +120,24 @@ _SPREADSHEET = "\ufeffsep=;\r\n" + _BARS.upper().replace(",", ";").replace(".", 
 
 def _rods() -> trimesh.Trimesh:
     return trimesh.util.concatenate(_RODS)
+
+
+def _ifc_of_solids() -> str:
+    """Return a bar of two legs and a bend, each a solid, one along an endless line, and a curve that is cut."""
+    step = Step(MILLIMETRES, "IFC4")
+    vector = step.add(f"IFCVECTOR({step.direction((1, 0, 0))},2.)")
+    endless = step.add(f"IFCLINE({step.point((0, 0, 0))},{vector})")
+    bend = step.arc((500, 50, 0), 50.0, 1.5 * np.pi, 2 * np.pi)
+    legs = [
+        step.disc(endless, 6.0, 0.0, 250.0),
+        step.disc(step.polyline((550, 300, 0), (550, 50, 0)), 6.0, "$", "$"),
+    ]
+    step.bar([*legs, step.disc(bend, 6.0, "$", "$")], 0.012, 0.82854)
+    curve = step.composite(
+        step.polyline((0, 0, 90), (100, 0, 90), (200, 0, 90)), step.polyline((200, 0, 90), (400, 0, 90))
+    )
+    step.bar([step.disc(curve, 6.0, 0.0, 2.0)], 0.012, 0.4)
+    return step.text()
 
 
 def _dataset_ply(path: Path) -> None:
@@ -324,6 +343,15 @@ FILE_ENTRIES = (
         partial(_copy, EXAMPLES / "column.ifc"),
         _read_cage,
         share=5,
+        is_quick=False,
+        cpu_s=10.0,
+        shows_truncation=True,
+    ),
+    _reader(
+        "IFC: solids of a bar",
+        "c.ifc",
+        lambda path: path.write_text(_ifc_of_solids()),
+        _read_cage,
         is_quick=False,
         cpu_s=10.0,
         shows_truncation=True,

@@ -110,7 +110,7 @@ def damage_zip(
     at, kind, mode = int(rng.integers(len(entries))), rng.integers(6), 0o100644
     name, data = entries.pop(at)
     if kind == 1:
-        paths = (*PATHS, *TEXTS[:10])
+        paths = (*PATHS, *TEXTS[:10], b"__MACOSX/._a", b"lattice/.DS_Store")
         name = paths[rng.integers(len(paths))].decode("latin-1") + str(rng.choice(("", ".npy", ".png")))
     elif kind == 2:
         entries.insert(at, (name, data))
@@ -120,15 +120,19 @@ def damage_zip(
         data, _ = damage_entry(name, data, rng)
     if kind != 4:
         entries.insert(at, (name, data))
-    return _zip(entries, name, mode, int(rng.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED))))
+    compression = int(rng.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)))
+    if host := int(rng.choice((0, 3))):
+        return _zip(entries, name, mode, compression, host)
+    entries = [(other.replace("/", "\\"), data) for other, data in entries]
+    return _zip(entries, name.replace("/", "\\"), mode, compression, host)
 
 
-def _zip(entries: list[tuple[str, bytes]], linked: str, mode: int, compression: int) -> bytes:
+def _zip(entries: list[tuple[str, bytes]], linked: str, mode: int, compression: int, host: int) -> bytes:
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w", compression) as archive:
         for name, data in entries:
             entry = zipfile.ZipInfo(name or "-")
-            entry.compress_type = compression
+            entry.compress_type, entry.create_system = compression, host
             entry.external_attr = (mode if name == linked else 0o100644) << 16
             archive.writestr(entry, data)
     return out.getvalue()

@@ -13,6 +13,7 @@ import pytest
 
 from rebar_depth_bench.base.errors import InputError, SubmissionError
 from rebar_depth_bench.cli.main import main
+from rebar_depth_bench.cli.submit import read_token
 from rebar_depth_bench.remote import leaderboard_client
 from rebar_depth_bench.remote.leaderboard_client import AnswerError, LeaderboardClient, ServiceError
 from tests.leaderboard.conftest import Refused, SharedServer, WriteArchive
@@ -86,10 +87,16 @@ def test_wrong_token_or_url_is_reported_before_upload(
     assert "uploading" not in process.stderr
 
 
-@pytest.mark.parametrize("content", ["", " \n", "\x1b[2J"])
-def test_token_file_without_a_token_exits_2(tmp_path: Path, content: str) -> None:
+def test_token_file_of_windows_is_read(tmp_path: Path) -> None:
+    """Set-Content -Encoding utf8 of PowerShell 5.1 begins a file with a byte order mark."""
+    (tmp_path / "token").write_bytes(b"\xef\xbb\xbfrdb_x\r\n")
+    assert read_token(str(tmp_path / "token")) == "rdb_x"
+
+
+@pytest.mark.parametrize("content", [b"", b" \n", b"\x1b[2J", "rdb_x".encode("utf-16")])
+def test_token_file_without_a_token_exits_2(tmp_path: Path, content: bytes) -> None:
     token = tmp_path / "token"
-    token.write_text(content)
+    token.write_bytes(content)
     process = run_bench("submit", tmp_path / "a.zip", "--url", "http://127.0.0.1:9", "--token-file", token)
     assert process.returncode == 2
     assert f"{token}: " in process.stderr

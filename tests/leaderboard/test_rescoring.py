@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sqlite3
+import zipfile
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -191,6 +192,14 @@ def test_only_the_split_test_is_accepted(split_root: Path, tmp_path: Path) -> No
     assert "split train" in str(problem)
     accepted = check(write_split_archive(split_root, tmp_path / "test.zip", "test"), str(split_root))
     assert accepted.method == "exact"
+
+
+@pytest.mark.slow
+def test_archive_of_macos_is_accepted(split_root: Path, tmp_path: Path) -> None:
+    archive = write_split_archive(split_root, tmp_path / "test.zip", "test")
+    with zipfile.ZipFile(archive, "a") as zipped:
+        zipped.writestr("__MACOSX/._submission.json", bytes.fromhex("0005160700020000"))
+    assert check(archive, str(split_root)).method == "exact"
 
 
 @pytest.mark.slow

@@ -30,6 +30,8 @@ FILES = {
     "long": f"quota = '{'many' * 200_000}'".encode(),
     "escape": rb'"\u001b[2J" = 1',
     "latin": b'title = "\xe4"',
+    "utf16": "quota = 3".encode("utf-16"),
+    "bom": b"\xef\xbb\xbfquotta = 3",
 }
 
 
@@ -49,6 +51,8 @@ class Case:
 COMMAND_WITHOUT_DATA = "serve --state-dir HERE/state"
 CASES = {
     "unknown key": Case("quotta: there is no such setting", "--settings HERE/unknown"),
+    "unknown key after a byte order mark": Case("quotta: there is no such setting", "--settings HERE/bom"),
+    "UTF-16": Case("the text is UTF-16", "--settings HERE/utf16"),
     "unknown key with a secret": Case("dbb: there is no such setting", "--settings HERE/secret"),
     "parameter of the settings class": Case("_env_file: there is no such setting", "--settings HERE/parameter"),
     "device as TOML file": Case("cannot be read: it is a device", "--settings /dev/zero"),

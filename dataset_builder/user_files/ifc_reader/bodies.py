@@ -135,11 +135,15 @@ def xyz(coordinates: tuple[float, ...]) -> tuple[float, float, float]:
 
 @dataclass(frozen=True, eq=False)
 class BodyItem:
-    """Item of a body, its ``object_from_item`` and the factor by which that scales lengths."""
+    """Item of a body, its ``object_from_item``, the factor by which that scales lengths, and its map's use.
+
+    ``use`` is the number of the IfcMappedItem that shows the item, 0 for none: a map is shown several times.
+    """
 
     item: Entity
     object_from_item: Float64[ndarray, "4 4"]
     scale: float
+    use: int = 0
 
 
 def body_items(model: Model, entity: Entity, types: list[Entity]) -> list[BodyItem]:
@@ -193,7 +197,7 @@ def _resolved(items: list[BodyItem]) -> list[BodyItem]:
     """Return the items with each IfcMappedItem replaced by the items of its map."""
     pending = items[::-1]
     resolved: list[BodyItem] = []
-    for _ in range(_MAX_BODY_ITEMS):
+    for use in range(1, _MAX_BODY_ITEMS + 1):
         if not pending:
             return resolved
         outer = pending.pop()
@@ -203,5 +207,5 @@ def _resolved(items: list[BodyItem]) -> list[BodyItem]:
         mapped, factor = mapped_matrix(outer.item)
         matrix, scale = outer.object_from_item @ mapped, outer.scale * factor
         inside = outer.item.MappingSource.MappedRepresentation.Items
-        pending += [BodyItem(item, matrix, scale) for item in reversed(inside)]
+        pending += [BodyItem(item, matrix, scale, use) for item in reversed(inside)]
     raise ValueError(f"the body has more than {_MAX_BODY_ITEMS} items, or circular maps")

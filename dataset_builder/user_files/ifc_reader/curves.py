@@ -7,6 +7,7 @@ define them. Anything else raises ``ValueError``.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -42,6 +43,11 @@ class Sampled:
     shares: Float64[ndarray, " n"]
     parameters: float
 
+    @property
+    def length(self) -> float:
+        """Length of the line through the samples."""
+        return float(np.linalg.norm(np.diff(self.line, axis=0), axis=1).sum())
+
     def points(self) -> Float64[ndarray, "n 3"]:
         """Return the sampled points."""
         return self.line
@@ -61,17 +67,19 @@ class Sampled:
 
 @dataclass(frozen=True, eq=False)
 class Leg(Sampled):
-    """Straight leg; ``parameters`` is its parameter range: 1 in a polyline, else a multiple of a line's vector."""
+    """Straight leg; ``parameters`` is its parameter range: 1 in a polyline, else a multiple of a line's vector.
+
+    ``legs`` is the number of legs of its polyline, 1 for a line.
+    """
+
+    legs: int = 1
 
     @classmethod
-    def between(cls, start: Float64[ndarray, " 3"], end: Float64[ndarray, " 3"], parameters: float = 1.0) -> Leg:
+    def between(
+        cls, start: Float64[ndarray, " 3"], end: Float64[ndarray, " 3"], parameters: float = 1.0, legs: int = 1
+    ) -> Leg:
         """Return the leg between two points."""
-        return cls(np.array([start, end]), np.array([0.0, 1.0]), parameters)
-
-    @property
-    def length(self) -> float:
-        """Length of the leg."""
-        return float(np.linalg.norm(self.line[1] - self.line[0]))
+        return cls(np.array([start, end]), np.array([0.0, 1.0]), parameters, legs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +96,11 @@ class Arc:
     first_rad: float
     turn_rad: float
     parameters: float
+
+    @property
+    def length(self) -> float:
+        """Length of the arc of a circle; that of an ellipse is by its first half axis."""
+        return abs(self.turn_rad) * float(np.linalg.norm(self.x_axis))
 
     def points(self) -> Float64[ndarray, "n 3"]:
         """Return points at most ``ARC_STEP_DEG`` apart, including both ends."""
@@ -177,8 +190,36 @@ def curve_pieces(curve: Any, angle_rad: float, depth: int = 0) -> list[Piece]:
     return pieces
 
 
+def directrix(solid: Any, angle_rad: float) -> tuple[list[Piece], float, float | None]:
+    """Return the pieces of an IfcSweptDiskSolid's curve, and the parameters from and to which it is swept.
+
+    Of a line, a circle and an ellipse they are the swept part, from 0. The end is None if it is that of the curve.
+    Raises ``ValueError`` as ``curve_pieces`` does, and if a line has no ends or a circle is swept beyond a turn.
+    """
+    curve, start, end = solid.Directrix, solid.StartParam, solid.EndParam
+    size = math.nan if start is None or end is None else float(end) - float(start)
+    turn_rad = size * angle_rad
+    if curve.is_a("IfcLine"):
+        if not 0 < size < math.inf:
+            found = f"the disc is swept along an IfcLine from StartParam {start} to EndParam {end}"
+            raise ValueError(f"{found}, expected both, the second above the first: a line has no ends")
+        origin, along = _origin_and_vector(curve)
+        return [Leg.between(origin + start * along, origin + end * along, size)], 0.0, size
+    # From 0 to 1, and from 0 to a turn or more, programs mean the whole curve.
+    if (
+        curve.is_a("IfcConic")
+        and size > 0
+        and (start or (end != 1 and turn_rad < _FULL_TURN_RAD - _ANGLE_NOISE_RAD))
+    ):
+        if turn_rad > _FULL_TURN_RAD + _ANGLE_NOISE_RAD:
+            raise ValueError(f"the disc is swept from {start} to {end} along a circle, expected at most one turn")
+        arc = replace(_conic(curve, angle_rad), first_rad=start * angle_rad, turn_rad=turn_rad, parameters=size)
+        return [arc], 0.0, size
+    return curve_pieces(curve, angle_rad), float(start or 0.0), None if end is None else float(end)
+
+
 def _legs(points: Float64[ndarray, "n 3"]) -> list[Piece]:
-    return [Leg.between(start, end) for start, end in pairwise(points)]
+    return [Leg.between(start, end, legs=len(points) - 1) for start, end in pairwise(points)]
 
 
 def _indexed_curve(curve: Any, angle_rad: float) -> list[Piece]:
@@ -234,13 +275,17 @@ def _trimmed_curve(curve: Any, angle_rad: float, depth: int) -> list[Piece]:
 
 
 def _trimmed_line(curve: Any, line: Any) -> Leg:
-    start = np.array(point_xyz(line.Pnt))
-    along = unit_vector(line.Dir.Orientation) * line.Dir.Magnitude
+    start, along = _origin_and_vector(line)
     first, last = (
         _trim_parameter(curve, trim, lambda point: float((point - start) @ along / (along @ along)), 1.0)
         for trim in "12"
     )
     return Leg.between(start + first * along, start + last * along, abs(last - first))
+
+
+def _origin_and_vector(line: Any) -> tuple[Float64[ndarray, " 3"], Float64[ndarray, " 3"]]:
+    """Return the points of an IfcLine at the parameter 0, and its vector to that at 1."""
+    return np.array(point_xyz(line.Pnt)), unit_vector(line.Dir.Orientation) * line.Dir.Magnitude
 
 
 def _trimmed_conic(curve: Any, conic: Any, angle_rad: float) -> Arc:

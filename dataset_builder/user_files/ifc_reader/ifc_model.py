@@ -9,6 +9,7 @@ coordinates by zero.
 
 from __future__ import annotations
 
+import codecs
 import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -27,6 +28,7 @@ from dataset_builder.user_files.ifc_reader.step_text import (
     tokens,
 )
 from rebar_depth_bench.base.errors import MeshError, escape_text
+from rebar_depth_bench.base.reading import decode_text
 
 Entity = Any
 """An ``ifcopenshell.entity_instance``, with the attributes of its IFC class."""
@@ -76,7 +78,10 @@ def open_model(content: bytes) -> Model:
     Raises ``MeshError`` if the file is not a complete IFC file: truncated, of an unknown schema, with text that
     is not an instance, or with instances that the parser cannot read; ``MemoryError`` at the limit of memory.
     """
-    text = content.decode("utf-8", errors="replace")
+    text, problems = decode_text(content)
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+        raise MeshError(str(problems[0]))
+    text = text or content.decode("utf-8", errors="replace")  # Some programs write Latin-1.
     step = StepText(text)
     try:
         file = ifcopenshell.file.from_string(text)

@@ -60,8 +60,12 @@ class Network:
         """Return the description with ``label`` in the name and the digest of the weights in the summary.
 
         Different weights are thus a different method, and an interrupted prediction is not resumed with them.
+        Raises ``MethodError`` if a file cannot be read.
         """
-        info = self.described(f"weights sha256:{files_digest(files)}")
+        try:
+            info = self.described(f"weights sha256:{files_digest(files)}")
+        except OSError as error:
+            raise MethodError(f"{error.filename}: cannot be read: {error.strerror}") from None
         return replace(info, name=f"{info.name}:{label}")
 
     def check_folder(self, folder: Path, *required_files: str) -> None:

@@ -6,6 +6,7 @@ import os
 import socket
 import time
 import tracemalloc
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -26,6 +27,13 @@ from rebar_depth_bench.base.reading import (
 from rebar_depth_bench.base.terminal import terminal_text
 from rebar_depth_bench.base.validation import with_lines
 from rebar_depth_bench.base.writing import write_text
+from rebar_depth_bench.captures.calibration_files import read_calibration
+from rebar_depth_bench.captures.images import read_image, read_image_shape
+from rebar_depth_bench.data.bars import read_bars
+from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.detections.reading import read_detections
+from rebar_depth_bench.methods.onnx.external_data import external_files
+from rebar_depth_bench.methods.onnx.spec import read_onnx_toml
 
 
 def test_file_above_the_limit_is_not_read(tmp_path: Path) -> None:
@@ -50,7 +58,8 @@ def test_file_above_the_limit_is_not_read(tmp_path: Path) -> None:
         (b"[NaN]", "syntax"),
         (b'["\\ud800"]', "syntax"),
         (b'"\xff"', "syntax"),
-        (b"\xef\xbb\xbf{}", "syntax"),
+        ("{}".encode("utf-16"), "syntax"),
+        (b"\xef\xbb\xbf\xef\xbb\xbf{}", "syntax"),
         (b"1" * 4400, "syntax"),
         (b"", "syntax"),
         (b'{"a": 1} x', "syntax"),
@@ -113,6 +122,56 @@ def test_only_regular_files_and_links_to_them_are_opened(tmp_path: Path) -> None
         server.bind(str(tmp_path / "socket"))
         with pytest.raises(OSError, match=r"."):
             open_regular(tmp_path / "socket")
+
+
+LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:" + b"4d" * 32 + b"\nsize 12345\n"
+"""Pointer file, as the specification of git LFS defines it: the version comes first."""
+
+
+@pytest.mark.parametrize(
+    ("name", "read"),
+    [
+        ("model.onnx", external_files),
+        ("manifest.json", lambda path: open_folder(path.parent)),
+        ("bars.parquet", read_bars),
+        ("left.png", read_image_shape),
+        ("left.jpg", lambda path: read_image(path, (3, 4))),
+        ("rig.toml", lambda path: read_calibration(path, 4, 3)),
+        ("rows.csv", lambda path: read_detections(path, {})),
+    ],
+)
+def test_pointer_of_git_lfs_is_named(tmp_path: Path, name: str, read: Callable[[Path], object]) -> None:
+    path = tmp_path / name
+    path.write_bytes(LFS)
+    with pytest.raises(InputError, match=r"is a pointer of git LFS, .*git lfs pull"):
+        read(path)
+    path.write_bytes(LFS[:40])  # Any other text is as it was.
+    with pytest.raises(InputError) as raised:
+        read(path)
+    assert "LFS" not in str(raised.value)
+
+
+TEXTS: list[tuple[str, str, Callable[[Path], object]]] = [
+    ("manifest.json", "{}", lambda path: open_folder(path.parent)),
+    ("rows.csv", "view_id,x,y,z\nmat/0,1,2,3\n", lambda path: read_detections(path, {})),
+    ("model.toml", "sumary = 1\n", read_onnx_toml),
+]
+
+
+@pytest.mark.parametrize(("name", "text", "read"), TEXTS)
+def test_texts_of_windows_are_read_or_named(
+    tmp_path: Path, name: str, text: str, read: Callable[[Path], object]
+) -> None:
+    """PowerShell 5.1 writes UTF-16 with ``>``, and a byte order mark with Set-Content -Encoding utf8."""
+    messages = []
+    for encoding in ("utf-8", "utf-8-sig", "utf-16", "utf-16-be"):
+        mark = "\ufeff" if encoding == "utf-16-be" else ""
+        (tmp_path / name).write_bytes((mark + text).encode(encoding))
+        with pytest.raises(InputError) as raised:  # Other keys are expected, so what was read is in the message.
+            read(tmp_path / name)
+        messages.append(str(raised.value))
+    assert messages[0] == messages[1]
+    assert ["UTF-16" in message for message in messages] == [False, False, True, True]
 
 
 def test_variable_raises_a_limit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -172,6 +172,13 @@ def test_weights_folder_inside_clone_is_accepted(tmp_path: Path) -> None:
         find_method(f"foundation-stereo:{clone}")
 
 
+def test_weights_that_are_a_pointer_of_git_lfs_are_named(tmp_path: Path) -> None:
+    weights = stand_ins.stereo_clone(tmp_path / "clone") / "pretrained_models" / "23-51-11" / "model_best_bp2.pth"
+    weights.write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:4d4d\nsize 12\n")
+    with pytest.raises(MethodError, match=r"model_best_bp2.pth: cannot be read: it is a pointer of git LFS"):
+        stereo_method(tmp_path)
+
+
 def test_foreign_core_package_is_refused(tmp_path: Path, site: Path) -> None:
     (site / "core").mkdir()
     (site / "core" / "foundation_stereo.py").write_text("FoundationStereo = None\n")

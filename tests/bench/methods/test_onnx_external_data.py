@@ -47,6 +47,15 @@ def write_external_model(folder: Path, location: str) -> Path:
     return write_toml(folder)
 
 
+def test_weights_that_are_a_pointer_of_git_lfs_are_named(tmp_path: Path) -> None:
+    toml = write_external_model(tmp_path, "weights.bin")
+    (tmp_path / "weights.bin").write_bytes(
+        b"version https://git-lfs.github.com/spec/v1\noid sha256:4d4d\nsize 12\n"
+    )
+    with pytest.raises(MethodError, match=r"weights.bin: cannot be read: it is a pointer of git LFS"):
+        find_method(str(toml))
+
+
 def model_with_tensor(place: Callable[[ModelProto, TensorProto], None], location: str) -> bytes:
     model = helper.make_model(helper.make_graph([], "g", [], []))
     place(model, external(location))

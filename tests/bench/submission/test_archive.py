@@ -200,13 +200,6 @@ def test_unknown_entries_are_explained() -> None:
     assert [problem.expected for problem in problems] == [*explained.values()]
 
 
-def test_macos_entries_are_one_problem_with_a_remedy() -> None:
-    junk = [Record(b"__MACOSX/lattice/._0000.npy", b"x"), Record(b"lattice/.DS_Store", b"x")]
-    (problem,) = problems_of([*GOOD, *junk])
-    assert (problem.code, problem.where) == ("unknown", "__MACOSX/lattice/._0000.npy")
-    assert "zip with:" in problem.expected
-
-
 def test_missing_views_and_metadata_are_reported() -> None:
     (problem,) = problems_of([META, FIRST])
     assert (problem.code, problem.where) == ("missing", "lattice/0001")

@@ -43,6 +43,7 @@ class Record:
     local_extra: bytes = b""
     local_size: int | None = None
     disk: int = 0
+    host: int = 3
 
 
 def check_archive(path: str | Path, expected: ExpectedViews) -> list[Problem]:
@@ -73,7 +74,7 @@ def build(records: list[Record], *, count: int | None = None, comment: bytes = b
             numbers = (crc, packed, local_size, len(name), len(record.local_extra))
             out.write(struct.pack("<4s5H3L2H", b"PK\3\4", 20, record.flags, method, 0, 33, *numbers))
             out.write(name + record.local_extra + record.data)
-        head = struct.pack("<4s4B4H", b"PK\1\2", 20, 3, 20, 0, record.flags, record.method, 0, 33)
+        head = struct.pack("<4s4B4H", b"PK\1\2", 20, record.host, 20, 0, record.flags, record.method, 0, 33)
         head += struct.pack("<3L3H", crc, packed, size, len(record.name), len(record.extra), 0)
         directory += head + struct.pack("<2H2L", record.disk, 0, record.mode << 16, offset)
         directory += record.name + record.extra

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from dataset_builder.user_files.cage_file import cage_file_spec, mesh_file_spec
 from rebar_depth_bench.base.errors import MeshError
 from rebar_depth_bench.data.bars import Bar
 from tests.builder.scene.cages import assembly_of
@@ -55,6 +57,19 @@ def column_with(old: str, new: str) -> str:
 )  # fmt: skip
 def test_damaged_files_are_rejected(content: str, words: str) -> None:
     assert_rejected(content, words)
+
+
+def test_texts_of_windows_and_pointers_of_git_lfs(tmp_path: Path) -> None:
+    """A byte order mark is no part of the text; names of an older program are Latin-1."""
+    text = COLUMN.read_text()
+    assert len(bars_in_process(b"\xef\xbb\xbf" + text.encode())) == 13
+    assert len(bars_in_process(text.replace("('')", "('B\xfcro')", 1).encode("latin-1"))) == 13
+    with pytest.raises(MeshError, match=r"^a.ifc: the text is UTF-16, expected UTF-8 text"):
+        bars_in_process(text.encode("utf-16"))
+    for name, spec in (("a.ifc", cage_file_spec), ("a.obj", partial(mesh_file_spec, unit="m"))):
+        (tmp_path / name).write_bytes(b"version https://git-lfs.github.com/spec/v1\noid sha256:4d4d\nsize 12\n")
+        with pytest.raises(MeshError, match="it is a pointer of git LFS"):
+            spec(tmp_path / name)
 
 
 POINT = "#24=IFCCARTESIANPOINT((-46.,-46.,0.1));"
