@@ -13,6 +13,7 @@ their place::
 
     calibration = "stereo.yml"    # or two files: ["left.yaml", "right.yaml"]
     unit = "mm"                   # of lengths in OpenCV's, ROS' and Kalibr's files; default: "m"
+    rectified = false             # whether the pictures are rectified and have the file's matrix P
 
     [board]                       # ArUco board, see geometry.aruco_board; default: its A3 sheet of 6 markers
     markers = 12
@@ -112,6 +113,7 @@ class _CamerasTable(StrictModel):
         Expected("the name of a file beside this one, or two"),
     ] = None
     unit: Annotated[str, one_of(*UNITS_M)] = "m"
+    rectified: bool | None = None
     board: _Board | None = None
     pose: tuple[_PoseTable, ...] = Field(default=(), strict=False)
     width: Any = None
@@ -141,7 +143,7 @@ def read_cameras(root: Path, images: Sequence[str], width: int, height: int, *, 
     """
     path = root / CAMERAS_FILE
     if not path.exists():
-        calibration = _file_calibration(_found_files(root), 1.0, width, height, is_stereo=is_stereo)
+        calibration = _file_calibration(_found_files(root), _CamerasTable(), width, height, is_stereo=is_stereo)
         return CaptureCameras(calibration, None, {})
     content = read_file(path, TOML_BYTES, "the cameras of a capture", CalibrationError)
     document, problems = parse_toml(content)
@@ -187,7 +189,7 @@ def cameras_of_table(
     else:
         names = [table.calibration] if isinstance(table.calibration, str) else list(table.calibration or ())
         paths = [path.parent / name for name in names]
-        calibration = _file_calibration(paths, UNITS_M[table.unit], width, height, is_stereo=is_stereo)
+        calibration = _file_calibration(paths, table, width, height, is_stereo=is_stereo)
     return CaptureCameras(calibration, None if table.board is None else table.board.spec, poses)
 
 
@@ -205,9 +207,9 @@ def _found_files(root: Path) -> list[Path]:
 
 
 def _file_calibration(
-    paths: Sequence[Path], unit_m: float, width: int, height: int, *, is_stereo: bool
+    paths: Sequence[Path], stated: _CamerasTable, width: int, height: int, *, is_stereo: bool
 ) -> Calibration:
-    """Return the calibration in one or two files, scaled to the image size."""
+    """Return the calibration in one or two files, of the ``stated`` unit, scaled to the image size."""
     source = " and ".join(map(str, paths))
     if paths[0].suffix.lower() not in DOCUMENT_SUFFIXES:
         return read_calibration(paths[0], width, height)
@@ -215,7 +217,10 @@ def _file_calibration(
     problems: list[Problem] = []
     contents = {path.name: read_file(path, TOML_BYTES, "a calibration file", CalibrationError) for path in paths}
     documents = {name: parse_document(name, content, problems) for name, content in contents.items()}
-    calibration = None if problems else program_calibration(documents, width, height, unit_m, problems)
+    calibration = None
+    if not problems:
+        unit_m = UNITS_M[stated.unit]
+        calibration = program_calibration(documents, width, height, unit_m, problems, rectified=stated.rectified)
     if calibration is None:
         for name, content in contents.items():
             problems = with_lines(problems, content, name)

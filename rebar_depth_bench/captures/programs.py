@@ -1,17 +1,20 @@
-"""Calibrations as OpenCV, ROS and Kalibr write them.
+"""Calibrations as OpenCV, ROS and Kalibr write them; ``captures.program_formats`` has their fields.
 
 - OpenCV's FileStorage has no fixed names. Those of its stereo sample (M1, D1, M2, D2, R, T), of its calibration
   sample (camera_matrix, distortion_coefficients, image_width), and their common spellings are known. The unit of T
   is that of the calibration target's squares: metres unless another unit is stated.
 - ROS: ``camera_info`` as camera_calibration writes it (camera_matrix, ...) or as a printed message (K or k, ...).
   The motion of a pair follows from the rectification of both cameras: x_rectified = R_i x_i, P[0, 3] = -fx B.
+  K and P are those of the full sensor; the pictures may be a region of it, divided by the binning (REP 104).
 - Kalibr: a camera chain with cam0 and, for a pair, cam1 with T_cn_cnm1 = cam1_from_cam0.
+
+Pictures are those of the camera, with its matrix and distortion, unless they are stated to be rectified: they have
+the projection matrix P then, no distortion, and for a pair the baseline that P states.
 """
 
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -25,88 +28,50 @@ from rebar_depth_bench.base.errors import Problem, ProblemCode
 from rebar_depth_bench.base.reading import parse_number
 from rebar_depth_bench.base.validation import format_location, short_repr
 from rebar_depth_bench.captures.calibration import Calibration, table_calibration
+from rebar_depth_bench.captures.fields import DISTORTION_TERMS, FileFormat, lens_problem, plain_key
+from rebar_depth_bench.captures.program_formats import CAMERA, EYES, KALIBR, PAIR
 from rebar_depth_bench.geometry.cameras import is_rotation, nearest_rotation, rotation_matrix
 
 Document = Mapping[str, Any]
 Values = Float64[ndarray, "..."]
-Fields = Mapping[str, Sequence[str]]
-"""Keys of each value that is read; the first one that a document has counts, without case and punctuation."""
 
-_KNOWN_MODEL = "k1 k2 p1 p2 k3 (plumb_bob, radtan); rectify the images first"
 _CAMERAS = ("left", "right")
+_REGION = ("x_offset", "y_offset", "width", "height")
 _MAX_NUMBERS = 100
 _MAX_MAGNITUDE = 1e9
 _ROUNDED_ROTATION = 1e-4
 """Largest deviation of ``R @ R.T`` from the identity in a file with few digits; it is made exact."""
-_DISTORTION_TERMS = 5
-_MODELS = ("plumb_bob", "radtan", "rational_polynomial", "none", "")
-"""Distortion models whose first terms are k1 k2 p1 p2 k3, or of a camera without distortion."""
-
-_ROS: Fields = {
-    "matrix": ("camera_matrix", "K"),
-    "distortion": ("distortion_coefficients", "D"),
-    "model": ("distortion_model",),
-    "width": ("image_width", "width"),
-    "height": ("image_height", "height"),
-    "rotation": ("rectification_matrix", "R"),
-    "projection": ("projection_matrix", "P"),
-}
-_KALIBR: Fields = {
-    "matrix": ("intrinsics",),
-    "distortion": ("distortion_coeffs",),
-    "model": ("distortion_model",),
-    "size": ("resolution",),
-    "projection model": ("camera_model",),
-    "motion": ("T_cn_cnm1",),
-}
-
-
-def _opencv_fields(eyes: Sequence[str]) -> Fields:
-    """Return the fields of a camera of OpenCV; ``eyes`` are the spellings of which one, before or after a name."""
-
-    def spellings(*names: str) -> tuple[str, ...]:
-        return tuple(spelling for name in names for eye in eyes for spelling in (name + eye, eye + name))
-
-    return {
-        "matrix": spellings("M", "K", "camera_matrix", "intrinsics", "intrinsic_matrix", "mtx", "cam_matrix"),
-        "distortion": spellings(
-            *("D", "distortion", "distortion_coefficients", "distortion_coeffs"),
-            *("dist", "dist_coeffs", "dist_coeff"),
-        ),
-        "model": ("distortion_model",),
-        "fisheye": ("fisheye_model",),
-        "size": ("image_size", "size", "camera_resolution", "resolution"),
-        "width": ("image_width", "width"),
-        "height": ("image_height", "height"),
-        "rotation": ("R", "rotation", "rotation_matrix", "rmat"),
-        "translation": ("T", "translation", "translation_vector", "tvec"),
-    }
-
-
-_OPENCV = _opencv_fields([""])
-_OPENCV_PAIR = (_opencv_fields(["1", "left", "l"]), _opencv_fields(["2", "right", "r"]))
+_STATED_IN = "cameras.toml"
+_ROUNDED_PX = 0.01
+"""Largest difference of K and P that is due to the digits of a file, pixels."""
 
 
 @dataclass(frozen=True)
 class _Reader:
     """Values of a document ``name``; problems are added to ``problems``, in place of which zeros are returned.
 
-    ``sources`` names the files of the keys of a document that was put together from several.
+    Notes are added to ``notes``. ``sources`` names the files of the keys of a document that was put together from
+    several.
     """
 
     name: str
     document: Document
     problems: list[Problem]
-    fields: Fields
+    notes: list[str]
+    fields: FileFormat
     sources: Mapping[str, str] = field(default_factory=dict)
 
     @cached_property
     def _keys(self) -> Mapping[str, str]:
-        return {_plain(str(key)): key for key in self.document}
+        return {plain_key(str(key)): key for key in self.document}
+
+    def keys(self, name: str) -> list[str]:
+        """Return the keys of a field in the document."""
+        return [self._keys[key] for key in map(plain_key, self.fields.keys(name)) if key in self._keys]
 
     def key(self, name: str) -> str | None:
-        """Return the key of a field in the document, None if it has none."""
-        return next((self._keys[key] for key in map(_plain, self.fields.get(name, ())) if key in self._keys), None)
+        """Return the first key of a field in the document, None if it has none."""
+        return next(iter(self.keys(name)), None)
 
     def numbers(self, name: str, *shapes: tuple[int, ...], default: Values | None = None) -> Values:
         """Return the numbers of a field, in one of ``shapes``; a side that is -1 may have any length."""
@@ -127,22 +92,77 @@ class _Reader:
         self.problem("invalid", name, f"got {short_repr(value)}", expected)
         return zeros
 
-    def lens(self) -> dict[str, Any]:
-        """Return the table of the lens for ``table_calibration``."""
-        if self.fields is _KALIBR:  # Its intrinsics are these four numbers.
-            pinhole = dict(zip(("fx", "fy", "cx", "cy"), self.numbers("matrix", (4,)).tolist(), strict=True))
-        else:
-            pinhole = {"K": self.numbers("matrix", (3, 3)).tolist()}
-        terms = self.numbers("distortion", (-1,), default=np.zeros(_DISTORTION_TERMS))
-        key = self.key("model")
-        model = "" if key is None else self.document[key]
-        found = f"the distortion has {len(terms)} terms" if terms[_DISTORTION_TERMS:].any() else ""
-        if str(model).lower() not in _MODELS:
-            found = f"the distortion model is {short_repr(model)}"
-        if found:
-            self.problems.append(Problem("invalid", self.name, found, _KNOWN_MODEL))
-        distortion = [*terms[:_DISTORTION_TERMS].tolist(), *[0.0] * (4 - len(terms))]
-        return {**pinhole, "distortion": distortion}
+    @cached_property
+    def matrix(self) -> Values:
+        """Pinhole matrix of the camera."""
+        if self.fields is KALIBR:
+            fx, fy, cx, cy = self.numbers("matrix", (4,)).tolist()
+            return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])
+        matrix = self.numbers("matrix", (3, 3))
+        if not matrix[:2, 2].any() and matrix[2, :2].any():
+            expected = "rows of [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"
+            self.problem("invalid", "matrix", f"the rows of {matrix.tolist()} are columns", expected)
+        return matrix
+
+    @cached_property
+    def projection(self) -> Values | None:
+        """Matrix P of the rectified camera, 3 x 4 or 3 x 3; None if the document has none or zeros."""
+        projection = self.numbers("projection", (3, 4), (3, 3), default=np.zeros((3, 4)))
+        return projection if projection.any() else None
+
+    @cached_property
+    def distortion(self) -> list[float]:
+        """Terms k1 k2 p1 p2 k3, after the check that they describe the lens."""
+        terms = self.numbers("distortion", (-1,), default=np.zeros(DISTORTION_TERMS)).tolist()
+        models = {key: self.document[key] for key in (*self.keys("camera model"), *self.keys("distortion model"))}
+        one_each = [key for key in self.keys("other lenses") if any(_flattened(self.document[key]))]
+        found = [lens_problem(self.key_place(key), {key: self.document[key]}) for key in one_each]
+        found += [lens_problem(self.key_place(key), {key: models[key]}) for key in self.keys("camera model")]
+        if not any(found):
+            found = [lens_problem(self.name, models, terms)]
+        self.problems.extend(problem for problem in found if problem is not None and problem not in self.problems)
+        return [*terms[:DISTORTION_TERMS], *[0.0] * (4 - len(terms))]
+
+    def on_pictures(self, matrix: Values, width: int, height: int) -> tuple[Values, dict[str, float]]:
+        """Return a matrix of the sensor on pictures of ``width`` x ``height``, and the image size that it is for.
+
+        By REP 104 ``roi`` is in pixels of the sensor, and the pictures show it divided by the binning. Pixel
+        centres are at integers: cx' = (cx - x + 0.5) / binning - 0.5; ROS' image_geometry leaves out the halves.
+        Pictures of the full size are not cropped; without ``roi``, those of another size show all of the sensor.
+        """
+        size, pictures = self.size(), [width, height]
+        sensor = list(size.values())
+        bin_x, bin_y = (max(1.0, self.numbers(f"binning {axis}", (1,), default=np.zeros(1))[0]) for axis in "xy")
+        key = self.key("region")
+        roi = {} if key is None else self.document[key]
+        fields = [roi.get(name, 0) for name in _REGION] if isinstance(roi, dict) else roi
+        x, y, *sides = region = list(_flattened(fields)) or [0.0] * 4
+        if len(region) != 4 or not all(value >= 0 and value.is_integer() for value in (*region, bin_x, bin_y)):
+            self.problem("invalid", "region", f"got {short_repr(roi)}", f"whole numbers {', '.join(_REGION)}")
+            return matrix, size
+        has_region = any(region) and region != [0, 0, *sensor]
+        if has_region and not (
+            all(sides) and (not sensor or (x + sides[0] <= sensor[0] and y + sides[1] <= sensor[1]))
+        ):
+            found = f"{sides[0]:g} x {sides[1]:g} pixels at ({x:g}, {y:g}) are not inside width x height"
+            expected = (
+                "the size and K of the full sensor and a part of it (REP 104), or zeros and K of the pictures"
+            )
+            self.problem("conflict", "region", found, expected)
+        shown = [side // bin for side, bin in zip(sides if has_region else sensor, (bin_x, bin_y), strict=False)]
+        if (has_region or max(bin_x, bin_y) > 1) and shown == pictures:
+            cropped = np.diag([1 / bin_x, 1 / bin_y, 1.0]) @ (
+                matrix - [[0, 0, x - 0.5], [0, 0, y - 0.5], [0, 0, 0]]
+            )
+            return cropped - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], {"width": width, "height": height}
+        if has_region and sensor != pictures:
+            found = f"the pictures have {width} x {height} pixels"
+            self.problem(
+                "conflict", "region", found, f"{shown[0]:g} x {shown[1]:g}, or the size of the full sensor"
+            )
+        elif has_region or (bin_x, bin_y) != (1, 1):
+            self.notes.append(f"{self.name}: the pictures show all of the sensor; roi and binning are left out")
+        return matrix, size
 
     def size(self) -> dict[str, float]:
         """Return width and height, from one field with both or from two; nothing if the document has none."""
@@ -155,9 +175,9 @@ class _Reader:
         sides_px = {"width": width, "height": height}
         return {key: int(side_px) if side_px.is_integer() else side_px for key, side_px in sides_px.items()}
 
-    def rotation(self) -> Values:
-        """Return the rotation matrix, which the file may also hold as a rotation vector."""
-        rotation = self.numbers("rotation", (3, 3), (3,))
+    def rotation(self, name: str) -> Values:
+        """Return a rotation matrix, which the file may also hold as a rotation vector."""
+        rotation = self.numbers(name, (3, 3), (3,))
         return rotation_matrix(rotation) if rotation.ndim == 1 else rotation
 
     def problem(self, code: ProblemCode, name: str, found: str, expected: str) -> None:
@@ -166,7 +186,7 @@ class _Reader:
 
     def place(self, name: str) -> str:
         """Return the location of a field."""
-        return self.key_place(self.key(name) or self.fields[name][0])
+        return self.key_place(self.key(name) or (*self.fields.keys(name), name)[0])
 
     def key_place(self, key: str) -> str:
         """Return the location of a key."""
@@ -175,25 +195,36 @@ class _Reader:
 
 
 def program_calibration(
-    documents: Mapping[str, Document], width: int, height: int, unit_m: float, problems: list[Problem]
+    documents: Mapping[str, Document],
+    width: int,
+    height: int,
+    unit_m: float,
+    problems: list[Problem],
+    *,
+    rectified: bool | None,
 ) -> Calibration | None:
     """Return the calibration in one or two documents, by file name; of two, the left camera is the first.
 
-    ``unit_m`` is the unit of lengths in the documents, metres; ``width`` and ``height`` are the image size where
-    the documents state none. Problems are added to ``problems``; the result is None if there are any.
+    ``unit_m`` is the unit of lengths in the documents, metres; ``width`` and ``height`` are the size of the
+    pictures, ``rectified`` whether they are rectified, None if that is not stated. The calibration is for the size
+    that the documents state, or else for the pictures. Problems are added to ``problems``; the result is None if
+    there are any.
     """
-    cameras = [_Reader(name, document, problems, _ROS) for name, document in documents.items()]
-    find_motion: Callable[[_Reader, _Reader, float], tuple[Values, Values]] = _ros_motion
-    if not any(camera.key("matrix") and camera.key("projection") for camera in cameras):
-        merged = _merged(documents, problems)
-        if "cam0" in merged.document:
-            cameras, find_motion = _kalibr_cameras(merged), _kalibr_motion
-        else:
-            cameras, find_motion = _opencv_cameras(merged), _opencv_motion
-    table: dict[str, Any] = {eye: one.lens() for eye, one in zip(_CAMERAS, cameras, strict=False)}
-    table |= cameras[0].size()
+    notes: list[str] = []
+    cameras, find_motion = _cameras(documents, problems, notes)
+    is_rectified = _is_rectified(cameras, rectified, notes)
+    table: dict[str, Any] = {}
+    sizes = []
+    for eye, camera in zip(_CAMERAS, cameras, strict=False):
+        matrix = camera.projection[:, :3] if is_rectified and camera.projection is not None else camera.matrix
+        matrix, size = camera.on_pictures(matrix, width, height)
+        table[eye] = {"K": matrix.tolist(), "distortion": [0.0] * 4 if is_rectified else camera.distortion}
+        sizes.append(size)
+    table |= sizes[0]
     if len(cameras) == 2:
-        rotation, translation_m = find_motion(cameras[0], cameras[1], unit_m)
+        rotation, translation_m = (_rectified_motion if is_rectified else find_motion)(
+            cameras[0], cameras[1], unit_m
+        )
         if not is_rotation(rotation) and is_rotation(rotation, _ROUNDED_ROTATION):
             rotation = nearest_rotation(rotation)
         table["stereo"] = {"rotation": rotation.tolist(), "translation_m": translation_m.tolist()}
@@ -203,36 +234,100 @@ def program_calibration(
     calibration = table_calibration(table, width, height, table_problems, is_stereo=len(cameras) == 2)
     for problem in table_problems:
         eye, _, key = problem.where.partition(".")
-        place = cameras[eye == _CAMERAS[1]].place("matrix")
+        place = cameras[eye == _CAMERAS[1]].place("projection" if is_rectified else "matrix")
         problems.append(replace(problem, where=place, found=f"{key or eye}: {problem.found}"))
-    return calibration
+    if calibration is not None and sizes[0] and sizes[-1] and sizes[0] != sizes[-1]:
+        left, right = (" x ".join(map(str, size.values())) for size in sizes)
+        cameras[1].problem("conflict", "size", f"width x height is {right}", f"that of the left camera, {left}")
+    return None if calibration is None or problems else replace(calibration, notes=tuple(dict.fromkeys(notes)))
 
 
-def _merged(documents: Mapping[str, Document], problems: list[Problem]) -> _Reader:
+_Motion = Callable[[_Reader, _Reader, float], tuple[Values, Values]]
+
+
+def _cameras(
+    documents: Mapping[str, Document], problems: list[Problem], notes: list[str]
+) -> tuple[list[_Reader], _Motion]:
+    """Return the readers of the cameras in the documents, and the function for the motion of a pair."""
+    cameras = [_Reader(name, document, problems, notes, CAMERA) for name, document in documents.items()]
+    if len(cameras) == 2 and any(camera.key("matrix") and camera.key("projection") for camera in cameras):
+        for camera in cameras:
+            notes += CAMERA.notes(camera.name, camera.document)
+        return cameras, _ros_motion
+    merged, name = _merged(cameras), " and ".join(documents)
+    if "cam0" in merged.document:
+        cameras = _kalibr_cameras(merged)
+        keys = [*merged.document, *(key for camera in cameras for key in camera.document)]
+        notes += KALIBR.notes(name, dict.fromkeys(keys))
+        return cameras, _kalibr_motion
+    pair = [replace(merged, fields=fields) for fields in EYES]
+    right = pair[1].key("matrix")
+    is_pair = right is not None and isinstance(merged.document[right], dict | list)
+    notes += (PAIR if is_pair else CAMERA).notes(name, merged.document)
+    return pair if is_pair else [merged], _opencv_motion
+
+
+def _merged(readers: Sequence[_Reader]) -> _Reader:
     """Return the reader of all keys of the documents; a key with two values adds a problem."""
     merged: dict[str, Any] = {}
     sources: dict[str, str] = {}
-    for name, document in documents.items():
-        for key, value in document.items():
+    for reader in readers:
+        for key, value in reader.document.items():
             if key in merged and value != merged[key]:
-                place = format_location(f"{name}:", key)
-                problems.append(Problem("duplicate", place, f"differs from that in {sources[key]}", "one value"))
+                found = f"differs from that in {sources[key]}"
+                reader.problems.append(Problem("duplicate", reader.key_place(key), found, "one value"))
             merged.setdefault(key, value)
-            sources.setdefault(key, name)
-    return _Reader(next(iter(documents)), merged, problems, _OPENCV, sources)
+            sources.setdefault(key, reader.name)
+    return replace(readers[0], document=merged, sources=sources)
+
+
+def _is_rectified(cameras: Sequence[_Reader], rectified: bool | None, notes: list[str]) -> bool:
+    """Return whether the pictures have the matrices P; if that is not stated, they have the cameras', with a note.
+
+    Adds a problem if P is stated and missing, or if nothing but P tells that the pictures may be rectified.
+    """
+    for camera in cameras:
+        P = camera.projection
+        if rectified is None and P is not None:
+            unlike = np.abs(P[:, :3] - camera.matrix).max() > _ROUNDED_PX
+            rotation = camera.numbers("rectification", (3, 3), (3,), default=np.eye(3))
+            if unlike and not any(camera.distortion) and np.allclose(rotation, np.eye(3)):
+                found = (
+                    "differs from the matrix of the camera, which has no distortion: the pictures may be rectified"
+                )
+                expected = f"rectified = true (they have P) or false beside calibration in {_STATED_IN}"
+                camera.problem("conflict", "projection", found, expected)
+            elif unlike or any(camera.distortion):
+                found = "the pictures are taken as not rectified, with the camera's own matrix and distortion"
+                notes.append(
+                    f"{camera.name}: {found}; if they are rectified, state rectified = true in {_STATED_IN}"
+                )
+        elif rectified and P is None:
+            camera.problem("missing", "projection", "missing", "the matrix P of rectified pictures")
+        if rectified is not True and camera.key("distortion") is None:
+            notes.append(f"{camera.name}: no distortion is stated, taken as 0")
+    return rectified is True
+
+
+def _rectified_motion(left: _Reader, right: _Reader, unit_m: float) -> tuple[Values, Values]:
+    """Return rotation and translation (metres) of ``x_right = R x_left + T`` of rectified cameras."""
+    x_m = []
+    for camera in (left, right):
+        row = np.zeros(4) if camera.projection is None else camera.projection[0]
+        x_m.append(row[3] / row[0] * unit_m if len(row) == 4 and row[0] > 0 else math.nan)
+    if not x_m[1] < min(x_m[0], 0):
+        expected = "fx above 0 and P[0, 3] = -fx * baseline, of the right camera of a calibrated pair"
+        row = [] if right.projection is None else right.projection[0].tolist()
+        right.problem("invalid", "projection", f"got {short_repr(row)}", expected)
+        return np.eye(3), np.zeros(3)
+    return np.eye(3), np.array([x_m[1] - x_m[0], 0.0, 0.0])
 
 
 def _ros_motion(left: _Reader, right: _Reader, unit_m: float) -> tuple[Values, Values]:
     """Return rotation and translation (metres) of ``x_right = R x_left + T``."""
-    left_rotation, right_rotation = left.rotation(), right.rotation()
-    row = right.numbers("projection", (3, 4))[0]
-    fx, x = row[0], row[3]
-    if not fx > 0 > x:
-        expected = "fx above 0 and P[0, 3] = -fx * baseline, of the right camera of a calibrated pair"
-        right.problem("invalid", "projection", f"got {short_repr(row.tolist())}", expected)
-        return np.eye(3), np.zeros(3)
-    right_from_rectified = right_rotation.T
-    return right_from_rectified @ left_rotation, right_from_rectified @ np.array([x / fx * unit_m, 0.0, 0.0])
+    left_rotation, right_from_rectified = left.rotation("rectification"), right.rotation("rectification").T
+    _, offset_m = _rectified_motion(left, right, unit_m)
+    return right_from_rectified @ left_rotation, right_from_rectified @ offset_m
 
 
 def _kalibr_cameras(chain: _Reader) -> list[_Reader]:
@@ -243,10 +338,7 @@ def _kalibr_cameras(chain: _Reader) -> list[_Reader]:
             if not isinstance(table, dict):
                 chain.problems.append(Problem("invalid", place, f"got {short_repr(table)}", "a table"))
                 table = {}
-            cameras.append(_Reader(place, table, chain.problems, _KALIBR))
-            model = table.get("camera_model", "pinhole")
-            if model != "pinhole":
-                cameras[-1].problem("invalid", "projection model", f"got {short_repr(model)}", "pinhole")
+            cameras.append(_Reader(place, table, chain.problems, chain.notes, KALIBR))
     return cameras
 
 
@@ -256,24 +348,9 @@ def _kalibr_motion(_: _Reader, right: _Reader, unit_m: float) -> tuple[Values, V
     return right_from_left[:3, :3], unit_m * right_from_left[:3, 3]
 
 
-def _opencv_cameras(storage: _Reader) -> list[_Reader]:
-    """Return the readers of both cameras, or of one if the document has no matrix of a right camera."""
-    if float(storage.numbers("fisheye", (1,), default=np.zeros(1))[0]):
-        storage.problem("invalid", "fisheye", "got a fisheye calibration", _KNOWN_MODEL)
-    pair = [replace(storage, fields=fields) for fields in _OPENCV_PAIR]
-    right = pair[1].key("matrix")
-    is_pair = right is not None and isinstance(storage.document[right], dict | list)
-    return pair if is_pair else [storage]
-
-
 def _opencv_motion(left: _Reader, _: _Reader, unit_m: float) -> tuple[Values, Values]:
     """Return rotation and translation (metres) of ``x_right = R x_left + T``."""
-    return left.rotation(), unit_m * left.numbers("translation", (3,))
-
-
-def _plain(key: str) -> str:
-    """Return a key without case and punctuation."""
-    return re.sub("[^a-z0-9]", "", key.lower())
+    return left.rotation("rotation"), unit_m * left.numbers("translation", (3,))
 
 
 def _flattened(value: Any) -> Iterable[float]:
