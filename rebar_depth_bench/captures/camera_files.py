@@ -60,12 +60,15 @@ from rebar_depth_bench.captures.calibration import (
 from rebar_depth_bench.captures.calibration_files import check_image_size, read_calibration
 from rebar_depth_bench.captures.documents import DOCUMENT_SUFFIXES, parse_document
 from rebar_depth_bench.captures.programs import program_calibration
+from rebar_depth_bench.captures.recognised import recognised_problem
 from rebar_depth_bench.data.schema import BoardTable
 from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
 from rebar_depth_bench.geometry.cameras import is_rigid
 
 CAMERAS_FILE = "cameras.toml"
 CALIBRATION_SUFFIXES = (".conf", *DOCUMENT_SUFFIXES)
+_OTHER_SUFFIXES = (".txt", ".bin", ".h5", ".hdf5")
+"""Suffixes of the files that are looked at if a folder has no others."""
 _CALIBRATION_FILES = ("calibration.conf", "calibration.toml")
 _CALIBRATION_KEYS = ("width", "height", "left", "right", "stereo")
 
@@ -196,7 +199,11 @@ def cameras_of_table(
 def _found_files(root: Path) -> list[Path]:
     """Return the calibration files of a folder. Raises ``InputError`` unless there is one, or a pair."""
     own = [root / name for name in _CALIBRATION_FILES if (root / name).exists()]
-    others = sorted(path for path in root.iterdir() if path.suffix.lower() in DOCUMENT_SUFFIXES)
+    files = sorted(root.iterdir())
+    others = [path for path in files if path.suffix.lower() in DOCUMENT_SUFFIXES and path.suffix.lower() != ".txt"]
+    if not own and not others:
+        texts = [path for path in files if path.suffix.lower() in _OTHER_SUFFIXES]
+        others = [path for path in texts if path.name.lower() == "calib.txt" or recognised_problem(path)][:1]
     if len(own) == 1 or (not own and 1 <= len(others) <= 2):
         return own or others
     found = ", ".join(path.name for path in (*own, *others)[:5]) or "none"
@@ -206,15 +213,35 @@ def _found_files(root: Path) -> list[Path]:
     )
 
 
+def _own_calibration(path: Path, width: int, height: int, *, is_stereo: bool) -> Calibration:
+    """Return the calibration in a ``.conf`` or ``.toml`` file, which may have ``[left]`` alone for one camera."""
+    if is_stereo or path.suffix.lower() != ".toml":
+        return read_calibration(path, width, height)
+    check_image_size(path, width, height)
+    content = read_file(path, TOML_BYTES, "a calibration file", CalibrationError)
+    document, problems = parse_toml(content)
+    is_pair = "right" in document
+    calibration = None if problems else table_calibration(document, width, height, problems, is_stereo=is_pair)
+    if calibration is None:
+        raise CalibrationError.from_problems(path, with_lines(problems, content))
+    return scaled_calibration(calibration, path, width, height)
+
+
 def _file_calibration(
     paths: Sequence[Path], stated: _CamerasTable, width: int, height: int, *, is_stereo: bool
 ) -> Calibration:
     """Return the calibration in one or two files, of the ``stated`` unit, scaled to the image size."""
     source = " and ".join(map(str, paths))
-    if paths[0].suffix.lower() not in DOCUMENT_SUFFIXES:
-        return read_calibration(paths[0], width, height)
-    check_image_size(paths[0], width, height)
     problems: list[Problem] = []
+    if paths[0].suffix.lower() not in DOCUMENT_SUFFIXES:
+        problem = recognised_problem(paths[0])
+        if problem is None and stated.rectified:
+            expected = "a file with the matrix P of rectified pictures, of ROS or OpenCV"
+            problem = Problem("conflict", "", "has no matrix of rectified pictures", expected)
+        if problem is not None:
+            raise CalibrationError.from_problems(paths[0], [problem])
+        return _own_calibration(paths[0], width, height, is_stereo=is_stereo)
+    check_image_size(paths[0], width, height)
     contents = {path.name: read_file(path, TOML_BYTES, "a calibration file", CalibrationError) for path in paths}
     documents = {name: parse_document(name, content, problems) for name, content in contents.items()}
     calibration = None
@@ -222,6 +249,7 @@ def _file_calibration(
         unit_m = UNITS_M[stated.unit]
         calibration = program_calibration(documents, width, height, unit_m, problems, rectified=stated.rectified)
     if calibration is None:
+        problems = [problem for path in paths if (problem := recognised_problem(path))] or problems
         for name, content in contents.items():
             problems = with_lines(problems, content, name)
         raise CalibrationError.from_problems(paths[0].parent, problems)

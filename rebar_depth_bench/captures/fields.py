@@ -23,6 +23,8 @@ _RADIAL = (
 )
 """Lens models, or answers to whether it is a fisheye lens, whose first terms are k1 k2 p1 p2 k3; as plain keys."""
 _UNDISTORTED = ("none", "")
+_SAME_WITHOUT_TERMS = ("inversebrownconrady", "modifiedbrownconrady")
+"""Lens models of other distortion, which are pinholes if all terms are 0."""
 _PINHOLE = ("pinhole", "perspective")
 """Names of a projection without a statement about the distortion."""
 _RECTIFY = (
@@ -80,7 +82,8 @@ def lens_problem(where: str, models: Mapping[str, Any], terms: Sequence[float] =
     texts = {key: "" if model is None else str(model) for key, model in models.items()}
     plain = {key: plain_key(text) or text.strip() for key, text in texts.items()}
     stated_radial = any(model in _RADIAL for model in plain.values())
-    others = [key for key, model in plain.items() if model not in (*_RADIAL, *_PINHOLE, *_UNDISTORTED)]
+    known = (*_RADIAL, *_PINHOLE, *_UNDISTORTED, *(() if any(terms) else _SAME_WITHOUT_TERMS))
+    others = [key for key, model in plain.items() if model not in known]
     expected = _RECTIFY
     if others:
         found = f"{escape_text(others[0])} is {short_repr(models[others[0]])}"

@@ -1,6 +1,8 @@
-"""Fields of the calibrations of OpenCV, ROS and Kalibr, in the spellings of programs and of their users."""
+"""Fields of the calibrations of OpenCV, ROS, Kalibr and Middlebury, in the spellings that are known."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 from rebar_depth_bench.captures.fields import Field, FileFormat
 
@@ -84,6 +86,19 @@ CAMERA = FileFormat(
     "One camera of OpenCV's FileStorage, or ROS camera_info", (*_camera_fields(""), *_SIZE, _DETAILS)
 )
 PAIR = FileFormat("Pair of OpenCV's FileStorage", (*dict.fromkeys(EYES[0].fields + EYES[1].fields), _DETAILS))
+MIDDLEBURY = FileFormat(
+    "calib.txt of Middlebury's and ETH3D's rectified pairs",
+    (
+        Field("matrix", ("cam0",), "used", "[fx 0 cx; 0 fy cy; 0 0 1], pixel centres at integers"),
+        Field("right matrix", ("cam1",), "used", "[fx 0 cx; 0 fy cy; 0 0 1] of the right camera"),
+        Field("width", ("width",), "used", "pixels"),
+        Field("height", ("height",), "used", "pixels"),
+        Field("baseline", ("baseline",), "used", "millimetres"),
+        Field("offset", ("doffs",), "checked", "cx of cam1 minus cx of cam0"),
+        Field("details", ("ndisp", "isint", "vmin", "vmax", "dyavg", "dymax"), "harmless", "of the disparity"),
+    ),
+)
+MIDDLEBURY_RIGHT = FileFormat("", (replace(MIDDLEBURY.fields[1], name="matrix"), *MIDDLEBURY.fields[2:]))
 KALIBR = FileFormat(
     "Kalibr's camera chain",
     (

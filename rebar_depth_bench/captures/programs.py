@@ -1,4 +1,4 @@
-"""Calibrations as OpenCV, ROS and Kalibr write them; ``captures.program_formats`` has their fields.
+"""Calibrations as OpenCV, ROS, Kalibr and Middlebury write them; ``captures.program_formats`` has their fields.
 
 - OpenCV's FileStorage has no fixed names. Those of its stereo sample (M1, D1, M2, D2, R, T), of its calibration
   sample (camera_matrix, distortion_coefficients, image_width), and their common spellings are known. The unit of T
@@ -7,6 +7,7 @@
   The motion of a pair follows from the rectification of both cameras: x_rectified = R_i x_i, P[0, 3] = -fx B.
   K and P are those of the full sensor; the pictures may be a region of it, divided by the binning (REP 104).
 - Kalibr: a camera chain with cam0 and, for a pair, cam1 with T_cn_cnm1 = cam1_from_cam0.
+- Middlebury and ETH3D: ``calib.txt`` of a rectified pair, whose baseline is in millimetres.
 
 Pictures are those of the camera, with its matrix and distortion, unless they are stated to be rectified: they have
 the projection matrix P then, no distortion, and for a pair the baseline that P states.
@@ -29,7 +30,7 @@ from rebar_depth_bench.base.reading import parse_number
 from rebar_depth_bench.base.validation import format_location, short_repr
 from rebar_depth_bench.captures.calibration import Calibration, table_calibration
 from rebar_depth_bench.captures.fields import DISTORTION_TERMS, FileFormat, lens_problem, plain_key
-from rebar_depth_bench.captures.program_formats import CAMERA, EYES, KALIBR, PAIR
+from rebar_depth_bench.captures.program_formats import CAMERA, EYES, KALIBR, MIDDLEBURY, MIDDLEBURY_RIGHT, PAIR
 from rebar_depth_bench.geometry.cameras import is_rotation, nearest_rotation, rotation_matrix
 
 Document = Mapping[str, Any]
@@ -82,7 +83,7 @@ class _Reader:
             self.problem("missing", name, "missing", expected)
             return zeros
         value = [] if key is None else self.document[key]
-        flat = list(_flattened(value.get("data") if isinstance(value, dict) else value))
+        flat = list(flat_numbers(value.get("data") if isinstance(value, dict) else value))
         if not flat and default is not None:
             return default
         if flat and len(flat) <= _MAX_NUMBERS and np.isfinite(flat).all():
@@ -115,7 +116,7 @@ class _Reader:
         """Terms k1 k2 p1 p2 k3, after the check that they describe the lens."""
         terms = self.numbers("distortion", (-1,), default=np.zeros(DISTORTION_TERMS)).tolist()
         models = {key: self.document[key] for key in (*self.keys("camera model"), *self.keys("distortion model"))}
-        one_each = [key for key in self.keys("other lenses") if any(_flattened(self.document[key]))]
+        one_each = [key for key in self.keys("other lenses") if any(flat_numbers(self.document[key]))]
         found = [lens_problem(self.key_place(key), {key: self.document[key]}) for key in one_each]
         found += [lens_problem(self.key_place(key), {key: models[key]}) for key in self.keys("camera model")]
         if not any(found):
@@ -136,7 +137,7 @@ class _Reader:
         key = self.key("region")
         roi = {} if key is None else self.document[key]
         fields = [roi.get(name, 0) for name in _REGION] if isinstance(roi, dict) else roi
-        x, y, *sides = region = list(_flattened(fields)) or [0.0] * 4
+        x, y, *sides = region = list(flat_numbers(fields)) or [0.0] * 4
         if len(region) != 4 or not all(value >= 0 and value.is_integer() for value in (*region, bin_x, bin_y)):
             self.problem("invalid", "region", f"got {short_repr(roi)}", f"whole numbers {', '.join(_REGION)}")
             return matrix, size
@@ -255,6 +256,10 @@ def _cameras(
             notes += CAMERA.notes(camera.name, camera.document)
         return cameras, _ros_motion
     merged, name = _merged(cameras), " and ".join(documents)
+    if isinstance(merged.document.get("cam0"), list):
+        notes += MIDDLEBURY.notes(name, merged.document)
+        pair = [replace(merged, fields=fields) for fields in (MIDDLEBURY, MIDDLEBURY_RIGHT)]
+        return pair, _middlebury_motion
     if "cam0" in merged.document:
         cameras = _kalibr_cameras(merged)
         keys = [*merged.document, *(key for camera in cameras for key in camera.document)]
@@ -286,6 +291,8 @@ def _is_rectified(cameras: Sequence[_Reader], rectified: bool | None, notes: lis
 
     Adds a problem if P is stated and missing, or if nothing but P tells that the pictures may be rectified.
     """
+    if cameras[0].fields is MIDDLEBURY:  # It has no other matrices.
+        return False
     for camera in cameras:
         P = camera.projection
         if rectified is None and P is not None:
@@ -348,16 +355,25 @@ def _kalibr_motion(_: _Reader, right: _Reader, unit_m: float) -> tuple[Values, V
     return right_from_left[:3, :3], unit_m * right_from_left[:3, 3]
 
 
+def _middlebury_motion(left: _Reader, right: _Reader, _: float) -> tuple[Values, Values]:
+    """Return rotation and translation (metres) of ``x_right = R x_left + T``."""
+    offset_px = right.matrix[0, 2] - left.matrix[0, 2]
+    stated_px = left.numbers("offset", (1,), default=np.array([offset_px]))[0]
+    if abs(stated_px - offset_px) > _ROUNDED_PX:
+        left.problem("conflict", "offset", f"got {stated_px}", f"cx of cam1 minus cx of cam0, {offset_px:.3f}")
+    return np.eye(3), np.array([-left.numbers("baseline", (1,))[0] / 1000, 0.0, 0.0])
+
+
 def _opencv_motion(left: _Reader, _: _Reader, unit_m: float) -> tuple[Values, Values]:
     """Return rotation and translation (metres) of ``x_right = R x_left + T``."""
     return left.rotation("rotation"), unit_m * left.numbers("translation", (3,))
 
 
-def _flattened(value: Any) -> Iterable[float]:
+def flat_numbers(value: Any) -> Iterable[float]:
     """Yield the numbers in nested lists; NaN for anything else."""
     if isinstance(value, list | tuple):
         for item in value:
-            yield from _flattened(item)
+            yield from flat_numbers(item)
     else:
         number = parse_number(value) if isinstance(value, str) else value
         is_number = isinstance(number, int | float) and not isinstance(number, bool)
