@@ -179,6 +179,10 @@ def cameras_of_table(
         problems.append(Problem("conflict", "calibration", f"given beside {', '.join(rest)}", "one of them"))
     elif table is not None and table.calibration is None:
         inline = table_calibration(rest, width, height, problems, is_stereo=is_stereo)
+        if table.rectified is not None:
+            problems.append(
+                Problem("conflict", "rectified", "given without calibration", "a file with the matrix P")
+            )
     poses = {} if table is None else {pose.image: np.array(pose.cam_from_world) for pose in table.pose}
     if table is not None and poses and (missing := sorted(set(images) - poses.keys())):
         found = f"{len(missing)} images have none, such as {missing[0]}"

@@ -82,8 +82,8 @@ def lens_problem(where: str, models: Mapping[str, Any], terms: Sequence[float] =
     texts = {key: "" if model is None else str(model) for key, model in models.items()}
     plain = {key: plain_key(text) or text.strip() for key, text in texts.items()}
     stated_radial = any(model in _RADIAL for model in plain.values())
-    known = (*_RADIAL, *_PINHOLE, *_UNDISTORTED, *(() if any(terms) else _SAME_WITHOUT_TERMS))
-    others = [key for key, model in plain.items() if model not in known]
+    accepted = (*_RADIAL, *_PINHOLE, *_UNDISTORTED, *(() if any(terms) else _SAME_WITHOUT_TERMS))
+    others = [key for key, model in plain.items() if model not in accepted]
     expected = _RECTIFY
     if others:
         found = f"{escape_text(others[0])} is {short_repr(models[others[0]])}"
@@ -93,9 +93,8 @@ def lens_problem(where: str, models: Mapping[str, Any], terms: Sequence[float] =
         found, expected = "distortion terms beside a model of none", "zeros, or the model of the terms"
     elif any(terms) and len(terms) == 4 and not stated_radial:
         found = "four distortion terms without a stated model may be those of a fisheye lens"
-        expected = (
-            f"distortion_model: plumb_bob, or a fifth term k3 = 0, if they are k1 k2 p1 p2; otherwise {_RECTIFY}"
-        )
+        remedy = "add distortion_model: plumb_bob, or a fifth term k3 = 0, if they are k1 k2 p1 p2"
+        expected = f"{remedy}; otherwise {_RECTIFY}"
     elif any(terms) and len(terms) < 4:
         found = f"the distortion has {len(terms)} terms"
     else:

@@ -22,11 +22,12 @@ _HARMLESS = (
         "nframes",
         "nr_of_frames",
     ),
-    *("board_width", "board_height", "square_size", "marker_size", "aspectRatio", "fix_aspect_ratio", "flags"),
+    *("board_width", "board_height", "square_size", "marker_size", "aspectRatio", "fix_aspect_ratio"),
     *("avg_reprojection_error", "reprojection_error", "rms", "rms_error", "ret", "per_view_reprojection_errors"),
     *("extrinsic_parameters", "image_points", "grid_points", "rvecs", "tvecs", "E", "F", "essential_matrix"),
     *("fundamental_matrix", "Q", "disparity_to_depth_matrix", "roi1", "roi2", "valid_roi1", "valid_roi2"),
 )
+_FLAGS = Field("flags", ("flags",), "checked", "of OpenCV's calibration; not a text that names fisheye")
 _DETAILS = Field("details", _HARMLESS, "harmless", "of the calibration, its target and its message")
 
 
@@ -79,11 +80,11 @@ _MOTION = (
     Field("translation", ("T", "translation", "translation_vector", "tvec"), "used", "x_right = R x_left + T"),
 )
 EYES = tuple(
-    FileFormat(f"camera {eyes[0]}", (*_camera_fields(*eyes), *_SIZE, *_MOTION))
+    FileFormat(f"camera {eyes[0]}", (*_camera_fields(*eyes), *_SIZE, *_MOTION, _FLAGS))
     for eyes in (("1", "left", "l"), ("2", "right", "r"))
 )
 CAMERA = FileFormat(
-    "One camera of OpenCV's FileStorage, or ROS camera_info", (*_camera_fields(""), *_SIZE, _DETAILS)
+    "One camera of OpenCV's FileStorage, or ROS camera_info", (*_camera_fields(""), *_SIZE, _FLAGS, _DETAILS)
 )
 PAIR = FileFormat("Pair of OpenCV's FileStorage", (*dict.fromkeys(EYES[0].fields + EYES[1].fields), _DETAILS))
 MIDDLEBURY = FileFormat(

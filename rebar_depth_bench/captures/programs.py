@@ -83,7 +83,14 @@ class _Reader:
             self.problem("missing", name, "missing", expected)
             return zeros
         value = [] if key is None else self.document[key]
-        flat = list(flat_numbers(value.get("data") if isinstance(value, dict) else value))
+        flat, *others = (
+            list(flat_numbers(one.get("data") if isinstance(one, dict) else one))
+            for one in (value, *(self.document[other] for other in self.keys(name)[1:]))
+        )
+        if any(len(other) == len(flat) and other != flat for other in others):
+            self.problem(
+                "conflict", name, f"differs from that in {' and '.join(self.keys(name)[1:])}", "one value"
+            )
         if not flat and default is not None:
             return default
         if flat and len(flat) <= _MAX_NUMBERS and np.isfinite(flat).all():
@@ -116,6 +123,9 @@ class _Reader:
         """Terms k1 k2 p1 p2 k3, after the check that they describe the lens."""
         terms = self.numbers("distortion", (-1,), default=np.zeros(DISTORTION_TERMS)).tolist()
         models = {key: self.document[key] for key in (*self.keys("camera model"), *self.keys("distortion model"))}
+        models |= {
+            key: self.document[key] for key in self.keys("flags") if "fish" in str(self.document[key]).lower()
+        }
         one_each = [key for key in self.keys("other lenses") if any(flat_numbers(self.document[key]))]
         found = [lens_problem(self.key_place(key), {key: self.document[key]}) for key in one_each]
         found += [lens_problem(self.key_place(key), {key: models[key]}) for key in self.keys("camera model")]
@@ -137,10 +147,11 @@ class _Reader:
         key = self.key("region")
         roi = {} if key is None else self.document[key]
         fields = [roi.get(name, 0) for name in _REGION] if isinstance(roi, dict) else roi
-        x, y, *sides = region = list(flat_numbers(fields)) or [0.0] * 4
+        region = list(flat_numbers(fields)) or [0.0] * 4
         if len(region) != 4 or not all(value >= 0 and value.is_integer() for value in (*region, bin_x, bin_y)):
             self.problem("invalid", "region", f"got {short_repr(roi)}", f"whole numbers {', '.join(_REGION)}")
             return matrix, size
+        x, y, *sides = region
         has_region = any(region) and region != [0, 0, *sensor]
         if has_region and not (
             all(sides) and (not sensor or (x + sides[0] <= sensor[0] and y + sides[1] <= sensor[1]))

@@ -83,8 +83,8 @@ _SIGNATURES = (
     _Signature(
         "DepthAI's calibration, whose lenses have 14 terms",
         r'"cameraData"\s*:',
-        remark="the cameras of rectified pictures: K of the right one for their size (getCameraIntrinsics) in [left] "
-        "and [right], zero distortion, and baseline_m from getBaselineDistance(), which is in centimetres",
+        remark="the cameras of rectified pictures: K of the right one for their size (getCameraIntrinsics) in "
+        "[left] and [right], zero distortion, and baseline_m from getBaselineDistance(), which is in centimetres",
     ),
     _Signature(
         "a camera of camodocal or VINS",
