@@ -26,8 +26,8 @@ class _Signature:
     """File of another program: its pattern, the patterns of numbers in it, and a remark.
 
     ``numbers`` are those of fx, fy, cx, cy, and as far as they are known of width, height, the terms of distortion
-    and tx, which is fx times the offset of a camera; ``model`` is that of the lens model, or its name. Of a pair,
-    EYE in patterns is one of ``eyes``. ``first_pixel`` is the coordinate of the centre of the first pixel.
+    and tx, which is fx times the offset of a camera. ``model`` is that of the lens model, radtan if none is found, or
+    its name. Of a pair, EYE in patterns is one of ``eyes``. ``first_pixel`` is the centre of the first pixel.
     """
 
     title: str
@@ -92,7 +92,7 @@ _SIGNATURES = (
         {key: _key(key) for key in _PINHOLE}
         | {"terms": r"\bk1:\s*(\S+)\s+k2:\s*(\S+)\s+p1:\s*(\S+)\s+p2:\s*(\S+)"}
         | {"width": _key("image_width"), "height": _key("image_height")},
-        r"^model_type:\s*(\w+)",
+        r"^model_type:\s*(?!PINHOLE)(\w+)",
     ),
     _Signature(
         "ScanNet's scene file",
@@ -129,7 +129,7 @@ _SIGNATURES = (
         r"^P(?:_rect_0)?2: ",
         _nth(r"^P(?:_rect_0)?EYE:", 0, 5, 2, 6, 3)
         | {"width": rf"^S_rect_02:\s*({_NUMBER})", "height": rf"^S_rect_02:\s*{_NUMBER}\s+({_NUMBER})"},
-        remark="of image_2 and image_3; for one camera leave out [right] and [stereo]",
+        remark="the numbers of image_2 and image_3; for one camera leave out [right] and [stereo]",
         eyes=("2", "3"),
     ),
     *(
@@ -184,7 +184,7 @@ def _problem(name: str, text: str, signature: _Signature) -> Problem:
     terms = [*terms, *[0.0] * (DISTORTION_TERMS - len(terms))] if len(terms) < 4 else terms
     if "(" in model:
         match = re.search(model, text, re.MULTILINE)
-        model = match[1] if match else ""
+        model = match[1] if match else "radtan"
     lens = lens_problem(name, {"the lens model": model}, terms)
     if lens is not None:
         return replace(lens, found=f"{found}; {lens.found}")
