@@ -12,17 +12,16 @@ _MODEL_NAMES = (
 )
 _OTHER_TERMS = ("k4", "k5", "k6", "s1", "s2", "s3", "s4", "tau_x", "tau_y")
 _HARMLESS = (
+    *("header", "camera_name", "camera_id", "calibration_time", "calibration_date", "date", "nframes"),
     *(
-        "header",
-        "camera_name",
-        "camera_id",
-        "calibration_time",
-        "calibration_date",
-        "date",
-        "nframes",
         "nr_of_frames",
+        "board_width",
+        "board_height",
+        "square_size",
+        "marker_size",
+        "aspectRatio",
+        "fix_aspect_ratio",
     ),
-    *("board_width", "board_height", "square_size", "marker_size", "aspectRatio", "fix_aspect_ratio"),
     *("avg_reprojection_error", "reprojection_error", "rms", "rms_error", "ret", "per_view_reprojection_errors"),
     *("extrinsic_parameters", "image_points", "grid_points", "rvecs", "tvecs", "E", "F", "essential_matrix"),
     *("fundamental_matrix", "Q", "disparity_to_depth_matrix", "roi1", "roi2", "valid_roi1", "valid_roi2"),
@@ -35,29 +34,18 @@ def _camera_fields(*eyes: str) -> tuple[Field, ...]:
     """Return the fields of one camera; ``eyes`` are the spellings of which one, before or after a name."""
 
     def spellings(*names: str, of: tuple[str, ...] = eyes) -> tuple[str, ...]:
-        return tuple(
-            dict.fromkeys(spelling for name in names for eye in of for spelling in (name + eye, eye + name))
-        )
+        return tuple(dict.fromkeys(text for name in names for eye in of for text in (name + eye, eye + name)))
 
     short, long = ("M", "K"), ("camera_matrix", "intrinsics", "intrinsic_matrix", "mtx", "cam_matrix")
     matrix = spellings(*((*long, *short) if eyes == ("",) else (*short, *long)))
-    terms = (
-        "D",
-        "distortion",
-        "distortion_coefficients",
-        "distortion_coeffs",
-        "dist",
-        "dist_coeffs",
-        "dist_coeff",
-    )
+    short, long = ("D", "dist"), ("distortion", "distortion_coefficients", "distortion_coeffs")
+    terms = spellings(*short, *long, "dist_coeffs", "dist_coeff")
     new_matrix = ("P", "projection_matrix", "new_camera_matrix", "optimal_camera_matrix", "newcameramtx")
     both = (*eyes, "")
     return (
         Field("matrix", matrix, "used", "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]], pixel centres at integers"),
-        Field("distortion", spellings(*terms), "used", "k1 k2 p1 p2 k3; further terms must be 0"),
-        Field(
-            "distortion model", spellings("distortion_model", of=both), "checked", "plumb_bob, radtan or the like"
-        ),
+        Field("distortion", terms, "used", "k1 k2 p1 p2 k3; further terms must be 0"),
+        Field("distortion model", spellings("distortion_model", of=both), "checked", "plumb_bob or radtan"),
         Field("camera model", spellings(*_MODEL_NAMES, of=both), "checked", "pinhole; not a fisheye lens"),
         Field("other lenses", spellings("xi", of=both) + _OTHER_TERMS, "checked", "0"),
         Field("rectification", spellings("R", "rectification_matrix"), "used", "rotation to the rectified camera"),
@@ -69,9 +57,7 @@ _SIZE = (
     Field("size", ("image_size", "size", "camera_resolution", "resolution"), "used", "width, height"),
     Field("width", ("image_width", "width"), "used", "of the full sensor, pixels"),
     Field("height", ("image_height", "height"), "used", "of the full sensor, pixels"),
-    Field(
-        "region", ("roi",), "used", "x_offset, y_offset, width, height in pixels of the full sensor; 0: all of it"
-    ),
+    Field("region", ("roi",), "used", "x_offset, y_offset, width, height in pixels of the sensor; 0: all of it"),
     Field("binning x", ("binning_x",), "used", "columns in one of the pictures; 0: one"),
     Field("binning y", ("binning_y",), "used", "rows in one of the pictures; 0: one"),
 )
@@ -111,10 +97,10 @@ KALIBR = FileFormat(
         Field("size", ("resolution",), "used", "width, height"),
         Field("motion", ("T_cn_cnm1",), "used", "cam1_from_cam0, 4 x 4"),
         Field(
-            "details",
+            "recording",
             ("cam_overlaps", "rostopic", "T_cam_imu", "timeshift_cam_imu"),
             "harmless",
-            "of the recording",
+            "of the IMU too",
         ),
     ),
 )

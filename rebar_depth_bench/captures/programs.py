@@ -82,15 +82,11 @@ class _Reader:
         if key is None and default is None:
             self.problem("missing", name, "missing", expected)
             return zeros
-        value = [] if key is None else self.document[key]
-        flat, *others = (
-            list(flat_numbers(one.get("data") if isinstance(one, dict) else one))
-            for one in (value, *(self.document[other] for other in self.keys(name)[1:]))
-        )
-        if any(len(other) == len(flat) and other != flat for other in others):
-            self.problem(
-                "conflict", name, f"differs from that in {' and '.join(self.keys(name)[1:])}", "one value"
-            )
+        values = [self.document[key] for key in self.keys(name)] or [[]]
+        flats = [list(flat_numbers(one.get("data") if isinstance(one, dict) else one)) for one in values]
+        value, flat = values[0], flats[0]
+        if any(len(other) == len(flat) and other != flat for other in flats):
+            self.problem("conflict", name, f"differs from that in {self.keys(name)[-1]}", "one value")
         if not flat and default is not None:
             return default
         if flat and len(flat) <= _MAX_NUMBERS and np.isfinite(flat).all():
@@ -122,14 +118,17 @@ class _Reader:
     def distortion(self) -> list[float]:
         """Terms k1 k2 p1 p2 k3, after the check that they describe the lens."""
         terms = self.numbers("distortion", (-1,), default=np.zeros(DISTORTION_TERMS)).tolist()
-        models = {key: self.document[key] for key in (*self.keys("camera model"), *self.keys("distortion model"))}
-        models |= {
+        models = {key: self.document[key] for key in self.keys("camera model")}
+        alone = dict(models)
+        alone |= {
+            key: self.document[key] for key in self.keys("other lenses") if any(flat_numbers(self.document[key]))
+        }
+        alone |= {
             key: self.document[key] for key in self.keys("flags") if "fish" in str(self.document[key]).lower()
         }
-        one_each = [key for key in self.keys("other lenses") if any(flat_numbers(self.document[key]))]
-        found = [lens_problem(self.key_place(key), {key: self.document[key]}) for key in one_each]
-        found += [lens_problem(self.key_place(key), {key: models[key]}) for key in self.keys("camera model")]
+        found = [lens_problem(self.key_place(key), {key: value}) for key, value in alone.items()]
         if not any(found):
+            models |= {key: self.document[key] for key in self.keys("distortion model")}
             found = [lens_problem(self.name, models, terms)]
         self.problems.extend(problem for problem in found if problem is not None and problem not in self.problems)
         return [*terms[:DISTORTION_TERMS], *[0.0] * (4 - len(terms))]
@@ -153,25 +152,21 @@ class _Reader:
             return matrix, size
         x, y, *sides = region
         has_region = any(region) and region != [0, 0, *sensor]
-        if has_region and not (
-            all(sides) and (not sensor or (x + sides[0] <= sensor[0] and y + sides[1] <= sensor[1]))
-        ):
+        is_inside = all(sides) and (not sensor or (x + sides[0] <= sensor[0] and y + sides[1] <= sensor[1]))
+        if has_region and not is_inside:
             found = f"{sides[0]:g} x {sides[1]:g} pixels at ({x:g}, {y:g}) are not inside width x height"
-            expected = (
-                "the size and K of the full sensor and a part of it (REP 104), or zeros and K of the pictures"
-            )
+            expected = "a part of the full sensor, to which width, height and K belong (REP 104), or zeros"
             self.problem("conflict", "region", found, expected)
         shown = [side // bin for side, bin in zip(sides if has_region else sensor, (bin_x, bin_y), strict=False)]
         if (has_region or max(bin_x, bin_y) > 1) and shown == pictures:
-            cropped = np.diag([1 / bin_x, 1 / bin_y, 1.0]) @ (
-                matrix - [[0, 0, x - 0.5], [0, 0, y - 0.5], [0, 0, 0]]
-            )
-            return cropped - [[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]], {"width": width, "height": height}
+            corner = np.array([[0, 0, x - 0.5], [0, 0, y - 0.5], [0, 0, 0]])
+            half_pixel = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
+            matrix = np.diag([1 / bin_x, 1 / bin_y, 1.0]) @ (matrix - corner) - half_pixel
+            return matrix, {"width": width, "height": height}
         if has_region and sensor != pictures:
             found = f"the pictures have {width} x {height} pixels"
-            self.problem(
-                "conflict", "region", found, f"{shown[0]:g} x {shown[1]:g}, or the size of the full sensor"
-            )
+            expected = f"{shown[0]:g} x {shown[1]:g}, or the size of the full sensor"
+            self.problem("conflict", "region", found, expected)
         elif has_region or (bin_x, bin_y) != (1, 1):
             self.notes.append(f"{self.name}: the pictures show all of the sensor; roi and binning are left out")
         return matrix, size
@@ -234,9 +229,8 @@ def program_calibration(
         sizes.append(size)
     table |= sizes[0]
     if len(cameras) == 2:
-        rotation, translation_m = (_rectified_motion if is_rectified else find_motion)(
-            cameras[0], cameras[1], unit_m
-        )
+        find_motion = _rectified_motion if is_rectified else find_motion
+        rotation, translation_m = find_motion(cameras[0], cameras[1], unit_m)
         if not is_rotation(rotation) and is_rotation(rotation, _ROUNDED_ROTATION):
             rotation = nearest_rotation(rotation)
         table["stereo"] = {"rotation": rotation.tolist(), "translation_m": translation_m.tolist()}
@@ -310,16 +304,13 @@ def _is_rectified(cameras: Sequence[_Reader], rectified: bool | None, notes: lis
             unlike = np.abs(P[:, :3] - camera.matrix).max() > _ROUNDED_PX
             rotation = camera.numbers("rectification", (3, 3), (3,), default=np.eye(3))
             if unlike and not any(camera.distortion) and np.allclose(rotation, np.eye(3)):
-                found = (
-                    "differs from the matrix of the camera, which has no distortion: the pictures may be rectified"
-                )
+                found = "differs from the camera's matrix without distortion: the pictures may be rectified"
                 expected = f"rectified = true (they have P) or false beside calibration in {_STATED_IN}"
                 camera.problem("conflict", "projection", found, expected)
             elif unlike or any(camera.distortion):
                 found = "the pictures are taken as not rectified, with the camera's own matrix and distortion"
-                notes.append(
-                    f"{camera.name}: {found}; if they are rectified, state rectified = true in {_STATED_IN}"
-                )
+                remedy = f"if they are rectified, state rectified = true in {_STATED_IN}"
+                notes.append(f"{camera.name}: {found}; {remedy}")
         elif rectified and P is None:
             camera.problem("missing", "projection", "missing", "the matrix P of rectified pictures")
         if rectified is not True and camera.key("distortion") is None:

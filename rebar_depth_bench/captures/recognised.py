@@ -26,8 +26,8 @@ class _Signature:
     """File of another program: its pattern, the patterns of numbers in it, and a remark.
 
     ``numbers`` are those of fx, fy, cx, cy, and as far as they are known of width, height, the terms of distortion
-    and tx, which is fx times the offset of a camera. ``model`` is that of the lens model, radtan if none is found, or
-    its name. Of a pair, EYE in patterns is one of ``eyes``. ``first_pixel`` is the centre of the first pixel.
+    and tx, which is fx times the offset of a camera. ``model`` is that of the lens model, radtan if none is found,
+    or its name. Of a pair, EYE in patterns is one of ``eyes``. ``first_pixel`` is the centre of the first pixel.
     """
 
     title: str
