@@ -214,13 +214,6 @@ CASES: dict[str, tuple[str, str, tuple[int, int], tuple[float, ...], list[float]
         (1169.621094, 1167.105103, 646.295044, 489.927032),
         [],
     ),
-    "matrix of numpy.savetxt": (
-        "K.txt",
-        "5.0e+02 0.0e+00 3.2e+02\n0.0e+00 5.0e+02 2.4e+02\n0.0e+00 0.0e+00 1.0e+00\n",
-        (640, 480),
-        (500, 500, 320, 240),
-        [],
-    ),
     "kitti odometry": ("calib.txt", KITTI, (1241, 376), (718.856, 718.856, 607.1928, 185.2157), []),
     "kitti raw": ("calib_cam_to_cam.txt", KITTI_RAW, (1242, 375), (718.856, 718.856, 607.1928, 185.2157), []),
     "colmap opencv": (
@@ -243,13 +236,6 @@ CASES: dict[str, tuple[str, str, tuple[int, int], tuple[float, ...], list[float]
         (640, 480),
         (500.5, 500.5, 320.0, 240.0),
         [-0.021],
-    ),
-    "dso": (
-        "camera.txt",
-        "RadTan 500 501 320 240 -0.1 0.02 0.001 -0.002\n640 480\ncrop\n640 480\n",
-        (640, 480),
-        (500, 501, 320, 240),
-        [-0.1, 0.02, 0.001, -0.002],
     ),
 }
 
@@ -292,11 +278,6 @@ COLMAP_BIN = struct.pack("<QiiQQ4d", 1, 1, 1, 640, 480, 500.0, 500.0, 320.0, 240
             "camera.txt",
             "0.349 0.436 0.493 0.499 0.933\n1280 1024\ncrop\n640 480\n",
             "lens model is 'FOV'.*rectify",
-        ),
-        (
-            "camera.txt",
-            "KannalaBrandt 500 500 320 240 0.1 0 0 0\n640 480\ncrop\n640 480\n",
-            "'KannalaBrandt'.*rectify",
         ),
         ("camera.yaml", MEI, "camodocal.*lens model is 'MEI'.*rectify"),
         ("sensor.yaml", EUROC.replace("radial-tangential", "equidistant"), "EuRoC.*'equidistant'.*rectify"),
