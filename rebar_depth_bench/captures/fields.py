@@ -58,10 +58,10 @@ class FileFormat:
         """Return the keys of a field; none if the format does not have it."""
         return next((field.keys for field in self.fields if field.name == name), ())
 
-    def notes(self, source: str, keys: Iterable[str]) -> list[str]:
+    def notes(self, source: str, keys: Iterable[Any]) -> list[str]:
         """Return a note that names the ``keys`` of the file ``source`` that are not listed; none if all are."""
         listed = {plain_key(key) for field in self.fields for key in field.keys}
-        unlisted = [escape_text(key) for key in keys if plain_key(key) not in listed]
+        unlisted = [escape_text(str(key)) for key in keys if plain_key(str(key)) not in listed]
         if not unlisted:
             return []
         more = f" and {len(unlisted) - _MAX_NAMED} more" if len(unlisted) > _MAX_NAMED else ""

@@ -38,8 +38,8 @@ def _camera_fields(*eyes: str) -> tuple[Field, ...]:
 
     short, long = ("M", "K"), ("camera_matrix", "intrinsics", "intrinsic_matrix", "mtx", "cam_matrix")
     matrix = spellings(*((*long, *short) if eyes == ("",) else (*short, *long)))
-    short, long = ("D", "dist"), ("distortion", "distortion_coefficients", "distortion_coeffs")
-    terms = spellings(*short, *long, "dist_coeffs", "dist_coeff")
+    distortion = ("D", "distortion", "distortion_coefficients", "distortion_coeffs", "dist", "dist_coeffs")
+    terms = spellings(*distortion, "dist_coeff")
     new_matrix = ("P", "projection_matrix", "new_camera_matrix", "optimal_camera_matrix", "newcameramtx")
     both = (*eyes, "")
     return (

@@ -131,7 +131,8 @@ def _message_text(name: str, K: np.ndarray, D: np.ndarray, R: np.ndarray, P: np.
 def aliased_text() -> str:
     """Return a pair of equal cameras as ``yaml.dump`` writes it, with aliases for the lists of the right one."""
     K, D = LEFT_K.tolist(), LEFT_D.tolist()
-    return yaml.dump({"K1": K, "K2": K, "D1": D, "D2": D, "R": ROTATION.tolist(), "T": TRANSLATION_M.tolist()})
+    pair = {"K1": K, "K2": K, "D1": D, "D2": D, "R": ROTATION.tolist(), "T": TRANSLATION_M.tolist()}
+    return str(yaml.dump(pair))
 
 
 def kalibr_text() -> str:

@@ -33,13 +33,17 @@ def projection(fx: float, cx: float, cy: float, x: float = 0.0) -> list[float]:
     return [fx, 0.0, cx, x, 0.0, fx, cy, 0.0, 0.0, 0.0, 1.0, 0.0]
 
 
-def message(*, ros2: bool = False, **changes: Any) -> str:
+def message(changes: dict[str, Any] | None = None, *, ros2: bool = False, **others: Any) -> str:
     """Return a printed ``sensor_msgs/CameraInfo``, with the field names of ROS 1 or of ROS 2."""
     fields = {"height": 800, "width": 1280, "distortion_model": "plumb_bob", "D": D, "K": K, "R": IDENTITY}
-    fields |= {"P": projection(405.0, 633.2, 377.5), "binning_x": 0, "binning_y": 0, "roi": region()} | changes
+    fields |= (
+        {"P": projection(405.0, 633.2, 377.5), "binning_x": 0, "binning_y": 0, "roi": region()}
+        | others
+        | (changes or {})
+    )
     named = {LOWER.get(key, key) if ros2 else key: value for key, value in fields.items() if value is not None}
     header = {"header": {"seq": 3, "stamp": {"secs": 1, "nsecs": 2}, "frame_id": "left_optical"}}
-    return yaml.safe_dump(header | named, sort_keys=False) + "---\n"
+    return f"{yaml.safe_dump(header | named, sort_keys=False)}---\n"
 
 
 def region(x: int = 0, y: int = 0, width: int = 0, height: int = 0, *, do_rectify: bool = False) -> dict[str, Any]:
@@ -229,7 +233,7 @@ def write_storage(path: Path, values: dict[str, Any]) -> None:
     storage.release()
 
 
-TUTORIAL = {  # In the order of OpenCV's tutorial camera_calibration.cpp, saveCameraParams.
+TUTORIAL: dict[str, Any] = {  # In the order of OpenCV's tutorial camera_calibration.cpp, saveCameraParams.
     "calibration_time": "Thu Nov 26 09:00:00 2026",
     "nr_of_frames": 20,
     "image_width": 640,
@@ -265,8 +269,9 @@ def test_known_fields_of_opencv_are_left_without_a_note(suffix: str, tmp_path: P
     ("text", "named"),
     [
         (message(D=[0.0] * 5, exposure=3, Gain=1), "exposure, Gain"),
-        (message(D=[0.0] * 5, **{f"field_{at:02}": at for at in range(13)}), "field_08, field_09 and 3 more"),
+        (message({f"field_{at:02}": at for at in range(13)}, D=[0.0] * 5), "field_08, field_09 and 3 more"),
         (files.kalibr_text() + "cam2: {camera_model: pinhole}\n", "cam2"),
+        (files.kalibr_text().replace("  rostopic", "  1.5: 1\n  rostopic"), "1.5"),
         (
             files.kalibr_text().replace("  rostopic", "  T_cam_lidar: 1\n  timeshift_cam_imu: 0.1\n  rostopic"),
             "T_cam_lidar",
