@@ -25,6 +25,7 @@ from rebar_depth_bench.base.limits import CELL_BYTES, TABLE_BYTES, TOML_BYTES
 from rebar_depth_bench.base.reading import parse_json, read_file
 from rebar_depth_bench.base.validation import UNITS_M, short_repr
 from rebar_depth_bench.captures.calibration import Calibration, StereoCalibration
+from rebar_depth_bench.captures.images import check_upright
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.geometry.cameras import (
     inverse_rigid,
@@ -71,6 +72,7 @@ def read_depth(path: Path, grid: Grid, table: DepthTable) -> Float64[ndarray, "h
     """
     suffix = path.suffix.lower()
     content = read_file(path, CELL_BYTES, "a depth map", InputError)
+    check_upright(io.BytesIO(content), path.name)
     if suffix == ".exr" and table.channel is not None:
         values = _exr_channel(path, table.channel)
     elif suffix in FORMATS:
@@ -128,6 +130,7 @@ def read_labels(path: Path, grid: Grid) -> Shaped[ndarray, "h w"]:
     Raises ``EntryError`` for a damaged file, another size, and values that are not whole numbers.
     """
     content = read_file(path, CELL_BYTES, "an image of labels", InputError)
+    check_upright(io.BytesIO(content), path.name)
     values = _npy(path, content) if path.suffix.lower() == ".npy" else _pixels(path, content)
     _check_grid(path, values, grid)
     if values.dtype.kind not in "bui":

@@ -74,7 +74,7 @@ def read_file(path: Path, limit: Limit, expected: str, error_type: type[InputErr
 
 
 def decode_text(content: bytes, where: str = "") -> tuple[str, list[Problem]]:
-    """Return a UTF-8 text without its byte order mark, or an empty text and the problem at the location ``where``."""
+    """Return a UTF-8 text without its byte order mark, or an empty text and the problem at ``where``."""
     try:
         return content.decode("utf-8-sig"), []
     except UnicodeDecodeError as error:

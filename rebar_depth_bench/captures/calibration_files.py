@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 from rebar_depth_bench.base.errors import MAX_PROBLEMS_SHOWN, CalibrationError, Problem, escape_text
 from rebar_depth_bench.base.limits import TOML_BYTES
-from rebar_depth_bench.base.reading import parse_number, parse_toml, read_file
+from rebar_depth_bench.base.reading import decode_text, parse_number, parse_toml, read_file
 from rebar_depth_bench.base.validation import Expected, format_location, short_repr, with_lines
 from rebar_depth_bench.captures.calibration import (
     ANGLE_RAD,
     DISTORTION,
     FOCAL_PX,
+    KNOWN_LENS,
     SIDES_PX,
     Calibration,
     Lens,
@@ -24,18 +27,18 @@ from rebar_depth_bench.captures.calibration import (
     scaled_calibration,
     table_calibration,
 )
+from rebar_depth_bench.captures.fields import Field, FileFormat
 
 
 def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibration:
     """Read a stereo calibration from a ``.conf`` or ``.toml`` file, for images of ``width`` x ``height`` pixels.
 
-    ``.conf`` is Stereolabs' INI file: sections ``LEFT_CAM_2K``, ``_FHD``, ``_HD``, ``_VGA`` (and ``RIGHT_CAM_``)
-    with fx fy cx cy k1 k2 and, if given, p1 p2 k3; ``STEREO`` with Baseline, TY, TZ (millimetres; 0 where TY or
-    TZ is missing) and RX, CV, RZ (radians), each with or without the section's suffix. If the file has no sections
-    for the requested size, those nearest in aspect ratio and then in width are read and passed to
-    ``scale_calibration``, which assumes that both sizes cover the same sensor area. The motion is
-    ``x_right = R x_left + T`` with R = Rodrigues(RX, CV, RZ) and T = -(Baseline, TY, TZ): the whole vector is
-    negated, which keeps it on the line that the vendor's rectification uses.
+    ``.conf`` is Stereolabs' INI file, whose keys docs/formats.md lists: sections ``LEFT_CAM_X``, ``RIGHT_CAM_X``
+    for each image size X, such as HD, and ``STEREO``. If the file has no sections for the requested size, those
+    nearest in aspect ratio and then in width are read and passed to ``scale_calibration``, which assumes that both
+    sizes cover the same sensor area; a file that shows that they do not, or has sections of unknown sizes, is
+    refused. The motion is ``x_right = R x_left + T`` with R = Rodrigues(RX, CV, RZ) and T = -(Baseline, TY, TZ):
+    the whole vector is negated, which keeps it on the line that the vendor's rectification uses.
 
     In TOML, ``K = [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]`` may replace the four numbers, ``rotation`` may be a
     3 x 3 matrix, and ``baseline_m = 0.12`` may replace ``translation_m = [-0.12, 0, 0]``::
@@ -70,7 +73,7 @@ def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibra
     check_image_size(path, width, height)
     problems: list[Problem] = []
     if suffix == ".conf":
-        calibration: Calibration | None = _read_conf(content, width, height, problems)
+        calibration: Calibration | None = _read_conf(path.name, content, width, height, problems)
     else:
         document, problems = parse_toml(content)
         calibration = None if problems else table_calibration(document, width, height, problems, is_stereo=True)
@@ -96,17 +99,45 @@ _GRIDS: Mapping[str, tuple[int, int]] = {
     "HD": (1280, 720),
     "SVGA": (960, 600),
     "VGA": (672, 376),
+    "4K": (3840, 2160),
+    "QHDPLUS": (3200, 1800),
+    "HD1536": (1920, 1536),
+    "XVGA": (960, 768),
+    "TXGA": (640, 512),
 }
 """Image sizes (width, height) of Stereolabs cameras, pixels, by section suffix."""
+_CAMERAS = ("LEFT_CAM_", "RIGHT_CAM_")
 
+_TERMS = ("k1", "k2", "p1", "p2", "k3")
 _STEREO: Mapping[str, Expected] = {
     "Baseline": quantity(1, 10_000, "millimetres"),
     **dict.fromkeys(("TY", "TZ"), quantity(-1000, 1000, "millimetres")),
     **dict.fromkeys(("RX", "CV", "RZ"), ANGLE_RAD),
 }
-"""Keys of the section ``[STEREO]``."""
 _OPTIONAL = ("p1", "p2", "k3", "TY", "TZ")
-"""Keys that may be missing, which means 0."""
+"""Fields that may be missing, which means 0."""
+
+
+def _fields(names: Iterable[str], keys: str, use: Literal["used", "checked"], meaning: str) -> list[Field]:
+    return [Field(name, tuple(keys.replace("#", name).split()), use, meaning) for name in names]
+
+
+_SIZES = ", ".join(f"{name} ({width} x {height})" for name, (width, height) in _GRIDS.items())
+ZED_CONF = FileFormat(
+    "Stereolabs' `*.conf`",
+    (
+        *_fields(("fx", "fy", "cx", "cy"), "EYE_CAM_X.#", "used", f"pixels; EYE: LEFT or RIGHT; X: {_SIZES}"),
+        *_fields(_TERMS, "EYE_DISTO.# EYE_CAM_X.#", "used", "distortion; equal if in both sections"),
+        *_fields(
+            ("k4", "k5", "k6", "s1", "s2", "s3", "s4", "tauX", "tauY"),
+            *("EYE_DISTO.# EYE_CAM_X.#", "checked", "absent or 0: terms of other lens models"),
+        ),
+        *_fields(("Baseline", "TY", "TZ"), "STEREO.#_X STEREO.#", "used", "T = -(Baseline, TY, TZ), millimetres"),
+        *_fields(("RX", "CV", "RZ"), "STEREO.#_X STEREO.#", "used", "R = Rodrigues(RX, CV, RZ), radians"),
+        Field("miscellaneous", ("MISC",), "harmless", "such as the kind of sensor"),
+    ),
+)
+"""Fields by section and key, in which EYE and X stand for the names of an eye and of an image size."""
 
 _Sections = Mapping[str, Mapping[str, tuple[int, str]]]
 """Line and text of each key of each section."""
@@ -114,52 +145,117 @@ _COMMENT = re.compile(r"(?:^|\s)[;#]")
 _SEPARATOR = re.compile("[=:]")
 
 
-def _camera_keys(width: int, height: int) -> Mapping[str, Expected]:
-    """Return the keys of the section of a camera whose images have ``width`` x ``height`` pixels."""
-    return {
-        **dict.fromkeys(("fx", "fy"), FOCAL_PX),
-        "cx": principal_point(width),
-        "cy": principal_point(height),
-        **dict.fromkeys(("k1", "k2", "p1", "p2", "k3"), DISTORTION),
-    }
+@dataclass(frozen=True)
+class _SizeReader:
+    """Values of the image size ``suffix`` in the sections of a file; problems are added to ``problems``."""
+
+    sections: _Sections
+    suffix: str
+    problems: list[Problem]
+
+    def lens(self, eye: str) -> Lens:
+        """Return the lens of the camera ``eye``."""
+        width, height = _GRIDS[self.suffix]
+        fx, fy = self.numbers({"fx": FOCAL_PX, "fy": FOCAL_PX}, eye)
+        cx, cy = self.numbers({"cx": principal_point(width), "cy": principal_point(height)}, eye)
+        terms = dict.fromkeys(_TERMS, DISTORTION) if self._has_known_model(eye) else {}
+        k1, k2, p1, p2, k3 = self.numbers(terms, eye) or [0.0] * len(_TERMS)
+        return Lens(fx, fy, cx, cy, (k1, k2, p1, p2, k3))
+
+    def numbers(self, fields: Mapping[str, Expected], eye: str = "") -> list[float]:
+        """Return the numbers of fields; 0 and a problem for an invalid one, and for a missing one of a section."""
+        numbers = []
+        for name, expected in fields.items():
+            entries = self._entries(name, eye)
+            place, line, raw = (*entries, (_place(ZED_CONF.keys(name)[-1], eye, self.suffix), 0, "0"))[0]
+            numbers.append(parse_number(raw))
+            if not entries and place.partition(".")[0] in self.sections and name not in _OPTIONAL:
+                self.problems.append(Problem("missing", place, "missing", expected.text))
+            elif entries and not expected.accept(numbers[-1]):
+                found = f"line {line}: got {short_repr(raw)}"
+                self.problems.append(Problem("invalid", place, found, expected.text))
+            elif name in _TERMS and any(parse_number(other) != numbers[-1] for _, _, other in entries[1:]):
+                self.problems.append(Problem("conflict", place, f"differs from {entries[1][0]}", "one lens model"))
+        return numbers
+
+    def _has_known_model(self, eye: str) -> bool:
+        """Return whether the lens has no terms but k1 k2 p1 p2 k3 and is no fisheye one; add a problem if not."""
+        checked = [field.name for field in ZED_CONF.fields if field.use == "checked"]
+        other = [entry for name in checked for entry in self._entries(name, eye)]
+        tangential = self._entries("p1", eye) + self._entries("p2", eye)
+        has_four = bool(self._entries("k4", eye)) and not tangential
+        terms = [entry for entry in other if has_four or parse_number(entry[2]) != 0]
+        if terms:
+            further = [raw for *_, raw in tangential + self._entries("k5", eye) + self._entries("k6", eye)]
+            section, _, name = terms[0][0].partition(".")
+            radial = "rational" if any(map(parse_number, further)) else "fisheye"
+            kind = {"s": "thin prism", "t": "tilted"}.get(name[0], radial)
+            stated = ", ".join(f"{place.partition('.')[2]} = {escape_text(raw)}" for place, _, raw in terms)
+            self.problems.append(Problem("invalid", section, f"{kind} distortion ({stated})", KNOWN_LENS))
+        return not terms
+
+    def _entries(self, name: str, eye: str) -> list[tuple[str, int, str]]:
+        """Return place, line and text of the keys of a field that the file has."""
+        places = [_place(key, eye, self.suffix).split(".") for key in ZED_CONF.keys(name)]
+        return [
+            (f"{section}.{key}", *self.sections[section][key.lower()])
+            for section, key in places
+            if key.lower() in self.sections.get(section, {})
+        ]
 
 
-def _read_conf(content: bytes, width: int, height: int, problems: list[Problem]) -> StereoCalibration | None:
+def _place(key: str, eye: str, suffix: str) -> str:
+    """Return a key of the table for one camera and one image size."""
+    return key.replace("EYE", eye).replace("_X", f"_{suffix}")
+
+
+def _read_conf(
+    name: str, content: bytes, width: int, height: int, problems: list[Problem]
+) -> StereoCalibration | None:
     """Return the calibration of a Stereolabs ``.conf`` file for one of its image sizes; the caller scales it.
 
     The size is that nearest to ``width`` x ``height`` in aspect ratio, then in width. Section names and keys are
-    case-insensitive, unknown keys are ignored. Problems are added to ``problems``; the result is None if there are
-    any.
+    case-insensitive. Problems are added to ``problems``; the result is None if there are any.
     """
     sections = _read_sections(content, problems)
     suffix = _nearest_suffix(sections, width, height, problems)
     if suffix is None:
         return None
-    width, height = _GRIDS[suffix]
     names = (f"LEFT_CAM_{suffix}", f"RIGHT_CAM_{suffix}", "STEREO")
-    problems += [Problem("missing", name, "missing", "a section") for name in names if name not in sections]
-    lenses = []
-    for name in names[:2]:
-        keys = _camera_keys(width, height)
-        fx, fy, cx, cy, k1, k2, p1, p2, k3 = _section_numbers(sections, name, keys, suffix, problems)
-        lenses.append(Lens(fx, fy, cx, cy, (k1, k2, p1, p2, k3)))
-    baseline_mm, y_mm, z_mm, rx, cv, rz = _section_numbers(sections, "STEREO", _STEREO, suffix, problems)
+    problems += [Problem("missing", one, "missing", "a section") for one in names if one not in sections]
+    reader = _SizeReader(sections, suffix, problems)
+    left, right = reader.lens("LEFT"), reader.lens("RIGHT")
+    baseline_mm, y_mm, z_mm, rx, cv, rz = reader.numbers(_STEREO)
     translation_m = (0.0 - baseline_mm / 1000, 0.0 - y_mm / 1000, 0.0 - z_mm / 1000)
-    return (
-        None if problems else StereoCalibration(width, height, lenses[0], lenses[1], (rx, cv, rz), translation_m)
-    )
+    if problems:
+        return None
+    notes = _notes(name, sections)
+    if _GRIDS[suffix] != (width, height):
+        size = " x ".join(map(str, _GRIDS[suffix]))
+        notes.append(f"{name}: scaled from {suffix}, {size}, as if both sizes showed the same part of the sensor")
+    return StereoCalibration(*_GRIDS[suffix], left, right, (rx, cv, rz), translation_m, tuple(notes))
+
+
+def _notes(name: str, sections: _Sections) -> list[str]:
+    """Return the note that names the sections, and the keys of known ones, that ``ZED_CONF`` does not list."""
+    keys = [key for field in ZED_CONF.fields for key in field.keys]
+    listed = {_place(key, eye, suffix).upper() for key in keys for eye in ("LEFT", "RIGHT") for suffix in _GRIDS}
+    known = {place.partition(".")[0] for place in listed} - listed
+    places = [
+        place
+        for section, keys in sections.items()
+        for place in ([f"{section}.{key}" for key in keys] if section in known else [section])
+    ]
+    return ZED_CONF.notes(name, [place for place in places if place.upper() not in listed])
 
 
 def _read_sections(content: bytes, problems: list[Problem]) -> _Sections:
     """Return the sections, names in upper and keys in lower case, without the comments after ``;`` and ``#``."""
-    try:
-        lines = content.decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        problems.append(Problem("syntax", "", f"byte {error.start} is not UTF-8", "an INI file"))
-        return {}
+    content_text, text_problems = decode_text(content)
+    problems += text_problems
     sections: dict[str, dict[str, tuple[int, str]]] = {}
     section = ""
-    for line_number, line in enumerate(lines, start=1):
+    for line_number, line in enumerate(content_text.splitlines(), start=1):
         if len(problems) == MAX_PROBLEMS_SHOWN:
             break
         text = _COMMENT.split(line, maxsplit=1)[0].strip()
@@ -184,9 +280,10 @@ def _read_sections(content: bytes, problems: list[Problem]) -> _Sections:
 def _nearest_suffix(sections: _Sections, width: int, height: int, problems: list[Problem]) -> str | None:
     """Return the suffix of the sections whose image size is nearest in aspect ratio, then in width.
 
-    Returns None, and adds a problem if there is none yet, if the file has no sections of a known size.
+    Returns None, and adds a problem if there is none yet, if the file has no sections of a known size, and if it
+    has none of this size and one of an unknown size.
     """
-    present = [name for name in _GRIDS if {f"LEFT_CAM_{name}", f"RIGHT_CAM_{name}"} & set(sections)]
+    present = [name for name in _GRIDS if {camera + name for camera in _CAMERAS} & set(sections)]
     if not present and not problems:
         found = escape_text(", ".join(f"[{name}]" for name in sections) or "no section")
         cameras = ", ".join(f"[LEFT_CAM_{name}]" for name in _GRIDS)
@@ -195,30 +292,17 @@ def _nearest_suffix(sections: _Sections, width: int, height: int, problems: list
 
     def distance(suffix: str) -> tuple[float, float]:
         grid_width, grid_height = _GRIDS[suffix]
-        return abs(math.log(grid_width * height / (width * grid_height))), abs(math.log(grid_width / width))
+        ratio = grid_width * height / (width * grid_height)
+        return round(abs(math.log(ratio)), 9), abs(math.log(grid_width / width))
 
-    return min(present, key=distance, default=None)
-
-
-def _section_numbers(
-    sections: _Sections, section: str, keys: Mapping[str, Expected], suffix: str, problems: list[Problem]
-) -> list[float]:
-    """Return the numbers of a section, by keys with the section's suffix or without; 0 for missing ones.
-
-    Add a problem for each invalid number, and for each missing one of an existing section unless it is optional.
-    """
-    values = sections.get(section, {})
-    numbers = []
-    for key, expected in keys.items():
-        name = next((name for name in (f"{key}_{suffix}", key) if name.lower() in values), None)
-        if name is None:
-            if section in sections and key not in _OPTIONAL:
-                problems.append(Problem("missing", f"{section}.{key}", "missing", expected.text))
-            numbers.append(0.0)
-            continue
-        line_number, raw = values[name.lower()]
-        numbers.append(parse_number(raw))
-        if not expected.accept(numbers[-1]):
-            found = f"line {line_number}: got {short_repr(raw)}"
-            problems.append(Problem("invalid", f"{section}.{name}", found, expected.text))
-    return numbers
+    nearest = min(present, key=distance, default=None)
+    if nearest is None or _GRIDS[nearest] == (width, height):
+        return nearest
+    known = {camera + name for camera in _CAMERAS for name in _GRIDS}
+    unknown = [f"[{escape_text(name)}]" for name in sections if name.startswith(_CAMERAS) and name not in known]
+    if not unknown:
+        return nearest
+    found = f"no section is known to be of {width} x {height} pixels; {', '.join(unknown[:10])} may be"
+    expected = "only sections of the size that the images were scaled from, or calibration.toml with that size"
+    problems.append(Problem("conflict", "", found, expected))
+    return None

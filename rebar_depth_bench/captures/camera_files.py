@@ -3,7 +3,7 @@
 A folder holds one of these:
 
 - ``cameras.toml``, see below;
-- ``calibration.conf`` (Stereolabs) or ``calibration.toml`` (``captures.calibration_files``);
+- one file ``*.conf`` (Stereolabs) or ``calibration.toml`` (``captures.calibration_files``);
 - calibrations of other programs (``captures.programs``): one file ``*.yaml``, ``.yml``, ``.xml`` or
   ``.json`` (OpenCV's FileStorage, a Kalibr camera chain, ROS ``camera_info`` of one camera), or two of them:
   intrinsics and extrinsics of OpenCV, or ``left.*`` and ``right.*`` of ROS.
@@ -202,17 +202,19 @@ def cameras_of_table(
 
 def _found_files(root: Path) -> list[Path]:
     """Return the calibration files of a folder. Raises ``InputError`` unless there is one, or a pair."""
-    own = [root / name for name in _CALIBRATION_FILES if (root / name).exists()]
-    files = sorted(root.iterdir())
+    files = sorted(path for path in root.iterdir() if not path.name.startswith("."))
+    own = [path for path in files if path.suffix.lower() == ".conf" or path.name in _CALIBRATION_FILES]
     others = [path for path in files if path.suffix.lower() in DOCUMENT_SUFFIXES and path.suffix.lower() != ".txt"]
     if not own and not others:
         texts = [path for path in files if path.suffix.lower() in _OTHER_SUFFIXES]
         others = [path for path in texts if path.name.lower() == "calib.txt" or recognised_problem(path)][:1]
-    if len(own) == 1 or (not own and 1 <= len(others) <= 2):
-        return own or others
+    if len(own) == 1 and (own[0].name in _CALIBRATION_FILES or not others):
+        return own
+    if not own and 1 <= len(others) <= 2:
+        return others
     found = ", ".join(path.name for path in (*own, *others)[:5]) or "none"
     raise InputError(
-        f"{root}: the calibration files are {found}, expected {CAMERAS_FILE}, {', '.join(_CALIBRATION_FILES)}, or "
+        f"{root}: the calibration files are {found}, expected {CAMERAS_FILE}, calibration.toml, one *.conf, or "
         f"one or two of *{', *'.join(DOCUMENT_SUFFIXES)}"
     )
 

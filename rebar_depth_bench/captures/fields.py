@@ -1,4 +1,4 @@
-"""Fields of other programs' files: those that a reader uses, checks, or leaves because they change no number.
+"""Fields of the files of other programs: those that a reader uses or checks, and those that change no number.
 
 A reader looks up its values in the table of its format and names every field that the table does not list. Lens
 models beyond k1 k2 p1 p2 k3, stated by name or by the number of terms, are refused in one way in all formats.
@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 from rebar_depth_bench.base.errors import Problem, escape_text
 from rebar_depth_bench.base.validation import short_repr
+from rebar_depth_bench.captures.calibration import KNOWN_LENS
 
 _MAX_NAMED = 10
 DISTORTION_TERMS = 5
@@ -27,10 +28,6 @@ _SAME_WITHOUT_TERMS = ("inversebrownconrady", "modifiedbrownconrady")
 """Lens models of other distortion, which are pinholes if all terms are 0."""
 _PINHOLE = ("pinhole", "perspective")
 """Names of a projection without a statement about the distortion."""
-_RECTIFY = (
-    "k1 k2 p1 p2 k3 (plumb_bob, radtan): rectify the images first, with the camera's own software or with OpenCV "
-    'as "Rectify images first" in docs/captures.md shows, and give their new K with zero distortion'
-)
 
 
 @dataclass(frozen=True)
@@ -84,7 +81,7 @@ def lens_problem(where: str, models: Mapping[str, Any], terms: Sequence[float] =
     stated_radial = any(model in _RADIAL for model in plain.values())
     accepted = (*_RADIAL, *_PINHOLE, *_UNDISTORTED, *(() if any(terms) else _SAME_WITHOUT_TERMS))
     others = [key for key, model in plain.items() if model not in accepted]
-    expected = _RECTIFY
+    expected = KNOWN_LENS
     if others:
         found = f"{escape_text(others[0])} is {short_repr(models[others[0]])}"
     elif any(terms[DISTORTION_TERMS:]):
@@ -94,7 +91,7 @@ def lens_problem(where: str, models: Mapping[str, Any], terms: Sequence[float] =
     elif any(terms) and len(terms) == 4 and not stated_radial:
         found = "four distortion terms without a stated model may be those of a fisheye lens"
         remedy = "add distortion_model: plumb_bob, or a fifth term k3 = 0, if they are k1 k2 p1 p2"
-        expected = f"{remedy}; otherwise {_RECTIFY}"
+        expected = f"{remedy}; otherwise {KNOWN_LENS}"
     elif any(terms) and len(terms) < 4:
         found = f"the distortion has {len(terms)} terms"
     else:

@@ -5,14 +5,21 @@ from __future__ import annotations
 import os
 import re
 import struct
+import warnings
 import zlib
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import BinaryIO
 
 from jaxtyping import UInt8
 from numpy import ndarray
+from PIL.ExifTags import Base
+from PIL.Image import Image
+from PIL.JpegImagePlugin import JpegImageFile
+from PIL.PngImagePlugin import PngImageFile
+from PIL.TiffImagePlugin import TiffImageFile
 
 from rebar_depth_bench.base.errors import EntryError, InputError, Problem, escape_text, format_shape
 from rebar_depth_bench.base.limits import CELL_BYTES, IMAGE_PIXELS
@@ -20,6 +27,8 @@ from rebar_depth_bench.base.reading import open_regular, read_file
 from rebar_depth_bench.data.codecs import decode
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg")
+OTHER_SUFFIXES = (".tif", ".tiff", ".bmp", ".webp", ".gif", ".exr", ".ppm", ".pgm", ".jp2", ".heic", ".avif")
+"""Suffixes of pictures that are not read."""
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 NAME_RULE = "a name of 1 to 100 letters, digits, . _ -"
 
@@ -51,8 +60,13 @@ def image_files(folder: Path, problems: list[Problem]) -> dict[str, Path]:
         problems.append(Problem("unreadable", f"{folder.name}/", "the folder cannot be read"))
         return {}
     files: dict[str, Path] = {}
-    for file in sorted(folder.iterdir()):
-        if file.suffix.lower() not in IMAGE_SUFFIXES or file.is_dir():
+    entries = [file for file in sorted(folder.iterdir()) if not file.name.startswith(".") and not file.is_dir()]
+    others = [escape_text(file.name) for file in entries if file.suffix.lower() in OTHER_SUFFIXES]
+    if others:
+        found = f"has {len(others)} pictures of other formats, such as {', '.join(others[:3])}"
+        problems.append(Problem("invalid", f"{folder.name}/", found, "PNG or JPEG: save them as PNG"))
+    for file in entries:
+        if file.suffix.lower() not in IMAGE_SUFFIXES:
             continue
         if file.stem in files:
             problems.append(Problem("duplicate", entry_name(file), "the name occurs twice", "one image per view"))
@@ -78,12 +92,48 @@ def common_shape(images: Sequence[Path], problems: list[Problem]) -> tuple[int, 
     return shape
 
 
+def check_upright(stream: BinaryIO, where: str = "") -> None:
+    """Check that a PNG, JPEG or TIFF file does not ask viewers to turn its pixels; damaged metadata do not.
+
+    Raises ``EntryError`` with the location ``where`` for an EXIF orientation other than 1: a calibration may be
+    that of the turned or of the stored pixels.
+    """
+    orientation: object = None
+    is_small = stream.seek(0, os.SEEK_END) <= CELL_BYTES.value()  # Larger files are not read.
+    for plugin in (PngImageFile, JpegImageFile, TiffImageFile) if is_small else ():
+        stream.seek(0)
+        with suppress(Exception), warnings.catch_warnings(action="ignore"), plugin(stream) as image:
+            if plugin is PngImageFile and (exif := _png_exif(stream)):
+                image.info["exif"] = exif
+            # The method of PngImageFile would decode the pixels.
+            orientation = Image.getexif(image).get(Base.Orientation)
+    if orientation in range(2, 9):
+        found = f"the EXIF orientation is {orientation}: viewers turn the pixels"
+        remedy = "save the turned pixels (mogrify -auto-orient), or remove the tag (exiftool -Orientation=)"
+        expected = f"1, as the calibration may be of either: {remedy}"
+        raise EntryError(Problem("invalid", where, found, expected))
+
+
+def _png_exif(stream: BinaryIO) -> bytes | None:
+    """Return the EXIF data of a PNG file, which may stand after the pixels."""
+    stream.seek(len(_PNG_SIGNATURE))
+    for _ in range(_MAX_PNG_CHUNKS):
+        head = stream.read(8)
+        length = int.from_bytes(head[:4], "big")
+        if len(head) < 8 or head[4:] == b"eXIf":
+            return stream.read(min(length, _MAX_EXIF_BYTES))
+        stream.seek(length + 4, 1)
+    return None
+
+
 # Size of an image, read from its header. No image library takes part: nothing is decoded or inflated, whatever the
 # file declares.
 
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_HEADER_BYTES = 33
+_MAX_PNG_CHUNKS = 100_000
+_MAX_EXIF_BYTES = 1 << 20
 _MAX_JPEG_SEGMENTS = 1000
 """Largest number of JPEG segments and of bytes between them before the one with the size."""
 _FRAME_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
@@ -93,11 +143,13 @@ _FRAME_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}
 def read_image_shape(path: Path) -> tuple[int, int]:
     """Return (height, width) of a PNG or JPEG file, at most ``IMAGE_PIXELS`` pixels.
 
-    Raises ``EntryError``, whose problem has no location, for any other file.
+    Raises ``EntryError``, whose problem has no location, for any other file and as ``check_upright``.
     """
     try:
         with open_regular(path) as stream:
             shape = _png_shape(stream) or _jpeg_shape(stream)
+            if shape:
+                check_upright(stream)
     except OSError as error:
         raise EntryError(Problem("unreadable", "", f"cannot be read: {error.strerror or error}")) from None
     if not shape or not all(shape):

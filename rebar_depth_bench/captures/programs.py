@@ -30,19 +30,22 @@ from rebar_depth_bench.base.reading import parse_number
 from rebar_depth_bench.base.validation import format_location, short_repr
 from rebar_depth_bench.captures.calibration import Calibration, table_calibration
 from rebar_depth_bench.captures.fields import DISTORTION_TERMS, FileFormat, lens_problem, plain_key
-from rebar_depth_bench.captures.program_formats import CAMERA, EYES, KALIBR, MIDDLEBURY, MIDDLEBURY_RIGHT, PAIR
+from rebar_depth_bench.captures.program_formats import CAMERA, KALIBR, MIDDLEBURY, MIDDLEBURY_RIGHT, PAIR
 from rebar_depth_bench.geometry.cameras import is_rotation, nearest_rotation, rotation_matrix
 
 Document = Mapping[str, Any]
 Values = Float64[ndarray, "..."]
 
 _CAMERAS = ("left", "right")
+_OF_EACH_EYE = ("matrix", "distortion", "rectification", "projection")
+"""Fields that a pair states for each camera."""
+_OF_ANY_EYE = ("distortion model", "camera model", "other lenses")
+"""Fields that a pair states for each camera or for both."""
 _REGION = ("x_offset", "y_offset", "width", "height")
 _MAX_NUMBERS = 100
 _MAX_MAGNITUDE = 1e9
 _ROUNDED_ROTATION = 1e-4
 """Largest deviation of ``R @ R.T`` from the identity in a file with few digits; it is made exact."""
-_STATED_IN = "cameras.toml"
 _ROUNDED_PX = 0.01
 """Largest difference of K and P that is due to the digits of a file, pixels."""
 
@@ -52,7 +55,7 @@ class _Reader:
     """Values of a document ``name``; problems are added to ``problems``, in place of which zeros are returned.
 
     Notes are added to ``notes``. ``sources`` names the files of the keys of a document that was put together from
-    several.
+    several; of a document of a pair, ``eyes`` are the spellings of one of its cameras.
     """
 
     name: str
@@ -60,6 +63,7 @@ class _Reader:
     problems: list[Problem]
     notes: list[str]
     fields: FileFormat
+    eyes: tuple[str, ...] = ("",)
     sources: Mapping[str, str] = field(default_factory=dict)
 
     @cached_property
@@ -68,7 +72,14 @@ class _Reader:
 
     def keys(self, name: str) -> list[str]:
         """Return the keys of a field in the document."""
-        return [self._keys[key] for key in map(plain_key, self.fields.keys(name)) if key in self._keys]
+        eyes = self._eyes(name)
+        spellings = (text for key in self.fields.keys(name) for eye in eyes for text in (key + eye, eye + key))
+        return list(dict.fromkeys(self._keys[key] for key in map(plain_key, spellings) if key in self._keys))
+
+    def _eyes(self, name: str) -> tuple[str, ...]:
+        """Return what may be before or after the keys of a field."""
+        shared = (*self.eyes, "") if name in _OF_ANY_EYE else ("",)
+        return self.eyes if name in _OF_EACH_EYE else shared
 
     def key(self, name: str) -> str | None:
         """Return the first key of a field in the document, None if it has none."""
@@ -193,7 +204,7 @@ class _Reader:
 
     def place(self, name: str) -> str:
         """Return the location of a field."""
-        return self.key_place(self.key(name) or (*self.fields.keys(name), name)[0])
+        return self.key_place(self.key(name) or (*self.fields.keys(name), name)[0] + self._eyes(name)[0])
 
     def key_place(self, key: str) -> str:
         """Return the location of a key."""
@@ -270,11 +281,15 @@ def _cameras(
         keys = [*merged.document, *(key for camera in cameras for key in camera.document)]
         notes += KALIBR.notes(name, dict.fromkeys(keys))
         return cameras, _kalibr_motion
-    pair = [replace(merged, fields=fields) for fields in EYES]
+    fields = replace(PAIR, fields=PAIR.fields + CAMERA.fields)
+    pair = [replace(merged, fields=fields, eyes=eyes) for eyes in (("1", "left", "l"), ("2", "right", "r"))]
     right = pair[1].key("matrix")
-    is_pair = right is not None and isinstance(merged.document[right], dict | list)
-    notes += (PAIR if is_pair else CAMERA).notes(name, merged.document)
-    return pair if is_pair else [merged], _opencv_motion
+    if right is None or not isinstance(merged.document[right], dict | list):
+        notes += CAMERA.notes(name, merged.document)
+        return [merged], _opencv_motion
+    listed = {key for camera in pair for one in fields.fields for key in camera.keys(one.name)}
+    notes += PAIR.notes(name, (key for key in merged.document if key not in listed))
+    return pair, _opencv_motion
 
 
 def _merged(readers: Sequence[_Reader]) -> _Reader:
@@ -305,11 +320,11 @@ def _is_rectified(cameras: Sequence[_Reader], rectified: bool | None, notes: lis
             rotation = camera.numbers("rectification", (3, 3), (3,), default=np.eye(3))
             if unlike and not any(camera.distortion) and np.allclose(rotation, np.eye(3)):
                 found = "differs from the camera's matrix without distortion: the pictures may be rectified"
-                expected = f"rectified = true (they have P) or false beside calibration in {_STATED_IN}"
+                expected = "rectified = true (they have P) or false beside calibration in cameras.toml"
                 camera.problem("conflict", "projection", found, expected)
             elif unlike or any(camera.distortion):
                 found = "the pictures are taken as not rectified, with the camera's own matrix and distortion"
-                remedy = f"if they are rectified, state rectified = true in {_STATED_IN}"
+                remedy = "if they are rectified, state rectified = true in cameras.toml"
                 notes.append(f"{camera.name}: {found}; {remedy}")
         elif rectified and P is None:
             camera.problem("missing", "projection", "missing", "the matrix P of rectified pictures")

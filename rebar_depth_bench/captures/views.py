@@ -31,6 +31,7 @@ from rebar_depth_bench.captures.images import (
     IMAGE_SUFFIXES,
     NAME,
     NAME_RULE,
+    OTHER_SUFFIXES,
     common_shape,
     entry_name,
     image_files,
@@ -154,13 +155,14 @@ CAPTURE_LAYOUT = "left/<name>.png|jpg, right/<name>.png|jpg, calibration.conf|to
 def is_capture(path: str | os.PathLike[str]) -> bool:
     """Return whether a folder is meant as a capture.
 
-    It has a folder ``left``, or ``cameras.toml``, or both images and a calibration file.
+    It has a folder ``left``, or ``cameras.toml`` or ``calibration.toml``, or both images and a calibration file.
     """
     root = Path(path)
-    if (root / "left").is_dir() or (root / CAMERAS_FILE).is_file():
+    if (root / "left").is_dir() or any((root / name).is_file() for name in (CAMERAS_FILE, "calibration.toml")):
         return True
     suffixes = {entry.suffix.lower() for entry in root.iterdir()} if root.is_dir() else set()
-    return not suffixes.isdisjoint(IMAGE_SUFFIXES) and not suffixes.isdisjoint(CALIBRATION_SUFFIXES)
+    pictures = {*IMAGE_SUFFIXES, *OTHER_SUFFIXES}
+    return not suffixes.isdisjoint(pictures) and not suffixes.isdisjoint(CALIBRATION_SUFFIXES)
 
 
 def open_capture(path: str | os.PathLike[str]) -> ImageViews:

@@ -27,7 +27,7 @@ from rebar_depth_bench.submission.declaration import parse_metadata
 from rebar_depth_bench.submission.entries import FORMATS
 from tests.bench.captures import calibration_files as pair
 from tests.bench.captures.example_capture import write_capture
-from tests.bench.geometry.calibrations import CONF, TOML
+from tests.bench.geometry.calibrations import CONF, CONF_OF_SIZES, TOML
 from tests.bench.reporting.results import overflowed_view, result, scored_view, unpredicted_view
 from tests.bench.submission.zips import exr, npy, npz, png
 from tests.building import TWO_BARS
@@ -143,11 +143,11 @@ def _write_ros(path: Path) -> None:
         path.with_name(name).write_text(text)
 
 
-def _write_capture_image(path: Path) -> None:
+def _write_capture_image(path: Path, exif: bytes = b"") -> None:
     """Write a capture of one pair, whose right image is ``path``."""
     root = write_capture(path.parents[1], 1)
     (root / "right" / "000000.png").unlink()
-    Image.new("L", (64, 36)).save(path)
+    Image.new("L", (64, 36)).save(path, exif=exif)
 
 
 def _open_capture(path: Path) -> object:
@@ -256,6 +256,7 @@ _mesh = partial(_reader, read=_read_mesh, share=4, shows_truncation=True)
 _calibration = partial(_reader, read=_read_calibration, share=8)
 _cameras = partial(_reader, read=_read_cameras)
 _picture = partial(_reader, write=_write_capture_image, read=_open_capture)
+_UPRIGHT = partial(_write_capture_image, exif=b"II*\0\x08\0\0\0\1\0\x12\1\3\0\1\0\0\0\1\0\0\0\0\0\0\0")
 _content = partial(_reader, special_files=False)
 _depth = partial(_content, read=_decode_depth)
 _imported = partial(_reader, read=_import, cpu_s=10.0)
@@ -295,6 +296,7 @@ FILE_ENTRIES = (
     _mesh("mesh: OBJ", "a.obj", lambda path: _rods().export(path), shows_truncation=False),
     _calibration("calibration: TOML", "rig.toml", partial(_text, TOML)),
     _calibration("calibration: conf", "SN1.conf", partial(_text, CONF)),
+    _calibration("calibration: conf of sizes", "SN2.conf", partial(_text, CONF_OF_SIZES)),
     _cameras("cameras: TOML", "cameras.toml", partial(_text, pair.TOML + _BOARD_AND_POSES)),
     _cameras("cameras: OpenCV YAML", "a.yml", _write_opencv),
     _cameras("cameras: OpenCV XML", "a.xml", _write_opencv),
@@ -305,6 +307,8 @@ FILE_ENTRIES = (
     _cameras("cameras: calib.txt", "calib.txt", partial(_text, pair.CALIB_TXT)),
     _picture("capture: PNG", "capture/right/000000.png"),
     _picture("capture: JPEG", "capture/right/000000.jpg"),
+    _picture("capture: PNG with EXIF", "capture/right/000000.png", write=_UPRIGHT),
+    _picture("capture: JPEG with EXIF", "capture/right/000000.jpg", write=_UPRIGHT),
     _depth("depth: npy", "a.npy", lambda path: path.write_bytes(npy(DEPTH_M))),
     _depth("depth: npz", "a.npz", lambda path: path.write_bytes(npz(depth=DEPTH_M))),
     _depth("depth: EXR", "a.exr", lambda path: exr(path, {"Z": DEPTH_M})),

@@ -35,6 +35,7 @@ from rebar_depth_bench.methods import find_method, own_methods
 from rebar_depth_bench.methods.onnx.spec import OUTPUT_MEANINGS
 from rebar_depth_bench.submission import SubmissionMeta
 from scripts.diagrams import PACKAGE_EDGES, diagrams
+from scripts.format_tables import with_tables
 from tests.bench.methods.predictors import load_predictor
 from tests.project.pages import (
     DOCS,
@@ -231,6 +232,11 @@ def test_architecture_table_and_diagram_have_the_real_imports() -> None:
 def test_diagrams_are_current() -> None:
     stored = {name: (DOCS / "pictures" / name).read_text() for name in diagrams()}
     assert stored == diagrams(), "write them: python -m scripts.diagrams docs/pictures"
+
+
+def test_tables_of_other_programs_files_are_current() -> None:
+    page = (DOCS / "formats.md").read_text()
+    assert page == with_tables(page), "write them: python -m scripts.format_tables docs/formats.md"
 
 
 def test_results_in_readme_are_those_of_the_card() -> None:

@@ -105,8 +105,8 @@ def test_other_lens_is_refused_with_one_remedy(contents: dict[str, str], found: 
     problem = caught.value.problems[0]
     assert found in problem.found
     assert problem.expected.endswith(
-        'rectify the images first, with the camera\'s own software or with OpenCV as "Rectify images first" in '
-        "docs/captures.md shows, and give their new K with zero distortion"
+        'rectify the images first with the camera\'s own software or OpenCV, see "Rectify images first" in '
+        "docs/captures.md, and give their new K with zero distortion"
     )
 
 

@@ -42,6 +42,17 @@ RX_HD=-0.001
 RZ_HD=0.0007
 """
 
+_EYES = ("LEFT", "RIGHT")
+_PINHOLE = "fx=742.1\nfy=742.1\ncx=961.3\ncy=543.2\n"
+_TERMS = "k1=-0.05\nk2=0.01\np1=1e-4\np2=-2e-4\nk3=1e-3\nk4=0\nk5=0\nk6=0\n"
+CONF_OF_SIZES = (
+    "".join(f"[{eye}_CAM_{size}]\n{_PINHOLE}" for size in ("FHD1200", "FHD") for eye in _EYES)
+    + "".join(f"[{eye}_DISTO]\n{_TERMS}" for eye in _EYES)
+    + CONF[CONF.index("[STEREO]") :].replace("_HD", "_FHD")
+    + "[MISC]\nSensor_ID=1\n"
+)
+"""File with the distortion of all sizes in sections of its own, for images of 16:9."""
+
 
 TOML = """\
 width = 1280

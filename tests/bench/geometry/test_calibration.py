@@ -206,7 +206,8 @@ INVALID_CONF = [
     [
         (b"", "missing", "the file has no section, expected one of"),
         (b"\x00" * 100, "syntax", "line 1 is '\\x00"),
-        (b"\xff\xfe[\x00L\x00", "syntax", "byte 0 is not UTF-8"),
+        (b"\xff\xfe[\x00L\x00", "syntax", "the text is UTF-16, expected UTF-8 text"),
+        (b"[\xe9]", "syntax", "byte 1 is not UTF-8"),
         (b"[STEREO]\nBaseline=120\n", "missing", "the file has [STEREO], expected one of [LEFT_CAM_2K]"),
         (b"[DEFAULT]\nfx=1\n", "missing", "the file has [DEFAULT], expected"),
         (b"; " + b"x" * (1 << 20), "size", "at most 1048576 bytes"),

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 import rebar_depth_bench as rdb
 from dataset_builder.cli.main import main
@@ -119,6 +120,32 @@ def test_invalid_file_is_refused_and_named(
         (folder / name).symlink_to(content)
     message = refused(layout, tmp_path / "out", capsys)
     assert any(view in message for view in NAMES) or "left_bars" in message
+
+
+@pytest.mark.parametrize(
+    ("column", "suffix", "values"),
+    [
+        ("left_rgb", ".jpg", np.zeros((90, 160, 3), np.uint8)),
+        ("right_rgb", ".png", np.zeros((90, 160, 3), np.uint8)),
+        ("left_depth", ".tif", np.ones((90, 160), np.float32)),
+        ("left_depth", ".png", np.ones((90, 160), np.uint16)),
+        ("left_mask", ".png", np.ones((90, 160), np.uint8)),
+        ("left_bars", ".tiff", np.ones((90, 160), np.uint16)),
+    ],
+)
+def test_turned_picture_is_refused(
+    column: str, suffix: str, values: np.ndarray, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Check pictures with tag 274 (Orientation) of EXIF or TIFF 6.0: 3, turned by half, keeps the size."""
+    exif = Image.Exif()
+    exif[274] = 3
+    for view in NAMES:
+        path = folder / f"turned/{view}{suffix}"
+        path.parent.mkdir(exist_ok=True)
+        Image.fromarray(values).save(path, exif=exif)
+    layout = data.write_layout(folder, files={column: f"turned/{{view}}{suffix}"})
+    message = refused(layout, tmp_path / "out", capsys)
+    assert f"{FIRST}{suffix}: the EXIF orientation is 3: viewers turn the pixels, expected 1, as the" in message
 
 
 @pytest.mark.slow
