@@ -166,7 +166,8 @@ class _Reader:
         is_inside = all(sides) and (not sensor or (x + sides[0] <= sensor[0] and y + sides[1] <= sensor[1]))
         if has_region and not is_inside:
             found = f"{sides[0]:g} x {sides[1]:g} pixels at ({x:g}, {y:g}) are not inside width x height"
-            expected = "a part of the full sensor, to which width, height and K belong (REP 104), or zeros"
+            expected = "a part of the full sensor, which width, height and K are for (REP 104)"
+            expected += "; or a roi of zeros, and K of the pictures"
             self.problem("conflict", "region", found, expected)
         shown = [side // bin for side, bin in zip(sides if has_region else sensor, (bin_x, bin_y), strict=False)]
         if (has_region or max(bin_x, bin_y) > 1) and shown == pictures:
@@ -320,7 +321,7 @@ def _is_rectified(cameras: Sequence[_Reader], rectified: bool | None, notes: lis
             rotation = camera.numbers("rectification", (3, 3), (3,), default=np.eye(3))
             if unlike and not any(camera.distortion) and np.allclose(rotation, np.eye(3)):
                 found = "differs from the camera's matrix without distortion: the pictures may be rectified"
-                expected = "rectified = true (they have P) or false beside calibration in cameras.toml"
+                expected = "rectified = true (they have P) or rectified = false beside calibration in cameras.toml"
                 camera.problem("conflict", "projection", found, expected)
             elif unlike or any(camera.distortion):
                 found = "the pictures are taken as not rectified, with the camera's own matrix and distortion"

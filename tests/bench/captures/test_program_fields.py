@@ -154,7 +154,9 @@ UNDISTORTED = {"D": [0.0] * 5, "P": RECTIFIED_P}
 
 @pytest.mark.parametrize("changes", [UNDISTORTED, UNDISTORTED | {"D": []}, UNDISTORTED | {"distortion_model": ""}])
 def test_two_matrices_without_distortion_must_be_told_apart(changes: dict[str, Any], tmp_path: Path) -> None:
-    with pytest.raises(CalibrationError, match=r"P: line \d+: differs .* rectified = true .* or false"):
+    with pytest.raises(
+        CalibrationError, match=r"P: line \d+: differs .* rectified = true .* or rectified = false"
+    ):
         mono(tmp_path, message(**changes), 1280, 800)
     for answer, fx in (("true", 380.0), ("false", 405.0)):
         assert mono(tmp_path, message(**changes), 1280, 800, f"rectified = {answer}\n").left.fx == fx
