@@ -157,7 +157,7 @@ def _import(options: argparse.Namespace) -> None:
     from dataset_builder.importing.config_import import plan_import, run_import
 
     source = plan_import(options.layout, options.config)
-    for note in source.views.cameras.calibration.notes:
+    for note in source.views.notes:
         print_notice(note)
     (height, width), views = source.views.grid, source.views.names
     print(f"{source.name}: {len(views)} views of {width} x {height}, sigma {source.layout.truth_sigma_m} m")

@@ -23,10 +23,7 @@ from scipy.spatial.transform import Rotation
 from dataset_builder.export.exported_views import EXPORT_FILES, MILLIMETRE_M, CameraView
 from dataset_builder.scene.shapes.bending import resample_polyline_m
 from rebar_depth_bench.data.bars import Bar, with_axis
-from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid, swap_camera_axes
-
-HALF_PIXEL = 0.5
-"""Offset of COLMAP's and nerfstudio's pixel coordinates from ours, pixels."""
+from rebar_depth_bench.geometry.cameras import HALF_PIXEL, Camera, inverse_rigid, swap_camera_axes
 
 TARGET_POINT_COUNT = 10_000
 """Approximate number of points in ``points3D.txt``."""

@@ -115,14 +115,15 @@ def _key_inputs(source: Import, progress: Progress) -> list[Any]:
     for done, path in enumerate(files, start=1):
         digests.append(file_sha256(path))
         progress("files read", done, len(files))
-    calibration = asdict(source.views.cameras.calibration)
-    poses = {name: pose.tolist() for name, pose in source.views.cameras.cam_from_world.items()}
+    cameras = source.views.cameras.values()
+    calibrations = [asdict(one) for one in dict.fromkeys(camera.calibration for camera in cameras)]
+    poses = [None if camera.cam_from_world is None else camera.cam_from_world.tolist() for camera in cameras]
     bars = [asdict(bar) for bar in source.bars]
     return [
         source.layout.model_dump(),
         source.views.names,
         digests,
-        calibration,
+        calibrations,
         poses,
         bars,
         generator_versions(),
@@ -171,7 +172,7 @@ def _config_entry(source: Import) -> dict[str, Any]:
 
 def _scene_entry(source: Import, key: str) -> dict[str, Any]:
     """Return the manifest entry of the scene without its shards."""
-    board = source.views.cameras.board
+    board = source.views.board
     return {
         "name": source.name,
         "split": TEST_SPLIT,

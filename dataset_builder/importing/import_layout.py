@@ -19,7 +19,7 @@ All files are named relative to its folder; ``{view}`` in a name stands for the 
     channel = "R"                     # of EXR files with several channels
 
     [cameras]                         # the keys of cameras.toml, see ``captures.camera_files``
-    calibration = "stereo.yml"
+    calibration = "stereo.yml"        # or views = "scene_camera.json", see ``view_cameras``
 
     [poses]                           # of the left camera, for each view; or [[cameras.pose]]
     file = "poses/{view}.txt"         # 4 x 4 numbers: .txt, .npy, .json
@@ -55,6 +55,7 @@ from rebar_depth_bench.base.validation import (
     field_error,
     number,
     one_of,
+    short_repr,
     text,
     validate_table,
     whole_number,
@@ -171,16 +172,31 @@ class Layout(StrictModel):
     masks: MasksTable = MasksTable()
     bars: BarsTable | None = None
 
+    @property
+    def views(self) -> str | None:
+        """Name of the file with the cameras of all views, or None."""
+        return str(self.cameras["views"]) if "views" in self.cameras else None
+
     @model_validator(mode="after")
     def _check_sizes(self) -> Layout:
         if self.files.left_rgb is None and (self.width is None or self.height is None):
             raise field_error("width or height is missing", "both, or files.left_rgb", "missing")
         if self.poses is not None and "pose" in self.cameras:
             raise field_error("got poses and cameras.pose", "one of them", "conflict")
-        if self.bars is not None and self.poses is None and "pose" not in self.cameras:
+        tables = {"poses": self.poses, "intrinsics": self.intrinsics}
+        shared = {"a right camera": self.files.has_right, "disparity": self.depth.kind == "disparity"}
+        if self.views is not None:
+            others = [f"cameras.{key}" for key in self.cameras if key != "views"]
+            if others := [*others, *(name for name, given in {**tables, **shared}.items() if given)]:
+                found = f"got cameras.views and {others[0]}"
+                raise field_error(found, "cameras.views alone, for one camera", "conflict")
+            if not isinstance(self.cameras["views"], str) or not is_below(self.views):
+                found = f"cameras.views is {short_repr(self.cameras['views'])}"
+                raise field_error(found, "the name of a file in or below the layout's folder")
+        if self.bars is not None and self.poses is None and not {"pose", "views"} & set(self.cameras):
             raise field_error("got bars without poses", "poses in the frame of the bars", "conflict")
-        if self.intrinsics is not None and (self.files.has_right or self.depth.kind == "disparity"):
-            other = "a right camera" if self.files.has_right else "disparity"
+        if self.intrinsics is not None and any(shared.values()):
+            other = next(name for name, is_given in shared.items() if is_given)
             raise field_error(f"got intrinsics of each view and {other}", "one calibration", "conflict")
         return self
 

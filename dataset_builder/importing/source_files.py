@@ -65,8 +65,8 @@ def _damage(path: Path, expected: str) -> Iterator[None]:
         raise EntryError(Problem("damaged", path.name, f"cannot be read: {reason}", expected)) from None
 
 
-def read_depth(path: Path, grid: Grid, table: DepthTable) -> Float64[ndarray, "h w"]:
-    """Return the values of a depth map of ``grid`` times its factor; NaN where there is none.
+def read_depth(path: Path, grid: Grid, table: DepthTable, factor: float) -> Float64[ndarray, "h w"]:
+    """Return the values of a depth map of ``grid`` times ``factor``; NaN where there is none.
 
     Raises ``EntryError`` for a damaged file, and for one of another size.
     """
@@ -84,7 +84,7 @@ def read_depth(path: Path, grid: Grid, table: DepthTable) -> Float64[ndarray, "h
         units = values.astype(np.float64)
     units[~np.isfinite(units) | (units <= 0) | np.isin(units, table.invalid)] = np.nan
     with np.errstate(over="ignore"):
-        return np.asarray(units * table.factor)
+        return np.asarray(units * factor)
 
 
 def planar_depth_m(
@@ -186,7 +186,7 @@ def _exr_channel(path: Path, channel: str) -> Shaped[ndarray, "h w"]:
 
 
 def _read_matrix(path: Path, key: str | None, shape: tuple[int, int]) -> Float64[ndarray, "n m"]:
-    """Return the matrix in a file, of ``shape`` or, for poses, without the row 0 0 0 1.
+    """Return the matrix in a file, of ``shape`` or, for poses, without its last row.
 
     ``key`` is that of a JSON object. Raises ``EntryError`` for anything but finite numbers.
     """
@@ -200,7 +200,7 @@ def _read_matrix(path: Path, key: str | None, shape: tuple[int, int]) -> Float64
             numbers = np.loadtxt(io.StringIO(content.decode().replace(",", " ")), ndmin=2)
         values = np.asarray(numbers, dtype=np.float64)
     if values.size == 12 and shape == (4, 4):
-        values = np.vstack([values.reshape(3, 4), [0, 0, 0, 1]])
+        shape = 3, 4
     if values.size != shape[0] * shape[1] or not np.isfinite(values).all():
         found = f"holds {values.size} numbers"
         raise EntryError(Problem("invalid", path.name, found, f"{shape[0]} x {shape[1]} finite numbers"))
@@ -230,15 +230,30 @@ def intrinsics(path: Path, table: MatricesTable) -> Float64[ndarray, "3 3"]:
 
 def cam_from_world(path: Path, table: PosesTable) -> Float64[ndarray, "4 4"]:
     """Return a pose in OpenCV axes and metres. Raises ``EntryError`` for a matrix that is no rigid pose."""
-    pose = _read_matrix(path, table.key, (4, 4))
+    matrix = _read_matrix(path, table.key, (4, 4))
+    return checked_pose(matrix, path.name, table.kind, table.axes, UNITS_M[table.unit])
+
+
+def checked_pose(
+    matrix: Float64[ndarray, "n 4"],
+    where: str,
+    kind: str = "cam_from_world",
+    axes: str = "opencv",
+    unit_m: float = 1.0,
+) -> Float64[ndarray, "4 4"]:
+    """Return a pose of 3 or 4 rows, whose kind and axes ``PosesTable`` names, in OpenCV axes and metres.
+
+    Raises ``EntryError`` for a matrix that is no rigid pose.
+    """
+    pose = np.vstack([matrix, [0, 0, 0, 1]])[:4]
     if not is_rigid(pose, _ROUNDED_ROTATION):
         found = f"holds {short_repr(pose.tolist())}"
-        raise EntryError(Problem("invalid", path.name, found, "a rotation, a translation, and 0 0 0 1"))
+        raise EntryError(Problem("invalid", where, found, "a rotation, a translation, and 0 0 0 1"))
     pose[:3, :3] = nearest_rotation(pose[:3, :3])
-    pose[:3, 3] *= UNITS_M[table.unit]
-    if table.kind == "world_from_cam":
+    pose[:3, 3] *= unit_m
+    if kind == "world_from_cam":
         pose = inverse_rigid(pose)
-    return swap_camera_axes(pose) if table.axes == "opengl" else pose
+    return swap_camera_axes(pose) if axes == "opengl" else pose
 
 
 def read_bars_file(path: Path) -> tuple[Bar, ...]:

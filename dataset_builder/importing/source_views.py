@@ -25,12 +25,14 @@ from dataset_builder.importing.source_files import (
     read_labels,
     rectified_pair,
 )
+from dataset_builder.importing.view_cameras import ViewCamera, read_view_cameras
 from rebar_depth_bench.base.errors import EntryError, InputError, Problem, escape_text
 from rebar_depth_bench.base.names import NAME_LETTERS, NAME_PATTERN
 from rebar_depth_bench.captures.calibration import camera_columns
-from rebar_depth_bench.captures.camera_files import CaptureCameras, cameras_of_table
+from rebar_depth_bench.captures.camera_files import cameras_of_table
 from rebar_depth_bench.captures.images import IMAGE_SUFFIXES, common_shape, read_image
 from rebar_depth_bench.data.schema import EYES, column_kind
+from rebar_depth_bench.geometry.aruco_board import BoardSpec
 
 _SUFFIXES: Mapping[str, tuple[str, ...]] = {
     "rgb": IMAGE_SUFFIXES,
@@ -43,26 +45,30 @@ _SUFFIXES: Mapping[str, tuple[str, ...]] = {
 
 @dataclass(frozen=True, eq=False)
 class SourceViews:
-    """Checked views of a layout: names, files by column, image size (height, width) and cameras.
+    """Checked views of a layout: names, files by column, image size (height, width), cameras by view, board.
 
-    Without poses, ``has_poses`` is False and the world frame of a view is its left camera.
+    ``notes`` say what was left out of the files of cameras. Without poses, ``has_poses`` is False and the world
+    frame of a view is its left camera.
     """
 
     root: Path
     layout: Layout
     names: tuple[str, ...]
     grid: tuple[int, int]
-    cameras: CaptureCameras
+    cameras: Mapping[str, ViewCamera]
+    board: BoardSpec | None
+    notes: tuple[str, ...]
 
     @property
     def has_poses(self) -> bool:
         """Whether the views have poses in one world frame."""
-        return self.layout.poses is not None or bool(self.cameras.cam_from_world)
+        return self.layout.poses is not None or self.cameras[self.names[0]].cam_from_world is not None
 
     @property
     def files(self) -> list[Path]:
-        """Files of all views."""
-        return [self.file(pattern, name) for pattern in _patterns(self.layout).values() for name in self.names]
+        """Files of all views, and that of their cameras."""
+        files = [self.file(pattern, name) for pattern in _patterns(self.layout).values() for name in self.names]
+        return files if self.layout.views is None else [*files, self.root / self.layout.views]
 
     def file(self, pattern: str, name: str) -> Path:
         """Return the file of a view."""
@@ -80,11 +86,11 @@ class SourceViews:
             raise InputError.from_problems(f"{self.root}: view {name}", error.problems) from None
 
     def _cameras(self, name: str) -> dict[str, Any]:
-        layout, calibration = self.layout, self.cameras.calibration
-        pose = self.cameras.cam_from_world.get(name, np.eye(4))
+        layout, camera = self.layout, self.cameras[name]
+        pose = np.eye(4) if camera.cam_from_world is None else camera.cam_from_world
         if layout.poses is not None:
             pose = cam_from_world(self.file(layout.poses.file, name), layout.poses)
-        columns = camera_columns(calibration, pose)
+        columns = camera_columns(camera.calibration, pose)
         if layout.intrinsics is not None:
             columns["left_K"] = intrinsics(self.file(layout.intrinsics.file, name), layout.intrinsics)
         if layout.files.has_right:
@@ -99,9 +105,10 @@ class SourceViews:
             if kind == "rgb":
                 columns[column] = read_image(path, self.grid)
             elif kind == "depth":
-                values = read_depth(path, self.grid, table)
+                calibration, _, unit_m = self.cameras[name]
+                values = read_depth(path, self.grid, table, table.factor if unit_m is None else unit_m)
                 K, distortion = cameras[f"{eye}_K"], cameras[f"{eye}_distortion"]
-                columns[column] = planar_depth_m(values, table.kind, self.cameras.calibration, K, distortion)
+                columns[column] = planar_depth_m(values, table.kind, calibration, K, distortion)
             else:
                 values = read_labels(path, self.grid)
                 columns[column] = self._mask(values) if kind == "mask" else bar_ids(path, values)
@@ -152,12 +159,17 @@ def open_views(path: Path, layout: Layout) -> SourceViews:
     if problems:
         raise InputError.from_problems(path, problems)
     height, width = grid if grid is not None else (layout.height or 0, layout.width or 0)
+    if layout.views is not None:
+        by_view, notes = read_view_cameras(root / layout.views, layout, names, (height, width))
+        return SourceViews(root, layout, tuple(names), (height, width), by_view, None, notes)
     cameras = cameras_of_table(
         path, layout.cameras, names, width, height, is_stereo=layout.files.has_right, where="cameras"
     )
     if layout.depth.kind == "disparity":
         rectified_pair(cameras.calibration)
-    return SourceViews(root, layout, tuple(names), (height, width), cameras)
+    by_view = {name: ViewCamera(cameras.calibration, cameras.cam_from_world.get(name)) for name in names}
+    notes = cameras.calibration.notes
+    return SourceViews(root, layout, tuple(names), (height, width), by_view, cameras.board, notes)
 
 
 def _patterns(layout: Layout) -> dict[str, str]:

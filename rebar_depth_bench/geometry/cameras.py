@@ -23,6 +23,9 @@ NOMINAL_HEIGHT = 720
 NOMINAL_FOCAL_PX = 700.0
 """Nominal focal length of the first-generation ZED at HD720, pixels (Stereolabs)."""
 
+HALF_PIXEL = 0.5
+"""Offset of COLMAP's and nerfstudio's pixel coordinates from ours, pixels."""
+
 ROTATION_TOLERANCE = 1e-6
 """Largest deviation of ``R @ R.T`` from the identity for a rotation ``R``."""
 

@@ -85,6 +85,26 @@ file = "pose-{view}.txt"
 [bars]
 file = "bars.csv"
 """
+_VIEWS = """
+truth_sigma_m = 0.001
+[files]
+left_depth = "depth-{view}.npy"
+left_rgb = "rgb-{view}.png"
+[cameras]
+views = "views.json"
+"""
+_BOP = """{
+  "0": {"cam_K": [20.0, 0.0, 7.5, 0.0, 20.0, 7.5, 0.0, 0.0, 1.0], "depth_scale": 1000.0,
+    "cam_R_w2c": [1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0], "cam_t_w2c": [10.0, -20.0, 500.0]},
+  "1": {"cam_K": [20.0, 0.0, 7.5, 0.0, 20.0, 7.5, 0.0, 0.0, 1.0], "depth_scale": 1000.0, "view_level": 2}
+}"""
+_NERFSTUDIO = """{
+  "camera_model": "OPENCV", "w": 16, "h": 16, "fl_x": 20.0, "cx": 8.0, "cy": 8.0, "k1": 0.01, "p2": 0.001,
+  "depth_unit_scale_factor": 1.0, "applied_scale": 0.5, "frames": [
+    {"file_path": "./images/0.png",
+      "transform_matrix": [[1, 0, 0, 0.5], [0, 0, 1, 0.1], [0, -1, 0, 2.0], [0, 0, 0, 1]]},
+    {"file_path": "./images/1.png", "fl_y": 20.5}]}
+"""
 _MILLIMETRES = '[depth]\nunit = "mm"\n'
 _BARS = """bar_id,role,diameter_m,x_m,y_m,z_m
 1,main,0.016,0.0,0.1,0.2
@@ -211,6 +231,23 @@ def _import(path: Path) -> object:
     return source.bars, depth_m.tolist()
 
 
+def _write_views(content: str, path: Path) -> None:
+    """Write a layout with one view, whose cameras are in a file with this content."""
+    path.write_text(content)
+    path.with_name("layout.toml").write_text(_VIEWS)
+    path.with_name("depth-0.npy").write_bytes(npy(IMPORTED_M))
+    Image.new("RGB", (16, 16)).save(path.with_name("rgb-0.png"))
+
+
+def _read_views(path: Path) -> object:
+    source = plan_import(path.with_name("layout.toml"), "mock-up")
+    camera = source.views.cameras["0"]
+    assert _is_finite(astuple(camera.calibration))
+    assert camera.cam_from_world is None or np.isfinite(camera.cam_from_world).all()
+    assert np.isfinite(source.views.decode("0")["left_depth"]).all()
+    return camera
+
+
 def _copy(source: Path, path: Path) -> None:
     path.write_bytes(source.read_bytes())
 
@@ -324,6 +361,15 @@ FILE_ENTRIES = (
         names=("settings: ",),
     ),
     _imported("import: layout", "layout.toml", _write_import),
+    _reader("import: BOP's cameras", "views.json", partial(_write_views, _BOP), _read_views, share=4, cpu_s=10.0),
+    _reader(
+        "import: nerfstudio's cameras",
+        "views.json",
+        partial(_write_views, _NERFSTUDIO),
+        _read_views,
+        share=6,
+        cpu_s=10.0,
+    ),
     _imported("import: bars", "bars.csv", _write_import),
     _imported_depth("npy", "npy", npy(IMPORTED_M)),
     _imported_depth("npz", "npz", npz(depth=IMPORTED_M)),
