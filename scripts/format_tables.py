@@ -15,8 +15,9 @@ from pathlib import Path
 
 from rebar_depth_bench.captures.calibration_files import ZED_CONF
 from rebar_depth_bench.captures.fields import Field, FileFormat
+from rebar_depth_bench.captures.program_formats import CAMERA, KALIBR, MIDDLEBURY, PAIR
 
-FORMATS = (ZED_CONF,)
+FORMATS = (ZED_CONF, CAMERA, PAIR, KALIBR, MIDDLEBURY)
 _BLOCK = re.compile(r"(<!-- tables of fields -->\n).*(<!-- end of tables of fields -->)", re.DOTALL)
 
 

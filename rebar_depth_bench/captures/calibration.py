@@ -181,7 +181,8 @@ def _check_invertible(lens: Lens, width: int, height: int) -> None:
 # Bounds of the numbers.
 
 KNOWN_LENS = (
-    'k1 k2 p1 p2 k3 (plumb_bob, radtan); rectify the images first, see "Rectify images first" in docs/captures.md'
+    "k1 k2 p1 p2 k3 (plumb_bob, radtan); rectify the images first with the camera's own software or OpenCV, "
+    'see "Rectify images first" in docs/captures.md, and give their new K with zero distortion'
 )
 """Expected lens model."""
 SIDES_PX = range(16, 16385)

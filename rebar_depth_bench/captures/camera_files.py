@@ -13,6 +13,7 @@ their place::
 
     calibration = "stereo.yml"    # or two files: ["left.yaml", "right.yaml"]
     unit = "mm"                   # of lengths in OpenCV's, ROS' and Kalibr's files; default: "m"
+    rectified = false             # whether the pictures are rectified and have the file's matrix P
 
     [board]                       # ArUco board, see geometry.aruco_board; default: its A3 sheet of 6 markers
     markers = 12
@@ -59,12 +60,15 @@ from rebar_depth_bench.captures.calibration import (
 from rebar_depth_bench.captures.calibration_files import check_image_size, read_calibration
 from rebar_depth_bench.captures.documents import DOCUMENT_SUFFIXES, parse_document
 from rebar_depth_bench.captures.programs import program_calibration
+from rebar_depth_bench.captures.recognised import recognised_problem
 from rebar_depth_bench.data.schema import BoardTable
 from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
 from rebar_depth_bench.geometry.cameras import is_rigid
 
 CAMERAS_FILE = "cameras.toml"
 CALIBRATION_SUFFIXES = (".conf", *DOCUMENT_SUFFIXES)
+_OTHER_SUFFIXES = (".txt", ".bin", ".h5", ".hdf5")
+"""Suffixes of the files that are looked at if a folder has no others."""
 _CALIBRATION_FILES = ("calibration.conf", "calibration.toml")
 _CALIBRATION_KEYS = ("width", "height", "left", "right", "stereo")
 
@@ -112,6 +116,7 @@ class _CamerasTable(StrictModel):
         Expected("the name of a file beside this one, or two"),
     ] = None
     unit: Annotated[str, one_of(*UNITS_M)] = "m"
+    rectified: bool | None = None
     board: _Board | None = None
     pose: tuple[_PoseTable, ...] = Field(default=(), strict=False)
     width: Any = None
@@ -141,7 +146,7 @@ def read_cameras(root: Path, images: Sequence[str], width: int, height: int, *, 
     """
     path = root / CAMERAS_FILE
     if not path.exists():
-        calibration = _file_calibration(_found_files(root), 1.0, width, height, is_stereo=is_stereo)
+        calibration = _file_calibration(_found_files(root), _CamerasTable(), width, height, is_stereo=is_stereo)
         return CaptureCameras(calibration, None, {})
     content = read_file(path, TOML_BYTES, "the cameras of a capture", CalibrationError)
     document, problems = parse_toml(content)
@@ -174,6 +179,10 @@ def cameras_of_table(
         problems.append(Problem("conflict", "calibration", f"given beside {', '.join(rest)}", "one of them"))
     elif table is not None and table.calibration is None:
         inline = table_calibration(rest, width, height, problems, is_stereo=is_stereo)
+        if table.rectified is not None:
+            problems.append(
+                Problem("conflict", "rectified", "given without calibration", "a file with the matrix P")
+            )
     poses = {} if table is None else {pose.image: np.array(pose.cam_from_world) for pose in table.pose}
     if table is not None and poses and (missing := sorted(set(images) - poses.keys())):
         found = f"{len(missing)} images have none, such as {missing[0]}"
@@ -187,7 +196,7 @@ def cameras_of_table(
     else:
         names = [table.calibration] if isinstance(table.calibration, str) else list(table.calibration or ())
         paths = [path.parent / name for name in names]
-        calibration = _file_calibration(paths, UNITS_M[table.unit], width, height, is_stereo=is_stereo)
+        calibration = _file_calibration(paths, table, width, height, is_stereo=is_stereo)
     return CaptureCameras(calibration, None if table.board is None else table.board.spec, poses)
 
 
@@ -195,7 +204,10 @@ def _found_files(root: Path) -> list[Path]:
     """Return the calibration files of a folder. Raises ``InputError`` unless there is one, or a pair."""
     files = sorted(path for path in root.iterdir() if not path.name.startswith("."))
     own = [path for path in files if path.suffix.lower() == ".conf" or path.name in _CALIBRATION_FILES]
-    others = [path for path in files if path.suffix.lower() in DOCUMENT_SUFFIXES]
+    others = [path for path in files if path.suffix.lower() in DOCUMENT_SUFFIXES and path.suffix.lower() != ".txt"]
+    if not own and not others:
+        texts = [path for path in files if path.suffix.lower() in _OTHER_SUFFIXES]
+        others = [path for path in texts if path.name.lower() == "calib.txt" or recognised_problem(path)][:1]
     if len(own) == 1 and (own[0].name in _CALIBRATION_FILES or not others):
         return own
     if not own and 1 <= len(others) <= 2:
@@ -207,19 +219,43 @@ def _found_files(root: Path) -> list[Path]:
     )
 
 
+def _own_calibration(path: Path, width: int, height: int, *, is_stereo: bool) -> Calibration:
+    """Return the calibration in a ``.conf`` or ``.toml`` file, which may have ``[left]`` alone for one camera."""
+    if is_stereo or path.suffix.lower() != ".toml":
+        return read_calibration(path, width, height)
+    check_image_size(path, width, height)
+    content = read_file(path, TOML_BYTES, "a calibration file", CalibrationError)
+    document, problems = parse_toml(content)
+    is_pair = "right" in document
+    calibration = None if problems else table_calibration(document, width, height, problems, is_stereo=is_pair)
+    if calibration is None:
+        raise CalibrationError.from_problems(path, with_lines(problems, content))
+    return scaled_calibration(calibration, path, width, height)
+
+
 def _file_calibration(
-    paths: Sequence[Path], unit_m: float, width: int, height: int, *, is_stereo: bool
+    paths: Sequence[Path], stated: _CamerasTable, width: int, height: int, *, is_stereo: bool
 ) -> Calibration:
-    """Return the calibration in one or two files, scaled to the image size."""
+    """Return the calibration in one or two files, of the ``stated`` unit, scaled to the image size."""
     source = " and ".join(map(str, paths))
-    if paths[0].suffix.lower() not in DOCUMENT_SUFFIXES:
-        return read_calibration(paths[0], width, height)
-    check_image_size(paths[0], width, height)
     problems: list[Problem] = []
+    if paths[0].suffix.lower() not in DOCUMENT_SUFFIXES:
+        problem = recognised_problem(paths[0])
+        if problem is None and stated.rectified:
+            expected = "a file with the matrix P of rectified pictures, of ROS or OpenCV"
+            problem = Problem("conflict", "", "has no matrix of rectified pictures", expected)
+        if problem is not None:
+            raise CalibrationError.from_problems(paths[0], [problem])
+        return _own_calibration(paths[0], width, height, is_stereo=is_stereo)
+    check_image_size(paths[0], width, height)
     contents = {path.name: read_file(path, TOML_BYTES, "a calibration file", CalibrationError) for path in paths}
     documents = {name: parse_document(name, content, problems) for name, content in contents.items()}
-    calibration = None if problems else program_calibration(documents, width, height, unit_m, problems)
+    calibration = None
+    if not problems:
+        unit_m = UNITS_M[stated.unit]
+        calibration = program_calibration(documents, width, height, unit_m, problems, rectified=stated.rectified)
     if calibration is None:
+        problems = [problem for path in paths if (problem := recognised_problem(path))] or problems
         for name, content in contents.items():
             problems = with_lines(problems, content, name)
         raise CalibrationError.from_problems(paths[0].parent, problems)

@@ -1,4 +1,4 @@
-"""Content of calibration files as other programs write them: YAML, and OpenCV's FileStorage in YAML, XML or JSON.
+"""Content of other programs' calibration files: YAML, OpenCV's FileStorage in YAML, XML or JSON, and calib.txt.
 
 A document is returned as dicts, lists, numbers and texts. Matrices of OpenCV are dicts with rows, cols and data.
 """
@@ -12,9 +12,11 @@ from typing import Any
 from xml.etree import ElementTree
 
 from rebar_depth_bench.base.errors import Problem, escape_text
-from rebar_depth_bench.base.reading import MAX_NESTING, parse_json
+from rebar_depth_bench.base.reading import MAX_NESTING, decode_text, parse_json
 
-_OPENCV_HEADER = re.compile(r"\A\ufeff?%YAML[: ][0-9.]+[^\n]*\n")
+_MAX_ALIASED = 10_000
+"""Largest number of values that the aliases of a YAML text stand for."""
+_OPENCV_HEADER = re.compile(r"\A%YAML[: ][0-9.]+[^\n]*\n")
 """First line of OpenCV's YAML; its older form, ``%YAML:1.0``, is not YAML."""
 _OPENCV_MATRIX = "tag:yaml.org,2002:opencv-matrix"
 _STORAGE = "opencv_storage"
@@ -25,10 +27,9 @@ def parse_document(name: str, content: bytes, problems: list[Problem]) -> dict[s
 
     Problems are added to ``problems``, and the result is empty if there are any.
     """
-    try:
-        text = content.decode("utf-8")
-    except UnicodeDecodeError as error:
-        problems.append(Problem("syntax", name, f"byte {error.start} is not UTF-8", "UTF-8 text"))
+    text, text_problems = decode_text(content, name)
+    if text_problems:
+        problems += text_problems
         return {}
     try:
         document = _PARSERS[PurePath(name).suffix.lower()](text)
@@ -45,7 +46,7 @@ def parse_document(name: str, content: bytes, problems: list[Problem]) -> dict[s
 
 
 def _parse_yaml(text: str) -> Any:
-    """Return the first document of a text. Raises ``ValueError`` for invalid YAML, aliases and deep nesting."""
+    """Return the first document of a text. Raises ``ValueError`` for invalid YAML and for what is too large."""
     import yaml
 
     class Loader(getattr(yaml, "CSafeLoader", yaml.SafeLoader)):  # type: ignore[misc]
@@ -64,16 +65,40 @@ def _parse_yaml(text: str) -> Any:
 
 
 def _check_events(events: Iterable[Any]) -> None:
-    """Raise ``ValueError`` for aliases, which can make a short text huge, and for deep nesting."""
-    depth = 0
+    """Raise ``ValueError`` for Python's tags, deep nesting, and aliases that make a short text huge or endless.
+
+    Values and levels are those after the aliases are replaced by what they stand for.
+    """
+    containers: list[tuple[str | None, int, int]] = []  # Anchor, values and levels of each open one.
+    anchors: dict[str, tuple[int, int]] = {}
+    aliased = 0
     for event in events:
         kind, line = type(event).__name__, event.start_mark.line + 1
-        depth += kind.endswith("StartEvent")
-        depth -= kind.endswith("EndEvent")
-        if kind == "AliasEvent":
-            raise ValueError(f"line {line}: an alias (*), expected plain values")
-        if depth > MAX_NESTING:
+        anchor, values, levels = getattr(event, "anchor", None), 1, 0
+        if "python/" in str(getattr(event, "tag", "")):
+            expected = "plain lists: array.tolist(), list(tuple), float(number)"
+            raise ValueError(f"line {line}: a Python object (!!python/...), expected {expected}")
+        if kind.endswith("StartEvent"):
+            containers.append((anchor, values, levels))
+        elif kind.endswith("EndEvent"):
+            anchor, values, levels = containers.pop()
+            levels += 1
+        elif kind == "AliasEvent":
+            if anchor not in anchors:
+                raise ValueError(f"line {line}: the alias *{anchor} stands for no complete value")
+            values, levels = anchors[anchor]
+            aliased += values
+        if aliased > _MAX_ALIASED:
+            found = f"the aliases (*) stand for more than {_MAX_ALIASED} values"
+            raise ValueError(f"line {line}: {found}, expected plain values")
+        if len(containers) + levels > MAX_NESTING:
             raise ValueError(f"line {line}: the values are nested too deep, expected at most {MAX_NESTING} levels")
+        if not kind.endswith("StartEvent"):
+            if anchor is not None:
+                anchors[anchor] = values, levels
+            if containers:
+                outer, its_values, its_levels = containers[-1]
+                containers[-1] = outer, its_values + values, max(its_levels, levels)
 
 
 def _parse_json(text: str) -> Any:
@@ -88,7 +113,7 @@ def _parse_xml(text: str) -> Any:
     if "<!" in re.sub(r"<!--.*?(?:-->|\Z)", "", text, flags=re.DOTALL):
         raise ValueError("a document type or CDATA, expected OpenCV's XML")
     try:
-        root = ElementTree.fromstring(text.lstrip("\ufeff").encode())  # noqa: S314 (no entities without a type)
+        root = ElementTree.fromstring(text.encode())  # noqa: S314 (no entities without a type)
     except ElementTree.ParseError as error:
         raise ValueError(f"line {error.position[0]}: not valid XML: {error}") from None
     if root.tag != _STORAGE:
@@ -104,11 +129,25 @@ def _element_value(element: ElementTree.Element) -> Any:
     return words if len(words) > 1 else "".join(words)
 
 
+def _parse_text(text: str) -> dict[str, Any]:
+    """Return the values of Middlebury's ``calib.txt``. Raises ``ValueError`` for other texts."""
+    values: dict[str, Any] = {}
+    for number, line in enumerate(text.splitlines(), start=1):
+        key, separator, value = map(str.strip, line.partition("="))
+        if key and (not separator or key in values):
+            raise ValueError(f"line {number}: expected key=value of a calib.txt as Middlebury's, each key once")
+        if key:
+            is_matrix = value.startswith("[") and value.endswith("]")
+            values[key] = value.strip("[]").replace(";", " ").replace(",", " ").split() if is_matrix else value
+    return values
+
+
 _PARSERS: Mapping[str, Callable[[str], Any]] = {
     ".yaml": _parse_yaml,
     ".yml": _parse_yaml,
     ".xml": _parse_xml,
     ".json": _parse_json,
+    ".txt": _parse_text,
 }
 DOCUMENT_SUFFIXES = tuple(_PARSERS)
 """Suffixes of the files that ``parse_document`` reads."""

@@ -1,18 +1,33 @@
 """Fields of the files of other programs: those that a reader uses or checks, and those that change no number.
 
-A reader looks up its values in the table of its format and names every field that the table does not list.
+A reader looks up its values in the table of its format and names every field that the table does not list. Lens
+models beyond k1 k2 p1 p2 k3, stated by name or by the number of terms, are refused in one way in all formats.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
-from rebar_depth_bench.base.errors import escape_text
+from rebar_depth_bench.base.errors import Problem, escape_text
+from rebar_depth_bench.base.validation import short_repr
+from rebar_depth_bench.captures.calibration import KNOWN_LENS
 
 _MAX_NAMED = 10
+DISTORTION_TERMS = 5
+"""Number of distortion terms that are used: k1 k2 p1 p2 k3."""
+_RADIAL = (
+    *("plumbbob", "radtan", "radialtangential", "brown", "brownconrady", "opencv", "rationalpolynomial"),
+    *("0", "false"),
+)
+"""Lens models, or answers to whether it is a fisheye lens, whose first terms are k1 k2 p1 p2 k3; as plain keys."""
+_UNDISTORTED = ("none", "")
+_SAME_WITHOUT_TERMS = ("inversebrownconrady", "modifiedbrownconrady")
+"""Lens models of other distortion, which are pinholes if all terms are 0."""
+_PINHOLE = ("pinhole", "perspective")
+"""Names of a projection without a statement about the distortion."""
 
 
 @dataclass(frozen=True)
@@ -37,13 +52,13 @@ class FileFormat:
     fields: tuple[Field, ...]
 
     def keys(self, name: str) -> tuple[str, ...]:
-        """Return the keys of a field."""
-        return next(field.keys for field in self.fields if field.name == name)
+        """Return the keys of a field; none if the format does not have it."""
+        return next((field.keys for field in self.fields if field.name == name), ())
 
-    def notes(self, source: str, keys: Iterable[str]) -> list[str]:
+    def notes(self, source: str, keys: Iterable[Any]) -> list[str]:
         """Return a note that names the ``keys`` of the file ``source`` that are not listed; none if all are."""
         listed = {plain_key(key) for field in self.fields for key in field.keys}
-        unlisted = [escape_text(key) for key in keys if plain_key(key) not in listed]
+        unlisted = [escape_text(str(key)) for key in keys if plain_key(str(key)) not in listed]
         if not unlisted:
             return []
         more = f" and {len(unlisted) - _MAX_NAMED} more" if len(unlisted) > _MAX_NAMED else ""
@@ -53,3 +68,32 @@ class FileFormat:
 def plain_key(key: str) -> str:
     """Return a key without case and punctuation."""
     return re.sub("[^a-z0-9]", "", key.lower())
+
+
+def lens_problem(where: str, models: Mapping[str, Any], terms: Sequence[float] = ()) -> Problem | None:
+    """Return the problem of a lens that k1 k2 p1 p2 k3 do not describe, or None.
+
+    ``models`` are the stated models, such as ``{"distortion_model": "equidistant"}``, and ``terms`` the distortion
+    in OpenCV's order. Further terms may be 0. Four terms may be those of a fisheye lens and need a stated model.
+    """
+    texts = {key: "" if model is None else str(model) for key, model in models.items()}
+    plain = {key: plain_key(text) or text.strip() for key, text in texts.items()}
+    stated_radial = any(model in _RADIAL for model in plain.values())
+    accepted = (*_RADIAL, *_PINHOLE, *_UNDISTORTED, *(() if any(terms) else _SAME_WITHOUT_TERMS))
+    others = [key for key, model in plain.items() if model not in accepted]
+    expected = KNOWN_LENS
+    if others:
+        found = f"{escape_text(others[0])} is {short_repr(models[others[0]])}"
+    elif any(terms[DISTORTION_TERMS:]):
+        found = f"the distortion has {len(terms)} terms"
+    elif any(terms) and "none" in plain.values():
+        found, expected = "distortion terms beside a model of none", "zeros, or the model of the terms"
+    elif any(terms) and len(terms) == 4 and not stated_radial:
+        found = "four distortion terms without a stated model may be those of a fisheye lens"
+        remedy = "add distortion_model: plumb_bob, or a fifth term k3 = 0, if they are k1 k2 p1 p2"
+        expected = f"{remedy}; otherwise {KNOWN_LENS}"
+    elif any(terms) and len(terms) < 4:
+        found = f"the distortion has {len(terms)} terms"
+    else:
+        return None
+    return Problem("invalid", where, found, expected)

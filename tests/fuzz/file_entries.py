@@ -178,6 +178,12 @@ def _write_opencv(path: Path) -> None:
     (path.parent / f"stereo{path.suffix}").rename(path)
 
 
+def _write_ros(path: Path) -> None:
+    """Write ``camera_info`` of a pair as it is printed; that of the left camera is ``path``."""
+    for name, text in pair.ros_texts(as_message=True).items():
+        path.with_name(name).write_text(text)
+
+
 def _write_capture_image(path: Path, exif: bytes = b"") -> None:
     """Write a capture of one pair, whose right image is ``path``."""
     root = write_capture(path.parents[1], 1)
@@ -371,6 +377,9 @@ FILE_ENTRIES = (
     _cameras("cameras: OpenCV XML", "a.xml", _write_opencv),
     _cameras("cameras: OpenCV JSON", "a.json", _write_opencv),
     _cameras("cameras: Kalibr", "a.yaml", partial(_text, pair.kalibr_text())),
+    _cameras("cameras: YAML with aliases", "a.yaml", partial(_text, pair.aliased_text())),
+    _cameras("cameras: ROS", "left.yaml", _write_ros),
+    _cameras("cameras: calib.txt", "calib.txt", partial(_text, pair.CALIB_TXT)),
     _picture("capture: PNG", "capture/right/000000.png"),
     _picture("capture: JPEG", "capture/right/000000.jpg"),
     _picture("capture: PNG with EXIF", "capture/right/000000.png", write=_UPRIGHT),

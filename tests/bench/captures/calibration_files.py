@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import yaml
 
 from rebar_depth_bench.captures.calibration import StereoCalibration
 from rebar_depth_bench.captures.calibration_files import read_calibration
@@ -32,6 +33,16 @@ distortion = {RIGHT_D.tolist()}
 rotation = {ROTATION_RAD.tolist()}
 translation_m = {TRANSLATION_M.tolist()}
 """
+CALIB_TXT = f"""\
+cam0=[534.07 0 341.53; 0 534.07 232.94; 0 0 1]
+cam1=[534.07 0 346.53; 0 534.07 232.94; 0 0 1]
+doffs=5
+baseline=120.5
+width={WIDTH}
+height={HEIGHT}
+ndisp=64
+"""
+"""File of a rectified pair as in the Middlebury and ETH3D data sets."""
 
 
 def expected_calibration(folder: Path, width: int = WIDTH, height: int = HEIGHT) -> StereoCalibration:
@@ -115,6 +126,13 @@ def _message_text(name: str, K: np.ndarray, D: np.ndarray, R: np.ndarray, P: np.
     roi = "roi:\n  x_offset: 0\n  y_offset: 0\n  height: 0\n  width: 0\n  do_rectify: false"
     message = f"{text}binning_x: 0\nbinning_y: 0\n{roi}\n---\n"
     return message + message  # The topic is printed until it is interrupted.
+
+
+def aliased_text() -> str:
+    """Return a pair of equal cameras as ``yaml.dump`` writes it, with aliases for the lists of the right one."""
+    K, D = LEFT_K.tolist(), LEFT_D.tolist()
+    pair = {"K1": K, "K2": K, "D1": D, "D2": D, "R": ROTATION.tolist(), "T": TRANSLATION_M.tolist()}
+    return str(yaml.dump(pair))
 
 
 def kalibr_text() -> str:
