@@ -141,7 +141,7 @@ def _toml_cage(content: bytes, where: str) -> Cage:
     except InputError as error:
         raise MeshError.from_problems(where, error.problems) from error
     cage_bars, problems = [], []
-    for number, bar in enumerate(scene.bars, start=1):
+    for number, bar in scene.bars:
         label = f"bar {bar.bar_id} ({bar.role}, diameter {bar.diameter_m:g} m)"
         mandrel_m = mandrel_diameter_m(bar.diameter_m) if bar.mandrel_m is None else bar.mandrel_m
         try:

@@ -16,8 +16,10 @@ azimuths = 12
 [[bar]]                       # or, above the tables: mesh = "cage.stl", or ifc = "cage.ifc"
 diameter = 10
 points = [[-150, 0, 5], [150, 0, 5], [150, 0, 80]]   # corners of the path; world, z up, board at z = 0
+count = 4                     # of equal bars in a row, each [x, y, z] after the one before it; default 1
+step = [0, 50, 0]
 role = "main"                 # default "bar"
-id = 7                        # default: the lowest free id
+id = 7                        # of the first one, the others follow; default: the lowest free ids
 bend_diameter = 40            # of the mandrel; default EN 1992-1-1: 4 d up to 16 mm, 7 d above
 ribs = true                   # default
 ```
@@ -146,6 +148,9 @@ _Length = Annotated[
 _Point = Annotated[
     Triple, three_numbers(-1e9, 1e9, "three numbers from -1e9 to 1e9, [x, y, z]"), AfterValidator(_point_in_metres)
 ]
+_Step = Annotated[
+    _Point, Expected("a step from bar to bar that is not zero, [x, y, z]", lambda step_m: any(step_m))
+]
 _Distance = Annotated[
     float,
     number(0, expected="a distance above 0, up to 1e9"),
@@ -164,7 +169,8 @@ _Box = Annotated[
 class TomlBar(StrictModel):
     """One ``[[bar]]`` table in metres; ``corners_m`` are the corners of its path in the world frame.
 
-    ``bar_id`` 0 stands for the lowest free id. ``mandrel_m`` is the mandrel diameter; None selects the minimum of
+    The table makes ``count`` equal bars, each ``step_m`` after the one before it. ``bar_id`` is that of the first;
+    0 stands for the lowest free ids. ``mandrel_m`` is the mandrel diameter; None selects the minimum of
     EN 1992-1-1.
     """
 
@@ -172,6 +178,8 @@ class TomlBar(StrictModel):
     corners_m: Annotated[
         tuple[_Point, ...], Strict(False), _list_of("two or more points, [[x, y, z], ...]", 2)
     ] = Field(alias="points")
+    count: Annotated[int, whole_number(1, MAX_BARS)] = 1
+    step_m: _Step = Field(default=(0.0, 0.0, 0.0), alias="step")
     role: Annotated[str, _ROLE] = "bar"
     bar_id: Annotated[int, whole_number(1, MAX_BARS)] = Field(default=0, alias="id")
     mandrel_m: _Length | None = Field(default=None, alias="bend_diameter")
@@ -185,6 +193,14 @@ class TomlBar(StrictModel):
             found, least = (length_m / info.context.unit_m for length_m in (mandrel_m, diameter_m))
             raise field_error(f"got {found:g}", f"at least the bar's diameter, {least:g}", "conflict")
         return mandrel_m
+
+    def corners_at(self, place: int) -> tuple[Triple, ...]:
+        """Return the corners of the bar at a ``place`` in the row, from 0, in metres."""
+        x, y, z = (place * step_m for step_m in self.step_m)
+        return tuple(
+            (to_metres(cx + x, 1.0), to_metres(cy + y, 1.0), to_metres(cz + z, 1.0))
+            for cx, cy, cz in self.corners_m
+        )
 
 
 class CamerasTable(StrictModel, extra="ignore"):
@@ -285,11 +301,14 @@ class SceneToml(StrictModel):
         return tuple(table.selection() for table in self.select)
 
     @property
-    def bars(self) -> tuple[TomlBar, ...]:
-        """Bars in file order; those without an id get the lowest free ids."""
-        used_ids = {bar.bar_id for bar in self.bar}
+    def bars(self) -> Iterator[tuple[int, TomlBar]]:
+        """Single bars in file order with the numbers of their tables; bars without an id get the lowest free ids."""
+        used_ids = {bar.bar_id + place for bar in self.bar if bar.bar_id for place in range(bar.count)}
         free_ids = (bar_id for bar_id in count(1) if bar_id not in used_ids)
-        return tuple(bar if bar.bar_id else bar.model_copy(update={"bar_id": next(free_ids)}) for bar in self.bar)
+        for number, bar in enumerate(self.bar, start=1):
+            for place in range(bar.count):
+                bar_id = bar.bar_id + place if bar.bar_id else next(free_ids)
+                yield number, bar.model_copy(update={"bar_id": bar_id, "corners_m": bar.corners_at(place)})
 
     @field_validator("name")
     @classmethod
@@ -357,14 +376,39 @@ def _conflicts(values: Mapping[str, Any]) -> Iterator[Problem]:
             yield Problem("conflict", where, found, expected)
     if (views := _view_count(values.get("cameras"))) > MAX_VIEWS:
         yield Problem("conflict", "cameras", f"{views} views requested", f"at most {MAX_VIEWS}")
+    yield from _row_conflicts(values)
+
+
+def _row_conflicts(values: Mapping[str, Any]) -> Iterator[Problem]:
+    """Yield the problems of rows of bars: keys without each other, too many bars, and ids of several bars."""
+    tables = [(number, table, _bar_count(table)) for number, table in _numbered_tables(values, "bar")]
+    if (bars := sum(in_row for _, _, in_row in tables)) > MAX_BARS:
+        yield Problem("conflict", "bar", f"{bars} bars in all rows", f"at most {MAX_BARS}")
+        return
     number_of_id: dict[int, int] = {}
-    for table_number, table in _numbered_tables(values, "bar"):
+    for number, table, in_row in tables:
         bar_id = table.get("id")
-        if type(bar_id) is int and 1 <= bar_id <= MAX_BARS:
-            first = number_of_id.setdefault(bar_id, table_number)
-            if first != table_number:
-                found = f"{bar_id} is the id of bar {first}"
-                yield Problem("duplicate", f"bar {table_number}: id", found, "a unique id")
+        if in_row > 1 and "step" not in table:
+            yield Problem("missing", f"bar {number}: step", "missing", f"[x, y, z] between two of {in_row} bars")
+        if "step" in table and "count" not in table:
+            yield Problem("missing", f"bar {number}: count", "missing", "the number of bars in the row")
+        if type(bar_id) is not int or not 1 <= bar_id <= MAX_BARS:
+            continue
+        last_id = bar_id + in_row - 1
+        if last_id > MAX_BARS:
+            yield Problem("conflict", f"bar {number}: id", f"the ids end at {last_id}", f"at most {MAX_BARS}")
+        first_numbers = {own_id: number_of_id.setdefault(own_id, number) for own_id in range(bar_id, last_id + 1)}
+        taken = [
+            f"{own_id} is the id of bar {first}" for own_id, first in first_numbers.items() if first != number
+        ]
+        if taken:
+            yield Problem("duplicate", f"bar {number}: id", taken[0], "a unique id")
+
+
+def _bar_count(table: Mapping[str, Any]) -> int:
+    """Return the number of bars of a ``[[bar]]`` table, 1 if it is invalid."""
+    in_row = table.get("count")
+    return in_row if type(in_row) is int and 1 <= in_row <= MAX_BARS else 1
 
 
 def _numbered_tables(values: Mapping[str, Any], key: str) -> Iterator[tuple[int, Mapping[str, Any]]]:
