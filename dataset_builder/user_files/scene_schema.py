@@ -302,13 +302,13 @@ class SceneToml(StrictModel):
 
     @property
     def bars(self) -> Iterator[tuple[int, TomlBar]]:
-        """Single bars in file order with the numbers of their tables; bars without an id get the lowest free ids."""
+        """Bars in file order with the numbers of their tables; those without an id get the lowest free ids."""
         used_ids = {bar.bar_id + place for bar in self.bar if bar.bar_id for place in range(bar.count)}
         free_ids = (bar_id for bar_id in count(1) if bar_id not in used_ids)
-        for number, bar in enumerate(self.bar, start=1):
+        for table_number, bar in enumerate(self.bar, start=1):
             for place in range(bar.count):
                 bar_id = bar.bar_id + place if bar.bar_id else next(free_ids)
-                yield number, bar.model_copy(update={"bar_id": bar_id, "corners_m": bar.corners_at(place)})
+                yield table_number, bar.model_copy(update={"bar_id": bar_id, "corners_m": bar.corners_at(place)})
 
     @field_validator("name")
     @classmethod
@@ -380,29 +380,27 @@ def _conflicts(values: Mapping[str, Any]) -> Iterator[Problem]:
 
 
 def _row_conflicts(values: Mapping[str, Any]) -> Iterator[Problem]:
-    """Yield the problems of rows of bars: keys without each other, too many bars, and ids of several bars."""
-    tables = [(number, table, _bar_count(table)) for number, table in _numbered_tables(values, "bar")]
+    """Yield the problems of rows of bars: too many bars, keys without each other, and ids of several bars."""
+    tables = [(f"bar {n}", table, _bar_count(table)) for n, table in _numbered_tables(values, "bar")]
     if (bars := sum(in_row for _, _, in_row in tables)) > MAX_BARS:
         yield Problem("conflict", "bar", f"{bars} bars in all rows", f"at most {MAX_BARS}")
         return
-    number_of_id: dict[int, int] = {}
-    for number, table, in_row in tables:
-        bar_id = table.get("id")
+    row_of_id: dict[int, str] = {}
+    for where, table, in_row in tables:
         if in_row > 1 and "step" not in table:
-            yield Problem("missing", f"bar {number}: step", "missing", f"[x, y, z] between two of {in_row} bars")
+            yield Problem("missing", f"{where}: step", "missing", f"[x, y, z] between two of {in_row} bars")
         if "step" in table and "count" not in table:
-            yield Problem("missing", f"bar {number}: count", "missing", "the number of bars in the row")
-        if type(bar_id) is not int or not 1 <= bar_id <= MAX_BARS:
-            continue
-        last_id = bar_id + in_row - 1
-        if last_id > MAX_BARS:
-            yield Problem("conflict", f"bar {number}: id", f"the ids end at {last_id}", f"at most {MAX_BARS}")
-        first_numbers = {own_id: number_of_id.setdefault(own_id, number) for own_id in range(bar_id, last_id + 1)}
-        taken = [
-            f"{own_id} is the id of bar {first}" for own_id, first in first_numbers.items() if first != number
-        ]
-        if taken:
-            yield Problem("duplicate", f"bar {number}: id", taken[0], "a unique id")
+            yield Problem("missing", f"{where}: count", "missing", "the number of bars in the row")
+        first_id = table.get("id")
+        if type(first_id) is int and 1 <= first_id <= MAX_BARS:
+            ids = range(first_id, first_id + in_row)
+            if ids[-1] > MAX_BARS:
+                yield Problem("conflict", f"{where}: id", f"the ids end at {ids[-1]}", f"at most {MAX_BARS}")
+            if taken := next((bar_id for bar_id in ids if bar_id in row_of_id), None):
+                yield Problem(
+                    "duplicate", f"{where}: id", f"{taken} is the id of {row_of_id[taken]}", "a unique id"
+                )
+            row_of_id |= {bar_id: where for bar_id in ids if bar_id not in row_of_id}
 
 
 def _bar_count(table: Mapping[str, Any]) -> int:
