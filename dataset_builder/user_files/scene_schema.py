@@ -46,7 +46,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
-from itertools import count
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, BeforeValidator, Field, Strict, ValidationInfo, field_validator
@@ -148,9 +147,7 @@ _Length = Annotated[
 _Point = Annotated[
     Triple, three_numbers(-1e9, 1e9, "three numbers from -1e9 to 1e9, [x, y, z]"), AfterValidator(_point_in_metres)
 ]
-_Step = Annotated[
-    _Point, Expected("a step from bar to bar that is not zero, [x, y, z]", lambda step_m: any(step_m))
-]
+_Step = Annotated[_Point, Expected("a step that is not zero, [x, y, z]", any)]
 _Distance = Annotated[
     float,
     number(0, expected="a distance above 0, up to 1e9"),
@@ -193,14 +190,6 @@ class TomlBar(StrictModel):
             found, least = (length_m / info.context.unit_m for length_m in (mandrel_m, diameter_m))
             raise field_error(f"got {found:g}", f"at least the bar's diameter, {least:g}", "conflict")
         return mandrel_m
-
-    def corners_at(self, place: int) -> tuple[Triple, ...]:
-        """Return the corners of the bar at a ``place`` in the row, from 0, in metres."""
-        x, y, z = (place * step_m for step_m in self.step_m)
-        return tuple(
-            (to_metres(cx + x, 1.0), to_metres(cy + y, 1.0), to_metres(cz + z, 1.0))
-            for cx, cy, cz in self.corners_m
-        )
 
 
 class CamerasTable(StrictModel, extra="ignore"):
@@ -300,16 +289,6 @@ class SceneToml(StrictModel):
         """Tables ``[[select]]`` in file order."""
         return tuple(table.selection() for table in self.select)
 
-    @property
-    def bars(self) -> Iterator[tuple[int, TomlBar]]:
-        """Bars in file order with the numbers of their tables; those without an id get the lowest free ids."""
-        used_ids = {bar.bar_id + place for bar in self.bar if bar.bar_id for place in range(bar.count)}
-        free_ids = (bar_id for bar_id in count(1) if bar_id not in used_ids)
-        for table_number, bar in enumerate(self.bar, start=1):
-            for place in range(bar.count):
-                bar_id = bar.bar_id + place if bar.bar_id else next(free_ids)
-                yield table_number, bar.model_copy(update={"bar_id": bar_id, "corners_m": bar.corners_at(place)})
-
     @field_validator("name")
     @classmethod
     def _check_name(cls, name: str, info: ValidationInfo[_Context]) -> str:
@@ -381,32 +360,26 @@ def _conflicts(values: Mapping[str, Any]) -> Iterator[Problem]:
 
 def _row_conflicts(values: Mapping[str, Any]) -> Iterator[Problem]:
     """Yield the problems of rows of bars: too many bars, keys without each other, and ids of several bars."""
-    tables = [(f"bar {n}", table, _bar_count(table)) for n, table in _numbered_tables(values, "bar")]
-    if (bars := sum(in_row for _, _, in_row in tables)) > MAX_BARS:
-        yield Problem("conflict", "bar", f"{bars} bars in all rows", f"at most {MAX_BARS}")
-        return
-    row_of_id: dict[int, str] = {}
-    for where, table, in_row in tables:
-        if in_row > 1 and "step" not in table:
-            yield Problem("missing", f"{where}: step", "missing", f"[x, y, z] between two of {in_row} bars")
-        if "step" in table and "count" not in table:
-            yield Problem("missing", f"{where}: count", "missing", "the number of bars in the row")
-        first_id = table.get("id")
+    row_of_id, bars = dict[int, str](), 0
+    for table_number, table in _numbered_tables(values, "bar"):
+        where, first_id, in_row = f"bar {table_number}", table.get("id"), table.get("count")
+        if not isinstance(in_row, int) or not 1 <= in_row <= MAX_BARS:
+            in_row = 1
+        bars += in_row
+        if bars > MAX_BARS:
+            yield Problem("conflict", where, f"{bars} bars with those before it", f"at most {MAX_BARS}")
+            return
+        if in_row > 1 or "step" in table:
+            for key in {"count", "step"} - table.keys():  # One at most.
+                yield Problem("missing", f"{where}: {key}", "missing", "count and step = [x, y, z] of a row")
         if type(first_id) is int and 1 <= first_id <= MAX_BARS:
             ids = range(first_id, first_id + in_row)
             if ids[-1] > MAX_BARS:
                 yield Problem("conflict", f"{where}: id", f"the ids end at {ids[-1]}", f"at most {MAX_BARS}")
-            if taken := next((bar_id for bar_id in ids if bar_id in row_of_id), None):
-                yield Problem(
-                    "duplicate", f"{where}: id", f"{taken} is the id of {row_of_id[taken]}", "a unique id"
-                )
+            for taken in sorted(row_of_id.keys() & ids)[:1]:
+                found = f"{taken} is the id of {row_of_id[taken]}"
+                yield Problem("duplicate", f"{where}: id", found, "a unique id")
             row_of_id |= {bar_id: where for bar_id in ids if bar_id not in row_of_id}
-
-
-def _bar_count(table: Mapping[str, Any]) -> int:
-    """Return the number of bars of a ``[[bar]]`` table, 1 if it is invalid."""
-    in_row = table.get("count")
-    return in_row if type(in_row) is int and 1 <= in_row <= MAX_BARS else 1
 
 
 def _numbered_tables(values: Mapping[str, Any], key: str) -> Iterator[tuple[int, Mapping[str, Any]]]:

@@ -145,7 +145,7 @@ def test_unit_only_scales_geometry(unit: tuple[str, float], scale: float) -> Non
     name, metres = unit
     length, diameter = 0.2 * scale / metres, 0.01 * scale / metres
     bar = f"[[bar]]\ndiameter = {diameter!r}\npoints = [[0, 0, {diameter!r}], [{length!r}, 0, {diameter!r}]]\n"
-    [(_, parsed_bar)] = read_scene_toml(f'unit = "{name}"\n{bar}'.encode(), "a").bars
+    [parsed_bar] = read_scene_toml(f'unit = "{name}"\n{bar}'.encode(), "a").bar
     assert parsed_bar.diameter_m == pytest.approx(0.01 * scale, abs=1e-12)
     assert parsed_bar.corners_m[1] == pytest.approx((0.2 * scale, 0.0, 0.01 * scale), abs=1e-12)
 

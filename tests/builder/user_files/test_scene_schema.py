@@ -55,7 +55,7 @@ INVALID_SCENES = [
     (MM + "[[bar]]\n", "missing bar 1: diameter, missing bar 1: points"),
     (MM + BAR + "id = 5\n" + BAR + "id = 5\n", "duplicate bar 2: id"),
     (MM + BAR + "id = 5\n" + BAR + ROW + "id = 3\n", "duplicate bar 2: id"),
-    (MM + (BAR + ROW.replace("3", "40000")) * 2, "conflict bar"),
+    (MM + (BAR + ROW.replace("3", "40000")) * 2, "conflict bar 2"),
     ("unit = ", "syntax"),
     ("x = " + "[" * 5000, "size"),
     ("x = " + "9" * 5000, "syntax"),
@@ -200,8 +200,8 @@ def test_documented_example_is_valid() -> None:
     scene = read_scene_toml(example.encode(), "example")
     assert (scene.name, scene.board, scene.cameras) == ("my-beam", 6, DomeSpec((0.3, 0.4), (15.0, 45.0), 12))
     corners_m = ((-0.15, 0.0, 0.005), (0.15, 0.0, 0.005), (0.15, 0.0, 0.08))
-    (_, bar), *row = scene.bars
-    assert [(other.bar_id, other.corners_m[0][1]) for _, other in row] == [(8, 0.05), (9, 0.1), (10, 0.15)]
+    [bar] = scene.bar
+    assert (bar.count, bar.step_m) == (4, (0.0, 0.05, 0.0))
     assert (bar.bar_id, bar.role, bar.diameter_m, bar.mandrel_m, bar.ribs) == (7, "main", 0.01, 0.04, True)
     assert bar.corners_m == corners_m
 
