@@ -91,7 +91,7 @@ def nearest_names(select: Iterable[Selection], known: Mapping[str, Collection[st
     The words are empty if each pattern matches a name. At most ``_MAX_NEAREST`` patterns are named, and the first
     ``_MAX_COMPARED`` names of a key are compared, without regard to case.
     """
-    words = []
+    words: list[str] = []
     for key, pattern in dict.fromkeys(pair for table in select for pair in table.patterns):
         names = known.get(key, ())
         if names and not any(_matches(key, name, pattern) for name in names) and len(words) < _MAX_NEAREST:

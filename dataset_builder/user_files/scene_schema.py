@@ -6,7 +6,7 @@ unit = "mm"                   # of every length: m, cm, mm, in, ft; default with
 environment = "laboratory"    # or "outdoors", "hall", "deck"
 board = 6                     # markers on the A3 sheet: 6, 12, or false for no sheet
 
-[cameras]                     # default: a dome around the assembly, or a survey of large steel
+[cameras]                     # default: a dome around the assembly, or a survey beyond 1 m
 kind = "dome"                 # or "ring" with radius, elevation_deg, azimuths;
                               # or "survey" with, if wanted, distances, views_per_distance, seed
 radii = [300, 400]
@@ -369,9 +369,8 @@ def _row_conflicts(values: Mapping[str, Any]) -> Iterator[Problem]:
         if bars > MAX_BARS:
             yield Problem("conflict", where, f"{bars} bars with those before it", f"at most {MAX_BARS}")
             return
-        if in_row > 1 or "step" in table:
-            for key in {"count", "step"} - table.keys():  # One at most.
-                yield Problem("missing", f"{where}: {key}", "missing", "count and step = [x, y, z] of a row")
+        for key in {"count", "step"} - table.keys() if in_row > 1 or "step" in table else ():  # One at most.
+            yield Problem("missing", f"{where}: {key}", "missing", "count and step = [x, y, z] of a row")
         if type(first_id) is int and 1 <= first_id <= MAX_BARS:
             ids = range(first_id, first_id + in_row)
             if ids[-1] > MAX_BARS:

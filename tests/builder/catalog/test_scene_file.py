@@ -165,7 +165,7 @@ def test_default_dome_scales_with_steel_extent(tmp_path: Path) -> None:
 
 
 @settings(max_examples=15)
-@given(length=st.floats(3.0, 2500.0), across=st.floats(0.0, 2000.0))
+@given(length=st.floats(3.0, 340.0), across=st.floats(0.0, 190.0))
 def test_default_dome_fits_any_cage(
     length: float, across: float, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
@@ -173,7 +173,18 @@ def test_default_dome_fits_any_cage(
     content = f"{MM}[[bar]]\ndiameter = 10\nribs = false\npoints = {points}\n"
     config = scene_config(write_scene(tmp_path_factory.mktemp("dome"), content))
     check_fits(make_assembly(config.scene.assembly), config)
+    assert isinstance(config.protocol, DomeSpec)
     assert view_count(config.protocol) == 504
+
+
+@pytest.mark.slow
+def test_default_is_a_survey_where_a_dome_would_exceed_one_metre(tmp_path: Path) -> None:
+    for half_mm, kind in ((203, DomeSpec), (206, SurveySpec)):
+        config = scene_config(write_scene(tmp_path, MM + BAR.replace("100", str(half_mm))))
+        assert isinstance(config.protocol, kind)
+    assert (view_count(config.protocol), config.scene.environment) == (504, "outdoors")
+    bench = 'environment = "laboratory"\n' + MM + BAR.replace("100", "206")
+    assert isinstance(scene_config(write_scene(tmp_path, bench)).protocol, DomeSpec)
 
 
 def test_cameras_board_and_environment_are_applied(tmp_path: Path) -> None:

@@ -208,7 +208,7 @@ def test_documented_example_is_valid() -> None:
 
 def test_survey_has_defaults_in_metres_and_distances_in_the_unit() -> None:
     for unit, keys, expected in (
-        ("mm", "", SurveySpec((0.5, 1.0, 2.0, 4.0), 126, 0)),
+        ("mm", "", SurveySpec((0.5, 0.75, 1.0, 1.5), 126, 0)),
         ("ft", "", SurveySpec()),
         ("ft", "distances = [5, 10]\n", SurveySpec((1.524, 3.048))),
         ("mm", "views_per_distance = 2500\nseed = 7\n", SurveySpec(views_per_distance=2500, seed=7)),
