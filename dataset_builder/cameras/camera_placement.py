@@ -170,24 +170,21 @@ class _Site:
             middle_shares.append(is_middle.mean(axis=1))
         views = replace(views, middle_share=np.mean(middle_shares, axis=0))[is_accepted]
         is_steel = np.isfinite(ranges_m["left"][is_accepted])
-        is_scored = self._has_scored_pixel(views.steel_m, poses["left"][chosen][is_accepted], is_steel)
+        is_scored = self._has_scored_pixel(views, poses["left"][chosen][is_accepted], is_steel)
         return replace(views, is_scored=is_scored)
 
     def _has_scored_pixel(
-        self,
-        steel_m: Float64[ndarray, "n 3"],
-        world_from_left: Float64[ndarray, "n 4 4"],
-        is_steel: Bool[ndarray, "n g"],
+        self, views: _Views, world_from_left: Float64[ndarray, "n 4 4"], is_steel: Bool[ndarray, "n g"]
     ) -> Bool[ndarray, " n"]:
-        """Return which views have steel all round a pixel of the grid that is steel, or round that of a point."""
+        """Return which views have steel all round the pixel of their point, or one of the grid that is steel."""
         view, place = np.nonzero(is_steel)
-        in_eye_m = np.einsum("nji,nj->ni", world_from_left[:, :3, :3], steel_m - world_from_left[:, :3, 3])
+        in_eye_m = np.einsum("nji,nj->ni", world_from_left[:, :3, :3], views.steel_m - world_from_left[:, :3, 3])
         own = self._block_rays(np.round((in_eye_m / in_eye_m[:, 2:] @ self._K.T)[:, :2]))
         view, rays = np.append(view, np.arange(len(own))), np.concatenate([self._blocks[place], own])
         directions = np.einsum("nij,nrj->nri", world_from_left[view, :3, :3], rays)
         origins_m = np.repeat(world_from_left[view, :3, 3], rays.shape[1], axis=0)
         bar_id = self._caster.bar_ids(origins_m, directions.reshape(-1, 3)).reshape(rays.shape[:2])
-        is_scored = np.zeros(len(steel_m), bool)
+        is_scored = np.zeros(len(is_steel), bool)
         is_scored[view[(bar_id != NOT_STEEL).all(axis=1)]] = True
         return is_scored
 
@@ -266,10 +263,7 @@ def with_stations(
 
 
 def _survey_views(site: _Site, distance_m: float, count: int, rng: np.random.Generator) -> _Views:
-    """Return acceptable views of random points of the steel: several times ``count`` if they are found.
-
-    They have scored pixels unless fewer than ``count`` have.
-    """
+    """Return acceptable views of random points of the steel, several times ``count`` if found; scored if enough."""
     turns_deg = np.array(_SURVEY_TURNS_DEG)[:, None]
     found: list[_Views] = []
     for _ in range(-(-max(_MIN_POINTS, _POINTS_PER_VIEW * count) // _SURVEY_BATCH)):

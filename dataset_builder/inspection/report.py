@@ -12,7 +12,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from dataset_builder.inspection.summary import CONTACT, CONTACT_M, MAX_PAIRS, BarGroup, Inspection, Overlap
+from dataset_builder.inspection.summary import CONTACT, CONTACT_M, MAX_PAIRS, BarGroup, Inspection
 from dataset_builder.scene.assemblies.cage import CageBar
 from rebar_depth_bench.reporting.formatting import counted
 from rebar_depth_bench.reporting.tables import plain_text, print_unwrapped
@@ -35,21 +35,17 @@ def inspection_json(inspection: Inspection) -> str:
     cage.
     """
     cage = inspection.cage
+    pairs = {"contacts": inspection.contacts, "clashes": inspection.clashes}
     values = {
         "bars": [_bar_values(bar) for bar in cage.bars],
         "left_out": [vars(record) for record in cage.left_out],
         "world_from_source": cage.world_from_source.tolist(),
         "box_m": inspection.box_m.tolist(),
-        "contacts": _pair_values(inspection.contacts),
-        "clashes": _pair_values(inspection.clashes),
+        **{kind: None if found is None else [vars(pair) for pair in found] for kind, found in pairs.items()},
         "notes": [f"{note.source}: {note.text}" for note in cage.notes],
         "problems": [str(problem) for problem in cage.problems],
     }
     return json.dumps(values, indent=1, allow_nan=False, ensure_ascii=False) + "\n"
-
-
-def _pair_values(pairs: Sequence[Overlap] | None) -> list[dict[str, Any]] | None:
-    return None if pairs is None else [vars(pair) for pair in pairs]
 
 
 def _bar_values(bar: CageBar) -> dict[str, Any]:

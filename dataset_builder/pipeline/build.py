@@ -141,8 +141,8 @@ def _build_plans(
 def _steel_notes(config: DatasetConfig) -> list[Note]:
     """Return the note that names the views of a config without scored pixels, if there are any."""
     empty = [view.view_id for view in config.views if view.scored_px == 0]
-    more = f" and {len(empty) - _MAX_NAMED} more" if len(empty) > _MAX_NAMED else ""
-    text = f"{len(empty)} of {len(config.views)} views have no scored pixel: {', '.join(empty[:_MAX_NAMED])}{more}"
+    named = ", ".join(empty[:_MAX_NAMED] + ["..."] * (len(empty) > _MAX_NAMED))
+    text = f"{len(empty)} of {len(config.views)} views have no scored pixel: {named}"
     return [Note(config.name, "steel", text)] if empty else []
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from textwrap import shorten
 
@@ -118,7 +118,7 @@ def choose_objects(
             reason = "no [[select]] table matches" if select else "not reinforcement"
             left_out.append(left_out_record(entity, reason))
     if not chosen:
-        raise _nothing_error(left_out, select, known)
+        raise _nothing_error(left_out, bool(select), nearest_names(select, known))
     return chosen, left_out
 
 
@@ -203,16 +203,13 @@ def _layers(model: Model, entity: Entity) -> list[str]:
     return names
 
 
-def _nothing_error(
-    left_out: Sequence[LeftOutRecord], select: Sequence[Selection], known: Mapping[str, Collection[str]]
-) -> MeshError:
-    """Return the error of a model without an object to read; ``known`` are the names compared, by key."""
+def _nothing_error(left_out: Sequence[LeftOutRecord], is_selection: bool, nearest: str) -> MeshError:
+    """Return the error of a model without an object to read; ``nearest`` are the ``nearest_names``."""
     classes = Counter(record.reason.partition(":")[0] for record in left_out).most_common(_NAMED_CLASSES)
     found = ", ".join(f"{count} {name}" for name, count in classes) or "no other object with a shape"
-    if select:
+    if is_selection:
         return MeshError(
-            f"no object is selected, expected [[select]] tables that match one or more; it has {found}"
-            f"{nearest_names(select, known)}"
+            f"no object is selected, expected [[select]] tables that match one or more; it has {found}{nearest}"
         )
     return MeshError(
         f"contains no reinforcement, expected at least one object of {', '.join(CLASSES)}, or a scene TOML file "
