@@ -263,7 +263,7 @@ def with_stations(
 
 
 def _survey_views(site: _Site, distance_m: float, count: int, rng: np.random.Generator) -> _Views:
-    """Return acceptable views of random points of the steel, several times ``count`` if found; scored if enough."""
+    """Return acceptable views of random points of steel, several times ``count`` if found, scored if enough."""
     turns_deg = np.array(_SURVEY_TURNS_DEG)[:, None]
     found: list[_Views] = []
     for _ in range(-(-max(_MIN_POINTS, _POINTS_PER_VIEW * count) // _SURVEY_BATCH)):

@@ -69,7 +69,7 @@ def test_views_without_scored_pixels_are_named(tmp_path: Path, run_build: RunBui
     size = ("--width", "24", "--height", "16", "--no-colour")
     process = run_build("--out", tmp_path, "--scene", TWO_BARS, "--views", "12", *size)
     assert process.returncode == 0, process.stderr
-    [config] = open_folder(tmp_path).configs
+    [config] = open_folder(tmp_path).config_by_name.values()
     empty = [view.view_id for view in config.views if view.scored_px == 0]
     assert len(empty) > 10
     note = f"{len(empty)} of 12 views have no scored pixel: {', '.join(empty[:10])}, ..."
