@@ -1,7 +1,8 @@
 """Pictures of the documentation, made from a dataset folder: views, reports and pages of a leaderboard.
 
 rebar-build --out ROOT --config lattice pile pier --views 12 --width 640 --height 360 --quality preview
-python -m scripts.documentation_pictures ROOT docs/pictures
+rebar-build --out MAT --scene examples/mat.toml --views 12 --width 480 --height 270 --quality preview
+python -m scripts.documentation_pictures ROOT MAT docs/pictures
 
 The dataset needs the configs lattice, pile and pier in colour. Methods that take less than a second a view are run
 and scored; the pages are those that users see, in the system's Chromium.
@@ -38,12 +39,13 @@ START_S = 60.0
 PROJECT = Path(__file__).parents[1]
 
 
-def main(root: str, target: str) -> None:
-    """Write the pictures of the dataset folder ``root`` to the folder ``target`` as WebP files."""
+def main(root: str, mat: str, target: str) -> None:
+    """Write the pictures of the dataset folders ``root`` and ``mat`` to the folder ``target`` as WebP files."""
     data, out = Path(root).resolve(), Path(target).resolve()
     save(view_strip(data), out / "lattice.webp")
     for name, target_name in (("scenes", "scenes"), ("lattice", "contact-sheet")):
         shutil.copyfile(data / "pictures" / f"{name}.webp", out / f"{target_name}.webp")
+    save(opened((Path(mat) / "pictures" / "mat.webp").read_bytes()), out / "mat.webp")
     with tempfile.TemporaryDirectory() as name, chromium() as page:
         work = Path(name)
         save(cage_picture(work), out / "inspect.webp")
@@ -170,9 +172,9 @@ def photograph(page: Page, top: float, bottom: float) -> Image.Image:
     return opened(page.screenshot(full_page=True, clip=clip))  # type: ignore[arg-type]
 
 
-def opened(png: bytes) -> Image.Image:
-    """Return the image of a PNG file."""
-    return Image.open(io.BytesIO(png)).convert("RGB")
+def opened(content: bytes) -> Image.Image:
+    """Return the image of a PNG or WebP file."""
+    return Image.open(io.BytesIO(content)).convert("RGB")
 
 
 def save(image: Image.Image, path: Path) -> None:

@@ -62,24 +62,20 @@ def _check_shadow_screen(vertices_m: Float64[ndarray, "n 3"], farthest_m: float,
 
 
 def misfit(environment: str, assembly: Assembly, trajectory: TrajectorySpec) -> str | None:
-    """Return why the assembly or its cameras do not fit into an environment, or None if they do."""
-    steel_radius_m, limit_m = _steel_radius_m(assembly), SURROUNDINGS[environment].steel_radius_m
-    if steel_radius_m > limit_m:
-        return _outside("the steel extends", steel_radius_m, limit_m, environment)
-    return cameras_misfit(environment, assembly, trajectory)
-
-
-def cameras_misfit(environment: str, assembly: Assembly, trajectory: TrajectorySpec) -> str | None:
-    """Return why the cameras do not fit into an environment, or None if they do.
+    """Return why the assembly or its cameras do not fit into an environment, or None if they do.
 
     A survey has no stations yet: in an environment for life-size steel its cameras are placed where they fit, in
     the laboratory all places that they could have must fit.
     """
+    steel_radius_m = float(np.linalg.norm(assembly.vertices_m[:, :2], axis=1).max())
+    limit_m = SURROUNDINGS[environment].steel_radius_m
+    if steel_radius_m > limit_m:
+        return _outside("the steel extends", steel_radius_m, limit_m, environment)
     space = SURROUNDINGS[environment].cameras
     if isinstance(trajectory, SurveySpec):
         if environment in LIFE_SIZE_ENVIRONMENTS:
             return None
-        radius_m, height_m = _steel_radius_m(assembly) + max(trajectory.distances_m), 0.0
+        radius_m, height_m = steel_radius_m + max(trajectory.distances_m), 0.0
     else:
         aim_m = aim_point_m(assembly)
         centres_m = aim_m + np.array(camera_offsets_m(trajectory, aim_m, assembly.bars))
@@ -93,11 +89,6 @@ def cameras_misfit(environment: str, assembly: Assembly, trajectory: TrajectoryS
             f"expected at most {space.ceiling_m:g} m in the environment {environment}"
         )
     return None
-
-
-def _steel_radius_m(assembly: Assembly) -> float:
-    """Return the largest horizontal distance of steel from the world's origin."""
-    return float(np.linalg.norm(assembly.vertices_m[:, :2], axis=1).max())
 
 
 def _outside(what: str, radius_m: float, limit_m: float, environment: str) -> str:

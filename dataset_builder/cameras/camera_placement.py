@@ -2,7 +2,8 @@
 
 Random points of the steel's surface are tried, each with a random direction near the normal there. A view is
 acceptable if both eyes are clear of steel, see the point, and have little steel near to them (``ViewRules``). A
-survey keeps the acceptable views that are farthest apart.
+random view must have a scored pixel as well. A survey keeps the acceptable views that are farthest apart, of those
+with a scored pixel if they are enough.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Shaped
 from numpy import ndarray
 
 from dataset_builder.cameras.rigs import rig_cameras
@@ -33,7 +34,7 @@ NEAR = 0.5
 
 @dataclass(frozen=True)
 class ViewRules:
-    """Rules for acceptable views; shares are those of a ``grid`` (columns, rows) of rays over an eye's image.
+    """Rules for acceptable views; shares are those of a ``grid`` (columns, rows) of pixels of an eye's image.
 
     An eye is at least ``max_clearance_m`` from steel, or half the distance of the view if that is less. Near steel
     covers at most ``max_near_share`` of each image, and steel at least ``min_steel_share``.
@@ -107,6 +108,8 @@ class _Views:
     distance_m: Float64[ndarray, " n"]
     middle_share: Float64[ndarray, " n"]
     """Share of both images with steel at about the distance, 0 until a site has accepted the views."""
+    is_scored: Bool[ndarray, " n"]
+    """Whether the left image is known to have a scored pixel, False until a site has accepted the views."""
 
     def __getitem__(self, index: Any) -> _Views:
         return _Views(*(getattr(self, field.name)[index] for field in fields(self)))
@@ -125,8 +128,8 @@ class _Views:
 class _Site:
     """Steel of an assembly and ``obstacles``, with the space for cameras: tests of views of a rig.
 
-    Distances of eyes are to points of the surfaces of which one is within ``spacing_m`` of every point.
-    ``surface`` samples the steel.
+    The rig has ideal pinholes. Distances of eyes are to points of the surfaces of which one is within
+    ``spacing_m`` of every point. ``surface`` samples the steel.
     """
 
     def __init__(
@@ -146,10 +149,10 @@ class _Site:
         self._caster = RayCaster(surfaces)
         self._points = cKDTree(covering_points(surfaces, spacing_m))
         self._space, self._rules, self._spacing_m = space, rules, spacing_m
-        width, height = rules.grid
-        self._rig = replace(rig, width=width, height=height)
-        cameras = rig_cameras(self._rig, np.eye(4))
-        self._rays = {eye: camera.rays().reshape(-1, 3) for eye, camera in cameras.items()}
+        sides = zip(rules.grid, (rig.width, rig.height), strict=True)
+        places = [np.clip((np.arange(n) + 0.5) * side / n, 1, side - 2) for n, side in sides]
+        self._rig, self._K = rig, rig_cameras(rig, np.eye(4))["left"].K
+        self._blocks = self._block_rays(np.stack(np.meshgrid(*places), axis=-1).reshape(-1, 2).astype(int))
 
     def accepted(self, views: _Views) -> _Views:
         """Return the acceptable ones of the views."""
@@ -159,13 +162,38 @@ class _Site:
         views = views[chosen]
         distance_m = views.distance_m[:, None]
         is_accepted, middle_shares = np.ones(len(distance_m), bool), []
-        for eye, world_from_eye in poses.items():
-            range_m = self._ranges_m(world_from_eye[chosen], self._rays[eye])
+        ranges_m = {eye: self._ranges_m(poses[eye][chosen], self._blocks[:, 4]) for eye in EYES}
+        for range_m in ranges_m.values():
             is_accepted &= (range_m < NEAR * distance_m).mean(axis=1) <= self._rules.max_near_share
             is_accepted &= np.isfinite(range_m).mean(axis=1) >= self._rules.min_steel_share
             is_middle = (range_m >= _MIDDLE * distance_m) & (range_m <= _FAR * distance_m)
             middle_shares.append(is_middle.mean(axis=1))
-        return replace(views, middle_share=np.mean(middle_shares, axis=0))[is_accepted]
+        views = replace(views, middle_share=np.mean(middle_shares, axis=0))[is_accepted]
+        is_steel = np.isfinite(ranges_m["left"][is_accepted])
+        is_scored = self._has_scored_pixel(views, poses["left"][chosen][is_accepted], is_steel)
+        return replace(views, is_scored=is_scored)
+
+    def _has_scored_pixel(
+        self, views: _Views, world_from_left: Float64[ndarray, "n 4 4"], is_steel: Bool[ndarray, "n g"]
+    ) -> Bool[ndarray, " n"]:
+        """Return which views have steel all round the pixel of their point, or one of the grid that is steel."""
+        view, place = np.nonzero(is_steel)
+        in_eye_m = np.einsum("nji,nj->ni", world_from_left[:, :3, :3], views.steel_m - world_from_left[:, :3, 3])
+        own = self._block_rays(np.round((in_eye_m / in_eye_m[:, 2:] @ self._K.T)[:, :2]))
+        view, rays = np.append(view, np.arange(len(own))), np.concatenate([self._blocks[place], own])
+        directions = np.einsum("nij,nrj->nri", world_from_left[view, :3, :3], rays)
+        origins_m = np.repeat(world_from_left[view, :3, 3], rays.shape[1], axis=0)
+        bar_id = self._caster.bar_ids(origins_m, directions.reshape(-1, 3)).reshape(rays.shape[:2])
+        is_scored = np.zeros(len(is_steel), bool)
+        is_scored[view[(bar_id != NOT_STEEL).all(axis=1)]] = True
+        return is_scored
+
+    def _block_rays(self, pixels: Shaped[ndarray, "n 2"]) -> Float64[ndarray, "n 9 3"]:
+        """Return the rays of the 3 x 3 pixels round each pixel (x, y), row by row, in the frame of an eye."""
+        v, u = np.indices((3, 3)).reshape(2, 9) - 1
+        x = (pixels[:, :1] + u - self._K[0, 2]) / self._K[0, 0]
+        y = (pixels[:, 1:] + v - self._K[1, 2]) / self._K[1, 1]
+        return np.stack([x, y, np.ones_like(x)], axis=-1)
 
     def _world_from_eyes(self, views: _Views) -> dict[str, Float64[ndarray, "n 4 4"]]:
         stations = zip(views.centres_m, views.aimed_m, views.roll_deg, strict=True)
@@ -235,7 +263,7 @@ def with_stations(
 
 
 def _survey_views(site: _Site, distance_m: float, count: int, rng: np.random.Generator) -> _Views:
-    """Return acceptable views of random points of the steel: several times ``count`` if they are found."""
+    """Return acceptable views of random points of steel, several times ``count`` if found, scored if enough."""
     turns_deg = np.array(_SURVEY_TURNS_DEG)[:, None]
     found: list[_Views] = []
     for _ in range(-(-max(_MIN_POINTS, _POINTS_PER_VIEW * count) // _SURVEY_BATCH)):
@@ -245,12 +273,13 @@ def _survey_views(site: _Site, distance_m: float, count: int, rng: np.random.Gen
         steel_m = np.round(surface.points_m, _DECIMALS)
         centres_m = np.round(steel_m + distance_m * direction, _DECIMALS)
         none = np.zeros(_SURVEY_BATCH)
-        views = _Views(steel_m, centres_m, steel_m, none, np.full(_SURVEY_BATCH, distance_m), none)
+        views = _Views(steel_m, centres_m, steel_m, none, np.full(_SURVEY_BATCH, distance_m), none, none > 0)
         found.append(site.accepted(views))
-        if sum(len(views.steel_m) for views in found) >= _ACCEPTABLE_PER_VIEW * count:
+        if sum(np.count_nonzero(views.is_scored) for views in found) >= _ACCEPTABLE_PER_VIEW * count:
             break
     views = _Views.joined(found)
-    return views[np.unique(views.steel_m, axis=0, return_index=True)[1]]
+    views = views[np.unique(views.steel_m, axis=0, return_index=True)[1]]
+    return views[views.is_scored] if np.count_nonzero(views.is_scored) >= count else views
 
 
 def _spread(views: _Views, count: int) -> _Views:
@@ -282,8 +311,9 @@ def with_random_stations(
 ) -> RandomViewsSpec:
     """Return random views with their stations: varied distance, direction, aim and roll.
 
-    Each view has its own random numbers, so that it does not depend on how many views there are. No eye is in or
-    near one of the ``obstacles``. Raises ``InputError``, which names ``where``, if a view cannot be placed.
+    Each view has its own random numbers, so that it does not depend on how many views there are. It has a scored
+    pixel in the images of the rig. No eye is in or near one of the ``obstacles``. Raises ``InputError``, which
+    names ``where``, if a view cannot be placed.
     """
     site = _Site(assembly, space, rig, RANDOM_RULES, _RANDOM_SPACING_M, obstacles)
     return replace(
@@ -295,15 +325,15 @@ def _random_station(views: RandomViewsSpec, number: int, site: _Site, where: str
     rng = np.random.default_rng([views.seed, number])
     for _ in range(_RANDOM_BATCHES):
         accepted = site.accepted(_random_views(site, views.distances_m, rng))
-        if len(accepted.steel_m):
-            return accepted[:1].stations()[0]
+        if accepted.is_scored.any():
+            return accepted[accepted.is_scored][:1].stations()[0]
     low_m, high_m = views.distances_m
     problem = Problem(
         "conflict",
         f"view {number}",
         f"none of {_RANDOM_BATCH * _RANDOM_BATCHES} random views {low_m:g} to {high_m:g} m from the steel is "
-        "clear of it and sees it with both eyes",
-        "steel that can be seen from outside",
+        "clear of it, sees it with both eyes, and has a scored pixel",
+        "steel that can be seen from outside, and images that are large enough",
     )
     raise InputError.from_problems(where, [problem])
 
@@ -325,7 +355,7 @@ def _random_views(site: _Site, distances_m: tuple[float, float], rng: np.random.
     aimed_m = np.round(steel_m + distance_m[:, None] * (u * across + v * upwards), _DECIMALS)
     turns_deg = 90.0 * (rng.random(n) < UPRIGHT_SHARE) * np.where(rng.random(n) < 0.5, 1.0, -1.0)
     roll_deg = np.round(rng.uniform(-MAX_ROLL_DEG, MAX_ROLL_DEG, n) + turns_deg, _ROLL_DECIMALS)
-    return _Views(steel_m, centres_m, aimed_m, roll_deg, distance_m, np.zeros(n))
+    return _Views(steel_m, centres_m, aimed_m, roll_deg, distance_m, np.zeros(n), np.zeros(n, bool))
 
 
 def _directions(

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dataset_builder.cameras.camera_fit import cameras_misfit, check_above_ground, check_fits, misfit
+from dataset_builder.cameras.camera_fit import check_above_ground, check_fits, misfit
 from dataset_builder.cameras.camera_placement import with_stations
 from dataset_builder.cameras.trajectories import aim_point_m
 from dataset_builder.catalog.cages_config import CAGES
@@ -49,6 +49,9 @@ NEAREST_RADIUS_PER_REACH = 2.5
 At this distance the whole assembly is in the frame and fills much of it.
 """
 
+MAX_DOME_M = 1.0
+"""Largest radius of a default dome, metres: from farther away, thin bars have hardly a scored pixel."""
+
 _SMALL, _LARGE = "laboratory", "outdoors"
 """Environment of steel and cameras that fit in it, and of others."""
 
@@ -75,10 +78,9 @@ def read_scene(path: str | os.PathLike[str]) -> UserScene:
     """Return the config of a scene file, with the default rig, colour settings and seed, and its cage.
 
     Defaults of omitted keys: the name is that of the file in lower case, with hyphens; the cameras are
-    ``default_dome``, or a survey if that does not fit outdoors, or into the hall or onto the deck where these are
-    named; the environment is the laboratory if all steel is within 0.45 m and all cameras are within 1.6 m of its
-    centre (wherever a survey places them), otherwise outdoors; the board has 6 markers in the laboratory, and
-    there is no board elsewhere.
+    ``default_dome``, or a survey if that exceeds ``MAX_DOME_M``; the environment is the laboratory if all steel is
+    within 0.45 m and all cameras are within 1.6 m of its centre (wherever a survey places them), otherwise
+    outdoors; the board has 6 markers in the laboratory, and there is no board elsewhere.
 
     Raises ``InputError`` if the file is neither TOML nor IFC, listing every missing, unknown or invalid key, for
     an invalid name, and if the assembly or the cameras do not fit. Raises ``MeshError`` if the cage or mesh is
@@ -136,13 +138,12 @@ def files_of_scene(path: str | os.PathLike[str]) -> list[Path]:
 
 
 def _default_trajectory(assembly: Assembly, environment: str | None) -> DomeSpec | SurveySpec:
-    """Return the default dome, or a survey without its stations if the dome does not fit.
+    """Return the default dome, or a survey without its stations if a radius exceeds ``MAX_DOME_M``.
 
-    It must fit outdoors; in the laboratory, which is too small for a survey of what has no dome there, as well.
+    In the laboratory, which is too small for a survey of such steel, it is the dome.
     """
     dome = default_dome(assembly)
-    place = _LARGE if environment is None or environment == _SMALL else environment
-    return dome if cameras_misfit(place, assembly, dome) is None else SurveySpec()
+    return dome if environment == _SMALL or max(dome.radii_m) <= MAX_DOME_M else SurveySpec()
 
 
 def default_dome(assembly: Assembly) -> DomeSpec:

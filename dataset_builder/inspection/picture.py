@@ -82,7 +82,7 @@ class _Stroke:
 
 
 def inspection_picture(inspection: Inspection) -> bytes:
-    """Return a PNG of a cage from four sides, with its diameters, sizes, and marks where bars overlap."""
+    """Return a PNG of a cage from four sides, with its diameters, sizes, and marks where bars clash."""
     colours = _colours(inspection.cage.bars)
     strokes = _strokes(inspection.cage.bars, colours)
     picture = Image.new("RGB", (_WIDTH_PX, _LEGEND_PX + _HEAD_PX), _PAPER)
@@ -164,8 +164,8 @@ def _panel(inspection: Inspection, strokes: Sequence[_Stroke], side: _Side) -> I
     projection = _Projection.fitting(side.axes, inspection.box_m)
     draw = ImageDraw.Draw(large)
     _draw_strokes(draw, strokes, projection)
-    for overlap in (inspection.overlaps or ())[:_MAX_MARKS]:
-        ((x, y),) = projection.pixels(np.array([overlap.point_m])).tolist()
+    for clash in (inspection.clashes or ())[:_MAX_MARKS]:
+        ((x, y),) = projection.pixels(np.array([clash.point_m])).tolist()
         draw.ellipse((x - 9, y - 9, x + 9, y + 9), outline=_MARK, width=3)
     panel = large.resize(_PANEL_PX, Image.Resampling.BOX)
     draw = ImageDraw.Draw(panel)
@@ -225,8 +225,8 @@ def _write_head(draw: ImageDraw.ImageDraw, inspection: Inspection) -> None:
     draw.text((_MARGIN_PX, 14), name, _INK, font(30))
     bars = counted(len(inspection.cage.bars), "bar")
     words = [f"{bars}, {inspection.size_text} (x, y, z)"]
-    if inspection.overlaps:
-        words.append(f"red circles: {counted(len(inspection.overlaps), 'pair')} of bars overlap")
+    if inspection.clashes:
+        words.append(f"red circles: {counted(len(inspection.clashes), 'pair')} of bars clash")
     draw.text((_MARGIN_PX, 54), "; ".join(words), _GREY, font(20))
 
 

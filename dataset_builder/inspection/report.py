@@ -12,13 +12,13 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from dataset_builder.inspection.summary import MAX_PAIRS, MIN_OVERLAP_M, BarGroup, Inspection
+from dataset_builder.inspection.summary import CONTACT, CONTACT_M, MAX_PAIRS, BarGroup, Inspection
 from dataset_builder.scene.assemblies.cage import CageBar
 from rebar_depth_bench.reporting.formatting import counted
 from rebar_depth_bench.reporting.tables import plain_text, print_unwrapped
 
 _MAX_GROUPS = 40
-_MAX_OVERLAPS = 10
+_MAX_CLASHES = 10
 _MAX_REASONS = 20
 _AXIS_WORDS: Mapping[str | None, str] = {
     "exact": "from the file",
@@ -30,17 +30,18 @@ _AXIS_WORDS: Mapping[str | None, str] = {
 def inspection_json(inspection: Inspection) -> str:
     """Return an inspection as JSON, as the contract defines it.
 
-    Further keys are ``box_m`` (lower and upper corner of the steel, world), ``overlaps`` (null if too many bars
-    are close to each other), ``notes`` and ``problems``, the reasons for which a build refuses the cage.
+    Further keys are ``box_m`` (lower and upper corner of the steel, world), ``contacts`` and ``clashes`` (null if
+    too many bars are close to each other), ``notes`` and ``problems``, the reasons for which a build refuses the
+    cage.
     """
     cage = inspection.cage
-    overlaps = inspection.overlaps
+    pairs = {"contacts": inspection.contacts, "clashes": inspection.clashes}
     values = {
         "bars": [_bar_values(bar) for bar in cage.bars],
         "left_out": [vars(record) for record in cage.left_out],
         "world_from_source": cage.world_from_source.tolist(),
         "box_m": inspection.box_m.tolist(),
-        "overlaps": None if overlaps is None else [vars(overlap) for overlap in overlaps],
+        **{kind: None if found is None else [vars(pair) for pair in found] for kind, found in pairs.items()},
         "notes": [f"{note.source}: {note.text}" for note in cage.notes],
         "problems": [str(problem) for problem in cage.problems],
     }
@@ -75,7 +76,7 @@ def print_inspection(inspection: Inspection, console: Console | None = None) -> 
             console, f"and {counted(len(more), 'more group')} of {counted(bars, 'bar')} (--json lists all bars)"
         )
     console.print()
-    kinds = (_axis_lines, _place_lines, _overlap_lines, _left_out_lines)
+    kinds = (_axis_lines, _place_lines, _meeting_lines, _left_out_lines)
     for line in (line for lines in kinds for line in lines(inspection)):
         _print(console, line)
 
@@ -126,17 +127,18 @@ def _place_lines(inspection: Inspection) -> list[str]:
     ]
 
 
-def _overlap_lines(inspection: Inspection) -> list[str]:
-    if inspection.overlaps is None:
-        return [f"overlaps: not compared, more than {MAX_PAIRS} places where bars are close to each other"]
-    if not inspection.overlaps:
-        return [f"overlaps: no bars penetrate each other by more than {MIN_OVERLAP_M * 1000:g} mm"]
-    count = len(inspection.overlaps)
-    verb = "penetrates another" if count == 1 else "penetrate each other"
-    lines = [f"overlaps: {counted(count, 'pair')} of bars {verb} by more than {MIN_OVERLAP_M * 1000:g} mm"]
-    worst = inspection.overlaps[:_MAX_OVERLAPS]
-    lines += [f"  bars {item.bar_a} and {item.bar_b}: {item.depth_m * 1000:.1f} mm" for item in worst]
-    return lines + _more(count - len(worst))
+def _meeting_lines(inspection: Inspection) -> list[str]:
+    """Return the number of bars in contact, and the deepest clashes."""
+    if inspection.contacts is None or inspection.clashes is None:
+        return [f"clashes: not compared, more than {MAX_PAIRS} places where bars are close to each other"]
+    limit = f"{CONTACT * 100:g} % of their mean diameter and {CONTACT_M * 1000:g} mm"
+    worst = inspection.clashes[:_MAX_CLASHES]
+    return [
+        f"in contact: {counted(len(inspection.contacts), 'pair')} of bars (gap or overlap of at most {limit})",
+        f"clashes: {counted(len(inspection.clashes), 'pair')} of bars (deeper overlap)",
+        *(f"  bars {item.bar_a} and {item.bar_b}: {item.depth_m * 1000:.1f} mm" for item in worst),
+        *_more(len(inspection.clashes) - len(worst)),
+    ]
 
 
 def _left_out_lines(inspection: Inspection) -> list[str]:

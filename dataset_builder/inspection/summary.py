@@ -1,11 +1,13 @@
-"""Summary of a cage: groups of bars, the box of its steel, and bars that penetrate each other."""
+"""Summary of a cage: groups of bars, the box of its steel, and bars that touch or penetrate each other."""
 
 from __future__ import annotations
 
 import math
 from collections import defaultdict
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
@@ -19,8 +21,8 @@ from rebar_depth_bench.geometry.segments import closest_points_m
 STEEL_KG_PER_M3 = 7850.0
 """Density of reinforcing steel (EN 1992-1-1, 3.2.7)."""
 
-MIN_OVERLAP_M = 0.0005
-"""Smallest overlap that counts, metres: bars that touch overlap by rounding errors."""
+CONTACT, CONTACT_M = 0.1, 0.0005
+"""Largest gap, and largest overlap, of bars in contact: of their mean diameter, what ribs add, and in metres."""
 
 MAX_PAIRS = 20_000_000
 """Largest number of pairs of neighbouring pieces of axes that are compared."""
@@ -49,7 +51,7 @@ class BarGroup:
 
 @dataclass(frozen=True)
 class Overlap:
-    """Two bars that penetrate each other by ``depth_m``, and the point (world) where they do so most."""
+    """Two bars that overlap by ``depth_m``, negative for a gap, and the point (world) where it is largest."""
 
     bar_a: int
     bar_b: int
@@ -59,16 +61,17 @@ class Overlap:
 
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """Cage of the file ``name``, its groups, the box of its steel (world, metres) and its overlaps.
+    """Cage of the file ``name``, its groups, the box of its steel (world, metres), and its ``meetings``.
 
-    ``overlaps`` is None if too many bars are close to each other to compare them.
+    ``contacts`` and ``clashes`` are None if too many bars are close to each other to compare them.
     """
 
     name: str
     cage: Cage
     groups: tuple[BarGroup, ...]
     box_m: Box
-    overlaps: tuple[Overlap, ...] | None
+    contacts: Sequence[Overlap] | None
+    clashes: Sequence[Overlap] | None
 
     @property
     def size_text(self) -> str:
@@ -80,21 +83,21 @@ def inspect_cage(cage: Cage, name: str) -> Inspection:
     """Return the summary of a cage of one or more bars."""
     boxes_m = np.array([bar_box_m(bar) for bar in cage.bars])
     box_m = np.array([boxes_m[:, 0].min(axis=0), boxes_m[:, 1].max(axis=0)])
-    try:
-        found: tuple[Overlap, ...] | None = tuple(overlaps([bar.bar for bar in cage.bars]))
-    except TooManyNeighboursError:
-        found = None
-    return Inspection(name, cage, tuple(_groups(cage.bars)), box_m, found)
+    found: tuple[Sequence[Overlap] | None, Sequence[Overlap] | None] = None, None
+    with suppress(TooManyNeighboursError):
+        found = meetings([bar.bar for bar in cage.bars])
+    return Inspection(name, cage, tuple(_groups(cage.bars)), box_m, *found)
 
 
-def overlaps(bars: Sequence[Bar]) -> list[Overlap]:
-    """Return the pairs of bars that penetrate each other by more than ``MIN_OVERLAP_M``, the deepest first.
+def meetings(bars: Sequence[Bar]) -> tuple[list[Overlap], list[Overlap]]:
+    """Return the pairs of bars in contact, as tied bars are, and those that clash, the deepest first.
 
-    Bars without axis are left out. Raises ``TooManyNeighboursError`` for more than ``MAX_PAIRS`` neighbours.
+    Bars clash if they overlap by more than bars in contact (``CONTACT``). Those without axis are left out. Raises
+    ``TooManyNeighboursError`` for more than ``MAX_PAIRS`` neighbours.
     """
     measured = with_axis(bars)
     axes = AxisSegments.of_bars(measured)
-    pairs = axes.near_pairs(0.0, MAX_PAIRS)
+    pairs = axes.near_pairs(_contact_m(axes.diameter_m.max(initial=0.0)), MAX_PAIRS)
     pairs = pairs[axes.bar[pairs[:, 0]] != axes.bar[pairs[:, 1]]]
     ends_m = axes.start_m + axes.vector_m
     deepest: dict[tuple[int, int], tuple[float, list[float]]] = {}
@@ -103,16 +106,22 @@ def overlaps(bars: Sequence[Bar]) -> list[Overlap]:
         on_a, on_b = closest_points_m(axes.start_m[i], ends_m[i], axes.start_m[j], ends_m[j])
         radii_m = (axes.diameter_m[axes.bar[i]] + axes.diameter_m[axes.bar[j]]) / 2
         depth_m = radii_m - np.linalg.norm(on_a - on_b, axis=1)
-        for index in np.flatnonzero(depth_m > MIN_OVERLAP_M).tolist():
+        for index in np.flatnonzero(depth_m >= -_contact_m(radii_m)).tolist():
             a, b = int(axes.bar[i[index]]), int(axes.bar[j[index]])
             found_m = float(depth_m[index])
-            if found_m > deepest.get((a, b), (0.0, []))[0]:
+            if found_m > deepest.get((a, b), (-np.inf, []))[0]:
                 deepest[a, b] = found_m, ((on_a[index] + on_b[index]) / 2).tolist()
-    found = [
-        Overlap(measured[a].bar_id, measured[b].bar_id, depth_m, (x, y, z))
-        for (a, b), (depth_m, (x, y, z)) in deepest.items()
-    ]
-    return sorted(found, key=lambda overlap: (-overlap.depth_m, overlap.bar_a, overlap.bar_b))
+    contacts, clashes = list[Overlap](), list[Overlap]()
+    for (a, b), (depth_m, (x, y, z)) in sorted(deepest.items(), key=lambda item: (-item[1][0], item[0])):
+        is_clash = depth_m > _contact_m((measured[a].diameter_m + measured[b].diameter_m) / 2)
+        pair = Overlap(measured[a].bar_id, measured[b].bar_id, depth_m, (x, y, z))
+        (clashes if is_clash else contacts).append(pair)
+    return contacts, clashes
+
+
+def _contact_m(mean_diameter_m: Any) -> Any:
+    """Return the largest gap and overlap of bars in contact by their mean diameters, of the same shape."""
+    return CONTACT * mean_diameter_m + CONTACT_M
 
 
 def bar_box_m(bar: CageBar) -> Box:

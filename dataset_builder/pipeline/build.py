@@ -28,11 +28,16 @@ from dataset_builder.pipeline.plan import (
 from dataset_builder.pipeline.publish import publish_plans, remove_leftovers, repair_metadata
 from dataset_builder.pipeline.retained import Finished, check_retained, kept_scenes
 from dataset_builder.pipeline.work_units import UnitResult, WorkUnit, accept_result, remaining_units
+from dataset_builder.scene.model import Note
 from dataset_builder.specs.config_specs import SceneConfigSpec
 from dataset_builder.specs.file_specs import CageFileSpec, MeshFileSpec
 from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.base.parallel import Progress, silent
 from rebar_depth_bench.base.writing import write_bytes
+from rebar_depth_bench.data.manifest import DatasetConfig
+
+_MAX_NAMED = 10
+"""Largest number of views that a note names."""
 
 
 @dataclass
@@ -124,12 +129,21 @@ def _build_plans(
             _render(of_config, submit, progress, summary)
             kept = kept_scenes(finished.configs.get(name), of_config)
             folder = publish_plans(out, folder, of_config, kept)
+            print_notes(_steel_notes(folder.config_by_name[name]))
             summary.built.append(name)
         elif folder is not None:
             folder = repair_metadata(out, folder, plans_of_config)
             summary.up_to_date.append(name)
         remove_stagings(out, plans_of_config)
     return summary
+
+
+def _steel_notes(config: DatasetConfig) -> list[Note]:
+    """Return the note that names the views of a config without scored pixels, if there are any."""
+    empty = [view.view_id for view in config.views if view.scored_px == 0]
+    named = ", ".join(empty[:_MAX_NAMED] + ["..."] * (len(empty) > _MAX_NAMED))
+    text = f"{len(empty)} of {len(config.views)} views have no scored pixel: {named}"
+    return [Note(config.name, "steel", text)] if empty else []
 
 
 class _ViewCount:

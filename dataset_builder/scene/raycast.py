@@ -102,6 +102,13 @@ class RayCaster:
         bar_id[hit] = self._face_bar_id[face[hit]]
         return RayHits(range_m, cos_incidence, bar_id)
 
+    def bar_ids(
+        self, origins_m: Float64[ndarray, "n 3"], directions: Float64[ndarray, "n 3"]
+    ) -> UInt16[ndarray, " n"]:
+        """Return the bar id of the first intersection of each ray, 0 without a hit; arguments as in ``hits``."""
+        face = self._first_face(origins_m, directions)
+        return np.where(face == _MISS, np.uint16(0), self._face_bar_id[face])
+
     def _first_face(
         self, centre_m: Float64[ndarray, "*n 3"], directions: Float64[ndarray, "n 3"]
     ) -> Int32[ndarray, " n"]:

@@ -152,7 +152,7 @@ class SurveySpec:
     assembly (``cameras.camera_placement``), and are stored so that every machine uses the same ones.
     """
 
-    distances_m: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)
+    distances_m: tuple[float, ...] = (0.5, 0.75, 1.0, 1.5)
     views_per_distance: int = 126
     seed: int = 0
     stations: tuple[Station, ...] = ()

@@ -5,8 +5,9 @@ Like all specs, they are written to the manifest: field names and defaults are p
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from dataclasses import dataclass
+from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from typing import Literal
 
@@ -14,6 +15,8 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 from pydantic import TypeAdapter
+
+from rebar_depth_bench.base.errors import escape_text
 
 Up = Literal["z", "y"]
 Origin = Literal["centre", "keep"]
@@ -39,6 +42,9 @@ class PlacementSpec:
 CLASS = "class"
 KEYS = (CLASS, "global_id", "name", "host", "storey", "layer")
 """Names of an object that a pattern can be for; a part of a mesh file has a ``name`` only."""
+
+_MAX_NAME, _MAX_COMPARED, _MAX_NEAREST = 60, 10_000, 3
+"""Limits of the names in a message about a selection: their characters, how many are compared, and listed."""
 
 Corner = tuple[float, float, float]
 
@@ -77,6 +83,23 @@ def _matches(key: str, name: str, pattern: str) -> bool:
     if key == CLASS:
         name, pattern = name.casefold(), pattern.casefold()
     return fnmatchcase(name, pattern)
+
+
+def nearest_names(select: Iterable[Selection], known: Mapping[str, Collection[str]]) -> str:
+    """Return words for a message: the names nearest to patterns that match no ``known`` name of their keys.
+
+    The words are empty if each pattern matches a name. At most ``_MAX_NEAREST`` patterns are named, and the first
+    ``_MAX_COMPARED`` names of a key are compared, without regard to case.
+    """
+    words: list[str] = []
+    for key, pattern in dict.fromkeys(pair for table in select for pair in table.patterns):
+        names = known.get(key, ())
+        if names and not any(_matches(key, name, pattern) for name in names) and len(words) < _MAX_NEAREST:
+            by_plain = {name[:_MAX_NAME].casefold(): name for name in sorted(names)[:_MAX_COMPARED]}
+            near = get_close_matches(pattern[:_MAX_NAME].casefold(), by_plain, n=_MAX_NEAREST, cutoff=0.3)
+            shown = [escape_text(by_plain[name][:_MAX_NAME]) for name in near or list(by_plain)[:_MAX_NEAREST]]
+            words.append(f"; nearest to {key} {escape_text(pattern[:_MAX_NAME])}: {', '.join(shown)}")
+    return "".join(words)
 
 
 TABLES: TypeAdapter[tuple[Selection, ...]] = TypeAdapter(tuple[Selection, ...])

@@ -8,6 +8,7 @@ import os
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import count
 from pathlib import Path
 from typing import Literal
 
@@ -15,7 +16,7 @@ import numpy as np
 
 from dataset_builder.scene.assemblies.bar_meshes import bar_mesh, estimated_triangles, with_ribs_chosen
 from dataset_builder.scene.assemblies.cage import Cage, CageBar, unit_scale
-from dataset_builder.scene.model import MAX_BARS, Assembly, Note, axis_of
+from dataset_builder.scene.model import MAX_BARS, METRE_DECIMALS, Assembly, Note, axis_of
 from dataset_builder.scene.shapes.bending import bent_line_m, mandrel_diameter_m
 from dataset_builder.specs.file_specs import (
     CageFileSpec,
@@ -28,7 +29,7 @@ from dataset_builder.user_files.cage_placement import placed
 from dataset_builder.user_files.ifc_file import ifc_cage
 from dataset_builder.user_files.mesh_import import SUFFIXES as MESH_SUFFIXES
 from dataset_builder.user_files.mesh_import import mesh_cage
-from dataset_builder.user_files.scene_schema import read_scene_toml
+from dataset_builder.user_files.scene_schema import TomlBar, read_scene_toml
 from rebar_depth_bench.base.errors import InputError, MeshError, Problem
 from rebar_depth_bench.base.limits import IFC_BYTES, MESH_BYTES, TOML_BYTES
 from rebar_depth_bench.base.reading import read_file
@@ -141,7 +142,7 @@ def _toml_cage(content: bytes, where: str) -> Cage:
     except InputError as error:
         raise MeshError.from_problems(where, error.problems) from error
     cage_bars, problems = [], []
-    for number, bar in enumerate(scene.bars, start=1):
+    for number, bar in _single_bars(scene.bar):
         label = f"bar {bar.bar_id} ({bar.role}, diameter {bar.diameter_m:g} m)"
         mandrel_m = mandrel_diameter_m(bar.diameter_m) if bar.mandrel_m is None else bar.mandrel_m
         try:
@@ -153,6 +154,18 @@ def _toml_cage(content: bytes, where: str) -> Cage:
         cage_bars.append(CageBar(label, bent, bar.ribs, source=f"bar {number}"))
     raise_problems(problems, where)
     return Cage(tuple(cage_bars), (), unit_scale(scene.unit_m))
+
+
+def _single_bars(tables: Sequence[TomlBar]) -> Iterator[tuple[int, TomlBar]]:
+    """Yield bars in file order with the numbers of their tables; those without an id get the lowest free ids."""
+    used_ids = {table.bar_id + place for table in tables if table.bar_id for place in range(table.count)}
+    free_ids = (bar_id for bar_id in count(1) if bar_id not in used_ids)
+    for number, table in enumerate(tables, start=1):
+        for place in range(table.count):
+            bar_id = table.bar_id + place if table.bar_id else next(free_ids)
+            moved_m = np.array(table.corners_m) + place * np.array(table.step_m)
+            corners_m = axis_of(np.round(moved_m, METRE_DECIMALS))
+            yield number, table.model_copy(update={"bar_id": bar_id, "corners_m": corners_m})
 
 
 def _pinned_content(spec: CageFileSpec | MeshFileSpec) -> bytes:

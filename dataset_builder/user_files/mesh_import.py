@@ -32,7 +32,7 @@ from numpy import ndarray
 from dataset_builder.scene.assemblies.cage import Cage, CageBar, LeftOut, unit_scale
 from dataset_builder.scene.mesh_ply import has_mesh_ply_header, parse_mesh_ply
 from dataset_builder.scene.model import ESTIMATED_ROLE, MAX_BARS, NOT_STEEL, Mesh, axis_of
-from dataset_builder.specs.file_specs import MeshFileSpec
+from dataset_builder.specs.file_specs import MeshFileSpec, nearest_names
 from dataset_builder.user_files.mesh_formats.parsing import MalformedMeshError, Surface
 from dataset_builder.user_files.mesh_formats.ply import read_ply
 from dataset_builder.user_files.mesh_formats.stl_obj import read_obj, read_stl
@@ -96,7 +96,7 @@ def _selected(parts: list[MeshPart], spec: MeshFileSpec) -> tuple[list[MeshPart]
     if not taken:
         raise MeshError(
             f"{spec.path}: no part is selected, expected [[select]] tables that match at least one of its "
-            f"{len(parts)} parts, such as {escape_text(parts[0].name)}"
+            f"{len(parts)} parts{nearest_names(spec.select, {'name': [part.name for part in parts]})}"
         )
     return taken, left_out
 

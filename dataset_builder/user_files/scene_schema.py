@@ -6,7 +6,7 @@ unit = "mm"                   # of every length: m, cm, mm, in, ft; default with
 environment = "laboratory"    # or "outdoors", "hall", "deck"
 board = 6                     # markers on the A3 sheet: 6, 12, or false for no sheet
 
-[cameras]                     # default: a dome around the assembly, or a survey of large steel
+[cameras]                     # default: a dome around the assembly, or a survey beyond 1 m
 kind = "dome"                 # or "ring" with radius, elevation_deg, azimuths;
                               # or "survey" with, if wanted, distances, views_per_distance, seed
 radii = [300, 400]
@@ -16,8 +16,10 @@ azimuths = 12
 [[bar]]                       # or, above the tables: mesh = "cage.stl", or ifc = "cage.ifc"
 diameter = 10
 points = [[-150, 0, 5], [150, 0, 5], [150, 0, 80]]   # corners of the path; world, z up, board at z = 0
+count = 4                     # of equal bars in a row, each [x, y, z] after the one before it; default 1
+step = [0, 50, 0]
 role = "main"                 # default "bar"
-id = 7                        # default: the lowest free id
+id = 7                        # of the first one, the others follow; default: the lowest free ids
 bend_diameter = 40            # of the mandrel; default EN 1992-1-1: 4 d up to 16 mm, 7 d above
 ribs = true                   # default
 ```
@@ -44,7 +46,6 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass
-from itertools import count
 from typing import Annotated, Any
 
 from pydantic import AfterValidator, BeforeValidator, Field, Strict, ValidationInfo, field_validator
@@ -146,6 +147,7 @@ _Length = Annotated[
 _Point = Annotated[
     Triple, three_numbers(-1e9, 1e9, "three numbers from -1e9 to 1e9, [x, y, z]"), AfterValidator(_point_in_metres)
 ]
+_Step = Annotated[_Point, Expected("a step that is not zero, [x, y, z]", any)]
 _Distance = Annotated[
     float,
     number(0, expected="a distance above 0, up to 1e9"),
@@ -164,7 +166,8 @@ _Box = Annotated[
 class TomlBar(StrictModel):
     """One ``[[bar]]`` table in metres; ``corners_m`` are the corners of its path in the world frame.
 
-    ``bar_id`` 0 stands for the lowest free id. ``mandrel_m`` is the mandrel diameter; None selects the minimum of
+    The table makes ``count`` equal bars, each ``step_m`` after the one before it. ``bar_id`` is that of the first;
+    0 stands for the lowest free ids. ``mandrel_m`` is the mandrel diameter; None selects the minimum of
     EN 1992-1-1.
     """
 
@@ -172,6 +175,8 @@ class TomlBar(StrictModel):
     corners_m: Annotated[
         tuple[_Point, ...], Strict(False), _list_of("two or more points, [[x, y, z], ...]", 2)
     ] = Field(alias="points")
+    count: Annotated[int, whole_number(1, MAX_BARS)] = 1
+    step_m: _Step = Field(default=(0.0, 0.0, 0.0), alias="step")
     role: Annotated[str, _ROLE] = "bar"
     bar_id: Annotated[int, whole_number(1, MAX_BARS)] = Field(default=0, alias="id")
     mandrel_m: _Length | None = Field(default=None, alias="bend_diameter")
@@ -284,13 +289,6 @@ class SceneToml(StrictModel):
         """Tables ``[[select]]`` in file order."""
         return tuple(table.selection() for table in self.select)
 
-    @property
-    def bars(self) -> tuple[TomlBar, ...]:
-        """Bars in file order; those without an id get the lowest free ids."""
-        used_ids = {bar.bar_id for bar in self.bar}
-        free_ids = (bar_id for bar_id in count(1) if bar_id not in used_ids)
-        return tuple(bar if bar.bar_id else bar.model_copy(update={"bar_id": next(free_ids)}) for bar in self.bar)
-
     @field_validator("name")
     @classmethod
     def _check_name(cls, name: str, info: ValidationInfo[_Context]) -> str:
@@ -357,14 +355,30 @@ def _conflicts(values: Mapping[str, Any]) -> Iterator[Problem]:
             yield Problem("conflict", where, found, expected)
     if (views := _view_count(values.get("cameras"))) > MAX_VIEWS:
         yield Problem("conflict", "cameras", f"{views} views requested", f"at most {MAX_VIEWS}")
-    number_of_id: dict[int, int] = {}
+    yield from _row_conflicts(values)
+
+
+def _row_conflicts(values: Mapping[str, Any]) -> Iterator[Problem]:
+    """Yield the problems of rows of bars: too many bars, keys without each other, and ids of several bars."""
+    row_of_id, bars = dict[int, str](), 0
     for table_number, table in _numbered_tables(values, "bar"):
-        bar_id = table.get("id")
-        if type(bar_id) is int and 1 <= bar_id <= MAX_BARS:
-            first = number_of_id.setdefault(bar_id, table_number)
-            if first != table_number:
-                found = f"{bar_id} is the id of bar {first}"
-                yield Problem("duplicate", f"bar {table_number}: id", found, "a unique id")
+        where, first_id, in_row = f"bar {table_number}", table.get("id"), table.get("count")
+        if not isinstance(in_row, int) or not 1 <= in_row <= MAX_BARS:
+            in_row = 1
+        bars += in_row
+        if bars > MAX_BARS:
+            yield Problem("conflict", where, f"{bars} bars with those before it", f"at most {MAX_BARS}")
+            return
+        for key in {"count", "step"} - table.keys() if in_row > 1 or "step" in table else ():  # One at most.
+            yield Problem("missing", f"{where}: {key}", "missing", "count and step = [x, y, z] of a row")
+        if type(first_id) is int and 1 <= first_id <= MAX_BARS:
+            ids = range(first_id, first_id + in_row)
+            if ids[-1] > MAX_BARS:
+                yield Problem("conflict", f"{where}: id", f"the ids end at {ids[-1]}", f"at most {MAX_BARS}")
+            for taken in sorted(row_of_id.keys() & ids)[:1]:
+                found = f"{taken} is the id of {row_of_id[taken]}"
+                yield Problem("duplicate", f"{where}: id", found, "a unique id")
+            row_of_id |= {bar_id: where for bar_id in ids if bar_id not in row_of_id}
 
 
 def _numbered_tables(values: Mapping[str, Any], key: str) -> Iterator[tuple[int, Mapping[str, Any]]]:

@@ -15,7 +15,7 @@ from textwrap import shorten
 
 from ifcopenshell.util.unit import get_prefix_multiplier
 
-from dataset_builder.specs.file_specs import Selection
+from dataset_builder.specs.file_specs import KEYS, Selection, nearest_names
 from dataset_builder.user_files.ifc_reader.ifc_model import Entity, Model
 from dataset_builder.user_files.ifc_records import LeftOutRecord, Source
 from rebar_depth_bench.base.errors import MeshError, escape_text
@@ -103,10 +103,13 @@ def choose_objects(
     """
     chosen: list[tuple[Entity, Sequence[Selection]]] = []
     left_out: list[LeftOutRecord] = []
+    known: dict[str, set[str]] = {key: set() for key in KEYS}
     for entity in model.by_type("IfcProduct"):
         is_reinforcement = any(map(entity.is_a, CLASSES))
         tables = [table for table in select if is_reinforcement or table.has_class]
         names = _names(model, entity) if tables else {}
+        for key, values in names.items():
+            known[key].update(values)
         matching = [table for table in tables if table.matches(names)]
         if matching or (is_reinforcement and not select):
             if is_reinforcement or _has_shape(entity):
@@ -115,7 +118,7 @@ def choose_objects(
             reason = "no [[select]] table matches" if select else "not reinforcement"
             left_out.append(left_out_record(entity, reason))
     if not chosen:
-        raise _nothing_error(left_out, bool(select))
+        raise _nothing_error(left_out, bool(select), nearest_names(select, known))
     return chosen, left_out
 
 
@@ -200,13 +203,13 @@ def _layers(model: Model, entity: Entity) -> list[str]:
     return names
 
 
-def _nothing_error(left_out: Sequence[LeftOutRecord], is_selection: bool) -> MeshError:
-    """Return the error of a model without an object to read."""
+def _nothing_error(left_out: Sequence[LeftOutRecord], is_selection: bool, nearest: str) -> MeshError:
+    """Return the error of a model without an object to read; ``nearest`` are the ``nearest_names``."""
     classes = Counter(record.reason.partition(":")[0] for record in left_out).most_common(_NAMED_CLASSES)
     found = ", ".join(f"{count} {name}" for name, count in classes) or "no other object with a shape"
     if is_selection:
         return MeshError(
-            f"no object is selected, expected [[select]] tables that match one or more; it has {found}"
+            f"no object is selected, expected [[select]] tables that match one or more; it has {found}{nearest}"
         )
     return MeshError(
         f"contains no reinforcement, expected at least one object of {', '.join(CLASSES)}, or a scene TOML file "

@@ -30,8 +30,9 @@ from dataset_builder.catalog.scene_file import scene_config
 from dataset_builder.scene.cages.generate import FAMILIES
 from dataset_builder.scene.environments.surroundings import GROUND_CLEARANCE_M, CameraSpace
 from dataset_builder.scene.model import Assembly
+from dataset_builder.scene.raycast import RayCaster
 from dataset_builder.scene.shapes.point_sets import SurfaceSampler
-from dataset_builder.scene.shapes.solids import merge_meshes
+from dataset_builder.scene.shapes.solids import merge_meshes, world_mesh
 from dataset_builder.specs.config_specs import (
     ConfigSpec,
     FocalRigSpec,
@@ -44,6 +45,7 @@ from dataset_builder.user_files.cage_file import cage_file_spec, load_cage
 from dataset_builder.user_files.make_assembly import make_assembly
 from rebar_depth_bench.base.errors import InputError, MeshError
 from rebar_depth_bench.geometry.cameras import camera_centre, ideal_K, inverse_rigid
+from rebar_depth_bench.scoring.protocol import scored_pixels
 from tests.builder.cameras.survey_cages import (
     bar_table,
     column,
@@ -289,8 +291,10 @@ def views(cages: Mapping[str, Assembly]) -> Mapping[str, RandomViewsSpec]:
     return {name: randomly_placed(SPEC, cage) for name, cage in cages.items()}
 
 
-def randomly_placed(spec: RandomViewsSpec, cage: Assembly, space: CameraSpace = SPACE) -> RandomViewsSpec:
-    return with_random_stations(spec, cage, space, RIG, "cage")
+def randomly_placed(
+    spec: RandomViewsSpec, cage: Assembly, space: CameraSpace = SPACE, rig: RigSpec = RIG
+) -> RandomViewsSpec:
+    return with_random_stations(spec, cage, space, rig, "cage")
 
 
 def steel(assembly: Assembly) -> trimesh.Trimesh:
@@ -339,6 +343,38 @@ def test_distances_aims_and_rolls_vary(views: Mapping[str, RandomViewsSpec]) -> 
     assert max(distances_m) > 3
     offsets = [camera_offsets_m(spec, np.ones(3), ()) for spec in views.values()]
     assert np.allclose(np.concatenate(offsets) + 1, [centre for centre, _, _ in stations])
+
+
+def scored_counts(assembly: Assembly, views: SurveySpec | RandomViewsSpec, rig: RigSpec) -> list[int]:
+    """Cast all rays of the left images of views, as a build does, and count their scored pixels."""
+    caster = RayCaster(
+        world_mesh([part.mesh for part in assembly.parts], [part.bar_id for part in assembly.parts])
+    )
+    eyes = [caster.cast(rig_cameras(rig, pose)["left"]) for pose in poses(views, np.zeros(3), rig)]
+    return [len(scored_pixels(eye.mask, eye.depth_m)) for eye in eyes]
+
+
+def test_random_views_have_scored_pixels_in_small_images(cages: Mapping[str, Assembly]) -> None:
+    rig = replace(RIG, width=96, height=54)
+    large, small = [], []
+    for cage in cages.values():
+        drawn = [randomly_placed(replace(SPEC, views=12), cage, rig=size) for size in (RIG, rig)]
+        large += scored_counts(cage, drawn[0], rig)
+        small += scored_counts(cage, drawn[1], rig)
+    assert min(small) > 0
+    assert large.count(0) > 5  # Such views are drawn again.
+    with pytest.raises(InputError, match=r"none of .* random views .* has a scored pixel"):
+        randomly_placed(SPEC, next(iter(cages.values())), rig=replace(RIG, width=3, height=3))
+
+
+@pytest.mark.parametrize("diameter_mm", [5, 1])
+def test_survey_of_thin_bars_prefers_views_with_scored_pixels(tmp_path: Path, diameter_mm: float) -> None:
+    bars = [bar_table(diameter_mm, [(-1000, y, 50), (1000, y, 50)]) for y in (-300, 0, 300)]
+    keys = "distances = [500, 1500]\nviews_per_distance = 10"
+    placed = place(tmp_path, scene(bars, keys))
+    assert view_count(placed.survey) == 20
+    scored = scored_counts(placed.assembly, placed.survey, placed.config.rig)
+    assert (min(scored) > 0) == (diameter_mm == 5)
 
 
 def test_cage_without_space_for_cameras_is_refused(cages: Mapping[str, Assembly]) -> None:

@@ -35,7 +35,7 @@ from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
 from dataset_builder.scene.variants.registry import LIGHT_SLOT, PROPS_SLOT, VARIANTS
 from dataset_builder.specs.config_specs import DomeSpec, LatticeSpec, RingSpec, SurveySpec
 from dataset_builder.specs.file_specs import CageFileSpec, MeshFileSpec
-from dataset_builder.user_files.cage_file import cage_file_spec, load_cage
+from dataset_builder.user_files.cage_file import cage_file_spec, load_cage, read_cage
 from dataset_builder.user_files.make_assembly import make_assembly
 from dataset_builder.user_files.scene_schema import read_scene_toml
 from rebar_depth_bench.base.errors import InputError, MeshError
@@ -113,6 +113,30 @@ points = [[0, 200, 20], [300, 200, 20], [300, 400, 20]]
     assert np.ptp(assembly.parts[1].mesh.vertices_m[:, 2]) == pytest.approx(0.297, abs=1e-12)
 
 
+def test_rows_are_equal_to_bars_in_tables_of_their_own(tmp_path: Path) -> None:
+    def table(y: float, keys: str) -> str:
+        return f'[[bar]]\ndiameter = 1\npoints = [[0, {y}, 5], [20, {y}, 5], [20, {y}, 20]]\nrole = "a"\n{keys}\n'
+
+    unit = 'unit = "cm"\n'
+    row = load_cage_text(
+        tmp_path, unit + table(0, "count = 4\nstep = [0, 15.1, 0]\nid = 7") + table(90, "count = 1")
+    )
+    tables = [
+        table(0, "id = 7"),
+        table(15.1, "id = 8"),
+        table(30.2, "id = 9"),
+        table(45.3, "id = 10"),
+        table(90, ""),
+    ]
+    assert row.bars == load_cage_text(tmp_path, unit + "".join(tables)).bars
+    assert [bar.bar_id for bar in row.bars] == [7, 8, 9, 10, 1]
+    split = table(0, "count = 3\nstep = [0, 30, 0]") + table(5, "id = 2")
+    cage = read_cage(cage_file_spec(write_scene(tmp_path, unit + split)))
+    assert [(bar.bar.bar_id, bar.source) for bar in cage.bars] == [
+        (1, "bar 1"), (3, "bar 1"), (4, "bar 1"), (2, "bar 2")
+    ]  # fmt: skip
+
+
 @given(
     unit=st.sampled_from([("m", 1.0), ("cm", 0.01), ("mm", 0.001), ("in", 0.0254), ("ft", 0.3048)]),
     scale=st.floats(0.5, 2.0),
@@ -121,7 +145,7 @@ def test_unit_only_scales_geometry(unit: tuple[str, float], scale: float) -> Non
     name, metres = unit
     length, diameter = 0.2 * scale / metres, 0.01 * scale / metres
     bar = f"[[bar]]\ndiameter = {diameter!r}\npoints = [[0, 0, {diameter!r}], [{length!r}, 0, {diameter!r}]]\n"
-    [parsed_bar] = read_scene_toml(f'unit = "{name}"\n{bar}'.encode(), "a").bars
+    [parsed_bar] = read_scene_toml(f'unit = "{name}"\n{bar}'.encode(), "a").bar
     assert parsed_bar.diameter_m == pytest.approx(0.01 * scale, abs=1e-12)
     assert parsed_bar.corners_m[1] == pytest.approx((0.2 * scale, 0.0, 0.01 * scale), abs=1e-12)
 
@@ -141,7 +165,7 @@ def test_default_dome_scales_with_steel_extent(tmp_path: Path) -> None:
 
 
 @settings(max_examples=15)
-@given(length=st.floats(3.0, 2500.0), across=st.floats(0.0, 2000.0))
+@given(length=st.floats(3.0, 340.0), across=st.floats(0.0, 190.0))
 def test_default_dome_fits_any_cage(
     length: float, across: float, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
@@ -149,7 +173,18 @@ def test_default_dome_fits_any_cage(
     content = f"{MM}[[bar]]\ndiameter = 10\nribs = false\npoints = {points}\n"
     config = scene_config(write_scene(tmp_path_factory.mktemp("dome"), content))
     check_fits(make_assembly(config.scene.assembly), config)
+    assert isinstance(config.protocol, DomeSpec)
     assert view_count(config.protocol) == 504
+
+
+@pytest.mark.slow
+def test_default_is_a_survey_where_a_dome_would_exceed_one_metre(tmp_path: Path) -> None:
+    for half_mm, kind in ((203, DomeSpec), (206, SurveySpec)):
+        config = scene_config(write_scene(tmp_path, MM + BAR.replace("100", str(half_mm))))
+        assert isinstance(config.protocol, kind)
+    assert (view_count(config.protocol), config.scene.environment) == (504, "outdoors")
+    bench = 'environment = "laboratory"\n' + MM + BAR.replace("100", "206")
+    assert isinstance(scene_config(write_scene(tmp_path, bench)).protocol, DomeSpec)
 
 
 def test_cameras_board_and_environment_are_applied(tmp_path: Path) -> None:

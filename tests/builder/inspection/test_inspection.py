@@ -1,4 +1,4 @@
-"""The command ``rebar-build inspect``: its table, files and picture, and the overlaps of bars."""
+"""The command ``rebar-build inspect``: its table, files and picture, and bars that meet."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from dataset_builder.cli.main import main
 from dataset_builder.inspection import summary as summary_module
 from dataset_builder.inspection.picture import _draw_scale_bar, font, inspection_picture
 from dataset_builder.inspection.report import inspection_json, print_inspection
-from dataset_builder.inspection.summary import MIN_OVERLAP_M, bar_box_m, inspect_cage, overlaps
+from dataset_builder.inspection.summary import CONTACT, CONTACT_M, bar_box_m, inspect_cage, meetings
 from dataset_builder.pipeline.plan import MAX_NOTES, print_notes
 from dataset_builder.scene.assemblies.bar_meshes import bar_mesh
 from dataset_builder.scene.assemblies.cage import Cage, CageBar, LeftOut
@@ -60,7 +60,7 @@ def test_json_lists_every_bar(tmp_path: Path) -> None:
         assert picture.format == "PNG"
         assert picture.width >= 1600
     mass_kg = sum(math.pi / 4 * bar["diameter_m"] ** 2 * bar["length_m"] * 7850 for bar in values["bars"])
-    assert f"{mass_kg:.1f}" in completed.stdout.splitlines()[-9]
+    assert f"{mass_kg:.1f}" in completed.stdout.splitlines()[-10]
 
 
 def test_mesh_file_has_fitted_and_unknown_axes(tmp_path: Path) -> None:
@@ -150,7 +150,7 @@ def test_long_lists_are_cut_and_counted() -> None:
     assert "and 60 more groups of 60 bars" in text
     assert "left out: 50 objects" in text
     assert "and 30 more" in text
-    assert "overlaps: 99 pairs" in text
+    assert "clashes: 99 pairs" in text
     assert "and 89 more" in text
 
 
@@ -220,7 +220,7 @@ def rod(bar_id: int, start: tuple[float, ...], end: tuple[float, ...], diameter_
 
 
 @pytest.mark.slow
-def test_overlaps_are_those_of_sampled_axes() -> None:
+def test_clashes_are_those_of_sampled_axes() -> None:
     random = np.random.default_rng(3)
     bars = [
         Bar(number, "bar", float(random.uniform(0.02, 0.06)), axis_of(random.uniform(0, 1, (4, 3))))
@@ -235,31 +235,43 @@ def test_overlaps_are_those_of_sampled_axes() -> None:
         tree = cKDTree(samples_m[index])
         for b, points_m in zip(bars[index + 1 :], samples_m[index + 1 :], strict=True):
             depth_m = (a.diameter_m + b.diameter_m) / 2 - tree.query(points_m, distance_upper_bound=0.1)[0].min()
-            if depth_m > MIN_OVERLAP_M:
+            if depth_m > CONTACT * (a.diameter_m + b.diameter_m) / 2 + CONTACT_M:
                 expected[a.bar_id, b.bar_id] = depth_m
-    found = {(pair.bar_a, pair.bar_b): pair.depth_m for pair in overlaps(bars)}
+    _, clashes = meetings(bars)
+    found = {(pair.bar_a, pair.bar_b): pair.depth_m for pair in clashes}
     assert len(expected) > 20
     assert expected.keys() <= found.keys()
     for pair, depth_m in found.items():
-        sampled_m = expected.get(pair, MIN_OVERLAP_M)
+        diameters_m = [bars[bar_id - 1].diameter_m for bar_id in pair]
+        sampled_m = expected.get(pair, CONTACT * np.mean(diameters_m) + CONTACT_M)
         assert sampled_m - 1e-9 <= depth_m <= sampled_m + 1.5e-3  # Samples are up to 1.7 mm apart.
     assert list(found.values()) == sorted(found.values(), reverse=True)
 
 
-def test_bars_that_touch_do_not_overlap() -> None:
-    long, across = rod(1, (-2, 0, 0), (2, 0, 0)), rod(2, (0, -2, 0.012), (0, 2, 0.012))
-    assert overlaps([long, across]) == []
-    (pair,) = overlaps([long, rod(2, (0, -2, 0.011), (0, 2, 0.011))])
-    assert (pair.bar_a, pair.bar_b, round(pair.depth_m, 9)) == (1, 2, 0.001)
-    np.testing.assert_allclose(pair.point_m, (0, 0, 0.0055), atol=1e-9)
+@pytest.mark.parametrize(
+    ("height_mm", "contacts", "clashes"), [(13.8, 0, 0), (13.6, 1, 0), (12, 1, 0), (10.4, 1, 0), (10.2, 0, 1)]
+)
+def test_bars_in_contact_are_apart_from_clashes(height_mm: float, contacts: int, clashes: int) -> None:
+    """Bars of 12 mm are in contact up to a gap and an overlap of 1.7 mm."""
+    z_m = height_mm / 1000
+    inspection = inspect_cage(bars_of(rod(1, (-2, 0, 0), (2, 0, 0)), rod(2, (0, -2, z_m), (0, 2, z_m))), "a")
+    values = json.loads(inspection_json(inspection))
+    assert (len(values["contacts"]), len(values["clashes"])) == (contacts, clashes)
+    for pair in values["contacts"] + values["clashes"]:
+        assert (pair["bar_a"], pair["bar_b"]) == (1, 2)
+        assert pair["depth_m"] == pytest.approx(0.012 - z_m, abs=1e-9)
+        np.testing.assert_allclose(pair["point_m"], (0, 0, z_m / 2), atol=1e-9)
+    text = printed(inspection.cage)
+    assert f"in contact: {contacts} pair" in text
+    assert f"clashes: {clashes} pair" in text
 
 
-def test_bars_without_axis_and_single_bars_have_no_overlaps() -> None:
-    assert overlaps([rod(1, (0, 0, 0), (1, 0, 0)), Bar.without_axis(2, "imported")]) == []
+def test_bars_without_axis_and_single_bars_meet_no_others() -> None:
+    assert meetings([rod(1, (0, 0, 0), (1, 0, 0)), Bar.without_axis(2, "imported")]) == ([], [])
 
 
 def test_too_many_neighbours_are_not_compared(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(summary_module, "MAX_PAIRS", 1000)
     crowd = [rod(number, (0, 0, 0), (0.05, 0, 0)) for number in range(1, 100)]
     with pytest.raises(TooManyNeighboursError):
-        overlaps(crowd)
+        meetings(crowd)

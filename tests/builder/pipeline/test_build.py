@@ -65,6 +65,17 @@ def whole_without_colour(tmp_path_factory: pytest.TempPathFactory, run_build: Ru
     return root
 
 
+def test_views_without_scored_pixels_are_named(tmp_path: Path, run_build: RunBuild) -> None:
+    size = ("--width", "24", "--height", "16", "--no-colour")
+    process = run_build("--out", tmp_path, "--scene", TWO_BARS, "--views", "12", *size)
+    assert process.returncode == 0, process.stderr
+    [config] = open_folder(tmp_path).config_by_name.values()
+    empty = [view.view_id for view in config.views if view.scored_px == 0]
+    assert len(empty) > 10
+    note = f"{len(empty)} of 12 views have no scored pixel: {', '.join(empty[:10])}, ..."
+    assert f"note: {config.name}: {note}\n" in process.stderr
+
+
 @pytest.mark.parametrize(
     ("options", "whole"),
     [(SMALL, "small_root"), (WITHOUT_COLOUR, "whole_without_colour")],

@@ -137,8 +137,8 @@ def test_parts_of_a_mesh_are_selected_by_name_and_box(tmp_path: Path) -> None:
         cage = scene_cage(write_scene(tmp_path, f"{keys}[[select]]\n{table}\n"))
         assert [(bar.bar.bar_id, bar.source) for bar in cage.bars] == [(1, "Rod 1")]
         assert [record.source for record in cage.left_out] == ["Rod 0"]
-    with pytest.raises(MeshError, match=r"no part is selected.*2 parts, such as Rod 0"):
-        scene_cage(write_scene(tmp_path, f"{keys}[[select]]\nname = 'x'\n"))
+    with pytest.raises(MeshError, match=r"no part is selected.*2 parts; nearest to name rod-1\*: Rod 1, Rod 0$"):
+        scene_cage(write_scene(tmp_path, f"{keys}[[select]]\nname = 'rod-1*'\n"))
 
 
 def test_mesh_file_alone_keeps_its_coordinates(tmp_path: Path) -> None:
@@ -319,10 +319,25 @@ def test_box_takes_the_objects_that_are_wholly_inside(model: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("tables", ["[[select]]\nname = 'x'", "[[select]]\nclass = 'IfcDoor'"])
-def test_selection_of_nothing_names_what_there_is(model: Path, tables: str) -> None:
-    with pytest.raises(MeshError, match=rf"no object is selected.*{BOTH} IfcReinforcingBar.*1 IfcWall"):
-        cage_with(model, tables)
+@pytest.mark.parametrize(
+    ("tables", "nearest"),
+    [
+        ("name = 'Bar 25'\nhost = 'w 1'", "; nearest to host w 1: W-1"),
+        (
+            "class = 'IfcBuildingElementProxi'",
+            "; nearest to class IfcBuildingElementProxi: IfcBuildingElementProxy",
+        ),
+        (
+            "storey = '2'\n[[select]]\nstorey = 'Level'",
+            "; nearest to storey 2: .*; nearest to storey Level: Level 1",
+        ),
+        ("name = 'Bar 25'\nstorey = 'EG*'", "$"),
+    ],
+)
+def test_selection_of_nothing_names_what_there_is(model: Path, tables: str, nearest: str) -> None:
+    words = rf"no object is selected.*{BOTH} IfcReinforcingBar.*1 IfcWall[^;]*{nearest}"
+    with pytest.raises(MeshError, match=words):
+        cage_with(model, f"[[select]]\n{tables}")
 
 
 @pytest.mark.slow

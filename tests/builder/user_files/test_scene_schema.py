@@ -20,6 +20,7 @@ from dataset_builder.user_files.scene_schema import read_scene_toml
 from rebar_depth_bench.base.errors import InputError, MeshError
 from tests.builder.catalog.scene_files import BAR, MM, write_scene
 
+ROW = "count = 3\nstep = [0, 50, 0]\n"
 SURVEY = "[cameras]\nkind = 'survey'\n"
 RING = "[cameras]\nkind = 'ring'\n"
 DOME = "[cameras]\nkind = 'dome'\n"
@@ -53,6 +54,8 @@ INVALID_SCENES = [
     (MM + "cameras = 3\n" + BAR, "invalid cameras"),
     (MM + "[[bar]]\n", "missing bar 1: diameter, missing bar 1: points"),
     (MM + BAR + "id = 5\n" + BAR + "id = 5\n", "duplicate bar 2: id"),
+    (MM + BAR + "id = 5\n" + BAR + ROW + "id = 3\n", "duplicate bar 2: id"),
+    (MM + (BAR + ROW.replace("3", "40000")) * 2, "conflict bar 2"),
     ("unit = ", "syntax"),
     ("x = " + "[" * 5000, "size"),
     ("x = " + "9" * 5000, "syntax"),
@@ -120,6 +123,14 @@ INVALID_BAR_KEYS = [
     (f"role = '{'x' * 61}'", "invalid bar 1: role"),
     ("bend_diameter = 9", "conflict bar 1: bend_diameter"),
     ("bend_diameter = -4", "invalid bar 1: bend_diameter"),
+    ("count = 0\nstep = [0, 50, 0]", "invalid bar 1: count"),
+    ("count = 2.0\nstep = [0, 50, 0]", "invalid bar 1: count"),
+    ("count = 65536\nstep = [0, 50, 0]", "invalid bar 1: count"),
+    ("count = 2", "missing bar 1: step"),
+    ("step = [0, 50, 0]", "missing bar 1: count"),
+    ("count = 2\nstep = [0, 0, 0]", "invalid bar 1: step"),
+    ("count = 2\nstep = [0, 50]", "invalid bar 1: step"),
+    ("count = 2\nstep = [0, 50, 0]\nid = 65535", "conflict bar 1: id"),
 ]
 INVALID_DIAMETERS = ("0", "nan", "inf", "'10'", "true", "1" + "0" * 400, "2020-01-01")
 INVALID_POINTS = ("[100, 0]", "[100, 0, nan]", "[100, 0, '5']", "7", "[1e300, 0, 5]")
@@ -189,14 +200,15 @@ def test_documented_example_is_valid() -> None:
     scene = read_scene_toml(example.encode(), "example")
     assert (scene.name, scene.board, scene.cameras) == ("my-beam", 6, DomeSpec((0.3, 0.4), (15.0, 45.0), 12))
     corners_m = ((-0.15, 0.0, 0.005), (0.15, 0.0, 0.005), (0.15, 0.0, 0.08))
-    [bar] = scene.bars
+    [bar] = scene.bar
+    assert (bar.count, bar.step_m) == (4, (0.0, 0.05, 0.0))
     assert (bar.bar_id, bar.role, bar.diameter_m, bar.mandrel_m, bar.ribs) == (7, "main", 0.01, 0.04, True)
     assert bar.corners_m == corners_m
 
 
 def test_survey_has_defaults_in_metres_and_distances_in_the_unit() -> None:
     for unit, keys, expected in (
-        ("mm", "", SurveySpec((0.5, 1.0, 2.0, 4.0), 126, 0)),
+        ("mm", "", SurveySpec((0.5, 0.75, 1.0, 1.5), 126, 0)),
         ("ft", "", SurveySpec()),
         ("ft", "distances = [5, 10]\n", SurveySpec((1.524, 3.048))),
         ("mm", "views_per_distance = 2500\nseed = 7\n", SurveySpec(views_per_distance=2500, seed=7)),
