@@ -1,20 +1,25 @@
 """Deviations of a built cage from its design: bars displaced, tilted, bowed, left out or doubled. Metres.
 
-The tolerances are those of common execution rules: cover -10 mm and more inwards (EN 13670:2009, 10.6, from a
-secondary source), and ours for spacing, tilt and bow. A deviation is taken only if the bar stays clear of all
-others; otherwise a smaller one is tried. Bars that rest on others or are tied into a mat (``held_along``) deviate
-within the plane of the mat, so that they do not hover.
+A deviation of a bar is taken only if the bar stays clear of all others and above the ground; otherwise a smaller
+one is tried. Bars that rest on others or are tied into a mat (``held_along``) deviate within the plane of the mat,
+so that they do not hover. All steel then follows its ``Mat`` through the thickness of the member: one smooth
+displacement of offset, tilt, and sag between supports, which keeps the distances of bars that lie on each other.
+
+Tolerances of the cover are those of EN 13670:2009, 10.6, as The Concrete Society gives them (concrete.org.uk,
+fingertips, "Maximum cover to steel reinforcement", a secondary source); those of spacing, tilt and bow are ours.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.scene.cages.design import Design, DesignBar, InfeasibleError, Z
+from dataset_builder.scene.cages.design import LEAST_COVER_M, Design, DesignBar, InfeasibleError, Mat, Z
 from dataset_builder.scene.cages.rules import contact_m
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
 from dataset_builder.scene.shapes.capsules import Clearances
@@ -37,8 +42,28 @@ BOW_TOLERANCE = 1 / 250
 MIN_CLEAR_M = 1e-4
 """Least clear distance of two bars as built."""
 
-_NEEDED_M = MIN_CLEAR_M + 1e-8
-"""Clear distance that is checked; axes are rounded to the nanometre afterwards."""
+PLUS_TOLERANCES_M = {1: (0.010, 0.015, 0.025), 2: (0.005, 0.010, 0.020)}
+"""Largest excess of the cover by tolerance class, for members of ``SIZES_M``; linear in between."""
+
+SIZES_M = (0.150, 0.400, 2.500)
+
+FOUNDATION_M = 0.015
+"""By how much the cover of a foundation may exceed the nominal one further."""
+
+MINUS_TOLERANCE_M = 0.010
+"""Largest deficit of the cover: the allowance for deviations of the nominal cover (EN 1992-1-1, 4.4.1.3)."""
+
+BEYOND, _BEYOND_SHARES, _WITHIN_SHARES = 0.1, (1.05, 1.5), (0.1, 1.0)
+"""Probability that a mat is beyond its tolerance, and ranges of its largest deviation in tolerances."""
+
+_SQUEEZE = 0.2
+"""Largest approach of a mat to the opposite one, per distance of both: ties and chairs keep their shape."""
+
+_SAG_CURVATURE = 0.06
+"""Largest curvature of a sagging mat, 1/m: 3 mm in 0.7 m, and 0.1 mm in ``_RING_SPACING_M``."""
+
+_NEEDED_M = MIN_CLEAR_M + 1e-4
+"""Clear distance that is checked before the mats deviate, which may reduce it a little."""
 
 _SHARES = ((1.0, 1.0), (0.5, 1.0), (0.25, 1.0), (0.1, 1.0), (0.1, 0.3), (0.0, 1.0), (0.0, 0.3))
 """Shares that are tried of the drawn deviation, and of its part along the direction of the spacing."""
@@ -66,10 +91,14 @@ class BuiltBar:
 
 @dataclass(frozen=True, eq=False)
 class BuiltCage:
-    """Bars as built, bars of the design that were left out, and the numbers of refused deviations."""
+    """Bars as built, bars of the design that were left out, and the numbers of refused deviations.
+
+    ``mats`` are records of the deviations of mats, as JSON values.
+    """
 
     bars: tuple[BuiltBar, ...]
     left_out: tuple[DesignBar, ...]
+    mats: tuple[dict[str, Any], ...]
     doubled: int
     deviations_reduced: int
     deviations_refused: int
@@ -77,6 +106,10 @@ class BuiltCage:
 
 def build_as(design: Design, rng: np.random.Generator) -> BuiltCage:
     """Return the cage as it is built. Raises ``InfeasibleError`` if bars of the design touch each other."""
+    mats = _drawn_mats(design, rng)
+    lowest_m = min(lowest_steel_m(bar.line_m, bar.diameter_m) for bar in design.bars)
+    fall_m = max((abs(mat.mat.outward[2]) * mat.most_m for mat in mats), default=0.0)
+    least_z = lowest_m - max(0.0, design.ground_m - LEAST_COVER_M - fall_m)
     bars, left_out = _some_left_out(design.bars, rng)
     clearances = Clearances([bar.line_m for bar in bars], [outer_radius_m(bar.diameter_m) for bar in bars])
     if not clearances.are_all(_NEEDED_M):
@@ -89,7 +122,8 @@ def build_as(design: Design, rng: np.random.Generator) -> BuiltCage:
         near = clearances.neighbours(bar.line_m, radius, index, deviation.most_m)
         for share, spacing_share in _SHARES:
             line_m = deviation.applied(share, spacing_share)
-            if near.bar_clearance_m(line_m, radius) >= _NEEDED_M:
+            is_above = lowest_steel_m(line_m, bar.diameter_m) > least_z - 1e-9
+            if is_above and near.bar_clearance_m(line_m, radius) >= _NEEDED_M:
                 lines[index] = line_m
                 clearances.replace(index, line_m)
                 reduced += (share, spacing_share) != _SHARES[0]
@@ -100,7 +134,115 @@ def build_as(design: Design, rng: np.random.Generator) -> BuiltCage:
         BuiltBar(bar.role, bar.diameter_m, line_m, bar.line_m) for bar, line_m in zip(bars, lines, strict=True)
     ]
     doubles = _doubled(built, clearances, rng)
-    return BuiltCage((*built, *doubles), tuple(left_out), len(doubles), reduced, refused)
+    moved = [_with_mats(bar, mats, lowest_m if design.stands else -np.inf) for bar in (*built, *doubles)]
+    radii_m = [outer_radius_m(bar.diameter_m) for bar in moved]
+    if not Clearances([bar.line_m for bar in moved], radii_m).are_all(MIN_CLEAR_M + 1e-8):
+        raise InfeasibleError("bars touch each other as their mats deviate")
+    records = tuple(mat.record for mat in mats)
+    return BuiltCage(tuple(moved), tuple(left_out), records, len(doubles), reduced, refused)
+
+
+def lowest_steel_m(line_m: Float64[ndarray, "n 3"], diameter_m: float) -> float:
+    """Return the height of the lowest point of a bar's surface, whose ends are flat discs."""
+    tangents = np.gradient(line_m, axis=0)
+    level = np.linalg.norm(tangents[:, :2], axis=1) / np.linalg.norm(tangents, axis=1)
+    return float((line_m[:, 2] - outer_radius_m(diameter_m) * level).min())
+
+
+@dataclass(frozen=True, eq=False)
+class _MatDeviation:
+    """Drawn deviation of a mat as excess of its cover: offset, slopes along its axes, and sag; and its record."""
+
+    mat: Mat
+    offset_m: float
+    slopes: Float64[ndarray, " k"]
+    sag_m: float
+    record: dict[str, Any]
+
+    @property
+    def most_m(self) -> float:
+        """Largest displacement."""
+        return float(np.abs(self.record["deviation_m"]).max())
+
+    def displacement_m(self, points_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 3"]:
+        """Return the displacements of steel at these points of the design."""
+        excess_m = self.offset_m + _slope_and_sag_m(self.mat, self.slopes, self.sag_m, points_m)
+        return np.asarray(-(self.mat.weights(points_m) * excess_m)[:, None] * np.array(self.mat.outward))
+
+
+def _slope_and_sag_m(
+    mat: Mat, slopes: Float64[ndarray, " k"], sag_m: float, points_m: Float64[ndarray, "n 3"]
+) -> Float64[ndarray, " n"]:
+    """Return the excess of the cover without offset: a mat sags by 0 at its supports and ``sag_m`` amid them."""
+    along_m = points_m @ np.array(mat.axes).T
+    excess_m = along_m @ slopes
+    for at_m, places_m in zip(along_m.T, mat.supports_m, strict=False):
+        turns = np.interp(at_m, places_m, np.arange(len(places_m)))
+        excess_m = excess_m + sag_m / len(mat.axes) * (1 - np.cos(2 * np.pi * turns)) / 2
+    return np.asarray(excess_m)
+
+
+def _drawn_mats(design: Design, rng: np.random.Generator) -> list[_MatDeviation]:
+    """Return the deviations of all mats, by one tolerance class."""
+    tolerance_class = int(rng.integers(1, 3))
+    points_m = np.concatenate([_divided(bar.line_m) for bar in design.bars])
+    return [_drawn_mat(mat, points_m[mat.weights(points_m) == 1], tolerance_class, rng) for mat in design.mats]
+
+
+def _drawn_mat(
+    mat: Mat, points_m: Float64[ndarray, "n 3"], tolerance_class: int, rng: np.random.Generator
+) -> _MatDeviation:
+    """Return the deviation of a mat with steel at these points.
+
+    Its largest excess or deficit of cover is a drawn share of the tolerance, below or above 1. A share above 1 is
+    drawn only at a side where the mat has room for it.
+    """
+    minus_m = MINUS_TOLERANCE_M
+    plus_m = float(np.interp(mat.thickness_m, SIZES_M, PLUS_TOLERANCES_M[tolerance_class]))
+    plus_m += FOUNDATION_M if mat.is_foundation else 0.0
+    room_m = np.array([np.inf, mat.cover_m - LEAST_COVER_M - 0.001])
+    if mat.between_m is not None:
+        room_m[0] = _SQUEEZE * (mat.between_m[1] - mat.between_m[0])
+    if not mat.supports_m:  # Less cover at one face is more at the other.
+        plus_m = minus_m = min(plus_m, minus_m)
+        room_m[0] = room_m[1]
+    tolerances_m = np.array([plus_m, minus_m])
+    is_beyond = bool(rng.random() < BEYOND)
+    side, share = int(rng.integers(2)), rng.uniform(*_WITHIN_SHARES)
+    if is_beyond:
+        least, most = _BEYOND_SHARES
+        wide = np.flatnonzero(room_m > least * tolerances_m).tolist()
+        side = wide[side % len(wide)]
+        share = rng.uniform(least, min(most, float(room_m[side] / tolerances_m[side])))
+    limits_m = np.minimum(share * tolerances_m, room_m)
+    between_m = float(limits_m.sum())
+    slopes = rng.uniform(-0.5, 0.5, len(mat.axes)) * between_m / np.ptp(points_m @ np.array(mat.axes).T, axis=0)
+    sag_m = 0.0
+    if mat.supports_m:
+        pitch_m = min(float(np.diff(places_m).min()) for places_m in mat.supports_m)
+        upwards = 1.0 if mat.outward[2] > 0 else -1.0  # Sagging away from the upper face; else towards the face.
+        sag_m = upwards * rng.random() * _SAG_CURVATURE * (pitch_m / np.pi) ** 2
+    excess_m = _slope_and_sag_m(mat, slopes, sag_m, points_m)
+    scale = min(1.0, between_m / float(np.ptp(excess_m)))
+    excess_m = scale * excess_m
+    offset_m = float(limits_m[0] - excess_m.max() if side == 0 else -limits_m[1] - excess_m.min())
+    record = {
+        "name": mat.name,
+        "deviation_m": [round(offset_m + float(end), 9) for end in (excess_m.min(), excess_m.max())],
+        "tolerance_m": [-round(minus_m, 9), round(plus_m, 9)],
+        "class": tolerance_class,
+        "beyond": is_beyond,
+    }
+    return _MatDeviation(mat, offset_m, scale * slopes, scale * sag_m, record)
+
+
+def _with_mats(bar: BuiltBar, mats: Sequence[_MatDeviation], least_z: float) -> BuiltBar:
+    """Return a bar displaced with the mats; one that would reach below ``least_z`` is raised to it."""
+    line_m = _divided(bar.line_m) if any(mat.mat.supports_m for mat in mats) else bar.line_m
+    for displacement_m in [mat.displacement_m(line_m) for mat in mats]:
+        line_m = line_m + displacement_m
+    line_m[:, 2] += max(0.0, least_z - lowest_steel_m(line_m, bar.diameter_m))
+    return replace(bar, line_m=line_m)
 
 
 def _some_left_out(
@@ -143,6 +285,7 @@ class _Deviation:
     """Drawn deviation of a bar: displacement, along the spacing and otherwise, tilt (rotation vector), and bow."""
 
     line_m: Float64[ndarray, "n 3"]
+    diameter_m: float
     spacing_m: Float64[ndarray, " 3"]
     shift_m: Float64[ndarray, " 3"]
     tilt_rad: Float64[ndarray, " 3"]
@@ -157,7 +300,7 @@ class _Deviation:
 
     def applied(self, share: float, spacing_share: float) -> Float64[ndarray, "k 3"]:
         """Return the axis with these shares of the deviation."""
-        line_m = _with_rings(self.line_m) if self.bow_m.any() else self.line_m
+        line_m = _divided(self.line_m, 4) if self.bow_m.any() else self.line_m
         middle_m = (line_m.min(axis=0) + line_m.max(axis=0)) / 2
         if self.stands:  # A bar that stands on the ground is tilted about its foot.
             middle_m = line_m[np.argmin(line_m[:, 2])]
@@ -167,7 +310,7 @@ class _Deviation:
             along = np.linspace(0.0, np.pi, len(line_m))[:, None]
             moved = moved + share * np.sin(along) * self.bow_m
         if self.stands:
-            moved[:, 2] += line_m[:, 2].min() - moved[:, 2].min()
+            moved[:, 2] += line_m[:, 2].min() - lowest_steel_m(moved, self.diameter_m)
         return np.asarray(moved)
 
 
@@ -192,7 +335,7 @@ def _drawn_deviation(bar: DesignBar, rng: np.random.Generator, *, stands: bool) 
     if len(line_m) == 2 and length_m > _BOWED_FROM * bar.diameter_m:
         side = np.cross(line_m[1] - line_m[0], side)
         bow_m = side / np.linalg.norm(side) * rng.uniform(-BOW_TOLERANCE, BOW_TOLERANCE) * length_m
-    return _Deviation(line_m, spacing_m, shift_m, tilt_rad, bow_m, is_standing)
+    return _Deviation(line_m, bar.diameter_m, spacing_m, shift_m, tilt_rad, bow_m, is_standing)
 
 
 def _within_ball(rng: np.random.Generator) -> Float64[ndarray, " 3"]:
@@ -211,7 +354,10 @@ def _rotation(vector_rad: Float64[ndarray, " 3"]) -> Float64[ndarray, "3 3"]:
     return np.asarray(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross))
 
 
-def _with_rings(line_m: Float64[ndarray, "2 3"]) -> Float64[ndarray, "k 3"]:
-    """Return a straight line with points at most ``_RING_SPACING_M`` apart."""
-    count = max(4, int(np.ceil(np.linalg.norm(line_m[1] - line_m[0]) / _RING_SPACING_M)))
-    return np.asarray(line_m[0] + np.linspace(0, 1, count + 1)[:, None] * (line_m[1] - line_m[0]))
+def _divided(line_m: Float64[ndarray, "n 3"], least: int = 1) -> Float64[ndarray, "k 3"]:
+    """Return a line with points at most ``_RING_SPACING_M`` apart, with ``least`` pieces for each of its own."""
+    length_m = np.linalg.norm(np.diff(line_m, axis=0), axis=1)
+    pieces = np.maximum(least, np.ceil(length_m / _RING_SPACING_M - 1e-9)).astype(int)
+    at = [n + np.arange(count) / count for n, count in enumerate(pieces.tolist())]
+    places = np.concatenate([*at, [len(pieces)]])
+    return np.stack([np.interp(places, np.arange(len(line_m)), column) for column in line_m.T], axis=1)
