@@ -62,7 +62,7 @@ _SQUEEZE = 0.2
 _SAG_CURVATURE = 0.06
 """Largest curvature of a sagging mat, 1/m: 3 mm in 0.7 m, and 0.1 mm in ``_RING_SPACING_M``."""
 
-_NEEDED_M = MIN_CLEAR_M + 1e-4
+_NEEDED_M = MIN_CLEAR_M + 1.5e-4
 """Clear distance that is checked before the mats deviate, which may reduce it a little."""
 
 _SHARES = ((1.0, 1.0), (0.5, 1.0), (0.25, 1.0), (0.1, 1.0), (0.1, 0.3), (0.0, 1.0), (0.0, 0.3))
@@ -122,7 +122,9 @@ def build_as(design: Design, rng: np.random.Generator) -> BuiltCage:
         near = clearances.neighbours(bar.line_m, radius, index, deviation.most_m)
         for share, spacing_share in _SHARES:
             line_m = deviation.applied(share, spacing_share)
-            is_above = lowest_steel_m(line_m, bar.diameter_m) > least_z - 1e-9
+            is_above = line_m[:, 2].min() - radius > least_z or (
+                lowest_steel_m(line_m, bar.diameter_m) > least_z - 1e-9
+            )
             if is_above and near.bar_clearance_m(line_m, radius) >= _NEEDED_M:
                 lines[index] = line_m
                 clearances.replace(index, line_m)
@@ -133,8 +135,8 @@ def build_as(design: Design, rng: np.random.Generator) -> BuiltCage:
     built = [
         BuiltBar(bar.role, bar.diameter_m, line_m, bar.line_m) for bar, line_m in zip(bars, lines, strict=True)
     ]
-    doubles = _doubled(built, clearances, rng)
-    moved = [_with_mats(bar, mats, lowest_m if design.stands else -np.inf) for bar in (*built, *doubles)]
+    doubles = _doubled(bars, built, clearances, rng)
+    moved = _with_mats([*built, *doubles], mats, lowest_m if design.stands else -np.inf)
     radii_m = [outer_radius_m(bar.diameter_m) for bar in moved]
     if not Clearances([bar.line_m for bar in moved], radii_m).are_all(MIN_CLEAR_M + 1e-8):
         raise InfeasibleError("bars touch each other as their mats deviate")
@@ -144,9 +146,9 @@ def build_as(design: Design, rng: np.random.Generator) -> BuiltCage:
 
 def lowest_steel_m(line_m: Float64[ndarray, "n 3"], diameter_m: float) -> float:
     """Return the height of the lowest point of a bar's surface, whose ends are flat discs."""
-    tangents = np.gradient(line_m, axis=0)
-    level = np.linalg.norm(tangents[:, :2], axis=1) / np.linalg.norm(tangents, axis=1)
-    return float((line_m[:, 2] - outer_radius_m(diameter_m) * level).min())
+    step_m, heights_m = np.diff(line_m, axis=0), line_m[:, 2]
+    level = np.hypot(step_m[:, 0], step_m[:, 1]) / np.linalg.norm(step_m, axis=1)
+    return float((np.minimum(heights_m[:-1], heights_m[1:]) - outer_radius_m(diameter_m) * level).min())
 
 
 @dataclass(frozen=True, eq=False)
@@ -236,13 +238,17 @@ def _drawn_mat(
     return _MatDeviation(mat, offset_m, scale * slopes, scale * sag_m, record)
 
 
-def _with_mats(bar: BuiltBar, mats: Sequence[_MatDeviation], least_z: float) -> BuiltBar:
-    """Return a bar displaced with the mats; one that would reach below ``least_z`` is raised to it."""
-    line_m = _divided(bar.line_m) if any(mat.mat.supports_m for mat in mats) else bar.line_m
-    for displacement_m in [mat.displacement_m(line_m) for mat in mats]:
-        line_m = line_m + displacement_m
-    line_m[:, 2] += max(0.0, least_z - lowest_steel_m(line_m, bar.diameter_m))
-    return replace(bar, line_m=line_m)
+def _with_mats(bars: Sequence[BuiltBar], mats: Sequence[_MatDeviation], least_z: float) -> list[BuiltBar]:
+    """Return bars displaced with the mats; those that would reach below ``least_z`` are raised to it."""
+    sags = any(mat.mat.supports_m for mat in mats)
+    lines_m = [_divided(bar.line_m) if sags else bar.line_m for bar in bars]
+    points_m = np.concatenate(lines_m)
+    points_m = points_m + sum(mat.displacement_m(points_m) for mat in mats)
+    moved_m = np.split(points_m, np.cumsum([len(line_m) for line_m in lines_m])[:-1])
+    for bar, line_m in zip(bars, moved_m, strict=True):
+        if line_m[:, 2].min() - outer_radius_m(bar.diameter_m) < least_z:
+            line_m[:, 2] += max(0.0, least_z - lowest_steel_m(line_m, bar.diameter_m))
+    return [replace(bar, line_m=line_m) for bar, line_m in zip(bars, moved_m, strict=True)]
 
 
 def _some_left_out(
@@ -256,22 +262,22 @@ def _some_left_out(
     return [bar for index, bar in enumerate(bars) if index != missing], [bars[missing]]
 
 
-def _doubled(built: list[BuiltBar], clearances: Clearances, rng: np.random.Generator) -> list[BuiltBar]:
+def _doubled(
+    bars: Sequence[DesignBar], built: Sequence[BuiltBar], clearances: Clearances, rng: np.random.Generator
+) -> list[BuiltBar]:
     """Return a straight bar that lies beside another one and is not in the design, or none."""
     if rng.random() >= _DOUBLED:
         return []
     straight = [
-        bar
-        for bar in built
-        if bar.nominal_m is not None
-        and len(bar.nominal_m) == 2
-        and np.linalg.norm(np.diff(bar.nominal_m, axis=0)) >= _DOUBLED_FROM_M
+        (bar, design.held_along)
+        for design, bar in zip(bars, built, strict=True)
+        if len(design.line_m) == 2 and np.linalg.norm(np.diff(design.line_m, axis=0)) >= _DOUBLED_FROM_M
     ]
     for _ in range(8 if straight else 0):
-        bar = straight[int(rng.integers(len(straight)))]
+        bar, held_along = straight[int(rng.integers(len(straight)))]
         along = bar.line_m[-1] - bar.line_m[0]
         is_level = abs(along[2]) < 0.5 * np.linalg.norm(along)  # It is laid beside another one, not below it.
-        side = np.array([0.0, 0.0, 1.0]) if is_level else rng.normal(size=3)
+        side = np.array(held_along or Z) if held_along or is_level else rng.normal(size=3)
         beside = np.cross(along, side) * rng.choice([-1.0, 1.0])
         distance_m = contact_m(bar.diameter_m, bar.diameter_m) + MIN_CLEAR_M
         line_m = bar.line_m + beside / np.linalg.norm(beside) * distance_m
@@ -356,8 +362,10 @@ def _rotation(vector_rad: Float64[ndarray, " 3"]) -> Float64[ndarray, "3 3"]:
 
 def _divided(line_m: Float64[ndarray, "n 3"], least: int = 1) -> Float64[ndarray, "k 3"]:
     """Return a line with points at most ``_RING_SPACING_M`` apart, with ``least`` pieces for each of its own."""
-    length_m = np.linalg.norm(np.diff(line_m, axis=0), axis=1)
-    pieces = np.maximum(least, np.ceil(length_m / _RING_SPACING_M - 1e-9)).astype(int)
-    at = [n + np.arange(count) / count for n, count in enumerate(pieces.tolist())]
-    places = np.concatenate([*at, [len(pieces)]])
-    return np.stack([np.interp(places, np.arange(len(line_m)), column) for column in line_m.T], axis=1)
+    step_m = np.diff(line_m, axis=0)
+    pieces = np.maximum(least, np.ceil(np.linalg.norm(step_m, axis=1) / _RING_SPACING_M - 1e-9)).astype(int)
+    piece = np.arange(pieces.sum()) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+    points_m = np.repeat(line_m[:-1], pieces, axis=0) + piece[:, None] * np.repeat(
+        step_m / pieces[:, None], pieces, axis=0
+    )
+    return np.concatenate([points_m, line_m[-1:]])
