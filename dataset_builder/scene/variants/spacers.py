@@ -140,8 +140,10 @@ SPACING_M = 0.7
 """Half the width of a block, and the largest distance of the places where blocks are sought, along each side."""
 _REACH_M = 0.35
 """Largest distance of a block from its place."""
-_LAYER_M, _MAT_M = 0.012, 0.05
-"""Heights up to which bars are supported, above the lowest steel within ``_REACH_M``, and above that of the cage."""
+_LAYER_M = 0.012
+"""Height above the lowest steel within ``_REACH_M`` up to which bars are supported."""
+_MAT_M = 0.05
+"""Height above the lowest steel of a cage up to which its bars are supported anywhere."""
 _MAX_SLOPE = 0.1
 """Largest rise per length of a supported part of a bar: a block below a bend would carry nothing."""
 _SAMPLE_M = 0.02
