@@ -245,6 +245,18 @@ def _loss_problems(finished: Finished, config: DatasetConfig, plans: Sequence[Co
     reasons: dict[str, None] = {}
     lost = 0
     may_grow = config.has_splits and isinstance(plans[0].spec, SceneConfigSpec)
+    if may_grow:
+        version = config_parameters(plans[0].spec)["scene"]["assembly"]["version"]
+        others = sorted({scene.entry["assembly"]["version"] for scene in config.scenes} - {version})
+        if others:
+            yield Problem(
+                "conflict",
+                f"config {config.name}",
+                f"it was made by version {others[0]} of the generator of cages, this is version {version}",
+                f"another folder (--out), or --overwrite {config.name}, which replaces its "
+                f"{len(config.views)} finished views",
+            )
+            return
     for plan in plans:
         scene = finished.scene(plan)
         if scene is None and may_grow:  # A further scene.
@@ -257,12 +269,10 @@ def _loss_problems(finished: Finished, config: DatasetConfig, plans: Sequence[Co
             reasons |= dict.fromkeys(found)
             lost += len(scene.views)
     if may_grow:
-        others = len(config.scenes) - len(kept_scenes(config, plans))
-        others -= sum(finished.scene(plan) is not None for plan in plans)
-        if others:
-            reasons[f"{others} other scenes have another image size, colour, seed or version of the generator"] = (
-                None
-            )
+        left = len(config.scenes) - len(kept_scenes(config, plans))
+        left -= sum(finished.scene(plan) is not None for plan in plans)
+        if left:
+            reasons[f"{left} other scenes have another image size, colour or seed"] = None
     if reasons:
         more = [f"{len(reasons) - _SHOWN_DIFFERENCES} more"] if len(reasons) > _SHOWN_DIFFERENCES else []
         shown = "; ".join([*list(reasons)[:_SHOWN_DIFFERENCES], *more])

@@ -319,19 +319,42 @@ class SceneRig(ManifestTable):
     camera: Annotated[str, StringConstraints(max_length=100)] = ""
 
 
+_Range = Annotated[tuple[Annotated[float, number(-1, 1)], Annotated[float, number(-1, 1)]], Strict(False)]
+
+
+class MatRecord(ManifestTable):
+    """Deviation of the cover of a mat or a whole cage as built: least and largest, and the tolerances, metres."""
+
+    deviation_m: _Range
+    tolerance_m: _Range
+
+    @property
+    def is_within(self) -> bool:
+        """Whether the deviations are within the tolerances."""
+        return self.tolerance_m[0] <= self.deviation_m[0] and self.deviation_m[1] <= self.tolerance_m[1]
+
+
+class CageRecord(ManifestTable):
+    """Record of a generated cage, of which the bench reads the ``mats``; older cages have none."""
+
+    mats: Annotated[tuple[MatRecord, ...], Strict(False)] = ()
+
+
 class Scene(ManifestTable):
     """Scene of a config, with its cameras, its mesh and its shards, which hold the rows of no other scene.
 
     ``board`` is the ArUco board under the assembly, or None; ``protocol_views`` is the number of views of the full
     trajectory; ``aim_point_m`` is the point that its cameras aim at, world metres, if they share one; ``bytes`` is
     the size of the shards; ``key`` is the digest of all parameters. ``family`` is the kind of cage of a generated
-    scene, otherwise None. ``assembly``, ``protocol``, ``rig`` and ``mesh`` are None in a config that was imported.
+    scene and ``cage`` the record of how it was generated, otherwise None. ``assembly``, ``protocol``, ``rig`` and
+    ``mesh`` are None in a config that was imported.
     ``entry`` is the scene as it was written, with all parameters of the build.
     """
 
     name: Name
     split: Annotated[str, one_of(*SPLITS)]
     family: Name | None = None
+    cage: CageRecord | None = None
     assembly: Assembly | None = None
     board: BoardSpec | None
     environment: Annotated[str, StringConstraints(max_length=60)] = ""
