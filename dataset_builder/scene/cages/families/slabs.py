@@ -60,7 +60,7 @@ def slab(rng: np.random.Generator, shape: str) -> Design:
         *chairs,
     ]
     for index in under_feet:
-        bars[index] = replace(bars[index], spaced_along=None)
+        bars[index] = replace(bars[index], spaced_along=None, is_structural=True)
     drawn: dict[str, float | str] = {
         "shape": shape,
         "thickness_m": thickness_m,
