@@ -188,25 +188,19 @@ def _split_row(config: DatasetConfig) -> dict[str, Any]:
     }
 
 
-def _mat_rows(config: DatasetConfig) -> list[dict[str, str]]:
+def _mat_rows(config: DatasetConfig) -> list[dict[str, Any]]:
     """Return the deviations of the cover of generated cages: one row for each family, millimetres."""
     mats: dict[str, list[MatRecord]] = {}
     for scene in config.scenes:
-        if scene.family is not None and scene.cage is not None and scene.cage.mats:
-            mats.setdefault(scene.family, []).extend(scene.cage.mats)
+        if scene.family is not None and scene.mats:
+            mats.setdefault(scene.family, []).extend(scene.mats)
     rows = []
     for family, of_family in sorted(mats.items()):
-        deviations_mm = 1000 * np.array([mat.deviation_m for mat in of_family])
-        rows.append(
-            {
-                "family": family,
-                "mats": f"{len(of_family)}",
-                "within": f"{np.mean([mat.is_within for mat in of_family]):.0%}",
-                "least": f"{deviations_mm[:, 0].min():.1f}",
-                "median": f"{np.median(np.abs(deviations_mm).max(axis=1)):.1f}",
-                "largest": f"{deviations_mm[:, 1].max():.1f}",
-            }
-        )
+        mm = 1000 * np.array([mat.deviation_m for mat in of_family])
+        within = f"{np.mean([not mat.beyond for mat in of_family]):.0%}"
+        median_mm = np.median(np.abs(mm).max(axis=1))
+        deviations = " | ".join(f"{value:.1f}" for value in (mm.min(), median_mm, mm.max()))
+        rows.append({"family": family, "mats": len(of_family), "within": within, "deviations": deviations})
     return rows
 
 

@@ -245,18 +245,9 @@ def _loss_problems(finished: Finished, config: DatasetConfig, plans: Sequence[Co
     reasons: dict[str, None] = {}
     lost = 0
     may_grow = config.has_splits and isinstance(plans[0].spec, SceneConfigSpec)
-    if may_grow:
-        version = config_parameters(plans[0].spec)["scene"]["assembly"]["version"]
-        others = sorted({scene.entry["assembly"]["version"] for scene in config.scenes} - {version})
-        if others:
-            yield Problem(
-                "conflict",
-                f"config {config.name}",
-                f"it was made by version {others[0]} of the generator of cages, this is version {version}",
-                f"another folder (--out), or --overwrite {config.name}, which replaces its "
-                f"{len(config.views)} finished views",
-            )
-            return
+    version = config_parameters(plans[0].spec)["scene"]["assembly"].get("version")
+    if may_grow and (earlier := {scene.entry["assembly"]["version"] for scene in config.scenes} - {version}):
+        reasons[f"they are of version {min(earlier)} of the generator of cages, this is version {version}"] = None
     for plan in plans:
         scene = finished.scene(plan)
         if scene is None and may_grow:  # A further scene.
@@ -269,10 +260,10 @@ def _loss_problems(finished: Finished, config: DatasetConfig, plans: Sequence[Co
             reasons |= dict.fromkeys(found)
             lost += len(scene.views)
     if may_grow:
-        left = len(config.scenes) - len(kept_scenes(config, plans))
-        left -= sum(finished.scene(plan) is not None for plan in plans)
-        if left:
-            reasons[f"{left} other scenes have another image size, colour or seed"] = None
+        others = len(config.scenes) - len(kept_scenes(config, plans))
+        others -= sum(finished.scene(plan) is not None for plan in plans)
+        if others:
+            reasons[f"{others} other scenes have another image size, colour, seed or version"] = None
     if reasons:
         more = [f"{len(reasons) - _SHOWN_DIFFERENCES} more"] if len(reasons) > _SHOWN_DIFFERENCES else []
         shown = "; ".join([*list(reasons)[:_SHOWN_DIFFERENCES], *more])
@@ -280,7 +271,8 @@ def _loss_problems(finished: Finished, config: DatasetConfig, plans: Sequence[Co
             "conflict",
             f"config {config.name}",
             f"{lost or len(config.views)} finished views would be lost: {shown}",
-            f"more views or scenes with the same parameters; --overwrite {config.name} replaces the config",
+            f"more views or scenes with the same parameters, or another folder (--out); --overwrite {config.name} "
+            "replaces the config",
         )
 
 

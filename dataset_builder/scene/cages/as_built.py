@@ -42,16 +42,11 @@ BOW_TOLERANCE = 1 / 250
 MIN_CLEAR_M = 1e-4
 """Least clear distance of two bars as built."""
 
-PLUS_TOLERANCES_M = {1: (0.010, 0.015, 0.025), 2: (0.005, 0.010, 0.020)}
-"""Largest excess of the cover by tolerance class, for members of ``SIZES_M``; linear in between."""
-
-SIZES_M = (0.150, 0.400, 2.500)
-
-FOUNDATION_M = 0.015
-"""By how much the cover of a foundation may exceed the nominal one further."""
+PLUS_TOLERANCES_M, SIZES_M = {1: (0.010, 0.015, 0.025), 2: (0.005, 0.010, 0.020)}, (0.150, 0.400, 2.500)
+"""Largest excess of the cover by tolerance class, and the sizes of members to which the three numbers belong."""
 
 MINUS_TOLERANCE_M = 0.010
-"""Largest deficit of the cover: the allowance for deviations of the nominal cover (EN 1992-1-1, 4.4.1.3)."""
+"""Largest deficit of the cover, the allowance for deviations of EN 1992-1-1, 4.4.1.3."""
 
 BEYOND, _BEYOND_SHARES, _WITHIN_SHARES = 0.1, (1.05, 1.5), (0.1, 1.0)
 """Probability that a mat is beyond its tolerance, and ranges of its largest deviation in tolerances."""
@@ -106,10 +101,10 @@ class BuiltCage:
 
 def build_as(design: Design, rng: np.random.Generator) -> BuiltCage:
     """Return the cage as it is built. Raises ``InfeasibleError`` if bars of the design touch each other."""
-    mats = _drawn_mats(design, rng)
+    tolerance_class = int(rng.integers(1, 3))
+    points_m = np.concatenate([_divided(bar.line_m) for bar in design.bars])
+    mats = [_drawn_mat(mat, points_m[mat.weights(points_m) == 1], tolerance_class, rng) for mat in design.mats]
     lowest_m = min(lowest_steel_m(bar.line_m, bar.diameter_m) for bar in design.bars)
-    fall_m = max((abs(mat.mat.outward[2]) * mat.most_m for mat in mats), default=0.0)
-    least_z = lowest_m - max(0.0, design.ground_m - LEAST_COVER_M - fall_m)
     bars, left_out = _some_left_out(design.bars, rng)
     clearances = Clearances([bar.line_m for bar in bars], [outer_radius_m(bar.diameter_m) for bar in bars])
     if not clearances.are_all(_NEEDED_M):
@@ -122,9 +117,7 @@ def build_as(design: Design, rng: np.random.Generator) -> BuiltCage:
         near = clearances.neighbours(bar.line_m, radius, index, deviation.most_m)
         for share, spacing_share in _SHARES:
             line_m = deviation.applied(share, spacing_share)
-            is_above = line_m[:, 2].min() - radius > least_z or (
-                lowest_steel_m(line_m, bar.diameter_m) > least_z - 1e-9
-            )
+            is_above = lowest_steel_m(line_m, bar.diameter_m) > lowest_m - 1e-9
             if is_above and near.bar_clearance_m(line_m, radius) >= _NEEDED_M:
                 lines[index] = line_m
                 clearances.replace(index, line_m)
@@ -137,10 +130,9 @@ def build_as(design: Design, rng: np.random.Generator) -> BuiltCage:
     ]
     doubles = _doubled(bars, built, clearances, rng)
     moved = _with_mats([*built, *doubles], mats, lowest_m if design.stands else -np.inf)
-    radii_m = [outer_radius_m(bar.diameter_m) for bar in moved]
+    radii_m, records = [outer_radius_m(bar.diameter_m) for bar in moved], tuple(record for *_, record in mats)
     if not Clearances([bar.line_m for bar in moved], radii_m).are_all(MIN_CLEAR_M + 1e-8):
         raise InfeasibleError("bars touch each other as their mats deviate")
-    records = tuple(mat.record for mat in mats)
     return BuiltCage(tuple(moved), tuple(left_out), records, len(doubles), reduced, refused)
 
 
@@ -151,104 +143,73 @@ def lowest_steel_m(line_m: Float64[ndarray, "n 3"], diameter_m: float) -> float:
     return float((np.minimum(heights_m[:-1], heights_m[1:]) - outer_radius_m(diameter_m) * level).min())
 
 
-@dataclass(frozen=True, eq=False)
-class _MatDeviation:
-    """Drawn deviation of a mat as excess of its cover: offset, slopes along its axes, and sag; and its record."""
-
-    mat: Mat
-    offset_m: float
-    slopes: Float64[ndarray, " k"]
-    sag_m: float
-    record: dict[str, Any]
-
-    @property
-    def most_m(self) -> float:
-        """Largest displacement."""
-        return float(np.abs(self.record["deviation_m"]).max())
-
-    def displacement_m(self, points_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 3"]:
-        """Return the displacements of steel at these points of the design."""
-        excess_m = self.offset_m + _slope_and_sag_m(self.mat, self.slopes, self.sag_m, points_m)
-        return np.asarray(-(self.mat.weights(points_m) * excess_m)[:, None] * np.array(self.mat.outward))
+_DrawnMat = tuple[Mat, Float64[ndarray, " k"], dict[str, Any]]
+"""Mat, its deviation as factors of its ``_shapes``, and the record of it as JSON values."""
 
 
-def _slope_and_sag_m(
-    mat: Mat, slopes: Float64[ndarray, " k"], sag_m: float, points_m: Float64[ndarray, "n 3"]
-) -> Float64[ndarray, " n"]:
-    """Return the excess of the cover without offset: a mat sags by 0 at its supports and ``sag_m`` amid them."""
+def _shapes(mat: Mat, points_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n k"]:
+    """Return unit deviations of a mat at points: slopes along its axes, sag amid its supports, and offset."""
     along_m = points_m @ np.array(mat.axes).T
-    excess_m = along_m @ slopes
+    sag = np.zeros(len(points_m))
     for at_m, places_m in zip(along_m.T, mat.supports_m, strict=False):
         turns = np.interp(at_m, places_m, np.arange(len(places_m)))
-        excess_m = excess_m + sag_m / len(mat.axes) * (1 - np.cos(2 * np.pi * turns)) / 2
-    return np.asarray(excess_m)
-
-
-def _drawn_mats(design: Design, rng: np.random.Generator) -> list[_MatDeviation]:
-    """Return the deviations of all mats, by one tolerance class."""
-    tolerance_class = int(rng.integers(1, 3))
-    points_m = np.concatenate([_divided(bar.line_m) for bar in design.bars])
-    return [_drawn_mat(mat, points_m[mat.weights(points_m) == 1], tolerance_class, rng) for mat in design.mats]
+        sag = sag + (1 - np.cos(2 * np.pi * turns)) / 2 / len(mat.axes)
+    return np.column_stack([along_m, sag, np.ones(len(points_m))])
 
 
 def _drawn_mat(
     mat: Mat, points_m: Float64[ndarray, "n 3"], tolerance_class: int, rng: np.random.Generator
-) -> _MatDeviation:
-    """Return the deviation of a mat with steel at these points.
+) -> _DrawnMat:
+    """Return a mat with steel at these points and its deviation.
 
     Its largest excess or deficit of cover is a drawn share of the tolerance, below or above 1. A share above 1 is
     drawn only at a side where the mat has room for it.
     """
-    minus_m = MINUS_TOLERANCE_M
     plus_m = float(np.interp(mat.thickness_m, SIZES_M, PLUS_TOLERANCES_M[tolerance_class]))
-    plus_m += FOUNDATION_M if mat.is_foundation else 0.0
-    room_m = np.array([np.inf, mat.cover_m - LEAST_COVER_M - 0.001])
-    if mat.between_m is not None:
-        room_m[0] = _SQUEEZE * (mat.between_m[1] - mat.between_m[0])
-    if not mat.supports_m:  # Less cover at one face is more at the other.
-        plus_m = minus_m = min(plus_m, minus_m)
-        room_m[0] = room_m[1]
-    tolerances_m = np.array([plus_m, minus_m])
-    is_beyond = bool(rng.random() < BEYOND)
+    tolerances_m = np.array([plus_m, MINUS_TOLERANCE_M])
+    room_m = np.full(2, mat.cover_m - LEAST_COVER_M - 0.001)
+    if not mat.supports_m:  # More cover at one face of a cage is less at the other.
+        tolerances_m[:] = tolerances_m.min()
+    else:
+        room_m[0] = _SQUEEZE * np.ptp(mat.between_m) if mat.between_m else np.inf
     side, share = int(rng.integers(2)), rng.uniform(*_WITHIN_SHARES)
+    is_beyond = bool(rng.random() < BEYOND)
     if is_beyond:
         least, most = _BEYOND_SHARES
         wide = np.flatnonzero(room_m > least * tolerances_m).tolist()
         side = wide[side % len(wide)]
         share = rng.uniform(least, min(most, float(room_m[side] / tolerances_m[side])))
     limits_m = np.minimum(share * tolerances_m, room_m)
-    between_m = float(limits_m.sum())
-    slopes = rng.uniform(-0.5, 0.5, len(mat.axes)) * between_m / np.ptp(points_m @ np.array(mat.axes).T, axis=0)
-    sag_m = 0.0
-    if mat.supports_m:
-        pitch_m = min(float(np.diff(places_m).min()) for places_m in mat.supports_m)
-        upwards = 1.0 if mat.outward[2] > 0 else -1.0  # Sagging away from the upper face; else towards the face.
-        sag_m = upwards * rng.random() * _SAG_CURVATURE * (pitch_m / np.pi) ** 2
-    excess_m = _slope_and_sag_m(mat, slopes, sag_m, points_m)
-    scale = min(1.0, between_m / float(np.ptp(excess_m)))
-    excess_m = scale * excess_m
-    offset_m = float(limits_m[0] - excess_m.max() if side == 0 else -limits_m[1] - excess_m.min())
+    shapes, axes = _shapes(mat, points_m), len(mat.axes)
+    slopes = rng.uniform(-0.5, 0.5, axes) * limits_m.sum() / np.ptp(shapes[:, :axes], axis=0)
+    pitch_m = min((float(np.diff(places_m).min()) for places_m in mat.supports_m), default=0.0)
+    sag_m = rng.random() * _SAG_CURVATURE * (pitch_m / np.pi) ** 2  # Upper mats sag from their face, others to it.
+    factors = np.array([*slopes, sag_m if mat.outward[2] > 0 else -sag_m, 0.0])
+    factors *= min(1.0, limits_m.sum() / np.ptp(shapes @ factors))
+    excess_m = shapes @ factors
+    factors[-1] = -limits_m[1] - excess_m.min() if side else limits_m[0] - excess_m.max()
     record = {
         "name": mat.name,
-        "deviation_m": [round(offset_m + float(end), 9) for end in (excess_m.min(), excess_m.max())],
-        "tolerance_m": [-round(minus_m, 9), round(plus_m, 9)],
+        "deviation_m": [round(float(end + factors[-1]), 9) for end in (excess_m.min(), excess_m.max())],
+        "tolerance_m": [round(float(end), 9) for end in (-tolerances_m[1], tolerances_m[0])],
         "class": tolerance_class,
         "beyond": is_beyond,
     }
-    return _MatDeviation(mat, offset_m, scale * slopes, scale * sag_m, record)
+    return mat, factors, record
 
 
-def _with_mats(bars: Sequence[BuiltBar], mats: Sequence[_MatDeviation], least_z: float) -> list[BuiltBar]:
+def _with_mats(bars: Sequence[BuiltBar], mats: Sequence[_DrawnMat], least_z: float) -> list[BuiltBar]:
     """Return bars displaced with the mats; those that would reach below ``least_z`` are raised to it."""
-    sags = any(mat.mat.supports_m for mat in mats)
+    sags = any(mat.supports_m for mat, *_ in mats)
     lines_m = [_divided(bar.line_m) if sags else bar.line_m for bar in bars]
-    points_m = np.concatenate(lines_m)
-    points_m = points_m + sum(mat.displacement_m(points_m) for mat in mats)
-    moved_m = np.split(points_m, np.cumsum([len(line_m) for line_m in lines_m])[:-1])
-    for bar, line_m in zip(bars, moved_m, strict=True):
-        if line_m[:, 2].min() - outer_radius_m(bar.diameter_m) < least_z:
-            line_m[:, 2] += max(0.0, least_z - lowest_steel_m(line_m, bar.diameter_m))
-    return [replace(bar, line_m=line_m) for bar, line_m in zip(bars, moved_m, strict=True)]
+    points_m = moved_m = np.concatenate(lines_m)
+    for mat, factors, _ in mats:
+        excess_m = mat.weights(points_m) * (_shapes(mat, points_m) @ factors)
+        moved_m = moved_m - excess_m[:, None] * np.array(mat.outward)
+    parts_m = np.split(moved_m, np.cumsum([len(line_m) for line_m in lines_m])[:-1])
+    for bar, line_m in zip(bars, parts_m, strict=True):
+        line_m[:, 2] += max(0.0, least_z - lowest_steel_m(line_m, bar.diameter_m))
+    return [replace(bar, line_m=line_m) for bar, line_m in zip(bars, parts_m, strict=True)]
 
 
 def _some_left_out(

@@ -59,8 +59,7 @@ class Mat:
     member along it. ``axes`` are the directions along which the deviation varies. ``supports_m`` are the places
     along each of them of chairs or spacers, between which a mat sags; none for a cage, which is stiff and has a
     face at either side. Steel between two mats follows both: ``between_m`` are the places along ``outward`` up to
-    which it does not follow this one, and from which on it follows only this one (None: all steel does). The cover
-    of a foundation may be exceeded further.
+    which it does not follow this one, and from which on it follows only this one (None: all steel does).
     """
 
     name: str
@@ -70,7 +69,6 @@ class Mat:
     axes: tuple[Direction, ...]
     supports_m: tuple[tuple[float, ...], ...] = ()
     between_m: tuple[float, float] | None = None
-    is_foundation: bool = False
 
     def weights(self, points_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, " n"]:
         """Return the shares in which steel at these points follows the mat."""

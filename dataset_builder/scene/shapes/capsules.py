@@ -95,6 +95,10 @@ class Capsules:
         return i, j
 
 
+_Bars = int | slice | None
+"""Index of a bar, or of several."""
+
+
 class Clearances:
     """Axes of bars, of which one can be replaced at a time, and the least clearance of an axis to the others.
 
@@ -113,11 +117,7 @@ class Clearances:
         self._low_m[index], self._high_m[index] = line_m.min(axis=0), line_m.max(axis=0)
 
     def neighbours(
-        self,
-        line_m: Float64[ndarray, "n 3"],
-        radius_m: float,
-        without: int | slice | None = None,
-        margin_m: float = 0.0,
+        self, line_m: Float64[ndarray, "n 3"], radius_m: float, without: _Bars = None, margin_m: float = 0.0
     ) -> Capsules:
         """Return the bars near a bar along ``line_m``, or along lines within ``margin_m``, ``without`` some."""
         reach_m = NEAR_M + radius_m + margin_m
@@ -130,9 +130,7 @@ class Clearances:
         pieces = Capsules.of_lines([self._lines_m[index] for index in near], self._radii_m[near])
         return pieces.select(pieces.overlapping(low, high))
 
-    def least_m(
-        self, line_m: Float64[ndarray, "n 3"], radius_m: float, without: int | slice | None = None
-    ) -> float:
+    def least_m(self, line_m: Float64[ndarray, "n 3"], radius_m: float, without: _Bars = None) -> float:
         """Return the least clearance between a bar along ``line_m`` and the others, ``without`` some of them."""
         return self.neighbours(line_m, radius_m, without).bar_clearance_m(line_m, radius_m)
 

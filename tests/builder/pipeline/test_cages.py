@@ -147,7 +147,7 @@ def test_folder_of_an_earlier_generator_is_scored_and_not_continued(
         refused = run_in_process(main, "--out", copy, *request, *GROUND_TRUTH)
         assert refused.returncode == 2
         assert f"version 1 of the generator of cages, this is version {VERSION}" in refused.stderr
-        assert "another folder (--out), or --overwrite cages" in refused.stderr
+        assert "another folder (--out); --overwrite cages replaces the config" in refused.stderr
     assert contents(copy) == before
 
 

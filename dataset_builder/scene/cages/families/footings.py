@@ -97,7 +97,7 @@ def footing(rng: np.random.Generator, shape: str) -> Design:
         "column_m": column_m,
     }
     supports_m = tuple(tuple(spaced(-half, half, SUPPORT_SPACING_M)) for half in (half_x, half_y))
-    mat = Mat(LOWER, (0.0, 0.0, -1.0), depth_m, cover_m, (X, Y), supports_m, is_foundation=True)
+    mat = Mat(LOWER, (0.0, 0.0, -1.0), depth_m, cover_m, (X, Y), supports_m)
     return Design("footing", tuple(bars), drawn, cover_m, (mat,))
 
 
