@@ -58,8 +58,8 @@ ENVIRONMENTS = (
 
 BETWEEN_MATS = ("chair", "tie", "u-bar")
 """Roles of bars of walls and slabs that are longer or shorter where the mats are farther apart or closer."""
-MOST_SAG_M = 0.003
-"""Sag of a mat on supports 0.7 m apart."""
+MOST_SAG_M = 0.007
+"""Sag of a mat on supports about 1 m apart."""
 OUTWARD = {name: (axis, 1) for axis, name in enumerate("xyz")}
 OUTWARD |= {"lower": (2, -1), "upper": (2, 1), "front": (1, -1), "back": (1, 1)}
 """Axis and sign of the direction to the face of a mat or a cage, by its name."""
