@@ -27,7 +27,12 @@ from benchmarks.timing import machine_description, print_markdown
 from dataset_builder.inspection.picture import corner_view, font
 from dataset_builder.inspection.summary import inspect_cage
 from dataset_builder.scene.assemblies.cage import Cage
-from dataset_builder.scene.cages.as_built import END_TOLERANCE_M, PLACE_TOLERANCE_M, SPACING_TOLERANCE_M
+from dataset_builder.scene.cages.as_built import (
+    END_TOLERANCE_M,
+    PLACE_TOLERANCE_M,
+    PLUS_TOLERANCES_M,
+    SPACING_TOLERANCE_M,
+)
 from dataset_builder.scene.cages.generate import FAMILIES, GeneratedCage, cage_bars, generate_cage
 from dataset_builder.scene.cages.rules import (
     BEAM_STEEL,
@@ -102,8 +107,16 @@ _PLOTTED: Mapping[str, Plotted] = {
         (0.0, SPACING_TOLERANCE_M + PLACE_TOLERANCE_M + END_TOLERANCE_M),
         "displacement, tilt and spacing of as_built.py",
     ),
+    "mats_m": Plotted(
+        "deviation of mats",
+        "mm",
+        1e-3,
+        range(0, 50, 10),
+        (PLUS_TOLERANCES_M[2][0], PLUS_TOLERANCES_M[1][-1]),
+        "plus tolerances of EN 13670, 10.6",
+    ),
 }
-"""Parameters of the record that are plotted, and the deviations of the ends of bars from the design."""
+"""Parameters of the record that are plotted, and the deviations of ends of bars and of the cover of mats."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -178,6 +191,8 @@ def deviations_m(cage: GeneratedCage) -> Float64[ndarray, " n"]:
 def _values(cages: Sequence[GeneratedCage], name: str) -> Float64[ndarray, " n"]:
     if name == "deviation_m":
         return np.concatenate([deviations_m(cage) for cage in cages]) if cages else np.zeros(0)
+    if name == "mats_m":
+        return np.array([np.abs(mat["deviation_m"]).max() for cage in cages for mat in cage.record["mats"]])
     return np.array([cage.record["parameters"][name] for cage in cages if name in cage.record["parameters"]])
 
 

@@ -19,6 +19,7 @@ from rebar_depth_bench.data.schema import (
     AnyTrajectory,
     Assembly,
     Colour,
+    MatRecord,
     References,
     Scene,
     Survey,
@@ -56,6 +57,7 @@ def dataset_card(version: str, digest: str, configs: Sequence[DatasetConfig]) ->
         protocol=PROTOCOL,
         configs=[row for config in configs for row in _config_rows(config)],
         has_rendered=bool(_rendered(configs)),
+        mats=[row for config in configs for row in _mat_rows(config)],
         columns=column_rows(),
         example=configs[0].name,
         example_split=configs[0].splits[0],
@@ -184,6 +186,22 @@ def _split_row(config: DatasetConfig) -> dict[str, Any]:
         "sheet": config.sheet if split == config.manifest_entry["scenes"][0]["split"] else None,
         "optics": f"ideal pinholes with baseline and field of view of {', '.join(sorted(cameras))}",
     }
+
+
+def _mat_rows(config: DatasetConfig) -> list[dict[str, Any]]:
+    """Return the deviations of the cover of generated cages: one row for each family, millimetres."""
+    mats: dict[str, list[MatRecord]] = {}
+    for scene in config.scenes:
+        if scene.family is not None and scene.mats:
+            mats.setdefault(scene.family, []).extend(scene.mats)
+    rows = []
+    for family, of_family in sorted(mats.items()):
+        mm = 1000 * np.array([mat.deviation_m for mat in of_family])
+        within = f"{np.mean([not mat.beyond for mat in of_family]):.0%}"
+        median_mm = np.median(np.abs(mm).max(axis=1))
+        deviations = " | ".join(f"{value:.1f}" for value in (mm.min(), median_mm, mm.max()))
+        rows.append({"family": family, "mats": len(of_family), "within": within, "deviations": deviations})
+    return rows
 
 
 def _config_row(config: DatasetConfig) -> dict[str, Any]:

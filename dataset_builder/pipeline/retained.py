@@ -245,6 +245,9 @@ def _loss_problems(finished: Finished, config: DatasetConfig, plans: Sequence[Co
     reasons: dict[str, None] = {}
     lost = 0
     may_grow = config.has_splits and isinstance(plans[0].spec, SceneConfigSpec)
+    version = config_parameters(plans[0].spec)["scene"]["assembly"].get("version")
+    if may_grow and (earlier := {scene.entry["assembly"]["version"] for scene in config.scenes} - {version}):
+        reasons[f"they are of version {min(earlier)} of the generator of cages, this is version {version}"] = None
     for plan in plans:
         scene = finished.scene(plan)
         if scene is None and may_grow:  # A further scene.
@@ -260,9 +263,7 @@ def _loss_problems(finished: Finished, config: DatasetConfig, plans: Sequence[Co
         others = len(config.scenes) - len(kept_scenes(config, plans))
         others -= sum(finished.scene(plan) is not None for plan in plans)
         if others:
-            reasons[f"{others} other scenes have another image size, colour, seed or version of the generator"] = (
-                None
-            )
+            reasons[f"{others} other scenes have another image size, colour, seed or version"] = None
     if reasons:
         more = [f"{len(reasons) - _SHOWN_DIFFERENCES} more"] if len(reasons) > _SHOWN_DIFFERENCES else []
         shown = "; ".join([*list(reasons)[:_SHOWN_DIFFERENCES], *more])
@@ -270,7 +271,8 @@ def _loss_problems(finished: Finished, config: DatasetConfig, plans: Sequence[Co
             "conflict",
             f"config {config.name}",
             f"{lost or len(config.views)} finished views would be lost: {shown}",
-            f"more views or scenes with the same parameters; --overwrite {config.name} replaces the config",
+            f"more views or scenes with the same parameters, or another folder (--out); --overwrite {config.name} "
+            "replaces the config",
         )
 
 

@@ -70,7 +70,7 @@ class GeneratedCageSpec:
     number: int
     seed: int = 0
     family: str | None = None
-    version: int = 1
+    version: int = 2
     kind: str = "generated-cage"
 
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import pyarrow as pa
 from pydantic import (
+    AliasPath,
     BeforeValidator,
     ConfigDict,
     Field,
@@ -319,19 +320,31 @@ class SceneRig(ManifestTable):
     camera: Annotated[str, StringConstraints(max_length=100)] = ""
 
 
+_Deviation = Annotated[float, number(-1, 1)]
+
+
+class MatRecord(ManifestTable):
+    """Deviation of the cover of a mat as built: least and largest, metres, and whether beyond the tolerance."""
+
+    deviation_m: Annotated[tuple[_Deviation, _Deviation], Strict(False)]
+    beyond: bool
+
+
 class Scene(ManifestTable):
     """Scene of a config, with its cameras, its mesh and its shards, which hold the rows of no other scene.
 
     ``board`` is the ArUco board under the assembly, or None; ``protocol_views`` is the number of views of the full
     trajectory; ``aim_point_m`` is the point that its cameras aim at, world metres, if they share one; ``bytes`` is
     the size of the shards; ``key`` is the digest of all parameters. ``family`` is the kind of cage of a generated
-    scene, otherwise None. ``assembly``, ``protocol``, ``rig`` and ``mesh`` are None in a config that was imported.
-    ``entry`` is the scene as it was written, with all parameters of the build.
+    scene, otherwise None, and ``mats`` are its parts that are off as one. ``assembly``, ``protocol``, ``rig`` and
+    ``mesh`` are None in a config that was imported. ``entry`` is the scene as it was written, with all parameters
+    of the build.
     """
 
     name: Name
     split: Annotated[str, one_of(*SPLITS)]
     family: Name | None = None
+    mats: Annotated[tuple[MatRecord, ...], Strict(False)] = Field((), validation_alias=AliasPath("cage", "mats"))
     assembly: Assembly | None = None
     board: BoardSpec | None
     environment: Annotated[str, StringConstraints(max_length=60)] = ""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -22,6 +22,13 @@ STANDING_M = 5e-5
 """Height of the ends of standing bars above z = 0, so that they do not coincide with the ground."""
 
 
+LEAST_COVER_M = 0.008
+"""Least height of the steel of a cage on spacers as built, above z = 0 and the base of its formwork."""
+
+SUPPORT_SPACING_M = 0.7
+"""Largest distance of the chairs or spacers of a mat, about that of practice."""
+
+
 class InfeasibleError(ValueError):
     """Raised for drawn parameters with which no cage can be made; the message is the reason, without numbers."""
 
@@ -33,7 +40,7 @@ class DesignBar:
     ``spaced_along`` is the unit vector along which bars of its kind are spaced, or None: only in this direction
     may it be off by the tolerance of the spacing. ``is_structural`` bars are never left out. ``held_along`` is the
     unit vector along which a bar is held by those that it rests on or is tied to, or None: it is neither displaced
-    along it nor tilted out of the plane perpendicular to it.
+    along it nor tilted out of the plane perpendicular to it, other than with its mat.
     """
 
     role: str
@@ -44,18 +51,52 @@ class DesignBar:
     held_along: Direction | None = None
 
 
+@dataclass(frozen=True)
+class Mat:
+    """Part of a design that is off through the thickness of its member as one: a mat, or a whole cage.
+
+    ``outward`` is the unit vector to the face from which the cover is measured, ``thickness_m`` the size of the
+    member along it. ``axes`` are the directions along which the deviation varies. ``supports_m`` are the places
+    along each of them of chairs or spacers, between which a mat sags; none for a cage, which is stiff and has a
+    face at either side. Steel between two mats follows both: ``between_m`` are the places along ``outward`` up to
+    which it does not follow this one, and from which on it follows only this one (None: all steel does).
+    """
+
+    name: str
+    outward: Direction
+    thickness_m: float
+    cover_m: float
+    axes: tuple[Direction, ...]
+    supports_m: tuple[tuple[float, ...], ...] = ()
+    between_m: tuple[float, float] | None = None
+
+    def weights(self, points_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, " n"]:
+        """Return the shares in which steel at these points follows the mat."""
+        if self.between_m is None:
+            return np.ones(len(points_m))
+        return np.asarray(np.interp(points_m @ np.array(self.outward), self.between_m, (0.0, 1.0)))
+
+
+def cage_mats(axis: Direction, cover_m: float, sizes_m: Mapping[Direction, float]) -> tuple[Mat, ...]:
+    """Return what is off as one in a cage along an axis: the cage, in each direction of which a size is given."""
+    return tuple(
+        Mat("xyz"[int(np.argmax(across))], across, size_m, cover_m, (axis,)) for across, size_m in sizes_m.items()
+    )
+
+
 @dataclass(frozen=True, eq=False)
 class Design:
     """Bars of a cage, world frame, and what was drawn: names and values of its parameters, metres.
 
     ``ground_m`` is the height of the lowest point of its steel above z = 0: ``STANDING_M`` if bars stand on the
-    ground, or the cover of a cage on spacers.
+    ground, or the cover of a cage on spacers. ``mats`` are its parts that are off as one through the thickness.
     """
 
     family: str
     bars: tuple[DesignBar, ...]
     parameters: dict[str, float | str]
     ground_m: float
+    mats: tuple[Mat, ...] = ()
 
     @property
     def stands(self) -> bool:

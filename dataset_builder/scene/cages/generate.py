@@ -14,7 +14,7 @@ from numpy import ndarray
 
 from dataset_builder.scene.assemblies.bar_meshes import bar_mesh, ribs_per_row
 from dataset_builder.scene.assemblies.cage import CageBar
-from dataset_builder.scene.cages.as_built import BuiltBar, build_as
+from dataset_builder.scene.cages.as_built import BuiltBar, build_as, lowest_steel_m
 from dataset_builder.scene.cages.design import Design, InfeasibleError
 from dataset_builder.scene.cages.families.beams import beam
 from dataset_builder.scene.cages.families.columns import column, pile_cage
@@ -23,13 +23,12 @@ from dataset_builder.scene.cages.families.joints import joint
 from dataset_builder.scene.cages.families.slabs import slab
 from dataset_builder.scene.cages.families.walls import wall
 from dataset_builder.scene.model import Assembly, Mesh, axis_of
-from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
 from dataset_builder.specs.config_specs import GeneratedCageSpec
 from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.base.names import SPLITS
 from rebar_depth_bench.data.bars import Bar
 
-VERSION = 1
+VERSION = 2
 """Version of the generator: it changes when the same seed gives another cage."""
 
 MAX_BARS = 200
@@ -72,8 +71,10 @@ FAMILIES: Mapping[str, Family] = {
 class GeneratedCage:
     """Cage of a family, centred above the world's origin: its bars, and a record of how it was generated.
 
-    ``record`` holds the parameters of the design, the bars that were left out with their nominal axes, the number
-    of doubled bars, and how many designs and deviations were refused, as JSON values.
+    ``record`` holds the parameters of the design, the bars that were left out with their nominal axes, the
+    deviations of its mats, the number of doubled bars, and how many designs and deviations were refused, as JSON
+    values. ``mats`` has for each mat the least and the largest deviation of its cover, their tolerances, the class
+    of these, and whether the mat was drawn beyond them.
     """
 
     family: str
@@ -115,7 +116,7 @@ def generate_cage(split: str, number: int, seed: int = 0, family: str | None = N
         except ValueError as error:
             refused[f"a bar cannot be bent: {str(error).split()[0]}"] += 1
             continue
-        offset_m = _offset_m(built.bars, design.ground_m)
+        offset_m = _offset_m(design)
         record = {
             "family": design.family,
             "parameters": design.parameters,
@@ -127,6 +128,7 @@ def generate_cage(split: str, number: int, seed: int = 0, family: str | None = N
                 }
                 for bar in built.left_out
             ],
+            "mats": list(built.mats),
             "doubled": built.doubled,
             "deviations_reduced": built.deviations_reduced,
             "deviations_refused": built.deviations_refused,
@@ -158,20 +160,12 @@ def _drawn_family(rng: np.random.Generator) -> str:
     return list(FAMILIES)[int(rng.integers(len(FAMILIES)))]
 
 
-def _offset_m(bars: tuple[BuiltBar, ...], ground_m: float) -> Float64[ndarray, " 3"]:
-    """Return the displacement that centres a cage above the origin and sets its lowest steel at ``ground_m``."""
-    points = np.concatenate([bar.line_m for bar in bars])
-    lowest_m = min(_lowest_m(bar) for bar in bars)
+def _offset_m(design: Design) -> Float64[ndarray, " 3"]:
+    """Return the displacement that centres a design above the origin and sets its lowest steel at ``ground_m``."""
+    points = np.concatenate([bar.line_m for bar in design.bars])
+    lowest_m = min(lowest_steel_m(bar.line_m, bar.diameter_m) for bar in design.bars)
     middle = (points.min(axis=0) + points.max(axis=0)) / 2
-    return np.array([-round(float(middle[0]), 3), -round(float(middle[1]), 3), ground_m - lowest_m])
-
-
-def _lowest_m(bar: BuiltBar) -> float:
-    """Return the height of the lowest point of a bar's surface, whose ends are flat discs."""
-    line_m, radius = bar.line_m, outer_radius_m(bar.diameter_m)
-    tangents = np.gradient(line_m, axis=0)
-    level = np.linalg.norm(tangents[:, :2], axis=1) / np.linalg.norm(tangents, axis=1)
-    return float((line_m[:, 2] - radius * level).min())
+    return np.array([-round(float(middle[0]), 3), -round(float(middle[1]), 3), design.ground_m - lowest_m])
 
 
 def _moved(bar: BuiltBar, offset_m: Float64[ndarray, " 3"]) -> BuiltBar:

@@ -83,7 +83,7 @@ def _arc(
     start = corner - before * radius_m * np.tan(turn_rad / 2)
     inward = after - (after @ before) * before
     inward /= np.linalg.norm(inward)
-    angle = np.linspace(0.0, turn_rad, max(2, int(np.ceil(np.rad2deg(turn_rad) / step_deg)) + 1))[:, None]
+    angle = np.linspace(0.0, turn_rad, max(2, int(np.ceil(np.rad2deg(turn_rad) / step_deg - 1e-9)) + 1))[:, None]
     return np.asarray(start + radius_m * (np.sin(angle) * before + (1 - np.cos(angle)) * inward))
 
 

@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from rebar_depth_bench.geometry.segments import closest_points_m
 
-NEAR_M = 0.05
+NEAR_M = 0.01
 """Distance up to which bars are compared; bars that are farther apart have an infinite clearance."""
 
 
@@ -95,6 +95,10 @@ class Capsules:
         return i, j
 
 
+_Bars = int | slice | None
+"""Index of a bar, or of several."""
+
+
 class Clearances:
     """Axes of bars, of which one can be replaced at a time, and the least clearance of an axis to the others.
 
@@ -113,9 +117,9 @@ class Clearances:
         self._low_m[index], self._high_m[index] = line_m.min(axis=0), line_m.max(axis=0)
 
     def neighbours(
-        self, line_m: Float64[ndarray, "n 3"], radius_m: float, without: int | None = None, margin_m: float = 0.0
+        self, line_m: Float64[ndarray, "n 3"], radius_m: float, without: _Bars = None, margin_m: float = 0.0
     ) -> Capsules:
-        """Return the bars near a bar along ``line_m``, or along lines within ``margin_m``, ``without`` one."""
+        """Return the bars near a bar along ``line_m``, or along lines within ``margin_m``, ``without`` some."""
         reach_m = NEAR_M + radius_m + margin_m
         low, high = line_m.min(axis=0) - reach_m, line_m.max(axis=0) + reach_m
         radii_m = self._radii_m[:, None]
@@ -126,12 +130,13 @@ class Clearances:
         pieces = Capsules.of_lines([self._lines_m[index] for index in near], self._radii_m[near])
         return pieces.select(pieces.overlapping(low, high))
 
-    def least_m(self, line_m: Float64[ndarray, "n 3"], radius_m: float, without: int | None = None) -> float:
-        """Return the least clearance between a bar along ``line_m`` and the others, ``without`` one of them."""
+    def least_m(self, line_m: Float64[ndarray, "n 3"], radius_m: float, without: _Bars = None) -> float:
+        """Return the least clearance between a bar along ``line_m`` and the others, ``without`` some of them."""
         return self.neighbours(line_m, radius_m, without).bar_clearance_m(line_m, radius_m)
 
     def are_all(self, least_m: float) -> bool:
         """Return True if the clearance of any two bars is at least ``least_m``."""
         return all(
-            self.least_m(line_m, float(self._radii_m[i]), i) >= least_m for i, line_m in enumerate(self._lines_m)
+            self.least_m(line_m, float(self._radii_m[i]), slice(i + 1)) >= least_m
+            for i, line_m in enumerate(self._lines_m)
         )

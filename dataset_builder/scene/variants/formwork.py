@@ -14,10 +14,10 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from dataset_builder.scene.cages.design import LEAST_COVER_M
 from dataset_builder.scene.model import Mesh, Part, surface
 from dataset_builder.scene.shapes.solids import box, rotation_about_z, transformed
 from dataset_builder.scene.variants.context import GAP_M, PlacementContext, Rect
-from dataset_builder.scene.variants.spacers import LEAST_COVER_M
 
 PANEL_WIDTHS = (0.8, 0.5)
 """Widths of the scaled panels, as fractions of the side of the steel at which they stand."""
@@ -29,7 +29,7 @@ BATTENS = 4
 STANDING_COVER_M = 0.04
 COVERS_M = (0.025, 0.075)
 """Cover beside a cage that stands, and the range of covers beside one that lies, which are those below it."""
-SHEET_M, BASE_M = 0.021, 0.009
+SHEET_M, BASE_M = 0.021, 0.004
 """Thickness of the sheets at the sides and of the base."""
 SHEET_LENGTH_M = 2.5
 STUD_M = (0.08, 0.06)

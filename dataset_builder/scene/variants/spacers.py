@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from dataset_builder.scene.cages.design import LEAST_COVER_M
 from dataset_builder.scene.model import Mesh, Part, surface
 from dataset_builder.scene.shapes.capsules import Capsules
 from dataset_builder.scene.shapes.solids import box, lathe, merge_meshes, rotation_about_z, transformed
@@ -134,15 +135,15 @@ def _frame_along(direction: Float64[ndarray, " 3"]) -> Float64[ndarray, "3 3"]:
     return np.stack([x, np.cross(direction, x), direction], axis=1)
 
 
-LEAST_COVER_M = 0.012
-"""Height of the lowest steel from which a cage has blocks; cages below it stand or lie on the ground."""
 BLOCK_HALF_M = 0.02
 SPACING_M = 0.7
 """Half the width of a block, and the largest distance of the places where blocks are sought, along each side."""
 _REACH_M = 0.35
 """Largest distance of a block from its place."""
 _LAYER_M = 0.012
-"""Height above the lowest steel up to which bars are supported."""
+"""Height above the lowest steel within ``_REACH_M`` up to which bars are supported."""
+_MAT_M = 0.05
+"""Height above the lowest steel of a cage up to which its bars are supported anywhere."""
 _MAX_SLOPE = 0.1
 """Largest rise per length of a supported part of a bar: a block below a bend would carry nothing."""
 _SAMPLE_M = 0.02
@@ -158,6 +159,7 @@ def supports(context: PlacementContext) -> tuple[Part, ...]:
     blocks: list[Float64[ndarray, " 3"]] = []
     for place_m in _places_m(context):
         distance_m = np.hypot(*(below[:, :2] - place_m).T)
+        distance_m[below[:, 2] > below[distance_m < _REACH_M, 2].min(initial=np.inf) + _LAYER_M] = np.inf
         for index in np.argsort(distance_m, kind="stable"):
             top_m = below[index]
             if distance_m[index] > _REACH_M:
@@ -183,10 +185,10 @@ def _places_m(context: PlacementContext) -> Float64[ndarray, "n 2"]:
 
 
 def _points_below_bars(context: PlacementContext) -> Float64[ndarray, "n 3"]:
-    """Return points below level bars of the lowest layer, at the height of the top of a block there."""
+    """Return points below level bars near the lowest steel, at the height of the top of a block there."""
     capsules = context.capsules
     bottoms_m = np.minimum(capsules.a_m[:, 2], capsules.b_m[:, 2]) - capsules.radius_m
-    lowest = capsules.select(bottoms_m < context.low_m[2] + _LAYER_M)
+    lowest = capsules.select(bottoms_m < context.low_m[2] + _MAT_M)
     points = [np.zeros((0, 3))]
     for a, b, radius_m in zip(lowest.a_m, lowest.b_m, lowest.radius_m, strict=True):
         # A bar that slopes is lower at one side of a block than above its middle.

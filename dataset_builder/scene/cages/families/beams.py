@@ -17,6 +17,7 @@ from dataset_builder.scene.cages.design import (
     Y,
     Z,
     bent,
+    cage_mats,
     drawn_of,
     drawn_step,
     rise_m,
@@ -80,7 +81,8 @@ def beam(rng: np.random.Generator, shape: str) -> Design:
     section = beam_section(rng, bar_m, link_m, cover_m, width_m, depth_m)
     bars, drawn = beam_bars(rng, section, layout, first_link_m=0.05)
     lying = turned(bars, LYING, (-layout.length_m / 2, 0.0, depth_m / 2))
-    return Design("beam", tuple(lying), {"shape": shape, **drawn}, cover_m)
+    mats = cage_mats(X, cover_m, {Y: width_m, Z: depth_m})
+    return Design("beam", tuple(lying), {"shape": shape, **drawn}, cover_m, mats)
 
 
 def beam_section(

@@ -13,6 +13,10 @@ from dataset_builder.scene.cages.design import (
     DesignBar,
     InfeasibleError,
     Lap,
+    X,
+    Y,
+    Z,
+    cage_mats,
     drawn_of,
     drawn_step,
     lapped,
@@ -70,7 +74,8 @@ def column(rng: np.random.Generator, shape: str) -> Design:
     drawn = {**common, "diameter_m": diameter_m, "bars": float(section.bars), "spacing_m": spacing_m}
     drawn["steel_share"] = share
     drawn |= {"extra": "none"} if lap is None else {"extra": "laps", "lap_start_m": lap.start_m}
-    return Design("column", tuple(bars), drawn, STANDING_M)
+    mats = cage_mats(Z, cover_m, dict.fromkeys((X, Y), diameter_m))
+    return Design("column", tuple(bars), drawn, STANDING_M, mats)
 
 
 def _drawn_lap(rng: np.random.Generator, bar_m: float, has_laps: bool) -> Lap | None:
@@ -125,7 +130,8 @@ def _rectangular(rng: np.random.Generator, shape: str, common: dict[str, float |
         "steel_share": share,
     }
     drawn |= {} if lap is None else {"lap_start_m": lap.start_m}
-    return Design("column", tuple(bars), drawn, STANDING_M)
+    mats = cage_mats(Z, cover_m, {X: side_x_m, Y: side_y_m})
+    return Design("column", tuple(bars), drawn, STANDING_M, mats)
 
 
 def pile_cage(rng: np.random.Generator, shape: str) -> Design:
@@ -164,4 +170,7 @@ def pile_cage(rng: np.random.Generator, shape: str) -> Design:
         "steel_share": share,
         "lies": float(lies),
     }
-    return Design("pile-cage", tuple(bars), drawn, LYING_M if lies else STANDING_M)
+    # A cage that lies rests on the ground.
+    axis, across = (X, (Y,)) if lies else (Z, (X, Y))
+    mats = cage_mats(axis, cover_m, dict.fromkeys(across, diameter_m))
+    return Design("pile-cage", tuple(bars), drawn, LYING_M if lies else STANDING_M, mats)

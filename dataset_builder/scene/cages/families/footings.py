@@ -6,9 +6,11 @@ import numpy as np
 
 from dataset_builder.scene.cages.design import (
     STARTER,
+    SUPPORT_SPACING_M,
     Design,
     DesignBar,
     InfeasibleError,
+    Mat,
     X,
     Y,
     Z,
@@ -94,7 +96,9 @@ def footing(rng: np.random.Generator, shape: str) -> Design:
         "starters_steel_share": starters_share,
         "column_m": column_m,
     }
-    return Design("footing", tuple(bars), drawn, cover_m)
+    supports_m = tuple(tuple(spaced(-half, half, SUPPORT_SPACING_M)) for half in (half_x, half_y))
+    mat = Mat(LOWER, (0.0, 0.0, -1.0), depth_m, cover_m, (X, Y), supports_m)
+    return Design("footing", tuple(bars), drawn, cover_m, (mat,))
 
 
 def _starters(section: Section, foot_m: float, feet_z: tuple[float, float], top_z: float) -> list[DesignBar]:

@@ -13,6 +13,10 @@ from dataset_builder.scene.cages.design import (
     Design,
     DesignBar,
     InfeasibleError,
+    X,
+    Y,
+    Z,
+    cage_mats,
     drawn_of,
     drawn_step,
     rise_m,
@@ -86,7 +90,7 @@ def joint(rng: np.random.Generator, shape: str) -> Design:
         "ties_left_out": float(len(held) - len(kept)),
     }
     bars = (*standing, *stirrups(column, levels), *kept, *beam)
-    return Design("joint", bars, drawn, STANDING_M)
+    return Design("joint", bars, drawn, STANDING_M, cage_mats(Z, cover_m, {X: side_m, Y: side_m}))
 
 
 def _beam(

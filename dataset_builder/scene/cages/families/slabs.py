@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from dataset_builder.scene.cages.design import (
+    SUPPORT_SPACING_M,
     Design,
     DesignBar,
     InfeasibleError,
+    Mat,
     X,
     Y,
     Z,
@@ -26,11 +29,10 @@ LOWER, UPPER, CHAIR = "lower", "upper", "chair"
 _EDGE_M = 0.05
 """Distance of the outermost bars of a mat from the ends of the bars that cross them."""
 
-_CHAIR_SPACING_M = 0.7
 _CLOSE_M = 0.150
 """Largest spacing of bars of which a chair carries two, or stands on two, instead of one."""
 
-_FOOT_END_M = 0.03
+_FOOT_END_M = 0.04
 """Length of a chair's foot beyond the last bar that it stands on."""
 
 
@@ -47,14 +49,18 @@ def slab(rng: np.random.Generator, shape: str) -> Design:
     share = steel_share(area_m2(bar_m) / spacing_m, high[0], SLAB_STEEL)
     across_x = spaced(_EDGE_M - side_x_m / 2, side_x_m / 2 - _EDGE_M, spacing_m)
     across_y = spaced(_EDGE_M - side_y_m / 2, side_y_m / 2 - _EDGE_M, spacing_m)
+    between_m = contact_m(bar_m, chair_m)
+    foot_z, top_z = low[0] + between_m, high[0] - between_m
+    chairs, places_m, under_feet = _chairs(chair_m, across_x, across_y, foot_z, top_z)
     bars = [
         *_mat(LOWER, bar_m, 0, across_y, side_x_m / 2, low[0]),
         *_mat(LOWER, bar_m, 1, across_x, side_y_m / 2, low[1]),
         *_mat(UPPER, bar_m, 1, across_x, side_y_m / 2, high[0]),
         *_mat(UPPER, bar_m, 0, across_y, side_x_m / 2, high[1]),
+        *chairs,
     ]
-    between_m = contact_m(bar_m, chair_m)
-    bars += _chairs(chair_m, across_x, across_y, low[0] + between_m, high[0] - between_m)
+    for index in under_feet:
+        bars[index] = replace(bars[index], spaced_along=None, is_structural=True)
     drawn: dict[str, float | str] = {
         "shape": shape,
         "thickness_m": thickness_m,
@@ -66,7 +72,12 @@ def slab(rng: np.random.Generator, shape: str) -> Design:
         "spacing_m": spacing_m,
         "steel_share": share,
     }
-    return Design("slab", tuple(bars), drawn, cover_m)
+    first_z = max(low[1], foot_z)
+    mats = (
+        Mat(LOWER, (0.0, 0.0, -1.0), thickness_m, cover_m, (X, Y), places_m, (-top_z, -first_z)),
+        Mat(UPPER, Z, thickness_m, cover_m, (X, Y), places_m, (first_z, top_z)),
+    )
+    return Design("slab", tuple(bars), drawn, cover_m, mats)
 
 
 def _mat(
@@ -82,11 +93,13 @@ def _mat(
 
 def _chairs(
     diameter_m: float, across_x: Sequence[float], across_y: Sequence[float], foot_z: float, top_z: float
-) -> list[DesignBar]:
+) -> tuple[list[DesignBar], tuple[tuple[float, ...], tuple[float, ...]], set[int]]:
     """Return chairs whose feet stand on bars along x of the lowest layer and whose tops carry bars along y.
 
+    Also return the places (x, y) of their middles, and the indices in ``across_y`` of the bars that they stand on.
     The top of a chair is along x. Its feet are along y between bars of the second layer, one to each side, so that
-    the chair does not fall over. Raises ``InfeasibleError`` if bars are too few, or too close for the bends.
+    the chair does not fall over; they are tied to the bars. Raises ``InfeasibleError`` if bars are too few, or too
+    close for the bends.
     """
     pitch_x, pitch_y = across_x[1] - across_x[0], across_y[1] - across_y[0]
     carried, under = (2 if pitch <= _CLOSE_M + 1e-9 else 1 for pitch in (pitch_x, pitch_y))
@@ -105,12 +118,14 @@ def _chairs(
                 line_m = bent(places, diameter_m)
             except ValueError:
                 raise InfeasibleError("a slab is too thin or its bars are too close for chairs") from None
-            chairs.append(DesignBar(CHAIR, diameter_m, line_m, Y, False, Z))
-    return chairs
+            chairs.append(DesignBar(CHAIR, diameter_m, line_m, None, False, Z))
+    middle_x = tuple(across_x[first] + (1 + carried) / 2 * pitch_x for first in firsts)
+    middle_y = tuple((across_y[row] + across_y[row + 1]) / 2 for row in rows)
+    return chairs, (middle_x, middle_y), {row + n for row in rows for n in range(1 - under, under + 1)}
 
 
 def _spread_indices(first: int, last: int, step_m: float, least: int) -> list[int]:
-    """Return indices from ``first`` to ``last``, about ``_CHAIR_SPACING_M`` and at least ``least`` steps apart.
+    """Return indices from ``first`` to ``last``, about ``SUPPORT_SPACING_M`` and at least ``least`` steps apart.
 
     The first and the last one are left out if others remain. Raises ``InfeasibleError`` if only one fits.
     """
@@ -118,5 +133,5 @@ def _spread_indices(first: int, last: int, step_m: float, least: int) -> list[in
         first, last = first + 1, last - 1
     if last - first < least:
         raise InfeasibleError("a slab has too few bars for chairs")
-    intervals = min((last - first) // least, max(1, round((last - first) * step_m / _CHAIR_SPACING_M)))
+    intervals = min((last - first) // least, max(1, round((last - first) * step_m / SUPPORT_SPACING_M)))
     return [first + (last - first) * number // intervals for number in range(intervals + 1)]
