@@ -133,10 +133,10 @@ STARTER = "starter"
 _FREE_END_M = 0.05
 """Distance of the first and the last link from the ends of the main bars."""
 
-_BEYOND_M, _BESIDE_M = 0.10, 0.02
-"""How much longer than the lap the common length is, and the distance of the last link from its end.
+_BEYOND_M = 0.09
+"""How much longer than the lap starters and bars lie side by side.
 
-So the first and the last link along it are beyond both ends of the lap (EN 1992-1-1, 8.7.4.2).
+So the first and the last bar across are beyond both ends of the lap (EN 1992-1-1, 8.7.4.2).
 """
 
 
@@ -157,10 +157,8 @@ class Lap:
         return self.start_m + lap_m(self.bar_m) + _BEYOND_M
 
     def levels_m(self, first_m: float, spacing_m: float) -> list[float]:
-        """Return levels of the bars across the lap, from the first one up."""
-        return spaced(
-            first_m, self.end_m - _BESIDE_M, min(spacing_m, lap_link_spacing_m(self.bar_m, self.cross_m))
-        )
+        """Return levels of the bars across the lap, from the first one up to the ends of the starters."""
+        return spaced(first_m, self.end_m, min(spacing_m, lap_link_spacing_m(self.bar_m, self.cross_m)))
 
 
 def link_levels_m(

@@ -69,8 +69,8 @@ def column(rng: np.random.Generator, shape: str) -> Design:
     section = replace(section, bars=int(drawn_of(rng, section.counts(least_clear_m(bar_m), MOST_CLEAR_M))))
     share = steel_share(area_m2(bar_m, section.bars), section.concrete_m2, COLUMN_STEEL)
     most_m = column_link_spacing_m(bar_m, diameter_m)
-    if shape == "spiral":  # Its pitch is the same everywhere.
-        most_m = min(DENSE * most_m, lap_link_spacing_m(bar_m, link_m) if lap else 0.15)
+    if shape == "spiral":  # Its pitch is the same everywhere, and a turn passes a lap's end (9.5.3 (4), 8.7.4.2).
+        most_m = min(DENSE * most_m, min(lap_link_spacing_m(bar_m, link_m), 0.10) if lap else 0.15)
     spacing_m = drawn_step(rng, min(0.06, most_m), most_m, 0.01)
     bars: list[DesignBar] = section.main_bars(length_m)
     levels = link_levels_m(length_m, spacing_m, diameter_m, max(0.06, DENSE * spacing_m), lap)
