@@ -134,10 +134,7 @@ _FREE_END_M = 0.05
 """Distance of the first and the last link from the ends of the main bars."""
 
 _BEYOND_M = 0.09
-"""How much longer than the lap starters and bars lie side by side.
-
-So the first and the last bar across are beyond both ends of the lap (EN 1992-1-1, 8.7.4.2).
-"""
+"""Length beside each other beyond a lap, so that bars across are past both of its ends (EN 1992-1-1, 8.7.4.2)."""
 
 
 @dataclass(frozen=True)
@@ -156,8 +153,13 @@ class Lap:
         """Height of the ends of the starters."""
         return self.start_m + lap_m(self.bar_m) + _BEYOND_M
 
-    def levels_m(self, first_m: float, spacing_m: float) -> list[float]:
-        """Return levels of the bars across the lap, from the first one up to the ends of the starters."""
+    def levels_m(self, first_m: float, last_m: float, spacing_m: float) -> list[float]:
+        """Return levels of the bars across the lap, from the first one up to the ends of the starters.
+
+        Raises ``InfeasibleError`` if these are near the last level.
+        """
+        if self.end_m + 0.3 > last_m:
+            raise InfeasibleError("the member is too short for laps")
         return spaced(first_m, self.end_m, min(spacing_m, lap_link_spacing_m(self.bar_m, self.cross_m)))
 
 
@@ -166,12 +168,10 @@ def link_levels_m(
 ) -> list[float]:
     """Return levels of links: ``dense_spacing_m`` apart along ``dense_m`` at both ends, else ``spacing_m``.
 
-    They are dense along a lap as well. Raises ``InfeasibleError`` if the bars are too short for the lap.
+    They are dense along a lap as well. Raises ``InfeasibleError`` as ``Lap.levels_m``.
     """
     first, last = _FREE_END_M, length_m - _FREE_END_M
-    levels = [first] if lap is None else lap.levels_m(first, dense_spacing_m)
-    if lap is not None and levels[-1] + 0.3 > last:
-        raise InfeasibleError("the member is too short for laps")
+    levels = [first] if lap is None else lap.levels_m(first, last, dense_spacing_m)
     low, high = max(levels[-1], first + dense_m), last - dense_m
     if high - low < spacing_m:
         return [*levels[:-1], *spaced(levels[-1], last, dense_spacing_m)]

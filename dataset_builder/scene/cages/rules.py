@@ -56,10 +56,7 @@ DENSE = 0.6
 bars over 14 mm (9.5.3 (4))."""
 
 PILE_CLEAR_M = (0.100, 0.200)
-"""Least and largest clear distance of a bored pile's bars (EN 1536, 7.5.2; 9.8.5 (3)).
-
-EN 1536 also accepts 80 mm with small aggregate.
-"""
+"""Least and largest clear distance of a bored pile's bars (EN 1536, which also has 80 mm; 9.8.5 (3))."""
 
 
 def contact_m(first_m: float, second_m: float) -> float:
@@ -68,21 +65,12 @@ def contact_m(first_m: float, second_m: float) -> float:
 
 
 def least_cover_m(outer_m: float, inner_m: float = 0.0) -> float:
-    """Return the least nominal cover of outer bars, with bars of ``inner_m`` inside of them.
-
-    Each bar is covered by its diameter, and 10 mm at least, with an allowance of 10 mm (4.4.1.2,
-    4.4.1.3).
-    """
+    """Return the least cover of bars, with others inside of them: d, 10 mm, plus 10 mm (4.4.1.2, 4.4.1.3)."""
     return max(outer_m, 0.010, inner_m - outer_m) + 0.010
 
 
-def bundle_m(bar_m: float) -> float:
-    """Return the diameter of one bar with the area of a bundle of two (8.9.1 (2))."""
-    return float(2**0.5 * bar_m)
-
-
 def pile_cover_m(diameter_m: float) -> float:
-    """Return the least cover of a bored pile: 60 mm above a diameter of 0.6 m, else 50 mm (EN 1536, 7.5.3)."""
+    """Return the least cover of a bored pile: 60 mm above a diameter of 0.6 m, else 50 mm (EN 1536)."""
     return 0.060 if diameter_m > 0.6 else 0.050
 
 
@@ -102,10 +90,7 @@ def least_lap_clear_m(diameter_m: float) -> float:
 
 
 def lap_link_spacing_m(bar_m: float, link_m: float) -> float:
-    """Return the largest spacing of links along a lap (8.7.4).
-
-    It is 150 mm; the legs in each outer third have half the area of a lapped bar from 20 mm up.
-    """
+    """Return the largest spacing of links along a lap: 150 mm, half the bar's area in each outer third (8.7.4)."""
     count = ceil(bar_m**2 / 2 / link_m**2) if bar_m >= 0.020 else 1
     return min(lap_m(bar_m) / 3 / count, 0.150)
 
@@ -152,14 +137,9 @@ def column_link_spacing_m(bar_m: float, side_m: float) -> float:
     return min(20 * bar_m, side_m, 0.400)
 
 
-def beam_link_spacing_m(depth_m: float, width_m: float, link_m: float) -> float:
-    """Return the largest spacing of vertical links in a beam of an effective depth (9.2.2 (5), (6))."""
-    return min(0.75 * depth_m, area_m2(link_m, 2) / (LINK_STEEL * width_m))
-
-
-def beam_legs_m(depth_m: float) -> float:
-    """Return the largest distance of the legs of a beam's links: 0.75 d, 600 mm (9.2.2 (8))."""
-    return min(0.75 * depth_m, 0.600)
+def beam_link_spacing_m(depth_m: float) -> float:
+    """Return the largest spacing of a beam's links, and of their legs: 0.75 effective depths (9.2.2 (6), (8))."""
+    return 0.75 * depth_m
 
 
 def slab_spacing_m(thickness_m: float) -> float:
@@ -170,8 +150,3 @@ def slab_spacing_m(thickness_m: float) -> float:
 def wall_spacing_m(thickness_m: float) -> float:
     """Return the largest spacing of a wall's vertical bars: 3 h, 400 mm (9.6.2)."""
     return min(3 * thickness_m, 0.400)
-
-
-def wall_level_steel(upright_share: float) -> float:
-    """Return the least area of a wall's level bars: 25 % of the upright ones, 0.1 % (9.6.3 (1))."""
-    return max(0.25 * upright_share, 0.001)

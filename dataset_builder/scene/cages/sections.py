@@ -15,7 +15,6 @@ from dataset_builder.scene.cages.rules import (
     CONTACT_GAP_M,
     MOST_UNHELD_M,
     area_m2,
-    bundle_m,
     contact_m,
     hook_end_m,
     inside_link_m,
@@ -140,7 +139,7 @@ def bundled(bars: Sequence[DesignBar], section: Section) -> list[DesignBar]:
 
     Raises ``InfeasibleError`` if other bars are nearer than the diameter of one bar with the area of both.
     """
-    equivalent_m = bundle_m(section.bar_m)
+    equivalent_m = 2**0.5 * section.bar_m
     twins = []
     for bar, (inward_x, inward_y) in zip(bars[:4], section.inward(), strict=False):
         shift_m = contact_m(section.bar_m, section.bar_m) * np.array([inward_x, inward_y, 0.0])

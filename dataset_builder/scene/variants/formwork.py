@@ -240,66 +240,56 @@ def _waler_heights_m(top_m: float) -> list[float]:
     return [share * top_m for share in heights]
 
 
-SOFFIT_COVER_M, COLUMN_COVER_M = 0.035, 0.045
-"""Distances of a soffit from the steel above it, and of its end from the steel of the column."""
-ARM_FROM_M = 0.3
-"""Least length of steel beyond a column that rests on a soffit."""
-JOIST_M, BEARER_M = (0.06, 0.10), (0.08, 0.12)
-"""Sections (width, height) of the timbers along a soffit, and of those across, which lie on props."""
-BEARER_END_M, PROP_END_M = 0.12, 0.06
-"""Lengths of a bearer, and up to the middle of a prop, beyond the soffit."""
+SOFFIT_COVER_M, ARM_FROM_M = 0.035, 0.3
+"""Distance of a soffit from the steel above it, and the least length of an arm that rests on one."""
+JOIST_M, BEARER_M, BEARER_END_M = (0.06, 0.10), (0.08, 0.12), 0.12
+"""Sections (width, height) of timbers along and across a soffit, and the length of the latter beyond it."""
 
 
 def falsework(context: PlacementContext) -> tuple[Part, ...]:
-    """Return soffits on timbers and props below the arms, along x, of a cage that stands, with blocks on them."""
+    """Return soffits with blocks, on timbers and props, below the arms, along x, of a cage that stands."""
     if _is_lying(context):
         return ()
-    capsules = context.capsules
+    capsules, parts = context.capsules, list[Part]()
     ends_m = np.concatenate([capsules.a_m, capsules.b_m])
     radius_m = np.concatenate([capsules.radius_m, capsules.radius_m])[:, None]
-    foot_x = ends_m[ends_m[:, 2] < LEAST_COVER_M, 0]
-    parts: list[Part] = []
-    for side, sign in (("low", -1.0), ("high", 1.0)):
-        start_m = float((sign * foot_x).max()) + COLUMN_COVER_M
-        is_arm = sign * ends_m[:, 0] > start_m
-        if (sign * ends_m[:, 0]).max() < start_m + ARM_FROM_M:
-            continue
-        low_m, high_m = (ends_m - radius_m)[is_arm].min(axis=0), (ends_m + radius_m)[is_arm].max(axis=0)
-        (low_m if sign > 0 else high_m)[0] = sign * start_m
-        top_m = float(low_m[2]) - SOFFIT_COVER_M
-        parts += _soffit(f"falsework-{side}", low_m - SOFFIT_COVER_M, high_m + SOFFIT_COVER_M, top_m)
-        parts += blocks(context, low_m, high_m, top_m + _TIGHT_M)
+    is_foot = ends_m[:, 2] < LEAST_COVER_M
+    for sign in (-1.0, 1.0):
+        reach_m = sign * ends_m[:, 0]
+        start_m = float(reach_m[is_foot].max()) + STANDING_COVER_M
+        if reach_m.max() > start_m + ARM_FROM_M:
+            arm = reach_m > start_m
+            low_m, high_m = (ends_m - radius_m)[arm].min(axis=0), (ends_m + radius_m)[arm].max(axis=0)
+            (low_m if sign > 0 else high_m)[0] = sign * start_m
+            soffit_m = float(low_m[2]) - SOFFIT_COVER_M
+            parts += _soffit(Rect(low_m[:2], high_m[:2]).expanded(SOFFIT_COVER_M), soffit_m)
+            parts += blocks(context, low_m, high_m, soffit_m + _TIGHT_M)
     return tuple(parts)
 
 
-def _soffit(
-    name: str, low_m: Float64[ndarray, " 3"], high_m: Float64[ndarray, " 3"], top_m: float
-) -> tuple[Part, ...]:
-    """Return a sheet between two corners with its upper face at ``top_m``, and what carries it."""
-    (x, y), (end_x, end_y) = low_m[:2].tolist(), high_m[:2].tolist()
+def _soffit(rect: Rect, top_m: float) -> tuple[Part, ...]:
+    """Return a sheet with its upper face at ``top_m``, and what carries it."""
+    (x, y), (end_x, end_y) = rect.low_m.tolist(), rect.high_m.tolist()
     joist_m = top_m - SHEET_M - _TIGHT_M
     bearer_m = joist_m - JOIST_M[1] - _TIGHT_M
     prop_m = bearer_m - BEARER_M[1] - _TIGHT_M
-    low_y, high_y, inset_m = y - BEARER_END_M, end_y + BEARER_END_M, 0.15 * (end_x - x)
-    timbers = [
-        box((x, at, joist_m - JOIST_M[1]), (end_x, at + JOIST_M[0], joist_m)) for at in (y, end_y - JOIST_M[0])
-    ]
+    sheet = box((x, y, top_m - SHEET_M), (end_x, end_y, top_m))
+    joists_y = (y, end_y - JOIST_M[0])
+    timbers = [box((x, at, joist_m - JOIST_M[1]), (end_x, at + JOIST_M[0], joist_m)) for at in joists_y]
     props = []
-    for at in (x + inset_m, end_x - inset_m):
-        half_m = BEARER_M[0] / 2
-        timbers.append(box((at - half_m, low_y, bearer_m - BEARER_M[1]), (at + half_m, high_y, bearer_m)))
-        props += [_prop((at, place, GAP_M), prop_m - GAP_M) for place in (y - PROP_END_M, end_y + PROP_END_M)]
-    return (
-        surface(f"{name}-sheet", box((x, y, top_m - SHEET_M), (end_x, end_y, top_m)), "plywood"),
-        surface(f"{name}-timbers", merge_meshes(timbers), "timber"),
-        surface(f"{name}-props", merge_meshes(props), "red paint"),
-    )
+    for at in (0.85 * x + 0.15 * end_x, 0.15 * x + 0.85 * end_x):
+        low = (at - BEARER_M[0] / 2, y - BEARER_END_M, bearer_m - BEARER_M[1])
+        timbers.append(box(low, (at + BEARER_M[0] / 2, end_y + BEARER_END_M, bearer_m)))
+        props += [_prop((at, side, GAP_M), prop_m) for side in (y - BEARER_END_M / 2, end_y + BEARER_END_M / 2)]
+    pieces = {"sheet": (sheet, "plywood"), "timbers": (merge_meshes(timbers), "timber")}
+    pieces["props"] = (merge_meshes(props), "red paint")
+    return tuple(surface(f"falsework-{name}", *piece) for name, piece in pieces.items())
 
 
-def _prop(foot_m: Point, height_m: float) -> Mesh:
-    """Return a steel prop: a plate, a tube, a collar, and a thinner tube with a plate."""
-    collar_m, head_m = 0.6 * height_m, height_m - 0.008
-    outline = [(0.001, 0.0), (0.07, 0.0), (0.07, 0.008), (0.03, 0.008), (0.03, collar_m), (0.042, collar_m)]
-    outline += [(0.042, collar_m + 0.05), (0.024, collar_m + 0.05), (0.024, head_m), (0.06, head_m)]
-    outline += [(0.06, height_m), (0.001, height_m)]
+def _prop(foot_m: Point, top_m: float) -> Mesh:
+    """Return a steel prop: a plate, a tube, and a thinner tube with a plate."""
+    height_m = top_m - foot_m[2]
+    middle_m, head_m = 0.6 * height_m, height_m - 0.008
+    outline = [(0.001, 0.0), (0.07, 0.0), (0.07, 0.008), (0.03, 0.008), (0.03, middle_m), (0.024, middle_m)]
+    outline += [(0.024, head_m), (0.06, head_m), (0.06, height_m), (0.001, height_m)]
     return transformed(lathe(np.array(outline)), np.eye(3), foot_m)

@@ -80,10 +80,8 @@ def make_props(assembly: Assembly, spec: SceneSpec) -> tuple[Part, ...]:
     They are in the world frame, all with bar id ``NOT_STEEL``.
     """
     context = PlacementContext.from_assembly(assembly, spec)
-    parts: tuple[Part, ...] = ()
-    if context.is_life_size:
-        standing = falsework(context)
-        parts, context = (*supports(context), *standing), context.with_parts(standing)
+    parts = (*supports(context), *falsework(context)) if context.is_life_size else ()
+    context = context.with_parts(parts)
     for name, build_props in PROP_BUILDERS.items():
         if name in spec.appearance.variants:
             props = build_props(context)

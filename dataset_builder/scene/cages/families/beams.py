@@ -31,9 +31,9 @@ from dataset_builder.scene.cages.rules import (
     BEAM_STEEL,
     COVER_M,
     DIAMETERS_M,
+    LINK_STEEL,
     OPPOSITE_STEEL,
     area_m2,
-    beam_legs_m,
     beam_link_spacing_m,
     contact_m,
     inside_link_m,
@@ -106,9 +106,10 @@ def beam_bars(
     outer = _layer_m(section, bar_m, section.bars_x, side)
     inner_m = outer[0][1] + (2 * contact_m(bar_m, _spacer_m(bar_m)) if layout.two_layers else 0.0)
     effective_m = depth_m / 2 + abs(float(np.mean([y for _, y, _ in outer])) + inner_m) / 2
-    if 2 * section.link_half_m[0] > beam_legs_m(effective_m):
+    most_m = beam_link_spacing_m(effective_m)
+    if 2 * section.link_half_m[0] > most_m:
         raise InfeasibleError("links of a beam need more than two legs")
-    most_m = min(beam_link_spacing_m(effective_m, width_m, section.link_m), 0.30)
+    most_m = min(most_m, area_m2(section.link_m, 2) / (LINK_STEEL * width_m), 0.30)
     spacing_m = drawn_step(rng, 0.08, most_m, 0.01)
     steel_m2 = area_m2(bar_m, section.bars_x * (1 + layout.two_layers))
     share = steel_share(steel_m2, effective_m * width_m, BEAM_STEEL)

@@ -29,7 +29,6 @@ from dataset_builder.scene.cages.rules import (
     GROUND_COVER_M,
     PILE_CLEAR_M,
     area_m2,
-    bundle_m,
     column_link_spacing_m,
     lap_link_spacing_m,
     least_clear_m,
@@ -47,7 +46,6 @@ MOST_CLEAR_M = 0.300
 """Largest distance of main bars of a column (common practice)."""
 
 _EXTRAS = ("none", "none", "laps", "bundles")
-_ROUND_EXTRAS = ("none", "none", "none", "laps")
 
 
 def column(rng: np.random.Generator, shape: str) -> Design:
@@ -55,8 +53,8 @@ def column(rng: np.random.Generator, shape: str) -> Design:
     bar_m = drawn_of(rng, [d for d in DIAMETERS_M if 0.012 <= d <= 0.032])
     link_m = drawn_of(rng, link_diameters_m(bar_m))
     is_round = shape not in ("square", "rectangular")
-    extra = str(rng.choice(_ROUND_EXTRAS if is_round else _EXTRAS))
-    covered_m = bundle_m(bar_m) if extra == "bundles" else bar_m
+    extra = str(rng.choice(_EXTRAS[:3] if is_round else _EXTRAS))
+    covered_m = 2**0.5 * bar_m if extra == "bundles" else bar_m  # One bar of the same area (8.9.1 (2)).
     cover_m = drawn_cover_m(rng, COVER_M, link_m, covered_m)
     length_m = drawn_step(rng, 1.2, 3.0, 0.1)
     common: dict[str, float | str] = {"shape": shape, "bar_m": bar_m, "link_m": link_m, "cover_m": cover_m}
@@ -161,7 +159,7 @@ def pile_cage(rng: np.random.Generator, shape: str) -> Design:
     )
     stiffener_m = drawn_of(rng, [0.012, 0.016] if diameter_m < 0.6 else [0.016, 0.020, 0.025])
     bars += section.stiffeners(np.linspace(0.3, length_m - 0.3, 2 + int(length_m / 1.5)).tolist(), stiffener_m)
-    lies = bool(rng.random() < 0.7)
+    lies = bool(rng.random() < 0.7) or length_m > 4 * diameter_m
     if lies:
         bars = turned(bars, LYING, (-length_m / 2, 0.0, 0.0))
     drawn: dict[str, float | str] = {

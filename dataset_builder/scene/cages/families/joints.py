@@ -40,7 +40,6 @@ from dataset_builder.scene.cages.sections import LINK, Section, links_height_m, 
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
 from dataset_builder.scene.shapes.capsules import Clearances
 
-_COVER_M = (0.030, 0.050)
 _PASSING_M = 0.002
 """Clear distance of links of a column from the bars of the beam that they pass."""
 
@@ -52,7 +51,7 @@ def joint(rng: np.random.Generator, shape: str) -> Design:
     """Draw a column with a beam that is anchored in it or passes it; ties that the beam would cut are left out."""
     bar_m = drawn_of(rng, [0.016, 0.020, 0.025])
     link_m = drawn_of(rng, link_diameters_m(bar_m))
-    cover_m = drawn_cover_m(rng, _COVER_M, link_m, bar_m)
+    cover_m = drawn_cover_m(rng, (0.030, 0.050), link_m, bar_m)
     side_m = drawn_step(rng, 0.40, 0.60, 0.05)
     column = drawn_section(rng, bar_m, link_m, cover_m, side_m, side_m)
     share = column.column_steel_share(column.count)

@@ -27,7 +27,6 @@ LOWER, UPPER, CHAIR = "lower", "upper", "chair"
 _EDGE_M = 0.05
 """Distance of the outermost bars of a mat from the ends of the bars that cross them."""
 
-_COVER_M = (0.020, 0.040)
 _CHAIR_SPACING_M = 0.7
 _CLOSE_M = 0.150
 """Largest spacing of bars of which a chair carries two, or stands on two, instead of one."""
@@ -41,7 +40,7 @@ def slab(rng: np.random.Generator, shape: str) -> Design:
     thickness_m = drawn_step(rng, 0.16, 0.40, 0.01)
     side_x_m, side_y_m = drawn_step(rng, 1.0, 2.4, 0.1), drawn_step(rng, 1.0, 2.4, 0.1)
     bar_m = drawn_of(rng, [d for d in DIAMETERS_M if 0.008 <= d <= 0.016])
-    cover_m = drawn_cover_m(rng, _COVER_M, bar_m, 0.0)
+    cover_m = drawn_cover_m(rng, (0.020, 0.040), bar_m, 0.0)
     effective_m = thickness_m - cover_m - bar_m / 2
     most_m = min(0.25, slab_spacing_m(thickness_m), area_m2(bar_m) / (SLAB_STEEL[0] * effective_m))
     spacing_m = drawn_step(rng, 0.10, most_m, 0.025)

@@ -32,7 +32,6 @@ from dataset_builder.scene.cages.rules import (
     area_m2,
     contact_m,
     lap_m,
-    wall_level_steel,
     wall_spacing_m,
 )
 from dataset_builder.scene.cages.sections import TIE, held_tie_m
@@ -71,7 +70,7 @@ def wall(rng: np.random.Generator, shape: str) -> Design:
         edge_x = end_x - level_m / 2 - max(bend_radius_m(level_m), contact_m(level_m, upright_m))
     columns = spaced(-edge_x, edge_x, spacing_m)
     upright_share = steel_share(upright_m2, columns[1] - columns[0], WALL_STEEL)
-    most_m = min(0.30, level_m2 / wall_level_steel(upright_share))
+    most_m = min(0.30, level_m2 / max(0.25 * upright_share, 0.001))  # EN 1992-1-1, 9.6.3 (1).
     level_spacing_m = drawn_step(rng, 0.10, most_m, 0.025)
     level_y = thickness_m / 2 - cover_m - level_m / 2
     upright_y = level_y - contact_m(level_m, upright_m)
@@ -99,9 +98,7 @@ def wall(rng: np.random.Generator, shape: str) -> Design:
     if shape == "laps":
         lap = Lap(upright_m, level_m, drawn_step(rng, 0.01, 0.06, 0.01))
         drawn["lap_start_m"] = lap.start_m
-        across = lap.levels_m(rows[0], level_spacing_m)
-        if across[-1] + 0.3 > rows[-1]:
-            raise InfeasibleError("the member is too short for laps")
+        across = lap.levels_m(rows[0], rows[-1], level_spacing_m)
         rows = [*across[:-1], *spaced(across[-1], rows[-1], level_spacing_m)]
         inward = [(0.0, -float(np.sign(bar.line_m[0, 1]))) for bar in uprights]
         uprights = lapped(uprights, inward, lap)
