@@ -139,10 +139,7 @@ _BEYOND_M = 0.09
 
 @dataclass(frozen=True)
 class Lap:
-    """Lap of upright bars with starters of the same diameter, which stand inside of them.
-
-    ``cross_m`` is the diameter of the bars across it, ``start_m`` the height of the feet of the upright bars.
-    """
+    """Lap of upright bars with starters inside of them: diameters of both and of bars across, height of the feet."""
 
     bar_m: float
     cross_m: float

@@ -42,11 +42,9 @@ Those of beams and slabs are for the bars at the side in tension and the effecti
 steel would need links as columns do (9.6.4 (1)).
 """
 
-OPPOSITE_STEEL = 0.25
-"""Least area of a beam's bars at the other side per area of the main bars (9.2.1.2 (1), 9.2.1.4 (1))."""
-
-LINK_STEEL = 0.00088
-"""Least area of the legs of a beam's links per area of concrete between links (9.2.2 (5))."""
+OPPOSITE_STEEL, LINK_STEEL = 0.25, 0.00088
+"""Least areas in a beam: bars at the other side per area of the main bars (9.2.1.2 (1), 9.2.1.4 (1)), and legs of
+links per area of concrete between links (9.2.2 (5))."""
 
 MOST_UNHELD_M = 0.150
 """Largest distance of a compressed bar of a column from one in the bend of a link or tie (9.5.3 (6))."""

@@ -4,7 +4,6 @@ Two panels with battens stand on adjacent sides of the steel. Formwork that fits
 of its bounding box. Its sheets, up to 2.5 m long, are held by studs, walers and, where they are high, raking
 struts of timber. Two adjacent sides are closed for a cage that stands or is deep, three for a flat one, which is
 seen from above. A cage that is cast lying gets a base, except on the deck, which is one.
-
 The arms of a beam at a standing column rest on falsework, which belongs to the cage and is no variant.
 """
 
@@ -240,8 +239,8 @@ def _waler_heights_m(top_m: float) -> list[float]:
     return [share * top_m for share in heights]
 
 
-SOFFIT_COVER_M, ARM_FROM_M = 0.035, 0.3
-"""Distance of a soffit from the steel above it, and the least length of an arm that rests on one."""
+SOFFIT_COVER_M, ARM_START_M, ARM_FROM_M = 0.035, 0.11, 0.3
+"""Distance of a soffit from the steel above it; start of an arm beyond a column's feet, and its least length."""
 JOIST_M, BEARER_M, BEARER_END_M = (0.06, 0.10), (0.08, 0.12), 0.12
 """Sections (width, height) of timbers along and across a soffit, and the length of the latter beyond it."""
 
@@ -256,18 +255,19 @@ def falsework(context: PlacementContext) -> tuple[Part, ...]:
     is_foot = ends_m[:, 2] < LEAST_COVER_M
     for sign in (-1.0, 1.0):
         reach_m = sign * ends_m[:, 0]
-        start_m = float(reach_m[is_foot].max()) + STANDING_COVER_M
+        start_m = float(reach_m[is_foot].max()) + ARM_START_M
         if reach_m.max() > start_m + ARM_FROM_M:
             arm = reach_m > start_m
             low_m, high_m = (ends_m - radius_m)[arm].min(axis=0), (ends_m + radius_m)[arm].max(axis=0)
             (low_m if sign > 0 else high_m)[0] = sign * start_m
             soffit_m = float(low_m[2]) - SOFFIT_COVER_M
-            parts += _soffit(Rect(low_m[:2], high_m[:2]).expanded(SOFFIT_COVER_M), soffit_m)
-            parts += blocks(context, low_m, high_m, soffit_m + _TIGHT_M)
+            name = f"falsework-{len(parts)}"
+            parts += _soffit(name, Rect(low_m[:2], high_m[:2]).expanded(SOFFIT_COVER_M), soffit_m)
+            parts += blocks(f"{name}-blocks", context, low_m, high_m, soffit_m + _TIGHT_M)
     return tuple(parts)
 
 
-def _soffit(rect: Rect, top_m: float) -> tuple[Part, ...]:
+def _soffit(name: str, rect: Rect, top_m: float) -> tuple[Part, ...]:
     """Return a sheet with its upper face at ``top_m``, and what carries it."""
     (x, y), (end_x, end_y) = rect.low_m.tolist(), rect.high_m.tolist()
     joist_m = top_m - SHEET_M - _TIGHT_M
@@ -283,7 +283,7 @@ def _soffit(rect: Rect, top_m: float) -> tuple[Part, ...]:
         props += [_prop((at, side, GAP_M), prop_m) for side in (y - BEARER_END_M / 2, end_y + BEARER_END_M / 2)]
     pieces = {"sheet": (sheet, "plywood"), "timbers": (merge_meshes(timbers), "timber")}
     pieces["props"] = (merge_meshes(props), "red paint")
-    return tuple(surface(f"falsework-{name}", *piece) for name, piece in pieces.items())
+    return tuple(surface(f"{name}-{piece}", *what) for piece, what in pieces.items())
 
 
 def _prop(foot_m: Point, top_m: float) -> Mesh:

@@ -154,11 +154,15 @@ def supports(context: PlacementContext) -> tuple[Part, ...]:
     """Return the blocks as one part, or nothing for a cage that stands or lies on the ground."""
     if context.low_m[2] < LEAST_COVER_M:
         return ()
-    return blocks(context, context.low_m, context.high_m, 1.5 * GAP_M)
+    return blocks("supports", context, context.low_m, context.high_m, 1.5 * GAP_M)
 
 
 def blocks(
-    context: PlacementContext, low_m: Float64[ndarray, " 3"], high_m: Float64[ndarray, " 3"], foot_m: float
+    name: str,
+    context: PlacementContext,
+    low_m: Float64[ndarray, " 3"],
+    high_m: Float64[ndarray, " 3"],
+    foot_m: float,
 ) -> tuple[Part, ...]:
     """Return blocks from the height ``foot_m`` up to the lowest steel of a box, as one part, or nothing."""
     below = _points_below_bars(context.capsules, low_m[2], 0.5 * (foot_m + low_m[2]))
@@ -178,7 +182,7 @@ def blocks(
         box((x - BLOCK_HALF_M, y - BLOCK_HALF_M, foot_m), (x + BLOCK_HALF_M, y + BLOCK_HALF_M, z))
         for x, y, z in (top_m.tolist() for top_m in tops_m)
     ]
-    return (surface("supports", merge_meshes(meshes), "concrete"),) if meshes else ()
+    return (surface(name, merge_meshes(meshes), "concrete"),) if meshes else ()
 
 
 def _places_m(low_m: Float64[ndarray, " 3"], high_m: Float64[ndarray, " 3"]) -> Float64[ndarray, "n 2"]:

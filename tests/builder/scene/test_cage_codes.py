@@ -267,7 +267,7 @@ def check_beam(bars: Sequence[DesignBar], size_m: tuple[float, float], low_m: fl
     heights = places(tension, middle)[:, 1] - low_m
     effective_m = float((heights if hogging else depth_m - heights).mean())
     share = area_m2(tension) / (width_m * effective_m)
-    assert LEAST_TENSION <= share  # 9.2.1.1 (1)
+    assert share >= LEAST_TENSION  # 9.2.1.1 (1)
     assert area_m2(tension) <= 0.04 * width_m * depth_m  # 9.2.1.1 (3)
     assert area_m2(other) >= (0.25 if hogging else 0.15) * area_m2(tension)  # 9.2.1.4 (1), 9.2.1.2 (1)
     check_hooks(links, 270)
