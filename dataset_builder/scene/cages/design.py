@@ -139,7 +139,7 @@ _BEYOND_M = 0.09
 
 @dataclass(frozen=True)
 class Lap:
-    """Lap of upright bars with starters inside of them: diameters of both and of bars across, height of the feet."""
+    """Lap of upright bars with starters inside of them: diameters of both and of bars across, height of feet."""
 
     bar_m: float
     cross_m: float
@@ -169,7 +169,8 @@ def link_levels_m(
     """
     first, last = _FREE_END_M, length_m - _FREE_END_M
     levels = [first] if lap is None else lap.levels_m(first, last, dense_spacing_m)
-    low, high = max(levels[-1], first + dense_m), last - dense_m
+    high, more = last - dense_m, np.ceil((first + dense_m - levels[-1]) / dense_spacing_m)
+    low = levels[-1] + dense_spacing_m * max(0.0, float(more))
     if high - low < spacing_m:
         return [*levels[:-1], *spaced(levels[-1], last, dense_spacing_m)]
     levels = [*levels[:-1], *spaced(levels[-1], low, dense_spacing_m)]

@@ -259,7 +259,7 @@ def check_beam(bars: Sequence[DesignBar], size_m: tuple[float, float], low_m: fl
             line_m[:, 1] - low_m,
             low_m + depth_m - line_m[:, 1],
         ]
-        return np.min(faces, axis=0)
+        return np.asarray(np.min(faces, axis=0))
 
     check_cover([*along, *links], cover_depth_m)
     check_clear(along, middle)
