@@ -34,7 +34,6 @@ LINK_SLACK_M = 0.003
 """Clear distance by which links are wider than the bars that they hold: links are bent to within 5 mm (tolerance
 of BS 8666 for sides up to 1 m, from a secondary source)."""
 
-
 COLUMN_STEEL, BEAM_STEEL, WALL_STEEL, SLAB_STEEL = (0.002, 0.04), (0.00151, 0.04), (0.002, 0.02), (0.00151, 0.04)
 """Least and largest areas of main bars per area of concrete (9.5.2, 9.2.1.1, 9.6.2, 9.3.1.1).
 

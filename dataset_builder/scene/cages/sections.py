@@ -252,12 +252,11 @@ class RoundSection:
 
     def counts(self, least_m: float, most_m: float) -> list[int]:
         """Return the numbers of main bars that are ``least_m`` apart or more, and along the circle ``most_m``."""
-        return [
-            count
-            for count in range(_LEAST_BARS, _MOST_BARS + 1)
-            if 2 * self.bar_radius_m * np.sin(np.pi / count) - self.bar_m >= least_m
-            and 2 * np.pi * self.bar_radius_m / count - self.bar_m <= most_m
+        across_m, counts = 2 * self.bar_radius_m, range(_LEAST_BARS, _MOST_BARS + 1)
+        clear_m = [
+            (n, across_m * np.sin(np.pi / n) - self.bar_m, np.pi * across_m / n - self.bar_m) for n in counts
         ]
+        return [count for count, chord_m, arc_m in clear_m if chord_m >= least_m and arc_m <= most_m]
 
     def outward(self) -> Float64[ndarray, "n 2"]:
         """Return the unit vectors (x, y) from the middle to the main bars."""

@@ -252,7 +252,7 @@ def falsework(context: PlacementContext) -> tuple[Part, ...]:
     capsules, parts = context.capsules, list[Part]()
     ends_m = np.concatenate([capsules.a_m, capsules.b_m])
     radius_m = np.concatenate([capsules.radius_m, capsules.radius_m])[:, None]
-    is_foot = ends_m[:, 2] < LEAST_COVER_M
+    is_foot = (ends_m - radius_m)[:, 2] < LEAST_COVER_M
     for sign in (-1.0, 1.0):
         reach_m = sign * ends_m[:, 0]
         start_m = float(reach_m[is_foot].max()) + ARM_START_M
@@ -272,7 +272,7 @@ def _soffit(name: str, rect: Rect, top_m: float) -> tuple[Part, ...]:
     (x, y), (end_x, end_y) = rect.low_m.tolist(), rect.high_m.tolist()
     joist_m = top_m - SHEET_M - _TIGHT_M
     bearer_m = joist_m - JOIST_M[1] - _TIGHT_M
-    prop_m = bearer_m - BEARER_M[1] - _TIGHT_M
+    prop_m = bearer_m - BEARER_M[1] - _TIGHT_M - GAP_M
     sheet = box((x, y, top_m - SHEET_M), (end_x, end_y, top_m))
     joists_y = (y, end_y - JOIST_M[0])
     timbers = [box((x, at, joist_m - JOIST_M[1]), (end_x, at + JOIST_M[0], joist_m)) for at in joists_y]
@@ -286,9 +286,8 @@ def _soffit(name: str, rect: Rect, top_m: float) -> tuple[Part, ...]:
     return tuple(surface(f"{name}-{piece}", *what) for piece, what in pieces.items())
 
 
-def _prop(foot_m: Point, top_m: float) -> Mesh:
+def _prop(foot_m: Point, height_m: float) -> Mesh:
     """Return a steel prop: a plate, a tube, and a thinner tube with a plate."""
-    height_m = top_m - foot_m[2]
     middle_m, head_m = 0.6 * height_m, height_m - 0.008
     outline = [(0.001, 0.0), (0.07, 0.0), (0.07, 0.008), (0.03, 0.008), (0.03, middle_m), (0.024, middle_m)]
     outline += [(0.024, head_m), (0.06, head_m), (0.06, height_m), (0.001, height_m)]

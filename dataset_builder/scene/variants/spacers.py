@@ -77,7 +77,7 @@ def _find_position(
         k = int(rng.choice(len(pieces), p=lengths / lengths.sum()))
         at_m = context.capsules.a_m[pieces[k]] + rng.uniform(0.02, 0.98) * along[k]
         direction = along[k] / lengths[k]
-        if lengths[k] < 4 * wheel.width_m or not _is_outside(context, at_m, wheel):
+        if lengths[k] < 4 * wheel.width_m or not _is_outside(context, at_m, direction, wheel):
             continue
         if len(wheel_centres_m) and np.linalg.norm(wheel_centres_m - at_m, axis=1).min() < 3 * wheel.rim_m:
             continue
@@ -86,9 +86,12 @@ def _find_position(
     return None
 
 
-def _is_outside(context: PlacementContext, at_m: Float64[ndarray, " 3"], wheel: Wheel) -> bool:
+def _is_outside(
+    context: PlacementContext, at_m: Float64[ndarray, " 3"], direction: Float64[ndarray, " 3"], wheel: Wheel
+) -> bool:
     """Return whether the wheel extends sideways beyond the box of the steel and stays above the ground."""
-    to_side_m = np.minimum(at_m - context.low_m, context.high_m - at_m)[:2].min()
+    is_end = context.is_life_size & (np.abs(direction[:2]) > 0.7)  # Bars of generated cages end at this side.
+    to_side_m = np.minimum(at_m - context.low_m, context.high_m - at_m)[:2].min(where=~is_end, initial=np.inf)
     return bool(to_side_m < wheel.rim_m and at_m[2] - np.hypot(wheel.rim_m, wheel.width_m) > GAP_M)
 
 

@@ -344,6 +344,19 @@ def test_arms_of_a_beam_rest_on_falsework(number: int) -> None:
 
 
 @pytest.mark.slow
+def test_wheels_keep_the_cover_of_a_pile_and_are_not_at_the_ends_of_its_bars() -> None:
+    cage = GeneratedCageSpec("train", 3, 7, "pile-cage")
+    assembly = make_assembly(cage)
+    low, high = box_of(assembly.vertices_m)
+    assert high[0] - low[0] > 1.5 * (high[1] - low[1]), "it lies along x"
+    for seed in range(8):
+        spec = SceneSpec("any", cage, None, appearance=AppearanceSpec(("spacers",)), seed=seed)
+        for wheel in named(make_props(assembly, spec), "spacer"):
+            lower, upper = box_of(wheel.mesh.vertices_m)
+            assert lower[1] < low[1] or upper[1] > high[1]
+
+
+@pytest.mark.slow
 @pytest.mark.parametrize("family", FORMWORK_FAMILIES)
 def test_sheets_stand_at_the_cover_and_leave_sides_open(family: str) -> None:
     low, high = box_of(steel(family).vertices_m)
