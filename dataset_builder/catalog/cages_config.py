@@ -95,6 +95,8 @@ def _variants(rng: np.random.Generator, environment: str, family: str) -> tuple[
     drawn = {name for name, share in _PROPS.items() if rng.random() < share}
     if family not in FORMWORK_FAMILIES:
         drawn.discard(FORMWORK)
+    if family == "slab":  # Its mats lie on blocks and chairs.
+        drawn.discard("spacers")
     if rng.random() < _SENSOR_SHARE:
         drawn.add(SENSOR)
     for slot in EXCLUSIVE_SLOTS:

@@ -29,7 +29,6 @@ AGGREGATE_M = 0.020
 CONTACT_GAP_M = 4e-4
 """Clear distance of bars that are tied to each other in a design, so that no surfaces coincide."""
 
-
 LINK_SLACK_M = 0.003
 """Clear distance by which links are wider than the bars that they hold: links are bent to within 5 mm (tolerance
 of BS 8666 for sides up to 1 m, from a secondary source)."""

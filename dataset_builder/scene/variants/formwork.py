@@ -274,9 +274,8 @@ def _soffit(name: str, rect: Rect, top_m: float) -> tuple[Part, ...]:
     bearer_m = joist_m - JOIST_M[1] - _TIGHT_M
     prop_m = bearer_m - BEARER_M[1] - _TIGHT_M - GAP_M
     sheet = box((x, y, top_m - SHEET_M), (end_x, end_y, top_m))
-    joists_y = (y, end_y - JOIST_M[0])
-    timbers = [box((x, at, joist_m - JOIST_M[1]), (end_x, at + JOIST_M[0], joist_m)) for at in joists_y]
-    props = []
+    low_m, props = joist_m - JOIST_M[1], []
+    timbers = [box((x, at, low_m), (end_x, at + JOIST_M[0], joist_m)) for at in (y, end_y - JOIST_M[0])]
     for at in (0.85 * x + 0.15 * end_x, 0.15 * x + 0.85 * end_x):
         low = (at - BEARER_M[0] / 2, y - BEARER_END_M, bearer_m - BEARER_M[1])
         timbers.append(box(low, (at + BEARER_M[0] / 2, end_y + BEARER_END_M, bearer_m)))
