@@ -35,6 +35,8 @@ _STREAM = 1
 
 _DEFAULT_SHARE = 0.3
 """Probabilities of the default light, and of the default steel; the variants share the rest equally."""
+_IN_GROUND = ("footing", "pile-cage")
+"""Families that are cast in the ground, and so are not on a deck."""
 FORMWORK = "formwork"
 _PROPS: Mapping[str, float] = {"clutter": 0.25, FORMWORK: 0.25, "spacers": 0.3, "tie-wire": 0.5}
 """Probability of each variant of props on and round the steel."""
@@ -67,7 +69,8 @@ def _scene(request: CagesRequest, number: int, seed: int) -> SceneConfigSpec:
 
     rng = np.random.default_rng([_STREAM, seed, SPLITS.index(request.split), number])
     family = drawn_family(request.split, number, seed)
-    environment = str(rng.choice(LIFE_SIZE_ENVIRONMENTS))
+    suitable = [name for name in LIFE_SIZE_ENVIRONMENTS if name != "deck" or family not in _IN_GROUND]
+    environment = str(rng.choice(suitable))
     variants = _variants(rng, environment, family)
     surface_seed, views_seed = (int(rng.integers(2**31)) for _ in range(2))
     scene = SceneSpec(
@@ -92,6 +95,8 @@ def _variants(rng: np.random.Generator, environment: str, family: str) -> tuple[
     drawn = {name for name, share in _PROPS.items() if rng.random() < share}
     if family not in FORMWORK_FAMILIES:
         drawn.discard(FORMWORK)
+    if family == "slab":  # Its mats lie on blocks and chairs.
+        drawn.discard("spacers")
     if rng.random() < _SENSOR_SHARE:
         drawn.add(SENSOR)
     for slot in EXCLUSIVE_SLOTS:

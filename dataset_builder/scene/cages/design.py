@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.scene.cages.rules import CRANK_SLOPE, contact_m, lap_m
+from dataset_builder.scene.cages.rules import contact_m, lap_link_spacing_m, lap_m, least_lap_clear_m
 from dataset_builder.scene.shapes.bending import bend_radius_m, bent_line_m
 
 Line = Float64[ndarray, "n 3"]
@@ -134,7 +134,7 @@ def drawn_step(rng: np.random.Generator, low_m: float, high_m: float, step_m: fl
 def drawn_of(rng: np.random.Generator, choices: Sequence[float]) -> float:
     """Return one of the choices. Raises ``InfeasibleError`` if there is none."""
     if not choices:
-        raise InfeasibleError("no diameter fits")
+        raise InfeasibleError("no choice fits")
     return float(choices[int(rng.integers(len(choices)))])
 
 
@@ -174,40 +174,31 @@ STARTER = "starter"
 _FREE_END_M = 0.05
 """Distance of the first and the last link from the ends of the main bars."""
 
-_STRAIGHT_M = 0.02
-"""Straight length of a cranked bar beyond its lap."""
-
-_BESIDE_CRANK_M = 0.02
-"""Distance of links from the ends of starters and of cranks."""
+_BEYOND_M = 0.09
+"""Length beside each other beyond a lap, so that bars across are past both of its ends (EN 1992-1-1, 8.7.4.2)."""
 
 
 @dataclass(frozen=True)
 class Lap:
-    """Lap of upright bars with starters of the same diameter: the heights between which they lie side by side."""
+    """Lap of upright bars with starters inside of them: diameters of both and of bars across, height of feet."""
 
     bar_m: float
+    cross_m: float
     start_m: float
 
     @property
     def end_m(self) -> float:
         """Height of the ends of the starters."""
-        return self.start_m + lap_m(self.bar_m)
+        return self.start_m + lap_m(self.bar_m) + _BEYOND_M
 
-    @property
-    def crank_m(self) -> tuple[float, float]:
-        """Heights of both ends of the cranks, between which the bars come to the places of the starters."""
-        first_m = self.end_m + _STRAIGHT_M
-        return first_m, first_m + contact_m(self.bar_m, self.bar_m) / CRANK_SLOPE
+    def levels_m(self, first_m: float, last_m: float, spacing_m: float) -> list[float]:
+        """Return levels of the bars across the lap, from the first one up to the ends of the starters.
 
-    def levels_m(self, first_m: float, last_m: float, spacing_m: float) -> tuple[list[float], list[float]]:
-        """Return levels of bars in contact with the starters, and of those in contact with the bars above them.
-
-        Raises ``InfeasibleError`` if the bars are too short for the lap.
+        Raises ``InfeasibleError`` if these are near the last level.
         """
-        low, high = self.end_m - _BESIDE_CRANK_M, self.crank_m[1] + _BESIDE_CRANK_M
-        if high + 0.3 > last_m:
+        if self.end_m + 0.3 > last_m:
             raise InfeasibleError("the member is too short for laps")
-        return spaced(first_m, low, spacing_m), spaced(high, last_m, spacing_m)
+        return spaced(first_m, self.end_m, min(spacing_m, lap_link_spacing_m(self.bar_m, self.cross_m)))
 
 
 def link_levels_m(
@@ -218,43 +209,35 @@ def link_levels_m(
     They are dense along a lap as well. Raises ``InfeasibleError`` as ``Lap.levels_m``.
     """
     first, last = _FREE_END_M, length_m - _FREE_END_M
-    if lap is not None:
-        dense, above = lap.levels_m(first, last, dense_spacing_m)
-        return [*dense, *_dense_at_last(above[0], last, spacing_m, dense_m, dense_spacing_m)]
-    if last - first < 2 * dense_m + spacing_m:
-        return spaced(first, last, dense_spacing_m)
-    start = spaced(first, first + dense_m, dense_spacing_m)
-    return [*start[:-1], *_dense_at_last(first + dense_m, last, spacing_m, dense_m, dense_spacing_m)]
-
-
-def _dense_at_last(
-    first_m: float, last_m: float, spacing_m: float, dense_m: float, dense_spacing_m: float
-) -> list[float]:
-    """Return levels that are ``dense_spacing_m`` apart along ``dense_m`` at the upper end."""
-    if last_m - first_m < dense_m + spacing_m:
-        return spaced(first_m, last_m, dense_spacing_m)
-    middle = spaced(first_m, last_m - dense_m, spacing_m)
-    return [*middle[:-1], *spaced(last_m - dense_m, last_m, dense_spacing_m)]
+    levels = [first] if lap is None else lap.levels_m(first, last, dense_spacing_m)
+    high, more = last - dense_m, np.ceil((first + dense_m - levels[-1]) / dense_spacing_m)
+    low = levels[-1] + dense_spacing_m * max(0.0, float(more))
+    if high - low < spacing_m:
+        return [*levels[:-1], *spaced(levels[-1], last, dense_spacing_m)]
+    levels = [*levels[:-1], *spaced(levels[-1], low, dense_spacing_m)]
+    return [*levels[:-1], *spaced(low, high, spacing_m)[:-1], *spaced(high, last, dense_spacing_m)]
 
 
 def lapped(bars: Sequence[DesignBar], inward: Sequence[tuple[float, float]], lap: Lap) -> list[DesignBar]:
-    """Return each upright bar as one that laps with a starter.
+    """Return each upright bar as one that laps with a starter inside of it, in the direction ``inward`` (x, y).
 
-    Starters are in the places of the bars, in the links. Each bar starts inside of its starter, in the direction
-    ``inward`` (x, y), and is cranked above the lap, so that the links hold it from there on. Both stay in their
-    places along the side, so that they remain tied to each other.
+    Both stay in their places along the side, so that they remain tied to each other. Raises ``InfeasibleError`` if
+    laps are too close to each other.
     """
     made = []
-    for bar, (inward_x, inward_y) in zip(bars, inward, strict=True):
-        foot, height_m, diameter_m = bar.line_m[0], float(bar.line_m[-1, 2]), bar.diameter_m
-        starter_m = straight(foot, (*foot[:2], lap.end_m))
-        inside = foot + contact_m(diameter_m, diameter_m) * np.array([inward_x, inward_y, 0.0])
-        heights_m = zip((inside, inside, foot, foot), (lap.start_m, *lap.crank_m, height_m), strict=True)
-        line_m: Line = bent([(*place[:2], z) for place, z in heights_m], diameter_m)
+    for bar, direction in zip(bars, inward, strict=True):
+        foot, top = bar.line_m
+        inside = foot + contact_m(bar.diameter_m, bar.diameter_m) * np.array([*direction, 0.0])
+        starter_m = straight(inside, (*inside[:2], lap.end_m))
         made += [
             replace(bar, role=STARTER, line_m=starter_m, spaced_along=None),
-            replace(bar, line_m=line_m, spaced_along=None),
+            replace(bar, line_m=straight((*foot[:2], lap.start_m), top), spaced_along=None),
         ]
+    places = np.array([bar.line_m[0, :2] for bar in made])
+    apart_m = np.linalg.norm(places[:, None] - places[None], axis=2) - lap.bar_m
+    other = np.arange(len(made)) // 2
+    if apart_m[other[:, None] != other].min() < least_lap_clear_m(lap.bar_m):
+        raise InfeasibleError("laps are too close to each other")
     return made
 
 

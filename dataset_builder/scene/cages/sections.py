@@ -115,9 +115,9 @@ class Section:
 
     def needs_ties(self) -> bool:
         """Return True if bars along a side are too far from the corners to be held by the links."""
-        (corner_x, corner_y), (along_x, along_y) = self.half_m(self.bar_m)[0], self.along_m()
-        unheld_m = [corner_x - abs(x) for x in along_x] + [corner_y - abs(y) for y in along_y]
-        return max(unheld_m, default=0.0) > MOST_UNHELD_M
+        places = np.array(self.places_m())
+        apart_m = np.linalg.norm(places[:, None] - places[None, :4], axis=2)
+        return bool(apart_m.min(axis=1).max() > MOST_UNHELD_M)
 
 
 def main_bars(section: Section, length_m: float) -> list[DesignBar]:
@@ -221,8 +221,8 @@ SPIRAL, STIFFENER = "spiral", "stiffener"
 _CLOSED_TURNS = 1.5
 """Closed turns at each end of a spiral (ACI 318-19, 25.7.3.4, from a secondary source)."""
 
-_LEAST_BARS = 6
-"""Least number of main bars, of which none is ever left out."""
+_LEAST_BARS, _MOST_BARS = 6, 18
+"""Least number of main bars, of which none is ever left out (EN 1992-1-1, 9.8.5 (3)), and largest number."""
 
 
 @dataclass(frozen=True)
@@ -233,7 +233,7 @@ class RoundSection:
     cover_m: float
     link_m: float
     bar_m: float
-    bars: int
+    bars: int = _LEAST_BARS
 
     @property
     def concrete_m2(self) -> float:
@@ -250,11 +250,13 @@ class RoundSection:
         """Radius of the circle of the main bars' axes."""
         return self.link_radius_m - inside_link_m(self.link_m, self.bar_m)
 
-    def check(self, most_clear_m: float) -> None:
-        """Raise ``InfeasibleError`` unless the clear distance of the bars is from the least one to this one."""
-        between_m = 2 * self.bar_radius_m * np.sin(np.pi / self.bars) - self.bar_m
-        if not least_clear_m(self.bar_m) <= between_m <= most_clear_m:
-            raise InfeasibleError("bars of a round section are too close or too far apart")
+    def counts(self, least_m: float, most_m: float) -> list[int]:
+        """Return the numbers of main bars that are ``least_m`` apart or more, and along the circle ``most_m``."""
+        across_m, counts = 2 * self.bar_radius_m, range(_LEAST_BARS, _MOST_BARS + 1)
+        clear_m = [
+            (n, across_m * np.sin(np.pi / n) - self.bar_m, np.pi * across_m / n - self.bar_m) for n in counts
+        ]
+        return [count for count, chord_m, arc_m in clear_m if chord_m >= least_m and arc_m <= most_m]
 
     def outward(self) -> Float64[ndarray, "n 2"]:
         """Return the unit vectors (x, y) from the middle to the main bars."""

@@ -118,8 +118,8 @@ than the hall and the deck have.
 LIFE_SIZE_ENVIRONMENTS = ("outdoors", "hall", "deck")
 """Environments with room for life-size cages and cameras up to 8 m from them; on the deck, up to its rim."""
 
-FORMWORK_FAMILIES = ("column", "beam", "wall", "slab", "footing")
-"""Families of generated cages that ``formwork`` suits: the others are cast in the ground, or in stages."""
+FORMWORK_FAMILIES = ("beam", "wall", "slab", "footing")
+"""Families of generated cages that ``formwork`` suits: others are round, or cast in the ground or in stages."""
 
 
 def check_suitable(environment: str, variants: Iterable[str]) -> None:

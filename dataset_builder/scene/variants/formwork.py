@@ -4,6 +4,7 @@ Two panels with battens stand on adjacent sides of the steel. Formwork that fits
 of its bounding box. Its sheets, up to 2.5 m long, are held by studs, walers and, where they are high, raking
 struts of timber. Two adjacent sides are closed for a cage that stands or is deep, three for a flat one, which is
 seen from above. A cage that is cast lying gets a base, except on the deck, which is one.
+The arms of a beam at a standing column rest on falsework, which belongs to the cage and is no variant.
 """
 
 from __future__ import annotations
@@ -16,8 +17,9 @@ from numpy import ndarray
 
 from dataset_builder.scene.cages.design import LEAST_COVER_M
 from dataset_builder.scene.model import Mesh, Part, surface
-from dataset_builder.scene.shapes.solids import box, rotation_about_z, transformed
+from dataset_builder.scene.shapes.solids import Point, box, lathe, merge_meshes, rotation_about_z, transformed
 from dataset_builder.scene.variants.context import GAP_M, PlacementContext, Rect
+from dataset_builder.scene.variants.spacers import blocks
 
 PANEL_WIDTHS = (0.8, 0.5)
 """Widths of the scaled panels, as fractions of the side of the steel at which they stand."""
@@ -236,3 +238,57 @@ def _waler_heights_m(top_m: float) -> list[float]:
         return [0.5 * top_m]
     heights: list[float] = np.linspace(0.18, 0.86, max(2, round(top_m / 0.8))).tolist()
     return [share * top_m for share in heights]
+
+
+SOFFIT_COVER_M, ARM_START_M, ARM_FROM_M = 0.035, 0.11, 0.3
+"""Distance of a soffit from the steel above it; start of an arm beyond a column's feet, and its least length."""
+JOIST_M, BEARER_M, BEARER_END_M = (0.06, 0.10), (0.08, 0.12), 0.12
+"""Sections (width, height) of timbers along and across a soffit, and the length of the latter beyond it."""
+
+
+def falsework(context: PlacementContext) -> tuple[Part, ...]:
+    """Return soffits with blocks, on timbers and props, below the arms, along x, of a cage that stands."""
+    if _is_lying(context):
+        return ()
+    capsules, parts = context.capsules, list[Part]()
+    ends_m = np.concatenate([capsules.a_m, capsules.b_m])
+    radius_m = np.concatenate([capsules.radius_m, capsules.radius_m])[:, None]
+    is_foot = (ends_m - radius_m)[:, 2] < LEAST_COVER_M
+    for sign in (-1.0, 1.0):
+        reach_m = sign * ends_m[:, 0]
+        start_m = float(reach_m[is_foot].max()) + ARM_START_M
+        if reach_m.max() > start_m + ARM_FROM_M:
+            arm = reach_m > start_m
+            low_m, high_m = (ends_m - radius_m)[arm].min(axis=0), (ends_m + radius_m)[arm].max(axis=0)
+            (low_m if sign > 0 else high_m)[0] = sign * start_m
+            soffit_m = float(low_m[2]) - SOFFIT_COVER_M
+            name = f"falsework-{len(parts)}"
+            parts += _soffit(name, Rect(low_m[:2], high_m[:2]).expanded(SOFFIT_COVER_M), soffit_m)
+            parts += blocks(f"{name}-blocks", context, low_m, high_m, soffit_m + _TIGHT_M)
+    return tuple(parts)
+
+
+def _soffit(name: str, rect: Rect, top_m: float) -> tuple[Part, ...]:
+    """Return a sheet with its upper face at ``top_m``, and what carries it."""
+    (x, y), (end_x, end_y) = rect.low_m.tolist(), rect.high_m.tolist()
+    joist_m = top_m - SHEET_M - _TIGHT_M
+    bearer_m = joist_m - JOIST_M[1] - _TIGHT_M
+    prop_m = bearer_m - BEARER_M[1] - _TIGHT_M - GAP_M
+    sheet = box((x, y, top_m - SHEET_M), (end_x, end_y, top_m))
+    low_m, props = joist_m - JOIST_M[1], []
+    timbers = [box((x, at, low_m), (end_x, at + JOIST_M[0], joist_m)) for at in (y, end_y - JOIST_M[0])]
+    for at in (0.85 * x + 0.15 * end_x, 0.15 * x + 0.85 * end_x):
+        low = (at - BEARER_M[0] / 2, y - BEARER_END_M, bearer_m - BEARER_M[1])
+        timbers.append(box(low, (at + BEARER_M[0] / 2, end_y + BEARER_END_M, bearer_m)))
+        props += [_prop((at, side, GAP_M), prop_m) for side in (y - BEARER_END_M / 2, end_y + BEARER_END_M / 2)]
+    pieces = {"sheet": (sheet, "plywood"), "timbers": (merge_meshes(timbers), "timber")}
+    pieces["props"] = (merge_meshes(props), "red paint")
+    return tuple(surface(f"{name}-{piece}", *what) for piece, what in pieces.items())
+
+
+def _prop(foot_m: Point, height_m: float) -> Mesh:
+    """Return a steel prop: a plate, a tube, and a thinner tube with a plate."""
+    middle_m, head_m = 0.6 * height_m, height_m - 0.008
+    outline = [(0.001, 0.0), (0.07, 0.0), (0.07, 0.008), (0.03, 0.008), (0.03, middle_m), (0.024, middle_m)]
+    outline += [(0.024, head_m), (0.06, head_m), (0.06, height_m), (0.001, height_m)]
+    return transformed(lathe(np.array(outline)), np.eye(3), foot_m)

@@ -1,10 +1,10 @@
 """Props of the appearance variants: surfaces around the steel that are not steel.
 
 Props are computed only from the bars and the bounding box of the steel, scale with them, and are reproducible for
-a seed. Generated cages are life-size: their formwork and clutter have real sizes, and blocks support those that do
-not stand on the ground. The builders run in a fixed order; each receives the ground regions occupied by the
-earlier ones. Only supports, tie wire and spacers are placed inside the bounding box of the steel; they stay
-outside the envelope of every bar.
+a seed. Generated cages are life-size: their formwork and clutter have real sizes; blocks support those that do not
+stand on the ground, and falsework the arms of beams. The builders run in a fixed order; each receives the ground
+regions occupied by the earlier ones. Only supports, tie wire and spacers are placed inside the bounding box of the
+steel; they stay outside the envelope of every bar.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from dataset_builder.scene.model import Assembly, Part, surface
 from dataset_builder.scene.shapes.solids import box, merge_meshes, transformed
 from dataset_builder.scene.variants.clutter import clutter
 from dataset_builder.scene.variants.context import GAP_M, PlacementContext
-from dataset_builder.scene.variants.formwork import formwork
+from dataset_builder.scene.variants.formwork import falsework, formwork
 from dataset_builder.scene.variants.registry import SCREEN_DISTANCE, SHADOWS, SUN_FROM
 from dataset_builder.scene.variants.spacers import spacers, supports
 from dataset_builder.scene.variants.tie_wire import tie_wire
@@ -75,12 +75,13 @@ PROP_BUILDERS: Mapping[str, Callable[[PlacementContext], tuple[Part, ...]]] = {
 
 
 def make_props(assembly: Assembly, spec: SceneSpec) -> tuple[Part, ...]:
-    """Return the props requested by ``spec.appearance``, and the supports of a generated cage.
+    """Return the props requested by ``spec.appearance``, and what carries a generated cage.
 
     They are in the world frame, all with bar id ``NOT_STEEL``.
     """
     context = PlacementContext.from_assembly(assembly, spec)
-    parts = supports(context) if context.is_life_size else ()
+    parts = (*supports(context), *falsework(context)) if context.is_life_size else ()
+    context = context.with_parts(parts)
     for name, build_props in PROP_BUILDERS.items():
         if name in spec.appearance.variants:
             props = build_props(context)

@@ -78,7 +78,7 @@ def _find_position(
         k = int(rng.choice(len(pieces), p=lengths / lengths.sum()))
         at_m = context.capsules.a_m[pieces[k]] + rng.uniform(0.02, 0.98) * along[k]
         direction = along[k] / lengths[k]
-        if lengths[k] < 4 * wheel.width_m or not _is_outside(context, at_m, wheel):
+        if lengths[k] < 4 * wheel.width_m or not _is_outside(context, at_m, direction, wheel):
             continue
         if len(wheel_centres_m) and np.linalg.norm(wheel_centres_m - at_m, axis=1).min() < 3 * wheel.rim_m:
             continue
@@ -87,9 +87,12 @@ def _find_position(
     return None
 
 
-def _is_outside(context: PlacementContext, at_m: Float64[ndarray, " 3"], wheel: Wheel) -> bool:
+def _is_outside(
+    context: PlacementContext, at_m: Float64[ndarray, " 3"], direction: Float64[ndarray, " 3"], wheel: Wheel
+) -> bool:
     """Return whether the wheel extends sideways beyond the box of the steel and stays above the ground."""
-    to_side_m = np.minimum(at_m - context.low_m, context.high_m - at_m)[:2].min()
+    is_end = context.is_life_size & (np.abs(direction[:2]) > 0.7)  # Bars of generated cages end at this side.
+    to_side_m = np.minimum(at_m - context.low_m, context.high_m - at_m)[:2].min(where=~is_end, initial=np.inf)
     return bool(to_side_m < wheel.rim_m and at_m[2] - np.hypot(wheel.rim_m, wheel.width_m) > GAP_M)
 
 
@@ -155,40 +158,51 @@ def supports(context: PlacementContext) -> tuple[Part, ...]:
     """Return the blocks as one part, or nothing for a cage that stands or lies on the ground."""
     if context.low_m[2] < LEAST_COVER_M:
         return ()
-    below = _points_below_bars(context)
-    blocks: list[Float64[ndarray, " 3"]] = []
-    for place_m in _places_m(context):
+    return blocks("supports", context, context.low_m, context.high_m, 1.5 * GAP_M)
+
+
+def blocks(
+    name: str,
+    context: PlacementContext,
+    low_m: Float64[ndarray, " 3"],
+    high_m: Float64[ndarray, " 3"],
+    foot_m: float,
+) -> tuple[Part, ...]:
+    """Return blocks from the height ``foot_m`` up to the lowest steel of a box, as one part, or nothing."""
+    below = _points_below_bars(context.capsules, low_m[2], 0.5 * (foot_m + low_m[2]))
+    below = below[((below[:, :2] >= low_m[:2]) & (below[:, :2] <= high_m[:2])).all(axis=1)]
+    tops_m: list[Float64[ndarray, " 3"]] = []
+    for place_m in _places_m(low_m, high_m):
         distance_m = np.hypot(*(below[:, :2] - place_m).T)
         distance_m[below[:, 2] > below[distance_m < _REACH_M, 2].min(initial=np.inf) + _LAYER_M] = np.inf
         for index in np.argsort(distance_m, kind="stable"):
             top_m = below[index]
             if distance_m[index] > _REACH_M:
                 break
-            is_apart = all(np.abs(top_m - other)[:2].max() > 3 * BLOCK_HALF_M for other in blocks)
+            is_apart = all(np.abs(top_m - other)[:2].max() > 3 * BLOCK_HALF_M for other in tops_m)
             if is_apart and _is_block_clear(context.capsules, top_m):
-                blocks.append(top_m)
+                tops_m.append(top_m)
                 break
     meshes = [
-        box((x - BLOCK_HALF_M, y - BLOCK_HALF_M, 1.5 * GAP_M), (x + BLOCK_HALF_M, y + BLOCK_HALF_M, z))
-        for x, y, z in (block.tolist() for block in blocks)
+        box((x - BLOCK_HALF_M, y - BLOCK_HALF_M, foot_m), (x + BLOCK_HALF_M, y + BLOCK_HALF_M, z))
+        for x, y, z in (top_m.tolist() for top_m in tops_m)
     ]
-    return (surface("supports", merge_meshes(meshes), "concrete"),) if meshes else ()
+    return (surface(name, merge_meshes(meshes), "concrete"),) if meshes else ()
 
 
-def _places_m(context: PlacementContext) -> Float64[ndarray, "n 2"]:
-    """Return places for blocks: a grid over the footprint of the steel, from edge to edge."""
+def _places_m(low_m: Float64[ndarray, " 3"], high_m: Float64[ndarray, " 3"]) -> Float64[ndarray, "n 2"]:
+    """Return places for blocks: a grid over a box seen from above, from edge to edge."""
     axes: list[Float64[ndarray, " n"]] = []
-    for low, high in zip(context.low_m[:2], context.high_m[:2], strict=True):
+    for low, high in zip(low_m[:2], high_m[:2], strict=True):
         inset = min(0.06, 0.25 * (high - low))
         axes.append(np.linspace(low + inset, high - inset, 1 + int(np.ceil((high - low - 2 * inset) / SPACING_M))))
     return np.asarray(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2))
 
 
-def _points_below_bars(context: PlacementContext) -> Float64[ndarray, "n 3"]:
+def _points_below_bars(capsules: Capsules, lowest_m: float, above_m: float) -> Float64[ndarray, "n 3"]:
     """Return points below level bars near the lowest steel, at the height of the top of a block there."""
-    capsules = context.capsules
     bottoms_m = np.minimum(capsules.a_m[:, 2], capsules.b_m[:, 2]) - capsules.radius_m
-    lowest = capsules.select(bottoms_m < context.low_m[2] + _MAT_M)
+    lowest = capsules.select((bottoms_m > lowest_m - _LAYER_M) & (bottoms_m < lowest_m + _MAT_M))
     points = [np.zeros((0, 3))]
     for a, b, radius_m in zip(lowest.a_m, lowest.b_m, lowest.radius_m, strict=True):
         # A bar that slopes is lower at one side of a block than above its middle.
@@ -199,11 +213,11 @@ def _points_below_bars(context: PlacementContext) -> Float64[ndarray, "n 3"]:
         along = a + np.linspace(0.0, 1.0, count)[:, None] * (b - a)
         points.append(along - [0.0, 0.0, radius_m + slope * BLOCK_HALF_M + 2 * _CLEAR_M])
     joined = np.concatenate(points)
-    return np.asarray(joined[joined[:, 2] > 0.5 * context.low_m[2]])
+    return np.asarray(joined[joined[:, 2] > above_m])
 
 
 def _is_block_clear(capsules: Capsules, top_m: Float64[ndarray, " 3"]) -> bool:
-    """Return whether the upper part of a block is clear of all bars; none is lower."""
+    """Return whether the upper part of a block is clear of all bars; none is lower there."""
     at, down = np.linspace(-BLOCK_HALF_M, BLOCK_HALF_M, 9), np.linspace(-1.5 * _LAYER_M, 0.0, 5)
     grid = np.stack(np.meshgrid(at, at, down, indexing="ij"), axis=-1).reshape(-1, 3) + top_m
     return capsules.clearance_m(grid) > _CLEAR_M

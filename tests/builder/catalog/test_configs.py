@@ -18,7 +18,7 @@ import rebar_depth_bench as rdb
 from dataset_builder.audit import audit
 from dataset_builder.cameras.camera_fit import check_fits
 from dataset_builder.cameras.trajectories import aim_point_m, camera_offsets_m, poses, subset, view_count
-from dataset_builder.catalog.cages_config import CagesRequest
+from dataset_builder.catalog.cages_config import CagesRequest, cage_scenes
 from dataset_builder.catalog.named_configs import CONFIGS, SWEEPS, BuildRequest
 from dataset_builder.cli.main import argument_parser
 from dataset_builder.pipeline.contact_sheet import STRIP_PANEL_PX, TILE_PX
@@ -346,3 +346,18 @@ def test_farthest_views_have_1000_scored_pixels(config: ConfigSpec) -> None:
     cameras = [Camera(ideal_K(1280, 720), np.zeros(5), views[i], 1280, 720) for i in (0, 95)]
     scored = [scored_pixels(truth.mask, truth.depth_m) for truth in map(caster.cast, cameras)]
     assert len(scored[0]) > len(scored[1]) > 1000
+
+
+def test_surroundings_of_generated_cages_suit_their_families() -> None:
+    scenes = [config.scene for config in cage_scenes(CagesRequest("train", 400), 0, 64, 36, None)]
+    found = {(scene.name.rpartition("-")[0], scene.environment) for scene in scenes}
+    assert found >= {("slab", "deck"), ("column", "deck"), ("footing", "outdoors"), ("pile-cage", "hall")}
+    assert not found & {("footing", "deck"), ("pile-cage", "deck")}, "they are cast in the ground"
+    props = {(scene.name.rpartition("-")[0], name) for scene in scenes for name in scene.appearance.variants}
+    assert props >= {("wall", "formwork"), ("slab", "formwork"), ("column", "spacers"), ("slab", "clutter")}
+    assert not props & {
+        ("column", "formwork"),
+        ("pile-cage", "formwork"),
+        ("joint", "formwork"),
+        ("slab", "spacers"),
+    }

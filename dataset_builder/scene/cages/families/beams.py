@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import ceil
 
 import numpy as np
 
@@ -26,11 +27,13 @@ from dataset_builder.scene.cages.design import (
     straight,
     turned,
 )
-from dataset_builder.scene.cages.families.columns import drawn_section
+from dataset_builder.scene.cages.families.columns import drawn_cover_m, drawn_section
 from dataset_builder.scene.cages.rules import (
     BEAM_STEEL,
     COVER_M,
     DIAMETERS_M,
+    LINK_STEEL,
+    OPPOSITE_STEEL,
     area_m2,
     beam_link_spacing_m,
     contact_m,
@@ -72,10 +75,11 @@ def beam(rng: np.random.Generator, shape: str) -> Design:
     """Draw a beam: one or two layers below, one above, side bars in deep beams, hooked or straight ends."""
     bar_m = drawn_of(rng, [d for d in DIAMETERS_M if 0.012 <= d <= 0.032])
     link_m = drawn_of(rng, [d for d in link_diameters_m(bar_m) if d <= 0.012])
-    cover_m = drawn_step(rng, *COVER_M, 0.005)
-    width_m, depth_m = drawn_step(rng, 0.20, 0.45, 0.05), drawn_step(rng, 0.30, 0.80, 0.05)
+    cover_m = drawn_cover_m(rng, COVER_M, link_m, bar_m)
+    width_m = drawn_step(rng, 0.20, 0.45, 0.05)
+    depth_m = drawn_step(rng, max(0.30, 1.2 * width_m), min(0.80, 3 * width_m), 0.05)
     is_hooked, two_layers = shape == "hooked", bool(rng.random() < 0.3)
-    if depth_m > 3 * width_m or depth_m < width_m or (two_layers and depth_m < 0.45):
+    if two_layers and depth_m < 0.45:
         raise InfeasibleError("the proportions of a beam do not fit")
     layout = BeamLayout(drawn_step(rng, 1.5, 4.0, 0.1), (is_hooked, is_hooked), two_layers)
     section = beam_section(rng, bar_m, link_m, cover_m, width_m, depth_m)
@@ -100,21 +104,28 @@ def beam_bars(
     The links start at ``first_link_m``. Raises ``InfeasibleError`` if the parts of the beam do not fit.
     """
     bar_m, width_m, depth_m, length_m = section.bar_m, section.side_x_m, section.side_y_m, layout.length_m
-    spacing_m = drawn_step(rng, 0.08, min(beam_link_spacing_m(depth_m), 0.30), 0.01)
-    other_m = drawn_of(rng, [d for d in DIAMETERS_M if max(0.010, bar_m / 2) <= d <= bar_m])
-    others = int(rng.integers(2, section.bars_x + 1))
-    steel_m2 = area_m2(bar_m, section.bars_x * (1 + layout.two_layers))
-    share = steel_share(steel_m2, 0.9 * width_m * depth_m, BEAM_STEEL)
-    links = stirrups(section, spaced(first_link_m, length_m - 0.05, spacing_m), corners=2)
     role, other_role, side = (TOP, BOTTOM, 1.0) if layout.hogging else (BOTTOM, TOP, -1.0)
     outer = _layer_m(section, bar_m, section.bars_x, side)
+    inner_m = outer[0][1] + (2 * contact_m(bar_m, _spacer_m(bar_m)) if layout.two_layers else 0.0)
+    effective_m = depth_m / 2 + abs(float(np.mean([y for _, y, _ in outer])) + inner_m) / 2
+    most_m = beam_link_spacing_m(effective_m)
+    if 2 * section.link_half_m[0] > most_m:
+        raise InfeasibleError("links of a beam need more than two legs")
+    most_m = min(most_m, area_m2(section.link_m, 2) / (LINK_STEEL * width_m), 0.30)
+    spacing_m = drawn_step(rng, 0.08, most_m, 0.01)
+    steel_m2 = area_m2(bar_m, section.bars_x * (1 + layout.two_layers))
+    share = steel_share(steel_m2, effective_m * width_m, BEAM_STEEL)
+    others_m = [d for d in DIAMETERS_M if max(0.010, bar_m / 2) <= d <= bar_m]
+    least_m2 = OPPOSITE_STEEL * steel_m2
+    other_m = drawn_of(rng, [d for d in others_m if area_m2(d, section.bars_x) > least_m2])
+    others = int(rng.integers(max(2, ceil(least_m2 / area_m2(other_m))), section.bars_x + 1))
     opposite = _layer_m(section, other_m, others, -side)
+    links = stirrups(section, spaced(first_link_m, length_m - 0.05, spacing_m), corners=2)
     step_m = _HOOK_STEP * contact_m(bar_m, bar_m)
     bend_m = bend_radius_m(bar_m)  # Hooks bend beyond the ends, so that all links hold the bars.
     bars = [_bar(other_role, other_m, place, layout, bend_m) for place in opposite]
-    inner_m = outer[0][1]
     if layout.two_layers:
-        spacers, inner_m = _spacers(section, links, inner_m)
+        spacers = _spacers(section, links, outer[0][1])
         face_x = section.half_m(bar_m)[1][0]
         places = [(x, inner_m, abs(x) == face_x) for x in np.linspace(-face_x, face_x, section.bars_x).tolist()]
         bars += [*(_bar(role, bar_m, place, layout, bend_m + step_m) for place in places), *spacers]
@@ -171,17 +182,21 @@ def _hooked(place: tuple[float, float], bar_m: float, layout: BeamLayout, out_m:
     return bent(line_m, bar_m)
 
 
-def _spacers(section: Section, links: Sequence[DesignBar], below_m: float) -> tuple[list[DesignBar], float]:
-    """Return bars across a layer at y = ``below_m``, beside links, and the y of the layer that they carry."""
-    bar_m = section.bar_m
-    spacer_m = min(d for d in DIAMETERS_M if d >= least_clear_m(bar_m))
-    y = below_m + contact_m(bar_m, spacer_m)
+def _spacer_m(bar_m: float) -> float:
+    """Return the diameter of bars that keep two layers apart."""
+    return min(d for d in DIAMETERS_M if d >= least_clear_m(bar_m))
+
+
+def _spacers(section: Section, links: Sequence[DesignBar], below_m: float) -> list[DesignBar]:
+    """Return bars across a layer at y = ``below_m``, beside links, which carry another layer."""
+    spacer_m = _spacer_m(section.bar_m)
+    y = below_m + contact_m(section.bar_m, spacer_m)
     half_m = section.link_half_m[0] - contact_m(section.link_m, spacer_m) - 0.003
     levels_m = [float(link.line_m[:, 2].mean()) for link in links]
     count = 2 + int((levels_m[-1] - levels_m[0]) / _SPACER_SPACING_M)
     chosen = np.linspace(1, len(links) - 2, count).round().astype(int)
     beside_m = rise_m(links) + contact_m(section.link_m, spacer_m)
-    made = [
+    return [
         DesignBar(
             SPACER,
             spacer_m,
@@ -192,7 +207,6 @@ def _spacers(section: Section, links: Sequence[DesignBar], below_m: float) -> tu
         )
         for index in sorted(set(chosen.tolist()))
     ]
-    return made, y + contact_m(spacer_m, bar_m)
 
 
 def _side_bars(section: Section, layout: BeamLayout, low_m: float, high_m: float) -> list[DesignBar]:

@@ -23,9 +23,11 @@ from dataset_builder.scene.cages.design import (
 )
 from dataset_builder.scene.cages.families.columns import drawn_section
 from dataset_builder.scene.cages.rules import (
+    DENSE,
     GROUND_COVER_M,
     SLAB_STEEL,
     area_m2,
+    column_link_spacing_m,
     contact_m,
     lap_m,
     square_end_m,
@@ -44,12 +46,13 @@ def footing(rng: np.random.Generator, shape: str) -> Design:
     side_x_m, side_y_m = drawn_step(rng, 1.0, 2.2, 0.1), drawn_step(rng, 1.0, 2.2, 0.1)
     depth_m = drawn_step(rng, 0.35, 0.70, 0.05)
     bar_m = drawn_of(rng, [0.012, 0.016, 0.020])
-    spacing_m = drawn_step(rng, 0.125, 0.25, 0.025)
+    effective_m = depth_m - cover_m - bar_m / 2
+    spacing_m = drawn_step(rng, 0.125, min(0.25, area_m2(bar_m) / (SLAB_STEEL[0] * effective_m)), 0.025)
     starter_m, link_m = drawn_of(rng, [0.016, 0.020, 0.025]), drawn_of(rng, [0.008, 0.010])
     column_m = drawn_step(rng, 0.30, 0.50, 0.05)
     low = cover_m + bar_m / 2
     second = low + contact_m(bar_m, bar_m)
-    share = steel_share(area_m2(bar_m) / spacing_m, depth_m - second, SLAB_STEEL)
+    share = steel_share(area_m2(bar_m) / spacing_m, effective_m, SLAB_STEEL)
     bob_m = second + bend_radius_m(bar_m) + square_end_m(bar_m)
     up_m = bob_m if shape == "bobs" else depth_m - cover_m
     if bob_m > depth_m - cover_m:
@@ -79,7 +82,8 @@ def footing(rng: np.random.Generator, shape: str) -> Design:
     first_z = feet_z[1] + bend_radius_m(starter_m) + 0.04
     if first_z > depth_m - 0.11:
         raise InfeasibleError("a footing is too shallow for the links of its starters")
-    bars += stirrups(section, [first_z, depth_m - 0.05, *spaced(depth_m + 0.15, top_z - 0.10, 0.30)])
+    above_m = spaced(depth_m + 0.05, top_z - 0.05, DENSE * column_link_spacing_m(starter_m, column_m))
+    bars += stirrups(section, [*spaced(first_z, depth_m - 0.05, 0.30), *above_m])
     drawn: dict[str, float | str] = {
         "shape": shape,
         "side_x_m": side_x_m,

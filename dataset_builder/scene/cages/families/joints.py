@@ -32,9 +32,10 @@ from dataset_builder.scene.cages.families.beams import (
     beam_section,
     hook_reach_m,
 )
-from dataset_builder.scene.cages.families.columns import drawn_section
+from dataset_builder.scene.cages.families.columns import drawn_cover_m, drawn_section
 from dataset_builder.scene.cages.rules import (
     CONTACT_GAP_M,
+    DENSE,
     column_link_spacing_m,
     contact_m,
     link_diameters_m,
@@ -54,12 +55,13 @@ def joint(rng: np.random.Generator, shape: str) -> Design:
     """Draw a column with a beam that is anchored in it or passes it; ties that the beam would cut are left out."""
     bar_m = drawn_of(rng, [0.016, 0.020, 0.025])
     link_m = drawn_of(rng, link_diameters_m(bar_m))
-    cover_m = drawn_step(rng, 0.03, 0.05, 0.005)
+    cover_m = drawn_cover_m(rng, (0.030, 0.050), link_m, bar_m)
     side_m = drawn_step(rng, 0.40, 0.60, 0.05)
     column = drawn_section(rng, bar_m, link_m, cover_m, side_m, side_m)
     share = column.column_steel_share(column.count)
     height_m, level_m = drawn_step(rng, 1.8, 2.6, 0.1), drawn_step(rng, 0.8, 1.2, 0.05)
-    spacing_m = drawn_step(rng, 0.08, column_link_spacing_m(bar_m, side_m), 0.01)
+    # All of the column is near its beam or a slab.
+    spacing_m = drawn_step(rng, 0.08, DENSE * column_link_spacing_m(bar_m, side_m), 0.01)
     depth_m = drawn_step(rng, 0.35, SIDES_FROM_M - 0.05, 0.05)
     if level_m + depth_m + 0.3 > height_m:
         raise InfeasibleError("a column ends too close to its beam")
@@ -98,9 +100,9 @@ def _beam(
 ) -> tuple[list[DesignBar], dict[str, float | str]]:
     """Return the bars of the beam along x, whose concrete is from z = ``level_m`` up, and what was drawn."""
     arm_m = drawn_step(rng, 0.8, 1.5, 0.1)
-    width_m = drawn_step(rng, 0.20, column.side_x_m - 0.10, 0.05)
+    width_m = drawn_step(rng, 0.20, min(column.side_x_m - 0.10, depth_m / 1.2), 0.05)
     bar_m = drawn_of(rng, [0.012, 0.016, 0.020])
-    link_m = drawn_of(rng, [d for d in link_diameters_m(bar_m) if d <= 0.010])
+    link_m = drawn_of(rng, [d for d in link_diameters_m(bar_m) if d <= 0.010])  # The cover suits all of these.
     if depth_m > 3 * width_m:
         raise InfeasibleError("the proportions of a beam do not fit")
     section = beam_section(rng, bar_m, link_m, column.cover_m, width_m, depth_m)

@@ -23,6 +23,7 @@ from dataset_builder.scene.cages.design import (
     steel_share,
     straight,
 )
+from dataset_builder.scene.cages.families.columns import drawn_cover_m
 from dataset_builder.scene.cages.rules import DIAMETERS_M, SLAB_STEEL, area_m2, contact_m, slab_spacing_m
 
 LOWER, UPPER, CHAIR = "lower", "upper", "chair"
@@ -38,15 +39,18 @@ _FOOT_END_M = 0.04
 
 def slab(rng: np.random.Generator, shape: str) -> Design:
     """Draw a slab on spacers, of bars of one diameter and spacing."""
-    thickness_m, cover_m = drawn_step(rng, 0.16, 0.40, 0.01), drawn_step(rng, 0.020, 0.040, 0.005)
+    thickness_m = drawn_step(rng, 0.16, 0.40, 0.01)
     side_x_m, side_y_m = drawn_step(rng, 1.0, 2.4, 0.1), drawn_step(rng, 1.0, 2.4, 0.1)
     bar_m = drawn_of(rng, [d for d in DIAMETERS_M if 0.008 <= d <= 0.016])
-    spacing_m = drawn_step(rng, 0.10, min(0.25, slab_spacing_m(thickness_m)), 0.025)
+    cover_m = drawn_cover_m(rng, (0.020, 0.040), bar_m, 0.0)
+    effective_m = thickness_m - cover_m - bar_m / 2
+    most_m = min(0.25, slab_spacing_m(thickness_m), area_m2(bar_m) / (SLAB_STEEL[0] * effective_m))
+    spacing_m = drawn_step(rng, 0.10, most_m, 0.025)
     chair_m = drawn_of(rng, [0.008, 0.010, 0.012])
     step_m = contact_m(bar_m, bar_m)
     low = [cover_m + bar_m / 2, cover_m + bar_m / 2 + step_m]
-    high = [thickness_m - cover_m - bar_m / 2 - step_m, thickness_m - cover_m - bar_m / 2]
-    share = steel_share(area_m2(bar_m) / spacing_m, high[0], SLAB_STEEL)
+    high = [effective_m - step_m, effective_m]
+    share = steel_share(area_m2(bar_m) / spacing_m, effective_m, SLAB_STEEL)
     across_x = spaced(_EDGE_M - side_x_m / 2, side_x_m / 2 - _EDGE_M, spacing_m)
     across_y = spaced(_EDGE_M - side_y_m / 2, side_y_m / 2 - _EDGE_M, spacing_m)
     between_m = contact_m(bar_m, chair_m)

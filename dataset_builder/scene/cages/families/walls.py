@@ -25,9 +25,11 @@ from dataset_builder.scene.cages.design import (
     steel_share,
     straight,
 )
+from dataset_builder.scene.cages.families.columns import drawn_cover_m
 from dataset_builder.scene.cages.rules import (
     COVER_M,
     DIAMETERS_M,
+    LINK_SLACK_M,
     WALL_STEEL,
     area_m2,
     contact_m,
@@ -45,7 +47,7 @@ _LEAST_BETWEEN_M = 0.060
 """Least clear distance of the mats, in which concrete can be poured and compacted."""
 
 _TIE_SPACING_M = 0.5
-"""Largest distance of ties, four per square metre (EN 1992-1-1, 9.6.4)."""
+"""Largest distance of ties, four per square metre (EN 1992-1-1, 9.6.4 (2))."""
 
 _TIE_GAP_M = 0.002
 """Clear distance of a tie from the level bar below it."""
@@ -53,25 +55,29 @@ _TIE_GAP_M = 0.002
 
 def wall(rng: np.random.Generator, shape: str) -> Design:
     """Draw a wall: two mats with level bars outside of upright ones, and ties; laps at the foot or U-bars."""
-    thickness_m, cover_m = drawn_step(rng, 0.18, 0.40, 0.01), drawn_step(rng, *COVER_M, 0.005)
+    thickness_m = drawn_step(rng, 0.18, 0.40, 0.01)
     length_m, height_m = drawn_step(rng, 1.0, 3.0, 0.1), drawn_step(rng, 1.0, 2.5, 0.1)
-    upright_m = drawn_of(rng, [d for d in DIAMETERS_M if 0.010 <= d <= 0.020])
+    # Laps of bars from 20 mm up would need links across the wall (EN 1992-1-1, 8.7.4.1 (3)).
+    upright_m = drawn_of(rng, [d for d in DIAMETERS_M if 0.010 <= d <= (0.016 if shape == "laps" else 0.020)])
     level_m = drawn_of(rng, [d for d in DIAMETERS_M if 0.008 <= d <= min(0.016, upright_m)])
-    spacing_m = drawn_step(rng, 0.10, min(0.30, wall_spacing_m(thickness_m)), 0.025)
-    level_spacing_m = drawn_step(rng, 0.10, 0.30, 0.025)
-    upright_share = steel_share(2 * area_m2(upright_m), spacing_m * thickness_m, WALL_STEEL)
-    least_share = max(0.25 * upright_share, 0.001)  # EN 1992-1-1, 9.6.3.
-    steel_share(2 * area_m2(level_m), level_spacing_m * thickness_m, (least_share, WALL_STEEL[1]))
     tie_m = drawn_of(rng, [0.006, 0.008])
-    level_y = thickness_m / 2 - cover_m - level_m / 2
-    upright_y = level_y - contact_m(level_m, upright_m)
-    if 2 * upright_y - upright_m < _LEAST_BETWEEN_M:
-        raise InfeasibleError("the mats of a wall are too close to each other")
+    least_m = COVER_M[0] + max(0.0, tie_m + LINK_SLACK_M - level_m)  # The bends of ties are beside level bars.
+    cover_m = drawn_cover_m(rng, (least_m, COVER_M[1]), level_m, upright_m)
+    upright_m2, level_m2 = 2 * area_m2(upright_m) / thickness_m, 2 * area_m2(level_m) / thickness_m
+    most_m = min(0.30, wall_spacing_m(thickness_m), upright_m2 / WALL_STEEL[0])
+    spacing_m = drawn_step(rng, 0.10, most_m, 0.025)
     end_x, edge_x = length_m / 2, length_m / 2 - _EDGE_M
     if shape == "u-bars":  # The outermost upright bars are where the bends of the U-bars end.
         end_x -= cover_m
         edge_x = end_x - level_m / 2 - max(bend_radius_m(level_m), contact_m(level_m, upright_m))
     columns = spaced(-edge_x, edge_x, spacing_m)
+    upright_share = steel_share(upright_m2, columns[1] - columns[0], WALL_STEEL)
+    most_m = min(0.30, level_m2 / max(0.25 * upright_share, 0.001))  # EN 1992-1-1, 9.6.3 (1).
+    level_spacing_m = drawn_step(rng, 0.10, most_m, 0.025)
+    level_y = thickness_m / 2 - cover_m - level_m / 2
+    upright_y = level_y - contact_m(level_m, upright_m)
+    if 2 * upright_y - upright_m < _LEAST_BETWEEN_M:
+        raise InfeasibleError("the mats of a wall are too close to each other")
     rows = spaced(_FIRST_ROW_M, height_m - _FIRST_ROW_M, level_spacing_m)
     uprights = [
         DesignBar(UPRIGHT, upright_m, straight((x, y, 0.0), (x, y, height_m)), X, False, Y)
@@ -92,9 +98,10 @@ def wall(rng: np.random.Generator, shape: str) -> Design:
         "level_spacing_m": level_spacing_m,
     }
     if shape == "laps":
-        lap = Lap(upright_m, drawn_step(rng, 0.01, 0.06, 0.01))
+        lap = Lap(upright_m, level_m, drawn_step(rng, 0.01, 0.06, 0.01))
         drawn["lap_start_m"] = lap.start_m
-        rows = [row for part in lap.levels_m(rows[0], rows[-1], level_spacing_m) for row in part]
+        across = lap.levels_m(rows[0], rows[-1], level_spacing_m)
+        rows = [*across[:-1], *spaced(across[-1], rows[-1], level_spacing_m)]
         inward = [(0.0, -float(np.sign(bar.line_m[0, 1]))) for bar in uprights]
         uprights = lapped(uprights, inward, lap)
     bars = [*uprights, *_level_bars(level_m, rows, end_x, level_y)]
@@ -143,7 +150,7 @@ def _u_bars(diameter_m: float, rows: Sequence[float], back_x: float, level_y: fl
 
     ``back_x`` is the distance of their backs from the middle. Raises ``InfeasibleError`` for a short wall.
     """
-    leg_x = back_x - lap_m(diameter_m)
+    leg_x = back_x - bend_radius_m(diameter_m) - lap_m(diameter_m)
     if leg_x < 0.05:
         raise InfeasibleError("a wall is too short for the laps of its U-bars")
     below_m = contact_m(diameter_m, diameter_m)
