@@ -85,7 +85,8 @@ def lens_problem(where: str, models: Mapping[str, Any], terms: Sequence[float] =
     if others:
         found = f"{escape_text(others[0])} is {short_repr(models[others[0]])}"
     elif any(terms[DISTORTION_TERMS:]):
-        found = f"the distortion has {len(terms)} terms"
+        kind = "tilted" if any(terms[12:]) else "thin prism" if any(terms[8:]) else "fisheye or rational"
+        found = f"the distortion has {len(terms)} terms: {kind} distortion"
     elif any(terms) and "none" in plain.values():
         found, expected = "distortion terms beside a model of none", "zeros, or the model of the terms"
     elif any(terms) and len(terms) == 4 and not stated_radial:

@@ -27,7 +27,7 @@ _MODEL = r"^distortion_model:\s*([\w-]+)|^\d+ (FOV|\w+_FISHEYE) "
 class _Program:
     """File of a program: a pattern of its name and text, where its numbers are, and a remark.
 
-    ``camera`` names fx fy cx cy, and ``size`` width and height, each by a key and its places in the list of the key.
+    ``camera`` names fx fy cx cy, and ``size`` width and height, each by a key and places in its list.
     The distortion begins at the first place of ``terms``. Of a pair, ``offsets`` are fx times the offset of each
     camera. ``first_pixel`` is the centre of the first pixel.
     """
