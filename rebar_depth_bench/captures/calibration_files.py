@@ -62,7 +62,13 @@ def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibra
     Raises ``CalibrationError`` with all problems of the file; also if a distortion model cannot be inverted over
     the whole image, if the requested size is not 16 to 16384 pixels each, and if its aspect ratio is another one.
     """
-    path = Path(path)
+    calibration = own_calibration(Path(path), width, height, is_stereo=True)
+    assert isinstance(calibration, StereoCalibration)
+    return calibration
+
+
+def own_calibration(path: Path, width: int, height: int, *, is_stereo: bool) -> Calibration:
+    """Return the calibration in a file as ``read_calibration``; a ``.toml`` file may have one camera."""
     suffix = path.suffix.lower()
     if suffix not in (".conf", ".toml"):
         problem = Problem("invalid", "", f"the file suffix is {path.suffix!r}", ".conf or .toml")
@@ -74,8 +80,9 @@ def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibra
         calibration: Calibration | None = _read_conf(path.name, content, width, height, problems)
     else:
         document, problems = parse_toml(content)
-        calibration = None if problems else table_calibration(document, width, height, problems, is_stereo=True)
-    if not isinstance(calibration, StereoCalibration):
+        is_pair = is_stereo or "right" in document
+        calibration = None if problems else table_calibration(document, width, height, problems, is_stereo=is_pair)
+    if calibration is None:
         raise CalibrationError.from_problems(path, with_lines(problems, content))
     return scaled_calibration(calibration, path, width, height)
 

@@ -23,6 +23,8 @@ _RADIAL = (
     *("0", "false"),
 )
 """Lens models, or answers to whether it is a fisheye lens, whose first terms are k1 k2 p1 p2 k3; as plain keys."""
+OTHER_LENS = re.compile("fish|omni|equidist|kannala|brandt|rational|prism|tilt|unified|double.?sphere", re.I)
+"""Part of the name of another lens model, by which a text with an unknown key is refused."""
 _UNDISTORTED = ("none", "")
 _SAME_WITHOUT_TERMS = ("inversebrownconrady", "modifiedbrownconrady")
 """Lens models of other distortion, which are pinholes if all terms are 0."""

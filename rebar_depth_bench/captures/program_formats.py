@@ -73,6 +73,6 @@ KALIBR = FileFormat(
         _field("camera model", "camera_model", "checked", "pinhole"),
         _field("size", "resolution", "used", "width, height"),
         _field("motion", "T_cn_cnm1", "used", "cam1_from_cam0, 4 x 4"),
-        _field("recording", "cam_overlaps rostopic T_cam_imu timeshift_cam_imu", "harmless", "of the recording"),
+        _field("details", "cam_overlaps rostopic T_cam_imu timeshift_cam_imu", "harmless", "of the recording"),
     ),
 )
