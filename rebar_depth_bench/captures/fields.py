@@ -26,8 +26,6 @@ _RADIAL = (
 OTHER_LENS = re.compile("fish|omni|equidist|kannala|brandt|rational|prism|tilt|unified|double.?sphere", re.I)
 """Part of the name of another lens model, by which a text with an unknown key is refused."""
 _UNDISTORTED = ("none", "")
-_SAME_WITHOUT_TERMS = ("inversebrownconrady", "modifiedbrownconrady")
-"""Lens models of other distortion, which are pinholes if all terms are 0."""
 _PINHOLE = ("pinhole", "perspective")
 """Names of a projection without a statement about the distortion."""
 
@@ -81,8 +79,7 @@ def lens_problem(where: str, models: Mapping[str, Any], terms: Sequence[float] =
     texts = {key: "" if model is None else str(model) for key, model in models.items()}
     plain = {key: plain_key(text) or text.strip() for key, text in texts.items()}
     stated_radial = any(model in _RADIAL for model in plain.values())
-    accepted = (*_RADIAL, *_PINHOLE, *_UNDISTORTED, *(() if any(terms) else _SAME_WITHOUT_TERMS))
-    others = [key for key, model in plain.items() if model not in accepted]
+    others = [key for key, model in plain.items() if model not in (*_RADIAL, *_PINHOLE, *_UNDISTORTED)]
     expected = KNOWN_LENS
     if others:
         found = f"{escape_text(others[0])} is {short_repr(models[others[0]])}"

@@ -121,7 +121,6 @@ def test_other_lens_is_refused_with_one_remedy(contents: dict[str, str], found: 
         (message("rational_polynomial", [0.0] * 8), [0.0] * 5),
         (message("", FIVE), FIVE),
         (message("none", []), [0.0] * 5),
-        (message("inverse_brown_conrady", [0.0] * 5), [0.0] * 5),
         (kalibr("pinhole", "radtan"), [*files.LEFT_D[:4], 0.0]),
         (kalibr("pinhole", "none", []), [0.0] * 5),
         (opencv(dist_coeffs=[FIVE]), FIVE),
