@@ -23,7 +23,9 @@ _RADIAL = (
     *("0", "false"),
 )
 """Lens models, or answers to whether it is a fisheye lens, whose first terms are k1 k2 p1 p2 k3; as plain keys."""
-OTHER_LENS = re.compile("fish|omni|equidist|kannala|brandt|rational|prism|tilt|unified|double.?sphere", re.I)
+OTHER_LENS = re.compile(
+    r"fish|omnidir|\bomni\b|equidist|kannala|rational|thin.?prism|unified|double.?sphere", re.I
+)
 """Part of the name of another lens model, by which a text with an unknown key is refused."""
 _UNDISTORTED = ("none", "")
 _PINHOLE = ("pinhole", "perspective")

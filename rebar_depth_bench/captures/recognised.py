@@ -16,10 +16,10 @@ from rebar_depth_bench.captures.fields import DISTORTION_TERMS, lens_problem
 
 _HEAD_BYTES = 1 << 16
 """Length of the part of a file that is searched."""
-_NUMBER = r"[-+]?\d{1,20}(?:\.\d{0,40})?(?:[eE][-+]?\d{1,2})?"
+_NUMBER = r"[-+]?(?:\d{1,20}(?:\.\d{0,40})?|\.\d{1,40})(?:[eE][-+]?\d{1,3})?"
 _ZERO = r"[-+]?0(?:\.0{0,40})?(?:[eE][-+]?\d{1,2})?"
-_ENTRY = rf'(?:^(?:\d+ )?|[\s"])(\w+)(?: |"?\s*[:=]\s*(?:\[\s*)?)((?:{_NUMBER}[\s,]+)*{_NUMBER})(?![\d.]| [A-Z])'
-"""Key and its numbers, which are not those that begin a line of COLMAP."""
+_ENTRY = rf'(?:^(?:\d+ )?|[\s"])(\w+)(?: |"?\s*[:=]\s*(?:\[\s*)?)((?:{_NUMBER}[\s,]+)*{_NUMBER})(?! ?[\w.])'
+"""Key and its numbers, up to the end of a line or list; none if another word follows."""
 _MODEL = r"^distortion_model:\s*([\w-]+)|^\d+ (FOV|\w+_FISHEYE) "
 
 

@@ -129,7 +129,7 @@ def test_other_lens_is_refused_with_one_remedy(contents: dict[str, str], found: 
         (opencv(dist_coeffs=FOUR, distortion_model="plumb_bob"), [*FOUR, 0.0]),
         (opencv(dist_coeffs=FOUR, camera_model="plumb_bob"), [*FOUR, 0.0]),
         (opencv(dist_coeffs=FOUR, fisheye_model=False), [*FOUR, 0.0]),
-        (opencv(camera_name="fisheye_left"), FIVE),
+        (opencv(camera_name="fisheye_left", comment="no fisheye", sensor="OmniVision"), FIVE),
         (opencv(camera_model="pinhole", xi=0, k4=0.0), FIVE),
         (stored(D1=[[*FIVE, *[0.0] * 9]], fisheye_model=0), FIVE),
     ],
