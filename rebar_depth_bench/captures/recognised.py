@@ -18,8 +18,11 @@ _HEAD_BYTES = 1 << 16
 """Length of the part of a file that is searched."""
 _NUMBER = r"[-+]?(?:\d{1,20}(?:\.\d{0,40})?|\.\d{1,40})(?:[eE][-+]?\d{1,3})?"
 _ZERO = r"[-+]?0(?:\.0{0,40})?(?:[eE][-+]?\d{1,2})?"
-_ENTRY = rf'(?:^(?:\d+ )?|[\s"])(\w+)(?: |"?\s*[:=]\s*(?:\[\s*)?)((?:{_NUMBER}[\s,]+)*{_NUMBER})(?! ?[\w.])'
+_ENTRY = (
+    rf'(?:^(?:\d+ )?|[\s"])([A-Za-z_]\w*)(?: |"?\s*[:=]\s*(?:\[\s*)?)((?:{_NUMBER}[\s,]+)*{_NUMBER})(?! ?[\w.])'
+)
 """Key and its numbers, up to the end of a line or list; none if another word follows."""
+_COLMAP = "COLMAP's cameras.txt"
 _MODEL = r"^distortion_model:\s*([\w-]+)|^\d+ (FOV|\w+_FISHEYE) "
 
 
@@ -49,8 +52,8 @@ def _kitti(key: str) -> _Program:
 
 
 def _colmap(model: str, camera: str, terms: str) -> _Program:
-    texts = (f"{model}:{places}" for places in (camera, "0,1", terms))
-    return _Program("COLMAP's cameras.txt", rf"^\d+ {model} ", "its first camera", *texts, first_pixel=0.5)
+    pattern, (camera, size, terms) = rf"^\d+ {model} ", (f"{model}:{text}" for text in (camera, "0,1", terms))
+    return _Program(_COLMAP, pattern, "its first camera", camera, size, terms, first_pixel=0.5)
 
 
 _PROGRAMS = (
@@ -91,7 +94,7 @@ _PROGRAMS = (
     _kitti("P_rect_0"),
     *(_colmap(model, "2,3,4,5", "6") for model in ("PINHOLE", "OPENCV", "FULL_OPENCV")),
     *(_colmap(model, "2,2,3,4", "5") for model in ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL")),
-    _Program("COLMAP's cameras.txt", r"^\d+ [A-Z_]+ \d+ \d+ |^# Camera list", "its first camera"),
+    _Program(_COLMAP, r"^\d+ [A-Z_]+ \d+ \d+ |^# Camera list", "its first camera"),
     _Program(
         *("COLMAP's cameras.bin", r"\Acameras\.bin\n"),
         "the numbers of cameras.txt, which colmap model_converter --output_type TXT writes",
