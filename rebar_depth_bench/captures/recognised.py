@@ -53,7 +53,7 @@ def _kitti(key: str) -> _Program:
 
 def _colmap(model: str, camera: str, terms: str) -> _Program:
     pattern, (camera, size, terms) = rf"^\d+ {model} ", (f"{model}:{text}" for text in (camera, "0,1", terms))
-    return _Program(_COLMAP, pattern, "its first camera", camera, size, terms, first_pixel=0.5)
+    return _Program(_COLMAP, pattern, f"its first {model} camera", camera, size, terms, first_pixel=0.5)
 
 
 _PROGRAMS = (

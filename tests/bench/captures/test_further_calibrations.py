@@ -250,7 +250,7 @@ COLMAP_BIN = struct.pack("<QiiQQ4d", 1, 1, 1, 640, 480, 500.0, 500.0, 320.0, 240
         ("cameras.txt", COLMAP + "1 OPENCV_FISHEYE 640 480 5 5 3 2 0.1 0 0 0\n", "'OPENCV_FISHEYE'.*rectify"),
         ("cameras.txt", COLMAP + f"1 FULL_OPENCV 640 480 5 5 3 2 {'0.1 ' * 8}\n", "8 terms.*rectify"),
         ("cameras.txt", COLMAP + "1 FULL_OPENCV 640 480 5 5 3 2 .1 .1 0 0 0 .1 0 0\n", "8 terms.*rectify"),
-        ("cameras.txt", COLMAP + "1 OPENCV 640 480 5 5 3 2 0.1 nan 0 0\n", "toml with its first camera"),
+        ("cameras.txt", COLMAP + "1 OPENCV 640 480 5 5 3 2 0.1 nan 0 0\n", "toml with its first OPENCV camera"),
         ("cameras.bin", COLMAP_BIN, "COLMAP.*model_converter"),
         ("0.hdf5", b"\x89HDF\r\n\x1a\n" + bytes(2 << 20), "HDF5.*get_intrinsics_as_K_matrix"),
         (
