@@ -31,7 +31,10 @@ from rebar_depth_bench.captures.fields import Field, FileFormat, plain_key
 from rebar_depth_bench.geometry.cameras import HALF_PIXEL
 
 _UNIT = "depth_unit_scale_factor"
-_LENS = "no other lens: undistort images and depth maps first, and state the new K"
+_LENS = (
+    'no other lens: undistort images and depth maps first, see "Rectify images first" in docs/captures.md, and '
+    "state the new K"
+)
 _MODELS = ("OPENCV", "RADIAL", "SIMPLE_RADIAL", "PINHOLE", "SIMPLE_PINHOLE")
 
 BOP = FileFormat(
