@@ -110,13 +110,6 @@ MISTAKES: dict[str, tuple[str, Change | None, Change | None, str]] = {
     ),
     "outliers": (POSES + BARS, outliers(0.04, 30.0), inverted, 'poses.kind = "world_from_cam"'),
     "poses in millimetres": (POSES + BARS, None, moved(1000), 'poses.unit = "mm"'),
-    "depth and poses": (POSES + BARS, times(100), moved(1000), 'depth.unit = "cm" and poses.unit = "mm"'),
-    "range and poses": (
-        POSES + BARS,
-        data.range_m,
-        inverted,
-        'depth.kind = "range" and poses.kind = "world_from_cam"',
-    ),
 }
 
 
