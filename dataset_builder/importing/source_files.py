@@ -81,16 +81,19 @@ def read_depth(path: Path, grid: Grid, table: DepthTable, tally: DepthTally) -> 
 
     Values of ``depth.invalid`` are rounded to the type of the file before they are compared, and those that occur
     are added to ``tally``. Raises ``EntryError`` for a damaged file, for one of another size, and for the largest
-    value of an integer type, which marks pixels without depth, unless it is among the invalid ones.
+    value of an integer type, or of half floats, which marks pixels without depth, unless it is among the invalid
+    ones; that of half floats is left out with ``depth.max_m``.
     """
     values = _depth_values(path, grid, table)
     _check_grid(path, values, grid)
-    if values.dtype.kind in "iu":
-        largest = np.iinfo(values.dtype).max
+    is_integer = values.dtype.kind in "iu"
+    if is_integer or (values.dtype == np.float16 and table.max_m is None):
+        largest = np.iinfo(values.dtype).max if is_integer else int(np.finfo(np.float16).max)
         count = int(np.count_nonzero(values == largest))
         if count and float(largest) not in table.invalid:
             found = f"{count} pixels have {largest}, the largest value of {values.dtype}, which marks no depth"
-            raise EntryError(Problem("invalid", path.name, found, f"depth.invalid with {largest}"))
+            remedy = f"depth.invalid with {largest}" + ("" if is_integer else ", or depth.max_m")
+            raise EntryError(Problem("invalid", path.name, found, remedy))
     with np.errstate(invalid="ignore", over="ignore"):  # A damaged file may hold NaN that signal.
         units = values.astype(np.float64)
         marks = np.array(table.invalid, dtype=values.dtype if values.dtype.kind == "f" else np.float64)
@@ -115,7 +118,7 @@ def _depth_values(path: Path, grid: Grid, table: DepthTable) -> Shaped[ndarray, 
     if suffix in (".npy", ".npz"):
         decode = decode_npy if suffix == ".npy" else decode_npz
         return decode(path.name, memoryview(content), grid, ints=True)
-    return _pixels(path, content, table)
+    return _pixels(path, content, is_depth=True)
 
 
 def planar_depth_m(
@@ -216,10 +219,10 @@ def _npy(path: Path, content: bytes) -> ndarray:
         return np.asarray(np.load(io.BytesIO(content), allow_pickle=False))
 
 
-def _pixels(path: Path, content: bytes, depth: DepthTable | None = None) -> Shaped[ndarray, "h w"]:
+def _pixels(path: Path, content: bytes, *, is_depth: bool = False) -> Shaped[ndarray, "h w"]:
     """Return the values of a TIFF, PNG or PFM image with one channel, in the type of the file.
 
-    Raises ``EntryError`` for other images. As ``depth``, pictures of a palette or of single bits are refused too.
+    Raises ``EntryError`` for other images. As depth, pictures of a palette or of single bits are refused too.
     """
     from PIL import Image, UnidentifiedImageError
 
@@ -234,7 +237,7 @@ def _pixels(path: Path, content: bytes, depth: DepthTable | None = None) -> Shap
             if image_format != "TIFF":
                 raise
             return _raw_tiff(path, content)
-    if values.ndim != 2 or values.dtype.kind not in "buif" or (depth is not None and mode in ("1", "P")):
+    if values.ndim != 2 or values.dtype.kind not in "buif" or (is_depth and mode in ("1", "P")):
         found = f"has values of type {values.dtype} and shape {values.shape}, Pillow's mode {mode}"
         raise EntryError(Problem("invalid", path.name, found, "one channel of numbers"))
     values = values.astype(values.dtype.newbyteorder("="))

@@ -189,9 +189,17 @@ def background(value: float, kind: type = np.float32) -> np.ndarray:
     return depth
 
 
+@pytest.mark.parametrize("unit", ["m", "mm"])
+def test_largest_half_float_is_no_depth_in_any_unit(unit: str, tmp_path: Path) -> None:
+    content = data.npy(np.where(VALUES == 403, 65504, VALUES).astype(np.float16))
+    with pytest.raises(EntryError, match=r"1 pixels have 65504, .* depth.invalid with 65504, or depth.max_m"):
+        read(tmp_path, "a.npy", content, DepthTable(unit=unit))
+    units = read(tmp_path, "a.npy", content, DepthTable(unit=unit, invalid=(65504.0,)))
+    assert np.argwhere(np.isnan(units)).tolist() == [[1, 3]]
+
+
 FAR: dict[str, tuple[str, np.ndarray, str]] = {
     "Blender": ("", background(1e10), "1e+10"),
-    "largest half": ("", background(65504, np.float16), "65504"),
     "megametre": ("", background(1e6), "1000000"),
     "largest float32": ("", background(float(np.finfo(np.float32).max)), "3.40282347e+38"),
     "largest float64": (
