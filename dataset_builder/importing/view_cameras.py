@@ -189,7 +189,7 @@ def _values(file_format: FileFormat, whole: Mapping[str, Any], entry: Mapping[st
     """
     values = {key: value for key, value in {**whole, **entry}.items() if value is not None}
     for field in file_format.fields:
-        for key in values.keys() & set(field.keys):
+        for key in filter(values.__contains__, field.keys):
             value, other = values[key], whole.get(key)
             if field.use == "checked" and (any(value) if isinstance(value, list) else value):
                 raise EntryError(Problem("invalid", key, f"got {short_repr(value)}", field.meaning))
