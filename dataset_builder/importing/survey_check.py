@@ -16,7 +16,7 @@ from rebar_depth_bench.bar_crossings.axis_segments import nearest_points
 from rebar_depth_bench.base.errors import Problem
 from rebar_depth_bench.base.validation import UNITS_M
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.geometry.cameras import pixel_rays, swap_camera_axes
+from rebar_depth_bench.geometry.cameras import swap_camera_axes, undistort
 from rebar_depth_bench.scoring.protocol import interior
 
 _MAX_POINTS = 20_000
@@ -67,8 +67,9 @@ class SurveyCheck:
         of_bars = np.split(order, np.flatnonzero(np.diff(ids[row, column][order])) + 1)
         limit = max(1, _MAX_POINTS // (self.views * len(of_bars)))
         chosen = np.concatenate([pixels[:: max(1, -(-len(pixels) // limit))] for pixels in of_bars])
-        at = row[chosen], column[chosen]
-        rays = pixel_rays(columns["left_K"], *ids.shape[::-1], columns["left_distortion"])[at]
+        at, K = (row[chosen], column[chosen]), columns["left_K"]
+        plane = np.stack([(at[1] - K[0, 2]) / K[0, 0], (at[0] - K[1, 2]) / K[1, 1]], axis=-1)
+        rays = np.insert(undistort(plane, columns["left_distortion"]), 2, 1.0, axis=-1)
         poses = np.broadcast_to(columns["left_cam_from_world"], (len(chosen), 4, 4))
         bars = np.array([place[bar_id] for bar_id in ids[at].tolist()], dtype=np.int64)
         self.parts.append(_Pixels(depth_m[at].astype(np.float64), rays, poses, bars))
@@ -142,14 +143,14 @@ def _mistakes(layout: Layout, pixels: _Pixels) -> Iterator[tuple[str, _Pixels]]:
     both = swap_camera_axes(inverted)
     if is_opengl:
         inverted, both = both, inverted
-    kind, axes = "poses inverted", "camera axes turned"
+    kind, axes, changes = "poses inverted", "camera axes turned", dict[str, ndarray]()
     if poses is not None:
         kind = f'poses.kind = "{"world_from_cam" if poses.kind == "cam_from_world" else "cam_from_world"}"'
         axes = f'poses.axes = "{"opencv" if is_opengl else "opengl"}"'
-    changes = {kind: inverted, axes: turned, f"{kind} and {axes}": both}
-    for unit, factor_m in UNITS_M.items() if poses is not None else ():
-        scales = np.array([1, 1, 1, factor_m / UNITS_M[poses.unit]])
-        changes[f'poses.unit = "{unit}"'] = found * np.vstack([[scales] * 3, np.ones(4)])
+        for unit, factor_m in UNITS_M.items():
+            scales = np.array([1, 1, 1, factor_m / UNITS_M[poses.unit]])
+            changes[f'poses.unit = "{unit}"'] = found * np.vstack([[scales] * 3, np.ones(4)])
+    changes |= {kind: inverted, axes: turned, f"{kind} and {axes}": both}
     for line, pose in changes.items():
         yield line, replace(pixels, cam_from_world=pose)
 
