@@ -26,6 +26,7 @@ _MAX_PAIRS = 1_000_000
 _TRUSTED_SHARE = 0.95
 """Share of the deviations that count, the smallest ones: a survey and a segmentation have outliers."""
 _MAX_LINES = 20
+_RATIOS = (0.001, 0.01, 0.0254, 0.1, 0.3048, 10.0, 100.0, 1000.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,19 +122,19 @@ class SurveyCheck:
         if left_rms_m > _rms(found_m) / 2:
             return None
         found = f"the points of surveyed bars are {_rms(found_m):.3g} m off their surfaces (RMS)"
-        return Problem(
-            "conflict", "", f"{found}, and {left_rms_m:.3g} m if read with {line}", f"{line} in the layout"
-        )
+        found += f", and {left_rms_m:.3g} m if read with {line}"
+        return Problem("conflict", "", found, f"{line} in {self.layout.views or 'the layout'}")
 
 
 def _mistakes(layout: Layout, pixels: _Pixels) -> Iterator[tuple[str, _Pixels]]:
     """Yield changed lines of the layout, and the pixels as they are read with each."""
     depth, poses, length = layout.depth, layout.poses, np.linalg.norm(pixels.ray, axis=1)
     if depth.kind != "disparity":
-        for unit, factor_m in UNITS_M.items():
-            ratio = factor_m / depth.factor
-            line = f'depth.unit = "{unit}"' + ("" if depth.scale is None else " in place of depth.scale")
-            line = line if layout.views is None else f"a unit of depth that is {ratio:g} times as large"
+        in_place = "" if depth.scale is None else " in place of depth.scale"
+        units = {f'depth.unit = "{unit}"{in_place}': size_m / depth.factor for unit, size_m in UNITS_M.items()}
+        if layout.views is not None:  # It may state the unit, such as that of BOP in metres by mistake.
+            units = {f"a unit of depth that is {ratio:g} times as large": ratio for ratio in _RATIOS}
+        for line, ratio in units.items():
             yield line, replace(pixels, depth_m=pixels.depth_m * ratio)
         kind, factors = ("range", 1 / length) if depth.kind == "z" else ("z", length)
         yield f'depth.kind = "{kind}"', replace(pixels, depth_m=pixels.depth_m * factors)
