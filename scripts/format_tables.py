@@ -13,11 +13,12 @@ from collections.abc import Iterable
 from itertools import groupby
 from pathlib import Path
 
+from dataset_builder.importing.view_cameras import BOP, NERFSTUDIO
 from rebar_depth_bench.captures.calibration_files import ZED_CONF
 from rebar_depth_bench.captures.fields import Field, FileFormat
 from rebar_depth_bench.captures.program_formats import CAMERA, KALIBR, MIDDLEBURY, PAIR
 
-FORMATS = (ZED_CONF, CAMERA, PAIR, KALIBR, MIDDLEBURY)
+FORMATS = (ZED_CONF, CAMERA, PAIR, KALIBR, MIDDLEBURY, BOP, NERFSTUDIO)
 _BLOCK = re.compile(r"(<!-- tables of fields -->\n).*(<!-- end of tables of fields -->)", re.DOTALL)
 
 

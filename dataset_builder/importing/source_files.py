@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import re
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -52,9 +51,6 @@ _MIN_DEPTH_M, _MAX_DEPTH_M = 1e-4, 1000.0
 _BIG_TIFF = 43
 _TIFF_INTEGERS = ("L", "I;16", "I;16B", "I")
 """Pillow's modes of integers in TIFF files."""
-_PFM_SCALES = (1.0, 0.003922)
-"""Scales in headers of PFM files by which no program multiplies: none, and that of all files of Middlebury."""
-
 _MAX_BAR_ID = np.iinfo(np.uint16).max
 _ROUNDED_ROTATION = 1e-3
 """Largest deviation of ``R @ R.T`` from the identity in files with few digits; the rotation is made exact."""
@@ -85,16 +81,19 @@ def read_depth(path: Path, grid: Grid, table: DepthTable, tally: DepthTally) -> 
 
     Values of ``depth.invalid`` are rounded to the type of the file before they are compared, and those that occur
     are added to ``tally``. Raises ``EntryError`` for a damaged file, for one of another size, and for the largest
-    value of an integer type, which marks pixels without depth, unless it is among the invalid ones.
+    value of an integer type, or of half floats, which marks pixels without depth, unless it is among the invalid
+    ones; that of half floats is left out with ``depth.max_m``.
     """
     values = _depth_values(path, grid, table)
     _check_grid(path, values, grid)
-    if values.dtype.kind in "iu":
-        largest = np.iinfo(values.dtype).max
+    is_integer = values.dtype.kind in "iu"
+    if is_integer or (values.dtype == np.float16 and table.max_m is None):
+        largest = np.iinfo(values.dtype).max if is_integer else int(np.finfo(np.float16).max)
         count = int(np.count_nonzero(values == largest))
         if count and float(largest) not in table.invalid:
             found = f"{count} pixels have {largest}, the largest value of {values.dtype}, which marks no depth"
-            raise EntryError(Problem("invalid", path.name, found, f"depth.invalid with {largest}"))
+            remedy = f"depth.invalid with {largest}" + ("" if is_integer else ", or depth.max_m")
+            raise EntryError(Problem("invalid", path.name, found, remedy))
     with np.errstate(invalid="ignore", over="ignore"):  # A damaged file may hold NaN that signal.
         units = values.astype(np.float64)
         marks = np.array(table.invalid, dtype=values.dtype if values.dtype.kind == "f" else np.float64)
@@ -119,7 +118,7 @@ def _depth_values(path: Path, grid: Grid, table: DepthTable) -> Shaped[ndarray, 
     if suffix in (".npy", ".npz"):
         decode = decode_npy if suffix == ".npy" else decode_npz
         return decode(path.name, memoryview(content), grid, ints=True)
-    return _pixels(path, content, table)
+    return _pixels(path, content, is_depth=True)
 
 
 def planar_depth_m(
@@ -134,17 +133,13 @@ def planar_depth_m(
 
     Range is divided by the length of the ray (x, y, 1) of its pixel in the camera with ``K`` and ``distortion``.
     Disparity d is that of the left pixel to the right: z = fx B / (d + cx_right - cx_left). Raises ``InputError``
-    as ``rectified_pair`` does, and ``EntryError`` for a lens model that cannot be inverted at a pixel.
+    as ``rectified_pair`` does.
     """
     with np.errstate(over="ignore"):
         values = units * factor
     if kind == "range":
         height, width = values.shape
-        try:
-            rays = pixel_rays(K, width, height, distortion)
-        except ValueError as error:
-            raise EntryError(Problem("invalid", "K", str(error), "a lens that sees every pixel")) from None
-        values = values / np.linalg.norm(rays, axis=-1)
+        values = values / np.linalg.norm(pixel_rays(K, width, height, distortion), axis=-1)
     if kind == "disparity":
         pair = rectified_pair(calibration)
         with np.errstate(divide="ignore", over="ignore"):
@@ -178,8 +173,7 @@ def limited_depth_m(
                 named = f"{value:.9g}" if float(np.float32(value)) == value else repr(value)
             found = f"{outside.sum()} pixels have depth {what}, most often the value {named}"
             unit = "depth.scale" if table.kind == "disparity" else 'depth.unit (for example "mm")'
-            remedy = f"{unit}, or depth.invalid with the values without depth, as [{named}]"
-            remedy += ", or depth.max_m to drop what lies beyond it" if outside is beyond else ""
+            remedy = f"{unit}, or depth.invalid = [{named}] if it marks no depth, or depth.max_m"
             raise EntryError(Problem("invalid", path.name, found, remedy))
     return np.where(depth_m > 0, depth_m, 0).astype(np.float32)
 
@@ -225,10 +219,10 @@ def _npy(path: Path, content: bytes) -> ndarray:
         return np.asarray(np.load(io.BytesIO(content), allow_pickle=False))
 
 
-def _pixels(path: Path, content: bytes, depth: DepthTable | None = None) -> Shaped[ndarray, "h w"]:
+def _pixels(path: Path, content: bytes, *, is_depth: bool = False) -> Shaped[ndarray, "h w"]:
     """Return the values of a TIFF, PNG or PFM image with one channel, in the type of the file.
 
-    Raises ``EntryError`` for other images. As ``depth``, pictures of a palette or of single bits are refused too.
+    Raises ``EntryError`` for other images. As depth, pictures of a palette or of single bits are refused too.
     """
     from PIL import Image, UnidentifiedImageError
 
@@ -237,21 +231,15 @@ def _pixels(path: Path, content: bytes, depth: DepthTable | None = None) -> Shap
         warnings.simplefilter("error")  # Pillow warns of huge images before it decodes them.
         try:
             with Image.open(io.BytesIO(content), formats=[image_format]) as image:
-                tags, scale = dict(getattr(image, "tag_v2", {})), image.info.get("scale", 1.0)
-                values, mode = np.asarray(image), image.mode
+                tags, values, mode = dict(getattr(image, "tag_v2", {})), np.asarray(image), image.mode
                 stored = _tiff_type(tags) if tags and mode in _TIFF_INTEGERS else values.dtype.newbyteorder("=")
         except UnidentifiedImageError:
             if image_format != "TIFF":
                 raise
             return _raw_tiff(path, content)
-    if values.ndim != 2 or values.dtype.kind not in "buif" or (depth is not None and mode in ("1", "P")):
+    if values.ndim != 2 or values.dtype.kind not in "buif" or (is_depth and mode in ("1", "P")):
         found = f"has values of type {values.dtype} and shape {values.shape}, Pillow's mode {mode}"
         raise EntryError(Problem("invalid", path.name, found, "one channel of numbers"))
-    if depth is not None and scale not in _PFM_SCALES and depth.unit is None and depth.scale is None:
-        expected = (
-            f"depth.scale, since programs differ: 1 for the values as they are, or {scale:g} to multiply them"
-        )
-        raise EntryError(Problem("invalid", path.name, f"states the scale {scale:g} in its header", expected))
     values = values.astype(values.dtype.newbyteorder("="))
     # Pillow has signed integers of 32 bits for unsigned ones and for those of 16 bits, and bytes for signed ones.
     return values.view(stored) if stored.itemsize == values.itemsize else values.astype(stored)
@@ -306,13 +294,16 @@ def _read_matrix(path: Path, key: str | None, shape: tuple[int, int]) -> Float64
     ``key`` is that of a JSON object. Raises ``EntryError`` for anything but finite numbers.
     """
     content, suffix = read_file(path, TOML_BYTES, "a matrix", InputError), path.suffix.lower()
-    with _damage(path, "numbers with decimal points"):
+    with _damage(path, "numbers with decimal points between blanks or commas"):
         if suffix == ".npy":
             numbers: object = _npy(path, content)
         elif suffix == ".json":
             numbers = _json_value(content, key)
         else:
-            numbers = _text_numbers(path, content)
+            text, problems = decode_text(content, path.name)
+            if problems:
+                raise EntryError(problems[0])
+            numbers = np.loadtxt(io.StringIO(text.replace(",", " ")), ndmin=2)
         values = np.asarray(numbers, dtype=np.float64)
     if values.size == 12 and shape == (4, 4):
         shape = 3, 4
@@ -320,20 +311,6 @@ def _read_matrix(path: Path, key: str | None, shape: tuple[int, int]) -> Float64
         found = f"holds {values.size} numbers"
         raise EntryError(Problem("invalid", path.name, found, f"{shape[0]} x {shape[1]} finite numbers"))
     return values.reshape(shape)
-
-
-def _text_numbers(path: Path, content: bytes) -> list[float]:
-    """Return numbers that blanks, commas, semicolons or brackets separate; the rest of a line after # is left out.
-
-    Commas between digits are refused where other characters separate numbers: they may be decimal commas.
-    """
-    text, problems = decode_text(content, path.name)
-    if problems:
-        raise EntryError(problems[0])
-    text = re.sub("#.*", "", text)
-    if re.search(r"\d,\d", text) and re.search(r"\d[ \t;]+[-+.\d]", text):
-        raise ValueError("it has decimal commas, or several separators")
-    return [float(word) for word in re.split(r"[\s,;\[\]()]+", text) if word]
 
 
 def _json_value(content: bytes, key: str | None) -> object:

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
-from itertools import combinations, product
 from operator import itemgetter
 from typing import Any
 
@@ -15,7 +13,7 @@ from numpy import ndarray
 
 from dataset_builder.importing.import_layout import Layout
 from rebar_depth_bench.bar_crossings.axis_segments import nearest_points
-from rebar_depth_bench.base.errors import EntryError, Problem
+from rebar_depth_bench.base.errors import Problem
 from rebar_depth_bench.base.validation import UNITS_M
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.geometry.cameras import swap_camera_axes, undistort
@@ -28,6 +26,7 @@ _MAX_PAIRS = 1_000_000
 _TRUSTED_SHARE = 0.95
 """Share of the deviations that count, the smallest ones: a survey and a segmentation have outliers."""
 _MAX_LINES = 20
+_RATIOS = (0.001, 0.01, 0.0254, 0.1, 0.3048, 10.0, 100.0, 1000.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,10 +43,6 @@ class _Pixels:
         return _Pixels(*(values[rows] for values in vars(self).values()))
 
 
-_Change = tuple[str, Callable[[_Pixels], _Pixels]]
-"""Changed line of the layout, and the pixels as they are read with it."""
-
-
 @dataclass
 class SurveyCheck:
     """Steel pixels of the left images of ``views`` views, compared with the surfaces of the surveyed ``bars``.
@@ -61,38 +56,29 @@ class SurveyCheck:
     parts: list[_Pixels] = field(default_factory=list)
 
     def add(self, columns: Mapping[str, Any]) -> None:
-        """Add pixels of a view: for each bar, those in the interior of the steel if there are any.
-
-        Raises ``EntryError`` for a lens model that cannot be inverted at one of them.
-        """
+        """Add pixels of a view: for each bar, those in the interior of the steel if there are any."""
         if not self.bars or "left_bars" not in columns:
             return
-        ids, depth_m, K = columns["left_bars"].ravel(), columns["left_depth"].ravel(), columns["left_K"]
-        inside = interior(columns["left_mask"]).ravel()
+        ids, depth_m = columns["left_bars"], columns["left_depth"]
         place = {bar.bar_id: k for k, bar in enumerate(self.bars)}
-        usable = np.flatnonzero(np.isin(ids, list(place)) & (depth_m > 0))
-        usable = usable[np.argsort(ids[usable], kind="stable")]
-        of_bars = np.split(usable, np.flatnonzero(np.diff(ids[usable])) + 1)
-        limit, chosen = max(1, _MAX_POINTS // (self.views * len(of_bars))), []
-        for pixels in of_bars:
-            inner = pixels[inside[pixels]]
-            pixels = inner if len(inner) else pixels
-            chosen.append(pixels[np.linspace(0, len(pixels) - 1, min(limit, len(pixels))).astype(np.intp)])
-        pixels = np.concatenate(chosen)
-        row, column = np.divmod(pixels, columns["left_bars"].shape[1])
-        plane = np.stack([(column - K[0, 2]) / K[0, 0], (row - K[1, 2]) / K[1, 1]], axis=-1)
-        try:
-            rays = np.insert(undistort(plane, columns["left_distortion"]), 2, 1.0, axis=-1)
-        except ValueError as error:
-            raise EntryError(Problem("invalid", "K", str(error), "a lens that sees every pixel")) from None
-        poses = np.broadcast_to(columns["left_cam_from_world"], (len(pixels), 4, 4))
-        bars = np.array([place[bar_id] for bar_id in ids[pixels].tolist()], dtype=np.int64)
-        self.parts.append(_Pixels(depth_m[pixels].astype(np.float64), rays, poses, bars))
+        usable, inside = np.isin(ids, list(place)) & (depth_m > 0), interior(columns["left_mask"])
+        usable &= inside | ~np.isin(ids, ids[usable & inside])
+        row, column = np.nonzero(usable)
+        order = np.argsort(ids[row, column], kind="stable")
+        of_bars = np.split(order, np.flatnonzero(np.diff(ids[row, column][order])) + 1)
+        limit = max(1, _MAX_POINTS // (self.views * len(of_bars)))
+        chosen = np.concatenate([pixels[:: max(1, -(-len(pixels) // limit))] for pixels in of_bars])
+        at, K = (row[chosen], column[chosen]), columns["left_K"]
+        plane = np.stack([(at[1] - K[0, 2]) / K[0, 0], (at[0] - K[1, 2]) / K[1, 1]], axis=-1)
+        rays = np.insert(undistort(plane, columns["left_distortion"]), 2, 1.0, axis=-1)
+        poses = np.broadcast_to(columns["left_cam_from_world"], (len(chosen), 4, 4))
+        bars = np.array([place[bar_id] for bar_id in ids[at].tolist()], dtype=np.int64)
+        self.parts.append(_Pixels(depth_m[at].astype(np.float64), rays, poses, bars))
 
     def pixels(self) -> _Pixels:
         """Return the pixels of all views; there may be none."""
         parts = [*self.parts, _Pixels(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 4, 4)), np.zeros(0, np.int64))]
-        return _Pixels(*(np.concatenate([vars(part)[name] for part in parts]) for name in vars(parts[0])))
+        return _Pixels(*map(np.concatenate, zip(*(vars(part).values() for part in parts), strict=True)))
 
     def lines(self) -> list[str]:
         """Return the lines of the summary: how far the points of each bar are off its surface.
@@ -122,71 +108,52 @@ class SurveyCheck:
     def mistake(self) -> Problem | None:
         """Return the mistake of the layout that explains the deviations, if their RMS exceeds ``truth_sigma_m``.
 
-        It is the changed line that leaves the smallest RMS, at most half of that found. Two lines are named if
-        they leave at most half of that again. The median has to fall too, since outliers alone are no evidence.
+        It is the changed line that leaves the smallest RMS, at most half of that found. The median has to fall
+        too, since outliers alone are no evidence.
         """
-        pixels, sigma_m = self.pixels(), self.layout.truth_sigma_m
+        pixels = self.pixels()
         pixels = pixels.of(slice(None, None, max(1, len(pixels.bar) // _MAX_TRIED_POINTS)))
         found_m = _deviations(pixels, self.bars)[0]
-        groups = list(_changes(self.layout, pixels))
-        singles = [(change,) for group in groups for change in group]
-        pairs = [pair for two in combinations(groups, 2) for pair in product(*two)]
-        least_m, named = _rms(found_m), ""
-        for tried in (singles, pairs):
-            if least_m <= sigma_m:
-                break
-            left = [(_deviations(_changed(pixels, changes), self.bars)[0], changes) for changes in tried]
-            better = [(_rms(left_m), one) for left_m, one in left if _median(left_m) < _median(found_m)]
-            left_rms_m, changes = min(better, key=itemgetter(0), default=(np.inf, ()))
-            if left_rms_m <= least_m / 2:
-                least_m, named = left_rms_m, " and ".join(line for line, _ in changes)
-        if not named:
+        if _rms(found_m) <= self.layout.truth_sigma_m:
+            return None
+        tried = [(line, _deviations(changed, self.bars)[0]) for line, changed in _mistakes(self.layout, pixels)]
+        better = [(_rms(left_m), line) for line, left_m in tried if _median(left_m) < _median(found_m)]
+        left_rms_m, line = min(better, key=itemgetter(0), default=(np.inf, ""))
+        if left_rms_m > _rms(found_m) / 2:
             return None
         found = f"the points of surveyed bars are {_rms(found_m):.3g} m off their surfaces (RMS)"
-        return Problem(
-            "conflict", "", f"{found}, and {least_m:.3g} m if read with {named}", f"{named} in the layout"
-        )
+        found += f", and {left_rms_m:.3g} m if read with {line}"
+        return Problem("conflict", "", found, f"{line} in {self.layout.views or 'the layout'}")
 
 
-def _changes(layout: Layout, pixels: _Pixels) -> Iterator[list[_Change]]:
-    """Yield the alternatives that are tried, in groups: unit of depth, its kind, the poses, and their unit."""
+def _mistakes(layout: Layout, pixels: _Pixels) -> Iterator[tuple[str, _Pixels]]:
+    """Yield changed lines of the layout, and the pixels as they are read with each."""
     depth, poses, length = layout.depth, layout.poses, np.linalg.norm(pixels.ray, axis=1)
-
-    def scaled(factor: float | ndarray) -> Callable[[_Pixels], _Pixels]:
-        return lambda one: replace(one, depth_m=one.depth_m * factor)
-
-    def posed(change: Callable[[ndarray], ndarray]) -> Callable[[_Pixels], _Pixels]:
-        return lambda one: replace(one, cam_from_world=change(one.cam_from_world))
-
-    def inverse(pose: ndarray) -> ndarray:
-        is_turned = poses is not None and poses.axes == "opengl"
-        return swap_camera_axes(np.linalg.inv(swap_camera_axes(pose))) if is_turned else np.linalg.inv(pose)
-
     if depth.kind != "disparity":
         in_place = "" if depth.scale is None else " in place of depth.scale"
-        units = {unit: factor / depth.factor for unit, factor in UNITS_M.items() if factor != depth.factor}
-        yield [(f'depth.unit = "{unit}"{in_place}', scaled(ratio)) for unit, ratio in units.items()]
-        yield [
-            ('depth.kind = "range"', scaled(1 / length))
-            if depth.kind == "z"
-            else ('depth.kind = "z"', scaled(length))
-        ]
-    kind, axes = "poses inverted", "camera axes turned"
+        units = {f'depth.unit = "{unit}"{in_place}': size_m / depth.factor for unit, size_m in UNITS_M.items()}
+        if layout.views is not None:  # It may state the unit, such as that of BOP in metres by mistake.
+            units = {f"a unit of depth that is {ratio:g} times as large": ratio for ratio in _RATIOS}
+        for line, ratio in units.items():
+            yield line, replace(pixels, depth_m=pixels.depth_m * ratio)
+        kind, factors = ("range", 1 / length) if depth.kind == "z" else ("z", length)
+        yield f'depth.kind = "{kind}"', replace(pixels, depth_m=pixels.depth_m * factors)
+    found, is_opengl = pixels.cam_from_world, poses is not None and poses.axes == "opengl"
+    turned = swap_camera_axes(found)
+    inverted = np.linalg.inv(turned if is_opengl else found)  # The poses in the axes of the files.
+    both = swap_camera_axes(inverted)
+    if is_opengl:
+        inverted, both = both, inverted
+    kind, axes, changes = "poses inverted", "camera axes turned", dict[str, ndarray]()
     if poses is not None:
         kind = f'poses.kind = "{"world_from_cam" if poses.kind == "cam_from_world" else "cam_from_world"}"'
-        axes = f'poses.axes = "{"opengl" if poses.axes == "opencv" else "opencv"}"'
-    both = posed(lambda pose: swap_camera_axes(inverse(pose)))
-    yield [(kind, posed(inverse)), (axes, posed(swap_camera_axes)), (f"{kind} and {axes}", both)]
-    if poses is not None:
-        units = {unit: factor / UNITS_M[poses.unit] for unit, factor in UNITS_M.items() if unit != poses.unit}
-        columns = {unit: np.array([[1, 1, 1, ratio]] * 3 + [[1] * 4]) for unit, ratio in units.items()}
-        yield [(f'poses.unit = "{unit}"', posed(partial(np.multiply, one))) for unit, one in columns.items()]
-
-
-def _changed(pixels: _Pixels, changes: Sequence[_Change]) -> _Pixels:
-    for _, change in changes:
-        pixels = change(pixels)
-    return pixels
+        axes = f'poses.axes = "{"opencv" if is_opengl else "opengl"}"'
+        for unit, factor_m in UNITS_M.items():
+            scales = np.array([1, 1, 1, factor_m / UNITS_M[poses.unit]])
+            changes[f'poses.unit = "{unit}"'] = found * np.vstack([[scales] * 3, np.ones(4)])
+    changes |= {kind: inverted, axes: turned, f"{kind} and {axes}": both}
+    for line, pose in changes.items():
+        yield line, replace(pixels, cam_from_world=pose)
 
 
 def _deviations(

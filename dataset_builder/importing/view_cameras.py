@@ -27,20 +27,30 @@ from rebar_depth_bench.base.limits import JSON_BYTES
 from rebar_depth_bench.base.reading import parse_json, read_file
 from rebar_depth_bench.base.validation import UNITS_M, short_repr, with_lines
 from rebar_depth_bench.captures.calibration import Calibration, scaled_calibration, table_calibration
-from rebar_depth_bench.captures.fields import Field, FileFormat, plain_key
+from rebar_depth_bench.captures.fields import Field, FileFormat
 from rebar_depth_bench.geometry.cameras import HALF_PIXEL
 
 _UNIT = "depth_unit_scale_factor"
-_LENS = "no other lens: undistort images and depth maps first, and state the new K"
+_LENS = (
+    'no other lens: undistort images and depth maps first, see "Rectify images first" in docs/captures.md, and '
+    "state the new K"
+)
 _MODELS = ("OPENCV", "RADIAL", "SIMPLE_RADIAL", "PINHOLE", "SIMPLE_PINHOLE")
+_TERMS = ("k1", "k2", "p1", "p2", "k3")
+_OTHER_LENS = ("k4", "k5", "k6", "is_fisheye", "ftheta_p0", "latlong", "equirectangular")
+_OTHERS = ("x_fov", "y_fov", "rolling_shutter", "from_na", "integer_depth_scale")
+_FURTHER = (
+    *("mask_path", "normal_file_path", "ply_file_path", "train_filenames", "val_filenames", "test_filenames"),
+    *("n_frames", "aabb_scale", "aabb", "offset", "up", "orientation_override"),
+    *("sharpness", "colmap_im_id", "rotation", "time"),
+)
 
 BOP = FileFormat(
     "BOP `scene_camera.json`",
     (
         Field("K", ("cam_K",), "used", "K row by row, pixels"),
         Field("unit", ("depth_scale",), "used", "millimetres of one unit of the depth map"),
-        Field("rotation", ("cam_R_w2c",), "used", "rotation from the world to the camera, row by row"),
-        Field("translation", ("cam_t_w2c",), "used", "translation from the world to the camera, millimetres"),
+        Field("pose", ("cam_R_w2c", "cam_t_w2c"), "used", "from the world to the camera, millimetres"),
         Field("lens", ("cam_model",), "checked", _LENS),
         Field("sampling", ("elevation", "mode", "view_level"), "harmless", "how the view was chosen"),
     ),
@@ -53,24 +63,19 @@ NERFSTUDIO = FileFormat(
         Field("pose", ("transform_matrix",), "used", "from the camera, in OpenGL axes, to the world"),
         Field("scale", ("applied_scale",), "used", "divides the translations, which gives metres"),
         Field("motion", ("applied_transform",), "used", "moved the world; refused beside surveyed bars"),
-        Field("fx", ("fl_x",), "used", "focal length, pixels"),
-        Field("fy", ("fl_y",), "used", "focal length, pixels; default: that of x"),
-        Field("angle_x", ("camera_angle_x",), "used", "field of view, radians; checked beside `fl_x`"),
-        Field("angle_y", ("camera_angle_y",), "used", "field of view, radians; left out beside `fl_y`"),
-        *(Field(key, (key,), "used", "principal point, pixels; default: the middle") for key in ("cx", "cy")),
-        *(Field(key, (key,), "used", "lens distortion of OpenCV") for key in ("k1", "k2", "p1", "p2", "k3")),
-        *(Field(key, (key,), "used", "size, which is that of the images") for key in ("w", "h")),
+        Field("focal", ("fl_x", "fl_y"), "used", "focal length, pixels; that of y is by default that of x"),
+        Field("angle", ("camera_angle_x", "camera_angle_y"), "used", "field of view, radians, instead of `fl_x`"),
+        Field("centre", ("cx", "cy"), "used", "principal point, pixels; default: the middle"),
+        Field("distortion", _TERMS, "used", "lens distortion of OpenCV"),
+        Field("size", ("w", "h"), "used", "size, which is that of the images"),
         Field("model", ("camera_model",), "used", f"{', '.join(_MODELS)}; {_LENS}"),
-        Field("k4", ("k4", "k5", "k6", "is_fisheye", "ftheta_p0", "latlong", "equirectangular"), "checked", _LENS),
-        Field("fov", ("x_fov", "y_fov"), "checked", "fl_x and fl_y in its place"),
-        Field("shutter", ("rolling_shutter", "transform_matrix_start"), "checked", "one pose for each image"),
-        Field("axes", ("from_na", "normal_mts_args"), "checked", "none: OpenGL axes"),
-        Field("unit", (_UNIT, "integer_depth_scale"), "used", "metres of one unit of depth"),
-        Field("depth", ("depth_file_path", "depth_path"), "used", "depth map with this unit"),
-        Field("files", ("mask_path", "normal_file_path", "ply_file_path"), "harmless", "further files"),
-        Field("splits", ("train_filenames", "val_filenames", "test_filenames", "n_frames"), "harmless", "subsets"),
-        Field("region", ("aabb_scale", "aabb", "offset", "up", "orientation_override"), "harmless", "the scene"),
-        Field("origin", ("sharpness", "colmap_im_id", "rotation", "time"), "harmless", "how an image was taken"),
+        Field("lens", _OTHER_LENS, "checked", _LENS),
+        Field(
+            "others", _OTHERS, "checked", f"only fl_x, fl_y, one pose for each image in OpenGL axes, and {_UNIT}"
+        ),
+        Field("unit", (_UNIT,), "used", "metres of one unit of depth"),
+        Field("depth", ("depth_file_path",), "used", "depth map with this unit"),
+        Field("further", _FURTHER, "harmless", "further files, subsets, region, and how an image was taken"),
     ),
 )
 _FACTORS = (1e-9, 1e6)
@@ -180,22 +185,20 @@ def _places(
     return {} if problems else {name: found[0] for name, found in places.items()}
 
 
-def _values(file_format: FileFormat, *tables: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the values of the whole file and of an entry by the first key of their fields, without null.
+def _values(file_format: FileFormat, whole: Mapping[str, Any], entry: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the values of the whole file and of an entry, without null.
 
     Raises ``EntryError`` for a field that must not be there, and for values that differ between both tables.
     """
-    values: dict[str, Any] = {}
-    for table in tables:
-        plain = {plain_key(key): value for key, value in table.items() if value is not None}
-        for field in file_format.fields:
-            for key in [key for key in field.keys if plain_key(key) in plain]:
-                value = plain[plain_key(key)]
-                if field.use == "checked" and (any(value) if isinstance(value, list) else value):
-                    raise EntryError(Problem("invalid", key, f"got {short_repr(value)}", field.meaning))
-                if field.use == "used" and values.setdefault(field.keys[0], value) != value:
-                    found = f"got {short_repr(values[field.keys[0]])} and {short_repr(value)}"
-                    raise EntryError(Problem("conflict", key, found, "one value, of the file or of the frame"))
+    values = {key: value for key, value in {**whole, **entry}.items() if value is not None}
+    for field in file_format.fields:
+        for key in filter(values.__contains__, field.keys):
+            value, other = values[key], whole.get(key)
+            if field.use == "checked" and (any(value) if isinstance(value, list) else value):
+                raise EntryError(Problem("invalid", key, f"got {short_repr(value)}", field.meaning))
+            if field.use == "used" and other is not None and other != value:
+                found = f"got {short_repr(other)} and {short_repr(value)}"
+                raise EntryError(Problem("conflict", key, found, "one value, of the file or of the frame"))
     return values
 
 
@@ -250,7 +253,7 @@ def _nerfstudio(values: Mapping[str, Any], layout: Layout, name: str, grid: Grid
     if (model := values.get("camera_model", _MODELS[0])) not in _MODELS:
         expected = f"{', '.join(_MODELS)}; {_LENS}"
         raise EntryError(Problem("invalid", "camera_model", f"got {short_repr(model)}", expected))
-    lens: dict[str, Any] = {"distortion": [_number(values, key, 0.0) for key in ("k1", "k2", "p1", "p2", "k3")]}
+    lens: dict[str, Any] = {"distortion": [_number(values, key, 0.0) for key in _TERMS]}
     for axis, side, side_px in (("x", "w", grid[1]), ("y", "h", grid[0])):
         if _number(values, side, side_px) != side_px:
             expected = f"{side_px} as the images: scale them, or w, h, fl_x, fl_y, cx and cy"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -17,7 +16,6 @@ from rebar_depth_bench.captures.calibration import (
     ANGLE_RAD,
     DISTORTION,
     FOCAL_PX,
-    KNOWN_LENS,
     SIDES_PX,
     Calibration,
     Lens,
@@ -27,7 +25,7 @@ from rebar_depth_bench.captures.calibration import (
     scaled_calibration,
     table_calibration,
 )
-from rebar_depth_bench.captures.fields import Field, FileFormat
+from rebar_depth_bench.captures.fields import Field, FileFormat, lens_problem
 
 
 def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibration:
@@ -64,7 +62,13 @@ def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibra
     Raises ``CalibrationError`` with all problems of the file; also if a distortion model cannot be inverted over
     the whole image, if the requested size is not 16 to 16384 pixels each, and if its aspect ratio is another one.
     """
-    path = Path(path)
+    calibration = own_calibration(Path(path), width, height, is_stereo=True)
+    assert isinstance(calibration, StereoCalibration)
+    return calibration
+
+
+def own_calibration(path: Path, width: int, height: int, *, is_stereo: bool) -> Calibration:
+    """Return the calibration in a file as ``read_calibration``; a ``.toml`` file may have one camera."""
     suffix = path.suffix.lower()
     if suffix not in (".conf", ".toml"):
         problem = Problem("invalid", "", f"the file suffix is {path.suffix!r}", ".conf or .toml")
@@ -76,8 +80,9 @@ def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibra
         calibration: Calibration | None = _read_conf(path.name, content, width, height, problems)
     else:
         document, problems = parse_toml(content)
-        calibration = None if problems else table_calibration(document, width, height, problems, is_stereo=True)
-    if not isinstance(calibration, StereoCalibration):
+        is_pair = is_stereo or "right" in document
+        calibration = None if problems else table_calibration(document, width, height, problems, is_stereo=is_pair)
+    if calibration is None:
         raise CalibrationError.from_problems(path, with_lines(problems, content))
     return scaled_calibration(calibration, path, width, height)
 
@@ -108,13 +113,14 @@ _GRIDS: Mapping[str, tuple[int, int]] = {
 """Image sizes (width, height) of Stereolabs cameras, pixels, by section suffix."""
 _CAMERAS = ("LEFT_CAM_", "RIGHT_CAM_")
 
-_TERMS = ("k1", "k2", "p1", "p2", "k3")
+_TERMS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tauX", "tauY")
+"""Distortion terms in OpenCV's order."""
 _STEREO: Mapping[str, Expected] = {
     "Baseline": quantity(1, 10_000, "millimetres"),
     **dict.fromkeys(("TY", "TZ"), quantity(-1000, 1000, "millimetres")),
     **dict.fromkeys(("RX", "CV", "RZ"), ANGLE_RAD),
 }
-_OPTIONAL = ("p1", "p2", "k3", "TY", "TZ")
+_OPTIONAL = (*_TERMS[2:], "TY", "TZ")
 """Fields that may be missing, which means 0."""
 
 
@@ -123,15 +129,13 @@ def _fields(names: Iterable[str], keys: str, use: Literal["used", "checked"], me
 
 
 _SIZES = ", ".join(f"{name} ({width} x {height})" for name, (width, height) in _GRIDS.items())
+_DISTO = "EYE_DISTO.# EYE_CAM_X.#"
 ZED_CONF = FileFormat(
     "Stereolabs' `*.conf`",
     (
         *_fields(("fx", "fy", "cx", "cy"), "EYE_CAM_X.#", "used", f"pixels; EYE: LEFT or RIGHT; X: {_SIZES}"),
-        *_fields(_TERMS, "EYE_DISTO.# EYE_CAM_X.#", "used", "distortion; equal if in both sections"),
-        *_fields(
-            ("k4", "k5", "k6", "s1", "s2", "s3", "s4", "tauX", "tauY"),
-            *("EYE_DISTO.# EYE_CAM_X.#", "checked", "absent or 0: terms of other lens models"),
-        ),
+        *_fields(_TERMS[:5], _DISTO, "used", "distortion; equal if in both sections"),
+        *_fields(_TERMS[5:], _DISTO, "checked", "absent or 0: terms of other lens models"),
         *_fields(("Baseline", "TY", "TZ"), "STEREO.#_X STEREO.#", "used", "T = -(Baseline, TY, TZ), millimetres"),
         *_fields(("RX", "CV", "RZ"), "STEREO.#_X STEREO.#", "used", "R = Rodrigues(RX, CV, RZ), radians"),
         Field("miscellaneous", ("MISC",), "harmless", "such as the kind of sensor"),
@@ -145,63 +149,50 @@ _COMMENT = re.compile(r"(?:^|\s)[;#]")
 _SEPARATOR = re.compile("[=:]")
 
 
-@dataclass(frozen=True)
-class _SizeReader:
-    """Values of the image size ``suffix`` in the sections of a file; problems are added to ``problems``."""
+def _lens(sections: _Sections, eye: str, suffix: str, problems: list[Problem]) -> Lens:
+    """Return the lens of the camera ``eye`` for an image size; problems are added to ``problems``."""
+    width, height = _GRIDS[suffix]
+    pinhole = {"fx": FOCAL_PX, "fy": FOCAL_PX, "cx": principal_point(width), "cy": principal_point(height)}
+    fx, fy, cx, cy = _numbers(sections, pinhole, eye, suffix, problems)
+    invalid = list[Problem]()
+    terms = _numbers(sections, dict.fromkeys(_TERMS, DISTORTION), eye, suffix, invalid)
+    while terms[5:] and not terms[-1]:
+        terms.pop()
+    present = [name for name in _TERMS if _entries(sections, name, eye, suffix)]
+    has_four = "k4" in present and "p1" not in present and "p2" not in present
+    models = {"the lens model": "fisheye, k1 k2 k3 k4"} if has_four else {}
+    section = f"{eye}_DISTO" if f"{eye}_DISTO" in sections else f"{eye}_CAM_{suffix}"
+    problem = lens_problem(section, models, terms)
+    problems += invalid if problem is None else [problem]
+    return Lens(fx, fy, cx, cy, (terms[0], terms[1], terms[2], terms[3], terms[4]))
 
-    sections: _Sections
-    suffix: str
-    problems: list[Problem]
 
-    def lens(self, eye: str) -> Lens:
-        """Return the lens of the camera ``eye``."""
-        width, height = _GRIDS[self.suffix]
-        fx, fy = self.numbers({"fx": FOCAL_PX, "fy": FOCAL_PX}, eye)
-        cx, cy = self.numbers({"cx": principal_point(width), "cy": principal_point(height)}, eye)
-        terms = dict.fromkeys(_TERMS, DISTORTION) if self._has_known_model(eye) else {}
-        k1, k2, p1, p2, k3 = self.numbers(terms, eye) or [0.0] * len(_TERMS)
-        return Lens(fx, fy, cx, cy, (k1, k2, p1, p2, k3))
+def _numbers(
+    sections: _Sections, fields: Mapping[str, Expected], eye: str, suffix: str, problems: list[Problem]
+) -> list[float]:
+    """Return the numbers of fields; 0 and a problem for an invalid one, and for a missing one of a section."""
+    numbers = []
+    for name, expected in fields.items():
+        entries = _entries(sections, name, eye, suffix)
+        place, line, raw = (*entries, (_place(ZED_CONF.keys(name)[-1], eye, suffix), 0, "0"))[0]
+        numbers.append(parse_number(raw))
+        if not entries and place.partition(".")[0] in sections and name not in _OPTIONAL:
+            problems.append(Problem("missing", place, "missing", expected.text))
+        elif entries and not expected.accept(numbers[-1]):
+            problems.append(Problem("invalid", place, f"line {line}: got {short_repr(raw)}", expected.text))
+        elif name in _TERMS and any(parse_number(other) != numbers[-1] for _, _, other in entries[1:]):
+            problems.append(Problem("conflict", place, f"differs from {entries[1][0]}", "one lens model"))
+    return numbers
 
-    def numbers(self, fields: Mapping[str, Expected], eye: str = "") -> list[float]:
-        """Return the numbers of fields; 0 and a problem for an invalid one, and for a missing one of a section."""
-        numbers = []
-        for name, expected in fields.items():
-            entries = self._entries(name, eye)
-            place, line, raw = (*entries, (_place(ZED_CONF.keys(name)[-1], eye, self.suffix), 0, "0"))[0]
-            numbers.append(parse_number(raw))
-            if not entries and place.partition(".")[0] in self.sections and name not in _OPTIONAL:
-                self.problems.append(Problem("missing", place, "missing", expected.text))
-            elif entries and not expected.accept(numbers[-1]):
-                found = f"line {line}: got {short_repr(raw)}"
-                self.problems.append(Problem("invalid", place, found, expected.text))
-            elif name in _TERMS and any(parse_number(other) != numbers[-1] for _, _, other in entries[1:]):
-                self.problems.append(Problem("conflict", place, f"differs from {entries[1][0]}", "one lens model"))
-        return numbers
 
-    def _has_known_model(self, eye: str) -> bool:
-        """Return whether the lens has no terms but k1 k2 p1 p2 k3 and is no fisheye one; add a problem if not."""
-        checked = [field.name for field in ZED_CONF.fields if field.use == "checked"]
-        other = [entry for name in checked for entry in self._entries(name, eye)]
-        tangential = self._entries("p1", eye) + self._entries("p2", eye)
-        has_four = bool(self._entries("k4", eye)) and not tangential
-        terms = [entry for entry in other if has_four or parse_number(entry[2]) != 0]
-        if terms:
-            further = [raw for *_, raw in tangential + self._entries("k5", eye) + self._entries("k6", eye)]
-            section, _, name = terms[0][0].partition(".")
-            radial = "rational" if any(map(parse_number, further)) else "fisheye"
-            kind = {"s": "thin prism", "t": "tilted"}.get(name[0], radial)
-            stated = ", ".join(f"{place.partition('.')[2]} = {escape_text(raw)}" for place, _, raw in terms)
-            self.problems.append(Problem("invalid", section, f"{kind} distortion ({stated})", KNOWN_LENS))
-        return not terms
-
-    def _entries(self, name: str, eye: str) -> list[tuple[str, int, str]]:
-        """Return place, line and text of the keys of a field that the file has."""
-        places = [_place(key, eye, self.suffix).split(".") for key in ZED_CONF.keys(name)]
-        return [
-            (f"{section}.{key}", *self.sections[section][key.lower()])
-            for section, key in places
-            if key.lower() in self.sections.get(section, {})
-        ]
+def _entries(sections: _Sections, name: str, eye: str, suffix: str) -> list[tuple[str, int, str]]:
+    """Return place, line and text of the keys of a field that the file has."""
+    places = [_place(key, eye, suffix).split(".") for key in ZED_CONF.keys(name)]
+    return [
+        (f"{section}.{key}", *sections[section][key.lower()])
+        for section, key in places
+        if key.lower() in sections.get(section, {})
+    ]
 
 
 def _place(key: str, eye: str, suffix: str) -> str:
@@ -223,9 +214,8 @@ def _read_conf(
         return None
     names = (f"LEFT_CAM_{suffix}", f"RIGHT_CAM_{suffix}", "STEREO")
     problems += [Problem("missing", one, "missing", "a section") for one in names if one not in sections]
-    reader = _SizeReader(sections, suffix, problems)
-    left, right = reader.lens("LEFT"), reader.lens("RIGHT")
-    baseline_mm, y_mm, z_mm, rx, cv, rz = reader.numbers(_STEREO)
+    left, right = (_lens(sections, eye, suffix, problems) for eye in ("LEFT", "RIGHT"))
+    baseline_mm, y_mm, z_mm, rx, cv, rz = _numbers(sections, _STEREO, "", suffix, problems)
     translation_m = (0.0 - baseline_mm / 1000, 0.0 - y_mm / 1000, 0.0 - z_mm / 1000)
     if problems:
         return None

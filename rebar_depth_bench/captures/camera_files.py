@@ -57,7 +57,7 @@ from rebar_depth_bench.captures.calibration import (
     scaled_calibration,
     table_calibration,
 )
-from rebar_depth_bench.captures.calibration_files import check_image_size, read_calibration
+from rebar_depth_bench.captures.calibration_files import check_image_size, own_calibration
 from rebar_depth_bench.captures.documents import DOCUMENT_SUFFIXES, parse_document
 from rebar_depth_bench.captures.programs import program_calibration
 from rebar_depth_bench.captures.recognised import recognised_problem
@@ -219,20 +219,6 @@ def _found_files(root: Path) -> list[Path]:
     )
 
 
-def _own_calibration(path: Path, width: int, height: int, *, is_stereo: bool) -> Calibration:
-    """Return the calibration in a ``.conf`` or ``.toml`` file, which may have ``[left]`` alone for one camera."""
-    if is_stereo or path.suffix.lower() != ".toml":
-        return read_calibration(path, width, height)
-    check_image_size(path, width, height)
-    content = read_file(path, TOML_BYTES, "a calibration file", CalibrationError)
-    document, problems = parse_toml(content)
-    is_pair = "right" in document
-    calibration = None if problems else table_calibration(document, width, height, problems, is_stereo=is_pair)
-    if calibration is None:
-        raise CalibrationError.from_problems(path, with_lines(problems, content))
-    return scaled_calibration(calibration, path, width, height)
-
-
 def _file_calibration(
     paths: Sequence[Path], stated: _CamerasTable, width: int, height: int, *, is_stereo: bool
 ) -> Calibration:
@@ -246,7 +232,7 @@ def _file_calibration(
             problem = Problem("conflict", "", "has no matrix of rectified pictures", expected)
         if problem is not None:
             raise CalibrationError.from_problems(paths[0], [problem])
-        return _own_calibration(paths[0], width, height, is_stereo=is_stereo)
+        return own_calibration(paths[0], width, height, is_stereo=is_stereo)
     check_image_size(paths[0], width, height)
     contents = {path.name: read_file(path, TOML_BYTES, "a calibration file", CalibrationError) for path in paths}
     documents = {name: parse_document(name, content, problems) for name, content in contents.items()}

@@ -15,7 +15,7 @@ from rebar_depth_bench.base.errors import Problem, escape_text
 from rebar_depth_bench.base.reading import MAX_NESTING, decode_text, parse_json
 
 _MAX_ALIASED = 10_000
-"""Largest number of values that the aliases of a YAML text stand for."""
+"""Largest number of values that the aliases of a YAML text stand for; it keeps their nesting below 150 levels."""
 _OPENCV_HEADER = re.compile(r"\A%YAML[: ][0-9.]+[^\n]*\n")
 """First line of OpenCV's YAML; its older form, ``%YAML:1.0``, is not YAML."""
 _OPENCV_MATRIX = "tag:yaml.org,2002:opencv-matrix"
@@ -65,40 +65,35 @@ def _parse_yaml(text: str) -> Any:
 
 
 def _check_events(events: Iterable[Any]) -> None:
-    """Raise ``ValueError`` for Python's tags, deep nesting, and aliases that make a short text huge or endless.
-
-    Values and levels are those after the aliases are replaced by what they stand for.
-    """
-    containers: list[tuple[str | None, int, int]] = []  # Anchor, values and levels of each open one.
-    anchors: dict[str, tuple[int, int]] = {}
-    aliased = 0
+    """Raise ``ValueError`` for Python's tags, deep nesting, and aliases that make a short text huge or endless."""
+    opened: list[tuple[str | None, int]] = []  # Anchor of each open container, and the values before it.
+    sizes: dict[str | None, int] = {}  # Values that each anchor stands for.
+    values = aliased = 0
     for event in events:
-        kind, line = type(event).__name__, event.start_mark.line + 1
-        anchor, values, levels = getattr(event, "anchor", None), 1, 0
+        kind, line, anchor = type(event).__name__, event.start_mark.line + 1, getattr(event, "anchor", None)
         if "python/" in str(getattr(event, "tag", "")):
             expected = "plain lists: array.tolist(), list(tuple), float(number)"
             raise ValueError(f"line {line}: a Python object (!!python/...), expected {expected}")
-        if kind.endswith("StartEvent"):
-            containers.append((anchor, values, levels))
-        elif kind.endswith("EndEvent"):
-            anchor, values, levels = containers.pop()
-            levels += 1
-        elif kind == "AliasEvent":
-            if anchor not in anchors:
+        if kind == "AliasEvent":
+            if anchor not in sizes:
                 raise ValueError(f"line {line}: the alias *{anchor} stands for no complete value")
-            values, levels = anchors[anchor]
-            aliased += values
+            aliased += sizes[anchor]
+            values += sizes[anchor]
+        elif kind.endswith("EndEvent"):
+            anchor, before = opened.pop()
+            sizes[anchor] = values - before
+        elif kind.endswith("StartEvent"):
+            opened.append((anchor, values))
+            sizes.pop(anchor, None)
+            values += 1
+        else:
+            sizes[anchor] = 1
+            values += 1
         if aliased > _MAX_ALIASED:
             found = f"the aliases (*) stand for more than {_MAX_ALIASED} values"
             raise ValueError(f"line {line}: {found}, expected plain values")
-        if len(containers) + levels > MAX_NESTING:
+        if len(opened) > MAX_NESTING:
             raise ValueError(f"line {line}: the values are nested too deep, expected at most {MAX_NESTING} levels")
-        if not kind.endswith("StartEvent"):
-            if anchor is not None:
-                anchors[anchor] = values, levels
-            if containers:
-                outer, its_values, its_levels = containers[-1]
-                containers[-1] = outer, its_values + values, max(its_levels, levels)
 
 
 def _parse_json(text: str) -> Any:

@@ -23,9 +23,11 @@ _RADIAL = (
     *("0", "false"),
 )
 """Lens models, or answers to whether it is a fisheye lens, whose first terms are k1 k2 p1 p2 k3; as plain keys."""
+OTHER_LENS = re.compile(
+    r"fish|omnidir|\bomni\b|equidist|kannala|rational|thin.?prism|unified|double.?sphere", re.I
+)
+"""Part of the name of another lens model, by which a text with an unknown key is refused."""
 _UNDISTORTED = ("none", "")
-_SAME_WITHOUT_TERMS = ("inversebrownconrady", "modifiedbrownconrady")
-"""Lens models of other distortion, which are pinholes if all terms are 0."""
 _PINHOLE = ("pinhole", "perspective")
 """Names of a projection without a statement about the distortion."""
 
@@ -79,13 +81,13 @@ def lens_problem(where: str, models: Mapping[str, Any], terms: Sequence[float] =
     texts = {key: "" if model is None else str(model) for key, model in models.items()}
     plain = {key: plain_key(text) or text.strip() for key, text in texts.items()}
     stated_radial = any(model in _RADIAL for model in plain.values())
-    accepted = (*_RADIAL, *_PINHOLE, *_UNDISTORTED, *(() if any(terms) else _SAME_WITHOUT_TERMS))
-    others = [key for key, model in plain.items() if model not in accepted]
+    others = [key for key, model in plain.items() if model not in (*_RADIAL, *_PINHOLE, *_UNDISTORTED)]
     expected = KNOWN_LENS
     if others:
         found = f"{escape_text(others[0])} is {short_repr(models[others[0]])}"
     elif any(terms[DISTORTION_TERMS:]):
-        found = f"the distortion has {len(terms)} terms"
+        kind = "tilted" if any(terms[12:]) else "thin prism" if any(terms[8:]) else "fisheye or rational"
+        found = f"the distortion has {len(terms)} terms: {kind} distortion"
     elif any(terms) and "none" in plain.values():
         found, expected = "distortion terms beside a model of none", "zeros, or the model of the terms"
     elif any(terms) and len(terms) == 4 and not stated_radial:

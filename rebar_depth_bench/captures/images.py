@@ -103,8 +103,9 @@ def check_upright(stream: BinaryIO, where: str = "") -> None:
     for plugin in (PngImageFile, JpegImageFile, TiffImageFile) if is_small else ():
         stream.seek(0)
         with suppress(Exception), warnings.catch_warnings(action="ignore"), plugin(stream) as image:
-            if plugin is PngImageFile and (exif := _png_exif(stream)):
-                image.info["exif"] = exif
+            if plugin is PngImageFile:  # Pillow knows the chunks before the pixels only.
+                stream.seek(0)
+                image.info["exif"] = b"".join(_PNG_EXIF.findall(stream.read())[:1])
             # The method of PngImageFile would decode the pixels.
             orientation = Image.getexif(image).get(Base.Orientation)
     if orientation in range(2, 9):
@@ -114,26 +115,14 @@ def check_upright(stream: BinaryIO, where: str = "") -> None:
         raise EntryError(Problem("invalid", where, found, expected))
 
 
-def _png_exif(stream: BinaryIO) -> bytes | None:
-    """Return the EXIF data of a PNG file, which may stand after the pixels."""
-    stream.seek(len(_PNG_SIGNATURE))
-    for _ in range(_MAX_PNG_CHUNKS):
-        head = stream.read(8)
-        length = int.from_bytes(head[:4], "big")
-        if len(head) < 8 or head[4:] == b"eXIf":
-            return stream.read(min(length, _MAX_EXIF_BYTES))
-        stream.seek(length + 4, 1)
-    return None
-
-
 # Size of an image, read from its header. No image library takes part: nothing is decoded or inflated, whatever the
 # file declares.
 
 
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 _PNG_HEADER_BYTES = 33
-_MAX_PNG_CHUNKS = 100_000
-_MAX_EXIF_BYTES = 1 << 20
+_PNG_EXIF = re.compile(rb"eXIf((?:II\*\0|MM\0\*)[\s\S]{4,65536})")
+"""Chunk with EXIF data, and what is after it."""
 _MAX_JPEG_SEGMENTS = 1000
 """Largest number of JPEG segments and of bytes between them before the one with the size."""
 _FRAME_MARKERS = frozenset(range(0xC0, 0xD0)) - {0xC4, 0xC8, 0xCC}

@@ -18,10 +18,11 @@ _TERMS = "distortion_coefficients D distortion distortion_coeffs dist dist_coeff
 _MODEL = "camera_model model model_type camera_type lens_model projection_model fisheye_model fisheye is_fisheye"
 _NEW_MATRIX = "projection_matrix P new_camera_matrix optimal_camera_matrix newcameramtx"
 _HARMLESS = (
-    "header camera_name camera_id calibration_time calibration_date date nframes nr_of_frames board_width "
-    "board_height square_size marker_size aspectRatio fix_aspect_ratio avg_reprojection_error reprojection_error "
-    "rms rms_error ret per_view_reprojection_errors extrinsic_parameters image_points grid_points rvecs tvecs E F "
-    "essential_matrix fundamental_matrix Q disparity_to_depth_matrix roi1 roi2 valid_roi1 valid_roi2"
+    "header comment description camera_name camera_id calibration_time calibration_date date nframes nr_of_frames "
+    "board_width board_height square_size marker_size aspectRatio fix_aspect_ratio avg_reprojection_error "
+    "reprojection_error rms rms_error ret per_view_reprojection_errors extrinsic_parameters image_points "
+    "grid_points rvecs tvecs E F essential_matrix fundamental_matrix Q disparity_to_depth_matrix roi1 roi2 "
+    "valid_roi1 valid_roi2"
 )
 CAMERA = FileFormat(
     "One camera of OpenCV's FileStorage, or ROS camera_info",
@@ -73,6 +74,6 @@ KALIBR = FileFormat(
         _field("camera model", "camera_model", "checked", "pinhole"),
         _field("size", "resolution", "used", "width, height"),
         _field("motion", "T_cn_cnm1", "used", "cam1_from_cam0, 4 x 4"),
-        _field("recording", "cam_overlaps rostopic T_cam_imu timeshift_cam_imu", "harmless", "of the recording"),
+        _field("details", "cam_overlaps rostopic T_cam_imu timeshift_cam_imu", "harmless", "of the recording"),
     ),
 )

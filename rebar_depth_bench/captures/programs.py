@@ -29,7 +29,7 @@ from rebar_depth_bench.base.errors import Problem, ProblemCode
 from rebar_depth_bench.base.reading import parse_number
 from rebar_depth_bench.base.validation import format_location, short_repr
 from rebar_depth_bench.captures.calibration import Calibration, table_calibration
-from rebar_depth_bench.captures.fields import DISTORTION_TERMS, FileFormat, lens_problem, plain_key
+from rebar_depth_bench.captures.fields import DISTORTION_TERMS, OTHER_LENS, FileFormat, lens_problem, plain_key
 from rebar_depth_bench.captures.program_formats import CAMERA, KALIBR, MIDDLEBURY, MIDDLEBURY_RIGHT, PAIR
 from rebar_depth_bench.geometry.cameras import is_rotation, nearest_rotation, rotation_matrix
 
@@ -130,12 +130,13 @@ class _Reader:
         """Terms k1 k2 p1 p2 k3, after the check that they describe the lens."""
         terms = self.numbers("distortion", (-1,), default=np.zeros(DISTORTION_TERMS)).tolist()
         models = {key: self.document[key] for key in self.keys("camera model")}
-        alone = dict(models)
-        alone |= {
-            key: self.document[key] for key in self.keys("other lenses") if any(flat_numbers(self.document[key]))
-        }
-        alone |= {
-            key: self.document[key] for key in self.keys("flags") if "fish" in str(self.document[key]).lower()
+        others = {key: self.document[key] for key in self.keys("other lenses")}
+        ignored = self.keys("details") + self.keys("distortion model")
+        texts = {key: text for key, text in self.document.items() if key not in ignored}
+        alone = {
+            **models,
+            **{key: value for key, value in others.items() if any(flat_numbers(value))},
+            **{key: text for key, text in texts.items() if isinstance(text, str) and OTHER_LENS.search(text)},
         }
         found = [lens_problem(self.key_place(key), {key: value}) for key, value in alone.items()]
         if not any(found):
@@ -154,32 +155,30 @@ class _Reader:
         size, pictures = self.size(), [width, height]
         sensor = list(size.values())
         bin_x, bin_y = (max(1.0, self.numbers(f"binning {axis}", (1,), default=np.zeros(1))[0]) for axis in "xy")
-        key = self.key("region")
-        roi = {} if key is None else self.document[key]
-        fields = [roi.get(name, 0) for name in _REGION] if isinstance(roi, dict) else roi
-        region = list(flat_numbers(fields)) or [0.0] * 4
+        roi = self.document.get(self.key("region") or "", {})
+        region = list(flat_numbers([roi.get(name, 0) for name in _REGION] if isinstance(roi, dict) else roi))
         if len(region) != 4 or not all(value >= 0 and value.is_integer() for value in (*region, bin_x, bin_y)):
             self.problem("invalid", "region", f"got {short_repr(roi)}", f"whole numbers {', '.join(_REGION)}")
             return matrix, size
-        x, y, *sides = region
-        has_region = any(region) and region != [0, 0, *sensor]
+        x, y, *sides = region if any(region) else [0.0, 0.0, *sensor]
+        is_whole = [x, y, *sides] == [0, 0, *sensor]
         is_inside = all(sides) and (not sensor or (x + sides[0] <= sensor[0] and y + sides[1] <= sensor[1]))
-        if has_region and not is_inside:
+        shown = [side // bin for side, bin in zip(sides, (bin_x, bin_y), strict=False)]
+        if not is_inside:
             found = f"{sides[0]:g} x {sides[1]:g} pixels at ({x:g}, {y:g}) are not inside width x height"
-            expected = "a part of the full sensor, which width, height and K are for (REP 104)"
-            expected += "; or a roi of zeros, and K of the pictures"
-            self.problem("conflict", "region", found, expected)
-        shown = [side // bin for side, bin in zip(sides if has_region else sensor, (bin_x, bin_y), strict=False)]
-        if (has_region or max(bin_x, bin_y) > 1) and shown == pictures:
+            expected = (
+                "a part of the full sensor, which width, height and K are for (REP 104); or a roi of zeros, "
+            )
+            self.problem("conflict", "region", found, f"{expected}and K of the pictures")
+        elif shown == pictures and not (is_whole and bin_x == bin_y == 1):
             corner = np.array([[0, 0, x - 0.5], [0, 0, y - 0.5], [0, 0, 0]])
             half_pixel = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
             matrix = np.diag([1 / bin_x, 1 / bin_y, 1.0]) @ (matrix - corner) - half_pixel
-            return matrix, {"width": width, "height": height}
-        if has_region and sensor != pictures:
-            found = f"the pictures have {width} x {height} pixels"
+            size = {"width": width, "height": height}
+        elif not is_whole and sensor != pictures:
             expected = f"{shown[0]:g} x {shown[1]:g}, or the size of the full sensor"
-            self.problem("conflict", "region", found, expected)
-        elif has_region or (bin_x, bin_y) != (1, 1):
+            self.problem("conflict", "region", f"the pictures have {width} x {height} pixels", expected)
+        elif not is_whole or max(bin_x, bin_y) > 1:
             self.notes.append(f"{self.name}: the pictures show all of the sensor; roi and binning are left out")
         return matrix, size
 

@@ -14,12 +14,13 @@ from rebar_depth_bench.cli.console import EXIT_DONE
 from tests.fuzz.damage import SPECIAL_FILES, damage_content, replace_by_special_file
 from tests.fuzz.dataset_entries import DATASET_ENTRIES
 from tests.fuzz.file_entries import FILE_ENTRIES
+from tests.fuzz.import_entries import IMPORT_ENTRIES
 from tests.fuzz.model_entries import MODEL_ENTRIES
 from tests.fuzz.oracle import Expectation, Observation, failures, observe
 from tests.fuzz.workspace import CASE, ELSEWHERE, EntryPoint, Workspace
 
 ENTRY_POINTS: Mapping[str, EntryPoint] = {
-    entry.name: entry for entry in (*DATASET_ENTRIES, *FILE_ENTRIES, *MODEL_ENTRIES)
+    entry.name: entry for entry in (*DATASET_ENTRIES, *FILE_ENTRIES, *IMPORT_ENTRIES, *MODEL_ENTRIES)
 }
 """Entry points by name."""
 _SPECIAL_SHARE, _TRUNCATED_SHARE, _SECOND_DAMAGE_SHARE = 0.15, 0.08, 0.15

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Sequence
 from dataclasses import astuple
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 import trimesh
 from PIL import Image
 
 from dataset_builder.catalog.scene_file import scene_config
-from dataset_builder.importing.config_import import plan_import
 from dataset_builder.scene.mesh_ply import write_mesh_ply
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.user_files.cage_file import cage_file_spec, load_cage, mesh_file_spec
@@ -37,7 +34,6 @@ from tests.fuzz.workspace import CASE, EntryPoint, Workspace
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 DEPTH_M = np.linspace(0.5, 2.0, 12).reshape(3, 4).astype(np.float32)
-IMPORTED_M = np.linspace(0.5, 2.0, 256).reshape(16, 16).astype(np.float32)
 _RODS = tuple(
     trimesh.creation.cylinder(diameter_m / 2, segment=[[0.0, y_m, 0.1], [0.5, y_m, 0.1]], sections=12)
     for diameter_m, y_m in ((0.016, 0.0), (0.010, 0.1), (0.020, 0.2))
@@ -67,55 +63,6 @@ score_time = 60.5
 read_rate_limit = "600/minute"
 rescore = true
 """
-_LAYOUT = """
-description = "a scan"
-truth_sigma_m = 0.001
-[files]
-left_depth = "depth-{view}.{suffix}"
-left_rgb = "rgb-{view}.png"
-[cameras]
-width = 16
-height = 16
-[cameras.left]
-fx = 20.0
-fy = 20.0
-cx = 7.5
-cy = 7.5
-distortion = [0, 0, 0, 0]
-[poses]
-file = "pose-{view}.txt"
-[bars]
-file = "bars.csv"
-"""
-_VIEWS = """
-truth_sigma_m = 0.001
-[files]
-left_depth = "depth-{view}.npy"
-left_rgb = "rgb-{view}.png"
-[cameras]
-views = "views.json"
-"""
-_BOP = """{
-  "0": {"cam_K": [20.0, 0.0, 7.5, 0.0, 20.0, 7.5, 0.0, 0.0, 1.0], "depth_scale": 1000.0,
-    "cam_R_w2c": [1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0], "cam_t_w2c": [10.0, -20.0, 500.0]},
-  "1": {"cam_K": [20.0, 0.0, 7.5, 0.0, 20.0, 7.5, 0.0, 0.0, 1.0], "depth_scale": 1000.0, "view_level": 2}
-}"""
-_NERFSTUDIO = """{
-  "camera_model": "OPENCV", "w": 16, "h": 16, "fl_x": 20.0, "cx": 8.0, "cy": 8.0, "k1": 0.01, "p2": 0.001,
-  "depth_unit_scale_factor": 1.0, "applied_scale": 0.5, "frames": [
-    {"file_path": "./images/0.png",
-      "transform_matrix": [[1, 0, 0, 0.5], [0, 0, 1, 0.1], [0, -1, 0, 2.0], [0, 0, 0, 1]]},
-    {"file_path": "./images/1.png", "fl_y": 20.5}]}
-"""
-_MILLIMETRES = '[depth]\nunit = "mm"\ninvalid = [65535, 65.535]\nmax_m = 1.8\n'
-_BARS = """bar_id,role,diameter_m,x_m,y_m,z_m
-1,main,0.016,0.0,0.1,0.2
-1,main,0.016,0.5,0.1,0.2
-2,stirrup,0.01,0.0,0.0,0.0
-2,stirrup,0.01,0.0,0.2,0.0
-2,stirrup,0.01,0.1,0.3,0.1
-"""
-_SPREADSHEET = "\ufeffsep=;\r\n" + _BARS.upper().replace(",", ";").replace(".", ",").replace("\n", "\r\n")
 
 
 def _rods() -> trimesh.Trimesh:
@@ -153,22 +100,22 @@ def _read_cage(path: Path) -> object:
     return [(bar.bar_id, bar.diameter_m, bar.axis_m) for bar in load_cage(cage_file_spec(path)).bars]
 
 
-def _is_finite(value: object) -> bool:
+def is_finite(value: object) -> bool:
     """Return whether all numbers in nested tuples are finite."""
     if isinstance(value, tuple):
-        return all(map(_is_finite, value))
+        return all(map(is_finite, value))
     return not isinstance(value, float) or bool(np.isfinite(value))
 
 
 def _read_calibration(path: Path) -> object:
     calibration = read_calibration(path, 1280, 720)
-    assert _is_finite(astuple(calibration))
+    assert is_finite(astuple(calibration))
     return calibration
 
 
 def _read_cameras(path: Path) -> object:
     cameras = read_cameras(path.parent, ["0001", "0002"], pair.WIDTH, pair.HEIGHT, is_stereo=True)
-    assert _is_finite(astuple(cameras.calibration))
+    assert is_finite(astuple(cameras.calibration))
     assert all(np.isfinite(pose).all() for pose in cameras.cam_from_world.values())
     return cameras
 
@@ -222,61 +169,6 @@ def _write_result(path: Path) -> None:
     path.write_bytes(result(*views).to_json())
 
 
-def _tiff_float64(depth_m: np.ndarray) -> bytes:
-    """Return a TIFF file as OpenCV writes float64 values, which Pillow does not read."""
-    content: bytes = cv2.imencode(".tiff", depth_m.astype(np.float64))[1].tobytes()
-    return content
-
-
-def _tiff(depth_m: np.ndarray) -> bytes:
-    stream = io.BytesIO()
-    Image.fromarray(depth_m).save(stream, "TIFF")
-    return stream.getvalue()
-
-
-def _pfm(depth_m: np.ndarray) -> bytes:
-    """Return a PFM file, whose rows are from bottom to top."""
-    height, width = depth_m.shape
-    return f"Pf\n{width} {height}\n-1.0\n".encode() + depth_m[::-1].astype("<f4").tobytes()
-
-
-def _write_import(
-    path: Path, depth: bytes = npy(IMPORTED_M), suffix: str = "npy", table: str = "", bars: str = _BARS
-) -> None:
-    """Write a layout with a further ``table``, its bars and one view, whose depth has the content ``depth``."""
-    folder = path.parent
-    (folder / "layout.toml").write_text(_LAYOUT.replace("{suffix}", suffix) + table)
-    (folder / "bars.csv").write_text(bars)
-    (folder / f"depth-a.{suffix}").write_bytes(depth)
-    Image.new("RGB", (16, 16)).save(folder / "rgb-a.png")
-    np.savetxt(folder / "pose-a.txt", np.eye(4))
-
-
-def _import(path: Path) -> object:
-    source = plan_import(path.with_name("layout.toml"), "mock-up")
-    depth_m = source.views.decode("a")["left_depth"]
-    assert np.isfinite(depth_m).all()
-    assert (depth_m >= 0).all()
-    return source.bars, depth_m.tolist()
-
-
-def _write_views(content: str, path: Path) -> None:
-    """Write a layout with one view, whose cameras are in a file with this content."""
-    path.write_text(content)
-    path.with_name("layout.toml").write_text(_VIEWS)
-    path.with_name("depth-0.npy").write_bytes(npy(IMPORTED_M))
-    Image.new("RGB", (16, 16)).save(path.with_name("rgb-0.png"))
-
-
-def _read_views(path: Path) -> object:
-    source = plan_import(path.with_name("layout.toml"), "mock-up")
-    camera = source.views.cameras["0"]
-    assert _is_finite(astuple(camera.calibration))
-    assert camera.cam_from_world is None or np.isfinite(camera.cam_from_world).all()
-    assert np.isfinite(source.views.decode("0")["left_depth"]).all()
-    return camera
-
-
 def _copy(source: Path, path: Path) -> None:
     path.write_bytes(source.read_bytes())
 
@@ -285,7 +177,7 @@ def _text(content: str, path: Path) -> None:
     path.write_text(content)
 
 
-def _reader(
+def file_entry(
     title: str,
     file: str,
     write: Callable[[Path], object],
@@ -318,24 +210,16 @@ def _reader(
     )
 
 
-_mesh = partial(_reader, read=_read_mesh, share=4, shows_truncation=True)
-_calibration = partial(_reader, read=_read_calibration, share=8)
-_cameras = partial(_reader, read=_read_cameras)
-_picture = partial(_reader, write=_write_capture_image, read=_open_capture)
+_mesh = partial(file_entry, read=_read_mesh, share=4, shows_truncation=True)
+_calibration = partial(file_entry, read=_read_calibration, share=8)
+_cameras = partial(file_entry, read=_read_cameras)
+_picture = partial(file_entry, write=_write_capture_image, read=_open_capture)
 _UPRIGHT = partial(_write_capture_image, exif=b"II*\0\x08\0\0\0\1\0\x12\1\3\0\1\0\0\0\1\0\0\0\0\0\0\0")
-_content = partial(_reader, special_files=False)
+_content = partial(file_entry, special_files=False)
 _depth = partial(_content, read=_decode_depth)
-_imported = partial(_reader, read=_import, cpu_s=10.0)
-
-
-def _imported_depth(kind: str, suffix: str, content: bytes, table: str = "") -> EntryPoint:
-    write = partial(_write_import, depth=content, suffix=suffix, table=table)
-    return _imported(f"import: {kind}", f"depth-a.{suffix}", write)
-
-
 FILE_ENTRIES = (
-    _reader("scene TOML", "scene.toml", partial(_copy, TWO_BARS), scene_config, share=8),
-    _reader(
+    file_entry("scene TOML", "scene.toml", partial(_copy, TWO_BARS), scene_config, share=8),
+    file_entry(
         "scene TOML: beam",
         "beam.toml",
         partial(_copy, EXAMPLES / "beam.toml"),
@@ -343,7 +227,7 @@ FILE_ENTRIES = (
         is_quick=False,
         cpu_s=10.0,
     ),
-    _reader(
+    file_entry(
         "IFC",
         "c.ifc",
         partial(_copy, EXAMPLES / "column.ifc"),
@@ -353,7 +237,7 @@ FILE_ENTRIES = (
         cpu_s=10.0,
         shows_truncation=True,
     ),
-    _reader(
+    file_entry(
         "IFC: solids of a bar",
         "c.ifc",
         lambda path: path.write_text(_ifc_of_solids()),
@@ -390,7 +274,7 @@ FILE_ENTRIES = (
     _depth("depth: PNG", "a.png", lambda path: path.write_bytes(png(DEPTH_M * 1000.0))),
     _content("archive metadata", "submission.json", partial(_text, _METADATA), _parse_metadata),
     _content("result JSON", "r.json", _write_result, _read_result, share=6),
-    _reader(
+    file_entry(
         "leaderboard settings",
         "s.toml",
         partial(_text, _SETTINGS),
@@ -398,25 +282,4 @@ FILE_ENTRIES = (
         share=4,
         names=("settings: ",),
     ),
-    _imported("import: layout", "layout.toml", _write_import),
-    _reader("import: BOP's cameras", "views.json", partial(_write_views, _BOP), _read_views, share=4, cpu_s=10.0),
-    _reader(
-        "import: nerfstudio's cameras",
-        "views.json",
-        partial(_write_views, _NERFSTUDIO),
-        _read_views,
-        share=6,
-        cpu_s=10.0,
-    ),
-    _imported("import: bars", "bars.csv", _write_import),
-    _imported("import: bars of a spreadsheet", "bars.csv", partial(_write_import, bars=_SPREADSHEET)),
-    _imported_depth("npy", "npy", npy(IMPORTED_M)),
-    _imported_depth("npz", "npz", npz(depth=IMPORTED_M)),
-    _imported_depth("npy of integers", "npy", npy(np.round(1000 * IMPORTED_M).astype(np.int32)), _MILLIMETRES),
-    _imported_depth("TIFF", "tif", _tiff(IMPORTED_M)),
-    _imported_depth("TIFF of float64", "tif", _tiff_float64(IMPORTED_M)),
-    _imported_depth("TIFF of integers", "tif", _tiff(np.round(1000 * IMPORTED_M).astype(np.uint16)), _MILLIMETRES),
-    _imported_depth("PFM", "pfm", _pfm(IMPORTED_M)),
-    _imported("import: EXR", "depth-a.exr", lambda path: _write_import(path, exr(path, {"V": IMPORTED_M}), "exr")),
-    _imported_depth("PNG", "png", png(np.round(1000 * IMPORTED_M)), _MILLIMETRES),
 )

@@ -198,23 +198,17 @@ def directrix(solid: Any, angle_rad: float) -> tuple[list[Piece], float, float |
     """
     curve, start, end = solid.Directrix, solid.StartParam, solid.EndParam
     size = math.nan if start is None or end is None else float(end) - float(start)
-    turn_rad = size * angle_rad
     if curve.is_a("IfcLine"):
         if not 0 < size < math.inf:
             found = f"the disc is swept along an IfcLine from StartParam {start} to EndParam {end}"
             raise ValueError(f"{found}, expected both, the second above the first: a line has no ends")
         origin, along = _origin_and_vector(curve)
         return [Leg.between(origin + start * along, origin + end * along, size)], 0.0, size
-    # From 0 to 1, and from 0 to a turn or more, programs mean the whole curve.
-    if (
-        curve.is_a("IfcConic")
-        and size > 0
-        and (start or (end != 1 and turn_rad < _FULL_TURN_RAD - _ANGLE_NOISE_RAD))
-    ):
-        if turn_rad > _FULL_TURN_RAD + _ANGLE_NOISE_RAD:
+    if curve.is_a("IfcConic") and start and size > 0:  # From 0, ``curve_pieces`` has the parameters as they are.
+        turned = replace(_conic(curve, angle_rad), first_rad=start * angle_rad)
+        if size > turned.parameters * (1 + _ANGLE_NOISE_RAD):
             raise ValueError(f"the disc is swept from {start} to {end} along a circle, expected at most one turn")
-        arc = replace(_conic(curve, angle_rad), first_rad=start * angle_rad, turn_rad=turn_rad, parameters=size)
-        return [arc], 0.0, size
+        return cut([turned], [turned.parameters], 0.0, size), 0.0, size
     return curve_pieces(curve, angle_rad), float(start or 0.0), None if end is None else float(end)
 
 

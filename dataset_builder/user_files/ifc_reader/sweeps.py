@@ -27,12 +27,6 @@ _SAME = 1e-6
 _AGREES, _DIFFERS = 0.03, 0.002
 """Largest difference of a length from the declared one, and least one of two ways of counting, relative."""
 
-_WAYS = (
-    *("legs 1", "legs by length", "legs in feet", "legs and arcs 1", "the curve 1"),
-    *("polylines 1", "segments 1", "legs and arcs by length"),
-)
-"""Ways of counting parameters along a curve, in the order of ``_swept_pieces``."""
-
 _CLOSED_GAP = 0.25
 """Largest gap between two segments that is closed, in diameters."""
 
@@ -157,8 +151,9 @@ def _swept_pieces(solid: Any, units: Units, declared: float | None, notes: dict[
     10303-42: a leg of a polyline counts 1, a trimmed line its length over the vector's magnitude, an arc its angle
     in the project's unit), also with legs counted by their length in the file's unit or in feet; an end beyond the
     largest of these. Any other parameters cut the curve: they count as in the rule, or else in the first of the
-    other ways that ends at the end parameter, or at least reaches it. If only another of all ways, which include
-    polylines or segments that count 1, and arcs by length, agrees with the ``declared`` length, it is taken.
+    other ways that ends at the end parameter, or at least reaches it. If that does not give the ``declared``
+    length, and one of these ways or one in which polylines or segments count 1, or arcs their length, does, it is
+    taken.
     """
     pieces, start, end = directrix(solid, units.angle_rad)
     by_rule = [piece.parameters for piece in pieces]
@@ -182,32 +177,18 @@ def _swept_pieces(solid: Any, units: Units, declared: float | None, notes: dict[
         chosen = [count for count in counts if abs(end - sum(count)) <= _SAME * end]
         chosen += [count for count in counts if end <= sum(count)]
         part = cut(pieces, (chosen or counts)[0], start, end)
-    legs = [getattr(piece, "legs", 1) for piece in pieces]
-    counts += [
-        [size / number for size, number in zip(by_rule, legs, strict=True)],
-        [1 / number for number in legs],
-        [piece.length for piece in pieces],
-    ]
-    length, wanted = _length(part), declared or math.nan  # Comparisons with NaN are false.
-    off = abs(length / wanted - 1)
-    if not length or off <= _DIFFERS or (part is pieces and not declared):
-        counts = []
-    others = [
-        (other, _length(other), way, abs(end - sum(count)) <= _SAME * end)
-        for count, way in zip(counts, _WAYS, strict=False)
-        if end <= sum(count) * (1 + _SAME) and (other := cut(pieces, count, start, end))
-    ]
-    words = f"the parameters {start:g} to {end:g}"
-    if others:
-        other, size, way, _ = min(others, key=lambda other: abs(other[1] - wanted))
-        if abs(size / wanted - 1) <= min(_AGREES, off - _DIFFERS):
-            notes["parameters"] = (
-                f"{words} count {way}, which gives the declared length, not {length / size:.1%} of it"
-            )
-            part, length, others = other, size, []
-    for _, size, way, is_whole in others:
-        if is_whole and not off <= _AGREES and abs(size / length - 1) > _DIFFERS:
-            notes["parameters"] = f"{words} may count {way}, which gives {size / length:.1%} of the length built"
+    length = _length(part)
+    if declared and length:
+        legs = [getattr(piece, "legs", 1) for piece in pieces]
+        counts.append([size / number for size, number in zip(by_rule, legs, strict=True)])
+        counts += [[1 / number for number in legs], [piece.length for piece in pieces]]
+        parts = [cut(pieces, count, start, end) for count in counts if end <= sum(count) * (1 + _SAME)]
+        other = min(parts, key=lambda one: abs(_length(one) - declared), default=part)
+        size = _length(other)
+        if abs(size / declared - 1) <= min(_AGREES, abs(length / declared - 1) - _DIFFERS):
+            text = f"count so that they give the declared length, not {length / size:.1%} of it"
+            notes["parameters"] = f"the parameters {start:g} to {end:g} {text}"
+            part, length = other, size
     if length and (share := length / _length(pieces)) < 1 - _SAME:
         notes["cut"] = f"the curve is swept from {solid.StartParam} to {solid.EndParam}, {share:.1%} of its length"
     return part

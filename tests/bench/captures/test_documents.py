@@ -66,7 +66,8 @@ def laughs(levels: int, copies: int) -> str:
     [
         (laughs(30, 9), "line 5: the aliases (*) stand for more than 10000 values"),
         (laughs(40, 2), "line 12: the aliases (*) stand for more than 10000 values"),
-        (laughs(100, 1), "the values are nested too deep"),
+        (laughs(1000, 1), "the aliases (*) stand for more than 10000 values"),
+        ("[" * 100 + "]" * 100, "the values are nested too deep"),
         ("a: &a {b: [1, *a]}", "line 1: the alias *a stands for no complete value"),
         ("K1: *K\nK2: &K [1]", "line 1: the alias *K stands for no complete value"),
         ("<<: &a {<<: *a}", "line 1: the alias *a stands for no complete value"),

@@ -125,23 +125,23 @@ PADDING = {"k5": "0", "k6": "0", "p1": "0", "p2": "0"}
 @pytest.mark.parametrize(
     ("text", "size", "where", "words"),
     [
-        (ar0234(RATIONAL), (960, 600), "LEFT_DISTO", "rational distortion (k4 = 5.0742, k5 = 2.0070, k6 = 0.2)"),
+        (ar0234(RATIONAL), (960, 600), "LEFT_DISTO", "8 terms: fisheye or rational distortion"),
         (ar0234(RATIONAL), (640, 400), "LEFT_DISTO", "rational"),
         (ar0234(RATIONAL).lower(), (1920, 1080), "LEFT_DISTO", "rational"),
-        (imx678({**BROWN, "k6": "1e-9"}), (3840, 2160), "LEFT_DISTO", "rational distortion (k6 = 1e-9)"),
+        (imx678({**BROWN, "k6": "1e-9"}), (3840, 2160), "LEFT_DISTO", "8 terms: fisheye or rational distortion"),
         # The factory's files have the rational terms beside five of an older model.
         (conf(FACTORY, RATIONAL, BROWN), (1280, 720), "LEFT_DISTO", "rational"),
         # printDisto writes four terms of a fisheye lens; normalizedStereoDisto adds zeros.
-        (ar0234(FISHEYE), (960, 600), "LEFT_DISTO", "fisheye distortion (k4 = 0.0167972)"),
-        (ar0234({**FISHEYE, "k4": "0"}), (960, 600), "LEFT_DISTO", "fisheye distortion (k4 = 0)"),
-        (ar0234(FISHEYE | PADDING), (960, 600), "LEFT_DISTO", "fisheye distortion (k4 = 0.0167972)"),
+        (ar0234(FISHEYE), (960, 600), "LEFT_DISTO", "'fisheye, k1 k2 k3 k4'"),
+        (ar0234({**FISHEYE, "k4": "0"}), (960, 600), "LEFT_DISTO", "'fisheye, k1 k2 k3 k4'"),
+        (ar0234(FISHEYE | PADDING), (960, 600), "LEFT_DISTO", "6 terms: fisheye"),
         # stereolabs/zed-opencv-native, issue 16: a ZED Mini with four terms in the sections of sizes.
         (conf({"HD": FACTORY["HD"]}, {}, FISHEYE), (1280, 720), "LEFT_CAM_HD", "fisheye"),
         (conf({"HD": FACTORY["HD"]}, {}, RATIONAL), (1280, 720), "LEFT_CAM_HD", "rational"),
         # stereolabs/zed-ros2-wrapper, issue 128: thin prism terms.
-        (ar0234({**BROWN, "s2": "0.002"}), (960, 600), "LEFT_DISTO", "thin prism distortion (s2 = 0.002)"),
+        (ar0234({**BROWN, "s2": "0.002"}), (960, 600), "LEFT_DISTO", "10 terms: thin prism distortion"),
         (ar0234({**BROWN, "p1": "0", "p2": "0", "tauX": "0.002"}), (960, 600), "LEFT_DISTO", "tilted distortion"),
-        (ar0234({**BROWN, "k4": "none"}), (960, 600), "LEFT_DISTO", "(k4 = none)"),
+        (ar0234({**BROWN, "k4": "none"}), (960, 600), "LEFT_DISTO", "6 terms"),
     ],
 )
 def test_other_lens_models_are_refused_with_the_remedy(

@@ -5,6 +5,7 @@ The depth of the sample dataset was cast against the bars' meshes, without any c
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 from collections.abc import Callable
@@ -110,13 +111,6 @@ MISTAKES: dict[str, tuple[str, Change | None, Change | None, str]] = {
     ),
     "outliers": (POSES + BARS, outliers(0.04, 30.0), inverted, 'poses.kind = "world_from_cam"'),
     "poses in millimetres": (POSES + BARS, None, moved(1000), 'poses.unit = "mm"'),
-    "depth and poses": (POSES + BARS, times(100), moved(1000), 'depth.unit = "cm" and poses.unit = "mm"'),
-    "range and poses": (
-        POSES + BARS,
-        data.range_m,
-        inverted,
-        'depth.kind = "range" and poses.kind = "world_from_cam"',
-    ),
 }
 
 
@@ -129,6 +123,37 @@ def test_mistake_is_named_and_nothing_is_published(
     assert run(layout) == 2
     assert f"expected {line} in the layout\n" in capsys.readouterr().err
     assert not list((layout.parent / "out").rglob("*"))
+
+
+@pytest.mark.parametrize(
+    ("unit_m", "is_inverted", "words"),
+    [
+        (0.001, False, "a unit of depth that is 1000 times as large in transforms.json"),
+        (1.0, True, "poses inverted in transforms.json"),
+    ],
+)
+def test_mistake_of_the_file_of_all_cameras_is_named(
+    unit_m: float,
+    is_inverted: bool,
+    words: str,
+    source: Path,
+    rows: list[Row],
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    layout = write(source, rows, tmp_path / "data", BARS)
+    frames = []
+    for name, row in zip(NAMES, rows, strict=True):
+        pose = inverted(row) if is_inverted else row["left_cam_from_world"]
+        frames.append({"file_path": name, "transform_matrix": (inverse_rigid(pose) @ OPENGL).tolist()})
+    K = rows[0]["left_K"].tolist()
+    lens = {"fl_x": K[0][0], "fl_y": K[1][1], "cx": K[0][2] + 0.5, "cy": K[1][2] + 0.5}
+    document = {**lens, "depth_unit_scale_factor": unit_m, "frames": frames}
+    (layout.parent / "transforms.json").write_text(json.dumps(document))
+    cameras = '[cameras]\nviews = "transforms.json"\n'
+    layout.write_text(re.sub(r"(?s)\[cameras.*?(?=\n\[bars\])", cameras, layout.read_text()))
+    assert run(layout) == 2
+    assert f"expected {words}\n" in capsys.readouterr().err
 
 
 def noisy(row: Row) -> np.ndarray:

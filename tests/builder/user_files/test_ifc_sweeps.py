@@ -165,8 +165,8 @@ def arc_and_legs(step: Step, end: float) -> str:
         (lambda step: bent_bar(step, 93.0), 978.54, WHOLE_MM, {"parameters"}),
         (lambda step: bent_bar(step, 93.0), 985.0, WHOLE_MM, {"parameters"}),
         (lambda step: bent_bar(step, 93.0), CUT_MM, CUT_MM, {"cut"}),
-        (lambda step: bent_bar(step, 93.0), None, CUT_MM, {"cut", "parameters"}),
-        (lambda step: bent_bar(step, 93.0), 700.0, CUT_MM, {"cut", "parameters", "length"}),
+        (lambda step: bent_bar(step, 93.0), None, CUT_MM, {"cut"}),
+        (lambda step: bent_bar(step, 93.0), 700.0, CUT_MM, {"cut", "length"}),
         (lambda step: bent_bar(step, 102.0), 978.54, WHOLE_MM, set()),
         (lambda step: bent_bar(step, 92.5), WHOLE_MM - 100, WHOLE_MM - 100, {"cut", "parameters"}),
         (lambda step: bent_bar(step, 93.0, 1.0), WHOLE_MM - 300, WHOLE_MM - 300, {"cut", "parameters"}),
@@ -179,7 +179,7 @@ def arc_and_legs(step: Step, end: float) -> str:
         (lambda step: indexed(step, 1.0, 3.0), 200.0, 200.0, {"cut"}),
         (lambda step: polylines(step, 1.0, 3.0), 700.0, 700.0, {"cut", "parameters"}),
         (lambda step: polylines(step, 1.0, 3.0), 200.0, 200.0, {"cut"}),
-        (lambda step: polylines(step, 1.0, 3.0), None, 200.0, {"cut", "parameters"}),
+        (lambda step: polylines(step, 1.0, 3.0), None, 200.0, {"cut"}),
     ],
 )
 def test_counting_that_agrees_with_the_declared_length_is_taken(
