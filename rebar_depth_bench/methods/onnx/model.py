@@ -8,7 +8,6 @@ i to i + 1 with its centre at i + 0.5.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,6 +20,7 @@ from PIL import Image
 
 from rebar_depth_bench.base.errors import MethodError, Problem
 from rebar_depth_bench.base.limits import ONNX_MEMORY_BYTES, DeadlineError, call_within
+from rebar_depth_bench.base.system import memory_bytes, processors
 from rebar_depth_bench.methods.base import (
     VIEW_TIMEOUT_S,
     Method,
@@ -285,7 +285,7 @@ def open_session(spec: OnnxSpec, timeout_s: float) -> OnnxSession:
     options = onnxruntime.SessionOptions()
     options.log_severity_level = _LOG_ERRORS_ONLY
     # Without a number, it pins threads to processors and prints an error for each that the process may not use.
-    options.intra_op_num_threads = len(os.sched_getaffinity(0))
+    options.intra_op_num_threads = processors()
     _limit_memory(onnxruntime, options)
     available = onnxruntime.get_available_providers()
     providers = [name for name in PROVIDERS if name in available]
@@ -310,7 +310,7 @@ def open_session(spec: OnnxSpec, timeout_s: float) -> OnnxSession:
 
 def _limit_memory(onnxruntime: Any, options: Any) -> None:
     """Give sessions a common CPU memory arena that cannot grow past the limit or the machine's memory."""
-    max_bytes = min(ONNX_MEMORY_BYTES.value(), os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    max_bytes = min(ONNX_MEMORY_BYTES.value(), memory_bytes() or ONNX_MEMORY_BYTES.value())
     arena, default = onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR, onnxruntime.OrtMemType.DEFAULT
     onnxruntime.create_and_register_allocator(
         onnxruntime.OrtMemoryInfo("Cpu", arena, 0, default), onnxruntime.OrtArenaCfg(max_bytes, -1, -1, -1)
