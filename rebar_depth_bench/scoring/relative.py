@@ -1,0 +1,141 @@
+"""Errors of relative depth by protocol ``rebar-relative-1``: predictions are aligned with the truth of each view.
+
+x is the prediction and z the true planar depth in metres, both float64, on V, the scored pixels of a view where x
+has a value. Every pixel has the same weight and every view its own fit:
+
+================  ==========================  ===============================================================
+kind              V                           aligned depth p
+================  ==========================  ===============================================================
+scale             x is finite and above 0     x median(z) / median(x), the scaled numbers of ``rebar-2``
+affine-depth      x is finite                 a x + b, which minimises the sum of (a x + b - z)^2
+affine-disparity  x is finite                 1 / max(a x + b, 1 / max(z)); a and b minimise the sum of
+                                              (a x + b - 1/z)^2
+================  ==========================  ===============================================================
+
+A fit with a slope a <= 0, of fewer than two pixels or of a constant x is replaced by a = 0 and b = mean of the
+target. The robust variant of the affine kinds has a = mean|y - median(y)| / mean|x - median(x)| and b = median(y) -
+a median(x) for the target y (MiDaS: Ranftl et al., TPAMI 2022, equation 5), and the same bound of the disparity.
+
+Every alignment uses the truth, so that none ranks. Beside each stands the constant of the same fit (a = 0).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+import numpy as np
+from jaxtyping import Bool, Float, Float64
+from numpy import ndarray
+
+from rebar_depth_bench.scoring.metrics import DepthMetrics, mean_metrics, median, metrics_at_scales, rank_error
+from rebar_depth_bench.scoring.protocol import WITHIN_MM
+
+RELATIVE_PROTOCOL = "rebar-relative-1"
+"""Name of the protocol of predictions that are not metric."""
+
+RelativeKind = Literal["scale", "affine-depth", "affine-disparity"]
+RELATIVE_KINDS: tuple[str, ...] = get_args(RelativeKind)
+"""Kinds of predictions that are aligned before their errors are computed."""
+
+
+@dataclass(frozen=True)
+class AlignedErrors:
+    """Errors of aligned depth p of a view, or their means over views.
+
+    ``error`` is the mean over all scored pixels of |p - z| / max(p, z), and of 1 outside of V and where p <= 0.
+    ``metrics`` are those over V, None if it is empty; ``within_mm`` has shares of all scored pixels.
+    """
+
+    error: float
+    metrics: DepthMetrics | None
+    within_mm: Mapping[int, float]
+
+
+@dataclass(frozen=True)
+class AlignedView:
+    """Errors of one view after alignment, after the robust one (None for ``scale``), and of the constant.
+
+    ``is_flat`` is True if the fit has no positive slope.
+    """
+
+    coverage: float
+    aligned: AlignedErrors
+    aligned_robust: AlignedErrors | None
+    constant: AlignedErrors
+    is_flat: bool
+
+
+_NO_VALUES = AlignedErrors(1.0, None, dict.fromkeys(WITHIN_MM, 0.0))
+"""Errors of a view in which no scored pixel has a value."""
+
+
+def has_value(x: Float[ndarray, " n"], kind: str) -> Bool[ndarray, " n"]:
+    """Return where a prediction of this kind has a value."""
+    with np.errstate(invalid="ignore"):
+        return np.asarray(np.isfinite(x) & (x > 0)) if kind == "scale" else np.isfinite(x)
+
+
+def align_view(x: Float[ndarray, " n"], z_m: Float[ndarray, " n"], kind: str) -> AlignedView:
+    """Return the errors of a view's prediction ``x`` and true depth ``z_m``, metres, on all its scored pixels."""
+    valid = has_value(x, kind)
+    values, z = x[valid].astype(np.float64), z_m[valid].astype(np.float64)
+    if not len(values):
+        robust = None if kind == "scale" else _NO_VALUES
+        return AlignedView(0.0, _NO_VALUES, robust, _NO_VALUES, is_flat=kind != "scale")
+
+    def errors(p_m: Float64[ndarray, " v"]) -> AlignedErrors:
+        everywhere = np.zeros(len(z_m))
+        everywhere[valid] = p_m
+        error = rank_error(everywhere, z_m, np.isfinite(everywhere) & (everywhere > 0))
+        [metrics], within = metrics_at_scales(p_m, z, (1.0,), WITHIN_MM)
+        return AlignedErrors(error, metrics, {tolerance: count / len(z_m) for tolerance, count in within.items()})
+
+    coverage = len(values) / len(z_m)
+    if kind == "scale":
+        with np.errstate(over="ignore"):
+            scaled = values * (median(z) / median(values))
+        constant = np.full(len(z), median(z))
+        return AlignedView(coverage, errors(scaled), None, errors(constant), is_flat=False)
+    target = 1.0 / z if kind == "affine-disparity" else z
+    fits = (_least_squares(values, target), _robust_fit(values, target), (0.0, float(target.mean())))
+    aligned, robust, constant = (errors(_fitted_depth(fit, values, z, kind)) for fit in fits)
+    return AlignedView(coverage, aligned, robust, constant, is_flat=fits[0][0] == 0.0)
+
+
+def _fitted_depth(
+    fit: tuple[float, float], x: Float64[ndarray, " n"], z_m: Float64[ndarray, " n"], kind: str
+) -> Float64[ndarray, " n"]:
+    """Return the depth, metres, of a fit (a, b) to the target of a kind."""
+    line = fit[0] * x + fit[1]
+    return 1.0 / np.maximum(line, 1.0 / z_m.max()) if kind == "affine-disparity" else line
+
+
+def _least_squares(x: Float64[ndarray, " n"], y: Float64[ndarray, " n"]) -> tuple[float, float]:
+    """Return (a, b) that minimise the sum of (a x + b - y)^2, or (0, mean(y)) as the module says."""
+    unit = float(np.abs(x).max()) or 1.0  # Squares of values near the limits of float64 would overflow.
+    x_off = x / unit - (x / unit).mean()
+    y_mean = float(y.mean())
+    if x.min() < x.max() and (a := float(x_off @ (y - y_mean)) / float(x_off @ x_off)) > 0:
+        return a / unit, y_mean - a * float((x / unit).mean())
+    return 0.0, y_mean
+
+
+def _robust_fit(x: Float64[ndarray, " n"], y: Float64[ndarray, " n"]) -> tuple[float, float]:
+    """Return (a, b) of the robust variant, or (0, mean(y)) as the module says."""
+    x_median, y_median = median(x), median(y)
+    spread = float(np.abs(x / 2 - x_median / 2).mean()) * 2
+    if x.min() < x.max() and (a := float(np.abs(y - y_median).mean()) / spread) > 0:
+        return a, y_median - a * x_median
+    return 0.0, float(y.mean())
+
+
+def mean_errors(errors: Sequence[AlignedErrors]) -> AlignedErrors:
+    """Return the means of one or more views; those of the metrics over the views that have them."""
+    metrics = mean_metrics([one.metrics for one in errors if one.metrics is not None])
+    within = {
+        tolerance: math.fsum(one.within_mm[tolerance] for one in errors) / len(errors) for tolerance in WITHIN_MM
+    }
+    return AlignedErrors(math.fsum(one.error for one in errors) / len(errors), metrics, within)
