@@ -13,8 +13,9 @@ affine-disparity  x is finite                 1 / max(a x + b, 1 / max(z)); a an
 ================  ==========================  ===============================================================
 
 A fit with a slope a <= 0, of fewer than two pixels or of a constant x is replaced by a = 0 and b = mean of the
-target. The robust variant of the affine kinds has a = mean|y - median(y)| / mean|x - median(x)| and b = median(y) -
-a median(x) for the target y (MiDaS: Ranftl et al., TPAMI 2022, equation 5), and the same bound of the disparity.
+target. The robust variant of the affine kinds has a = mean|y - median(y)| / mean|x - median(x)| and
+b = median(y) - a median(x) for the target y (MiDaS: Ranftl et al., TPAMI 2022, equation 5), and the same bound of
+the disparity.
 
 Every alignment uses the truth, so that none ranks. Beside each stands the constant of the same fit (a = 0).
 """
@@ -24,7 +25,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Literal, get_args
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64
@@ -35,10 +35,6 @@ from rebar_depth_bench.scoring.protocol import WITHIN_MM
 
 RELATIVE_PROTOCOL = "rebar-relative-1"
 """Name of the protocol of predictions that are not metric."""
-
-RelativeKind = Literal["scale", "affine-depth", "affine-disparity"]
-RELATIVE_KINDS: tuple[str, ...] = get_args(RelativeKind)
-"""Kinds of predictions that are aligned before their errors are computed."""
 
 
 @dataclass(frozen=True)

@@ -39,8 +39,8 @@ class SubmissionWriter:
     predictions give the same bytes. Entries are stored uncompressed, which is fastest to read; ``compress=True``
     deflates them (about 100 times slower to write, 10 times slower to read, a fifth smaller), and the bytes then
     also depend on the zlib library in use. ``inputs`` and
-    ``uses_ground_truth`` are declared as in ``Declaration``. ``notes`` is free-form information about the method;
-    no score depends on it.
+    ``uses_ground_truth`` are declared as in ``Declaration``, ``prediction`` is one of ``PREDICTION_KINDS`` (default:
+    metric). ``notes`` is free-form information about the method; no score depends on it.
     """
 
     def __init__(
@@ -56,6 +56,7 @@ class SubmissionWriter:
         parameters: float | str | None = None,
         inputs: str | None = None,
         uses_ground_truth: bool | None = None,
+        prediction: str | None = None,
         runtime: Mapping[str, object] | None = None,
         notes: Mapping[str, object] | None = None,
         compress: bool = False,
@@ -73,6 +74,7 @@ class SubmissionWriter:
             "parameters": parameters,
             "inputs": inputs,
             "uses_ground_truth": uses_ground_truth,
+            "prediction": prediction,
             "runtime": None if runtime is None else dict(runtime),
             "notes": None if notes is None else dict(notes),
         }
