@@ -84,7 +84,9 @@ def table_notes(table: Table) -> list[str]:
             f"The ground truth was measured, with a standard deviation of {1000 * table.truth_sigma_m:.3g} mm, as "
             "its authors state; smaller errors cannot be told from errors of the ground truth."
         )
-    if not table.ranked:
+    if table.of_views is not None:
+        notes.append(f"Not ranked: {table.views} of {counted(table.of_views, 'view')}.")
+    elif not table.ranked:
         reason = "the submission declares that it uses ground truth" if table.views else "no views"
         notes.append(f"Not ranked: {reason}.")
     if reasons := incomparable_reasons(table):

@@ -144,14 +144,16 @@ class Evaluation:
 
 @contextmanager
 def open_evaluation(
-    archive: str | os.PathLike[str], root: str | Path, *, expect_digest: str | None = None
+    archive: str | os.PathLike[str], root: str | Path | DatasetFolder, *, expect_digest: str | None = None
 ) -> Iterator[Evaluation]:
     """Open an archive and a dataset folder or Hub repository, and close the archive when the block ends.
+
+    A folder that is open already may be restricted to some configs and views, which the archive then has.
 
     Raises ``SubmissionError`` with all problems, also those of single entries, if the structure of the archive is
     invalid, and ``DatasetError`` if the dataset folder is, or if its digest is not ``expect_digest``.
     """
-    folder = open_folder(root, expect_digest=expect_digest)
+    folder = root if isinstance(root, DatasetFolder) else open_folder(root, expect_digest=expect_digest)
     with SubmissionReader(archive, folder.expected_views()) as submission:
         if submission.structure_problems:
             raise SubmissionError.from_problems(archive, list(submission.problems()))

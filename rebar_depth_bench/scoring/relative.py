@@ -93,8 +93,7 @@ def align_view(x: Float[ndarray, " n"], z_m: Float[ndarray, " n"], kind: str) ->
     if kind == "scale":
         with np.errstate(over="ignore"):
             scaled = values * (median(z) / median(values))
-        constant = np.full(len(z), median(z))
-        return AlignedView(coverage, errors(scaled), None, errors(constant), is_flat=False)
+        return AlignedView(coverage, errors(scaled), None, errors(np.full(len(z), median(z))), is_flat=False)
     target = 1.0 / z if kind == "affine-disparity" else z
     fits = (_least_squares(values, target), _robust_fit(values, target), (0.0, float(target.mean())))
     aligned, robust, constant = (errors(_fitted_depth(fit, values, z, kind)) for fit in fits)

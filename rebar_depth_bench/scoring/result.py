@@ -6,6 +6,7 @@ The classes mirror the JSON. Unknown keys are ignored, because results of later 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -30,8 +31,17 @@ from rebar_depth_bench.base.reading import parse_json
 from rebar_depth_bench.base.validation import StrictModel, field_error, one_of, validate_document, validate_table
 from rebar_depth_bench.scoring import frames
 from rebar_depth_bench.scoring.bootstrap import INTERVALS
-from rebar_depth_bench.scoring.columns import Share
-from rebar_depth_bench.scoring.protocol import PROTOCOL
+from rebar_depth_bench.scoring.columns import (
+    COVERAGE,
+    NATIVE,
+    RANK_ERROR,
+    SCALED,
+    SCALED_CONSTANT,
+    VIEW_COLUMNS,
+    WITHIN,
+    Share,
+)
+from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, PROTOCOL
 from rebar_depth_bench.scoring.table import (
     LIMITED,
     Count,
@@ -55,6 +65,9 @@ _NOTEBOOK_COLUMNS = (
     *("config", "views", "views_scored", "coverage", "ranked", "rank_error"),
     *("native_abs_rel", "native_rmse_cm", "scaled_abs_rel", "scaled_rmse_cm", "scale_median"),
 )
+
+_SUMMARY_COLUMNS = (COVERAGE, RANK_ERROR, NATIVE[0], SCALED[0], SCALED_CONSTANT[0], WITHIN[1])
+"""Columns that ``print(result)`` shows."""
 
 
 @dataclass(frozen=True)
@@ -155,6 +168,52 @@ class Result:
             return self.extended.to_pandas()
         expected = "'tables', 'groups', 'views', or 'extended' for a result that has them"
         raise ValueError(f"rows is {rows!r}, expected {expected}")
+
+    @property
+    def metrics(self) -> dict[str, float]:
+        """Numbers of the tables by config and place in the JSON, as "lattice/native/abs_rel"; NaN if undefined."""
+        values = {
+            f"{name}/{column.path.replace('.', '/')}": column.value(table)
+            for name, table in self.tables.items()
+            for column in VIEW_COLUMNS
+        }
+        return {name: math.nan if value is None else float(value) for name, value in values.items()}
+
+    def __str__(self) -> str:
+        """Return the main numbers of each config as a table, with what limits them."""
+        heads = ("coverage", "rank error", "AbsRel", "scaled", "constant", "within 5 mm")
+        rows = [[printable(self.method), *heads]]
+        notes = dict[str, list[str]]()
+        for name, table in self.tables.items():
+            cells = [column.text(column.value(table)) for column in _SUMMARY_COLUMNS]
+            rows.append(
+                [
+                    printable(name),
+                    *(f"{cell} {one.unit}".strip() for cell, one in zip(cells, _SUMMARY_COLUMNS, strict=True)),
+                ]
+            )
+            for note in self._short_notes(name):
+                notes.setdefault(note, []).append(printable(name))
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        lines = [
+            "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip() for row in rows
+        ]
+        lines += [
+            note if len(names) == len(self.tables) else f"{', '.join(names)}: {note}"
+            for note, names in notes.items()
+        ]
+        return "\n".join(lines)
+
+    def _short_notes(self, name: str) -> list[str]:
+        """Return the notes on a config that are printed with its numbers."""
+        table = self.tables[name]
+        notes = [] if table.of_views is None else [f"{table.views} of {table.of_views} views: not ranked"]
+        if table.views and not table.is_comparable:
+            is_low = (table.coverage or 0.0) < MIN_COMPARABLE_COVERAGE
+            low = f"coverage below {MIN_COMPARABLE_COVERAGE * 100:.0f} %"
+            reason = low if is_low else "views without predictions, or numbers that overflowed"
+            notes.append(f"{reason}: errors of valid predictions are not comparable")
+        return notes
 
     def __repr__(self) -> str:
         """Return the method, the numbers of the first ten configs, and the number of views."""

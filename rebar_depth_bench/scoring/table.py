@@ -141,7 +141,8 @@ class Table:
     ``rank_error`` is None without views; ``reference`` are the config's reference errors,
     and ``published`` is the scene of the paper's Table I that it shows, if any. ``split`` is None
     for a config of one scene. ``truth_sigma_m`` is the standard deviation of the ground truth's depth, None where
-    it is exact. ``intervals`` has the 95 % bootstrap interval of each of ``VIEW_COLUMNS``, None where undefined.
+    it is exact. ``of_views`` is the number of the config's views, None if ``views`` are all. ``intervals`` has the
+    95 % bootstrap interval of each of ``VIEW_COLUMNS``, None where undefined.
     ``groups`` has the tables of groups of views by grouping (see ``groups.GROUPINGS``) and group, of a config with
     splits; they have no groups.
     """
@@ -149,6 +150,7 @@ class Table:
     split: Annotated[str, Strict(), one_of(*SPLITS)] | None = None
     truth_sigma_m: Annotated[float, Strict(), Field(ge=0)] | None = None
     views: Count
+    of_views: Count | None = None
     views_scored: Count
     coverage: Share | None
     ranked: Flag
@@ -171,6 +173,14 @@ class Table:
     def scored_of_views(self) -> str:
         """Numbers of the views with a prediction and of all views."""
         return f"{self.views_scored}/{self.views}"
+
+    def of_some_views(self, of_views: int) -> Table:
+        """Return the table as that of some of the ``of_views`` views of the config, which is not ranked."""
+        groups = {
+            grouping: {group: replace(table, ranked=False) for group, table in tables.items()}
+            for grouping, tables in self.groups.items()
+        }
+        return replace(self, ranked=False, groups=groups, of_views=of_views)
 
     @property
     def is_comparable(self) -> bool:
@@ -204,6 +214,7 @@ def _without_absent(table: Table, write: SerializerFunctionWrapHandler) -> dict[
         "split": table.split is None,
         "truth_sigma_m": table.truth_sigma_m is None,
         "groups": not table.groups,
+        "of_views": table.of_views is None,
     }
     return {key: value for key, value in write(table).items() if not absent.get(key)}
 

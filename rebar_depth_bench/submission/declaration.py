@@ -108,9 +108,9 @@ class MethodDetails(StrictModel):
 class SubmissionMeta(MethodDetails):
     """Values declared in ``submission.json``; None where a key is absent. Unknown keys are ignored.
 
-    ``inputs`` and ``uses_ground_truth`` are those of ``Declaration``. ``prediction`` is one of ``PREDICTION_KINDS``.
-    ``depth_scale`` is in metres per unit of a PNG value. ``runtime`` is the author's own report, kept unchanged;
-    nothing is computed from it.
+    ``inputs`` and ``uses_ground_truth`` are those of ``Declaration``, ``prediction`` is one of
+    ``PREDICTION_KINDS``. ``depth_scale`` is in metres per unit of a PNG value. ``runtime`` is the author's own
+    report, kept unchanged; nothing is computed from it.
     """
 
     model_config = ConfigDict(extra="ignore")

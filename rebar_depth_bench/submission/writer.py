@@ -39,8 +39,8 @@ class SubmissionWriter:
     predictions give the same bytes. Entries are stored uncompressed, which is fastest to read; ``compress=True``
     deflates them (about 100 times slower to write, 10 times slower to read, a fifth smaller), and the bytes then
     also depend on the zlib library in use. ``inputs`` and
-    ``uses_ground_truth`` are declared as in ``Declaration``, ``prediction`` is one of ``PREDICTION_KINDS`` (default:
-    metric). ``notes`` is free-form information about the method; no score depends on it.
+    ``uses_ground_truth`` are declared as in ``Declaration``, ``prediction`` is one of ``PREDICTION_KINDS``, by
+    default metric. ``notes`` is free-form information about the method; no score depends on it.
     """
 
     def __init__(
