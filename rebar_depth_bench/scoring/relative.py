@@ -22,39 +22,25 @@ Every alignment uses the truth, so that none ranks. Beside each stands the const
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 from numpy import ndarray
 
-from rebar_depth_bench.scoring.metrics import DepthMetrics, mean_metrics, median, metrics_at_scales, rank_error
+from rebar_depth_bench.scoring.columns import METRICS
+from rebar_depth_bench.scoring.metrics import is_valid_prediction, mean, median, metrics_at_scales, rank_error
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
-
-RELATIVE_PROTOCOL = "rebar-relative-1"
-"""Name of the protocol of predictions that are not metric."""
-
-
-@dataclass(frozen=True)
-class AlignedErrors:
-    """Errors of aligned depth p of a view, or their means over views.
-
-    ``error`` is the mean over all scored pixels of |p - z| / max(p, z), and of 1 outside of V and where p <= 0.
-    ``metrics`` are those over V, None if it is empty; ``within_mm`` has shares of all scored pixels.
-    """
-
-    error: float
-    metrics: DepthMetrics | None
-    within_mm: Mapping[int, float]
+from rebar_depth_bench.scoring.table import AlignedErrors
 
 
 @dataclass(frozen=True)
 class AlignedView:
     """Errors of one view after alignment, after the robust one (None for ``scale``), and of the constant.
 
-    ``is_flat`` is True if the fit has no positive slope.
+    ``coverage`` is the share of the scored pixels in V; ``is_flat`` is True if the fit has no positive slope.
     """
 
     coverage: float
@@ -64,14 +50,13 @@ class AlignedView:
     is_flat: bool
 
 
-_NO_VALUES = AlignedErrors(1.0, None, dict.fromkeys(WITHIN_MM, 0.0))
+_NO_VALUES = AlignedErrors(1.0, None, None, None, None, dict.fromkeys(WITHIN_MM, 0.0))
 """Errors of a view in which no scored pixel has a value."""
 
 
 def has_value(x: Float[ndarray, " n"], kind: str) -> Bool[ndarray, " n"]:
     """Return where a prediction of this kind has a value."""
-    with np.errstate(invalid="ignore"):
-        return np.asarray(np.isfinite(x) & (x > 0)) if kind == "scale" else np.isfinite(x)
+    return is_valid_prediction(x) if kind == "scale" else np.isfinite(x)
 
 
 def align_view(x: Float[ndarray, " n"], z_m: Float[ndarray, " n"], kind: str) -> AlignedView:
@@ -87,7 +72,8 @@ def align_view(x: Float[ndarray, " n"], z_m: Float[ndarray, " n"], kind: str) ->
         everywhere[valid] = p_m
         error = rank_error(everywhere, z_m, np.isfinite(everywhere) & (everywhere > 0))
         [metrics], within = metrics_at_scales(p_m, z, (1.0,), WITHIN_MM)
-        return AlignedErrors(error, metrics, {tolerance: count / len(z_m) for tolerance, count in within.items()})
+        shares = {tolerance_mm: count / len(z_m) for tolerance_mm, count in within.items()}
+        return AlignedErrors(error=error, **vars(metrics), within_mm=shares)
 
     coverage = len(values) / len(z_m)
     if kind == "scale":
@@ -98,6 +84,12 @@ def align_view(x: Float[ndarray, " n"], z_m: Float[ndarray, " n"], kind: str) ->
     fits = (_least_squares(values, target), _robust_fit(values, target), (0.0, float(target.mean())))
     aligned, robust, constant = (errors(_fitted_depth(fit, values, z, kind)) for fit in fits)
     return AlignedView(coverage, aligned, robust, constant, is_flat=fits[0][0] == 0.0)
+
+
+def metric_as(depth_m: Float[ndarray, "h w"], kind: str) -> Float64[ndarray, "h w"]:
+    """Return metric predictions as those of another kind: disparity is 1 / depth; NaN where there are none."""
+    values = np.where(is_valid_prediction(depth_m), depth_m, np.nan).astype(np.float64)
+    return 1.0 / values if kind == "affine-disparity" else values
 
 
 def _fitted_depth(
@@ -128,9 +120,11 @@ def _robust_fit(x: Float64[ndarray, " n"], y: Float64[ndarray, " n"]) -> tuple[f
 
 
 def mean_errors(errors: Sequence[AlignedErrors]) -> AlignedErrors:
-    """Return the means of one or more views; those of the metrics over the views that have them."""
-    metrics = mean_metrics([one.metrics for one in errors if one.metrics is not None])
-    within = {
-        tolerance: math.fsum(one.within_mm[tolerance] for one in errors) / len(errors) for tolerance in WITHIN_MM
-    }
-    return AlignedErrors(math.fsum(one.error for one in errors) / len(errors), metrics, within)
+    """Return the mean of each number over the views that have it; ``errors`` are those of one or more views."""
+
+    def mean_of(values: Iterable[float | None]) -> Any:
+        return mean([value for value in values if value is not None])
+
+    means = {name: mean_of(getattr(one, name) for one in errors) for name in ("error", *METRICS)}
+    within = {tolerance_mm: mean_of(one.within_mm[tolerance_mm] for one in errors) for tolerance_mm in WITHIN_MM}
+    return AlignedErrors(**means, within_mm=within)

@@ -35,13 +35,15 @@ from rebar_depth_bench.scoring.columns import (
     COVERAGE,
     NATIVE,
     RANK_ERROR,
+    RELATIVE_COLUMNS,
     SCALED,
     SCALED_CONSTANT,
     VIEW_COLUMNS,
     WITHIN,
+    Column,
     Share,
 )
-from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, PROTOCOL
+from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, PROTOCOL, RELATIVE_PROTOCOL
 from rebar_depth_bench.scoring.table import (
     LIMITED,
     Count,
@@ -53,7 +55,7 @@ from rebar_depth_bench.scoring.table import (
     ViewScore,
     check_tables,
 )
-from rebar_depth_bench.submission.declaration import INPUTS, Declaration
+from rebar_depth_bench.submission.declaration import INPUTS, PREDICTION_KINDS, Declaration
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -121,11 +123,12 @@ if not TYPE_CHECKING:
 class Result:
     """Result of scoring one submission, with the digests and versions of its inputs.
 
-    ``intervals`` states how the intervals were computed; None in a file of an earlier version, which does not.
-    ``extended`` are the extended measures, None in a result that was read from a file.
+    ``prediction`` is the kind of predictions that are not metric. ``intervals`` states how the intervals were
+    computed; None in a file of an earlier version, which does not. ``extended`` are the extended measures, None in a result that was read from a file.
     """
 
-    protocol: Annotated[str, Strict(), one_of(PROTOCOL)] = PROTOCOL
+    protocol: Annotated[str, Strict(), one_of(PROTOCOL, RELATIVE_PROTOCOL)] = PROTOCOL
+    prediction: Annotated[str, Strict(), one_of(*PREDICTION_KINDS)] | None = None
     dataset: DatasetIdentity
     submission: SubmissionIdentity
     software: SoftwareIdentity
@@ -138,6 +141,11 @@ class Result:
     def method(self) -> str:
         """Name of the method."""
         return self.submission.method
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """Columns of the numbers of its views."""
+        return VIEW_COLUMNS if self.prediction is None else RELATIVE_COLUMNS
 
     @property
     def declared(self) -> Declaration:
@@ -175,7 +183,7 @@ class Result:
         values = {
             f"{name}/{column.path.replace('.', '/')}": column.value(table)
             for name, table in self.tables.items()
-            for column in VIEW_COLUMNS
+            for column in self.columns
         }
         return {name: math.nan if value is None else float(value) for name, value in values.items()}
 
@@ -249,8 +257,12 @@ def _check_views(result: Result) -> Result:
     groups = [
         table for tables in result.tables.values() for group in tables.groups.values() for table in group.values()
     ]
-    if any(table.views and table.rank_error is None for table in (*result.tables.values(), *groups)):
-        raise field_error("a table of views has no rank_error", "one in each of them", "missing")
+    number = "rank_error" if result.prediction is None else "aligned"
+    if any(table.views and getattr(table, number) is None for table in (*result.tables.values(), *groups)):
+        raise field_error(f"a table of views has no {number}", "one in each of them", "missing")
+    if (result.protocol == RELATIVE_PROTOCOL) != (result.prediction is not None):
+        found = f"the protocol is {result.protocol} and prediction is {result.prediction}"
+        raise field_error(found, f"{RELATIVE_PROTOCOL} for predictions that are not metric", "conflict")
     return result
 
 
