@@ -33,6 +33,7 @@ from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation, sc
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.truth import scored_counts
 from rebar_depth_bench.submission import SubmissionWriter
+from rebar_depth_bench.submission.declaration import METRIC
 
 if TYPE_CHECKING:
     from datasets import Dataset
@@ -128,10 +129,12 @@ class Evaluator:
         inputs: str | None = None,
         uses_ground_truth: bool | None = None,
     ) -> None:
+        if extended and kind != METRIC:
+            raise InputError(f"extended is true and kind is {kind}, expected {METRIC} for measures in metres")
         self._root, self._split, self._extended = root, split, extended
         self._declared: dict[str, Any] = {
             "method": method,
-            "prediction": kind if kind != "metric" else None,
+            "prediction": kind,
             "inputs": inputs,
             "uses_ground_truth": uses_ground_truth,
         }
@@ -182,7 +185,8 @@ class Evaluator:
         """Add the planar depth of left views in metres, or of another kind: of one view or of a batch.
 
         ``depth`` is an array or tensor of any float type and device: H x W or 1 x H x W for one id; for a list of
-        B ids B x H x W, B x 1 x H x W, or a list. Values that are not finite or <= 0 mean no prediction.
+        B ids B x H x W, B x 1 x H x W, or a list. Values that are not finite, and of ``metric`` and ``scale``
+        those <= 0, mean no prediction.
 
         Raises ``InputError``, which names the view, for one that is not to be predicted or was added before, and
         for depth of another size.

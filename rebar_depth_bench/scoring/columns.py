@@ -285,16 +285,19 @@ TABLE_COLUMNS = (_VIEWS, _SCORED, COVERAGE, _RANKED, *VIEW_COLUMNS[1:], *CONSTAN
 PAPER_COLUMNS = (NATIVE[1], NATIVE[0], SCALED[0], SCALE)
 """Columns of the paper's Table I: RMSE and AbsRel native, AbsRel scaled, and the median s."""
 
+ALIGNED_METRICS = (Column("error", "error", better="lower", of_all_views=True), *METRICS.values(), *WITHIN)
+"""Columns of the numbers of an alignment, whose paths begin at it."""
 RELATIVE_ALIGNMENTS = ("aligned", "aligned_robust", "constant")
 """Alignments of predictions that are not metric: that of their kind, its robust variant, and its constant."""
-_ALIGNED_ERROR = Column("error", "error", better="lower", of_all_views=True)
 ALIGNED, ALIGNED_ROBUST, ALIGNED_CONSTANT = (
-    tuple(_aligned(alignment, one) for one in (_ALIGNED_ERROR, *METRICS.values(), *WITHIN))
-    for alignment in RELATIVE_ALIGNMENTS
+    tuple(_aligned(alignment, one) for one in ALIGNED_METRICS) for alignment in RELATIVE_ALIGNMENTS
 )
 """Columns of these: the error over all scored pixels, the metrics, and the shares within a tolerance."""
 RELATIVE_COLUMNS = (COVERAGE, *ALIGNED, *ALIGNED_ROBUST, *ALIGNED_CONSTANT)
 """Columns of the numbers of a view, and of a table, of predictions that are not metric."""
+FLAT_VIEWS = Column("flat_views", "views without positive slope", of_view="is_flat")
+RELATIVE_TABLE_COLUMNS = (_VIEWS, _SCORED, FLAT_VIEWS, COVERAGE, _RANKED, *RELATIVE_COLUMNS[1:])
+"""Columns of a config's table of such predictions in frames and CSV."""
 RELATIVE_INTERVALS = tuple(column for column in RELATIVE_COLUMNS if "within_mm" not in column.path)
 """Those of them that have intervals."""
 COLUMN_BY_PATH: Mapping[str, Column] = {column.path: column for column in (*VIEW_COLUMNS, *RELATIVE_COLUMNS)}

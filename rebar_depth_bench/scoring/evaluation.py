@@ -18,7 +18,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from rebar_depth_bench import software_version
-from rebar_depth_bench.base.errors import Problem, SubmissionError
+from rebar_depth_bench.base.errors import InputError, SubmissionError, escape_text
 from rebar_depth_bench.base.names import TEST_SPLIT, config_of, split_of
 from rebar_depth_bench.base.parallel import Progress, map_with_progress, silent
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_folder
@@ -32,7 +32,7 @@ from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareId
 from rebar_depth_bench.scoring.score import ReadDepth, UseView, score_views
 from rebar_depth_bench.scoring.truth import config_truth
 from rebar_depth_bench.submission import EntryError, SubmissionMeta, SubmissionReader
-from rebar_depth_bench.submission.declaration import METRIC
+from rebar_depth_bench.submission.declaration import METRIC, PREDICTION_KINDS
 
 _Found = TypeVar("_Found")
 
@@ -138,6 +138,11 @@ class Evaluation:
         if problems:
             raise SubmissionError.from_problems(self.submission.path, problems)
 
+    def require_metric(self, use: str) -> None:
+        """Raise ``SubmissionError`` unless the predictions are metric, which ``use`` requires."""
+        if problems := self.meta.kind_problems(use):
+            raise SubmissionError.from_problems(self.submission.path, problems)
+
     def provenance(self) -> Provenance:
         """Return the provenance of an analysis of the submission."""
         archive = SubmissionIdentity(self.meta.method, self.submission.sha256())
@@ -195,15 +200,15 @@ def score_evaluation(
 ) -> Result:
     """Score an open submission as ``score`` does; ``use_view`` is called on its threads, as in ``score_views``.
 
-    Raises ``SubmissionError`` if an entry is invalid, and for ``align`` with an archive that is not metric.
+    Raises ``SubmissionError`` if an entry is invalid, and for ``align`` with an archive that is neither metric nor
+    of that kind, and ``InputError`` if ``align`` is no kind.
     """
     submission, folder, meta = evaluation.submission, evaluation.folder, evaluation.meta
     kind, read = align or meta.prediction, submission.read
+    if kind not in PREDICTION_KINDS:
+        raise InputError(f"align is {escape_text(kind)}, expected one of {', '.join(PREDICTION_KINDS)}")
     if kind != meta.prediction:
-        if meta.prediction != METRIC:
-            found = f"the predictions are of the kind {meta.prediction}"
-            problem = Problem("conflict", "prediction", found, f"metric ones, to be aligned as {kind}")
-            raise SubmissionError.from_problems(submission.path, [problem])
+        evaluation.require_metric(f"only they can be aligned as {kind}")
         read = lambda view_id: metric_as(submission.read(view_id), kind)  # noqa: E731
     truths = ((config.name, config_truth(folder, config, progress)) for config in evaluation.configs)
     with ThreadPoolExecutor(1) as pool:
@@ -230,5 +235,6 @@ def score_evaluation(
             software=SoftwareIdentity(software_version()),
             tables=tables,
             views=views,
-            **({} if kind == METRIC else {"protocol": RELATIVE_PROTOCOL, "prediction": kind}),
+            protocol=PROTOCOL if kind == METRIC else RELATIVE_PROTOCOL,
+            prediction=None if kind == METRIC else kind,
         )

@@ -17,12 +17,14 @@ target. The robust variant of the affine kinds has a = mean|y - median(y)| / mea
 b = median(y) - a median(x) for the target y (MiDaS: Ranftl et al., TPAMI 2022, equation 5), and the same bound of
 the disparity.
 
-Every alignment uses the truth, so that none ranks. Beside each stands the constant of the same fit (a = 0).
+Every alignment uses the truth, so that none ranks. Beside each stands the constant of the same fit (a = 0):
+median(z) for scale, else the mean of the target. The error counts 1 outside V and where p <= 0; the other metrics
+take p as it is, over V, and a p <= 0 is not counted in delta1.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -31,9 +33,26 @@ from jaxtyping import Bool, Float, Float64
 from numpy import ndarray
 
 from rebar_depth_bench.scoring.columns import METRICS
-from rebar_depth_bench.scoring.metrics import is_valid_prediction, mean, median, metrics_at_scales, rank_error
+from rebar_depth_bench.scoring.metrics import (
+    is_valid_prediction,
+    mean,
+    median,
+    median_scale,
+    metrics_at_scales,
+    rank_error,
+)
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
-from rebar_depth_bench.scoring.table import AlignedErrors
+from rebar_depth_bench.scoring.table import AlignedErrors, Table
+
+ALIGNMENT_BY_KIND: Mapping[str, str] = {
+    "scale": "depth up to a scale, p = x median(z) / median(x) in each view",
+    "affine-depth": "depth up to scale and shift, p = a x + b fitted to z in each view",
+    "affine-disparity": "disparity up to scale and shift, 1 / p = a x + b fitted to 1 / z in each view",
+}
+"""Kinds of predictions that are not metric, and how they are aligned."""
+
+LEAST_GAIN = 0.95
+"""Share of the constant's error above which an aligned error says little."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +75,7 @@ _NO_VALUES = AlignedErrors(1.0, None, None, None, None, dict.fromkeys(WITHIN_MM,
 
 def has_value(x: Float[ndarray, " n"], kind: str) -> Bool[ndarray, " n"]:
     """Return where a prediction of this kind has a value."""
-    return is_valid_prediction(x) if kind == "scale" else np.isfinite(x)
+    return np.isfinite(x) if kind.startswith("affine") else is_valid_prediction(x)
 
 
 def align_view(x: Float[ndarray, " n"], z_m: Float[ndarray, " n"], kind: str) -> AlignedView:
@@ -77,10 +96,12 @@ def align_view(x: Float[ndarray, " n"], z_m: Float[ndarray, " n"], kind: str) ->
 
     coverage = len(values) / len(z_m)
     if kind == "scale":
-        with np.errstate(over="ignore"):
-            scaled = values * (median(z) / median(values))
+        with np.errstate(over="ignore", invalid="ignore"):
+            scaled = values * median_scale(values, median(z))
         return AlignedView(coverage, errors(scaled), None, errors(np.full(len(z), median(z))), is_flat=False)
     target = 1.0 / z if kind == "affine-disparity" else z
+    # A power of two changes no digit of the fit; squares of values near the limits of float64 would overflow.
+    values = np.ldexp(values, -int(np.frexp(np.abs(values).max())[1]))
     fits = (_least_squares(values, target), _robust_fit(values, target), (0.0, float(target.mean())))
     aligned, robust, constant = (errors(_fitted_depth(fit, values, z, kind)) for fit in fits)
     return AlignedView(coverage, aligned, robust, constant, is_flat=fits[0][0] == 0.0)
@@ -89,7 +110,8 @@ def align_view(x: Float[ndarray, " n"], z_m: Float[ndarray, " n"], kind: str) ->
 def metric_as(depth_m: Float[ndarray, "h w"], kind: str) -> Float64[ndarray, "h w"]:
     """Return metric predictions as those of another kind: disparity is 1 / depth; NaN where there are none."""
     values = np.where(is_valid_prediction(depth_m), depth_m, np.nan).astype(np.float64)
-    return 1.0 / values if kind == "affine-disparity" else values
+    with np.errstate(over="ignore"):
+        return 1.0 / values if kind == "affine-disparity" else values
 
 
 def _fitted_depth(
@@ -102,21 +124,25 @@ def _fitted_depth(
 
 def _least_squares(x: Float64[ndarray, " n"], y: Float64[ndarray, " n"]) -> tuple[float, float]:
     """Return (a, b) that minimise the sum of (a x + b - y)^2, or (0, mean(y)) as the module says."""
-    unit = float(np.abs(x).max()) or 1.0  # Squares of values near the limits of float64 would overflow.
-    x_off = x / unit - (x / unit).mean()
-    y_mean = float(y.mean())
-    if x.min() < x.max() and (a := float(x_off @ (y - y_mean)) / float(x_off @ x_off)) > 0:
-        return a / unit, y_mean - a * float((x / unit).mean())
+    x_mean, y_mean = float(x.mean()), float(y.mean())
+    x_off = x - x_mean
+    if _vary(x, y) and (a := float(x_off @ (y - y_mean)) / float(x_off @ x_off)) > 0:
+        return a, y_mean - a * x_mean
     return 0.0, y_mean
 
 
 def _robust_fit(x: Float64[ndarray, " n"], y: Float64[ndarray, " n"]) -> tuple[float, float]:
     """Return (a, b) of the robust variant, or (0, mean(y)) as the module says."""
+    if not _vary(x, y):
+        return 0.0, float(y.mean())
     x_median, y_median = median(x), median(y)
-    spread = float(np.abs(x / 2 - x_median / 2).mean()) * 2
-    if x.min() < x.max() and (a := float(np.abs(y - y_median).mean()) / spread) > 0:
-        return a, y_median - a * x_median
-    return 0.0, float(y.mean())
+    a = float(np.abs(y - y_median).mean()) / float(np.abs(x - x_median).mean())
+    return a, y_median - a * x_median
+
+
+def _vary(x: Float64[ndarray, " n"], y: Float64[ndarray, " n"]) -> bool:
+    """Return whether neither is constant; of a constant, rounding would leave a slope beside 0."""
+    return bool(x.min() < x.max() and y.min() < y.max())
 
 
 def mean_errors(errors: Sequence[AlignedErrors]) -> AlignedErrors:
@@ -128,3 +154,21 @@ def mean_errors(errors: Sequence[AlignedErrors]) -> AlignedErrors:
     means = {name: mean_of(getattr(one, name) for one in errors) for name in ("error", *METRICS)}
     within = {tolerance_mm: mean_of(one.within_mm[tolerance_mm] for one in errors) for tolerance_mm in WITHIN_MM}
     return AlignedErrors(**means, within_mm=within)
+
+
+def relative_findings(table: Table) -> list[str]:
+    """Return a sentence on each sign that the alignment of a table makes up for what its predictions lack."""
+    if table.aligned is None or table.constant is None:
+        return []
+    findings = []
+    if table.aligned.error > LEAST_GAIN * table.constant.error:
+        findings.append(
+            f"The aligned error {table.aligned.error:.4f} is above {LEAST_GAIN * 100:.0f} % of that of a constant "
+            f"({table.constant.error:.4f}): the fit hides that the predictions say little about depth."
+        )
+    if (table.flat_views or 0) > table.views / 2:
+        findings.append(
+            f"In {table.flat_views} of {table.views} views the fit has no positive slope and is a constant: it "
+            "hides that the predictions say nothing about depth."
+        )
+    return findings

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from html import escape
@@ -32,6 +32,9 @@ from rebar_depth_bench.base.validation import StrictModel, field_error, one_of, 
 from rebar_depth_bench.scoring import frames
 from rebar_depth_bench.scoring.bootstrap import INTERVALS
 from rebar_depth_bench.scoring.columns import (
+    ALIGNED,
+    ALIGNED_CONSTANT,
+    ALIGNED_ROBUST,
     COVERAGE,
     NATIVE,
     RANK_ERROR,
@@ -44,6 +47,7 @@ from rebar_depth_bench.scoring.columns import (
     Share,
 )
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, PROTOCOL, RELATIVE_PROTOCOL
+from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND, relative_findings
 from rebar_depth_bench.scoring.table import (
     LIMITED,
     Count,
@@ -55,7 +59,7 @@ from rebar_depth_bench.scoring.table import (
     ViewScore,
     check_tables,
 )
-from rebar_depth_bench.submission.declaration import INPUTS, PREDICTION_KINDS, Declaration
+from rebar_depth_bench.submission.declaration import INPUTS, METRIC, PREDICTION_KINDS, Declaration
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -68,8 +72,27 @@ _NOTEBOOK_COLUMNS = (
     *("native_abs_rel", "native_rmse_cm", "scaled_abs_rel", "scaled_rmse_cm", "scale_median"),
 )
 
-_SUMMARY_COLUMNS = (COVERAGE, RANK_ERROR, NATIVE[0], SCALED[0], SCALED_CONSTANT[0], WITHIN[1])
-"""Columns that ``print(result)`` shows."""
+_RELATIVE_NOTEBOOK_COLUMNS = (
+    *("config", "views", "views_scored", "coverage", "flat_views", "aligned_error", "constant_error"),
+    *("aligned_abs_rel", "aligned_robust_abs_rel", "constant_abs_rel", "aligned_within_5mm"),
+)
+_SUMMARY: Mapping[Column, str] = {
+    COVERAGE: "coverage",
+    RANK_ERROR: "rank error",
+    NATIVE[0]: "AbsRel",
+    SCALED[0]: "scaled",
+    SCALED_CONSTANT[0]: "constant",
+    WITHIN[1]: "within 5 mm",
+}
+_RELATIVE_SUMMARY: Mapping[Column, str] = {
+    COVERAGE: "coverage",
+    ALIGNED[0]: "aligned error",
+    ALIGNED[1]: "AbsRel",
+    ALIGNED_ROBUST[1]: "robust AbsRel",
+    ALIGNED_CONSTANT[1]: "constant",
+    ALIGNED[6]: "within 5 mm",
+}
+"""Columns that ``print(result)`` shows, and their headings."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +147,8 @@ class Result:
     """Result of scoring one submission, with the digests and versions of its inputs.
 
     ``prediction`` is the kind of predictions that are not metric. ``intervals`` states how the intervals were
-    computed; None in a file of an earlier version, which does not. ``extended`` are the extended measures, None in a result that was read from a file.
+    computed; None in a file of an earlier version, which does not. ``extended`` are the extended measures, None in
+    a result that was read from a file.
     """
 
     protocol: Annotated[str, Strict(), one_of(PROTOCOL, RELATIVE_PROTOCOL)] = PROTOCOL
@@ -143,9 +167,16 @@ class Result:
         return self.submission.method
 
     @property
+    def kind(self) -> str:
+        """Kind of its predictions, one of ``PREDICTION_KINDS``."""
+        return self.prediction or METRIC
+
+    @property
     def columns(self) -> tuple[Column, ...]:
         """Columns of the numbers of its views."""
-        return VIEW_COLUMNS if self.prediction is None else RELATIVE_COLUMNS
+        if self.prediction is None:
+            return VIEW_COLUMNS
+        return (COVERAGE, *ALIGNED, *ALIGNED_CONSTANT) if self.prediction == "scale" else RELATIVE_COLUMNS
 
     @property
     def declared(self) -> Declaration:
@@ -171,7 +202,7 @@ class Result:
         if rows == "groups":
             return frames.groups_frame([self])
         if rows == "views":
-            return frames.views_frame(self.views)
+            return frames.views_frame(self)
         if rows == "extended" and self.extended is not None:
             return self.extended.to_pandas()
         expected = "'tables', 'groups', 'views', or 'extended' for a result that has them"
@@ -189,17 +220,12 @@ class Result:
 
     def __str__(self) -> str:
         """Return the main numbers of each config as a table, with what limits them."""
-        heads = ("coverage", "rank error", "AbsRel", "scaled", "constant", "within 5 mm")
-        rows = [[printable(self.method), *heads]]
+        shown = _SUMMARY if self.prediction is None else _RELATIVE_SUMMARY
+        rows = [[printable(self.method), *shown.values()]]
         notes = dict[str, list[str]]()
         for name, table in self.tables.items():
-            cells = [column.text(column.value(table)) for column in _SUMMARY_COLUMNS]
-            rows.append(
-                [
-                    printable(name),
-                    *(f"{cell} {one.unit}".strip() for cell, one in zip(cells, _SUMMARY_COLUMNS, strict=True)),
-                ]
-            )
+            cells = (f"{column.text(column.value(table))} {column.unit}".strip() for column in shown)
+            rows.append([printable(name), *cells])
             for note in self._short_notes(name):
                 notes.setdefault(note, []).append(printable(name))
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
@@ -215,7 +241,14 @@ class Result:
     def _short_notes(self, name: str) -> list[str]:
         """Return the notes on a config that are printed with its numbers."""
         table = self.tables[name]
-        notes = [] if table.of_views is None else [f"{table.views} of {table.of_views} views: not ranked"]
+        notes = (
+            []
+            if self.prediction is None
+            else [f"{self.prediction}: {ALIGNMENT_BY_KIND[self.prediction]}; not ranked"]
+        )
+        if table.of_views is not None:
+            notes.append(f"{table.views} of {table.of_views} views: not ranked")
+        notes += relative_findings(table)
         if table.views and not table.is_comparable:
             is_low = (table.coverage or 0.0) < MIN_COMPARABLE_COVERAGE
             low = f"coverage below {MIN_COMPARABLE_COVERAGE * 100:.0f} %"
@@ -232,9 +265,10 @@ class Result:
 
     def _repr_html_(self) -> str:
         """Return the method, its provenance and the tables for notebooks."""
-        frame = self.to_pandas()[[*_NOTEBOOK_COLUMNS]]
+        frame = self.to_pandas()[[*(_NOTEBOOK_COLUMNS if self.prediction is None else _RELATIVE_NOTEBOOK_COLUMNS)]]
         frame["config"] = frame["config"].map(printable)
-        provenance = f"protocol {self.protocol}, dataset {self.dataset.version} ({self.dataset.digest[:19]})"
+        kind = "" if self.prediction is None else f" ({self.prediction})"
+        provenance = f"protocol {self.protocol}{kind}, dataset {self.dataset.version} ({self.dataset.digest[:19]})"
         head = f"<p><b>{escape(printable(self.method))}</b>, {escape(printable(provenance))}</p>"
         return head + str(frame.to_html(index=False, na_rep="–", float_format="{:.4g}".format, border=0))
 
@@ -284,6 +318,8 @@ def read_result(data: bytes, where: str) -> Result:
 
 
 def _describe_table(table: Table) -> str:
+    if table.aligned is not None and table.constant is not None:
+        return f"aligned error {table.aligned.error:.4g}, constant {table.constant.error:.4g}, not ranked"
     if table.native is None or table.scaled is None:
         return "no predictions"
     note = "" if table.ranked else ", not ranked"

@@ -16,12 +16,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt32
 from numpy import ndarray
 
-from rebar_depth_bench.scoring.columns import (
-    RELATIVE_ALIGNMENTS,
-    RELATIVE_INTERVALS,
-    VIEW_COLUMNS,
-    view_intervals,
-)
+from rebar_depth_bench.scoring.columns import RELATIVE_INTERVALS, VIEW_COLUMNS, view_intervals
 from rebar_depth_bench.scoring.groups import GROUPINGS, ViewTraits, positions_by_group
 from rebar_depth_bench.scoring.metrics import (
     is_valid_prediction,
@@ -105,8 +100,9 @@ def score_views(
 ) -> tuple[dict[str, Table], list[ViewScore]]:
     """Return the tables by config, and the scores of all views.
 
-    ``truths`` are names and ground truth of configs, ``kind`` is that of the predictions. One view is in memory at a
-    time, unless ``each`` computes several at once. ``use_view`` is called with each view, for further measures of the same depth.
+    ``truths`` are names and ground truth of configs, ``kind`` is that of the predictions. One view is in memory at
+    a time, unless ``each`` computes several at once. ``use_view`` is called with each view, for further measures
+    of the same depth.
     """
     tables: dict[str, Table] = {}
     views: list[ViewScore] = []
@@ -196,9 +192,9 @@ def tabulate(
     """Return the table of a config, or of a group of its views, from the scores of its scored views.
 
     Predictions that are not metric have aligned errors alone. The intervals of a config with splits are those of
-    resampled scenes, of others those of consecutive views. A config without views is not ranked, and neither is a submission that declares the use of ground truth. An
-    infinite metric (of a prediction so large that its square overflows) is written as null; the rank error is
-    always finite.
+    resampled scenes, of others those of consecutive views. A config without views is not ranked, and neither is a
+    submission that declares the use of ground truth. An infinite metric (of a prediction so large that its square
+    overflows) is written as null; the rank error is always finite.
     """
     if views and views[0].aligned is not None:
         return _tabulate_relative(views, reference, published, split, truth_sigma_m)
@@ -251,7 +247,9 @@ def _tabulate_relative(
         scaled=None,
         scale_median=None,
         within_mm=dict.fromkeys(WITHIN_MM),
-        **{alignment: mean_of(alignment) for alignment in RELATIVE_ALIGNMENTS},
+        aligned=mean_of("aligned"),
+        aligned_robust=mean_of("aligned_robust"),
+        constant=mean_of("constant"),
         flat_views=sum(view.is_flat is True for view in views),
         reference=reference,
         published=published,

@@ -6,6 +6,7 @@ versions have more of them.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cache
@@ -27,6 +28,7 @@ from rebar_depth_bench.base.names import SPLITS
 from rebar_depth_bench.base.validation import Expected, field_error, one_of, text, validate_document
 from rebar_depth_bench.scoring.bootstrap import Interval
 from rebar_depth_bench.scoring.columns import (
+    METRICS,
     RELATIVE_ALIGNMENTS,
     RELATIVE_INTERVALS,
     VIEW_COLUMNS,
@@ -152,6 +154,12 @@ class ViewScore:
         tuple[float, float] | None, Field(exclude=True), BeforeValidator(lambda _: None)
     ] = None
 
+    @property
+    def error(self) -> float:
+        """The error by which views are ordered: the rank error, or the aligned one; 1 without any."""
+        found = self.rank_error if self.aligned is None else self.aligned.error
+        return 1.0 if found is None else found
+
 
 @dataclass(frozen=True)
 class PublishedMatch:
@@ -200,6 +208,11 @@ class Table:
     groups: dict[Name, dict[Name, _GroupTable]] = field(default_factory=dict)
 
     @property
+    def error(self) -> float | None:
+        """The error by which tables are ordered: the rank error, or the aligned one of other kinds."""
+        return self.rank_error if self.aligned is None else self.aligned.error
+
+    @property
     def scored_of_views(self) -> str:
         """Numbers of the views with a prediction and of all views."""
         return f"{self.views_scored}/{self.views}"
@@ -220,8 +233,15 @@ class Table:
         be infinite. Otherwise, missing or enormous predictions could improve the comparison.
         """
         is_complete = 0 < self.views == self.views_scored
-        is_finite = all(metrics is not None and metrics.is_finite for metrics in (self.native, self.scaled))
-        return is_complete and is_finite and (self.coverage or 0.0) >= MIN_COMPARABLE_COVERAGE
+        return is_complete and self.is_finite and (self.coverage or 0.0) >= MIN_COMPARABLE_COVERAGE
+
+    @property
+    def is_finite(self) -> bool:
+        """Whether there are metrics, and none of them overflowed."""
+        if self.aligned is not None:
+            errors = [getattr(self.aligned, name) for name in METRICS]
+            return all(error is not None and math.isfinite(error) for error in errors)
+        return all(metrics is not None and metrics.is_finite for metrics in (self.native, self.scaled))
 
 
 def _checked(scores: Any, is_predicted: bool) -> Any:

@@ -127,6 +127,13 @@ class SubmissionMeta(MethodDetails):
         """What the submission declares."""
         return Declaration(self.inputs, self.uses_ground_truth)
 
+    def kind_problems(self, use: str) -> list[Problem]:
+        """Return the problem of predictions that are not metric, which ``use`` requires; none if they are."""
+        if self.prediction == METRIC:
+            return []
+        found = f"the predictions are of the kind {self.prediction}"
+        return [Problem("conflict", f"{METADATA_NAME}: prediction", found, f"{METRIC} ones: {use}")]
+
     @property
     def seconds_per_view(self) -> float | None:
         """Median runtime per view in seconds, if ``runtime`` is a number or an object with the key ``seconds``."""

@@ -199,7 +199,7 @@ def test_groups_are_not_disclosed(scored: Result) -> None:
 def test_comparison_resamples_scenes(root: Path, tmp_path: Path, scored: Result) -> None:
     other = rdb.score(write_noisy(root, tmp_path / "b.zip", "other", 1.05), root)
     [row] = [row for row in compare(scored, other).configs["cages"] if row.column.path == "rank_error"]
-    change = [b.rank_error - a.rank_error for a, b in zip(scored.views, other.views, strict=True)]
+    change = [b.error - a.error for a, b in zip(scored.views, other.views, strict=True)]
     by_scene = np.reshape(change, (len(SCENES), VIEWS))
     counts = resample_scenes(list(SCENES)).counts
     means = [np.repeat(by_scene, drawn.astype(int), axis=0).mean() for drawn in counts]
