@@ -293,7 +293,7 @@ class EvaluatedResult(Result):
             for name, table in self.tables.items()
             for note in (*table_notes(table), *reference_findings(table))
         ]
-        return (*of_tables, *mistakes)
+        return (*self.kind_notes, *of_tables, *mistakes)
 
     def to_html(self, path: str | Path) -> None:
         """Write the self-contained report of ``rebar-bench score --html``."""

@@ -183,6 +183,7 @@ def draw_figure(figure: Figure, table: pd.DataFrame) -> None:
 def run(options: argparse.Namespace) -> None:
     """Compute the table, write the requested files and print it."""
     with ProgressBars() as bars, open_evaluation(options.archive, options.data) as evaluation:
+        evaluation.require_metric("the scale is that of depth in metres")
         evaluation.check_entries(bars.update)
         content = anchored(evaluation, options, bars)
     table = pd.json_normalize([{**row, "draws": len(row["draws"])} for row in content["rows"]], sep="_")

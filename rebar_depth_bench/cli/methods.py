@@ -13,6 +13,7 @@ from rebar_depth_bench.base.errors import MethodError
 from rebar_depth_bench.methods import AnyMethod, MultiViewMethod, all_methods
 from rebar_depth_bench.methods.base import input_class
 from rebar_depth_bench.reporting.tables import plain_text
+from rebar_depth_bench.submission.declaration import METRIC
 
 _ALL_VIEWS_NOTE = "prepares a whole config before it predicts any view"
 _NEEDS_COLUMN_WIDTH = len("cam_from_world,")
@@ -35,11 +36,12 @@ def run(_: argparse.Namespace) -> None:
             table.add_row(plain_text(name), plain_text(f"cannot be used: {method}"), "", "")
             continue
         info = method.info
+        kind = [] if info.prediction == METRIC else [f"prediction: {info.prediction}"]
         label = f"{name} †" if info.uses_ground_truth else name
         table.add_row(
             plain_text(label),
             _summary_and_notes(method),
-            plain_text(f"{_format_columns(info.columns)}\ninputs: {input_class(method) or '-'}"),
+            plain_text("\n".join([_format_columns(info.columns), f"inputs: {input_class(method) or '-'}", *kind])),
             plain_text(f"{info.source}\nlicence: {info.licence}"),
         )
     Console().print(table)

@@ -104,9 +104,7 @@ def table_notes(table: Table) -> list[str]:
         )
     if table.of_views is not None:
         notes.append(f"Not ranked: {table.views} of {counted(table.of_views, 'view')}.")
-    elif table.aligned is not None:
-        notes.append("Not ranked: the predictions are aligned with the truth of each view.")
-    elif not table.ranked:
+    elif not table.ranked and table.aligned is None:
         reason = "the submission declares that it uses ground truth" if table.views else "no views"
         notes.append(f"Not ranked: {reason}.")
     if reasons := incomparable_reasons(table):

@@ -48,7 +48,7 @@ from rebar_depth_bench.scoring.columns import (
     value_at,
     with_reference,
 )
-from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND
+from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND, relative_findings
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.table import PublishedMatch, Table
 
@@ -288,7 +288,7 @@ def print_comparison(comparison: Comparison, console: Console) -> None:
         table.add_column("B is")
         for row in rows:
             table.add_row(*map(plain_text, comparison_cells(row)))
-        console.print(table)
+        print_unwrapped(console, table)
     console.print()
     print_line(console, COMPARISON_NOTE)
 
@@ -360,6 +360,9 @@ def print_paper_table(results: Sequence[Result], console: Console, *, published:
             else:
                 aligned = [row for result, of in rows for row in _aligned_rows(printable(result.method, 40), of)]
                 _print_rows(aligned, console, _ALIGNED_LAYOUTS, "")
+                for result, of in rows:
+                    for note in relative_findings(of):
+                        print_line(console, f"{printable(result.method)}: {note}", style="yellow")
         console.print()
         if kind is None:
             _print_paper_notes(block, console, published=published)

@@ -241,11 +241,7 @@ class Result:
     def _short_notes(self, name: str) -> list[str]:
         """Return the notes on a config that are printed with its numbers."""
         table = self.tables[name]
-        notes = (
-            []
-            if self.prediction is None
-            else [f"{self.prediction}: {ALIGNMENT_BY_KIND[self.prediction]}; not ranked"]
-        )
+        notes = self.kind_notes
         if table.of_views is not None:
             notes.append(f"{table.views} of {table.of_views} views: not ranked")
         notes += relative_findings(table)
@@ -255,6 +251,13 @@ class Result:
             reason = low if is_low else "views without predictions, or numbers that overflowed"
             notes.append(f"{reason}: errors of valid predictions are not comparable")
         return notes
+
+    @property
+    def kind_notes(self) -> list[str]:
+        """A sentence on the kind of predictions that are not metric; none of metric ones."""
+        if self.prediction is None:
+            return []
+        return [f"{self.prediction}: {ALIGNMENT_BY_KIND[self.prediction]}; not ranked"]
 
     def __repr__(self) -> str:
         """Return the method, the numbers of the first ten configs, and the number of views."""

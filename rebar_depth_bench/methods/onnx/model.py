@@ -26,11 +26,13 @@ from rebar_depth_bench.methods.base import (
     Method,
     MethodInfo,
     Predictor,
+    finite_or_nan,
     import_optional,
     positive_or_nan,
 )
 from rebar_depth_bench.methods.onnx.external_data import model_digest
 from rebar_depth_bench.methods.onnx.spec import OUTPUT_MEANINGS, InputSpec, OnnxSpec, OutputSpec, read_onnx_toml
+from rebar_depth_bench.submission.declaration import METRIC
 
 
 @dataclass(frozen=True)
@@ -170,6 +172,7 @@ def onnx_method(path: Path, view_timeout_s: float = VIEW_TIMEOUT_S) -> Method:
         uses_intrinsics=meaning.canonical,
         source=f"{spec.source or model.name} (sha256:{model_digest(path, model)})",
         licence=spec.licence,
+        prediction=meaning.prediction,
     )
     return Method(info, lambda: _load(spec, view_timeout_s))
 
@@ -177,12 +180,14 @@ def onnx_method(path: Path, view_timeout_s: float = VIEW_TIMEOUT_S) -> Method:
 def output_to_depth_m(
     values: Float[ndarray, "*grid"], output: OutputSpec, factor: float = 1.0
 ) -> Float32[ndarray, "*grid"]:
-    """Return planar depth in metres of output values.
+    """Return planar depth in metres of output values; of relative networks the finite values times ``scale``.
 
     Depth is v or 1 / v, where v is the value times ``scale``, multiplied by ``factor``. It is NaN where the value
     is not finite, or the depth is not finite and above 0 or lies outside ``min_m`` to ``max_m``.
     """
     scaled = np.asarray(values, np.float64) * output.scale
+    if OUTPUT_MEANINGS[output.meaning].prediction != METRIC:
+        return finite_or_nan(scaled)
     with np.errstate(all="ignore"):
         depth_m = np.asarray(factor / scaled if OUTPUT_MEANINGS[output.meaning].inverse else factor * scaled)
     valid = np.isfinite(scaled) & (depth_m >= output.min_m) & (depth_m <= output.max_m)
