@@ -110,7 +110,8 @@ def test_errors_are_those_of_the_definitions(kind: str, noise: float) -> None:
         check_view(x, z, kind)
         x[::3], x[1::7] = np.nan, np.inf
         check_view(x, z, kind)
-        check_view(x[:2], z[:2], kind)
+        if kind in AFFINE:
+            check_view(x[:3], z[:3], kind)
 
 
 @pytest.mark.parametrize("kind", AFFINE)
@@ -200,14 +201,12 @@ def test_disparity_is_bounded_by_the_farthest_truth() -> None:
 
 
 def test_depth_at_or_below_zero_is_an_error_of_one() -> None:
-    z = np.array([0.5, 0.5, 0.5, 0.5, 2.5])
-    x = np.array([-3.0, -1.0, 1.0, 1.0, 9.0])
+    z = np.array([0.3, *[0.4] * 4, *[3.1] * 4])
+    x = np.array([0.0, *[2.0] * 4, *[3.0] * 4])
     check_view(x, z, "affine-depth")
-    (a, b), *_ = np.linalg.lstsq(np.stack([x, np.ones(5)], 1), z, rcond=None)
-    p = a * x + b
-    assert p[0] < 0
-    assert align_view(x, z, "affine-depth").aligned.error >= 0.2
-    assert align_view(x, z, "affine-depth").aligned.abs_rel == pytest.approx(np.mean(np.abs(p - z) / z))
+    (_, b), *_ = np.linalg.lstsq(np.stack([x, np.ones(9)], 1), z, rcond=None)
+    assert b < 0, "the depth of the first pixel"
+    assert align_view(x, z, "affine-depth").aligned.error >= 1 / 9
 
 
 # Results of archives.
@@ -315,7 +314,11 @@ def test_metric_archives_are_aligned_as_weaker_kinds(
             metric.add(view_id, noisy)
             other.add(view_id, make(noisy))
     aligned = rdb.score(tmp_path / "metric.zip", tiny_root, align=kind)
-    assert numbers(rdb.score(tmp_path / "other.zip", tiny_root).to_dict()["tables"]) == aligned.to_dict()["tables"]
+    [first, second] = (one.to_pandas("views") for one in (rdb.score(tmp_path / "other.zip", tiny_root), aligned))
+    assert list(first["view_id"]) == list(second["view_id"])
+    for column in aligned.columns:  # The archives hold float32: some pixels are at a tolerance.
+        tolerance = {"abs": 2e-3} if "within" in column.path else {"rel": 1e-4}
+        assert list(first[column.name]) == pytest.approx(list(second[column.name]), **tolerance)
     with pytest.raises(rdb.SubmissionError, match=f"of the kind {kind}, expected metric ones: .*aligned as scale"):
         rdb.score(tmp_path / "other.zip", tiny_root, align="scale")
     with pytest.raises(rdb.InputError, match="align is metres, expected one of metric, scale, affine-depth"):
@@ -331,7 +334,7 @@ def test_zero_of_a_png_is_no_value(tiny_root: Path, tiny_truth: dict[str, np.nda
             archive.writestr("submission.json", json.dumps(metadata))
             for view_id, depth_m in tiny_truth.items():
                 values = disparity(depth_m)
-                values = np.clip(1000 * (values - values.min()), 1, 65535).astype(np.uint16)
+                values = np.clip(400 * (values - values.min()), 1, 65535).astype(np.uint16)
                 values[::2] *= not with_holes
                 image = io.BytesIO()
                 Image.fromarray(values).save(image, "PNG")
@@ -367,7 +370,7 @@ def test_unknown_kind_is_refused(tiny_root: Path, archive_of: Write, tiny_truth:
     with zipfile.ZipFile(path, "w") as archive:
         for name, content in entries.items():
             archive.writestr(name, content)
-    with pytest.raises(rdb.SubmissionError, match=r'prediction: got "disparity", expected "metric", "scale"'):
+    with pytest.raises(rdb.SubmissionError, match="prediction: got 'disparity', expected"):
         rdb.score(path, tiny_root)
 
 
@@ -409,8 +412,11 @@ def test_frames(relative: Result) -> None:
     assert relative.metrics["lattice/aligned/within_mm/5"] == pytest.approx(row["aligned_within_5mm"])
 
 
-def test_score_command(tiny_root: Path, tmp_path: Path, write: Write, capsys: Any) -> None:
-    metric, page = write("metric", None, lambda z: 1.1 * z), tmp_path / "report.html"
+def test_score_command(
+    tiny_root: Path, tmp_path: Path, write: Write, capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    metric = write("metric", None, lambda z: 1.1 * z)
     arguments = ["score", str(metric), "--data", str(tiny_root), "--align", "affine-disparity"]
     files = {name: tmp_path / f"result.{name}" for name in ("json", "csv", "html")}
     options = [text for name, path in files.items() for text in (f"--{name}", str(path))]
@@ -422,16 +428,17 @@ def test_score_command(tiny_root: Path, tmp_path: Path, write: Write, capsys: An
     [row] = csv.DictReader(io.StringIO(files["csv"].read_text()))
     table = expected.tables["lattice"]
     assert table.aligned is not None
+    assert table.constant is not None
     assert float(row["aligned_error"]) == pytest.approx(table.aligned.error)
-    rows = {line.split()[0]: line.split() for line in output.out.splitlines() if line.strip()}
-    assert rows["constant"][1] == f"{table.constant.error:.4f}" if table.constant else False
+    lines = [line.split() for line in output.out.splitlines()]
+    [constant] = [line for line in lines if line[:1] == ["constant"]]
+    assert constant[1:3] == [f"{value:.4f}" for value in (table.constant.error, table.constant.abs_rel)]
     text = Page(files["html"].read_text()).text
     for column in RELATIVE_INTERVALS[1:]:
         assert column.text(column.value(table)) in text
     assert all(view.view_id in text for view in expected.views)
     assert "affine-disparity: disparity up to scale and shift" in text
     assert "Rank error" not in text
-    assert not page.exists()
 
 
 def test_table_has_a_block_for_each_kind(tiny_root: Path, tmp_path: Path, write: Write, capsys: Any) -> None:
@@ -509,7 +516,7 @@ def test_disparity_is_no_mistake(tiny_root: Path, write: Write, capsys: Any) -> 
     assert "mistake" not in check("negative", "affine-depth", lambda z: z - 90)
     assert "0.0 % are finite and above 0" in check("none", "scale", lambda z: z - 90)
     assert "0.0 % are finite\n" in check("infinite", "affine-depth", lambda z: z * np.inf)
-    assert "the same at all pixels in 9 of 9 views" in check("zero", "affine-depth", lambda z: 0 * z)
+    assert "the same at all pixels in 8 of 8 views" in check("zero", "affine-depth", lambda z: 0 * z)
 
 
 def test_evaluation_of_another_kind(tiny_root: Path, tiny_truth: dict[str, np.ndarray], tmp_path: Path) -> None:
