@@ -52,13 +52,12 @@ INTERVAL_NOTE = (
 
 _SCENES_NOTE = "bootstrap over scenes (other scenes of the same generator)."
 
-ALIGNED_GROUP_NOTE = (
-    "The group of a view follows from its ground truth. A group with views of fewer than "
-    f"{MIN_BLOCKS} scenes has no intervals."
-)
+_GROUP = "The group of a view follows from its ground truth."
+_NO_INTERVALS = f"A group with views of fewer than {MIN_BLOCKS} scenes has no intervals."
+ALIGNED_GROUP_NOTE = f"{_GROUP} {_NO_INTERVALS}"
 GROUP_NOTE = (
-    f"{ALIGNED_GROUP_NOTE} Beside the errors of a group are the reference errors of its views: {ONE_PIXEL_TITLE} "
-    f"for native, {CONSTANT_TITLE} for scaled errors."
+    f"{_GROUP} Beside the errors of a group are the reference errors of its views: {ONE_PIXEL_TITLE} for native, "
+    f"{CONSTANT_TITLE} for scaled errors. {_NO_INTERVALS}"
 )
 
 

@@ -300,7 +300,6 @@ RELATIVE_TABLE_COLUMNS = (_VIEWS, _SCORED, FLAT_VIEWS, COVERAGE, _RANKED, *RELAT
 """Columns of a config's table of such predictions in frames and CSV."""
 RELATIVE_INTERVALS = tuple(column for column in RELATIVE_COLUMNS if "within_mm" not in column.path)
 """Those of them that have intervals."""
-COLUMN_BY_PATH: Mapping[str, Column] = {column.path: column for column in (*VIEW_COLUMNS, *RELATIVE_COLUMNS)}
 
 
 def with_reference(columns: Sequence[Column]) -> list[Column]:

@@ -119,7 +119,7 @@ def test_invalid_network_output_is_nan() -> None:
     inverse, metres = (
         network_output_to_prediction(output, values) for output in (OutputKind.INVERSE, OutputKind.METRES)
     )
-    np.testing.assert_array_equal(inverse, [[np.nan] * 3 + [-1, 0, np.float32(1e-45), 2]])
+    np.testing.assert_array_equal(inverse, np.array([[np.nan, np.nan, np.nan, -1, 0, 1e-45, 2]], np.float32))
     assert np.isfinite(metres).tolist() == [[False] * 5 + [True, True]]
 
 
