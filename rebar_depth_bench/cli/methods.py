@@ -36,12 +36,11 @@ def run(_: argparse.Namespace) -> None:
             table.add_row(plain_text(name), plain_text(f"cannot be used: {method}"), "", "")
             continue
         info = method.info
-        kind = [] if info.prediction == METRIC else [f"prediction: {info.prediction}"]
         label = f"{name} †" if info.uses_ground_truth else name
         table.add_row(
             plain_text(label),
             _summary_and_notes(method),
-            plain_text("\n".join([_format_columns(info.columns), f"inputs: {input_class(method) or '-'}", *kind])),
+            plain_text(f"{_format_columns(info.columns)}\ninputs: {input_class(method) or '-'}"),
             plain_text(f"{info.source}\nlicence: {info.licence}"),
         )
     Console().print(table)
@@ -50,7 +49,8 @@ def run(_: argparse.Namespace) -> None:
 
 def _summary_and_notes(method: AnyMethod) -> Text:
     """Return the summary, followed by dimmed notes on separate lines."""
-    notes = (*((_ALL_VIEWS_NOTE,) if isinstance(method, MultiViewMethod) else ()), method.info.untested_note)
+    kind = "" if method.info.prediction == METRIC else f"predictions of the kind {method.info.prediction}"
+    notes = (*((_ALL_VIEWS_NOTE,) if isinstance(method, MultiViewMethod) else ()), kind, method.info.untested_note)
     lines = [plain_text(method.info.summary), *(plain_text(f"({line})", style="dim") for line in notes if line)]
     return Text("\n").join(lines)
 

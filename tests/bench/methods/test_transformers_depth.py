@@ -26,7 +26,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from rebar_depth_bench import score
+from rebar_depth_bench import evaluate, score
 from rebar_depth_bench.base.errors import MethodError
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.methods import METHODS, find_method
@@ -205,6 +205,14 @@ def test_predict_command_runs_hf_folder(
     assert (metadata["inputs"], metadata["uses_ground_truth"]) == ("rgb+K", False)
     assert metadata["method"] == "hf:pro"
     assert re.search(r"focal length given; weights sha256:[0-9a-f]{64}$", metadata["description"])
+
+
+@pytest.mark.parametrize("kind", ["depth-anything", "glpn"])
+def test_evaluation_takes_the_kind_of_the_checkpoint(folders: dict[str, Path], kind: str, tiny_root: Path) -> None:
+    result = evaluate(f"hf:{folders[kind]}", tiny_root, config="lattice-orbit")
+    assert result.kind == ("affine-disparity" if kind == "depth-anything" else "metric")
+    table = result.tables["lattice-orbit"]
+    assert (table.aligned is None) == (table.native is not None) == (kind == "glpn")
 
 
 def drop_tensor(path: Path) -> None:
