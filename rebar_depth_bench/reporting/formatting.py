@@ -22,10 +22,8 @@ from rebar_depth_bench.scoring.columns import (
 from rebar_depth_bench.scoring.groups import GROUPINGS
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE
 from rebar_depth_bench.scoring.relative import relative_findings
-from rebar_depth_bench.submission.declaration import PREDICTION_KINDS
 
 if TYPE_CHECKING:
-    from rebar_depth_bench.scoring.result import Result
     from rebar_depth_bench.scoring.table import Table
     from rebar_depth_bench.submission.declaration import Declaration
 
@@ -59,12 +57,6 @@ GROUP_NOTE = (
     f"{_GROUP} Beside the errors of a group are the reference errors of its views: {ONE_PIXEL_TITLE} for native, "
     f"{CONSTANT_TITLE} for scaled errors. {_NO_INTERVALS}"
 )
-
-
-def kind_blocks(results: Sequence[Result]) -> list[list[Result]]:
-    """Return the results of each kind of predictions that any of them has, metric ones first."""
-    blocks = ([result for result in results if result.kind == kind] for kind in PREDICTION_KINDS)
-    return [block for block in blocks if block]
 
 
 def inputs_text(declared: Declaration) -> str:

@@ -27,7 +27,7 @@ from rebar_depth_bench.scoring.columns import (
     Column,
     rounded,
 )
-from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND
+from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND, kind_blocks
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.table import PublishedMatch, Table
 
@@ -88,7 +88,7 @@ def latex_table(results: Sequence[Result], *, published: bool, intervals: bool =
     if len(digests) != 1:
         digest_list = ", ".join(sorted(map(formatting.short_digest, digests))) or "no result"
         raise InputError(f"LaTeX table: results of {len(digests)} datasets ({digest_list}), expected one dataset")
-    blocks = formatting.kind_blocks(results)
+    blocks = kind_blocks(results)
     return "\n\n".join(_table_of_kind(block, published=published, intervals=intervals) for block in blocks)
 
 
@@ -129,9 +129,7 @@ def _table_of_kind(results: Sequence[Result], *, published: bool, intervals: boo
             {
                 "titles": [_config_title(config, tables[config]) for config in block],
                 "rows": _result_rows(results, block, columns, intervals),
-                "reference_rows": _merged([_reference_rows(results, config) for config in block], "")
-                if kind is None
-                else [],
+                "reference_rows": _merged([_reference_rows(results, config) for config in block], ""),
                 "published_rows": _merged([_published_rows(matches.get(config)) for config in block], _MISSING),
             }
             for block in blocks
@@ -179,11 +177,7 @@ def _result_rows(
     return [
         [
             escape_latex(result.method) + ("" if result.declared.uses_ground_truth is not None else "$^{?}$"),
-            *(
-                cell
-                for name in configs
-                for cell in _cells(result.tables.get(name), columns, best[name], intervals)
-            ),
+            *(cell for one in configs for cell in _cells(result.tables.get(one), columns, best[one], intervals)),
         ]
         for result in sorted(shown, key=lambda result: _sort_key(result.tables.get(configs[0])))
     ]
@@ -234,8 +228,9 @@ def _cells(table: Table | None, columns: Sequence[Column], best: Mapping[str, st
 
 
 def _reference_rows(results: Sequence[Result], config: str) -> dict[str, list[str]]:
-    """Return the cells of each reference of a config."""
-    shown = [(result.method, result.tables[config]) for result in results if config in result.tables]
+    """Return the cells of each reference of a config of metric results."""
+    metric = [result for result in results if result.prediction is None]
+    shown = [(result.method, result.tables[config]) for result in metric if config in result.tables]
     return {name: ["", *cells, *_NO_OTHERS] for name, cells in formatting.paper_reference_rows(shown)}
 
 

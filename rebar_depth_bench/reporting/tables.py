@@ -33,7 +33,6 @@ from rebar_depth_bench.scoring.columns import (
     OTHERS,
     PAPER_COLUMNS,
     RANK_ERROR,
-    RELATIVE_ALIGNMENTS,
     SCALE,
     SCALED,
     SCALED_CONSTANT,
@@ -45,10 +44,9 @@ from rebar_depth_bench.scoring.columns import (
     range_text,
     rounded,
     texts,
-    value_at,
     with_reference,
 )
-from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND, relative_findings
+from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND, kind_blocks, relative_findings
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.table import PublishedMatch, Table
 
@@ -146,7 +144,7 @@ def print_table(result: Result, console: Console) -> None:
     if result.prediction is not None:
         print_line(console, f"{result.prediction}: {ALIGNMENT_BY_KIND[result.prediction]}", style="italic")
         layouts = group_layouts = _ALIGNED_LAYOUTS
-    _print_rows(_config_rows(result), console, layouts, "config")
+    _print_rows(_config_rows(result.tables), console, layouts, "config")
     for config, table in result.tables.items():
         if table.groups:
             console.print()
@@ -155,31 +153,27 @@ def print_table(result: Result, console: Console) -> None:
     _print_notes(result, console)
 
 
-def _config_rows(result: Result) -> list[Row]:
+def _config_rows(tables: Mapping[str, Table]) -> list[Row]:
     rows: list[Row] = []
-    for name, table in result.tables.items():
-        title = formatting.config_title(name, table.split)
-        if result.prediction is not None:
-            rows += _aligned_rows(title, table)
-            continue
-        rows.append((title, _row_texts(table), ""))
+    for name, table in tables.items():
+        rows += _table_rows(formatting.config_title(name, table.split), table)
         rows += [(f"  {title}", shown, "dim") for title, shown in formatting.reference_rows([("", table)])]
     return rows
 
 
-def _aligned_rows(title: str, table: Table) -> list[Row]:
-    """Return the rows of a table of predictions that are not metric: aligned, robust, and constant of the fit."""
-    indent = title[: len(title) - len(title.lstrip())] + "  "
-    names = dict(zip(RELATIVE_ALIGNMENTS, (title, f"{indent}robust", f"{indent}constant"), strict=True))
+def _table_rows(title: str, table: Table) -> list[Row]:
+    """Return the row of a table; of predictions that are not metric those of both alignments and the constant."""
+    if table.aligned is None:
+        return [(title, _row_texts(table), "")]
     rows: list[Row] = []
-    for alignment, errors in ((one, value_at(table, one)) for one in RELATIVE_ALIGNMENTS):
-        is_first = alignment == RELATIVE_ALIGNMENTS[0]
-        base = (VIEWS_SCORED, COVERAGE) if is_first else ()
-        shown = {column.path: column.text(column.value(table)) for column in base}
+    below = " " * (len(title) - len(title.lstrip()) + 2)
+    shown = {column.path: column.text(column.value(table)) for column in (VIEWS_SCORED, COVERAGE)}
+    named = {title: table.aligned, f"{below}robust": table.aligned_robust, f"{below}constant": table.constant}
+    for name, errors in named.items():
         if errors is not None:
             shown |= {column.path: column.text(column.value(errors)) for column in ALIGNED_METRICS}
-        if shown:
-            rows.append((names[alignment], shown, "" if is_first else "dim"))
+            rows.append((name, shown, "dim" if rows else ""))
+            shown = {}
     return rows
 
 
@@ -189,9 +183,7 @@ def _group_rows(table: Table) -> list[Row]:
     for grouping, groups in table.groups.items():
         rows.append((formatting.grouping_title(grouping), {}, "italic"))
         for group, of_group in groups.items():
-            title = f"  {printable(group)}"
-            is_metric = of_group.aligned is None
-            rows += [(title, _row_texts(of_group), "")] if is_metric else _aligned_rows(title, of_group)
+            rows += _table_rows(f"  {printable(group)}", of_group)
     return rows
 
 
@@ -236,10 +228,8 @@ def _print_notes(result: Result, console: Console) -> None:
     if result.prediction is not None:
         print_line(console, f"Means over views. ↓ lower, ↑ higher is better. {formatting.ALIGNED_NOTE}")
     else:
-        print_line(
-            console,
-            "Means over views; s: median over views. z: truth, p: prediction. ↓ lower, ↑ higher is better.",
-        )
+        means = "Means over views; s: median over views. z: truth, p: prediction. ↓ lower, ↑ higher is better."
+        print_line(console, means)
         print_line(console, f"{formatting.RANK_ERROR_NOTE} {formatting.REFERENCE_NOTE} ‡: not ranked.")
     for name, table in result.tables.items():
         for note in (*formatting.table_notes(table), *formatting.reference_findings(table)):
@@ -342,7 +332,7 @@ def print_paper_table(results: Sequence[Result], console: Console, *, published:
     """
     dataset = results[0].dataset
     digest, version = formatting.short_digest(dataset.digest), printable(dataset.version)
-    for block in formatting.kind_blocks(results):
+    for block in kind_blocks(results):
         kind, protocol = block[0].prediction, block[0].protocol
         line = f"protocol {protocol}, dataset {version} ({digest}), software {software_version()}"
         print_line(console, line, style="dim")
@@ -358,7 +348,7 @@ def print_paper_table(results: Sequence[Result], console: Console, *, published:
             if kind is None:
                 console.print(_paper_table(rows, table.published if published else None))
             else:
-                aligned = [row for result, of in rows for row in _aligned_rows(printable(result.method, 40), of)]
+                aligned = [row for result, of in rows for row in _table_rows(printable(result.method, 40), of)]
                 _print_rows(aligned, console, _ALIGNED_LAYOUTS, "")
                 for result, of in rows:
                     for note in relative_findings(of):

@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from rebar_depth_bench.base.errors import printable
@@ -19,11 +19,10 @@ from rebar_depth_bench.scoring.columns import (
     RELATIVE_TABLE_COLUMNS,
     TABLE_COLUMNS,
     VIEW_COLUMNS,
-    Column,
     rounded,
     rounded_interval,
 )
-from rebar_depth_bench.submission.declaration import PREDICTION_KINDS
+from rebar_depth_bench.scoring.relative import kind_blocks
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -34,7 +33,7 @@ if TYPE_CHECKING:
 _MAX_TEXT_CHARACTERS = 10_000
 _FORMULA_STARTS = ("=", "+", "-", "@")
 _DECLARED_COLUMNS = ("protocol", "method", "inputs", "uses_ground_truth")
-_PROVENANCE_COLUMNS = ("dataset_digest", "dataset_version", "submission_sha256", "software_version")
+_METRIC_COLUMNS = (TABLE_COLUMNS, VIEW_COLUMNS)
 _DIFFERENCE_COLUMNS = (
     *("first_method", "other_method", "config", "number", "views", "first", "other", "difference", "low", "high"),
     *("verdict", "protocol", "dataset_digest", "software_version", "first_sha256", "other_sha256"),
@@ -64,77 +63,58 @@ def frame_of_values(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> Da
 def tables_frame(results: Sequence[Result]) -> DataFrame:
     """Return one row per result and config, with provenance.
 
-    The 95 % interval of a metric is in the columns ``<metric>_low`` and ``<metric>_high``. With results that are
-    not metric there is the column ``prediction``, and the numbers that only other kinds have are NaN; their rows
-    are last, by kind, config and aligned error.
+    The 95 % interval of a metric is in the columns ``<metric>_low`` and ``<metric>_high``. Results that are not
+    metric have the column ``prediction``; numbers that only other kinds have are undefined. The rows are in the
+    order of ``kind_blocks``.
     """
-    tables = [(result, config, table) for result in results for config, table in result.tables.items()]
-    configs = list(dict.fromkeys(config for _, config, _ in tables))
-
-    def order(one: tuple[Result, str, Table]) -> tuple[int, int, float]:
-        result, config, table = one
-        if result.prediction is None:
-            return 0, 0, 0.0
-        return PREDICTION_KINDS.index(result.prediction), configs.index(config), table.error or 0.0
-
-    rows = [_table_row(result, table, {"config": config}) for result, config, table in sorted(tables, key=order)]
-    return _frame_of_tables(results, ("config",), rows)
+    return _frame(
+        results, ("config",), lambda result: [((config,), table) for config, table in result.tables.items()]
+    )
 
 
 def groups_frame(results: Sequence[Result]) -> DataFrame:
     """Return one row per result, config, grouping and group as ``tables_frame``; others have none."""
-    rows = [
-        _table_row(
-            result, of_group, {"config": config, "split": table.split, "grouping": grouping, "group": group}
-        )
-        for result in results
-        for config, table in result.tables.items()
-        for grouping, tables in table.groups.items()
-        for group, of_group in tables.items()
-    ]
-    return _frame_of_tables(results, ("config", "split", "grouping", "group"), rows)
-
-
-def _columns(result: Result) -> tuple[Sequence[Column], Sequence[Column]]:
-    """Return the columns of the tables of a result, and those that have intervals."""
-    is_metric = result.prediction is None
-    return (TABLE_COLUMNS, VIEW_COLUMNS) if is_metric else (RELATIVE_TABLE_COLUMNS, RELATIVE_INTERVALS)
-
-
-def _frame_of_tables(
-    results: Sequence[Result], names: Sequence[str], rows: Sequence[Mapping[str, Any]]
-) -> DataFrame:
-    """Return rows of numbers by column, or column and end, as a frame with all columns of the results' kinds."""
-    kinds = [_columns(result) for result in results] or [(TABLE_COLUMNS, VIEW_COLUMNS)]
-    prediction = [] if all(result.prediction is None for result in results) else ["prediction"]
-    columns = (
-        *(*_DECLARED_COLUMNS, *prediction, *names),
-        *dict.fromkeys(column.name for numbers, _ in kinds for column in numbers),
-        *dict.fromkeys(f"{column.name}_{end}" for _, of in kinds for column in of for end in ("low", "high")),
-        *_PROVENANCE_COLUMNS,
+    return _frame(
+        results,
+        ("config", "split", "grouping", "group"),
+        lambda result: [
+            ((config, table.split, grouping, group), of_group)
+            for config, table in result.tables.items()
+            for grouping, tables in table.groups.items()
+            for group, of_group in tables.items()
+        ],
     )
-    return frame_of_values(columns, [[row.get(name) for name in columns] for row in rows])
 
 
-def _table_row(result: Result, table: Table, names: Mapping[str, Any]) -> dict[str, Any]:
-    submission, (columns, with_interval) = result.submission, _columns(result)
-    row = {
-        "protocol": result.protocol,
-        "method": submission.method,
-        "inputs": submission.inputs,
-        "uses_ground_truth": submission.uses_ground_truth,
-        "prediction": result.kind,
-        **names,
-        **{column.name: column.value(table) for column in columns},
-        "dataset_digest": result.dataset.digest,
-        "dataset_version": result.dataset.version,
-        "submission_sha256": submission.sha256,
-        "software_version": result.software.version,
-    }
-    for column in with_interval:
-        ends = rounded_interval(table.intervals.get(column.path)) or (None, None)
-        row[f"{column.name}_low"], row[f"{column.name}_high"] = ends
-    return row
+def _frame(
+    results: Sequence[Result],
+    names: Sequence[str],
+    tables_of: Callable[[Result], Iterable[tuple[Sequence[Any], Table]]],
+) -> DataFrame:
+    """Return one row per table of the results; ``tables_of`` returns these and their ``names``."""
+    import pandas as pd
+
+    frames = []
+    for block in kind_blocks(results) or [[]]:
+        kind = [result.prediction for result in block[:1] if result.prediction is not None]
+        columns, with_interval = (RELATIVE_TABLE_COLUMNS, RELATIVE_INTERVALS) if kind else _METRIC_COLUMNS
+        head = (
+            *(*_DECLARED_COLUMNS, *(["prediction"] if kind else []), *names),
+            *(column.name for column in columns),
+            *(f"{column.name}_{end}" for column in with_interval for end in ("low", "high")),
+            *("dataset_digest", "dataset_version", "submission_sha256", "software_version"),
+        )
+        rows = []
+        for result in block:
+            submission, dataset = result.submission, result.dataset
+            declared = (result.protocol, submission.method, submission.inputs, submission.uses_ground_truth)
+            provenance = (dataset.digest, dataset.version, submission.sha256, result.software.version)
+            for named, table in tables_of(result):
+                ends = (rounded_interval(table.intervals.get(one.path)) or (None, None) for one in with_interval)
+                numbers = (*(column.value(table) for column in columns), *(end for both in ends for end in both))
+                rows.append((*declared, *kind, *named, *numbers, *provenance))
+        frames.append(frame_of_values(head, rows))
+    return frames[0] if len(frames) == 1 else pd.concat(frames, ignore_index=True)
 
 
 def views_frame(result: Result) -> DataFrame:

@@ -26,23 +26,20 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64
 from numpy import ndarray
 
 from rebar_depth_bench.scoring.columns import METRICS
-from rebar_depth_bench.scoring.metrics import (
-    is_valid_prediction,
-    mean,
-    median,
-    median_scale,
-    metrics_at_scales,
-    rank_error,
-)
+from rebar_depth_bench.scoring.metrics import is_valid_prediction, mean, median, metrics_at_scales, rank_error
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
 from rebar_depth_bench.scoring.table import AlignedErrors, Table
+from rebar_depth_bench.submission.declaration import METRIC
+
+if TYPE_CHECKING:
+    from rebar_depth_bench.scoring.result import Result
 
 ALIGNMENT_BY_KIND: Mapping[str, str] = {
     "scale": "depth up to a scale, p = x median(z) / median(x) in each view",
@@ -96,8 +93,8 @@ def align_view(x: Float[ndarray, " n"], z_m: Float[ndarray, " n"], kind: str) ->
 
     coverage = len(values) / len(z_m)
     if kind == "scale":
-        with np.errstate(over="ignore", invalid="ignore"):
-            scaled = values * median_scale(values, median(z))
+        with np.errstate(over="ignore"):
+            scaled = values * (median(z) / median(values))
         return AlignedView(coverage, errors(scaled), None, errors(np.full(len(z), median(z))), is_flat=False)
     target = 1.0 / z if kind == "affine-disparity" else z
     # A power of two changes no digit of the fit; squares of values near the limits of float64 would overflow.
@@ -154,6 +151,16 @@ def mean_errors(errors: Sequence[AlignedErrors]) -> AlignedErrors:
     means = {name: mean_of(getattr(one, name) for one in errors) for name in ("error", *METRICS)}
     within = {tolerance_mm: mean_of(one.within_mm[tolerance_mm] for one in errors) for tolerance_mm in WITHIN_MM}
     return AlignedErrors(**means, within_mm=within)
+
+
+def kind_blocks(results: Iterable[Result]) -> list[list[Result]]:
+    """Return the results of each kind; others than metric ones by the aligned error of their first config."""
+    blocks: dict[str, list[Result]] = {kind: [] for kind in (METRIC, *ALIGNMENT_BY_KIND)}
+    for result in results:
+        blocks[result.kind].append(result)
+    for kind in ALIGNMENT_BY_KIND:
+        blocks[kind].sort(key=lambda result: next(iter(result.tables.values())).error or 0.0)
+    return [block for block in blocks.values() if block]
 
 
 def relative_findings(table: Table) -> list[str]:

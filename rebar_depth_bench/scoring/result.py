@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from html import escape
@@ -76,22 +76,14 @@ _RELATIVE_NOTEBOOK_COLUMNS = (
     *("config", "views", "views_scored", "coverage", "flat_views", "aligned_error", "constant_error"),
     *("aligned_abs_rel", "aligned_robust_abs_rel", "constant_abs_rel", "aligned_within_5mm"),
 )
-_SUMMARY: Mapping[Column, str] = {
-    COVERAGE: "coverage",
-    RANK_ERROR: "rank error",
-    NATIVE[0]: "AbsRel",
-    SCALED[0]: "scaled",
-    SCALED_CONSTANT[0]: "constant",
-    WITHIN[1]: "within 5 mm",
-}
-_RELATIVE_SUMMARY: Mapping[Column, str] = {
-    COVERAGE: "coverage",
-    ALIGNED[0]: "aligned error",
-    ALIGNED[1]: "AbsRel",
-    ALIGNED_ROBUST[1]: "robust AbsRel",
-    ALIGNED_CONSTANT[1]: "constant",
-    ALIGNED[6]: "within 5 mm",
-}
+_SUMMARY = (
+    (COVERAGE, RANK_ERROR, NATIVE[0], SCALED[0], SCALED_CONSTANT[0], WITHIN[1]),
+    ("coverage", "rank error", "AbsRel", "scaled", "constant", "within 5 mm"),
+)
+_RELATIVE_SUMMARY = (
+    (COVERAGE, *ALIGNED[:2], ALIGNED_ROBUST[1], ALIGNED_CONSTANT[1], ALIGNED[6]),
+    ("coverage", "aligned error", "AbsRel", "robust AbsRel", "constant", "within 5 mm"),
+)
 """Columns that ``print(result)`` shows, and their headings."""
 
 
@@ -220,11 +212,11 @@ class Result:
 
     def __str__(self) -> str:
         """Return the main numbers of each config as a table, with what limits them."""
-        shown = _SUMMARY if self.prediction is None else _RELATIVE_SUMMARY
-        rows = [[printable(self.method), *shown.values()]]
+        columns, heads = _SUMMARY if self.prediction is None else _RELATIVE_SUMMARY
+        rows = [[printable(self.method), *heads]]
         notes = dict[str, list[str]]()
         for name, table in self.tables.items():
-            cells = (f"{column.text(column.value(table))} {column.unit}".strip() for column in shown)
+            cells = (f"{column.text(column.value(table))} {column.unit}".strip() for column in columns)
             rows.append([printable(name), *cells])
             for note in self._short_notes(name):
                 notes.setdefault(note, []).append(printable(name))

@@ -34,13 +34,7 @@ from rebar_depth_bench.reporting.html.views import (
     worst_first,
 )
 from rebar_depth_bench.reporting.published import OTHER_OPTICS_NOTE, load_published, paper_scenes
-from rebar_depth_bench.scoring.columns import (
-    ALIGNED,
-    ALIGNED_CONSTANT,
-    ALIGNED_ROBUST,
-    VIEW_COLUMNS,
-    has_dash,
-)
+from rebar_depth_bench.scoring.columns import ALIGNED, ALIGNED_CONSTANT, ALIGNED_ROBUST, VIEW_COLUMNS, has_dash
 from rebar_depth_bench.scoring.evaluation import Evaluation, View
 from rebar_depth_bench.scoring.groups import GROUPINGS
 from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND
@@ -294,9 +288,8 @@ def write_report(
     spaced down to the best; none of predictions that are not metric. Raises ``InputError`` if ``views_shown`` is
     negative.
     """
-    chosen = {name: views_to_show(views, views_shown) for name, views in views_by_config(result).items()}
-    if result.prediction is not None:
-        chosen = {}
+    views = {} if result.prediction else views_by_config(result)
+    chosen = {name: views_to_show(of_config, views_shown) for name, of_config in views.items()}
     found = look_at_views(evaluation, chosen, crossings=result.extended is not None)
     write_output(target, render_report(result, found.shown, found.mistakes, found.pictures))
     return found.mistakes
