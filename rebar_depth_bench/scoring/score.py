@@ -197,7 +197,7 @@ def tabulate(
     overflows) is written as null; the rank error is always finite.
     """
     if views and views[0].aligned is not None:
-        return _tabulate_relative(views, reference, published, split, truth_sigma_m)
+        return _tabulate_relative(views, tabulate([], declared, reference, published, split, truth_sigma_m))
     predicted = [view for view in views if view.native is not None]
     native = mean_metrics([view.native for view in predicted if view.native])
     scaled = mean_metrics([view.scaled for view in predicted if view.scaled])
@@ -224,36 +224,21 @@ def tabulate(
     )
 
 
-def _tabulate_relative(
-    views: Sequence[ViewScore],
-    reference: Reference,
-    published: PublishedMatch | None,
-    split: str | None,
-    truth_sigma_m: float | None,
-) -> Table:
-    """Return the table of views, one or more, of predictions that are not metric."""
+def _tabulate_relative(views: Sequence[ViewScore], empty: Table) -> Table:
+    """Return the table of one or more views of predictions that are not metric; ``empty`` is that of no views."""
 
     def mean_of(alignment: str) -> AlignedErrors | None:
         found = [errors for view in views if (errors := getattr(view, alignment)) is not None]
         return mean_errors(found) if found else None
 
-    return Table(
+    return replace(
+        empty,
         views=len(views),
         views_scored=sum(view.coverage > 0 for view in views),
         coverage=mean([view.coverage for view in views]),
-        ranked=False,
-        rank_error=None,
-        native=None,
-        scaled=None,
-        scale_median=None,
-        within_mm=dict.fromkeys(WITHIN_MM),
         aligned=mean_of("aligned"),
         aligned_robust=mean_of("aligned_robust"),
         constant=mean_of("constant"),
         flat_views=sum(view.is_flat is True for view in views),
-        reference=reference,
-        published=published,
-        split=split,
-        truth_sigma_m=truth_sigma_m,
-        intervals=view_intervals(views, RELATIVE_INTERVALS, by_scene=split is not None),
+        intervals=view_intervals(views, RELATIVE_INTERVALS, by_scene=empty.split is not None),
     )
