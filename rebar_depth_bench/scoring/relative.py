@@ -34,7 +34,7 @@ from numpy import ndarray
 
 from rebar_depth_bench.scoring.columns import METRICS
 from rebar_depth_bench.scoring.metrics import is_valid_prediction, mean, median, metrics_at_scales, rank_error
-from rebar_depth_bench.scoring.protocol import WITHIN_MM
+from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, WITHIN_MM
 from rebar_depth_bench.scoring.table import AlignedErrors, Table
 from rebar_depth_bench.submission.declaration import METRIC
 
@@ -169,9 +169,11 @@ def relative_findings(table: Table) -> list[str]:
         return []
     findings = []
     if table.aligned.error > LEAST_GAIN * table.constant.error:
+        is_low = (table.coverage or 0.0) < MIN_COMPARABLE_COVERAGE
+        missing = ", or missing values are most of both errors" if is_low else ""
         findings.append(
             f"The aligned error {table.aligned.error:.4f} is above {LEAST_GAIN * 100:.0f} % of that of a constant "
-            f"({table.constant.error:.4f}): the fit hides that the predictions say little about depth."
+            f"({table.constant.error:.4f}): the fit hides that the predictions say little about depth{missing}."
         )
     if (table.flat_views or 0) > table.views / 2:
         findings.append(
