@@ -114,7 +114,10 @@ def _frame(
                 numbers = (*(column.value(table) for column in columns), *(end for both in ends for end in both))
                 rows.append((*declared, *kind, *named, *numbers, *provenance))
         frames.append(frame_of_values(head, rows))
-    return frames[0] if len(frames) == 1 else pd.concat(frames, ignore_index=True)
+    if len(frames) == 1:
+        return frames[0]
+    joined = pd.concat(frames, ignore_index=True)
+    return joined.astype({"flat_views": "Int64"})
 
 
 def views_frame(result: Result) -> DataFrame:

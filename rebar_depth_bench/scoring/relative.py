@@ -24,7 +24,7 @@ take p as it is, over V, and a p <= 0 is not counted in delta1.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -32,7 +32,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64
 from numpy import ndarray
 
-from rebar_depth_bench.scoring.columns import METRICS
+from rebar_depth_bench.scoring.columns import METRICS, value_at
 from rebar_depth_bench.scoring.metrics import is_valid_prediction, mean, median, metrics_at_scales, rank_error
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, WITHIN_MM
 from rebar_depth_bench.scoring.table import AlignedErrors, Table
@@ -142,15 +142,15 @@ def _vary(x: Float64[ndarray, " n"], y: Float64[ndarray, " n"]) -> bool:
     return bool(x.min() < x.max() and y.min() < y.max())
 
 
-def mean_errors(errors: Sequence[AlignedErrors]) -> AlignedErrors:
-    """Return the mean of each number over the views that have it; ``errors`` are those of one or more views."""
+def mean_errors(errors: Iterable[AlignedErrors | None]) -> AlignedErrors | None:
+    """Return the mean of each number over the views that have it; None if no view has any."""
+    found = [one for one in errors if one is not None]
 
-    def mean_of(values: Iterable[float | None]) -> Any:
-        return mean([value for value in values if value is not None])
+    def mean_at(path: str) -> Any:
+        return mean([value for one in found if (value := value_at(one, path)) is not None])
 
-    means = {name: mean_of(getattr(one, name) for one in errors) for name in ("error", *METRICS)}
-    within = {tolerance_mm: mean_of(one.within_mm[tolerance_mm] for one in errors) for tolerance_mm in WITHIN_MM}
-    return AlignedErrors(**means, within_mm=within)
+    means = {name: mean_at(name) for name in ("error", *METRICS)}
+    return AlignedErrors(**means, within_mm={t: mean_at(f"within_mm.{t}") for t in WITHIN_MM}) if found else None
 
 
 def kind_blocks(results: Iterable[Result]) -> list[list[Result]]:

@@ -37,7 +37,7 @@ from rebar_depth_bench.scoring.reference import (
     mean_reference,
 )
 from rebar_depth_bench.scoring.relative import align_view, mean_errors
-from rebar_depth_bench.scoring.table import AlignedErrors, PublishedMatch, Table, ViewScore
+from rebar_depth_bench.scoring.table import PublishedMatch, Table, ViewScore
 from rebar_depth_bench.submission.declaration import METRIC, NOT_DECLARED, Declaration
 
 ReadDepth = Callable[[str], Float[ndarray, "h w"]]
@@ -226,19 +226,14 @@ def tabulate(
 
 def _tabulate_relative(views: Sequence[ViewScore], empty: Table) -> Table:
     """Return the table of one or more views of predictions that are not metric; ``empty`` is that of no views."""
-
-    def mean_of(alignment: str) -> AlignedErrors | None:
-        found = [errors for view in views if (errors := getattr(view, alignment)) is not None]
-        return mean_errors(found) if found else None
-
     return replace(
         empty,
         views=len(views),
         views_scored=sum(view.coverage > 0 for view in views),
         coverage=mean([view.coverage for view in views]),
-        aligned=mean_of("aligned"),
-        aligned_robust=mean_of("aligned_robust"),
-        constant=mean_of("constant"),
+        aligned=mean_errors([view.aligned for view in views]),
+        aligned_robust=mean_errors([view.aligned_robust for view in views]),
+        constant=mean_errors([view.constant for view in views]),
         flat_views=sum(view.is_flat is True for view in views),
         intervals=view_intervals(views, RELATIVE_INTERVALS, by_scene=empty.split is not None),
     )

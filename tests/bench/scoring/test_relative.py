@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pandas as pd
 import pytest
 from PIL import Image
 from scipy.optimize import minimize
@@ -455,7 +454,10 @@ def test_table_has_a_block_for_each_kind(tiny_root: Path, tmp_path: Path, write:
     order = [out.index(f"\n{name} ") for name in ("sound", "better", "worse", "net")]
     assert order == sorted(order)
     assert "worse: The aligned error" in out
-    assert list(pd.read_csv(frame)["method"]) == ["sound", "better", "worse", "net"]
+    rows = list(csv.DictReader(io.StringIO(frame.read_text())))
+    assert [row["method"] for row in rows] == ["sound", "better", "worse", "net"]
+    assert [row["prediction"] for row in rows] == ["", "affine-depth", "affine-depth", "affine-disparity"]
+    assert [row["flat_views"] for row in rows] == ["", "0", "9", "0"]
     text = latex.read_text()
     assert text.count(r"\begin{table*}") == 3
     blocks = text.split(r"\begin{table*}")
