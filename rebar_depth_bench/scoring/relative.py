@@ -25,7 +25,7 @@ take p as it is, over V, and a p <= 0 is not counted in delta1.
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -35,7 +35,7 @@ from numpy import ndarray
 from rebar_depth_bench.scoring.columns import METRICS, value_at
 from rebar_depth_bench.scoring.metrics import is_valid_prediction, mean, median, metrics_at_scales, rank_error
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, WITHIN_MM
-from rebar_depth_bench.scoring.table import AlignedErrors, Table
+from rebar_depth_bench.scoring.table import AlignedErrors, Table, ViewScore
 from rebar_depth_bench.submission.declaration import METRIC
 
 if TYPE_CHECKING:
@@ -52,20 +52,6 @@ LEAST_GAIN = 0.95
 """Share of the constant's error above which an aligned error says little."""
 
 
-@dataclass(frozen=True)
-class AlignedView:
-    """Errors of one view after alignment, after the robust one (None for ``scale``), and of the constant.
-
-    ``coverage`` is the share of the scored pixels in V; ``is_flat`` is True if the fit has no positive slope.
-    """
-
-    coverage: float
-    aligned: AlignedErrors
-    aligned_robust: AlignedErrors | None
-    constant: AlignedErrors
-    is_flat: bool
-
-
 _NO_VALUES = AlignedErrors(1.0, None, None, None, None, dict.fromkeys(WITHIN_MM, 0.0))
 """Errors of a view in which no scored pixel has a value."""
 
@@ -75,13 +61,17 @@ def has_value(x: Float[ndarray, " n"], kind: str) -> Bool[ndarray, " n"]:
     return np.isfinite(x) if kind.startswith("affine") else is_valid_prediction(x)
 
 
-def align_view(x: Float[ndarray, " n"], z_m: Float[ndarray, " n"], kind: str) -> AlignedView:
-    """Return the errors of a view's prediction ``x`` and true depth ``z_m``, metres, on all its scored pixels."""
+def align_view(view_id: str, x: Float[ndarray, " n"], z_m: Float[ndarray, " n"], kind: str) -> ViewScore:
+    """Return the errors of a view's prediction ``x`` and true depth ``z_m``, metres, on all its scored pixels.
+
+    Its ``coverage`` is the share of these in V; ``is_flat`` is whether the fit has no positive slope.
+    """
     valid = has_value(x, kind)
     values, z = x[valid].astype(np.float64), z_m[valid].astype(np.float64)
+    score = partial(ViewScore, view_id, len(z_m), len(values) / len(z_m))
     if not len(values):
         robust = None if kind == "scale" else _NO_VALUES
-        return AlignedView(0.0, _NO_VALUES, robust, _NO_VALUES, is_flat=kind != "scale")
+        return score(aligned=_NO_VALUES, aligned_robust=robust, constant=_NO_VALUES, is_flat=kind != "scale")
 
     def errors(p_m: Float64[ndarray, " v"]) -> AlignedErrors:
         everywhere = np.zeros(len(z_m))
@@ -91,17 +81,17 @@ def align_view(x: Float[ndarray, " n"], z_m: Float[ndarray, " n"], kind: str) ->
         shares = {tolerance_mm: count / len(z_m) for tolerance_mm, count in within.items()}
         return AlignedErrors(error=error, **vars(metrics), within_mm=shares)
 
-    coverage = len(values) / len(z_m)
     if kind == "scale":
         with np.errstate(over="ignore"):
             scaled = values * (median(z) / median(values))
-        return AlignedView(coverage, errors(scaled), None, errors(np.full(len(z), median(z))), is_flat=False)
+        constant = errors(np.full(len(z), median(z)))
+        return score(aligned=errors(scaled), constant=constant, is_flat=False)
     target = 1.0 / z if kind == "affine-disparity" else z
     # A power of two changes no digit of the fit; squares of values near the limits of float64 would overflow.
     values = np.ldexp(values, -int(np.frexp(np.abs(values).max())[1]))
     fits = (_least_squares(values, target), _robust_fit(values, target), (0.0, float(target.mean())))
     aligned, robust, constant = (errors(_fitted_depth(fit, values, z, kind)) for fit in fits)
-    return AlignedView(coverage, aligned, robust, constant, is_flat=fits[0][0] == 0.0)
+    return score(aligned=aligned, aligned_robust=robust, constant=constant, is_flat=fits[0][0] == 0.0)
 
 
 def metric_as(depth_m: Float[ndarray, "h w"], kind: str) -> Float64[ndarray, "h w"]:

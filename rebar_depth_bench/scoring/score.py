@@ -119,7 +119,10 @@ def _score_at(
 ) -> ViewScore:
     view = truth.read(position)
     prediction_m = read_depth(view.view_id)
-    score = score_view(view, prediction_m) if kind == METRIC else score_relative_view(view, prediction_m, kind)
+    if kind == METRIC:
+        score = score_view(view, prediction_m)
+    else:
+        score = align_view(view.view_id, _at_pixels(prediction_m, view), view.depth_m, kind)
     if use_view is not None:
         use_view(prediction_m, score)
     return score
@@ -127,7 +130,7 @@ def _score_at(
 
 def score_view(truth: ViewTruth, prediction_m: Float[ndarray, "h w"]) -> ViewScore:
     """Return the metrics of one view's prediction (planar depth, metres) on the view's scored pixels."""
-    p_m, z_m, z_median_m = prediction_m.ravel().take(truth.index.astype(np.intp)), truth.depth_m, truth.median_m
+    p_m, z_m, z_median_m = _at_pixels(prediction_m, truth), truth.depth_m, truth.median_m
     valid = is_valid_prediction(p_m)
     error = rank_error(p_m, z_m, valid)
     constant = truth.constant
@@ -155,10 +158,8 @@ def score_view(truth: ViewTruth, prediction_m: Float[ndarray, "h w"]) -> ViewSco
     )
 
 
-def score_relative_view(truth: ViewTruth, prediction: Float[ndarray, "h w"], kind: str) -> ViewScore:
-    """Return the errors of one view's prediction of another kind after alignment, on the view's scored pixels."""
-    found = align_view(prediction.ravel().take(truth.index.astype(np.intp)), truth.depth_m, kind)
-    return ViewScore(truth.view_id, len(truth.index), **vars(found))
+def _at_pixels(prediction: Float[ndarray, "h w"], truth: ViewTruth) -> Float[ndarray, " n"]:
+    return prediction.ravel().take(truth.index.astype(np.intp))
 
 
 def tabulate_config(scores: Sequence[ViewScore], truth: Truth, declared: Declaration) -> Table:

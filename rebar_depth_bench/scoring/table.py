@@ -135,7 +135,7 @@ class ViewScore:
     """Metrics of one view; ``scale``, ``native`` and ``scaled`` are None without valid predictions.
 
     ``scaled_constant`` is that of ``Reference``, None in results that were read from a file. The view of a
-    prediction that is not metric has none of these but those of ``AlignedView``.
+    prediction that is not metric has none of these but those of ``relative.align_view``.
     """
 
     view_id: Name
