@@ -149,7 +149,7 @@ def kind_blocks(results: Iterable[Result]) -> list[list[Result]]:
     for result in results:
         blocks[result.kind].append(result)
     for kind in ALIGNMENT_BY_KIND:
-        blocks[kind].sort(key=lambda result: next(iter(result.tables.values())).error or 0.0)
+        blocks[kind].sort(key=lambda result: [table.error or 0.0 for table in result.tables.values()])
     return [block for block in blocks.values() if block]
 
 
