@@ -33,7 +33,14 @@ from rebar_depth_bench.reporting.extended_tables import FITS_NOTE, REACH_NOTE
 from rebar_depth_bench.scoring.bootstrap import BLOCK_VIEWS, INTERVALS, MIN_BLOCKS, RESAMPLES
 from rebar_depth_bench.scoring.columns import SIGNIFICANT_DIGITS
 from rebar_depth_bench.scoring.groups import GROUPINGS
-from rebar_depth_bench.scoring.protocol import DELTA1_RATIO, MIN_COMPARABLE_COVERAGE, PROTOCOL, WITHIN_MM
+from rebar_depth_bench.scoring.protocol import (
+    DELTA1_RATIO,
+    MIN_COMPARABLE_COVERAGE,
+    PROTOCOL,
+    RELATIVE_PROTOCOL,
+    WITHIN_MM,
+)
+from rebar_depth_bench.scoring.relative import LEAST_GAIN
 from rebar_depth_bench.submission import INPUTS
 
 _CONTACTS = {"lattice": "375", "pier": "4,860", "pile": "15"}
@@ -78,6 +85,8 @@ def benchmark_card() -> str:
     return render(
         "benchmark_card.md.j2",
         protocol=PROTOCOL,
+        relative_protocol=RELATIVE_PROTOCOL,
+        least_gain=LEAST_GAIN,
         delta1_ratio=DELTA1_RATIO,
         min_comparable_coverage=MIN_COMPARABLE_COVERAGE,
         significant_digits=SIGNIFICANT_DIGITS,

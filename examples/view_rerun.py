@@ -85,6 +85,7 @@ def log_prediction(
 ) -> list[str]:
     """Log the prediction of an archive, native and scaled, and return the path of its entities."""
     with open_evaluation(archive, root) as evaluation:
+        evaluation.require_metric("points need depth in metres")
         try:
             predicted_m = evaluation.submission.read(view_id)
         except EntryError as error:

@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from rebar_depth_bench.data.bars import bars
     from rebar_depth_bench.data.loading import load
     from rebar_depth_bench.data.torch import torch_loader
+    from rebar_depth_bench.evaluator import Evaluator, evaluate
     from rebar_depth_bench.scoring.evaluation import score
     from rebar_depth_bench.scoring.result import Result
     from rebar_depth_bench.scoring.table import Table, ViewScore
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 __all__ = [
     "CalibrationError",
     "DatasetError",
+    "Evaluator",
     "InputError",
     "MethodError",
     "Problem",
@@ -38,6 +40,7 @@ __all__ = [
     "ViewScore",
     "bars",
     "crossings",
+    "evaluate",
     "load",
     "score",
     "torch_loader",
@@ -46,9 +49,11 @@ __all__ = [
 _MODULE_BY_NAME = {
     "bars": "data.bars",
     "crossings": "bar_crossings.table",
+    "evaluate": "evaluator",
     "load": "data.loading",
     "score": "scoring.evaluation",
     "torch_loader": "data.torch",
+    "Evaluator": "evaluator",
     "SubmissionWriter": "submission",
     "Result": "scoring.result",
     "Table": "scoring.table",

@@ -11,8 +11,9 @@ from typing import Annotated
 from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.base.limits import JSON_BYTES
 from rebar_depth_bench.base.reading import check_no_links, parse_json, read_file, remove_file
+from rebar_depth_bench.base.system import exclusive_lock
 from rebar_depth_bench.base.validation import StrictModel, one_of, validate_table
-from rebar_depth_bench.base.writing import exclusive_lock, temporary_target, write_error, write_text
+from rebar_depth_bench.base.writing import temporary_target, write_error, write_text
 from rebar_depth_bench.data.manifest import DatasetFolder
 
 MARKER = "export.json"

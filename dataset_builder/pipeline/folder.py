@@ -19,7 +19,8 @@ from rebar_depth_bench.bar_crossings.table import CROSSINGS_FILE
 from rebar_depth_bench.base.errors import InputError, OutputError
 from rebar_depth_bench.base.names import SPLITS, TEST_SPLIT
 from rebar_depth_bench.base.reading import check_no_links, remove_file, remove_folder
-from rebar_depth_bench.base.writing import exclusive_lock, temporary_target, write_error, write_text
+from rebar_depth_bench.base.system import exclusive_lock
+from rebar_depth_bench.base.writing import temporary_target, write_error, write_text
 from rebar_depth_bench.data.bars import BARS_FILE
 from rebar_depth_bench.data.files import MANIFEST_FILE, file_sha256
 from rebar_depth_bench.data.manifest import (

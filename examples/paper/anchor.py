@@ -133,8 +133,7 @@ def anchored(evaluation: Evaluation, options: argparse.Namespace, bars: Progress
     def ratio_and_coverage(truth: ViewTruth) -> tuple[float | None, float]:
         p_m, z_m = pairs(truth)
         with np.errstate(over="ignore", under="ignore"):
-            ratio = float(np.median(z_m / p_m)) if len(p_m) else None
-        return ratio, len(p_m) / len(truth.index)
+            return float(np.median(z_m / p_m)) if len(p_m) else None, len(p_m) / len(truth.index)
 
     found = map_with_progress(ratio_and_coverage, truths, None, bars.update, "ratios", len(truths))
     predicted = [position for position, (ratio, _) in enumerate(found) if ratio is not None]
@@ -183,6 +182,7 @@ def draw_figure(figure: Figure, table: pd.DataFrame) -> None:
 def run(options: argparse.Namespace) -> None:
     """Compute the table, write the requested files and print it."""
     with ProgressBars() as bars, open_evaluation(options.archive, options.data) as evaluation:
+        evaluation.require_metric("the scale is that of depth in metres")
         evaluation.check_entries(bars.update)
         content = anchored(evaluation, options, bars)
     table = pd.json_normalize([{**row, "draws": len(row["draws"])} for row in content["rows"]], sep="_")

@@ -29,6 +29,9 @@ _MAX_SHAPE, _MAX_ENTRIES = (1024, 4096), 100_000
 """Bounds of views that an archive may hold but that are not read, and of the number of its entries."""
 
 
+_METRES = "the paper's errors are those of depth in metres"
+
+
 @dataclass(frozen=True, eq=False)
 class DepthMaps:
     """Depth maps of one method by view id; ``read`` returns planar depth in metres, shape (H, W)."""
@@ -60,6 +63,7 @@ def open_maps(
     present = _entry_stems(Path(path)).intersection(() if optional is None else optional)
     with SubmissionReader(path, {**expected, **dict.fromkeys(present, _MAX_SHAPE)}) as reader:
         problems = [problem for problem in reader.problems() if problem.where.rpartition(".")[0] not in present]
+        problems += [] if reader.meta is None else reader.meta.kind_problems(_METRES)
         if reader.meta is None or problems:
             raise SubmissionError.from_problems(path, problems)
         yield DepthMaps(Path(path), reader.meta.method, reader.view_ids, reader.read, reader.sha256())
@@ -77,6 +81,7 @@ def _folder_maps(folder: Path, expected: ExpectedViews, png_scale: float | None,
     method, scale = printable(folder.resolve().name), png_scale
     if (folder / METADATA_NAME).exists():
         meta, problems = parse_metadata((folder / METADATA_NAME).read_bytes())
+        problems += [] if meta is None else meta.kind_problems(_METRES)
         if meta is None or problems:
             raise SubmissionError.from_problems(folder, problems)
         method, scale = meta.method, meta.depth_scale or png_scale

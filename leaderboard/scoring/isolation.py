@@ -15,7 +15,7 @@ from multiprocessing.connection import Connection
 from typing import Any, TypeVar
 
 from rebar_depth_bench.base.errors import Problem, ProblemCode, RebarDepthError, SubmissionError
-from rebar_depth_bench.base.limits import limit_process
+from rebar_depth_bench.base.system import limit_process
 
 POLL_INTERVAL_S = 1.0
 NICENESS = 10

@@ -23,6 +23,9 @@ if TYPE_CHECKING:
     from rebar_depth_bench.reporting.html.views import ShownView
 
 
+_RANKS_METRIC = "the leaderboard ranks depth in metres"
+
+
 @dataclass(frozen=True)
 class ViewPicture:
     """Pictures of a view: WebP images by kind, and a JSON object with their size and the texts of colour bars."""
@@ -46,10 +49,13 @@ class Outcome:
 def check(archive: Path, data: str) -> SubmissionMeta:
     """Return the content of ``submission.json`` of an archive. Raises ``SubmissionError`` with all problems."""
     with SubmissionReader(archive, open_folder(data).expected_views()) as submission:
-        if problems := list(_split_problems(submission.view_ids)) or list(submission.problems()):
+        meta = submission.meta
+        conflicts = [] if meta is None else meta.kind_problems(_RANKS_METRIC)
+        conflicts += _split_problems(submission.view_ids)
+        if problems := conflicts or list(submission.problems()):
             raise SubmissionError.from_problems("the archive", problems)
-        assert submission.meta is not None
-        return submission.meta
+        assert meta is not None
+        return meta
 
 
 def _split_problems(view_ids: Iterable[str]) -> Iterator[Problem]:
@@ -73,6 +79,7 @@ def score(archive: Path, data: str, dataset_digest: str, error_maps: int, hidden
     if digest != dataset_digest:  # Checked first: on another dataset, the archive could seem invalid.
         raise DatasetError(f"{data}: the digest is {digest}, expected {dataset_digest}")
     with open_evaluation(archive, data) as evaluation:
+        evaluation.require_metric(_RANKS_METRIC)
         result = score_evaluation(evaluation)
         if hidden_truth:
             check_view_coverage(result.views)

@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import IO
 
 from rebar_depth_bench.base.errors import InputError
-from rebar_depth_bench.base.writing import atomic_replace, exclusive_lock, fsync_path, write_error
+from rebar_depth_bench.base.system import exclusive_lock, fsync_path
+from rebar_depth_bench.base.writing import atomic_replace, write_error
 from rebar_depth_bench.data.files import file_sha256
 
 FILE_MODE = 0o600

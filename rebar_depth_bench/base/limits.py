@@ -1,18 +1,13 @@
 """Limits on the size, time and memory of files and answers from outside.
 
 Each limit has a default, which an environment variable ``REBAR_MAX_<NAME>`` replaces. ``SECURITY.md`` lists them.
-``limit_process`` limits a process that reads what may crash, hang or need any amount of memory, and ``call_until``
-the time of a call.
+``call_until`` limits the time of a call; ``system.limit_process`` limits a process.
 """
 
 from __future__ import annotations
 
-import ctypes
 import os
 import re
-import resource
-import signal
-import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import Future, wait
@@ -23,7 +18,6 @@ from typing import TypeVar
 from rebar_depth_bench.base.errors import InputError, escape_text
 
 _MIB, _GIB = 1 << 20, 1 << 30
-_PR_SET_PDEATHSIG = 1
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,36 +63,6 @@ ONNX_MEMORY_BYTES = Limit(
 CACHE_BYTES = Limit(
     "cache_bytes", 20 * _GIB, "the cache of ground truth; the least recently used entries go first"
 )
-
-
-def limit_process(
-    parent: int, memory_bytes: int, *, cpu_seconds: int | None = None, wall_seconds: float | None = None
-) -> None:
-    """Limit this process, which ``parent`` (its process id) has started, and turn off its core dumps.
-
-    Allocations beyond ``memory_bytes`` fail. SIGXCPU ends the process after its processor time, SIGALRM after its
-    duration, and SIGKILL when its parent has ended, where the system can do so (Linux). The limits hold for this
-    process alone: one that it forks would have the same again, without the duration.
-    """
-    if sys.platform == "linux":
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-        if os.getppid() != parent:  # The parent ended before the signal was set.
-            os.kill(os.getpid(), signal.SIGKILL)
-    # Not RLIMIT_AS: files are memory-mapped, and libraries reserve address space that they never use.
-    _lower_limit(resource.RLIMIT_DATA, memory_bytes, memory_bytes)
-    _lower_limit(resource.RLIMIT_CORE, 0, 0)
-    if cpu_seconds is not None:
-        _lower_limit(resource.RLIMIT_CPU, cpu_seconds, cpu_seconds + 1)
-    if wall_seconds is not None:
-        signal.setitimer(signal.ITIMER_REAL, wall_seconds)
-
-
-def _lower_limit(kind: int, soft: int, hard: int) -> None:
-    """Set a limit of this process, or keep the hard limit that is in force if it is lower."""
-    present = resource.getrlimit(kind)[1]
-    if present != resource.RLIM_INFINITY:
-        soft, hard = min(soft, present), min(hard, present)
-    resource.setrlimit(kind, (soft, hard))
 
 
 # Time limit on a call that may never return: an inference, or a request to a server.

@@ -11,7 +11,6 @@ import errno
 import hashlib
 import json
 import math
-import mmap
 import os
 import re
 import shutil
@@ -25,6 +24,7 @@ from typing import Any, BinaryIO, NoReturn, Protocol
 from rebar_depth_bench.base.errors import InputError, Problem, ProblemCode, escape_text
 from rebar_depth_bench.base.limits import Limit
 from rebar_depth_bench.base.names import NAME_LETTERS, PATH_PATTERN
+from rebar_depth_bench.base.system import map_range, open_for_reading, read_range
 
 MAX_NESTING = 64
 """Largest number of JSON or TOML containers inside each other."""
@@ -44,7 +44,7 @@ def open_regular(path: Path) -> BinaryIO:
     Raises ``OSError``, whose ``strerror`` can be shown to users, for anything else, and for a pointer of git LFS.
     """
     try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC | os.O_NOCTTY)
+        descriptor = open_for_reading(path)
     except ValueError as error:  # The path contains a null character.
         raise OSError(errno.EINVAL, str(error)) from None
     mode = os.fstat(descriptor).st_mode
@@ -226,7 +226,7 @@ def remove_folder(path: Path) -> None:
 
 # Sources of bytes that are read at positions: files and memory.
 
-# For smaller reads, pread is cheaper than a mapping and its page faults.
+# For smaller reads, reading is cheaper than a mapping and its page faults.
 _MIN_MAPPED_BYTES = 64 * 1024
 
 
@@ -242,7 +242,7 @@ class ByteSource(Protocol):
 
 
 class FileSource:
-    """Byte source of a regular file, read through ``pread`` and short-lived read-only mappings.
+    """Byte source of a regular file, read at positions and through short-lived read-only mappings.
 
     Every large read maps its own range, and the mapping is released with the last view on it, so the resident
     memory is that of the views in use, independent of the file size. The file must not be truncated while a view
@@ -261,15 +261,11 @@ class FileSource:
         if offset < 0 or length < 0 or offset + length > os.fstat(self._fd).st_size:
             raise EOFError(f"{length} bytes at {offset} lie past the end of the file")
         if length < _MIN_MAPPED_BYTES:
-            data = os.pread(self._fd, length, offset)
+            data = read_range(self._fd, offset, length)
             if len(data) < length:  # The file was truncated just now.
                 raise EOFError(f"{len(data)} bytes found at {offset}, expected {length}")
             return memoryview(data)
-        lead = offset % mmap.ALLOCATIONGRANULARITY
-        # MAP_POPULATE loads all pages at once: one page fault per page would take as long as reading the pages.
-        flags = mmap.MAP_SHARED | getattr(mmap, "MAP_POPULATE", 0)
-        mapped = mmap.mmap(self._fd, lead + length, flags, mmap.PROT_READ, offset=offset - lead)
-        return memoryview(mapped)[lead:]
+        return map_range(self._fd, offset, length)
 
     def sha256(self) -> str:
         """Return the hex SHA-256 of the whole file."""

@@ -11,6 +11,7 @@ from rebar_depth_bench.base.terminal import ProgressBars
 from rebar_depth_bench.base.writing import write_output
 from rebar_depth_bench.cli.console import (
     InputFile,
+    add_align,
     add_data,
     add_expect_digest,
     add_output_file,
@@ -29,6 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("others", type=InputFile, metavar="B", nargs="+", help="one or more archives")
     add_data(parser)
     add_expect_digest(parser)
+    add_align(parser)
     add_output_file(parser, "--json", "write the differences as JSON")
     add_output_file(parser, "--csv", "write the differences as CSV")
     add_workers(parser)
@@ -43,6 +45,7 @@ def run(options: argparse.Namespace) -> None:
                 options.data,
                 workers=options.workers,
                 expect_digest=options.expect_digest,
+                align=options.align,
                 progress=bars.update,
             )
             for archive in (options.first, *options.others)

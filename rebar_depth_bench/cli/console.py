@@ -186,6 +186,17 @@ def positive_number(text: str, expected: str, high: float = sys.float_info.max) 
     return value
 
 
+def add_align(parser: argparse.ArgumentParser) -> None:
+    """Add the option that scores metric archives as those of another kind."""
+    from rebar_depth_bench.submission.declaration import METRIC, PREDICTION_KINDS  # Not for all commands.
+
+    parser.add_argument(
+        "--align",
+        choices=[kind for kind in PREDICTION_KINDS if kind != METRIC],
+        help="score metric predictions as this kind, aligned with the truth of each view; never ranked",
+    )
+
+
 def add_expect_digest(parser: argparse.ArgumentParser) -> None:
     """Add the option ``--expect-digest``."""
     parser.add_argument(

@@ -13,6 +13,7 @@ from rebar_depth_bench.base.errors import MethodError
 from rebar_depth_bench.methods import AnyMethod, MultiViewMethod, all_methods
 from rebar_depth_bench.methods.base import input_class
 from rebar_depth_bench.reporting.tables import plain_text
+from rebar_depth_bench.submission.declaration import METRIC
 
 _ALL_VIEWS_NOTE = "prepares a whole config before it predicts any view"
 _NEEDS_COLUMN_WIDTH = len("cam_from_world,")
@@ -48,7 +49,8 @@ def run(_: argparse.Namespace) -> None:
 
 def _summary_and_notes(method: AnyMethod) -> Text:
     """Return the summary, followed by dimmed notes on separate lines."""
-    notes = (*((_ALL_VIEWS_NOTE,) if isinstance(method, MultiViewMethod) else ()), method.info.untested_note)
+    kind = "" if method.info.prediction == METRIC else f"predictions of the kind {method.info.prediction}"
+    notes = (*((_ALL_VIEWS_NOTE,) if isinstance(method, MultiViewMethod) else ()), kind, method.info.untested_note)
     lines = [plain_text(method.info.summary), *(plain_text(f"({line})", style="dim") for line in notes if line)]
     return Text("\n").join(lines)
 

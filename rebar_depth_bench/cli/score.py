@@ -10,6 +10,7 @@ from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.base.terminal import ProgressBars, print_notice
 from rebar_depth_bench.base.writing import write_output
 from rebar_depth_bench.cli.console import (
+    add_align,
     add_archive,
     add_data,
     add_expect_digest,
@@ -32,6 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_archive(parser)
     add_data(parser)
     add_expect_digest(parser)
+    add_align(parser)
     add_output_file(parser, "--json", "write the result as JSON")
     add_output_file(parser, "--html", "write a self-contained report")
     parser.add_argument(
@@ -56,6 +58,8 @@ def run(options: argparse.Namespace) -> None:
     """Score an archive, write the requested files and print the tables."""
     if options.html_views < 0:
         raise InputError(f"--html-views is {options.html_views}, expected 0 or more")
+    if options.align and (options.extended or options.extended_csv):
+        raise InputError("--align and --extended are both given: extended measures need metric predictions")
     with open_evaluation(options.archive, options.data, expect_digest=options.expect_digest) as evaluation:
         with ProgressBars() as bars:
             if options.extended or options.extended_csv:
@@ -64,7 +68,9 @@ def run(options: argparse.Namespace) -> None:
 
                 result = score_extended(evaluation, workers=options.workers, progress=bars.update)
             else:
-                result = score_evaluation(evaluation, workers=options.workers, progress=bars.update)
+                result = score_evaluation(
+                    evaluation, workers=options.workers, align=options.align, progress=bars.update
+                )
         names = ", ".join(config.name for config in evaluation.configs)
         print_verified(
             evaluation.folder, f"views of {names} verified when their ground truth was stored in the cache"

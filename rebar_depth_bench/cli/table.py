@@ -6,10 +6,12 @@ import argparse
 
 from rich.console import Console
 
+from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.base.terminal import ProgressBars, print_notice
 from rebar_depth_bench.base.writing import write_output
 from rebar_depth_bench.cli.console import (
     InputFile,
+    add_align,
     add_data,
     add_expect_digest,
     add_output_file,
@@ -30,6 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("archives", type=InputFile, metavar="ARCHIVE", nargs="+", help=archives)
     add_data(parser)
     add_expect_digest(parser)
+    add_align(parser)
     add_output_file(parser, "--latex", "write the table as LaTeX (booktabs)")
     add_output_file(parser, "--csv", "write all tables as CSV")
     add_output_file(parser, "--figure", "draw native against scaled AbsRel of all configs (.svg, .png or .pdf)")
@@ -49,11 +52,16 @@ def run(options: argparse.Namespace) -> None:
                 options.data,
                 workers=options.workers,
                 expect_digest=options.expect_digest,
+                align=options.align,
                 progress=bars.update,
             )
             for archive in options.archives
         ]
     check_same_splits(results)
+    for result in results if options.figure else ():
+        if result.prediction is not None:
+            found = f"{result.method} has predictions of the kind {result.kind}"
+            raise InputError(f"--figure: {found}, expected metric ones: the figure shows native errors")
     results = disambiguate_method_names(results)
     published = not options.no_published
     if options.latex:

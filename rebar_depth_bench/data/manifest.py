@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, Self
 
-from pydantic import AliasPath, Field, Strict, ValidationInfo, field_validator
+from pydantic import AliasPath, Field, PrivateAttr, Strict, ValidationInfo, field_validator
 
 from rebar_depth_bench.base.errors import DatasetError, InputError, Problem, escape_text
 from rebar_depth_bench.base.limits import JSON_BYTES
@@ -62,6 +62,7 @@ class DatasetConfig(Located):
     sheet: RelativePath
     references: dict[str, References] = Field({})
     colour: Colour | None
+    _whole: Self | None = PrivateAttr(default=None)
 
     @classmethod
     def fields_of_entry(cls, name: str, entry: Mapping[str, Any]) -> dict[str, Any]:
@@ -197,6 +198,17 @@ class DatasetConfig(Located):
         for view in self.views:
             views[self.scene_by_view[view.view_id]].append(view)
         return tuple(self._restricted((scene,), views[scene.name]) for scene in self.scenes)
+
+    def of_views(self, view_ids: Collection[str]) -> Self:
+        """Return the config restricted to some of its views."""
+        restricted = self._restricted(self.scenes, (view for view in self.views if view.view_id in view_ids))
+        restricted._whole = self.whole
+        return restricted
+
+    @property
+    def whole(self) -> Self:
+        """The config with all views of its scenes."""
+        return self._whole or self
 
     def _restricted(self, scenes: Iterable[Scene], views: Iterable[ViewRecord]) -> Self:
         restricted = self.model_copy(update={"scenes": tuple(scenes), "views": tuple(views)})

@@ -304,6 +304,8 @@ def encoded_rows(
     twice or is not in the manifest.
     """
     columns = validated_columns(columns)
+    if view_ids is None and config.whole is not config:
+        view_ids = config.view_ids
     known = frozenset(config.view_ids if view_ids is None else view_ids)
     remaining = set(known)
     shards = config.shards if view_ids is None else _shards_with(config, view_ids)
@@ -345,7 +347,7 @@ def shard_rows(
     Of a shard with one row group for each view, as the builder writes it, only the wanted rows are read. Raises
     ``DatasetError`` for a damaged shard.
     """
-    table = rows_table(("view_id", *columns), len(config.views))
+    table = rows_table(("view_id", *columns), len(config.whole.views))
     for shard in shards:
         with _open_shard(config, shard, table) as file:
             groups = None

@@ -20,10 +20,11 @@ from rebar_depth_bench.diagnosis.corrections import (
     positions_to_read,
     shape_corrections,
     unit_corrections,
-    valid_share,
 )
 from rebar_depth_bench.scoring.evaluation import Evaluation
+from rebar_depth_bench.scoring.relative import has_value
 from rebar_depth_bench.submission import SubmissionReader
+from rebar_depth_bench.submission.declaration import METRIC
 
 MAX_KEPT = 16
 """Number of predictions of other views that are kept decoded."""
@@ -70,8 +71,10 @@ def diagnose_config(
 ) -> list[PossibleMistake]:
     """Return at most two possible mistakes in the ``views`` of a config, those at ``positions_to_read``.
 
-    They are one of units and one other, or with few valid values what the others are, and a logarithm.
+    They are one of units and one other, or with few valid values what the others are, and a logarithm. Of
+    predictions that are not metric only the values are looked at: they have no unit, and disparity is no mistake.
     """
+    kind = METRIC if submission.meta is None else submission.meta.prediction
     known = {view.position: view.prediction for view in views}
 
     @lru_cache(MAX_KEPT)
@@ -80,13 +83,15 @@ def diagnose_config(
 
     if len(views) < MIN_VIEWS:
         return []
-    invalid = invalid_values(config.name, views)
+    invalid = invalid_values(config.name, views, kind)
     if invalid is None and is_same_map(views):
         text = (
             f"the predictions of {config.name} seem to be one picture: {len(views)} of {len(views)} are identical"
         )
         return [PossibleMistake(config.name, "same-map", text)]
-    if invalid is not None:
+    if kind != METRIC:
+        found = [invalid or _constant_values(config.name, views)]
+    elif invalid is not None:
         found = [invalid, best_mistake(config.name, views, logarithm_corrections())]
     else:
         others = [*shape_corrections(views, read, len(config.views)), *logarithm_corrections()]
@@ -94,10 +99,18 @@ def diagnose_config(
     return [mistake for mistake in found if mistake]
 
 
-def invalid_values(config: str, views: Sequence[DiagnosedView]) -> PossibleMistake | None:
-    """Return the mistake of predictions that are hardly anywhere finite and above 0; None if they are."""
+def _constant_values(config: str, views: Sequence[DiagnosedView]) -> PossibleMistake | None:
+    """Return the mistake of predictions that have one value in most of the views; None if they have several."""
+    count = sum(bool((view.p == view.p[0]).all()) for view in views)
+    text = f"the predictions of {config} are the same at all pixels in {count} of {len(views)} views"
+    return PossibleMistake(config, "constant", text) if count >= MOST_VIEWS * len(views) else None
+
+
+def invalid_values(config: str, views: Sequence[DiagnosedView], kind: str = METRIC) -> PossibleMistake | None:
+    """Return the mistake of predictions that hardly anywhere have a value of their kind; None if they do."""
     p = np.concatenate([view.p for view in views])
-    if valid_share(p) >= LEAST_COVERAGE:
+    valid = float(np.mean(has_value(p, kind)))
+    if valid >= LEAST_COVERAGE:
         return None
     shares = {
         "negative": float(np.mean(np.isfinite(p) & (p < 0))),
@@ -105,10 +118,11 @@ def invalid_values(config: str, views: Sequence[DiagnosedView]) -> PossibleMista
         "NaN": float(np.isnan(p).mean()),
         "zero": float((p == 0).mean()),
     }
+    name = "valid depth" if kind == METRIC else "valid"
     text = (
-        f"the predictions of {config} are hardly anywhere valid depth: of the scored pixels looked at in "
+        f"the predictions of {config} are hardly anywhere {name}: of the scored pixels looked at in "
         f"{len(views)} views, {', '.join(f'{_percent(share)} are {name}' for name, share in shares.items())} and "
-        f"{_percent(valid_share(p))} are finite and above 0"
+        f"{_percent(valid)} are finite{'' if kind.startswith('affine') else ' and above 0'}"
     )
     return PossibleMistake(config, max(shares, key=lambda name: shares[name]).lower(), text)
 

@@ -67,8 +67,10 @@ def score_extended(
     """Return the result of an open submission as ``score_evaluation``, with its extended measures.
 
     Each prediction is read once. All extended measures are null for a config without masks or bar ids.
-    Raises ``DatasetError`` if the dataset folder lacks its bars or contradicts its manifest.
+    Raises ``DatasetError`` if the dataset folder lacks its bars or contradicts its manifest, and
+    ``SubmissionError`` for predictions that are not metric.
     """
+    evaluation.require_metric("extended measures are in metres")
     families = tuple(families)
     steel = {
         config.name: steel_truth(evaluation, config, progress)

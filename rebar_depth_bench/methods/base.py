@@ -15,9 +15,13 @@ from numpy import ndarray
 from rebar_depth_bench.base.errors import MethodError
 from rebar_depth_bench.base.parallel import Progress
 from rebar_depth_bench.data.rows import Views
+from rebar_depth_bench.submission.declaration import METRIC, PREDICTION_KINDS
 
 Predictor = Callable[[Mapping[str, Any]], Float32[ndarray, "h w"]]
-"""Function from a decoded row to planar depth of the left view, metres, on the left grid; NaN: no prediction."""
+"""Function from a decoded row to planar depth of the left view, metres, on the left grid; NaN: no prediction.
+
+Of a method of another kind, the values are those of its kind.
+"""
 
 VIEW_TIMEOUT_S = 600.0
 """Default time limit on the inference of a view by an ONNX model, seconds."""
@@ -30,7 +34,8 @@ class MethodInfo:
     ``columns`` are the dataset columns that the predictor reads. ``uses_ground_truth`` is True if the method reads
     ground truth, so that its submissions are not ranked. ``untested_note`` states which part was never run by the
     authors because weights or hardware were not available; empty if everything was tested. ``inputs`` is the input
-    class, one of ``INPUTS``; without it, ``input_class`` derives the class from the columns.
+    class, one of ``INPUTS``; without it, ``input_class`` derives the class from the columns. ``prediction`` is the
+    kind of the predictions, one of ``PREDICTION_KINDS``.
     """
 
     name: str
@@ -42,10 +47,13 @@ class MethodInfo:
     uses_ground_truth: bool = False
     untested_note: str = ""
     inputs: str | None = None
+    prediction: str = METRIC
 
     def __post_init__(self) -> None:
         if isinstance(self.columns, str):  # Catches a one-element tuple written without its comma.
             raise TypeError(f"columns is the text {self.columns!r}, expected a tuple of names")
+        if self.prediction not in PREDICTION_KINDS:
+            raise ValueError(f"prediction is {self.prediction!r}, expected one of {', '.join(PREDICTION_KINDS)}")
 
 
 @dataclass(frozen=True)
@@ -121,9 +129,15 @@ def input_class(method: AnyMethod) -> str | None:
 
 def positive_or_nan(depth_m: Float[ndarray, "*grid"]) -> Float32[ndarray, "*grid"]:
     """Return depth as float32, with NaN (no prediction) where it is not finite or not above 0."""
+    single = finite_or_nan(depth_m)
+    return np.where(single > 0, single, np.float32(np.nan))
+
+
+def finite_or_nan(values: Float[ndarray, "*grid"]) -> Float32[ndarray, "*grid"]:
+    """Return values as float32, with NaN (no prediction) where they are not finite."""
     with np.errstate(over="ignore"):
-        single = depth_m.astype(np.float32)
-    return np.where(np.isfinite(single) & (single > 0), single, np.float32(np.nan))
+        single = values.astype(np.float32)
+    return np.where(np.isfinite(single), single, np.float32(np.nan))
 
 
 def import_optional(module: str, need: str, extra: str) -> Any:

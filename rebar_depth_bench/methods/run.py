@@ -12,6 +12,7 @@ import time
 import traceback
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -32,6 +33,7 @@ from rebar_depth_bench.methods.base import import_optional, input_class
 from rebar_depth_bench.methods.kept_views import KeptViews, PreparationReport
 from rebar_depth_bench.methods.sgbm import RECTIFIED_COLUMNS, STEREO_COLUMNS, pair_row
 from rebar_depth_bench.submission import SubmissionWriter
+from rebar_depth_bench.submission.declaration import METRIC
 
 
 def predict(
@@ -136,7 +138,7 @@ def _predict_config(
     """Predict and store the views that are not in ``done``."""
     columns = method.info.columns
     if views.rectify and isinstance(method, Method) and "left_distortion" not in columns:
-        predictor, columns = rectifying_predictor(predictor, columns)
+        predictor, columns = rectifying_predictor(predictor, columns, method.info.prediction)
     for count, row in enumerate(views.rows(*columns, skip=done), start=len(done) + 1):
         start = time.perf_counter()
         with _wrap_errors(f"{method.info.name}: {row['view_id']}: the predictor, given {', '.join(row)}"):
@@ -219,8 +221,7 @@ def _validated_depth(where: str, depth_m: object, grid: tuple[int, int]) -> Floa
     array = np.asarray(depth_m)
     if array.shape != grid or array.dtype.kind != "f":
         raise MethodError(
-            f"{where}: the method returned {array.dtype} of shape {array.shape}, expected float metres of shape "
-            f"{grid}"
+            f"{where}: the method returned {array.dtype} of shape {array.shape}, expected floats of shape {grid}"
         )
     return array
 
@@ -247,6 +248,7 @@ def _write_archive(
         description=info.summary,
         inputs=input_class(method),
         uses_ground_truth=info.uses_ground_truth,
+        prediction=info.prediction,
         runtime=runtime,
         notes={config: report.notes for config, report in reports.items()} or None,
     ) as writer:
@@ -259,17 +261,20 @@ def _write_archive(
 # Rectified images for methods that do not read the lens distortion, and their depth on the raw left grid.
 #
 # A method that reads the right image is given the rectified pair (``geometry.rectification``), another one the
-# undistorted left image. Its depth is transferred to the raw left image without interpolation. Multi-view methods,
-# and those that read ``left_distortion``, do this themselves.
+# undistorted left image. Its depth is transferred to the raw left image without interpolation; values that are
+# known up to a shift keep their value, although the raw camera is turned against the rectified one. Multi-view
+# methods, and those that read ``left_distortion``, do this themselves.
 
 _MONO_COLUMNS = ("left_rgb", "left_K", "left_distortion")
 
 
-def rectifying_predictor(predictor: Predictor, columns: Sequence[str]) -> tuple[Predictor, tuple[str, ...]]:
+def rectifying_predictor(
+    predictor: Predictor, columns: Sequence[str], kind: str = METRIC
+) -> tuple[Predictor, tuple[str, ...]]:
     """Return a predictor of raw rows, and the columns that it needs, for a predictor of rectified rows.
 
-    ``columns`` are those that ``predictor`` reads. Raises ``MethodError`` if a rectified row lacks one of them,
-    and if OpenCV is missing.
+    ``columns`` are those that ``predictor`` reads, ``kind`` is that of its predictions. Raises ``MethodError`` if
+    a rectified row lacks one of the columns, and if OpenCV is missing.
     """
     if others := sorted(set(columns) - RECTIFIED_COLUMNS):
         raise MethodError(
@@ -284,6 +289,8 @@ def rectifying_predictor(predictor: Predictor, columns: Sequence[str]) -> tuple[
     def predict_raw(row: Mapping[str, Any]) -> Float[ndarray, "h w"]:
         if is_stereo:
             pair = rectification.rectified_pair(row)
+            if kind.startswith("affine"):
+                pair = replace(pair, depth_ratio=np.ones_like(pair.depth_ratio))
             cells, on_raw_grid = pair_row(pair), partial(rectification.raw_depth_m, pair)
         else:
             height, width, _ = row["left_rgb"].shape

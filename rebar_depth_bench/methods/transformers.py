@@ -29,7 +29,7 @@ from numpy import ndarray
 from rebar_depth_bench.base.errors import MethodError
 from rebar_depth_bench.base.validation import short_repr
 from rebar_depth_bench.data.files import files_digest
-from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor, positive_or_nan
+from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor, finite_or_nan, positive_or_nan
 from rebar_depth_bench.methods.paper.third_party import (
     CONFIG,
     Network,
@@ -41,6 +41,7 @@ from rebar_depth_bench.methods.paper.third_party import (
     snapshot,
     torch_device,
 )
+from rebar_depth_bench.submission.declaration import METRIC
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -161,11 +162,13 @@ class OutputKind(Enum):
     """Meaning of a network's output; the value is the text shown to users."""
 
     METRES = "depth in metres, the camera's focal length not given"
-    INVERSE = (
-        "up to scale, and up to a shift of the inverse: the model puts out relative inverse depth, one over it is "
-        "submitted, and only the scaled numbers mean anything"
-    )
+    INVERSE = "disparity up to scale and shift, aligned with the truth of each view when it is scored"
     CANONICAL = "depth in metres, the camera's focal length given"
+
+    @property
+    def prediction(self) -> str:
+        """Kind of the predictions, one of ``PREDICTION_KINDS``."""
+        return "affine-disparity" if self is OutputKind.INVERSE else METRIC
 
 
 def hf_method(name_or_path: str) -> Method:
@@ -194,6 +197,7 @@ def hf_method(name_or_path: str) -> Method:
         uses_intrinsics=output is OutputKind.CANONICAL,
         source=f"transformers, {checkpoint.name}",
         licence="that of the checkpoint",
+        prediction=output.prediction,
     )
     return Method(info, lambda: _load_predictor(Network(info, _INSTALL), checkpoint, output))
 
@@ -242,10 +246,10 @@ def output_kind(config: Mapping[str, Any]) -> OutputKind:
     return OutputKind.METRES if is_metric else OutputKind.INVERSE
 
 
-def network_output_to_depth_m(
+def network_output_to_prediction(
     output: OutputKind, values: Float[ndarray, "h w"], K: Float64[ndarray, "3 3"] | None = None
 ) -> Float32[ndarray, "h w"]:
-    """Return planar depth in metres; for relative output, its unit is unknown.
+    """Return planar depth in metres; relative disparity as it is.
 
     ``values`` is the network output on the left grid. ``K`` holds the intrinsics of that grid in pixels and is
     required for canonical output, the inverse depth C of a camera whose focal length equals the image width:
@@ -254,13 +258,14 @@ def network_output_to_depth_m(
 
     Depths that are not finite or not above 0 become NaN, which means no prediction.
     """
+    if output is OutputKind.INVERSE:
+        return finite_or_nan(values)
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         if output is OutputKind.CANONICAL:
             assert K is not None
             inverse_per_m = values.astype(np.float64) * (values.shape[1] / K[0, 0])
-            values = np.clip(inverse_per_m, *INVERSE_DEPTH_BOUNDS_PER_M)
-        z_m = values if output is OutputKind.METRES else 1 / values
-    return positive_or_nan(z_m)
+            values = 1 / np.clip(inverse_per_m, *INVERSE_DEPTH_BOUNDS_PER_M)
+    return positive_or_nan(values)
 
 
 def _load_predictor(network: Network, checkpoint: Checkpoint, output: OutputKind) -> Predictor:
@@ -290,7 +295,7 @@ def _load_predictor(network: Network, checkpoint: Checkpoint, output: OutputKind
         network_output = model(pixel_values=to_network_input(rgb).to(model.device))
         network_output.predicted_depth = network_output.predicted_depth.float().cpu()
         values = to_left_grid(model_type, processor, network_output, rgb.shape[:2])
-        return network_output_to_depth_m(output, np.asarray(values.numpy()), row.get("left_K"))
+        return network_output_to_prediction(output, np.asarray(values.numpy()), row.get("left_K"))
 
     return network.predictor(infer)
 

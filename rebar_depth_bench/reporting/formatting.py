@@ -21,6 +21,7 @@ from rebar_depth_bench.scoring.columns import (
 )
 from rebar_depth_bench.scoring.groups import GROUPINGS
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE
+from rebar_depth_bench.scoring.relative import relative_findings
 
 if TYPE_CHECKING:
     from rebar_depth_bench.scoring.table import Table
@@ -37,16 +38,24 @@ REFERENCE_NOTE = (
     f"scaled errors; {ONE_PIXEL_TITLE}, exact depth shifted by one pixel, for native errors."
 )
 
+ALIGNED_NOTE = (
+    "Errors of predictions x after the alignment of their kind with the truth z of each view, and after the "
+    "robust one; constant: of the same fit without x. Error: mean over all scored pixels of |p - z| / max(p, z), "
+    "1 where x has no value or p <= 0. Never ranked."
+)
+
 INTERVAL_NOTE = (
     "Small figures: 95 % interval, block bootstrap over views (other views of the same scene, not other scenes)."
 )
 
 _SCENES_NOTE = "bootstrap over scenes (other scenes of the same generator)."
 
+_GROUP = "The group of a view follows from its ground truth."
+_NO_INTERVALS = f"A group with views of fewer than {MIN_BLOCKS} scenes has no intervals."
+ALIGNED_GROUP_NOTE = f"{_GROUP} {_NO_INTERVALS}"
 GROUP_NOTE = (
-    "The group of a view follows from its ground truth. Beside the errors of a group are the reference errors of "
-    f"its views: {ONE_PIXEL_TITLE} for native, {CONSTANT_TITLE} for scaled errors. A group with views of fewer "
-    f"than {MIN_BLOCKS} scenes has no intervals."
+    f"{_GROUP} Beside the errors of a group are the reference errors of its views: {ONE_PIXEL_TITLE} for native, "
+    f"{CONSTANT_TITLE} for scaled errors. {_NO_INTERVALS}"
 )
 
 
@@ -84,7 +93,9 @@ def table_notes(table: Table) -> list[str]:
             f"The ground truth was measured, with a standard deviation of {1000 * table.truth_sigma_m:.3g} mm, as "
             "its authors state; smaller errors cannot be told from errors of the ground truth."
         )
-    if not table.ranked:
+    if table.of_views is not None:
+        notes.append(f"Not ranked: {table.views} of {counted(table.of_views, 'view')}.")
+    elif not table.ranked and table.aligned is None:
         reason = "the submission declares that it uses ground truth" if table.views else "no views"
         notes.append(f"Not ranked: {reason}.")
     if reasons := incomparable_reasons(table):
@@ -105,7 +116,7 @@ def incomparable_reasons(table: Table) -> list[str]:
     if table.coverage is not None and table.coverage < MIN_COMPARABLE_COVERAGE:
         minimum = f"{MIN_COMPARABLE_COVERAGE * 100:.0f} %"
         reasons.append(f"coverage {COVERAGE.text(table.coverage)} % is below {minimum}")
-    if any(metrics is not None and not metrics.is_finite for metrics in (table.native, table.scaled)):
+    if table.views_scored and not table.is_finite:
         reasons.append("a number overflowed")
     return reasons
 
@@ -166,7 +177,7 @@ def rank_mark(declared: Declaration, table: Table) -> str:
 
 def reference_findings(table: Table) -> list[str]:
     """Return a sentence on each error of a table that its reference errors put into perspective."""
-    findings = []
+    findings = relative_findings(table)
     native, scaled = NATIVE[0], SCALED[0]
     one_pixel, constant = table.reference.one_pixel.abs_rel, table.reference.scaled_constant.abs_rel
     if table.native and one_pixel and table.native.abs_rel < one_pixel:

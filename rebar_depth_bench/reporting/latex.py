@@ -15,8 +15,19 @@ from rebar_depth_bench.base.errors import InputError, printable
 from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.html.assets import environment
 from rebar_depth_bench.reporting.published import load_published, published_rows
-from rebar_depth_bench.scoring.columns import DASH, OTHERS, PAPER_COLUMNS, RANK_ERROR, Better, Column, rounded
-from rebar_depth_bench.scoring.protocol import PROTOCOL
+from rebar_depth_bench.scoring.columns import (
+    ALIGNED,
+    ALIGNED_CONSTANT,
+    ALIGNED_ROBUST,
+    DASH,
+    OTHERS,
+    PAPER_COLUMNS,
+    RANK_ERROR,
+    Better,
+    Column,
+    rounded,
+)
+from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND, kind_blocks
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.table import PublishedMatch, Table
 
@@ -24,12 +35,19 @@ CONFIGS_PER_BLOCK = 2
 """Number of configs side by side that fit into a page width of 17 cm; further configs follow in blocks below."""
 
 _COLUMNS = (RANK_ERROR, *PAPER_COLUMNS, *OTHERS)
+_ALIGNED_COLUMNS = (ALIGNED[0], ALIGNED_CONSTANT[0], ALIGNED[1], ALIGNED_ROBUST[1], ALIGNED_CONSTANT[1])
+"""Columns of predictions that are not metric."""
 _HEADS: Mapping[str, str] = {
     "rank_error": "$E$",
     "native.rmse_cm": "RMSE",
     "native.abs_rel": "AbsRel",
     "scaled.abs_rel": "AbsRel$_s$",
     "scale_median": "$s$",
+    "aligned.error": "$E$",
+    "constant.error": "const.",
+    "aligned.abs_rel": "AbsRel",
+    "aligned_robust.abs_rel": "robust",
+    "constant.abs_rel": "const.",
 }
 _ARROWS: Mapping[Better, str] = {"lower": r" $\downarrow$", "higher": r" $\uparrow$", "": ""}
 _MISSING = "--"
@@ -61,7 +79,8 @@ def latex_table(results: Sequence[Result], *, published: bool, intervals: bool =
     best number of a column is bold if the column has two or more ranked rows; a row that is not ranked is marked
     with a double dagger and is never bold. With ``published``, the paper's rows of the same scenes follow below a
     rule; they are marked and not compared with the results. With ``intervals``, the 95 % intervals are printed
-    beside the numbers, and each block holds one config.
+    beside the numbers, and each block holds one config. Results that are not metric follow in a table for each
+    kind, in the order of the aligned error of a block's first config, without bold numbers.
 
     Raises ``InputError`` if there are no results, or if they belong to different datasets.
     """
@@ -69,15 +88,26 @@ def latex_table(results: Sequence[Result], *, published: bool, intervals: bool =
     if len(digests) != 1:
         digest_list = ", ".join(sorted(map(formatting.short_digest, digests))) or "no result"
         raise InputError(f"LaTeX table: results of {len(digests)} datasets ({digest_list}), expected one dataset")
+    blocks = kind_blocks(results)
+    return "\n\n".join(_table_of_kind(block, published=published, intervals=intervals) for block in blocks)
+
+
+def _table_of_kind(results: Sequence[Result], *, published: bool, intervals: bool) -> str:
+    """Return the ``table*`` of results of one kind."""
+    kind = results[0].prediction
+    columns = _COLUMNS if kind is None else _ALIGNED_COLUMNS
     tables = {config: table for result in results for config, table in result.tables.items()}
     configs = list(tables)
     configs_per_block = 1 if intervals else CONFIGS_PER_BLOCK
     blocks = [configs[start : start + configs_per_block] for start in range(0, len(configs), configs_per_block)]
+    published = published and kind is None
     matches = {config: table.published for config, table in tables.items() if published and table.published}
     paper_rows = [row for match in matches.values() for row in published_rows(match.scene)]
     return _template().render(
-        protocol=PROTOCOL,
-        heads=[_head(column) for column in _COLUMNS],
+        protocol=results[0].protocol,
+        kind=kind,
+        alignment=ALIGNMENT_BY_KIND.get(kind or ""),
+        heads=[_head(column) for column in columns],
         version=results[0].dataset.version,
         digest=formatting.short_digest(results[0].dataset.digest, 16),
         view_counts=[
@@ -98,7 +128,7 @@ def latex_table(results: Sequence[Result], *, published: bool, intervals: bool =
         blocks=[
             {
                 "titles": [_config_title(config, tables[config]) for config in block],
-                "rows": _result_rows(results, block, intervals),
+                "rows": _result_rows(results, block, columns, intervals),
                 "reference_rows": _merged([_reference_rows(results, config) for config in block], ""),
                 "published_rows": _merged([_published_rows(matches.get(config)) for config in block], _MISSING),
             }
@@ -138,14 +168,16 @@ def _config_title(config: str, table: Table) -> str:
     return _config_name(config, table) + (f" ({scene.distance.replace('–', '--')})" if scene else "")
 
 
-def _result_rows(results: Sequence[Result], configs: Sequence[str], intervals: bool) -> list[list[str]]:
+def _result_rows(
+    results: Sequence[Result], configs: Sequence[str], columns: Sequence[Column], intervals: bool
+) -> list[list[str]]:
     """Return the rows of a block, each a name and the cells of each config."""
     best = {config: _best_texts([result.tables.get(config) for result in results]) for config in configs}
     shown = [result for result in results if any(name in result.tables for name in configs)]
     return [
         [
             escape_latex(result.method) + ("" if result.declared.uses_ground_truth is not None else "$^{?}$"),
-            *(cell for name in configs for cell in _cells(result.tables.get(name), best[name], intervals)),
+            *(cell for one in configs for cell in _cells(result.tables.get(one), columns, best[one], intervals)),
         ]
         for result in sorted(shown, key=lambda result: _sort_key(result.tables.get(configs[0])))
     ]
@@ -161,7 +193,7 @@ def _sort_key(table: Table | None) -> tuple[bool, bool, float]:
     """Return the sort key of a row by the block's first config: ranked rows by rank error, the others last."""
     if table is None:
         return True, True, 0.0
-    return False, not table.ranked, rounded(table.rank_error) or 0.0
+    return False, not table.ranked, rounded(table.error) or 0.0
 
 
 def _best_texts(tables: Iterable[Table | None]) -> dict[str, str]:
@@ -181,22 +213,24 @@ def _best_texts(tables: Iterable[Table | None]) -> dict[str, str]:
     }
 
 
-def _cells(table: Table | None, best: Mapping[str, str], intervals: bool) -> list[str]:
+def _cells(table: Table | None, columns: Sequence[Column], best: Mapping[str, str], intervals: bool) -> list[str]:
     """Return a config's cells; ``best`` holds the formatted best number of columns."""
     if table is None:
-        return [_MISSING] * len(_COLUMNS)
+        return [_MISSING] * len(columns)
     cells = []
-    for column in _COLUMNS:
+    for column in columns:
         number = column.text(column.value(table)).replace(DASH, _MISSING)
         interval = column.interval_text(column.interval(table), ", ") if intervals else ""
         shown = rf"\textbf{{{number}}}" if table.ranked and number == best.get(column.path) else number
         cells.append(shown + (rf" {{\tiny[{interval}]}}" if interval else ""))
-    return cells if table.ranked else [cells[0] + _UNRANKED_MARK, *cells[1:]]
+    is_marked = not table.ranked and table.aligned is None
+    return [cells[0] + _UNRANKED_MARK, *cells[1:]] if is_marked else cells
 
 
 def _reference_rows(results: Sequence[Result], config: str) -> dict[str, list[str]]:
-    """Return the cells of each reference of a config."""
-    shown = [(result.method, result.tables[config]) for result in results if config in result.tables]
+    """Return the cells of each reference of a config of metric results."""
+    metric = [result for result in results if result.prediction is None]
+    shown = [(result.method, result.tables[config]) for result in metric if config in result.tables]
     return {name: ["", *cells, *_NO_OTHERS] for name, cells in formatting.paper_reference_rows(shown)}
 
 

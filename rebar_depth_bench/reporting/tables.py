@@ -26,6 +26,7 @@ from rebar_depth_bench.reporting.published import (
 )
 from rebar_depth_bench.scoring.bootstrap import BLOCK_VIEWS, MIN_BLOCKS
 from rebar_depth_bench.scoring.columns import (
+    ALIGNED_METRICS,
     COVERAGE,
     NATIVE,
     ONE_PIXEL,
@@ -45,7 +46,7 @@ from rebar_depth_bench.scoring.columns import (
     texts,
     with_reference,
 )
-from rebar_depth_bench.scoring.protocol import PROTOCOL
+from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND, kind_blocks, relative_findings
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.table import PublishedMatch, Table
 
@@ -116,6 +117,13 @@ _GROUP_SCALED = (*with_reference(SCALED), *SCALED_CONSTANT, SCALE)
 _GROUP_LAYOUTS: Sequence[Sequence[Columns]] = ([[*_GROUP_NATIVE, *_GROUP_SCALED]], [_GROUP_NATIVE, _GROUP_SCALED])
 """Columns of the tables of groups of views."""
 
+_ALIGNED_BASE = (VIEWS_SCORED, COVERAGE, *ALIGNED_METRICS[:5])
+_ALIGNED_LAYOUTS: Sequence[Sequence[Columns]] = (
+    [[*_ALIGNED_BASE, *ALIGNED_METRICS[5:]]],
+    [_ALIGNED_BASE, ALIGNED_METRICS[5:]],
+)
+"""Columns of the tables of predictions that are not metric."""
+
 
 def print_table(result: Result, console: Console) -> None:
     """Print one row per config, followed by its reference errors: in one table if it fits, else in two or three.
@@ -132,20 +140,40 @@ def print_table(result: Result, console: Console) -> None:
     )
     declared = (formatting.inputs_text(result.declared), formatting.ground_truth_text(result.declared))
     print_line(console, "inputs: {}; ground truth: {}".format(*declared), style="dim")
-    _print_rows(_config_rows(result.tables), console, _LAYOUTS, "config")
+    layouts, group_layouts = _LAYOUTS, _GROUP_LAYOUTS
+    if result.prediction is not None:
+        print_line(console, f"{result.prediction}: {ALIGNMENT_BY_KIND[result.prediction]}", style="italic")
+        layouts = group_layouts = _ALIGNED_LAYOUTS
+    _print_rows(_config_rows(result.tables), console, layouts, "config")
     for config, table in result.tables.items():
         if table.groups:
             console.print()
             print_line(console, f"{formatting.config_title(config, table.split)}: groups of views", style="bold")
-            _print_rows(_group_rows(table), console, _GROUP_LAYOUTS, "group")
+            _print_rows(_group_rows(table), console, group_layouts, "group")
     _print_notes(result, console)
 
 
 def _config_rows(tables: Mapping[str, Table]) -> list[Row]:
     rows: list[Row] = []
     for name, table in tables.items():
-        rows.append((formatting.config_title(name, table.split), _row_texts(table), ""))
+        rows += _table_rows(formatting.config_title(name, table.split), table)
         rows += [(f"  {title}", shown, "dim") for title, shown in formatting.reference_rows([("", table)])]
+    return rows
+
+
+def _table_rows(title: str, table: Table) -> list[Row]:
+    """Return the row of a table; of predictions that are not metric those of both alignments and the constant."""
+    if table.aligned is None:
+        return [(title, _row_texts(table), "")]
+    rows: list[Row] = []
+    below = " " * (len(title) - len(title.lstrip()) + 2)
+    shown = {column.path: column.text(column.value(table)) for column in (VIEWS_SCORED, COVERAGE)}
+    named = {title: table.aligned, f"{below}robust": table.aligned_robust, f"{below}constant": table.constant}
+    for name, errors in named.items():
+        if errors is not None:
+            shown |= {column.path: column.text(column.value(errors)) for column in ALIGNED_METRICS}
+            rows.append((name, shown, "dim" if rows else ""))
+            shown = {}
     return rows
 
 
@@ -154,7 +182,8 @@ def _group_rows(table: Table) -> list[Row]:
     rows: list[Row] = []
     for grouping, groups in table.groups.items():
         rows.append((formatting.grouping_title(grouping), {}, "italic"))
-        rows += [(f"  {printable(group)}", _row_texts(of_group), "") for group, of_group in groups.items()]
+        for group, of_group in groups.items():
+            rows += _table_rows(f"  {printable(group)}", of_group)
     return rows
 
 
@@ -181,7 +210,7 @@ def _print_rows(rows: Sequence[Row], console: Console, layouts: Sequence[Sequenc
 
 def _rich_table(rows: Sequence[Row], columns: Columns, head: str) -> RichTable:
     """Return the table of headings, and of the rows that have a text in any of the columns."""
-    heads = [head, *(column.head or f"{column.title}\n{column.unit}" for column in columns)]
+    heads = [head, *(column.head or column.heading.replace(", ", "\n", 1) for column in columns)]
     lines = max(one.count("\n") for one in heads)
     heads = ["\n" * (lines - one.count("\n")) + one for one in heads]
     table = make_grid(heads[0], heads[1:])
@@ -196,16 +225,19 @@ def _rich_table(rows: Sequence[Row], columns: Columns, head: str) -> RichTable:
 
 def _print_notes(result: Result, console: Console) -> None:
     console.print()
-    print_line(
-        console, "Means over views; s: median over views. z: truth, p: prediction. ↓ lower, ↑ higher is better."
-    )
-    print_line(console, f"{formatting.RANK_ERROR_NOTE} {formatting.REFERENCE_NOTE} ‡: not ranked.")
+    if result.prediction is not None:
+        print_line(console, f"Means over views. ↓ lower, ↑ higher is better. {formatting.ALIGNED_NOTE}")
+    else:
+        means = "Means over views; s: median over views. z: truth, p: prediction. ↓ lower, ↑ higher is better."
+        print_line(console, means)
+        print_line(console, f"{formatting.RANK_ERROR_NOTE} {formatting.REFERENCE_NOTE} ‡: not ranked.")
     for name, table in result.tables.items():
         for note in (*formatting.table_notes(table), *formatting.reference_findings(table)):
             print_line(console, f"{printable(name)}: {note}", style="yellow")
     if any(table.groups for table in result.tables.values()):
-        print_line(console, f"{formatting.GROUP_NOTE} Intervals: in JSON and the report.")
-    if any(has_dash(VIEW_COLUMNS, table) for table in result.tables.values()):
+        note = formatting.GROUP_NOTE if result.prediction is None else formatting.ALIGNED_GROUP_NOTE
+        print_line(console, f"{note} Intervals: in JSON and the report.")
+    if any(has_dash(result.columns, table) for table in result.tables.values()):
         print_line(console, formatting.DASH_NOTE)
 
 
@@ -246,7 +278,7 @@ def print_comparison(comparison: Comparison, console: Console) -> None:
         table.add_column("B is")
         for row in rows:
             table.add_row(*map(plain_text, comparison_cells(row)))
-        console.print(table)
+        print_unwrapped(console, table)
     console.print()
     print_line(console, COMPARISON_NOTE)
 
@@ -295,21 +327,40 @@ def print_paper_table(results: Sequence[Result], console: Console, *, published:
     The reference errors of the config follow.
 
     ``results`` must not be empty and must belong to one dataset. With ``published``, the paper's rows of the same
-    scene follow; they are marked and not compared with the results.
+    scene follow; they are marked and not compared with the results. Results that are not metric follow in one
+    block per kind, sorted by aligned error.
     """
     dataset = results[0].dataset
     digest, version = formatting.short_digest(dataset.digest), printable(dataset.version)
-    line = f"protocol {PROTOCOL}, dataset {version} ({digest}), software {software_version()}"
-    print_line(console, line, style="dim")
-    for config in dict.fromkeys(name for result in results for name in result.tables):
-        rows = [(result, result.tables[config]) for result in results if config in result.tables]
-        table = rows[0][1]
-        title = formatting.config_title(config, table.split)
+    for block in kind_blocks(results):
+        kind, protocol = block[0].prediction, block[0].protocol
+        line = f"protocol {protocol}, dataset {version} ({digest}), software {software_version()}"
+        print_line(console, line, style="dim")
+        if kind is not None:
+            print_line(console, f"{kind}: {ALIGNMENT_BY_KIND[kind]}", style="italic")
+        for config in dict.fromkeys(name for result in block for name in result.tables):
+            rows = [(result, result.tables[config]) for result in block if config in result.tables]
+            table = rows[0][1]
+            title = formatting.config_title(config, table.split)
+            console.print()
+            print_line(console, f"{title}, {formatting.counted(table.views, 'view')}", style="italic")
+            rows.sort(key=lambda row: (not row[1].ranked, rounded(row[1].error) or 0.0))
+            if kind is None:
+                console.print(_paper_table(rows, table.published if published else None))
+            else:
+                aligned = [row for result, of in rows for row in _table_rows(printable(result.method, 40), of)]
+                _print_rows(aligned, console, _ALIGNED_LAYOUTS, "")
+                for result, of in rows:
+                    for note in relative_findings(of):
+                        print_line(console, f"{printable(result.method)}: {note}", style="yellow")
         console.print()
-        print_line(console, f"{title}, {formatting.counted(table.views, 'view')}", style="italic")
-        rows.sort(key=lambda row: (not row[1].ranked, rounded(row[1].rank_error) or 0.0))
-        console.print(_paper_table(rows, table.published if published else None))
-    console.print()
+        if kind is None:
+            _print_paper_notes(block, console, published=published)
+        else:
+            print_line(console, formatting.ALIGNED_NOTE)
+
+
+def _print_paper_notes(results: Sequence[Result], console: Console, *, published: bool) -> None:
     print_line(console, "RMSE, AbsRel: native (no alignment). AbsRel_s: scaled (oracle median scale per view).")
     print_line(
         console,

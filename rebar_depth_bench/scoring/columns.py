@@ -1,15 +1,15 @@
 """Columns of tables: one description of every number of a result, from which all of its forms are made.
 
-CSV, data frames, comparisons and intervals have all of ``VIEW_COLUMNS`` and ``TABLE_COLUMNS``; terminal, LaTeX and
-HTML show their groups. A number of a new kind needs a column in ``OTHERS``, a field of the classes in ``table``
-and its computation in ``score``.
+CSV, data frames, comparisons and intervals have all of ``VIEW_COLUMNS`` and ``TABLE_COLUMNS``, or of
+``RELATIVE_COLUMNS`` for predictions that are not metric; terminal, LaTeX and HTML show their groups. A number of a
+new kind needs a column in ``OTHERS``, a field of the classes in ``table`` and its computation in ``score``.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from decimal import ROUND_DOWN, Decimal
 from typing import Annotated, Any, Literal
 
@@ -134,7 +134,9 @@ class Column:
     def name(self) -> str:
         """Name of the column in frames and CSV."""
         parts = self.path.removeprefix("reference.").split(".")
-        return f"within_{parts[1]}mm" if parts[0] == "within_mm" else "_".join(parts)
+        if parts[-2:-1] == ["within_mm"]:
+            parts[-2:] = [f"within_{parts[-1]}mm"]
+        return "_".join(parts)
 
     @property
     def heading(self) -> str:
@@ -212,15 +214,12 @@ METRICS: Mapping[str, Column] = {
 """Presentation of each field of ``DepthMetrics``, in order, in all tables and pages."""
 
 
-def _aligned(alignment: str, name: str) -> Column:
-    metric = METRICS[name]
-    return Column(
-        path=f"{alignment}.{name}",
-        title=f"{alignment} {metric.title}",
-        unit=metric.unit,
-        better=metric.better,
-        decimals=metric.decimals,
-        head=f"{alignment}\n{metric.title} {ARROWS[metric.better]}\n{metric.unit}",
+def _aligned(alignment: str, metric: Column) -> Column:
+    return replace(
+        metric,
+        path=f"{alignment}.{metric.path}",
+        title=f"{alignment} {metric.title}".replace("_", " "),
+        head=f"{alignment.removeprefix('aligned_')}\n{metric.title} {ARROWS[metric.better]}\n{metric.unit}",
     )
 
 
@@ -251,7 +250,7 @@ COVERAGE = Column(
     of_all_views=True,
 )
 RANK_ERROR = Column("rank_error", "rank error", better="lower", head="rank\nerror ↓\n", of_all_views=True)
-NATIVE, SCALED = (tuple(_aligned(alignment, name) for name in METRICS) for alignment in ALIGNMENTS)
+NATIVE, SCALED = (tuple(_aligned(alignment, one) for one in METRICS.values()) for alignment in ALIGNMENTS)
 SCALE = Column(
     "scale_median", "scale s, median", decimals=3, head="scale\ns\n", of_view="scale", statistic="median"
 )
@@ -285,7 +284,22 @@ TABLE_COLUMNS = (_VIEWS, _SCORED, COVERAGE, _RANKED, *VIEW_COLUMNS[1:], *CONSTAN
 """Columns of a config's table in frames and CSV."""
 PAPER_COLUMNS = (NATIVE[1], NATIVE[0], SCALED[0], SCALE)
 """Columns of the paper's Table I: RMSE and AbsRel native, AbsRel scaled, and the median s."""
-COLUMN_BY_PATH: Mapping[str, Column] = {column.path: column for column in VIEW_COLUMNS}
+
+ALIGNED_METRICS = (Column("error", "error", better="lower", of_all_views=True), *METRICS.values(), *WITHIN)
+"""Columns of the numbers of an alignment, whose paths begin at it."""
+RELATIVE_ALIGNMENTS = ("aligned", "aligned_robust", "constant")
+"""Alignments of predictions that are not metric: that of their kind, its robust variant, and its constant."""
+ALIGNED, ALIGNED_ROBUST, ALIGNED_CONSTANT = (
+    tuple(_aligned(alignment, one) for one in ALIGNED_METRICS) for alignment in RELATIVE_ALIGNMENTS
+)
+"""Columns of these: the error over all scored pixels, the metrics, and the shares within a tolerance."""
+RELATIVE_COLUMNS = (COVERAGE, *ALIGNED, *ALIGNED_ROBUST, *ALIGNED_CONSTANT)
+"""Columns of the numbers of a view, and of a table, of predictions that are not metric."""
+FLAT_VIEWS = Column("flat_views", "views without positive slope", of_view="is_flat")
+RELATIVE_TABLE_COLUMNS = (_VIEWS, _SCORED, FLAT_VIEWS, COVERAGE, _RANKED, *RELATIVE_COLUMNS[1:])
+"""Columns of a config's table of such predictions in frames and CSV."""
+RELATIVE_INTERVALS = tuple(column for column in RELATIVE_COLUMNS if "within_mm" not in column.path)
+"""Those of them that have intervals."""
 
 
 def with_reference(columns: Sequence[Column]) -> list[Column]:
@@ -303,33 +317,40 @@ def texts(columns: Sequence[Column], table: Any) -> list[str]:
     return [column.text(column.value(table)) for column in columns]
 
 
-def view_intervals(views: Sequence[Any], *, by_scene: bool) -> dict[str, Interval | None]:
-    """Return the 95 % interval of each of ``VIEW_COLUMNS`` by path; ``by_scene`` as in ``resample_views``."""
-    values = view_values(views)
+def view_intervals(
+    views: Sequence[Any], columns: Sequence[Column] = VIEW_COLUMNS, *, by_scene: bool
+) -> dict[str, Interval | None]:
+    """Return the 95 % interval of each of ``columns`` by path; ``by_scene`` as in ``resample_views``."""
+    values = view_values(views, columns)
     resampling = resample_views([view.view_id for view in views], by_scene=by_scene)
-    return column_intervals(bootstrap_estimates(values, resampling), values, resampling)
+    return column_intervals(bootstrap_estimates(values, columns, resampling), values, columns, resampling)
 
 
 def column_intervals(
-    estimates: Float64[ndarray, "draws k"], values: Float64[ndarray, "n k"], resampling: Resampling
+    estimates: Float64[ndarray, "draws k"],
+    values: Float64[ndarray, "n k"],
+    columns: Sequence[Column],
+    resampling: Resampling,
 ) -> dict[str, Interval | None]:
-    """Return the interval of each of ``VIEW_COLUMNS`` from its estimates; ``values`` is NaN where it has none."""
+    """Return the interval of each of ``columns`` from its estimates; ``values`` is NaN where it has none."""
     return {
         column.path: interval(estimates[:, k], resampling.blocks(np.flatnonzero(~np.isnan(values[:, k]))))
-        for k, column in enumerate(VIEW_COLUMNS)
+        for k, column in enumerate(columns)
     }
 
 
-def bootstrap_estimates(values: Float64[ndarray, "n k"], resampling: Resampling) -> Float64[ndarray, "draws k"]:
-    """Return the table's ``VIEW_COLUMNS`` in each resample of ``view_values``; NaN where undefined."""
+def bootstrap_estimates(
+    values: Float64[ndarray, "n k"], columns: Sequence[Column], resampling: Resampling
+) -> Float64[ndarray, "draws k"]:
+    """Return the table's ``columns`` in each resample of ``view_values``; NaN where undefined."""
     draws = resampling.means(values)
-    for k, column in enumerate(VIEW_COLUMNS):
+    for k, column in enumerate(columns):
         if column.statistic == "median":
             draws[:, k] = resampling.medians(values[:, k])
     return draws
 
 
-def view_values(views: Sequence[Any]) -> Float64[ndarray, "n k"]:
-    """Return the ``VIEW_COLUMNS`` of each view, one row per view; NaN where it has no value."""
-    rows = [[column.view_value(view) for column in VIEW_COLUMNS] for view in views]
-    return np.array(rows, dtype=np.float64).reshape(len(views), len(VIEW_COLUMNS))
+def view_values(views: Sequence[Any], columns: Sequence[Column]) -> Float64[ndarray, "n k"]:
+    """Return the ``columns`` of each view, one row per view; NaN where it has no value."""
+    rows = [[column.view_value(view) for column in columns] for view in views]
+    return np.array(rows, dtype=np.float64).reshape(len(views), len(columns))

@@ -16,8 +16,6 @@ from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.base.names import config_of
 from rebar_depth_bench.scoring.bootstrap import INTERVALS, Interval, resample_views
 from rebar_depth_bench.scoring.columns import (
-    COLUMN_BY_PATH,
-    VIEW_COLUMNS,
     Column,
     bootstrap_estimates,
     column_intervals,
@@ -27,7 +25,6 @@ from rebar_depth_bench.scoring.columns import (
 )
 from rebar_depth_bench.scoring.evaluation import Provenance
 from rebar_depth_bench.scoring.frames import differences_frame
-from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.table import ViewScore
 
@@ -81,9 +78,14 @@ class Comparison:
 def compare(first: Result, other: Result) -> Comparison:
     """Return the differences of ``other`` from ``first``.
 
-    Raises ``InputError`` if they were scored against different ground truth, have no config in common, or cover
-    different splits of one.
+    Raises ``InputError`` if they were scored against different ground truth or are of different kinds, have no
+    config in common, or cover different splits of one.
     """
+    if first.kind != other.kind:
+        raise InputError(
+            f"{other.method} has predictions of the kind {other.kind}, expected {first.kind} as {first.method}: "
+            "errors after different alignments cannot be compared; --align scores metric ones as another kind"
+        )
     if first.dataset.digest != other.dataset.digest:
         raise InputError(
             f"{other.method} was scored on the dataset {other.dataset.digest}, expected {first.dataset.digest} as "
@@ -97,7 +99,7 @@ def compare(first: Result, other: Result) -> Comparison:
             "expected a config that is in both"
         )
     return Comparison(
-        provenance=Provenance(PROTOCOL, first.dataset, (first.submission, other.submission)),
+        provenance=Provenance(first.protocol, first.dataset, (first.submission, other.submission)),
         configs={config: _config_differences(first, other, config) for config in shared},
     )
 
@@ -121,36 +123,46 @@ def _config_differences(first: Result, other: Result, config: str) -> list[Diffe
         {view.view_id: view for view in result.views if config_of(view.view_id) == config}
         for result in (first, other)
     )
-    predicted_by_both = [view_id for view_id in of_first if of_first[view_id].native and of_other[view_id].native]
+    predicted_by_both = [
+        view_id for view_id in of_first if of_first[view_id].coverage and of_other[view_id].coverage
+    ]
     on_all_views, on_predicted_by_both = (
         _differences_on_views(
             [of_first[view_id] for view_id in view_ids],
             [of_other[view_id] for view_id in view_ids],
+            first.columns,
             by_scene=tables[0].split is not None,
             are_comparable=all(table.is_comparable for table in tables),
         )
         for view_ids in (of_first, predicted_by_both)
     )
     return [
-        (on_all_views if column.of_all_views else on_predicted_by_both)[column.path] for column in VIEW_COLUMNS
+        (on_all_views if column.of_all_views else on_predicted_by_both)[column.path] for column in first.columns
     ]
 
 
 def _differences_on_views(
-    first: Sequence[ViewScore], other: Sequence[ViewScore], *, by_scene: bool, are_comparable: bool
+    first: Sequence[ViewScore],
+    other: Sequence[ViewScore],
+    columns: Sequence[Column],
+    *,
+    by_scene: bool,
+    are_comparable: bool,
 ) -> dict[str, Difference]:
     """Return the differences on the given views by metric name, with the same resamples for both submissions."""
     resampling = resample_views([view.view_id for view in first], by_scene=by_scene)
-    first_values, other_values = view_values(first), view_values(other)
-    draws = bootstrap_estimates(other_values, resampling) - bootstrap_estimates(first_values, resampling)
-    intervals = column_intervals(draws, first_values + other_values, resampling)
+    first_values, other_values = view_values(first, columns), view_values(other, columns)
+    first_draws, other_draws = (
+        bootstrap_estimates(values, columns, resampling) for values in (first_values, other_values)
+    )
+    intervals = column_intervals(other_draws - first_draws, first_values + other_values, columns, resampling)
     differences = {}
-    for name, bounds in intervals.items():
-        column = COLUMN_BY_PATH[name]
+    for column in columns:
+        bounds = intervals[column.path]
         first_value, other_value = (_table_value(column, views) for views in (first, other))
         change = None if first_value is None or other_value is None else other_value - first_value
         verdict = _verdict(column, bounds) if are_comparable or column.of_all_views else "no verdict"
-        differences[name] = Difference(
+        differences[column.path] = Difference(
             column, len(first), first_value, other_value, change, bounds, verdict if column.better else ""
         )
     return differences

@@ -18,7 +18,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from rebar_depth_bench import software_version
-from rebar_depth_bench.base.errors import SubmissionError
+from rebar_depth_bench.base.errors import InputError, SubmissionError, escape_text
 from rebar_depth_bench.base.names import TEST_SPLIT, config_of, split_of
 from rebar_depth_bench.base.parallel import Progress, map_with_progress, silent
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_folder
@@ -26,11 +26,13 @@ from rebar_depth_bench.data.rows import camera_from_row, decode_row
 from rebar_depth_bench.data.schema import CAMERA_SHAPES
 from rebar_depth_bench.data.shards import encoded_rows
 from rebar_depth_bench.geometry.cameras import Camera
-from rebar_depth_bench.scoring.protocol import PROTOCOL
+from rebar_depth_bench.scoring.protocol import PROTOCOL, RELATIVE_PROTOCOL
+from rebar_depth_bench.scoring.relative import metric_as
 from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareIdentity, SubmissionIdentity
 from rebar_depth_bench.scoring.score import ReadDepth, UseView, score_views
 from rebar_depth_bench.scoring.truth import config_truth
 from rebar_depth_bench.submission import EntryError, SubmissionMeta, SubmissionReader
+from rebar_depth_bench.submission.declaration import METRIC, PREDICTION_KINDS
 
 _Found = TypeVar("_Found")
 
@@ -136,6 +138,11 @@ class Evaluation:
         if problems:
             raise SubmissionError.from_problems(self.submission.path, problems)
 
+    def require_metric(self, use: str) -> None:
+        """Raise ``SubmissionError`` unless the predictions are metric, which ``use`` requires."""
+        if problems := self.meta.kind_problems(use):
+            raise SubmissionError.from_problems(self.submission.path, problems)
+
     def provenance(self) -> Provenance:
         """Return the provenance of an analysis of the submission."""
         archive = SubmissionIdentity(self.meta.method, self.submission.sha256())
@@ -144,14 +151,16 @@ class Evaluation:
 
 @contextmanager
 def open_evaluation(
-    archive: str | os.PathLike[str], root: str | Path, *, expect_digest: str | None = None
+    archive: str | os.PathLike[str], root: str | Path | DatasetFolder, *, expect_digest: str | None = None
 ) -> Iterator[Evaluation]:
     """Open an archive and a dataset folder or Hub repository, and close the archive when the block ends.
+
+    A folder that is open already may be restricted to some configs and views, which the archive then has.
 
     Raises ``SubmissionError`` with all problems, also those of single entries, if the structure of the archive is
     invalid, and ``DatasetError`` if the dataset folder is, or if its digest is not ``expect_digest``.
     """
-    folder = open_folder(root, expect_digest=expect_digest)
+    folder = root if isinstance(root, DatasetFolder) else open_folder(root, expect_digest=expect_digest)
     with SubmissionReader(archive, folder.expected_views()) as submission:
         if submission.structure_problems:
             raise SubmissionError.from_problems(archive, list(submission.problems()))
@@ -164,9 +173,12 @@ def score(
     *,
     workers: int | None = None,
     expect_digest: str | None = None,
+    align: str | None = None,
     progress: Progress = silent,
 ) -> Result:
     """Score an archive against a dataset folder or Hub repository.
+
+    An archive is scored by the kind of its predictions; ``align`` scores a metric one as one of another kind.
 
     Views are read directly from the archive and scored on ``workers`` threads (default: one per core); only a few
     views are in memory at a time. The result does not depend on the number of workers.
@@ -175,33 +187,42 @@ def score(
     dataset folder is invalid or its digest is not ``expect_digest``.
     """
     with open_evaluation(archive, root, expect_digest=expect_digest) as evaluation:
-        return score_evaluation(evaluation, workers=workers, progress=progress)
+        return score_evaluation(evaluation, workers=workers, align=align, progress=progress)
 
 
 def score_evaluation(
     evaluation: Evaluation,
     *,
     workers: int | None = None,
+    align: str | None = None,
     progress: Progress = silent,
     use_view: UseView | None = None,
 ) -> Result:
     """Score an open submission as ``score`` does; ``use_view`` is called on its threads, as in ``score_views``.
 
-    Raises ``SubmissionError`` if an entry is invalid.
+    Raises ``SubmissionError`` if an entry is invalid, and for ``align`` with an archive that is neither metric nor
+    of that kind, and ``InputError`` if ``align`` is no kind.
     """
     submission, folder, meta = evaluation.submission, evaluation.folder, evaluation.meta
+    kind, read = align or meta.prediction, submission.read
+    if kind not in PREDICTION_KINDS:
+        raise InputError(f"align is {escape_text(kind)}, expected one of {', '.join(PREDICTION_KINDS)}")
+    if kind != meta.prediction:
+        evaluation.require_metric(f"only they can be aligned as {kind}")
+        read = lambda view_id: metric_as(submission.read(view_id), kind)  # noqa: E731
     truths = ((config.name, config_truth(folder, config, progress)) for config in evaluation.configs)
     with ThreadPoolExecutor(1) as pool:
         sha256 = pool.submit(submission.sha256)
         try:
             tables, views = score_views(
                 truths,
-                submission.read,
+                read,
                 meta.declaration,
                 lambda name, work, positions: map_with_progress(
                     work, positions, workers, progress, f"scoring {name}", len(positions)
                 ),
                 use_view,
+                kind,
             )
             for view_id in set(submission.view_ids) - {view.view_id for view in views}:
                 submission.read(view_id)  # A view without scored pixels.
@@ -214,4 +235,6 @@ def score_evaluation(
             software=SoftwareIdentity(software_version()),
             tables=tables,
             views=views,
+            protocol=PROTOCOL if kind == METRIC else RELATIVE_PROTOCOL,
+            prediction=None if kind == METRIC else kind,
         )

@@ -8,29 +8,32 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from rebar_depth_bench.base.errors import printable
 from rebar_depth_bench.base.names import config_of
-from rebar_depth_bench.scoring.columns import TABLE_COLUMNS, VIEW_COLUMNS, rounded, rounded_interval
+from rebar_depth_bench.scoring.columns import (
+    FLAT_VIEWS,
+    RELATIVE_INTERVALS,
+    RELATIVE_TABLE_COLUMNS,
+    TABLE_COLUMNS,
+    VIEW_COLUMNS,
+    rounded,
+    rounded_interval,
+)
+from rebar_depth_bench.scoring.relative import kind_blocks
 
 if TYPE_CHECKING:
     from pandas import DataFrame
 
     from rebar_depth_bench.scoring.result import Result
-    from rebar_depth_bench.scoring.table import Table, ViewScore
+    from rebar_depth_bench.scoring.table import Table
 
 _MAX_TEXT_CHARACTERS = 10_000
 _FORMULA_STARTS = ("=", "+", "-", "@")
 _DECLARED_COLUMNS = ("protocol", "method", "inputs", "uses_ground_truth")
-_NUMBER_COLUMNS = (
-    *(column.name for column in TABLE_COLUMNS),
-    *(f"{column.name}_{end}" for column in VIEW_COLUMNS for end in ("low", "high")),
-    *("dataset_digest", "dataset_version", "submission_sha256", "software_version"),
-)
-_TABLE_FRAME_COLUMNS = (*_DECLARED_COLUMNS, "config", *_NUMBER_COLUMNS)
-_GROUP_FRAME_COLUMNS = (*_DECLARED_COLUMNS, "config", "split", "grouping", "group", *_NUMBER_COLUMNS)
+_METRIC_COLUMNS = (TABLE_COLUMNS, VIEW_COLUMNS)
 _DIFFERENCE_COLUMNS = (
     *("first_method", "other_method", "config", "number", "views", "first", "other", "difference", "low", "high"),
     *("verdict", "protocol", "dataset_digest", "software_version", "first_sha256", "other_sha256"),
@@ -60,41 +63,70 @@ def frame_of_values(columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> Da
 def tables_frame(results: Sequence[Result]) -> DataFrame:
     """Return one row per result and config, with provenance.
 
-    The 95 % interval of a metric is in the columns ``<metric>_low`` and ``<metric>_high``.
+    The 95 % interval of a metric is in the columns ``<metric>_low`` and ``<metric>_high``. Results that are not
+    metric have the column ``prediction``; numbers that only other kinds have are undefined. The rows are in the
+    order of ``kind_blocks``.
     """
-    rows = [_table_row(result, table, (config,)) for result in results for config, table in result.tables.items()]
-    return frame_of_values(_TABLE_FRAME_COLUMNS, rows)
+    return _frame(
+        results, ("config",), lambda result: [((config,), table) for config, table in result.tables.items()]
+    )
 
 
 def groups_frame(results: Sequence[Result]) -> DataFrame:
     """Return one row per result, config, grouping and group as ``tables_frame``; others have none."""
-    rows = [
-        _table_row(result, of_group, (config, table.split, grouping, group))
-        for result in results
-        for config, table in result.tables.items()
-        for grouping, tables in table.groups.items()
-        for group, of_group in tables.items()
-    ]
-    return frame_of_values(_GROUP_FRAME_COLUMNS, rows)
-
-
-def _table_row(result: Result, table: Table, names: Sequence[Any]) -> tuple[Any, ...]:
-    ends = (rounded_interval(table.intervals.get(column.path)) or (None, None) for column in VIEW_COLUMNS)
-    submission = result.submission
-    return (
-        *(result.protocol, submission.method, submission.inputs, submission.uses_ground_truth),
-        *names,
-        *(column.value(table) for column in TABLE_COLUMNS),
-        *(end for both in ends for end in both),
-        *(result.dataset.digest, result.dataset.version, submission.sha256, result.software.version),
+    return _frame(
+        results,
+        ("config", "split", "grouping", "group"),
+        lambda result: [
+            ((config, table.split, grouping, group), of_group)
+            for config, table in result.tables.items()
+            for grouping, tables in table.groups.items()
+            for group, of_group in tables.items()
+        ],
     )
 
 
-def views_frame(views: Sequence[ViewScore]) -> DataFrame:
+def _frame(
+    results: Sequence[Result],
+    names: Sequence[str],
+    tables_of: Callable[[Result], Iterable[tuple[Sequence[Any], Table]]],
+) -> DataFrame:
+    """Return one row per table of the results; ``tables_of`` returns these and their ``names``."""
+    import pandas as pd
+
+    frames = []
+    for block in kind_blocks(results) or [[]]:
+        kind = [result.prediction for result in block[:1] if result.prediction is not None]
+        columns, with_interval = (RELATIVE_TABLE_COLUMNS, RELATIVE_INTERVALS) if kind else _METRIC_COLUMNS
+        head = (
+            *(*_DECLARED_COLUMNS, *(["prediction"] if kind else []), *names),
+            *(column.name for column in columns),
+            *(f"{column.name}_{end}" for column in with_interval for end in ("low", "high")),
+            *("dataset_digest", "dataset_version", "submission_sha256", "software_version"),
+        )
+        rows = []
+        for result in block:
+            submission, dataset = result.submission, result.dataset
+            declared = (result.protocol, submission.method, submission.inputs, submission.uses_ground_truth)
+            provenance = (dataset.digest, dataset.version, submission.sha256, result.software.version)
+            for named, table in tables_of(result):
+                ends = (rounded_interval(table.intervals.get(one.path)) or (None, None) for one in with_interval)
+                numbers = (*(column.value(table) for column in columns), *(end for both in ends for end in both))
+                rows.append((*declared, *kind, *named, *numbers, *provenance))
+        frames.append(frame_of_values(head, rows))
+    if len(frames) == 1:
+        return frames[0]
+    joined = pd.concat(frames, ignore_index=True)
+    return joined.astype({"flat_views": "Int64"})
+
+
+def views_frame(result: Result) -> DataFrame:
     """Return one row per view; undefined metrics are NaN."""
-    names = [column.of_view or column.name for column in VIEW_COLUMNS]
-    names.insert(2, names.pop(names.index("scale")))
-    by_name = {column.of_view or column.name: column for column in VIEW_COLUMNS}
+    columns = result.columns if result.prediction is None else (*result.columns, FLAT_VIEWS)
+    by_name = {column.of_view or column.name: column for column in columns}
+    names = list(by_name)
+    if "scale" in by_name:
+        names.insert(2, names.pop(names.index("scale")))
     rows = [
         (
             config_of(view.view_id),
@@ -102,7 +134,7 @@ def views_frame(views: Sequence[ViewScore]) -> DataFrame:
             view.scored_px,
             *(by_name[name].view_value(view) for name in names),
         )
-        for view in views
+        for view in result.views
     ]
     return frame_of_values(("config", "view_id", "scored_px", *names) if rows else (), rows)
 

@@ -12,6 +12,9 @@ from numpy import ndarray
 PROTOCOL = "rebar-2"
 """Name of the scoring protocol."""
 
+RELATIVE_PROTOCOL = "rebar-relative-1"
+"""Name of the protocol of predictions that are not metric, see ``relative``."""
+
 WITHIN_MM = (3, 5, 10, 20)
 """Tolerances in millimetres for the share of scored pixels within a given absolute error."""
 

@@ -6,6 +6,7 @@ The classes mirror the JSON. Unknown keys are ignored, because results of later 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -30,8 +31,23 @@ from rebar_depth_bench.base.reading import parse_json
 from rebar_depth_bench.base.validation import StrictModel, field_error, one_of, validate_document, validate_table
 from rebar_depth_bench.scoring import frames
 from rebar_depth_bench.scoring.bootstrap import INTERVALS
-from rebar_depth_bench.scoring.columns import Share
-from rebar_depth_bench.scoring.protocol import PROTOCOL
+from rebar_depth_bench.scoring.columns import (
+    ALIGNED,
+    ALIGNED_CONSTANT,
+    ALIGNED_ROBUST,
+    COVERAGE,
+    NATIVE,
+    RANK_ERROR,
+    RELATIVE_COLUMNS,
+    SCALED,
+    SCALED_CONSTANT,
+    VIEW_COLUMNS,
+    WITHIN,
+    Column,
+    Share,
+)
+from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, PROTOCOL, RELATIVE_PROTOCOL
+from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND, relative_findings
 from rebar_depth_bench.scoring.table import (
     LIMITED,
     Count,
@@ -43,7 +59,7 @@ from rebar_depth_bench.scoring.table import (
     ViewScore,
     check_tables,
 )
-from rebar_depth_bench.submission.declaration import INPUTS, Declaration
+from rebar_depth_bench.submission.declaration import INPUTS, METRIC, PREDICTION_KINDS, Declaration
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -55,6 +71,20 @@ _NOTEBOOK_COLUMNS = (
     *("config", "views", "views_scored", "coverage", "ranked", "rank_error"),
     *("native_abs_rel", "native_rmse_cm", "scaled_abs_rel", "scaled_rmse_cm", "scale_median"),
 )
+
+_RELATIVE_NOTEBOOK_COLUMNS = (
+    *("config", "views", "views_scored", "coverage", "flat_views", "aligned_error", "constant_error"),
+    *("aligned_abs_rel", "aligned_robust_abs_rel", "constant_abs_rel", "aligned_within_5mm"),
+)
+_SUMMARY = (
+    (COVERAGE, RANK_ERROR, NATIVE[0], SCALED[0], SCALED_CONSTANT[0], WITHIN[1]),
+    ("coverage", "rank error", "AbsRel", "scaled", "constant", "within 5 mm"),
+)
+_RELATIVE_SUMMARY = (
+    (COVERAGE, *ALIGNED[:2], ALIGNED_ROBUST[1], ALIGNED_CONSTANT[1], ALIGNED[6]),
+    ("coverage", "aligned error", "AbsRel", "robust AbsRel", "constant", "within 5 mm"),
+)
+"""Columns that ``print(result)`` shows, and their headings."""
 
 
 @dataclass(frozen=True)
@@ -108,11 +138,13 @@ if not TYPE_CHECKING:
 class Result:
     """Result of scoring one submission, with the digests and versions of its inputs.
 
-    ``intervals`` states how the intervals were computed; None in a file of an earlier version, which does not.
-    ``extended`` are the extended measures, None in a result that was read from a file.
+    ``prediction`` is the kind of predictions that are not metric. ``intervals`` states how the intervals were
+    computed; None in a file of an earlier version, which does not. ``extended`` are the extended measures, None in
+    a result that was read from a file.
     """
 
-    protocol: Annotated[str, Strict(), one_of(PROTOCOL)] = PROTOCOL
+    protocol: Annotated[str, Strict(), one_of(PROTOCOL, RELATIVE_PROTOCOL)] = PROTOCOL
+    prediction: Annotated[str, Strict(), one_of(*PREDICTION_KINDS)] | None = None
     dataset: DatasetIdentity
     submission: SubmissionIdentity
     software: SoftwareIdentity
@@ -125,6 +157,18 @@ class Result:
     def method(self) -> str:
         """Name of the method."""
         return self.submission.method
+
+    @property
+    def kind(self) -> str:
+        """Kind of its predictions, one of ``PREDICTION_KINDS``."""
+        return self.prediction or METRIC
+
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """Columns of the numbers of its views."""
+        if self.prediction is None:
+            return VIEW_COLUMNS
+        return (COVERAGE, *ALIGNED, *ALIGNED_CONSTANT) if self.prediction == "scale" else RELATIVE_COLUMNS
 
     @property
     def declared(self) -> Declaration:
@@ -150,11 +194,62 @@ class Result:
         if rows == "groups":
             return frames.groups_frame([self])
         if rows == "views":
-            return frames.views_frame(self.views)
+            return frames.views_frame(self)
         if rows == "extended" and self.extended is not None:
             return self.extended.to_pandas()
         expected = "'tables', 'groups', 'views', or 'extended' for a result that has them"
         raise ValueError(f"rows is {rows!r}, expected {expected}")
+
+    @property
+    def metrics(self) -> dict[str, float]:
+        """Numbers of the tables by config and place in the JSON, as "lattice/native/abs_rel"; NaN if undefined."""
+        values = {
+            f"{name}/{column.path.replace('.', '/')}": column.value(table)
+            for name, table in self.tables.items()
+            for column in self.columns
+        }
+        return {name: math.nan if value is None else float(value) for name, value in values.items()}
+
+    def __str__(self) -> str:
+        """Return the main numbers of each config as a table, with what limits them."""
+        columns, heads = _SUMMARY if self.prediction is None else _RELATIVE_SUMMARY
+        rows = [[printable(self.method), *heads]]
+        notes = dict[str, list[str]]()
+        for name, table in self.tables.items():
+            cells = (f"{column.text(column.value(table))} {column.unit}".strip() for column in columns)
+            rows.append([printable(name), *cells])
+            for note in self._short_notes(name):
+                notes.setdefault(note, []).append(printable(name))
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        lines = [
+            "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip() for row in rows
+        ]
+        lines += [
+            note if len(names) == len(self.tables) else f"{', '.join(names)}: {note}"
+            for note, names in notes.items()
+        ]
+        return "\n".join(lines)
+
+    def _short_notes(self, name: str) -> list[str]:
+        """Return the notes on a config that are printed with its numbers."""
+        table = self.tables[name]
+        notes = self.kind_notes
+        if table.of_views is not None:
+            notes.append(f"{table.views} of {table.of_views} views: not ranked")
+        notes += relative_findings(table)
+        if table.views and not table.is_comparable:
+            is_low = (table.coverage or 0.0) < MIN_COMPARABLE_COVERAGE
+            low = f"coverage below {MIN_COMPARABLE_COVERAGE * 100:.0f} %"
+            reason = low if is_low else "views without predictions, or numbers that overflowed"
+            notes.append(f"{reason}: errors of valid predictions are not comparable")
+        return notes
+
+    @property
+    def kind_notes(self) -> list[str]:
+        """A sentence on the kind of predictions that are not metric; none of metric ones."""
+        if self.prediction is None:
+            return []
+        return [f"{self.prediction}: {ALIGNMENT_BY_KIND[self.prediction]}; not ranked"]
 
     def __repr__(self) -> str:
         """Return the method, the numbers of the first ten configs, and the number of views."""
@@ -165,9 +260,10 @@ class Result:
 
     def _repr_html_(self) -> str:
         """Return the method, its provenance and the tables for notebooks."""
-        frame = self.to_pandas()[[*_NOTEBOOK_COLUMNS]]
+        frame = self.to_pandas()[[*(_NOTEBOOK_COLUMNS if self.prediction is None else _RELATIVE_NOTEBOOK_COLUMNS)]]
         frame["config"] = frame["config"].map(printable)
-        provenance = f"protocol {self.protocol}, dataset {self.dataset.version} ({self.dataset.digest[:19]})"
+        kind = "" if self.prediction is None else f" ({self.prediction})"
+        provenance = f"protocol {self.protocol}{kind}, dataset {self.dataset.version} ({self.dataset.digest[:19]})"
         head = f"<p><b>{escape(printable(self.method))}</b>, {escape(printable(provenance))}</p>"
         return head + str(frame.to_html(index=False, na_rep="–", float_format="{:.4g}".format, border=0))
 
@@ -190,8 +286,12 @@ def _check_views(result: Result) -> Result:
     groups = [
         table for tables in result.tables.values() for group in tables.groups.values() for table in group.values()
     ]
-    if any(table.views and table.rank_error is None for table in (*result.tables.values(), *groups)):
-        raise field_error("a table of views has no rank_error", "one in each of them", "missing")
+    number = "rank_error" if result.prediction is None else "aligned"
+    if any(table.views and getattr(table, number) is None for table in (*result.tables.values(), *groups)):
+        raise field_error(f"a table of views has no {number}", "one in each of them", "missing")
+    if (result.protocol == RELATIVE_PROTOCOL) != (result.prediction is not None):
+        found = f"the protocol is {result.protocol} and prediction is {result.prediction}"
+        raise field_error(found, f"{RELATIVE_PROTOCOL} for predictions that are not metric", "conflict")
     return result
 
 
@@ -213,6 +313,8 @@ def read_result(data: bytes, where: str) -> Result:
 
 
 def _describe_table(table: Table) -> str:
+    if table.aligned is not None and table.constant is not None:
+        return f"aligned error {table.aligned.error:.4g}, constant {table.constant.error:.4g}, not ranked"
     if table.native is None or table.scaled is None:
         return "no predictions"
     note = "" if table.ranked else ", not ranked"

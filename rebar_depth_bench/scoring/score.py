@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt32
 from numpy import ndarray
 
-from rebar_depth_bench.scoring.columns import COLUMN_BY_PATH, view_intervals
+from rebar_depth_bench.scoring.columns import RELATIVE_INTERVALS, VIEW_COLUMNS, view_intervals
 from rebar_depth_bench.scoring.groups import GROUPINGS, ViewTraits, positions_by_group
 from rebar_depth_bench.scoring.metrics import (
     is_valid_prediction,
@@ -36,8 +36,9 @@ from rebar_depth_bench.scoring.reference import (
     constant_errors,
     mean_reference,
 )
+from rebar_depth_bench.scoring.relative import align_view, mean_errors
 from rebar_depth_bench.scoring.table import PublishedMatch, Table, ViewScore
-from rebar_depth_bench.submission.declaration import NOT_DECLARED, Declaration
+from rebar_depth_bench.submission.declaration import METRIC, NOT_DECLARED, Declaration
 
 ReadDepth = Callable[[str], Float[ndarray, "h w"]]
 """Function that returns the predicted planar depth of a view in metres, by view id."""
@@ -95,25 +96,33 @@ def score_views(
     declared: Declaration = NOT_DECLARED,
     each: Each = lambda _, work, positions: map(work, positions),
     use_view: UseView | None = None,
+    kind: str = METRIC,
 ) -> tuple[dict[str, Table], list[ViewScore]]:
     """Return the tables by config, and the scores of all views.
 
-    ``truths`` are names and ground truth of configs. One view is in memory at a time, unless ``each`` computes
-    several at once. ``use_view`` is called with each view, for further measures of the same depth.
+    ``truths`` are names and ground truth of configs, ``kind`` is that of the predictions. One view is in memory at
+    a time, unless ``each`` computes several at once. ``use_view`` is called with each view, for further measures
+    of the same depth.
     """
     tables: dict[str, Table] = {}
     views: list[ViewScore] = []
     for name, truth in truths:
-        scores = list(each(name, partial(_score_at, truth, read_depth, use_view), range(len(truth.view_ids))))
+        work = partial(_score_at, truth, read_depth, use_view, kind)
+        scores = list(each(name, work, range(len(truth.view_ids))))
         tables[name] = tabulate_config(scores, truth, declared)
         views += scores
     return tables, views
 
 
-def _score_at(truth: Truth, read_depth: ReadDepth, use_view: UseView | None, position: int) -> ViewScore:
+def _score_at(
+    truth: Truth, read_depth: ReadDepth, use_view: UseView | None, kind: str, position: int
+) -> ViewScore:
     view = truth.read(position)
     prediction_m = read_depth(view.view_id)
-    score = score_view(view, prediction_m)
+    if kind == METRIC:
+        score = score_view(view, prediction_m)
+    else:
+        score = align_view(view.view_id, _at_pixels(prediction_m, view), view.depth_m, kind)
     if use_view is not None:
         use_view(prediction_m, score)
     return score
@@ -121,7 +130,7 @@ def _score_at(truth: Truth, read_depth: ReadDepth, use_view: UseView | None, pos
 
 def score_view(truth: ViewTruth, prediction_m: Float[ndarray, "h w"]) -> ViewScore:
     """Return the metrics of one view's prediction (planar depth, metres) on the view's scored pixels."""
-    p_m, z_m, z_median_m = prediction_m.ravel().take(truth.index.astype(np.intp)), truth.depth_m, truth.median_m
+    p_m, z_m, z_median_m = _at_pixels(prediction_m, truth), truth.depth_m, truth.median_m
     valid = is_valid_prediction(p_m)
     error = rank_error(p_m, z_m, valid)
     constant = truth.constant
@@ -147,6 +156,10 @@ def score_view(truth: ViewTruth, prediction_m: Float[ndarray, "h w"]) -> ViewSco
         within_mm={tolerance_mm: count / scored_px for tolerance_mm, count in within.items()},
         scaled_constant=constant or constant_errors(z_m, z_median_m),
     )
+
+
+def _at_pixels(prediction: Float[ndarray, "h w"], truth: ViewTruth) -> Float[ndarray, " n"]:
+    return prediction.ravel().take(truth.index.astype(np.intp))
 
 
 def tabulate_config(scores: Sequence[ViewScore], truth: Truth, declared: Declaration) -> Table:
@@ -179,11 +192,13 @@ def tabulate(
 ) -> Table:
     """Return the table of a config, or of a group of its views, from the scores of its scored views.
 
-    The intervals of a config with splits are those of resampled scenes, of others those of consecutive views.
-    A config without views is not ranked, and neither is a submission that declares the use of ground truth. An
-    infinite metric (of a prediction so large that its square overflows) is written as null; the rank error is
-    always finite.
+    Predictions that are not metric have aligned errors alone. The intervals of a config with splits are those of
+    resampled scenes, of others those of consecutive views. A config without views is not ranked, and neither is a
+    submission that declares the use of ground truth. An infinite metric (of a prediction so large that its square
+    overflows) is written as null; the rank error is always finite.
     """
+    if views and views[0].aligned is not None:
+        return _tabulate_relative(views, tabulate([], declared, reference, published, split, truth_sigma_m))
     predicted = [view for view in views if view.native is not None]
     native = mean_metrics([view.native for view in predicted if view.native])
     scaled = mean_metrics([view.scaled for view in predicted if view.scaled])
@@ -193,16 +208,33 @@ def tabulate(
         views_scored=len(predicted),
         coverage=mean([view.coverage for view in views]),
         ranked=bool(views) and not declared.uses_ground_truth,
-        rank_error=mean([view.rank_error for view in views]),
+        rank_error=mean([view.rank_error for view in views if view.rank_error is not None]),
         native=native,
         scaled=scaled,
         scale_median=statistics.median([view.scale for view in predicted if view.scale is not None])
         if predicted
         else None,
-        within_mm={t: mean([view.within_mm[t] for view in views]) for t in WITHIN_MM},
+        within_mm={t: mean([view.within_mm[t] or 0.0 for view in views]) for t in WITHIN_MM},
         reference=replace(reference, scaled_constant=Errors(*map(mean, zip(*constants, strict=True)))),
         published=published,
         split=split,
         truth_sigma_m=truth_sigma_m,
-        intervals=view_intervals(views, by_scene=split is not None) if views else dict.fromkeys(COLUMN_BY_PATH),
+        intervals=view_intervals(views, by_scene=split is not None)
+        if views
+        else dict.fromkeys(column.path for column in VIEW_COLUMNS),
+    )
+
+
+def _tabulate_relative(views: Sequence[ViewScore], empty: Table) -> Table:
+    """Return the table of one or more views of predictions that are not metric; ``empty`` is that of no views."""
+    return replace(
+        empty,
+        views=len(views),
+        views_scored=sum(view.coverage > 0 for view in views),
+        coverage=mean([view.coverage for view in views]),
+        aligned=mean_errors([view.aligned for view in views]),
+        aligned_robust=mean_errors([view.aligned_robust for view in views]),
+        constant=mean_errors([view.constant for view in views]),
+        flat_views=sum(view.is_flat is True for view in views),
+        intervals=view_intervals(views, RELATIVE_INTERVALS, by_scene=empty.split is not None),
     )

@@ -65,6 +65,12 @@ INPUTS: tuple[str, ...] = get_args(InputClass)
 """Input classes of methods, within which submissions are ranked too."""
 
 
+PredictionKind = Literal["metric", "scale", "affine-depth", "affine-disparity"]
+METRIC = "metric"
+PREDICTION_KINDS: tuple[str, ...] = get_args(PredictionKind)
+"""Kinds of predictions: metres, depth up to a scale, depth and disparity up to scale and shift."""
+
+
 @dataclass(frozen=True)
 class Declaration:
     """What a submission declares about itself; None where it does not.
@@ -102,8 +108,9 @@ class MethodDetails(StrictModel):
 class SubmissionMeta(MethodDetails):
     """Values declared in ``submission.json``; None where a key is absent. Unknown keys are ignored.
 
-    ``inputs`` and ``uses_ground_truth`` are those of ``Declaration``. ``depth_scale`` is in metres per unit of a
-    PNG value. ``runtime`` is the author's own report, kept unchanged; nothing is computed from it.
+    ``inputs`` and ``uses_ground_truth`` are those of ``Declaration``, ``prediction`` is one of
+    ``PREDICTION_KINDS``. ``depth_scale`` is in metres per unit of a PNG value. ``runtime`` is the author's own
+    report, kept unchanged; nothing is computed from it.
     """
 
     model_config = ConfigDict(extra="ignore")
@@ -111,6 +118,7 @@ class SubmissionMeta(MethodDetails):
     method: Annotated[str, text(MAX_METHOD_CHARACTERS, "a printable name")]
     inputs: Annotated[str, one_of(*INPUTS)] | None = None
     uses_ground_truth: Flag | None = None
+    prediction: Annotated[str, one_of(*PREDICTION_KINDS)] = METRIC
     depth_scale: _Scale | None = None
     runtime: _Runtime | None = None
 
@@ -118,6 +126,13 @@ class SubmissionMeta(MethodDetails):
     def declaration(self) -> Declaration:
         """What the submission declares."""
         return Declaration(self.inputs, self.uses_ground_truth)
+
+    def kind_problems(self, use: str) -> list[Problem]:
+        """Return the problem of predictions that are not metric, which ``use`` requires; none if they are."""
+        if self.prediction == METRIC:
+            return []
+        found = f"the predictions are of the kind {self.prediction}"
+        return [Problem("conflict", f"{METADATA_NAME}: prediction", found, f"{METRIC} ones: {use}")]
 
     @property
     def seconds_per_view(self) -> float | None:

@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path, PurePosixPath
 
+import numpy as np
+
 from rebar_depth_bench.base.errors import EntryError, Problem
 from rebar_depth_bench.base.parallel import Progress, silent
 from rebar_depth_bench.base.reading import FileSource
@@ -86,7 +88,8 @@ class SubmissionReader(AbstractContextManager["SubmissionReader"]):
     def read(self, view_id: str) -> Depth:
         """Return the predicted planar depth of a view in metres: (H, W), float16, float32 or float64.
 
-        A stored ``.npy`` entry is returned as a read-only view on the mapped file where its alignment allows; all
+        Of predictions that are not metric, it is what the kind says. A value of 0 of a PNG is returned as NaN. A
+        stored ``.npy`` entry is returned as a read-only view on the mapped file where its alignment allows; all
         other entries are returned as new arrays. Raises ``EntryError`` if the entry is missing or invalid, and
         ``ValueError`` if the reader is closed.
         """
@@ -102,7 +105,7 @@ class SubmissionReader(AbstractContextManager["SubmissionReader"]):
         depth_m = FORMATS[suffix].decode(entry.name, data, self._expected[view_id], scale or 1.0)
         if scale is None and suffix == ".png":
             raise EntryError(Problem("missing", DEPTH_SCALE, "missing", f"metres per unit of {entry.name}"))
-        return depth_m
+        return np.where(depth_m == 0, np.nan, depth_m) if suffix == ".png" else depth_m
 
     def problems(self, progress: Progress = silent) -> Iterator[Problem]:
         """Yield all problems: structural ones first, then decoding errors of each view in sorted order."""

@@ -19,7 +19,7 @@ from rebar_depth_bench.base.errors import InputError, Problem, escape_text
 from rebar_depth_bench.base.names import VIEW_ID_PATTERN
 from rebar_depth_bench.base.validation import validate_table
 from rebar_depth_bench.base.writing import output_file
-from rebar_depth_bench.submission.declaration import METADATA_NAME, SubmissionMeta
+from rebar_depth_bench.submission.declaration import METADATA_NAME, METRIC, SubmissionMeta
 from rebar_depth_bench.submission.maps import Depth
 
 _EPOCH = (1980, 1, 1, 0, 0, 0)
@@ -39,8 +39,8 @@ class SubmissionWriter:
     predictions give the same bytes. Entries are stored uncompressed, which is fastest to read; ``compress=True``
     deflates them (about 100 times slower to write, 10 times slower to read, a fifth smaller), and the bytes then
     also depend on the zlib library in use. ``inputs`` and
-    ``uses_ground_truth`` are declared as in ``Declaration``. ``notes`` is free-form information about the method;
-    no score depends on it.
+    ``uses_ground_truth`` are declared as in ``Declaration``, ``prediction`` is one of ``PREDICTION_KINDS``, by
+    default metric. ``notes`` is free-form information about the method; no score depends on it.
     """
 
     def __init__(
@@ -56,6 +56,7 @@ class SubmissionWriter:
         parameters: float | str | None = None,
         inputs: str | None = None,
         uses_ground_truth: bool | None = None,
+        prediction: str | None = None,
         runtime: Mapping[str, object] | None = None,
         notes: Mapping[str, object] | None = None,
         compress: bool = False,
@@ -73,6 +74,7 @@ class SubmissionWriter:
             "parameters": parameters,
             "inputs": inputs,
             "uses_ground_truth": uses_ground_truth,
+            "prediction": None if prediction == METRIC else prediction,
             "runtime": None if runtime is None else dict(runtime),
             "notes": None if notes is None else dict(notes),
         }
@@ -96,8 +98,9 @@ class SubmissionWriter:
         """Store the planar depth of a left view in metres: (H, W), any object that ``numpy.asarray`` accepts.
 
         float16 is kept, every other float type is converted to float32 (values out of its range become infinite).
-        Values that are not finite or <= 0 mean no prediction. ``seconds`` is the method's computing time for the
-        view; it is stored in ``runtime``, so that the bytes of the archive depend on it.
+        Values that are not finite, and of ``metric`` and ``scale`` predictions those <= 0, mean no prediction.
+        ``seconds`` is the method's computing time for the view; it is stored in ``runtime``, so that the bytes of
+        the archive depend on it.
 
         Raises ``InputError`` if the writer is not open, ``view_id`` is malformed or was added before, ``depth`` is
         not a two-dimensional array of floats, or ``seconds`` is not a finite number >= 0.

@@ -102,6 +102,16 @@ def test_bad_archive_is_refused_as_by_score(
         assert refusal(anchor, capsys, archive, "--data", tiny_root).endswith(f"error: {by_score.value}\n")
 
 
+def test_predictions_that_are_not_metric_are_refused(
+    noisy: Depths, tiny_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with SubmissionWriter(tmp_path / "a.zip", method="test", prediction="scale") as writer:
+        for view_id, depth_m in noisy.items():
+            writer.add(view_id, depth_m)
+    message = refusal(anchor, capsys, tmp_path / "a.zip", "--data", tiny_root)
+    assert "of the kind scale, expected metric ones: the scale is that of depth in metres" in message
+
+
 def test_archive_of_several_configs_needs_config_option(
     tiny_truth: Depths, tiny_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

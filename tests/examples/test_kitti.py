@@ -279,6 +279,8 @@ def folders(truths: Depths, tmp_path_factory: pytest.TempPathFactory) -> Path:
     write_npy(folder / "short", dict(list(predictions(truths).items())[:1]))
     write_npy(folder / "large", dict.fromkeys(list(truths), np.ones((20, 30), np.float32)))
     (folder / "empty").mkdir()
+    relative = write_npy(folder / "relative", predictions(truths))
+    (relative / "submission.json").write_text('{"method": "net", "prediction": "affine-disparity"}')
     return folder
 
 
@@ -290,6 +292,7 @@ def folders(truths: Depths, tmp_path_factory: pytest.TempPathFactory) -> Path:
         (("--ground-truth", "improved"), "has no improved ground truth"),
         (("--predictions", "short"), "95 views have no file, among them kitti/2011_09_26_drive_0002_sync_00000"),
         (("--predictions", "empty"), "no depth file of any view was found"),
+        (("--predictions", "relative"), "of the kind affine-disparity, expected metric ones: the paper's errors"),
         (("--predictions", "large"), r"2011_09_26_drive_0002_sync_0000000000_l.npy: "),
     ],
 )

@@ -135,6 +135,25 @@ def test_rejected_archive_lists_problems_and_keeps_quota(
     assert private_server.submit(small_archive, token).status_code == 202
 
 
+def test_predictions_that_are_not_metric_are_refused_and_keep_quota(
+    private_server: Server, small_archive: Path, write_archive: WriteArchive
+) -> None:
+    token = private_server.token("relative")
+    relative = write_archive("relative", configs=("lattice-orbit",), prediction="affine-disparity")
+    for _ in range(QUOTA + 1):
+        response = private_server.submit(relative, token)
+        assert response.status_code == 422
+    [problem] = response.json()["problems"]
+    assert (
+        "the predictions are of the kind affine-disparity, expected metric ones: the leaderboard ranks" in problem
+    )
+    submitted = run_bench("submit", relative, "--url", private_server.url, token=token)
+    assert submitted.returncode == 2
+    assert problem in submitted.stderr
+    assert "Predictions must be metric" in private_server.get("/how-to-submit").text
+    assert private_server.submit(small_archive, token).status_code == 202
+
+
 def test_quota_holds_for_concurrent_uploads_and_deletions(private_server: Server, small_archive: Path) -> None:
     token, other_token = private_server.token("eager"), private_server.token("patient")
     with ThreadPoolExecutor(10) as pool:

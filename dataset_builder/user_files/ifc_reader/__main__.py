@@ -16,7 +16,7 @@ from typing import IO
 from dataset_builder.specs.file_specs import TABLES, Selection
 from dataset_builder.user_files.ifc_records import MAX_MESSAGE, EndRecord, FailureRecord, write_record
 from rebar_depth_bench.base.errors import MeshError, exception_summary, printable
-from rebar_depth_bench.base.limits import limit_process
+from rebar_depth_bench.base.system import limit_process
 
 
 def main() -> None:

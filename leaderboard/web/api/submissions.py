@@ -68,7 +68,9 @@ _ACCEPTED_RESPONSE: Responses = {
 async def upload(request: Request, response: Response, service: ServiceDep, token: RequiredToken) -> Submission:
     """Upload an archive as the body. It is checked before it is accepted, and stored durably before 202 is sent.
 
-    If the token has sent the same archive before, status 200 and that submission are returned.
+    If the token has sent the same archive before, status 200 and that submission are returned. Predictions that
+    are not metric (`prediction` in `submission.json`) are refused with 422, as all problems of an archive, which
+    do not count against the quota.
     """
     check_length(request)
     return _accepted(request, response, await accept_upload(service, token, request.stream()))

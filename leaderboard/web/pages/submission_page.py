@@ -195,7 +195,7 @@ def _pictured_views(service: Service, submission_id: str, result: Result) -> lis
     pictures = picture_facts(service.database, submission_id)
     views = [view for view in result.views if view.view_id in pictures]
     order = {config: index for index, config in enumerate(result.tables)}
-    views.sort(key=lambda view: (order[config_of(view.view_id)], -view.rank_error))
+    views.sort(key=lambda view: (order[config_of(view.view_id)], -view.error))
     return [
         {
             "score": view,

@@ -8,7 +8,6 @@ i to i + 1 with its centre at i + 0.5.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,16 +20,19 @@ from PIL import Image
 
 from rebar_depth_bench.base.errors import MethodError, Problem
 from rebar_depth_bench.base.limits import ONNX_MEMORY_BYTES, DeadlineError, call_within
+from rebar_depth_bench.base.system import memory_bytes, processors
 from rebar_depth_bench.methods.base import (
     VIEW_TIMEOUT_S,
     Method,
     MethodInfo,
     Predictor,
+    finite_or_nan,
     import_optional,
     positive_or_nan,
 )
 from rebar_depth_bench.methods.onnx.external_data import model_digest
 from rebar_depth_bench.methods.onnx.spec import OUTPUT_MEANINGS, InputSpec, OnnxSpec, OutputSpec, read_onnx_toml
+from rebar_depth_bench.submission.declaration import METRIC
 
 
 @dataclass(frozen=True)
@@ -170,6 +172,7 @@ def onnx_method(path: Path, view_timeout_s: float = VIEW_TIMEOUT_S) -> Method:
         uses_intrinsics=meaning.canonical,
         source=f"{spec.source or model.name} (sha256:{model_digest(path, model)})",
         licence=spec.licence,
+        prediction=meaning.prediction,
     )
     return Method(info, lambda: _load(spec, view_timeout_s))
 
@@ -177,12 +180,14 @@ def onnx_method(path: Path, view_timeout_s: float = VIEW_TIMEOUT_S) -> Method:
 def output_to_depth_m(
     values: Float[ndarray, "*grid"], output: OutputSpec, factor: float = 1.0
 ) -> Float32[ndarray, "*grid"]:
-    """Return planar depth in metres of output values.
+    """Return planar depth in metres of output values; of relative networks the finite values times ``scale``.
 
     Depth is v or 1 / v, where v is the value times ``scale``, multiplied by ``factor``. It is NaN where the value
     is not finite, or the depth is not finite and above 0 or lies outside ``min_m`` to ``max_m``.
     """
     scaled = np.asarray(values, np.float64) * output.scale
+    if OUTPUT_MEANINGS[output.meaning].prediction != METRIC:
+        return finite_or_nan(scaled)
     with np.errstate(all="ignore"):
         depth_m = np.asarray(factor / scaled if OUTPUT_MEANINGS[output.meaning].inverse else factor * scaled)
     valid = np.isfinite(scaled) & (depth_m >= output.min_m) & (depth_m <= output.max_m)
@@ -285,7 +290,7 @@ def open_session(spec: OnnxSpec, timeout_s: float) -> OnnxSession:
     options = onnxruntime.SessionOptions()
     options.log_severity_level = _LOG_ERRORS_ONLY
     # Without a number, it pins threads to processors and prints an error for each that the process may not use.
-    options.intra_op_num_threads = len(os.sched_getaffinity(0))
+    options.intra_op_num_threads = processors()
     _limit_memory(onnxruntime, options)
     available = onnxruntime.get_available_providers()
     providers = [name for name in PROVIDERS if name in available]
@@ -310,7 +315,7 @@ def open_session(spec: OnnxSpec, timeout_s: float) -> OnnxSession:
 
 def _limit_memory(onnxruntime: Any, options: Any) -> None:
     """Give sessions a common CPU memory arena that cannot grow past the limit or the machine's memory."""
-    max_bytes = min(ONNX_MEMORY_BYTES.value(), os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
+    max_bytes = min(ONNX_MEMORY_BYTES.value(), memory_bytes() or ONNX_MEMORY_BYTES.value())
     arena, default = onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR, onnxruntime.OrtMemType.DEFAULT
     onnxruntime.create_and_register_allocator(
         onnxruntime.OrtMemoryInfo("Cpu", arena, 0, default), onnxruntime.OrtArenaCfg(max_bytes, -1, -1, -1)

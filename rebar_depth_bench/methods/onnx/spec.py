@@ -18,7 +18,8 @@
     std = [58.395, 57.12, 57.375]     # optional (default: 1)
 
     [output]
-    meaning = "canonical-depth"     # or depth, inverse-depth, canonical-inverse-depth
+    meaning = "canonical-depth"     # or depth, inverse-depth, canonical-inverse-depth; of relative networks
+                                    # scale, affine-depth, affine-disparity
     focal_canonical_px = 1000       # only for canonical meanings
     scale = 1.0                     # optional: factor applied to the value first (0.001: millimetres)
     min_m = 0.1                     # optional, as is max_m: depth outside becomes NaN (no prediction)
@@ -55,7 +56,7 @@ from rebar_depth_bench.base.validation import (
     validate_table,
     whole_number,
 )
-from rebar_depth_bench.submission.declaration import MAX_METHOD_CHARACTERS
+from rebar_depth_bench.submission.declaration import MAX_METHOD_CHARACTERS, METRIC
 
 MAX_SIDE_PX = 8192
 
@@ -65,12 +66,14 @@ class OutputMeaning:
     """Meaning of an output value.
 
     Depth is the value, or one over it if ``inverse``; if ``canonical``, it is multiplied by a factor of the focal
-    length. ``description`` is the text shown to users.
+    length. ``description`` is the text shown to users. ``prediction`` is the kind of the predictions; those that
+    are not metric are the values as they are.
     """
 
     description: str
-    inverse: bool
-    canonical: bool
+    inverse: bool = False
+    canonical: bool = False
+    prediction: str = METRIC
 
 
 OUTPUT_MEANINGS: Mapping[str, OutputMeaning] = {
@@ -78,6 +81,9 @@ OUTPUT_MEANINGS: Mapping[str, OutputMeaning] = {
     "inverse-depth": OutputMeaning("one over planar depth, 1/metres", True, False),
     "canonical-depth": OutputMeaning("depth as a camera of the canonical focal length would see it", False, True),
     "canonical-inverse-depth": OutputMeaning("one over that depth", True, True),
+    "scale": OutputMeaning("planar depth up to a scale", prediction="scale"),
+    "affine-depth": OutputMeaning("planar depth up to scale and shift", prediction="affine-depth"),
+    "affine-disparity": OutputMeaning("disparity up to scale and shift", prediction="affine-disparity"),
 }
 """Output meanings by their name in the TOML file.
 
@@ -172,6 +178,14 @@ class OutputSpec(StrictModel):  # Order matters: validators read the fields abov
         if min_m >= (max_m := info.data.get("max_m", math.inf)):
             raise field_error(f"got {min_m:g}", f"less than max_m, {max_m:g}", "conflict")
         return min_m
+
+    @field_validator("min_m", "max_m")
+    @classmethod
+    def _check_metric(cls, limit_m: float, info: ValidationInfo) -> float:
+        meaning = info.data.get("meaning")
+        if meaning is not None and OUTPUT_MEANINGS[meaning].prediction != METRIC:
+            raise field_error(f"got {limit_m:g}", f'none: meaning "{meaning}" has no metres', "conflict")
+        return limit_m
 
     @field_validator("index")
     @classmethod

@@ -34,9 +34,10 @@ from rebar_depth_bench.reporting.html.views import (
     worst_first,
 )
 from rebar_depth_bench.reporting.published import OTHER_OPTICS_NOTE, load_published, paper_scenes
-from rebar_depth_bench.scoring.columns import VIEW_COLUMNS, has_dash
+from rebar_depth_bench.scoring.columns import ALIGNED, ALIGNED_CONSTANT, ALIGNED_ROBUST, VIEW_COLUMNS, has_dash
 from rebar_depth_bench.scoring.evaluation import Evaluation, View
 from rebar_depth_bench.scoring.groups import GROUPINGS
+from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.table import Table, ViewScore
 
@@ -75,6 +76,16 @@ def render_report(
     views = views_by_config(result)
     shown = sorted_views(shown, list(result.tables))
     script = inline_script("static/sortable.js", "browser.js")
+    if result.prediction is not None:
+        content = relative_context(result, views)
+    else:
+        content = {
+            **results_context(result, views),
+            **paper_context(result),
+            **_extended_context(result, pictures or {}),
+            **_browser_context(shown, views),
+            **views_context(views, {name: of for name, of in views.items() if len(of) > WORST_SHOWN}),
+        }
     return (
         environment()
         .get_template("report.html.j2")
@@ -85,19 +96,43 @@ def render_report(
             script=script.text,
             policy=script.policy,
             mistakes=[printable(mistake.text) for mistake in mistakes],
-            **results_context(result, views),
-            **paper_context(result),
-            **_extended_context(result, pictures or {}),
-            **_browser_context(shown, views),
-            **views_context(views, {name: of for name, of in views.items() if len(of) > WORST_SHOWN}),
+            kind=result.prediction,
+            **content,
         )
     )
 
 
 def results_context(result: Result, views: Mapping[str, Sequence[ViewScore]]) -> dict[str, object]:
     """Return the context of ``part_results.html.j2``."""
+    return {
+        **_tables_context(result),
+        "references": [
+            (f"{printable(config)}: {name}", errors)
+            for config, table in result.tables.items()
+            for name, errors in formatting.reference_rows([("", table)])
+        ],
+        "group_note": formatting.GROUP_NOTE,
+        "alignment_chart": charts.alignment_chart(result.tables),
+        "scale_chart": charts.scale_chart(result.tables, views),
+    }
+
+
+def relative_context(result: Result, views: Mapping[str, Sequence[ViewScore]]) -> dict[str, object]:
+    """Return the context of ``part_relative.html.j2``, of predictions that are not metric."""
+    return {
+        **_tables_context(result),
+        "group_note": formatting.ALIGNED_GROUP_NOTE,
+        "alignment": ALIGNMENT_BY_KIND[result.kind],
+        "alignments": {"aligned": ALIGNED, "robust": ALIGNED_ROBUST, "constant": ALIGNED_CONSTANT},
+        "aligned_note": formatting.ALIGNED_NOTE,
+        "view_columns": (*ALIGNED[:5], ALIGNED[6], ALIGNED_ROBUST[1], *ALIGNED_CONSTANT[:2]),
+        "view_tables": [(printable(name), worst_first(scores), WORST_SHOWN) for name, scores in views.items()],
+    }
+
+
+def _tables_context(result: Result) -> dict[str, object]:
     rows = [(formatting.config_title(name, table.split), table) for name, table in result.tables.items()]
-    has_intervals = any(column.interval(table) for _, table in rows for column in VIEW_COLUMNS)
+    has_intervals = any(column.interval(table) for _, table in rows for column in result.columns)
     return {
         "rows": rows,
         "row_notes": [
@@ -105,17 +140,9 @@ def results_context(result: Result, views: Mapping[str, Sequence[ViewScore]]) ->
             for name, table in rows
             for note in (*formatting.table_notes(table), *formatting.reference_findings(table))
         ],
-        "references": [
-            (f"{printable(config)}: {name}", errors)
-            for config, table in result.tables.items()
-            for name, errors in formatting.reference_rows([("", table)])
-        ],
-        "dash_in_results": any(has_dash(VIEW_COLUMNS, table) for table in result.tables.values()),
+        "dash_in_results": any(has_dash(result.columns, table) for table in result.tables.values()),
         "interval_note": formatting.interval_note(result.tables.values()) if has_intervals else "",
         "groups": [(name, _groupings(table)) for name, table in rows if any(table.groups.values())],
-        "group_note": formatting.GROUP_NOTE,
-        "alignment_chart": charts.alignment_chart(result.tables),
-        "scale_chart": charts.scale_chart(result.tables, views),
     }
 
 
@@ -258,9 +285,11 @@ def write_report(
     """Write the HTML report of ``result``, the scores of the submission of ``evaluation``; return its mistakes.
 
     Up to ``views_shown`` views of each config are shown with images: the worst by rank error, then evenly
-    spaced down to the best. Raises ``InputError`` if ``views_shown`` is negative.
+    spaced down to the best; none of predictions that are not metric. Raises ``InputError`` if ``views_shown`` is
+    negative.
     """
-    chosen = {name: views_to_show(views, views_shown) for name, views in views_by_config(result).items()}
+    views = {} if result.prediction else views_by_config(result)
+    chosen = {name: views_to_show(of_config, views_shown) for name, of_config in views.items()}
     found = look_at_views(evaluation, chosen, crossings=result.extended is not None)
     write_output(target, render_report(result, found.shown, found.mistakes, found.pictures))
     return found.mistakes

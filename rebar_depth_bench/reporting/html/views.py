@@ -247,8 +247,8 @@ VIEWS_SHOWN = 12
 
 
 def worst_first(views: Iterable[ViewScore]) -> list[ViewScore]:
-    """Return the views sorted by falling rank error."""
-    return sorted(views, key=attrgetter("rank_error"), reverse=True)
+    """Return the views sorted by falling error."""
+    return sorted(views, key=attrgetter("error"), reverse=True)
 
 
 def views_to_show(views: Sequence[ViewScore], count: int) -> list[ViewScore]:
@@ -272,5 +272,5 @@ def sorted_views(views: Iterable[ShownView], configs: Sequence[str]) -> list[Sho
     rank = {printable(config): number for number, config in enumerate(configs)}
     return sorted(
         views,
-        key=lambda view: (rank.get(view.config, len(rank)), -view.score.rank_error, view.score.view_id),
+        key=lambda view: (rank.get(view.config, len(rank)), -view.score.error, view.score.view_id),
     )

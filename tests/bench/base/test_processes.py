@@ -63,7 +63,7 @@ def test_zero_workers_raises_input_error() -> None:
         mapped(lambda n: n, [1], 0)
 
 
-LIMIT = "import os, sys, time; from rebar_depth_bench.base.limits import limit_process; "
+LIMIT = "import os, sys, time; from rebar_depth_bench.base.system import limit_process; "
 MIB = 1 << 20
 
 

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from onnx import TensorProto, helper
 from scipy.ndimage import map_coordinates
 
-from rebar_depth_bench import load, score
+from rebar_depth_bench import MethodError, load, score
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.methods import find_method
 from rebar_depth_bench.methods.onnx.model import (
@@ -99,9 +99,20 @@ def test_invalid_output_becomes_nan(tmp_path: Path) -> None:
     assert np.isnan(depth_m[0]).all(), "one over the smallest float is more than float32 holds"
 
 
+@pytest.mark.parametrize("meaning", ["scale", "affine-depth", "affine-disparity"])
+def test_relative_output_is_kept_as_it_is(tmp_path: Path, meaning: str) -> None:
+    write_constant_model(tmp_path, np.array([[-2.0, 0.0, 1e-30, np.inf, np.nan, 3.0]] * 4))
+    path = write_toml(tmp_path, output_table=f"meaning = '{meaning}'\nscale = 2")
+    assert find_method(str(path)).info.prediction == meaning
+    values = predict_depth(path, GREY)[0]
+    np.testing.assert_array_equal(values, np.array([-4, 0, 2e-30, np.nan, np.nan, 6], np.float32))
+    with pytest.raises(MethodError, match=f'output.min_m: got 0.1, expected none: meaning "{meaning}"'):
+        find_method(str(write_toml(tmp_path, output_table=f"meaning = '{meaning}'\nmin_m = 0.1")))
+
+
 @given(
     values=st.lists(st.floats(width=32), min_size=1, max_size=20),
-    meaning=st.sampled_from(list(OUTPUT_MEANINGS)),
+    meaning=st.sampled_from([name for name, one in OUTPUT_MEANINGS.items() if one.prediction == "metric"]),
     scale=st.floats(1e-9, 1e9),
 )
 def test_any_output_gives_depth_within_bounds(values: list[float], meaning: str, scale: float) -> None:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rebar_depth_bench import score
+from rebar_depth_bench import evaluate, score
 from rebar_depth_bench.base.errors import InputError, MethodError
 from rebar_depth_bench.base.parallel import Progress
 from rebar_depth_bench.cli.main import main
@@ -83,6 +83,22 @@ def test_user_file_is_usable_as_method(user_file: Path, tiny_root: Path, tmp_pat
     assert sorted(path.name for path in tmp_path.iterdir()) == ["log", "own.py", "own.zip"]
 
 
+def test_method_of_another_kind_declares_it(tiny_root: Path, tmp_path: Path) -> None:
+    code = USER_METHOD.replace("LOG", repr(str(tmp_path / "log"))).replace('"MIT"', '"MIT", prediction="KIND"')
+    code = code.replace('row["left_K"][0, 0] / 200, np.float32', "-row['left_rgb'][..., 0] / 9 - 2.0")
+    path, archive = tmp_path / "own.py", tmp_path / "own.zip"
+    path.write_text(code.replace("KIND", "affine-depth"))
+    predict(find_method(f"{path}:METHOD"), tiny_root, archive, configs=["lattice"])
+    assert metadata_of(archive)["prediction"] == "affine-depth"
+    result = score(archive, tiny_root)
+    assert (result.kind, result.tables["lattice"].coverage) == ("affine-depth", 1.0), "values <= 0 are kept"
+    evaluated = evaluate(f"{path}:METHOD", tiny_root, config="lattice")
+    assert evaluated.to_dict()["tables"] == result.to_dict()["tables"]
+    path.write_text(code.replace("KIND", "depth"))
+    with pytest.raises(MethodError, match="prediction is 'depth', expected one of metric, scale, affine-depth"):
+        find_method(f"{path}:METHOD")
+
+
 def orbit_view_ids(root: Path) -> list[str]:
     """Return the view ids of ``lattice-orbit``."""
     manifest = json.loads((root / "manifest.json").read_text())
@@ -110,7 +126,7 @@ def test_unknown_method_raises_with_reason(name: str, words: str, user_file: Pat
 def test_invalid_prediction_stops_run(returned: str, user_file: Path, tiny_root: Path, tmp_path: Path) -> None:
     text = user_file.read_text()
     user_file.write_text(re.sub(r"return np\.full.*", f"return {returned}", text))
-    with pytest.raises(MethodError, match=r"own: lattice.* returned .*, expected float metres of"):
+    with pytest.raises(MethodError, match=r"own: lattice.* returned .*, expected floats of"):
         predict(find_method(f"{user_file}:METHOD"), tiny_root, tmp_path / "x.zip", configs=["lattice-orbit"])
     assert len((tmp_path / "log").read_text().split()) == 1
     assert not (tmp_path / "x.zip").exists()
@@ -126,6 +142,7 @@ def test_entry_point_methods_are_listed_as_plain_text(
     lines = [f"{name} = {value}" for name, value in entries.items()]
     (info / "entry_points.txt").write_text("\n".join(["[rebar_depth_bench.methods]", *lines]))
     code = user_file.read_text().replace('"a test"', r'"[red]a\x1b[2J[/]"').replace('"here"', '"[/nothing]"')
+    code = code.replace('"MIT"', '"MIT", prediction="affine-disparity"')
     (tmp_path / "site" / "own_copy.py").write_text(code)
     (tmp_path / "site" / "bad_code.py").write_text("raise ImportError('pip install x[onnx] [/end]')")
     monkeypatch.syspath_prepend(str(tmp_path / "site"))
@@ -137,7 +154,15 @@ def test_entry_point_methods_are_listed_as_plain_text(
     assert "cannot be imported: ModuleNotFoundError" in str(methods["gone"])
     assert main(["methods"]) == 0
     listed = capsys.readouterr().out
-    shown = ("theirs", r"[red]a\x1b[2J[/]", "[/nothing]", "cannot be", "pip install x[onnx] [/end]")
+    assert listed.count("of the kind") == 1, "metric methods do not say so"
+    shown = (
+        "theirs",
+        "predictions of the kind affine-disparity",
+        r"[red]a\x1b[2J[/]",
+        "[/nothing]",
+        "cannot be",
+        "pip install x[onnx] [/end]",
+    )
     assert all(words in listed for words in shown)
     assert "\x1b" not in listed
 

@@ -169,6 +169,17 @@ def test_method_that_reads_no_distortion_is_given_the_rectified_pair(dataset_row
     assert depth_m.shape == (HEIGHT, WIDTH)
 
 
+@pytest.mark.parametrize("kind", ["scale", "affine-disparity"])
+def test_values_up_to_a_shift_keep_their_value_on_the_raw_grid(kind: str, dataset_row: Row) -> None:
+    columns = ("left_rgb", "right_rgb")
+    predictor, needed = rectifying_predictor(
+        lambda row: np.full(row["left_rgb"].shape[:2], -3.0, np.float32), columns, kind
+    )
+    values = predictor({name: dataset_row[name] for name in ("view_id", *needed)})
+    ratio = rectified_pair(dataset_row).depth_ratio if kind == "scale" else np.ones((HEIGHT, WIDTH))
+    np.testing.assert_allclose(values, -3 * ratio, rtol=1e-6)
+
+
 def test_exact_depth_of_the_undistorted_image_is_exact_on_the_raw_grid(dataset_row: Row) -> None:
     """A method of one image is given it without distortion; its optical axis, and so planar depth, is the same."""
 
@@ -212,5 +223,5 @@ def test_method_that_needs_what_rectified_images_lack_is_refused(column: str) ->
 @pytest.mark.parametrize("depth", [np.zeros((2, 2), np.float32), np.zeros((HEIGHT, WIDTH), np.int64), None])
 def test_depth_of_another_shape_or_type_is_refused(depth: Any, dataset_row: Row) -> None:
     predictor, needed = rectifying_predictor(lambda _: depth, ("left_rgb", "left_K"))
-    with pytest.raises(MethodError, match=r"capture/0001, rectified: .*expected float metres of shape"):
+    with pytest.raises(MethodError, match=r"capture/0001, rectified: .*expected floats of shape"):
         predictor({name: dataset_row[name] for name in ("view_id", *needed)})

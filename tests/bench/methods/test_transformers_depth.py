@@ -26,7 +26,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from rebar_depth_bench import score
+from rebar_depth_bench import evaluate, score
 from rebar_depth_bench.base.errors import MethodError
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.methods import METHODS, find_method
@@ -35,7 +35,7 @@ from rebar_depth_bench.methods.transformers import (
     OutputKind,
     depth_pro_preprocessing,
     hf_method,
-    network_output_to_depth_m,
+    network_output_to_prediction,
     to_left_grid,
 )
 from tests.bench.methods.predictors import load_predictor
@@ -73,11 +73,13 @@ def test_families_predict_deterministically_on_left_grid(folders: dict[str, Path
     assert np.array_equal(first, second, equal_nan=True)
     known = first[np.isfinite(first)]
     assert known.size > 0.3 * first.size
-    assert (known > 0).all()
+    assert method.info.prediction != "metric" or (known > 0).all()
     assert known.std() > 1e-3 * known.mean(), "the network looks at the picture"
     assert method.info.name == f"hf:{kind}"
     assert str(folders[kind]) not in json.dumps(vars(method.info))
-    assert ("up to scale" in method.info.summary) == (kind in ("depth-anything", "dpt"))
+    is_relative = kind in ("depth-anything", "dpt")
+    assert ("up to scale" in method.info.summary) == is_relative
+    assert method.info.prediction == ("affine-disparity" if is_relative else "metric")
     assert method.info.uses_intrinsics == (kind == "depth-pro")
 
 
@@ -85,16 +87,16 @@ def test_families_predict_deterministically_on_left_grid(folders: dict[str, Path
     ("kind", "bias", "changes", "expected"),
     [
         ("depth-anything", 2.0, {"depth_estimation_type": "metric", "max_depth": 20}, 20 * SIGMOID_2),
-        ("depth-anything", 2.0, {}, 1 / 2.0),
-        ("depth-anything", -1.0, {}, np.nan),
-        ("dpt", 4.0, {}, 1 / 4.0),
+        ("depth-anything", 2.0, {}, 2.0),
+        ("depth-anything", -1.0, {}, 0.0),
+        ("dpt", 4.0, {}, 4.0),
         ("dpt-dinov2", 4.0, {}, 4.0),
         ("glpn", 2.0, {"max_depth": 80}, 80 * SIGMOID_2),
         ("depth-pro", 0.25, {}, FX / (0.25 * W)),
         ("depth-pro", -1.0, {}, 1e4),
     ],
 )
-def test_known_output_becomes_expected_metres(
+def test_known_output_becomes_expected_values(
     tmp_path: Path, kind: str, bias: float, changes: dict[str, Any], expected: float
 ) -> None:
     depth_m = hf_method(str(save_checkpoint(tmp_path, kind, bias, **changes))).load()(row())
@@ -106,19 +108,18 @@ def test_canonical_output_to_depth_at_any_image_width(width: int, fx: float, z: 
     """The canonical output equals 1 / z for a camera whose focal length is one image width."""
     K = np.diag([fx, fx, 1.0])
     canonical = np.full((2, width), fx / (z * width))
-    depth_m = network_output_to_depth_m(OutputKind.CANONICAL, canonical, K)
+    depth_m = network_output_to_prediction(OutputKind.CANONICAL, canonical, K)
     np.testing.assert_allclose(depth_m, np.clip(z, 1e-4, 1e4), rtol=1e-6)
     canonical, K = np.full((1, width), 1 / z), np.diag([width, 1.0, 1.0])
-    np.testing.assert_allclose(network_output_to_depth_m(OutputKind.CANONICAL, canonical, K), z, rtol=1e-6)
+    np.testing.assert_allclose(network_output_to_prediction(OutputKind.CANONICAL, canonical, K), z, rtol=1e-6)
 
 
 def test_invalid_network_output_is_nan() -> None:
     values = np.array([[np.nan, np.inf, -np.inf, -1, 0, 1e-45, 2]], np.float32)
     inverse, metres = (
-        network_output_to_depth_m(output, values) for output in (OutputKind.INVERSE, OutputKind.METRES)
+        network_output_to_prediction(output, values) for output in (OutputKind.INVERSE, OutputKind.METRES)
     )
-    assert np.isfinite(inverse).tolist() == [[False] * 6 + [True]]
-    assert inverse[0, -1] == 0.5
+    np.testing.assert_array_equal(inverse, np.array([[np.nan, np.nan, np.nan, -1, 0, 1e-45, 2]], np.float32))
     assert np.isfinite(metres).tolist() == [[False] * 5 + [True, True]]
 
 
@@ -130,9 +131,9 @@ def test_depth_matches_transformers_pipeline(folders: dict[str, Path], kind: str
     theirs = pipe(Image.fromarray(row()["left_rgb"]))["predicted_depth"].numpy()
     method = hf_method(str(folders[kind]))
     ours = method.load()(row())
-    if "up to scale" in method.info.summary:
-        theirs = np.where(theirs > 0, 1 / theirs, np.nan)
-    np.testing.assert_allclose(ours, np.where(theirs > 0, theirs, np.nan), rtol=1e-5)
+    if method.info.prediction == "metric":
+        theirs = np.where(theirs > 0, theirs, np.nan)
+    np.testing.assert_allclose(ours, theirs, rtol=1e-5)
 
 
 def test_depth_pro_input_matches_pillow() -> None:
@@ -204,6 +205,14 @@ def test_predict_command_runs_hf_folder(
     assert (metadata["inputs"], metadata["uses_ground_truth"]) == ("rgb+K", False)
     assert metadata["method"] == "hf:pro"
     assert re.search(r"focal length given; weights sha256:[0-9a-f]{64}$", metadata["description"])
+
+
+@pytest.mark.parametrize("kind", ["depth-anything", "glpn"])
+def test_evaluation_takes_the_kind_of_the_checkpoint(folders: dict[str, Path], kind: str, tiny_root: Path) -> None:
+    result = evaluate(f"hf:{folders[kind]}", tiny_root, config="lattice-orbit")
+    assert result.kind == ("affine-disparity" if kind == "depth-anything" else "metric")
+    table = result.tables["lattice-orbit"]
+    assert (table.aligned is None) == (table.native is not None) == (kind == "glpn")
 
 
 def drop_tensor(path: Path) -> None:

@@ -25,7 +25,7 @@ from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.extended.result import ExtendedResult
 from rebar_depth_bench.reporting.extended_tables import extended_csv
 from rebar_depth_bench.reporting.tables import print_comparison
-from rebar_depth_bench.scoring.columns import COLUMN_BY_PATH, TABLE_COLUMNS, VIEW_COLUMNS
+from rebar_depth_bench.scoring.columns import TABLE_COLUMNS, VIEW_COLUMNS
 from rebar_depth_bench.scoring.comparison import Difference, compare
 from rebar_depth_bench.scoring.frames import differences_frame, frame_csv, frame_of_values
 from rebar_depth_bench.scoring.metrics import DepthMetrics
@@ -135,7 +135,7 @@ def test_table_is_80_columns_and_names_every_number() -> None:
     assert all(column.heading in text for column in VIEW_COLUMNS)
     assert max(map(len, text.splitlines())) <= 80
     rows = list(csv.DictReader(io.StringIO(frame_csv(comparison.to_pandas()))))
-    assert [row["number"] for row in rows] == list(COLUMN_BY_PATH)
+    assert [row["number"] for row in rows] == [column.path for column in VIEW_COLUMNS]
     assert rows[0]["other_method"] == "'=B"
     assert {row["verdict"] for row in rows} <= {"equal", "worse", "better", "no verdict", "undecided", ""}
     assert float(rows[1]["low"]) <= float(rows[1]["difference"]) <= float(rows[1]["high"])

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.base.errors import DatasetError
+from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars, write_bars
 from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.scoring.bootstrap import end_percents, resample_scenes
@@ -29,6 +30,7 @@ from rebar_depth_bench.scoring.groups import (
 )
 from rebar_depth_bench.scoring.result import Result, disclosed_json, read_result
 from rebar_depth_bench.scoring.table import read_table
+from tests.bench.reporting.pages import Page
 from tests.damage import change_manifest
 from tests.ground_truth import truth_of
 from tests.synthetic_dataset import HEIGHT, write_archive, write_dataset, write_split_dataset
@@ -196,10 +198,38 @@ def test_groups_are_not_disclosed(scored: Result) -> None:
     assert b"wall" not in disclosed
 
 
+def test_groups_of_predictions_that_are_not_metric(
+    root: Path, archive: Path, tmp_path: Path, scored: Result, capsys: pytest.CaptureFixture[str]
+) -> None:
+    aligned = rdb.score(archive, root, align="affine-depth")
+    frame, views = aligned.to_pandas("groups"), aligned.to_pandas("views")
+    expected = scored.to_pandas("groups")
+    assert list(frame["group"]) == list(expected["group"])
+    assert list(frame["views"]) == list(expected["views"])
+    families = frame[frame["grouping"] == "family"].set_index("group")["aligned_error"]
+    names = {"wall": "/test-a", "beam": "/test-b"}
+    for family, part in names.items():
+        of_family = views[views["view_id"].str.contains(part)]["aligned_error"]
+        assert families[family] == pytest.approx(of_family.mean())
+    low, high = aligned.tables["cages"].intervals["aligned.error"] or (math.nan, math.nan)
+    assert low < views["aligned_error"].mean() < high, "of scenes"
+    read = read_result(aligned.to_json(), "x")
+    assert read.to_json() == aligned.to_json()
+    page = tmp_path / "report.html"
+    options = ["--align", "affine-depth", "--html", str(page), "--groups-csv", str(tmp_path / "groups.csv")]
+    assert main(["score", str(archive), "--data", str(root), *options]) == 0
+    shown = capsys.readouterr().out
+    text = Page(page.read_text()).text
+    for error in families:
+        assert f"{error:.4f}" in shown
+        assert f"{error:.4f}" in text
+    assert (tmp_path / "groups.csv").read_text().count("\n") == len(frame) + 1
+
+
 def test_comparison_resamples_scenes(root: Path, tmp_path: Path, scored: Result) -> None:
     other = rdb.score(write_noisy(root, tmp_path / "b.zip", "other", 1.05), root)
     [row] = [row for row in compare(scored, other).configs["cages"] if row.column.path == "rank_error"]
-    change = [b.rank_error - a.rank_error for a, b in zip(scored.views, other.views, strict=True)]
+    change = [b.error - a.error for a, b in zip(scored.views, other.views, strict=True)]
     by_scene = np.reshape(change, (len(SCENES), VIEWS))
     counts = resample_scenes(list(SCENES)).counts
     means = [np.repeat(by_scene, drawn.astype(int), axis=0).mean() for drawn in counts]

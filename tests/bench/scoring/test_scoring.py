@@ -275,8 +275,8 @@ BIAS_CHANGES = (
     ),
     (
         "score.py",
-        "published=published,\n",
-        "published=published, bias_mm=mean([view.bias_mm for view in predicted]),\n",
+        "scale_median=statistics",
+        "bias_mm=mean([view.bias_mm for view in predicted]), scale_median=statistics",
     ),
 )
 """Changes of three files that add a signed number outside the depth metrics: old and new text."""

@@ -1,0 +1,357 @@
+"""Evaluation of a model in Python: its predictions are collected in a temporary archive, which is scored.
+
+For complete configs the result is that of ``rebar-bench score`` on the same archive, to the byte.
+"""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import weakref
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+
+from rebar_depth_bench.base.errors import InputError, escape_text
+from rebar_depth_bench.base.names import TEST_SPLIT
+from rebar_depth_bench.base.writing import output_file
+from rebar_depth_bench.data.loading import load
+from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
+from rebar_depth_bench.data.rows import ConfigViews, iterate_rows
+from rebar_depth_bench.diagnosis.diagnose import diagnose
+from rebar_depth_bench.methods.registry import find_method
+from rebar_depth_bench.methods.run import dataset_views, predict_views
+from rebar_depth_bench.reporting.formatting import reference_findings, table_notes
+from rebar_depth_bench.reporting.html.page import write_report
+from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation, score_evaluation
+from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.scoring.truth import scored_counts
+from rebar_depth_bench.submission import SubmissionWriter
+from rebar_depth_bench.submission.declaration import METRIC
+
+if TYPE_CHECKING:
+    from datasets import Dataset
+
+    from rebar_depth_bench.extended.result import ExtendedResult
+
+Depth = Float[ndarray, "h w"]
+Model = str | Callable[[Mapping[str, Any]], object] | Mapping[str, object] | Iterable[tuple[str, object]]
+
+_POSES = ("left_cam_from_world", "right_cam_from_world")
+_ROW_COLUMNS = (
+    *("left_rgb", "right_rgb", "left_K", "right_K", "left_distortion", "right_distortion", "baseline_m"),
+    *_POSES,
+)
+
+
+def evaluate(
+    model: Model,
+    root: str | Path,
+    *,
+    config: str | None = None,
+    split: str = TEST_SPLIT,
+    views: int | Sequence[str] | None = None,
+    extended: bool = False,
+    method: str = "unnamed",
+    kind: str = "metric",
+    inputs: str | None = None,
+    uses_ground_truth: bool | None = None,
+) -> EvaluatedResult:
+    """Predict views of a dataset folder or Hub repository with a model, and score the predictions.
+
+    ``model`` is the name of a method ("sgbm", "my.toml"), which then declares itself; a function from a row to the
+    planar depth of the left view in metres, H x W; a mapping of view ids to depth; or an iterable of pairs of
+    both. Depth is as for ``Evaluator.update``; of pairs, views that ``views`` does not select are passed over. A
+    row has ``view_id``, colour, ``K`` and distortion of both eyes, ``baseline_m`` and ``right_from_left``, which
+    takes points of the left camera's frame to the right one's; with ``inputs="multi-view"`` also the poses in the
+    world. What the config lacks is None.
+
+    The other arguments are those of ``Evaluator``. Raises as it does, and what a function raises.
+    """
+    evaluator = Evaluator(
+        root,
+        config,
+        split=split,
+        views=views,
+        extended=extended,
+        method=method,
+        kind=kind,
+        inputs=inputs,
+        uses_ground_truth=uses_ground_truth,
+    )
+    if isinstance(model, str):
+        if (method, kind, inputs, uses_ground_truth) != ("unnamed", "metric", None, None):
+            raise InputError(f"method, kind, inputs or uses_ground_truth is given, but {model} declares its own")
+        return evaluator._predicted_by(model)
+    if isinstance(model, Mapping):
+        pairs: Iterable[tuple[str, object]] = model.items()
+    elif callable(model):
+        rows = evaluator._rows(with_poses=inputs == "multi-view")
+        pairs = ((row["view_id"], model(row)) for row in rows)
+    else:
+        pairs = model
+    for view_id, depth in pairs:
+        if view_id not in evaluator._left_out:
+            evaluator.update(view_id, depth)
+    return evaluator.compute()
+
+
+class Evaluator:
+    """Collector of predictions, which ``compute`` scores; ``reset`` begins again, as for the next epoch.
+
+    ``config`` is one config, or None for all that have the ``split``. ``views`` selects views of each config: a
+    number of them, spread evenly, or their ids; such a result is not ranked. ``extended`` adds the extended
+    measures. ``method``, ``inputs`` and ``uses_ground_truth`` are what the predictions declare, and ``kind`` is
+    one of ``PREDICTION_KINDS``.
+
+    Raises ``DatasetError`` for an invalid dataset folder and an unknown config or split, and ``InputError`` for
+    unknown views and invalid declarations.
+    """
+
+    _is_open = False
+
+    def __init__(
+        self,
+        root: str | Path,
+        config: str | None = None,
+        *,
+        split: str = TEST_SPLIT,
+        views: int | Sequence[str] | None = None,
+        extended: bool = False,
+        method: str = "unnamed",
+        kind: str = "metric",
+        inputs: str | None = None,
+        uses_ground_truth: bool | None = None,
+    ) -> None:
+        if extended and kind != METRIC:
+            raise InputError(f"extended is true and kind is {kind}, expected {METRIC} for measures in metres")
+        self._root, self._split, self._extended = root, split, extended
+        self._declared: dict[str, Any] = {
+            "method": method,
+            "prediction": kind,
+            "inputs": inputs,
+            "uses_ground_truth": uses_ground_truth,
+        }
+        whole = open_folder(root)
+        self._all = dataset_views(whole, None if config is None else [config], split)
+        self._views = self._all if views is None else _selected(self._all, views)
+        self._folder = whole.model_copy(
+            update={"config_by_name": {one.source.name: one.source for one in self._views}}
+        )
+        self._grids = self._folder.expected_views()
+        self._left_out = {view_id for one in self._all for view_id in one.view_ids} - self._grids.keys()
+        self.reset()
+
+    @property
+    def view_ids(self) -> tuple[str, ...]:
+        """Ids of the views to predict, in order."""
+        return tuple(self._grids)
+
+    @cached_property
+    def dataset(self) -> Dataset:
+        """Rows of the views, as ``load`` returns them. Raises ``InputError`` for several configs."""
+        if len(self._views) > 1:
+            names = ", ".join(one.source.name for one in self._views)
+            raise InputError(f"{self._root}: the configs are {names}, expected one: Evaluator(ROOT, CONFIG)")
+        [views], [whole] = self._views, self._all
+        rows = load(self._root, views.source.name, split=self._split)
+        positions = {view_id: position for position, view_id in enumerate(whole.view_ids)}
+        return rows.select([positions[view_id] for view_id in views.view_ids])
+
+    def reset(self) -> None:
+        """Drop all predictions."""
+        self._close()
+        self._archive = _TemporaryArchive()
+        self._writer = SubmissionWriter(self._archive.path, **self._declared)
+        self._added = set[str]()
+
+    def __del__(self) -> None:
+        """Close the file of predictions that were never scored."""
+        self._close()
+
+    def _close(self) -> None:
+        """Complete the archive, so that no file stays open."""
+        if self._is_open:
+            self._writer.__exit__(None, None, None)
+            self._is_open = False
+
+    def update(self, view_ids: str | Sequence[str], depth: object) -> None:
+        """Add the planar depth of left views in metres, or of another kind: of one view or of a batch.
+
+        ``depth`` is an array or tensor of any float type and device: H x W or 1 x H x W for one id; for a list of
+        B ids B x H x W, B x 1 x H x W, or a list. Values that are not finite, and of ``metric`` and ``scale``
+        those <= 0, mean no prediction.
+
+        Raises ``InputError``, which names the view, for one that is not to be predicted or was added before, and
+        for depth of another size.
+        """
+        ids = [view_ids] if isinstance(view_ids, str) else list(view_ids)
+        is_list = isinstance(depth, list | tuple)
+        maps = list(depth) if is_list else _array(depth)  # type: ignore[call-overload]
+        if isinstance(view_ids, str) and not is_list:
+            maps = [maps]
+        if len(maps) != len(ids):
+            raise InputError(f"{len(ids)} view ids and {len(maps)} depth maps are given, expected as many of both")
+        for view_id, one in zip(ids, maps, strict=True):
+            self._add(view_id, _array(one))
+
+    def _add(self, view_id: str, depth: ndarray) -> None:
+        if view_id not in self._grids:
+            found = f"{escape_text(str(view_id))}: is not among the {len(self._grids)} views to predict"
+            raise InputError(f"{found}, expected one as {next(iter(self._grids))}")
+        if view_id in self._added:
+            raise InputError(
+                f"{view_id}: was added before, expected each view once; a distributed sampler repeats views to "
+                "fill its last batch: gather all in one process and drop the repeated ones; reset() begins again"
+            )
+        height, width = self._grids[view_id]
+        if depth.shape not in ((height, width), (1, height, width)):
+            raise InputError(f"{view_id}: depth has shape {depth.shape}, expected ({height}, {width})")
+        if not self._is_open:
+            self._writer.__enter__()
+            self._is_open = True
+        self._writer.add(view_id, depth.reshape(height, width))
+        self._added.add(view_id)
+
+    def compute(self) -> EvaluatedResult:
+        """Return the result of the predictions. Raises ``InputError`` if a view is missing."""
+        if missing := [view_id for view_id in self._grids if view_id not in self._added]:
+            raise InputError(f"{len(missing)} of {len(self._grids)} views are missing, such as {missing[0]}")
+        self._close()
+        return self._scored()
+
+    def _scored(self) -> EvaluatedResult:
+        partial = [one.source for one in self._views if one.source.whole is not one.source]
+        of_views = {config.name: len(scored_counts(config.whole)) for config in partial}
+        archive = self._archive
+        self.reset()
+        return EvaluatedResult.of_archive(archive, self._folder, of_views, is_extended=self._extended)
+
+    def _predicted_by(self, name: str) -> EvaluatedResult:
+        """Return the result of a method."""
+        predict_views(find_method(name), self._views, self._archive.path)
+        return self._scored()
+
+    def _rows(self, *, with_poses: bool) -> Iterator[dict[str, Any]]:
+        """Yield what a function may read of each view."""
+        for views in self._views:
+            for row in iterate_rows(views.source, ("view_id", *_ROW_COLUMNS)):
+                left, right = (row[name] if with_poses else row.pop(name) for name in _POSES)
+                yield {**row, "right_from_left": None if right is None else right @ np.linalg.inv(left)}
+
+
+class EvaluatedResult(Result):
+    """Result of an evaluation, with its archive, which is deleted with it.
+
+    ``extended`` and ``notes`` are computed when they are read.
+    """
+
+    _archive: _TemporaryArchive
+    _folder: DatasetFolder
+    _is_extended: bool
+
+    @classmethod
+    def of_archive(
+        cls, archive: _TemporaryArchive, folder: DatasetFolder, of_views: Mapping[str, int], *, is_extended: bool
+    ) -> EvaluatedResult:
+        """Score an archive; ``of_views`` are the numbers of views of the configs of which only some are scored."""
+        with open_evaluation(archive.path, folder) as evaluation:
+            scored = score_evaluation(evaluation)
+        tables = {
+            name: table.of_some_views(of_views[name]) if name in of_views else table
+            for name, table in scored.tables.items()
+        }
+        result = cls(**{**vars(scored), "tables": tables})
+        result.__dict__.update(_archive=archive, _folder=folder, _is_extended=is_extended)
+        return result
+
+    @cached_property
+    def _extended(self) -> ExtendedResult | None:
+        if not self._is_extended:
+            return None
+        from rebar_depth_bench.extended.registry import score_extended  # A third of the package.
+
+        with self._evaluation() as evaluation:
+            return score_extended(evaluation).extended
+
+    extended = property(lambda self: self._extended, lambda *_: None)
+    """Extended measures; None unless they were asked for."""
+
+    @cached_property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences on what limits the numbers, and on possible mistakes in the predictions."""
+        with self._evaluation() as evaluation:
+            mistakes = [f"possible mistake: {mistake.text}" for mistake in diagnose(evaluation)]
+        of_tables = [
+            f"{name}: {note}"
+            for name, table in self.tables.items()
+            for note in (*table_notes(table), *reference_findings(table))
+        ]
+        return (*self.kind_notes, *of_tables, *mistakes)
+
+    def to_html(self, path: str | Path) -> None:
+        """Write the self-contained report of ``rebar-bench score --html``."""
+        with self._evaluation() as evaluation:
+            write_report(self, evaluation, Path(path))
+
+    def save_archive(self, path: str | Path) -> None:
+        """Copy the archive of the predictions. Raises ``InputError`` if only some views were evaluated."""
+        for name, table in self.tables.items():
+            if table.of_views is not None:
+                found = f"{name}: {table.views} of {table.of_views} views were evaluated"
+                raise InputError(f"{found}, expected all views of a config in an archive")
+        with output_file(Path(path)) as target:
+            shutil.copyfile(self._archive.path, target)
+
+    @contextmanager
+    def _evaluation(self) -> Iterator[Evaluation]:
+        with open_evaluation(self._archive.path, self._folder) as evaluation:
+            yield evaluation
+
+
+class _TemporaryArchive:
+    """Path of an archive in a temporary folder, which is deleted with this object."""
+
+    def __init__(self) -> None:
+        folder = tempfile.mkdtemp(prefix="rebar-evaluate-")
+        self.path = Path(folder, "predictions.zip")
+        weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+
+
+def _selected(configs: Sequence[ConfigViews], views: int | Sequence[str]) -> list[ConfigViews]:
+    """Return some views of each config: a number of them, spread evenly, or those with the given ids."""
+    if isinstance(views, int):
+        if views < 1:
+            raise InputError(f"views is {views}, expected a number from 1 or view ids")
+        spread = [
+            [one.view_ids[k * len(one.view_ids) // views] for k in range(views)]
+            if views < len(one.view_ids)
+            else one.view_ids
+            for one in configs
+        ]
+    else:
+        known = {view_id for one in configs for view_id in one.view_ids}
+        if unknown := [view_id for view_id in views if view_id not in known]:
+            raise InputError(f"views has {escape_text(str(unknown[0]))}, expected ids of views, as {min(known)}")
+        wanted = set(views)
+        spread = [[view_id for view_id in one.view_ids if view_id in wanted] for one in configs]
+    return [
+        one if len(ids) == len(one.view_ids) else ConfigViews(one.source.of_views(ids))
+        for one, ids in zip(configs, spread, strict=True)
+        if ids
+    ]
+
+
+def _array(depth: object) -> ndarray:
+    """Return depth as an array of NumPy, from one or from a tensor of torch on any device."""
+    if hasattr(depth, "detach"):
+        tensor = depth.detach()
+        depth = (tensor.float() if "bfloat16" in str(tensor.dtype) else tensor).cpu().numpy()
+    array: ndarray = np.asarray(depth)
+    return array.astype(np.float32) if array.dtype.name == "bfloat16" else array

@@ -1,0 +1,168 @@
+"""Evaluation of models in Python: all forms of predictions, some views, and equality with ``score``."""
+
+from __future__ import annotations
+
+import gc
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import rebar_depth_bench as rdb
+
+Truth = dict[str, np.ndarray]
+LATTICE = "lattice"
+
+
+@pytest.fixture
+def lattice(tiny_root: Path) -> Truth:
+    return {row["view_id"]: row["left_depth"] for row in rdb.load(tiny_root, LATTICE)}
+
+
+def test_evaluation_equals_score_of_its_archive(tiny_root: Path, tmp_path: Path) -> None:
+    result = rdb.evaluate("sgbm", tiny_root)
+    result.save_archive(tmp_path / "sgbm.zip")
+    assert result.to_json() == rdb.score(tmp_path / "sgbm.zip", tiny_root).to_json()
+    assert list(result.tables) == ["lattice", "lattice-orbit"]
+    result.to_html(tmp_path / "report.html")
+    assert b"sgbm" in (tmp_path / "report.html").read_bytes()
+
+
+def test_every_form_of_model_gives_the_same_numbers(tiny_root: Path, lattice: Truth) -> None:
+    predictions = {view_id: depth_m * 1.1 for view_id, depth_m in lattice.items()}
+    of_mapping = rdb.evaluate(predictions, tiny_root, config=LATTICE)
+    of_pairs = rdb.evaluate(iter(predictions.items()), tiny_root, config=LATTICE)
+    of_function = rdb.evaluate(lambda row: predictions[row["view_id"]], tiny_root, config=LATTICE)
+    assert of_mapping.to_json() == of_pairs.to_json() == of_function.to_json()
+    assert of_mapping.metrics["lattice/native/abs_rel"] == pytest.approx(0.1)
+    assert of_mapping.metrics["lattice/within_mm/5"] == of_mapping.tables[LATTICE].within_mm[5]
+
+
+@pytest.mark.parametrize("inputs", ["stereo", "multi-view"])
+def test_functions_see_no_ground_truth(tiny_root: Path, inputs: str) -> None:
+    rows: list[dict[str, Any]] = []
+
+    def predict(row: Any) -> np.ndarray:
+        rows.append(row)
+        return np.ones(row["left_rgb"].shape[:2], np.float16)
+
+    rdb.evaluate(predict, tiny_root, config=LATTICE, inputs=inputs)
+    poses = {"left_cam_from_world", "right_cam_from_world"} if inputs == "multi-view" else set()
+    eyes = {f"{eye}_{kind}" for eye in ("left", "right") for kind in ("rgb", "K", "distortion")}
+    assert set(rows[0]) == {"view_id", "baseline_m", "right_from_left"} | eyes | poses
+    assert np.allclose(rows[0]["right_from_left"][:3, 3], [-rows[0]["baseline_m"], 0, 0], atol=1e-9)
+
+
+def test_some_views_are_not_ranked(tiny_root: Path, lattice: Truth, tmp_path: Path) -> None:
+    result = rdb.evaluate(lattice, tiny_root, config=LATTICE, views=3, method="truth", extended=True)
+    assert [view.view_id for view in result.views] == [list(lattice)[k] for k in (0, 3, 6)]
+    assert str(result).splitlines() == [
+        "truth    coverage  rank error  AbsRel  scaled  constant  within 5 mm",
+        "lattice   100.0 %      0.0000  0.0000  0.0000    0.0667      100.0 %",
+        "3 of 9 views: not ranked",
+    ]
+    assert not result.tables[LATTICE].ranked
+    assert result.notes[0] == "lattice: Not ranked: 3 of 9 views."
+    assert result.extended is not None
+    with pytest.raises(rdb.InputError, match="3 of 9 views were evaluated, expected all views"):
+        result.save_archive(tmp_path / "some.zip")
+    chosen = list(lattice)[:2]
+    by_id = rdb.evaluate(lattice, tiny_root, config=LATTICE, views=chosen)
+    assert [view.view_id for view in by_id.views] == chosen
+
+
+def test_low_coverage_is_printed_with_the_numbers(tiny_root: Path, lattice: Truth) -> None:
+    halved = {
+        view_id: np.where(np.arange(depth_m.shape[1]) % 2, depth_m, 0) for view_id, depth_m in lattice.items()
+    }
+    lines = str(rdb.evaluate(halved, tiny_root, config=LATTICE)).splitlines()
+    assert lines[2:] == ["coverage below 95 %: errors of valid predictions are not comparable"]
+
+
+def test_mistakes_are_among_the_notes(tiny_root: Path, lattice: Truth) -> None:
+    millimetres = {view_id: depth_m * 1000 for view_id, depth_m in lattice.items()}
+    assert any("possible mistake" in note for note in rdb.evaluate(millimetres, tiny_root, config=LATTICE).notes)
+
+
+def test_batches_of_tensors(tiny_root: Path) -> None:
+    torch = pytest.importorskip("torch")
+    evaluator = rdb.Evaluator(tiny_root, LATTICE, views=4)
+    loader = rdb.torch_loader(evaluator.dataset, batch_size=2)
+    forms: list[Callable[[Any], Any]] = [
+        lambda depth: depth,
+        lambda depth: depth[:, 0].double().requires_grad_(),
+        lambda depth: list(depth.to(torch.bfloat16)),
+    ]
+    errors = []
+    for form in forms:
+        evaluator.reset()
+        for batch in loader:
+            evaluator.update(batch["view_id"], form(batch["depth"]))
+        errors.append(evaluator.compute().metrics["lattice/rank_error"])
+    assert errors[:2] == [0.0, 0.0]
+    assert 0 < errors[2] < 2**-8  # bfloat16 has 8 significant bits.
+
+
+@pytest.mark.parametrize(
+    ("shape", "words"),
+    [
+        ((90, 160), None),
+        ((1, 90, 160), None),
+        ((1, 1, 90, 160), "shape"),
+        ((90, 161), r"shape \(90, 161\), expected \(90, 160\)"),
+        ((2, 90, 160), "shape"),
+    ],
+)
+def test_shapes_of_one_view(tiny_root: Path, shape: tuple[int, ...], words: str | None) -> None:
+    evaluator = rdb.Evaluator(tiny_root, LATTICE, views=1)
+    [view_id] = evaluator.view_ids
+    if words is None:
+        evaluator.update(view_id, np.ones(shape))
+        assert evaluator.compute().tables[LATTICE].coverage == 1
+    else:
+        with pytest.raises(rdb.InputError, match=f"{view_id}: .*{words}"):
+            evaluator.update(view_id, np.ones(shape))
+
+
+def test_wrong_views_are_named(tiny_root: Path, lattice: Truth) -> None:
+    first, second, *_ = lattice
+    evaluator = rdb.Evaluator(tiny_root, LATTICE)
+    evaluator.update(first, lattice[first])
+    with pytest.raises(rdb.InputError, match=f"{first}: was added before.*sampler"):
+        evaluator.update(first, lattice[first])
+    with pytest.raises(rdb.InputError, match="lattice/9999: is not among the 9 views"):
+        evaluator.update("lattice/9999", lattice[first])
+    with pytest.raises(rdb.InputError, match=f"8 of 9 views are missing, such as {second}"):
+        evaluator.compute()
+    with pytest.raises(rdb.InputError, match="2 view ids and 1 depth maps"):
+        evaluator.update([first, second], lattice[first][None])
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"views": 0}, "views is 0"),
+        ({"views": ["lattice/9999"]}, "views has lattice/9999"),
+        ({"kind": "depth"}, 'prediction: .*"metric", "scale", "affine-depth" or'),
+        ({"inputs": "sonar"}, "inputs"),
+        ({"split": "train"}, "train"),
+        ({"config": "none"}, "no config 'none'"),
+    ],
+)
+def test_arguments_are_checked_before_any_prediction(tiny_root: Path, arguments: Any, words: str) -> None:
+    with pytest.raises(rdb.InputError, match=words):
+        rdb.Evaluator(tiny_root, **arguments)
+
+
+def test_archive_is_deleted_with_the_result(
+    tiny_root: Path, lattice: Truth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    result = rdb.evaluate(lattice, tiny_root, config=LATTICE)
+    assert len(list(tmp_path.glob("*/predictions.zip"))) == 1
+    del result
+    gc.collect()
+    assert not list(tmp_path.iterdir())
