@@ -23,10 +23,16 @@ from rebar_depth_bench.scoring.groups import GROUPINGS
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE
 
 if TYPE_CHECKING:
+    from rebar_depth_bench.scoring.result import Result
     from rebar_depth_bench.scoring.table import Table
     from rebar_depth_bench.submission.declaration import Declaration
 
 DASH_NOTE = f"{DASH}: undefined, because no pixel has a prediction or a number overflowed."
+
+INCOMPARABLE_MARK = "*"
+INCOMPARABLE_NOTE = "Errors of valid predictions are not compared with those of others: "
+ABSENT_PAPER_NOTE = "Without the paper's rows, which are for other conditions: "
+"""Beginnings of notes on rows of tables, which list them."""
 
 RANK_ERROR_NOTE = "Rank error: mean over all scored pixels of |p - z| / max(p, z), 1 without a valid prediction."
 
@@ -110,6 +116,16 @@ def incomparable_reasons(table: Table) -> list[str]:
     if any(metrics is not None and not metrics.is_finite for metrics in (table.native, table.scaled)):
         reasons.append("a number overflowed")
     return reasons
+
+
+def incomparable_rows(results: Sequence[Result]) -> list[str]:
+    """Return method, config and reasons of the rows that tables mark with ``INCOMPARABLE_MARK``."""
+    return [
+        f"{printable(result.method, 40)}, {config_title(name, table.split)} ({', '.join(reasons)})"
+        for result in results
+        for name, table in result.tables.items()
+        if (reasons := incomparable_reasons(table))
+    ]
 
 
 def grouping_title(grouping: str) -> str:

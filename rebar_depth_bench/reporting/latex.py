@@ -35,6 +35,7 @@ _ARROWS: Mapping[Better, str] = {"lower": r" $\downarrow$", "higher": r" $\uparr
 _MISSING = "--"
 _NO_OTHERS = [""] * len(OTHERS)
 _UNRANKED_MARK = r"$^{\ddagger}$"
+_INCOMPARABLE_MARK = f"$^{{{formatting.INCOMPARABLE_MARK}}}$"
 _OTHER_OPTICS_MARK = r"$^{\S}$"
 _ANCHORED_MARK = r"$^{\dagger}$"
 _LATEX_ESCAPES = {
@@ -54,14 +55,17 @@ _LATEX_ESCAPES = {
 _LIGATURE = re.compile(r"([-',])(?=\1)")
 
 
-def latex_table(results: Sequence[Result], *, published: bool, intervals: bool = False) -> str:
+def latex_table(
+    results: Sequence[Result], *, published: bool, intervals: bool = False, absent: Sequence[str] = ()
+) -> str:
     r"""Return ``results`` as a LaTeX ``table*`` with one row per result and the same columns per config.
 
     RMSE (cm) and AbsRel are native, AbsRel_s is computed after the oracle scale, s is its median over views. The
     best number of a column is bold if the column has two or more ranked rows; a row that is not ranked is marked
-    with a double dagger and is never bold. With ``published``, the paper's rows of the same scenes follow below a
-    rule; they are marked and not compared with the results. With ``intervals``, the 95 % intervals are printed
-    beside the numbers, and each block holds one config.
+    with a double dagger and is never bold. The RMSE of a row whose errors are not compared with those of others
+    has an asterisk. With ``published``, the paper's rows of the same scenes follow below a rule; they are marked
+    and not compared with the results. ``absent`` is as in ``print_paper_table``. With ``intervals``, the 95 %
+    intervals are printed beside the numbers, and each block holds one config.
 
     Raises ``InputError`` if there are no results, or if they belong to different datasets.
     """
@@ -87,6 +91,14 @@ def latex_table(results: Sequence[Result], *, published: bool, intervals: bool =
         unranked=any(not table.ranked for result in results for table in result.tables.values()),
         undeclared=any(result.declared.uses_ground_truth is None for result in results),
         unranked_mark=_UNRANKED_MARK,
+        notes=[
+            mark + escape_latex(start) + "; ".join(map(escape_latex, rows)) + "."
+            for mark, start, rows in (
+                (_INCOMPARABLE_MARK, formatting.INCOMPARABLE_NOTE, formatting.incomparable_rows(results)),
+                ("", formatting.ABSENT_PAPER_NOTE, absent),
+            )
+            if rows
+        ],
         intervals=intervals,
         resampled=_resampled(tables.values()),
         anchored=any(row.median_anchored for row in paper_rows),
@@ -191,7 +203,11 @@ def _cells(table: Table | None, best: Mapping[str, str], intervals: bool) -> lis
         interval = column.interval_text(column.interval(table), ", ") if intervals else ""
         shown = rf"\textbf{{{number}}}" if table.ranked and number == best.get(column.path) else number
         cells.append(shown + (rf" {{\tiny[{interval}]}}" if interval else ""))
-    return cells if table.ranked else [cells[0] + _UNRANKED_MARK, *cells[1:]]
+    marks = (
+        "" if table.ranked else _UNRANKED_MARK,
+        _INCOMPARABLE_MARK * bool(formatting.incomparable_reasons(table)),
+    )
+    return [*(cell + mark for cell, mark in zip(cells, marks, strict=False)), *cells[2:]]
 
 
 def _reference_rows(results: Sequence[Result], config: str) -> dict[str, list[str]]:

@@ -289,13 +289,15 @@ def disambiguate_method_names(results: Sequence[Result]) -> list[Result]:
     ]
 
 
-def print_paper_table(results: Sequence[Result], console: Console, *, published: bool) -> None:
+def print_paper_table(
+    results: Sequence[Result], console: Console, *, published: bool, absent: Sequence[str] = ()
+) -> None:
     """Print a table per config: one row per result, sorted by rank error, then the rows that are not ranked.
 
     The reference errors of the config follow.
 
     ``results`` must not be empty and must belong to one dataset. With ``published``, the paper's rows of the same
-    scene follow; they are marked and not compared with the results.
+    scene follow; they are marked and not compared with the results. If none do, ``absent`` are configs and why.
     """
     dataset = results[0].dataset
     digest, version = formatting.short_digest(dataset.digest), printable(dataset.version)
@@ -317,6 +319,11 @@ def print_paper_table(results: Sequence[Result], console: Console, *, published:
         "?: use of ground truth not declared.",
     )
     print_line(console, f"{formatting.RANK_ERROR_NOTE} {formatting.REFERENCE_NOTE}")
+    if rows := formatting.incomparable_rows(results):
+        note = f"{formatting.INCOMPARABLE_MARK}: {formatting.INCOMPARABLE_NOTE}{'; '.join(rows)}."
+        print_line(console, note, style="yellow")
+    if absent:
+        print_line(console, f"{formatting.ABSENT_PAPER_NOTE}{'; '.join(absent)}.")
     if published and any(table.published for result in results for table in result.tables.values()):
         mark = load_published().parts["synthetic"].mark
         print_line(console, f"The paper's rows: {mark}. †: median-anchored. {OTHER_OPTICS_NOTE}")
@@ -326,6 +333,8 @@ def _paper_table(rows: Sequence[tuple[Result, Table]], match: PublishedMatch | N
     paper = make_grid("", _HEADS, fold=True, left=1)
     for result, table in rows:
         name = printable(result.method, 40) + formatting.rank_mark(result.declared, table)
+        if formatting.incomparable_reasons(table):
+            name += f" {formatting.INCOMPARABLE_MARK}"
         paper.add_row(*map(plain_text, [name, *texts((RANK_ERROR, *PAPER_COLUMNS), table)]))
     for title, cells in formatting.paper_reference_rows([(result.method, table) for result, table in rows]):
         paper.add_row(*map(plain_text, [f"reference: {title}", "", *cells]), style="dim")
