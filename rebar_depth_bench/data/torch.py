@@ -11,7 +11,7 @@ import numpy as np
 import PIL.Image
 from datasets import Dataset, Image, IterableDataset, Value
 
-from rebar_depth_bench.base.errors import DatasetError, InputError, MethodError, Problem
+from rebar_depth_bench.base.errors import DatasetError, InputError, MethodError, Problem, install_command
 from rebar_depth_bench.data.codecs import PICTURE_KINDS
 from rebar_depth_bench.data.decoding_features import STORED_MODES
 from rebar_depth_bench.data.rows import is_absent
@@ -121,7 +121,7 @@ try:
     from torch.utils.data import DataLoader
     from torch.utils.data import IterableDataset as TorchIterableDataset
 except ImportError as error:
-    raise MethodError(f"torch_loader needs torch ({error}): pip install 'rebar-depth-bench[torch]'") from None
+    raise MethodError(f"torch_loader needs torch ({error}): {install_command('torch')}") from None
 
 Batch = dict[str, Any]
 
