@@ -8,8 +8,10 @@ import shlex
 import tomllib
 from argparse import ArgumentParser, _SubParsersAction
 from collections.abc import Iterator
+from contextlib import redirect_stdout
 from importlib import import_module
 from importlib.util import find_spec
+from io import StringIO
 from pathlib import Path
 
 import grimp
@@ -46,6 +48,7 @@ from tests.project.pages import (
     inline_code,
     local_links,
     name_of,
+    python_blocks,
     shell_lines,
 )
 
@@ -147,10 +150,14 @@ def test_documented_python_runs(
     page: Path, tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    names: dict[str, object] = {"my_model": lambda rgb, K: np.full(rgb.shape[:2], K[0, 0] / 200)}
-    for block in blocks(page, "python"):
+    (tmp_path / "tests").symlink_to(ROOT / "tests")
+    names: dict[str, object] = {}
+    for block, output in python_blocks(page):
         shown = block.replace('"demo-output/dataset"', repr(str(tiny_root)))
-        exec(shown.replace("(480, 640)", "(48, 64)"), names)
+        with redirect_stdout(StringIO()) as printed:
+            exec(shown.replace("(480, 640)", "(48, 64)"), names)
+        assert not output or printed.getvalue() == output
+    assert name_of(page) not in ("README.md", "docs/score.md") or any(output for _, output in python_blocks(page))
     writes = any("submission.zip" in block for block in blocks(page, "python"))
     assert (tmp_path / "submission.zip").is_file() == writes
     if "loader" in names:
