@@ -319,8 +319,8 @@ def print_paper_table(
         "?: use of ground truth not declared.",
     )
     print_line(console, f"{formatting.RANK_ERROR_NOTE} {formatting.REFERENCE_NOTE}")
-    if rows := formatting.incomparable_rows(results):
-        note = f"{formatting.INCOMPARABLE_MARK}: {formatting.INCOMPARABLE_NOTE}{'; '.join(rows)}."
+    if incomparable := formatting.incomparable_rows(results):
+        note = f"{formatting.INCOMPARABLE_MARK}: {formatting.INCOMPARABLE_NOTE}{'; '.join(incomparable)}."
         print_line(console, note, style="yellow")
     if absent:
         print_line(console, f"{formatting.ABSENT_PAPER_NOTE}{'; '.join(absent)}.")
