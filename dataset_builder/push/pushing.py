@@ -81,7 +81,7 @@ class VerifiedFolder:
         for name, file in self.files.items():
             yield f"  {name}, {file.size:,} bytes"
         total_bytes = sum(file.size for file in self.files.values())
-        yield f"{len(self.files)} files ({total_bytes:,} bytes), without those that the Hub has already"
+        yield f"{len(self.files)} files ({total_bytes:,} bytes); what the Hub has is not sent again"
 
 
 def verified_folder(root: str, progress: Progress = silent) -> VerifiedFolder:

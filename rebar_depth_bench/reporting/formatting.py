@@ -31,7 +31,7 @@ DASH_NOTE = f"{DASH}: undefined, because no pixel has a prediction or a number o
 
 INCOMPARABLE_MARK = "*"
 INCOMPARABLE_NOTE = "Errors of valid predictions are not compared with those of others: "
-ABSENT_PAPER_NOTE = "Without the paper's rows, which are for other conditions: "
+ABSENT_PAPER_NOTE = "The paper's rows are absent; the configs differ from its scenes: "
 """Beginnings of notes on rows of tables, which list them."""
 
 RANK_ERROR_NOTE = "Rank error: mean over all scored pixels of |p - z| / max(p, z), 1 without a valid prediction."

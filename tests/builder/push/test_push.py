@@ -58,7 +58,7 @@ def test_dry_run_lists_the_files_without_a_network(
     head, *files, totals, end = finished.stdout.splitlines()
     assert head == f"{HUB_ID}, branch main"
     assert files == [f"  {name}, {size:,} bytes" for name, size in sorted(sizes.items())]
-    assert totals.startswith(f"{len(sizes)} files ({sum(sizes.values()):,} bytes), ")
+    assert totals.startswith(f"{len(sizes)} files ({sum(sizes.values()):,} bytes); ")
     assert end == "dry run: not compared with the Hub, nothing was sent"
     assert hub.requests == []
     assert push(root, "--dry-run", "--yes").returncode == 2
