@@ -171,7 +171,7 @@ def test_models_of_other_types_are_refused(tiny_root: Path, model: Any) -> None:
     [
         (None, "shape"),
         (np.ones((90, 160), int), "int64, expected floats"),
-        (np.ma.MaskedArray(np.ones((90, 160)), mask=True), "masked array"),
+        (np.ma.MaskedArray(np.ones((90, 160)), mask=True), "masked array"),  # type: ignore[no-untyped-call]
         ([[1.0] * 160] * 90, None),
     ],
 )
