@@ -29,11 +29,6 @@ if TYPE_CHECKING:
 
 DASH_NOTE = f"{DASH}: undefined, because no pixel has a prediction or a number overflowed."
 
-INCOMPARABLE_MARK = "*"
-INCOMPARABLE_NOTE = "Errors of valid predictions are not compared with those of others: "
-ABSENT_PAPER_NOTE = "The paper's rows are absent; the configs differ from its scenes: "
-"""Beginnings of notes on rows of tables, which list them."""
-
 RANK_ERROR_NOTE = "Rank error: mean over all scored pixels of |p - z| / max(p, z), 1 without a valid prediction."
 
 CONSTANT_TITLE = "constant"
@@ -118,14 +113,17 @@ def incomparable_reasons(table: Table) -> list[str]:
     return reasons
 
 
-def incomparable_rows(results: Sequence[Result]) -> list[str]:
-    """Return method, config and reasons of the rows that tables mark with ``INCOMPARABLE_MARK``."""
-    return [
+def row_notes(results: Sequence[Result], absent: Sequence[str]) -> list[tuple[str, str, Sequence[str]]]:
+    """Return mark, beginning and list of each note on rows of tables; ``absent`` as in ``print_paper_table``."""
+    marked = [
         f"{printable(result.method, 40)}, {config_title(name, table.split)} ({', '.join(reasons)})"
         for result in results
         for name, table in result.tables.items()
         if (reasons := incomparable_reasons(table))
     ]
+    incomparable = ("*", "Errors of valid predictions are not compared with those of others: ", marked)
+    without_paper = ("", "The paper's rows are absent; the configs differ from its scenes: ", absent)
+    return [note for note in (incomparable, without_paper) if note[-1]]
 
 
 def grouping_title(grouping: str) -> str:

@@ -35,7 +35,7 @@ _ARROWS: Mapping[Better, str] = {"lower": r" $\downarrow$", "higher": r" $\uparr
 _MISSING = "--"
 _NO_OTHERS = [""] * len(OTHERS)
 _UNRANKED_MARK = r"$^{\ddagger}$"
-_INCOMPARABLE_MARK = f"$^{{{formatting.INCOMPARABLE_MARK}}}$"
+_INCOMPARABLE_MARK = "$^{*}$"
 _OTHER_OPTICS_MARK = r"$^{\S}$"
 _ANCHORED_MARK = r"$^{\dagger}$"
 _LATEX_ESCAPES = {
@@ -92,12 +92,8 @@ def latex_table(
         undeclared=any(result.declared.uses_ground_truth is None for result in results),
         unranked_mark=_UNRANKED_MARK,
         notes=[
-            mark + escape_latex(start) + "; ".join(map(escape_latex, rows)) + "."
-            for mark, start, rows in (
-                (_INCOMPARABLE_MARK, formatting.INCOMPARABLE_NOTE, formatting.incomparable_rows(results)),
-                ("", formatting.ABSENT_PAPER_NOTE, absent),
-            )
-            if rows
+            _INCOMPARABLE_MARK * bool(mark) + start + "; ".join(map(escape_latex, listed)) + "."
+            for mark, start, listed in formatting.row_notes(results, absent)
         ],
         intervals=intervals,
         resampled=_resampled(tables.values()),
@@ -203,11 +199,9 @@ def _cells(table: Table | None, best: Mapping[str, str], intervals: bool) -> lis
         interval = column.interval_text(column.interval(table), ", ") if intervals else ""
         shown = rf"\textbf{{{number}}}" if table.ranked and number == best.get(column.path) else number
         cells.append(shown + (rf" {{\tiny[{interval}]}}" if interval else ""))
-    marks = (
-        "" if table.ranked else _UNRANKED_MARK,
-        _INCOMPARABLE_MARK * bool(formatting.incomparable_reasons(table)),
-    )
-    return [*(cell + mark for cell, mark in zip(cells, marks, strict=False)), *cells[2:]]
+    cells[0] += "" if table.ranked else _UNRANKED_MARK
+    cells[1] += _INCOMPARABLE_MARK if formatting.incomparable_reasons(table) else ""
+    return cells
 
 
 def _reference_rows(results: Sequence[Result], config: str) -> dict[str, list[str]]:

@@ -319,11 +319,8 @@ def print_paper_table(
         "?: use of ground truth not declared.",
     )
     print_line(console, f"{formatting.RANK_ERROR_NOTE} {formatting.REFERENCE_NOTE}")
-    if incomparable := formatting.incomparable_rows(results):
-        note = f"{formatting.INCOMPARABLE_MARK}: {formatting.INCOMPARABLE_NOTE}{'; '.join(incomparable)}."
-        print_line(console, note, style="yellow")
-    if absent:
-        print_line(console, f"{formatting.ABSENT_PAPER_NOTE}{'; '.join(absent)}.")
+    for mark, start, listed in formatting.row_notes(results, absent):
+        print_line(console, f"{mark and mark + ': '}{start}{'; '.join(listed)}.", style="yellow")
     if published and any(table.published for result in results for table in result.tables.values()):
         mark = load_published().parts["synthetic"].mark
         print_line(console, f"The paper's rows: {mark}. †: median-anchored. {OTHER_OPTICS_NOTE}")
@@ -333,8 +330,7 @@ def _paper_table(rows: Sequence[tuple[Result, Table]], match: PublishedMatch | N
     paper = make_grid("", _HEADS, fold=True, left=1)
     for result, table in rows:
         name = printable(result.method, 40) + formatting.rank_mark(result.declared, table)
-        if formatting.incomparable_reasons(table):
-            name += f" {formatting.INCOMPARABLE_MARK}"
+        name += " *" * bool(formatting.incomparable_reasons(table))
         paper.add_row(*map(plain_text, [name, *texts((RANK_ERROR, *PAPER_COLUMNS), table)]))
     for title, cells in formatting.paper_reference_rows([(result.method, table) for result, table in rows]):
         paper.add_row(*map(plain_text, [f"reference: {title}", "", *cells]), style="dim")
