@@ -31,6 +31,7 @@ from rebar_depth_bench.bar_crossings.table import CROSSINGS_SCHEMA
 from rebar_depth_bench.base import limits
 from rebar_depth_bench.base.limits import Limit
 from rebar_depth_bench.cli.main import argument_parser as bench_parser
+from rebar_depth_bench.cli.main import main as bench_main
 from rebar_depth_bench.data.bars import BARS_SCHEMA
 from rebar_depth_bench.data.schema import COLUMN_DESCRIPTIONS, COLUMNS, column_kind
 from rebar_depth_bench.methods import find_method, own_methods
@@ -158,6 +159,10 @@ def test_documented_python_runs(
             exec(shown.replace("(480, 640)", "(48, 64)"), names)
         assert not output or printed.getvalue() == output
     assert name_of(page) not in ("README.md", "docs/score.md") or any(output for _, output in python_blocks(page))
+    for line in shell_lines(page):
+        if "tests/data/tiny" in line:
+            program, *arguments = shlex.split(line, comments=True)
+            assert (program, bench_main(arguments)) == ("rebar-bench", 0)
     writes = any("submission.zip" in block for block in blocks(page, "python"))
     assert (tmp_path / "submission.zip").is_file() == writes
     if "loader" in names:
