@@ -21,6 +21,9 @@ count alike at 0.3 m and 8 m.
 the protocol does, plus ``FRAME_WEIGHT`` times that of all pixels with a surface. For a logarithmic error e, the
 rank error of a pixel is 1 - exp(-|e|). Both images of each stereo pair are used, and no other data or weights.
 
+**What it prints.** After each epoch, the errors on the training views and, if the folder has it, on the split
+``validation``, which ``rdb.Evaluator`` computes; at the end, the table of the exported network beside SGBM.
+
 The same command continues an interrupted training after its last complete epoch, with the result that an
 uninterrupted one has. The same ``--seed``, ``--epochs``, ``--batch`` and ``--crop`` give the same weights on the
 same machine, unless ``--minutes`` ends the training.
