@@ -21,6 +21,9 @@ count alike at 0.3 m and 8 m.
 the protocol does, plus ``FRAME_WEIGHT`` times that of all pixels with a surface. For a logarithmic error e, the
 rank error of a pixel is 1 - exp(-|e|). Both images of each stereo pair are used, and no other data or weights.
 
+**What it prints.** After each epoch, the errors on the training views and, if the folder has it, on the split
+``validation``, which ``rdb.Evaluator`` computes; at the end, the table of the exported network beside SGBM.
+
 The same command continues an interrupted training after its last complete epoch, with the result that an
 uninterrupted one has. The same ``--seed``, ``--epochs``, ``--batch`` and ``--crop`` give the same weights on the
 same machine, unless ``--minutes`` ends the training.
@@ -45,13 +48,11 @@ from torch.nn import functional
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.base.errors import InputError
-from rebar_depth_bench.base.terminal import ProgressBars, duration_text, print_notice
+from rebar_depth_bench.base.terminal import duration_text, print_notice
 from rebar_depth_bench.base.writing import atomic_replace, write_text
 from rebar_depth_bench.cli.console import run_command
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import ConfigViews
-from rebar_depth_bench.methods import find_method
-from rebar_depth_bench.methods.run import predict
 from rebar_depth_bench.reporting.formatting import scaled_constants
 from rebar_depth_bench.scoring.columns import COVERAGE, NATIVE, RANK_ERROR, SCALED, number, texts
 
@@ -226,8 +227,25 @@ def train_epoch(
     return sums[0] / max(steps, 1), sums[1] / max(steps, 1)
 
 
+def validate(net: DepthNet, evaluator: rdb.Evaluator, batch_size: int) -> str:
+    """Return the errors of the depth that a network predicts for the views of an evaluator, as text."""
+    evaluator.reset()
+    net.eval()
+    with torch.inference_mode():
+        for batch in rdb.torch_loader(evaluator.dataset, batch_size):
+            factor = (batch["K"][:, 0, 0] / FOCAL_PX)[:, None, None, None]
+            canonical_m = net(batch["rgb"].float().div(255).sub(MEAN).div(STD)).exp()
+            evaluator.update(batch["view_id"], canonical_m * factor)
+    net.train()
+    metrics = evaluator.compute().metrics
+    rank_error, abs_rel = metrics[f"{CONFIG}/rank_error"], metrics[f"{CONFIG}/native/abs_rel"]
+    return f"; validation: rank error {rank_error:.4f}, AbsRel {abs_rel:.4f}"
+
+
 def train(options: argparse.Namespace, checkpoint: Path) -> DepthNet:
     """Return the network, trained until ``--epochs`` or ``--minutes``; print the errors of each epoch."""
+    splits = open_folder(options.root).config(CONFIG).splits
+    evaluator = rdb.Evaluator(options.root, CONFIG, split="validation") if "validation" in splits else None
     views = rdb.load(options.root, CONFIG, split="train", columns=COLUMNS)
     plan = {name: getattr(options, name) for name in ("seed", "epochs", "crop", "batch")}
     training = Training.open(checkpoint, plan | {"views": list(views["view_id"]), "channels": list(CHANNELS)})
@@ -255,10 +273,11 @@ def train(options: argparse.Namespace, checkpoint: Path) -> DepthNet:
         steel, frame = train_epoch(training, loader, share_done)
         training.epoch, training.seconds = training.epoch + 1, time.monotonic() - start
         training.save(checkpoint)
+        validation = validate(training.net, evaluator, options.batch) if evaluator else ""
         left_s = min(limit_s - training.seconds, training.seconds * (options.epochs / training.epoch - 1))
         print_notice(
             f"epoch {training.epoch} of {options.epochs}: mean error of log depth {steel:.3f} on steel, "
-            f"{frame:.3f} on all surfaces; {duration_text(max(left_s, 0.0))} left"
+            f"{frame:.3f} on all surfaces{validation}; {duration_text(max(left_s, 0.0))} left"
         )
     return training.net
 
@@ -314,14 +333,12 @@ def score_rows(root: str, method_names: Sequence[str], out: Path) -> Iterator[Se
         title = f"{config}, {split}" if configs[config].has_splits else config
         scored = []
         for name in method_names:
-            method = find_method(name)
-            archive = out / f"{method.info.name.partition(' ')[0]}-{config}.zip"
-            with ProgressBars() as bars:
-                predict(method, root, archive, configs=[config], split=split, progress=bars.update)
-            table = rdb.score(archive, root).tables[config]
-            scored.append((method.info.name.partition(" ")[0], table))
+            result = rdb.evaluate(name, root, config=config, split=split)
+            short_name, table = result.method.partition(" ")[0], result.tables[config]
+            result.save_archive(out / f"{short_name}-{config}.zip")
+            scored.append((short_name, table))
             cells = texts((RANK_ERROR, NATIVE[0], SCALED[0], COVERAGE), table)
-            yield (title, method.info.name.partition(" ")[0], str(table.views), *cells)
+            yield (title, short_name, str(table.views), *cells)
         for name, (abs_rel, _) in scaled_constants(scored).items():
             yield title, f"{name}, scaled", str(table.views), "", "", number(abs_rel, 4), ""
 

@@ -89,13 +89,11 @@ def evaluate(
         if (method, kind, inputs, uses_ground_truth) != ("unnamed", "metric", None, None):
             raise InputError(f"method, kind, inputs or uses_ground_truth is given, but {model} declares its own")
         return evaluator._predicted_by(model)
-    if isinstance(model, Mapping):
-        pairs: Iterable[tuple[str, object]] = model.items()
-    elif callable(model):
+    if callable(model):
         rows = evaluator._rows(with_poses=inputs == "multi-view")
-        pairs = ((row["view_id"], model(row)) for row in rows)
+        pairs: Iterable[tuple[str, object]] = ((row["view_id"], model(row)) for row in rows)
     else:
-        pairs = model
+        pairs = _pairs(model)
     for view_id, depth in pairs:
         if view_id not in evaluator._left_out:
             evaluator.update(view_id, depth)
@@ -138,6 +136,8 @@ class Evaluator:
             "inputs": inputs,
             "uses_ground_truth": uses_ground_truth,
         }
+        if not isinstance(config, str | None):
+            raise InputError(f"config is {escape_text(str(config))}, expected the name of one, or None for all")
         whole = open_folder(root)
         self._all = dataset_views(whole, None if config is None else [config], split)
         self._views = self._all if views is None else _selected(self._all, views)
@@ -168,7 +168,10 @@ class Evaluator:
         """Drop all predictions."""
         self._close()
         self._archive = _TemporaryArchive()
-        self._writer = SubmissionWriter(self._archive.path, **self._declared)
+        try:
+            self._writer = SubmissionWriter(self._archive.path, **self._declared)
+        except InputError as error:  # Its message names the temporary archive.
+            raise InputError.from_problems("declaration", error.problems) from None
         self._added = set[str]()
 
     def __del__(self) -> None:
@@ -191,11 +194,10 @@ class Evaluator:
         Raises ``InputError``, which names the view, for one that is not to be predicted or was added before, and
         for depth of another size.
         """
-        ids = [view_ids] if isinstance(view_ids, str) else list(view_ids)
-        is_list = isinstance(depth, list | tuple)
-        maps = list(depth) if is_list else _array(depth)  # type: ignore[call-overload]
-        if isinstance(view_ids, str) and not is_list:
-            maps = [maps]
+        if isinstance(view_ids, str):
+            self._add(view_ids, _array(depth))
+            return
+        ids, maps = list(view_ids), depth if isinstance(depth, list | tuple) else np.atleast_1d(_array(depth))
         if len(maps) != len(ids):
             raise InputError(f"{len(ids)} view ids and {len(maps)} depth maps are given, expected as many of both")
         for view_id, one in zip(ids, maps, strict=True):
@@ -220,7 +222,7 @@ class Evaluator:
         self._added.add(view_id)
 
     def compute(self) -> EvaluatedResult:
-        """Return the result of the predictions. Raises ``InputError`` if a view is missing."""
+        """Return the result of the predictions and begin again. Raises ``InputError`` if a view is missing."""
         if missing := [view_id for view_id in self._grids if view_id not in self._added]:
             raise InputError(f"{len(missing)} of {len(self._grids)} views are missing, such as {missing[0]}")
         self._close()
@@ -326,7 +328,7 @@ class _TemporaryArchive:
 
 def _selected(configs: Sequence[ConfigViews], views: int | Sequence[str]) -> list[ConfigViews]:
     """Return some views of each config: a number of them, spread evenly, or those with the given ids."""
-    if isinstance(views, int):
+    if isinstance(views, int | np.integer):
         if views < 1:
             raise InputError(f"views is {views}, expected a number from 1 or view ids")
         spread = [
@@ -337,6 +339,9 @@ def _selected(configs: Sequence[ConfigViews], views: int | Sequence[str]) -> lis
         ]
     else:
         known = {view_id for one in configs for view_id in one.view_ids}
+        views = [views] if isinstance(views, str) else views
+        if not len(views):
+            raise InputError(f"views has no id, expected ids of views, as {min(known)}")
         if unknown := [view_id for view_id in views if view_id not in known]:
             raise InputError(f"views has {escape_text(str(unknown[0]))}, expected ids of views, as {min(known)}")
         wanted = set(views)
@@ -348,10 +353,20 @@ def _selected(configs: Sequence[ConfigViews], views: int | Sequence[str]) -> lis
     ]
 
 
+def _pairs(model: object) -> Iterator[tuple[str, object]]:
+    """Yield ids and depth of a mapping or of pairs. Raises ``InputError`` for anything else."""
+    pairs = model.items() if isinstance(model, Mapping) else model
+    for pair in pairs if isinstance(pairs, Iterable) else [None]:
+        if not (isinstance(pair, tuple) and len(pair) == 2 and isinstance(pair[0], str)):
+            expected = "the name of a method, a function of a row, or view ids with their depth"
+            raise InputError(f"the model is of type {type(model).__name__}, expected {expected}")
+        yield pair
+
+
 def _array(depth: object) -> ndarray:
     """Return depth as an array of NumPy, from one or from a tensor of torch on any device."""
     if hasattr(depth, "detach"):
         tensor = depth.detach()
         depth = (tensor.float() if "bfloat16" in str(tensor.dtype) else tensor).cpu().numpy()
-    array: ndarray = np.asarray(depth)
+    array: ndarray = np.asanyarray(depth)  # The writer refuses masked arrays.
     return array.astype(np.float32) if array.dtype.name == "bfloat16" else array

@@ -8,7 +8,6 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -315,10 +314,7 @@ def _cluster_context(address: str | None, device: str) -> Iterator[Submit | None
     if address is None:
         yield None
         return
-    if find_spec("distributed") is None:
-        raise InputError(
-            "not installed: distributed; --cluster needs it: pip install 'rebar-depth-bench[cluster]'"
-        )
+    require_extra("cluster", ["distributed"])
     from dataset_builder.pipeline.dask_renderer import connect_to_cluster
 
     with connect_to_cluster(address) as cluster:

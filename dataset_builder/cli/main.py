@@ -213,9 +213,9 @@ def _inspect(options: argparse.Namespace) -> None:
 def _add_push_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("root", metavar="ROOT", help="dataset folder")
     parser.add_argument("--hub-id", required=True, metavar="ID", help="id of the repository, ORG/NAME")
-    parser.add_argument(
-        "--yes", action="store_true", help="publish; without it, only what would be sent is printed"
-    )
+    mode = parser.add_mutually_exclusive_group()
+    mode.add_argument("--yes", action="store_true", help="publish; without it, only what would be sent is printed")
+    mode.add_argument("--dry-run", action="store_true", help="print the files without connecting to the Hub")
     parser.add_argument("--private", action="store_true", help="make a new repository private")
     parser.add_argument(
         "--revision",
@@ -233,7 +233,8 @@ def _push(options: argparse.Namespace) -> None:
     check_repository_id(options.hub_id)
     if not re.fullmatch(PATH_PATTERN, options.revision):
         raise InputError(f"--revision is {escape_text(options.revision)}, expected the name of a branch")
-    require_online()
+    if not options.dry_run:
+        require_online()
     if options.yes:
         require_token()
     with ProgressBars() as bars:
@@ -241,13 +242,17 @@ def _push(options: argparse.Namespace) -> None:
     if source.stray:
         more = f" and {len(source.stray) - _STRAY_SHOWN} more" if len(source.stray) > _STRAY_SHOWN else ""
         print_notice(f"not in the manifest, stays local: {', '.join(source.stray[:_STRAY_SHOWN])}{more}")
+    if options.dry_run:
+        print(f"{options.hub_id}, branch {options.revision}", *source.lines(), sep="\n")
+        print("dry run: not compared with the Hub, nothing was sent")
+        return
     push = plan_push(source, options.hub_id, options.revision, private=options.private)
     print(*push.lines(), sep="\n")
     sys.stdout.flush()
     if not push.is_needed:
         print("up to date: nothing to send")
     elif not options.yes:
-        print("dry run: nothing was sent; --yes publishes")
+        print("nothing was sent; --yes publishes")
     else:
         with ProgressBars() as bars:
             print(send_push(push, bars.update))

@@ -34,7 +34,7 @@ from dataset_builder.lidar.scanner import (
 )
 from dataset_builder.scene.mesh_ply import read_mesh_ply
 from dataset_builder.scene.raycast import RayCaster
-from rebar_depth_bench.base.errors import MethodError
+from rebar_depth_bench.base.errors import MethodError, install_command
 from rebar_depth_bench.base.parallel import Progress
 from rebar_depth_bench.geometry.cameras import Camera, fold_radius, project
 from rebar_depth_bench.methods import MethodInfo, MultiViewMethod, Prepared, Views
@@ -58,7 +58,7 @@ def lidar_method(name: str, spec: ScannerSpec, what: str) -> MultiViewMethod:
 
     def check(_: Views) -> None:
         if find_spec("embreex") is None:
-            raise MethodError(f"{name} requires embreex for ray casting: pip install 'rebar-depth-bench[build]'")
+            raise MethodError(f"{name} requires embreex for ray casting: {install_command('build')}")
 
     def prepare(views: Views, _: Path, progress: Progress) -> Prepared:
         progress(f"{name}: the mesh of {views.config}", 0, 1)

@@ -76,6 +76,13 @@ class VerifiedFolder:
     stray: tuple[str, ...]
     card: DatasetCard
 
+    def lines(self) -> Iterator[str]:
+        """Yield a line for each file that is published, and the totals."""
+        for name, file in self.files.items():
+            yield f"  {name}, {file.size:,} bytes"
+        total_bytes = sum(file.size for file in self.files.values())
+        yield f"{len(self.files)} files ({total_bytes:,} bytes); what the Hub has is not sent again"
+
 
 def verified_folder(root: str, progress: Progress = silent) -> VerifiedFolder:
     """Compare a local dataset folder with its manifest and parse its card; return what is published of it.

@@ -11,7 +11,6 @@ for information: some programs write them in another unit, or for a whole row of
 
 from __future__ import annotations
 
-import importlib.util
 import os
 import signal
 import subprocess
@@ -40,7 +39,7 @@ from dataset_builder.user_files.ifc_records import (
     read_records,
 )
 from dataset_builder.user_files.mesh_import import connected_components, fitted_bar
-from rebar_depth_bench.base.errors import InputError, MeshError, Problem
+from rebar_depth_bench.base.errors import MeshError, Problem, require_extra
 from rebar_depth_bench.base.limits import IFC_MEMORY_BYTES, IFC_SECONDS
 from rebar_depth_bench.data.bars import Bar
 
@@ -65,11 +64,7 @@ def ifc_cage(content: bytes, where: str, select: tuple[Selection, ...] = (), tru
     a bar without usable geometry (with its GlobalId), if a bar depends on an instance that cannot be read as
     written, or if reading exceeds a limit; ``InputError`` if ifcopenshell is not installed.
     """
-    if importlib.util.find_spec("ifcopenshell") is None:
-        raise InputError(
-            "not installed: ifcopenshell; expected the ifc extra for IFC models: "
-            "pip install 'rebar-depth-bench[ifc]'"
-        )
+    require_extra("ifc", ["ifcopenshell"])
     seconds = IFC_SECONDS.value()
     wall_seconds = _WALL_CLOCK_FACTOR * seconds
     limits = map(str, (os.getpid(), IFC_MEMORY_BYTES.value(), seconds, wall_seconds))

@@ -169,6 +169,10 @@ def require_extra(extra: str, modules: Sequence[str]) -> None:
     missing = [name for name in modules if find_spec(name) is None]
     if missing:
         raise InputError(
-            f"not installed: {', '.join(missing)}; expected the {extra} extra: "
-            f"pip install 'rebar-depth-bench[{extra}]'"
+            f"not installed: {', '.join(missing)}; expected the {extra} extra: {install_command(extra)}"
         )
+
+
+def install_command(extra: str) -> str:
+    """Return how to install an extra of this distribution, which is not on a package index."""
+    return f"pip install '.[{extra}]' in a clone of rebar-depth-bench"

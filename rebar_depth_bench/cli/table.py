@@ -6,7 +6,7 @@ import argparse
 
 from rich.console import Console
 
-from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.errors import InputError, printable
 from rebar_depth_bench.base.terminal import ProgressBars, print_notice
 from rebar_depth_bench.base.writing import write_output
 from rebar_depth_bench.cli.console import (
@@ -18,12 +18,14 @@ from rebar_depth_bench.cli.console import (
     add_workers,
     prints_table,
 )
+from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.reporting.figure import check_figure, write_figure
 from rebar_depth_bench.reporting.latex import latex_table
 from rebar_depth_bench.reporting.tables import disambiguate_method_names, print_paper_table
 from rebar_depth_bench.scoring.comparison import check_same_splits
 from rebar_depth_bench.scoring.evaluation import score
 from rebar_depth_bench.scoring.frames import frame_csv, tables_frame
+from rebar_depth_bench.scoring.truth import paper_differences
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -64,12 +66,18 @@ def run(options: argparse.Namespace) -> None:
             raise InputError(f"--figure: {found}, expected metric ones: the figure shows native errors")
     results = disambiguate_method_names(results)
     published = not options.no_published
+    absent = []
+    if published and not any(table.published for result in results for table in result.tables.values()):
+        configs = open_folder(options.data).config_by_name
+        names = dict.fromkeys(name for result in results for name in result.tables)
+        absent = [f"{printable(name)} ({', '.join(paper_differences(configs[name]))})" for name in names]
     if options.latex:
-        write_output(options.latex, latex_table(results, published=published, intervals=options.intervals))
+        latex = latex_table(results, published=published, intervals=options.intervals, absent=absent)
+        write_output(options.latex, latex)
     if options.csv:
         write_output(options.csv, frame_csv(tables_frame(results)))
     if options.figure:
         for note in write_figure(results, options.figure, published=published):
             print_notice(note)
     if prints_table(options):
-        print_paper_table(results, Console(), published=published)
+        print_paper_table(results, Console(), published=published, absent=absent)

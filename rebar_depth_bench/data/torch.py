@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 from zlib import crc32
@@ -11,7 +11,7 @@ import numpy as np
 import PIL.Image
 from datasets import Dataset, Image, IterableDataset, Value
 
-from rebar_depth_bench.base.errors import DatasetError, InputError, MethodError, Problem
+from rebar_depth_bench.base.errors import DatasetError, InputError, MethodError, Problem, install_command
 from rebar_depth_bench.data.codecs import PICTURE_KINDS
 from rebar_depth_bench.data.decoding_features import STORED_MODES
 from rebar_depth_bench.data.rows import is_absent
@@ -118,10 +118,10 @@ def _is_image(row: Row, name: str) -> bool:
 
 try:
     import torch
-    from torch.utils.data import DataLoader
+    from torch.utils.data import DataLoader, Sampler
     from torch.utils.data import IterableDataset as TorchIterableDataset
 except ImportError as error:
-    raise MethodError(f"torch_loader needs torch ({error}): pip install 'rebar-depth-bench[torch]'") from None
+    raise MethodError(f"torch_loader needs torch ({error}): {install_command('torch')}") from None
 
 Batch = dict[str, Any]
 
@@ -144,6 +144,9 @@ def torch_loader(
     num_workers: int = 0,
     *,
     shuffle: bool = False,
+    sampler: Sampler[int] | Iterable[int] | None = None,
+    drop_last: bool = False,
+    pin_memory: bool = False,
     stereo: bool = False,
     crop: tuple[int, int] | None = None,
     flip: bool = False,
@@ -167,16 +170,23 @@ def torch_loader(
     ``seed`` and the epoch, and for a streamed dataset on the number of workers; crops and flips depend on
     ``seed``, the epoch and the view id.
 
+    ``sampler``, ``drop_last`` and ``pin_memory`` are those of ``DataLoader``. A sampler takes the place of
+    ``shuffle``, and a streamed dataset has none; the caller sets the epoch of a ``DistributedSampler``.
+
     Importing this module without torch raises ``MethodError``. Raises ``InputError`` for an invalid crop or seed,
-    and ``DatasetError`` if ``ds`` lacks columns.
+    and a sampler beside ``shuffle`` or of a streamed dataset, and ``DatasetError`` if ``ds`` lacks columns.
     """
     keys = {**_LEFT, **_RIGHT, "baseline_m": "baseline_m"} if stereo else _LEFT
     rows = _pictured(ds, ["view_id", *keys.values()])
     collate = _Collate(keys, Augmentation(crop, flip, seed))
+    if sampler is not None and (shuffle or isinstance(rows, IterableDataset)):
+        found = "shuffle" if shuffle else "a streamed dataset, whose rows have no numbers"
+        raise InputError(f"torch_loader: sampler is given with {found}, expected only one of both")
+    options = {"num_workers": num_workers, "drop_last": drop_last, "pin_memory": pin_memory}
     if not isinstance(rows, IterableDataset):
-        return _EpochLoader(rows, batch_size, shuffle, collate, num_workers)
+        return _EpochLoader(rows, collate, batch_size=batch_size, shuffle=shuffle, sampler=sampler, **options)
     shuffled = rows.shuffle(seed, buffer_size=SHUFFLE_BUFFER) if shuffle else rows
-    return _EpochLoader(_StreamedRows(shuffled), batch_size, False, collate, num_workers)
+    return _EpochLoader(_StreamedRows(shuffled), collate, batch_size=batch_size, **options)
 
 
 def _pictured(ds: Dataset | IterableDataset, columns: Sequence[str]) -> Dataset | IterableDataset:
@@ -198,17 +208,8 @@ def _pictured(ds: Dataset | IterableDataset, columns: Sequence[str]) -> Dataset 
 class _EpochLoader(DataLoader[Any]):
     """Data loader that counts its iterations, on which the order, crops and flips depend."""
 
-    def __init__(
-        self, source: Dataset | _StreamedRows, batch_size: int, shuffle: bool, collate: _Collate, num_workers: int
-    ) -> None:
-        super().__init__(
-            source,
-            batch_size=batch_size,
-            shuffle=shuffle,
-            collate_fn=collate,
-            num_workers=num_workers,
-            generator=torch.Generator(),
-        )
+    def __init__(self, source: Dataset | _StreamedRows, collate: _Collate, **options: Any) -> None:
+        super().__init__(source, collate_fn=collate, generator=torch.Generator(), **options)
         self._collate = collate
 
     def __iter__(self) -> Any:

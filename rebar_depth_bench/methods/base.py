@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Float32
 from numpy import ndarray
 
-from rebar_depth_bench.base.errors import MethodError
+from rebar_depth_bench.base.errors import MethodError, install_command
 from rebar_depth_bench.base.parallel import Progress
 from rebar_depth_bench.data.rows import Views
 from rebar_depth_bench.submission.declaration import METRIC, PREDICTION_KINDS
@@ -148,4 +148,4 @@ def import_optional(module: str, need: str, extra: str) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        raise MethodError(f"{need} ({error}): pip install 'rebar-depth-bench[{extra}]'") from None
+        raise MethodError(f"{need} ({error}): {install_command(extra)}") from None

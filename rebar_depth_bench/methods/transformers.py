@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Float64, UInt8
 from numpy import ndarray
 
-from rebar_depth_bench.base.errors import MethodError
+from rebar_depth_bench.base.errors import MethodError, install_command
 from rebar_depth_bench.base.validation import short_repr
 from rebar_depth_bench.data.files import files_digest
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor, finite_or_nan, positive_or_nan
@@ -137,7 +137,7 @@ def read_settings(path: Path) -> dict[str, Any]:
     return read_json_object(path)
 
 
-_INSTALL = "pip install 'rebar-depth-bench[models]'"
+_INSTALL = install_command("models")
 DEPTH_PRO_CHECKPOINT = "apple/DepthPro-hf"
 INVERSE_DEPTH_BOUNDS_PER_M = (1e-4, 1e4)
 """Bounds of Depth Pro's inverse depth, 1/m: depth between 0.1 mm and 10 km."""

@@ -24,6 +24,7 @@ from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE
 from rebar_depth_bench.scoring.relative import relative_findings
 
 if TYPE_CHECKING:
+    from rebar_depth_bench.scoring.result import Result
     from rebar_depth_bench.scoring.table import Table
     from rebar_depth_bench.submission.declaration import Declaration
 
@@ -119,6 +120,19 @@ def incomparable_reasons(table: Table) -> list[str]:
     if table.views_scored and not table.is_finite:
         reasons.append("a number overflowed")
     return reasons
+
+
+def row_notes(results: Sequence[Result], absent: Sequence[str]) -> list[tuple[str, str, Sequence[str]]]:
+    """Return mark, beginning and list of each note on rows of tables; ``absent`` as in ``print_paper_table``."""
+    marked = [
+        f"{printable(result.method, 40)}, {config_title(name, table.split)} ({', '.join(reasons)})"
+        for result in results
+        for name, table in result.tables.items()
+        if (reasons := incomparable_reasons(table))
+    ]
+    incomparable = ("*", "Errors of valid predictions are not compared with those of others: ", marked)
+    without_paper = ("", "The paper's rows are absent; the configs differ from its scenes: ", absent)
+    return [note for note in (incomparable, without_paper) if note[-1]]
 
 
 def grouping_title(grouping: str) -> str:

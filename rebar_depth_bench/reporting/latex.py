@@ -53,6 +53,7 @@ _ARROWS: Mapping[Better, str] = {"lower": r" $\downarrow$", "higher": r" $\uparr
 _MISSING = "--"
 _NO_OTHERS = [""] * len(OTHERS)
 _UNRANKED_MARK = r"$^{\ddagger}$"
+_INCOMPARABLE_MARK = "$^{*}$"
 _OTHER_OPTICS_MARK = r"$^{\S}$"
 _ANCHORED_MARK = r"$^{\dagger}$"
 _LATEX_ESCAPES = {
@@ -72,14 +73,17 @@ _LATEX_ESCAPES = {
 _LIGATURE = re.compile(r"([-',])(?=\1)")
 
 
-def latex_table(results: Sequence[Result], *, published: bool, intervals: bool = False) -> str:
+def latex_table(
+    results: Sequence[Result], *, published: bool, intervals: bool = False, absent: Sequence[str] = ()
+) -> str:
     r"""Return ``results`` as a LaTeX ``table*`` with one row per result and the same columns per config.
 
     RMSE (cm) and AbsRel are native, AbsRel_s is computed after the oracle scale, s is its median over views. The
     best number of a column is bold if the column has two or more ranked rows; a row that is not ranked is marked
-    with a double dagger and is never bold. With ``published``, the paper's rows of the same scenes follow below a
-    rule; they are marked and not compared with the results. With ``intervals``, the 95 % intervals are printed
-    beside the numbers, and each block holds one config. Results that are not metric follow in a table for each
+    with a double dagger and is never bold. The RMSE of a row whose errors are not compared with those of others
+    has an asterisk. With ``published``, the paper's rows of the same scenes follow below a rule; they are marked
+    and not compared with the results. ``absent`` is as in ``print_paper_table``. With ``intervals``, the 95 %
+    intervals are printed beside the numbers, and each block holds one config. Results that are not metric follow in a table for each
     kind, in the order of the aligned error of a block's first config, without bold numbers.
 
     Raises ``InputError`` if there are no results, or if they belong to different datasets.
@@ -89,10 +93,10 @@ def latex_table(results: Sequence[Result], *, published: bool, intervals: bool =
         digest_list = ", ".join(sorted(map(formatting.short_digest, digests))) or "no result"
         raise InputError(f"LaTeX table: results of {len(digests)} datasets ({digest_list}), expected one dataset")
     blocks = kind_blocks(results)
-    return "\n\n".join(_table_of_kind(block, published=published, intervals=intervals) for block in blocks)
+    return "\n\n".join(_table_of_kind(block, absent, published=published, intervals=intervals) for block in blocks)
 
 
-def _table_of_kind(results: Sequence[Result], *, published: bool, intervals: bool) -> str:
+def _table_of_kind(results: Sequence[Result], absent: Sequence[str], *, published: bool, intervals: bool) -> str:
     """Return the ``table*`` of results of one kind."""
     kind = results[0].prediction
     columns = _COLUMNS if kind is None else _ALIGNED_COLUMNS
@@ -117,6 +121,10 @@ def _table_of_kind(results: Sequence[Result], *, published: bool, intervals: boo
         unranked=any(not table.ranked for result in results for table in result.tables.values()),
         undeclared=any(result.declared.uses_ground_truth is None for result in results),
         unranked_mark=_UNRANKED_MARK,
+        notes=[
+            _INCOMPARABLE_MARK * bool(mark) + start + "; ".join(map(escape_latex, listed)) + "."
+            for mark, start, listed in formatting.row_notes(results, absent if kind is None else ())
+        ],
         intervals=intervals,
         resampled=_resampled(tables.values()),
         anchored=any(row.median_anchored for row in paper_rows),
@@ -223,8 +231,9 @@ def _cells(table: Table | None, columns: Sequence[Column], best: Mapping[str, st
         interval = column.interval_text(column.interval(table), ", ") if intervals else ""
         shown = rf"\textbf{{{number}}}" if table.ranked and number == best.get(column.path) else number
         cells.append(shown + (rf" {{\tiny[{interval}]}}" if interval else ""))
-    is_marked = not table.ranked and table.aligned is None
-    return [cells[0] + _UNRANKED_MARK, *cells[1:]] if is_marked else cells
+    cells[0] += _UNRANKED_MARK if not table.ranked and table.aligned is None else ""
+    cells[1] += _INCOMPARABLE_MARK if formatting.incomparable_reasons(table) else ""
+    return cells
 
 
 def _reference_rows(results: Sequence[Result], config: str) -> dict[str, list[str]]:

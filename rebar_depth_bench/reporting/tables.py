@@ -321,14 +321,16 @@ def disambiguate_method_names(results: Sequence[Result]) -> list[Result]:
     ]
 
 
-def print_paper_table(results: Sequence[Result], console: Console, *, published: bool) -> None:
+def print_paper_table(
+    results: Sequence[Result], console: Console, *, published: bool, absent: Sequence[str] = ()
+) -> None:
     """Print a table per config: one row per result, sorted by rank error, then the rows that are not ranked.
 
     The reference errors of the config follow.
 
     ``results`` must not be empty and must belong to one dataset. With ``published``, the paper's rows of the same
-    scene follow; they are marked and not compared with the results. Results that are not metric follow in one
-    block per kind, sorted by aligned error.
+    scene follow; they are marked and not compared with the results. If none do, ``absent`` are configs and why.
+    Results that are not metric follow in one block per kind, sorted by aligned error.
     """
     dataset = results[0].dataset
     digest, version = formatting.short_digest(dataset.digest), printable(dataset.version)
@@ -355,12 +357,14 @@ def print_paper_table(results: Sequence[Result], console: Console, *, published:
                         print_line(console, f"{printable(result.method)}: {note}", style="yellow")
         console.print()
         if kind is None:
-            _print_paper_notes(block, console, published=published)
+            _print_paper_notes(block, console, absent, published=published)
         else:
             print_line(console, formatting.ALIGNED_NOTE)
 
 
-def _print_paper_notes(results: Sequence[Result], console: Console, *, published: bool) -> None:
+def _print_paper_notes(
+    results: Sequence[Result], console: Console, absent: Sequence[str], *, published: bool
+) -> None:
     print_line(console, "RMSE, AbsRel: native (no alignment). AbsRel_s: scaled (oracle median scale per view).")
     print_line(
         console,
@@ -368,6 +372,8 @@ def _print_paper_notes(results: Sequence[Result], console: Console, *, published
         "?: use of ground truth not declared.",
     )
     print_line(console, f"{formatting.RANK_ERROR_NOTE} {formatting.REFERENCE_NOTE}")
+    for mark, start, listed in formatting.row_notes(results, absent):
+        print_line(console, f"{mark and mark + ': '}{start}{'; '.join(listed)}.", style="yellow")
     if published and any(table.published for result in results for table in result.tables.values()):
         mark = load_published().parts["synthetic"].mark
         print_line(console, f"The paper's rows: {mark}. †: median-anchored. {OTHER_OPTICS_NOTE}")
@@ -377,6 +383,7 @@ def _paper_table(rows: Sequence[tuple[Result, Table]], match: PublishedMatch | N
     paper = make_grid("", _HEADS, fold=True, left=1)
     for result, table in rows:
         name = printable(result.method, 40) + formatting.rank_mark(result.declared, table)
+        name += " *" * bool(formatting.incomparable_reasons(table))
         paper.add_row(*map(plain_text, [name, *texts((RANK_ERROR, *PAPER_COLUMNS), table)]))
     for title, cells in formatting.paper_reference_rows([(result.method, table) for result, table in rows]):
         paper.add_row(*map(plain_text, [f"reference: {title}", "", *cells]), style="dim")

@@ -230,20 +230,41 @@ _CONDITIONS: Mapping[str, _Conditions] = {
 
 
 def published_match(config: DatasetConfig) -> PublishedMatch | None:
-    """Return the scene of Table I whose rows may be shown beside a config, or None.
+    """Return the scene of Table I whose rows may be shown beside a config, or None."""
+    name = _paper_scene(config)
+    if name is None or paper_differences(config):
+        return None
+    rig = config.scene.rig
+    optics = None if rig is None else (rig.grid, rig.baseline_m)
+    return PublishedMatch(name, optics == _CONDITIONS[name].optics)
+
+
+def paper_differences(config: DatasetConfig) -> list[str]:
+    """Return why the rows of Table I may not be shown beside a config; empty if they may.
 
     Assembly, board, environment, image size and trajectory have to be equal, with all of its views and without
     appearance variants.
     """
-    is_complete = len(config.views) == config.scenes[0].protocol_views and config.grid == _GRID
-    if config.imported is not None or config.has_splits or not is_complete or config.scene.appearance.variants:
-        return None
-    scene = config.scene
+    name = _paper_scene(config)
+    if name is None:
+        return ["not a scene of the paper"]
+    expected, scene = _CONDITIONS[name], config.scene
     markers = scene.board.markers if scene.board else 0
-    shown = (scene.assembly, markers, scene.environment, scene.protocol)
-    for name, expected in _CONDITIONS.items():
-        assembly = Assembly.model_validate(expected.assembly)
-        if shown == (assembly, expected.markers, expected.environment, expected.trajectory):
-            optics = None if scene.rig is None else (scene.rig.grid, scene.rig.baseline_m)
-            return PublishedMatch(name, optics == expected.optics)
-    return None
+    (height, width), of_views = config.grid, scene.protocol_views
+    conditions = {
+        f"{len(config.views)} of {of_views} views": len(config.views) == of_views,
+        f"{width} x {height} pixels, not {_GRID[1]} x {_GRID[0]}": config.grid == _GRID,
+        "other camera positions": scene.protocol == expected.trajectory,
+        f"{markers} markers, not {expected.markers}": markers == expected.markers,
+        f"environment {scene.environment}, not {expected.environment}": scene.environment == expected.environment,
+        "variants of appearance": not scene.appearance.variants,
+    }
+    return [difference for difference, is_equal in conditions.items() if not is_equal]
+
+
+def _paper_scene(config: DatasetConfig) -> str | None:
+    """Return the scene of Table I that has the assembly of a config, or None."""
+    if config.imported is not None or config.has_splits:
+        return None
+    assemblies = {name: Assembly.model_validate(one.assembly) for name, one in _CONDITIONS.items()}
+    return next((name for name, assembly in assemblies.items() if assembly == config.scene.assembly), None)

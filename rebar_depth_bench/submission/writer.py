@@ -10,6 +10,7 @@ import zipfile
 from collections.abc import Mapping
 from contextlib import ExitStack
 from pathlib import Path
+from threading import Lock
 from types import TracebackType
 from typing import Any, BinaryIO, Self
 
@@ -36,11 +37,12 @@ class SubmissionWriter:
 
     The archive appears at ``path`` only on a clean exit; after an exception in the block an existing file at
     ``path`` is unchanged. Of a link its target is replaced; a device or a pipe is written through. The same
-    predictions give the same bytes. Entries are stored uncompressed, which is fastest to read; ``compress=True``
-    deflates them (about 100 times slower to write, 10 times slower to read, a fifth smaller), and the bytes then
-    also depend on the zlib library in use. ``inputs`` and
-    ``uses_ground_truth`` are declared as in ``Declaration``, ``prediction`` is one of ``PREDICTION_KINDS``, by
-    default metric. ``notes`` is free-form information about the method; no score depends on it.
+    predictions, added in the same order, give the same bytes. Several threads may add views; the order of the
+    entries, which changes no score, is then theirs. Entries are stored uncompressed, which is fastest to read;
+    ``compress=True`` deflates them (about 100 times slower to write, 10 times slower to read, a fifth smaller),
+    and the bytes then also depend on the zlib library in use. ``inputs`` and ``uses_ground_truth`` are declared as
+    in ``Declaration``, ``prediction`` is one of ``PREDICTION_KINDS``, by default metric. ``notes`` is free-form
+    information about the method; no score depends on it.
     """
 
     def __init__(
@@ -90,6 +92,7 @@ class SubmissionWriter:
             raise InputError.from_problems(self.path, problems)
         self._seconds: dict[str, float] = {}
         self._view_ids: set[str] = set()
+        self._lock = Lock()
         self._open = ExitStack()
         self._file: BinaryIO | None = None
         self._zip: zipfile.ZipFile | None = None
@@ -111,15 +114,16 @@ class SubmissionWriter:
             raise InputError(
                 f"view_id is {escape_text(str(view_id))}, expected '<config>/<number>' like 'lattice/0000'"
             )
-        if view_id in self._view_ids:
-            raise InputError(f"{view_id}: the view was added twice, expected once")
         if seconds is not None and not (isinstance(seconds, int | float) and 0 <= seconds < math.inf):
             raise InputError(f"{view_id}: seconds is {seconds!r}, expected a finite number of at least 0")
         values = _as_depth(view_id, depth)
-        self._write_entry(self._zip, f"{view_id}.npy", _npy_header(values), values.data.cast("B"))
-        self._view_ids.add(view_id)
-        if seconds is not None:
-            self._seconds[view_id] = float(seconds)
+        with self._lock:
+            if view_id in self._view_ids:
+                raise InputError(f"{view_id}: the view was added twice, expected once")
+            self._write_entry(self._zip, f"{view_id}.npy", _npy_header(values), values.data.cast("B"))
+            self._view_ids.add(view_id)
+            if seconds is not None:
+                self._seconds[view_id] = float(seconds)
 
     def __enter__(self) -> Self:
         if not self.path.parent.is_dir():

@@ -146,15 +146,41 @@ def test_wrong_views_are_named(tiny_root: Path, lattice: Truth) -> None:
     [
         ({"views": 0}, "views is 0"),
         ({"views": ["lattice/9999"]}, "views has lattice/9999"),
-        ({"kind": "depth"}, 'prediction: .*"metric", "scale", "affine-depth" or'),
+        ({"views": "lattice/9999"}, "views has lattice/9999"),
+        ({"views": []}, "views has no id"),
+        ({"kind": "depth"}, '^declaration: .*\n.* prediction: .*"metric", "scale", "affine-depth" or'),
         ({"inputs": "sonar"}, "inputs"),
         ({"split": "train"}, "train"),
         ({"config": "none"}, "no config 'none'"),
+        ({"config": ["lattice"]}, "expected the name of one"),
     ],
 )
 def test_arguments_are_checked_before_any_prediction(tiny_root: Path, arguments: Any, words: str) -> None:
     with pytest.raises(rdb.InputError, match=words):
         rdb.Evaluator(tiny_root, **arguments)
+
+
+@pytest.mark.parametrize("model", [None, 3, np.ones((9, 90, 160)), [np.ones((90, 160))], {1: np.ones((90, 160))}])
+def test_models_of_other_types_are_refused(tiny_root: Path, model: Any) -> None:
+    with pytest.raises(rdb.InputError, match=f"of type {type(model).__name__}, expected the name of a method"):
+        rdb.evaluate(model, tiny_root, config=LATTICE)
+
+
+@pytest.mark.parametrize(
+    ("depth", "words"),
+    [
+        (None, "shape"),
+        (np.ones((90, 160), int), "int64, expected floats"),
+        (np.ma.MaskedArray(np.ones((90, 160)), mask=True), "masked array"),  # type: ignore[no-untyped-call]
+        ([[1.0] * 160] * 90, None),
+    ],
+)
+def test_what_is_no_depth_is_refused(tiny_root: Path, depth: Any, words: str | None) -> None:
+    if words is None:
+        assert rdb.evaluate(lambda _: depth, tiny_root, config=LATTICE, views=1).tables[LATTICE].coverage == 1
+    else:
+        with pytest.raises(rdb.InputError, match=f"lattice/.*{words}"):
+            rdb.evaluate(lambda _: depth, tiny_root, config=LATTICE)
 
 
 def test_archive_is_deleted_with_the_result(

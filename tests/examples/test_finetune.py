@@ -54,7 +54,8 @@ def test_errors_fall_and_the_table_has_every_method(
     assert example["main"]([str(root), "--out", str(tmp_path / "out"), "--epochs", "6", *OPTIONS]) == 0
     printed = capsys.readouterr()
     errors = [float(text) for text in re.findall(r"depth ([0-9.]+) on steel", printed.err)]
-    assert len(errors) == 6
+    validated = [float(text) for text in re.findall(r"validation: rank error ([0-9.]+),", printed.err)]
+    assert len(errors) == len(validated) == 6
     assert errors[-1] < 0.6 * errors[0]
     _, _, *rows = printed.out.splitlines()
     cells = [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]
@@ -62,6 +63,8 @@ def test_errors_fall_and_the_table_has_every_method(
         ["cages, validation", method, "2"] for method in ("finetuned", "sgbm", "constant, scaled")
     ]
     assert 0 < float(cells[0][3]) < float(cells[1][3]) == 1
+    # The exported network, which the table is about, is that of the last epoch.
+    assert validated[-1] == pytest.approx(float(cells[0][3]), abs=2e-4)
     # The same seed and options give the same weights.
     assert all(torch.equal(value, weights(trained)[name]) for name, value in weights(tmp_path / "out").items())
 

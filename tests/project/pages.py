@@ -26,6 +26,12 @@ def blocks(page: Path, language: str) -> list[str]:
     return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), flags=re.DOTALL | re.MULTILINE)
 
 
+def python_blocks(page: Path) -> list[tuple[str, str]]:
+    """Return the Python blocks of a page, each with the text block right below it, which shows what it prints."""
+    pattern = r"^```python\n(.*?)^```\n(?:\n```text\n(.*?)^```)?"
+    return re.findall(pattern, page.read_text(), flags=re.DOTALL | re.MULTILINE)
+
+
 def prose(page: Path) -> str:
     """Return the text of a page without its code blocks and comments."""
     without_comments = re.sub(r"<!--.*?-->", "", page.read_text(), flags=re.DOTALL)

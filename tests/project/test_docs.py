@@ -8,8 +8,10 @@ import shlex
 import tomllib
 from argparse import ArgumentParser, _SubParsersAction
 from collections.abc import Iterator
+from contextlib import redirect_stdout
 from importlib import import_module
 from importlib.util import find_spec
+from io import StringIO
 from pathlib import Path
 
 import grimp
@@ -29,6 +31,7 @@ from rebar_depth_bench.bar_crossings.table import CROSSINGS_SCHEMA
 from rebar_depth_bench.base import limits
 from rebar_depth_bench.base.limits import Limit
 from rebar_depth_bench.cli.main import argument_parser as bench_parser
+from rebar_depth_bench.cli.main import main as bench_main
 from rebar_depth_bench.data.bars import BARS_SCHEMA
 from rebar_depth_bench.data.schema import COLUMN_DESCRIPTIONS, COLUMNS, column_kind
 from rebar_depth_bench.methods import find_method, own_methods
@@ -47,6 +50,7 @@ from tests.project.pages import (
     inline_code,
     local_links,
     name_of,
+    python_blocks,
     shell_lines,
 )
 
@@ -125,7 +129,11 @@ def test_documented_modules_scripts_and_make_targets_exist() -> None:
 
 def test_extras_are_installed_from_the_repository_and_listed() -> None:
     text = "\n".join(page.read_text() for page in CURRENT_PAGES)
-    assert "pip install rebar-depth-bench" not in text
+    sources = [
+        path for package in PACKAGES for path in (ROOT / package).rglob("*.*") if "__pycache__" not in str(path)
+    ]
+    shown = text + "".join(path.read_text("utf-8", errors="ignore") for path in sources)
+    assert not re.findall(r"pip install.{,3}rebar-depth-bench", shown)
     extras = set(PROJECT["optional-dependencies"])
     assert {name for group in re.findall(r"\.\[([\w,]+)\]'", text) for name in group.split(",")} <= extras
     assert set(first_column(DOCS / "quick-start.md")) == extras
@@ -144,10 +152,18 @@ def test_documented_python_runs(
     page: Path, tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    names: dict[str, object] = {"my_model": lambda rgb, K: np.full(rgb.shape[:2], K[0, 0] / 200)}
-    for block in blocks(page, "python"):
+    (tmp_path / "tests").symlink_to(ROOT / "tests")
+    names: dict[str, object] = {}
+    for block, output in python_blocks(page):
         shown = block.replace('"demo-output/dataset"', repr(str(tiny_root)))
-        exec(shown.replace("(480, 640)", "(48, 64)"), names)
+        with redirect_stdout(StringIO()) as printed:
+            exec(shown.replace("(480, 640)", "(48, 64)"), names)
+        assert not output or printed.getvalue() == output
+    assert name_of(page) not in ("README.md", "docs/score.md") or any(output for _, output in python_blocks(page))
+    for line in shell_lines(page):
+        if "tests/data/tiny" in line:
+            program, *arguments = shlex.split(line, comments=True)
+            assert (program, bench_main(arguments)) == ("rebar-bench", 0)
     writes = any("submission.zip" in block for block in blocks(page, "python"))
     assert (tmp_path / "submission.zip").is_file() == writes
     if "loader" in names:

@@ -110,7 +110,8 @@ sys.exit(main(["--out", "nowhere"]))
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
     assert process.returncode == 2
     assert process.stderr == (
-        "error: not installed: bpy, trimesh; expected the build extra: pip install 'rebar-depth-bench[build]'\n"
+        "error: not installed: bpy, trimesh; expected the build extra: "
+        "pip install '.[build]' in a clone of rebar-depth-bench\n"
     )
 
 

@@ -144,6 +144,6 @@ def test_wheel_alone_exports(installed: Path, tmp_path: Path) -> None:
 def test_missing_extra_is_named(installed: Path, command: tuple[str, ...], extra: str, tmp_path: Path) -> None:
     program, *arguments = command
     finished = run(installed / program, *arguments, cwd=tmp_path, status=2)
-    assert f"pip install 'rebar-depth-bench[{extra}]'" in finished.stderr
+    assert f"pip install '.[{extra}]'" in finished.stderr
     assert "Traceback" not in finished.stderr
     assert not list(tmp_path.iterdir())

@@ -38,7 +38,7 @@ import numpy as np
 from jaxtyping import Float32
 from numpy import ndarray
 
-from rebar_depth_bench.base.errors import MethodError, Problem
+from rebar_depth_bench.base.errors import MethodError, Problem, install_command
 from rebar_depth_bench.base.limits import TOML_BYTES
 from rebar_depth_bench.base.reading import read_file
 from rebar_depth_bench.base.validation import short_repr
@@ -138,7 +138,7 @@ def _load(clone: Path, weights: Path, nearest_m: float | None) -> Predictor:
     incomplete.
     """
     torch = NETWORK.import_torch()
-    NETWORK.import_package("cv2", "pip install 'rebar-depth-bench[methods]'")
+    NETWORK.import_package("cv2", install_command("methods"))
     settings = _read_settings(weights)
     print(f"{NAME}: {DOWNLOADS}", file=sys.stderr, flush=True)
     with NETWORK.errors(f"{weights} cannot be loaded"), on_sys_path(clone):

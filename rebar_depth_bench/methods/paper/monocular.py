@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Float32, UInt8
 from numpy import ndarray
 
-from rebar_depth_bench.base.errors import MethodError
+from rebar_depth_bench.base.errors import MethodError, install_command
 from rebar_depth_bench.data.files import files_digest
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor, positive_or_nan
 from rebar_depth_bench.methods.paper.third_party import (
@@ -110,7 +110,7 @@ def _load_metric3d(code: Path, checkpoint: Path) -> Predictor:
     """
     network = METRIC3D_NETWORK
     torch = network.import_torch()
-    network.import_package("cv2", "pip install 'rebar-depth-bench[methods]'")
+    network.import_package("cv2", install_command("methods"))
     with network.errors(f"{code.name} cannot be loaded"):
         model = torch.hub.load(str(code), METRIC3D_ENTRY_POINT, source="local", pretrain=False)
         model = network.load_checkpoint(model, checkpoint, "model_state_dict", strict=False)

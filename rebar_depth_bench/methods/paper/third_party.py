@@ -21,7 +21,7 @@ import numpy as np
 from jaxtyping import Float, Float32, Num, UInt8
 from numpy import ndarray
 
-from rebar_depth_bench.base.errors import MethodError, Problem, exception_summary
+from rebar_depth_bench.base.errors import MethodError, Problem, exception_summary, install_command
 from rebar_depth_bench.base.limits import JSON_BYTES
 from rebar_depth_bench.base.reading import parse_json, read_file
 from rebar_depth_bench.base.validation import short_repr
@@ -79,7 +79,7 @@ class Network:
 
     def import_torch(self) -> Any:
         """Import and return torch. Raises ``MethodError`` if it is missing."""
-        return self.import_package("torch", "pip install 'rebar-depth-bench[torch]'")
+        return self.import_package("torch", install_command("torch"))
 
     def import_package(self, module: str, install: str) -> Any:
         """Import and return a module.

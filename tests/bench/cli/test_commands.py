@@ -90,6 +90,14 @@ def test_sgbm_is_metric_and_constant_needs_scaling(constant: Path, tiny_root: Pa
     assert table.scaled.abs_rel < 0.1 * table.native.abs_rel
 
 
+def test_table_says_why_the_rows_of_the_paper_are_absent(constant: Path, tiny_root: Path, tmp_path: Path) -> None:
+    note = "rows are absent; the configs differ from its scenes: lattice (9 of 504 views, 160 x 90 pixels, not"
+    shown = run_bench("table", constant, "--data", tiny_root, "--latex", tmp_path / "table.tex").stdout
+    assert f"{note} 1280 x 720)." in " ".join(shown.split())
+    assert f"{note} 1280 x 720)." in (tmp_path / "table.tex").read_text()
+    assert "paper" not in run_bench("table", constant, "--data", tiny_root, "--no-published").stdout
+
+
 def test_predicting_twice_gives_identical_depth_entries(constant: Path, tiny_root: Path, tmp_path: Path) -> None:
     entries = []
     for archive in (constant, predict("constant", tiny_root, tmp_path)):

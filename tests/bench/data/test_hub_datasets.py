@@ -35,6 +35,10 @@ print(len(list(rdb.load(root, "lattice-orbit", streaming=True, columns=["view_id
 print(len(rdb.load(root, "lattice-orbit", columns=["view_id"])))
 if main(["verify", root, "--files-only"]):
     sys.exit(1)
+evaluator = rdb.Evaluator(root, "lattice-orbit", views=1)
+for row in evaluator.dataset:
+    evaluator.update(row["view_id"], row["left_depth"])
+assert evaluator.compute().metrics["lattice-orbit/rank_error"] == 0
 with rdb.SubmissionWriter(f"{work}/a.zip", "mine") as writer:
     for row in iterate_rows(folder.config("lattice-orbit"), ["view_id", "left_depth"]):
         writer.add(row["view_id"], row["left_depth"])

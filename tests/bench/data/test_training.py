@@ -160,6 +160,22 @@ def test_what_cannot_be_batched_is_refused(tiny_root: Path) -> None:
         flip_row(row)
 
 
+def test_samplers_choose_the_rows_and_their_order(tiny_root: Path) -> None:
+    all_ids = ids(batches(tiny_root))
+    assert ids(batches(tiny_root, sampler=[5, 0, 5])) == [all_ids[5], all_ids[0], all_ids[5]]
+    ranks = [
+        ids(batches(tiny_root, sampler=torch.utils.data.DistributedSampler(all_ids, 3, rank, shuffle=True)))
+        for rank in range(3)
+    ]
+    assert sorted(view_id for found in ranks for view_id in found) == all_ids
+    assert [len(batch["view_id"]) for batch in batches(tiny_root, batch_size=4, drop_last=True)] == [4, 4]
+    assert rdb.torch_loader(rdb.load(tiny_root, CONFIG), pin_memory=True).pin_memory
+    with pytest.raises(InputError, match="sampler is given with shuffle, expected only one"):
+        batches(tiny_root, sampler=[0], shuffle=True)
+    with pytest.raises(InputError, match="sampler is given with a streamed dataset"):
+        batches(tiny_root, sampler=[0], streaming=True)
+
+
 def test_batch_has_the_values_of_the_rows(tiny_root: Path) -> None:
     [batch] = batches(tiny_root, batch_size=VIEWS, stereo=True)
     types = {

@@ -147,7 +147,7 @@ def test_missing_onnxruntime_names_extra_to_install(tmp_path: Path, monkeypatch:
     write_mixer_model(tmp_path)
     method = find_method(str(write_toml(tmp_path)))
     monkeypatch.setitem(sys.modules, "onnxruntime", None)
-    with pytest.raises(MethodError, match=re.escape("pip install 'rebar-depth-bench[onnx]'")):
+    with pytest.raises(MethodError, match=re.escape("pip install '.[onnx]'")):
         load_predictor(method)
 
 

@@ -221,9 +221,9 @@ def test_metric3d_reports_code_digest_and_weights_commit(
     [
         ("unidepth", "unidepth", "pip install 'unidepth @ git+https://github.com/lpiccinelli-eth/UniDepth'"),
         ("depth-anything-3", "depth_anything_3", "pip install depth-anything-3 addict"),
-        ("metric3d", "cv2", "pip install 'rebar-depth-bench[methods]'"),
-        ("foundation-stereo", "cv2", "pip install 'rebar-depth-bench[methods]'"),
-        *((name, "torch", "pip install 'rebar-depth-bench[torch]'") for name in FROM_FOLDER),
+        ("metric3d", "cv2", "pip install '.[methods]'"),
+        ("foundation-stereo", "cv2", "pip install '.[methods]'"),
+        *((name, "torch", "pip install '.[torch]'") for name in FROM_FOLDER),
     ],
 )
 def test_missing_package_names_install_command(

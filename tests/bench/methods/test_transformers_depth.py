@@ -295,7 +295,7 @@ def test_missing_package_names_extra_to_install(
 ) -> None:
     method = hf_method(str(folders["glpn"]))
     monkeypatch.setitem(sys.modules, package, None)
-    with pytest.raises(MethodError, match=re.escape("pip install 'rebar-depth-bench[models]'")):
+    with pytest.raises(MethodError, match=re.escape("pip install '.[models]'")):
         method.load()
 
 

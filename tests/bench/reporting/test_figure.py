@@ -312,7 +312,7 @@ def test_missing_extra_and_other_suffixes_are_refused_before_scoring(
     monkeypatch.setattr("rebar_depth_bench.base.errors.find_spec", lambda _: None)
     refused = run_in_process(main, *command, tmp_path / "a.pdf")
     assert refused.returncode == 2
-    assert "matplotlib; expected the plot extra: pip install 'rebar-depth-bench[plot]'" in refused.stderr
+    assert "matplotlib; expected the plot extra: pip install '.[plot]'" in refused.stderr
     assert not any(tmp_path.iterdir())
 
 

@@ -80,7 +80,10 @@ def test_best_error_is_bold_only_among_comparable_results() -> None:
         [fair, good], published=True
     )
     table = checked(latex_table([good, fair, gaps], published=False))
-    assert r"gaps & 0.5005 & 20.09 & 0.0010 &" in table
+    assert r"gaps & 0.5005 & 20.09$^{*}$ & 0.0010 &" in table
+    note = r"$^{*}$Errors of valid predictions are not compared with those of others: "
+    assert rf"{note}gaps, lattice (coverage 50.0 \% is below 95 \%)." in table
+    assert table.count("$^{*}$") == 2
     assert r"\emph{constant, gaps} &  &  &  & 0.0529 &  \\" in table
     assert re.findall(r"\\textbf\{.*?\}", table) == [r"\textbf{0.0196}"]
 

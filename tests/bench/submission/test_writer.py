@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 import struct
 import time
 import zipfile
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -73,6 +75,22 @@ def test_same_predictions_give_identical_bytes(
     finally:
         os.umask(previous)
     assert (tmp_path / "a.zip").read_bytes() == (tmp_path / "b.zip").read_bytes()
+
+
+def test_views_of_several_threads_are_all_in_the_archive(tmp_path: Path) -> None:
+    depths = {f"lattice/{index:04d}": np.full((60, 80), 1 + index, np.float32) for index in range(64)}
+    with (
+        SubmissionWriter(tmp_path / "a.zip", "m", compress=True) as writer,
+        ThreadPoolExecutor(8) as threads,
+    ):
+        list(threads.map(writer.add, depths, depths.values(), itertools.count()))
+    with zipfile.ZipFile(tmp_path / "a.zip") as archive:
+        assert sorted(archive.namelist()) == [*(f"{view_id}.npy" for view_id in depths), "submission.json"]
+        for view_id, depth_m in depths.items():
+            with archive.open(f"{view_id}.npy") as entry:
+                assert np.array_equal(np.load(entry), depth_m)
+        seconds = json.loads(archive.read("submission.json"))["runtime"]["seconds"]
+    assert seconds == {view_id: float(index) for index, view_id in enumerate(depths)}
 
 
 def test_archive_appears_on_exit_alone_and_replaces_none_after_an_exception(tmp_path: Path) -> None:

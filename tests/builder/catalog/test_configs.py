@@ -38,7 +38,7 @@ from rebar_depth_bench.geometry.cameras import Camera, ideal_K
 from rebar_depth_bench.scoring.evaluation import score
 from rebar_depth_bench.scoring.protocol import scored_pixels
 from rebar_depth_bench.scoring.table import PublishedMatch
-from rebar_depth_bench.scoring.truth import published_match
+from rebar_depth_bench.scoring.truth import paper_differences, published_match
 from tests.builder.cameras.survey_cages import steel_caster
 from tests.building import TINY, RunBuild
 from tests.commands import run_in_process
@@ -274,21 +274,40 @@ def test_published_rows_match_complete_standard_configs(name: str) -> None:
     if scene := (EXACT | OTHER_OPTICS).get(name):
         expected = PublishedMatch(scene, same_optics=name in EXACT)
     assert published_match(config_of_spec(CONFIGS[name]())) == expected
-    assert published_match(config_of_spec(CONFIGS[name](), views=6)) is None, "incomplete"
+    incomplete = config_of_spec(CONFIGS[name](), views=6)
+    assert published_match(incomplete) is None
+    assert not expected or paper_differences(incomplete) == ["6 of 504 views"]
 
 
 @pytest.mark.parametrize(
-    "change",
+    ("change", "difference"),
     [
-        lambda spec: replace(spec, rig=replace(spec.rig, width=640, height=360)),
-        lambda spec: replace(spec, protocol=replace(spec.protocol, azimuths=11)),
-        lambda spec: replace(spec, protocol=replace(spec.protocol, distance_to="centre")),
-        lambda spec: replace(spec, scene=replace(spec.scene, environment="laboratory")),
-        lambda spec: replace(spec, scene=replace(spec.scene, assembly=replace(spec.scene.assembly, levels=44))),
+        (
+            lambda spec: replace(spec, rig=replace(spec.rig, width=640, height=360)),
+            "640 x 360 pixels, not 1280 x 720",
+        ),
+        (lambda spec: replace(spec, protocol=replace(spec.protocol, azimuths=11)), "other camera positions"),
+        (
+            lambda spec: replace(spec, protocol=replace(spec.protocol, distance_to="centre")),
+            "other camera positions",
+        ),
+        (
+            lambda spec: replace(spec, scene=replace(spec.scene, environment="laboratory")),
+            "environment laboratory, not outdoors",
+        ),
+        (
+            lambda spec: replace(
+                spec, scene=replace(spec.scene, assembly=replace(spec.scene.assembly, levels=44))
+            ),
+            "not a scene of the paper",
+        ),
     ],
 )
-def test_other_conditions_match_no_published_rows(change: Callable[[ConfigSpec], ConfigSpec]) -> None:
-    assert published_match(config_of_spec(change(CONFIGS["pier"]()))) is None
+def test_other_conditions_match_no_published_rows(
+    change: Callable[[ConfigSpec], ConfigSpec], difference: str
+) -> None:
+    config = config_of_spec(change(CONFIGS["pier"]()))
+    assert (published_match(config), paper_differences(config)) == (None, [difference])
 
 
 DISTANCE_RANGES_M = {"lattice-distance": (0.22, 1.6), "pile-distance": (0.5, 2.2), "pier-distance": (5.0, 17.0)}

@@ -151,7 +151,7 @@ except MethodError as error:
 """
     process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert process.stdout.strip() == (
-        "lidar-survey requires embreex for ray casting: pip install 'rebar-depth-bench[build]'"
+        "lidar-survey requires embreex for ray casting: pip install '.[build]' in a clone of rebar-depth-bench"
     )
 
 

@@ -376,7 +376,7 @@ def test_missing_distributed_names_pip_extra(tmp_path: Path) -> None:
     arguments = ("--out", str(tmp_path / "dataset"), "--cluster", NOWHERE)
     process = run_cli("sys.modules['distributed'] = None", *arguments)
     assert process.returncode == 2, process.stderr
-    assert "pip install 'rebar-depth-bench[cluster]'" in process.stderr
+    assert "pip install '.[cluster]'" in process.stderr
 
 
 @pytest.mark.slow

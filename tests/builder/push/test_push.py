@@ -48,7 +48,23 @@ def root(tmp_path: Path) -> Path:
     return write_publishable(tmp_path / "dataset")
 
 
-def test_dry_run_lists_the_files_and_writes_nothing(hub: HubServer, root: Path) -> None:
+def test_dry_run_lists_the_files_without_a_network(
+    hub: HubServer, root: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(constants, "HF_HUB_OFFLINE", True)
+    finished = push(root, "--dry-run")
+    assert finished.returncode == 0, finished.stderr
+    sizes = {name: len(content) for name, content in folder_files(root).items()}
+    head, *files, totals, end = finished.stdout.splitlines()
+    assert head == f"{HUB_ID}, branch main"
+    assert files == [f"  {name}, {size:,} bytes" for name, size in sorted(sizes.items())]
+    assert totals.startswith(f"{len(sizes)} files ({sum(sizes.values()):,} bytes); ")
+    assert end == "dry run: not compared with the Hub, nothing was sent"
+    assert hub.requests == []
+    assert push(root, "--dry-run", "--yes").returncode == 2
+
+
+def test_without_yes_the_files_are_listed_and_nothing_is_written(hub: HubServer, root: Path) -> None:
     finished = push(root)
     assert finished.returncode == 0
     for name, content in folder_files(root).items():

@@ -269,7 +269,7 @@ def test_bar_without_readable_shape_is_named() -> None:
 
 def test_missing_ifcopenshell_names_pip_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "ifcopenshell", None)
-    with pytest.raises(InputError, match=r"pip install 'rebar-depth-bench\[ifc\]'"):
+    with pytest.raises(InputError, match=r"pip install '\.\[ifc\]'"):
         scene_config(COLUMN)
 
 
