@@ -20,9 +20,11 @@ from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder
 from rebar_depth_bench.data.rows import EyeTruth
 from rebar_depth_bench.extended.axes import assign_segments
 from rebar_depth_bench.extended.depth_layers import other_layers
+from rebar_depth_bench.extended.disparity import seen_by_right
 from rebar_depth_bench.extended.judged import SAMPLED_PIXELS, judged_crossings
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL
-from rebar_depth_bench.extended.steel import JudgedCrossings, SceneBars, SteelTruth
+from rebar_depth_bench.extended.published import depth_steps
+from rebar_depth_bench.extended.steel import DepthSteps, JudgedCrossings, RightView, SceneBars, SteelTruth
 from rebar_depth_bench.geometry.cameras import pixel_rays
 from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.scoring.protocol import interior, single_bar_pixels
@@ -37,8 +39,12 @@ _DTYPES: Mapping[str, type] = {
     "run": np.int16,
     "front_m": np.float32,
     "behind_m": np.float32,
+    "seen_by_right": np.bool_,
+    "has_depth": np.uint8,
+    "near_step": np.uint8,
+    "step_depth_m": np.float32,
 }
-"""Arrays of ``SteelTruth`` that are cached, with their types."""
+"""Arrays of ``SteelTruth``, its ``RightView`` and its ``DepthSteps`` that are cached, with their types."""
 
 
 Rays = Float64[ndarray, "hw 2"]
@@ -47,7 +53,8 @@ Rays = Float64[ndarray, "hw 2"]
 Lens = tuple[float, ...]
 """K, row by row, and distortion of a camera."""
 
-_LENS_NUMBERS, _CAMERA_NUMBERS = 9 + 5, 9 + 5 + 16
+_LENS_NUMBERS, _CAMERA_NUMBERS = 9 + 5, 9 + 5 + 16 + 1
+"""The last number is ``RightView.parallax_px_m``, 0 if there is none."""
 
 
 def has_bar_ids(config: DatasetConfig) -> bool:
@@ -83,8 +90,11 @@ class ConfigSteelTruth:
     def view(self, position: int) -> SteelTruth:
         """Return the view at ``position`` in protocol order."""
         view = self.cache.view(position)
-        lens, pose = view.numbers[:_LENS_NUMBERS], view.numbers[_LENS_NUMBERS:]
+        lens, pose, parallax_px_m = view.numbers[:_LENS_NUMBERS], view.numbers[_LENS_NUMBERS:-1], view.numbers[-1]
         height, width = self.config.grid
+        arrays = dict(view.arrays)
+        seen_by_right = arrays.pop("seen_by_right")
+        steps = DepthSteps(*(arrays.pop(name) for name in ("has_depth", "near_step", "step_depth_m")))
         return SteelTruth(
             view_id=view.view_id,
             height=height,
@@ -95,7 +105,9 @@ class ConfigSteelTruth:
             bars=self.bars_by_view[view.view_id],
             distortion=np.array(lens[9:]),
             judged=self.judged(position),
-            **view.arrays,
+            right=RightView(parallax_px_m, seen_by_right) if parallax_px_m else None,
+            steps=steps,
+            **arrays,
         )
 
     def judged(self, position: int) -> JudgedCrossings:
@@ -183,15 +195,23 @@ def _view_arrays(
 ) -> Iterator[ViewArrays]:
     """Yield the cached arrays of some views, or of all with scored pixels, with numbers of K, distortion, pose."""
     rays: dict[Lens, Rays] = {}
-    for view_id, left, scored in verified_views(config, view_ids):
+    for view_id, eyes, scored in verified_views(config, view_ids, config.truth_eyes):
         if not len(scored):
             continue
-        camera = left.camera
+        left, camera = eyes[0], eyes[0].camera
         lens = (*camera.K.ravel().tolist(), *camera.distortion.tolist())
         if lens not in rays:
             rays[lens] = _rays(lens, config)
         arrays = _steel_arrays(left, scored, rays[lens], bars_by_view[view_id])
-        yield ViewArrays(view_id, arrays, (*lens, *camera.cam_from_world.ravel().tolist()))
+        parallax_px_m, seen = seen_by_right(eyes, scored)
+        steps = depth_steps(left.depth_m)
+        arrays |= {
+            "seen_by_right": np.isin(arrays["index"], scored[seen], assume_unique=True),
+            "has_depth": steps.has_depth,
+            "near_step": steps.near_step,
+            "step_depth_m": steps.depth_m,
+        }
+        yield ViewArrays(view_id, arrays, (*lens, *camera.cam_from_world.ravel().tolist(), parallax_px_m))
 
 
 def _steel_arrays(left: EyeTruth, scored: ndarray, rays: Rays, scene: SceneBars) -> dict[str, ndarray]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64, UInt16, UInt32
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8, UInt16, UInt32
 from numpy import ndarray
 
 from rebar_depth_bench.bar_crossings.definition import Crossings, scene_crossings
@@ -59,6 +59,31 @@ class JudgedCrossings:
 
 
 @dataclass(frozen=True, eq=False)
+class RightView:
+    """Right camera of a rectified pair: which disparity a depth has, and which pixels it sees too.
+
+    ``parallax_px_m`` is focal length (pixels) times baseline (metres). ``sees``, parallel to ``SteelTruth.index``,
+    marks the scored pixels that are not occluded: see ``disparity.seen_by_right``.
+    """
+
+    parallax_px_m: float
+    sees: Bool[ndarray, " n"]
+
+
+@dataclass(frozen=True, eq=False)
+class DepthSteps:
+    """Depth edges of the whole image of a view: see ``published.depth_steps``.
+
+    ``has_depth`` and ``near_step`` are masks of the image, row by row, packed into bits. ``depth_m`` is the planar
+    depth on ``near_step``, metres.
+    """
+
+    has_depth: UInt8[ndarray, " b"]
+    near_step: UInt8[ndarray, " b"]
+    depth_m: Float32[ndarray, " n"]
+
+
+@dataclass(frozen=True, eq=False)
 class SteelTruth:
     """Ground truth of one view at the pixels on steel or within one pixel (3 x 3) of it that have true depth > 0.
 
@@ -70,7 +95,8 @@ class SteelTruth:
     of ``CageTruth``), -1 where the point is on no segment. ``front_m`` and ``behind_m`` are the depths
     of the closest other layer in front of and behind the pixel, NaN where none is visible: see
     ``depth_layers.other_layers``. ``bars`` are those of the scene. ``distortion`` is that of the grid
-    (``cameras.distort``), zeros on an ideal one.
+    (``cameras.distort``), zeros on an ideal one. ``right`` is None without a rectified pair that both have depth.
+    ``steps``, unlike all the others, covers the whole image.
     """
 
     view_id: str
@@ -90,6 +116,8 @@ class SteelTruth:
     bars: SceneBars = field(default_factory=lambda: SceneBars.of(()))
     distortion: Float64[ndarray, " 5"] = field(default_factory=lambda: np.zeros(5))
     judged: JudgedCrossings = field(default_factory=JudgedCrossings.none)
+    right: RightView | None = None
+    steps: DepthSteps | None = None
     _made: dict[object, Any] = field(default_factory=dict, init=False, repr=False)
 
     def once(self, make: Callable[[SteelTruth], _Made]) -> _Made:

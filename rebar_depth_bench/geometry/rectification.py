@@ -16,7 +16,13 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from numpy import ndarray
 
-from rebar_depth_bench.geometry.cameras import inverse_rigid, pixel_rays, project
+from rebar_depth_bench.geometry.cameras import (
+    PARALLEL_TOLERANCE,
+    pixel_rays,
+    project,
+    rectified_baseline_m,
+    right_from_left,
+)
 
 
 def rectify(
@@ -47,11 +53,6 @@ def rectify(
     return np.asarray(P_left[:, :3]), (np.asarray(R_left), np.asarray(R_right))
 
 
-_MOTION_DECIMALS = 12
-PARALLEL_TOLERANCE = 1e-9
-"""Largest deviation of an entry of ``right_from_left`` from that of a rectified pair."""
-
-
 @dataclass(frozen=True, eq=False)
 class RectifiedPair:
     """Rectified image pair, with the mapping back to the raw left image.
@@ -72,16 +73,10 @@ class RectifiedPair:
 
 
 def is_rectified(row: Mapping[str, Any]) -> bool:
-    """Return whether a row's cameras are undistorted and parallel, and differ along the left one's x axis only.
-
-    The principal points may differ in x, which is a constant of all disparities.
-    """
-    parallel = np.eye(4)
-    parallel[0, 3] = -row["baseline_m"]
-    differs = row["left_K"] != row["right_K"]
-    differs[0, 2] = False
-    has_lens = differs.any() or row["left_distortion"].any() or row["right_distortion"].any()
-    return not has_lens and bool(np.abs(_right_from_left(row) - parallel).max() <= PARALLEL_TOLERANCE)
+    """Return whether a row's cameras are a rectified pair (``rectified_baseline_m``) with the row's baseline."""
+    Ks, distortions = ([row[f"{eye}_{kind}"] for eye in ("left", "right")] for kind in ("K", "distortion"))
+    baseline_m = rectified_baseline_m(Ks, distortions, _right_from_left(row))
+    return baseline_m is not None and abs(baseline_m - row["baseline_m"]) <= PARALLEL_TOLERANCE
 
 
 def rectified_pair(row: Mapping[str, Any]) -> RectifiedPair:
@@ -128,9 +123,7 @@ def matched_in_right(pair: RectifiedPair, disparity_px: Float32[ndarray, "hc wc"
 
 
 def _right_from_left(row: Mapping[str, Any]) -> Float64[ndarray, "4 4"]:
-    """Return the motion of the pair without the rounding errors of its poses, so that it is that of all views."""
-    motion = row["right_cam_from_world"] @ inverse_rigid(row["left_cam_from_world"])
-    return np.asarray(np.round(motion, _MOTION_DECIMALS))
+    return right_from_left(row["left_cam_from_world"], row["right_cam_from_world"])
 
 
 def enclosing_canvas(

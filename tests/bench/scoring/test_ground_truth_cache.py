@@ -27,7 +27,7 @@ CONFIG = "lattice-orbit"
 @pytest.fixture
 def archive(tiny_root: Path, archive_of: Callable[..., Path]) -> Path:
     views = verified_views(open_folder(tiny_root).config(CONFIG))
-    return archive_of({view_id: 1.015 * left.depth_m for view_id, left, _ in views})
+    return archive_of({view_id: 1.015 * left.depth_m for view_id, (left,), _ in views})
 
 
 @pytest.fixture
