@@ -93,7 +93,8 @@ def _measures(prefix: str, title: str, pixels: str) -> Iterator[Measure]:
     """Yield the errors over some pixels, whose description completes "mean over"."""
     yield Measure(
         f"{prefix}_epe_px", f"Disparity error EPE{title}", "px", "",
-        f"end-point error, mean over {pixels} with a prediction of |f B / p - f B / z| (Geiger et al. 2012)",
+        "end-point error of the disparity f B / z (f: focal length, px; B: baseline; rectified pairs only): mean "
+        f"over {pixels} with a prediction of |f B / p - f B / z| (Geiger et al. 2012, KITTI)",
     )  # fmt: skip
     for t in BAD_PX:
         definition = f"share of {pixels} with |f B / p - f B / z| > {t} px; a missing prediction counts as bad"
@@ -117,4 +118,4 @@ MEASURES = (
 )  # fmt: skip
 """Disparity measures in table order."""
 
-FAMILIES = (MeasureFamily("disparity", "Disparity of rectified pairs", 4, MEASURES, disparity_samples),)
+FAMILIES = (MeasureFamily("disparity", "Disparity of rectified pairs", 2, MEASURES, disparity_samples),)

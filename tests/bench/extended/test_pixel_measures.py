@@ -319,7 +319,8 @@ def test_views_that_are_no_rectified_pair_have_no_disparity() -> None:
     pairs = [(left,), *((left, replace(right, camera=camera)) for camera in others)]
     for pair in pairs:
         parallax_px_m, seen = disparity.seen_by_right(pair, scored)
-        assert parallax_px_m == 0.0 and not seen.any()
+        assert parallax_px_m == 0.0
+        assert not seen.any()
     assert disparity.disparity_samples(np.ones(3), replace(pixel_truth([1.0, 1.0, 1.0]), right=None)) == {}
 
 
