@@ -125,17 +125,16 @@ class MeasureFamily:
     """Related measures under one heading, found by the registry in the ``FAMILIES`` of a module.
 
     ``evaluate`` returns a view's samples from a prediction: planar depth on ``SteelTruth.index``, metres, NaN
-    where missing; names that it leaves out have no samples. If the family is ``on_image``, the prediction is the
-    whole native one, height x width. It is called for each of ``alignments``, once for all families that share it.
-    ``note`` explains the single column of measures that are taken ``ONCE``. Reports have the families by ascending
-    ``place``.
+    where missing; names that it leaves out have no samples. If the family is ``on_image``, it gets the whole image
+    as submitted. It is called for each of ``alignments``, once for all families that share it. ``note`` explains
+    the single column of measures that are taken ``ONCE``. Reports have the families by ascending ``place``.
     """
 
     key: str
     title: str
     place: int
     measures: tuple[Measure, ...]
-    evaluate: Callable[[Float64[ndarray, ...], SteelTruth], Samples]
+    evaluate: Callable[[Float[ndarray, ...], SteelTruth], Samples]
     alignments: tuple[str, ...] = (NATIVE, SCALED)
     note: str = ""
     on_image: bool = False
@@ -153,16 +152,12 @@ def aligned_predictions(
 
     ``scale`` is the view's median scale s, None if it has none.
     """
-    native_m = valid_or_nan(prediction_m.ravel().take(truth.index.astype(np.intp)))
+    predicted_m = prediction_m.ravel().take(truth.index.astype(np.intp))
+    native_m = np.where(is_valid_prediction(predicted_m), predicted_m.astype(np.float64), np.nan)
     with np.errstate(over="ignore"):
         scaled_m = native_m * (np.nan if scale is None else scale)
     scaled_m[~is_valid_prediction(scaled_m)] = np.nan
     return {ONCE: native_m, NATIVE: native_m, SCALED: scaled_m}
-
-
-def valid_or_nan(prediction_m: Float[ndarray, ...]) -> Float64[ndarray, ...]:
-    """Return a prediction in float64, with NaN where it is not valid."""
-    return np.where(is_valid_prediction(prediction_m), prediction_m.astype(np.float64), np.nan)
 
 
 def finite_sample(value: float | None) -> Float64[ndarray, " one"]:

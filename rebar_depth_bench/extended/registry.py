@@ -24,7 +24,6 @@ from rebar_depth_bench.extended.measures import (
     MeasureFamily,
     Samples,
     aligned_predictions,
-    valid_or_nan,
 )
 from rebar_depth_bench.extended.result import ExtendedResult, ViewSamples, tabulate_extended, view_numbers
 from rebar_depth_bench.extended.steel import SteelTruth
@@ -112,6 +111,6 @@ def view_samples(
     for alignment, p_m in aligned_predictions(prediction_m, truth, scale).items():
         of_alignment: dict[str, Float64[ndarray, " n"]] = {}
         for family in {family.evaluate: family for family in families if alignment in family.alignments}.values():
-            of_alignment |= family.evaluate(valid_or_nan(prediction_m) if family.on_image else p_m, truth)
+            of_alignment |= family.evaluate(prediction_m if family.on_image else p_m, truth)
         samples[alignment] = of_alignment
     return samples

@@ -59,31 +59,6 @@ class JudgedCrossings:
 
 
 @dataclass(frozen=True, eq=False)
-class RightView:
-    """Right camera of a rectified pair: which disparity a depth has, and which pixels it sees too.
-
-    ``parallax_px_m`` is focal length (pixels) times baseline (metres). ``sees``, parallel to ``SteelTruth.index``,
-    marks the scored pixels that are not occluded: see ``disparity.seen_by_right``.
-    """
-
-    parallax_px_m: float
-    sees: Bool[ndarray, " n"]
-
-
-@dataclass(frozen=True, eq=False)
-class DepthSteps:
-    """Depth edges of the whole image of a view: see ``published.depth_steps``.
-
-    ``has_depth`` and ``near_step`` are masks of the image, row by row, packed into bits. ``depth_m`` is the planar
-    depth on ``near_step``, metres.
-    """
-
-    has_depth: UInt8[ndarray, " b"]
-    near_step: UInt8[ndarray, " b"]
-    depth_m: Float32[ndarray, " n"]
-
-
-@dataclass(frozen=True, eq=False)
 class SteelTruth:
     """Ground truth of one view at the pixels on steel or within one pixel (3 x 3) of it that have true depth > 0.
 
@@ -95,8 +70,12 @@ class SteelTruth:
     of ``CageTruth``), -1 where the point is on no segment. ``front_m`` and ``behind_m`` are the depths
     of the closest other layer in front of and behind the pixel, NaN where none is visible: see
     ``depth_layers.other_layers``. ``bars`` are those of the scene. ``distortion`` is that of the grid
-    (``cameras.distort``), zeros on an ideal one. ``right`` is None without a rectified pair that both have depth.
-    ``steps``, unlike all the others, covers the whole image.
+    (``cameras.distort``), zeros on an ideal one.
+
+    ``parallax_px_m`` is focal length times baseline of a rectified pair, pixels times metres, 0 if there is none;
+    ``seen_by_right`` marks the scored pixels that are not occluded in it (``disparity.match_right``). Of the whole
+    image there are two masks, row by row, packed into bits: ``has_depth``, and ``near_step`` with the depth
+    ``step_depth_m`` of its pixels (``published.depth_steps``).
     """
 
     view_id: str
@@ -116,8 +95,11 @@ class SteelTruth:
     bars: SceneBars = field(default_factory=lambda: SceneBars.of(()))
     distortion: Float64[ndarray, " 5"] = field(default_factory=lambda: np.zeros(5))
     judged: JudgedCrossings = field(default_factory=JudgedCrossings.none)
-    right: RightView | None = None
-    steps: DepthSteps | None = None
+    parallax_px_m: float = 0.0
+    seen_by_right: Bool[ndarray, " n"] = field(default_factory=lambda: np.empty(0, np.bool_))
+    has_depth: UInt8[ndarray, " b"] = field(default_factory=lambda: np.empty(0, np.uint8))
+    near_step: UInt8[ndarray, " b"] = field(default_factory=lambda: np.empty(0, np.uint8))
+    step_depth_m: Float32[ndarray, " m"] = field(default_factory=lambda: np.empty(0, np.float32))
     _made: dict[object, Any] = field(default_factory=dict, init=False, repr=False)
 
     def once(self, make: Callable[[SteelTruth], _Made]) -> _Made:

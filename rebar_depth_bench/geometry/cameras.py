@@ -10,9 +10,10 @@ them (``matrix_product``).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import cos, sin
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64
@@ -26,10 +27,10 @@ NOMINAL_FOCAL_PX = 700.0
 ROTATION_TOLERANCE = 1e-6
 """Largest deviation of ``R @ R.T`` from the identity for a rotation ``R``."""
 
+_MOTION_DECIMALS = 12
 PARALLEL_TOLERANCE = 1e-9
 """Largest deviation of an entry of ``right_from_left`` from that of a rectified pair."""
 
-_MOTION_DECIMALS = 12
 _NEWTON_STEPS = 50
 _NEWTON_TOLERANCE = 1e-15
 _NEWTON_CHUNK = 8192
@@ -144,29 +145,23 @@ def right_camera_pose(left_cam_from_world: Float[ndarray, "4 4"], baseline_m: fl
     return pose
 
 
-def right_from_left(
-    left_cam_from_world: Float[ndarray, "4 4"], right_cam_from_world: Float[ndarray, "4 4"]
-) -> Float64[ndarray, "4 4"]:
-    """Return the motion of a pair without the rounding errors of its poses, so that it is that of all views."""
-    return np.asarray(np.round(right_cam_from_world @ inverse_rigid(left_cam_from_world), _MOTION_DECIMALS))
+def right_from_left(row: Mapping[str, Any]) -> Float64[ndarray, "4 4"]:
+    """Return the motion of the pair without the rounding errors of its poses, so that it is that of all views."""
+    motion = row["right_cam_from_world"] @ inverse_rigid(row["left_cam_from_world"])
+    return np.asarray(np.round(motion, _MOTION_DECIMALS))
 
 
-def rectified_baseline_m(
-    K: Sequence[Float64[ndarray, "3 3"]],
-    distortion: Sequence[Float64[ndarray, " 5"]],
-    motion: Float64[ndarray, "4 4"],
-) -> float | None:
-    """Return the baseline of a rectified pair; None if the left and right camera are no such pair.
+def is_rectified(row: Mapping[str, Any]) -> bool:
+    """Return whether a row's cameras are undistorted and parallel, and differ along the left one's x axis only.
 
-    They are undistorted and parallel, and the right one lies on the left one's positive x axis. The principal
-    points may differ in x, which is a constant of all disparities. ``motion`` is ``right_from_left``.
+    The principal points may differ in x, which is a constant of all disparities.
     """
-    baseline_m = -float(motion[0, 3])
-    differs = K[0] != K[1]
+    parallel = np.eye(4)
+    parallel[0, 3] = -row["baseline_m"]
+    differs = row["left_K"] != row["right_K"]
     differs[0, 2] = False
-    has_lens = differs.any() or any(np.any(of_eye) for of_eye in distortion)
-    is_parallel = np.abs(motion - rigid(np.eye(3), np.array([-baseline_m, 0, 0]))).max() <= PARALLEL_TOLERANCE
-    return baseline_m if is_parallel and not has_lens and baseline_m > 0 else None
+    has_lens = differs.any() or row["left_distortion"].any() or row["right_distortion"].any()
+    return not has_lens and bool(np.abs(right_from_left(row) - parallel).max() <= PARALLEL_TOLERANCE)
 
 
 def transform(pose: Float[ndarray, "4 4"], points: Float[ndarray, "*n 3"]) -> Float[ndarray, "*n 3"]:

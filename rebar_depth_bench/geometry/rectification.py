@@ -16,13 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from numpy import ndarray
 
-from rebar_depth_bench.geometry.cameras import (
-    PARALLEL_TOLERANCE,
-    pixel_rays,
-    project,
-    rectified_baseline_m,
-    right_from_left,
-)
+from rebar_depth_bench.geometry.cameras import pixel_rays, project, right_from_left
 
 
 def rectify(
@@ -72,13 +66,6 @@ class RectifiedPair:
     depth_ratio: Float64[ndarray, "h w"]
 
 
-def is_rectified(row: Mapping[str, Any]) -> bool:
-    """Return whether a row's cameras are a rectified pair (``rectified_baseline_m``) with the row's baseline."""
-    Ks, distortions = ([row[f"{eye}_{kind}"] for eye in ("left", "right")] for kind in ("K", "distortion"))
-    baseline_m = rectified_baseline_m(Ks, distortions, _right_from_left(row))
-    return baseline_m is not None and abs(baseline_m - row["baseline_m"]) <= PARALLEL_TOLERANCE
-
-
 def rectified_pair(row: Mapping[str, Any]) -> RectifiedPair:
     """Rectify the image pair of a dataset row with its K, distortion and poses (``rectify``).
 
@@ -86,7 +73,7 @@ def rectified_pair(row: Mapping[str, Any]) -> RectifiedPair:
     """
     height, width, _ = row["left_rgb"].shape
     Ks, distortions = (row["left_K"], row["right_K"]), (row["left_distortion"], row["right_distortion"])
-    rectified_K, rotations = rectify(Ks, distortions, _right_from_left(row), width, height)
+    rectified_K, rotations = rectify(Ks, distortions, right_from_left(row), width, height)
     rays = [
         pixel_rays(K, width, height, distortion) @ rotation.T
         for K, distortion, rotation in zip(Ks, distortions, rotations, strict=True)
@@ -120,10 +107,6 @@ def matched_in_right(pair: RectifiedPair, disparity_px: Float32[ndarray, "hc wc"
     match = np.rint(columns - np.nan_to_num(disparity_px)).astype(np.int64)
     on_canvas = (match >= 0) & (match < disparity_px.shape[1])
     return np.asarray(on_canvas & pair.seen_by_right[rows, np.where(on_canvas, match, 0)])
-
-
-def _right_from_left(row: Mapping[str, Any]) -> Float64[ndarray, "4 4"]:
-    return right_from_left(row["left_cam_from_world"], row["right_cam_from_world"])
 
 
 def enclosing_canvas(

@@ -30,7 +30,7 @@ from rebar_depth_bench.extended.profiles import (
 )
 from rebar_depth_bench.extended.profiles import MEASURES as PROFILE_MEASURES
 from rebar_depth_bench.extended.regions import region_samples
-from rebar_depth_bench.extended.steel import RightView, SteelTruth
+from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.geometry.cameras import Camera, rotation_matrix
 from rebar_depth_bench.scoring.score import ViewTruth, score_view
 from tests.bench.extended.thin_scenes import pixel_truth, random_prediction, random_truth, steel_truth, with_holes
@@ -274,7 +274,7 @@ def test_non_occluded_pixels_and_disparity_errors_by_pixel_loops(seed: int) -> N
     rng = np.random.default_rng(seed)
     left, right = stereo_pair(rng)
     scored = np.flatnonzero(left.depth_m).astype(np.uint32)
-    parallax_px_m, seen = disparity.seen_by_right((left, right), scored)
+    parallax_px_m, seen = disparity.match_right((left, right), scored)
     assert parallax_px_m == pytest.approx(8.0)
     z_m, p_m = left.depth_m.ravel()[scored].astype(float), np.full(len(scored), np.nan)
     expected_seen, errors = [], []
@@ -290,7 +290,7 @@ def test_non_occluded_pixels_and_disparity_errors_by_pixel_loops(seed: int) -> N
         else:
             errors.append((math.inf, d, expected_seen[-1]))
     assert seen.tolist() == expected_seen
-    truth = replace(pixel_truth(z_m), right=RightView(parallax_px_m, seen))
+    truth = replace(pixel_truth(z_m), parallax_px_m=parallax_px_m, seen_by_right=seen)
     measured = {name: values.tolist() for name, values in disparity.disparity_samples(p_m, truth).items()}
     expected = {"disparity_seen_by_right": [sum(expected_seen) / len(scored)]}
     for prefix, chosen in (("disparity", errors), ("disparity_noc", [one for one in errors if one[2]])):
@@ -318,10 +318,10 @@ def test_views_that_are_no_rectified_pair_have_no_disparity() -> None:
     ]
     pairs = [(left,), *((left, replace(right, camera=camera)) for camera in others)]
     for pair in pairs:
-        parallax_px_m, seen = disparity.seen_by_right(pair, scored)
+        parallax_px_m, seen = disparity.match_right(pair, scored)
         assert parallax_px_m == 0.0
         assert not seen.any()
-    assert disparity.disparity_samples(np.ones(3), replace(pixel_truth([1.0, 1.0, 1.0]), right=None)) == {}
+    assert disparity.disparity_samples(np.ones(3), replace(pixel_truth([1.0, 1.0, 1.0]), parallax_px_m=0.0)) == {}
 
 
 # Profiles.

@@ -9,7 +9,7 @@ import numpy as np
 from numpy import ndarray
 
 from rebar_depth_bench.extended.published import depth_steps
-from rebar_depth_bench.extended.steel import RightView, SceneBars, SteelTruth
+from rebar_depth_bench.extended.steel import SceneBars, SteelTruth
 from rebar_depth_bench.geometry.cameras import ideal_K, pixel_rays
 from rebar_depth_bench.scoring.protocol import interior, single_bar_pixels
 
@@ -45,8 +45,9 @@ def steel_truth(
         run=np.full(len(index), -1, np.int16),
         front_m=(no_layer if front_m is None else front_m).ravel()[index].astype(np.float32),
         behind_m=(no_layer if behind_m is None else behind_m).ravel()[index].astype(np.float32),
-        right=RightView(84.0, inside.ravel()[index] & (index % 3 > 0)),
-        steps=depth_steps(depth_m.astype(np.float32)),
+        parallax_px_m=84.0,
+        seen_by_right=inside.ravel()[index] & (index % 3 > 0),
+        **depth_steps(depth_m.astype(np.float32)),
     )
 
 
