@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -93,8 +93,8 @@ class ConfigSteelTruth:
         crossing, pixel = (arrays.pop(name).astype(np.int64) for name in ("crossing", "pixel"))
         judged = JudgedCrossings(crossing, pixel.reshape(-1, 2, SAMPLED_PIXELS))
         rays = self.rays[view.numbers[:_LENS_NUMBERS]]
-        truth = _steel_truth(self.config, ViewArrays(view.view_id, arrays, view.numbers), rays, self.bars_by_view)
-        return replace(truth, judged=judged)
+        view = ViewArrays(view.view_id, arrays, view.numbers)
+        return _steel_truth(self.config, view, rays, self.bars_by_view, judged)
 
     @property
     def judged_counts(self) -> tuple[int, ...]:
@@ -174,15 +174,19 @@ def _view_arrays(
         arrays |= depth_steps(left.depth_m)
         numbers = (*lens, *camera.cam_from_world.ravel().tolist(), parallax_px_m, 0)
         view = ViewArrays(view_id, arrays, numbers)
-        judged = judged_crossings(_steel_truth(config, view, rays[lens], bars_by_view))
+        judged = judged_crossings(_steel_truth(config, view, rays[lens], bars_by_view, JudgedCrossings.none()))
         arrays |= {"crossing": judged.crossing, "pixel": judged.pixels.ravel()}
         yield ViewArrays(view_id, arrays, (*numbers[:-1], len(judged.crossing)))
 
 
 def _steel_truth(
-    config: DatasetConfig, view: ViewArrays, rays: Rays, bars_by_view: Mapping[str, SceneBars]
+    config: DatasetConfig,
+    view: ViewArrays,
+    rays: Rays,
+    bars_by_view: Mapping[str, SceneBars],
+    judged: JudgedCrossings,
 ) -> SteelTruth:
-    """Return a view without judged crossings from its arrays and numbers."""
+    """Return a view from its arrays and numbers, those of ``judged`` aside."""
     lens, (*pose, parallax_px_m, _) = view.numbers[:_LENS_NUMBERS], view.numbers[_LENS_NUMBERS:]
     height, width = config.grid
     return SteelTruth(
@@ -194,6 +198,7 @@ def _steel_truth(
         rays=rays[view.arrays["index"]],
         bars=bars_by_view[view.view_id],
         distortion=np.array(lens[9:]),
+        judged=judged,
         parallax_px_m=parallax_px_m,
         **view.arrays,
     )

@@ -28,7 +28,7 @@ def steel_truth(
     no_layer = np.full(depth_m.shape, np.nan)
     K = ideal_K(width, height)
     inside = interior(bars > 0) & (depth_m > 0)
-    single_bar = np.zeros_like(inside)
+    single_bar, steps = np.zeros_like(inside), depth_steps(depth_m.astype(np.float32))
     single_bar[inside] = single_bar_pixels(bars, np.flatnonzero(inside).astype(np.uint32))
     return SteelTruth(
         view_id="synthetic/0000",
@@ -47,7 +47,9 @@ def steel_truth(
         behind_m=(no_layer if behind_m is None else behind_m).ravel()[index].astype(np.float32),
         parallax_px_m=84.0,
         seen_by_right=inside.ravel()[index] & (index % 3 > 0),
-        **depth_steps(depth_m.astype(np.float32)),
+        has_depth=steps["has_depth"],
+        near_step=steps["near_step"],
+        step_depth_m=steps["step_depth_m"],
     )
 
 
