@@ -133,8 +133,8 @@ ERROR_MEASURES = (
     Measure("delta3", "δ3", "%", "", f"{_RATIO} 1.25^3 (Eigen et al. 2014)"),
 )
 _EDGES = (
-    "F1 of the depth edges of the whole image at ten evenly spaced t, 1.05 to 1.25; edge from a to b: depth of b > "
-    "t times that of a, both with true depth; a missing prediction has no edge, a view without true edges no F1;"
+    "F1 of the depth edges of the whole image at ten evenly spaced t, 1.05 to 1.25; edge from a to b: depth of b "
+    "> t times that of a, both with true depth; a missing prediction has no edge, a view without true edges no F1;"
 )
 BOUNDARY_MEASURES = (
     Measure(
