@@ -89,12 +89,8 @@ class ConfigSteelTruth:
     def view(self, position: int) -> SteelTruth:
         """Return the view at ``position`` in protocol order."""
         view = self.cache.view(position)
-        arrays = dict(view.arrays)
-        crossing, pixel = (arrays.pop(name).astype(np.int64) for name in ("crossing", "pixel"))
-        judged = JudgedCrossings(crossing, pixel.reshape(-1, 2, SAMPLED_PIXELS))
         rays = self.rays[view.numbers[:_LENS_NUMBERS]]
-        view = ViewArrays(view.view_id, arrays, view.numbers)
-        return _steel_truth(self.config, view, rays, self.bars_by_view, judged)
+        return _steel_truth(self.config, view, rays, self.bars_by_view[view.view_id])
 
     @property
     def judged_counts(self) -> tuple[int, ...]:
@@ -172,21 +168,18 @@ def _view_arrays(
         parallax_px_m, is_seen = match_right(eyes, scored)
         arrays["seen_by_right"] = np.isin(arrays["index"], scored[is_seen], assume_unique=True)
         arrays |= depth_steps(left.depth_m)
+        arrays |= {"crossing": np.empty(0), "pixel": np.empty(0)}
         numbers = (*lens, *camera.cam_from_world.ravel().tolist(), parallax_px_m, 0)
         view = ViewArrays(view_id, arrays, numbers)
-        judged = judged_crossings(_steel_truth(config, view, rays[lens], bars_by_view, JudgedCrossings.none()))
+        judged = judged_crossings(_steel_truth(config, view, rays[lens], bars_by_view[view_id]))
         arrays |= {"crossing": judged.crossing, "pixel": judged.pixels.ravel()}
         yield ViewArrays(view_id, arrays, (*numbers[:-1], len(judged.crossing)))
 
 
-def _steel_truth(
-    config: DatasetConfig,
-    view: ViewArrays,
-    rays: Rays,
-    bars_by_view: Mapping[str, SceneBars],
-    judged: JudgedCrossings,
-) -> SteelTruth:
-    """Return a view from its arrays and numbers, those of ``judged`` aside."""
+def _steel_truth(config: DatasetConfig, view: ViewArrays, rays: Rays, bars: SceneBars) -> SteelTruth:
+    """Return a view from its arrays and numbers, the rays of its lens, and the bars of its scene."""
+    arrays = dict(view.arrays)
+    crossing, pixel = (arrays.pop(name).astype(np.int64) for name in ("crossing", "pixel"))
     lens, (*pose, parallax_px_m, _) = view.numbers[:_LENS_NUMBERS], view.numbers[_LENS_NUMBERS:]
     height, width = config.grid
     return SteelTruth(
@@ -195,12 +188,12 @@ def _steel_truth(
         width=width,
         K=np.array(lens[:9]).reshape(3, 3),
         cam_from_world=np.array(pose).reshape(4, 4),
-        rays=rays[view.arrays["index"]],
-        bars=bars_by_view[view.view_id],
+        rays=rays[arrays["index"]],
+        bars=bars,
         distortion=np.array(lens[9:]),
-        judged=judged,
+        judged=JudgedCrossings(crossing, pixel.reshape(-1, 2, SAMPLED_PIXELS)),
         parallax_px_m=parallax_px_m,
-        **view.arrays,
+        **arrays,
     )
 
 
