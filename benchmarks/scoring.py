@@ -92,7 +92,7 @@ def extended_rows(root: str, config: str, submission: SubmissionReader) -> list[
     views = []
     for index in range(len(steel)):
         truth = steel.view(index)
-        views.append((truth, submission.read(truth.view_id).ravel()[truth.index].astype(np.float64)))
+        views.append((truth, submission.read(truth.view_id).astype(np.float64)))
     seconds = {"gathering a view's truth": median_seconds(lambda: [*map(steel.view, range(len(steel)))], REPEATS)}
     for family in MEASURE_FAMILIES.values():
         seconds[family.title] = median_seconds(partial(_evaluate_all, family, views), REPEATS // 3)
@@ -101,8 +101,9 @@ def extended_rows(root: str, config: str, submission: SubmissionReader) -> list[
 
 
 def _evaluate_all(family: MeasureFamily, views: list[tuple[SteelTruth, np.ndarray]]) -> None:
-    for truth, p_m in views:
+    for truth, image_m in views:
         fresh = replace(truth)  # What predictions share is computed again in each repetition.
+        p_m = image_m if family.on_image else image_m.ravel()[truth.index]
         for alignment in family.alignments:
             family.evaluate(p_m / 1.1 if alignment == SCALED else p_m, fresh)
 

@@ -165,7 +165,7 @@ class Data:
         if self.config is None or not exact:
             yield from ((view_id, None) for view_id in self.views)
             return
-        for view_id, left, _ in verified_views(self.config):
+        for view_id, (left,), _ in verified_views(self.config):
             yield view_id, left.depth_m
 
 

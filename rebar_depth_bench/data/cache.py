@@ -103,7 +103,7 @@ def total_bytes(files: Iterable[CacheFile]) -> int:
 
 # One entry: its file, and the views in it.
 
-_FORMAT = "rebar-cache-3"
+_FORMAT = "rebar-cache-4"
 _ALIGNMENT = 8
 _TRAILER = struct.Struct("<32sQ")
 """SHA-256 of the index and its length in bytes."""
@@ -113,7 +113,7 @@ _DAMAGE = (OSError, EOFError, ValueError)
 
 @dataclass(frozen=True, eq=False)
 class ViewArrays:
-    """Cached data of one view: named 1-D arrays of equal length, and a few numbers."""
+    """Cached data of one view: named 1-D arrays, and a few numbers."""
 
     view_id: str
     arrays: Mapping[str, ndarray]
@@ -162,12 +162,12 @@ class CacheContent:
 
 
 class _Block(StrictModel):
-    """Place of a view's arrays, which have ``count`` values each, and the checksum of their bytes."""
+    """Place of a view's arrays, which have ``counts`` values in order, and the checksum of their bytes."""
 
     view_id: str
     start: Annotated[int, Field(ge=0)]
     size: Annotated[int, Field(ge=0)]
-    count: Annotated[int, Field(ge=0)]
+    counts: tuple[Annotated[int, Field(ge=0)], ...]
     crc32: int
     numbers: tuple[float, ...]
 
@@ -194,8 +194,8 @@ class _Entry:
             raise ValueError(f"the values of {view_id} do not match their checksum")
         arrays: dict[str, ndarray] = {}
         offset = 0
-        for name, dtype in self.content.dtypes.items():
-            arrays[name] = np.frombuffer(values, dtype, block.count, offset)
+        for (name, dtype), count in zip(self.content.dtypes.items(), block.counts, strict=True):
+            arrays[name] = np.frombuffer(values, dtype, count, offset)
             offset += arrays[name].nbytes + _padding(arrays[name].nbytes)
         view = ViewArrays(view_id, arrays, block.numbers)
         if not self.content.is_sound(view):
@@ -243,17 +243,17 @@ def _write_entry(path: Path, content: CacheContent, progress: Progress) -> _Entr
     with atomic_replace(path, 0o600) as unfinished:
         with unfinished.open("wb") as file:
             for view in content.compute(progress=progress):
-                start, count, checksum = file.tell(), 0, 0
+                start, checksum = file.tell(), 0
                 for array in view.arrays.values():
                     values = array.tobytes() + bytes(_padding(array.nbytes))
                     file.write(values)
-                    count, checksum = len(array), zlib_ng.crc32(values, checksum)
+                    checksum = zlib_ng.crc32(values, checksum)
                 blocks.append(
                     _Block(
                         view_id=view.view_id,
                         start=start,
                         size=file.tell() - start,
-                        count=count,
+                        counts=tuple(map(len, view.arrays.values())),
                         crc32=checksum,
                         numbers=view.numbers,
                     )

@@ -8,13 +8,9 @@ front. Counts are pooled over directions, then per t
 
     precision = correct / predicted,    recall = correct / true,    F1 = 2 correct / (predicted + true),
 
-and each is averaged, unweighted, over those t at which the view has a true contour. Differences from the
-published variants:
+and each is averaged, unweighted, over those t at which the view has a true contour. Differences from Depth Pro and
+MoGe, whose boundary F1 ``published`` has:
 
-- Depth Pro takes precision and recall for each of four directions (which side is in front), averages them over
-  the directions, and weights ten t from 5 to 25 % by t, over the whole frame.
-- MoGe's evaluation (Wang et al., CVPR 2025; its radius 1) pools as here, over pairs of valid pixels, at those t
-  with those weights.
 - Here t is 1, 2, 5, 10, 20 %, all of equal weight: a 20 mm gap is 7 % at 0.3 m, while at 12 m bars one behind the
   other are 1-3 % apart.
 - In both of them a missing prediction can remove false contours. Here a pair with a missing prediction counts as

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Iterator, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Bool, Float64
@@ -20,8 +20,10 @@ from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder
 from rebar_depth_bench.data.rows import EyeTruth
 from rebar_depth_bench.extended.axes import assign_segments
 from rebar_depth_bench.extended.depth_layers import other_layers
+from rebar_depth_bench.extended.disparity import match_right
 from rebar_depth_bench.extended.judged import SAMPLED_PIXELS, judged_crossings
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL
+from rebar_depth_bench.extended.published import depth_steps
 from rebar_depth_bench.extended.steel import JudgedCrossings, SceneBars, SteelTruth
 from rebar_depth_bench.geometry.cameras import pixel_rays
 from rebar_depth_bench.scoring.evaluation import Evaluation
@@ -37,8 +39,14 @@ _DTYPES: Mapping[str, type] = {
     "run": np.int16,
     "front_m": np.float32,
     "behind_m": np.float32,
+    "seen_by_right": np.bool_,
+    "has_depth": np.uint8,
+    "near_step": np.uint8,
+    "step_depth_m": np.float32,
+    "crossing": np.uint32,
+    "pixel": np.uint32,
 }
-"""Arrays of ``SteelTruth`` that are cached, with their types."""
+"""Arrays of ``SteelTruth``, and flattened ones of ``JudgedCrossings``, that are cached, with their types."""
 
 
 Rays = Float64[ndarray, "hw 2"]
@@ -47,7 +55,7 @@ Rays = Float64[ndarray, "hw 2"]
 Lens = tuple[float, ...]
 """K, row by row, and distortion of a camera."""
 
-_LENS_NUMBERS, _CAMERA_NUMBERS = 9 + 5, 9 + 5 + 16
+_LENS_NUMBERS, _NUMBERS = 9 + 5, 9 + 5 + 16 + 1 + 1
 
 
 def has_bar_ids(config: DatasetConfig) -> bool:
@@ -61,7 +69,6 @@ class ConfigSteelTruth:
 
     ``bars_by_view`` holds the bars of each view's scene. ``rays`` holds the rays of each distinct lens (K and
     distortion), which views share. ``source`` is the file that the crossings come from.
-    Without ``judged_cache``, no crossings are judged.
     """
 
     config: DatasetConfig
@@ -69,7 +76,6 @@ class ConfigSteelTruth:
     rays: Mapping[Lens, Rays]
     source: CrossingsSource
     cache: ArrayCache
-    judged_cache: ArrayCache | None = None
 
     def __len__(self) -> int:
         """Return the number of views."""
@@ -83,28 +89,13 @@ class ConfigSteelTruth:
     def view(self, position: int) -> SteelTruth:
         """Return the view at ``position`` in protocol order."""
         view = self.cache.view(position)
-        lens, pose = view.numbers[:_LENS_NUMBERS], view.numbers[_LENS_NUMBERS:]
-        height, width = self.config.grid
-        return SteelTruth(
-            view_id=view.view_id,
-            height=height,
-            width=width,
-            K=np.array(lens[:9]).reshape(3, 3),
-            cam_from_world=np.array(pose).reshape(4, 4),
-            rays=self.rays[lens][view.arrays["index"]],
-            bars=self.bars_by_view[view.view_id],
-            distortion=np.array(lens[9:]),
-            judged=self.judged(position),
-            **view.arrays,
-        )
+        rays = self.rays[view.numbers[:_LENS_NUMBERS]]
+        return _steel_truth(self.config, view, rays, self.bars_by_view[view.view_id])
 
-    def judged(self, position: int) -> JudgedCrossings:
-        """Return the judged crossings of the view at ``position``."""
-        if self.judged_cache is None:
-            return JudgedCrossings.none()
-        view = self.judged_cache.view(position)
-        crossing = view.arrays["crossing"][:: 2 * SAMPLED_PIXELS].astype(np.int64)
-        return JudgedCrossings(crossing, view.arrays["pixel"].astype(np.int64).reshape(-1, 2, SAMPLED_PIXELS))
+    @property
+    def judged_counts(self) -> tuple[int, ...]:
+        """Number of judged crossings of each view."""
+        return tuple(int(numbers[-1]) for numbers in self.cache.numbers)
 
 
 def steel_truth(evaluation: Evaluation, config: DatasetConfig, progress: Progress = silent) -> ConfigSteelTruth:
@@ -132,13 +123,15 @@ def load_steel_truth(
     scored_px = scored_counts(config)
 
     def is_sound(view: ViewArrays) -> bool:
-        has_camera = len(view.numbers) == _CAMERA_NUMBERS and all(map(math.isfinite, view.numbers))
+        has_camera = len(view.numbers) == _NUMBERS and all(map(math.isfinite, view.numbers))
         has_counts = np.count_nonzero(view.arrays["interior"]) == scored_px[view.view_id]
         return has_camera and has_counts and are_pixels_inside(view, config)
 
     content = CacheContent(
         task=f"bars in the views of {config.name}",
-        inputs=cache_inputs(config, EXTENDED_PROTOCOL, folder.files[BARS_FILE]),
+        inputs=cache_inputs(
+            config, f"{EXTENDED_PROTOCOL} {CROSSINGS_PROTOCOL}", f"{folder.files[BARS_FILE]} {source.sha256}"
+        ),
         dtypes=_DTYPES,
         view_ids=tuple(scored_px),
         extract=lambda view_ids: _view_arrays(config, bars_by_view, view_ids),
@@ -146,29 +139,7 @@ def load_steel_truth(
     )
     cache = open_cache(content, progress)
     rays = {lens: _rays(lens, config) for lens in {numbers[:_LENS_NUMBERS] for numbers in cache.numbers}}
-    steel = ConfigSteelTruth(config, bars_by_view, rays, source, cache)
-
-    def judged_arrays(view_ids: Collection[str] | None) -> Iterator[ViewArrays]:
-        for position, view_id in enumerate(cache.view_ids):
-            if view_ids is None or view_id in view_ids:
-                judged = judged_crossings(steel.view(position))
-                arrays = {
-                    "crossing": np.repeat(judged.crossing, 2 * SAMPLED_PIXELS),
-                    "pixel": judged.pixels.ravel(),
-                }
-                yield ViewArrays(view_id, arrays, ())
-
-    # An entry of its own: its arrays have other lengths, and it also depends on the definition of crossings.
-    protocol = f"{EXTENDED_PROTOCOL} {CROSSINGS_PROTOCOL}"
-    judged = CacheContent(
-        task=f"crossings in the views of {config.name}",
-        inputs=cache_inputs(config, protocol, f"{folder.files[BARS_FILE]} {source.sha256}"),
-        dtypes={"crossing": np.uint32, "pixel": np.uint32},
-        view_ids=tuple(scored_px),
-        extract=judged_arrays,
-        is_sound=lambda view: len(view.arrays["pixel"]) % (2 * SAMPLED_PIXELS) == 0,
-    )
-    return replace(steel, judged_cache=open_cache(judged, progress))
+    return ConfigSteelTruth(config, bars_by_view, rays, source, cache)
 
 
 def _rays(lens: Lens, config: DatasetConfig) -> Rays:
@@ -181,17 +152,49 @@ def _rays(lens: Lens, config: DatasetConfig) -> Rays:
 def _view_arrays(
     config: DatasetConfig, bars_by_view: Mapping[str, SceneBars], view_ids: Collection[str] | None
 ) -> Iterator[ViewArrays]:
-    """Yield the cached arrays of some views, or of all with scored pixels, with numbers of K, distortion, pose."""
+    """Yield the cached arrays of some views, or of all with scored pixels.
+
+    The numbers are those of K, distortion and pose, the parallax, and the number of judged crossings.
+    """
     rays: dict[Lens, Rays] = {}
-    for view_id, left, scored in verified_views(config, view_ids):
+    for view_id, eyes, scored in verified_views(config, view_ids, config.truth_eyes):
         if not len(scored):
             continue
-        camera = left.camera
+        left, camera = eyes[0], eyes[0].camera
         lens = (*camera.K.ravel().tolist(), *camera.distortion.tolist())
         if lens not in rays:
             rays[lens] = _rays(lens, config)
         arrays = _steel_arrays(left, scored, rays[lens], bars_by_view[view_id])
-        yield ViewArrays(view_id, arrays, (*lens, *camera.cam_from_world.ravel().tolist()))
+        parallax_px_m, is_seen = match_right(eyes, scored)
+        arrays["seen_by_right"] = np.isin(arrays["index"], scored[is_seen], assume_unique=True)
+        arrays |= depth_steps(left.depth_m)
+        arrays |= {"crossing": np.empty(0), "pixel": np.empty(0)}
+        numbers = (*lens, *camera.cam_from_world.ravel().tolist(), parallax_px_m, 0)
+        view = ViewArrays(view_id, arrays, numbers)
+        judged = judged_crossings(_steel_truth(config, view, rays[lens], bars_by_view[view_id]))
+        arrays |= {"crossing": judged.crossing, "pixel": judged.pixels.ravel()}
+        yield ViewArrays(view_id, arrays, (*numbers[:-1], len(judged.crossing)))
+
+
+def _steel_truth(config: DatasetConfig, view: ViewArrays, rays: Rays, bars: SceneBars) -> SteelTruth:
+    """Return a view from its arrays and numbers, the rays of its lens, and the bars of its scene."""
+    arrays = dict(view.arrays)
+    crossing, pixel = (arrays.pop(name).astype(np.int64) for name in ("crossing", "pixel"))
+    lens, (*pose, parallax_px_m, _) = view.numbers[:_LENS_NUMBERS], view.numbers[_LENS_NUMBERS:]
+    height, width = config.grid
+    return SteelTruth(
+        view_id=view.view_id,
+        height=height,
+        width=width,
+        K=np.array(lens[:9]).reshape(3, 3),
+        cam_from_world=np.array(pose).reshape(4, 4),
+        rays=rays[arrays["index"]],
+        bars=bars,
+        distortion=np.array(lens[9:]),
+        judged=JudgedCrossings(crossing, pixel.reshape(-1, 2, SAMPLED_PIXELS)),
+        parallax_px_m=parallax_px_m,
+        **arrays,
+    )
 
 
 def _steel_arrays(left: EyeTruth, scored: ndarray, rays: Rays, scene: SceneBars) -> dict[str, ndarray]:

@@ -19,7 +19,7 @@ from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.columns import Better, Column
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
 
-EXTENDED_PROTOCOL = "rebar-extended-4"
+EXTENDED_PROTOCOL = "rebar-extended-5"
 """Version of the definitions of all extended measures; any change of a definition changes it."""
 
 ONCE, NATIVE, SCALED = "once", "native", "scaled"
@@ -58,15 +58,15 @@ STATISTICS: Mapping[Statistic, Callable[[Float64[ndarray, " n"]], float]] = {
 }
 """Population statistics of one or more values."""
 
-_DECIMALS: Mapping[str, int] = {"mm": 2, "cm": 2, "m": 3, "%": 1, "": 4}
+_DECIMALS: Mapping[str, int] = {"mm": 2, "cm": 2, "m": 3, "px": 3, "%": 1, "": 4}
 
 
 @dataclass(frozen=True)
 class Measure:
     """Definition of one table entry: ``statistic`` of the samples named ``sample``, pooled over a config's views.
 
-    ``unit`` is "mm", "cm", "%" (samples are shares from 0 to 1, shown times 100), "m" or "". ``better`` is "lower"
-    or "higher" only if missing pixels, or bars that were not found, count as failures; otherwise "".
+    ``unit`` is "mm", "cm", "%" (samples are shares from 0 to 1, shown times 100), "m", "px" or "". ``better`` is
+    "lower" or "higher" only if missing pixels, or bars that were not found, count as failures; otherwise "".
     ``definition`` is one sentence with the formula. ``sample_name`` names the samples if the measure's name does
     not. ``convert``, if set, maps the statistic to the measure's value. It must be decreasing, and returns None
     where the statistic only reflects that something was missed.
@@ -125,18 +125,19 @@ class MeasureFamily:
     """Related measures under one heading, found by the registry in the ``FAMILIES`` of a module.
 
     ``evaluate`` returns a view's samples from a prediction: planar depth on ``SteelTruth.index``, metres, NaN
-    where missing; names that it leaves out have no samples. It is called for each of ``alignments``, once for all
-    families that share it. ``note`` explains the single column of measures that are taken ``ONCE``. Reports have
-    the families by ascending ``place``.
+    where missing; names that it leaves out have no samples. If the family is ``on_image``, it gets the whole image
+    as submitted. It is called for each of ``alignments``, once for all families that share it. ``note`` explains
+    the single column of measures that are taken ``ONCE``. Reports have the families by ascending ``place``.
     """
 
     key: str
     title: str
     place: int
     measures: tuple[Measure, ...]
-    evaluate: Callable[[Float64[ndarray, " n"], SteelTruth], Samples]
+    evaluate: Callable[[Float[ndarray, ...], SteelTruth], Samples]
     alignments: tuple[str, ...] = (NATIVE, SCALED)
     note: str = ""
+    on_image: bool = False
 
     @property
     def by_name(self) -> dict[str, Measure]:

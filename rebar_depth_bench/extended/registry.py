@@ -109,9 +109,10 @@ def view_samples(
     ``scale`` is the view's median scale s, None if it has none.
     """
     samples: dict[str, Samples] = {}
+    families = tuple(families)
     for alignment, p_m in aligned_predictions(prediction_m, truth, scale).items():
         of_alignment: dict[str, Float64[ndarray, " n"]] = {}
-        for evaluate in dict.fromkeys(family.evaluate for family in families if alignment in family.alignments):
-            of_alignment |= evaluate(p_m, truth)
+        for family in {family.evaluate: family for family in families if alignment in family.alignments}.values():
+            of_alignment |= family.evaluate(prediction_m if family.on_image else p_m, truth)
         samples[alignment] = of_alignment
     return samples

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from typing import Any, TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64, UInt16, UInt32
+from jaxtyping import Bool, Float32, Float64, Int64, UInt8, UInt16, UInt32
 from numpy import ndarray
 
 from rebar_depth_bench.bar_crossings.definition import Crossings, scene_crossings
@@ -71,6 +71,11 @@ class SteelTruth:
     of the closest other layer in front of and behind the pixel, NaN where none is visible: see
     ``depth_layers.other_layers``. ``bars`` are those of the scene. ``distortion`` is that of the grid
     (``cameras.distort``), zeros on an ideal one.
+
+    ``parallax_px_m`` is focal length times baseline of a rectified pair, pixels times metres, 0 if there is none;
+    ``seen_by_right`` marks the scored pixels that are not occluded in it (``disparity.match_right``). Of the whole
+    image there are two masks, row by row, packed into bits: ``has_depth``, and ``near_step`` with the depth
+    ``step_depth_m`` of its pixels (``published.depth_steps``).
     """
 
     view_id: str
@@ -90,6 +95,11 @@ class SteelTruth:
     bars: SceneBars = field(default_factory=lambda: SceneBars.of(()))
     distortion: Float64[ndarray, " 5"] = field(default_factory=lambda: np.zeros(5))
     judged: JudgedCrossings = field(default_factory=JudgedCrossings.none)
+    parallax_px_m: float = 0.0
+    seen_by_right: Bool[ndarray, " n"] = field(default_factory=lambda: np.empty(0, np.bool_))
+    has_depth: UInt8[ndarray, " b"] = field(default_factory=lambda: np.empty(0, np.uint8))
+    near_step: UInt8[ndarray, " b"] = field(default_factory=lambda: np.empty(0, np.uint8))
+    step_depth_m: Float32[ndarray, " m"] = field(default_factory=lambda: np.empty(0, np.float32))
     _made: dict[object, Any] = field(default_factory=dict, init=False, repr=False)
 
     def once(self, make: Callable[[SteelTruth], _Made]) -> _Made:

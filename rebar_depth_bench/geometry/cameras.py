@@ -10,9 +10,10 @@ them (``matrix_product``).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from math import cos, sin
+from typing import Any
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64
@@ -28,6 +29,10 @@ HALF_PIXEL = 0.5
 
 ROTATION_TOLERANCE = 1e-6
 """Largest deviation of ``R @ R.T`` from the identity for a rotation ``R``."""
+
+_MOTION_DECIMALS = 12
+PARALLEL_TOLERANCE = 1e-9
+"""Largest deviation of an entry of ``right_from_left`` from that of a rectified pair."""
 
 _NEWTON_STEPS = 50
 _NEWTON_TOLERANCE = 1e-15
@@ -141,6 +146,25 @@ def right_camera_pose(left_cam_from_world: Float[ndarray, "4 4"], baseline_m: fl
     pose = left_cam_from_world.copy()
     pose[0, 3] -= baseline_m
     return pose
+
+
+def right_from_left(row: Mapping[str, Any]) -> Float64[ndarray, "4 4"]:
+    """Return the motion of the pair without the rounding errors of its poses, so that it is that of all views."""
+    motion = row["right_cam_from_world"] @ inverse_rigid(row["left_cam_from_world"])
+    return np.asarray(np.round(motion, _MOTION_DECIMALS))
+
+
+def is_rectified(row: Mapping[str, Any]) -> bool:
+    """Return whether a row's cameras are undistorted and parallel, and differ along the left one's x axis only.
+
+    The principal points may differ in x, which is a constant of all disparities.
+    """
+    parallel = np.eye(4)
+    parallel[0, 3] = -row["baseline_m"]
+    differs = row["left_K"] != row["right_K"]
+    differs[0, 2] = False
+    has_lens = differs.any() or row["left_distortion"].any() or row["right_distortion"].any()
+    return not has_lens and bool(np.abs(right_from_left(row) - parallel).max() <= PARALLEL_TOLERANCE)
 
 
 def transform(pose: Float[ndarray, "4 4"], points: Float[ndarray, "*n 3"]) -> Float[ndarray, "*n 3"]:

@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from numpy import ndarray
 
-from rebar_depth_bench.geometry.cameras import inverse_rigid, pixel_rays, project
+from rebar_depth_bench.geometry.cameras import pixel_rays, project, right_from_left
 
 
 def rectify(
@@ -47,11 +47,6 @@ def rectify(
     return np.asarray(P_left[:, :3]), (np.asarray(R_left), np.asarray(R_right))
 
 
-_MOTION_DECIMALS = 12
-PARALLEL_TOLERANCE = 1e-9
-"""Largest deviation of an entry of ``right_from_left`` from that of a rectified pair."""
-
-
 @dataclass(frozen=True, eq=False)
 class RectifiedPair:
     """Rectified image pair, with the mapping back to the raw left image.
@@ -71,19 +66,6 @@ class RectifiedPair:
     depth_ratio: Float64[ndarray, "h w"]
 
 
-def is_rectified(row: Mapping[str, Any]) -> bool:
-    """Return whether a row's cameras are undistorted and parallel, and differ along the left one's x axis only.
-
-    The principal points may differ in x, which is a constant of all disparities.
-    """
-    parallel = np.eye(4)
-    parallel[0, 3] = -row["baseline_m"]
-    differs = row["left_K"] != row["right_K"]
-    differs[0, 2] = False
-    has_lens = differs.any() or row["left_distortion"].any() or row["right_distortion"].any()
-    return not has_lens and bool(np.abs(_right_from_left(row) - parallel).max() <= PARALLEL_TOLERANCE)
-
-
 def rectified_pair(row: Mapping[str, Any]) -> RectifiedPair:
     """Rectify the image pair of a dataset row with its K, distortion and poses (``rectify``).
 
@@ -91,7 +73,7 @@ def rectified_pair(row: Mapping[str, Any]) -> RectifiedPair:
     """
     height, width, _ = row["left_rgb"].shape
     Ks, distortions = (row["left_K"], row["right_K"]), (row["left_distortion"], row["right_distortion"])
-    rectified_K, rotations = rectify(Ks, distortions, _right_from_left(row), width, height)
+    rectified_K, rotations = rectify(Ks, distortions, right_from_left(row), width, height)
     rays = [
         pixel_rays(K, width, height, distortion) @ rotation.T
         for K, distortion, rotation in zip(Ks, distortions, rotations, strict=True)
@@ -125,12 +107,6 @@ def matched_in_right(pair: RectifiedPair, disparity_px: Float32[ndarray, "hc wc"
     match = np.rint(columns - np.nan_to_num(disparity_px)).astype(np.int64)
     on_canvas = (match >= 0) & (match < disparity_px.shape[1])
     return np.asarray(on_canvas & pair.seen_by_right[rows, np.where(on_canvas, match, 0)])
-
-
-def _right_from_left(row: Mapping[str, Any]) -> Float64[ndarray, "4 4"]:
-    """Return the motion of the pair without the rounding errors of its poses, so that it is that of all views."""
-    motion = row["right_cam_from_world"] @ inverse_rigid(row["left_cam_from_world"])
-    return np.asarray(np.round(motion, _MOTION_DECIMALS))
 
 
 def enclosing_canvas(

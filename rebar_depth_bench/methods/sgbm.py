@@ -18,6 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8
 from numpy import ndarray
 
+from rebar_depth_bench.geometry.cameras import is_rectified
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor, import_optional
 
 if TYPE_CHECKING:
@@ -69,7 +70,7 @@ def rectified_row(row: Mapping[str, Any]) -> tuple[Mapping[str, Any], RectifiedP
     """
     from rebar_depth_bench.geometry import rectification
 
-    if rectification.is_rectified(row):
+    if is_rectified(row):
         return row, None
     pair = rectification.rectified_pair(row)
     return pair_row(pair), pair

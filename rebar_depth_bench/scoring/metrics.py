@@ -155,7 +155,7 @@ def mean_metrics(metrics: Sequence[DepthMetrics]) -> DepthMetrics | None:
     return DepthMetrics(**defined) if defined else None
 
 
-def is_valid_prediction(p_m: Float[ndarray, " n"]) -> Bool[ndarray, " n"]:
+def is_valid_prediction(p_m: Float[ndarray, ...]) -> Bool[ndarray, ...]:
     """Return a mask of the valid predictions: finite and > 0."""
     with np.errstate(invalid="ignore"):
         return np.asarray(np.isfinite(p_m) & (p_m > 0))

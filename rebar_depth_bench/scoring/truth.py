@@ -7,7 +7,7 @@ read the cache one view at a time.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -121,23 +121,27 @@ def scored_counts(config: DatasetConfig) -> dict[str, int]:
 
 
 def verified_views(
-    config: DatasetConfig, view_ids: Collection[str] | None = None
-) -> Iterator[tuple[str, EyeTruth, UInt32[ndarray, " n"]]]:
-    """Yield id, left eye and flat indices of the scored pixels of some views, or all, verified by the manifest.
+    config: DatasetConfig, view_ids: Collection[str] | None = None, eyes: Sequence[str] = ("left",)
+) -> Iterator[tuple[str, Sequence[EyeTruth], UInt32[ndarray, " n"]]]:
+    """Yield id, eyes and flat indices of the scored pixels of some views, or all, verified by the manifest.
 
+    The first of ``eyes`` is the left one, which has the scored pixels.
     Raises ``DatasetError`` as ``iterate_rows``, and naming a view that does not match its digest.
     """
     records = {view.view_id: view for view in config.views}
-    for row in iterate_rows(config, ("view_id", *truth_columns("left")), view_ids):
-        record, left = records[row["view_id"]], truth_from_row(row, "left")
-        digest, pixels = left.digest(), scored_pixels(left.mask, left.depth_m)
-        if digest != record.left or len(pixels) != record.scored_px:
-            raise DatasetError(
-                f"{config.root}: view {record.view_id}: ground truth has digest {digest[:16]} and {len(pixels)} "
-                f"scored pixels, the manifest has {record.left[:16]} and {record.scored_px}; "
-                f"rebar-bench verify {config.root} lists damaged files"
-            )
-        yield record.view_id, left, pixels
+    columns = [column for eye in eyes for column in truth_columns(eye)]
+    for row in iterate_rows(config, ("view_id", *columns), view_ids):
+        record, truths = records[row["view_id"]], [truth_from_row(row, eye) for eye in eyes]
+        pixels = scored_pixels(truths[0].mask, truths[0].depth_m)
+        for eye, truth in zip(eyes, truths, strict=True):
+            digest, expected = truth.digest(), getattr(record, eye)
+            if digest != expected or len(pixels) != record.scored_px:
+                raise DatasetError(
+                    f"{config.root}: view {record.view_id}: {eye} ground truth has digest {digest[:16]} and "
+                    f"{len(pixels)} scored pixels, the manifest has {expected[:16]} and {record.scored_px}; "
+                    f"rebar-bench verify {config.root} lists damaged files"
+                )
+        yield record.view_id, truths, pixels
 
 
 def _extract_views(
@@ -149,7 +153,7 @@ def _extract_views(
 
     With ``diameters``, the diameters of the bars by scene, the last number is the bar width in pixels.
     """
-    for view_id, left, pixels in verified_views(config, view_ids):
+    for view_id, (left,), pixels in verified_views(config, view_ids):
         if len(pixels):
             depth_m = left.depth_m.ravel()[pixels]
             median_m = median(depth_m)

@@ -18,7 +18,7 @@ from scipy.ndimage import binary_erosion
 
 from rebar_depth_bench import load
 from rebar_depth_bench.captures.views import open_capture
-from rebar_depth_bench.geometry.rectification import is_rectified
+from rebar_depth_bench.geometry.cameras import is_rectified
 from tests.bench.methods.predictors import load_predictor
 
 VIEW = "lattice/0028"

@@ -357,8 +357,7 @@ def crossing_view(evaluation: Evaluation, config: DatasetConfig) -> CrossingView
     steel = steel_truth(evaluation, config)
     if not any(len(bars.crossings) for bars in steel.bars_by_view.values()) or not len(steel):
         return None
-    counts = [len(steel.judged(position).crossing) for position in range(len(steel))]
-    truth = steel.view(int(np.argmax(counts)))
+    truth = steel.view(int(np.argmax(steel.judged_counts)))
     return CrossingView(config.view_ids.index(truth.view_id), truth)
 
 

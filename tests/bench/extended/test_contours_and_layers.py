@@ -12,6 +12,7 @@ from numpy import ndarray
 
 from rebar_depth_bench.extended.boundary import THRESHOLDS_PERCENT, boundary_samples, neighbour_pairs
 from rebar_depth_bench.extended.depth_layers import DIRECTIONS, RADII_PX, layer_samples, other_layers
+from rebar_depth_bench.extended.published import RADII, image_boundary_samples
 from rebar_depth_bench.extended.steel import SteelTruth
 from tests.bench.extended.thin_scenes import (
     pixel_truth,
@@ -132,6 +133,98 @@ def test_extreme_values_give_shares_without_warning() -> None:
     truth = random_truth(rng)
     p_m = rng.choice([1e308, 5e-324, np.inf, -np.inf, np.nan, 0.0, -0.0, -1e308, 1.0], len(truth.index))
     assert all(0.0 <= value <= 1.0 for value in boundary_scores(p_m, truth).values())
+
+
+# Boundary F1 of Depth Pro and MoGe.
+
+
+def f1_of(precision: float, recall: float) -> float:
+    return 2 * precision * recall / (precision + recall) if precision + recall else 0.0
+
+
+def share(part: int, whole: int) -> float:
+    return part / whole if whole else 0.0
+
+
+def edge_pairs(depth_m: ndarray, down: int, right: int, t: float, rim: int = 0) -> set[tuple[int, int]]:
+    """Return the pixels, ``rim`` or more from the border, from which another one is over t times as far away."""
+    height, width = depth_m.shape
+    return {
+        (row, column)
+        for row in range(rim, height - rim)
+        for column in range(rim, width - rim)
+        if 0 <= row + down < height and 0 <= column + right < width
+        if depth_m[row + down, column + right] / depth_m[row, column] > t
+    }
+
+
+def published_f1s(p_m: ndarray, z_m: ndarray) -> dict[str, float]:
+    """Return the published definitions from whole depth maps with NaN where there is no depth."""
+    p_m = np.where(np.isnan(z_m), np.nan, p_m)
+    steps, numbers = [0.05 + 0.2 * number / 9 for number in range(10)], {}
+    f1s = []
+    for step in steps:
+        shares = []
+        for down, right in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+            found, true = (edge_pairs(depth_m, down, right, 1 + step) for depth_m in (p_m, z_m))
+            shares.append((share(len(found & true), len(found)), share(len(found & true), len(true))))
+        f1s.append(f1_of(*np.mean(shares, axis=0)))
+    numbers["depth_pro_f1"] = sum((1 + t) * f1 for t, f1 in zip(steps, f1s, strict=True)) / sum(
+        1 + t for t in steps
+    )
+    for radius in RADII:
+        f1s = []
+        for step in steps:
+            found_px = true_px = both_px = 0
+            for down in range(-radius, radius + 1):
+                for right in range(-radius, radius + 1):
+                    if 0 < down * down + right * right <= radius * radius:
+                        found, true = (
+                            edge_pairs(depth_m, down, right, 1 + step, radius) for depth_m in (p_m, z_m)
+                        )
+                        found_px, true_px = found_px + len(found), true_px + len(true)
+                        both_px += len(found & true)
+            f1s.append(f1_of(share(both_px, found_px), share(both_px, true_px)))
+        numbers[f"moge_f1_{radius}px"] = sum(t * f1 for t, f1 in zip(steps, f1s, strict=True)) / sum(steps)
+    return numbers
+
+
+def image_scores(p_m: ndarray, z_m: ndarray) -> dict[str, float]:
+    truth = steel_truth(np.nan_to_num(z_m), np.zeros(z_m.shape, np.uint16))
+    return {name: float(values[0]) for name, values in image_boundary_samples(p_m, truth).items() if len(values)}
+
+
+@settings(max_examples=6, deadline=None)
+@given(SEEDS)
+def test_published_boundaries_by_pixel_loops(seed: int) -> None:
+    """Compare maps with steps, slopes, noise, shifts, holes in the prediction and pixels without true depth."""
+    rng = np.random.default_rng(seed)
+    z_m = random_images(rng, 12, 20)[0].astype(np.float64)
+    z_m[z_m == 0] = np.nan
+    p_m = np.roll(np.nan_to_num(z_m, nan=0.7), rng.integers(0, 2), axis=1) * np.exp(rng.normal(0, 0.02, z_m.shape))
+    p_m[rng.random(z_m.shape) < 0.05] = np.nan
+    expected = published_f1s(p_m, z_m)
+    measured = image_scores(p_m, z_m)
+    assert {**dict.fromkeys(expected, 0.0), **measured} == pytest.approx(expected)
+    assert image_scores(3.0 * p_m, z_m) == pytest.approx(measured)
+
+
+def test_published_boundaries_by_hand() -> None:
+    """The one step of 1.2 is above seven thresholds, in one of the four directions of Depth Pro."""
+    z_m = np.where(np.arange(12) < 6, 1.0, 1.2) * np.ones((9, 1))
+    steps = np.linspace(0.05, 0.25, 10)
+    in_moge, in_depth_pro = steps[:7].sum() / steps.sum(), 0.25 * (1 + steps[:7]).sum() / (1 + steps).sum()
+    names = [f"moge_f1_{radius}px" for radius in RADII]
+    exact = {"depth_pro_f1": in_depth_pro, **dict.fromkeys(names, in_moge)}
+    assert image_scores(z_m, z_m) == pytest.approx(exact)
+    # One column to the right, the step has no pair of neighbours in common with the true one.
+    moved = image_scores(np.where(np.arange(12) < 7, 1.0, 1.2) * np.ones((9, 1)), z_m)
+    assert (moved["depth_pro_f1"], moved["moge_f1_1px"]) == (0.0, 0.0)
+    # Both have five pairs a row: one 1 px apart in the row, two 2 px apart, of which one is common, two diagonal.
+    assert moved["moge_f1_2px"] == pytest.approx(1 / 5 * in_moge)
+    # A missing prediction misses true edges only; without true edges there is no number.
+    assert image_scores(np.full(z_m.shape, np.nan), z_m) == dict.fromkeys(exact, 0.0)
+    assert image_scores(z_m, np.ones(z_m.shape)) == {}
 
 
 # Depth layers and their confusion.

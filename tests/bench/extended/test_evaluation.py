@@ -16,17 +16,20 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from rebar_depth_bench import DatasetError, SubmissionWriter, score
+from rebar_depth_bench import DatasetError, SubmissionWriter, load, score
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.bars import bars, read_bars, write_bars
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.extended.ground_truth import dilate_mask, load_steel_truth
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, NATIVE, ONCE, SCALED
+from rebar_depth_bench.extended.published import image_boundary_samples
 from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, measures_by_alignment, score_extended
 from rebar_depth_bench.extended.result import ExtendedResult
 from rebar_depth_bench.reporting.extended_tables import print_extended
 from rebar_depth_bench.scoring.evaluation import open_evaluation
+from rebar_depth_bench.scoring.protocol import scored_pixels
 from rebar_depth_bench.submission import SubmissionReader
+from tests.bench.extended.thin_scenes import steel_truth
 
 Depths = dict[str, np.ndarray]
 Archive = Callable[..., Path]
@@ -64,7 +67,7 @@ def test_measures_have_names_titles_and_definitions_of_their_own() -> None:
         assert len(names) == len({measure.title for measure in measures}) == len(measures)
         assert not {"abs_rel", "rmse_cm", "mae_cm", "delta1", "coverage"} & names
         assert all(measure.definition for measure in measures)
-    for family in ("boundary", "clouds", "layers", "full_mask"):
+    for family in ("boundary", "clouds", "layers", "full_mask", "disparity", "published", "published_boundary"):
         assert not any(measure.definition.endswith(".") for measure in MEASURE_FAMILIES[family].measures)
 
 
@@ -79,7 +82,7 @@ def test_ground_truth_is_perfect_in_every_measure(of_truth: ExtendedResult) -> N
                 1.0 if "delta1" in name or name.startswith(("boundary_f1", "boundary_p", "boundary_r")) else 0.0
             )
             assert once[name] == pytest.approx(ideal, abs=1e-9), name
-    for family in ("full_mask", "clouds", "layers"):
+    for family in ("full_mask", "clouds", "layers", "disparity"):
         for measure in MEASURE_FAMILIES[family].measures:
             if measure.name in native and measure.better:
                 assert native[measure.name] == (1.0 if measure.better == "higher" else 0.0), measure.name
@@ -163,6 +166,35 @@ def test_dilate_mask_by_hand() -> None:
     mask[0, 0] = mask[2, 3] = True
     expected = ["11...", "11111", "..111", "..111"]
     assert ["".join("1" if cell else "." for cell in row) for row in dilate_mask(mask)] == expected
+
+
+def test_disparity_and_boundary_of_whole_images_follow_from_the_rows(tiny_root: Path, archive_of: Archive) -> None:
+    """Numbers of views, from the archive to the result, are those of the depth of both views in the rows."""
+    rows = {row["view_id"]: row for row in load(tiny_root, "lattice")}
+    predicted = {view: np.roll(row["left_depth"], 1, axis=1) * np.float32(0.99) for view, row in rows.items()}
+    result = extended(archive_of(predicted), tiny_root)
+    for view_id, row in rows.items():
+        z_m, p_m = row["left_depth"].astype(np.float64), predicted[view_id].astype(np.float64)
+        truth = steel_truth(row["left_depth"], row["left_bars"])
+        expected = image_boundary_samples(np.where(p_m > 0, p_m, np.nan), truth)
+        assert {name: result.views[view_id][ONCE][name] for name in expected} == {
+            name: float(values[0]) for name, values in expected.items()
+        }
+        parallax_px_m = row["left_K"][0, 0] * row["baseline_m"]
+        v, u = np.divmod(scored_pixels(row["left_mask"], row["left_depth"]).astype(int), z_m.shape[1])
+        d = parallax_px_m / z_m[v, u]
+        match = np.round(u - d).astype(int)
+        inside = match >= 0
+        right_m = np.where(inside, row["right_depth"][v, np.where(inside, match, 0)], 0).astype(np.float64)
+        with np.errstate(divide="ignore"):
+            seen = (right_m > 0) & (np.abs(parallax_px_m / right_m - d) <= 1)
+        error = np.abs(parallax_px_m / p_m[v, u] - d)
+        numbers = result.views[view_id][NATIVE]
+        assert numbers["disparity_seen_by_right"] == pytest.approx(seen.mean())
+        assert numbers["disparity_epe_px"] == pytest.approx(error.mean())
+        assert numbers["disparity_noc_epe_px"] == pytest.approx(error[seen].mean())
+        assert numbers["disparity_noc_bad2"] == pytest.approx((error[seen] > 2).mean())
+        assert numbers["disparity_d1"] == pytest.approx(((error > 3) & (error > 0.05 * d)).mean())
 
 
 @pytest.mark.slow

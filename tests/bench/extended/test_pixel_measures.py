@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 
 import numpy as np
 import pytest
@@ -12,7 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy import ndarray
 
-from rebar_depth_bench.extended import boundary, depth_layers, point_cloud, regions
+from rebar_depth_bench.data.rows import EyeTruth
+from rebar_depth_bench.extended import boundary, depth_layers, disparity, point_cloud, published, regions
 from rebar_depth_bench.extended.alignment import MEASURES as ALIGNMENT_MEASURES
 from rebar_depth_bench.extended.alignment import (
     alignment_samples,
@@ -30,6 +31,7 @@ from rebar_depth_bench.extended.profiles import (
 from rebar_depth_bench.extended.profiles import MEASURES as PROFILE_MEASURES
 from rebar_depth_bench.extended.regions import region_samples
 from rebar_depth_bench.extended.steel import SteelTruth
+from rebar_depth_bench.geometry.cameras import Camera, rotation_matrix
 from rebar_depth_bench.scoring.score import ViewTruth, score_view
 from tests.bench.extended.thin_scenes import pixel_truth, random_prediction, random_truth, steel_truth, with_holes
 
@@ -41,6 +43,8 @@ FAMILIES: dict[str, tuple[Callable[..., Samples], Sequence[Measure]]] = {
     "clouds": (point_cloud.cloud_samples, point_cloud.MEASURES),
     "layers": (depth_layers.layer_samples, depth_layers.MEASURES),
     "full_mask": (regions.region_samples, regions.FULL_MASK_MEASURES),
+    "disparity": (disparity.disparity_samples, disparity.MEASURES),
+    "published": (published.error_samples, published.ERROR_MEASURES),
 }
 
 
@@ -230,6 +234,94 @@ def test_aligned_ground_truth_is_perfect() -> None:
     errors = [measured[name] for name in measured if "abs_rel" in name or "_cm" in name]
     assert errors == pytest.approx([0] * len(errors), abs=1e-9)
     assert measured["log_scaled_delta1"] == measured["shifted_delta1"] == 1.0
+
+
+# Errors as papers print them.
+
+
+def test_published_errors_by_hand() -> None:
+    """Ratios of 1, 1.02, 1.03, 1.5, 1.6 and 2 to one side or the other; a missing prediction is left out."""
+    z = np.array([1.0, 0.5, 2.0, 1.0, 1.0, 1.0, 1.0])
+    p = np.array([1.0, 0.51, 2.06, 1 / 1.5, 1.6, 0.5, np.nan])
+    measured = {name: values.tolist() for name, values in published.error_samples(p, pixel_truth(z)).items()}
+    logs = [0, math.log10(1.02), math.log10(1.03), math.log10(1.5), math.log10(1.6), math.log10(2)]
+    assert measured == {
+        "log10": [pytest.approx(sum(logs) / 6)],
+        "inlier_1.03": [2 / 6],
+        "delta2": [4 / 6],  # 1.25^2 = 1.5625
+        "delta3": [5 / 6],  # 1.25^3 = 1.953125
+    }
+
+
+# Disparity.
+
+
+def stereo_pair(rng: np.random.Generator, width: int = 60, height: int = 12) -> tuple[EyeTruth, EyeTruth]:
+    """Return two random depths before a rectified pair, f B = 8 px m, whose principal points differ by 2 px."""
+    eyes = []
+    for cx, x_m in ((25.0, 0.0), (23.0, 0.1)):
+        K = np.array([[80.0, 0, cx], [0, 70.0, 5.0], [0, 0, 1.0]])
+        depth_m = rng.choice([0.5, 0.52, 1.0, 2.0, 0.0], (height, width)).astype(np.float32)
+        pose = np.eye(4)
+        pose[0, 3] = -x_m
+        eyes.append(EyeTruth(Camera(K, np.zeros(5), pose, width, height), None, depth_m, depth_m > 0, None))
+    return eyes[0], eyes[1]
+
+
+@settings(max_examples=20)
+@given(SEEDS)
+def test_non_occluded_pixels_and_disparity_errors_by_pixel_loops(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    left, right = stereo_pair(rng)
+    scored = np.flatnonzero(left.depth_m).astype(np.uint32)
+    parallax_px_m, seen = disparity.match_right((left, right), scored)
+    assert parallax_px_m == pytest.approx(8.0)
+    z_m, p_m = left.depth_m.ravel()[scored].astype(float), np.full(len(scored), np.nan)
+    expected_seen, errors = [], []
+    for place, pixel in enumerate(scored.tolist()):
+        v, u = divmod(pixel, 60)
+        d = 8.0 / z_m[place]
+        match = round(u - d - (25.0 - 23.0))
+        there = float(right.depth_m[v, match]) if 0 <= match < 60 else 0.0
+        expected_seen.append(there > 0 and abs(8.0 / there - d) <= 1.0)
+        if rng.random() < 0.8:
+            p_m[place] = z_m[place] * rng.choice([1.0, 1.1, 0.8, 0.6])
+            errors.append((abs(8.0 / p_m[place] - d), d, expected_seen[-1]))
+        else:
+            errors.append((math.inf, d, expected_seen[-1]))
+    assert seen.tolist() == expected_seen
+    truth = replace(pixel_truth(z_m), parallax_px_m=parallax_px_m, seen_by_right=seen)
+    measured = {name: values.tolist() for name, values in disparity.disparity_samples(p_m, truth).items()}
+    expected = {"disparity_seen_by_right": [sum(expected_seen) / len(scored)]}
+    for prefix, chosen in (("disparity", errors), ("disparity_noc", [one for one in errors if one[2]])):
+        found = [error for error, _, _ in chosen if error < math.inf]
+        expected[f"{prefix}_epe_px"] = [sum(found) / len(found)]
+        expected[f"{prefix}_bad1"] = [sum(error > 1 for error, _, _ in chosen) / len(chosen)]
+        expected[f"{prefix}_bad2"] = [sum(error > 2 for error, _, _ in chosen) / len(chosen)]
+        expected[f"{prefix}_d1"] = [sum(error > 3 and error > 0.05 * d for error, d, _ in chosen) / len(chosen)]
+    assert measured.keys() == expected.keys()
+    for name, value in expected.items():
+        assert measured[name] == pytest.approx(value, rel=1e-9), name
+
+
+def test_views_that_are_no_rectified_pair_have_no_disparity() -> None:
+    left, right = stereo_pair(np.random.default_rng(0))
+    scored = np.flatnonzero(left.depth_m).astype(np.uint32)
+    turned, lens, swapped = np.eye(4), np.array([1e-3, 0, 0, 0, 0]), right.camera.cam_from_world.copy()
+    turned[:3, :3] = rotation_matrix([0, 0.01, 0])
+    swapped[0, 3] *= -1
+    others = [
+        replace(right.camera, cam_from_world=turned @ right.camera.cam_from_world),
+        replace(right.camera, cam_from_world=swapped),
+        replace(right.camera, distortion=lens),
+        replace(right.camera, K=right.camera.K + np.diag([1.0, 0, 0])),
+    ]
+    pairs = [(left,), *((left, replace(right, camera=camera)) for camera in others)]
+    for pair in pairs:
+        parallax_px_m, seen = disparity.match_right(pair, scored)
+        assert parallax_px_m == 0.0
+        assert not seen.any()
+    assert disparity.disparity_samples(np.ones(3), replace(pixel_truth([1.0, 1.0, 1.0]), parallax_px_m=0.0)) == {}
 
 
 # Profiles.

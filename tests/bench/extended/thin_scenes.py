@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy import ndarray
 
+from rebar_depth_bench.extended.published import depth_steps
 from rebar_depth_bench.extended.steel import SceneBars, SteelTruth
 from rebar_depth_bench.geometry.cameras import ideal_K, pixel_rays
 from rebar_depth_bench.scoring.protocol import interior, single_bar_pixels
@@ -27,7 +28,7 @@ def steel_truth(
     no_layer = np.full(depth_m.shape, np.nan)
     K = ideal_K(width, height)
     inside = interior(bars > 0) & (depth_m > 0)
-    single_bar = np.zeros_like(inside)
+    single_bar, steps = np.zeros_like(inside), depth_steps(depth_m.astype(np.float32))
     single_bar[inside] = single_bar_pixels(bars, np.flatnonzero(inside).astype(np.uint32))
     return SteelTruth(
         view_id="synthetic/0000",
@@ -44,6 +45,11 @@ def steel_truth(
         run=np.full(len(index), -1, np.int16),
         front_m=(no_layer if front_m is None else front_m).ravel()[index].astype(np.float32),
         behind_m=(no_layer if behind_m is None else behind_m).ravel()[index].astype(np.float32),
+        parallax_px_m=84.0,
+        seen_by_right=inside.ravel()[index] & (index % 3 > 0),
+        has_depth=steps["has_depth"],
+        near_step=steps["near_step"],
+        step_depth_m=steps["step_depth_m"],
     )
 
 

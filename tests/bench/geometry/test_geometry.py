@@ -22,6 +22,7 @@ from rebar_depth_bench.geometry.cameras import (
     fold_radius,
     ideal_K,
     inverse_rigid,
+    is_rectified,
     look_at,
     pixel_rays,
     project,
@@ -244,11 +245,11 @@ def test_no_match_outside_raw_right_image(pair: rectification.RectifiedPair) -> 
 
 def test_is_rectified_detects_rotation_and_distortion(raw_row: dict[str, Any]) -> None:
     ideal = ideal_row()
-    assert rectification.is_rectified(ideal)
-    assert not rectification.is_rectified(raw_row)
+    assert is_rectified(ideal)
+    assert not is_rectified(raw_row)
     rotated = raw_row["right_cam_from_world"]
-    assert not rectification.is_rectified(ideal | {"right_cam_from_world": rotated})
-    assert not rectification.is_rectified(ideal | {"right_distortion": raw_row["right_distortion"]})
+    assert not is_rectified(ideal | {"right_cam_from_world": rotated})
+    assert not is_rectified(ideal | {"right_distortion": raw_row["right_distortion"]})
 
 
 def grid_distance_m(a: np.ndarray, b: np.ndarray) -> float:

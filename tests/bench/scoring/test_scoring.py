@@ -156,7 +156,7 @@ def test_damaged_ground_truth_names_view(
     copy = copy_dataset(tiny_root, tmp_path / "copy")
     change_manifest(copy, lambda _, config: config["views"][3].update(left="0" * 64))
     view_id = open_folder(copy).config("lattice").view_ids[3]
-    with pytest.raises(DatasetError, match=f"view {view_id}: ground truth has digest"):
+    with pytest.raises(DatasetError, match=f"view {view_id}: left ground truth has digest"):
         score(archive_of(tiny_truth), copy)
 
 
