@@ -72,7 +72,8 @@ def main(root: Path, models: Path, out: Path, methods: list[str]) -> int:
     """Compute missing archives, write and print their numbers; return the exit status."""
     os.environ["MODELS"] = str(models.resolve())
     out.mkdir(parents=True, exist_ok=True)
-    configs = {name: config.of_split(TEST_SPLIT) for name, config in open_folder(root).config_by_name.items()}
+    folder = open_folder(root)
+    configs = {name: config.of_split(TEST_SPLIT) for name, config in folder.config_by_name.items()}
     for method in methods:
         for name in configs:
             archive = _archive(out, method, name)
@@ -80,7 +81,8 @@ def main(root: Path, models: Path, out: Path, methods: list[str]) -> int:
             if _is_stale(archive, root / name) and (status := rebar_bench(list(predict))):
                 return status
     numbers = {name: config_numbers(config, root, out) for name, config in configs.items()}
-    document = {"command": "python -m benchmarks.learned ROOT MODELS OUT", "configs": numbers}
+    command = "python -m benchmarks.learned ROOT MODELS OUT"
+    document = {"command": command, "dataset": folder.digest, "configs": numbers}
     write_text(results_file(LEARNED), json.dumps(document, indent=1, allow_nan=False) + "\n")
     print("\n\n".join(learned_tables(numbers).values()))
     return 0
@@ -179,4 +181,4 @@ if __name__ == "__main__":
     if len(sys.argv) < 4 or not set(sys.argv[4:]) <= {*METHODS, "none"}:
         sys.exit(f"usage: python -m benchmarks.learned ROOT MODELS OUT [{'|'.join(METHODS)}|none ...]")
     chosen = [name for name in sys.argv[4:] if name != "none"] if sys.argv[4:] else list(METHODS)
-    sys.exit(main(*map(Path, sys.argv[1:4]), chosen))
+    sys.exit(main(Path(sys.argv[1]), Path(sys.argv[2]), Path(sys.argv[3]), chosen))

@@ -28,8 +28,8 @@ def learned_tables(configs: Mapping[str, Any]) -> dict[str, str]:
 
 def _head(config: Mapping[str, Any]) -> str:
     low, middle, high = (number(value, 1) for value in config["disparity_px"])
-    reach = ", ".join(
-        f"{percent(reach['pixels'])} of the pixels, all those of {reach['views']} views, up to {limit} px"
+    reach = "; ".join(
+        f"up to {limit} px: {percent(reach['pixels'])} of the pixels, and all of them in {reach['views']} views"
         for limit, reach in config["reach"].items()
     )
     of_scenes = f" of {config['scenes']} scenes" if config["scenes"] > 1 else ""
@@ -52,7 +52,7 @@ def _metric_table(name: str, config: Mapping[str, Any]) -> str:
         "within 5 mm",
         "bias, px",
     )
-    rows = [
+    rows: list[tuple[str, ...]] = [
         (
             _title(method, row),
             number(row["rank_error"], 4),
@@ -92,9 +92,9 @@ def _aligned_table(name: str, config: Mapping[str, Any]) -> str:
 
 
 def _sorted(config: Mapping[str, Any], key: str) -> list[tuple[str, Mapping[str, Any]]]:
-    """Return the methods that have the number ``key``, by it."""
+    """Return the methods that have the number ``key``, by it; those that use ground truth come last."""
     rows = [(method, row) for method, row in config["methods"].items() if row[key] is not None]
-    return sorted(rows, key=lambda item: item[1][key])
+    return sorted(rows, key=lambda item: (bool(item[1]["uses_ground_truth"]), item[1][key]))
 
 
 def _title(method: str, row: Mapping[str, Any]) -> str:
@@ -102,5 +102,5 @@ def _title(method: str, row: Mapping[str, Any]) -> str:
 
 
 def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
-    lines = [" | ".join(cells) for cells in (head, ["---"] * len(head), *rows)]
-    return "\n".join(f"| {line} |" for line in lines)
+    first, *others = [f"| {' | '.join(cells)} |" for cells in (head, *rows)]
+    return "\n".join((first, "|---" * len(head) + "|", *others))
