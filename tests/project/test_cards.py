@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -14,7 +15,6 @@ import yaml
 from scipy.ndimage import binary_erosion
 
 import rebar_depth_bench as rdb
-from benchmarks import learned
 from cards.benchmark import benchmark_card
 from cards.dataset import column_rows, dataset_card
 from cards.learned import learned_tables
@@ -192,7 +192,8 @@ def test_numbers_of_learned_networks_are_those_of_a_known_shift(
 ) -> None:
     """Disparities are half a pixel too large in the left half of the image, and missing in the right one."""
     limit_px, views = 33.5, list(rdb.load(tiny_root, "lattice"))
-    monkeypatch.setattr("benchmarks.learned.REACHES_PX", (limit_px,))
+    config_numbers = runpy.run_path("benchmarks/learned.py")["config_numbers"]
+    monkeypatch.setitem(config_numbers.__globals__, "REACHES_PX", (limit_px,))
     near, far, reached = 0, 0, []
     with rdb.SubmissionWriter(tmp_path / "sgbm-lattice.zip", method="shifted") as writer:
         for row in views:
@@ -205,7 +206,7 @@ def test_numbers_of_learned_networks_are_those_of_a_known_shift(
             near, far = near + (true_px[scored] <= limit_px).sum(), far + (true_px[scored] > limit_px).sum()
             if (true_px[scored] <= limit_px).all():
                 reached.append(np.where(is_left, 0.5 / (true_px + 0.5), 1)[scored].mean())
-    config = learned.config_numbers(open_folder(tiny_root).config("lattice"), tiny_root, tmp_path)
+    config = config_numbers(open_folder(tiny_root).config("lattice"), tiny_root, tmp_path)
     [(method, numbers)] = config["methods"].items()
     assert method == "sgbm"
     assert numbers["bias_px"] == pytest.approx(0.5, abs=1e-3)
