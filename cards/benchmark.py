@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from cards.crossings import FILES, crossing_baselines
+from cards.learned import learned_context
 from cards.reference import (
     CAGES,
     FULL_SETS,
@@ -98,6 +99,7 @@ def benchmark_card() -> str:
         cages=reference_context(CAGES),
         cage_groups=group_tables(CAGES, "cages"),
         groups_method=GROUPS_METHOD,
+        learned=learned_context(),
         **steel_context(),
         draws=RESAMPLES,
         ring_views=BLOCK_VIEWS,

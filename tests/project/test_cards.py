@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -11,10 +12,12 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
+from scipy.ndimage import binary_erosion
 
 import rebar_depth_bench as rdb
 from cards.benchmark import benchmark_card
 from cards.dataset import column_rows, dataset_card
+from cards.learned import learned_tables
 from cards.reference import CAGES, FULL_SETS, SUBSET, reference_context, results_file
 from cards.steel import steel_by_config
 from dataset_builder.cameras.trajectories import view_count
@@ -182,3 +185,34 @@ def test_card_rows_match_stored_results(name: str) -> None:
     assert row["coverage"] == f"{100 * table['coverage']:.1f} %"
     assert row["rank_error"] == f"{table['rank_error']:.4f}"
     assert row["within"] == f"{100 * table['within_mm']['5']:.1f} %"
+
+
+def test_numbers_of_learned_networks_are_those_of_a_known_shift(
+    tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Disparities are half a pixel too large in the left half of the image, and missing in the right one."""
+    limit_px, views = 33.5, list(rdb.load(tiny_root, "lattice"))
+    config_numbers = runpy.run_path("benchmarks/learned.py")["config_numbers"]
+    monkeypatch.setitem(config_numbers.__globals__, "REACHES_PX", (limit_px,))
+    near, far, reached = 0, 0, []
+    with rdb.SubmissionWriter(tmp_path / "sgbm-lattice.zip", method="shifted") as writer:
+        for row in views:
+            is_left = np.indices(row["left_depth"].shape)[1] < row["left_depth"].shape[1] // 2
+            with np.errstate(divide="ignore"):
+                true_px = row["left_K"][0, 0] * row["baseline_m"] / row["left_depth"].astype(float)
+            scored = binary_erosion(row["left_mask"] > 0, np.ones((3, 3))) & (row["left_depth"] > 0)
+            depth_m = row["left_depth"] * true_px / (true_px + 0.5)
+            writer.add(row["view_id"], np.where(is_left, depth_m, np.nan))
+            near, far = near + (true_px[scored] <= limit_px).sum(), far + (true_px[scored] > limit_px).sum()
+            if (true_px[scored] <= limit_px).all():
+                reached.append(np.where(is_left, 0.5 / (true_px + 0.5), 1)[scored].mean())
+    config = config_numbers(open_folder(tiny_root).config("lattice"), tiny_root, tmp_path)
+    [(method, numbers)] = config["methods"].items()
+    assert method == "sgbm"
+    assert numbers["bias_px"] == pytest.approx(0.5, abs=1e-3)
+    assert 0 < len(reached) < len(views)
+    assert numbers["reached_rank_error"] == pytest.approx(np.mean(reached), rel=1e-6)
+    assert config["reach"] == {
+        "33.5": {"pixels": pytest.approx(near / (near + far), abs=1e-4), "views": len(reached)}
+    }
+    assert "| `sgbm` | " in learned_tables({"lattice": config})["lattice"]

@@ -331,16 +331,23 @@ def _input_problems(inputs: Sequence[Any], spec: InputSpec) -> list[Problem]:
     """Return problems of the model's inputs: exactly one, floating point, of the expected shape."""
     if len(inputs) != 1:
         names = ", ".join(repr(entry.name) for entry in inputs) or "none"
-        return [Problem("invalid", "input", f"the model takes {len(inputs)} ({names})", "one: the image")]
-    [image_input] = inputs
-    # The shape is empty if the model leaves even the rank undefined.
+        images = [entry for entry in inputs if len(entry.shape) == 4]
+        example = "stereo" if len(images) > 1 else "several_inputs" if inputs else None
+        expected = f"one: the image{_python_method(example)}"
+        return [Problem("invalid", "input", f"the model takes {len(inputs)} ({names})", expected)]
+    [image_input] = inputs  # Its shape is empty if the model leaves even the rank undefined.
     shape_problems = _shape_problems(image_input.shape, spec) if image_input.shape else []
-    return [*_dtype_problems("input", image_input), *shape_problems]
+    return [*_dtype_problems("input", image_input, _python_method("uint8")), *shape_problems]
 
 
-def _dtype_problems(where: str, entry: Any) -> list[Problem]:
+def _python_method(example: str | None) -> str:
+    """Return the remedy for a model like an example, as the end of what was expected; empty for None."""
+    return f"; for this model write a Python method file, see examples/methods/{example}.py" if example else ""
+
+
+def _dtype_problems(where: str, entry: Any, remedy: str = "") -> list[Problem]:
     """Return the problem of an input or output that is not floating point."""
-    found, expected = f"{entry.name!r} is {entry.type}", f"one of {', '.join(_FLOAT_DTYPES)}"
+    found, expected = f"{entry.name!r} is {entry.type}", f"one of {', '.join(_FLOAT_DTYPES)}{remedy}"
     return [] if entry.type in _FLOAT_DTYPES else [Problem("invalid", where, found, expected)]
 
 
@@ -353,8 +360,9 @@ def _shape_problems(shape: Sequence[int | str | None], spec: InputSpec) -> list[
     configured = (None, None) if spec.size_px is None else spec.size_px[::-1]
     channels_last = shape[-1] == 3 != channels and configured[1] != 3
     if channels_last or (_is_fixed(batch) and batch != 1) or (_is_fixed(channels) and channels != 3):
-        hint = ": channels come before height and width" if channels_last else ""
-        return [Problem("invalid", "input", found, f"1 x 3 x H x W{hint}")]
+        # 2 or 6 channels are a stereo pair.
+        example = "channels_last" if channels_last else "hitnet" if channels in (2, 6) else None
+        return [Problem("invalid", "input", found, f"1 x 3 x H x W{_python_method(example)}")]
     return [
         Problem("size", f"input.{name}", f"got {got or 'a variable size (longest_side)'}, {found}", str(side))
         for name, side, got in zip(("height", "width"), sides, configured, strict=True)

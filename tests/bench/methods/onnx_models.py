@@ -27,14 +27,19 @@ def write_model(
     input_shape: Shape = OPEN_SHAPE,
     input_type: int = TensorProto.FLOAT,
     more_inputs: Sequence[str] = (),
+    more_shape: Shape | None = None,
     outputs: Sequence[str] = ("y",),
     output_type: int = TensorProto.FLOAT,
 ) -> Path:
-    """Write a graph with input ``x``; the shapes of its outputs are undeclared and known only at run time."""
+    """Write a graph with input ``x``; the shapes of its outputs are undeclared and known only at run time.
+
+    ``more_shape`` is the shape of ``more_inputs``, by default that of ``x``.
+    """
+    shapes = {"x": input_shape, **dict.fromkeys(more_inputs, more_shape or input_shape)}
     graph = helper.make_graph(
         nodes,
         "tiny",
-        [helper.make_tensor_value_info(name, input_type, input_shape) for name in ("x", *more_inputs)],
+        [helper.make_tensor_value_info(name, input_type, shape) for name, shape in shapes.items()],
         [helper.make_tensor_value_info(name, output_type, None) for name in outputs],
         [numpy_helper.from_array(value, name) for name, value in (constants or {}).items()],
     )

@@ -42,6 +42,10 @@ SHAPE = helper.make_node("Shape", ["x"], ["y"])
 SUM_OF_TWO_INPUTS = helper.make_node("Sum", ["x", "k"], ["y"])
 FAILING_RESHAPE = helper.make_node("Reshape", ["x", "to"], ["y"])
 TWO_OUTPUTS = [CHANNEL_MEAN, helper.make_node("Neg", ["x"], ["z"])]
+AS_FLOAT = helper.make_node("Cast", ["x"], ["y"], to=TensorProto.FLOAT)
+UINT8 = TensorProto.UINT8
+FLOATS = "one of tensor(float), tensor(float16), tensor(double)"
+PYTHON_METHOD = "; for this model write a Python method file, see examples/methods/"
 INT32 = {"input_type": TensorProto.INT32, "output_type": TensorProto.INT32}
 
 
@@ -56,15 +60,29 @@ def mismatch(
     ("words", "input_table", "output", "model"),
     [
         mismatch(
-            "invalid input: the model takes 2 ('x', 'k'), expected one", SUM_OF_TWO_INPUTS, more_inputs=["k"]
+            f"invalid input: the model takes 2 ('x', 'k'), expected one: the image{PYTHON_METHOD}stereo.py",
+            SUM_OF_TWO_INPUTS,
+            more_inputs=["k"],
         ),
         mismatch(
-            "invalid input: the model takes 1 x ? x ? x 3, expected 1 x 3 x H x W", input_shape=(1, "h", "w", 3)
+            f"the model takes 2 ('x', 'k'), expected one: the image{PYTHON_METHOD}several_inputs.py",
+            SUM_OF_TWO_INPUTS,
+            more_inputs=["k"],
+            more_shape=(1, 3, 3),
         ),
         mismatch(
-            "invalid input: the model takes 1 x 4 x 6 x 3, expected 1 x 3 x H x W: channels come before",
+            f"invalid input: the model takes 1 x ? x ? x 3, expected 1 x 3 x H x W{PYTHON_METHOD}channels_last.py",
+            input_shape=(1, "h", "w", 3),
+        ),
+        mismatch(
+            f"invalid input: the model takes 1 x 4 x 6 x 3, expected 1 x 3 x H x W{PYTHON_METHOD}channels_last.py",
             input_shape=(1, 4, 6, 3),
         ),
+        mismatch(
+            f"invalid input: the model takes 1 x 2 x ? x ?, expected 1 x 3 x H x W{PYTHON_METHOD}hitnet.py",
+            input_shape=(1, 2, "h", "w"),
+        ),
+        mismatch(f"'x' is tensor(uint8), expected {FLOATS}{PYTHON_METHOD}uint8.py", AS_FLOAT, input_type=UINT8),
         mismatch("invalid input: the model takes 3 x 4 x 6, expected 1 x 3 x H", input_shape=(3, 4, 6)),
         mismatch("invalid input: the model takes 2 x 3 x 4 x 6, expected", input_shape=(2, 3, 4, 6)),
         mismatch("size input.width: got 6, the model takes 1 x 3 x ? x 8, expected 8", input_shape=(1, 3, "h", 8)),
