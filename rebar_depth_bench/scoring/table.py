@@ -156,7 +156,7 @@ class ViewScore:
 
     @property
     def error(self) -> float:
-        """The error by which views are ordered: the rank error, or the aligned one; 1 without any."""
+        """Rank error, or aligned error, by which views are ordered; 1 without either."""
         found = self.rank_error if self.aligned is None else self.aligned.error
         return 1.0 if found is None else found
 
