@@ -83,8 +83,8 @@ def latex_table(
     with a double dagger and is never bold. The RMSE of a row whose errors are not compared with those of others
     has an asterisk. With ``published``, the paper's rows of the same scenes follow below a rule; they are marked
     and not compared with the results. ``absent`` is as in ``print_paper_table``. With ``intervals``, the 95 %
-    intervals are printed beside the numbers, and each block holds one config. Results that are not metric follow in
-    a table for each kind, in the order of the aligned error of a block's first config, without bold numbers.
+    intervals are printed beside the numbers, and each block holds one config. Results that are not metric follow
+    in a table for each kind, in the order of the aligned error of a block's first config, without bold numbers.
 
     Raises ``InputError`` if there are no results, or if they belong to different datasets.
     """
