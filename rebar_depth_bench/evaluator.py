@@ -25,6 +25,7 @@ from rebar_depth_bench.data.loading import load
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.data.rows import ConfigViews, iterate_rows
 from rebar_depth_bench.diagnosis.diagnose import diagnose
+from rebar_depth_bench.geometry.cameras import right_from_left
 from rebar_depth_bench.methods.registry import find_method
 from rebar_depth_bench.methods.run import dataset_views, predict_views
 from rebar_depth_bench.reporting.formatting import reference_findings, table_notes
@@ -179,7 +180,7 @@ class Evaluator:
         self._close()
 
     def _close(self) -> None:
-        """Complete the archive, so that no file stays open."""
+        """Close the archive if it is open."""
         if self._is_open:
             self._writer.__exit__(None, None, None)
             self._is_open = False
@@ -197,6 +198,8 @@ class Evaluator:
         if isinstance(view_ids, str):
             self._add(view_ids, _array(depth))
             return
+        if not isinstance(view_ids, Iterable):
+            raise InputError(f"view_ids is {view_ids!r}, expected a view id or a list of them")
         ids, maps = list(view_ids), depth if isinstance(depth, list | tuple) else np.atleast_1d(_array(depth))
         if len(maps) != len(ids):
             raise InputError(f"{len(ids)} view ids and {len(maps)} depth maps are given, expected as many of both")
@@ -204,7 +207,7 @@ class Evaluator:
             self._add(view_id, _array(one))
 
     def _add(self, view_id: str, depth: ndarray) -> None:
-        if view_id not in self._grids:
+        if not isinstance(view_id, str) or view_id not in self._grids:
             found = f"{escape_text(str(view_id))}: is not among the {len(self._grids)} views to predict"
             raise InputError(f"{found}, expected one as {next(iter(self._grids))}")
         if view_id in self._added:
@@ -222,7 +225,10 @@ class Evaluator:
         self._added.add(view_id)
 
     def compute(self) -> EvaluatedResult:
-        """Return the result of the predictions and begin again. Raises ``InputError`` if a view is missing."""
+        """Return the result of the predictions and begin again.
+
+        Raises ``InputError`` if a view is missing, and as ``score`` does, after which all are missing.
+        """
         if missing := [view_id for view_id in self._grids if view_id not in self._added]:
             raise InputError(f"{len(missing)} of {len(self._grids)} views are missing, such as {missing[0]}")
         self._close()
@@ -237,15 +243,18 @@ class Evaluator:
 
     def _predicted_by(self, name: str) -> EvaluatedResult:
         """Return the result of a method."""
-        predict_views(find_method(name), self._views, self._archive.path)
+        found = find_method(name)
+        if self._extended and found.info.prediction != METRIC:
+            raise InputError(f"{name} predicts {found.info.prediction}, but extended measures need metric depth")
+        predict_views(found, self._views, self._archive.path)
         return self._scored()
 
     def _rows(self, *, with_poses: bool) -> Iterator[dict[str, Any]]:
         """Yield what a function may read of each view."""
         for views in self._views:
             for row in iterate_rows(views.source, ("view_id", *_ROW_COLUMNS)):
-                left, right = (row[name] if with_poses else row.pop(name) for name in _POSES)
-                yield {**row, "right_from_left": None if right is None else right @ np.linalg.inv(left)}
+                row["right_from_left"] = None if row["right_cam_from_world"] is None else right_from_left(row)
+                yield {name: value for name, value in row.items() if with_poses or name not in _POSES}
 
 
 class EvaluatedResult(Result):
@@ -277,7 +286,7 @@ class EvaluatedResult(Result):
     def _extended(self) -> ExtendedResult | None:
         if not self._is_extended:
             return None
-        from rebar_depth_bench.extended.registry import score_extended  # A third of the package.
+        from rebar_depth_bench.extended.registry import score_extended  # Other evaluations do not need it.
 
         with self._evaluation() as evaluation:
             return score_extended(evaluation).extended
@@ -328,7 +337,7 @@ class _TemporaryArchive:
 
 def _selected(configs: Sequence[ConfigViews], views: int | Sequence[str]) -> list[ConfigViews]:
     """Return some views of each config: a number of them, spread evenly, or those with the given ids."""
-    if isinstance(views, int | np.integer):
+    if isinstance(views, int | np.integer) and not isinstance(views, bool):
         if views < 1:
             raise InputError(f"views is {views}, expected a number from 1 or view ids")
         spread = [
@@ -339,10 +348,10 @@ def _selected(configs: Sequence[ConfigViews], views: int | Sequence[str]) -> lis
         ]
     else:
         known = {view_id for one in configs for view_id in one.view_ids}
-        views = [views] if isinstance(views, str) else views
-        if not len(views):
-            raise InputError(f"views has no id, expected ids of views, as {min(known)}")
-        if unknown := [view_id for view_id in views if view_id not in known]:
+        views = [views] if isinstance(views, str) else list(views) if isinstance(views, Iterable) else []
+        if not views:
+            raise InputError(f"views has no id, expected a number from 1 or ids of views, as {min(known)}")
+        if unknown := [view_id for view_id in views if not isinstance(view_id, str) or view_id not in known]:
             raise InputError(f"views has {escape_text(str(unknown[0]))}, expected ids of views, as {min(known)}")
         wanted = set(views)
         spread = [[view_id for view_id in one.view_ids if view_id in wanted] for one in configs]

@@ -173,7 +173,8 @@ def limited_depth_m(
                 named = f"{value:.9g}" if float(np.float32(value)) == value else repr(value)
             found = f"{outside.sum()} pixels have depth {what}, most often the value {named}"
             unit = "depth.scale" if table.kind == "disparity" else 'depth.unit (for example "mm")'
-            remedy = f"{unit}, or depth.invalid = [{named}] if it marks no depth, or depth.max_m"
+            remedy = f"{unit}, or depth.invalid = [{named}] if it marks no depth"
+            remedy += ", or depth.max_m" if outside is beyond else ""
             raise EntryError(Problem("invalid", path.name, found, remedy))
     return np.where(depth_m > 0, depth_m, 0).astype(np.float32)
 

@@ -101,7 +101,11 @@ class SurveyCheck:
             with np.errstate(divide="ignore", invalid="ignore"):
                 scale = 1 / (1 - np.divide(residual_m[trusted] @ radial_m, radial_m @ radial_m))
             offset = ", ".join(f"{value + 0.0:.1f}" for value in np.round(offset_mm, 1))
-            numbers = f"offset ({offset}) mm, scale {scale:.5g}, RMS {1000 * _rms(residual_m):.3g} mm"
+            spread_mm = _rms(1000 * residual_m - normal @ offset_mm)
+            numbers = (
+                f"offset ({offset}) mm, scale {scale:.5g}, RMS {1000 * _rms(residual_m):.3g} mm, "
+                f"{spread_mm:.3g} mm without the offset"
+            )
             lines.append(f"  bar {self.bars[k].bar_id}: {len(residual_m)} points, {numbers}")
         return lines + ([f"  and {len(seen) - _MAX_LINES} more"] if len(seen) > _MAX_LINES else [])
 

@@ -129,7 +129,7 @@ def read_view_cameras(
         raise InputError.from_problems(path, with_lines(problems, content))
     keys = dict.fromkeys([*whole, *(key for where in places.values() for key in entries[where])])
     notes = file_format.notes(path.name, keys)
-    if _UNIT in {**whole, **entries[where]} and unit_m is None:
+    if _UNIT in keys and any(camera.depth_unit_m is None for camera in cameras.values()):
         notes.append(f"{path.name}: {_UNIT} is that of other depth maps, depth_file_path; [depth] states the unit")
     if len(entries) > len(names):
         notes.append(f"{path.name}: {len(entries) - len(names)} of {len(entries)} entries are those of no view")

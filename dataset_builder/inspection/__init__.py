@@ -1,1 +1,1 @@
-"""Content of a scene file without rendering: bars, sizes, overlaps, placement, and a picture."""
+"""Content of a scene file without rendering: bars, sizes, contacts and clashes, placement, and a picture."""

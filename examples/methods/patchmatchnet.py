@@ -48,11 +48,16 @@ def prepare(views, _work, _progress):
     centres = {name: -pose[:3, :3].T @ pose[:3, 3] for name, (_, _, pose) in cameras.items()}
 
     def predict(row):
-        centre = centres[row["view_id"], "left"]
-        # The first of the sorted cameras is the view's own.
-        nearest = sorted(cameras, key=lambda name: np.linalg.norm(centres[name] - centre))[: SOURCES + 1]
+        own = row["view_id"], "left"
+
+        def order(name):
+            return name != own, np.linalg.norm(centres[name] - centres[own])
+
+        nearest = sorted(cameras, key=order)[: SOURCES + 1]
         images, Ks, poses = zip(*(cameras[name] for name in nearest), strict=True)
         steel = row["left_depth"][(row["left_mask"] > 0) & (row["left_depth"] > 0)]
+        if not len(steel):
+            return np.full(row["left_depth"].shape, np.nan)
         low, high = np.percentile(steel, (1, 99)) * (0.75, 1.25)
         tensors = [torch.from_numpy(image / 255).float().permute(2, 0, 1)[None] for image in images]
         K, pose = (torch.from_numpy(np.stack(stack)).float()[None] for stack in (Ks, poses))

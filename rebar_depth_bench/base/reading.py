@@ -53,7 +53,9 @@ def open_regular(path: Path) -> BinaryIO:
         found = _KINDS.get(stat.S_IFMT(mode), "a device")
         raise OSError(errno.EINVAL, f"it is {found}, not a regular file", str(path))
     stream = os.fdopen(descriptor, "rb")
-    if is_lfs_pointer(os.pread(descriptor, len(_LFS_PREFIX), 0)):
+    head = stream.read(len(_LFS_PREFIX))
+    stream.seek(0)
+    if is_lfs_pointer(head):
         stream.close()
         raise OSError(errno.EINVAL, LFS_POINTER, str(path))
     return stream

@@ -45,7 +45,7 @@ CAMERA = FileFormat(
     ),
 )
 PAIR = FileFormat(
-    "Pair of OpenCV's FileStorage: keys of one camera with 1, left or l (2, right or r) before or after them, and",
+    "Pair of OpenCV's FileStorage: the keys above with 1, left or l (2, right or r) at an end",
     (
         _field("rotation", "R rotation rotation_matrix rmat", "used", "x_right = R x_left + T"),
         _field("translation", "T translation translation_vector tvec", "used", "x_right = R x_left + T"),

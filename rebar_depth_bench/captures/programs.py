@@ -160,6 +160,9 @@ class _Reader:
         if len(region) != 4 or not all(value >= 0 and value.is_integer() for value in (*region, bin_x, bin_y)):
             self.problem("invalid", "region", f"got {short_repr(roi)}", f"whole numbers {', '.join(_REGION)}")
             return matrix, size
+        if not sensor and max(bin_x, bin_y) > 1:
+            self.problem("missing", "width", "missing beside binning", "width and height of the full sensor")
+            return matrix, size
         x, y, *sides = region if any(region) else [0.0, 0.0, *sensor]
         is_whole = [x, y, *sides] == [0, 0, *sensor]
         is_inside = all(sides) and (not sensor or (x + sides[0] <= sensor[0] and y + sides[1] <= sensor[1]))

@@ -188,7 +188,7 @@ def positive_number(text: str, expected: str, high: float = sys.float_info.max) 
 
 def add_align(parser: argparse.ArgumentParser) -> None:
     """Add the option that scores metric archives as those of another kind."""
-    from rebar_depth_bench.submission.declaration import METRIC, PREDICTION_KINDS  # Not for all commands.
+    from rebar_depth_bench.submission.declaration import METRIC, PREDICTION_KINDS  # Most commands do not need it.
 
     parser.add_argument(
         "--align",

@@ -336,9 +336,9 @@ class Scene(ManifestTable):
     ``board`` is the ArUco board under the assembly, or None; ``protocol_views`` is the number of views of the full
     trajectory; ``aim_point_m`` is the point that its cameras aim at, world metres, if they share one; ``bytes`` is
     the size of the shards; ``key`` is the digest of all parameters. ``family`` is the kind of cage of a generated
-    scene, otherwise None, and ``mats`` are its parts that are off as one. ``assembly``, ``protocol``, ``rig`` and
-    ``mesh`` are None in a config that was imported. ``entry`` is the scene as it was written, with all parameters
-    of the build.
+    scene, otherwise None, and ``mats`` are its parts that deviate together. ``assembly``, ``protocol``, ``rig``
+    and ``mesh`` are None in a config that was imported. ``entry`` is the scene as it was written, with all
+    parameters of the build.
     """
 
     name: Name

@@ -208,8 +208,11 @@ def score_evaluation(
     if kind not in PREDICTION_KINDS:
         raise InputError(f"align is {escape_text(kind)}, expected one of {', '.join(PREDICTION_KINDS)}")
     if kind != meta.prediction:
-        evaluation.require_metric(f"only they can be aligned as {kind}")
-        read = lambda view_id: metric_as(submission.read(view_id), kind)  # noqa: E731
+        evaluation.require_metric(f"only they can be scored as {kind}")
+
+        def read(view_id: str) -> Float[ndarray, "h w"]:
+            return metric_as(submission.read(view_id), kind)
+
     truths = ((config.name, config_truth(folder, config, progress)) for config in evaluation.configs)
     with ThreadPoolExecutor(1) as pool:
         sha256 = pool.submit(submission.sha256)

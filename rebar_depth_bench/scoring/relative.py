@@ -144,7 +144,7 @@ def mean_errors(errors: Iterable[AlignedErrors | None]) -> AlignedErrors | None:
 
 
 def kind_blocks(results: Iterable[Result]) -> list[list[Result]]:
-    """Return the results of each kind; others than metric ones by the aligned error of their first config."""
+    """Return the results of each kind; others than metric ones by the aligned errors of their configs."""
     blocks: dict[str, list[Result]] = {kind: [] for kind in (METRIC, *ALIGNMENT_BY_KIND)}
     for result in results:
         blocks[result.kind].append(result)

@@ -209,7 +209,7 @@ class Table:
 
     @property
     def error(self) -> float | None:
-        """The error by which tables are ordered: the rank error, or the aligned one of other kinds."""
+        """Rank error, or aligned error, by which tables are ordered; None without either."""
         return self.rank_error if self.aligned is None else self.aligned.error
 
     @property

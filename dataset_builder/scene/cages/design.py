@@ -78,7 +78,7 @@ class Mat:
 
 
 def cage_mats(axis: Direction, cover_m: float, sizes_m: Mapping[Direction, float]) -> tuple[Mat, ...]:
-    """Return what is off as one in a cage along an axis: the cage, in each direction of which a size is given."""
+    """Return the mats of a cage along an axis that deviates as a whole in each direction with a size."""
     return tuple(
         Mat("xyz"[int(np.argmax(across))], across, size_m, cover_m, (axis,)) for across, size_m in sizes_m.items()
     )
@@ -89,7 +89,7 @@ class Design:
     """Bars of a cage, world frame, and what was drawn: names and values of its parameters, metres.
 
     ``ground_m`` is the height of the lowest point of its steel above z = 0: ``STANDING_M`` if bars stand on the
-    ground, or the cover of a cage on spacers. ``mats`` are its parts that are off as one through the thickness.
+    ground, or the cover of a cage on spacers. ``mats`` are its parts that deviate together through the thickness.
     """
 
     family: str

@@ -135,10 +135,10 @@ PADDING = {"k5": "0", "k6": "0", "p1": "0", "p2": "0"}
         (ar0234(FISHEYE), (960, 600), "LEFT_DISTO", "'fisheye, k1 k2 k3 k4'"),
         (ar0234({**FISHEYE, "k4": "0"}), (960, 600), "LEFT_DISTO", "'fisheye, k1 k2 k3 k4'"),
         (ar0234(FISHEYE | PADDING), (960, 600), "LEFT_DISTO", "6 terms: fisheye"),
-        # stereolabs/zed-opencv-native, issue 16: a ZED Mini with four terms in the sections of sizes.
+        # stereolabs/zed-opencv-native/issues/16: a ZED Mini with four terms in the sections of sizes.
         (conf({"HD": FACTORY["HD"]}, {}, FISHEYE), (1280, 720), "LEFT_CAM_HD", "fisheye"),
         (conf({"HD": FACTORY["HD"]}, {}, RATIONAL), (1280, 720), "LEFT_CAM_HD", "rational"),
-        # stereolabs/zed-ros2-wrapper, issue 128: thin prism terms.
+        # stereolabs/zed-ros2-wrapper/issues/128: thin prism terms.
         (ar0234({**BROWN, "s2": "0.002"}), (960, 600), "LEFT_DISTO", "10 terms: thin prism distortion"),
         (ar0234({**BROWN, "p1": "0", "p2": "0", "tauX": "0.002"}), (960, 600), "LEFT_DISTO", "tilted distortion"),
         (ar0234({**BROWN, "k4": "none"}), (960, 600), "LEFT_DISTO", "6 terms"),
