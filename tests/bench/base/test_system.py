@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -32,6 +33,8 @@ with open(result, "wb") as file:
 def test_load_write_and_score_without_posix(tiny_root: Path, tmp_path: Path) -> None:
     archive, result = tmp_path / "copy.zip", tmp_path / "copy.json"
     command = [sys.executable, "-c", HIDE + RUN, str(tiny_root), str(archive), str(result)]
-    done = subprocess.run(command, capture_output=True, text=True)
+    # Without fcntl, the lock files that other tests have left in the cache of datasets would be waited for.
+    caches = os.environ | {"HF_HOME": str(tmp_path), "HF_DATASETS_CACHE": str(tmp_path / "datasets")}
+    done = subprocess.run(command, capture_output=True, text=True, env=caches)
     assert done.returncode == 0, done.stderr
     assert result.read_bytes() == rdb.score(archive, tiny_root).to_json()
