@@ -338,7 +338,7 @@ def test_metric_archives_are_aligned_as_weaker_kinds(
     for column in aligned.columns:  # The archives hold float32: some pixels are at a tolerance.
         tolerance = 2e-3 if "within" in column.path else 1e-6
         assert list(first[column.name]) == pytest.approx(list(second[column.name]), rel=1e-4, abs=tolerance)
-    with pytest.raises(rdb.SubmissionError, match=f"of the kind {kind}, expected metric ones: .*aligned as scale"):
+    with pytest.raises(rdb.SubmissionError, match=f"of the kind {kind}, expected metric ones: .*scored as scale"):
         rdb.score(tmp_path / "other.zip", tiny_root, align="scale")
     with pytest.raises(rdb.InputError, match="align is metres, expected one of metric, scale, affine-depth"):
         rdb.score(tmp_path / "metric.zip", tiny_root, align="metres")
