@@ -246,8 +246,8 @@ def _loss_problems(finished: Finished, config: DatasetConfig, plans: Sequence[Co
     lost = 0
     may_grow = config.has_splits and isinstance(plans[0].spec, SceneConfigSpec)
     version = config_parameters(plans[0].spec)["scene"]["assembly"].get("version")
-    earlier = {scene.entry["assembly"].get("version", 0) for scene in config.scenes} - {version}
-    if may_grow and earlier:
+    versions = {scene.entry["assembly"].get("version", 0) for scene in config.scenes} if may_grow else set()
+    if earlier := versions - {version}:
         reasons[f"they are of version {min(earlier)} of the generator of cages, this is version {version}"] = None
     for plan in plans:
         scene = finished.scene(plan)

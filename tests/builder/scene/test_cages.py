@@ -338,4 +338,8 @@ def test_neighbours_are_enough_for_lines_within_the_margin(
 ) -> None:
     clearances = Clearances(lines, [0.004] * len(lines))
     near = clearances.neighbours(lines[0], 0.004, 0, float(np.linalg.norm(shift_m)))
-    assert near.bar_clearance_m(lines[0] + shift_m, 0.004) == clearances.least_m(lines[0] + shift_m, 0.004, 0)
+    expected, found = (
+        clearances.least_m(lines[0] + shift_m, 0.004, 0),
+        near.bar_clearance_m(lines[0] + shift_m, 0.004),
+    )
+    assert found == expected if expected < NEAR_M - 1e-9 else found >= NEAR_M - 1e-9
