@@ -180,11 +180,6 @@ def _check_invertible(lens: Lens, width: int, height: int) -> None:
 
 # Bounds of the numbers.
 
-KNOWN_LENS = (
-    "k1 k2 p1 p2 k3 (plumb_bob, radtan); rectify the images first with the camera's own software or OpenCV, "
-    'see "Rectify images first" in docs/captures.md, and give their new K with zero distortion'
-)
-"""Expected lens model."""
 SIDES_PX = range(16, 16385)
 """Accepted widths and heights of images, pixels."""
 _SQUARE_PIXEL_TOLERANCE = 0.03

@@ -13,7 +13,6 @@ from typing import Any, Literal
 
 from rebar_depth_bench.base.errors import Problem, escape_text
 from rebar_depth_bench.base.validation import short_repr
-from rebar_depth_bench.captures.calibration import KNOWN_LENS
 
 _MAX_NAMED = 10
 DISTORTION_TERMS = 5
@@ -23,6 +22,11 @@ _RADIAL = (
     *("0", "false"),
 )
 """Lens models, or answers to whether it is a fisheye lens, whose first terms are k1 k2 p1 p2 k3; as plain keys."""
+_KNOWN_LENS = (
+    "k1 k2 p1 p2 k3 (plumb_bob, radtan); rectify the images first with the camera's own software or OpenCV, "
+    'see "Rectify images first" in docs/captures.md, and give their new K with zero distortion'
+)
+"""Lens model that is read, and the remedy for others."""
 OTHER_LENS = re.compile(
     r"fish|omnidir|\bomni\b|equidist|kannala|rational|thin.?prism|unified|double.?sphere", re.I
 )
@@ -82,7 +86,7 @@ def lens_problem(where: str, models: Mapping[str, Any], terms: Sequence[float] =
     plain = {key: plain_key(text) or text.strip() for key, text in texts.items()}
     stated_radial = any(model in _RADIAL for model in plain.values())
     others = [key for key, model in plain.items() if model not in (*_RADIAL, *_PINHOLE, *_UNDISTORTED)]
-    expected = KNOWN_LENS
+    expected = _KNOWN_LENS
     if others:
         found = f"{escape_text(others[0])} is {short_repr(models[others[0]])}"
     elif any(terms[DISTORTION_TERMS:]):
@@ -93,7 +97,7 @@ def lens_problem(where: str, models: Mapping[str, Any], terms: Sequence[float] =
     elif any(terms) and len(terms) == 4 and not stated_radial:
         found = "four distortion terms without a stated model may be those of a fisheye lens"
         remedy = "add distortion_model: plumb_bob, or a fifth term k3 = 0, if they are k1 k2 p1 p2"
-        expected = f"{remedy}; otherwise {KNOWN_LENS}"
+        expected = f"{remedy}; otherwise {_KNOWN_LENS}"
     elif any(terms) and len(terms) < 4:
         found = f"the distortion has {len(terms)} terms"
     else:

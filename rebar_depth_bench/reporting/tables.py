@@ -334,8 +334,10 @@ def print_paper_table(
     """
     dataset = results[0].dataset
     digest, version = formatting.short_digest(dataset.digest), printable(dataset.version)
-    for block in kind_blocks(results):
+    for number, block in enumerate(kind_blocks(results)):
         kind, protocol = block[0].prediction, block[0].protocol
+        if number:
+            console.print()
         line = f"protocol {protocol}, dataset {version} ({digest}), software {software_version()}"
         print_line(console, line, style="dim")
         if kind is not None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from dataset_builder.scene.cages.design import (
@@ -59,16 +61,9 @@ def footing(rng: np.random.Generator, shape: str) -> Design:
         raise InfeasibleError("a footing is too shallow for the ends of its bars")
     half_x, half_y = side_x_m / 2 - low, side_y_m / 2 - low
     inset_m = bend_radius_m(bar_m) + 2 * contact_m(bar_m, bar_m)
-    corners_x = [(-half_x, up_m), (-half_x, low), (half_x, low), (half_x, up_m)]
-    corners_y = [(-half_y, up_m), (-half_y, second), (half_y, second), (half_y, up_m)]
-    bars = [
-        DesignBar(LOWER, bar_m, bent([(x, y, z) for x, z in corners_x], bar_m), Y, False, Z)
-        for y in spaced(inset_m - half_y, half_y - inset_m, spacing_m)
-    ]
-    bars += [
-        DesignBar(UPPER, bar_m, bent([(x, y, z) for y, z in corners_y], bar_m), X, False, Z)
-        for x in spaced(inset_m - half_x, half_x - inset_m, spacing_m)
-    ]
+    across_x = spaced(inset_m - half_x, half_x - inset_m, spacing_m)
+    across_y = spaced(inset_m - half_y, half_y - inset_m, spacing_m)
+    bars = _layers(bar_m, (half_x, half_y), (low, second), up_m, (across_x, across_y))
     if shape == "full-height":
         bars += _edge_bars(bar_m, half_x, half_y, up_m, second + bend_radius_m(bar_m))
     section = drawn_section(rng, starter_m, link_m, _COLUMN_COVER_M, column_m, column_m)
@@ -103,6 +98,23 @@ def footing(rng: np.random.Generator, shape: str) -> Design:
     supports_m = tuple(tuple(spaced(-half, half, SUPPORT_SPACING_M)) for half in (half_x, half_y))
     mat = Mat(LOWER, (0.0, 0.0, -1.0), depth_m, cover_m, (X, Y), supports_m)
     return Design("footing", tuple(bars), drawn, cover_m, (mat,))
+
+
+def _layers(
+    bar_m: float,
+    half_m: tuple[float, float],
+    levels_m: tuple[float, float],
+    up_m: float,
+    across_m: tuple[Sequence[float], Sequence[float]],
+) -> list[DesignBar]:
+    """Return bars along x and, above them, along y, whose ends are bent up to the height ``up_m``."""
+    (half_x, half_y), (low, second), (across_x, across_y) = half_m, levels_m, across_m
+    corners_x = [(-half_x, up_m), (-half_x, low), (half_x, low), (half_x, up_m)]
+    corners_y = [(-half_y, up_m), (-half_y, second), (half_y, second), (half_y, up_m)]
+    bars = [DesignBar(LOWER, bar_m, bent([(x, y, z) for x, z in corners_x], bar_m), Y, False, Z) for y in across_y]
+    return bars + [
+        DesignBar(UPPER, bar_m, bent([(x, y, z) for y, z in corners_y], bar_m), X, False, Z) for x in across_x
+    ]
 
 
 def _starters(section: Section, foot_m: float, feet_z: tuple[float, float], top_z: float) -> list[DesignBar]:

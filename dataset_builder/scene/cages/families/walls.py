@@ -108,14 +108,21 @@ def wall(rng: np.random.Generator, shape: str) -> Design:
     bars += _ties(columns, rows, (spacing_m, level_spacing_m), (tie_m, upright_m, level_m), upright_y)
     if shape == "u-bars":
         bars += _u_bars(level_m, rows, end_x - level_m / 2, level_y)
-    supports_m = tuple(tuple(spaced(line[0], line[-1], SUPPORT_SPACING_M)) for line in (columns, rows))
     # Bars that lap with starters are inside of these.
     inner_y = upright_y - (contact_m(upright_m, upright_m) if shape == "laps" else 0.0)
-    mats = [
+    mats = _mats(thickness_m, cover_m, columns, rows, inner_y)
+    return Design("wall", tuple(bars), drawn, STANDING_M, mats)
+
+
+def _mats(
+    thickness_m: float, cover_m: float, columns: Sequence[float], rows: Sequence[float], inner_y: float
+) -> tuple[Mat, ...]:
+    """Return both mats, between whose inner bars at y = ``inner_y`` and ``-inner_y`` there are ties."""
+    supports_m = tuple(tuple(spaced(line[0], line[-1], SUPPORT_SPACING_M)) for line in (columns, rows))
+    return tuple(
         Mat(name, (0.0, side, 0.0), thickness_m, cover_m, (X, Z), supports_m, (-inner_y, inner_y))
         for name, side in (("front", -1.0), ("back", 1.0))
-    ]
-    return Design("wall", tuple(bars), drawn, STANDING_M, tuple(mats))
+    )
 
 
 def _level_bars(level_m: float, rows: Sequence[float], end_x: float, level_y: float) -> list[DesignBar]:
