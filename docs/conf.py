@@ -15,6 +15,7 @@ INCLUDED = {
     "CHANGELOG.md": "changelog.md",
     "CONTRIBUTING.md": "contributing.md",
     "SECURITY.md": "security.md",
+    "benchmarks/README.md": "measurements.md",
     "cards/BENCHMARK.md": "benchmark-card.md",
 }
 """Files of the repository that are pages of the site, and the pages that include them."""

@@ -9,7 +9,7 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 REPOSITORY_PAGES = (
     *("README.md", "ARCHITECTURE.md", "CONTRIBUTING.md", "SECURITY.md", "CHANGELOG.md"),
-    *("cards/BENCHMARK.md", "deploy/README.md"),
+    *("benchmarks/README.md", "cards/BENCHMARK.md", "deploy/README.md"),
 )
 PAGES = tuple(ROOT / name for name in REPOSITORY_PAGES) + tuple(sorted(DOCS.rglob("*.md")))
 """All pages, those of the repository first."""
