@@ -35,7 +35,7 @@ from rebar_depth_bench.cli.main import main as bench_main
 from rebar_depth_bench.data.bars import BARS_SCHEMA
 from rebar_depth_bench.data.schema import COLUMN_DESCRIPTIONS, COLUMNS, column_kind
 from rebar_depth_bench.methods import find_method, own_methods
-from rebar_depth_bench.methods.onnx.spec import OUTPUT_MEANINGS
+from rebar_depth_bench.methods.onnx.spec import OUTPUT_MEANINGS, read_onnx_toml
 from rebar_depth_bench.submission import SubmissionMeta
 from scripts.diagrams import PACKAGE_EDGES, diagrams
 from scripts.format_tables import with_tables
@@ -225,6 +225,10 @@ def test_documented_toml_and_json_are_valid(tmp_path: Path) -> None:
         (tmp_path / "layout.toml").write_text(layout)
         assert read_layout(tmp_path / "layout.toml").truth_sigma_m > 0
     assert all(read_scene_toml(scene.encode(), "page") for scene in scenes)
+    [model] = blocks(DOCS / "methods.md", "toml")
+    (tmp_path / "my_model.toml").write_text(model)
+    (tmp_path / "model.onnx").touch()
+    assert read_onnx_toml(tmp_path / "my_model.toml").name == "my_model"
     assert all(tomllib.loads(block) for page in PAGES for block in blocks(page, "toml"))
     assert all(json.loads(block) for page in PAGES for block in blocks(page, "json"))
 
