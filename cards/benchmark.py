@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,11 +30,11 @@ from cards.reference import (
     reference_context,
 )
 from cards.steel import STEEL_RESULTS, depth_text, range_text
-from cards.templates import render
+from cards.templates import render, wrapped
 from rebar_depth_bench.bar_crossings.definition import crossing_parameters
 from rebar_depth_bench.detections.reading import MAX_ROWS_PER_VIEW
 from rebar_depth_bench.extended.fits import MISS_MM
-from rebar_depth_bench.extended.inspection import PROFILES, TOLERANCES
+from rebar_depth_bench.extended.inspection import MISSED_NOTE, PROFILES, TOLERANCES
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, ONCE, Measure, MeasureFamily
 from rebar_depth_bench.extended.registry import MEASURE_FAMILIES
 from rebar_depth_bench.methods import AnyMethod, MultiViewMethod, own_methods
@@ -96,7 +96,7 @@ _SHARED_PART = 0.7
 def benchmark_card() -> str:
     """Return the text of ``cards/BENCHMARK.md``: task, data, protocol, main results and limits."""
     networks = learned_results()
-    return render(
+    text = render(
         "benchmark_card.md.j2",
         protocol=PROTOCOL,
         relative_protocol=RELATIVE_PROTOCOL,
@@ -114,17 +114,22 @@ def benchmark_card() -> str:
         cages=reference_context(CAGES),
         baselines={name: table for one in (SUBSET, CAGES) for name, table in baseline_tables(one).items()},
         networks=networks["configs"],
+        same_views=all(
+            networks["configs"][name]["views"] == reference_context(one)["renders"]["views"]
+            for one, name in ((SUBSET, FULL_SETS[0]), (CAGES, CAGES))
+        ),
         worse=worse_than_constant(networks["configs"]),
         relative=errors_of_relative_depth(networks["configs"], "tcmonodepth"),
         number=number,
         percent=percent,
         **steel_context(),
     )
+    return wrapped(text)
 
 
 def measures_page() -> str:
     """Return the text of ``docs/measures.md``: groups of views, extended measures and crossings."""
-    return render(
+    text = render(
         "measures.md.j2",
         protocol=PROTOCOL,
         extended_protocol=EXTENDED_PROTOCOL,
@@ -132,17 +137,19 @@ def measures_page() -> str:
         families=[_family_rows(family) for family in MEASURE_FAMILIES.values()],
         profiles=PROFILES,
         miss_mm=MISS_MM,
+        missed_note=MISSED_NOTE,
         crossings=crossing_parameters(),
         fits_note=FITS_NOTE,
         reach_note=REACH_NOTE,
         contacts=_CONTACTS,
         max_rows=f"{MAX_ROWS_PER_VIEW:,}",
     )
+    return wrapped(text)
 
 
 def results_page() -> str:
     """Return the text of ``docs/results.md``: the long tables of results and how to repeat them."""
-    return render(
+    text = render(
         "results.md.j2",
         plain_sets=[f"`{name}`" for name in (*FULL_SETS, SUBSET, CAGES) if reference_context(name)["is_plain"]],
         full=[reference_context(name) for name in FULL_SETS],
@@ -158,6 +165,7 @@ def results_page() -> str:
         methods=[_method_row(method) for method in own_methods().values()],
         **steel_context(),
     )
+    return wrapped(text)
 
 
 PAGES: Mapping[Path, Callable[[], str]] = {
@@ -177,7 +185,7 @@ def _method_row(method: AnyMethod) -> dict[str, str]:
 
 
 def _family_rows(family: MeasureFamily) -> dict[str, Any]:
-    """Return title, alignment and rows of a family, without the measures of tolerances, which have their own table."""
+    """Return title, alignment and rows of a family, without the measures that tolerances have besides."""
     of_tolerances = {name for _, one in TOLERANCES for name in (one.pass_name, one.capability_name)}
     by_name: dict[str, list[Measure]] = {}
     for measure in family.measures:
@@ -187,7 +195,7 @@ def _family_rows(family: MeasureFamily) -> dict[str, Any]:
     for name, variants in by_name.items():
         row = _measure_row(name, variants)
         for group in groups:
-            if _common_end([row, *group]):
+            if _common_end(one["definition"] for one in (row, *group)):
                 group.append(row)
                 break
         else:
@@ -200,34 +208,43 @@ def _family_rows(family: MeasureFamily) -> dict[str, Any]:
     }
 
 
-def _common_end(rows: Sequence[Mapping[str, str]]) -> int:
+def _common_end(definitions: Iterable[str]) -> int:
     """Return the number of words with which all definitions end; 0 if that is a small part of one of them."""
-    words = [row["definition"].split()[::-1] for row in rows]
-    common = next(
-        (place for place, ends in enumerate(zip(*words, strict=False)) if len(set(ends)) > 1),
-        min(map(len, words)),
-    )
+    words = [definition.split() for definition in definitions]
+    common = _equal_at_the_start([one[::-1] for one in words])
     return common if common >= _SHARED_PART * max(map(len, words)) else 0
 
 
+def _equal_at_the_start(texts: Sequence[Sequence[str]]) -> int:
+    """Return the number of words with which all texts begin."""
+    columns = enumerate(zip(*texts, strict=False))
+    return next((place for place, words in columns if len(set(words)) > 1), min(map(len, texts)))
+
+
 def _merged(rows: Sequence[Mapping[str, str]]) -> dict[str, Any]:
-    """Return one row for measures whose definitions end alike: their names and beginnings, and the end once."""
-    common = _common_end(rows)
-    beginnings = [" ".join(row["definition"].split()[:-common]) for row in rows]
-    end = " ".join(rows[0]["definition"].split()[-common:])
-    columns = {
-        key: " / ".join(dict.fromkeys(row[key] or "-" for row in rows)) for key in ("unit", "better", "statistic")
-    }
+    """Return one row for measures whose definitions end alike: their names, and what differs with "or" between."""
+    names = [f"`{row['name']}`" for row in rows]
+    if len(rows) == 1:
+        return {**rows[0], "names": names}
+    words = [row["definition"].split() for row in rows]
+    end = _common_end(row["definition"] for row in rows)
+    beginnings = [one[:-end] for one in words]
+    start = _equal_at_the_start(beginnings)
+    different = [" ".join(one[start:]) or "all" for one in beginnings]
+    columns = {key: [row[key] or "-" for row in rows] for key in ("unit", "better", "statistic")}
     return {
-        "names": [f"`{row['name']}`" for row in rows],
-        **{key: "" if text == "-" else text for key, text in columns.items()},
-        "definition": f"{' / '.join(beginnings)} {end}".strip(),
+        "names": names,
+        "definition": " ".join((*words[0][:start], " or ".join(different), *words[0][-end:])),
+        **{
+            key: " / ".join(cells) if len(set(cells)) > 1 else cells[0].strip("-")
+            for key, cells in columns.items()
+        },
     }
 
 
 def _measure_row(name: str, measures: Sequence[Measure]) -> dict[str, str]:
     """Return one row for measures that differ only in the tolerance or bin of their name, written as N."""
-    first, definition = measures[0], measures[0].definition
+    first, definition = measures[0], measures[0].definition.removesuffix(f" {MISSED_NOTE}")
     parameter = _PARAMETER.search(first.name)
     if parameter is not None:
         values = ", ".join(match[0] for measure in measures if (match := _PARAMETER.search(measure.name)))

@@ -65,9 +65,7 @@ def worse_than_constant(configs: Mapping[str, Any]) -> str:
     texts = []
     for name, config in configs.items():
         methods = [
-            f"`{method}`"
-            for method, row in _sorted(config, "scaled")
-            if row["scaled"] > row["scaled_constant"]
+            f"`{method}`" for method, row in _sorted(config, "scaled") if row["scaled"] > row["scaled_constant"]
         ]
         texts.append(f"{name}: {', '.join(methods) or 'none'}")
     return "; ".join(texts)
@@ -79,7 +77,7 @@ def errors_of_relative_depth(configs: Mapping[str, Any], method: str) -> str:
     for name, config in configs.items():
         row = config["methods"][method]
         errors = (number(row[key], 4) for key in ("aligned_error", "aligned_constant_error"))
-        flat = f"{row['flat_views']} of {config['views']} views have no positive slope"
+        flat = f"{row['flat_views']} of {config['views']} views"
         texts.append("{} {} ({}; {})".format(name, *errors, flat))
     return ", ".join(texts)
 
