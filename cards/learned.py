@@ -41,7 +41,7 @@ def _baseline_table(
             "views": str(networks["views"]),
             "rank_error": number(row["rank_error"], 4),
             "coverage": percent(row["coverage"]),
-            "abs_rel": number(row["native"], 4),
+            "native": number(row["native"], 4),
             "scaled": number(row["scaled"], 4),
             "scale": number(row["scale"], 3),
             "within": percent(row["within_5_mm"]),
@@ -49,7 +49,7 @@ def _baseline_table(
         for method, row in _sorted(networks, "rank_error")
         if method not in names
     ]
-    keys = ("views", "rank_error", "coverage", "abs_rel", "scaled", "scale", "within")
+    keys = ("views", "rank_error", "coverage", "native", "scaled", "scale", "within")
     head = (config, "views", "rank error", "coverage", "AbsRel", "AbsRel scaled", "s", "within 5 mm")
     ordered = sorted((*bundled, *learned), key=lambda row: (row["mark"], float(row["rank_error"])))
     rows = [[f"`{row['method']}`{row['mark']}", *(row[key] for key in keys)] for row in ordered]

@@ -114,8 +114,8 @@ def _table_cells(table: Mapping[str, Any]) -> dict[str, str]:
     return {
         "rank_error": number(table["rank_error"], 4),
         "coverage": percent(table["coverage"]),
-        "abs_rel": number(native.get("abs_rel"), 4),
-        "interval": interval,
+        "native": number(native.get("abs_rel"), 4),
+        "abs_rel": number(native.get("abs_rel"), 4) + interval,
         "rmse": number(native.get("rmse_cm"), 2, " cm"),
         "scaled": number(scaled.get("abs_rel"), 4),
         "scale": number(table["scale_median"], 3),
