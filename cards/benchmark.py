@@ -12,13 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from cards.crossings import FILES, crossing_baselines
-from cards.learned import (
-    baseline_tables,
-    errors_of_relative_depth,
-    learned_context,
-    learned_results,
-    worse_than_constant,
-)
+from cards.learned import baseline_tables, learned_results, learned_tables
 from cards.reference import (
     CAGES,
     FULL_SETS,
@@ -95,7 +89,7 @@ _SHARED_PART = 0.7
 
 def benchmark_card() -> str:
     """Return the text of ``cards/BENCHMARK.md``: task, data, protocol, main results and limits."""
-    networks = learned_results()
+    subset, cages, networks = reference_context(SUBSET), reference_context(CAGES), learned_results()["configs"]
     text = render(
         "benchmark_card.md.j2",
         protocol=PROTOCOL,
@@ -110,16 +104,12 @@ def benchmark_card() -> str:
         min_blocks=MIN_BLOCKS,
         interval_method=INTERVALS["method"],
         scenes=FULL_SETS,
-        subset=reference_context(SUBSET),
-        cages=reference_context(CAGES),
-        baselines={name: table for one in (SUBSET, CAGES) for name, table in baseline_tables(one).items()},
-        networks=networks["configs"],
-        same_views=all(
-            networks["configs"][name]["views"] == reference_context(one)["renders"]["views"]
-            for one, name in ((SUBSET, FULL_SETS[0]), (CAGES, CAGES))
-        ),
-        worse=worse_than_constant(networks["configs"]),
-        relative=errors_of_relative_depth(networks["configs"], "tcmonodepth"),
+        subset=subset,
+        cages=cages,
+        baselines={**baseline_tables(SUBSET), **baseline_tables(CAGES)},
+        networks=networks,
+        same_views=(networks["lattice"]["views"], networks["cages"]["views"])
+        == (subset["renders"]["views"], cages["renders"]["views"]),
         number=number,
         percent=percent,
         **steel_context(),
@@ -149,6 +139,7 @@ def measures_page() -> str:
 
 def results_page() -> str:
     """Return the text of ``docs/results.md``: the long tables of results and how to repeat them."""
+    learned = learned_results()
     text = render(
         "results.md.j2",
         plain_sets=[f"`{name}`" for name in (*FULL_SETS, SUBSET, CAGES) if reference_context(name)["is_plain"]],
@@ -158,7 +149,8 @@ def results_page() -> str:
         cage_groups=group_tables(CAGES, "cages"),
         groupings=GROUPINGS,
         groups_method=GROUPS_METHOD,
-        learned=learned_context(),
+        learned_command=learned["command"],
+        learned_tables=learned_tables(learned["configs"]),
         crossing_baselines=[crossing_baselines(file) for file in FILES],
         random_points=60,
         ring_views=BLOCK_VIEWS,

@@ -60,34 +60,6 @@ def _baseline_table(
     return _markdown(head, rows)
 
 
-def worse_than_constant(configs: Mapping[str, Any]) -> str:
-    """Return the methods of each config whose scaled error is above that of a constant on the same pixels."""
-    texts = []
-    for name, config in configs.items():
-        methods = [
-            f"`{method}`" for method, row in _sorted(config, "scaled") if row["scaled"] > row["scaled_constant"]
-        ]
-        texts.append(f"{name}: {', '.join(methods) or 'none'}")
-    return "; ".join(texts)
-
-
-def errors_of_relative_depth(configs: Mapping[str, Any], method: str) -> str:
-    """Return the aligned error of a method in each config, that of the constant, and the views without slope."""
-    texts = []
-    for name, config in configs.items():
-        row = config["methods"][method]
-        errors = (number(row[key], 4) for key in ("aligned_error", "aligned_constant_error"))
-        flat = f"{row['flat_views']} of {config['views']} views"
-        texts.append("{} {} ({}; {})".format(name, *errors, flat))
-    return ", ".join(texts)
-
-
-def learned_context() -> dict[str, Any]:
-    """Return the template variables of the section on learned networks: command and tables by config."""
-    document = learned_results()
-    return {"command": document["command"], "tables": learned_tables(document["configs"])}
-
-
 def learned_tables(configs: Mapping[str, Any]) -> dict[str, str]:
     """Return the Markdown tables of each config: disparities, metric methods, and all methods after alignment."""
     return {
