@@ -222,11 +222,12 @@ def _merged(rows: Sequence[Mapping[str, str]]) -> dict[str, Any]:
     end = _common_end(row["definition"] for row in rows)
     beginnings = [one[:-end] for one in words]
     start = _equal_at_the_start(beginnings)
-    different = [" ".join(one[start:]) or "all" for one in beginnings]
+    *different, last = [" ".join(one[start:]) or "all" for one in beginnings]
+    alternatives = " or ".join((*(text.rstrip(",:") for text in different), last))
     columns = {key: [row[key] or "-" for row in rows] for key in ("unit", "better", "statistic")}
     return {
         "names": names,
-        "definition": " ".join((*words[0][:start], " or ".join(different), *words[0][-end:])),
+        "definition": " ".join((*words[0][:start], alternatives, *words[0][-end:])),
         **{
             key: " / ".join(cells) if len(set(cells)) > 1 else cells[0].strip("-")
             for key, cells in columns.items()
