@@ -135,6 +135,7 @@ def main(out: Path, set_name: str, given_root: Path | None = None) -> int:
     if differing := _differing(reference, root):
         print(f"{root}: the views of {', '.join(differing)} are not those of {' '.join(build)}", file=sys.stderr)
         return 2
+    out.mkdir(parents=True, exist_ok=True)
     for method, configs in reference.runs.items():
         archive = out / f"{method}.zip"
         predict = ("predict", method, "--data", root, "--out", archive, "--config", *configs)

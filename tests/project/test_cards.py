@@ -223,6 +223,16 @@ def test_main_table_has_methods_and_networks_by_rank_error() -> None:
     assert sgbm[2] == f"{STORED[CAGES]['results']['sgbm']['tables']['cages']['rank_error']:.4f}"
 
 
+def test_reference_results_refuse_a_folder_with_other_views(
+    tiny_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    compute = runpy.run_path("benchmarks/reference.py")["main"]
+    assert compute(tmp_path, SUBSET, tiny_root) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"{tiny_root}: the views of lattice, pile, pier are not those of --out")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_numbers_of_learned_networks_are_those_of_a_known_shift(
     tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
