@@ -37,8 +37,8 @@ format: env-dev ## Format the code and apply the linter's safe fixes
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-cards: env-dev ## Write the benchmark card from the code
-	$(BIN)/python -m cards > cards/BENCHMARK.md
+cards: env-dev ## Write the benchmark card, measures and results from the code
+	$(BIN)/python -m cards
 
 docs: system-packages env-dev ## Build the documentation as a site in build/docs; a warning is an error
 	$(BIN)/python -m sphinx -W --keep-going -n -q docs build/docs

@@ -2,7 +2,7 @@
 
 For each archive of predicted depth, the measures at crossings and the reach are computed, and a simple detector
 is run on its depth; a further detector returns random points on the steel of the ground truth. Files of
-detections and ``crossings.json``, which the benchmark card shows, are written to OUT. The detector is the same
+detections and ``crossings.json``, which ``docs/results.md`` shows, are written to OUT. The detector is the same
 for all archives:
 
 1. steel stands in front of its surroundings: pixels whose inverse depth is above its morphological opening, and
@@ -12,7 +12,7 @@ for all archives:
    diameter, and the tie point lies one diameter behind that front;
 4. the confidence is the share of steel pixels around the point.
 
-The card's results are of the views of ``rebar-build --out ROOT --config lattice pile --views 72 --width 640
+The results there are of the views of ``rebar-build --out ROOT --config lattice pile --views 72 --width 640
 --height 360 --samples 4`` with ``truth``, ``sgbm``, ``sgbm-filled`` and ``sweep-aruco`` (``crossings.json``), and
 of the dataset and archives of ``python -m benchmarks.reference OUT cages`` with ``truth``, ``sgbm``,
 ``sgbm-filled`` and ``lidar-mobile`` (``crossings-cages.json``).

@@ -1,4 +1,4 @@
-"""Results of learned networks beside SGBM: the tables of the card's section on learned networks.
+"""Results of learned networks beside SGBM, on the views of ``subset`` and ``cages`` of ``benchmarks.reference``.
 
     SIZE="--width 640 --height 360 --quality preview"
     rebar-build --out ROOT --config lattice pile pier --views 72 $SIZE
@@ -10,7 +10,7 @@
 MODELS is the folder of the weights that the files in ``examples/methods`` name. Each method predicts each config
 of ROOT into ``OUT/METHOD-CONFIG.zip``; archives that are newer than the config are used again, so that the command
 continues after an interruption. It prints the tables as Markdown and writes their numbers to
-``cards/reference/learned.json``, from which ``make cards`` writes the card. If methods are named after OUT, only
+``cards/reference/learned.json``, from which ``make cards`` writes its pages. If methods are named after OUT, only
 these run (``none``: no method); the tables contain all that have an archive.
 
 The numbers are those of ``rebar-bench score``, with and without ``--align affine-disparity``, and of the disparity
@@ -78,7 +78,7 @@ def main(root: Path, models: Path, out: Path, methods: list[str]) -> int:
         for name in configs:
             archive = _archive(out, method, name)
             predict = ("predict", METHODS[method], "--data", str(root), "--config", name, "--out", str(archive))
-            if _is_stale(archive, root / name) and (status := rebar_bench(list(predict))):
+            if is_stale(archive, root / name) and (status := rebar_bench(list(predict))):
                 return status
     numbers = {name: config_numbers(config, root, out) for name, config in configs.items()}
     command = "python -m benchmarks.learned ROOT MODELS OUT"
@@ -92,7 +92,8 @@ def _archive(out: Path, method: str, config: str) -> Path:
     return out / f"{method}-{config}.zip"
 
 
-def _is_stale(archive: Path, config: Path) -> bool:
+def is_stale(archive: Path, config: Path) -> bool:
+    """Return True if an archive does not exist, or is older than a file in the folder of a config."""
     newest = max(path.stat().st_mtime for path in config.rglob("*"))
     return not archive.is_file() or archive.stat().st_mtime < newest
 

@@ -6,6 +6,9 @@ benchmark card. ``subset`` has all methods on a subset of every scene; ``lattice
 fast methods on all views of one scene, ``cages`` has them on 40 generated scenes. A set takes hours. After an
 interruption, the same command computes only the archives that are missing or older than the dataset. OUT must not
 be used for two sets.
+
+``python -m benchmarks.reference OUT SET ROOT`` takes the views from the dataset folder ROOT and renders nothing.
+The folder that ``benchmarks.learned`` needs has the views of ``subset`` and of ``cages``.
 """
 
 from __future__ import annotations
@@ -19,12 +22,14 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from benchmarks.learned import is_stale
 from cards.reference import results_file
 from dataset_builder.cli.main import main as rebar_build
 from rebar_depth_bench import score
 from rebar_depth_bench.base.names import TEST_SPLIT, config_of
 from rebar_depth_bench.base.writing import write_text
 from rebar_depth_bench.cli.main import main as rebar_bench
+from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, score_extended
 from rebar_depth_bench.extended.result import ExtendedTable
 from rebar_depth_bench.scoring.evaluation import open_evaluation
@@ -113,24 +118,29 @@ def _all_views(scene: str) -> ReferenceSet:
 CAGE_METHODS = ("sgbm", "sgbm-filled", "lidar-mobile", "constant", "noisy-truth", "truth")
 
 SETS: Mapping[str, ReferenceSet] = {
-    "subset": ReferenceSet(Renders(72, "--samples 4"), RUNS),
+    "subset": ReferenceSet(Renders(72, "--quality preview"), RUNS),
     **{scene: _all_views(scene) for scene in ALL_SCENES},
     "cages": ReferenceSet(Renders(160, "--quality preview", scenes=40), dict.fromkeys(CAGE_METHODS, ("cages",))),
 }
 """Sets of results by name."""
 
 
-def main(out: Path, set_name: str) -> int:
+def main(out: Path, set_name: str, given_root: Path | None = None) -> int:
     """Compute missing archives of a set and write its results; return the exit status."""
     reference = SETS[set_name]
-    root = out / "dataset"
+    root = given_root or out / "dataset"
     build = ("--out", str(root), "--config", *reference.configs, *reference.renders.options())
-    if status := rebar_build(list(build)):
+    if given_root is None and (status := rebar_build(list(build))):
         return status
+    if differing := _differing(reference, root):
+        print(f"{root}: the views of {', '.join(differing)} are not those of {' '.join(build)}", file=sys.stderr)
+        return 2
+    out.mkdir(parents=True, exist_ok=True)
     for method, configs in reference.runs.items():
         archive = out / f"{method}.zip"
         predict = ("predict", method, "--data", root, "--out", archive, "--config", *configs)
-        if _is_stale(archive, root) and (status := rebar_bench(list(map(str, predict)))):
+        is_missing = any(is_stale(archive, root / config) for config in configs)
+        if is_missing and (status := rebar_bench(list(map(str, predict)))):
             return status
     results = {method: _result(out / f"{method}.zip", root) for method in reference.runs}
     command = f"python -m benchmarks.reference OUT {set_name}"
@@ -139,8 +149,15 @@ def main(out: Path, set_name: str) -> int:
     return 0
 
 
-def _is_stale(archive: Path, root: Path) -> bool:
-    return not archive.is_file() or archive.stat().st_mtime < (root / "manifest.json").stat().st_mtime
+def _differing(reference: ReferenceSet, root: Path) -> list[str]:
+    """Return the configs of a set whose views in a folder differ from it in number, scenes or size."""
+    renders, config_by_name = reference.renders, open_folder(root).config_by_name
+    expected = (renders.views, renders.scenes or 1, (renders.height, renders.width))
+    parts = {
+        name: config_by_name[name].of_split(TEST_SPLIT) for name in reference.configs if name in config_by_name
+    }
+    found = {name: (len(part.views), len(part.scenes), part.grid) for name, part in parts.items()}
+    return [name for name in reference.configs if found.get(name) != expected]
 
 
 def _result(archive: Path, root: Path) -> dict[str, Any]:
@@ -188,6 +205,6 @@ def _median(seconds: Mapping[str, float], config: str) -> float:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) != 3 or sys.argv[2] not in SETS:
-        sys.exit(f"usage: python -m benchmarks.reference OUT {'|'.join(SETS)}")
-    sys.exit(main(Path(sys.argv[1]), sys.argv[2]))
+    if len(sys.argv) not in (3, 4) or sys.argv[2] not in SETS:
+        sys.exit(f"usage: python -m benchmarks.reference OUT {'|'.join(SETS)} [ROOT]")
+    sys.exit(main(Path(sys.argv[1]), sys.argv[2], *map(Path, sys.argv[3:])))

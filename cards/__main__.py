@@ -1,6 +1,8 @@
-"""Command ``python -m cards``: prints the benchmark card."""
+"""Command ``python -m cards``: writes the benchmark card and the pages of measures and results."""
 
-from cards.benchmark import benchmark_card
+from cards.benchmark import PAGES
+from rebar_depth_bench.base.writing import write_text
 
 if __name__ == "__main__":
-    print(benchmark_card(), end="")
+    for path, text in PAGES.items():
+        write_text(path, text())

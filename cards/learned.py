@@ -1,4 +1,7 @@
-"""Tables of learned networks in the card, from the numbers that ``benchmarks.learned`` writes."""
+"""Tables with learned networks, from the numbers that ``benchmarks.learned`` writes.
+
+The main table of a config has the bundled methods of a set of reference results, too.
+"""
 
 from __future__ import annotations
 
@@ -6,16 +9,55 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from cards.reference import number, percent, results_file
+from cards.reference import number, percent, reference_context, results_file
 
 LEARNED = "learned"
 """Set of results of learned networks."""
 
 
-def learned_context() -> dict[str, Any]:
-    """Return the template variables of the section on learned networks: command and tables by config."""
-    document = json.loads(results_file(LEARNED).read_text())
-    return {"command": document["command"], "tables": learned_tables(document["configs"])}
+def learned_results() -> dict[str, Any]:
+    """Return the stored numbers: ``command``, and ``configs`` with those of each config and its methods."""
+    document: dict[str, Any] = json.loads(results_file(LEARNED).read_text())
+    return document
+
+
+def baseline_tables(set_name: str) -> dict[str, str]:
+    """Return the main table of each config of a set: bundled methods and learned networks, by rank error."""
+    context, networks = reference_context(set_name), learned_results()["configs"]
+    return {
+        config: _baseline_table(config, rows, context["errors"][config], networks[config])
+        for config, rows in context["rows"].items()
+    }
+
+
+def _baseline_table(
+    config: str, bundled: Sequence[Mapping[str, str]], errors: Mapping[str, Any], networks: Mapping[str, Any]
+) -> str:
+    names = [row["method"] for row in bundled]
+    learned = [
+        {
+            "method": method,
+            "mark": _mark(row),
+            "views": str(networks["views"]),
+            "rank_error": number(row["rank_error"], 4),
+            "coverage": percent(row["coverage"]),
+            "native": number(row["native"], 4),
+            "scaled": number(row["scaled"], 4),
+            "scale": number(row["scale"], 3),
+            "within": percent(row["within_5_mm"]),
+        }
+        for method, row in _sorted(networks, "rank_error")
+        if method not in names
+    ]
+    keys = ("views", "rank_error", "coverage", "native", "scaled", "scale", "within")
+    head = (config, "views", "rank error", "coverage", "AbsRel", "AbsRel scaled", "s", "within 5 mm")
+    ordered = sorted((*bundled, *learned), key=lambda row: (row["mark"], float(row["rank_error"])))
+    rows = [[f"`{row['method']}`{row['mark']}", *(row[key] for key in keys)] for row in ordered]
+    rows += [
+        ["*constant, after scaling*", *[""] * 4, errors["constant"][0], *[""] * 2],
+        ["*exact depth, one pixel beside*", *[""] * 3, errors["one_pixel"][0], *[""] * 3],
+    ]
+    return _markdown(head, rows)
 
 
 def learned_tables(configs: Mapping[str, Any]) -> dict[str, str]:
@@ -98,7 +140,11 @@ def _sorted(config: Mapping[str, Any], key: str) -> list[tuple[str, Mapping[str,
 
 
 def _title(method: str, row: Mapping[str, Any]) -> str:
-    return f"`{method}`{' †' if row['uses_ground_truth'] else ''}"
+    return f"`{method}`{_mark(row)}"
+
+
+def _mark(row: Mapping[str, Any]) -> str:
+    return " †" if row["uses_ground_truth"] else ""
 
 
 def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

@@ -28,16 +28,19 @@ def results_file(set_name: str) -> Path:
 
 
 def reference_context(set_name: str) -> dict[str, Any]:
-    """Return the template variables of a set of results: file, command, renders, and rows by config."""
+    """Return the template variables of a set of results: command, renders, and rows by config.
+
+    ``is_plain`` states that the intervals are those of a version that did not name their method.
+    """
     document = json.loads(results_file(set_name).read_text())
     by_config: dict[str, list[tuple[str, Mapping[str, Any]]]] = {}
     for method, result in document["results"].items():
         for config in result["tables"]:
             by_config.setdefault(config, []).append((method, result))
     return {
-        "file": f"reference/{set_name}.json",
         "command": document["command"],
         "renders": document["renders"],
+        "is_plain": any(result.get("intervals") is None for result in document["results"].values()),
         "rows": {config: _method_rows(config, rows) for config, rows in by_config.items()},
         "errors": {
             config: {
@@ -97,6 +100,7 @@ def _method_row_of(method: str, result: Mapping[str, Any], config: str) -> dict[
     return {
         "method": method,
         "mark": _mark(method),
+        "views": str(table["views"]),
         **_table_cells(table),
         "seconds": _seconds(result, config, table["views"]),
     }
@@ -110,6 +114,7 @@ def _table_cells(table: Mapping[str, Any]) -> dict[str, str]:
     return {
         "rank_error": number(table["rank_error"], 4),
         "coverage": percent(table["coverage"]),
+        "native": number(native.get("abs_rel"), 4),
         "abs_rel": number(native.get("abs_rel"), 4) + interval,
         "rmse": number(native.get("rmse_cm"), 2, " cm"),
         "scaled": number(scaled.get("abs_rel"), 4),

@@ -75,7 +75,7 @@ def print_extended(extended: ExtendedResult, console: Console) -> None:
             console, f"Intervals: in CSV, JSON and the report, and in terminals with at least {width} columns."
         )
     note = "A single number in the first column is independent of scale or uses its own alignment."
-    print_line(console, f"{note} Definitions: cards/BENCHMARK.md.")
+    print_line(console, f"{note} Definitions: docs/measures.md.")
 
 
 def measure_cells(table: ExtendedTable, family: MeasureFamily, measure: Measure) -> list[str]:

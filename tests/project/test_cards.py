@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import runpy
 import subprocess
 import sys
@@ -15,9 +16,9 @@ import yaml
 from scipy.ndimage import binary_erosion
 
 import rebar_depth_bench as rdb
-from cards.benchmark import benchmark_card
+from cards.benchmark import PAGES, measures_page
 from cards.dataset import column_rows, dataset_card
-from cards.learned import learned_tables
+from cards.learned import LEARNED, baseline_tables, learned_tables
 from cards.reference import CAGES, FULL_SETS, SUBSET, reference_context, results_file
 from cards.steel import steel_by_config
 from dataset_builder.cameras.trajectories import view_count
@@ -25,6 +26,7 @@ from dataset_builder.catalog.named_configs import CONFIGS, SWEEPS
 from dataset_builder.specs.config_specs import DomeSpec
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.schema import CENTRE, NEAREST_STEEL, features
+from rebar_depth_bench.extended.registry import MEASURE_FAMILIES
 from rebar_depth_bench.methods import own_methods
 from tests.conftest import TINY_DATASET
 
@@ -33,23 +35,43 @@ STORED: dict[str, dict[str, Any]] = {name: json.loads(results_file(name).read_te
 
 
 @pytest.mark.slow
-def test_benchmark_card_in_repository_is_up_to_date() -> None:
-    assert Path("cards/BENCHMARK.md").read_text() == benchmark_card(), "run `make cards`"
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_generated_page_in_repository_is_up_to_date(page: Path) -> None:
+    assert page.read_text() == PAGES[page](), "run `make cards`"
 
 
 @pytest.mark.slow
-def test_benchmark_card_names_every_method_and_rule() -> None:
-    card = benchmark_card()
-    assert all(f"| `{name}`" in card for name in own_methods())
+def test_pages_name_every_method_rule_and_measure() -> None:
+    card, measures, results = (PAGES[page]() for page in PAGES)
+    assert all(f"| `{name}`" in results for name in own_methods())
     assert "max(p/z, z/p) < 1.25" in card
     assert "t = 3, 5, 10, 20 mm" in card
-    assert "at least 0.95" in card
+    assert "at least 0.95" in " ".join(card.split())
+    assert len(card.split()) <= 4900
+    shown = set(re.findall(r"`(\w+)`", measures))
+    names = {measure.name for family in MEASURE_FAMILIES.values() for measure in family.measures}
+    of_tolerances = {name.removeprefix("pass_") for name in names if name.startswith("pass_")}
+    binned = {name for name in names if re.search(r"_\d|-", name)}
+    assert of_tolerances <= shown
+    assert {name for name in names - binned if not name.startswith(("pass_", "capability_"))} <= shown
 
 
 @pytest.mark.slow
 def test_names_of_bins_stand_for_their_numbers_only() -> None:
-    row = next(line for line in benchmark_card().splitlines() if line.startswith("| `single_bar_within_Nmm`"))
-    assert "3 x 3 neighbourhood belongs to one bar with |p - z| <= N mm" in row.replace("\\|", "|")
+    rows = measures_page().replace("\\|", "|").splitlines()
+    row = next(line for line in rows if line.startswith("| `single_bar_within_Nmm`"))
+    assert "3 x 3 neighbourhood belongs to one bar with |p - z| <= N mm" in row
+
+
+@pytest.mark.slow
+def test_measures_whose_definitions_end_alike_share_a_row() -> None:
+    rows = measures_page().splitlines()
+    row = next(
+        line for line in rows if "`cover_bias_mm`, `cover_std_mm`, `cover_median_mm`, `cover_p95_mm`" in line
+    )
+    assert "| - / - / lower / lower | mean / std / median / p95 | Mean over what was found" in row
+    assert row.count("fitted axis minus true axis") == 1
+    assert "95th percentile of the absolute value: fitted" in row
 
 
 def test_every_column_is_described_once() -> None:
@@ -167,7 +189,8 @@ def test_reference_errors_do_not_depend_on_the_method(name: str) -> None:
     results = STORED[name]["results"]
     for config, errors in reference_context(name)["errors"].items():
         tables = [result["tables"][config] for result in results.values() if config in result["tables"]]
-        assert all(table["reference"] == tables[0]["reference"] for table in tables)
+        for key in ("constant", "one_pixel"):
+            assert all(table["reference"][key] == tables[0]["reference"][key] for table in tables)
         assert errors["constant"][0] == f"{tables[0]['reference']['constant']['abs_rel']:.4f}"
 
 
@@ -185,6 +208,29 @@ def test_card_rows_match_stored_results(name: str) -> None:
     assert row["coverage"] == f"{100 * table['coverage']:.1f} %"
     assert row["rank_error"] == f"{table['rank_error']:.4f}"
     assert row["within"] == f"{100 * table['within_mm']['5']:.1f} %"
+
+
+def test_main_table_has_methods_and_networks_by_rank_error() -> None:
+    table = baseline_tables(CAGES)["cages"].splitlines()
+    rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table[2:-2]]
+    networks = json.loads(results_file(LEARNED).read_text())["configs"]["cages"]["methods"]
+    metric = {name for name, numbers in networks.items() if numbers["rank_error"] is not None}
+    assert {row[0].split("`")[1] for row in rows} == {*STORED[CAGES]["results"], *metric}
+    for marked in (False, True):
+        errors = [float(row[2]) for row in rows if row[0].endswith("†") == marked]
+        assert errors == sorted(errors)
+    [sgbm] = [row for row in rows if row[0] == "`sgbm`"]
+    assert sgbm[2] == f"{STORED[CAGES]['results']['sgbm']['tables']['cages']['rank_error']:.4f}"
+
+
+def test_reference_results_refuse_a_folder_with_other_views(
+    tiny_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    compute = runpy.run_path("benchmarks/reference.py")["main"]
+    assert compute(tmp_path, SUBSET, tiny_root) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"{tiny_root}: the views of lattice, pile, pier are not those of --out")
+    assert list(tmp_path.iterdir()) == []
 
 
 def test_numbers_of_learned_networks_are_those_of_a_known_shift(
