@@ -23,7 +23,7 @@ from cards.reference import FULL_SETS, reference_context
 from dataset_builder.catalog.named_configs import CONFIGS, SWEEPS
 from dataset_builder.cli.main import argument_parser as build_parser
 from dataset_builder.cli.main import with_command
-from dataset_builder.importing.import_layout import read_layout
+from dataset_builder.importing import import_layout
 from dataset_builder.scene.variants.registry import VARIANTS
 from dataset_builder.user_files.scene_schema import read_scene_toml
 from leaderboard.cli import argument_parser as board_parser
@@ -199,12 +199,16 @@ def test_local_links_and_anchors_exist(page: Path) -> None:
 
 
 def test_documented_toml_and_json_are_valid(tmp_path: Path) -> None:
-    layouts, scenes = blocks(DOCS / "import.md", "toml"), blocks(DOCS / "cages.md", "toml")
+    layouts = [
+        *blocks(DOCS / "import.md", "toml"),
+        (import_layout.__doc__ or "").split("```")[1].removeprefix("toml"),
+    ]
+    scenes = blocks(DOCS / "cages.md", "toml")
     assert layouts
     assert scenes
     for layout in layouts:
         (tmp_path / "layout.toml").write_text(layout)
-        assert read_layout(tmp_path / "layout.toml").truth_sigma_m > 0
+        assert import_layout.read_layout(tmp_path / "layout.toml").truth_sigma_m > 0
     assert all(read_scene_toml(scene.encode(), "page") for scene in scenes)
     assert all(tomllib.loads(block) for page in PAGES for block in blocks(page, "toml"))
     assert all(json.loads(block) for page in PAGES for block in blocks(page, "json"))
