@@ -48,14 +48,22 @@ def _table(header: str, rows: Iterable[Iterable[str]]) -> str:
 
 def _settings() -> str:
     """Return the settings of the leaderboard with their defaults."""
-    rows = []
-    for name, field in Settings.model_fields.items():
-        value = "" if field.is_required() else field.default
-        if isinstance(value, bool | float):
-            value = f"{value:g}" if isinstance(value, float) else str(value).lower()
-        text = _size(value) if field.annotation is ByteSize else str(value)
-        rows.append((f"`{name}`", text and f"`{text}`", field.description or ""))
+    rows = (
+        (f"`{name}`", "" if field.is_required() else _setting(field.default), field.description or "")
+        for name, field in Settings.model_fields.items()
+    )
     return _table("setting | default | description", rows)
+
+
+def _setting(value: object) -> str:
+    """Return the value of a setting as its users write it; empty for empty text."""
+    if isinstance(value, ByteSize):
+        text = _size(value)
+    elif isinstance(value, bool):
+        text = str(value).lower()
+    else:
+        text = f"{value:g}" if isinstance(value, float) else str(value)
+    return text and f"`{text}`"
 
 
 def _limits() -> str:
