@@ -96,7 +96,8 @@ def _options(parser: ArgumentParser) -> Iterator[tuple[str, str]]:
             value = action.metavar or ("|".join(action.choices) if action.choices else action.dest.upper())
             usage = action.option_strings[0] + (f" {value}" if action.nargs != 0 else "")
             usage += " ..." if action.nargs == "+" else ""
-            yield f"`{usage}`".replace("|", "\\|"), (action.help or "") % vars(action)
+            text = (action.help or "") % vars(action)
+            yield f"`{usage}`".replace("|", "\\|"), re.sub("--[a-z-]+", r"`\g<0>`", text)
 
 
 def _variants() -> str:
