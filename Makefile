@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 
 .DEFAULT_GOAL := help
 .NOTPARALLEL:
-.PHONY: help demo quick test nightly versions docs dist format env-dev system-packages cards sample-data clean
+.PHONY: help demo quick test nightly versions docs dist format env-dev system-packages cards tables sample-data clean
 
 help: ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
@@ -39,6 +39,9 @@ format: env-dev ## Format the code and apply the linter's safe fixes
 
 cards: env-dev ## Write the benchmark card, measures and results from the code
 	$(BIN)/python -m cards
+
+tables: env-dev ## Write the tables of the documentation that list what the code declares
+	$(BIN)/python -m scripts.tables
 
 docs: system-packages env-dev ## Build the documentation as a site in build/docs; a warning is an error
 	$(BIN)/python -m sphinx -W --keep-going -n -q docs build/docs

@@ -1,42 +1,44 @@
 """Layout file: a TOML file that describes a set of images, depth maps, cameras and bars of another program.
 
-All files are named relative to its folder; ``{view}`` in a name stands for the name of a view::
+```toml
+description = "Column mock-up, scanned with a terrestrial laser scanner"
+source = "https://example.org/mock-up"
+licence = "CC-BY-4.0"
+truth_sigma_m = 0.002             # standard deviation of the depth, metres; required
 
-    description = "Column mock-up, scanned with a terrestrial laser scanner"
-    source = "https://example.org/mock-up"
-    licence = "CC-BY-4.0"
-    truth_sigma_m = 0.002             # standard deviation of the depth, metres
+[files]                           # below this file's folder; {view} stands for the name of a view
+left_depth = "depth/{view}.exr"   # .exr, .tif, .png (16 bit), .npy, .npz, .pfm; required; and right_depth
+left_rgb = "left/{view}.jpg"      # .png, .jpg; and right_rgb
+left_mask = "masks/{view}.png"    # .png, .tif, .npy; and right_mask
+left_bars = "ids/{view}.png"      # bar ids, 0 where no steel; and right_bars
 
-    [files]
-    left_depth = "depth/{view}.exr"   # .exr, .tif, .png (16 bit), .npy, .npz, .pfm; required
-    left_rgb = "left/{view}.jpg"      # .png, .jpg
-    right_rgb = "right/{view}.jpg"    # and right_depth, left_mask, right_mask, left_bars, right_bars
+[depth]
+unit = "mm"                       # "m" (default), "cm", "mm", "in" or "ft"; or scale = 0.001, metres of one unit
+kind = "z"                        # along the optical axis, the default; "range" along the ray; "disparity", pixels
+invalid = [65535]                 # values without depth, beside those that are not finite or not above 0
+max_m = 20                        # farther pixels are left out, and counted; without it, 1000 m is an error
+channel = "R"                     # of EXR files with several channels
 
-    [depth]
-    unit = "mm"                       # or scale = 0.001, metres of one unit; default: "m"
-    kind = "z"                        # "z", "range" along the ray, or "disparity" in pixels
-    invalid = [65535]                 # values without depth, beside those that are not finite or not above 0
-    max_m = 20                        # largest depth that is kept, metres; without it, 1000 m is an error
-    channel = "R"                     # of EXR files with several channels
+[cameras]                         # the keys of cameras.toml
+calibration = "camera.yml"        # or views = "FILE", with the cameras of all views
 
-    [cameras]                         # the keys of cameras.toml, see ``captures.camera_files``
-    calibration = "stereo.yml"        # or views = "scene_camera.json", see ``view_cameras``
+[poses]                           # of the left camera; or [[cameras.pose]]
+file = "poses/{view}.txt"         # 4 x 4 or 3 x 4 numbers: .txt, .npy, .json
+key = "pose"                      # of JSON files; "a.b" is the key b in a
+kind = "world_from_cam"           # or "cam_from_world", the default
+axes = "opengl"                   # or "opencv", the default
+unit = "m"
 
-    [poses]                           # of the left camera, for each view; or [[cameras.pose]]
-    file = "poses/{view}.txt"         # 4 x 4 numbers: .txt, .npy, .json
-    kind = "world_from_cam"           # or "cam_from_world"
-    axes = "opengl"                   # of the camera: "opencv" (default) or "opengl"
-    unit = "m"
+[intrinsics]                      # K of images of one camera, where it differs between views
+file = "intrinsics/{view}.json"   # fx 0 cx, 0 fy cy, 0 0 1 in pixels; the distortion is that of [cameras]
+key = "K"                         # of JSON files
 
-    [intrinsics]                      # of images of one camera, where they differ between views
-    file = "intrinsics/{view}.json"   # 3 x 3 numbers
-    key = "K"                         # of JSON files
+[masks]
+values = [255]                    # steel; default: all but 0
 
-    [masks]
-    values = [255]                    # steel; default: all but 0
-
-    [bars]                            # surveyed bars, in the world frame of the poses
-    file = "bars.csv"                 # bar_id, diameter_m, x_m, y_m, z_m; one line for each point of an axis
+[bars]
+file = "bars.csv"                 # surveyed bars: bar_id, diameter_m, x_m, y_m, z_m, and role if wanted
+```
 """
 
 from __future__ import annotations

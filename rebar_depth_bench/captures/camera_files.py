@@ -1,27 +1,23 @@
 """Files that state the cameras of a capture, and ``cameras.toml``, which also states its board and its poses.
 
-A folder holds one of these:
+A folder holds ``cameras.toml``; or one file ``*.conf`` or ``calibration.toml`` (``captures.calibration_files``);
+or one or two calibrations of other programs (``captures.programs``). docs/captures.md lists these files.
 
-- ``cameras.toml``, see below;
-- one file ``*.conf`` (Stereolabs) or ``calibration.toml`` (``captures.calibration_files``);
-- calibrations of other programs (``captures.programs``): one file ``*.yaml``, ``.yml``, ``.xml`` or
-  ``.json`` (OpenCV's FileStorage, a Kalibr camera chain, ROS ``camera_info`` of one camera), or two of them:
-  intrinsics and extrinsics of OpenCV, or ``left.*`` and ``right.*`` of ROS.
+``cameras.toml`` has the keys of ``calibration.toml``, of one camera or of a pair, or names files in their place:
 
-``cameras.toml`` has the keys of ``calibration.toml``, of one camera (``[left]``) or of a pair, or names files in
-their place::
+```toml
+calibration = ["intrinsics.yml", "extrinsics.yml"]    # or one file; or [left], [right], [stereo]
+unit = "mm"          # of lengths in files of OpenCV, ROS and Kalibr: "m" (default), "cm", "mm", "in" or "ft"
+rectified = false    # true: the pictures are rectified and have the file's matrix P
 
-    calibration = "stereo.yml"    # or two files: ["left.yaml", "right.yaml"]
-    unit = "mm"                   # of lengths in OpenCV's, ROS' and Kalibr's files; default: "m"
-    rectified = false             # whether the pictures are rectified and have the file's matrix P
+[board]              # ArUco board; default: the A3 sheet with 6 markers of 50 mm
+markers = 12
+marker_side_m = 0.03
 
-    [board]                       # ArUco board, see geometry.aruco_board; default: its A3 sheet of 6 markers
-    markers = 12
-    marker_side_m = 0.05
-
-    [[pose]]                      # of all images or of none; OpenCV axes, metres
-    image = "0001"
-    cam_from_world = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0.5], [0, 0, 0, 1]]
+[[pose]]             # of all images or of none: x_cam = cam_from_world @ x_world, OpenCV axes, metres
+image = "0001"
+cam_from_world = [[1, 0, 0, 0.1], [0, 1, 0, 0], [0, 0, 1, 0.5], [0, 0, 0, 1]]
+```
 """
 
 from __future__ import annotations

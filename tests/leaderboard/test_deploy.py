@@ -64,14 +64,6 @@ def test_commands_of_the_page_parse() -> None:
     assert {words[0] for words in commands} == set(known)
 
 
-def test_settings_table_of_the_page_is_that_of_the_code() -> None:
-    rows = re.findall(r"^\| `(\w+)` \| (?:`(.*)`)? ?\| (.+) \|$", PAGE, re.MULTILINE)
-    assert rows == [
-        (name, "" if field.is_required() else str(field.default), field.description)
-        for name, field in Settings.model_fields.items()
-    ]
-
-
 def test_extras_and_files_that_are_installed_exist() -> None:
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     lists = re.findall(r"pip install \'\.\[([\w,]+)\]", PAGE) + re.findall(r"/source\[([\w,]+)\]", CONTAINERFILE)

@@ -1,0 +1,152 @@
+"""Tables of the documentation that list what the code declares: settings, limits, options, columns and formats.
+
+python -m scripts.tables
+
+A page has a table between the marks ``<!-- table: NAME -->`` and ``<!-- end of table -->``, where NAME is a key of
+``TABLES``. The command writes the tables of all ``PAGES``.
+"""
+
+from __future__ import annotations
+
+import re
+from argparse import ArgumentParser, _SubParsersAction
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import groupby
+from pathlib import Path
+
+from pydantic import ByteSize
+
+from cards.dataset import column_rows
+from dataset_builder.cli.main import argument_parser
+from dataset_builder.importing.view_cameras import BOP, NERFSTUDIO
+from dataset_builder.scene.variants.registry import VARIANTS
+from leaderboard.settings import Settings
+from rebar_depth_bench.base import limits
+from rebar_depth_bench.captures.calibration_files import ZED_CONF
+from rebar_depth_bench.captures.fields import Field, FileFormat
+from rebar_depth_bench.captures.program_formats import CAMERA, KALIBR, MIDDLEBURY, PAIR
+
+ROOT = Path(__file__).parents[1]
+PAGES = (
+    ROOT / "SECURITY.md",
+    *(ROOT / "docs" / f"{name}.md" for name in ("build", "formats", "leaderboard-operator")),
+)
+FORMATS = (ZED_CONF, CAMERA, PAIR, KALIBR, MIDDLEBURY, BOP, NERFSTUDIO)
+_BLOCK = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
+
+
+def with_tables(page: str) -> str:
+    """Return the text of a page with its tables. Raises ``KeyError`` for a mark with an unknown name."""
+    return _BLOCK.sub(lambda block: f"{block[1]}\n{TABLES[block[2]]()}\n\n{block[3]}", page)
+
+
+def _table(header: str, rows: Iterable[Iterable[str]]) -> str:
+    """Return a table; ``header`` has the titles of the columns, separated by bars."""
+    lines = [f"| {header} |", "|---" * (header.count("|") + 1) + "|"]
+    return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in rows)])
+
+
+def _settings() -> str:
+    """Return the settings of the leaderboard with their defaults."""
+    rows = (
+        (f"`{name}`", "" if field.is_required() else _setting(field.default), field.description or "")
+        for name, field in Settings.model_fields.items()
+    )
+    return _table("setting | default | description", rows)
+
+
+def _setting(value: object) -> str:
+    """Return the value of a setting as its users write it; empty for empty text."""
+    if isinstance(value, ByteSize):
+        text = _size(value)
+    elif isinstance(value, bool):
+        text = str(value).lower()
+    else:
+        text = f"{value:g}" if isinstance(value, float) else str(value)
+    return text and f"`{text}`"
+
+
+def _limits() -> str:
+    """Return the limits that environment variables replace."""
+    known = [limit for limit in vars(limits).values() if isinstance(limit, limits.Limit)]
+    rows = [(f"`{limit.variable}`", _default(limit), limit.description) for limit in known]
+    return _table("variable | default | limits", rows)
+
+
+def _default(limit: limits.Limit) -> str:
+    unit = limit.name.rpartition("_")[2]
+    return _size(limit.default) if unit == "bytes" else f"{limit.default:,} {unit}"
+
+
+def _size(size: int) -> str:
+    """Return a whole number of bytes in the largest unit of which it is a multiple: ``64 MiB``."""
+    power = max(power for power in range(4) if size % (1 << (10 * power)) == 0)
+    return f"{size >> (10 * power)} {('B', 'KiB', 'MiB', 'GiB')[power]}"
+
+
+def _build_options() -> str:
+    """Return the options of ``rebar-build build`` as its help lists them."""
+    [commands] = [one for one in argument_parser()._actions if isinstance(one, _SubParsersAction)]
+    return _table("option | description", _options(commands.choices["build"]))
+
+
+def _options(parser: ArgumentParser) -> Iterator[tuple[str, str]]:
+    for action in parser._actions:
+        if action.dest != "help":
+            value = action.metavar or ("|".join(action.choices) if action.choices else action.dest.upper())
+            usage = action.option_strings[0] + (f" {value}" if action.nargs != 0 else "")
+            usage += " ..." if action.nargs == "+" else ""
+            text = (action.help or "") % vars(action)
+            yield f"`{usage}`".replace("|", "\\|"), re.sub("--[a-z-]+", r"`\g<0>`", text)
+
+
+def _variants() -> str:
+    """Return the appearance variants of scenes."""
+    rows = ((f"`{variant.name}`", variant.description) for variant in VARIANTS.values())
+    return _table("variant | what it does", rows)
+
+
+def _columns() -> str:
+    """Return the columns of a dataset, as the dataset card lists them."""
+    rows = ((row["names"], row["type"], row["meaning"]) for row in column_rows())
+    return _table("columns | type | meaning", rows)
+
+
+def _formats() -> str:
+    """Return the tables by which the readers of the files of other programs look up keys."""
+    return "\n\n".join(map(format_table, FORMATS))
+
+
+def format_table(file_format: FileFormat) -> str:
+    """Return the heading and the table of a format; fields of the same use and meaning share a row."""
+    groups = groupby(file_format.fields, lambda field: (field.use, field.meaning))
+    rows = ((_keys(fields), use, meaning) for (use, meaning), fields in groups)
+    return f"### {file_format.title}\n\n{_table('keys | use | meaning', rows)}"
+
+
+def _keys(fields: Iterable[Field]) -> str:
+    """Return the keys of fields as code, those of one section together."""
+    sections: dict[str, list[str]] = {}
+    for field in fields:
+        for key in field.keys:
+            section, _, name = key.rpartition(".")
+            sections.setdefault(section, []).append(f"`{name}`")
+    return "; ".join(
+        f"`{section}`: {', '.join(names)}" if section else ", ".join(names) for section, names in sections.items()
+    )
+
+
+TABLES: Mapping[str, Callable[[], str]] = {
+    "settings": _settings,
+    "limits": _limits,
+    "build-options": _build_options,
+    "variants": _variants,
+    "columns": _columns,
+    "formats": _formats,
+}
+"""Functions of the tables by their names in the marks."""
+
+
+if __name__ == "__main__":
+    for path in PAGES:
+        path.write_text(with_tables(path.read_text()))
