@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from rebar_depth_bench import software_version
 from rebar_depth_bench.base.errors import InputError, OutputError, RebarDepthError
 from rebar_depth_bench.base.reading import parse_number
-from rebar_depth_bench.base.terminal import print_notice, use_plain_characters
+from rebar_depth_bench.base.terminal import ProgressBars, print_notice, use_plain_characters
 from rebar_depth_bench.base.writing import (
     STANDARD_OUTPUT,
     WRITE_ERRORS,
@@ -30,6 +30,7 @@ from rebar_depth_bench.base.writing import (
 
 if TYPE_CHECKING:
     from rebar_depth_bench.data.manifest import DatasetFolder
+    from rebar_depth_bench.scoring.result import Result
 
 EXIT_DONE, EXIT_OTHER, EXIT_INPUT = 0, 1, 2
 """Exit codes: success, any other error, invalid input."""
@@ -204,6 +205,29 @@ def add_expect_digest(parser: argparse.ArgumentParser) -> None:
         metavar="DIGEST",
         help="refuse any other dataset than that with this ground-truth digest (sha256:...)",
     )
+
+
+def score_archives(
+    archives: Sequence[str], options: argparse.Namespace, check_kinds: Callable[[Sequence[tuple[str, str]]], None]
+) -> list[Result]:
+    """Score several archives with the options of a command.
+
+    ``check_kinds`` is called with the method and kind of each before any is scored, to refuse kinds.
+    """
+    from rebar_depth_bench.data.manifest import open_folder  # Most commands do not score.
+    from rebar_depth_bench.scoring.evaluation import open_evaluation, score
+
+    folder = open_folder(options.data, expect_digest=options.expect_digest)
+    kinds = []
+    for archive in archives:
+        with open_evaluation(archive, folder) as evaluation:
+            kinds.append((evaluation.meta.method, evaluation.kind(options.align)))
+    check_kinds(kinds)
+    with ProgressBars() as bars:
+        return [
+            score(archive, folder, workers=options.workers, align=options.align, progress=bars.update)
+            for archive in archives
+        ]
 
 
 def print_verified(

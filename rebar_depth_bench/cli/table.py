@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 
 from rich.console import Console
 
 from rebar_depth_bench.base.errors import InputError, printable
-from rebar_depth_bench.base.terminal import ProgressBars, print_notice
+from rebar_depth_bench.base.terminal import print_notice
 from rebar_depth_bench.base.writing import write_output
 from rebar_depth_bench.cli.console import (
     InputFile,
@@ -17,15 +18,16 @@ from rebar_depth_bench.cli.console import (
     add_output_file,
     add_workers,
     prints_table,
+    score_archives,
 )
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.reporting.figure import check_figure, write_figure
 from rebar_depth_bench.reporting.latex import latex_table
 from rebar_depth_bench.reporting.tables import disambiguate_method_names, print_paper_table
 from rebar_depth_bench.scoring.comparison import check_same_splits
-from rebar_depth_bench.scoring.evaluation import score
 from rebar_depth_bench.scoring.frames import frame_csv, tables_frame
 from rebar_depth_bench.scoring.truth import paper_differences
+from rebar_depth_bench.submission.declaration import METRIC
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -47,23 +49,8 @@ def run(options: argparse.Namespace) -> None:
     """Score all archives, write the requested files and print the table."""
     if options.figure:
         check_figure(options.figure)
-    with ProgressBars() as bars:
-        results = [
-            score(
-                archive,
-                options.data,
-                workers=options.workers,
-                expect_digest=options.expect_digest,
-                align=options.align,
-                progress=bars.update,
-            )
-            for archive in options.archives
-        ]
+    results = score_archives(options.archives, options, _check_figure_kinds if options.figure else list)
     check_same_splits(results)
-    for result in results if options.figure else ():
-        if result.prediction is not None:
-            found = f"{result.method} has predictions of the kind {result.kind}"
-            raise InputError(f"--figure: {found}, expected metric ones: the figure shows native errors")
     results = disambiguate_method_names(results)
     published = not options.no_published
     absent = []
@@ -81,3 +68,10 @@ def run(options: argparse.Namespace) -> None:
             print_notice(note)
     if prints_table(options):
         print_paper_table(results, Console(), published=published, absent=absent)
+
+
+def _check_figure_kinds(kinds: Sequence[tuple[str, str]]) -> None:
+    for method, kind in kinds:
+        if kind != METRIC:
+            found = f"{method} has predictions of the kind {kind}"
+            raise InputError(f"--figure: {found}, expected metric ones: the figure shows native errors")

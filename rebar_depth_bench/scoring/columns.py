@@ -74,11 +74,12 @@ MetricSize = Annotated[float, json_as(Size | None, _overflow, rounded)]
 def number(value: float | None, decimals: int) -> str:
     """Return a number with fixed decimals, in scientific notation if these would hide it, a dash if undefined.
 
-    Scientific notation is used below half a unit of the last decimal and from 1e6 on.
+    Scientific notation is used below half a unit of the last decimal and from 1e6 on, but not below 1e-12: errors
+    that small are rounding errors of the arithmetic.
     """
     if value is None or not math.isfinite(value):
         return DASH
-    if value != 0 and not 0.5 * 10**-decimals <= abs(value) < 1e6:
+    if abs(value) > 1e-12 and not 0.5 * 10**-decimals <= abs(value) < 1e6:
         return f"{value:.1e}"
     return f"{value:.{decimals}f}"
 
