@@ -74,12 +74,11 @@ MetricSize = Annotated[float, json_as(Size | None, _overflow, rounded)]
 def number(value: float | None, decimals: int) -> str:
     """Return a number with fixed decimals, in scientific notation if these would hide it, a dash if undefined.
 
-    Scientific notation is used below half a unit of the last decimal and from 1e6 on, but not below 1e-12: errors
-    that small are rounding errors of the arithmetic.
+    Scientific notation is used below half a unit of the last decimal and from 1e6 on.
     """
     if value is None or not math.isfinite(value):
         return DASH
-    if abs(value) > 1e-12 and not 0.5 * 10**-decimals <= abs(value) < 1e6:
+    if value != 0 and not 0.5 * 10**-decimals <= abs(value) < 1e6:
         return f"{value:.1e}"
     return f"{value:.{decimals}f}"
 
@@ -176,6 +175,8 @@ class Column:
 
     def number_text(self, value: float | None) -> str:
         """Return a value in its unit and with its decimals, also of a difference."""
+        if value is not None and self.better == "lower" and abs(value) < 1e-12:
+            value = 0.0  # Rounding errors of exact predictions.
         return number(None if value is None else self.factor * value, self.decimals)
 
     def signed_text(self, value: float | None) -> str:
