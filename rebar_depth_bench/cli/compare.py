@@ -11,10 +11,8 @@ from rebar_depth_bench.base.terminal import print_notice
 from rebar_depth_bench.base.writing import write_output
 from rebar_depth_bench.cli.console import (
     InputFile,
-    add_align,
-    add_data,
-    add_expect_digest,
     add_output_file,
+    add_scored_data,
     add_workers,
     prints_table,
     score_archives,
@@ -28,9 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     parser.add_argument("first", type=InputFile, metavar="A", help="the archive that the others are compared with")
     parser.add_argument("others", type=InputFile, metavar="B", nargs="+", help="one or more archives")
-    add_data(parser)
-    add_expect_digest(parser)
-    add_align(parser)
+    add_scored_data(parser)
     add_output_file(parser, "--json", "write the differences as JSON")
     add_output_file(parser, "--csv", "write the differences as CSV")
     add_workers(parser)

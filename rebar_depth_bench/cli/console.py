@@ -187,10 +187,12 @@ def positive_number(text: str, expected: str, high: float = sys.float_info.max) 
     return value
 
 
-def add_align(parser: argparse.ArgumentParser) -> None:
-    """Add the option that scores metric archives as those of another kind."""
+def add_scored_data(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the dataset, and the one that scores metric archives as those of another kind."""
     from rebar_depth_bench.submission.declaration import METRIC, PREDICTION_KINDS  # Most commands do not need it.
 
+    add_data(parser)
+    add_expect_digest(parser)
     parser.add_argument(
         "--align",
         choices=[kind for kind in PREDICTION_KINDS if kind != METRIC],
@@ -210,10 +212,7 @@ def add_expect_digest(parser: argparse.ArgumentParser) -> None:
 def score_archives(
     archives: Sequence[str], options: argparse.Namespace, check_kinds: Callable[[Sequence[tuple[str, str]]], None]
 ) -> list[Result]:
-    """Score several archives with the options of a command.
-
-    ``check_kinds`` is called with the method and kind of each before any is scored, to refuse kinds.
-    """
+    """Score archives with a command's options; before any, call ``check_kinds`` with method and kind of each."""
     from rebar_depth_bench.data.manifest import open_folder  # Most commands do not score.
     from rebar_depth_bench.scoring.evaluation import open_evaluation, score
 

@@ -12,10 +12,8 @@ from rebar_depth_bench.base.terminal import print_notice
 from rebar_depth_bench.base.writing import write_output
 from rebar_depth_bench.cli.console import (
     InputFile,
-    add_align,
-    add_data,
-    add_expect_digest,
     add_output_file,
+    add_scored_data,
     add_workers,
     prints_table,
     score_archives,
@@ -34,9 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     archives = "submission archives (zip), one table row per archive"
     parser.add_argument("archives", type=InputFile, metavar="ARCHIVE", nargs="+", help=archives)
-    add_data(parser)
-    add_expect_digest(parser)
-    add_align(parser)
+    add_scored_data(parser)
     add_output_file(parser, "--latex", "write the table as LaTeX (booktabs)")
     add_output_file(parser, "--csv", "write all tables as CSV")
     add_output_file(parser, "--figure", "draw native against scaled AbsRel of all configs (.svg, .png or .pdf)")

@@ -24,8 +24,8 @@ from rebar_depth_bench.reporting.formatting import (
     ONE_PIXEL_TITLE,
     config_title,
     counted,
-    mark_notes,
     rank_mark,
+    row_notes,
     scaled_constants,
 )
 from rebar_depth_bench.reporting.published import (
@@ -200,7 +200,7 @@ def _notes(results: Sequence[Result], panels: Sequence[Panel]) -> list[str]:
     if any(point.hollow for point in points):
         percent = f"{MIN_COMPARABLE_COVERAGE * 100:.0f} %"
         notes.append(f"Hollow: coverage below {percent} or a view without prediction; errors over chosen pixels.")
-    notes += [f"{mark}: {meaning}." for mark, meaning in mark_notes(results).items()]
+    notes += [f"{mark}: {meaning}." for mark, meaning, listed in row_notes(results, ()) if not listed]
     if any(point.published for point in points):
         part = load_published().parts["synthetic"]
         notes.append(f"Paper: {part.place}, {part.mark}.")

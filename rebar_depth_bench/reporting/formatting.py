@@ -136,7 +136,8 @@ def row_notes(results: Sequence[Result], absent: Sequence[str]) -> list[tuple[st
     incomparable = ("*", "Errors of valid predictions are not compared with those of others: ", marked)
     without_paper = ("", "The paper's rows are absent; the configs differ from its scenes: ", absent)
     as_another_kind = ("", "Metric predictions, aligned as this kind: ", aligned)
-    declared = [(mark, meaning, ()) for mark, meaning in mark_notes(results).items()]
+    marks = {rank_mark(result.declared, table) for result in results for table in result.tables.values()}
+    declared = [(mark, meaning, ()) for mark, meaning in _MARKS.items() if mark in marks]
     return declared + [note for note in (incomparable, as_another_kind, without_paper) if note[-1]]
 
 
@@ -188,19 +189,10 @@ def paper_reference_rows(results: Sequence[tuple[str, Table]]) -> list[tuple[str
 
 
 def rank_mark(declared: Declaration, table: Table) -> str:
-    """Return the mark of a row that is not ranked (‡) or whose use of ground truth is not declared (?).
-
-    Of predictions that are not metric, none of which is ranked, only those that use ground truth are marked so.
-    """
+    """Return the mark of a row that uses ground truth, or is metric and not ranked (‡), or ? if undeclared."""
     if declared.uses_ground_truth or not (table.ranked or table.aligned):
         return "‡"
     return "?" if declared.uses_ground_truth is None else ""
-
-
-def mark_notes(results: Iterable[Result]) -> dict[str, str]:
-    """Return the meaning of each mark that ``rank_mark`` gives rows of the results."""
-    marks = {rank_mark(result.declared, table) for result in results for table in result.tables.values()}
-    return {mark: meaning for mark, meaning in _MARKS.items() if mark in marks}
 
 
 def row_name(result: Result, table: Table) -> str:

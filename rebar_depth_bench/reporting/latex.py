@@ -44,10 +44,10 @@ _HEADS: Mapping[str, str] = {
     "scaled.abs_rel": "AbsRel$_s$",
     "scale_median": "$s$",
     "aligned.error": "$E$",
-    "constant.error": "const. $E$",
+    "constant.error": r"\shortstack[r]{const.\\$E$}",
     "aligned.abs_rel": "AbsRel",
     "aligned_robust.abs_rel": "robust",
-    "constant.abs_rel": "const. AbsRel",
+    "constant.abs_rel": r"\shortstack[r]{const.\\AbsRel}",
 }
 _ARROWS: Mapping[Better, str] = {"lower": r" $\downarrow$", "higher": r" $\uparrow$", "": ""}
 _MISSING = "--"
@@ -195,7 +195,8 @@ def _result_rows(
 def _head(column: Column) -> str:
     """Return the heading of a column; that of the paper's table, if it has one."""
     unit = f", {column.unit}" if column.unit else ""
-    return _HEADS.get(column.path, escape_latex(f"{column.title}{unit}")) + _ARROWS[column.better]
+    arrow = "" if column in ALIGNED_CONSTANT else _ARROWS[column.better]
+    return _HEADS.get(column.path, escape_latex(f"{column.title}{unit}")) + arrow
 
 
 def _sort_key(table: Table | None) -> tuple[bool, bool, float]:

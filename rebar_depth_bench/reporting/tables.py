@@ -46,7 +46,6 @@ from rebar_depth_bench.scoring.columns import (
     texts,
     with_reference,
 )
-from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND, kind_blocks, kind_text, relative_findings
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.table import PublishedMatch, Table
@@ -68,10 +67,7 @@ def print_line(console: Console, line: str, style: str = "") -> None:
 
 
 def make_grid(name: str | Text, heads: Sequence[str | Text], *, fold: bool = False) -> RichTable:
-    """Return a table without rows: a column of names, and right-aligned columns, which are never truncated.
-
-    Long names are wrapped if ``fold``.
-    """
+    """Return a table without rows: names, wrapped if ``fold``, and right-aligned columns, never truncated."""
     grid = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
     grid.add_column(name, no_wrap=not fold, overflow="fold" if fold else "ellipsis")
     for head in heads:
@@ -250,7 +246,7 @@ COMPARISON_NOTE = (
     f"{MIN_BLOCKS} blocks or, with splits, scenes. B is called better "
     "or worse if the interval excludes zero, which happens by chance in about one of twenty comparisons. "
     "Errors of valid predictions are not compared if either submission has a coverage below 95 %, a view "
-    "without prediction or an overflow; the rank error counts every scored pixel."
+    "without prediction or an overflow; the error over all scored pixels always is."
 )
 """Explanation of the numbers of a comparison."""
 
@@ -281,8 +277,7 @@ def print_comparison(comparison: Comparison, console: Console) -> None:
             table.add_row(*map(plain_text, comparison_cells(row)))
         print_unwrapped(console, table)
     console.print()
-    is_metric = comparison.provenance.protocol == PROTOCOL
-    print_line(console, COMPARISON_NOTE if is_metric else COMPARISON_NOTE.replace("the rank error", "the error"))
+    print_line(console, COMPARISON_NOTE)
 
 
 def views_note(rows: Sequence[Difference]) -> str:
@@ -313,18 +308,15 @@ def disambiguate_method_names(results: Sequence[Result]) -> list[Result]:
     number if the same archive occurs again.
     """
     names = Counter(result.method for result in results)
-    methods = [
-        f"{result.method} ({result.submission.sha256[:8]})" if names[result.method] > 1 else result.method
-        for result in results
-    ]
-    numbered = [
-        f"{method} {before + 1}" if (before := methods[:place].count(method)) else method
-        for place, method in enumerate(methods)
-    ]
-    return [
-        replace(result, submission=replace(result.submission, method=method))
-        for result, method in zip(results, numbered, strict=True)
-    ]
+    renamed = []
+    for place, result in enumerate(results):
+        submission = result.submission
+        if names[result.method] > 1:
+            before = [one.submission for one in results[:place]].count(submission)
+            method = f"{result.method} ({submission.sha256[:8]})" + (f" {before + 1}" if before else "")
+            submission = replace(submission, method=method)
+        renamed.append(replace(result, submission=submission))
+    return renamed
 
 
 def print_paper_table(

@@ -119,17 +119,14 @@ def results_context(result: Result, views: Mapping[str, Sequence[ViewScore]]) ->
 
 def relative_context(result: Result, views: Mapping[str, Sequence[ViewScore]]) -> dict[str, object]:
     """Return the context of ``part_relative.html.j2``, of predictions that are not metric."""
+    robust = () if result.kind == "scale" else ALIGNED_ROBUST[1:2]
     return {
         **_tables_context(result),
         "group_note": formatting.ALIGNED_GROUP_NOTE,
         "kind_text": kind_text(result),
         "alignments": {"aligned": ALIGNED, "robust": ALIGNED_ROBUST, "constant": ALIGNED_CONSTANT},
         "aligned_note": formatting.ALIGNED_NOTE,
-        "view_columns": [
-            column
-            for column in (*ALIGNED[:5], ALIGNED[6], ALIGNED_ROBUST[1], *ALIGNED_CONSTANT[:2])
-            if column in result.columns
-        ],
+        "view_columns": (*ALIGNED[:5], ALIGNED[6], *robust, *ALIGNED_CONSTANT[:2]),
         "view_tables": [(printable(name), worst_first(scores), WORST_SHOWN) for name, scores in views.items()],
     }
 
