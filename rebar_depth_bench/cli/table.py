@@ -45,7 +45,7 @@ def run(options: argparse.Namespace) -> None:
     """Score all archives, write the requested files and print the table."""
     if options.figure:
         check_figure(options.figure)
-    results = score_archives(options.archives, options, _check_figure_kinds if options.figure else list)
+    results = score_archives(options.archives, options, _check_figure_kinds if options.figure else lambda _: None)
     check_same_splits(results)
     results = disambiguate_method_names(results)
     published = not options.no_published
