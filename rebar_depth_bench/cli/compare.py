@@ -7,20 +7,18 @@ import json
 
 from rich.console import Console
 
-from rebar_depth_bench.base.terminal import ProgressBars
+from rebar_depth_bench.base.terminal import print_notice
 from rebar_depth_bench.base.writing import write_output
 from rebar_depth_bench.cli.console import (
     InputFile,
-    add_align,
-    add_data,
-    add_expect_digest,
     add_output_file,
+    add_scored_data,
     add_workers,
     prints_table,
+    score_archives,
 )
 from rebar_depth_bench.reporting.tables import print_comparison
-from rebar_depth_bench.scoring.comparison import compare
-from rebar_depth_bench.scoring.evaluation import score
+from rebar_depth_bench.scoring.comparison import check_same_kinds, compare
 from rebar_depth_bench.scoring.frames import differences_frame, frame_csv
 
 
@@ -28,9 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     parser.add_argument("first", type=InputFile, metavar="A", help="the archive that the others are compared with")
     parser.add_argument("others", type=InputFile, metavar="B", nargs="+", help="one or more archives")
-    add_data(parser)
-    add_expect_digest(parser)
-    add_align(parser)
+    add_scored_data(parser)
     add_output_file(parser, "--json", "write the differences as JSON")
     add_output_file(parser, "--csv", "write the differences as CSV")
     add_workers(parser)
@@ -38,19 +34,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(options: argparse.Namespace) -> None:
     """Score all archives, compare each with the first, and write and print the differences."""
-    with ProgressBars() as bars:
-        first, *others = (
-            score(
-                archive,
-                options.data,
-                workers=options.workers,
-                expect_digest=options.expect_digest,
-                align=options.align,
-                progress=bars.update,
-            )
-            for archive in (options.first, *options.others)
-        )
+    first, *others = score_archives([options.first, *options.others], options, check_same_kinds)
     comparisons = [compare(first, other) for other in others]
+    for other, comparison in zip(others, comparisons, strict=True):
+        if names := [name for name in {**first.tables, **other.tables} if name not in comparison.configs]:
+            print_notice(f"only in one of {first.method} and {other.method}, not compared: {', '.join(names)}")
     content = [comparison.to_dict() for comparison in comparisons]
     if options.json:
         write_output(options.json, json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")

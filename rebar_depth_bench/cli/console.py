@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from rebar_depth_bench import software_version
 from rebar_depth_bench.base.errors import InputError, OutputError, RebarDepthError
 from rebar_depth_bench.base.reading import parse_number
-from rebar_depth_bench.base.terminal import print_notice, use_plain_characters
+from rebar_depth_bench.base.terminal import ProgressBars, print_notice, use_plain_characters
 from rebar_depth_bench.base.writing import (
     STANDARD_OUTPUT,
     WRITE_ERRORS,
@@ -30,6 +30,7 @@ from rebar_depth_bench.base.writing import (
 
 if TYPE_CHECKING:
     from rebar_depth_bench.data.manifest import DatasetFolder
+    from rebar_depth_bench.scoring.result import Result
 
 EXIT_DONE, EXIT_OTHER, EXIT_INPUT = 0, 1, 2
 """Exit codes: success, any other error, invalid input."""
@@ -186,10 +187,12 @@ def positive_number(text: str, expected: str, high: float = sys.float_info.max) 
     return value
 
 
-def add_align(parser: argparse.ArgumentParser) -> None:
-    """Add the option that scores metric archives as those of another kind."""
+def add_scored_data(parser: argparse.ArgumentParser) -> None:
+    """Add the options of the dataset, and the one that scores metric archives as those of another kind."""
     from rebar_depth_bench.submission.declaration import METRIC, PREDICTION_KINDS  # Most commands do not need it.
 
+    add_data(parser)
+    add_expect_digest(parser)
     parser.add_argument(
         "--align",
         choices=[kind for kind in PREDICTION_KINDS if kind != METRIC],
@@ -204,6 +207,26 @@ def add_expect_digest(parser: argparse.ArgumentParser) -> None:
         metavar="DIGEST",
         help="refuse any other dataset than that with this ground-truth digest (sha256:...)",
     )
+
+
+def score_archives(
+    archives: Sequence[str], options: argparse.Namespace, check_kinds: Callable[[Sequence[tuple[str, str]]], None]
+) -> list[Result]:
+    """Score archives with a command's options; before any, call ``check_kinds`` with method and kind of each."""
+    from rebar_depth_bench.data.manifest import open_folder  # Most commands do not score.
+    from rebar_depth_bench.scoring.evaluation import open_evaluation, score
+
+    folder = open_folder(options.data, expect_digest=options.expect_digest)
+    kinds = []
+    for archive in archives:
+        with open_evaluation(archive, folder) as evaluation:
+            kinds.append((evaluation.meta.method, evaluation.kind(options.align)))
+    check_kinds(kinds)
+    with ProgressBars() as bars:
+        return [
+            score(archive, folder, workers=options.workers, align=options.align, progress=bars.update)
+            for archive in archives
+        ]
 
 
 def print_verified(

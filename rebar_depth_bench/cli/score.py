@@ -10,11 +10,9 @@ from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.base.terminal import ProgressBars, print_notice
 from rebar_depth_bench.base.writing import write_output
 from rebar_depth_bench.cli.console import (
-    add_align,
     add_archive,
-    add_data,
-    add_expect_digest,
     add_output_file,
+    add_scored_data,
     add_workers,
     print_verified,
     prints_table,
@@ -31,9 +29,7 @@ from rebar_depth_bench.scoring.result import Result
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     add_archive(parser)
-    add_data(parser)
-    add_expect_digest(parser)
-    add_align(parser)
+    add_scored_data(parser)
     add_output_file(parser, "--json", "write the result as JSON")
     add_output_file(parser, "--html", "write a self-contained report")
     parser.add_argument(

@@ -3,38 +3,36 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
 
 from rich.console import Console
 
 from rebar_depth_bench.base.errors import InputError, printable
-from rebar_depth_bench.base.terminal import ProgressBars, print_notice
+from rebar_depth_bench.base.terminal import print_notice
 from rebar_depth_bench.base.writing import write_output
 from rebar_depth_bench.cli.console import (
     InputFile,
-    add_align,
-    add_data,
-    add_expect_digest,
     add_output_file,
+    add_scored_data,
     add_workers,
     prints_table,
+    score_archives,
 )
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.reporting.figure import check_figure, write_figure
 from rebar_depth_bench.reporting.latex import latex_table
 from rebar_depth_bench.reporting.tables import disambiguate_method_names, print_paper_table
 from rebar_depth_bench.scoring.comparison import check_same_splits
-from rebar_depth_bench.scoring.evaluation import score
 from rebar_depth_bench.scoring.frames import frame_csv, tables_frame
 from rebar_depth_bench.scoring.truth import paper_differences
+from rebar_depth_bench.submission.declaration import METRIC
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     archives = "submission archives (zip), one table row per archive"
     parser.add_argument("archives", type=InputFile, metavar="ARCHIVE", nargs="+", help=archives)
-    add_data(parser)
-    add_expect_digest(parser)
-    add_align(parser)
+    add_scored_data(parser)
     add_output_file(parser, "--latex", "write the table as LaTeX (booktabs)")
     add_output_file(parser, "--csv", "write all tables as CSV")
     add_output_file(parser, "--figure", "draw native against scaled AbsRel of all configs (.svg, .png or .pdf)")
@@ -47,23 +45,8 @@ def run(options: argparse.Namespace) -> None:
     """Score all archives, write the requested files and print the table."""
     if options.figure:
         check_figure(options.figure)
-    with ProgressBars() as bars:
-        results = [
-            score(
-                archive,
-                options.data,
-                workers=options.workers,
-                expect_digest=options.expect_digest,
-                align=options.align,
-                progress=bars.update,
-            )
-            for archive in options.archives
-        ]
+    results = score_archives(options.archives, options, _check_figure_kinds if options.figure else lambda _: None)
     check_same_splits(results)
-    for result in results if options.figure else ():
-        if result.prediction is not None:
-            found = f"{result.method} has predictions of the kind {result.kind}"
-            raise InputError(f"--figure: {found}, expected metric ones: the figure shows native errors")
     results = disambiguate_method_names(results)
     published = not options.no_published
     absent = []
@@ -81,3 +64,10 @@ def run(options: argparse.Namespace) -> None:
             print_notice(note)
     if prints_table(options):
         print_paper_table(results, Console(), published=published, absent=absent)
+
+
+def _check_figure_kinds(kinds: Sequence[tuple[str, str]]) -> None:
+    for method, kind in kinds:
+        if kind != METRIC:
+            found = f"{method} has predictions of the kind {kind}"
+            raise InputError(f"--figure: {found}, expected metric ones: the figure shows native errors")

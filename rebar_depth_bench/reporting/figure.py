@@ -25,6 +25,7 @@ from rebar_depth_bench.reporting.formatting import (
     config_title,
     counted,
     rank_mark,
+    row_notes,
     scaled_constants,
 )
 from rebar_depth_bench.reporting.published import (
@@ -189,7 +190,8 @@ def _errors(table: Table) -> tuple[float, float] | None:
 def _name(result: Result) -> str:
     """Return a method's name with the mark of its declaration, as the tables show it."""
     table = next((table for table in result.tables.values() if table.views), None)
-    return printable(result.method) + (rank_mark(result.declared, table) if table else "")
+    mark = rank_mark(result.declared, table) if table else ""
+    return f"{printable(result.method)} {mark}".rstrip()
 
 
 def _notes(results: Sequence[Result], panels: Sequence[Panel]) -> list[str]:
@@ -198,10 +200,7 @@ def _notes(results: Sequence[Result], panels: Sequence[Panel]) -> list[str]:
     if any(point.hollow for point in points):
         percent = f"{MIN_COMPARABLE_COVERAGE * 100:.0f} %"
         notes.append(f"Hollow: coverage below {percent} or a view without prediction; errors over chosen pixels.")
-    if any(result.declared.uses_ground_truth for result in results):
-        notes.append("‡: not ranked (declares the use of ground truth).")
-    if any(result.declared.uses_ground_truth is None for result in results):
-        notes.append("?: use of ground truth not declared.")
+    notes += [f"{mark}: {meaning}." for mark, meaning, listed in row_notes(results, ()) if not listed]
     if any(point.published for point in points):
         part = load_published().parts["synthetic"]
         notes.append(f"Paper: {part.place}, {part.mark}.")

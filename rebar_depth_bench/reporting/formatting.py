@@ -45,6 +45,8 @@ ALIGNED_NOTE = (
     "1 where x has no value or p <= 0. Never ranked."
 )
 
+_MARKS = {"‡": "Not ranked (declares the use of ground truth)", "?": "Use of ground truth not declared"}
+
 INTERVAL_NOTE = (
     "Small figures: 95 % interval, block bootstrap over views (other views of the same scene, not other scenes)."
 )
@@ -130,9 +132,13 @@ def row_notes(results: Sequence[Result], absent: Sequence[str]) -> list[tuple[st
         for name, table in result.tables.items()
         if (reasons := incomparable_reasons(table))
     ]
+    aligned = [printable(result.method, 40) for result in results if result.declared_prediction]
     incomparable = ("*", "Errors of valid predictions are not compared with those of others: ", marked)
     without_paper = ("", "The paper's rows are absent; the configs differ from its scenes: ", absent)
-    return [note for note in (incomparable, without_paper) if note[-1]]
+    as_another_kind = ("", "Metric predictions, aligned as this kind: ", aligned)
+    marks = {rank_mark(result.declared, table) for result in results for table in result.tables.values()}
+    declared = [(mark, meaning, ()) for mark, meaning in _MARKS.items() if mark in marks]
+    return declared + [note for note in (incomparable, as_another_kind, without_paper) if note[-1]]
 
 
 def grouping_title(grouping: str) -> str:
@@ -183,10 +189,16 @@ def paper_reference_rows(results: Sequence[tuple[str, Table]]) -> list[tuple[str
 
 
 def rank_mark(declared: Declaration, table: Table) -> str:
-    """Return the mark of a row that is not ranked (‡) or whose use of ground truth is not declared (?)."""
-    if not table.ranked:
-        return " ‡"
-    return " ?" if declared.uses_ground_truth is None else ""
+    """Return the mark of a row that uses ground truth, or is metric and not ranked (‡), or ? if undeclared."""
+    if declared.uses_ground_truth or not (table.ranked or table.aligned):
+        return "‡"
+    return "?" if declared.uses_ground_truth is None else ""
+
+
+def row_name(result: Result, table: Table) -> str:
+    """Return the method of a row of a table with its marks, that of ``row_notes`` included."""
+    marks = (rank_mark(result.declared, table), "*" if incomparable_reasons(table) else "")
+    return " ".join([printable(result.method, 40), *filter(None, marks)])
 
 
 def reference_findings(table: Table) -> list[str]:

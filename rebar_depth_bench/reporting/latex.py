@@ -44,16 +44,15 @@ _HEADS: Mapping[str, str] = {
     "scaled.abs_rel": "AbsRel$_s$",
     "scale_median": "$s$",
     "aligned.error": "$E$",
-    "constant.error": "const.",
+    "constant.error": r"\shortstack[r]{const.\\$E$}",
     "aligned.abs_rel": "AbsRel",
     "aligned_robust.abs_rel": "robust",
-    "constant.abs_rel": "const.",
+    "constant.abs_rel": r"\shortstack[r]{const.\\AbsRel}",
 }
 _ARROWS: Mapping[Better, str] = {"lower": r" $\downarrow$", "higher": r" $\uparrow$", "": ""}
 _MISSING = "--"
 _NO_OTHERS = [""] * len(OTHERS)
-_UNRANKED_MARK = r"$^{\ddagger}$"
-_INCOMPARABLE_MARK = "$^{*}$"
+_MARKS: Mapping[str, str] = {"‡": r"$^{\ddagger}$", "?": "$^{?}$", "*": "$^{*}$", "": ""}
 _OTHER_OPTICS_MARK = r"$^{\S}$"
 _ANCHORED_MARK = r"$^{\dagger}$"
 _LATEX_ESCAPES = {
@@ -71,6 +70,8 @@ _LATEX_ESCAPES = {
     **{char: f"{{{char}}}" for char in "[]*"},
 }
 _LIGATURE = re.compile(r"([-',])(?=\1)")
+_FORMULA = re.compile(r"(?:1 / )?p = (?:a x \+ b|x median\(z\) / median\(x\))|(?:1 / )?\bz\b")
+"""Formulas in ``ALIGNMENT_BY_KIND``."""
 
 
 def latex_table(
@@ -80,11 +81,12 @@ def latex_table(
 
     RMSE (cm) and AbsRel are native, AbsRel_s is computed after the oracle scale, s is its median over views. The
     best number of a column is bold if the column has two or more ranked rows; a row that is not ranked is marked
-    with a double dagger and is never bold. The RMSE of a row whose errors are not compared with those of others
-    has an asterisk. With ``published``, the paper's rows of the same scenes follow below a rule; they are marked
-    and not compared with the results. ``absent`` is as in ``print_paper_table``. With ``intervals``, the 95 %
-    intervals are printed beside the numbers, and each block holds one config. Results that are not metric follow
-    in a table for each kind, in the order of the aligned error of a block's first config, without bold numbers.
+    with a double dagger and is never bold. The first error of valid predictions of a row whose errors are not
+    compared with those of others has an asterisk. With ``published``, the paper's rows of the same scenes follow
+    below a rule; they are marked and not compared with the results. ``absent`` is as in ``print_paper_table``.
+    With ``intervals``, the 95 % intervals are printed beside the numbers, and each block holds one config. Results
+    that are not metric follow in a table for each kind, in the order of the aligned error of a block's first
+    config, without bold numbers.
 
     Raises ``InputError`` if there are no results, or if they belong to different datasets.
     """
@@ -110,7 +112,9 @@ def _table_of_kind(results: Sequence[Result], absent: Sequence[str], *, publishe
     return _template().render(
         protocol=results[0].protocol,
         kind=kind,
-        alignment=ALIGNMENT_BY_KIND.get(kind or ""),
+        alignment=_FORMULA.sub(r"$\g<0>$", ALIGNMENT_BY_KIND.get(kind or "", "")).replace(
+            "median", r"\mathrm{med}"
+        ),
         heads=[_head(column) for column in columns],
         version=results[0].dataset.version,
         digest=formatting.short_digest(results[0].dataset.digest, 16),
@@ -118,11 +122,8 @@ def _table_of_kind(results: Sequence[Result], absent: Sequence[str], *, publishe
             f"{_config_name(config, table)} {formatting.counted(table.views, 'view')}"
             for config, table in tables.items()
         ],
-        unranked=any(not table.ranked for result in results for table in result.tables.values()),
-        undeclared=any(result.declared.uses_ground_truth is None for result in results),
-        unranked_mark=_UNRANKED_MARK,
         notes=[
-            _INCOMPARABLE_MARK * bool(mark) + start + "; ".join(map(escape_latex, listed)) + "."
+            _MARKS[mark] + start + "; ".join(map(escape_latex, listed)) + "."
             for mark, start, listed in formatting.row_notes(results, absent if kind is None else ())
         ],
         intervals=intervals,
@@ -184,8 +185,8 @@ def _result_rows(
     shown = [result for result in results if any(name in result.tables for name in configs)]
     return [
         [
-            escape_latex(result.method) + ("" if result.declared.uses_ground_truth is not None else "$^{?}$"),
-            *(cell for one in configs for cell in _cells(result.tables.get(one), columns, best[one], intervals)),
+            escape_latex(result.method) + _MARKS["?"] * (result.declared.uses_ground_truth is None),
+            *(cell for one in configs for cell in _cells(result, one, columns, best[one], intervals)),
         ]
         for result in sorted(shown, key=lambda result: _sort_key(result.tables.get(configs[0])))
     ]
@@ -194,7 +195,8 @@ def _result_rows(
 def _head(column: Column) -> str:
     """Return the heading of a column; that of the paper's table, if it has one."""
     unit = f", {column.unit}" if column.unit else ""
-    return _HEADS.get(column.path, escape_latex(f"{column.title}{unit}")) + _ARROWS[column.better]
+    arrow = "" if column in ALIGNED_CONSTANT else _ARROWS[column.better]
+    return _HEADS.get(column.path, escape_latex(f"{column.title}{unit}")) + arrow
 
 
 def _sort_key(table: Table | None) -> tuple[bool, bool, float]:
@@ -221,8 +223,11 @@ def _best_texts(tables: Iterable[Table | None]) -> dict[str, str]:
     }
 
 
-def _cells(table: Table | None, columns: Sequence[Column], best: Mapping[str, str], intervals: bool) -> list[str]:
+def _cells(
+    result: Result, config: str, columns: Sequence[Column], best: Mapping[str, str], intervals: bool
+) -> list[str]:
     """Return a config's cells; ``best`` holds the formatted best number of columns."""
+    table = result.tables.get(config)
     if table is None:
         return [_MISSING] * len(columns)
     cells = []
@@ -231,8 +236,9 @@ def _cells(table: Table | None, columns: Sequence[Column], best: Mapping[str, st
         interval = column.interval_text(column.interval(table), ", ") if intervals else ""
         shown = rf"\textbf{{{number}}}" if table.ranked and number == best.get(column.path) else number
         cells.append(shown + (rf" {{\tiny[{interval}]}}" if interval else ""))
-    cells[0] += _UNRANKED_MARK if not table.ranked and table.aligned is None else ""
-    cells[1] += _INCOMPARABLE_MARK if formatting.incomparable_reasons(table) else ""
+    cells[0] += _MARKS["‡"] if formatting.rank_mark(result.declared, table) == "‡" else ""
+    of_valid = next(place for place, column in enumerate(columns) if not column.of_all_views)
+    cells[of_valid] += _MARKS["*"] if formatting.incomparable_reasons(table) else ""
     return cells
 
 

@@ -46,7 +46,7 @@ from rebar_depth_bench.scoring.columns import (
     texts,
     with_reference,
 )
-from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND, kind_blocks, relative_findings
+from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND, kind_blocks, kind_text, relative_findings
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.table import PublishedMatch, Table
 
@@ -66,12 +66,9 @@ def print_line(console: Console, line: str, style: str = "") -> None:
     console.print(plain_text(line, style))
 
 
-def make_grid(name: str | Text, heads: Sequence[str | Text], *, fold: bool = False, left: int = 0) -> RichTable:
-    """Return a table without rows: a column of names, and right-aligned columns, which are never truncated.
-
-    Long names are wrapped if ``fold``. ``left`` is the number of spaces on the left of each column.
-    """
-    grid = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, left), show_edge=False)
+def make_grid(name: str | Text, heads: Sequence[str | Text], *, fold: bool = False) -> RichTable:
+    """Return a table without rows: names, wrapped if ``fold``, and right-aligned columns, never truncated."""
+    grid = RichTable(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
     grid.add_column(name, no_wrap=not fold, overflow="fold" if fold else "ellipsis")
     for head in heads:
         grid.add_column(head, justify="right", no_wrap=True)
@@ -142,7 +139,7 @@ def print_table(result: Result, console: Console) -> None:
     print_line(console, "inputs: {}; ground truth: {}".format(*declared), style="dim")
     layouts, group_layouts = _LAYOUTS, _GROUP_LAYOUTS
     if result.prediction is not None:
-        print_line(console, f"{result.prediction}: {ALIGNMENT_BY_KIND[result.prediction]}", style="italic")
+        print_line(console, kind_text(result), style="italic")
         layouts = group_layouts = _ALIGNED_LAYOUTS
     _print_rows(_config_rows(result.tables), console, layouts, "config")
     for config, table in result.tables.items():
@@ -249,7 +246,7 @@ COMPARISON_NOTE = (
     f"{MIN_BLOCKS} blocks or, with splits, scenes. B is called better "
     "or worse if the interval excludes zero, which happens by chance in about one of twenty comparisons. "
     "Errors of valid predictions are not compared if either submission has a coverage below 95 %, a view "
-    "without prediction or an overflow; the rank error counts every scored pixel."
+    "without prediction or an overflow; the error over all scored pixels always is."
 )
 """Explanation of the numbers of a comparison."""
 
@@ -274,7 +271,7 @@ def print_comparison(comparison: Comparison, console: Console) -> None:
     for config, rows in comparison.configs.items():
         console.print()
         print_line(console, f"{printable(config)}, {views_note(rows)}", style="italic")
-        table = make_grid("number", ("A", "B", "B - A", "95 % interval"), left=1)
+        table = make_grid("number", ("A", "B", "B - A", "95 % interval"))
         table.add_column("B is")
         for row in rows:
             table.add_row(*map(plain_text, comparison_cells(row)))
@@ -307,18 +304,19 @@ _HEADS = ("rank err. ↓", "RMSE cm ↓", "AbsRel ↓", "AbsRel_s ↓", "s")
 def disambiguate_method_names(results: Sequence[Result]) -> list[Result]:
     """Return the results with unique method names.
 
-    A name that occurs more than once gets the first eight digits of its submission's SHA-256 appended.
+    A name that occurs more than once gets the first eight digits of its submission's SHA-256 appended, and a
+    number if the same archive occurs again.
     """
     names = Counter(result.method for result in results)
-    return [
-        replace(
-            result,
-            submission=replace(result.submission, method=f"{result.method} ({result.submission.sha256[:8]})"),
-        )
-        if names[result.method] > 1
-        else result
-        for result in results
-    ]
+    renamed = []
+    for place, result in enumerate(results):
+        submission = result.submission
+        if names[result.method] > 1:
+            before = [one.submission for one in results[:place]].count(submission)
+            method = f"{result.method} ({submission.sha256[:8]})" + (f" {before + 1}" if before else "")
+            submission = replace(submission, method=method)
+        renamed.append(replace(result, submission=submission))
+    return renamed
 
 
 def print_paper_table(
@@ -352,28 +350,24 @@ def print_paper_table(
             if kind is None:
                 console.print(_paper_table(rows, table.published if published else None))
             else:
-                aligned = [row for result, of in rows for row in _table_rows(printable(result.method, 40), of)]
+                aligned = [row for result, of in rows for row in _table_rows(formatting.row_name(result, of), of)]
                 _print_rows(aligned, console, _ALIGNED_LAYOUTS, "")
                 for result, of in rows:
                     for note in relative_findings(of):
                         print_line(console, f"{printable(result.method)}: {note}", style="yellow")
         console.print()
-        if kind is None:
-            _print_paper_notes(block, console, absent, published=published)
-        else:
-            print_line(console, formatting.ALIGNED_NOTE)
+        _print_paper_notes(block, console, absent if kind is None else (), published=published)
 
 
 def _print_paper_notes(
     results: Sequence[Result], console: Console, absent: Sequence[str], *, published: bool
 ) -> None:
-    print_line(console, "RMSE, AbsRel: native (no alignment). AbsRel_s: scaled (oracle median scale per view).")
-    print_line(
-        console,
-        "s: median over views of median(z)/median(p). ‡: not ranked (declares the use of ground truth). "
-        "?: use of ground truth not declared.",
-    )
-    print_line(console, f"{formatting.RANK_ERROR_NOTE} {formatting.REFERENCE_NOTE}")
+    if results[0].prediction is None:
+        native = "RMSE, AbsRel: native (no alignment). AbsRel_s: scaled (oracle median scale per view)."
+        print_line(console, f"{native} s: median over views of median(z)/median(p).")
+        print_line(console, f"{formatting.RANK_ERROR_NOTE} {formatting.REFERENCE_NOTE}")
+    else:
+        print_line(console, formatting.ALIGNED_NOTE)
     for mark, start, listed in formatting.row_notes(results, absent):
         print_line(console, f"{mark and mark + ': '}{start}{'; '.join(listed)}.", style="yellow")
     if published and any(table.published for result in results for table in result.tables.values()):
@@ -382,11 +376,10 @@ def _print_paper_notes(
 
 
 def _paper_table(rows: Sequence[tuple[Result, Table]], match: PublishedMatch | None) -> RichTable:
-    paper = make_grid("", _HEADS, fold=True, left=1)
+    paper = make_grid("", _HEADS, fold=True)
     for result, table in rows:
-        name = printable(result.method, 40) + formatting.rank_mark(result.declared, table)
-        name += " *" * bool(formatting.incomparable_reasons(table))
-        paper.add_row(*map(plain_text, [name, *texts((RANK_ERROR, *PAPER_COLUMNS), table)]))
+        cells = texts((RANK_ERROR, *PAPER_COLUMNS), table)
+        paper.add_row(*map(plain_text, [formatting.row_name(result, table), *cells]))
     for title, cells in formatting.paper_reference_rows([(result.method, table) for result, table in rows]):
         paper.add_row(*map(plain_text, [f"reference: {title}", "", *cells]), style="dim")
     if match is not None:

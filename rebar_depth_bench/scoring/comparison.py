@@ -16,6 +16,7 @@ from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.base.names import config_of
 from rebar_depth_bench.scoring.bootstrap import INTERVALS, Interval, resample_views
 from rebar_depth_bench.scoring.columns import (
+    ALIGNED_CONSTANT,
     Column,
     bootstrap_estimates,
     column_intervals,
@@ -81,11 +82,7 @@ def compare(first: Result, other: Result) -> Comparison:
     Raises ``InputError`` if they were scored against different ground truth or are of different kinds, have no
     config in common, or cover different splits of one.
     """
-    if first.kind != other.kind:
-        raise InputError(
-            f"{other.method} has predictions of the kind {other.kind}, expected {first.kind} as {first.method}: "
-            "errors after different alignments cannot be compared; --align scores metric ones as another kind"
-        )
+    check_same_kinds([(result.method, result.kind) for result in (first, other)])
     if first.dataset.digest != other.dataset.digest:
         raise InputError(
             f"{other.method} was scored on the dataset {other.dataset.digest}, expected {first.dataset.digest} as "
@@ -104,6 +101,17 @@ def compare(first: Result, other: Result) -> Comparison:
     )
 
 
+def check_same_kinds(kinds: Sequence[tuple[str, str]]) -> None:
+    """Raise ``InputError`` if the kinds of predictions of methods, pairs of both, differ."""
+    first_method, first_kind = kinds[0]
+    for method, kind in kinds:
+        if kind != first_kind:
+            raise InputError(
+                f"{method} has predictions of the kind {kind}, expected {first_kind} as {first_method}: "
+                "errors after different alignments cannot be compared; --align scores metric ones as another kind"
+            )
+
+
 def check_same_splits(results: Sequence[Result]) -> None:
     """Raise ``InputError`` if two results cover different splits of a config."""
     first: dict[str, tuple[str, str | None]] = {}
@@ -119,6 +127,8 @@ def check_same_splits(results: Sequence[Result]) -> None:
 def _config_differences(first: Result, other: Result, config: str) -> list[Difference]:
     """Return one difference per metric; error metrics use only the views where both submissions have a value."""
     tables = first.tables[config], other.tables[config]
+    # The constant of a fit differs with the pixels that have a value, not with the quality of a method.
+    columns = [column for column in first.columns if column not in ALIGNED_CONSTANT]
     of_first, of_other = (
         {view.view_id: view for view in result.views if config_of(view.view_id) == config}
         for result in (first, other)
@@ -130,15 +140,13 @@ def _config_differences(first: Result, other: Result, config: str) -> list[Diffe
         _differences_on_views(
             [of_first[view_id] for view_id in view_ids],
             [of_other[view_id] for view_id in view_ids],
-            first.columns,
+            columns,
             by_scene=tables[0].split is not None,
             are_comparable=all(table.is_comparable for table in tables),
         )
         for view_ids in (of_first, predicted_by_both)
     )
-    return [
-        (on_all_views if column.of_all_views else on_predicted_by_both)[column.path] for column in first.columns
-    ]
+    return [(on_all_views if column.of_all_views else on_predicted_by_both)[column.path] for column in columns]
 
 
 def _differences_on_views(

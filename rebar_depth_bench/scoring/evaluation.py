@@ -138,6 +138,15 @@ class Evaluation:
         if problems:
             raise SubmissionError.from_problems(self.submission.path, problems)
 
+    def kind(self, align: str | None = None) -> str:
+        """Return the kind that the predictions are scored as; errors for ``align`` as in ``score_evaluation``."""
+        kind = align or self.meta.prediction
+        if kind not in PREDICTION_KINDS:
+            raise InputError(f"align is {escape_text(kind)}, expected one of {', '.join(PREDICTION_KINDS)}")
+        if kind != self.meta.prediction:
+            self.require_metric(f"only they can be scored as {kind}")
+        return kind
+
     def require_metric(self, use: str) -> None:
         """Raise ``SubmissionError`` unless the predictions are metric, which ``use`` requires."""
         if problems := self.meta.kind_problems(use):
@@ -169,7 +178,7 @@ def open_evaluation(
 
 def score(
     archive: str | os.PathLike[str],
-    root: str | Path,
+    root: str | Path | DatasetFolder,
     *,
     workers: int | None = None,
     expect_digest: str | None = None,
@@ -204,11 +213,8 @@ def score_evaluation(
     of that kind, and ``InputError`` if ``align`` is no kind.
     """
     submission, folder, meta = evaluation.submission, evaluation.folder, evaluation.meta
-    kind, read = align or meta.prediction, submission.read
-    if kind not in PREDICTION_KINDS:
-        raise InputError(f"align is {escape_text(kind)}, expected one of {', '.join(PREDICTION_KINDS)}")
+    kind, read = evaluation.kind(align), submission.read
     if kind != meta.prediction:
-        evaluation.require_metric(f"only they can be scored as {kind}")
 
         def read(view_id: str) -> Float[ndarray, "h w"]:
             return metric_as(submission.read(view_id), kind)
@@ -240,4 +246,5 @@ def score_evaluation(
             views=views,
             protocol=PROTOCOL if kind == METRIC else RELATIVE_PROTOCOL,
             prediction=None if kind == METRIC else kind,
+            declared_prediction=None if kind == meta.prediction else meta.prediction,
         )

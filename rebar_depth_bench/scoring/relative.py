@@ -153,6 +153,12 @@ def kind_blocks(results: Iterable[Result]) -> list[list[Result]]:
     return [block for block in blocks.values() if block]
 
 
+def kind_text(result: Result) -> str:
+    """Return the kind of a result that is not metric and how it is aligned, and whether its archive is metric."""
+    declared = f"{result.declared_prediction} predictions, scored as " if result.declared_prediction else ""
+    return f"{declared}{result.kind}{' (--align)' if declared else ''}: {ALIGNMENT_BY_KIND[result.kind]}"
+
+
 def relative_findings(table: Table) -> list[str]:
     """Return a sentence on each sign that the alignment of a table makes up for what its predictions lack."""
     if table.aligned is None or table.constant is None:
@@ -162,7 +168,7 @@ def relative_findings(table: Table) -> list[str]:
         is_low = (table.coverage or 0.0) < MIN_COMPARABLE_COVERAGE
         missing = ", or missing values are most of both errors" if is_low else ""
         findings.append(
-            f"The aligned error {table.aligned.error:.4f} is above {LEAST_GAIN * 100:.0f} % of that of a constant "
+            f"The aligned error {table.aligned.error:.4f} is not below {LEAST_GAIN * 100:.0f} % of a constant's "
             f"({table.constant.error:.4f}): the fit hides that the predictions say little about depth{missing}."
         )
     if (table.flat_views or 0) > table.views / 2:

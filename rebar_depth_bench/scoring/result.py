@@ -47,7 +47,7 @@ from rebar_depth_bench.scoring.columns import (
     Share,
 )
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, PROTOCOL, RELATIVE_PROTOCOL
-from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND, relative_findings
+from rebar_depth_bench.scoring.relative import kind_text, relative_findings
 from rebar_depth_bench.scoring.table import (
     LIMITED,
     Count,
@@ -81,8 +81,8 @@ _SUMMARY = (
     ("coverage", "rank error", "AbsRel", "scaled", "constant", "within 5 mm"),
 )
 _RELATIVE_SUMMARY = (
-    (COVERAGE, *ALIGNED[:2], ALIGNED_ROBUST[1], ALIGNED_CONSTANT[1], ALIGNED[6]),
-    ("coverage", "aligned error", "AbsRel", "robust AbsRel", "constant", "within 5 mm"),
+    (COVERAGE, ALIGNED[0], ALIGNED_CONSTANT[0], ALIGNED[1], ALIGNED_ROBUST[1], ALIGNED[6]),
+    ("coverage", "aligned error", "constant error", "AbsRel", "robust AbsRel", "within 5 mm"),
 )
 """Columns that ``print(result)`` shows, and their headings."""
 
@@ -138,13 +138,14 @@ if not TYPE_CHECKING:
 class Result:
     """Result of scoring one submission, with the digests and versions of its inputs.
 
-    ``prediction`` is the kind of predictions that are not metric. ``intervals`` states how the intervals were
-    computed; None in a file of an earlier version, which does not. ``extended`` are the extended measures, None in
-    a result that was read from a file.
+    ``prediction`` is the kind of predictions that are not metric, ``declared_prediction`` that of an archive which
+    was scored as another. ``intervals`` states how the intervals were computed; None in a file of an earlier
+    version. ``extended`` are the extended measures, None in a result that was read from a file.
     """
 
     protocol: Annotated[str, Strict(), one_of(PROTOCOL, RELATIVE_PROTOCOL)] = PROTOCOL
     prediction: Annotated[str, Strict(), one_of(*PREDICTION_KINDS)] | None = None
+    declared_prediction: Annotated[str, Strict(), one_of(METRIC)] | None = None
     dataset: DatasetIdentity
     submission: SubmissionIdentity
     software: SoftwareIdentity
@@ -247,9 +248,7 @@ class Result:
     @property
     def kind_notes(self) -> list[str]:
         """A sentence on the kind of predictions that are not metric; none of metric ones."""
-        if self.prediction is None:
-            return []
-        return [f"{self.prediction}: {ALIGNMENT_BY_KIND[self.prediction]}; not ranked"]
+        return [] if self.prediction is None else [f"{kind_text(self)}; not ranked"]
 
     def __repr__(self) -> str:
         """Return the method, the numbers of the first ten configs, and the number of views."""

@@ -37,7 +37,7 @@ from rebar_depth_bench.reporting.published import OTHER_OPTICS_NOTE, load_publis
 from rebar_depth_bench.scoring.columns import ALIGNED, ALIGNED_CONSTANT, ALIGNED_ROBUST, VIEW_COLUMNS, has_dash
 from rebar_depth_bench.scoring.evaluation import Evaluation, View
 from rebar_depth_bench.scoring.groups import GROUPINGS
-from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND
+from rebar_depth_bench.scoring.relative import kind_text
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.table import Table, ViewScore
 
@@ -119,13 +119,14 @@ def results_context(result: Result, views: Mapping[str, Sequence[ViewScore]]) ->
 
 def relative_context(result: Result, views: Mapping[str, Sequence[ViewScore]]) -> dict[str, object]:
     """Return the context of ``part_relative.html.j2``, of predictions that are not metric."""
+    robust = () if result.kind == "scale" else ALIGNED_ROBUST[1:2]
     return {
         **_tables_context(result),
         "group_note": formatting.ALIGNED_GROUP_NOTE,
-        "alignment": ALIGNMENT_BY_KIND[result.kind],
+        "kind_text": kind_text(result),
         "alignments": {"aligned": ALIGNED, "robust": ALIGNED_ROBUST, "constant": ALIGNED_CONSTANT},
         "aligned_note": formatting.ALIGNED_NOTE,
-        "view_columns": (*ALIGNED[:5], ALIGNED[6], ALIGNED_ROBUST[1], *ALIGNED_CONSTANT[:2]),
+        "view_columns": (*ALIGNED[:5], ALIGNED[6], *robust, *ALIGNED_CONSTANT[:2]),
         "view_tables": [(printable(name), worst_first(scores), WORST_SHOWN) for name, scores in views.items()],
     }
 

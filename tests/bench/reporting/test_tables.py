@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -122,6 +123,13 @@ def test_constants_of_results_on_other_pixels_are_named() -> None:
     assert titles == [*formatting.scaled_constants(rows), "one pixel"]
     without = replace(rows[0][1], reference=REFERENCE)
     assert formatting.reference_rows([("x", without)])[0][0] == "one pixel"
+
+
+def test_names_of_references_fit_a_line() -> None:
+    other = scored_view("lattice/0000", coverage=0.9)
+    two = [result(scored_view("lattice/0000"), method="full"), result(other, method="sgbm")]
+    text = printed(lambda console: print_paper_table(two, console, published=False), 80)
+    assert "reference: constant, sgbm  " in text
 
 
 def test_scaled_error_is_compared_with_the_constant_on_the_same_pixels() -> None:
@@ -244,6 +252,9 @@ def test_table_command_writes_latex_and_csv(
     assert [json.loads(row["ranked"]) for row in rows] == [True, True]
     assert r"\begin{tabular}" in latex.read_text()
     assert "AbsRel_s" in capsys.readouterr().out
+    assert main(["table", archives[0], archives[0], "--data", str(tiny_root)]) == 0
+    labels = re.findall(r"^test \(\w+\)(?: 2)?", capsys.readouterr().out, re.MULTILINE)
+    assert labels == [labels[0], f"{labels[0]} 2"], "one archive twice"
     assert main(["table", "nowhere.zip", "--data", str(tiny_root)]) == 2
     assert "does not exist" in capsys.readouterr().err
 

@@ -5,24 +5,30 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 import zipfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from PIL import Image
+from rich.console import Console
 from scipy.optimize import minimize
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.cli.main import main
+from rebar_depth_bench.reporting.html.page import render_report
+from rebar_depth_bench.reporting.latex import latex_table
+from rebar_depth_bench.reporting.tables import print_paper_table
 from rebar_depth_bench.scoring import relative as scoring
-from rebar_depth_bench.scoring.columns import RELATIVE_INTERVALS
+from rebar_depth_bench.scoring.columns import METRICS, RELATIVE_INTERVALS
 from rebar_depth_bench.scoring.result import Result, read_result
 from rebar_depth_bench.scoring.table import AlignedErrors
 from tests.bench.reporting.pages import Page
+from tests.bench.reporting.test_browser import run_in_browser
 
 KINDS = ("scale", "affine-depth", "affine-disparity")
 AFFINE = KINDS[1:]
@@ -400,13 +406,13 @@ def test_unknown_kind_is_refused(tiny_root: Path, archive_of: Write, tiny_truth:
 def test_text_of_a_result(relative: Result, tiny_root: Path, write: Write) -> None:
     lines = str(relative).splitlines()
     assert lines[0].split("  ")[-6:] == [
-        *("coverage", "aligned error", "AbsRel", "robust AbsRel", "constant", "within 5 mm")
+        *("coverage", "aligned error", "constant error", "AbsRel", "robust AbsRel", "within 5 mm")
     ]
     table = relative.tables["lattice"]
     assert table.aligned is not None
     assert table.aligned_robust is not None
     assert table.constant is not None
-    errors = (table.aligned.error, table.aligned.abs_rel, table.aligned_robust.abs_rel, table.constant.abs_rel)
+    errors = (table.aligned.error, table.constant.error, table.aligned.abs_rel, table.aligned_robust.abs_rel)
     within = f"{100 * (table.aligned.within_mm[5] or 0):.1f}"
     assert lines[1].split() == ["lattice", "100.0", "%", *(f"{value:.4f}" for value in errors), within, "%"]
     assert lines[2].startswith("affine-disparity: disparity up to scale and shift")
@@ -414,7 +420,7 @@ def test_text_of_a_result(relative: Result, tiny_root: Path, write: Write) -> No
     assert f"aligned error {table.aligned.error:.4g}, constant {table.constant.error:.4g}" in repr(relative)
     assert "rebar-relative-1 (affine-disparity)" in relative._repr_html_()
     flat = str(rdb.score(write("flat", "affine-depth", lambda z: -z), tiny_root))
-    assert "above 95 % of that of a constant" in flat
+    assert re.search(r"The aligned error (0\.\d+) is not below 95 % of a constant's \(\1\)", flat)
     assert "In 9 of 9 views the fit has no positive slope" in flat
 
 
@@ -457,7 +463,10 @@ def test_score_command(
     for column in RELATIVE_INTERVALS[1:]:
         assert column.text(column.value(table)) in text
     assert all(view.view_id in text for view in expected.views)
-    assert "affine-disparity: disparity up to scale and shift" in text
+    declared = "etric predictions, scored as affine-disparity (--align): disparity up to scale and shift"
+    assert f"M{declared}" in text
+    assert f"m{declared}" in output.out
+    assert f"m{declared}" in str(expected)
     assert "Rank error" not in text
 
 
@@ -487,7 +496,9 @@ def test_table_has_a_block_for_each_kind(tiny_root: Path, tmp_path: Path, write:
     assert "ddagger" not in blocks[2]
     figure = tmp_path / "figure.svg"
     assert main([*arguments, "--figure", str(figure)]) == 2
-    assert "expected metric ones: the figure shows native errors" in capsys.readouterr().err
+    errors = capsys.readouterr().err
+    assert "expected metric ones: the figure shows native errors" in errors
+    assert "scoring" not in errors, "kinds are refused before any archive is scored"
     assert not figure.exists()
     shared = ["table", str(metric), str(net), "--data", str(tiny_root), "--align", "affine-disparity"]
     assert main(shared) == 0
@@ -501,7 +512,9 @@ def test_compare(tiny_root: Path, write: Write, capsys: Any, monkeypatch: pytest
     metric = write("metric", None, lambda z: z)
     assert main(["compare", str(net), str(metric), "--data", str(tiny_root)]) == 2
     words = "metric has predictions of the kind metric, expected affine-disparity as net"
-    assert words in " ".join(capsys.readouterr().err.split())
+    errors = capsys.readouterr().err
+    assert words in " ".join(errors.split())
+    assert "scoring" not in errors, "kinds are refused before any archive is scored"
     assert main(["compare", str(net), str(blurred), "--data", str(tiny_root), "--json", "-"]) == 0
     [document] = json.loads(capsys.readouterr().out)
     assert document["protocol"] == "rebar-relative-1"
@@ -510,10 +523,94 @@ def test_compare(tiny_root: Path, write: Write, capsys: Any, monkeypatch: pytest
     assert [rows["aligned.error"][key] for key in ("first", "other")] == [
         pytest.approx(one.error) for one in results if one is not None
     ]
-    assert (rows["aligned.error"]["verdict"], rows["constant.error"]["verdict"]) == ("worse", "equal")
-    assert "native.abs_rel" not in rows
+    assert rows["aligned.error"]["verdict"] == "worse"
+    assert {name.partition(".")[0] for name in rows} == {"coverage", "aligned", "aligned_robust"}
     assert main(["compare", str(net), str(blurred), "--data", str(tiny_root)]) == 0
-    assert "…" not in capsys.readouterr().out, "numbers are never truncated"
+    table = capsys.readouterr().out
+    assert "…" not in table, "numbers are never truncated"
+    assert "rank error" not in table
+
+
+def test_marks_and_legends_are_those_of_metric_tables(write: Write, tiny_root: Path, capsys: Any) -> None:
+    sparse = rdb.score(
+        write("sparse", None, lambda z: np.where(z > 0.3, z, 0)), tiny_root, align="affine-disparity"
+    )
+    net = rdb.score(write("net", "affine-disparity", disparity), tiny_root)
+    net = replace(net, tables={"lattice": net.tables["lattice"], "twin": net.tables["lattice"]})
+    sparse = replace(sparse, tables={"lattice": sparse.tables["lattice"], "twin": sparse.tables["lattice"]})
+    declared = {"cheat": True, "unknown": None}
+    results = [sparse, net]
+    for method, uses in declared.items():
+        results.append(replace(net, submission=replace(net.submission, method=method, uses_ground_truth=uses)))
+    print_paper_table(results, Console(width=200), published=True)
+    printed = capsys.readouterr().out
+    latex = latex_table(results, published=True)
+    for method in ("net", "cheat ‡", "unknown ?", "sparse *"):
+        assert printed.count(f"\n{method}  ") == 2, "in the table of each config"
+    for text in (printed, latex):
+        assert "Not ranked (declares the use of ground truth)." in text
+        assert "Use of ground truth not declared." in text
+        assert "Errors of valid predictions are not compared with those of others: sparse, lattice" in text
+        assert "Metric predictions, aligned as this kind: sparse." in text
+    rows = {
+        cells[0]: cells[1:] for line in latex.splitlines() if len(cells := line.rstrip("\\ ").split(" & ")) == 11
+    }
+    heads = rows["Method"]
+    assert len(set(heads)) == 5, "no two columns of a config have one name"
+    marked = {
+        row: [heads[place] for place, cell in enumerate(cells) if "$^" in cell] for row, cells in rows.items()
+    }
+    assert marked["sparse"] == [r"AbsRel $\downarrow$"] * 2, "of valid predictions"
+    assert marked["cheat"] == [r"$E$ $\downarrow$"] * 2
+    assert "unknown$^{?}$" in rows
+    assert "$1 / p = a x + b$ fitted to $1 / z$ in each view" in latex
+
+
+def test_aligned_metric_archive_is_recognised(write: Write, tiny_root: Path, relative: Result) -> None:
+    metric = write("metric", None, lambda z: 1.1 * z)
+    aligned = rdb.score(metric, tiny_root, align="affine-disparity")
+    document = json.loads(aligned.to_json())
+    assert (document["prediction"], document["declared_prediction"]) == ("affine-disparity", "metric")
+    assert read_result(aligned.to_json(), "result.json").to_json() == aligned.to_json()
+    for other in (relative, rdb.score(metric, tiny_root)):
+        assert "declared_prediction" not in json.loads(other.to_json())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_report_names_the_fit_of_each_view(kind: str, write: Write, tiny_root: Path) -> None:
+    result = rdb.score(write("net", kind, lambda z: np.where(z.max() > 0.75, z.max() - z, z) + 1), tiny_root)
+    page = render_report(result, [])
+    fits = re.findall(r">(constant|sloped)</td>", page)
+    assert fits.count("constant") == result.tables["lattice"].flat_views
+    assert len(fits) == (0 if kind == "scale" else 9), "a scale has no slope"
+    assert ("Constant fit: a view whose fit has no positive slope" in Page(page).text) == (kind != "scale")
+
+
+def test_tables_of_the_report_fit_a_window(chromium_program: str, relative: Result, tmp_path: Path) -> None:
+    """No table has a scroll bar at 1200 pixels."""
+    page = re.sub(r"<meta http-equiv=[^>]*>", "", render_report(relative, []))
+    script = """
+    document.body.style = "width: 1185px; padding: 36px; margin: 0";
+    return [...document.querySelectorAll(".scroll")].map((one) => one.scrollWidth - one.clientWidth);
+    """
+    overflow = run_in_browser(chromium_program, page.replace("</body>\n</html>\n", ""), script, tmp_path)
+    assert overflow == [0, 0]
+
+
+def test_rounding_errors_of_exact_predictions_are_zero() -> None:
+    assert METRICS["rmse_cm"].text(1.2e-17) == "0.00"
+    assert METRICS["rmse_cm"].text(1.2e-9) == "1.2e-09"
+
+
+def test_configs_of_one_archive_are_named(write: Write, tiny_root: Path, tmp_path: Path, capsys: Any) -> None:
+    both = tmp_path / "both.zip"
+    with rdb.SubmissionWriter(both, "both", prediction="affine-disparity") as writer:
+        for config in ("lattice", "lattice-orbit"):
+            for row in rdb.load(tiny_root, config, columns=["view_id", "left_depth"]):
+                writer.add(row["view_id"], disparity(row["left_depth"]))
+    net = write("net", "affine-disparity", disparity)
+    assert main(["compare", str(both), str(net), "--data", str(tiny_root)]) == 0
+    assert "only in one of both and net, not compared: lattice-orbit" in capsys.readouterr().err
 
 
 def test_extended_measures_and_paper_scripts_are_refused(tiny_root: Path, write: Write, capsys: Any) -> None:
