@@ -53,12 +53,12 @@ class Command:
     run: Callable[[argparse.Namespace], None]
 
 
-def module_command(module: str, summary: str) -> Command:
-    """Return the command of a module with ``add_arguments`` and ``run``, imported when they are called."""
+def module_command(module: str, summary: str, add: str = "add_arguments", run: str = "run") -> Command:
+    """Return the command of the functions ``add`` and ``run`` of a module, imported when they are called."""
     return Command(
         summary,
-        lambda parser: import_module(module).add_arguments(parser),
-        lambda options: import_module(module).run(options),
+        lambda parser: getattr(import_module(module), add)(parser),
+        lambda options: getattr(import_module(module), run)(options),
     )
 
 

@@ -1,8 +1,10 @@
-"""The ``rebar-bench table`` command: several submissions in the layout of the paper's Table I."""
+"""The commands of several submissions: ``rebar-bench table``, as in the paper, and ``rebar-bench compare``."""
 
 from __future__ import annotations
 
 import argparse
+import json
+from collections.abc import Sequence
 
 from rich.console import Console
 
@@ -21,10 +23,11 @@ from rebar_depth_bench.cli.console import (
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.reporting.figure import check_figure, write_figure
 from rebar_depth_bench.reporting.latex import latex_table
-from rebar_depth_bench.reporting.tables import disambiguate_method_names, print_paper_table
-from rebar_depth_bench.scoring.comparison import check_same_splits
+from rebar_depth_bench.reporting.tables import disambiguate_method_names, print_comparison, print_paper_table
+from rebar_depth_bench.scoring.comparison import check_same_splits, compare
 from rebar_depth_bench.scoring.evaluation import score
-from rebar_depth_bench.scoring.frames import frame_csv, tables_frame
+from rebar_depth_bench.scoring.frames import differences_frame, frame_csv, tables_frame
+from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.truth import paper_differences
 
 
@@ -47,18 +50,7 @@ def run(options: argparse.Namespace) -> None:
     """Score all archives, write the requested files and print the table."""
     if options.figure:
         check_figure(options.figure)
-    with ProgressBars() as bars:
-        results = [
-            score(
-                archive,
-                options.data,
-                workers=options.workers,
-                expect_digest=options.expect_digest,
-                align=options.align,
-                progress=bars.update,
-            )
-            for archive in options.archives
-        ]
+    results = _scored(options.archives, options)
     check_same_splits(results)
     for result in results if options.figure else ():
         if result.prediction is not None:
@@ -81,3 +73,44 @@ def run(options: argparse.Namespace) -> None:
             print_notice(note)
     if prints_table(options):
         print_paper_table(results, Console(), published=published, absent=absent)
+
+
+def add_compare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of ``compare``."""
+    parser.add_argument("first", type=InputFile, metavar="A", help="the archive that the others are compared with")
+    parser.add_argument("others", type=InputFile, metavar="B", nargs="+", help="one or more archives")
+    add_data(parser)
+    add_expect_digest(parser)
+    add_align(parser)
+    add_output_file(parser, "--json", "write the differences as JSON")
+    add_output_file(parser, "--csv", "write the differences as CSV")
+    add_workers(parser)
+
+
+def run_compare(options: argparse.Namespace) -> None:
+    """Score all archives, compare each with the first, and write and print the differences."""
+    first, *others = _scored([options.first, *options.others], options)
+    comparisons = [compare(first, other) for other in others]
+    content = [comparison.to_dict() for comparison in comparisons]
+    if options.json:
+        write_output(options.json, json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    if options.csv:
+        write_output(options.csv, frame_csv(differences_frame(content)))
+    for comparison in comparisons if prints_table(options) else ():
+        print_comparison(comparison, Console())
+
+
+def _scored(archives: Sequence[str], options: argparse.Namespace) -> list[Result]:
+    """Return the results of archives, scored as the options of a command say."""
+    with ProgressBars() as bars:
+        return [
+            score(
+                archive,
+                options.data,
+                workers=options.workers,
+                expect_digest=options.expect_digest,
+                align=options.align,
+                progress=bars.update,
+            )
+            for archive in archives
+        ]
