@@ -7,7 +7,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from dataset_builder.cameras.trajectories import subset
-from dataset_builder.export.camera_formats import cameras_txt, images_txt, points_txt, transforms_json
+from dataset_builder.export.camera_formats import (
+    cameras_json,
+    cameras_txt,
+    images_txt,
+    points_txt,
+    readme_txt,
+    transforms_json,
+)
 from dataset_builder.export.exported_views import (
     EXPORT_FILES,
     CameraView,
@@ -15,7 +22,6 @@ from dataset_builder.export.exported_views import (
     exported_files,
     stored_views,
 )
-from dataset_builder.export.metadata import cameras_json, readme_txt
 from dataset_builder.export.target import ExportedPart, export_target
 from rebar_depth_bench.base.errors import DatasetError, InputError
 from rebar_depth_bench.base.parallel import Progress, silent
