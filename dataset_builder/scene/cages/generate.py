@@ -16,11 +16,9 @@ from dataset_builder.scene.assemblies.bar_meshes import bar_mesh, ribs_per_row
 from dataset_builder.scene.assemblies.cage import CageBar
 from dataset_builder.scene.cages.as_built import BuiltBar, build_as, lowest_steel_m
 from dataset_builder.scene.cages.design import Design, InfeasibleError
-from dataset_builder.scene.cages.families.beams import beam
+from dataset_builder.scene.cages.families.beams import beam, joint
 from dataset_builder.scene.cages.families.columns import column, pile_cage
-from dataset_builder.scene.cages.families.footings import footing
-from dataset_builder.scene.cages.families.joints import joint
-from dataset_builder.scene.cages.families.slabs import slab
+from dataset_builder.scene.cages.families.mats import footing, slab
 from dataset_builder.scene.cages.families.walls import wall
 from dataset_builder.scene.model import Assembly, Mesh, axis_of
 from dataset_builder.specs.config_specs import GeneratedCageSpec
