@@ -22,6 +22,7 @@ from scipy.spatial.transform import Rotation
 
 from dataset_builder.export.exported_views import EXPORT_FILES, MILLIMETRE_M, CameraView, exported_files
 from dataset_builder.scene.shapes.bending import resample_polyline_m
+from rebar_depth_bench.captures.fields import LENS_TERMS
 from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder
 from rebar_depth_bench.geometry.cameras import HALF_PIXEL, Camera, inverse_rigid, swap_camera_axes
@@ -156,7 +157,7 @@ def _intrinsics(camera: Camera) -> dict[str, float]:
     K = camera.K
     focal = {"fl_x": float(K[0, 0]), "fl_y": float(K[1, 1])}
     centre = {"cx": float(K[0, 2]) + HALF_PIXEL, "cy": float(K[1, 2]) + HALF_PIXEL}
-    distortion = dict(zip(("k1", "k2", "p1", "p2", "k3"), camera.distortion.tolist(), strict=True))
+    distortion = dict(zip(LENS_TERMS, camera.distortion.tolist(), strict=True))
     return {**focal, **centre, "w": camera.width, "h": camera.height, **distortion}
 
 

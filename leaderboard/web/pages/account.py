@@ -49,12 +49,16 @@ async def account(request: Request, service: ServiceDep) -> HTMLResponse:
     text = fields.get("token", "").strip()
     token = await to_thread.run_sync(find_token, service.database, text)
     if token is None:
-        refusal = {
-            "status_code": 401,
-            "headers": {"WWW-Authenticate": "Bearer"},
-            "message": "The token is unknown.",
-        }
-        return render(request, "account.html.j2", cache=NO_STORE, token="", **refusal)
+        challenge, message = {"WWW-Authenticate": "Bearer"}, "The token is unknown."
+        return render(
+            request,
+            "account.html.j2",
+            status_code=401,
+            cache=NO_STORE,
+            headers=challenge,
+            token="",
+            message=message,
+        )
     status, message = await to_thread.run_sync(_change, service, token, fields)
     records = await to_thread.run_sync(submissions.of_token, service.database, token)
     return render(

@@ -1,4 +1,4 @@
-"""Cages of slabs, two mats of two layers each and chairs that carry the upper one, and of pad footings, one mat."""
+"""Cages of slabs, two mats of two layers each with chairs under the upper one, and of pad footings, one mat."""
 
 from __future__ import annotations
 
