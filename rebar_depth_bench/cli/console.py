@@ -162,6 +162,11 @@ def add_data(parser: argparse.ArgumentParser, summary: str = "dataset folder or 
     parser.add_argument("--data", type=InputFolder, required=True, metavar="ROOT", help=summary)
 
 
+def add_names(parser: argparse.ArgumentParser, option: str, summary: str, metavar: str = "NAME") -> None:
+    """Add ``option``, which takes one name or more and may be repeated."""
+    parser.add_argument(option, nargs="+", action="extend", metavar=metavar, help=summary)
+
+
 def add_workers(parser: argparse.ArgumentParser) -> None:
     """Add the option ``--workers``."""
     parser.add_argument("--workers", type=int, metavar="N", help="number of threads (default: one per core)")
