@@ -194,8 +194,9 @@ def _mesh_instances() -> Iterator[_MeshInstance]:
     depsgraph = bpy.context.evaluated_depsgraph_get()
     local_meshes: dict[int, Mesh] = {}
     for instance in depsgraph.object_instances:
-        evaluated = instance.object
-        if evaluated.type != "MESH" or not instance.show_self or _hidden(evaluated.original):
+        evaluated, original = instance.object, instance.object.original
+        is_visible = instance.show_self and original.visible_camera and not original.hide_render
+        if evaluated.type != "MESH" or not is_visible:
             continue
         # Mesh data that several objects share is read once.
         key = evaluated.data.as_pointer()
@@ -207,11 +208,6 @@ def _mesh_instances() -> Iterator[_MeshInstance]:
             mesh=transformed(local_meshes[key], world_from_local[:3, :3], world_from_local[:3, 3]),
             bar_id=int(evaluated.get(BAR_ID, NOT_STEEL)),
         )
-
-
-def _hidden(original: bpy.types.Object) -> bool:
-    """Return whether an object is not rendered or not visible to cameras."""
-    return bool(original.hide_render or not original.visible_camera)
 
 
 def _local_mesh(data: bpy.types.Mesh) -> Mesh:
@@ -232,15 +228,10 @@ PANORAMAS = Path("datafiles", "studiolights", "world")
 
 def add_light(rig: LightRig) -> None:
     """Add the sky and the lamp of ``rig`` to the open scene, which must have no light yet."""
-    _add_sky(rig.sky)
-    _add_lamp(rig.lamp)
-
-
-def _add_sky(sky: Sky) -> None:
-    """Set the sky as the background of the open scene."""
     # The sky is smooth enough for unguided sampling, so that lamps get all the shadow rays.
-    tree = WorldBuilder("sky", "NONE")
+    sky, tree = rig.sky, WorldBuilder("sky", "NONE")
     tree.background(sky.horizon if sky.zenith == sky.horizon else _sky_gradient(tree, sky), sky.strength)
+    _add_lamp(rig.lamp)
 
 
 def _sky_gradient(tree: NodeTreeBuilder, sky: Sky) -> Socket:
