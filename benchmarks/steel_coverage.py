@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.timing import print_markdown
 from cards.steel import range_text
-from dataset_builder.cameras.steel_distance import Cylinders
+from dataset_builder.cameras.trajectories import Cylinders
 from rebar_depth_bench.base.names import TEST_SPLIT
 from rebar_depth_bench.base.writing import write_text
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import logging
 import signal
 import stat
 import sys
@@ -13,10 +14,12 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import structlog
 from sqlalchemy import select
+from structlog.typing import Processor
 
 from leaderboard.db import jobs, submissions
 from leaderboard.db.engine import Database, database_errors, sqlite_path, without_password
@@ -24,7 +27,6 @@ from leaderboard.db.models import SubmissionModel, TokenModel
 from leaderboard.db.submissions import DELETED, archive_rows
 from leaderboard.db.tokens import create_token, list_tokens, replace_token, revoke_token
 from leaderboard.health import disk_problem, queue_problems
-from leaderboard.log_setup import set_up_logs
 from leaderboard.scoring.worker import process_queue
 from leaderboard.settings import Settings, read_settings
 from leaderboard.storage import retention
@@ -313,3 +315,43 @@ COMMANDS = {
     ),
 }
 """Commands by name. All settings can also be set in a TOML file or the environment."""
+
+
+# Structured logging on standard error: one JSON object per line, or readable lines on a terminal.
+
+
+def set_up_logs() -> None:
+    """Configure logging of this process: structlog, library loggers, warnings and uncaught exceptions."""
+    renderer: Processor = (
+        structlog.dev.ConsoleRenderer()
+        if sys.stderr.isatty()
+        else structlog.processors.JSONRenderer(sort_keys=True)
+    )
+    common: list[Processor] = [
+        structlog.processors.add_log_level,
+        structlog.processors.TimeStamper(fmt="iso", utc=True),
+        structlog.processors.format_exc_info,
+    ]
+    structlog.configure(
+        processors=[*common, renderer],
+        # Each line is a single write, because other processes write to the same stream.
+        logger_factory=structlog.WriteLoggerFactory(sys.stderr),
+        cache_logger_on_first_use=True,
+    )
+    handler = logging.StreamHandler(sys.stderr)
+    handler.setLevel(logging.WARNING)
+    remove_meta = structlog.stdlib.ProcessorFormatter.remove_processors_meta
+    handler.setFormatter(
+        structlog.stdlib.ProcessorFormatter(
+            foreign_pre_chain=[structlog.stdlib.add_logger_name, *common], processors=[remove_meta, renderer]
+        )
+    )
+    logging.basicConfig(handlers=[handler], level=logging.WARNING, force=True)
+    logging.captureWarnings(True)
+    sys.excepthook = _log_uncaught_exception
+
+
+def _log_uncaught_exception(
+    error_type: type[BaseException], error: BaseException, traceback: TracebackType | None
+) -> None:
+    structlog.get_logger("process").critical("uncaught exception", exc_info=(error_type, error, traceback))

@@ -16,10 +16,9 @@ from numpy import ndarray
 
 from dataset_builder.audit.checks import AuditedConfig, AuditedView, Check
 from dataset_builder.cameras.camera_placement import RANDOM_RULES
-from dataset_builder.scene.cages.generate import VERSION
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
 from dataset_builder.scene.shapes.capsules import Clearances
-from dataset_builder.specs.config_specs import RandomViewsSpec
+from dataset_builder.specs.config_specs import CAGES_VERSION, RandomViewsSpec
 from dataset_builder.specs.manifest_specs import cage_spec, trajectory_spec
 from dataset_builder.user_files.make_assembly import assembly_bars
 from rebar_depth_bench.data.bars import Bar
@@ -200,8 +199,8 @@ def _bars_check(scene: DatasetConfig, bars: Sequence[Bar]) -> Check:
     """Return the check of the bars against those that the generator makes from the parameters in the manifest."""
     name = "bars and their designs"
     spec = cage_spec(scene)
-    if spec.version != VERSION:
-        return Check.skip(name, f"made by version {spec.version} of the generator, this is {VERSION}")
+    if spec.version != CAGES_VERSION:
+        return Check.skip(name, f"made by version {spec.version} of the generator, this is {CAGES_VERSION}")
     expected = assembly_bars(spec)
     if [_identity(bar) for bar in bars] != [_identity(bar) for bar in expected]:
         problem = f"{len(bars)} bars differ from the {len(expected)} of the generator in number, role or diameter"

@@ -17,12 +17,11 @@ from numpy import ndarray
 
 from rebar_depth_bench.base.errors import BuildError
 from rebar_depth_bench.base.writing import scratch_folder
+from rebar_depth_bench.captures.fields import LENS_TERMS
 from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid, swap_camera_axes
 
 SHADER = "brown_conrady.osl"
 """File name of the OSL camera shader in this package."""
-
-_LENS_TERMS = ("k1", "k2", "p1", "p2", "k3")
 
 
 def set_distorted_optics(optics: bpy.types.Camera, camera: Camera) -> None:
@@ -49,7 +48,7 @@ def _shader_parameters(camera: Camera) -> dict[str, float]:
     """
     K = camera.K
     pinhole = {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
-    lens = dict(zip(_LENS_TERMS, camera.distortion, strict=True))
+    lens = dict(zip(LENS_TERMS, camera.distortion, strict=True))
     grid = {"width": camera.width, "height": camera.height}
     return {name: float(value) for name, value in (grid | pinhole | lens).items()}
 

@@ -144,16 +144,12 @@ def rendered_file(path: Path, scene: bpy.types.Scene, **image_settings: Any) -> 
     try:
         yield path
     except (OSError, RuntimeError, ValueError):
-        _check_space(path, render.resolution_x * render.resolution_y * _MAX_BYTES_PER_PIXEL)
+        size = render.resolution_x * render.resolution_y * _MAX_BYTES_PER_PIXEL
+        with named_write_errors(path), path.open("wb") as file:  # An ``OutputError`` if there is no space.
+            os.posix_fallocate(file.fileno(), 0, size)
         raise
     finally:
         path.unlink(missing_ok=True)
-
-
-def _check_space(path: Path, size: int) -> None:
-    """Raise ``OutputError`` if a file of ``size`` bytes cannot be written at ``path``."""
-    with named_write_errors(path), path.open("wb") as file:
-        os.posix_fallocate(file.fileno(), 0, size)
 
 
 @contextmanager

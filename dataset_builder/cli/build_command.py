@@ -26,6 +26,7 @@ from dataset_builder.specs.config_specs import (
 from rebar_depth_bench.base.errors import InputError, printable, require_extra
 from rebar_depth_bench.base.names import SPLITS
 from rebar_depth_bench.base.terminal import ProgressBars, Rate
+from rebar_depth_bench.cli.console import add_names
 
 if TYPE_CHECKING:
     from dataset_builder.pipeline.blender_process import Submit
@@ -50,12 +51,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def _add_request_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options for the folder, its configs, and the number and size of views."""
     parser.add_argument("--out", type=Path, metavar="ROOT", help="dataset folder to build or resume")
-    parser.add_argument(
+    add_names(
+        parser,
         "--config",
-        nargs="+",
-        action="extend",
-        metavar="NAME",
-        help=f"configs to build: {', '.join(CONFIGS)} (default: all of these), or {', '.join((*SWEEPS, CAGES))}",
+        f"configs to build: {', '.join(CONFIGS)} (default: all of these), or {', '.join((*SWEEPS, CAGES))}",
     )
     parser.add_argument(
         "--views",
@@ -75,12 +74,10 @@ def _add_request_arguments(parser: argparse.ArgumentParser) -> None:
         default=0,
         help=f"random seed of surfaces and noise, and of all of {CAGES} (default: %(default)s)",
     )
-    parser.add_argument(
+    add_names(
+        parser,
         "--overwrite",
-        nargs="+",
-        action="extend",
-        metavar="NAME",
-        help="finished configs of ROOT that may be replaced; to others, only views and scenes can be added",
+        "finished configs of ROOT that may be replaced; to others, only views and scenes can be added",
     )
 
 
@@ -159,20 +156,13 @@ def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options for user's meshes and scenes, and for variants."""
     parser.add_argument("--mesh", metavar="FILE", help="STL, PLY or OBJ file that replaces the lattice's rods")
     add_mesh_unit(parser)
-    parser.add_argument(
+    add_names(
+        parser,
         "--scene",
-        nargs="+",
-        action="extend",
-        metavar="FILE",
-        help="scene files to build: TOML or IFC; only these are built unless --config is given",
+        "scene files to build: TOML or IFC; only these are built unless --config is given",
+        "FILE",
     )
-    parser.add_argument(
-        "--variant",
-        nargs="+",
-        action="extend",
-        metavar="NAME",
-        help=f"appearance variants, appended to the config name: {', '.join(VARIANTS)}",
-    )
+    add_names(parser, "--variant", f"appearance variants, appended to the config name: {', '.join(VARIANTS)}")
 
 
 def add_mesh_unit(parser: argparse.ArgumentParser) -> None:

@@ -18,6 +18,7 @@ from rebar_depth_bench.base.writing import write_output
 from rebar_depth_bench.cli.console import (
     Command,
     InputFile,
+    add_names,
     add_output_file,
     check_outputs,
     prints_table,
@@ -99,9 +100,7 @@ def _add_export_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="output folder: new, or an earlier export to resume"
     )
-    parser.add_argument(
-        "--config", nargs="+", action="extend", metavar="NAME", help="configs to export (default: all)"
-    )
+    add_names(parser, "--config", "configs to export (default: all)")
     parser.add_argument(
         "--split", choices=SPLITS, metavar="NAME", help="split to export: train, validation or test (default: all)"
     )

@@ -13,8 +13,7 @@ from dataset_builder.catalog.scene_file import RESERVED_NAMES, scene_name_of
 from dataset_builder.importing.import_layout import Layout, read_layout
 from dataset_builder.importing.source_files import DepthTally
 from dataset_builder.importing.source_views import SourceViews, open_views
-from dataset_builder.importing.survey_check import SurveyCheck
-from dataset_builder.importing.surveyed_bars import read_bars_file
+from dataset_builder.importing.survey_check import SurveyCheck, read_bars_file
 from dataset_builder.pipeline.folder import build_lock, check_target, remove_build_folder
 from dataset_builder.pipeline.plan import BUILD_FOLDER, KEY_CHARACTERS, generator_versions
 from dataset_builder.pipeline.publish import StagedScene, publish, remove_leftovers

@@ -27,16 +27,12 @@ from rebar_depth_bench.base.limits import JSON_BYTES
 from rebar_depth_bench.base.reading import parse_json, read_file
 from rebar_depth_bench.base.validation import UNITS_M, short_repr, with_lines
 from rebar_depth_bench.captures.calibration import Calibration, scaled_calibration, table_calibration
-from rebar_depth_bench.captures.fields import Field, FileFormat
+from rebar_depth_bench.captures.fields import LENS_TERMS, RECTIFY_PAGE, Field, FileFormat
 from rebar_depth_bench.geometry.cameras import HALF_PIXEL
 
 _UNIT = "depth_unit_scale_factor"
-_LENS = (
-    'no other lens: undistort images and depth maps first, see "Rectify images first" in docs/captures.md, and '
-    "state the new K"
-)
+_LENS = f"no other lens: undistort images and depth maps first, {RECTIFY_PAGE}, and state the new K"
 _MODELS = ("OPENCV", "RADIAL", "SIMPLE_RADIAL", "PINHOLE", "SIMPLE_PINHOLE")
-_TERMS = ("k1", "k2", "p1", "p2", "k3")
 _OTHER_LENS = ("k4", "k5", "k6", "is_fisheye", "ftheta_p0", "latlong", "equirectangular")
 _OTHERS = ("x_fov", "y_fov", "rolling_shutter", "from_na", "integer_depth_scale")
 _FURTHER = (
@@ -66,7 +62,7 @@ NERFSTUDIO = FileFormat(
         Field("focal", ("fl_x", "fl_y"), "used", "focal length, pixels; that of y is by default that of x"),
         Field("angle", ("camera_angle_x", "camera_angle_y"), "used", "field of view, radians, instead of `fl_x`"),
         Field("centre", ("cx", "cy"), "used", "principal point, pixels; default: the middle"),
-        Field("distortion", _TERMS, "used", "lens distortion of OpenCV"),
+        Field("distortion", LENS_TERMS, "used", "lens distortion of OpenCV"),
         Field("size", ("w", "h"), "used", "size, which is that of the images"),
         Field("model", ("camera_model",), "used", f"{', '.join(_MODELS)}; {_LENS}"),
         Field("lens", _OTHER_LENS, "checked", _LENS),
@@ -253,7 +249,7 @@ def _nerfstudio(values: Mapping[str, Any], layout: Layout, name: str, grid: Grid
     if (model := values.get("camera_model", _MODELS[0])) not in _MODELS:
         expected = f"{', '.join(_MODELS)}; {_LENS}"
         raise EntryError(Problem("invalid", "camera_model", f"got {short_repr(model)}", expected))
-    lens: dict[str, Any] = {"distortion": [_number(values, key, 0.0) for key in _TERMS]}
+    lens: dict[str, Any] = {"distortion": [_number(values, key, 0.0) for key in LENS_TERMS]}
     for axis, side, side_px in (("x", "w", grid[1]), ("y", "h", grid[0])):
         if _number(values, side, side_px) != side_px:
             expected = f"{side_px} as the images: scale them, or w, h, fl_x, fl_y, cx and cy"

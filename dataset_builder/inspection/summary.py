@@ -50,8 +50,8 @@ class BarGroup:
 
 
 @dataclass(frozen=True)
-class Overlap:
-    """Two bars that overlap by ``depth_m``, negative for a gap, and the point (world) where it is largest."""
+class Meeting:
+    """Two bars in contact or clashing: largest overlap ``depth_m``, negative for a gap, and its place (world)."""
 
     bar_a: int
     bar_b: int
@@ -70,8 +70,8 @@ class Inspection:
     cage: Cage
     groups: tuple[BarGroup, ...]
     box_m: Box
-    contacts: Sequence[Overlap] | None
-    clashes: Sequence[Overlap] | None
+    contacts: Sequence[Meeting] | None
+    clashes: Sequence[Meeting] | None
 
     @property
     def size_text(self) -> str:
@@ -83,13 +83,13 @@ def inspect_cage(cage: Cage, name: str) -> Inspection:
     """Return the summary of a cage of one or more bars."""
     boxes_m = np.array([bar_box_m(bar) for bar in cage.bars])
     box_m = np.array([boxes_m[:, 0].min(axis=0), boxes_m[:, 1].max(axis=0)])
-    found: tuple[Sequence[Overlap] | None, Sequence[Overlap] | None] = None, None
+    found: tuple[Sequence[Meeting] | None, Sequence[Meeting] | None] = None, None
     with suppress(TooManyNeighboursError):
         found = meetings([bar.bar for bar in cage.bars])
     return Inspection(name, cage, tuple(_groups(cage.bars)), box_m, *found)
 
 
-def meetings(bars: Sequence[Bar]) -> tuple[list[Overlap], list[Overlap]]:
+def meetings(bars: Sequence[Bar]) -> tuple[list[Meeting], list[Meeting]]:
     """Return the pairs of bars in contact, as tied bars are, and those that clash, the deepest first.
 
     Bars clash if they overlap by more than bars in contact (``CONTACT``). Those without axis are left out. Raises
@@ -111,10 +111,10 @@ def meetings(bars: Sequence[Bar]) -> tuple[list[Overlap], list[Overlap]]:
             found_m = float(depth_m[index])
             if found_m > deepest.get((a, b), (-np.inf, []))[0]:
                 deepest[a, b] = found_m, ((on_a[index] + on_b[index]) / 2).tolist()
-    contacts, clashes = list[Overlap](), list[Overlap]()
+    contacts, clashes = list[Meeting](), list[Meeting]()
     for (a, b), (depth_m, (x, y, z)) in sorted(deepest.items(), key=lambda item: (-item[1][0], item[0])):
         is_clash = depth_m > _contact_m((measured[a].diameter_m + measured[b].diameter_m) / 2)
-        pair = Overlap(measured[a].bar_id, measured[b].bar_id, depth_m, (x, y, z))
+        pair = Meeting(measured[a].bar_id, measured[b].bar_id, depth_m, (x, y, z))
         (clashes if is_clash else contacts).append(pair)
     return contacts, clashes
 

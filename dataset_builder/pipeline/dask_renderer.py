@@ -112,8 +112,10 @@ def _translate_dask_errors(renderer: ClusterRenderer, address: str) -> Iterator[
     try:
         yield
     except KilledWorker as error:
+        unit = renderer.keys.get(str(error.task))
+        label = "a staged cage" if unit is None else unit.label
         raise RenderProcessError(
-            f"{_task_label(renderer, error.task)}: {error.allowed_failures + 1} workers died while rendering "
+            f"{label}: {error.allowed_failures + 1} workers died while rendering "
             f"it, the last at {error.last_worker.address}; see the logs of these workers for the reason"
         ) from None
     except CancelledError:
@@ -133,10 +135,6 @@ def _quiet_client() -> Iterator[None]:
         yield
     finally:
         logger.setLevel(level)
-
-
-def _task_label(renderer: ClusterRenderer, key: object) -> str:
-    return renderer.keys[key].label if isinstance(key, str) and key in renderer.keys else "a staged cage"
 
 
 def _connect(address: str) -> distributed.Client:

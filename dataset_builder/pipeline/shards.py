@@ -168,7 +168,8 @@ def encode_row(columns: Mapping[str, Any]) -> tuple[pa.Table, ViewRecord]:
     for name in COLUMNS:
         value, kind = columns.get(name), column_kind(name)
         if value is not None:
-            cells[name] = _ENCODERS.get(kind, _plain)(value)
+            encode = _ENCODERS.get(kind)
+            cells[name] = value if encode is None else encode(value)
         elif name not in cells:
             cells[name] = absent_cell(kind)
     left = truth_from_row(columns, "left")
@@ -180,10 +181,6 @@ def encode_row(columns: Mapping[str, Any]) -> tuple[pa.Table, ViewRecord]:
         scored_px=len(scored_pixels(left.mask, left.depth_m)),
     )
     return pa.Table.from_pylist([cells], schema=ROW_SCHEMA), record
-
-
-def _plain(value: Any) -> Any:
-    return value
 
 
 _ENCODERS: Mapping[str, Callable[[Any], Any]] = {

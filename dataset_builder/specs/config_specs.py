@@ -58,6 +58,10 @@ class PierSpec:
     tie_diameter_m: float = 0.016
 
 
+CAGES_VERSION = 2
+"""Version of the generator of cages: it changes when the same seed gives another cage."""
+
+
 @dataclass(frozen=True)
 class GeneratedCageSpec:
     """Reinforcement cage from the generator (``scene.cages``): cage ``number`` of a split, from a seed.
@@ -70,7 +74,7 @@ class GeneratedCageSpec:
     number: int
     seed: int = 0
     family: str | None = None
-    version: int = 2
+    version: int = CAGES_VERSION
     kind: str = "generated-cage"
 
 

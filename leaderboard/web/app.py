@@ -22,7 +22,7 @@ from leaderboard.web.api import leaderboard, status, submissions
 from leaderboard.web.api.schemas import DATABASE_UNAVAILABLE_MESSAGE
 from leaderboard.web.cache import CacheMiddleware
 from leaderboard.web.middleware import EarlyResponseMiddleware, RequestMiddleware
-from leaderboard.web.pages import account, ranking, submission_page, upload_form
+from leaderboard.web.pages import account, ranking, submission_page
 from leaderboard.web.pages.rendering import error_response, make_templates
 from rebar_depth_bench import software_version
 from rebar_depth_bench.base.errors import Problem
@@ -70,7 +70,7 @@ def make_app(service: Service) -> FastAPI:
     )
     app.state.service = service
     app.state.templates = make_templates()
-    for router in (submissions, leaderboard, status, ranking, submission_page, upload_form, account):
+    for router in (submissions, leaderboard, status, ranking, submission_page, account):
         app.include_router(router.router)
     app.mount("/static", _StaticFiles(packages=_STATIC_FOLDERS))
     identity = f"{software_version()} {service.folder.digest} {settings.model_dump_json()}"

@@ -25,7 +25,7 @@ from rebar_depth_bench.captures.calibration import (
     scaled_calibration,
     table_calibration,
 )
-from rebar_depth_bench.captures.fields import Field, FileFormat, lens_problem
+from rebar_depth_bench.captures.fields import DISTORTION_TERMS, LENS_TERMS, Field, FileFormat, lens_problem
 
 
 def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibration:
@@ -113,7 +113,7 @@ _GRIDS: Mapping[str, tuple[int, int]] = {
 """Image sizes (width, height) of Stereolabs cameras, pixels, by section suffix."""
 _CAMERAS = ("LEFT_CAM_", "RIGHT_CAM_")
 
-_TERMS = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tauX", "tauY")
+_TERMS = (*LENS_TERMS, "k4", "k5", "k6", "s1", "s2", "s3", "s4", "tauX", "tauY")
 """Distortion terms in OpenCV's order."""
 _STEREO: Mapping[str, Expected] = {
     "Baseline": quantity(1, 10_000, "millimetres"),
@@ -134,8 +134,8 @@ ZED_CONF = FileFormat(
     "Stereolabs' `*.conf`",
     (
         *_fields(("fx", "fy", "cx", "cy"), "EYE_CAM_X.#", "used", f"pixels; EYE: LEFT or RIGHT; X: {_SIZES}"),
-        *_fields(_TERMS[:5], _DISTO, "used", "distortion; equal if in both sections"),
-        *_fields(_TERMS[5:], _DISTO, "checked", "absent or 0: terms of other lens models"),
+        *_fields(LENS_TERMS, _DISTO, "used", "distortion; equal if in both sections"),
+        *_fields(_TERMS[DISTORTION_TERMS:], _DISTO, "checked", "absent or 0: terms of other lens models"),
         *_fields(("Baseline", "TY", "TZ"), "STEREO.#_X STEREO.#", "used", "T = -(Baseline, TY, TZ), millimetres"),
         *_fields(("RX", "CV", "RZ"), "STEREO.#_X STEREO.#", "used", "R = Rodrigues(RX, CV, RZ), radians"),
         Field("miscellaneous", ("MISC",), "harmless", "such as the kind of sensor"),

@@ -15,16 +15,18 @@ from rebar_depth_bench.base.errors import Problem, escape_text
 from rebar_depth_bench.base.validation import short_repr
 
 _MAX_NAMED = 10
-DISTORTION_TERMS = 5
-"""Number of distortion terms that are used: k1 k2 p1 p2 k3."""
+LENS_TERMS = ("k1", "k2", "p1", "p2", "k3")
+"""Distortion terms that are used, in OpenCV's order."""
+DISTORTION_TERMS = len(LENS_TERMS)
 _RADIAL = (
     *("plumbbob", "radtan", "radialtangential", "brown", "brownconrady", "opencv", "rationalpolynomial"),
     *("0", "false"),
 )
 """Lens models, or answers to whether it is a fisheye lens, whose first terms are k1 k2 p1 p2 k3; as plain keys."""
+RECTIFY_PAGE = 'see "Rectify images first" in docs/captures.md'
 _KNOWN_LENS = (
-    "k1 k2 p1 p2 k3 (plumb_bob, radtan); rectify the images first with the camera's own software or OpenCV, "
-    'see "Rectify images first" in docs/captures.md, and give their new K with zero distortion'
+    f"{' '.join(LENS_TERMS)} (plumb_bob, radtan); rectify the images first with the camera's own software or "
+    f"OpenCV, {RECTIFY_PAGE}, and give their new K with zero distortion"
 )
 """Lens model that is read, and the remedy for others."""
 OTHER_LENS = re.compile(

@@ -54,12 +54,12 @@ class Command:
     run: Callable[[argparse.Namespace], None]
 
 
-def module_command(module: str, summary: str) -> Command:
-    """Return the command of a module with ``add_arguments`` and ``run``, imported when they are called."""
+def module_command(module: str, summary: str, add: str = "add_arguments", run: str = "run") -> Command:
+    """Return the command of the functions ``add`` and ``run`` of a module, imported when they are called."""
     return Command(
         summary,
-        lambda parser: import_module(module).add_arguments(parser),
-        lambda options: import_module(module).run(options),
+        lambda parser: getattr(import_module(module), add)(parser),
+        lambda options: getattr(import_module(module), run)(options),
     )
 
 
@@ -161,6 +161,11 @@ def add_archive(parser: argparse.ArgumentParser) -> None:
 def add_data(parser: argparse.ArgumentParser, summary: str = "dataset folder or Hub repository id") -> None:
     """Add the option ``--data``."""
     parser.add_argument("--data", type=InputFolder, required=True, metavar="ROOT", help=summary)
+
+
+def add_names(parser: argparse.ArgumentParser, option: str, summary: str, metavar: str = "NAME") -> None:
+    """Add ``option``, which takes one name or more and may be repeated."""
+    parser.add_argument(option, nargs="+", action="extend", metavar=metavar, help=summary)
 
 
 def add_workers(parser: argparse.ArgumentParser) -> None:

@@ -16,13 +16,19 @@ COMMANDS: Mapping[str, Command] = {
         f"{_CLI}.score_crossings",
         "score detected crossings of bars: precision, recall, average precision, position",
     ),
-    "compare": module_command(f"{_CLI}.compare", "compute paired differences between submissions, with intervals"),
+    "compare": module_command(
+        f"{_CLI}.table",
+        "compute paired differences between submissions, with intervals",
+        *("add_compare_arguments", "run_compare"),
+    ),
     "table": module_command(
         f"{_CLI}.table", "print several submissions and the paper's rows in the layout of its Table I"
     ),
     "check": module_command(f"{_CLI}.check", "list all problems of a submission archive"),
     "verify": module_command(
-        f"{_CLI}.verify", "compare every file, view and digest of a dataset with its manifest"
+        f"{_CLI}.check",
+        "compare every file, view and digest of a dataset with its manifest",
+        *("add_verify_arguments", "run_verify"),
     ),
     "methods": module_command(f"{_CLI}.methods", "list the available methods"),
     "predict": module_command(f"{_CLI}.predict", "run a method on a dataset and write a submission archive"),

@@ -17,6 +17,7 @@ from rebar_depth_bench.cli.console import (
     OutputArchive,
     add_data,
     add_expect_digest,
+    add_names,
     add_output_file,
     add_seconds,
     positive_number,
@@ -46,13 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_expect_digest(parser)
     archive = "submission archive (zip) to write"
     add_output_file(parser, "--out", archive, kind=OutputArchive, metavar="ARCHIVE", required=True)
-    parser.add_argument(
-        "--config",
-        nargs="+",
-        action="extend",
-        metavar="NAME",
-        help="configs to predict (default: all in the folder that have the split)",
-    )
+    add_names(parser, "--config", "configs to predict (default: all in the folder that have the split)")
     parser.add_argument(
         "--split",
         choices=SPLITS,

@@ -10,7 +10,14 @@ from rich.console import Console
 from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.base.terminal import ProgressBars, print_notice
 from rebar_depth_bench.base.writing import write_output
-from rebar_depth_bench.cli.console import InputFile, add_data, add_output_file, add_workers, prints_table
+from rebar_depth_bench.cli.console import (
+    InputFile,
+    add_data,
+    add_names,
+    add_output_file,
+    add_workers,
+    prints_table,
+)
 from rebar_depth_bench.detections.score import score_crossings
 from rebar_depth_bench.reporting.detections import detection_page, print_page, render_page
 from rebar_depth_bench.submission import INPUTS
@@ -25,13 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="CSV or Parquet file: view_id; x, y, z or world_x, world_y, world_z; nx, ny, nz, confidence",
     )
     add_data(parser)
-    parser.add_argument(
-        "--config",
-        nargs="+",
-        action="extend",
-        metavar="NAME",
-        help="configs that were searched (default: those of the rows)",
-    )
+    add_names(parser, "--config", "configs that were searched (default: those of the rows)")
     parser.add_argument(
         "--confidence", type=float, metavar="C", help="match only detections of at least C (default: all)"
     )

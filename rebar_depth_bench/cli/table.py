@@ -1,8 +1,9 @@
-"""The ``rebar-bench table`` command: several submissions in the layout of the paper's Table I."""
+"""The commands of several submissions: ``rebar-bench table``, as in the paper, and ``rebar-bench compare``."""
 
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Sequence
 
 from rich.console import Console
@@ -21,9 +22,9 @@ from rebar_depth_bench.cli.console import (
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.reporting.figure import check_figure, write_figure
 from rebar_depth_bench.reporting.latex import latex_table
-from rebar_depth_bench.reporting.tables import disambiguate_method_names, print_paper_table
-from rebar_depth_bench.scoring.comparison import check_same_splits
-from rebar_depth_bench.scoring.frames import frame_csv, tables_frame
+from rebar_depth_bench.reporting.tables import disambiguate_method_names, print_comparison, print_paper_table
+from rebar_depth_bench.scoring.comparison import check_same_kinds, check_same_splits, compare
+from rebar_depth_bench.scoring.frames import differences_frame, frame_csv, tables_frame
 from rebar_depth_bench.scoring.truth import paper_differences
 from rebar_depth_bench.submission.declaration import METRIC
 
@@ -71,3 +72,29 @@ def _check_figure_kinds(kinds: Sequence[tuple[str, str]]) -> None:
         if kind != METRIC:
             found = f"{method} has predictions of the kind {kind}"
             raise InputError(f"--figure: {found}, expected metric ones: the figure shows native errors")
+
+
+def add_compare_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of ``compare``."""
+    parser.add_argument("first", type=InputFile, metavar="A", help="the archive that the others are compared with")
+    parser.add_argument("others", type=InputFile, metavar="B", nargs="+", help="one or more archives")
+    add_scored_data(parser)
+    add_output_file(parser, "--json", "write the differences as JSON")
+    add_output_file(parser, "--csv", "write the differences as CSV")
+    add_workers(parser)
+
+
+def run_compare(options: argparse.Namespace) -> None:
+    """Score all archives, compare each with the first, and write and print the differences."""
+    first, *others = score_archives([options.first, *options.others], options, check_same_kinds)
+    comparisons = [compare(first, other) for other in others]
+    for other, comparison in zip(others, comparisons, strict=True):
+        if names := [name for name in {**first.tables, **other.tables} if name not in comparison.configs]:
+            print_notice(f"only in one of {first.method} and {other.method}, not compared: {', '.join(names)}")
+    content = [comparison.to_dict() for comparison in comparisons]
+    if options.json:
+        write_output(options.json, json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
+    if options.csv:
+        write_output(options.csv, frame_csv(differences_frame(content)))
+    for comparison in comparisons if prints_table(options) else ():
+        print_comparison(comparison, Console())

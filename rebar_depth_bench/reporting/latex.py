@@ -16,15 +16,14 @@ from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.html.assets import environment
 from rebar_depth_bench.reporting.published import load_published, published_rows
 from rebar_depth_bench.scoring.columns import (
-    ALIGNED,
     ALIGNED_CONSTANT,
-    ALIGNED_ROBUST,
     DASH,
     OTHERS,
     PAPER_COLUMNS,
     RANK_ERROR,
     Better,
     Column,
+    columns_at,
     rounded,
 )
 from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND, kind_blocks
@@ -35,20 +34,21 @@ CONFIGS_PER_BLOCK = 2
 """Number of configs side by side that fit into a page width of 17 cm; further configs follow in blocks below."""
 
 _COLUMNS = (RANK_ERROR, *PAPER_COLUMNS, *OTHERS)
-_ALIGNED_COLUMNS = (ALIGNED[0], ALIGNED_CONSTANT[0], ALIGNED[1], ALIGNED_ROBUST[1], ALIGNED_CONSTANT[1])
-"""Columns of predictions that are not metric."""
 _HEADS: Mapping[str, str] = {
     "rank_error": "$E$",
     "native.rmse_cm": "RMSE",
     "native.abs_rel": "AbsRel",
     "scaled.abs_rel": "AbsRel$_s$",
     "scale_median": "$s$",
+}
+_ALIGNED_HEADS: Mapping[str, str] = {
     "aligned.error": "$E$",
     "constant.error": r"\shortstack[r]{const.\\$E$}",
     "aligned.abs_rel": "AbsRel",
     "aligned_robust.abs_rel": "robust",
     "constant.abs_rel": r"\shortstack[r]{const.\\AbsRel}",
 }
+"""Headings of the columns of predictions that are not metric."""
 _ARROWS: Mapping[Better, str] = {"lower": r" $\downarrow$", "higher": r" $\uparrow$", "": ""}
 _MISSING = "--"
 _NO_OTHERS = [""] * len(OTHERS)
@@ -101,7 +101,7 @@ def latex_table(
 def _table_of_kind(results: Sequence[Result], absent: Sequence[str], *, published: bool, intervals: bool) -> str:
     """Return the ``table*`` of results of one kind."""
     kind = results[0].prediction
-    columns = _COLUMNS if kind is None else _ALIGNED_COLUMNS
+    columns = _COLUMNS if kind is None else columns_at(*_ALIGNED_HEADS)
     tables = {config: table for result in results for config, table in result.tables.items()}
     configs = list(tables)
     configs_per_block = 1 if intervals else CONFIGS_PER_BLOCK
@@ -195,8 +195,9 @@ def _result_rows(
 def _head(column: Column) -> str:
     """Return the heading of a column; that of the paper's table, if it has one."""
     unit = f", {column.unit}" if column.unit else ""
+    heads = {**_HEADS, **_ALIGNED_HEADS}
     arrow = "" if column in ALIGNED_CONSTANT else _ARROWS[column.better]
-    return _HEADS.get(column.path, escape_latex(f"{column.title}{unit}")) + arrow
+    return heads.get(column.path, escape_latex(f"{column.title}{unit}")) + arrow
 
 
 def _sort_key(table: Table | None) -> tuple[bool, bool, float]:

@@ -303,6 +303,13 @@ RELATIVE_TABLE_COLUMNS = (_VIEWS, _SCORED, FLAT_VIEWS, COVERAGE, _RANKED, *RELAT
 RELATIVE_INTERVALS = tuple(column for column in RELATIVE_COLUMNS if "within_mm" not in column.path)
 """Those of them that have intervals."""
 
+_BY_PATH: Mapping[str, Column] = {column.path: column for column in (*TABLE_COLUMNS, *RELATIVE_COLUMNS)}
+
+
+def columns_at(*paths: str) -> tuple[Column, ...]:
+    """Return the columns of a config's table at ``paths``, such as ``native.abs_rel``."""
+    return tuple(_BY_PATH[path] for path in paths)
+
 
 def with_reference(columns: Sequence[Column]) -> list[Column]:
     """Return the columns of the metrics that have reference errors."""

@@ -34,17 +34,12 @@ from rebar_depth_bench.scoring.bootstrap import INTERVALS
 from rebar_depth_bench.scoring.columns import (
     ALIGNED,
     ALIGNED_CONSTANT,
-    ALIGNED_ROBUST,
     COVERAGE,
-    NATIVE,
-    RANK_ERROR,
     RELATIVE_COLUMNS,
-    SCALED,
-    SCALED_CONSTANT,
     VIEW_COLUMNS,
-    WITHIN,
     Column,
     Share,
+    columns_at,
 )
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, PROTOCOL, RELATIVE_PROTOCOL
 from rebar_depth_bench.scoring.relative import kind_text, relative_findings
@@ -76,15 +71,23 @@ _RELATIVE_NOTEBOOK_COLUMNS = (
     *("config", "views", "views_scored", "coverage", "flat_views", "aligned_error", "constant_error"),
     *("aligned_abs_rel", "aligned_robust_abs_rel", "constant_abs_rel", "aligned_within_5mm"),
 )
-_SUMMARY = (
-    (COVERAGE, RANK_ERROR, NATIVE[0], SCALED[0], SCALED_CONSTANT[0], WITHIN[1]),
-    ("coverage", "rank error", "AbsRel", "scaled", "constant", "within 5 mm"),
-)
-_RELATIVE_SUMMARY = (
-    (COVERAGE, ALIGNED[0], ALIGNED_CONSTANT[0], ALIGNED[1], ALIGNED_ROBUST[1], ALIGNED[6]),
-    ("coverage", "aligned error", "constant error", "AbsRel", "robust AbsRel", "within 5 mm"),
-)
-"""Columns that ``print(result)`` shows, and their headings."""
+_SUMMARY = {
+    "coverage": "coverage",
+    "rank_error": "rank error",
+    "native.abs_rel": "AbsRel",
+    "scaled.abs_rel": "scaled",
+    "reference.scaled_constant.abs_rel": "constant",
+    "within_mm.5": "within 5 mm",
+}
+_RELATIVE_SUMMARY = {
+    "coverage": "coverage",
+    "aligned.error": "aligned error",
+    "constant.error": "constant error",
+    "aligned.abs_rel": "AbsRel",
+    "aligned_robust.abs_rel": "robust AbsRel",
+    "aligned.within_mm.5": "within 5 mm",
+}
+"""Headings of the columns that ``print(result)`` shows, by their paths."""
 
 
 @dataclass(frozen=True)
@@ -213,8 +216,8 @@ class Result:
 
     def __str__(self) -> str:
         """Return the main numbers of each config as a table, with what limits them."""
-        columns, heads = _SUMMARY if self.prediction is None else _RELATIVE_SUMMARY
-        rows = [[printable(self.method), *heads]]
+        heads = _SUMMARY if self.prediction is None else _RELATIVE_SUMMARY
+        columns, rows = columns_at(*heads), [[printable(self.method), *heads.values()]]
         notes = dict[str, list[str]]()
         for name, table in self.tables.items():
             cells = (f"{column.text(column.value(table))} {column.unit}".strip() for column in columns)

@@ -13,9 +13,8 @@ from urllib.parse import urlsplit
 import pytest
 
 from leaderboard.settings import read_settings
-from leaderboard.web.connections import ConnectionCounts
 from leaderboard.web.middleware import client_network
-from leaderboard.web.server import listening_socket
+from leaderboard.web.server import ConnectionCounts, listening_socket
 from tests.leaderboard.serving import (
     API,
     END,

@@ -16,20 +16,15 @@ from dataset_builder.scene.assemblies.bar_meshes import bar_mesh, ribs_per_row
 from dataset_builder.scene.assemblies.cage import CageBar
 from dataset_builder.scene.cages.as_built import BuiltBar, build_as, lowest_steel_m
 from dataset_builder.scene.cages.design import Design, InfeasibleError
-from dataset_builder.scene.cages.families.beams import beam
+from dataset_builder.scene.cages.families.beams import beam, joint
 from dataset_builder.scene.cages.families.columns import column, pile_cage
-from dataset_builder.scene.cages.families.footings import footing
-from dataset_builder.scene.cages.families.joints import joint
-from dataset_builder.scene.cages.families.slabs import slab
+from dataset_builder.scene.cages.families.mats import footing, slab
 from dataset_builder.scene.cages.families.walls import wall
 from dataset_builder.scene.model import Assembly, Mesh, axis_of
-from dataset_builder.specs.config_specs import GeneratedCageSpec
+from dataset_builder.specs.config_specs import CAGES_VERSION, GeneratedCageSpec
 from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.base.names import SPLITS
 from rebar_depth_bench.data.bars import Bar
-
-VERSION = 2
-"""Version of the generator: it changes when the same seed gives another cage."""
 
 MAX_BARS = 200
 """Largest number of bars of a design, which bounds the time to generate and to render a cage."""
@@ -151,7 +146,7 @@ def _cage_rng(split: str, number: int, seed: int) -> np.random.Generator:
         raise InputError(f"the split of a cage is {split!r}, expected one of {', '.join(SPLITS)}")
     if number < 0:
         raise InputError(f"the number of a cage is {number}, expected 0 or more")
-    name = f"cage version {VERSION} seed {seed} split {split} number {number}"
+    name = f"cage version {CAGES_VERSION} seed {seed} split {split} number {number}"
     return np.random.default_rng(int.from_bytes(sha256(name.encode()).digest(), "little"))
 
 
@@ -187,8 +182,8 @@ def spec_cage(spec: GeneratedCageSpec) -> GeneratedCage:
 
     Raises ``InputError`` if the spec is of another version of the generator, and as ``generate_cage``.
     """
-    if spec.version != VERSION:
-        raise InputError(f"the cage is of version {spec.version} of the generator, expected {VERSION}")
+    if spec.version != CAGES_VERSION:
+        raise InputError(f"the cage is of version {spec.version} of the generator, expected {CAGES_VERSION}")
     return generate_cage(spec.split, spec.number, spec.seed, spec.family)
 
 

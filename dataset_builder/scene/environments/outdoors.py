@@ -47,7 +47,9 @@ def outdoors() -> tuple[Part, ...]:
 
 def site() -> tuple[Part, ...]:
     """Return the surfaces of the site without the footing slab: the ground, objects beyond ``CLEAR_M``, trees."""
-    return (_ground(), *_containers(), *_hoarding(), *_stacks(), _spoil_heap(), _trees())
+    g = GROUND_HALF_M
+    ground = surface("ground", box((-g, -g, GROUND_M - 1.0), (g, g, GROUND_M)), "gravel")
+    return (ground, *_containers(), *_hoarding(), *_stacks(), _spoil_heap(), _trees())
 
 
 def placed(name: str, mesh: Mesh, at_m: Point, turn_deg: float, material: str) -> Part:
@@ -62,11 +64,6 @@ def _footing() -> tuple[Part, ...]:
         surface("slab", box((-s, -s, -0.6), (s, s, 0.0)), "site concrete"),
         surface("blinding", box((-b, -b, -0.5), (b, b, -0.075)), "blinding"),
     )
-
-
-def _ground() -> Part:
-    g = GROUND_HALF_M
-    return surface("ground", box((-g, -g, GROUND_M - 1.0), (g, g, GROUND_M)), "gravel")
 
 
 def _containers() -> tuple[Part, ...]:

@@ -30,11 +30,6 @@ class SortedColumn:
     name: str
     column: Column
 
-    @property
-    def largest_first(self) -> bool:
-        """Whether more is better."""
-        return self.column.better == "higher"
-
     def value(self, table: Mapping[str, Any]) -> float | None:
         """Return the value in the JSON of a table, or None if it is undefined or hidden."""
         found = self.column.value(table)
@@ -74,7 +69,8 @@ class Selection:
     @property
     def is_descending(self) -> bool:
         """Whether values decrease from top to bottom."""
-        return (self.order in COLUMNS and COLUMNS[self.order].largest_first) != self.inverted
+        is_better = self.order in COLUMNS and COLUMNS[self.order].column.better == "higher"
+        return is_better != self.inverted
 
     def heading(self, name: str) -> str | None:
         """Return the ``aria-sort`` value of a column's heading, or None if the rows are not sorted by it."""

@@ -1,4 +1,4 @@
-"""Kept predictions of an interrupted run: damaged, renamed and foreign files, links and pipes."""
+"""Kept predictions of an interrupted run: resumption, damaged, renamed and foreign files, links and pipes."""
 
 from __future__ import annotations
 
@@ -14,8 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 
+from rebar_depth_bench import score
 from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.methods.kept_views import KeptViews, PreparationReport
+from rebar_depth_bench.methods.run import predict
+from tests.bench.methods.predictors import counting_method, metadata_of, orbit_view_ids, stop_after
 
 KEY = {"method": "whole", "columns": ("a", "b")}
 VIEW, GRID = "orbit/0001", (90, 160)
@@ -231,3 +234,42 @@ def test_links_in_work_folder_are_not_followed_when_it_is_deleted(kept: KeptView
     (kept.work_folder("orbit") / "pictures").symlink_to(tmp_path / "documents")
     KeptViews.open(kept.path, KEY).remove()
     assert {path.name for path in tmp_path.rglob("*")} == {"documents", "thesis.tex"}
+
+
+def test_multi_view_method_is_prepared_once_per_config(tiny_root: Path, tmp_path: Path) -> None:
+    log: list[str] = []
+    archive = tmp_path / "whole.zip"
+    prepared = predict(counting_method(log), tiny_root, archive)
+    assert log[:3] == ["check lattice", "check lattice-orbit", "prepare lattice False"]
+    assert log.count("prepare lattice False") == log.count("prepare lattice-orbit False") == 1
+    assert len(log) == 4 + 9 + 2
+    notes = {"lattice": {"counted": 9}, "lattice-orbit": {"counted": 2}}
+    assert {name: report.notes for name, report in prepared.items()} == notes
+    metadata = metadata_of(archive)
+    assert metadata["notes"] == notes
+    assert set(metadata["runtime"]["preparing"]) == {"lattice", "lattice-orbit"}
+    assert score(archive, tiny_root).tables["lattice"].ranked
+
+
+def test_resumed_run_keeps_work_finished_configs_and_sound_views(
+    tiny_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    archive, views = tmp_path / "whole.zip", orbit_view_ids(tiny_root)
+    with pytest.raises(KeyboardInterrupt):
+        predict(counting_method([]), tiny_root, archive, progress=stop_after(1, "on lattice-orbit"))
+    kept = tmp_path / ".whole.zip.views"
+    shutil.copytree(kept, tmp_path / "before")
+    log: list[str] = []
+    prepared = predict(counting_method(log), tiny_root, archive)
+    assert log[2:] == ["prepare lattice-orbit True", views[1]]
+    assert set(prepared) == {"lattice", "lattice-orbit"}
+    (tmp_path / "before").rename(kept)
+    (kept / f"{views[0]}.npz").write_bytes(b"damaged")
+    predict(counting_method(log), tiny_root, archive)
+    assert log[-2:] == views
+    [notice] = [line for line in capsys.readouterr().err.splitlines() if "again" in line]
+    assert f"{views[0]}.npz" in notice
+    with zipfile.ZipFile(archive) as source:
+        depths_m = [np.load(io.BytesIO(source.read(f"{view}.npy"))) for view in views]
+    assert all((depth_m == 2).all() for depth_m in depths_m)
+    assert [path.name for path in tmp_path.iterdir()] == ["whole.zip"]

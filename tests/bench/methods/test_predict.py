@@ -1,14 +1,10 @@
-"""Prediction runs: lookup of methods, archives, errors, interruption and resumption."""
+"""Prediction runs: lookup of methods, archives, errors and interruption."""
 
 from __future__ import annotations
 
-import io
 import json
 import re
-import shutil
 import sys
-import zipfile
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -19,7 +15,6 @@ import pytest
 
 from rebar_depth_bench import evaluate, score
 from rebar_depth_bench.base.errors import InputError, MethodError
-from rebar_depth_bench.base.parallel import Progress
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.methods import (
     METHODS,
@@ -35,7 +30,7 @@ from rebar_depth_bench.methods import (
 from rebar_depth_bench.methods.base import input_class
 from rebar_depth_bench.methods.run import predict
 from rebar_depth_bench.submission import INPUTS
-from tests.bench.methods.predictors import stop_after
+from tests.bench.methods.predictors import counting_method, metadata_of, orbit_view_ids, stop_after
 from tests.damage import change_manifest, copy_dataset
 
 USER_METHOD = """
@@ -61,13 +56,6 @@ def user_file(tmp_path: Path) -> Path:
     path = tmp_path / "own.py"
     path.write_text(USER_METHOD.replace("LOG", repr(str(tmp_path / "log"))))
     return path
-
-
-def metadata_of(archive: Path) -> dict[str, Any]:
-    """Return the metadata of an archive."""
-    with zipfile.ZipFile(archive) as source:
-        metadata: dict[str, Any] = json.loads(source.read("submission.json"))
-    return metadata
 
 
 def test_user_file_is_usable_as_method(user_file: Path, tiny_root: Path, tmp_path: Path) -> None:
@@ -97,12 +85,6 @@ def test_method_of_another_kind_declares_it(tiny_root: Path, tmp_path: Path) -> 
     path.write_text(code.replace("KIND", "depth"))
     with pytest.raises(MethodError, match="prediction is 'depth', expected one of metric, scale, affine-depth"):
         find_method(f"{path}:METHOD")
-
-
-def orbit_view_ids(root: Path) -> list[str]:
-    """Return the view ids of ``lattice-orbit``."""
-    manifest = json.loads((root / "manifest.json").read_text())
-    return [view["view_id"] for view in manifest["configs"]["lattice-orbit"]["views"]]
 
 
 @pytest.mark.parametrize(
@@ -181,68 +163,6 @@ def test_ground_truth_controls_score_as_expected(tiny_root: Path, tmp_path: Path
     assert noisy.native.abs_rel == pytest.approx(0.25, rel=0.01)
     mean_of_gaussian = 0.01 * (2 / np.pi) ** 0.5
     assert noisy.scaled.abs_rel == pytest.approx(mean_of_gaussian, rel=0.05)
-
-
-def counting_method(log: list[str]) -> MultiViewMethod:
-    """Return a multi-view method that predicts the number of views of a config and logs its calls."""
-
-    def check(views: Views) -> None:
-        log.append(f"check {views.config}")
-
-    def prepare(views: Views, work: Path, progress: Progress) -> Prepared:
-        log.append(f"prepare {views.config} {(work / 'kept').exists()}")
-        (work / "kept").touch()
-        progress("preparing", 1, 1)
-        counted = sum(row["left_K"].shape == (3, 3) for row in views.rows("left_K"))
-        assert counted == len(views.view_ids)
-
-        def run(row: Mapping[str, Any]) -> np.ndarray:
-            assert set(row) == {"view_id"}
-            log.append(row["view_id"])
-            return np.full(views.grid, counted, np.float32)
-
-        return Prepared(run, {"counted": counted})
-
-    return MultiViewMethod(MethodInfo("whole", "a test", (), False, "here", "MIT"), prepare, check)
-
-
-def test_multi_view_method_is_prepared_once_per_config(tiny_root: Path, tmp_path: Path) -> None:
-    log: list[str] = []
-    archive = tmp_path / "whole.zip"
-    prepared = predict(counting_method(log), tiny_root, archive)
-    assert log[:3] == ["check lattice", "check lattice-orbit", "prepare lattice False"]
-    assert log.count("prepare lattice False") == log.count("prepare lattice-orbit False") == 1
-    assert len(log) == 4 + 9 + 2
-    notes = {"lattice": {"counted": 9}, "lattice-orbit": {"counted": 2}}
-    assert {name: report.notes for name, report in prepared.items()} == notes
-    metadata = metadata_of(archive)
-    assert metadata["notes"] == notes
-    assert set(metadata["runtime"]["preparing"]) == {"lattice", "lattice-orbit"}
-    assert score(archive, tiny_root).tables["lattice"].ranked
-
-
-def test_resumed_run_keeps_work_finished_configs_and_sound_views(
-    tiny_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    archive, views = tmp_path / "whole.zip", orbit_view_ids(tiny_root)
-    with pytest.raises(KeyboardInterrupt):
-        predict(counting_method([]), tiny_root, archive, progress=stop_after(1, "on lattice-orbit"))
-    kept = tmp_path / ".whole.zip.views"
-    shutil.copytree(kept, tmp_path / "before")
-    log: list[str] = []
-    prepared = predict(counting_method(log), tiny_root, archive)
-    assert log[2:] == ["prepare lattice-orbit True", views[1]]
-    assert set(prepared) == {"lattice", "lattice-orbit"}
-    (tmp_path / "before").rename(kept)
-    (kept / f"{views[0]}.npz").write_bytes(b"damaged")
-    predict(counting_method(log), tiny_root, archive)
-    assert log[-2:] == views
-    [notice] = [line for line in capsys.readouterr().err.splitlines() if "again" in line]
-    assert f"{views[0]}.npz" in notice
-    with zipfile.ZipFile(archive) as source:
-        depths_m = [np.load(io.BytesIO(source.read(f"{view}.npy"))) for view in views]
-    assert all((depth_m == 2).all() for depth_m in depths_m)
-    assert [path.name for path in tmp_path.iterdir()] == ["whole.zip"]
 
 
 def test_user_file_is_a_module_that_imports_files_beside_it(

@@ -28,8 +28,7 @@ from dataset_builder.audit.camera_checks import (
 )
 from dataset_builder.audit.checks import RayCache, view_from_row
 from dataset_builder.cameras.rigs import rig_cameras
-from dataset_builder.cameras.steel_distance import Cylinders
-from dataset_builder.cameras.trajectories import poses
+from dataset_builder.cameras.trajectories import Cylinders, poses
 from dataset_builder.scene.mesh_ply import write_mesh_ply
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.specs.config_specs import DistanceSweepSpec, DomeSpec, RandomViewsSpec, RingSpec

@@ -121,7 +121,7 @@ def _panorama(folder: Path) -> dict[str, ndarray]:
     import bpy
 
     from dataset_builder.blender.colour import configure_colour, render_colour
-    from dataset_builder.blender.lights import add_panorama
+    from dataset_builder.blender.scene import add_panorama
 
     bpy.ops.wm.read_factory_settings(use_empty=True)
     light = replace(light_of("sunrise"), strength=0.02, turn_deg=TURN_DEG)

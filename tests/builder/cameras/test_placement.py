@@ -23,8 +23,8 @@ from dataset_builder.cameras.camera_placement import (
     with_random_stations,
     with_stations,
 )
-from dataset_builder.cameras.rigs import STEREO_CAMERAS, focal_of_view_px, rig_cameras
-from dataset_builder.cameras.trajectories import aim_point_m, camera_offsets_m, look_at_with_rig, poses, view_count
+from dataset_builder.cameras.rigs import STEREO_CAMERAS, rig_cameras
+from dataset_builder.cameras.trajectories import aim_point_m, camera_offsets_m, poses, view_count
 from dataset_builder.catalog.named_configs import BuildRequest
 from dataset_builder.catalog.scene_file import scene_config
 from dataset_builder.scene.cages.generate import FAMILIES
@@ -44,7 +44,7 @@ from dataset_builder.specs.config_specs import (
 from dataset_builder.user_files.cage_file import cage_file_spec, load_cage
 from dataset_builder.user_files.make_assembly import make_assembly
 from rebar_depth_bench.base.errors import InputError, MeshError
-from rebar_depth_bench.geometry.cameras import camera_centre, ideal_K, inverse_rigid
+from rebar_depth_bench.geometry.cameras import camera_centre, inverse_rigid
 from rebar_depth_bench.scoring.protocol import scored_pixels
 from tests.builder.cameras.survey_cages import (
     bar_table,
@@ -381,29 +381,3 @@ def test_cage_without_space_for_cameras_is_refused(cages: Mapping[str, Assembly]
     cage = next(iter(cages.values()))
     with pytest.raises(InputError, match="view 0"):
         randomly_placed(SPEC, cage, CameraSpace(0.01, clear_radius_m=0.01))
-
-
-def test_rolled_rig_turns_about_its_line_of_sight() -> None:
-    centre_m, target_m, baseline_m = np.array([2.0, 1.0, 1.5]), np.array([0.1, 0.2, 0.3]), 0.1
-    upright = look_at_with_rig(centre_m, target_m, baseline_m)
-    rolled = look_at_with_rig(centre_m, target_m, baseline_m, 90.0)
-    for pose in (upright, rolled):
-        np.testing.assert_allclose(camera_centre(pose), centre_m, atol=1e-12)
-        seen_m = pose[:3, :3] @ target_m + pose[:3, 3]
-        np.testing.assert_allclose(seen_m[:2], [baseline_m / 2, 0.0], atol=1e-12)
-    # A camera turned clockwise by 90 degrees has its x axis where its y axis, downwards, was.
-    np.testing.assert_allclose(rolled[0, :3] @ upright[1, :3], 1.0, atol=0.01)
-
-
-@pytest.mark.parametrize("camera", STEREO_CAMERAS.values(), ids=STEREO_CAMERAS)
-def test_rig_of_a_named_camera_has_its_focal_length(camera: FocalRigSpec) -> None:
-    eyes = rig_cameras(camera, np.eye(4))
-    assert eyes["left"].K[0, 0] == eyes["left"].K[1, 1] == camera.focal_px
-    assert eyes["right"].cam_from_world[0, 3] == -camera.baseline_m
-    half = ideal_K(640, 360, camera.focal_px)
-    assert (half[0, 0], half[0, 2]) == (camera.focal_px / 2, 319.5)
-
-
-def test_field_of_view_gives_the_focal_length() -> None:
-    assert focal_of_view_px(90.0) == 640.0
-    assert focal_of_view_px(2 * np.degrees(np.arctan(640 / 882.5))) == 882.5

@@ -10,10 +10,14 @@ import pytest
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.cameras.rigs import rig_cameras, zed_rig
+from dataset_builder.cameras.rigs import STEREO_CAMERAS, focal_of_view_px, rig_cameras, zed_rig
+from dataset_builder.cameras.trajectories import look_at_with_rig
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.scene.raycast import RayCaster
-from dataset_builder.specs.config_specs import RigSpec
+from dataset_builder.specs.config_specs import (
+    FocalRigSpec,
+    RigSpec,
+)
 from rebar_depth_bench.captures.calibration import StereoCalibration, scale_calibration
 from rebar_depth_bench.geometry.cameras import (
     Camera,
@@ -195,3 +199,29 @@ def opencv_ray(camera: Camera, u: int, v: int) -> tuple[float, float]:
     pixel = np.array([[[float(u), float(v)]]])
     x, y = cv2.undistortPointsIter(pixel, camera.K, camera.distortion, np.eye(3), np.eye(3), criteria)[0, 0]
     return float(x), float(y)
+
+
+def test_rolled_rig_turns_about_its_line_of_sight() -> None:
+    centre_m, target_m, baseline_m = np.array([2.0, 1.0, 1.5]), np.array([0.1, 0.2, 0.3]), 0.1
+    upright = look_at_with_rig(centre_m, target_m, baseline_m)
+    rolled = look_at_with_rig(centre_m, target_m, baseline_m, 90.0)
+    for pose in (upright, rolled):
+        np.testing.assert_allclose(camera_centre(pose), centre_m, atol=1e-12)
+        seen_m = pose[:3, :3] @ target_m + pose[:3, 3]
+        np.testing.assert_allclose(seen_m[:2], [baseline_m / 2, 0.0], atol=1e-12)
+    # A camera turned clockwise by 90 degrees has its x axis where its y axis, downwards, was.
+    np.testing.assert_allclose(rolled[0, :3] @ upright[1, :3], 1.0, atol=0.01)
+
+
+@pytest.mark.parametrize("camera", STEREO_CAMERAS.values(), ids=STEREO_CAMERAS)
+def test_rig_of_a_named_camera_has_its_focal_length(camera: FocalRigSpec) -> None:
+    eyes = rig_cameras(camera, np.eye(4))
+    assert eyes["left"].K[0, 0] == eyes["left"].K[1, 1] == camera.focal_px
+    assert eyes["right"].cam_from_world[0, 3] == -camera.baseline_m
+    half = ideal_K(640, 360, camera.focal_px)
+    assert (half[0, 0], half[0, 2]) == (camera.focal_px / 2, 319.5)
+
+
+def test_field_of_view_gives_the_focal_length() -> None:
+    assert focal_of_view_px(90.0) == 640.0
+    assert focal_of_view_px(2 * np.degrees(np.arctan(640 / 882.5))) == 882.5

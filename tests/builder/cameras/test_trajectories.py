@@ -12,8 +12,15 @@ from hypothesis import strategies as st
 
 from dataset_builder.cameras.camera_fit import check_fits
 from dataset_builder.cameras.rigs import rig_cameras
-from dataset_builder.cameras.steel_distance import Cylinders, radii_at_steel_distance_m
-from dataset_builder.cameras.trajectories import aim_point_m, camera_offsets_m, poses, subset, view_count
+from dataset_builder.cameras.trajectories import (
+    Cylinders,
+    aim_point_m,
+    camera_offsets_m,
+    poses,
+    radii_at_steel_distance_m,
+    subset,
+    view_count,
+)
 from dataset_builder.catalog.named_configs import CONFIGS, PIER_DOME
 from dataset_builder.scene.assemblies.pier import pier_assembly
 from dataset_builder.scene.environments.outdoors import CLEAR_M

@@ -18,7 +18,7 @@ from PIL import Image
 import rebar_depth_bench as rdb
 from dataset_builder.cli.main import main
 from dataset_builder.export import export
-from dataset_builder.export.target import MARKER
+from dataset_builder.export.exporting import MARKER
 from rebar_depth_bench.base.errors import DatasetError, InputError
 from tests.damage import change_manifest
 from tests.synthetic_dataset import write_dataset, write_split_dataset

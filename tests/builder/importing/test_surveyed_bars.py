@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from dataset_builder.importing.surveyed_bars import read_bars_file
+from dataset_builder.importing.survey_check import read_bars_file
 from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.data.bars import Bar
 

@@ -26,8 +26,8 @@ from dataset_builder.pipeline import plan as plan_module
 from dataset_builder.pipeline.build import build
 from dataset_builder.pipeline.plan import BUILD_FOLDER, plan_config
 from dataset_builder.scene.cages import generate as generate_module
-from dataset_builder.scene.cages.generate import VERSION, drawn_family
-from dataset_builder.specs.config_specs import ColourSpec, GeneratedCageSpec, SceneConfigSpec
+from dataset_builder.scene.cages.generate import drawn_family
+from dataset_builder.specs.config_specs import CAGES_VERSION, ColourSpec, GeneratedCageSpec, SceneConfigSpec
 from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.cli.main import main as rebar_bench
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars
@@ -146,7 +146,7 @@ def test_folder_of_an_earlier_generator_is_scored_and_not_continued(
     for request in (cages("train", 2), cages("train", 3), cages("test", 1)):
         refused = run_in_process(main, "--out", copy, *request, *GROUND_TRUTH)
         assert refused.returncode == 2
-        assert f"version 1 of the generator of cages, this is version {VERSION}" in refused.stderr
+        assert f"version 1 of the generator of cages, this is version {CAGES_VERSION}" in refused.stderr
         assert "another folder (--out); --overwrite cages replaces the config" in refused.stderr
     assert contents(copy) == before
 
@@ -217,7 +217,7 @@ def test_scenes_do_not_depend_on_their_number_and_vary() -> None:
 
 def test_version_of_the_generator_changes_the_key(tmp_path: Path) -> None:
     [spec] = specs("test", 1)
-    assembly = GeneratedCageSpec("test", 0, version=VERSION + 1)
+    assembly = GeneratedCageSpec("test", 0, version=CAGES_VERSION + 1)
     later = replace(spec, scene=replace(spec.scene, assembly=assembly))
     assert plan_config(spec, None, tmp_path).key != plan_config(later, None, tmp_path).key
 

@@ -21,8 +21,7 @@ from numpy import ndarray
 from scipy.spatial import ConvexHull
 
 from dataset_builder.cameras.rigs import rig_cameras
-from dataset_builder.cameras.steel_distance import Cylinders
-from dataset_builder.cameras.trajectories import aim_point_m, poses
+from dataset_builder.cameras.trajectories import Cylinders, aim_point_m, poses
 from dataset_builder.catalog.named_configs import LATTICE_DOME, LATTICE_RING, PIER_DOME, PILE_DOME
 from dataset_builder.export.camera_formats import axis_points_m
 from dataset_builder.scene.assemblies.cage import CageBar

@@ -161,13 +161,6 @@ def _u_bars(diameter_m: float, rows: Sequence[float], back_x: float, level_y: fl
     if leg_x < 0.05:
         raise InfeasibleError("a wall is too short for the laps of its U-bars")
     below_m = contact_m(diameter_m, diameter_m)
-    lines = [
-        bent([(s * x, y, z - below_m) for x, y in _u_corners_m(leg_x, back_x, level_y)], diameter_m)
-        for s in (1, -1)
-        for z in rows
-    ]
+    corners_m = [(leg_x, level_y), (back_x, level_y), (back_x, -level_y), (leg_x, -level_y)]
+    lines = [bent([(s * x, y, z - below_m) for x, y in corners_m], diameter_m) for s in (1, -1) for z in rows]
     return [DesignBar(U_BAR, diameter_m, line_m, Z, False, Y) for line_m in lines]
-
-
-def _u_corners_m(leg_x: float, back_x: float, level_y: float) -> list[tuple[float, float]]:
-    return [(leg_x, level_y), (back_x, level_y), (back_x, -level_y), (leg_x, -level_y)]

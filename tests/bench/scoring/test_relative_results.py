@@ -1,0 +1,445 @@
+"""Results of predictions that are not metric: archives, tables, and what refuses them."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+import zipfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+from rich.console import Console
+
+import rebar_depth_bench as rdb
+from rebar_depth_bench.cli.main import main
+from rebar_depth_bench.reporting.html.page import render_report
+from rebar_depth_bench.reporting.latex import latex_table
+from rebar_depth_bench.reporting.tables import print_paper_table
+from rebar_depth_bench.scoring.columns import METRICS, RELATIVE_INTERVALS
+from rebar_depth_bench.scoring.result import Result, read_result
+from tests.bench.reporting.pages import Page
+from tests.bench.reporting.test_browser import run_in_browser
+
+KINDS = ("scale", "affine-depth", "affine-disparity")
+Values = np.ndarray
+Write = Callable[..., Path]
+
+
+def disparity(depth_m: Values) -> Values:
+    with np.errstate(divide="ignore"):
+        return np.asarray(np.where(depth_m > 0, 30 / depth_m - 70, -99), np.float32)
+
+
+@pytest.fixture
+def write(tiny_truth: dict[str, np.ndarray], tmp_path: Path) -> Write:
+    """Write an archive of a function of the true depth of the lattice."""
+
+    def write_archive(name: str, kind: str | None, make: Callable[[Values], Values]) -> Path:
+        path = tmp_path / f"{name}.zip"
+        with rdb.SubmissionWriter(path, name, prediction=kind, inputs="rgb", uses_ground_truth=False) as writer:
+            for number, (view_id, depth_m) in enumerate(tiny_truth.items()):
+                rng = np.random.default_rng(number)
+                writer.add(view_id, make(depth_m) * (1 + 0.01 * rng.standard_normal(depth_m.shape)))
+        return path
+
+    return write_archive
+
+
+@pytest.fixture
+def relative(write: Write, tiny_root: Path) -> Result:
+    return rdb.score(write("net", "affine-disparity", disparity), tiny_root)
+
+
+def numbers(document: Any) -> Any:
+    """Return a JSON value with approximate numbers, for comparisons."""
+    if isinstance(document, dict):
+        return {key: numbers(value) for key, value in document.items()}
+    return pytest.approx(document, rel=1e-5, abs=1e-9) if isinstance(document, float) else document
+
+
+def test_result_of_another_kind(relative: Result) -> None:
+    document = json.loads(relative.to_json())
+    assert (document["protocol"], document["prediction"]) == ("rebar-relative-1", "affine-disparity")
+    [table] = document["tables"].values()
+    nulls = {table[key] for key in ("native", "scaled", "rank_error", "scale_median")}
+    assert (nulls, table["ranked"], table["flat_views"]) == ({None}, False, 0)
+    for view in document["views"]:
+        assert {view[key] for key in ("native", "scaled", "rank_error", "scale")} == {None}
+    for alignment in ("aligned", "aligned_robust", "constant"):
+        views = [view[alignment] for view in document["views"]]
+        assert list(views[0]) == ["error", "abs_rel", "rmse_cm", "mae_cm", "delta1", "within_mm"]
+        mean = {key: np.mean([view[key] for view in views]) for key in views[0] if key != "within_mm"}
+        within = {t: np.mean([view["within_mm"][t] for view in views]) for t in ("3", "5", "10", "20")}
+        assert table[alignment] == numbers({**mean, "within_mm": within})
+    assert table["aligned"]["error"] < table["constant"]["error"] / 3
+
+
+def test_result_is_read_as_it_was_written(relative: Result, tiny_root: Path, write: Write) -> None:
+    scaled = rdb.score(write("scaled", "scale", lambda z: 3 * z), tiny_root)
+    empty = rdb.score(write("empty", "affine-depth", lambda z: z * np.nan), tiny_root)
+    for one in (relative, scaled, empty):
+        again = read_result(one.to_json(), "result.json")
+        assert again.to_json() == one.to_json()
+        assert (again.kind, again.columns) == (one.kind, one.columns)
+        assert again.tables["lattice"].intervals.keys() == {column.path for column in RELATIVE_INTERVALS}
+    assert json.loads(scaled.to_json())["tables"]["lattice"]["aligned_robust"] is None
+    assert json.loads(empty.to_json())["tables"]["lattice"]["aligned"]["abs_rel"] is None
+    mixed = relative.to_json().replace(b"rebar-relative-1", b"rebar-2")
+    with pytest.raises(rdb.InputError, match="the protocol is rebar-2 and prediction is affine-disparity"):
+        read_result(mixed, "result.json")
+
+
+def test_intervals_are_those_of_the_view_numbers(relative: Result) -> None:
+    """Nine sparse views are nine blocks: the interval of the mean contains it and is narrower than the views."""
+    table = relative.tables["lattice"]
+    for column in RELATIVE_INTERVALS[1:]:
+        values = [column.view_value(view) or 0.0 for view in relative.views]
+        low, high = table.intervals[column.path] or (np.nan, np.nan)
+        assert min(values) <= low <= column.value(table) <= high <= max(values)
+
+
+def test_scale_has_the_scaled_numbers_of_metric_results(write: Write, tiny_root: Path) -> None:
+    holed = write("holed", None, lambda z: np.where(np.indices(z.shape)[1] % 3, 5 * z, 0))
+    metric, aligned = rdb.score(holed, tiny_root), rdb.score(holed, tiny_root, align="scale")
+    assert aligned.kind == "scale"
+    for native, of_scale in zip(metric.views, aligned.views, strict=True):
+        assert native.scaled is not None
+        assert of_scale.aligned is not None
+        assert of_scale.constant is not None
+        assert vars(native.scaled).items() <= vars(of_scale.aligned).items()
+        assert (of_scale.constant.abs_rel, of_scale.constant.rmse_cm) == pytest.approx(native.scaled_constant)
+        assert of_scale.coverage == native.coverage < 1
+        assert of_scale.aligned.error > 1 - of_scale.coverage
+
+
+@pytest.mark.parametrize(("kind", "make"), [("affine-depth", lambda z: z), ("affine-disparity", lambda z: 1 / z)])
+def test_metric_archives_are_aligned_as_weaker_kinds(
+    kind: str, make: Callable[[Values], Values], tmp_path: Path, tiny_root: Path, tiny_truth: dict[str, np.ndarray]
+) -> None:
+    """Metric depth aligned as another kind has the errors of an archive of that kind."""
+    rng = np.random.default_rng(0)
+    with (
+        rdb.SubmissionWriter(tmp_path / "metric.zip", "m") as metric,
+        rdb.SubmissionWriter(tmp_path / "other.zip", "m", prediction=kind) as other,
+    ):
+        for view_id, depth_m in tiny_truth.items():
+            noisy = np.where(rng.random(depth_m.shape) < 0.1, np.nan, depth_m) + 0.5
+            metric.add(view_id, noisy)
+            other.add(view_id, make(noisy))
+    aligned = rdb.score(tmp_path / "metric.zip", tiny_root, align=kind)
+    [first, second] = (one.to_pandas("views") for one in (rdb.score(tmp_path / "other.zip", tiny_root), aligned))
+    assert list(first["view_id"]) == list(second["view_id"])
+    for column in aligned.columns:  # The archives hold float32: some pixels are at a tolerance.
+        tolerance = 2e-3 if "within" in column.path else 1e-6
+        assert list(first[column.name]) == pytest.approx(list(second[column.name]), rel=1e-4, abs=tolerance)
+    with pytest.raises(rdb.SubmissionError, match=f"of the kind {kind}, expected metric ones: .*scored as scale"):
+        rdb.score(tmp_path / "other.zip", tiny_root, align="scale")
+    with pytest.raises(rdb.InputError, match="align is metres, expected one of metric, scale, affine-depth"):
+        rdb.score(tmp_path / "metric.zip", tiny_root, align="metres")
+
+
+def test_zero_of_a_png_is_no_value(tiny_root: Path, tiny_truth: dict[str, np.ndarray], tmp_path: Path) -> None:
+    paths = {}
+    for with_holes in (False, True):
+        paths[with_holes] = tmp_path / f"{with_holes}.zip"
+        with zipfile.ZipFile(paths[with_holes], "w") as archive:
+            metadata = {"method": "png", "prediction": "affine-disparity", "depth_scale": 0.5}
+            archive.writestr("submission.json", json.dumps(metadata))
+            for view_id, depth_m in tiny_truth.items():
+                values = disparity(depth_m)
+                values = np.clip(400 * (values - values.min()), 1, 65535).astype(np.uint16)
+                values[::2] *= not with_holes
+                image = io.BytesIO()
+                Image.fromarray(values).save(image, "PNG")
+                archive.writestr(f"{view_id}.png", image.getvalue())
+    whole, holed = (rdb.score(path, tiny_root).tables["lattice"] for path in paths.values())
+    assert whole.coverage == 1
+    assert 0.3 < (holed.coverage or 0) < 0.7
+    assert holed.aligned is not None
+    assert holed.aligned.error == pytest.approx(1 - (holed.coverage or 0), abs=0.05)
+    assert holed.flat_views == 0
+
+
+def test_metric_json_has_no_keys_of_other_kinds(write: Write, tiny_root: Path) -> None:
+    path = write("metric", "metric", lambda z: z)
+    with zipfile.ZipFile(path) as archive:
+        assert "prediction" not in json.loads(archive.read("submission.json"))
+    document = json.loads(rdb.score(path, tiny_root).to_json())
+    assert (document["protocol"], "prediction" in document) == ("rebar-2", False)
+    table, view = document["tables"]["lattice"], document["views"][0]
+    assert list(table) == [
+        *("views", "views_scored", "coverage", "ranked", "rank_error", "native", "scaled", "scale_median"),
+        *("within_mm", "reference", "published", "ci95"),
+    ]
+    assert list(table["ci95"]) == ["coverage", "rank_error", "native", "scaled", "scale_median", "within_mm"]
+    shared = ("coverage", "rank_error", "scale", "native", "scaled", "within_mm")
+    assert list(view) == ["view_id", "scored_px", *shared]
+
+
+def test_unknown_kind_is_refused(tiny_root: Path, archive_of: Write, tiny_truth: dict[str, np.ndarray]) -> None:
+    path = archive_of(tiny_truth)
+    with zipfile.ZipFile(path) as archive:
+        entries = {name: archive.read(name) for name in archive.namelist()}
+    entries["submission.json"] = b'{"method": "m", "prediction": "disparity"}'
+    with zipfile.ZipFile(path, "w") as archive:
+        for name, content in entries.items():
+            archive.writestr(name, content)
+    with pytest.raises(rdb.SubmissionError, match="prediction: got 'disparity', expected"):
+        rdb.score(path, tiny_root)
+
+
+# Presentation.
+
+
+def test_text_of_a_result(relative: Result, tiny_root: Path, write: Write) -> None:
+    lines = str(relative).splitlines()
+    assert lines[0].split("  ")[-6:] == [
+        *("coverage", "aligned error", "constant error", "AbsRel", "robust AbsRel", "within 5 mm")
+    ]
+    table = relative.tables["lattice"]
+    assert table.aligned is not None
+    assert table.aligned_robust is not None
+    assert table.constant is not None
+    errors = (table.aligned.error, table.constant.error, table.aligned.abs_rel, table.aligned_robust.abs_rel)
+    within = f"{100 * (table.aligned.within_mm[5] or 0):.1f}"
+    assert lines[1].split() == ["lattice", "100.0", "%", *(f"{value:.4f}" for value in errors), within, "%"]
+    assert lines[2].startswith("affine-disparity: disparity up to scale and shift")
+    assert len(lines) == 3
+    assert f"aligned error {table.aligned.error:.4g}, constant {table.constant.error:.4g}" in repr(relative)
+    assert "rebar-relative-1 (affine-disparity)" in relative._repr_html_()
+    flat = str(rdb.score(write("flat", "affine-depth", lambda z: -z), tiny_root))
+    assert re.search(r"The aligned error (0\.\d+) is not below 95 % of a constant's \(\1\)", flat)
+    assert "In 9 of 9 views the fit has no positive slope" in flat
+
+
+def test_frames(relative: Result) -> None:
+    frame, views = relative.to_pandas(), relative.to_pandas("views")
+    table = json.loads(relative.to_json())["tables"]["lattice"]
+    row = frame.iloc[0]
+    assert (row["prediction"], row["ranked"], row["flat_views"]) == ("affine-disparity", False, 0)
+    assert row["aligned_robust_within_5mm"] == table["aligned_robust"]["within_mm"]["5"]
+    assert [row["constant_error_low"], row["constant_error_high"]] == table["ci95"]["constant"]["error"]
+    assert "native_abs_rel" not in frame
+    assert views["aligned_error"].mean() == pytest.approx(table["aligned"]["error"])
+    assert not views["is_flat"].any()
+    assert relative.to_pandas("groups").empty
+    assert relative.metrics["lattice/aligned/within_mm/5"] == pytest.approx(row["aligned_within_5mm"])
+
+
+def test_score_command(
+    tiny_root: Path, tmp_path: Path, write: Write, capsys: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    metric = write("metric", None, lambda z: 1.1 * z)
+    arguments = ["score", str(metric), "--data", str(tiny_root), "--align", "affine-disparity"]
+    files = {name: tmp_path / f"result.{name}" for name in ("json", "csv", "html")}
+    options = [text for name, path in files.items() for text in (f"--{name}", str(path))]
+    assert main([*arguments, *options]) == 0
+    output = capsys.readouterr()
+    assert "mistake" not in output.err
+    expected = rdb.score(metric, tiny_root, align="affine-disparity")
+    assert files["json"].read_bytes() == expected.to_json()
+    [row] = csv.DictReader(io.StringIO(files["csv"].read_text()))
+    table = expected.tables["lattice"]
+    assert table.aligned is not None
+    assert table.constant is not None
+    assert float(row["aligned_error"]) == pytest.approx(table.aligned.error)
+    lines = [line.split() for line in output.out.splitlines()]
+    [constant] = [line for line in lines if line[:1] == ["constant"]]
+    assert constant[1:3] == [f"{value:.4f}" for value in (table.constant.error, table.constant.abs_rel)]
+    text = Page(files["html"].read_text()).text
+    for column in RELATIVE_INTERVALS[1:]:
+        assert column.text(column.value(table)) in text
+    assert all(view.view_id in text for view in expected.views)
+    declared = "etric predictions, scored as affine-disparity (--align): disparity up to scale and shift"
+    assert f"M{declared}" in text
+    assert f"m{declared}" in output.out
+    assert f"m{declared}" in str(expected)
+    assert "Rank error" not in text
+
+
+def test_table_has_a_block_for_each_kind(tiny_root: Path, tmp_path: Path, write: Write, capsys: Any) -> None:
+    worse = write("worse", "affine-depth", lambda z: z**-2)
+    better = write("better", "affine-depth", lambda z: 5 * z - 3)
+    metric = write("sound", None, lambda z: z)
+    net = write("net", "affine-disparity", disparity)
+    latex, frame = tmp_path / "table.tex", tmp_path / "table.csv"
+    archives = [str(path) for path in (net, worse, metric, better)]
+    arguments = ["table", *archives, "--data", str(tiny_root)]
+    assert main([*arguments, "--latex", str(latex), "--csv", str(frame), "--no-published"]) == 0
+    out = capsys.readouterr().out
+    order = [out.index(f"\n{name} ") for name in ("sound", "better", "worse", "net")]
+    assert order == sorted(order)
+    assert "worse: The aligned error" in out
+    rows = list(csv.DictReader(io.StringIO(frame.read_text())))
+    assert [row["method"] for row in rows] == ["sound", "better", "worse", "net"]
+    assert [row["prediction"] for row in rows] == ["", "affine-depth", "affine-depth", "affine-disparity"]
+    assert [row["flat_views"] for row in rows] == ["", "0", "9", "0"]
+    text = latex.read_text()
+    assert text.count(r"\begin{table*}") == 3
+    blocks = text.split(r"\begin{table*}")
+    assert [r"\label{tab:rebar-depth-affine-depth}" in block for block in blocks] == [False, False, True, False]
+    assert blocks[2].index("better &") < blocks[2].index("worse &")
+    assert "textbf" not in blocks[2]
+    assert "ddagger" not in blocks[2]
+    figure = tmp_path / "figure.svg"
+    assert main([*arguments, "--figure", str(figure)]) == 2
+    errors = capsys.readouterr().err
+    assert "expected metric ones: the figure shows native errors" in errors
+    assert "scoring" not in errors, "kinds are refused before any archive is scored"
+    assert not figure.exists()
+    shared = ["table", str(metric), str(net), "--data", str(tiny_root), "--align", "affine-disparity"]
+    assert main(shared) == 0
+    assert "rank err" not in capsys.readouterr().out
+
+
+def test_compare(tiny_root: Path, write: Write, capsys: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "60")
+    net = write("net", "affine-disparity", disparity)
+    blurred = write("blurred", "affine-disparity", lambda z: disparity(z) + 25 * np.indices(z.shape)[1] % 3)
+    metric = write("metric", None, lambda z: z)
+    assert main(["compare", str(net), str(metric), "--data", str(tiny_root)]) == 2
+    words = "metric has predictions of the kind metric, expected affine-disparity as net"
+    errors = capsys.readouterr().err
+    assert words in " ".join(errors.split())
+    assert "scoring" not in errors, "kinds are refused before any archive is scored"
+    assert main(["compare", str(net), str(blurred), "--data", str(tiny_root), "--json", "-"]) == 0
+    [document] = json.loads(capsys.readouterr().out)
+    assert document["protocol"] == "rebar-relative-1"
+    rows = {row["name"]: row for row in document["configs"]["lattice"]}
+    results = [rdb.score(path, tiny_root).tables["lattice"].aligned for path in (net, blurred)]
+    assert [rows["aligned.error"][key] for key in ("first", "other")] == [
+        pytest.approx(one.error) for one in results if one is not None
+    ]
+    assert rows["aligned.error"]["verdict"] == "worse"
+    assert {name.partition(".")[0] for name in rows} == {"coverage", "aligned", "aligned_robust"}
+    assert main(["compare", str(net), str(blurred), "--data", str(tiny_root)]) == 0
+    table = capsys.readouterr().out
+    assert "…" not in table, "numbers are never truncated"
+    assert "rank error" not in table
+
+
+def test_marks_and_legends_are_those_of_metric_tables(write: Write, tiny_root: Path, capsys: Any) -> None:
+    sparse = rdb.score(
+        write("sparse", None, lambda z: np.where(z > 0.3, z, 0)), tiny_root, align="affine-disparity"
+    )
+    net = rdb.score(write("net", "affine-disparity", disparity), tiny_root)
+    net = replace(net, tables={"lattice": net.tables["lattice"], "twin": net.tables["lattice"]})
+    sparse = replace(sparse, tables={"lattice": sparse.tables["lattice"], "twin": sparse.tables["lattice"]})
+    declared = {"cheat": True, "unknown": None}
+    results = [sparse, net]
+    for method, uses in declared.items():
+        results.append(replace(net, submission=replace(net.submission, method=method, uses_ground_truth=uses)))
+    print_paper_table(results, Console(width=200), published=True)
+    printed = capsys.readouterr().out
+    latex = latex_table(results, published=True)
+    for method in ("net", "cheat ‡", "unknown ?", "sparse *"):
+        assert printed.count(f"\n{method}  ") == 2, "in the table of each config"
+    for text in (printed, latex):
+        assert "Not ranked (declares the use of ground truth)." in text
+        assert "Use of ground truth not declared." in text
+        assert "Errors of valid predictions are not compared with those of others: sparse, lattice" in text
+        assert "Metric predictions, aligned as this kind: sparse." in text
+    rows = {
+        cells[0]: cells[1:] for line in latex.splitlines() if len(cells := line.rstrip("\\ ").split(" & ")) == 11
+    }
+    heads = rows["Method"]
+    assert len(set(heads)) == 5, "no two columns of a config have one name"
+    marked = {
+        row: [heads[place] for place, cell in enumerate(cells) if "$^" in cell] for row, cells in rows.items()
+    }
+    assert marked["sparse"] == [r"AbsRel $\downarrow$"] * 2, "of valid predictions"
+    assert marked["cheat"] == [r"$E$ $\downarrow$"] * 2
+    assert "unknown$^{?}$" in rows
+    assert "$1 / p = a x + b$ fitted to $1 / z$ in each view" in latex
+
+
+def test_aligned_metric_archive_is_recognised(write: Write, tiny_root: Path, relative: Result) -> None:
+    metric = write("metric", None, lambda z: 1.1 * z)
+    aligned = rdb.score(metric, tiny_root, align="affine-disparity")
+    document = json.loads(aligned.to_json())
+    assert (document["prediction"], document["declared_prediction"]) == ("affine-disparity", "metric")
+    assert read_result(aligned.to_json(), "result.json").to_json() == aligned.to_json()
+    for other in (relative, rdb.score(metric, tiny_root)):
+        assert "declared_prediction" not in json.loads(other.to_json())
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_report_names_the_fit_of_each_view(kind: str, write: Write, tiny_root: Path) -> None:
+    result = rdb.score(write("net", kind, lambda z: np.where(z.max() > 0.75, z.max() - z, z) + 1), tiny_root)
+    page = render_report(result, [])
+    fits = re.findall(r">(constant|sloped)</td>", page)
+    assert fits.count("constant") == result.tables["lattice"].flat_views
+    assert len(fits) == (0 if kind == "scale" else 9), "a scale has no slope"
+    assert ("Constant fit: a view whose fit has no positive slope" in Page(page).text) == (kind != "scale")
+
+
+def test_tables_of_the_report_fit_a_window(chromium_program: str, relative: Result, tmp_path: Path) -> None:
+    """No table has a scroll bar at 1200 pixels."""
+    page = re.sub(r"<meta http-equiv=[^>]*>", "", render_report(relative, []))
+    script = """
+    document.body.style = "width: 1185px; padding: 36px; margin: 0";
+    return [...document.querySelectorAll(".scroll")].map((one) => one.scrollWidth - one.clientWidth);
+    """
+    overflow = run_in_browser(chromium_program, page.replace("</body>\n</html>\n", ""), script, tmp_path)
+    assert overflow == [0, 0]
+
+
+def test_rounding_errors_of_exact_predictions_are_zero() -> None:
+    assert METRICS["rmse_cm"].text(1.2e-17) == "0.00"
+    assert METRICS["rmse_cm"].text(1.2e-9) == "1.2e-09"
+
+
+def test_configs_of_one_archive_are_named(write: Write, tiny_root: Path, tmp_path: Path, capsys: Any) -> None:
+    both = tmp_path / "both.zip"
+    with rdb.SubmissionWriter(both, "both", prediction="affine-disparity") as writer:
+        for config in ("lattice", "lattice-orbit"):
+            for row in rdb.load(tiny_root, config, columns=["view_id", "left_depth"]):
+                writer.add(row["view_id"], disparity(row["left_depth"]))
+    net = write("net", "affine-disparity", disparity)
+    assert main(["compare", str(both), str(net), "--data", str(tiny_root)]) == 0
+    assert "only in one of both and net, not compared: lattice-orbit" in capsys.readouterr().err
+
+
+def test_extended_measures_and_paper_scripts_are_refused(tiny_root: Path, write: Write, capsys: Any) -> None:
+    net = write("net", "affine-disparity", disparity)
+    assert main(["score", str(net), "--data", str(tiny_root), "--extended"]) == 2
+    assert "expected metric ones: extended measures are in metres" in capsys.readouterr().err
+    metric = write("metric", None, lambda z: z)
+    assert main(["score", str(metric), "--data", str(tiny_root), "--extended", "--align", "scale"]) == 2
+    assert "--align and --extended are both given" in capsys.readouterr().err
+    with pytest.raises(rdb.InputError, match="extended is true and kind is scale"):
+        rdb.Evaluator(tiny_root, "lattice", extended=True, kind="scale")
+
+
+def test_disparity_is_no_mistake(tiny_root: Path, write: Write, capsys: Any) -> None:
+    def check(name: str, kind: str, make: Callable[[Values], Values]) -> str:
+        assert main(["check", str(write(name, kind, make)), "--data", str(tiny_root)]) == 0
+        return str(capsys.readouterr().err)
+
+    with np.errstate(divide="ignore"):
+        assert "mistake" in check("undeclared", "metric", lambda z: 1 / z)
+    assert "mistake" not in check("declared", "affine-disparity", disparity)
+    assert "mistake" not in check("millimetres", "scale", lambda z: 1000 * z)
+    assert "mistake" not in check("negative", "affine-depth", lambda z: z - 90)
+    assert "0.0 % are finite and above 0" in check("none", "scale", lambda z: z - 90)
+    assert "0.0 % are finite\n" in check("infinite", "affine-depth", lambda z: z * np.inf)
+    assert "the same at all pixels in 8 of 8 views" in check("zero", "affine-depth", lambda z: 0 * z)
+
+
+def test_evaluation_of_another_kind(tiny_root: Path, tiny_truth: dict[str, np.ndarray], tmp_path: Path) -> None:
+    predictions = {view_id: disparity(depth_m) for view_id, depth_m in tiny_truth.items()}
+    result = rdb.evaluate(predictions, tiny_root, config="lattice", kind="affine-disparity", method="net")
+    result.save_archive(tmp_path / "net.zip")
+    assert result.to_json() == rdb.score(tmp_path / "net.zip", tiny_root).to_json()
+    assert result.notes[0].startswith("affine-disparity: disparity up to scale and shift")
+    assert len(result.notes) == 1
+    result.to_html(tmp_path / "report.html")
+    assert "affine-disparity" in Page((tmp_path / "report.html").read_text()).text
