@@ -24,6 +24,7 @@ from rebar_depth_bench.base.writing import output_file
 from rebar_depth_bench.data.loading import load
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.data.rows import ConfigViews, iterate_rows
+from rebar_depth_bench.data.schema import COLUMNS, POSE_COLUMNS, TRUTH_COLUMNS
 from rebar_depth_bench.diagnosis.diagnose import diagnose
 from rebar_depth_bench.geometry.cameras import right_from_left
 from rebar_depth_bench.methods.registry import find_method
@@ -44,11 +45,7 @@ if TYPE_CHECKING:
 Depth = Float[ndarray, "h w"]
 Model = str | Callable[[Mapping[str, Any]], object] | Mapping[str, object] | Iterable[tuple[str, object]]
 
-_POSES = ("left_cam_from_world", "right_cam_from_world")
-_ROW_COLUMNS = (
-    *("left_rgb", "right_rgb", "left_K", "right_K", "left_distortion", "right_distortion", "baseline_m"),
-    *_POSES,
-)
+_ROW_COLUMNS = tuple(name for name in COLUMNS if name != "scene" and name not in TRUTH_COLUMNS)
 
 
 def evaluate(
@@ -252,9 +249,9 @@ class Evaluator:
     def _rows(self, *, with_poses: bool) -> Iterator[dict[str, Any]]:
         """Yield what a function may read of each view."""
         for views in self._views:
-            for row in iterate_rows(views.source, ("view_id", *_ROW_COLUMNS)):
+            for row in iterate_rows(views.source, _ROW_COLUMNS):
                 row["right_from_left"] = None if row["right_cam_from_world"] is None else right_from_left(row)
-                yield {name: value for name, value in row.items() if with_poses or name not in _POSES}
+                yield {name: value for name, value in row.items() if with_poses or name not in POSE_COLUMNS}
 
 
 class EvaluatedResult(Result):

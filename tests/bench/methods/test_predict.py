@@ -99,6 +99,24 @@ def test_method_of_another_kind_declares_it(tiny_root: Path, tmp_path: Path) -> 
         find_method(f"{path}:METHOD")
 
 
+def test_method_that_reads_ground_truth_declares_it(user_file: Path, tiny_root: Path, tmp_path: Path) -> None:
+    code = user_file.read_text()
+    for columns, read in {
+        '"left_rgb", "left_depth", "right_bars"': "left_depth, right_bars",
+        '"left_rgb", "left_preview"': "left_preview",
+        '"left_rgb", "left_cam_from_world"': "left_cam_from_world",
+    }.items():
+        user_file.write_text(code.replace('"left_rgb", "left_K"', columns))
+        words = f"own: reads {read}, expected MethodInfo(..., uses_ground_truth=True)"
+        with pytest.raises(MethodError, match=re.escape(words)):
+            find_method(f"{user_file}:METHOD")
+        user_file.write_text(user_file.read_text().replace('"MIT"', '"MIT", uses_ground_truth=True'))
+        assert find_method(f"{user_file}:METHOD").info.uses_ground_truth
+    assert {name for name, method in own_methods().items() if method.info.uses_ground_truth} == {
+        *("truth", "noisy-truth", "colmap-anchored", "sweep-anchored", "lidar-survey", "lidar-mobile")
+    }
+
+
 def orbit_view_ids(root: Path) -> list[str]:
     """Return the view ids of ``lattice-orbit``."""
     manifest = json.loads((root / "manifest.json").read_text())
