@@ -36,6 +36,7 @@ from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.truth import scored_counts
 from rebar_depth_bench.submission import SubmissionWriter
 from rebar_depth_bench.submission.declaration import METRIC
+from rebar_depth_bench.submission.writer import as_array, depth_map
 
 if TYPE_CHECKING:
     from datasets import Dataset
@@ -94,7 +95,7 @@ def evaluate(
         pairs = _pairs(model)
     for view_id, depth in pairs:
         if view_id not in evaluator._left_out:
-            evaluator.update(view_id, depth)
+            evaluator._add(view_id, depth, "the model returned" if callable(model) else "depth is")
     return evaluator.compute()
 
 
@@ -185,25 +186,27 @@ class Evaluator:
     def update(self, view_ids: str | Sequence[str], depth: object) -> None:
         """Add the planar depth of left views in metres, or of another kind: of one view or of a batch.
 
-        ``depth`` is an array or tensor of any float type and device: H x W or 1 x H x W for one id; for a list of
-        B ids B x H x W, B x 1 x H x W, or a list. Values that are not finite, and of ``metric`` and ``scale``
-        those <= 0, mean no prediction.
+        ``depth`` is an array or tensor of any float type and device: H x W for one id, also after axes of length
+        1; for a list of B ids B x H x W, B x 1 x H x W, or a list. Values that are not finite, and of ``metric``
+        and ``scale`` those <= 0, mean no prediction.
 
         Raises ``InputError``, which names the view, for one that is not to be predicted or was added before, and
         for depth of another size.
         """
         if isinstance(view_ids, str):
-            self._add(view_ids, _array(depth))
+            self._add(view_ids, depth)
             return
         if not isinstance(view_ids, Iterable):
             raise InputError(f"view_ids is {view_ids!r}, expected a view id or a list of them")
-        ids, maps = list(view_ids), depth if isinstance(depth, list | tuple) else np.atleast_1d(_array(depth))
+        ids, maps = list(view_ids), depth
+        if not isinstance(maps, list | tuple):
+            maps = np.atleast_1d(as_array(f"{escape_text(str(ids))}: depth is", depth))
         if len(maps) != len(ids):
             raise InputError(f"{len(ids)} view ids and {len(maps)} depth maps are given, expected as many of both")
         for view_id, one in zip(ids, maps, strict=True):
-            self._add(view_id, _array(one))
+            self._add(view_id, one)
 
-    def _add(self, view_id: str, depth: ndarray) -> None:
+    def _add(self, view_id: str, depth: object, what: str = "depth is") -> None:
         if not isinstance(view_id, str) or view_id not in self._grids:
             found = f"{escape_text(str(view_id))}: is not among the {len(self._grids)} views to predict"
             raise InputError(f"{found}, expected one as {next(iter(self._grids))}")
@@ -212,13 +215,11 @@ class Evaluator:
                 f"{view_id}: was added before, expected each view once; a distributed sampler repeats views to "
                 "fill its last batch: gather all in one process and drop the repeated ones; reset() begins again"
             )
-        height, width = self._grids[view_id]
-        if depth.shape not in ((height, width), (1, height, width)):
-            raise InputError(f"{view_id}: depth has shape {depth.shape}, expected ({height}, {width})")
+        one = depth_map(f"{view_id}: {what}", depth, self._grids[view_id])
         if not self._is_open:
             self._writer.__enter__()
             self._is_open = True
-        self._writer.add(view_id, depth.reshape(height, width))
+        self._writer.add(view_id, one)
         self._added.add(view_id)
 
     def compute(self) -> EvaluatedResult:
@@ -367,12 +368,3 @@ def _pairs(model: object) -> Iterator[tuple[str, object]]:
             expected = "the name of a method, a function of a row, or view ids with their depth"
             raise InputError(f"the model is of type {type(model).__name__}, expected {expected}")
         yield pair
-
-
-def _array(depth: object) -> ndarray:
-    """Return depth as an array of NumPy, from one or from a tensor of torch on any device."""
-    if hasattr(depth, "detach"):
-        tensor = depth.detach()
-        depth = (tensor.float() if "bfloat16" in str(tensor.dtype) else tensor).cpu().numpy()
-    array: ndarray = np.asanyarray(depth)  # The writer refuses masked arrays.
-    return array.astype(np.float32) if array.dtype.name == "bfloat16" else array

@@ -106,13 +106,36 @@ def test_batches_of_tensors(tiny_root: Path) -> None:
     assert 0 < errors[2] < 2**-8  # bfloat16 has 8 significant bits.
 
 
+def test_tensors_are_taken_wherever_depth_is(tiny_root: Path, tmp_path: Path) -> None:
+    torch = pytest.importorskip("torch")
+    path = tmp_path / "own.py"
+    path.write_text("""
+import torch
+from rebar_depth_bench.methods import Method, MethodInfo
+
+def run(row):
+    network = torch.nn.Parameter(torch.full((1, 1, *row["left_rgb"].shape[:2]), 0.3, dtype=torch.bfloat16))
+    return network * 1
+
+METHOD = Method(MethodInfo("own", "a test", ("left_rgb",), False, "here", "MIT"), lambda: run)
+""")
+    by_name = rdb.evaluate(f"{path}:METHOD", tiny_root, config=LATTICE)
+    depth = torch.full((1, 1, 90, 160), 0.3, dtype=torch.bfloat16, requires_grad=True)
+    of_function = rdb.evaluate(lambda _: depth, tiny_root, config=LATTICE)
+    with rdb.SubmissionWriter(tmp_path / "written.zip", "own") as writer:
+        for view_id in rdb.Evaluator(tiny_root, LATTICE).view_ids:
+            writer.add(view_id, depth)
+    written = rdb.score(tmp_path / "written.zip", tiny_root)
+    assert by_name.metrics == of_function.metrics == written.metrics
+
+
 @pytest.mark.parametrize(
     ("shape", "words"),
     [
         ((90, 160), None),
         ((1, 90, 160), None),
-        ((1, 1, 90, 160), "shape"),
-        ((90, 161), r"shape \(90, 161\), expected \(90, 160\)"),
+        ((1, 1, 90, 160), None),
+        ((90, 161), r"shape \(90, 161\), expected .* of shape \(90, 160\)"),
         ((2, 90, 160), "shape"),
     ],
 )
@@ -169,8 +192,10 @@ def test_models_of_other_types_are_refused(tiny_root: Path, model: Any) -> None:
 @pytest.mark.parametrize(
     ("depth", "words"),
     [
-        (None, "shape"),
-        (np.ones((90, 160), int), "int64, expected floats"),
+        (None, r"the model returned None, expected an array of floats of shape \(90, 160\)"),
+        ("depth", "the model returned an object of type str, expected an array"),
+        ({"depth": np.ones((90, 160))}, "the model returned an object of type dict, expected an array"),
+        (np.ones((90, 160), int), r"int64 of shape \(90, 160\), expected an array of floats"),
         (np.ma.MaskedArray(np.ones((90, 160)), mask=True), "masked array"),  # type: ignore[no-untyped-call]
         ([[1.0] * 160] * 90, None),
     ],

@@ -144,7 +144,7 @@ def test_unknown_method_raises_with_reason(name: str, words: str, user_file: Pat
 def test_invalid_prediction_stops_run(returned: str, user_file: Path, tiny_root: Path, tmp_path: Path) -> None:
     text = user_file.read_text()
     user_file.write_text(re.sub(r"return np\.full.*", f"return {returned}", text))
-    with pytest.raises(MethodError, match=r"own: lattice.* returned .*, expected floats of"):
+    with pytest.raises(MethodError, match=r"own: lattice.* returned .*, expected an array of floats of"):
         predict(find_method(f"{user_file}:METHOD"), tiny_root, tmp_path / "x.zip", configs=["lattice-orbit"])
     assert len((tmp_path / "log").read_text().split()) == 1
     assert not (tmp_path / "x.zip").exists()
