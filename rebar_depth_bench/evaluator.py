@@ -23,8 +23,8 @@ from rebar_depth_bench.base.names import TEST_SPLIT
 from rebar_depth_bench.base.writing import output_file
 from rebar_depth_bench.data.loading import load
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
-from rebar_depth_bench.data.rows import ConfigViews, iterate_rows
-from rebar_depth_bench.data.schema import COLUMNS, POSE_COLUMNS, TRUTH_COLUMNS
+from rebar_depth_bench.data.rows import POSE_COLUMNS, TRUTH_COLUMNS, ConfigViews, iterate_rows
+from rebar_depth_bench.data.schema import COLUMNS
 from rebar_depth_bench.diagnosis.diagnose import diagnose
 from rebar_depth_bench.geometry.cameras import right_from_left
 from rebar_depth_bench.methods.registry import find_method

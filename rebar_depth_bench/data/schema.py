@@ -51,10 +51,6 @@ COLUMNS = (
     "baseline_m",
 )
 """Names of the columns, in order."""
-TRUTH_COLUMNS = tuple(name for name in COLUMNS if name.endswith(("_depth", "_mask", "_bars", "_preview")))
-"""Columns of ground truth about the scene; the preview shows depth."""
-POSE_COLUMNS = tuple(f"{eye}_cam_from_world" for eye in EYES)
-"""Columns of the poses in the world, which are ground truth; that of one eye from the other is calibration."""
 OPTIONAL_COLUMNS = (
     *("left_rgb", "left_mask", "left_bars"),
     *(name for name in COLUMNS if name.startswith("right_") or name == "baseline_m"),

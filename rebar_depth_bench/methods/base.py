@@ -14,8 +14,7 @@ from numpy import ndarray
 
 from rebar_depth_bench.base.errors import MethodError, install_command
 from rebar_depth_bench.base.parallel import Progress
-from rebar_depth_bench.data.rows import Views
-from rebar_depth_bench.data.schema import POSE_COLUMNS, TRUTH_COLUMNS
+from rebar_depth_bench.data.rows import POSE_COLUMNS, TRUTH_COLUMNS, Views
 from rebar_depth_bench.submission.declaration import METRIC, PREDICTION_KINDS
 
 Predictor = Callable[[Mapping[str, Any]], Float32[ndarray, "h w"]]
