@@ -85,8 +85,11 @@ def evaluate(
         uses_ground_truth=uses_ground_truth,
     )
     if isinstance(model, str):
-        if (method, kind, inputs, uses_ground_truth) != ("unnamed", "metric", None, None):
-            raise InputError(f"method, kind, inputs or uses_ground_truth is given, but {model} declares its own")
+        given = [name for name, value in evaluator._declared.items() if value not in ("unnamed", METRIC, None)]
+        if given:
+            remedy = "; score its archive with align=KIND for another kind" if "prediction" in given else ""
+            named = ", ".join(given).replace("prediction", "kind")
+            raise InputError(f"{named}: given, but the method {model} declares its own{remedy}")
         return evaluator._predicted_by(model)
     if callable(model):
         rows = evaluator._rows(with_poses=inputs == "multi-view")
@@ -111,7 +114,7 @@ class Evaluator:
     unknown views and invalid declarations.
     """
 
-    _is_open = False
+    _closing: weakref.finalize[..., Any] | None = None
 
     def __init__(
         self,
@@ -173,15 +176,11 @@ class Evaluator:
             raise InputError.from_problems("declaration", error.problems) from None
         self._added = set[str]()
 
-    def __del__(self) -> None:
-        """Close the file of predictions that were never scored."""
-        self._close()
-
     def _close(self) -> None:
         """Close the archive if it is open."""
-        if self._is_open:
-            self._writer.__exit__(None, None, None)
-            self._is_open = False
+        if self._closing is not None:
+            self._closing()
+            self._closing = None
 
     def update(self, view_ids: str | Sequence[str], depth: object) -> None:
         """Add the planar depth of left views in metres, or of another kind: of one view or of a batch.
@@ -216,9 +215,9 @@ class Evaluator:
                 "fill its last batch: gather all in one process and drop the repeated ones; reset() begins again"
             )
         one = depth_map(f"{view_id}: {what}", depth, self._grids[view_id])
-        if not self._is_open:
+        if self._closing is None:
             self._writer.__enter__()
-            self._is_open = True
+            self._closing = weakref.finalize(self, _close_writer, self._writer, self._archive)
         self._writer.add(view_id, one)
         self._added.add(view_id)
 
@@ -258,7 +257,7 @@ class Evaluator:
 class EvaluatedResult(Result):
     """Result of an evaluation, with its archive, which is deleted with it.
 
-    ``extended`` and ``notes`` are computed when they are read.
+    ``extended``, ``notes`` and the possible mistakes that ``print`` shows are computed when they are read.
     """
 
     _archive: _TemporaryArchive
@@ -295,14 +294,21 @@ class EvaluatedResult(Result):
     @cached_property
     def notes(self) -> tuple[str, ...]:
         """Sentences on what limits the numbers, and on possible mistakes in the predictions."""
-        with self._evaluation() as evaluation:
-            mistakes = [f"possible mistake: {mistake.text}" for mistake in diagnose(evaluation)]
         of_tables = [
             f"{name}: {note}"
             for name, table in self.tables.items()
             for note in (*table_notes(table), *reference_findings(table))
         ]
-        return (*self.kind_notes, *of_tables, *mistakes)
+        return (*self.kind_notes, *of_tables, *self._mistakes)
+
+    @cached_property
+    def _mistakes(self) -> list[str]:
+        with self._evaluation() as evaluation:
+            return [f"possible mistake: {mistake.text}" for mistake in diagnose(evaluation)]
+
+    def __str__(self) -> str:
+        """Return the main numbers of each config, with what limits them and possible mistakes."""
+        return "\n".join([super().__str__(), *self._mistakes])
 
     def to_html(self, path: str | Path) -> None:
         """Write the self-contained report of ``rebar-bench score --html``."""
@@ -333,11 +339,16 @@ class _TemporaryArchive:
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
 
 
+def _close_writer(writer: SubmissionWriter, _: _TemporaryArchive) -> None:
+    """Close a writer, while its archive still exists."""
+    writer.__exit__(None, None, None)
+
+
 def _selected(configs: Sequence[ConfigViews], views: int | Sequence[str]) -> list[ConfigViews]:
     """Return some views of each config: a number of them, spread evenly, or those with the given ids."""
-    if isinstance(views, int | np.integer) and not isinstance(views, bool):
-        if views < 1:
-            raise InputError(f"views is {views}, expected a number from 1 or view ids")
+    if not isinstance(views, Iterable):
+        if not isinstance(views, int | np.integer) or isinstance(views, bool) or views < 1:
+            raise InputError(f"views is {views}, expected a whole number from 1 or view ids")
         spread = [
             [one.view_ids[k * len(one.view_ids) // views] for k in range(views)]
             if views < len(one.view_ids)
@@ -346,7 +357,7 @@ def _selected(configs: Sequence[ConfigViews], views: int | Sequence[str]) -> lis
         ]
     else:
         known = {view_id for one in configs for view_id in one.view_ids}
-        views = [views] if isinstance(views, str) else list(views) if isinstance(views, Iterable) else []
+        views = [views] if isinstance(views, str) else list(views)
         if not views:
             raise InputError(f"views has no id, expected a number from 1 or ids of views, as {min(known)}")
         if unknown := [view_id for view_id in views if not isinstance(view_id, str) or view_id not in known]:

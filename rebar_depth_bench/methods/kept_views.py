@@ -85,7 +85,8 @@ class KeptViews:
                     return cls(path, run)
                 views = sum(1 for _ in path.glob("*/*.npz"))
                 found = "another method, dataset or version" if run else f"a run without a readable {_RUN_FILE}"
-                print_notice(f"starting over: {path} holds {views} views of {found}")
+                if views:
+                    print_notice(f"starting over: {path} holds {views} views of {found}")
                 remove_folder(path)
             path.mkdir(parents=True)
         except OSError as error:

@@ -241,7 +241,10 @@ class Result:
             is_low = (table.coverage or 0.0) < MIN_COMPARABLE_COVERAGE
             low = f"coverage below {MIN_COMPARABLE_COVERAGE * 100:.0f} %"
             reason = low if is_low else "views without predictions, or numbers that overflowed"
-            notes.append(f"{reason}: errors of valid predictions are not comparable")
+            none = f"{table.views} of {table.views} views without any prediction"
+            notes.append(
+                f"{reason}: errors of valid predictions are not comparable" if table.views_scored else none
+            )
         return notes
 
     @property

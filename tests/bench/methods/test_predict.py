@@ -128,6 +128,7 @@ def orbit_view_ids(root: Path) -> list[str]:
     [
         ("magic", "unknown method 'magic', expected one of sgbm, sgbm-filled, "),
         ("nowhere.py:METHOD", "nowhere.py: no such file"),
+        ("my_stereo.py", "my_stereo.py: names no method in the file, expected my_stereo.py:METHOD"),
         ("OWN:NOTHING", "is str, expected a rebar_depth_bench.methods.Method"),
         ("OWN:ABSENT", "own.py: has no ABSENT, expected the name of a method in it"),
         ("BROKEN:METHOD", "cannot be imported: ZeroDivisionError: division by zero"),
