@@ -9,7 +9,7 @@ import shutil
 import tempfile
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -36,7 +36,7 @@ from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.truth import scored_counts
 from rebar_depth_bench.submission import SubmissionWriter
 from rebar_depth_bench.submission.declaration import METRIC
-from rebar_depth_bench.submission.writer import as_array, depth_map
+from rebar_depth_bench.submission.writer import depth_map
 
 if TYPE_CHECKING:
     from datasets import Dataset
@@ -114,8 +114,6 @@ class Evaluator:
     unknown views and invalid declarations.
     """
 
-    _closing: weakref.finalize[..., Any] | None = None
-
     def __init__(
         self,
         root: str | Path,
@@ -168,19 +166,12 @@ class Evaluator:
 
     def reset(self) -> None:
         """Drop all predictions."""
-        self._close()
         self._archive = _TemporaryArchive()
         try:
             self._writer = SubmissionWriter(self._archive.path, **self._declared)
         except InputError as error:  # Its message names the temporary archive.
             raise InputError.from_problems("declaration", error.problems) from None
         self._added = set[str]()
-
-    def _close(self) -> None:
-        """Close the archive if it is open."""
-        if self._closing is not None:
-            self._closing()
-            self._closing = None
 
     def update(self, view_ids: str | Sequence[str], depth: object) -> None:
         """Add the planar depth of left views in metres, or of another kind: of one view or of a batch.
@@ -197,9 +188,8 @@ class Evaluator:
             return
         if not isinstance(view_ids, Iterable):
             raise InputError(f"view_ids is {view_ids!r}, expected a view id or a list of them")
-        ids, maps = list(view_ids), depth
-        if not isinstance(maps, list | tuple):
-            maps = np.atleast_1d(as_array(f"{escape_text(str(ids))}: depth is", depth))
+        ids = list(view_ids)
+        maps = list(depth) if isinstance(depth, Iterable) and getattr(depth, "ndim", True) else [depth]
         if len(maps) != len(ids):
             raise InputError(f"{len(ids)} view ids and {len(maps)} depth maps are given, expected as many of both")
         for view_id, one in zip(ids, maps, strict=True):
@@ -215,11 +205,10 @@ class Evaluator:
                 "fill its last batch: gather all in one process and drop the repeated ones; reset() begins again"
             )
         one = depth_map(f"{view_id}: {what}", depth, self._grids[view_id])
-        if self._closing is None:
-            self._writer.__enter__()
-            self._closing = weakref.finalize(self, _close_writer, self._writer, self._archive)
-        self._writer.add(view_id, one)
+        if not self._added:
+            self._archive.writers.enter_context(self._writer)
         self._added.add(view_id)
+        self._writer.add(view_id, one)
 
     def compute(self) -> EvaluatedResult:
         """Return the result of the predictions and begin again.
@@ -228,7 +217,7 @@ class Evaluator:
         """
         if missing := [view_id for view_id in self._grids if view_id not in self._added]:
             raise InputError(f"{len(missing)} of {len(self._grids)} views are missing, such as {missing[0]}")
-        self._close()
+        self._archive.writers.close()
         return self._scored()
 
     def _scored(self) -> EvaluatedResult:
@@ -331,17 +320,15 @@ class EvaluatedResult(Result):
 
 
 class _TemporaryArchive:
-    """Path of an archive in a temporary folder, which is deleted with this object."""
+    """Path of an archive in a temporary folder, deleted with this object after its ``writers`` are closed."""
 
     def __init__(self) -> None:
         folder = tempfile.mkdtemp(prefix="rebar-evaluate-")
         self.path = Path(folder, "predictions.zip")
-        weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
-
-
-def _close_writer(writer: SubmissionWriter, _: _TemporaryArchive) -> None:
-    """Close a writer, while its archive still exists."""
-    writer.__exit__(None, None, None)
+        stack = ExitStack()
+        stack.callback(shutil.rmtree, folder, ignore_errors=True)
+        self.writers = stack.enter_context(ExitStack())
+        weakref.finalize(self, stack.close)
 
 
 def _selected(configs: Sequence[ConfigViews], views: int | Sequence[str]) -> list[ConfigViews]:

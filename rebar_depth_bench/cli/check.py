@@ -32,8 +32,8 @@ def run(options: argparse.Namespace) -> None:
         if problems:
             raise SubmissionError.from_problems(options.archive, problems)
         print(f"{options.archive}: no problem found")
-        assert submission.meta is not None
-        if problems := submission.meta.kind_problems("leaderboards accept only these"):
+        evaluation = Evaluation(folder, submission)
+        if problems := evaluation.meta.kind_problems("leaderboards accept only these"):
             print_notice(f"not ranked: {problems[0]}")
-        for mistake in diagnose(Evaluation(folder, submission)):
+        for mistake in diagnose(evaluation):
             print_notice(f"possible mistake: {mistake.text}")

@@ -277,14 +277,14 @@ def shape_corrections(views: Sequence[DiagnosedView], read: ReadPrediction, coun
     height, width = views[0].prediction.shape
     turns = {**_TURNS, **(_QUARTER_TURNS if height == width else {})}
     dv, du = best_shift(views)
-    relative = '; if the network is relative, declare kind="affine-disparity" (prediction= of SubmissionWriter)'
+    hint = '; if the network is relative, declare kind="affine-disparity" (prediction= of SubmissionWriter)'
     ray = "distances along the rays instead of depth along the optical axis"
     # Range and shift change most pixels by less than the errors of a method. The sound predictions of those in
     # "tests.mistakes" are not better than 0.98 after these corrections.
     corrections = [
         Correction("range", ray, _SCALED, _range_errors, clearly_better=0.95),
         Correction(
-            "inverse", "disparity or inverse depth instead of depth", _FITTED, _inverse_errors, remedy=relative
+            "inverse", "disparity or inverse depth instead of depth", _FITTED, _inverse_errors, remedy=hint
         ),
         Correction("right-eye", "those of the right pictures", _SCALED, _right_eye_errors),
     ]

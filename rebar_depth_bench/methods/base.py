@@ -37,8 +37,6 @@ class MethodInfo:
     because weights or hardware were not available; empty if everything was tested. ``inputs`` is the input class,
     one of ``INPUTS``; without it, ``input_class`` derives the class from the columns. ``prediction`` is the kind
     of the predictions, one of ``PREDICTION_KINDS``.
-
-    Raises ``MethodError`` if the method reads ground truth and does not declare it.
     """
 
     name: str
@@ -59,10 +57,9 @@ class MethodInfo:
             raise ValueError(f"prediction is {self.prediction!r}, expected one of {', '.join(PREDICTION_KINDS)}")
         # Stereo methods need both poses for that of the right eye from the left one.
         truth = TRUTH_COLUMNS if "right_rgb" in self.columns else (*TRUTH_COLUMNS, *POSE_COLUMNS)
-        if not self.uses_ground_truth and (read := [name for name in self.columns if name in truth]):
-            raise MethodError(
-                f"{self.name}: reads {', '.join(read)}, expected MethodInfo(..., uses_ground_truth=True)"
-            )
+        read = ", ".join(name for name in self.columns if name in truth)
+        if read and not self.uses_ground_truth:
+            raise MethodError(f"{self.name}: reads {read}, expected MethodInfo(..., uses_ground_truth=True)")
 
 
 @dataclass(frozen=True)

@@ -144,9 +144,8 @@ def _predict_config(
         start = time.perf_counter()
         with _wrap_errors(f"{method.info.name}: {row['view_id']}: the predictor, given {', '.join(row)}"):
             prediction = predictor(row)
-        depth_m = depth_map(
-            f"{method.info.name}: {row['view_id']}: the method returned", prediction, views.grid, MethodError
-        )
+        what = f"{method.info.name}: {row['view_id']}: the method returned"
+        depth_m = depth_map(what, prediction, views.grid, MethodError)
         kept.put(row["view_id"], depth_m, time.perf_counter() - start)
         progress(f"{method.info.name} on {views.config}", count, len(views.view_ids))
 

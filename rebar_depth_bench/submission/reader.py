@@ -13,13 +13,7 @@ import numpy as np
 from rebar_depth_bench.base.errors import EntryError, Problem
 from rebar_depth_bench.base.parallel import Progress, silent
 from rebar_depth_bench.base.reading import FileSource
-from rebar_depth_bench.submission.declaration import (
-    DEPTH_SCALE,
-    MAX_METADATA_BYTES,
-    METADATA_NAME,
-    SubmissionMeta,
-    parse_metadata,
-)
+from rebar_depth_bench.submission.declaration import DEPTH_SCALE, METADATA_NAME, SubmissionMeta, parse_metadata
 from rebar_depth_bench.submission.entries import (
     FORMATS,
     ExpectedViews,
@@ -142,7 +136,7 @@ def read_metadata(path: Path) -> SubmissionMeta | None:
     """Return the content of ``submission.json`` of an archive of any views; None if it is missing or invalid."""
     try:
         with closing(FileSource(path)) as source:
-            entries = read_entries(source, sys.maxsize, lambda _: MAX_METADATA_BYTES)
+            entries = read_entries(source, sys.maxsize, lambda name: max_entry_bytes(name, {}))
             found = [entry for entry in entries if entry.name == METADATA_NAME and not entry.problems]
             return parse_metadata(bytes(read_data(source, found[0])))[0] if found else None
     except (EntryError, EOFError, OSError):

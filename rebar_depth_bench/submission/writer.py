@@ -174,31 +174,24 @@ class SubmissionWriter:
             entry.write(body)
 
 
-def as_array(what: str, values: object, error: type[InputError] = InputError) -> ndarray:
-    """Return an array of NumPy, from one, from a tensor of torch of any float type and device, or from lists.
-
-    ``what`` begins the message of an ``error``, such as "depth is". A masked array stays one.
-    """
-    try:
-        if hasattr(values, "detach"):
-            tensor = values.detach()
-            values = (tensor.float() if "bfloat16" in str(tensor.dtype) else tensor).cpu().numpy()
-        array: ndarray = np.asanyarray(values)
-        return array.astype(np.float32) if array.dtype.name == "bfloat16" else array
-    except Exception as reason:  # The object's own conversion may raise anything.
-        found = f"an object of type {type(values).__name__}, which cannot be converted to a numpy array"
-        raise error(f"{what} {found} ({escape_text(str(reason))})") from reason
-
-
 def depth_map(
     what: str, depth: object, grid: tuple[int, int] | None = None, error: type[InputError] = InputError
 ) -> Float[ndarray, "h w"]:
-    """Return the depth of one view, of what ``as_array`` accepts; axes of length 1 before H x W are dropped.
+    """Return the depth of one view: an array of NumPy, a tensor of torch of any float type and device, or lists.
 
-    ``grid`` is the expected (H, W), None for any. Raises ``error`` for anything but floats of that shape, and for
-    masked arrays.
+    Axes of length 1 before H x W are dropped. ``grid`` is the expected (H, W), None for any. Raises ``error``, its
+    message beginning with ``what``, for anything but floats of that shape, and for masked arrays.
     """
-    array = as_array(what, depth, error)
+    try:
+        values: Any = depth
+        if hasattr(values, "detach"):
+            values = values.detach()
+            values = (values.float() if "bfloat16" in str(values.dtype) else values).cpu().numpy()
+        array: ndarray = np.asanyarray(values)
+        array = array.astype(np.float32) if array.dtype.name == "bfloat16" else array
+    except Exception as reason:  # The object's own conversion may raise anything.
+        found = f"an object of type {type(depth).__name__}, which cannot be converted to a numpy array"
+        raise error(f"{what} {found} ({escape_text(str(reason))})") from reason
     if isinstance(array, np.ma.MaskedArray):  # numpy.asarray would silently drop the mask.
         raise error(f"{what} a masked array, expected NaN where there is no prediction")
     shape = array.shape
