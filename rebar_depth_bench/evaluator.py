@@ -87,9 +87,9 @@ def evaluate(
     if isinstance(model, str):
         given = [name for name, value in evaluator._declared.items() if value not in ("unnamed", METRIC, None)]
         if given:
-            remedy = "; score its archive with align=KIND for another kind" if "prediction" in given else ""
-            named = ", ".join(given).replace("prediction", "kind")
-            raise InputError(f"{named}: given, but the method {model} declares its own{remedy}")
+            remedy = "; score its archive by score(ARCHIVE, ROOT, align=KIND)" if "prediction" in given else ""
+            named = " and ".join(given).replace("prediction", "kind")
+            raise InputError(f"{named} given, but the method {model} declares its own{remedy}")
         return evaluator._predicted_by(model)
     if callable(model):
         rows = evaluator._rows(with_poses=inputs == "multi-view")

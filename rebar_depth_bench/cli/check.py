@@ -11,6 +11,7 @@ from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.diagnosis.diagnose import diagnose
 from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.submission import SubmissionReader
+from rebar_depth_bench.submission.declaration import RANKS_METRIC
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,7 +34,7 @@ def run(options: argparse.Namespace) -> None:
             raise SubmissionError.from_problems(options.archive, problems)
         print(f"{options.archive}: no problem found")
         evaluation = Evaluation(folder, submission)
-        if problems := evaluation.meta.kind_problems("leaderboards accept only these"):
+        if problems := evaluation.meta.kind_problems(RANKS_METRIC):
             print_notice(f"not ranked: {problems[0]}")
         for mistake in diagnose(evaluation):
             print_notice(f"possible mistake: {mistake.text}")

@@ -540,7 +540,7 @@ def test_disparity_is_no_mistake(tiny_root: Path, write: Write, capsys: Any) -> 
     declared = check("declared", "affine-disparity", disparity)
     assert "mistake" not in declared
     assert "not ranked: " in declared
-    assert "affine-disparity, expected metric ones: leaderboards accept only these" in declared
+    assert "affine-disparity, expected metric ones: the leaderboard ranks depth in metres" in declared
     assert "not ranked" not in check("undeclared", "metric", lambda z: z)
     assert "mistake" not in check("millimetres", "scale", lambda z: 1000 * z)
     assert "mistake" not in check("negative", "affine-depth", lambda z: z - 90)
