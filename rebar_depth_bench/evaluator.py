@@ -9,7 +9,7 @@ import shutil
 import tempfile
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,7 +23,8 @@ from rebar_depth_bench.base.names import TEST_SPLIT
 from rebar_depth_bench.base.writing import output_file
 from rebar_depth_bench.data.loading import load
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
-from rebar_depth_bench.data.rows import ConfigViews, iterate_rows
+from rebar_depth_bench.data.rows import POSE_COLUMNS, TRUTH_COLUMNS, ConfigViews, iterate_rows
+from rebar_depth_bench.data.schema import COLUMNS
 from rebar_depth_bench.diagnosis.diagnose import diagnose
 from rebar_depth_bench.geometry.cameras import right_from_left
 from rebar_depth_bench.methods.registry import find_method
@@ -35,6 +36,7 @@ from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.truth import scored_counts
 from rebar_depth_bench.submission import SubmissionWriter
 from rebar_depth_bench.submission.declaration import METRIC
+from rebar_depth_bench.submission.writer import depth_map
 
 if TYPE_CHECKING:
     from datasets import Dataset
@@ -44,11 +46,7 @@ if TYPE_CHECKING:
 Depth = Float[ndarray, "h w"]
 Model = str | Callable[[Mapping[str, Any]], object] | Mapping[str, object] | Iterable[tuple[str, object]]
 
-_POSES = ("left_cam_from_world", "right_cam_from_world")
-_ROW_COLUMNS = (
-    *("left_rgb", "right_rgb", "left_K", "right_K", "left_distortion", "right_distortion", "baseline_m"),
-    *_POSES,
-)
+_ROW_COLUMNS = tuple(name for name in COLUMNS if name != "scene" and name not in TRUTH_COLUMNS)
 
 
 def evaluate(
@@ -87,8 +85,11 @@ def evaluate(
         uses_ground_truth=uses_ground_truth,
     )
     if isinstance(model, str):
-        if (method, kind, inputs, uses_ground_truth) != ("unnamed", "metric", None, None):
-            raise InputError(f"method, kind, inputs or uses_ground_truth is given, but {model} declares its own")
+        given = [name for name, value in evaluator._declared.items() if value not in ("unnamed", METRIC, None)]
+        if given:
+            remedy = "; score its archive by score(ARCHIVE, ROOT, align=KIND)" if "prediction" in given else ""
+            named = " and ".join(given).replace("prediction", "kind")
+            raise InputError(f"{named} given, but the method {model} declares its own{remedy}")
         return evaluator._predicted_by(model)
     if callable(model):
         rows = evaluator._rows(with_poses=inputs == "multi-view")
@@ -97,7 +98,7 @@ def evaluate(
         pairs = _pairs(model)
     for view_id, depth in pairs:
         if view_id not in evaluator._left_out:
-            evaluator.update(view_id, depth)
+            evaluator._add(view_id, depth, "the model returned" if callable(model) else "depth is")
     return evaluator.compute()
 
 
@@ -112,8 +113,6 @@ class Evaluator:
     Raises ``DatasetError`` for an invalid dataset folder and an unknown config or split, and ``InputError`` for
     unknown views and invalid declarations.
     """
-
-    _is_open = False
 
     def __init__(
         self,
@@ -167,7 +166,6 @@ class Evaluator:
 
     def reset(self) -> None:
         """Drop all predictions."""
-        self._close()
         self._archive = _TemporaryArchive()
         try:
             self._writer = SubmissionWriter(self._archive.path, **self._declared)
@@ -175,38 +173,29 @@ class Evaluator:
             raise InputError.from_problems("declaration", error.problems) from None
         self._added = set[str]()
 
-    def __del__(self) -> None:
-        """Close the file of predictions that were never scored."""
-        self._close()
-
-    def _close(self) -> None:
-        """Close the archive if it is open."""
-        if self._is_open:
-            self._writer.__exit__(None, None, None)
-            self._is_open = False
-
     def update(self, view_ids: str | Sequence[str], depth: object) -> None:
         """Add the planar depth of left views in metres, or of another kind: of one view or of a batch.
 
-        ``depth`` is an array or tensor of any float type and device: H x W or 1 x H x W for one id; for a list of
-        B ids B x H x W, B x 1 x H x W, or a list. Values that are not finite, and of ``metric`` and ``scale``
-        those <= 0, mean no prediction.
+        ``depth`` is an array or tensor of any float type and device: H x W for one id, also after axes of length
+        1; for a list of B ids B x H x W, B x 1 x H x W, or a list. Values that are not finite, and of ``metric``
+        and ``scale`` those <= 0, mean no prediction.
 
         Raises ``InputError``, which names the view, for one that is not to be predicted or was added before, and
         for depth of another size.
         """
         if isinstance(view_ids, str):
-            self._add(view_ids, _array(depth))
+            self._add(view_ids, depth)
             return
         if not isinstance(view_ids, Iterable):
             raise InputError(f"view_ids is {view_ids!r}, expected a view id or a list of them")
-        ids, maps = list(view_ids), depth if isinstance(depth, list | tuple) else np.atleast_1d(_array(depth))
+        ids = list(view_ids)
+        maps = list(depth) if isinstance(depth, Iterable) and getattr(depth, "ndim", True) else [depth]
         if len(maps) != len(ids):
             raise InputError(f"{len(ids)} view ids and {len(maps)} depth maps are given, expected as many of both")
         for view_id, one in zip(ids, maps, strict=True):
-            self._add(view_id, _array(one))
+            self._add(view_id, one)
 
-    def _add(self, view_id: str, depth: ndarray) -> None:
+    def _add(self, view_id: str, depth: object, what: str = "depth is") -> None:
         if not isinstance(view_id, str) or view_id not in self._grids:
             found = f"{escape_text(str(view_id))}: is not among the {len(self._grids)} views to predict"
             raise InputError(f"{found}, expected one as {next(iter(self._grids))}")
@@ -215,14 +204,11 @@ class Evaluator:
                 f"{view_id}: was added before, expected each view once; a distributed sampler repeats views to "
                 "fill its last batch: gather all in one process and drop the repeated ones; reset() begins again"
             )
-        height, width = self._grids[view_id]
-        if depth.shape not in ((height, width), (1, height, width)):
-            raise InputError(f"{view_id}: depth has shape {depth.shape}, expected ({height}, {width})")
-        if not self._is_open:
-            self._writer.__enter__()
-            self._is_open = True
-        self._writer.add(view_id, depth.reshape(height, width))
+        one = depth_map(f"{view_id}: {what}", depth, self._grids[view_id])
+        if not self._added:
+            self._archive.writers.enter_context(self._writer)
         self._added.add(view_id)
+        self._writer.add(view_id, one)
 
     def compute(self) -> EvaluatedResult:
         """Return the result of the predictions and begin again.
@@ -231,7 +217,7 @@ class Evaluator:
         """
         if missing := [view_id for view_id in self._grids if view_id not in self._added]:
             raise InputError(f"{len(missing)} of {len(self._grids)} views are missing, such as {missing[0]}")
-        self._close()
+        self._archive.writers.close()
         return self._scored()
 
     def _scored(self) -> EvaluatedResult:
@@ -252,15 +238,15 @@ class Evaluator:
     def _rows(self, *, with_poses: bool) -> Iterator[dict[str, Any]]:
         """Yield what a function may read of each view."""
         for views in self._views:
-            for row in iterate_rows(views.source, ("view_id", *_ROW_COLUMNS)):
+            for row in iterate_rows(views.source, _ROW_COLUMNS):
                 row["right_from_left"] = None if row["right_cam_from_world"] is None else right_from_left(row)
-                yield {name: value for name, value in row.items() if with_poses or name not in _POSES}
+                yield {name: value for name, value in row.items() if with_poses or name not in POSE_COLUMNS}
 
 
 class EvaluatedResult(Result):
     """Result of an evaluation, with its archive, which is deleted with it.
 
-    ``extended`` and ``notes`` are computed when they are read.
+    ``extended``, ``notes`` and the possible mistakes that ``print`` shows are computed when they are read.
     """
 
     _archive: _TemporaryArchive
@@ -297,14 +283,21 @@ class EvaluatedResult(Result):
     @cached_property
     def notes(self) -> tuple[str, ...]:
         """Sentences on what limits the numbers, and on possible mistakes in the predictions."""
-        with self._evaluation() as evaluation:
-            mistakes = [f"possible mistake: {mistake.text}" for mistake in diagnose(evaluation)]
         of_tables = [
             f"{name}: {note}"
             for name, table in self.tables.items()
             for note in (*table_notes(table), *reference_findings(table))
         ]
-        return (*self.kind_notes, *of_tables, *mistakes)
+        return (*self.kind_notes, *of_tables, *self._mistakes)
+
+    @cached_property
+    def _mistakes(self) -> list[str]:
+        with self._evaluation() as evaluation:
+            return [f"possible mistake: {mistake.text}" for mistake in diagnose(evaluation)]
+
+    def __str__(self) -> str:
+        """Return the main numbers of each config, with what limits them and possible mistakes."""
+        return "\n".join([super().__str__(), *self._mistakes])
 
     def to_html(self, path: str | Path) -> None:
         """Write the self-contained report of ``rebar-bench score --html``."""
@@ -327,19 +320,22 @@ class EvaluatedResult(Result):
 
 
 class _TemporaryArchive:
-    """Path of an archive in a temporary folder, which is deleted with this object."""
+    """Path of an archive in a temporary folder, deleted with this object after its ``writers`` are closed."""
 
     def __init__(self) -> None:
         folder = tempfile.mkdtemp(prefix="rebar-evaluate-")
         self.path = Path(folder, "predictions.zip")
-        weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
+        stack = ExitStack()
+        stack.callback(shutil.rmtree, folder, ignore_errors=True)
+        self.writers = stack.enter_context(ExitStack())
+        weakref.finalize(self, stack.close)
 
 
 def _selected(configs: Sequence[ConfigViews], views: int | Sequence[str]) -> list[ConfigViews]:
     """Return some views of each config: a number of them, spread evenly, or those with the given ids."""
-    if isinstance(views, int | np.integer) and not isinstance(views, bool):
-        if views < 1:
-            raise InputError(f"views is {views}, expected a number from 1 or view ids")
+    if not isinstance(views, Iterable):
+        if not isinstance(views, int | np.integer) or isinstance(views, bool) or views < 1:
+            raise InputError(f"views is {views}, expected a whole number from 1 or view ids")
         spread = [
             [one.view_ids[k * len(one.view_ids) // views] for k in range(views)]
             if views < len(one.view_ids)
@@ -348,7 +344,7 @@ def _selected(configs: Sequence[ConfigViews], views: int | Sequence[str]) -> lis
         ]
     else:
         known = {view_id for one in configs for view_id in one.view_ids}
-        views = [views] if isinstance(views, str) else list(views) if isinstance(views, Iterable) else []
+        views = [views] if isinstance(views, str) else list(views)
         if not views:
             raise InputError(f"views has no id, expected a number from 1 or ids of views, as {min(known)}")
         if unknown := [view_id for view_id in views if not isinstance(view_id, str) or view_id not in known]:
@@ -370,12 +366,3 @@ def _pairs(model: object) -> Iterator[tuple[str, object]]:
             expected = "the name of a method, a function of a row, or view ids with their depth"
             raise InputError(f"the model is of type {type(model).__name__}, expected {expected}")
         yield pair
-
-
-def _array(depth: object) -> ndarray:
-    """Return depth as an array of NumPy, from one or from a tensor of torch on any device."""
-    if hasattr(depth, "detach"):
-        tensor = depth.detach()
-        depth = (tensor.float() if "bfloat16" in str(tensor.dtype) else tensor).cpu().numpy()
-    array: ndarray = np.asanyarray(depth)  # The writer refuses masked arrays.
-    return array.astype(np.float32) if array.dtype.name == "bfloat16" else array

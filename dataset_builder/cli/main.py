@@ -242,7 +242,8 @@ def _push(options: argparse.Namespace) -> None:
         more = f" and {len(source.stray) - _STRAY_SHOWN} more" if len(source.stray) > _STRAY_SHOWN else ""
         print_notice(f"not in the manifest, stays local: {', '.join(source.stray[:_STRAY_SHOWN])}{more}")
     if options.dry_run:
-        print(f"{options.hub_id}, branch {options.revision}", *source.lines(), sep="\n")
+        private = ", private" if options.private else ""
+        print(f"{options.hub_id}, branch {options.revision}{private}", *source.lines(), sep="\n")
         print("dry run: not compared with the Hub, nothing was sent")
         return
     push = plan_push(source, options.hub_id, options.revision, private=options.private)

@@ -18,12 +18,10 @@ from rebar_depth_bench.base.names import TEST_SPLIT, config_of, split_of
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.scoring.table import ViewScore
 from rebar_depth_bench.submission import SubmissionMeta, SubmissionReader
+from rebar_depth_bench.submission.declaration import RANKS_METRIC
 
 if TYPE_CHECKING:
     from rebar_depth_bench.reporting.html.views import ShownView
-
-
-_RANKS_METRIC = "the leaderboard ranks depth in metres"
 
 
 @dataclass(frozen=True)
@@ -50,7 +48,7 @@ def check(archive: Path, data: str) -> SubmissionMeta:
     """Return the content of ``submission.json`` of an archive. Raises ``SubmissionError`` with all problems."""
     with SubmissionReader(archive, open_folder(data).expected_views()) as submission:
         meta = submission.meta
-        conflicts = [] if meta is None else meta.kind_problems(_RANKS_METRIC)
+        conflicts = [] if meta is None else meta.kind_problems(RANKS_METRIC)
         conflicts += _split_problems(submission.view_ids)
         if problems := conflicts or list(submission.problems()):
             raise SubmissionError.from_problems("the archive", problems)
@@ -79,7 +77,7 @@ def score(archive: Path, data: str, dataset_digest: str, error_maps: int, hidden
     if digest != dataset_digest:  # Checked first: on another dataset, the archive could seem invalid.
         raise DatasetError(f"{data}: the digest is {digest}, expected {dataset_digest}")
     with open_evaluation(archive, data) as evaluation:
-        evaluation.require_metric(_RANKS_METRIC)
+        evaluation.require_metric(RANKS_METRIC)
         result = score_evaluation(evaluation)
         if hidden_truth:
             check_view_coverage(result.views)

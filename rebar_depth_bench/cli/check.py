@@ -13,6 +13,7 @@ from rebar_depth_bench.data.rows import truth_problems
 from rebar_depth_bench.diagnosis.diagnose import diagnose
 from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.submission import SubmissionReader
+from rebar_depth_bench.submission.declaration import RANKS_METRIC
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -34,7 +35,10 @@ def run(options: argparse.Namespace) -> None:
         if problems:
             raise SubmissionError.from_problems(options.archive, problems)
         print(f"{options.archive}: no problem found")
-        for mistake in diagnose(Evaluation(folder, submission)):
+        evaluation = Evaluation(folder, submission)
+        if problems := evaluation.meta.kind_problems(RANKS_METRIC):
+            print_notice(f"not ranked: {problems[0]}")
+        for mistake in diagnose(evaluation):
             print_notice(f"possible mistake: {mistake.text}")
 
 

@@ -23,10 +23,15 @@ from rebar_depth_bench.base.parallel import Progress, silent
 from rebar_depth_bench.base.validation import short_repr
 from rebar_depth_bench.data import codecs
 from rebar_depth_bench.data.manifest import DatasetConfig
-from rebar_depth_bench.data.schema import CAMERA_SHAPES, column_kind
+from rebar_depth_bench.data.schema import CAMERA_SHAPES, COLUMNS, EYES, column_kind
 from rebar_depth_bench.data.shards import encoded_rows
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import Camera, is_rigid
+
+TRUTH_COLUMNS = tuple(name for name in COLUMNS if name.endswith(("_depth", "_mask", "_bars", "_preview")))
+"""Columns of ground truth about the scene; the preview shows depth."""
+POSE_COLUMNS = tuple(f"{eye}_cam_from_world" for eye in EYES)
+"""Columns of the poses in the world, which are ground truth; that of one eye from the other is calibration."""
 
 
 @dataclass(frozen=True, eq=False)

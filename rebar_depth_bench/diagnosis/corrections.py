@@ -211,6 +211,7 @@ class Correction:
     """Correction of a mistake: what the predictions seem to be, what the errors are, and the errors of a view.
 
     A view is clearly better after the correction if its error is at most ``clearly_better`` of that before.
+    ``remedy`` ends the description of the mistake.
     """
 
     name: str
@@ -218,6 +219,7 @@ class Correction:
     measure: str
     errors: Callable[[DiagnosedView], Errors]
     clearly_better: float = 0.8
+    remedy: str = ""
 
 
 def unit_corrections() -> list[Correction]:
@@ -275,12 +277,15 @@ def shape_corrections(views: Sequence[DiagnosedView], read: ReadPrediction, coun
     height, width = views[0].prediction.shape
     turns = {**_TURNS, **(_QUARTER_TURNS if height == width else {})}
     dv, du = best_shift(views)
+    hint = '; if the network is relative, declare kind="affine-disparity" (prediction= of SubmissionWriter)'
     ray = "distances along the rays instead of depth along the optical axis"
     # Range and shift change most pixels by less than the errors of a method. The sound predictions of those in
     # "tests.mistakes" are not better than 0.98 after these corrections.
     corrections = [
         Correction("range", ray, _SCALED, _range_errors, clearly_better=0.95),
-        Correction("inverse", "disparity or inverse depth instead of depth", _FITTED, _inverse_errors),
+        Correction(
+            "inverse", "disparity or inverse depth instead of depth", _FITTED, _inverse_errors, remedy=hint
+        ),
         Correction("right-eye", "those of the right pictures", _SCALED, _right_eye_errors),
     ]
     for name, (seems, turn) in turns.items():

@@ -153,7 +153,7 @@ def best_mistake(
             text = (
                 f"the predictions of {config} seem to be {correction.seems}: the {correction.measure} is "
                 f"{_percent(before)}, and {_percent(after)} if that is undone, "
-                f"in {len(better)} of {len(views)} views"
+                f"in {len(better)} of {len(views)} views{correction.remedy}"
             )
             found[mean_ratio] = PossibleMistake(config, correction.name, text)
     return found[min(found)] if found else None

@@ -14,7 +14,7 @@ from numpy import ndarray
 
 from rebar_depth_bench.base.errors import MethodError, install_command
 from rebar_depth_bench.base.parallel import Progress
-from rebar_depth_bench.data.rows import Views
+from rebar_depth_bench.data.rows import POSE_COLUMNS, TRUTH_COLUMNS, Views
 from rebar_depth_bench.submission.declaration import METRIC, PREDICTION_KINDS
 
 Predictor = Callable[[Mapping[str, Any]], Float32[ndarray, "h w"]]
@@ -32,10 +32,11 @@ class MethodInfo:
     """Description of a method, shown in listings and written into submissions.
 
     ``columns`` are the dataset columns that the predictor reads. ``uses_ground_truth`` is True if the method reads
-    ground truth, so that its submissions are not ranked. ``untested_note`` states which part was never run by the
-    authors because weights or hardware were not available; empty if everything was tested. ``inputs`` is the input
-    class, one of ``INPUTS``; without it, ``input_class`` derives the class from the columns. ``prediction`` is the
-    kind of the predictions, one of ``PREDICTION_KINDS``.
+    ground truth, so that its submissions are not ranked; it must be if ``columns`` has any of ``TRUTH_COLUMNS``,
+    or of ``POSE_COLUMNS`` without ``right_rgb``. ``untested_note`` states which part was never run by the authors
+    because weights or hardware were not available; empty if everything was tested. ``inputs`` is the input class,
+    one of ``INPUTS``; without it, ``input_class`` derives the class from the columns. ``prediction`` is the kind
+    of the predictions, one of ``PREDICTION_KINDS``.
     """
 
     name: str
@@ -54,6 +55,11 @@ class MethodInfo:
             raise TypeError(f"columns is the text {self.columns!r}, expected a tuple of names")
         if self.prediction not in PREDICTION_KINDS:
             raise ValueError(f"prediction is {self.prediction!r}, expected one of {', '.join(PREDICTION_KINDS)}")
+        # Stereo methods need both poses for that of the right eye from the left one.
+        truth = TRUTH_COLUMNS if "right_rgb" in self.columns else (*TRUTH_COLUMNS, *POSE_COLUMNS)
+        read = ", ".join(name for name in self.columns if name in truth)
+        if read and not self.uses_ground_truth:
+            raise MethodError(f"{self.name}: reads {read}, expected MethodInfo(..., uses_ground_truth=True)")
 
 
 @dataclass(frozen=True)

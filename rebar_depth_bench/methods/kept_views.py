@@ -83,9 +83,9 @@ class KeptViews:
                 run = _read_run(path / _RUN_FILE)
                 if run is not None and run.key == stored_key:
                     return cls(path, run)
-                views = sum(1 for _ in path.glob("*/*.npz"))
                 found = "another method, dataset or version" if run else f"a run without a readable {_RUN_FILE}"
-                print_notice(f"starting over: {path} holds {views} views of {found}")
+                if views := sum(1 for _ in path.glob("*/*.npz")):
+                    print_notice(f"starting over: {path} holds {views} views of {found}")
                 remove_folder(path)
             path.mkdir(parents=True)
         except OSError as error:

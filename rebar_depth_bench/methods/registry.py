@@ -95,6 +95,8 @@ def find_method(name: str, *, view_timeout_s: float = VIEW_TIMEOUT_S, nearest_m:
         if not hasattr(module, attribute):
             raise MethodError(f"{path}: has no {attribute}, expected the name of a method in it")
         return _with_file_digest(Path(path), _require_method(name, getattr(module, attribute)))
+    if name.endswith(".py"):
+        raise MethodError(f"{name}: names no method in the file, expected {name}:METHOD")
     if name.endswith(".toml"):
         from rebar_depth_bench.methods.onnx.model import onnx_method
 

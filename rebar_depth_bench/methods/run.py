@@ -34,6 +34,7 @@ from rebar_depth_bench.methods.kept_views import KeptViews, PreparationReport
 from rebar_depth_bench.methods.sgbm import RECTIFIED_COLUMNS, STEREO_COLUMNS, pair_row
 from rebar_depth_bench.submission import SubmissionWriter
 from rebar_depth_bench.submission.declaration import METRIC
+from rebar_depth_bench.submission.writer import depth_map
 
 
 def predict(
@@ -143,7 +144,8 @@ def _predict_config(
         start = time.perf_counter()
         with _wrap_errors(f"{method.info.name}: {row['view_id']}: the predictor, given {', '.join(row)}"):
             prediction = predictor(row)
-        depth_m = _validated_depth(f"{method.info.name}: {row['view_id']}", prediction, views.grid)
+        what = f"{method.info.name}: {row['view_id']}: the method returned"
+        depth_m = depth_map(what, prediction, views.grid, MethodError)
         kept.put(row["view_id"], depth_m, time.perf_counter() - start)
         progress(f"{method.info.name} on {views.config}", count, len(views.view_ids))
 
@@ -214,16 +216,6 @@ def _prepare_method(method: AnyMethod, views: Views, kept: KeptViews, progress: 
         seconds = round(time.perf_counter() - start, 1) if started_from_scratch else None
         kept.put_report(views.config, PreparationReport(notes=notes, seconds=seconds))
     return prepared.predict
-
-
-def _validated_depth(where: str, depth_m: object, grid: tuple[int, int]) -> Float[ndarray, "h w"]:
-    """Return a prediction as an array. Raises ``MethodError`` unless it is floating point of shape ``grid``."""
-    array = np.asarray(depth_m)
-    if array.shape != grid or array.dtype.kind != "f":
-        raise MethodError(
-            f"{where}: the method returned {array.dtype} of shape {array.shape}, expected floats of shape {grid}"
-        )
-    return array
 
 
 def _write_archive(
@@ -298,7 +290,7 @@ def rectifying_predictor(
             cells = {"left_rgb": rectification.pinhole_image(row, grid), "left_K": grid.K}
             on_raw_grid = grid.depth_on_left_grid
         depth_m = predictor({"view_id": row["view_id"], **{name: cells[name] for name in columns}})
-        where = f"{row['view_id']}, rectified"
-        return np.asarray(on_raw_grid(_validated_depth(where, depth_m, cells["left_rgb"].shape[:2])))
+        what = f"{row['view_id']}, rectified: the method returned"
+        return np.asarray(on_raw_grid(depth_map(what, depth_m, cells["left_rgb"].shape[:2], MethodError)))
 
     return predict_raw, STEREO_COLUMNS if is_stereo else _MONO_COLUMNS

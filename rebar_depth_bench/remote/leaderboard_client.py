@@ -33,6 +33,8 @@ from rebar_depth_bench.base.parallel import Progress, silent
 from rebar_depth_bench.base.reading import open_regular, parse_json
 from rebar_depth_bench.base.validation import Expected, StrictModel, one_of, validate_table, whole_number
 from rebar_depth_bench.scoring.result import DisclosedResult, Result, is_disclosed, read_disclosed, read_result
+from rebar_depth_bench.submission.declaration import RANKS_METRIC
+from rebar_depth_bench.submission.reader import read_metadata
 
 POLL_INTERVAL_S = 2.0
 """Time between two status requests, seconds."""
@@ -188,10 +190,13 @@ class LeaderboardClient:
     def submit(self, archive: Path, progress: Progress = silent) -> Submission:
         """Upload an archive and return the accepted submission, with the SHA-256 of what was sent.
 
-        Raises ``SubmissionError`` with every problem of a rejected archive, ``InputError`` for an invalid token,
-        an exhausted quota, an archive that is too large or a file that cannot be read, and ``ServiceError`` if
-        the service cannot be reached or its answer is not valid.
+        Raises ``SubmissionError`` with every problem of a rejected archive, before the upload if its predictions
+        are not metric, ``InputError`` for an invalid token, an exhausted quota, an archive that is too large or a
+        file that cannot be read, and ``ServiceError`` if the service cannot be reached or its answer is not valid.
         """
+        meta = read_metadata(archive)
+        if meta is not None and (problems := meta.kind_problems(RANKS_METRIC)):
+            raise SubmissionError.from_problems(archive, problems)
         max_bytes = self._get("token", REQUEST_TIMEOUT_S).answer(TokenInfo, 200).max_upload_bytes
         try:
             with open_regular(archive) as stream:

@@ -27,12 +27,12 @@ from rebar_depth_bench.data.schema import CAMERA_SHAPES
 from rebar_depth_bench.data.shards import encoded_rows
 from rebar_depth_bench.geometry.cameras import Camera
 from rebar_depth_bench.scoring.protocol import PROTOCOL, RELATIVE_PROTOCOL
-from rebar_depth_bench.scoring.relative import metric_as
+from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND, metric_as
 from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareIdentity, SubmissionIdentity
 from rebar_depth_bench.scoring.score import ReadDepth, UseView, score_views
 from rebar_depth_bench.scoring.truth import config_truth
 from rebar_depth_bench.submission import EntryError, SubmissionMeta, SubmissionReader
-from rebar_depth_bench.submission.declaration import METRIC, PREDICTION_KINDS
+from rebar_depth_bench.submission.declaration import METRIC
 
 _Found = TypeVar("_Found")
 
@@ -141,8 +141,8 @@ class Evaluation:
     def kind(self, align: str | None = None) -> str:
         """Return the kind that the predictions are scored as; errors for ``align`` as in ``score_evaluation``."""
         kind = align or self.meta.prediction
-        if kind not in PREDICTION_KINDS:
-            raise InputError(f"align is {escape_text(kind)}, expected one of {', '.join(PREDICTION_KINDS)}")
+        if align is not None and align not in ALIGNMENT_BY_KIND:
+            raise InputError(f"align is {escape_text(str(align))}, expected one of {', '.join(ALIGNMENT_BY_KIND)}")
         if kind != self.meta.prediction:
             self.require_metric(f"only they can be scored as {kind}")
         return kind

@@ -161,7 +161,7 @@ def kind_text(result: Result) -> str:
 
 def relative_findings(table: Table) -> list[str]:
     """Return a sentence on each sign that the alignment of a table makes up for what its predictions lack."""
-    if table.aligned is None or table.constant is None:
+    if table.aligned is None or table.constant is None or not table.views_scored:
         return []
     findings = []
     if table.aligned.error > LEAST_GAIN * table.constant.error:
@@ -174,6 +174,7 @@ def relative_findings(table: Table) -> list[str]:
     if (table.flat_views or 0) > table.views / 2:
         findings.append(
             f"In {table.flat_views} of {table.views} views the fit has no positive slope and is a constant: it "
-            "hides that the predictions say nothing about depth."
+            "hides that the predictions say nothing about depth, or run the other way (depth declared as "
+            "disparity, or disparity as depth)."
         )
     return findings

@@ -241,7 +241,9 @@ class Result:
         if table.of_views is not None:
             notes.append(f"{table.views} of {table.of_views} views: not ranked")
         notes += relative_findings(table)
-        if table.views and not table.is_comparable:
+        if table.views and not table.views_scored:
+            notes.append(f"{table.views} of {table.views} views without any prediction")
+        elif table.views and not table.is_comparable:
             is_low = (table.coverage or 0.0) < MIN_COMPARABLE_COVERAGE
             low = f"coverage below {MIN_COMPARABLE_COVERAGE * 100:.0f} %"
             reason = low if is_low else "views without predictions, or numbers that overflowed"

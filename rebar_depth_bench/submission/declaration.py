@@ -69,6 +69,8 @@ PredictionKind = Literal["metric", "scale", "affine-depth", "affine-disparity"]
 METRIC = "metric"
 PREDICTION_KINDS: tuple[str, ...] = get_args(PredictionKind)
 """Kinds of predictions: metres, depth up to a scale, depth and disparity up to scale and shift."""
+RANKS_METRIC = "the leaderboard ranks depth in metres"
+"""Reason why other predictions are not ranked."""
 
 
 @dataclass(frozen=True)

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import os
+import sys
 from collections.abc import Iterator
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, closing
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -129,3 +130,14 @@ class SubmissionReader(AbstractContextManager["SubmissionReader"]):
         if self._source is not None:
             self._source.close()
             self._source = None
+
+
+def read_metadata(path: Path) -> SubmissionMeta | None:
+    """Return the content of ``submission.json`` of an archive of any views; None if it is missing or invalid."""
+    try:
+        with closing(FileSource(path)) as source:
+            entries = read_entries(source, sys.maxsize, lambda name: max_entry_bytes(name, {}))
+            found = [entry for entry in entries if entry.name == METADATA_NAME and not entry.problems]
+            return parse_metadata(bytes(read_data(source, found[0])))[0] if found else None
+    except (EntryError, EOFError, OSError):
+        return None

@@ -15,6 +15,8 @@ from types import TracebackType
 from typing import Any, BinaryIO, Self
 
 import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
 
 from rebar_depth_bench.base.errors import InputError, Problem, escape_text
 from rebar_depth_bench.base.names import VIEW_ID_PATTERN
@@ -98,7 +100,7 @@ class SubmissionWriter:
         self._zip: zipfile.ZipFile | None = None
 
     def add(self, view_id: str, depth: object, seconds: float | None = None) -> None:
-        """Store the planar depth of a left view in metres: (H, W), any object that ``numpy.asarray`` accepts.
+        """Store the planar depth of a left view in metres: an array or tensor (H, W), as ``depth_map`` accepts.
 
         float16 is kept, every other float type is converted to float32 (values out of its range become infinite).
         Values that are not finite, and of ``metric`` and ``scale`` predictions those <= 0, mean no prediction.
@@ -106,7 +108,7 @@ class SubmissionWriter:
         the archive depend on it.
 
         Raises ``InputError`` if the writer is not open, ``view_id`` is malformed or was added before, ``depth`` is
-        not a two-dimensional array of floats, or ``seconds`` is not a finite number >= 0.
+        not one map of floats, or ``seconds`` is not a finite number >= 0.
         """
         if self._zip is None:
             raise InputError(f"{self.path}: the writer is not open, expected add() inside its 'with' block")
@@ -116,7 +118,9 @@ class SubmissionWriter:
             )
         if seconds is not None and not (isinstance(seconds, int | float) and 0 <= seconds < math.inf):
             raise InputError(f"{view_id}: seconds is {seconds!r}, expected a finite number of at least 0")
-        values = _as_depth(view_id, depth)
+        array = depth_map(f"{view_id}: depth is", depth)
+        with np.errstate(over="ignore", under="ignore"):
+            values = np.ascontiguousarray(array, "<f2" if array.dtype.itemsize == 2 else "<f4")
         with self._lock:
             if view_id in self._view_ids:
                 raise InputError(f"{view_id}: the view was added twice, expected once")
@@ -170,21 +174,35 @@ class SubmissionWriter:
             entry.write(body)
 
 
-def _as_depth(view_id: str, depth: object) -> Depth:
-    if isinstance(depth, np.ma.MaskedArray):  # numpy.asarray would silently drop the mask.
-        raise InputError(f"{view_id}: depth is a masked array, expected NaN where there is no prediction")
+def depth_map(
+    what: str, depth: object, grid: tuple[int, int] | None = None, error: type[InputError] = InputError
+) -> Float[ndarray, "h w"]:
+    """Return the depth of one view: an array of NumPy, a tensor of torch of any float type and device, or lists.
+
+    Axes of length 1 before H x W are dropped. ``grid`` is the expected (H, W), None for any. Raises ``error``, its
+    message beginning with ``what``, for anything but floats of that shape, and for masked arrays.
+    """
     try:
-        array = np.asarray(depth)
-    except Exception as error:  # The object's own conversion may raise anything, e.g. for a tensor on a GPU.
-        raise InputError(
-            f"{view_id}: depth cannot be converted to a numpy array ({escape_text(str(error))})"
-        ) from error
-    if array.dtype.kind != "f":
-        raise InputError(f"{view_id}: depth has dtype {array.dtype}, expected floats in metres")
-    if array.ndim != 2 or 0 in array.shape:
-        raise InputError(f"{view_id}: depth has shape {array.shape}, expected (H, W)")
-    with np.errstate(over="ignore", under="ignore"):
-        return np.ascontiguousarray(array, "<f2" if array.dtype.itemsize == 2 else "<f4")
+        values: Any = depth
+        if hasattr(values, "detach"):
+            values = values.detach()
+            values = (values.float() if "bfloat16" in str(values.dtype) else values).cpu().numpy()
+        array: ndarray = np.asanyarray(values)
+        array = array.astype(np.float32) if array.dtype.name == "bfloat16" else array
+    except Exception as reason:  # The object's own conversion may raise anything.
+        found = f"an object of type {type(depth).__name__}, which cannot be converted to a numpy array"
+        raise error(f"{what} {found} ({escape_text(str(reason))})") from reason
+    if isinstance(array, np.ma.MaskedArray):  # numpy.asarray would silently drop the mask.
+        raise error(f"{what} a masked array, expected NaN where there is no prediction")
+    shape = array.shape
+    if set(shape[:-2]) <= {1}:
+        array = array.reshape(shape[-2:])
+    if array.dtype.kind != "f" or array.ndim != 2 or 0 in shape or (grid and array.shape != grid):
+        found = f"{array.dtype} of shape {shape}"
+        if array.dtype.kind in "OSU":
+            found = "None" if depth is None else f"an object of type {type(depth).__name__}"
+        raise error(f"{what} {found}, expected an array of floats of shape {grid or '(H, W)'}")
+    return np.asarray(array)
 
 
 def _npy_header(values: Depth) -> bytes:

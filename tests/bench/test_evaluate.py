@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import gc
+import os
+import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from subprocess import run
 from typing import Any
 
 import numpy as np
@@ -82,9 +85,50 @@ def test_low_coverage_is_printed_with_the_numbers(tiny_root: Path, lattice: Trut
     assert lines[2:] == ["coverage below 95 %: errors of valid predictions are not comparable"]
 
 
-def test_mistakes_are_among_the_notes(tiny_root: Path, lattice: Truth) -> None:
-    millimetres = {view_id: depth_m * 1000 for view_id, depth_m in lattice.items()}
-    assert any("possible mistake" in note for note in rdb.evaluate(millimetres, tiny_root, config=LATTICE).notes)
+def test_mistakes_are_printed_and_among_the_notes(tiny_root: Path, lattice: Truth) -> None:
+    made: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+        "in millimetres": lambda z: z * 1000,
+        'if the network is relative, declare kind="affine-disparity"': lambda z: 1 / np.where(z > 0, z, np.nan),
+    }
+    for words, make in made.items():
+        result = rdb.evaluate({view_id: make(z) for view_id, z in lattice.items()}, tiny_root, config=LATTICE)
+        [mistake] = [note for note in result.notes if note.startswith("possible mistake: ")]
+        assert words in mistake
+        assert str(result).splitlines()[-1] == mistake
+
+
+def test_predictions_that_say_nothing_are_told_apart(tiny_root: Path, lattice: Truth) -> None:
+    def notes(make: Callable[[np.ndarray], np.ndarray]) -> list[str]:
+        predictions = {view_id: make(z) for view_id, z in lattice.items()}
+        return str(rdb.evaluate(predictions, tiny_root, config=LATTICE, kind="affine-disparity")).splitlines()[3:]
+
+    words = "say nothing about depth, or run the other way (depth declared as disparity, or disparity as depth)."
+    assert notes(lambda z: z)[1].endswith(words)
+    none = notes(lambda z: np.full_like(z, np.nan))
+    assert none[0] == "9 of 9 views without any prediction"
+    assert not any("fit" in note for note in none)
+
+
+def test_unfinished_evaluator_is_silent_at_exit(tiny_root: Path, tmp_path: Path) -> None:
+    code = f"""
+import numpy as np
+import rebar_depth_bench as rdb
+evaluator = rdb.Evaluator({str(tiny_root)!r}, "lattice")
+evaluator.update(evaluator.view_ids[0], np.ones((90, 160)))
+evaluator.itself = evaluator
+"""
+    environment = {**os.environ, "TMPDIR": str(tmp_path)}
+    for last in ("", "import gc\ndel evaluator\ngc.collect()\n"):
+        finished = run([sys.executable, "-c", code + last], env=environment, capture_output=True, text=True)
+        assert (finished.returncode, finished.stderr) == (0, "")
+        assert not list(tmp_path.iterdir())
+
+
+def test_a_method_declares_itself(tiny_root: Path) -> None:
+    with pytest.raises(rdb.InputError, match=r"^kind and uses_ground_truth given, .* sgbm .*, align=KIND"):
+        rdb.evaluate("sgbm", tiny_root, kind="affine-disparity", uses_ground_truth=False)
+    with pytest.raises(rdb.InputError, match=r"^method given, but the method sgbm declares its own$"):
+        rdb.evaluate("sgbm", tiny_root, method="mine")
 
 
 def test_batches_of_tensors(tiny_root: Path) -> None:
@@ -106,13 +150,36 @@ def test_batches_of_tensors(tiny_root: Path) -> None:
     assert 0 < errors[2] < 2**-8  # bfloat16 has 8 significant bits.
 
 
+def test_tensors_are_taken_wherever_depth_is(tiny_root: Path, tmp_path: Path) -> None:
+    torch = pytest.importorskip("torch")
+    path = tmp_path / "own.py"
+    path.write_text("""
+import torch
+from rebar_depth_bench.methods import Method, MethodInfo
+
+def run(row):
+    network = torch.nn.Parameter(torch.full((1, 1, *row["left_rgb"].shape[:2]), 0.3, dtype=torch.bfloat16))
+    return network * 1
+
+METHOD = Method(MethodInfo("own", "a test", ("left_rgb",), False, "here", "MIT"), lambda: run)
+""")
+    by_name = rdb.evaluate(f"{path}:METHOD", tiny_root, config=LATTICE)
+    depth = torch.full((1, 1, 90, 160), 0.3, dtype=torch.bfloat16, requires_grad=True)
+    of_function = rdb.evaluate(lambda _: depth, tiny_root, config=LATTICE)
+    with rdb.SubmissionWriter(tmp_path / "written.zip", "own") as writer:
+        for view_id in rdb.Evaluator(tiny_root, LATTICE).view_ids:
+            writer.add(view_id, depth)
+    written = rdb.score(tmp_path / "written.zip", tiny_root)
+    assert by_name.metrics == of_function.metrics == written.metrics
+
+
 @pytest.mark.parametrize(
     ("shape", "words"),
     [
         ((90, 160), None),
         ((1, 90, 160), None),
-        ((1, 1, 90, 160), "shape"),
-        ((90, 161), r"shape \(90, 161\), expected \(90, 160\)"),
+        ((1, 1, 90, 160), None),
+        ((90, 161), r"shape \(90, 161\), expected .* of shape \(90, 160\)"),
         ((2, 90, 160), "shape"),
     ],
 )
@@ -148,6 +215,8 @@ def test_wrong_views_are_named(tiny_root: Path, lattice: Truth) -> None:
         ({"views": ["lattice/9999"]}, "views has lattice/9999"),
         ({"views": "lattice/9999"}, "views has lattice/9999"),
         ({"views": []}, "views has no id"),
+        ({"views": 2.5}, "views is 2.5, expected a whole number from 1 or view ids"),
+        ({"views": True}, "views is True, expected a whole number from 1"),
         ({"kind": "depth"}, '^declaration: .*\n.* prediction: .*"metric", "scale", "affine-depth" or'),
         ({"inputs": "sonar"}, "inputs"),
         ({"split": "train"}, "train"),
@@ -169,8 +238,10 @@ def test_models_of_other_types_are_refused(tiny_root: Path, model: Any) -> None:
 @pytest.mark.parametrize(
     ("depth", "words"),
     [
-        (None, "shape"),
-        (np.ones((90, 160), int), "int64, expected floats"),
+        (None, r"the model returned None, expected an array of floats of shape \(90, 160\)"),
+        ("depth", "the model returned an object of type str, expected an array"),
+        ({"depth": np.ones((90, 160))}, "the model returned an object of type dict, expected an array"),
+        (np.ones((90, 160), int), r"int64 of shape \(90, 160\), expected an array of floats"),
         (np.ma.MaskedArray(np.ones((90, 160)), mask=True), "masked array"),  # type: ignore[no-untyped-call]
         ([[1.0] * 160] * 90, None),
     ],

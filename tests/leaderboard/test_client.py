@@ -9,8 +9,10 @@ import time
 from io import BufferedIOBase
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from rebar_depth_bench import SubmissionWriter
 from rebar_depth_bench.base.errors import InputError, SubmissionError
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.cli.submit import read_token
@@ -149,6 +151,19 @@ def test_too_large_archive_is_not_sent(scripted: ScriptedServer, small_archive: 
     scripted.answers["token"] = [answer({**TOKEN_INFO, "max_upload_bytes": 2000})]
     assert f"has {small_archive.stat().st_size} bytes, expected at most 2000" in refused(2)
     assert scripted.endpoints() == ["token"]
+
+
+def test_predictions_that_are_not_metric_are_not_sent(scripted: ScriptedServer, tmp_path: Path) -> None:
+    archive = tmp_path / "relative.zip"
+    with SubmissionWriter(archive, "net", prediction="affine-disparity") as writer:
+        for number in range(2000):
+            writer.add(f"lattice/{number:04d}", np.ones((2, 2), np.float32))
+    with (
+        LeaderboardClient(scripted.url, TOKEN) as client,
+        pytest.raises(SubmissionError, match="affine-disparity"),
+    ):
+        client.submit(archive)
+    assert scripted.requests == []
 
 
 def test_token_is_sent_to_the_leaderboard_only(scripted: ScriptedServer, small_archive: Path) -> None:

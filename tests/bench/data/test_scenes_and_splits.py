@@ -126,7 +126,7 @@ def test_reports_name_the_split_and_show_its_views(root: Path, archives: dict[st
     assert latex_table([result], published=True).count("cages (validation)") == 2  # Caption and heading.
 
 
-INFO = MethodInfo("shifted", "test", ("left_depth", "scene"), False, "here", "none")
+INFO = MethodInfo("shifted", "test", ("left_depth", "scene"), False, "here", "none", uses_ground_truth=True)
 
 
 def multi_view_method(prepared: list[Views]) -> MultiViewMethod:

@@ -145,6 +145,8 @@ def test_run_with_damaged_or_other_parameters_starts_over(
     assert KeptViews.open(kept.path, KEY).run.reports == {}
     assert f"starting over: {kept.path} holds 1 views of " in capsys.readouterr().err
     assert tree(kept.path) == [file]
+    KeptViews.open(kept.path, {"other": "method"})
+    assert capsys.readouterr().err == "", "there are no views to lose"
 
 
 def test_report_is_read_as_it_was_written(kept: KeptViews) -> None:

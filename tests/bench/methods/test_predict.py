@@ -87,11 +87,30 @@ def test_method_of_another_kind_declares_it(tiny_root: Path, tmp_path: Path) -> 
         find_method(f"{path}:METHOD")
 
 
+def test_method_that_reads_ground_truth_declares_it(user_file: Path, tiny_root: Path, tmp_path: Path) -> None:
+    code = user_file.read_text()
+    for columns, read in {
+        '"left_rgb", "left_depth", "right_bars"': "left_depth, right_bars",
+        '"left_rgb", "left_preview"': "left_preview",
+        '"left_rgb", "left_cam_from_world"': "left_cam_from_world",
+    }.items():
+        user_file.write_text(code.replace('"left_rgb", "left_K"', columns))
+        words = f"own: reads {read}, expected MethodInfo(..., uses_ground_truth=True)"
+        with pytest.raises(MethodError, match=re.escape(words)):
+            find_method(f"{user_file}:METHOD")
+        user_file.write_text(user_file.read_text().replace('"MIT"', '"MIT", uses_ground_truth=True'))
+        assert find_method(f"{user_file}:METHOD").info.uses_ground_truth
+    assert {name for name, method in own_methods().items() if method.info.uses_ground_truth} == {
+        *("truth", "noisy-truth", "colmap-anchored", "sweep-anchored", "lidar-survey", "lidar-mobile")
+    }
+
+
 @pytest.mark.parametrize(
     ("name", "words"),
     [
         ("magic", "unknown method 'magic', expected one of sgbm, sgbm-filled, "),
         ("nowhere.py:METHOD", "nowhere.py: no such file"),
+        ("my_stereo.py", "my_stereo.py: names no method in the file, expected my_stereo.py:METHOD"),
         ("OWN:NOTHING", "is str, expected a rebar_depth_bench.methods.Method"),
         ("OWN:ABSENT", "own.py: has no ABSENT, expected the name of a method in it"),
         ("BROKEN:METHOD", "cannot be imported: ZeroDivisionError: division by zero"),
@@ -108,7 +127,7 @@ def test_unknown_method_raises_with_reason(name: str, words: str, user_file: Pat
 def test_invalid_prediction_stops_run(returned: str, user_file: Path, tiny_root: Path, tmp_path: Path) -> None:
     text = user_file.read_text()
     user_file.write_text(re.sub(r"return np\.full.*", f"return {returned}", text))
-    with pytest.raises(MethodError, match=r"own: lattice.* returned .*, expected floats of"):
+    with pytest.raises(MethodError, match=r"own: lattice.* returned .*, expected an array of floats of"):
         predict(find_method(f"{user_file}:METHOD"), tiny_root, tmp_path / "x.zip", configs=["lattice-orbit"])
     assert len((tmp_path / "log").read_text().split()) == 1
     assert not (tmp_path / "x.zip").exists()

@@ -223,5 +223,5 @@ def test_method_that_needs_what_rectified_images_lack_is_refused(column: str) ->
 @pytest.mark.parametrize("depth", [np.zeros((2, 2), np.float32), np.zeros((HEIGHT, WIDTH), np.int64), None])
 def test_depth_of_another_shape_or_type_is_refused(depth: Any, dataset_row: Row) -> None:
     predictor, needed = rectifying_predictor(lambda _: depth, ("left_rgb", "left_K"))
-    with pytest.raises(MethodError, match=r"capture/0001, rectified: .*expected floats of shape"):
+    with pytest.raises(MethodError, match=r"capture/0001, rectified: .*expected an array of floats of shape"):
         predictor({name: dataset_row[name] for name in ("view_id", *needed)})

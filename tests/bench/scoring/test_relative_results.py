@@ -141,8 +141,11 @@ def test_metric_archives_are_aligned_as_weaker_kinds(
         assert list(first[column.name]) == pytest.approx(list(second[column.name]), rel=1e-4, abs=tolerance)
     with pytest.raises(rdb.SubmissionError, match=f"of the kind {kind}, expected metric ones: .*scored as scale"):
         rdb.score(tmp_path / "other.zip", tiny_root, align="scale")
-    with pytest.raises(rdb.InputError, match="align is metres, expected one of metric, scale, affine-depth"):
-        rdb.score(tmp_path / "metric.zip", tiny_root, align="metres")
+    for align in ("metric", "metres"):  # As the command.
+        with pytest.raises(
+            rdb.InputError, match=f"align is {align}, expected one of scale, affine-depth, affine-d"
+        ):
+            rdb.score(tmp_path / "metric.zip", tiny_root, align=align)
 
 
 def test_zero_of_a_png_is_no_value(tiny_root: Path, tiny_truth: dict[str, np.ndarray], tmp_path: Path) -> None:
@@ -426,7 +429,11 @@ def test_disparity_is_no_mistake(tiny_root: Path, write: Write, capsys: Any) -> 
 
     with np.errstate(divide="ignore"):
         assert "mistake" in check("undeclared", "metric", lambda z: 1 / z)
-    assert "mistake" not in check("declared", "affine-disparity", disparity)
+    declared = check("declared", "affine-disparity", disparity)
+    assert "mistake" not in declared
+    assert "not ranked: " in declared
+    assert "affine-disparity, expected metric ones: the leaderboard ranks depth in metres" in declared
+    assert "not ranked" not in check("undeclared", "metric", lambda z: z)
     assert "mistake" not in check("millimetres", "scale", lambda z: 1000 * z)
     assert "mistake" not in check("negative", "affine-depth", lambda z: z - 90)
     assert "0.0 % are finite and above 0" in check("none", "scale", lambda z: z - 90)

@@ -52,6 +52,7 @@ def test_dry_run_lists_the_files_without_a_network(
     assert totals.startswith(f"{len(sizes)} files ({sum(sizes.values()):,} bytes); ")
     assert end == "dry run: not compared with the Hub, nothing was sent"
     assert hub.requests == []
+    assert push(root, "--dry-run", "--private").stdout.startswith(f"{HUB_ID}, branch main, private\n")
     assert push(root, "--dry-run", "--yes").returncode == 2
 
 
