@@ -76,7 +76,7 @@ _RELATIVE_NOTEBOOK_COLUMNS = (
     *("config", "views", "views_scored", "coverage", "flat_views", "aligned_error", "constant_error"),
     *("aligned_abs_rel", "aligned_robust_abs_rel", "constant_abs_rel", "aligned_within_5mm"),
 )
-_SUMMARY = (
+SUMMARY = (
     (COVERAGE, RANK_ERROR, NATIVE[0], SCALED[0], SCALED_CONSTANT[0], WITHIN[1]),
     ("coverage", "rank error", "AbsRel", "scaled", "constant", "within 5 mm"),
 )
@@ -212,7 +212,7 @@ class Result:
 
     def __str__(self) -> str:
         """Return the main numbers of each config as a table, with what limits them."""
-        columns, heads = _SUMMARY if self.prediction is None else _RELATIVE_SUMMARY
+        columns, heads = SUMMARY if self.prediction is None else _RELATIVE_SUMMARY
         rows = [[printable(self.method), *heads]]
         notes = dict[str, list[str]]()
         for name, table in self.tables.items():

@@ -30,6 +30,7 @@ from leaderboard.cli import argument_parser as board_parser
 from rebar_depth_bench.bar_crossings.table import CROSSINGS_SCHEMA
 from rebar_depth_bench.base import limits
 from rebar_depth_bench.base.limits import Limit
+from rebar_depth_bench.cli.demo import SAMPLE
 from rebar_depth_bench.cli.main import argument_parser as bench_parser
 from rebar_depth_bench.cli.main import main as bench_main
 from rebar_depth_bench.data.bars import BARS_SCHEMA
@@ -152,16 +153,17 @@ def test_documented_python_runs(
     page: Path, tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    (tmp_path / "tests").symlink_to(ROOT / "tests")
+    (tmp_path / "demo-output" / "sample").mkdir(parents=True)
+    (tmp_path / "demo-output" / "sample" / "dataset").symlink_to(SAMPLE)
+    (tmp_path / "demo-output" / "dataset").symlink_to(tiny_root)
     names: dict[str, object] = {}
     for block, output in python_blocks(page):
-        shown = block.replace('"demo-output/dataset"', repr(str(tiny_root)))
         with redirect_stdout(StringIO()) as printed:
-            exec(shown.replace("(480, 640)", "(48, 64)"), names)
+            exec(block.replace("(480, 640)", "(48, 64)"), names)
         assert not output or printed.getvalue() == output
     assert name_of(page) not in ("README.md", "docs/score.md") or any(output for _, output in python_blocks(page))
     for line in shell_lines(page):
-        if "tests/data/tiny" in line:
+        if "demo-output/sample/dataset" in line:
             program, *arguments = shlex.split(line, comments=True)
             assert (program, bench_main(arguments)) == ("rebar-bench", 0)
     writes = any("submission.zip" in block for block in blocks(page, "python"))

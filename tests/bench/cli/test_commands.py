@@ -18,6 +18,7 @@ import pytest
 import rebar_depth_bench as rdb
 from rebar_depth_bench.base.errors import MAX_PROBLEMS_SHOWN
 from rebar_depth_bench.cli import check
+from rebar_depth_bench.cli.demo import DEMO_METHODS
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.codecs import encode_depth
 from rebar_depth_bench.data.files import file_sha256
@@ -296,3 +297,19 @@ def test_false_digest_is_refused_by_every_command(
         finished = run_bench(*arguments)
         assert (finished.returncode, finished.stdout) == (2, "")
         assert "ground_truth.digest" in finished.stderr
+
+
+def test_demo_on_the_sample_ends_with_one_table_and_the_reports(tmp_path: Path) -> None:
+    finished = run_bench("demo", "--sample", "--out", tmp_path)
+    assert finished.returncode == 0, finished.stderr
+    heading, _, *rows = finished.stdout.partition("\n\n")[0].splitlines()
+    assert heading.split()[:2] == ["method", "coverage"]
+    assert [row.split()[0] for row in rows] == list(DEMO_METHODS)
+    for name, row in zip(DEMO_METHODS, rows, strict=True):
+        result = rdb.score(tmp_path / "sample" / f"{name}.zip", tmp_path / "sample" / "dataset")
+        assert f"{result.tables['lattice'].rank_error:.4f}" in row.split()
+        assert ("‡" in row) == (name == "noisy-truth")
+    assert "show no shape: sgbm, sgbm-filled, constant." in " ".join(finished.stdout.split())
+    reports = [Path(line.strip()) for line in finished.stdout.partition("Reports")[2].splitlines()[1:]]
+    assert [path.stem for path in reports] == list(DEMO_METHODS)
+    assert all(path.read_text().startswith("<!DOCTYPE html>") for path in reports)
