@@ -1,10 +1,12 @@
 """Pictures of the documentation, made from a dataset folder: views, reports and pages of a leaderboard.
 
 rebar-build --out ROOT --config lattice pile pier --views 12 --width 640 --height 360 --quality preview
+rebar-build --out ROOT --config cages --split test --scenes 40 --views-per-scene 4 --width 640 --height 360 \
+    --quality preview
 rebar-build --out MAT --scene examples/mat.toml --views 12 --width 480 --height 270 --quality preview
 python -m scripts.documentation_pictures ROOT MAT docs/pictures
 
-The dataset needs the configs lattice, pile and pier in colour. Methods that take less than a second a view are run
+The dataset needs the configs in colour. Methods that take less than a second a view are run
 and scored; the pages are those that users see, in the system's Chromium.
 """
 
@@ -17,16 +19,17 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 from playwright.sync_api import Page, sync_playwright
 
 import rebar_depth_bench as rdb
-from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, colour_indices
+from rebar_depth_bench.methods.sgbm import SGBM
+from rebar_depth_bench.reporting.html.views import depth_image, error_image
 
 METHODS = ("sgbm-filled", "sgbm", "board-plane", "constant", "truth")
 REPORT_METHOD, BOARD_METHOD = "sgbm-filled", "sgbm"
@@ -34,6 +37,11 @@ REPORT_METHOD, BOARD_METHOD = "sgbm-filled", "sgbm"
 SHOWN = ("lattice", "pile")
 """Configs whose results are shown; the pier has no board, which ``board-plane`` needs."""
 PANEL = (640, 360)
+CAGES = ("slab-test0001", "footing-test0003", "pile-cage-test0004", "joint-test0005")
+"""Scenes of cages that are shown, of which the first view is taken."""
+CAGE_PANEL = (400, 225)
+CAGE_HEAD = 48
+ERROR_LIMIT_CM = 2.0
 MAX_BYTES = 150_000
 START_S = 60.0
 PROJECT = Path(__file__).parents[1]
@@ -43,6 +51,7 @@ def main(root: str, mat: str, target: str) -> None:
     """Write the pictures of the dataset folders ``root`` and ``mat`` to the folder ``target`` as WebP files."""
     data, out = Path(root).resolve(), Path(target).resolve()
     save(view_strip(data), out / "lattice.webp")
+    save(cage_grid(data), out / "cages.webp")
     for name, target_name in (("scenes", "scenes"), ("lattice", "contact-sheet")):
         shutil.copyfile(data / "pictures" / f"{name}.webp", out / f"{target_name}.webp")
     save(opened((Path(mat) / "pictures" / "mat.webp").read_bytes()), out / "mat.webp")
@@ -68,17 +77,44 @@ def main(root: str, mat: str, target: str) -> None:
 def view_strip(data: Path, view: int = 0) -> Image.Image:
     """Return colour, depth and bar ids of one view of the lattice, side by side."""
     row = rdb.load(data, "lattice", columns=["left_rgb", "left_depth", "left_bars"])[view]
-    steel = row["left_bars"] > 0
-    near_m, far_m = row["left_depth"][steel].min(), row["left_depth"][steel].max()
-    depth = DEPTH_COLOURS[colour_indices(-row["left_depth"], -far_m, -near_m)]
-    hues = np.random.default_rng(1).integers(70, 240, (np.iinfo(np.uint16).max + 1, 3)).astype(np.uint8)
-    bars = np.where(steel[..., None], hues[row["left_bars"]], np.uint8(24))
-    panels = [
-        Image.fromarray(panel).resize(PANEL, Image.Resampling.LANCZOS) for panel in (row["left_rgb"], depth, bars)
+    return side_by_side(truth_images(row), PANEL)
+
+
+def cage_grid(data: Path) -> Image.Image:
+    """Return a row per cage: colour, depth, bar ids and the signed error of SGBM, below their headings."""
+    sgbm = SGBM.load()
+    rows = [
+        row for row in rdb.load(data, "cages") if row["view_id"] in {f"cages/test-{cage}-0000" for cage in CAGES}
     ]
-    strip = Image.new("RGB", (PANEL[0] * len(panels), PANEL[1]))
-    for n, panel in enumerate(panels):
-        strip.paste(panel, (n * PANEL[0], 0))
+    strips = []
+    for row in sorted(rows, key=lambda row: CAGES.index(row["scene"])):
+        error_m = sgbm(row).astype(np.float64) - row["left_depth"]
+        error_m[~(error_m > -row["left_depth"])] = np.nan  # No prediction.
+        error = error_image(error_m, row["left_bars"] > 0, row["left_rgb"], ERROR_LIMIT_CM)
+        strips.append(side_by_side([*truth_images(row), error], CAGE_PANEL))
+    grid = Image.new("RGB", (strips[0].width, CAGE_HEAD + sum(strip.height for strip in strips)), "white")
+    draw = ImageDraw.Draw(grid)
+    font = ImageFont.load_default(CAGE_HEAD * 0.75)
+    for n, head in enumerate(("colour", "exact depth", "bar ids", f"SGBM error, ± {10 * ERROR_LIMIT_CM:g} mm")):
+        draw.text(((n + 0.5) * CAGE_PANEL[0], CAGE_HEAD / 2), head, "black", font, anchor="mm")
+    for n, strip in enumerate(strips):
+        grid.paste(strip, (0, CAGE_HEAD + n * strip.height))
+    return grid
+
+
+def truth_images(row: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+    """Return colour, depth in the range of the steel, and bar ids of a view as images."""
+    steel = row["left_bars"] > 0
+    depth = depth_image(row["left_depth"], row["left_depth"][steel].min(), row["left_depth"][steel].max())
+    hues = np.random.default_rng(1).integers(70, 240, (np.iinfo(np.uint16).max + 1, 3)).astype(np.uint8)
+    return [row["left_rgb"], depth, np.where(steel[..., None], hues[row["left_bars"]], np.uint8(24))]
+
+
+def side_by_side(images: Sequence[np.ndarray], panel: tuple[int, int]) -> Image.Image:
+    """Return images of the size ``panel`` in one row."""
+    strip = Image.new("RGB", (panel[0] * len(images), panel[1]))
+    for n, image in enumerate(images):
+        strip.paste(Image.fromarray(image).resize(panel, Image.Resampling.LANCZOS), (n * panel[0], 0))
     return strip
 
 

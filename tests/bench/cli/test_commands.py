@@ -28,6 +28,7 @@ from rebar_depth_bench.methods.base import WeightsMethod
 from rebar_depth_bench.methods.registry import FROM_FOLDER
 from tests.commands import run_in_process
 from tests.damage import change_manifest, change_rows, copy_dataset, first_shard
+from tests.project.pages import PAGES, blocks
 
 
 def run_bench(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
@@ -299,17 +300,15 @@ def test_false_digest_is_refused_by_every_command(
         assert "ground_truth.digest" in finished.stderr
 
 
-def test_demo_on_the_sample_ends_with_one_table_and_the_reports(tmp_path: Path) -> None:
+def test_demo_on_the_sample_prints_what_the_readme_shows(tmp_path: Path) -> None:
     finished = run_bench("demo", "--sample", "--out", tmp_path)
     assert finished.returncode == 0, finished.stderr
-    heading, _, *rows = finished.stdout.partition("\n\n")[0].splitlines()
-    assert heading.split()[:2] == ["method", "coverage"]
-    assert [row.split()[0] for row in rows] == list(DEMO_METHODS)
-    for name, row in zip(DEMO_METHODS, rows, strict=True):
-        result = rdb.score(tmp_path / "sample" / f"{name}.zip", tmp_path / "sample" / "dataset")
-        assert f"{result.tables['lattice'].rank_error:.4f}" in row.split()
-        assert ("‡" in row) == (name == "noisy-truth")
-    assert "show no shape: sgbm, sgbm-filled, constant." in " ".join(finished.stdout.split())
+    shown, *_ = blocks(PAGES[0], "text")
+    assert "\n".join(map(str.rstrip, finished.stdout.splitlines())).startswith(shown)
+    out = tmp_path / "sample"
     reports = [Path(line.strip()) for line in finished.stdout.partition("Reports")[2].splitlines()[1:]]
-    assert [path.stem for path in reports] == list(DEMO_METHODS)
+    assert reports == [out / f"{name}.html" for name in DEMO_METHODS]
     assert all(path.read_text().startswith("<!DOCTYPE html>") for path in reports)
+    for name in DEMO_METHODS:
+        assert (out / f"{name}.json").read_bytes() == rdb.score(out / f"{name}.zip", out / "dataset").to_json()
+        assert f"{name} " in shown
