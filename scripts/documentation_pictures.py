@@ -83,11 +83,10 @@ def view_strip(data: Path, view: int = 0) -> Image.Image:
 def cage_grid(data: Path) -> Image.Image:
     """Return a row per cage: colour, depth, bar ids and the signed error of SGBM, below their headings."""
     sgbm = SGBM.load()
-    rows = [
-        row for row in rdb.load(data, "cages") if row["view_id"] in {f"cages/test-{cage}-0000" for cage in CAGES}
-    ]
+    rows = rdb.load(data, "cages")
+    first = [rows["scene"].index(cage) for cage in CAGES]
     strips = []
-    for row in sorted(rows, key=lambda row: CAGES.index(row["scene"])):
+    for row in map(rows.__getitem__, first):
         error_m = sgbm(row).astype(np.float64) - row["left_depth"]
         error_m[~(error_m > -row["left_depth"])] = np.nan  # No prediction.
         error = error_image(error_m, row["left_bars"] > 0, row["left_rgb"], ERROR_LIMIT_CM)
