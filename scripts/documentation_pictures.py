@@ -41,6 +41,7 @@ CAGES = ("slab-test0001", "footing-test0003", "pile-cage-test0004", "joint-test0
 """Scenes of cages that are shown, of which the first view is taken."""
 CAGE_PANEL = (400, 225)
 CAGE_HEAD = 48
+BACKGROUND = (24, 24, 24)
 ERROR_LIMIT_CM = 2.0
 MAX_BYTES = 150_000
 START_S = 60.0
@@ -91,11 +92,11 @@ def cage_grid(data: Path) -> Image.Image:
         error_m[~(error_m > -row["left_depth"])] = np.nan  # No prediction.
         error = error_image(error_m, row["left_bars"] > 0, row["left_rgb"], ERROR_LIMIT_CM)
         strips.append(side_by_side([*truth_images(row), error], CAGE_PANEL))
-    grid = Image.new("RGB", (strips[0].width, CAGE_HEAD + sum(strip.height for strip in strips)), "white")
+    grid = Image.new("RGB", (strips[0].width, CAGE_HEAD + sum(strip.height for strip in strips)), BACKGROUND)
     draw = ImageDraw.Draw(grid)
     font = ImageFont.load_default(CAGE_HEAD * 0.75)
     for n, head in enumerate(("colour", "exact depth", "bar ids", f"SGBM error, ± {10 * ERROR_LIMIT_CM:g} mm")):
-        draw.text(((n + 0.5) * CAGE_PANEL[0], CAGE_HEAD / 2), head, "black", font, anchor="mm")
+        draw.text(((n + 0.5) * CAGE_PANEL[0], CAGE_HEAD / 2), head, "white", font, anchor="mm")
     for n, strip in enumerate(strips):
         grid.paste(strip, (0, CAGE_HEAD + n * strip.height))
     return grid
@@ -106,7 +107,11 @@ def truth_images(row: Mapping[str, np.ndarray]) -> list[np.ndarray]:
     steel = row["left_bars"] > 0
     depth = depth_image(row["left_depth"], row["left_depth"][steel].min(), row["left_depth"][steel].max())
     hues = np.random.default_rng(1).integers(70, 240, (np.iinfo(np.uint16).max + 1, 3)).astype(np.uint8)
-    return [row["left_rgb"], depth, np.where(steel[..., None], hues[row["left_bars"]], np.uint8(24))]
+    return [
+        row["left_rgb"],
+        depth,
+        np.where(steel[..., None], hues[row["left_bars"]], np.array(BACKGROUND, np.uint8)),
+    ]
 
 
 def side_by_side(images: Sequence[np.ndarray], panel: tuple[int, int]) -> Image.Image:

@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(options: argparse.Namespace) -> None:
     """Copy or render lattice views, run four methods, write a report of each, and print one table.
 
-    An interrupted demo is resumed. Raises ``InputError`` if the extra ``methods``, or ``build`` for rendering, is
+    An interrupted build is resumed. Raises ``InputError`` if the extra ``methods``, or ``build`` for rendering, is
     not installed.
     """
     out = options.out / "sample" if options.sample else options.out
