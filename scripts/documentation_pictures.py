@@ -37,13 +37,13 @@ REPORT_METHOD, BOARD_METHOD = "sgbm-filled", "sgbm"
 SHOWN = ("lattice", "pile")
 """Configs whose results are shown; the pier has no board, which ``board-plane`` needs."""
 PANEL = (640, 360)
-CAGES = ("slab-test0001", "footing-test0003", "pile-cage-test0004", "joint-test0005")
+CAGES = ("slab-test0014", "beam-test0022", "pile-cage-test0017", "column-test0032")
 """Scenes of cages that are shown, of which the first view is taken."""
-CAGE_PANEL = (400, 225)
+CAGE_PANEL = (384, 216)
 CAGE_HEAD = 48
 BACKGROUND = (24, 24, 24)
 ERROR_LIMIT_CM = 2.0
-MAX_BYTES = 150_000
+MAX_BYTES = 200_000
 START_S = 60.0
 PROJECT = Path(__file__).parents[1]
 

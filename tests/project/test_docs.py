@@ -63,7 +63,7 @@ PARSERS: dict[str, ArgumentParser] = {
     "rebar-bench": bench_parser(),
     "rebar-leaderboard": board_parser(),
 }
-MAX_PICTURE_BYTES = 150_000
+MAX_PICTURE_BYTES = 200_000
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
