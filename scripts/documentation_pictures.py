@@ -13,7 +13,6 @@ and scored; the pages are those that users see, in the system's Chromium.
 from __future__ import annotations
 
 import io
-import os
 import shutil
 import subprocess
 import sys
@@ -29,6 +28,7 @@ from playwright.sync_api import Page, sync_playwright
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.methods.sgbm import SGBM
+from rebar_depth_bench.remote.leaderboard_client import LeaderboardClient
 from rebar_depth_bench.reporting.html.views import depth_image, error_image
 
 METHODS = ("sgbm-filled", "sgbm", "board-plane", "constant", "truth")
@@ -166,12 +166,12 @@ def leaderboard(data: Path, state: Path, archives: Sequence[Path]) -> Iterator[t
     server = subprocess.Popen([*command, "--port", "0"], stderr=subprocess.PIPE, text=True)
     try:
         url = _announced_url(server)
-        environment = {**os.environ, "REBAR_LEADERBOARD_TOKEN": token}
-        for archive in reversed(archives):
-            run("rebar_depth_bench", "submit", str(archive), "--url", url, env=environment)
-        listed = run("rebar_depth_bench", "submissions", "list", "--url", url, env=environment)
-        # The list has the newest first, which is the first of the archives.
-        yield url, [f"{url}/submissions/{line.split()[0]}" for line in listed.splitlines()]
+        with LeaderboardClient(url, token) as client:
+            # The first of the archives is submitted last, and is the newest.
+            accepted = [client.submit(archive) for archive in reversed(archives)]
+            for submission in accepted:
+                client.wait(submission.id)
+        yield url, [submission.url for submission in reversed(accepted)]
     finally:
         server.terminate()
         server.wait()
@@ -228,10 +228,10 @@ def save(image: Image.Image, path: Path) -> None:
     print(f"{path.name}: {image.width} x {image.height}, {stream.tell() // 1000} kB")
 
 
-def run(module: str, *arguments: str, env: dict[str, str] | None = None) -> str:
+def run(module: str, *arguments: str) -> str:
     """Run a command of the project; return its standard output."""
     command = [sys.executable, "-m", module, *arguments]
-    return subprocess.run(command, check=True, capture_output=True, text=True, env=env).stdout
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout
 
 
 if __name__ == "__main__":
