@@ -37,10 +37,10 @@ REPORT_METHOD, BOARD_METHOD = "sgbm-filled", "sgbm"
 SHOWN = ("lattice", "pile")
 """Configs whose results are shown; the pier has no board, which ``board-plane`` needs."""
 PANEL = (640, 360)
-CAGES = ("slab-test0014", "beam-test0022", "pile-cage-test0017", "column-test0032")
+CAGES = ("slab-test0014", "beam-test0022", "column-test0032", "pile-cage-test0017")
 """Scenes of cages that are shown, of which the first view is taken."""
 CAGE_PANEL = (384, 216)
-CAGE_HEAD = 48
+CAGE_HEAD, CAGE_GAP = 48, 8
 BACKGROUND = (24, 24, 24)
 ERROR_LIMIT_CM = 2.0
 MAX_BYTES = 200_000
@@ -92,13 +92,14 @@ def cage_grid(data: Path) -> Image.Image:
         error_m[~(error_m > -row["left_depth"])] = np.nan  # No prediction.
         error = error_image(error_m, row["left_bars"] > 0, row["left_rgb"], ERROR_LIMIT_CM)
         strips.append(side_by_side([*truth_images(row), error], CAGE_PANEL))
-    grid = Image.new("RGB", (strips[0].width, CAGE_HEAD + sum(strip.height for strip in strips)), BACKGROUND)
+    step = CAGE_PANEL[1] + CAGE_GAP
+    grid = Image.new("RGB", (strips[0].width, CAGE_HEAD + len(strips) * step - CAGE_GAP), BACKGROUND)
     draw = ImageDraw.Draw(grid)
     font = ImageFont.load_default(CAGE_HEAD * 0.75)
     for n, head in enumerate(("colour", "exact depth", "bar ids", f"SGBM error, ± {10 * ERROR_LIMIT_CM:g} mm")):
         draw.text(((n + 0.5) * CAGE_PANEL[0], CAGE_HEAD / 2), head, "white", font, anchor="mm")
     for n, strip in enumerate(strips):
-        grid.paste(strip, (0, CAGE_HEAD + n * strip.height))
+        grid.paste(strip, (0, CAGE_HEAD + n * step))
     return grid
 
 
