@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import lzma
 import os
 import shutil
 import signal
@@ -41,8 +40,6 @@ if TYPE_CHECKING:
     from tests.hub_server import HubServer
 
 TINY_DATASET = SAMPLE
-TINY_MESH = Path(__file__).parent / "data" / "lattice.ply.xz"
-"""Mesh of the tiny dataset, packed, which the package leaves out."""
 GOLDEN_TEXTS = Path(__file__).parent / "data" / "golden"
 
 FIXTURE_MARKERS = {
@@ -180,13 +177,6 @@ def chromium_program() -> str:
     return path
 
 
-def unpack_mesh(root: Path) -> None:
-    """Write the mesh of the tiny dataset into a copy of it."""
-    mesh = root / "meshes" / TINY_MESH.stem
-    mesh.parent.mkdir()
-    mesh.write_bytes(lzma.decompress(TINY_MESH.read_bytes()))
-
-
 @pytest.fixture(scope="session")
 def tiny_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a copy of the package's sample, with its mesh: lattice (nine views), lattice-orbit (two), 160 x 90.
@@ -195,7 +185,7 @@ def tiny_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """
     root = tmp_path_factory.mktemp("tiny") / "dataset"
     shutil.copytree(TINY_DATASET, root)
-    unpack_mesh(root)
+    building.unpack_mesh(root)
     return root
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 
-from tests.building import TINY, TINY_VIEWS, run_build
-from tests.conftest import TINY_DATASET, TINY_MESH
+from rebar_depth_bench.cli.demo import SAMPLE
+from tests.building import TINY, TINY_MESH, TINY_VIEWS, run_build
 from tests.data import orbit
 
 
@@ -37,8 +37,8 @@ def main() -> None:
         root = Path(folder) / "dataset"
         render(root)
         TINY_MESH.write_bytes(lzma.compress((root / "meshes" / TINY_MESH.stem).read_bytes(), preset=9))
-        shutil.rmtree(TINY_DATASET, ignore_errors=True)
-        shutil.copytree(root, TINY_DATASET, ignore=shutil.ignore_patterns("meshes"))
+        shutil.rmtree(SAMPLE, ignore_errors=True)
+        shutil.copytree(root, SAMPLE, ignore=shutil.ignore_patterns("meshes"))
         shutil.rmtree(orbit.IMAGES, ignore_errors=True)
         orbit.IMAGES.mkdir()
         for name, content in render_orbit(Path(folder) / "orbit").items():

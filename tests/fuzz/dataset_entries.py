@@ -20,11 +20,12 @@ from dataset_builder.specs.config_specs import colour_spec
 from rebar_depth_bench import SubmissionWriter, load
 from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.cli.console import EXIT_DONE
+from rebar_depth_bench.cli.demo import SAMPLE
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import ConfigViews
 from rebar_depth_bench.methods.controls import noisy_depth_m
 from rebar_depth_bench.submission import SubmissionReader
-from tests.conftest import TINY_DATASET, unpack_mesh
+from tests.building import unpack_mesh
 from tests.fuzz.workspace import CACHE, CASE, EntryPoint, Workspace, bench, run_options
 from tests.mat_dataset import write_mat_dataset
 from tests.synthetic_dataset import write_earlier_manifest, write_split_dataset
@@ -43,7 +44,7 @@ OPTIONAL_OUTPUTS = (*("--html", "r.html", "--csv", "r.csv", "--extended-csv", "e
 
 def write_dataset(workspace: Workspace) -> None:
     """Copy the tiny dataset, whose config ``lattice-orbit`` has two views, without its mesh."""
-    shutil.copytree(TINY_DATASET, workspace.root / ROOT)
+    shutil.copytree(SAMPLE, workspace.root / ROOT)
 
 
 def _write_complete_dataset(workspace: Workspace) -> None:
