@@ -10,7 +10,7 @@ BIN := $(VENV)/bin
 help: ## List the targets
 	@awk -F ':.*## ' '/^[a-z-]+:.*## / {printf "  make %-12s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
-demo: ## Render a small lattice set, predict, score, and write the report
+demo: ## Render six views of the lattice, predict with four methods, score, and write the reports
 	@scripts/system_packages.sh blender
 	@scripts/environment.sh $(PYTHON) $(VENV) build
 	$(BIN)/rebar-bench demo
@@ -46,7 +46,7 @@ tables: env-dev ## Write the tables of the documentation that list what the code
 docs: system-packages env-dev ## Build the documentation as a site in build/docs; a warning is an error
 	$(BIN)/python -m sphinx -W --keep-going -n -q docs build/docs
 
-sample-data: system-packages env-dev ## Render the dataset in tests/data again, after a change of the format
+sample-data: system-packages env-dev ## Render the sample of the package and the tests again, after a change of the format
 	$(BIN)/python -m tests.data.render
 
 env-dev: ## Make .venv for developing and testing

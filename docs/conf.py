@@ -11,6 +11,7 @@ from typing import Any
 
 ROOT = Path(__file__).parents[1]
 INCLUDED = {
+    "README.md": "index.md",
     "ARCHITECTURE.md": "architecture.md",
     "CHANGELOG.md": "changelog.md",
     "CONTRIBUTING.md": "contributing.md",
@@ -53,7 +54,7 @@ myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 4
 
 # The notebooks read the small dataset of the tests, and find the commands of this environment.
-os.environ.setdefault("REBAR_NOTEBOOK_DATA", str(ROOT / "tests" / "data" / "tiny"))
+os.environ.setdefault("REBAR_NOTEBOOK_DATA", str(ROOT / "rebar_depth_bench" / "sample"))
 os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
 nb_execution_mode = "force"
 nb_execution_show_tb = True

@@ -1,32 +1,35 @@
 """Pictures of the documentation, made from a dataset folder: views, reports and pages of a leaderboard.
 
 rebar-build --out ROOT --config lattice pile pier --views 12 --width 640 --height 360 --quality preview
+rebar-build --out ROOT --config cages --split test --scenes 40 --views-per-scene 4 --width 640 --height 360 \
+    --quality preview
 rebar-build --out MAT --scene examples/mat.toml --views 12 --width 480 --height 270 --quality preview
 python -m scripts.documentation_pictures ROOT MAT docs/pictures
 
-The dataset needs the configs lattice, pile and pier in colour. Methods that take less than a second a view are run
+The dataset needs the configs in colour. Methods that take less than a second a view are run
 and scored; the pages are those that users see, in the system's Chromium.
 """
 
 from __future__ import annotations
 
 import io
-import os
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
-from PIL import Image
+from PIL import Image, ImageDraw, ImageFont
 from playwright.sync_api import Page, sync_playwright
 
 import rebar_depth_bench as rdb
-from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, colour_indices
+from rebar_depth_bench.methods.sgbm import SGBM
+from rebar_depth_bench.remote.leaderboard_client import LeaderboardClient
+from rebar_depth_bench.reporting.html.views import depth_image, error_image
 
 METHODS = ("sgbm-filled", "sgbm", "board-plane", "constant", "truth")
 REPORT_METHOD, BOARD_METHOD = "sgbm-filled", "sgbm"
@@ -34,7 +37,13 @@ REPORT_METHOD, BOARD_METHOD = "sgbm-filled", "sgbm"
 SHOWN = ("lattice", "pile")
 """Configs whose results are shown; the pier has no board, which ``board-plane`` needs."""
 PANEL = (640, 360)
-MAX_BYTES = 150_000
+CAGES = ("slab-test0014", "beam-test0022", "column-test0032", "pile-cage-test0017")
+"""Scenes of cages that are shown, of which the first view is taken."""
+CAGE_PANEL = (384, 216)
+CAGE_HEAD, CAGE_GAP = 48, 8
+BACKGROUND = (24, 24, 24)
+ERROR_LIMIT_CM = 2.0
+MAX_BYTES = 200_000
 START_S = 60.0
 PROJECT = Path(__file__).parents[1]
 
@@ -43,6 +52,7 @@ def main(root: str, mat: str, target: str) -> None:
     """Write the pictures of the dataset folders ``root`` and ``mat`` to the folder ``target`` as WebP files."""
     data, out = Path(root).resolve(), Path(target).resolve()
     save(view_strip(data), out / "lattice.webp")
+    save(cage_grid(data), out / "cages.webp")
     for name, target_name in (("scenes", "scenes"), ("lattice", "contact-sheet")):
         shutil.copyfile(data / "pictures" / f"{name}.webp", out / f"{target_name}.webp")
     save(opened((Path(mat) / "pictures" / "mat.webp").read_bytes()), out / "mat.webp")
@@ -68,17 +78,48 @@ def main(root: str, mat: str, target: str) -> None:
 def view_strip(data: Path, view: int = 0) -> Image.Image:
     """Return colour, depth and bar ids of one view of the lattice, side by side."""
     row = rdb.load(data, "lattice", columns=["left_rgb", "left_depth", "left_bars"])[view]
+    return side_by_side(truth_images(row), PANEL)
+
+
+def cage_grid(data: Path) -> Image.Image:
+    """Return a row per cage: colour, depth, bar ids and the signed error of SGBM, below their headings."""
+    sgbm = SGBM.load()
+    rows = rdb.load(data, "cages")
+    first = [rows["scene"].index(cage) for cage in CAGES]
+    strips = []
+    for row in map(rows.__getitem__, first):
+        error_m = sgbm(row).astype(np.float64) - row["left_depth"]
+        error_m[~(error_m > -row["left_depth"])] = np.nan  # No prediction.
+        error = error_image(error_m, row["left_bars"] > 0, row["left_rgb"], ERROR_LIMIT_CM)
+        strips.append(side_by_side([*truth_images(row), error], CAGE_PANEL))
+    step = CAGE_PANEL[1] + CAGE_GAP
+    grid = Image.new("RGB", (strips[0].width, CAGE_HEAD + len(strips) * step - CAGE_GAP), BACKGROUND)
+    draw = ImageDraw.Draw(grid)
+    font = ImageFont.load_default(CAGE_HEAD * 0.75)
+    for n, head in enumerate(("colour", "exact depth", "bar ids", f"SGBM error, ± {10 * ERROR_LIMIT_CM:g} mm")):
+        draw.text(((n + 0.5) * CAGE_PANEL[0], CAGE_HEAD / 2), head, "white", font, anchor="mm")
+    for n, strip in enumerate(strips):
+        grid.paste(strip, (0, CAGE_HEAD + n * step))
+    return grid
+
+
+def truth_images(row: Mapping[str, np.ndarray]) -> list[np.ndarray]:
+    """Return colour, depth in the range of the steel, and bar ids of a view as images."""
     steel = row["left_bars"] > 0
-    near_m, far_m = row["left_depth"][steel].min(), row["left_depth"][steel].max()
-    depth = DEPTH_COLOURS[colour_indices(-row["left_depth"], -far_m, -near_m)]
+    depth = depth_image(row["left_depth"], row["left_depth"][steel].min(), row["left_depth"][steel].max())
     hues = np.random.default_rng(1).integers(70, 240, (np.iinfo(np.uint16).max + 1, 3)).astype(np.uint8)
-    bars = np.where(steel[..., None], hues[row["left_bars"]], np.uint8(24))
-    panels = [
-        Image.fromarray(panel).resize(PANEL, Image.Resampling.LANCZOS) for panel in (row["left_rgb"], depth, bars)
+    return [
+        row["left_rgb"],
+        depth,
+        np.where(steel[..., None], hues[row["left_bars"]], np.array(BACKGROUND, np.uint8)),
     ]
-    strip = Image.new("RGB", (PANEL[0] * len(panels), PANEL[1]))
-    for n, panel in enumerate(panels):
-        strip.paste(panel, (n * PANEL[0], 0))
+
+
+def side_by_side(images: Sequence[np.ndarray], panel: tuple[int, int]) -> Image.Image:
+    """Return images of the size ``panel`` in one row."""
+    strip = Image.new("RGB", (panel[0] * len(images), panel[1]))
+    for n, image in enumerate(images):
+        strip.paste(Image.fromarray(image).resize(panel, Image.Resampling.LANCZOS), (n * panel[0], 0))
     return strip
 
 
@@ -105,7 +146,9 @@ def board_pictures(page: Page, url: str, submission: str, out: Path) -> None:
     """Photograph the ranking of a config, and the page of a submission."""
     page.set_viewport_size({"width": 1440, "height": 900})
     page.goto(f"{url}/?config=lattice")
-    save(photograph(page, 0, 1000), out / "leaderboard.webp")
+    top, _ = extent(page, "h1")
+    _, bottom = extent(page, "table tbody")
+    save(photograph(page, top, bottom), out / "leaderboard.webp")
     page.set_viewport_size({"width": 1280, "height": 900})
     page.goto(submission)
     save(photograph(page, 0, 900), out / "submission.webp")
@@ -126,12 +169,12 @@ def leaderboard(data: Path, state: Path, archives: Sequence[Path]) -> Iterator[t
     server = subprocess.Popen([*command, "--port", "0"], stderr=subprocess.PIPE, text=True)
     try:
         url = _announced_url(server)
-        environment = {**os.environ, "REBAR_LEADERBOARD_TOKEN": token}
-        for archive in reversed(archives):
-            run("rebar_depth_bench", "submit", str(archive), "--url", url, env=environment)
-        listed = run("rebar_depth_bench", "submissions", "list", "--url", url, env=environment)
-        # The list has the newest first, which is the first of the archives.
-        yield url, [f"{url}/submissions/{line.split()[0]}" for line in listed.splitlines()]
+        with LeaderboardClient(url, token) as client:
+            # The first of the archives is submitted last, and is the newest.
+            accepted = [client.submit(archive) for archive in reversed(archives)]
+            for submission in accepted:
+                client.wait(submission.id)
+        yield url, [submission.url for submission in reversed(accepted)]
     finally:
         server.terminate()
         server.wait()
@@ -188,10 +231,10 @@ def save(image: Image.Image, path: Path) -> None:
     print(f"{path.name}: {image.width} x {image.height}, {stream.tell() // 1000} kB")
 
 
-def run(module: str, *arguments: str, env: dict[str, str] | None = None) -> str:
+def run(module: str, *arguments: str) -> str:
     """Run a command of the project; return its standard output."""
     command = [sys.executable, "-m", module, *arguments]
-    return subprocess.run(command, check=True, capture_output=True, text=True, env=env).stdout
+    return subprocess.run(command, check=True, capture_output=True, text=True).stdout
 
 
 if __name__ == "__main__":

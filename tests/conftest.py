@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import lzma
 import os
 import shutil
 import signal
@@ -23,6 +22,7 @@ os.environ.update(HF_HOME=_CACHES.name, XDG_CACHE_HOME=_CACHES.name, HF_HUB_OFFL
 os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
 
 from rebar_depth_bench import SubmissionWriter, load  # noqa: E402
+from rebar_depth_bench.cli.demo import SAMPLE  # noqa: E402
 from tests import building, dask_cluster, requirements  # noqa: E402
 from tests.building import RunBuild, StartBuild  # noqa: E402
 from tests.dask_cluster import NewCluster  # noqa: E402
@@ -39,7 +39,7 @@ settings.load_profile("untimed")
 if TYPE_CHECKING:
     from tests.hub_server import HubServer
 
-TINY_DATASET = Path(__file__).parent / "data" / "tiny"
+TINY_DATASET = SAMPLE
 GOLDEN_TEXTS = Path(__file__).parent / "data" / "golden"
 
 FIXTURE_MARKERS = {
@@ -179,15 +179,13 @@ def chromium_program() -> str:
 
 @pytest.fixture(scope="session")
 def tiny_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a copy of the rendered dataset in the tree: lattice (nine views) and lattice-orbit (two), 160 x 90.
+    """Return a copy of the package's sample, with its mesh: lattice (nine views), lattice-orbit (two), 160 x 90.
 
     ``make sample-data`` renders it anew; the nightly tier compares it with a fresh render.
     """
     root = tmp_path_factory.mktemp("tiny") / "dataset"
     shutil.copytree(TINY_DATASET, root)
-    for packed in root.glob("meshes/*.xz"):
-        packed.with_suffix("").write_bytes(lzma.decompress(packed.read_bytes()))
-        packed.unlink()
+    building.unpack_mesh(root)
     return root
 
 

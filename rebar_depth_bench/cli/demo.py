@@ -1,4 +1,4 @@
-"""The ``rebar-bench demo`` command: render, predict, score and report a few views.
+"""The ``rebar-bench demo`` command: predict, score and report a few views, rendered or those of the package.
 
 ``dataset_builder`` depends on this package and not vice versa, so the demo renders by running ``rebar-build`` in a
 subprocess.
@@ -9,22 +9,28 @@ from __future__ import annotations
 import argparse
 import subprocess
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 
 from rich.console import Console
 
 from rebar_depth_bench.base.errors import BuildError, InputError, require_extra
-from rebar_depth_bench.base.terminal import ProgressBars, print_notice
+from rebar_depth_bench.base.terminal import print_notice
 from rebar_depth_bench.base.writing import write_bytes
 from rebar_depth_bench.cli.console import EXIT_INPUT
+from rebar_depth_bench.evaluator import evaluate
 from rebar_depth_bench.methods import METHODS
-from rebar_depth_bench.methods.run import predict
-from rebar_depth_bench.reporting.html.page import write_report
-from rebar_depth_bench.reporting.tables import print_table
-from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
+from rebar_depth_bench.methods.controls import NOISY_TRUTH_FACTOR
+from rebar_depth_bench.reporting.formatting import row_name
+from rebar_depth_bench.reporting.tables import make_grid, plain_text, print_line, print_unwrapped
+from rebar_depth_bench.scoring.columns import SCALED, SCALED_CONSTANT, columns_at
+from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE
+from rebar_depth_bench.scoring.result import SUMMARY, Result
 
+SAMPLE = Path(__file__).parents[1] / "sample"
+"""Dataset folder in the package: small views of the lattice and of its orbit, without the mesh."""
 DEMO_CONFIG = "lattice"
-DEMO_METHODS = ("sgbm", "sgbm-filled", "constant")
+DEMO_METHODS = ("sgbm", "sgbm-filled", "constant", "noisy-truth")
 DEMO_SAMPLES = 8
 """Samples per pixel: half the default of a build, which halves the demo's run time; the denoiser compensates."""
 
@@ -33,34 +39,42 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the command's arguments."""
     folder = Path("demo-output")
     parser.add_argument("--out", type=Path, default=folder, help="working folder (default: %(default)s)")
-    parser.add_argument("--views", type=int, default=6, help="stereo views to render (default: %(default)s)")
+    views = parser.add_mutually_exclusive_group()
+    views.add_argument("--views", type=int, default=6, help="stereo views to render (default: %(default)s)")
+    sample = (
+        "use nine views of 160 x 90 that come with the package, without Blender, in the folder sample of --out"
+    )
+    views.add_argument("--sample", action="store_true", help=sample)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Build lattice views in a folder, run three methods, score and report each.
+    """Copy or render lattice views, run four methods, write a report of each, and print one table.
 
-    An interrupted demo is resumed. Raises ``InputError`` if the ``build`` extra is not installed.
+    An interrupted build is resumed. Raises ``InputError`` if the extra ``methods``, or ``build`` for rendering, is
+    not installed.
     """
-    data = options.out / "dataset"
-    require_extra("build", ["dataset_builder", "bpy"])
-    print_notice(f"rendering {options.views} stereo views of the lattice at 1280 x 720 into {data}")
-    _build_dataset(data, options.views)
-    reports = []
+    out = options.out / "sample" if options.sample else options.out
+    data = out / "dataset"
+    if options.sample:
+        require_extra("methods", ["cv2"])
+        for source in filter(Path.is_file, SAMPLE.rglob("*")):
+            write_bytes(data / source.relative_to(SAMPLE), source.read_bytes())
+    else:
+        require_extra("build", ["dataset_builder", "bpy"])
+        print_notice(f"rendering {options.views} stereo views of the lattice at 1280 x 720 into {data}")
+        _build_dataset(data, options.views)
+    results = []
     for name in DEMO_METHODS:
-        method = METHODS[name]
-        archive = options.out / f"{name}.zip"
-        print_notice(f"predicting with {name}: {method.info.summary}")
-        with ProgressBars() as bars:
-            predict(method, data, archive, configs=[DEMO_CONFIG], progress=bars.update)
-            with open_evaluation(archive, data) as evaluation:
-                result = score_evaluation(evaluation, progress=bars.update)
-                reports.append(options.out / f"{name}.html")
-                write_report(result, evaluation, reports[-1])
-        write_bytes(options.out / f"{name}.json", result.to_json())
-        print_table(result, Console())
-    print("open the reports in a browser:")
-    for report in reports:
-        print(f"  {report.resolve()}")
+        print_notice(f"predicting with {name}: {METHODS[name].info.summary}")
+        result = evaluate(name, data, config=DEMO_CONFIG)
+        result.save_archive(out / f"{name}.zip")
+        result.to_html(out / f"{name}.html")
+        write_bytes(out / f"{name}.json", result.to_json())
+        results.append(result)
+    _print_results(results, Console())
+    print("Reports, for a browser:")
+    for name in DEMO_METHODS:
+        print(f"  {(out / name).resolve()}.html")
 
 
 def _build_dataset(data: Path, views: int) -> None:
@@ -71,3 +85,26 @@ def _build_dataset(data: Path, views: int) -> None:
         raise InputError("the demo dataset cannot be built, see the error above")
     if finished.returncode:
         raise BuildError(f"rebar-build ended with exit status {finished.returncode}, expected 0")
+
+
+def _print_results(results: Sequence[Result], console: Console) -> None:
+    """Print one row per result, what the rows show, and the meaning of their marks."""
+    grid = make_grid("method", list(SUMMARY.values()))
+    flat = []
+    for result in results:
+        table = result.tables[DEMO_CONFIG]
+        cells = (f"{column.text(column.value(table))} {column.unit}".strip() for column in columns_at(*SUMMARY))
+        grid.add_row(*map(plain_text, [row_name(result, table), *cells]))
+        scaled, constant = (column.value(table) for column in (SCALED[0], SCALED_CONSTANT[0]))
+        if scaled is not None and constant is not None and scaled >= constant:
+            flat.append(result.method)
+    print_unwrapped(console, grid)
+    console.print()
+    print_line(
+        console,
+        f"noisy-truth, exact depth times {NOISY_TRUTH_FACTOR:g} with noise, has a wrong scale and almost the "
+        "exact shape: AbsRel shows the one, scaled AbsRel the other. A plane at one depth has the scaled AbsRel "
+        f"in the column constant, and methods that are not below it show no shape: {', '.join(flat)}.",
+    )
+    low = f"*: coverage below {MIN_COMPARABLE_COVERAGE * 100:.0f} %, so only the rank error compares."
+    print_line(console, f"{low} ‡: uses ground truth, not ranked.")

@@ -36,7 +36,7 @@ COMMANDS: Mapping[str, Command] = {
         f"{_CLI}.submit", "upload an archive to a leaderboard, wait for its score and print the table"
     ),
     "cache": module_command(f"{_CLI}.cache", "show or clear the cache of ground truth"),
-    "demo": module_command(f"{_CLI}.demo", "render a small lattice dataset, predict, score and report"),
+    "demo": module_command(f"{_CLI}.demo", "predict, score and report a few views, rendered or of the package"),
 }
 
 

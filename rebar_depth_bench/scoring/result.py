@@ -71,7 +71,7 @@ _RELATIVE_NOTEBOOK_COLUMNS = (
     *("config", "views", "views_scored", "coverage", "flat_views", "aligned_error", "constant_error"),
     *("aligned_abs_rel", "aligned_robust_abs_rel", "constant_abs_rel", "aligned_within_5mm"),
 )
-_SUMMARY = {
+SUMMARY = {
     "coverage": "coverage",
     "rank_error": "rank error",
     "native.abs_rel": "AbsRel",
@@ -216,7 +216,7 @@ class Result:
 
     def __str__(self) -> str:
         """Return the main numbers of each config as a table, with what limits them."""
-        heads = _SUMMARY if self.prediction is None else _RELATIVE_SUMMARY
+        heads = SUMMARY if self.prediction is None else _RELATIVE_SUMMARY
         columns, rows = columns_at(*heads), [[printable(self.method), *heads.values()]]
         notes = dict[str, list[str]]()
         for name, table in self.tables.items():

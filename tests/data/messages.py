@@ -19,13 +19,12 @@ from dataset_builder.user_files.scene_schema import read_scene_toml
 from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.captures.calibration_files import read_calibration
 from rebar_depth_bench.captures.views import open_capture
+from rebar_depth_bench.cli.demo import SAMPLE
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.methods.onnx.spec import read_onnx_toml
 from rebar_depth_bench.submission import SubmissionReader
 from tests.bench.geometry.calibrations import CONF
 from tests.bench.submission.zips import DEPTH, EXPECTED, META, Record, build, npy, npz
-
-DATASET = Path(__file__).with_name("tiny")
 
 SCENE = """
 name = "lattice"
@@ -121,7 +120,7 @@ def rejected_inputs(folder: Path) -> Mapping[str, Callable[[], object]]:
     for name, content in files.items():
         (folder / name).parent.mkdir(parents=True, exist_ok=True)
         (folder / name).write_bytes(content)
-    manifest = json.loads((DATASET / "manifest.json").read_bytes())
+    manifest = json.loads((SAMPLE / "manifest.json").read_bytes())
     entry = next(iter(manifest["configs"].values()))
     entry["views"][0]["steel_px"] = "many"
     entry["views"][1]["view_id"] = "../../evil"

@@ -1,4 +1,4 @@
-"""Rendering of the sample data in ``tests/data``: ``python -m tests.data.render`` replaces it."""
+"""Rendering of the sample data of the package and the tests: ``python -m tests.data.render`` replaces it."""
 
 from __future__ import annotations
 
@@ -9,10 +9,9 @@ from pathlib import Path
 
 import pyarrow.parquet as pq
 
-from tests.building import TINY, TINY_VIEWS, run_build
+from rebar_depth_bench.cli.demo import SAMPLE
+from tests.building import TINY, TINY_MESH, TINY_VIEWS, run_build
 from tests.data import orbit
-
-FOLDER = Path(__file__).parent / "tiny"
 
 
 def render(root: Path) -> None:
@@ -33,15 +32,13 @@ def render_orbit(root: Path) -> dict[str, bytes]:
 
 
 def main() -> None:
-    """Render the sample data, pack the mesh of the tiny dataset, and replace both folders in the tree."""
+    """Render the sample data, pack the mesh of the tiny dataset, and replace all in the tree."""
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "dataset"
         render(root)
-        for mesh in (root / "meshes").glob("*.ply"):
-            mesh.with_name(f"{mesh.name}.xz").write_bytes(lzma.compress(mesh.read_bytes(), preset=9))
-            mesh.unlink()
-        shutil.rmtree(FOLDER, ignore_errors=True)
-        shutil.copytree(root, FOLDER)
+        TINY_MESH.write_bytes(lzma.compress((root / "meshes" / TINY_MESH.stem).read_bytes(), preset=9))
+        shutil.rmtree(SAMPLE, ignore_errors=True)
+        shutil.copytree(root, SAMPLE, ignore=shutil.ignore_patterns("meshes"))
         shutil.rmtree(orbit.IMAGES, ignore_errors=True)
         orbit.IMAGES.mkdir()
         for name, content in render_orbit(Path(folder) / "orbit").items():

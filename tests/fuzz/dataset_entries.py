@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import lzma
 import shutil
 from collections.abc import Sequence
 from functools import partial
@@ -21,15 +20,16 @@ from dataset_builder.specs.config_specs import colour_spec
 from rebar_depth_bench import SubmissionWriter, load
 from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.cli.console import EXIT_DONE
+from rebar_depth_bench.cli.demo import SAMPLE
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import ConfigViews
 from rebar_depth_bench.methods.controls import noisy_depth_m
 from rebar_depth_bench.submission import SubmissionReader
+from tests.building import unpack_mesh
 from tests.fuzz.workspace import CACHE, CASE, EntryPoint, Workspace, bench, run_options
 from tests.mat_dataset import write_mat_dataset
 from tests.synthetic_dataset import write_earlier_manifest, write_split_dataset
 
-TINY = Path(__file__).parents[1] / "data" / "tiny"
 CONFIG = "lattice-orbit"
 ROOT = f"{CASE}/root"
 SHARDS = f"{ROOT}/{CONFIG}/*.parquet"
@@ -43,15 +43,14 @@ OPTIONAL_OUTPUTS = (*("--html", "r.html", "--csv", "r.csv", "--extended-csv", "e
 
 
 def write_dataset(workspace: Workspace) -> None:
-    """Copy the tiny dataset, whose config ``lattice-orbit`` has two views, without its packed mesh."""
-    shutil.copytree(TINY, workspace.root / ROOT, ignore=shutil.ignore_patterns("*.xz"))
+    """Copy the tiny dataset, whose config ``lattice-orbit`` has two views, without its mesh."""
+    shutil.copytree(SAMPLE, workspace.root / ROOT)
 
 
 def _write_complete_dataset(workspace: Workspace) -> None:
     """Copy the tiny dataset with its mesh, as if this software had just built it."""
     write_dataset(workspace)
-    root = workspace.root / ROOT
-    (root / "meshes" / "lattice.ply").write_bytes(lzma.decompress((TINY / "meshes/lattice.ply.xz").read_bytes()))
+    unpack_mesh(workspace.root / ROOT)
 
 
 def write_dataset_and_archive(workspace: Workspace) -> None:

@@ -20,7 +20,7 @@ from tests.requirements import pip_environment, require_index
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = {"cards", "dataset_builder", "leaderboard", "rebar_depth_bench"}
-MAX_BYTES = {"sdist": 10_000_000, "wheel": 2_000_000}
+MAX_BYTES = {"sdist": 10_000_000, "wheel": 3_000_000}
 
 pytestmark = pytest.mark.slow
 
@@ -137,6 +137,7 @@ def test_wheel_alone_exports(installed: Path, tmp_path: Path) -> None:
         (("rebar-build", "inspect", str(ROOT / "examples" / "beam.toml")), "build"),
         (("rebar-leaderboard", "serve", "--data", str(TINY_DATASET)), "server"),
         (("rebar-bench", "demo"), "build"),
+        (("rebar-bench", "demo", "--sample"), "methods"),
         (("rebar-bench", "predict", "sgbm", "--data", str(TINY_DATASET), "--out", "a.zip"), "methods"),
     ],
     ids=lambda value: " ".join(value[:2]) if isinstance(value, tuple) else None,

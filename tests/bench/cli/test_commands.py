@@ -18,6 +18,7 @@ import pytest
 import rebar_depth_bench as rdb
 from rebar_depth_bench.base.errors import MAX_PROBLEMS_SHOWN
 from rebar_depth_bench.cli import check
+from rebar_depth_bench.cli.demo import DEMO_METHODS
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.codecs import encode_depth
 from rebar_depth_bench.data.files import file_sha256
@@ -27,6 +28,7 @@ from rebar_depth_bench.methods.base import WeightsMethod
 from rebar_depth_bench.methods.registry import FROM_FOLDER
 from tests.commands import run_in_process
 from tests.damage import change_manifest, change_rows, copy_dataset, first_shard
+from tests.project.pages import PAGES, blocks
 
 
 def run_bench(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
@@ -296,3 +298,17 @@ def test_false_digest_is_refused_by_every_command(
         finished = run_bench(*arguments)
         assert (finished.returncode, finished.stdout) == (2, "")
         assert "ground_truth.digest" in finished.stderr
+
+
+def test_demo_on_the_sample_prints_what_the_readme_shows(tmp_path: Path) -> None:
+    finished = run_bench("demo", "--sample", "--out", tmp_path)
+    assert finished.returncode == 0, finished.stderr
+    shown, *_ = blocks(PAGES[0], "text")
+    assert "\n".join(map(str.rstrip, finished.stdout.splitlines())).startswith(shown)
+    out = tmp_path / "sample"
+    reports = [Path(line.strip()) for line in finished.stdout.partition("Reports")[2].splitlines()[1:]]
+    assert reports == [out / f"{name}.html" for name in DEMO_METHODS]
+    assert all(path.read_text().startswith("<!DOCTYPE html>") for path in reports)
+    for name in DEMO_METHODS:
+        assert (out / f"{name}.json").read_bytes() == rdb.score(out / f"{name}.zip", out / "dataset").to_json()
+        assert f"{name} " in shown
