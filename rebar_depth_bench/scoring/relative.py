@@ -29,7 +29,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Bool, Float, Float64
+from jaxtyping import Bool, Float, Float64, Integer
 from numpy import ndarray
 
 from rebar_depth_bench.scoring.columns import METRICS, value_at
@@ -87,8 +87,7 @@ def align_view(view_id: str, x: Float[ndarray, " n"], z_m: Float[ndarray, " n"],
         constant = errors(np.full(len(z), median(z)))
         return score(aligned=errors(scaled), constant=constant, is_flat=False)
     target = 1.0 / z if kind == "affine-disparity" else z
-    # A power of two changes no digit of the fit; squares of values near the limits of float64 would overflow.
-    values = np.ldexp(values, -int(np.frexp(np.abs(values).max())[1]))
+    values = _within_range(values, values)
     fits = (_least_squares(values, target), _robust_fit(values, target), (0.0, float(target.mean())))
     aligned, robust, constant = (errors(_fitted_depth(fit, values, z, kind)) for fit in fits)
     return score(aligned=aligned, aligned_robust=robust, constant=constant, is_flat=fits[0][0] == 0.0)
@@ -101,10 +100,38 @@ def metric_as(depth_m: Float[ndarray, "h w"], kind: str) -> Float64[ndarray, "h 
         return 1.0 / values if kind == "affine-disparity" else values
 
 
+def aligned_depth(
+    x: Float[ndarray, "h w"], truth_m: Float[ndarray, "h w"], scored: Integer[ndarray, " n"], kind: str
+) -> Float64[ndarray, "h w"]:
+    """Return the aligned depth of a whole view, metres: the fit of ``align_view`` on the flat indices ``scored``.
+
+    It is NaN where the prediction ``x`` has no value, and everywhere if no scored pixel has one.
+    """
+    everywhere = np.where(has_value(x, kind), x, np.nan).astype(np.float64)
+    at = scored[np.isfinite(everywhere.ravel()[scored])]
+    if not len(at):
+        return np.full(x.shape, np.nan)
+    z = truth_m.ravel()[at].astype(np.float64)
+    with np.errstate(over="ignore"):
+        if kind == "scale":
+            return everywhere * (median(z) / median(everywhere.ravel()[at]))
+        everywhere = _within_range(everywhere, everywhere.ravel()[at])
+        target = 1.0 / z if kind == "affine-disparity" else z
+        return _fitted_depth(_least_squares(everywhere.ravel()[at], target), everywhere, z, kind)
+
+
+def _within_range(x: Float64[ndarray, "*n"], fitted: Float64[ndarray, " v"]) -> Float64[ndarray, "*n"]:
+    """Return x times the power of two that brings the values ``fitted`` to at most 1.
+
+    It changes no digit of the fit; squares of values near the limits of float64 would overflow.
+    """
+    return np.ldexp(x, -int(np.frexp(np.abs(fitted).max())[1]))
+
+
 def _fitted_depth(
-    fit: tuple[float, float], x: Float64[ndarray, " n"], z_m: Float64[ndarray, " n"], kind: str
-) -> Float64[ndarray, " n"]:
-    """Return the depth, metres, of a fit (a, b) to the target of a kind."""
+    fit: tuple[float, float], x: Float64[ndarray, "*n"], z_m: Float64[ndarray, " v"], kind: str
+) -> Float64[ndarray, "*n"]:
+    """Return the depth of x, metres, by a fit (a, b) to the target of a kind on pixels of true depth ``z_m``."""
     line = fit[0] * x + fit[1]
     return 1.0 / np.maximum(line, 1.0 / z_m.max()) if kind == "affine-disparity" else line
 

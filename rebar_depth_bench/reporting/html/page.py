@@ -37,9 +37,11 @@ from rebar_depth_bench.reporting.published import OTHER_OPTICS_NOTE, load_publis
 from rebar_depth_bench.scoring.columns import ALIGNED, ALIGNED_CONSTANT, ALIGNED_ROBUST, VIEW_COLUMNS, has_dash
 from rebar_depth_bench.scoring.evaluation import Evaluation, View
 from rebar_depth_bench.scoring.groups import GROUPINGS
-from rebar_depth_bench.scoring.relative import kind_text
+from rebar_depth_bench.scoring.protocol import scored_pixels
+from rebar_depth_bench.scoring.relative import aligned_depth, kind_text, metric_as
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.table import Table, ViewScore
+from rebar_depth_bench.submission.declaration import METRIC
 
 if TYPE_CHECKING:
     from rebar_depth_bench.reporting.html.extended import CrossingPicture
@@ -76,14 +78,14 @@ def render_report(
     views = views_by_config(result)
     shown = sorted_views(shown, list(result.tables))
     script = inline_script("static/sortable.js", "browser.js")
+    content = _browser_context(shown, views)
     if result.prediction is not None:
-        content = relative_context(result, views)
+        content |= relative_context(result, views)
     else:
-        content = {
+        content |= {
             **results_context(result, views),
             **paper_context(result),
             **_extended_context(result, pictures or {}),
-            **_browser_context(shown, views),
             **views_context(views, {name: of for name, of in views.items() if len(of) > WORST_SHOWN}),
         }
     return (
@@ -246,10 +248,15 @@ class LookedAt:
 
 
 def look_at_views(
-    evaluation: Evaluation, chosen: Mapping[str, Sequence[ViewScore]], *, crossings: bool = False
+    evaluation: Evaluation,
+    chosen: Mapping[str, Sequence[ViewScore]],
+    *,
+    crossings: bool = False,
+    kind: str = METRIC,
 ) -> LookedAt:
     """Diagnose a submission and encode the images of the chosen views, by config, decoding each view once.
 
+    ``kind`` is that of the scores; the images of a kind that is not metric show aligned depth.
     With ``crossings``, one view of each config that has any is pictured with its crossings. Only the rows of these
     views are read, and one is in memory at a time. Raises ``EntryError`` and ``DatasetError`` for entries and
     shards that scoring refuses.
@@ -273,7 +280,7 @@ def look_at_views(
             if view.position in diagnosed_at:
                 diagnosed.append(diagnosed_view(view))
             if view.position in positions:
-                shown.append(shown_view(view_panels(view, scores[view.view_id])))
+                shown.append(shown_view(view_panels(view, scores[view.view_id], evaluation.meta.prediction, kind)))
             if pictured and view.position == pictured.position:
                 pictures[config.name] = pictured.picture(view)
         mistakes += diagnose_config(config, diagnosed, evaluation.submission)
@@ -285,19 +292,25 @@ def write_report(
 ) -> Sequence[PossibleMistake]:
     """Write the HTML report of ``result``, the scores of the submission of ``evaluation``; return its mistakes.
 
-    Up to ``views_shown`` views of each config are shown with images: the worst by rank error, then evenly
-    spaced down to the best; none of predictions that are not metric. Raises ``InputError`` if ``views_shown`` is
-    negative.
+    Up to ``views_shown`` views of each config are shown with images: the worst by rank error, or by aligned error,
+    then evenly spaced down to the best. Raises ``InputError`` if ``views_shown`` is negative.
     """
-    views = {} if result.prediction else views_by_config(result)
-    chosen = {name: views_to_show(of_config, views_shown) for name, of_config in views.items()}
-    found = look_at_views(evaluation, chosen, crossings=result.extended is not None)
+    views = views_by_config(result).items()
+    chosen = {name: views_to_show(of_config, views_shown) for name, of_config in views}
+    found = look_at_views(evaluation, chosen, crossings=result.extended is not None, kind=result.kind)
     write_output(target, render_report(result, found.shown, found.mistakes, found.pictures))
     return found.mistakes
 
 
-def view_panels(view: View, score: ViewScore) -> ViewPanels:
-    """Return the arrays of a view that are rendered."""
-    truth_m, mask = view.cell("left_depth"), view.cell("left_mask")
+def view_panels(view: View, score: ViewScore, declared: str, kind: str) -> ViewPanels:
+    """Return the arrays of a view that are rendered.
+
+    Predictions that are scored as a ``kind`` that is not metric are shown as aligned depth; ``declared`` is their
+    own kind.
+    """
+    truth_m, mask, depth_m = view.cell("left_depth"), view.cell("left_mask"), view.prediction_m
     steel = truth_m > 0 if mask is None else mask
-    return ViewPanels(view.cell("left_rgb"), truth_m, view.prediction_m, steel, score)
+    if kind != METRIC:
+        values = depth_m if kind == declared else metric_as(depth_m, kind)
+        depth_m = aligned_depth(values, truth_m, scored_pixels(steel, truth_m), kind)
+    return ViewPanels(view.cell("left_rgb"), truth_m, depth_m, steel, score)

@@ -213,3 +213,18 @@ def test_depth_at_or_below_zero_is_an_error_of_one() -> None:
     (_, b), *_ = np.linalg.lstsq(np.stack([x, np.ones(9)], 1), z, rcond=None)
     assert b < 0, "the depth of the first pixel"
     assert align_view(x, z, "affine-depth").aligned.error >= 1 / 9
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_aligned_depth_of_a_view_has_the_errors_of_its_scored_pixels(kind: str) -> None:
+    rng = np.random.default_rng(4)
+    z = rng.uniform(0.4, 2.0, (7, 9)).astype(np.float32)
+    x = np.where(rng.random(z.shape) < 0.2, np.nan, (3 / z if kind == "affine-disparity" else 3 * z) + 0.5)
+    x = (1e30 * x * (1 + 0.05 * rng.standard_normal(z.shape))).astype(np.float32)
+    scored = np.flatnonzero(rng.random(z.size) < 0.6)
+    score = align_view(x.ravel()[scored], z.ravel()[scored], kind)
+    p = scoring.aligned_depth(x, z, scored, kind)
+    assert list(np.isfinite(p.ravel())) == list(np.isfinite(x.ravel())), "also of pixels that are not scored"
+    error = np.abs(p - z).ravel()[scored] / z.ravel()[scored]
+    assert np.nanmean(error) == pytest.approx(score.aligned.abs_rel)
+    assert np.isnan(scoring.aligned_depth(x * np.nan, z, scored, kind)).all()

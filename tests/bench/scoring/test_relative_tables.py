@@ -1,4 +1,4 @@
-"""Results of predictions that are not metric: archives, tables, and what refuses them."""
+"""Tables, reports and commands of predictions that are not metric, and what refuses them."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import csv
 import io
 import json
 import re
-import zipfile
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -14,188 +13,21 @@ from typing import Any
 
 import numpy as np
 import pytest
-from PIL import Image
 from rich.console import Console
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.reporting.html.page import render_report
+from rebar_depth_bench.reporting.html.page import look_at_views, render_report, views_by_config
 from rebar_depth_bench.reporting.latex import latex_table
 from rebar_depth_bench.reporting.tables import print_paper_table
 from rebar_depth_bench.scoring.columns import METRICS, RELATIVE_INTERVALS
+from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
 from rebar_depth_bench.scoring.result import Result, read_result
 from tests.bench.reporting.pages import Page
 from tests.bench.reporting.test_browser import run_in_browser
+from tests.bench.scoring.conftest import Values, Write, disparity
 
 KINDS = ("scale", "affine-depth", "affine-disparity")
-Values = np.ndarray
-Write = Callable[..., Path]
-
-
-def disparity(depth_m: Values) -> Values:
-    with np.errstate(divide="ignore"):
-        return np.asarray(np.where(depth_m > 0, 30 / depth_m - 70, -99), np.float32)
-
-
-@pytest.fixture
-def write(tiny_truth: dict[str, np.ndarray], tmp_path: Path) -> Write:
-    """Write an archive of a function of the true depth of the lattice."""
-
-    def write_archive(name: str, kind: str | None, make: Callable[[Values], Values]) -> Path:
-        path = tmp_path / f"{name}.zip"
-        with rdb.SubmissionWriter(path, name, prediction=kind, inputs="rgb", uses_ground_truth=False) as writer:
-            for number, (view_id, depth_m) in enumerate(tiny_truth.items()):
-                rng = np.random.default_rng(number)
-                writer.add(view_id, make(depth_m) * (1 + 0.01 * rng.standard_normal(depth_m.shape)))
-        return path
-
-    return write_archive
-
-
-@pytest.fixture
-def relative(write: Write, tiny_root: Path) -> Result:
-    return rdb.score(write("net", "affine-disparity", disparity), tiny_root)
-
-
-def numbers(document: Any) -> Any:
-    """Return a JSON value with approximate numbers, for comparisons."""
-    if isinstance(document, dict):
-        return {key: numbers(value) for key, value in document.items()}
-    return pytest.approx(document, rel=1e-5, abs=1e-9) if isinstance(document, float) else document
-
-
-def test_result_of_another_kind(relative: Result) -> None:
-    document = json.loads(relative.to_json())
-    assert (document["protocol"], document["prediction"]) == ("rebar-relative-1", "affine-disparity")
-    [table] = document["tables"].values()
-    nulls = {table[key] for key in ("native", "scaled", "rank_error", "scale_median")}
-    assert (nulls, table["ranked"], table["flat_views"]) == ({None}, False, 0)
-    for view in document["views"]:
-        assert {view[key] for key in ("native", "scaled", "rank_error", "scale")} == {None}
-    for alignment in ("aligned", "aligned_robust", "constant"):
-        views = [view[alignment] for view in document["views"]]
-        assert list(views[0]) == ["error", "abs_rel", "rmse_cm", "mae_cm", "delta1", "within_mm"]
-        mean = {key: np.mean([view[key] for view in views]) for key in views[0] if key != "within_mm"}
-        within = {t: np.mean([view["within_mm"][t] for view in views]) for t in ("3", "5", "10", "20")}
-        assert table[alignment] == numbers({**mean, "within_mm": within})
-    assert table["aligned"]["error"] < table["constant"]["error"] / 3
-
-
-def test_result_is_read_as_it_was_written(relative: Result, tiny_root: Path, write: Write) -> None:
-    scaled = rdb.score(write("scaled", "scale", lambda z: 3 * z), tiny_root)
-    empty = rdb.score(write("empty", "affine-depth", lambda z: z * np.nan), tiny_root)
-    for one in (relative, scaled, empty):
-        again = read_result(one.to_json(), "result.json")
-        assert again.to_json() == one.to_json()
-        assert (again.kind, again.columns) == (one.kind, one.columns)
-        assert again.tables["lattice"].intervals.keys() == {column.path for column in RELATIVE_INTERVALS}
-    assert json.loads(scaled.to_json())["tables"]["lattice"]["aligned_robust"] is None
-    assert json.loads(empty.to_json())["tables"]["lattice"]["aligned"]["abs_rel"] is None
-    mixed = relative.to_json().replace(b"rebar-relative-1", b"rebar-2")
-    with pytest.raises(rdb.InputError, match="the protocol is rebar-2 and prediction is affine-disparity"):
-        read_result(mixed, "result.json")
-
-
-def test_intervals_are_those_of_the_view_numbers(relative: Result) -> None:
-    """Nine sparse views are nine blocks: the interval of the mean contains it and is narrower than the views."""
-    table = relative.tables["lattice"]
-    for column in RELATIVE_INTERVALS[1:]:
-        values = [column.view_value(view) or 0.0 for view in relative.views]
-        low, high = table.intervals[column.path] or (np.nan, np.nan)
-        assert min(values) <= low <= column.value(table) <= high <= max(values)
-
-
-def test_scale_has_the_scaled_numbers_of_metric_results(write: Write, tiny_root: Path) -> None:
-    holed = write("holed", None, lambda z: np.where(np.indices(z.shape)[1] % 3, 5 * z, 0))
-    metric, aligned = rdb.score(holed, tiny_root), rdb.score(holed, tiny_root, align="scale")
-    assert aligned.kind == "scale"
-    for native, of_scale in zip(metric.views, aligned.views, strict=True):
-        assert native.scaled is not None
-        assert of_scale.aligned is not None
-        assert of_scale.constant is not None
-        assert vars(native.scaled).items() <= vars(of_scale.aligned).items()
-        assert (of_scale.constant.abs_rel, of_scale.constant.rmse_cm) == pytest.approx(native.scaled_constant)
-        assert of_scale.coverage == native.coverage < 1
-        assert of_scale.aligned.error > 1 - of_scale.coverage
-
-
-@pytest.mark.parametrize(("kind", "make"), [("affine-depth", lambda z: z), ("affine-disparity", lambda z: 1 / z)])
-def test_metric_archives_are_aligned_as_weaker_kinds(
-    kind: str, make: Callable[[Values], Values], tmp_path: Path, tiny_root: Path, tiny_truth: dict[str, np.ndarray]
-) -> None:
-    """Metric depth aligned as another kind has the errors of an archive of that kind."""
-    rng = np.random.default_rng(0)
-    with (
-        rdb.SubmissionWriter(tmp_path / "metric.zip", "m") as metric,
-        rdb.SubmissionWriter(tmp_path / "other.zip", "m", prediction=kind) as other,
-    ):
-        for view_id, depth_m in tiny_truth.items():
-            noisy = np.where(rng.random(depth_m.shape) < 0.1, np.nan, depth_m) + 0.5
-            metric.add(view_id, noisy)
-            other.add(view_id, make(noisy))
-    aligned = rdb.score(tmp_path / "metric.zip", tiny_root, align=kind)
-    [first, second] = (one.to_pandas("views") for one in (rdb.score(tmp_path / "other.zip", tiny_root), aligned))
-    assert list(first["view_id"]) == list(second["view_id"])
-    for column in aligned.columns:  # The archives hold float32: some pixels are at a tolerance.
-        tolerance = 2e-3 if "within" in column.path else 1e-6
-        assert list(first[column.name]) == pytest.approx(list(second[column.name]), rel=1e-4, abs=tolerance)
-    with pytest.raises(rdb.SubmissionError, match=f"of the kind {kind}, expected metric ones: .*scored as scale"):
-        rdb.score(tmp_path / "other.zip", tiny_root, align="scale")
-    with pytest.raises(rdb.InputError, match="align is metres, expected one of metric, scale, affine-depth"):
-        rdb.score(tmp_path / "metric.zip", tiny_root, align="metres")
-
-
-def test_zero_of_a_png_is_no_value(tiny_root: Path, tiny_truth: dict[str, np.ndarray], tmp_path: Path) -> None:
-    paths = {}
-    for with_holes in (False, True):
-        paths[with_holes] = tmp_path / f"{with_holes}.zip"
-        with zipfile.ZipFile(paths[with_holes], "w") as archive:
-            metadata = {"method": "png", "prediction": "affine-disparity", "depth_scale": 0.5}
-            archive.writestr("submission.json", json.dumps(metadata))
-            for view_id, depth_m in tiny_truth.items():
-                values = disparity(depth_m)
-                values = np.clip(400 * (values - values.min()), 1, 65535).astype(np.uint16)
-                values[::2] *= not with_holes
-                image = io.BytesIO()
-                Image.fromarray(values).save(image, "PNG")
-                archive.writestr(f"{view_id}.png", image.getvalue())
-    whole, holed = (rdb.score(path, tiny_root).tables["lattice"] for path in paths.values())
-    assert whole.coverage == 1
-    assert 0.3 < (holed.coverage or 0) < 0.7
-    assert holed.aligned is not None
-    assert holed.aligned.error == pytest.approx(1 - (holed.coverage or 0), abs=0.05)
-    assert holed.flat_views == 0
-
-
-def test_metric_json_has_no_keys_of_other_kinds(write: Write, tiny_root: Path) -> None:
-    path = write("metric", "metric", lambda z: z)
-    with zipfile.ZipFile(path) as archive:
-        assert "prediction" not in json.loads(archive.read("submission.json"))
-    document = json.loads(rdb.score(path, tiny_root).to_json())
-    assert (document["protocol"], "prediction" in document) == ("rebar-2", False)
-    table, view = document["tables"]["lattice"], document["views"][0]
-    assert list(table) == [
-        *("views", "views_scored", "coverage", "ranked", "rank_error", "native", "scaled", "scale_median"),
-        *("within_mm", "reference", "published", "ci95"),
-    ]
-    assert list(table["ci95"]) == ["coverage", "rank_error", "native", "scaled", "scale_median", "within_mm"]
-    shared = ("coverage", "rank_error", "scale", "native", "scaled", "within_mm")
-    assert list(view) == ["view_id", "scored_px", *shared]
-
-
-def test_unknown_kind_is_refused(tiny_root: Path, archive_of: Write, tiny_truth: dict[str, np.ndarray]) -> None:
-    path = archive_of(tiny_truth)
-    with zipfile.ZipFile(path) as archive:
-        entries = {name: archive.read(name) for name in archive.namelist()}
-    entries["submission.json"] = b'{"method": "m", "prediction": "disparity"}'
-    with zipfile.ZipFile(path, "w") as archive:
-        for name, content in entries.items():
-            archive.writestr(name, content)
-    with pytest.raises(rdb.SubmissionError, match="prediction: got 'disparity', expected"):
-        rdb.score(path, tiny_root)
-
-
-# Presentation.
 
 
 def test_text_of_a_result(relative: Result, tiny_root: Path, write: Write) -> None:
@@ -371,6 +203,21 @@ def test_aligned_metric_archive_is_recognised(write: Write, tiny_root: Path, rel
         assert "declared_prediction" not in json.loads(other.to_json())
 
 
+@pytest.mark.parametrize("declared", [None, "affine-disparity"])
+def test_pictures_show_aligned_depth(declared: str | None, write: Write, tiny_root: Path) -> None:
+    path = write("net", declared, disparity if declared else lambda z: 3 * z)
+    with open_evaluation(path, tiny_root) as evaluation:
+        result = score_evaluation(evaluation, align="affine-disparity")
+        shown = look_at_views(evaluation, views_by_config(result), kind=result.kind).shown
+        [worst] = look_at_views(evaluation, {"lattice": result.views[:1]}).shown
+    assert worst.off_scale, "without alignment"
+    for view in shown:
+        assert not view.off_scale
+        assert 0.1 <= float(view.native_limit.removesuffix(" cm")) <= 3, "noise of 1 % at 0.22 to 0.43 m"
+    page = Page(render_report(result, shown)).text
+    assert page.count("Aligned prediction") == len(shown) == 9
+
+
 @pytest.mark.parametrize("kind", KINDS)
 def test_report_names_the_fit_of_each_view(kind: str, write: Write, tiny_root: Path) -> None:
     result = rdb.score(write("net", kind, lambda z: np.where(z.max() > 0.75, z.max() - z, z) + 1), tiny_root)
@@ -426,7 +273,11 @@ def test_disparity_is_no_mistake(tiny_root: Path, write: Write, capsys: Any) -> 
 
     with np.errstate(divide="ignore"):
         assert "mistake" in check("undeclared", "metric", lambda z: 1 / z)
-    assert "mistake" not in check("declared", "affine-disparity", disparity)
+    declared = check("declared", "affine-disparity", disparity)
+    assert "mistake" not in declared
+    assert "not ranked: " in declared
+    assert "affine-disparity, expected metric ones: the leaderboard ranks depth in metres" in declared
+    assert "not ranked" not in check("undeclared", "metric", lambda z: z)
     assert "mistake" not in check("millimetres", "scale", lambda z: 1000 * z)
     assert "mistake" not in check("negative", "affine-depth", lambda z: z - 90)
     assert "0.0 % are finite and above 0" in check("none", "scale", lambda z: z - 90)
