@@ -200,4 +200,6 @@ def _text(value: float | None, factor: float, digits: int) -> str:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) < 4:
+        sys.exit("usage: python -m benchmarks.crossings ROOT OUT ARCHIVE...")
     main(*sys.argv[1:])

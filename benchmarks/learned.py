@@ -9,9 +9,9 @@
 
 MODELS is the folder of the weights that the files in ``examples/methods`` name. Each method predicts each config
 of ROOT into ``OUT/METHOD-CONFIG.zip``; archives that are newer than the config are used again, so that the command
-continues after an interruption. It prints the tables as Markdown and writes their numbers to
-``cards/reference/learned.json``, from which ``make cards`` writes its pages. If methods are named after OUT, only
-these run (``none``: no method); the tables contain all that have an archive.
+continues after an interruption. It prints the tables as Markdown and, if every method has an archive of
+every config, writes their numbers to ``cards/reference/learned.json``, from which ``make cards`` writes its pages.
+If methods are named after OUT, only these run (``none``: no method); the tables contain all that have an archive.
 
 The numbers are those of ``rebar-bench score``, with and without ``--align affine-disparity``, and of the disparity
 f B / z of the scored pixels:
@@ -83,7 +83,8 @@ def main(root: Path, models: Path, out: Path, methods: list[str]) -> int:
     numbers = {name: config_numbers(config, root, out) for name, config in configs.items()}
     command = "python -m benchmarks.learned ROOT MODELS OUT"
     document = {"command": command, "dataset": folder.digest, "configs": numbers}
-    write_text(results_file(LEARNED), json.dumps(document, indent=1, allow_nan=False) + "\n")
+    if all(len(of_config["methods"]) == len(METHODS) for of_config in numbers.values()):
+        write_text(results_file(LEARNED), json.dumps(document, indent=1, allow_nan=False) + "\n")
     print("\n\n".join(learned_tables(numbers).values()))
     return 0
 

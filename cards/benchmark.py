@@ -31,7 +31,7 @@ from rebar_depth_bench.extended.fits import MISS_MM
 from rebar_depth_bench.extended.inspection import MISSED_NOTE, PROFILES, TOLERANCES
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, ONCE, Measure, MeasureFamily
 from rebar_depth_bench.extended.registry import MEASURE_FAMILIES
-from rebar_depth_bench.methods import AnyMethod, MultiViewMethod, own_methods
+from rebar_depth_bench.methods import AnyMethod, own_methods
 from rebar_depth_bench.reporting.extended_tables import FITS_NOTE, REACH_NOTE
 from rebar_depth_bench.scoring.bootstrap import BLOCK_VIEWS, INTERVALS, MIN_BLOCKS, RESAMPLES
 from rebar_depth_bench.scoring.columns import SIGNIFICANT_DIGITS
@@ -172,7 +172,7 @@ def _method_row(method: AnyMethod) -> dict[str, str]:
     info = method.info
     name = f"`{info.name}`{' †' if info.uses_ground_truth else ''}"
     what = f"{info.summary} ({info.untested_note})" if info.untested_note else info.summary
-    needs = "a whole config" if isinstance(method, MultiViewMethod) else ", ".join(info.columns)
+    needs = ", ".join(info.columns) or ("all views of a config" if info.inputs == "multi-view" else "nothing")
     return {"name": name, "what": what, "needs": needs, "licence": info.licence}
 
 

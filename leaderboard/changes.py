@@ -49,7 +49,7 @@ def edit_submission(service: Service, record: SubmissionModel, change: Submissio
     """Make the owner's change of a submission. Raises status 403 if the visibility cannot be changed."""
     values = change.model_dump(include=change.model_fields_set)
     if values.get("public") is False and service.settings.default_visibility == "always":
-        raise RefusedError(403, "every submission of this leaderboard is public")
+        raise RefusedError(403, "every submission of this leaderboard is public; delete it to remove its rows")
     columns: dict[str, Any] = {"public": values.pop("public")} if "public" in values else {}
     details = {**json.loads(record.details), **values}
     columns["details"] = json.dumps({name: value for name, value in details.items() if value is not None})

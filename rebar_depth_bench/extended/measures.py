@@ -69,7 +69,8 @@ class Measure:
     "lower" or "higher" only if missing pixels, or bars that were not found, count as failures; otherwise "".
     ``definition`` is one sentence with the formula. ``sample_name`` names the samples if the measure's name does
     not. ``convert``, if set, maps the statistic to the measure's value. It must be decreasing, and returns None
-    where the statistic only reflects that something was missed.
+    where the statistic only reflects that something was missed. Raises ``ValueError`` for an unknown statistic or
+    unit.
     """
 
     name: str
@@ -80,6 +81,11 @@ class Measure:
     sample_name: str = ""
     statistic: Statistic = "mean"
     convert: Callable[[float], float | None] | None = None
+
+    def __post_init__(self) -> None:
+        for found, known in ((self.statistic, STATISTICS), (self.unit, _DECIMALS)):
+            if found not in known:
+                raise ValueError(f"{self.name}: got {found!r}, expected one of {', '.join(map(repr, known))}")
 
     @property
     def sample(self) -> str:

@@ -237,7 +237,7 @@ def test_always_public_submission_cannot_be_hidden(postgres_board: SharedServer)
     response = postgres_board.server.call("PATCH", path, postgres_board.token, json={"public": False})
     assert (response.status_code, response.json()["detail"]) == (
         403,
-        "every submission of this leaderboard is public",
+        "every submission of this leaderboard is public; delete it to remove its rows",
     )
     assert postgres_board.server.get(path).json()["public"] is True
 

@@ -21,7 +21,7 @@ from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.bars import bars, read_bars, write_bars
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.extended.ground_truth import dilate_mask, load_steel_truth
-from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, NATIVE, ONCE, SCALED
+from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, NATIVE, ONCE, SCALED, Measure
 from rebar_depth_bench.extended.published import image_boundary_samples
 from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, measures_by_alignment, score_extended
 from rebar_depth_bench.extended.result import ExtendedResult
@@ -258,6 +258,12 @@ status = main(sys.argv[1:])
 assert not {"torch", "cv2", "bpy"} & set(sys.modules)
 sys.exit(status)
 """
+
+
+def test_measure_of_an_unknown_statistic_or_unit_is_refused() -> None:
+    for arguments, words in ((("mm", "", "d", "s", "p90"), "new: got 'p90', expected"), (("km", "", "d"), "'km'")):
+        with pytest.raises(ValueError, match=words):
+            Measure("new", "New", *arguments)  # type: ignore[arg-type]
 
 
 @pytest.mark.slow
