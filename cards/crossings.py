@@ -19,7 +19,7 @@ def crossing_baselines(file: str) -> dict[str, Any]:
     document = json.loads((Path(__file__).parent / "reference" / file).read_text())
     depth = document["depth"]
     return {
-        "file": f"reference/{file}",
+        "file": f"cards/reference/{file}",
         "command": document["command"],
         "renders": document["renders"],
         "methods": [f"`{method}`" for method in depth],
