@@ -33,10 +33,10 @@ class MethodInfo:
 
     ``columns`` are the dataset columns that the predictor reads. ``uses_ground_truth`` is True if the method reads
     ground truth, so that its submissions are not ranked; it must be if ``columns`` has any of ``TRUTH_COLUMNS``,
-    or of ``POSE_COLUMNS`` without the other and ``right_rgb``. ``untested_note`` states which part was never run by the authors
-    because weights or hardware were not available; empty if everything was tested. ``inputs`` is the input class,
-    one of ``INPUTS``; without it, ``input_class`` derives the class from the columns. ``prediction`` is the kind
-    of the predictions, one of ``PREDICTION_KINDS``.
+    or of ``POSE_COLUMNS`` but not both with ``right_rgb``. ``untested_note`` states which part was never run by
+    the authors because weights or hardware were not available; empty if everything was tested. ``inputs`` is the input
+    class, one of ``INPUTS``; without it, ``input_class`` derives the class from the columns. ``prediction`` is the
+    kind of the predictions, one of ``PREDICTION_KINDS``.
     """
 
     name: str
@@ -107,9 +107,10 @@ class MultiViewMethod:
     ``check(views)`` raises ``MethodError`` if the config is unsuitable (for example without a board) or a package
     is missing; it is called for every config before any work begins. ``prepare(views, work, progress)`` makes the
     predictor from all views: ``views.rows("left_rgb", "left_K")`` yields decoded rows, and ``views`` also has
-    ``view_ids``, ``grid``, ``board`` and ``mesh``; ``progress("what", done, total)`` reports progress. Mesh and
-    ``TRUTH_COLUMNS`` raise ``MethodError`` unless ``info.uses_ground_truth`` is True. Files in the folder ``work`` persist until an interrupted run is resumed. The rows passed to the predictor hold
-    ``view_id`` and ``info.columns``.
+    ``view_ids``, ``grid``, ``board`` and ``mesh``; ``TRUTH_COLUMNS`` and the mesh raise ``MethodError`` unless
+    ``info.uses_ground_truth`` is True. ``progress("what", done, total)`` reports progress. Files in the folder
+    ``work`` persist until an interrupted run is resumed. The rows passed to the predictor hold ``view_id`` and
+    ``info.columns``.
     """
 
     info: MethodInfo

@@ -76,7 +76,12 @@ def predict_views(
     if target.is_dir():
         raise InputError(f"{target}: is a folder, expected the name of the archive to write")
     if isinstance(method, MultiViewMethod):
-        views = [_for_method(scene, method.info) for config in views for scene in config.by_scene()]
+        scenes = [scene for config in views for scene in config.by_scene()]
+        # A capture has no ground truth.
+        views = [
+            _ViewsWithoutTruth(scene.source, method.info) if isinstance(scene, ConfigViews) else scene
+            for scene in scenes
+        ]
         for config in views:
             with _wrap_errors(f"{method.info.name}: {config.config}: check"):
                 method.check(config)
@@ -118,19 +123,10 @@ class _ViewsWithoutTruth(ConfigViews):
         self.info.check_truth(["mesh"], ["mesh"])
         return super().mesh
 
-    def by_scene(self) -> tuple[ConfigViews, ...]:
-        """Return the views of each scene."""
-        return tuple(replace(self, source=source) for source in self.source.by_scene())
-
     def rows(self, *columns: str, skip: Collection[str] = ()) -> Iterator[dict[str, Any]]:
         """Yield rows as ``ConfigViews.rows``. Raises ``MethodError`` for ground truth without the declaration."""
         self.info.check_truth(columns, TRUTH_COLUMNS)
         return super().rows(*columns, skip=skip)
-
-
-def _for_method(views: Views, info: MethodInfo) -> Views:
-    """Return the views as a method may read them; those of a capture have no ground truth."""
-    return _ViewsWithoutTruth(views.source, info) if isinstance(views, ConfigViews) else views
 
 
 @contextmanager

@@ -133,12 +133,25 @@ def row_notes(results: Sequence[Result], absent: Sequence[str]) -> list[tuple[st
         if (reasons := incomparable_reasons(table))
     ]
     aligned = [printable(result.method, 40) for result in results if result.declared_prediction]
+    partial = [
+        f"{printable(result.method, 40)}, {config_title(name, table.split)}: "
+        f"{table.views} of {counted(table.of_views, 'view')}"
+        for result in results
+        for name, table in result.tables.items()
+        if table.of_views is not None
+    ]
     incomparable = ("*", "Errors of valid predictions are not compared with those of others: ", marked)
     without_paper = ("", "The paper's rows are absent; the configs differ from its scenes: ", absent)
+    of_some_views = ("", "Not ranked: ", partial)
     as_another_kind = ("", "Metric predictions, aligned as this kind: ", aligned)
-    marks = {rank_mark(result.declared, table) for result in results for table in result.tables.values()}
+    marks = {rank_mark(result.declared) for result in results}
     declared = [(mark, meaning, ()) for mark, meaning in _MARKS.items() if mark in marks]
-    return declared + [note for note in (incomparable, as_another_kind, without_paper) if note[-1]]
+    return declared + [note for note in (incomparable, of_some_views, as_another_kind, without_paper) if note[-1]]
+
+
+def note_text(mark: str, start: str, listed: Sequence[str]) -> str:
+    """Return a note of ``row_notes`` as a sentence."""
+    return f"{mark and mark + ': '}{start}{'; '.join(listed)}."
 
 
 def grouping_title(grouping: str) -> str:
@@ -188,16 +201,16 @@ def paper_reference_rows(results: Sequence[tuple[str, Table]]) -> list[tuple[str
     ]
 
 
-def rank_mark(declared: Declaration, table: Table) -> str:
-    """Return the mark of a row that uses ground truth, or is metric and not ranked (‡), or ? if undeclared."""
-    if declared.uses_ground_truth or not (table.ranked or table.aligned):
+def rank_mark(declared: Declaration) -> str:
+    """Return the mark of a row that declares the use of ground truth (‡), or ? if it declares nothing about it."""
+    if declared.uses_ground_truth:
         return "‡"
     return "?" if declared.uses_ground_truth is None else ""
 
 
 def row_name(result: Result, table: Table) -> str:
     """Return the method of a row of a table with its marks, that of ``row_notes`` included."""
-    marks = (rank_mark(result.declared, table), "*" if incomparable_reasons(table) else "")
+    marks = (rank_mark(result.declared), "*" if incomparable_reasons(table) else "")
     return " ".join([printable(result.method, 40), *filter(None, marks)])
 
 
