@@ -47,6 +47,8 @@ Depth = Float[ndarray, "h w"]
 Model = str | Callable[[Mapping[str, Any]], object] | Mapping[str, object] | Iterable[tuple[str, object]]
 
 _ROW_COLUMNS = tuple(name for name in COLUMNS if name != "scene" and name not in TRUTH_COLUMNS)
+_UNDECLARED = {"method": "unnamed", "kind": METRIC, "inputs": None, "uses_ground_truth": None}
+"""Defaults of what predictions declare."""
 
 
 def evaluate(
@@ -73,25 +75,15 @@ def evaluate(
 
     The other arguments are those of ``Evaluator``. Raises as it does, and what a function raises.
     """
-    evaluator = Evaluator(
-        root,
-        config,
-        split=split,
-        views=views,
-        extended=extended,
-        method=method,
-        kind=kind,
-        inputs=inputs,
-        uses_ground_truth=uses_ground_truth,
-    )
+    declared: dict[str, Any] = {
+        "method": method,
+        "kind": kind,
+        "inputs": inputs,
+        "uses_ground_truth": uses_ground_truth,
+    }
+    evaluator = Evaluator(root, config, split=split, views=views, extended=extended, **declared)
     if isinstance(model, str):
-        defaults = {
-            "method": (method, "unnamed"),
-            "kind": (kind, METRIC),
-            "inputs": (inputs, None),
-            "uses_ground_truth": (uses_ground_truth, None),
-        }
-        given = [name for name, (value, default) in defaults.items() if value != default]
+        given = [name for name, value in declared.items() if value != _UNDECLARED[name]]
         if given:
             named = f"{' and '.join(given)} {'is' if len(given) == 1 else 'are'} given"
             remedy = "; score its archive by score(ARCHIVE, ROOT, align=KIND)" if "kind" in given else ""

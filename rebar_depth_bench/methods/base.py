@@ -34,9 +34,9 @@ class MethodInfo:
     ``columns`` are the dataset columns that the predictor reads. ``uses_ground_truth`` is True if the method reads
     ground truth, so that its submissions are not ranked; it must be if ``columns`` has any of ``TRUTH_COLUMNS``,
     or of ``POSE_COLUMNS`` but not both with ``right_rgb``. ``untested_note`` states which part was never run by
-    the authors because weights or hardware were not available; empty if everything was tested. ``inputs`` is the input
-    class, one of ``INPUTS``; without it, ``input_class`` derives the class from the columns. ``prediction`` is the
-    kind of the predictions, one of ``PREDICTION_KINDS``.
+    the authors because weights or hardware were not available; empty if everything was tested. ``inputs`` is the
+    input class, one of ``INPUTS``; without it, ``input_class`` derives the class from the columns. ``prediction``
+    is the kind of the predictions, one of ``PREDICTION_KINDS``.
     """
 
     name: str

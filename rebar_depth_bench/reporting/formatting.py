@@ -126,20 +126,16 @@ def incomparable_reasons(table: Table) -> list[str]:
 
 def row_notes(results: Sequence[Result], absent: Sequence[str]) -> list[tuple[str, str, Sequence[str]]]:
     """Return mark, beginning and list of each note on rows of tables; ``absent`` as in ``print_paper_table``."""
-    marked = [
-        f"{printable(result.method, 40)}, {config_title(name, table.split)} ({', '.join(reasons)})"
+    rows = [
+        (f"{printable(result.method, 40)}, {config_title(name, table.split)}", table)
         for result in results
         for name, table in result.tables.items()
-        if (reasons := incomparable_reasons(table))
+    ]
+    marked = [f"{row} ({', '.join(reasons)})" for row, table in rows if (reasons := incomparable_reasons(table))]
+    partial = [
+        f"{row} ({table.views} of {table.of_views} views)" for row, table in rows if table.of_views is not None
     ]
     aligned = [printable(result.method, 40) for result in results if result.declared_prediction]
-    partial = [
-        f"{printable(result.method, 40)}, {config_title(name, table.split)}: "
-        f"{table.views} of {counted(table.of_views, 'view')}"
-        for result in results
-        for name, table in result.tables.items()
-        if table.of_views is not None
-    ]
     incomparable = ("*", "Errors of valid predictions are not compared with those of others: ", marked)
     without_paper = ("", "The paper's rows are absent; the configs differ from its scenes: ", absent)
     of_some_views = ("", "Not ranked: ", partial)

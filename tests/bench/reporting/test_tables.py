@@ -103,8 +103,8 @@ def test_results_of_some_views_are_named_and_not_marked_as_declared() -> None:
     some = replace(some, tables={"lattice": some.tables["lattice"].of_some_views(9)})
     text = printed(lambda console: print_paper_table([some, whole], console, published=False), 80)
     assert "‡" not in text
-    assert "Not ranked: some, lattice: 1 of 9 views." in text
-    assert "Not ranked: some, lattice: 1 of 9 views." in latex_table([some, whole], published=False)
+    assert "Not ranked: some, lattice (1 of 9 views)." in text
+    assert "Not ranked: some, lattice (1 of 9 views)." in latex_table([some, whole], published=False)
 
 
 def test_coverage_of_a_comparison_is_rounded_down_as_everywhere() -> None:

@@ -132,7 +132,7 @@ def test_metric_archives_are_aligned_as_weaker_kinds(
             rdb.InputError, match=f"align is {align}, expected one of scale, affine-depth, affine-d"
         ):
             rdb.score(tmp_path / "metric.zip", tiny_root, align=align)
-    with pytest.raises(rdb.InputError, match="; metric predictions are scored as metric without it$"):
+    with pytest.raises(rdb.InputError, match=r"; metric predictions are scored as metric without it$"):
         rdb.score(tmp_path / "metric.zip", tiny_root, align="metric")
 
 
