@@ -75,12 +75,7 @@ def evaluate(
 
     The other arguments are those of ``Evaluator``. Raises as it does, and what a function raises.
     """
-    declared: dict[str, Any] = {
-        "method": method,
-        "kind": kind,
-        "inputs": inputs,
-        "uses_ground_truth": uses_ground_truth,
-    }
+    declared = dict[str, Any](method=method, kind=kind, inputs=inputs, uses_ground_truth=uses_ground_truth)
     evaluator = Evaluator(root, config, split=split, views=views, extended=extended, **declared)
     if isinstance(model, str):
         given = [name for name, value in declared.items() if value != _UNDECLARED[name]]

@@ -41,8 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     views = parser.add_mutually_exclusive_group()
     views.add_argument("--views", type=int, default=6, help="stereo views to render (default: %(default)s)")
     sample = (
-        "use nine views of 160 x 90 that come with the package, without Blender and the mesh that rebar-bench verify "
-        "misses, in the folder sample of --out"
+        "use nine views of 160 x 90 that come with the package, without Blender, in the folder sample of --out; "
+        "rebar-bench verify reports that their mesh is missing"
     )
     views.add_argument("--sample", action="store_true", help=sample)
 

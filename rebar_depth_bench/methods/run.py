@@ -79,8 +79,7 @@ def predict_views(
         scenes = [scene for config in views for scene in config.by_scene()]
         # A capture has no ground truth.
         views = [
-            _ViewsWithoutTruth(scene.source, method.info) if isinstance(scene, ConfigViews) else scene
-            for scene in scenes
+            _DeclaredViews(one.source, method.info) if isinstance(one, ConfigViews) else one for one in scenes
         ]
         for config in views:
             with _wrap_errors(f"{method.info.name}: {config.config}: check"):
@@ -109,7 +108,7 @@ def predict_views(
 
 
 @dataclass(frozen=True)
-class _ViewsWithoutTruth(ConfigViews):
+class _DeclaredViews(ConfigViews):
     """Views that raise ``MethodError`` where a method reads ground truth whose use it does not declare.
 
     The poses can be read: methods that compute their cameras report the errors of these.

@@ -132,9 +132,7 @@ def row_notes(results: Sequence[Result], absent: Sequence[str]) -> list[tuple[st
         for name, table in result.tables.items()
     ]
     marked = [f"{row} ({', '.join(reasons)})" for row, table in rows if (reasons := incomparable_reasons(table))]
-    partial = [
-        f"{row} ({table.views} of {table.of_views} views)" for row, table in rows if table.of_views is not None
-    ]
+    partial = [f"{row} ({one.views} of {one.of_views} views)" for row, one in rows if one.of_views is not None]
     aligned = [printable(result.method, 40) for result in results if result.declared_prediction]
     incomparable = ("*", "Errors of valid predictions are not compared with those of others: ", marked)
     without_paper = ("", "The paper's rows are absent; the configs differ from its scenes: ", absent)
@@ -199,9 +197,7 @@ def paper_reference_rows(results: Sequence[tuple[str, Table]]) -> list[tuple[str
 
 def rank_mark(declared: Declaration) -> str:
     """Return the mark of a row that declares the use of ground truth (‡), or ? if it declares nothing about it."""
-    if declared.uses_ground_truth:
-        return "‡"
-    return "?" if declared.uses_ground_truth is None else ""
+    return {True: "‡", False: "", None: "?"}[declared.uses_ground_truth]
 
 
 def row_name(result: Result, table: Table) -> str:
