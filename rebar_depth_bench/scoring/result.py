@@ -288,9 +288,8 @@ def _check_views(result: Result) -> Result:
         raise field_error("declared_prediction without prediction", "the kind that was scored", "missing")
     by_kind = {None: "rank_error", "scale": "aligned, constant"}
     expected = by_kind.get(result.prediction, ", ".join(RELATIVE_ALIGNMENTS))
-    groups = [group for table in result.tables.values() for group in table.groups.values()]
-    of_groups = [table for group in groups for table in group.values()]
-    for one in (*result.tables.values(), *of_groups, *result.views):
+    groups = [one for table in result.tables.values() for group in table.groups.values() for one in group.values()]
+    for one in (*result.tables.values(), *groups, *result.views):
         found = ", ".join(name for name in _ERRORS if getattr(one, name) is not None)
         if found != expected and not (isinstance(one, Table) and one.views == 0):
             raise field_error(f"a table or view has {found or 'no errors'}", expected, "conflict")
