@@ -236,18 +236,6 @@ def test_arguments_are_checked_before_any_prediction(tiny_root: Path, arguments:
         rdb.Evaluator(tiny_root, **arguments)
 
 
-def test_depth_is_converted_once(tiny_root: Path) -> None:
-    class Depth:
-        conversions = 0
-
-        def __array__(self, *_: Any, **__: Any) -> np.ndarray:
-            Depth.conversions += 1
-            return np.ones((90, 160), np.float32)
-
-    rdb.evaluate(lambda _: Depth(), tiny_root, config=LATTICE, views=1)
-    assert Depth.conversions == 1
-
-
 @pytest.mark.parametrize("model", [None, 3, np.ones((9, 90, 160)), [np.ones((90, 160))], {1: np.ones((90, 160))}])
 def test_models_of_other_types_are_refused(tiny_root: Path, model: Any) -> None:
     with pytest.raises(rdb.InputError, match=f"of type {type(model).__name__}, expected the name of a method"):

@@ -83,7 +83,8 @@ def test_method_of_another_kind_declares_it(tiny_root: Path, tmp_path: Path) -> 
     evaluated = evaluate(f"{path}:METHOD", tiny_root, config="lattice")
     assert evaluated.to_dict()["tables"] == result.to_dict()["tables"]
     path.write_text(code.replace("KIND", "depth"))
-    with pytest.raises(MethodError, match="prediction is 'depth', expected one of metric, scale, affine-depth"):
+    words = f"^{path}: own: prediction is 'depth', expected one of metric, scale, affine-depth"
+    with pytest.raises(MethodError, match=words):
         find_method(f"{path}:METHOD")
 
 
