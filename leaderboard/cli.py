@@ -1,4 +1,4 @@
-"""Command-line interface ``rebar-leaderboard``: the server, and what operators do to its database and archives."""
+"""Command line of ``rebar-leaderboard``: server, work on its database and archives, and set-up of the logs."""
 
 from __future__ import annotations
 

@@ -47,6 +47,8 @@ Depth = Float[ndarray, "h w"]
 Model = str | Callable[[Mapping[str, Any]], object] | Mapping[str, object] | Iterable[tuple[str, object]]
 
 _ROW_COLUMNS = tuple(name for name in COLUMNS if name != "scene" and name not in TRUTH_COLUMNS)
+_UNDECLARED = {"method": "unnamed", "kind": METRIC, "inputs": None, "uses_ground_truth": None}
+"""Defaults of what predictions declare."""
 
 
 def evaluate(
@@ -68,30 +70,24 @@ def evaluate(
     planar depth of the left view in metres, H x W; a mapping of view ids to depth; or an iterable of pairs of
     both. Depth is as for ``Evaluator.update``; of pairs, views that ``views`` does not select are passed over. A
     row has ``view_id``, colour, ``K`` and distortion of both eyes, ``baseline_m`` and ``right_from_left``, which
-    takes points of the left camera's frame to the right one's; with ``inputs="multi-view"`` also the poses in the
-    world. What the config lacks is None.
+    takes points of the left camera's frame to the right one's; with ``inputs="multi-view"``, which then needs
+    ``uses_ground_truth=True``, also the poses in the world. What the config lacks is None.
 
     The other arguments are those of ``Evaluator``. Raises as it does, and what a function raises.
     """
-    evaluator = Evaluator(
-        root,
-        config,
-        split=split,
-        views=views,
-        extended=extended,
-        method=method,
-        kind=kind,
-        inputs=inputs,
-        uses_ground_truth=uses_ground_truth,
-    )
+    declared = dict[str, Any](method=method, kind=kind, inputs=inputs, uses_ground_truth=uses_ground_truth)
+    evaluator = Evaluator(root, config, split=split, views=views, extended=extended, **declared)
     if isinstance(model, str):
-        given = [name for name, value in evaluator._declared.items() if value not in ("unnamed", METRIC, None)]
+        given = [name for name, value in declared.items() if value != _UNDECLARED[name]]
         if given:
-            remedy = "; score its archive by score(ARCHIVE, ROOT, align=KIND)" if "prediction" in given else ""
-            named = " and ".join(given).replace("prediction", "kind")
-            raise InputError(f"{named} given, but the method {model} declares its own{remedy}")
+            named = f"{' and '.join(given)} {'is' if len(given) == 1 else 'are'} given"
+            remedy = "; score its archive by score(ARCHIVE, ROOT, align=KIND)" if "kind" in given else ""
+            raise InputError(f"{named}, but the method {model} declares its own{remedy}")
         return evaluator._predicted_by(model)
     if callable(model):
+        if inputs == "multi-view" and uses_ground_truth is not True:
+            found = f"inputs is multi-view and uses_ground_truth is {uses_ground_truth}"
+            raise InputError(f"{found}, expected True, because the rows then have the true poses")
         rows = evaluator._rows(with_poses=inputs == "multi-view")
         pairs: Iterable[tuple[str, object]] = ((row["view_id"], model(row)) for row in rows)
     else:
@@ -208,7 +204,7 @@ class Evaluator:
         if not self._added:
             self._archive.writers.enter_context(self._writer)
         self._added.add(view_id)
-        self._writer.add(view_id, one)
+        self._writer.write_map(view_id, one)
 
     def compute(self) -> EvaluatedResult:
         """Return the result of the predictions and begin again.
@@ -333,9 +329,9 @@ class _TemporaryArchive:
 
 def _selected(configs: Sequence[ConfigViews], views: int | Sequence[str]) -> list[ConfigViews]:
     """Return some views of each config: a number of them, spread evenly, or those with the given ids."""
-    if not isinstance(views, Iterable):
+    if not isinstance(views, Iterable) or getattr(views, "ndim", 1) == 0:
         if not isinstance(views, int | np.integer) or isinstance(views, bool) or views < 1:
-            raise InputError(f"views is {views}, expected a whole number from 1 or view ids")
+            raise InputError(f"views is {views!r}, expected a whole number from 1 or view ids")
         spread = [
             [one.view_ids[k * len(one.view_ids) // views] for k in range(views)]
             if views < len(one.view_ids)

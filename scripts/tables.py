@@ -80,7 +80,7 @@ def _default(limit: limits.Limit) -> str:
 
 def _size(size: int) -> str:
     """Return a whole number of bytes in the largest unit of which it is a multiple: ``64 MiB``."""
-    power = max(power for power in range(4) if size % (1 << (10 * power)) == 0)
+    power = max(power for power in range(4 if size else 1) if size % (1 << (10 * power)) == 0)
     return f"{size >> (10 * power)} {('B', 'KiB', 'MiB', 'GiB')[power]}"
 
 

@@ -1,4 +1,4 @@
-"""Audit of a dataset folder: its files, and every check in one pass over the rows of each config."""
+"""Audit of a dataset folder: files, all checks in one pass over the rows, and checks of imported configs."""
 
 from __future__ import annotations
 
@@ -296,7 +296,7 @@ def imported_checks(
         for eye, truth in eyes.items():
             row_faults += [f"{record.view_id}: {eye}: {one}" for one in _truth_problems(truth, ids)]
             _compare_with_axes(truth, surveyed, allowed_m, from_axes)
-        camera_faults += [f"{record.view_id}: {one}" for one in _camera_problems(row, config)]
+        camera_faults += [f"{record.view_id}: {one}" for one in _imported_camera_problems(row, config)]
         if "right" in eyes:
             _compare_eyes(eyes["left"], eyes["right"], allowed_m, between_eyes)
         progress(f"audit of {config.name}", done, len(config.views))
@@ -321,7 +321,7 @@ def _truth_problems(truth: EyeTruth, bar_ids: set[int]) -> Iterator[str]:
             yield f"bar ids {unknown[:5]} are not in bars.parquet"
 
 
-def _camera_problems(row: Mapping[str, Any], config: DatasetConfig) -> Iterator[str]:
+def _imported_camera_problems(row: Mapping[str, Any], config: DatasetConfig) -> Iterator[str]:
     """Yield what is wrong with the cameras of a row."""
     height, width = config.grid
     eyes = [eye for eye in ("left", "right") if row[f"{eye}_K"] is not None]

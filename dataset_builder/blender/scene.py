@@ -1,4 +1,4 @@
-"""Scene in Blender's open file, and its evaluated mesh. World frame, metres."""
+"""Scene in Blender's open file, its lights, and its evaluated mesh. World frame, metres."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Camera trajectories: poses of the left camera of the rig, view by view. World frame, metres."""
+"""Camera trajectories: poses of the left camera, and distances of points to the nearest steel. World, metres."""
 
 from __future__ import annotations
 

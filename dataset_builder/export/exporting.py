@@ -1,4 +1,4 @@
-"""Dataset export: writes configs of a dataset folder as plain files for use without ``datasets``."""
+"""Dataset export: configs as plain files, and their target folder with its lock and its ``export.json``."""
 
 from __future__ import annotations
 

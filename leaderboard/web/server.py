@@ -1,4 +1,4 @@
-"""Web server of ``rebar-leaderboard serve`` with its local scoring workers."""
+"""Web server of ``rebar-leaderboard serve``: limits on its connections, and its local scoring workers."""
 
 from __future__ import annotations
 

@@ -163,9 +163,9 @@ def add_data(parser: argparse.ArgumentParser, summary: str = "dataset folder or 
     parser.add_argument("--data", type=InputFolder, required=True, metavar="ROOT", help=summary)
 
 
-def add_names(parser: argparse.ArgumentParser, option: str, summary: str, metavar: str = "NAME") -> None:
+def add_names(parser: argparse.ArgumentParser, option: str, help_text: str, metavar: str = "NAME") -> None:
     """Add ``option``, which takes one name or more and may be repeated."""
-    parser.add_argument(option, nargs="+", action="extend", metavar=metavar, help=summary)
+    parser.add_argument(option, nargs="+", action="extend", metavar=metavar, help=help_text)
 
 
 def add_workers(parser: argparse.ArgumentParser) -> None:
@@ -223,7 +223,7 @@ def score_archives(
 
     folder = open_folder(options.data, expect_digest=options.expect_digest)
     kinds = []
-    for archive in archives:
+    for archive in archives:  # Opened twice: kinds that do not fit are refused before the first is scored.
         with open_evaluation(archive, folder) as evaluation:
             kinds.append((evaluation.meta.method, evaluation.kind(options.align)))
     check_kinds(kinds)

@@ -21,10 +21,9 @@ from rebar_depth_bench.cli.console import EXIT_INPUT
 from rebar_depth_bench.evaluator import evaluate
 from rebar_depth_bench.methods import METHODS
 from rebar_depth_bench.methods.controls import NOISY_TRUTH_FACTOR
-from rebar_depth_bench.reporting.formatting import row_name
+from rebar_depth_bench.reporting.formatting import note_text, row_name, row_notes
 from rebar_depth_bench.reporting.tables import make_grid, plain_text, print_line, print_unwrapped
 from rebar_depth_bench.scoring.columns import SCALED, SCALED_CONSTANT, columns_at
-from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE
 from rebar_depth_bench.scoring.result import SUMMARY, Result
 
 SAMPLE = Path(__file__).parents[1] / "sample"
@@ -42,7 +41,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     views = parser.add_mutually_exclusive_group()
     views.add_argument("--views", type=int, default=6, help="stereo views to render (default: %(default)s)")
     sample = (
-        "use nine views of 160 x 90 that come with the package, without Blender, in the folder sample of --out"
+        "use nine views of 160 x 90 that come with the package, without Blender, in the folder sample of --out; "
+        "rebar-bench verify reports that their mesh is missing"
     )
     views.add_argument("--sample", action="store_true", help=sample)
 
@@ -96,15 +96,16 @@ def _print_results(results: Sequence[Result], console: Console) -> None:
         cells = (f"{column.text(column.value(table))} {column.unit}".strip() for column in columns_at(*SUMMARY))
         grid.add_row(*map(plain_text, [row_name(result, table), *cells]))
         scaled, constant = (column.value(table) for column in (SCALED[0], SCALED_CONSTANT[0]))
-        if scaled is not None and constant is not None and scaled >= constant:
+        if table.is_comparable and scaled is not None and constant is not None and scaled >= constant:
             flat.append(result.method)
     print_unwrapped(console, grid)
     console.print()
+    listed = f"; no better in scaled AbsRel than that plane: {', '.join(flat)}" if flat else ""
     print_line(
         console,
         f"noisy-truth, exact depth times {NOISY_TRUTH_FACTOR:g} with noise, has a wrong scale and almost the "
         "exact shape: AbsRel shows the one, scaled AbsRel the other. A plane at one depth has the scaled AbsRel "
-        f"in the column constant, and methods that are not below it show no shape: {', '.join(flat)}.",
+        f"in the column constant{listed}.",
     )
-    low = f"*: coverage below {MIN_COMPARABLE_COVERAGE * 100:.0f} %, so only the rank error compares."
-    print_line(console, f"{low} ‡: uses ground truth, not ranked.")
+    for note in row_notes(results, ()):
+        print_line(console, note_text(*note))

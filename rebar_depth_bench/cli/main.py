@@ -19,7 +19,8 @@ COMMANDS: Mapping[str, Command] = {
     "compare": module_command(
         f"{_CLI}.table",
         "compute paired differences between submissions, with intervals",
-        *("add_compare_arguments", "run_compare"),
+        add="add_compare_arguments",
+        run="run_compare",
     ),
     "table": module_command(
         f"{_CLI}.table", "print several submissions and the paper's rows in the layout of its Table I"
@@ -28,7 +29,8 @@ COMMANDS: Mapping[str, Command] = {
     "verify": module_command(
         f"{_CLI}.check",
         "compare every file, view and digest of a dataset with its manifest",
-        *("add_verify_arguments", "run_verify"),
+        add="add_verify_arguments",
+        run="run_verify",
     ),
     "methods": module_command(f"{_CLI}.methods", "list the available methods"),
     "predict": module_command(f"{_CLI}.predict", "run a method on a dataset and write a submission archive"),

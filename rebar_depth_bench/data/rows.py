@@ -10,7 +10,7 @@ import hashlib
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -332,7 +332,7 @@ class ConfigViews:
 
     def by_scene(self) -> tuple[ConfigViews, ...]:
         """Return the views of each scene."""
-        return tuple(map(ConfigViews, self.source.by_scene()))
+        return tuple(replace(self, source=source) for source in self.source.by_scene())
 
     def check_columns(self, columns: Sequence[str], reader: str) -> None:
         """Raise ``DatasetError`` if ``reader`` needs columns that the config was built or imported without."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -33,10 +33,10 @@ class MethodInfo:
 
     ``columns`` are the dataset columns that the predictor reads. ``uses_ground_truth`` is True if the method reads
     ground truth, so that its submissions are not ranked; it must be if ``columns`` has any of ``TRUTH_COLUMNS``,
-    or of ``POSE_COLUMNS`` without ``right_rgb``. ``untested_note`` states which part was never run by the authors
-    because weights or hardware were not available; empty if everything was tested. ``inputs`` is the input class,
-    one of ``INPUTS``; without it, ``input_class`` derives the class from the columns. ``prediction`` is the kind
-    of the predictions, one of ``PREDICTION_KINDS``.
+    or of ``POSE_COLUMNS`` but not both with ``right_rgb``. ``untested_note`` states which part was never run by
+    the authors because weights or hardware were not available; empty if everything was tested. ``inputs`` is the
+    input class, one of ``INPUTS``; without it, ``input_class`` derives the class from the columns. ``prediction``
+    is the kind of the predictions, one of ``PREDICTION_KINDS``.
     """
 
     name: str
@@ -52,14 +52,19 @@ class MethodInfo:
 
     def __post_init__(self) -> None:
         if isinstance(self.columns, str):  # Catches a one-element tuple written without its comma.
-            raise TypeError(f"columns is the text {self.columns!r}, expected a tuple of names")
+            raise MethodError(f"{self.name}: columns is the text {self.columns!r}, expected a tuple of names")
         if self.prediction not in PREDICTION_KINDS:
-            raise ValueError(f"prediction is {self.prediction!r}, expected one of {', '.join(PREDICTION_KINDS)}")
+            expected = f"expected one of {', '.join(PREDICTION_KINDS)}"
+            raise MethodError(f"{self.name}: prediction is {self.prediction!r}, {expected}")
         # Stereo methods need both poses for that of the right eye from the left one.
-        truth = TRUTH_COLUMNS if "right_rgb" in self.columns else (*TRUTH_COLUMNS, *POSE_COLUMNS)
-        read = ", ".join(name for name in self.columns if name in truth)
-        if read and not self.uses_ground_truth:
-            raise MethodError(f"{self.name}: reads {read}, expected MethodInfo(..., uses_ground_truth=True)")
+        is_stereo = {"right_rgb", *POSE_COLUMNS} <= set(self.columns)
+        self.check_truth(self.columns, TRUTH_COLUMNS if is_stereo else (*TRUTH_COLUMNS, *POSE_COLUMNS))
+
+    def check_truth(self, read: Sequence[str], truth: Sequence[str]) -> None:
+        """Raise ``MethodError`` if any of the names ``read`` is in ``truth`` and its use is not declared."""
+        found = ", ".join(name for name in read if name in truth)
+        if found and not self.uses_ground_truth:
+            raise MethodError(f"{self.name}: reads {found}, expected MethodInfo(..., uses_ground_truth=True)")
 
 
 @dataclass(frozen=True)
@@ -102,9 +107,10 @@ class MultiViewMethod:
     ``check(views)`` raises ``MethodError`` if the config is unsuitable (for example without a board) or a package
     is missing; it is called for every config before any work begins. ``prepare(views, work, progress)`` makes the
     predictor from all views: ``views.rows("left_rgb", "left_K")`` yields decoded rows, and ``views`` also has
-    ``view_ids``, ``grid``, ``board`` and ``mesh``; ``progress("what", done, total)`` reports progress. Files in
-    the folder ``work`` persist until an interrupted run is resumed. The rows passed to the predictor hold
-    ``view_id`` and ``info.columns``.
+    ``view_ids``, ``grid``, ``board`` and ``mesh``; ``TRUTH_COLUMNS`` and the mesh raise ``MethodError`` unless
+    ``info.uses_ground_truth`` is True. ``progress("what", done, total)`` reports progress. Files in the folder
+    ``work`` persist until an interrupted run is resumed. The rows passed to the predictor hold ``view_id`` and
+    ``info.columns``.
     """
 
     info: MethodInfo

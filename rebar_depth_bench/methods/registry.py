@@ -154,8 +154,14 @@ def _load_entry_point(entry: EntryPoint) -> AnyMethod:
     try:
         value = entry.load()
     except Exception as error:  # Importing third-party modules may raise anything.
-        raise MethodError(f"{entry.name}: {entry.value} cannot be imported: {exception_summary(error)}") from error
+        raise _import_error(f"{entry.name}: {entry.value}", error) from error
     return _require_method(entry.name, value)
+
+
+def _import_error(where: str, error: Exception) -> MethodError:
+    """Return the error of an import; that of a ``MethodInfo`` keeps its words."""
+    reason = error if isinstance(error, MethodError) else f"cannot be imported: {exception_summary(error)}"
+    return MethodError(f"{where}: {reason}")
 
 
 def _with_file_digest(path: Path, method: AnyMethod) -> AnyMethod:
@@ -190,7 +196,7 @@ def _import_file(path: Path) -> ModuleType:
     except Exception as error:
         del sys.modules[name]
         sys.path[:] = before
-        raise MethodError(f"{path}: cannot be imported: {exception_summary(error)}") from error
+        raise _import_error(str(path), error) from error
     return module
 
 

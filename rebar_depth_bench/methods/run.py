@@ -10,9 +10,9 @@ import json
 import platform
 import time
 import traceback
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -27,9 +27,9 @@ from rebar_depth_bench.base.names import TEST_SPLIT
 from rebar_depth_bench.base.parallel import Progress, silent
 from rebar_depth_bench.base.writing import NO_SPACE, is_stream, link_target, scratch_folder, write_error
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
-from rebar_depth_bench.data.rows import Views
+from rebar_depth_bench.data.rows import TRUTH_COLUMNS, Views
 from rebar_depth_bench.methods import AnyMethod, ConfigViews, Method, MultiViewMethod, Predictor, Prepared
-from rebar_depth_bench.methods.base import import_optional, input_class
+from rebar_depth_bench.methods.base import MethodInfo, import_optional, input_class
 from rebar_depth_bench.methods.kept_views import KeptViews, PreparationReport
 from rebar_depth_bench.methods.sgbm import RECTIFIED_COLUMNS, STEREO_COLUMNS, pair_row
 from rebar_depth_bench.submission import SubmissionWriter
@@ -76,7 +76,11 @@ def predict_views(
     if target.is_dir():
         raise InputError(f"{target}: is a folder, expected the name of the archive to write")
     if isinstance(method, MultiViewMethod):
-        views = [scene for config in views for scene in config.by_scene()]
+        scenes = [scene for config in views for scene in config.by_scene()]
+        # A capture has no ground truth.
+        views = [
+            _DeclaredViews(one.source, method.info) if isinstance(one, ConfigViews) else one for one in scenes
+        ]
         for config in views:
             with _wrap_errors(f"{method.info.name}: {config.config}: check"):
                 method.check(config)
@@ -101,6 +105,27 @@ def predict_views(
         _write_archive(method, target, kept, views, reports)
         kept.remove()
     return reports
+
+
+@dataclass(frozen=True)
+class _DeclaredViews(ConfigViews):
+    """Views that raise ``MethodError`` where a method reads ground truth whose use it does not declare.
+
+    The poses can be read: methods that compute their cameras report the errors of these.
+    """
+
+    info: MethodInfo
+
+    @property
+    def mesh(self) -> Path:
+        """Path of the scene's mesh. Raises ``MethodError`` without the declaration."""
+        self.info.check_truth(["mesh"], ["mesh"])
+        return super().mesh
+
+    def rows(self, *columns: str, skip: Collection[str] = ()) -> Iterator[dict[str, Any]]:
+        """Yield rows as ``ConfigViews.rows``. Raises ``MethodError`` for ground truth without the declaration."""
+        self.info.check_truth(columns, TRUTH_COLUMNS)
+        return super().rows(*columns, skip=skip)
 
 
 @contextmanager

@@ -24,6 +24,7 @@ from rebar_depth_bench.reporting.formatting import (
     ONE_PIXEL_TITLE,
     config_title,
     counted,
+    note_text,
     rank_mark,
     row_notes,
     scaled_constants,
@@ -189,9 +190,7 @@ def _errors(table: Table) -> tuple[float, float] | None:
 
 def _name(result: Result) -> str:
     """Return a method's name with the mark of its declaration, as the tables show it."""
-    table = next((table for table in result.tables.values() if table.views), None)
-    mark = rank_mark(result.declared, table) if table else ""
-    return f"{printable(result.method)} {mark}".rstrip()
+    return f"{printable(result.method)} {rank_mark(result.declared)}".rstrip()
 
 
 def _notes(results: Sequence[Result], panels: Sequence[Panel]) -> list[str]:
@@ -200,7 +199,7 @@ def _notes(results: Sequence[Result], panels: Sequence[Panel]) -> list[str]:
     if any(point.hollow for point in points):
         percent = f"{MIN_COMPARABLE_COVERAGE * 100:.0f} %"
         notes.append(f"Hollow: coverage below {percent} or a view without prediction; errors over chosen pixels.")
-    notes += [f"{mark}: {meaning}." for mark, meaning, listed in row_notes(results, ()) if not listed]
+    notes += [note_text(*note) for note in row_notes(results, ()) if note[0] != "*"]
     if any(point.published for point in points):
         part = load_published().parts["synthetic"]
         notes.append(f"Paper: {part.place}, {part.mark}.")

@@ -126,19 +126,26 @@ def incomparable_reasons(table: Table) -> list[str]:
 
 def row_notes(results: Sequence[Result], absent: Sequence[str]) -> list[tuple[str, str, Sequence[str]]]:
     """Return mark, beginning and list of each note on rows of tables; ``absent`` as in ``print_paper_table``."""
-    marked = [
-        f"{printable(result.method, 40)}, {config_title(name, table.split)} ({', '.join(reasons)})"
+    rows = [
+        (f"{printable(result.method, 40)}, {config_title(name, table.split)}", table)
         for result in results
         for name, table in result.tables.items()
-        if (reasons := incomparable_reasons(table))
     ]
+    marked = [f"{row} ({', '.join(reasons)})" for row, table in rows if (reasons := incomparable_reasons(table))]
+    partial = [f"{row} ({one.views} of {one.of_views} views)" for row, one in rows if one.of_views is not None]
     aligned = [printable(result.method, 40) for result in results if result.declared_prediction]
     incomparable = ("*", "Errors of valid predictions are not compared with those of others: ", marked)
     without_paper = ("", "The paper's rows are absent; the configs differ from its scenes: ", absent)
+    of_some_views = ("", "Not ranked: ", partial)
     as_another_kind = ("", "Metric predictions, aligned as this kind: ", aligned)
-    marks = {rank_mark(result.declared, table) for result in results for table in result.tables.values()}
+    marks = {rank_mark(result.declared) for result in results}
     declared = [(mark, meaning, ()) for mark, meaning in _MARKS.items() if mark in marks]
-    return declared + [note for note in (incomparable, as_another_kind, without_paper) if note[-1]]
+    return declared + [note for note in (incomparable, of_some_views, as_another_kind, without_paper) if note[-1]]
+
+
+def note_text(mark: str, start: str, listed: Sequence[str]) -> str:
+    """Return a note of ``row_notes`` as a sentence."""
+    return f"{mark and mark + ': '}{start}{'; '.join(listed)}."
 
 
 def grouping_title(grouping: str) -> str:
@@ -188,16 +195,14 @@ def paper_reference_rows(results: Sequence[tuple[str, Table]]) -> list[tuple[str
     ]
 
 
-def rank_mark(declared: Declaration, table: Table) -> str:
-    """Return the mark of a row that uses ground truth, or is metric and not ranked (‡), or ? if undeclared."""
-    if declared.uses_ground_truth or not (table.ranked or table.aligned):
-        return "‡"
-    return "?" if declared.uses_ground_truth is None else ""
+def rank_mark(declared: Declaration) -> str:
+    """Return the mark of a row that declares the use of ground truth (‡), or ? if it declares nothing about it."""
+    return {True: "‡", False: "", None: "?"}[declared.uses_ground_truth]
 
 
 def row_name(result: Result, table: Table) -> str:
     """Return the method of a row of a table with its marks, that of ``row_notes`` included."""
-    marks = (rank_mark(result.declared, table), "*" if incomparable_reasons(table) else "")
+    marks = (rank_mark(result.declared), "*" if incomparable_reasons(table) else "")
     return " ".join([printable(result.method, 40), *filter(None, marks)])
 
 

@@ -237,7 +237,7 @@ def _cells(
         interval = column.interval_text(column.interval(table), ", ") if intervals else ""
         shown = rf"\textbf{{{number}}}" if table.ranked and number == best.get(column.path) else number
         cells.append(shown + (rf" {{\tiny[{interval}]}}" if interval else ""))
-    cells[0] += _MARKS["‡"] if formatting.rank_mark(result.declared, table) == "‡" else ""
+    cells[0] += _MARKS["‡"] if formatting.rank_mark(result.declared) == "‡" else ""
     of_valid = next(place for place, column in enumerate(columns) if not column.of_all_views)
     cells[of_valid] += _MARKS["*"] if formatting.incomparable_reasons(table) else ""
     return cells

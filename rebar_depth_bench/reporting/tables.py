@@ -291,7 +291,7 @@ def views_note(rows: Sequence[Difference]) -> str:
 def comparison_cells(row: Difference) -> list[str]:
     """Return title, both values, difference, interval and verdict as text."""
     column = row.column
-    first, other = (column.number_text(value) for value in (row.first, row.other))
+    first, other = (column.text(value) for value in (row.first, row.other))
     interval = range_text(row.interval, column.signed_text)
     return [column.heading, first, other, column.signed_text(row.difference), interval, row.verdict]
 
@@ -368,8 +368,8 @@ def _print_paper_notes(
         print_line(console, f"{formatting.RANK_ERROR_NOTE} {formatting.REFERENCE_NOTE}")
     else:
         print_line(console, formatting.ALIGNED_NOTE)
-    for mark, start, listed in formatting.row_notes(results, absent):
-        print_line(console, f"{mark and mark + ': '}{start}{'; '.join(listed)}.", style="yellow")
+    for note in formatting.row_notes(results, absent):
+        print_line(console, formatting.note_text(*note), style="yellow")
     if published and any(table.published for result in results for table in result.tables.values()):
         mark = load_published().parts["synthetic"].mark
         print_line(console, f"The paper's rows: {mark}. †: median-anchored. {OTHER_OPTICS_NOTE}")

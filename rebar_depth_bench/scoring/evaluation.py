@@ -142,7 +142,8 @@ class Evaluation:
         """Return the kind that the predictions are scored as; errors for ``align`` as in ``score_evaluation``."""
         kind = align or self.meta.prediction
         if align is not None and align not in ALIGNMENT_BY_KIND:
-            raise InputError(f"align is {escape_text(str(align))}, expected one of {', '.join(ALIGNMENT_BY_KIND)}")
+            expected = f"{', '.join(ALIGNMENT_BY_KIND)}, or None, which scores metric predictions as metric"
+            raise InputError(f"align is {escape_text(str(align))}, expected one of {expected}")
         if kind != self.meta.prediction:
             self.require_metric(f"only they can be scored as {kind}")
         return kind

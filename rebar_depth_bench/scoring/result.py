@@ -13,15 +13,7 @@ from functools import cache
 from html import escape
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
-from pydantic import (
-    AfterValidator,
-    BeforeValidator,
-    FailFast,
-    Field,
-    GetPydanticSchema,
-    Strict,
-    TypeAdapter,
-)
+from pydantic import AfterValidator, BeforeValidator, FailFast, Field, GetPydanticSchema, Strict, TypeAdapter
 from pydantic_core import core_schema
 
 from rebar_depth_bench.base.errors import InputError, Problem, SubmissionError, printable
@@ -35,6 +27,7 @@ from rebar_depth_bench.scoring.columns import (
     ALIGNED,
     ALIGNED_CONSTANT,
     COVERAGE,
+    RELATIVE_ALIGNMENTS,
     RELATIVE_COLUMNS,
     VIEW_COLUMNS,
     Column,
@@ -42,7 +35,7 @@ from rebar_depth_bench.scoring.columns import (
     columns_at,
 )
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, PROTOCOL, RELATIVE_PROTOCOL
-from rebar_depth_bench.scoring.relative import kind_text, relative_findings
+from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND, kind_text, relative_findings
 from rebar_depth_bench.scoring.table import (
     LIMITED,
     Count,
@@ -54,7 +47,7 @@ from rebar_depth_bench.scoring.table import (
     ViewScore,
     check_tables,
 )
-from rebar_depth_bench.submission.declaration import INPUTS, METRIC, PREDICTION_KINDS, Declaration
+from rebar_depth_bench.submission.declaration import INPUTS, METRIC, Declaration
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -62,6 +55,7 @@ if TYPE_CHECKING:
     from rebar_depth_bench.extended.result import ExtendedResult
 
 _MAX_CONFIGS_SHOWN = 10
+_ERRORS = ("rank_error", *RELATIVE_ALIGNMENTS)
 _NOTEBOOK_COLUMNS = (
     *("config", "views", "views_scored", "coverage", "ranked", "rank_error"),
     *("native_abs_rel", "native_rmse_cm", "scaled_abs_rel", "scaled_rmse_cm", "scale_median"),
@@ -147,7 +141,7 @@ class Result:
     """
 
     protocol: Annotated[str, Strict(), one_of(PROTOCOL, RELATIVE_PROTOCOL)] = PROTOCOL
-    prediction: Annotated[str, Strict(), one_of(*PREDICTION_KINDS)] | None = None
+    prediction: Annotated[str, Strict(), one_of(*ALIGNMENT_BY_KIND)] | None = None
     declared_prediction: Annotated[str, Strict(), one_of(METRIC)] | None = None
     dataset: DatasetIdentity
     submission: SubmissionIdentity
@@ -287,15 +281,18 @@ def _check_views(result: Result) -> Result:
         raise field_error("views: a view_id occurs twice", "each view once", "duplicate")
     if not {config_of(view_id) for view_id in view_ids} <= result.tables.keys():
         raise field_error("views: a view belongs to no config of the tables", "views of these", "conflict")
-    groups = [
-        table for tables in result.tables.values() for group in tables.groups.values() for table in group.values()
-    ]
-    number = "rank_error" if result.prediction is None else "aligned"
-    if any(table.views and getattr(table, number) is None for table in (*result.tables.values(), *groups)):
-        raise field_error(f"a table of views has no {number}", "one in each of them", "missing")
     if (result.protocol == RELATIVE_PROTOCOL) != (result.prediction is not None):
         found = f"the protocol is {result.protocol} and prediction is {result.prediction}"
         raise field_error(found, f"{RELATIVE_PROTOCOL} for predictions that are not metric", "conflict")
+    if result.declared_prediction and result.prediction is None:
+        raise field_error("declared_prediction without prediction", "the kind that was scored", "missing")
+    by_kind = {None: "rank_error", "scale": "aligned, constant"}
+    expected = by_kind.get(result.prediction, ", ".join(RELATIVE_ALIGNMENTS))
+    groups = [one for table in result.tables.values() for group in table.groups.values() for one in group.values()]
+    for one in (*result.tables.values(), *groups, *result.views):
+        found = ", ".join(name for name in _ERRORS if getattr(one, name) is not None)
+        if found != expected and not (isinstance(one, Table) and one.views == 0):
+            raise field_error(f"a table or view has {found or 'no errors'}", expected, "conflict")
     return result
 
 

@@ -118,7 +118,11 @@ class SubmissionWriter:
             )
         if seconds is not None and not (isinstance(seconds, int | float) and 0 <= seconds < math.inf):
             raise InputError(f"{view_id}: seconds is {seconds!r}, expected a finite number of at least 0")
-        array = depth_map(f"{view_id}: depth is", depth)
+        self.write_map(view_id, depth_map(f"{view_id}: depth is", depth), seconds)
+
+    def write_map(self, view_id: str, array: Float[ndarray, "h w"], seconds: float | None = None) -> None:
+        """Store a map that ``depth_map`` returned, as ``add`` does; the caller has checked the other arguments."""
+        assert self._zip is not None
         with np.errstate(over="ignore", under="ignore"):
             values = np.ascontiguousarray(array, "<f2" if array.dtype.itemsize == 2 else "<f4")
         with self._lock:

@@ -45,15 +45,21 @@ def test_every_form_of_model_gives_the_same_numbers(tiny_root: Path, lattice: Tr
 
 
 @pytest.mark.parametrize("inputs", ["stereo", "multi-view"])
-def test_functions_see_no_ground_truth(tiny_root: Path, inputs: str) -> None:
+def test_functions_see_no_ground_truth_that_is_not_declared(tiny_root: Path, inputs: str) -> None:
     rows: list[dict[str, Any]] = []
 
     def predict(row: Any) -> np.ndarray:
         rows.append(row)
         return np.ones(row["left_rgb"].shape[:2], np.float16)
 
-    rdb.evaluate(predict, tiny_root, config=LATTICE, inputs=inputs)
-    poses = {"left_cam_from_world", "right_cam_from_world"} if inputs == "multi-view" else set()
+    has_poses = inputs == "multi-view"
+    if has_poses:
+        for undeclared in (None, False):
+            with pytest.raises(rdb.InputError, match=f"uses_ground_truth is {undeclared}, expected True, because"):
+                rdb.evaluate(predict, tiny_root, inputs=inputs, uses_ground_truth=undeclared)
+        assert not rows
+    rdb.evaluate(predict, tiny_root, config=LATTICE, inputs=inputs, uses_ground_truth=has_poses)
+    poses = {"left_cam_from_world", "right_cam_from_world"} if has_poses else set()
     eyes = {f"{eye}_{kind}" for eye in ("left", "right") for kind in ("rgb", "K", "distortion")}
     assert set(rows[0]) == {"view_id", "baseline_m", "right_from_left"} | eyes | poses
     assert np.allclose(rows[0]["right_from_left"][:3, 3], [-rows[0]["baseline_m"], 0, 0], atol=1e-9)
@@ -125,9 +131,9 @@ evaluator.itself = evaluator
 
 
 def test_a_method_declares_itself(tiny_root: Path) -> None:
-    with pytest.raises(rdb.InputError, match=r"^kind and uses_ground_truth given, .* sgbm .*, align=KIND"):
+    with pytest.raises(rdb.InputError, match=r"^kind and uses_ground_truth are given, .* sgbm .*, align=KIND"):
         rdb.evaluate("sgbm", tiny_root, kind="affine-disparity", uses_ground_truth=False)
-    with pytest.raises(rdb.InputError, match=r"^method given, but the method sgbm declares its own$"):
+    with pytest.raises(rdb.InputError, match=r"^method is given, but the method sgbm declares its own$"):
         rdb.evaluate("sgbm", tiny_root, method="mine")
 
 
@@ -216,6 +222,7 @@ def test_wrong_views_are_named(tiny_root: Path, lattice: Truth) -> None:
         ({"views": "lattice/9999"}, "views has lattice/9999"),
         ({"views": []}, "views has no id"),
         ({"views": 2.5}, "views is 2.5, expected a whole number from 1 or view ids"),
+        ({"views": np.array(3)}, r"views is array\(3\), expected a whole number from 1"),
         ({"views": True}, "views is True, expected a whole number from 1"),
         ({"kind": "depth"}, '^declaration: .*\n.* prediction: .*"metric", "scale", "affine-depth" or'),
         ({"inputs": "sonar"}, "inputs"),

@@ -47,13 +47,18 @@ def test_pages_name_every_method_rule_and_measure() -> None:
     assert "max(p/z, z/p) < 1.25" in card
     assert "t = 3, 5, 10, 20 mm" in card
     assert "at least 0.95" in " ".join(card.split())
-    assert len(card.split()) <= 4900
     shown = set(re.findall(r"`(\w+)`", measures))
     names = {measure.name for family in MEASURE_FAMILIES.values() for measure in family.measures}
     of_tolerances = {name.removeprefix("pass_") for name in names if name.startswith("pass_")}
     binned = {name for name in names if re.search(r"_\d|-", name)}
     assert of_tolerances <= shown
     assert {name for name in names - binned if not name.startswith(("pass_", "capability_"))} <= shown
+
+
+@pytest.mark.slow
+def test_card_has_at_most_4900_words() -> None:
+    card = next(iter(PAGES.values()))()
+    assert len(card.split()) <= 4900
 
 
 @pytest.mark.slow

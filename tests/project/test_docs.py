@@ -36,7 +36,7 @@ from rebar_depth_bench.methods.onnx.spec import OUTPUT_MEANINGS, read_onnx_toml
 from rebar_depth_bench.submission import SubmissionMeta
 from scripts.diagrams import PACKAGE_EDGES, diagrams
 from scripts.tables import PAGES as PAGES_WITH_TABLES
-from scripts.tables import TABLES, with_tables
+from scripts.tables import TABLES, _size, with_tables
 from tests.bench.methods.predictors import load_predictor
 from tests.project.pages import (
     DOCS,
@@ -238,6 +238,10 @@ def test_architecture_table_and_diagram_have_the_real_imports() -> None:
 def test_diagrams_are_current() -> None:
     stored = {name: (DOCS / "pictures" / name).read_text() for name in diagrams()}
     assert stored == diagrams(), "write them: python -m scripts.diagrams docs/pictures"
+
+
+def test_sizes_have_the_largest_unit_of_which_they_are_multiples() -> None:
+    assert [_size(size) for size in (0, 1000, 1 << 20, 3 << 29)] == ["0 B", "1000 B", "1 MiB", "1536 MiB"]
 
 
 def test_generated_tables_are_current() -> None:

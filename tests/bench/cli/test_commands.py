@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import shutil
 import subprocess
@@ -14,11 +15,12 @@ from pathlib import Path
 import huggingface_hub
 import numpy as np
 import pytest
+from rich.console import Console
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.base.errors import MAX_PROBLEMS_SHOWN
 from rebar_depth_bench.cli import check
-from rebar_depth_bench.cli.demo import DEMO_METHODS
+from rebar_depth_bench.cli.demo import DEMO_METHODS, _print_results
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.codecs import encode_depth
 from rebar_depth_bench.data.files import file_sha256
@@ -26,6 +28,8 @@ from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.methods import METHODS, MultiViewMethod, own_methods
 from rebar_depth_bench.methods.base import WeightsMethod
 from rebar_depth_bench.methods.registry import FROM_FOLDER
+from rebar_depth_bench.scoring.result import Result
+from tests.bench.reporting.results import result, scored_view
 from tests.commands import run_in_process
 from tests.damage import change_manifest, change_rows, copy_dataset, first_shard
 from tests.project.pages import PAGES, blocks
@@ -298,6 +302,20 @@ def test_false_digest_is_refused_by_every_command(
         finished = run_bench(*arguments)
         assert (finished.returncode, finished.stdout) == (2, "")
         assert "ground_truth.digest" in finished.stderr
+
+
+def test_demo_lists_only_comparable_methods_that_are_no_better_than_a_plane() -> None:
+    def printed(*results: Result) -> str:
+        console = Console(width=200, file=io.StringIO())
+        _print_results(results, console)
+        return " ".join(console.file.getvalue().split())  # type: ignore[attr-defined]
+
+    [whole, sparse] = (
+        result(scored_view("lattice/0000", coverage=share), method=name)
+        for name, share in (("whole", 1.0), ("sparse", 0.9))
+    )
+    assert "no better in scaled AbsRel than that plane: whole." in printed(whole, sparse)
+    assert "in the column constant." in printed(sparse)
 
 
 def test_demo_on_the_sample_prints_what_the_readme_shows(tmp_path: Path) -> None:

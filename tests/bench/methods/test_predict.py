@@ -83,7 +83,8 @@ def test_method_of_another_kind_declares_it(tiny_root: Path, tmp_path: Path) -> 
     evaluated = evaluate(f"{path}:METHOD", tiny_root, config="lattice")
     assert evaluated.to_dict()["tables"] == result.to_dict()["tables"]
     path.write_text(code.replace("KIND", "depth"))
-    with pytest.raises(MethodError, match="prediction is 'depth', expected one of metric, scale, affine-depth"):
+    words = f"^{path}: own: prediction is 'depth', expected one of metric, scale, affine-depth"
+    with pytest.raises(MethodError, match=words):
         find_method(f"{path}:METHOD")
 
 
@@ -93,10 +94,11 @@ def test_method_that_reads_ground_truth_declares_it(user_file: Path, tiny_root: 
         '"left_rgb", "left_depth", "right_bars"': "left_depth, right_bars",
         '"left_rgb", "left_preview"': "left_preview",
         '"left_rgb", "left_cam_from_world"': "left_cam_from_world",
+        '"right_rgb", "left_cam_from_world"': "left_cam_from_world",
     }.items():
         user_file.write_text(code.replace('"left_rgb", "left_K"', columns))
-        words = f"own: reads {read}, expected MethodInfo(..., uses_ground_truth=True)"
-        with pytest.raises(MethodError, match=re.escape(words)):
+        words = f"{user_file}: own: reads {read}, expected MethodInfo(..., uses_ground_truth=True)"
+        with pytest.raises(MethodError, match=f"^{re.escape(words)}$"):
             find_method(f"{user_file}:METHOD")
         user_file.write_text(user_file.read_text().replace('"MIT"', '"MIT", uses_ground_truth=True'))
         assert find_method(f"{user_file}:METHOD").info.uses_ground_truth
@@ -317,8 +319,30 @@ def test_check_and_notes_of_multi_view_method_stop_the_run(tiny_root: Path, tmp_
     assert log[-1].startswith("prepare")
 
 
-def test_columns_given_as_string_raise_type_error() -> None:
-    with pytest.raises(TypeError, match="columns is the text 'left_rgb', expected a tuple of names"):
+@pytest.mark.parametrize("read", ["left_depth", "mesh"])
+def test_multi_view_method_declares_the_ground_truth_that_it_reads(
+    tiny_root: Path, tmp_path: Path, read: str
+) -> None:
+    def prepare(views: Views, *_: Any) -> Prepared:
+        [views] = views.by_scene()
+        if read == "mesh":
+            assert views.mesh.is_file()
+            return Prepared(lambda _: np.ones(views.grid, np.float32))
+        depth_m = {row["view_id"]: row["left_depth"] for row in views.rows("left_depth")}
+        return Prepared(lambda row: depth_m[row["view_id"]])
+
+    method = replace(counting_method([]), prepare=prepare)
+    words = f"^whole: reads {read}, expected MethodInfo(..., uses_ground_truth=True)$"
+    with pytest.raises(MethodError, match=words.replace("(", r"\(").replace(")", r"\)")):
+        predict(method, tiny_root, tmp_path / "whole.zip", configs=["lattice"])
+    assert not (tmp_path / "whole.zip").exists()
+    method = replace(method, info=replace(method.info, uses_ground_truth=True))
+    predict(method, tiny_root, tmp_path / "whole.zip", configs=["lattice"])
+    assert not score(tmp_path / "whole.zip", tiny_root).tables["lattice"].ranked
+
+
+def test_columns_given_as_string_raise_an_error() -> None:
+    with pytest.raises(MethodError, match="mine: columns is the text 'left_rgb', expected a tuple of names"):
         MethodInfo("mine", "a test", "left_rgb", False, "here", "MIT")  # type: ignore[arg-type]
 
 

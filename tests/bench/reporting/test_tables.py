@@ -21,7 +21,7 @@ from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.detections import DetectionPage, PageTable, print_page
 from rebar_depth_bench.reporting.latex import latex_table
 from rebar_depth_bench.reporting.published import load_published, published_rows
-from rebar_depth_bench.reporting.tables import print_comparison, print_paper_table, print_table
+from rebar_depth_bench.reporting.tables import comparison_cells, print_comparison, print_paper_table, print_table
 from rebar_depth_bench.scoring.columns import DASH, coverage_percent, number
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.frames import frame_csv
@@ -95,6 +95,22 @@ def test_notes_and_published_rows_appear_only_where_they_apply() -> None:
     )
     assert "paper" not in own
     assert "Not ranked: no views." in formatting.table_notes(tabulate([]))
+
+
+def test_results_of_some_views_are_named_and_not_marked_as_declared() -> None:
+    """Only the declared use of ground truth has its mark."""
+    some, whole = result(scored_view("lattice/0000"), method="some"), result(scored_view("lattice/0000"))
+    some = replace(some, tables={"lattice": some.tables["lattice"].of_some_views(9)})
+    text = printed(lambda console: print_paper_table([some, whole], console, published=False), 80)
+    assert "‡" not in text
+    assert "Not ranked: some, lattice (1 of 9 views)." in text
+    assert "Not ranked: some, lattice (1 of 9 views)." in latex_table([some, whole], published=False)
+
+
+def test_coverage_of_a_comparison_is_rounded_down_as_everywhere() -> None:
+    first, other = (result(scored_view("lattice/0000", coverage=share)) for share in (0.794957, 1.0))
+    rows = [comparison_cells(row) for row in compare(first, other).configs["lattice"]]
+    assert ["79.4", "100.0"] in [cells[1:3] for cells in rows]
 
 
 def test_notes_state_what_is_resampled() -> None:

@@ -58,6 +58,30 @@ def test_result_is_read_as_it_was_written(relative: Result, tiny_root: Path, wri
         read_result(mixed, "result.json")
 
 
+def test_results_that_lack_the_numbers_of_their_kind_are_refused(
+    relative: Result, write: Write, tiny_root: Path
+) -> None:
+    metric = rdb.score(write("metric", "metric", lambda z: z), tiny_root)
+
+    def refuse(result: Result, change: Callable[[Any], object], words: str) -> None:
+        document = json.loads(result.to_json())
+        change(document)
+        with pytest.raises(rdb.InputError, match=words):
+            read_result(json.dumps(document).encode(), "result.json")
+
+    refuse(relative, lambda top: top.update(prediction="metric"), "prediction: .*metric.*expected .*scale")
+    refuse(metric, lambda top: top.update(declared_prediction="metric"), "declared_prediction without prediction")
+    refuse(relative, lambda top: top.update(prediction="scale"), "aligned_robust, .*expected aligned, constant")
+    aligned = json.loads(relative.to_json())["views"][0]["aligned"]
+    places: list[Callable[[Any], Any]] = [lambda top: top["tables"]["lattice"], lambda top: top["views"][0]]
+    for at in places:
+        for name in ("constant", "aligned_robust"):
+            words = "or view has aligned, [a-z_]+, expected aligned, aligned_robust, constant"
+            refuse(relative, lambda top, at=at, name=name: at(top).update({name: None}), words)  # type: ignore[misc]
+        words = "or view has rank_error, aligned, expected rank_error"
+        refuse(metric, lambda top, at=at: at(top).update(aligned=aligned), words)  # type: ignore[misc]
+
+
 def test_intervals_are_those_of_the_view_numbers(relative: Result) -> None:
     """Nine sparse views are nine blocks: the interval of the mean contains it and is narrower than the views."""
     table = relative.tables["lattice"]
@@ -104,9 +128,8 @@ def test_metric_archives_are_aligned_as_weaker_kinds(
     with pytest.raises(rdb.SubmissionError, match=f"of the kind {kind}, expected metric ones: .*scored as scale"):
         rdb.score(tmp_path / "other.zip", tiny_root, align="scale")
     for align in ("metric", "metres"):  # As the command.
-        with pytest.raises(
-            rdb.InputError, match=f"align is {align}, expected one of scale, affine-depth, affine-d"
-        ):
+        words = f"align is {align}, expected one of scale, affine-depth, .*, or None, which scores metric .*"
+        with pytest.raises(rdb.InputError, match=words):
             rdb.score(tmp_path / "metric.zip", tiny_root, align=align)
 
 

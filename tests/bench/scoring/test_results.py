@@ -210,7 +210,7 @@ def set_groups(groups: object) -> Change:
         (set_groups({"a" * 800_000: {}}), f"invalid tables.lattice.groups.'{'a' * 59} ..."),
         (set_groups({"family": {str(key): 0 for key in range(20_000)}}), "size tables"),
         (set_groups({str(key): {str(group): 0 for group in range(100)} for key in range(1000)}), "size tables"),
-        (set_groups({"family": {"wall": TABLE | {"rank_error": None}}}), "missing "),
+        (set_groups({"family": {"wall": TABLE | {"rank_error": None}}}), "conflict "),
     ],
 )
 def test_wrong_value_is_refused_with_its_place(change: Change, location: str) -> None:
