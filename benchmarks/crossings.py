@@ -12,9 +12,9 @@ for all archives:
    diameter, and the tie point lies one diameter behind that front;
 4. the confidence is the share of steel pixels around the point.
 
-The results there are of the datasets and archives of ``python -m benchmarks.reference OUT SET``: of ``subset`` with
-``truth``, ``sgbm``, ``sgbm-filled`` and ``sweep-aruco`` (``crossings.json``), and of ``cages`` with ``truth``,
-``sgbm``, ``sgbm-filled`` and ``lidar-mobile`` (``crossings-cages.json``).
+The results there are of the datasets and archives of ``python -m benchmarks.reference OUT SET``: of ``subset``
+with ``truth``, ``sgbm``, ``sgbm-filled`` and ``sweep-aruco`` (``crossings.json``), and of ``cages`` with
+``truth``, ``sgbm``, ``sgbm-filled`` and ``lidar-mobile`` (``crossings-cages.json``).
 """
 
 from __future__ import annotations
