@@ -263,7 +263,7 @@ sys.exit(status)
 def test_measure_of_an_unknown_statistic_or_unit_is_refused() -> None:
     for arguments, words in ((("mm", "", "d", "s", "p90"), "new: got 'p90', expected"), (("km", "", "d"), "'km'")):
         with pytest.raises(ValueError, match=words):
-            Measure("new", "New", *arguments)  # type: ignore[arg-type]
+            Measure("new", "New", *arguments)
 
 
 @pytest.mark.slow
