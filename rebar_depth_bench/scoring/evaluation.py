@@ -179,7 +179,7 @@ def open_evaluation(
 
 def score(
     archive: str | os.PathLike[str],
-    root: str | Path | DatasetFolder,
+    root: str | Path,
     *,
     workers: int | None = None,
     expect_digest: str | None = None,
