@@ -210,7 +210,7 @@ _BASELINE_M = quantity(0.001, 10, "metres")
 
 
 _Matrix = Annotated[tuple[Triple, Triple, Triple], Strict(False)]
-_Offset = Annotated[float, quantity(-10, 10, "metres")]
+_Offset = Annotated[float, quantity(-10, 10, "metres; the unit of a file is stated in cameras.toml")]
 _Pixels = Annotated[float, Expected("a number of pixels")]
 _Side = Annotated[int, whole_number(SIDES_PX[0], SIDES_PX[-1])]
 _PINHOLE_ENTRIES: Mapping[str, tuple[int, int]] = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}

@@ -144,7 +144,8 @@ def scale_chart(tables: Mapping[str, Table], views: Mapping[str, Sequence[ViewSc
     """Return the chart of every view's scale factor, one strip per config, with its median and the line s = 1."""
     scales = {name: [view.scale for view in views.get(name, ()) if view.scale is not None] for name in tables}
     axis = log_axis_with_one([scale for strip in scales.values() for scale in strip], _ROW_LEFT, RIGHT)
-    marks = _path("one", _down(axis.at(1.0), 14, _row_y(len(tables)) - 20))
+    rows = [_row_y(index) for index in range(len(tables))]
+    marks = _path("one", "".join(_down(axis.at(1.0), y - 13, y + 13) for y in rows))  # Not through their texts.
     medians = {name: SCALE.text(table.scale_median) for name, table in tables.items()}
     for index, (name, strip) in enumerate(scales.items()):
         y = _row_y(index)

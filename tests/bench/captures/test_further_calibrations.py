@@ -73,6 +73,11 @@ def test_calib_txt_is_scaled_and_serves_images_of_one_camera(tmp_path: Path) -> 
         ("doffs=32.778", "doffs=31.5", "doffs: line 3: got 31.5, expected cx of cam1 minus cx of cam0, 32.778"),
         ("baseline=193.001\n", "", "baseline: missing"),
         ("baseline=193.001", "baseline=0.193", "cam0: line 1: .*got .*baseline a number from 0.001 to 10 metres"),
+        (
+            "baseline=193.001",
+            "baseline=193001",
+            "got -193.001, expected .*metres; the unit .* is stated in cameras.toml",
+        ),
         ("; 0 0 1]\ncam1", "]\ncam1", "cam0: line 1: got .*expected numbers of shape 3 x 3"),
         ("width=741", "width", "line 5: expected key=value"),
         ("width=741", "doffs=1", "line 5: expected key=value of a calib.txt as Middlebury's, each key once"),
