@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import lzma
 import subprocess
 import sys
 from collections.abc import Callable
@@ -15,8 +14,6 @@ TINY = ("--width", "160", "--height", "90", "--quality", "preview")
 """Small pictures, rendered in two passes like those of the default quality."""
 TINY_VIEWS = 9
 """One more than a shard holds."""
-TINY_MESH = Path(__file__).parent / "data" / "lattice.ply.xz"
-"""Mesh of the tiny dataset, packed, which the package leaves out."""
 TWO_BARS = Path(__file__).parent / "data" / "two-bars.toml"
 """Cage that renders in a third of the time of the lattice."""
 
@@ -60,10 +57,3 @@ def contents(root: Path) -> dict[str, str]:
         for name, path in named.items()
         if not name.startswith(".")
     }
-
-
-def unpack_mesh(root: Path) -> None:
-    """Write the mesh of the tiny dataset into a copy of it."""
-    mesh = root / "meshes" / TINY_MESH.stem
-    mesh.parent.mkdir()
-    mesh.write_bytes(lzma.decompress(TINY_MESH.read_bytes()))

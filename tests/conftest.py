@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import tempfile
 from collections.abc import Callable, Iterator
@@ -22,7 +21,7 @@ os.environ.update(HF_HOME=_CACHES.name, XDG_CACHE_HOME=_CACHES.name, HF_HUB_OFFL
 os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
 
 from rebar_depth_bench import SubmissionWriter, load  # noqa: E402
-from rebar_depth_bench.cli.demo import SAMPLE  # noqa: E402
+from rebar_depth_bench.cli.demo import SAMPLE, copy_sample  # noqa: E402
 from tests import building, dask_cluster, requirements  # noqa: E402
 from tests.building import RunBuild, StartBuild  # noqa: E402
 from tests.dask_cluster import NewCluster  # noqa: E402
@@ -179,13 +178,12 @@ def chromium_program() -> str:
 
 @pytest.fixture(scope="session")
 def tiny_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a copy of the package's sample, with its mesh: lattice (nine views), lattice-orbit (two), 160 x 90.
+    """Return a copy of the package's sample: lattice (nine views), lattice-orbit (two), 160 x 90.
 
     ``make sample-data`` renders it anew; the nightly tier compares it with a fresh render.
     """
     root = tmp_path_factory.mktemp("tiny") / "dataset"
-    shutil.copytree(TINY_DATASET, root)
-    building.unpack_mesh(root)
+    copy_sample(root)
     return root
 
 

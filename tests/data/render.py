@@ -10,7 +10,7 @@ from pathlib import Path
 import pyarrow.parquet as pq
 
 from rebar_depth_bench.cli.demo import SAMPLE
-from tests.building import TINY, TINY_MESH, TINY_VIEWS, run_build
+from tests.building import TINY, TINY_VIEWS, run_build
 from tests.data import orbit
 
 
@@ -32,13 +32,15 @@ def render_orbit(root: Path) -> dict[str, bytes]:
 
 
 def main() -> None:
-    """Render the sample data, pack the mesh of the tiny dataset, and replace all in the tree."""
+    """Render the sample data, pack its mesh, and replace all in the tree."""
     with tempfile.TemporaryDirectory() as folder:
         root = Path(folder) / "dataset"
         render(root)
-        TINY_MESH.write_bytes(lzma.compress((root / "meshes" / TINY_MESH.stem).read_bytes(), preset=9))
+        for mesh in (root / "meshes").iterdir():
+            mesh.with_suffix(".ply.xz").write_bytes(lzma.compress(mesh.read_bytes(), preset=9))
+            mesh.unlink()
         shutil.rmtree(SAMPLE, ignore_errors=True)
-        shutil.copytree(root, SAMPLE, ignore=shutil.ignore_patterns("meshes"))
+        shutil.copytree(root, SAMPLE)
         shutil.rmtree(orbit.IMAGES, ignore_errors=True)
         orbit.IMAGES.mkdir()
         for name, content in render_orbit(Path(folder) / "orbit").items():

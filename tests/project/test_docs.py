@@ -27,7 +27,6 @@ from dataset_builder.scene.variants.registry import VARIANTS
 from dataset_builder.user_files.scene_schema import read_scene_toml
 from leaderboard.cli import argument_parser as board_parser
 from rebar_depth_bench.bar_crossings.table import CROSSINGS_SCHEMA
-from rebar_depth_bench.cli.demo import SAMPLE
 from rebar_depth_bench.cli.main import argument_parser as bench_parser
 from rebar_depth_bench.cli.main import main as bench_main
 from rebar_depth_bench.data.bars import BARS_SCHEMA
@@ -151,7 +150,7 @@ def test_documented_python_runs(
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "demo-output" / "sample").mkdir(parents=True)
-    (tmp_path / "demo-output" / "sample" / "dataset").symlink_to(SAMPLE)
+    (tmp_path / "demo-output" / "sample" / "dataset").symlink_to(tiny_root)
     (tmp_path / "demo-output" / "dataset").symlink_to(tiny_root)
     names: dict[str, object] = {}
     for block, output in python_blocks(page):

@@ -324,6 +324,7 @@ def test_demo_on_the_sample_prints_what_the_readme_shows(tmp_path: Path) -> None
     shown, *_ = blocks(PAGES[0], "text")
     assert "\n".join(map(str.rstrip, finished.stdout.splitlines())).startswith(shown)
     out = tmp_path / "sample"
+    assert run_bench("verify", out / "dataset").returncode == 0
     reports = [Path(line.strip()) for line in finished.stdout.partition("Reports")[2].splitlines()[1:]]
     assert reports == [out / f"{name}.html" for name in DEMO_METHODS]
     assert all(path.read_text().startswith("<!DOCTYPE html>") for path in reports)
