@@ -214,7 +214,7 @@ def _equal_at_the_start(texts: Sequence[Sequence[str]]) -> int:
 
 
 def _merged(rows: Sequence[Mapping[str, str]]) -> dict[str, Any]:
-    """Return one row for measures whose definitions end alike: their names, and "**or**" between what differs."""
+    """Return one row for measures whose definitions end alike: their names, and what differs in brackets."""
     names = [f"`{row['name']}`" for row in rows]
     if len(rows) == 1:
         return {**rows[0], "names": names}
@@ -223,7 +223,8 @@ def _merged(rows: Sequence[Mapping[str, str]]) -> dict[str, Any]:
     beginnings = [one[:-end] for one in words]
     start = _equal_at_the_start(beginnings)
     *different, last = [" ".join(one[start:]) or "all" for one in beginnings]
-    alternatives = " **or** ".join((*(text.rstrip(",:") for text in different), last))
+    stripped = last.rstrip(",:")
+    alternatives = f"[{'; '.join((*(text.rstrip(',:') for text in different), stripped))}]{last[len(stripped) :]}"
     columns = {key: [row[key] or "-" for row in rows] for key in ("unit", "better", "statistic")}
     return {
         "names": names,

@@ -74,9 +74,12 @@ def test_measures_whose_definitions_end_alike_share_a_row() -> None:
     row = next(
         line for line in rows if "`cover_bias_mm`, `cover_std_mm`, `cover_median_mm`, `cover_p95_mm`" in line
     )
-    assert "| - / - / lower / lower | mean / std / median / p95 | Mean over what was found" in row
+    assert (
+        "| - / - / lower / lower | mean / std / median / p95 | [Mean over what was found; Standard deviation"
+        in row
+    )
     assert row.count("fitted axis minus true axis") == 1
-    assert "95th percentile of the absolute value: fitted" in row
+    assert "95th percentile of the absolute value]: fitted" in row
 
 
 def test_every_column_is_described_once() -> None:
