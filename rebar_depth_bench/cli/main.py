@@ -32,7 +32,9 @@ COMMANDS: Mapping[str, Command] = {
         add="add_verify_arguments",
         run="run_verify",
     ),
-    "methods": module_command(f"{_CLI}.methods", "list the available methods"),
+    "methods": module_command(
+        f"{_CLI}.predict", "list the available methods", add="add_methods_arguments", run="run_methods"
+    ),
     "predict": module_command(f"{_CLI}.predict", "run a method on a dataset and write a submission archive"),
     "submit": module_command(
         f"{_CLI}.submit", "upload an archive to a leaderboard, wait for its score and print the table"
