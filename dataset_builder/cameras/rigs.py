@@ -1,10 +1,10 @@
-"""Stereo rigs by name, and their cameras from a ``RigSpec`` and the left pose of each view."""
+"""The bundled ZED rig, and the cameras of a rig from a ``RigSpec`` and the left pose of each view."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from importlib import resources
-from math import isclose, radians, tan
+from math import isclose
 
 import numpy as np
 from jaxtyping import Float64
@@ -109,27 +109,3 @@ GRIDS: Mapping[str, Callable[[RigSpec, Pose], dict[str, Camera]]] = {
     "rectified": _rectified_cameras,
 }
 """Functions that return the cameras of a rig, by the name of the grid in ``RigSpec.grid``."""
-
-
-def focal_of_view_px(horizontal_deg: float) -> float:
-    """Return the focal length that shows ``horizontal_deg`` in an image 1280 px wide, to 0.1 px."""
-    return round(NOMINAL_WIDTH / 2 / tan(radians(horizontal_deg) / 2), 1)
-
-
-def _rig(camera: str, baseline_m: float, focal_px: float) -> FocalRigSpec:
-    return FocalRigSpec(baseline_m=baseline_m, camera=camera, focal_px=focal_px)
-
-
-_ALL = (
-    _rig("Stereolabs ZED", 0.120, NOMINAL_FOCAL_PX),  # HD720; the rig of the paper.
-    _rig("Luxonis OAK-D", 0.075, 882.5),  # Documentation of stereo depth, 1280 x 800 pixels.
-    _rig("Intel RealSense D415", 0.055, focal_of_view_px(65.0)),
-    _rig("Intel RealSense D435", 0.050, focal_of_view_px(87.0)),
-    _rig("Intel RealSense D455", 0.095, focal_of_view_px(87.0)),
-)
-STEREO_CAMERAS: Mapping[str, FocalRigSpec] = {rig.camera: rig for rig in _ALL}
-"""Rigs of stereo cameras that can be bought, by name, for the views of generated cages.
-
-The fields of view are those of the pair of cameras that depth is computed from, at 16:9, as their makers state
-them. The images are those of ideal pinholes: the differences that matter here are focal length and baseline.
-"""

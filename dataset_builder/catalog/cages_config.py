@@ -10,10 +10,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from dataset_builder.cameras.rigs import STEREO_CAMERAS
 from dataset_builder.scene.environments.surroundings import FORMWORK_FAMILIES, LIFE_SIZE_ENVIRONMENTS, SURROUNDINGS
 from dataset_builder.scene.variants.registry import EXCLUSIVE_SLOTS, SENSOR, SHADOWS, VARIANTS
 from dataset_builder.specs.config_specs import (
+    STEREO_CAMERAS,
     AppearanceSpec,
     ColourSpec,
     GeneratedCageSpec,

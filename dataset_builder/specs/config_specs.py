@@ -8,13 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from math import radians, tan
 
 from dataset_builder.specs.file_specs import CageFileSpec, MeshFileSpec
 from rebar_depth_bench.base.names import TEST_SPLIT, scene_prefix, view_id
 from rebar_depth_bench.captures.calibration import StereoCalibration
 from rebar_depth_bench.data.schema import CENTRE, RANDOM_VIEWS, SURVEY
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
-from rebar_depth_bench.geometry.cameras import NOMINAL_FOCAL_PX
+from rebar_depth_bench.geometry.cameras import NOMINAL_FOCAL_PX, NOMINAL_WIDTH
 
 
 @dataclass(frozen=True)
@@ -208,6 +209,30 @@ class FocalRigSpec(RigSpec):
 
     camera: str = ""
     focal_px: float = NOMINAL_FOCAL_PX
+
+
+def focal_of_view_px(horizontal_deg: float) -> float:
+    """Return the focal length that shows ``horizontal_deg`` in an image 1280 px wide, to 0.1 px."""
+    return round(NOMINAL_WIDTH / 2 / tan(radians(horizontal_deg) / 2), 1)
+
+
+def _rig(camera: str, baseline_m: float, focal_px: float) -> FocalRigSpec:
+    return FocalRigSpec(baseline_m=baseline_m, camera=camera, focal_px=focal_px)
+
+
+_ALL = (
+    _rig("Stereolabs ZED", 0.120, NOMINAL_FOCAL_PX),  # HD720; the rig of the paper.
+    _rig("Luxonis OAK-D", 0.075, 882.5),  # Documentation of stereo depth, 1280 x 800 pixels.
+    _rig("Intel RealSense D415", 0.055, focal_of_view_px(65.0)),
+    _rig("Intel RealSense D435", 0.050, focal_of_view_px(87.0)),
+    _rig("Intel RealSense D455", 0.095, focal_of_view_px(87.0)),
+)
+STEREO_CAMERAS: Mapping[str, FocalRigSpec] = {rig.camera: rig for rig in _ALL}
+"""Rigs of stereo cameras that can be bought, by name, for the views of generated cages.
+
+The fields of view are those of the pair of cameras that depth is computed from, at 16:9, as their makers state
+them. The images are those of ideal pinholes: the differences that matter here are focal length and baseline.
+"""
 
 
 CPU = "cpu"

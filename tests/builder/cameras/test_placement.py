@@ -23,7 +23,7 @@ from dataset_builder.cameras.camera_placement import (
     with_random_stations,
     with_stations,
 )
-from dataset_builder.cameras.rigs import STEREO_CAMERAS, rig_cameras
+from dataset_builder.cameras.rigs import rig_cameras
 from dataset_builder.cameras.trajectories import aim_point_m, camera_offsets_m, poses, view_count
 from dataset_builder.catalog.named_configs import BuildRequest
 from dataset_builder.catalog.scene_file import scene_config
@@ -34,6 +34,7 @@ from dataset_builder.scene.raycast import RayCaster
 from dataset_builder.scene.shapes.point_sets import SurfaceSampler
 from dataset_builder.scene.shapes.solids import merge_meshes, world_mesh
 from dataset_builder.specs.config_specs import (
+    STEREO_CAMERAS,
     ConfigSpec,
     FocalRigSpec,
     GeneratedCageSpec,

@@ -10,14 +10,11 @@ import pytest
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.cameras.rigs import STEREO_CAMERAS, focal_of_view_px, rig_cameras, zed_rig
+from dataset_builder.cameras.rigs import rig_cameras, zed_rig
 from dataset_builder.cameras.trajectories import look_at_with_rig
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.scene.raycast import RayCaster
-from dataset_builder.specs.config_specs import (
-    FocalRigSpec,
-    RigSpec,
-)
+from dataset_builder.specs.config_specs import STEREO_CAMERAS, FocalRigSpec, RigSpec, focal_of_view_px
 from rebar_depth_bench.captures.calibration import StereoCalibration, scale_calibration
 from rebar_depth_bench.geometry.cameras import (
     Camera,
