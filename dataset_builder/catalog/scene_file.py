@@ -24,6 +24,7 @@ from dataset_builder.scene.assemblies.cage import Cage
 from dataset_builder.scene.environments.surroundings import SURROUNDINGS
 from dataset_builder.scene.model import Assembly
 from dataset_builder.specs.config_specs import (
+    STEREO_CAMERAS,
     ConfigSpec,
     DomeSpec,
     RigSpec,
@@ -75,7 +76,7 @@ def scene_config(path: str | os.PathLike[str]) -> ConfigSpec:
 
 
 def read_scene(path: str | os.PathLike[str]) -> UserScene:
-    """Return the config of a scene file, with the default rig, colour settings and seed, and its cage.
+    """Return the config of a scene file, with the default colour settings and seed, and its cage.
 
     Defaults of omitted keys: the name is that of the file in lower case, with hyphens; the cameras are
     ``default_dome``, or a survey if that exceeds ``MAX_DOME_M``; the environment is the laboratory if all steel is
@@ -98,12 +99,13 @@ def read_scene(path: str | os.PathLike[str]) -> UserScene:
     environment = scene_toml.environment or (_LARGE if misfit(_SMALL, assembly, trajectory) else _SMALL)
     if problem := misfit(environment, assembly, trajectory):
         raise InputError(f"{path}: {problem}: {_ADVICE if environment == _LARGE else _ADVICE_OF_ROOMS}")
+    rig = RigSpec() if scene_toml.rig is None else STEREO_CAMERAS[scene_toml.rig]
     try:
         check_above_ground(assembly, name)
         if isinstance(trajectory, SurveySpec):
             space = SURROUNDINGS[environment].cameras
-            trajectory = with_stations(trajectory, assembly, space, RigSpec(), str(path))
-        config = ConfigSpec(name, SceneSpec(name, assembly_spec, None, environment), trajectory)
+            trajectory = with_stations(trajectory, assembly, space, rig, str(path))
+        config = ConfigSpec(name, SceneSpec(name, assembly_spec, None, environment), trajectory, rig)
         check_fits(assembly, config)
     except MeshError as error:
         raise MeshError(f"{path}: {error}") from None

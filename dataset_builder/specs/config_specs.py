@@ -228,7 +228,7 @@ _ALL = (
     _rig("Intel RealSense D455", 0.095, focal_of_view_px(87.0)),
 )
 STEREO_CAMERAS: Mapping[str, FocalRigSpec] = {rig.camera: rig for rig in _ALL}
-"""Rigs of stereo cameras that can be bought, by name, for the views of generated cages.
+"""Rigs of stereo cameras that can be bought, by name, for generated cages and scene files.
 
 The fields of view are those of the pair of cameras that depth is computed from, at 16:9, as their makers state
 them. The images are those of ideal pinholes: the differences that matter here are focal length and baseline.

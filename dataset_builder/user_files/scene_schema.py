@@ -5,6 +5,7 @@ name = "my-beam"              # default: the file name; lower-case letters, digi
 unit = "mm"                   # of every length: m, cm, mm, in, ft; default with ifc: m
 environment = "laboratory"    # or "outdoors", "hall", "deck"
 board = 6                     # markers on the A3 sheet: 6, 12, or false for no sheet
+rig = "Intel RealSense D455"  # baseline and field of view; default: 0.12 m, 84.9 degrees
 
 [cameras]                     # default: a dome around the assembly, or a survey beyond 1 m
 kind = "dome"                 # or "ring" with radius, elevation_deg, azimuths;
@@ -53,7 +54,7 @@ from pydantic import AfterValidator, BeforeValidator, Field, Strict, ValidationI
 from dataset_builder.scene.environments.surroundings import SURROUNDINGS
 from dataset_builder.scene.model import MAX_BARS, to_metres
 from dataset_builder.scene.variants.registry import VARIANTS
-from dataset_builder.specs.config_specs import DomeSpec, RigSpec, RingSpec, SurveySpec
+from dataset_builder.specs.config_specs import STEREO_CAMERAS, DomeSpec, RigSpec, RingSpec, SurveySpec
 from dataset_builder.specs.file_specs import KEYS, Origin, PlacementSpec, Selection, Trust, Up
 from rebar_depth_bench.base.errors import InputError, Problem
 from rebar_depth_bench.base.reading import is_below, parse_toml
@@ -149,9 +150,7 @@ _Point = Annotated[
 ]
 _Step = Annotated[_Point, Expected("a step that is not zero, [x, y, z]", any)]
 _Distance = Annotated[
-    float,
-    number(0, expected="a distance above 0, up to 1e9"),
-    AfterValidator(_distance_in_metres),
+    float, number(0, expected="a distance above 0, up to 1e9"), AfterValidator(_distance_in_metres)
 ]
 _Distances = Annotated[tuple[_Distance, ...], Strict(False), _list_of("a list of distances")]
 _Elevation = Annotated[float, number(0, 89, "degrees above 0, up to 89")]
@@ -266,6 +265,7 @@ class SceneToml(StrictModel):
     environment: Annotated[str, one_of(*SURROUNDINGS)] | None = None
     board: Annotated[int | bool, Expected("6, 12 or false", lambda markers: markers in (0, 6, 12))] | None = None
     cameras: _Trajectory | None = None
+    rig: Annotated[str, one_of(*STEREO_CAMERAS)] | None = None
     up: Annotated[Up, one_of("z", "y")] = "z"
     origin: Annotated[Origin, one_of("centre", "keep")] | None = None
     rotate_deg: Annotated[float, number(-360, 360, "degrees from -360 to 360")] = 0.0

@@ -108,7 +108,8 @@ SIZE = ("--width", "192", "--height", "108", "--no-colour")
 
 @pytest.mark.slow
 def test_build_of_life_size_column(tmp_path: Path, run_build: RunBuild) -> None:
-    path = write_scene(tmp_path, scene(column(), CAMERAS), "column.toml")
+    content = f'rig = "Luxonis OAK-D"\n{scene(column(), CAMERAS)}'
+    path = write_scene(tmp_path, content, "column.toml")
     root = tmp_path / "root"
     estimate = run_in_process(main, "--out", root, "--scene", path, "--views", "4", *SIZE, "--dry-run")
     assert estimate.returncode == 0, estimate.stderr
@@ -123,6 +124,7 @@ def test_build_of_life_size_column(tmp_path: Path, run_build: RunBuild) -> None:
     for row, n in zip(rdb.load(root, "column"), (1, 3, 5, 7), strict=True):
         centre_m, aimed_m = config.scene.entry["protocol"]["stations"][n]
         np.testing.assert_allclose(camera_centre(row["left_cam_from_world"]), centre_m, atol=1e-9)
+        assert (row["baseline_m"], row["left_K"][0, 0]) == (0.075, pytest.approx(882.5 * 192 / 1280, rel=1e-6))
         steel_m = row["left_depth"][row["left_mask"]]
         distance_m = float(np.linalg.norm(np.subtract(centre_m, aimed_m)))
         assert 0.5 * distance_m < np.median(steel_m) < 1.5 * distance_m

@@ -81,6 +81,7 @@ INVALID_KEYS = [
     ("board = true", "invalid board"),
     ("board = 7", "invalid board"),
     ("board = 6.0", "invalid board"),
+    ("rig = 'ZED'", "invalid rig"),
 ]
 INVALID_CAMERAS = [
     ("[cameras]\n", "missing cameras.kind"),
@@ -198,7 +199,8 @@ def test_conflicts_are_reported_with_other_problems(tmp_path: Path) -> None:
 def test_documented_example_is_valid() -> None:
     example = (scene_schema.__doc__ or "").split("```")[1].removeprefix("toml")
     scene = read_scene_toml(example.encode(), "example")
-    assert (scene.name, scene.board, scene.cameras) == ("my-beam", 6, DomeSpec((0.3, 0.4), (15.0, 45.0), 12))
+    assert (scene.name, scene.board, scene.rig) == ("my-beam", 6, "Intel RealSense D455")
+    assert scene.cameras == DomeSpec((0.3, 0.4), (15.0, 45.0), 12)
     corners_m = ((-0.15, 0.0, 0.005), (0.15, 0.0, 0.005), (0.15, 0.0, 0.08))
     [bar] = scene.bar
     assert (bar.count, bar.step_m) == (4, (0.0, 0.05, 0.0))
