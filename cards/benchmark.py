@@ -142,7 +142,6 @@ def results_page() -> str:
     learned = learned_results()
     text = render(
         "results.md.j2",
-        plain_sets=[f"`{name}`" for name in (*FULL_SETS, SUBSET, CAGES) if reference_context(name)["is_plain"]],
         full=[reference_context(name) for name in FULL_SETS],
         subset=reference_context(SUBSET),
         cages=reference_context(CAGES),
@@ -170,7 +169,7 @@ PAGES: Mapping[Path, Callable[[], str]] = {
 
 def _method_row(method: AnyMethod) -> dict[str, str]:
     info = method.info
-    name = f"`{info.name}`{' †' if info.uses_ground_truth else ''}"
+    name = f"`{info.name}`{' ‡' if info.uses_ground_truth else ''}"
     what = f"{info.summary} ({info.untested_note})" if info.untested_note else info.summary
     needs = ", ".join(info.columns) or ("all views of a config" if info.inputs == "multi-view" else "nothing")
     return {"name": name, "what": what, "needs": needs, "licence": info.licence}
@@ -222,12 +221,13 @@ def _merged(rows: Sequence[Mapping[str, str]]) -> dict[str, Any]:
     end = _common_end(row["definition"] for row in rows)
     beginnings = [one[:-end] for one in words]
     start = _equal_at_the_start(beginnings)
-    *different, last = [" ".join(one[start:]) or "all" for one in beginnings]
-    stripped = last.rstrip(",:")
-    alternatives = f"[{'; '.join((*(text.rstrip(',:') for text in different), stripped))}]{last[len(stripped) :]}"
+    *_, last = texts = [" ".join(one[start:]) or "all" for one in beginnings]
+    listed = "; ".join(text.rstrip(",:") for text in texts)
+    alternatives = f"[{listed}]{last[len(last.rstrip(',:')) :]}"
     columns = {key: [row[key] or "-" for row in rows] for key in ("unit", "better", "statistic")}
     return {
         "names": names,
+        "title": rows[0]["title"] if len({row["title"] for row in rows}) == 1 else "",
         "definition": " ".join((*words[0][:start], alternatives, *words[0][-end:])),
         **{
             key: " / ".join(cells) if len(set(cells)) > 1 else cells[0].strip("-")
@@ -246,6 +246,7 @@ def _measure_row(name: str, measures: Sequence[Measure]) -> dict[str, str]:
         definition = f"{re.sub(pattern, ' N ', definition, count=1)}; N = {values}"
     return {
         "name": name,
+        "title": first.title.partition(":")[0] if ":" in first.title and parameter is None else "",
         "unit": first.unit,
         "better": first.better,
         "statistic": first.statistic,

@@ -22,6 +22,7 @@ from rebar_depth_bench.data.schema import (
     MatRecord,
     References,
     Scene,
+    SceneRig,
     Survey,
     Trajectory,
     column_kind,
@@ -35,7 +36,7 @@ if TYPE_CHECKING:
 
 PRETTY_NAME = "Industrial rebar metric depth"
 _OPTICS_TEXTS = {
-    "ideal": "",
+    "ideal": "ideal pinholes with baseline and field of view of ",
     "raw": "factory-calibrated lenses, on the distorted grid as the sensor sees it",
     "rectified": "factory-calibrated lenses, on the grid that OpenCV's stereoRectify makes of the pair; "
     "depth along the rectified axis",
@@ -184,7 +185,7 @@ def _split_row(config: DatasetConfig) -> dict[str, Any]:
         "steel_source": f"{len(config.scenes)} generated cages",
         "distance": f"{min(distances_m):g}-{max(distances_m):g} m, random views",
         "sheet": config.sheet if split == config.manifest_entry["scenes"][0]["split"] else None,
-        "optics": f"ideal pinholes with baseline and field of view of {', '.join(sorted(cameras))}",
+        "optics": _OPTICS_TEXTS["ideal"] + ", ".join(sorted(cameras)),
     }
 
 
@@ -214,8 +215,13 @@ def _config_row(config: DatasetConfig) -> dict[str, Any]:
         "steel_depth": _steel_depth(config.name, scene),
         "variants": scene.appearance.variants,
         "panorama": light.image if light is not None else None,
-        "optics": _OPTICS_TEXTS[scene.rig.grid] if scene.rig is not None else "",
+        "optics": _optics(scene.rig) if scene.rig is not None else "",
     }
+
+
+def _optics(rig: SceneRig) -> str:
+    """Return the optics of a rig in words; an empty string for the default rig."""
+    return "" if rig.grid == "ideal" and not rig.camera else _OPTICS_TEXTS[rig.grid] + rig.camera
 
 
 def _rendered_row(config: DatasetConfig) -> dict[str, Any]:

@@ -63,12 +63,12 @@ def _baseline_table(
 def learned_tables(configs: Mapping[str, Any]) -> dict[str, str]:
     """Return the Markdown tables of each config: disparities, metric methods, and all methods after alignment."""
     return {
-        name: "\n\n".join((_head(config), _metric_table(name, config), _aligned_table(name, config)))
+        name: "\n\n".join((_head(name, config), _metric_table(name, config), _aligned_table(name, config)))
         for name, config in configs.items()
     }
 
 
-def _head(config: Mapping[str, Any]) -> str:
+def _head(name: str, config: Mapping[str, Any]) -> str:
     low, middle, high = (number(value, 1) for value in config["disparity_px"])
     reach = "; ".join(
         f"up to {limit} px: {percent(reach['pixels'])} of the pixels, and all of them in {reach['views']} views"
@@ -76,7 +76,7 @@ def _head(config: Mapping[str, Any]) -> str:
     )
     of_scenes = f" of {config['scenes']} scenes" if config["scenes"] > 1 else ""
     return (
-        f"{config['views']} views{of_scenes}, {config['width']} x {config['height']}. "
+        f"{name}: {config['views']} views{of_scenes}, {config['width']} x {config['height']}. "
         f"True disparities: {low} to {high} px, median {middle} px; {reach}."
     )
 
@@ -144,7 +144,7 @@ def _title(method: str, row: Mapping[str, Any]) -> str:
 
 
 def _mark(row: Mapping[str, Any]) -> str:
-    return " †" if row["uses_ground_truth"] else ""
+    return " ‡" if row["uses_ground_truth"] else ""
 
 
 def _markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

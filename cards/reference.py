@@ -28,10 +28,7 @@ def results_file(set_name: str) -> Path:
 
 
 def reference_context(set_name: str) -> dict[str, Any]:
-    """Return the template variables of a set of results: command, renders, and rows by config.
-
-    ``is_plain`` states that the intervals are those of a version that did not name their method.
-    """
+    """Return the template variables of a set of results: command, renders, and rows by config."""
     document = json.loads(results_file(set_name).read_text())
     by_config: dict[str, list[tuple[str, Mapping[str, Any]]]] = {}
     for method, result in document["results"].items():
@@ -40,7 +37,6 @@ def reference_context(set_name: str) -> dict[str, Any]:
     return {
         "command": document["command"],
         "renders": document["renders"],
-        "is_plain": any(result.get("intervals") is None for result in document["results"].values()),
         "rows": {config: _method_rows(config, rows) for config, rows in by_config.items()},
         "errors": {
             config: {
@@ -92,7 +88,7 @@ def _single_bar_row(config: str, method: str, result: Mapping[str, Any]) -> dict
 
 
 def _mark(method: str) -> str:
-    return " †" if own_methods()[method].info.uses_ground_truth else ""
+    return " ‡" if own_methods()[method].info.uses_ground_truth else ""
 
 
 def _method_row_of(method: str, result: Mapping[str, Any], config: str) -> dict[str, str]:

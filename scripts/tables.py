@@ -12,6 +12,7 @@ import re
 from argparse import ArgumentParser, _SubParsersAction
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from itertools import groupby
+from math import atan2, degrees
 from pathlib import Path
 
 from pydantic import ByteSize
@@ -20,16 +21,18 @@ from cards.dataset import column_rows
 from dataset_builder.cli.main import argument_parser
 from dataset_builder.importing.view_cameras import BOP, NERFSTUDIO
 from dataset_builder.scene.variants.registry import VARIANTS
+from dataset_builder.specs.config_specs import STEREO_CAMERAS
 from leaderboard.settings import Settings
 from rebar_depth_bench.base import limits
 from rebar_depth_bench.captures.calibration_files import ZED_CONF
 from rebar_depth_bench.captures.fields import Field, FileFormat
 from rebar_depth_bench.captures.program_formats import CAMERA, KALIBR, MIDDLEBURY, PAIR
+from rebar_depth_bench.geometry.cameras import NOMINAL_WIDTH
 
 ROOT = Path(__file__).parents[1]
 PAGES = (
     ROOT / "SECURITY.md",
-    *(ROOT / "docs" / f"{name}.md" for name in ("build", "formats", "leaderboard-operator")),
+    *(ROOT / "docs" / f"{name}.md" for name in ("build", "cages", "formats", "leaderboard-operator")),
 )
 FORMATS = (ZED_CONF, CAMERA, PAIR, KALIBR, MIDDLEBURY, BOP, NERFSTUDIO)
 _BLOCK = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
@@ -106,6 +109,19 @@ def _variants() -> str:
     return _table("variant | what it does", rows)
 
 
+def _rigs() -> str:
+    """Return the stereo cameras that a scene file can name."""
+    rows = (
+        (
+            f'`"{name}"`',
+            f"{rig.baseline_m:.3f} m",
+            f"{2 * degrees(atan2(NOMINAL_WIDTH / 2, rig.focal_px)):.1f} degrees",
+        )
+        for name, rig in STEREO_CAMERAS.items()
+    )
+    return _table("rig | baseline | horizontal field of view", rows)
+
+
 def _columns() -> str:
     """Return the columns of a dataset, as the dataset card lists them."""
     rows = ((row["names"], row["type"], row["meaning"]) for row in column_rows())
@@ -141,6 +157,7 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "limits": _limits,
     "build-options": _build_options,
     "variants": _variants,
+    "rigs": _rigs,
     "columns": _columns,
     "formats": _formats,
 }

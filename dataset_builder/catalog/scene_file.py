@@ -47,7 +47,7 @@ RESERVED_NAMES = (*CONFIGS, *SWEEPS, CAGES, "meshes", "pictures", "scenes")
 NEAREST_RADIUS_PER_REACH = 2.5
 """Nearest dome radius per reach of the assembly, close to that of the lattice dome (2.67).
 
-At this distance the whole assembly is in the frame and fills much of it.
+At this distance the whole assembly is in the frame of the default rig and fills much of it.
 """
 
 MAX_DOME_M = 1.0
@@ -81,7 +81,7 @@ def read_scene(path: str | os.PathLike[str]) -> UserScene:
     Defaults of omitted keys: the name is that of the file in lower case, with hyphens; the cameras are
     ``default_dome``, or a survey if that exceeds ``MAX_DOME_M``; the environment is the laboratory if all steel is
     within 0.45 m and all cameras are within 1.6 m of its centre (wherever a survey places them), otherwise
-    outdoors; the board has 6 markers in the laboratory, and there is no board elsewhere.
+    outdoors; the board has 6 markers in the laboratory, and there is no board elsewhere; the rig is ``RigSpec()``.
 
     Raises ``InputError`` if the file is neither TOML nor IFC, listing every missing, unknown or invalid key, for
     an invalid name, and if the assembly or the cameras do not fit. Raises ``MeshError`` if the cage or mesh is

@@ -220,14 +220,14 @@ def _rig(camera: str, baseline_m: float, focal_px: float) -> FocalRigSpec:
     return FocalRigSpec(baseline_m=baseline_m, camera=camera, focal_px=focal_px)
 
 
-_ALL = (
+_RIGS = (
     _rig("Stereolabs ZED", 0.120, NOMINAL_FOCAL_PX),  # HD720; the rig of the paper.
     _rig("Luxonis OAK-D", 0.075, 882.5),  # Documentation of stereo depth, 1280 x 800 pixels.
     _rig("Intel RealSense D415", 0.055, focal_of_view_px(65.0)),
     _rig("Intel RealSense D435", 0.050, focal_of_view_px(87.0)),
     _rig("Intel RealSense D455", 0.095, focal_of_view_px(87.0)),
 )
-STEREO_CAMERAS: Mapping[str, FocalRigSpec] = {rig.camera: rig for rig in _ALL}
+STEREO_CAMERAS: Mapping[str, FocalRigSpec] = {rig.camera: rig for rig in _RIGS}
 """Rigs of stereo cameras that can be bought, by name, for generated cages and scene files.
 
 The fields of view are those of the pair of cameras that depth is computed from, at 16:9, as their makers state

@@ -109,11 +109,11 @@ def _point_in_metres(point: Triple, info: ValidationInfo[_Context]) -> Triple:
 
 
 def _distance_in_metres(distance: float, info: ValidationInfo[_Context]) -> float:
-    """Return a camera distance in metres, which is at least the rig's baseline."""
+    """Return a camera distance in metres, which is at least the baseline of the default rig."""
     distance_m = to_metres(distance, info.context.unit_m)
     if distance_m < RigSpec.baseline_m:
         found = f"cameras are {distance_m:.4g} m from the aim point"
-        expected = f"at least the rig's baseline, {RigSpec.baseline_m} m: is the unit right?"
+        expected = f"at least {RigSpec.baseline_m} m, the baseline of the default rig: is the unit right?"
         raise field_error(found, expected, "conflict")
     return distance_m
 

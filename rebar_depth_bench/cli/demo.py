@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, default=folder, help="working folder (default: %(default)s)")
     views = parser.add_mutually_exclusive_group()
     views.add_argument("--views", type=int, default=6, help="stereo views to render (default: %(default)s)")
-    sample = "use nine views of 160 x 90 that come with the package, without Blender, in folder sample of --out"
+    sample = "use nine views of 160 x 90 that come with the package, without Blender; written to sample in --out"
     views.add_argument("--sample", action="store_true", help=sample)
 
 

@@ -149,7 +149,7 @@ def run_methods(_: argparse.Namespace) -> None:
             table.add_row(plain_text(name), plain_text(f"cannot be used: {method}"), "", "")
             continue
         info = method.info
-        label = f"{name} †" if info.uses_ground_truth else name
+        label = f"{name} ‡" if info.uses_ground_truth else name
         table.add_row(
             plain_text(label),
             _summary_and_notes(method),
@@ -157,7 +157,7 @@ def run_methods(_: argparse.Namespace) -> None:
             plain_text(f"{info.source}\nlicence: {info.licence}"),
         )
     Console().print(table)
-    Console().print("† uses ground truth; its submissions are not ranked")
+    Console().print("‡ uses ground truth; its submissions are not ranked")
 
 
 def _summary_and_notes(method: AnyMethod) -> Text:

@@ -178,7 +178,7 @@ INSPECTION_MEASURES = (
     ),
     Measure(
         "axis_offset_p95_mm", "axis offset: p95", "mm", "lower",
-        "95th percentile of the distance of the fitted axis from the middle of what is seen of the true one. "
+        "95th percentile distance of the fitted axis from the middle of what is seen of the true one. "
         + MISSED_NOTE,
         "axis_offset_judged_mm", "p95",
     ),

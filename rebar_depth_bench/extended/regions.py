@@ -109,7 +109,7 @@ def _region_measures(*regions: str) -> Iterator[Measure]:
                 )
                 yield Measure(name, f"{info.title}, {short}", info.unit, "", definition)
             elif number == "coverage":
-                definition = f"share of {pixels} with a prediction (finite and > 0)"
+                definition = f"share with a prediction (finite and > 0) of {pixels}"
                 yield Measure(name, f"Coverage, {short}", "%", "higher", definition)
             else:
                 limit = number.removeprefix("within_").removesuffix("mm")

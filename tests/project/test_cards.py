@@ -225,7 +225,7 @@ def test_main_table_has_methods_and_networks_by_rank_error() -> None:
     metric = {name for name, numbers in networks.items() if numbers["rank_error"] is not None}
     assert {row[0].split("`")[1] for row in rows} == {*STORED[CAGES]["results"], *metric}
     for marked in (False, True):
-        errors = [float(row[2]) for row in rows if row[0].endswith("†") == marked]
+        errors = [float(row[2]) for row in rows if row[0].endswith("‡") == marked]
         assert errors == sorted(errors)
     [sgbm] = [row for row in rows if row[0] == "`sgbm`"]
     assert sgbm[2] == f"{STORED[CAGES]['results']['sgbm']['tables']['cages']['rank_error']:.4f}"

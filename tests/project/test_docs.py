@@ -252,7 +252,7 @@ def test_generated_tables_are_current() -> None:
 
 def test_results_in_readme_are_those_of_the_card() -> None:
     """The table of README has all rows of methods of the card's table of the lattice, without views and scale."""
-    row = re.compile(r"^\| (`[\w-]+`(?: †)?) \| (.*) \|$", re.MULTILINE)
+    row = re.compile(r"^\| (`[\w-]+`(?: ‡)?) \| (.*) \|$", re.MULTILINE)
     card = (ROOT / "cards/BENCHMARK.md").read_text()
     of_card = card[card.index("| lattice | views |") : card.index("| pile | views |")]
     rows = [(name, cells.split(" | ")) for name, cells in row.findall(of_card)]

@@ -20,7 +20,7 @@ from tests.requirements import pip_environment, require_index
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = {"cards", "dataset_builder", "leaderboard", "rebar_depth_bench"}
-MAX_BYTES = {"sdist": 10_000_000, "wheel": 3_000_000}
+MAX_BYTES = {"sdist": 10_000_000, "wheel": 4_000_000}
 
 pytestmark = pytest.mark.slow
 

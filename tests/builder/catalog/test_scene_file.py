@@ -33,7 +33,7 @@ from dataset_builder.scene.mesh_ply import write_mesh_ply
 from dataset_builder.scene.model import Assembly, WorldMesh
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
 from dataset_builder.scene.variants.registry import LIGHT_SLOT, PROPS_SLOT, VARIANTS
-from dataset_builder.specs.config_specs import DomeSpec, LatticeSpec, RingSpec, SurveySpec
+from dataset_builder.specs.config_specs import STEREO_CAMERAS, DomeSpec, LatticeSpec, RingSpec, SurveySpec
 from dataset_builder.specs.file_specs import CageFileSpec, MeshFileSpec
 from dataset_builder.user_files.cage_file import cage_file_spec, load_cage, read_cage
 from dataset_builder.user_files.make_assembly import make_assembly
@@ -187,12 +187,13 @@ def test_default_is_a_survey_where_a_dome_would_exceed_one_metre(tmp_path: Path)
     assert isinstance(scene_config(write_scene(tmp_path, bench)).protocol, DomeSpec)
 
 
-def test_cameras_board_and_environment_are_applied(tmp_path: Path) -> None:
-    head = 'name = "other"\nenvironment = "outdoors"\nboard = 12\n' + MM
+def test_cameras_board_environment_and_rig_are_applied(tmp_path: Path) -> None:
+    head = 'name = "other"\nenvironment = "outdoors"\nboard = 12\nrig = "Luxonis OAK-D"\n' + MM
     ring = '[cameras]\nkind = "ring"\nradius = 400\nelevation_deg = 35\nazimuths = 20\n'
     config = scene_config(write_scene(tmp_path, head + BAR + ring))
     assert (config.name, config.scene.name, config.scene.environment) == ("other", "other", "outdoors")
     assert (config.protocol, config.scene.board) == (RingSpec(0.4, 35.0, 20), BoardSpec(markers=12))
+    assert config.rig == STEREO_CAMERAS["Luxonis OAK-D"]
     in_cm = "[[bar]]\ndiameter = 1\npoints = [[-10, 0, 5], [10, 0, 5]]\n"
     dome = '[cameras]\nkind = "dome"\nradii = [30, 40.5]\nelevations_deg = [15, 45]\nazimuths = 5\n'
     config = scene_config(write_scene(tmp_path, 'unit = "cm"\nboard = false\n' + in_cm + dome))

@@ -131,7 +131,9 @@ def test_build_of_life_size_column(tmp_path: Path, run_build: RunBuild) -> None:
     assert audit(root, depth_views=1).failures == ()
     again = run_in_process(main, "--out", root, "--scene", path, "--views", "4", *SIZE)
     assert "up to date: column" in again.stdout
-    assert "0.5-2 m, steel aimed at" in (root / "README.md").read_text()
+    card = (root / "README.md").read_text()
+    assert "0.5-2 m, steel aimed at" in card
+    assert "ideal pinholes with baseline and field of view of Luxonis OAK-D." in card
 
     export(root, tmp_path / "export")
     assert (tmp_path / "export/column/cameras.json").is_file()
