@@ -186,16 +186,16 @@ def views_chart(config: str, views: Sequence[ViewScore]) -> Markup:
     """
     top, bottom, left = 26.0, 170.0, 52.0
     axis = decade_axis([m.abs_rel for view in views for m in (view.native, view.scaled) if m], bottom, top)
-    x = [left + 6 + (RIGHT - left - 12) * (i + 0.5) / max(len(views), 1) for i in range(len(views))]
-    placed = list(zip(x, views, strict=True))
+    placed = [(left + 6 + (RIGHT - left - 12) * (i + 0.5) / len(views), view) for i, view in enumerate(views)]
+    dots = "large points" if len(views) <= 60 else "points"
     without = [at for at, view in placed if view.native is None]
     return _figure(
         f"AbsRel by view, {printable(config)}",
         f"AbsRel of the {len(views)} views of {printable(config)}, {len(without)} without any prediction.",
         bottom + 26,
         _y_grid(axis, axis.ticks(), left),
-        _dots("scaled points", ((at, axis.at(view.scaled.abs_rel)) for at, view in placed if view.scaled)),
-        _dots("native points", ((at, axis.at(view.native.abs_rel)) for at, view in placed if view.native)),
+        _dots(f"scaled {dots}", ((at, axis.at(view.scaled.abs_rel)) for at, view in placed if view.scaled)),
+        _dots(f"native {dots}", ((at, axis.at(view.native.abs_rel)) for at, view in placed if view.native)),
         _path("missing", "".join(_down(at, 8, 18) for at in without)),
         _text(left + 6, bottom + 18, "first view"),
         _text(RIGHT, bottom + 18, "last view", "end"),
