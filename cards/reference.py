@@ -40,7 +40,7 @@ def reference_context(set_name: str) -> dict[str, Any]:
         "rows": {config: _method_rows(config, rows) for config, rows in by_config.items()},
         "errors": {
             config: {
-                name: [number(errors["abs_rel"], 4), number(errors["rmse_cm"], 2, " cm")]
+                name: [number(errors["abs_rel"], 4), number(errors["rmse_cm"], 2)]
                 for name, errors in rows[0][1]["tables"][config]["reference"].items()
             }
             for config, rows in by_config.items()
@@ -112,7 +112,7 @@ def _table_cells(table: Mapping[str, Any]) -> dict[str, str]:
         "coverage": percent(table["coverage"]),
         "native": number(native.get("abs_rel"), 4),
         "abs_rel": number(native.get("abs_rel"), 4) + interval,
-        "rmse": number(native.get("rmse_cm"), 2, " cm"),
+        "rmse": number(native.get("rmse_cm"), 2),
         "scaled": number(scaled.get("abs_rel"), 4),
         "scale": number(table["scale_median"], 3),
         "within": percent(table["within_mm"]["5"]),
