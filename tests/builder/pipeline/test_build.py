@@ -26,6 +26,7 @@ from dataset_builder.pipeline.plan import BUILD_FOLDER
 from dataset_builder.specs.config_specs import CPU, colour_spec
 from dataset_builder.user_files.cage_file import mesh_file_spec
 from rebar_depth_bench.data.bars import read_bars
+from rebar_depth_bench.data.codecs import decode
 from rebar_depth_bench.data.manifest import open_folder
 from tests.building import (
     TINY,
@@ -298,7 +299,13 @@ def test_sample_data_equals_fresh_render(tiny_root: Path, tmp_path: Path) -> Non
 @pytest.mark.usefixtures("blender")
 def test_dataset_of_stored_images_equals_fresh_render(tiny_root: Path, tmp_path: Path) -> None:
     images = render_orbit(tmp_path / "rendered")
-    assert images == {path.name: path.read_bytes() for path in orbit.IMAGES.iterdir()}, "run `make sample-data`"
+    assert set(images) == {path.name for path in orbit.IMAGES.iterdir()}, "run `make sample-data`"
+    for name, image in images.items():
+        stored_image = (orbit.IMAGES / name).read_bytes()
+        rgb, stored_rgb = (decode("rgb", one, (288, 512)).astype(int) for one in (image, stored_image))
+        differences = np.abs(rgb - stored_rgb)  # Between types of processors.
+        assert differences.max() <= 1
+        assert (differences > 0).mean() < 0.001
     orbit.write_orbit(tmp_path / "stored", tiny_root / "meshes" / "lattice.ply")
     rendered, stored = (open_folder(tmp_path / name).digest for name in ("rendered", "stored"))
     assert stored == rendered
