@@ -26,6 +26,7 @@ def lattice(tiny_root: Path) -> Truth:
 
 
 def test_evaluation_equals_score_of_its_archive(tiny_root: Path, tmp_path: Path) -> None:
+    pytest.importorskip("cv2")
     result = rdb.evaluate("sgbm", tiny_root)
     result.save_archive(tmp_path / "sgbm.zip")
     assert result.to_json() == rdb.score(tmp_path / "sgbm.zip", tiny_root).to_json()

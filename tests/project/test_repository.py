@@ -201,9 +201,11 @@ def test_interpreter_that_does_not_start_is_passed_over(tmp_path: Path) -> None:
     assert "Python 3.99: skipped, no interpreter was found" in missing.stdout
 
 
-@pytest.mark.nightly
-@pytest.mark.parametrize("version", [version for version in VERSIONS if version != "3.11"])
-def test_quick_tests_of_the_core_pass_on_other_versions_of_python(version: str, tmp_path: Path) -> None:
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "version", [pytest.param(one, marks=[pytest.mark.nightly] if one != VERSIONS[0] else []) for one in VERSIONS]
+)
+def test_quick_tests_of_the_core_pass_with_base_dependencies_alone(version: str, tmp_path: Path) -> None:
     if versions("--find", version).returncode:
         pytest.skip(f"no interpreter of Python {version} was found")
     requirements.require_index(tmp_path / "downloads")

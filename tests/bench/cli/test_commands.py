@@ -319,6 +319,7 @@ def test_demo_lists_only_comparable_methods_that_are_no_better_than_a_plane() ->
 
 
 def test_demo_on_the_sample_prints_what_the_readme_shows(tmp_path: Path) -> None:
+    pytest.importorskip("cv2")
     finished = run_bench("demo", "--sample", "--out", tmp_path)
     assert finished.returncode == 0, finished.stderr
     shown, *_ = blocks(PAGES[0], "text")

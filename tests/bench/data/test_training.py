@@ -13,10 +13,11 @@ from numpy import ndarray
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.base.errors import InputError
-from rebar_depth_bench.data.torch import Augmentation, flip_row
 from tests.synthetic_dataset import write_split_dataset
 
 torch = pytest.importorskip("torch")
+
+from rebar_depth_bench.data.torch import Augmentation, flip_row  # noqa: E402
 
 CROP = (20, 30)
 CONFIG, VIEWS = "lattice", 9

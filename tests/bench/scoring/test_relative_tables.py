@@ -97,6 +97,18 @@ def test_score_command(
     assert "Rank error" not in text
 
 
+def test_figure_is_refused_before_an_archive_is_scored(
+    tiny_root: Path, tmp_path: Path, write: Write, capsys: Any
+) -> None:
+    pytest.importorskip("matplotlib")
+    net, figure = write("net", "affine-disparity", disparity), tmp_path / "figure.svg"
+    assert main(["table", str(net), "--data", str(tiny_root), "--figure", str(figure)]) == 2
+    errors = capsys.readouterr().err
+    assert "expected metric ones: the figure shows native errors" in errors
+    assert "scoring" not in errors
+    assert not figure.exists()
+
+
 def test_table_has_a_block_for_each_kind(tiny_root: Path, tmp_path: Path, write: Write, capsys: Any) -> None:
     worse = write("worse", "affine-depth", lambda z: z**-2)
     better = write("better", "affine-depth", lambda z: 5 * z - 3)
@@ -121,12 +133,6 @@ def test_table_has_a_block_for_each_kind(tiny_root: Path, tmp_path: Path, write:
     assert blocks[2].index("better &") < blocks[2].index("worse &")
     assert "textbf" not in blocks[2]
     assert "ddagger" not in blocks[2]
-    figure = tmp_path / "figure.svg"
-    assert main([*arguments, "--figure", str(figure)]) == 2
-    errors = capsys.readouterr().err
-    assert "expected metric ones: the figure shows native errors" in errors
-    assert "scoring" not in errors, "kinds are refused before any archive is scored"
-    assert not figure.exists()
     shared = ["table", str(metric), str(net), "--data", str(tiny_root), "--align", "affine-disparity"]
     assert main(shared) == 0
     assert "rank err" not in capsys.readouterr().out
