@@ -17,20 +17,14 @@ import numpy as np
 
 from dataset_builder.cameras.camera_fit import check_above_ground, check_fits, misfit
 from dataset_builder.cameras.camera_placement import with_stations
+from dataset_builder.cameras.rigs import rig_cameras
 from dataset_builder.cameras.trajectories import aim_point_m
 from dataset_builder.catalog.cages_config import CAGES
 from dataset_builder.catalog.named_configs import CONFIGS, LATTICE_DOME, SWEEPS
 from dataset_builder.scene.assemblies.cage import Cage
 from dataset_builder.scene.environments.surroundings import SURROUNDINGS
 from dataset_builder.scene.model import Assembly
-from dataset_builder.specs.config_specs import (
-    STEREO_CAMERAS,
-    ConfigSpec,
-    DomeSpec,
-    RigSpec,
-    SceneSpec,
-    SurveySpec,
-)
+from dataset_builder.specs.config_specs import STEREO_CAMERAS, ConfigSpec, DomeSpec, RigSpec, SceneSpec, SurveySpec
 from dataset_builder.specs.file_specs import CageFileSpec, MeshFileSpec
 from dataset_builder.user_files.cage_file import cage_file_spec, mesh_file_spec, read_cage, unsupported_type
 from dataset_builder.user_files.make_assembly import make_assembly
@@ -40,6 +34,7 @@ from rebar_depth_bench.base.errors import InputError, MeshError
 from rebar_depth_bench.base.limits import TOML_BYTES
 from rebar_depth_bench.base.reading import read_file
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
+from rebar_depth_bench.geometry.cameras import NOMINAL_FOCAL_PX
 
 RESERVED_NAMES = (*CONFIGS, *SWEEPS, CAGES, "meshes", "pictures", "scenes")
 """Names that a user scene cannot have: names of configs and of other entries of the dataset folder."""
@@ -47,7 +42,8 @@ RESERVED_NAMES = (*CONFIGS, *SWEEPS, CAGES, "meshes", "pictures", "scenes")
 NEAREST_RADIUS_PER_REACH = 2.5
 """Nearest dome radius per reach of the assembly, close to that of the lattice dome (2.67).
 
-At this distance the whole assembly is in the frame of the default rig and fills much of it.
+At this distance the whole assembly is in the frame of the default rig and fills much of it. For another rig,
+it is multiplied by the ratio of the focal lengths.
 """
 
 MAX_DOME_M = 1.0
@@ -95,11 +91,11 @@ def read_scene(path: str | os.PathLike[str]) -> UserScene:
         assembly_spec = _assembly_spec(scene_toml, path)
         cage = read_cage(assembly_spec)
         assembly = make_assembly(assembly_spec, cage)
-    trajectory = scene_toml.cameras or _default_trajectory(assembly, scene_toml.environment)
+    rig = RigSpec() if scene_toml.rig is None else STEREO_CAMERAS[scene_toml.rig]
+    trajectory = scene_toml.cameras or _default_trajectory(assembly, scene_toml.environment, rig)
     environment = scene_toml.environment or (_LARGE if misfit(_SMALL, assembly, trajectory) else _SMALL)
     if problem := misfit(environment, assembly, trajectory):
         raise InputError(f"{path}: {problem}: {_ADVICE if environment == _LARGE else _ADVICE_OF_ROOMS}")
-    rig = RigSpec() if scene_toml.rig is None else STEREO_CAMERAS[scene_toml.rig]
     try:
         check_above_ground(assembly, name)
         if isinstance(trajectory, SurveySpec):
@@ -139,24 +135,26 @@ def files_of_scene(path: str | os.PathLike[str]) -> list[Path]:
     return [path] if named is None else [path, path.parent / named]
 
 
-def _default_trajectory(assembly: Assembly, environment: str | None) -> DomeSpec | SurveySpec:
+def _default_trajectory(assembly: Assembly, environment: str | None, rig: RigSpec) -> DomeSpec | SurveySpec:
     """Return the default dome, or a survey without its stations if a radius exceeds ``MAX_DOME_M``.
 
     In the laboratory, which is too small for a survey of such steel, it is the dome.
     """
-    dome = default_dome(assembly)
+    dome = default_dome(assembly, rig)
     return dome if environment == _SMALL or max(dome.radii_m) <= MAX_DOME_M else SurveySpec()
 
 
-def default_dome(assembly: Assembly) -> DomeSpec:
+def default_dome(assembly: Assembly, rig: RigSpec) -> DomeSpec:
     """Return ``LATTICE_DOME`` scaled to an assembly: 7 radii x 6 elevations x 12 azimuths, 504 views.
 
     All radii are multiplied by the factor, at least 1, for which the nearest radius is
     ``NEAREST_RADIUS_PER_REACH`` times the reach of the assembly: the greatest distance of its surface from the aim
-    point. They are never reduced because the stereo rig keeps its size. Radii are rounded to millimetres.
+    point, for a rig with the default focal length, and in proportion to it. They are never reduced, because the
+    stereo rig keeps its size. Radii are rounded to millimetres.
     """
     reach_m = float(np.linalg.norm(assembly.vertices_m - aim_point_m(assembly), axis=1).max())
-    factor = max(1.0, NEAREST_RADIUS_PER_REACH * reach_m / min(LATTICE_DOME.radii_m))
+    radius_per_reach = NEAREST_RADIUS_PER_REACH * rig_cameras(rig, np.eye(4))["left"].K[0, 0] / NOMINAL_FOCAL_PX
+    factor = max(1.0, radius_per_reach * reach_m / min(LATTICE_DOME.radii_m))
     return replace(LATTICE_DOME, radii_m=tuple(round(factor * radius_m, 3) for radius_m in LATTICE_DOME.radii_m))
 
 
