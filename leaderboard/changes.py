@@ -1,19 +1,21 @@
-"""Rules for submissions: who finds, changes and deletes one, and when a result is outdated."""
+"""Rules for submissions: who finds, changes and deletes one."""
 
 from __future__ import annotations
 
 import json
 from typing import Any
 
+import structlog
 from pydantic import ConfigDict
 
 from leaderboard.db import submissions
 from leaderboard.db.models import SubmissionModel, TokenModel
-from leaderboard.db.submissions import SCORED
 from leaderboard.refusals import RefusedError
 from leaderboard.service import Service
-from leaderboard.storage.retention import delete_archives
+from rebar_depth_bench.base.errors import StorageError
 from rebar_depth_bench.submission.declaration import MethodDetails
+
+_LOG = structlog.get_logger("submissions")
 
 
 class SubmissionChange(MethodDetails):
@@ -57,14 +59,11 @@ def edit_submission(service: Service, record: SubmissionModel, change: Submissio
 
 
 def delete_submission(service: Service, record: SubmissionModel) -> None:
-    """Delete a submission, its archive and its results."""
-    submissions.remove(service.database, record.id)
-    delete_archives(service.archives, [record.id])
-
-
-def outdated_note(record: SubmissionModel, dataset_digest: str) -> str | None:
-    """Return why a result is not of the dataset with ``dataset_digest``, or None if it is."""
-    if record.status != SCORED or record.dataset_digest == dataset_digest:
-        return None
-    reason = "its archive is not kept, so that it is neither scored against the present dataset nor ranked"
-    return f"the result belongs to the dataset {record.dataset_digest}; {reason}"
+    """Delete a submission, its archive and its results. Raises status 503 if the archive folder is unusable."""
+    try:
+        service.archives.check()
+        submissions.remove(service.database, record.id)
+        service.archives.delete(record.id)
+    except (StorageError, OSError) as error:
+        _LOG.error("deletion failed: archive folder unusable", error=str(error))
+        raise RefusedError(503, "the service cannot delete archives at the moment; try again later") from None

@@ -8,6 +8,7 @@ import signal
 import stat
 import sys
 import threading
+import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
@@ -24,12 +25,11 @@ from structlog.typing import Processor
 from leaderboard.db import jobs, submissions
 from leaderboard.db.engine import Database, database_errors, sqlite_path, without_password
 from leaderboard.db.models import SubmissionModel, TokenModel
-from leaderboard.db.submissions import DELETED, archive_rows
+from leaderboard.db.submissions import DELETED, QUEUED, SCORING, archive_rows
 from leaderboard.db.tokens import create_token, list_tokens, replace_token, revoke_token
 from leaderboard.health import disk_problem, queue_problems
 from leaderboard.scoring.worker import process_queue
 from leaderboard.settings import Settings, read_settings
-from leaderboard.storage import retention
 from leaderboard.storage.archive_store import ArchiveStore, archive_problem, make_folder, state_lock
 from leaderboard.storage.backup import back_up
 from rebar_depth_bench import software_version
@@ -73,16 +73,21 @@ def _add_arguments(name: str, command: argparse.ArgumentParser) -> None:
         change = command.add_mutually_exclusive_group()
         change.add_argument("--replace", action="store_true", help="revoke the existing token of NAME")
         change.add_argument("--revoke", action="store_true", help="only revoke the existing token of NAME")
+        change.add_argument(
+            "--baseline", action="store_true", help="mark the rows of the new token as the organiser's"
+        )
+    if name == "requeue":
+        command.add_argument("ids", metavar="ID", nargs="+", help="id of a submission, the last part of its URL")
     if name == "remove":
         command.add_argument("id", metavar="ID", help="id of the submission, the last part of its URL")
-    if name == "prune":
-        command.add_argument("--dry-run", action="store_true", help="print the ids, but delete nothing")
-        command.add_argument("--orphans", action="store_true", help="delete the archives without a submission")
+        command.add_argument(
+            "--archive-only", action="store_true", help="delete its archive, and keep its results"
+        )
     if name == "check":
         command.add_argument("--hash-archives", action="store_true", help="read all archives, too")
     if name == "backup":
         command.add_argument("target", type=Path, metavar="FOLDER", help="folder to write the backup to")
-        command.add_argument("--prune", action="store_true", help="delete what is removed or pruned from it")
+        command.add_argument("--prune", action="store_true", help="delete from it the archives that were removed")
 
 
 def _add_setting(command: argparse.ArgumentParser, name: str) -> None:
@@ -105,8 +110,9 @@ def _run(options: argparse.Namespace) -> None:
     command = COMMANDS[options.command]
     values = {name: getattr(options, name, None) for name in command.settings}
     overrides: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
-    needs_data = "data" in command.settings and not getattr(options, "orphans", False)
-    settings = read_settings(options.settings, overrides if needs_data else {**overrides, "data": ""})
+    settings = read_settings(
+        options.settings, overrides if "data" in command.settings else {**overrides, "data": ""}
+    )
     set_up_logs()
     database = sqlite_path(settings.database_url)
     is_missing = database is not None and not database.is_file() and options.command not in ("serve", "token")
@@ -161,7 +167,10 @@ def _token(settings: Settings, options: argparse.Namespace) -> None:
         if options.revoke:
             revoke_token(database, options.name)
             return
-        print((replace_token if options.replace else create_token)(database, options.name))
+        if options.replace:
+            print(replace_token(database, options.name))
+        else:
+            print(create_token(database, options.name, is_baseline=options.baseline))
     print("The token is not shown again; only its hash is stored.", file=sys.stderr)
 
 
@@ -191,29 +200,27 @@ def _submissions(settings: Settings, _: argparse.Namespace) -> None:
     _print_csv(head, rows)
 
 
+def _requeue(settings: Settings, options: argparse.Namespace) -> None:
+    with _migrated(settings) as database:
+        ArchiveStore(settings.archive_dir, database.board().board_id).check()
+        jobs.requeue(database, options.ids)
+
+
 def _remove(settings: Settings, options: argparse.Namespace) -> None:
+    """Delete a submission, or its archive alone: the row first, so that the next ``serve`` ends what is killed."""
     with _migrated(settings) as database:
-        if not options.id.isascii() or submissions.find(database, options.id) is None:
+        archives = ArchiveStore(settings.archive_dir, database.board().board_id)
+        archives.check()
+        record = submissions.find(database, options.id) if options.id.isascii() else None
+        if record is None:
             raise InputError(f"there is no submission {options.id!r}")
-        submissions.remove(database, options.id)
-    retention.delete_archives(ArchiveStore(settings.archive_dir), [options.id])
-
-
-def _prune(settings: Settings, options: argparse.Namespace) -> None:
-    archives = ArchiveStore(settings.archive_dir)
-    with _migrated(settings) as database:
-        if options.orphans:
-            pruned = retention.orphaned_archives(database, archives)
-            if not options.dry_run:
-                retention.delete_archives(archives, pruned)
-        elif settings.archive_days:
-            pruned = retention.expired_archives(database, open_folder(settings.data), settings)
-            if not options.dry_run:
-                retention.prune_archives(database, archives, pruned)
+        if not options.archive_only:
+            submissions.remove(database, record.id)
+        elif record.status in (QUEUED, SCORING):
+            raise InputError(f"{record.id}: is {record.status}, so that its archive is needed; try again later")
         else:
-            raise InputError("archive_days is 0, which keeps every archive; expected --archive-days DAYS")
-    for submission_id in pruned:
-        print(submission_id)
+            submissions.change(database, record.id, {"archive_deleted_at": time.time()})
+    archives.delete(record.id)
 
 
 def _back_up(settings: Settings, options: argparse.Namespace) -> None:
@@ -225,46 +232,53 @@ def _back_up(settings: Settings, options: argparse.Namespace) -> None:
 
 
 def _check(settings: Settings, options: argparse.Namespace) -> None:
-    """Print that all is well; nothing is written or created.
+    """Print that all is well, and the archives that no submission needs; nothing is written or created.
 
     Raises ``StorageError`` with everything that is wrong, and ``InputError`` if only the dataset is.
     """
-    archives = ArchiveStore(settings.archive_dir, create=False)
-    with closing(Database(settings.database_url, read_only=True)) as database:
-        database.check_schema()
-        problems = [*database.problems(), *_archive_problems(database, archives, options.hash_archives)]
-        problems += queue_problems(database)
-        of_dataset = _dataset_problems(database, settings, archives)
-    for name, folder in (("the state folder", settings.state_dir), ("the archives", settings.archive_dir)):
-        problems += disk_problem(folder, name) if folder.is_dir() else []
-    if problems or of_dataset:
-        raise (StorageError if problems else InputError)(problem_summary([*problems, *of_dataset]))
-    print(f"dataset, database, {counted(len(archives.ids()), 'archive')}, disk and queue are in order")
-
-
-def _archive_problems(database: Database, archives: ArchiveStore, hashed: bool) -> Iterator[str]:
-    rows = archive_rows(database)
-    found = {name: archive_problem(archives.file(name), row, hashed) for name, row in rows.items() if row}
-    rows = archive_rows(database)  # Again, because archives may have been deleted meanwhile.
-    for name, problem in found.items():
-        if problem and rows[name]:
-            yield f"the archive of submission {name} {problem}"
-    for name in retention.unneeded_archives(rows, archives):
-        yield f"the archive {name}.zip exists, but its row says deleted; serve deletes it within an hour"
-    for name in retention.orphaned_archives(database, archives):
-        yield f"the archive {name}.zip has no submission; prune --orphans deletes it"
-
-
-def _dataset_problems(database: Database, settings: Settings, archives: ArchiveStore) -> list[str]:
+    of_dataset: list[str] = []
     try:
         folder = open_folder(settings.data)
+        of_dataset += map(str, file_problems(folder))
     except InputError as error:
-        return [str(error)]
-    with database.read() as session:
-        stale = jobs.stale_submissions(session, folder.digest, archives.ids())
-    others = sum(record.dataset_digest != folder.digest for record in stale)
-    text = f"{counted(others, 'submission')} of another dataset than {folder.digest}"
-    return [*map(str, file_problems(folder)), *([text] if others else [])]
+        of_dataset.append(str(error))
+        folder = None
+    with closing(Database(settings.database_url, read_only=True)) as database:
+        database.check_schema()
+        board = database.board()
+        if folder is not None and board.dataset_digest not in (None, folder.digest):
+            of_dataset.append(f"the digest is {folder.digest}, expected {board.dataset_digest}, which was served")
+        problems = [*database.problems(), *queue_problems(database)]
+        archives = ArchiveStore(settings.archive_dir, board.board_id)
+        stored: set[str] = set()
+        try:
+            rows, stored = archive_rows(database), archives.ids()
+            found = {
+                name: archive_problem(archives.file(name), row, options.hash_archives)
+                for name, row in rows.items()
+                if row is not None
+            }
+            rows = archive_rows(database)  # Again, because archives may have been deleted meanwhile.
+        except StorageError as error:
+            problems.append(str(error))
+        else:
+            problems += [
+                f"the archive of submission {name} {problem}"
+                for name, problem in found.items()
+                if problem and rows[name]
+            ]
+            for name in sorted(stored - {name for name, row in rows.items() if row is not None}):
+                why = (
+                    "was deleted; serve deletes the file at its start"
+                    if name in rows
+                    else "is not in the database"
+                )
+                print(f"note: {archives.file(name)}: its submission {why}", file=sys.stderr)
+    for name, path in (("the state folder", settings.state_dir), ("the archives", settings.archive_dir)):
+        problems += disk_problem(path, name) if path.is_dir() else []
+    if problems or of_dataset:
+        raise (StorageError if problems else InputError)(problem_summary([*problems, *of_dataset]))
+    print(f"dataset, database, {counted(len(stored), 'archive')}, disk and queue are in order")
 
 
 def _print_csv(head: Sequence[str], rows: Sequence[Sequence[Cell]]) -> None:
@@ -286,7 +300,7 @@ class _Operation:
 
 _STORED = ("state_dir", "db")
 _WITH_ARCHIVES = (*_STORED, "archives")
-_SCORING = ("score_time", "score_memory", "lease_seconds", "error_maps", "hidden_truth")
+_SCORING = ("score_time", "score_memory", "lease_seconds")
 COMMANDS = {
     "serve": _Operation("run the web server and its local scoring workers", tuple(Settings.model_fields), _serve),
     "score": _Operation(
@@ -297,18 +311,16 @@ COMMANDS = {
     "token": _Operation("create a token for a submitter and print it", _STORED, _token),
     "tokens": _Operation("list the tokens with their submissions and bytes as CSV", _STORED, _tokens),
     "submissions": _Operation("list the submissions of all tokens as CSV", _STORED, _submissions),
-    "prune": _Operation(
-        "delete archives of ended submissions by age and rank, as the settings say, or those without a submission",
-        ("data", *_WITH_ARCHIVES, "archive_days", "archive_ranks"),
-        _prune,
-    ),
+    "requeue": _Operation("score submissions again, failed ones too, without quota", _WITH_ARCHIVES, _requeue),
     "check": _Operation(
         "check dataset, database, archives, disk and queue, and print what is wrong; nothing is changed",
         ("data", *_WITH_ARCHIVES),
         _check,
     ),
     "remove": _Operation(
-        "delete a submission of any owner, with its archive and results", _WITH_ARCHIVES, _remove
+        "delete a submission of any owner with its archive and results, or its archive alone",
+        _WITH_ARCHIVES,
+        _remove,
     ),
     "backup": _Operation(
         "copy the database and the archives to a folder while the service is running", _WITH_ARCHIVES, _back_up

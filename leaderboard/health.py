@@ -1,4 +1,4 @@
-"""Checks of a leaderboard: dataset, disk, workers and queue; for ``/healthz`` and the command ``check``."""
+"""Checks of a leaderboard: dataset, archive folder, disk, workers and queue; for ``/healthz`` and the command ``check``."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ from leaderboard.db.engine import Database
 from leaderboard.db.models import SubmissionModel
 from leaderboard.db.submissions import QUEUED, SCORING
 from leaderboard.service import Service, manifest_state
+from rebar_depth_bench.base.errors import StorageError
 
 MIN_FREE_BYTES = 1 << 30
 STALLED_S = 600.0
@@ -22,6 +23,13 @@ STALLED_S = 600.0
 def service_problems(service: Service) -> list[str]:
     """Return what is wrong with a running service. Raises the errors of an unavailable database."""
     problems = [*_dataset_problems(service), *disk_problem(service.spool)]
+    try:
+        service.archives.check()
+    except (StorageError, OSError) as error:
+        problems.append(str(error))
+    served = service.database.board().dataset_digest
+    if served != service.folder.digest:
+        problems.append(f"another server of this database serves the dataset {served}")
     expected, running = service.settings.workers, sum(worker.is_alive() for worker in service.workers)
     if running < expected:
         problems.append(f"{running} of {expected} local workers are running")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -16,8 +16,10 @@ from huggingface_hub.repocard import metadata_load
 from leaderboard.db import jobs
 from leaderboard.db.engine import Database
 from leaderboard.db.rankings import CurrentRankings
+from leaderboard.db.submissions import archive_rows
 from leaderboard.settings import Settings
 from leaderboard.storage.archive_store import ArchiveStore, delete_abandoned_uploads, make_folder
+from rebar_depth_bench.base.errors import StorageError
 from rebar_depth_bench.base.names import TEST_SPLIT, config_of
 from rebar_depth_bench.data.files import MANIFEST_FILE
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
@@ -54,24 +56,27 @@ class Service:
 
 @contextmanager
 def open_service(settings: Settings) -> Iterator[Service]:
-    """Open the service: migrate the database, and remove abandoned uploads.
+    """Open the service: migrate the database, remove abandoned uploads, and queue what is to be scored again.
 
-    Submissions whose result is of other definitions are scored again if their archive is kept. Raises
-    ``InputError`` if the dataset, the database or the archive storage is unusable, and if the leaderboard has
-    submissions of another dataset with their archives, unless the setting ``rescore`` is on.
+    If the archive folder is not that of the database, reading works, uploads are refused, and jobs wait. Raises
+    ``InputError`` if the dataset or the database is unusable, and if the leaderboard has submissions of another
+    dataset with their archives, unless the setting ``rescore`` is on.
     """
     folder, manifest = open_folder(settings.data), manifest_state(settings.data)
     name, licence = _read_card(settings.data)
     make_folder(settings.spool, "the folder of uploads")
     delete_abandoned_uploads(settings.spool)
-    with ExitStack() as stack:
-        database = stack.enter_context(
-            closing(Database(settings.database_url, hidden_truth=settings.hidden_truth))
-        )
-        archives = ArchiveStore(settings.archive_dir)
+    with closing(Database(settings.database_url)) as database:
         database.migrate()
-        if requeued := jobs.requeue_stale(database, folder.digest, archives.ids(), settings.rescore):
-            _LOG.info("results of another dataset or definition; submissions requeued", submissions=requeued)
+        archives = ArchiveStore(settings.archive_dir, database.board().board_id)
+        rows = archive_rows(database)
+        archives.initialise(rows)
+        try:
+            archives.finish_deletions(rows)
+        except (StorageError, OSError) as error:
+            _LOG.error("the archive folder is unusable; uploads are refused, and jobs wait", error=str(error))
+        if requeued := jobs.serve_dataset(database, folder.digest, settings.rescore):
+            _LOG.info("results of another dataset or protocol; submissions queued", submissions=requeued)
         yield Service(
             settings=settings,
             folder=folder,

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 from urllib.parse import urlsplit
 
-from limits import parse_many
-from pydantic import BaseModel, ByteSize, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
+from pydantic import BaseModel, ByteSize, ConfigDict, Field, ValidationError, field_validator
 from pydantic_core import ErrorDetails
 from sqlalchemy import make_url
 from sqlalchemy.exc import ArgumentError
@@ -56,31 +55,9 @@ class Settings(BaseModel):
         ByteSize(64 * GIB), ge=0, description="bytes of accepted archives per token and day (UTC)"
     )
     max_upload: ByteSize = Field(ByteSize(16 * GIB), gt=0, description="maximum size of an archive")
-    upload_seconds: float = Field(14400.0, gt=0, description="time after which an upload is ended")
-    upload_idle_seconds: float = Field(
-        30.0, gt=0, description="time without a byte from the client after which an upload is ended"
-    )
-    archive_days: float = Field(
-        0.0,
-        ge=0,
-        description="age in days after which archives of ended submissions are deleted; 0: never",
-    )
-    archive_ranks: int = Field(
-        10, ge=0, description="archives of submissions up to this rank in any config are never deleted"
-    )
-    error_maps: int = Field(
-        0,
-        ge=0,
-        le=100,
-        description="worst views per config shown with pictures; these let a submitter compute the ground truth",
-    )
-    hidden_truth: bool = Field(
-        False, description="return only rank error and coverage per config, rounded to three decimals"
-    )
-    rescore: bool = Field(False, description="score submissions for another dataset again, against this one")
+    rescore: bool = Field(False, description="score submissions of another dataset again, against this one")
     workers: int = Field(1, ge=0, le=64, description="number of submissions that `serve` scores at a time")
-    check_time: float = Field(1800.0, gt=0, description="time limit for checking an uploaded archive")
-    score_time: float = Field(3600.0, gt=0, description="time limit for scoring an archive")
+    score_time: float = Field(3600.0, gt=0, description="time limit for checking or scoring an archive")
     score_memory: ByteSize = Field(
         ByteSize(4 * GIB), gt=0, description="memory limit for checking or scoring an archive"
     )
@@ -90,15 +67,6 @@ class Settings(BaseModel):
         le=MAX_LEASE_S,
         description="time without a heartbeat from a worker after which its job is reassigned, at most 600",
     )
-    max_connections: int = Field(1000, ge=1, description="maximum number of open connections")
-    max_connections_per_address: int = Field(
-        100,
-        ge=0,
-        description="maximum number of open connections per client address; 0, behind a proxy: no limit",
-    )
-    head_seconds: float = Field(15.0, gt=0, description="time for a client to send the head of a request")
-    read_rate_limit: str = Field("600/minute", description="read requests per client address")
-    write_rate_limit: str = Field("60/minute", description="uploads and changes per client address")
 
     @field_validator("db")
     @classmethod
@@ -133,24 +101,6 @@ class Settings(BaseModel):
             raise ValueError("expected an address such as https://leaderboard.example.org")
         return url.rstrip("/")
 
-    @field_validator("hidden_truth")
-    @classmethod
-    def _check_no_error_maps(cls, hidden_truth: bool, info: ValidationInfo) -> bool:
-        if hidden_truth and info.data.get("error_maps"):
-            raise ValueError("expected error_maps 0, because the pictures show the ground truth")
-        return hidden_truth
-
-    @field_validator("read_rate_limit", "write_rate_limit")
-    @classmethod
-    def _check_rate(cls, rate: str) -> str:
-        try:
-            (parsed,) = parse_many(rate)
-            if parsed.amount < 1 or parsed.multiples < 1:
-                raise ValueError
-        except ValueError:
-            raise ValueError("expected a rate such as 600/minute or 10/second") from None
-        return rate
-
     @property
     def database_url(self) -> str:
         """Database URL in the form that SQLAlchemy expects."""
@@ -169,13 +119,24 @@ class Settings(BaseModel):
         return self.state_dir.absolute() / "spool"
 
 
+TOKEN_VARIABLE = f"{ENVIRONMENT_PREFIX}TOKEN"
+"""Variable of the client, which a submitter may have set."""
+_SETTING_NAMES = "REBAR_LEADERBOARD_NAME with one of the names " + ", ".join(Settings.model_fields)
+
+
 def read_settings(file: Path | None, overrides: dict[str, Any]) -> Settings:
     """Return the settings; ``overrides`` (command line) precede ``file``, which precedes the environment.
 
-    Raises ``InputError``, naming every invalid setting, and if ``file`` cannot be read as TOML.
+    Raises ``InputError``, naming every invalid setting, for a variable of the environment that is no setting, which
+    could publish what was to be hidden if it were ignored, and if ``file`` cannot be read as TOML.
     """
-    variables = {name: os.environ.get(f"{ENVIRONMENT_PREFIX}{name.upper()}") for name in Settings.model_fields}
-    values: dict[str, Any] = {name: value for name, value in variables.items() if value is not None}
+    values: dict[str, Any] = {}
+    for variable, value in os.environ.items():
+        if variable.startswith(ENVIRONMENT_PREFIX) and variable != TOKEN_VARIABLE:
+            name = variable.removeprefix(ENVIRONMENT_PREFIX).lower()
+            if name not in Settings.model_fields:
+                raise InputError(f"{variable}: there is no such setting, expected {_SETTING_NAMES}")
+            values[name] = value
     if file is not None:
         content, problems = parse_toml(read_file(file, TOML_BYTES, "a TOML file with settings", InputError))
         if problems:

@@ -15,7 +15,7 @@ from sqlalchemy.exc import ArgumentError, DatabaseError, InterfaceError, NoSuchM
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from sqlalchemy.orm import Session
 
-from leaderboard.db.models import Base, ContentVersionModel, ResultModel
+from leaderboard.db.models import Base, BoardModel, ResultModel
 from rebar_depth_bench.base.errors import InputError, StorageError
 
 MIGRATIONS = Path(__file__).parent / "migrations"
@@ -25,7 +25,7 @@ DATABASE_UNAVAILABLE = (OperationalError, InterfaceError, PoolTimeoutError)
 _POSTGRESQL_TIMEOUTS = {"connect_timeout": 10, "tcp_user_timeout": 30_000}
 """Timeouts for an unresponsive PostgreSQL server: connect in seconds, unacknowledged TCP data in ms."""
 _IMMEDIATE = "immediate"
-_CONTENT_VERSION = select(ContentVersionModel.value)
+_CONTENT_VERSION = select(BoardModel.content_version)
 _OWN_TABLES = frozenset({"alembic_version", *Base.metadata.tables})
 
 
@@ -35,15 +35,12 @@ class Database:
     On SQLite, write transactions acquire the single write lock at their start (``BEGIN IMMEDIATE``) and wait for
     it; read transactions never wait.
 
-    With ``hidden_truth``, the functions of this package return only the disclosed part of the stored scores
-    (``rebar_depth_bench.scoring.result``). What is stored does not depend on it.
-
     With ``read_only``, an SQLite database must exist, and nothing is written or created to read it.
     """
 
-    def __init__(self, url: str, *, hidden_truth: bool = False, read_only: bool = False) -> None:
+    def __init__(self, url: str, *, read_only: bool = False) -> None:
         """Create the engine. Raises ``InputError`` if ``url`` is not a valid database URL."""
-        self.hidden_truth, self._url = hidden_truth, url
+        self._url = url
         try:
             self._engine = _engine(url, read_only)
         except (ArgumentError, NoSuchModuleError, ImportError, OSError) as error:
@@ -68,6 +65,11 @@ class Database:
         """Return the version of everything that pages show, apart from queue positions."""
         with self._engine.connect() as connection:
             return int(connection.scalar(_CONTENT_VERSION) or 0)
+
+    def board(self) -> BoardModel:
+        """Return the facts on the whole leaderboard."""
+        with self.read() as session:
+            return session.scalars(select(BoardModel)).one()
 
     @property
     def has_row_locks(self) -> bool:
@@ -108,7 +110,7 @@ class Database:
                 for pragma in () if self.has_row_locks else ("integrity_check(5)", "foreign_key_check"):
                     rows = session.execute(text(f"PRAGMA {pragma}"))
                     found += [f"the database is damaged: {pragma} finds {row}" for row in rows if row != ("ok",)]
-                results = select(ResultModel.submission_id, ResultModel.json)
+                results = select(ResultModel.submission_id, ResultModel.json).where(ResultModel.json.is_not(None))
                 for submission_id, content in session.execute(results, execution_options={"yield_per": 20}):
                     try:
                         parsed_result(content)

@@ -2,36 +2,30 @@
 
 Each submission is leased by at most one worker. Renewal and completion are single conditional updates, so that a
 worker whose lease has expired cannot finish a job that another worker has taken over. The column ``scorer`` holds
-the name of the worker.
+the name of the worker. A job is scored against the dataset that is served (``BoardModel.dataset_digest``).
 """
 
 from __future__ import annotations
 
 import json
 import time
-from collections.abc import Collection, Iterator, Mapping
-from contextlib import suppress
-from typing import Any
+from collections.abc import Sequence
 
-from sqlalchemy import ColumnElement, and_, or_, select, update
-from sqlalchemy.engine import CursorResult
+from sqlalchemy import ColumnElement, and_, delete, exists, or_, select, update
 from sqlalchemy.orm import Session
 
-from leaderboard.db.engine import Database, parsed_result
+from leaderboard.db.engine import Database
 from leaderboard.db.models import (
-    Base,
+    BoardModel,
     LeaderboardRowModel,
-    PictureImageModel,
-    PictureModel,
     ResultModel,
     SubmissionModel,
     increment_content_version,
 )
-from leaderboard.db.submissions import FAILED, QUEUED, SCORED, SCORING, delete_results
-from leaderboard.db.view_errors import view_errors
+from leaderboard.db.submissions import DELETED, FAILED, QUEUED, SCORED, SCORING
 from leaderboard.scoring.sandbox import Outcome
 from leaderboard.settings import MAX_LEASE_S
-from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.errors import InputError, problem_summary
 from rebar_depth_bench.scoring.bootstrap import INTERVALS
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 
@@ -39,13 +33,78 @@ MAX_ATTEMPTS = 5
 """Number of leases after which a submission fails if no worker finished it.
 
 The limit is high enough for a service that is killed occasionally."""
+_INTERVALS_JSON = json.dumps(INTERVALS, sort_keys=True)
 
 
-def claim(database: Database, scorer: str, lease_s: float) -> str | None:
-    """Lease a waiting submission to ``scorer`` for ``lease_s`` seconds; return its id, or None if none is waiting.
+def serve_dataset(database: Database, dataset_digest: str, rescore: bool) -> int:
+    """Record the dataset that is served; queue what has to be scored against it, and return the number of these.
+
+    A submission that has a result of this dataset and protocol is scored, whatever was to be done before. One
+    whose scoring against this dataset has failed is not tried again, and one without archive cannot be. Results of
+    other datasets stay. Raises ``InputError`` if submissions would have to be scored for another dataset than
+    theirs, unless ``rescore`` is True.
+    """
+    current = exists().where(
+        ResultModel.submission_id == SubmissionModel.id,
+        ResultModel.dataset_digest == dataset_digest,
+        ResultModel.protocol == PROTOCOL,
+        ResultModel.intervals == _INTERVALS_JSON,
+    )
+    is_waiting = SubmissionModel.status.in_((QUEUED, SCORING))
+    is_stale = and_(SubmissionModel.status == SCORED, SubmissionModel.archive_deleted_at.is_(None), ~current)
+    with database.write() as session:
+        board = session.scalars(select(BoardModel).with_for_update()).one()
+        is_other = board.dataset_digest not in (None, dataset_digest)
+        if is_other:
+            has_result = current.where(ResultModel.json.is_not(None))
+            session.execute(
+                update(SubmissionModel).where(is_waiting, has_result).values(status=SCORED, lease_until=None)
+            )
+            to_score = and_(or_(is_waiting, is_stale), ~current)
+        else:
+            to_score = is_stale
+        records = session.scalars(select(SubmissionModel).where(to_score)).all()
+        if records and is_other and not rescore:
+            raise InputError(
+                f"the dataset digest is {dataset_digest}, but {len(records)} submissions of this leaderboard belong "
+                f"to the dataset {board.dataset_digest}; use --rescore true to score them against this one"
+            )
+        for record in records:
+            record.status, record.attempts, record.finished_at = QUEUED, 0, None
+        if records or is_other:
+            increment_content_version(session)
+        board.dataset_digest = dataset_digest
+        return len(records)
+
+
+def requeue(database: Database, submission_ids: Sequence[str]) -> None:
+    """Queue submissions again, without quota; earlier results stay until they are replaced.
+
+    Raises ``InputError``, before any is queued, for ids of no submission, of one that waits already, and of one
+    whose archive was deleted.
+    """
+    problems: list[str] = []
+    with database.write() as session:
+        for submission_id in submission_ids:
+            record = session.get(SubmissionModel, submission_id, with_for_update=True)
+            if record is None or record.status == DELETED:
+                problems.append(f"{submission_id}: there is no such submission")
+            elif record.status in (QUEUED, SCORING):
+                problems.append(f"{submission_id}: is {record.status} already")
+            elif record.archive_deleted_at is not None:
+                problems.append(f"{submission_id}: its archive was deleted, so that it cannot be scored")
+            else:
+                record.status, record.attempts, record.finished_at, record.reason = QUEUED, 0, None, None
+        if problems:
+            raise InputError(f"nothing was queued: {problem_summary(problems)}")
+        increment_content_version(session)
+
+
+def claim(database: Database, scorer: str, lease_s: float) -> SubmissionModel | None:
+    """Lease a waiting submission to ``scorer`` for ``lease_s`` seconds; return it, or None if none is waiting.
 
     Submissions with the fewest attempts come first, then the oldest, so that an archive that crashes workers does
-    not delay the others. Submissions that have reached ``MAX_ATTEMPTS`` are marked as failed.
+    not delay the others. Jobs that have reached ``MAX_ATTEMPTS`` are ended.
     """
     while True:
         with database.write() as session:
@@ -61,9 +120,10 @@ def claim(database: Database, scorer: str, lease_s: float) -> str | None:
             if record.attempts < MAX_ATTEMPTS:
                 record.status, record.scorer = SCORING, scorer
                 record.lease_until, record.attempts = now + lease_s, record.attempts + 1
-                return record.id
-            record.status, record.finished_at = FAILED, now
-            record.reason = f"scoring was started {record.attempts} times but never finished"
+                return record
+            digest = session.scalars(select(BoardModel)).one().dataset_digest or ""
+            reason = f"scoring was started {record.attempts} times but never finished"
+            _store(session, record, Outcome(digest, reason=reason))
 
 
 def is_free(now: float) -> ColumnElement[bool]:
@@ -79,120 +139,83 @@ def is_free(now: float) -> ColumnElement[bool]:
 def renew(database: Database, submission_id: str, scorer: str, lease_s: float) -> bool:
     """Extend a lease to ``lease_s`` seconds from now; return whether ``scorer`` still holds it."""
     with database.write() as session:
-        return _update_one(session, _has_lease(submission_id, scorer), {"lease_until": time.time() + lease_s})
+        lease = update(SubmissionModel).where(_has_lease(submission_id, scorer))
+        renewed = lease.values(lease_until=time.time() + lease_s).returning(SubmissionModel.id)
+        return session.scalar(renewed) is not None
 
 
 def release(database: Database, submission_id: str, scorer: str, wait_s: float = 0.0) -> None:
     """Requeue a leased submission without counting the attempt; it cannot be leased for ``wait_s`` seconds."""
     with database.write() as session:
-        values = {
-            "status": QUEUED,
-            "scorer": None,
-            "lease_until": time.time() + wait_s if wait_s else None,
-            "attempts": SubmissionModel.attempts - 1,
-        }
-        _update_one(session, _has_lease(submission_id, scorer), values)
+        session.execute(
+            update(SubmissionModel)
+            .where(_has_lease(submission_id, scorer))
+            .values(
+                status=QUEUED,
+                scorer=None,
+                lease_until=time.time() + wait_s if wait_s else None,
+                attempts=SubmissionModel.attempts - 1,
+            )
+        )
 
 
 def finish(database: Database, submission_id: str, scorer: str, outcome: Outcome) -> bool:
-    """Store the outcome in one transaction if ``scorer`` still holds the lease; return whether it did.
-
-    If the archive is missing, a result that was to be computed again stays, with its dataset.
-    """
-    result = None if outcome.result is None else json.loads(outcome.result)
-    values = {
-        "status": FAILED if result is None else SCORED,
-        "reason": outcome.reason,
-        "finished_at": time.time(),
-        "lease_until": None,
-    }
+    """Store the outcome in one transaction if ``scorer`` still holds the lease; return whether it did."""
     with database.write() as session:
-        if outcome.archive_missing and (kept := session.get(ResultModel, submission_id)):
-            with suppress(ValueError):  # A damaged result is not kept.
-                digest = parsed_result(kept.json)["dataset"]["digest"]
-                values |= {"status": SCORED, "reason": None, "dataset_digest": digest}
-        if not _update_one(session, _has_lease(submission_id, scorer), values):
+        leased = select(SubmissionModel).where(_has_lease(submission_id, scorer)).with_for_update()
+        record = session.scalar(leased)
+        if record is None:
             return False
-        if result is not None:
-            delete_results(session, submission_id)
-            session.add_all(_stored(submission_id, outcome, result))
-        increment_content_version(session)
+        _store(session, record, outcome)
     return True
 
 
-def requeue_stale(database: Database, dataset_digest: str, archive_ids: Collection[str], rescore: bool) -> int:
-    """Requeue the stale submissions for scoring against a dataset; return their number.
+def _store(session: Session, record: SubmissionModel, outcome: Outcome) -> None:
+    """Store the outcome of a job and end the job.
 
-    Old results stay until they are replaced. Raises ``InputError`` if there are submissions of other datasets,
-    unless ``rescore`` is True.
+    A submission that has a result stays scored if scoring it again fails. A submission that was scored against
+    another dataset than the one that is served by now is queued again.
     """
-    with database.write() as session:
-        stale = stale_submissions(session, dataset_digest, archive_ids, lock=True)
-        others = sum(record.dataset_digest != dataset_digest for record in stale)
-        if others and not rescore:
-            raise InputError(
-                f"the dataset digest is {dataset_digest}, but {others} submissions of this leaderboard belong to "
-                "another dataset; use --rescore true to score them against this one"
+    record.lease_until, record.finished_at, record.reason = None, time.time(), None
+    present = select(ResultModel.dataset_digest, ResultModel.protocol, ResultModel.json.is_not(None))
+    with_json = {
+        (digest, protocol)
+        for digest, protocol, has_json in session.execute(present.where(ResultModel.submission_id == record.id))
+        if has_json
+    }
+    if outcome.result is None and not with_json:
+        record.status, record.reason = FAILED, outcome.reason
+    elif outcome.result is None and (outcome.dataset_digest, PROTOCOL) in with_json:
+        record.status = SCORED  # The earlier result of the same dataset stays.
+    else:
+        record.status = SCORED
+        key = {"submission_id": record.id, "dataset_digest": outcome.dataset_digest, "protocol": PROTOCOL}
+        for table in (LeaderboardRowModel, ResultModel):
+            session.execute(delete(table).filter_by(**key))
+        session.add(
+            ResultModel(
+                **key,
+                intervals=_INTERVALS_JSON,
+                json=outcome.result,
+                notes=json.dumps(list(outcome.notes)),
+                reason=outcome.reason,
+                finished_at=record.finished_at,
             )
-        for record in stale:
-            record.status, record.attempts, record.finished_at = QUEUED, 0, None
-            record.dataset_digest = dataset_digest
-        if stale:
-            increment_content_version(session)
-        return len(stale)
-
-
-def stale_submissions(
-    session: Session, digest: str, archive_ids: Collection[str], *, lock: bool = False
-) -> list[SubmissionModel]:
-    """Return the submissions of other datasets than the one with ``digest``, and those of other definitions.
-
-    Results stay as they are if their archive is pruned, or not among ``archive_ids``. With ``lock``, the rows are
-    locked until the session ends.
-    """
-    query = (
-        select(SubmissionModel, ResultModel.json)
-        .outerjoin(ResultModel, ResultModel.submission_id == SubmissionModel.id)
-        .where(SubmissionModel.status.in_((QUEUED, SCORING, SCORED)))
-    )
-    if lock:
-        query = query.with_for_update(of=SubmissionModel)
-    stale = []
-    for record, content in session.execute(query, execution_options={"yield_per": 20}):
-        scored, has_archive = record.status == SCORED, record.id in archive_ids and not record.archive_deleted_at
-        is_other = record.dataset_digest != digest or (scored and _has_other_definitions(content or b""))
-        if is_other and (has_archive or not scored):
-            stale.append(record)
-    return stale
-
-
-def _has_other_definitions(content: bytes) -> bool:
-    """Return whether a result JSON was computed with other definitions than those of this version."""
-    try:
-        result = parsed_result(content)
-    except ValueError:  # Damaged: it is computed again, too.
-        return True
-    return bool(result["protocol"] != PROTOCOL or result.get("intervals") != INTERVALS)
-
-
-def _stored(submission_id: str, outcome: Outcome, result: Mapping[str, Any]) -> Iterator[Base]:
-    """Yield the rows of what scoring has found out."""
-    notes = json.dumps(list(outcome.notes))
-    yield ResultModel(submission_id=submission_id, json=outcome.result, notes=notes)
-    for config, table in result["tables"].items():
-        yield LeaderboardRowModel(
-            submission_id=submission_id,
-            config=config,
-            ranked=table["ranked"],
-            rank_error=table["rank_error"],
-            json=json.dumps({name: value for name, value in table.items() if name != "groups"}),
-            view_errors=view_errors(result, config),
         )
-    for picture in outcome.pictures:
-        place = {"submission_id": submission_id, "view_id": picture.view_id}
-        yield PictureModel(**place, facts=picture.facts_json)
-        for kind, webp in picture.images.items():
-            yield PictureImageModel(**place, kind=kind, webp=webp)
+        tables = {} if outcome.result is None else json.loads(outcome.result)["tables"]
+        for config, table in tables.items():
+            session.add(
+                LeaderboardRowModel(
+                    **key,
+                    config=config,
+                    ranked=table["ranked"],
+                    rank_error=table["rank_error"],
+                    json=json.dumps({name: value for name, value in table.items() if name != "groups"}),
+                )
+            )
+    if session.scalar(select(BoardModel.dataset_digest)) not in (None, outcome.dataset_digest):
+        record.status, record.attempts, record.finished_at = QUEUED, 0, None
+    increment_content_version(session)
 
 
 def _has_lease(submission_id: str, scorer: str) -> ColumnElement[bool]:
@@ -201,9 +224,3 @@ def _has_lease(submission_id: str, scorer: str) -> ColumnElement[bool]:
         SubmissionModel.status == SCORING,
         SubmissionModel.scorer == scorer,
     )
-
-
-def _update_one(session: Session, where: ColumnElement[bool], values: Mapping[str, Any]) -> bool:
-    changed = session.execute(update(SubmissionModel).where(where).values(**values))
-    assert isinstance(changed, CursorResult)
-    return changed.rowcount == 1

@@ -1,16 +1,13 @@
-"""Ranking queries: the rows of a config with their ranks, pictures of views, and the queue position.
+"""Ranking queries: the rows of a config with their ranks, and the queue position.
 
 The queries select columns instead of ORM objects, so that a page with hundreds of rows takes milliseconds.
-
-If the ground truth is hidden, rows, order and ranks depend on the disclosed numbers only, and no picture is
-returned.
 """
 
 from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -18,19 +15,12 @@ from typing import Any
 from sqlalchemy import false, func, select
 
 from leaderboard.db.engine import Database
-from leaderboard.db.models import (
-    LeaderboardRowModel,
-    PictureImageModel,
-    PictureModel,
-    SubmissionModel,
-    TokenModel,
-)
-from leaderboard.db.submissions import QUEUED, SCORED
-from leaderboard.db.view_errors import rank_ranges
-from rebar_depth_bench.scoring.result import DisclosedTable, disclosed_number
+from leaderboard.db.models import LeaderboardRowModel, SubmissionModel, TokenModel
+from leaderboard.db.submissions import QUEUED
+from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.submission.declaration import INPUTS
 
-_CACHED_TABLES = 4096
+_CACHED_OBJECTS = 4096
 MISSING_ERROR = 1.0
 """Rank error that counts where a submission lacks a config: that of no prediction at all."""
 _SIGNIFICANT_DIGITS = 12
@@ -41,14 +31,15 @@ class LeaderboardEntry:
     """A submission's row of one config; ``rank`` is None if the row is not ranked.
 
     ``class_rank`` is the rank among the submissions that declare the same ``inputs``, None without a declaration.
-    ``rank_range`` holds the first and last rank that the paired 95 % differences allow, None where they are not
-    known. ``table_json`` is the JSON text of the config's table in the result, or of its disclosed part.
+    ``is_baseline`` marks the organiser's rows. ``details`` is the column of ``SubmissionModel``, ``table_json`` the
+    JSON text of the config's table in the result.
     """
 
     id: str
     config: str
     method: str
     submitter: str
+    is_baseline: bool
     details: str
     inputs: str | None
     uses_ground_truth: bool | None
@@ -56,16 +47,19 @@ class LeaderboardEntry:
     public: bool
     may_rank: bool
     rank_error: float | None
-    view_errors: str | None
     table_json: str
     rank: int | None = None
     class_rank: int | None = None
-    rank_range: tuple[int, int] | None = None
+
+    @property
+    def declared(self) -> dict[str, Any]:
+        """What the submitter says about the method, by name; what is not given is absent."""
+        return _parsed(self.details)
 
     @property
     def url(self) -> str | None:
         """Page or paper of the method."""
-        url: str | None = json.loads(self.details).get("url")
+        url: str | None = self.declared.get("url")
         return url
 
     @property
@@ -74,11 +68,11 @@ class LeaderboardEntry:
         return _parsed(self.table_json)
 
 
-@lru_cache(maxsize=_CACHED_TABLES)
-def _parsed(table_json: str) -> dict[str, Any]:
-    """Return a table's JSON object; cached, because most rows stay the same when the content changes."""
-    table: dict[str, Any] = json.loads(table_json)
-    return table
+@lru_cache(maxsize=_CACHED_OBJECTS)
+def _parsed(text: str) -> dict[str, Any]:
+    """Return a JSON object; cached, because most rows stay the same when the content changes."""
+    found: dict[str, Any] = json.loads(text)
+    return found
 
 
 _COLUMNS = (
@@ -86,6 +80,7 @@ _COLUMNS = (
     LeaderboardRowModel.config,
     SubmissionModel.method,
     TokenModel.name,
+    TokenModel.is_baseline,
     SubmissionModel.details,
     SubmissionModel.inputs,
     SubmissionModel.uses_ground_truth,
@@ -93,7 +88,6 @@ _COLUMNS = (
     SubmissionModel.public,
     LeaderboardRowModel.ranked,
     LeaderboardRowModel.rank_error,
-    LeaderboardRowModel.view_errors,
     LeaderboardRowModel.json,
 )
 """Columns of the fields of an entry, without ranks."""
@@ -104,6 +98,14 @@ class Ranking:
     """Rows of a config: ranked rows first, by rank error, then unranked ones; ties by age, oldest first."""
 
     entries: tuple[LeaderboardEntry, ...]
+
+    @cached_property
+    def best(self) -> Ranking:
+        """The best row of each submitter and method name, with ranks among these rows."""
+        first: dict[tuple[str, str], LeaderboardEntry] = {}
+        for entry in self.entries:
+            first.setdefault((entry.submitter, entry.method), entry)
+        return Ranking(_with_ranks(list(first.values())))
 
     @cached_property
     def by_id(self) -> dict[str, LeaderboardEntry]:
@@ -120,8 +122,8 @@ def read_ranking(
 ) -> Ranking:
     """Return the public rows of a config and those of ``viewer``.
 
-    Results of another dataset than the one with ``dataset_digest`` are left out. Equal rank errors share a
-    rank. A row that is not public has no rank and does not affect the ranks of others.
+    Results of other datasets than the one with ``dataset_digest``, and of other protocols, are left out. Equal
+    rank errors share a rank. A row that is not public has no rank and does not affect the ranks of others.
     """
     own = false() if viewer is None else SubmissionModel.token_id == viewer.id
     query = (
@@ -130,39 +132,28 @@ def read_ranking(
         .join(TokenModel, TokenModel.id == SubmissionModel.token_id)
         .where(
             LeaderboardRowModel.config == config,
-            SubmissionModel.status == SCORED,
-            SubmissionModel.dataset_digest == dataset_digest,
+            LeaderboardRowModel.dataset_digest == dataset_digest,
+            LeaderboardRowModel.protocol == PROTOCOL,
             SubmissionModel.public | own,
         )
         .order_by(SubmissionModel.created_at)
     )
     with database.read() as session:
         entries = [LeaderboardEntry(*tuple(row)) for row in session.execute(query)]
-    if database.hidden_truth:
-        entries = [_disclosed(entry) for entry in entries]
     # Sorted here, because databases round differently; the sort is stable.
     entries.sort(key=lambda entry: (not entry.may_rank, entry.rank_error is None, entry.rank_error))
-    return Ranking(tuple(_with_ranks(entries)))
+    return Ranking(_with_ranks(entries))
 
 
-def _disclosed(entry: LeaderboardEntry) -> LeaderboardEntry:
-    """Return the entry with the rank error and the table as they are disclosed."""
-    shown = None if entry.rank_error is None else disclosed_number(entry.rank_error)
-    table_json = DisclosedTable.model_validate_json(entry.table_json).model_dump_json()
-    return replace(entry, rank_error=shown, view_errors=None, table_json=table_json)
-
-
-def _with_ranks(entries: Sequence[LeaderboardEntry]) -> Iterator[LeaderboardEntry]:
-    """Yield sorted entries with their ranks."""
+def _with_ranks(entries: Sequence[LeaderboardEntry]) -> tuple[LeaderboardEntry, ...]:
+    """Return sorted entries with their ranks."""
     ranked = [entry for entry in entries if entry.may_rank and entry.public]
     ranks = _ranks(ranked)
-    ranges = rank_ranges([entry.view_errors for entry in ranked])
     classes = [_ranks([entry for entry in ranked if entry.inputs == name]) for name in INPUTS]
     class_ranks = {entry_id: rank for ranks in classes for entry_id, rank in ranks.items()}
-    range_of = {entry.id: rank_range for entry, rank_range in zip(ranked, ranges, strict=True)}
-    for entry in entries:
-        key = entry.id
-        yield replace(entry, rank=ranks.get(key), class_rank=class_ranks.get(key), rank_range=range_of.get(key))
+    return tuple(
+        replace(entry, rank=ranks.get(entry.id), class_rank=class_ranks.get(entry.id)) for entry in entries
+    )
 
 
 def _ranks(entries: Sequence[LeaderboardEntry]) -> dict[str, int]:
@@ -196,19 +187,25 @@ class OverallEntry:
         return any(entry.rank is not None for entry in self.entries.values())
 
 
-def overall_ranking(rankings: Sequence[tuple[str, Ranking]]) -> list[OverallEntry]:
+def overall_ranking(rankings: Sequence[tuple[str, Ranking]], *, best: bool = False) -> list[OverallEntry]:
     """Return the submissions in order of their mean rank error over the configs of ``rankings``.
 
     A config that a submission lacks counts ``MISSING_ERROR``; results of different submissions are not combined.
-    Submissions that are ranked in no config come last.
+    Submissions that are ranked in no config come last. With ``best``, only the best submission of each submitter
+    and method name is returned.
     """
     by_id: dict[str, dict[str, LeaderboardEntry]] = {}
     for config, ranking in rankings:
         for entry in ranking.entries:
             by_id.setdefault(entry.id, {})[config] = entry
     all_entries = [OverallEntry(_mean_error(entries, len(rankings)), entries) for entries in by_id.values()]
+    all_entries.sort(key=lambda one: (not one.is_ranked, one.mean, one.first.created_at))
+    if best:
+        first: dict[tuple[str, str], OverallEntry] = {}
+        for one in all_entries:
+            first.setdefault((one.first.submitter, one.first.method), one)
+        all_entries = list(first.values())
     ranked = [one for one in all_entries if one.is_ranked]
-    ranked.sort(key=lambda one: (one.mean, one.first.created_at))
     ranks = _shared_ranks([one.mean for one in ranked])
     unranked = [one for one in all_entries if not one.is_ranked]
     return [*(replace(one, rank=rank) for one, rank in zip(ranked, ranks, strict=True)), *unranked]
@@ -239,30 +236,6 @@ class CurrentRankings:
             if config not in self._by_config:
                 self._by_config[config] = read_ranking(self._database, config, self._dataset_digest)
             return self._by_config[config]
-
-
-def picture_facts(database: Database, submission_id: str) -> dict[str, tuple[dict[str, Any], list[str]]]:
-    """Return the facts and the kinds of the stored pictures by view id."""
-    if database.hidden_truth:
-        return {}
-    facts = select(PictureModel.view_id, PictureModel.facts).where(PictureModel.submission_id == submission_id)
-    kinds = select(PictureImageModel.view_id, PictureImageModel.kind).where(
-        PictureImageModel.submission_id == submission_id
-    )
-    with database.read() as session:
-        pictures = {view_id: (json.loads(text), list[str]()) for view_id, text in session.execute(facts)}
-        for view_id, kind in session.execute(kinds):
-            pictures[view_id][1].append(kind)
-    return pictures
-
-
-def picture_webp(database: Database, submission_id: str, view_id: str, kind: str) -> bytes | None:
-    """Return a picture of a view as WebP bytes, or None if it is not stored."""
-    if database.hidden_truth:
-        return None
-    with database.read() as session:
-        record = session.get(PictureImageModel, (submission_id, view_id, kind))
-        return None if record is None else record.webp
 
 
 def queue_position(database: Database, submission: SubmissionModel) -> tuple[int, int] | None:

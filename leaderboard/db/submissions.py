@@ -1,12 +1,12 @@
-"""Database operations on submissions: acceptance within the quota, lookup, publication and deletion."""
+"""Database operations on submissions: lookup, quota, results, change and deletion."""
 
 from __future__ import annotations
 
 import json
 import secrets
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 from sqlalchemy import delete, func, select, update
@@ -15,16 +15,12 @@ from sqlalchemy.orm import Session
 from leaderboard.db.engine import Database
 from leaderboard.db.models import (
     LeaderboardRowModel,
-    PictureImageModel,
-    PictureModel,
     ResultModel,
     SubmissionModel,
     TokenModel,
     increment_content_version,
 )
-from rebar_depth_bench.scoring.result import disclosed_json
-from rebar_depth_bench.submission import SubmissionMeta
-from rebar_depth_bench.submission.declaration import MethodDetails
+from rebar_depth_bench.scoring.protocol import PROTOCOL
 
 QUEUED, SCORING, SCORED, FAILED, DELETED = "queued", "scoring", "scored", "failed", "deleted"
 DAY_S = 86400
@@ -42,20 +38,6 @@ class Quota:
     size: int
 
 
-@dataclass(frozen=True)
-class Upload:
-    """A validated archive that is about to be accepted.
-
-    ``meta`` is its ``submission.json``, ``sha256`` its digest in hexadecimal, ``size`` is in bytes, and
-    ``dataset_digest`` is the digest of the dataset that it was validated against.
-    """
-
-    meta: SubmissionMeta
-    sha256: str
-    size: int
-    dataset_digest: str
-
-
 def new_id() -> str:
     """Return a random id of 128 bits.
 
@@ -65,60 +47,16 @@ def new_id() -> str:
     return secrets.token_hex(16)
 
 
-def accept(
-    database: Database, submission_id: str, token: TokenModel, upload: Upload, quota: Quota, public: bool
-) -> SubmissionModel:
-    """Insert a queued submission, whose archive is stored already, and return its row. Durable on return.
-
-    If the token has a submission of the same archive, nothing is inserted, and the row of that one is returned.
-    Raises ``QuotaExceededError`` if the token has used its daily quota.
-    """
-    with database.write() as session:
-        # The token's row is locked, so that concurrent uploads are neither duplicates nor exceed the quota.
-        session.execute(select(TokenModel).where(TokenModel.id == token.id).with_for_update())
-        if duplicate := find_duplicate(session, token, upload.sha256):
-            return duplicate
-        check_quota(session, token, quota, upload.size)
-        record = SubmissionModel(
-            id=submission_id,
-            token_id=token.id,
-            method=upload.meta.method,
-            inputs=upload.meta.inputs,
-            uses_ground_truth=upload.meta.uses_ground_truth,
-            archive_sha256=upload.sha256,
-            archive_bytes=upload.size,
-            status=QUEUED,
-            public=public,
-            created_at=time.time(),
-            attempts=0,
-            dataset_digest=upload.dataset_digest,
-            details=_details_json(upload.meta),
-        )
-        session.add(record)
-    return record
-
-
-def _details_json(meta: SubmissionMeta) -> str:
-    """Return what the submitter says about the method."""
-    details = meta.model_dump(include=set(MethodDetails.model_fields), exclude_none=True)
-    if (seconds := meta.seconds_per_view) is not None:
-        details["seconds_per_view"] = seconds
-    return json.dumps(details)
-
-
-def find_duplicate(session: Session, token: TokenModel, sha256: str) -> SubmissionModel | None:
-    """Return the submission that a token has made of an archive, or None; failed ones may be sent again."""
-    is_own = (SubmissionModel.token_id == token.id, SubmissionModel.archive_sha256 == sha256)
-    return session.scalar(
-        select(SubmissionModel).where(*is_own, SubmissionModel.status.in_((QUEUED, SCORING, SCORED)))
-    )
-
-
 def quota_used(session: Session, token: TokenModel) -> Quota:
-    """Return the submissions made with a token since midnight UTC and their bytes, including deleted ones."""
+    """Return the submissions made with a token today (UTC) and their bytes, including deleted ones.
+
+    Submissions dated in the future, by a clock that was wrong, do not count.
+    """
     midnight = time.time() // DAY_S * DAY_S
     used = select(func.count(), func.coalesce(func.sum(SubmissionModel.archive_bytes), 0)).where(
-        SubmissionModel.token_id == token.id, SubmissionModel.created_at >= midnight
+        SubmissionModel.token_id == token.id,
+        SubmissionModel.created_at >= midnight,
+        SubmissionModel.created_at < midnight + DAY_S,
     )
     count, size = session.execute(used).one()
     return Quota(count, int(size))
@@ -140,29 +78,75 @@ def find(database: Database, submission_id: str) -> SubmissionModel | None:
     return None if record is None or record.status == DELETED else record
 
 
-def result_json(database: Database, submission_id: str) -> bytes | None:
-    """Return the result JSON of a scored submission, byte-identical to the command line's, or None.
+def of_token(database: Database, token: TokenModel) -> list[SubmissionModel]:
+    """Return the submissions of a token, newest first, without deleted ones."""
+    own = select(SubmissionModel).where(SubmissionModel.token_id == token.id, SubmissionModel.status != DELETED)
+    with database.read() as session:
+        return list(session.scalars(own.order_by(SubmissionModel.created_at.desc())))
 
-    If the ground truth is hidden, it is the disclosed part of the result.
+
+@dataclass(frozen=True)
+class ShownResult:
+    """Dataset and protocol of the result of a submission that is shown.
+
+    ``outdated`` says why they are not those that are served; it is None if they are.
     """
-    query = (
-        select(ResultModel.json)
-        .join(SubmissionModel, SubmissionModel.id == ResultModel.submission_id)
-        .where(ResultModel.submission_id == submission_id, SubmissionModel.status == SCORED)
+
+    dataset_digest: str
+    protocol: str
+    outdated: str | None
+
+
+def shown_results(
+    database: Database, records: Sequence[SubmissionModel], dataset_digest: str
+) -> dict[str, ShownResult]:
+    """Return the shown results by submission id, for the submissions that have any.
+
+    The result of the served dataset and protocol is shown if there is one, and else the newest result.
+    """
+    columns = (
+        ResultModel.submission_id,
+        ResultModel.dataset_digest,
+        ResultModel.protocol,
+        ResultModel.json.is_not(None),
+        ResultModel.reason,
     )
+    query = select(*columns).where(ResultModel.submission_id.in_([record.id for record in records]))
+    by_id: dict[str, ShownResult] = {}
+    failures: dict[str, str | None] = {}
     with database.read() as session:
-        result = session.scalar(query)
-    return disclosed_json(result) if result is not None and database.hidden_truth else result
+        for submission_id, digest, protocol, has_json, reason in session.execute(
+            query.order_by(ResultModel.finished_at)
+        ):
+            is_current = (digest, protocol) == (dataset_digest, PROTOCOL)
+            if not has_json:
+                failures |= {submission_id: reason} if is_current else {}
+            elif is_current:
+                by_id[submission_id] = ShownResult(digest, protocol, None)
+            elif submission_id not in by_id or by_id[submission_id].outdated is not None:
+                where = f"the result belongs to the dataset {digest} and the protocol {protocol}"
+                by_id[submission_id] = ShownResult(digest, protocol, where)
+    for record in records:
+        shown = by_id.get(record.id)
+        if shown is None or shown.outdated is None:
+            continue
+        if record.status in (QUEUED, SCORING):
+            why = "the submission is being scored again"
+        elif record.id in failures:
+            why = f"scoring against the served dataset {dataset_digest} failed: {failures[record.id]}"
+        elif record.archive_deleted_at is not None:
+            why = "its archive is not kept, so that it is neither scored against the served dataset nor ranked"
+        else:
+            why = f"it is not scored against the served dataset {dataset_digest}"
+        by_id[record.id] = replace(shown, outdated=f"{shown.outdated}; {why}")
+    return by_id
 
 
-def result_notes(database: Database, submission_id: str) -> list[str]:
-    """Return the notes on possible mistakes in a scored submission; none if the ground truth is hidden."""
-    if database.hidden_truth:
-        return []
+def result_content(database: Database, submission_id: str, shown: ShownResult) -> tuple[bytes, list[str]] | None:
+    """Return the JSON of a result and the notes on possible mistakes; None if it was deleted meanwhile."""
     with database.read() as session:
-        record = session.get(ResultModel, submission_id)
-    notes: list[str] = [] if record is None else json.loads(record.notes)
-    return notes
+        record = session.get(ResultModel, (submission_id, shown.dataset_digest, shown.protocol))
+    return None if record is None or record.json is None else (record.json, json.loads(record.notes))
 
 
 def change(database: Database, submission_id: str, values: Mapping[str, Any]) -> None:
@@ -172,40 +156,29 @@ def change(database: Database, submission_id: str, values: Mapping[str, Any]) ->
         increment_content_version(session)
 
 
-def of_token(database: Database, token: TokenModel) -> list[SubmissionModel]:
-    """Return the submissions of a token, newest first, without deleted ones."""
-    own = select(SubmissionModel).where(SubmissionModel.token_id == token.id, SubmissionModel.status != DELETED)
-    with database.read() as session:
-        return list(session.scalars(own.order_by(SubmissionModel.created_at.desc())))
-
-
 def archive_rows(database: Database) -> dict[str, tuple[str, int] | None]:
-    """Return the archive of every submission by id, also of removed ones: its SHA-256 and its size in bytes.
+    """Return the archive of every submission by id, also of deleted ones: its SHA-256 and its size in bytes.
 
-    None stands for an archive that is not kept: its row says that it was deleted with its submission or pruned.
+    None stands for an archive that is not kept, because the submission or the archive alone was deleted.
     """
     of_archive = (SubmissionModel.archive_sha256, SubmissionModel.archive_bytes)
-    query = select(SubmissionModel.id, SubmissionModel.status, SubmissionModel.archive_deleted_at, *of_archive)
+    query = select(SubmissionModel.id, SubmissionModel.archive_deleted_at, *of_archive)
     with database.read() as session:
         return {
-            submission_id: None if status == DELETED or deleted_at is not None else (sha256, size)
-            for submission_id, status, deleted_at, sha256, size in session.execute(query)
+            submission_id: None if deleted_at is not None else (sha256, size)
+            for submission_id, deleted_at, sha256, size in session.execute(query)
         }
 
 
-def delete_results(session: Session, submission_id: str) -> None:
-    """Delete what scoring has stored of a submission."""
-    for table in (PictureImageModel, PictureModel, LeaderboardRowModel, ResultModel):
-        session.execute(delete(table).where(table.submission_id == submission_id))
-
-
 def remove(database: Database, submission_id: str) -> None:
-    """Delete a submission's rows, result and pictures; its cleared own row still counts for the quota."""
+    """Delete a submission's rows and results; its cleared own row still counts for the quota."""
     with database.write() as session:
         # The row is locked, so that no worker finishes the submission meanwhile.
         record = session.get_one(SubmissionModel, submission_id, with_for_update=True)
-        delete_results(session, submission_id)
+        for table in (LeaderboardRowModel, ResultModel):
+            session.execute(delete(table).where(table.submission_id == submission_id))
         increment_content_version(session)
         record.status, record.public, record.details = DELETED, False, "{}"
         record.method, record.archive_sha256 = "", ""
+        record.archive_deleted_at = time.time()
         record.reason = None

@@ -10,14 +10,16 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
 from multiprocessing.connection import Connection
-from typing import Any, TypeVar
+from multiprocessing.context import SpawnProcess
+from typing import Any, Generic, TypeVar
 
 from rebar_depth_bench.base.errors import Problem, ProblemCode, RebarDepthError, SubmissionError
 from rebar_depth_bench.base.system import limit_process
 
-POLL_INTERVAL_S = 1.0
 NICENESS = 10
 MIN_MEMORY_BYTES = 1 << 30
 """Minimum memory limit: interpreter, libraries and thread stacks alone take several hundred megabytes."""
@@ -45,27 +47,51 @@ class TimeLimitError(Exception):
     """Raised when the process has reached its time limit."""
 
 
-class StoppedError(Exception):
-    """Raised when ``should_continue`` returned False."""
+@dataclass(frozen=True)
+class IsolatedCall(Generic[T]):
+    """A function that runs in a process of its own until ``deadline``, in seconds of ``time.monotonic``."""
+
+    process: SpawnProcess
+    receiver: Connection
+    deadline: float
+
+    def wait(self, seconds: float) -> bool:
+        """Wait for the value for at most ``seconds`` seconds; return whether ``value`` has it.
+
+        Raises ``TimeLimitError`` after the deadline.
+        """
+        if self.receiver.poll(min(seconds, max(0.0, self.deadline - time.monotonic()))):
+            return True
+        if time.monotonic() >= self.deadline:
+            raise TimeLimitError
+        return False
+
+    def value(self) -> T:
+        """Return the value of the function, for which it waits.
+
+        Raises ``ProcessEndedError``; ``SubmissionError`` if the function does, or needs more memory; and
+        ``UnavailableError`` for its other errors.
+        """
+        try:
+            found: T | UnavailableError | SubmissionError = self.receiver.recv()
+        except EOFError:
+            self.process.join()
+            raise ProcessEndedError(self.process.exitcode) from None
+        if isinstance(found, UnavailableError | SubmissionError):
+            raise found
+        return found
 
 
-def call_isolated(
-    function: Callable[..., T],
-    *arguments: object,
-    memory: int,
-    time_limit_s: float,
-    step_s: float = POLL_INTERVAL_S,
-    should_continue: Callable[[], bool] = lambda: True,
-) -> T:
-    """Return the value of ``function(*arguments)``, which runs in a new process.
+@contextmanager
+def isolated_call(
+    function: Callable[..., T], *arguments: object, memory: int, time_limit_s: float
+) -> Iterator[IsolatedCall[T]]:
+    """Start ``function(*arguments)`` in a new process, and kill the process at the end of the block.
 
-    ``memory`` is its limit in bytes; ``should_continue`` is called about every ``step_s`` seconds. Raises
-    ``TimeLimitError``, ``StoppedError`` and ``ProcessEndedError``; ``SubmissionError`` if the function does, or
-    needs more memory; and ``UnavailableError`` for its other errors, and if no process can be started.
+    ``memory`` is its limit in bytes. Raises ``UnavailableError`` if no process can be started.
     """
     receiver, sender = _SPAWN.Pipe(duplex=False)
     process = _SPAWN.Process(target=_run, args=(sender, memory, os.getpid(), function, arguments))
-    deadline = time.monotonic() + time_limit_s
     with receiver:
         with sender:  # Closed here, so that the end of the other process is noticed.
             try:
@@ -73,22 +99,11 @@ def call_isolated(
             except OSError as error:  # Out of memory or processes.
                 raise UnavailableError(str(error)) from None
         try:
-            while not receiver.poll(min(step_s, max(0.0, deadline - time.monotonic()))):
-                if time.monotonic() >= deadline:
-                    raise TimeLimitError
-                if not should_continue():
-                    raise StoppedError
-            value: T | UnavailableError | SubmissionError = receiver.recv()
-        except EOFError:
-            process.join()
-            raise ProcessEndedError(process.exitcode) from None
+            yield IsolatedCall(process, receiver, time.monotonic() + time_limit_s)
         finally:
             process.kill()
             process.join()
             process.close()
-    if isinstance(value, UnavailableError | SubmissionError):
-        raise value
-    return value
 
 
 def _run(

@@ -7,37 +7,70 @@ import os
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO
 
-from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.errors import InputError, StorageError, escape_text
 from rebar_depth_bench.base.system import exclusive_lock, fsync_path
 from rebar_depth_bench.base.writing import atomic_replace, write_error
 from rebar_depth_bench.data.files import file_sha256
 
 FILE_MODE = 0o600
+MARKER = "leaderboard-id"
+"""Name of the file in the archive folder that holds the id of the database (``BoardModel.board_id``).
+
+A folder that is not mounted, or of another leaderboard, is recognised by it."""
+COPY_AGE_S = 3600.0
+"""Time without a change after which an unfinished copy of an archive belongs to no process, in seconds."""
 
 
 class ArchiveNotFoundError(Exception):
-    """Raised when an archive does not exist although the folder does."""
+    """Raised when an archive does not exist although the folder is the right one."""
 
 
 class ArchiveStore:
-    """Storage of submission archives by submission id. Methods raise ``OSError`` if the folder is unusable."""
+    """Storage of submission archives by submission id.
 
-    def __init__(self, folder: Path, *, create: bool = True) -> None:
-        """Create the folder, which machines may share. Raises the errors of ``make_folder``."""
-        self._folder = folder
-        if create:
-            make_folder(folder, "the archive storage")
+    Every method raises ``StorageError`` unless the folder has the marker of the database with the id ``board_id``,
+    and ``OSError`` if the folder is unusable.
+    """
+
+    def __init__(self, folder: Path, board_id: str) -> None:
+        self._folder, self._board_id = folder, board_id
+
+    def initialise(self, rows: Mapping[str, tuple[str, int] | None]) -> None:
+        """Create the folder, and the marker while there are no archives, neither in it nor in ``rows``.
+
+        ``rows`` are those of ``archive_rows``. Otherwise the folder stays as it is. Raises the errors of
+        ``make_folder``.
+        """
+        if any(rows.values()) or any(self._folder.glob("*.zip")) or (self._folder / MARKER).exists():
+            return
+        make_folder(self._folder, "the archive storage")
+        with atomic_replace(self._folder / MARKER, FILE_MODE) as temporary:
+            temporary.write_text(f"{self._board_id}\n")
+
+    def check(self) -> None:
+        """Raise ``StorageError`` unless the folder has the marker of the database."""
+        try:
+            found = (self._folder / MARKER).read_text(errors="replace").strip()
+        except FileNotFoundError:
+            raise StorageError(
+                f"{self._folder}: has no file {MARKER}, expected that of this leaderboard; mount the folder of its "
+                "archives, or name it with --archives"
+            ) from None
+        if found != self._board_id:
+            raise StorageError(
+                f"{self._folder}: belongs to the database with the id {escape_text(found)}, expected "
+                f"{self._board_id}; name the right database with --db or --state-dir, or folder with --archives"
+            )
 
     def put(self, submission_id: str, source: Path) -> None:
         """Move a file into the storage; durable on return. It is renamed on the same disk and copied otherwise."""
         target = self.file(submission_id)
         if source.stat().st_dev == self._folder.stat().st_dev:
-            os.utime(source)  # Its age counts from now.
             fsync_path(source)
             source.replace(target)
             fsync_path(self._folder)
@@ -46,39 +79,38 @@ class ArchiveStore:
                 shutil.copyfile(source, temporary)
             source.unlink()
 
+    def file(self, submission_id: str) -> Path:
+        """Return the place of an archive, which may not exist."""
+        self.check()
+        return self._folder / f"{submission_id}.zip"
+
     def path(self, submission_id: str) -> Path:
         """Return the path of an archive. Raises ``ArchiveNotFoundError`` if the archive does not exist."""
         path = self.file(submission_id)
-        if path.is_file():
-            return path
-        if self._folder.is_dir():
+        if not path.is_file():
             raise ArchiveNotFoundError(submission_id)
-        raise OSError(f"{self._folder}: the folder does not exist")
+        return path
 
     def delete(self, submission_id: str) -> None:
         """Delete an archive; a missing archive is not an error."""
         self.file(submission_id).unlink(missing_ok=True)
 
     def ids(self) -> set[str]:
-        """Return the ids of all stored archives, none if the folder does not exist."""
+        """Return the ids of all stored archives."""
+        self.check()
         return {path.stem for path in self._folder.glob("*.zip")}
 
-    def age_s(self, submission_id: str) -> float:
-        """Return the age of an archive in seconds; 0 if it was deleted since it was listed."""
-        with suppress(FileNotFoundError):
-            return time.time() - self.file(submission_id).stat().st_mtime
-        return 0.0
+    def finish_deletions(self, rows: Mapping[str, tuple[str, int] | None], copy_age_s: float = COPY_AGE_S) -> None:
+        """Delete what killed processes left: archives whose row in ``rows`` says deleted, and unfinished copies.
 
-    def delete_leftovers(self, age_s: float) -> None:
-        """Delete the temporary files of copies that were killed: those that have not changed for ``age_s``."""
+        Archives without a row stay, and copies that have changed in the last ``copy_age_s`` seconds.
+        """
+        for submission_id in self.ids() & {name for name, row in rows.items() if row is None}:
+            self.delete(submission_id)
         for path in self._folder.glob(".*.zip.*.tmp"):
             with suppress(FileNotFoundError):
-                if time.time() - path.stat().st_mtime >= age_s:
+                if time.time() - path.stat().st_mtime >= copy_age_s:
                     path.unlink()
-
-    def file(self, submission_id: str) -> Path:
-        """Return the place of an archive, which may not exist."""
-        return self._folder / f"{submission_id}.zip"
 
 
 def make_folder(folder: Path, name: str) -> None:

@@ -21,7 +21,6 @@ from leaderboard.storage.archive_store import (
     archive_problem,
     state_lock,
 )
-from leaderboard.storage.retention import delete_archives, unneeded_archives
 from rebar_depth_bench.base.errors import InputError, StorageError, problem_summary
 from rebar_depth_bench.base.writing import atomic_replace, write_error
 
@@ -35,7 +34,7 @@ def back_up(settings: Settings, target: Path, prune: bool) -> None:
 
     The target is a valid state folder, which ``serve --state-dir target`` can serve. It holds a whole backup at
     any time: archives are added before the database that needs them replaces the former one, and with ``prune``,
-    those whose row says deleted or pruned are deleted last. Nothing is replaced unless what is copied is sound.
+    those whose row says deleted are deleted last. Nothing is replaced unless what is copied is sound.
 
     Raises ``InputError`` for a target that is in use, holds other files or has submissions that the database
     lacks, ``OutputError`` if the target cannot be written, and ``StorageError`` for damaged data, and, after all
@@ -47,7 +46,9 @@ def back_up(settings: Settings, target: Path, prune: bool) -> None:
         raise InputError(f"{target}: is in use by the service, expected another folder")
     with closing(Database(settings.database_url, read_only=True)) as database:
         database.check_schema()
-        rows: Rows = archive_rows(database)
+        board_id, rows = database.board().board_id, archive_rows(database)
+        archives = ArchiveStore(settings.archive_dir, board_id)
+        archives.check()
         if source is None and (problems := database.problems()):
             raise StorageError(f"nothing was copied: {problem_summary(problems)}")
     try:
@@ -58,8 +59,9 @@ def back_up(settings: Settings, target: Path, prune: bool) -> None:
             if source is None and (target / DATABASE).exists():
                 raise InputError(f"{target}: is the backup of an SQLite leaderboard, expected another folder")
             target.chmod(0o700)
-            archives, copies = ArchiveStore(settings.archive_dir), ArchiveStore(target / ARCHIVES)
-            copies.delete_leftovers(0)  # Of a backup that was killed.
+            copies = ArchiveStore(target / ARCHIVES, board_id)
+            copies.initialise({})
+            copies.finish_deletions({}, copy_age_s=0)  # Copies of a backup that was killed.
             for leftover in target.glob(f".{DATABASE}*.tmp*"):
                 leftover.unlink()
             if source is None:
@@ -67,7 +69,7 @@ def back_up(settings: Settings, target: Path, prune: bool) -> None:
             else:
                 rows, missing = _copy_board(source, archives, target, copies)
             if prune:
-                delete_archives(copies, unneeded_archives(rows, copies))
+                copies.finish_deletions(rows)
     except OSError as error:
         raise write_error(target, error) from None
     with closing(Database(settings.database_url, read_only=True)) as database:

@@ -19,9 +19,8 @@ from leaderboard.db.engine import DATABASE_UNAVAILABLE
 from leaderboard.refusals import RefusedError
 from leaderboard.service import Service
 from leaderboard.web.api import leaderboard, status, submissions
-from leaderboard.web.api.schemas import DATABASE_UNAVAILABLE_MESSAGE
-from leaderboard.web.cache import CacheMiddleware
-from leaderboard.web.middleware import EarlyResponseMiddleware, RequestMiddleware
+from leaderboard.web.api.errors import DATABASE_UNAVAILABLE_MESSAGE
+from leaderboard.web.middleware import ETagMiddleware, RequestMiddleware
 from leaderboard.web.pages import account, ranking, submission_page
 from leaderboard.web.pages.rendering import error_response, make_templates
 from rebar_depth_bench import software_version
@@ -34,10 +33,6 @@ Uploads require a bearer token. An archive is validated before it is accepted; a
 against the quota. The id of a submission is random. Anyone who knows the id can read the submission, even if its
 rows are not on the leaderboard."""
 
-HIDDEN_TRUTH = """
-
-The ground truth is hidden: of each result, only the rank error and the coverage of each config are returned, to
-three decimals, and ranks use these rounded numbers."""
 _LOCAL_HOSTS = ("localhost", "127.0.0.1", "[::1]")
 """Hosts that are always allowed: health checks of the machine itself name them."""
 _MIN_GZIP_BYTES = 1024
@@ -53,7 +48,7 @@ class _StaticFiles(StaticFiles):
 
     def file_response(self, *arguments: Any, **options: Any) -> Response:
         response = super().file_response(*arguments, **options)
-        response.headers["Cache-Control"] = "public, no-cache"  # Not REVALIDATE: the cache has its own ETag.
+        response.headers["Cache-Control"] = "public, no-cache"  # Not REVALIDATE: files have their own ETag.
         return response
 
 
@@ -63,7 +58,7 @@ def make_app(service: Service) -> FastAPI:
     app = FastAPI(
         title=settings.title,
         version=software_version(),
-        description=DESCRIPTION + (HIDDEN_TRUTH if settings.hidden_truth else ""),
+        description=DESCRIPTION,
         docs_url=None,  # These pages load scripts from other hosts.
         redoc_url=None,
         root_path=urlsplit(settings.public_url).path,
@@ -74,17 +69,11 @@ def make_app(service: Service) -> FastAPI:
         app.include_router(router.router)
     app.mount("/static", _StaticFiles(packages=_STATIC_FOLDERS))
     identity = f"{software_version()} {service.folder.digest} {settings.model_dump_json()}"
-    # Inside the cache, so that a kept response is compressed once.
     app.add_middleware(GZipMiddleware, minimum_size=_MIN_GZIP_BYTES, compresslevel=5)
-    app.add_middleware(CacheMiddleware, database=service.database, identity=identity)
+    app.add_middleware(ETagMiddleware, database=service.database, identity=identity)
     if host := urlsplit(settings.public_url).hostname:
         app.add_middleware(TrustedHostMiddleware, allowed_hosts=[host, *_LOCAL_HOSTS], www_redirect=False)
-    app.add_middleware(
-        RequestMiddleware,
-        reads=settings.read_rate_limit,
-        writes=settings.write_rate_limit,
-    )
-    app.add_middleware(EarlyResponseMiddleware)
+    app.add_middleware(RequestMiddleware)
     app.add_exception_handler(HTTPException, _handle_http_exception)
     app.add_exception_handler(RefusedError, _handle_refusal)
     app.add_exception_handler(ClientDisconnect, _handle_client_disconnect)

@@ -16,7 +16,7 @@ from leaderboard.db.models import SubmissionModel, TokenModel
 from leaderboard.db.tokens import find_token
 from leaderboard.refusals import RefusedError, too_large
 from leaderboard.service import Service
-from leaderboard.uploads.multipart import MAX_OVERHEAD_BYTES
+from leaderboard.uploads import MAX_OVERHEAD_BYTES
 
 MAX_PATCH_BYTES = 32 << 10
 """Maximum size in bytes of a change of a submission."""

@@ -10,48 +10,38 @@ from fastapi import APIRouter, Query, Response
 from leaderboard.db.models import TokenModel
 from leaderboard.db.rankings import LeaderboardEntry, overall_ranking
 from leaderboard.service import Service
-from leaderboard.web.api.schemas import (
+from leaderboard.web.api.errors import Responses, errors
+from leaderboard.web.dependencies import WITHOUT_TOKEN, OptionalToken, ServiceDep, check_config
+from leaderboard.web.middleware import NO_STORE, REVALIDATE
+from rebar_depth_bench.remote.models import (
     Leaderboard,
     LeaderboardRow,
     OverallRanking,
     OverallRow,
-    Responses,
     SubmissionOfRow,
-    errors,
 )
-from leaderboard.web.cache import NO_STORE, REVALIDATE
-from leaderboard.web.dependencies import WITHOUT_TOKEN, OptionalToken, ServiceDep, check_config
 from rebar_depth_bench.scoring.columns import TABLE_COLUMNS
 from rebar_depth_bench.scoring.frames import csv_text
 from rebar_depth_bench.scoring.protocol import PROTOCOL
-from rebar_depth_bench.scoring.result import DisclosedTable
 from rebar_depth_bench.submission.declaration import InputClass
 
 
-def entries_to_csv(rows: Sequence[LeaderboardEntry], hidden_truth: bool = False) -> str:
+def entries_to_csv(rows: Sequence[LeaderboardEntry]) -> str:
     """Return rows as CSV: ranks, id, method, submitter, declarations, config, then the command line's columns.
 
-    If the ground truth is hidden, the last columns are those of the disclosed table. Undefined numbers are empty
-    cells.
+    Undefined numbers are empty cells.
     """
-    columns = tuple(DisclosedTable.model_fields) if hidden_truth else tuple(one.name for one in TABLE_COLUMNS)
-    header = ["rank", "class_rank", "id", "method", "submitter", "inputs", "uses_ground_truth", "config"]
-    cells = (
-        [
-            *(row.rank, row.class_rank, row.id, row.method, row.submitter),
-            *(row.inputs, row.uses_ground_truth, row.config),
-            *(
-                (row.table[name] for name in columns)
-                if hidden_truth
-                else (column.value(row.table) for column in TABLE_COLUMNS)
-            ),
-        ]
-        for row in rows
-    )
-    return csv_text([[*header, *columns], *cells])
+    header = ["rank", "class_rank", "id", "method", "submitter", "baseline", "inputs", "uses_ground_truth"]
+    columns = [column.name for column in TABLE_COLUMNS]
+    lines = [[*header, "seconds_per_view", "config", *columns]]
+    for row in rows:
+        named = [row.rank, row.class_rank, row.id, row.method, row.submitter, row.is_baseline, row.inputs]
+        declared = [row.uses_ground_truth, row.declared.get("seconds_per_view"), row.config]
+        lines.append([*named, *declared, *(column.value(row.table) for column in TABLE_COLUMNS)])
+    return csv_text(lines)
 
 
-router = APIRouter(prefix="/api/v1", tags=["leaderboard"], responses=errors(429, 503))
+router = APIRouter(prefix="/api/v1", tags=["leaderboard"], responses=errors(503))
 
 CSV = "text/csv; charset=utf-8"
 ConfigName = Annotated[str, Query(max_length=100, description="name of the config", examples=["lattice"])]
@@ -61,14 +51,22 @@ InputsQuery = Annotated[
     InputClass | None,
     Query(description="only the rows that declare this input class"),
 ]
+BestQuery = Annotated[
+    bool,
+    Query(description="only the best row of each submitter and method name, with ranks among these rows"),
+]
 
 
 @router.get("/leaderboard", response_model=Leaderboard, responses=_ERROR_RESPONSES, openapi_extra=WITHOUT_TOKEN)
 def leaderboard(
-    config: ConfigName, service: ServiceDep, token: OptionalToken, inputs: InputsQuery = None
+    config: ConfigName,
+    service: ServiceDep,
+    token: OptionalToken,
+    inputs: InputsQuery = None,
+    best: BestQuery = False,
 ) -> Response:
     """Return the public rows of a config and, with a token, those of its owner."""
-    rows = [LeaderboardRow.model_validate(row) for row in _rows(service, config, inputs, token)]
+    rows = [LeaderboardRow.model_validate(row) for row in _rows(service, config, inputs, best, token)]
     dataset = {"digest": service.folder.digest, "version": service.folder.version}
     content = Leaderboard(config=config, protocol=PROTOCOL, dataset=dataset, rows=rows)
     return _response(content.model_dump_json(), "application/json", token)
@@ -81,18 +79,22 @@ def leaderboard(
     openapi_extra=WITHOUT_TOKEN,
 )
 def leaderboard_csv(
-    config: ConfigName, service: ServiceDep, token: OptionalToken, inputs: InputsQuery = None
+    config: ConfigName,
+    service: ServiceDep,
+    token: OptionalToken,
+    inputs: InputsQuery = None,
+    best: BestQuery = False,
 ) -> Response:
     """Return the rows of a config as CSV."""
-    rows = _rows(service, config, inputs, token)
-    return _response(entries_to_csv(rows, service.settings.hidden_truth), CSV, token)
+    rows = _rows(service, config, inputs, best, token)
+    return _response(entries_to_csv(rows), CSV, token)
 
 
 @router.get("/overall", response_model=OverallRanking)
-def overall(service: ServiceDep) -> Response:
-    """Return the public submissions in order of their mean rank error over all configs, as the pages show them."""
+def overall(service: ServiceDep, best: BestQuery = False) -> Response:
+    """Return the public submissions in order of their mean rank error over all configs."""
     configs = service.folder.configs
-    entries = overall_ranking([(config, service.rankings.of(config)) for config in configs])
+    entries = overall_ranking([(config, service.rankings.of(config)) for config in configs], best=best)
     rows = [
         OverallRow(
             rank=one.rank,
@@ -107,10 +109,13 @@ def overall(service: ServiceDep) -> Response:
     return _response(content.model_dump_json(), "application/json", None)
 
 
-def _rows(service: Service, config: str, inputs: str | None, token: TokenModel | None) -> list[LeaderboardEntry]:
+def _rows(
+    service: Service, config: str, inputs: str | None, best: bool, token: TokenModel | None
+) -> list[LeaderboardEntry]:
     """Return the rows with declared ``inputs`` (None: all). Raises status 404 for an unknown config."""
     check_config(service, config)
-    return service.rankings.of(config, token).of_class(inputs)
+    ranking = service.rankings.of(config, token)
+    return (ranking.best if best else ranking).of_class(inputs)
 
 
 def _response(content: str, media_type: str, token: TokenModel | None) -> Response:

@@ -16,13 +16,12 @@ from leaderboard.changes import (
     edit_submission,
     get_own_submission,
     get_submission,
-    outdated_note,
 )
 from leaderboard.db import submissions
 from leaderboard.db.models import SubmissionModel
-from leaderboard.uploads.accept import accept_upload
-from leaderboard.uploads.multipart import UploadForm
-from leaderboard.web.api.schemas import Responses, Submission, SubmissionList, errors
+from leaderboard.db.submissions import ShownResult, result_content, shown_results
+from leaderboard.uploads import UploadForm, accept_upload
+from leaderboard.web.api.errors import Responses, errors
 from leaderboard.web.dependencies import (
     MAX_PATCH_BYTES,
     WITHOUT_TOKEN,
@@ -32,10 +31,10 @@ from leaderboard.web.dependencies import (
     SubmissionId,
     check_length,
     page_url,
-    service_of,
 )
+from rebar_depth_bench.remote.models import Submission, SubmissionList
 
-router = APIRouter(prefix="/api/v1/submissions", tags=["submissions"], responses=errors(429, 503))
+router = APIRouter(prefix="/api/v1/submissions", tags=["submissions"], responses=errors(503))
 
 _BINARY = {"type": "string", "format": "binary"}
 _UPLOAD_REQUEST_BODY = {
@@ -49,7 +48,10 @@ _UPLOAD_REQUEST_BODY = {
     }
 }
 _ACCEPTED_RESPONSE: Responses = {
-    200: {"description": "the token has sent this archive before; its submission is returned"},
+    200: {
+        "description": "the token has sent this archive before; its submission is returned, unless it is outdated "
+        "and its archive is gone"
+    },
     202: {
         "description": "accepted; the archive and its database row are stored on disk",
         "headers": {"Location": {"description": "URL path of the submission", "schema": {"type": "string"}}},
@@ -60,7 +62,7 @@ _ACCEPTED_RESPONSE: Responses = {
 @router.put(
     "",
     status_code=202,
-    responses={**_ACCEPTED_RESPONSE, **errors(401, 408, 413, 422)},
+    responses={**_ACCEPTED_RESPONSE, **errors(401, 413, 422, 429)},
     openapi_extra={
         "requestBody": {"required": True, "content": {"application/zip": {"schema": _BINARY}}},
     },
@@ -79,7 +81,7 @@ async def upload(request: Request, response: Response, service: ServiceDep, toke
 @router.post(
     "",
     status_code=202,
-    responses={**_ACCEPTED_RESPONSE, **errors(401, 408, 413, 422)},
+    responses={**_ACCEPTED_RESPONSE, **errors(401, 413, 422, 429)},
     openapi_extra=_UPLOAD_REQUEST_BODY,
 )
 async def upload_form(
@@ -95,15 +97,17 @@ async def upload_form(
 def list_own(request: Request, service: ServiceDep, token: RequiredToken) -> SubmissionList:
     """Return the submissions of the token, newest first, without their results."""
     records = submissions.of_token(service.database, token)
-    return SubmissionList(submissions=[_schema(request, record) for record in records])
+    shown = shown_results(service.database, records, service.folder.digest)
+    return SubmissionList(submissions=[_schema(request, record, shown.get(record.id)) for record in records])
 
 
 @router.get("/{submission_id}", responses=errors(401, 404, 422), openapi_extra=WITHOUT_TOKEN)
 def look_up(submission_id: SubmissionId, request: Request, service: ServiceDep, _: OptionalToken) -> Submission:
     """Return a submission. Its id cannot be guessed and gives read access without a token."""
     record = get_submission(service, submission_id)
-    result = submissions.result_json(service.database, submission_id)
-    return _schema(request, record, None if result is None else json.loads(result))
+    shown = shown_results(service.database, [record], service.folder.digest).get(record.id)
+    content = shown and result_content(service.database, record.id, shown)
+    return _schema(request, record, shown, json.loads(content[0]) if content else None)
 
 
 @router.get(
@@ -114,13 +118,14 @@ def look_up(submission_id: SubmissionId, request: Request, service: ServiceDep, 
 def result(submission_id: SubmissionId, service: ServiceDep) -> Response:
     """Return the result, byte for byte as `rebar-bench score ARCHIVE --data ROOT --json FILE` writes it.
 
-    If the ground truth is hidden, it is only the rank error and the coverage of each config, rounded.
+    It is the result on the dataset that is served, or else the newest one, which names its dataset.
     """
-    get_submission(service, submission_id)
-    content = submissions.result_json(service.database, submission_id)
+    record = get_submission(service, submission_id)
+    shown = shown_results(service.database, [record], service.folder.digest).get(record.id)
+    content = shown and result_content(service.database, record.id, shown)
     if content is None:
         raise HTTPException(404, "the submission has no result")
-    return Response(content, media_type="application/json")
+    return Response(content[0], media_type="application/json")
 
 
 @router.patch(
@@ -138,7 +143,8 @@ def edit(
     """Publish a submission's rows, withdraw them, or change what is said about the method; only as the owner."""
     record = get_own_submission(service, submission_id, token)
     edit_submission(service, record, change)
-    return _schema(request, get_submission(service, submission_id))
+    shown = shown_results(service.database, [record], service.folder.digest).get(record.id)
+    return _schema(request, get_submission(service, submission_id), shown)
 
 
 @router.delete("/{submission_id}", status_code=204, responses=errors(401, 403, 404, 422))
@@ -151,10 +157,13 @@ def _accepted(request: Request, response: Response, accepted: tuple[SubmissionMo
     record, is_new = accepted
     response.status_code = 202 if is_new else 200
     response.headers["Location"] = request.url_for("look_up", submission_id=record.id).path
-    return _schema(request, record)
+    return _schema(request, record, None)
 
 
-def _schema(request: Request, record: SubmissionModel, result: dict[str, Any] | None = None) -> Submission:
+def _schema(
+    request: Request, record: SubmissionModel, shown: ShownResult | None, result: dict[str, Any] | None = None
+) -> Submission:
+    """Return the answer on a submission; ``shown`` is its result, ``result`` the JSON object if that is included."""
     details = json.loads(record.details)
     return Submission.model_validate(
         {
@@ -163,7 +172,7 @@ def _schema(request: Request, record: SubmissionModel, result: dict[str, Any] | 
             "url": page_url(request, record),
             "method_url": details.get("url"),
             "archive_kept": record.archive_deleted_at is None,
-            "outdated": outdated_note(record, service_of(request).folder.digest),
+            "outdated": shown and shown.outdated,
             "result": result,
         }
     )

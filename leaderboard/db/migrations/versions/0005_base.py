@@ -1,6 +1,6 @@
 """Schema of the first release; a new database gets the current schema at once."""
 
-revision, down_revision = "0004", None
+revision, down_revision = "0005", None
 
 
 def upgrade() -> None:

@@ -1,1 +1,0 @@
-"""Upload handling: multipart parsing, validation in a child process, acceptance."""
