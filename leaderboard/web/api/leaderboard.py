@@ -6,13 +6,6 @@ from collections.abc import Sequence
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Response
-
-from leaderboard.db.models import TokenModel
-from leaderboard.db.rankings import LeaderboardEntry, overall_ranking
-from leaderboard.service import Service
-from leaderboard.web.api.errors import Responses, errors
-from leaderboard.web.dependencies import WITHOUT_TOKEN, OptionalToken, ServiceDep, check_config
-from leaderboard.web.middleware import NO_STORE, REVALIDATE
 from rebar_depth_bench.remote.models import (
     Leaderboard,
     LeaderboardRow,
@@ -20,6 +13,13 @@ from rebar_depth_bench.remote.models import (
     OverallRow,
     SubmissionOfRow,
 )
+
+from leaderboard.db.models import TokenModel
+from leaderboard.db.rankings import LeaderboardEntry, overall_ranking
+from leaderboard.service import Service
+from leaderboard.web.api.errors import Responses, errors
+from leaderboard.web.dependencies import WITHOUT_TOKEN, OptionalToken, ServiceDep, check_config
+from leaderboard.web.middleware import NO_STORE, REVALIDATE
 from rebar_depth_bench.scoring.columns import TABLE_COLUMNS
 from rebar_depth_bench.scoring.frames import csv_text
 from rebar_depth_bench.scoring.protocol import PROTOCOL

@@ -6,13 +6,13 @@ from typing import Any
 
 from fastapi import APIRouter
 from fastapi.responses import JSONResponse
+from rebar_depth_bench.remote.models import Token
 
 from leaderboard.db.submissions import quota_used
 from leaderboard.health import service_problems
 from leaderboard.web.api.errors import errors
 from leaderboard.web.dependencies import RequiredToken, ServiceDep
 from rebar_depth_bench import software_version
-from rebar_depth_bench.remote.models import Token
 
 router = APIRouter()
 

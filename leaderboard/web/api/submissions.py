@@ -9,6 +9,7 @@ import json
 from typing import Any
 
 from fastapi import APIRouter, HTTPException, Request, Response
+from rebar_depth_bench.remote.models import Submission, SubmissionList
 
 from leaderboard.changes import (
     SubmissionChange,
@@ -32,7 +33,6 @@ from leaderboard.web.dependencies import (
     check_length,
     page_url,
 )
-from rebar_depth_bench.remote.models import Submission, SubmissionList
 
 router = APIRouter(prefix="/api/v1/submissions", tags=["submissions"], responses=errors(503))
 
