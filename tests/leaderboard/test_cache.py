@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 from fastapi import FastAPI
+from leaderboard.web.cache import CacheMiddleware
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from starlette.middleware.gzip import GZipMiddleware
 from starlette.types import Receive, Scope, Send
@@ -24,7 +25,6 @@ from leaderboard.db.models import increment_content_version
 from leaderboard.db.tokens import create_token
 from leaderboard.service import open_service
 from leaderboard.web.app import make_app
-from leaderboard.web.cache import CacheMiddleware
 from tests.leaderboard.boards import add_scored_submission, board_settings, call, finish_scoring, get_response
 from tests.synthetic_dataset import write_dataset
 
