@@ -116,11 +116,10 @@ def claimed(database: Database, scorer: str, lease_s: float = 60) -> str | None:
 
 def get_response(app: ASGIApp, address: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
     """Call an ASGI application directly; return status, headers and body."""
-    return asyncio.run(call(app, address, **headers))
+    return asyncio.run(_call(app, address, **headers))
 
 
-async def call(app: ASGIApp, address: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
-    """Call an ASGI application in a running event loop, as ``get_response`` does."""
+async def _call(app: ASGIApp, address: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
     transport = httpx2.ASGITransport(app=app)
     fields = {"accept-encoding": "", **{name.replace("_", "-"): value for name, value in headers.items()}}
     async with httpx2.AsyncClient(transport=transport, base_url="http://localhost", headers=fields) as client:
