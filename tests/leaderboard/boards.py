@@ -111,7 +111,7 @@ def finish_scoring(database: Database, submission_id: str, method: str, error: f
 def claimed(database: Database, scorer: str, lease_s: float = 60) -> str | None:
     """Claim a job; return its id."""
     record = jobs.claim(database, scorer, lease_s)
-    return record and record.id
+    return None if record is None else record.id
 
 
 def get_response(app: ASGIApp, address: str, **headers: str) -> tuple[int, dict[str, str], bytes]:

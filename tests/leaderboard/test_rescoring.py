@@ -204,9 +204,9 @@ def test_job_of_a_dataset_that_was_replaced_meanwhile_is_queued_again(tmp_path: 
         assert jobs.serve_dataset(database, OTHER_DIGEST, rescore=True) == 1
         assert claimed(database, "slow") == first
         assert jobs.finish(database, first, "slow", Outcome(DIGEST, result_bytes(DIGEST)))
-        assert facts(settings)[first][:2] == ("queued", {DIGEST})
+        assert facts(settings)[first][:2] == ("queued", frozenset({DIGEST}))
         score_all(database)
-        assert facts(settings)[first][:2] == ("scored", {DIGEST, OTHER_DIGEST})
+        assert facts(settings)[first][:2] == ("scored", frozenset({DIGEST, OTHER_DIGEST}))
 
 
 def test_missing_and_other_datasets_cost_no_submission(

@@ -374,7 +374,7 @@ def rescore(settings: Settings) -> None:
 def test_killed_rescoring_keeps_every_result(tmp_path: Path, new_database: Callable[[], str]) -> None:
     boards = iter(range(MAX_OPERATIONS))
     ids: list[str] = []
-    both = {DIGEST, OTHER_DIGEST}
+    both = frozenset({DIGEST, OTHER_DIGEST})
 
     def prepare() -> tuple[object, ...]:
         settings = board_settings(tmp_path / f"state-{next(boards)}", db=new_database())
@@ -385,7 +385,7 @@ def test_killed_rescoring_keeps_every_result(tmp_path: Path, new_database: Calla
 
     def check(settings: Settings) -> None:
         found = facts(settings)
-        assert found[ids[0]] == ("scored", {DIGEST}, False)
+        assert found[ids[0]] == ("scored", frozenset({DIGEST}), False)
         for name in ids[1:]:
             status, of_results, has_archive = found[name]
             assert has_archive
