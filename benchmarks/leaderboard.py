@@ -1,19 +1,20 @@
-"""Benchmark of the leaderboard: its speed beside a bare FastAPI app, and reads during uploads and scoring.
+"""Benchmark of the leaderboard: the first page after a change, and reads beside a large upload.
 
-python -m benchmarks.leaderboard ROOT ARCHIVE [--rows N] [--seconds S] [--repeats N] [--uploaders N] [--db URL]
+python -m benchmarks.leaderboard ROOT ARCHIVE [--rows N] [--seconds S] [--repeats N] [--db URL]
 
 The real server runs in a process of its own, with scored submissions that differ from the result of ARCHIVE by a
-factor of their errors. The bare app returns the same bytes from memory, without middleware; both are measured by
-turns. Then 50 readers send their next request immediately after a response, alone and beside uploaders, so that
-the rates are the maximum throughput. ``--db`` names an empty database, which is filled; default: SQLite.
+factor of their errors. The first request for a page after a change of a submission renders it; the times are
+medians. Then 50 readers send their next request immediately after a response, alone and while ARCHIVE is uploaded
+again and again, so that the rates are the maximum throughput. ``--db`` names an empty database, which is filled;
+default: SQLite.
 """
 
 from __future__ import annotations
 
 import argparse
 import asyncio
+import itertools
 import json
-import os
 import random
 import re
 import statistics
@@ -28,45 +29,22 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import func, select
+from sqlalchemy import select
 
 import rebar_depth_bench as rdb
 from benchmarks.timing import machine_description, print_markdown
 from leaderboard.db import jobs, submissions
 from leaderboard.db.engine import Database
 from leaderboard.db.models import SubmissionModel, TokenModel
-from leaderboard.db.submissions import QUEUED, SCORED, SCORING, Quota, Upload
+from leaderboard.db.submissions import DELETED, QUEUED
 from leaderboard.db.tokens import create_token, find_token
 from leaderboard.scoring.sandbox import Outcome
 from leaderboard.settings import read_settings
-from rebar_depth_bench.submission import SubmissionMeta
 
-CLIENTS = (1, 50)
-START_S, UPLOAD_PAUSE_S = 120.0, 5.0
+READERS = 50
+START_S = 120.0
 WITHOUT_LIMIT = 1_000_000_000
 _STREAM_LIMIT_BYTES = 1 << 22
-_BARE_APP = """
-import socket
-import sys
-from pathlib import Path
-import uvicorn
-from fastapi import FastAPI
-from fastapi.responses import Response
-
-app = FastAPI()
-
-def add_route(number: int, content: bytes) -> None:
-    @app.get(f"/{number}")
-    async def get() -> Response:
-        return Response(content, media_type="text/html")
-
-for number, path in enumerate(sorted(Path(sys.argv[1]).iterdir())):
-    add_route(number, path.read_bytes())
-listener = socket.create_server(("127.0.0.1", 0), backlog=512)
-listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)  # As asyncio does for its own sockets.
-print(f"http://127.0.0.1:{listener.getsockname()[1]}", file=sys.stderr, flush=True)
-uvicorn.Server(uvicorn.Config(app, http="h11", access_log=False, log_level="warning")).run(sockets=[listener])
-"""
 
 
 @dataclass(frozen=True)
@@ -75,11 +53,6 @@ class Served:
 
     port: int
     pid: int
-
-    def cpu_s(self) -> float:
-        """Return the user and system CPU seconds of the server process (Linux only)."""
-        fields = Path(f"/proc/{self.pid}/stat").read_text().rpartition(")")[2].split()
-        return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
     def body(self, path: str) -> bytes:
         """Return the body of a page."""
@@ -90,23 +63,17 @@ class Served:
 
 @dataclass
 class Load:
-    """Measurements of a load: response times, wall-clock and server CPU seconds, and submissions scored."""
+    """Measurements of a load: response times, wall-clock seconds, uploads, and responses with another status."""
 
     read_s: list[float] = field(default_factory=list)
     upload_s: list[float] = field(default_factory=list)
     wall_s: float = 0.0
-    server_cpu_s: float = 0.0
-    scored: int = 0
+    errors: int = 0
 
     @property
     def reads_per_s(self) -> float:
         """Return the reads per second."""
         return len(self.read_s) / self.wall_s
-
-    @property
-    def cpu_ms(self) -> float:
-        """Return the processor time of the server for a read in milliseconds."""
-        return 1000 * self.server_cpu_s / len(self.read_s)
 
     def read_ms(self, share: float) -> float:
         """Return a quantile of the response times in milliseconds, by nearest rank."""
@@ -119,75 +86,69 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser("python -m benchmarks.leaderboard")
     parser.add_argument("data", type=Path, metavar="ROOT", help="a dataset folder")
     parser.add_argument("archive", type=Path, metavar="ARCHIVE", help="an archive of it")
-    parser.add_argument("--rows", type=int, default=200, help="scored rows on the leaderboard")
-    parser.add_argument("--seconds", type=float, default=5.0, help="length of a measurement")
+    parser.add_argument("--rows", type=int, default=1000, help="scored rows on the leaderboard")
+    parser.add_argument("--seconds", type=float, default=10.0, help="length of a measurement")
     parser.add_argument("--repeats", type=int, default=3, help="measurements of each kind, by turns")
-    parser.add_argument("--uploaders", type=int, default=4)
     parser.add_argument("--db", default="", metavar="URL", help="an empty database; default: SQLite")
     options = parser.parse_args(arguments)
     print(f"{options.rows} rows; {machine_description()}; medians of {options.repeats}")
     with tempfile.TemporaryDirectory() as scratch:
-        state, bodies = Path(scratch) / "state", Path(scratch) / "bodies"
+        state = Path(scratch) / "state"
         state.mkdir(mode=0o700)
-        bodies.mkdir()
         result = json.loads(rdb.score(options.archive, options.data).to_json())
         settings = read_settings(None, {"data": str(options.data), "state_dir": state, "db": options.db})
         with closing(Database(settings.database_url)) as database:
             database.migrate()
-            if _count(database):
+            if _ids(database):
                 sys.exit("the database holds submissions, expected an empty one")
+            jobs.serve_dataset(database, result["dataset"]["digest"], rescore=False)
             ids = add_scored_submissions(database, result, options.rows)
             config = next(iter(result["tables"]))
             targets = ("/", f"/?config={config}", f"/api/v1/leaderboard?config={config}", f"/submissions/{ids[0]}")
             with leaderboard(options.data, state, options.db) as served:
-                for number, path in enumerate(targets):
-                    (bodies / f"{number:02d}").write_bytes(served.body(path))
-                with started([sys.executable, "-c", _BARE_APP, str(bodies)], state / "bare.log") as bare:
-                    _print_overhead(served, bare, targets, options)
+                _print_first_pages(served, database, targets, ids, options.repeats)
                 _print_reads(served, database, targets, ids, options)
 
 
-def _print_overhead(served: Served, bare: Served, targets: Sequence[str], options: argparse.Namespace) -> None:
-    """Print the rate of each page beside that of the bare app."""
+def _print_first_pages(
+    served: Served, database: Database, targets: Sequence[str], ids: Sequence[str], repeats: int
+) -> None:
+    """Print the time of the first request for each page after a change, and of the next one."""
     rows = []
-    for number, path in enumerate(targets):
-        size = len(bare.body(f"/{number}"))
-        for clients in CLIENTS:
-            loads: dict[Served, list[Load]] = {served: [], bare: []}
-            for _ in range(options.repeats):
-                for server, page in ((served, path), (bare, f"/{number}")):
-                    loads[server].append(run_load(server, [page], clients, options.seconds))
-            rates = [statistics.median(load.reads_per_s for load in of_one) for of_one in loads.values()]
-            times_ms = [statistics.median(load.cpu_ms for load in of_one) for of_one in loads.values()]
-            cells = (*(f"{rate:.0f}" for rate in rates), f"{rates[0] / rates[1]:.0%}")
-            cells += (*(f"{ms:.2f}" for ms in times_ms), f"{times_ms[1] / times_ms[0]:.0%}")
-            rows.append((f"`{path}`", f"{size / 1000:.0f}", clients, *cells))
-    heads = ["page", "kB", "clients", "leaderboard/s", "bare/s", "share"]
+    for path in targets:
+        size = len(served.body(path))
+        times_ms: list[list[float]] = [[], []]
+        for _ in range(max(repeats, 5)):
+            submissions.change(database, ids[-1], {"public": True})
+            for of_turn in times_ms:
+                start = time.perf_counter()
+                served.body(path)
+                of_turn.append(1000 * (time.perf_counter() - start))
+        rows.append((f"`{path[:40]}`", f"{size / 1000:.0f}", *(f"{statistics.median(ms):.0f}" for ms in times_ms)))
     print()
-    print_markdown([*heads, "leaderboard ms", "bare ms", "share by processor time"], rows)
+    print_markdown(["page", "kB", "first after a change, ms", "next, ms"], rows)
 
 
 def _print_reads(
     served: Served, database: Database, targets: Sequence[str], ids: Sequence[str], options: argparse.Namespace
 ) -> None:
-    """Print the reads of 50 readers, alone and beside uploads and scoring."""
-    tokens = [_new_token(database)[0] for _ in range(options.uploaders)]
-    archives = _distinct(options.archive.read_bytes())
-    loads: dict[str, list[Load]] = {"alone": [], "with uploads and scoring": []}
+    """Print the reads of 50 readers, alone and beside uploads of a large archive."""
+    token = _new_token(database)[0]
+    archive = options.archive.read_bytes()
+    archives = _distinct(archive)
+    loads: dict[str, list[Load]] = {"alone": [], f"beside uploads of {len(archive) / 1e6:.0f} MB": []}
     for _ in range(options.repeats):
-        for name, uploading in zip(loads, ([], tokens), strict=True):
-            before = _count(database, SCORED)
-            load = run_load(served, targets, CLIENTS[-1], options.seconds, uploading, archives)
-            load.scored = _count(database, SCORED) - before
-            _remove_others(database, ids)
-            loads[name].append(load)
+        for name, sender in zip(loads, ("", token), strict=True):
+            loads[name].append(run_load(served, targets, options.seconds, sender, archives))
+            for submission_id in set(_ids(database)) - set(ids):
+                submissions.remove(database, submission_id)
     columns = {
         "reads a second": lambda load: load.reads_per_s,
         "p50 ms": lambda load: load.read_ms(0.5),
         "p99 ms": lambda load: load.read_ms(0.99),
         "max ms": lambda load: load.read_ms(1.0),
-        "uploads a minute": lambda load: 60 * len(load.upload_s) / load.wall_s,
-        "scored a minute": lambda load: 60 * load.scored / load.wall_s,
+        "errors": lambda load: load.errors,
+        "uploads": lambda load: len(load.upload_s),
     }
     print()
     print_markdown(
@@ -206,13 +167,27 @@ def add_scored_submissions(database: Database, result: dict[str, Any], rows: int
     ids = []
     for number in range(rows):
         submission_id, method = submissions.new_id(), f"method {number:04d}"
-        meta = SubmissionMeta(method=method, url="https://example.org/method" if number % 2 else None)
-        upload = Upload(meta, f"{number:064x}", 1, result["dataset"]["digest"])
-        submissions.accept(database, submission_id, token, upload, Quota(WITHOUT_LIMIT, WITHOUT_LIMIT), True)
+        with database.write() as session:
+            session.add(
+                SubmissionModel(
+                    id=submission_id,
+                    token_id=token.id,
+                    method=method,
+                    details=json.dumps({"url": "https://example.org/method"} if number % 2 else {}),
+                    archive_sha256=f"{number:064x}",
+                    archive_bytes=1,
+                    archive_deleted_at=1.0,
+                    public=True,
+                    created_at=time.time(),
+                    status=QUEUED,
+                    attempts=0,
+                )
+            )
         jobs.claim(database, "benchmark", 60.0)
         varied = _with_errors(result, rng.uniform(0.2, 5.0))
         varied["submission"]["method"] = method
-        jobs.finish(database, submission_id, "benchmark", Outcome(json.dumps(varied).encode()))
+        outcome = Outcome(result["dataset"]["digest"], json.dumps(varied).encode())
+        jobs.finish(database, submission_id, "benchmark", outcome)
         ids.append(submission_id)
     return ids
 
@@ -233,31 +208,18 @@ def _new_token(database: Database) -> tuple[str, TokenModel]:
     return token, record
 
 
-def _count(database: Database, *statuses: str) -> int:
-    """Return the number of submissions with one of the statuses, or of all submissions if none is given."""
-    query = select(func.count()).select_from(SubmissionModel)
+def _ids(database: Database) -> list[str]:
+    """Return the ids of all submissions that are not deleted."""
     with database.read() as session:
-        return session.scalar(query.where(SubmissionModel.status.in_(statuses)) if statuses else query) or 0
-
-
-def _remove_others(database: Database, ids: Sequence[str]) -> None:
-    """Remove uploaded submissions, so that each measurement has the same rows; running ones end before."""
-    for status in (QUEUED, SCORED):
-        while _count(database, SCORING):
-            time.sleep(0.2)
-        with database.read() as session:
-            found = session.scalars(select(SubmissionModel.id).where(SubmissionModel.status == status)).all()
-        for submission_id in set(found) - set(ids):
-            submissions.remove(database, submission_id)
+        return list(session.scalars(select(SubmissionModel.id).where(SubmissionModel.status != DELETED)))
 
 
 @contextmanager
 def leaderboard(data: Path, state: Path, db: str) -> Iterator[Served]:
-    """Run ``rebar-leaderboard serve`` with one worker, and rate limits and quota too high to take effect."""
+    """Run ``rebar-leaderboard serve`` without workers, with a quota too high to take effect."""
     command = [sys.executable, "-m", "leaderboard", "serve", "--data", str(data), "--state-dir", str(state)]
-    command += ["--port", "0", "--quota", str(WITHOUT_LIMIT), "--quota-bytes", "1TiB"]
-    command += ["--max-connections-per-address", "0", *(["--db", db] if db else [])]
-    command += ["--read-rate-limit", f"{WITHOUT_LIMIT}/minute", "--write-rate-limit", f"{WITHOUT_LIMIT}/minute"]
+    command += ["--port", "0", "--quota", str(WITHOUT_LIMIT), "--quota-bytes", "1TiB", "--workers", "0"]
+    command += ["--db", db] if db else []
     with started(command, state / "log") as served:
         yield served
 
@@ -279,20 +241,13 @@ def started(command: Sequence[str], log: Path) -> Iterator[Served]:
         process.wait()
 
 
-def run_load(
-    server: Served,
-    paths: Sequence[str],
-    readers: int,
-    seconds: float,
-    tokens: Sequence[str] = (),
-    archives: Iterator[bytes] | None = None,
-) -> Load:
-    """Send requests for random ``paths`` by ``readers``, and uploads of ``archives`` by an uploader per token.
+def run_load(server: Served, paths: Sequence[str], seconds: float, token: str, archives: Iterator[bytes]) -> Load:
+    """Send requests for random ``paths`` by ``READERS`` readers, and uploads of ``archives`` if there is a token.
 
     The requests are written to plain streams, so that the server, not the client, limits the rate.
     """
     load = Load()
-    start, cpu_s = time.perf_counter(), server.cpu_s()
+    start = time.perf_counter()
     end = start + seconds
 
     async def read(number: int) -> None:
@@ -300,28 +255,28 @@ def run_load(
         reader, writer = await asyncio.open_connection("127.0.0.1", server.port, limit=_STREAM_LIMIT_BYTES)
         while (sent := time.perf_counter()) < end:
             writer.write(f"GET {choose.choice(paths)} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode())
-            assert await _status(reader) == 200
+            load.errors += await _status(reader) != 200
             load.read_s.append(time.perf_counter() - sent)
         writer.close()
 
-    async def upload(token: str) -> None:
-        while (sent := time.perf_counter()) < end:
-            assert archives is not None
+    async def upload() -> None:
+        while token and (sent := time.perf_counter()) < end:
             content = next(archives)
             reader, writer = await asyncio.open_connection("127.0.0.1", server.port)
             head = f"PUT /api/v1/submissions HTTP/1.1\r\nHost: 127.0.0.1\r\nAuthorization: Bearer {token}\r\n"
-            writer.write(f"{head}Content-Length: {len(content)}\r\n\r\n".encode() + content)
-            await writer.drain()
-            assert await _status(reader) == 202
+            writer.write(f"{head}Content-Length: {len(content)}\r\n\r\n".encode())
+            for offset in range(0, len(content), 1 << 20):
+                writer.write(content[offset : offset + (1 << 20)])
+                await writer.drain()
+            load.errors += await _status(reader) != 202
             load.upload_s.append(time.perf_counter() - sent)
             writer.close()
-            await asyncio.sleep(UPLOAD_PAUSE_S)
 
     async def send() -> None:
-        await asyncio.gather(*map(read, range(readers)), *map(upload, tokens))
+        await asyncio.gather(*map(read, range(READERS)), upload())
 
     asyncio.run(send())
-    load.wall_s, load.server_cpu_s = time.perf_counter() - start, server.cpu_s() - cpu_s
+    load.wall_s = time.perf_counter() - start
     return load
 
 
@@ -335,13 +290,11 @@ async def _status(reader: asyncio.StreamReader) -> int:
 
 
 def _distinct(archive: bytes) -> Iterator[bytes]:
-    """Yield copies of an archive that differ in the comment of the zip file, so that each is scored."""
+    """Yield copies of an archive that differ in the comment of the zip file, so that each is checked."""
     assert archive[-2:] == b"\0\0", "the archive has a comment"
-    number = 0
-    while True:
+    for number in itertools.count():
         comment = f"copy {number}".encode()
         yield archive[:-2] + len(comment).to_bytes(2, "little") + comment
-        number += 1
 
 
 if __name__ == "__main__":

@@ -8,7 +8,6 @@ import sys
 _EXTRA_MODULES = (
     "alembic",
     "fastapi",
-    "limits",
     "multipart",
     "sqlalchemy",
     "structlog",

@@ -1,4 +1,4 @@
-"""Checks of a leaderboard: dataset, archive folder, disk, workers and queue; for ``/healthz`` and the command ``check``."""
+"""Checks of a leaderboard: dataset, archive folder, disk, workers, queue; for ``/healthz`` and ``check``."""
 
 from __future__ import annotations
 

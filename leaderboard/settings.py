@@ -127,8 +127,8 @@ _SETTING_NAMES = "REBAR_LEADERBOARD_NAME with one of the names " + ", ".join(Set
 def read_settings(file: Path | None, overrides: dict[str, Any]) -> Settings:
     """Return the settings; ``overrides`` (command line) precede ``file``, which precedes the environment.
 
-    Raises ``InputError``, naming every invalid setting, for a variable of the environment that is no setting, which
-    could publish what was to be hidden if it were ignored, and if ``file`` cannot be read as TOML.
+    Raises ``InputError``, naming every invalid setting, and if ``file`` cannot be read as TOML. A variable of the
+    environment that is no setting is refused too, because ignoring it could publish what it was to hide.
     """
     values: dict[str, Any] = {}
     for variable, value in os.environ.items():

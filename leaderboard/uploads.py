@@ -175,10 +175,10 @@ def _checked_archive(service: Service, path: Path) -> SubmissionMeta:
     Raises ``SubmissionError`` with the problems of the archive, and ``UnavailableError``.
     """
     settings = service.settings
-    limits = {"memory": settings.score_memory, "time_limit_s": settings.score_time}
     for _ in range(2):  # A process that was killed from outside says nothing about the archive.
         try:
-            with isolated_call(check, path, settings.data, **limits) as call:
+            job = (check, path, settings.data)
+            with isolated_call(*job, memory=settings.score_memory, time_limit_s=settings.score_time) as call:
                 while not call.wait(settings.score_time):
                     pass
                 return call.value()

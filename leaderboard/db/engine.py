@@ -112,10 +112,8 @@ class Database:
                     found += [f"the database is damaged: {pragma} finds {row}" for row in rows if row != ("ok",)]
                 results = select(ResultModel.submission_id, ResultModel.json).where(ResultModel.json.is_not(None))
                 for submission_id, content in session.execute(results, execution_options={"yield_per": 20}):
-                    try:
-                        parsed_result(content)
-                    except ValueError as error:
-                        found.append(f"the result of submission {submission_id} is {error}")
+                    if problem := _result_problem(content or b""):
+                        found.append(f"the result of submission {submission_id} is {problem}")
         except DatabaseError as error:
             found.append(f"the database is damaged: {error.orig}")
         return found
@@ -125,16 +123,16 @@ class Database:
         self._engine.dispose()
 
 
-def parsed_result(content: bytes) -> dict[str, Any]:
-    """Return a stored result as its JSON object. Raises ``ValueError`` for content that is no result."""
+def _result_problem(content: bytes) -> str | None:
+    """Return what a stored result is if it is none, or None."""
     try:
-        result: dict[str, Any] = json.loads(content)
+        result = json.loads(content)
     except ValueError:
-        raise ValueError("no JSON") from None
+        return "no JSON"
     match result:
         case {"protocol": str(), "dataset": {"digest": str()}, "tables": dict()}:
-            return result
-    raise ValueError("no result of scoring")
+            return None
+    return "no result of scoring"
 
 
 def without_password(url: str) -> str:

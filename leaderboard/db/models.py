@@ -26,9 +26,9 @@ class Base(DeclarativeBase):
 class BoardModel(Base):
     """The single row of facts on the whole leaderboard.
 
-    ``board_id`` is random; the marker in the archive folder has the same. ``dataset_digest`` is that of the dataset
-    that ``serve`` has served last, None before the first time. ``content_version`` is incremented by every change
-    of what pages show.
+    ``board_id`` is random; the marker in the archive folder has the same. ``dataset_digest`` is the digest of the
+    dataset that ``serve`` served last, None before the first time. Every change of what pages show increments
+    ``content_version``.
     """
 
     __tablename__ = "board"
@@ -66,12 +66,13 @@ class TokenModel(Base):
 
 
 class SubmissionModel(Base):
-    """An accepted archive and the status of its job. Deleted submissions keep their rows, which count for the quota.
+    """An accepted archive and the status of its job.
 
     ``status`` is ``queued`` or ``scoring`` while a job is to be done, ``scored`` if the submission has a result, of
-    whatever dataset, ``failed`` with ``reason`` if it has none, or ``deleted``. ``details`` is a JSON object with
-    what the submitter says of the method (``MethodDetails``), and the declared seconds per view, without what is not
-    given; ``archive_deleted_at`` is set when the archive of a submission that stays was deleted.
+    whatever dataset, ``failed`` with ``reason`` if it has none, or ``deleted``. Deleted submissions keep their
+    rows, which count for the quota. ``details`` is a JSON object with what the submitter says of the method
+    (``MethodDetails``) and the declared seconds per view, without what is not given. ``archive_deleted_at`` is
+    set when the archive was deleted, alone or with the submission.
     """
 
     __tablename__ = "submissions"

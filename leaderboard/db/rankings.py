@@ -31,8 +31,8 @@ class LeaderboardEntry:
     """A submission's row of one config; ``rank`` is None if the row is not ranked.
 
     ``class_rank`` is the rank among the submissions that declare the same ``inputs``, None without a declaration.
-    ``is_baseline`` marks the organiser's rows. ``details`` is the column of ``SubmissionModel``, ``table_json`` the
-    JSON text of the config's table in the result.
+    ``is_baseline`` marks the organiser's rows. ``details`` is the column of ``SubmissionModel``, and ``table_json``
+    the JSON text of the config's table in the result.
     """
 
     id: str

@@ -80,8 +80,8 @@ def score_next(database: Database, settings: Settings, name: str, stop: threadin
     outcome: Outcome | None = None
     try:
         archive = ArchiveStore(settings.archive_dir, board.board_id).path(record.id)
-        limits = {"memory": settings.score_memory, "time_limit_s": settings.score_time}
-        with isolated_call(score, archive, settings.data, digest, **limits) as call:
+        job = (score, archive, settings.data, digest)
+        with isolated_call(*job, memory=settings.score_memory, time_limit_s=settings.score_time) as call:
             while not call.wait(min(lease_s / RENEWALS_PER_LEASE, POLL_INTERVAL_S)):
                 if stop.is_set():
                     jobs.release(database, record.id, name)

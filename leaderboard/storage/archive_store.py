@@ -58,8 +58,8 @@ class ArchiveStore:
             found = (self._folder / MARKER).read_text(errors="replace").strip()
         except FileNotFoundError:
             raise StorageError(
-                f"{self._folder}: has no file {MARKER}, expected that of this leaderboard; mount the folder of its "
-                "archives, or name it with --archives"
+                f"{self._folder}: has no file {MARKER} with the id {self._board_id}, expected the folder of this "
+                "leaderboard's archives; mount it, or name it with --archives"
             ) from None
         if found != self._board_id:
             raise StorageError(

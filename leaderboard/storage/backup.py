@@ -46,7 +46,8 @@ def back_up(settings: Settings, target: Path, prune: bool) -> None:
         raise InputError(f"{target}: is in use by the service, expected another folder")
     with closing(Database(settings.database_url, read_only=True)) as database:
         database.check_schema()
-        board_id, rows = database.board().board_id, archive_rows(database)
+        board_id = database.board().board_id
+        rows: Rows = archive_rows(database)
         archives = ArchiveStore(settings.archive_dir, board_id)
         archives.check()
         if source is None and (problems := database.problems()):

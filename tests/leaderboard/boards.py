@@ -22,17 +22,15 @@ from starlette.types import ASGIApp
 from leaderboard.db import jobs, submissions
 from leaderboard.db.engine import Database
 from leaderboard.db.models import ResultModel, SubmissionModel
-from leaderboard.db.submissions import Quota, Upload, archive_rows
+from leaderboard.db.submissions import QUEUED, archive_rows
 from leaderboard.db.tokens import create_token, find_token
 from leaderboard.scoring.sandbox import Outcome
 from leaderboard.settings import Settings, read_settings
 from leaderboard.storage.archive_store import ArchiveStore
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.submission import SubmissionMeta
 from tests.bench.reporting.results import result, scored_view
 from tests.synthetic_dataset import scale_errors
 
-NO_LIMIT = Quota(10_000, 1 << 40)
 DIGEST, OTHER_DIGEST = "sha256:" + "0" * 64, "sha256:" + "1" * 64
 _PROCESSES = multiprocessing.get_context("forkserver")
 _OPERATIONS = ("os.rename", "os.remove", "os.chmod", "shutil.copyfile", "sqlite3.connect")
@@ -49,39 +47,48 @@ def opened(settings: Settings) -> Iterator[tuple[Database, ArchiveStore]]:
     settings.state_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
     with closing(Database(settings.database_url)) as database:
         database.migrate()
-        yield database, ArchiveStore(settings.archive_dir)
+        archives = ArchiveStore(settings.archive_dir, database.board().board_id)
+        archives.initialise(archive_rows(database))
+        yield database, archives
 
 
 def make_board(settings: Settings) -> str:
-    """Make a leaderboard, and return a token of it."""
+    """Make a leaderboard that serves the dataset with ``DIGEST``, and return a token of it."""
     with opened(settings) as (database, _):
+        jobs.serve_dataset(database, DIGEST, rescore=False)
         return create_token(database, "alice")
 
 
 def accept(
-    database: Database,
-    token: str,
-    *,
-    method: str = "m",
-    digest: str = DIGEST,
-    sha256: str = "",
-    size: int = 5,
-    quota: Quota = NO_LIMIT,
-    public: bool = True,
+    database: Database, token: str, *, method: str = "m", sha256: str = "", size: int = 5, public: bool = True
 ) -> str:
-    """Insert a queued submission, as a server does; return its id, or that of the same archive."""
+    """Insert a queued submission, as a server does; return its id."""
     record = find_token(database, token)
     assert record is not None
     submission_id = submissions.new_id()
-    upload = Upload(SubmissionMeta(method=method), sha256 or submission_id * 2, size, digest)
-    return submissions.accept(database, submission_id, record, upload, quota, public).id
+    with database.write() as session:
+        session.add(
+            SubmissionModel(
+                id=submission_id,
+                token_id=record.id,
+                method=method,
+                details="{}",
+                archive_sha256=sha256 or submission_id * 2,
+                archive_bytes=size,
+                public=public,
+                created_at=time.time(),
+                status=QUEUED,
+                attempts=0,
+            )
+        )
+    return submission_id
 
 
 def add_scored_submission(
     database: Database, token: str, method: str, error: float, *, public: bool = True
 ) -> str:
     """Insert a submission of ``lattice`` and ``pile`` that is scored; its errors are scaled by ``error``."""
-    submission_id = accept(database, token, method=method, digest=digest_of_board(database), public=public)
+    submission_id = accept(database, token, method=method, public=public)
     finish_scoring(database, submission_id, method, error)
     return submission_id
 
@@ -95,19 +102,24 @@ def digest_of_board(database: Database) -> str:
 
 def finish_scoring(database: Database, submission_id: str, method: str, error: float) -> None:
     """Score the queued submission, as a worker does."""
-    assert jobs.claim(database, "scorer", 60) == submission_id
+    assert claimed(database, "scorer") == submission_id
     views = (scored_view("lattice/0000"), scored_view("pile/0000"))
     content = json.dumps(scale_errors(result(*views, method=method).to_dict(), error)).encode()
-    assert jobs.finish(database, submission_id, "scorer", Outcome(content))
+    assert jobs.finish(database, submission_id, "scorer", Outcome(digest_of_board(database), content))
+
+
+def claimed(database: Database, scorer: str, lease_s: float = 60) -> str | None:
+    """Claim a job; return its id."""
+    record = jobs.claim(database, scorer, lease_s)
+    return None if record is None else record.id
 
 
 def get_response(app: ASGIApp, address: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
     """Call an ASGI application directly; return status, headers and body."""
-    return asyncio.run(call(app, address, **headers))
+    return asyncio.run(_call(app, address, **headers))
 
 
-async def call(app: ASGIApp, address: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
-    """Call an ASGI application in a running event loop, as ``get_response`` does."""
+async def _call(app: ASGIApp, address: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
     transport = httpx2.ASGITransport(app=app)
     fields = {"accept-encoding": "", **{name.replace("_", "-"): value for name, value in headers.items()}}
     async with httpx2.AsyncClient(transport=transport, base_url="http://localhost", headers=fields) as client:
@@ -123,15 +135,12 @@ async def call(app: ASGIApp, address: str, **headers: str) -> tuple[int, dict[st
 def add_submission(settings: Settings, token: str, content: bytes, *, scored: bool = True) -> str:
     """Add a submission whose archive is ``content``, as a server and a worker do; return its id."""
     with opened(settings) as (database, archives):
-        record = find_token(database, token)
-        assert record is not None
-        submission_id = submissions.new_id()
-        file = settings.state_dir / f"{submission_id}.upload"
+        file = settings.state_dir / "one.upload"
         file.touch(0o600)
         file.write_bytes(content)
+        sha256 = hashlib.sha256(content).hexdigest()
+        submission_id = accept(database, token, sha256=sha256, size=len(content))
         archives.put(submission_id, file)
-        upload = Upload(SubmissionMeta(method="m"), hashlib.sha256(content).hexdigest(), len(content), DIGEST)
-        submissions.accept(database, submission_id, record, upload, NO_LIMIT, True)
         if scored:
             score_all(database)
     return submission_id
@@ -144,29 +153,28 @@ def result_bytes(dataset_digest: str) -> bytes:
 
 
 def score_all(database: Database) -> None:
-    """Score what is queued."""
-    while submission_id := jobs.claim(database, "scorer", 1e-6):
-        record = submissions.find(database, submission_id)
-        assert record is not None
-        jobs.finish(database, submission_id, "scorer", Outcome(result_bytes(record.dataset_digest)))
+    """Score what is queued against the served dataset."""
+    digest = database.board().dataset_digest
+    assert digest is not None
+    while submission_id := claimed(database, "scorer", 1e-6):
+        jobs.finish(database, submission_id, "scorer", Outcome(digest, result_bytes(digest)))
 
 
-def facts(settings: Settings) -> dict[str, tuple[str, str, str | None, bool]]:
-    """Return status, dataset, digest of the stored result's dataset, and presence of the archive by submission."""
+def facts(settings: Settings) -> dict[str, tuple[str, frozenset[str], bool]]:
+    """Return status, digests of the datasets of the stored results, and presence of the archive by submission."""
     with closing(Database(settings.database_url, read_only=True)) as database, database.read() as session:
-        rows = session.execute(
-            select(SubmissionModel, ResultModel.json).outerjoin(
-                ResultModel, ResultModel.submission_id == SubmissionModel.id
-            )
-        )
+        results = list(session.execute(select(ResultModel.submission_id, ResultModel.json)))
+        of_results: dict[str, set[str]] = {}
+        for submission_id, content in results:
+            if content is not None:
+                of_results.setdefault(submission_id, set()).add(json.loads(content)["dataset"]["digest"])
         return {
             row.id: (
                 row.status,
-                row.dataset_digest,
-                None if content is None else json.loads(content)["dataset"]["digest"],
+                frozenset(of_results.get(row.id, ())),
                 (settings.archive_dir / f"{row.id}.zip").is_file(),
             )
-            for row, content in rows
+            for row in session.scalars(select(SubmissionModel))
         }
 
 

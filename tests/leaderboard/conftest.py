@@ -87,16 +87,11 @@ def small_archive(write_archive: WriteArchive) -> Path:
 
 @pytest.fixture(scope="session")
 def running_server(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> RunServer:
-    """Run ``rebar-leaderboard serve`` until a block ends: of the tiny dataset and in a new folder unless given.
-
-    Its rate limits are never reached unless they are given.
-    """
-    often = "1000000/minute"
+    """Run ``rebar-leaderboard serve`` until a block ends: of the tiny dataset and in a new folder unless given."""
 
     def run(
         state: Path | None = None, *, root: Path = tiny_root, **options: Any
     ) -> AbstractContextManager[Server]:
-        options = {"read_rate_limit": often, "write_rate_limit": often, **options}
         return serving.running_server(root, state or tmp_path_factory.mktemp("board") / "state", **options)
 
     return run
@@ -132,7 +127,7 @@ def new_database(request: pytest.FixtureRequest) -> Callable[[], str]:
 
 @contextmanager
 def filled_board(running_server: RunServer, write_archive: WriteArchive, db: str = "") -> Iterator[SharedServer]:
-    """Run a server that scores, with five scored submissions and error maps of two views."""
+    """Run a server that scores, with five scored submissions."""
     archives = {
         "good": write_archive("good", 1.01, url="https://example.org/good", description="plain words"),
         "near": write_archive("near", 0.8, inputs="rgb+K", uses_ground_truth=False),
@@ -140,7 +135,7 @@ def filled_board(running_server: RunServer, write_archive: WriteArchive, db: str
         "holes": write_archive("holes", 1.0, 0.3, inputs="stereo", uses_ground_truth=True),
         "hostile": write_archive(HOSTILE, 1.4, description=DESCRIPTION, url="https://example.org/?a=1&b=<i>"),
     }
-    with running_server(db=db, error_maps=2, quota=100) as server:
+    with running_server(db=db, quota=100) as server:
         token = server.token("Müller & <Söhne>")
         ids = {name: server.submit_accepted(path, token) for name, path in archives.items()}
         for submission_id in ids.values():
@@ -162,7 +157,7 @@ def waiting(
     """A server that scores nothing, where owners publish: a failed, a scored and two queued submissions."""
     state = tmp_path_factory.mktemp("waiting") / "state"
     token, archive = make_token(state, "bob"), write_archive("slow")
-    common: dict[str, Any] = {"default_visibility": "owner", "error_maps": 1}
+    common: dict[str, Any] = {"default_visibility": "owner"}
     ids = {}
     for name, limits in (("failed", {"score_time": 0.01}), ("scored", {})):
         with running_server(state, **limits, **common) as server:

@@ -9,6 +9,7 @@ import json
 import os
 import re
 import subprocess
+import time
 import zipfile
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -17,11 +18,13 @@ from pathlib import Path
 import httpx2
 import pytest
 
+from leaderboard.db import submissions
 from rebar_depth_bench import load
 from rebar_depth_bench.base.errors import Problem
 from tests import requirements
+from tests.leaderboard.boards import board_settings, opened
 from tests.leaderboard.conftest import SharedServer, WriteArchive, filled_board
-from tests.leaderboard.serving import API, Postgres, RunServer, Server, distinct_archive, run_bench
+from tests.leaderboard.serving import API, Postgres, RunServer, Server, distinct_archive, run, run_bench
 
 QUOTA = 6
 
@@ -183,7 +186,6 @@ def test_token_states_quota_and_limits(private_server: Server, small_archive: Pa
     assert (before["name"], before["quota"], before["quota_left"]) == ("curious about limits", QUOTA, QUOTA)
     used = {"quota_left": QUOTA - 1, "quota_bytes_left": before["quota_bytes"] - small_archive.stat().st_size}
     assert after == before | used
-    assert before["write_rate_limit"] == "1000000/minute"
     assert before["max_upload_bytes"] > 0
 
 
@@ -268,14 +270,80 @@ def test_only_owner_can_delete_submission(private_server: Server, write_archive:
     assert not (private_server.state / "archives" / f"{submission_id}.zip").exists()
 
 
-def test_error_maps_are_off_by_default(private_server: Server, small_archive: Path) -> None:
-    submission_id = private_server.submit_accepted(small_archive, private_server.token("secret truth"))
-    private_server.wait_until_ended(submission_id)
-    views = private_server.get(f"{API}/{submission_id}/result.json").json()["views"]
-    assert views
-    for view in views:
-        path = f"/submissions/{submission_id}/pictures/error/{view['view_id']}.webp"
-        assert private_server.get(path).status_code == 404
+@pytest.mark.parametrize(
+    ("declared", "where"),
+    [
+        ('"method": "m", "runtime": 1%s' % ("0" * 400), "runtime"),
+        ('"method": "m", "parameters": 1%s' % ("0" * 4000), "parameters"),
+        ('"method": "m", "parameters": 1%s' % ("0" * 5000), "submission.json"),
+        ('"method": "m", "parameters": 1e19', "parameters"),
+        ('"method": "%s"' % ("\ufdfa" * 12), "method"),
+        ('"method": "m", "description": "%s"' % ("x" * 4001), "description"),
+    ],
+)
+def test_declarations_that_cannot_be_stored_are_refused_before_the_archive_is_stored(
+    private_server: Server, small_archive: Path, tmp_path: Path, declared: str, where: str
+) -> None:
+    token = private_server.token(f"large {declared[:30]} {len(declared)}")
+    archive = tmp_path / "large.zip"
+    with zipfile.ZipFile(small_archive) as source, zipfile.ZipFile(archive, "w") as target:
+        for name in source.namelist():
+            is_metadata = name == "submission.json"
+            target.writestr(name, f"{{{declared}}}".encode() if is_metadata else source.read(name))
+    stored = set((private_server.state / "archives").iterdir())
+    response = private_server.submit(archive, token)
+    assert response.status_code == 422, response.text
+    assert where in response.json()["problems"][0]
+    assert len(response.text) < 3000
+    assert set((private_server.state / "archives").iterdir()) == stored
+    assert private_server.get(API, token).json() == {"submissions": []}
+
+
+def test_best_rows_of_a_method_have_ranks_of_their_own(
+    running_server: RunServer, write_archive: WriteArchive
+) -> None:
+    with running_server() as server:
+        token, organiser = server.token("alice"), run("token", "org", "--baseline", "--state-dir", server.state)
+        ids = [
+            server.submit_accepted(write_archive(method, scale, configs=("lattice",)), sender)
+            for method, scale, sender in (
+                ("m", 1.02, token),
+                ("m", 1.01, token),
+                ("other", 1.03, token),
+                ("plane", 1.04, organiser.stdout.strip()),
+            )
+        ]
+        for submission_id in ids:
+            server.wait_until_ended(submission_id)
+        rows = server.rows()
+        assert [(row["id"], row["rank"], row["baseline"]) for row in rows] == [
+            (ids[1], 1, False),
+            (ids[0], 2, False),
+            (ids[2], 3, False),
+            (ids[3], 4, True),
+        ]
+        best = server.get("/api/v1/leaderboard?config=lattice&best=1").json()["rows"]
+        assert [(row["id"], row["rank"]) for row in best] == [(ids[1], 1), (ids[2], 2), (ids[3], 3)]
+        lines = list(csv.DictReader(io.StringIO(server.get("/api/v1/leaderboard.csv?config=lattice&best=1").text)))
+        assert [(line["id"], line["baseline"]) for line in lines] == [
+            (ids[1], "false"),
+            (ids[2], "false"),
+            (ids[3], "true"),
+        ]
+        overall = server.get("/api/v1/overall?best=1").json()["rows"]
+        assert [(row["id"], row["rank"]) for row in overall] == [(ids[1], 1), (ids[2], 2), (ids[3], 3)]
+
+
+def test_quota_counts_the_submissions_of_today(private_server: Server, small_archive: Path) -> None:
+    """A clock that was ahead, or yesterday's submissions, do not use it up."""
+    token = private_server.token("traveller")
+    times = (0.0, -86400.0, 400 * 86400.0)
+    ids = [private_server.submit_accepted(distinct_archive(small_archive, 50 + k), token) for k in range(3)]
+    settings = board_settings(private_server.state, db=private_server.db)
+    with opened(settings) as (database, _):
+        for submission_id, shift_s in zip(ids, times, strict=True):
+            submissions.change(database, submission_id, {"created_at": time.time() + shift_s})
+    assert private_server.get("/api/v1/token", token).json()["quota_left"] == QUOTA - 1
 
 
 @pytest.mark.parametrize(

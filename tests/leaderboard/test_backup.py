@@ -18,12 +18,10 @@ from pathlib import Path
 import pytest
 from sqlalchemy import update
 
-from leaderboard.db import submissions
 from leaderboard.db.models import ResultModel
 from leaderboard.settings import Settings
 from leaderboard.storage.archive_store import state_lock
 from leaderboard.storage.backup import back_up
-from leaderboard.storage.retention import prune_archives
 from rebar_depth_bench.base.errors import InputError, StorageError
 from tests.leaderboard.boards import (
     add_submission,
@@ -36,6 +34,7 @@ from tests.leaderboard.boards import (
 )
 from tests.leaderboard.conftest import WriteArchive
 from tests.leaderboard.serving import Postgres, RunServer, run
+from tests.leaderboard.test_storage import free_archive, remove
 from tests.processes import wait_until
 
 
@@ -82,9 +81,10 @@ def test_backup_of_a_lost_board_is_refused(board: tuple[Settings, str], tmp_path
     make_board(settings)
     before = tree(target)
     for prune in (False, True):
-        with pytest.raises(InputError, match=f"has 1 submissions that .* lacks, as {kept}"):
+        with pytest.raises(StorageError, match="archives: belongs to the database with the id"):
             back_up(settings, target, prune)
         assert tree(target) == before
+    assert (target / "archives" / f"{kept}.zip").exists()
     back_up(settings, new, prune=False)
     assert facts(board_settings(new)) == {}
 
@@ -106,11 +106,12 @@ def test_damaged_database_replaces_no_backup(board: tuple[Settings, str], tmp_pa
         with pytest.raises(StorageError, match=words):
             back_up(board_settings(target), tmp_path / "second", prune=False)
     assert not (tmp_path / "second" / "leaderboard.sqlite").exists()
-    (target / "leaderboard.sqlite").write_bytes(b"no database" * 1000)
     sound = board_settings(tmp_path / "sound")
     make_board(sound)
+    back_up(sound, tmp_path / "third", prune=False)
+    (tmp_path / "third" / "leaderboard.sqlite").write_bytes(b"no database" * 1000)
     with pytest.raises(InputError, match="file is not a database"):
-        back_up(sound, target, prune=False)
+        back_up(sound, tmp_path / "third", prune=False)
 
 
 def _accept_and_die(settings: Settings, token: str) -> None:
@@ -172,7 +173,7 @@ def test_board_is_backed_up_while_it_is_served(
         process = back_up_by_command(settings, target)
         assert (process.returncode, process.stdout) == (0, f"{target}\n"), process.stderr
         accepted = {scored, *(upload.result() for upload in uploads)}
-    copied = {path.stem for path in (target / "archives").iterdir()}
+    copied = {path.stem for path in (target / "archives").glob("*.zip")}
     assert scored in copied
     assert copied <= accepted
     assert "queued" in {status for status, *_ in facts(board_settings(target)).values()}
@@ -198,6 +199,7 @@ def test_backup_has_the_modes_of_a_state_folder(board: tuple[Settings, str], tmp
         "backup": 0o700,
         "archives": 0o700,
         f"{submission_id}.zip": 0o600,
+        "leaderboard-id": 0o600,
         "leaderboard.sqlite": 0o600,
         "leaderboard.sqlite.1": 0o600,
     }
@@ -232,23 +234,31 @@ def test_damaged_archive_replaces_nothing_and_missing_one_is_named(
     assert (target / "archives" / f"{sound}.zip").read_bytes() == b"three", "a truncated copy is made again"
 
 
-def test_backup_keeps_what_was_removed_until_it_is_pruned(board: tuple[Settings, str], tmp_path: Path) -> None:
+def test_backup_keeps_what_was_removed_until_it_is_pruned(
+    board: tuple[Settings, str], tiny_root: Path, tmp_path: Path
+) -> None:
     settings, token = board
     target = tmp_path / "backup"
-    removed, pruned, kept = (add_submission(settings, token, content) for content in (b"1", b"2", b"3"))
+    removed, freed, kept = (add_submission(settings, token, content) for content in (b"1", b"2", b"3"))
     (settings.archive_dir / "orphan.zip").write_bytes(b"of nobody")
     back_up(settings, target, prune=False)
     (target / "archives" / "orphan.zip").write_bytes(b"of nobody")
     copies = {path: (path.stat().st_ino, path.stat().st_mtime_ns) for path in (target / "archives").iterdir()}
-    with opened(settings) as (database, archives):
-        submissions.remove(database, removed)
-        prune_archives(database, archives, [pruned])
-    assert names(settings.archive_dir) == {f"{kept}.zip", "orphan.zip"}
+    remove(settings, removed)
+    free_archive(settings, freed)
+    assert names(settings.archive_dir) == {f"{kept}.zip", "orphan.zip", "leaderboard-id"}
     back_up(settings, target, prune=False)
-    assert names(target / "archives") == {f"{name}.zip" for name in (removed, pruned, kept, "orphan")}
+    assert names(target / "archives") == {
+        *(f"{name}.zip" for name in (removed, freed, kept, "orphan")),
+        "leaderboard-id",
+    }
+    process = run("check", "--data", tiny_root, "--state-dir", target)
+    assert process.stderr.count("note: ") == 3, process.stderr
+    assert f"{removed}.zip: its submission was deleted" in process.stderr
+    assert "orphan.zip: its submission is not in the database" in process.stderr
     assert all((path.stat().st_ino, path.stat().st_mtime_ns) == file for path, file in copies.items())
     back_up(settings, target, prune=True)
-    assert names(target / "archives") == {f"{kept}.zip", "orphan.zip"}
+    assert names(target / "archives") == {f"{kept}.zip", "orphan.zip", "leaderboard-id"}
     assert facts(board_settings(target)) == facts(settings)
 
 
@@ -275,8 +285,7 @@ def test_backup_of_postgresql_is_restored_from_dump_and_archives(tmp_path: Path,
     shutil.copytree(target / "archives", restored.archive_dir)
     assert_sound(restored)
     assert facts(restored) == {name: fact for name, fact in facts(settings).items() if name != later}
-    with opened(settings) as (database, archives):
-        prune_archives(database, archives, [first])
+    free_archive(settings, first)
     assert back_up_by_command(settings, target, "--prune").returncode == 0
     assert names(target / "archives") == names(settings.archive_dir)
     with opened(settings) as (database, _), database.write() as session:
@@ -304,7 +313,6 @@ def test_restore_runs_as_written(block: int, tiny_root: Path, tmp_path: Path) ->
     before = facts(settings)
     newer = add_submission(settings, token, b"two")
     archive = settings.archive_dir / f"{newer}.zip"
-    os.utime(archive, (0, 0))
     if block:
         back_up(settings, target, prune=False)
     damage(settings.state_dir / "leaderboard.sqlite")
@@ -317,5 +325,5 @@ def test_restore_runs_as_written(block: int, tiny_root: Path, tmp_path: Path) ->
     assert_sound(settings)
     assert stat.S_IMODE(settings.state_dir.stat().st_mode) == 0o700
     if block:
-        assert f"{newer}.zip has no submission" in finished.stdout + finished.stderr
+        assert f"{newer}.zip: its submission is not in the database" in finished.stdout + finished.stderr
         assert archive.read_bytes() == b"two"

@@ -89,6 +89,7 @@ class Service:
     running: ExitStack = field(default_factory=ExitStack)
     server: Server | None = None
     logs: list[list[str]] = field(default_factory=list)
+    requeued: Counter[str] = field(default_factory=Counter)
 
     @property
     def db(self) -> str:
@@ -144,9 +145,13 @@ class Service:
         process.wait()
         self.run("backup", self.backup, "--prune")
 
-    def prune(self) -> None:
-        """Delete the archives of all ended submissions but the best."""
-        self.run("prune", "--data", self.root, "--archive-days", "0.00001", "--archive-ranks", "1")
+    def rescore(self) -> None:
+        """Queue scored submissions again, against the same dataset."""
+        rows = httpx2.get(f"{self.url()}/api/v1/leaderboard?config=lattice-orbit", timeout=60).json()["rows"]
+        for row in rows[-2:]:
+            if httpx2.get(f"{self.url()}{API}/{row['id']}", timeout=60).json()["status"] == "scored":
+                self.run("requeue", row["id"])
+                self.requeued[row["id"][:6]] += 1
 
     def restore(self) -> None:
         """Lose the state folder of a killed server, and restore the backup that was made just before."""
@@ -204,7 +209,7 @@ def test_accepted_submissions_are_scored_once(
         service.kill_server,
         lambda: service.back_up(rng),
         lambda: service.kill_scorer(rng),
-        service.prune,
+        service.rescore,
         service.kill_database,
         service.restore,
     ]
@@ -238,7 +243,7 @@ def test_accepted_submissions_are_scored_once(
     shown = [row["id"] for row in rows]
     # An upload whose response was cut off may have been accepted; its row and archive must then be complete.
     times = service.times_ended()
-    assert set(times.values()) == {1}
+    assert all(count <= 1 + service.requeued[name] for name, count in times.items())
     assert len(times) >= len(shown) / 2  # A scorer killed right after the commit logs nothing.
     scored = set(uploads.accepted) - set(failed)
     assert scored <= set(shown)

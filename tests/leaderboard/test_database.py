@@ -1,4 +1,4 @@
-"""Database on SQLite and PostgreSQL: schema, migration, tokens, quota, and the queue of jobs."""
+"""Database on SQLite and PostgreSQL: schema, migration, tokens, and the queue of jobs."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from pathlib import Path
 
 import pytest
@@ -22,14 +22,14 @@ from leaderboard.db import jobs, submissions
 from leaderboard.db.engine import MIGRATIONS, Database
 from leaderboard.db.jobs import MAX_ATTEMPTS
 from leaderboard.db.models import Base
-from leaderboard.db.rankings import picture_facts, picture_webp, read_ranking
-from leaderboard.db.submissions import Quota, QuotaExceededError
+from leaderboard.db.rankings import read_ranking
+from leaderboard.db.submissions import result_content, shown_results
 from leaderboard.db.tokens import create_token, find_token, list_tokens, replace_token, revoke_token
-from leaderboard.scoring.sandbox import Outcome, ViewPicture
+from leaderboard.scoring.sandbox import Outcome
 from leaderboard.settings import MAX_LEASE_S
 from rebar_depth_bench.base.errors import InputError
 from tests.bench.reporting.results import result, scored_view
-from tests.leaderboard.boards import DIGEST, accept, board_settings, result_bytes
+from tests.leaderboard.boards import DIGEST, accept, board_settings, claimed, result_bytes
 
 LEASE_S = 60.0
 _MIGRATE = """
@@ -144,7 +144,7 @@ def test_concurrent_migrations_succeed(url: str, engine: Engine) -> None:
 @pytest.mark.parametrize(
     ("change", "found"),
     [
-        ("UPDATE alembic_version SET version_num = '0003'", "the schema of revision 0003"),
+        ("UPDATE alembic_version SET version_num = '0004'", "the schema of revision 0004"),
         ("DELETE FROM alembic_version", "a schema without a revision"),
         ("DROP TABLE alembic_version", "a schema without a revision"),
     ],
@@ -155,14 +155,14 @@ def test_database_of_another_revision_is_refused(
     with engine.begin() as connection:
         connection.exec_driver_sql(change)
     for use in (database.migrate, database.check_schema):
-        with pytest.raises(InputError, match=f"the database has {found}, expected 0004, or a new database"):
+        with pytest.raises(InputError, match=f"the database has {found}, expected 0005, or a new database"):
             use()
     assert set(Base.metadata.tables) <= set(inspect(engine).get_table_names())
 
 
 def test_migrations_have_one_base() -> None:
     scripts = ScriptDirectory(str(MIGRATIONS))
-    assert (scripts.get_heads(), scripts.get_bases()) == (["0004"], ["0004"])
+    assert (scripts.get_heads(), scripts.get_bases()) == (["0005"], ["0005"])
 
 
 def queue(database: Database, token: str, count: int) -> list[str]:
@@ -180,64 +180,64 @@ def test_each_job_is_claimed_by_one_scorer(database: Database, alice: str) -> No
     ids = queue(database, alice, 40)
 
     def take(name: str) -> list[str]:
-        claimed = []
-        while submission_id := jobs.claim(database, name, LEASE_S):
-            claimed.append(submission_id)
+        taken = []
+        while submission_id := claimed(database, name, LEASE_S):
+            taken.append(submission_id)
             assert jobs.renew(database, submission_id, name, LEASE_S)
-            assert jobs.finish(database, submission_id, name, Outcome(reason=name))
-        return claimed
+            assert jobs.finish(database, submission_id, name, Outcome(DIGEST, reason=name))
+        return taken
 
     with ThreadPoolExecutor(8) as pool:
-        claimed_by_scorer = list(pool.map(take, [f"s{k}" for k in range(8)]))
-    assert sorted(submission_id for claimed in claimed_by_scorer for submission_id in claimed) == sorted(ids)
-    for k, claimed in enumerate(claimed_by_scorer):
-        assert {status_and_reason(database, submission_id)[1] for submission_id in claimed} <= {f"s{k}"}
+        taken_by_scorer = list(pool.map(take, [f"s{k}" for k in range(8)]))
+    assert sorted(submission_id for taken in taken_by_scorer for submission_id in taken) == sorted(ids)
+    for k, taken in enumerate(taken_by_scorer):
+        assert {status_and_reason(database, submission_id)[1] for submission_id in taken} <= {f"s{k}"}
 
 
 def test_scorer_with_expired_lease_cannot_finish(database: Database, alice: str) -> None:
     [submission_id] = queue(database, alice, 1)
-    assert jobs.claim(database, "slow", 0.05) == submission_id
+    assert claimed(database, "slow", 0.05) == submission_id
     time.sleep(0.1)
-    assert jobs.claim(database, "quick", LEASE_S) == submission_id
+    assert claimed(database, "quick", LEASE_S) == submission_id
     assert not jobs.renew(database, submission_id, "slow", LEASE_S)
-    assert not jobs.finish(database, submission_id, "slow", Outcome(reason="slow"))
+    assert not jobs.finish(database, submission_id, "slow", Outcome(DIGEST, reason="slow"))
     jobs.release(database, submission_id, "slow")
     assert status_and_reason(database, submission_id)[0] == "scoring"
-    assert jobs.finish(database, submission_id, "quick", Outcome(reason="quick"))
-    assert not jobs.finish(database, submission_id, "quick", Outcome(reason="twice"))
+    assert jobs.finish(database, submission_id, "quick", Outcome(DIGEST, reason="quick"))
+    assert not jobs.finish(database, submission_id, "quick", Outcome(DIGEST, reason="twice"))
     assert status_and_reason(database, submission_id) == ("failed", "quick")
 
 
 def test_expired_unclaimed_lease_can_be_renewed(database: Database, alice: str) -> None:
     [submission_id] = queue(database, alice, 1)
-    assert jobs.claim(database, "s", 0.01) == submission_id
+    assert claimed(database, "s", 0.01) == submission_id
     time.sleep(0.05)
     assert jobs.renew(database, submission_id, "s", LEASE_S)
-    assert jobs.claim(database, "other", LEASE_S) is None
+    assert claimed(database, "other", LEASE_S) is None
 
 
 def test_job_fails_after_max_attempts_and_next_is_claimed(database: Database, alice: str) -> None:
     [bad] = queue(database, alice, 1)
     for _ in range(MAX_ATTEMPTS):
-        assert jobs.claim(database, "s", 0.0) == bad
+        assert claimed(database, "s", 0.0) == bad
         time.sleep(0.01)
     [good] = queue(database, alice, 1)
-    assert [jobs.claim(database, "s", LEASE_S) for _ in range(2)] == [good, None]
+    assert [claimed(database, "s", LEASE_S) for _ in range(2)] == [good, None]
     reason = f"scoring was started {MAX_ATTEMPTS} times but never finished"
     assert status_and_reason(database, bad) == ("failed", reason)
 
 
 def test_jobs_are_claimed_by_age_and_that_of_a_dead_scorer_last(database: Database, alice: str) -> None:
     bad, second, third = queue(database, alice, 3)
-    assert jobs.claim(database, "s", 0.0) == bad
+    assert claimed(database, "s", 0.0) == bad
     time.sleep(0.01)
-    assert [jobs.claim(database, "s", LEASE_S) for _ in range(4)] == [second, third, bad, None]
+    assert [claimed(database, "s", LEASE_S) for _ in range(4)] == [second, third, bad, None]
 
 
 def test_released_job_costs_no_attempt(database: Database, alice: str) -> None:
     [submission_id] = queue(database, alice, 1)
     for _ in range(3 * MAX_ATTEMPTS):
-        assert jobs.claim(database, "s", LEASE_S) == submission_id
+        assert claimed(database, "s", LEASE_S) == submission_id
         jobs.release(database, submission_id, "s")
     record = submissions.find(database, submission_id)
     assert record is not None
@@ -247,38 +247,36 @@ def test_released_job_costs_no_attempt(database: Database, alice: str) -> None:
 @pytest.mark.slow
 def test_released_job_with_wait_is_claimed_later(database: Database, alice: str) -> None:
     first, second = queue(database, alice, 2)
-    assert jobs.claim(database, "s", LEASE_S) == first
+    assert claimed(database, "s", LEASE_S) == first
     jobs.release(database, first, "s", wait_s=0.2)
-    assert [jobs.claim(database, "s", LEASE_S) for _ in range(2)] == [second, None]
+    assert [claimed(database, "s", LEASE_S) for _ in range(2)] == [second, None]
     time.sleep(0.3)
-    assert jobs.claim(database, "s", LEASE_S) == first
+    assert claimed(database, "s", LEASE_S) == first
 
 
 def test_job_scored_twice_has_one_result(database: Database, alice: str) -> None:
     [submission_id] = queue(database, alice, 1)
     first, second = (result(scored_view("lattice/0000", error)).to_json() for error in (0.5, 0.25))
-    jobs.claim(database, "a", 0.0)
+    claimed(database, "a", 0.0)
     time.sleep(0.01)
-    jobs.claim(database, "b", LEASE_S)
-    pictures = [ViewPicture("lattice/0000", '{"near": "1 m"}', {"error": b"webp", "truth": b"true"})]
-    assert jobs.finish(database, submission_id, "b", Outcome(second, ["a note"], pictures))
-    assert not jobs.finish(database, submission_id, "a", Outcome(result=first))
-    assert submissions.result_json(database, submission_id) == second
-    assert submissions.result_notes(database, submission_id) == ["a note"]
-    assert picture_facts(database, submission_id) == {"lattice/0000": ({"near": "1 m"}, ["error", "truth"])}
-    assert picture_webp(database, submission_id, "lattice/0000", "truth") == b"true"
+    claimed(database, "b", LEASE_S)
+    assert jobs.finish(database, submission_id, "b", Outcome(DIGEST, second, ["a note"]))
+    assert not jobs.finish(database, submission_id, "a", Outcome(DIGEST, first))
+    record = submissions.find(database, submission_id)
+    assert record is not None
+    shown = shown_results(database, [record], DIGEST)[submission_id]
+    assert result_content(database, submission_id, shown) == (second, ["a note"])
     [row] = read_ranking(database, "lattice", DIGEST).entries
     assert json.loads(row.table_json) == json.loads(second)["tables"]["lattice"]
 
 
 def test_submission_deleted_while_scoring_stays_deleted(database: Database, alice: str) -> None:
     [submission_id] = queue(database, alice, 1)
-    jobs.claim(database, "s", LEASE_S)
+    claimed(database, "s", LEASE_S)
     submissions.remove(database, submission_id)
     assert not jobs.renew(database, submission_id, "s", LEASE_S)
-    assert not jobs.finish(database, submission_id, "s", Outcome(result=result_bytes(DIGEST)))
+    assert not jobs.finish(database, submission_id, "s", Outcome(DIGEST, result_bytes(DIGEST)))
     assert submissions.find(database, submission_id) is None
-    assert submissions.result_json(database, submission_id) is None
     assert read_ranking(database, "lattice", DIGEST).entries == ()
 
 
@@ -287,45 +285,14 @@ def test_clock_that_was_set_back_blocks_no_job(
     database: Database, alice: str, monkeypatch: pytest.MonkeyPatch, status: str
 ) -> None:
     [submission_id] = queue(database, alice, 1)
-    assert jobs.claim(database, "s", MAX_LEASE_S) == submission_id
+    assert claimed(database, "s", MAX_LEASE_S) == submission_id
     if status == "queued":
         jobs.release(database, submission_id, "s", wait_s=MAX_LEASE_S)
-    assert jobs.claim(database, "other", 1.0) is None, "a lease of another worker may be longer"
+    assert claimed(database, "other", 1.0) is None, "a lease of another worker may be longer"
     yesterday = time.time() - 86400
     monkeypatch.setattr(time, "time", lambda: yesterday)
     assert status_and_reason(database, submission_id)[0] == status
-    assert jobs.claim(database, "other", LEASE_S) == submission_id
-
-
-def test_quota_holds_for_concurrent_uploads_and_counts_bytes(database: Database, alice: str) -> None:
-    def try_one(_: int) -> bool:
-        with suppress(QuotaExceededError):
-            accept(database, alice, quota=Quota(3, 1000))
-            return True
-        return False
-
-    with ThreadPoolExecutor(12) as pool:
-        assert sum(pool.map(try_one, range(12))) == 3
-    with pytest.raises(QuotaExceededError, match="19 bytes"):
-        accept(database, alice, quota=Quota(1000, 19))
-    accept(database, alice, quota=Quota(1000, 20))
-
-
-def test_concurrent_uploads_of_one_archive_are_one_submission(database: Database, alice: str) -> None:
-    with ThreadPoolExecutor(8) as pool:
-        assert len(set(pool.map(lambda _: accept(database, alice, sha256="ab" * 32), range(8)))) == 1
-    record = find_token(database, alice)
-    assert record is not None
-    assert len(submissions.of_token(database, record)) == 1
-
-
-def test_failed_and_deleted_archives_may_be_sent_again(database: Database, alice: str) -> None:
-    first = accept(database, alice, sha256="ab" * 32)
-    assert jobs.claim(database, "s", LEASE_S) == first
-    jobs.finish(database, first, "s", Outcome(reason="no time"))
-    second = accept(database, alice, sha256="ab" * 32)
-    submissions.remove(database, second)
-    assert len({first, second, accept(database, alice, sha256="ab" * 32)}) == 3
+    assert claimed(database, "other", LEASE_S) == submission_id
 
 
 def test_token_is_found_only_by_exact_value(database: Database, alice: str) -> None:

@@ -11,10 +11,10 @@ import pytest
 from fastapi import Request
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from leaderboard.uploads.multipart import MAX_FIELD_BYTES, UploadForm
 
 from leaderboard.names import confused_scripts, name_problem, normalised
 from leaderboard.refusals import RefusedError
-from leaderboard.uploads.multipart import MAX_FIELD_BYTES, UploadForm
 from leaderboard.web.pages.rendering import clean_text, error_response, format_size, link_html, time_html
 from rebar_depth_bench.base.errors import Problem
 

@@ -13,11 +13,11 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from leaderboard.db.view_errors import rank_ranges, view_errors
 
 from leaderboard.db.engine import Database
 from leaderboard.db.models import LeaderboardRowModel, ResultModel, SubmissionModel, TokenModel
 from leaderboard.db.rankings import LeaderboardEntry, Ranking, queue_position, read_ranking
-from leaderboard.db.view_errors import rank_ranges, view_errors
 from leaderboard.web.pages.ranking import make_config_ranking
 from leaderboard.web.pages.selection import COLUMNS, RANK, Selection, parse_selection
 from rebar_depth_bench.scoring.bootstrap import interval, resample

@@ -1,4 +1,4 @@
-"""Storage of archives, and kills at every change of backup, prune, retention and rescoring: nothing is lost."""
+"""Storage of archives, and kills at every change of backup, deletion and rescoring: nothing is lost."""
 
 from __future__ import annotations
 
@@ -18,11 +18,10 @@ import pytest
 
 from leaderboard.db import jobs, submissions
 from leaderboard.settings import Settings
-from leaderboard.storage.archive_store import ArchiveNotFoundError, ArchiveStore
+from leaderboard.storage.archive_store import MARKER, ArchiveNotFoundError, ArchiveStore
 from leaderboard.storage.backup import back_up
-from leaderboard.storage.retention import ORPHAN_AGE_S, prune_archives
-from leaderboard.uploads.accept import UNAVAILABLE_MESSAGE
-from rebar_depth_bench.base.errors import InputError
+from leaderboard.uploads import UNAVAILABLE_MESSAGE
+from rebar_depth_bench.base.errors import InputError, StorageError
 from rebar_depth_bench.base.writing import atomic_replace
 from tests.leaderboard.boards import (
     DIGEST,
@@ -36,7 +35,7 @@ from tests.leaderboard.boards import (
     opened,
     score_all,
 )
-from tests.leaderboard.serving import API, RunScorer, RunServer
+from tests.leaderboard.serving import API, RunServer, distinct_archive, make_token, run
 from tests.processes import wait_until
 
 CONTENT = bytes(range(256)) * 1000
@@ -58,47 +57,77 @@ def new_file(tmp_path: Path) -> Callable[[], Path]:
     return make
 
 
-def test_archive_is_stored_listed_read_and_deleted(folder: Path, new_file: Callable[[], Path]) -> None:
-    archives = ArchiveStore(folder)
+@pytest.fixture
+def archives(folder: Path) -> ArchiveStore:
+    """Return a new archive folder, of the database with the id ``ab``."""
+    store = ArchiveStore(folder, "ab")
+    store.initialise({})
+    return store
+
+
+def stored(folder: Path) -> dict[str, bytes]:
+    """Return the content of all files but the marker by name."""
+    return {path.name: path.read_bytes() for path in folder.iterdir() if path.name != MARKER}
+
+
+def test_archive_is_stored_listed_read_and_deleted(
+    folder: Path, archives: ArchiveStore, new_file: Callable[[], Path]
+) -> None:
     assert archives.ids() == set()
     source = new_file()
     archives.put("an-id_1", source)
     assert not source.exists(), "an upload that is kept is no longer in the spool"
-    assert {path.name: path.read_bytes() for path in folder.iterdir()} == {"an-id_1.zip": CONTENT}
-    assert archives.ids() == ArchiveStore(folder).ids() == {"an-id_1"}
+    assert stored(folder) == {"an-id_1.zip": CONTENT}
+    assert archives.ids() == ArchiveStore(folder, "ab").ids() == {"an-id_1"}
     assert archives.path("an-id_1").read_bytes() == CONTENT
     archives.delete("an-id_1")
-    assert not list(folder.iterdir())
-    assert archives.ids() == set()
-
-
-def test_missing_archive_raises_on_read_but_not_on_delete(folder: Path) -> None:
-    archives = ArchiveStore(folder)
-    archives.delete("never-was")
+    archives.delete("an-id_1")
+    assert stored(folder) == {}
     with pytest.raises(ArchiveNotFoundError):
-        archives.path("never-was")
-    folder.rmdir()
-    with pytest.raises(OSError, match="the folder does not exist"):
-        archives.path("never-was")
+        archives.path("an-id_1")
+
+
+@pytest.mark.parametrize("wrong", ["missing", "empty", "other database"])
+def test_wrong_folder_is_refused_by_every_operation(
+    folder: Path, archives: ArchiveStore, new_file: Callable[[], Path], wrong: str
+) -> None:
+    archives.put("an-id", new_file())
+    shutil.rmtree(folder)
+    if wrong != "missing":
+        folder.mkdir()
+    if wrong == "other database":
+        ArchiveStore(folder, "cd").initialise({})
+    archives.initialise({"an-id": ("0" * 64, 1)})
+    for use in (archives.ids, archives.check, lambda: archives.path("an-id"), lambda: archives.delete("an-id")):
+        with pytest.raises(StorageError, match=f"{folder}: (has no file|belongs to the database with the id cd)"):
+            use()
+    with pytest.raises(StorageError):
+        archives.put("new", new_file())
+    assert not folder.exists() or stored(folder) == {}
+    archives.initialise({"an-id": None})  # No row needs an archive any more.
+    if wrong == "other database":
+        with pytest.raises(StorageError):
+            archives.check()
+    else:
+        archives.check()
+
+
+def test_folder_with_archives_gets_no_marker(folder: Path) -> None:
+    folder.mkdir(parents=True)
+    (folder / "an-id.zip").write_bytes(CONTENT)
+    ArchiveStore(folder, "ab").initialise({})
+    assert not (folder / MARKER).exists()
 
 
 def test_unusable_folder_is_an_input_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("x")
     with pytest.raises(InputError, match=r"the archive storage .* cannot be written"):
-        ArchiveStore(tmp_path / "file" / "kept")
+        ArchiveStore(tmp_path / "file" / "kept", "ab").initialise({})
 
 
-def test_age_is_that_of_file(folder: Path, new_file: Callable[[], Path]) -> None:
-    archives, now = ArchiveStore(folder), time.time()
-    archives.put("old", new_file())
-    assert archives.age_s("old") == pytest.approx(0, abs=60)
-    os.utime(folder / "old.zip", (now - 5000, now - 5000))
-    assert archives.age_s("old") == pytest.approx(5000, abs=60)
-    assert archives.age_s("deleted meanwhile") == 0
-
-
-def test_killed_copy_from_another_device_leaves_no_archive(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    archives = ArchiveStore(folder)
+def test_killed_copy_from_another_device_leaves_no_archive(
+    folder: Path, archives: ArchiveStore, monkeypatch: pytest.MonkeyPatch
+) -> None:
     with tempfile.TemporaryDirectory(dir="/dev/shm") as device:
         source = Path(device) / "one.upload"
         source.write_bytes(CONTENT)
@@ -116,73 +145,99 @@ def test_killed_copy_from_another_device_leaves_no_archive(folder: Path, monkeyp
         assert source.read_bytes() == CONTENT
         archives.put("an-id", source)
         assert not source.exists()
-    assert {path.name: path.read_bytes() for path in folder.iterdir()} == {"an-id.zip": CONTENT}
+    assert stored(folder) == {"an-id.zip": CONTENT}
     assert stat.S_IMODE(archives.path("an-id").stat().st_mode) == 0o600
 
 
-def test_leftovers_of_killed_copies_are_deleted_when_they_are_old(folder: Path) -> None:
-    archives, now = ArchiveStore(folder), time.time()
+def test_leftovers_of_killed_copies_are_deleted_when_they_are_old(folder: Path, archives: ArchiveStore) -> None:
+    now = time.time()
     with atomic_replace(folder / "an-id.zip") as temporary:
         temporary.write_bytes(CONTENT)
         for name in (temporary.name, "kept.zip"):
             (folder / name).write_bytes(CONTENT)
             os.utime(folder / name, (now - 5000, now - 5000))
-        archives.delete_leftovers(5100)
+        archives.finish_deletions({}, copy_age_s=5100)
         assert temporary.exists()
-        archives.delete_leftovers(3600)
-        assert [path.name for path in folder.iterdir()] == ["kept.zip"]
+        archives.finish_deletions({})
+        assert stored(folder) == {"kept.zip": CONTENT}
         temporary.write_bytes(CONTENT)
 
 
-def test_other_files_are_not_listed(folder: Path) -> None:
-    archives = ArchiveStore(folder)
-    (folder / "notes.txt").write_text("not ours")
-    (folder / "half.part").write_text("under way")
-    assert archives.ids() == set()
-
-
-def test_concurrent_uploads_are_all_stored(folder: Path, new_file: Callable[[], Path]) -> None:
-    archives = ArchiveStore(folder)
+def test_concurrent_uploads_are_all_stored(
+    folder: Path, archives: ArchiveStore, new_file: Callable[[], Path]
+) -> None:
     names = [f"id-{number}" for number in range(12)]
     with ThreadPoolExecutor(6) as threads:
         list(threads.map(archives.put, names, [new_file() for _ in names]))
     assert archives.ids() == set(names)
-    assert {path.read_bytes() for path in folder.iterdir()} == {CONTENT}
+    assert set(stored(folder).values()) == {CONTENT}
 
 
 def test_service_uses_another_folder(small_archive: Path, folder: Path, running_server: RunServer) -> None:
     with running_server(workers=0, archives=folder) as server:
         token = server.token("alice")
         submission = server.submit_accepted(small_archive, token)
-    for name, age_s in (("orphan", 2 * ORPHAN_AGE_S), ("young", 0.0)):
-        (folder / f"{name}.zip").write_bytes(CONTENT)
-        os.utime(folder / f"{name}.zip", (time.time() - age_s,) * 2)
+    (folder / "orphan.zip").write_bytes(CONTENT)
     with running_server(server.state, archives=folder) as server:
-        assert {path.name for path in folder.iterdir()} == {"orphan.zip", "young.zip", f"{submission}.zip"}
-        for name in ("orphan", "young"):
-            (folder / f"{name}.zip").unlink()
+        assert set(stored(folder)) == {"orphan.zip", f"{submission}.zip"}
         assert (folder / f"{submission}.zip").read_bytes() == small_archive.read_bytes()
         assert server.wait_until_ended(submission)["status"] == "scored"
         assert server.call("DELETE", f"{API}/{submission}", token).status_code == 204
-        assert not list(folder.iterdir())
+        assert set(stored(folder)) == {"orphan.zip"}
         assert not (server.state / "archives").exists()
         wait_until(lambda: not server.spool_files(), "the spool is empty")
 
 
-def test_storage_outage_keeps_quota_and_requeues_job(
-    tmp_path: Path, small_archive: Path, running_server: RunServer, running_scorer: RunScorer
+@pytest.mark.parametrize("outage", ["away", "not mounted"])
+def test_archive_folder_that_is_not_mounted_loses_nothing(
+    tmp_path: Path, small_archive: Path, tiny_root: Path, running_server: RunServer, outage: str
 ) -> None:
-    with running_server(quota=1, workers=0) as server:
-        token, archives = server.token("alice"), server.state / "archives"
-        archives.rename(tmp_path / "away")
-        response = server.submit(small_archive, token)
-        assert (response.status_code, response.json()["detail"]) == (503, UNAVAILABLE_MESSAGE)
+    with running_server(workers=0) as server:
+        token, state = server.token("alice"), server.state
+        waiting, archives = server.submit_accepted(small_archive, token), state / "archives"
+        before = server.get("/api/v1/token", token).json()
+    archives.rename(tmp_path / "away")
+    if outage == "not mounted":
+        archives.mkdir()
+    with running_server(state, workers=1) as server:
+        for archive in (small_archive, distinct_archive(small_archive, 7)):
+            response = server.submit(archive, token)
+            assert (response.status_code, response.json()["detail"]) == (503, UNAVAILABLE_MESSAGE)
+        assert server.call("DELETE", f"{API}/{waiting}", token).status_code == 503
+        assert server.get("/api/v1/token", token).json() == before
+        health = server.get("/healthz")
+        assert health.status_code == 503
+        assert "has no file leaderboard-id" in str(health.json()["problems"])
+        options = ("--state-dir", state)
+        commands = (("check", "--data", tiny_root), ("backup", tmp_path / "copy"), ("remove", waiting))
+        for command in (*commands, ("requeue", waiting)):
+            process = run(*command, *options)
+            assert process.returncode == 1, command
+            assert "has no file leaderboard-id" in process.stderr
+        wait_until(lambda: any("job requeued" in line for line in server.log), "the job waits")
+        assert server.row(waiting)["attempts"] <= 1
+        assert not archives.exists() or list(archives.iterdir()) == []
+        if outage == "not mounted":
+            archives.rmdir()
         (tmp_path / "away").rename(archives)
-        submission = server.submit_accepted(small_archive, token)
-        assert server.spool_files() == []
-        with running_scorer(server.state) as log:
-            wait_until(lambda: any("waiting for submissions" in line for line in log), "the scorer has started")
-            assert server.wait_until_ended(submission)["status"] == "scored"
+        assert server.wait_until_ended(waiting)["status"] == "scored"
+        assert server.get("/healthz").status_code == 200
+        assert server.submit(distinct_archive(small_archive, 8), token).status_code == 202
+
+
+def test_archive_folder_of_another_database_is_refused(
+    tmp_path: Path, small_archive: Path, tiny_root: Path, running_server: RunServer
+) -> None:
+    with running_server(workers=0) as server:
+        kept = server.submit_accepted(small_archive, server.token("alice"))
+    other = board_settings(tmp_path / "other")
+    make_board(other)
+    process = run("check", "--data", tiny_root, "--state-dir", server.state, "--db", other.database_url)
+    assert process.returncode == 1
+    assert "belongs to the database with the id" in process.stderr
+    with running_server(server.state, db=other.database_url, workers=0) as wrong:
+        assert wrong.submit(small_archive, make_token(server.state, "bob", other.database_url)).status_code == 503
+    assert (server.state / "archives" / f"{kept}.zip").read_bytes() == small_archive.read_bytes()
 
 
 MAX_OPERATIONS = 200
@@ -214,16 +269,15 @@ def change_and_die(settings: Settings, submission_id: str) -> None:
 def test_killed_backup_is_whole_and_can_be_repeated(tmp_path: Path, prune: bool) -> None:
     settings, target = board_settings(tmp_path / "state"), tmp_path / "backup"
     token = make_board(settings)
-    removed, pruned, kept = (add_submission(settings, token, content) for content in (b"1", b"2", b"3"))
+    removed, freed, kept = (add_submission(settings, token, content) for content in (b"1", b"2", b"3"))
     back_up(settings, target, prune=False)
     assert killed(MAX_OPERATIONS, change_and_die, board_settings(target), kept)
     assert (target / "leaderboard.sqlite-wal").stat().st_size > 0
-    with opened(settings) as (database, archives):
-        submissions.remove(database, removed)
-        prune_archives(database, archives, [pruned])
+    remove(settings, removed)
+    free_archive(settings, freed)
     new = [add_submission(settings, token, content, scored=False) for content in (b"4", b"5")]
     shutil.copytree(target, tmp_path / "earlier")
-    earlier = {removed, pruned, kept}
+    earlier = {removed, freed, kept}
 
     def prepare() -> tuple[object, ...]:
         shutil.rmtree(target)
@@ -239,7 +293,7 @@ def test_killed_backup_is_whole_and_can_be_repeated(tmp_path: Path, prune: bool)
         assert_sound(backup)
         shown = facts(settings)
         if not prune:
-            shown |= {name: (*shown[name][:3], True) for name in (removed, pruned)}
+            shown |= {name: (*shown[name][:2], True) for name in (removed, freed)}
         assert facts(backup) == shown
         others = [path.name for path in target.rglob("*") if path.name.startswith(".") or "wal" in path.name]
         assert others == []
@@ -269,54 +323,50 @@ def test_killed_first_backup_can_be_repeated(tmp_path: Path) -> None:
     kill_everywhere(back_up, check, prepare)
 
 
-def prune(settings: Settings, submission_ids: list[str]) -> None:
-    with opened(settings) as (database, archives):
-        prune_archives(database, archives, submission_ids)
-
-
 def remove(settings: Settings, submission_id: str) -> None:
     with opened(settings) as (database, archives):
         submissions.remove(database, submission_id)
-        prune_archives(database, archives, [])
+        archives.delete(submission_id)
+
+
+def free_archive(settings: Settings, submission_id: str) -> None:
+    """Delete an archive and keep its submission, as ``remove --archive-only`` does."""
+    with opened(settings) as (database, archives):
+        submissions.change(database, submission_id, {"archive_deleted_at": time.time()})
+        archives.delete(submission_id)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("operation", [prune, remove])
+@pytest.mark.parametrize("operation", [free_archive, remove])
 def test_killed_deletion_is_finished_by_the_next_start(
-    tmp_path: Path, new_database: Callable[[], str], operation: Callable[..., object]
+    tmp_path: Path, new_database: Callable[[], str], operation: Callable[[Settings, str], object]
 ) -> None:
     boards = iter(range(MAX_OPERATIONS))
-    expected: dict[str, set[str]] = {}
+    kept: list[str] = []
 
     def prepare() -> tuple[object, ...]:
         settings = board_settings(tmp_path / f"state-{next(boards)}", db=new_database())
         token = make_board(settings)
-        ids = [add_submission(settings, token, content) for content in (b"1", b"2", b"3")]
-        expected["kept"] = {ids[2]}
-        expected["gone"] = set(ids[:2]) if operation is prune else {ids[0]}
-        expected["kept"] |= set(ids) - expected["gone"]
-        return settings, ids[:2] if operation is prune else ids[0]
+        gone, kept[:] = add_submission(settings, token, b"1"), [add_submission(settings, token, b"2")]
+        return settings, gone
 
-    def check(settings: Settings, _: object) -> None:
-        def stored() -> set[str]:
-            return {name for name, (*_, has_archive) in facts(settings).items() if has_archive}
-
-        assert expected["kept"] <= stored()
+    def check(settings: Settings, gone: str) -> None:
         with opened(settings) as (database, archives):
-            marked = {name for name, row in submissions.archive_rows(database).items() if row is None}
-            assert stored() >= set(facts(settings)) - marked, "an archive is deleted before its row says so"
-            prune_archives(database, archives, [])  # As at a start.
-            assert stored() == set(facts(settings)) - marked
+            rows = submissions.archive_rows(database)
+            assert archives.ids() >= {name for name, row in rows.items() if row}, "deleted before its row says so"
+            archives.finish_deletions(rows)  # As at a start.
+            assert archives.ids() == {name for name, row in rows.items() if row}
         assert_sound(settings)
-        operation(settings, list(expected["gone"]) if operation is prune else min(expected["gone"]))
-        assert stored() == expected["kept"]
+        operation(settings, gone)
+        with opened(settings) as (_, archives):
+            assert archives.ids() == set(kept)
 
     kill_everywhere(operation, check, prepare)
 
 
 def rescore(settings: Settings) -> None:
-    with opened(settings) as (database, archives):
-        jobs.requeue_stale(database, OTHER_DIGEST, archives.ids(), rescore=True)
+    with opened(settings) as (database, _):
+        jobs.serve_dataset(database, OTHER_DIGEST, rescore=True)
         score_all(database)
 
 
@@ -324,49 +374,24 @@ def rescore(settings: Settings) -> None:
 def test_killed_rescoring_keeps_every_result(tmp_path: Path, new_database: Callable[[], str]) -> None:
     boards = iter(range(MAX_OPERATIONS))
     ids: list[str] = []
+    both = frozenset({DIGEST, OTHER_DIGEST})
 
     def prepare() -> tuple[object, ...]:
         settings = board_settings(tmp_path / f"state-{next(boards)}", db=new_database())
         token = make_board(settings)
-        ids[:] = [add_submission(settings, token, content) for content in (b"1", b"2", b"3", b"4")]
-        prune(settings, ids[:1])
-        (settings.archive_dir / f"{ids[0]}.zip").write_bytes(b"1")  # As a crash leaves it.
-        (settings.archive_dir / f"{ids[1]}.zip").unlink()
+        ids[:] = [add_submission(settings, token, content) for content in (b"1", b"2", b"3")]
+        free_archive(settings, ids[0])
         return (settings,)
 
     def check(settings: Settings) -> None:
-        pruned, lost = (("scored", DIGEST, DIGEST, has_archive) for has_archive in (True, False))
-        for name, (status, dataset, of_result, has_archive) in facts(settings).items():
-            if name in ids[:2]:
-                assert (status, dataset, of_result, has_archive) == (pruned if has_archive else lost)
-            else:
-                assert has_archive
-                assert of_result in (DIGEST, OTHER_DIGEST)
-                assert status in ("queued", "scoring") or dataset == of_result
+        found = facts(settings)
+        assert found[ids[0]] == ("scored", frozenset({DIGEST}), False)
+        for name in ids[1:]:
+            status, of_results, has_archive = found[name]
+            assert has_archive
+            assert DIGEST in of_results
+            assert status in ("queued", "scoring", "scored")
         rescore(settings)
-        new = ("scored", OTHER_DIGEST, OTHER_DIGEST, True)
-        assert facts(settings) == dict(zip(ids, (pruned, lost, new, new), strict=True))
+        assert [facts(settings)[name] for name in ids[1:]] == [("scored", both, True)] * 2
 
     kill_everywhere(rescore, check, prepare)
-
-
-def test_archive_that_cannot_be_deleted_delays_no_other(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    settings = board_settings(tmp_path / "state")
-    token = make_board(settings)
-    ids = sorted(add_submission(settings, token, content) for content in (b"1", b"2", b"3"))
-    delete = ArchiveStore.delete
-
-    def fail_first(archives: ArchiveStore, submission_id: str) -> None:
-        if submission_id == ids[0]:
-            raise PermissionError(13, "Permission denied")
-        delete(archives, submission_id)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(ArchiveStore, "delete", fail_first)
-        prune(settings, ids)
-    assert [name for name, fact in facts(settings).items() if fact[3]] == ids[:1]
-    assert "archive not deleted" in "".join(capsys.readouterr())
-    prune(settings, [])
-    assert not any(fact[3] for fact in facts(settings).values())

@@ -6,13 +6,6 @@ from collections.abc import Sequence
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Response
-from rebar_depth_bench.remote.models import (
-    Leaderboard,
-    LeaderboardRow,
-    OverallRanking,
-    OverallRow,
-    SubmissionOfRow,
-)
 
 from leaderboard.db.models import TokenModel
 from leaderboard.db.rankings import LeaderboardEntry, overall_ranking
@@ -20,6 +13,13 @@ from leaderboard.service import Service
 from leaderboard.web.api.errors import Responses, errors
 from leaderboard.web.dependencies import WITHOUT_TOKEN, OptionalToken, ServiceDep, check_config
 from leaderboard.web.middleware import NO_STORE, REVALIDATE
+from rebar_depth_bench.remote.models import (
+    Leaderboard,
+    LeaderboardRow,
+    OverallRanking,
+    OverallRow,
+    SubmissionOfRow,
+)
 from rebar_depth_bench.scoring.columns import TABLE_COLUMNS
 from rebar_depth_bench.scoring.frames import csv_text
 from rebar_depth_bench.scoring.protocol import PROTOCOL
@@ -33,12 +33,15 @@ def entries_to_csv(rows: Sequence[LeaderboardEntry]) -> str:
     """
     header = ["rank", "class_rank", "id", "method", "submitter", "baseline", "inputs", "uses_ground_truth"]
     columns = [column.name for column in TABLE_COLUMNS]
-    lines = [[*header, "seconds_per_view", "config", *columns]]
-    for row in rows:
-        named = [row.rank, row.class_rank, row.id, row.method, row.submitter, row.is_baseline, row.inputs]
-        declared = [row.uses_ground_truth, row.declared.get("seconds_per_view"), row.config]
-        lines.append([*named, *declared, *(column.value(row.table) for column in TABLE_COLUMNS)])
-    return csv_text(lines)
+    cells = (
+        [
+            *(row.rank, row.class_rank, row.id, row.method, row.submitter, row.is_baseline, row.inputs),
+            *(row.uses_ground_truth, row.declared.get("seconds_per_view"), row.config),
+            *(column.value(row.table) for column in TABLE_COLUMNS),
+        ]
+        for row in rows
+    )
+    return csv_text([[*header, "seconds_per_view", "config", *columns], *cells])
 
 
 router = APIRouter(prefix="/api/v1", tags=["leaderboard"], responses=errors(503))

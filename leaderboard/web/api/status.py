@@ -6,13 +6,13 @@ from typing import Any
 
 from fastapi import APIRouter
 from fastapi.responses import JSONResponse
-from rebar_depth_bench.remote.models import Token
 
 from leaderboard.db.submissions import quota_used
 from leaderboard.health import service_problems
 from leaderboard.web.api.errors import errors
 from leaderboard.web.dependencies import RequiredToken, ServiceDep
 from rebar_depth_bench import software_version
+from rebar_depth_bench.remote.models import Token
 
 router = APIRouter()
 
@@ -35,7 +35,7 @@ def token(service: ServiceDep, token: RequiredToken) -> Token:
 
 @router.get("/healthz", tags=["operations"], responses=errors(503))
 def healthz(service: ServiceDep) -> Any:
-    """Check database, dataset, archive folder, disk and local workers; status 503 and `problems` if one of them is unusable."""
+    """Check database, dataset, archive folder, disk and workers; status 503 and `problems` if one is unusable."""
     problems = service_problems(service)
     content = {"status": "ok", "version": software_version(), "dataset": service.folder.digest}
     return JSONResponse({**content, "status": "failing", "problems": problems}, 503) if problems else content

@@ -9,7 +9,6 @@ import json
 from typing import Any
 
 from fastapi import APIRouter, HTTPException, Request, Response
-from rebar_depth_bench.remote.models import Submission, SubmissionList
 
 from leaderboard.changes import (
     SubmissionChange,
@@ -33,6 +32,7 @@ from leaderboard.web.dependencies import (
     check_length,
     page_url,
 )
+from rebar_depth_bench.remote.models import Submission, SubmissionList
 
 router = APIRouter(prefix="/api/v1/submissions", tags=["submissions"], responses=errors(503))
 
@@ -122,7 +122,7 @@ def result(submission_id: SubmissionId, service: ServiceDep) -> Response:
     """
     record = get_submission(service, submission_id)
     shown = shown_results(service.database, [record], service.folder.digest).get(record.id)
-    content = shown and result_content(service.database, record.id, shown)
+    content = None if shown is None else result_content(service.database, record.id, shown)
     if content is None:
         raise HTTPException(404, "the submission has no result")
     return Response(content[0], media_type="application/json")
@@ -163,7 +163,7 @@ def _accepted(request: Request, response: Response, accepted: tuple[SubmissionMo
 def _schema(
     request: Request, record: SubmissionModel, shown: ShownResult | None, result: dict[str, Any] | None = None
 ) -> Submission:
-    """Return the answer on a submission; ``shown`` is its result, ``result`` the JSON object if that is included."""
+    """Return the answer on a submission; ``shown`` is its result, ``result`` the JSON object if included."""
     details = json.loads(record.details)
     return Submission.model_validate(
         {
