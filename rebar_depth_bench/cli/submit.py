@@ -10,15 +10,13 @@ from pathlib import Path
 
 from rich.console import Console
 
-from rebar_depth_bench.base.errors import InputError, printable
+from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.base.reading import decode_text
 from rebar_depth_bench.base.terminal import ProgressBars
 from rebar_depth_bench.base.writing import write_output
 from rebar_depth_bench.cli.console import InputFile, add_archive, add_output_file, add_seconds, prints_table
 from rebar_depth_bench.remote.leaderboard_client import WAIT_S, LeaderboardClient
 from rebar_depth_bench.reporting.tables import print_table
-from rebar_depth_bench.scoring.columns import COVERAGE, number
-from rebar_depth_bench.scoring.result import DECIMALS, DisclosedResult, Result
 
 TOKEN_VARIABLE = "REBAR_LEADERBOARD_TOKEN"
 """Environment variable that holds the token."""
@@ -64,21 +62,8 @@ def run(options: argparse.Namespace) -> None:
         result, result_json = leaderboard.result(accepted.id, accepted.archive_sha256)
     if options.json:
         write_output(options.json, result_json)
-    if not prints_table(options):
-        return
-    if isinstance(result, Result):
+    if prints_table(options):
         print_table(result, Console())
-    else:
-        _print_disclosed(result)
-
-
-def _print_disclosed(result: DisclosedResult) -> None:
-    """Print what a leaderboard with hidden ground truth discloses: one line per config."""
-    print(f"{printable(result.submission.method)}, protocol {result.protocol}, ground truth hidden")
-    for config, table in result.tables.items():
-        error, coverage = number(table.rank_error, DECIMALS), COVERAGE.text(table.coverage)
-        note = "" if table.ranked else ", not ranked"
-        print(f"{printable(config)}: rank error {error}, coverage {coverage} %{note}")
 
 
 def read_token(file: str | None) -> str:

@@ -13,9 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO, Self, TypeVar
-
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from typing import Any, Self, TypeVar
 
 from rebar_depth_bench.base.errors import (
     MAX_PROBLEMS_SHOWN,
@@ -31,8 +29,9 @@ from rebar_depth_bench.base.errors import (
 from rebar_depth_bench.base.limits import JSON_BYTES, DeadlineError, call_until
 from rebar_depth_bench.base.parallel import Progress, silent
 from rebar_depth_bench.base.reading import open_regular, parse_json
-from rebar_depth_bench.base.validation import Expected, StrictModel, one_of, validate_table, whole_number
-from rebar_depth_bench.scoring.result import DisclosedResult, Result, is_disclosed, read_disclosed, read_result
+from rebar_depth_bench.base.validation import validate_table
+from rebar_depth_bench.remote.models import ID_PATTERN, Answer, RejectedResponse, Submission, Token
+from rebar_depth_bench.scoring.result import Result, read_result
 from rebar_depth_bench.submission.declaration import RANKS_METRIC
 from rebar_depth_bench.submission.reader import read_metadata
 
@@ -48,7 +47,7 @@ _CHUNK_BYTES = 1 << 16
 UPLOAD_TIMEOUT_S = 3600.0
 """Time limit from the last byte of an upload to the end of the response, seconds: the archive is checked first."""
 _MAX_LINE_CHARACTERS = 500
-_PROBLEMS = TypeAdapter(tuple[Problem, ...], config=ConfigDict(defer_build=True))
+_Model = TypeVar("_Model", bound=Answer)
 
 
 class ServiceError(RebarDepthError):
@@ -59,39 +58,8 @@ class AnswerError(ServiceError):
     """Answer of a leaderboard that is not valid; asking again does not help."""
 
 
-def _matches(pattern: str, expected: str) -> Expected:
-    return Expected(expected, lambda value: re.fullmatch(pattern, value) is not None and value.isprintable())
-
-
-SUBMISSION_ID = _matches("[A-Za-z0-9_-]{1,100}", "an id of letters, digits, _ and -")
-"""Description of an id, which becomes part of URLs."""
-
-
-class _Answer(StrictModel, extra="ignore"):
-    """Base class of answers: types are strict, and keys of newer services are ignored."""
-
-
-class TokenInfo(_Answer):
-    """Answer to a valid token: the size limit of the service, bytes."""
-
-    max_upload_bytes: Annotated[int, whole_number(1, 2**63 - 1)]
-
-
-class Submission(_Answer):
-    """Accepted submission: its status, the URL of its page, and the reason if scoring has failed."""
-
-    id: Annotated[str, SUBMISSION_ID]
-    status: Annotated[str, one_of("queued", "scoring", "scored", "failed")]
-    url: Annotated[str, _matches(r"https?://[^\s/][^\s]{0,1999}", "an http or https URL")]
-    reason: Annotated[str, Expected("the reason of the failure")] | None = None
-    archive_sha256: Annotated[str, _matches("[0-9a-f]{64}", "64 hex digits")] | None = None
-
-
-_Model = TypeVar("_Model", bound=_Answer)
-
-
 @dataclass(frozen=True)
-class Response:
+class _Response:
     """Status and body of a response; ``where`` is the address of the service for error messages."""
 
     where: str
@@ -134,26 +102,9 @@ class Response:
         more = len(lines) - len(shown)
         omitted = f"\n  ... and {more} more" if more > 0 else ""
         error = SubmissionError(f"{archive}: {_detail(content, 'rejected')}{''.join(shown)}{omitted}")
-        try:
-            error.problems = _PROBLEMS.validate_python(content.get("problem_details", ()))
-        except ValidationError:  # Another version of the service.
-            error.problems = ()
+        rejected = validate_table(RejectedResponse, content, [], from_json=True)
+        error.problems = () if rejected is None else tuple(rejected.problem_details)
         return error
-
-    def result(self, archive_sha256: str | None) -> Result | DisclosedResult:
-        """Return the result in the body. Raises ``AnswerError`` if it is none, or that of another archive.
-
-        A leaderboard with hidden ground truth returns only the disclosed part of it.
-        """
-        where = f"{self.where}: the result of the leaderboard"
-        try:
-            result = (read_disclosed if is_disclosed(self.content()) else read_result)(self.body, where)
-        except InputError as error:
-            raise AnswerError(str(error)) from None
-        if archive_sha256 not in (None, result.submission.sha256):
-            found = escape_text(str(result.submission.sha256))
-            raise AnswerError(f"{where} is of the archive with SHA-256 {found}, expected {archive_sha256}")
-        return result
 
 
 def _detail(content: Mapping[str, Any], default: str) -> str:
@@ -188,7 +139,7 @@ class LeaderboardClient:
         self._client.close()
 
     def submit(self, archive: Path, progress: Progress = silent) -> Submission:
-        """Upload an archive and return the accepted submission, with the SHA-256 of what was sent.
+        """Upload an archive and return the accepted submission.
 
         Raises ``SubmissionError`` with every problem of a rejected archive, before the upload if its predictions
         are not metric, ``InputError`` for an invalid token, an exhausted quota, an archive that is too large or a
@@ -197,23 +148,35 @@ class LeaderboardClient:
         meta = read_metadata(archive)
         if meta is not None and (problems := meta.kind_problems(RANKS_METRIC)):
             raise SubmissionError.from_problems(archive, problems)
-        max_bytes = self._get("token", REQUEST_TIMEOUT_S).answer(TokenInfo, 200).max_upload_bytes
+        max_bytes = self._get("token", REQUEST_TIMEOUT_S).answer(Token, 200).max_upload_bytes
+        digest, last_read = hashlib.sha256(), time.monotonic()
         try:
             with open_regular(archive) as stream:
                 total = os.fstat(stream.fileno()).st_size
                 if total > max_bytes:
                     raise InputError(f"{archive}: has {total} bytes, expected at most {max_bytes}")
-                upload = _Upload(stream, lambda done: progress("uploading", done, total))
+
+                def chunks() -> Iterator[bytes]:
+                    nonlocal last_read
+                    while data := stream.read(_CHUNK_BYTES):
+                        digest.update(data)
+                        last_read = time.monotonic()
+                        progress("uploading", stream.tell(), total)
+                        yield data
+
                 headers = {"Content-Type": "application/zip", "Content-Length": str(total)}
-                response = self._call("PUT", "submissions", upload.deadline, headers=headers, content=upload)
+                # An upload may take any time as long as it proceeds.
+                response = self._call(
+                    "PUT", "submissions", lambda: last_read + UPLOAD_TIMEOUT_S, headers=headers, content=chunks()
+                )
         except OSError as error:
             raise InputError(f"{archive}: cannot be read: {error.strerror or error}") from None
         if response.status == 422:
             raise response.rejection(archive)
         accepted = response.answer(Submission, 202, 200)
-        if accepted.archive_sha256 not in (None, upload.sha256()):
+        if accepted.archive_sha256 != digest.hexdigest():
             raise AnswerError(f"{self._url}: the service received another archive than was sent")
-        return accepted.model_copy(update={"archive_sha256": upload.sha256()})
+        return accepted
 
     def wait(self, submission_id: str, progress: Progress = silent, limit_s: float = WAIT_S) -> Submission:
         """Poll until the submission is scored or failed, and return it.
@@ -222,11 +185,19 @@ class LeaderboardClient:
         requests and for an answer that is not valid, such as an unknown status, and ``InputError`` if the service
         rejects the token or the id.
         """
+        path = f"submissions/{_checked_id(submission_id)}"
         end = time.monotonic() + limit_s
         failed_polls, status = 0, "not scored"
         while (remaining_s := end - time.monotonic()) > 0:
             try:
-                submission = self._poll(submission_id, min(remaining_s, REQUEST_TIMEOUT_S))
+                response = self._get(path, min(remaining_s, REQUEST_TIMEOUT_S))
+                if response.status == 429:
+                    raise ServiceError(f"{self._url}: {_detail(response.content(), 'too many requests')}")
+                submission = response.answer(Submission, 200)
+                if submission.id != submission_id:
+                    raise AnswerError(
+                        f"{self._url}: the answer is on submission {submission.id}, expected {submission_id}"
+                    )
             except AnswerError:
                 raise
             except ServiceError:
@@ -241,45 +212,38 @@ class LeaderboardClient:
                 if has_ended:
                     return submission
             time.sleep(min(POLL_INTERVAL_S, max(end - time.monotonic(), 0)))
-        page = f"{self._url}/submissions/{submission_id}"
         raise ServiceError(
-            f"{page}: the submission is still {status} after {limit_s:g} s of waiting; this page shows its result "
-            "once it is scored"
+            f"{self._url}/{path}: the submission is still {status} after {limit_s:g} s of waiting; "
+            "this page shows its result once it is scored"
         )
 
-    def result(
-        self, submission_id: str, archive_sha256: str | None = None
-    ) -> tuple[Result | DisclosedResult, bytes]:
+    def result(self, submission_id: str, archive_sha256: str | None = None) -> tuple[Result, bytes]:
         """Return the result and its JSON, byte-identical to the output of ``rebar-bench score --json``.
 
-        A leaderboard with hidden ground truth returns only the disclosed part of it.
-
-        Raises ``ServiceError`` if the response status is not 200 or the body is no result, or that of another
-        archive than the one with ``archive_sha256``.
+        Raises ``ServiceError`` if the response status is not 200, and ``AnswerError`` if the body is no result, or
+        that of another archive than the one with ``archive_sha256``.
         """
         response = self._get(f"submissions/{_checked_id(submission_id)}/result.json", RESULT_TIMEOUT_S)
         if response.status != 200:
             raise ServiceError(
                 f"{self._url}: the response status for the result is {response.status}, expected 200"
             )
-        return response.result(archive_sha256), response.body
-
-    def _poll(self, submission_id: str, limit_s: float) -> Submission:
-        response = self._get(f"submissions/{_checked_id(submission_id)}", limit_s)
-        if response.status == 429:
-            raise ServiceError(f"{self._url}: {_detail(response.content(), 'too many requests')}")
-        submission = response.answer(Submission, 200)
-        if submission.id != submission_id:
+        where = f"{self._url}: the result of the leaderboard"
+        try:
+            result = read_result(response.body, where)
+        except InputError as error:
+            raise AnswerError(str(error)) from None
+        if archive_sha256 not in (None, result.submission.sha256):
             raise AnswerError(
-                f"{self._url}: the answer is on submission {submission.id}, expected {submission_id}"
+                f"{where} is of the archive with SHA-256 {result.submission.sha256}, expected {archive_sha256}"
             )
-        return submission
+        return result, response.body
 
-    def _get(self, path: str, limit_s: float) -> Response:
+    def _get(self, path: str, limit_s: float) -> _Response:
         end = time.monotonic() + limit_s
         return self._call("GET", path, lambda: end)
 
-    def _call(self, method: str, path: str, end: Callable[[], float], **content: Any) -> Response:
+    def _call(self, method: str, path: str, end: Callable[[], float], **content: Any) -> _Response:
         """Return the response to a request, which must be complete before the time ``end()``."""
         client = self._client
         try:
@@ -292,7 +256,7 @@ class LeaderboardClient:
             found = _one_line(str(error)) or type(error).__name__
             raise ServiceError(f"{self._url}: no response: {found}") from None
 
-    def _exchange(self, client: Any, method: str, path: str, content: dict[str, Any]) -> Response:
+    def _exchange(self, client: Any, method: str, path: str, content: dict[str, Any]) -> _Response:
         max_bytes, body = JSON_BYTES.value(), bytearray()
         with client.stream(method, f"{self._url}/api/v1/{path}", **content) as response:
             for chunk in response.iter_raw():
@@ -300,7 +264,7 @@ class LeaderboardClient:
                 if len(body) > max_bytes:
                     expected = JSON_BYTES.allowed("bytes")
                     raise AnswerError(f"{self._url}: the response is too large, expected {expected}")
-            return Response(self._url, response.status_code, bytes(body))
+            return _Response(self._url, response.status_code, bytes(body))
 
     def _new_client(self) -> Any:
         # A compressed body could be far larger than what is received.
@@ -314,34 +278,10 @@ class LeaderboardClient:
         client.close()
 
 
-class _Upload:
-    """Chunks of a file, which report the number of bytes read so far and compute their SHA-256."""
-
-    def __init__(self, stream: BinaryIO, on_read: Callable[[int], None]) -> None:
-        self._stream, self._on_read, self._bytes_read = stream, on_read, 0
-        self._digest, self._last_read = hashlib.sha256(), time.monotonic()
-
-    def __iter__(self) -> Iterator[bytes]:
-        while data := self._stream.read(_CHUNK_BYTES):
-            self._digest.update(data)
-            self._last_read = time.monotonic()
-            self._bytes_read += len(data)
-            self._on_read(self._bytes_read)
-            yield data
-
-    def sha256(self) -> str:
-        """Return the hex SHA-256 of the bytes read so far."""
-        return self._digest.hexdigest()
-
-    def deadline(self) -> float:
-        """Return the time by which the next chunk must be read or the response be complete."""
-        return self._last_read + UPLOAD_TIMEOUT_S
-
-
 def _checked_id(submission_id: str) -> str:
     """Return an id that can be part of a URL; raise ``InputError`` for any other text."""
-    if not SUBMISSION_ID.accept(submission_id):
+    if not re.fullmatch(ID_PATTERN, submission_id):
         raise InputError(
-            f"{escape_text(submission_id)} is not the id of a submission, expected {SUBMISSION_ID.text}"
+            f"{escape_text(submission_id)} is not the id of a submission, expected letters, digits, _ and -"
         )
     return submission_id

@@ -1,4 +1,4 @@
-"""Result of scoring one submission, written and read by the same classes, and the part of it that is disclosed.
+"""Result of scoring one submission, written and read by the same classes.
 
 The classes mirror the JSON. Unknown keys are ignored, because results of later versions have more of them.
 """
@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from html import escape
@@ -16,11 +15,11 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import AfterValidator, BeforeValidator, FailFast, Field, GetPydanticSchema, Strict, TypeAdapter
 from pydantic_core import core_schema
 
-from rebar_depth_bench.base.errors import InputError, Problem, SubmissionError, printable
+from rebar_depth_bench.base.errors import InputError, Problem, printable
 from rebar_depth_bench.base.limits import JSON_BYTES
 from rebar_depth_bench.base.names import config_of
 from rebar_depth_bench.base.reading import parse_json
-from rebar_depth_bench.base.validation import StrictModel, field_error, one_of, validate_document, validate_table
+from rebar_depth_bench.base.validation import field_error, one_of, validate_document
 from rebar_depth_bench.scoring import frames
 from rebar_depth_bench.scoring.bootstrap import INTERVALS
 from rebar_depth_bench.scoring.columns import (
@@ -37,14 +36,12 @@ from rebar_depth_bench.scoring.columns import (
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, PROTOCOL, RELATIVE_PROTOCOL
 from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND, kind_text, relative_findings
 from rebar_depth_bench.scoring.table import (
-    LIMITED,
     Count,
     Flag,
     Name,
     Table,
     TableJson,
     ViewJson,
-    ViewScore,
     check_tables,
 )
 from rebar_depth_bench.submission.declaration import INPUTS, METRIC, Declaration
@@ -321,79 +318,3 @@ def _describe_table(table: Table) -> str:
     note = "" if table.ranked else ", not ranked"
     error = "" if table.rank_error is None else f"rank error {table.rank_error:.4g}, "
     return f"{error}AbsRel {table.native.abs_rel:.4g} native, {table.scaled.abs_rel:.4g} scaled{note}"
-
-
-# Disclosed results: what a leaderboard with hidden ground truth returns of a result. Most numbers of a result help
-# a submitter to compute the ground truth: a view's scale factor, for example, is the ratio of the median true
-# depth to the median of the submitter's own depth. Only the rank error and the coverage of each config are
-# disclosed, rounded to ``DECIMALS``. The models name all that is disclosed, so that a number that is added to
-# results is hidden unless it is added here, too.
-
-DECIMALS = 3
-"""Decimals of the disclosed numbers."""
-
-MIN_VIEW_COVERAGE = 0.5
-"""Smallest coverage of a view that is scored if the ground truth is hidden; it limits probing by omission."""
-
-COVERAGE_RULE = f"predictions for at least {MIN_VIEW_COVERAGE * 100:.0f} % of the scored pixels of each view"
-
-
-def disclosed_number(value: float) -> float:
-    """Return a number as it is disclosed."""
-    return round(value, DECIMALS)
-
-
-_Number = Annotated[float, Strict(), Field(ge=0, le=1), AfterValidator(disclosed_number)] | None
-
-
-class DisclosedTable(StrictModel, extra="ignore"):
-    """Disclosed part of the table of a config; ``rank_error`` is None without scored views."""
-
-    coverage: _Number
-    ranked: bool
-    rank_error: _Number
-
-
-class DisclosedResult(StrictModel, extra="ignore", strict=False):
-    """Disclosed part of a result; ``hidden_truth`` distinguishes it from a whole result."""
-
-    protocol: Annotated[str, Strict(), one_of(PROTOCOL)]
-    hidden_truth: Literal[True] = True
-    dataset: DatasetIdentity
-    submission: SubmissionIdentity
-    software: SoftwareIdentity
-    tables: Annotated[dict[Name, DisclosedTable], LIMITED]
-
-
-def disclosed_json(result: bytes) -> bytes:
-    """Return the JSON of the disclosed part of a result; of a result that cannot be read, it has no numbers."""
-    content = validate_table(DisclosedResult, json.loads(result), [])
-    disclosed = {"hidden_truth": True} if content is None else content.model_dump(mode="json")
-    return (json.dumps(disclosed, indent=1, ensure_ascii=False) + "\n").encode()
-
-
-def is_disclosed(document: object) -> bool:
-    """Return whether a JSON value is the disclosed part of a result."""
-    return isinstance(document, dict) and document.get("hidden_truth") is True
-
-
-def read_disclosed(data: bytes, where: str) -> DisclosedResult:
-    """Return the disclosed result in ``data``; ``where`` names the source in error messages.
-
-    Raises ``InputError`` with all problems if it is none.
-    """
-    document, problems = parse_json(data)
-    content = None if problems else validate_table(DisclosedResult, document, problems)
-    if content is None:
-        raise InputError.from_problems(f"{where}: is not a disclosed result", problems)
-    return content
-
-
-def check_view_coverage(views: Sequence[ViewScore]) -> None:
-    """Raise ``SubmissionError`` if a view has less than ``MIN_VIEW_COVERAGE``.
-
-    The message names neither the view nor its coverage, because these tell how many omitted pixels are scored.
-    """
-    if any(view.coverage < MIN_VIEW_COVERAGE for view in views):
-        problem = Problem("missing", "", "a view has too few predictions on scored pixels", COVERAGE_RULE)
-        raise SubmissionError.from_problems("the archive", [problem])

@@ -57,7 +57,7 @@ def _check_length(table: object) -> object:
     return table
 
 
-LIMITED = BeforeValidator(_check_length)
+_LIMITED = BeforeValidator(_check_length)
 """Annotation of a JSON object whose keys are names."""
 Name = Annotated[str, Strict(), text(_NAME_CHARACTERS)]
 Flag = Annotated[bool, Strict()]
@@ -82,7 +82,7 @@ def _write_within(within_mm: Mapping[int, float | None]) -> dict[str, float | No
 
 WithinMm = Annotated[
     Mapping[int, float | None],
-    json_as(Annotated[dict[int, Share | None], _WITHIN, LIMITED, _KNOWN], dict, _write_within),
+    json_as(Annotated[dict[int, Share | None], _WITHIN, _LIMITED, _KNOWN], dict, _write_within),
 ]
 """Shares of all scored pixels by tolerance in millimetres."""
 
@@ -106,7 +106,7 @@ _Bound = Annotated[float, Strict(), Field(allow_inf_nan=False)] | None
 _Ends = tuple[_Bound, _Bound] | None
 _INTERVAL_FIELDS: dict[str, Any] = {
     column.path.partition(".")[0]: (
-        (Annotated[dict[str, _Ends], LIMITED], Field({})) if "." in column.path else (_Ends, None)
+        (Annotated[dict[str, _Ends], _LIMITED], Field({})) if "." in column.path else (_Ends, None)
     )
     for column in (*VIEW_COLUMNS, *RELATIVE_INTERVALS)
 }

@@ -37,7 +37,7 @@ def is_http_url(url: str) -> bool:
 _Description = Annotated[
     str, Expected("text without NUL and surrogates", lambda value: not re.search("[\0\ud800-\udfff]", value))
 ]
-_HttpUrl = Annotated[
+HttpUrl = Annotated[
     str,
     Expected(
         f"an http:// or https:// address without spaces, at most {_MAX_URL_CHARACTERS} characters", is_http_url
@@ -100,8 +100,8 @@ class MethodDetails(StrictModel):
     """
 
     description: _Description | None = None
-    url: _HttpUrl | None = None
-    code_url: _HttpUrl | None = None
+    url: HttpUrl | None = None
+    code_url: HttpUrl | None = None
     licence: Annotated[str, text(100)] | None = None
     training_data: Annotated[str, text(1000)] | None = None
     parameters: _Parameters | None = None

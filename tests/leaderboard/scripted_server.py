@@ -25,8 +25,27 @@ TOKEN_INFO = {
     "name": "alice",
     "quota": 10,
     "quota_left": 9,
+    "quota_bytes": 1 << 40,
+    "quota_bytes_left": 1 << 39,
     "max_upload_bytes": 1 << 30,
-    "read_rate_limit": "9/minute",
+}
+SUBMISSION: dict[str, Any] = {
+    "id": ID,
+    "status": "queued",
+    "url": URL,
+    "method": "m",
+    "parameters": 1_000_000,
+    "inputs": None,
+    "uses_ground_truth": False,
+    "public": True,
+    "created_at": "2026-01-31T12:00:00.123456Z",
+    "finished_at": None,
+    "reason": None,
+    "archive_sha256": "0" * 64,
+    "archive_bytes": 1234,
+    "archive_kept": True,
+    "outdated": None,
+    "result": None,
 }
 
 
@@ -62,9 +81,8 @@ def answer(
 
 def submission(archive: Path, **changes: Any) -> dict[str, Any]:
     """Return the JSON of an accepted submission with some values changed; a value of ``...`` is left out."""
-    sha256 = hashlib.sha256(archive.read_bytes()).hexdigest()
-    values = {"id": ID, "status": "queued", "url": URL, "method": "m", "reason": None, "archive_sha256": sha256}
-    return {key: value for key, value in {**values, **changes}.items() if value is not ...}
+    values = {**SUBMISSION, "archive_sha256": hashlib.sha256(archive.read_bytes()).hexdigest(), **changes}
+    return {key: value for key, value in values.items() if value is not ...}
 
 
 @contextmanager

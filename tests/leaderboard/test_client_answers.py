@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,16 @@ import pytest
 
 from rebar_depth_bench.base.errors import SubmissionError
 from rebar_depth_bench.remote.leaderboard_client import LeaderboardClient
-from rebar_depth_bench.scoring.result import disclosed_json
 from tests.leaderboard.conftest import Refused
-from tests.leaderboard.scripted_server import ID, TOKEN, TOKEN_INFO, URL, ScriptedServer, answer, submission
+from tests.leaderboard.scripted_server import (
+    SUBMISSION,
+    TOKEN,
+    TOKEN_INFO,
+    URL,
+    ScriptedServer,
+    answer,
+    submission,
+)
 
 ESCAPES = "\x1b]0;owned\x07\x1b[2J\u202e[red]\r\n"
 
@@ -34,9 +42,10 @@ def test_good_answers_are_accepted(
 
 
 def test_answers_of_other_versions_are_accepted(scripted: ScriptedServer, small_archive: Path) -> None:
-    """An older service has fewer keys, a newer one more; a repeated upload is answered with status 200."""
-    few = submission(small_archive, archive_sha256=..., reason=..., method=...)
-    scripted.answers["token"] = [answer({"max_upload_bytes": 1 << 30, "new": {"key": [1]}})]
+    """An older service has no optional keys, a newer one more; a repeated upload is answered with status 200."""
+    optional = ("parameters", "inputs", "uses_ground_truth", "outdated", "result")
+    few = submission(small_archive, **dict.fromkeys(optional, ...))
+    scripted.answers["token"] = [answer({**TOKEN_INFO, "new": {"key": [1]}})]
     scripted.answers["submit"] = [answer({**few, "new": 1}, 200)]
     scripted.answers["status"] = [answer({**few, "status": "scored", "result": {"protocol": "rebar-9"}})]
     assert scripted.submit(small_archive) == 0
@@ -59,7 +68,7 @@ NOT_JSON = {
     "text": b'"token"',
 }
 TOKEN_ANSWERS: dict[str, Any] = {
-    "missing": {"name": "alice"},
+    "missing": {key: value for key, value in TOKEN_INFO.items() if key != "max_upload_bytes"},
     "text": {**TOKEN_INFO, "max_upload_bytes": "1000000000"},
     "fraction": {**TOKEN_INFO, "max_upload_bytes": 1e9},
     "true": {**TOKEN_INFO, "max_upload_bytes": True},
@@ -91,9 +100,9 @@ SUBMISSION_CHANGES: dict[str, dict[str, Any]] = {
     "long url": {"url": "https://example.org/" + "a" * 100_000},
     "url that turns text around": {"url": "https://example.org/\u202egpj"},
     "reason as list": {"reason": ["x"]},
-    "digest of another archive": {"archive_sha256": "0" * 64},
     "digest as number": {"archive_sha256": 7},
     "digest with escapes": {"archive_sha256": ESCAPES},
+    "time as text": {"created_at": ESCAPES},
 }
 
 
@@ -112,7 +121,9 @@ def test_answer_that_is_no_json_object_is_refused(
 @pytest.mark.parametrize("content", TOKEN_ANSWERS.values(), ids=TOKEN_ANSWERS)
 def test_invalid_token_info_is_refused(content: object, scripted: ScriptedServer, refused: Refused) -> None:
     scripted.answers["token"] = [answer(content)]
-    assert "answer of the leaderboard is not valid" in refused()
+    assert re.search(
+        r"answer of the leaderboard is not valid: 1 problem\n  - max_upload_bytes: .*, expected a whole", refused()
+    )
     assert scripted.endpoints() == ["token"]
 
 
@@ -121,13 +132,31 @@ def test_invalid_token_info_is_refused(content: object, scripted: ScriptedServer
 def test_invalid_submission_is_refused(
     endpoint: str, changes: dict[str, Any], scripted: ScriptedServer, small_archive: Path, refused: Refused
 ) -> None:
-    if endpoint == "status" and "archive_sha256" in changes:
-        changes = {"id": "another"}
-    scripted.answers[endpoint] = [
-        answer(submission(small_archive, **changes), 202 if endpoint == "submit" else 200)
-    ]
-    refused()
+    content = submission(small_archive, **changes)
+    scripted.answers[endpoint] = [answer(content, 202 if endpoint == "submit" else 200)]
+    [key] = changes
+    assert re.search(f"1 problem\n  - {key}: (got|missing)", refused())
     assert scripted.endpoints() == (["token", "submit"] if endpoint == "submit" else ["token", "submit", "status"])
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "changes", "words"),
+    [
+        ("submit", {"archive_sha256": "0" * 64}, "another archive than was sent"),
+        ("status", {"id": "another", "status": "scored"}, "on submission another"),
+    ],
+)
+def test_answer_on_another_submission_is_refused(
+    endpoint: str,
+    changes: dict[str, Any],
+    words: str,
+    scripted: ScriptedServer,
+    small_archive: Path,
+    refused: Refused,
+) -> None:
+    content = submission(small_archive, **changes)
+    scripted.answers[endpoint] = [answer(content, 202 if endpoint == "submit" else 200)]
+    assert words in refused()
 
 
 RESULT_CHANGES: dict[str, Any] = {
@@ -146,45 +175,17 @@ RESULT_CHANGES: dict[str, Any] = {
 }
 
 
-DISCLOSED_CHANGES = {
-    **{name: change for name, change in RESULT_CHANGES.items() if "view" not in name},
-    "many tables": lambda values: values.update(tables={str(k): {} for k in range(20_000)}),
-    "rank error above 1": lambda values: values["tables"]["lattice-orbit"].update(rank_error=1.5),
-    "coverage as text": lambda values: values["tables"]["lattice-orbit"].update(coverage=ESCAPES),
-    "mark without a result": lambda values: values.clear() or values.update(hidden_truth=True),
-}
-
-
-RESULT_CASES = {
-    **{f"whole, {name}": (False, change) for name, change in RESULT_CHANGES.items()},
-    **{f"disclosed, {name}": (True, change) for name, change in DISCLOSED_CHANGES.items()},
-}
-
-
-@pytest.mark.parametrize(("is_disclosed", "change"), RESULT_CASES.values(), ids=RESULT_CASES)
+@pytest.mark.parametrize("change", RESULT_CHANGES.values(), ids=RESULT_CHANGES)
 def test_invalid_result_is_not_written(
-    is_disclosed: bool, change: Any, scripted: ScriptedServer, small_result: bytes, refused: Refused
+    change: Any, scripted: ScriptedServer, small_result: bytes, refused: Refused
 ) -> None:
-    values = json.loads(disclosed_json(small_result) if is_disclosed else small_result)
+    values = json.loads(small_result)
     change(values)
     scripted.answers["result"] = [answer(values)]
     refused()
 
 
-def test_disclosed_result_is_printed_and_written(
-    scripted: ScriptedServer,
-    small_archive: Path,
-    small_result: bytes,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    scripted.answers["result"] = [answer(disclosed_json(small_result))]
-    assert scripted.submit(small_archive, "--json", str(tmp_path / "r.json")) == 0
-    assert (tmp_path / "r.json").read_bytes() == disclosed_json(small_result)
-    error = json.loads(small_result)["tables"]["lattice-orbit"]["rank_error"]
-    assert f"lattice-orbit: rank error {error:.3f}, coverage 100.0 %\n" in capsys.readouterr().out
-
-
+FAILED = {**SUBMISSION, "status": "failed"}
 ERRORS: dict[str, tuple[str, bytes, int, str]] = {
     "unknown token": ("token", answer({"detail": "the token is unknown"}, 401), 2, "the token is unknown"),
     "wrong URL": ("token", answer({"detail": "Not Found"}, 404), 2, "Not Found"),
@@ -203,11 +204,11 @@ ERRORS: dict[str, tuple[str, bytes, int, str]] = {
     "many lines": ("token", answer({"detail": "x\n" * 100_000}, 401), 2, "x x x"),
     "reason with escapes": (
         "status",
-        answer({"id": ID, "url": URL, "status": "failed", "reason": f"no{ESCAPES}more" + "\n1" * 1000}),
+        answer({**FAILED, "reason": f"no{ESCAPES}more" + "\n1" * 1000}),
         2,
         "no\\x1b]0;owned",
     ),
-    "no reason": ("status", answer({"id": ID, "url": URL, "status": "failed"}), 2, "scoring failed"),
+    "no reason": ("status", answer(FAILED), 2, "scoring failed"),
     "no HTTP": ("token", b"SSH-2.0-OpenSSH\r\n", 1, "no response"),
     "binary": ("token", bytes(range(256)) * 100, 1, "no response"),
     "closed": ("token", b"", 1, "no response"),

@@ -28,7 +28,7 @@ from rebar_depth_bench.scoring.groups import (
     bar_width_px,
     positions_by_group,
 )
-from rebar_depth_bench.scoring.result import Result, disclosed_json, read_result
+from rebar_depth_bench.scoring.result import Result, read_result
 from rebar_depth_bench.scoring.table import read_table
 from tests.bench.reporting.pages import Page
 from tests.damage import change_manifest
@@ -190,12 +190,6 @@ def test_cached_widths_follow_the_bars(tmp_path: Path) -> None:
     )
     after = truth_of(copy, "cages", "test").traits
     assert [view.bar_width_px for view in after] == [2 * (view.bar_width_px or 0) for view in before]
-
-
-def test_groups_are_not_disclosed(scored: Result) -> None:
-    disclosed = disclosed_json(scored.to_json())
-    assert b"groups" not in disclosed
-    assert b"wall" not in disclosed
 
 
 def test_groups_of_predictions_that_are_not_metric(

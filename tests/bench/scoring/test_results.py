@@ -1,4 +1,4 @@
-"""Results: tables, JSON content, what is read back, what is refused, and the disclosed part."""
+"""Results: tables, JSON content, what is read back and what is refused."""
 
 from __future__ import annotations
 
@@ -12,14 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from rebar_depth_bench.base.errors import InputError, SubmissionError
-from rebar_depth_bench.scoring.result import (
-    check_view_coverage,
-    disclosed_json,
-    is_disclosed,
-    read_disclosed,
-    read_result,
-)
+from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.scoring.result import read_result
 from rebar_depth_bench.scoring.score import tabulate
 from rebar_depth_bench.scoring.table import read_table
 from rebar_depth_bench.submission import Declaration
@@ -246,56 +240,3 @@ def test_table_of_a_row_is_checked_alike() -> None:
     with pytest.raises(InputError) as caught:
         read_table(TABLE | {"views": None})
     assert [problem.where for problem in caught.value.problems] == ["views"]
-
-
-RESULT = result(scored_view("lattice/0000", 0.12345), scored_view("pile/0000", 0.5, coverage=0.98765))
-
-
-def test_disclosed_result_has_rank_error_and_coverage_alone() -> None:
-    whole = RESULT.to_dict()
-    disclosed = json.loads(disclosed_json(RESULT.to_json()))
-    assert is_disclosed(disclosed)
-    assert not is_disclosed(whole)
-    tables = {
-        config: {
-            "coverage": round(table["coverage"], 3),
-            "ranked": True,
-            "rank_error": round(table["rank_error"], 3),
-        }
-        for config, table in whole["tables"].items()
-    }
-    kept = {key: whole[key] for key in ("protocol", "dataset", "submission", "software")}
-    assert disclosed == {**kept, "tables": tables, "hidden_truth": True}
-
-
-def test_new_numbers_are_not_disclosed_and_a_disclosed_result_is_read() -> None:
-    document = RESULT.to_dict()
-    for part in (document, document["dataset"], document["submission"], document["tables"]["lattice"]):
-        part["new"] = 0.123456
-    data = disclosed_json(json.dumps(document).encode())
-    assert data == disclosed_json(RESULT.to_json()) == disclosed_json(data)
-    assert read_disclosed(data, "r.json").submission == RESULT.submission
-
-
-@pytest.mark.parametrize(
-    "data",
-    [
-        b'{"protocol": "rebar-9"}',
-        b"[]",
-        json.dumps({**RESULT.to_dict(), "protocol": "rebar-1"}).encode(),
-        b'{"protocol": "rebar-9", "tables": {"lattice": {"rank_error": 0.5}}}',
-    ],
-)
-def test_unreadable_result_has_no_numbers(data: bytes) -> None:
-    assert json.loads(disclosed_json(data)) == {"hidden_truth": True}
-    with pytest.raises(InputError):
-        read_disclosed(disclosed_json(data), "r.json")
-
-
-def test_view_below_half_coverage_is_refused_without_its_name() -> None:
-    check_view_coverage([scored_view("lattice/0000", coverage=0.5)])
-    with pytest.raises(SubmissionError) as refusal:
-        check_view_coverage([scored_view("lattice/0000"), scored_view("lattice/0001", coverage=0.4999)])
-    assert "lattice" not in str(refusal.value)
-    assert "0.4999" not in str(refusal.value)
-    assert [(problem.code, problem.where) for problem in refusal.value.problems] == [("missing", "")]
