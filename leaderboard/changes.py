@@ -33,7 +33,8 @@ class SubmissionChange(MethodDetails):
 
 def get_submission(service: Service, submission_id: str) -> SubmissionModel:
     """Return the row of a submission. Raises status 404 if it does not exist."""
-    record = submissions.find(service.database, submission_id)
+    # PostgreSQL raises an error for an id with NUL.
+    record = submissions.find(service.database, submission_id) if submission_id.isprintable() else None
     if record is None:
         raise RefusedError(404, "no such submission")
     return record

@@ -115,7 +115,7 @@ async def _handle_validation_error(request: Request, error: Exception) -> Respon
         )
         for details in error.errors()
     ]
-    return error_response(request, 422, "the request is malformed", problems=problems, limit=None)
+    return error_response(request, 422, "the request is malformed", problems=problems)
 
 
 async def _handle_database_unavailable(request: Request, error: Exception) -> Response:

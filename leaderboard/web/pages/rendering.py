@@ -15,7 +15,8 @@ from markupsafe import Markup
 
 from leaderboard.names import confused_scripts
 from leaderboard.service import Service
-from leaderboard.web.cache import NO_STORE, REVALIDATE
+from leaderboard.web.middleware import NO_STORE, REVALIDATE
+from leaderboard.web.pages.board_columns import seconds_text
 from rebar_depth_bench import software_version
 from rebar_depth_bench.base.errors import MAX_PROBLEMS_SHOWN, Problem, printable
 from rebar_depth_bench.reporting import formatting
@@ -23,8 +24,11 @@ from rebar_depth_bench.reporting.html.assets import environment
 from rebar_depth_bench.reporting.published import load_published
 from rebar_depth_bench.scoring.columns import number
 from rebar_depth_bench.scoring.protocol import PROTOCOL
-from rebar_depth_bench.scoring.result import COVERAGE_RULE
 from rebar_depth_bench.submission.declaration import INPUTS, is_http_url
+
+MAX_TEXT_CHARS = 4000
+_STEPS = ((1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB"))
+_TITLES = {404: "Page not found", 405: "Method not allowed", 422: "Invalid request"}
 
 
 def make_templates() -> Environment:
@@ -34,20 +38,19 @@ def make_templates() -> Environment:
         clean=clean_text,
         link=link_html,
         number=number,
+        ground_truth=formatting.ground_truth_text,
+        inputs=formatting.inputs_text,
         notes=formatting.table_notes,
         scripts=confused_scripts,
+        seconds=seconds_text,
         size=format_size,
         time=time_html,
     )
     templates.globals.update(
         protocol=PROTOCOL,
         input_classes=INPUTS,
-        plural=formatting.plural,
-        is_degenerate=lambda interval: len(set(interval.split(" – "))) == 1,
-        picture_titles=PICTURE_TITLES,
-        max_intervals=MAX_INTERVALS_PLOTTED,
+        counted=formatting.counted,
         paper_title=load_published().title,
-        coverage_rule=COVERAGE_RULE,
     )
     return templates
 
@@ -61,40 +64,28 @@ def render(
     headers: Mapping[str, str] | None = None,
     **context: Any,
 ) -> HTMLResponse:
-    """Return the page rendered from a template with ``context`` and the context common to all pages."""
+    """Return the page rendered from a template with ``context`` and the context common to all pages.
+
+    The common context does not depend on the request, except for the path below which the service is.
+    """
     service: Service = request.app.state.service
     templates: Environment = request.app.state.templates
-    content = templates.get_template(template).render({**_common_context(request, service), **context})
-    return HTMLResponse(content, status_code, {"Cache-Control": cache, **(headers or {})})
-
-
-def _common_context(request: Request, service: Service) -> dict[str, Any]:
-    """Return the context of all pages; of the request, it depends on the path below which the service is only."""
-    root = str(request.scope.get("root_path", "").rstrip("/"))
     settings = service.settings
-    return {
-        "root": root,
+    common = {
+        "root": str(request.scope.get("root_path", "").rstrip("/")),
         "site": printable(settings.title),
         "settings": settings,
-        "stamps": [
-            ("Protocol", PROTOCOL),
-            ("Dataset version", printable(service.folder.version)),
-            ("Dataset digest", printable(service.folder.digest)),
-            ("Software", f"rebar-depth-bench {software_version()}"),
-        ],
-        "hidden_truth": settings.hidden_truth,
+        "stamps": {
+            "Protocol": PROTOCOL,
+            "Dataset version": printable(service.folder.version),
+            "Dataset digest": printable(service.folder.digest),
+            "Software": f"rebar-depth-bench {software_version()}",
+        },
         "contact": printable(settings.contact),
         "service": service,
-        "view_counts": service.view_counts,
     }
-
-
-MAX_INTERVALS_PLOTTED = 60
-"""Number of points up to which a plot has their intervals."""
-PICTURE_TITLES = {"colour": "Colour", "truth": "Ground truth", "prediction": "Prediction", "error": "Native error"}
-"""Headings of the pictures of a view by kind, in the order in which they are shown."""
-MAX_TEXT_CHARS = 4000
-_STEPS = ((1 << 30, "GiB"), (1 << 20, "MiB"), (1 << 10, "KiB"))
+    content = templates.get_template(template).render({**common, **context})
+    return HTMLResponse(content, status_code, {"Cache-Control": cache, **(headers or {})})
 
 
 def time_html(seconds: float, date_only: bool = False) -> Markup:
@@ -104,12 +95,16 @@ def time_html(seconds: float, date_only: bool = False) -> Markup:
     return Markup('<time datetime="{}">{}</time>').format(when.strftime("%Y-%m-%dT%H:%M:%SZ"), text)
 
 
-def link_html(url: str | None) -> Markup:
-    """Return a link that shows the host of a submitter's URL; nothing if it is no valid http or https URL."""
+def link_html(url: str | None, text: str = "") -> Markup:
+    """Return a link to a submitter's URL; nothing if it is no valid http or https URL.
+
+    The link shows its host, or ``text`` with the host as title.
+    """
     if not url or not is_http_url(url):
         return Markup()
-    link = Markup('<a href="{}" rel="nofollow noopener noreferrer">{}</a>')
-    return link.format(url, printable(urlsplit(url).hostname or "", 60))
+    host = printable(urlsplit(url).hostname or "", 60)
+    link = Markup('<a href="{}" title="{}" rel="nofollow noopener noreferrer">{}</a>')
+    return link.format(url, host, text or host)
 
 
 def clean_text(text: str | None) -> str:
@@ -127,14 +122,10 @@ def format_size(count: int) -> str:
     return f"{count} bytes"
 
 
-def problem_lines(problems: Sequence[Problem], limit: int | None = MAX_PROBLEMS_SHOWN) -> list[str]:
-    """Return the first ``limit`` problems (None: all) as text, followed by the number of the others if any."""
-    shown = problems[:limit]
-    omitted = len(problems) - len(shown)
-    return [*map(str, shown), *([f"... and {omitted} more"] if omitted else [])]
-
-
-_TITLES = {404: "Page not found", 405: "Method not allowed", 422: "Invalid request"}
+def problem_lines(problems: Sequence[Problem]) -> list[str]:
+    """Return the first ``MAX_PROBLEMS_SHOWN`` problems as text, followed by the number of the others if any."""
+    omitted = len(problems) - MAX_PROBLEMS_SHOWN
+    return [*map(str, problems[:MAX_PROBLEMS_SHOWN]), *([f"... and {omitted} more"] if omitted > 0 else [])]
 
 
 def error_response(
@@ -143,23 +134,22 @@ def error_response(
     detail: str,
     headers: Mapping[str, str] | None = None,
     problems: Sequence[Problem] = (),
-    limit: int | None = MAX_PROBLEMS_SHOWN,
 ) -> Response:
-    """Return an error response: a page if a browser requests a path outside the API, otherwise JSON.
-
-    At most ``limit`` problems are shown.
-    """
-    content: dict[str, Any] = {"detail": detail}
-    if problems:
-        content["problems"] = problem_lines(problems, limit)
-        content["problem_details"] = [asdict(problem) for problem in problems[:limit]]
-    if not request.url.path.startswith("/api/") and "text/html" in request.headers.get("accept", ""):
-        return _error_page(request, status, "\n".join(content.get("problems", [detail])), headers)
-    return JSONResponse(content, status, headers)
-
-
-def _error_page(request: Request, status: int, detail: str, headers: Mapping[str, str] | None) -> Response:
-    title = _TITLES.get(status, "Request failed")
-    message = "" if detail in ("Not Found", "Method Not Allowed") else clean_text(detail)
-    context = {"title": title, "detail": message}
-    return render(request, "refusal.html.j2", status_code=status, cache=NO_STORE, headers=headers, **context)
+    """Return an error response: a page if a browser requests a path outside the API, otherwise JSON."""
+    lines = problem_lines(problems)
+    if request.url.path.startswith("/api/") or "text/html" not in request.headers.get("accept", ""):
+        content: dict[str, Any] = {"detail": detail}
+        if problems:
+            details = [asdict(problem) for problem in problems[:MAX_PROBLEMS_SHOWN]]
+            content |= {"problems": lines, "problem_details": details}
+        return JSONResponse(content, status, headers)
+    message = "" if detail in ("Not Found", "Method Not Allowed") else clean_text("\n".join(lines) or detail)
+    return render(
+        request,
+        "refusal.html.j2",
+        status_code=status,
+        cache=NO_STORE,
+        headers=headers,
+        title=_TITLES.get(status, "Request failed"),
+        detail=message,
+    )

@@ -1,28 +1,19 @@
-// Enhancements of the pages: polls the status of a queued submission and shows the progress of an upload. Without
-// this script, the page of a queued submission reloads periodically, and the form is submitted by the browser.
+// Enhancements of the pages: follows a queued submission and shows the progress of an upload. Without this script,
+// the page of a queued submission reloads periodically, and the form is submitted by the browser.
 (() => {
   "use strict";
   const POLL_MS = 2000;
 
-  // Poll the status of a submission, update its queue position, and reload the page when it is scored or failed.
-  function follow(state) {
-    const again = () => setTimeout(() => ask().catch(again), POLL_MS);
-    async function ask() {
-      const answer = await fetch(state.dataset.poll, { headers: { Accept: "application/json" } });
-      if (!answer.ok) return again();
-      const { status } = await answer.json();
-      if (status !== "queued" && status !== "scoring") return location.reload();
-      if (status === "queued" || status !== state.dataset.status) await refresh(state);
-      state.dataset.status = status;
-      again();
-    }
-    again();
-  }
+  const inPage = (html, id) => new DOMParser().parseFromString(html, "text/html").getElementById(id);
 
-  async function refresh(state) {
-    const page = await (await fetch(location.href)).text();
-    const fresh = new DOMParser().parseFromString(page, "text/html").getElementById("state");
+  // Show the state of a waiting submission as it changes, and load its page again when it waits no longer.
+  async function follow(state) {
+    await new Promise((resolve) => setTimeout(resolve, POLL_MS));
+    const page = await fetch(location.href).then((answer) => answer.text()).catch(() => "");
+    const fresh = inPage(page, "state");
+    if (fresh && !("waits" in fresh.dataset)) return location.reload();
     if (fresh && fresh.textContent !== state.textContent) state.replaceChildren(...fresh.childNodes);
+    return follow(state);
   }
 
   const megabytes = (bytes) => `${(bytes / 1e6).toFixed(1)} MB`;
@@ -44,20 +35,18 @@
     }
 
     function refused(page) {
-      const fresh = new DOMParser().parseFromString(page, "text/html").getElementById("refusal");
+      const fresh = inPage(page, "refusal");
       if (!fresh) return ended("The service returned an unexpected response. Please try again.");
       document.getElementById("refusal")?.remove();
       document.querySelector("h1").after(fresh);
       ended("Not accepted: see above.");
-      fresh.focus();
-      return undefined;
+      return fresh.focus();
     }
 
     form.addEventListener("submit", (event) => {
       event.preventDefault();
       const file = form.elements.archive.files[0];
-      box.hidden = false;
-      bar.hidden = false;
+      box.hidden = bar.hidden = false;
       if (file.size > Number(form.dataset.most)) return ended("The archive is larger than the upload limit.");
       button.disabled = true;
       const request = new XMLHttpRequest();
@@ -78,12 +67,11 @@
       request.addEventListener("error", () => ended("The connection was lost. Please try again."));
       request.open("POST", form.action);
       request.setRequestHeader("Accept", "text/html");
-      request.send(new FormData(form));
-      return undefined;
+      return request.send(new FormData(form));
     });
   }
 
-  const state = document.querySelector("[data-poll]");
+  const state = document.querySelector("[data-waits]");
   if (state) follow(state);
   const form = document.getElementById("upload-form");
   if (form) upload(form);
