@@ -66,8 +66,8 @@ def serve_dataset(database: Database, dataset_digest: str, rescore: bool) -> int
         records = session.scalars(select(SubmissionModel).where(to_score)).all()
         if records and is_other and not rescore:
             raise InputError(
-                f"the dataset digest is {dataset_digest}, but {len(records)} submissions of this leaderboard are of "
-                f"the dataset {board.dataset_digest}; use --rescore true to score them against this one"
+                f"the dataset digest is {dataset_digest}, but {len(records)} submissions are of the dataset "
+                f"{board.dataset_digest}; use --rescore true to score them against this one"
             )
         for record in records:
             record.status, record.attempts, record.finished_at = QUEUED, 0, None

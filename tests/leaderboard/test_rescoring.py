@@ -75,7 +75,7 @@ def test_other_dataset_is_rejected_without_rescore_option(datasets: Datasets, ru
         ranks, state = ids_and_ranks(server), server.state
     process = run("serve", "--data", datasets.second, "--state-dir", state, "--port", "0")
     assert process.returncode == 2
-    assert "2 submissions of this leaderboard are of the dataset" in process.stderr
+    assert "2 submissions are of the dataset" in process.stderr
     assert "--rescore true" in process.stderr
     assert "Traceback" not in process.stderr
     with running_server(state, root=datasets.second, rescore=True, workers=0) as server:
