@@ -53,7 +53,7 @@ env-dev: ## Make .venv for developing and testing
 	@scripts/environment.sh $(PYTHON) $(VENV) dev
 
 system-packages: ## Check the system packages that rendering and testing need; as root on Debian, install them
-	@scripts/system_packages.sh blender browser uploads
+	@scripts/system_packages.sh blender browser uploads proxy
 
 clean: ## Remove the environments and the demo's output
 	rm -rf $(VENV) $(VENV)-3.* build dist *.egg-info demo-output

@@ -170,7 +170,7 @@ def _token(settings: Settings, options: argparse.Namespace) -> None:
         if options.replace:
             print(replace_token(database, options.name))
         else:
-            print(create_token(database, options.name, is_baseline=options.baseline))
+            print(create_token(database, options.name, baseline=options.baseline))
     print("The token is not shown again; only its hash is stored.", file=sys.stderr)
 
 

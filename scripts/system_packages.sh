@@ -1,8 +1,8 @@
 #!/usr/bin/env bash
 # Checks the system packages of scripts/system-packages.txt before anything is downloaded.
 # As root on Debian it installs what is missing; otherwise it prints the command. Missing libraries of Blender are an
-# error; without a browser or curl the tests that need them are skipped, except under CI=true, where they fail.
-# usage: scripts/system_packages.sh USE...       for example: scripts/system_packages.sh blender browser uploads
+# error; without a browser, curl or nginx the tests that need them are skipped, except under CI=true, where they fail.
+# usage: scripts/system_packages.sh USE...       for example: scripts/system_packages.sh blender browser uploads proxy
 set -euo pipefail
 list="$(dirname "$0")/system-packages.txt"
 libraries=$(PATH="$PATH:/sbin:/usr/sbin" ldconfig -p 2>/dev/null || true)
@@ -12,7 +12,7 @@ is_present() { # PROBE
         /*) [ -e "$1" ] ;;
         *.so.*) grep -q "[[:space:]]$1 " <<<"$libraries" ;;
         chromium) command -v chromium >/dev/null || command -v google-chrome >/dev/null ;;
-        *) command -v "$1" >/dev/null ;;
+        *) PATH="$PATH:/usr/sbin" command -v "$1" >/dev/null ;;
     esac
 }
 

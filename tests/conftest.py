@@ -44,6 +44,7 @@ GOLDEN_TEXTS = Path(__file__).parent / "data" / "golden"
 FIXTURE_MARKERS = {
     "blender": "blender",
     "running_server": "server",
+    "running_nginx": "server",
     "scripted": "server",
     "hub": "server",
     "running_scorer": "server",

@@ -19,7 +19,7 @@ PACKAGES = Path(__file__).parents[1] / "scripts" / "system-packages.txt"
 
 
 def probes(use: str) -> dict[str, str]:
-    """Return the probes of one use (``blender``, ``browser``, ``uploads``) and the Debian package of each."""
+    """Return the probes of one use (``blender``, ``browser``, ...) and the Debian package of each."""
     rows = [line.split() for line in PACKAGES.read_text().splitlines() if not line.startswith("#")]
     return {probe: package for kind, probe, package in rows if kind == use}
 
@@ -29,11 +29,16 @@ def chromium_path() -> str | None:
     return shutil.which("chromium") or shutil.which("google-chrome")
 
 
+def program_path(name: str) -> str | None:
+    """Return the path of a program, which may be one that Debian keeps out of the ``PATH`` of users."""
+    return shutil.which(name, path=f"{os.environ['PATH']}:/usr/sbin")
+
+
 def is_present(probe: str) -> bool:
     """Return whether a library or program of the list is on this machine."""
     if ".so." in probe:
         return ctypes.util.find_library(probe.removeprefix("lib").split(".so.")[0]) is not None
-    return chromium_path() is not None if probe == "chromium" else shutil.which(probe) is not None
+    return (chromium_path() if probe == "chromium" else program_path(probe)) is not None
 
 
 def require(use: str) -> None:

@@ -66,11 +66,12 @@ def serve_dataset(database: Database, dataset_digest: str, rescore: bool) -> int
         records = session.scalars(select(SubmissionModel).where(to_score)).all()
         if records and is_other and not rescore:
             raise InputError(
-                f"the dataset digest is {dataset_digest}, but {len(records)} submissions of this leaderboard are of "
-                f"the dataset {board.dataset_digest}; use --rescore true to score them against this one"
+                f"the dataset digest is {dataset_digest}, but {len(records)} submissions are of the dataset "
+                f"{board.dataset_digest}; use --rescore true to score them against this one"
             )
         for record in records:
             record.status, record.attempts, record.finished_at = QUEUED, 0, None
+            record.scorer = record.lease_until = None  # A worker that scores it for another dataset ends.
         if records or is_other:
             increment_content_version(session)
         board.dataset_digest = dataset_digest
@@ -171,11 +172,7 @@ def finish(database: Database, submission_id: str, scorer: str, outcome: Outcome
 
 
 def _store(session: Session, record: SubmissionModel, outcome: Outcome) -> None:
-    """Store the outcome of a job and end the job.
-
-    A submission that has a result stays scored if scoring it again fails. A submission that was scored against
-    another dataset than the one that is served by now is queued again.
-    """
+    """Store the outcome of a job and end the job; what has a result stays scored if scoring it again fails."""
     record.lease_until, record.finished_at, record.reason = None, time.time(), None
     present = select(ResultModel.dataset_digest, ResultModel.protocol, ResultModel.json.is_not(None))
     with_json = {
@@ -213,8 +210,6 @@ def _store(session: Session, record: SubmissionModel, outcome: Outcome) -> None:
                     json=json.dumps({name: value for name, value in table.items() if name != "groups"}),
                 )
             )
-    if session.scalar(select(BoardModel.dataset_digest)) not in (None, outcome.dataset_digest):
-        record.status, record.attempts, record.finished_at = QUEUED, 0, None
     increment_content_version(session)
 
 

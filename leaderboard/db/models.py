@@ -52,7 +52,7 @@ def increment_content_version(session: Session) -> None:
 class TokenModel(Base):
     """A submitter and the SHA-256 of their token, which has 256 random bits; the token is not stored.
 
-    ``is_baseline`` marks the submissions of the organiser.
+    ``baseline`` marks the submissions of the organiser.
     """
 
     __tablename__ = "tokens"
@@ -62,7 +62,7 @@ class TokenModel(Base):
     sha256: Mapped[str] = mapped_column(String(64), unique=True)
     created_at: Mapped[float]
     revoked_at: Mapped[float | None]
-    is_baseline: Mapped[bool]
+    baseline: Mapped[bool]
 
 
 class SubmissionModel(Base):

@@ -31,7 +31,7 @@ class LeaderboardEntry:
     """A submission's row of one config; ``rank`` is None if the row is not ranked.
 
     ``class_rank`` is the rank among the submissions that declare the same ``inputs``, None without a declaration.
-    ``is_baseline`` marks the organiser's rows. ``details`` is the column of ``SubmissionModel``, and ``table_json``
+    ``baseline`` marks the organiser's rows. ``details`` is the column of ``SubmissionModel``, and ``table_json``
     the JSON text of the config's table in the result.
     """
 
@@ -39,7 +39,7 @@ class LeaderboardEntry:
     config: str
     method: str
     submitter: str
-    is_baseline: bool
+    baseline: bool
     details: str
     inputs: str | None
     uses_ground_truth: bool | None
@@ -80,7 +80,7 @@ _COLUMNS = (
     LeaderboardRowModel.config,
     SubmissionModel.method,
     TokenModel.name,
-    TokenModel.is_baseline,
+    TokenModel.baseline,
     SubmissionModel.details,
     SubmissionModel.inputs,
     SubmissionModel.uses_ground_truth,

@@ -22,8 +22,8 @@ PREFIX = "rdb_"
 MAX_NAME = 100
 
 
-def create_token(database: Database, name: str, *, is_baseline: bool = False) -> str:
-    """Create and return a token for ``name``; ``is_baseline`` marks its submissions as the organiser's.
+def create_token(database: Database, name: str, *, baseline: bool = False) -> str:
+    """Create and return a token for ``name``; ``baseline`` marks its submissions as the organiser's.
 
     Raises ``InputError`` if the name is taken, blank, longer than ``MAX_NAME`` characters or not printable.
     """
@@ -31,7 +31,7 @@ def create_token(database: Database, name: str, *, is_baseline: bool = False) ->
     token = PREFIX + secrets.token_urlsafe(32)
     try:
         with database.write() as session:
-            row = TokenModel(name=name, sha256=digest(token), created_at=time.time(), is_baseline=is_baseline)
+            row = TokenModel(name=name, sha256=digest(token), created_at=time.time(), baseline=baseline)
             session.add(row)
     except IntegrityError:
         raise InputError(f"a token for {name!r} already exists, expected another name or --replace") from None

@@ -115,7 +115,8 @@ def parse_json(content: bytes, where: str = "") -> tuple[Any, list[Problem]]:
     except _DuplicateKeyError as error:
         return None, [Problem("duplicate", where, f"the key {error} occurs twice", "each key once")]
     except ValueError as error:
-        found = f"the text is not valid JSON ({escape_text(str(error))})"
+        # Of a number with too many digits, json says after the semicolon how a programmer raises the limit.
+        found = f"the text is not valid JSON ({escape_text(str(error).partition(';')[0])})"
         return None, [Problem("syntax", where, found, "JSON")]
     if isinstance(value, dict | list) and _nesting_exceeds(value, MAX_NESTING):
         return None, [_nesting_problem(where)]

@@ -5,21 +5,35 @@ from __future__ import annotations
 import math
 import re
 import statistics
+import unicodedata
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, get_args
 from urllib.parse import urlsplit
 
-from pydantic import ConfigDict
+from pydantic import AfterValidator, ConfigDict
 
 from rebar_depth_bench.base.errors import Problem
 from rebar_depth_bench.base.reading import parse_json
-from rebar_depth_bench.base.validation import Expected, Flag, StrictModel, one_of, text, validate_table
+from rebar_depth_bench.base.validation import (
+    Expected,
+    Flag,
+    StrictModel,
+    field_error,
+    number,
+    one_of,
+    short_repr,
+    text,
+    validate_table,
+)
 
 METADATA_NAME = "submission.json"
 DEPTH_SCALE = f"{METADATA_NAME}: depth_scale"
 """Location of the key that an archive with PNG entries requires."""
 MAX_METADATA_BYTES = 4 * 1024 * 1024
 MAX_METHOD_CHARACTERS = 200
+MAX_DESCRIPTION_CHARACTERS = 4000
+MAX_NUMBER = 1e18
+"""Largest magnitude of a number: it fits a float and 64 bits."""
 _MAX_URL_CHARACTERS = 2000
 
 
@@ -33,9 +47,35 @@ def is_http_url(url: str) -> bool:
     return valid and url.isprintable() and " " not in url and len(url) <= _MAX_URL_CHARACTERS
 
 
+def _check_numbers(runtime: Any) -> Any:
+    """Return ``runtime``; raise the error of a field if a number in it is larger than ``MAX_NUMBER``."""
+    values = [runtime]
+    for value in values:
+        if isinstance(value, dict):
+            values += value.values()
+        elif isinstance(value, list):
+            values += value
+        elif isinstance(value, int | float) and not abs(value) <= MAX_NUMBER:
+            raise field_error(f"got the number {short_repr(value)}", f"numbers of at most {MAX_NUMBER:g}")
+    return runtime
+
+
+_Method = Annotated[
+    str,
+    text(MAX_METHOD_CHARACTERS, "a printable name"),
+    # A character can become 18, and the leaderboard stores this form.
+    Expected(
+        f"a name of at most {MAX_METHOD_CHARACTERS} characters in Unicode form NFKC",
+        lambda value: len(unicodedata.normalize("NFKC", value)) <= MAX_METHOD_CHARACTERS,
+    ),
+]
 # PostgreSQL cannot store NUL, and UTF-8 has no surrogates.
 _Description = Annotated[
-    str, Expected("text without NUL and surrogates", lambda value: not re.search("[\0\ud800-\udfff]", value))
+    str,
+    Expected(
+        f"text of at most {MAX_DESCRIPTION_CHARACTERS} characters without NUL and surrogates",
+        lambda value: len(value) <= MAX_DESCRIPTION_CHARACTERS and not re.search("[\0\ud800-\udfff]", value),
+    ),
 ]
 HttpUrl = Annotated[
     str,
@@ -43,18 +83,20 @@ HttpUrl = Annotated[
         f"an http:// or https:// address without spaces, at most {_MAX_URL_CHARACTERS} characters", is_http_url
     ),
 ]
-_Scale = Annotated[
-    float, Expected("a finite number of metres per unit above 0", lambda value: 0 < value < math.inf)
+_Scale = Annotated[float, number(0, MAX_NUMBER, f"a number of metres per unit above 0, at most {MAX_NUMBER:g}")]
+_Runtime = Annotated[
+    dict[Any, Any] | str | int | float,
+    Expected("an object, text or a number"),
+    AfterValidator(_check_numbers),
 ]
-_Runtime = Annotated[dict[Any, Any] | str | int | float, Expected("an object, text or a number")]
 _Parameters = Annotated[
     int | float | str,
     Expected(
-        "a finite number from 0 or printable text of at most 100 characters",
+        f"a number from 0 to {MAX_NUMBER:g} or printable text of at most 100 characters",
         lambda value: (
             0 < len(value.strip()) <= 100 and value.isprintable()
             if isinstance(value, str)
-            else 0 <= value < math.inf
+            else 0 <= value <= MAX_NUMBER
         ),
     ),
 ]
@@ -117,7 +159,7 @@ class SubmissionMeta(MethodDetails):
 
     model_config = ConfigDict(extra="ignore")
 
-    method: Annotated[str, text(MAX_METHOD_CHARACTERS, "a printable name")]
+    method: _Method
     inputs: Annotated[str, one_of(*INPUTS)] | None = None
     uses_ground_truth: Flag | None = None
     prediction: Annotated[str, one_of(*PREDICTION_KINDS)] = METRIC

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import os
 import re
 import zipfile
@@ -20,9 +19,9 @@ from numpy import ndarray
 
 from rebar_depth_bench.base.errors import InputError, Problem, escape_text
 from rebar_depth_bench.base.names import VIEW_ID_PATTERN
-from rebar_depth_bench.base.validation import validate_table
+from rebar_depth_bench.base.validation import short_repr
 from rebar_depth_bench.base.writing import output_file
-from rebar_depth_bench.submission.declaration import METADATA_NAME, METRIC, SubmissionMeta
+from rebar_depth_bench.submission.declaration import MAX_NUMBER, METADATA_NAME, METRIC, parse_metadata
 from rebar_depth_bench.submission.maps import Depth
 
 _EPOCH = (1980, 1, 1, 0, 0, 0)
@@ -83,13 +82,13 @@ class SubmissionWriter:
             "notes": None if notes is None else dict(notes),
         }
         self._metadata = {key: value for key, value in metadata.items() if value is not None}
-        problems: list[Problem] = []
-        validate_table(SubmissionMeta, self._metadata, problems)
         try:
-            json.dumps(self._metadata, allow_nan=False, ensure_ascii=False).encode("utf-8")
-        except (TypeError, ValueError) as error:
-            found = f"the metadata is not JSON ({error})"
-            problems.append(Problem("invalid", "", found, "text, finite numbers, lists and objects"))
+            content = json.dumps(self._metadata, allow_nan=False, ensure_ascii=False, sort_keys=True).encode()
+        except (TypeError, ValueError, RecursionError) as error:
+            expected = f"text, numbers of at most {MAX_NUMBER:g}, lists and objects"
+            problems = [Problem("invalid", "", f"the metadata is not JSON ({error})", expected)]
+        else:
+            _, problems = parse_metadata(content)
         if problems:
             raise InputError.from_problems(self.path, problems)
         self._seconds: dict[str, float] = {}
@@ -108,7 +107,7 @@ class SubmissionWriter:
         the archive depend on it.
 
         Raises ``InputError`` if the writer is not open, ``view_id`` is malformed or was added before, ``depth`` is
-        not one map of floats, or ``seconds`` is not a finite number >= 0.
+        not one map of floats, or ``seconds`` is not a number from 0 to ``MAX_NUMBER``.
         """
         if self._zip is None:
             raise InputError(f"{self.path}: the writer is not open, expected add() inside its 'with' block")
@@ -116,8 +115,9 @@ class SubmissionWriter:
             raise InputError(
                 f"view_id is {escape_text(str(view_id))}, expected '<config>/<number>' like 'lattice/0000'"
             )
-        if seconds is not None and not (isinstance(seconds, int | float) and 0 <= seconds < math.inf):
-            raise InputError(f"{view_id}: seconds is {seconds!r}, expected a finite number of at least 0")
+        if seconds is not None and not (isinstance(seconds, int | float) and 0 <= seconds <= MAX_NUMBER):
+            found = short_repr(seconds)
+            raise InputError(f"{view_id}: seconds is {found}, expected a number from 0 to {MAX_NUMBER:g}")
         self.write_map(view_id, depth_map(f"{view_id}: depth is", depth), seconds)
 
     def write_map(self, view_id: str, array: Float[ndarray, "h w"], seconds: float | None = None) -> None:

@@ -41,10 +41,18 @@ _SUBMISSION = {
     "created_at": "2026-01-31T12:00:00Z",
     "finished_at": None,
     "reason": None,
+    "archive_bytes": 1234,
+    "archive_kept": True,
     "result": None,
 }
-_TOKEN = {"name": "a", "quota": 10, "quota_left": 9, "max_upload_bytes": 1 << 30}
-_RATES = {"read_rate_limit": "600/minute", "write_rate_limit": "60/minute"}
+_TOKEN = {
+    "name": "a",
+    "quota": 10,
+    "quota_left": 9,
+    "quota_bytes": 1 << 40,
+    "quota_bytes_left": 1 << 39,
+    "max_upload_bytes": 1 << 30,
+}
 
 
 def _predict(workspace: Workspace, method: str) -> None:
@@ -94,7 +102,7 @@ def _write_answers(workspace: Workspace) -> None:
     write_result(workspace, workspace.case / "answers" / "result.json")
     submission = _SUBMISSION | {"archive_sha256": file_sha256(workspace.case / "a.zip")}
     answers = {
-        "token": _TOKEN | _RATES,
+        "token": _TOKEN,
         "accepted": submission | {"status": "queued"},
         "submission": submission | {"status": "scored"},
     }

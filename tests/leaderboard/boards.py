@@ -105,7 +105,7 @@ def finish_scoring(database: Database, submission_id: str, method: str, error: f
     assert claimed(database, "scorer") == submission_id
     views = (scored_view("lattice/0000"), scored_view("pile/0000"))
     content = json.dumps(scale_errors(result(*views, method=method).to_dict(), error)).encode()
-    assert jobs.finish(database, submission_id, "scorer", Outcome(digest_of_board(database), content))
+    assert jobs.finish(database, submission_id, "scorer", Outcome(database.board().dataset_digest or "", content))
 
 
 def claimed(database: Database, scorer: str, lease_s: float = 60) -> str | None:

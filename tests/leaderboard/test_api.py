@@ -284,7 +284,7 @@ def test_only_owner_can_delete_submission(private_server: Server, write_archive:
 def test_declarations_that_cannot_be_stored_are_refused_before_the_archive_is_stored(
     private_server: Server, small_archive: Path, tmp_path: Path, declared: str, where: str
 ) -> None:
-    token = private_server.token(f"large {declared[:30]} {len(declared)}")
+    token = private_server.token(f"large {where} {len(declared)}")
     archive = tmp_path / "large.zip"
     with zipfile.ZipFile(small_archive) as source, zipfile.ZipFile(archive, "w") as target:
         for name in source.namelist():

@@ -143,7 +143,7 @@ def test_invalid_submission_is_refused(
     ("endpoint", "changes", "words"),
     [
         ("submit", {"archive_sha256": "0" * 64}, "another archive than was sent"),
-        ("status", {"id": "another"}, "on submission another"),
+        ("status", {"id": "another", "status": "scored"}, "on submission another"),
     ],
 )
 def test_answer_on_another_submission_is_refused(

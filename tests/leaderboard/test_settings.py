@@ -209,7 +209,9 @@ def help_of(*command: str) -> str:
 
 def test_help_shows_every_setting_with_its_default() -> None:
     shown = {command: help_of(command) for command in re.findall(r"^    ([a-z]+)", run("--help").stdout, re.M)}
-    assert {"serve", "score", "token", "tokens", "submissions", "requeue", "check", "remove", "backup"} == set(shown)
+    assert {"serve", "score", "token", "tokens", "submissions", "requeue", "check", "remove", "backup"} == set(
+        shown
+    )
     for name, field_info in Settings.model_fields.items():
         default, option = field_info.default, f"--{name.replace('_', '-')} "
         assert option in shown["serve"]

@@ -123,9 +123,8 @@ def libraries() -> str:
 
 def test_quick_start_lists_all_system_packages() -> None:
     commands = re.findall(r"^apt-get install (.+)$", (DOCS / "quick-start.md").read_text(), flags=re.MULTILINE)
-    listed = [
-        package for use in ("blender", "browser", "uploads") for package in requirements.probes(use).values()
-    ]
+    uses = ("blender", "browser", "uploads", "proxy")
+    listed = [package for use in uses for package in requirements.probes(use).values()]
     assert sorted(" ".join(commands).split()) == sorted(listed)
 
 

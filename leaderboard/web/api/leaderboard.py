@@ -35,7 +35,7 @@ def entries_to_csv(rows: Sequence[LeaderboardEntry]) -> str:
     columns = [column.name for column in TABLE_COLUMNS]
     cells = (
         [
-            *(row.rank, row.class_rank, row.id, row.method, row.submitter, row.is_baseline, row.inputs),
+            *(row.rank, row.class_rank, row.id, row.method, row.submitter, row.baseline, row.inputs),
             *(row.uses_ground_truth, row.declared.get("seconds_per_view"), row.config),
             *(column.value(row.table) for column in TABLE_COLUMNS),
         ]

@@ -153,25 +153,37 @@ def test_add_rejects_invalid_view_id_and_depth(tmp_path: Path, view_id: str, dep
     assert check_archive(tmp_path / "s.zip", EXPECTED) == []
 
 
-def test_add_requires_open_writer_and_finite_seconds(tmp_path: Path) -> None:
+def test_add_requires_open_writer_and_valid_seconds(tmp_path: Path) -> None:
     writer = SubmissionWriter(tmp_path / "s.zip", "m")
     with pytest.raises(InputError, match="not open, expected add"):
         writer.add("lattice/0000", DEPTH)
-    with writer, pytest.raises(InputError, match="seconds is nan, expected"):
-        writer.add("lattice/0000", DEPTH, seconds=float("nan"))
+    with writer:
+        for seconds, found in ((float("nan"), "nan"), (1e19, "1e\\+19"), (10**5000, "a huge int")):
+            with pytest.raises(InputError, match=f"seconds is {found}, expected a number from 0 to 1e\\+18"):
+                writer.add("lattice/0000", DEPTH, seconds=seconds)
     with pytest.raises(InputError, match="not open"):
         writer.add("lattice/0000", DEPTH)
+
+
+CYCLE: list[object] = []
+CYCLE.append(CYCLE)
 
 
 @pytest.mark.parametrize(
     ("options", "key"),
     [
-        ({"method": " "}, "method"),
-        ({"method": "m" * 201}, "method"),
-        ({"method": "m", "url": "ftp://x"}, "url"),
-        ({"method": "m", "uses_ground_truth": "yes"}, "uses_ground_truth"),
+        ({"method": " "}, "submission.json: method"),
+        ({"method": "m" * 201}, "submission.json: method"),
+        ({"method": "m", "url": "ftp://x"}, "submission.json: url"),
+        ({"method": "m", "uses_ground_truth": "yes"}, "submission.json: uses_ground_truth"),
+        ({"method": "m", "description": "d" * 4001}, "submission.json: description"),
+        ({"method": "m", "parameters": 10**400}, "submission.json: parameters"),
+        ({"method": "m", "runtime": {"s": (1, 10**400)}}, "submission.json: runtime"),
+        ({"method": "m", "runtime": {"s": 10**5000}}, ""),
         ({"method": "m", "runtime": {"s": float("nan")}}, ""),
         ({"method": "m", "runtime": {"s": object()}}, ""),
+        ({"method": "m", "runtime": {"s": CYCLE}}, ""),
+        ({"method": "m", "runtime": {1: "s", "s": 1}}, ""),
     ],
 )
 def test_invalid_metadata_raises_on_construction(tmp_path: Path, options: dict[str, object], key: str) -> None:
@@ -209,7 +221,7 @@ def test_optional_and_unknown_keys_are_accepted() -> None:
     assert parse_metadata(json.dumps(full).encode()) == (SubmissionMeta(**full), [])
 
 
-@pytest.mark.parametrize("runtime", ["3", "1.5", '"fast"', '{"seconds": [1, null]}', "1" + "0" * 400])
+@pytest.mark.parametrize("runtime", ["3", "1.5", '"fast"', '{"seconds": [1, null]}', "1" + "0" * 18])
 def test_runtime_is_kept_unchanged(runtime: str) -> None:
     meta, _ = parse_metadata(f'{{"method": "m", "runtime": {runtime}}}'.encode())
     assert meta is not None
@@ -241,6 +253,8 @@ def test_runtime_is_kept_unchanged(runtime: str) -> None:
         ('{"method": "m", "depth_scale": "0.001"}', "invalid", ": depth_scale"),
         ('{"method": "m", "depth_scale": 1' + "0" * 400 + "}", "invalid", ": depth_scale"),
         ('{"method": "m", "x": 1' + "0" * 5000 + "}", "syntax", ""),
+        ('{"method": "' + "\\ufdfa" * 12 + '"}', "invalid", ": method"),
+        ('{"method": "m", "description": "' + "d" * 4001 + '"}', "invalid", ": description"),
         ('{"method": "m", "runtime": [1]}', "invalid", ": runtime"),
         ('{"method": "m", "runtime": true}', "invalid", ": runtime"),
     ],
@@ -249,6 +263,30 @@ def test_invalid_metadata_is_rejected(text: str, code: ProblemCode, key: str) ->
     (problem,) = problems_of([Record(b"submission.json", text.encode()), FIRST, SECOND])
     assert (problem.code, problem.where) == (code, f"submission.json{key}")
     assert str(problem).isprintable()
+
+
+@pytest.mark.parametrize("number", ["1e19", "-1e19", "1" + "0" * 17 + "01", "1" + "0" * 309, "-1" + "0" * 4298])
+@pytest.mark.parametrize(
+    ("key", "value"),
+    [("depth_scale", "%s"), ("parameters", "%s"), ("runtime", "%s"), ("runtime", '{"a": [1, {"b": [%s]}]}')],
+)
+def test_number_above_the_limit_is_a_problem_of_its_key(key: str, value: str, number: str) -> None:
+    meta, [problem] = parse_metadata(f'{{"method": "m", "{key}": {value % number}}}'.encode())
+    assert meta is None
+    assert problem.where == f"submission.json: {key}"
+    assert problem.code == "invalid"
+    assert "1e+18" in problem.expected
+    assert len(str(problem)) < 200
+
+
+def test_values_at_their_limits_are_accepted() -> None:
+    largest = 10**18
+    values = {"depth_scale": largest, "parameters": largest, "runtime": {"seconds": [-largest, 1e18]}}
+    # The form NFKC of U+FDFA has 18 characters.
+    texts = {"method": "\ufdfa" * 11 + "xy", "description": "d" * 4000}
+    meta, problems = parse_metadata(json.dumps({**texts, **values, "unused": 10**400}).encode())
+    assert problems == []
+    assert meta == SubmissionMeta(**texts, **values)  # type: ignore[arg-type]
 
 
 def test_oversized_metadata_and_all_problems_are_reported_at_once() -> None:
