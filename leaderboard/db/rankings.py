@@ -250,9 +250,3 @@ def queue_position(database: Database, submission: SubmissionModel) -> tuple[int
     with database.read() as session:
         before, waiting = session.execute(query).one()
     return before + 1, max(waiting, before + 1)
-
-
-def submitter_name(database: Database, submission: SubmissionModel) -> str:
-    """Return the name of the token that made a submission."""
-    with database.read() as session:
-        return session.get_one(TokenModel, submission.token_id).name

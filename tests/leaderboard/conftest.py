@@ -170,8 +170,9 @@ def waiting(
     common: dict[str, Any] = {"default_visibility": "owner"}
     ids = {}
     for name, limits in (("failed", {"score_time": 0.01}), ("scored", {})):
-        with running_server(state, **limits, **common) as server:
+        with running_server(state, workers=0, **common) as server:
             ids[name] = server.submit_accepted(archive, token)
+        with running_server(state, **limits, **common) as server:
             assert server.wait_until_ended(ids[name])["status"] == name
     with running_server(state, workers=0, quota=5, max_upload=2_000_000, **common) as server:
         ids |= {name: server.submit_accepted(archive, token) for name in ("next", "later")}
@@ -180,6 +181,7 @@ def waiting(
 
 LONG_NAME = "a method whose name is as long as a name may be, " * 4 + "full"
 """Name of 200 characters."""
+LINKS = {"dataset_url": "https://example.org/data", "paper_url": "https://example.org/paper"}
 
 
 @pytest.fixture(scope="session")
@@ -196,7 +198,7 @@ def crowded(
     ids = {}
     with opened(board_settings(state)) as (database, _):
         jobs.serve_dataset(database, digest, rescore=False)
-        token, organiser = create_token(database, "x" * 100), create_token(database, "org", is_baseline=True)
+        token, organiser = create_token(database, "x" * 100), create_token(database, "org", baseline=True)
         for name, error in errors.items():
             view = scored_view("lattice/0000", error)
             if name == "huge":
@@ -214,7 +216,7 @@ def crowded(
             submissions.change(database, ids[name], declared)
         kept = {"status": "scored", "archive_deleted_at": time.time()}
         submissions.change(database, ids["outdated"], kept)
-    with running_server(state, workers=0, quota=50) as server:
+    with running_server(state, workers=0, **LINKS) as server:
         yield SharedServer(server, token, ids)
 
 

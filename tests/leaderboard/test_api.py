@@ -211,24 +211,27 @@ def test_private_submission_is_visible_to_owner_only(private_server: Server, wri
     assert submission_id not in {row["id"] for row in private_server.rows()}
 
 
-def test_curl_commands_of_the_page_list_edit_and_delete(
+def test_curl_commands_of_the_page_submit_list_edit_and_delete(
     private_server: Server, write_archive: WriteArchive
 ) -> None:
     requirements.require("uploads")
-    token = private_server.token("curl")
-    submission_id = private_server.submit_accepted(write_archive("by curl", 1.05), token)
+    token, archive = private_server.token("curl"), write_archive("by curl", 1.05)
+    submission_id = private_server.submit_accepted(archive, token)
     private_server.wait_until_ended(submission_id)
     page = private_server.get("/how-to-submit").text
-    (commands,) = re.findall(r'id="manage">(.*?)</pre>', page, re.DOTALL)
+    (script,) = re.findall(r'id="manage">(.*?)</pre>', page, re.DOTALL)
+    variables, *commands = re.split(r"\n(?=curl)", html.unescape(script).replace("ARCHIVE", str(archive)))
     environment = {**os.environ, "REBAR_LEADERBOARD_TOKEN": token}
     answers = []
-    for command in re.split(r"\n(?=curl)", html.unescape(commands)):
-        script = command.replace("/ID", f"/{submission_id}").replace("curl ", "curl -sS -w '\n%{http_code}' ")
+    for command in commands:
+        call = command.replace("/ID", f"/{submission_id}").replace("curl ", "curl -sS -w '\n%{http_code}' ")
+        script = f"{variables}\n{call}"
         done = subprocess.run(["sh", "-c", script], capture_output=True, text=True, check=True, env=environment)
         body, _, status = done.stdout.rpartition("\n")
         answers.append((status, json.loads(body or "{}")))
-    (listed, owned), (changed, edited), (deleted, _) = answers
-    assert (listed, changed, deleted) == ("200", "200", "204")
+    (sent, known), (listed, owned), (changed, edited), (deleted, _) = answers
+    assert (sent, listed, changed, deleted) == ("200", "200", "200", "204")
+    assert known["id"] == submission_id
     assert [(own["id"], own["public"]) for own in owned["submissions"]] == [(submission_id, False)]
     assert (edited["public"], edited["code_url"]) == (True, "https://example.org")
     assert private_server.get(f"{API}/{submission_id}").status_code == 404

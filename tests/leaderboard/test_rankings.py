@@ -32,7 +32,7 @@ def database(tmp_path: Path) -> Iterator[Database]:
     opened = Database(f"sqlite:///{tmp_path / 'db.sqlite'}")
     opened.migrate()
     with opened.write() as session:
-        session.add(TokenModel(id=1, name="alice", sha256="0" * 64, created_at=0.0, is_baseline=False))
+        session.add(TokenModel(id=1, name="alice", sha256="0" * 64, created_at=0.0, baseline=False))
         session.flush()
         for index, error in enumerate(ERRORS):
             table = table_of(error or 0.5)
@@ -120,15 +120,6 @@ def test_pages_divide_the_rows(database: Database) -> None:
     assert {(page.row_count, page.pages) for page in pages} == {(6, 2)}
 
 
-def test_search_selects_by_method_and_submitter(database: Database) -> None:
-    ranking = read_ranking(database, "lattice", DIGEST)
-    found = {
-        text: config_table(ranking, "lattice", Selection(text=text), 50)["page"].row_count
-        for text in ("S2", "alice", "nobody")
-    }
-    assert found == {"S2": 1, "alice": 6, "nobody": 0}
-
-
 @pytest.mark.slow
 @given(
     st.lists(st.one_of(st.none(), st.floats(0.01, 9.0)), max_size=12),
@@ -157,7 +148,7 @@ def entry_of(name: str, table: dict[str, Any], declared: dict[str, Any]) -> Lead
         config="lattice",
         method=name,
         submitter="alice",
-        is_baseline=False,
+        baseline=False,
         details=json.dumps(declared),
         inputs=None,
         uses_ground_truth=None,
