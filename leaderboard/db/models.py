@@ -68,9 +68,9 @@ class TokenModel(Base):
 class SubmissionModel(Base):
     """An accepted archive and the status of its job.
 
-    ``status`` is ``queued`` or ``scoring`` while a job is to be done, ``scored`` if the submission has a result, of
-    whatever dataset, ``failed`` with ``reason`` if it has none, or ``deleted``. Deleted submissions keep their
-    rows, which count for the quota. ``details`` is a JSON object with what the submitter says of the method
+    ``status`` is ``queued`` or ``scoring`` while a job is to be done, ``scored`` if the submission has a result of
+    any dataset, ``failed`` with ``reason`` if it has none, or ``deleted``. Deleted submissions keep their rows,
+    which count for the quota. ``details`` is a JSON object with what the submitter says of the method
     (``MethodDetails``) and the declared seconds per view, without what is not given. ``archive_deleted_at`` is
     set when the archive was deleted, alone or with the submission.
     """

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import threading
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
 from typing import Any
@@ -148,24 +148,22 @@ def read_ranking(
 def _with_ranks(entries: Sequence[LeaderboardEntry]) -> tuple[LeaderboardEntry, ...]:
     """Return sorted entries with their ranks."""
     ranked = [entry for entry in entries if entry.may_rank and entry.public]
-    ranks = _ranks(ranked)
-    classes = [_ranks([entry for entry in ranked if entry.inputs == name]) for name in INPUTS]
-    class_ranks = {entry_id: rank for ranks in classes for entry_id, rank in ranks.items()}
+    ranks = _ranks((entry.id, entry.rank_error) for entry in ranked)
+    class_ranks: dict[str, int] = {}
+    for name in INPUTS:
+        class_ranks |= _ranks((entry.id, entry.rank_error) for entry in ranked if entry.inputs == name)
     return tuple(
         replace(entry, rank=ranks.get(entry.id), class_rank=class_ranks.get(entry.id)) for entry in entries
     )
 
 
-def _ranks(entries: Sequence[LeaderboardEntry]) -> dict[str, int]:
-    """Return the ranks of entries in ascending order by submission id; equal errors share a rank."""
-    ranks = _shared_ranks([entry.rank_error for entry in entries])
-    return {entry.id: rank for entry, rank in zip(entries, ranks, strict=True)}
-
-
-def _shared_ranks(values: Sequence[float | None]) -> list[int]:
-    """Return the ranks of values in ascending order; equal values share a rank."""
+def _ranks(errors: Iterable[tuple[str, float | None]]) -> dict[str, int]:
+    """Return the ranks by submission id of ids and errors in ascending order; equal errors share a rank."""
     first: dict[float | None, int] = {}
-    return [first.setdefault(value, place) for place, value in enumerate(values, start=1)]
+    return {
+        submission_id: first.setdefault(error, place)
+        for place, (submission_id, error) in enumerate(errors, start=1)
+    }
 
 
 @dataclass(frozen=True)
@@ -205,10 +203,8 @@ def overall_ranking(rankings: Sequence[tuple[str, Ranking]], *, best: bool = Fal
         for one in all_entries:
             first.setdefault((one.first.submitter, one.first.method), one)
         all_entries = list(first.values())
-    ranked = [one for one in all_entries if one.is_ranked]
-    ranks = _shared_ranks([one.mean for one in ranked])
-    unranked = [one for one in all_entries if not one.is_ranked]
-    return [*(replace(one, rank=rank) for one, rank in zip(ranked, ranks, strict=True)), *unranked]
+    ranks = _ranks((one.first.id, one.mean) for one in all_entries if one.is_ranked)
+    return [replace(one, rank=ranks.get(one.first.id)) for one in all_entries]
 
 
 def _mean_error(entries: Mapping[str, LeaderboardEntry], configs: int) -> float:

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 import structlog
 from anyio import to_thread
 from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from leaderboard.db.engine import DATABASE_UNAVAILABLE, Database
@@ -31,6 +32,7 @@ REVALIDATE = "no-cache"
 """Cache-Control of public responses: stored by browsers, which must revalidate each time."""
 NO_STORE = "no-store"
 """Cache-Control of responses with unpublished content: not stored anywhere."""
+MAX_HOST_CHARACTERS = 300
 _LOG = structlog.get_logger("http")
 
 
@@ -56,6 +58,10 @@ class RequestMiddleware:
                     headers.setdefault(name, value)
             await send(message)
 
+        if len(Headers(scope=scope).get("host", "")) > MAX_HOST_CHARACTERS:  # Addresses of pages contain it.
+            response = PlainTextResponse("the Host header is too long", 400)
+            await response(scope, receive, send_with_headers)
+            return
         # The server leaves out the body of responses to HEAD; FastAPI routes of GET do not take HEAD themselves.
         scope = {**scope, "method": "GET"} if method == "HEAD" else scope
         try:

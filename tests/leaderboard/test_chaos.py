@@ -198,7 +198,7 @@ def service(
 def test_accepted_submissions_are_scored_once(
     service: Service, write_archive: WriteArchive, repetitions: Repetitions
 ) -> None:
-    num_kills = repetitions(6, 100)
+    num_kills = repetitions(6, 30)
     archive = write_archive("chaos", configs=("lattice-orbit",))
     uploads = Uploads(archive, make_token(service.state, "alice", service.db), service.url)
     threads = [threading.Thread(target=uploads.run) for _ in range(UPLOADERS)]

@@ -132,6 +132,11 @@ def test_address_of_a_server_without_proxy_warns(running_server: RunServer) -> N
         assert any("tokens are sent without TLS" in line for line in server.log)
 
 
+def test_long_host_is_refused(server: Server) -> None:
+    response = server.call("PUT", API, server.token("host"), headers={"Host": "a" * 3000})
+    assert (response.status_code, response.text) == (400, "the Host header is too long")
+
+
 @pytest.fixture(scope="module")
 def proxied(running_server: RunServer) -> Iterator[Server]:
     """Run a server with a public URL."""

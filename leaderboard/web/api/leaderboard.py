@@ -5,11 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Annotated
 
-from fastapi import APIRouter, Query, Response
+from fastapi import APIRouter, Depends, Query, Request, Response
 
 from leaderboard.db.models import TokenModel
 from leaderboard.db.rankings import LeaderboardEntry, overall_ranking
-from leaderboard.service import Service
 from leaderboard.web.api.errors import Responses, errors
 from leaderboard.web.dependencies import WITHOUT_TOKEN, OptionalToken, ServiceDep, check_config
 from leaderboard.web.middleware import NO_STORE, REVALIDATE
@@ -50,28 +49,34 @@ CSV = "text/csv; charset=utf-8"
 ConfigName = Annotated[str, Query(max_length=100, description="name of the config", examples=["lattice"])]
 _ERROR_RESPONSES = errors(401, 404, 422)
 _CSV_RESPONSE: Responses = {200: {"content": {"text/csv": {"schema": {"type": "string"}}}}}
-InputsQuery = Annotated[
-    InputClass | None,
-    Query(description="only the rows that declare this input class"),
-]
 BestQuery = Annotated[
     bool,
     Query(description="only the best row of each submitter and method name, with ranks among these rows"),
 ]
 
 
-@router.get("/leaderboard", response_model=Leaderboard, responses=_ERROR_RESPONSES, openapi_extra=WITHOUT_TOKEN)
-def leaderboard(
+def _rows(
     config: ConfigName,
     service: ServiceDep,
     token: OptionalToken,
-    inputs: InputsQuery = None,
+    inputs: Annotated[InputClass | None, Query(description="only the rows that declare this input class")] = None,
     best: BestQuery = False,
-) -> Response:
+) -> list[LeaderboardEntry]:
+    """Return the rows of a config. Raises status 404 for an unknown config."""
+    check_config(service, config)
+    ranking = service.rankings.of(config, token)
+    return (ranking.best if best else ranking).of_class(inputs)
+
+
+_Rows = Annotated[list[LeaderboardEntry], Depends(_rows)]
+
+
+@router.get("/leaderboard", response_model=Leaderboard, responses=_ERROR_RESPONSES, openapi_extra=WITHOUT_TOKEN)
+def leaderboard(request: Request, service: ServiceDep, token: OptionalToken, rows: _Rows) -> Response:
     """Return the public rows of a config and, with a token, those of its owner."""
-    rows = [LeaderboardRow.model_validate(row) for row in _rows(service, config, inputs, best, token)]
     dataset = {"digest": service.folder.digest, "version": service.folder.version}
-    content = Leaderboard(config=config, protocol=PROTOCOL, dataset=dataset, rows=rows)
+    shown = [LeaderboardRow.model_validate(row) for row in rows]
+    content = Leaderboard(config=request.query_params["config"], protocol=PROTOCOL, dataset=dataset, rows=shown)
     return _response(content.model_dump_json(), "application/json", token)
 
 
@@ -81,15 +86,8 @@ def leaderboard(
     response_class=Response,
     openapi_extra=WITHOUT_TOKEN,
 )
-def leaderboard_csv(
-    config: ConfigName,
-    service: ServiceDep,
-    token: OptionalToken,
-    inputs: InputsQuery = None,
-    best: BestQuery = False,
-) -> Response:
+def leaderboard_csv(token: OptionalToken, rows: _Rows) -> Response:
     """Return the rows of a config as CSV."""
-    rows = _rows(service, config, inputs, best, token)
     return _response(entries_to_csv(rows), CSV, token)
 
 
@@ -110,15 +108,6 @@ def overall(service: ServiceDep, best: BestQuery = False) -> Response:
     dataset = {"digest": service.folder.digest, "version": service.folder.version}
     content = OverallRanking(protocol=PROTOCOL, dataset=dataset, rows=rows)
     return _response(content.model_dump_json(), "application/json", None)
-
-
-def _rows(
-    service: Service, config: str, inputs: str | None, best: bool, token: TokenModel | None
-) -> list[LeaderboardEntry]:
-    """Return the rows with declared ``inputs`` (None: all). Raises status 404 for an unknown config."""
-    check_config(service, config)
-    ranking = service.rankings.of(config, token)
-    return (ranking.best if best else ranking).of_class(inputs)
 
 
 def _response(content: str, media_type: str, token: TokenModel | None) -> Response:
