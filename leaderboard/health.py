@@ -54,7 +54,7 @@ def disk_problem(folder: Path, name: str = "the state folder") -> list[str]:
 
 def queue_problems(database: Database) -> list[str]:
     """Return the problem if the oldest queued submission waits although none is being scored."""
-    oldest = select(func.min(SubmissionModel.created_at)).where(SubmissionModel.status == QUEUED)
+    oldest = select(func.min(SubmissionModel.queued_at)).where(SubmissionModel.status == QUEUED)
     active = select(func.count()).where(SubmissionModel.status == SCORING, not_(jobs.is_free(time.time())))
     with database.read() as session:
         queued_since, scoring = session.scalar(oldest), session.scalar(active)

@@ -101,11 +101,11 @@ class Ranking:
 
     @cached_property
     def best(self) -> Ranking:
-        """The best row of each submitter and method name, with ranks among these rows."""
-        first: dict[tuple[str, str], LeaderboardEntry] = {}
+        """The best public row of each submitter and method name, ranked among these; rows that are not public."""
+        best: dict[tuple[str, ...], LeaderboardEntry] = {}
         for entry in self.entries:
-            first.setdefault((entry.submitter, entry.method), entry)
-        return Ranking(_with_ranks(list(first.values())))
+            best.setdefault((entry.submitter, entry.method) if entry.public else (entry.id,), entry)
+        return Ranking(_with_ranks(list(best.values())))
 
     @cached_property
     def by_id(self) -> dict[str, LeaderboardEntry]:

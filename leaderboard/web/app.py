@@ -68,7 +68,8 @@ def make_app(service: Service) -> FastAPI:
     for router in (submissions, leaderboard, status, ranking, submission_page, account):
         app.include_router(router.router)
     app.mount("/static", _StaticFiles(packages=_STATIC_FOLDERS))
-    identity = f"{software_version()} {service.folder.digest} {settings.model_dump_json()}"
+    dataset = (service.folder.digest, service.folder.version, service.dataset_name, service.dataset_licence)
+    identity = f"{software_version()} {dataset} {settings.model_dump_json()}"
     app.add_middleware(GZipMiddleware, minimum_size=_MIN_GZIP_BYTES, compresslevel=5)
     app.add_middleware(ETagMiddleware, database=service.database, identity=identity)
     if host := urlsplit(settings.public_url).hostname:

@@ -46,7 +46,7 @@ def opened(settings: Settings) -> Iterator[tuple[Database, ArchiveStore]]:
     """Yield database and archives of a leaderboard, which is made if there is none."""
     settings.state_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
     with closing(Database(settings.database_url)) as database:
-        database.migrate()
+        database.create_schema()
         archives = ArchiveStore(settings.archive_dir, database.board().board_id)
         archives.initialise(archive_rows(database))
         yield database, archives
@@ -77,6 +77,7 @@ def accept(
                 archive_bytes=size,
                 public=public,
                 created_at=time.time(),
+                queued_at=time.time(),
                 status=QUEUED,
                 attempts=0,
             )

@@ -147,7 +147,7 @@ def make_token(state: Path, name: str, db: str = "") -> str:
     state.mkdir(mode=0o700, parents=True, exist_ok=True)
     settings = read_settings(None, {"data": "", "state_dir": state, "db": db})
     with closing(Database(settings.database_url)) as database:
-        database.migrate()
+        database.create_schema()
         return create_token(database, name)
 
 

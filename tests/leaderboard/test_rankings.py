@@ -30,7 +30,7 @@ UNRANKED, HIDDEN = (5, 6), (1,)
 def database(tmp_path: Path) -> Iterator[Database]:
     """Yield a database of seven submissions of ``lattice``: two unranked, one not public."""
     opened = Database(f"sqlite:///{tmp_path / 'db.sqlite'}")
-    opened.migrate()
+    opened.create_schema()
     with opened.write() as session:
         session.add(TokenModel(id=1, name="alice", sha256="0" * 64, created_at=0.0, baseline=False))
         session.flush()

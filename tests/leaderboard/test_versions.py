@@ -32,7 +32,7 @@ def database(tmp_path: Path) -> Iterator[Database]:
     """Yield the database of a leaderboard whose dataset is beside the state folder."""
     write_dataset(tmp_path / "dataset", ["lattice", "pile"], 1)
     with closing(Database(f"sqlite:///{tmp_path / 'state' / 'leaderboard.sqlite'}")) as opened:
-        opened.migrate()
+        opened.create_schema()
         jobs.serve_dataset(opened, digest_of_board(opened), rescore=False)
         yield opened
 
