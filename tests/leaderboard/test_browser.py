@@ -130,7 +130,7 @@ def test_two_ticked_rows_are_compared_without_javascript(chromium: Browser, crow
             form.get_by_label("Compare method 2", exact=True).check()
             button = form.get_by_role("button", name="Compare two ticked rows")
             button.click()
-            expect(page.get_by_text("1 rows are ticked, expected two")).to_be_visible()
+            expect(page.get_by_text("1 row ticked, expected two")).to_be_visible()
             page.go_back()
             form.get_by_label("Compare method 2", exact=True).check()
             form.get_by_label("Compare method 0", exact=True).check()

@@ -238,9 +238,9 @@ def test_comparison_page_shows_the_numbers_of_the_command_line(board: SharedServ
 @pytest.mark.parametrize(
     ("names", "status", "words"),
     [
-        ((), 422, "0 rows are ticked, expected two"),
-        (("huge", "huge"), 422, "1 rows are ticked, expected two"),
-        (("huge", "worse", "truth"), 422, "3 rows are ticked, expected two"),
+        ((), 422, "0 rows ticked, expected two"),
+        (("huge", "huge"), 422, "1 row ticked, expected two"),
+        (("huge", "worse", "truth"), 422, "3 rows ticked, expected two"),
         (("huge", "nobody"), 404, "no such submission"),
         (("huge", "%00"), 404, "no such submission"),
         (("huge", "outdated"), 422, "only submissions on the same ground truth can be compared"),

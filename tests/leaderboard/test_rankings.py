@@ -187,7 +187,7 @@ def test_heading_link_reverses_sort_order() -> None:
     assert rmse.sorted_by("rmse").query(None) == "sort=-rmse"
     assert rmse.sorted_by("rmse").sorted_by("rmse").query(None) == "sort=rmse"
     assert (rmse.is_descending, Selection("within_5mm").is_descending) == (False, True)
-    assert [parse_selection(text, None, None, None, None) for text in (None, "nope", "-", "-rmse", "-rank")] == [
+    assert [parse_selection({"sort": text}) for text in ("", "nope", "-", "-rmse", "-rank")] == [
         Selection(),
         Selection(),
         Selection(),
@@ -210,10 +210,9 @@ def test_query_of_a_selection_is_read_back(
     selection = Selection(order, inverted, inputs, text.strip(), all_rows, page)
     values = dict(parse_qsl(selection.query("lattice")))
     assert values.pop("config") == "lattice"
-    read = [values.get(name) for name in ("sort", "inputs", "q", "rows", "page")]
-    assert parse_selection(*read) == selection
+    assert parse_selection(values) == selection
 
 
 @pytest.mark.parametrize("page", ["abc", "0", "-1", "1.5", "²", "9" * 5000, ""])
 def test_page_that_is_no_number_is_the_first(page: str) -> None:
-    assert parse_selection(None, None, None, None, page).page == 1
+    assert parse_selection({"page": page}).page == 1

@@ -17,6 +17,7 @@ from leaderboard.web.dependencies import ServiceDep, SubmissionId
 from leaderboard.web.middleware import NO_STORE, REVALIDATE
 from leaderboard.web.pages.rendering import render
 from rebar_depth_bench.base.errors import InputError, printable
+from rebar_depth_bench.reporting.formatting import counted
 from rebar_depth_bench.reporting.html.page import (
     paper_context,
     results_context,
@@ -97,7 +98,7 @@ def compare_page(
     chosen = list(dict.fromkeys(ids))
     if len(chosen) != 2:
         raise HTTPException(
-            422, f"{len(chosen)} rows are ticked, expected two: go back and tick two rows of a table"
+            422, f"{counted(len(chosen), 'row')} ticked, expected two: go back and tick two rows of a table"
         )
     records = [get_submission(service, submission_id) for submission_id in chosen]
     shown = shown_results(service.database, records, service.folder.digest)
