@@ -48,7 +48,10 @@ def _dataset_problems(service: Service) -> list[str]:
 
 def disk_problem(folder: Path, name: str = "the state folder") -> list[str]:
     """Return the problem if the disk of a folder is nearly full."""
-    free = shutil.disk_usage(folder).free
+    try:
+        free = shutil.disk_usage(folder).free
+    except OSError as error:
+        return [f"{name} cannot be read: {error.strerror}"]
     return [] if free >= MIN_FREE_BYTES else [f"the disk of {name} has {free >> 20} MiB left"]
 
 

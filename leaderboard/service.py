@@ -56,8 +56,9 @@ class Service:
 
 @contextmanager
 def open_service(settings: Settings) -> Iterator[Service]:
-    """Open the service: create the tables of an empty database, remove abandoned uploads, and queue what is to be scored again.
+    """Open the service.
 
+    The tables of an empty database are created, abandoned uploads deleted, and what is to be scored again queued.
     If the archive folder is not that of the database, reading works, uploads are refused, and jobs wait. Raises
     ``InputError`` if the dataset or the database is unusable, and if the leaderboard has submissions of another
     dataset with their archives, unless the setting ``rescore`` is on.

@@ -73,6 +73,8 @@ async def accept_upload(
 
     def check_before() -> None:
         service.archives.check()
+        if database.board().dataset_digest != service.folder.digest:
+            raise UnavailableError("another server of this database serves another dataset")
         with database.read() as session:
             check_quota(session, token, quota, 0)
 
@@ -192,6 +194,8 @@ def _checked_archive(service: Service, path: Path) -> SubmissionMeta:
             _LOG.error("checking process ended", status=error.status, details=error.details)
             if not error.was_killed:
                 break
+    else:
+        raise UnavailableError("the process that checks the archive was killed twice")
     raise archive_error("damaged", "the archive cannot be read: the process that reads it crashed")
 
 

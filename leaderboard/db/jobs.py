@@ -25,7 +25,7 @@ from leaderboard.db.models import (
 from leaderboard.db.submissions import DELETED, FAILED, QUEUED, SCORED, SCORING
 from leaderboard.scoring.sandbox import Outcome
 from leaderboard.settings import MAX_LEASE_S
-from rebar_depth_bench.base.errors import InputError, problem_summary
+from rebar_depth_bench.base.errors import InputError, escape_text, problem_summary
 from rebar_depth_bench.scoring.bootstrap import INTERVALS
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 
@@ -58,7 +58,9 @@ def serve_dataset(database: Database, dataset_digest: str, rescore: bool) -> int
         if is_other:
             has_result = current.where(ResultModel.json.is_not(None))
             session.execute(
-                update(SubmissionModel).where(is_waiting, has_result).values(status=SCORED, lease_until=None)
+                update(SubmissionModel)
+                .where(is_waiting, has_result)
+                .values(status=SCORED, lease_until=None, finished_at=time.time())
             )
             to_score = and_(or_(is_waiting, is_stale), ~current)
         else:
@@ -81,15 +83,16 @@ def serve_dataset(database: Database, dataset_digest: str, rescore: bool) -> int
 def requeue(database: Database, submission_ids: Sequence[str]) -> None:
     """Queue submissions again, without quota; earlier results stay until they are replaced.
 
-    Raises ``InputError``, before any is queued, for ids of no submission, of one that waits already, and of one
-    whose archive was deleted.
+    Raises ``InputError``, before any is queued, if an id is unknown, waits already, has no archive, or if its
+    archive was sent again since.
     """
     problems: list[str] = []
     with database.write() as session:
-        for submission_id in submission_ids:
-            record = session.get(SubmissionModel, submission_id, with_for_update=True)
+        for submission_id in dict.fromkeys(submission_ids):
+            is_id = submission_id.isascii()  # A database refuses bytes that are no text.
+            record = session.get(SubmissionModel, submission_id, with_for_update=True) if is_id else None
             if record is None or record.status == DELETED:
-                problems.append(f"{submission_id}: there is no such submission")
+                problems.append(f"{escape_text(submission_id)}: there is no such submission")
             elif record.status in (QUEUED, SCORING):
                 problems.append(f"{submission_id}: is {record.status} already")
             elif record.archive_deleted_at is not None:
@@ -133,7 +136,7 @@ def claim(database: Database, scorer: str, lease_s: float) -> SubmissionModel | 
                 record.lease_until, record.attempts = now + lease_s, record.attempts + 1
                 return record
             digest = session.scalars(select(BoardModel)).one().dataset_digest or ""
-            reason = f"scoring was started {record.attempts} times but never finished"
+            reason = f"scoring was started {record.attempts} times but never finished; the operator can requeue it"
             _store(session, record, Outcome(digest, reason=reason))
 
 

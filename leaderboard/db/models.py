@@ -18,7 +18,6 @@ from sqlalchemy import (
 )
 from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column
 
-
 SCHEMA = 5
 """Number of the schema; a database with another one is refused."""
 
@@ -30,9 +29,9 @@ class Base(DeclarativeBase):
 class BoardModel(Base):
     """The single row of facts on the whole leaderboard.
 
-    ``schema`` is ``SCHEMA`` of the version that made the tables. ``board_id`` is random; the marker in the archive folder has the same. ``dataset_digest`` is the digest of the
-    dataset that ``serve`` served last, None before the first time. Every change of what pages show increments
-    ``content_version``.
+    ``schema`` is ``SCHEMA`` of the version that made the tables. ``board_id`` is random; the marker in the archive
+    folder has the same. ``dataset_digest`` is the digest of the dataset that was served last, None before the
+    first time. Every change of what pages show increments ``content_version``.
     """
 
     __tablename__ = "board"

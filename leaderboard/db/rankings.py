@@ -99,11 +99,13 @@ class Ranking:
 
     entries: tuple[LeaderboardEntry, ...]
 
-    @cached_property
-    def best(self) -> Ranking:
-        """The best public row of each submitter and method name, ranked among these; rows that are not public."""
+    def best(self, inputs: str | None = None) -> Ranking:
+        """Return the best row of each submitter and method name of those that declare ``inputs`` (None: of all).
+
+        Ranks are those among these rows. Rows that are not public are all returned.
+        """
         best: dict[tuple[str, ...], LeaderboardEntry] = {}
-        for entry in self.entries:
+        for entry in self.of_class(inputs):
             best.setdefault((entry.submitter, entry.method) if entry.public else (entry.id,), entry)
         return Ranking(_with_ranks(list(best.values())))
 

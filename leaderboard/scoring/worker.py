@@ -19,7 +19,7 @@ from leaderboard.db.engine import DATABASE_UNAVAILABLE, Database
 from leaderboard.scoring.isolation import ProcessEndedError, TimeLimitError, UnavailableError, isolated_call
 from leaderboard.scoring.sandbox import Outcome, score
 from leaderboard.settings import Settings
-from leaderboard.storage.archive_store import ArchiveNotFoundError, ArchiveStore, archive_problem
+from leaderboard.storage.archive_store import ArchiveStore, archive_problem
 from rebar_depth_bench.base.errors import StorageError, SubmissionError, problem_summary
 
 POLL_INTERVAL_S = 1.0
@@ -80,7 +80,7 @@ def score_next(database: Database, settings: Settings, name: str, stop: threadin
     digest = board.dataset_digest or ""
     archives = ArchiveStore(settings.archive_dir, board.board_id)
     try:
-        job = (score, archives.path(record.id), settings.data, digest)
+        job = (score, archives.file(record.id), settings.data, digest)
         with isolated_call(*job, memory=settings.score_memory, time_limit_s=settings.score_time) as call:
             while not call.wait(min(lease_s / RENEWALS_PER_LEASE, POLL_INTERVAL_S)):
                 if stop.is_set():
@@ -94,8 +94,6 @@ def score_next(database: Database, settings: Settings, name: str, stop: threadin
                 except DATABASE_UNAVAILABLE:
                     pass  # If another worker takes over, only one of them can finish the job.
             outcome = call.value()
-    except ArchiveNotFoundError:
-        outcome = Outcome(digest, reason="the archive is no longer in the archive storage")
     except (UnavailableError, StorageError, OSError) as error:
         return _requeue(database, record.id, name, lease_s, error)
     except SubmissionError as error:
@@ -111,7 +109,9 @@ def score_next(database: Database, settings: Settings, name: str, stop: threadin
         row = (record.archive_sha256, record.archive_bytes)
         try:
             if problem := archive_problem(archives.file(record.id), row, hashed=True):
-                outcome = Outcome(digest, reason=f"the stored archive {problem}; the operator can requeue it")
+                outcome = Outcome(
+                    digest, reason=f"the stored archive {problem}; the operator can requeue it once it is restored"
+                )
         except (StorageError, OSError) as error:
             return _requeue(database, record.id, name, lease_s, error)
     while True:

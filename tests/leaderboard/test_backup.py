@@ -81,7 +81,7 @@ def test_backup_of_a_lost_board_is_refused(board: tuple[Settings, str], tmp_path
     make_board(settings)
     before = tree(target)
     for prune in (False, True):
-        with pytest.raises(StorageError, match="archives: belongs to the database with the id"):
+        with pytest.raises(InputError, match="is the backup of another leaderboard"):
             back_up(settings, target, prune)
         assert tree(target) == before
     assert (target / "archives" / f"{kept}.zip").exists()

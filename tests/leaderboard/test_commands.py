@@ -117,7 +117,7 @@ def test_check_names_everything_that_is_wrong(tmp_path: Path, tiny_root: Path) -
     with closing(sqlite3.connect(settings.state_dir / "leaderboard.sqlite")) as connection, connection:
         connection.execute("UPDATE submissions SET archive_deleted_at = 1 WHERE id = ?", (left,))
         connection.execute("UPDATE results SET json = 'x' WHERE submission_id = ?", (gone,))
-        waits = "UPDATE submissions SET status = 'queued', created_at = 1 WHERE id = ?"
+        waits = "UPDATE submissions SET status = 'queued', queued_at = 1 WHERE id = ?"
         connection.execute(waits, (damaged,))
         connection.execute("UPDATE board SET dataset_digest = 'sha256:1'")
     status, text = check()

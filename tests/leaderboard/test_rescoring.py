@@ -20,6 +20,7 @@ from leaderboard.scoring.sandbox import Outcome, check, score
 from leaderboard.uploads import UNAVAILABLE_MESSAGE
 from rebar_depth_bench.base.errors import SubmissionError
 from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.submission import SubmissionMeta
 from tests.leaderboard.boards import (
     DIGEST,
     OTHER_DIGEST,
@@ -137,7 +138,7 @@ def test_submission_without_archive_keeps_its_result_and_may_be_sent_again(
         for submission_id in (lost, *kept):
             server.wait_until_ended(submission_id)
         assert {name for name, _ in ids_and_ranks(server)} == set(kept)
-        for name, words in ((freed, "its archive is not kept"), (lost, "no longer in the archive storage")):
+        for name, words in ((freed, "its archive is not kept"), (lost, "the stored archive is missing")):
             shown = server.wait_until_ended(name)
             assert (shown["status"], shown["reason"], shown["result"]) == ("scored", None, before[name])
             assert words in shown["outdated"]
@@ -241,14 +242,18 @@ def write_split_archive(root: Path, archive: Path, split: str) -> Path:
     return archive
 
 
+def checked(archive: Path, root: Path) -> SubmissionMeta:
+    return check(archive, str(root), open_folder(root).digest)
+
+
 @pytest.mark.slow
 def test_only_the_split_test_is_accepted(split_root: Path, tmp_path: Path) -> None:
     with pytest.raises(SubmissionError) as refused:
-        check(write_split_archive(split_root, tmp_path / "train.zip", "train"), str(split_root))
+        checked(write_split_archive(split_root, tmp_path / "train.zip", "train"), split_root)
     [problem] = refused.value.problems
     assert (problem.code, problem.where) == ("conflict", "cages")
     assert "split train" in str(problem)
-    accepted = check(write_split_archive(split_root, tmp_path / "test.zip", "test"), str(split_root))
+    accepted = checked(write_split_archive(split_root, tmp_path / "test.zip", "test"), split_root)
     assert accepted.method == "exact"
 
 
@@ -257,7 +262,7 @@ def test_archive_of_macos_is_accepted(split_root: Path, tmp_path: Path) -> None:
     archive = write_split_archive(split_root, tmp_path / "test.zip", "test")
     with zipfile.ZipFile(archive, "a") as zipped:
         zipped.writestr("__MACOSX/._submission.json", bytes.fromhex("0005160700020000"))
-    assert check(archive, str(split_root)).method == "exact"
+    assert checked(archive, split_root).method == "exact"
 
 
 @pytest.mark.slow

@@ -65,7 +65,7 @@ def _rows(
     """Return the rows of a config. Raises status 404 for an unknown config."""
     check_config(service, config)
     ranking = service.rankings.of(config, token)
-    return (ranking.best if best else ranking).of_class(inputs)
+    return list(ranking.best(inputs).entries) if best else ranking.of_class(inputs)
 
 
 _Rows = Annotated[list[LeaderboardEntry], Depends(_rows)]

@@ -42,10 +42,11 @@ def leaderboard_page(request: Request, service: ServiceDep, config: str | None =
     selection = parse_selection(request.query_params)
     configs = service.folder.configs if config is None else (config,)
     rankings = {name: service.rankings.of(name) for name in configs}
-    shown = {name: one if selection.all_rows else one.best for name, one in rankings.items()}
+    shown = {name: one if selection.all_rows else one.best(selection.inputs) for name, one in rankings.items()}
     overview, of_config, page_rows = None, selection, PAGE_ROWS
     if len(configs) > 1:
-        overall = overall_ranking([*rankings.items()], best=not selection.all_rows)
+        chosen = {name: Ranking(tuple(one.of_class(selection.inputs))) for name, one in rankings.items()}
+        overall = overall_ranking([*chosen.items()], best=not selection.all_rows)
         overview = selection.page_of([one for one in overall if selection.matches(one.first)], PAGE_ROWS)
         of_config, page_rows = selection.but(), FIRST_ROWS
     return render(
