@@ -72,6 +72,7 @@ def make_submission(
         status=status,
         public=public,
         created_at=created_at,
+        queued_at=created_at,
         attempts=0,
     )
 
