@@ -91,7 +91,7 @@ def leaderboard_csv(token: OptionalToken, rows: _Rows) -> Response:
     return _response(entries_to_csv(rows), CSV, token)
 
 
-@router.get("/overall", response_model=OverallRanking)
+@router.get("/overall", response_model=OverallRanking, responses=errors(422))
 def overall(service: ServiceDep, best: BestQuery = False) -> Response:
     """Return the public submissions in order of their mean rank error over all configs."""
     configs = service.folder.configs
