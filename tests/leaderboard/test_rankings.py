@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 
 from leaderboard.db.engine import Database
 from leaderboard.db.models import LeaderboardRowModel, SubmissionModel, TokenModel
-from leaderboard.db.rankings import LeaderboardEntry, Ranking, queue_position, read_ranking
-from leaderboard.web.pages.board_columns import COLUMNS_BY_NAME, METHOD, RANK
+from leaderboard.db.rankings import LeaderboardEntry, Ranking, read_ranking
+from leaderboard.web.pages.board_columns import COLUMNS_BY_NAME, METHOD
 from leaderboard.web.pages.ranking import config_table
 from leaderboard.web.pages.selection import Selection, parse_selection
 from rebar_depth_bench.scoring.protocol import PROTOCOL
-from tests.bench.reporting.results import overflowed_view, result, scored_view, unpredicted_view
+from tests.bench.reporting.results import result, scored_view, unpredicted_view
 from tests.leaderboard.boards import DIGEST
 
 ERRORS = [0.3, 0.1, 0.1, 2.0, 0.7, None, 0.05]
@@ -35,8 +35,20 @@ def database(tmp_path: Path) -> Iterator[Database]:
         session.add(TokenModel(id=1, name="alice", sha256="0" * 64, created_at=0.0, baseline=False))
         session.flush()
         for index, error in enumerate(ERRORS):
-            table = table_of(error or 0.5)
-            session.add(make_submission(f"s{index}", 100.0 + index, public=index not in HIDDEN))
+            session.add(
+                SubmissionModel(
+                    id=f"s{index}",
+                    token_id=1,
+                    method=f"s{index}",
+                    details="{}",
+                    archive_sha256="0" * 64,
+                    archive_bytes=1,
+                    status="scored",
+                    public=index not in HIDDEN,
+                    created_at=100.0 + index,
+                    attempts=0,
+                )
+            )
             session.flush()
             session.add(
                 LeaderboardRowModel(
@@ -46,7 +58,7 @@ def database(tmp_path: Path) -> Iterator[Database]:
                     config="lattice",
                     ranked=index not in UNRANKED,
                     rank_error=error,
-                    json=json.dumps(table),
+                    json=json.dumps(table_of(error or 0.5)),
                 )
             )
     yield opened
@@ -59,36 +71,9 @@ def table_of(error: float) -> dict[str, Any]:
     return tables["lattice"]
 
 
-def make_submission(
-    name: str, created_at: float, *, public: bool = True, status: str = "scored"
-) -> SubmissionModel:
-    return SubmissionModel(
-        id=name,
-        token_id=1,
-        method=name,
-        details="{}",
-        archive_sha256="0" * 64,
-        archive_bytes=1,
-        status=status,
-        public=public,
-        created_at=created_at,
-        attempts=0,
-    )
-
-
 def test_leaderboard_entries_are_public_and_in_order(database: Database) -> None:
     shown = [(row.rank, row.id) for row in read_ranking(database, "lattice", DIGEST).entries]
     assert shown == [(1, "s2"), (2, "s0"), (3, "s4"), (4, "s3"), (None, "s6"), (None, "s5")]
-
-
-def test_queue_position_counts_earlier_submissions(database: Database) -> None:
-    waiting = [make_submission(f"q{k}", 200.0 + k, status="queued") for k in range(3)]
-    with database.write() as session:
-        session.add_all(waiting)
-        session.add(make_submission("q-", 150.0, status="scoring"))
-    positions = [queue_position(database, record) for record in waiting]
-    assert [position for position in positions if position] == [(1, 3), (2, 3), (3, 3)]
-    assert queue_position(database, make_submission("s0", 1.0)) is None
 
 
 def test_equal_errors_share_a_rank_overall_and_in_their_class(database: Database) -> None:
@@ -160,17 +145,6 @@ def entry_of(name: str, table: dict[str, Any], declared: dict[str, Any]) -> Lead
     )
 
 
-def test_cells_of_huge_and_undefined_numbers_are_short() -> None:
-    """Numbers of predictions of 1e200 m, and of none, are as wide as others."""
-    table = result(overflowed_view("lattice/0000")).to_dict()["tables"]["lattice"]
-    entry = entry_of("m", table, {"seconds_per_view": 1e18})
-    cells = {name: one.cell(entry).text for name, one in COLUMNS_BY_NAME.items() if one.number}
-    assert (cells["abs_rel"], cells["rmse"], cells["scale"]) == ("1.0e+200", "–", "1.0e-200")
-    assert cells["runtime"] == "1.0e+18"
-    assert max(map(len, cells.values())) <= 8
-    assert COLUMNS_BY_NAME["runtime"].cell(entry_of("m", table, {})).text == ""
-
-
 def test_rows_of_the_paper_and_references_have_the_columns_that_they_fill() -> None:
     ranking = Ranking((entry_of("m", table_of(0.5), {}),))
     table = config_table(ranking, "lattice", Selection(), 50)
@@ -180,20 +154,6 @@ def test_rows_of_the_paper_and_references_have_the_columns_that_they_fill() -> N
         assert name
         assert texts.keys() <= paths, name
     assert config_table(Ranking(()), "lattice", Selection(), 50)["published"] == []
-
-
-def test_heading_link_reverses_sort_order() -> None:
-    rmse = Selection("rmse", page=3)
-    assert rmse.sorted_by("rmse").query(None) == "sort=-rmse"
-    assert rmse.sorted_by("rmse").sorted_by("rmse").query(None) == "sort=rmse"
-    assert (rmse.is_descending, Selection("within_5mm").is_descending) == (False, True)
-    assert [parse_selection(text, None, None, None, None) for text in (None, "nope", "-", "-rmse", "-rank")] == [
-        Selection(),
-        Selection(),
-        Selection(),
-        Selection("rmse", inverted=True),
-        Selection(RANK, inverted=True),
-    ]
 
 
 @given(
@@ -212,8 +172,3 @@ def test_query_of_a_selection_is_read_back(
     assert values.pop("config") == "lattice"
     read = [values.get(name) for name in ("sort", "inputs", "q", "rows", "page")]
     assert parse_selection(*read) == selection
-
-
-@pytest.mark.parametrize("page", ["abc", "0", "-1", "1.5", "²", "9" * 5000, ""])
-def test_page_that_is_no_number_is_the_first(page: str) -> None:
-    assert parse_selection(None, None, None, None, page).page == 1
