@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, Engine, create_engine, event, inspect, select, text
+from sqlalchemy import URL, Connection, Engine, create_engine, event, inspect, select, text
 from sqlalchemy.exc import ArgumentError, DatabaseError, InterfaceError, NoSuchModuleError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from sqlalchemy.orm import Session
@@ -157,14 +157,19 @@ def _engine(url: str, read_only: bool) -> Engine:
             pool_size=10,
             max_overflow=10,
         )
+    sqlite_url = URL.create("sqlite", database=str(path))  # As text, SQLAlchemy would replace %20 in the path.
     if read_only:
         # Without a write-ahead log nobody has the database open, and SQLite would create one to read it.
         mode = "mode=ro" if Path(f"{path}-wal").exists() else "immutable=1"
         uri = f"{path.resolve().as_uri()}?{mode}"
-        return create_engine(url, creator=lambda: sqlite3.connect(uri, uri=True))
+        return create_engine(sqlite_url, creator=lambda: sqlite3.connect(uri, uri=True))
     path.parent.mkdir(parents=True, exist_ok=True)
     engine = create_engine(
-        url, hide_parameters=True, connect_args={"timeout": SQLITE_BUSY_TIMEOUT_S}, pool_size=20, max_overflow=20
+        sqlite_url,
+        hide_parameters=True,
+        connect_args={"timeout": SQLITE_BUSY_TIMEOUT_S},
+        pool_size=20,
+        max_overflow=20,
     )
     event.listen(engine, "connect", _configure_sqlite)
     event.listen(engine, "begin", _begin_transaction)

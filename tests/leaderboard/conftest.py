@@ -18,31 +18,21 @@ from playwright.sync_api import Browser, sync_playwright
 from leaderboard.db import jobs, submissions
 from leaderboard.db.tokens import create_token
 from leaderboard.scoring.sandbox import Outcome
-from rebar_depth_bench import SubmissionWriter, load, score
+from rebar_depth_bench import SubmissionWriter, load
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.remote import leaderboard_client
 from rebar_depth_bench.scoring.metrics import DepthMetrics
 from rebar_depth_bench.scoring.result import DatasetIdentity
 from rebar_depth_bench.submission.declaration import Declaration
 from tests.bench.reporting.results import result, scored_view
 from tests.leaderboard import serving
 from tests.leaderboard.boards import OTHER_DIGEST, accept, board_settings, claimed, opened
-from tests.leaderboard.scripted_server import (
-    TOKEN,
-    TOKEN_INFO,
-    ScriptedServer,
-    answer,
-    scripted_server,
-    submission,
-)
 from tests.leaderboard.serving import Postgres, RunPostgres, RunScorer, RunServer, Server, make_token
 
 HOSTILE = "<script>alert(1)</script>\"'&amp;{{ 7 * 7 }}"
 DESCRIPTION = "first line\n<b>second</b>\u202egnp\x1b[31m"
 
 WriteArchive = Callable[..., Path]
-Refused = Callable[..., str]
-"""Types of the functions that the fixtures of the same names return."""
+"""Type of the function that the fixture of the same name returns."""
 
 
 @dataclass(frozen=True)
@@ -198,7 +188,8 @@ def crowded(
     ids = {}
     with opened(board_settings(state)) as (database, _):
         jobs.serve_dataset(database, digest, rescore=False)
-        token, organiser = create_token(database, "x" * 100), create_token(database, "org", baseline=True)
+        token = create_token(database, "x" * 100)
+        organiser = serving.run("token", "org", "--baseline", "--state-dir", state).stdout.strip()
         for name, error in errors.items():
             view = scored_view("lattice/0000", error)
             if name == "huge":
@@ -218,50 +209,6 @@ def crowded(
         submissions.change(database, ids["outdated"], kept)
     with running_server(state, workers=0, **LINKS) as server:
         yield SharedServer(server, token, ids)
-
-
-@pytest.fixture(scope="session")
-def small_result(small_archive: Path, tiny_root: Path) -> bytes:
-    """Return the result of ``small_archive`` as JSON."""
-    return score(small_archive, tiny_root).to_json()
-
-
-@pytest.fixture
-def scripted(
-    small_archive: Path, small_result: bytes, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[ScriptedServer]:
-    """Run a server that accepts and scores ``small_archive``; tests replace its answers."""
-    monkeypatch.setattr(leaderboard_client, "POLL_INTERVAL_S", 0.01)
-    monkeypatch.setenv("REBAR_LEADERBOARD_TOKEN", TOKEN)
-    with scripted_server() as script:
-        script.answers = {
-            "token": [answer(TOKEN_INFO)],
-            "submit": [answer(submission(small_archive), 202)],
-            "status": [answer(submission(small_archive, status=status)) for status in ("queued", "scored")],
-            "result": [answer(small_result)],
-        }
-        yield script
-
-
-@pytest.fixture
-def refused(
-    scripted: ScriptedServer, small_archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> Refused:
-    """Submit to the scripted server, and check exit status and that nothing is written; return the message."""
-
-    def check(status: int = 1) -> str:
-        start = time.monotonic()
-        assert scripted.submit(small_archive, "--json", str(tmp_path / "r.json")) == status
-        assert time.monotonic() - start < 20
-        assert list(tmp_path.iterdir()) == []
-        captured = capsys.readouterr()
-        assert captured.out == ""
-        assert all(line.isprintable() and len(line) < 3000 for line in captured.err.split("\n"))
-        assert len(captured.err) < 30_000
-        assert TOKEN not in captured.err
-        return captured.err[captured.err.index("error: ") :]
-
-    return check
 
 
 @pytest.fixture(scope="module")

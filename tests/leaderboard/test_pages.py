@@ -196,14 +196,6 @@ def test_account_shows_what_is_left_of_the_quota_and_ranks(
     assert f"lattice rank error {row['table']['rank_error']:.4f}" in private
 
 
-def test_private_submission_is_not_on_leaderboard_page(waiting: SharedServer) -> None:
-    response, parsed = page(f"{waiting.url}/")
-    assert "No submission of lattice is on the leaderboard yet." in parsed.text
-    assert waiting.ids["scored"] not in response.text
-    assert "rank" not in page(waiting.page("scored"))[1].text.split("Submitted by")[0].replace("not ranked", "")
-    assert get(waiting.page("scored")).headers["cache-control"] == "no-store"
-
-
 def test_overview_orders_by_the_mean_over_configs(board: SharedServer) -> None:
     table = get(f"{board.url}/").text.partition('aria-label="Ranks in all configs"')[2].partition("</table>")[0]
     rows = {config: board.server.rows(config=config) for config in CONFIGS}
@@ -354,12 +346,3 @@ def test_form_rejects_uploads_like_api(waiting: SharedServer, write_archive: Wri
     assert len(api_problems) > 1
     assert all(" ".join(problem.split()) in shown for problem in api_problems)
     assert not list((waiting.server.state / "spool").glob("*.upload"))
-
-
-def test_how_to_submit_page_shows_command_and_form(waiting: SharedServer) -> None:
-    _, parsed = page(f"{waiting.url}/how-to-submit")
-    assert f"rebar-bench submit ARCHIVE --url {waiting.url}" in parsed.text
-    assert "5 submissions and 64 GiB a day" in parsed.text
-    assert [field["name"] for field in parsed.attributes_of("input")] == ["token", "archive"]
-    assert parsed.attributes_of("input")[0]["autocomplete"] == "off"
-    assert parsed.attributes_of("form")[0]["enctype"] == "multipart/form-data"

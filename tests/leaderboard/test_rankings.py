@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 
 from leaderboard.db.engine import Database
 from leaderboard.db.models import LeaderboardRowModel, SubmissionModel, TokenModel
-from leaderboard.db.rankings import LeaderboardEntry, Ranking, queue_position, read_ranking
-from leaderboard.web.pages.board_columns import COLUMNS_BY_NAME, METHOD, RANK
+from leaderboard.db.rankings import LeaderboardEntry, Ranking, read_ranking
+from leaderboard.web.pages.board_columns import COLUMNS_BY_NAME, METHOD
 from leaderboard.web.pages.ranking import config_table
 from leaderboard.web.pages.selection import Selection, parse_selection
 from rebar_depth_bench.scoring.protocol import PROTOCOL
-from tests.bench.reporting.results import overflowed_view, result, scored_view, unpredicted_view
+from tests.bench.reporting.results import result, scored_view, unpredicted_view
 from tests.leaderboard.boards import DIGEST
 
 ERRORS = [0.3, 0.1, 0.1, 2.0, 0.7, None, 0.05]
@@ -35,8 +35,21 @@ def database(tmp_path: Path) -> Iterator[Database]:
         session.add(TokenModel(id=1, name="alice", sha256="0" * 64, created_at=0.0, baseline=False))
         session.flush()
         for index, error in enumerate(ERRORS):
-            table = table_of(error or 0.5)
-            session.add(make_submission(f"s{index}", 100.0 + index, public=index not in HIDDEN))
+            session.add(
+                SubmissionModel(
+                    id=f"s{index}",
+                    token_id=1,
+                    method=f"s{index}",
+                    details="{}",
+                    archive_sha256="0" * 64,
+                    archive_bytes=1,
+                    status="scored",
+                    public=index not in HIDDEN,
+                    created_at=100.0 + index,
+                    queued_at=100.0 + index,
+                    attempts=0,
+                )
+            )
             session.flush()
             session.add(
                 LeaderboardRowModel(
@@ -46,7 +59,7 @@ def database(tmp_path: Path) -> Iterator[Database]:
                     config="lattice",
                     ranked=index not in UNRANKED,
                     rank_error=error,
-                    json=json.dumps(table),
+                    json=json.dumps(table_of(error or 0.5)),
                 )
             )
     yield opened
@@ -59,37 +72,22 @@ def table_of(error: float) -> dict[str, Any]:
     return tables["lattice"]
 
 
-def make_submission(
-    name: str, created_at: float, *, public: bool = True, status: str = "scored"
-) -> SubmissionModel:
-    return SubmissionModel(
-        id=name,
-        token_id=1,
-        method=name,
-        details="{}",
-        archive_sha256="0" * 64,
-        archive_bytes=1,
-        status=status,
-        public=public,
-        created_at=created_at,
-        queued_at=created_at,
-        attempts=0,
-    )
-
-
 def test_leaderboard_entries_are_public_and_in_order(database: Database) -> None:
     shown = [(row.rank, row.id) for row in read_ranking(database, "lattice", DIGEST).entries]
     assert shown == [(1, "s2"), (2, "s0"), (3, "s4"), (4, "s3"), (None, "s6"), (None, "s5")]
 
 
-def test_queue_position_counts_earlier_submissions(database: Database) -> None:
-    waiting = [make_submission(f"q{k}", 200.0 + k, status="queued") for k in range(3)]
+def test_best_rows_are_those_of_the_inputs_and_public(database: Database) -> None:
+    """A better row that is not public, or that declares other inputs, takes no place."""
     with database.write() as session:
-        session.add_all(waiting)
-        session.add(make_submission("q-", 150.0, status="scoring"))
-    positions = [queue_position(database, record) for record in waiting]
-    assert [position for position in positions if position] == [(1, 3), (2, 3), (3, 3)]
-    assert queue_position(database, make_submission("s0", 1.0)) is None
+        for name, inputs in (("s1", "rgb"), ("s2", "stereo"), ("s0", "rgb"), ("s4", "rgb")):
+            record = session.get_one(SubmissionModel, name)
+            record.method, record.inputs = "m", inputs
+        alice = session.get_one(TokenModel, 1)
+    ranking = read_ranking(database, "lattice", DIGEST, alice)
+    best = {name: [(row.id, row.rank) for row in ranking.best(name).entries] for name in ("rgb", None)}
+    assert best["rgb"] == [("s1", None), ("s0", 1)]
+    assert best[None][:3] == [("s1", None), ("s2", 1), ("s3", 2)]
 
 
 def test_equal_errors_share_a_rank_overall_and_in_their_class(database: Database) -> None:
@@ -161,17 +159,6 @@ def entry_of(name: str, table: dict[str, Any], declared: dict[str, Any]) -> Lead
     )
 
 
-def test_cells_of_huge_and_undefined_numbers_are_short() -> None:
-    """Numbers of predictions of 1e200 m, and of none, are as wide as others."""
-    table = result(overflowed_view("lattice/0000")).to_dict()["tables"]["lattice"]
-    entry = entry_of("m", table, {"seconds_per_view": 1e18})
-    cells = {name: one.cell(entry).text for name, one in COLUMNS_BY_NAME.items() if one.number}
-    assert (cells["abs_rel"], cells["rmse"], cells["scale"]) == ("1.0e+200", "–", "1.0e-200")
-    assert cells["runtime"] == "1.0e+18"
-    assert max(map(len, cells.values())) <= 8
-    assert COLUMNS_BY_NAME["runtime"].cell(entry_of("m", table, {})).text == ""
-
-
 def test_rows_of_the_paper_and_references_have_the_columns_that_they_fill() -> None:
     ranking = Ranking((entry_of("m", table_of(0.5), {}),))
     table = config_table(ranking, "lattice", Selection(), 50)
@@ -181,20 +168,6 @@ def test_rows_of_the_paper_and_references_have_the_columns_that_they_fill() -> N
         assert name
         assert texts.keys() <= paths, name
     assert config_table(Ranking(()), "lattice", Selection(), 50)["published"] == []
-
-
-def test_heading_link_reverses_sort_order() -> None:
-    rmse = Selection("rmse", page=3)
-    assert rmse.sorted_by("rmse").query(None) == "sort=-rmse"
-    assert rmse.sorted_by("rmse").sorted_by("rmse").query(None) == "sort=rmse"
-    assert (rmse.is_descending, Selection("within_5mm").is_descending) == (False, True)
-    assert [parse_selection({"sort": text}) for text in ("", "nope", "-", "-rmse", "-rank")] == [
-        Selection(),
-        Selection(),
-        Selection(),
-        Selection("rmse", inverted=True),
-        Selection(RANK, inverted=True),
-    ]
 
 
 @given(
@@ -212,8 +185,3 @@ def test_query_of_a_selection_is_read_back(
     values = dict(parse_qsl(selection.query("lattice")))
     assert values.pop("config") == "lattice"
     assert parse_selection(values) == selection
-
-
-@pytest.mark.parametrize("page", ["abc", "0", "-1", "1.5", "²", "9" * 5000, ""])
-def test_page_that_is_no_number_is_the_first(page: str) -> None:
-    assert parse_selection({"page": page}).page == 1
