@@ -20,7 +20,7 @@ from rich.console import Console
 import rebar_depth_bench as rdb
 from rebar_depth_bench import InputError, score
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.data.bars import read_bars, write_bars
+from rebar_depth_bench.data.bars import Bar, read_bars, write_bars
 from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.extended.result import ExtendedResult
 from rebar_depth_bench.reporting.extended_tables import extended_csv
@@ -229,6 +229,7 @@ def test_bars_of_a_dataset_folder(tiny_root: Path, tmp_path: Path) -> None:
     path = root / "bars.parquet"
     bars = list(read_bars(path)["lattice"])
     bars[0] = replace(bars[0], nominal_axis_m=((0.0, 0.0, 0.5), (1.0, 0.0, 0.5)))
+    bars[1] = Bar.without_axis(bars[1].bar_id, bars[1].role)
     write_bars(path, {"lattice": tuple(bars)})
     change_manifest(root, lambda manifest, _: manifest["files"].update({path.name: file_sha256(path)}))
     frame = rdb.bars(root)
@@ -238,7 +239,9 @@ def test_bars_of_a_dataset_folder(tiny_root: Path, tmp_path: Path) -> None:
     first = frame.iloc[0]
     assert np.array_equal(first["axis"], np.array(bars[0].axis_m))
     assert np.array_equal(first["nominal_axis"], np.array(bars[0].nominal_axis_m))
-    assert {axis.shape for axis in frame["nominal_axis"][1:]} == {(0, 3)}
+    assert set(frame["nominal_axis"][1:]) == {None}
+    assert frame.iloc[1]["axis"] is None
+    assert frame.iloc[1][["diameter_m", "length_m"]].isna().all()
     assert first["length_m"] == pytest.approx(float(np.linalg.norm(np.diff(first["axis"], axis=0), axis=1).sum()))
 
 
