@@ -12,8 +12,8 @@ help: ## List the targets
 
 demo: ## Render six views of the lattice, predict with four methods, score, and write the reports
 	@scripts/system_packages.sh blender
-	@scripts/environment.sh $(PYTHON) $(VENV) build
-	$(BIN)/rebar-bench demo
+	@scripts/environment.sh $(PYTHON) $(VENV)-demo build
+	$(VENV)-demo/bin/rebar-bench demo
 
 quick: env-dev ## Format, lint, types, import contracts, and the fast tests that need no Blender, server, database or browser
 	scripts/check.sh $(BIN) quick
@@ -56,4 +56,4 @@ system-packages: ## Check the system packages that rendering and testing need; a
 	@scripts/system_packages.sh blender browser uploads proxy
 
 clean: ## Remove the environments and the demo's output
-	rm -rf $(VENV) $(VENV)-3.* build dist *.egg-info demo-output
+	rm -rf $(VENV) $(VENV)-3.* $(VENV)-demo build dist *.egg-info demo-output

@@ -128,7 +128,7 @@ def read_cage(spec: CageFileSpec | MeshFileSpec) -> Cage:
     else:
         source = _toml_cage(content, spec.path)
     check_values(source.bars, spec.path)
-    cage = placed(source, spec.placement)
+    cage = placed(source, spec.placement, spec.path)
     return replace(cage, problems=(*cage.problems, *cage_problems(cage.bars)))
 
 

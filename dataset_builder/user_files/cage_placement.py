@@ -11,7 +11,7 @@ from numpy import ndarray
 
 from dataset_builder.scene.assemblies.bar_meshes import bar_mesh, bar_reach_m, with_ribs_chosen
 from dataset_builder.scene.assemblies.cage import Cage, CageBar
-from dataset_builder.scene.model import METRE_DECIMALS, Mesh, axis_of
+from dataset_builder.scene.model import METRE_DECIMALS, Mesh, Note, axis_of
 from dataset_builder.scene.shapes.solids import rotation_about_z
 from dataset_builder.specs.file_specs import PlacementSpec
 
@@ -26,8 +26,8 @@ _SAME_SHAPE_DECIMALS = 6
 """Rounding of the coordinates by which bars of the same shape are recognised, metres: to the micrometre."""
 
 
-def placed(cage: Cage, placement: PlacementSpec) -> Cage:
-    """Return the cage in the world frame.
+def placed(cage: Cage, placement: PlacementSpec, where: str) -> Cage:
+    """Return the cage of the file ``where`` in the world frame, with a note if centring moves it.
 
     The bars of ``cage`` are in the file's frame, in metres, and its ``world_from_source`` is the scale of the
     file's unit. A cage that is centred has its box in the middle above the world's origin, to whole millimetres,
@@ -40,7 +40,15 @@ def placed(cage: Cage, placement: PlacementSpec) -> Cage:
     motion = _Motion(rotation, origin_m, np.array(placement.translate_m))
     matrix = motion.matrix
     bars = cage.bars if (matrix == np.eye(4)).all() else tuple(map(motion.moved, cage.bars))
-    return replace(cage, bars=bars, world_from_source=matrix @ cage.world_from_source)
+    notes: tuple[Note, ...] = ()
+    if origin_m.any():
+        x, y, z = (0.0 - up @ origin_m).tolist()
+        text = (
+            f"the steel is moved by x {x:.3f}, y {y:.3f}, z {z:.3f} m, to the middle and onto the ground, without "
+            'cover below it; origin = "keep" in a scene TOML file keeps the place that the file gives it'
+        )
+        notes = (Note(where, "moved", text),)
+    return replace(cage, bars=bars, world_from_source=matrix @ cage.world_from_source, placement_notes=notes)
 
 
 @dataclass(frozen=True, eq=False)

@@ -54,16 +54,15 @@ def argument_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def estimate(value: float | None, draws: Float64[ndarray, " draws"], blocks: int) -> dict[str, Any]:
+def estimate(value: float | None, draws: Float64[ndarray, " draws"], blocks: bootstrap.Blocks) -> dict[str, Any]:
     """Return a value with its 95 % interval over resamples of blocks; the interval is None for few blocks."""
     return {"value": value, "interval": bootstrap.interval(draws, blocks)}
 
 
 def resampling_of(views: pd.DataFrame) -> bootstrap.Resampling:
     """Return the resamples of views of one config: of whole scenes if it has several."""
-    if views["by_scene"].any():
-        return bootstrap.resample_views(views["view_id"].tolist(), by_scene=True)
-    return bootstrap.resample(views["index"].tolist())
+    how = views[["by_scene", "views_per_distance"]].iloc[0].to_dict()
+    return bootstrap.resample_views(views["view_id"].tolist(), **how)
 
 
 def view_table(evaluation: Evaluation, config: DatasetConfig, result: Result) -> pd.DataFrame:
@@ -74,7 +73,7 @@ def view_table(evaluation: Evaluation, config: DatasetConfig, result: Result) ->
     columns = {
         "config": config.name,
         "by_scene": config.has_splits,
-        "index": bootstrap.protocol_indices(truths.view_ids),
+        "views_per_distance": config.views_per_distance,
         "view_id": truths.view_ids,
         "distance_m": [view.distance_m for view in truths.traits],
         "scale": np.array([score.scale for score in scores], np.float64),
@@ -125,7 +124,7 @@ def scale_slope(name: str, configs: Mapping[str, pd.DataFrame]) -> dict[str, Any
         moments = [regression_moments(views, math.log(nearest_m * farthest_m) / 2) for views in usable]
         resamplings = [resampling_of(views) for views in usable]
         sums = [one.counts @ one.sums(of_views) for one, of_views in zip(resamplings, moments, strict=True)]
-        fewest = min(one.blocks() for one in resamplings)
+        fewest = min((one.blocks() for one in resamplings), key=lambda one: one.degrees_of_freedom)
         slope_interval = bootstrap.interval(least_squares_slopes(np.sum(sums, axis=0)), fewest)
         value = least_squares_slopes(np.sum([one.sum(axis=0) for one in moments], axis=0)[None]).item()
     row = {"config": name, "views": len(distances_m), "nearest_m": nearest_m, "farthest_m": farthest_m}

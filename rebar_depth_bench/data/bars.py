@@ -121,15 +121,16 @@ def bars(root: str | Path) -> DataFrame:
     """Return the bars of every scene of a dataset folder or Hub repository as a frame, one row per bar.
 
     Columns as in ``bars.parquet``, and ``length_m`` of the centreline; ``axis`` and ``nominal_axis`` are float64
-    arrays of shape (n, 3), world frame, metres. A bar without an axis has NaN, NaN and no points. Raises
-    ``DatasetError`` if the folder is invalid, or its table of bars is damaged or not that of the manifest.
+    arrays of shape (n, 3), world frame, metres, or None where the table has null: a bar without an axis has the
+    axis None and NaN as diameter and length. Raises ``DatasetError`` if the folder is invalid, or its table of
+    bars is damaged or not that of the manifest.
     """
     import pandas as pd  # Half a second to import, which reading bars for scoring does not need.
 
     rows = [
         (
             *(scene, bar.bar_id, bar.role, bar.diameter_m),
-            *(np.array(line).reshape(-1, 3) for line in (bar.axis_m, bar.nominal_axis_m)),
+            *(np.array(line) if line else None for line in (bar.axis_m, bar.nominal_axis_m)),
             bar.length_m,
         )
         for scene, scene_bars in read_bars(open_folder(root).verified_file(BARS_FILE)).items()

@@ -37,6 +37,7 @@ from rebar_depth_bench.data.schema import (
     Rig,
     Scene,
     Sha256,
+    Survey,
     ViewRecord,
 )
 
@@ -129,6 +130,12 @@ class DatasetConfig(Located):
         if "views" in info.data and digest != (expected := views_digest(info.data["views"])):
             raise field_error(f"got {digest}", f"the digest of the views, {expected}", "conflict")
         return digest
+
+    @property
+    def views_per_distance(self) -> int | None:
+        """Number of views at each distance of a survey; None for other cameras, and with splits."""
+        protocol = None if self.has_splits else self.scenes[0].protocol
+        return protocol.views_per_distance if isinstance(protocol, Survey) else None
 
     @property
     def splits(self) -> tuple[str, ...]:

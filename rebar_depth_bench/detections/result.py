@@ -15,7 +15,7 @@ from rebar_depth_bench import software_version
 from rebar_depth_bench.bar_crossings.definition import CROSSINGS_PROTOCOL
 from rebar_depth_bench.bar_crossings.table import CrossingsSource
 from rebar_depth_bench.extended.measures import percentile
-from rebar_depth_bench.scoring.bootstrap import INTERVALS, MIN_BLOCKS, Interval, Resampling, interval
+from rebar_depth_bench.scoring.bootstrap import INTERVALS, Interval, Resampling, interval
 from rebar_depth_bench.scoring.columns import rounded, rounded_interval
 from rebar_depth_bench.submission.declaration import SubmissionMeta
 
@@ -58,7 +58,7 @@ class RankedDetections:
         ordered, ends = self._order()
         correct, view = self.correct[ordered].astype(np.float64), self.view[ordered]
         blocks = resampling.blocks(np.flatnonzero(self.positives))
-        view_counts = resampling.view_counts if blocks >= MIN_BLOCKS else np.empty((0, 0))
+        view_counts = resampling.view_counts if blocks.are_enough else np.empty((0, 0))
         draws = np.full(len(view_counts), np.nan)
         for draw, counts in enumerate(view_counts):
             total = float(counts @ self.positives)

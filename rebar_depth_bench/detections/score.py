@@ -65,9 +65,11 @@ def score_crossings(
 
         task = f"crossings of {config.name}"
         found = map_with_progress(compare, range(len(steel)), workers, progress, task, len(steel))
-        resampling = resample_views(steel.view_ids, by_scene=config.has_splits) if found else None
         views[config.name] = found
-        tables[config.name] = tabulate_detections(found, resampling)
+        resampling = resample_views(
+            steel.view_ids, by_scene=config.has_splits, views_per_distance=config.views_per_distance
+        )
+        tables[config.name] = tabulate_detections(found, resampling if found else None)
     assert source is not None
     of_all = [view for of_config in views.values() for view in of_config]
     known = {view.view_id for view in of_all}

@@ -150,7 +150,7 @@ def _reach(
         limit_mm,
         verdict,
         float(edges_m[reached]) if reached else None,
-        interval(drawn_m, min(blocks[tested]), "inverted_cdf"),
+        interval(drawn_m, min(blocks[tested], key=lambda one: one.degrees_of_freedom), "inverted_cdf"),
         tuple(bins),
     )
 

@@ -92,7 +92,9 @@ def score_extended(
         view_ids: tuple[str, ...] = ()
         if config.name in steel:
             view_ids, source = steel[config.name].view_ids, steel[config.name].source
-        resampling = resample_views(view_ids, by_scene=config.has_splits and bool(view_ids))
+        resampling = resample_views(
+            view_ids, by_scene=config.has_splits, views_per_distance=config.views_per_distance
+        )
         tables[config.name] = tabulate_extended([samples[view_id] for view_id in view_ids], resampling, measures)
     views = {view_id: view_numbers(samples[view_id], measures) for view_id in places}
     return replace(result, extended=ExtendedResult(measures, tables, views, source))

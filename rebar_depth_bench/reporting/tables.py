@@ -242,9 +242,10 @@ def _print_notes(result: Result, console: Console) -> None:
 
 COMPARISON_NOTE = (
     "B - A: mean over the views that both have. 95 % interval: bootstrap of blocks of neighbouring views "
-    f"({BLOCK_VIEWS} steps of the protocol), of whole scenes in configs with splits; none with fewer than "
-    f"{MIN_BLOCKS} blocks or, with splits, scenes. B is called better "
-    "or worse if the interval excludes zero, which happens by chance in about one of twenty comparisons. "
+    f"({BLOCK_VIEWS} steps of the protocol), of views within each distance of a survey, of whole scenes in "
+    f"configs with splits; none with fewer than {MIN_BLOCKS} blocks or, with splits, scenes, and a survey needs "
+    "one view more for each further distance. B is called better or worse if the interval excludes zero, which "
+    "happens by chance in about one of twenty comparisons. "
     "Errors of valid predictions are not compared if either submission has a coverage below 95 %, a view "
     "without prediction or an overflow; the error over all scored pixels always is."
 )

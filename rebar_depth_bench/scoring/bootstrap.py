@@ -6,6 +6,10 @@ block bootstrap of Politis and Romano ("A circular block-resampling procedure fo
 intervals describe the variation with other views of the same scene from the same camera protocol, not with other
 cages, lights or cameras.
 
+The views of a survey are spread over the steel, and those of one distance are exchangeable. They are resampled one
+by one within each distance: stratified bootstrap (Davison and Hinkley, "Bootstrap Methods and their Application",
+1997, section 3.2).
+
 In a config of several scenes, which are drawn independently of each other, whole scenes with all of their views
 are resampled: cluster bootstrap of Field and Welsh ("Bootstrapping clustered data", Journal of the Royal
 Statistical Society B 69, 2007). These intervals describe the variation with other scenes of the same generator.
@@ -23,7 +27,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from statistics import NormalDist
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -41,15 +45,38 @@ BLOCK_VIEWS = 12
 """Block length in steps of the full camera protocol: one ring of azimuths of the dome."""
 
 MIN_BLOCKS = 8
-"""Smallest number of blocks of views, or of scenes, with values for which an interval is computed."""
+"""Smallest number of blocks of views, or of scenes, with values for which an interval is computed.
 
-INTERVALS: Mapping[str, Any] = {"method": "expanded-percentile", "draws": RESAMPLES, "level": CONFIDENCE_LEVEL}
-"""Entry ``intervals`` of the JSON of results: how all of their intervals were computed."""
+A survey needs one view more for each distance after the first.
+"""
+
+INTERVALS: Mapping[str, Any] = {"method": "expanded-percentile-2", "draws": RESAMPLES, "level": CONFIDENCE_LEVEL}
+"""Entry ``intervals`` of the JSON of results: how all of their intervals were computed.
+
+Method 2 resamples the views of a survey one by one.
+"""
 
 _SEED = 0
 _VIEW_INDEX = re.compile("[0-9]{4,9}")
 
 Interval = tuple[float, float]
+
+
+class Blocks(NamedTuple):
+    """Number of blocks of views, or of scenes, and of the distances of a survey within which they are drawn."""
+
+    number: int
+    distances: int = 1
+
+    @property
+    def degrees_of_freedom(self) -> int:
+        """Number of independent deviations of blocks from the mean of their distance."""
+        return self.number - self.distances
+
+    @property
+    def are_enough(self) -> bool:
+        """Whether an interval is computed from so many."""
+        return self.degrees_of_freedom >= MIN_BLOCKS - 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,24 +85,27 @@ class Resampling:
 
     ``counts[i, j]`` is the number of times that unit j occurs in resample i; there are ``RESAMPLES`` resamples.
     ``unit`` holds the unit of each view; ``length`` is the number of consecutive views that are drawn together.
+    ``distance`` is the number of the distance of each view of a survey, within which it is drawn.
     """
 
     counts: Float64[ndarray, "draws units"]
     unit: Int64[ndarray, " n"]
     length: int = 1
+    distance: Int64[ndarray, " n"] | None = None
 
     @property
     def view_counts(self) -> Float64[ndarray, "draws n"]:
         """Number of times that each view occurs in each resample."""
         return self.counts[:, self.unit]
 
-    def blocks(self, view: Int64[ndarray, " m"] | None = None) -> int:
+    def blocks(self, view: Int64[ndarray, " m"] | None = None) -> Blocks:
         """Return the number of blocks of ``length`` views, or of scenes, that have any of some views.
 
         ``view`` holds positions of views, in any order and any number of times; all views by default.
         """
-        units = self.unit if view is None else self.unit[view]
-        return len(np.unique(units // self.length))
+        chosen = slice(None) if view is None else view
+        distances = 1 if self.distance is None else len(np.unique(self.distance[chosen]))
+        return Blocks(len(np.unique(self.unit[chosen] // self.length)), distances)
 
     def means(self, values: Float64[ndarray, "n k"]) -> Float64[ndarray, "draws k"]:
         """Return the mean of each column in each resample; NaN in ``values`` marks a view without a value.
@@ -147,32 +177,34 @@ class Resampling:
         return np.where(totals > 0, values, np.nan)
 
 
-def half_width(blocks: int) -> float:
+def half_width(blocks: Blocks) -> float:
     """Return half the width of the interval of a normal mean of two or more blocks, in standard deviations.
 
-    The deviation is that of the means of resamples. The half width is sqrt(u / (u - 1)) t for u blocks: variance
-    in resamples is (u - 1) / u of that in samples, and t is Student's quantile for u - 1 degrees of freedom.
+    The deviation is that of the means of resamples. The half width is sqrt(u / (u - d)) t for u blocks at d
+    distances: variance in resamples is (u - d) / u of that in samples, if each distance has as many blocks, and t
+    is Student's quantile for u - d degrees of freedom.
     """
     from scipy.special import stdtrit  # A tenth of a second to import.
 
-    return math.sqrt(blocks / (blocks - 1)) * float(stdtrit(blocks - 1, (1 + CONFIDENCE_LEVEL) / 2))
+    degrees = blocks.degrees_of_freedom
+    return math.sqrt(blocks.number / degrees) * float(stdtrit(degrees, (1 + CONFIDENCE_LEVEL) / 2))
 
 
-def end_percents(blocks: int) -> tuple[float, float]:
+def end_percents(blocks: Blocks) -> tuple[float, float]:
     """Return the percentiles of the estimates over resamples that are the ends of the interval."""
     low = 100 * NormalDist().cdf(-half_width(blocks))
     return low, 100 - low
 
 
 def interval(
-    estimates: Float64[ndarray, " draws"], blocks: int, method: Literal["linear", "inverted_cdf"] = "linear"
+    estimates: Float64[ndarray, " draws"], blocks: Blocks, method: Literal["linear", "inverted_cdf"] = "linear"
 ) -> Interval | None:
     """Return the interval of the finite estimates over resamples; None if there are none, or too few blocks.
 
-    ``blocks`` is the number of ``Resampling.blocks`` with a value, and ``method`` that of ``numpy.percentile``.
+    ``blocks`` are the ``Resampling.blocks`` with a value, and ``method`` is that of ``numpy.percentile``.
     """
     finite = estimates[np.isfinite(estimates)]
-    if blocks < MIN_BLOCKS or not len(finite):
+    if not blocks.are_enough or not len(finite):
         return None
     low, high = np.percentile(finite, end_percents(blocks), method=method)
     return float(low), float(high)
@@ -208,14 +240,32 @@ def resample_scenes(scenes: Sequence[str]) -> Resampling:
     return Resampling(_counts(drawn, n), np.array([number[scene] for scene in scenes], np.int64))
 
 
-def resample_views(view_ids: Sequence[str], *, by_scene: bool) -> Resampling:
+def resample_survey(indices: Sequence[int], views_per_distance: int) -> Resampling:
+    """Return the resamples of the views of a survey, given their ascending indices in the full camera protocol.
+
+    The full protocol has ``views_per_distance`` views at each distance, one distance after the other. Each
+    resample has as many views of a distance as there are, drawn with replacement. The same indices give the same
+    resamples on every machine.
+    """
+    n, distance = len(indices), np.array(indices, np.int64) // views_per_distance
+    _, first, views = np.unique(distance, return_index=True, return_counts=True)
+    numbers = np.random.PCG64(_SEED).random_raw(RESAMPLES * n).reshape(RESAMPLES, n)
+    places = (numbers % np.repeat(views, views).astype(np.uint64)).astype(np.int64)
+    return Resampling(_counts(np.repeat(first, views) + places, n), np.arange(n), distance=distance)
+
+
+def resample_views(
+    view_ids: Sequence[str], *, by_scene: bool, views_per_distance: int | None = None
+) -> Resampling:
     """Return the resamples of views: of whole scenes if ``by_scene``, otherwise of blocks of consecutive views.
 
-    Scenes are resampled in configs of several scenes, which are those with splits.
+    Scenes are resampled in configs of several scenes, which are those with splits. The views of a survey, which
+    has ``views_per_distance``, are resampled one by one.
     """
     if by_scene:
         return resample_scenes([scene_of(view_id) for view_id in view_ids])
-    return resample(protocol_indices(view_ids))
+    indices = protocol_indices(view_ids)
+    return resample(indices) if views_per_distance is None else resample_survey(indices, views_per_distance)
 
 
 def protocol_indices(view_ids: Sequence[str]) -> list[int]:

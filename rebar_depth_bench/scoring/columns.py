@@ -327,11 +327,16 @@ def texts(columns: Sequence[Column], table: Any) -> list[str]:
 
 
 def view_intervals(
-    views: Sequence[Any], columns: Sequence[Column] = VIEW_COLUMNS, *, by_scene: bool
+    views: Sequence[Any],
+    columns: Sequence[Column] = VIEW_COLUMNS,
+    *,
+    by_scene: bool,
+    views_per_distance: int | None,
 ) -> dict[str, Interval | None]:
-    """Return the 95 % interval of each of ``columns`` by path; ``by_scene`` as in ``resample_views``."""
+    """Return the 95 % interval of each of ``columns`` by path; the keywords are those of ``resample_views``."""
     values = view_values(views, columns)
-    resampling = resample_views([view.view_id for view in views], by_scene=by_scene)
+    view_ids = [view.view_id for view in views]
+    resampling = resample_views(view_ids, by_scene=by_scene, views_per_distance=views_per_distance)
     return column_intervals(bootstrap_estimates(values, columns, resampling), values, columns, resampling)
 
 

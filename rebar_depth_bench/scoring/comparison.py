@@ -32,7 +32,7 @@ from rebar_depth_bench.scoring.table import ViewScore
 if TYPE_CHECKING:
     from pandas import DataFrame
 
-Verdict = Literal["better", "worse", "equal", "undecided", "no verdict", ""]
+Verdict = Literal["better", "worse", "equal", "undecided", "too few views", "too few scenes", "no verdict", ""]
 
 
 @dataclass(frozen=True)
@@ -40,9 +40,10 @@ class Difference:
     """Metric of two submissions on the same views, and the difference ``other - first`` with its 95 % interval.
 
     ``verdict`` rates the other submission: "better" or "worse" if the interval excludes zero; "equal" if the
-    interval is [0, 0]; "undecided" if the interval contains zero or is None; "no verdict" for errors of valid
-    predictions if either submission has less than ``MIN_COMPARABLE_COVERAGE``, since errors over freely chosen
-    pixels are not comparable; "" for numbers of which neither direction is better, as the scale factor.
+    interval is [0, 0]; "undecided" if it contains zero; "too few views", or "too few scenes" with splits, if there
+    is none; "no verdict" for errors of valid predictions if either submission has less than
+    ``MIN_COMPARABLE_COVERAGE``, since errors over freely chosen pixels are not comparable; "" for numbers of which
+    neither direction is better, as the scale factor.
     """
 
     column: Column
@@ -145,6 +146,7 @@ def config_differences(first: Result, other: Result, config: str) -> list[Differ
             [of_other[view_id] for view_id in view_ids],
             columns,
             by_scene=tables[0].split is not None,
+            views_per_distance=tables[0].views_per_distance,
             are_comparable=all(table.is_comparable for table in tables),
         )
         for view_ids in (of_first, predicted_by_both)
@@ -158,10 +160,12 @@ def _differences_on_views(
     columns: Sequence[Column],
     *,
     by_scene: bool,
+    views_per_distance: int | None,
     are_comparable: bool,
 ) -> dict[str, Difference]:
     """Return the differences on the given views by metric name, with the same resamples for both submissions."""
-    resampling = resample_views([view.view_id for view in first], by_scene=by_scene)
+    view_ids = [view.view_id for view in first]
+    resampling = resample_views(view_ids, by_scene=by_scene, views_per_distance=views_per_distance)
     first_values, other_values = view_values(first, columns), view_values(other, columns)
     first_draws, other_draws = (
         bootstrap_estimates(values, columns, resampling) for values in (first_values, other_values)
@@ -172,9 +176,9 @@ def _differences_on_views(
         bounds = intervals[column.path]
         first_value, other_value = (_table_value(column, views) for views in (first, other))
         change = None if first_value is None or other_value is None else other_value - first_value
-        verdict = _verdict(column, bounds) if are_comparable or column.of_all_views else "no verdict"
+        verdict = _verdict(column, bounds, by_scene=by_scene, are_comparable=are_comparable)
         differences[column.path] = Difference(
-            column, len(first), first_value, other_value, change, bounds, verdict if column.better else ""
+            column, len(first), first_value, other_value, change, bounds, verdict
         )
     return differences
 
@@ -186,10 +190,16 @@ def _table_value(column: Column, views: Sequence[ViewScore]) -> float | None:
     return float(np.median(values) if column.statistic == "median" else np.mean(values))
 
 
-def _verdict(column: Column, bounds: Interval | None) -> Verdict:
+def _verdict(column: Column, bounds: Interval | None, *, by_scene: bool, are_comparable: bool) -> Verdict:
+    if not column.better:
+        return ""
+    if not (are_comparable or column.of_all_views):
+        return "no verdict"
+    if bounds is None:
+        return "too few scenes" if by_scene else "too few views"
     if bounds == (0.0, 0.0):
         return "equal"
-    if bounds is None or bounds[0] <= 0.0 <= bounds[1]:
+    if bounds[0] <= 0.0 <= bounds[1]:
         return "undecided"
     return "better" if (bounds[0] > 0) == (column.better == "higher") else "worse"
 

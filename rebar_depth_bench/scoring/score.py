@@ -68,7 +68,7 @@ class Truth:
 
     ``read(position)`` returns a view. ``references`` are the errors of ``view_reference`` and ``traits`` the
     properties by which views are grouped, of each view. ``split`` is that of the views, None in a config of one
-    scene. ``truth_sigma_m`` and ``published`` are those of ``Table``.
+    scene. ``views_per_distance``, ``truth_sigma_m`` and ``published`` are those of ``Table``.
     """
 
     view_ids: tuple[str, ...]
@@ -76,6 +76,7 @@ class Truth:
     references: Sequence[ReferenceNumbers]
     traits: Sequence[ViewTraits] = ()
     split: str | None = None
+    views_per_distance: int | None = None
     truth_sigma_m: float | None = None
     published: PublishedMatch | None = None
 
@@ -168,7 +169,8 @@ def tabulate_config(scores: Sequence[ViewScore], truth: Truth, declared: Declara
     def table_of(positions: Sequence[int]) -> Table:
         views = [scores[position] for position in positions]
         reference = mean_reference([truth.references[position] for position in positions])
-        return tabulate(views, declared, reference, truth.published, truth.split, truth.truth_sigma_m)
+        known = truth.published, truth.split, truth.truth_sigma_m, truth.views_per_distance
+        return tabulate(views, declared, reference, *known)
 
     table = table_of(range(len(scores)))
     if truth.split is None:
@@ -189,16 +191,18 @@ def tabulate(
     published: PublishedMatch | None = None,
     split: str | None = None,
     truth_sigma_m: float | None = None,
+    views_per_distance: int | None = None,
 ) -> Table:
     """Return the table of a config, or of a group of its views, from the scores of its scored views.
 
     Predictions that are not metric have aligned errors alone. The intervals of a config with splits are those of
-    resampled scenes, of others those of consecutive views. A config without views is not ranked, and neither is a
-    submission that declares the use of ground truth. An infinite metric (of a prediction so large that its square
-    overflows) is written as null; the rank error is always finite.
+    resampled scenes, of a survey those of views, of others those of consecutive views. A config without views is
+    not ranked, and neither is a submission that declares the use of ground truth. An infinite metric (of a
+    prediction so large that its square overflows) is written as null; the rank error is always finite.
     """
     if views and views[0].aligned is not None:
-        return _tabulate_relative(views, tabulate([], declared, reference, published, split, truth_sigma_m))
+        empty = tabulate([], declared, reference, published, split, truth_sigma_m, views_per_distance)
+        return _tabulate_relative(views, empty)
     predicted = [view for view in views if view.native is not None]
     native = mean_metrics([view.native for view in predicted if view.native])
     scaled = mean_metrics([view.scaled for view in predicted if view.scaled])
@@ -218,8 +222,9 @@ def tabulate(
         reference=replace(reference, scaled_constant=Errors(*map(mean, zip(*constants, strict=True)))),
         published=published,
         split=split,
+        views_per_distance=views_per_distance,
         truth_sigma_m=truth_sigma_m,
-        intervals=view_intervals(views, by_scene=split is not None)
+        intervals=view_intervals(views, by_scene=split is not None, views_per_distance=views_per_distance)
         if views
         else dict.fromkeys(column.path for column in VIEW_COLUMNS),
     )
@@ -227,6 +232,7 @@ def tabulate(
 
 def _tabulate_relative(views: Sequence[ViewScore], empty: Table) -> Table:
     """Return the table of one or more views of predictions that are not metric; ``empty`` is that of no views."""
+    by_scene, per_distance = empty.split is not None, empty.views_per_distance
     return replace(
         empty,
         views=len(views),
@@ -236,5 +242,5 @@ def _tabulate_relative(views: Sequence[ViewScore], empty: Table) -> Table:
         aligned_robust=mean_errors([view.aligned_robust for view in views]),
         constant=mean_errors([view.constant for view in views]),
         flat_views=sum(view.is_flat is True for view in views),
-        intervals=view_intervals(views, RELATIVE_INTERVALS, by_scene=empty.split is not None),
+        intervals=view_intervals(views, RELATIVE_INTERVALS, by_scene=by_scene, views_per_distance=per_distance),
     )

@@ -175,16 +175,18 @@ class Table:
 
     ``rank_error`` is None without views; ``reference`` are the config's reference errors,
     and ``published`` is the scene of the paper's Table I that it shows, if any. ``split`` is None
-    for a config of one scene. ``truth_sigma_m`` is the standard deviation of the ground truth's depth, None where
-    it is exact. ``of_views`` is the number of the config's views, None if ``views`` are all. ``intervals`` has the
-    95 % bootstrap interval of each of ``VIEW_COLUMNS``, None where undefined. A table of predictions that are not
-    metric has the means of ``aligned``, ``aligned_robust`` and ``constant`` instead, with the intervals of
-    ``RELATIVE_INTERVALS``, and the number of views whose fit has no positive slope.
+    for a config of one scene. ``views_per_distance`` is that of a survey, otherwise None. ``truth_sigma_m`` is the
+    standard deviation of the ground truth's depth, None where it is exact. ``of_views`` is the number of the
+    config's views, None if ``views`` are all. ``intervals`` has the 95 % bootstrap interval of each of
+    ``VIEW_COLUMNS``, None where undefined. A table of predictions that are not metric has the means of
+    ``aligned``, ``aligned_robust`` and ``constant`` instead, with the intervals of ``RELATIVE_INTERVALS``, and the
+    number of views whose fit has no positive slope.
     ``groups`` has the tables of groups of views by grouping (see ``groups.GROUPINGS``) and group, of a config with
     splits; they have no groups.
     """
 
     split: Annotated[str, Strict(), one_of(*SPLITS)] | None = None
+    views_per_distance: Annotated[int, Strict(), Field(ge=1, lt=1 << 53)] | None = None
     truth_sigma_m: Annotated[float, Strict(), Field(ge=0)] | None = None
     views: Count
     of_views: Count | None = None
@@ -264,6 +266,7 @@ def _without_absent(table: Table, write: SerializerFunctionWrapHandler) -> dict[
     """Return the JSON object of a table, without the keys that only some tables have."""
     absent = {
         "split": table.split is None,
+        "views_per_distance": table.views_per_distance is None,
         "truth_sigma_m": table.truth_sigma_m is None,
         "groups": not table.groups,
         "of_views": table.of_views is None,

@@ -69,6 +69,7 @@ def config_truth(folder: DatasetFolder, config: DatasetConfig, progress: Progres
         references=references,
         traits=traits,
         split=config.scenes[0].split if config.has_splits else None,
+        views_per_distance=config.views_per_distance,
         truth_sigma_m=None if config.imported is None else config.imported.truth_sigma_m,
         published=published_match(config),
     )

@@ -213,7 +213,7 @@ def test_counts_pool_over_views_by_hand(mat: Path, tmp_path: Path) -> None:
     views = {view["view_id"]: view for view in result["views"]}
     assert views[f"{CONFIG}/0001"]["detections"] == 0
     assert len(views) == result["views_scored"] == VIEWS
-    assert result["intervals"]["method"] == "expanded-percentile"
+    assert result["intervals"]["method"] == "expanded-percentile-2"
     assert set(result["ci95"].values()) == {None}, "six consecutive views are one block"
 
 

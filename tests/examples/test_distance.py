@@ -17,7 +17,7 @@ import distance
 from distance import distance_bins, scale_slope
 from rebar_depth_bench.methods import METHODS
 from rebar_depth_bench.methods.run import predict
-from rebar_depth_bench.scoring.bootstrap import half_width
+from rebar_depth_bench.scoring.bootstrap import Blocks, half_width
 from rebar_depth_bench.scoring.evaluation import score
 from tests.examples.scripts import refusal, repeated_files, result_of
 from tests.synthetic_dataset import write_split_dataset
@@ -37,7 +37,7 @@ def table(distances_m: Sequence[float], scales: Sequence[float], step: int = 1) 
         {
             "config": "lattice-distance",
             "by_scene": False,
-            "index": range(0, step * len(scale), step),
+            "views_per_distance": None,
             "view_id": [f"lattice-distance/{step * index:04d}" for index in range(len(scale))],
             "distance_m": np.array(distances_m, float),
             "scale": scale,
@@ -70,7 +70,7 @@ def test_slope_interval_has_nominal_coverage() -> None:
         widths.append(high - low)
     assert 53 <= covered <= 60, "95 % of 60 are 57"
     standard_error = 0.2 / (np.std(np.log(SWEEP_M)) * math.sqrt(len(SWEEP_M)))
-    assert np.mean(widths) == pytest.approx(2 * half_width(8) * standard_error, rel=0.15)
+    assert np.mean(widths) == pytest.approx(2 * half_width(Blocks(8)) * standard_error, rel=0.15)
 
 
 @given(st.lists(st.tuples(st.floats(0.1, 20.0), st.floats(0.05, 20.0)), min_size=3, max_size=40))

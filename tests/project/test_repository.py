@@ -108,6 +108,18 @@ def test_workflow_classifiers_and_requirement_name_the_same_versions() -> None:
     assert PROJECT["requires-python"] == f">={VERSIONS[0]}"
 
 
+def test_demo_neither_uses_nor_changes_the_environment_of_developers() -> None:
+    def commands(target: str) -> str:
+        made = subprocess.run(["make", "--dry-run", target], cwd=ROOT, capture_output=True, text=True, check=True)
+        return made.stdout
+
+    demo, dev = (re.findall(r"environment\.sh \S+ (\S+)", commands(target)) for target in ("demo", "env-dev"))
+    assert len(demo) == len(dev) == 1
+    assert demo != dev
+    assert f"{demo[0]}/bin/rebar-bench demo" in commands("demo")
+    assert demo[0] in commands("clean").split()
+
+
 def write_program(path: Path, text: str) -> Path:
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(f"#!/bin/sh\n{text}\n")

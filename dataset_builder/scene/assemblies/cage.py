@@ -69,18 +69,19 @@ class Cage:
     """Bars of a user's file, what the file holds beside them, and how they were placed.
 
     ``world_from_source`` takes coordinates in the file's frame and unit to the world frame in metres.
-    ``problems`` are the reasons for which a build refuses the cage.
+    ``problems`` are the reasons for which a build refuses the cage; ``placement_notes`` say how it was moved.
     """
 
     bars: tuple[CageBar, ...]
     left_out: tuple[LeftOut, ...] = ()
     world_from_source: Float64[ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
     problems: tuple[Problem, ...] = ()
+    placement_notes: tuple[Note, ...] = ()
 
     @property
     def notes(self) -> tuple[Note, ...]:
-        """Notes of the bars, each once; those on lengths last, of which some files have one for every bar."""
-        notes = dict.fromkeys(note for bar in self.bars for note in bar.notes)
+        """Notes on cage and bars, each once; those on lengths last, of which some files have one for every bar."""
+        notes = dict.fromkeys((*self.placement_notes, *(note for bar in self.bars for note in bar.notes)))
         return tuple(sorted(notes, key=lambda note: note.code == "length"))
 
 

@@ -12,6 +12,7 @@ from rebar_depth_bench.base.names import view_id
 from rebar_depth_bench.scoring.bootstrap import (
     MIN_BLOCKS,
     RESAMPLES,
+    Blocks,
     half_width,
     interval,
     protocol_indices,
@@ -60,21 +61,32 @@ def test_blocks_do_not_depend_on_the_digits_of_view_ids(first: int) -> None:
     np.testing.assert_array_equal(resample_views(view_ids, by_scene=False).counts, expected.counts)
 
 
-@pytest.mark.parametrize(("blocks", "t"), [(8, 2.364624), (10, 2.262157), (24, 2.068658), (61, 2.000298)])
-def test_ends_are_those_of_students_interval(blocks: int, t: float) -> None:
+@pytest.mark.parametrize(
+    ("blocks", "t"),
+    [
+        (Blocks(8), 2.364624),
+        (Blocks(10), 2.262157),
+        (Blocks(24), 2.068658),
+        (Blocks(61), 2.000298),
+        (Blocks(14, 4), 2.228139),
+        (Blocks(48, 4), 2.015368),
+    ],
+)
+def test_ends_are_those_of_students_interval(blocks: Blocks, t: float) -> None:
     """Resamples of normal means give the interval mean +- t s / sqrt(n); t is from printed tables."""
-    assert half_width(blocks) == pytest.approx(math.sqrt(blocks / (blocks - 1)) * t, rel=1e-6)
+    ratio = math.sqrt(blocks.number / (blocks.number - blocks.distances))
+    assert half_width(blocks) == pytest.approx(ratio * t, rel=1e-6)
     draws = np.array([NormalDist(3.0, 0.5).inv_cdf((k + 0.5) / 100_000) for k in range(100_000)])
-    error = t * 0.5 * math.sqrt(blocks / (blocks - 1))
+    error = t * 0.5 * ratio
     assert interval(draws, blocks) == pytest.approx((3 - error, 3 + error), abs=1e-3)
 
 
 def test_blocks_and_scenes_with_values_are_counted() -> None:
-    assert [resample(range(n)).blocks() for n in (504, 100, 20)] == [42, 9, 2]
-    assert resample(range(0, 504, 21)).blocks() == 24
-    assert resample(range(504)).blocks(np.array([0, 11, 12, 503, 12])) == 3
+    assert [resample(range(n)).blocks() for n in (504, 100, 20)] == [(42, 1), (9, 1), (2, 1)]
+    assert resample(range(0, 504, 21)).blocks() == (24, 1)
+    assert resample(range(504)).blocks(np.array([0, 11, 12, 503, 12])) == (3, 1)
     scenes = resample_scenes(["a", "b", "a", "c"])
-    assert (scenes.blocks(), scenes.blocks(np.array([0, 2, 3]))) == (3, 2)
+    assert (scenes.blocks(), scenes.blocks(np.array([0, 2, 3]))) == ((3, 1), (2, 1))
 
 
 @pytest.mark.slow
@@ -82,7 +94,7 @@ def test_intervals_of_few_views_contain_the_mean() -> None:
     """Plain percentiles of eight normal values contain their mean in 88 of 100 cases."""
     values = np.random.default_rng(12).normal(size=(8, 2000))
     draws = resample(range(0, 96, 12)).means(values)
-    intervals = [interval(draws[:, k], 8) for k in range(2000)]
+    intervals = [interval(draws[:, k], Blocks(8)) for k in range(2000)]
     contain = [bounds is not None and bounds[0] <= 0 <= bounds[1] for bounds in intervals]
     assert 0.92 <= np.mean(contain) <= 0.96
 
@@ -164,7 +176,7 @@ def test_few_scenes_have_no_interval_however_many_views() -> None:
         means, medians = scenes.means(values[:, None])[:, 0], scenes.medians(values)
         for estimates in (means, medians, scenes.pooled_means(values, view)):
             assert (interval(estimates, scenes.blocks()) is not None) == has_interval
-    assert interval(resample_scenes([]).medians(np.empty(0)), 0) is None
+    assert interval(resample_scenes([]).medians(np.empty(0)), Blocks(0)) is None
 
 
 def test_view_counts_repeat_those_of_the_scenes_of_the_views() -> None:

@@ -20,7 +20,7 @@ from rich.console import Console
 import rebar_depth_bench as rdb
 from rebar_depth_bench import InputError, score
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.data.bars import read_bars, write_bars
+from rebar_depth_bench.data.bars import Bar, read_bars, write_bars
 from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.extended.result import ExtendedResult
 from rebar_depth_bench.reporting.extended_tables import extended_csv
@@ -107,7 +107,7 @@ def test_errors_use_common_views_and_shares_use_all_views() -> None:
         assert (row.views, row.verdict) == (20, "worse"), name
 
 
-def test_chance_differences_and_those_of_few_views_are_undecided() -> None:
+def test_chance_differences_are_undecided_and_few_views_are_named() -> None:
     errors = np.linspace(0.3, 0.5, 20)
     row = difference(result_of(errors), result_of(errors + 0.01 * (-1.0) ** np.arange(20)))
     assert row.interval is not None
@@ -115,7 +115,7 @@ def test_chance_differences_and_those_of_few_views_are_undecided() -> None:
     assert row.verdict == "undecided"
     row = difference(result_of(np.full(3, 0.1)), result_of(np.full(3, 0.9)))
     assert row.difference == pytest.approx(0.8)
-    assert (row.interval, row.verdict) == (None, "undecided")
+    assert (row.interval, row.verdict) == (None, "too few views")
 
 
 def test_incompatible_results_raise_input_error() -> None:
@@ -137,7 +137,15 @@ def test_table_is_80_columns_and_names_every_number() -> None:
     rows = list(csv.DictReader(io.StringIO(frame_csv(comparison.to_pandas()))))
     assert [row["number"] for row in rows] == [column.path for column in VIEW_COLUMNS]
     assert rows[0]["other_method"] == "'=B"
-    assert {row["verdict"] for row in rows} <= {"equal", "worse", "better", "no verdict", "undecided", ""}
+    assert {row["verdict"] for row in rows} <= {
+        "equal",
+        "worse",
+        "better",
+        "no verdict",
+        "undecided",
+        "too few views",
+        "",
+    }
     assert float(rows[1]["low"]) <= float(rows[1]["difference"]) <= float(rows[1]["high"])
 
 
@@ -154,7 +162,7 @@ def test_compare_command_on_archives(
     status = main(["compare", str(exact), str(far), str(exact), "--data", str(tiny_root), "--json", str(out)])
     assert status == 0
     to_far, to_exact = json.loads(out.read_text())
-    assert to_far["intervals"] == {"method": "expanded-percentile", "draws": 2000, "level": 0.95}
+    assert to_far["intervals"] == {"method": "expanded-percentile-2", "draws": 2000, "level": 0.95}
     by_name = {row["name"]: row for row in to_far["configs"]["lattice"]}
     assert by_name["native.abs_rel"]["difference"] == pytest.approx(0.1, abs=1e-6)
     assert by_name["native.abs_rel"]["verdict"] == "worse"
@@ -229,6 +237,7 @@ def test_bars_of_a_dataset_folder(tiny_root: Path, tmp_path: Path) -> None:
     path = root / "bars.parquet"
     bars = list(read_bars(path)["lattice"])
     bars[0] = replace(bars[0], nominal_axis_m=((0.0, 0.0, 0.5), (1.0, 0.0, 0.5)))
+    bars[1] = Bar.without_axis(bars[1].bar_id, bars[1].role)
     write_bars(path, {"lattice": tuple(bars)})
     change_manifest(root, lambda manifest, _: manifest["files"].update({path.name: file_sha256(path)}))
     frame = rdb.bars(root)
@@ -238,7 +247,9 @@ def test_bars_of_a_dataset_folder(tiny_root: Path, tmp_path: Path) -> None:
     first = frame.iloc[0]
     assert np.array_equal(first["axis"], np.array(bars[0].axis_m))
     assert np.array_equal(first["nominal_axis"], np.array(bars[0].nominal_axis_m))
-    assert {axis.shape for axis in frame["nominal_axis"][1:]} == {(0, 3)}
+    assert set(frame["nominal_axis"][1:]) == {None}
+    assert frame.iloc[1]["axis"] is None
+    assert frame.iloc[1][["diameter_m", "length_m"]].isna().all()
     assert first["length_m"] == pytest.approx(float(np.linalg.norm(np.diff(first["axis"], axis=0), axis=1).sum()))
 
 

@@ -18,7 +18,7 @@ from rebar_depth_bench.base.errors import DatasetError
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars, write_bars
 from rebar_depth_bench.data.files import file_sha256
-from rebar_depth_bench.scoring.bootstrap import end_percents, resample_scenes
+from rebar_depth_bench.scoring.bootstrap import Blocks, end_percents, resample_scenes
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.groups import (
     DISTANCE_EDGES_M,
@@ -227,7 +227,7 @@ def test_comparison_resamples_scenes(root: Path, tmp_path: Path, scored: Result)
     by_scene = np.reshape(change, (len(SCENES), VIEWS))
     counts = resample_scenes(list(SCENES)).counts
     means = [np.repeat(by_scene, drawn.astype(int), axis=0).mean() for drawn in counts]
-    assert row.interval == pytest.approx(np.percentile(means, end_percents(len(SCENES))))
+    assert row.interval == pytest.approx(np.percentile(means, end_percents(Blocks(len(SCENES)))))
 
 
 traits = st.builds(

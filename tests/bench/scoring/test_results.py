@@ -75,7 +75,7 @@ def test_no_views_give_null_and_unranked_table() -> None:
 def test_json_keys_and_units_match_contract() -> None:
     content = json.loads(result(scored_view("config/0000")).to_json())
     assert list(content) == ["protocol", "dataset", "submission", "software", "intervals", "tables", "views"]
-    assert content["intervals"] == {"method": "expanded-percentile", "draws": 2000, "level": 0.95}
+    assert content["intervals"] == {"method": "expanded-percentile-2", "draws": 2000, "level": 0.95}
     assert content["protocol"] == "rebar-2"
     assert content["dataset"] == {"digest": "sha256:" + "fedcba9876543210" * 4, "version": "1.2.3"}
     about = {"method": "my model", "sha256": "0123456789abcdef" * 4, "inputs": "rgb+K", "uses_ground_truth": False}

@@ -15,6 +15,7 @@ from PIL import Image, ImageDraw
 from rich.console import Console
 from scipy.spatial import cKDTree
 
+from dataset_builder.catalog.scene_file import scene_cage
 from dataset_builder.cli.main import main
 from dataset_builder.inspection import summary as summary_module
 from dataset_builder.inspection.picture import _draw_scale_bar, font, inspection_picture
@@ -120,6 +121,26 @@ def test_inputs_are_not_overwritten(tmp_path: Path, output: str) -> None:
     completed = run_in_process(main, "inspect", scene, "--json", tmp_path / output)
     assert completed.returncode == 2
     assert (tmp_path / output).read_bytes() == before
+
+
+def test_shift_onto_the_ground_is_noted_by_inspect_and_build(tmp_path: Path) -> None:
+    """The shift is the difference between the places of a bar that is centred and of one that keeps its place."""
+    keys, axes_m, notes = f'mesh = "{rods(tmp_path).name}"\nunit = "mm"\n', [], []
+    for origin in ("", 'origin = "keep"\n'):
+        scene = write_scene(tmp_path, keys + origin)
+        axes_m.append(np.array(scene_cage(scene).bars[0].bar.axis_m))
+        inspected = run_in_process(main, "inspect", scene, "--json", "-")
+        notes.append(json.loads(inspected.stdout)["notes"])
+        build = run_in_process(main, "--out", tmp_path / "root", "--scene", scene, "--dry-run")
+        for printed in (inspected.stderr, build.stderr):
+            assert [line for line in printed.splitlines() if "moved" in line] == [
+                f"note: {one}" for one in notes[-1]
+            ]
+    x, y, z = np.unique(np.round(axes_m[0] - axes_m[1], 6), axis=0)[0]
+    assert z < -0.05
+    assert f"x {x:.3f}, y {y:.3f}, z {z:.3f} m" in notes[0][0]
+    assert 'origin = "keep"' in notes[0][0]
+    assert notes[1] == []
 
 
 def bars_of(*bars: Bar, **fields: str) -> Cage:

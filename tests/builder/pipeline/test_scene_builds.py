@@ -81,7 +81,8 @@ def test_build_with_bent_bar_and_plate(tmp_path: Path, run_build: RunBuild) -> N
     request = ("--out", root, "--scene", tmp_path / "bent.toml", "--views", "2", *TINY)
     process = run_build(*request)
     assert process.returncode == 0, process.stderr
-    (note,) = (line for line in process.stderr.splitlines() if line.startswith("note:"))
+    moved, note = (line for line in process.stderr.splitlines() if line.startswith("note:"))
+    assert "cage.obj" in moved
     assert "cage.obj" in note
     assert "1 of 2 bars" in note
     assert note.endswith("bar 2, plate")

@@ -49,7 +49,7 @@ def test_centred_cage_is_the_same_wherever_the_file_has_it(
     x: float, y: float, z: float, up: Up, rotate_deg: float
 ) -> None:
     placement = PlacementSpec(up, "centre", rotate_deg)
-    cage, at_origin = placed(rods_at(x, y, z), placement), placed(rods_at(0, 0, 0), placement)
+    cage, at_origin = placed(rods_at(x, y, z), placement, "a"), placed(rods_at(0, 0, 0), placement, "b")
     for bar, expected in zip(cage.bars, at_origin.bars, strict=True):
         shift_m = np.array(bar.bar.axis_m) - np.array(expected.bar.axis_m)
         assert np.abs(shift_m).max() <= 0.0021  # The box is centred by whole millimetres.
@@ -67,7 +67,7 @@ def test_matrix_takes_source_points_to_the_world(
     x: float, y: float, rotate_deg: float, up: Up, origin: Origin
 ) -> None:
     source = rods_at(x, y, 3.0)
-    cage = placed(source, PlacementSpec(up, origin, rotate_deg, (1.0, -2.0, 0.5)))
+    cage = placed(source, PlacementSpec(up, origin, rotate_deg, (1.0, -2.0, 0.5)), "a")
     for before, after in zip(source.bars, cage.bars, strict=True):
         points = np.column_stack([before.bar.axis_m, np.ones(2)]) @ cage.world_from_source.T
         np.testing.assert_allclose(points[:, :3], after.bar.axis_m, rtol=0, atol=1e-6)
@@ -76,7 +76,7 @@ def test_matrix_takes_source_points_to_the_world(
 def test_order_is_up_centre_rotation_translation() -> None:
     """A rod along the file's y axis at (5, 7, 9) stands upright; a quarter turn takes x to y."""
     upright = cage_of(((5.0, 7.0, 9.0), (5.0, 8.0, 9.0)), ((5.0, 7.0, 9.0), (6.0, 7.0, 9.0)))
-    cage = placed(upright, PlacementSpec("y", "centre", 90.0, (0.0, 0.0, 2.0)))
+    cage = placed(upright, PlacementSpec("y", "centre", 90.0, (0.0, 0.0, 2.0)), "a")
     (foot, head), (_, end) = (np.array(bar.bar.axis_m) for bar in cage.bars)
     np.testing.assert_allclose(head - foot, (0, 0, 1), atol=1e-12)
     np.testing.assert_allclose(end - foot, (0, 1, 0), atol=1e-12)
@@ -323,5 +323,5 @@ def test_ifc_file_alone_is_centred_and_surveyed(model: Path, monkeypatch: pytest
     assert 0 <= assembly.vertices_m[:, 2].min() <= 0.001
     assert assembly.world_from_source is cage.world_from_source
     codes = [note.code for note in assembly.notes]
-    assert codes == ["left-out"]
-    assert "1 (IfcWall: not reinforcement)" in assembly.notes[0].text
+    assert codes == ["moved", "left-out"]
+    assert "1 (IfcWall: not reinforcement)" in assembly.notes[1].text
