@@ -47,7 +47,6 @@ FIXTURE_MARKERS = {
     "running_nginx": "server",
     "scripted": "server",
     "hub": "server",
-    "running_scorer": "server",
     "running_postgres": "postgres",
     "new_cluster": "dask",
     "chromium_program": "browser",

@@ -26,7 +26,7 @@ from rebar_depth_bench.submission.declaration import Declaration
 from tests.bench.reporting.results import result, scored_view
 from tests.leaderboard import serving
 from tests.leaderboard.boards import OTHER_DIGEST, accept, board_settings, claimed, opened
-from tests.leaderboard.serving import Postgres, RunPostgres, RunScorer, RunServer, Server, make_token
+from tests.leaderboard.serving import Postgres, RunPostgres, RunServer, Server, make_token
 
 HOSTILE = "<script>alert(1)</script>\"'&amp;{{ 7 * 7 }}"
 DESCRIPTION = "first line\n<b>second</b>\u202egnp\x1b[31m"
@@ -95,12 +95,6 @@ def running_server(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) ->
         return serving.running_server(root, state or tmp_path_factory.mktemp("board") / "state", **options)
 
     return run
-
-
-@pytest.fixture(scope="session")
-def running_scorer(tiny_root: Path) -> RunScorer:
-    """Run ``rebar-leaderboard score`` until a block ends: of the tiny dataset unless another is given."""
-    return lambda state, root=tiny_root: serving.running_scorer(root, state)
 
 
 @pytest.fixture(scope="session")

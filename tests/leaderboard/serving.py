@@ -137,7 +137,6 @@ def distinct_archive(archive: Path, number: int) -> Path:
 
 
 RunServer = Callable[..., AbstractContextManager[Server]]
-RunScorer = Callable[..., AbstractContextManager[list[str]]]
 RunPostgres = Callable[[], AbstractContextManager["Postgres"]]
 """Types of the functions that the fixtures of the same names return."""
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import sqlite3
 import time
 from contextlib import closing
@@ -15,7 +14,7 @@ import pytest
 
 import rebar_depth_bench as rdb
 from leaderboard.db import jobs
-from leaderboard.scoring.sandbox import Outcome, check, score
+from leaderboard.scoring.sandbox import Outcome, check
 from leaderboard.uploads import UNAVAILABLE_MESSAGE
 from rebar_depth_bench.base.errors import SubmissionError
 from rebar_depth_bench.data.manifest import open_folder
@@ -32,7 +31,7 @@ from tests.leaderboard.boards import (
     result_bytes,
     score_all,
 )
-from tests.leaderboard.serving import API, RunScorer, RunServer, Server, run
+from tests.leaderboard.serving import API, RunServer, Server, run, running_scorer
 from tests.processes import wait_until
 from tests.synthetic_dataset import write_archive, write_dataset, write_split_dataset
 
@@ -206,7 +205,7 @@ def test_job_of_a_dataset_that_was_replaced_meanwhile_is_queued_again(tmp_path: 
 
 
 def test_missing_and_other_datasets_cost_no_submission(
-    datasets: Datasets, tmp_path: Path, running_server: RunServer, running_scorer: RunScorer
+    datasets: Datasets, tmp_path: Path, running_server: RunServer
 ) -> None:
     with running_server(root=datasets.first, workers=0) as server:
         token = server.token("alice")
@@ -215,12 +214,12 @@ def test_missing_and_other_datasets_cost_no_submission(
         assert (response.status_code, response.json()["detail"]) == (503, UNAVAILABLE_MESSAGE)
         (tmp_path / "elsewhere").rename(datasets.first)
         submission_id = server.submit_accepted(datasets.archive, token)
-        with running_scorer(server.state, root=datasets.second) as log:
+        with running_scorer(datasets.second, server.state) as log:
             wait_until(lambda: any("job requeued" in line for line in log), "the job is requeued")
         assert any("expected sha256:" in line for line in log)
         row = server.row(submission_id)
         assert (row["status"], row["attempts"]) == ("queued", 0)
-        with running_scorer(server.state, root=datasets.first):
+        with running_scorer(datasets.first, server.state):
             assert server.wait_until_ended(submission_id)["status"] == "scored"
 
 
@@ -250,12 +249,3 @@ def test_only_the_split_test_is_accepted(split_root: Path, tmp_path: Path) -> No
     assert "split train" in str(problem)
     accepted = checked(write_split_archive(split_root, tmp_path / "test.zip", "test"), split_root)
     assert accepted.method == "exact"
-
-
-@pytest.mark.slow
-def test_scored_archive_has_the_groups_of_the_command_line(split_root: Path, tmp_path: Path) -> None:
-    archive = write_split_archive(split_root, tmp_path / "test.zip", "test")
-    outcome = score(archive, str(split_root), open_folder(split_root).digest)
-    expected = rdb.score(archive, split_root).to_json()
-    assert outcome.result == expected
-    assert list(json.loads(expected)["tables"]["cages"]["groups"]["family"]) == ["wall"]

@@ -150,13 +150,6 @@ def test_every_setting_is_read_from_every_source(
     assert Settings.model_fields[name].default != by_command
 
 
-@pytest.mark.parametrize("url", ["postgresql://u:p@h:5432/x", "postgresql+psycopg://u@/x?host=/run/pg"])
-def test_postgresql_urls_use_psycopg(url: str) -> None:
-    database_url = read_settings(None, {"data": "x", "db": url}).database_url
-    assert database_url.startswith("postgresql+psycopg://")
-    assert database_url.split("://")[1] == url.split("://")[1]
-
-
 def test_state_folder_name_may_have_special_characters(tmp_path: Path) -> None:
     settings = board_settings(tmp_path / "a st%20ate?b")
     add_submission(settings, make_board(settings), b"zip")

@@ -6,7 +6,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from tests.leaderboard.serving import (
@@ -131,16 +130,6 @@ def test_body_size_is_limited_everywhere(uploads: UploadServer, after: bytes, st
     response = uploads.post(chunked(*pieces), "Transfer-Encoding: chunked")
     assert response.status == status
     assert words in response.text
-
-
-def test_randomly_damaged_body_is_422(uploads: UploadServer) -> None:
-    random = np.random.default_rng(20261122)
-    valid_body = multipart_part(b"PK\3\4", DISPOSITION, "Content-Type: application/zip") + END
-    for _ in range(40):
-        body = bytearray(valid_body)
-        for position in random.integers(len(body), size=random.integers(1, 6)):
-            body[position] = random.choice(np.frombuffer(b'\0\r\n:;="-\\ \t\xffX', np.uint8))
-        assert uploads.post(bytes(body)).status == 422, bytes(body)
 
 
 @pytest.mark.parametrize(
