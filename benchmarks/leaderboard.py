@@ -98,7 +98,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         result = json.loads(rdb.score(options.archive, options.data).to_json())
         settings = read_settings(None, {"data": str(options.data), "state_dir": state, "db": options.db})
         with closing(Database(settings.database_url)) as database:
-            database.migrate()
+            database.create_schema()
             if _ids(database):
                 sys.exit("the database holds submissions, expected an empty one")
             jobs.serve_dataset(database, result["dataset"]["digest"], rescore=False)
@@ -179,6 +179,7 @@ def add_scored_submissions(database: Database, result: dict[str, Any], rows: int
                     archive_deleted_at=1.0,
                     public=True,
                     created_at=time.time(),
+                    queued_at=time.time(),
                     status=QUEUED,
                     attempts=0,
                 )

@@ -6,7 +6,6 @@ The processes that read archives import this module again, but need no command.
 import sys
 
 _EXTRA_MODULES = (
-    "alembic",
     "fastapi",
     "multipart",
     "sqlalchemy",

@@ -63,8 +63,11 @@ def delete_submission(service: Service, record: SubmissionModel) -> None:
     """Delete a submission, its archive and its results. Raises status 503 if the archive folder is unusable."""
     try:
         service.archives.check()
-        submissions.remove(service.database, record.id)
-        service.archives.delete(record.id)
     except (StorageError, OSError) as error:
         _LOG.error("deletion failed: archive folder unusable", error=str(error))
         raise RefusedError(503, "the service cannot delete archives at the moment; try again later") from None
+    submissions.remove(service.database, record.id)
+    try:
+        service.archives.delete(record.id)
+    except (StorageError, OSError) as error:  # The next start deletes it.
+        _LOG.error("archive not deleted", submission=record.id[:6], error=str(error))

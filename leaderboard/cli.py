@@ -138,10 +138,10 @@ def _make_state_dir(folder: Path) -> None:
 
 
 @contextmanager
-def _migrated(settings: Settings) -> Iterator[Database]:
-    """Yield the database of the settings, with the newest schema."""
+def _opened(settings: Settings) -> Iterator[Database]:
+    """Yield the database of the settings; an empty one gets its tables."""
     with closing(Database(settings.database_url)) as database:
-        database.migrate()
+        database.create_schema()
         yield database
 
 
@@ -156,14 +156,14 @@ def _score(settings: Settings, _: argparse.Namespace) -> None:
     stop = threading.Event()
     for signal_number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(signal_number, lambda *_: stop.set())
-    with _migrated(settings) as database:
+    with _opened(settings) as database:
         url = without_password(settings.database_url)
         _LOG.info("waiting for submissions", database=url, version=software_version())
         process_queue(database, settings, stop)
 
 
 def _token(settings: Settings, options: argparse.Namespace) -> None:
-    with _migrated(settings) as database:
+    with _opened(settings) as database:
         if options.revoke:
             revoke_token(database, options.name)
             return
@@ -175,7 +175,7 @@ def _token(settings: Settings, options: argparse.Namespace) -> None:
 
 
 def _tokens(settings: Settings, _: argparse.Namespace) -> None:
-    with _migrated(settings) as database:
+    with _opened(settings) as database:
         tokens = list_tokens(database)
     rows = [(name, _time(created), _time(revoked), count, size) for name, created, revoked, count, size in tokens]
     _print_csv(["name", "created", "revoked", "submissions", "bytes"], rows)
@@ -188,7 +188,7 @@ def _submissions(settings: Settings, _: argparse.Namespace) -> None:
         .where(SubmissionModel.status != DELETED)
         .order_by(SubmissionModel.created_at)
     )
-    with _migrated(settings) as database, database.read() as session:
+    with _opened(settings) as database, database.read() as session:
         rows = [
             (
                 *(one.id, name, one.method, one.status, one.public, _time(one.created_at)),
@@ -201,14 +201,14 @@ def _submissions(settings: Settings, _: argparse.Namespace) -> None:
 
 
 def _requeue(settings: Settings, options: argparse.Namespace) -> None:
-    with _migrated(settings) as database:
+    with _opened(settings) as database:
         ArchiveStore(settings.archive_dir, database.board().board_id).check()
         jobs.requeue(database, options.ids)
 
 
 def _remove(settings: Settings, options: argparse.Namespace) -> None:
     """Delete a submission, or its archive alone: the row first, so that the next ``serve`` ends what is killed."""
-    with _migrated(settings) as database:
+    with _opened(settings) as database:
         archives = ArchiveStore(settings.archive_dir, database.board().board_id)
         archives.check()
         record = submissions.find(database, options.id) if options.id.isascii() else None

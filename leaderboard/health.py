@@ -48,13 +48,16 @@ def _dataset_problems(service: Service) -> list[str]:
 
 def disk_problem(folder: Path, name: str = "the state folder") -> list[str]:
     """Return the problem if the disk of a folder is nearly full."""
-    free = shutil.disk_usage(folder).free
+    try:
+        free = shutil.disk_usage(folder).free
+    except OSError as error:
+        return [f"{name} cannot be read: {error.strerror}"]
     return [] if free >= MIN_FREE_BYTES else [f"the disk of {name} has {free >> 20} MiB left"]
 
 
 def queue_problems(database: Database) -> list[str]:
     """Return the problem if the oldest queued submission waits although none is being scored."""
-    oldest = select(func.min(SubmissionModel.created_at)).where(SubmissionModel.status == QUEUED)
+    oldest = select(func.min(SubmissionModel.queued_at)).where(SubmissionModel.status == QUEUED)
     active = select(func.count()).where(SubmissionModel.status == SCORING, not_(jobs.is_free(time.time())))
     with database.read() as session:
         queued_since, scoring = session.scalar(oldest), session.scalar(active)

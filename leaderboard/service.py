@@ -56,8 +56,9 @@ class Service:
 
 @contextmanager
 def open_service(settings: Settings) -> Iterator[Service]:
-    """Open the service: migrate the database, remove abandoned uploads, and queue what is to be scored again.
+    """Open the service.
 
+    The tables of an empty database are created, abandoned uploads deleted, and what is to be scored again queued.
     If the archive folder is not that of the database, reading works, uploads are refused, and jobs wait. Raises
     ``InputError`` if the dataset or the database is unusable, and if the leaderboard has submissions of another
     dataset with their archives, unless the setting ``rescore`` is on.
@@ -67,7 +68,7 @@ def open_service(settings: Settings) -> Iterator[Service]:
     make_folder(settings.spool, "the folder of uploads")
     delete_abandoned_uploads(settings.spool)
     with closing(Database(settings.database_url)) as database:
-        database.migrate()
+        database.create_schema()
         archives = ArchiveStore(settings.archive_dir, database.board().board_id)
         rows = archive_rows(database)
         archives.initialise(rows)

@@ -43,7 +43,7 @@ from rebar_depth_bench.base.errors import RebarDepthError, SubmissionError
 from rebar_depth_bench.scoring.formatting import counted
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.submission import SubmissionMeta
-from rebar_depth_bench.submission.declaration import MAX_METHOD_CHARACTERS, MethodDetails
+from rebar_depth_bench.submission.declaration import MethodDetails
 
 UNAVAILABLE_MESSAGE = "the service cannot check or store archives at the moment; try again later"
 """Detail of the 503 response if the dataset or the archive folder is unusable, or the disk full."""
@@ -73,6 +73,8 @@ async def accept_upload(
 
     def check_before() -> None:
         service.archives.check()
+        if database.board().dataset_digest != service.folder.digest:
+            raise UnavailableError("another server of this database serves another dataset")
         with database.read() as session:
             check_quota(session, token, quota, 0)
 
@@ -101,7 +103,8 @@ async def accept_upload(
                     _check_and_store, service, token, quota, *received, limiter=service.check_limiter
                 )
     except QuotaExceededError as error:
-        raise RefusedError(429, f"the quota of {error} is used up; rejected archives do not count") from None
+        message = f"the quota of {error} is used up; rejected archives do not count"
+        raise RefusedError(429, f"{message}, and GET /api/v1/submissions lists the accepted ones") from None
     except SubmissionError as error:
         _LOG.info("upload rejected", token=token.name, problems=len(error.problems))
         detail = f"the archive is invalid: {counted(len(error.problems), 'problem')}"
@@ -114,7 +117,11 @@ async def accept_upload(
 def _check_and_store(
     service: Service, token: TokenModel, quota: Quota, path: Path, sha256: str, size: int
 ) -> tuple[SubmissionModel, bool]:
-    """Check a received archive, build its row, and store the archive and then the row."""
+    """Check a received archive, build its row, store the archive, and commit the row.
+
+    A process that is killed before the archive is stored leaves the file of an upload, which the next start
+    deletes; one that is killed before the commit, an archive without a row, which ``check`` lists.
+    """
     settings, database, archives = service.settings, service.database, service.archives
     with database.read() as session:
         if duplicate := _find_duplicate(session, service, token, sha256):
@@ -123,12 +130,10 @@ def _check_and_store(
     method = normalised(meta.method)
     if problem := name_problem(method):
         raise archive_error("invalid", problem, "submission.json: method", "visible characters")
-    if len(method) > MAX_METHOD_CHARACTERS:
-        found = f"it has {len(method)} characters in the Unicode form NFKC"
-        raise archive_error("size", found, "submission.json: method", f"at most {MAX_METHOD_CHARACTERS}")
     details = meta.model_dump(include=set(MethodDetails.model_fields), exclude_none=True)
     if (seconds := meta.seconds_per_view) is not None:
         details["seconds_per_view"] = seconds
+    now = time.time()
     record = SubmissionModel(
         id=new_id(),
         token_id=token.id,
@@ -139,7 +144,8 @@ def _check_and_store(
         archive_sha256=sha256,
         archive_bytes=size,
         public=settings.default_visibility == "always",
-        created_at=time.time(),
+        created_at=now,
+        queued_at=now,
         status=QUEUED,
         attempts=0,
     )
@@ -177,7 +183,7 @@ def _checked_archive(service: Service, path: Path) -> SubmissionMeta:
     settings = service.settings
     for _ in range(2):  # A process that was killed from outside says nothing about the archive.
         try:
-            job = (check, path, settings.data)
+            job = (check, path, settings.data, service.folder.digest)
             with isolated_call(*job, memory=settings.score_memory, time_limit_s=settings.score_time) as call:
                 while not call.wait(settings.score_time):
                     pass
@@ -185,9 +191,11 @@ def _checked_archive(service: Service, path: Path) -> SubmissionMeta:
         except TimeLimitError:
             raise archive_error("size", f"the check took longer than {settings.score_time:g} s") from None
         except ProcessEndedError as error:
-            _LOG.error("checking process ended", status=error.status)
+            _LOG.error("checking process ended", status=error.status, details=error.details)
             if not error.was_killed:
                 break
+    else:
+        raise UnavailableError("the process that checks the archive was killed twice")
     raise archive_error("damaged", "the archive cannot be read: the process that reads it crashed")
 
 
@@ -208,7 +216,8 @@ def _find_duplicate(session: Session, service: Service, token: TokenModel, sha25
         SubmissionModel.status.in_((QUEUED, SCORING, SCORED)),
     )
     for record, has_current_result in session.execute(same):
-        if has_current_result or service.archives.file(record.id).is_file():
+        has_archive = record.archive_deleted_at is None and service.archives.file(record.id).is_file()
+        if has_current_result or has_archive:
             return record
     return None
 

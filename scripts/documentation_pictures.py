@@ -144,11 +144,9 @@ def report_pictures(page: Page, report: Path, out: Path) -> None:
 
 def board_pictures(page: Page, url: str, submission: str, out: Path) -> None:
     """Photograph the ranking of a config, and the page of a submission."""
-    page.set_viewport_size({"width": 1440, "height": 900})
     page.goto(f"{url}/?config=lattice")
     _, bottom = extent(page, "table tbody")
     save(photograph(page, 0, bottom), out / "leaderboard.webp")
-    page.set_viewport_size({"width": 1280, "height": 900})
     page.goto(submission)
     save(photograph(page, 0, 900), out / "submission.webp")
 

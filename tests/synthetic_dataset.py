@@ -205,20 +205,3 @@ def _depth_m(index: int) -> np.ndarray:
     """
     bars_m = 0.3 + 0.01 * index + 0.001 * np.arange(HEIGHT)[:, None]
     return np.where(_is_bar()[None, :], bars_m, 1.5).astype(np.float32)
-
-
-_ERROR_METRICS = ("abs_rel", "rmse_cm", "mae_cm")
-
-
-def scale_errors(part: Any, factor: float, name: str = "") -> Any:
-    """Return part of a result (as JSON data) with all errors and their intervals multiplied by ``factor``.
-
-    Rank errors, which stay below 1, have their ratio to 1 - rank error multiplied.
-    """
-    if isinstance(part, dict):
-        return {key: scale_errors(value, factor, key) for key, value in part.items()}
-    if isinstance(part, list):
-        return [scale_errors(value, factor, name) for value in part]
-    if name == "rank_error" and isinstance(part, float):
-        return part * factor / (1 - part + part * factor)
-    return part * factor if name in _ERROR_METRICS and isinstance(part, float) else part

@@ -1,1 +1,1 @@
-"""Database layer: models, engine, migrations, and queries for submissions, jobs and rankings."""
+"""Database layer: models, engine, and queries for submissions, jobs and rankings."""

@@ -1,4 +1,4 @@
-"""Database engine for SQLite and PostgreSQL: read sessions, write sessions, schema migration and checks."""
+"""Database engine for SQLite and PostgreSQL: read sessions, write sessions, the schema and checks."""
 
 from __future__ import annotations
 
@@ -10,15 +10,14 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from sqlalchemy import Connection, Engine, create_engine, event, inspect, select, text
+from sqlalchemy import URL, Connection, Engine, create_engine, event, inspect, select, text
 from sqlalchemy.exc import ArgumentError, DatabaseError, InterfaceError, NoSuchModuleError, OperationalError
 from sqlalchemy.exc import TimeoutError as PoolTimeoutError
 from sqlalchemy.orm import Session
 
-from leaderboard.db.models import Base, BoardModel, ResultModel
+from leaderboard.db.models import SCHEMA, Base, BoardModel, ResultModel
 from rebar_depth_bench.base.errors import InputError, StorageError
 
-MIGRATIONS = Path(__file__).parent / "migrations"
 SQLITE_BUSY_TIMEOUT_S = 30
 DATABASE_UNAVAILABLE = (OperationalError, InterfaceError, PoolTimeoutError)
 """Exceptions raised while the database is unavailable: down, starting, or no connection left in the pool."""
@@ -26,7 +25,7 @@ _POSTGRESQL_TIMEOUTS = {"connect_timeout": 10, "tcp_user_timeout": 30_000}
 """Timeouts for an unresponsive PostgreSQL server: connect in seconds, unacknowledged TCP data in ms."""
 _IMMEDIATE = "immediate"
 _CONTENT_VERSION = select(BoardModel.content_version)
-_OWN_TABLES = frozenset({"alembic_version", *Base.metadata.tables})
+_OWN_TABLES = frozenset(Base.metadata.tables)
 
 
 class Database:
@@ -76,31 +75,22 @@ class Database:
         """Whether single rows can be locked (PostgreSQL) instead of the whole database only (SQLite)."""
         return self._engine.dialect.name != "sqlite"
 
-    def migrate(self) -> None:
-        """Create the schema or upgrade it; services that start simultaneously take turns.
+    def create_schema(self) -> None:
+        """Create the tables in an empty database; services that start simultaneously take turns.
 
-        Raises ``InputError`` if the database is unavailable, or has a schema that no migration leads from.
+        Raises ``InputError`` if the database is unavailable, or has the tables of another version.
         """
-        from alembic import command  # Half a second to import, which processes that only score do not need.
-        from alembic.config import Config
-
-        config = Config()
-        config.set_main_option("script_location", str(MIGRATIONS))
         with database_errors(self._url, InputError), self._write_engine.begin() as connection:
             if self.has_row_locks:
                 connection.exec_driver_sql("SELECT pg_advisory_xact_lock(7241053)")
-            config.attributes["connection"] = connection
-            if not _OWN_TABLES.isdisjoint(inspect(connection).get_table_names()):
-                _check_revision(connection, upgradable=True)
-                command.upgrade(config, "head")
-            else:
+            if _OWN_TABLES.isdisjoint(inspect(connection).get_table_names()):
                 Base.metadata.create_all(connection, checkfirst=False)
-                command.stamp(config, "head")
+            _check_schema(connection)
 
     def check_schema(self) -> None:
         """Raise ``InputError`` unless the database has the schema of this version."""
         with self._engine.connect() as connection:
-            _check_revision(connection, upgradable=False)
+            _check_schema(connection)
 
     def problems(self) -> list[str]:
         """Return what is damaged: pages and references of an SQLite database, and results."""
@@ -167,14 +157,19 @@ def _engine(url: str, read_only: bool) -> Engine:
             pool_size=10,
             max_overflow=10,
         )
+    sqlite_url = URL.create("sqlite", database=str(path))  # As text, SQLAlchemy would replace %20 in the path.
     if read_only:
         # Without a write-ahead log nobody has the database open, and SQLite would create one to read it.
         mode = "mode=ro" if Path(f"{path}-wal").exists() else "immutable=1"
         uri = f"{path.resolve().as_uri()}?{mode}"
-        return create_engine(url, creator=lambda: sqlite3.connect(uri, uri=True))
+        return create_engine(sqlite_url, creator=lambda: sqlite3.connect(uri, uri=True))
     path.parent.mkdir(parents=True, exist_ok=True)
     engine = create_engine(
-        url, hide_parameters=True, connect_args={"timeout": SQLITE_BUSY_TIMEOUT_S}, pool_size=20, max_overflow=20
+        sqlite_url,
+        hide_parameters=True,
+        connect_args={"timeout": SQLITE_BUSY_TIMEOUT_S},
+        pool_size=20,
+        max_overflow=20,
     )
     event.listen(engine, "connect", _configure_sqlite)
     event.listen(engine, "begin", _begin_transaction)
@@ -198,15 +193,10 @@ def _begin_transaction(connection: Connection) -> None:
     connection.exec_driver_sql("BEGIN IMMEDIATE" if immediate else "BEGIN")
 
 
-def _check_revision(connection: Connection, *, upgradable: bool) -> None:
-    """Raise ``InputError`` unless the database has the newest schema, or an ``upgradable`` earlier one."""
-    from alembic.migration import MigrationContext
-    from alembic.script import ScriptDirectory
-
-    found = MigrationContext.configure(connection).get_current_revision()
-    known = [script.revision for script in ScriptDirectory(str(MIGRATIONS)).walk_revisions()]
-    known = known if upgradable else known[:1]
-    if found not in known:
+def _check_schema(connection: Connection) -> None:
+    is_known = inspect(connection).has_table(BoardModel.__tablename__)
+    found = connection.scalar(select(BoardModel.schema)) if is_known else None
+    if found != SCHEMA:
         url = connection.engine.url.render_as_string(hide_password=True)
-        schema = "a schema without a revision" if found is None else f"the schema of revision {found}"
-        raise InputError(f"{url}: the database has {schema}, expected {' or '.join(known)}, or a new database")
+        has = "no schema of this service" if found is None else f"schema {found}"
+        raise InputError(f"{url}: the database has {has}, expected schema {SCHEMA}, or a new database")

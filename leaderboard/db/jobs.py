@@ -25,7 +25,7 @@ from leaderboard.db.models import (
 from leaderboard.db.submissions import DELETED, FAILED, QUEUED, SCORED, SCORING
 from leaderboard.scoring.sandbox import Outcome
 from leaderboard.settings import MAX_LEASE_S
-from rebar_depth_bench.base.errors import InputError, problem_summary
+from rebar_depth_bench.base.errors import InputError, escape_text, problem_summary
 from rebar_depth_bench.scoring.bootstrap import INTERVALS
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 
@@ -53,24 +53,26 @@ def serve_dataset(database: Database, dataset_digest: str, rescore: bool) -> int
     is_waiting = SubmissionModel.status.in_((QUEUED, SCORING))
     is_stale = and_(SubmissionModel.status == SCORED, SubmissionModel.archive_deleted_at.is_(None), ~current)
     with database.write() as session:
-        board = session.scalars(select(BoardModel).with_for_update()).one()
+        board = session.scalars(select(BoardModel)).one()
         is_other = board.dataset_digest not in (None, dataset_digest)
         if is_other:
             has_result = current.where(ResultModel.json.is_not(None))
             session.execute(
-                update(SubmissionModel).where(is_waiting, has_result).values(status=SCORED, lease_until=None)
+                update(SubmissionModel)
+                .where(is_waiting, has_result)
+                .values(status=SCORED, lease_until=None, finished_at=time.time())
             )
             to_score = and_(or_(is_waiting, is_stale), ~current)
         else:
             to_score = is_stale
-        records = session.scalars(select(SubmissionModel).where(to_score)).all()
+        records = session.scalars(select(SubmissionModel).where(to_score).with_for_update()).all()
         if records and is_other and not rescore:
             raise InputError(
                 f"the dataset digest is {dataset_digest}, but {len(records)} submissions are of the dataset "
                 f"{board.dataset_digest}; use --rescore true to score them against this one"
             )
         for record in records:
-            record.status, record.attempts, record.finished_at = QUEUED, 0, None
+            record.status, record.attempts, record.queued_at, record.finished_at = QUEUED, 0, time.time(), None
             record.scorer = record.lease_until = None  # A worker that scores it for another dataset ends.
         if records or is_other:
             increment_content_version(session)
@@ -81,21 +83,32 @@ def serve_dataset(database: Database, dataset_digest: str, rescore: bool) -> int
 def requeue(database: Database, submission_ids: Sequence[str]) -> None:
     """Queue submissions again, without quota; earlier results stay until they are replaced.
 
-    Raises ``InputError``, before any is queued, for ids of no submission, of one that waits already, and of one
-    whose archive was deleted.
+    Raises ``InputError``, before any is queued, if an id is unknown, waits already, has no archive, or if its
+    archive was sent again since.
     """
     problems: list[str] = []
     with database.write() as session:
-        for submission_id in submission_ids:
-            record = session.get(SubmissionModel, submission_id, with_for_update=True)
+        for submission_id in dict.fromkeys(submission_ids):
+            is_id = submission_id.isascii()  # A database refuses bytes that are no text.
+            record = session.get(SubmissionModel, submission_id, with_for_update=True) if is_id else None
             if record is None or record.status == DELETED:
-                problems.append(f"{submission_id}: there is no such submission")
+                problems.append(f"{escape_text(submission_id)}: there is no such submission")
             elif record.status in (QUEUED, SCORING):
                 problems.append(f"{submission_id}: is {record.status} already")
             elif record.archive_deleted_at is not None:
                 problems.append(f"{submission_id}: its archive was deleted, so that it cannot be scored")
+            elif again := session.scalar(
+                select(SubmissionModel.id).where(
+                    SubmissionModel.token_id == record.token_id,
+                    SubmissionModel.archive_sha256 == record.archive_sha256,
+                    SubmissionModel.status.in_((QUEUED, SCORING, SCORED)),
+                    SubmissionModel.id != record.id,
+                )
+            ):
+                problems.append(f"{submission_id}: the same archive was sent again as {again}")
             else:
-                record.status, record.attempts, record.finished_at, record.reason = QUEUED, 0, None, None
+                record.status, record.attempts, record.queued_at = QUEUED, 0, time.time()
+                record.finished_at = record.reason = None
         if problems:
             raise InputError(f"nothing was queued: {problem_summary(problems)}")
         increment_content_version(session)
@@ -123,7 +136,7 @@ def claim(database: Database, scorer: str, lease_s: float) -> SubmissionModel | 
                 record.lease_until, record.attempts = now + lease_s, record.attempts + 1
                 return record
             digest = session.scalars(select(BoardModel)).one().dataset_digest or ""
-            reason = f"scoring was started {record.attempts} times but never finished"
+            reason = f"scoring was started {record.attempts} times but never finished; the operator can requeue it"
             _store(session, record, Outcome(digest, reason=reason))
 
 
@@ -184,6 +197,8 @@ def _store(session: Session, record: SubmissionModel, outcome: Outcome) -> None:
         record.status, record.reason = FAILED, outcome.reason
     elif outcome.result is None and (outcome.dataset_digest, PROTOCOL) in with_json:
         record.status = SCORED  # The earlier result of the same dataset stays.
+        earlier = session.get_one(ResultModel, (record.id, outcome.dataset_digest, PROTOCOL))
+        earlier.intervals, earlier.reason = _INTERVALS_JSON, outcome.reason
     else:
         record.status = SCORED
         key = {"submission_id": record.id, "dataset_digest": outcome.dataset_digest, "protocol": PROTOCOL}
@@ -210,6 +225,8 @@ def _store(session: Session, record: SubmissionModel, outcome: Outcome) -> None:
                     json=json.dumps({name: value for name, value in table.items() if name != "groups"}),
                 )
             )
+    if session.scalar(select(BoardModel.dataset_digest)) not in (None, outcome.dataset_digest):
+        record.status, record.attempts, record.queued_at = QUEUED, 0, time.time()  # Another one is served by now.
     increment_content_version(session)
 
 

@@ -18,6 +18,9 @@ from sqlalchemy import (
 )
 from sqlalchemy.orm import DeclarativeBase, Mapped, Session, mapped_column
 
+SCHEMA = 5
+"""Number of the schema; a database with another one is refused."""
+
 
 class Base(DeclarativeBase):
     """Declarative base class of the models."""
@@ -26,14 +29,15 @@ class Base(DeclarativeBase):
 class BoardModel(Base):
     """The single row of facts on the whole leaderboard.
 
-    ``board_id`` is random; the marker in the archive folder has the same. ``dataset_digest`` is the digest of the
-    dataset that ``serve`` served last, None before the first time. Every change of what pages show increments
-    ``content_version``.
+    ``schema`` is ``SCHEMA`` of the version that made the tables. ``board_id`` is random; the marker in the archive
+    folder has the same. ``dataset_digest`` is the digest of the dataset that was served last, None before the
+    first time. Every change of what pages show increments ``content_version``.
     """
 
     __tablename__ = "board"
 
     id: Mapped[int] = mapped_column(primary_key=True)
+    schema: Mapped[int]
     board_id: Mapped[str] = mapped_column(String(32))
     dataset_digest: Mapped[str | None] = mapped_column(String(100))
     content_version: Mapped[int] = mapped_column(BigInteger)
@@ -41,7 +45,9 @@ class BoardModel(Base):
 
 @event.listens_for(Base.metadata.tables["board"], "after_create")
 def _insert_board(table: Table, connection: Connection, **_: object) -> None:
-    connection.execute(table.insert().values(id=1, board_id=secrets.token_hex(16), content_version=1))
+    connection.execute(
+        table.insert().values(id=1, schema=SCHEMA, board_id=secrets.token_hex(16), content_version=1)
+    )
 
 
 def increment_content_version(session: Session) -> None:
@@ -93,6 +99,7 @@ class SubmissionModel(Base):
     archive_deleted_at: Mapped[float | None]
     public: Mapped[bool]
     created_at: Mapped[float]
+    queued_at: Mapped[float]
     status: Mapped[str] = mapped_column(String(10))
     reason: Mapped[str | None] = mapped_column(Text)
     finished_at: Mapped[float | None]
@@ -105,7 +112,8 @@ class ResultModel(Base):
     """What scoring a submission against one dataset under one protocol has given: a result, or a reason.
 
     ``json`` is the result, byte-identical to that of the command line, and ``notes`` a JSON array of sentences on
-    possible mistakes in the submission. Where scoring again has failed, ``json`` is None and ``reason`` says why.
+    possible mistakes in the submission. Where scoring has failed, ``reason`` says why, and ``json`` is None or the
+    earlier result of the same dataset.
     ``intervals`` is the method of confidence intervals, as JSON.
     """
 

@@ -99,13 +99,15 @@ class Ranking:
 
     entries: tuple[LeaderboardEntry, ...]
 
-    @cached_property
-    def best(self) -> Ranking:
-        """The best row of each submitter and method name, with ranks among these rows."""
-        first: dict[tuple[str, str], LeaderboardEntry] = {}
-        for entry in self.entries:
-            first.setdefault((entry.submitter, entry.method), entry)
-        return Ranking(_with_ranks(list(first.values())))
+    def best(self, inputs: str | None = None) -> Ranking:
+        """Return the best row of each submitter and method name of those that declare ``inputs`` (None: of all).
+
+        Ranks are those among these rows. Rows that are not public are all returned.
+        """
+        best: dict[tuple[str, ...], LeaderboardEntry] = {}
+        for entry in self.of_class(inputs):
+            best.setdefault((entry.submitter, entry.method) if entry.public else (entry.id,), entry)
+        return Ranking(_with_ranks(list(best.values())))
 
     @cached_property
     def by_id(self) -> dict[str, LeaderboardEntry]:

@@ -152,7 +152,8 @@ def result_content(database: Database, submission_id: str, shown: ShownResult) -
 def change(database: Database, submission_id: str, values: Mapping[str, Any]) -> None:
     """Set columns of a submission that pages show."""
     with database.write() as session:
-        session.execute(update(SubmissionModel).where(SubmissionModel.id == submission_id).values(**values))
+        present = (SubmissionModel.id == submission_id, SubmissionModel.status != DELETED)
+        session.execute(update(SubmissionModel).where(*present).values(**values))
         increment_content_version(session)
 
 

@@ -10,6 +10,7 @@ import multiprocessing
 import os
 import signal
 import time
+import traceback
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -35,12 +36,16 @@ class UnavailableError(Exception):
 class ProcessEndedError(Exception):
     """Raised when the process has ended without a value.
 
-    ``status`` is its exit status, ``was_killed`` tells whether something outside has ended it.
+    ``status`` is its exit status, ``was_killed`` tells whether something outside has ended it, and ``details`` is
+    the traceback of an unexpected error.
     """
 
-    def __init__(self, status: int | None) -> None:
-        self.status, self.was_killed = status, status in (-signal.SIGKILL, -signal.SIGTERM)
-        super().__init__(f"the process exited with status {status}")
+    def __init__(self, status: int | None, details: str = "") -> None:
+        self.status, self.was_killed, self.details = status, status == -signal.SIGKILL, details
+        super().__init__(status, details)
+
+    def __str__(self) -> str:
+        return f"the process exited with status {self.status}"
 
 
 class TimeLimitError(Exception):
@@ -73,11 +78,11 @@ class IsolatedCall(Generic[T]):
         ``UnavailableError`` for its other errors.
         """
         try:
-            found: T | UnavailableError | SubmissionError = self.receiver.recv()
+            found: T | UnavailableError | SubmissionError | ProcessEndedError = self.receiver.recv()
         except EOFError:
             self.process.join()
             raise ProcessEndedError(self.process.exitcode) from None
-        if isinstance(found, UnavailableError | SubmissionError):
+        if isinstance(found, UnavailableError | SubmissionError | ProcessEndedError):
             raise found
         return found
 
@@ -94,10 +99,14 @@ def isolated_call(
     process = _SPAWN.Process(target=_run, args=(sender, memory, os.getpid(), function, arguments))
     with receiver:
         with sender:  # Closed here, so that the end of the other process is noticed.
+            # A terminal or systemd signals the children too, for which the parent decides. The mask is inherited.
+            former = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
             try:
                 process.start()
             except OSError as error:  # Out of memory or processes.
                 raise UnavailableError(str(error)) from None
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, former)
         try:
             yield IsolatedCall(process, receiver, time.monotonic() + time_limit_s)
         finally:
@@ -128,6 +137,8 @@ def _run(
         value = archive_error("size", "the archive needs more memory than this service allows")
     except (RebarDepthError, OSError) as error:  # Dataset, cache or disk, not the archive.
         value = UnavailableError(str(error))
+    except Exception:
+        value = ProcessEndedError(1, traceback.format_exc())
     sender.send(value)
 
 

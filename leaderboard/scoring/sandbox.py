@@ -23,9 +23,14 @@ class Outcome:
     reason: str | None = None
 
 
-def check(archive: Path, data: str) -> SubmissionMeta:
-    """Return the content of ``submission.json`` of an archive. Raises ``SubmissionError`` with all problems."""
-    with SubmissionReader(archive, open_folder(data).expected_views()) as submission:
+def check(archive: Path, data: str, dataset_digest: str) -> SubmissionMeta:
+    """Return the content of ``submission.json`` of an archive.
+
+    Raises ``SubmissionError`` with all problems, and ``DatasetError`` if ``data`` has another digest.
+    """
+    folder = open_folder(data)
+    _check_digest(data, folder.digest, dataset_digest)
+    with SubmissionReader(archive, folder.expected_views()) as submission:
         meta = submission.meta
         conflicts = [] if meta is None else meta.kind_problems(RANKS_METRIC)
         splits = {(config_of(view_id), split_of(view_id) or TEST_SPLIT) for view_id in submission.view_ids}
@@ -45,11 +50,16 @@ def score(archive: Path, data: str, dataset_digest: str) -> Outcome:
     from rebar_depth_bench.reporting.html.page import look_at_views
     from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
 
-    digest = open_folder(data).digest
-    if digest != dataset_digest:  # Checked first: on another dataset, the archive could seem invalid.
-        raise DatasetError(f"{data}: the digest is {digest}, expected {dataset_digest}, which serve serves")
+    _check_digest(data, open_folder(data).digest, dataset_digest)
     with open_evaluation(archive, data) as evaluation:
         evaluation.require_metric(RANKS_METRIC)
         result = score_evaluation(evaluation)
         mistakes = look_at_views(evaluation, {}).mistakes
-    return Outcome(digest, result.to_json(), [mistake.text for mistake in mistakes])
+    _check_digest(data, result.dataset.digest, dataset_digest)  # The folder may have been replaced meanwhile.
+    return Outcome(dataset_digest, result.to_json(), [mistake.text for mistake in mistakes])
+
+
+def _check_digest(data: str, found: str, expected: str) -> None:
+    """Raise ``DatasetError`` for another dataset, on which an archive could seem invalid."""
+    if found != expected:
+        raise DatasetError(f"{data}: the digest is {found}, expected {expected}, which serve serves")

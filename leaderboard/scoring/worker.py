@@ -19,7 +19,7 @@ from leaderboard.db.engine import DATABASE_UNAVAILABLE, Database
 from leaderboard.scoring.isolation import ProcessEndedError, TimeLimitError, UnavailableError, isolated_call
 from leaderboard.scoring.sandbox import Outcome, score
 from leaderboard.settings import Settings
-from leaderboard.storage.archive_store import ArchiveNotFoundError, ArchiveStore
+from leaderboard.storage.archive_store import ArchiveStore, archive_problem
 from rebar_depth_bench.base.errors import StorageError, SubmissionError, problem_summary
 
 POLL_INTERVAL_S = 1.0
@@ -29,9 +29,10 @@ _LOG = structlog.get_logger("worker")
 
 
 @contextmanager
-def running_workers(database: Database, settings: Settings) -> Iterator[list[threading.Thread]]:
-    """Run the workers of the settings until the block ends; their jobs are then requeued."""
-    stop = threading.Event()
+def running_workers(
+    database: Database, settings: Settings, stop: threading.Event
+) -> Iterator[list[threading.Thread]]:
+    """Run the workers of the settings until ``stop`` is set or the block ends; their jobs are then requeued."""
     workers = [
         threading.Thread(target=process_queue, args=(database, settings, stop), name=f"worker {number}")
         for number in range(settings.workers)
@@ -77,10 +78,9 @@ def score_next(database: Database, settings: Settings, name: str, stop: threadin
     log.info("scoring started")
     board = database.board()
     digest = board.dataset_digest or ""
-    outcome: Outcome | None = None
+    archives = ArchiveStore(settings.archive_dir, board.board_id)
     try:
-        archive = ArchiveStore(settings.archive_dir, board.board_id).path(record.id)
-        job = (score, archive, settings.data, digest)
+        job = (score, archives.file(record.id), settings.data, digest)
         with isolated_call(*job, memory=settings.score_memory, time_limit_s=settings.score_time) as call:
             while not call.wait(min(lease_s / RENEWALS_PER_LEASE, POLL_INTERVAL_S)):
                 if stop.is_set():
@@ -94,21 +94,26 @@ def score_next(database: Database, settings: Settings, name: str, stop: threadin
                 except DATABASE_UNAVAILABLE:
                     pass  # If another worker takes over, only one of them can finish the job.
             outcome = call.value()
-    except ArchiveNotFoundError:
-        outcome = Outcome(digest, reason="the archive is no longer in the archive storage")
+    except (UnavailableError, StorageError, OSError) as error:
+        return _requeue(database, record.id, name, lease_s, error)
     except SubmissionError as error:
         outcome = Outcome(digest, reason=problem_summary(error.problems))
     except TimeLimitError:
         outcome = Outcome(digest, reason=f"scoring took longer than the limit of {settings.score_time:g} s")
     except ProcessEndedError as error:
-        log.error("scoring process ended", status=error.status)
+        log.error("scoring process ended", status=error.status, details=error.details)
         if error.was_killed:  # From outside, which says nothing of the archive; free when the lease expires.
             return True
         outcome = Outcome(digest, reason=f"{error} without a result")
-    except (UnavailableError, StorageError, OSError) as error:  # The attempt does not count.
-        log.warning("scoring is unavailable; job requeued", reason=str(error))
-        jobs.release(database, record.id, name, wait_s=lease_s)
-        return True
+    if outcome.reason is not None:  # Is it the fault of what was accepted, or of the storage?
+        row = (record.archive_sha256, record.archive_bytes)
+        try:
+            if problem := archive_problem(archives.file(record.id), row, hashed=True):
+                outcome = Outcome(
+                    digest, reason=f"the stored archive {problem}; the operator can requeue it once it is restored"
+                )
+        except (StorageError, OSError) as error:
+            return _requeue(database, record.id, name, lease_s, error)
     while True:
         try:
             is_stored = jobs.finish(database, record.id, name, outcome)
@@ -119,3 +124,10 @@ def score_next(database: Database, settings: Settings, name: str, stop: threadin
         else:
             log.info("scoring finished" if is_stored else "lease lost; outcome discarded", reason=outcome.reason)
             return True
+
+
+def _requeue(database: Database, submission_id: str, name: str, wait_s: float, error: Exception) -> bool:
+    """Requeue a job that cannot be done now, without counting the attempt; return True."""
+    _LOG.warning("scoring is unavailable; job requeued", submission=submission_id[:6], reason=str(error))
+    jobs.release(database, submission_id, name, wait_s)
+    return True

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import shutil
@@ -70,14 +71,17 @@ class ArchiveStore:
     def put(self, submission_id: str, source: Path) -> None:
         """Move a file into the storage; durable on return. It is renamed on the same disk and copied otherwise."""
         target = self.file(submission_id)
-        if source.stat().st_dev == self._folder.stat().st_dev:
-            fsync_path(source)
+        fsync_path(source)
+        try:
             source.replace(target)
-            fsync_path(self._folder)
-        else:
+        except OSError as error:
+            if error.errno != errno.EXDEV:  # Another disk, or another mount of the same one.
+                raise
             with atomic_replace(target, FILE_MODE) as temporary:
                 shutil.copyfile(source, temporary)
             source.unlink()
+        else:
+            fsync_path(self._folder)
 
     def file(self, submission_id: str) -> Path:
         """Return the place of an archive, which may not exist."""

@@ -62,6 +62,11 @@ def back_up(settings: Settings, target: Path, prune: bool) -> None:
             target.chmod(0o700)
             copies = ArchiveStore(target / ARCHIVES, board_id)
             copies.initialise({})
+            try:
+                copies.check()
+            except StorageError:
+                found = "is the backup of another leaderboard or version"
+                raise InputError(f"{target}: {found}, expected a new folder or an earlier backup") from None
             copies.finish_deletions({}, copy_age_s=0)  # Copies of a backup that was killed.
             for leftover in target.glob(f".{DATABASE}*.tmp*"):
                 leftover.unlink()

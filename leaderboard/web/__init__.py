@@ -1,1 +1,1 @@
-"""Web application: middleware, response cache, API and pages."""
+"""Web application: middleware, API and pages."""

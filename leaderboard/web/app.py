@@ -24,7 +24,7 @@ from leaderboard.web.middleware import ETagMiddleware, RequestMiddleware
 from leaderboard.web.pages import account, ranking, submission_page
 from leaderboard.web.pages.rendering import error_response, make_templates
 from rebar_depth_bench import software_version
-from rebar_depth_bench.base.errors import Problem
+from rebar_depth_bench.base.errors import Problem, RebarDepthError
 
 _LOG = structlog.get_logger("http")
 DESCRIPTION = """Accepts prediction archives and scores them exactly as `rebar-bench score` does.
@@ -68,7 +68,8 @@ def make_app(service: Service) -> FastAPI:
     for router in (submissions, leaderboard, status, ranking, submission_page, account):
         app.include_router(router.router)
     app.mount("/static", _StaticFiles(packages=_STATIC_FOLDERS))
-    identity = f"{software_version()} {service.folder.digest} {settings.model_dump_json()}"
+    dataset = (service.folder.digest, service.folder.version, service.dataset_name, service.dataset_licence)
+    identity = f"{software_version()} {dataset} {settings.model_dump_json(exclude={'db'})}"
     app.add_middleware(GZipMiddleware, minimum_size=_MIN_GZIP_BYTES, compresslevel=5)
     app.add_middleware(ETagMiddleware, database=service.database, identity=identity)
     if host := urlsplit(settings.public_url).hostname:
@@ -80,6 +81,7 @@ def make_app(service: Service) -> FastAPI:
     for error_type in DATABASE_UNAVAILABLE:
         app.add_exception_handler(error_type, _handle_database_unavailable)
     app.add_exception_handler(RequestValidationError, _handle_validation_error)
+    app.add_exception_handler(RebarDepthError, _handle_unusable_data)
     return app
 
 
@@ -121,6 +123,11 @@ async def _handle_validation_error(request: Request, error: Exception) -> Respon
 async def _handle_database_unavailable(request: Request, error: Exception) -> Response:
     _LOG.warning("database unavailable", error=" ".join(str(getattr(error, "orig", error)).split()))
     return error_response(request, 503, DATABASE_UNAVAILABLE_MESSAGE, {"Retry-After": "10"})
+
+
+async def _handle_unusable_data(request: Request, error: Exception) -> Response:
+    _LOG.error("dataset or stored data unusable", error=str(error))
+    return error_response(request, 503, "the service cannot read its data at the moment", {"Retry-After": "60"})
 
 
 async def _handle_client_disconnect(_: Request, __: Exception) -> Response:

@@ -20,7 +20,6 @@ from leaderboard.uploads import MAX_OVERHEAD_BYTES
 
 MAX_PATCH_BYTES = 32 << 10
 """Maximum size in bytes of a change of a submission."""
-ID_PATTERN = r"^[A-Za-z0-9_-]+$"
 _BEARER = HTTPBearer(auto_error=False, description="A token created by `rebar-leaderboard token NAME`.")
 _Credentials = Annotated[HTTPAuthorizationCredentials | None, Depends(_BEARER)]
 
@@ -44,7 +43,7 @@ async def optional_token(request: Request, credentials: _Credentials) -> TokenMo
         return None
     token = await to_thread.run_sync(find_token, service_of(request).database, credentials.credentials)
     if token is None:
-        raise _unauthorised("the token is unknown")
+        raise _unauthorised("the token is unknown or revoked; ask the operator for a new one")
     return token
 
 
@@ -65,7 +64,7 @@ WITHOUT_TOKEN: dict[str, Any] = {"security": [{}]}
 OptionalToken = Annotated[TokenModel | None, Depends(optional_token)]
 RequiredToken = Annotated[TokenModel, Depends(required_token)]
 
-SubmissionId = Annotated[str, Path(min_length=1, max_length=32, pattern=ID_PATTERN)]
+SubmissionId = Annotated[str, Path(description="id of the submission, the last part of its URL")]
 
 
 def check_config(service: Service, config: str) -> None:

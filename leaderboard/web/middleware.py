@@ -99,7 +99,8 @@ class ETagMiddleware:
             return
         etag = f'W/"{self._identity}-{version}"'
         if etag in headers.get("if-none-match", ""):
-            unchanged = [(b"etag", etag.encode()), (b"cache-control", REVALIDATE.encode())]
+            fields = {"etag": etag, "cache-control": REVALIDATE, "vary": "Accept-Encoding"}
+            unchanged = [(name.encode(), value.encode()) for name, value in fields.items()]
             await send({"type": "http.response.start", "status": 304, "headers": unchanged})
             await send({"type": "http.response.body", "body": b""})
             return

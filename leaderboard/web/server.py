@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import socket
 import sys
+import threading
 from ipaddress import ip_address
 
 import structlog
@@ -55,15 +56,18 @@ def serve(settings: Settings) -> None:
         # While pages are rendered in threads, the event loop gets the interpreter back after this time.
         sys.setswitchinterval(_SWITCH_INTERVAL_S)
 
+        stop_workers = threading.Event()
+
         def stop(*_: object) -> None:
             server.should_exit = True
+            stop_workers.set()
 
         # uvicorn re-raises caught signals when it ends; the default handler would exit before the workers stop.
         for signal_number in (signal.SIGTERM, signal.SIGINT):
             signal.signal(signal_number, stop)
         details = {"version": software_version(), "dataset": service.folder.digest, "scorers": settings.workers}
         _LOG.info("serving", database=without_password(settings.database_url), **details)
-        with running_workers(service.database, settings) as workers:
+        with running_workers(service.database, settings, stop_workers) as workers:
             service.workers.extend(workers)
             server.run(sockets=[listener])
         _LOG.info("stopped")

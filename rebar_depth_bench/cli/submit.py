@@ -10,7 +10,7 @@ from pathlib import Path
 
 from rich.console import Console
 
-from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.errors import InputError, printable
 from rebar_depth_bench.base.reading import decode_text
 from rebar_depth_bench.base.terminal import ProgressBars
 from rebar_depth_bench.base.writing import write_output
@@ -59,6 +59,8 @@ def run(options: argparse.Namespace) -> None:
         if submission.status == "failed":
             reason = submission.reason or "the service gives no reason"
             raise InputError(f"{options.archive}: scoring failed: {reason}")
+        if submission.outdated:
+            print(f"warning: the result is outdated: {printable(submission.outdated, 1000)}", file=sys.stderr)
         result, result_json = leaderboard.result(accepted.id, accepted.archive_sha256)
     if options.json:
         write_output(options.json, result_json)

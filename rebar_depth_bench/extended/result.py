@@ -99,10 +99,14 @@ class ExtendedResult:
         }
 
     def to_pandas(self) -> DataFrame:
-        """Return one row per config, alignment and measure: value, 95 % interval and number of samples."""
+        """Return one row per config, alignment and measure: value, 95 % interval and number of samples.
+
+        Shares are from 0 to 1 and have no unit.
+        """
         rows = [
             (
-                *(config, alignment, measure.name, measure.unit, measure.statistic, estimate.value),
+                *(config, alignment, measure.name, "" if measure.unit == "%" else measure.unit),
+                *(measure.statistic, estimate.value),
                 *(rounded_interval(estimate.interval) or (None, None)),
                 estimate.samples,
             )

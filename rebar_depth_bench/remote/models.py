@@ -91,16 +91,14 @@ class Submission(Answer):
     code_url: str | None = None
     licence: str | None = None
     training_data: str | None = None
-    parameters: float | str | None = Field(None, description="number of learned parameters, or text")
+    parameters: int | float | str | None = Field(None, description="number of learned parameters, or text")
     seconds_per_view: float | None = Field(None, description="runtime as the submitter declares it")
     inputs: str | None = Field(None, description="input class, as declared by the submitter")
     uses_ground_truth: bool | None = None
     public: bool = Field(description="whether its rows are shown on the leaderboard")
     created_at: _Time
     finished_at: _Time | None
-    reason: str | None = Field(
-        description="reason why scoring failed, or why it could not be scored again; null otherwise"
-    )
+    reason: str | None = Field(description="reason why scoring failed; null otherwise")
     archive_sha256: _Sha256
     archive_bytes: _Count
     archive_kept: bool = Field(description="whether the archive is kept; without it nothing is scored again")

@@ -26,6 +26,7 @@ from rebar_depth_bench.scoring.columns import (
     columns_at,
     rounded,
 )
+from rebar_depth_bench.scoring.comparison import config_differences
 from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND, kind_blocks
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.table import PublishedMatch, Table
@@ -53,6 +54,8 @@ _ARROWS: Mapping[Better, str] = {"lower": r" $\downarrow$", "higher": r" $\uparr
 _MISSING = "--"
 _NO_OTHERS = [""] * len(OTHERS)
 _MARKS: Mapping[str, str] = {"‡": r"$^{\ddagger}$", "?": "$^{?}$", "*": "$^{*}$", "": ""}
+_INCOMPARABLE = "$^{*}$Not comparable with other rows: predictions are missing, or a number overflowed."
+"""Note of the caption; the methods and reasons are in a comment."""
 _OTHER_OPTICS_MARK = r"$^{\S}$"
 _ANCHORED_MARK = r"$^{\dagger}$"
 _LATEX_ESCAPES = {
@@ -79,14 +82,15 @@ def latex_table(
 ) -> str:
     r"""Return ``results`` as a LaTeX ``table*`` with one row per result and the same columns per config.
 
-    RMSE (cm) and AbsRel are native, AbsRel_s is computed after the oracle scale, s is its median over views. The
-    best number of a column is bold if the column has two or more ranked rows; a row that is not ranked is marked
-    with a double dagger and is never bold. The first error of valid predictions of a row whose errors are not
-    compared with those of others has an asterisk. With ``published``, the paper's rows of the same scenes follow
+    RMSE (cm) and AbsRel are native, AbsRel_s is computed after the oracle scale, s is its median over views. A
+    number of a ranked row is bold if ``compare`` finds it better than that of every other ranked row. A row that
+    is not ranked is marked with a double dagger. Numbers of valid predictions have an asterisk in a row whose
+    errors are not compared with those of others. With ``published``, the paper's rows of the same scenes follow
     below a rule; they are marked and not compared with the results. ``absent`` is as in ``print_paper_table``.
     With ``intervals``, the 95 % intervals are printed beside the numbers, and each block holds one config. Results
     that are not metric follow in a table for each kind, in the order of the aligned error of a block's first
-    config, without bold numbers.
+    config, without bold numbers. The caption is for readers of a paper; digest, versions and the reasons why rows
+    are not comparable are comments above the table.
 
     Raises ``InputError`` if there are no results, or if they belong to different datasets.
     """
@@ -109,6 +113,17 @@ def _table_of_kind(results: Sequence[Result], absent: Sequence[str], *, publishe
     published = published and kind is None
     matches = {config: table.published for config, table in tables.items() if published and table.published}
     paper_rows = [row for match in matches.values() for row in published_rows(match.scene)]
+    rows = [_result_rows(results, block, columns, intervals) for block in blocks]
+    notes, captioned = (formatting.row_notes(results, one) for one in (absent if kind is None else (), ()))
+    flat = [
+        f"{result.method}, {formatting.config_title(config, table.split)} "
+        f"({table.flat_views} of {formatting.counted(table.views, 'view')})"
+        for result in results
+        for config, table in result.tables.items()
+        if table.flat_views
+    ]
+    if flat:
+        captioned.append(("", "Fits without a positive slope, which are constants: ", flat))
     return _template().render(
         protocol=results[0].protocol,
         kind=kind,
@@ -117,15 +132,15 @@ def _table_of_kind(results: Sequence[Result], absent: Sequence[str], *, publishe
         ),
         heads=[_head(column) for column in columns],
         version=results[0].dataset.version,
-        digest=formatting.short_digest(results[0].dataset.digest, 16),
+        digest=results[0].dataset.digest,
+        software=results[0].software.version,
         view_counts=[
-            f"{_config_name(config, table)} {formatting.counted(table.views, 'view')}"
+            f"{_config_name(config, table)}, {formatting.counted(table.views, 'view')}"
             for config, table in tables.items()
         ],
-        notes=[
-            _MARKS[mark] + start + "; ".join(map(escape_latex, listed)) + "."
-            for mark, start, listed in formatting.row_notes(results, absent if kind is None else ())
-        ],
+        notes=[_INCOMPARABLE if note[0] == "*" else _note_text(*note) for note in captioned],
+        comments=[_note_text(*note) for note in notes if note[0] == "*" or note not in captioned],
+        bold=any(r"\textbf" in cell for of_block in rows for row in of_block for cell in row[1:]),
         intervals=intervals,
         resampled=_resampled(tables.values()),
         anchored=any(row.median_anchored for row in paper_rows),
@@ -137,11 +152,11 @@ def _table_of_kind(results: Sequence[Result], absent: Sequence[str], *, publishe
         blocks=[
             {
                 "titles": [_config_title(config, tables[config]) for config in block],
-                "rows": _result_rows(results, block, columns, intervals),
+                "rows": of_block,
                 "reference_rows": _merged([_reference_rows(results, config) for config in block], ""),
                 "published_rows": _merged([_published_rows(matches.get(config)) for config in block], _MISSING),
             }
-            for block in blocks
+            for block, of_block in zip(blocks, rows, strict=True)
         ],
     )
 
@@ -149,6 +164,11 @@ def _table_of_kind(results: Sequence[Result], absent: Sequence[str], *, publishe
 def escape_latex(text: str) -> str:
     """Return text from a submission escaped for LaTeX: a single line without commands or control characters."""
     return _LIGATURE.sub(r"\1{}", "".join(_LATEX_ESCAPES.get(char, char) for char in printable(text)))
+
+
+def _note_text(mark: str, start: str, listed: Sequence[str]) -> str:
+    """Return a note of ``formatting.row_notes`` as a sentence."""
+    return _MARKS[mark] + start + "; ".join(map(escape_latex, listed)) + "."
 
 
 def _template() -> Template:
@@ -181,12 +201,11 @@ def _result_rows(
     results: Sequence[Result], configs: Sequence[str], columns: Sequence[Column], intervals: bool
 ) -> list[list[str]]:
     """Return the rows of a block, each a name and the cells of each config."""
-    best = {config: _best_texts([result.tables.get(config) for result in results]) for config in configs}
     shown = [result for result in results if any(name in result.tables for name in configs)]
     return [
         [
             escape_latex(result.method) + _MARKS["?"] * (result.declared.uses_ground_truth is None),
-            *(cell for one in configs for cell in _cells(result, one, columns, best[one], intervals)),
+            *(cell for one in configs for cell in _cells(result, results, one, columns, intervals)),
         ]
         for result in sorted(shown, key=lambda result: _sort_key(result.tables.get(configs[0])))
     ]
@@ -207,39 +226,43 @@ def _sort_key(table: Table | None) -> tuple[bool, bool, float]:
     return False, not table.ranked, rounded(table.error) or 0.0
 
 
-def _best_texts(tables: Iterable[Table | None]) -> dict[str, str]:
-    """Return the formatted lowest rank error, RMSE, AbsRel and AbsRel_s of the ranked tables by path.
+def _bold_paths(result: Result, results: Sequence[Result], config: str) -> set[str]:
+    """Return the paths of the numbers of a config in which a result is decided to be better than all others.
 
-    There are none if fewer than two tables are ranked, and only the first if not all of these are comparable.
+    Only ranked rows are compared; without another one there are no such numbers.
     """
-    ranked = [table for table in tables if table is not None and table.ranked]
-    if len(ranked) < 2:
-        return {}
-    columns = _COLUMNS if all(table.is_comparable for table in ranked) else _COLUMNS[:1]
-    best = {"lower": min, "higher": max}
-    return {
-        column.path: column.text(best[column.better](column.value(table) for table in ranked))
-        for column in columns
-        if column.better
-    }
+    others = [
+        other
+        for other in results
+        if other is not result and config in other.tables and other.tables[config].ranked
+    ]
+    # The best first: most results are better than it in no number, and need no other comparison.
+    others.sort(key=lambda other: _sort_key(other.tables[config]))
+    better = {column.path for column in _COLUMNS} if others else set()
+    for other in others:
+        if better:
+            rows = config_differences(other, result, config)
+            better &= {row.column.path for row in rows if row.verdict == "better"}
+    return better
 
 
 def _cells(
-    result: Result, config: str, columns: Sequence[Column], best: Mapping[str, str], intervals: bool
+    result: Result, results: Sequence[Result], config: str, columns: Sequence[Column], intervals: bool
 ) -> list[str]:
-    """Return a config's cells; ``best`` holds the formatted best number of columns."""
+    """Return the cells of a result in a config, with their marks, bold among the ``results`` of the table."""
     table = result.tables.get(config)
     if table is None:
         return [_MISSING] * len(columns)
+    bold = _bold_paths(result, results, config) if table.ranked else set()
+    unranked = _MARKS["‡"] if formatting.rank_mark(result.declared) == "‡" else ""
+    incomparable = _MARKS["*"] if formatting.incomparable_reasons(table) else ""
     cells = []
     for column in columns:
         number = column.text(column.value(table)).replace(DASH, _MISSING)
         interval = column.interval_text(column.interval(table), ", ") if intervals else ""
-        shown = rf"\textbf{{{number}}}" if table.ranked and number == best.get(column.path) else number
-        cells.append(shown + (rf" {{\tiny[{interval}]}}" if interval else ""))
-    cells[0] += _MARKS["‡"] if formatting.rank_mark(result.declared) == "‡" else ""
-    of_valid = next(place for place, column in enumerate(columns) if not column.of_all_views)
-    cells[of_valid] += _MARKS["*"] if formatting.incomparable_reasons(table) else ""
+        shown = rf"\textbf{{{number}}}" if column.path in bold else number
+        mark = unranked if column is columns[0] else "" if column.of_all_views else incomparable
+        cells.append(shown + mark + (rf" {{\tiny[{interval}]}}" if interval else ""))
     return cells
 
 
@@ -258,8 +281,7 @@ def _published_rows(match: PublishedMatch | None) -> dict[str, list[str]]:
     return {
         row.method: [
             "",
-            row.rmse_cm + (_ANCHORED_MARK if row.median_anchored else "") + optics,
-            *row.cells[1:],
+            *(cell + (_ANCHORED_MARK if row.median_anchored else "") + optics for cell in row.cells),
             *_NO_OTHERS,
         ]
         for row in published_rows(match.scene)

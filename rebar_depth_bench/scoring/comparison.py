@@ -97,7 +97,7 @@ def compare(first: Result, other: Result) -> Comparison:
         )
     return Comparison(
         provenance=Provenance(first.protocol, first.dataset, (first.submission, other.submission)),
-        configs={config: _config_differences(first, other, config) for config in shared},
+        configs={config: config_differences(first, other, config) for config in shared},
     )
 
 
@@ -124,8 +124,11 @@ def check_same_splits(results: Sequence[Result]) -> None:
                 )
 
 
-def _config_differences(first: Result, other: Result, config: str) -> list[Difference]:
-    """Return one difference per metric; error metrics use only the views where both submissions have a value."""
+def config_differences(first: Result, other: Result, config: str) -> list[Difference]:
+    """Return one difference per metric of a config that both cover, with the same split.
+
+    Error metrics use only the views where both submissions have a value.
+    """
     tables = first.tables[config], other.tables[config]
     # The constant of a fit differs with the pixels that have a value, not with the quality of a method.
     columns = [column for column in first.columns if column not in ALIGNED_CONSTANT]

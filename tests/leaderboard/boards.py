@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import hashlib
 import json
 import multiprocessing
@@ -15,9 +14,7 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any
 
-import httpx2
 from sqlalchemy import Engine, event, select
-from starlette.types import ASGIApp
 
 from leaderboard.db import jobs, submissions
 from leaderboard.db.engine import Database
@@ -27,9 +24,7 @@ from leaderboard.db.tokens import create_token, find_token
 from leaderboard.scoring.sandbox import Outcome
 from leaderboard.settings import Settings, read_settings
 from leaderboard.storage.archive_store import ArchiveStore
-from rebar_depth_bench.data.manifest import open_folder
 from tests.bench.reporting.results import result, scored_view
-from tests.synthetic_dataset import scale_errors
 
 DIGEST, OTHER_DIGEST = "sha256:" + "0" * 64, "sha256:" + "1" * 64
 _PROCESSES = multiprocessing.get_context("forkserver")
@@ -46,7 +41,7 @@ def opened(settings: Settings) -> Iterator[tuple[Database, ArchiveStore]]:
     """Yield database and archives of a leaderboard, which is made if there is none."""
     settings.state_dir.mkdir(mode=0o700, parents=True, exist_ok=True)
     with closing(Database(settings.database_url)) as database:
-        database.migrate()
+        database.create_schema()
         archives = ArchiveStore(settings.archive_dir, database.board().board_id)
         archives.initialise(archive_rows(database))
         yield database, archives
@@ -77,6 +72,7 @@ def accept(
                 archive_bytes=size,
                 public=public,
                 created_at=time.time(),
+                queued_at=time.time(),
                 status=QUEUED,
                 attempts=0,
             )
@@ -84,52 +80,10 @@ def accept(
     return submission_id
 
 
-def add_scored_submission(
-    database: Database, token: str, method: str, error: float, *, public: bool = True
-) -> str:
-    """Insert a submission of ``lattice`` and ``pile`` that is scored; its errors are scaled by ``error``."""
-    submission_id = accept(database, token, method=method, public=public)
-    finish_scoring(database, submission_id, method, error)
-    return submission_id
-
-
-def digest_of_board(database: Database) -> str:
-    """Return the digest of the dataset that is beside the state folder, if there is one."""
-    assert database.file is not None
-    root = database.file.parents[1] / "dataset"
-    return open_folder(root).digest if root.is_dir() else DIGEST
-
-
-def finish_scoring(database: Database, submission_id: str, method: str, error: float) -> None:
-    """Score the queued submission, as a worker does."""
-    assert claimed(database, "scorer") == submission_id
-    views = (scored_view("lattice/0000"), scored_view("pile/0000"))
-    content = json.dumps(scale_errors(result(*views, method=method).to_dict(), error)).encode()
-    assert jobs.finish(database, submission_id, "scorer", Outcome(database.board().dataset_digest or "", content))
-
-
 def claimed(database: Database, scorer: str, lease_s: float = 60) -> str | None:
     """Claim a job; return its id."""
     record = jobs.claim(database, scorer, lease_s)
     return None if record is None else record.id
-
-
-def get_response(app: ASGIApp, address: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
-    """Call an ASGI application directly; return status, headers and body."""
-    return asyncio.run(_call(app, address, **headers))
-
-
-async def _call(app: ASGIApp, address: str, **headers: str) -> tuple[int, dict[str, str], bytes]:
-    transport = httpx2.ASGITransport(app=app)
-    fields = {"accept-encoding": "", **{name.replace("_", "-"): value for name, value in headers.items()}}
-    async with httpx2.AsyncClient(transport=transport, base_url="http://localhost", headers=fields) as client:
-        request = client.build_request("GET", address)
-        response = await client.send(request, stream=True)
-        return (
-            response.status_code,
-            dict(response.headers),
-            b"".join([part async for part in response.aiter_raw()]),
-        )
 
 
 def add_submission(settings: Settings, token: str, content: bytes, *, scored: bool = True) -> str:

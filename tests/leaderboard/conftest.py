@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import json
 import secrets
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,25 +15,24 @@ import numpy as np
 import pytest
 from playwright.sync_api import Browser, sync_playwright
 
-from rebar_depth_bench import SubmissionWriter, load, score
-from rebar_depth_bench.remote import leaderboard_client
+from leaderboard.db import jobs, submissions
+from leaderboard.db.tokens import create_token
+from leaderboard.scoring.sandbox import Outcome
+from rebar_depth_bench import SubmissionWriter, load
+from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.scoring.metrics import DepthMetrics
+from rebar_depth_bench.scoring.result import DatasetIdentity
+from rebar_depth_bench.submission.declaration import Declaration
+from tests.bench.reporting.results import result, scored_view
 from tests.leaderboard import serving
-from tests.leaderboard.scripted_server import (
-    TOKEN,
-    TOKEN_INFO,
-    ScriptedServer,
-    answer,
-    scripted_server,
-    submission,
-)
+from tests.leaderboard.boards import OTHER_DIGEST, accept, board_settings, claimed, opened
 from tests.leaderboard.serving import Postgres, RunPostgres, RunScorer, RunServer, Server, make_token
 
 HOSTILE = "<script>alert(1)</script>\"'&amp;{{ 7 * 7 }}"
 DESCRIPTION = "first line\n<b>second</b>\u202egnp\x1b[31m"
 
 WriteArchive = Callable[..., Path]
-Refused = Callable[..., str]
-"""Types of the functions that the fixtures of the same names return."""
+"""Type of the function that the fixture of the same name returns."""
 
 
 @dataclass(frozen=True)
@@ -160,56 +160,55 @@ def waiting(
     common: dict[str, Any] = {"default_visibility": "owner"}
     ids = {}
     for name, limits in (("failed", {"score_time": 0.01}), ("scored", {})):
-        with running_server(state, **limits, **common) as server:
+        with running_server(state, workers=0, **common) as server:
             ids[name] = server.submit_accepted(archive, token)
+        with running_server(state, **limits, **common) as server:
             assert server.wait_until_ended(ids[name])["status"] == name
     with running_server(state, workers=0, quota=5, max_upload=2_000_000, **common) as server:
         ids |= {name: server.submit_accepted(archive, token) for name in ("next", "later")}
         yield SharedServer(server, token, ids)
 
 
+LONG_NAME = "a method whose name is as long as a name may be, " * 4 + "full"
+"""Name of 200 characters."""
+LINKS = {"dataset_url": "https://example.org/data", "paper_url": "https://example.org/paper"}
+
+
 @pytest.fixture(scope="session")
-def small_result(small_archive: Path, tiny_root: Path) -> bytes:
-    """Return the result of ``small_archive`` as JSON."""
-    return score(small_archive, tiny_root).to_json()
+def crowded(
+    tiny_root: Path, tmp_path_factory: pytest.TempPathFactory, running_server: RunServer
+) -> Iterator[SharedServer]:
+    """A server that scores nothing, with rows of ``lattice`` of every kind.
 
-
-@pytest.fixture
-def scripted(
-    small_archive: Path, small_result: bytes, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[ScriptedServer]:
-    """Run a server that accepts and scores ``small_archive``; tests replace its answers."""
-    monkeypatch.setattr(leaderboard_client, "POLL_INTERVAL_S", 0.01)
-    monkeypatch.setenv("REBAR_LEADERBOARD_TOKEN", TOKEN)
-    with scripted_server() as script:
-        script.answers = {
-            "token": [answer(TOKEN_INFO)],
-            "submit": [answer(submission(small_archive), 202)],
-            "status": [answer(submission(small_archive, status=status)) for status in ("queued", "scored")],
-            "result": [answer(small_result)],
-        }
-        yield script
-
-
-@pytest.fixture
-def refused(
-    scripted: ScriptedServer, small_archive: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> Refused:
-    """Submit to the scripted server, and check exit status and that nothing is written; return the message."""
-
-    def check(status: int = 1) -> str:
-        start = time.monotonic()
-        assert scripted.submit(small_archive, "--json", str(tmp_path / "r.json")) == status
-        assert time.monotonic() - start < 20
-        assert list(tmp_path.iterdir()) == []
-        captured = capsys.readouterr()
-        assert captured.out == ""
-        assert all(line.isprintable() and len(line) < 3000 for line in captured.err.split("\n"))
-        assert len(captured.err) < 30_000
-        assert TOKEN not in captured.err
-        return captured.err[captured.err.index("error: ") :]
-
-    return check
+    ``worse`` is a second row of ``method 3``, and ``truth`` declares the use of ground truth.
+    """
+    state, digest = tmp_path_factory.mktemp("crowded") / "state", open_folder(tiny_root).digest
+    errors = {f"method {number}": 0.02 + 0.01 * number for number in range(12)}
+    errors |= {"baseline": 0.3, "worse": 0.5, LONG_NAME: 0.05, "huge": 9.0, "truth": 0.01, "outdated": 0.01}
+    ids = {}
+    with opened(board_settings(state)) as (database, _):
+        jobs.serve_dataset(database, digest, rescore=False)
+        token = create_token(database, "x" * 100)
+        organiser = serving.run("token", "org", "--baseline", "--state-dir", state).stdout.strip()
+        for name, error in errors.items():
+            view = scored_view("lattice/0000", error)
+            if name == "huge":
+                view = replace(view, rank_error=1.0, scale=1e-30, native=DepthMetrics(1e30, 1e32, 1e32, 0.0))
+            views = [replace(view, view_id=f"lattice/{8 * index:04d}") for index in range(80)]
+            method = "method 3" if name == "worse" else name
+            content = result(*views, method=method, declared=Declaration("rgb", name == "truth"))
+            scored_on = OTHER_DIGEST if name == "outdated" else digest
+            content = replace(content, dataset=DatasetIdentity(scored_on, "1"))
+            ids[name] = accept(database, organiser if name == "baseline" else token, method=method)
+            assert claimed(database, "scorer") == ids[name]
+            assert jobs.finish(database, ids[name], "scorer", Outcome(scored_on, content.to_json()))
+            details = json.dumps({"seconds_per_view": 1e18, "code_url": "https://example.org/code"})
+            declared = {"inputs": "rgb", "uses_ground_truth": name == "truth", "details": details}
+            submissions.change(database, ids[name], declared)
+        kept = {"status": "scored", "archive_deleted_at": time.time()}
+        submissions.change(database, ids["outdated"], kept)
+    with running_server(state, workers=0, **LINKS) as server:
+        yield SharedServer(server, token, ids)
 
 
 @pytest.fixture(scope="module")

@@ -15,12 +15,13 @@ from pathlib import Path
 from typing import Any
 
 from rebar_depth_bench.cli.main import main
+from rebar_depth_bench.remote.models import Submission
 
 Send = Callable[[BufferedIOBase], None]
 """Function that writes an answer to a connection."""
-ID = "5f0c9a7e2b4d4c1f8e6a3d2b1c0f9e8d"
+SUBMISSION: dict[str, Any] = Submission.model_json_schema()["example"]
+ID, URL = SUBMISSION["id"], SUBMISSION["url"]
 TOKEN = "rdb_secret-of-the-user"
-URL = f"https://example.org/submissions/{ID}"
 TOKEN_INFO = {
     "name": "alice",
     "quota": 10,
@@ -28,24 +29,6 @@ TOKEN_INFO = {
     "quota_bytes": 1 << 40,
     "quota_bytes_left": 1 << 39,
     "max_upload_bytes": 1 << 30,
-}
-SUBMISSION: dict[str, Any] = {
-    "id": ID,
-    "status": "queued",
-    "url": URL,
-    "method": "m",
-    "parameters": 1_000_000,
-    "inputs": None,
-    "uses_ground_truth": False,
-    "public": True,
-    "created_at": "2026-01-31T12:00:00.123456Z",
-    "finished_at": None,
-    "reason": None,
-    "archive_sha256": "0" * 64,
-    "archive_bytes": 1234,
-    "archive_kept": True,
-    "outdated": None,
-    "result": None,
 }
 
 
@@ -69,14 +52,12 @@ class ScriptedServer:
         return main(["submit", str(archive), "--url", self.url, *options])
 
 
-def answer(
-    content: object, status: int = 200, headers: Mapping[str, str] | None = None, reason: str = "Answer"
-) -> bytes:
+def answer(content: object, status: int = 200, headers: Mapping[str, str] | None = None) -> bytes:
     """Return a complete HTTP response; content other than bytes becomes JSON."""
     body = content if isinstance(content, bytes) else json.dumps(content).encode()
     lines = {"Content-Length": str(len(body)), "Connection": "close", **(headers or {})}
     head = "".join(f"{name}: {value}\r\n" for name, value in lines.items())
-    return f"HTTP/1.1 {status} {reason}\r\n{head}\r\n".encode() + body
+    return f"HTTP/1.1 {status} Answer\r\n{head}\r\n".encode() + body
 
 
 def submission(archive: Path, **changes: Any) -> dict[str, Any]:

@@ -147,7 +147,7 @@ def make_token(state: Path, name: str, db: str = "") -> str:
     state.mkdir(mode=0o700, parents=True, exist_ok=True)
     settings = read_settings(None, {"data": "", "state_dir": state, "db": db})
     with closing(Database(settings.database_url)) as database:
-        database.migrate()
+        database.create_schema()
         return create_token(database, name)
 
 
@@ -183,7 +183,14 @@ def running_server(
     options = [part for name, value in settings.items() for part in (f"--{name.replace('_', '-')}", str(value))]
     arguments = ["serve", "--data", str(root), "--state-dir", str(state), "--port", "0", *options]
     with _running_command(arguments, environment or {}) as (process, log):
-        yield Server(_address(process, log), process, state, str(settings.get("db", "")), log)
+
+        def addresses() -> list[str]:
+            """Return the line with the address, which is the first unless there are warnings."""
+            assert process.poll() is None, "\n".join(log)
+            return [line for line in list(log) if line.startswith("http://")]
+
+        wait_until(addresses, "the server prints its address")
+        yield Server(addresses()[0], process, state, str(settings.get("db", "")), log)
 
 
 @contextmanager
@@ -202,42 +209,21 @@ def _running_command(
     command = [sys.executable, "-m", "leaderboard", *arguments]
     every = {**os.environ, "PYTHONWARNINGS": "default", **environment}
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True, env=every)
-    log: list[str] = []
-    reader = threading.Thread(target=_collect, args=(process, log), daemon=True)
+    stderr, log = process.stderr, list[str]()
+    assert stderr is not None
+    reader = threading.Thread(target=lambda: log.extend(line.rstrip("\n") for line in stderr), daemon=True)
     reader.start()
     try:
         yield process, log
     finally:
-        _stop(process)
-        reader.join(10)
-        assert process.stderr is not None
-        process.stderr.close()
-
-
-def _collect(process: subprocess.Popen[str], log: list[str]) -> None:
-    assert process.stderr is not None
-    log.extend(line.rstrip("\n") for line in process.stderr)  # Extends line by line.
-
-
-def _address(process: subprocess.Popen[str], log: list[str]) -> str:
-    """Wait for the line with the address, which is the first unless there are warnings."""
-
-    def addresses() -> list[str]:
-        assert process.poll() is None, "\n".join(log)
-        return [line for line in list(log) if line.startswith("http://")]
-
-    wait_until(addresses, "the server prints its address")
-    return addresses()[0]
-
-
-def _stop(process: subprocess.Popen[str]) -> None:
-    if process.poll() is None:
         process.terminate()
         try:
             process.wait(30)
         except subprocess.TimeoutExpired:
             os.killpg(process.pid, signal.SIGKILL)
             process.wait(10)
+        reader.join(10)
+        stderr.close()
 
 
 BOUNDARY = "XX"
@@ -330,7 +316,7 @@ class Postgres:
 
         def is_ready() -> bool:
             assert process.poll() is None, log.read_text()[-2000:]
-            return self._run("pg_isready", "-q", "-h", str(self.folder), check=False) == 0
+            return self.run("pg_isready", "-q", "-h", str(self.folder), check=False) == 0
 
         wait_until(is_ready, "PostgreSQL accepts connections")
 
@@ -346,22 +332,24 @@ class Postgres:
 
     def new_database(self, name: str) -> str:
         """Create an empty database and return its URL."""
-        self._run("createdb", "-h", str(self.folder), "-U", "board", name)
+        self.run("createdb", "-h", str(self.folder), "-U", "board", name)
         return f"postgresql://board@/{name}?host={self.folder}"
 
-    def run(self, program: str, *arguments: str, output: Path | None = None, input: Path | None = None) -> None:
-        """Run a program of PostgreSQL as its user, with a file as standard output or input."""
+    def run(
+        self,
+        program: str,
+        *arguments: str,
+        check: bool = True,
+        output: Path | None = None,
+        input: Path | None = None,
+    ) -> int:
+        """Run a program of PostgreSQL as its user, with a file as standard output or input; return its status."""
         command = [str(self.binaries / program), *arguments]
         content = b"" if input is None else input.read_bytes()
-        finished = subprocess.run(
-            command, check=True, user=_user(), stdout=subprocess.PIPE, cwd="/", input=content
-        )
+        finished = subprocess.run(command, check=check, user=_user(), capture_output=True, cwd="/", input=content)
         if output is not None:
             output.write_bytes(finished.stdout)
-
-    def _run(self, program: str, *arguments: str, check: bool = True) -> int:
-        command = [str(self.binaries / program), *arguments]
-        return subprocess.run(command, check=check, user=_user(), capture_output=True, cwd="/").returncode
+        return finished.returncode
 
 
 @contextmanager
@@ -372,7 +360,7 @@ def running_postgres() -> Iterator[Postgres]:
         server = Postgres(_binaries(folder), folder)
         if user := _user():
             shutil.chown(folder, user)
-        server._run("initdb", "-D", str(folder / "data"), "-U", "board", "--auth=trust", "--encoding=UTF8")
+        server.run("initdb", "-D", str(folder / "data"), "-U", "board", "--auth=trust", "--encoding=UTF8")
         server.start()
         try:
             yield server

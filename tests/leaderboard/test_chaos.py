@@ -259,100 +259,37 @@ PASSWORD = "correct-horse-battery"
 WRONG_TOKEN = "rdb_nobody-ever-made-this-token"
 
 
-@dataclass(frozen=True)
-class ServiceRun:
-    """Service on PostgreSQL that has accepted and rejected uploads and survived a database outage."""
-
-    server: Server
-    token: str
-    ids: tuple[str, ...]
-    health: tuple[int, ...]
-    away: httpx2.Response
-
-
-def health(server: Server) -> int:
-    return int(server.get("/healthz").status_code)
-
-
-def restart_database(server: Server, database: Postgres, page: str) -> tuple[tuple[int, ...], httpx2.Response]:
-    before = health(server)
-    database.kill()
-    try:
-        away, during = server.get(page), health(server)
-        wait_until(lambda: any("database unavailable" in line for line in server.log), "the loss is logged")
-    finally:
-        database.start()
-    wait_until(lambda: health(server) == 200, "the database is found again")
-    return (before, during, health(server)), away
-
-
-@pytest.fixture(scope="module")
-def observed(
-    small_archive: Path,
-    tmp_path_factory: pytest.TempPathFactory,
-    running_server: RunServer,
-    running_postgres: RunPostgres,
-) -> Iterator[ServiceRun]:
-    broken = tmp_path_factory.mktemp("observing") / "broken.zip"
-    broken.write_bytes(b"no zip")
+def test_database_outage_is_answered_and_logs_have_no_secrets(
+    small_archive: Path, tmp_path: Path, running_server: RunServer, running_postgres: RunPostgres
+) -> None:
+    (tmp_path / "broken.zip").write_bytes(b"no zip")
     with running_postgres() as database:
         db = database.url.replace("board@", f"board:{PASSWORD}@")  # The server ignores the password.
         with running_server(db=db, default_visibility="owner", lease_seconds=5) as server:
             token = server.token("alice")
             first = server.submit_accepted(small_archive, token)
             assert server.submit(small_archive, WRONG_TOKEN).status_code == 401
-            assert server.submit(broken, token).status_code == 422
+            assert server.submit(tmp_path / "broken.zip", token).status_code == 422
             invalid = f"GET / HTTP/9.9 {WRONG_TOKEN}\r\nAuthorization: Bearer {WRONG_TOKEN}\r\n\r\n"
             exchange(server.url, invalid.encode())
             assert server.wait_until_ended(first)["status"] == "scored"
-            page = f"{API}/{first}"
-            health_codes, away = restart_database(server, database, page)
+            assert server.get("/healthz").status_code == 200
+            database.kill()
+            away, health = server.get(f"{API}/{first}"), server.get("/healthz")
+            wait_until(lambda: any("database unavailable" in line for line in server.log), "the loss is logged")
+            database.start()
+            wait_until(lambda: server.get("/healthz").status_code == 200, "the database is found again")
             second = server.submit_accepted(small_archive, token)
             assert server.wait_until_ended(second)["status"] == "scored"
-            assert server.call("DELETE", page, token).status_code == 204
-            # A request is logged after its response has been sent.
-            wait_until(lambda: any('"status": 204' in line for line in server.log), "the deletion is logged")
-            yield ServiceRun(server, token, (first, second), health_codes, away)
-
-
-def test_health_is_503_during_database_outage(observed: ServiceRun) -> None:
-    assert observed.health == (200, 503, 200)
-    assert observed.away.status_code == 503
-    assert observed.away.headers["Retry-After"] == "10"
-    assert "try again" in observed.away.json()["detail"]
-    assert PASSWORD not in observed.away.text
-
-
-def test_logs_are_json_lines_without_secrets(observed: ServiceRun) -> None:
-    log = [line for line in observed.server.log if line]
-    assert log[0] == observed.server.url
-    events = [json.loads(line) for line in log[1:]]
-    for event in events:
-        assert {"event", "level", "timestamp"} <= set(event), event
-    text = "\n".join(log)
-    for secret in (
-        observed.token,
-        observed.token[4:],
-        WRONG_TOKEN,
-        PASSWORD,
-        "Authorization",
-        "Bearer",
-        *observed.ids,
-    ):
-        assert secret not in text, f"{secret} is in the log"
-
-
-def test_logs_contain_expected_events(observed: ServiceRun) -> None:
-    events = [json.loads(line) for line in observed.server.log[1:] if line]
-    event_names = {event["event"] for event in events}
+    assert (away.status_code, away.headers["Retry-After"], health.status_code) == (503, "10", 503)
+    assert "try again" in away.json()["detail"]
+    assert PASSWORD not in away.text
+    events = [json.loads(line) for line in server.log if line and line != server.url]
+    assert all({"event", "level", "timestamp"} <= set(event) for event in events)
     uploads = {"upload accepted", "upload rejected", "scoring started", "scoring finished"}
-    assert {"request", "database unavailable", *uploads} <= event_names
-    assert any("nvalid HTTP request" in name for name in event_names), "messages of uvicorn are not logged"
-    accepted = [event for event in events if event["event"] == "upload accepted"]
-    assert [event["submission"] for event in accepted] == [submission_id[:6] for submission_id in observed.ids]
-    assert {event["token"] for event in accepted} == {"alice"}
-    statuses = {event["status"] for event in events if event["event"] == "request"}
-    assert {200, 202, 204, 401, 422, 503} <= statuses
+    assert {event["event"] for event in events} >= {"request", "database unavailable", *uploads}
+    for secret in (token[4:], WRONG_TOKEN, PASSWORD, "Authorization", "Bearer", first, second):
+        assert not any(secret in line for line in server.log), f"{secret} is in the log"
 
 
 def test_health_tells_of_a_lost_dataset(tiny_root: Path, tmp_path: Path, running_server: RunServer) -> None:

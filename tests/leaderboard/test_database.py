@@ -1,4 +1,4 @@
-"""Database on SQLite and PostgreSQL: schema, migration, tokens, and the queue of jobs."""
+"""Database on SQLite and PostgreSQL: schema, tokens, and the queue of jobs."""
 
 from __future__ import annotations
 
@@ -13,15 +13,12 @@ from contextlib import closing, contextmanager
 from pathlib import Path
 
 import pytest
-from alembic.autogenerate import compare_metadata
-from alembic.migration import MigrationContext
-from alembic.script import ScriptDirectory
-from sqlalchemy import Column, Engine, MetaData, String, create_engine, inspect
+from sqlalchemy import Engine, create_engine, inspect
 
 from leaderboard.db import jobs, submissions
-from leaderboard.db.engine import MIGRATIONS, Database
+from leaderboard.db.engine import Database
 from leaderboard.db.jobs import MAX_ATTEMPTS
-from leaderboard.db.models import Base
+from leaderboard.db.models import SCHEMA, Base
 from leaderboard.db.rankings import read_ranking
 from leaderboard.db.submissions import result_content, shown_results
 from leaderboard.db.tokens import create_token, find_token, list_tokens, replace_token, revoke_token
@@ -32,13 +29,13 @@ from tests.bench.reporting.results import result, scored_view
 from tests.leaderboard.boards import DIGEST, accept, board_settings, claimed, result_bytes
 
 LEASE_S = 60.0
-_MIGRATE = """
+_CREATE = """
 import sys
 from leaderboard.db.engine import Database
 database = Database(sys.argv[1])
 print("ready", flush=True)
 sys.stdin.readline()
-database.migrate()
+database.create_schema()
 """
 
 
@@ -51,7 +48,7 @@ def url(new_database: Callable[[], str], tmp_path: Path) -> str:
 @pytest.fixture
 def database(url: str) -> Iterator[Database]:
     with closing(Database(url)) as opened:
-        opened.migrate()
+        opened.create_schema()
         yield opened
 
 
@@ -68,45 +65,21 @@ def engine(url: str) -> Iterator[Engine]:
     new_engine.dispose()
 
 
-def differences(engine: Engine, metadata: MetaData) -> list[object]:
-    """Return the changes, including types and defaults, that Alembic would need to match ``metadata``."""
-    with engine.connect() as connection:
-        options = {"compare_type": True, "compare_server_default": True}
-        return list(compare_metadata(MigrationContext.configure(connection, opts=options), metadata))
-
-
-def test_migrated_schema_matches_models(url: str, engine: Engine) -> None:
-    """The comparison finds missing tables and columns; tables of other programs are left alone."""
+def test_tables_are_created_once_beside_those_of_others(url: str, engine: Engine) -> None:
     with engine.begin() as connection:
         connection.exec_driver_sql("CREATE TABLE foreign_table (id INTEGER)")
-    assert len(differences(engine, Base.metadata)) > len(Base.metadata.tables), "an empty database lacks them all"
-    for _ in range(2):
+    for turn in range(2):
         with closing(Database(url)) as database:
-            database.migrate()
-    tables = {*Base.metadata.tables, "alembic_version", "foreign_table"}
-    assert set(inspect(engine).get_table_names()) == tables
-    with engine.begin() as connection:
-        connection.exec_driver_sql("DROP TABLE foreign_table")
-    assert differences(engine, Base.metadata) == []
-    changed = MetaData()
-    for table in Base.metadata.tables.values():
-        table.to_metadata(changed)
-    changed.tables["tokens"].append_column(Column("forgotten", String(10)))
-    assert [step[0] for step in differences(engine, changed)] == ["add_column"]  # type: ignore[index]
-
-
-def test_repeated_migration_keeps_rows(url: str, database: Database, alice: str) -> None:
-    database.migrate()
-    with closing(Database(url)) as again:
-        again.migrate()
-        record = find_token(again, alice)
-    assert record is not None
-    assert record.name == "alice"
+            database.create_schema()
+            if not turn:
+                token = create_token(database, "alice")
+            assert find_token(database, token) is not None
+    assert set(inspect(engine).get_table_names()) == {*Base.metadata.tables, "foreign_table"}
 
 
 @contextmanager
 def sqlite_write_lock(engine: Engine) -> Iterator[None]:
-    """Hold SQLite's write lock so that all concurrent migrations start before any of them can write."""
+    """Hold SQLite's write lock so that all concurrent processes start before any of them can write."""
     if engine.dialect.name != "sqlite":
         yield
         return
@@ -119,8 +92,8 @@ def sqlite_write_lock(engine: Engine) -> Iterator[None]:
 
 
 @pytest.mark.slow
-def test_concurrent_migrations_succeed(url: str, engine: Engine) -> None:
-    arguments, pipe = [sys.executable, "-c", _MIGRATE, url], subprocess.PIPE
+def test_tables_are_created_by_processes_at_once(url: str, engine: Engine) -> None:
+    arguments, pipe = [sys.executable, "-c", _CREATE, url], subprocess.PIPE
     processes = [subprocess.Popen(arguments, stdin=pipe, stdout=pipe, stderr=pipe, text=True) for _ in range(3)]
     try:
         for process in processes:
@@ -138,31 +111,25 @@ def test_concurrent_migrations_succeed(url: str, engine: Engine) -> None:
         for process in processes:
             process.kill()
             process.communicate()
-    assert differences(engine, Base.metadata) == []
+    with closing(Database(url)) as database:
+        database.check_schema()
 
 
 @pytest.mark.parametrize(
     ("change", "found"),
     [
-        ("UPDATE alembic_version SET version_num = '0004'", "the schema of revision 0004"),
-        ("DELETE FROM alembic_version", "a schema without a revision"),
-        ("DROP TABLE alembic_version", "a schema without a revision"),
+        ("UPDATE board SET schema = 4", "schema 4"),
+        ("DROP TABLE board", "no schema of this service"),
     ],
 )
-def test_database_of_another_revision_is_refused(
+def test_database_of_another_version_is_refused(
     database: Database, engine: Engine, change: str, found: str
 ) -> None:
     with engine.begin() as connection:
         connection.exec_driver_sql(change)
-    for use in (database.migrate, database.check_schema):
-        with pytest.raises(InputError, match=f"the database has {found}, expected 0005, or a new database"):
+    for use in (database.create_schema, database.check_schema):
+        with pytest.raises(InputError, match=f"the database has {found}, expected schema {SCHEMA}, or a new"):
             use()
-    assert set(Base.metadata.tables) <= set(inspect(engine).get_table_names())
-
-
-def test_migrations_have_one_base() -> None:
-    scripts = ScriptDirectory(str(MIGRATIONS))
-    assert (scripts.get_heads(), scripts.get_bases()) == (["0005"], ["0005"])
 
 
 def queue(database: Database, token: str, count: int) -> list[str]:

@@ -11,8 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from leaderboard.settings import read_settings
-from leaderboard.web.server import MAX_CONNECTIONS, listening_socket
+from leaderboard.web.server import MAX_CONNECTIONS
 from tests.leaderboard.serving import (
     API,
     END,
@@ -21,12 +20,11 @@ from tests.leaderboard.serving import (
     Server,
     connect,
     distinct_archive,
-    exchange,
     multipart_part,
     read_response,
     request_head,
 )
-from tests.processes import memory_bytes, num_open_files, wait_until
+from tests.processes import num_open_files, wait_until
 
 PUBLIC_URL = "https://board.example.org/depth"
 BEFORE, AFTER = (multipart_part(b"|") + END).split(b"|")
@@ -107,29 +105,6 @@ def test_uploads_with_one_token_are_received_one_after_the_other(server: Server,
             connection.sendall(content[1000:] + AFTER)
         assert [read_response(connection).status for connection in connections] == [202] * 4
     assert server.spool_files() == []
-
-
-def test_unknown_methods_leave_nothing_in_memory(server: Server) -> None:
-    before = memory_bytes(server.process.pid), num_open_files(server.process.pid)
-    for number in range(300):
-        assert exchange(server.url, request_head("/healthz", (), method=f"WORD{number}")).status == 405
-    after = memory_bytes(server.process.pid), num_open_files(server.process.pid)
-    assert after[0] - before[0] < 4 << 20
-    assert after[1] <= before[1] + 2
-
-
-def test_small_responses_are_sent_at_once() -> None:
-    settings = read_settings(None, {"data": "ROOT", "port": 0})
-    with listening_socket(settings) as listener, socket.create_connection(listener.getsockname()):
-        accepted, _ = listener.accept()
-        with accepted:
-            assert accepted.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
-
-
-def test_address_of_a_server_without_proxy_warns(running_server: RunServer) -> None:
-    with running_server(workers=0, host="0.0.0.0") as server:
-        assert server.get("/healthz").status_code == 200
-        assert any("tokens are sent without TLS" in line for line in server.log)
 
 
 def test_long_host_is_refused(server: Server) -> None:

@@ -60,35 +60,6 @@ def token(server: Server) -> str:
     return server.token("schemathesis")
 
 
-def api_responses(log: list[str]) -> set[tuple[str, str]]:
-    """Return method and status of the responses of the API that log lines tell of."""
-    events = [json.loads(line) for line in log if line.startswith("{")]
-    return {
-        (event["method"], str(event["status"]))
-        for event in events
-        if event["event"] == "request" and event["route"].startswith("/api/")
-    }
-
-
-def fuzz(server: Server, hooks: Path, token: str, max_examples: int) -> str:
-    """Run ``schemathesis run`` and return its output; fail if it reports a problem."""
-    command = [sys.executable, "-m", "schemathesis.cli", "run", f"{server.url}/openapi.json", "--no-color"]
-    command += ["--checks", "all", "--exclude-checks", ",".join(EXCLUDED_CHECKS), "--continue-on-failure"]
-    command += ["--generation-deterministic", "--max-examples", str(max_examples)]
-    command += ["--header", f"Authorization: Bearer {token}"]
-    process = subprocess.run(
-        command,
-        capture_output=True,
-        text=True,
-        cwd=hooks.parent,
-        check=False,
-        timeout=1800,
-        env={**os.environ, "SCHEMATHESIS_HOOKS": str(hooks)},
-    )
-    assert process.returncode == 0, process.stdout + process.stderr
-    return process.stdout
-
-
 EXPECTED = {
     *(("POST", status) for status in ("202", "422")),
     *(("PUT", status) for status in ("200", "422")),
@@ -104,18 +75,28 @@ def test_responses_match_openapi_document(
 ) -> None:
     hooks = tmp_path / "hooks.py"
     hooks.write_text(UPLOAD_HOOKS.format(archive=str(small_archive)))
-    output = fuzz(server, hooks, token, repetitions(4, 30))
-    assert re.search(r"Operations: +12 selected / 12 total", output)
-    responses = api_responses(server.log)
+    command = [sys.executable, "-m", "schemathesis.cli", "run", f"{server.url}/openapi.json", "--no-color"]
+    command += ["--checks", "all", "--exclude-checks", ",".join(EXCLUDED_CHECKS), "--continue-on-failure"]
+    command += ["--generation-deterministic", "--max-examples", str(repetitions(4, 30))]
+    command += ["--header", f"Authorization: Bearer {token}"]
+    environment = {**os.environ, "SCHEMATHESIS_HOOKS": str(hooks)}
+    process = subprocess.run(
+        command, capture_output=True, text=True, cwd=tmp_path, check=False, timeout=1800, env=environment
+    )
+    assert process.returncode == 0, process.stdout + process.stderr
+    assert re.search(r"Operations: +12 selected / 12 total", process.stdout)
+    events = [json.loads(line) for line in server.log if line.startswith("{")]
+    requests = [event for event in events if event["event"] == "request" and event["route"].startswith("/api/")]
+    responses = {(event["method"], str(event["status"])) for event in requests}
     assert responses >= EXPECTED
     assert not any(status >= "500" for _, status in responses)
 
 
-@pytest.mark.parametrize("header", [None, "Bearer nobody's"])
+@pytest.mark.parametrize("header", [None, "Bearer nobody's", "Bearer", "Bearer \udcff"])
 def test_requests_without_a_known_token_are_401_as_documented(
     server: Server, document: dict[str, Any], header: str | None
 ) -> None:
-    headers = {} if header is None else {"Authorization": header}
+    headers = {} if header is None else {"Authorization": header.encode("utf-8", "surrogateescape")}
     for path, operations in document["paths"].items():
         for method, operation in operations.items():
             address = f"{path.replace('{submission_id}', 'some')}?config=lattice"
@@ -123,45 +104,11 @@ def test_requests_without_a_known_token_are_401_as_documented(
             needs_token = {"HTTPBearer": []} in operation.get("security", []) and {} not in operation["security"]
             if needs_token or (header and operation.get("security")):
                 assert (response.status_code, list(response.json())) == (401, ["detail"]), (method, path)
+                assert response.headers["www-authenticate"] == "Bearer"
                 assert "401" in operation["responses"]
             else:
                 assert response.status_code != 401, (method, path)
             assert str(response.status_code) in operation["responses"], (method, path)
-
-
-@pytest.mark.parametrize(
-    ("body", "status"),
-    [(b"\xc3", 400), (b"", 422), (b"{", 422), (b'{"public": 1}', 422), (b'{"public": true, "id": "x"}', 422)],
-)
-def test_invalid_patch_is_rejected_as_documented(
-    server: Server, document: dict[str, Any], token: str, body: bytes, status: int
-) -> None:
-    headers = {"Content-Type": "application/json"}
-    response = server.call("PATCH", f"{API}/some", token, content=body, headers=headers)
-    assert response.status_code == status
-    documented = document["paths"]["/api/v1/submissions/{submission_id}"]["patch"]["responses"][str(status)]
-    model = documented["content"]["application/json"]["schema"]["$ref"].split("/")[-1]
-    assert set(response.json()) == set(document["components"]["schemas"][model]["required"])
-
-
-def test_models_have_examples_and_operations_descriptions(document: dict[str, Any]) -> None:
-    for name in ("ErrorResponse", "RejectedResponse", "Submission", "SubmissionChange"):
-        assert document["components"]["schemas"][name]["example"]
-    operations = [operation for path in document["paths"].values() for operation in path.values()]
-    assert all(operation["description"] for operation in operations)
-    assert all(response["description"] for operation in operations for response in operation["responses"].values())
-
-
-def test_page_of_submitters_lists_every_request(document: dict[str, Any]) -> None:
-    served = {
-        f"{method.upper()} {path.replace('{submission_id}', 'ID')}"
-        for path, operations in document["paths"].items()
-        for method in operations
-    }
-    page = (Path(__file__).parents[2] / "docs/leaderboard-submitter.md").read_text()
-    listed = re.findall(r"^\| `([A-Z]+ [^`?]+)", page, re.MULTILINE)
-    assert {*listed, "GET /api/v1/leaderboard.csv"} == served
-    assert "`leaderboard.csv`" in page
 
 
 @pytest.mark.parametrize(("path", "allowed"), [(f"{API}/some", "DELETE, GET, PATCH"), ("/how-to-submit", "GET")])

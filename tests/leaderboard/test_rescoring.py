@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import sqlite3
 import time
-import zipfile
 from contextlib import closing
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,6 +19,7 @@ from leaderboard.scoring.sandbox import Outcome, check, score
 from leaderboard.uploads import UNAVAILABLE_MESSAGE
 from rebar_depth_bench.base.errors import SubmissionError
 from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.submission import SubmissionMeta
 from tests.leaderboard.boards import (
     DIGEST,
     OTHER_DIGEST,
@@ -58,10 +58,6 @@ def ids_and_ranks(server: Server) -> list[tuple[str, int]]:
     return [(row["id"], row["rank"]) for row in server.rows()]
 
 
-def digest_of(root: Path) -> str:
-    return str(json.loads((root / "manifest.json").read_text())["ground_truth"]["digest"])
-
-
 def submit_and_score(server: Server, archive: Path, count: int) -> dict[str, dict[str, Any]]:
     """Submit an archive several times; return the results by id."""
     token = server.token("alice")
@@ -86,7 +82,7 @@ def test_other_dataset_is_rejected_without_rescore_option(datasets: Datasets, ru
         assert server.get(f"/submissions/{min(before)}").status_code == 200
     with running_server(state, root=datasets.second) as server:
         after = [server.wait_until_ended(submission_id) for submission_id in before]
-        digest = digest_of(datasets.second)
+        digest = open_folder(datasets.second).digest
         assert [one["result"]["dataset"]["digest"] for one in after] == [digest, digest]
         assert [one["result"]["tables"] for one in after] == [result["tables"] for result in before.values()]
         assert [one["outdated"] for one in after] == [None, None]
@@ -109,7 +105,7 @@ def test_failed_rescoring_keeps_the_result(datasets: Datasets, running_server: R
         assert "lattice/0004: missing" in server.get(f"{API}/{waiting}").json()["reason"]
         shown = server.wait_until_ended(scored)
         assert (shown["status"], shown["reason"], shown["result"]) == ("scored", None, before[scored])
-        assert f"against the served dataset {digest_of(tmp_path / 'larger')} failed" in shown["outdated"]
+        assert f"against the served dataset {open_folder(tmp_path / 'larger').digest} failed" in shown["outdated"]
         assert "lattice/0004: missing" in shown["outdated"]
         assert ids_and_ranks(server) == []
     with running_server(state, root=tmp_path / "larger", workers=0) as server:
@@ -137,7 +133,7 @@ def test_submission_without_archive_keeps_its_result_and_may_be_sent_again(
         for submission_id in (lost, *kept):
             server.wait_until_ended(submission_id)
         assert {name for name, _ in ids_and_ranks(server)} == set(kept)
-        for name, words in ((freed, "its archive is not kept"), (lost, "no longer in the archive storage")):
+        for name, words in ((freed, "its archive is not kept"), (lost, "the stored archive is missing")):
             shown = server.wait_until_ended(name)
             assert (shown["status"], shown["reason"], shown["result"]) == ("scored", None, before[name])
             assert words in shown["outdated"]
@@ -241,23 +237,19 @@ def write_split_archive(root: Path, archive: Path, split: str) -> Path:
     return archive
 
 
+def checked(archive: Path, root: Path) -> SubmissionMeta:
+    return check(archive, str(root), open_folder(root).digest)
+
+
 @pytest.mark.slow
 def test_only_the_split_test_is_accepted(split_root: Path, tmp_path: Path) -> None:
     with pytest.raises(SubmissionError) as refused:
-        check(write_split_archive(split_root, tmp_path / "train.zip", "train"), str(split_root))
+        checked(write_split_archive(split_root, tmp_path / "train.zip", "train"), split_root)
     [problem] = refused.value.problems
     assert (problem.code, problem.where) == ("conflict", "cages")
     assert "split train" in str(problem)
-    accepted = check(write_split_archive(split_root, tmp_path / "test.zip", "test"), str(split_root))
+    accepted = checked(write_split_archive(split_root, tmp_path / "test.zip", "test"), split_root)
     assert accepted.method == "exact"
-
-
-@pytest.mark.slow
-def test_archive_of_macos_is_accepted(split_root: Path, tmp_path: Path) -> None:
-    archive = write_split_archive(split_root, tmp_path / "test.zip", "test")
-    with zipfile.ZipFile(archive, "a") as zipped:
-        zipped.writestr("__MACOSX/._submission.json", bytes.fromhex("0005160700020000"))
-    assert check(archive, str(split_root)).method == "exact"
 
 
 @pytest.mark.slow

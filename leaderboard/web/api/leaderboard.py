@@ -65,7 +65,7 @@ def _rows(
     """Return the rows of a config. Raises status 404 for an unknown config."""
     check_config(service, config)
     ranking = service.rankings.of(config, token)
-    return (ranking.best if best else ranking).of_class(inputs)
+    return list(ranking.best(inputs).entries) if best else ranking.of_class(inputs)
 
 
 _Rows = Annotated[list[LeaderboardEntry], Depends(_rows)]
@@ -91,7 +91,7 @@ def leaderboard_csv(token: OptionalToken, rows: _Rows) -> Response:
     return _response(entries_to_csv(rows), CSV, token)
 
 
-@router.get("/overall", response_model=OverallRanking)
+@router.get("/overall", response_model=OverallRanking, responses=errors(422))
 def overall(service: ServiceDep, best: BestQuery = False) -> Response:
     """Return the public submissions in order of their mean rank error over all configs."""
     configs = service.folder.configs

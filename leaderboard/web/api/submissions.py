@@ -31,6 +31,7 @@ from leaderboard.web.dependencies import (
     SubmissionId,
     check_length,
     page_url,
+    service_of,
 )
 from rebar_depth_bench.remote.models import Submission, SubmissionList
 
@@ -157,7 +158,10 @@ def _accepted(request: Request, response: Response, accepted: tuple[SubmissionMo
     record, is_new = accepted
     response.status_code = 202 if is_new else 200
     response.headers["Location"] = request.url_for("look_up", submission_id=record.id).path
-    return _schema(request, record, None)
+    service = service_of(request)
+    return _schema(
+        request, record, shown_results(service.database, [record], service.folder.digest).get(record.id)
+    )
 
 
 def _schema(

@@ -51,7 +51,7 @@ class BoardColumn:
         assert self.number is not None, "the template writes the cells of rank and method"
         has_interval = self.number is columns.RANK_ERROR
         return self.number.value_cell(
-            self.value(entry), entry.table["ci95"]["rank_error"] if has_interval else None
+            self.value(entry), entry.table.get("ci95", {}).get("rank_error") if has_interval else None
         )
 
 

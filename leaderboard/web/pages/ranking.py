@@ -32,29 +32,21 @@ _SCENE_WIDTH, _SCENE_AGE_S = 480, 3600
 
 
 @router.get("/", name="board_page")
-def leaderboard_page(
-    request: Request,
-    service: ServiceDep,
-    config: str | None = None,
-    sort: str | None = None,
-    inputs: str | None = None,
-    q: str | None = None,
-    rows: str | None = None,
-    page: str | None = None,
-) -> HTMLResponse:
+def leaderboard_page(request: Request, service: ServiceDep, config: str | None = None) -> HTMLResponse:
     """Return the page with an overview and the first rows of all configs, or with the rows of ``config``.
 
     The other parameters are those of ``parse_selection``.
     """
     if config is not None:
         check_config(service, config)
-    selection = parse_selection(sort, inputs, q, rows, page)
+    selection = parse_selection(request.query_params)
     configs = service.folder.configs if config is None else (config,)
     rankings = {name: service.rankings.of(name) for name in configs}
-    shown = {name: one if selection.all_rows else one.best for name, one in rankings.items()}
+    shown = {name: one if selection.all_rows else one.best(selection.inputs) for name, one in rankings.items()}
     overview, of_config, page_rows = None, selection, PAGE_ROWS
     if len(configs) > 1:
-        overall = overall_ranking([*rankings.items()], best=not selection.all_rows)
+        chosen = {name: Ranking(tuple(one.of_class(selection.inputs))) for name, one in rankings.items()}
+        overall = overall_ranking([*chosen.items()], best=not selection.all_rows)
         overview = selection.page_of([one for one in overall if selection.matches(one.first)], PAGE_ROWS)
         of_config, page_rows = selection.but(), FIRST_ROWS
     return render(

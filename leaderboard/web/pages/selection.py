@@ -5,7 +5,7 @@ Rows are selected on the server, so that an address shows the same rows to every
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 from urllib.parse import urlencode
@@ -98,18 +98,16 @@ class PageOfRows(Generic[T]):
     pages: int
 
 
-def parse_selection(
-    sort: str | None, inputs: str | None, text: str | None, rows: str | None, page: str | None
-) -> Selection:
+def parse_selection(parameters: Mapping[str, str]) -> Selection:
     """Return the selection of URL parameters; values that are invalid are replaced by their defaults."""
-    order = (sort or "").removeprefix("-")
+    sort, inputs, page = (parameters.get(name, "") for name in ("sort", "inputs", "page"))
+    order = sort.removeprefix("-")
     is_column = order in COLUMNS_BY_NAME
-    is_number = page is not None and page.isdecimal() and len(page) <= _MAX_PAGE_DIGITS
     return Selection(
         order=order if is_column else RANK,
         inverted=is_column and sort != order,
         inputs=inputs if inputs in INPUTS else None,
-        text=(text or "").strip()[:_MAX_QUERY_CHARACTERS],
-        all_rows=rows == "all",
-        page=max(1, int(page or 1)) if is_number else 1,
+        text=parameters.get("q", "").strip()[:_MAX_QUERY_CHARACTERS],
+        all_rows=parameters.get("rows") == "all",
+        page=max(1, int(page)) if page.isdecimal() and len(page) <= _MAX_PAGE_DIGITS else 1,
     )

@@ -26,6 +26,7 @@ from rebar_depth_bench.reporting.html.page import (
 from rebar_depth_bench.reporting.html.views import worst_first
 from rebar_depth_bench.reporting.tables import COMPARISON_NOTE, comparison_cells, views_note
 from rebar_depth_bench.scoring.comparison import compare
+from rebar_depth_bench.scoring.formatting import counted
 from rebar_depth_bench.scoring.result import read_result
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
@@ -97,7 +98,7 @@ def compare_page(
     chosen = list(dict.fromkeys(ids))
     if len(chosen) != 2:
         raise HTTPException(
-            422, f"{len(chosen)} rows are ticked, expected two: go back and tick two rows of a table"
+            422, f"{counted(len(chosen), 'row')} ticked, expected two: go back and tick two rows of a table"
         )
     records = [get_submission(service, submission_id) for submission_id in chosen]
     shown = shown_results(service.database, records, service.folder.digest)

@@ -21,6 +21,7 @@ from rebar_depth_bench.base.errors import InputError, printable
 from rebar_depth_bench.base.names import config_of
 from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS, colour_indices, robust_range
 from rebar_depth_bench.reporting.html.assets import data_uri
+from rebar_depth_bench.scoring.metrics import is_valid_prediction
 from rebar_depth_bench.scoring.protocol import scored_pixels
 from rebar_depth_bench.scoring.table import ViewScore
 
@@ -31,6 +32,8 @@ _NO_DEPTH_STRIPES = ((136, 136, 136), (112, 112, 112))
 _NO_PREDICTION_STRIPES = ((240, 200, 0), (16, 16, 16))
 _HATCH_PX = 4
 _MAX_LIMIT_CM = 1e9
+_SHARED_LIMIT_FACTOR = 3.0
+"""Largest ratio of the colour limits of native and scaled error that are replaced by the larger one."""
 _LIMIT_TOLERANCE = 1e-6  # An error of 30 cm in float32 is slightly more than 30 cm.
 _ROUND_STEPS = (1, 2, 3, 5, 7, 10)
 _BACKDROP_LEVELS = 16
@@ -59,8 +62,8 @@ class ShownView:
 
     ``colour`` is None in a config without colour. Depth colours run from ``near`` to ``far`` for both ground truth
     and prediction, error colours from minus to plus ``native_limit`` or ``scaled_limit`` ("" if no scored pixel
-    has an error). ``predicted`` is the robust range of the prediction on scored pixels ("" without any), which is
-    ``off_scale`` if it lies outside the colour bar.
+    has an error). ``predicted`` is the text of ``range_text`` of the prediction on scored pixels ("" without any),
+    which is ``off_scale`` if its robust range lies outside the colour bar.
     """
 
     score: ViewScore
@@ -94,10 +97,16 @@ def shown_view(view: ViewPanels) -> ShownView:
     step = max(1, round(view.truth_m.shape[1] / PANEL_WIDTH))
     scored = scored_pixels(view.steel, view.truth_m)
     near_m, far_m = depth_range(view.truth_m, scored)
-    predicted_m = predicted_range(view.prediction_m, scored)
+    predicted_m = view.prediction_m.ravel()[scored].astype(np.float64)
+    predicted_m = predicted_m[is_valid_prediction(predicted_m)]
+    low_m, high_m = robust_range(predicted_m) if predicted_m.size else (near_m, far_m)
     native_m = signed_error(view, 1.0)
     scaled_m = signed_error(view, math.nan if view.score.scale is None else view.score.scale)
     native_limit, scaled_limit = (error_limit_cm(error_m, scored) for error_m in (native_m, scaled_m))
+    if native_limit and scaled_limit:
+        larger = max(native_limit, scaled_limit)
+        if larger <= _SHARED_LIMIT_FACTOR * min(native_limit, scaled_limit):
+            native_limit = scaled_limit = larger
     truth, steel = depth_image(view.truth_m[::step, ::step], near_m, far_m), view.steel[::step, ::step]
     # Colour is averaged over blocks of pixels; depth and error maps must be sampled instead.
     rgb = None if view.rgb is None else np.asarray(Image.fromarray(view.rgb).reduce(step))
@@ -110,17 +119,19 @@ def shown_view(view: ViewPanels) -> ShownView:
         prediction=_webp(depth_image(view.prediction_m[::step, ::step], near_m, far_m)),
         native_error=_webp(error_image(native_m[::step, ::step], steel, rgb, native_limit)),
         scaled_error=_webp(error_image(scaled_m[::step, ::step], steel, rgb, scaled_limit)),
-        near=_metres(near_m),
-        far=_metres(far_m),
-        predicted=" to ".join(map(_metres, predicted_m or ())),
-        off_scale=predicted_m is not None and (predicted_m[0] > far_m or predicted_m[1] < near_m),
+        near=f"{_metres(near_m)} m",
+        far=f"{_metres(far_m)} m",
+        predicted=range_text(predicted_m) if predicted_m.size else "",
+        off_scale=low_m > far_m or high_m < near_m,
         native_limit=_centimetres(native_limit),
         scaled_limit=_centimetres(scaled_limit),
     )
 
 
 def _metres(value: float) -> str:
-    return f"{value:#.3g} m" if 0.01 <= abs(value) < 1000 else f"{value:.3g} m"
+    if not 0.01 <= abs(value) < 1000:
+        return f"{value:.3g}"
+    return f"{value:#.3g}" if abs(value) < 10 else f"{value:.2f}"
 
 
 def _centimetres(value: float | None) -> str:
@@ -150,11 +161,19 @@ def depth_range(truth_m: Float32[ndarray, "h w"], scored: ndarray) -> tuple[floa
     return near - margin, far + margin
 
 
-def predicted_range(prediction_m: Float[ndarray, "h w"], scored: ndarray) -> tuple[float, float] | None:
-    """Return the robust range of valid predictions at the flat indices ``scored``, metres; None without any."""
-    values = prediction_m.ravel()[scored].astype(np.float64)
-    values = values[np.isfinite(values) & (values > 0)]
-    return robust_range(values) if values.size else None
+def range_text(values_m: Float64[ndarray, " n"]) -> str:
+    """Return the range of one or more depths, metres, as text.
+
+    If the robust range is narrower than the whole one, both are stated, the robust one with the share of the
+    values that lie in it, rounded down.
+    """
+    low, high = robust_range(values_m)
+    inside = np.count_nonzero((values_m >= low) & (values_m <= high))
+    robust, whole = (
+        "–".join(dict.fromkeys(map(_metres, ends))) + " m"
+        for ends in ((low, high), (values_m.min(), values_m.max()))
+    )
+    return whole if robust == whole else f"{robust} ({100 * inside // values_m.size} %), {whole} in all"
 
 
 def signed_error(view: ViewPanels, scale: float) -> Float64[ndarray, "h w"]:

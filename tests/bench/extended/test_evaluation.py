@@ -291,6 +291,17 @@ sys.exit(status)
 """
 
 
+def test_shares_of_frames_are_from_0_to_1_without_a_unit(of_truth: ExtendedResult) -> None:
+    units = {one.name: one.unit for measures in measures_by_alignment().values() for one in measures}
+    frame = of_truth.to_pandas()
+    unit = frame["measure"].map(units)
+    shares = frame[unit == "%"]
+    assert set(shares["unit"]) == {""}
+    assert shares["value"].dropna().between(0, 1).all()
+    assert shares["value"].max() == 1
+    assert (frame["unit"] == unit.replace("%", "")).all()
+
+
 def test_measure_of_an_unknown_statistic_or_unit_is_refused() -> None:
     for arguments, words in ((("mm", "", "d", "s", "p90"), "new: got 'p90', expected"), (("km", "", "d"), "'km'")):
         with pytest.raises(ValueError, match=words):

@@ -41,6 +41,7 @@ from rebar_depth_bench.reporting.html.views import (
     shown_view,
     signed_error,
 )
+from rebar_depth_bench.scoring.protocol import scored_pixels
 from tests.bench.reporting.results import (
     HOSTILE,
     panels,
@@ -164,7 +165,42 @@ def test_scaled_error_uses_scale_of_view() -> None:
     images = shown_view(view)
     assert (images.native_limit, images.scaled_limit) == ("30 cm", "0.01 cm")
     assert decoded(images.scaled_error)[5, 25].tolist() == ERROR_COLOURS[127].tolist()
-    assert images.predicted == "0.800 m to 0.800 m"
+    assert images.predicted == "0.800 m"
+
+
+@pytest.mark.parametrize(
+    ("native_cm", "scaled_cm", "shared"),
+    [(2.0, 1.0, True), (3.0, 1.0, True), (1.0, 3.0, True), (5.0, 1.0, False), (1.0, 5.0, False)],
+)
+def test_error_maps_share_the_larger_range_up_to_a_factor_of_three(
+    native_cm: float, scaled_cm: float, shared: bool
+) -> None:
+    native, scaled = 1 + 0.999 * native_cm / 50, 1 + 0.999 * scaled_cm / 50
+    score = dataclasses.replace(scored_view("lattice/0000"), scale=scaled / native)
+    images = shown_view(panels(score=score, factor=native))
+    larger = max(native_cm, scaled_cm)
+    limits = (larger, larger) if shared else (native_cm, scaled_cm)
+    assert (images.native_limit, images.scaled_limit) == tuple(f"{limit:g} cm" for limit in limits)
+    for webp, error_cm, limit in zip(
+        (images.native_error, images.scaled_error), (native_cm, scaled_cm), limits, strict=True
+    ):
+        index = colour_indices(np.array([0.999 * error_cm]), -limit, limit)
+        assert decoded(webp)[5, 25] == pytest.approx(ERROR_COLOURS[index[0]], abs=2)
+
+
+@pytest.mark.parametrize("tied", [0, 1])
+def test_prediction_states_its_whole_range_and_the_share_within_the_robust_one(tied: int) -> None:
+    """The robust range excludes 2 % of the pixels at either end, but not those that equal an end of it."""
+    view = panels()
+    scored = scored_pixels(view.steel, view.truth_m)
+    out = int(0.02 * (scored.size - 1))
+    near, far = np.full(out + tied, 0.140), np.full(out, 79.06)
+    middle = np.linspace(0.146, 0.357, scored.size - len(near) - len(far))
+    view.prediction_m.ravel()[scored] = np.concatenate([near, middle, far])
+    inside = scored.size - out - (0 if tied else out)
+    low = "0.140" if tied else "0.146"
+    expected = f"{low}–0.357 m ({math.floor(100 * inside / scored.size)} %), 0.140–79.06 m in all"
+    assert shown_view(view).predicted == expected
 
 
 @pytest.mark.parametrize(

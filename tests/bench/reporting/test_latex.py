@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.reporting.latex import escape_latex, latex_table
+from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.result import DatasetIdentity
 from tests.bench.reporting.results import HOSTILE, example, examples, result, scored_view
 
@@ -31,8 +32,10 @@ def checked(table: str) -> str:
         depth += {"{": 1, "}": -1}.get(token, 0)
         assert depth >= 0
     assert depth == 0
-    comment, _, rest = table.partition("\n")
-    assert comment == r"% needs \usepackage{booktabs}"
+    comments, begin, rest = table.partition(r"\begin{table*}")
+    assert comments.startswith("% needs \\usepackage{booktabs}\n% rebar-")
+    assert all(line.startswith("% ") for line in comments.splitlines())
+    rest = begin + rest
     assert set(re.findall(r"\\([A-Za-z]+)", re.sub(r"\\\\", "", rest))) <= COMMANDS
     assert not re.search(r"\\\\\s*[\[*]", table), "an argument of the line break"
     assert len(re.findall(r"(?<!\\)\$", table)) % 2 == 0
@@ -66,26 +69,65 @@ def test_rows_and_notes_appear_only_where_they_apply() -> None:
     assert "Published" not in unknown
     mixed = latex_table([result(scored_view("beam_1/0000"), scored_view("pile/0000"))], published=True)
     assert r"Depth Pro & -- & -- & -- & -- & -- &  & 15.46 & 0.262 & 0.043 & 0.92 \\" in checked(mixed)
+    anchored = checked(latex_table([result(scored_view("pier/0000"))], published=True))
+    row = next(line for line in anchored.splitlines() if line.startswith("COLMAP+ArUco"))
+    assert [cell.count(r"$^{\dagger}$") for cell in row.split(" & ")[2:]] == [1, 1, 1, 1]
     assert "dagger" not in mixed.split(r"\begin{tabular}")[1]
+
+
+def bold_rows(table: str) -> dict[str, list[str]]:
+    """Return the bold numbers of each row that has any."""
+    rows = (line.split(" & ") for line in table.splitlines() if " & " in line)
+    return {cells[0]: bold for cells in rows if (bold := re.findall(r"\\textbf\{(.*?)\}", " ".join(cells)))}
 
 
 def test_best_error_is_bold_only_among_comparable_results() -> None:
     """With a result that has gaps, only the rank error, which counts them, is compared."""
     [good, fair, gaps] = [
-        result(*(scored_view(f"lattice/{i:04d}", error, coverage) for i in range(8)), method=name)
+        result(*(scored_view(f"lattice/{12 * i:04d}", error, coverage) for i in range(8)), method=name)
         for name, error, coverage in (("good", 0.02, 1.0), ("fair", 0.03, 1.0), ("gaps", 0.001, 0.5))
     ]
     assert "textbf" not in latex_table([good], published=True)
-    assert r"good & \textbf{0.0196} & \textbf{20.09} & \textbf{0.0200}" in latex_table(
-        [fair, good], published=True
-    )
+    pair = checked(latex_table([fair, good], published=True))
+    assert bold_rows(pair) == {"good": ["0.0196", "0.0200"]}, "their RMSE is equal"
+    assert "Bold" in pair
+    assert "constant, gaps" not in pair
     table = checked(latex_table([good, fair, gaps], published=False))
-    assert r"gaps & 0.5005 & 20.09$^{*}$ & 0.0010 &" in table
-    note = r"$^{*}$Errors of valid predictions are not compared with those of others: "
-    assert rf"{note}gaps, lattice (coverage 50.0 \% is below 95 \%)." in table
-    assert table.count("$^{*}$") == 2
     assert r"\emph{constant, gaps} &  &  &  & 0.0529 &  \\" in table
-    assert re.findall(r"\\textbf\{.*?\}", table) == [r"\textbf{0.0196}"]
+    assert bold_rows(table) == {"good": ["0.0196"]}
+
+
+def test_numbers_that_compare_leaves_undecided_are_not_bold() -> None:
+    """The lower mean is bold where the difference is alike in all views, not where it changes its sign."""
+    steady, lower, mixed = (
+        result(*(scored_view(f"lattice/{12 * i:04d}", error + (-1) ** i * change) for i in range(8)), method=name)
+        for name, error, change in (("steady", 0.030, 0.0), ("lower", 0.028, 0.0), ("mixed", 0.026, 0.02))
+    )
+    for other, verdict in ((lower, "better"), (mixed, "undecided")):
+        rows = {row.column.path: row.verdict for row in compare(steady, other).configs["lattice"]}
+        assert rows["native.abs_rel"] == verdict
+    assert list(bold_rows(latex_table([steady, lower], published=False))) == ["lower"]
+    undecided = latex_table([steady, lower, mixed], published=False)
+    assert "mixed &" in undecided.partition("steady &")[0], "above the others"
+    assert "textbf" not in undecided
+    assert "Bold" not in undecided
+
+
+def test_all_numbers_of_chosen_pixels_are_marked_and_reasons_are_comments() -> None:
+    whole, gaps = (
+        result(*(scored_view(f"{config}/0000", coverage=share) for config in configs), method=name)
+        for name, share, configs in (("whole", 1.0, ("lattice", "pile")), ("gaps", 0.5, ("lattice", "pile")))
+    )
+    table = checked(latex_table([whole, gaps], published=False, absent=["lattice (why)"]))
+    heads = next(line for line in table.splitlines() if line.startswith("Method & ")).rstrip("\\ ").split(" & ")
+    row = next(line for line in table.splitlines() if line.startswith("gaps & ")).rstrip("\\ ").split(" & ")
+    marked = [head for head, cell in zip(heads, row, strict=True) if cell.endswith("$^{*}$")]
+    assert marked == [head for head in heads[1:] if not head.startswith("$E$")]
+    comments, caption = table.partition(r"\begin{table*}")[0], table.partition(r"\caption")[2].split("\n")[0]
+    for reason in (r"gaps, pile (coverage 50.0 \% is below 95 \%)", "lattice (why)", whole.dataset.digest):
+        assert reason in comments
+        assert reason not in caption
+    assert caption.count("$^{*}$") == 1
 
 
 NAMES = (
@@ -106,7 +148,7 @@ NAMES = (
 @pytest.mark.parametrize("name", NAMES)
 def test_hostile_names_are_escaped(name: str) -> None:
     plain, table = (
-        checked(latex_table([result(scored_view("lattice/0000"), method=method), example()], published=True))
+        checked(latex_table([result(*example().views[:8], method=method), example()], published=True))
         for method in ("x", name)
     )
     assert "\\input" not in table

@@ -71,6 +71,15 @@ def test_pages_are_the_golden_texts(rendered: str, check_golden: Callable[[str, 
     check_golden("detections.html", without_embedded(render_page(detection_page())))
 
 
+@pytest.mark.parametrize(("scale", "differ"), [(1.01 / 1.02, False), (1.001 / 1.02, True)])
+def test_captions_of_error_maps_state_that_their_ranges_differ(scale: float, differ: bool) -> None:
+    score = dataclasses.replace(scored_view("lattice/0000"), scale=scale)
+    page = render_report(result(score), [images_of("lattice/0000", score, 1.02)])
+    captions = re.findall(r"<figcaption><strong>(?:Native|Scaled) error</strong>.*?</figcaption>", page, re.DOTALL)
+    assert ["other colour range" in caption for caption in captions] == [differ, differ]
+    assert (len(set(re.findall(r"−([\d.]+) cm", "".join(captions)))) == 2) == differ
+
+
 def test_page_is_well_formed_with_alternative_texts(rendered: str) -> None:
     page = Page(rendered)
     assert page.count("h1") == 1
