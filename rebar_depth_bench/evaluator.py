@@ -1,15 +1,17 @@
-"""Evaluation of a model in Python: its predictions are collected in a temporary archive, which is scored.
+"""Scoring in Python, of an archive or of a model, whose predictions are collected in a temporary archive.
 
 For complete configs the result is that of ``rebar-bench score`` on the same archive, to the byte.
 """
 
 from __future__ import annotations
 
+import os
 import shutil
 import tempfile
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,8 +20,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from rebar_depth_bench.base.errors import InputError, escape_text
+from rebar_depth_bench.base.errors import InputError, RebarDepthError, escape_text
 from rebar_depth_bench.base.names import TEST_SPLIT
+from rebar_depth_bench.base.parallel import Progress, silent
 from rebar_depth_bench.base.writing import output_file
 from rebar_depth_bench.data.loading import load
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
@@ -29,7 +32,6 @@ from rebar_depth_bench.diagnosis.diagnose import diagnose
 from rebar_depth_bench.geometry.cameras import right_from_left
 from rebar_depth_bench.methods.registry import find_method
 from rebar_depth_bench.methods.run import dataset_views, predict_views
-from rebar_depth_bench.reporting.formatting import reference_findings, table_notes
 from rebar_depth_bench.reporting.html.page import write_report
 from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation, score_evaluation
 from rebar_depth_bench.scoring.result import Result
@@ -40,8 +42,6 @@ from rebar_depth_bench.submission.writer import depth_map
 
 if TYPE_CHECKING:
     from datasets import Dataset
-
-    from rebar_depth_bench.extended.result import ExtendedResult
 
 Depth = Float[ndarray, "h w"]
 Model = str | Callable[[Mapping[str, Any]], object] | Mapping[str, object] | Iterable[tuple[str, object]]
@@ -96,6 +96,31 @@ def evaluate(
         if view_id not in evaluator._left_out:
             evaluator._add(view_id, depth, "the model returned" if callable(model) else "depth is")
     return evaluator.compute()
+
+
+def score(
+    archive: str | os.PathLike[str],
+    root: str | Path,
+    *,
+    workers: int | None = None,
+    expect_digest: str | None = None,
+    align: str | None = None,
+    progress: Progress = silent,
+) -> EvaluatedResult:
+    """Score an archive against a dataset folder or Hub repository.
+
+    An archive is scored by the kind of its predictions; ``align`` scores a metric one as one of another kind.
+
+    Views are read directly from the archive and scored on ``workers`` threads (default: one per core); only a few
+    views are in memory at a time. The result does not depend on the number of workers.
+
+    Raises ``SubmissionError`` with all problems if any part of the archive is invalid, and ``DatasetError`` if the
+    dataset folder is invalid or its digest is not ``expect_digest``.
+    """
+    with open_evaluation(archive, root, expect_digest=expect_digest) as evaluation:
+        result = score_evaluation(evaluation, workers=workers, align=align, progress=progress)
+        path = evaluation.submission.path.absolute()
+        return EvaluatedResult(**vars(result), _archive=path, _folder=evaluation.folder)
 
 
 class Evaluator:
@@ -218,10 +243,21 @@ class Evaluator:
 
     def _scored(self) -> EvaluatedResult:
         partial = [one.source for one in self._views if one.source.whole is not one.source]
-        of_views = {config.name: len(scored_counts(config.whole)) for config in partial}
         archive = self._archive
         self.reset()
-        return EvaluatedResult.of_archive(archive, self._folder, of_views, is_extended=self._extended)
+        with open_evaluation(archive.path, self._folder) as evaluation:
+            if self._extended:
+                from rebar_depth_bench.extended.registry import score_extended  # Other evaluations do not need it.
+
+                result = score_extended(evaluation)
+            else:
+                result = score_evaluation(evaluation)
+            some = {
+                config.name: result.tables[config.name].of_some_views(len(scored_counts(config.whole)))
+                for config in partial
+            }
+            result = replace(result, tables={**result.tables, **some})
+            return EvaluatedResult(**vars(result), _archive=archive.path, _folder=self._folder, _owner=archive)
 
     def _predicted_by(self, name: str) -> EvaluatedResult:
         """Return the result of a method."""
@@ -239,79 +275,59 @@ class Evaluator:
                 yield {name: value for name, value in row.items() if with_poses or name not in POSE_COLUMNS}
 
 
+@dataclass(frozen=True, repr=False, kw_only=True)
 class EvaluatedResult(Result):
-    """Result of an evaluation, with its archive, which is deleted with it.
+    """Result of ``score`` or ``evaluate``, whose archive is read again for the notes and the report.
 
-    ``extended``, ``notes`` and the possible mistakes that ``print`` shows are computed when they are read.
+    The archive of ``evaluate`` is temporary and deleted with the result.
     """
 
-    _archive: _TemporaryArchive
-    _folder: DatasetFolder
-    _is_extended: bool
-
-    @classmethod
-    def of_archive(
-        cls, archive: _TemporaryArchive, folder: DatasetFolder, of_views: Mapping[str, int], *, is_extended: bool
-    ) -> EvaluatedResult:
-        """Score an archive; ``of_views`` are the numbers of views of the configs of which only some are scored."""
-        with open_evaluation(archive.path, folder) as evaluation:
-            scored = score_evaluation(evaluation)
-        tables = {
-            name: table.of_some_views(of_views[name]) if name in of_views else table
-            for name, table in scored.tables.items()
-        }
-        result = cls(**{**vars(scored), "tables": tables})
-        result.__dict__.update(_archive=archive, _folder=folder, _is_extended=is_extended)
-        return result
-
-    @cached_property
-    def _extended(self) -> ExtendedResult | None:
-        if not self._is_extended:
-            return None
-        from rebar_depth_bench.extended.registry import score_extended  # Other evaluations do not need it.
-
-        with self._evaluation() as evaluation:
-            return score_extended(evaluation).extended
-
-    extended = property(lambda self: self._extended, lambda *_: None)
-    """Extended measures; None unless they were asked for."""
+    _archive: Path = field(compare=False)
+    _folder: DatasetFolder = field(compare=False)
+    _owner: _TemporaryArchive | None = field(default=None, compare=False)
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
-        """Sentences on what limits the numbers, and on possible mistakes in the predictions."""
-        of_tables = [
-            f"{name}: {note}"
-            for name, table in self.tables.items()
-            for note in (*table_notes(table), *reference_findings(table))
-        ]
-        return (*self.kind_notes, *of_tables, *self._mistakes)
+        """Sentences on what limits the numbers, and on possible mistakes in the predictions.
 
-    @cached_property
-    def _mistakes(self) -> list[str]:
-        with self._evaluation() as evaluation:
-            return [f"possible mistake: {mistake.text}" for mistake in diagnose(evaluation)]
-
-    def __str__(self) -> str:
-        """Return the main numbers of each config, with what limits them and possible mistakes."""
-        return "\n".join([super().__str__(), *self._mistakes])
+        Mistakes are looked for when this is read first; if the archive has gone or changed, a sentence says so.
+        """
+        try:
+            with self._evaluation() as evaluation:
+                mistakes = [f"possible mistake: {mistake.text}" for mistake in diagnose(evaluation)]
+        except RebarDepthError as error:
+            mistakes = [f"possible mistakes were not looked for: {' '.join(str(error).split())}"]
+        return (*super().notes, *mistakes)
 
     def to_html(self, path: str | Path) -> None:
-        """Write the self-contained report of ``rebar-bench score --html``."""
+        """Write the self-contained report of ``rebar-bench score --html``.
+
+        Raises ``InputError`` if the archive has gone or changed.
+        """
         with self._evaluation() as evaluation:
             write_report(self, evaluation, Path(path))
 
     def save_archive(self, path: str | Path) -> None:
-        """Copy the archive of the predictions. Raises ``InputError`` if only some views were evaluated."""
+        """Copy the archive of the predictions.
+
+        Raises ``InputError`` if only some views were evaluated, and if the archive has gone or changed.
+        """
         for name, table in self.tables.items():
             if table.of_views is not None:
                 found = f"{name}: {table.views} of {table.of_views} views were evaluated"
                 raise InputError(f"{found}, expected all views of a config in an archive")
-        with output_file(Path(path)) as target:
-            shutil.copyfile(self._archive.path, target)
+        with self._evaluation() as evaluation, output_file(Path(path)) as target:
+            shutil.copyfile(evaluation.submission.path, target)
 
     @contextmanager
     def _evaluation(self) -> Iterator[Evaluation]:
-        with open_evaluation(self._archive.path, self._folder) as evaluation:
+        with open_evaluation(self._archive, self._folder) as evaluation:
+            found, expected = evaluation.submission.sha256(), self.submission.sha256
+            if found != expected:
+                found = (
+                    f"has the SHA-256 {found[:12]}..., expected {expected[:12]}... of the archive that was scored"
+                )
+                raise InputError(f"{self._archive}: {found}; score it again")
             yield evaluation
 
 

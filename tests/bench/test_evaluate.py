@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import gc
+import math
 import os
+import pickle
 import sys
 import tempfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from subprocess import run
 from typing import Any
@@ -15,6 +18,9 @@ import numpy as np
 import pytest
 
 import rebar_depth_bench as rdb
+from rebar_depth_bench.cli.main import main
+from rebar_depth_bench.scoring.result import read_result
+from tests.bench.reporting.pages import Page
 
 Truth = dict[str, np.ndarray]
 LATTICE = "lattice"
@@ -69,13 +75,16 @@ def test_functions_see_no_ground_truth_that_is_not_declared(tiny_root: Path, inp
 def test_some_views_are_not_ranked(tiny_root: Path, lattice: Truth, tmp_path: Path) -> None:
     result = rdb.evaluate(lattice, tiny_root, config=LATTICE, views=3, method="truth", extended=True)
     assert [view.view_id for view in result.views] == [list(lattice)[k] for k in (0, 3, 6)]
-    assert str(result).splitlines() == [
-        "truth    coverage  rank error  AbsRel  scaled  constant  within 5 mm",
-        "lattice   100.0 %      0.0000  0.0000  0.0000    0.0667      100.0 %",
-        "3 of 9 views: not ranked",
-    ]
-    assert not result.tables[LATTICE].ranked
+    table = result.tables[LATTICE]
+    assert not table.ranked
     assert result.notes[0] == "lattice: Not ranked: 3 of 9 views."
+    constant = f"{table.reference.scaled_constant.abs_rel:.4f}"
+    lines = str(result).splitlines()
+    assert [line.split() for line in lines[:2]] == [
+        ["truth", "?", "coverage", "rank", "error", "AbsRel", "scaled", "constant", "margin", "<=", "5", "mm"],
+        ["lattice", "100.0", "%", "0.0000", "0.0000", "0.0000", constant, "100.0", "%", "100.0", "%"],
+    ]
+    assert lines[2:] == ["protocol rebar-2; inputs: not declared; ground truth: use not declared", *result.notes]
     assert result.extended is not None
     with pytest.raises(rdb.InputError, match="3 of 9 views were evaluated, expected all views"):
         result.save_archive(tmp_path / "some.zip")
@@ -84,15 +93,85 @@ def test_some_views_are_not_ranked(tiny_root: Path, lattice: Truth, tmp_path: Pa
     assert [view.view_id for view in by_id.views] == chosen
 
 
-def test_low_coverage_is_printed_with_the_numbers(tiny_root: Path, lattice: Truth) -> None:
-    halved = {
-        view_id: np.where(np.arange(depth_m.shape[1]) % 2, depth_m, 0) for view_id, depth_m in lattice.items()
+def half(depth_m: np.ndarray) -> np.ndarray:
+    """Return depth in every other column, and no prediction in the others."""
+    return np.where(np.arange(depth_m.shape[1]) % 2, depth_m, 0)
+
+
+def test_every_display_has_the_same_summary(
+    tiny_root: Path, lattice: Truth, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Depth in millimetres in every other column, of a method that declares the use of ground truth."""
+    predictions = {view_id: 1000 * half(depth_m) for view_id, depth_m in lattice.items()}
+    evaluated = rdb.evaluate(predictions, tiny_root, config=LATTICE, method="mine", uses_ground_truth=True)
+    evaluated.save_archive(tmp_path / "a.zip")
+    scored = rdb.score(tmp_path / "a.zip", tiny_root)
+    assert (str(scored), scored._repr_html_()) == (str(evaluated), evaluated._repr_html_())
+    assert main(["score", str(tmp_path / "a.zip"), "--data", str(tiny_root)]) == 0
+    streams = capsys.readouterr()
+    displays = {
+        "print": str(scored),
+        "notebook": Page(scored._repr_html_()).text,
+        "terminal": streams.out + streams.err,
     }
-    lines = str(rdb.evaluate(halved, tiny_root, config=LATTICE)).splitlines()
-    assert lines[2:] == ["coverage below 95 %: errors of valid predictions are not comparable"]
+    table = scored.tables[LATTICE]
+    assert table.coverage is not None
+    assert table.scaled is not None
+    constant = table.reference.scaled_constant.abs_rel
+    assert constant is not None
+    coverage = math.floor(1000 * table.coverage) / 10
+    margin = math.floor(1000 * (1 - table.scaled.abs_rel / constant)) / 10
+    for display, text in displays.items():
+        shown = " ".join(text.split())
+        for words in (
+            *(f"{coverage:.1f}", f"{table.rank_error:.4f}", f"{constant:.4f}", f"{margin:.1f} %"),
+            *("ground truth: used, as declared", f"coverage {coverage:.1f} % is below 95 %"),
+            *("Not ranked: the submission declares", "possible mistake: ", "in millimetres"),
+        ):
+            assert words in shown, (display, words)
+    assert "mine ‡" in displays["print"]
+    assert "mine ‡" in displays["notebook"]
+    assert "mine ‡" in displays["terminal"]
 
 
-def test_mistakes_are_printed_and_among_the_notes(tiny_root: Path, lattice: Truth) -> None:
+def test_score_has_report_and_archive_as_evaluate(tiny_root: Path, lattice: Truth, tmp_path: Path) -> None:
+    evaluated = rdb.evaluate(lattice, tiny_root, config=LATTICE)
+    evaluated.save_archive(tmp_path / "a.zip")
+    scored = rdb.score(tmp_path / "a.zip", tiny_root)
+    scored.save_archive(tmp_path / "b.zip")
+    assert (tmp_path / "b.zip").read_bytes() == (tmp_path / "a.zip").read_bytes()
+    for name, result in (("evaluated", evaluated), ("scored", scored)):
+        result.to_html(tmp_path / f"{name}.html")
+    assert (tmp_path / "scored.html").read_bytes() == (tmp_path / "evaluated.html").read_bytes()
+
+
+@pytest.mark.parametrize("change", [Path.unlink, lambda path: path.write_bytes(path.read_bytes() + b" ")])
+def test_mistakes_are_looked_for_in_the_archive_that_was_scored(
+    change: Callable[[Path], object],
+    tiny_root: Path,
+    lattice: Truth,
+    archive_of: Callable[..., Path],
+    tmp_path: Path,
+) -> None:
+    archive = archive_of({view_id: 1000 * depth_m for view_id, depth_m in lattice.items()})
+    before, after, other = (rdb.score(archive, tiny_root) for _ in range(3))
+    [mistake] = [note for note in before.notes if note.startswith("possible mistake: ")]
+    read = read_result(before.to_json(), "json")
+    assert (*read.notes, mistake) == before.notes, "a result that was read has no archive"
+    copies = [pickle.loads(pickle.dumps(one)) for one in (before, after)]
+    change(archive)
+    assert before.notes[-1] == copies[0].notes[-1] == mistake
+    for result in (after, copies[1], replace(other, submission=replace(other.submission, method="b"))):
+        assert result.notes[:-1] == read.notes
+        assert result.notes[-1].startswith("possible mistakes were not looked for: ")
+        assert str(result).endswith(result.notes[-1])
+        with pytest.raises(rdb.InputError, match=str(archive)):
+            result.to_html(tmp_path / "report.html")
+        with pytest.raises(rdb.InputError, match=str(archive)):
+            result.save_archive(tmp_path / "copy.zip")
+
+
+def test_mistakes_are_printed_and_among_the_notes(tiny_root: Path, lattice: Truth, tmp_path: Path) -> None:
     made: dict[str, Callable[[np.ndarray], np.ndarray]] = {
         "in millimetres": lambda z: z * 1000,
         'if the network is relative, declare kind="affine-disparity"': lambda z: 1 / np.where(z > 0, z, np.nan),
@@ -102,18 +181,22 @@ def test_mistakes_are_printed_and_among_the_notes(tiny_root: Path, lattice: Trut
         [mistake] = [note for note in result.notes if note.startswith("possible mistake: ")]
         assert words in mistake
         assert str(result).splitlines()[-1] == mistake
+        result.to_html(tmp_path / "report.html")
+        assert mistake.removeprefix("possible mistake: ") in Page((tmp_path / "report.html").read_text()).text
 
 
 def test_predictions_that_say_nothing_are_told_apart(tiny_root: Path, lattice: Truth) -> None:
     def notes(make: Callable[[np.ndarray], np.ndarray]) -> list[str]:
         predictions = {view_id: make(z) for view_id, z in lattice.items()}
-        return str(rdb.evaluate(predictions, tiny_root, config=LATTICE, kind="affine-disparity")).splitlines()[3:]
+        return list(rdb.evaluate(predictions, tiny_root, config=LATTICE, kind="affine-disparity").notes[1:])
 
     words = "say nothing about depth, or run the other way (depth declared as disparity, or disparity as depth)."
     assert notes(lambda z: z)[1].endswith(words)
     none = notes(lambda z: np.full_like(z, np.nan))
-    assert none[0] == "9 of 9 views without any prediction"
-    assert not any("fit" in note for note in none)
+    assert none[0].endswith(
+        f"{len(lattice)} of {len(lattice)} views without any prediction; coverage 0.0 % is below 95 %."
+    )
+    assert not any("fit " in note for note in none)
 
 
 def test_unfinished_evaluator_is_silent_at_exit(tiny_root: Path, tmp_path: Path) -> None:
