@@ -21,7 +21,7 @@ from jaxtyping import Float
 from numpy import ndarray
 
 from rebar_depth_bench.base.errors import InputError, RebarDepthError, escape_text
-from rebar_depth_bench.base.names import TEST_SPLIT
+from rebar_depth_bench.base.names import TEST_SPLIT, config_of
 from rebar_depth_bench.base.parallel import Progress, silent
 from rebar_depth_bench.base.writing import output_file
 from rebar_depth_bench.data.loading import load
@@ -31,7 +31,7 @@ from rebar_depth_bench.data.schema import COLUMNS
 from rebar_depth_bench.diagnosis.diagnose import diagnose
 from rebar_depth_bench.geometry.cameras import right_from_left
 from rebar_depth_bench.methods.registry import find_method
-from rebar_depth_bench.methods.run import dataset_views, predict_views
+from rebar_depth_bench.methods.run import dataset_views, predict_views, wrap_errors
 from rebar_depth_bench.reporting.html.page import write_report
 from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation, score_evaluation
 from rebar_depth_bench.scoring.result import Result
@@ -49,6 +49,8 @@ Model = str | Callable[[Mapping[str, Any]], object] | Mapping[str, object] | Ite
 _ROW_COLUMNS = tuple(name for name in COLUMNS if name != "scene" and name not in TRUTH_COLUMNS)
 _UNDECLARED = {"method": "unnamed", "kind": METRIC, "inputs": None, "uses_ground_truth": None}
 """Defaults of what predictions declare."""
+_WRAPPED_MODULE = 'lambda row: net(torch.tensor(row["left_rgb"]).permute(2, 0, 1)[None] / 255)'
+"""Function of a row for a network that takes B x 3 x H x W."""
 
 
 def evaluate(
@@ -73,7 +75,8 @@ def evaluate(
     takes points of the left camera's frame to the right one's; with ``inputs="multi-view"``, which then needs
     ``uses_ground_truth=True``, also the poses in the world. What the config lacks is None.
 
-    The other arguments are those of ``Evaluator``. Raises as it does, and what a function raises.
+    The other arguments are those of ``Evaluator``, and so are the errors. An exception of a function is the cause
+    of a ``MethodError``, which names the view and the line.
     """
     declared = dict[str, Any](method=method, kind=kind, inputs=inputs, uses_ground_truth=uses_ground_truth)
     evaluator = Evaluator(root, config, split=split, views=views, extended=extended, **declared)
@@ -89,12 +92,17 @@ def evaluate(
             found = f"inputs is multi-view and uses_ground_truth is {uses_ground_truth}"
             raise InputError(f"{found}, expected True, because the rows then have the true poses")
         rows = evaluator._rows(with_poses=inputs == "multi-view")
-        pairs: Iterable[tuple[str, object]] = ((row["view_id"], model(row)) for row in rows)
+        what = "the model"
+        if hasattr(model, "forward"):
+            what += f", a {type(model).__name__} that is given a row; wrap it in a function, as {_WRAPPED_MODULE}"
+        for row in rows:
+            with wrap_errors(f"{row['view_id']}: {what}"):
+                predicted = model(row)
+            evaluator._add(row["view_id"], predicted, "the model returned")
     else:
-        pairs = _pairs(model)
-    for view_id, depth in pairs:
-        if view_id not in evaluator._left_out:
-            evaluator._add(view_id, depth, "the model returned" if callable(model) else "depth is")
+        for view_id, depth in _pairs(model):
+            if view_id not in evaluator._left_out:
+                evaluator._add(view_id, depth)
     return evaluator.compute()
 
 
@@ -219,7 +227,8 @@ class Evaluator:
     def _add(self, view_id: str, depth: object, what: str = "depth is") -> None:
         if not isinstance(view_id, str) or view_id not in self._grids:
             found = f"{escape_text(str(view_id))}: is not among the {len(self._grids)} views to predict"
-            raise InputError(f"{found}, expected one as {next(iter(self._grids))}")
+            others = "config=, split= and views= select others"
+            raise InputError(f"{found}, expected one as {next(iter(self._grids))}; {others}")
         if view_id in self._added:
             raise InputError(
                 f"{view_id}: was added before, expected each view once; a distributed sampler repeats views to "
@@ -237,7 +246,12 @@ class Evaluator:
         Raises ``InputError`` if a view is missing, and as ``score`` does, after which all are missing.
         """
         if missing := [view_id for view_id in self._grids if view_id not in self._added]:
-            raise InputError(f"{len(missing)} of {len(self._grids)} views are missing, such as {missing[0]}")
+            found = f"{len(missing)} of {len(self._grids)} views are missing, such as {missing[0]}"
+            given = {config_of(view_id) for view_id in self._added}
+            absent = [one.source.name for one in self._views if one.source.name not in given]
+            if given and absent:
+                found += f"; none is of {', '.join(absent)}: config={min(given)!r} evaluates that config alone"
+            raise InputError(found)
         self._archive.writers.close()
         return self._scored()
 

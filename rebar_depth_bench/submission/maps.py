@@ -48,6 +48,14 @@ def max_npy_bytes(shape: tuple[int, int]) -> int:
     return shape[0] * shape[1] * 8 + MAX_HEADER_BYTES
 
 
+def resize_hint(shape: Sequence[object], expected: tuple[int, int]) -> str:
+    """Return how a map comes to the (H, W) of its view, for the end of a message; "" for other than two axes."""
+    height, width = expected
+    # Other interpolations make depth that lies between a bar and its background.
+    how = f"cv2.resize(depth, ({width}, {height}), interpolation=cv2.INTER_NEAREST)"
+    return f"; resize it by {how}" if len(shape) == 2 else ""
+
+
 def decode_npy(name: str, data: memoryview, shape: tuple[int, int], _: float = 1.0, ints: bool = False) -> Depth:
     """Return the depth array in ``data``, in metres: (H, W), float16, float32 or float64 in native byte order.
 
@@ -98,7 +106,8 @@ def _parse_header(
     actual_shape = shapes[0].replace("L", "").replace(",", " ").split()
     if actual_shape != [str(size) for size in shape]:
         actual = " x ".join(map(escape_text, actual_shape)) if actual_shape else "a single value"
-        raise EntryError(Problem("invalid", name, f"the shape is {actual}", f"{format_shape(shape)} (H x W)"))
+        expected = f"{format_shape(shape)} (H x W){resize_hint(actual_shape, shape)}"
+        raise EntryError(Problem("invalid", name, f"the shape is {actual}", expected))
     return np.dtype(descr[0].replace("|", "=")), fortran[0] == "True", end
 
 
@@ -203,7 +212,8 @@ def _check_exr_header(name: str, data: memoryview, shape: tuple[int, int]) -> No
     window_shape = (window[3] - window[1] + 1, window[2] - window[0] + 1)
     if window_shape != shape:
         found = f"the data window is {format_shape(window_shape)}"
-        raise EntryError(Problem("invalid", name, found, f"{format_shape(shape)} (H x W)"))
+        expected = f"{format_shape(shape)} (H x W){resize_hint(window_shape, shape)}"
+        raise EntryError(Problem("invalid", name, found, expected))
     if tiles is not None:
         _check_tiles(name, tiles, shape)
 
@@ -349,7 +359,8 @@ def _check_png_header(
         raise EntryError(Problem("invalid", name, f"the PNG is {actual}", "16-bit greyscale"))
     if (height, width) != shape:
         found = f"the image is {height} x {width}"
-        raise EntryError(Problem("invalid", name, found, f"{format_shape(shape)} (H x W)"))
+        expected = f"{format_shape(shape)} (H x W){resize_hint((height, width), shape)}"
+        raise EntryError(Problem("invalid", name, found, expected))
     if compression or filtering or interlace > 1:
         actual = f"compression {compression}, filter {filtering}, interlace {interlace}"
         raise EntryError(Problem("invalid", name, f"the PNG header declares {actual}", "0, 0 and 0 or 1"))

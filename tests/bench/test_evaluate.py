@@ -6,6 +6,7 @@ import gc
 import math
 import os
 import pickle
+import re
 import sys
 import tempfile
 from collections.abc import Callable
@@ -292,10 +293,65 @@ def test_wrong_views_are_named(tiny_root: Path, lattice: Truth) -> None:
         evaluator.update(first, lattice[first])
     with pytest.raises(rdb.InputError, match="lattice/9999: is not among the 9 views"):
         evaluator.update("lattice/9999", lattice[first])
-    with pytest.raises(rdb.InputError, match=f"8 of 9 views are missing, such as {second}"):
+    with pytest.raises(rdb.InputError, match=f"8 of 9 views are missing, such as {second}$"):
         evaluator.compute()
     with pytest.raises(rdb.InputError, match="2 view ids and 1 depth maps"):
         evaluator.update([first, second], lattice[first][None])
+
+
+def test_the_argument_that_selects_what_is_predicted_is_named(tiny_root: Path, lattice: Truth) -> None:
+    orbit = rdb.Evaluator(tiny_root, "lattice-orbit").view_ids
+    words = (
+        f"{len(orbit)} of {len(orbit) + len(lattice)} views are missing, .* is of lattice-orbit: config='lattice'"
+    )
+    with pytest.raises(rdb.InputError, match=words):
+        rdb.evaluate(lattice, tiny_root)
+    assert rdb.evaluate(lattice, tiny_root, config="lattice").tables[LATTICE].coverage == 1
+    with pytest.raises(rdb.InputError, match=f"{min(lattice)}: is not among .*; config=, split= and views="):
+        rdb.evaluate(lattice, tiny_root, config="lattice-orbit")
+
+
+def test_an_exception_of_a_model_names_the_view(tiny_root: Path) -> None:
+    second = rdb.Evaluator(tiny_root, LATTICE).view_ids[1]
+
+    def model(row: Any) -> np.ndarray:
+        if row["view_id"] == second:
+            raise KeyError("depth")
+        return np.ones(row["left_rgb"].shape[:2])
+
+    with pytest.raises(
+        rdb.InputError, match=f"^{second}: the model: raised KeyError: 'depth' .*{Path(__file__).name}:"
+    ) as e:
+        rdb.evaluate(model, tiny_root, config=LATTICE)
+    assert isinstance(e.value.__cause__, KeyError)
+
+
+def test_a_network_that_is_given_a_row_is_told_of_a_function(tiny_root: Path) -> None:
+    torch = pytest.importorskip("torch")
+    net = torch.nn.Conv2d(3, 1, 3, padding=1)
+    with pytest.raises(rdb.InputError, match="a Conv2d that is given a row; wrap it") as e:
+        rdb.evaluate(net, tiny_root, config=LATTICE)
+    function = eval(re.search("lambda row: .* / 255[)]", str(e.value))[0], {"net": net, "torch": torch})  # type: ignore[index]
+    assert list(rdb.evaluate(function, tiny_root, config=LATTICE).tables) == [LATTICE]
+
+
+def test_smaller_maps_are_resized_as_the_message_says(
+    tiny_root: Path, lattice: Truth, archive_of: Callable[..., Path]
+) -> None:
+    cv2 = pytest.importorskip("cv2")
+    small = {view_id: depth_m[::2, ::2] for view_id, depth_m in lattice.items()}
+    height, width = next(iter(lattice.values())).shape
+    sizes = rf"{height // 2}\D+{width // 2}\b.*expected.*{height}\D+{width}\b.*; resize it by (.*)"
+    ways: list[Callable[[], object]] = [
+        lambda: rdb.evaluate(small, tiny_root, config=LATTICE),
+        lambda: rdb.score(archive_of(small), tiny_root),
+    ]
+    for evaluate in ways:
+        with pytest.raises(rdb.InputError) as e:
+            evaluate()
+        how = re.findall(sizes, str(e.value))[0]
+        resized = {view_id: eval(how, {"depth": depth, "cv2": cv2}) for view_id, depth in small.items()}
+        assert rdb.evaluate(resized, tiny_root, config=LATTICE).tables[LATTICE].views == len(lattice)
 
 
 @pytest.mark.parametrize(

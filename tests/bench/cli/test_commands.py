@@ -124,7 +124,7 @@ def test_check_reads_the_manifest_once(
     monkeypatch.setattr(check, "print_verified", lambda _: (root / "manifest.json").unlink())
     finished = run_bench("check", constant, "--data", root, "--expect-digest", open_folder(root).digest)
     assert (finished.returncode, finished.stderr.count("error: ")) == (0, 0), finished.stderr
-    assert finished.stdout == f"{constant}: no problem found\n"
+    assert finished.stdout == f"{constant}: the archive is valid\n"
 
 
 @pytest.mark.parametrize("command", ["score", "check"])
