@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import os
 import re
+import socket
 import time
+from importlib.util import find_spec
 from io import BufferedIOBase
 from pathlib import Path
 
@@ -112,6 +114,85 @@ def test_unreachable_service_or_invalid_url_is_reported(small_archive: Path, url
     process = run_bench("submit", small_archive, "--url", url, token="rdb_x")
     assert process.returncode == status
     assert process.stderr.splitlines()[-1].startswith("error: ")
+
+
+PROXIES = [
+    name for proxy in ("http_proxy", "https_proxy", "all_proxy", "no_proxy") for name in (proxy, proxy.upper())
+]
+CERTIFICATES = ("SSL_CERT_FILE", "SSL_CERT_DIR", "SSLKEYLOGFILE")
+
+
+@pytest.fixture
+def no_proxy(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+    """Remove what the environment says of proxies and certificates."""
+    for name in (*PROXIES, *CERTIFICATES):
+        monkeypatch.delenv(name, raising=False)
+    return monkeypatch
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "shown", "remedy"),
+    [
+        pytest.param(
+            "ALL_PROXY",
+            "socks5://u:secret@127.0.0.1:9",
+            "socks5://127.0.0.1:9",
+            "httpx2[socks]",
+            marks=pytest.mark.skipif(find_spec("socksio") is not None, reason="SOCKS is supported here"),
+        ),
+        ("HTTP_PROXY", "ftp://127.0.0.1:9", "ftp://127.0.0.1:9", "http://HOST:PORT"),
+        ("https_proxy", "socks4://u:secret@[::1]:9", "socks4://[::1]:9", "NO_PROXY=*"),
+        ("HTTP_PROXY", "http://[::1", "http://[::1", "http://HOST:PORT"),
+        ("SSL_CERT_FILE", "/nowhere/ca.pem", "/nowhere/ca.pem", "No such file or directory"),
+        ("SSL_CERT_FILE", __file__, __file__, "no certificate"),
+        ("SSL_CERT_DIR", "/nowhere/certs", "/nowhere/certs", "no such folder"),
+        ("SSLKEYLOGFILE", "/nowhere/keys", "/nowhere/keys", "No such file or directory"),
+    ],
+)
+def test_unusable_variable_of_http_is_named(
+    name: str, value: str, shown: str, remedy: str, small_archive: Path, no_proxy: pytest.MonkeyPatch
+) -> None:
+    no_proxy.setenv("SSL_CERT_DIR", str(small_archive.parent))  # SSLKEYLOGFILE is read with certificates only.
+    no_proxy.setenv(name, value)
+    process = run_bench("submit", small_archive, "--url", "http://127.0.0.1:9", token=TOKEN)
+    assert process.returncode == 2
+    [line] = process.stderr.splitlines()
+    assert line.startswith(f"error: {name}={shown}: ")
+    assert remedy in line
+    assert "secret" not in line
+
+
+def test_proxy_that_does_not_answer_is_named(
+    scripted: ScriptedServer, small_archive: Path, no_proxy: pytest.MonkeyPatch
+) -> None:
+    """A local leaderboard is behind the proxy, too, unless NO_PROXY has its address."""
+    with socket.socket() as unused:
+        unused.bind(("127.0.0.1", 0))
+        proxy = f"127.0.0.1:{unused.getsockname()[1]}"
+        no_proxy.setenv("HTTP_PROXY", f"http://u:secret@{proxy}")
+        process = run_bench("submit", small_archive, "--url", scripted.url, token=TOKEN)
+        assert (process.returncode, scripted.requests) == (1, [])
+        assert (
+            f"through the proxy {proxy} (HTTP_PROXY=http://{proxy}; NO_PROXY=127.0.0.1 avoids it)"
+            in process.stderr
+        )
+        assert "secret" not in process.stderr
+        scripted.answers = {"token": [answer({}, 500)]}
+        no_proxy.setenv("NO_PROXY", "127.0.0.1")
+        process = run_bench("submit", small_archive, "--url", scripted.url, token=TOKEN)
+    assert (process.returncode, scripted.endpoints()) == (1, ["token"])
+    assert proxy not in process.stderr
+
+
+def test_answer_of_a_proxy_names_it(
+    scripted: ScriptedServer, small_archive: Path, no_proxy: pytest.MonkeyPatch
+) -> None:
+    no_proxy.setenv("all_proxy", scripted.url)
+    scripted.answers = {"token": [answer(b"<html>no upstream</html>", 503)]}
+    process = run_bench("submit", small_archive, "--url", "http://board.invalid", token=TOKEN)
+    assert process.returncode == 1
+    assert f"through the proxy {scripted.url.removeprefix('http://')} (all_proxy={scripted.url};" in process.stderr
+    assert "the response status is 503" in process.stderr
 
 
 def test_client_library_raises_errors_of_command(board: SharedServer, tmp_path: Path) -> None:
