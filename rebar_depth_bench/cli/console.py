@@ -94,6 +94,10 @@ def run_program(parser: argparse.ArgumentParser, words: Sequence[str] | None = N
 
     def run() -> None:
         options = parser.parse_args(words)
+        try:
+            Path.cwd()
+        except FileNotFoundError:
+            raise InputError("the current folder was removed: change to one that exists") from None
         check_outputs(vars(options))
         options.run(options)
 

@@ -147,6 +147,26 @@ def test_closed_standard_output_is_no_file(scored: list[str | Path]) -> None:
 
 
 @pytest.mark.parametrize(
+    ("module", "words"),
+    [
+        ("rebar_depth_bench.cli.main", ["score", "a.zip", "--data", "data", "--json", "a.json"]),
+        ("dataset_builder.cli.main", ["--out", "data", "--dry-run"]),
+        ("leaderboard.__main__", ["check", "--data", "data"]),
+    ],
+)
+def test_removed_current_folder_is_named(module: str, words: list[str], tmp_path: Path) -> None:
+    enter = "os.chdir(sys.argv.pop(1)); os.rmdir(os.getcwd())"
+    start = f"import os, sys; from {module} import main; {enter}; sys.exit(main())"
+    gone = tmp_path / "gone"
+    gone.mkdir()
+    command = [sys.executable, "-P", "-c", start, str(gone), *words]
+    finished = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
+    assert finished.returncode == 2
+    assert finished.stderr.startswith("error: the current folder was removed")
+    assert "Traceback" not in finished.stderr
+
+
+@pytest.mark.parametrize(
     ("seconds", "text"),
     [
         (0, "0 s"),
