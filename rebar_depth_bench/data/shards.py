@@ -360,7 +360,7 @@ def shard_rows(
                     yield {name: row[name] for name in columns}
 
 
-def damaged_error(config: DatasetConfig, error: Exception, shard: str = "") -> DatasetError:
+def _damaged_error(config: DatasetConfig, error: Exception, shard: str = "") -> DatasetError:
     """Return the error of a config that cannot be read; ``shard`` is the file, if it is known."""
     place = f"{config.root}: config {config.name} cannot be read: {f'{shard}: ' if shard else ''}"
     reason = escape_text(str(error) or type(error).__name__)
@@ -385,4 +385,4 @@ def _open_shard(config: DatasetConfig, shard: str, table: Table) -> Iterator[pq.
     except InputError:
         raise
     except Exception as error:  # pyarrow and the Hub's client raise many types, which depend on the damage.
-        raise damaged_error(config, error, shard) from error
+        raise _damaged_error(config, error, shard) from error
