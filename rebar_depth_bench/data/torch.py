@@ -37,14 +37,16 @@ class Augmentation:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Raise ``InputError`` for a crop that is empty and for a seed below 0."""
+        """Raise ``InputError`` for a crop that is empty, a flip that is no bool and a seed below 0."""
         problems = []
-        if self.crop is not None and (len(self.crop) != 2 or min(self.crop) < 1):
-            problems.append(
-                Problem("invalid", "crop", f"got {self.crop}", "height and width in pixels, 1 or more")
-            )
-        if self.seed < 0:
-            problems.append(Problem("invalid", "seed", f"got {self.seed}", "0 or more"))
+        is_pair = isinstance(self.crop, Sequence) and len(self.crop) == 2
+        if self.crop is not None and not (is_pair and all(_is_whole(side, 1) for side in self.crop)):
+            expected = "a side or (height, width) in pixels, whole numbers of 1 or more"
+            problems.append(Problem("invalid", "crop", f"got {self.crop!r}", expected))
+        if not isinstance(self.flip, bool):
+            problems.append(Problem("invalid", "flip", f"got {self.flip!r}", "True or False"))
+        if not _is_whole(self.seed, 0):
+            problems.append(Problem("invalid", "seed", f"got {self.seed!r}", "a whole number, 0 or more"))
         if problems:
             raise InputError.from_problems("augmentation", problems)
 
@@ -58,6 +60,10 @@ class Augmentation:
             row = crop_row(row, self.crop, rng)
         is_flipped = self.flip and rng.random() < FLIP_PROBABILITY
         return flip_row(row) if is_flipped else row
+
+
+def _is_whole(value: object, least: int) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(value >= least)
 
 
 def crop_row(row: Row, size: tuple[int, int], rng: np.random.Generator) -> Row:
@@ -152,7 +158,7 @@ def torch_loader(
     drop_last: bool = False,
     pin_memory: bool = False,
     stereo: bool = False,
-    crop: tuple[int, int] | None = None,
+    crop: int | tuple[int, int] | None = None,
     flip: bool = False,
     seed: int = 0,
 ) -> DataLoader[Batch]:
@@ -168,24 +174,38 @@ def torch_loader(
     is applied. A dataset that only ``datasets`` has read is not compared with the manifest.
 
     For training, ``shuffle`` changes the order in every epoch. A streamed dataset is shuffled by shard, and then
-    in a buffer of 32 views (``SHUFFLE_BUFFER``). ``crop`` (height, width) takes a random part of each view, and
-    ``flip`` mirrors half of the views. Depth, masks, K and poses stay consistent: a flipped stereo pair has its
-    eyes exchanged, and the pose of a flipped view contains the reflection. Crops and flips depend on ``seed``, the
-    view id and how often the view was drawn before (of a streamed dataset: how often it was iterated), not on the
-    order, the sampler or the number of workers. Views that workers drew ahead of an interruption count too. The
-    order of shuffled views depends on ``seed`` and how often the loader was iterated, and for a streamed dataset
-    also on torch's seed and the number of workers.
+    in a buffer of 32 views (``SHUFFLE_BUFFER``). ``crop``, (height, width) or the side of a square in pixels,
+    takes a random part of each view, and ``flip`` mirrors half of the views. Depth, masks, K and poses stay
+    consistent: a flipped stereo pair has its eyes exchanged, and the pose of a flipped view contains the
+    reflection. Crops and flips depend on ``seed``, the view id and how often the view was drawn before (of a
+    streamed dataset: how often it was iterated), not on the order, the sampler or the number of workers. Views
+    that workers drew ahead of an interruption count too. The order of shuffled views depends on ``seed`` and how
+    often the loader was iterated, and for a streamed dataset also on torch's seed and the number of workers.
 
     ``sampler``, ``drop_last`` and ``pin_memory`` are those of ``DataLoader``. A sampler takes the place of
     ``shuffle``, and a streamed dataset has none; the caller sets the epoch of a ``DistributedSampler``. Training
     frameworks may build the loader again from its ``dataset`` and ``collate_fn``, with a sampler of their own.
 
-    Importing this module without torch raises ``MethodError``. Raises ``InputError`` for an invalid crop or seed,
+    Importing this module without torch raises ``MethodError``. Raises ``InputError`` for arguments of other types,
     and a sampler beside ``shuffle`` or of a streamed dataset, and ``DatasetError`` if ``ds`` lacks columns.
     """
     keys = {**_LEFT, **_RIGHT, "baseline_m": "baseline_m"} if stereo else _LEFT
     rows = _pictured(ds, ["view_id", *keys.values()])
-    augmentation = Augmentation(crop, flip, seed)
+    augmentation = Augmentation((crop, crop) if isinstance(crop, int | np.integer) else crop, flip, seed)
+    flags = {"shuffle": shuffle, "drop_last": drop_last, "pin_memory": pin_memory, "stereo": stereo}
+    given = (
+        ("batch_size", batch_size, _is_whole(batch_size, 1), "a whole number, 1 or more"),
+        ("num_workers", num_workers, _is_whole(num_workers, 0), "a whole number, 0 or more"),
+        ("sampler", sampler, isinstance(sampler, Iterable | None), "numbers of rows, which can be iterated"),
+        *((name, flag, isinstance(flag, bool), "True or False") for name, flag in flags.items()),
+    )
+    problems = [
+        Problem("invalid", name, f"got {value!r}", expected)
+        for name, value, is_valid, expected in given
+        if not is_valid
+    ]
+    if problems:
+        raise InputError.from_problems("torch_loader", problems)
     if sampler is not None and (shuffle or isinstance(rows, IterableDataset)):
         found = "shuffle" if shuffle else "a streamed dataset, whose rows have no numbers"
         raise InputError(f"torch_loader: sampler is given with {found}, expected only one of both")
@@ -197,7 +217,7 @@ def torch_loader(
         sampler = _SeededSampler(source, seed) if shuffle else sampler
     return DataLoader(
         source,
-        batch_size=batch_size,
+        batch_size=int(batch_size),  # torch takes no integers of NumPy.
         sampler=sampler,
         num_workers=num_workers,
         collate_fn=partial(_collated, keys),

@@ -131,6 +131,12 @@ evaluator.itself = evaluator
         assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("config", [None, LATTICE])
+def test_split_of_another_type_is_refused(tiny_root: Path, config: str | None) -> None:
+    with pytest.raises(rdb.DatasetError, match=r"the split 3$|no split 3, expected test"):
+        rdb.Evaluator(tiny_root, config, split=3)  # type: ignore[arg-type]
+
+
 def test_a_method_declares_itself(tiny_root: Path) -> None:
     with pytest.raises(rdb.InputError, match=r"^kind and uses_ground_truth are given, .* sgbm .*, align=KIND"):
         rdb.evaluate("sgbm", tiny_root, kind="affine-disparity", uses_ground_truth=False)

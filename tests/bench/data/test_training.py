@@ -160,6 +160,38 @@ def test_what_cannot_be_batched_is_refused(tiny_root: Path) -> None:
         flip_row(row)
 
 
+@pytest.mark.parametrize("streaming", [False, True])
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("batch_size", [None, 0, -1, 2.0, True, "2", [2]]),
+        ("num_workers", [None, -1, 1.0, "1"]),
+        ("crop", [0, -8, 64.0, True, "64", (8.0, 8), (8, None), (8, 8, 8), {8, 9}]),
+        ("seed", [None, -1, 1.5, "1"]),
+        ("flip", [None, 0.5, "no"]),
+        ("shuffle", [None, "no"]),
+        ("stereo", [None, "right"]),
+        ("drop_last", ["no"]),
+        ("pin_memory", ["cuda"]),
+        ("sampler", [3, 0.5]),
+    ],
+)
+def test_wrong_arguments_are_named(tiny_root: Path, streaming: bool, name: str, values: list[Any]) -> None:
+    views = rdb.load(tiny_root, CONFIG, streaming=streaming)
+    for value in values:
+        with pytest.raises(InputError) as caught:
+            rdb.torch_loader(views, **{name: value})
+        assert [problem.where for problem in caught.value.problems] == [name]
+        assert repr(value) in caught.value.problems[0].found
+
+
+def test_one_side_is_a_square_crop(tiny_root: Path) -> None:
+    expected = depth_by_view(batches(tiny_root, crop=(24, 24)))
+    for side in (24, np.int64(24)):
+        found = depth_by_view(batches(tiny_root, batch_size=np.int32(1), crop=side))
+        assert all(torch.equal(depth, expected[view_id]) for view_id, depth in found.items())
+
+
 def test_samplers_choose_the_rows_and_their_order(tiny_root: Path) -> None:
     all_ids = ids(batches(tiny_root))
     for numbers in ([5, 0, 5], np.array([5, 0, 5]), torch.tensor([5, 0, 5])):
