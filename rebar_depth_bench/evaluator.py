@@ -212,7 +212,9 @@ class Evaluator:
         Raises ``InputError`` if a view is missing, and as ``score`` does, after which all are missing.
         """
         if missing := [view_id for view_id in self._grids if view_id not in self._added]:
-            raise InputError(f"{len(missing)} of {len(self._grids)} views are missing, such as {missing[0]}")
+            found = f"{len(missing)} of {len(self._grids)} views are missing, such as {missing[0]}"
+            remedy = "views=... selects some, and reset() begins again; Lightning: Trainer(num_sanity_val_steps=0)"
+            raise InputError(f"{found}, expected all of them before compute(): {remedy}")
         self._archive.writers.close()
         return self._scored()
 

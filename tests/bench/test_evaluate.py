@@ -207,6 +207,22 @@ def test_shapes_of_one_view(tiny_root: Path, shape: tuple[int, ...], words: str 
             evaluator.update(view_id, np.ones(shape))
 
 
+def test_remedies_for_a_part_of_the_views_are_named_and_work(tiny_root: Path, lattice: Truth) -> None:
+    first, *others = lattice
+    evaluator = rdb.Evaluator(tiny_root, LATTICE)
+    evaluator.update(first, lattice[first])
+    with pytest.raises(rdb.InputError, match=f"{len(others)} of {len(lattice)} views are missing") as caught:
+        evaluator.compute()
+    for remedy in ("views=", "reset()", "num_sanity_val_steps=0"):
+        assert remedy in str(caught.value)
+    evaluator.reset()
+    evaluator.update(list(lattice), list(lattice.values()))
+    selected = rdb.Evaluator(tiny_root, LATTICE, views=[first])
+    selected.update(first, lattice[first])
+    for complete, views in ((evaluator, len(lattice)), (selected, 1)):
+        assert complete.compute().tables[LATTICE].views == views
+
+
 def test_wrong_views_are_named(tiny_root: Path, lattice: Truth) -> None:
     first, second, *_ = lattice
     evaluator = rdb.Evaluator(tiny_root, LATTICE)
