@@ -205,9 +205,9 @@ class Evaluator:
     def update(self, view_ids: str | Sequence[str], depth: object) -> None:
         """Add the planar depth of left views in metres, or of another kind: of one view or of a batch.
 
-        ``depth`` is an array or tensor of any float type and device: H x W for one id, also after axes of length
-        1; for a list of B ids B x H x W, B x 1 x H x W, or a list. Values that are not finite, and of ``metric``
-        and ``scale`` those <= 0, mean no prediction.
+        ``depth`` is an array or tensor of any float type and device: H x W for one id, alone or in a list, also
+        after axes of length 1; for a list of B ids B x H x W, B x 1 x H x W, or a list. Values that are
+        not finite, and of ``metric`` and ``scale`` those <= 0, mean no prediction.
 
         Raises ``InputError``, which names the view, for one that is not to be predicted or was added before, and
         for depth of another size.
@@ -215,12 +215,23 @@ class Evaluator:
         if isinstance(view_ids, str):
             self._add(view_ids, depth)
             return
-        if not isinstance(view_ids, Iterable):
-            raise InputError(f"view_ids is {view_ids!r}, expected a view id or a list of them")
+        if (
+            not isinstance(view_ids, Iterable)
+            or isinstance(view_ids, Mapping)
+            or getattr(view_ids, "ndim", 1) == 0
+        ):
+            found = f"an object of type {type(view_ids).__name__}"
+            raise InputError(f"view_ids is {found}, expected a view id or a list of them")
         ids = list(view_ids)
-        maps = list(depth) if isinstance(depth, Iterable) and getattr(depth, "ndim", True) else [depth]
+        axes = getattr(depth, "ndim", None)
+        if isinstance(depth, Iterable) and not isinstance(depth, Mapping | str | bytes) and axes != 0:
+            maps = [depth] if len(ids) == 1 and axes == 2 else list(depth)
+        else:
+            maps = [depth] * max(len(ids), 1)  # ``depth_map`` refuses it.
         if len(maps) != len(ids):
-            raise InputError(f"{len(ids)} view ids and {len(maps)} depth maps are given, expected as many of both")
+            shape = "" if axes is None else f" of shape {tuple(getattr(depth, 'shape', ()))}"
+            found = f"{len(ids)} view ids and {len(maps)} depth maps ({type(depth).__name__}{shape}) are given"
+            raise InputError(f"{found}, expected as many of both")
         for view_id, one in zip(ids, maps, strict=True):
             self._add(view_id, one)
 
@@ -251,7 +262,8 @@ class Evaluator:
             absent = [one.source.name for one in self._views if one.source.name not in given]
             if given and absent:
                 found += f"; none is of {', '.join(absent)}: config={min(given)!r} evaluates that config alone"
-            raise InputError(found)
+            remedy = "views=... selects some, and reset() begins again; Lightning: Trainer(num_sanity_val_steps=0)"
+            raise InputError(f"{found}, expected all of them before compute(): {remedy}")
         self._archive.writers.close()
         return self._scored()
 

@@ -84,7 +84,7 @@ def load(
 
     from rebar_depth_bench.data.decoding_features import decoding_features
 
-    whole = split.partition("[")[0] if split.endswith("]") else split
+    whole = split.partition("[")[0] if isinstance(split, str) and split.endswith("]") else split
     located = open_folder(root).config(config).of_split(whole)
     part = None if split == whole else _part(located, split)
     selected = validated_columns(columns)

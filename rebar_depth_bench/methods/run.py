@@ -149,7 +149,7 @@ def dataset_views(
     having_split = [name for name, config in folder.config_by_name.items() if split in config.splits]
     chosen = [ConfigViews(folder.config(name).of_split(split)) for name in dict.fromkeys(names or having_split)]
     if not chosen:
-        raise DatasetError(f"{folder.root}: no config has the split {escape_text(split)}")
+        raise DatasetError(f"{folder.root}: no config has the split {escape_text(str(split))}")
     return chosen
 
 

@@ -205,6 +205,8 @@ def depth_map(
         found = f"{array.dtype} of shape {shape}"
         if array.dtype.kind in "OSU":
             found = "None" if depth is None else f"an object of type {type(depth).__name__}"
+            if isinstance(depth, Mapping):
+                found += f" with the keys {escape_text(', '.join(map(str, depth)))}"
         hint = resize_hint(array.shape, grid) if grid and array.dtype.kind == "f" else ""
         raise error(f"{what} {found}, expected an array of floats of shape {grid or '(H, W)'}{hint}")
     return np.asarray(array)

@@ -9,6 +9,7 @@ import pickle
 import re
 import sys
 import tempfile
+from collections import UserDict
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -215,6 +216,12 @@ evaluator.itself = evaluator
         assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.parametrize("config", [None, LATTICE])
+def test_split_of_another_type_is_refused(tiny_root: Path, config: str | None) -> None:
+    with pytest.raises(rdb.DatasetError, match=r"the split 3$|no split 3, expected test"):
+        rdb.Evaluator(tiny_root, config, split=3)  # type: ignore[arg-type]
+
+
 def test_a_method_declares_itself(tiny_root: Path) -> None:
     with pytest.raises(rdb.InputError, match=r"^kind and uses_ground_truth are given, .* sgbm .*, align=KIND"):
         rdb.evaluate("sgbm", tiny_root, kind="affine-disparity", uses_ground_truth=False)
@@ -283,6 +290,65 @@ def test_shapes_of_one_view(tiny_root: Path, shape: tuple[int, ...], words: str 
     else:
         with pytest.raises(rdb.InputError, match=f"{view_id}: .*{words}"):
             evaluator.update(view_id, np.ones(shape))
+
+
+@pytest.mark.parametrize(
+    ("depth", "words"),
+    [
+        ({"depth": 1, "mask": 2}, "an object of type dict with the keys depth, mask, expected an array of floats"),
+        (UserDict(depth=1), "an object of type UserDict with the keys depth, expected"),
+        ("ab", "an object of type str, expected"),
+        (None, "None, expected"),
+        (np.float32(1), r"float32 of shape \(\), expected"),
+    ],
+)
+@pytest.mark.parametrize("count", [1, 2])
+def test_what_is_no_batch_is_named(tiny_root: Path, depth: Any, words: str, count: int) -> None:
+    evaluator = rdb.Evaluator(tiny_root, LATTICE)
+    ids = evaluator.view_ids[:count]
+    with pytest.raises(rdb.InputError, match=f"^{ids[0]}: depth is {words}"):
+        evaluator.update(ids, depth)
+
+
+@pytest.mark.parametrize("view_ids", [None, 3, {"view_id": ["lattice/0028"]}, np.array("lattice/0028")])
+def test_what_are_no_view_ids_is_named(tiny_root: Path, view_ids: Any) -> None:
+    found = f"view_ids is an object of type {type(view_ids).__name__}, expected a view id or a list"
+    with pytest.raises(rdb.InputError, match=found):
+        rdb.Evaluator(tiny_root, LATTICE).update(view_ids, np.ones((1, 90, 160)))
+
+
+def test_numbers_of_ids_and_maps_differ(tiny_root: Path, lattice: Truth) -> None:
+    [first, second, *_], height_width = lattice, next(iter(lattice.values())).shape
+    evaluator = rdb.Evaluator(tiny_root, LATTICE)
+    with pytest.raises(
+        rdb.InputError, match=rf"2 view ids and {height_width[0]} depth maps \(ndarray of shape \("
+    ):
+        evaluator.update([first, second], lattice[first])
+    with pytest.raises(rdb.InputError, match=r"1 view ids and 2 depth maps \(tuple\)"):
+        evaluator.update([first], (lattice[first], lattice[first]))
+
+
+def test_squeezed_batch_of_one_is_taken(tiny_root: Path, lattice: Truth) -> None:
+    first = next(iter(lattice))
+    evaluator = rdb.Evaluator(tiny_root, LATTICE, views=[first])
+    evaluator.update([first], lattice[first].squeeze())
+    assert evaluator.compute().metrics["lattice/rank_error"] == 0
+
+
+def test_remedies_for_a_part_of_the_views_are_named_and_work(tiny_root: Path, lattice: Truth) -> None:
+    first, *others = lattice
+    evaluator = rdb.Evaluator(tiny_root, LATTICE)
+    evaluator.update(first, lattice[first])
+    with pytest.raises(rdb.InputError, match=f"{len(others)} of {len(lattice)} views are missing") as caught:
+        evaluator.compute()
+    for remedy in ("views=", "reset()", "num_sanity_val_steps=0"):
+        assert remedy in str(caught.value)
+    evaluator.reset()
+    evaluator.update(list(lattice), list(lattice.values()))
+    selected = rdb.Evaluator(tiny_root, LATTICE, views=[first])
+    selected.update(first, lattice[first])
+    for complete, views in ((evaluator, len(lattice)), (selected, 1)):
+        assert complete.compute().tables[LATTICE].views == views
 
 
 def test_wrong_views_are_named(tiny_root: Path, lattice: Truth) -> None:
@@ -387,7 +453,10 @@ def test_models_of_other_types_are_refused(tiny_root: Path, model: Any) -> None:
     [
         (None, r"the model returned None, expected an array of floats of shape \(90, 160\)"),
         ("depth", "the model returned an object of type str, expected an array"),
-        ({"depth": np.ones((90, 160))}, "the model returned an object of type dict, expected an array"),
+        (
+            {"depth": np.ones((90, 160)), "valid": 1},
+            "the model returned an object of type dict with the keys depth, valid, expected an array",
+        ),
         (np.ones((90, 160), int), r"int64 of shape \(90, 160\), expected an array of floats"),
         (np.ma.MaskedArray(np.ones((90, 160)), mask=True), "masked array"),  # type: ignore[no-untyped-call]
         ([[1.0] * 160] * 90, None),

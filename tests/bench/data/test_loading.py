@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import datasets
 import numpy as np
@@ -108,6 +109,19 @@ def test_rows_decode_to_contract_dtypes_and_shapes(tiny_root: Path) -> None:
         assert 0.03 < row[f"{eye}_mask"].mean() < 0.3
     assert row["baseline_m"] == 0.12
     assert np.array_equal(row["right_cam_from_world"], right_camera_pose(row["left_cam_from_world"], 0.12))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"split": None}, "lattice has no split None, expected test"),
+        ({"split": 3}, "lattice has no split 3, expected test"),
+        ({"columns": 3}, "columns is 3, expected a list of column names"),
+    ],
+)
+def test_arguments_of_other_types_are_refused(tiny_root: Path, arguments: dict[str, Any], words: str) -> None:
+    with pytest.raises(rdb.DatasetError, match=words):
+        rdb.load(tiny_root, "lattice", **arguments)
 
 
 def test_load_errors_name_expected_values(tiny_root: Path, tmp_path: Path) -> None:
