@@ -25,8 +25,7 @@ from rebar_depth_bench.base.errors import MethodError, Problem, exception_summar
 from rebar_depth_bench.base.limits import JSON_BYTES
 from rebar_depth_bench.base.reading import parse_json, read_file
 from rebar_depth_bench.base.validation import short_repr
-from rebar_depth_bench.data.files import files_digest
-from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor, WeightsMethod
+from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor, WeightsMethod, files_digest
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -62,10 +61,7 @@ class Network:
         Different weights are thus a different method, and an interrupted prediction is not resumed with them.
         Raises ``MethodError`` if a file cannot be read.
         """
-        try:
-            info = self.described(f"weights sha256:{files_digest(files)}")
-        except OSError as error:
-            raise MethodError(f"{error.filename}: cannot be read: {error.strerror}") from None
+        info = self.described(f"weights sha256:{files_digest(files)}")
         return replace(info, name=f"{info.name}:{label}")
 
     def check_folder(self, folder: Path, *required_files: str) -> None:
