@@ -35,7 +35,7 @@ from rebar_depth_bench.geometry.cameras import (
     swap_camera_axes,
 )
 from rebar_depth_bench.submission.entries import FORMATS
-from rebar_depth_bench.submission.maps import decode_exr, decode_npy, decode_npz, decode_png
+from rebar_depth_bench.submission.maps import check_exr_windows, decode_exr, decode_npy, decode_npz, decode_png
 
 Grid = tuple[int, int]
 """Height and width of an image, pixels."""
@@ -278,11 +278,15 @@ def _raw_tiff(path: Path, content: bytes) -> Shaped[ndarray, "h w"]:
 
 
 def _exr_channel(path: Path, channel: str) -> Shaped[ndarray, "h w"]:
-    """Return one channel of an EXR file with several. Raises ``EntryError`` if it has no such channel."""
+    """Return one channel of an EXR file with several.
+
+    Raises ``EntryError`` if it has no such channel, and as ``check_exr_windows``.
+    """
     import OpenEXR
 
     with _damage(path, "EXR"), OpenEXR.File(str(path), separate_channels=True) as file:
-        channels = file.channels()
+        channels, header = file.channels(), file.header()
+        check_exr_windows(path.name, *(np.ravel(header[key]).tolist() for key in ("dataWindow", "displayWindow")))
         if channel in channels:
             return np.asarray(channels[channel].pixels)
     found = f"has the channels {', '.join(map(escape_text, list(channels)[:10]))}"
