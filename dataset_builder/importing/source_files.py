@@ -21,6 +21,7 @@ from rebar_depth_bench.base.errors import (
     Problem,
     escape_text,
     format_shape,
+    library_message,
 )
 from rebar_depth_bench.base.limits import CELL_BYTES, TOML_BYTES
 from rebar_depth_bench.base.reading import decode_text, parse_json, read_file
@@ -64,7 +65,7 @@ def _damage(path: Path, expected: str) -> Iterator[None]:
     except EntryError:
         raise
     except Exception as error:
-        reason = escape_text(str(error) or type(error).__name__)
+        reason = library_message(error)
         raise EntryError(Problem("damaged", path.name, f"cannot be read: {reason}", expected)) from None
 
 

@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from rebar_depth_bench.base.errors import EntryError, Problem, escape_text, format_shape
+from rebar_depth_bench.base.errors import EntryError, Problem, escape_text, format_shape, library_message
 from rebar_depth_bench.base.reading import MemorySource
 from rebar_depth_bench.submission.zip import read_data, read_entries
 
@@ -173,7 +173,7 @@ def decode_exr(name: str, data: memoryview, shape: tuple[int, int], _: float = 1
         (channel,) = image.channels().values()
         pixels: Depth = channel.pixels
     except Exception as error:  # OpenEXR raises several unrelated exception types for damaged files.
-        found = f"the OpenEXR data is corrupt or truncated ({escape_text(str(error))})"
+        found = f"the OpenEXR data is corrupt or truncated ({library_message(error)})"
         raise EntryError(Problem("damaged", name, found)) from error
     if pixels.shape != shape or pixels.dtype not in (np.float16, np.float32):
         found = f"the image decodes to {pixels.dtype} {pixels.shape}"
@@ -315,7 +315,7 @@ def decode_png(name: str, data: memoryview, shape: tuple[int, int], depth_scale:
         with Image.open(io.BytesIO(_minimal_png(header, rows)), formats=["PNG"]) as image:
             units = np.asarray(image)
     except Exception as error:  # Pillow raises several unrelated exception types for damaged files.
-        found = f"the PNG data is corrupt ({escape_text(str(error))})"
+        found = f"the PNG data is corrupt ({library_message(error)})"
         raise EntryError(Problem("damaged", name, found)) from error
     if units.shape != shape or units.dtype.kind not in "ui":
         found = f"the PNG decodes to {units.dtype} of shape {units.shape}"
