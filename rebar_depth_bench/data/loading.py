@@ -78,9 +78,9 @@ def load(
 
     Raises ``DatasetError`` for a folder, config, split or column that does not exist, for a damaged shard, and for
     a cell that contradicts the manifest; the rows raise it for a damaged image. A streamed dataset raises it while
-    it is read.
+    it is read. Raises ``InputError`` if the installed ``datasets`` or a codec of Pillow does not suffice.
     """
-    from datasets import IterableDataset, NamedSplit
+    from datasets import IterableDataset, NamedSplit, __version__
 
     from rebar_depth_bench.data.decoding_features import decoding_features
 
@@ -97,6 +97,10 @@ def load(
             split=NamedSplit(whole),
         )
         return streamed if part is None else streamed.skip(part.start).take(len(part))
+    if tuple(map(int, __version__.split(".")[:2])) < (5, 1):  # Matrices would be arrays of Python objects.
+        raise InputError(
+            f"datasets {__version__} is installed, expected 5.1 or later: pip install 'datasets>=5.1'"
+        )
     loaded = _cached(located, whole, decoding_features(located, COLUMNS)).select_columns(list(selected))
     loaded.info.features = decoding_features(located, selected)
     formatted = loaded.with_format("numpy")

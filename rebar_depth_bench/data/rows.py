@@ -165,9 +165,11 @@ def open_cell(root: str, grid: tuple[int, int], column: str, cell: Mapping[str, 
 
 @contextmanager
 def _naming(root: str, view: str, column: str) -> Iterator[None]:
+    """Convert the errors of a damaged cell to ``DatasetError``. Raises ``InputError`` as ``check_codecs``."""
     try:
         yield
     except Exception as error:  # Pillow raises many types, which depend on the damage.
+        codecs.check_codecs()
         reason = library_message(error)
         raise DatasetError(
             f"{root}: view {escape_text(view)}: {column} is damaged: {reason}; "
