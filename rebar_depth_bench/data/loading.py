@@ -78,9 +78,10 @@ def load(
 
     Raises ``DatasetError`` for a folder, config, split or column that does not exist, for a damaged shard, and for
     a cell that contradicts the manifest; the rows raise it for a damaged image. A streamed dataset raises it while
-    it is read. Raises ``OutputError`` if the cache cannot be written.
+    it is read. Raises ``OutputError`` if the cache cannot be written, and ``InputError`` if the installed
+    ``datasets`` or a codec of Pillow does not suffice.
     """
-    from datasets import IterableDataset, NamedSplit
+    from datasets import IterableDataset, NamedSplit, __version__
 
     from rebar_depth_bench.data.decoding_features import decoding_features
 
@@ -100,6 +101,10 @@ def load(
         except OSError as error:  # ``datasets`` makes its folder and a lock file.
             raise _cache_error(located, error) from error
         return streamed if part is None else streamed.skip(part.start).take(len(part))
+    if tuple(map(int, __version__.split(".")[:2])) < (5, 1):  # Matrices would be arrays of Python objects.
+        raise InputError(
+            f"datasets {__version__} is installed, expected 5.1 or later: pip install 'datasets>=5.1'"
+        )
     loaded = _cached(located, whole, decoding_features(located, COLUMNS)).select_columns(list(selected))
     loaded.info.features = decoding_features(located, selected)
     formatted = loaded.with_format("numpy")
