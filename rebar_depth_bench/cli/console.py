@@ -89,7 +89,8 @@ def program_parser(
 def run_program(parser: argparse.ArgumentParser, words: Sequence[str] | None = None) -> int:
     """Parse the words of a command line, check the outputs, call ``run(options)`` and return the exit code.
 
-    ``run`` is a default of the parser, as is ``interrupted``, the message printed on Ctrl-C, if it has one.
+    ``run`` is a default of the parser or of a command, as is ``interrupted``, the message printed on Ctrl-C, if it
+    has one.
     """
 
     def run() -> None:
@@ -99,17 +100,20 @@ def run_program(parser: argparse.ArgumentParser, words: Sequence[str] | None = N
         except FileNotFoundError:
             raise InputError("the current folder was removed: change to one that exists") from None
         check_outputs(vars(options))
-        options.run(options)
+        try:
+            options.run(options)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(getattr(options, "interrupted", "interrupted")) from None
 
-    return run_command(run, parser.get_default("interrupted") or "interrupted")
+    return run_command(run)
 
 
 def run_command(command: Callable[[], None], interrupted: str = "interrupted") -> int:
     """Run a command and return its exit code.
 
     A ``RebarDepthError``, and an error of a machine that cannot write, is printed to standard error without a
-    traceback. If nobody reads standard output any more, the command ends without a message. ``interrupted`` is the
-    message printed on Ctrl-C.
+    traceback. If nobody reads standard output any more, the command ends without a message. On Ctrl-C, the text of
+    the ``KeyboardInterrupt`` is printed, or ``interrupted`` if it has none.
     """
     prepare_terminal()
     try:
@@ -129,8 +133,8 @@ def run_command(command: Callable[[], None], interrupted: str = "interrupted") -
         print_notice(f"error: {error.filename or 'standard output'}: {os.strerror(error.errno)}")
         discard_stream(sys.stdout)
         return EXIT_OTHER
-    except KeyboardInterrupt:
-        print_notice(interrupted)
+    except KeyboardInterrupt as error:
+        print_notice(str(error) or interrupted)
         return EXIT_OTHER
     return EXIT_DONE
 
