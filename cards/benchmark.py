@@ -18,6 +18,7 @@ from cards.reference import (
     FULL_SETS,
     GROUPS_METHOD,
     SUBSET,
+    coverage_text,
     group_tables,
     number,
     percent,
@@ -43,7 +44,7 @@ from rebar_depth_bench.scoring.protocol import (
     RELATIVE_PROTOCOL,
     WITHIN_MM,
 )
-from rebar_depth_bench.scoring.relative import LEAST_GAIN
+from rebar_depth_bench.scoring.relative import LEAST_MARGIN
 
 _ROOT = Path(__file__).parents[1]
 _CONTACTS = {"lattice": "375", "pier": "4,860", "pile": "15"}
@@ -94,7 +95,7 @@ def benchmark_card() -> str:
         "benchmark_card.md.j2",
         protocol=PROTOCOL,
         relative_protocol=RELATIVE_PROTOCOL,
-        least_gain=LEAST_GAIN,
+        most_of_constant=1 - LEAST_MARGIN,
         delta1_ratio=DELTA1_RATIO,
         min_comparable_coverage=MIN_COMPARABLE_COVERAGE,
         significant_digits=SIGNIFICANT_DIGITS,
@@ -112,6 +113,7 @@ def benchmark_card() -> str:
         == (subset["renders"]["views"], cages["renders"]["views"]),
         number=number,
         percent=percent,
+        coverage_text=coverage_text,
         **steel_context(),
     )
     return wrapped(text)

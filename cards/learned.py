@@ -9,7 +9,7 @@ import json
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from cards.reference import number, percent, reference_context, results_file
+from cards.reference import coverage_text, number, percent, reference_context, results_file
 
 LEARNED = "learned"
 """Set of results of learned networks."""
@@ -40,7 +40,7 @@ def _baseline_table(
             "mark": _mark(row),
             "views": str(networks["views"]),
             "rank_error": number(row["rank_error"], 4),
-            "coverage": percent(row["coverage"]),
+            "coverage": coverage_text(row["coverage"]),
             "native": number(row["native"], 4),
             "scaled": number(row["scaled"], 4),
             "scale": number(row["scale"], 3),
@@ -99,7 +99,7 @@ def _metric_table(name: str, config: Mapping[str, Any]) -> str:
             _title(method, row),
             number(row["rank_error"], 4),
             number(row["reached_rank_error"], 4),
-            percent(row["coverage"]),
+            coverage_text(row["coverage"]),
             number(row["native"], 4),
             number(row["scaled"], 4),
             number(row["scaled_constant"], 4),

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rebar_depth_bench.methods import own_methods
+from rebar_depth_bench.scoring.columns import coverage_percent
 
 SUBSET = "subset"
 """Set of results of all methods on a subset of the views of three scenes."""
@@ -109,7 +110,7 @@ def _table_cells(table: Mapping[str, Any]) -> dict[str, str]:
     interval = "" if bounds is None else f" ({number(bounds[0], 3)}-{number(bounds[1], 3)})"
     return {
         "rank_error": number(table["rank_error"], 4),
-        "coverage": percent(table["coverage"]),
+        "coverage": coverage_text(table["coverage"]),
         "native": number(native.get("abs_rel"), 4),
         "abs_rel": number(native.get("abs_rel"), 4) + interval,
         "rmse": number(native.get("rmse_cm"), 2),
@@ -134,3 +135,8 @@ def number(value: float | None, digits: int, unit: str = "") -> str:
 def percent(share: float | None) -> str:
     """Return a share in per cent with one decimal; "-" for None."""
     return "-" if share is None else f"{100 * share:.1f} %"
+
+
+def coverage_text(share: float | None) -> str:
+    """Return a coverage in per cent, rounded down as in results; "-" for None."""
+    return "-" if share is None else f"{coverage_percent(share)} %"

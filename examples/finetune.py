@@ -53,8 +53,8 @@ from rebar_depth_bench.base.writing import atomic_replace, write_text
 from rebar_depth_bench.cli.console import run_command
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import ConfigViews
-from rebar_depth_bench.reporting.formatting import scaled_constants
 from rebar_depth_bench.scoring.columns import COVERAGE, NATIVE, RANK_ERROR, SCALED, number, texts
+from rebar_depth_bench.scoring.formatting import scaled_constants
 
 CONFIG = "cages"
 TARGETS = ((CONFIG, "validation"), ("lattice", "test"), ("pile", "test"))

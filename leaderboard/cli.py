@@ -37,7 +37,7 @@ from rebar_depth_bench.base.errors import InputError, StorageError, problem_summ
 from rebar_depth_bench.cli.console import Command, program_parser, run_program
 from rebar_depth_bench.data.files import file_problems
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.reporting.formatting import counted
+from rebar_depth_bench.scoring.formatting import counted
 from rebar_depth_bench.scoring.frames import csv_text
 
 _LOG = structlog.get_logger("worker")
@@ -202,8 +202,13 @@ def _submissions(settings: Settings, _: argparse.Namespace) -> None:
 
 def _requeue(settings: Settings, options: argparse.Namespace) -> None:
     with _opened(settings) as database:
-        ArchiveStore(settings.archive_dir, database.board().board_id).check()
+        archives = ArchiveStore(settings.archive_dir, database.board().board_id)
+        archives.check()
+        known = archive_rows(database)
+        if missing := [name for name in options.ids if known.get(name) and not archives.file(name).is_file()]:
+            raise StorageError(f"{archives.file(missing[0])}: is missing, expected the archive; restore it first")
         jobs.requeue(database, options.ids)
+    print(f"{counted(len(set(options.ids)), 'submission')} queued")
 
 
 def _remove(settings: Settings, options: argparse.Namespace) -> None:
@@ -221,6 +226,7 @@ def _remove(settings: Settings, options: argparse.Namespace) -> None:
         else:
             submissions.change(database, record.id, {"archive_deleted_at": time.time()})
     archives.delete(record.id)
+    print(f"{record.id}: {'its archive is deleted' if options.archive_only else 'is deleted'}")
 
 
 def _back_up(settings: Settings, options: argparse.Namespace) -> None:

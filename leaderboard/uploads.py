@@ -40,7 +40,7 @@ from leaderboard.scoring.sandbox import check
 from leaderboard.service import Service
 from leaderboard.storage.archive_store import upload_file
 from rebar_depth_bench.base.errors import RebarDepthError, SubmissionError
-from rebar_depth_bench.reporting.formatting import counted
+from rebar_depth_bench.scoring.formatting import counted
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.submission import SubmissionMeta
 from rebar_depth_bench.submission.declaration import MethodDetails

@@ -19,8 +19,7 @@ if TYPE_CHECKING:
     from rebar_depth_bench.data.bars import bars
     from rebar_depth_bench.data.loading import load
     from rebar_depth_bench.data.torch import torch_loader
-    from rebar_depth_bench.evaluator import Evaluator, evaluate
-    from rebar_depth_bench.scoring.evaluation import score
+    from rebar_depth_bench.evaluator import Evaluator, evaluate, score
     from rebar_depth_bench.scoring.result import Result
     from rebar_depth_bench.scoring.table import Table, ViewScore
     from rebar_depth_bench.submission import SubmissionWriter
@@ -51,7 +50,7 @@ _MODULE_BY_NAME = {
     "crossings": "bar_crossings.table",
     "evaluate": "evaluator",
     "load": "data.loading",
-    "score": "scoring.evaluation",
+    "score": "evaluator",
     "torch_loader": "data.torch",
     "Evaluator": "evaluator",
     "SubmissionWriter": "submission",

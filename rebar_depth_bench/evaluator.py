@@ -1,15 +1,17 @@
-"""Evaluation of a model in Python: its predictions are collected in a temporary archive, which is scored.
+"""Scoring in Python, of an archive or of a model, whose predictions are collected in a temporary archive.
 
 For complete configs the result is that of ``rebar-bench score`` on the same archive, to the byte.
 """
 
 from __future__ import annotations
 
+import os
 import shutil
 import tempfile
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,8 +20,9 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
-from rebar_depth_bench.base.errors import InputError, escape_text
-from rebar_depth_bench.base.names import TEST_SPLIT
+from rebar_depth_bench.base.errors import InputError, RebarDepthError, escape_text
+from rebar_depth_bench.base.names import TEST_SPLIT, config_of
+from rebar_depth_bench.base.parallel import Progress, silent
 from rebar_depth_bench.base.writing import output_file
 from rebar_depth_bench.data.loading import load
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
@@ -28,8 +31,7 @@ from rebar_depth_bench.data.schema import COLUMNS
 from rebar_depth_bench.diagnosis.diagnose import diagnose
 from rebar_depth_bench.geometry.cameras import right_from_left
 from rebar_depth_bench.methods.registry import find_method
-from rebar_depth_bench.methods.run import dataset_views, predict_views
-from rebar_depth_bench.reporting.formatting import reference_findings, table_notes
+from rebar_depth_bench.methods.run import dataset_views, predict_views, wrap_errors
 from rebar_depth_bench.reporting.html.page import write_report
 from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation, score_evaluation
 from rebar_depth_bench.scoring.result import Result
@@ -41,14 +43,14 @@ from rebar_depth_bench.submission.writer import depth_map
 if TYPE_CHECKING:
     from datasets import Dataset
 
-    from rebar_depth_bench.extended.result import ExtendedResult
-
 Depth = Float[ndarray, "h w"]
 Model = str | Callable[[Mapping[str, Any]], object] | Mapping[str, object] | Iterable[tuple[str, object]]
 
 _ROW_COLUMNS = tuple(name for name in COLUMNS if name != "scene" and name not in TRUTH_COLUMNS)
 _UNDECLARED = {"method": "unnamed", "kind": METRIC, "inputs": None, "uses_ground_truth": None}
 """Defaults of what predictions declare."""
+_WRAPPED_MODULE = 'lambda row: net(torch.tensor(row["left_rgb"]).permute(2, 0, 1)[None] / 255)'
+"""Function of a row for a network that takes B x 3 x H x W."""
 
 
 def evaluate(
@@ -73,7 +75,8 @@ def evaluate(
     takes points of the left camera's frame to the right one's; with ``inputs="multi-view"``, which then needs
     ``uses_ground_truth=True``, also the poses in the world. What the config lacks is None.
 
-    The other arguments are those of ``Evaluator``. Raises as it does, and what a function raises.
+    The other arguments are those of ``Evaluator``, and so are the errors. An exception of a function is the cause
+    of a ``MethodError``, which names the view and the line.
     """
     declared = dict[str, Any](method=method, kind=kind, inputs=inputs, uses_ground_truth=uses_ground_truth)
     evaluator = Evaluator(root, config, split=split, views=views, extended=extended, **declared)
@@ -89,13 +92,43 @@ def evaluate(
             found = f"inputs is multi-view and uses_ground_truth is {uses_ground_truth}"
             raise InputError(f"{found}, expected True, because the rows then have the true poses")
         rows = evaluator._rows(with_poses=inputs == "multi-view")
-        pairs: Iterable[tuple[str, object]] = ((row["view_id"], model(row)) for row in rows)
+        what = "the model"
+        if hasattr(model, "forward"):
+            what += f", a {type(model).__name__} that is given a row; wrap it in a function, as {_WRAPPED_MODULE}"
+        for row in rows:
+            with wrap_errors(f"{row['view_id']}: {what}"):
+                predicted = model(row)
+            evaluator._add(row["view_id"], predicted, "the model returned")
     else:
-        pairs = _pairs(model)
-    for view_id, depth in pairs:
-        if view_id not in evaluator._left_out:
-            evaluator._add(view_id, depth, "the model returned" if callable(model) else "depth is")
+        for view_id, depth in _pairs(model):
+            if view_id not in evaluator._left_out:
+                evaluator._add(view_id, depth)
     return evaluator.compute()
+
+
+def score(
+    archive: str | os.PathLike[str],
+    root: str | Path,
+    *,
+    workers: int | None = None,
+    expect_digest: str | None = None,
+    align: str | None = None,
+    progress: Progress = silent,
+) -> EvaluatedResult:
+    """Score an archive against a dataset folder or Hub repository.
+
+    An archive is scored by the kind of its predictions; ``align`` scores a metric one as one of another kind.
+
+    Views are read directly from the archive and scored on ``workers`` threads (default: one per core); only a few
+    views are in memory at a time. The result does not depend on the number of workers.
+
+    Raises ``SubmissionError`` with all problems if any part of the archive is invalid, and ``DatasetError`` if the
+    dataset folder is invalid or its digest is not ``expect_digest``.
+    """
+    with open_evaluation(archive, root, expect_digest=expect_digest) as evaluation:
+        result = score_evaluation(evaluation, workers=workers, align=align, progress=progress)
+        path = evaluation.submission.path.absolute()
+        return EvaluatedResult(**vars(result), _archive=path, _folder=evaluation.folder)
 
 
 class Evaluator:
@@ -172,9 +205,9 @@ class Evaluator:
     def update(self, view_ids: str | Sequence[str], depth: object) -> None:
         """Add the planar depth of left views in metres, or of another kind: of one view or of a batch.
 
-        ``depth`` is an array or tensor of any float type and device: H x W for one id, also after axes of length
-        1; for a list of B ids B x H x W, B x 1 x H x W, or a list. Values that are not finite, and of ``metric``
-        and ``scale`` those <= 0, mean no prediction.
+        ``depth`` is an array or tensor of any float type and device: H x W for one id, alone or in a list, also
+        after axes of length 1; for a list of B ids B x H x W, B x 1 x H x W, or a list. Values that are
+        not finite, and of ``metric`` and ``scale`` those <= 0, mean no prediction.
 
         Raises ``InputError``, which names the view, for one that is not to be predicted or was added before, and
         for depth of another size.
@@ -182,19 +215,31 @@ class Evaluator:
         if isinstance(view_ids, str):
             self._add(view_ids, depth)
             return
-        if not isinstance(view_ids, Iterable):
-            raise InputError(f"view_ids is {view_ids!r}, expected a view id or a list of them")
+        if (
+            not isinstance(view_ids, Iterable)
+            or isinstance(view_ids, Mapping)
+            or getattr(view_ids, "ndim", 1) == 0
+        ):
+            found = f"an object of type {type(view_ids).__name__}"
+            raise InputError(f"view_ids is {found}, expected a view id or a list of them")
         ids = list(view_ids)
-        maps = list(depth) if isinstance(depth, Iterable) and getattr(depth, "ndim", True) else [depth]
+        axes = getattr(depth, "ndim", None)
+        if isinstance(depth, Iterable) and not isinstance(depth, Mapping | str | bytes) and axes != 0:
+            maps = [depth] if len(ids) == 1 and axes == 2 else list(depth)
+        else:
+            maps = [depth] * max(len(ids), 1)  # ``depth_map`` refuses it.
         if len(maps) != len(ids):
-            raise InputError(f"{len(ids)} view ids and {len(maps)} depth maps are given, expected as many of both")
+            shape = "" if axes is None else f" of shape {tuple(getattr(depth, 'shape', ()))}"
+            found = f"{len(ids)} view ids and {len(maps)} depth maps ({type(depth).__name__}{shape}) are given"
+            raise InputError(f"{found}, expected as many of both")
         for view_id, one in zip(ids, maps, strict=True):
             self._add(view_id, one)
 
     def _add(self, view_id: str, depth: object, what: str = "depth is") -> None:
         if not isinstance(view_id, str) or view_id not in self._grids:
             found = f"{escape_text(str(view_id))}: is not among the {len(self._grids)} views to predict"
-            raise InputError(f"{found}, expected one as {next(iter(self._grids))}")
+            others = "config=, split= and views= select others"
+            raise InputError(f"{found}, expected one as {next(iter(self._grids))}; {others}")
         if view_id in self._added:
             raise InputError(
                 f"{view_id}: was added before, expected each view once; a distributed sampler repeats views to "
@@ -212,16 +257,33 @@ class Evaluator:
         Raises ``InputError`` if a view is missing, and as ``score`` does, after which all are missing.
         """
         if missing := [view_id for view_id in self._grids if view_id not in self._added]:
-            raise InputError(f"{len(missing)} of {len(self._grids)} views are missing, such as {missing[0]}")
+            found = f"{len(missing)} of {len(self._grids)} views are missing, such as {missing[0]}"
+            given = {config_of(view_id) for view_id in self._added}
+            absent = [one.source.name for one in self._views if one.source.name not in given]
+            if given and absent:
+                found += f"; none is of {', '.join(absent)}: config={min(given)!r} evaluates that config alone"
+            remedy = "views=... selects some, and reset() begins again; Lightning: Trainer(num_sanity_val_steps=0)"
+            raise InputError(f"{found}, expected all of them before compute(): {remedy}")
         self._archive.writers.close()
         return self._scored()
 
     def _scored(self) -> EvaluatedResult:
         partial = [one.source for one in self._views if one.source.whole is not one.source]
-        of_views = {config.name: len(scored_counts(config.whole)) for config in partial}
         archive = self._archive
         self.reset()
-        return EvaluatedResult.of_archive(archive, self._folder, of_views, is_extended=self._extended)
+        with open_evaluation(archive.path, self._folder) as evaluation:
+            if self._extended:
+                from rebar_depth_bench.extended.registry import score_extended  # Other evaluations do not need it.
+
+                result = score_extended(evaluation)
+            else:
+                result = score_evaluation(evaluation)
+            some = {
+                config.name: result.tables[config.name].of_some_views(len(scored_counts(config.whole)))
+                for config in partial
+            }
+            result = replace(result, tables={**result.tables, **some})
+            return EvaluatedResult(**vars(result), _archive=archive.path, _folder=self._folder, _owner=archive)
 
     def _predicted_by(self, name: str) -> EvaluatedResult:
         """Return the result of a method."""
@@ -239,79 +301,59 @@ class Evaluator:
                 yield {name: value for name, value in row.items() if with_poses or name not in POSE_COLUMNS}
 
 
+@dataclass(frozen=True, repr=False, kw_only=True)
 class EvaluatedResult(Result):
-    """Result of an evaluation, with its archive, which is deleted with it.
+    """Result of ``score`` or ``evaluate``, whose archive is read again for the notes and the report.
 
-    ``extended``, ``notes`` and the possible mistakes that ``print`` shows are computed when they are read.
+    The archive of ``evaluate`` is temporary and deleted with the result.
     """
 
-    _archive: _TemporaryArchive
-    _folder: DatasetFolder
-    _is_extended: bool
-
-    @classmethod
-    def of_archive(
-        cls, archive: _TemporaryArchive, folder: DatasetFolder, of_views: Mapping[str, int], *, is_extended: bool
-    ) -> EvaluatedResult:
-        """Score an archive; ``of_views`` are the numbers of views of the configs of which only some are scored."""
-        with open_evaluation(archive.path, folder) as evaluation:
-            scored = score_evaluation(evaluation)
-        tables = {
-            name: table.of_some_views(of_views[name]) if name in of_views else table
-            for name, table in scored.tables.items()
-        }
-        result = cls(**{**vars(scored), "tables": tables})
-        result.__dict__.update(_archive=archive, _folder=folder, _is_extended=is_extended)
-        return result
-
-    @cached_property
-    def _extended(self) -> ExtendedResult | None:
-        if not self._is_extended:
-            return None
-        from rebar_depth_bench.extended.registry import score_extended  # Other evaluations do not need it.
-
-        with self._evaluation() as evaluation:
-            return score_extended(evaluation).extended
-
-    extended = property(lambda self: self._extended, lambda *_: None)
-    """Extended measures; None unless they were asked for."""
+    _archive: Path = field(compare=False)
+    _folder: DatasetFolder = field(compare=False)
+    _owner: _TemporaryArchive | None = field(default=None, compare=False)
 
     @cached_property
     def notes(self) -> tuple[str, ...]:
-        """Sentences on what limits the numbers, and on possible mistakes in the predictions."""
-        of_tables = [
-            f"{name}: {note}"
-            for name, table in self.tables.items()
-            for note in (*table_notes(table), *reference_findings(table))
-        ]
-        return (*self.kind_notes, *of_tables, *self._mistakes)
+        """Sentences on what limits the numbers, and on possible mistakes in the predictions.
 
-    @cached_property
-    def _mistakes(self) -> list[str]:
-        with self._evaluation() as evaluation:
-            return [f"possible mistake: {mistake.text}" for mistake in diagnose(evaluation)]
-
-    def __str__(self) -> str:
-        """Return the main numbers of each config, with what limits them and possible mistakes."""
-        return "\n".join([super().__str__(), *self._mistakes])
+        Mistakes are looked for when this is read first; if the archive has gone or changed, a sentence says so.
+        """
+        try:
+            with self._evaluation() as evaluation:
+                mistakes = [f"possible mistake: {mistake.text}" for mistake in diagnose(evaluation)]
+        except RebarDepthError as error:
+            mistakes = [f"possible mistakes were not looked for: {' '.join(str(error).split())}"]
+        return (*super().notes, *mistakes)
 
     def to_html(self, path: str | Path) -> None:
-        """Write the self-contained report of ``rebar-bench score --html``."""
+        """Write the self-contained report of ``rebar-bench score --html``.
+
+        Raises ``InputError`` if the archive has gone or changed.
+        """
         with self._evaluation() as evaluation:
             write_report(self, evaluation, Path(path))
 
     def save_archive(self, path: str | Path) -> None:
-        """Copy the archive of the predictions. Raises ``InputError`` if only some views were evaluated."""
+        """Copy the archive of the predictions.
+
+        Raises ``InputError`` if only some views were evaluated, and if the archive has gone or changed.
+        """
         for name, table in self.tables.items():
             if table.of_views is not None:
                 found = f"{name}: {table.views} of {table.of_views} views were evaluated"
                 raise InputError(f"{found}, expected all views of a config in an archive")
-        with output_file(Path(path)) as target:
-            shutil.copyfile(self._archive.path, target)
+        with self._evaluation() as evaluation, output_file(Path(path)) as target:
+            shutil.copyfile(evaluation.submission.path, target)
 
     @contextmanager
     def _evaluation(self) -> Iterator[Evaluation]:
-        with open_evaluation(self._archive.path, self._folder) as evaluation:
+        with open_evaluation(self._archive, self._folder) as evaluation:
+            found, expected = evaluation.submission.sha256(), self.submission.sha256
+            if found != expected:
+                found = (
+                    f"has the SHA-256 {found[:12]}..., expected {expected[:12]}... of the archive that was scored"
+                )
+                raise InputError(f"{self._archive}: {found}; score it again")
             yield evaluation
 
 

@@ -1,6 +1,7 @@
 #!/usr/bin/env bash
 # Makes or reuses a virtual environment with one of the project's extras.
-# The extra "test" works on any supported version of Python.
+# The extra "test" works on any supported version of Python: with 3.11 it installs the lowest versions of the base
+# package's dependencies that pyproject.toml allows, with others the newest.
 # usage: scripts/environment.sh PYTHON VENV EXTRA
 set -euo pipefail
 cd "$(dirname "$0")/.."
@@ -21,11 +22,19 @@ version=$("$python" -c 'import sys; print("%d.%d" % sys.version_info[:2])')
 # The file holds a digest of the requirements that were installed; other requirements install anew.
 installed="$venv/.installed-$extra"
 wanted=$(cat pyproject.toml constraints.txt | "$python" -c 'import hashlib, sys; print(hashlib.sha256(sys.stdin.buffer.read()).hexdigest())')
+[ "$extra" != test ] || rm -f "$installed"  # The newest versions change with time.
 if [ ! -x "$venv/bin/python" ] || [ "$(cat "$installed" 2>/dev/null)" != "$wanted" ]; then
     echo "installing the environment into $venv (a few minutes the first time)" >&2
     "$venv/bin/python" -m pip --version >/dev/null 2>&1 || "$python" -m venv --clear "$venv"
+    versions=(--constraint constraints.txt)
+    if [ "$extra" = test ] && [ "$version" = 3.11 ]; then
+        "$python" scripts/lowest_versions.py >"$venv/lowest.txt"
+        versions=(--constraint "$venv/lowest.txt")
+    elif [ "$extra" = test ]; then
+        versions=(--upgrade --upgrade-strategy eager)
+    fi
     "$venv/bin/python" -m pip install --quiet --disable-pip-version-check \
-        --constraint constraints.txt --editable ".[$extra]"
+        "${versions[@]}" --editable ".[$extra]"
     echo "$wanted" >"$installed"
 fi
 

@@ -1,5 +1,6 @@
 #!/usr/bin/env bash
-# Runs the quick tests of the core with the base dependencies only, on every version of Python that is found.
+# Runs the quick tests of the core with the base dependencies only, on every version of Python that is found: with 3.11
+# in the lowest versions that pyproject.toml allows, with others in the newest.
 # usage: scripts/versions.sh                      all versions in pyproject.toml but 3.11; one without interpreter is skipped
 #        scripts/versions.sh VERSION...           these versions, such as 3.12 3.13; all are needed
 #        scripts/versions.sh --find VERSION       prints the interpreter; exit status 1 if there is none

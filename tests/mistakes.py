@@ -64,12 +64,15 @@ def mistakes(rows: Sequence[Mapping[str, ndarray]]) -> dict[str, Callable[[Seque
     """Return functions that make each mistake, by the name of its correction, and one that makes none."""
     count = len(rows)
     as_text = sorted(range(count), key=str)
+    focal_baseline = rows[0]["left_K"][0, 0] * rows[0]["baseline_m"]
     range_per_depth = _range_per_depth(rows[0]["left_K"], *rows[0]["left_depth"].shape)
     each: dict[str, Callable[[Image], Image]] = {
         SOUND: lambda p: p,
         **{unit: partial(np.multiply, factor) for unit, factor in UNITS.items()},
-        "inverse": _disparity,
-        "right-eye": partial(_seen_from_the_right, focal_baseline=rows[0]["left_K"][0, 0] * rows[0]["baseline_m"]),
+        "factor": partial(np.multiply, 0.01),
+        "disparity": partial(_divided_by, focal_baseline),
+        "inverse": partial(_divided_by, 1.0),
+        "right-eye": partial(_seen_from_the_right, focal_baseline=focal_baseline),
         "range": lambda p: p * range_per_depth,
         "mirrored": np.fliplr,
         "upside-down": np.flipud,
@@ -118,8 +121,8 @@ def _reorder(images: Sequence[Image], order: Sequence[int]) -> list[Image]:
     return [images[n] for n in order]
 
 
-def _disparity(depth_m: Image) -> Image:
-    return np.divide(42.0, depth_m, out=np.zeros_like(depth_m), where=depth_m > 0)
+def _divided_by(dividend: float, depth_m: Image) -> Image:
+    return np.divide(dividend, depth_m, out=np.zeros_like(depth_m), where=depth_m > 0)
 
 
 def _seen_from_the_right(depth_m: Image, focal_baseline: float) -> Image:

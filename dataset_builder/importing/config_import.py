@@ -126,11 +126,14 @@ def run_import(
 
 
 def _key_inputs(source: Import, progress: Progress) -> list[Any]:
-    """Return everything that determines the bytes of the config."""
+    """Return everything that determines the bytes of the config. Raises ``InputError`` for an unreadable file."""
     files = source.views.files
     digests = []
     for done, path in enumerate(files, start=1):
-        digests.append(file_sha256(path))
+        try:
+            digests.append(file_sha256(path))
+        except OSError as error:
+            raise InputError(f"{path}: cannot be read: {error.strerror or error}") from None
         progress("files read", done, len(files))
     cameras = source.views.cameras.values()
     calibrations = [asdict(one) for one in dict.fromkeys(camera.calibration for camera in cameras)]

@@ -21,6 +21,7 @@ from rebar_depth_bench.base.errors import (
     Problem,
     escape_text,
     format_shape,
+    library_message,
 )
 from rebar_depth_bench.base.limits import CELL_BYTES, TOML_BYTES
 from rebar_depth_bench.base.reading import decode_text, parse_json, read_file
@@ -35,7 +36,7 @@ from rebar_depth_bench.geometry.cameras import (
     swap_camera_axes,
 )
 from rebar_depth_bench.submission.entries import FORMATS
-from rebar_depth_bench.submission.maps import decode_exr, decode_npy, decode_npz, decode_png
+from rebar_depth_bench.submission.maps import check_exr_windows, decode_exr, decode_npy, decode_npz, decode_png
 
 Grid = tuple[int, int]
 """Height and width of an image, pixels."""
@@ -64,7 +65,7 @@ def _damage(path: Path, expected: str) -> Iterator[None]:
     except EntryError:
         raise
     except Exception as error:
-        reason = escape_text(str(error) or type(error).__name__)
+        reason = library_message(error)
         raise EntryError(Problem("damaged", path.name, f"cannot be read: {reason}", expected)) from None
 
 
@@ -278,11 +279,15 @@ def _raw_tiff(path: Path, content: bytes) -> Shaped[ndarray, "h w"]:
 
 
 def _exr_channel(path: Path, channel: str) -> Shaped[ndarray, "h w"]:
-    """Return one channel of an EXR file with several. Raises ``EntryError`` if it has no such channel."""
+    """Return one channel of an EXR file with several.
+
+    Raises ``EntryError`` if it has no such channel, and as ``check_exr_windows``.
+    """
     import OpenEXR
 
     with _damage(path, "EXR"), OpenEXR.File(str(path), separate_channels=True) as file:
-        channels = file.channels()
+        channels, header = file.channels(), file.header()
+        check_exr_windows(path.name, *(np.ravel(header[key]).tolist() for key in ("dataWindow", "displayWindow")))
         if channel in channels:
             return np.asarray(channels[channel].pixels)
     found = f"has the channels {', '.join(map(escape_text, list(channels)[:10]))}"

@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 from dataset_builder.inspection.summary import Inspection, diameter_mm
 from dataset_builder.scene.assemblies.cage import CageBar
 from rebar_depth_bench.base.errors import printable
-from rebar_depth_bench.reporting.formatting import counted
+from rebar_depth_bench.scoring.formatting import counted
 
 FONT_FILE = "DejaVuSans-subset.ttf"
 """Font of the pictures, which comes with the package: the same text width on every machine."""

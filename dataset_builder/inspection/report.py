@@ -14,8 +14,8 @@ from rich.table import Table
 
 from dataset_builder.inspection.summary import CONTACT, CONTACT_M, MAX_PAIRS, BarGroup, Inspection
 from dataset_builder.scene.assemblies.cage import CageBar
-from rebar_depth_bench.reporting.formatting import counted
 from rebar_depth_bench.reporting.tables import plain_text, print_unwrapped
+from rebar_depth_bench.scoring.formatting import counted
 
 _MAX_GROUPS = 40
 _MAX_CLASHES = 10

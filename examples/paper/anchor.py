@@ -14,7 +14,6 @@ import argparse
 import math
 import sys
 from collections.abc import Sequence
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -27,6 +26,7 @@ from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.base.parallel import map_with_progress
 from rebar_depth_bench.base.terminal import ProgressBars
 from rebar_depth_bench.cli.console import add_archive, add_data
+from rebar_depth_bench.scoring.columns import coverage_percent
 from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
 from rebar_depth_bench.scoring.score import ViewTruth
@@ -128,10 +128,9 @@ def anchored(evaluation: Evaluation, options: argparse.Namespace, bars: Progress
     """
     config = only_config(options.archive, evaluation.configs, options.config)
     truths = config_truth(evaluation.folder, config, bars.update)
-    pairs = partial(scored_pairs, evaluation.submission)
 
     def ratio_and_coverage(truth: ViewTruth) -> tuple[float | None, float]:
-        p_m, z_m = pairs(truth)
+        p_m, z_m = scored_pairs(evaluation.submission, truth)
         with np.errstate(over="ignore", under="ignore"):
             return float(np.median(z_m / p_m)) if len(p_m) else None, len(p_m) / len(truth.index)
 
@@ -147,7 +146,7 @@ def anchored(evaluation: Evaluation, options: argparse.Namespace, bars: Progress
     scales = np.concatenate([[options.baseline_scale, np.median(ratios)], *drawn])
 
     def errors_of_view(position: int) -> Float64[ndarray, "2 m"]:
-        return errors_at_scales(*pairs(truths.read(position)), scales)
+        return errors_at_scales(*scored_pairs(evaluation.submission, truths.read(position)), scales)
 
     errors = map_with_progress(errors_of_view, predicted, None, bars.update, "errors", len(predicted))
     numbers = zip(scales.tolist(), *np.mean(errors, axis=0).tolist(), strict=True)
@@ -188,8 +187,8 @@ def run(options: argparse.Namespace) -> None:
     table = pd.json_normalize([{**row, "draws": len(row["draws"])} for row in content["rows"]], sep="_")
     notes = [
         f"{content['config']} times {content['given']['scale']:g}: AbsRel {content['given']['abs_rel']:.4f}, RMSE "
-        f"{content['given']['rmse_cm']:.2f} cm; coverage {content['coverage']:.3f}; without prediction: "
-        f"{len(content['views_without_prediction'])} of {content['views']} views",
+        f"{content['given']['rmse_cm']:.2f} cm; coverage {coverage_percent(content['coverage'])} %; without "
+        f"prediction: {len(content['views_without_prediction'])} of {content['views']} views",
         PUBLISHED,
     ]
     shown = [name for name in table if not name.endswith("_sd")]

@@ -156,6 +156,21 @@ def exception_summary(error: Exception) -> str:
     return f"{type(error).__name__}: {first_line}"
 
 
+_MAX_LIBRARY_CHARACTERS = 300
+
+
+def library_message(error: Exception) -> str:
+    """Return the message of another library's exception on one line; of a long one the end, which has the cause.
+
+    It is the name of the exception's type if there is no message.
+    """
+    message = " ".join(str(error).split()) or type(error).__name__
+    message = message if message.isprintable() else ascii(message)
+    if len(message) <= _MAX_LIBRARY_CHARACTERS:
+        return message
+    return f"... {message[-_MAX_LIBRARY_CHARACTERS:]}"
+
+
 def format_shape(shape: tuple[int, int]) -> str:
     """Return a (height, width) shape formatted as ``H x W``."""
     return f"{shape[0]} x {shape[1]}"

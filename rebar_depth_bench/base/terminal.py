@@ -8,10 +8,15 @@ from __future__ import annotations
 
 import codecs
 import io
+import os
+import re
 import sys
 import time
 import unicodedata
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
+from typing import TextIO
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
@@ -46,8 +51,19 @@ _REPLACEMENTS = str.maketrans(
 """Replacements by character; those of headings and marks have one character, so that columns stay aligned."""
 
 
-def use_plain_characters() -> None:
-    """Let standard output and standard error replace characters that their encoding lacks."""
+def prepare_terminal() -> None:
+    """Let standard output and standard error replace characters that their encoding lacks.
+
+    Standard streams that are closed are opened on the null device: otherwise the next file would get their
+    descriptor, and what libraries print would be written into it. A width of 0 counts as unset.
+    """
+    for name, mode in (("stdin", "r"), ("stdout", "w"), ("stderr", "w")):
+        if getattr(sys, name) is None:
+            stream = Path(os.devnull).open(mode)  # noqa: SIM115
+            os.set_inheritable(stream.fileno(), True)
+            setattr(sys, name, stream)
+    if re.fullmatch("0+", os.environ.get("COLUMNS", "")):
+        del os.environ["COLUMNS"]
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors=_HANDLER)
@@ -88,7 +104,16 @@ def terminal_text(message: str) -> str:
 
 def print_notice(text: str) -> None:
     """Print text to standard error; control characters of names in it are shown as escapes."""
-    sys.stderr.write(f"{terminal_text(text)}\n")  # In one call, so that threads do not mix lines.
+    try:
+        sys.stderr.write(f"{terminal_text(text)}\n")  # In one call, so that threads do not mix lines.
+    except OSError:  # No note is worth a result.
+        discard_stream(sys.stderr)
+
+
+def discard_stream(stream: TextIO) -> None:
+    """Discard text that cannot be written: the interpreter would try again, and complain, when it ends."""
+    with suppress(OSError, ValueError):
+        os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
 MAX_SILENCE_S = 600.0

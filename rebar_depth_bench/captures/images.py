@@ -21,7 +21,14 @@ from PIL.JpegImagePlugin import JpegImageFile
 from PIL.PngImagePlugin import PngImageFile
 from PIL.TiffImagePlugin import TiffImageFile
 
-from rebar_depth_bench.base.errors import EntryError, InputError, Problem, escape_text, format_shape
+from rebar_depth_bench.base.errors import (
+    EntryError,
+    InputError,
+    Problem,
+    escape_text,
+    format_shape,
+    library_message,
+)
 from rebar_depth_bench.base.limits import CELL_BYTES, IMAGE_PIXELS
 from rebar_depth_bench.base.reading import open_regular, read_file
 from rebar_depth_bench.data.codecs import decode
@@ -42,7 +49,7 @@ def read_image(path: Path, grid: tuple[int, int]) -> UInt8[ndarray, "h w 3"]:
     try:
         return decode("rgb", content, grid)
     except Exception as error:  # Pillow raises many types, which depend on the damage.
-        reason = escape_text(str(error) or type(error).__name__)
+        reason = library_message(error)
         raise InputError(f"{path}: cannot be decoded: {reason}, expected an 8-bit PNG or JPEG image") from error
 
 

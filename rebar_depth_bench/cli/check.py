@@ -34,7 +34,7 @@ def run(options: argparse.Namespace) -> None:
             print_notice(note)
         if problems:
             raise SubmissionError.from_problems(options.archive, problems)
-        print(f"{options.archive}: no problem found")
+        print(f"{options.archive}: the archive is valid")
         evaluation = Evaluation(folder, submission)
         if problems := evaluation.meta.kind_problems(RANKS_METRIC):
             print_notice(f"not ranked: {problems[0]}")

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import errno
 import os
 import re
 import sys
 import warnings
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 from rebar_depth_bench import software_version
 from rebar_depth_bench.base.errors import InputError, OutputError, RebarDepthError
 from rebar_depth_bench.base.reading import parse_number
-from rebar_depth_bench.base.terminal import ProgressBars, print_notice, use_plain_characters
+from rebar_depth_bench.base.terminal import ProgressBars, discard_stream, prepare_terminal, print_notice
 from rebar_depth_bench.base.writing import (
     STANDARD_OUTPUT,
     WRITE_ERRORS,
@@ -89,25 +89,33 @@ def program_parser(
 def run_program(parser: argparse.ArgumentParser, words: Sequence[str] | None = None) -> int:
     """Parse the words of a command line, check the outputs, call ``run(options)`` and return the exit code.
 
-    ``run`` is a default of the parser, as is ``interrupted``, the message printed on Ctrl-C, if it has one.
+    ``run`` is a default of the parser or of a command, as is ``interrupted``, the message printed on Ctrl-C, if it
+    has one.
     """
-    use_plain_characters()
-    options = parser.parse_args(words)
 
     def run() -> None:
+        options = parser.parse_args(words)
+        try:
+            Path.cwd()
+        except FileNotFoundError:
+            raise InputError("the current folder was removed: change to one that exists") from None
         check_outputs(vars(options))
-        options.run(options)
+        try:
+            options.run(options)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(getattr(options, "interrupted", "interrupted")) from None
 
-    return run_command(run, getattr(options, "interrupted", "interrupted"))
+    return run_command(run)
 
 
 def run_command(command: Callable[[], None], interrupted: str = "interrupted") -> int:
     """Run a command and return its exit code.
 
     A ``RebarDepthError``, and an error of a machine that cannot write, is printed to standard error without a
-    traceback. If nobody reads standard output any more, the command ends without a message. ``interrupted`` is the
-    message printed on Ctrl-C.
+    traceback. If nobody reads standard output any more, the command ends without a message. On Ctrl-C, the text of
+    the ``KeyboardInterrupt`` is printed, or ``interrupted`` if it has none.
     """
+    prepare_terminal()
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", module=r"PIL\.")  # Errors name the image and its file.
@@ -117,24 +125,18 @@ def run_command(command: Callable[[], None], interrupted: str = "interrupted") -
         print_notice(f"error: {error}")
         return EXIT_INPUT if isinstance(error, InputError) else EXIT_OTHER
     except BrokenPipeError:
-        _discard_standard_output()
+        discard_stream(sys.stdout)
         return EXIT_OTHER
     except OSError as error:
-        if error.errno not in WRITE_ERRORS:
+        if error.errno not in (*WRITE_ERRORS, errno.EBADF):  # Standard output may be open for reading only.
             raise
         print_notice(f"error: {error.filename or 'standard output'}: {os.strerror(error.errno)}")
-        _discard_standard_output()
+        discard_stream(sys.stdout)
         return EXIT_OTHER
-    except KeyboardInterrupt:
-        print(interrupted, file=sys.stderr)
+    except KeyboardInterrupt as error:
+        print_notice(str(error) or interrupted)
         return EXIT_OTHER
     return EXIT_DONE
-
-
-def _discard_standard_output() -> None:
-    """Discard text that cannot be written: the interpreter would try again, and complain, when it ends."""
-    with suppress(OSError, ValueError):
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
 
 
 class InputFile(str):
@@ -309,7 +311,9 @@ def check_outputs(options: Mapping[str, object]) -> None:
 
 def _check_stream(option: str, output: Path) -> None:
     descriptor = open_descriptor(output)
-    if descriptor is not None and not Path(f"/dev/fd/{descriptor}").exists():
+    stream = {1: sys.stdout, 2: sys.stderr}.get(descriptor or 0)
+    is_closed = getattr(stream, "name", "") == os.devnull  # By ``prepare_terminal``.
+    if descriptor is not None and (is_closed or not Path(f"/dev/fd/{descriptor}").exists()):
         raise InputError(f"{option} names {output}, but descriptor {descriptor} is not open")
     if descriptor is None and not os.access(output, os.W_OK):
         raise OutputError(f"{option} names {output}, which cannot be written to")

@@ -22,10 +22,10 @@ from rebar_depth_bench.cli.console import EXIT_INPUT
 from rebar_depth_bench.evaluator import evaluate
 from rebar_depth_bench.methods import METHODS
 from rebar_depth_bench.methods.controls import NOISY_TRUTH_FACTOR
-from rebar_depth_bench.reporting.formatting import note_text, row_name, row_notes
 from rebar_depth_bench.reporting.tables import make_grid, plain_text, print_line, print_unwrapped
-from rebar_depth_bench.scoring.columns import SCALED, SCALED_CONSTANT, columns_at
-from rebar_depth_bench.scoring.result import SUMMARY, Result
+from rebar_depth_bench.scoring.formatting import note_text, row_name, row_notes, summary
+from rebar_depth_bench.scoring.relative import LEAST_MARGIN, is_like_constant
+from rebar_depth_bench.scoring.result import Result
 
 SAMPLE = Path(__file__).parents[1] / "sample"
 """Dataset folder in the package: small views of the lattice and of its orbit; its mesh is packed."""
@@ -95,23 +95,22 @@ def _build_dataset(data: Path, views: int) -> None:
 
 def _print_results(results: Sequence[Result], console: Console) -> None:
     """Print one row per result, what the rows show, and the meaning of their marks."""
-    grid = make_grid("method", list(SUMMARY.values()))
+    shown = [summary(result) for result in results]
+    grid = make_grid("method", shown[0].heads[1:])
     flat = []
-    for result in results:
+    for result, one in zip(results, shown, strict=True):
         table = result.tables[DEMO_CONFIG]
-        cells = (f"{column.text(column.value(table))} {column.unit}".strip() for column in columns_at(*SUMMARY))
-        grid.add_row(*map(plain_text, [row_name(result, table), *cells]))
-        scaled, constant = (column.value(table) for column in (SCALED[0], SCALED_CONSTANT[0]))
-        if table.is_comparable and scaled is not None and constant is not None and scaled >= constant:
+        grid.add_row(*map(plain_text, [row_name(result, table), *one.rows[0][1:]]))
+        if is_like_constant(table):
             flat.append(result.method)
     print_unwrapped(console, grid)
     console.print()
-    listed = f"; no better in scaled AbsRel than that plane: {', '.join(flat)}" if flat else ""
+    listed = f", less than {LEAST_MARGIN * 100:.0f} % for {', '.join(flat)}" if flat else ""
     print_line(
         console,
         f"noisy-truth, exact depth times {NOISY_TRUTH_FACTOR:g} with noise, has a wrong scale and almost the "
         "exact shape: AbsRel shows the one, scaled AbsRel the other. A plane at one depth has the scaled AbsRel "
-        f"in the column constant{listed}.",
+        f"in the column constant; margin is the share by which a method is below it{listed}.",
     )
     for note in row_notes(results, ()):
         print_line(console, note_text(*note))

@@ -33,7 +33,10 @@ COMMANDS: Mapping[str, Command] = {
         run="run_verify",
     ),
     "methods": module_command(
-        f"{_CLI}.predict", "list the available methods", add="add_methods_arguments", run="run_methods"
+        f"{_CLI}.predict",
+        "list the available methods, or print one whole",
+        add="add_methods_arguments",
+        run="run_methods",
     ),
     "predict": module_command(f"{_CLI}.predict", "run a method on a dataset and write a submission archive"),
     "submit": module_command(

@@ -8,8 +8,6 @@ from functools import partial
 from pathlib import Path
 
 from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from rebar_depth_bench.base.errors import InputError, MethodError
 from rebar_depth_bench.base.names import SPLITS, TEST_SPLIT
@@ -35,11 +33,11 @@ from rebar_depth_bench.methods import METHODS, AnyMethod, MultiViewMethod, all_m
 from rebar_depth_bench.methods.base import VIEW_TIMEOUT_S, input_class
 from rebar_depth_bench.methods.registry import FROM_FOLDER
 from rebar_depth_bench.methods.run import dataset_views, predict_views
-from rebar_depth_bench.reporting.tables import plain_text
+from rebar_depth_bench.reporting.tables import plain_text, print_line
 from rebar_depth_bench.submission.declaration import METRIC
 
 _ALL_VIEWS_NOTE = "prepares a whole config before it predicts any view"
-_NEEDS_COLUMN_WIDTH = len("cam_from_world,")
+_LIST_WIDTH = 100
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -133,39 +131,51 @@ def _open_views(options: argparse.Namespace, method: AnyMethod) -> tuple[Sequenc
 
 
 def add_methods_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add no arguments; ``methods`` has none."""
-    del parser
+    """Add the arguments of ``methods``."""
+    summary = "print one method whole: what it reads, source, licence and untested parts (default: list all)"
+    parser.add_argument("name", nargs="?", metavar="NAME", help=summary)
 
 
-def run_methods(_: argparse.Namespace) -> None:
-    """Print a table of the methods: summary, required columns, source, licence and untested parts."""
-    table = Table(title="Methods", show_lines=True, expand=True)
-    table.add_column("method", no_wrap=True)
-    table.add_column("description", overflow="fold", ratio=3)
-    table.add_column("needs", overflow="fold", width=_NEEDS_COLUMN_WIDTH)
-    table.add_column("source, licence", overflow="fold", ratio=2)
-    for name, method in all_methods().items():
+def run_methods(options: argparse.Namespace) -> None:
+    """Print one line per method, cut off at 100 columns, or one method whole."""
+    console, methods = Console(), all_methods()
+    if options.name is not None:
+        _print_method(options.name, methods.get(options.name) or find_method(options.name), console)
+        return
+    rows = [("method", "inputs", "description")]
+    for name, method in methods.items():
         if isinstance(method, MethodError):
-            table.add_row(plain_text(name), plain_text(f"cannot be used: {method}"), "", "")
-            continue
-        info = method.info
-        label = f"{name} ‡" if info.uses_ground_truth else name
-        table.add_row(
-            plain_text(label),
-            _summary_and_notes(method),
-            plain_text(f"{_format_columns(info.columns)}\ninputs: {input_class(method) or '-'}"),
-            plain_text(f"{info.source}\nlicence: {info.licence}"),
-        )
-    Console().print(table)
-    Console().print("‡ uses ground truth; its submissions are not ranked")
+            rows.append((name, "", f"cannot be used: {method}"))
+        else:
+            label = f"{name} ‡" if method.info.uses_ground_truth else name
+            rows.append((label, input_class(method) or "-", method.info.summary))
+    first, second, _ = (max(map(len, column)) for column in zip(*rows, strict=True))
+    for name, inputs, description in rows:
+        line = plain_text(f"{name:<{first}}  {inputs:<{second}}  {description}")
+        line.truncate(min(console.width, _LIST_WIDTH), overflow="ellipsis")
+        console.print(line)
+    print_line(console, "‡ uses ground truth; its submissions are not ranked")
+    print_line(console, "rebar-bench methods NAME prints all about one: source, licence, untested parts")
 
 
-def _summary_and_notes(method: AnyMethod) -> Text:
-    """Return the summary, followed by dimmed notes on separate lines."""
-    kind = "" if method.info.prediction == METRIC else f"predictions of the kind {method.info.prediction}"
-    notes = (*((_ALL_VIEWS_NOTE,) if isinstance(method, MultiViewMethod) else ()), kind, method.info.untested_note)
-    lines = [plain_text(method.info.summary), *(plain_text(f"({line})", style="dim") for line in notes if line)]
-    return Text("\n").join(lines)
+def _print_method(name: str, method: AnyMethod | MethodError, console: Console) -> None:
+    if isinstance(method, MethodError):
+        raise method
+    info = method.info
+    print_line(console, name, style="bold")
+    for title, text in {
+        "description": info.summary,
+        "reads": _format_columns(info.columns),
+        "inputs": input_class(method) or "",
+        "predicts": "" if info.prediction == METRIC else f"predictions of the kind {info.prediction}",
+        "ground truth": "used; submissions are not ranked" if info.uses_ground_truth else "",
+        "preparation": _ALL_VIEWS_NOTE if isinstance(method, MultiViewMethod) else "",
+        "source": info.source,
+        "licence": info.licence,
+        "untested": info.untested_note,
+    }.items():
+        if text:
+            print_line(console, f"{title}: {text}")
 
 
 def _format_columns(columns: Sequence[str]) -> str:

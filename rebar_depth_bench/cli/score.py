@@ -6,7 +6,7 @@ import argparse
 
 from rich.console import Console
 
-from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.errors import InputError, escape_text
 from rebar_depth_bench.base.terminal import ProgressBars, print_notice
 from rebar_depth_bench.base.writing import write_output
 from rebar_depth_bench.cli.console import (
@@ -23,7 +23,6 @@ from rebar_depth_bench.reporting.html.views import VIEWS_SHOWN
 from rebar_depth_bench.reporting.tables import print_table
 from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
 from rebar_depth_bench.scoring.frames import frame_csv
-from rebar_depth_bench.scoring.result import Result
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -46,6 +45,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="also compute boundary, point cloud, layer, per-bar inspection and alignment measures",
     )
+    parser.add_argument(
+        "--family",
+        metavar="NAME",
+        help="print all measures of one family of the extended ones, which --extended names (implies --extended)",
+    )
     add_output_file(parser, "--extended-csv", "write the extended measures as CSV (implies --extended)")
     add_workers(parser)
 
@@ -54,11 +58,18 @@ def run(options: argparse.Namespace) -> None:
     """Score an archive, write the requested files and print the tables."""
     if options.html_views < 0:
         raise InputError(f"--html-views is {options.html_views}, expected 0 or more")
-    if options.align and (options.extended or options.extended_csv):
+    is_extended = options.extended or options.extended_csv or options.family is not None
+    if options.align and is_extended:
         raise InputError("--align and --extended are both given: extended measures need metric predictions")
+    if options.family is not None:
+        from rebar_depth_bench.extended.registry import MEASURE_FAMILIES
+
+        if options.family not in MEASURE_FAMILIES:
+            found = f"--family is {escape_text(options.family)}"
+            raise InputError(f"{found}, expected one of {', '.join(MEASURE_FAMILIES)}")
     with open_evaluation(options.archive, options.data, expect_digest=options.expect_digest) as evaluation:
         with ProgressBars() as bars:
-            if options.extended or options.extended_csv:
+            if is_extended:
                 # A third of the package, which other scores do not need.
                 from rebar_depth_bench.extended.registry import score_extended
 
@@ -86,16 +97,12 @@ def run(options: argparse.Namespace) -> None:
 
         write_output(options.extended_csv, extended_csv(result))
     if prints_table(options):
-        _print_tables(result)
+        print_table(result, Console())
+        if result.extended is not None:
+            from rebar_depth_bench.reporting.extended_tables import print_extended
+
+            print_extended(result.extended, Console(), options.family or "")
     for note in evaluation.submission.notes:
         print_notice(note)
     for mistake in mistakes:
         print_notice(f"possible mistake: {mistake.text}")
-
-
-def _print_tables(result: Result) -> None:
-    print_table(result, Console())
-    if result.extended is not None:
-        from rebar_depth_bench.reporting.extended_tables import print_extended
-
-        print_extended(result.extended, Console())

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from rebar_depth_bench.base.errors import InputError, printable
 from rebar_depth_bench.base.reading import decode_text
-from rebar_depth_bench.base.terminal import ProgressBars
+from rebar_depth_bench.base.terminal import ProgressBars, print_notice
 from rebar_depth_bench.base.writing import write_output
 from rebar_depth_bench.cli.console import InputFile, add_archive, add_output_file, add_seconds, prints_table
 from rebar_depth_bench.remote.leaderboard_client import WAIT_S, LeaderboardClient
@@ -47,20 +47,20 @@ def run(options: argparse.Namespace) -> None:
         )
     with LeaderboardClient(options.url, read_token(options.token_file)) as leaderboard, ProgressBars() as bars:
         accepted = leaderboard.submit(Path(options.archive), bars.update)
-        print(accepted.url, file=sys.stderr, flush=True)
+        print_notice(accepted.url)
         if options.no_wait:
             print(accepted.id)
             return
         try:
             submission = leaderboard.wait(accepted.id, bars.update, options.wait)
         except KeyboardInterrupt:
-            print("the submission is accepted and will be scored; its URL is printed above", file=sys.stderr)
+            print_notice("the submission is accepted and will be scored; its URL is printed above")
             raise
         if submission.status == "failed":
             reason = submission.reason or "the service gives no reason"
             raise InputError(f"{options.archive}: scoring failed: {reason}")
         if submission.outdated:
-            print(f"warning: the result is outdated: {printable(submission.outdated, 1000)}", file=sys.stderr)
+            print_notice(f"warning: the result is outdated: {printable(submission.outdated, 1000)}")
         result, result_json = leaderboard.result(accepted.id, accepted.archive_sha256)
     if options.json:
         write_output(options.json, result_json)

@@ -14,13 +14,21 @@ from typing import Any
 import numpy as np
 from jaxtyping import Bool, Float32, UInt8, UInt16
 from numpy import ndarray
-from PIL import Image
+from PIL import Image, __version__, features
 from PIL.ImageFile import ImageFile
 
+from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.base.limits import CELL_BYTES
 
 _TIFF_PREDICTOR, _FLOATING_POINT = 317, 3
 _TIFF_ROWS_PER_STRIP, _TIFF_TILE_WIDTH = 278, 322
+
+_ZSTANDARD_PIXEL = bytes.fromhex(
+    "49492a00080000000a000001030001000000010000000101030001000000010000000201030001000000200000000301030001000000"
+    "50c3000006010300010000000100000011010300010000008600000015010300010000000100000016010300010000000100000017010300"
+    "010000000d0000005301030001000000030000000000000028b52ffd006021000000000000"
+)
+"""TIFF of one pixel, float32, compressed with Zstandard."""
 
 
 @dataclass(frozen=True)
@@ -61,8 +69,28 @@ class Picture(Image.Image):
         return interface | {"data": bytearray(interface["data"])}
 
 
+@cache
+def check_codecs() -> None:
+    """Raise ``InputError`` if Pillow is built without a codec of the dataset's images, as wheels before 12 are."""
+    missing = [] if features.check("webp") else ["WebP"]
+    try:
+        with Image.open(io.BytesIO(_ZSTANDARD_PIXEL)) as pixel:
+            pixel.load()
+    except OSError:
+        missing.append("TIFF with Zstandard")
+    if missing:
+        raise InputError(
+            f"Pillow {__version__} lacks {' and '.join(missing)}, expected all codecs of the dataset's images: "
+            "pip install 'pillow>=12'"
+        )
+
+
 def encode_depth(depth_m: Float32[ndarray, "h w"]) -> bytes:
-    """Encode float32 planar depth in metres as TIFF: floating-point predictor, zstd, one strip."""
+    """Encode float32 planar depth in metres as TIFF: floating-point predictor, zstd, one strip.
+
+    Raises as ``check_codecs``.
+    """
+    check_codecs()  # Wheels of Pillow without Zstandard end the process.
     tags = {_TIFF_PREDICTOR: _FLOATING_POINT, _TIFF_ROWS_PER_STRIP: depth_m.shape[0]}
     image = Image.fromarray(np.ascontiguousarray(depth_m, dtype=np.float32))
     return _encode_image(image, "TIFF", compression="zstd", tiffinfo=tags)

@@ -144,16 +144,6 @@ def file_sha256(path: Path) -> str:
     return FileSource(path).sha256()
 
 
-def files_digest(paths: Iterable[Path]) -> str:
-    """Return the hex SHA-256 over the names and SHA-256 digests of files, in the order of ``paths``.
-
-    Folders do not enter the digest, so that copies elsewhere have the same one. Raises ``OSError`` if a file is
-    missing.
-    """
-    lines = [f"{path.name} {file_sha256(path)}\n" for path in paths]
-    return hashlib.sha256("".join(lines).encode()).hexdigest()
-
-
 def views_digest(views: Iterable[ViewRecord]) -> str:
     """Return the ground-truth digest, ``sha256:...``, over the ids and eye digests of the views, sorted by id."""
     lines = sorted(f"{view.view_id} {view.left} {view.right}\n" for view in views)

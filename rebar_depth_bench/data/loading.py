@@ -8,12 +8,12 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, overload
 
-from rebar_depth_bench.base.errors import DatasetError, InputError, escape_text
+from rebar_depth_bench.base.errors import DatasetError, InputError, OutputError, escape_text
 from rebar_depth_bench.base.names import TEST_SPLIT
 from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
 from rebar_depth_bench.data.rows import row_of_pictures
 from rebar_depth_bench.data.schema import COLUMNS, validated_columns
-from rebar_depth_bench.data.shards import check_shards, damaged_error, shard_rows
+from rebar_depth_bench.data.shards import check_shards, shard_rows
 
 if TYPE_CHECKING:
     from datasets import Dataset, Features, IterableDataset
@@ -78,25 +78,33 @@ def load(
 
     Raises ``DatasetError`` for a folder, config, split or column that does not exist, for a damaged shard, and for
     a cell that contradicts the manifest; the rows raise it for a damaged image. A streamed dataset raises it while
-    it is read.
+    it is read. Raises ``OutputError`` if the cache cannot be written, and ``InputError`` if the installed
+    ``datasets`` or a codec of Pillow does not suffice.
     """
-    from datasets import IterableDataset, NamedSplit
+    from datasets import IterableDataset, NamedSplit, __version__
 
     from rebar_depth_bench.data.decoding_features import decoding_features
 
-    whole = split.partition("[")[0] if split.endswith("]") else split
+    whole = split.partition("[")[0] if isinstance(split, str) and split.endswith("]") else split
     located = open_folder(root).config(config).of_split(whole)
     part = None if split == whole else _part(located, split)
     selected = validated_columns(columns)
     check_shards(located)
     if streaming:
-        streamed = IterableDataset.from_generator(
-            _encoded_rows,
-            features=decoding_features(located, selected, to_arrays=True),
-            gen_kwargs={"config": located, "columns": selected, "shards": list(located.shards)},
-            split=NamedSplit(whole),
-        )
+        try:
+            streamed = IterableDataset.from_generator(
+                _encoded_rows,
+                features=decoding_features(located, selected, to_arrays=True),
+                gen_kwargs={"config": located, "columns": selected, "shards": list(located.shards)},
+                split=NamedSplit(whole),
+            )
+        except OSError as error:  # ``datasets`` makes its folder and a lock file.
+            raise _cache_error(located, error) from error
         return streamed if part is None else streamed.skip(part.start).take(len(part))
+    if tuple(map(int, __version__.split(".")[:2])) < (5, 1):  # Matrices would be arrays of Python objects.
+        raise InputError(
+            f"datasets {__version__} is installed, expected 5.1 or later: pip install 'datasets>=5.1'"
+        )
     loaded = _cached(located, whole, decoding_features(located, COLUMNS)).select_columns(list(selected))
     loaded.info.features = decoding_features(located, selected)
     formatted = loaded.with_format("numpy")
@@ -144,6 +152,15 @@ def _cached(config: DatasetConfig, split: str, features: Features) -> Dataset:
             config_name=config.name,
             writer_batch_size=_ROWS_IN_MEMORY,
         )
-    except Exception as error:  # ``datasets`` wraps what reading a shard raises.
-        cause = error.__cause__ if isinstance(error.__cause__, Exception) else error
-        raise cause if isinstance(cause, InputError) else damaged_error(config, cause) from error
+    except Exception as error:  # ``datasets`` wraps what reading a shard raises, which is an ``InputError``.
+        cause = error.__cause__ or error
+        raise (cause if isinstance(cause, InputError) else _cache_error(config, cause)) from error
+
+
+def _cache_error(config: DatasetConfig, error: BaseException) -> OutputError:
+    from datasets.config import HF_DATASETS_CACHE
+
+    return OutputError(
+        f"{HF_DATASETS_CACHE}: cannot be used as the cache of {config.name}: {escape_text(str(error))}; set "
+        "HF_DATASETS_CACHE or HF_HOME to another folder; streaming=True needs a folder, but no space"
+    )

@@ -189,7 +189,7 @@ class DatasetConfig(Located):
     def of_split(self, split: str) -> Self:
         """Return the scenes of a split. Raises ``DatasetError`` if there are none."""
         if split not in self.splits:
-            found = f"config {self.name} has no split {escape_text(split)}"
+            found = f"config {self.name} has no split {escape_text(str(split))}"
             raise DatasetError(f"{self.root}: {found}, expected {' or '.join(self.splits)}")
         if len(self.splits) == 1:
             return self

@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Bool, Float32, Float64, UInt8, UInt16
 from numpy import ndarray
 
-from rebar_depth_bench.base.errors import DatasetError, Problem, escape_text
+from rebar_depth_bench.base.errors import DatasetError, Problem, escape_text, library_message
 from rebar_depth_bench.base.parallel import Progress, silent
 from rebar_depth_bench.base.validation import short_repr
 from rebar_depth_bench.data import codecs
@@ -165,10 +165,12 @@ def open_cell(root: str, grid: tuple[int, int], column: str, cell: Mapping[str, 
 
 @contextmanager
 def _naming(root: str, view: str, column: str) -> Iterator[None]:
+    """Convert the errors of a damaged cell to ``DatasetError``. Raises ``InputError`` as ``check_codecs``."""
     try:
         yield
     except Exception as error:  # Pillow raises many types, which depend on the damage.
-        reason = escape_text(str(error) or type(error).__name__)
+        codecs.check_codecs()
+        reason = library_message(error)
         raise DatasetError(
             f"{root}: view {escape_text(view)}: {column} is damaged: {reason}; "
             f"rebar-bench verify {root} lists damaged files"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import reduce
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -108,12 +108,12 @@ def validated_columns(columns: Sequence[str] | None) -> tuple[str, ...]:
     """Return the names of columns as a tuple, all of them for None. Raises ``DatasetError`` for unknown names."""
     if columns is None:
         return COLUMNS
-    if isinstance(columns, str):
+    if isinstance(columns, str) or not isinstance(columns, Iterable):
         raise DatasetError(f"columns is {columns!r}, expected a list of column names")
-    unknown = [name for name in columns if name not in COLUMNS]
-    if unknown:
+    names = tuple(columns)
+    if unknown := [name for name in names if name not in COLUMNS]:
         raise DatasetError(f"no column {', '.join(map(repr, unknown))}, expected some of {', '.join(COLUMNS)}")
-    return tuple(columns)
+    return names
 
 
 class ManifestTable(StrictModel):

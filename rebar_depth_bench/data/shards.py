@@ -21,7 +21,7 @@ from typing import Any, BinaryIO
 import pyarrow as pa
 import pyarrow.parquet as pq
 
-from rebar_depth_bench.base.errors import DatasetError, InputError, escape_text
+from rebar_depth_bench.base.errors import DatasetError, InputError, escape_text, library_message
 from rebar_depth_bench.base.limits import CELL_BYTES
 from rebar_depth_bench.base.reading import open_regular
 from rebar_depth_bench.base.writing import atomic_replace
@@ -256,7 +256,7 @@ def read_table(path: Path, table: Table, what: str) -> Iterator[dict[str, Any]]:
         with open_regular(path) as stream, open_parquet(stream, table) as file:
             yield from read_rows(file, table.schema, batch_rows=1000)
     except Exception as error:  # pyarrow raises many types, which depend on the damage.
-        reason = escape_text(str(error) or type(error).__name__)
+        reason = library_message(error)
         raise DatasetError(f"{path}: cannot be read as a table of {what}: {reason}") from error
 
 
@@ -360,10 +360,10 @@ def shard_rows(
                     yield {name: row[name] for name in columns}
 
 
-def damaged_error(config: DatasetConfig, error: Exception, shard: str = "") -> DatasetError:
+def _damaged_error(config: DatasetConfig, error: Exception, shard: str = "") -> DatasetError:
     """Return the error of a config that cannot be read; ``shard`` is the file, if it is known."""
     place = f"{config.root}: config {config.name} cannot be read: {f'{shard}: ' if shard else ''}"
-    reason = escape_text(str(error) or type(error).__name__)
+    reason = library_message(error)
     return DatasetError(f"{place}{reason}; rebar-bench verify {config.root} lists damaged files")
 
 
@@ -385,4 +385,4 @@ def _open_shard(config: DatasetConfig, shard: str, table: Table) -> Iterator[pq.
     except InputError:
         raise
     except Exception as error:  # pyarrow and the Hub's client raise many types, which depend on the damage.
-        raise damaged_error(config, error, shard) from error
+        raise _damaged_error(config, error, shard) from error

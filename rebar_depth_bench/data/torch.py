@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from operator import index
 from typing import Any
 from zlib import crc32
 
@@ -27,7 +29,7 @@ FLIP_PROBABILITY = 0.5
 class Augmentation:
     """Random changes of rows: crops of ``crop`` (height, width) pixels, None for none, and flips of half the rows.
 
-    They depend on ``seed``, the epoch and the view id only, not on the order of rows or the number of workers.
+    They depend on ``seed``, the view id and how often the view was drawn before only.
     """
 
     crop: tuple[int, int] | None = None
@@ -35,27 +37,33 @@ class Augmentation:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Raise ``InputError`` for a crop that is empty and for a seed below 0."""
+        """Raise ``InputError`` for a crop that is empty, a flip that is no bool and a seed below 0."""
         problems = []
-        if self.crop is not None and (len(self.crop) != 2 or min(self.crop) < 1):
-            problems.append(
-                Problem("invalid", "crop", f"got {self.crop}", "height and width in pixels, 1 or more")
-            )
-        if self.seed < 0:
-            problems.append(Problem("invalid", "seed", f"got {self.seed}", "0 or more"))
+        is_pair = isinstance(self.crop, Sequence) and len(self.crop) == 2
+        if self.crop is not None and not (is_pair and all(_is_whole(side, 1) for side in self.crop)):
+            expected = "a side or (height, width) in pixels, whole numbers of 1 or more"
+            problems.append(Problem("invalid", "crop", f"got {self.crop!r}", expected))
+        if not isinstance(self.flip, bool):
+            problems.append(Problem("invalid", "flip", f"got {self.flip!r}", "True or False"))
+        if not _is_whole(self.seed, 0):
+            problems.append(Problem("invalid", "seed", f"got {self.seed!r}", "a whole number, 0 or more"))
         if problems:
             raise InputError.from_problems("augmentation", problems)
 
-    def __call__(self, row: Row, epoch: int) -> Row:
-        """Return a row with ``view_id`` as changed in an epoch.
+    def __call__(self, row: Row, earlier_draws: int) -> Row:
+        """Return a row with ``view_id`` as changed after so many draws.
 
         Raises ``InputError`` if the crop is larger than the image, and as ``flip_row``.
         """
-        rng = np.random.default_rng([self.seed, epoch, crc32(row["view_id"].encode())])
+        rng = np.random.default_rng([self.seed, earlier_draws, crc32(row["view_id"].encode())])
         if self.crop is not None:
             row = crop_row(row, self.crop, rng)
         is_flipped = self.flip and rng.random() < FLIP_PROBABILITY
         return flip_row(row) if is_flipped else row
+
+
+def _is_whole(value: object, least: int) -> bool:
+    return isinstance(value, int | np.integer) and not isinstance(value, bool) and bool(value >= least)
 
 
 def crop_row(row: Row, size: tuple[int, int], rng: np.random.Generator) -> Row:
@@ -118,7 +126,8 @@ def _is_image(row: Row, name: str) -> bool:
 
 try:
     import torch
-    from torch.utils.data import DataLoader, Sampler
+    from torch.utils.data import DataLoader, RandomSampler, Sampler, get_worker_info
+    from torch.utils.data import Dataset as TorchDataset
     from torch.utils.data import IterableDataset as TorchIterableDataset
 except ImportError as error:
     raise MethodError(f"torch_loader needs torch ({error}): {install_command('torch')}") from None
@@ -135,6 +144,7 @@ _LEFT = {
 _NUMBER_KINDS = ("K", "cam_from_world", "baseline_m")
 SHUFFLE_BUFFER = 32
 """Views of a streamed dataset among which the next one is drawn."""
+_MOST_WORKERS = 1024
 _RIGHT = {f"right_{key}": column.replace("left", "right") for key, column in _LEFT.items()}
 
 
@@ -148,7 +158,7 @@ def torch_loader(
     drop_last: bool = False,
     pin_memory: bool = False,
     stereo: bool = False,
-    crop: tuple[int, int] | None = None,
+    crop: int | tuple[int, int] | None = None,
     flip: bool = False,
     seed: int = 0,
 ) -> DataLoader[Batch]:
@@ -164,29 +174,56 @@ def torch_loader(
     is applied. A dataset that only ``datasets`` has read is not compared with the manifest.
 
     For training, ``shuffle`` changes the order in every epoch. A streamed dataset is shuffled by shard, and then
-    in a buffer of 32 views (``SHUFFLE_BUFFER``). ``crop`` (height, width) takes a random part of each view, and
-    ``flip`` mirrors half of the views. Depth, masks, K and poses stay consistent: a flipped stereo pair has its
-    eyes exchanged, and the pose of a flipped view contains the reflection. The order of shuffled views depends on
-    ``seed`` and the epoch, and for a streamed dataset on the number of workers; crops and flips depend on
-    ``seed``, the epoch and the view id.
+    in a buffer of 32 views (``SHUFFLE_BUFFER``). ``crop``, (height, width) or the side of a square in pixels,
+    takes a random part of each view, and ``flip`` mirrors half of the views. Depth, masks, K and poses stay
+    consistent: a flipped stereo pair has its eyes exchanged, and the pose of a flipped view contains the
+    reflection. Crops and flips depend on ``seed``, the view id and how often the view was drawn before (of a
+    streamed dataset: how often it was iterated), not on the order, the sampler or the number of workers. Views
+    that workers drew ahead of an interruption count too. The order of shuffled views depends on ``seed`` and how
+    often the loader was iterated, and for a streamed dataset also on torch's seed and the number of workers.
 
     ``sampler``, ``drop_last`` and ``pin_memory`` are those of ``DataLoader``. A sampler takes the place of
-    ``shuffle``, and a streamed dataset has none; the caller sets the epoch of a ``DistributedSampler``.
+    ``shuffle``, and a streamed dataset has none; the caller sets the epoch of a ``DistributedSampler``. Training
+    frameworks may build the loader again from its ``dataset`` and ``collate_fn``, with a sampler of their own.
 
-    Importing this module without torch raises ``MethodError``. Raises ``InputError`` for an invalid crop or seed,
+    Importing this module without torch raises ``MethodError``. Raises ``InputError`` for arguments of other types,
     and a sampler beside ``shuffle`` or of a streamed dataset, and ``DatasetError`` if ``ds`` lacks columns.
     """
     keys = {**_LEFT, **_RIGHT, "baseline_m": "baseline_m"} if stereo else _LEFT
     rows = _pictured(ds, ["view_id", *keys.values()])
-    collate = _Collate(keys, Augmentation(crop, flip, seed))
+    augmentation = Augmentation((crop, crop) if isinstance(crop, int | np.integer) else crop, flip, seed)
+    flags = {"shuffle": shuffle, "drop_last": drop_last, "pin_memory": pin_memory, "stereo": stereo}
+    given = (
+        ("batch_size", batch_size, _is_whole(batch_size, 1), "a whole number, 1 or more"),
+        ("num_workers", num_workers, _is_whole(num_workers, 0), "a whole number, 0 or more"),
+        ("sampler", sampler, isinstance(sampler, Iterable | None), "numbers of rows, which can be iterated"),
+        *((name, flag, isinstance(flag, bool), "True or False") for name, flag in flags.items()),
+    )
+    problems = [
+        Problem("invalid", name, f"got {value!r}", expected)
+        for name, value, is_valid, expected in given
+        if not is_valid
+    ]
+    if problems:
+        raise InputError.from_problems("torch_loader", problems)
     if sampler is not None and (shuffle or isinstance(rows, IterableDataset)):
         found = "shuffle" if shuffle else "a streamed dataset, whose rows have no numbers"
         raise InputError(f"torch_loader: sampler is given with {found}, expected only one of both")
-    options = {"num_workers": num_workers, "drop_last": drop_last, "pin_memory": pin_memory}
-    if not isinstance(rows, IterableDataset):
-        return _EpochLoader(rows, collate, batch_size=batch_size, shuffle=shuffle, sampler=sampler, **options)
-    shuffled = rows.shuffle(seed, buffer_size=SHUFFLE_BUFFER) if shuffle else rows
-    return _EpochLoader(_StreamedRows(shuffled), collate, batch_size=batch_size, **options)
+    source: Any
+    if isinstance(rows, IterableDataset):
+        source = _StreamedRows(rows, augmentation, shuffle=shuffle)
+    else:
+        source = _Rows(rows, augmentation)
+        sampler = _SeededSampler(source, seed) if shuffle else sampler
+    return DataLoader(
+        source,
+        batch_size=int(batch_size),  # torch takes no integers of NumPy.
+        sampler=sampler,
+        num_workers=num_workers,
+        collate_fn=partial(_collated, keys),
+        drop_last=drop_last,
+        pin_memory=pin_memory,
+    )
 
 
 def _pictured(ds: Dataset | IterableDataset, columns: Sequence[str]) -> Dataset | IterableDataset:
@@ -205,39 +242,84 @@ def _pictured(ds: Dataset | IterableDataset, columns: Sequence[str]) -> Dataset 
     return rows if has_transform else rows.with_format(None)
 
 
-class _EpochLoader(DataLoader[Any]):
-    """Data loader that counts its iterations, on which the order, crops and flips depend."""
+class _Rows(TorchDataset[Row]):
+    """Rows of a dataset as arrays, with crops and flips."""
 
-    def __init__(self, source: Dataset | _StreamedRows, collate: _Collate, **options: Any) -> None:
-        super().__init__(source, collate_fn=collate, generator=torch.Generator(), **options)
-        self._collate = collate
+    def __init__(self, rows: Dataset, augmentation: Augmentation) -> None:
+        self._rows, self._augmentation = rows, augmentation
+        self._draws = _SharedCounts(torch.zeros(len(rows), dtype=torch.int64))
 
-    def __iter__(self) -> Any:
-        self._collate.epoch += 1
-        self.generator.manual_seed(self._collate.augmentation.seed + self._collate.epoch)
-        if isinstance(self.dataset, _StreamedRows):
-            self.dataset.rows.set_epoch(self._collate.epoch)
-        return super().__iter__()
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def __getitem__(self, position: int) -> Row:
+        return self._augmentation(_arrays(self._rows[index(position)]), self._draws.add(position))
 
 
-class _Collate:
-    """Collate function that decodes and changes rows and stacks them to tensors; it is pickled for workers."""
+class _SeededSampler(RandomSampler):
+    """Order of rows, another one each time, without a generator, which cannot be sent to spawned processes."""
 
-    def __init__(self, keys: Mapping[str, str], augmentation: Augmentation) -> None:
-        self._keys = keys
-        self.augmentation = augmentation
-        self.epoch = -1
+    def __init__(self, rows: _Rows, seed: int) -> None:
+        super().__init__(rows)
+        self._seed = seed
+        self._passes = 0
 
-    def __call__(self, rows: Sequence[Mapping[str, Any]]) -> Batch:
-        rows = [{name: _array(column_kind(name), cell) for name, cell in row.items()} for row in rows]
-        rows = [self.augmentation(row, self.epoch) for row in rows]
-        batch: Batch = {
-            key: _tensor(key, np.stack([row[column] for row in rows]))
-            for key, column in self._keys.items()
-            if rows[0][column] is not None
-        }
-        batch["view_id"] = [row["view_id"] for row in rows]
-        return batch
+    def __iter__(self) -> Iterator[int]:
+        rng = np.random.default_rng([self._seed, self._passes])
+        self._passes += 1
+        return iter(rng.permutation(len(self)).tolist())
+
+
+class _StreamedRows(TorchIterableDataset[Row]):
+    """Rows of a streamed dataset as arrays, with crops and flips; each worker reads other shards."""
+
+    def __init__(self, rows: IterableDataset, augmentation: Augmentation, *, shuffle: bool) -> None:
+        self._rows, self._augmentation, self._shuffle = rows, augmentation, shuffle
+        self._passes = 0
+        self._passes_of_workers = _SharedCounts(torch.zeros(_MOST_WORKERS, dtype=torch.int64))
+
+    def __iter__(self) -> Iterator[Row]:
+        worker = get_worker_info()
+        # Workers divide the shards, so their orders must be equal: the seeds without the numbers of the workers
+        # are, and the passes of persistent ones, which keep their seeds.
+        torch_seed = worker.seed - worker.id if worker else torch.initial_seed()
+        rng = np.random.default_rng([self._augmentation.seed, torch_seed, self._passes])
+        self._passes += 1
+        earlier = self._passes_of_workers.add(worker.id % _MOST_WORKERS if worker else 0)
+        rows = self._rows.shuffle(generator=rng, buffer_size=SHUFFLE_BUFFER) if self._shuffle else self._rows
+        for row in rows:
+            yield self._augmentation(_arrays(row), earlier)
+
+
+class _SharedCounts:
+    """Counts in memory that a process shares with its workers, most of which live for one epoch."""
+
+    def __init__(self, counts: torch.Tensor) -> None:
+        self._counts = counts.share_memory_()  # type: ignore[no-untyped-call]
+
+    def __reduce__(self) -> Any:
+        return _SharedCounts, (self._counts,)  # Copies are shared with their workers too.
+
+    def add(self, position: int) -> int:
+        """Add one to a count and return what it was."""
+        earlier = int(self._counts[position])
+        self._counts[position] = earlier + 1
+        return earlier
+
+
+def _collated(keys: Mapping[str, str], rows: Sequence[Row]) -> Batch:
+    """Stack rows of arrays to tensors, whose ``keys`` are mapped to columns."""
+    batch: Batch = {
+        key: _tensor(key, np.stack([row[column] for row in rows]))
+        for key, column in keys.items()
+        if rows[0][column] is not None
+    }
+    batch["view_id"] = [row["view_id"] for row in rows]
+    return batch
+
+
+def _arrays(row: Row) -> Row:
+    return {name: _array(column_kind(name), cell) for name, cell in row.items()}
 
 
 def _array(kind: str, cell: Any) -> Any:
@@ -262,13 +344,3 @@ def _tensor(key: str, stacked: np.ndarray[Any, Any]) -> torch.Tensor:
     if kind == "rgb":
         return tensor.permute(0, 3, 1, 2)
     return tensor[:, None] if kind in ("depth", "mask") else tensor
-
-
-class _StreamedRows(TorchIterableDataset[Mapping[str, Any]]):
-    """Torch iterable over a streamed dataset; ``datasets`` assigns separate shards to each worker."""
-
-    def __init__(self, rows: IterableDataset) -> None:
-        self.rows = rows
-
-    def __iter__(self) -> Iterator[Mapping[str, Any]]:
-        return iter(self.rows)

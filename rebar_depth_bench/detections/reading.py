@@ -16,7 +16,7 @@ import pyarrow as pa
 from jaxtyping import Float64
 from numpy import ndarray
 
-from rebar_depth_bench.base.errors import Problem, SubmissionError, escape_text
+from rebar_depth_bench.base.errors import Problem, SubmissionError, escape_text, library_message
 from rebar_depth_bench.base.limits import DETECTIONS_BYTES
 from rebar_depth_bench.base.names import config_of, split_of
 from rebar_depth_bench.base.reading import decode_text, open_regular, parse_number, read_file
@@ -269,7 +269,7 @@ def _read_parquet(path: Path, problems: list[Problem]) -> RawDetections | None:
             schema = pa.schema([_SCHEMA.field(name) for name in columns])
             read = file.read(columns=columns).select(columns).cast(schema)
     except Exception as error:  # pyarrow raises many types, which depend on the damage.
-        reason = escape_text(str(error) or type(error).__name__)
+        reason = library_message(error)
         problems.append(Problem("damaged", "", f"cannot be read as a table of detections: {reason}"))
         return None
     numbers = {

@@ -1,9 +1,8 @@
 """Corrections of the mistakes that a diagnosis looks for, each a function of one view, and the errors of a view.
 
-A correction undoes a mistake and returns the errors of the prediction before and after. All but those of units are
-independent of the scale of the predictions. The error of a pixel is that of the rank error, |p - z| / max(p, z),
-between 0 and 1. Pixels without a valid prediction do not count: a correction must not be judged by the places
-where a method has holes.
+A correction undoes a mistake: it returns the depth that the prediction would have been without it. The error of a
+pixel is that of the rank error, |p - z| / max(p, z), between 0 and 1. Pixels without a valid prediction do not
+count: a correction must not be judged by the places where a method has holes.
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int64
@@ -36,7 +36,10 @@ MAX_PIXELS = 4000
 MIN_PIXELS = 50
 """Scored pixels that a view must have to be looked at."""
 
-COLUMNS = (*("left_depth", "left_mask", "right_depth", "right_mask"), *(f"left_{kind}" for kind in CAMERA_SHAPES))
+COLUMNS = (
+    *("left_depth", "left_mask", "right_depth", "right_mask", "baseline_m"),
+    *(f"left_{kind}" for kind in CAMERA_SHAPES),
+)
 """Columns that are looked at."""
 
 
@@ -67,6 +70,7 @@ class DiagnosedView:
 
     position: int
     camera: Camera
+    baseline_m: float
     left: Pixels
     right: Pixels
     prediction: Image
@@ -92,7 +96,8 @@ def positions_to_read(config: DatasetConfig) -> list[int]:
 def diagnosed_view(view: View) -> DiagnosedView:
     """Return what a diagnosis needs of a view. Raises ``EntryError`` for an invalid entry of the archive."""
     left, right = (_pixels(view.cell(f"{eye}_mask"), view.cell(f"{eye}_depth")) for eye in ("left", "right"))
-    return DiagnosedView(view.position, view.camera("left"), left, right, view.prediction_m)
+    baseline_m = float(view.cell("baseline_m"))
+    return DiagnosedView(view.position, view.camera("left"), baseline_m, left, right, view.prediction_m)
 
 
 def _pixels(mask: Bool[ndarray, "h w"] | None, depth_m: Float32[ndarray, "h w"]) -> Pixels:
@@ -102,41 +107,23 @@ def _pixels(mask: Bool[ndarray, "h w"] | None, depth_m: Float32[ndarray, "h w"])
     return Pixels(v, u, depth_m[v, u].astype(np.float64))
 
 
-def pixel_errors(p: Values, z_m: Values, scale: float | None = None) -> Values:
-    """Return the errors of the valid pixels of ``scale * p``, by default after the scale median(z) / median(p)."""
+def mean_error(p: Values, z_m: Values, scale: float | None = None) -> float:
+    """Return the mean error of the valid pixels of ``scale * p``, 1 if there are none.
+
+    The default scale is median(z) / median(p).
+    """
     valid = is_valid_prediction(p)
+    if not valid.any():
+        return 1.0
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         scaled, z_m = p[valid] * (median_ratio(p, z_m) if scale is None else scale), z_m[valid]
-        return np.asarray(np.abs(scaled - z_m) / np.maximum(scaled, z_m))
-
-
-def mean_error(p: Values, z_m: Values, scale: float | None = None) -> float:
-    """Return the mean of ``pixel_errors``, NaN without any; no pixel counts for more than 1."""
-    errors = pixel_errors(p, z_m, scale)
-    return float(np.mean(errors)) if errors.size else math.nan
+        return float(np.mean(np.abs(scaled - z_m) / np.maximum(scaled, z_m)))
 
 
 def median_ratio(p: Values, z_m: Values) -> float:
     """Return median(z) / median(p) over the valid predictions, NaN without any."""
     valid = is_valid_prediction(p)
     return median_scale(p[valid], float(np.median(z_m[valid]))) if valid.any() else math.nan
-
-
-def line_error(p: Values, z_m: Values, of_depth: Callable[[Values], Values]) -> float:
-    """Return the median error after a rising line from p to ``of_depth(z)`` has been fitted.
-
-    ``of_depth`` is a monotonic function that is its own inverse: the identity, or the reciprocal for predictions
-    of disparity. NaN if no line rises.
-    """
-    valid = is_valid_prediction(p)
-    if not valid.any():
-        return math.nan
-    p, z_m = p[valid], z_m[valid]
-    slope, intercept = resistant_line(p, of_depth(z_m))
-    if not slope > 0:
-        return math.nan
-    fitted = slope * p + intercept
-    return _median(pixel_errors(of_depth(np.where(fitted > 0, fitted, np.nan)), z_m, 1.0))
 
 
 def resistant_line(x: Values, y: Values) -> tuple[float, float]:
@@ -153,8 +140,23 @@ def resistant_line(x: Values, y: Values) -> tuple[float, float]:
     return slope, float(np.median(y - slope * x))
 
 
-def _median(errors: Values) -> float:
-    return float(np.median(errors)) if errors.size else math.nan
+def relative_spread(values: Values) -> float:
+    """Return the median deviation of the valid values from their median, as a share of it; 0 without any."""
+    valid = values[is_valid_prediction(values)]
+    with np.errstate(over="ignore", invalid="ignore"):
+        return float(np.median(np.abs(valid / np.median(valid) - 1))) if valid.size else 0.0
+
+
+def rank_correlation(p: Values, z_m: Values) -> float:
+    """Return Spearman's rank correlation of valid predictions with depth, NaN if either has one value only."""
+    valid = is_valid_prediction(p)
+    ranks = []
+    for values in (p[valid], z_m[valid]):
+        _, index, counts = np.unique(values, return_inverse=True, return_counts=True)
+        rank = np.cumsum(counts) - counts / 2  # Equal values share the mean of their ranks.
+        ranks.append(rank[index] - len(values) / 2)
+    norms = np.linalg.norm(ranks, axis=1)
+    return float(np.dot(*ranks) / np.prod(norms)) if norms.all() else math.nan
 
 
 def valid_share(p: Values) -> float:
@@ -165,13 +167,14 @@ def valid_share(p: Values) -> float:
 ReadPrediction = Callable[[int], Image]
 """Function that returns the prediction submitted for the view at a position of the config."""
 
-UNITS: Mapping[str, float] = {
-    "millimetres": 1000.0,
-    "centimetres": 100.0,
-    "inches": 1 / 0.0254,
-    "feet": 1 / 0.3048,
-}
+UNITS: Mapping[str, float] = {"millimetres": 1000.0, "centimetres": 100.0, "inches": 1 / 0.0254}
 """Units in a metre."""
+UNIT_TOLERANCE = 0.3
+"""Largest natural logarithm of a factor, divided by the number of units in a metre, that suggests the unit."""
+LARGEST_SCALE = 20.0
+"""Factor up to which, or of 1 divided by it, a wrong scale is an error of the method; networks reach 12.6."""
+SCALE_DEVIATION = 0.1
+"""Least standard deviation over the views of the logarithm of a scale that no mistake explains."""
 LOGARITHMS: Mapping[str, tuple[str, float]] = {
     "log": ("natural logarithms of depth in metres", 1.0),
     "log10": ("logarithms of depth in metres to base 10", math.log(10)),
@@ -181,12 +184,8 @@ LOGARITHM_TOLERANCE = 0.3
 """Largest natural logarithm of a view's scale after a logarithm is undone; that of sound depth is above 0.8."""
 NORMALISED_TOLERANCE = 0.005
 """Largest deviation from 1 of the largest value of a picture that was divided by its largest value."""
-UNIT_TOLERANCE = 0.06
-"""Largest deviation of a view's scale from that of a unit, as a share of the unit's logarithm.
-
-A wrong scale can have any size, so that the deviation must be the smaller the closer a unit is to the metre: a
-factor of 1.5 for millimetres, of 1.07 for feet.
-"""
+RELATIVE = '; if the network is relative, declare kind="{}" (prediction= of SubmissionWriter)'
+"""Remedy of predictions that a kind other than metric describes."""
 MAX_SHIFT_PX = 6
 """Largest shift that is looked for, pixels."""
 BETTER_THAN_PLANE = 0.7
@@ -194,82 +193,75 @@ BETTER_THAN_PLANE = 0.7
 
 A line fitted to predictions that have nothing to do with depth is such a plane.
 """
-LEAST_VALID_SHARE = 0.8
-"""Least number of valid pixels after a correction, as a share of those before."""
-
-
-@dataclass(frozen=True)
-class Errors:
-    """Errors of a view's prediction as it was submitted, and after a correction; NaN where there is none."""
-
-    before: float
-    after: float
 
 
 @dataclass(frozen=True)
 class Correction:
-    """Correction of a mistake: what the predictions seem to be, what the errors are, and the errors of a view.
+    """Correction of a mistake: what the predictions seem to be, and the depth without it at the pixels of an eye.
 
-    A view is clearly better after the correction if its error is at most ``clearly_better`` of that before.
-    ``remedy`` ends the description of the mistake.
+    ``corrected`` returns NaN where there is none. Its errors and those of the prediction are compared as they are
+    (``scale`` is None), after the scale of each view, or after one scale of all views, since a wrong order and
+    inverse depth show between the views even where the range of depth within each is too small. A view is clearly
+    better after the correction if its error is at most ``clearly_better`` of that before. ``remedy`` ends the
+    description of the mistake.
     """
 
     name: str
     seems: str
-    measure: str
-    errors: Callable[[DiagnosedView], Errors]
+    corrected: Callable[[DiagnosedView], Values]
+    scale: Literal["view", "all"] | None = "view"
+    eye: Literal["left", "right"] = "left"
     clearly_better: float = 0.8
     remedy: str = ""
 
 
-def unit_corrections() -> list[Correction]:
-    """Return the corrections of depth in other units than metres: those of ``UNITS``, or the largest value."""
-    units = [
-        Correction(unit, f"in {unit}", "mean error", partial(_unit_errors, units_in_metre=units_in_metre))
-        for unit, units_in_metre in UNITS.items()
-    ]
+def unit_corrections(views: Sequence[DiagnosedView], depth_scale: float | None = None) -> list[Correction]:
+    """Return the corrections of depth divided by its largest value, and of the factor of all views if it is one.
+
+    ``depth_scale`` is that of an archive of PNG images.
+    """
     seems = "depth divided by the largest value of each picture"
-    return [*units, Correction("normalised", seems, "mean error", _normalised_errors)]
+    hint = RELATIVE.format("scale")
+    corrections = [Correction("normalised", seems, _without_normalisation, scale=None, remedy=hint)]
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        scales = np.log([median_ratio(view.p, view.left.depth_m) for view in views if valid_share(view.p)])
+        factor, deviation = float(1 / np.exp(np.median(scales))), np.std(scales)
+    if deviation < SCALE_DEVIATION and not 1 / LARGEST_SCALE <= factor <= LARGEST_SCALE:
+        name, seems = "factor", f"{factor:.4g} times the depth in metres"
+        for unit, units_in_metre in UNITS.items():
+            if abs(math.log(factor / units_in_metre)) <= UNIT_TOLERANCE:
+                name, seems, factor, hint = unit, f"in {unit}, {seems}", units_in_metre, ""
+        if depth_scale:
+            hint = f"; depth_scale is {depth_scale:g}, try {depth_scale / factor:.3g}"
+        corrected = partial(_without_factor, factor=factor)
+        corrections.append(Correction(name, seems, corrected, scale=None, remedy=hint))
+    return corrections
 
 
-def _unit_errors(view: DiagnosedView, units_in_metre: float) -> Errors:
-    p, z_m = view.p, view.left.depth_m
-    before, scale = mean_error(p, z_m, 1.0), median_ratio(p, z_m) * units_in_metre
-    # One depth for every pixel can be near any unit by chance.
-    is_unit = scale > 0 and abs(math.log(scale)) <= UNIT_TOLERANCE * math.log(units_in_metre) and np.ptp(p) != 0
-    return Errors(before, mean_error(p, z_m, 1 / units_in_metre) if is_unit else math.nan)
+def _without_factor(view: DiagnosedView, factor: float) -> Values:
+    return view.p / factor
 
 
-def _normalised_errors(view: DiagnosedView) -> Errors:
-    p, z_m = view.p, view.left.depth_m
+def _without_normalisation(view: DiagnosedView) -> Values:
     valid = view.prediction[is_valid_prediction(view.prediction)]
-    is_normalised = valid.size and abs(valid.max() - 1) <= NORMALISED_TOLERANCE and np.ptp(p) != 0
-    return Errors(mean_error(p, z_m, 1.0), mean_error(p, z_m) if is_normalised else math.nan)
+    is_normalised = valid.size and abs(valid.max() - 1) <= NORMALISED_TOLERANCE and np.ptp(view.p) != 0
+    return view.p * (median_ratio(view.p, view.left.depth_m) if is_normalised else math.nan)
 
 
 def logarithm_corrections() -> list[Correction]:
     """Return the corrections of logarithms of depth, of which those of depth below a metre are no valid depth."""
-    measure = f"{_SCALED}, 100 % at values of 0 and less,"
     return [
-        Correction(name, seems, measure, partial(_logarithm_errors, log_base=log_base))
+        Correction(name, seems, partial(_without_logarithm, log_base=log_base))
         for name, (seems, log_base) in LOGARITHMS.items()
     ]
 
 
-def _logarithm_errors(view: DiagnosedView, log_base: float) -> Errors:
-    p = view.p
-    finite = np.isfinite(p)  # Holes of a method do not count.
-    if not finite.any():
-        return Errors(math.nan, math.nan)
-    p, z_m = p[finite], view.left.depth_m[finite]
-    coverage = valid_share(p)
-    before = 1 - coverage * (1 - mean_error(p, z_m)) if coverage else 1.0
+def _without_logarithm(view: DiagnosedView, log_base: float) -> Values:
     with np.errstate(over="ignore", under="ignore"):
-        depth_m = np.exp(p * log_base)
-    scale = median_ratio(depth_m, z_m)
-    is_logarithm = scale > 0 and abs(math.log(scale)) <= LOGARITHM_TOLERANCE and np.ptp(p) != 0
-    is_comparable = is_logarithm and valid_share(depth_m) >= LEAST_VALID_SHARE
-    return Errors(before, mean_error(depth_m, z_m) if is_comparable else math.nan)
+        depth_m = np.exp(view.p * log_base)
+    scale = median_ratio(depth_m, view.left.depth_m)
+    is_logarithm = scale > 0 and abs(math.log(scale)) <= LOGARITHM_TOLERANCE
+    return depth_m if is_logarithm else np.full_like(depth_m, np.nan)
 
 
 def shape_corrections(views: Sequence[DiagnosedView], read: ReadPrediction, count: int) -> list[Correction]:
@@ -277,31 +269,30 @@ def shape_corrections(views: Sequence[DiagnosedView], read: ReadPrediction, coun
     height, width = views[0].prediction.shape
     turns = {**_TURNS, **(_QUARTER_TURNS if height == width else {})}
     dv, du = best_shift(views)
-    hint = '; if the network is relative, declare kind="affine-disparity" (prediction= of SubmissionWriter)'
+    pixels = "disparity in pixels instead of depth, which is focal length times baseline / disparity"
+    inverse = "disparity or inverse depth instead of depth"
+    hint = RELATIVE.format("affine-disparity")
     ray = "distances along the rays instead of depth along the optical axis"
     # Range and shift change most pixels by less than the errors of a method. The sound predictions of those in
     # "tests.mistakes" are not better than 0.98 after these corrections.
     corrections = [
-        Correction("range", ray, _SCALED, _range_errors, clearly_better=0.95),
-        Correction(
-            "inverse", "disparity or inverse depth instead of depth", _FITTED, _inverse_errors, remedy=hint
-        ),
-        Correction("right-eye", "those of the right pictures", _SCALED, _right_eye_errors),
+        Correction("range", ray, _planar_depth, clearly_better=0.95),
+        Correction("disparity", pixels, _depth_of_disparity, scale=None, clearly_better=0.5),
+        Correction("inverse", inverse, _inverse, scale="all", clearly_better=0.7, remedy=hint),
+        Correction("inverse", f"{inverse}, with a shift", _shifted_inverse, scale="all", remedy=hint),
+        Correction("right-eye", "those of the right pictures", _at_right_pixels, eye="right"),
     ]
     for name, (seems, turn) in turns.items():
-        corrections.append(Correction(name, seems, _SCALED, partial(_turned_errors, turn=turn)))
+        corrections.append(Correction(name, seems, partial(_turned, turn=turn)))
     for name, (order, source) in _orders(count).items():
-        errors = partial(_order_errors, source=source, read=read)
-        corrections.append(Correction(name, f"those of other views: {order}", _SCALED, errors))
+        corrected = partial(_of_other_view, source=source, read=read, count=count)
+        corrections.append(Correction(name, f"those of other views: {order}", corrected, scale="all"))
     if (dv, du) != (0, 0):
         seems = f"shifted by {du:+d} columns and {dv:+d} rows"
-        errors = partial(_shift_errors, dv=dv, du=du)
-        corrections.append(Correction("shift", seems, _SCALED, errors, clearly_better=0.9))
+        corrections.append(Correction("shift", seems, partial(_shifted, dv=dv, du=du), clearly_better=0.9))
     return corrections
 
 
-_SCALED = "mean error after scaling"
-_FITTED = "median error after scaling and shifting"
 _TURNS: Mapping[str, tuple[str, Callable[[Image], Image]]] = {
     "mirrored": ("mirrored left to right", np.fliplr),
     "upside-down": ("mirrored upside down", np.flipud),
@@ -317,14 +308,17 @@ _QUARTER_TURNS: Mapping[str, tuple[str, Callable[[Image], Image]]] = {
 
 
 def _orders(count: int) -> Mapping[str, tuple[str, Callable[[int], int]]]:
-    """Return the wrong orders of ``count`` views, each with the position at which a view's prediction stands."""
+    """Return the wrong orders of ``count`` views, each with the position at which a view's prediction stands.
+
+    A position outside the config means that the prediction of the view is missing.
+    """
     as_text = sorted(range(count), key=str)
     position = {view: n for n, view in enumerate(as_text)}
     sorted_as_text = "sorted by numbers as text, 0, 1, 10, 100"
     return {
         "reversed": ("in reverse order", lambda view: count - 1 - view),
-        "one-early": ("each is that of the next view", lambda view: max(view - 1, 0)),
-        "one-late": ("each is that of the view before", lambda view: min(view + 1, count - 1)),
+        "one-early": ("each is that of the next view", lambda view: view - 1),
+        "one-late": ("each is that of the view before", lambda view: view + 1),
         "as-text": (sorted_as_text, lambda view: position[view]),
         "from-text": (f"read as if they had been {sorted_as_text}", lambda view: as_text[view]),
     }
@@ -339,46 +333,51 @@ def best_shift(views: Sequence[DiagnosedView]) -> tuple[int, int]:
     shifts = sorted(
         ((dv, du) for dv in steps for du in steps), key=lambda shift: (abs(shift[0]) + abs(shift[1]), shift)
     )
-    return min(shifts, key=lambda shift: math.fsum(_shift_errors(view, *shift).after for view in views))
+    return min(
+        shifts,
+        key=lambda shift: math.fsum(mean_error(_shifted(view, *shift), view.left.depth_m) for view in views),
+    )
 
 
-def _shift_errors(view: DiagnosedView, dv: int, du: int) -> Errors:
-    return _errors(view, view.left.values(view.prediction, dv, du))
+def _shifted(view: DiagnosedView, dv: int, du: int) -> Values:
+    return view.left.values(view.prediction, dv, du)
 
 
-def _range_errors(view: DiagnosedView) -> Errors:
+def _planar_depth(view: DiagnosedView) -> Values:
     range_per_depth = np.linalg.norm(view.camera.rays(), axis=-1)[view.left.v, view.left.u]
-    return _errors(view, view.p / range_per_depth)
+    return np.asarray(view.p / range_per_depth)
 
 
-def _inverse_errors(view: DiagnosedView) -> Errors:
-    """Return the errors of lines fitted to depth and to inverse depth, because disparity often has an offset."""
+def _inverse(view: DiagnosedView) -> Values:
+    with np.errstate(divide="ignore", over="ignore", invalid="ignore"):
+        return 1 / view.p
+
+
+def _depth_of_disparity(view: DiagnosedView) -> Values:
+    return np.asarray(view.camera.K[0, 0] * view.baseline_m * _inverse(view))
+
+
+def _shifted_inverse(view: DiagnosedView) -> Values:
+    """Return the depth of a line fitted to inverse depth, because disparity often has an offset."""
     p, z_m = view.p, view.left.depth_m
-    as_depth, as_inverse = line_error(p, z_m, np.positive), line_error(p, z_m, np.reciprocal)
-    # A plane at the median depth is the line fitted to nothing but noise; no rising line describes more.
-    plane = _median(pixel_errors(np.ones_like(z_m), z_m))
-    before = plane if math.isnan(as_depth) else as_depth
-    return Errors(before, as_inverse if as_inverse <= BETTER_THAN_PLANE * plane else math.nan)
+    valid = is_valid_prediction(p)
+    slope, intercept = resistant_line(p[valid], 1 / z_m[valid]) if valid.any() else (0.0, 0.0)
+    with np.errstate(invalid="ignore"):
+        inverse = slope * p + intercept
+    depth_m = np.divide(1, inverse, out=np.full_like(p, np.nan), where=valid & (inverse > 0))
+    plane_error = mean_error(np.ones_like(z_m), z_m)
+    is_better = slope > 0 and mean_error(depth_m, z_m, 1.0) <= BETTER_THAN_PLANE * plane_error
+    return depth_m if is_better else np.full_like(p, np.nan)
 
 
-def _right_eye_errors(view: DiagnosedView) -> Errors:
-    return _errors(view, view.right.values(view.prediction), view.right.depth_m)
+def _at_right_pixels(view: DiagnosedView) -> Values:
+    return view.right.values(view.prediction)
 
 
-def _turned_errors(view: DiagnosedView, turn: Callable[[Image], Image]) -> Errors:
-    return _errors(view, view.left.values(turn(view.prediction)))
+def _turned(view: DiagnosedView, turn: Callable[[Image], Image]) -> Values:
+    return view.left.values(turn(view.prediction))
 
 
-def _order_errors(view: DiagnosedView, source: Callable[[int], int], read: ReadPrediction) -> Errors:
-    return _errors(view, view.left.values(read(source(view.position))))
-
-
-def _errors(view: DiagnosedView, corrected: Values, corrected_z_m: Values | None = None) -> Errors:
-    """Return the errors after scaling of the prediction, and of the corrected values unless fewer are valid.
-
-    ``corrected_z_m`` is the true depth of the corrected values, by default that of the left eye.
-    """
-    p, z_m = view.p, view.left.depth_m
-    is_comparable = valid_share(corrected) >= LEAST_VALID_SHARE * valid_share(p)
-    after = mean_error(corrected, z_m if corrected_z_m is None else corrected_z_m) if is_comparable else math.nan
-    return Errors(mean_error(p, z_m), after)
+def _of_other_view(view: DiagnosedView, source: Callable[[int], int], read: ReadPrediction, count: int) -> Values:
+    position = source(view.position)
+    return view.left.values(read(position)) if 0 <= position < count else np.full_like(view.p, np.nan)

@@ -14,12 +14,17 @@ from rebar_depth_bench.diagnosis.corrections import (
     COLUMNS,
     Correction,
     DiagnosedView,
-    Errors,
+    Values,
     diagnosed_view,
     logarithm_corrections,
+    mean_error,
+    median_ratio,
     positions_to_read,
+    rank_correlation,
+    relative_spread,
     shape_corrections,
     unit_corrections,
+    valid_share,
 )
 from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.scoring.relative import has_value
@@ -38,6 +43,12 @@ LEAST_ERROR = 0.002
 """Error from which a prediction is worth correcting."""
 SMALLEST_RATIO = 1e-6
 """Bound of the ratios of errors, for predictions that a correction makes exact."""
+LEAST_VALID_SHARE = 0.5
+"""Least number of valid pixels after a correction, as a share of those before."""
+LEAST_SPREAD = 0.1
+"""Least relative spread of corrected depth within a view, as a share of that of the true depth."""
+LEAST_RANK_CORRELATION = 0.5
+"""Rank correlation of corrected and true depth, over all views, up to which the correction explains nothing."""
 
 
 @dataclass(frozen=True)
@@ -83,30 +94,33 @@ def diagnose_config(
 
     if len(views) < MIN_VIEWS:
         return []
-    invalid = invalid_values(config.name, views, kind)
+    invalid = invalid_values(config, views, kind)
     if invalid is None and is_same_map(views):
-        text = (
-            f"the predictions of {config.name} seem to be one picture: {len(views)} of {len(views)} are identical"
-        )
+        count = _count(len(views), views, config)
+        text = f"the predictions of {config.name} seem to be one picture: they are identical in {count}"
         return [PossibleMistake(config.name, "same-map", text)]
     if kind != METRIC:
-        found = [invalid or _constant_values(config.name, views)]
+        found = [invalid or _constant_values(config, views)]
     elif invalid is not None:
-        found = [invalid, best_mistake(config.name, views, logarithm_corrections())]
+        found = [invalid, best_mistake(config, views, logarithm_corrections())]
     else:
+        units = unit_corrections(views, submission.meta.depth_scale if submission.meta else None)
         others = [*shape_corrections(views, read, len(config.views)), *logarithm_corrections()]
-        found = [best_mistake(config.name, views, corrections) for corrections in (unit_corrections(), others)]
+        of_units, other = (best_mistake(config, views, corrections) for corrections in (units, others))
+        found = [other] if other and other.name == "inverse" else [of_units, other]  # It has no unit of depth.
     return [mistake for mistake in found if mistake]
 
 
-def _constant_values(config: str, views: Sequence[DiagnosedView]) -> PossibleMistake | None:
+def _constant_values(config: DatasetConfig, views: Sequence[DiagnosedView]) -> PossibleMistake | None:
     """Return the mistake of predictions that have one value in most of the views; None if they have several."""
     count = sum(bool((view.p == view.p[0]).all()) for view in views)
-    text = f"the predictions of {config} are the same at all pixels in {count} of {len(views)} views"
-    return PossibleMistake(config, "constant", text) if count >= MOST_VIEWS * len(views) else None
+    text = f"the predictions of {config.name} are the same at all pixels in {_count(count, views, config)}"
+    return PossibleMistake(config.name, "constant", text) if count >= MOST_VIEWS * len(views) else None
 
 
-def invalid_values(config: str, views: Sequence[DiagnosedView], kind: str = METRIC) -> PossibleMistake | None:
+def invalid_values(
+    config: DatasetConfig, views: Sequence[DiagnosedView], kind: str = METRIC
+) -> PossibleMistake | None:
     """Return the mistake of predictions that hardly anywhere have a value of their kind; None if they do."""
     p = np.concatenate([view.p for view in views])
     valid = float(np.mean(has_value(p, kind)))
@@ -118,13 +132,14 @@ def invalid_values(config: str, views: Sequence[DiagnosedView], kind: str = METR
         "NaN": float(np.isnan(p).mean()),
         "zero": float((p == 0).mean()),
     }
-    name = "valid depth" if kind == METRIC else "valid"
+    what = "valid depth" if kind == METRIC else "valid"
+    listed = ", ".join(f"{_percent(share)} are {name}" for name, share in shares.items())
     text = (
-        f"the predictions of {config} are hardly anywhere {name}: of the scored pixels looked at in "
-        f"{len(views)} views, {', '.join(f'{_percent(share)} are {name}' for name, share in shares.items())} and "
+        f"the predictions of {config.name} are hardly anywhere {what}: of the scored pixels looked at in "
+        f"{len(views)} of {len(config.views)} views, {listed} and "
         f"{_percent(valid)} are finite{'' if kind.startswith('affine') else ' and above 0'}"
     )
-    return PossibleMistake(config, max(shares, key=lambda name: shares[name]).lower(), text)
+    return PossibleMistake(config.name, max(shares, key=lambda name: shares[name]).lower(), text)
 
 
 def is_same_map(views: Sequence[DiagnosedView]) -> bool:
@@ -135,35 +150,67 @@ def is_same_map(views: Sequence[DiagnosedView]) -> bool:
 
 
 def best_mistake(
-    config: str, views: Sequence[DiagnosedView], corrections: Sequence[Correction]
+    config: DatasetConfig, views: Sequence[DiagnosedView], corrections: Sequence[Correction]
 ) -> PossibleMistake | None:
     """Return the mistake whose correction reduces the errors most.
 
-    None if no correction makes most of the views, and the geometric mean over all views, clearly better.
+    None if no correction makes most of the views, and the geometric mean over all views, clearly better, and gives
+    depth whose ranks, over all views, are those of the true depth.
     """
-    found: dict[float, PossibleMistake] = {}
+    best, best_ratio = None, math.inf
+    left = [(view.p, view.left.depth_m) for view in views]
     for correction in corrections:
-        errors = [correction.errors(view) for view in views]
-        better = [one for one in errors if _ratio(one) <= correction.clearly_better]
-        mean_ratio = math.exp(math.fsum(math.log(_ratio(one)) for one in errors) / len(views))
-        if len(better) >= MOST_VIEWS * len(views) and mean_ratio <= correction.clearly_better:
-            before, after = (
-                float(np.median([getattr(one, name) for one in better])) for name in ("before", "after")
-            )
+        corrected = [(correction.corrected(view), getattr(view, correction.eye).depth_m) for view in views]
+        before, after = scaled_errors(left, correction.scale), scaled_errors(corrected, correction.scale)
+        ratios = [
+            max(new / old, SMALLEST_RATIO) if old >= LEAST_ERROR and _is_comparable(correction, p, *one) else 1.0
+            for old, new, (p, _), one in zip(before, after, left, corrected, strict=True)
+        ]
+        better = [n for n, ratio in enumerate(ratios) if ratio <= correction.clearly_better]
+        mean_ratio = math.exp(math.fsum(map(math.log, ratios)) / len(views))
+        if (
+            len(better) >= MOST_VIEWS * len(views)
+            and mean_ratio <= correction.clearly_better
+            and mean_ratio < best_ratio
+            and rank_correlation(*map(np.concatenate, zip(*corrected, strict=True))) > LEAST_RANK_CORRELATION
+        ):
+            measure = f"mean error{_MEASURES[correction.scale]}"
+            old, new = (float(np.median([errors[n] for n in better])) for errors in (before, after))
             text = (
-                f"the predictions of {config} seem to be {correction.seems}: the {correction.measure} is "
-                f"{_percent(before)}, and {_percent(after)} if that is undone, "
-                f"in {len(better)} of {len(views)} views{correction.remedy}"
+                f"the predictions of {config.name} seem to be {correction.seems}: the {measure} is "
+                f"{_percent(old)}, and {_percent(new)} if that is undone, "
+                f"in {_count(len(better), views, config)}{correction.remedy}"
             )
-            found[mean_ratio] = PossibleMistake(config, correction.name, text)
-    return found[min(found)] if found else None
+            best, best_ratio = PossibleMistake(config.name, correction.name, text), mean_ratio
+    return best
 
 
-def _ratio(errors: Errors) -> float:
-    """Return the error after a correction as a share of that before; 1 where nothing is to be corrected."""
-    if not errors.before >= LEAST_ERROR or math.isnan(errors.after):
-        return 1.0
-    return max(errors.after / errors.before, SMALLEST_RATIO)
+_MEASURES = {None: "", "view": " after scaling", "all": " after the same scaling of all views"}
+
+
+def scaled_errors(pairs: Sequence[tuple[Values, Values]], scale: str | None) -> list[float]:
+    """Return the mean error of each view, of pairs of predicted and true depth, after ``Correction.scale``."""
+    if scale != "all":
+        return [mean_error(p, z_m, 1.0 if scale is None else None) for p, z_m in pairs]
+    ratios = [median_ratio(p, z_m) for p, z_m in pairs if valid_share(p)]
+    one_scale = float(np.median(ratios)) if ratios else 1.0
+    return [mean_error(p, z_m, one_scale) for p, z_m in pairs]
+
+
+def _is_comparable(correction: Correction, p: Values, corrected: Values, z_m: Values) -> bool:
+    """Return whether a correction keeps enough valid pixels of a view and is no plane at one depth.
+
+    After the scale of a view, such a plane, as of filled holes, has smaller errors than many a method.
+    """
+    is_plane = relative_spread(corrected) < LEAST_SPREAD * relative_spread(z_m)
+    enough_valid = valid_share(corrected) >= LEAST_VALID_SHARE * valid_share(p)
+    return enough_valid and not (is_plane and correction.scale == "view")
+
+
+def _count(found: int, views: Sequence[DiagnosedView], config: DatasetConfig) -> str:
+    """Return in how many of the views looked at something was found, and of how many views these are."""
+    total = len(config.views)
+    return f"{found} of {len(views)} views" + (f" looked at, of {total}" if len(views) < total else "")
 
 
 def _percent(share: float) -> str:

@@ -16,7 +16,7 @@ from jaxtyping import Float, Float64, Int64
 from numpy import ndarray
 
 from rebar_depth_bench.extended.steel import SteelTruth
-from rebar_depth_bench.scoring.columns import Better, Column
+from rebar_depth_bench.scoring.columns import Better, Column, coverage_percent
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
 
 EXTENDED_PROTOCOL = "rebar-extended-5"
@@ -103,6 +103,7 @@ class Measure:
             better=self.better,
             decimals=2 if is_ratio else _DECIMALS[self.unit],
             factor=100.0 if self.unit == "%" else 1.0,
+            as_text=coverage_percent if self.name.endswith("_coverage") else None,
         )
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
 import importlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,7 @@ from numpy import ndarray
 
 from rebar_depth_bench.base.errors import MethodError, install_command
 from rebar_depth_bench.base.parallel import Progress
+from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.data.rows import POSE_COLUMNS, TRUTH_COLUMNS, Views
 from rebar_depth_bench.submission.declaration import METRIC, PREDICTION_KINDS
 
@@ -137,6 +139,19 @@ def input_class(method: AnyMethod) -> str | None:
     if "left_rgb" in info.columns:
         return "rgb+K" if info.uses_intrinsics else "rgb"
     return None
+
+
+def files_digest(paths: Iterable[Path]) -> str:
+    """Return the hex SHA-256 over the names and SHA-256 digests of a method's files, in the order of ``paths``.
+
+    Folders do not enter the digest, so that copies elsewhere have the same one. Raises ``MethodError`` if a file
+    cannot be read, or if it is a pointer of git LFS.
+    """
+    try:
+        lines = [f"{path.name} {file_sha256(path)}\n" for path in paths]
+    except OSError as error:
+        raise MethodError(f"{error.filename}: cannot be read: {error.strerror}") from None
+    return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
 def positive_or_nan(depth_m: Float[ndarray, "*grid"]) -> Float32[ndarray, "*grid"]:

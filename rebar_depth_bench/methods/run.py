@@ -82,7 +82,7 @@ def predict_views(
             _DeclaredViews(one.source, method.info) if isinstance(one, ConfigViews) else one for one in scenes
         ]
         for config in views:
-            with _wrap_errors(f"{method.info.name}: {config.config}: check"):
+            with wrap_errors(f"{method.info.name}: {config.config}: check"):
                 method.check(config)
     # Loading comes first so that its errors occur before anything is written.
     loaded = _load_method(method) if isinstance(method, Method) else None
@@ -149,7 +149,7 @@ def dataset_views(
     having_split = [name for name, config in folder.config_by_name.items() if split in config.splits]
     chosen = [ConfigViews(folder.config(name).of_split(split)) for name in dict.fromkeys(names or having_split)]
     if not chosen:
-        raise DatasetError(f"{folder.root}: no config has the split {escape_text(split)}")
+        raise DatasetError(f"{folder.root}: no config has the split {escape_text(str(split))}")
     return chosen
 
 
@@ -167,7 +167,7 @@ def _predict_config(
         predictor, columns = rectifying_predictor(predictor, columns, method.info.prediction)
     for count, row in enumerate(views.rows(*columns, skip=done), start=len(done) + 1):
         start = time.perf_counter()
-        with _wrap_errors(f"{method.info.name}: {row['view_id']}: the predictor, given {', '.join(row)}"):
+        with wrap_errors(f"{method.info.name}: {row['view_id']}: the predictor, given {', '.join(row)}"):
             prediction = predictor(row)
         what = f"{method.info.name}: {row['view_id']}: the method returned"
         depth_m = depth_map(what, prediction, views.grid, MethodError)
@@ -177,7 +177,7 @@ def _predict_config(
 
 def _load_method(method: Method) -> Predictor:
     """Return the predictor of a single-view method. Raises ``MethodError`` if ``load`` fails."""
-    with _wrap_errors(f"{method.info.name}: load"):
+    with wrap_errors(f"{method.info.name}: load"):
         predictor = method.load()
     if not callable(predictor):
         raise MethodError(
@@ -187,7 +187,7 @@ def _load_method(method: Method) -> Predictor:
 
 
 @contextmanager
-def _wrap_errors(what: str) -> Iterator[None]:
+def wrap_errors(what: str) -> Iterator[None]:
     """Convert exceptions of a method's code into ``MethodError`` with ``what`` failed and the source line.
 
     Errors of this project (``RebarDepthError``) pass unchanged, and a full disk is no failure of the method.
@@ -209,7 +209,7 @@ def _first_row_report(method: AnyMethod, views: Views) -> PreparationReport | No
     if not isinstance(method, Method) or method.notes is None:
         return None
     row = next(views.rows(*method.info.columns))
-    with _wrap_errors(f"{method.info.name}: {views.config}: notes"):
+    with wrap_errors(f"{method.info.name}: {views.config}: notes"):
         return PreparationReport(notes=_plain_notes(method, views.config, method.notes(row)), seconds=None)
 
 
@@ -232,7 +232,7 @@ def _prepare_method(method: AnyMethod, views: Views, kept: KeptViews, progress: 
     work = kept.work_folder(views.config)
     started_from_scratch = not any(work.iterdir())
     start = time.perf_counter()
-    with _wrap_errors(f"{method.info.name}: {views.config}: prepare"):
+    with wrap_errors(f"{method.info.name}: {views.config}: prepare"):
         prepared = method.prepare(views, work, progress)
     if not isinstance(prepared, Prepared):
         raise MethodError(f"{method.info.name}: prepare returned {type(prepared).__name__}, expected a Prepared")

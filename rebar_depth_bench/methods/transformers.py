@@ -28,8 +28,14 @@ from numpy import ndarray
 
 from rebar_depth_bench.base.errors import MethodError, install_command
 from rebar_depth_bench.base.validation import short_repr
-from rebar_depth_bench.data.files import files_digest
-from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor, finite_or_nan, positive_or_nan
+from rebar_depth_bench.methods.base import (
+    Method,
+    MethodInfo,
+    Predictor,
+    files_digest,
+    finite_or_nan,
+    positive_or_nan,
+)
 from rebar_depth_bench.methods.paper.third_party import (
     CONFIG,
     Network,

@@ -121,7 +121,11 @@ class LeaderboardClient:
     """Client for the leaderboard at ``url`` that authenticates with ``token``; a context manager."""
 
     def __init__(self, url: str, token: str) -> None:
-        """Open an HTTP client; raise ``InputError`` if ``httpx2`` is not installed or the token is not ASCII."""
+        """Open an HTTP client.
+
+        Raises ``InputError`` if ``httpx2`` is not installed, the token is not ASCII, or the environment names a
+        proxy or certificates that cannot be used.
+        """
         if not token.isascii() or not token.isprintable():
             raise InputError("the token has other characters than printable ASCII, expected it as it was issued")
         require_extra("submit", ["httpx2"])
@@ -130,6 +134,7 @@ class LeaderboardClient:
         self._http: Any = httpx2
         self._url = url.rstrip("/")
         self._token = token
+        self._peer: tuple[str, int] | None = None
         self._client = self._new_client()
 
     def __enter__(self) -> Self:
@@ -249,33 +254,67 @@ class LeaderboardClient:
         try:
             return call_until(end, lambda: self._exchange(client, method, path, content), self._abandon)
         except DeadlineError:
-            raise ServiceError(f"{self._url}: no complete response within the time limit") from None
+            raise ServiceError(f"{self._where()}: no complete response within the time limit") from None
         except (self._http.InvalidURL, self._http.UnsupportedProtocol) as error:
             raise InputError(f"{self._url!r}: is not a valid URL, expected http://HOST:PORT: {error}") from None
         except self._http.HTTPError as error:
             found = _one_line(str(error)) or type(error).__name__
-            raise ServiceError(f"{self._url}: no response: {found}") from None
+            raise ServiceError(f"{self._where()}: no response: {found}") from None
 
     def _exchange(self, client: Any, method: str, path: str, content: dict[str, Any]) -> _Response:
-        max_bytes, body = JSON_BYTES.value(), bytearray()
-        with client.stream(method, f"{self._url}/api/v1/{path}", **content) as response:
+        def trace(event: str, info: Mapping[str, Any]) -> None:
+            if event.endswith("connect_tcp.started"):
+                self._peer = info["host"], info["port"]
+
+        max_bytes, body, url = JSON_BYTES.value(), bytearray(), f"{self._url}/api/v1/{path}"
+        with client.stream(method, url, extensions={"trace": trace}, **content) as response:
             for chunk in response.iter_raw():
                 body += chunk
                 if len(body) > max_bytes:
                     expected = JSON_BYTES.allowed("bytes")
                     raise AnswerError(f"{self._url}: the response is too large, expected {expected}")
-            return _Response(self._url, response.status_code, bytes(body))
+            return _Response(self._where(), response.status_code, bytes(body))
+
+    def _where(self) -> str:
+        """Return the address of the service, with the proxy to which the last connection was made, if any."""
+        if self._peer is None:
+            return self._url
+        url = self._http.URL(self._url)
+        if self._peer == (url.raw_host.decode(), url.port or {"http": 80, "https": 443}[url.scheme]):
+            return self._url
+        host, port = self._peer
+        names = _set_variables(f"{url.scheme}_proxy", "all_proxy")
+        return f"{self._url}, through the proxy {host}:{port} ({names}; NO_PROXY={url.host} avoids it)"
 
     def _new_client(self) -> Any:
         # A compressed body could be far larger than what is received.
         headers = {"Authorization": f"Bearer {self._token}", "Accept-Encoding": "identity"}
         timeout = self._http.Timeout(30.0, read=UPLOAD_TIMEOUT_S)
-        return self._http.Client(headers=headers, timeout=timeout, follow_redirects=False)
+        certificates = "ssl_cert_file" if os.environ.get("SSL_CERT_FILE") else "ssl_cert_dir"
+        folders = os.environ.get("SSL_CERT_DIR", "") if certificates == "ssl_cert_dir" else ""
+        try:
+            if folders and not any(map(os.path.isdir, folders.split(os.pathsep))):  # It would be as if empty.
+                raise OSError("there is no such folder")
+            return self._http.Client(headers=headers, timeout=timeout, follow_redirects=False)
+        except OSError as error:  # Before ``ValueError``, which some errors of certificates are as well.
+            found = _set_variables("sslkeylogfile" if error.filename else certificates)
+            raise InputError(f"{found}: cannot be used: {error.strerror or error}; unset or correct it") from None
+        except (ImportError, ValueError, self._http.InvalidURL) as error:
+            found = _set_variables("http_proxy", "https_proxy", "all_proxy")
+            expected = "the package httpx2[socks]" if isinstance(error, ImportError) else "http://HOST:PORT"
+            raise InputError(f"{found}: no usable proxy, expected {expected}; NO_PROXY=* avoids it") from None
 
     def _abandon(self) -> None:
         """Close the connections, so that a request that takes too long ends in its thread."""
         client, self._client = self._client, self._new_client()
         client.close()
+
+
+def _set_variables(*names: str) -> str:
+    """Return the environment variables with some names in any case, and their values without passwords."""
+    given = (item for item in sorted(os.environ.items()) if item[1] and item[0].lower() in names)
+    shown = [f"{name}=" + re.sub(r"^(\w+://)?.*@", r"\1", value) for name, value in given]
+    return printable(", ".join(shown), _MAX_LINE_CHARACTERS)
 
 
 def _checked_id(submission_id: str) -> str:

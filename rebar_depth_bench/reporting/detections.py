@@ -17,10 +17,10 @@ from rebar_depth_bench.bar_crossings.definition import CROSSINGS_PROTOCOL
 from rebar_depth_bench.base.errors import printable
 from rebar_depth_bench.detections.result import AVERAGE_PRECISION_MM, DetectionResult, DetectionTable
 from rebar_depth_bench.detections.score import MATCH_M
-from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.charts import precision_chart
 from rebar_depth_bench.reporting.html.assets import environment
 from rebar_depth_bench.reporting.tables import make_grid, plain_text, print_line, print_unwrapped
+from rebar_depth_bench.scoring import formatting
 from rebar_depth_bench.scoring.columns import ARROWS, DASH, Column
 
 Row = tuple[str, DetectionTable]

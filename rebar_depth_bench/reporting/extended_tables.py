@@ -39,12 +39,18 @@ MISSED = "missed"
 _ZERO_TOLERANCE = 1e-12
 """Magnitude below which a value is a rounding error and is shown as 0."""
 
+_FIRST_ROWS = 3
+"""Number of measures of each family that are printed if no family is named."""
+
 _MIN_WIDTH_WITH_INTERVALS = 100
 """Least console width that shows intervals, characters; in a narrower one, names would take three lines each."""
 
 
-def print_extended(extended: ExtendedResult, console: Console) -> None:
-    """Print every measure that has a value, native beside scaled; a wide console also shows the intervals."""
+def print_extended(extended: ExtendedResult, console: Console, only: str = "") -> None:
+    """Print the first measures of each family, or all of the family ``only``, native beside scaled.
+
+    Measures without a value are left out. A wide console also shows the intervals.
+    """
     wide = console.width >= _MIN_WIDTH_WITH_INTERVALS
     for config, table in extended.tables.items():
         console.print()
@@ -52,15 +58,19 @@ def print_extended(extended: ExtendedResult, console: Console) -> None:
         grid = make_grid("", ("native", "95 %", "scaled", "95 %") if wide else ("native", "scaled"), fold=True)
         for family in MEASURE_FAMILIES.values():
             rows = [(measure, measure_cells(table, family, measure)) for measure in family.measures]
-            known_rows = [(measure, texts) for measure, texts in rows if any(cell != DASH for cell in texts)]
-            if known_rows:
-                grid.add_section()
-                grid.add_row(plain_text(family.title, style="italic"))
-            for measure, texts in known_rows:
+            known_rows = [(measure, texts) for measure, texts in rows if not {*texts} <= {DASH, ""}]
+            if not known_rows or only not in ("", family.key):
+                continue
+            grid.add_section()
+            grid.add_row(plain_text(family.title, style="italic"))
+            shown_rows = known_rows if only else known_rows[:_FIRST_ROWS]
+            for measure, texts in shown_rows:
                 heading = Padding(measure.column.heading, (0, 0, 0, 2))
                 grid.add_row(heading, *map(plain_text, texts if wide else texts[::2]))
+            if hidden := len(known_rows) - len(shown_rows):
+                grid.add_row(plain_text(f"  and {hidden} more: --family {family.key}", style="dim"))
         console.print(grid)
-        for alignment, of_alignment in table.reaches.items():
+        for alignment, of_alignment in table.reaches.items() if only in ("", "crossings") else ():
             for reach in of_alignment:
                 print_line(console, reach_sentence(alignment, reach))
     numbers = [(measure, estimate) for _, _, measure, estimate in extended.estimates()]
@@ -111,6 +121,8 @@ def format_value(value: float | None, measure: Measure, digits: int = 4) -> str:
     """
     if value is None or not math.isfinite(value):
         return DASH
+    if measure.column.as_text is not None:
+        return measure.column.as_text(value)
     value = value if abs(value) >= _ZERO_TOLERANCE else 0.0
     return f"{100 * value:.1f}" if measure.unit == "%" else f"{value:.{digits}g}"
 

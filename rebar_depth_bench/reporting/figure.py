@@ -19,7 +19,14 @@ from typing import TYPE_CHECKING, Any
 from rebar_depth_bench.base.errors import InputError, printable, require_extra
 from rebar_depth_bench.base.writing import write_output
 from rebar_depth_bench.reporting.axes import Axis, decade_axis, select_spaced, tick_label
-from rebar_depth_bench.reporting.formatting import (
+from rebar_depth_bench.reporting.published import (
+    OTHER_OPTICS_MARK,
+    OTHER_OPTICS_NOTE,
+    load_published,
+    published_rows,
+)
+from rebar_depth_bench.scoring.columns import NATIVE, SCALED
+from rebar_depth_bench.scoring.formatting import (
     CONSTANT_TITLE,
     ONE_PIXEL_TITLE,
     config_title,
@@ -29,13 +36,6 @@ from rebar_depth_bench.reporting.formatting import (
     row_notes,
     scaled_constants,
 )
-from rebar_depth_bench.reporting.published import (
-    OTHER_OPTICS_MARK,
-    OTHER_OPTICS_NOTE,
-    load_published,
-    published_rows,
-)
-from rebar_depth_bench.scoring.columns import NATIVE, SCALED
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.table import Table

@@ -12,9 +12,9 @@ from collections.abc import Iterable, Mapping, Sequence
 from jinja2 import PackageLoader, Template
 
 from rebar_depth_bench.base.errors import InputError, printable
-from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.html.assets import environment
 from rebar_depth_bench.reporting.published import load_published, published_rows
+from rebar_depth_bench.scoring import formatting
 from rebar_depth_bench.scoring.columns import (
     ALIGNED_CONSTANT,
     DASH,

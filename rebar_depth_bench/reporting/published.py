@@ -18,9 +18,9 @@ from markupsafe import Markup
 from pydantic import TypeAdapter
 
 from rebar_depth_bench.reporting.charts import ScatterPoint, scatter_chart
-from rebar_depth_bench.reporting.formatting import config_title
 from rebar_depth_bench.scoring.bootstrap import Interval
 from rebar_depth_bench.scoring.columns import NATIVE, PAPER_COLUMNS, SCALED, Cell
+from rebar_depth_bench.scoring.formatting import config_title
 from rebar_depth_bench.scoring.result import Result
 
 

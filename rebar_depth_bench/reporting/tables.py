@@ -17,13 +17,13 @@ from rich.text import Text
 from rebar_depth_bench import software_version
 from rebar_depth_bench.base.errors import printable
 from rebar_depth_bench.base.terminal import terminal_text
-from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.published import (
     OTHER_OPTICS_MARK,
     OTHER_OPTICS_NOTE,
     load_published,
     published_rows,
 )
+from rebar_depth_bench.scoring import formatting
 from rebar_depth_bench.scoring.bootstrap import BLOCK_VIEWS, MIN_BLOCKS
 from rebar_depth_bench.scoring.columns import (
     ALIGNED_METRICS,
@@ -46,7 +46,13 @@ from rebar_depth_bench.scoring.columns import (
     texts,
     with_reference,
 )
-from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND, kind_blocks, kind_text, relative_findings
+from rebar_depth_bench.scoring.relative import (
+    ALIGNMENT_BY_KIND,
+    LEAST_MARGIN,
+    constant_findings,
+    is_like_constant,
+    kind_blocks,
+)
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.table import PublishedMatch, Table
 
@@ -128,18 +134,12 @@ def print_table(result: Result, console: Console) -> None:
     The groups of views of a config with splits follow, one row per group. Numbers are never truncated: a console
     narrower than the narrowest layout gets longer lines.
     """
-    print_line(console, f"{printable(result.method)}, protocol {result.protocol}", style="bold")
-    print_line(
-        console,
-        f"dataset {printable(result.dataset.version)} ({formatting.short_digest(result.dataset.digest)}), "
-        f"archive {formatting.short_digest(result.submission.sha256)}, software {result.software.version}",
-        style="dim",
-    )
-    declared = (formatting.inputs_text(result.declared), formatting.ground_truth_text(result.declared))
-    print_line(console, "inputs: {}; ground truth: {}".format(*declared), style="dim")
+    shown = formatting.summary(result)
+    print_line(console, shown.heads[0], style="bold")
+    print_line(console, shown.provenance, style="dim")
+    print_line(console, shown.declared, style="dim")
     layouts, group_layouts = _LAYOUTS, _GROUP_LAYOUTS
     if result.prediction is not None:
-        print_line(console, kind_text(result), style="italic")
         layouts = group_layouts = _ALIGNED_LAYOUTS
     _print_rows(_config_rows(result.tables), console, layouts, "config")
     for config, table in result.tables.items():
@@ -147,7 +147,7 @@ def print_table(result: Result, console: Console) -> None:
             console.print()
             print_line(console, f"{formatting.config_title(config, table.split)}: groups of views", style="bold")
             _print_rows(_group_rows(table), console, group_layouts, "group")
-    _print_notes(result, console)
+    _print_notes(result, shown.notes, console)
 
 
 def _config_rows(tables: Mapping[str, Table]) -> list[Row]:
@@ -155,6 +155,8 @@ def _config_rows(tables: Mapping[str, Table]) -> list[Row]:
     for name, table in tables.items():
         rows += _table_rows(formatting.config_title(name, table.split), table)
         rows += [(f"  {title}", shown, "dim") for title, shown in formatting.reference_rows([("", table)])]
+        judged = SCALED[0] if table.aligned is None else ALIGNED_METRICS[0]
+        rows.append(("  margin", {judged.path: formatting.margin_text(table)}, "dim"))
     return rows
 
 
@@ -220,7 +222,7 @@ def _rich_table(rows: Sequence[Row], columns: Columns, head: str) -> RichTable:
     return table
 
 
-def _print_notes(result: Result, console: Console) -> None:
+def _print_notes(result: Result, notes: Sequence[str], console: Console) -> None:
     console.print()
     if result.prediction is not None:
         print_line(console, f"Means over views. ↓ lower, ↑ higher is better. {formatting.ALIGNED_NOTE}")
@@ -228,9 +230,9 @@ def _print_notes(result: Result, console: Console) -> None:
         means = "Means over views; s: median over views. z: truth, p: prediction. ↓ lower, ↑ higher is better."
         print_line(console, means)
         print_line(console, f"{formatting.RANK_ERROR_NOTE} {formatting.REFERENCE_NOTE} ‡: not ranked.")
-    for name, table in result.tables.items():
-        for note in (*formatting.table_notes(table), *formatting.reference_findings(table)):
-            print_line(console, f"{printable(name)}: {note}", style="yellow")
+    print_line(console, "Margin: share by which an error is below that of the constant; negative if it is above.")
+    for note in notes:
+        print_line(console, note, style="yellow")
     if any(table.groups for table in result.tables.values()):
         note = formatting.GROUP_NOTE if result.prediction is None else formatting.ALIGNED_GROUP_NOTE
         print_line(console, f"{note} Intervals: in JSON and the report.")
@@ -350,11 +352,14 @@ def print_paper_table(
             rows.sort(key=lambda row: (not row[1].ranked, rounded(row[1].error) or 0.0))
             if kind is None:
                 console.print(_paper_table(rows, table.published if published else None))
+                if similar := [printable(result.method) for result, of in rows if is_like_constant(of)]:
+                    limit = f"AbsRel_s is not below {100 * (1 - LEAST_MARGIN):.0f} % of a constant's"
+                    print_line(console, f"{limit}: {', '.join(similar)}.", style="yellow")
             else:
                 aligned = [row for result, of in rows for row in _table_rows(formatting.row_name(result, of), of)]
                 _print_rows(aligned, console, _ALIGNED_LAYOUTS, "")
                 for result, of in rows:
-                    for note in relative_findings(of):
+                    for note in constant_findings(of):
                         print_line(console, f"{printable(result.method)}: {note}", style="yellow")
         console.print()
         _print_paper_notes(block, console, absent if kind is None else (), published=published)

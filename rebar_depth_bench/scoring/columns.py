@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from decimal import ROUND_DOWN, Decimal
+from decimal import ROUND_FLOOR, Decimal
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -89,13 +89,13 @@ def percent(share: float | None) -> str:
 
 
 def coverage_percent(share: float | None) -> str:
-    """Return a coverage in per cent with one decimal, rounded down.
+    """Return a coverage, or another share with a threshold, in per cent with one decimal, rounded down.
 
     Incomplete coverage is therefore never shown as 100 %, and coverage below the threshold never as reaching it.
     """
     if share is None:
         return DASH
-    return str((Decimal(repr(share)) * 100).quantize(Decimal("0.1"), rounding=ROUND_DOWN))
+    return str((Decimal(repr(float(share))) * 100).quantize(Decimal("0.1"), rounding=ROUND_FLOOR))
 
 
 @dataclass(frozen=True)

@@ -1,6 +1,6 @@
 """Scoring of a submission archive against a dataset folder: both are open in an ``Evaluation``.
 
-``score`` opens them and passes their views to the arithmetic of ``scoring.score``, on several threads.
+``score_evaluation`` passes their views to the arithmetic of ``scoring.score``, on several threads.
 """
 
 from __future__ import annotations
@@ -177,29 +177,6 @@ def open_evaluation(
         yield Evaluation(folder, submission)
 
 
-def score(
-    archive: str | os.PathLike[str],
-    root: str | Path,
-    *,
-    workers: int | None = None,
-    expect_digest: str | None = None,
-    align: str | None = None,
-    progress: Progress = silent,
-) -> Result:
-    """Score an archive against a dataset folder or Hub repository.
-
-    An archive is scored by the kind of its predictions; ``align`` scores a metric one as one of another kind.
-
-    Views are read directly from the archive and scored on ``workers`` threads (default: one per core); only a few
-    views are in memory at a time. The result does not depend on the number of workers.
-
-    Raises ``SubmissionError`` with all problems if any part of the archive is invalid, and ``DatasetError`` if the
-    dataset folder is invalid or its digest is not ``expect_digest``.
-    """
-    with open_evaluation(archive, root, expect_digest=expect_digest) as evaluation:
-        return score_evaluation(evaluation, workers=workers, align=align, progress=progress)
-
-
 def score_evaluation(
     evaluation: Evaluation,
     *,
@@ -208,7 +185,7 @@ def score_evaluation(
     progress: Progress = silent,
     use_view: UseView | None = None,
 ) -> Result:
-    """Score an open submission as ``score`` does; ``use_view`` is called on its threads, as in ``score_views``.
+    """Score an open submission on ``workers`` threads; ``use_view`` is called on them, as in ``score_views``.
 
     Raises ``SubmissionError`` if an entry is invalid, and for ``align`` with an archive that is neither metric nor
     of that kind, and ``InputError`` if ``align`` is no kind.

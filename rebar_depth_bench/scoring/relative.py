@@ -24,6 +24,7 @@ take p as it is, over V, and a p <= 0 is not counted in delta1.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -32,7 +33,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64, Integer
 from numpy import ndarray
 
-from rebar_depth_bench.scoring.columns import METRICS, value_at
+from rebar_depth_bench.scoring.columns import METRICS, SIGNIFICANT_DIGITS, value_at
 from rebar_depth_bench.scoring.metrics import is_valid_prediction, mean, median, metrics_at_scales, rank_error
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, WITHIN_MM
 from rebar_depth_bench.scoring.table import AlignedErrors, Table, ViewScore
@@ -48,8 +49,8 @@ ALIGNMENT_BY_KIND: Mapping[str, str] = {
 }
 """Kinds of predictions that are not metric, and how they are aligned."""
 
-LEAST_GAIN = 0.95
-"""Share of the constant's error above which an aligned error says little."""
+LEAST_MARGIN = 0.05
+"""Share by which an error must be below that of a constant; otherwise the predictions say little about depth."""
 
 
 _NO_VALUES = AlignedErrors(1.0, None, None, None, None, dict.fromkeys(WITHIN_MM, 0.0))
@@ -186,19 +187,43 @@ def kind_text(result: Result) -> str:
     return f"{declared}{result.kind}{' (--align)' if declared else ''}: {ALIGNMENT_BY_KIND[result.kind]}"
 
 
-def relative_findings(table: Table) -> list[str]:
-    """Return a sentence on each sign that the alignment of a table makes up for what its predictions lack."""
-    if table.aligned is None or table.constant is None or not table.views_scored:
-        return []
+def error_and_constant(table: Table) -> tuple[float | None, float | None]:
+    """Return the scaled AbsRel of a table, of a kind that is not metric the aligned error, and a constant's."""
+    if table.aligned is not None and table.constant is not None:
+        return table.aligned.error, table.constant.error
+    return value_at(table, "scaled.abs_rel"), table.reference.scaled_constant.abs_rel
+
+
+def constant_margin(table: Table) -> float | None:
+    """Return the share by which the error is below that of a constant, negative if above; None if undefined."""
+    error, constant = error_and_constant(table)
+    if not table.views_scored or error is None or not constant:
+        return None
+    margin = round(1 - error / constant, SIGNIFICANT_DIGITS) + 0.0  # Neither rounding errors nor -0.0.
+    return margin if math.isfinite(margin) else None
+
+
+def is_like_constant(table: Table) -> bool:
+    """Return whether the error of a table is not below that of a constant by ``LEAST_MARGIN``."""
+    margin = constant_margin(table)
+    return margin is not None and margin < LEAST_MARGIN
+
+
+def constant_findings(table: Table) -> list[str]:
+    """Return a sentence on each sign that the predictions of a table say little about depth."""
     findings = []
-    if table.aligned.error > LEAST_GAIN * table.constant.error:
+    if is_like_constant(table):
+        error, constant = error_and_constant(table)
+        compared = f"{error:.4f} is not below {100 * (1 - LEAST_MARGIN):.0f} % of a constant's ({constant:.4f})"
         is_low = (table.coverage or 0.0) < MIN_COMPARABLE_COVERAGE
         missing = ", or missing values are most of both errors" if is_low else ""
         findings.append(
-            f"The aligned error {table.aligned.error:.4f} is not below {LEAST_GAIN * 100:.0f} % of a constant's "
-            f"({table.constant.error:.4f}): the fit hides that the predictions say little about depth{missing}."
+            f"The scaled AbsRel {compared}: a plane at one depth is about as good, or better."
+            if table.aligned is None
+            else f"The aligned error {compared}: the fit hides that the predictions say little about "
+            f"depth{missing}."
         )
-    if (table.flat_views or 0) > table.views / 2:
+    if table.views_scored and (table.flat_views or 0) > table.views / 2:
         findings.append(
             f"In {table.flat_views} of {table.views} views the fit has no positive slope and is a constant: it "
             "hides that the predictions say nothing about depth, or run the other way (depth declared as "

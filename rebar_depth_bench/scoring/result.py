@@ -31,10 +31,10 @@ from rebar_depth_bench.scoring.columns import (
     VIEW_COLUMNS,
     Column,
     Share,
-    columns_at,
 )
-from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, PROTOCOL, RELATIVE_PROTOCOL
-from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND, kind_text, relative_findings
+from rebar_depth_bench.scoring.formatting import result_notes, summary
+from rebar_depth_bench.scoring.protocol import PROTOCOL, RELATIVE_PROTOCOL
+from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND
 from rebar_depth_bench.scoring.table import (
     Count,
     Flag,
@@ -53,32 +53,6 @@ if TYPE_CHECKING:
 
 _MAX_CONFIGS_SHOWN = 10
 _ERRORS = ("rank_error", *RELATIVE_ALIGNMENTS)
-_NOTEBOOK_COLUMNS = (
-    *("config", "views", "views_scored", "coverage", "ranked", "rank_error"),
-    *("native_abs_rel", "native_rmse_cm", "scaled_abs_rel", "scaled_rmse_cm", "scale_median"),
-)
-
-_RELATIVE_NOTEBOOK_COLUMNS = (
-    *("config", "views", "views_scored", "coverage", "flat_views", "aligned_error", "constant_error"),
-    *("aligned_abs_rel", "aligned_robust_abs_rel", "constant_abs_rel", "aligned_within_5mm"),
-)
-SUMMARY = {
-    "coverage": "coverage",
-    "rank_error": "rank error",
-    "native.abs_rel": "AbsRel",
-    "scaled.abs_rel": "scaled",
-    "reference.scaled_constant.abs_rel": "constant",
-    "within_mm.5": "within 5 mm",
-}
-_RELATIVE_SUMMARY = {
-    "coverage": "coverage",
-    "aligned.error": "aligned error",
-    "constant.error": "constant error",
-    "aligned.abs_rel": "AbsRel",
-    "aligned_robust.abs_rel": "robust AbsRel",
-    "aligned.within_mm.5": "within 5 mm",
-}
-"""Headings of the columns that ``print(result)`` shows, by their paths."""
 
 
 @dataclass(frozen=True)
@@ -205,46 +179,20 @@ class Result:
         }
         return {name: math.nan if value is None else float(value) for name, value in values.items()}
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Sentences on what limits the numbers."""
+        return tuple(result_notes(self))
+
     def __str__(self) -> str:
-        """Return the main numbers of each config as a table, with what limits them."""
-        heads = SUMMARY if self.prediction is None else _RELATIVE_SUMMARY
-        columns, rows = columns_at(*heads), [[printable(self.method), *heads.values()]]
-        notes = dict[str, list[str]]()
-        for name, table in self.tables.items():
-            cells = (f"{column.text(column.value(table))} {column.unit}".strip() for column in columns)
-            rows.append([printable(name), *cells])
-            for note in self._short_notes(name):
-                notes.setdefault(note, []).append(printable(name))
+        """Return the main numbers of each config as a table, what the submission declares, and the notes."""
+        shown = summary(self)
+        rows = [shown.heads, *shown.rows]
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         lines = [
             "  ".join([row[0].ljust(widths[0]), *map(str.rjust, row[1:], widths[1:])]).rstrip() for row in rows
         ]
-        lines += [
-            note if len(names) == len(self.tables) else f"{', '.join(names)}: {note}"
-            for note, names in notes.items()
-        ]
-        return "\n".join(lines)
-
-    def _short_notes(self, name: str) -> list[str]:
-        """Return the notes on a config that are printed with its numbers."""
-        table = self.tables[name]
-        notes = self.kind_notes
-        if table.of_views is not None:
-            notes.append(f"{table.views} of {table.of_views} views: not ranked")
-        notes += relative_findings(table)
-        if table.views and not table.views_scored:
-            notes.append(f"{table.views} of {table.views} views without any prediction")
-        elif table.views and not table.is_comparable:
-            is_low = (table.coverage or 0.0) < MIN_COMPARABLE_COVERAGE
-            low = f"coverage below {MIN_COMPARABLE_COVERAGE * 100:.0f} %"
-            reason = low if is_low else "views without predictions, or numbers that overflowed"
-            notes.append(f"{reason}: errors of valid predictions are not comparable")
-        return notes
-
-    @property
-    def kind_notes(self) -> list[str]:
-        """A sentence on the kind of predictions that are not metric; none of metric ones."""
-        return [] if self.prediction is None else [f"{kind_text(self)}; not ranked"]
+        return "\n".join([*lines, shown.declared, *shown.notes])
 
     def __repr__(self) -> str:
         """Return the method, the numbers of the first ten configs, and the number of views."""
@@ -254,13 +202,13 @@ class Result:
         return "\n".join([head, *shown[:_MAX_CONFIGS_SHOWN], *omitted]) + ">"
 
     def _repr_html_(self) -> str:
-        """Return the method, its provenance and the tables for notebooks."""
-        frame = self.to_pandas()[[*(_NOTEBOOK_COLUMNS if self.prediction is None else _RELATIVE_NOTEBOOK_COLUMNS)]]
-        frame["config"] = frame["config"].map(printable)
-        kind = "" if self.prediction is None else f" ({self.prediction})"
-        provenance = f"protocol {self.protocol}{kind}, dataset {self.dataset.version} ({self.dataset.digest[:19]})"
-        head = f"<p><b>{escape(printable(self.method))}</b>, {escape(printable(provenance))}</p>"
-        return head + str(frame.to_html(index=False, na_rep="–", float_format="{:.4g}".format, border=0))
+        """Return the summary for notebooks."""
+        shown = summary(self)
+        head = "".join(f"<th>{escape(cell)}</th>" for cell in shown.heads)
+        rows = ("".join(f"<td>{escape(cell)}</td>" for cell in row) for row in shown.rows)
+        body = "".join(f"<tr>{row}</tr>" for row in rows)
+        lines = "".join(f"<p>{escape(line)}</p>" for line in (shown.declared, shown.provenance, *shown.notes))
+        return f"<table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>{lines}"
 
     def to_json(self) -> bytes:
         """Return the result as UTF-8 JSON; the same archive and dataset give the same bytes on every machine."""

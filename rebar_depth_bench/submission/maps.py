@@ -24,7 +24,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from rebar_depth_bench.base.errors import EntryError, Problem, escape_text, format_shape
+from rebar_depth_bench.base.errors import EntryError, Problem, escape_text, format_shape, library_message
 from rebar_depth_bench.base.reading import MemorySource
 from rebar_depth_bench.submission.zip import read_data, read_entries
 
@@ -46,6 +46,14 @@ _INTEGER_DESCR = re.compile(r"[<>=|]?[iu][1248]")
 def max_npy_bytes(shape: tuple[int, int]) -> int:
     """Return the largest acceptable size of an ``.npy`` file of shape (H, W) in bytes (float64 values)."""
     return shape[0] * shape[1] * 8 + MAX_HEADER_BYTES
+
+
+def resize_hint(shape: Sequence[object], expected: tuple[int, int]) -> str:
+    """Return how a map comes to the (H, W) of its view, for the end of a message; "" for other than two axes."""
+    height, width = expected
+    # Other interpolations make depth that lies between a bar and its background.
+    how = f"cv2.resize(depth, ({width}, {height}), interpolation=cv2.INTER_NEAREST)"
+    return f"; resize it by {how}" if len(shape) == 2 else ""
 
 
 def decode_npy(name: str, data: memoryview, shape: tuple[int, int], _: float = 1.0, ints: bool = False) -> Depth:
@@ -98,7 +106,8 @@ def _parse_header(
     actual_shape = shapes[0].replace("L", "").replace(",", " ").split()
     if actual_shape != [str(size) for size in shape]:
         actual = " x ".join(map(escape_text, actual_shape)) if actual_shape else "a single value"
-        raise EntryError(Problem("invalid", name, f"the shape is {actual}", f"{format_shape(shape)} (H x W)"))
+        expected = f"{format_shape(shape)} (H x W){resize_hint(actual_shape, shape)}"
+        raise EntryError(Problem("invalid", name, f"the shape is {actual}", expected))
     return np.dtype(descr[0].replace("|", "=")), fortran[0] == "True", end
 
 
@@ -163,7 +172,7 @@ def decode_exr(name: str, data: memoryview, shape: tuple[int, int], _: float = 1
     """Return the single channel of an OpenEXR file in metres: (H, W), float16 (HALF) or float32 (FLOAT).
 
     Raises ``EntryError`` if the file is damaged, has another size or pixel type, or is not one flat image with one
-    channel.
+    channel, and as ``check_exr_windows``.
     """
     _check_exr_header(name, data, shape)
     import OpenEXR  # A tenth of a second, which archives of other formats do not need.
@@ -173,7 +182,7 @@ def decode_exr(name: str, data: memoryview, shape: tuple[int, int], _: float = 1
         (channel,) = image.channels().values()
         pixels: Depth = channel.pixels
     except Exception as error:  # OpenEXR raises several unrelated exception types for damaged files.
-        found = f"the OpenEXR data is corrupt or truncated ({escape_text(str(error))})"
+        found = f"the OpenEXR data is corrupt or truncated ({library_message(error)})"
         raise EntryError(Problem("damaged", name, found)) from error
     if pixels.shape != shape or pixels.dtype not in (np.float16, np.float32):
         found = f"the image decodes to {pixels.dtype} {pixels.shape}"
@@ -194,7 +203,7 @@ def _check_exr_header(name: str, data: memoryview, shape: tuple[int, int]) -> No
     try:
         attributes = _parse_attributes(head)
         channels = list(_parse_channels(attributes["channels"]))
-        window = struct.unpack("<4i", attributes["dataWindow"])
+        window, display = (struct.unpack("<4i", attributes[key]) for key in ("dataWindow", "displayWindow"))
         tiles = struct.unpack("<2IB", attributes["tiles"]) if flags & _TILED else None
     except (ValueError, KeyError, struct.error) as error:
         found = f"the OpenEXR header is damaged ({escape_text(str(error))})"
@@ -203,9 +212,27 @@ def _check_exr_header(name: str, data: memoryview, shape: tuple[int, int]) -> No
     window_shape = (window[3] - window[1] + 1, window[2] - window[0] + 1)
     if window_shape != shape:
         found = f"the data window is {format_shape(window_shape)}"
-        raise EntryError(Problem("invalid", name, found, f"{format_shape(shape)} (H x W)"))
+        expected = f"{format_shape(shape)} (H x W){resize_hint(window_shape, shape)}"
+        raise EntryError(Problem("invalid", name, found, expected))
+    check_exr_windows(name, window, display)
     if tiles is not None:
         _check_tiles(name, tiles, shape)
+
+
+def check_exr_windows(name: str, data_window: Sequence[int], display_window: Sequence[int]) -> None:
+    """Raise ``EntryError`` if the stored pixels of an OpenEXR file begin beside the picture.
+
+    Windows are (x_min, y_min, x_max, y_max), inclusive, in pixels. The display window is the picture, and the data
+    window the part of the plane that is stored: read without the windows, the pixels would be at other places.
+    """
+    if data_window[:2] != display_window[:2]:
+        data, display = (
+            f"columns {window[0]} to {window[2]} and rows {window[1]} to {window[3]}"
+            for window in (data_window, display_window)
+        )
+        found = f"the data window, {data}, and the display window, {display}, begin at different pixels"
+        expected = "the same first pixel: the whole picture, without crop or overscan"
+        raise EntryError(Problem("invalid", name, found, expected))
 
 
 def _check_channel(name: str, channels: list[tuple[str, int, int, int]]) -> None:
@@ -298,7 +325,7 @@ def decode_png(name: str, data: memoryview, shape: tuple[int, int], depth_scale:
         with Image.open(io.BytesIO(_minimal_png(header, rows)), formats=["PNG"]) as image:
             units = np.asarray(image)
     except Exception as error:  # Pillow raises several unrelated exception types for damaged files.
-        found = f"the PNG data is corrupt ({escape_text(str(error))})"
+        found = f"the PNG data is corrupt ({library_message(error)})"
         raise EntryError(Problem("damaged", name, found)) from error
     if units.shape != shape or units.dtype.kind not in "ui":
         found = f"the PNG decodes to {units.dtype} of shape {units.shape}"
@@ -349,7 +376,8 @@ def _check_png_header(
         raise EntryError(Problem("invalid", name, f"the PNG is {actual}", "16-bit greyscale"))
     if (height, width) != shape:
         found = f"the image is {height} x {width}"
-        raise EntryError(Problem("invalid", name, found, f"{format_shape(shape)} (H x W)"))
+        expected = f"{format_shape(shape)} (H x W){resize_hint((height, width), shape)}"
+        raise EntryError(Problem("invalid", name, found, expected))
     if compression or filtering or interlace > 1:
         actual = f"compression {compression}, filter {filtering}, interlace {interlace}"
         raise EntryError(Problem("invalid", name, f"the PNG header declares {actual}", "0, 0 and 0 or 1"))

@@ -22,7 +22,7 @@ from rebar_depth_bench.base.names import VIEW_ID_PATTERN
 from rebar_depth_bench.base.validation import short_repr
 from rebar_depth_bench.base.writing import output_file
 from rebar_depth_bench.submission.declaration import MAX_NUMBER, METADATA_NAME, METRIC, parse_metadata
-from rebar_depth_bench.submission.maps import Depth
+from rebar_depth_bench.submission.maps import Depth, resize_hint
 
 _EPOCH = (1980, 1, 1, 0, 0, 0)
 _UNIX_MODE = 0o100644
@@ -205,7 +205,10 @@ def depth_map(
         found = f"{array.dtype} of shape {shape}"
         if array.dtype.kind in "OSU":
             found = "None" if depth is None else f"an object of type {type(depth).__name__}"
-        raise error(f"{what} {found}, expected an array of floats of shape {grid or '(H, W)'}")
+            if isinstance(depth, Mapping):
+                found += f" with the keys {escape_text(', '.join(map(str, depth)))}"
+        hint = resize_hint(array.shape, grid) if grid and array.dtype.kind == "f" else ""
+        raise error(f"{what} {found}, expected an array of floats of shape {grid or '(H, W)'}{hint}")
     return np.asarray(array)
 
 

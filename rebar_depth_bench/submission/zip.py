@@ -117,13 +117,20 @@ def _read_end_record(source: ByteSource) -> tuple[int, int, int, int]:
     """Return where the central directory must end, and what is declared: its entries, its size and its start."""
     length = min(source.size, _ZIP64_END_LOCATOR.size + _END_RECORD.size + _MAX_COMMENT_BYTES)
     tail = bytes(source.read_at(source.size - length, length))
-    offset = tail.rfind(b"PK\x05\x06")
+    offset, extra = tail.rfind(b"PK\x05\x06"), 0
     while offset >= 0:
-        comment_bytes = int.from_bytes(tail[offset + _END_RECORD.size - 2 : offset + _END_RECORD.size], "little")
-        if offset + _END_RECORD.size + comment_bytes == len(tail):
+        record = tail[offset : offset + _END_RECORD.size].ljust(_END_RECORD.size, b"\0")
+        size, start, comment_bytes = _END_RECORD.unpack(record)[5:]
+        rest = len(tail) - offset - _END_RECORD.size - comment_bytes
+        if rest == 0:
             break
+        if rest > 0 and start + size == source.size - length + offset:  # Not of an archive that is an entry.
+            extra = rest
         offset = tail.rfind(b"PK\x05\x06", 0, offset + 3)
     else:
+        if extra:
+            found = f"{extra} {'byte follows' if extra == 1 else 'bytes follow'} the end of the archive"
+            raise EntryError(Problem("damaged", "", found, f"the file to end at byte {source.size - extra}"))
         if bytes(source.read_at(0, min(4, source.size))) == b"PK\x03\x04":
             found = "the zip has no end record"
             raise EntryError(Problem("damaged", "", found, "one at the end: the file is truncated"))

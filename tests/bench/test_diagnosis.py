@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import io
+import json
 import math
+import re
+import zipfile
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
@@ -11,6 +15,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from PIL import Image
+from scipy.stats import spearmanr
 
 from rebar_depth_bench import SubmissionWriter, score
 from rebar_depth_bench.cli.main import main
@@ -24,13 +30,15 @@ from rebar_depth_bench.diagnosis.corrections import (
     Pixels,
     best_shift,
     diagnosed_view,
-    line_error,
     mean_error,
     median_ratio,
     positions_to_read,
+    rank_correlation,
     resistant_line,
+    shape_corrections,
 )
 from rebar_depth_bench.diagnosis.diagnose import diagnose
+from rebar_depth_bench.geometry.cameras import Camera, ideal_K
 from rebar_depth_bench.methods import own_methods
 from rebar_depth_bench.methods.run import predict
 from rebar_depth_bench.scoring.evaluation import open_evaluation
@@ -41,7 +49,7 @@ from tests.synthetic_dataset import write_dataset
 pytestmark = pytest.mark.slow
 
 Rows = list[dict[str, np.ndarray]]
-_COLUMNS = ("view_id", "left_depth", "left_K", "baseline_m")
+_COLUMNS = ("view_id", "left_depth", "left_mask", "left_K", "baseline_m")
 
 ORDERS = ("reversed", "one-early", "one-late", "as-text", "from-text")
 ORDERS_OF_TEXT = ("as-text", "from-text")
@@ -60,6 +68,8 @@ def named_for_truth(tiny_root: Path, rows: Rows) -> dict[str, str]:
 
 
 MADE = (
+    "factor",
+    "disparity",
     "inverse",
     "range",
     "mirrored",
@@ -97,13 +107,63 @@ def test_sound_predictions_of_own_methods_are_not_mistaken(method: str, tiny_roo
         assert diagnose(evaluation) == []
 
 
-@pytest.mark.parametrize("unit", UNITS)
-def test_unit_of_stereo_depth_is_named(unit: str, tiny_root: Path, tmp_path: Path, rows: Rows) -> None:
-    archive = tmp_path / "sgbm.zip"
+@pytest.fixture(scope="module")
+def stereo(tiny_root: Path, rows: Rows, tmp_path_factory: pytest.TempPathFactory) -> list[np.ndarray]:
+    """Depth of SGBM, whose errors within the small pictures are above those of a plane at one depth."""
+    archive = tmp_path_factory.mktemp("stereo") / "sgbm.zip"
     predict(own_methods()["sgbm-filled"], tiny_root, archive, configs=["lattice"])
     with open_evaluation(archive, tiny_root) as evaluation:
-        images = [np.array(evaluation.submission.read(str(row["view_id"]))) for row in rows]
-    assert _named(tiny_root, tmp_path, rows, mistakes(rows)[unit](images)) == [unit]
+        return [np.array(evaluation.submission.read(str(row["view_id"]))) for row in rows]
+
+
+@pytest.mark.parametrize("name", [*UNITS, "factor", "disparity", "inverse", "reversed", "mirrored"])
+def test_mistake_in_stereo_depth_is_named(
+    name: str, tiny_root: Path, tmp_path: Path, rows: Rows, stereo: list[np.ndarray]
+) -> None:
+    assert _named(tiny_root, tmp_path, rows, mistakes(rows)[name](stereo)) == [name]
+
+
+@pytest.mark.parametrize("factor", [1e-3, 0.02, 1 / 20.5, 20.5, 60.0, 3000.0, 1e6])
+def test_factor_that_no_method_has_is_named(factor: float, tiny_root: Path, tmp_path: Path, rows: Rows) -> None:
+    archive = tmp_path / "factor.zip"
+    _write(archive, rows, [factor * row["left_depth"] for row in rows])
+    with open_evaluation(archive, tiny_root) as evaluation:
+        [mistake] = diagnose(evaluation)
+    assert (mistake.name, f" {factor:.4g} times the depth" in mistake.text) == ("factor", True)
+
+
+def test_factor_that_varies_over_the_views_is_no_mistake(tiny_root: Path, tmp_path: Path, rows: Rows) -> None:
+    factors = 50 * np.exp(0.3 * (-1.0) ** np.arange(len(rows)))
+    images = [factor * row["left_depth"] for factor, row in zip(factors, rows, strict=True)]
+    assert _named(tiny_root, tmp_path, rows, images) == []
+
+
+@pytest.mark.parametrize("depth_scale", [1.0, 1000.0])
+def test_depth_scale_that_undoes_the_factor_is_named(
+    depth_scale: float, tiny_root: Path, tmp_path: Path, rows: Rows
+) -> None:
+    archive = tmp_path / "png.zip"
+    with zipfile.ZipFile(archive, "w") as target:
+        target.writestr("submission.json", json.dumps({"method": "png", "depth_scale": depth_scale}))
+        for row in rows:
+            image = io.BytesIO()
+            Image.fromarray(np.rint(1000 * row["left_depth"]).astype(np.uint16)).save(image, "png")
+            target.writestr(f"{row['view_id']}.png", image.getvalue())
+    with open_evaluation(archive, tiny_root) as evaluation:
+        [mistake] = diagnose(evaluation)
+    assert mistake.name == ("millimetres" if depth_scale == 1 else "factor")
+    assert float(mistake.text.rpartition(f"; depth_scale is {depth_scale:g}, try ")[2]) == pytest.approx(0.001)
+
+
+def test_filled_holes_are_not_taken_for_other_pixels(tiny_root: Path, tmp_path: Path, rows: Rows) -> None:
+    """A plane at the median depth has smaller errors than stereo depth, and lies wherever there is no steel."""
+    random = np.random.default_rng(2)
+    images = []
+    for row in rows:
+        seen = row["left_mask"] & (random.random(row["left_mask"].shape) < 0.5)
+        depth_m = row["left_depth"] * np.exp(random.normal(0, 0.2, seen.shape))
+        images.append(np.where(seen, depth_m, np.median(depth_m[seen])))
+    assert _named(tiny_root, tmp_path, rows, images) == []
 
 
 RANDOM = np.random.default_rng(1)
@@ -112,14 +172,19 @@ RANDOM = np.random.default_rng(1)
 @pytest.mark.parametrize(
     "make",
     [
-        *(partial(np.multiply, scale) for scale in (0.2, 0.35, 1 / 3, 0.5, 2.0, 3.0, 50.0)),
-        lambda z: RANDOM.uniform(0.1, 5.0, z.shape),
+        *(partial(np.multiply, 1 / scale) for scale in (0.16, 0.3048, 0.5, 2.0, 5.0, 12.58)),
+        *(lambda z, most=most: RANDOM.uniform(0.1, most, z.shape) for most in (1.0, 5.0, 32.0, 64.0, 128.0)),
+        lambda z: (noise := RANDOM.uniform(0, 1, z.shape)) / noise.max(),
         lambda z: np.full(z.shape, 1000.0),
         lambda z: np.full(z.shape, np.median(z[z > 0]) / 0.3048),
         lambda z: 0.5 + 0.01 * np.indices(z.shape)[0] + RANDOM.uniform(0, 1e-6),
         lambda z: 1e38 * RANDOM.uniform(0.5, 1, z.shape),
     ],
-    ids=[*(f"scaled {n}" for n in range(7)), "noise", "constant", "constant in feet", "plane", "huge"],
+    ids=[
+        *(f"scaled {n}" for n in range(6)),
+        *(f"noise {n}" for n in range(5)),
+        *("normalised noise", "constant", "constant in feet", "plane", "huge"),
+    ],
 )
 def test_wrong_scale_and_prediction_without_structure_are_no_mistake(
     make: Callable[[np.ndarray], np.ndarray], tiny_root: Path, tmp_path: Path, rows: Rows
@@ -171,7 +236,7 @@ def test_commands_print_notes_and_leave_the_result_alone(tiny_root: Path, tmp_pa
         (np.zeros_like, "0.0 % are NaN, 100.0 % are zero and 0.0 % are finite and above 0"),
         (
             lambda z: np.log(z + (z == 0)),
-            "natural logarithms of depth in metres: the mean error after scaling, 10",
+            "natural logarithms of depth in metres: the mean error after scaling is 100.0 %, and ",
         ),
         (lambda z: z / z.max(), "depth divided by the largest value of each picture: the mean error is "),
     ],
@@ -186,6 +251,9 @@ def test_check_names_values_that_are_no_depth(
     assert checked.returncode == 0
     assert words in checked.stderr
     assert "one picture" not in checked.stderr
+    looked_at = min(MAX_VIEWS, len(rows))
+    assert re.search(rf"\b{looked_at} (of|views looked at, of) {len(rows)}\b", checked.stderr)
+    assert checked.stdout == f"{archive}: the archive is valid\n"
 
 
 def test_at_most_eight_evenly_spaced_views_with_steel_are_read(
@@ -212,8 +280,8 @@ def test_best_shift_is_the_made_shift(dv: int, du: int, scale: float) -> None:
     depth_m = random.uniform(1.0, 2.0, (40, 50))
     v, u = (index.ravel() for index in np.mgrid[10:30, 10:40])
     pixels = Pixels(v, u, depth_m[v, u])
-    view = DiagnosedView(0, None, pixels, pixels, scale * np.roll(depth_m, (dv, du), (0, 1)))  # type: ignore[arg-type]
-    assert best_shift([view]) == (dv, du)
+    image = scale * np.roll(depth_m, (dv, du), (0, 1))
+    assert best_shift([_view(pixels, image)]) == (dv, du)
 
 
 @given(st.floats(0.01, 100), st.floats(-5, 5), st.integers(0, 20))
@@ -231,9 +299,24 @@ def test_resistant_line_ignores_outliers(slope: float, intercept: float, outlier
 @given(st.floats(1e-3, 1e3), st.floats(0.0, 5.0))
 def test_inverse_depth_with_any_scale_and_offset_is_fitted(a: float, b: float) -> None:
     z_m = np.linspace(0.5, 3.0, 300)
-    p = a / z_m + b
-    assert line_error(p, z_m, np.reciprocal) < 0.02
-    assert math.isnan(line_error(p, z_m, np.positive))
+    pixels = Pixels(np.zeros(300, np.int64), np.arange(300), z_m)
+    image = (a / z_m + b)[None]
+    corrections = shape_corrections([_view(pixels, image)], lambda _: image, 1)
+    _, fitted = (one for one in corrections if one.name == "inverse")
+    assert mean_error(fitted.corrected(_view(pixels, image)), z_m, 1.0) < 0.03
+    assert np.isnan(fitted.corrected(_view(pixels, z_m[None]))).all(), "a line that falls"
+
+
+@given(st.lists(st.integers(-4, 4), min_size=3, max_size=30), st.integers(0, 99))
+def test_rank_correlation_is_that_of_spearman(values: list[int], seed: int) -> None:
+    p = np.array(values, np.float64)
+    z_m = np.random.default_rng(seed).integers(1, 6, len(p)).astype(np.float64)
+    valid = p > 0
+    if np.unique(p[valid]).size > 1 and np.unique(z_m[valid]).size > 1:
+        expected = spearmanr(p[valid], z_m[valid]).statistic
+        assert rank_correlation(p, z_m) == pytest.approx(expected, abs=1e-12)
+    else:
+        assert math.isnan(rank_correlation(p, z_m))
 
 
 @given(st.floats(1e-6, 1e6))
@@ -242,6 +325,11 @@ def test_mean_error_does_not_depend_on_the_scale(scale: float) -> None:
     z_m, p = random.uniform(0.2, 17, 200), random.uniform(0.2, 17, 200)
     assert mean_error(scale * p, z_m) == pytest.approx(mean_error(p, z_m), rel=1e-9)
     assert median_ratio(scale * p, z_m) * scale == pytest.approx(median_ratio(p, z_m), rel=1e-9)
+
+
+def _view(pixels: Pixels, image: np.ndarray) -> DiagnosedView:
+    camera = Camera(ideal_K(*image.shape[::-1]), np.zeros(5), np.eye(4), *image.shape[::-1])
+    return DiagnosedView(0, camera, 0.12, pixels, pixels, image)
 
 
 def _named(root: Path, folder: Path, rows: Rows, images: Sequence[np.ndarray]) -> list[str]:

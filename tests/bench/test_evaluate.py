@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import gc
+import math
 import os
+import pickle
+import re
 import sys
 import tempfile
+from collections import UserDict
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from subprocess import run
 from typing import Any
@@ -15,6 +20,9 @@ import numpy as np
 import pytest
 
 import rebar_depth_bench as rdb
+from rebar_depth_bench.cli.main import main
+from rebar_depth_bench.scoring.result import read_result
+from tests.bench.reporting.pages import Page
 
 Truth = dict[str, np.ndarray]
 LATTICE = "lattice"
@@ -69,13 +77,16 @@ def test_functions_see_no_ground_truth_that_is_not_declared(tiny_root: Path, inp
 def test_some_views_are_not_ranked(tiny_root: Path, lattice: Truth, tmp_path: Path) -> None:
     result = rdb.evaluate(lattice, tiny_root, config=LATTICE, views=3, method="truth", extended=True)
     assert [view.view_id for view in result.views] == [list(lattice)[k] for k in (0, 3, 6)]
-    assert str(result).splitlines() == [
-        "truth    coverage  rank error  AbsRel  scaled  constant  within 5 mm",
-        "lattice   100.0 %      0.0000  0.0000  0.0000    0.0667      100.0 %",
-        "3 of 9 views: not ranked",
-    ]
-    assert not result.tables[LATTICE].ranked
+    table = result.tables[LATTICE]
+    assert not table.ranked
     assert result.notes[0] == "lattice: Not ranked: 3 of 9 views."
+    constant = f"{table.reference.scaled_constant.abs_rel:.4f}"
+    lines = str(result).splitlines()
+    assert [line.split() for line in lines[:2]] == [
+        ["truth", "?", "coverage", "rank", "error", "AbsRel", "scaled", "constant", "margin", "<=", "5", "mm"],
+        ["lattice", "100.0", "%", "0.0000", "0.0000", "0.0000", constant, "100.0", "%", "100.0", "%"],
+    ]
+    assert lines[2:] == ["protocol rebar-2; inputs: not declared; ground truth: use not declared", *result.notes]
     assert result.extended is not None
     with pytest.raises(rdb.InputError, match="3 of 9 views were evaluated, expected all views"):
         result.save_archive(tmp_path / "some.zip")
@@ -84,15 +95,85 @@ def test_some_views_are_not_ranked(tiny_root: Path, lattice: Truth, tmp_path: Pa
     assert [view.view_id for view in by_id.views] == chosen
 
 
-def test_low_coverage_is_printed_with_the_numbers(tiny_root: Path, lattice: Truth) -> None:
-    halved = {
-        view_id: np.where(np.arange(depth_m.shape[1]) % 2, depth_m, 0) for view_id, depth_m in lattice.items()
+def half(depth_m: np.ndarray) -> np.ndarray:
+    """Return depth in every other column, and no prediction in the others."""
+    return np.where(np.arange(depth_m.shape[1]) % 2, depth_m, 0)
+
+
+def test_every_display_has_the_same_summary(
+    tiny_root: Path, lattice: Truth, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Depth in millimetres in every other column, of a method that declares the use of ground truth."""
+    predictions = {view_id: 1000 * half(depth_m) for view_id, depth_m in lattice.items()}
+    evaluated = rdb.evaluate(predictions, tiny_root, config=LATTICE, method="mine", uses_ground_truth=True)
+    evaluated.save_archive(tmp_path / "a.zip")
+    scored = rdb.score(tmp_path / "a.zip", tiny_root)
+    assert (str(scored), scored._repr_html_()) == (str(evaluated), evaluated._repr_html_())
+    assert main(["score", str(tmp_path / "a.zip"), "--data", str(tiny_root)]) == 0
+    streams = capsys.readouterr()
+    displays = {
+        "print": str(scored),
+        "notebook": Page(scored._repr_html_()).text,
+        "terminal": streams.out + streams.err,
     }
-    lines = str(rdb.evaluate(halved, tiny_root, config=LATTICE)).splitlines()
-    assert lines[2:] == ["coverage below 95 %: errors of valid predictions are not comparable"]
+    table = scored.tables[LATTICE]
+    assert table.coverage is not None
+    assert table.scaled is not None
+    constant = table.reference.scaled_constant.abs_rel
+    assert constant is not None
+    coverage = math.floor(1000 * table.coverage) / 10
+    margin = math.floor(1000 * (1 - table.scaled.abs_rel / constant)) / 10
+    for display, text in displays.items():
+        shown = " ".join(text.split())
+        for words in (
+            *(f"{coverage:.1f}", f"{table.rank_error:.4f}", f"{constant:.4f}", f"{margin:.1f} %"),
+            *("ground truth: used, as declared", f"coverage {coverage:.1f} % is below 95 %"),
+            *("Not ranked: the submission declares", "possible mistake: ", "in millimetres"),
+        ):
+            assert words in shown, (display, words)
+    assert "mine ‡" in displays["print"]
+    assert "mine ‡" in displays["notebook"]
+    assert "mine ‡" in displays["terminal"]
 
 
-def test_mistakes_are_printed_and_among_the_notes(tiny_root: Path, lattice: Truth) -> None:
+def test_score_has_report_and_archive_as_evaluate(tiny_root: Path, lattice: Truth, tmp_path: Path) -> None:
+    evaluated = rdb.evaluate(lattice, tiny_root, config=LATTICE)
+    evaluated.save_archive(tmp_path / "a.zip")
+    scored = rdb.score(tmp_path / "a.zip", tiny_root)
+    scored.save_archive(tmp_path / "b.zip")
+    assert (tmp_path / "b.zip").read_bytes() == (tmp_path / "a.zip").read_bytes()
+    for name, result in (("evaluated", evaluated), ("scored", scored)):
+        result.to_html(tmp_path / f"{name}.html")
+    assert (tmp_path / "scored.html").read_bytes() == (tmp_path / "evaluated.html").read_bytes()
+
+
+@pytest.mark.parametrize("change", [Path.unlink, lambda path: path.write_bytes(path.read_bytes() + b" ")])
+def test_mistakes_are_looked_for_in_the_archive_that_was_scored(
+    change: Callable[[Path], object],
+    tiny_root: Path,
+    lattice: Truth,
+    archive_of: Callable[..., Path],
+    tmp_path: Path,
+) -> None:
+    archive = archive_of({view_id: 1000 * depth_m for view_id, depth_m in lattice.items()})
+    before, after, other = (rdb.score(archive, tiny_root) for _ in range(3))
+    [mistake] = [note for note in before.notes if note.startswith("possible mistake: ")]
+    read = read_result(before.to_json(), "json")
+    assert (*read.notes, mistake) == before.notes, "a result that was read has no archive"
+    copies = [pickle.loads(pickle.dumps(one)) for one in (before, after)]
+    change(archive)
+    assert before.notes[-1] == copies[0].notes[-1] == mistake
+    for result in (after, copies[1], replace(other, submission=replace(other.submission, method="b"))):
+        assert result.notes[:-1] == read.notes
+        assert result.notes[-1].startswith("possible mistakes were not looked for: ")
+        assert str(result).endswith(result.notes[-1])
+        with pytest.raises(rdb.InputError, match=str(archive)):
+            result.to_html(tmp_path / "report.html")
+        with pytest.raises(rdb.InputError, match=str(archive)):
+            result.save_archive(tmp_path / "copy.zip")
+
+
+def test_mistakes_are_printed_and_among_the_notes(tiny_root: Path, lattice: Truth, tmp_path: Path) -> None:
     made: dict[str, Callable[[np.ndarray], np.ndarray]] = {
         "in millimetres": lambda z: z * 1000,
         'if the network is relative, declare kind="affine-disparity"': lambda z: 1 / np.where(z > 0, z, np.nan),
@@ -102,18 +183,22 @@ def test_mistakes_are_printed_and_among_the_notes(tiny_root: Path, lattice: Trut
         [mistake] = [note for note in result.notes if note.startswith("possible mistake: ")]
         assert words in mistake
         assert str(result).splitlines()[-1] == mistake
+        result.to_html(tmp_path / "report.html")
+        assert mistake.removeprefix("possible mistake: ") in Page((tmp_path / "report.html").read_text()).text
 
 
 def test_predictions_that_say_nothing_are_told_apart(tiny_root: Path, lattice: Truth) -> None:
     def notes(make: Callable[[np.ndarray], np.ndarray]) -> list[str]:
         predictions = {view_id: make(z) for view_id, z in lattice.items()}
-        return str(rdb.evaluate(predictions, tiny_root, config=LATTICE, kind="affine-disparity")).splitlines()[3:]
+        return list(rdb.evaluate(predictions, tiny_root, config=LATTICE, kind="affine-disparity").notes[1:])
 
     words = "say nothing about depth, or run the other way (depth declared as disparity, or disparity as depth)."
     assert notes(lambda z: z)[1].endswith(words)
     none = notes(lambda z: np.full_like(z, np.nan))
-    assert none[0] == "9 of 9 views without any prediction"
-    assert not any("fit" in note for note in none)
+    assert none[0].endswith(
+        f"{len(lattice)} of {len(lattice)} views without any prediction; coverage 0.0 % is below 95 %."
+    )
+    assert not any("fit " in note for note in none)
 
 
 def test_unfinished_evaluator_is_silent_at_exit(tiny_root: Path, tmp_path: Path) -> None:
@@ -129,6 +214,12 @@ evaluator.itself = evaluator
         finished = run([sys.executable, "-c", code + last], env=environment, capture_output=True, text=True)
         assert (finished.returncode, finished.stderr) == (0, "")
         assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("config", [None, LATTICE])
+def test_split_of_another_type_is_refused(tiny_root: Path, config: str | None) -> None:
+    with pytest.raises(rdb.DatasetError, match=r"the split 3$|no split 3, expected test"):
+        rdb.Evaluator(tiny_root, config, split=3)  # type: ignore[arg-type]
 
 
 def test_a_method_declares_itself(tiny_root: Path) -> None:
@@ -201,6 +292,65 @@ def test_shapes_of_one_view(tiny_root: Path, shape: tuple[int, ...], words: str 
             evaluator.update(view_id, np.ones(shape))
 
 
+@pytest.mark.parametrize(
+    ("depth", "words"),
+    [
+        ({"depth": 1, "mask": 2}, "an object of type dict with the keys depth, mask, expected an array of floats"),
+        (UserDict(depth=1), "an object of type UserDict with the keys depth, expected"),
+        ("ab", "an object of type str, expected"),
+        (None, "None, expected"),
+        (np.float32(1), r"float32 of shape \(\), expected"),
+    ],
+)
+@pytest.mark.parametrize("count", [1, 2])
+def test_what_is_no_batch_is_named(tiny_root: Path, depth: Any, words: str, count: int) -> None:
+    evaluator = rdb.Evaluator(tiny_root, LATTICE)
+    ids = evaluator.view_ids[:count]
+    with pytest.raises(rdb.InputError, match=f"^{ids[0]}: depth is {words}"):
+        evaluator.update(ids, depth)
+
+
+@pytest.mark.parametrize("view_ids", [None, 3, {"view_id": ["lattice/0028"]}, np.array("lattice/0028")])
+def test_what_are_no_view_ids_is_named(tiny_root: Path, view_ids: Any) -> None:
+    found = f"view_ids is an object of type {type(view_ids).__name__}, expected a view id or a list"
+    with pytest.raises(rdb.InputError, match=found):
+        rdb.Evaluator(tiny_root, LATTICE).update(view_ids, np.ones((1, 90, 160)))
+
+
+def test_numbers_of_ids_and_maps_differ(tiny_root: Path, lattice: Truth) -> None:
+    [first, second, *_], height_width = lattice, next(iter(lattice.values())).shape
+    evaluator = rdb.Evaluator(tiny_root, LATTICE)
+    with pytest.raises(
+        rdb.InputError, match=rf"2 view ids and {height_width[0]} depth maps \(ndarray of shape \("
+    ):
+        evaluator.update([first, second], lattice[first])
+    with pytest.raises(rdb.InputError, match=r"1 view ids and 2 depth maps \(tuple\)"):
+        evaluator.update([first], (lattice[first], lattice[first]))
+
+
+def test_squeezed_batch_of_one_is_taken(tiny_root: Path, lattice: Truth) -> None:
+    first = next(iter(lattice))
+    evaluator = rdb.Evaluator(tiny_root, LATTICE, views=[first])
+    evaluator.update([first], lattice[first].squeeze())
+    assert evaluator.compute().metrics["lattice/rank_error"] == 0
+
+
+def test_remedies_for_a_part_of_the_views_are_named_and_work(tiny_root: Path, lattice: Truth) -> None:
+    first, *others = lattice
+    evaluator = rdb.Evaluator(tiny_root, LATTICE)
+    evaluator.update(first, lattice[first])
+    with pytest.raises(rdb.InputError, match=f"{len(others)} of {len(lattice)} views are missing") as caught:
+        evaluator.compute()
+    for remedy in ("views=", "reset()", "num_sanity_val_steps=0"):
+        assert remedy in str(caught.value)
+    evaluator.reset()
+    evaluator.update(list(lattice), list(lattice.values()))
+    selected = rdb.Evaluator(tiny_root, LATTICE, views=[first])
+    selected.update(first, lattice[first])
+    for complete, views in ((evaluator, len(lattice)), (selected, 1)):
+        assert complete.compute().tables[LATTICE].views == views
+
+
 def test_wrong_views_are_named(tiny_root: Path, lattice: Truth) -> None:
     first, second, *_ = lattice
     evaluator = rdb.Evaluator(tiny_root, LATTICE)
@@ -209,10 +359,65 @@ def test_wrong_views_are_named(tiny_root: Path, lattice: Truth) -> None:
         evaluator.update(first, lattice[first])
     with pytest.raises(rdb.InputError, match="lattice/9999: is not among the 9 views"):
         evaluator.update("lattice/9999", lattice[first])
-    with pytest.raises(rdb.InputError, match=f"8 of 9 views are missing, such as {second}"):
+    with pytest.raises(rdb.InputError, match=f"8 of 9 views are missing, such as {second}, expected"):
         evaluator.compute()
     with pytest.raises(rdb.InputError, match="2 view ids and 1 depth maps"):
         evaluator.update([first, second], lattice[first][None])
+
+
+def test_the_argument_that_selects_what_is_predicted_is_named(tiny_root: Path, lattice: Truth) -> None:
+    orbit = rdb.Evaluator(tiny_root, "lattice-orbit").view_ids
+    words = (
+        f"{len(orbit)} of {len(orbit) + len(lattice)} views are missing, .* is of lattice-orbit: config='lattice'"
+    )
+    with pytest.raises(rdb.InputError, match=words):
+        rdb.evaluate(lattice, tiny_root)
+    assert rdb.evaluate(lattice, tiny_root, config="lattice").tables[LATTICE].coverage == 1
+    with pytest.raises(rdb.InputError, match=f"{min(lattice)}: is not among .*; config=, split= and views="):
+        rdb.evaluate(lattice, tiny_root, config="lattice-orbit")
+
+
+def test_an_exception_of_a_model_names_the_view(tiny_root: Path) -> None:
+    second = rdb.Evaluator(tiny_root, LATTICE).view_ids[1]
+
+    def model(row: Any) -> np.ndarray:
+        if row["view_id"] == second:
+            raise KeyError("depth")
+        return np.ones(row["left_rgb"].shape[:2])
+
+    with pytest.raises(
+        rdb.InputError, match=f"^{second}: the model: raised KeyError: 'depth' .*{Path(__file__).name}:"
+    ) as e:
+        rdb.evaluate(model, tiny_root, config=LATTICE)
+    assert isinstance(e.value.__cause__, KeyError)
+
+
+def test_a_network_that_is_given_a_row_is_told_of_a_function(tiny_root: Path) -> None:
+    torch = pytest.importorskip("torch")
+    net = torch.nn.Conv2d(3, 1, 3, padding=1)
+    with pytest.raises(rdb.InputError, match="a Conv2d that is given a row; wrap it") as e:
+        rdb.evaluate(net, tiny_root, config=LATTICE)
+    function = eval(re.search("lambda row: .* / 255[)]", str(e.value))[0], {"net": net, "torch": torch})  # type: ignore[index]
+    assert list(rdb.evaluate(function, tiny_root, config=LATTICE).tables) == [LATTICE]
+
+
+def test_smaller_maps_are_resized_as_the_message_says(
+    tiny_root: Path, lattice: Truth, archive_of: Callable[..., Path]
+) -> None:
+    cv2 = pytest.importorskip("cv2")
+    small = {view_id: depth_m[::2, ::2] for view_id, depth_m in lattice.items()}
+    height, width = next(iter(lattice.values())).shape
+    sizes = rf"{height // 2}\D+{width // 2}\b.*expected.*{height}\D+{width}\b.*; resize it by (.*)"
+    ways: list[Callable[[], object]] = [
+        lambda: rdb.evaluate(small, tiny_root, config=LATTICE),
+        lambda: rdb.score(archive_of(small), tiny_root),
+    ]
+    for evaluate in ways:
+        with pytest.raises(rdb.InputError) as e:
+            evaluate()
+        how = re.findall(sizes, str(e.value))[0]
+        resized = {view_id: eval(how, {"depth": depth, "cv2": cv2}) for view_id, depth in small.items()}
+        assert rdb.evaluate(resized, tiny_root, config=LATTICE).tables[LATTICE].views == len(lattice)
 
 
 @pytest.mark.parametrize(
@@ -248,7 +453,10 @@ def test_models_of_other_types_are_refused(tiny_root: Path, model: Any) -> None:
     [
         (None, r"the model returned None, expected an array of floats of shape \(90, 160\)"),
         ("depth", "the model returned an object of type str, expected an array"),
-        ({"depth": np.ones((90, 160))}, "the model returned an object of type dict, expected an array"),
+        (
+            {"depth": np.ones((90, 160)), "valid": 1},
+            "the model returned an object of type dict with the keys depth, valid, expected an array",
+        ),
         (np.ones((90, 160), int), r"int64 of shape \(90, 160\), expected an array of floats"),
         (np.ma.MaskedArray(np.ones((90, 160)), mask=True), "masked array"),  # type: ignore[no-untyped-call]
         ([[1.0] * 160] * 90, None),

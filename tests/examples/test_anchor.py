@@ -18,9 +18,8 @@ from hypothesis.extra import numpy as hnp
 
 import anchor
 from anchor import draw_scales, errors_at_scales, spread
-from rebar_depth_bench import SubmissionWriter
+from rebar_depth_bench import SubmissionWriter, score
 from rebar_depth_bench.base.errors import SubmissionError
-from rebar_depth_bench.scoring.evaluation import score
 from rebar_depth_bench.scoring.metrics import depth_metrics
 from tests.examples.scripts import refusal, repeated_files, result_of, run
 

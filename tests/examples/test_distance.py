@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 
 import distance
 from distance import distance_bins, scale_slope
+from rebar_depth_bench import score
 from rebar_depth_bench.methods import METHODS
 from rebar_depth_bench.methods.run import predict
 from rebar_depth_bench.scoring.bootstrap import Blocks, half_width
-from rebar_depth_bench.scoring.evaluation import score
 from tests.examples.scripts import refusal, repeated_files, result_of
 from tests.synthetic_dataset import write_split_dataset
 

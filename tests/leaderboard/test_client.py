@@ -5,8 +5,10 @@ from __future__ import annotations
 import gzip
 import json
 import re
+import socket
 import time
 from collections.abc import Callable, Iterator
+from importlib.util import find_spec
 from io import BufferedIOBase
 from pathlib import Path
 from typing import Any
@@ -160,6 +162,85 @@ def test_token_is_sent_to_the_leaderboard_with_every_request(
     assert scripted.endpoints() == ["token", "submit", "status", "status", "result"]
     assert all(f"Bearer {TOKEN}" in head for _, head in scripted.requests)
     assert all(re.search("accept-encoding: identity", head, re.IGNORECASE) for _, head in scripted.requests)
+
+
+PROXIES = [
+    name for proxy in ("http_proxy", "https_proxy", "all_proxy", "no_proxy") for name in (proxy, proxy.upper())
+]
+CERTIFICATES = ("SSL_CERT_FILE", "SSL_CERT_DIR", "SSLKEYLOGFILE")
+
+
+@pytest.fixture
+def no_proxy(monkeypatch: pytest.MonkeyPatch) -> pytest.MonkeyPatch:
+    """Remove what the environment says of proxies and certificates."""
+    for name in (*PROXIES, *CERTIFICATES):
+        monkeypatch.delenv(name, raising=False)
+    return monkeypatch
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "shown", "remedy"),
+    [
+        pytest.param(
+            "ALL_PROXY",
+            "socks5://u:secret@127.0.0.1:9",
+            "socks5://127.0.0.1:9",
+            "httpx2[socks]",
+            marks=pytest.mark.skipif(find_spec("socksio") is not None, reason="SOCKS is supported here"),
+        ),
+        ("HTTP_PROXY", "ftp://127.0.0.1:9", "ftp://127.0.0.1:9", "http://HOST:PORT"),
+        ("https_proxy", "socks4://u:secret@[::1]:9", "socks4://[::1]:9", "NO_PROXY=*"),
+        ("HTTP_PROXY", "http://[::1", "http://[::1", "http://HOST:PORT"),
+        ("SSL_CERT_FILE", "/nowhere/ca.pem", "/nowhere/ca.pem", "No such file or directory"),
+        ("SSL_CERT_FILE", __file__, __file__, "no certificate"),
+        ("SSL_CERT_DIR", "/nowhere/certs", "/nowhere/certs", "no such folder"),
+        ("SSLKEYLOGFILE", "/nowhere/keys", "/nowhere/keys", "No such file or directory"),
+    ],
+)
+def test_unusable_variable_of_http_is_named(
+    name: str, value: str, shown: str, remedy: str, small_archive: Path, no_proxy: pytest.MonkeyPatch
+) -> None:
+    no_proxy.setenv("SSL_CERT_DIR", str(small_archive.parent))  # SSLKEYLOGFILE is read with certificates only.
+    no_proxy.setenv(name, value)
+    process = run_bench("submit", small_archive, "--url", "http://127.0.0.1:9", token=TOKEN)
+    assert process.returncode == 2
+    [line] = process.stderr.splitlines()
+    assert line.startswith(f"error: {name}={shown}: ")
+    assert remedy in line
+    assert "secret" not in line
+
+
+def test_proxy_that_does_not_answer_is_named(
+    scripted: ScriptedServer, small_archive: Path, no_proxy: pytest.MonkeyPatch
+) -> None:
+    """A local leaderboard is behind the proxy, too, unless NO_PROXY has its address."""
+    with socket.socket() as unused:
+        unused.bind(("127.0.0.1", 0))
+        proxy = f"127.0.0.1:{unused.getsockname()[1]}"
+        no_proxy.setenv("HTTP_PROXY", f"http://u:secret@{proxy}")
+        process = run_bench("submit", small_archive, "--url", scripted.url, token=TOKEN)
+        assert (process.returncode, scripted.requests) == (1, [])
+        assert (
+            f"through the proxy {proxy} (HTTP_PROXY=http://{proxy}; NO_PROXY=127.0.0.1 avoids it)"
+            in process.stderr
+        )
+        assert "secret" not in process.stderr
+        scripted.answers = {"token": [answer({}, 500)]}
+        no_proxy.setenv("NO_PROXY", "127.0.0.1")
+        process = run_bench("submit", small_archive, "--url", scripted.url, token=TOKEN)
+    assert (process.returncode, scripted.endpoints()) == (1, ["token"])
+    assert proxy not in process.stderr
+
+
+def test_answer_of_a_proxy_names_it(
+    scripted: ScriptedServer, small_archive: Path, no_proxy: pytest.MonkeyPatch
+) -> None:
+    no_proxy.setenv("all_proxy", scripted.url)
+    scripted.answers = {"token": [answer(b"<html>no upstream</html>", 503)]}
+    process = run_bench("submit", small_archive, "--url", "http://board.invalid", token=TOKEN)
+    assert process.returncode == 1
+    assert f"through the proxy {scripted.url.removeprefix('http://')} (all_proxy={scripted.url};" in process.stderr
+    assert "the response status is 503" in process.stderr
 
 
 @pytest.mark.parametrize("endpoint", ["token", "submit", "status", "result"])

@@ -190,8 +190,10 @@ def test_job_fails_after_max_attempts_and_next_is_claimed(database: Database, al
         time.sleep(0.01)
     [good] = queue(database, alice, 1)
     assert [claimed(database, "s", LEASE_S) for _ in range(2)] == [good, None]
-    reason = f"scoring was started {MAX_ATTEMPTS} times but never finished"
-    assert status_and_reason(database, bad) == ("failed", reason)
+    status, reason = status_and_reason(database, bad)
+    assert status == "failed"
+    assert reason is not None
+    assert f"started {MAX_ATTEMPTS} times" in reason
 
 
 def test_jobs_are_claimed_by_age_and_that_of_a_dead_scorer_last(database: Database, alice: str) -> None:

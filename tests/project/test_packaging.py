@@ -7,12 +7,16 @@ import shutil
 import subprocess
 import sys
 import tarfile
+import tomllib
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import numpy as np
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+from packaging.version import Version
 
 import rebar_depth_bench as rdb
 from tests.conftest import TINY_DATASET
@@ -20,14 +24,18 @@ from tests.requirements import pip_environment, require_index
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = {"cards", "dataset_builder", "leaderboard", "rebar_depth_bench"}
+REQUIREMENTS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
 MAX_BYTES = {"sdist": 10_000_000, "wheel": 4_000_000}
 
 pytestmark = pytest.mark.slow
 
 
-def run(*command: str | Path, cwd: Path, status: int = 0) -> subprocess.CompletedProcess[str]:
+def run(
+    *command: str | Path, cwd: Path, status: int = 0, variables: Mapping[str, str] = {}
+) -> subprocess.CompletedProcess[str]:
+    environment = {**pip_environment(), **variables}
     finished = subprocess.run(
-        list(map(str, command)), cwd=cwd, capture_output=True, text=True, env=pip_environment(), check=False
+        list(map(str, command)), cwd=cwd, capture_output=True, text=True, env=environment, check=False
     )
     assert finished.returncode == status, f"{finished.stdout}\n{finished.stderr}"
     return finished
@@ -59,11 +67,11 @@ def distributions(source_files: set[str], tmp_path_factory: pytest.TempPathFacto
 
 @pytest.fixture(scope="module")
 def installed(distributions: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Install the wheel with its base dependencies only, in the versions in use; return the folder of programs."""
+    """Install the wheel with its base dependencies only, in the lowest versions; return the folder of programs."""
     folder = tmp_path_factory.mktemp("installed")
     run(sys.executable, "-m", "venv", folder / "venv", cwd=folder)
-    pip = folder / "venv" / "bin" / "pip"
-    constraints = ROOT / "constraints.txt"
+    pip, constraints = folder / "venv" / "bin" / "pip", folder / "lowest.txt"
+    constraints.write_text(run(sys.executable, ROOT / "scripts" / "lowest_versions.py", cwd=folder).stdout)
     run(pip, "install", "--quiet", "--constraint", constraints, distributions["wheel"], cwd=folder)
     return folder / "venv" / "bin"
 
@@ -114,6 +122,54 @@ def test_wheel_alone_scores_as_the_source(
     assert result["tables"]["lattice"]["views"] == len(tiny_truth)
     assert result["tables"]["lattice"]["scale_median"] == pytest.approx(1 / 1.1, rel=0.01)
     assert result == json.loads(rdb.score(archive, TINY_DATASET).to_json())
+
+
+def test_lowest_versions_are_installed_and_fit_together(installed: Path, tmp_path: Path) -> None:
+    listed = json.loads(run(installed / "pip", "list", "--format", "json", cwd=tmp_path).stdout)
+    found = {canonicalize_name(package["name"]): Version(package["version"]) for package in listed}
+    for requirement in map(Requirement, REQUIREMENTS):
+        [lowest] = [bound.version for bound in requirement.specifier if bound.operator == ">="]
+        assert found[canonicalize_name(requirement.name)] == Version(lowest)
+    run(installed / "pip", "check", cwd=tmp_path)
+
+
+def test_lowest_versions_load_matrices_as_float64(installed: Path, tmp_path: Path) -> None:
+    code = (
+        "import sys, numpy as np, rebar_depth_bench as rdb\n"
+        "row = rdb.load(sys.argv[1], 'lattice')[0]\n"
+        "print(np.linalg.inv(row['left_K'])[0, 0], row['left_cam_from_world'].dtype)\n"
+        "print(row['left_depth'].sum(dtype=float))"
+    )
+    row = rdb.load(TINY_DATASET, "lattice")[0]
+    printed = run(installed / "python", "-c", code, TINY_DATASET, cwd=tmp_path).stdout.split()
+    assert printed[1] == "float64"
+    expected = [1 / row["left_K"][0, 0], row["left_depth"].sum(dtype=float)]
+    np.testing.assert_allclose([float(printed[0]), float(printed[2])], expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("packages", "words"),
+    [
+        (("pillow==11.3.0",), "Pillow 11.3.0 lacks TIFF with Zstandard, expected"),
+        (
+            ("datasets==5.0.1", "requests", "urllib3", "charset-normalizer"),
+            "datasets 5.0.1 is installed, expected 5.1 or later",
+        ),
+    ],
+)
+def test_version_below_the_bounds_is_named_and_no_data_are_called_damaged(
+    packages: tuple[str, ...], words: str, installed: Path, tmp_path: Path
+) -> None:
+    """An environment may hold older versions than pip allows, as after the installation of another program."""
+    old = tmp_path / "old"
+    run(installed / "pip", "install", "--quiet", "--no-deps", "--target", old, *packages, cwd=tmp_path)
+    code = "import sys, rebar_depth_bench as rdb; rdb.load(sys.argv[1], 'lattice')[0]['left_depth']"
+    variables = {"PYTHONPATH": str(old)}
+    refused = run(
+        installed / "python", "-c", code, TINY_DATASET, cwd=tmp_path, status=1, variables=variables
+    ).stderr.splitlines()[-1]
+    assert words in refused
+    assert "damaged" not in refused
 
 
 def test_wheel_brings_no_heavy_packages(installed: Path, tmp_path: Path) -> None:

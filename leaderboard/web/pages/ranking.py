@@ -18,9 +18,9 @@ from leaderboard.web.pages.board_columns import COLUMNS
 from leaderboard.web.pages.rendering import render
 from leaderboard.web.pages.selection import Selection, parse_selection
 from rebar_depth_bench.data.rows import iterate_rows
-from rebar_depth_bench.reporting.formatting import interval_note, reference_rows
 from rebar_depth_bench.reporting.published import OTHER_OPTICS_NOTE, load_published
 from rebar_depth_bench.scoring.columns import PAPER_COLUMNS
+from rebar_depth_bench.scoring.formatting import interval_note, reference_rows
 from rebar_depth_bench.scoring.table import read_table
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)

@@ -19,9 +19,9 @@ from leaderboard.web.middleware import NO_STORE, REVALIDATE
 from leaderboard.web.pages.board_columns import seconds_text
 from rebar_depth_bench import software_version
 from rebar_depth_bench.base.errors import MAX_PROBLEMS_SHOWN, Problem, printable
-from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.html.assets import environment
 from rebar_depth_bench.reporting.published import load_published
+from rebar_depth_bench.scoring import formatting
 from rebar_depth_bench.scoring.columns import number
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.submission.declaration import INPUTS, is_http_url

@@ -17,7 +17,6 @@ from leaderboard.web.dependencies import ServiceDep, SubmissionId
 from leaderboard.web.middleware import NO_STORE, REVALIDATE
 from leaderboard.web.pages.rendering import render
 from rebar_depth_bench.base.errors import InputError, printable
-from rebar_depth_bench.reporting.formatting import counted
 from rebar_depth_bench.reporting.html.page import (
     paper_context,
     results_context,
@@ -27,6 +26,7 @@ from rebar_depth_bench.reporting.html.page import (
 from rebar_depth_bench.reporting.html.views import worst_first
 from rebar_depth_bench.reporting.tables import COMPARISON_NOTE, comparison_cells, views_note
 from rebar_depth_bench.scoring.comparison import compare
+from rebar_depth_bench.scoring.formatting import counted
 from rebar_depth_bench.scoring.result import read_result
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)

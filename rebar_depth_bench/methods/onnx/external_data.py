@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 
 from rebar_depth_bench.base.errors import MethodError, Problem, escape_text
 from rebar_depth_bench.base.reading import open_regular
-from rebar_depth_bench.data.files import files_digest
+from rebar_depth_bench.methods.base import files_digest
 from rebar_depth_bench.methods.onnx.spec import is_file
 
 MAX_FIELDS = 1_000_000
@@ -55,11 +55,7 @@ class _DamagedError(Exception):
 
 def model_digest(path: Path, model: Path) -> str:
     """Return the digest of the TOML file, the model and its external data."""
-    files = (path, model, *external_files(model))
-    try:
-        return files_digest(files)[:_DIGEST_CHARACTERS]
-    except OSError as error:
-        raise MethodError(f"{error.filename}: cannot be read: {error.strerror}") from None
+    return files_digest((path, model, *external_files(model)))[:_DIGEST_CHARACTERS]
 
 
 def external_files(model: Path) -> list[Path]:

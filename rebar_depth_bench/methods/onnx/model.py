@@ -18,9 +18,10 @@ from jaxtyping import Float, Float32, Float64, UInt8
 from numpy import ndarray
 from PIL import Image
 
-from rebar_depth_bench.base.errors import MethodError, Problem
+from rebar_depth_bench.base.errors import MethodError, Problem, library_message
 from rebar_depth_bench.base.limits import ONNX_MEMORY_BYTES, DeadlineError, call_within
 from rebar_depth_bench.base.system import memory_bytes, processors
+from rebar_depth_bench.base.terminal import print_notice
 from rebar_depth_bench.methods.base import (
     VIEW_TIMEOUT_S,
     Method,
@@ -198,13 +199,24 @@ def _load(spec: OnnxSpec, view_timeout_s: float) -> Predictor:
     session = open_session(spec, view_timeout_s)
     # The output shape of a model with dynamic sizes is only known after a run.
     placement, black = place_image(spec.input, *TRIAL_SIZE_PX), np.zeros((*TRIAL_SIZE_PX[::-1], 3), np.uint8)
-    session.run(input_tensor(spec.input, placement, black), "a black trial image")
+    trial = input_tensor(spec.input, placement, black)
+    session.run(trial, "a black trial image", trial.shape[-2:])
+    noted: set[str] = set()
 
     def predict(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
         height, width, _ = row["left_rgb"].shape
         placement = place_image(spec.input, width, height)
         tensor = input_tensor(spec.input, placement, row["left_rgb"])
-        values = session.run(tensor, row.get("view_id", "the image"))
+        values = session.run(tensor, row.get("view_id", "the image"), (height, width))
+        if not _has_ratio(values.shape, tensor.shape[-2:]) and not _has_ratio(values.shape, (height, width)):
+            sides = " x ".join(map(str, values.shape))
+            note = (
+                f"{spec.model}: the output, {sides}, is scaled to the picture along each axis: its ratio is "
+                f"neither that of the input nor that of the picture, {height} x {width}"
+            )
+            if note not in noted:  # Once for each size of the pictures.
+                noted.add(note)
+                print_notice(note)
         factor = 1.0
         if focal_px := spec.output.focal_canonical_px:
             # That of the resized image that the model receives (Yin et al., "Metric3D", ICCV 2023, section 3.2).
@@ -228,7 +240,6 @@ _FLOAT_DTYPES: Mapping[str, type] = {
     "tensor(double)": np.float64,
 }
 _LOG_ERRORS_ONLY, _LOG_NOTHING = 3, 4
-_MAX_ERROR_CHARACTERS = 300
 _OUT_OF_MEMORY = "Available memory of"
 """Part of onnxruntime's message if its memory arena cannot grow any further."""
 
@@ -242,11 +253,16 @@ class OnnxSession:
     output_name: str
     timeout_s: float
 
-    def run(self, tensor: Float64[ndarray, "1 3 h w"], view: str) -> Float64[ndarray, "out_h out_w"]:
+    def run(
+        self, tensor: Float64[ndarray, "1 3 h w"], view: str, picture: Sequence[int]
+    ) -> Float64[ndarray, "out_h out_w"]:
         """Return the output map for one normalised image; ``view`` names it in error messages.
 
-        Raises ``MethodError`` if the model fails or exceeds the time limit, or if the output is not a single map
-        or, with ``at_input_size``, not of the input's size.
+        ``picture`` are height and width of the image, for a trial those of the input.
+
+        Raises ``MethodError`` if the model fails or exceeds the time limit, or if the output is not a single map,
+        is a single row or column, has the ratio of the input or the picture transposed or, with ``at_input_size``,
+        is not of the input's size.
         """
         import onnxruntime
 
@@ -271,12 +287,27 @@ class OnnxSession:
             raise MethodError(
                 f"{name} has the shape {shape}, expected H x W, with optional leading dimensions of 1"
             )
-        if self.spec.output.at_input_size and shape[-2:] != tensor.shape[-2:]:
-            expected = " x ".join(map(str, tensor.shape[-2:]))
+        grid, canvas = shape[-2:], tensor.shape[-2:]
+        expected = " x ".join(map(str, canvas))
+        is_line = 1 in grid and 1 not in canvas
+        is_turned = any(_has_ratio(grid, sides[::-1]) for sides in (canvas, picture))
+        if is_line or (is_turned and not any(_has_ratio(grid, sides) for sides in (canvas, picture))):
+            found = "a single row or column" if is_line else "the width before the height"
+            raise MethodError(
+                f"{name} has the shape {shape}, {found}, expected rows and columns as the input, {expected}; "
+                "write a Python method file that reshapes or transposes it, see examples/methods/channels_last.py"
+            )
+        if self.spec.output.at_input_size and grid != canvas:
             raise MethodError(
                 f"{name} has the shape {shape}, expected {expected} or [output] at_input_size = false"
             )
         return np.asarray(output, np.float64).reshape(shape[-2:])
+
+
+def _has_ratio(grid: Sequence[int], sides: Sequence[int]) -> bool:
+    """Return whether the rows and columns of a grid have the ratio of ``sides`` within one row or column."""
+    (rows, columns), (height, width) = grid, sides
+    return abs(rows * width - columns * height) < max(height, width)
 
 
 def open_session(spec: OnnxSpec, timeout_s: float) -> OnnxSession:
@@ -394,7 +425,6 @@ def _select_output(outputs: Sequence[Any], spec: OutputSpec, problems: list[Prob
 
 
 def _error_text(error: Exception) -> str:
-    """Return the message of an exception on one line, truncated."""
-    message = " ".join(str(error).split())
-    hint = f"; {ONNX_MEMORY_BYTES.variable} raises the limit" if _OUT_OF_MEMORY in message else ""
-    return f"{message[:_MAX_ERROR_CHARACTERS]}{' ...' if len(message) > _MAX_ERROR_CHARACTERS else ''}{hint}"
+    """Return the message of an exception of onnxruntime, with the remedy if the memory was too small."""
+    hint = f"; {ONNX_MEMORY_BYTES.variable} raises the limit" if _OUT_OF_MEMORY in str(error) else ""
+    return f"{library_message(error)}{hint}"

@@ -11,8 +11,7 @@ from jaxtyping import Float32, UInt8
 from numpy import ndarray
 
 from rebar_depth_bench.base.errors import MethodError, install_command
-from rebar_depth_bench.data.files import files_digest
-from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor, positive_or_nan
+from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor, files_digest, positive_or_nan
 from rebar_depth_bench.methods.paper.third_party import (
     HubNetwork,
     Network,

@@ -21,20 +21,17 @@ import numpy as np
 from jaxtyping import Float, Float32, Num, UInt8
 from numpy import ndarray
 
-from rebar_depth_bench.base.errors import MethodError, Problem, exception_summary, install_command
+from rebar_depth_bench.base.errors import MethodError, Problem, exception_summary, install_command, library_message
 from rebar_depth_bench.base.limits import JSON_BYTES
 from rebar_depth_bench.base.reading import parse_json, read_file
 from rebar_depth_bench.base.validation import short_repr
-from rebar_depth_bench.data.files import files_digest
-from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor, WeightsMethod
+from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor, WeightsMethod, files_digest
 
 if TYPE_CHECKING:
     from torch import Tensor
 
 MIN_LOADED_FRACTION = 0.99
 """Smallest fraction of a network's parameters that a checkpoint must contain; an unused token may be missing."""
-MAX_ERROR_CHARACTERS = 300
-"""Length to which messages of third-party exceptions are truncated."""
 CONFIG, WEIGHTS = "config.json", "model.safetensors"
 """Files that ``PyTorchModelHubMixin`` reads and that a folder must hold."""
 
@@ -62,10 +59,7 @@ class Network:
         Different weights are thus a different method, and an interrupted prediction is not resumed with them.
         Raises ``MethodError`` if a file cannot be read.
         """
-        try:
-            info = self.described(f"weights sha256:{files_digest(files)}")
-        except OSError as error:
-            raise MethodError(f"{error.filename}: cannot be read: {error.strerror}") from None
+        info = self.described(f"weights sha256:{files_digest(files)}")
         return replace(info, name=f"{info.name}:{label}")
 
     def check_folder(self, folder: Path, *required_files: str) -> None:
@@ -223,7 +217,7 @@ class HubNetwork(Network):
 
 def _describe(error: Exception, install: str) -> str:
     """Return the message of a third-party exception, with advice for well-known causes."""
-    message = " ".join(f"{type(error).__name__}: {error}".split())[:MAX_ERROR_CHARACTERS]
+    message = f"{type(error).__name__}: {library_message(error)}"
     if isinstance(error, ImportError):
         return f"{message}; to install what its code imports: {install}"
     if "torchvision::" in message:  # Raised by the import of a torchvision that does not fit torch.

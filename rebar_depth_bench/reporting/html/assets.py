@@ -11,8 +11,7 @@ from jinja2 import BaseLoader, ChoiceLoader, Environment, PackageLoader, StrictU
 from markupsafe import Markup
 
 from rebar_depth_bench.base.errors import printable
-from rebar_depth_bench.reporting import formatting
-from rebar_depth_bench.scoring import columns
+from rebar_depth_bench.scoring import columns, formatting
 
 
 @dataclass(frozen=True)

@@ -20,7 +20,7 @@ from rebar_depth_bench.base.names import config_of
 from rebar_depth_bench.base.writing import write_output
 from rebar_depth_bench.diagnosis.corrections import COLUMNS, diagnosed_view, positions_to_read
 from rebar_depth_bench.diagnosis.diagnose import PossibleMistake, diagnose_config
-from rebar_depth_bench.reporting import charts, formatting
+from rebar_depth_bench.reporting import charts
 from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS
 from rebar_depth_bench.reporting.html.assets import environment, inline_script
 from rebar_depth_bench.reporting.html.views import (
@@ -34,6 +34,7 @@ from rebar_depth_bench.reporting.html.views import (
     worst_first,
 )
 from rebar_depth_bench.reporting.published import OTHER_OPTICS_NOTE, load_published, paper_scenes
+from rebar_depth_bench.scoring import formatting
 from rebar_depth_bench.scoring.columns import ALIGNED, ALIGNED_CONSTANT, ALIGNED_ROBUST, VIEW_COLUMNS, has_dash
 from rebar_depth_bench.scoring.evaluation import Evaluation, View
 from rebar_depth_bench.scoring.groups import GROUPINGS
@@ -48,6 +49,8 @@ if TYPE_CHECKING:
 
 WORST_SHOWN = 10
 """Number of views of a config that are listed openly; the full list is collapsed."""
+_MISTAKE_CHARACTERS = 1000
+"""Largest number of characters that are shown of a possible mistake; its remedy stands at its end."""
 
 
 @dataclass(frozen=True)
@@ -97,7 +100,7 @@ def render_report(
             protocol=result.protocol,
             script=script.text,
             policy=script.policy,
-            mistakes=[printable(mistake.text) for mistake in mistakes],
+            mistakes=[printable(mistake.text, _MISTAKE_CHARACTERS) for mistake in mistakes],
             kind=result.prediction,
             **content,
         )

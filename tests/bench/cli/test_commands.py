@@ -10,6 +10,7 @@ import subprocess
 import sys
 import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import huggingface_hub
@@ -123,7 +124,7 @@ def test_check_reads_the_manifest_once(
     monkeypatch.setattr(check, "print_verified", lambda _: (root / "manifest.json").unlink())
     finished = run_bench("check", constant, "--data", root, "--expect-digest", open_folder(root).digest)
     assert (finished.returncode, finished.stderr.count("error: ")) == (0, 0), finished.stderr
-    assert finished.stdout == f"{constant}: no problem found\n"
+    assert finished.stdout == f"{constant}: the archive is valid\n"
 
 
 @pytest.mark.parametrize("command", ["score", "check"])
@@ -170,25 +171,37 @@ def test_usage_and_input_errors_exit_2(arguments: str, words: str, tiny_root: Pa
     assert not Path("x.zip").exists()
 
 
-def test_methods_are_listed_without_network_and_packages(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_methods_are_listed_in_a_line_each(monkeypatch: pytest.MonkeyPatch) -> None:
+    for columns in ("80", "100", "600"):
+        monkeypatch.setenv("COLUMNS", columns)
+        lines = run_bench("methods").stdout.splitlines()
+        assert len(lines) <= 40
+        assert max(map(len, lines)) <= min(int(columns), 100)
+        named = {line.split()[0]: line for line in lines}
+        for name, method in own_methods().items():
+            assert (f"{name} ‡" in named[name]) == method.info.uses_ground_truth
+            assert method.info.summary[:20] in named[name]
+
+
+def test_a_method_is_printed_whole_without_network_and_packages(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "600")
     for function in ("hf_hub_download", "snapshot_download"):
         monkeypatch.setattr(huggingface_hub, function, None)
     monkeypatch.setitem(sys.modules, "torch", None)
-    finished = run_bench("methods")
-    listed = finished.stdout
-    assert (finished.returncode, finished.stderr) == (0, "")
-    assert all(name in listed and METHODS[name].info.name == name for name in METHODS)
     assert {name for name, method in METHODS.items() if isinstance(method, WeightsMethod)} == set(FROM_FOLDER)
-    for name in FROM_FOLDER:
-        assert METHODS[name].info.untested_note
-        assert f"({METHODS[name].info.untested_note})" in listed
-        assert METHODS[name].info.licence in listed
-    multi_view_methods = [method for method in own_methods().values() if isinstance(method, MultiViewMethod)]
-    assert listed.count("(prepares a whole config before it predicts any view)") == len(multi_view_methods) > 0
-    assert "both rgb, both" in listed
-    assert "left_depth" in listed
-    assert "right_rgb" not in listed
+    for name, method in own_methods().items():
+        finished = run_bench("methods", name)
+        assert (finished.returncode, finished.stderr) == (0, "")
+        info, shown = method.info, finished.stdout
+        assert info.name == name
+        assert all(words in shown for words in (name, info.summary, info.source, info.licence, info.untested_note))
+        assert bool(info.untested_note) >= (name in FROM_FOLDER)
+        assert ("prepares a whole config" in shown) == isinstance(method, MultiViewMethod)
+        assert ("both rgb, both" in shown) == ("right_rgb" in info.columns)
+        assert ("reads: left_depth" in shown) == (info.columns == ("left_depth",))
+    unknown = run_bench("methods", "magic")
+    assert unknown.returncode == 2
+    assert "unknown method 'magic', expected one of" in unknown.stderr
 
 
 def test_predict_help_names_weight_folders() -> None:
@@ -304,18 +317,21 @@ def test_false_digest_is_refused_by_every_command(
         assert "ground_truth.digest" in finished.stderr
 
 
-def test_demo_lists_only_comparable_methods_that_are_no_better_than_a_plane() -> None:
+def test_demo_lists_all_methods_that_are_hardly_better_than_a_plane() -> None:
     def printed(*results: Result) -> str:
         console = Console(width=200, file=io.StringIO())
         _print_results(results, console)
         return " ".join(console.file.getvalue().split())  # type: ignore[attr-defined]
 
-    [whole, sparse] = (
-        result(scored_view("lattice/0000", coverage=share), method=name)
-        for name, share in (("whole", 1.0), ("sparse", 0.9))
-    )
-    assert "no better in scaled AbsRel than that plane: whole." in printed(whole, sparse)
-    assert "in the column constant." in printed(sparse)
+    whole = scored_view("lattice/0000")
+    assert whole.scaled is not None
+    assert whole.scaled_constant is not None
+    results = [result(whole, method="whole"), result(scored_view("lattice/0000", coverage=0.9), method="sparse")]
+    for name, share in (("near", 0.97), ("good", 0.9)):
+        scaled = replace(whole.scaled, abs_rel=share * whole.scaled_constant[0])
+        results.append(result(replace(whole, scaled=scaled), method=name))
+    assert "less than 5 % for whole, sparse, near." in printed(*results)
+    assert "less than" not in printed(results[-1])
 
 
 def test_demo_on_the_sample_prints_what_the_readme_shows(tmp_path: Path) -> None:

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import datasets
 import numpy as np
@@ -17,6 +21,7 @@ from rebar_depth_bench.data.schema import COLUMNS, ROW_SCHEMA, features
 from rebar_depth_bench.data.shards import encoded_rows
 from rebar_depth_bench.geometry.cameras import ideal_K, right_camera_pose
 from tests.damage import change_rows, copy_dataset, first_shard
+from tests.small_disks import NewDisk
 
 HEIGHT, WIDTH, VIEWS = 90, 160, 9
 
@@ -42,6 +47,48 @@ def test_view_ids_of_the_manifest_are_indices_of_the_full_protocol(tiny_root: Pa
     assert list(view_ids) == [f"lattice/{(2 * i + 1) * 504 // 18:04d}" for i in range(VIEWS)]
 
 
+STREAMING = (False, True)
+LOADED = """
+import sys
+import rebar_depth_bench as rdb
+try:
+    rdb.load(sys.argv[1], "lattice", streaming=sys.argv[2] == "True")
+except rdb.InputError:
+    raise
+except Exception as error:
+    sys.exit(str(error))
+"""
+
+
+@pytest.mark.parametrize(
+    ("fault", "fails"), [("file", STREAMING), ("read-only", STREAMING), ("full", (False,)), ("none", ())]
+)
+def test_cache_of_datasets_that_cannot_be_written_is_named(
+    fault: str, fails: tuple[bool, ...], tiny_root: Path, tmp_path: Path, new_disk: NewDisk
+) -> None:
+    """The cache is named, and not the dataset, which has no damage."""
+    folder = tmp_path / "cache"
+    if fault == "file":
+        folder.write_bytes(b"")
+    elif fault != "none":
+        disk = new_disk(1 << 16)
+        folder = disk.root
+        if fault == "read-only":
+            disk.make_read_only()
+    for streaming in STREAMING:
+        command = [sys.executable, "-c", LOADED, str(tiny_root), str(streaming)]
+        environment = {**os.environ, "HF_DATASETS_CACHE": str(folder)}
+        finished = subprocess.run(
+            command, env=environment, capture_output=True, text=True, timeout=100, check=False
+        )
+        assert finished.returncode == (streaming in fails), finished.stderr
+        if streaming in fails:
+            [line] = [line for line in finished.stderr.splitlines() if "lattice" in line]
+            assert line.startswith(f"{folder}: cannot be used as the cache of lattice: ")
+            assert "HF_DATASETS_CACHE" in line
+            assert "Traceback" not in finished.stderr
+
+
 def test_rows_decode_to_contract_dtypes_and_shapes(tiny_root: Path) -> None:
     row = rdb.load(tiny_root, "lattice")[4]
     assert list(row) == list(features())
@@ -62,6 +109,19 @@ def test_rows_decode_to_contract_dtypes_and_shapes(tiny_root: Path) -> None:
         assert 0.03 < row[f"{eye}_mask"].mean() < 0.3
     assert row["baseline_m"] == 0.12
     assert np.array_equal(row["right_cam_from_world"], right_camera_pose(row["left_cam_from_world"], 0.12))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"split": None}, "lattice has no split None, expected test"),
+        ({"split": 3}, "lattice has no split 3, expected test"),
+        ({"columns": 3}, "columns is 3, expected a list of column names"),
+    ],
+)
+def test_arguments_of_other_types_are_refused(tiny_root: Path, arguments: dict[str, Any], words: str) -> None:
+    with pytest.raises(rdb.DatasetError, match=words):
+        rdb.load(tiny_root, "lattice", **arguments)
 
 
 def test_load_errors_name_expected_values(tiny_root: Path, tmp_path: Path) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import copy
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +32,12 @@ def batches(root: Path, **options: Any) -> list[dict[str, Any]]:
 
 def ids(found: list[dict[str, Any]]) -> list[str]:
     return [view_id for batch in found for view_id in batch["view_id"]]
+
+
+def depth_by_view(epoch: Any) -> dict[str, Any]:
+    return {
+        view_id: depth for batch in epoch for view_id, depth in zip(batch["view_id"], batch["depth"], strict=True)
+    }
 
 
 def project(K: ndarray, cam_from_world: ndarray, points_m: ndarray) -> Float64[ndarray, "n 3"]:
@@ -86,16 +94,14 @@ def test_single_view_is_mirrored_in_place(tiny_root: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("num_workers", [0, 2])
 @pytest.mark.parametrize("streaming", [False, True])
-def test_order_crops_and_flips_depend_on_seed_epoch_and_view(
+def test_order_crops_and_flips_depend_on_seed_draws_and_view(
     tiny_root: Path, num_workers: int, streaming: bool
 ) -> None:
     def two_epochs(**options: Any) -> list[list[dict[str, Any]]]:
         views = rdb.load(tiny_root, "lattice", streaming=streaming)
         loader = rdb.torch_loader(views, num_workers=num_workers, crop=CROP, flip=True, **options)
+        torch.manual_seed(3)
         return [list(loader), list(loader)]
-
-    def depth_by_view(epoch: list[dict[str, Any]]) -> dict[str, Any]:
-        return {batch["view_id"][0]: batch["depth"] for batch in epoch}
 
     first, second = two_epochs(shuffle=True)
     again = two_epochs(shuffle=True)
@@ -154,9 +160,42 @@ def test_what_cannot_be_batched_is_refused(tiny_root: Path) -> None:
         flip_row(row)
 
 
+@pytest.mark.parametrize("streaming", [False, True])
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("batch_size", [None, 0, -1, 2.0, True, "2", [2]]),
+        ("num_workers", [None, -1, 1.0, "1"]),
+        ("crop", [0, -8, 64.0, True, "64", (8.0, 8), (8, None), (8, 8, 8), {8, 9}]),
+        ("seed", [None, -1, 1.5, "1"]),
+        ("flip", [None, 0.5, "no"]),
+        ("shuffle", [None, "no"]),
+        ("stereo", [None, "right"]),
+        ("drop_last", ["no"]),
+        ("pin_memory", ["cuda"]),
+        ("sampler", [3, 0.5]),
+    ],
+)
+def test_wrong_arguments_are_named(tiny_root: Path, streaming: bool, name: str, values: list[Any]) -> None:
+    views = rdb.load(tiny_root, CONFIG, streaming=streaming)
+    for value in values:
+        with pytest.raises(InputError) as caught:
+            rdb.torch_loader(views, **{name: value})
+        assert [problem.where for problem in caught.value.problems] == [name]
+        assert repr(value) in caught.value.problems[0].found
+
+
+def test_one_side_is_a_square_crop(tiny_root: Path) -> None:
+    expected = depth_by_view(batches(tiny_root, crop=(24, 24)))
+    for side in (24, np.int64(24)):
+        found = depth_by_view(batches(tiny_root, batch_size=np.int32(1), crop=side))
+        assert all(torch.equal(depth, expected[view_id]) for view_id, depth in found.items())
+
+
 def test_samplers_choose_the_rows_and_their_order(tiny_root: Path) -> None:
     all_ids = ids(batches(tiny_root))
-    assert ids(batches(tiny_root, sampler=[5, 0, 5])) == [all_ids[5], all_ids[0], all_ids[5]]
+    for numbers in ([5, 0, 5], np.array([5, 0, 5]), torch.tensor([5, 0, 5])):
+        assert ids(batches(tiny_root, sampler=numbers)) == [all_ids[5], all_ids[0], all_ids[5]]
     ranks = [
         ids(batches(tiny_root, sampler=torch.utils.data.DistributedSampler(all_ids, 3, rank, shuffle=True)))
         for rank in range(3)
@@ -168,6 +207,62 @@ def test_samplers_choose_the_rows_and_their_order(tiny_root: Path) -> None:
         batches(tiny_root, sampler=[0], shuffle=True)
     with pytest.raises(InputError, match="sampler is given with a streamed dataset"):
         batches(tiny_root, sampler=[0], streaming=True)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("copied", [lambda source: source, copy.deepcopy])
+@pytest.mark.parametrize("streaming", [False, True])
+def test_frameworks_build_the_loader_again(tiny_root: Path, streaming: bool, copied: Callable[[Any], Any]) -> None:
+    def loader() -> Any:
+        views = rdb.load(tiny_root, CONFIG, streaming=streaming)
+        return rdb.torch_loader(views, 2, crop=CROP, flip=True, seed=4)
+
+    original = loader()
+    assert type(original) is torch.utils.data.DataLoader
+    expected = [depth_by_view(original) for _ in range(3)]
+    assert any(not torch.equal(depth, expected[1][view_id]) for view_id, depth in expected[0].items())
+    for workers in ({}, {"num_workers": 2}, {"num_workers": 2, "persistent_workers": True}):
+        given = loader()
+        sampler = None if streaming else range(len(given.dataset))[::-1]
+        again = torch.utils.data.DataLoader(
+            copied(given.dataset), 3, sampler=sampler, collate_fn=given.collate_fn, **workers
+        )
+        for depths in expected:
+            found = depth_by_view(again)
+            assert found.keys() == depths.keys()
+            assert all(torch.equal(depth, depths[view_id]) for view_id, depth in found.items())
+
+
+def test_view_drawn_twice_in_an_epoch_is_changed_twice(tiny_root: Path) -> None:
+    twice, once = (
+        rdb.torch_loader(rdb.load(tiny_root, CONFIG), crop=CROP, seed=4, sampler=sampler)
+        for sampler in ([1, 0, 1], [1])
+    )
+    first, _, second = twice
+    for batch in (first, second):
+        [same] = once
+        assert torch.equal(batch["depth"], same["depth"])
+    assert not torch.equal(first["depth"], second["depth"])
+
+
+@pytest.mark.slow
+def test_shuffled_loader_is_sent_to_spawned_processes(tiny_root: Path) -> None:
+    loader = rdb.torch_loader(rdb.load(tiny_root, CONFIG), shuffle=True, crop=CROP)
+    torch.multiprocessing.spawn(_expect_batches, (loader, len(loader)))
+
+
+def _expect_batches(_: int, loader: Any, expected: int) -> None:
+    assert len(list(loader)) == expected
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("num_workers", [0, 2])
+def test_order_of_a_stream_depends_on_the_seed_of_torch(root: Path, num_workers: int) -> None:
+    def order(torch_seed: int) -> list[list[str]]:
+        torch.manual_seed(torch_seed)
+        return epochs(root, 2, streaming=True, shuffle=True, num_workers=num_workers)
+
+    assert order(1) == order(1) != order(2)
 
 
 def test_batch_has_the_values_of_the_rows(tiny_root: Path) -> None:

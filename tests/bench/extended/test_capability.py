@@ -20,7 +20,7 @@ from rebar_depth_bench.extended.inspection import (
     capability,
 )
 from rebar_depth_bench.extended.measures import NATIVE, ONCE, SCALED, STATISTICS, Measure, Samples, Statistic
-from rebar_depth_bench.extended.registry import measures_by_alignment
+from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, measures_by_alignment
 from rebar_depth_bench.extended.result import (
     ExtendedResult,
     ExtendedTable,
@@ -232,7 +232,8 @@ def test_terminal_truncates_names_not_numbers(width: int) -> None:
     for view_samples in filled:
         view_samples |= {name: np.abs(values) for name, values in view_samples.items() if "judged" in name}
     console = Console(width=width, record=True, file=io.StringIO())
-    print_extended(extended_of(filled), console)
+    for family in ("", *MEASURE_FAMILIES):
+        print_extended(extended_of(filled), console, family)
     text = console.export_text()
     assert max(map(len, text.splitlines())) <= width
     assert "…" not in text

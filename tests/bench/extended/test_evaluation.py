@@ -95,6 +95,30 @@ def test_ground_truth_is_perfect_in_every_measure(of_truth: ExtendedResult) -> N
     assert shown == MEASURE_FAMILIES.keys() - {"as_built"}, "the lattice has no design"
 
 
+def printed_rows(of_truth: ExtendedResult, family: str = "") -> list[str]:
+    console = Console(width=300, record=True, file=io.StringIO())
+    print_extended(of_truth, console, family)
+    return [line.rstrip() for line in console.export_text().splitlines()]
+
+
+def test_terminal_prints_the_first_rows_of_families_or_one_whole(of_truth: ExtendedResult) -> None:
+    short = printed_rows(of_truth)
+    for key, family in MEASURE_FAMILIES.items():
+        whole = printed_rows(of_truth, key)
+        shown = [one for one in MEASURE_FAMILIES.values() if one.title in whole]
+        assert shown == ([family] if key != "as_built" else [])
+        known = {
+            measure.column.heading
+            for measure in family.measures
+            for alignment in family.alignments
+            if of_truth.tables["lattice"].numbers[alignment][measure.name].value is not None
+        }
+        rows = {name for name in known if any(line.startswith(f"  {name} ") for line in whole)}
+        assert rows == known
+        hidden = f"  and {len(known) - 3} more: --family {key}"
+        assert (hidden in short) == (len(known) > 3)
+
+
 def test_doubled_depth_is_corrected_by_scale(
     tiny_truth: Depths, tiny_root: Path, archive_of: Archive, of_truth: ExtendedResult
 ) -> None:
@@ -216,6 +240,13 @@ def test_score_command_writes_extended_json_and_csv(
     f1 = next(row for row in rows if row["measure"] == "boundary_f1")
     assert float(f1["value"]) == 1.0
     assert "Boundary" in capsys.readouterr().out
+    command = ["score", str(archive), "--data", str(tiny_root), "--family"]
+    assert main([*command, "layers"]) == 0
+    shown = capsys.readouterr().out
+    assert MEASURE_FAMILIES["layers"].title in shown
+    assert "Boundary" not in shown
+    assert main([*command, "layer"]) == 2
+    assert f"--family is layer, expected one of {', '.join(MEASURE_FAMILIES)}" in capsys.readouterr().err
 
 
 def test_missing_and_damaged_bars_are_refused(tiny_root: Path, archive_of_truth: Path, tmp_path: Path) -> None:

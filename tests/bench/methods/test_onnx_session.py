@@ -146,6 +146,56 @@ def test_undeclared_smaller_output_raises(tmp_path: Path) -> None:
         load_predictor(str(write_toml(tmp_path)))
 
 
+SQUARE_INPUT = "width = 8\nheight = 8\nresize = 'stretch'\nrange = 255"
+
+
+@pytest.mark.parametrize(
+    ("shape", "input_table", "at_input_size", "words"),
+    [
+        ((1, 24), PLAIN_INPUT, "true", "(1, 24), a single row or column"),
+        ((1, 24), PLAIN_INPUT, "false", "(1, 24), a single row or column"),
+        ((1, 24, 1), PLAIN_INPUT, "false", "(1, 24, 1), a single row or column"),
+        ((1, 1, 6, 4), PLAIN_INPUT, "true", "(1, 1, 6, 4), the width before the height"),
+        ((12, 8), PLAIN_INPUT, "false", "(12, 8), the width before the height"),
+        ((12, 6), SQUARE_INPUT, "false", "(12, 6), the width before the height"),
+    ],
+)
+def test_flat_or_transposed_output_is_refused_without_a_wrong_remedy(
+    shape: tuple[int, ...], input_table: str, at_input_size: str, words: str, tmp_path: Path
+) -> None:
+    """The input is 4 x 6, or 8 x 8, and the picture 6 x 12."""
+    write_constant_model(tmp_path, np.ones(shape))
+    path = write_toml(tmp_path, input_table, f"{DEPTH_OUTPUT}\nat_input_size = {at_input_size}")
+    with pytest.raises(MethodError, match=re.escape(words)) as caught:
+        predict_depth(path, np.zeros((6, 12, 3), np.uint8))
+    assert "at_input_size" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("shape", "noted"), [((2, 3), False), ((6, 12), False), ((5, 5), True), ((20, 12), True)])
+def test_output_of_another_ratio_is_scaled_per_axis_with_a_note(
+    shape: tuple[int, int], noted: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The input is 4 x 6 and the picture 12 x 24; a pixel has the value of the cell that contains its centre."""
+    rows, columns = shape
+    values = 1.0 + np.arange(rows * columns).reshape(shape)
+    write_constant_model(tmp_path, values)
+    path = write_toml(tmp_path, output_table=f"{DEPTH_OUTPUT}\nat_input_size = false")
+    predict = load_predictor(str(path))
+    for _ in range(2):
+        depth_m = predict({"left_rgb": np.zeros((12, 24, 3), np.uint8)})
+    down, across = ((np.arange(side) + 0.5) * cells / side for side, cells in ((12, rows), (24, columns)))
+    np.testing.assert_array_equal(depth_m, values[np.ix_(down.astype(int), across.astype(int))])
+    notes = capsys.readouterr().err.splitlines()
+    assert len(notes) == noted, "once for all pictures of a size"
+    assert all(f"the output, {rows} x {columns}, is scaled" in note for note in notes)
+
+
+def test_long_message_of_onnxruntime_ends_with_the_cause(tmp_path: Path) -> None:
+    write_model(tmp_path, [helper.make_node("NoOperator", ["x"], ["y"], name="n" * 1000)])
+    with pytest.raises(MethodError, match=r"cannot open this model: \.\.\. n.*No Op registered for NoOperator"):
+        load_predictor(str(write_toml(tmp_path)))
+
+
 def test_output_is_selected_by_name_or_index(tmp_path: Path) -> None:
     nodes = [helper.make_node("Neg", ["x"], ["no"]), helper.make_node("ReduceMax", ["x"], ["y"], axes=[1])]
     write_model(tmp_path, nodes, outputs=["no", "y"])

@@ -53,6 +53,7 @@ def test_missing_token_is_reported_and_shared_weights_count_once(capsys: pytest.
     ("error", "words"),
     [
         (ValueError("two\n  lines"), r"m: fails: ValueError: two lines$"),
+        (ValueError("x" * 1000 + " the cause"), r"m: fails: ValueError: \.\.\. x{290} the cause$"),
         (ImportError("No module named 'mmcv'"), r"'mmcv'; to install what its code imports: pip install m's req"),
         (RuntimeError("operator torchvision::nms does not exist"), r"exist; install torch and torchvision of one"),
         (RuntimeError("Found no NVIDIA driver"), r"m: fails: its code requires a CUDA GPU, and torch finds none"),

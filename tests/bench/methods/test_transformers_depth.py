@@ -232,6 +232,7 @@ def write(content: bytes) -> Callable[[Path], None]:
 
 
 LONG_NAME = b'{"model_type": "' + b"x" * 10_000 + rb'\u001b[31m"}'
+LFS_POINTER = b"version https://git-lfs.github.com/spec/v1\noid sha256:4d4d\nsize 12\n"
 
 
 @pytest.mark.parametrize(
@@ -259,6 +260,7 @@ LONG_NAME = b'{"model_type": "' + b"x" * 10_000 + rb'\u001b[31m"}'
             "preprocessor_config.json: 1 problem\n  - got None, expected a",
         ),
         ("model.safetensors", Path.unlink, "no weights, expected *.safetensors or *.bin beside config.json"),
+        ("model.safetensors", write(LFS_POINTER), "model.safetensors: cannot be read: it is a pointer of git LFS"),
         ("model.safetensors", write(b"{}" * 500), "cannot be loaded: SafetensorError"),
         ("model.safetensors", drop_tensor, "the weights lack 1 of the network's tensors, first head.conv3.weight"),
     ],

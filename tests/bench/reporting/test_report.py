@@ -21,12 +21,12 @@ from hypothesis import strategies as st
 from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.data import codecs
 from rebar_depth_bench.diagnosis.corrections import MAX_VIEWS
-from rebar_depth_bench.reporting import formatting
 from rebar_depth_bench.reporting.charts import precision_chart
 from rebar_depth_bench.reporting.detections import DetectionPage, PageTable, render_page
 from rebar_depth_bench.reporting.html.page import WORST_SHOWN, render_report, write_report
 from rebar_depth_bench.reporting.html.views import shown_view, views_to_show
 from rebar_depth_bench.reporting.published import paper_scenes
+from rebar_depth_bench.scoring import formatting
 from rebar_depth_bench.scoring.columns import COVERAGE, NATIVE, RANK_ERROR, SCALE, SCALED, WITHIN, Cell
 from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
 from tests.bench.reporting.pages import Page, without_embedded

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,20 +15,26 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from cards.reference import coverage_text
 from rebar_depth_bench import software_version
 from rebar_depth_bench.base.errors import printable
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.reporting import formatting
+from rebar_depth_bench.extended.registry import MEASURE_FAMILIES
+from rebar_depth_bench.extended.result import MeasureEstimate
 from rebar_depth_bench.reporting.detections import DetectionPage, PageTable, print_page
+from rebar_depth_bench.reporting.extended_tables import format_value
+from rebar_depth_bench.reporting.html.extended import estimate_cell
 from rebar_depth_bench.reporting.latex import latex_table
 from rebar_depth_bench.reporting.published import load_published, published_rows
 from rebar_depth_bench.reporting.tables import comparison_cells, print_comparison, print_paper_table, print_table
+from rebar_depth_bench.scoring import formatting
 from rebar_depth_bench.scoring.columns import DASH, coverage_percent, number
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.frames import frame_csv
 from rebar_depth_bench.scoring.reference import Errors
 from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareIdentity
 from rebar_depth_bench.scoring.score import tabulate
+from tests.bench.reporting.pages import Page
 from tests.bench.reporting.results import (
     HOSTILE,
     REFERENCE,
@@ -113,6 +120,22 @@ def test_coverage_of_a_comparison_is_rounded_down_as_everywhere() -> None:
     assert ["79.4", "100.0"] in [cells[1:3] for cells in rows]
 
 
+@pytest.mark.parametrize("share", [0.79496, 0.94999, 0.99999, 0.5, 1.0])
+def test_coverage_is_rounded_down_in_every_display(share: float) -> None:
+    text = f"{math.floor(1000 * share) / 10:.1f}"
+    shown = result(scored_view("lattice/0000", coverage=share))
+    measure = MEASURE_FAMILIES["single_bar"].by_name["single_bar_coverage"]
+    displays = {
+        "print": str(shown).splitlines()[1].split()[1],
+        "notebook": next(cell for cell in Page(shown._repr_html_()).text.split() if cell.startswith(text[:2])),
+        "terminal": printed_result(shown, 160).split("2/2")[-1].split("1/1")[-1].split()[0],
+        "cards": coverage_text(share).removesuffix(" %"),
+        "extended": format_value(share, measure),
+        "extended, page": estimate_cell(MeasureEstimate(share, None, 1), measure).text,
+    }
+    assert displays == dict.fromkeys(displays, text)
+
+
 def test_notes_state_what_is_resampled() -> None:
     one_scene = result(*(scored_view(f"lattice/{12 * index:04d}") for index in range(8)))
     split = split_result()
@@ -150,7 +173,7 @@ def test_names_of_references_fit_a_line() -> None:
 
 def test_scaled_error_is_compared_with_the_constant_on_the_same_pixels() -> None:
     table = result(scored_view("lattice/0000", coverage=0.9)).tables["lattice"]
-    assert any("above that of a constant (0.0529)" in finding for finding in formatting.reference_findings(table))
+    assert any("of a constant's (0.0529)" in finding for finding in formatting.reference_findings(table))
     between = replace(table, reference=replace(REFERENCE, scaled_constant=Errors(0.07, 2.6)))
     assert not any("constant" in finding for finding in formatting.reference_findings(between))
 

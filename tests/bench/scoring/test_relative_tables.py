@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import math
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -22,6 +23,8 @@ from rebar_depth_bench.reporting.latex import latex_table
 from rebar_depth_bench.reporting.tables import print_paper_table
 from rebar_depth_bench.scoring.columns import METRICS, RELATIVE_INTERVALS
 from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
+from rebar_depth_bench.scoring.protocol import scored_pixels
+from rebar_depth_bench.scoring.relative import constant_margin
 from rebar_depth_bench.scoring.result import Result, read_result
 from tests.bench.reporting.pages import Page
 from tests.bench.reporting.test_browser import run_in_browser
@@ -32,23 +35,53 @@ KINDS = ("scale", "affine-depth", "affine-disparity")
 
 def test_text_of_a_result(relative: Result, tiny_root: Path, write: Write) -> None:
     lines = str(relative).splitlines()
-    assert lines[0].split("  ")[-6:] == [
-        *("coverage", "aligned error", "constant error", "AbsRel", "robust AbsRel", "within 5 mm")
+    assert lines[0].split("  ")[-7:] == [
+        *("coverage", "aligned error", "constant error", "margin", "AbsRel", "robust AbsRel", "<= 5 mm")
     ]
     table = relative.tables["lattice"]
     assert table.aligned is not None
     assert table.aligned_robust is not None
     assert table.constant is not None
-    errors = (table.aligned.error, table.constant.error, table.aligned.abs_rel, table.aligned_robust.abs_rel)
+    errors = (table.aligned.error, table.constant.error)
+    margin = math.floor(1000 * (1 - errors[0] / errors[1])) / 10
+    shown = (*errors, margin, table.aligned.abs_rel, table.aligned_robust.abs_rel)
     within = f"{100 * (table.aligned.within_mm[5] or 0):.1f}"
-    assert lines[1].split() == ["lattice", "100.0", "%", *(f"{value:.4f}" for value in errors), within, "%"]
-    assert lines[2].startswith("affine-disparity: disparity up to scale and shift")
-    assert len(lines) == 3
+    cells = [f"{value:.4f}" if value != margin else f"{margin:.1f} %" for value in shown]
+    assert " ".join(lines[1].split()) == f"lattice 100.0 % {' '.join(cells)} {within} %"
+    assert lines[2] == "protocol rebar-relative-1; inputs: rgb; ground truth: not used, as declared"
+    assert lines[3].startswith("affine-disparity: disparity up to scale and shift")
+    assert len(lines) == 4
     assert f"aligned error {table.aligned.error:.4g}, constant {table.constant.error:.4g}" in repr(relative)
-    assert "rebar-relative-1 (affine-disparity)" in relative._repr_html_()
+    assert all(line in Page(relative._repr_html_()).text for line in lines[2:])
     flat = str(rdb.score(write("flat", "affine-depth", lambda z: -z), tiny_root))
     assert re.search(r"The aligned error (0\.\d+) is not below 95 % of a constant's \(\1\)", flat)
     assert "In 9 of 9 views the fit has no positive slope" in flat
+
+
+@pytest.mark.parametrize(("kind", "number"), [("metric", "scaled AbsRel"), ("scale", "aligned error")])
+@pytest.mark.parametrize(("share", "is_noted"), [(-0.5, True), (0.0, True), (0.02, True), (0.1, False)])
+def test_every_kind_has_one_margin_against_the_constant(
+    kind: str,
+    number: str,
+    share: float,
+    is_noted: bool,
+    tiny_root: Path,
+    tiny_truth: dict[str, Values],
+    tmp_path: Path,
+) -> None:
+    """The AbsRel of depth that is moved from its median by a share of the deviation is that much below."""
+    rows = rdb.load(tiny_root, "lattice", columns=["view_id", "left_mask"])
+    with rdb.SubmissionWriter(tmp_path / "a.zip", "net", prediction=kind) as writer:
+        for row in rows:
+            depth_m = tiny_truth[row["view_id"]].astype(np.float64)
+            pixels = scored_pixels(row["left_mask"], tiny_truth[row["view_id"]])
+            middle = np.median(depth_m.ravel()[pixels])
+            writer.add(row["view_id"], np.maximum(middle + share * (depth_m - middle), 1e-3))
+    result = rdb.score(tmp_path / "a.zip", tiny_root)
+    margin = constant_margin(result.tables["lattice"])
+    assert margin == pytest.approx(share, abs=1e-6 if kind == "metric" else 0.1 * abs(share) + 1e-6)
+    text = f"The {number} .* is not below 95 % of a constant's"
+    assert any(re.search(text, note) for note in result.notes) == is_noted
 
 
 def test_frames(relative: Result) -> None:

@@ -51,6 +51,26 @@ def test_valid_archives_have_no_problems() -> None:
     assert problems_of([META, streamed, SECOND]) == []
 
 
+@pytest.mark.parametrize("comment", [b"", b"made by hand PK\5\6"])
+@pytest.mark.parametrize("extra", [b"\n", bytes(511), b"PK\5\6", bytes(18) + b"PK\5\6" + bytes(17)])
+def test_bytes_after_the_archive_are_counted(comment: bytes, extra: bytes) -> None:
+    archive = build(GOOD, comment=comment)
+    [problem] = problems_of(archive + extra)
+    noun = "byte follows" if len(extra) == 1 else "bytes follow"
+    assert problem.found == f"{len(extra)} {noun} the end of the archive"
+    assert problem.expected == f"the file to end at byte {len(archive)}"
+
+
+@pytest.mark.parametrize("rest", [1, 21])
+def test_truncated_archive_is_not_said_to_have_more_bytes(rest: int) -> None:
+    """An archive that is an entry, such as .npz, may end within the part of the file that is there."""
+    nested = Record(b"lattice/0000.npz", build(GOOD))
+    archive = build([META, nested, SECOND])
+    assert [problem.expected for problem in problems_of(archive[:-rest])] == [
+        "one at the end: the file is truncated"
+    ]
+
+
 def test_zip64_sizes_in_directory_and_local_header() -> None:
     size = len(FIRST.data)
     wide = struct.pack("<2H2Q", 1, 16, size, size)

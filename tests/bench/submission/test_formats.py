@@ -8,6 +8,7 @@ import struct
 import zlib
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -109,6 +110,28 @@ def test_tiled_exr_is_decoded(tmp_path: Path) -> None:
     tiles.xSize = tiles.ySize = 16
     content = zips.exr(tmp_path / "a.exr", {"Z": DEPTH}, type=OpenEXR.tiledimage, tiles=tiles)
     np.testing.assert_array_equal(decode(".exr", content, SHAPE), DEPTH)
+
+
+HEIGHT, WIDTH = SHAPE
+
+
+@pytest.mark.parametrize("corner", [(10, 0), (0, -3), (-2, 5)])
+def test_exr_whose_pixels_begin_beside_the_picture_is_rejected_with_both_windows(
+    corner: tuple[int, int], tmp_path: Path
+) -> None:
+    (left, top), last = corner, (WIDTH - 1, HEIGHT - 1)
+    header: dict[str, Any] = {
+        "dataWindow": (corner, (left + last[0], top + last[1])),
+        "displayWindow": ((0, 0), last),
+    }
+    (problem,) = problems_of(with_view(".exr", zips.exr(tmp_path / "a.exr", {"Z": DEPTH}, **header)))
+    assert (problem.code, problem.where) == ("invalid", "lattice/0000.exr")
+    for x, y in (corner, (0, 0)):
+        assert f"columns {x} to {x + last[0]} and rows {y} to {y + last[1]}" in problem.found
+    header["displayWindow"] = header["dataWindow"]
+    np.testing.assert_array_equal(
+        decode(".exr", zips.exr(tmp_path / "a.exr", {"Z": DEPTH}, **header), SHAPE), DEPTH
+    )
 
 
 @pytest.mark.parametrize(

@@ -26,6 +26,7 @@ from dataset_builder.pipeline.plan import config_parameters
 from dataset_builder.scene.environments.surroundings import SURROUNDINGS
 from dataset_builder.specs.config_specs import ColourSpec, ConfigSpec, DomeSpec, RigSpec, RingSpec, colour_spec
 from dataset_builder.user_files.make_assembly import make_assembly
+from rebar_depth_bench import score
 from rebar_depth_bench.bar_crossings.table import read_crossings
 from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.cli.main import main as rebar_bench
@@ -35,7 +36,6 @@ from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.data.schema import ViewRecord
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import Camera, ideal_K
-from rebar_depth_bench.scoring.evaluation import score
 from rebar_depth_bench.scoring.protocol import scored_pixels
 from rebar_depth_bench.scoring.table import PublishedMatch
 from rebar_depth_bench.scoring.truth import paper_differences, published_match

@@ -119,10 +119,10 @@ def opencv(values: np.ndarray, suffix: str) -> bytes:
     return cv2.imencode(suffix, values)[1].tobytes()
 
 
-def exr(folder: Path, channels: Mapping[str, np.ndarray]) -> bytes:
+def exr(folder: Path, channels: Mapping[str, np.ndarray], **attributes: Any) -> bytes:
     """Return an EXR file with these channels."""
     path = folder / "one.exr"
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage, **attributes}
     OpenEXR.File(header, dict(channels)).write(str(path))
     content = path.read_bytes()
     path.unlink()

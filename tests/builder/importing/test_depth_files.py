@@ -96,6 +96,16 @@ def test_values_are_those_that_were_written(name: str, tmp_path: Path) -> None:
     assert np.array_equal(read(tmp_path, file, content), VALUES)
 
 
+@pytest.mark.parametrize("table", [DepthTable(), DepthTable(channel="V")], ids=["one channel", "named channel"])
+def test_exr_whose_pixels_begin_beside_the_picture_is_refused(table: DepthTable, tmp_path: Path) -> None:
+    depth, window = {"V": VALUES.astype(np.float32)}, ((10, 0), (14, 2))
+    content = data.exr(tmp_path, depth, dataWindow=window, displayWindow=((0, 0), (4, 2)))
+    with pytest.raises(EntryError, match=r"columns 10 to 14 and rows 0 to 2.*columns 0 to 4 and rows 0 to 2"):
+        read(tmp_path, "a.exr", content, table)
+    content = data.exr(tmp_path, depth, dataWindow=window, displayWindow=window)
+    assert np.array_equal(read(tmp_path, "a.exr", content, table), VALUES)
+
+
 def test_unsigned_integers_of_32_bits_are_no_signed_ones(tmp_path: Path) -> None:
     for order in "<>":
         content = tiff(np.full((3, 5), 4_000_000_000, np.uint32), order)

@@ -98,6 +98,10 @@ INVALID_FILES: dict[str, tuple[str, bytes | str | None]] = {
     "depth of another size": (f"depth/{THIRD}_left.npy", data.npy(np.ones((45, 80), np.float32))),
     "pickle": (f"depth/{THIRD}_left.npy", pickle.dumps(np.ones((90, 160)))),
     "array of objects": (f"depth/{THIRD}_left.npy", data.npy(np.full((90, 160), None))),
+    "pointer of git LFS": (
+        f"depth/{THIRD}_left.npy",
+        b"version https://git-lfs.github.com/spec/v1\noid sha256:4d4d\nsize 12\n",
+    ),
     "device": (f"depth/{FIRST}_left.npy", "/dev/zero"),
     "mask in colour": (f"mask/{FIRST}_left.png", data.png(np.zeros((90, 160, 3), np.uint8))),
     "ids beside the steel": (f"mask/{FIRST}_left.png", data.png(np.zeros((90, 160), np.uint8))),

@@ -1,8 +1,9 @@
-"""Text formatting of numbers, names and ranking reasons, shared by terminal tables and HTML reports."""
+"""Text formatting of results: their summary, and names, notes and ranking reasons of tables and reports."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from rebar_depth_bench.base.errors import printable
@@ -16,12 +17,15 @@ from rebar_depth_bench.scoring.columns import (
     SCALED,
     SCALED_CONSTANT,
     Column,
+    columns_at,
+    coverage_percent,
+    number,
     texts,
     with_reference,
 )
 from rebar_depth_bench.scoring.groups import GROUPINGS
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE
-from rebar_depth_bench.scoring.relative import relative_findings
+from rebar_depth_bench.scoring.relative import constant_findings, constant_margin, kind_text
 
 if TYPE_CHECKING:
     from rebar_depth_bench.scoring.result import Result
@@ -60,6 +64,87 @@ GROUP_NOTE = (
     f"{_GROUP} Beside the errors of a group are the reference errors of its views: {ONE_PIXEL_TITLE} for native, "
     f"{CONSTANT_TITLE} for scaled errors. {_NO_INTERVALS}"
 )
+
+
+_HEADS = {
+    "coverage": "coverage",
+    "rank_error": "rank error",
+    "native.abs_rel": "AbsRel",
+    "scaled.abs_rel": "scaled",
+    "reference.scaled_constant.abs_rel": "constant",
+    "margin": "margin",
+    "within_mm.5": "<= 5 mm",
+}
+_RELATIVE_HEADS = {
+    "coverage": "coverage",
+    "aligned.error": "aligned error",
+    "constant.error": "constant error",
+    "margin": "margin",
+    "aligned.abs_rel": "AbsRel",
+    "aligned_robust.abs_rel": "robust AbsRel",
+    "aligned.within_mm.5": "<= 5 mm",
+}
+"""Headings of the columns of a summary by their paths; ``margin`` is not in the JSON."""
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Content that ``print``, a notebook and the terminal show of a result.
+
+    ``heads`` and ``rows`` are a table of the main numbers: method and headings, config and numbers.
+    ``declared`` is the protocol and what the submission declares; ``provenance`` names dataset, archive and
+    software.
+    """
+
+    heads: Sequence[str]
+    rows: Sequence[Sequence[str]]
+    provenance: str
+    declared: str
+    notes: Sequence[str]
+
+
+def summary(result: Result) -> Summary:
+    """Return the summary of a result."""
+    by_path = _HEADS if result.prediction is None else _RELATIVE_HEADS
+    rows = []
+    for name, table in result.tables.items():
+        cells = [config_title(name, table.split)]
+        for path in by_path:
+            if path == "margin":
+                cells.append(margin_text(table))
+            else:
+                [column] = columns_at(path)
+                cells.append(f"{column.text(column.value(table))} {column.unit}".strip())
+        rows.append(cells)
+    dataset, declared = result.dataset, result.declared
+    method = f"{printable(result.method)} {rank_mark(declared)}".strip()
+    return Summary(
+        heads=[method, *by_path.values()],
+        rows=rows,
+        provenance=f"dataset {printable(dataset.version)} ({short_digest(dataset.digest)}), "
+        f"archive {short_digest(result.submission.sha256)}, software {printable(result.software.version)}",
+        declared=f"protocol {result.protocol}; inputs: {inputs_text(declared)}; "
+        f"ground truth: {ground_truth_text(declared)}",
+        notes=result.notes,
+    )
+
+
+def margin_text(table: Table) -> str:
+    """Return the margin of a table against the constant in per cent, rounded down as a coverage."""
+    margin = constant_margin(table)
+    if margin is None:
+        return DASH
+    return f"{coverage_percent(margin) if margin > -1 else number(100 * margin, 1)} %"
+
+
+def result_notes(result: Result) -> list[str]:
+    """Return the sentences on what limits the numbers of a result: on its kind, and on its configs."""
+    configs_by_note: dict[str, list[str]] = {}
+    for name, table in result.tables.items():
+        for note in (*table_notes(table), *reference_findings(table)):
+            configs_by_note.setdefault(note, []).append(printable(name))
+    kind = [] if result.prediction is None else [f"{kind_text(result)}; not ranked"]
+    return kind + [f"{', '.join(configs)}: {note}" for note, configs in configs_by_note.items()]
 
 
 def inputs_text(declared: Declaration) -> str:
@@ -208,19 +293,13 @@ def row_name(result: Result, table: Table) -> str:
 
 def reference_findings(table: Table) -> list[str]:
     """Return a sentence on each error of a table that its reference errors put into perspective."""
-    findings = relative_findings(table)
-    native, scaled = NATIVE[0], SCALED[0]
-    one_pixel, constant = table.reference.one_pixel.abs_rel, table.reference.scaled_constant.abs_rel
+    findings = constant_findings(table)
+    native, one_pixel = NATIVE[0], table.reference.one_pixel.abs_rel
     if table.native and one_pixel and table.native.abs_rel < one_pixel:
         findings.append(
             f"The native AbsRel {native.text(table.native.abs_rel)} is below that of exact depth shifted by "
             f"one pixel ({native.text(one_pixel)}): it is smaller than the differences between neighbouring "
             "pixels."
-        )
-    if table.scaled and constant and table.scaled.abs_rel > constant:
-        findings.append(
-            f"The scaled AbsRel {scaled.text(table.scaled.abs_rel)} is above that of a constant "
-            f"({scaled.text(constant)}): a plane at one depth describes the shape better."
         )
     return findings
 
