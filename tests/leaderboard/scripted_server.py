@@ -80,7 +80,10 @@ def scripted_server() -> Iterator[ScriptedServer]:
                 return
             if length := re.search(rb"content-length: (\d+)", head, re.IGNORECASE):
                 self.rfile.read(int(length[1]))
-            endpoint = _endpoint(head)
+            method, path = head.split(b" ", 2)[:2]
+            endpoint = path.decode("latin-1").rpartition("/")[2].removesuffix(".json")
+            if endpoint not in ("token", "result"):
+                endpoint = "submit" if method == b"PUT" else "status"
             script.requests.append((endpoint, head.decode("latin-1")))
             answers = script.answers[endpoint]
             response = answers.pop(0) if len(answers) > 1 else answers[0]
@@ -103,12 +106,3 @@ def scripted_server() -> Iterator[ScriptedServer]:
         finally:
             server.shutdown()
             thread.join(10)
-
-
-def _endpoint(head: bytes) -> str:
-    method, path = head.split(b" ", 2)[:2]
-    if path.endswith(b"/token"):
-        return "token"
-    if method == b"PUT":
-        return "submit"
-    return "result" if path.endswith(b"/result.json") else "status"

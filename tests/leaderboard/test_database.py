@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import json
-import sqlite3
-import subprocess
-import sys
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing, contextmanager
+from contextlib import ExitStack, closing
 from pathlib import Path
+from threading import Barrier
 
 import pytest
 from sqlalchemy import Engine, create_engine, inspect
@@ -29,14 +27,6 @@ from tests.bench.reporting.results import result, scored_view
 from tests.leaderboard.boards import DIGEST, accept, board_settings, claimed, result_bytes
 
 LEASE_S = 60.0
-_CREATE = """
-import sys
-from leaderboard.db.engine import Database
-database = Database(sys.argv[1])
-print("ready", flush=True)
-sys.stdin.readline()
-database.create_schema()
-"""
 
 
 @pytest.fixture
@@ -77,42 +67,19 @@ def test_tables_are_created_once_beside_those_of_others(url: str, engine: Engine
     assert set(inspect(engine).get_table_names()) == {*Base.metadata.tables, "foreign_table"}
 
 
-@contextmanager
-def sqlite_write_lock(engine: Engine) -> Iterator[None]:
-    """Hold SQLite's write lock so that all concurrent processes start before any of them can write."""
-    if engine.dialect.name != "sqlite":
-        yield
-        return
-    with closing(sqlite3.connect(str(engine.url.database), isolation_level=None)) as connection:
-        connection.execute("PRAGMA journal_mode=WAL")
-        connection.execute("BEGIN IMMEDIATE")
-        yield
-        time.sleep(1)
-        connection.execute("ROLLBACK")
-
-
 @pytest.mark.slow
-def test_tables_are_created_by_processes_at_once(url: str, engine: Engine) -> None:
-    arguments, pipe = [sys.executable, "-c", _CREATE, url], subprocess.PIPE
-    processes = [subprocess.Popen(arguments, stdin=pipe, stdout=pipe, stderr=pipe, text=True) for _ in range(3)]
-    try:
-        for process in processes:
-            assert process.stdout is not None
-            assert process.stdout.readline() == "ready\n"
-        with sqlite_write_lock(engine):
-            for process in processes:
-                assert process.stdin is not None
-                process.stdin.write("\n")
-                process.stdin.flush()
-        for process in processes:
-            _, stderr = process.communicate(timeout=60)
-            assert process.returncode == 0, stderr
-    finally:
-        for process in processes:
-            process.kill()
-            process.communicate()
-    with closing(Database(url)) as database:
-        database.check_schema()
+def test_tables_are_created_by_services_at_once(url: str) -> None:
+    with ExitStack() as stack:
+        services = [stack.enter_context(closing(Database(url))) for _ in range(6)]
+        start = Barrier(len(services))
+
+        def create(database: Database) -> None:
+            start.wait()
+            database.create_schema()
+
+        with ThreadPoolExecutor(len(services)) as pool:
+            list(pool.map(create, services))
+        services[0].check_schema()
 
 
 @pytest.mark.parametrize(

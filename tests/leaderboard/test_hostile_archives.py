@@ -22,7 +22,6 @@ import numpy as np
 import pytest
 
 from leaderboard.scoring.isolation import ProcessEndedError, TimeLimitError, isolated_call
-from leaderboard.settings import read_settings
 from rebar_depth_bench import load
 from rebar_depth_bench.base.errors import MAX_PROBLEMS_SHOWN, Problem, SubmissionError
 from tests.bench.submission.zips import Array, Record, build, deflated, npy, npy_header
@@ -215,9 +214,3 @@ def test_large_upload_is_scored_and_the_server_needs_little_memory(
     assert stored.stat().st_size == path.stat().st_size > unused_bytes
     assert server.wait_until_ended(stored.stem)["status"] == "scored"
     assert memory_bytes(server.process.pid, "VmHWM") < MAX_MEMORY_BYTES
-
-
-def test_archive_of_the_full_protocols_fits_the_default_limit() -> None:
-    """Float32 depth of six configs of 504 views and one of 100 views, 1280 x 720, stored without compression."""
-    full = (6 * 504 + 100) * (1280 * 720 * 4 + 128)
-    assert full < read_settings(None, {"data": "ROOT"}).max_upload

@@ -118,16 +118,12 @@ def test_invalid_parameters_are_replaced_by_their_defaults(crowded: SharedServer
     assert page(crowded.page("huge") + "?views=%00")[0].status_code == 200
 
 
-def test_page_shows_one_input_class(board: SharedServer) -> None:
-    assert names_in_order(get(f"{board.url}/?config=lattice&inputs=rgb%2BK").text) == ["near"]
+def test_page_shows_the_rows_of_a_search(board: SharedServer) -> None:
+    every = names_in_order(get(f"{board.url}/?config=lattice").text)
+    for query, names in (("inputs=rgb%2BK", ["near"]), ("q=FAR", ["far"]), ("q=müller", every), ("q=nobody", [])):
+        assert names_in_order(get(f"{board.url}/?config=lattice&{query}").text) == names
     csv = board.server.get("/api/v1/leaderboard.csv?config=lattice&inputs=stereo").text
     assert [line.split(",")[3] for line in csv.splitlines()[1:]] == ["holes"]
-
-
-def test_search_selects_by_method_and_submitter(board: SharedServer) -> None:
-    every = names_in_order(get(f"{board.url}/?config=lattice").text)
-    for text, names in (("FAR", ["far"]), ("müller", every), ("nobody", [])):
-        assert names_in_order(get(f"{board.url}/?config=lattice&q={text}").text) == names
 
 
 def test_texts_of_submissions_are_escaped(board: SharedServer) -> None:

@@ -52,7 +52,6 @@ CASES = {
         "REBAR_LEADERBOARD_HIDDEN_TRUTH: there is no such setting", "", environment={f"{PREFIX}HIDDEN_TRUTH": "1"}
     ),
     "malformed TOML": Case("malformed: .*\n.*not a valid TOML file", "--settings HERE/malformed"),
-    "device as TOML file": Case("cannot be read: it is a device", "--settings /dev/zero"),
     "no data": Case("data: is not given", f"--db postgresql://u:{PASSWORD}@h/x", COMMAND_WITHOUT_DATA),
     "dataset missing": Case("no such folder", "--data HERE/none", COMMAND_WITHOUT_DATA),
     "another database": Case("db: expected sqlite", f"--db mysql://u:{PASSWORD}@h/x"),
