@@ -44,8 +44,9 @@ def placed(cage: Cage, placement: PlacementSpec, where: str) -> Cage:
     if origin_m.any():
         x, y, z = (0.0 - up @ origin_m).tolist()
         text = (
-            f"the steel is moved by x {x:.3f}, y {y:.3f}, z {z:.3f} m, to the middle and onto the ground, without "
-            'cover below it; origin = "keep" in a scene TOML file keeps the place that the file gives it'
+            f"the steel is moved by x {x:.3f}, y {y:.3f}, z {z:.3f} m, to the middle and onto the ground, before "
+            'rotate_deg and translate: cover below it is lost unless they restore it; origin = "keep" in a scene '
+            "TOML file keeps the place that the file gives it"
         )
         notes = (Note(where, "moved", text),)
     return replace(cage, bars=bars, world_from_source=matrix @ cage.world_from_source, placement_notes=notes)

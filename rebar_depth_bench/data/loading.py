@@ -154,7 +154,11 @@ def _cached(config: DatasetConfig, split: str, features: Features) -> Dataset:
         )
     except Exception as error:  # ``datasets`` wraps what reading a shard raises, which is an ``InputError``.
         cause = error.__cause__ or error
-        raise (cause if isinstance(cause, InputError) else _cache_error(config, cause)) from error
+        if isinstance(cause, InputError):
+            raise cause from error
+        if isinstance(cause, OSError):
+            raise _cache_error(config, cause) from error
+        raise
 
 
 def _cache_error(config: DatasetConfig, error: BaseException) -> OutputError:

@@ -49,11 +49,18 @@ def max_npy_bytes(shape: tuple[int, int]) -> int:
 
 
 def resize_hint(shape: Sequence[object], expected: tuple[int, int]) -> str:
-    """Return how a map comes to the (H, W) of its view, for the end of a message; "" for other than two axes."""
+    """Return how a map comes to the (H, W) of its view, for the end of a message.
+
+    It is "" for other than two axes and for another ratio of the sides, as that of a transposed or flattened map,
+    which no resizing makes right.
+    """
     height, width = expected
-    # Other interpolations make depth that lies between a bar and its background.
-    how = f"cv2.resize(depth, ({width}, {height}), interpolation=cv2.INTER_NEAREST)"
-    return f"; resize it by {how}" if len(shape) == 2 else ""
+    if len(shape) == 2 and all(str(side).isdecimal() for side in shape):
+        rows, columns = (int(str(side)) for side in shape)
+        if abs(rows * width - columns * height) < max(height, width):
+            # Other interpolations make depth that lies between a bar and its background.
+            return f"; resize it by cv2.resize(depth, ({width}, {height}), interpolation=cv2.INTER_NEAREST)"
+    return ""
 
 
 def decode_npy(name: str, data: memoryview, shape: tuple[int, int], _: float = 1.0, ints: bool = False) -> Depth:

@@ -420,6 +420,19 @@ def test_smaller_maps_are_resized_as_the_message_says(
         assert rdb.evaluate(resized, tiny_root, config=LATTICE).tables[LATTICE].views == len(lattice)
 
 
+def test_turned_and_flat_maps_are_not_to_be_resized(
+    tiny_root: Path, lattice: Truth, archive_of: Callable[..., Path]
+) -> None:
+    turned = {view_id: np.ascontiguousarray(depth_m.T) for view_id, depth_m in lattice.items()}
+    flat = {view_id: depth_m.reshape(1, -1) for view_id, depth_m in lattice.items()}
+    for wrong in (turned, flat):
+        with pytest.raises(rdb.InputError) as by_evaluate:
+            rdb.evaluate(wrong, tiny_root, config=LATTICE)
+        with pytest.raises(rdb.InputError) as by_score:
+            rdb.score(archive_of(wrong), tiny_root)
+        assert "resize" not in f"{by_evaluate.value} {by_score.value}"
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

@@ -60,7 +60,7 @@ quota = 5
 max_upload = "2GiB"
 lease_seconds = 5
 score_time = 60.5
-read_rate_limit = "600/minute"
+score_memory = "4GiB"
 rescore = true
 """
 

@@ -283,6 +283,6 @@ def test_archive_damaged_in_storage_fails_alone(
     with running_server(state, db=db) as server:
         submissions = [server.wait_until_ended(submission_id) for submission_id in ids]
         assert [submission["status"] for submission in submissions] == ["scored", "failed", "scored"]
-        assert "lattice-orbit/" in submissions[1]["reason"]
+        assert "the stored archive has another SHA-256" in submissions[1]["reason"]
         assert str(state) not in submissions[1]["reason"]
         assert {row["id"] for row in server.rows(config="lattice-orbit")} == {ids[0], ids[2]}
