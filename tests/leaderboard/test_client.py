@@ -120,6 +120,8 @@ def test_rejected_archive_has_the_problems_of_check(board: SharedServer, tiny_ro
     with LeaderboardClient(board.url, board.token) as client, pytest.raises(SubmissionError) as raised:
         client.submit(broken)
     assert [problem.code for problem in raised.value.problems] == ["syntax"]
+    with LeaderboardClient(board.url, board.token) as client, pytest.raises(InputError, match="cannot be read"):
+        client.submit(tmp_path)
 
 
 @pytest.mark.parametrize(

@@ -132,7 +132,7 @@ def test_hostile_archives_are_refused_and_leave_nothing(
     with ThreadPoolExecutor(CLIENTS) as pool:
         responses = dict(zip(archives, pool.map(attacked.upload, archives.values()), strict=True))
     assert {name: response.status_code for name, response in responses.items()} == dict.fromkeys(archives, 422)
-    places = (str(server.state), str(tiny_root), str(REPOSITORY), sys.prefix)
+    places = (str(server.state), str(tiny_root), f"{REPOSITORY}/", sys.prefix)
     for name, response in responses.items():
         content = response.json()
         details = [str(Problem(**detail)) for detail in content["problem_details"]]
