@@ -31,7 +31,7 @@ from rebar_depth_bench.detections.reading import MAX_ROWS_PER_VIEW
 from rebar_depth_bench.extended.fits import MISS_MM
 from rebar_depth_bench.extended.inspection import MISSED_NOTE, PROFILES, TOLERANCES
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, ONCE, Measure, MeasureFamily
-from rebar_depth_bench.extended.registry import MEASURE_FAMILIES
+from rebar_depth_bench.extended.families import MEASURE_FAMILIES
 from rebar_depth_bench.methods import AnyMethod, own_methods
 from rebar_depth_bench.reporting.extended_tables import FITS_NOTE, REACH_NOTE
 from rebar_depth_bench.scoring.bootstrap import BLOCK_VIEWS, INTERVALS, MIN_BLOCKS, RESAMPLES

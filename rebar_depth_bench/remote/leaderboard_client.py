@@ -31,7 +31,8 @@ from rebar_depth_bench.base.parallel import Progress, silent
 from rebar_depth_bench.base.reading import open_regular, parse_json
 from rebar_depth_bench.base.validation import validate_table
 from rebar_depth_bench.remote.models import ID_PATTERN, Answer, RejectedResponse, Submission, Token
-from rebar_depth_bench.scoring.result import Result, read_result
+from rebar_depth_bench.scoring.reading import read_result
+from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.submission.declaration import RANKS_METRIC
 from rebar_depth_bench.submission.reader import read_metadata
 

@@ -16,7 +16,7 @@ from rebar_depth_bench.base.errors import DatasetError, InputError, SubmissionEr
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import ConfigViews, Views, truth_problems
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
-from rebar_depth_bench.extended.registry import score_extended
+from rebar_depth_bench.extended.families import score_extended
 from rebar_depth_bench.methods.base import Method, MethodInfo, MultiViewMethod, Prepared
 from rebar_depth_bench.methods.run import predict
 from rebar_depth_bench.reporting.figure import figure_content

@@ -19,8 +19,8 @@ from cards.reference import coverage_text
 from rebar_depth_bench import software_version
 from rebar_depth_bench.base.errors import printable
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.extended.registry import MEASURE_FAMILIES
-from rebar_depth_bench.extended.result import MeasureEstimate
+from rebar_depth_bench.extended.families import MEASURE_FAMILIES
+from rebar_depth_bench.extended.estimates import MeasureEstimate
 from rebar_depth_bench.reporting.detections import DetectionPage, PageTable, print_page
 from rebar_depth_bench.reporting.extended_tables import format_value
 from rebar_depth_bench.reporting.html.extended import estimate_cell

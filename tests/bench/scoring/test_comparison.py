@@ -22,7 +22,7 @@ from rebar_depth_bench import InputError, score
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.bars import Bar, read_bars, write_bars
 from rebar_depth_bench.data.files import file_sha256
-from rebar_depth_bench.extended.result import ExtendedResult
+from rebar_depth_bench.extended.estimates import ExtendedResult
 from rebar_depth_bench.reporting.extended_tables import extended_csv
 from rebar_depth_bench.reporting.tables import print_comparison
 from rebar_depth_bench.scoring.columns import TABLE_COLUMNS, VIEW_COLUMNS

@@ -27,7 +27,7 @@ from dataset_builder.scene.environments.surroundings import SURROUNDINGS
 from dataset_builder.specs.config_specs import ColourSpec, ConfigSpec, DomeSpec, RigSpec, RingSpec, colour_spec
 from dataset_builder.user_files.make_assembly import make_assembly
 from rebar_depth_bench import score
-from rebar_depth_bench.bar_crossings.table import read_crossings
+from rebar_depth_bench.bar_crossings.crossings_file import read_crossings
 from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.cli.main import main as rebar_bench
 from rebar_depth_bench.data.bars import read_bars
