@@ -237,7 +237,7 @@ class Evaluator:
             self._writing = None
         self._scored: dict[str, ViewResult | None] = {}
         """Result of each view that was added; None for a view without scored pixels."""
-        self._kept = {one.source.name: KeptPredictions.of(one.source) for one in self._views}
+        self._kept = {one.source.name: KeptPredictions(one.source) for one in self._views}
 
     def update(self, view_ids: str | Sequence[str], depth: object) -> None:
         """Add the planar depth of left views in metres, or of another kind: of one view or of a batch.
@@ -285,10 +285,9 @@ class Evaluator:
             result = score_view(stored, self._truths[name], position, self._kind, self._kind)
         with self._lock:
             if view_id in self._scored:
-                raise InputError(
-                    f"{view_id}: was added before, expected each view once; a distributed sampler repeats views to "
-                    "fill its last batch: gather all in one process and drop the repeated ones; reset() begins again"
-                )
+                sampler = "a distributed sampler repeats views to fill its last batch: gather all in one process"
+                remedy = f"{sampler} and drop the repeated ones; reset() begins again"
+                raise InputError(f"{view_id}: was added before, expected each view once; {remedy}")
             if self._archive is not None:
                 if self._writing is None:
                     self._writing = _WrittenArchive(SubmissionWriter(self._archive, **self._metadata))

@@ -1,4 +1,4 @@
-"""Scoring of an archive: ``score`` opens it, compares each view with the ground truth, and tabulates the numbers."""
+"""Scoring of an archive: ``score`` opens it, compares each view with the truth, and tabulates the numbers."""
 
 from __future__ import annotations
 
@@ -144,7 +144,7 @@ def score_view(
 ) -> ViewResult:
     """Return what a result has of one view; ``position`` is that among the scored views of the config.
 
-    ``prediction`` is of the kind ``declared``, planar depth in metres if that is metric, and is scored as ``kind``.
+    ``prediction``, of the kind ``declared``, is scored as ``kind``; if it is metric, it is planar depth in metres.
     """
     numbers = view_numbers(prediction, truth.scored.views[position], kind, declared)
     if truth.steel is None:

@@ -23,7 +23,7 @@ from numpy import ndarray
 
 from outputs import add_outputs, number, only_config, run_script, write_outputs
 from rebar_depth_bench.base.errors import InputError
-from rebar_depth_bench.base.parallel import map_with_progress
+from rebar_depth_bench.base.parallel import map_in_threads
 from rebar_depth_bench.base.terminal import ProgressBars
 from rebar_depth_bench.cli.console import add_archive, add_data
 from rebar_depth_bench.scoring.columns import coverage_percent

@@ -77,8 +77,8 @@ def view_table(evaluation: Evaluation, config: DatasetConfig, result: Result) ->
         "view_id": truths.view_ids,
         "distance_m": [view.distance_m for view in truths.traits],
         "scale": np.array([score.scale for score in scores], np.float64),
-        "native_abs_rel": [score.native.abs_rel if score.native else math.nan for score in scores],
-        "scaled_abs_rel": [score.scaled.abs_rel if score.scaled else math.nan for score in scores],
+        "native_abs_rel": [score["native.abs_rel"] if score.native else math.nan for score in scores],
+        "scaled_abs_rel": [score["scaled.abs_rel"] if score.scaled else math.nan for score in scores],
         "single_bar": [result.extended.views.get(view_id, {}) for view_id in truths.view_ids],
     }
     return pd.DataFrame(columns)

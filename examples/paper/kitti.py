@@ -26,7 +26,7 @@ from PIL import Image as Picture
 from depth_maps import DepthMaps, open_maps
 from outputs import add_outputs, number, run_script, write_outputs
 from rebar_depth_bench.base.errors import InputError
-from rebar_depth_bench.base.parallel import map_with_progress
+from rebar_depth_bench.base.parallel import map_in_threads
 from rebar_depth_bench.base.terminal import ProgressBars
 from rebar_depth_bench.captures.calibration import Calibration, Lens, MonoCalibration, StereoCalibration
 from rebar_depth_bench.captures.images import read_image_shape

@@ -26,7 +26,7 @@ from scipy.stats import kendalltau
 from depth_maps import DepthMaps, labelled, masked, open_data
 from outputs import add_outputs, flat_table, number, plain_name, run_script, write_outputs
 from rebar_depth_bench.base.errors import InputError
-from rebar_depth_bench.base.parallel import map_with_progress
+from rebar_depth_bench.base.parallel import map_in_threads
 from rebar_depth_bench.base.terminal import ProgressBars
 from rebar_depth_bench.cli.console import InputFolder, add_data, add_workers
 from rebar_depth_bench.scoring.bootstrap import INTERVALS

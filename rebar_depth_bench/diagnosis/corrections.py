@@ -89,26 +89,13 @@ class DiagnosedView:
 class KeptPredictions:
     """Predictions of a config that a diagnosis looks at: of a few views, and some pixels of others.
 
-    ``truths`` has the ground truth of the views that are looked at, by position in the config, as ``DiagnosedView``.
-    ``images`` has the predictions of these views, and ``by_order`` the values at the pixels of such a view that
-    each wrong order would put there. Both are filled by ``add``.
+    ``images`` has the predictions of the views that are looked at, by position in the config, and ``by_order`` the
+    values at the pixels of such a view that each wrong order would put there. Both are filled by ``add``.
     """
 
     config: DatasetConfig
-    truths: Mapping[int, tuple[Camera, float, Pixels, Pixels]]
     images: dict[int, Image] = field(default_factory=dict)
     by_order: dict[tuple[int, str], Values] = field(default_factory=dict)
-
-    @classmethod
-    def of(cls, config: DatasetConfig) -> KeptPredictions:
-        """Return none yet of a config. Raises ``DatasetError`` if a row of a view that is looked at is damaged."""
-        position = {config.view_ids[one]: one for one in positions_to_read(config)}
-        truths = {}
-        for row in iterate_rows(config, COLUMNS, position) if position else ():
-            left, right = (_pixels(row[f"{eye}_mask"], row[f"{eye}_depth"]) for eye in ("left", "right"))
-            camera = camera_from_row(row, "left", config.grid)
-            truths[position[row["view_id"]]] = camera, float(row["baseline_m"]), left, right
-        return cls(config, dict(sorted(truths.items())))
 
     @classmethod
     def of_archive(cls, config: DatasetConfig, submission: SubmissionReader) -> KeptPredictions:
@@ -116,14 +103,29 @@ class KeptPredictions:
 
         Raises ``EntryError`` and ``DatasetError`` for entries and shards that scoring refuses.
         """
-        kept = cls.of(config)
+        kept = cls(config)
         for position in {*kept.truths, *kept.sources}:
             kept.add(position, submission.read(config.view_ids[position]))
         return kept
 
     @cached_property
+    def truths(self) -> Mapping[int, tuple[Camera, float, Pixels, Pixels]]:
+        """Ground truth of the views that are looked at, by position: camera, baseline, pixels of both eyes.
+
+        It is read when it is first used. Raises ``DatasetError`` if a row is damaged.
+        """
+        config = self.config
+        position = {config.view_ids[one]: one for one in positions_to_read(config)}
+        truths = {}
+        for row in iterate_rows(config, ("view_id", *COLUMNS), position) if position else ():
+            left, right = (_pixels(row[f"{eye}_mask"], row[f"{eye}_depth"]) for eye in ("left", "right"))
+            camera = camera_from_row(row, "left", config.grid)
+            truths[position[row["view_id"]]] = camera, float(row["baseline_m"]), left, right
+        return dict(sorted(truths.items()))
+
+    @cached_property
     def sources(self) -> Mapping[int, Sequence[tuple[int, str]]]:
-        """Positions whose predictions a wrong order would put in views that are looked at: view and order of each."""
+        """For the position of a prediction, the views that are looked at where wrong orders would put it."""
         found: dict[int, list[tuple[int, str]]] = {}
         for name, (_, source) in orders(len(self.config.views)).items():
             for position in self.truths:

@@ -275,7 +275,7 @@ def scaled_constants(results: Sequence[tuple[str, Table]]) -> dict[str, tuple[fl
 
 
 def reference_rows(results: Sequence[tuple[str, Table]]) -> list[tuple[str, dict[str, str]]]:
-    """Return the name of each reference, and its errors as text by place of the column that they are compared with.
+    """Return the name of each reference, and its errors as text by place of the column to compare them with.
 
     ``results`` are as in ``scaled_constants``.
     """
@@ -400,8 +400,8 @@ def constant_findings(table: Table) -> list[str]:
         )
     if table["flat_views"] > table.views / 2:
         findings.append(
-            f"In {table['flat_views']:.0f} of {table.views} views the fit has no positive slope and is a constant: it "
-            "hides that the predictions say nothing about depth, or run the other way (depth declared as "
+            f"In {table['flat_views']:.0f} of {table.views} views the fit has no positive slope and is a constant: "
+            "it hides that the predictions say nothing about depth, or run the other way (depth declared as "
             "disparity, or disparity as depth)."
         )
     return findings

@@ -90,7 +90,7 @@ def metric_as(depth_m: Float[ndarray, "h w"], kind: str) -> Float64[ndarray, "h 
 def aligned_depth(
     x: Float[ndarray, "h w"], truth_m: Float[ndarray, "h w"], scored: Integer[ndarray, " n"], kind: str
 ) -> Float64[ndarray, "h w"]:
-    """Return the aligned depth of a whole view, metres: the fit of ``aligned_numbers`` on the flat indices ``scored``.
+    """Return the aligned depth of a whole view, metres, by the fit on the flat indices ``scored``.
 
     It is NaN where the prediction ``x`` has no value, and everywhere if no scored pixel has one.
     """

@@ -16,11 +16,12 @@ from rebar_depth_bench.base.errors import printable
 from rebar_depth_bench.scoring.columns import (
     COVERAGE,
     FLAT_VIEWS,
+    METRIC_COLUMNS,
     REFERENCES,
+    RELATIVE_COLUMNS,
+    at_place,
     interval_columns,
     rounded,
-    rounded_interval,
-    table_columns,
     view_columns,
 )
 from rebar_depth_bench.scoring.formatting import kind_blocks
@@ -77,7 +78,7 @@ class Sheet:
 
 
 def csv_text(rows: Iterable[Iterable[str | float | bool | None]]) -> str:
-    r"""Return rows of values, the first of which is the header, as CSV with ``\n`` line ends, as ``Sheet.to_csv``."""
+    r"""Return rows of values, the first of which is the header, as CSV; see ``Sheet.to_csv``."""
     out = io.StringIO()
     csv.writer(out, lineterminator="\n").writerows([_csv_cell(value) for value in row] for row in rows)
     return out.getvalue()
@@ -93,6 +94,16 @@ def _csv_cell(value: str | float | bool | None) -> str:
     return json.dumps(value)
 
 
+def table_places(kind: str) -> dict[str, str]:
+    """Return the place of each number of a table in its JSON, by the name of its column."""
+    flat = [] if kind == METRIC else [FLAT_VIEWS]
+    columns = (*METRIC_COLUMNS, *REFERENCES) if kind == METRIC else RELATIVE_COLUMNS
+    numbers = {column.name: column.place for column in (*flat, COVERAGE, *columns)}
+    ranked = list(numbers).index(COVERAGE.name) + 1
+    names = ["views", "views_scored", *list(numbers)[:ranked], "ranked", *list(numbers)[ranked:]]
+    return {name: numbers.get(name, name) for name in names}
+
+
 def tables_sheet(results: Sequence[Result], *, groups: bool = False) -> Sheet:
     """Return one row per result and config, or with ``groups`` per group of views of it, with provenance.
 
@@ -104,16 +115,13 @@ def tables_sheet(results: Sequence[Result], *, groups: bool = False) -> Sheet:
     rows: list[dict[str, Any]] = []
     for block in kind_blocks(results) or [[]]:
         kind = block[0].kind if block else METRIC
-        counts = ["views", "views_scored", *([] if kind == METRIC else [FLAT_VIEWS.name]), COVERAGE.name, "ranked"]
-        columns = table_columns(kind) if kind != METRIC else (*table_columns(kind), *REFERENCES)
-        with_interval = interval_columns(kind)
+        places, with_interval = table_places(kind), interval_columns(kind)
         named = ("config", "split", "grouping", "group") if groups else ("config",)
         heads |= dict.fromkeys([
             *("protocol", "method", "inputs", "uses_ground_truth"),
             *([] if kind == METRIC else ["prediction"]),
             *named,
-            *counts,
-            *(column.name for column in columns),
+            *places,
             *(f"{column.name}_{end}" for column in with_interval for end in ("low", "high")),
             *("dataset_digest", "dataset_version", "submission_sha256", "software_version"),
         ])  # fmt: skip
@@ -140,11 +148,11 @@ def tables_sheet(results: Sequence[Result], *, groups: bool = False) -> Sheet:
                     for group, of_group in tables.items()
                 ]
             for names, table in named_tables:
+                document = table.to_dict()
                 row = about | dict(zip(named, names, strict=True))
-                row |= {"views": table.views, "views_scored": table.views_scored, "ranked": table.ranked}
-                row |= {column.name: column.json_value(table) for column in columns}
+                row |= {name: at_place(document, place) for name, place in places.items()}
                 for column in with_interval:
-                    low, high = rounded_interval(table.intervals.get(column.place)) or (None, None)
+                    low, high = at_place(document["ci95"], column.place) or (None, None)
                     row |= {f"{column.name}_low": low, f"{column.name}_high": high}
                 rows.append(row)
     return Sheet(list(heads), [[row.get(head) for head in heads] for row in rows])

@@ -1,4 +1,4 @@
-"""Frames of the numbers of views, and the tables that are made of them: means, intervals, groups, and their JSON."""
+"""Frames of the numbers of views, and the tables that are made of them: means, intervals, groups, JSON."""
 
 from __future__ import annotations
 

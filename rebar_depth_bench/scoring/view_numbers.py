@@ -45,7 +45,7 @@ def view_numbers(
 ) -> dict[str, float]:
     """Return the numbers of a view by their places in the JSON.
 
-    ``prediction`` is of the kind ``declared``, planar depth in metres if that is metric, and is scored as ``kind``.
+    ``prediction``, of the kind ``declared``, is scored as ``kind``; if it is metric, it is planar depth in metres.
     """
     if kind != declared:
         prediction = metric_as(prediction, kind)

@@ -122,7 +122,7 @@ def test_every_display_has_the_same_summary(
     constant = table.reference.scaled_constant.abs_rel
     assert constant is not None
     coverage = math.floor(1000 * table.coverage) / 10
-    margin = math.floor(1000 * (1 - table.scaled.abs_rel / constant)) / 10
+    margin = math.floor(1000 * (1 - table["scaled.abs_rel"] / constant)) / 10
     for display, text in displays.items():
         shown = " ".join(text.split())
         for words in (

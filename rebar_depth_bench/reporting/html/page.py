@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -242,6 +242,9 @@ def views_by_config(result: Result) -> Mapping[str, list[ViewScore]]:
     return {name: list(frame.views()) for name, frame in result.frames.items()}
 
 
+_COLUMNS = ("view_id", "left_rgb", "left_depth", "left_mask")
+
+
 def write_report(
     result: Result,
     mistakes: Sequence[PossibleMistake],
@@ -250,7 +253,7 @@ def write_report(
     *,
     views_shown: int,
 ) -> None:
-    """Write the HTML report of ``result``, whose submission is that of ``evaluation``, None if there is no archive.
+    """Write the HTML report of ``result``; ``evaluation`` is of its submission, None without an archive.
 
     Up to ``views_shown`` views of each config are shown with images: the worst by rank error, or by aligned error,
     then evenly spaced down to the best. Without an archive there are none. Only the rows of these views are read,
@@ -265,7 +268,7 @@ def write_report(
         return
     for config in evaluation.configs:
         scores = {view.view_id: view for view in chosen[config.name]}
-        for row in iterate_rows(config, ("left_rgb", "left_depth", "left_mask"), scores) if scores else ():
+        for row in iterate_rows(config, _COLUMNS, scores) if scores else ():
             prediction = evaluation.submission.read(row["view_id"])
             panels = view_panels(row, prediction, scores[row["view_id"]], evaluation.meta.prediction, result.kind)
             shown.append(shown_view(panels))

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 import pytest
 
 from rebar_depth_bench.base.errors import InputError
-from rebar_depth_bench.base.parallel import map_with_progress, silent
+from rebar_depth_bench.base.parallel import map_in_threads, silent
 from tests.processes import is_running, wait_until
 
 

@@ -155,7 +155,7 @@ def test_multi_view_method_receives_one_scene_at_a_time(root: Path, tmp_path: Pa
     table = rdb.score(tmp_path / "a.zip", root).tables["cages"]
     assert table.split == "train"
     assert table.native is not None
-    assert 0 < table.native.mae_cm < 3  # The views of a scene differ by centimetres.
+    assert 0 < table["native.mae_cm"] < 3  # The views of a scene differ by centimetres.
 
 
 def test_interrupted_prediction_of_scenes_resumes(root: Path, tmp_path: Path) -> None:

@@ -30,7 +30,7 @@ from rebar_depth_bench.reporting.tables import comparison_cells, print_compariso
 from rebar_depth_bench.scoring import formatting
 from rebar_depth_bench.scoring.columns import DASH, coverage_percent, number
 from rebar_depth_bench.scoring.comparison import compare
-from rebar_depth_bench.scoring.frames import frame_csv
+from rebar_depth_bench.scoring.spreadsheet import frame_csv
 from rebar_depth_bench.scoring.reference import Errors
 from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareIdentity
 from rebar_depth_bench.scoring.score import tabulate

@@ -27,7 +27,7 @@ from rebar_depth_bench.reporting.extended_tables import extended_csv
 from rebar_depth_bench.reporting.tables import print_comparison
 from rebar_depth_bench.scoring.columns import TABLE_COLUMNS, VIEW_COLUMNS
 from rebar_depth_bench.scoring.comparison import Difference, compare
-from rebar_depth_bench.scoring.frames import differences_frame, frame_csv, frame_of_values
+from rebar_depth_bench.scoring.spreadsheet import differences_frame, frame_csv, frame_of_values
 from rebar_depth_bench.scoring.metrics import DepthMetrics
 from rebar_depth_bench.scoring.result import DatasetIdentity, Result, read_result
 from rebar_depth_bench.scoring.score import tabulate

@@ -100,9 +100,11 @@ def test_scale_has_the_scaled_numbers_of_metric_results(write: Write, tiny_root:
         assert of_scale.aligned is not None
         assert of_scale.constant is not None
         assert vars(native.scaled).items() <= vars(of_scale.aligned).items()
-        assert (of_scale.constant.abs_rel, of_scale.constant.rmse_cm) == pytest.approx(native.scaled_constant)
+        assert (of_scale["constant.abs_rel"], of_scale["constant.rmse_cm"]) == pytest.approx(
+            native.scaled_constant
+        )
         assert of_scale.coverage == native.coverage < 1
-        assert of_scale.aligned.error > 1 - of_scale.coverage
+        assert of_scale["aligned.error"] > 1 - of_scale.coverage
 
 
 @pytest.mark.parametrize(("kind", "make"), [("affine-depth", lambda z: z), ("affine-disparity", lambda z: 1 / z)])
@@ -151,7 +153,7 @@ def test_zero_of_a_png_is_no_value(tiny_root: Path, tiny_truth: dict[str, np.nda
     assert whole.coverage == 1
     assert 0.3 < (holed.coverage or 0) < 0.7
     assert holed.aligned is not None
-    assert holed.aligned.error == pytest.approx(1 - (holed.coverage or 0), abs=0.05)
+    assert holed["aligned.error"] == pytest.approx(1 - (holed.coverage or 0), abs=0.05)
     assert holed.flat_views == 0
 
 
