@@ -400,8 +400,8 @@ def constant_findings(table: Table) -> list[str]:
         )
     if table["flat_views"] > table.views / 2:
         findings.append(
-            f"In {table['flat_views']:.0f} of {table.views} views the fit has no positive slope and is a constant: "
-            "it hides that the predictions say nothing about depth, or run the other way (depth declared as "
-            "disparity, or disparity as depth)."
+            f"In {table['flat_views']:.0f} of {table.views} views the fit has no positive slope and is a "
+            "constant: it hides that the predictions say nothing about depth, or run the other way (depth "
+            "declared as disparity, or disparity as depth)."
         )
     return findings

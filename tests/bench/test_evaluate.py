@@ -21,7 +21,7 @@ import pytest
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.scoring.result import read_result
+from rebar_depth_bench.scoring.reading import read_result
 from tests.bench.reporting.pages import Page
 
 Truth = dict[str, np.ndarray]
@@ -126,7 +126,7 @@ def test_every_display_has_the_same_summary(
     for display, text in displays.items():
         shown = " ".join(text.split())
         for words in (
-            *(f"{coverage:.1f}", f"{table.rank_error:.4f}", f"{constant:.4f}", f"{margin:.1f} %"),
+            *(f"{coverage:.1f}", f"{table['rank_error']:.4f}", f"{constant:.4f}", f"{margin:.1f} %"),
             *("ground truth: used, as declared", f"coverage {coverage:.1f} % is below 95 %"),
             *("Not ranked: the submission declares", "possible mistake: ", "in millimetres"),
         ):

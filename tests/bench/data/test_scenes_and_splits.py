@@ -24,7 +24,7 @@ from rebar_depth_bench.reporting.html.page import look_at_views
 from rebar_depth_bench.reporting.latex import latex_table
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
-from rebar_depth_bench.scoring.result import read_result
+from rebar_depth_bench.scoring.reading import read_result
 from tests.synthetic_dataset import HEIGHT, WIDTH, write_dataset, write_split_dataset
 
 SCENES = {"a": "train", "b-1": "train", "c": "validation", "d": "test", "e": "test"}

@@ -33,7 +33,7 @@ from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.spreadsheet import frame_csv
 from rebar_depth_bench.scoring.reference import Errors
 from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareIdentity
-from rebar_depth_bench.scoring.score import tabulate
+from rebar_depth_bench.scoring.table import tabulate
 from tests.bench.reporting.pages import Page
 from tests.bench.reporting.results import (
     HOSTILE,

@@ -25,7 +25,8 @@ from rebar_depth_bench.scoring.columns import METRICS, RELATIVE_INTERVALS
 from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
 from rebar_depth_bench.scoring.protocol import scored_pixels
 from rebar_depth_bench.scoring.relative import constant_margin
-from rebar_depth_bench.scoring.result import Result, read_result
+from rebar_depth_bench.scoring.reading import read_result
+from rebar_depth_bench.scoring.result import Result
 from tests.bench.reporting.pages import Page
 from tests.bench.reporting.test_browser import run_in_browser
 from tests.bench.scoring.conftest import Values, Write, disparity

@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from rebar_depth_bench.base.errors import InputError
-from rebar_depth_bench.scoring.result import read_result
-from rebar_depth_bench.scoring.score import tabulate
-from rebar_depth_bench.scoring.table import read_table
+from rebar_depth_bench.scoring.reading import read_result
+from rebar_depth_bench.scoring.table import tabulate
+from rebar_depth_bench.scoring.reading import read_table
 from rebar_depth_bench.submission import Declaration
 from tests.bench.reporting.results import overflowed_view, result, scored_view, unpredicted_view
 

@@ -290,7 +290,7 @@ from rebar_depth_bench.reporting.latex import latex_table
 from rebar_depth_bench.reporting.tables import print_table
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.spreadsheet import frame_csv
-from rebar_depth_bench.scoring.result import read_result
+from rebar_depth_bench.scoring.reading import read_result
 from rebar_depth_bench.scoring.score import score_views
 from tests.bench.reporting.results import result as result_of
 from tests.bench.scoring.test_scoring import DEPTH_M, truth_in_memory
