@@ -308,19 +308,19 @@ FLAT_VIEWS = Column(
 # The list, by kind of predictions, in the order of the JSON.
 
 METRIC_COLUMNS = (COVERAGE, RANK_ERROR, *NATIVE, *SCALED, SCALE, *DISTRIBUTION)
-RELATIVE_COLUMNS = (COVERAGE, *ALIGNED, *ALIGNED_ROBUST, *ALIGNED_CONSTANT, FLAT_VIEWS)
+RELATIVE_COLUMNS = (COVERAGE, *ALIGNED, *ALIGNED_ROBUST, *ALIGNED_CONSTANT)
 _METRIC_VIEW_COLUMNS = (COVERAGE, RANK_ERROR, SCALE, *NATIVE, *SCALED, *DISTRIBUTION)
 _BY_PLACE: Mapping[str, Column] = {one.place: one for one in (*METRIC_COLUMNS, *REFERENCES, *RELATIVE_COLUMNS)}
 
 
 def table_columns(kind: str) -> tuple[Column, ...]:
     """Return the columns of a table of a kind of predictions, without those of reference errors."""
-    return METRIC_COLUMNS if kind == METRIC else RELATIVE_COLUMNS
+    return METRIC_COLUMNS if kind == METRIC else (*RELATIVE_COLUMNS, FLAT_VIEWS)
 
 
 def view_columns(kind: str) -> tuple[Column, ...]:
     """Return the columns of a view of a kind of predictions."""
-    return _METRIC_VIEW_COLUMNS if kind == METRIC else RELATIVE_COLUMNS
+    return _METRIC_VIEW_COLUMNS if kind == METRIC else (*RELATIVE_COLUMNS, FLAT_VIEWS)
 
 
 def interval_columns(kind: str) -> tuple[Column, ...]:

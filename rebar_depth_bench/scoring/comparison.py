@@ -16,7 +16,6 @@ from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.scoring.bootstrap import INTERVALS, Interval, resample_views
 from rebar_depth_bench.scoring.columns import (
     ALIGNED_CONSTANT,
-    FLAT_VIEWS,
     Column,
     rounded,
     rounded_interval,
@@ -135,7 +134,7 @@ def config_differences(first: Result, other: Result, config: str) -> list[Differ
     are_comparable = all(one.is_comparable for one in tables)
     predicted_by_both = np.flatnonzero((frames[0]["coverage"] > 0) & (frames[1]["coverage"] > 0))
     # The constant of a fit differs with the pixels that have a value, not with the quality of a method.
-    columns = [one for one in first.columns if one not in (*ALIGNED_CONSTANT, FLAT_VIEWS)]
+    columns = [one for one in first.columns if one not in ALIGNED_CONSTANT]
     found: dict[str, Difference] = {}
     for on_all_views in (True, False):
         some = [column for column in columns if column.of_all_views == on_all_views]

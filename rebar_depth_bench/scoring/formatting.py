@@ -398,7 +398,7 @@ def constant_findings(table: Table) -> list[str]:
             else f"The aligned error {compared}: the fit hides that the predictions say little about "
             f"depth{missing}."
         )
-    if table["flat_views"] > table.views / 2:
+    if table.views_scored and table["flat_views"] > table.views / 2:
         findings.append(
             f"In {table['flat_views']:.0f} of {table.views} views the fit has no positive slope and is a "
             "constant: it hides that the predictions say nothing about depth, or run the other way (depth "

@@ -17,9 +17,9 @@ from rebar_depth_bench.scoring.columns import (
     ALIGNED,
     ALIGNED_CONSTANT,
     COVERAGE,
-    FLAT_VIEWS,
+    METRIC_COLUMNS,
+    RELATIVE_COLUMNS,
     Column,
-    table_columns,
 )
 from rebar_depth_bench.scoring.formatting import result_notes, summary
 from rebar_depth_bench.scoring.protocol import PROTOCOL
@@ -106,10 +106,10 @@ class Result:
 
     @property
     def columns(self) -> tuple[Column, ...]:
-        """Columns of the numbers that its tables have."""
-        if self.kind == "scale":
-            return (COVERAGE, *ALIGNED, *ALIGNED_CONSTANT, FLAT_VIEWS)
-        return table_columns(self.kind)
+        """Columns of its metrics, those without a robust alignment for predictions up to a scale."""
+        if self.kind == METRIC:
+            return METRIC_COLUMNS
+        return (COVERAGE, *ALIGNED, *ALIGNED_CONSTANT) if self.kind == "scale" else RELATIVE_COLUMNS
 
     @property
     def views(self) -> list[ViewScore]:

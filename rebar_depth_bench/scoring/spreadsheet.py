@@ -160,7 +160,9 @@ def tables_sheet(results: Sequence[Result], *, groups: bool = False) -> Sheet:
 
 def views_sheet(result: Result) -> Sheet:
     """Return one row per view."""
-    columns = [one for one in view_columns(result.kind) if result.kind != "scale" or one in result.columns]
+    columns = view_columns(result.kind)
+    if result.kind == "scale":
+        columns = (*result.columns, FLAT_VIEWS)
     rows = [
         (config, view.view_id, int(view["scored_px"]), *(column.view_json_value(view) for column in columns))
         for config, frame in result.frames.items()
