@@ -282,6 +282,6 @@ class ScoredResult(Result):
         with open_evaluation(self.archive, self.folder) as evaluation:
             found, expected = evaluation.submission.sha256(), self.submission.sha256
             if found != expected:
-                found = f"has the SHA-256 {found[:12]}..., expected {str(expected)[:12]}... of what was scored"
-                raise InputError(f"{self.archive}: {found}; score it again")
+                of_scored = f"expected {str(expected)[:12]}... of the archive that was scored"
+                raise InputError(f"{self.archive}: has the SHA-256 {found[:12]}..., {of_scored}; score it again")
             yield evaluation

@@ -142,7 +142,8 @@ def print_table(result: Result, console: Console) -> None:
             console.print()
             print_line(console, f"{formatting.config_title(config, table.split)}: groups of views", style="bold")
             _print_rows(_group_rows(table), console, group_layouts, "group")
-    _print_notes(result, shown.notes, console)
+    # Possible mistakes, which the notes of a result also have, go to standard error.
+    _print_notes(result, formatting.result_notes(result), console)
 
 
 def _config_rows(tables: Mapping[str, Table]) -> list[Row]:

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 
 from pydantic import Strict, TypeAdapter
 
-from rebar_depth_bench.base.errors import InputError, Problem, ProblemCode
+from rebar_depth_bench.base.errors import InputError, Problem
 from rebar_depth_bench.base.limits import JSON_BYTES
 from rebar_depth_bench.base.names import SPLITS, config_of
 from rebar_depth_bench.base.reading import parse_json
@@ -42,6 +42,7 @@ from rebar_depth_bench.scoring.table import Frame, PublishedMatch, Table, ViewSc
 from rebar_depth_bench.submission.declaration import METRIC
 
 _NAME_CHARACTERS = 300
+_NAME = f"text on one line, 1 to {_NAME_CHARACTERS} characters"
 _MAX_ENTRIES = 5000
 """Largest number of entries of a JSON object whose keys are names, and of all tables of groups."""
 _MAX_COUNT = (1 << 53) - 1
@@ -164,6 +165,8 @@ def _table_from_json(
         entry, "views_per_distance", where, problems, "a whole number above 0", _is_positive_count, default=None
     )
     sigma_m = _checked(entry, "truth_sigma_m", where, problems, "a number of 0 or more", _is_size, default=None)
+    if counts["views"] == 0:
+        kind = METRIC  # Without views there is nothing of any kind, and the table is written as a metric one.
     published = None
     if (match := entry.get("published")) is not None:
         place = format_location(where, "published")
@@ -205,9 +208,9 @@ def _view_from_json(entry: Any, kind: str, where: str, problems: list[Problem]) 
     """Return a view from its JSON object; None, with all of its problems appended, if it is invalid."""
     before = len(problems)
     if not isinstance(entry, dict):
-        problems.append(Problem("invalid", where, f"got {short_repr(entry)}", "a view"))
+        problems.append(Problem("invalid", where.removesuffix(":"), f"got {short_repr(entry)}", "a view"))
         return None
-    view_id = _checked(entry, "view_id", where, problems, "a name", _is_name)
+    view_id = _checked(entry, "view_id", where, problems, _NAME, _is_name)
     scored_px = _checked(entry, "scored_px", where, problems, "a whole number of 0 or more", _is_count)
     columns = {column.in_view: column for column in view_columns(kind)}
     numbers = _numbers_from_json(entry, kind, columns, where, problems, is_empty=False)
@@ -224,8 +227,7 @@ def _named_entries(found: Any, where: str, problems: list[Problem]) -> list[tupl
         return []
     for name in found:
         if not _is_name(name):
-            expected = f"text on one line, 1 to {_NAME_CHARACTERS} characters"
-            problems.append(Problem("invalid", format_location(where, name), "the key is no name", expected))
+            problems.append(Problem("invalid", format_location(where, name), "the key is no name", _NAME))
     return list(found.items())
 
 
@@ -266,11 +268,16 @@ def _checked(
     """
     value = entry.get(key, default) if isinstance(entry, dict) else _REQUIRED
     if value is not default and not (value is not _REQUIRED and accept(value)):
-        code: ProblemCode = "missing" if value is _REQUIRED else "invalid"
-        found = "missing" if value is _REQUIRED else f"got {short_repr(value)}"
-        problems.append(Problem(code, format_location(where, key), found, expected))
+        problems.append(_value_problem(format_location(where, key), value, expected))
         return None
     return value
+
+
+def _value_problem(where: str, value: Any, expected: str) -> Problem:
+    """Return the problem of a value that is missing or invalid."""
+    if value is _REQUIRED:
+        return Problem("missing", where, "missing", expected)
+    return Problem("invalid", where, f"got {short_repr(value)}", expected)
 
 
 def _numbers_from_json(
@@ -295,44 +302,37 @@ def _numbers_from_json(
         problems.append(Problem("conflict", where, text, ", ".join(expected)))
         return {}
     is_predicted = entry.get("views_scored", entry.get("coverage")) not in (0, None)
-    numbers = {}
+    by_group: dict[str, list[tuple[str, Column]]] = {}
     for place, column in columns.items():
-        group, _, key = place.rpartition(".")
+        by_group.setdefault(place.rpartition(".")[0], []).append((place, column))
+    numbers: dict[str, float] = {}
+    for group, members in by_group.items():
         inner = at_place(entry, group) if group else entry
+        at = format_location(where, *filter(None, group.split(".")))
         is_error = group in ("native", "scaled", *RELATIVE_ALIGNMENTS)
-        if inner is None and (is_empty or group == "aligned_robust" or (is_error and not is_predicted)):
-            numbers[place] = math.nan
-            continue
-        if inner is None and is_error:
+        if inner is None and (is_empty or group.startswith("aligned_robust") or (is_error and not is_predicted)):
+            numbers |= {place: math.nan for place, _ in members}
+        elif inner is None and is_error:
             problems.append(Problem("conflict", where, f"{group} is null", "metrics where there is a prediction"))
-            continue
-        if not isinstance(inner, dict):
-            problems.append(
-                Problem(
-                    "invalid", format_location(where, *group.split(".")), f"got {short_repr(inner)}", "a table"
-                )
-            )
-            continue
-        if len(inner) > _MAX_ENTRIES:
-            size = Problem(
-                "size", format_location(where, group), f"got {len(inner)} entries", f"at most {_MAX_ENTRIES}"
-            )
-            problems.append(size)
-            continue
-        value = inner.get(key, _REQUIRED)
-        is_flag = column.statistic == "count" and column.in_view == place
-        if value is None:
-            numbers[place] = math.inf if is_error and is_predicted else math.nan
-        elif value is _REQUIRED:
-            problems.append(Problem("missing", format_location(where, *place.split(".")), "missing", column.title))
-        elif isinstance(value, bool) if is_flag else _is_size(value) and value <= column.most:
-            numbers[place] = float(value)
+        elif not isinstance(inner, dict):
+            problems.append(Problem("invalid", at, f"got {short_repr(inner)}", "a table"))
+        elif len(inner) > _MAX_ENTRIES:
+            problems.append(Problem("size", at, f"got {len(inner)} entries", f"at most {_MAX_ENTRIES}"))
         else:
-            most = f"from 0 to {column.most:g}" if math.isfinite(column.most) else "of 0 or more"
-            wanted = "true or false" if is_flag else f"a number {most}"
-            problems.append(
-                Problem("invalid", format_location(where, *place.split(".")), f"got {short_repr(value)}", wanted)
-            )
+            for place, column in members:
+                key = place.rpartition(".")[2]
+                is_flag = column.statistic == "count" and column.in_view == place
+                most = f"from 0 to {column.most:g}" if math.isfinite(column.most) else "of 0 or more"
+                expected_value = "true or false" if is_flag else f"a number {most}"
+                value = inner.get(key, _REQUIRED)
+                if value is None:
+                    numbers[place] = math.inf if is_error and is_predicted else math.nan
+                elif value is not _REQUIRED and (
+                    isinstance(value, bool) if is_flag else _is_size(value) and value <= column.most
+                ):
+                    numbers[place] = float(value)
+                else:
+                    problems.append(_value_problem(format_location(at, key), value, expected_value))
     return numbers
 
 

@@ -201,9 +201,9 @@ class Result:
 
 
 def _describe_table(table: Table) -> str:
-    if not table.views_scored:
-        return "no predictions"
     if table.kind != METRIC:
         return f"aligned error {table['aligned.error']:.4g}, constant {table['constant.error']:.4g}, not ranked"
+    if not table.views_scored:
+        return "no predictions"
     errors = f"AbsRel {table['native.abs_rel']:.4g} native, {table['scaled.abs_rel']:.4g} scaled"
     return f"rank error {table['rank_error']:.4g}, {errors}{'' if table.ranked else ', not ranked'}"

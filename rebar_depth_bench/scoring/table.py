@@ -253,7 +253,8 @@ def tabulate(frame: Frame, truth: Truth, kind: str = METRIC, declared: Declarati
     """
 
     def table_of(views: Frame) -> Table:
-        columns = interval_columns(kind)
+        of_kind = kind if len(views) else METRIC  # Without views there is nothing of any kind.
+        columns = interval_columns(of_kind)
         intervals: dict[str, Interval | None] = dict.fromkeys(column.place for column in columns)
         if len(views):
             resampling = resample_views(
@@ -264,11 +265,11 @@ def tabulate(frame: Frame, truth: Truth, kind: str = METRIC, declared: Declarati
                 bootstrap_estimates(values, columns, resampling), values, columns, resampling
             )
         return Table(
-            kind=kind,
+            kind=of_kind,
             views=len(views),
             views_scored=int(np.count_nonzero(views["coverage"] > 0)),
             ranked=kind == METRIC and len(views) > 0 and not declared.uses_ground_truth,
-            numbers={one.place: _summary(one, views) for one in (*table_columns(kind), *REFERENCES)},
+            numbers={one.place: _summary(one, views) for one in (*table_columns(of_kind), *REFERENCES)},
             intervals=intervals,
             split=truth.split,
             views_per_distance=truth.views_per_distance,
