@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from typing import Annotated, Any
@@ -213,7 +213,7 @@ def _view_from_json(entry: Any, kind: str, where: str, problems: list[Problem]) 
     view_id = _checked(entry, "view_id", where, problems, _NAME, _is_name)
     scored_px = _checked(entry, "scored_px", where, problems, "a whole number of 0 or more", _is_count)
     columns = {column.in_view: column for column in view_columns(kind)}
-    numbers = _numbers_from_json(entry, kind, columns, where, problems, is_empty=False)
+    numbers = _numbers_from_json(entry, kind, columns, where, problems, never_null=["coverage"])
     return None if len(problems) > before else ViewScore(view_id, {"scored_px": scored_px, **numbers})
 
 
@@ -225,9 +225,11 @@ def _named_entries(found: Any, where: str, problems: list[Problem]) -> list[tupl
     if len(found) > _MAX_ENTRIES:
         problems.append(Problem("size", where, f"got {len(found)} entries", f"at most {_MAX_ENTRIES}"))
         return []
-    for name in found:
-        if not _is_name(name):
-            problems.append(Problem("invalid", format_location(where, name), "the key is no name", _NAME))
+    problems += [
+        Problem("invalid", format_location(where, name), "the key is no name", _NAME)
+        for name in found
+        if not _is_name(name)
+    ]
     return list(found.items())
 
 
@@ -264,10 +266,12 @@ def _checked(
 ) -> Any:
     """Return the value of a key that ``accept`` accepts; otherwise append its problem and return None.
 
-    A key with a ``default`` may be missing.
+    A key whose ``default`` is None may be missing or null.
     """
     value = entry.get(key, default) if isinstance(entry, dict) else _REQUIRED
-    if value is not default and not (value is not _REQUIRED and accept(value)):
+    if value is None and default is None:
+        return None
+    if value is _REQUIRED or not accept(value):
         problems.append(_value_problem(format_location(where, key), value, expected))
         return None
     return value
@@ -287,19 +291,20 @@ def _numbers_from_json(
     where: str,
     problems: list[Problem],
     *,
-    is_empty: bool,
+    is_empty: bool = False,
+    never_null: Sequence[str] = (),
 ) -> dict[str, float]:
     """Return the numbers of a table or view; ``columns`` has the column of each place.
 
-    Null is an undefined number, but inf among the errors of valid predictions. A table that ``is_empty`` has no
-    views, and no errors of any kind.
+    Null is an undefined number, but inf among the errors of valid predictions; it is refused at ``never_null`` and
+    for errors over all pixels. A table that ``is_empty`` has no views, and no errors of any kind.
     """
     errors = ("rank_error", *RELATIVE_ALIGNMENTS)
     expected = {METRIC: errors[:1], "scale": ("aligned", "constant")}.get(kind, RELATIVE_ALIGNMENTS)
     found = tuple(name for name in errors if entry.get(name) is not None)
     if found != expected and not is_empty:
         text = f"a table or view has {', '.join(found) or 'no errors'}"
-        problems.append(Problem("conflict", where, text, ", ".join(expected)))
+        problems.append(Problem("conflict", where.removesuffix(":"), text, ", ".join(expected)))
         return {}
     is_predicted = entry.get("views_scored", entry.get("coverage")) not in (0, None)
     by_group: dict[str, list[tuple[str, Column]]] = {}
@@ -308,12 +313,16 @@ def _numbers_from_json(
     numbers: dict[str, float] = {}
     for group, members in by_group.items():
         inner = at_place(entry, group) if group else entry
-        at = format_location(where, *filter(None, group.split(".")))
+        at = format_location(where, *group.split(".")) if group else where
         is_error = group in ("native", "scaled", *RELATIVE_ALIGNMENTS)
         if inner is None and (is_empty or group.startswith("aligned_robust") or (is_error and not is_predicted)):
             numbers |= {place: math.nan for place, _ in members}
         elif inner is None and is_error:
-            problems.append(Problem("conflict", where, f"{group} is null", "metrics where there is a prediction"))
+            problems.append(
+                Problem(
+                    "conflict", where.removesuffix(":"), f"{group} is null", "metrics where there is a prediction"
+                )
+            )
         elif not isinstance(inner, dict):
             problems.append(Problem("invalid", at, f"got {short_repr(inner)}", "a table"))
         elif len(inner) > _MAX_ENTRIES:
@@ -325,7 +334,7 @@ def _numbers_from_json(
                 most = f"from 0 to {column.most:g}" if math.isfinite(column.most) else "of 0 or more"
                 expected_value = "true or false" if is_flag else f"a number {most}"
                 value = inner.get(key, _REQUIRED)
-                if value is None:
+                if value is None and key != "error" and place not in never_null:
                     numbers[place] = math.inf if is_error and is_predicted else math.nan
                 elif value is not _REQUIRED and (
                     isinstance(value, bool) if is_flag else _is_size(value) and value <= column.most
