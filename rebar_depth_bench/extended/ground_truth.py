@@ -86,7 +86,7 @@ class ConfigSteelTruth:
         return self.cache.view_ids
 
     def view(self, position: int) -> SteelTruth:
-        """Return the view at ``position`` in protocol order."""
+        """Return the view at ``position``, in the order of the trajectory."""
         view = self.cache.view(position)
         rays = self.rays[view.numbers[:_LENS_NUMBERS]]
         return _steel_truth(self.config, view, rays, self.bars_by_view[view.view_id])

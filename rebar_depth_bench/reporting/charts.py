@@ -182,7 +182,7 @@ def _row_figure(title: str, description: str, axis: Axis, numbers: Mapping[str, 
 
 
 def views_chart(config: str, views: Sequence[ViewScore]) -> Markup:
-    """Return the chart of AbsRel by view in protocol order, native and scaled.
+    """Return the chart of AbsRel by view in the order of the trajectory, native and scaled.
 
     Views without any prediction are marked along the top.
     """

@@ -239,7 +239,7 @@ def _print_notes(result: Result, notes: Sequence[str], console: Console) -> None
 
 COMPARISON_NOTE = (
     "B - A: mean over the views that both have. 95 % interval: bootstrap of blocks of neighbouring views "
-    f"({BLOCK_VIEWS} steps of the protocol), of views within each distance of a survey, of whole scenes in "
+    f"({BLOCK_VIEWS} steps of the trajectory), of views within each distance of a survey, of whole scenes in "
     f"configs with splits; none with fewer than {MIN_BLOCKS} blocks or, with splits, scenes, and a survey needs "
     "one view more for each further distance. B is called better or worse if the interval excludes zero, which "
     "happens by chance in about one of twenty comparisons. "

@@ -3,7 +3,7 @@
 Neighbouring views show nearly the same steel, so their errors are correlated, and resampling single views would
 give intervals that are too narrow. Resampling blocks of consecutive views preserves the correlation: circular
 block bootstrap of Politis and Romano ("A circular block-resampling procedure for stationary data", 1992). These
-intervals describe the variation with other views of the same scene from the same camera protocol, not with other
+intervals describe the variation with other views of the same scene from the same trajectory, not with other
 cages, lights or cameras.
 
 The views of a survey are spread over the steel, and those of one distance are exchangeable. They are resampled one
@@ -42,7 +42,7 @@ CONFIDENCE_LEVEL = 0.95
 """Confidence level of the intervals."""
 
 BLOCK_VIEWS = 12
-"""Block length in steps of the full camera protocol: one ring of azimuths of the dome."""
+"""Block length in steps of the full trajectory: one ring of azimuths of the dome."""
 
 MIN_BLOCKS = 8
 """Smallest number of blocks of views, or of scenes, with values for which an interval is computed.
@@ -211,9 +211,9 @@ def interval(
 
 
 def resample(indices: Sequence[int]) -> Resampling:
-    """Return the resamples of views, given their ascending indices in the full camera protocol.
+    """Return the resamples of views, given their ascending indices in the full trajectory.
 
-    Blocks have the views on ``BLOCK_VIEWS`` steps of the full protocol; the views of a sparse subset, which are
+    Blocks have the views on ``BLOCK_VIEWS`` steps of the full trajectory; the views of a sparse subset, which are
     farther apart than that, are resampled one by one.
 
     The same indices give the same resamples on every machine, since the raw PCG64 stream does not change between
@@ -241,9 +241,9 @@ def resample_scenes(scenes: Sequence[str]) -> Resampling:
 
 
 def resample_survey(indices: Sequence[int], views_per_distance: int) -> Resampling:
-    """Return the resamples of the views of a survey, given their ascending indices in the full camera protocol.
+    """Return the resamples of the views of a survey, given their ascending indices in the full trajectory.
 
-    The full protocol has ``views_per_distance`` views at each distance, one distance after the other. Each
+    The full trajectory has ``views_per_distance`` views at each distance, one distance after the other. Each
     resample has as many views of a distance as there are, drawn with replacement. The same indices give the same
     resamples on every machine.
     """
@@ -264,12 +264,12 @@ def resample_views(
     """
     if by_scene:
         return resample_scenes([scene_of(view_id) for view_id in view_ids])
-    indices = protocol_indices(view_ids)
+    indices = trajectory_indices(view_ids)
     return resample(indices) if views_per_distance is None else resample_survey(indices, views_per_distance)
 
 
-def protocol_indices(view_ids: Sequence[str]) -> list[int]:
-    """Return each view's index in its full camera protocol: the four or more digits at the end of its view_id.
+def trajectory_indices(view_ids: Sequence[str]) -> list[int]:
+    """Return each view's index in its full trajectory: the four or more digits at the end of its view_id.
 
     If the ids do not all end with such an index, or are not in its ascending order, return the positions in the
     sequence.

@@ -15,7 +15,7 @@ from rebar_depth_bench.scoring.bootstrap import (
     Blocks,
     half_width,
     interval,
-    protocol_indices,
+    trajectory_indices,
     resample,
     resample_scenes,
     resample_views,
@@ -56,7 +56,7 @@ def test_block_length_is_one_ring_of_full_protocol(indices: range, length: int) 
 @pytest.mark.parametrize("first", [0, 9_990, 99_990])
 def test_blocks_do_not_depend_on_the_digits_of_view_ids(first: int) -> None:
     view_ids = [view_id("dome", index) for index in range(first, first + 60, 3)]
-    assert protocol_indices(view_ids) == list(range(first, first + 60, 3))
+    assert trajectory_indices(view_ids) == list(range(first, first + 60, 3))
     expected = resample(range(0, 60, 3))
     np.testing.assert_array_equal(resample_views(view_ids, by_scene=False).counts, expected.counts)
 
