@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import gc
+import copy
 import math
 import os
 import pickle
@@ -11,6 +11,7 @@ import sys
 import tempfile
 from collections import UserDict
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from subprocess import run
@@ -20,8 +21,10 @@ import numpy as np
 import pytest
 
 import rebar_depth_bench as rdb
+from rebar_depth_bench.base.errors import RebarDepthError
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.scoring.reading import read_result
+from rebar_depth_bench.scoring.result import Result
 from tests.bench.reporting.pages import Page
 
 Truth = dict[str, np.ndarray]
@@ -33,14 +36,127 @@ def lattice(tiny_root: Path) -> Truth:
     return {row["view_id"]: row["left_depth"] for row in rdb.load(tiny_root, LATTICE)}
 
 
-def test_evaluation_equals_score_of_its_archive(tiny_root: Path, tmp_path: Path) -> None:
+def test_archive_of_a_method_is_written_and_scored(tiny_root: Path, tmp_path: Path) -> None:
     pytest.importorskip("cv2")
-    result = rdb.evaluate("sgbm", tiny_root)
-    result.save_archive(tmp_path / "sgbm.zip")
+    result = rdb.evaluate("sgbm", tiny_root, archive=tmp_path / "sgbm.zip")
     assert result.to_json() == rdb.score(tmp_path / "sgbm.zip", tiny_root).to_json()
     assert list(result.tables) == ["lattice", "lattice-orbit"]
     result.to_html(tmp_path / "report.html")
     assert b"sgbm" in (tmp_path / "report.html").read_bytes()
+
+
+def without_archive(result: Result) -> dict[str, Any]:
+    """Return the JSON of a result without the digest of its archive."""
+    document = result.to_dict()
+    document["submission"]["sha256"] = None
+    return document
+
+
+@pytest.mark.parametrize("kind", ["metric", "scale", "affine-disparity"])
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
+def test_views_scored_as_they_arrive_have_the_numbers_of_an_archive(
+    tiny_root: Path, lattice: Truth, tmp_path: Path, kind: str, dtype: type
+) -> None:
+    """In any order; some pixels and one view have no prediction, and one value overflows float32."""
+    rng = np.random.default_rng(0)
+    predictions = {view_id: (z * rng.normal(1, 0.1, z.shape)).astype(dtype) for view_id, z in lattice.items()}
+    first, second, third, *_ = predictions
+    predictions[first][::3] = np.nan
+    predictions[second][:] = 0
+    predictions[third][0] = np.inf if dtype == np.float16 else 1e38
+    backwards = dict(reversed(predictions.items()))
+    arguments: dict[str, Any] = {"config": LATTICE, "kind": kind, "extended": kind == "metric"}
+    result = rdb.evaluate(backwards, tiny_root, **arguments)
+    assert result.submission.sha256 is None
+    written = rdb.evaluate(backwards, tiny_root, **arguments, archive=tmp_path / "a.zip")
+    scored = rdb.score(tmp_path / "a.zip", tiny_root, extended=kind == "metric")
+    assert written.to_json() == scored.to_json()
+    assert result.to_dict() == without_archive(scored)
+    assert result.notes == scored.notes
+
+
+def test_without_an_archive_there_are_no_pictures(tiny_root: Path, lattice: Truth, tmp_path: Path) -> None:
+    result = rdb.evaluate(lattice, tiny_root, config=LATTICE)
+    assert "no archive" in result._repr_html_()
+    result.to_html(tmp_path / "report.html")
+    text = Page((tmp_path / "report.html").read_text()).text
+    assert "No pictures of views" in text
+    assert "archive=PATH" in text
+    with pytest.raises(rdb.InputError, match="not kept, expected archive=PATH"):
+        result.save_archive(tmp_path / "a.zip")
+    assert read_result(result.to_json(), "x").to_json() == result.to_json()
+
+
+def test_compute_may_be_repeated_until_reset(tiny_root: Path, lattice: Truth, tmp_path: Path) -> None:
+    archive = tmp_path / "a.zip"
+    evaluator = rdb.Evaluator(tiny_root, LATTICE, archive=archive)
+    for factor in (1.0, 1.1):
+        evaluator.update(list(lattice), [factor * z for z in lattice.values()])
+        results = [evaluator.compute().to_json() for _ in range(2)]
+        assert results[0] == results[1] == rdb.score(archive, tiny_root).to_json()
+        evaluator.reset()
+    evaluator.update(next(iter(lattice)), next(iter(lattice.values())))
+    written = archive.read_bytes()
+    evaluator.reset()
+    assert archive.read_bytes() == written, "an incomplete archive replaces none"
+    assert [path.name for path in tmp_path.iterdir()] == ["a.zip"]
+
+
+def test_several_threads_may_add_views(tiny_root: Path, lattice: Truth) -> None:
+    expected = rdb.evaluate(lattice, tiny_root, config=LATTICE).to_json()
+    evaluator = rdb.Evaluator(tiny_root, LATTICE)
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(evaluator.update, lattice, lattice.values()))
+        repeated = [pool.submit(evaluator.update, *item) for item in lattice.items()]
+    assert all(isinstance(one.exception(), rdb.InputError) for one in repeated)
+    assert evaluator.compute().to_json() == expected
+
+
+def test_copy_is_independent(tiny_root: Path, lattice: Truth, tmp_path: Path) -> None:
+    first, *others = lattice
+    evaluator = rdb.Evaluator(tiny_root, LATTICE)
+    evaluator.update(first, lattice[first])
+    twin = copy.deepcopy(evaluator)
+    for one, factor in ((evaluator, 1.0), (twin, 1.1)):
+        one.update(others, [factor * lattice[view_id] for view_id in others])
+    assert evaluator.compute().metrics["lattice/rank_error"] == 0 < twin.compute().metrics["lattice/rank_error"]
+    writing = rdb.Evaluator(tiny_root, LATTICE, archive=tmp_path / "a.zip")
+    writing.update(first, lattice[first])
+    with pytest.raises(RebarDepthError, match=r"a\.zip: is being written, expected"):
+        copy.deepcopy(writing)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_forked_process_changes_nothing_of_its_parent(tiny_root: Path, tmp_path: Path) -> None:
+    """The child adds a view, is refused with an archive, and ends with all finalizers."""
+    code = f"""
+import os, sys
+import numpy as np
+import rebar_depth_bench as rdb
+from rebar_depth_bench.base.errors import RebarDepthError
+archive = {str(tmp_path / "a.zip")!r}
+plain = rdb.Evaluator({str(tiny_root)!r}, "lattice")
+writing = rdb.Evaluator({str(tiny_root)!r}, "lattice", archive=archive)
+first, *others = plain.view_ids
+depth = np.ones((90, 160), np.float32)
+for one in (plain, writing):
+    one.update(first, depth)
+if not os.fork():
+    plain.update(others[0], depth)
+    try:
+        writing.update(others[0], depth)
+    except RebarDepthError:
+        sys.exit(7)
+    sys.exit(0)
+assert os.waitstatus_to_exitcode(os.wait()[1]) == 7
+for one in (plain, writing):
+    one.update(others, [depth] * len(others))
+expected = plain.compute().to_dict()
+assert rdb.score(archive, {str(tiny_root)!r}).to_json() == writing.compute().to_json()
+assert writing.compute().to_dict()["tables"] == expected["tables"]
+"""
+    finished = run([sys.executable, "-W", "ignore", "-c", code], capture_output=True, text=True)
+    assert (finished.returncode, finished.stderr) == (0, "")
 
 
 def test_every_form_of_model_gives_the_same_numbers(tiny_root: Path, lattice: Truth) -> None:
@@ -50,7 +166,7 @@ def test_every_form_of_model_gives_the_same_numbers(tiny_root: Path, lattice: Tr
     of_function = rdb.evaluate(lambda row: predictions[row["view_id"]], tiny_root, config=LATTICE)
     assert of_mapping.to_json() == of_pairs.to_json() == of_function.to_json()
     assert of_mapping.metrics["lattice/native/abs_rel"] == pytest.approx(0.1)
-    assert of_mapping.metrics["lattice/within_mm/5"] == of_mapping.tables[LATTICE].within_mm[5]
+    assert of_mapping.metrics["lattice/within_mm/5"] == of_mapping.tables[LATTICE]["within_mm.5"]
 
 
 @pytest.mark.parametrize("inputs", ["stereo", "multi-view"])
@@ -75,12 +191,13 @@ def test_functions_see_no_ground_truth_that_is_not_declared(tiny_root: Path, inp
 
 
 def test_some_views_are_not_ranked(tiny_root: Path, lattice: Truth, tmp_path: Path) -> None:
-    result = rdb.evaluate(lattice, tiny_root, config=LATTICE, views=3, method="truth", extended=True)
+    some: dict[str, Any] = {"config": LATTICE, "views": 3, "method": "truth", "extended": True}
+    result = rdb.evaluate(lattice, tiny_root, **some, archive=tmp_path / "truth.zip")
     assert [view.view_id for view in result.views] == [list(lattice)[k] for k in (0, 3, 6)]
     table = result.tables[LATTICE]
     assert not table.ranked
     assert result.notes[0] == "lattice: Not ranked: 3 of 9 views."
-    constant = f"{table.reference.scaled_constant.abs_rel:.4f}"
+    constant = f"{table['reference.scaled_constant.abs_rel']:.4f}"
     lines = str(result).splitlines()
     assert [line.split() for line in lines[:2]] == [
         ["truth", "?", "coverage", "rank", "error", "AbsRel", "scaled", "constant", "margin", "<=", "5", "mm"],
@@ -105,8 +222,8 @@ def test_every_display_has_the_same_summary(
 ) -> None:
     """Depth in millimetres in every other column, of a method that declares the use of ground truth."""
     predictions = {view_id: 1000 * half(depth_m) for view_id, depth_m in lattice.items()}
-    evaluated = rdb.evaluate(predictions, tiny_root, config=LATTICE, method="mine", uses_ground_truth=True)
-    evaluated.save_archive(tmp_path / "a.zip")
+    mine: dict[str, Any] = {"method": "mine", "uses_ground_truth": True, "archive": tmp_path / "a.zip"}
+    evaluated = rdb.evaluate(predictions, tiny_root, config=LATTICE, **mine)
     scored = rdb.score(tmp_path / "a.zip", tiny_root)
     assert (str(scored), scored._repr_html_()) == (str(evaluated), evaluated._repr_html_())
     assert main(["score", str(tmp_path / "a.zip"), "--data", str(tiny_root)]) == 0
@@ -117,11 +234,8 @@ def test_every_display_has_the_same_summary(
         "terminal": streams.out + streams.err,
     }
     table = scored.tables[LATTICE]
-    assert table.coverage is not None
-    assert table.scaled is not None
-    constant = table.reference.scaled_constant.abs_rel
-    assert constant is not None
-    coverage = math.floor(1000 * table.coverage) / 10
+    constant = table["reference.scaled_constant.abs_rel"]
+    coverage = math.floor(1000 * table["coverage"]) / 10
     margin = math.floor(1000 * (1 - table["scaled.abs_rel"] / constant)) / 10
     for display, text in displays.items():
         shown = " ".join(text.split())
@@ -137,8 +251,7 @@ def test_every_display_has_the_same_summary(
 
 
 def test_score_has_report_and_archive_as_evaluate(tiny_root: Path, lattice: Truth, tmp_path: Path) -> None:
-    evaluated = rdb.evaluate(lattice, tiny_root, config=LATTICE)
-    evaluated.save_archive(tmp_path / "a.zip")
+    evaluated = rdb.evaluate(lattice, tiny_root, config=LATTICE, archive=tmp_path / "a.zip")
     scored = rdb.score(tmp_path / "a.zip", tiny_root)
     scored.save_archive(tmp_path / "b.zip")
     assert (tmp_path / "b.zip").read_bytes() == (tmp_path / "a.zip").read_bytes()
@@ -286,7 +399,7 @@ def test_shapes_of_one_view(tiny_root: Path, shape: tuple[int, ...], words: str 
     [view_id] = evaluator.view_ids
     if words is None:
         evaluator.update(view_id, np.ones(shape))
-        assert evaluator.compute().tables[LATTICE].coverage == 1
+        assert evaluator.compute().tables[LATTICE]["coverage"] == 1
     else:
         with pytest.raises(rdb.InputError, match=f"{view_id}: .*{words}"):
             evaluator.update(view_id, np.ones(shape))
@@ -372,7 +485,7 @@ def test_the_argument_that_selects_what_is_predicted_is_named(tiny_root: Path, l
     )
     with pytest.raises(rdb.InputError, match=words):
         rdb.evaluate(lattice, tiny_root)
-    assert rdb.evaluate(lattice, tiny_root, config="lattice").tables[LATTICE].coverage == 1
+    assert rdb.evaluate(lattice, tiny_root, config="lattice").tables[LATTICE]["coverage"] == 1
     with pytest.raises(rdb.InputError, match=f"{min(lattice)}: is not among .*; config=, split= and views="):
         rdb.evaluate(lattice, tiny_root, config="lattice-orbit")
 
@@ -477,18 +590,16 @@ def test_models_of_other_types_are_refused(tiny_root: Path, model: Any) -> None:
 )
 def test_what_is_no_depth_is_refused(tiny_root: Path, depth: Any, words: str | None) -> None:
     if words is None:
-        assert rdb.evaluate(lambda _: depth, tiny_root, config=LATTICE, views=1).tables[LATTICE].coverage == 1
+        assert rdb.evaluate(lambda _: depth, tiny_root, config=LATTICE, views=1).tables[LATTICE]["coverage"] == 1
     else:
         with pytest.raises(rdb.InputError, match=f"lattice/.*{words}"):
             rdb.evaluate(lambda _: depth, tiny_root, config=LATTICE)
 
 
-def test_archive_is_deleted_with_the_result(
-    tiny_root: Path, lattice: Truth, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+def test_archive_of_a_method_is_temporary(
+    tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
-    result = rdb.evaluate(lattice, tiny_root, config=LATTICE)
-    assert len(list(tmp_path.glob("*/predictions.zip"))) == 1
-    del result
-    gc.collect()
+    result = rdb.evaluate("constant", tiny_root, config=LATTICE)
+    assert (result.method, result.submission.inputs, result.submission.sha256) == ("constant", "rgb", None)
     assert not list(tmp_path.iterdir())
