@@ -10,9 +10,10 @@ from typing import TYPE_CHECKING, Any, Literal, overload
 
 from rebar_depth_bench.base.errors import DatasetError, InputError, OutputError, escape_text
 from rebar_depth_bench.base.names import TEST_SPLIT
+from rebar_depth_bench.data.codecs import PICTURE_KINDS
 from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
-from rebar_depth_bench.data.rows import row_of_pictures
-from rebar_depth_bench.data.schema import COLUMNS, validated_columns
+from rebar_depth_bench.data.rows import decode_cell, image_content
+from rebar_depth_bench.data.schema import COLUMNS, column_kind, validated_columns
 from rebar_depth_bench.data.shards import check_shards, shard_rows
 
 if TYPE_CHECKING:
@@ -93,7 +94,7 @@ def load(
     if streaming:
         try:
             streamed = IterableDataset.from_generator(
-                _encoded_rows,
+                _rows_with_images,
                 features=decoding_features(located, selected, to_arrays=True),
                 gen_kwargs={"config": located, "columns": selected, "shards": list(located.shards)},
                 split=NamedSplit(whole),
@@ -123,12 +124,22 @@ def _part(config: DatasetConfig, split: str) -> range:
         raise DatasetError(f"{found}; expected one as test[:10] or test[50%:]") from None
 
 
-def _encoded_rows(
+def _rows_with_images(
     config: DatasetConfig, columns: Sequence[str], shards: Sequence[str]
 ) -> Iterator[dict[str, Any]]:
+    """Yield the rows of shards, with encoded images in cells of ``datasets.Image``; all other cells are checked.
+
+    The path of an image names its view. It is no file.
+    """
     for row in shard_rows(config, ("view_id", *columns), shards):
-        cells = row_of_pictures(config, row)
-        yield {name: cells[name] for name in columns}
+        view_id = str(row["view_id"])
+        for column, cell in row.items():
+            if column_kind(column) in PICTURE_KINDS and column not in config.absent_columns:
+                content = image_content(config.root, column, cell, view_id)
+                row[column] = {"bytes": content, "path": f"{config.root}/{view_id}"}
+            else:
+                decode_cell(config, column, cell, view_id)
+        yield {column: row[column] for column in columns}
 
 
 def _cached(config: DatasetConfig, split: str, features: Features) -> Dataset:
@@ -144,7 +155,7 @@ def _cached(config: DatasetConfig, split: str, features: Features) -> Dataset:
     key = json.dumps([_CACHE_VERSION, config.root, split, stamps, config.manifest_entry], sort_keys=True)
     try:
         return Dataset.from_generator(
-            _encoded_rows,
+            _rows_with_images,
             features=features,
             gen_kwargs={"config": config, "columns": COLUMNS, "shards": list(config.shards)},
             split=NamedSplit(split),

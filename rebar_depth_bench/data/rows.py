@@ -128,58 +128,18 @@ def camera_array(kind: str, cell: Any) -> Float64[ndarray, ...]:
 
 
 def decode_row(config: DatasetConfig, row: Mapping[str, Any]) -> dict[str, Any]:
-    """Decode the cells of a row of a config; those of its absent columns decode to None.
+    """Decode the cells of a row of a config; the cells of its absent columns decode to None.
 
     Raises ``DatasetError`` naming view and column if a cell is damaged or contradicts the manifest.
     """
-    view = str(row.get("view_id", f"a view of {config.name}"))
-    return {name: _decode(config, name, cell, view) for name, cell in row.items()}
+    view_id = str(row.get("view_id", f"a view of {config.name}"))
+    return {column: decode_cell(config, column, cell, view_id) for column, cell in row.items()}
 
 
-def row_of_pictures(config: DatasetConfig, row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a row for ``datasets``, whose images stay encoded and have the path that ``open_cell`` expects.
-
-    All other cells are checked. Raises ``DatasetError`` as ``decode_row``.
-    """
-    cells, view = dict(row), str(row["view_id"])
-    for column, cell in row.items():
-        kind = column_kind(column)
-        if kind not in codecs.PICTURE_KINDS or column in config.absent_columns:
-            _decode(config, column, cell, view)
-        else:
-            with _naming(config.root, view, column):
-                cells[column] = {"bytes": _content(kind, cell), "path": picture_place(config.root) + view}
-    return cells
-
-
-def picture_place(root: str) -> str:
-    """Return the start of the paths of images in ``row_of_pictures``, before the id of the view."""
-    return f"{root}/"
-
-
-def open_cell(root: str, grid: tuple[int, int], column: str, cell: Mapping[str, Any]) -> codecs.Picture:
-    """Decode the image in a cell of ``row_of_pictures``. Raises ``DatasetError`` as ``decode_row``."""
-    with _naming(root, cell["path"].removeprefix(picture_place(root)), column):
-        return codecs.open_picture(column_kind(column), cell["bytes"], grid)
-
-
-@contextmanager
-def _naming(root: str, view: str, column: str) -> Iterator[None]:
-    """Convert the errors of a damaged cell to ``DatasetError``. Raises ``InputError`` as ``check_codecs``."""
-    try:
-        yield
-    except Exception as error:  # Pillow raises many types, which depend on the damage.
-        codecs.check_codecs()
-        reason = library_message(error)
-        raise DatasetError(
-            f"{root}: view {escape_text(view)}: {column} is damaged: {reason}; "
-            f"rebar-bench verify {root} lists damaged files"
-        ) from error
-
-
-def _decode(config: DatasetConfig, column: str, cell: Any, view: str) -> Any:
+def decode_cell(config: DatasetConfig, column: str, cell: Any, view_id: str) -> Any:
+    """Decode one cell of a row of a config. Raises ``DatasetError`` as ``decode_row`` does."""
     kind = column_kind(column)
-    with _naming(config.root, view, column):
+    with _named_damage(config.root, view_id, column):
         if column in config.absent_columns:
             if not is_absent(cell):
                 raise ValueError("it has a value, expected null as in the manifest")
@@ -190,11 +150,43 @@ def _decode(config: DatasetConfig, column: str, cell: Any, view: str) -> Any:
             return camera_array(kind, cell)
         if kind == "view_id" and cell not in config.scene_by_view:
             raise ValueError("it is not in the manifest")
-        if kind == "scene" and cell != (expected := config.scene_by_view.get(view, cell)):
+        if kind == "scene" and cell != (expected := config.scene_by_view.get(view_id, cell)):
             raise ValueError(f"got {short_repr(cell)}, expected {expected} as in the manifest")
         if kind == "baseline_m" and not (isinstance(cell, float) and math.isfinite(cell)):
             raise ValueError(f"got {cell}, expected a length in metres")
         return cell
+
+
+def image_content(root: str, column: str, cell: Any, view_id: str) -> bytes:
+    """Return the encoded image in a cell of a shard. Raises ``DatasetError`` if the cell holds none."""
+    with _named_damage(root, view_id, column):
+        return _content(column_kind(column), cell)
+
+
+def open_image(root: str, column: str, content: bytes, view_id: str, grid: tuple[int, int]) -> codecs.Picture:
+    """Decode an image of a shard; ``grid`` is its (height, width).
+
+    Raises ``DatasetError`` naming view and column if it is damaged or of another size.
+    """
+    with _named_damage(root, view_id, column):
+        return codecs.open_picture(column_kind(column), content, grid)
+
+
+@contextmanager
+def _named_damage(root: str, view_id: str, column: str) -> Iterator[None]:
+    """Convert the errors of a damaged cell to ``DatasetError``.
+
+    Raises ``InputError`` instead if Pillow lacks a codec.
+    """
+    try:
+        yield
+    except Exception as error:  # Pillow raises many types, which depend on the damage.
+        codecs.check_codecs()
+        reason = library_message(error)
+        raise DatasetError(
+            f"{root}: view {escape_text(view_id)}: {column} is damaged: {reason}; "
+            f"rebar-bench verify {root} lists damaged files"
+        ) from error
 
 
 def _content(kind: str, cell: Any) -> bytes:
