@@ -162,7 +162,7 @@ class CacheContent:
 
 
 class _Block(StrictModel):
-    """Place of a view's arrays, which have ``counts`` values in order, and the checksum of their bytes."""
+    """Arrays of a view in an entry: their place, numbers of values and checksum, and the numbers of the view."""
 
     view_id: str
     start: Annotated[int, Field(ge=0)]
@@ -182,25 +182,8 @@ class _Entry:
     """Open entry. Its file stays open, so it remains readable while another process deletes or replaces it."""
 
     path: Path
-    content: CacheContent
     source: FileSource
     blocks: Mapping[str, _Block]
-
-    def view(self, view_id: str) -> ViewArrays:
-        """Return the arrays of a view, read-only. Raises one of ``_DAMAGE``."""
-        block = self.blocks[view_id]
-        values = self.source.read_at(block.start, block.size)
-        if zlib_ng.crc32(values) != block.crc32:
-            raise ValueError(f"the values of {view_id} do not match their checksum")
-        arrays: dict[str, ndarray] = {}
-        offset = 0
-        for (name, dtype), count in zip(self.content.dtypes.items(), block.counts, strict=True):
-            arrays[name] = np.frombuffer(values, dtype, count, offset)
-            offset += arrays[name].nbytes + _padding(arrays[name].nbytes)
-        view = ViewArrays(view_id, arrays, block.numbers)
-        if not self.content.is_sound(view):
-            raise ValueError(f"the values of {view_id} are out of range")
-        return view
 
 
 def _padding(size_bytes: int) -> int:
@@ -229,7 +212,7 @@ def _read_entry(path: Path, content: CacheContent) -> _Entry | None:
         return None
     with suppress(OSError):
         os.utime(path)
-    return _Entry(path, content, source, blocks)
+    return _Entry(path, source, blocks)
 
 
 def _write_entry(path: Path, content: CacheContent, progress: Progress) -> _Entry:
@@ -265,14 +248,14 @@ def _write_entry(path: Path, content: CacheContent, progress: Progress) -> _Entr
     if not path.exists():
         limit = f"{CACHE_BYTES.value()} bytes ({CACHE_BYTES.variable})"
         _warn_once(f"{path}: {source.size} bytes are not kept, expected a cache of at most {limit}")
-    return _Entry(path, content, source, {block.view_id: block for block in blocks})
+    return _Entry(path, source, {block.view_id: block for block in blocks})
 
 
 @dataclass(frozen=True, eq=False)
 class ArrayCache:
     """Views of an entry, in the order of its content; a view that the entry does not hold intact is computed.
 
-    ``numbers`` are those of each view.
+    ``numbers`` holds the numbers of each view.
     """
 
     content: CacheContent
@@ -295,9 +278,21 @@ class ArrayCache:
         view_id = self.view_ids[position]
         if self.entry is not None:
             try:
-                return self.entry.view(view_id)
+                block = self.entry.blocks[view_id]
+                values = self.entry.source.read_at(block.start, block.size)
+                if zlib_ng.crc32(values) != block.crc32:
+                    raise ValueError(f"the values of {view_id} do not match their checksum")
+                arrays: dict[str, ndarray] = {}
+                offset = 0
+                for (name, dtype), count in zip(self.content.dtypes.items(), block.counts, strict=True):
+                    arrays[name] = np.frombuffer(values, dtype, count, offset)
+                    offset += arrays[name].nbytes + _padding(arrays[name].nbytes)
+                view = ViewArrays(view_id, arrays, block.numbers)
+                if not self.content.is_sound(view):
+                    raise ValueError(f"the values of {view_id} are out of range")
+                return view
             except _DAMAGE as error:
-                with suppress(OSError):  # Of several threads, only the first can delete it.
+                with suppress(OSError):  # Of several threads, only the first can delete the file.
                     self.entry.path.unlink()
                     _warn_of_damage(self.entry.path, error)
         [view] = self.content.compute([view_id])
