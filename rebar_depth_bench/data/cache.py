@@ -3,7 +3,7 @@
 An entry is one file: the values of each view as a block of raw arrays, then an index in JSON, its SHA-256 and its
 length. The index holds the entry's key and, for each view, the place and the CRC-32 of its block and further
 numbers, so every byte of the file is covered by a checksum. The key is a digest of everything that the values
-depend on. What cannot be read from the cache is computed, one view at a time.
+depend on. A view that cannot be read from the cache is computed.
 
 A file is deleted only if it is a regular file with a name of the cache's own pattern, in a folder that is no link.
 """
@@ -66,7 +66,7 @@ def cache_folder() -> Path:
 
 
 def entries(folder: Path) -> list[CacheFile]:
-    """Return the entries of a cache folder and the files of unfinished ones, the least recently used first.
+    """Return the entries of a cache folder, finished and unfinished, the least recently used first.
 
     There are none if the folder is missing.
     """
@@ -81,7 +81,7 @@ def entries(folder: Path) -> list[CacheFile]:
 
 
 def clear(folder: Path) -> list[CacheFile]:
-    """Delete all ``entries`` of a cache folder, and return them. Raises ``OSError`` if one cannot be deleted."""
+    """Delete all entries of a cache folder, and return them. Raises ``OSError`` if one cannot be deleted."""
     files = entries(folder)
     for file in files:
         remove_file(file.path)
@@ -89,7 +89,7 @@ def clear(folder: Path) -> list[CacheFile]:
 
 
 def limit_size(folder: Path) -> None:
-    """Delete the least recently used of the ``entries`` beyond the size limit."""
+    """Delete the least recently used entries until the others are within the size limit."""
     kept = entries(folder)
     while total_bytes(kept) > CACHE_BYTES.value():
         with suppress(OSError):
@@ -124,9 +124,9 @@ class ViewArrays:
 class CacheContent:
     """Content of an entry and how it is computed.
 
-    ``inputs``, a value of JSON, contains everything that the arrays depend on. ``extract`` yields each view of
-    some ids, or for None of ``view_ids``, in any order; ``is_sound`` returns whether the data of a stored view are
-    in their range. ``task`` is the name of the computation in a progress.
+    ``inputs``, a value of JSON, contains everything that the arrays depend on. ``extract`` takes the ids of some
+    views, or None for all ``view_ids``, and yields the views in any order. ``is_sound`` returns whether the data
+    of a stored view are in their range. ``task`` is the name of the computation in a progress display.
     """
 
     task: str
@@ -151,7 +151,7 @@ class CacheContent:
     def compute(
         self, view_ids: Collection[str] | None = None, progress: Progress = silent
     ) -> Iterator[ViewArrays]:
-        """Yield the views of some ids, or all, with arrays of ``dtypes``. Raises what ``extract`` raises."""
+        """Yield some views, or all, with arrays of ``dtypes``. Every error of ``extract`` is raised."""
         total = len(self.view_ids if view_ids is None else view_ids)
         for done, view in enumerate(self.extract(view_ids), start=1):
             arrays: dict[str, ndarray] = {
@@ -218,8 +218,8 @@ def _read_entry(path: Path, content: CacheContent) -> _Entry | None:
 def _write_entry(path: Path, content: CacheContent, progress: Progress) -> _Entry:
     """Write an entry and open it. It appears complete or not at all, without locks between processes.
 
-    Raises what ``CacheContent.compute`` raises, and ``OSError``, ``OutputError`` or ``InputError`` if it cannot be
-    written.
+    Every error of computing the views is raised, and ``OSError``, ``OutputError`` or ``InputError`` if the entry
+    cannot be written.
     """
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     blocks = []
@@ -302,8 +302,8 @@ class ArrayCache:
 def open_cache(content: CacheContent, progress: Progress = silent) -> ArrayCache:
     """Open the entry of ``content``; if it is missing or damaged, it is written first, one view at a time.
 
-    If it cannot be written, each view is computed whenever it is needed, with a warning: a score never fails for
-    want of a cache. Raises ``DatasetError`` if a view cannot be computed.
+    If it cannot be written, a warning is printed, and each view is computed whenever it is needed: without a
+    cache, a score only takes longer. Raises ``DatasetError`` if a view cannot be computed.
     """
     CACHE_BYTES.value()  # An invalid variable is reported before the work.
     try:

@@ -1,7 +1,7 @@
 """Features of ``datasets`` that decode the columns of a config; importing them takes a second.
 
-Each feature is stored as, and equal to, a feature of ``datasets`` itself. Copies that ``datasets`` restores from
-files have that one.
+Each feature is stored as, and equal to, a feature of ``datasets`` itself, which copies have that ``datasets``
+restores from files.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ def decoding_features(config: DatasetConfig, columns: Sequence[str], *, to_array
 
 
 class _Stored:
-    """Feature that is equal to the feature of ``datasets`` as which it is stored."""
+    """Feature that equals the feature of ``datasets`` as which it is stored."""
 
     def __eq__(self, other: object) -> bool:
         return is_dataclass(other) and asdict(self) == asdict(other)  # type: ignore[call-overload,arg-type]

@@ -31,7 +31,7 @@ from rebar_depth_bench.geometry.cameras import Camera, is_rigid
 TRUTH_COLUMNS = tuple(name for name in COLUMNS if name.endswith(("_depth", "_mask", "_bars", "_preview")))
 """Columns of ground truth about the scene; the preview shows depth."""
 POSE_COLUMNS = tuple(f"{eye}_cam_from_world" for eye in EYES)
-"""Columns of the poses in the world, which are ground truth; that of one eye from the other is calibration."""
+"""Columns of the poses in the world, which are ground truth; the pose between the two eyes is calibration."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +49,9 @@ class EyeTruth:
     bars: UInt16[ndarray, "h w"] | None
 
     def digest(self) -> str:
-        """Return the hex SHA-256 of the ground truth: of image size, depth, mask, bar ids and camera.
+        """Return the hex SHA-256 of the ground truth: image size, depth, mask, bar ids and camera.
 
-        It covers the decoded values, not their encoding, and which of them are absent.
+        The digest covers the decoded values, not their encoding, and which of them are absent.
         """
         digest = hashlib.sha256(np.array(self.depth_m.shape, "<u4").tobytes())
         arrays = (
@@ -90,7 +90,7 @@ def truth_from_row(row: Mapping[str, Any], eye: str) -> EyeTruth:
 def camera_from_row(row: Mapping[str, Any], eye: str, grid: tuple[int, int]) -> Camera:
     """Return the camera of one eye of a row, decoded or not; ``grid`` is its image size (height, width).
 
-    Raises ``ValueError`` for arrays that ``camera_array`` rejects.
+    Raises ``ValueError`` for cells that ``camera_array`` rejects.
     """
     K, distortion, cam_from_world = (camera_array(kind, row[f"{eye}_{kind}"]) for kind in CAMERA_SHAPES)
     height, width = grid
@@ -137,7 +137,10 @@ def decode_row(config: DatasetConfig, row: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def decode_cell(config: DatasetConfig, column: str, cell: Any, view_id: str) -> Any:
-    """Decode one cell of a row of a config. Raises ``DatasetError`` as ``decode_row`` does."""
+    """Decode one cell of a row of a config.
+
+    Raises ``DatasetError`` naming view and column if the cell is damaged or contradicts the manifest.
+    """
     kind = column_kind(column)
     with _named_damage(config.root, view_id, column):
         if column in config.absent_columns:
@@ -190,7 +193,7 @@ def _named_damage(root: str, view_id: str, column: str) -> Iterator[None]:
 
 
 def _content(kind: str, cell: Any) -> bytes:
-    """Return the encoded image in a cell of a shard. Raises an error of any type for another cell."""
+    """Return the encoded image in a cell of a shard. A cell of another type raises an error of any type."""
     content = cell if kind == "depth" else cell["bytes"]
     if not isinstance(content, bytes):
         raise ValueError("the cell holds no bytes")
@@ -200,9 +203,9 @@ def _content(kind: str, cell: Any) -> bytes:
 def iterate_rows(
     config: DatasetConfig, columns: Sequence[str], view_ids: Collection[str] | None = None
 ) -> Iterator[dict[str, Any]]:
-    """Yield the decoded rows of a config, or those of some views, one at a time, without a cache.
+    """Yield the decoded rows of a config, or of some of its views, one at a time and without a cache.
 
-    Raises ``DatasetError`` if a cell is damaged, and as ``encoded_rows``.
+    Raises ``DatasetError`` if a shard or a cell is damaged, and if a view is missing.
     """
     return (decode_row(config, row) for row in encoded_rows(config, columns, view_ids))
 
@@ -227,7 +230,7 @@ def truth_problems(config: DatasetConfig, progress: Progress = silent) -> Iterat
         progress(f"ground truth of {config.name}", done, len(records))
 
 
-# Views for methods: those of a dataset, or pictures without ground truth.
+# Views for methods: from a dataset, or pictures without ground truth.
 
 
 class Views(Protocol):

@@ -67,7 +67,7 @@ def torch_loader(
     is no surface), ``mask`` bool B x 1 x H x W, ``K`` float64 B x 3 x 3 (pixels), ``poses`` float64 B x 4 x 4
     (``cam_from_world``), all of the left view, and ``view_id``, a list of str. With ``stereo`` the batch also has
     the same keys of the right view, prefixed ``right_``, and ``baseline_m`` float64 B. Batches of a config without
-    colour lack ``rgb`` and ``right_rgb``, and those of an imported config all that it lacks.
+    colour lack ``rgb`` and ``right_rgb``, and batches of an imported config lack what the config lacks.
 
     Columns that a batch does not need are not decoded. The format of ``ds`` makes no difference, but a transform
     is applied. A dataset that only ``datasets`` has read is not compared with the manifest.
@@ -81,12 +81,12 @@ def torch_loader(
     that workers drew ahead of an interruption count too. The order of shuffled views depends on ``seed`` and how
     often the loader was iterated, and for a streamed dataset also on torch's seed and the number of workers.
 
-    ``sampler``, ``drop_last`` and ``pin_memory`` are those of ``DataLoader``. A sampler takes the place of
+    ``sampler``, ``drop_last`` and ``pin_memory`` are arguments of ``DataLoader``. A sampler takes the place of
     ``shuffle``, and a streamed dataset has none; the caller sets the epoch of a ``DistributedSampler``. Training
     frameworks may build the loader again from its ``dataset`` and ``collate_fn``, with a sampler of their own.
 
     Importing this module without torch raises ``MethodError``. Raises ``InputError`` for arguments of other types,
-    and a sampler beside ``shuffle`` or of a streamed dataset, and ``DatasetError`` if ``ds`` lacks columns.
+    and for a sampler beside ``shuffle`` or with a streamed dataset, and ``DatasetError`` if ``ds`` lacks columns.
     """
     if not isinstance(ds, (Dataset, IterableDataset)):
         raise DatasetError(f"got a {type(ds).__name__}, expected one split, as rdb.load(ROOT, CONFIG) returns it")
@@ -155,7 +155,7 @@ class _Rows(TorchDataset[Row]):
 
 
 class _SeededSampler(RandomSampler):
-    """Order of rows, another one each time, without a generator, which cannot be sent to spawned processes."""
+    """Order of rows, different in each epoch; it has no generator, which cannot be sent to spawned processes."""
 
     def __init__(self, rows: _Rows, seed: int) -> None:
         super().__init__(rows)
@@ -199,7 +199,7 @@ class _SharedCounts:
         return _SharedCounts, (self._counts,)  # Copies are shared with their workers too.
 
     def add(self, position: int) -> int:
-        """Add one to a count and return what it was."""
+        """Add one to a count and return the count before."""
         earlier = int(self._counts[position])
         self._counts[position] = earlier + 1
         return earlier
@@ -239,9 +239,9 @@ def _collated(keys: Mapping[str, str], rows: Sequence[Row]) -> Batch:
 
 @dataclass(frozen=True)
 class Augmentation:
-    """Random changes of rows: crops of ``crop`` (height, width) pixels, None for none, and flips of half the rows.
+    """Random changes of rows: crops of ``crop`` (height, width) pixels, or None, and flips of half of the rows.
 
-    They depend on ``seed``, the view id and how often the view was drawn before only.
+    They depend only on ``seed``, the view id and how often the view was drawn before.
     """
 
     crop: tuple[int, int] | None = None
@@ -249,7 +249,7 @@ class Augmentation:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        """Raise ``InputError`` for a crop that is empty, a flip that is no bool and a seed below 0."""
+        """Raise ``InputError`` for an empty crop, a flip that is not a bool, and a seed below 0."""
         problems = []
         is_pair = isinstance(self.crop, Sequence) and len(self.crop) == 2
         if self.crop is not None and not (is_pair and all(_is_whole(side, 1) for side in self.crop)):
@@ -263,9 +263,10 @@ class Augmentation:
             raise InputError.from_problems("augmentation", problems)
 
     def __call__(self, row: Row, earlier_draws: int) -> Row:
-        """Return a row with ``view_id`` as changed after so many draws.
+        """Return a row with ``view_id``, changed as it is after ``earlier_draws`` of its view.
 
-        Raises ``InputError`` if the crop is larger than the image, and as ``flip_row``.
+        Raises ``InputError`` if the crop is larger than the image, and if an eye lacks an image that the other
+        has.
         """
         rng = np.random.default_rng([self.seed, earlier_draws, crc32(row["view_id"].encode())])
         if self.crop is not None:
@@ -302,7 +303,7 @@ def crop_row(row: Row, size: tuple[int, int], rng: np.random.Generator) -> Row:
 def flip_row(row: Row) -> Row:
     """Return a row with its images mirrored, and its eyes exchanged if it has columns of both.
 
-    Raises ``InputError`` if it has an image of one eye only that the row should have of both.
+    Raises ``InputError`` if an eye lacks an image that the other eye has.
     """
     eyes = [eye for eye in EYES if any(name.startswith(f"{eye}_") for name in row)]
     width = next(row[name].shape[1] for name in row if _is_image(row, name))
