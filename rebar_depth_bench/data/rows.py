@@ -68,7 +68,7 @@ class EyeTruth:
 
 
 @dataclass(frozen=True, eq=False)
-class EyeView(EyeTruth):
+class RenderedEye(EyeTruth):
     """One eye of a rendered view, which has a mask and bar ids."""
 
     mask: Bool[ndarray, "h w"]
