@@ -1,4 +1,4 @@
-"""Features of ``datasets`` that decode the columns of a config; importing them takes a second.
+"""Features of ``datasets`` that decode the columns of a dataset; importing them takes a second.
 
 Each feature is stored as, and equal to, a feature of ``datasets`` itself, which copies have that ``datasets``
 restores from files.
@@ -16,16 +16,15 @@ import pyarrow as pa
 from datasets import Features, Image, List, Value
 
 from rebar_depth_bench.data.codecs import PICTURE_KINDS, Picture
-from rebar_depth_bench.data.manifest import DatasetConfig
-from rebar_depth_bench.data.rows import is_absent, open_image
+from rebar_depth_bench.data.rows import is_absent, is_image_cell, open_image_cell
 from rebar_depth_bench.data.schema import CAMERA_SHAPES, column_kind, features
 
 STORED_MODES = {"depth": "F", "preview": "RGB"}
 """Modes of ``datasets.Image`` by kind of column; the images of the other kinds are stored in their modes."""
 
 
-def decoding_features(config: DatasetConfig, columns: Sequence[str], *, to_arrays: bool = False) -> Features:
-    """Return the features that decode columns of a config.
+def decoding_features(columns: Sequence[str], *, to_arrays: bool = False) -> Features:
+    """Return the features that decode columns.
 
     The cells decode to pictures of Pillow and to lists, of which every format of ``datasets`` makes its arrays or
     tensors. With ``to_arrays`` they decode to arrays, because a streamed dataset loses the types of its columns in
@@ -34,7 +33,7 @@ def decoding_features(config: DatasetConfig, columns: Sequence[str], *, to_array
     stored, decoding = features(), Features()
     for name in columns:
         if column_kind(name) in PICTURE_KINDS:
-            decoding[name] = _Image(config, name, to_arrays)
+            decoding[name] = _Image(name, to_arrays)
         elif column_kind(name) in CAMERA_SHAPES:
             decoding[name] = _Matrix(stored[name].feature, stored[name].length)
             decoding[name].to_arrays = to_arrays
@@ -51,23 +50,21 @@ class _Stored:
 
 
 class _Image(_Stored, Image):  # type: ignore[misc]
-    """Column of images, which decodes an image of the config's shards with all checks of its content.
+    """Column of images, which decodes an image of a shard with all checks of its content.
 
     ``datasets.Image`` decodes an image of any size, and its errors name neither view nor column. It still decodes
-    the images that ``map`` has changed, which lack the path of a view.
+    other images, which ``map`` has changed.
     """
 
-    def __init__(self, config: DatasetConfig, column: str, to_arrays: bool) -> None:
+    def __init__(self, column: str, to_arrays: bool) -> None:
         super().__init__(mode=STORED_MODES.get(column_kind(column)))
-        self._root, self._config, self._grid = config.root, config.name, config.grid
-        self._column, self._to_arrays = column, to_arrays
+        self._column = column
+        self._to_arrays = to_arrays
 
     def decode_example(self, value: Any, token_per_repo_id: Any = None) -> Any:
-        """Return the image in a cell. Raises ``DatasetError`` for a damaged image of the config's shards."""
-        path = value["path"] or ""
-        if path.startswith(f"{self._root}/{self._config}/"):
-            view_id = path.removeprefix(f"{self._root}/")
-            picture = open_image(self._root, self._column, value["bytes"], view_id, self._grid)
+        """Return the image in a cell. Raises ``DatasetError`` for a damaged image of a shard."""
+        if is_image_cell(value):
+            picture = open_image_cell(self._column, value)
         else:
             picture = Picture(super().decode_example(value, token_per_repo_id))
         return np.asarray(picture) if self._to_arrays else picture

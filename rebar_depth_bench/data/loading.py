@@ -12,14 +12,14 @@ from rebar_depth_bench.base.errors import DatasetError, InputError, OutputError,
 from rebar_depth_bench.base.names import TEST_SPLIT
 from rebar_depth_bench.data.codecs import PICTURE_KINDS
 from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
-from rebar_depth_bench.data.rows import decode_cell, image_content
+from rebar_depth_bench.data.rows import decode_cell, image_cell
 from rebar_depth_bench.data.schema import COLUMNS, column_kind, validated_columns
 from rebar_depth_bench.data.shards import check_shards, shard_rows
 
 if TYPE_CHECKING:
     from datasets import Dataset, IterableDataset
 
-_CACHE_VERSION = 1
+_CACHE_VERSION = 2
 _ROWS_IN_MEMORY = 8
 """Rows that are kept in memory until they are written to the cache of ``datasets``."""
 
@@ -95,7 +95,7 @@ def load(
         try:
             streamed = IterableDataset.from_generator(
                 _rows_with_images,
-                features=decoding_features(located, selected, to_arrays=True),
+                features=decoding_features(selected, to_arrays=True),
                 gen_kwargs={"config": located, "columns": selected, "shards": list(located.shards)},
                 split=NamedSplit(whole),
             )
@@ -116,7 +116,7 @@ def load(
     try:
         loaded = Dataset.from_generator(
             _rows_with_images,
-            features=decoding_features(located, COLUMNS),
+            features=decoding_features(COLUMNS),
             gen_kwargs={"config": located, "columns": COLUMNS, "shards": list(located.shards)},
             split=NamedSplit(whole),
             fingerprint=hashlib.sha256(key.encode()).hexdigest()[:32],
@@ -130,7 +130,7 @@ def load(
         if isinstance(cause, OSError):
             raise _cache_error(located, cause) from error
         raise
-    loaded.info.features = decoding_features(located, selected)  # A cached copy has features of ``datasets``.
+    loaded.info.features = decoding_features(selected)  # A cached copy has features of ``datasets``.
     formatted = loaded.with_format("numpy")
     return formatted if part is None else formatted.select(part)
 
@@ -150,16 +150,12 @@ def _part(config: DatasetConfig, split: str) -> range:
 def _rows_with_images(
     config: DatasetConfig, columns: Sequence[str], shards: Sequence[str]
 ) -> Iterator[dict[str, Any]]:
-    """Yield the rows of shards, with encoded images in cells of ``datasets.Image``; all other cells are checked.
-
-    The path of an image names its view. No file has this path.
-    """
+    """Yield the rows of shards, with images encoded for ``datasets.Image``; all other cells are checked."""
     for row in shard_rows(config, ("view_id", *columns), shards):
         view_id = str(row["view_id"])
         for column, cell in row.items():
             if column_kind(column) in PICTURE_KINDS and column not in config.absent_columns:
-                content = image_content(config.root, column, cell, view_id)
-                row[column] = {"bytes": content, "path": f"{config.root}/{view_id}"}
+                row[column] = image_cell(config, column, cell, view_id)
             else:
                 decode_cell(config, column, cell, view_id)
         yield {column: row[column] for column in columns}

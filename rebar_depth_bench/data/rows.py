@@ -160,19 +160,36 @@ def decode_cell(config: DatasetConfig, column: str, cell: Any, view_id: str) -> 
         return cell
 
 
-def image_content(root: str, column: str, cell: Any, view_id: str) -> bytes:
-    """Return the encoded image in a cell of a shard. Raises ``DatasetError`` if the cell holds none."""
-    with _named_damage(root, view_id, column):
-        return _content(column_kind(column), cell)
+_IMAGE_OF_SHARD = "rebar-depth-bench:"
+"""Start of the paths in the cells of ``image_cell``."""
 
 
-def open_image(root: str, column: str, content: bytes, view_id: str, grid: tuple[int, int]) -> codecs.Picture:
-    """Decode an image of a shard; ``grid`` is its (height, width).
+def image_cell(config: DatasetConfig, column: str, cell: Any, view_id: str) -> dict[str, Any]:
+    """Return a cell of ``datasets.Image`` with the encoded image in a cell of a shard.
 
-    Raises ``DatasetError`` naming view and column if it is damaged or of another size.
+    The path in the returned cell is no file: it names root, view and size for ``open_image_cell``. Raises
+    ``DatasetError`` if the cell of the shard has no image.
     """
-    with _named_damage(root, view_id, column):
-        return codecs.open_picture(column_kind(column), content, grid)
+    height, width = config.grid
+    with _named_damage(config.root, view_id, column):
+        content = _content(column_kind(column), cell)
+    return {"bytes": content, "path": f"{_IMAGE_OF_SHARD}{config.root}/{view_id}/{height}x{width}"}
+
+
+def is_image_cell(cell: Mapping[str, Any]) -> bool:
+    """Return whether a cell of ``datasets.Image`` is from ``image_cell``."""
+    return (cell["path"] or "").startswith(_IMAGE_OF_SHARD)
+
+
+def open_image_cell(column: str, cell: Mapping[str, Any]) -> codecs.Picture:
+    """Decode the image in a cell of ``image_cell``.
+
+    Raises ``DatasetError`` naming view and column if the image is damaged or has another size.
+    """
+    root, config, view, size = cell["path"].removeprefix(_IMAGE_OF_SHARD).rsplit("/", 3)
+    height, width = map(int, size.split("x"))
+    with _named_damage(root, f"{config}/{view}", column):
+        return codecs.open_picture(column_kind(column), cell["bytes"], (height, width))
 
 
 @contextmanager
