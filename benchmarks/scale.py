@@ -42,7 +42,7 @@ from dataset_builder.scene.model import WorldMesh
 from dataset_builder.specs.config_specs import ConfigSpec, RandomViewsSpec
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.data.rows import EyeView
+from rebar_depth_bench.data.rows import RenderedEye
 from rebar_depth_bench.geometry.cameras import Camera, ideal_K
 
 WIDTH, HEIGHT = 32, 18
@@ -64,7 +64,7 @@ def stage_prepared(config: ConfigSpec, indices: Sequence[int], staging: Staging)
     rgb = np.zeros((height, width, 3), np.uint8) if config.colour is not None else None
     for index in indices:
         depth_m = np.where(mask, 0.5 + 0.001 * index, 1.5).astype(np.float32)
-        eye = EyeView(camera, rgb=rgb, depth_m=depth_m, mask=mask, bars=mask.astype(np.uint16))
+        eye = RenderedEye(camera, rgb=rgb, depth_m=depth_m, mask=mask, bars=mask.astype(np.uint16))
         row, record = encode_view(View(config.view_id(index), config.scene.name, eye, eye, config.rig.baseline_m))
         stage_row(staging.row(index), row, record)
 

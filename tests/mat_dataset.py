@@ -15,7 +15,7 @@ from rebar_depth_bench.bar_crossings.crossings_file import CROSSINGS_FILE, cross
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, write_bars
 from rebar_depth_bench.data.files import MANIFEST_FILE, file_sha256, views_digest
 from rebar_depth_bench.data.manifest import MANIFEST_FORMAT
-from rebar_depth_bench.data.rows import EyeView
+from rebar_depth_bench.data.rows import RenderedEye
 from rebar_depth_bench.data.schema import ViewRecord
 from rebar_depth_bench.geometry.cameras import Camera, look_at
 from rebar_depth_bench.scoring.protocol import PROTOCOL
@@ -51,7 +51,7 @@ def mat_views(ids: Sequence[str], scene: str, bars: Sequence[Bar]) -> list[View]
     for view_id, pose in zip(ids, poses(len(ids)), strict=True):
         depth_m, bar_ids = cast([item for item in bars if item.has_axis], pose)
         depth_m, bar_ids = (image.reshape(HEIGHT, WIDTH) for image in (depth_m, bar_ids))
-        eye = EyeView(
+        eye = RenderedEye(
             Camera(K, np.zeros(5), pose, WIDTH, HEIGHT),
             rgb=np.where(bar_ids[..., None] > 0, 150, 70).astype(np.uint8).repeat(3, axis=2),
             depth_m=depth_m.astype(np.float32),

@@ -18,7 +18,7 @@ from rebar_depth_bench.base.names import config_of
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, write_bars
 from rebar_depth_bench.data.files import MANIFEST_FILE, file_sha256, views_digest
 from rebar_depth_bench.data.manifest import MANIFEST_FORMAT, OLD_FORMAT
-from rebar_depth_bench.data.rows import EyeView
+from rebar_depth_bench.data.rows import RenderedEye
 from rebar_depth_bench.data.schema import ViewRecord
 from rebar_depth_bench.geometry.cameras import Camera
 from rebar_depth_bench.scoring.protocol import PROTOCOL
@@ -179,13 +179,13 @@ def _view(view_id: str, index: int) -> View:
     return View(view_id, config_of(view_id), _eye(index, 0.0), _eye(index, BASELINE_M), BASELINE_M)
 
 
-def _eye(index: int, x_m: float) -> EyeView:
+def _eye(index: int, x_m: float) -> RenderedEye:
     """Return what a camera sees that is displaced by ``x_m``; the scene moves with the camera."""
     mask = np.broadcast_to(_is_bar(), (HEIGHT, WIDTH))
     K = np.array([[100.0, 0.0, (WIDTH - 1) / 2], [0.0, 100.0, (HEIGHT - 1) / 2], [0.0, 0.0, 1.0]])
     cam_from_world = np.eye(4)
     cam_from_world[0, 3] = -x_m
-    return EyeView(
+    return RenderedEye(
         Camera(K, np.zeros(5), cam_from_world, WIDTH, HEIGHT),
         rgb=np.where(mask[..., None], 200, 60).astype(np.uint8).repeat(3, axis=2),
         depth_m=_depth_m(index),

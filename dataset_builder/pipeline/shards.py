@@ -24,7 +24,7 @@ from rebar_depth_bench.base.reading import open_regular, parse_json
 from rebar_depth_bench.base.validation import validate_table
 from rebar_depth_bench.base.writing import atomic_replace
 from rebar_depth_bench.data import codecs
-from rebar_depth_bench.data.rows import EyeView, absent_cell, truth_from_row
+from rebar_depth_bench.data.rows import RenderedEye, absent_cell, truth_from_row
 from rebar_depth_bench.data.schema import CAMERA_SHAPES, COLUMNS, ROW_SCHEMA, ViewRecord, column_kind, features
 from rebar_depth_bench.data.shards import open_parquet, rows_table
 from rebar_depth_bench.reporting.colormap import depth_preview
@@ -143,8 +143,8 @@ class View:
 
     view_id: str
     scene: str
-    left: EyeView
-    right: EyeView
+    left: RenderedEye
+    right: RenderedEye
     baseline_m: float
 
 

@@ -19,7 +19,7 @@ from numpy import ndarray
 
 from dataset_builder.scene.model import WorldMesh
 from rebar_depth_bench.base.errors import BuildError
-from rebar_depth_bench.data.rows import EyeView
+from rebar_depth_bench.data.rows import RenderedEye
 from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid, matrix_product
 from rebar_depth_bench.geometry.segments import closest_points_m
 
@@ -62,7 +62,7 @@ class RayCaster:
             np.ascontiguousarray(mesh.faces, dtype=np.int32),
         )
 
-    def cast(self, camera: Camera, rays_cam: Float64[ndarray, "h w 3"] | None = None) -> EyeView:
+    def cast(self, camera: Camera, rays_cam: Float64[ndarray, "h w 3"] | None = None) -> RenderedEye:
         """Return the ground truth of one camera without colour, casting one ray per pixel.
 
         ``rays_cam`` are the ``camera.rays()``, which take seconds on a distorted grid, if they are known. Their z
@@ -83,7 +83,7 @@ class RayCaster:
         bars = np.zeros(len(face), np.uint16)
         bars[hit] = self._face_bar_id[face[hit]]
         bars = bars.reshape(camera.height, camera.width)
-        return EyeView(camera, None, depth_m.astype(np.float32).reshape(bars.shape), bars > 0, bars)
+        return RenderedEye(camera, None, depth_m.astype(np.float32).reshape(bars.shape), bars > 0, bars)
 
     def hits(self, origins_m: Float64[ndarray, "n 3"], directions: Float64[ndarray, "n 3"]) -> RayHits:
         """Return the first intersection of each ray; world frame, directions of any length.

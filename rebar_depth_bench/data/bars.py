@@ -39,8 +39,8 @@ BARS_SCHEMA = pa.schema(
 )
 """Schema of ``bars.parquet``; ``axis`` is the centreline as a polyline in the world frame, metres.
 
-Axis and diameter are null for steel whose surface is not that of one round bar. ``nominal_axis`` is the centreline
-in the design, null for bars that are not in a design; the column may be absent.
+Axis and diameter are null for steel that does not have the surface of one round bar. ``nominal_axis`` is the
+centreline in the design, null for bars that are not in a design; the column may be absent.
 """
 
 
@@ -50,7 +50,7 @@ class Bar:
 
     ``axis_m`` is the centreline as a polyline in the world frame, metres. Where none could be fitted to the bar's
     surface, it is empty and the diameter is NaN (both null in the table). ``nominal_axis_m`` is the centreline in
-    the design, of which the bar as built deviates; it is empty for a bar that is not in a design.
+    the design, from which the bar as built deviates; it is empty for a bar that is not in a design.
     """
 
     bar_id: int
@@ -71,7 +71,7 @@ class Bar:
 
     @property
     def decoded_bytes(self) -> int:
-        """Size in the decoded table, which ``TABLE_BYTES`` limits: mainly that of the points of both lines."""
+        """Size of the bar in the decoded table, bytes; the points of both lines are most of it."""
         return 24 * (len(self.axis_m) + len(self.nominal_axis_m)) + 40
 
     @property
@@ -109,7 +109,7 @@ def _table() -> Table:
 
 
 def decoded_bytes(path: Path) -> int:
-    """Return the decoded size of a ``bars.parquet``, as ``TABLE_BYTES`` limits it; 0 if it cannot be read."""
+    """Return the decoded size of a ``bars.parquet``, which ``TABLE_BYTES`` limits; 0 if it cannot be read."""
     try:
         with open_regular(path) as stream:
             return _table().decoded_bytes(read_footer(stream, _table().max_footer_bytes))
@@ -120,10 +120,10 @@ def decoded_bytes(path: Path) -> int:
 def bars(root: str | Path) -> DataFrame:
     """Return the bars of every scene of a dataset folder or Hub repository as a frame, one row per bar.
 
-    Columns as in ``bars.parquet``, and ``length_m`` of the centreline; ``axis`` and ``nominal_axis`` are float64
-    arrays of shape (n, 3), world frame, metres, or None where the table has null: a bar without an axis has the
-    axis None and NaN as diameter and length. Raises ``DatasetError`` if the folder is invalid, or its table of
-    bars is damaged or not that of the manifest.
+    The columns are those of ``bars.parquet`` and ``length_m``, the length of the centreline. ``axis`` and
+    ``nominal_axis`` are float64 arrays of shape (n, 3), world frame, metres, or None where the table has null: a
+    bar without an axis has the axis None, and its diameter and length are NaN. Raises ``DatasetError`` if the
+    folder is invalid, or if its table of bars is damaged or differs from the manifest.
     """
     import pandas as pd  # Half a second to import, which reading bars for scoring does not need.
 

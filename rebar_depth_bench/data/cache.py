@@ -3,7 +3,7 @@
 An entry is one file: the values of each view as a block of raw arrays, then an index in JSON, its SHA-256 and its
 length. The index holds the entry's key and, for each view, the place and the CRC-32 of its block and further
 numbers, so every byte of the file is covered by a checksum. The key is a digest of everything that the values
-depend on. What cannot be read from the cache is computed, one view at a time.
+depend on. A view that cannot be read from the cache is computed.
 
 A file is deleted only if it is a regular file with a name of the cache's own pattern, in a folder that is no link.
 """
@@ -66,7 +66,7 @@ def cache_folder() -> Path:
 
 
 def entries(folder: Path) -> list[CacheFile]:
-    """Return the entries of a cache folder and the files of unfinished ones, the least recently used first.
+    """Return the entries of a cache folder, finished and unfinished, the least recently used first.
 
     There are none if the folder is missing.
     """
@@ -81,7 +81,7 @@ def entries(folder: Path) -> list[CacheFile]:
 
 
 def clear(folder: Path) -> list[CacheFile]:
-    """Delete all ``entries`` of a cache folder, and return them. Raises ``OSError`` if one cannot be deleted."""
+    """Delete all entries of a cache folder, and return them. Raises ``OSError`` if one cannot be deleted."""
     files = entries(folder)
     for file in files:
         remove_file(file.path)
@@ -89,7 +89,7 @@ def clear(folder: Path) -> list[CacheFile]:
 
 
 def limit_size(folder: Path) -> None:
-    """Delete the least recently used of the ``entries`` beyond the size limit."""
+    """Delete the least recently used entries until the others are within the size limit."""
     kept = entries(folder)
     while total_bytes(kept) > CACHE_BYTES.value():
         with suppress(OSError):
@@ -124,9 +124,9 @@ class ViewArrays:
 class CacheContent:
     """Content of an entry and how it is computed.
 
-    ``inputs``, a value of JSON, contains everything that the arrays depend on. ``extract`` yields each view of
-    some ids, or for None of ``view_ids``, in any order; ``is_sound`` returns whether the data of a stored view are
-    in their range. ``task`` is the name of the computation in a progress.
+    ``inputs``, a value of JSON, contains everything that the arrays depend on. ``extract`` takes the ids of some
+    views, or None for all ``view_ids``, and yields the views in any order. ``is_sound`` returns whether the data
+    of a stored view are in their range. ``task`` is the name of the computation in a progress display.
     """
 
     task: str
@@ -151,7 +151,7 @@ class CacheContent:
     def compute(
         self, view_ids: Collection[str] | None = None, progress: Progress = silent
     ) -> Iterator[ViewArrays]:
-        """Yield the views of some ids, or all, with arrays of ``dtypes``. Raises what ``extract`` raises."""
+        """Yield some views, or all, with arrays of ``dtypes``. Every error of ``extract`` is raised."""
         total = len(self.view_ids if view_ids is None else view_ids)
         for done, view in enumerate(self.extract(view_ids), start=1):
             arrays: dict[str, ndarray] = {
@@ -162,7 +162,7 @@ class CacheContent:
 
 
 class _Block(StrictModel):
-    """Place of a view's arrays, which have ``counts`` values in order, and the checksum of their bytes."""
+    """Arrays of a view in an entry: their place, numbers of values and checksum, and the numbers of the view."""
 
     view_id: str
     start: Annotated[int, Field(ge=0)]
@@ -182,25 +182,8 @@ class _Entry:
     """Open entry. Its file stays open, so it remains readable while another process deletes or replaces it."""
 
     path: Path
-    content: CacheContent
     source: FileSource
     blocks: Mapping[str, _Block]
-
-    def view(self, view_id: str) -> ViewArrays:
-        """Return the arrays of a view, read-only. Raises one of ``_DAMAGE``."""
-        block = self.blocks[view_id]
-        values = self.source.read_at(block.start, block.size)
-        if zlib_ng.crc32(values) != block.crc32:
-            raise ValueError(f"the values of {view_id} do not match their checksum")
-        arrays: dict[str, ndarray] = {}
-        offset = 0
-        for (name, dtype), count in zip(self.content.dtypes.items(), block.counts, strict=True):
-            arrays[name] = np.frombuffer(values, dtype, count, offset)
-            offset += arrays[name].nbytes + _padding(arrays[name].nbytes)
-        view = ViewArrays(view_id, arrays, block.numbers)
-        if not self.content.is_sound(view):
-            raise ValueError(f"the values of {view_id} are out of range")
-        return view
 
 
 def _padding(size_bytes: int) -> int:
@@ -229,14 +212,14 @@ def _read_entry(path: Path, content: CacheContent) -> _Entry | None:
         return None
     with suppress(OSError):
         os.utime(path)
-    return _Entry(path, content, source, blocks)
+    return _Entry(path, source, blocks)
 
 
 def _write_entry(path: Path, content: CacheContent, progress: Progress) -> _Entry:
     """Write an entry and open it. It appears complete or not at all, without locks between processes.
 
-    Raises what ``CacheContent.compute`` raises, and ``OSError``, ``OutputError`` or ``InputError`` if it cannot be
-    written.
+    Every error of computing the views is raised, and ``OSError``, ``OutputError`` or ``InputError`` if the entry
+    cannot be written.
     """
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
     blocks = []
@@ -265,14 +248,14 @@ def _write_entry(path: Path, content: CacheContent, progress: Progress) -> _Entr
     if not path.exists():
         limit = f"{CACHE_BYTES.value()} bytes ({CACHE_BYTES.variable})"
         _warn_once(f"{path}: {source.size} bytes are not kept, expected a cache of at most {limit}")
-    return _Entry(path, content, source, {block.view_id: block for block in blocks})
+    return _Entry(path, source, {block.view_id: block for block in blocks})
 
 
 @dataclass(frozen=True, eq=False)
 class ArrayCache:
     """Views of an entry, in the order of its content; a view that the entry does not hold intact is computed.
 
-    ``numbers`` are those of each view.
+    ``numbers`` holds the numbers of each view.
     """
 
     content: CacheContent
@@ -295,9 +278,21 @@ class ArrayCache:
         view_id = self.view_ids[position]
         if self.entry is not None:
             try:
-                return self.entry.view(view_id)
+                block = self.entry.blocks[view_id]
+                values = self.entry.source.read_at(block.start, block.size)
+                if zlib_ng.crc32(values) != block.crc32:
+                    raise ValueError(f"the values of {view_id} do not match their checksum")
+                arrays: dict[str, ndarray] = {}
+                offset = 0
+                for (name, dtype), count in zip(self.content.dtypes.items(), block.counts, strict=True):
+                    arrays[name] = np.frombuffer(values, dtype, count, offset)
+                    offset += arrays[name].nbytes + _padding(arrays[name].nbytes)
+                view = ViewArrays(view_id, arrays, block.numbers)
+                if not self.content.is_sound(view):
+                    raise ValueError(f"the values of {view_id} are out of range")
+                return view
             except _DAMAGE as error:
-                with suppress(OSError):  # Of several threads, only the first can delete it.
+                with suppress(OSError):  # Of several threads, only the first can delete the file.
                     self.entry.path.unlink()
                     _warn_of_damage(self.entry.path, error)
         [view] = self.content.compute([view_id])
@@ -307,8 +302,8 @@ class ArrayCache:
 def open_cache(content: CacheContent, progress: Progress = silent) -> ArrayCache:
     """Open the entry of ``content``; if it is missing or damaged, it is written first, one view at a time.
 
-    If it cannot be written, each view is computed whenever it is needed, with a warning: a score never fails for
-    want of a cache. Raises ``DatasetError`` if a view cannot be computed.
+    If it cannot be written, a warning is printed, and each view is computed whenever it is needed: without a
+    cache, a score only takes longer. Raises ``DatasetError`` if a view cannot be computed.
     """
     CACHE_BYTES.value()  # An invalid variable is reported before the work.
     try:

@@ -33,7 +33,7 @@ _ZSTANDARD_PIXEL = bytes.fromhex(
 
 @dataclass(frozen=True)
 class PictureKind:
-    """Images of a kind of column: accepted formats and modes of Pillow; mode and type to which they decode."""
+    """Images of a kind of column: formats and modes of Pillow that are read, and mode and type when decoded."""
 
     formats: tuple[str, ...]
     modes: tuple[str, ...]
@@ -88,7 +88,7 @@ def check_codecs() -> None:
 def encode_depth(depth_m: Float32[ndarray, "h w"]) -> bytes:
     """Encode float32 planar depth in metres as TIFF: floating-point predictor, zstd, one strip.
 
-    Raises as ``check_codecs``.
+    Raises ``InputError`` if Pillow is built without Zstandard.
     """
     check_codecs()  # Wheels of Pillow without Zstandard end the process.
     tags = {_TIFF_PREDICTOR: _FLOATING_POINT, _TIFF_ROWS_PER_STRIP: depth_m.shape[0]}
@@ -117,16 +117,17 @@ def decode(kind: str, content: bytes, grid: tuple[int, int]) -> ndarray[Any, Any
     """Decode the image of a column of ``kind`` and ``grid`` (height, width) to a writable array.
 
     It is uint8 H x W x 3 for colour and previews, float32 H x W for depth (metres, 0.0 where there is no surface),
-    bool H x W for masks and uint16 H x W for bar ids. Raises as ``open_picture``.
+    bool H x W for masks and uint16 H x W for bar ids. Raises ``ValueError`` or an error of Pillow, which has no
+    base class, for other content.
     """
     return np.asarray(open_picture(kind, content, grid))
 
 
 def open_picture(kind: str, content: bytes, grid: tuple[int, int]) -> Picture:
-    """Decode the image of a column of ``kind`` and ``grid`` (height, width), in the mode of that kind.
+    """Decode the image of a column of ``kind`` and ``grid`` (height, width) to the mode of that kind.
 
-    Format, mode and size are checked before it is decoded. Raises ``ValueError`` or an error of Pillow, which has
-    no base class, for other content.
+    Format, mode and size are checked before the pixels are decoded. Raises ``ValueError`` or an error of Pillow,
+    which has no base class, for other content.
     """
     expected, (height, width) = PICTURE_KINDS[kind], grid
     if len(content) > CELL_BYTES.value():

@@ -51,9 +51,9 @@ class Located(StrictModel):
     def file(self, name: str) -> Path:
         """Return the local path of a file of the dataset, downloaded first if the dataset is a Hub repository.
 
-        Without a commit, the root may be a mistyped folder: the Hub is asked once, and not if its owner is a
-        folder here. Raises ``DatasetError`` if the root is neither a folder nor a repository, and if the file is
-        missing, not a regular file, or cannot be downloaded.
+        Without a commit, the root may be a mistyped folder: the Hub is asked once, and not at all if a local
+        folder has the name of the repository's owner. Raises ``DatasetError`` if the root is neither a folder nor
+        a repository, and if the file is missing, not a regular file, or cannot be downloaded.
         """
         folder = Path(self.root)
         if folder.exists() and not folder.is_dir():
@@ -72,7 +72,7 @@ class Located(StrictModel):
     def open(self, name: str) -> BinaryIO:
         """Open a file of the dataset for reading; a file of the Hub that is not cached is read in ranges.
 
-        Raises ``DatasetError`` as ``file`` does.
+        Raises ``DatasetError`` if the file is missing, not a regular file, or cannot be read from the Hub.
         """
         if self.local is not None:
             return open_regular(self.file(name))
@@ -91,7 +91,7 @@ class Located(StrictModel):
 def _hub_root(root: str) -> tuple[str, str | None]:
     """Return the repository and the revision (None: the main branch) of a Hub root.
 
-    Raises ``DatasetError`` if the root is no such text.
+    Raises ``DatasetError`` if the root cannot be a repository.
     """
     match = _HUB_ROOT_PATTERN.fullmatch(root)
     if match is None:
@@ -157,9 +157,9 @@ def parameters_digest(parameters: object) -> str:
 
 
 def file_problems(folder: DatasetFolder, progress: Progress = silent) -> Iterator[Problem]:
-    """Yield a problem for each file of the manifest that is missing or has another SHA-256, and for further files.
+    """Yield a problem for each file of the manifest that is missing or differs, and for each further file.
 
-    Files of a Hub repository are downloaded first; its further files are not looked for.
+    Files of a Hub repository are downloaded first; further files of a repository are not searched for.
     """
     for done, (name, sha256) in enumerate(folder.files.items(), start=1):
         if problem := _file_problem(folder, name, sha256):

@@ -134,8 +134,8 @@ class DatasetConfig(Located):
     @property
     def views_per_distance(self) -> int | None:
         """Number of views at each distance of a survey; None for other cameras, and with splits."""
-        protocol = None if self.has_splits else self.scenes[0].protocol
-        return protocol.views_per_distance if isinstance(protocol, Survey) else None
+        trajectory = None if self.has_splits else self.scenes[0].protocol
+        return trajectory.views_per_distance if isinstance(trajectory, Survey) else None
 
     @property
     def splits(self) -> tuple[str, ...]:
@@ -163,7 +163,7 @@ class DatasetConfig(Located):
 
     @property
     def mesh(self) -> str:
-        """Name of the mesh of the only scene. Raises ``DatasetError`` as ``scene``, and if there is none."""
+        """Name of the mesh of the only scene. Raises ``DatasetError`` for several scenes, and without a mesh."""
         if self.scene.mesh is None:
             raise DatasetError(f"{self.root}: config {self.name} was imported without a mesh, expected one")
         return self.scene.mesh
@@ -325,8 +325,8 @@ class _Format(ManifestTable):
 def open_folder(root: str | Path, *, expect_digest: str | None = None) -> DatasetFolder:
     """Open a dataset folder or Hub dataset repository.
 
-    Raises ``DatasetError`` if ``root`` is neither, or with all problems of its manifest if that is invalid, and if
-    the dataset's digest is not ``expect_digest``.
+    Raises ``DatasetError`` if ``root`` is neither, if the manifest is invalid, with all its problems, and if the
+    dataset's digest is not ``expect_digest``.
     """
     if expect_digest is not None and not re.fullmatch(DIGEST_PATTERN, expect_digest):
         raise InputError(
@@ -357,7 +357,7 @@ def read_manifest(path: Path) -> tuple[Any, list[Problem]]:
 def validated_folder(values: Any, problems: list[Problem], root: str, path: Path) -> DatasetFolder:
     """Return the dataset in ``root`` that ``read_manifest`` has read from ``path``, if there are no ``problems``.
 
-    Raises ``DatasetError`` with the problems, and with those of the values.
+    Raises ``DatasetError`` with ``problems`` and the problems of the values.
     """
     folder = None
     if not problems and validate_table(_Format, values, problems):  # Another format would cause many problems.

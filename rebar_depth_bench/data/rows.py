@@ -31,7 +31,7 @@ from rebar_depth_bench.geometry.cameras import Camera, is_rigid
 TRUTH_COLUMNS = tuple(name for name in COLUMNS if name.endswith(("_depth", "_mask", "_bars", "_preview")))
 """Columns of ground truth about the scene; the preview shows depth."""
 POSE_COLUMNS = tuple(f"{eye}_cam_from_world" for eye in EYES)
-"""Columns of the poses in the world, which are ground truth; that of one eye from the other is calibration."""
+"""Columns of the poses in the world, which are ground truth; the pose between the two eyes is calibration."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +49,9 @@ class EyeTruth:
     bars: UInt16[ndarray, "h w"] | None
 
     def digest(self) -> str:
-        """Return the hex SHA-256 of the ground truth: of image size, depth, mask, bar ids and camera.
+        """Return the hex SHA-256 of the ground truth: image size, depth, mask, bar ids and camera.
 
-        It covers the decoded values, not their encoding, and which of them are absent.
+        The digest covers the decoded values, not their encoding, and which of them are absent.
         """
         digest = hashlib.sha256(np.array(self.depth_m.shape, "<u4").tobytes())
         arrays = (
@@ -68,7 +68,7 @@ class EyeTruth:
 
 
 @dataclass(frozen=True, eq=False)
-class EyeView(EyeTruth):
+class RenderedEye(EyeTruth):
     """One eye of a rendered view, which has a mask and bar ids."""
 
     mask: Bool[ndarray, "h w"]
@@ -90,7 +90,7 @@ def truth_from_row(row: Mapping[str, Any], eye: str) -> EyeTruth:
 def camera_from_row(row: Mapping[str, Any], eye: str, grid: tuple[int, int]) -> Camera:
     """Return the camera of one eye of a row, decoded or not; ``grid`` is its image size (height, width).
 
-    Raises ``ValueError`` for arrays that ``camera_array`` rejects.
+    Raises ``ValueError`` for cells that ``camera_array`` rejects.
     """
     K, distortion, cam_from_world = (camera_array(kind, row[f"{eye}_{kind}"]) for kind in CAMERA_SHAPES)
     height, width = grid
@@ -128,58 +128,21 @@ def camera_array(kind: str, cell: Any) -> Float64[ndarray, ...]:
 
 
 def decode_row(config: DatasetConfig, row: Mapping[str, Any]) -> dict[str, Any]:
-    """Decode the cells of a row of a config; those of its absent columns decode to None.
+    """Decode the cells of a row of a config; the cells of its absent columns decode to None.
 
     Raises ``DatasetError`` naming view and column if a cell is damaged or contradicts the manifest.
     """
-    view = str(row.get("view_id", f"a view of {config.name}"))
-    return {name: _decode(config, name, cell, view) for name, cell in row.items()}
+    view_id = str(row.get("view_id", f"a view of {config.name}"))
+    return {column: decode_cell(config, column, cell, view_id) for column, cell in row.items()}
 
 
-def row_of_pictures(config: DatasetConfig, row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a row for ``datasets``, whose images stay encoded and have the path that ``open_cell`` expects.
+def decode_cell(config: DatasetConfig, column: str, cell: Any, view_id: str) -> Any:
+    """Decode one cell of a row of a config.
 
-    All other cells are checked. Raises ``DatasetError`` as ``decode_row``.
+    Raises ``DatasetError`` naming view and column if the cell is damaged or contradicts the manifest.
     """
-    cells, view = dict(row), str(row["view_id"])
-    for column, cell in row.items():
-        kind = column_kind(column)
-        if kind not in codecs.PICTURE_KINDS or column in config.absent_columns:
-            _decode(config, column, cell, view)
-        else:
-            with _naming(config.root, view, column):
-                cells[column] = {"bytes": _content(kind, cell), "path": picture_place(config.root) + view}
-    return cells
-
-
-def picture_place(root: str) -> str:
-    """Return the start of the paths of images in ``row_of_pictures``, before the id of the view."""
-    return f"{root}/"
-
-
-def open_cell(root: str, grid: tuple[int, int], column: str, cell: Mapping[str, Any]) -> codecs.Picture:
-    """Decode the image in a cell of ``row_of_pictures``. Raises ``DatasetError`` as ``decode_row``."""
-    with _naming(root, cell["path"].removeprefix(picture_place(root)), column):
-        return codecs.open_picture(column_kind(column), cell["bytes"], grid)
-
-
-@contextmanager
-def _naming(root: str, view: str, column: str) -> Iterator[None]:
-    """Convert the errors of a damaged cell to ``DatasetError``. Raises ``InputError`` as ``check_codecs``."""
-    try:
-        yield
-    except Exception as error:  # Pillow raises many types, which depend on the damage.
-        codecs.check_codecs()
-        reason = library_message(error)
-        raise DatasetError(
-            f"{root}: view {escape_text(view)}: {column} is damaged: {reason}; "
-            f"rebar-bench verify {root} lists damaged files"
-        ) from error
-
-
-def _decode(config: DatasetConfig, column: str, cell: Any, view: str) -> Any:
     kind = column_kind(column)
-    with _naming(config.root, view, column):
+    with _named_damage(config.root, view_id, column):
         if column in config.absent_columns:
             if not is_absent(cell):
                 raise ValueError("it has a value, expected null as in the manifest")
@@ -190,15 +153,64 @@ def _decode(config: DatasetConfig, column: str, cell: Any, view: str) -> Any:
             return camera_array(kind, cell)
         if kind == "view_id" and cell not in config.scene_by_view:
             raise ValueError("it is not in the manifest")
-        if kind == "scene" and cell != (expected := config.scene_by_view.get(view, cell)):
+        if kind == "scene" and cell != (expected := config.scene_by_view.get(view_id, cell)):
             raise ValueError(f"got {short_repr(cell)}, expected {expected} as in the manifest")
         if kind == "baseline_m" and not (isinstance(cell, float) and math.isfinite(cell)):
             raise ValueError(f"got {cell}, expected a length in metres")
         return cell
 
 
+_IMAGE_OF_SHARD = "rebar-depth-bench:"
+"""Start of the paths in the cells of ``image_cell``."""
+
+
+def image_cell(config: DatasetConfig, column: str, cell: Any, view_id: str) -> dict[str, Any]:
+    """Return a cell of ``datasets.Image`` with the encoded image in a cell of a shard.
+
+    The path in the returned cell is no file: it names root, view and size for ``open_image_cell``. Raises
+    ``DatasetError`` if the cell of the shard has no image.
+    """
+    height, width = config.grid
+    with _named_damage(config.root, view_id, column):
+        content = _content(column_kind(column), cell)
+    return {"bytes": content, "path": f"{_IMAGE_OF_SHARD}{config.root}/{view_id}/{height}x{width}"}
+
+
+def is_image_cell(cell: Mapping[str, Any]) -> bool:
+    """Return whether a cell of ``datasets.Image`` is from ``image_cell``."""
+    return (cell["path"] or "").startswith(_IMAGE_OF_SHARD)
+
+
+def open_image_cell(column: str, cell: Mapping[str, Any]) -> codecs.Picture:
+    """Decode the image in a cell of ``image_cell``.
+
+    Raises ``DatasetError`` naming view and column if the image is damaged or has another size.
+    """
+    root, config, view, size = cell["path"].removeprefix(_IMAGE_OF_SHARD).rsplit("/", 3)
+    height, width = map(int, size.split("x"))
+    with _named_damage(root, f"{config}/{view}", column):
+        return codecs.open_picture(column_kind(column), cell["bytes"], (height, width))
+
+
+@contextmanager
+def _named_damage(root: str, view_id: str, column: str) -> Iterator[None]:
+    """Convert the errors of a damaged cell to ``DatasetError``.
+
+    Raises ``InputError`` instead if Pillow lacks a codec.
+    """
+    try:
+        yield
+    except Exception as error:  # Pillow raises many types, which depend on the damage.
+        codecs.check_codecs()
+        reason = library_message(error)
+        raise DatasetError(
+            f"{root}: view {escape_text(view_id)}: {column} is damaged: {reason}; "
+            f"rebar-bench verify {root} lists damaged files"
+        ) from error
+
+
 def _content(kind: str, cell: Any) -> bytes:
-    """Return the encoded image in a cell of a shard. Raises an error of any type for another cell."""
+    """Return the encoded image in a cell of a shard. A cell of another type raises an error of any type."""
     content = cell if kind == "depth" else cell["bytes"]
     if not isinstance(content, bytes):
         raise ValueError("the cell holds no bytes")
@@ -208,9 +220,9 @@ def _content(kind: str, cell: Any) -> bytes:
 def iterate_rows(
     config: DatasetConfig, columns: Sequence[str], view_ids: Collection[str] | None = None
 ) -> Iterator[dict[str, Any]]:
-    """Yield the decoded rows of a config, or those of some views, one at a time, without a cache.
+    """Yield the decoded rows of a config, or of some of its views, one at a time and without a cache.
 
-    Raises ``DatasetError`` if a cell is damaged, and as ``encoded_rows``.
+    Raises ``DatasetError`` if a shard or a cell is damaged, and if a view is missing.
     """
     return (decode_row(config, row) for row in encoded_rows(config, columns, view_ids))
 
@@ -235,7 +247,7 @@ def truth_problems(config: DatasetConfig, progress: Progress = silent) -> Iterat
         progress(f"ground truth of {config.name}", done, len(records))
 
 
-# Views for methods: those of a dataset, or pictures without ground truth.
+# Views for methods: from a dataset, or pictures without ground truth.
 
 
 class Views(Protocol):

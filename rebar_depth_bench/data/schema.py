@@ -55,7 +55,7 @@ OPTIONAL_COLUMNS = (
     *("left_rgb", "left_mask", "left_bars"),
     *(name for name in COLUMNS if name.startswith("right_") or name == "baseline_m"),
 )
-"""Columns that may be null in every row of a config that was imported; K, distortion and pose are NaN then."""
+"""Columns that may be null in every row of an imported config; K, distortion and pose are NaN instead of null."""
 
 
 def features() -> Features:
@@ -117,7 +117,7 @@ def validated_columns(columns: Sequence[str] | None) -> tuple[str, ...]:
 
 
 class ManifestTable(StrictModel):
-    """Base class of the objects that may contain further keys, which are ignored."""
+    """Base class of objects in the manifest that may contain further keys, which are ignored."""
 
     model_config = ConfigDict(extra="ignore")
 
@@ -125,11 +125,11 @@ class ManifestTable(StrictModel):
 CENTRE, NEAREST_STEEL = "centre", "nearest steel"
 """Values of ``Trajectory.distance_to``."""
 SURVEY = "survey"
-"""Kind of the trajectories that are a ``Survey``."""
+"""Kind of a ``Survey``."""
 RANDOM_VIEWS = "random views"
-"""Kind of the trajectories that are ``RandomViews``."""
+"""Kind of ``RandomViews``."""
 _SHELLS = ("dome", "ring", "sweep")
-"""Kinds of the trajectories that are a ``Trajectory``."""
+"""Kinds of a ``Trajectory``."""
 _Views = Annotated[int, whole_number(1, 1_000_000)]
 _Distances = Annotated[tuple[Annotated[float, number(0)], ...], Strict(False), Field(min_length=1)]
 
@@ -189,7 +189,7 @@ _BY_KIND: Mapping[str, type[AnyTrajectory]] = {
 
 
 def trajectory_of(fields: Any) -> AnyTrajectory:
-    """Return the trajectory of a scene in the manifest; raise the error of a field if it is not valid."""
+    """Return the trajectory of a scene from its fields in the manifest. Raises the error of an invalid field."""
     if isinstance(fields, AnyTrajectory):
         return fields
     kind = fields.get("kind") if isinstance(fields, Mapping) else None
@@ -220,8 +220,8 @@ class ViewRecord(StrictModel):
     """Manifest entry of one view.
 
     ``left`` and ``right`` are the hex SHA-256 digests of the cameras' ground truth; ``steel_px`` and ``scored_px``
-    count steel and scored pixels. ``right`` is None in a config without depth of the right camera, ``steel_px``
-    in one without masks.
+    count steel and scored pixels. ``right`` is None in a config without depth of the right camera, and
+    ``steel_px`` in a config without masks.
     """
 
     view_id: _ViewId
@@ -309,7 +309,7 @@ _NEEDED = {
     "right_depth": {"right_mask", "right_bars"},
     "right_K": {name for name in OPTIONAL_COLUMNS if name.startswith("right_") or name == "baseline_m"},
 }
-"""Columns that cannot be present without the column that is the key."""
+"""Columns that are absent if the column in the key is absent."""
 
 
 class SceneRig(ManifestTable):

@@ -5,8 +5,8 @@ elements. The footer therefore has to declare the expected schema, no more rows 
 compression that expands its input at most about twentyfold.
 
 The footer is parsed in Python, because pyarrow ends the process where a damaged footer is inspected. It is a
-structure of Thrift's compact protocol. Structures become dicts by field number; the numbers used here are those of
-``parquet.thrift``.
+structure of Thrift's compact protocol. Structures become dicts by field number, as ``parquet.thrift`` numbers the
+fields.
 """
 
 from __future__ import annotations
@@ -98,8 +98,8 @@ def _footer(metadata: dict[int, Any]) -> Footer:
 def _read_structure(content: bytes, position: int, depth: int = 0) -> tuple[dict[int, Any], int]:
     """Return a structure as a dict of its fields by number, and the position behind it.
 
-    Integers are read here without a call: footers have a hundred thousand. Raises ``LookupError`` at the end of
-    the content.
+    Integers are read here without a call, because a footer has a hundred thousand of them. Raises ``LookupError``
+    at the end of the content.
     """
     if depth > _MAX_NESTING:
         raise ParquetError("the footer is nested too deep")
@@ -179,7 +179,7 @@ _MAX_STRING_BYTES = 1 << 22
 
 @dataclass(frozen=True)
 class Table:
-    """Expected content of a Parquet file; further columns are not read, and those of ``optional`` may be absent.
+    """Expected content of a Parquet file; further columns are not read, and columns of ``optional`` may be absent.
 
     ``max_values`` limits the values of a column on average over the rows (default: 1 per row), and ``max_bytes``
     the decoded size of all columns of ``schema`` together.
@@ -193,7 +193,7 @@ class Table:
 
     @property
     def max_footer_bytes(self) -> int:
-        """Largest accepted footer; one with a row group per row has about 4 kB for each."""
+        """Largest accepted footer, bytes; a footer with a row group for each row has about 4 kB for a group."""
         return (1 << 18) + (min(self.max_rows, 1 << 11) << 13)
 
     def check(self, footer: Footer) -> None:
@@ -237,7 +237,7 @@ def open_parquet(stream: BinaryIO, table: Table) -> Iterator[pq.ParquetFile]:
 def read_rows(
     file: pq.ParquetFile, schema: pa.Schema, *, batch_rows: int = 1, row_groups: Sequence[int] | None = None
 ) -> Iterator[dict[str, Any]]:
-    """Yield the rows of an open file, of which ``batch_rows`` are converted to Python objects at a time.
+    """Yield the rows of an open file; ``batch_rows`` of them are converted to Python objects at a time.
 
     Columns of ``schema`` that the file lacks are left out. ``row_groups`` are the indices of the row groups that
     are read (default: all).
@@ -281,7 +281,7 @@ def _check_schema(found: pa.Schema, table: Table) -> None:
 
 
 def check_shards(config: DatasetConfig) -> None:
-    """Check the footers of a local config's shards; those of the Hub are checked when they are read.
+    """Check the footers of a local config's shards; shards of the Hub are checked when they are read.
 
     Raises ``DatasetError`` for a missing or damaged shard, and if the manifest has another number of views.
     """
@@ -298,10 +298,10 @@ def check_shards(config: DatasetConfig) -> None:
 def encoded_rows(
     config: DatasetConfig, columns: Sequence[str], view_ids: Collection[str] | None = None
 ) -> Iterator[dict[str, Any]]:
-    """Yield the rows of a config, or those of some views, one at a time, with images and depth encoded.
+    """Yield the rows of a config, or of some of its views, one at a time, with images and depth encoded.
 
-    Raises ``DatasetError`` for a damaged shard, and if a view is missing; if all are read, also if one occurs
-    twice or is not in the manifest.
+    Raises ``DatasetError`` for a damaged shard, and if a view is missing; if all views are read, also if a view
+    occurs twice or is not in the manifest.
     """
     columns = validated_columns(columns)
     if view_ids is None and config.whole is not config:
@@ -328,7 +328,7 @@ def encoded_rows(
 
 
 def _shards_with(config: DatasetConfig, view_ids: Collection[str]) -> list[str]:
-    """Return the shards of the scenes of some views; those of a single view begin where it is expected."""
+    """Return the shards of the scenes of some views; for a single view, the most probable shard comes first."""
     scenes = {config.scene_by_view[view_id] for view_id in view_ids}
     shards = [shard for scene in config.scenes if scene.name in scenes for shard in scene.shards]
     if len(view_ids) == 1:
@@ -342,10 +342,10 @@ def _shards_with(config: DatasetConfig, view_ids: Collection[str]) -> list[str]:
 def shard_rows(
     config: DatasetConfig, columns: Sequence[str], shards: Sequence[str], view_ids: Collection[str] | None = None
 ) -> Iterator[dict[str, Any]]:
-    """Yield the rows of ``shards``, or those of some views, with the cells of ``columns`` encoded.
+    """Yield all rows of ``shards``, or the rows of some views, with the cells of ``columns`` encoded.
 
-    Of a shard with one row group for each view, as the builder writes it, only the wanted rows are read. Raises
-    ``DatasetError`` for a damaged shard.
+    If a shard has one row group for each view, as the builder writes it, only the rows of these views are read.
+    Raises ``DatasetError`` for a damaged shard.
     """
     table = rows_table(("view_id", *columns), len(config.whole.views))
     for shard in shards:
@@ -358,13 +358,6 @@ def shard_rows(
             for row in read_rows(file, table.schema, row_groups=groups):
                 if view_ids is None or row["view_id"] in view_ids:
                     yield {name: row[name] for name in columns}
-
-
-def _damaged_error(config: DatasetConfig, error: Exception, shard: str = "") -> DatasetError:
-    """Return the error of a config that cannot be read; ``shard`` is the file, if it is known."""
-    place = f"{config.root}: config {config.name} cannot be read: {f'{shard}: ' if shard else ''}"
-    reason = library_message(error)
-    return DatasetError(f"{place}{reason}; rebar-bench verify {config.root} lists damaged files")
 
 
 def rows_table(columns: Sequence[str], max_rows: int) -> Table:
@@ -385,4 +378,7 @@ def _open_shard(config: DatasetConfig, shard: str, table: Table) -> Iterator[pq.
     except InputError:
         raise
     except Exception as error:  # pyarrow and the Hub's client raise many types, which depend on the damage.
-        raise _damaged_error(config, error, shard) from error
+        raise DatasetError(
+            f"{config.root}: config {config.name} cannot be read: {shard}: {library_message(error)}; "
+            f"rebar-bench verify {config.root} lists damaged files"
+        ) from error

@@ -14,9 +14,11 @@ import pytest
 from PIL import Image
 
 import rebar_depth_bench as rdb
+from rebar_depth_bench.data.codecs import encode_depth
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import iterate_rows
 from rebar_depth_bench.data.schema import COLUMNS
+from tests.damage import change_manifest, change_rows, copy_dataset, first_shard
 
 torch = pytest.importorskip("torch")
 
@@ -170,6 +172,19 @@ def test_arrays_of_rows_are_exact_and_writable(tiny_root: Path, streaming: bool)
             if isinstance(cell, np.ndarray):
                 assert row[name].dtype == cell.dtype, name
                 assert row[name].flags.writeable, name
+
+
+def test_streamed_configs_of_several_sizes_are_concatenated(tiny_root: Path, tmp_path: Path) -> None:
+    root, other = copy_dataset(tiny_root, tmp_path / "copy"), "lattice-orbit"
+    change_manifest(root, lambda _, config: config["rig"].update(width=80, height=45), other)
+    small = encode_depth(np.ones((45, 80), np.float32))
+    change_rows(first_shard(root, other), lambda rows: [row.update(left_depth=small) for row in rows])
+    configs = [rdb.load(root, name, columns=["left_depth"], streaming=True) for name in (CONFIG, other)]
+    both = datasets.concatenate_datasets(configs)
+    assert [row["left_depth"].shape for row in both] == [(90, 160)] * VIEWS + [(45, 80)] * 2
+    change_rows(first_shard(root, other), lambda rows: rows[1].update(left_depth=small[:-20]))
+    with pytest.raises(rdb.DatasetError, match="view lattice-orbit/0075: left_depth is damaged"):
+        list(both)
 
 
 def test_loaded_table_stays_on_disk(tiny_root: Path) -> None:

@@ -26,7 +26,7 @@ from dataset_builder.scene.shapes.solids import world_mesh
 from dataset_builder.specs.config_specs import RigSpec
 from rebar_depth_bench.captures.calibration import Lens, StereoCalibration
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.data.rows import EyeView
+from rebar_depth_bench.data.rows import RenderedEye
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid, transform
 
@@ -114,7 +114,7 @@ def _colour(camera: Camera) -> UInt8[ndarray, "h w 3"]:
     return np.repeat(np.round(mean).astype(np.uint8)[..., None], 3, axis=2)
 
 
-def _board_levels(rays_cam: Float64[ndarray, "h w 3"], truth: EyeView) -> ndarray:
+def _board_levels(rays_cam: Float64[ndarray, "h w 3"], truth: RenderedEye) -> ndarray:
     points_m = transform(inverse_rigid(truth.camera.cam_from_world), rays_cam * truth.depth_m[..., None])
     column = (points_m[..., 0] + BOARD.width_m / 2) * PX_PER_M - 0.5
     row = (BOARD.height_m / 2 - points_m[..., 1]) * PX_PER_M - 0.5
