@@ -85,7 +85,7 @@ class DatasetConfig(Located):
         if info.data.get("imported") is None:
             for scene in scenes:
                 for key in ("mesh", "assembly", "protocol", "rig"):
-                    if getattr(scene, key) is None:
+                    if scene.entry.get(key) is None:
                         found = f"{key} of scene {scene.name} is null"
                         raise field_error(found, f"the {key} of a scene that was rendered", "conflict")
         if not info.data.get("has_splits", True) and [scene.split for scene in scenes] != [TEST_SPLIT]:
@@ -134,7 +134,7 @@ class DatasetConfig(Located):
     @property
     def views_per_distance(self) -> int | None:
         """Number of views at each distance of a survey; None for other cameras, and with splits."""
-        trajectory = None if self.has_splits else self.scenes[0].protocol
+        trajectory = None if self.has_splits else self.scenes[0].trajectory
         return trajectory.views_per_distance if isinstance(trajectory, Survey) else None
 
     @property
