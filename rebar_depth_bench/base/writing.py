@@ -68,6 +68,7 @@ def atomic_replace(target: Path, mode: int = 0) -> Iterator[Path]:
     if target.exists() and not target.is_file():  # Renaming would replace a device such as /dev/null.
         raise InputError(f"{target}: is a device or a pipe, expected the name of a file to write")
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
+    process = os.getpid()
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode or 0o666))
@@ -82,8 +83,9 @@ def atomic_replace(target: Path, mode: int = 0) -> Iterator[Path]:
             temporary.replace(target)
             fsync_path(target.parent)
     except BaseException:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
+        if os.getpid() == process:  # The file is not that of a process that was forked meanwhile and ends.
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
         raise
 
 
