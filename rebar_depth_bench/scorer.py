@@ -76,9 +76,11 @@ def score(
                     prediction = submission.read(truth.scored.view_ids[position])
                     return score_view(prediction, truth, position, kind, meta.prediction)
 
-                positions = range(len(truth.scored.view_ids))
+                count = len(truth.scored.view_ids)
                 task = f"scoring {config.name}"
-                views = list(map_in_threads(score_at, positions, task, workers=workers, progress=progress))
+                views = list(
+                    map_in_threads(score_at, range(count), count, task, workers=workers, progress=progress)
+                )
                 scored[config.name] = tabulate_config(views, truth, kind, meta.declaration)
             for view_id in set(submission.view_ids) - {one for of in scored.values() for one in of.frame.view_ids}:
                 submission.read(view_id)  # A view without scored pixels.

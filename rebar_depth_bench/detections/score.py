@@ -64,7 +64,9 @@ def score_crossings(
             return compare_view(seen, truth, confidence)
 
         task = f"crossings of {config.name}"
-        found = list(map_in_threads(compare, range(len(steel)), task, workers=workers, progress=progress))
+        found = list(
+            map_in_threads(compare, range(len(steel)), len(steel), task, workers=workers, progress=progress)
+        )
         views[config.name] = found
         resampling = resample_views(
             steel.view_ids, by_scene=config.has_splits, views_per_distance=config.views_per_distance
