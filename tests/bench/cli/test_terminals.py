@@ -119,7 +119,7 @@ def test_closed_streams_lose_no_file(
 def test_closed_standard_output_is_no_file(scored: list[str | Path]) -> None:
     finished = in_shell(">&-", *scored, "--json", "-")
     assert finished.returncode == 2
-    assert "descriptor 1 is not open" in finished.stderr
+    assert "standard output is closed" in finished.stderr
 
 
 @pytest.mark.parametrize(
