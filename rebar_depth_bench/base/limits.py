@@ -17,6 +17,7 @@ from typing import TypeVar
 from rebar_depth_bench.base.errors import InputError, escape_text
 
 _MIB, _GIB = 1 << 20, 1 << 30
+_Result = TypeVar("_Result")
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,15 +65,8 @@ CACHE_BYTES = Limit(
 )
 
 
-# Time limit on a call that may never return: an inference, or a request to a server.
-
-_Result = TypeVar("_Result")
-_GRACE_S = 2.0
-"""Time that a cancelled call has to end, seconds."""
-
-
 class DeadlineError(Exception):
-    """Call that did not return in time."""
+    """Call, such as an inference or a request to a server, that did not return in time."""
 
 
 def call_within(
@@ -99,6 +93,6 @@ def call_within(
     except BaseException:  # Ctrl-C, too.
         cancel()
         # A thread that returns from native code while Python exits would abort the process.
-        wait([future], _GRACE_S)
+        wait([future], 2.0)
         raise
     return future.result()

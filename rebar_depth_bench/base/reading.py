@@ -24,10 +24,11 @@ from typing import Any, BinaryIO, NoReturn
 from rebar_depth_bench.base.errors import InputError, Problem, ProblemCode, escape_text
 from rebar_depth_bench.base.limits import Limit
 from rebar_depth_bench.base.names import NAME_LETTERS, PATH_PATTERN
-from rebar_depth_bench.base.system import open_for_reading, read_range
+from rebar_depth_bench.base.system import READ_FLAGS, read_range
 
 MAX_NESTING = 64
 """Largest number of JSON or TOML containers inside each other."""
+_TOO_DEEP = ("the values are nested too deep", f"at most {MAX_NESTING} levels")
 _MAX_KEY_COST = 10_000_000
 """Largest sum over the lines of a TOML file of the squared number of dots; tomllib needs about 10 ns for each."""
 _DECIMAL_NUMBER = re.compile(rb"(?<![\w.\"'-])[-+]?\d+\.\d+(?=[\s,\]}eE]|$)")
@@ -44,7 +45,7 @@ def open_regular(path: Path) -> BinaryIO:
     Raises ``OSError``, whose ``strerror`` can be shown to users, for anything else, and for a pointer of git LFS.
     """
     try:
-        descriptor = open_for_reading(path)
+        descriptor = os.open(path, READ_FLAGS)
     except ValueError as error:  # The path contains a null character.
         raise OSError(errno.EINVAL, str(error)) from None
     mode = os.fstat(descriptor).st_mode
@@ -112,9 +113,10 @@ def parse_json(content: bytes, where: str = "") -> tuple[Any, list[Problem]]:
         json.dumps(value, allow_nan=False, ensure_ascii=False).encode()
         _check_nesting(value)
     except RecursionError:
-        return None, [_nesting_problem(where)]
-    except _DuplicateKeyError as error:
-        return None, [Problem("duplicate", where, f"the key {error} occurs twice", "each key once")]
+        return None, [Problem("size", where, *_TOO_DEEP)]
+    except KeyError as error:
+        found = f"the key {escape_text(error.args[0])} occurs twice"
+        return None, [Problem("duplicate", where, found, "each key once")]
     except ValueError as error:
         # Of a number with too many digits, json says after the semicolon how a programmer raises the limit.
         found = f"the text is not valid JSON ({escape_text(str(error).partition(';')[0])})"
@@ -134,7 +136,7 @@ def parse_toml(content: bytes) -> tuple[dict[str, Any], list[Problem]]:
         values = tomllib.loads(text)
         _check_nesting(values)
     except RecursionError:
-        return {}, [_nesting_problem("")]
+        return {}, [Problem("size", "", *_TOO_DEEP)]
     except ValueError as error:
         return {}, [Problem("syntax", "", f"not a valid TOML file: {escape_text(str(error))}")]
     return values, []
@@ -148,24 +150,17 @@ def parse_number(text: str) -> float:
     return float(text) if _NUMBER.fullmatch(text) else math.nan
 
 
-class _DuplicateKeyError(ValueError):
-    """Key that occurs twice in an object."""
-
-
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return the object of some pairs. Raises ``KeyError`` with a key that occurs twice."""
     table = dict(pairs)
     if len(table) < len(pairs):
         [(duplicate, _)] = Counter(key for key, _ in pairs).most_common(1)
-        raise _DuplicateKeyError(escape_text(duplicate))
+        raise KeyError(duplicate)
     return table
 
 
 def _refuse_constant(constant: str) -> NoReturn:
     raise ValueError(f"{constant} is not JSON")
-
-
-def _nesting_problem(where: str) -> Problem:
-    return Problem("size", where, "the values are nested too deep", f"at most {MAX_NESTING} levels")
 
 
 def _check_nesting(value: object, levels: int = MAX_NESTING) -> None:

@@ -17,12 +17,8 @@ from pathlib import Path
 
 _PR_SET_PDEATHSIG = 1
 _IS_POSIX = hasattr(os, "O_DIRECTORY")
-_READ_FLAGS = os.O_RDONLY | sum(getattr(os, name, 0) for name in ("O_NONBLOCK", "O_NOCTTY", "O_BINARY"))
-
-
-def open_for_reading(path: Path) -> int:
-    """Return a descriptor of a file; a pipe does not block and a terminal does not become that of the process."""
-    return os.open(path, _READ_FLAGS)
+READ_FLAGS = os.O_RDONLY | sum(getattr(os, name, 0) for name in ("O_NONBLOCK", "O_NOCTTY", "O_BINARY"))
+"""Flags for reading: a pipe does not block, and a terminal does not become that of the process."""
 
 
 def read_range(descriptor: int, offset: int, length: int) -> bytes:

@@ -17,18 +17,15 @@ from datetime import timedelta
 from pathlib import Path
 from typing import TextIO
 
+from rich import progress
 from rich.console import Console
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    TaskID,
-    TextColumn,
-    TimeElapsedColumn,
-    TimeRemainingColumn,
-)
 
 from rebar_depth_bench.base.errors import printable
+
+MAX_SILENCE_S = 600.0
+"""Longest time between two lines of progress, if there is progress, seconds."""
+_MAX_LINES = 100
+_MAX_LINE_CHARACTERS = 2000
 
 
 def prepare_terminal() -> None:
@@ -47,10 +44,6 @@ def prepare_terminal() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
-
-
-_MAX_LINES = 100
-_MAX_LINE_CHARACTERS = 2000
 
 
 def terminal_text(message: str) -> str:
@@ -80,15 +73,11 @@ def discard_stream(stream: TextIO) -> None:
         os.dup2(os.open(os.devnull, os.O_WRONLY), stream.fileno())
 
 
-MAX_SILENCE_S = 600.0
-"""Longest time between two lines of progress, if there is progress, seconds."""
-
-
 @dataclass
 class _Task:
     """Bar of a task, the steps done and the time when it was first shown, and the last line printed for it."""
 
-    bar: TaskID
+    bar: progress.TaskID
     done: int
     seconds: float
     tenth: int = -1
@@ -106,12 +95,12 @@ class ProgressBars:
         self._console = Console(stderr=True)
         self._pictures_per_step = pictures_per_step
         self._tasks: dict[str, _Task] = {}
-        self._progress = Progress(
-            TextColumn("{task.description}", markup=False),
-            BarColumn(),
-            MofNCompleteColumn(),
-            TimeElapsedColumn(),
-            TextColumn("{task.fields[rate]}") if pictures_per_step else TimeRemainingColumn(),
+        self._progress = progress.Progress(
+            progress.TextColumn("{task.description}", markup=False),
+            progress.BarColumn(),
+            progress.MofNCompleteColumn(),
+            progress.TimeElapsedColumn(),
+            progress.TextColumn("{task.fields[rate]}") if pictures_per_step else progress.TimeRemainingColumn(),
             console=self._console,
             disable=not self._console.is_terminal,
         )

@@ -63,10 +63,9 @@ def atomic_replace(target: Path, mode: int = 0) -> Iterator[Path]:
     Raises ``InputError`` if ``target`` is a folder, a device or a pipe, or its name is impossible, and
     ``OutputError`` if it or its folder cannot be written.
     """
-    if target.is_dir():
-        raise InputError(f"{target}: is a folder, expected the name of a file to write")
     if target.exists() and not target.is_file():  # Renaming would replace a device such as /dev/null.
-        raise InputError(f"{target}: is a device or a pipe, expected the name of a file to write")
+        found = "is a folder" if target.is_dir() else "is a device or a pipe"
+        raise InputError(f"{target}: {found}, expected the name of a file to write")
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -127,9 +126,7 @@ def link_target(path: Path) -> Path:
 
     Raises ``InputError`` for links that form a loop.
     """
-    if not path.is_symlink():
-        return path
-    target = Path(os.path.realpath(path))
+    target = Path(os.path.realpath(path)) if path.is_symlink() else path
     if target.is_symlink():
         raise InputError(f"{path}: its links form a loop, expected the name of a file to write")
     return target

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import resource
 import signal
 import subprocess
@@ -12,7 +13,7 @@ from collections.abc import Callable, Iterable, Iterator
 
 import pytest
 
-from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.errors import EntryError, InputError, Problem
 from rebar_depth_bench.base.parallel import map_with_progress, silent
 from tests.processes import is_running, wait_until
 
@@ -61,6 +62,13 @@ def test_exceptions_of_function_and_iterator_propagate() -> None:
 def test_zero_workers_raises_input_error() -> None:
     with pytest.raises(InputError, match="workers is 0, expected 1 or more"):
         mapped(lambda n: n, [1], 0)
+
+
+def test_error_of_an_entry_arrives_from_another_process() -> None:
+    error = EntryError(Problem("size", "lattice/0000", "4 bytes follow", "none"))
+    received = pickle.loads(pickle.dumps(error))
+    assert str(received) == "lattice/0000: 4 bytes follow, expected none"
+    assert received.problems == error.problems
 
 
 LIMIT = "import os, sys, time; from rebar_depth_bench.base.system import limit_process; "
