@@ -36,7 +36,7 @@ from rebar_depth_bench.base.names import config_of
 from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
 from rebar_depth_bench.detections.score import score_crossings
 from rebar_depth_bench.extended.measures import NATIVE
-from rebar_depth_bench.extended.registry import score_extended
+from rebar_depth_bench.extended.families import score_extended
 from rebar_depth_bench.scoring.columns import rounded
 from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.submission import SubmissionReader

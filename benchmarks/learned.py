@@ -119,7 +119,7 @@ def config_numbers(config: DatasetConfig, root: Path, out: Path) -> dict[str, An
             }
             for limit in REACHES_PX
         },
-        "constant": reference.constant.abs_rel,
+        "constant": reference["constant.abs_rel"],
         "one_pixel": reference.one_pixel.abs_rel,
         "methods": {
             method: _method_numbers(archive, root, config.name, truth)
@@ -153,16 +153,16 @@ def _method_numbers(archive: Path, root: Path, config: str, truth: Mapping[str, 
         "coverage": table.coverage,
         "rank_error": table.rank_error,
         "reached_rank_error": statistics.mean(reached) if reached else None,
-        "native": table.native and table.native.abs_rel,
-        "scaled": table.scaled and table.scaled.abs_rel,
+        "native": table.native and table["native.abs_rel"],
+        "scaled": table.scaled and table["scaled.abs_rel"],
         "scaled_constant": table.reference.scaled_constant.abs_rel,
         "scale": table.scale_median,
         "within_5_mm": table.within_mm[5],
         "bias_px": _bias_px(archive, root, truth) if is_metric else None,
-        "aligned_error": aligned.aligned.error,
-        "aligned": aligned.aligned.abs_rel,
-        "aligned_constant_error": aligned.constant.error,
-        "aligned_constant": aligned.constant.abs_rel,
+        "aligned_error": aligned["aligned.error"],
+        "aligned": aligned["aligned.abs_rel"],
+        "aligned_constant_error": aligned["constant.error"],
+        "aligned_constant": aligned["constant.abs_rel"],
         "flat_views": aligned.flat_views,
     }
 

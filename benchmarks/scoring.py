@@ -31,7 +31,7 @@ from benchmarks.timing import machine_description, median_seconds, print_markdow
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
 from rebar_depth_bench.extended.measures import SCALED, MeasureFamily
-from rebar_depth_bench.extended.registry import MEASURE_FAMILIES
+from rebar_depth_bench.extended.families import MEASURE_FAMILIES
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.protocol import interior
 from rebar_depth_bench.scoring.score import score_view

@@ -18,8 +18,8 @@ from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
 from rebar_depth_bench.extended.measures import NATIVE, ONCE
 from rebar_depth_bench.extended.reach import pooled
-from rebar_depth_bench.extended.registry import measures_by_alignment, view_samples
-from rebar_depth_bench.extended.result import tabulate_extended
+from rebar_depth_bench.extended.families import measures_by_alignment, view_samples
+from rebar_depth_bench.extended.estimates import tabulate_extended
 from rebar_depth_bench.scoring.bootstrap import resample
 
 COLUMNS = ["view_id", "left_depth"]

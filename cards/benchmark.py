@@ -28,14 +28,15 @@ from cards.steel import STEEL_RESULTS, depth_text, range_text
 from cards.templates import render, wrapped
 from rebar_depth_bench.bar_crossings.definition import crossing_parameters
 from rebar_depth_bench.detections.reading import MAX_ROWS_PER_VIEW
+from rebar_depth_bench.extended.families import MEASURE_FAMILIES
 from rebar_depth_bench.extended.fits import MISS_MM
 from rebar_depth_bench.extended.inspection import MISSED_NOTE, PROFILES, TOLERANCES
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, ONCE, Measure, MeasureFamily
-from rebar_depth_bench.extended.registry import MEASURE_FAMILIES
 from rebar_depth_bench.methods import AnyMethod, own_methods
 from rebar_depth_bench.reporting.extended_tables import FITS_NOTE, REACH_NOTE
 from rebar_depth_bench.scoring.bootstrap import BLOCK_VIEWS, INTERVALS, MIN_BLOCKS, RESAMPLES
 from rebar_depth_bench.scoring.columns import SIGNIFICANT_DIGITS
+from rebar_depth_bench.scoring.formatting import LEAST_MARGIN
 from rebar_depth_bench.scoring.groups import GROUPINGS
 from rebar_depth_bench.scoring.protocol import (
     DELTA1_RATIO,
@@ -44,7 +45,6 @@ from rebar_depth_bench.scoring.protocol import (
     RELATIVE_PROTOCOL,
     WITHIN_MM,
 )
-from rebar_depth_bench.scoring.relative import LEAST_MARGIN
 
 _ROOT = Path(__file__).parents[1]
 _CONTACTS = {"lattice": "375", "pier": "4,860", "pile": "15"}

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from cards.reference import number, percent
-from rebar_depth_bench.detections.result import AVERAGE_PRECISION_MM
+from rebar_depth_bench.detections.tables import AVERAGE_PRECISION_MM
 
 FILES = ("crossings.json", "crossings-cages.json")
 """Files of results: of the scenes, and of generated scenes."""

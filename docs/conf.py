@@ -79,7 +79,7 @@ nitpick_ignore_regex = [
 nitpick_ignore = [("py:class", name) for name in ("DataFrame", "Dataset", "IterableDataset", "Path", "ndarray")]
 # A result lists its extended measures with ``to_pandas("extended")``.
 nitpick_ignore += [
-    ("py:class", "rebar_depth_bench.extended.result.ExtendedResult"),
+    ("py:class", "rebar_depth_bench.extended.estimates.ExtendedResult"),
     ("py:class", "ExtendedResult"),
 ]
 

@@ -38,7 +38,7 @@ from rebar_depth_bench.cli.console import Command, program_parser, run_program
 from rebar_depth_bench.data.files import file_problems
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.scoring.formatting import counted
-from rebar_depth_bench.scoring.frames import csv_text
+from rebar_depth_bench.scoring.spreadsheet import csv_text
 
 _LOG = structlog.get_logger("worker")
 Cell = str | float | None

@@ -6,7 +6,7 @@ from importlib import import_module, metadata
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from rebar_depth_bench.bar_crossings.table import crossings
+    from rebar_depth_bench.bar_crossings.crossings_file import crossings
     from rebar_depth_bench.base.errors import (
         CalibrationError,
         DatasetError,
@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     from rebar_depth_bench.data.bars import bars
     from rebar_depth_bench.data.loading import load
     from rebar_depth_bench.data.torch import torch_loader
-    from rebar_depth_bench.evaluator import Evaluator, evaluate, score
+    from rebar_depth_bench.evaluator import Evaluator, evaluate
+    from rebar_depth_bench.scorer import score
     from rebar_depth_bench.scoring.result import Result
     from rebar_depth_bench.scoring.table import Table, ViewScore
     from rebar_depth_bench.submission import SubmissionWriter
@@ -47,10 +48,10 @@ __all__ = [
 
 _MODULE_BY_NAME = {
     "bars": "data.bars",
-    "crossings": "bar_crossings.table",
+    "crossings": "bar_crossings.crossings_file",
     "evaluate": "evaluator",
     "load": "data.loading",
-    "score": "evaluator",
+    "score": "scorer",
     "torch_loader": "data.torch",
     "Evaluator": "evaluator",
     "SubmissionWriter": "submission",

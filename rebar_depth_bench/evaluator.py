@@ -1,20 +1,21 @@
-"""Scoring in Python, of an archive or of a model, whose predictions are collected in a temporary archive.
+"""Evaluation of a model in Python: each view is scored as it arrives.
 
-For complete configs the result is that of ``rebar-bench score`` on the same archive, to the byte.
+For complete configs the numbers are those of ``rebar-bench score`` on an archive of the same predictions, exactly.
 """
 
 from __future__ import annotations
 
+import copy
 import os
-import shutil
 import tempfile
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass, field, replace
+from contextlib import ExitStack, suppress
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from threading import Lock
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from jaxtyping import Float
@@ -22,23 +23,32 @@ from numpy import ndarray
 
 from rebar_depth_bench.base.errors import InputError, RebarDepthError, escape_text
 from rebar_depth_bench.base.names import TEST_SPLIT, config_of
-from rebar_depth_bench.base.parallel import Progress, silent
-from rebar_depth_bench.base.writing import output_file
+from rebar_depth_bench.base.terminal import ProgressBars
+from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.data.loading import load
-from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
+from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import POSE_COLUMNS, TRUTH_COLUMNS, ConfigViews, iterate_rows
 from rebar_depth_bench.data.schema import COLUMNS
-from rebar_depth_bench.diagnosis.diagnose import diagnose
+from rebar_depth_bench.diagnosis.corrections import KeptPredictions
 from rebar_depth_bench.geometry.cameras import right_from_left
+from rebar_depth_bench.methods import AnyMethod
+from rebar_depth_bench.methods.base import input_class
 from rebar_depth_bench.methods.registry import find_method
 from rebar_depth_bench.methods.run import dataset_views, predict_views, wrap_errors
-from rebar_depth_bench.reporting.html.page import write_report
-from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation, score_evaluation
-from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.scorer import (
+    ConfigTruth,
+    ScoredResult,
+    ViewResult,
+    score,
+    score_view,
+    scored_result,
+    tabulate_config,
+)
+from rebar_depth_bench.scoring.result import SubmissionIdentity
 from rebar_depth_bench.scoring.truth import scored_counts
-from rebar_depth_bench.submission import SubmissionWriter
-from rebar_depth_bench.submission.declaration import METRIC
-from rebar_depth_bench.submission.writer import depth_map
+from rebar_depth_bench.submission import SubmissionReader, SubmissionWriter
+from rebar_depth_bench.submission.declaration import METRIC, Declaration
+from rebar_depth_bench.submission.writer import depth_map, stored_map
 
 if TYPE_CHECKING:
     from datasets import Dataset
@@ -65,7 +75,8 @@ def evaluate(
     kind: str = "metric",
     inputs: str | None = None,
     uses_ground_truth: bool | None = None,
-) -> EvaluatedResult:
+    archive: str | os.PathLike[str] | None = None,
+) -> ScoredResult:
     """Predict views of a dataset folder or Hub repository with a model, and score the predictions.
 
     ``model`` is the name of a method ("sgbm", "my.toml"), which then declares itself; a function from a row to the
@@ -76,29 +87,35 @@ def evaluate(
     ``uses_ground_truth=True``, also the poses in the world. What the config lacks is None.
 
     The other arguments are those of ``Evaluator``, and so are the errors. An exception of a function is the cause
-    of a ``MethodError``, which names the view and the line.
+    of a ``MethodError``, which names the view and the line. Progress is shown for methods and functions.
     """
-    declared = dict[str, Any](method=method, kind=kind, inputs=inputs, uses_ground_truth=uses_ground_truth)
-    evaluator = Evaluator(root, config, split=split, views=views, extended=extended, **declared)
+    selected: dict[str, Any] = {"config": config, "split": split, "views": views, "extended": extended}
+    declared: dict[str, Any] = {
+        "method": method,
+        "kind": kind,
+        "inputs": inputs,
+        "uses_ground_truth": uses_ground_truth,
+    }
     if isinstance(model, str):
-        given = [name for name, value in declared.items() if value != _UNDECLARED[name]]
-        if given:
+        if given := [name for name, value in declared.items() if value != _UNDECLARED[name]]:
             named = f"{' and '.join(given)} {'is' if len(given) == 1 else 'are'} given"
             remedy = "; score its archive by score(ARCHIVE, ROOT, align=KIND)" if "kind" in given else ""
             raise InputError(f"{named}, but the method {model} declares its own{remedy}")
-        return evaluator._predicted_by(model)
+        return _evaluate_method(find_method(model), root, selected, archive)
+    evaluator = Evaluator(root, **selected, **declared, archive=archive)
     if callable(model):
         if inputs == "multi-view" and uses_ground_truth is not True:
             found = f"inputs is multi-view and uses_ground_truth is {uses_ground_truth}"
             raise InputError(f"{found}, expected True, because the rows then have the true poses")
-        rows = evaluator._rows(with_poses=inputs == "multi-view")
         what = "the model"
         if hasattr(model, "forward"):
             what += f", a {type(model).__name__} that is given a row; wrap it in a function, as {_WRAPPED_MODULE}"
-        for row in rows:
-            with wrap_errors(f"{row['view_id']}: {what}"):
-                predicted = model(row)
-            evaluator._add(row["view_id"], predicted, "the model returned")
+        with ProgressBars() as bars:
+            for done, row in enumerate(evaluator._rows(with_poses=inputs == "multi-view"), 1):
+                with wrap_errors(f"{row['view_id']}: {what}"):
+                    predicted = model(row)
+                evaluator._add(row["view_id"], predicted, "the model returned")
+                bars.update(f"evaluating {method}", done, len(evaluator.view_ids))
     else:
         for view_id, depth in _pairs(model):
             if view_id not in evaluator._left_out:
@@ -106,38 +123,43 @@ def evaluate(
     return evaluator.compute()
 
 
-def score(
-    archive: str | os.PathLike[str],
-    root: str | Path,
-    *,
-    workers: int | None = None,
-    expect_digest: str | None = None,
-    align: str | None = None,
-    progress: Progress = silent,
-) -> EvaluatedResult:
-    """Score an archive against a dataset folder or Hub repository.
-
-    An archive is scored by the kind of its predictions; ``align`` scores a metric one as one of another kind.
-
-    Views are read directly from the archive and scored on ``workers`` threads (default: one per core); only a few
-    views are in memory at a time. The result does not depend on the number of workers.
-
-    Raises ``SubmissionError`` with all problems if any part of the archive is invalid, and ``DatasetError`` if the
-    dataset folder is invalid or its digest is not ``expect_digest``.
-    """
-    with open_evaluation(archive, root, expect_digest=expect_digest) as evaluation:
-        result = score_evaluation(evaluation, workers=workers, align=align, progress=progress)
-        path = evaluation.submission.path.absolute()
-        return EvaluatedResult(**vars(result), _archive=path, _folder=evaluation.folder)
+def _evaluate_method(
+    method: AnyMethod, root: str | Path, selected: Mapping[str, Any], archive: str | os.PathLike[str] | None
+) -> ScoredResult:
+    """Return the result of a method, whose predictions are in a temporary archive if none is named."""
+    info = method.info
+    if selected["extended"] and info.prediction != METRIC:
+        raise InputError(f"{info.name} predicts {info.prediction}, but extended measures need metric depth")
+    evaluator = Evaluator(
+        root,
+        **selected,
+        method=info.name,
+        kind=info.prediction,
+        inputs=input_class(method),
+        uses_ground_truth=info.uses_ground_truth,
+    )
+    with tempfile.TemporaryDirectory(prefix="rebar-evaluate-") as folder, ProgressBars() as bars:
+        path = Path(folder, "predictions.zip") if archive is None else Path(archive)
+        predict_views(method, evaluator._views, path, bars.update)
+        if archive is not None:
+            result = score(path, evaluator._folder, extended=selected["extended"], progress=bars.update)
+            return evaluator._as_partial(result)
+        with SubmissionReader(path, evaluator._grids) as submission:
+            for view_id in evaluator.view_ids:
+                evaluator._add(view_id, submission.read(view_id))
+    return evaluator.compute()
 
 
 class Evaluator:
-    """Collector of predictions, which ``compute`` scores; ``reset`` begins again, as for the next epoch.
+    """Evaluation of predictions, each of which is scored when it is added; ``reset`` begins again.
 
     ``config`` is one config, or None for all that have the ``split``. ``views`` selects views of each config: a
     number of them, spread evenly, or their ids; such a result is not ranked. ``extended`` adds the extended
     measures. ``method``, ``inputs`` and ``uses_ground_truth`` are what the predictions declare, and ``kind`` is
-    one of ``PREDICTION_KINDS``.
+    one of ``PREDICTION_KINDS``. With ``archive``, the predictions are also written to a submission archive.
+
+    Several threads may add views. A copy of an evaluator, as a process that is forked has one, is independent of
+    it; there is none of an evaluator that writes an archive.
 
     Raises ``DatasetError`` for an invalid dataset folder and an unknown config or split, and ``InputError`` for
     unknown views and invalid declarations.
@@ -155,18 +177,24 @@ class Evaluator:
         kind: str = "metric",
         inputs: str | None = None,
         uses_ground_truth: bool | None = None,
+        archive: str | os.PathLike[str] | None = None,
     ) -> None:
         if extended and kind != METRIC:
             raise InputError(f"extended is true and kind is {kind}, expected {METRIC} for measures in metres")
-        self._root, self._split, self._extended = root, split, extended
-        self._declared: dict[str, Any] = {
+        if not isinstance(config, str | None):
+            raise InputError(f"config is {escape_text(str(config))}, expected the name of one, or None for all")
+        self._metadata: dict[str, Any] = {
             "method": method,
             "prediction": kind,
             "inputs": inputs,
             "uses_ground_truth": uses_ground_truth,
         }
-        if not isinstance(config, str | None):
-            raise InputError(f"config is {escape_text(str(config))}, expected the name of one, or None for all")
+        self._root, self._split, self._kind = root, split, kind
+        self._archive = None if archive is None else Path(archive)
+        try:
+            SubmissionWriter(self._archive or "predictions", **self._metadata)
+        except InputError as error:  # Its message names an archive.
+            raise InputError.from_problems("declaration", error.problems) from None
         whole = open_folder(root)
         self._all = dataset_views(whole, None if config is None else [config], split)
         self._views = self._all if views is None else _selected(self._all, views)
@@ -175,6 +203,15 @@ class Evaluator:
         )
         self._grids = self._folder.expected_views()
         self._left_out = {view_id for one in self._all for view_id in one.view_ids} - self._grids.keys()
+        self._truths = {
+            one.source.name: ConfigTruth.of(self._folder, one.source, extended=extended) for one in self._views
+        }
+        self._positions = {
+            name: {view_id: position for position, view_id in enumerate(truth.scored.view_ids)}
+            for name, truth in self._truths.items()
+        }
+        self._lock = Lock()
+        self._writing: _WrittenArchive | None = None
         self.reset()
 
     @property
@@ -194,13 +231,13 @@ class Evaluator:
         return rows.select([positions[view_id] for view_id in views.view_ids])
 
     def reset(self) -> None:
-        """Drop all predictions."""
-        self._archive = _TemporaryArchive()
-        try:
-            self._writer = SubmissionWriter(self._archive.path, **self._declared)
-        except InputError as error:  # Its message names the temporary archive.
-            raise InputError.from_problems("declaration", error.problems) from None
-        self._added = set[str]()
+        """Drop all predictions, and an archive that is not complete."""
+        if self._writing is not None:
+            self._writing.discard()
+            self._writing = None
+        self._scored: dict[str, ViewResult | None] = {}
+        """Result of each view that was added; None for a view without scored pixels."""
+        self._kept = {one.source.name: KeptPredictions(one.source) for one in self._views}
 
     def update(self, view_ids: str | Sequence[str], depth: object) -> None:
         """Add the planar depth of left views in metres, or of another kind: of one view or of a batch.
@@ -240,58 +277,67 @@ class Evaluator:
             found = f"{escape_text(str(view_id))}: is not among the {len(self._grids)} views to predict"
             others = "config=, split= and views= select others"
             raise InputError(f"{found}, expected one as {next(iter(self._grids))}; {others}")
-        if view_id in self._added:
-            raise InputError(
-                f"{view_id}: was added before, expected each view once; a distributed sampler repeats views to "
-                "fill its last batch: gather all in one process and drop the repeated ones; reset() begins again"
-            )
-        one = depth_map(f"{view_id}: {what}", depth, self._grids[view_id])
-        if not self._added:
-            self._archive.writers.enter_context(self._writer)
-        self._added.add(view_id)
-        self._writer.write_map(view_id, one)
+        stored = stored_map(depth_map(f"{view_id}: {what}", depth, self._grids[view_id]))
+        name = config_of(view_id)
+        position = self._positions[name].get(view_id)
+        result = None
+        if position is not None and view_id not in self._scored:
+            result = score_view(stored, self._truths[name], position, self._kind, self._kind)
+        with self._lock:
+            if view_id in self._scored:
+                sampler = "a distributed sampler repeats views to fill its last batch: gather all in one process"
+                remedy = f"{sampler} and drop the repeated ones; reset() begins again"
+                raise InputError(f"{view_id}: was added before, expected each view once; {remedy}")
+            if self._archive is not None:
+                if self._writing is None:
+                    self._writing = _WrittenArchive(SubmissionWriter(self._archive, **self._metadata))
+                self._writing.add(view_id, stored)
+            self._kept[name].add(self._folder.config_by_name[name].view_ids.index(view_id), stored)
+            self._scored[view_id] = result
 
-    def compute(self) -> EvaluatedResult:
-        """Return the result of the predictions and begin again.
+    def compute(self) -> ScoredResult:
+        """Return the result of the predictions; it may be called again until ``reset``.
 
-        Raises ``InputError`` if a view is missing, and as ``score`` does, after which all are missing.
+        Raises ``InputError`` if a view is missing.
         """
-        if missing := [view_id for view_id in self._grids if view_id not in self._added]:
+        if missing := [view_id for view_id in self._grids if view_id not in self._scored]:
             found = f"{len(missing)} of {len(self._grids)} views are missing, such as {missing[0]}"
-            given = {config_of(view_id) for view_id in self._added}
+            given = {config_of(view_id) for view_id in self._scored}
             absent = [one.source.name for one in self._views if one.source.name not in given]
             if given and absent:
                 found += f"; none is of {', '.join(absent)}: config={min(given)!r} evaluates that config alone"
             remedy = "views=... selects some, and reset() begins again; Lightning: Trainer(num_sanity_val_steps=0)"
             raise InputError(f"{found}, expected all of them before compute(): {remedy}")
-        self._archive.writers.close()
-        return self._scored()
+        declared = Declaration(self._metadata["inputs"], self._metadata["uses_ground_truth"])
+        scored = {}
+        for name, truth in self._truths.items():
+            views = [view for view_id in truth.scored.view_ids if (view := self._scored[view_id]) is not None]
+            scored[name] = tabulate_config(views, truth, self._kind, declared)
+        sha256 = None
+        if self._archive is not None:
+            if self._writing is not None:
+                self._writing.close()
+                self._writing = None
+            sha256 = file_sha256(self._archive)
+        result = scored_result(
+            scored,
+            self._folder,
+            SubmissionIdentity(self._metadata["method"], sha256, declared.inputs, declared.uses_ground_truth),
+            self._kind,
+            self._kind,
+            archive=None if self._archive is None else self._archive.absolute(),
+            kept=self._kept,
+        )
+        return self._as_partial(result)
 
-    def _scored(self) -> EvaluatedResult:
-        partial = [one.source for one in self._views if one.source.whole is not one.source]
-        archive = self._archive
-        self.reset()
-        with open_evaluation(archive.path, self._folder) as evaluation:
-            if self._extended:
-                from rebar_depth_bench.extended.registry import score_extended  # Other evaluations do not need it.
-
-                result = score_extended(evaluation)
-            else:
-                result = score_evaluation(evaluation)
-            some = {
-                config.name: result.tables[config.name].of_some_views(len(scored_counts(config.whole)))
-                for config in partial
-            }
-            result = replace(result, tables={**result.tables, **some})
-            return EvaluatedResult(**vars(result), _archive=archive.path, _folder=self._folder, _owner=archive)
-
-    def _predicted_by(self, name: str) -> EvaluatedResult:
-        """Return the result of a method."""
-        found = find_method(name)
-        if self._extended and found.info.prediction != METRIC:
-            raise InputError(f"{name} predicts {found.info.prediction}, but extended measures need metric depth")
-        predict_views(found, self._views, self._archive.path)
-        return self._scored()
+    def _as_partial(self, result: ScoredResult) -> ScoredResult:
+        """Return a result whose tables state of how many views of a config those that were selected are."""
+        some = {
+            one.source.name: result.tables[one.source.name].of_some_views(len(scored_counts(one.source.whole)))
+            for one in self._views
+            if one.source.whole is not one.source
+        }
+        return replace(result, tables={**result.tables, **some})
 
     def _rows(self, *, with_poses: bool) -> Iterator[dict[str, Any]]:
         """Yield what a function may read of each view."""
@@ -300,73 +346,63 @@ class Evaluator:
                 row["right_from_left"] = None if row["right_cam_from_world"] is None else right_from_left(row)
                 yield {name: value for name, value in row.items() if with_poses or name not in POSE_COLUMNS}
 
+    def __deepcopy__(self, memo: dict[int, Any]) -> Self:
+        """Return an evaluator with the same predictions, which shares the ground truth with this one.
 
-@dataclass(frozen=True, repr=False, kw_only=True)
-class EvaluatedResult(Result):
-    """Result of ``score`` or ``evaluate``, whose archive is read again for the notes and the report.
-
-    The archive of ``evaluate`` is temporary and deleted with the result.
-    """
-
-    _archive: Path = field(compare=False)
-    _folder: DatasetFolder = field(compare=False)
-    _owner: _TemporaryArchive | None = field(default=None, compare=False)
-
-    @cached_property
-    def notes(self) -> tuple[str, ...]:
-        """Sentences on what limits the numbers, and on possible mistakes in the predictions.
-
-        Mistakes are looked for when this is read first; if the archive has gone or changed, a sentence says so.
+        Raises ``RebarDepthError`` while an archive is written.
         """
-        try:
-            with self._evaluation() as evaluation:
-                mistakes = [f"possible mistake: {mistake.text}" for mistake in diagnose(evaluation)]
-        except RebarDepthError as error:
-            mistakes = [f"possible mistakes were not looked for: {' '.join(str(error).split())}"]
-        return (*super().notes, *mistakes)
-
-    def to_html(self, path: str | Path) -> None:
-        """Write the self-contained report of ``rebar-bench score --html``.
-
-        Raises ``InputError`` if the archive has gone or changed.
-        """
-        with self._evaluation() as evaluation:
-            write_report(self, evaluation, Path(path))
-
-    def save_archive(self, path: str | Path) -> None:
-        """Copy the archive of the predictions.
-
-        Raises ``InputError`` if only some views were evaluated, and if the archive has gone or changed.
-        """
-        for name, table in self.tables.items():
-            if table.of_views is not None:
-                found = f"{name}: {table.views} of {table.of_views} views were evaluated"
-                raise InputError(f"{found}, expected all views of a config in an archive")
-        with self._evaluation() as evaluation, output_file(Path(path)) as target:
-            shutil.copyfile(evaluation.submission.path, target)
-
-    @contextmanager
-    def _evaluation(self) -> Iterator[Evaluation]:
-        with open_evaluation(self._archive, self._folder) as evaluation:
-            found, expected = evaluation.submission.sha256(), self.submission.sha256
-            if found != expected:
-                found = (
-                    f"has the SHA-256 {found[:12]}..., expected {expected[:12]}... of the archive that was scored"
-                )
-                raise InputError(f"{self._archive}: {found}; score it again")
-            yield evaluation
+        if self._writing is not None:
+            raise RebarDepthError(
+                f"{self._archive}: is being written, expected compute() or reset() before a copy"
+            )
+        with self._lock:
+            twin = copy.copy(self)
+            twin._scored = dict(self._scored)
+            twin._kept = {
+                name: replace(kept, images=dict(kept.images), by_order=dict(kept.by_order))
+                for name, kept in self._kept.items()
+            }
+        twin._lock = Lock()
+        return twin
 
 
-class _TemporaryArchive:
-    """Path of an archive in a temporary folder, deleted with this object after its ``writers`` are closed."""
+class _WrittenArchive:
+    """Archive that is being written; it is discarded with this object unless it was closed."""
 
-    def __init__(self) -> None:
-        folder = tempfile.mkdtemp(prefix="rebar-evaluate-")
-        self.path = Path(folder, "predictions.zip")
-        stack = ExitStack()
-        stack.callback(shutil.rmtree, folder, ignore_errors=True)
-        self.writers = stack.enter_context(ExitStack())
-        weakref.finalize(self, stack.close)
+    def __init__(self, writer: SubmissionWriter) -> None:
+        self._process = os.getpid()
+        self._writer = writer
+        self._open = ExitStack()
+        self._open.enter_context(writer)
+        weakref.finalize(self, _discard, self._open, self._process)
+
+    def add(self, view_id: str, depth: Depth) -> None:
+        """Write a prediction. Raises ``RebarDepthError`` in a process that was forked meanwhile."""
+        if os.getpid() != self._process:
+            found = f"{self._writer.path}: is written by the process {self._process}"
+            raise RebarDepthError(
+                f"{found}, expected all views there; a forked process may evaluate without archive="
+            )
+        self._writer.write_map(view_id, depth)
+
+    def close(self) -> None:
+        """Complete the archive."""
+        self._open.close()
+
+    def discard(self) -> None:
+        """Delete what was written."""
+        _discard(self._open, self._process)
+
+
+class _DiscardedError(Exception):
+    """Reason for which the writer of an archive deletes it."""
+
+
+def _discard(open_archive: ExitStack, process: int) -> None:
+    """End an archive that is not complete, unless another process writes it."""
+    if os.getpid() == process:
+        with suppress(_DiscardedError), open_archive.pop_all():
+            raise _DiscardedError
 
 
 def _selected(configs: Sequence[ConfigViews], views: int | Sequence[str]) -> list[ConfigViews]:

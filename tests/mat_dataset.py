@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from dataset_builder.pipeline.shards import View, encode_view
-from rebar_depth_bench.bar_crossings.table import CROSSINGS_FILE, crossings_entry, write_crossings
+from rebar_depth_bench.bar_crossings.crossings_file import CROSSINGS_FILE, crossings_entry, write_crossings
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, write_bars
 from rebar_depth_bench.data.files import MANIFEST_FILE, file_sha256, views_digest
 from rebar_depth_bench.data.manifest import MANIFEST_FORMAT

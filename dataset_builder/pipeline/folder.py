@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from dataset_builder.pipeline.plan import BUILD_FOLDER, STAGING_KEY, ConfigPlan
-from rebar_depth_bench.bar_crossings.table import CROSSINGS_FILE
+from rebar_depth_bench.bar_crossings.crossings_file import CROSSINGS_FILE
 from rebar_depth_bench.base.errors import InputError, OutputError
 from rebar_depth_bench.base.names import SPLITS, TEST_SPLIT
 from rebar_depth_bench.base.reading import check_no_links, remove_file, remove_folder

@@ -37,7 +37,7 @@ from dataset_builder.pipeline.shards import Staging, pack_shard, split_into_shar
 from dataset_builder.specs.config_specs import SceneConfigSpec
 from rebar_depth_bench import software_version
 from rebar_depth_bench.bar_crossings.definition import Crossings, crossing_parameters
-from rebar_depth_bench.bar_crossings.table import (
+from rebar_depth_bench.bar_crossings.crossings_file import (
     CROSSINGS_FILE,
     crossings_entry,
     read_crossings,
@@ -167,7 +167,7 @@ def _references(config: DatasetConfig, published: DatasetConfig | None) -> dict[
     return {
         split: published.references[split].model_dump()
         if published is not None and known.get(split) == config.of_split(split).views
-        else reference_errors(config.of_split(split)).to_dict()
+        else reference_errors(config.of_split(split))
         for split in config.splits
     }
 

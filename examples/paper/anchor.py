@@ -23,7 +23,7 @@ from numpy import ndarray
 
 from outputs import add_outputs, number, only_config, run_script, write_outputs
 from rebar_depth_bench.base.errors import InputError
-from rebar_depth_bench.base.parallel import map_with_progress
+from rebar_depth_bench.base.parallel import map_in_threads
 from rebar_depth_bench.base.terminal import ProgressBars
 from rebar_depth_bench.cli.console import add_archive, add_data
 from rebar_depth_bench.scoring.columns import coverage_percent
@@ -134,7 +134,7 @@ def anchored(evaluation: Evaluation, options: argparse.Namespace, bars: Progress
         with np.errstate(over="ignore", under="ignore"):
             return float(np.median(z_m / p_m)) if len(p_m) else None, len(p_m) / len(truth.index)
 
-    found = map_with_progress(ratio_and_coverage, truths, None, bars.update, "ratios", len(truths))
+    found = list(map_in_threads(ratio_and_coverage, truths, "ratios", workers=None, progress=bars.update))
     predicted = [position for position, (ratio, _) in enumerate(found) if ratio is not None]
     ratios = np.array([ratio for ratio, _ in found if ratio is not None])
     wanted = sorted(set(options.num_anchor_views))
@@ -148,7 +148,7 @@ def anchored(evaluation: Evaluation, options: argparse.Namespace, bars: Progress
     def errors_of_view(position: int) -> Float64[ndarray, "2 m"]:
         return errors_at_scales(*scored_pairs(evaluation.submission, truths.read(position)), scales)
 
-    errors = map_with_progress(errors_of_view, predicted, None, bars.update, "errors", len(predicted))
+    errors = list(map_in_threads(errors_of_view, predicted, "errors", workers=None, progress=bars.update))
     numbers = zip(scales.tolist(), *np.mean(errors, axis=0).tolist(), strict=True)
     given, all_views, *draws = [dict(zip(("scale", "abs_rel", "rmse_cm"), one, strict=True)) for one in numbers]
     markers = {scene.board.markers if scene.board else None for scene in config.scenes}

@@ -26,7 +26,7 @@ from rebar_depth_bench.base.terminal import ProgressBars
 from rebar_depth_bench.cli.console import add_archive, add_data
 from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.extended.ground_truth import has_bar_ids
-from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, score_extended
+from rebar_depth_bench.extended.families import MEASURE_FAMILIES, score_extended
 from rebar_depth_bench.reporting.extended_tables import reach_sentence
 from rebar_depth_bench.scoring import bootstrap
 from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation
@@ -77,8 +77,8 @@ def view_table(evaluation: Evaluation, config: DatasetConfig, result: Result) ->
         "view_id": truths.view_ids,
         "distance_m": [view.distance_m for view in truths.traits],
         "scale": np.array([score.scale for score in scores], np.float64),
-        "native_abs_rel": [score.native.abs_rel if score.native else math.nan for score in scores],
-        "scaled_abs_rel": [score.scaled.abs_rel if score.scaled else math.nan for score in scores],
+        "native_abs_rel": [score["native.abs_rel"] if score.native else math.nan for score in scores],
+        "scaled_abs_rel": [score["scaled.abs_rel"] if score.scaled else math.nan for score in scores],
         "single_bar": [result.extended.views.get(view_id, {}) for view_id in truths.view_ids],
     }
     return pd.DataFrame(columns)

@@ -26,7 +26,7 @@ from PIL import Image as Picture
 from depth_maps import DepthMaps, open_maps
 from outputs import add_outputs, number, run_script, write_outputs
 from rebar_depth_bench.base.errors import InputError
-from rebar_depth_bench.base.parallel import map_with_progress
+from rebar_depth_bench.base.parallel import map_in_threads
 from rebar_depth_bench.base.terminal import ProgressBars
 from rebar_depth_bench.captures.calibration import Calibration, Lens, MonoCalibration, StereoCalibration
 from rebar_depth_bench.captures.images import read_image_shape
@@ -226,7 +226,7 @@ def run(options: argparse.Namespace) -> None:
             predict_views(find_method(options.method), views, options.predictions, bars.update)
         with open_maps(options.predictions, shapes, 1 / 256, optional="kitti/" + missing) as source:
             work, each = partial(score_image, source=source, options=options), images.itertuples()
-            rows = map_with_progress(work, each, options.workers, bars.update, "scoring", len(images))
+            rows = list(map_in_threads(work, each, "scoring", workers=options.workers, progress=bars.update))
     scored = [row for row in rows if row["scored_px"]]
     if not scored:
         raise InputError(f"{options.kitti}: no image has ground truth inside the crop {options.crop}")

@@ -14,10 +14,10 @@ from rebar_depth_bench.base.errors import InputError, printable
 from rebar_depth_bench.base.writing import write_output
 from rebar_depth_bench.cli.console import add_output_file, prints_table, run_program
 from rebar_depth_bench.data.manifest import DatasetConfig
-from rebar_depth_bench.extended.result import ViewNumbers
+from rebar_depth_bench.extended.estimates import ViewNumbers
 from rebar_depth_bench.reporting.figure import check_figure, figure_bytes, figure_style
 from rebar_depth_bench.scoring.columns import METRICS, rounded
-from rebar_depth_bench.scoring.frames import frame_csv
+from rebar_depth_bench.scoring.spreadsheet import frame_csv
 from rebar_depth_bench.scoring.metrics import mean
 
 if TYPE_CHECKING:

@@ -26,7 +26,7 @@ from scipy.stats import kendalltau
 from depth_maps import DepthMaps, labelled, masked, open_data
 from outputs import add_outputs, flat_table, number, plain_name, run_script, write_outputs
 from rebar_depth_bench.base.errors import InputError
-from rebar_depth_bench.base.parallel import map_with_progress
+from rebar_depth_bench.base.parallel import map_in_threads
 from rebar_depth_bench.base.terminal import ProgressBars
 from rebar_depth_bench.cli.console import InputFolder, add_data, add_workers
 from rebar_depth_bench.scoring.bootstrap import INTERVALS
@@ -166,7 +166,7 @@ def run(options: argparse.Namespace) -> None:
         methods, references = dict([*sources.items()][:count]), dict([*sources.items()][count:])
         work = partial(score_frame, methods=methods, references=references, clip=clip, shape=data.shape)
         frames = data.frames(exact=not options.no_exact)
-        outcomes = map_with_progress(work, frames, options.workers, bars.update, "scoring", len(data.views))
+        outcomes = list(map_in_threads(work, frames, "scoring", workers=options.workers, progress=bars.update))
     shares = {name: [share[name] for share, *_ in outcomes] for name in outcomes[0][0]}
     if empty := [name for name, values in shares.items() if not any(values)]:
         raise InputError(f"{', '.join(empty)}: no depth from {options.near:g} to {options.far:g} m, expected some")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import islice
 from typing import TypeVar
@@ -21,32 +21,30 @@ def silent(task: str, done: int, total: int) -> None:
     """Ignore progress; the default callback."""
 
 
-def map_with_progress(
+def map_in_threads(
     work: Callable[[_Item], _Done],
-    items: Iterable[_Item],
-    workers: int | None,
-    progress: Progress,
+    items: Sequence[_Item],
     task: str,
-    total: int,
-) -> list[_Done]:
-    """Return ``work(item)`` of each of ``total`` items, in order, computed on ``workers`` threads.
+    *,
+    workers: int | None = None,
+    progress: Progress = silent,
+) -> Iterator[_Done]:
+    """Yield ``work(item)`` of each item, in order, computed on ``workers`` threads; None means one per core.
 
-    ``workers`` None means one per core. Each result is a step of ``task`` in ``progress``. At most two items per
-    thread are taken ahead of the next result, so that few items are in memory at a time. Exceptions of ``items``
-    and ``work`` propagate. Raises ``InputError`` if ``workers`` is less than 1.
+    Each result is a step of ``task`` in ``progress``. At most two items per thread are taken ahead of the next
+    result, so that few items are in memory at a time. Exceptions of ``work`` propagate. Raises ``InputError`` if
+    ``workers`` is less than 1.
     """
     if workers is not None and workers < 1:
         raise InputError(f"workers is {workers}, expected 1 or more")
     threads = workers or os.cpu_count() or 1
-    source, results = iter(items), list[_Done]()
+    source = iter(items)
     pending: deque[Future[_Done]] = deque()
     pool = ThreadPoolExecutor(threads)
     try:
-        while True:
+        for done in range(1, len(items) + 1):
             pending.extend(pool.submit(work, item) for item in islice(source, 2 * threads - len(pending)))
-            if not pending:
-                return results
-            results.append(pending.popleft().result())
-            progress(task, len(results), total)
+            yield pending.popleft().result()
+            progress(task, done, len(items))
     finally:
         pool.shutdown(cancel_futures=True)

@@ -10,6 +10,7 @@ from rebar_depth_bench.cli.console import add_archive, add_data, add_expect_dige
 from rebar_depth_bench.data.files import file_problems
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import truth_problems
+from rebar_depth_bench.diagnosis.corrections import KeptPredictions
 from rebar_depth_bench.diagnosis.diagnose import diagnose
 from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.submission import SubmissionReader
@@ -38,7 +39,8 @@ def run(options: argparse.Namespace) -> None:
         evaluation = Evaluation(folder, submission)
         if problems := evaluation.meta.kind_problems(RANKS_METRIC):
             print_notice(f"not ranked: {problems[0]}")
-        for mistake in diagnose(evaluation):
+        kept = [KeptPredictions.of_archive(config, submission) for config in evaluation.configs]
+        for mistake in diagnose(kept, evaluation.meta.prediction, evaluation.meta.depth_scale):
             print_notice(f"possible mistake: {mistake.text}")
 
 

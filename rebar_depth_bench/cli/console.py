@@ -214,21 +214,20 @@ def score_archives(
 ) -> list[Result]:
     """Score archives with a command's options; before any, call ``check_kinds`` with method and kind of each."""
     from rebar_depth_bench.data.manifest import open_folder  # Most commands do not score.
-    from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
+    from rebar_depth_bench.scorer import score
+    from rebar_depth_bench.scoring.evaluation import open_evaluation
 
     folder = open_folder(options.data, expect_digest=options.expect_digest)
     kinds = []
     for archive in archives:  # Opened twice: kinds that do not fit are refused before the first is scored.
         with open_evaluation(archive, folder) as evaluation:
-            kinds.append((evaluation.meta.method, evaluation.kind(options.align)))
+            kinds.append((evaluation.meta.method, evaluation.scored_kind(options.align)))
     check_kinds(kinds)
-    results = []
     with ProgressBars() as bars:
-        for archive in archives:
-            with open_evaluation(archive, folder) as one:
-                found = score_evaluation(one, workers=options.workers, align=options.align, progress=bars.update)
-            results.append(found)
-    return results
+        return [
+            score(archive, folder, workers=options.workers, align=options.align, progress=bars.update)
+            for archive in archives
+        ]
 
 
 def print_verified(

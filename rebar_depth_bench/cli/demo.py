@@ -23,8 +23,14 @@ from rebar_depth_bench.evaluator import evaluate
 from rebar_depth_bench.methods import METHODS
 from rebar_depth_bench.methods.controls import NOISY_TRUTH_FACTOR
 from rebar_depth_bench.reporting.tables import make_grid, plain_text, print_line, print_unwrapped
-from rebar_depth_bench.scoring.formatting import note_text, row_name, row_notes, summary
-from rebar_depth_bench.scoring.relative import LEAST_MARGIN, is_like_constant
+from rebar_depth_bench.scoring.formatting import (
+    LEAST_MARGIN,
+    is_like_constant,
+    note_text,
+    row_name,
+    row_notes,
+    summary,
+)
 from rebar_depth_bench.scoring.result import Result
 
 SAMPLE = Path(__file__).parents[1] / "sample"
@@ -63,8 +69,7 @@ def run(options: argparse.Namespace) -> None:
     results = []
     for name in DEMO_METHODS:
         print_notice(f"predicting with {name}: {METHODS[name].info.summary}")
-        result = evaluate(name, data, config=DEMO_CONFIG)
-        result.save_archive(out / f"{name}.zip")
+        result = evaluate(name, data, config=DEMO_CONFIG, archive=out / f"{name}.zip")
         result.to_html(out / f"{name}.html")
         write_bytes(out / f"{name}.json", result.to_json())
         results.append(result)

@@ -17,12 +17,9 @@ from rebar_depth_bench.cli.console import (
     print_verified,
     prints_table,
 )
-from rebar_depth_bench.diagnosis.diagnose import diagnose
-from rebar_depth_bench.reporting.html.page import write_report
-from rebar_depth_bench.reporting.html.views import VIEWS_SHOWN
 from rebar_depth_bench.reporting.tables import print_table
-from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
-from rebar_depth_bench.scoring.frames import frame_csv
+from rebar_depth_bench.scorer import VIEWS_SHOWN, score
+from rebar_depth_bench.scoring.spreadsheet import tables_sheet
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -62,36 +59,32 @@ def run(options: argparse.Namespace) -> None:
     if options.align and is_extended:
         raise InputError("--align and --extended are both given: extended measures need metric predictions")
     if options.family is not None:
-        from rebar_depth_bench.extended.registry import MEASURE_FAMILIES
+        from rebar_depth_bench.extended.families import MEASURE_FAMILIES
 
         if options.family not in MEASURE_FAMILIES:
             found = f"--family is {escape_text(options.family)}"
             raise InputError(f"{found}, expected one of {', '.join(MEASURE_FAMILIES)}")
-    with open_evaluation(options.archive, options.data, expect_digest=options.expect_digest) as evaluation:
-        with ProgressBars() as bars:
-            if is_extended:
-                # A third of the package, which other scores do not need.
-                from rebar_depth_bench.extended.registry import score_extended
-
-                result = score_extended(evaluation, workers=options.workers, progress=bars.update)
-            else:
-                result = score_evaluation(
-                    evaluation, workers=options.workers, align=options.align, progress=bars.update
-                )
-        names = ", ".join(config.name for config in evaluation.configs)
-        print_verified(
-            evaluation.folder, f"views of {names} verified when their ground truth was stored in the cache"
+    with ProgressBars() as bars:
+        result = score(
+            options.archive,
+            options.data,
+            expect_digest=options.expect_digest,
+            workers=options.workers,
+            align=options.align,
+            extended=bool(is_extended),
+            progress=bars.update,
         )
-        if options.html:
-            mistakes = write_report(result, evaluation, options.html, views_shown=options.html_views)
-        else:
-            mistakes = diagnose(evaluation)
+    names = ", ".join(result.tables)
+    print_verified(result.folder, f"views of {names} verified when their ground truth was stored in the cache")
+    if options.html:
+        result.to_html(options.html, views_shown=options.html_views)
+    mistakes = result.mistakes
     if options.json:
         write_output(options.json, result.to_json())
     if options.csv:
-        write_output(options.csv, frame_csv(result.to_pandas()))
+        write_output(options.csv, tables_sheet([result]).to_csv())
     if options.groups_csv:
-        write_output(options.groups_csv, frame_csv(result.to_pandas("groups")))
+        write_output(options.groups_csv, tables_sheet([result], groups=True).to_csv())
     if options.extended_csv:
         from rebar_depth_bench.reporting.extended_tables import extended_csv
 
@@ -102,7 +95,7 @@ def run(options: argparse.Namespace) -> None:
             from rebar_depth_bench.reporting.extended_tables import print_extended
 
             print_extended(result.extended, Console(), options.family or "")
-    for note in evaluation.submission.notes:
+    for note in result.archive_notes:
         print_notice(note)
     for mistake in mistakes:
         print_notice(f"possible mistake: {mistake.text}")

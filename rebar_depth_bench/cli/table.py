@@ -24,7 +24,7 @@ from rebar_depth_bench.reporting.figure import check_figure, write_figure
 from rebar_depth_bench.reporting.latex import latex_table
 from rebar_depth_bench.reporting.tables import disambiguate_method_names, print_comparison, print_paper_table
 from rebar_depth_bench.scoring.comparison import check_same_kinds, check_same_splits, compare
-from rebar_depth_bench.scoring.frames import differences_frame, frame_csv, tables_frame
+from rebar_depth_bench.scoring.spreadsheet import differences_sheet, tables_sheet
 from rebar_depth_bench.scoring.truth import paper_differences
 from rebar_depth_bench.submission.declaration import METRIC
 
@@ -59,7 +59,7 @@ def run(options: argparse.Namespace) -> None:
         latex = latex_table(results, published=published, intervals=options.intervals, absent=absent)
         write_output(options.latex, latex)
     if options.csv:
-        write_output(options.csv, frame_csv(tables_frame(results)))
+        write_output(options.csv, tables_sheet(results).to_csv())
     if options.figure:
         for note in write_figure(results, options.figure, published=published):
             print_notice(note)
@@ -95,6 +95,6 @@ def run_compare(options: argparse.Namespace) -> None:
     if options.json:
         write_output(options.json, json.dumps(content, indent=1, ensure_ascii=False, allow_nan=False) + "\n")
     if options.csv:
-        write_output(options.csv, frame_csv(differences_frame(content)))
+        write_output(options.csv, differences_sheet(content).to_csv())
     for comparison in comparisons if prints_table(options) else ():
         print_comparison(comparison, Console())

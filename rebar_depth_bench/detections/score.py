@@ -13,10 +13,10 @@ from numpy import ndarray
 
 from rebar_depth_bench.base.errors import InputError, escape_text
 from rebar_depth_bench.base.names import TEST_SPLIT, config_of, split_of
-from rebar_depth_bench.base.parallel import Progress, map_with_progress, silent
+from rebar_depth_bench.base.parallel import Progress, map_in_threads, silent
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_folder
 from rebar_depth_bench.detections.reading import DetectionFile, Detections, read_detections
-from rebar_depth_bench.detections.result import (
+from rebar_depth_bench.detections.tables import (
     AVERAGE_PRECISION_MM,
     DetectionResult,
     ViewDetections,
@@ -64,7 +64,7 @@ def score_crossings(
             return compare_view(seen, truth, confidence)
 
         task = f"crossings of {config.name}"
-        found = map_with_progress(compare, range(len(steel)), workers, progress, task, len(steel))
+        found = list(map_in_threads(compare, range(len(steel)), task, workers=workers, progress=progress))
         views[config.name] = found
         resampling = resample_views(
             steel.view_ids, by_scene=config.has_splits, views_per_distance=config.views_per_distance

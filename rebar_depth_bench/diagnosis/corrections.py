@@ -9,8 +9,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 from typing import Literal
 
 import numpy as np
@@ -18,11 +18,12 @@ from jaxtyping import Bool, Float, Float32, Float64, Int64
 from numpy import ndarray
 
 from rebar_depth_bench.data.manifest import DatasetConfig
+from rebar_depth_bench.data.rows import camera_from_row, iterate_rows
 from rebar_depth_bench.data.schema import CAMERA_SHAPES
 from rebar_depth_bench.geometry.cameras import Camera
-from rebar_depth_bench.scoring.evaluation import View
 from rebar_depth_bench.scoring.metrics import is_valid_prediction, median_scale
 from rebar_depth_bench.scoring.protocol import scored_pixels
+from rebar_depth_bench.submission import SubmissionReader
 
 Values = Float64[ndarray, " n"]
 Image = Float[ndarray, "h w"]
@@ -65,7 +66,9 @@ class Pixels:
 class DiagnosedView:
     """Ground truth and prediction of a view; ``position`` counts the views of its config.
 
-    ``prediction`` is the submitted image, H x W, meant to be planar depth in metres.
+    ``prediction`` is the submitted image, H x W, meant to be planar depth in metres. ``by_order`` has, for each of
+    the wrong orders of views, what was submitted for the view whose prediction it would be, at the pixels of the
+    left eye.
     """
 
     position: int
@@ -74,11 +77,78 @@ class DiagnosedView:
     left: Pixels
     right: Pixels
     prediction: Image
+    by_order: Mapping[str, Values]
 
     @property
     def p(self) -> Values:
         """Prediction at the pixels of the left eye."""
         return self.left.values(self.prediction)
+
+
+@dataclass(frozen=True, eq=False)
+class KeptPredictions:
+    """Predictions of a config that a diagnosis looks at: of a few views, and some pixels of others.
+
+    ``images`` has the predictions of the views that are looked at, by position in the config, and ``by_order`` the
+    values at the pixels of such a view that each wrong order would put there. Both are filled by ``add``.
+    """
+
+    config: DatasetConfig
+    images: dict[int, Image] = field(default_factory=dict)
+    by_order: dict[tuple[int, str], Values] = field(default_factory=dict)
+
+    @classmethod
+    def of_archive(cls, config: DatasetConfig, submission: SubmissionReader) -> KeptPredictions:
+        """Return the predictions of a config that a diagnosis looks at, read from an archive.
+
+        Raises ``EntryError`` and ``DatasetError`` for entries and shards that scoring refuses.
+        """
+        kept = cls(config)
+        for position in {*kept.truths, *kept.sources}:
+            kept.add(position, submission.read(config.view_ids[position]))
+        return kept
+
+    @cached_property
+    def truths(self) -> Mapping[int, tuple[Camera, float, Pixels, Pixels]]:
+        """Ground truth of the views that are looked at, by position: camera, baseline, pixels of both eyes.
+
+        It is read when it is first used. Raises ``DatasetError`` if a row is damaged.
+        """
+        config = self.config
+        position = {config.view_ids[one]: one for one in positions_to_read(config)}
+        truths = {}
+        for row in iterate_rows(config, ("view_id", *COLUMNS), position) if position else ():
+            left, right = (_pixels(row[f"{eye}_mask"], row[f"{eye}_depth"]) for eye in ("left", "right"))
+            camera = camera_from_row(row, "left", config.grid)
+            truths[position[row["view_id"]]] = camera, float(row["baseline_m"]), left, right
+        return dict(sorted(truths.items()))
+
+    @cached_property
+    def sources(self) -> Mapping[int, Sequence[tuple[int, str]]]:
+        """For the position of a prediction, the views that are looked at where wrong orders would put it."""
+        found: dict[int, list[tuple[int, str]]] = {}
+        for name, (_, source) in orders(len(self.config.views)).items():
+            for position in self.truths:
+                if 0 <= source(position) < len(self.config.views):
+                    found.setdefault(source(position), []).append((position, name))
+        return found
+
+    def add(self, position: int, prediction: Image) -> None:
+        """Keep what a diagnosis needs of the prediction for the view at a position of the config."""
+        if position in self.truths:
+            self.images[position] = prediction
+        for viewed, order in self.sources.get(position, ()):
+            self.by_order[viewed, order] = self.truths[viewed][2].values(prediction)
+
+    def views(self) -> list[DiagnosedView]:
+        """Return the views that are looked at, with their predictions."""
+        names = orders(len(self.config.views))
+        views = []
+        for position, (camera, baseline_m, left, right) in self.truths.items():
+            absent = np.full(len(left.v), np.nan)
+            by_order = {name: self.by_order.get((position, name), absent) for name in names}
+            views.append(DiagnosedView(position, camera, baseline_m, left, right, self.images[position], by_order))
+        return views
 
 
 def positions_to_read(config: DatasetConfig) -> list[int]:
@@ -91,13 +161,6 @@ def positions_to_read(config: DatasetConfig) -> list[int]:
     usable = [n for n, view in enumerate(config.views) if view.scored_px >= MIN_PIXELS]
     count = min(len(usable), MAX_VIEWS)
     return [usable[n * len(usable) // count] for n in range(count)]
-
-
-def diagnosed_view(view: View) -> DiagnosedView:
-    """Return what a diagnosis needs of a view. Raises ``EntryError`` for an invalid entry of the archive."""
-    left, right = (_pixels(view.cell(f"{eye}_mask"), view.cell(f"{eye}_depth")) for eye in ("left", "right"))
-    baseline_m = float(view.cell("baseline_m"))
-    return DiagnosedView(view.position, view.camera("left"), baseline_m, left, right, view.prediction_m)
 
 
 def _pixels(mask: Bool[ndarray, "h w"] | None, depth_m: Float32[ndarray, "h w"]) -> Pixels:
@@ -163,9 +226,6 @@ def valid_share(p: Values) -> float:
     """Return the share of valid predictions."""
     return float(is_valid_prediction(p).mean())
 
-
-ReadPrediction = Callable[[int], Image]
-"""Function that returns the prediction submitted for the view at a position of the config."""
 
 UNITS: Mapping[str, float] = {"millimetres": 1000.0, "centimetres": 100.0, "inches": 1 / 0.0254}
 """Units in a metre."""
@@ -264,7 +324,7 @@ def _without_logarithm(view: DiagnosedView, log_base: float) -> Values:
     return depth_m if is_logarithm else np.full_like(depth_m, np.nan)
 
 
-def shape_corrections(views: Sequence[DiagnosedView], read: ReadPrediction, count: int) -> list[Correction]:
+def shape_corrections(views: Sequence[DiagnosedView], count: int) -> list[Correction]:
     """Return the corrections of everything but units, for the ``views`` of a config that has ``count`` views."""
     height, width = views[0].prediction.shape
     turns = {**_TURNS, **(_QUARTER_TURNS if height == width else {})}
@@ -284,8 +344,8 @@ def shape_corrections(views: Sequence[DiagnosedView], read: ReadPrediction, coun
     ]
     for name, (seems, turn) in turns.items():
         corrections.append(Correction(name, seems, partial(_turned, turn=turn)))
-    for name, (order, source) in _orders(count).items():
-        corrected = partial(_of_other_view, source=source, read=read, count=count)
+    for name, (order, _) in orders(count).items():
+        corrected = partial(_of_other_view, order=name)
         corrections.append(Correction(name, f"those of other views: {order}", corrected, scale="all"))
     if (dv, du) != (0, 0):
         seems = f"shifted by {du:+d} columns and {dv:+d} rows"
@@ -307,7 +367,7 @@ _QUARTER_TURNS: Mapping[str, tuple[str, Callable[[Image], Image]]] = {
 """The same for square pictures."""
 
 
-def _orders(count: int) -> Mapping[str, tuple[str, Callable[[int], int]]]:
+def orders(count: int) -> Mapping[str, tuple[str, Callable[[int], int]]]:
     """Return the wrong orders of ``count`` views, each with the position at which a view's prediction stands.
 
     A position outside the config means that the prediction of the view is missing.
@@ -378,6 +438,5 @@ def _turned(view: DiagnosedView, turn: Callable[[Image], Image]) -> Values:
     return view.left.values(turn(view.prediction))
 
 
-def _of_other_view(view: DiagnosedView, source: Callable[[int], int], read: ReadPrediction, count: int) -> Values:
-    position = source(view.position)
-    return view.left.values(read(position)) if 0 <= position < count else np.full_like(view.p, np.nan)
+def _of_other_view(view: DiagnosedView, order: str) -> Values:
+    return view.by_order[order]

@@ -3,36 +3,29 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 
 import numpy as np
 
 from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.diagnosis.corrections import (
-    COLUMNS,
     Correction,
     DiagnosedView,
+    KeptPredictions,
     Values,
-    diagnosed_view,
     logarithm_corrections,
     mean_error,
     median_ratio,
-    positions_to_read,
     rank_correlation,
     relative_spread,
     shape_corrections,
     unit_corrections,
     valid_share,
 )
-from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.scoring.relative import has_value
-from rebar_depth_bench.submission import SubmissionReader
 from rebar_depth_bench.submission.declaration import METRIC
 
-MAX_KEPT = 16
-"""Number of predictions of other views that are kept decoded."""
 MIN_VIEWS = 3
 """Number of views below which nothing is said."""
 LEAST_COVERAGE = 0.05
@@ -64,34 +57,25 @@ class PossibleMistake:
     text: str
 
 
-def diagnose(evaluation: Evaluation) -> list[PossibleMistake]:
-    """Return the possible mistakes in a submission, those of ``diagnose_config`` for each config.
+def diagnose(
+    configs: Iterable[KeptPredictions], kind: str = METRIC, depth_scale: float | None = None
+) -> list[PossibleMistake]:
+    """Return the possible mistakes in the predictions of configs, those of ``diagnose_config`` for each.
 
-    Up to ``corrections.MAX_VIEWS`` views of each config in a local folder are read. Raises ``EntryError`` and
-    ``DatasetError`` for entries and shards that scoring refuses.
+    ``kind`` is that of the predictions, and ``depth_scale`` that of an archive of PNG images.
     """
-    mistakes = []
-    for config in evaluation.configs:
-        views = map(diagnosed_view, evaluation.views(config, COLUMNS, positions_to_read(config)))
-        mistakes += diagnose_config(config, list(views), evaluation.submission)
-    return mistakes
+    return [mistake for config in configs for mistake in diagnose_config(config, kind, depth_scale)]
 
 
 def diagnose_config(
-    config: DatasetConfig, views: Sequence[DiagnosedView], submission: SubmissionReader
+    kept: KeptPredictions, kind: str = METRIC, depth_scale: float | None = None
 ) -> list[PossibleMistake]:
-    """Return at most two possible mistakes in the ``views`` of a config, those at ``positions_to_read``.
+    """Return at most two possible mistakes in the predictions of a config.
 
     They are one of units and one other, or with few valid values what the others are, and a logarithm. Of
     predictions that are not metric only the values are looked at: they have no unit, and disparity is no mistake.
     """
-    kind = METRIC if submission.meta is None else submission.meta.prediction
-    known = {view.position: view.prediction for view in views}
-
-    @lru_cache(MAX_KEPT)
-    def read(position: int) -> np.ndarray:
-        return known[position] if position in known else submission.read(config.view_ids[position])
-
+    config, views = kept.config, kept.views()
     if len(views) < MIN_VIEWS:
         return []
     invalid = invalid_values(config, views, kind)
@@ -104,8 +88,8 @@ def diagnose_config(
     elif invalid is not None:
         found = [invalid, best_mistake(config, views, logarithm_corrections())]
     else:
-        units = unit_corrections(views, submission.meta.depth_scale if submission.meta else None)
-        others = [*shape_corrections(views, read, len(config.views)), *logarithm_corrections()]
+        units = unit_corrections(views, depth_scale)
+        others = [*shape_corrections(views, len(config.views)), *logarithm_corrections()]
         of_units, other = (best_mistake(config, views, corrections) for corrections in (units, others))
         found = [other] if other and other.name == "inverse" else [of_units, other]  # It has no unit of depth.
     return [mistake for mistake in found if mistake]

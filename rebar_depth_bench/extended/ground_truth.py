@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
+from rebar_depth_bench.bar_crossings.crossings_file import CrossingsSource, folder_crossings
 from rebar_depth_bench.bar_crossings.definition import CROSSINGS_PROTOCOL
-from rebar_depth_bench.bar_crossings.table import CrossingsSource, folder_crossings
 from rebar_depth_bench.base.errors import DatasetError
 from rebar_depth_bench.base.parallel import Progress, silent
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars
@@ -26,7 +26,6 @@ from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL
 from rebar_depth_bench.extended.published import depth_steps
 from rebar_depth_bench.extended.steel import JudgedCrossings, SceneBars, SteelTruth
 from rebar_depth_bench.geometry.cameras import pixel_rays
-from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.scoring.protocol import interior, single_bar_pixels
 from rebar_depth_bench.scoring.truth import are_pixels_inside, cache_inputs, scored_counts, verified_views
 
@@ -96,11 +95,6 @@ class ConfigSteelTruth:
     def judged_counts(self) -> tuple[int, ...]:
         """Number of judged crossings of each view."""
         return tuple(int(numbers[-1]) for numbers in self.cache.numbers)
-
-
-def steel_truth(evaluation: Evaluation, config: DatasetConfig, progress: Progress = silent) -> ConfigSteelTruth:
-    """Return ``load_steel_truth`` of a config of an evaluation, which is loaded once."""
-    return evaluation.once(("steel", config.name), lambda: load_steel_truth(evaluation.folder, config, progress))
 
 
 def load_steel_truth(

@@ -97,7 +97,7 @@ class Measure:
         """Column of the measure in tables and pages."""
         is_ratio = self.convert is not None or self.name.endswith("_deg")
         return Column(
-            path=self.name,
+            place=self.name,
             title=self.title,
             unit=self.unit,
             better=self.better,

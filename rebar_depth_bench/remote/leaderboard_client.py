@@ -13,7 +13,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 from urllib.request import proxy_bypass
 
 from rebar_depth_bench.base.errors import (
@@ -30,9 +30,10 @@ from rebar_depth_bench.base.errors import (
 from rebar_depth_bench.base.limits import JSON_BYTES, DeadlineError, call_within
 from rebar_depth_bench.base.parallel import Progress, silent
 from rebar_depth_bench.base.reading import open_regular, parse_json
-from rebar_depth_bench.base.validation import validate_table
-from rebar_depth_bench.remote.models import Answer, ErrorResponse, RejectedResponse, Submission, Token
-from rebar_depth_bench.scoring.result import Result, read_result
+from rebar_depth_bench.base.validation import Model, validate_table
+from rebar_depth_bench.remote.models import ErrorResponse, RejectedResponse, Submission, Token
+from rebar_depth_bench.scoring.reading import read_result
+from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.submission.declaration import RANKS_METRIC
 from rebar_depth_bench.submission.reader import read_metadata
 
@@ -46,7 +47,6 @@ REQUEST_TIMEOUT_S, RESULT_TIMEOUT_S, UPLOAD_TIMEOUT_S = 60.0, 600.0, 3600.0
 """Time limits of a request, of the download of a result, and of an upload, seconds."""
 MIN_UPLOAD_RATE = 10_000
 """Rate by which the size of an archive extends the time limit of its upload, bytes per second."""
-_Model = TypeVar("_Model", bound=Answer)
 
 
 class ServiceError(RebarDepthError):
@@ -61,13 +61,13 @@ class _Response:
     status: int
     body: bytes
 
-    def read(self, model: type[_Model], problems: list[Problem]) -> _Model | None:
+    def read(self, model: type[Model], problems: list[Problem]) -> Model | None:
         """Return the body as an answer of the API, or None after adding its problems to ``problems``."""
         value, found = parse_json(self.body)
         problems += found
         return None if found else validate_table(model, value, problems, from_json=True)
 
-    def answer(self, model: type[_Model], *statuses: int) -> _Model:
+    def answer(self, model: type[Model], *statuses: int) -> Model:
         """Return the answer of a response with one of ``statuses``.
 
         Raises ``InputError`` for other statuses from 400 to 499, and ``ServiceError`` for any other and for a body

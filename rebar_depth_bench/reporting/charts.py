@@ -21,7 +21,7 @@ from rebar_depth_bench.scoring.columns import NATIVE, SCALE, SCALED, number
 from rebar_depth_bench.scoring.table import Table, ViewScore
 
 if TYPE_CHECKING:
-    from rebar_depth_bench.extended.result import MeasureEstimate
+    from rebar_depth_bench.extended.estimates import MeasureEstimate
 
 Point = tuple[float, float]
 
@@ -114,21 +114,21 @@ _ABS_REL = {"native": NATIVE[0], "scaled": SCALED[0]}
 def alignment_chart(tables: Mapping[str, Table]) -> Markup:
     """Return the chart of AbsRel by config on a logarithmic axis, native (disc) connected to scaled (ring)."""
     columns = _ABS_REL.values()
-    errors = [(column.value(table), column.interval(table)) for table in tables.values() for column in columns]
+    errors = [(table[column.place], table.interval(column)) for table in tables.values() for column in columns]
     axis = decade_axis(_with_margin(errors, 0.0), _ROW_LEFT, RIGHT)
     numbers, described, marks = {}, [], ""
     for index, (name, table) in enumerate(tables.items()):
         y = _row_y(index)
-        native, scaled = (column.value(table) for column in columns)
+        native, scaled = (table[column.place] for column in columns)
         native_text, scaled_text = NATIVE[0].text(native), SCALED[0].text(scaled)
         described.append(f"{printable(name)}: native {native_text}, scaled {scaled_text}")
-        if native is None or scaled is None:
+        if math.isnan(native):
             numbers[name] = "no prediction"
             continue
         numbers[name] = f"{native_text} → {scaled_text} scaled"
         marks += _path("link", _across(axis.at(native), axis.at(scaled), y))
         for kind, column in _ABS_REL.items():
-            if ends := column.interval(table):
+            if ends := table.interval(column):
                 marks += _path(f"{kind} interval", _across(axis.at(ends[0]), axis.at(ends[1]), y))
         marks += _circle("native fill", axis.at(native), y, 6) + _circle("scaled ring", axis.at(scaled), y, 5)
     return _row_figure(
@@ -142,16 +142,18 @@ def alignment_chart(tables: Mapping[str, Table]) -> Markup:
 
 def scale_chart(tables: Mapping[str, Table], views: Mapping[str, Sequence[ViewScore]]) -> Markup:
     """Return the chart of every view's scale factor, one strip per config, with its median and the line s = 1."""
-    scales = {name: [view.scale for view in views.get(name, ()) if view.scale is not None] for name in tables}
+    scales = {
+        name: [view["scale"] for view in views.get(name, ()) if not math.isnan(view["scale"])] for name in tables
+    }
     axis = log_axis_with_one([scale for strip in scales.values() for scale in strip], _ROW_LEFT, RIGHT)
     rows = [_row_y(index) for index in range(len(tables))]
     marks = _path("one", "".join(_down(axis.at(1.0), y - 13, y + 13) for y in rows))  # Not through their texts.
-    medians = {name: SCALE.text(table.scale_median) for name, table in tables.items()}
+    medians = {name: SCALE.text(table[SCALE.place]) for name, table in tables.items()}
     for index, (name, strip) in enumerate(scales.items()):
         y = _row_y(index)
         marks += _dots("points", ((axis.at(s), y - 9 + 18 * (i * _GOLDEN_RATIO % 1)) for i, s in enumerate(strip)))
-        median = tables[name].scale_median
-        if median is not None and math.isfinite(median):
+        median = tables[name][SCALE.place]
+        if math.isfinite(median):
             marks += _path("median", _down(axis.at(median), y - 12, y + 12))
     description = "; ".join(f"{printable(name)}: median {median}" for name, median in medians.items())
     return _row_figure(
@@ -185,17 +187,24 @@ def views_chart(config: str, views: Sequence[ViewScore]) -> Markup:
     Views without any prediction are marked along the top.
     """
     top, bottom, left = 26.0, 170.0, 52.0
-    axis = decade_axis([m.abs_rel for view in views for m in (view.native, view.scaled) if m], bottom, top)
+    native, scaled = (column.place for column in _ABS_REL.values())
+    predicted = [view for view in views if not math.isnan(view[native])]
+    axis = decade_axis([view[place] for view in predicted for place in (native, scaled)], bottom, top)
     placed = [(left + 6 + (RIGHT - left - 12) * (i + 0.5) / len(views), view) for i, view in enumerate(views)]
     dots = "large points" if len(views) <= 60 else "points"
-    without = [at for at, view in placed if view.native is None]
+    without = [at for at, view in placed if math.isnan(view[native])]
     return _figure(
         f"AbsRel by view, {printable(config)}",
         f"AbsRel of the {len(views)} views of {printable(config)}, {len(without)} without any prediction.",
         bottom + 26,
         _y_grid(axis, axis.ticks(), left),
-        _dots(f"scaled {dots}", ((at, axis.at(view.scaled.abs_rel)) for at, view in placed if view.scaled)),
-        _dots(f"native {dots}", ((at, axis.at(view.native.abs_rel)) for at, view in placed if view.native)),
+        *(
+            _dots(
+                f"{kind} {dots}",
+                ((at, axis.at(view[place])) for at, view in placed if not math.isnan(view[place])),
+            )
+            for kind, place in (("scaled", scaled), ("native", native))
+        ),
         _path("missing", "".join(_down(at, 8, 18) for at in without)),
         _text(left + 6, bottom + 18, "first view"),
         _text(RIGHT, bottom + 18, "last view", "end"),
@@ -297,7 +306,12 @@ def _cells(x: float, y: float, radius_px: float) -> list[tuple[int, int]]:
 
 def _with_margin(numbers: Iterable[tuple[float | None, Interval | None]], margin: float = 0.05) -> list[float]:
     """Return values and ends of intervals, each smaller and larger by the share ``margin``."""
-    values = [value for number, ends in numbers for value in (number, *(ends or ())) if value is not None]
+    values = [
+        value
+        for one, ends in numbers
+        for value in (one, *(ends or ()))
+        if value is not None and not math.isnan(value)
+    ]
     return [value * factor for value in values for factor in (1 - margin, 1 + margin)]
 
 

@@ -15,8 +15,8 @@ from rich.console import Console
 from rebar_depth_bench import software_version
 from rebar_depth_bench.bar_crossings.definition import CROSSINGS_PROTOCOL
 from rebar_depth_bench.base.errors import printable
-from rebar_depth_bench.detections.result import AVERAGE_PRECISION_MM, DetectionResult, DetectionTable
 from rebar_depth_bench.detections.score import MATCH_M
+from rebar_depth_bench.detections.tables import AVERAGE_PRECISION_MM, DetectionResult, DetectionTable
 from rebar_depth_bench.reporting.charts import precision_chart
 from rebar_depth_bench.reporting.html.assets import environment
 from rebar_depth_bench.reporting.tables import make_grid, plain_text, print_line, print_unwrapped
@@ -158,8 +158,8 @@ def _number_table(caption: str, columns: Sequence[Column], rows: list[Row]) -> P
 
 def _texts(column: Column, table: DetectionTable) -> tuple[str, str]:
     """Return the number of a table and its interval as text."""
-    ends = column.interval_text(table.intervals[column.path], " to ")
-    return column.text(table.numbers[column.path]), ends or DASH
+    ends = column.interval_text(table.intervals[column.place], " to ")
+    return column.text(table.numbers[column.place]), ends or DASH
 
 
 def _count_table(rows: list[Row]) -> PageTable:

@@ -10,15 +10,15 @@ from rich.padding import Padding
 
 from rebar_depth_bench.base.errors import printable
 from rebar_depth_bench.extended.crossings import MISS_DEG
+from rebar_depth_bench.extended.estimates import ExtendedResult, ExtendedTable, MeasureEstimate
+from rebar_depth_bench.extended.families import MEASURE_FAMILIES
 from rebar_depth_bench.extended.fits import MISS_MM
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, NATIVE, SCALED, Measure, MeasureFamily
 from rebar_depth_bench.extended.reach import MIN_CROSSINGS, MIN_REACH_VIEWS, SHARE, Reach
-from rebar_depth_bench.extended.registry import MEASURE_FAMILIES
-from rebar_depth_bench.extended.result import ExtendedResult, ExtendedTable, MeasureEstimate
 from rebar_depth_bench.reporting.tables import make_grid, plain_text, print_line
 from rebar_depth_bench.scoring.columns import DASH, number, range_text
-from rebar_depth_bench.scoring.frames import frame_csv
 from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.scoring.spreadsheet import Sheet
 
 FITS_NOTE = (
     "The fits take from the ground truth which pixels show which bar, the radius of each bar, and each pixel's "
@@ -170,10 +170,12 @@ def extended_csv(result: Result) -> str:
     r"""Return the extended tables as tidy CSV: one row per config, alignment and measure, ``\n`` line ends."""
     if result.extended is None:
         raise ValueError("the result has no extended measures")
-    frame = result.extended.to_pandas()
-    frame.insert(0, "method", result.method)
-    frame["protocol"] = EXTENDED_PROTOCOL
-    frame["dataset_digest"] = result.dataset.digest
-    frame["submission_sha256"] = result.submission.sha256
-    frame["software_version"] = result.software.version
-    return frame_csv(frame)
+    sheet = result.extended.to_sheet()
+    provenance = {
+        "protocol": EXTENDED_PROTOCOL,
+        "dataset_digest": result.dataset.digest,
+        "submission_sha256": result.submission.sha256,
+        "software_version": result.software.version,
+    }
+    rows = [[result.method, *row, *provenance.values()] for row in sheet.rows]
+    return Sheet(["method", *sheet.heads, *provenance], rows).to_csv()

@@ -25,7 +25,7 @@ from rebar_depth_bench.reporting.published import (
     load_published,
     published_rows,
 )
-from rebar_depth_bench.scoring.columns import NATIVE, SCALED
+from rebar_depth_bench.scoring.columns import NATIVE, ONE_PIXEL, SCALED
 from rebar_depth_bench.scoring.formatting import (
     CONSTANT_TITLE,
     ONE_PIXEL_TITLE,
@@ -173,12 +173,12 @@ def _panel(config: str, results: Sequence[Result], *, published: bool) -> Panel:
         if errors := _errors(table):
             points.append(FigurePoint(name, *errors, hollow=not table.is_comparable))
     optics = f", paper {OTHER_OPTICS_MARK}" if match and not match.same_optics else ""
-    one_pixel = first.reference.one_pixel.abs_rel
+    one_pixel = first[ONE_PIXEL[0].place]
     return Panel(
         f"{config_title(printable(config, 40), first.split)}, {counted(first.views, 'view')}{optics}",
         tuple(points),
         tuple(abs_rel for abs_rel, _ in scaled_constants(rows).values()),
-        () if one_pixel is None else (one_pixel,),
+        () if math.isnan(one_pixel) else (one_pixel,),
     )
 
 

@@ -18,23 +18,21 @@ from rebar_depth_bench.scoring import formatting
 from rebar_depth_bench.scoring.columns import (
     ALIGNED_CONSTANT,
     DASH,
-    OTHERS,
     PAPER_COLUMNS,
     RANK_ERROR,
     Better,
     Column,
     columns_at,
-    rounded,
 )
 from rebar_depth_bench.scoring.comparison import config_differences
-from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND, kind_blocks
+from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.table import PublishedMatch, Table
 
 CONFIGS_PER_BLOCK = 2
 """Number of configs side by side that fit into a page width of 17 cm; further configs follow in blocks below."""
 
-_COLUMNS = (RANK_ERROR, *PAPER_COLUMNS, *OTHERS)
+_COLUMNS = (RANK_ERROR, *PAPER_COLUMNS)
 _HEADS: Mapping[str, str] = {
     "rank_error": "$E$",
     "native.rmse_cm": "RMSE",
@@ -52,7 +50,6 @@ _ALIGNED_HEADS: Mapping[str, str] = {
 """Headings of the columns of predictions that are not metric."""
 _ARROWS: Mapping[Better, str] = {"lower": r" $\downarrow$", "higher": r" $\uparrow$", "": ""}
 _MISSING = "--"
-_NO_OTHERS = [""] * len(OTHERS)
 _MARKS: Mapping[str, str] = {"‡": r"$^{\ddagger}$", "?": "$^{?}$", "*": "$^{*}$", "": ""}
 _INCOMPARABLE = "$^{*}$Not comparable with other rows: predictions are missing, or a number overflowed."
 """Note of the caption; the methods and reasons are in a comment."""
@@ -98,7 +95,7 @@ def latex_table(
     if len(digests) != 1:
         digest_list = ", ".join(sorted(map(formatting.short_digest, digests))) or "no result"
         raise InputError(f"LaTeX table: results of {len(digests)} datasets ({digest_list}), expected one dataset")
-    blocks = kind_blocks(results)
+    blocks = formatting.kind_blocks(results)
     return "\n\n".join(_table_of_kind(block, absent, published=published, intervals=intervals) for block in blocks)
 
 
@@ -117,10 +114,10 @@ def _table_of_kind(results: Sequence[Result], absent: Sequence[str], *, publishe
     notes, captioned = (formatting.row_notes(results, one) for one in (absent if kind is None else (), ()))
     flat = [
         f"{result.method}, {formatting.config_title(config, table.split)} "
-        f"({table.flat_views} of {formatting.counted(table.views, 'view')})"
+        f"({table['flat_views']:.0f} of {formatting.counted(table.views, 'view')})"
         for result in results
         for config, table in result.tables.items()
-        if table.flat_views
+        if table["flat_views"] > 0
     ]
     if flat:
         captioned.append(("", "Fits without a positive slope, which are constants: ", flat))
@@ -216,18 +213,18 @@ def _head(column: Column) -> str:
     unit = f", {column.unit}" if column.unit else ""
     heads = {**_HEADS, **_ALIGNED_HEADS}
     arrow = "" if column in ALIGNED_CONSTANT else _ARROWS[column.better]
-    return heads.get(column.path, escape_latex(f"{column.title}{unit}")) + arrow
+    return heads.get(column.place, escape_latex(f"{column.title}{unit}")) + arrow
 
 
 def _sort_key(table: Table | None) -> tuple[bool, bool, float]:
     """Return the sort key of a row by the block's first config: ranked rows by rank error, the others last."""
     if table is None:
         return True, True, 0.0
-    return False, not table.ranked, rounded(table.error) or 0.0
+    return False, not table.ranked, formatting.sort_error(table)
 
 
-def _bold_paths(result: Result, results: Sequence[Result], config: str) -> set[str]:
-    """Return the paths of the numbers of a config in which a result is decided to be better than all others.
+def _bold_places(result: Result, results: Sequence[Result], config: str) -> set[str]:
+    """Return the places of the numbers of a config in which a result is decided to be better than all others.
 
     Only ranked rows are compared; without another one there are no such numbers.
     """
@@ -238,11 +235,11 @@ def _bold_paths(result: Result, results: Sequence[Result], config: str) -> set[s
     ]
     # The best first: most results are better than it in no number, and need no other comparison.
     others.sort(key=lambda other: _sort_key(other.tables[config]))
-    better = {column.path for column in _COLUMNS} if others else set()
+    better = {column.place for column in _COLUMNS} if others else set()
     for other in others:
         if better:
             rows = config_differences(other, result, config)
-            better &= {row.column.path for row in rows if row.verdict == "better"}
+            better &= {row.column.place for row in rows if row.verdict == "better"}
     return better
 
 
@@ -253,14 +250,14 @@ def _cells(
     table = result.tables.get(config)
     if table is None:
         return [_MISSING] * len(columns)
-    bold = _bold_paths(result, results, config) if table.ranked else set()
+    bold = _bold_places(result, results, config) if table.ranked else set()
     unranked = _MARKS["‡"] if formatting.rank_mark(result.declared) == "‡" else ""
     incomparable = _MARKS["*"] if formatting.incomparable_reasons(table) else ""
     cells = []
     for column in columns:
-        number = column.text(column.value(table)).replace(DASH, _MISSING)
-        interval = column.interval_text(column.interval(table), ", ") if intervals else ""
-        shown = rf"\textbf{{{number}}}" if column.path in bold else number
+        number = column.text(table[column.place]).replace(DASH, _MISSING)
+        interval = column.interval_text(table.interval(column), ", ") if intervals else ""
+        shown = rf"\textbf{{{number}}}" if column.place in bold else number
         mark = unranked if column is columns[0] else "" if column.of_all_views else incomparable
         cells.append(shown + mark + (rf" {{\tiny[{interval}]}}" if interval else ""))
     return cells
@@ -270,7 +267,7 @@ def _reference_rows(results: Sequence[Result], config: str) -> dict[str, list[st
     """Return the cells of each reference of a config of metric results."""
     metric = [result for result in results if result.prediction is None]
     shown = [(result.method, result.tables[config]) for result in metric if config in result.tables]
-    return {name: ["", *cells, *_NO_OTHERS] for name, cells in formatting.paper_reference_rows(shown)}
+    return {name: ["", *cells] for name, cells in formatting.paper_reference_rows(shown)}
 
 
 def _published_rows(match: PublishedMatch | None) -> dict[str, list[str]]:
@@ -282,7 +279,6 @@ def _published_rows(match: PublishedMatch | None) -> dict[str, list[str]]:
         row.method: [
             "",
             *(cell + (_ANCHORED_MARK if row.median_anchored else "") + optics for cell in row.cells),
-            *_NO_OTHERS,
         ]
         for row in published_rows(match.scene)
     }

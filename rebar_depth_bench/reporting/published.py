@@ -138,7 +138,7 @@ def paper_scenes(result: Result) -> list[PaperScene]:
                     published=False,
                     dagger=False,
                     cells=[column.cell(table) for column in PAPER_COLUMNS],
-                    intervals=(NATIVE[0].interval(table), SCALED[0].interval(table)),
+                    intervals=(table.interval(NATIVE[0]), table.interval(SCALED[0])),
                 )
                 for number, (config, table, match) in enumerate(own, 1)
             ]

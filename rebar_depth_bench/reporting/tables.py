@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -28,33 +29,26 @@ from rebar_depth_bench.scoring.bootstrap import BLOCK_VIEWS, MIN_BLOCKS
 from rebar_depth_bench.scoring.columns import (
     ALIGNED_METRICS,
     COVERAGE,
+    DISTRIBUTION,
+    METRIC_COLUMNS,
     NATIVE,
     ONE_PIXEL,
-    OTHERS,
     PAPER_COLUMNS,
     RANK_ERROR,
+    RELATIVE_ALIGNMENTS,
     SCALE,
     SCALED,
     SCALED_CONSTANT,
-    VIEW_COLUMNS,
-    VIEWS_SCORED,
     WITHIN,
     Column,
-    has_dash,
     range_text,
-    rounded,
     texts,
     with_reference,
 )
-from rebar_depth_bench.scoring.relative import (
-    ALIGNMENT_BY_KIND,
-    LEAST_MARGIN,
-    constant_findings,
-    is_like_constant,
-    kind_blocks,
-)
+from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.table import PublishedMatch, Table
+from rebar_depth_bench.submission.declaration import METRIC
 
 if TYPE_CHECKING:
     from rebar_depth_bench.scoring.comparison import Comparison, Difference
@@ -97,15 +91,16 @@ def _width(table: RichTable, console: Console) -> int:
 
 Columns = Sequence[Column]
 Row = tuple[str, Mapping[str, str], str]
-"""Row of a table: name, texts by path of the column that they are shown in, and style. A heading has no texts."""
+"""Row of a table: name, texts by place of the column that they are shown in, and style. A heading has no texts."""
 
-_BASE = (VIEWS_SCORED, COVERAGE, RANK_ERROR)
+_VIEWS_SCORED = Column("scored_of_views", "views", head="views\nscored\n/all")
+"""Column of the numbers of scored and of all views."""
+_BASE = (_VIEWS_SCORED, COVERAGE, RANK_ERROR)
 _ALL_SCALED = (*SCALED, SCALE)
-_WITHIN = (*WITHIN, *OTHERS)
 _LAYOUTS: Sequence[Sequence[Columns]] = (
-    [[*_BASE, *NATIVE, *_ALL_SCALED, *_WITHIN]],
-    [[*NATIVE, *_ALL_SCALED], [*_BASE, *_WITHIN]],
-    [[*_BASE, *NATIVE], _ALL_SCALED, _WITHIN],
+    [[*_BASE, *NATIVE, *_ALL_SCALED, *DISTRIBUTION]],
+    [[*NATIVE, *_ALL_SCALED], [*_BASE, *DISTRIBUTION]],
+    [[*_BASE, *NATIVE], _ALL_SCALED, DISTRIBUTION],
 )
 """Columns of each table to print, from the widest to the narrowest layout."""
 _TITLES = (
@@ -120,7 +115,7 @@ _GROUP_SCALED = (*with_reference(SCALED), *SCALED_CONSTANT, SCALE)
 _GROUP_LAYOUTS: Sequence[Sequence[Columns]] = ([[*_GROUP_NATIVE, *_GROUP_SCALED]], [_GROUP_NATIVE, _GROUP_SCALED])
 """Columns of the tables of groups of views."""
 
-_ALIGNED_BASE = (VIEWS_SCORED, COVERAGE, *ALIGNED_METRICS[:5])
+_ALIGNED_BASE = (_VIEWS_SCORED, COVERAGE, *ALIGNED_METRICS[:5])
 _ALIGNED_LAYOUTS: Sequence[Sequence[Columns]] = (
     [[*_ALIGNED_BASE, *ALIGNED_METRICS[5:]]],
     [_ALIGNED_BASE, ALIGNED_METRICS[5:]],
@@ -147,7 +142,8 @@ def print_table(result: Result, console: Console) -> None:
             console.print()
             print_line(console, f"{formatting.config_title(config, table.split)}: groups of views", style="bold")
             _print_rows(_group_rows(table), console, group_layouts, "group")
-    _print_notes(result, shown.notes, console)
+    # Possible mistakes, which the notes of a result also have, go to standard error.
+    _print_notes(result, formatting.result_notes(result), console)
 
 
 def _config_rows(tables: Mapping[str, Table]) -> list[Row]:
@@ -155,22 +151,28 @@ def _config_rows(tables: Mapping[str, Table]) -> list[Row]:
     for name, table in tables.items():
         rows += _table_rows(formatting.config_title(name, table.split), table)
         rows += [(f"  {title}", shown, "dim") for title, shown in formatting.reference_rows([("", table)])]
-        judged = SCALED[0] if table.aligned is None else ALIGNED_METRICS[0]
-        rows.append(("  margin", {judged.path: formatting.margin_text(table)}, "dim"))
+        judged = SCALED[0] if table.kind == METRIC else ALIGNED_METRICS[0]
+        rows.append(("  margin", {judged.place: formatting.margin_text(table)}, "dim"))
     return rows
 
 
 def _table_rows(title: str, table: Table) -> list[Row]:
-    """Return the row of a table; of predictions that are not metric those of both alignments and the constant."""
-    if table.aligned is None:
-        return [(title, _row_texts(table), "")]
+    """Return the row of a table; of predictions that are not metric those of both alignments and the constant.
+
+    A rank error that does not rank is marked.
+    """
+    shown = {_VIEWS_SCORED.place: table.scored_of_views, COVERAGE.place: COVERAGE.text(table[COVERAGE.place])}
+    if table.kind == METRIC:
+        columns = (*METRIC_COLUMNS, *ONE_PIXEL, *SCALED_CONSTANT)
+        shown |= {column.place: column.text(table[column.place]) for column in columns}
+        if not table.ranked:
+            shown[RANK_ERROR.place] += "‡"
+        return [(title, shown, "")]
     rows: list[Row] = []
     below = " " * (len(title) - len(title.lstrip()) + 2)
-    shown = {column.path: column.text(column.value(table)) for column in (VIEWS_SCORED, COVERAGE)}
-    named = {title: table.aligned, f"{below}robust": table.aligned_robust, f"{below}constant": table.constant}
-    for name, errors in named.items():
-        if errors is not None:
-            shown |= {column.path: column.text(column.value(errors)) for column in ALIGNED_METRICS}
+    for name, alignment in zip((title, f"{below}robust", f"{below}constant"), RELATIVE_ALIGNMENTS, strict=True):
+        if not math.isnan(table[f"{alignment}.error"]):
+            shown |= {one.place: one.text(table[f"{alignment}.{one.place}"]) for one in ALIGNED_METRICS}
             rows.append((name, shown, "dim" if rows else ""))
             shown = {}
     return rows
@@ -184,13 +186,6 @@ def _group_rows(table: Table) -> list[Row]:
         for group, of_group in groups.items():
             rows += _table_rows(f"  {printable(group)}", of_group)
     return rows
-
-
-def _row_texts(table: Table) -> dict[str, str]:
-    """Return the numbers of a table as text by path; a rank error that does not rank is marked."""
-    columns = (VIEWS_SCORED, *VIEW_COLUMNS, *ONE_PIXEL, *SCALED_CONSTANT)
-    shown = dict(zip((column.path for column in columns), texts(columns, table), strict=True))
-    return shown if table.ranked else {**shown, RANK_ERROR.path: shown[RANK_ERROR.path] + "‡"}
 
 
 def _print_rows(rows: Sequence[Row], console: Console, layouts: Sequence[Sequence[Columns]], head: str) -> None:
@@ -214,7 +209,7 @@ def _rich_table(rows: Sequence[Row], columns: Columns, head: str) -> RichTable:
     heads = ["\n" * (lines - one.count("\n")) + one for one in heads]
     table = make_grid(heads[0], heads[1:])
     for name, shown, style in rows:
-        cells = [shown.get(column.path, "") for column in columns]
+        cells = [shown.get(column.place, "") for column in columns]
         if not shown:
             table.add_section()
         if any(cells) or not shown:
@@ -236,7 +231,7 @@ def _print_notes(result: Result, notes: Sequence[str], console: Console) -> None
     if any(table.groups for table in result.tables.values()):
         note = formatting.GROUP_NOTE if result.prediction is None else formatting.ALIGNED_GROUP_NOTE
         print_line(console, f"{note} Intervals: in JSON and the report.")
-    if any(has_dash(result.columns, table) for table in result.tables.values()):
+    if formatting.has_dash(result):
         print_line(console, formatting.DASH_NOTE)
 
 
@@ -316,7 +311,7 @@ def disambiguate_method_names(results: Sequence[Result]) -> list[Result]:
         submission = result.submission
         if names[result.method] > 1:
             before = [one.submission for one in results[:place]].count(submission)
-            method = f"{result.method} ({submission.sha256[:8]})" + (f" {before + 1}" if before else "")
+            method = f"{result.method} ({str(submission.sha256)[:8]})" + (f" {before + 1}" if before else "")
             submission = replace(submission, method=method)
         renamed.append(replace(result, submission=submission))
     return renamed
@@ -335,7 +330,7 @@ def print_paper_table(
     """
     dataset = results[0].dataset
     digest, version = formatting.short_digest(dataset.digest), printable(dataset.version)
-    for number, block in enumerate(kind_blocks(results)):
+    for number, block in enumerate(formatting.kind_blocks(results)):
         kind, protocol = block[0].prediction, block[0].protocol
         if number:
             console.print()
@@ -349,17 +344,17 @@ def print_paper_table(
             title = formatting.config_title(config, table.split)
             console.print()
             print_line(console, f"{title}, {formatting.counted(table.views, 'view')}", style="italic")
-            rows.sort(key=lambda row: (not row[1].ranked, rounded(row[1].error) or 0.0))
+            rows.sort(key=lambda row: (not row[1].ranked, formatting.sort_error(row[1])))
             if kind is None:
                 console.print(_paper_table(rows, table.published if published else None))
-                if similar := [printable(result.method) for result, of in rows if is_like_constant(of)]:
-                    limit = f"AbsRel_s is not below {100 * (1 - LEAST_MARGIN):.0f} % of a constant's"
+                if similar := [printable(result.method) for result, of in rows if formatting.is_like_constant(of)]:
+                    limit = f"AbsRel_s is not below {100 * (1 - formatting.LEAST_MARGIN):.0f} % of a constant's"
                     print_line(console, f"{limit}: {', '.join(similar)}.", style="yellow")
             else:
                 aligned = [row for result, of in rows for row in _table_rows(formatting.row_name(result, of), of)]
                 _print_rows(aligned, console, _ALIGNED_LAYOUTS, "")
                 for result, of in rows:
-                    for note in constant_findings(of):
+                    for note in formatting.constant_findings(of):
                         print_line(console, f"{printable(result.method)}: {note}", style="yellow")
         console.print()
         _print_paper_notes(block, console, absent if kind is None else (), published=published)

@@ -1,8 +1,10 @@
-"""Columns of tables: one description of every number of a result, from which all of its forms are made.
+"""The list of numbers: where each stands in the JSON, how it is summarised over views, and how it is shown.
 
-CSV, data frames, comparisons and intervals have all of ``VIEW_COLUMNS`` and ``TABLE_COLUMNS``, or of
-``RELATIVE_COLUMNS`` for predictions that are not metric; terminal, LaTeX and HTML show their groups. A number of a
-new kind needs a column in ``OTHERS``, a field of the classes in ``table`` and its computation in ``score``.
+A number has one name everywhere, its place in the JSON, such as ``"native.abs_rel"`` or ``"within_mm.5"``. The
+numbers of a view or a table are a flat mapping of places to floats: NaN where a number is undefined, inf where it
+overflowed; both are null in the JSON. JSON, frames, CSV, intervals and comparisons have all columns of a kind of
+predictions; terminal, LaTeX and HTML show their groups. A number of a new kind needs a column in ``DISTRIBUTION``
+and its computation in ``view_numbers``.
 """
 
 from __future__ import annotations
@@ -11,16 +13,14 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import ROUND_FLOOR, Decimal
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
-import numpy as np
-from jaxtyping import Float64
-from numpy import ndarray
-from pydantic import Field, GetPydanticSchema, PlainSerializer, Strict
-from pydantic_core import core_schema
-
-from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval, resample_views
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
+from rebar_depth_bench.submission.declaration import METRIC
+
+if TYPE_CHECKING:
+    from rebar_depth_bench.scoring.bootstrap import Interval
+    from rebar_depth_bench.scoring.table import Table, ViewScore
 
 DASH = "–"
 """Text of an undefined number, which is null in the JSON."""
@@ -47,30 +47,6 @@ def rounded_interval(ends: Interval | None) -> list[float | None] | None:
     return None if ends is None else [rounded(end, INTERVAL_DIGITS) for end in ends]
 
 
-def json_as(json_type: Any, read: Callable[[Any], Any], write: Callable[[Any], Any]) -> GetPydanticSchema:
-    """Return the annotation of a value whose JSON is a ``json_type``, with functions from and to that JSON."""
-    return GetPydanticSchema(
-        lambda _, handler: core_schema.no_info_after_validator_function(
-            read, handler(json_type), serialization=core_schema.plain_serializer_function_ser_schema(write)
-        )
-    )
-
-
-# Constraints of pydantic's core are checked without Python code: the leaderboard reads a table for each row.
-Share = Annotated[float, Strict(), Field(ge=0, le=1), PlainSerializer(rounded)]
-Size = Annotated[float, Strict(), Field(ge=0), PlainSerializer(rounded)]
-"""Types of numbers in JSON, which are written rounded."""
-
-
-def _overflow(value: float | None) -> float:
-    return math.inf if value is None else value
-
-
-MetricShare = Annotated[float, json_as(Share | None, _overflow, rounded)]
-MetricSize = Annotated[float, json_as(Size | None, _overflow, rounded)]
-"""Types of metrics of valid predictions, for which null is an overflow (``inf``)."""
-
-
 def number(value: float | None, decimals: int) -> str:
     """Return a number with fixed decimals, in scientific notation if these would hide it, a dash if undefined.
 
@@ -84,8 +60,8 @@ def number(value: float | None, decimals: int) -> str:
 
 
 def percent(share: float | None) -> str:
-    """Return a share in per cent, rounded to one decimal."""
-    return DASH if share is None else f"{share * 100:.1f}"
+    """Return a share in per cent, rounded to one decimal; a dash if undefined."""
+    return DASH if share is None or math.isnan(share) else f"{share * 100:.1f}"
 
 
 def coverage_percent(share: float | None) -> str:
@@ -93,7 +69,7 @@ def coverage_percent(share: float | None) -> str:
 
     Incomplete coverage is therefore never shown as 100 %, and coverage below the threshold never as reaching it.
     """
-    if share is None:
+    if share is None or math.isnan(share):
         return DASH
     return str((Decimal(repr(float(share))) * 100).quantize(Decimal("0.1"), rounding=ROUND_FLOOR))
 
@@ -111,14 +87,15 @@ class Cell:
 class Column:
     """Number of a table or view.
 
-    ``path`` is its place in the JSON, keys joined by dots; ``of_view`` is its place in a view if that differs.
-    ``title`` names it, ``unit`` is that of the shown value, which is the value times ``factor`` with ``decimals``.
-    ``as_text``, if set, makes the text of the value. ``head`` is a heading of three lines for narrow columns.
-    ``statistic`` makes the number of a table from those of its views. Views without predictions have only numbers
-    that are ``of_all_views``.
+    ``place`` is its place in the JSON of a table, keys joined by dots; ``view_place`` is its place in a view if
+    that differs. ``title`` names it, ``unit`` is that of the shown value, which is the value times ``factor`` with
+    ``decimals``. ``as_text``, if set, makes the text of the value. ``head`` is a heading of three lines for narrow
+    columns. ``statistic`` makes the number of a table from those of its views: mean or median, or the count of
+    views for which it is true. ``has_interval`` states whether it has a 95 % interval. Values are from 0 to
+    ``most``. Views without predictions have only numbers that are ``of_all_views``.
     """
 
-    path: str
+    place: str
     title: str
     unit: str = ""
     better: Better = ""
@@ -126,17 +103,26 @@ class Column:
     factor: float = 1.0
     as_text: Callable[[float | None], str] | None = None
     head: str = ""
-    of_view: str = ""
+    view_place: str = ""
     of_all_views: bool = False
-    statistic: Literal["mean", "median"] = "mean"
+    statistic: Literal["mean", "median", "count"] = "mean"
+    has_interval: bool = True
+    most: float = math.inf
 
     @property
     def name(self) -> str:
         """Name of the column in frames and CSV."""
-        parts = self.path.removeprefix("reference.").split(".")
-        if parts[-2:-1] == ["within_mm"]:
-            parts[-2:] = [f"within_{parts[-1]}mm"]
-        return "_".join(parts)
+        return _frame_name(self.place)
+
+    @property
+    def view_name(self) -> str:
+        """Name of the column in frames of views."""
+        return _frame_name(self.in_view)
+
+    @property
+    def in_view(self) -> str:
+        """Place of the number in the JSON of a view."""
+        return self.view_place or self.place
 
     @property
     def heading(self) -> str:
@@ -144,25 +130,9 @@ class Column:
         arrow = ARROWS[self.better]
         return f"{self.title}{f', {self.unit}' if self.unit else ''}{f' {arrow}' if arrow else ''}"
 
-    def value(self, source: Any) -> Any:
-        """Return the number of a table, or of the JSON object of one; None where it is undefined or missing."""
-        return value_at(source, self.path)
-
-    def view_value(self, view: Any) -> float | None:
-        """Return the number of a view; None where it is undefined."""
-        found: float | None = value_at(view, self.of_view or self.path)
-        return found
-
-    def interval(self, table: Any) -> Interval | None:
-        """Return the interval of the number of a table; None where it is undefined or not finite."""
-        ends: Interval | None = table.intervals.get(self.path)
-        return ends if ends is not None and all(map(math.isfinite, ends)) else None
-
-    def cell(self, scores: Any) -> Cell:
+    def cell(self, scores: Table | ViewScore) -> Cell:
         """Return the cell of a number of a table, with its interval, or of a view, which has none."""
-        if not hasattr(scores, "intervals"):
-            return self.value_cell(self.view_value(scores))
-        return self.value_cell(self.value(scores), self.interval(scores))
+        return self.value_cell(scores.number(self), scores.interval(self))
 
     def value_cell(self, value: float | None, ends: Interval | None = None) -> Cell:
         """Return the cell of a value and its interval."""
@@ -191,54 +161,80 @@ class Column:
         as_text = self.number_text if self.as_text is None or self.as_text is percent else self.as_text
         return separator.join(as_text(end) for end in ends)
 
+    def json_value(self, table: Table) -> float | None:
+        """Return the number of a table as it is written in JSON and CSV; None if it is undefined or not finite."""
+        value = rounded(table[self.place])
+        return int(value) if self.statistic == "count" and value is not None else value
+
+    def view_json_value(self, view: ViewScore) -> float | bool | None:
+        """Return the number of a view as it is written in JSON and CSV; None if undefined or not finite."""
+        value = rounded(view[self.in_view])
+        return bool(value) if self.statistic == "count" and value is not None else value
+
+
+def _frame_name(place: str) -> str:
+    parts = place.removeprefix("reference.").split(".")
+    if parts[-2:-1] == ["within_mm"]:
+        parts[-2:] = [f"within_{parts[-1]}mm"]
+    return "_".join(parts)
+
+
+def nested(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Return values by place as a JSON object: a place that has dots stands in objects of their own."""
+    document: dict[str, Any] = {}
+    for place, value in values.items():
+        *groups, key = place.split(".")
+        inner = document
+        for group in groups:
+            inner = inner.setdefault(group, {})
+        inner[key] = value
+    return document
+
+
+def at_place(document: Any, place: str) -> Any:
+    """Return the value at a place of a JSON object; None where it is missing."""
+    for key in place.split("."):
+        document = document.get(key) if isinstance(document, dict) else None
+    return document
+
 
 def range_text(ends: Interval | None, as_text: Callable[[float], str]) -> str:
     """Return an interval as text, a dash if it is undefined."""
     return DASH if ends is None else " to ".join(map(as_text, ends))
 
 
-def value_at(source: Any, path: str) -> Any:
-    """Return the value at a path of attributes and keys; None where one of them is None or missing."""
-    for key in path.split("."):
-        if isinstance(source, Mapping):
-            source = source.get(key, source.get(int(key)) if key.isdecimal() else None)
-        else:
-            source = getattr(source, key, None)
-    return source
-
-
 METRICS: Mapping[str, Column] = {
     "abs_rel": Column("abs_rel", "AbsRel", better="lower", decimals=4),
     "rmse_cm": Column("rmse_cm", "RMSE", "cm", "lower", 2),
     "mae_cm": Column("mae_cm", "MAE", "cm", "lower", 2),
-    "delta1": Column("delta1", "δ1", "", "higher", 3),
+    "delta1": Column("delta1", "δ1", "", "higher", 3, most=1.0),
 }
 """Presentation of each field of ``DepthMetrics``, in order, in all tables and pages."""
 
 
-def _aligned(alignment: str, metric: Column) -> Column:
+def _aligned(alignment: str, column: Column) -> Column:
     return replace(
-        metric,
-        path=f"{alignment}.{metric.path}",
-        title=f"{alignment} {metric.title}".replace("_", " "),
-        head=f"{alignment.removeprefix('aligned_')}\n{metric.title} {ARROWS[metric.better]}\n{metric.unit}",
+        column,
+        place=f"{alignment}.{column.place}",
+        title=f"{alignment} {column.title}".replace("_", " "),
+        head=f"{alignment.removeprefix('aligned_')}\n{column.title} {ARROWS[column.better]}\n{column.unit}",
+        has_interval=not column.place.startswith("within_mm"),
     )
 
 
 def _reference(kind: str, name: str) -> Column:
     metric = METRICS[name]
     return Column(
-        path=f"reference.{kind}.{name}",
+        place=f"reference.{kind}.{name}",
         title=f"{metric.title} of {kind}",
         unit=metric.unit,
         decimals=metric.decimals,
         head=f"{'1 pixel' if kind == 'one_pixel' else 'const.'}\n{metric.title}\n{metric.unit}",
+        has_interval=False,
     )
 
 
-ALIGNMENTS = ("native", "scaled")
-REFERENCE_ERRORS = ("abs_rel", "rmse_cm")
-"""Metrics that have reference errors."""
+# Columns of metric predictions.
 
 COVERAGE = Column(
     "coverage",
@@ -250,11 +246,16 @@ COVERAGE = Column(
     coverage_percent,
     "cover-\nage ↑\n%",
     of_all_views=True,
+    most=1.0,
 )
-RANK_ERROR = Column("rank_error", "rank error", better="lower", head="rank\nerror ↓\n", of_all_views=True)
-NATIVE, SCALED = (tuple(_aligned(alignment, one) for one in METRICS.values()) for alignment in ALIGNMENTS)
+RANK_ERROR = Column(
+    "rank_error", "rank error", better="lower", head="rank\nerror ↓\n", of_all_views=True, most=1.0
+)
+NATIVE, SCALED = (
+    tuple(_aligned(alignment, one) for one in METRICS.values()) for alignment in ("native", "scaled")
+)
 SCALE = Column(
-    "scale_median", "scale s, median", decimals=3, head="scale\ns\n", of_view="scale", statistic="median"
+    "scale_median", "scale s, median", decimals=3, head="scale\ns\n", view_place="scale", statistic="median"
 )
 WITHIN = tuple(
     Column(
@@ -267,104 +268,76 @@ WITHIN = tuple(
         percent,
         f"within\n{tolerance_mm} mm\n% ↑",
         of_all_views=True,
+        most=1.0,
     )
     for tolerance_mm in WITHIN_MM
 )
-OTHERS: tuple[Column, ...] = ()
-"""Columns of further numbers that every view has; tables and pages show them behind those within a tolerance."""
-VIEW_COLUMNS = (COVERAGE, RANK_ERROR, *NATIVE, *SCALED, SCALE, *WITHIN, *OTHERS)
-"""Columns of the numbers that every view has, and a table with an interval, in the order of the JSON."""
+DISTRIBUTION: tuple[Column, ...] = WITHIN
+"""Columns of the distribution of native errors over the pixels of a view, which tables and pages show together."""
+
+REFERENCE_ERRORS = ("abs_rel", "rmse_cm")
+"""Metrics that have reference errors."""
 CONSTANT, ONE_PIXEL, SCALED_CONSTANT = (
     tuple(_reference(kind, name) for name in REFERENCE_ERRORS)
     for kind in ("constant", "one_pixel", "scaled_constant")
 )
+REFERENCES = (*CONSTANT, *ONE_PIXEL, *SCALED_CONSTANT)
 """Columns of the reference errors of a config."""
-_VIEWS, _SCORED, _RANKED = (Column(name, name.replace("_", " ")) for name in ("views", "views_scored", "ranked"))
-VIEWS_SCORED = Column("scored_of_views", "views", as_text=str, head="views\nscored\n/all")
-"""Column of the numbers of scored and of all views, as text; the JSON has the two numbers."""
-TABLE_COLUMNS = (_VIEWS, _SCORED, COVERAGE, _RANKED, *VIEW_COLUMNS[1:], *CONSTANT, *ONE_PIXEL, *SCALED_CONSTANT)
-"""Columns of a config's table in frames and CSV."""
+
 PAPER_COLUMNS = (NATIVE[1], NATIVE[0], SCALED[0], SCALE)
 """Columns of the paper's Table I: RMSE and AbsRel native, AbsRel scaled, and the median s."""
 
-ALIGNED_METRICS = (Column("error", "error", better="lower", of_all_views=True), *METRICS.values(), *WITHIN)
-"""Columns of the numbers of an alignment, whose paths begin at it."""
+# Columns of predictions that are not metric.
+
+ALIGNED_METRICS = (
+    Column("error", "error", better="lower", of_all_views=True, most=1.0),
+    *METRICS.values(),
+    *WITHIN,
+)
+"""Columns of the numbers of an alignment, whose places begin at it."""
 RELATIVE_ALIGNMENTS = ("aligned", "aligned_robust", "constant")
 """Alignments of predictions that are not metric: that of their kind, its robust variant, and its constant."""
 ALIGNED, ALIGNED_ROBUST, ALIGNED_CONSTANT = (
     tuple(_aligned(alignment, one) for one in ALIGNED_METRICS) for alignment in RELATIVE_ALIGNMENTS
 )
 """Columns of these: the error over all scored pixels, the metrics, and the shares within a tolerance."""
+FLAT_VIEWS = Column(
+    "flat_views", "views without positive slope", view_place="is_flat", statistic="count", has_interval=False
+)
+
+# The list, by kind of predictions, in the order of the JSON.
+
+METRIC_COLUMNS = (COVERAGE, RANK_ERROR, *NATIVE, *SCALED, SCALE, *DISTRIBUTION)
 RELATIVE_COLUMNS = (COVERAGE, *ALIGNED, *ALIGNED_ROBUST, *ALIGNED_CONSTANT)
-"""Columns of the numbers of a view, and of a table, of predictions that are not metric."""
-FLAT_VIEWS = Column("flat_views", "views without positive slope", of_view="is_flat")
-RELATIVE_TABLE_COLUMNS = (_VIEWS, _SCORED, FLAT_VIEWS, COVERAGE, _RANKED, *RELATIVE_COLUMNS[1:])
-"""Columns of a config's table of such predictions in frames and CSV."""
-RELATIVE_INTERVALS = tuple(column for column in RELATIVE_COLUMNS if "within_mm" not in column.path)
-"""Those of them that have intervals."""
-
-_BY_PATH: Mapping[str, Column] = {column.path: column for column in (*TABLE_COLUMNS, *RELATIVE_COLUMNS)}
+_METRIC_VIEW_COLUMNS = (COVERAGE, RANK_ERROR, SCALE, *NATIVE, *SCALED, *DISTRIBUTION)
+_BY_PLACE: Mapping[str, Column] = {one.place: one for one in (*METRIC_COLUMNS, *REFERENCES, *RELATIVE_COLUMNS)}
 
 
-def columns_at(*paths: str) -> tuple[Column, ...]:
-    """Return the columns of a config's table at ``paths``, such as ``native.abs_rel``."""
-    return tuple(_BY_PATH[path] for path in paths)
+def table_columns(kind: str) -> tuple[Column, ...]:
+    """Return the columns of a table of a kind of predictions, without those of reference errors."""
+    return METRIC_COLUMNS if kind == METRIC else (*RELATIVE_COLUMNS, FLAT_VIEWS)
+
+
+def view_columns(kind: str) -> tuple[Column, ...]:
+    """Return the columns of a view of a kind of predictions."""
+    return _METRIC_VIEW_COLUMNS if kind == METRIC else (*RELATIVE_COLUMNS, FLAT_VIEWS)
+
+
+def interval_columns(kind: str) -> tuple[Column, ...]:
+    """Return the columns of a table that have intervals."""
+    return tuple(column for column in table_columns(kind) if column.has_interval)
+
+
+def columns_at(*places: str) -> tuple[Column, ...]:
+    """Return the columns of a config's table at ``places``, such as ``native.abs_rel``."""
+    return tuple(_BY_PLACE[place] for place in places)
 
 
 def with_reference(columns: Sequence[Column]) -> list[Column]:
     """Return the columns of the metrics that have reference errors."""
-    return [column for column in columns if column.path.rpartition(".")[2] in REFERENCE_ERRORS]
+    return [column for column in columns if column.place.rpartition(".")[2] in REFERENCE_ERRORS]
 
 
-def has_dash(columns: Sequence[Column], scores: Any) -> bool:
-    """Return whether any number of a table or view is undefined."""
-    return any(column.cell(scores).value is None for column in columns)
-
-
-def texts(columns: Sequence[Column], table: Any) -> list[str]:
+def texts(columns: Sequence[Column], table: Table) -> list[str]:
     """Return the numbers of a table as text."""
-    return [column.text(column.value(table)) for column in columns]
-
-
-def view_intervals(
-    views: Sequence[Any],
-    columns: Sequence[Column] = VIEW_COLUMNS,
-    *,
-    by_scene: bool,
-    views_per_distance: int | None,
-) -> dict[str, Interval | None]:
-    """Return the 95 % interval of each of ``columns`` by path; the keywords are those of ``resample_views``."""
-    values = view_values(views, columns)
-    view_ids = [view.view_id for view in views]
-    resampling = resample_views(view_ids, by_scene=by_scene, views_per_distance=views_per_distance)
-    return column_intervals(bootstrap_estimates(values, columns, resampling), values, columns, resampling)
-
-
-def column_intervals(
-    estimates: Float64[ndarray, "draws k"],
-    values: Float64[ndarray, "n k"],
-    columns: Sequence[Column],
-    resampling: Resampling,
-) -> dict[str, Interval | None]:
-    """Return the interval of each of ``columns`` from its estimates; ``values`` is NaN where it has none."""
-    return {
-        column.path: interval(estimates[:, k], resampling.blocks(np.flatnonzero(~np.isnan(values[:, k]))))
-        for k, column in enumerate(columns)
-    }
-
-
-def bootstrap_estimates(
-    values: Float64[ndarray, "n k"], columns: Sequence[Column], resampling: Resampling
-) -> Float64[ndarray, "draws k"]:
-    """Return the table's ``columns`` in each resample of ``view_values``; NaN where undefined."""
-    draws = resampling.means(values)
-    for k, column in enumerate(columns):
-        if column.statistic == "median":
-            draws[:, k] = resampling.medians(values[:, k])
-    return draws
-
-
-def view_values(views: Sequence[Any], columns: Sequence[Column]) -> Float64[ndarray, "n k"]:
-    """Return the ``columns`` of each view, one row per view; NaN where it has no value."""
-    rows = [[column.view_value(view) for column in columns] for view in views]
-    return np.array(rows, dtype=np.float64).reshape(len(views), len(columns))
+    return [column.text(table.number(column)) for column in columns]

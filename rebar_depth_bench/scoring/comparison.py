@@ -13,21 +13,17 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from rebar_depth_bench.base.errors import InputError
-from rebar_depth_bench.base.names import config_of
 from rebar_depth_bench.scoring.bootstrap import INTERVALS, Interval, resample_views
 from rebar_depth_bench.scoring.columns import (
     ALIGNED_CONSTANT,
     Column,
-    bootstrap_estimates,
-    column_intervals,
     rounded,
     rounded_interval,
-    view_values,
 )
 from rebar_depth_bench.scoring.evaluation import Provenance
-from rebar_depth_bench.scoring.frames import differences_frame
 from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.scoring.table import ViewScore
+from rebar_depth_bench.scoring.spreadsheet import differences_sheet
+from rebar_depth_bench.scoring.table import Frame, bootstrap_estimates, column_intervals, column_values
 
 if TYPE_CHECKING:
     from pandas import DataFrame
@@ -64,7 +60,7 @@ class Comparison:
 
     def to_pandas(self) -> DataFrame:
         """Return one row per config and metric: values, difference with its 95 % interval, and provenance."""
-        return differences_frame([self.to_dict()])
+        return differences_sheet([self.to_dict()]).to_pandas()
 
     def to_dict(self) -> dict[str, Any]:
         """Return the comparison as a JSON-compatible object."""
@@ -128,64 +124,41 @@ def check_same_splits(results: Sequence[Result]) -> None:
 def config_differences(first: Result, other: Result, config: str) -> list[Difference]:
     """Return one difference per metric of a config that both cover, with the same split.
 
-    Error metrics use only the views where both submissions have a value.
+    Error metrics use only the views where both submissions have a value. Both frames are resampled alike, so that
+    the difficulty of each view cancels.
     """
-    tables = first.tables[config], other.tables[config]
+    tables, frames = (first.tables[config], other.tables[config]), (first.frames[config], other.frames[config])
+    shared = set(frames[0].view_ids) & set(frames[1].view_ids)
+    frames = frames[0].of_views(shared), frames[1].of_views(shared)
+    table = tables[0]
+    are_comparable = all(one.is_comparable for one in tables)
+    predicted_by_both = np.flatnonzero((frames[0]["coverage"] > 0) & (frames[1]["coverage"] > 0))
     # The constant of a fit differs with the pixels that have a value, not with the quality of a method.
-    columns = [column for column in first.columns if column not in ALIGNED_CONSTANT]
-    of_first, of_other = (
-        {view.view_id: view for view in result.views if config_of(view.view_id) == config}
-        for result in (first, other)
-    )
-    predicted_by_both = [
-        view_id for view_id in of_first if of_first[view_id].coverage and of_other[view_id].coverage
-    ]
-    on_all_views, on_predicted_by_both = (
-        _differences_on_views(
-            [of_first[view_id] for view_id in view_ids],
-            [of_other[view_id] for view_id in view_ids],
-            columns,
-            by_scene=tables[0].split is not None,
-            views_per_distance=tables[0].views_per_distance,
-            are_comparable=all(table.is_comparable for table in tables),
+    columns = [one for one in first.columns if one not in ALIGNED_CONSTANT]
+    found: dict[str, Difference] = {}
+    for on_all_views in (True, False):
+        some = [column for column in columns if column.of_all_views == on_all_views]
+        a, b = frames if on_all_views else (frame.take(predicted_by_both) for frame in frames)
+        resampling = resample_views(
+            a.view_ids, by_scene=table.split is not None, views_per_distance=table.views_per_distance
         )
-        for view_ids in (of_first, predicted_by_both)
-    )
-    return [(on_all_views if column.of_all_views else on_predicted_by_both)[column.path] for column in columns]
+        values = column_values(a, some), column_values(b, some)
+        draws = [bootstrap_estimates(one, some, resampling) for one in values]
+        intervals = column_intervals(draws[1] - draws[0], values[0] + values[1], some, resampling)
+        for column in some:
+            before, after = _value(column, a), _value(column, b)
+            change = None if before is None or after is None else after - before
+            ends = intervals[column.place]
+            verdict = _verdict(column, ends, by_scene=table.split is not None, are_comparable=are_comparable)
+            found[column.place] = Difference(column, len(a), before, after, change, ends, verdict)
+    return [found[column.place] for column in columns]
 
 
-def _differences_on_views(
-    first: Sequence[ViewScore],
-    other: Sequence[ViewScore],
-    columns: Sequence[Column],
-    *,
-    by_scene: bool,
-    views_per_distance: int | None,
-    are_comparable: bool,
-) -> dict[str, Difference]:
-    """Return the differences on the given views by metric name, with the same resamples for both submissions."""
-    view_ids = [view.view_id for view in first]
-    resampling = resample_views(view_ids, by_scene=by_scene, views_per_distance=views_per_distance)
-    first_values, other_values = view_values(first, columns), view_values(other, columns)
-    first_draws, other_draws = (
-        bootstrap_estimates(values, columns, resampling) for values in (first_values, other_values)
-    )
-    intervals = column_intervals(other_draws - first_draws, first_values + other_values, columns, resampling)
-    differences = {}
-    for column in columns:
-        bounds = intervals[column.path]
-        first_value, other_value = (_table_value(column, views) for views in (first, other))
-        change = None if first_value is None or other_value is None else other_value - first_value
-        verdict = _verdict(column, bounds, by_scene=by_scene, are_comparable=are_comparable)
-        differences[column.path] = Difference(
-            column, len(first), first_value, other_value, change, bounds, verdict
-        )
-    return differences
-
-
-def _table_value(column: Column, views: Sequence[ViewScore]) -> float | None:
-    values = [value for view in views if (value := column.view_value(view)) is not None]
-    if not values or not np.isfinite(values).all():
+def _value(column: Column, views: Frame) -> float | None:
+    """Return the statistic of a column; None without values, or if one is infinite."""
+    values = views[column.in_view]
+    values = values[~np.isnan(values)]
+    if not len(values) or not np.isfinite(values).all():
         return None
     return float(np.median(values) if column.statistic == "median" else np.mean(values))
 
@@ -206,7 +179,7 @@ def _verdict(column: Column, bounds: Interval | None, *, by_scene: bool, are_com
 
 def _difference_dict(difference: Difference) -> dict[str, Any]:
     return {
-        "name": difference.column.path,
+        "name": difference.column.place,
         "views": difference.views,
         "first": rounded(difference.first),
         "other": rounded(difference.other),

@@ -1,40 +1,22 @@
-"""Scoring of a submission archive against a dataset folder: both are open in an ``Evaluation``.
-
-``score_evaluation`` passes their views to the arithmetic of ``scoring.score``, on several threads.
-"""
+"""Submission archive and dataset folder that are open together, and the provenance of what is computed of them."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
-from functools import cached_property
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, TypeVar
-
-from jaxtyping import Float
-from numpy import ndarray
+from typing import Any
 
 from rebar_depth_bench import software_version
 from rebar_depth_bench.base.errors import InputError, SubmissionError, escape_text
 from rebar_depth_bench.base.names import TEST_SPLIT, config_of, split_of
-from rebar_depth_bench.base.parallel import Progress, map_with_progress, silent
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_folder
-from rebar_depth_bench.data.rows import camera_from_row, decode_row
-from rebar_depth_bench.data.schema import CAMERA_SHAPES
-from rebar_depth_bench.data.shards import encoded_rows
-from rebar_depth_bench.geometry.cameras import Camera
-from rebar_depth_bench.scoring.protocol import PROTOCOL, RELATIVE_PROTOCOL
-from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND, metric_as
-from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareIdentity, SubmissionIdentity
-from rebar_depth_bench.scoring.score import ReadDepth, UseView, score_views
-from rebar_depth_bench.scoring.truth import config_truth
-from rebar_depth_bench.submission import EntryError, SubmissionMeta, SubmissionReader
-from rebar_depth_bench.submission.declaration import METRIC
-
-_Found = TypeVar("_Found")
+from rebar_depth_bench.scoring.protocol import PROTOCOL
+from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND
+from rebar_depth_bench.scoring.result import DatasetIdentity, SubmissionIdentity
+from rebar_depth_bench.submission import SubmissionMeta, SubmissionReader
 
 
 @dataclass(frozen=True)
@@ -59,45 +41,12 @@ class Provenance:
         }
 
 
-@dataclass(frozen=True, eq=False)
-class View:
-    """View of a submission, for diagnosis and pictures: cells and prediction are decoded once, on first use.
-
-    ``position`` counts the views of the config, ``encoded`` is the row, and ``read_depth`` reads predictions.
-    """
-
-    config: DatasetConfig
-    view_id: str
-    position: int
-    encoded: Mapping[str, Any]
-    read_depth: ReadDepth
-    _decoded: dict[str, Any] = field(default_factory=dict)
-
-    @cached_property
-    def prediction_m(self) -> Float[ndarray, "h w"]:
-        """Submitted planar depth in metres, H x W. Raises ``EntryError`` for an invalid entry."""
-        return self.read_depth(self.view_id)
-
-    def cell(self, column: str) -> Any:
-        """Return the decoded cell of a column. Raises ``DatasetError`` if it is damaged."""
-        if column not in self._decoded:
-            row = {"view_id": self.view_id, column: self.encoded[column]}
-            self._decoded[column] = decode_row(self.config, row)[column]
-        return self._decoded[column]
-
-    def camera(self, eye: str) -> Camera:
-        """Return the camera of one eye."""
-        cells = {f"{eye}_{kind}": self.cell(f"{eye}_{kind}") for kind in CAMERA_SHAPES}
-        return camera_from_row(cells, eye, self.config.grid)
-
-
 @dataclass(frozen=True)
 class Evaluation:
     """Submission whose structure is valid, and the dataset folder it is evaluated against."""
 
     folder: DatasetFolder
     submission: SubmissionReader
-    _made: dict[object, Any] = field(default_factory=dict, repr=False, compare=False)
 
     @property
     def meta(self) -> SubmissionMeta:
@@ -105,7 +54,7 @@ class Evaluation:
         assert self.submission.meta is not None
         return self.submission.meta
 
-    @cached_property
+    @property
     def configs(self) -> tuple[DatasetConfig, ...]:
         """Configs that the submission contains, in the order of the folder, each restricted to its split."""
         split_by_config = {config_of(view_id): split_of(view_id) for view_id in self.submission.view_ids}
@@ -115,43 +64,24 @@ class Evaluation:
             if name in split_by_config
         )
 
-    def once(self, key: object, make: Callable[[], _Found]) -> _Found:
-        """Return what ``make`` returned when this was called first with ``key``: what several measures need."""
-        if key not in self._made:
-            self._made[key] = make()
-        found: _Found = self._made[key]
-        return found
-
-    def views(self, config: DatasetConfig, columns: Sequence[str], positions: Collection[int]) -> Iterator[View]:
-        """Yield the views at ``positions`` of a config, one at a time; only their rows are read.
-
-        Raises ``DatasetError`` for a damaged shard.
-        """
-        position_by_view = {config.view_ids[position]: position for position in positions}
-        for row in encoded_rows(config, ("view_id", *columns), position_by_view):
-            view_id = row["view_id"]
-            yield View(config, view_id, position_by_view[view_id], row, self.submission.read)
-
-    def check_entries(self, progress: Progress = silent) -> None:
-        """Decode every entry. Raises ``SubmissionError`` with all problems."""
-        problems = list(self.submission.problems(progress))
-        if problems:
-            raise SubmissionError.from_problems(self.submission.path, problems)
-
-    def kind(self, align: str | None = None) -> str:
-        """Return the kind that the predictions are scored as; errors for ``align`` as in ``score_evaluation``."""
-        kind = align or self.meta.prediction
-        if align is not None and align not in ALIGNMENT_BY_KIND:
-            expected = f"{', '.join(ALIGNMENT_BY_KIND)}, or None, which scores metric predictions as metric"
-            raise InputError(f"align is {escape_text(str(align))}, expected one of {expected}")
-        if kind != self.meta.prediction:
-            self.require_metric(f"only they can be scored as {kind}")
-        return kind
-
     def require_metric(self, use: str) -> None:
         """Raise ``SubmissionError`` unless the predictions are metric, which ``use`` requires."""
         if problems := self.meta.kind_problems(use):
             raise SubmissionError.from_problems(self.submission.path, problems)
+
+    def scored_kind(self, align: str | None) -> str:
+        """Return the kind that the predictions are scored as: their own, or ``align`` if they are metric.
+
+        Raises ``InputError`` if ``align`` is no kind, and ``SubmissionError`` for predictions that are neither
+        metric nor of that kind.
+        """
+        if align is not None and align not in ALIGNMENT_BY_KIND:
+            expected = f"{', '.join(ALIGNMENT_BY_KIND)}, or None, which scores metric predictions as metric"
+            raise InputError(f"align is {escape_text(str(align))}, expected one of {expected}")
+        kind = align or self.meta.prediction
+        if kind != self.meta.prediction:
+            self.require_metric(f"only they can be scored as {kind}")
+        return kind
 
     def provenance(self) -> Provenance:
         """Return the provenance of an analysis of the submission."""
@@ -175,54 +105,3 @@ def open_evaluation(
         if submission.structure_problems:
             raise SubmissionError.from_problems(archive, list(submission.problems()))
         yield Evaluation(folder, submission)
-
-
-def score_evaluation(
-    evaluation: Evaluation,
-    *,
-    workers: int | None = None,
-    align: str | None = None,
-    progress: Progress = silent,
-    use_view: UseView | None = None,
-) -> Result:
-    """Score an open submission on ``workers`` threads; ``use_view`` is called on them, as in ``score_views``.
-
-    Raises ``SubmissionError`` if an entry is invalid, and for ``align`` with an archive that is neither metric nor
-    of that kind, and ``InputError`` if ``align`` is no kind.
-    """
-    submission, folder, meta = evaluation.submission, evaluation.folder, evaluation.meta
-    kind, read = evaluation.kind(align), submission.read
-    if kind != meta.prediction:
-
-        def read(view_id: str) -> Float[ndarray, "h w"]:
-            return metric_as(submission.read(view_id), kind)
-
-    truths = ((config.name, config_truth(folder, config, progress)) for config in evaluation.configs)
-    with ThreadPoolExecutor(1) as pool:
-        sha256 = pool.submit(submission.sha256)
-        try:
-            tables, views = score_views(
-                truths,
-                read,
-                meta.declaration,
-                lambda name, work, positions: map_with_progress(
-                    work, positions, workers, progress, f"scoring {name}", len(positions)
-                ),
-                use_view,
-                kind,
-            )
-            for view_id in set(submission.view_ids) - {view.view_id for view in views}:
-                submission.read(view_id)  # A view without scored pixels.
-        except EntryError:
-            evaluation.check_entries(progress)
-            raise
-        return Result(
-            dataset=DatasetIdentity(folder.digest, folder.version),
-            submission=SubmissionIdentity(meta.method, sha256.result(), meta.inputs, meta.uses_ground_truth),
-            software=SoftwareIdentity(software_version()),
-            tables=tables,
-            views=views,
-            protocol=PROTOCOL if kind == METRIC else RELATIVE_PROTOCOL,
-            prediction=None if kind == METRIC else kind,
-            declared_prediction=None if kind == meta.prediction else meta.prediction,
-        )

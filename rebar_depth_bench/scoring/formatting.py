@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -13,19 +14,23 @@ from rebar_depth_bench.scoring.columns import (
     COVERAGE,
     DASH,
     NATIVE,
+    ONE_PIXEL,
     PAPER_COLUMNS,
     SCALED,
     SCALED_CONSTANT,
+    SIGNIFICANT_DIGITS,
     Column,
     columns_at,
     coverage_percent,
     number,
+    rounded,
     texts,
     with_reference,
 )
 from rebar_depth_bench.scoring.groups import GROUPINGS
 from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE
-from rebar_depth_bench.scoring.relative import constant_findings, constant_margin, kind_text
+from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND
+from rebar_depth_bench.submission.declaration import METRIC
 
 if TYPE_CHECKING:
     from rebar_depth_bench.scoring.result import Result
@@ -84,7 +89,7 @@ _RELATIVE_HEADS = {
     "aligned_robust.abs_rel": "robust AbsRel",
     "aligned.within_mm.5": "<= 5 mm",
 }
-"""Headings of the columns of a summary by their paths; ``margin`` is not in the JSON."""
+"""Headings of the columns of a summary by their places; ``margin`` is not in the JSON."""
 
 
 @dataclass(frozen=True)
@@ -105,28 +110,41 @@ class Summary:
 
 def summary(result: Result) -> Summary:
     """Return the summary of a result."""
-    by_path = _HEADS if result.prediction is None else _RELATIVE_HEADS
+    by_place = _HEADS if result.prediction is None else _RELATIVE_HEADS
     rows = []
     for name, table in result.tables.items():
         cells = [config_title(name, table.split)]
-        for path in by_path:
-            if path == "margin":
+        for place in by_place:
+            if place == "margin":
                 cells.append(margin_text(table))
             else:
-                [column] = columns_at(path)
-                cells.append(f"{column.text(column.value(table))} {column.unit}".strip())
+                [column] = columns_at(place)
+                cells.append(f"{column.text(table[column.place])} {column.unit}".strip())
         rows.append(cells)
     dataset, declared = result.dataset, result.declared
     method = f"{printable(result.method)} {rank_mark(declared)}".strip()
     return Summary(
-        heads=[method, *by_path.values()],
+        heads=[method, *by_place.values()],
         rows=rows,
         provenance=f"dataset {printable(dataset.version)} ({short_digest(dataset.digest)}), "
-        f"archive {short_digest(result.submission.sha256)}, software {printable(result.software.version)}",
+        f"{archive_text(result)}, software {printable(result.software.version)}",
         declared=f"protocol {result.protocol}; inputs: {inputs_text(declared)}; "
         f"ground truth: {ground_truth_text(declared)}",
         notes=result.notes,
     )
+
+
+def has_dash(result: Result) -> bool:
+    """Return whether any number of the tables of a result is undefined."""
+    return any(
+        not math.isfinite(table[column.place]) for table in result.tables.values() for column in result.columns
+    )
+
+
+def archive_text(result: Result) -> str:
+    """Return the digest of the archive that was scored, or that the predictions were not written to one."""
+    sha256 = result.submission.sha256
+    return "no archive" if sha256 is None else f"archive {short_digest(sha256)}"
 
 
 def margin_text(table: Table) -> str:
@@ -183,7 +201,7 @@ def table_notes(table: Table) -> list[str]:
         )
     if table.of_views is not None:
         notes.append(f"Not ranked: {table.views} of {counted(table.of_views, 'view')}.")
-    elif not table.ranked and table.aligned is None:
+    elif not table.ranked and table.kind == METRIC:
         reason = "the submission declares that it uses ground truth" if table.views else "no views"
         notes.append(f"Not ranked: {reason}.")
     if reasons := incomparable_reasons(table):
@@ -201,9 +219,9 @@ def incomparable_reasons(table: Table) -> list[str]:
     missing = table.views - table.views_scored
     if missing:
         reasons.append(f"{missing} of {counted(table.views, 'view')} without any prediction")
-    if table.coverage is not None and table.coverage < MIN_COMPARABLE_COVERAGE:
+    if table["coverage"] < MIN_COMPARABLE_COVERAGE:
         minimum = f"{MIN_COMPARABLE_COVERAGE * 100:.0f} %"
-        reasons.append(f"coverage {COVERAGE.text(table.coverage)} % is below {minimum}")
+        reasons.append(f"coverage {COVERAGE.text(table['coverage'])} % is below {minimum}")
     if table.views_scored and not table.is_finite:
         reasons.append("a number overflowed")
     return reasons
@@ -238,45 +256,45 @@ def grouping_title(grouping: str) -> str:
     return GROUPINGS[grouping].title if grouping in GROUPINGS else printable(grouping)
 
 
-def scaled_constants(results: Sequence[tuple[str, Table]]) -> dict[str, tuple[float, float | None]]:
+def scaled_constants(results: Sequence[tuple[str, Table]]) -> dict[str, tuple[float, float]]:
     """Return AbsRel and RMSE (cm) of the scaled constants of one config that differ as text, by their titles.
 
     ``results`` are the method and table of each. The title of a constant has its methods, unless it is the
     only one, or that of complete predictions.
     """
-    found: dict[tuple[str, ...], tuple[float, float | None]] = {}
+    found: dict[tuple[str, ...], tuple[float, float]] = {}
     titles: dict[tuple[str, ...], str] = {}
     for method, table in results:
-        constant = table.reference.scaled_constant
-        if constant.abs_rel is not None:
+        abs_rel, rmse_cm = (table[column.place] for column in SCALED_CONSTANT)
+        if not math.isnan(abs_rel):
             shown, complete = (tuple(texts(columns, table)) for columns in (SCALED_CONSTANT, CONSTANT))
-            found.setdefault(shown, (constant.abs_rel, constant.rmse_cm))
+            found.setdefault(shown, (abs_rel, rmse_cm))
             listed = f"{titles.get(shown, CONSTANT_TITLE)}, {printable(method)}"
             titles[shown] = CONSTANT_TITLE if shown == complete else listed
     return {titles[shown] if len(found) > 1 else CONSTANT_TITLE: errors for shown, errors in found.items()}
 
 
 def reference_rows(results: Sequence[tuple[str, Table]]) -> list[tuple[str, dict[str, str]]]:
-    """Return the name of each reference, and its errors as text by path of the column that they are compared with.
+    """Return the name of each reference, and its errors as text by place of the column to compare them with.
 
     ``results`` are as in ``scaled_constants``.
     """
     rows = [(title, _reference_texts(SCALED, errors)) for title, errors in scaled_constants(results).items()]
-    shifted = [table.reference.one_pixel for _, table in results if table.reference.one_pixel.abs_rel is not None]
-    return rows + [
-        (ONE_PIXEL_TITLE, _reference_texts(NATIVE, (errors.abs_rel, errors.rmse_cm))) for errors in shifted[:1]
-    ]
+    one_pixel = [tuple(table[column.place] for column in ONE_PIXEL) for _, table in results]
+    shifted = [errors for errors in one_pixel if not math.isnan(errors[0])]
+    return rows + [(ONE_PIXEL_TITLE, _reference_texts(NATIVE, errors)) for errors in shifted[:1]]
 
 
-def _reference_texts(columns: Sequence[Column], errors: tuple[float | None, float | None]) -> dict[str, str]:
+def _reference_texts(columns: Sequence[Column], errors: Sequence[float]) -> dict[str, str]:
     shown = zip(with_reference(columns), errors, strict=True)
-    return {column.path: column.text(error) for column, error in shown}
+    return {column.place: column.text(error) for column, error in shown}
 
 
 def paper_reference_rows(results: Sequence[tuple[str, Table]]) -> list[tuple[str, list[str]]]:
     """Return name and cells of each reference for ``PAPER_COLUMNS``, empty where they do not apply."""
     return [
-        (name, [shown.get(column.path, "") for column in PAPER_COLUMNS]) for name, shown in reference_rows(results)
+        (name, [shown.get(column.place, "") for column in PAPER_COLUMNS])
+        for name, shown in reference_rows(results)
     ]
 
 
@@ -294,11 +312,11 @@ def row_name(result: Result, table: Table) -> str:
 def reference_findings(table: Table) -> list[str]:
     """Return a sentence on each error of a table that its reference errors put into perspective."""
     findings = constant_findings(table)
-    native, one_pixel = NATIVE[0], table.reference.one_pixel.abs_rel
-    if table.native and one_pixel and table.native.abs_rel < one_pixel:
+    column, one_pixel = NATIVE[0], table[ONE_PIXEL[0].place]
+    if table[column.place] < one_pixel:
         findings.append(
-            f"The native AbsRel {native.text(table.native.abs_rel)} is below that of exact depth shifted by "
-            f"one pixel ({native.text(one_pixel)}): it is smaller than the differences between neighbouring "
+            f"The native AbsRel {column.text(table[column.place])} is below that of exact depth shifted by "
+            f"one pixel ({column.text(one_pixel)}): it is smaller than the differences between neighbouring "
             "pixels."
         )
     return findings
@@ -317,3 +335,73 @@ def config_title(name: str, split: str | None) -> str:
 def counted(count: int, noun: str) -> str:
     """Return the count and the noun, such as ``1 view`` or ``3 views``."""
     return f"{count} {plural(noun, count)}"
+
+
+def kind_blocks(results: Iterable[Result]) -> list[list[Result]]:
+    """Return the results of each kind; others than metric ones by the aligned errors of their configs."""
+    blocks: dict[str, list[Result]] = {kind: [] for kind in (METRIC, *ALIGNMENT_BY_KIND)}
+    for result in results:
+        blocks[result.kind].append(result)
+    for kind in ALIGNMENT_BY_KIND:
+        blocks[kind].sort(key=lambda result: [sort_error(table) for table in result.tables.values()])
+    return [block for block in blocks.values() if block]
+
+
+def kind_text(result: Result) -> str:
+    """Return the kind of a result that is not metric and how it is aligned, and whether its archive is metric."""
+    declared = f"{result.declared_prediction} predictions, scored as " if result.declared_prediction else ""
+    return f"{declared}{result.kind}{' (--align)' if declared else ''}: {ALIGNMENT_BY_KIND[result.kind]}"
+
+
+def sort_error(table: Table) -> float:
+    """Return the error by which tables are ordered, rounded as in the JSON; 0 if it is undefined."""
+    return rounded(table.error) or 0.0
+
+
+def error_and_constant(table: Table) -> tuple[float, float]:
+    """Return the scaled AbsRel of a table, of a kind that is not metric the aligned error, and a constant's."""
+    if table.kind != METRIC:
+        return table["aligned.error"], table["constant.error"]
+    return table["scaled.abs_rel"], table["reference.scaled_constant.abs_rel"]
+
+
+def constant_margin(table: Table) -> float | None:
+    """Return the share by which the error is below that of a constant, negative if above; None if undefined."""
+    error, constant = error_and_constant(table)
+    if not table.views_scored or not constant or math.isnan(error / constant):
+        return None
+    margin = round(1 - error / constant, SIGNIFICANT_DIGITS) + 0.0  # Neither rounding errors nor -0.0.
+    return margin if math.isfinite(margin) else None
+
+
+LEAST_MARGIN = 0.05
+"""Share by which an error must be below that of a constant; otherwise the predictions say little about depth."""
+
+
+def is_like_constant(table: Table) -> bool:
+    """Return whether the error of a table is not below that of a constant by ``LEAST_MARGIN``."""
+    margin = constant_margin(table)
+    return margin is not None and margin < LEAST_MARGIN
+
+
+def constant_findings(table: Table) -> list[str]:
+    """Return a sentence on each sign that the predictions of a table say little about depth."""
+    findings = []
+    if is_like_constant(table):
+        error, constant = error_and_constant(table)
+        compared = f"{error:.4f} is not below {100 * (1 - LEAST_MARGIN):.0f} % of a constant's ({constant:.4f})"
+        is_low = table["coverage"] < MIN_COMPARABLE_COVERAGE
+        missing = ", or missing values are most of both errors" if is_low else ""
+        findings.append(
+            f"The scaled AbsRel {compared}: a plane at one depth is about as good, or better."
+            if table.kind == METRIC
+            else f"The aligned error {compared}: the fit hides that the predictions say little about "
+            f"depth{missing}."
+        )
+    if table.views_scored and table["flat_views"] > table.views / 2:
+        findings.append(
+            f"In {table['flat_views']:.0f} of {table.views} views the fit has no positive slope and is a "
+            "constant: it hides that the predictions say nothing about depth, or run the other way (depth "
+            "declared as disparity, or disparity as depth)."
+        )
+    return findings

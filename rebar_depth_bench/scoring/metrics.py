@@ -16,7 +16,6 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy import ndarray
 
-from rebar_depth_bench.scoring.columns import METRICS, MetricShare, MetricSize
 from rebar_depth_bench.scoring.protocol import DELTA1_RATIO
 
 _CHUNK_PX = 8192
@@ -32,15 +31,10 @@ class DepthMetrics:
     depth p and true depth z in metres.
     """
 
-    abs_rel: MetricSize
-    rmse_cm: MetricSize
-    mae_cm: MetricSize
-    delta1: MetricShare
-
-    @property
-    def is_finite(self) -> bool:
-        """Whether no error overflowed."""
-        return all(math.isfinite(value) for value in vars(self).values())
+    abs_rel: float
+    rmse_cm: float
+    mae_cm: float
+    delta1: float
 
 
 def depth_metrics(p_m: Float[ndarray, " n"], z_m: Float[ndarray, " n"], scale: float = 1.0) -> DepthMetrics:
@@ -136,23 +130,16 @@ def median(values: Float[ndarray, " n"]) -> float:
     return float(low if low == high else low + (high - low) / 2)
 
 
-def mean(values: Sequence[float]) -> float | None:
-    """Return the correctly rounded mean; None for no values, ``inf`` for non-finite values or on overflow."""
+def mean(values: Sequence[float]) -> float:
+    """Return the correctly rounded mean; NaN for no values, ``inf`` for non-finite values or on overflow."""
     if not values:
-        return None
+        return math.nan
     if not all(math.isfinite(value) for value in values):
         return math.inf
     try:
         return math.fsum(values) / len(values)
     except OverflowError:
         return math.inf
-
-
-def mean_metrics(metrics: Sequence[DepthMetrics]) -> DepthMetrics | None:
-    """Return the mean of each metric over views; None for no views."""
-    means = {name: mean([getattr(of_view, name) for of_view in metrics]) for name in METRICS}
-    defined = {name: value for name, value in means.items() if value is not None}
-    return DepthMetrics(**defined) if defined else None
 
 
 def is_valid_prediction(p_m: Float[ndarray, ...]) -> Bool[ndarray, ...]:

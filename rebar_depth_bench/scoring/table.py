@@ -1,218 +1,187 @@
-"""Tables and scores of views, with their JSON: the numbers of a result.
-
-The classes mirror the JSON, whose keys are their fields. Unknown keys are ignored, because results of later
-versions have more of them.
-"""
+"""Frames of the numbers of views, and the tables that are made of them: means, intervals, groups, JSON."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field, fields, replace
-from functools import cache
-from typing import TYPE_CHECKING, Annotated, Any
+import statistics
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any
 
-from pydantic import (
-    AfterValidator,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    Strict,
-    TypeAdapter,
-    WrapSerializer,
-    create_model,
-)
+import numpy as np
+from jaxtyping import Float64, Int64
+from numpy import ndarray
 
-from rebar_depth_bench.base.errors import InputError, Problem
-from rebar_depth_bench.base.names import SPLITS
-from rebar_depth_bench.base.validation import Expected, field_error, one_of, text, validate_document
-from rebar_depth_bench.scoring.bootstrap import Interval
+from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval, resample_views
 from rebar_depth_bench.scoring.columns import (
     METRICS,
-    RELATIVE_ALIGNMENTS,
-    RELATIVE_INTERVALS,
-    VIEW_COLUMNS,
-    Share,
-    Size,
-    json_as,
-    rounded,
+    REFERENCES,
+    WITHIN,
+    Column,
+    interval_columns,
+    nested,
     rounded_interval,
+    table_columns,
+    view_columns,
 )
-from rebar_depth_bench.scoring.metrics import DepthMetrics
-from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE, WITHIN_MM
-from rebar_depth_bench.scoring.reference import Reference
-
-if TYPE_CHECKING:
-    from pydantic import SerializerFunctionWrapHandler
-
-_NAME_CHARACTERS = 300
-_MAX_ENTRIES = 5000
-"""Largest number of entries of a JSON object whose keys are names."""
-
-
-def _check_length(table: object) -> object:
-    """Return ``table``; raise the error of a field if it has so many entries that their errors take minutes."""
-    if isinstance(table, dict) and len(table) > _MAX_ENTRIES:
-        raise field_error(f"got {len(table)} entries", f"at most {_MAX_ENTRIES}", "size")
-    return table
-
-
-_LIMITED = BeforeValidator(_check_length)
-"""Annotation of a JSON object whose keys are names."""
-Name = Annotated[str, Strict(), text(_NAME_CHARACTERS)]
-Flag = Annotated[bool, Strict()]
-Count = Annotated[int, Strict(), Field(ge=0, lt=1 << 53)]
-
-
-def _all_fields(metrics: DepthMetrics | None, write: SerializerFunctionWrapHandler) -> Any:
-    """Return the JSON object of metrics, whose fields are null without predictions."""
-    return dict.fromkeys((one.name for one in fields(DepthMetrics)), None) if metrics is None else write(metrics)
-
-
-Metrics = Annotated[DepthMetrics | None, WrapSerializer(_all_fields)]
-_WITHIN = Expected(
-    f"a share for each of {', '.join(map(str, WITHIN_MM))} mm", lambda within: within.keys() >= set(WITHIN_MM)
-)
-_KNOWN = AfterValidator(lambda within: {tolerance_mm: within[tolerance_mm] for tolerance_mm in WITHIN_MM})
-
-
-def _write_within(within_mm: Mapping[int, float | None]) -> dict[str, float | None]:
-    return {str(tolerance_mm): rounded(share) for tolerance_mm, share in within_mm.items()}
-
-
-WithinMm = Annotated[
-    Mapping[int, float | None],
-    json_as(Annotated[dict[int, Share | None], _WITHIN, _LIMITED, _KNOWN], dict, _write_within),
-]
-"""Shares of all scored pixels by tolerance in millimetres."""
-
-
-@dataclass(frozen=True)
-class AlignedErrors:
-    """Errors of aligned depth of a view, or their means over views, as ``relative`` defines them.
-
-    ``error`` goes over all scored pixels; the metrics over those with a value, None without any.
-    """
-
-    error: Share
-    abs_rel: Size | None
-    rmse_cm: Size | None
-    mae_cm: Size | None
-    delta1: Share | None
-    within_mm: WithinMm
-
-
-_Bound = Annotated[float, Strict(), Field(allow_inf_nan=False)] | None
-_Ends = tuple[_Bound, _Bound] | None
-_INTERVAL_FIELDS: dict[str, Any] = {
-    column.path.partition(".")[0]: (
-        (Annotated[dict[str, _Ends], _LIMITED], Field({})) if "." in column.path else (_Ends, None)
-    )
-    for column in (*VIEW_COLUMNS, *RELATIVE_INTERVALS)
-}
-_IntervalsJson = create_model("_IntervalsJson", __config__=ConfigDict(extra="ignore"), **_INTERVAL_FIELDS)
-"""Intervals nested like the numbers of a table; a missing one is undefined."""
-
-
-def _flat(nested: Any) -> dict[str, Interval | None]:
-    """Return the interval of each column by its path: of ``RELATIVE_INTERVALS`` if there are any of these."""
-    columns = RELATIVE_INTERVALS if nested.aligned else VIEW_COLUMNS
-    found = {column.path: column.value(vars(nested)) for column in columns}
-    return {path: None if ends is None or None in ends else ends for path, ends in found.items()}
-
-
-def _nested(intervals: Mapping[str, Interval | None]) -> dict[str, Any]:
-    """Return intervals nested like the numbers of a table."""
-    nested: dict[str, Any] = {}
-    for path, ends in intervals.items():
-        group, _, key = path.rpartition(".")
-        (nested.setdefault(group, {}) if group else nested)[key] = rounded_interval(ends)
-    return nested
-
-
-@dataclass(frozen=True)
-class ViewScore:
-    """Metrics of one view; ``scale``, ``native`` and ``scaled`` are None without valid predictions.
-
-    ``scaled_constant`` is that of ``Reference``, None in results that were read from a file. The view of a
-    prediction that is not metric has none of these but those of ``relative.align_view``.
-    """
-
-    view_id: Name
-    scored_px: Count
-    coverage: Share
-    rank_error: Share | None = None
-    scale: Size | None = None
-    native: Metrics = None
-    scaled: Metrics = None
-    within_mm: WithinMm = field(default_factory=lambda: dict.fromkeys(WITHIN_MM))
-    aligned: AlignedErrors | None = None
-    aligned_robust: AlignedErrors | None = None
-    constant: AlignedErrors | None = None
-    is_flat: Flag | None = None
-    scaled_constant: Annotated[
-        tuple[float, float] | None, Field(exclude=True), BeforeValidator(lambda _: None)
-    ] = None
-
-    @property
-    def error(self) -> float:
-        """Rank error, or aligned error, by which views are ordered; 1 without either."""
-        found = self.rank_error if self.aligned is None else self.aligned.error
-        return 1.0 if found is None else found
+from rebar_depth_bench.scoring.groups import GROUPINGS, ViewTraits, positions_by_group
+from rebar_depth_bench.scoring.metrics import mean
+from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE
+from rebar_depth_bench.scoring.view_numbers import ViewTruth
+from rebar_depth_bench.submission.declaration import METRIC, NOT_DECLARED, Declaration
 
 
 @dataclass(frozen=True)
 class PublishedMatch:
     """Scene of Table I that a config shows; ``same_optics`` is False if nothing but the optics differs."""
 
-    scene: Name
-    same_optics: Flag
+    scene: str
+    same_optics: bool
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """Ground truth of the views of a config that have scored pixels, in order.
+
+    ``views`` may read a view when it is taken. ``references`` are the reference errors of each view, by place, and
+    ``traits`` the properties by which views are grouped. ``split`` is that of the views, None in a config of one
+    scene. ``views_per_distance``, ``truth_sigma_m`` and ``published`` are those of ``Table``.
+    """
+
+    view_ids: tuple[str, ...]
+    views: Sequence[ViewTruth]
+    references: Sequence[Mapping[str, float]]
+    traits: Sequence[ViewTraits] = ()
+    split: str | None = None
+    views_per_distance: int | None = None
+    truth_sigma_m: float | None = None
+    published: PublishedMatch | None = None
+
+
+@dataclass(frozen=True)
+class ViewScore:
+    """Numbers of one view by their places in the JSON, as ``view["native.abs_rel"]``; NaN where undefined."""
+
+    view_id: str
+    numbers: Mapping[str, float]
+
+    def __getitem__(self, place: str) -> float:
+        """Return a number; NaN where it is undefined."""
+        return self.numbers.get(place, math.nan)
+
+    def number(self, column: Column) -> float:
+        """Return the number of a column; NaN where it is undefined."""
+        return self[column.in_view]
+
+    def interval(self, column: Column) -> None:
+        """Return None: numbers of single views have no intervals."""
+
+    @property
+    def error(self) -> float:
+        """Rank error, or aligned error, by which views are ordered; 1 without either."""
+        found = self["aligned.error"] if "aligned.error" in self.numbers else self["rank_error"]
+        return 1.0 if math.isnan(found) else found
+
+    def to_dict(self, kind: str) -> dict[str, Any]:
+        """Return the JSON object of the view of a kind of predictions."""
+        document = {"view_id": self.view_id, "scored_px": int(self["scored_px"])}
+        written = nested({one.in_view: one.view_json_value(self) for one in view_columns(kind)})
+        if kind != METRIC:
+            nulls = dict.fromkeys(("rank_error", "scale", "native", "scaled"))
+            written = _relative_object(written, nulls, self["aligned_robust.error"])
+        return document | written
+
+
+def _relative_object(written: dict[str, Any], nulls: Mapping[str, None], robust_error: float) -> dict[str, Any]:
+    """Return the JSON object of a view or table that is not metric, with null for what only metric ones have."""
+    if math.isnan(robust_error):
+        written["aligned_robust"] = None  # Predictions up to a scale have no robust alignment.
+    within = nested({column.place: None for column in WITHIN})
+    return {"coverage": written.pop("coverage"), **nulls, **within, **written}
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """Numbers of the views of a config: float64 columns by place, NaN where a number is undefined."""
+
+    view_ids: tuple[str, ...]
+    columns: Mapping[str, Float64[ndarray, " n"]]
+
+    @classmethod
+    def of_rows(cls, rows: Mapping[str, Mapping[str, float]]) -> Frame:
+        """Return the frame of the numbers of views, by id; a place that is missing in a row is undefined."""
+        places = dict.fromkeys(place for row in rows.values() for place in row)
+        values = {place: [row.get(place, math.nan) for row in rows.values()] for place in places}
+        return cls(tuple(rows), {place: np.array(column, np.float64) for place, column in values.items()})
+
+    def __len__(self) -> int:
+        """Return the number of views."""
+        return len(self.view_ids)
+
+    def __getitem__(self, place: str) -> Float64[ndarray, " n"]:
+        """Return a column; all NaN if no view has the number."""
+        return self.columns[place] if place in self.columns else np.full(len(self), math.nan)
+
+    def take(self, positions: Sequence[int] | Int64[ndarray, " m"]) -> Frame:
+        """Return the views at ``positions``."""
+        at = np.asarray(positions, np.intp)
+        columns = {place: column[at] for place, column in self.columns.items()}
+        return Frame(tuple(self.view_ids[position] for position in at), columns)
+
+    def of_views(self, view_ids: Collection[str]) -> Frame:
+        """Return some of the views, in the order of this frame."""
+        return self.take([place for place, view_id in enumerate(self.view_ids) if view_id in view_ids])
+
+    def views(self) -> Iterator[ViewScore]:
+        """Yield the numbers of each view."""
+        for position, view_id in enumerate(self.view_ids):
+            yield ViewScore(view_id, {place: float(column[position]) for place, column in self.columns.items()})
 
 
 @dataclass(frozen=True, kw_only=True)
 class Table:
-    """Metrics of one config: means over its views, and the median of their scale factors.
+    """Numbers of one config by their places in the JSON, as ``table["native.abs_rel"]``; NaN where undefined.
 
-    ``rank_error`` is None without views; ``reference`` are the config's reference errors,
-    and ``published`` is the scene of the paper's Table I that it shows, if any. ``split`` is None
-    for a config of one scene. ``views_per_distance`` is that of a survey, otherwise None. ``truth_sigma_m`` is the
-    standard deviation of the ground truth's depth, None where it is exact. ``of_views`` is the number of the
-    config's views, None if ``views`` are all. ``intervals`` has the 95 % bootstrap interval of each of
-    ``VIEW_COLUMNS``, None where undefined. A table of predictions that are not metric has the means of
-    ``aligned``, ``aligned_robust`` and ``constant`` instead, with the intervals of ``RELATIVE_INTERVALS``, and the
-    number of views whose fit has no positive slope.
-    ``groups`` has the tables of groups of views by grouping (see ``groups.GROUPINGS``) and group, of a config with
-    splits; they have no groups.
+    They are means over the views that have them, the median of the scale factors, the count of views whose fit has
+    no positive slope, and the reference errors. ``kind`` is that of the predictions. ``intervals`` has the 95 %
+    bootstrap intervals of the columns that have one, None where undefined. ``published`` is the scene of the
+    paper's Table I that the config shows, if any. ``split`` is None for a config of one scene.
+    ``views_per_distance`` is that of a survey, otherwise None. ``truth_sigma_m`` is the standard deviation of the
+    ground truth's depth, None where it is exact. ``of_views`` is the number of the config's views, None if
+    ``views`` are all. ``groups`` has the tables of groups of views by grouping (see ``groups.GROUPINGS``) and
+    group, of a config with splits; they have no groups.
     """
 
-    split: Annotated[str, Strict(), one_of(*SPLITS)] | None = None
-    views_per_distance: Annotated[int, Strict(), Field(ge=1, lt=1 << 53)] | None = None
-    truth_sigma_m: Annotated[float, Strict(), Field(ge=0)] | None = None
-    views: Count
-    of_views: Count | None = None
-    views_scored: Count
-    coverage: Share | None
-    ranked: Flag
-    rank_error: Share | None
-    native: Metrics
-    scaled: Metrics
-    scale_median: Size | None
-    within_mm: WithinMm
-    aligned: AlignedErrors | None = None
-    aligned_robust: AlignedErrors | None = None
-    constant: AlignedErrors | None = None
-    flat_views: Count | None = None
-    reference: Reference
+    kind: str
+    views: int
+    views_scored: int
+    ranked: bool
+    numbers: Mapping[str, float]
+    intervals: Mapping[str, Interval | None]
+    split: str | None = None
+    views_per_distance: int | None = None
+    truth_sigma_m: float | None = None
+    of_views: int | None = None
     published: PublishedMatch | None = None
-    intervals: Annotated[
-        Mapping[str, Interval | None], Field(alias="ci95"), json_as(_IntervalsJson, _flat, _nested)
-    ] = field(default_factory=lambda: dict.fromkeys(column.path for column in VIEW_COLUMNS))
-    groups: dict[Name, dict[Name, _GroupTable]] = field(default_factory=dict)
+    groups: Mapping[str, Mapping[str, Table]] = field(default_factory=dict)
+
+    def __getitem__(self, place: str) -> float:
+        """Return a number; NaN where it is undefined."""
+        return self.numbers.get(place, math.nan)
+
+    def number(self, column: Column) -> float:
+        """Return the number of a column; NaN where it is undefined."""
+        return self[column.place]
+
+    def interval(self, column: Column) -> Interval | None:
+        """Return the interval of the number of a column; None where it is undefined or not finite."""
+        ends = self.intervals.get(column.place)
+        return ends if ends is not None and all(map(math.isfinite, ends)) else None
 
     @property
-    def error(self) -> float | None:
-        """Rank error, or aligned error, by which tables are ordered; None without either."""
-        return self.rank_error if self.aligned is None else self.aligned.error
+    def error(self) -> float:
+        """Rank error, or aligned error, by which tables are ordered; NaN without either."""
+        return self["rank_error"] if self.kind == METRIC else self["aligned.error"]
 
     @property
     def scored_of_views(self) -> str:
@@ -235,96 +204,125 @@ class Table:
         be infinite. Otherwise, missing or enormous predictions could improve the comparison.
         """
         is_complete = 0 < self.views == self.views_scored
-        return is_complete and self.is_finite and (self.coverage or 0.0) >= MIN_COMPARABLE_COVERAGE
+        return is_complete and self.is_finite and self["coverage"] >= MIN_COMPARABLE_COVERAGE
 
     @property
     def is_finite(self) -> bool:
         """Whether there are metrics, and none of them overflowed."""
-        if self.aligned is not None:
-            errors = [getattr(self.aligned, name) for name in METRICS]
-            return all(error is not None and math.isfinite(error) for error in errors)
-        return all(metrics is not None and metrics.is_finite for metrics in (self.native, self.scaled))
+        alignments = ("native", "scaled") if self.kind == METRIC else ("aligned",)
+        return all(math.isfinite(self[f"{alignment}.{name}"]) for alignment in alignments for name in METRICS)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the JSON object of the table."""
+        document: dict[str, Any] = {
+            "split": self.split,
+            "views_per_distance": self.views_per_distance,
+            "truth_sigma_m": self.truth_sigma_m,
+            "views": self.views,
+            "of_views": self.of_views,
+        }
+        document = {key: value for key, value in document.items() if value is not None}
+        columns = (*table_columns(self.kind), *REFERENCES)
+        written = nested({column.place: column.json_value(self) for column in columns})
+        if self.kind != METRIC:
+            nulls = dict.fromkeys(("rank_error", "native", "scaled", "scale_median"))
+            written = _relative_object(written, nulls, self["aligned_robust.error"])
+        document |= {
+            "views_scored": self.views_scored,
+            "coverage": written.pop("coverage"),
+            "ranked": self.ranked,
+            **written,
+            "published": None if self.published is None else asdict(self.published),
+            "ci95": nested({place: rounded_interval(ends) for place, ends in self.intervals.items()}),
+        }
+        if self.groups:
+            document["groups"] = {
+                grouping: {group: table.to_dict() for group, table in tables.items()}
+                for grouping, tables in self.groups.items()
+            }
+        return document
 
 
-def _checked(scores: Any, is_predicted: bool) -> Any:
-    """Return a table or view, without metrics if it has no predictions; raise an error if they lack."""
-    if scores.aligned is not None:
-        return scores
-    if not is_predicted:
-        return replace(scores, native=None, scaled=None)
-    if scores.native is None or scores.scaled is None:
-        raise field_error("native or scaled is null", "metrics where there is a prediction", "conflict")
-    return scores
+def tabulate(frame: Frame, truth: Truth, kind: str = METRIC, declared: Declaration = NOT_DECLARED) -> Table:
+    """Return the table of a config from the numbers of its scored views, with those of groups if it has splits.
 
-
-def _checked_table(table: Table) -> Table:
-    checked: Table = _checked(table, table.views_scored > 0)
-    return replace(checked, ranked=table.ranked and table.rank_error is not None)
-
-
-def _without_absent(table: Table, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-    """Return the JSON object of a table, without the keys that only some tables have."""
-    absent = {
-        "split": table.split is None,
-        "views_per_distance": table.views_per_distance is None,
-        "truth_sigma_m": table.truth_sigma_m is None,
-        "groups": not table.groups,
-        "of_views": table.of_views is None,
-        "flat_views": table.flat_views is None,
-    }
-    return {key: value for key, value in _without_aligned(table, write).items() if not absent.get(key)}
-
-
-def _without_aligned(scores: Any, write: SerializerFunctionWrapHandler) -> dict[str, Any]:
-    """Return the JSON object of a table or view: without the keys of aligned errors, or native and scaled null."""
-    if scores.aligned is not None:
-        return {**write(scores), "native": None, "scaled": None}
-    return {key: value for key, value in write(scores).items() if key not in (*RELATIVE_ALIGNMENTS, "is_flat")}
-
-
-def _without_groups(table: Any) -> Any:
-    """Return the JSON object of a table of a group, which has no groups of its own."""
-    return {key: value for key, value in table.items() if key != "groups"} if isinstance(table, dict) else table
-
-
-TableJson = Annotated[Table, AfterValidator(_checked_table), WrapSerializer(_without_absent)]
-_GroupTable = Annotated[TableJson, BeforeValidator(_without_groups)]
-ViewJson = Annotated[
-    ViewScore,
-    AfterValidator(lambda view: _checked(view, view.coverage > 0)),
-    WrapSerializer(_without_aligned),
-]
-"""Types of a table and of a view in the JSON of a result."""
-
-
-def check_tables(tables: object) -> object:
-    """Return ``tables``; raise the error of a field if they are too many, those of groups included."""
-    count = sum(_group_tables(table) for table in tables.values()) if isinstance(tables, dict) else 0
-    if count > _MAX_ENTRIES:
-        raise field_error(f"got {count} tables of groups", f"at most {_MAX_ENTRIES}", "size")
-    return _check_length(tables)
-
-
-def _group_tables(table: object) -> int:
-    """Return the number of groupings and groups of a table that has not been validated."""
-    groups = table.get("groups") if isinstance(table, dict) else None
-    if not isinstance(groups, dict):
-        return 0
-    return len(groups) + sum(len(of_grouping) for of_grouping in groups.values() if isinstance(of_grouping, dict))
-
-
-@cache
-def _table_type() -> TypeAdapter[Table]:
-    return TypeAdapter(_GroupTable)
-
-
-def read_table(table: Mapping[str, Any]) -> Table:
-    """Return the table of a config from its JSON object, without groups.
-
-    Raises ``InputError`` if it is invalid.
+    The intervals of a config with splits are those of resampled scenes, of a survey those of views, of others
+    those of consecutive views. A config without views is not ranked, and neither are predictions that are not
+    metric, nor a submission that declares the use of ground truth. An infinite metric (of a prediction so large
+    that its square overflows) is written as null; the rank error is always finite.
     """
-    problems: list[Problem] = []
-    found = validate_document(_table_type(), table, problems)
-    if found is None:
-        raise InputError.from_problems("the table of a result", problems)
-    return found
+
+    def table_of(views: Frame) -> Table:
+        of_kind = kind if len(views) else METRIC  # Without views there is nothing of any kind.
+        columns = interval_columns(of_kind)
+        intervals: dict[str, Interval | None] = dict.fromkeys(column.place for column in columns)
+        if len(views):
+            resampling = resample_views(
+                views.view_ids, by_scene=truth.split is not None, views_per_distance=truth.views_per_distance
+            )
+            values = column_values(views, columns)
+            intervals = column_intervals(
+                bootstrap_estimates(values, columns, resampling), values, columns, resampling
+            )
+        return Table(
+            kind=of_kind,
+            views=len(views),
+            views_scored=int(np.count_nonzero(views["coverage"] > 0)),
+            ranked=kind == METRIC and len(views) > 0 and not declared.uses_ground_truth,
+            numbers={one.place: _summary(one, views) for one in (*table_columns(of_kind), *REFERENCES)},
+            intervals=intervals,
+            split=truth.split,
+            views_per_distance=truth.views_per_distance,
+            truth_sigma_m=truth.truth_sigma_m,
+            published=truth.published,
+        )
+
+    table = table_of(frame)
+    if truth.split is None:
+        return table
+    groups = {
+        key: {group: table_of(frame.take(at)) for group, at in positions_by_group(grouping, truth.traits).items()}
+        for key, grouping in GROUPINGS.items()
+    }
+    return replace(table, groups=groups)
+
+
+def _summary(column: Column, views: Frame) -> float:
+    """Return what a table has of a column; NaN without values, inf if one overflowed."""
+    values = views[column.in_view]
+    defined = values[~np.isnan(values)].tolist()
+    if not defined:
+        return math.nan
+    if column.statistic == "median":
+        return float(statistics.median(defined))
+    # Correctly rounded, so that the order of the views has no effect.
+    return float(sum(defined)) if column.statistic == "count" else mean(defined)
+
+
+def column_values(views: Frame, columns: Sequence[Column]) -> Float64[ndarray, "n k"]:
+    """Return the ``columns`` of each view, one row per view; NaN where it has no value."""
+    return np.column_stack([views[column.in_view] for column in columns])
+
+
+def bootstrap_estimates(
+    values: Float64[ndarray, "n k"], columns: Sequence[Column], resampling: Resampling
+) -> Float64[ndarray, "draws k"]:
+    """Return the table's ``columns`` in each resample of ``column_values``; NaN where undefined."""
+    draws = resampling.means(values)
+    for k, column in enumerate(columns):
+        if column.statistic == "median":
+            draws[:, k] = resampling.medians(values[:, k])
+    return draws
+
+
+def column_intervals(
+    estimates: Float64[ndarray, "draws k"],
+    values: Float64[ndarray, "n k"],
+    columns: Sequence[Column],
+    resampling: Resampling,
+) -> dict[str, Interval | None]:
+    """Return the interval of each of ``columns`` from its estimates; ``values`` is NaN where it has none."""
+    return {
+        column.place: interval(estimates[:, k], resampling.blocks(np.flatnonzero(~np.isnan(values[:, k]))))
+        for k, column in enumerate(columns)
+    }

@@ -18,16 +18,17 @@ from numpy import ndarray
 from rebar_depth_bench.base.errors import DatasetError
 from rebar_depth_bench.base.parallel import Progress, silent
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars, with_axis
-from rebar_depth_bench.data.cache import CacheContent, ViewArrays, open_cache
+from rebar_depth_bench.data.cache import ArrayCache, CacheContent, ViewArrays, open_cache
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder
 from rebar_depth_bench.data.rows import EyeTruth, iterate_rows, truth_columns, truth_from_row
 from rebar_depth_bench.data.schema import NEAREST_STEEL, Assembly, Trajectory
+from rebar_depth_bench.scoring.columns import nested, rounded
 from rebar_depth_bench.scoring.groups import ViewTraits, bar_width_px
-from rebar_depth_bench.scoring.metrics import median
+from rebar_depth_bench.scoring.metrics import mean, median
 from rebar_depth_bench.scoring.protocol import PROTOCOL, scored_pixels
-from rebar_depth_bench.scoring.reference import UNDEFINED, Reference, mean_reference, view_reference
-from rebar_depth_bench.scoring.score import Truth, ViewTruth
-from rebar_depth_bench.scoring.table import PublishedMatch
+from rebar_depth_bench.scoring.reference import REFERENCE_PLACES, UNDEFINED, references, view_reference
+from rebar_depth_bench.scoring.table import PublishedMatch, Truth
+from rebar_depth_bench.scoring.view_numbers import ViewTruth
 
 _REFERENCE = slice(1, 5)
 """Places of ``view_reference`` among the cached numbers: after the median depth, before the bar width, if any."""
@@ -58,15 +59,14 @@ def config_truth(folder: DatasetFolder, config: DatasetConfig, progress: Progres
     )
     cache = open_cache(content, progress)
     families = {scene.name: scene.family for scene in config.scenes}
-    references, traits = [], []
+    traits = []
     for view_id, numbers in zip(cache.view_ids, cache.numbers, strict=True):
         width_px = numbers[-1] if has_widths and numbers[-1] != UNDEFINED else None
-        references.append(numbers[_REFERENCE])
         traits.append(ViewTraits(families[config.scene_by_view[view_id]], numbers[0], width_px))
     return Truth(
         view_ids=cache.view_ids,
-        read=lambda position: _view_truth(cache.view(position)),
-        references=references,
+        views=_CachedViews(cache),
+        references=[references(numbers[_REFERENCE]) for numbers in cache.numbers],
         traits=traits,
         split=config.scenes[0].split if config.has_splits else None,
         views_per_distance=config.views_per_distance,
@@ -75,9 +75,19 @@ def config_truth(folder: DatasetFolder, config: DatasetConfig, progress: Progres
     )
 
 
-def _view_truth(view: ViewArrays) -> ViewTruth:
-    median_m, abs_rel, rmse_cm, *_ = view.numbers
-    return ViewTruth(view.view_id, view.arrays["index"], view.arrays["depth_m"], median_m, (abs_rel, rmse_cm))
+@dataclass(frozen=True)
+class _CachedViews(Sequence[ViewTruth]):
+    """Views of a config, each read from the cache when it is taken."""
+
+    cache: ArrayCache
+
+    def __len__(self) -> int:
+        return len(self.cache)
+
+    def __getitem__(self, position: int) -> ViewTruth:  # type: ignore[override]  # No slices.
+        view = self.cache.view(position)
+        median_m, abs_rel, rmse_cm, *_ = view.numbers
+        return ViewTruth(view.view_id, view.arrays["index"], view.arrays["depth_m"], median_m, (abs_rel, rmse_cm))
 
 
 def _diameters_by_scene(folder: DatasetFolder) -> dict[str, dict[int, float]]:
@@ -86,13 +96,19 @@ def _diameters_by_scene(folder: DatasetFolder) -> dict[str, dict[int, float]]:
     return {name: {bar.bar_id: bar.diameter_m for bar in with_axis(bars)} for name, bars in scenes.items()}
 
 
-def reference_errors(config: DatasetConfig) -> Reference:
-    """Return the reference errors of a config, computed from its rows without the cache.
+def reference_errors(config: DatasetConfig) -> dict[str, dict[str, float | None]]:
+    """Return the reference errors of a config as a JSON object, computed from its rows without the cache.
 
     Raises ``DatasetError`` as ``config_truth``.
     """
-    views = _extract_views(config, None)
-    return mean_reference([view.numbers[_REFERENCE] for view in views])
+    views = [references(view.numbers[_REFERENCE]) for view in _extract_views(config, None)]
+    means = {
+        place.removeprefix("reference."): rounded(
+            mean([view[place] for view in views if not math.isnan(view[place])])
+        )
+        for place in REFERENCE_PLACES
+    }
+    return nested(means)
 
 
 def cache_inputs(config: DatasetConfig, protocol: str, extra_digest: str = "") -> dict[str, Any]:
@@ -158,7 +174,7 @@ def _extract_views(
         if len(pixels):
             depth_m = left.depth_m.ravel()[pixels]
             median_m = median(depth_m)
-            numbers = (median_m, *view_reference(left.depth_m, pixels, median_m))
+            numbers: tuple[float, ...] = (median_m, *view_reference(left.depth_m, pixels, median_m))
             if diameters is not None:
                 known_m = diameters.get(config.scene_by_view[view_id], {})
                 assert left.bars is not None

@@ -123,8 +123,8 @@ class SubmissionWriter:
     def write_map(self, view_id: str, array: Float[ndarray, "h w"], seconds: float | None = None) -> None:
         """Store a map that ``depth_map`` returned, as ``add`` does; the caller has checked the other arguments."""
         assert self._zip is not None
-        with np.errstate(over="ignore", under="ignore"):
-            values = np.ascontiguousarray(array, "<f2" if array.dtype.itemsize == 2 else "<f4")
+        assert self._file is not None
+        values = stored_map(array)
         with self._lock:
             if view_id in self._view_ids:
                 raise InputError(f"{view_id}: the view was added twice, expected once")
@@ -132,6 +132,7 @@ class SubmissionWriter:
             self._view_ids.add(view_id)
             if seconds is not None:
                 self._seconds[view_id] = float(seconds)
+            self._file.flush()  # A process that is forked now has nothing left to write.
 
     def __enter__(self) -> Self:
         if not self.path.parent.is_dir():
@@ -210,6 +211,12 @@ def depth_map(
         hint = resize_hint(array.shape, grid) if grid and array.dtype.kind == "f" else ""
         raise error(f"{what} {found}, expected an array of floats of shape {grid or '(H, W)'}{hint}")
     return np.asarray(array)
+
+
+def stored_map(array: Float[ndarray, "h w"]) -> Depth:
+    """Return a map as archives store it: float16, or float32 with values out of its range infinite."""
+    with np.errstate(over="ignore", under="ignore"):
+        return np.ascontiguousarray(array, "<f2" if array.dtype.itemsize == 2 else "<f4")
 
 
 def _npy_header(values: Depth) -> bytes:

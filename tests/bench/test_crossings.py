@@ -21,7 +21,7 @@ from numpy import ndarray
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.bar_crossings.definition import MAX_GAP_M, Crossings, crossing_parameters, scene_crossings
-from rebar_depth_bench.bar_crossings.table import (
+from rebar_depth_bench.bar_crossings.crossings_file import (
     CROSSINGS_SCHEMA,
     CrossingsSource,
     folder_crossings,

@@ -23,7 +23,7 @@ from rebar_depth_bench.base.errors import InputError, SubmissionError
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.detections.reading import MAX_ROWS_PER_VIEW, read_detections
-from rebar_depth_bench.detections.result import RankedDetections, ViewDetections, tabulate_detections
+from rebar_depth_bench.detections.tables import RankedDetections, ViewDetections, tabulate_detections
 from rebar_depth_bench.detections.score import (
     SeenDetections,
     compare_view,

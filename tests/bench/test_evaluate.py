@@ -21,7 +21,7 @@ import pytest
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.scoring.result import read_result
+from rebar_depth_bench.scoring.reading import read_result
 from tests.bench.reporting.pages import Page
 
 Truth = dict[str, np.ndarray]
@@ -122,11 +122,11 @@ def test_every_display_has_the_same_summary(
     constant = table.reference.scaled_constant.abs_rel
     assert constant is not None
     coverage = math.floor(1000 * table.coverage) / 10
-    margin = math.floor(1000 * (1 - table.scaled.abs_rel / constant)) / 10
+    margin = math.floor(1000 * (1 - table["scaled.abs_rel"] / constant)) / 10
     for display, text in displays.items():
         shown = " ".join(text.split())
         for words in (
-            *(f"{coverage:.1f}", f"{table.rank_error:.4f}", f"{constant:.4f}", f"{margin:.1f} %"),
+            *(f"{coverage:.1f}", f"{table['rank_error']:.4f}", f"{constant:.4f}", f"{margin:.1f} %"),
             *("ground truth: used, as declared", f"coverage {coverage:.1f} % is below 95 %"),
             *("Not ranked: the submission declares", "possible mistake: ", "in millimetres"),
         ):

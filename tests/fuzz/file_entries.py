@@ -20,7 +20,7 @@ from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.captures.calibration_files import read_calibration
 from rebar_depth_bench.captures.camera_files import read_cameras
 from rebar_depth_bench.captures.views import open_capture
-from rebar_depth_bench.scoring.result import read_result
+from rebar_depth_bench.scoring.reading import read_result
 from rebar_depth_bench.submission.declaration import parse_metadata
 from rebar_depth_bench.submission.entries import FORMATS
 from tests.bench.captures import calibration_files as pair

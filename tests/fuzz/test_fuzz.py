@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from rebar_depth_bench.base.errors import InputError, Problem, RebarDepthError
-from rebar_depth_bench.scoring.result import read_result
+from rebar_depth_bench.scoring.reading import read_result
 from tests.bench.reporting.results import result, scored_view
 from tests.fuzz.__main__ import table, write_log
 from tests.fuzz.cases import ENTRY_POINTS, Outcome, number_of_cases

@@ -14,7 +14,7 @@ import pytest
 
 from rebar_depth_bench.reporting.tables import comparison_cells
 from rebar_depth_bench.scoring.comparison import compare
-from rebar_depth_bench.scoring.result import read_result
+from rebar_depth_bench.scoring.reading import read_result
 from tests.bench.reporting.pages import Page
 from tests.leaderboard.boards import OTHER_DIGEST
 from tests.leaderboard.conftest import HOSTILE, LINKS, SharedServer, WriteArchive

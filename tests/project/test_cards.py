@@ -27,7 +27,7 @@ from dataset_builder.catalog.named_configs import CONFIGS, SWEEPS
 from dataset_builder.specs.config_specs import DomeSpec
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.schema import CENTRE, NEAREST_STEEL, features
-from rebar_depth_bench.extended.registry import MEASURE_FAMILIES
+from rebar_depth_bench.extended.families import MEASURE_FAMILIES
 from rebar_depth_bench.methods import own_methods
 from tests.conftest import TINY_DATASET
 

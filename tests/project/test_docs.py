@@ -26,7 +26,7 @@ from dataset_builder.importing import import_layout
 from dataset_builder.scene.variants.registry import VARIANTS
 from dataset_builder.user_files.scene_schema import read_scene_toml
 from leaderboard.cli import argument_parser as board_parser
-from rebar_depth_bench.bar_crossings.table import CROSSINGS_SCHEMA
+from rebar_depth_bench.bar_crossings.crossings_file import CROSSINGS_SCHEMA
 from rebar_depth_bench.cli.main import argument_parser as bench_parser
 from rebar_depth_bench.cli.main import main as bench_main
 from rebar_depth_bench.data.bars import BARS_SCHEMA

@@ -19,10 +19,10 @@ from rebar_depth_bench.remote.models import (
     OverallRow,
     SubmissionOfRow,
 )
-from rebar_depth_bench.scoring.columns import TABLE_COLUMNS
-from rebar_depth_bench.scoring.frames import csv_text
+from rebar_depth_bench.scoring.columns import at_place
 from rebar_depth_bench.scoring.protocol import PROTOCOL
-from rebar_depth_bench.submission.declaration import InputClass
+from rebar_depth_bench.scoring.spreadsheet import csv_text, table_places
+from rebar_depth_bench.submission.declaration import METRIC, InputClass
 
 
 def entries_to_csv(rows: Sequence[LeaderboardEntry]) -> str:
@@ -31,16 +31,16 @@ def entries_to_csv(rows: Sequence[LeaderboardEntry]) -> str:
     Undefined numbers are empty cells.
     """
     header = ["rank", "class_rank", "id", "method", "submitter", "baseline", "inputs", "uses_ground_truth"]
-    columns = [column.name for column in TABLE_COLUMNS]
+    places = table_places(METRIC)
     cells = (
         [
             *(row.rank, row.class_rank, row.id, row.method, row.submitter, row.baseline, row.inputs),
             *(row.uses_ground_truth, row.declared.get("seconds_per_view"), row.config),
-            *(column.value(row.table) for column in TABLE_COLUMNS),
+            *(at_place(row.table, place) for place in places.values()),
         ]
         for row in rows
     )
-    return csv_text([[*header, "seconds_per_view", "config", *columns], *cells])
+    return csv_text([[*header, "seconds_per_view", "config", *places], *cells])
 
 
 router = APIRouter(prefix="/api/v1", tags=["leaderboard"], responses=errors(503))

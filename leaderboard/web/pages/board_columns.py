@@ -10,7 +10,7 @@ from typing import Any
 
 from leaderboard.db.rankings import LeaderboardEntry
 from rebar_depth_bench.scoring import columns
-from rebar_depth_bench.scoring.columns import Cell, Column
+from rebar_depth_bench.scoring.columns import Cell, Column, at_place
 
 RANK, METHOD = "rank", "method"
 
@@ -43,7 +43,7 @@ class BoardColumn:
     def value(self, entry: LeaderboardEntry) -> Any:
         """Return the value of a submission's row by which rows are sorted; None if it has none."""
         if self.number is not None:
-            return self.number.value(entry.declared if self.number is RUNTIME else entry.table)
+            return at_place(entry.declared if self.number is RUNTIME else entry.table, self.number.place)
         return entry.rank if self.name == RANK else entry.method.casefold()
 
     def cell(self, entry: LeaderboardEntry) -> Cell:

@@ -21,7 +21,7 @@ from rebar_depth_bench.data.rows import iterate_rows
 from rebar_depth_bench.reporting.published import OTHER_OPTICS_NOTE, load_published
 from rebar_depth_bench.scoring.columns import PAPER_COLUMNS
 from rebar_depth_bench.scoring.formatting import interval_note, reference_rows
-from rebar_depth_bench.scoring.table import read_table
+from rebar_depth_bench.scoring.reading import read_table
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 
@@ -67,7 +67,7 @@ def config_table(ranking: Ranking, config: str, selection: Selection, page_rows:
     """Return the table of a config for the template: the selected rows, ``page_rows`` on a page, and the others.
 
     ``lines`` are the submitted rows with their parsed tables. ``references`` are the rows of reference errors and
-    ``published`` those of the paper, each with its name and its texts by path of the number; ``distance`` is the
+    ``published`` those of the paper, each with its name and its texts by place of the number; ``distance`` is the
     paper's camera distance.
     """
     page = selection.page_of(selection.sorted(filter(selection.matches, ranking.entries)), page_rows)
@@ -86,7 +86,7 @@ def config_table(ranking: Ranking, config: str, selection: Selection, page_rows:
     if match is not None and scene is not None:
         table["distance"] = scene.distance if match.same_optics else f"{scene.distance} {OTHER_OPTICS_NOTE}"
         for row in scene.rows:
-            texts = {column.path: text for column, text in zip(PAPER_COLUMNS, row.cells, strict=True)}
+            texts = {column.place: text for column, text in zip(PAPER_COLUMNS, row.cells, strict=True)}
             anchor = " (median-anchored to ground truth)" if row.median_anchored else ""
             table["published"].append((row.method + anchor, texts))
     return table

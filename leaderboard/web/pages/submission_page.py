@@ -27,7 +27,7 @@ from rebar_depth_bench.reporting.html.views import worst_first
 from rebar_depth_bench.reporting.tables import COMPARISON_NOTE, comparison_cells, views_note
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.formatting import counted
-from rebar_depth_bench.scoring.result import read_result
+from rebar_depth_bench.scoring.reading import read_result
 
 router = APIRouter(include_in_schema=False, default_response_class=HTMLResponse)
 

@@ -24,7 +24,7 @@ from jaxtyping import Bool, Float32, Float64, Int64, UInt8
 from numpy import ndarray
 
 from rebar_depth_bench.base.errors import MethodError
-from rebar_depth_bench.base.parallel import Progress, map_with_progress
+from rebar_depth_bench.base.parallel import Progress, map_in_threads
 from rebar_depth_bench.base.writing import write_bytes
 from rebar_depth_bench.geometry.cameras import camera_centre, inverse_rigid, pixel_rays, project, transform
 from rebar_depth_bench.methods.multiview.sfm import LeftImages, SparseReconstruction
@@ -358,7 +358,7 @@ def plane_sweep_depth(
             write_bytes(path, content.getvalue())
 
     names = list(reconstruction.cam_from_sfm)
-    map_with_progress(store_depth, names, None, progress, "plane sweep", len(names))
+    list(map_in_threads(store_depth, names, "plane sweep", progress=progress))
 
     def read(name: str) -> Float32[ndarray, "h w"]:
         poses = reconstruction.cam_from_sfm

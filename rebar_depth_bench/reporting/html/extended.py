@@ -13,6 +13,7 @@ from numpy import ndarray
 
 from rebar_depth_bench.base.errors import printable
 from rebar_depth_bench.data.manifest import DatasetConfig
+from rebar_depth_bench.data.rows import iterate_rows
 from rebar_depth_bench.extended.crossings import (
     BINNED_MEASURES,
     MAIN_MEASURES,
@@ -20,8 +21,10 @@ from rebar_depth_bench.extended.crossings import (
     fitted_ties,
     view_crossings,
 )
+from rebar_depth_bench.extended.estimates import ExtendedResult, ExtendedTable, MeasureEstimate
+from rebar_depth_bench.extended.families import MEASURE_FAMILIES
 from rebar_depth_bench.extended.fits import MISS_MM
-from rebar_depth_bench.extended.ground_truth import has_bar_ids, steel_truth
+from rebar_depth_bench.extended.ground_truth import has_bar_ids, load_steel_truth
 from rebar_depth_bench.extended.inspection import (
     INSPECTION_MEASURES,
     PROFILES,
@@ -41,8 +44,6 @@ from rebar_depth_bench.extended.measures import (
 from rebar_depth_bench.extended.point_cloud import TOLERANCES_MM
 from rebar_depth_bench.extended.profiles import AXES, bins
 from rebar_depth_bench.extended.reach import ReachBin
-from rebar_depth_bench.extended.registry import MEASURE_FAMILIES
-from rebar_depth_bench.extended.result import ExtendedResult, ExtendedTable, MeasureEstimate
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.geometry.cameras import fold_radius, project, transform
 from rebar_depth_bench.reporting.charts import ProfileBin, profile_chart
@@ -58,7 +59,7 @@ from rebar_depth_bench.reporting.extended_tables import (
 from rebar_depth_bench.reporting.html.views import backdrop_image
 from rebar_depth_bench.scoring.bootstrap import Interval
 from rebar_depth_bench.scoring.columns import DASH, Cell, Column
-from rebar_depth_bench.scoring.evaluation import Evaluation, View
+from rebar_depth_bench.scoring.evaluation import Evaluation
 
 _TITLE_NUMBER = re.compile(r"\d[\d.]*(?:-[\d.]+)?(?= (?:mm|%|m|px|degrees)(?!\w))")
 """Tolerance, threshold or bin in a measure's title: a number followed by a unit."""
@@ -321,44 +322,34 @@ def _crossing_config(name: str, table: ExtendedTable, picture: CrossingPicture |
     )
 
 
-@dataclass(frozen=True, eq=False)
-class CrossingView:
-    """View of a config that is pictured with its crossings: the one with most judged crossings."""
-
-    position: int
-    truth: SteelTruth
-
-    def picture(self, view: View) -> CrossingPicture:
-        """Return the picture of the view, which has colour, depth and mask of the left camera."""
-        truth, scene, crossings = self.truth, self.truth.bars.crossings, view_crossings(self.truth)
-        is_located, ties = fitted_ties(aligned_predictions(view.prediction_m, truth, None)[NATIVE], crossings)
-        with np.errstate(invalid="ignore", over="ignore"):
-            error_mm = 1000 * np.linalg.norm(ties.tie_point_m - crossings.ties.tie_point_m, axis=1)
-        kinds = dict.fromkeys(range(len(scene)), "unjudged")
-        kinds |= dict.fromkeys(truth.judged.crossing.tolist(), "bent")
-        located = zip(crossings.crossing.tolist(), is_located.tolist(), error_mm.tolist(), strict=True)
-        kinds |= {crossing: error_kind(error) if found else "missed" for crossing, found, error in located}
-        marks = list(_marks(truth, scene.crossings.tie_point_m, kinds))
-        found = [kind for kind, _, _ in marks]
-        return CrossingPicture(
-            view_id=truth.view_id,
-            image=backdrop_image(*(view.cell(f"left_{kind}") for kind in ("rgb", "depth", "mask"))),
-            width=truth.width,
-            height=truth.height,
-            marks=marks,
-            counts=[(kind, text, found.count(kind)) for kind, text in _KINDS.items() if kind in found],
-        )
-
-
-def crossing_view(evaluation: Evaluation, config: DatasetConfig) -> CrossingView | None:
-    """Return the view of a config that is pictured, None if it has no crossings."""
+def crossing_picture(evaluation: Evaluation, config: DatasetConfig) -> CrossingPicture | None:
+    """Return the view of a config with most judged crossings, with all of its crossings; None if it has none."""
     if not has_bar_ids(config):
         return None
-    steel = steel_truth(evaluation, config)
+    steel = load_steel_truth(evaluation.folder, config)
     if not any(len(bars.crossings) for bars in steel.bars_by_view.values()) or not len(steel):
         return None
     truth = steel.view(int(np.argmax(steel.judged_counts)))
-    return CrossingView(config.view_ids.index(truth.view_id), truth)
+    scene, crossings = truth.bars.crossings, view_crossings(truth)
+    prediction_m = evaluation.submission.read(truth.view_id)
+    is_located, ties = fitted_ties(aligned_predictions(prediction_m, truth, None)[NATIVE], crossings)
+    with np.errstate(invalid="ignore", over="ignore"):
+        error_mm = 1000 * np.linalg.norm(ties.tie_point_m - crossings.ties.tie_point_m, axis=1)
+    kinds = dict.fromkeys(range(len(scene)), "unjudged")
+    kinds |= dict.fromkeys(truth.judged.crossing.tolist(), "bent")
+    located = zip(crossings.crossing.tolist(), is_located.tolist(), error_mm.tolist(), strict=True)
+    kinds |= {crossing: error_kind(error) if found else "missed" for crossing, found, error in located}
+    marks = list(_marks(truth, scene.crossings.tie_point_m, kinds))
+    found = [kind for kind, _, _ in marks]
+    [row] = iterate_rows(config, ("left_rgb", "left_depth", "left_mask"), [truth.view_id])
+    return CrossingPicture(
+        view_id=truth.view_id,
+        image=backdrop_image(row["left_rgb"], row["left_depth"], row["left_mask"]),
+        width=truth.width,
+        height=truth.height,
+        marks=marks,
+        counts=[(kind, text, found.count(kind)) for kind, text in _KINDS.items() if kind in found],
+    )
 
 
 def error_kind(error_mm: float) -> str:

@@ -8,23 +8,24 @@ views to show and loads their images.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from jaxtyping import Float
 from markupsafe import Markup
+from numpy import ndarray
 
 from rebar_depth_bench.base.errors import printable
-from rebar_depth_bench.base.names import config_of
 from rebar_depth_bench.base.writing import write_output
-from rebar_depth_bench.diagnosis.corrections import COLUMNS, diagnosed_view, positions_to_read
-from rebar_depth_bench.diagnosis.diagnose import PossibleMistake, diagnose_config
+from rebar_depth_bench.data.rows import iterate_rows
+from rebar_depth_bench.diagnosis.diagnose import PossibleMistake
 from rebar_depth_bench.reporting import charts
 from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS
 from rebar_depth_bench.reporting.html.assets import environment, inline_script
 from rebar_depth_bench.reporting.html.views import (
-    VIEWS_SHOWN,
     ShownView,
     ViewPanels,
     colour_bar_uri,
@@ -35,11 +36,11 @@ from rebar_depth_bench.reporting.html.views import (
 )
 from rebar_depth_bench.reporting.published import OTHER_OPTICS_NOTE, load_published, paper_scenes
 from rebar_depth_bench.scoring import formatting
-from rebar_depth_bench.scoring.columns import ALIGNED, ALIGNED_CONSTANT, ALIGNED_ROBUST, VIEW_COLUMNS, has_dash
-from rebar_depth_bench.scoring.evaluation import Evaluation, View
+from rebar_depth_bench.scoring.columns import ALIGNED, ALIGNED_CONSTANT, ALIGNED_ROBUST, METRIC_COLUMNS
+from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.scoring.groups import GROUPINGS
 from rebar_depth_bench.scoring.protocol import scored_pixels
-from rebar_depth_bench.scoring.relative import aligned_depth, kind_text, metric_as
+from rebar_depth_bench.scoring.relative import aligned_depth, metric_as
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.table import Table, ViewScore
 from rebar_depth_bench.submission.declaration import METRIC
@@ -102,6 +103,7 @@ def render_report(
             policy=script.policy,
             mistakes=[printable(mistake.text, _MISTAKE_CHARACTERS) for mistake in mistakes],
             kind=result.prediction,
+            has_archive=result.submission.sha256 is not None,
             **content,
         )
     )
@@ -128,7 +130,7 @@ def relative_context(result: Result, views: Mapping[str, Sequence[ViewScore]]) -
     return {
         **_tables_context(result),
         "group_note": formatting.ALIGNED_GROUP_NOTE,
-        "kind_text": kind_text(result),
+        "kind_text": formatting.kind_text(result),
         "alignments": {"aligned": ALIGNED, "robust": ALIGNED_ROBUST, "constant": ALIGNED_CONSTANT},
         "aligned_note": formatting.ALIGNED_NOTE,
         "view_columns": (*ALIGNED[:5], ALIGNED[6], *robust, *ALIGNED_CONSTANT[:2]),
@@ -138,7 +140,7 @@ def relative_context(result: Result, views: Mapping[str, Sequence[ViewScore]]) -
 
 def _tables_context(result: Result) -> dict[str, object]:
     rows = [(formatting.config_title(name, table.split), table) for name, table in result.tables.items()]
-    has_intervals = any(column.interval(table) for _, table in rows for column in result.columns)
+    has_intervals = any(table.interval(column) for _, table in rows for column in result.columns)
     return {
         "rows": rows,
         "row_notes": [
@@ -146,7 +148,7 @@ def _tables_context(result: Result) -> dict[str, object]:
             for name, table in rows
             for note in (*formatting.table_notes(table), *formatting.reference_findings(table))
         ],
-        "dash_in_results": any(has_dash(result.columns, table) for table in result.tables.values()),
+        "dash_in_results": formatting.has_dash(result),
         "interval_note": formatting.interval_note(result.tables.values()) if has_intervals else "",
         "groups": [(name, _groupings(table)) for name, table in rows if any(table.groups.values())],
     }
@@ -214,7 +216,12 @@ def views_context(
         )
         for name, scores in views.items()
     ]
-    undefined = any(has_dash(VIEW_COLUMNS, view) for config in configs for view in config.worst)
+    undefined = any(
+        not math.isfinite(view[column.in_view])
+        for config in configs
+        for view in config.worst
+        for column in METRIC_COLUMNS
+    )
     return {"configs": configs, "dash_in_views": undefined}
 
 
@@ -225,95 +232,66 @@ def _provenance(result: Result) -> list[tuple[str, str]]:
         ("Ground truth", formatting.ground_truth_text(result.declared)),
         ("Dataset version", printable(result.dataset.version)),
         ("Dataset digest", printable(result.dataset.digest)),
-        ("Archive sha256", printable(result.submission.sha256.removeprefix("sha256:"))),
+        ("Archive sha256", printable(result.submission.sha256 or "none")),
         ("Software", f"rebar-depth-bench {printable(result.software.version)}"),
     ]
 
 
 def views_by_config(result: Result) -> Mapping[str, list[ViewScore]]:
-    """Return the view scores by config, in protocol order."""
-    views: dict[str, list[ViewScore]] = {name: [] for name in result.tables}
-    for view in result.views:
-        views.setdefault(config_of(view.view_id), []).append(view)
-    return views
+    """Return the numbers of the views of each config, in their order."""
+    return {name: list(frame.views()) for name, frame in result.frames.items()}
 
 
-_COLUMNS = ("left_rgb", "left_depth", "left_mask")
-
-
-@dataclass(frozen=True)
-class LookedAt:
-    """What was found in views of a submission: mistakes, encoded images, and pictures of crossings by config."""
-
-    mistakes: Sequence[PossibleMistake] = ()
-    shown: Sequence[ShownView] = ()
-    pictures: Mapping[str, CrossingPicture] = field(default_factory=dict)
-
-
-def look_at_views(
-    evaluation: Evaluation,
-    chosen: Mapping[str, Sequence[ViewScore]],
-    *,
-    crossings: bool = False,
-    kind: str = METRIC,
-) -> LookedAt:
-    """Diagnose a submission and encode the images of the chosen views, by config, decoding each view once.
-
-    ``kind`` is that of the scores; the images of a kind that is not metric show aligned depth.
-    With ``crossings``, one view of each config that has any is pictured with its crossings. Only the rows of these
-    views are read, and one is in memory at a time. Raises ``EntryError`` and ``DatasetError`` for entries and
-    shards that scoring refuses.
-    """
-    mistakes: list[PossibleMistake] = []
-    shown: list[ShownView] = []
-    pictures: dict[str, CrossingPicture] = {}
-    for config in evaluation.configs:
-        scores = {view.view_id: view for view in chosen.get(config.name, ())}
-        positions = {position for position, view_id in enumerate(config.view_ids) if view_id in scores}
-        diagnosed_at = positions_to_read(config)
-        pictured = None
-        if crossings:
-            from rebar_depth_bench.reporting.html.extended import crossing_view
-
-            pictured = crossing_view(evaluation, config)
-        wanted = {*positions, *diagnosed_at, *({pictured.position} if pictured else ())}
-        columns = dict.fromkeys((*_COLUMNS, *(COLUMNS if diagnosed_at else ())))
-        diagnosed = []
-        for view in evaluation.views(config, tuple(columns), wanted):
-            if view.position in diagnosed_at:
-                diagnosed.append(diagnosed_view(view))
-            if view.position in positions:
-                shown.append(shown_view(view_panels(view, scores[view.view_id], evaluation.meta.prediction, kind)))
-            if pictured and view.position == pictured.position:
-                pictures[config.name] = pictured.picture(view)
-        mistakes += diagnose_config(config, diagnosed, evaluation.submission)
-    return LookedAt(mistakes, shown, pictures)
+_COLUMNS = ("view_id", "left_rgb", "left_depth", "left_mask")
 
 
 def write_report(
-    result: Result, evaluation: Evaluation, target: Path, *, views_shown: int = VIEWS_SHOWN
-) -> Sequence[PossibleMistake]:
-    """Write the HTML report of ``result``, the scores of the submission of ``evaluation``; return its mistakes.
+    result: Result,
+    mistakes: Sequence[PossibleMistake],
+    evaluation: Evaluation | None,
+    target: Path,
+    *,
+    views_shown: int,
+) -> None:
+    """Write the HTML report of ``result``; ``evaluation`` is of its submission, None without an archive.
 
     Up to ``views_shown`` views of each config are shown with images: the worst by rank error, or by aligned error,
-    then evenly spaced down to the best. Raises ``InputError`` if ``views_shown`` is negative.
+    then evenly spaced down to the best. Without an archive there are none. Only the rows of these views are read,
+    and one is in memory at a time. Raises ``InputError`` if ``views_shown`` is negative, and ``EntryError`` and
+    ``DatasetError`` for entries and shards that scoring refuses.
     """
-    views = views_by_config(result).items()
-    chosen = {name: views_to_show(of_config, views_shown) for name, of_config in views}
-    found = look_at_views(evaluation, chosen, crossings=result.extended is not None, kind=result.kind)
-    write_output(target, render_report(result, found.shown, found.mistakes, found.pictures))
-    return found.mistakes
+    chosen = {name: views_to_show(views, views_shown) for name, views in views_by_config(result).items()}
+    shown: list[ShownView] = []
+    pictures: dict[str, CrossingPicture] = {}
+    if evaluation is None:
+        write_output(target, render_report(result, shown, mistakes, pictures))
+        return
+    for config in evaluation.configs:
+        scores = {view.view_id: view for view in chosen[config.name]}
+        for row in iterate_rows(config, _COLUMNS, scores) if scores else ():
+            prediction = evaluation.submission.read(row["view_id"])
+            panels = view_panels(row, prediction, scores[row["view_id"]], evaluation.meta.prediction, result.kind)
+            shown.append(shown_view(panels))
+        if result.extended is not None:
+            from rebar_depth_bench.reporting.html.extended import crossing_picture
+
+            picture = crossing_picture(evaluation, config)
+            if picture is not None:
+                pictures[config.name] = picture
+    write_output(target, render_report(result, shown, mistakes, pictures))
 
 
-def view_panels(view: View, score: ViewScore, declared: str, kind: str) -> ViewPanels:
-    """Return the arrays of a view that are rendered.
+def view_panels(
+    row: Mapping[str, Any], prediction: Float[ndarray, "h w"], score: ViewScore, declared: str, kind: str
+) -> ViewPanels:
+    """Return the arrays of a view that are rendered; ``row`` is its decoded row.
 
     Predictions that are scored as a ``kind`` that is not metric are shown as aligned depth; ``declared`` is their
     own kind.
     """
-    truth_m, mask, depth_m = view.cell("left_depth"), view.cell("left_mask"), view.prediction_m
+    truth_m, mask = row["left_depth"], row["left_mask"]
     steel = truth_m > 0 if mask is None else mask
     if kind != METRIC:
-        values = depth_m if kind == declared else metric_as(depth_m, kind)
-        depth_m = aligned_depth(values, truth_m, scored_pixels(steel, truth_m), kind)
-    return ViewPanels(view.cell("left_rgb"), truth_m, depth_m, steel, score)
+        values = prediction if kind == declared else metric_as(prediction, kind)
+        prediction = aligned_depth(values, truth_m, scored_pixels(steel, truth_m), kind)
+    return ViewPanels(row["left_rgb"], truth_m, prediction, steel, score)

@@ -101,7 +101,7 @@ def shown_view(view: ViewPanels) -> ShownView:
     predicted_m = predicted_m[is_valid_prediction(predicted_m)]
     low_m, high_m = robust_range(predicted_m) if predicted_m.size else (near_m, far_m)
     native_m = signed_error(view, 1.0)
-    scaled_m = signed_error(view, math.nan if view.score.scale is None else view.score.scale)
+    scaled_m = signed_error(view, view.score["scale"])
     native_limit, scaled_limit = (error_limit_cm(error_m, scored) for error_m in (native_m, scaled_m))
     if native_limit and scaled_limit:
         larger = max(native_limit, scaled_limit)
@@ -259,10 +259,6 @@ def _webp(image: UInt8[ndarray, "h w 3"], *, lossless: bool = True) -> bytes:
     out = io.BytesIO()
     Image.fromarray(image).save(out, "WEBP", lossless=lossless, quality=70 if lossless else 80, method=4)
     return out.getvalue()
-
-
-VIEWS_SHOWN = 12
-"""Default number of views of a config shown with images, about 150 kB each at 1280 x 720."""
 
 
 def worst_first(views: Iterable[ViewScore]) -> list[ViewScore]:

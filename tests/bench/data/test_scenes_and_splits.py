@@ -16,7 +16,7 @@ from rebar_depth_bench.base.errors import DatasetError, InputError, SubmissionEr
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import ConfigViews, Views, truth_problems
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
-from rebar_depth_bench.extended.registry import score_extended
+from rebar_depth_bench.extended.families import score_extended
 from rebar_depth_bench.methods.base import Method, MethodInfo, MultiViewMethod, Prepared
 from rebar_depth_bench.methods.run import predict
 from rebar_depth_bench.reporting.figure import figure_content
@@ -24,7 +24,7 @@ from rebar_depth_bench.reporting.html.page import look_at_views
 from rebar_depth_bench.reporting.latex import latex_table
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
-from rebar_depth_bench.scoring.result import read_result
+from rebar_depth_bench.scoring.reading import read_result
 from tests.synthetic_dataset import HEIGHT, WIDTH, write_dataset, write_split_dataset
 
 SCENES = {"a": "train", "b-1": "train", "c": "validation", "d": "test", "e": "test"}
@@ -155,7 +155,7 @@ def test_multi_view_method_receives_one_scene_at_a_time(root: Path, tmp_path: Pa
     table = rdb.score(tmp_path / "a.zip", root).tables["cages"]
     assert table.split == "train"
     assert table.native is not None
-    assert 0 < table.native.mae_cm < 3  # The views of a scene differ by centimetres.
+    assert 0 < table["native.mae_cm"] < 3  # The views of a scene differ by centimetres.
 
 
 def test_interrupted_prediction_of_scenes_resumes(root: Path, tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ from rebar_depth_bench.extended.fits import MISS_MM
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
 from rebar_depth_bench.extended.inspection import INSPECTION_MEASURES, PROFILES, inspection_samples
 from rebar_depth_bench.extended.measures import STATISTICS, Samples
-from rebar_depth_bench.extended.registry import score_extended
+from rebar_depth_bench.extended.families import score_extended
 from rebar_depth_bench.extended.steel import SceneBars
 from rebar_depth_bench.geometry.cameras import rotation_matrix
 from rebar_depth_bench.scoring.evaluation import open_evaluation

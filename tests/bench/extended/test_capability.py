@@ -20,8 +20,8 @@ from rebar_depth_bench.extended.inspection import (
     capability,
 )
 from rebar_depth_bench.extended.measures import NATIVE, ONCE, SCALED, STATISTICS, Measure, Samples, Statistic
-from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, measures_by_alignment
-from rebar_depth_bench.extended.result import (
+from rebar_depth_bench.extended.families import MEASURE_FAMILIES, measures_by_alignment
+from rebar_depth_bench.extended.estimates import (
     ExtendedResult,
     ExtendedTable,
     MeasureEstimate,

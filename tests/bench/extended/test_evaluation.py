@@ -23,8 +23,8 @@ from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.extended.ground_truth import dilate_mask, load_steel_truth
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, NATIVE, ONCE, SCALED, Measure
 from rebar_depth_bench.extended.published import image_boundary_samples
-from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, measures_by_alignment, score_extended
-from rebar_depth_bench.extended.result import ExtendedResult
+from rebar_depth_bench.extended.families import MEASURE_FAMILIES, measures_by_alignment, score_extended
+from rebar_depth_bench.extended.estimates import ExtendedResult
 from rebar_depth_bench.reporting.extended_tables import print_extended
 from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.protocol import scored_pixels

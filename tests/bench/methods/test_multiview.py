@@ -96,7 +96,7 @@ def test_swept_depth_is_metric(archive: Path, orbit_root: Path) -> None:
     assert table.coverage is not None
     assert table.coverage > 0.4
     assert table.native is not None
-    assert table.native.abs_rel < 0.09
+    assert table["native.abs_rel"] < 0.09
     assert table.scale_median == pytest.approx(1, abs=0.03)
 
 

@@ -11,7 +11,7 @@ from rebar_depth_bench.reporting.html.views import ShownView, ViewPanels, shown_
 from rebar_depth_bench.scoring.metrics import DepthMetrics
 from rebar_depth_bench.scoring.reference import Errors, Reference
 from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareIdentity, SubmissionIdentity
-from rebar_depth_bench.scoring.score import tabulate
+from rebar_depth_bench.scoring.table import tabulate
 from rebar_depth_bench.scoring.table import PublishedMatch, ViewScore
 from rebar_depth_bench.submission.declaration import NOT_DECLARED, Declaration
 

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from rebar_depth_bench.extended.profiles import DISTANCE_EDGES_M
-from rebar_depth_bench.extended.result import MeasureEstimate
+from rebar_depth_bench.extended.estimates import MeasureEstimate
 from rebar_depth_bench.reporting.axes import Axis, decade_axis, log_axis_with_one, select_spaced
 from rebar_depth_bench.reporting.charts import (
     ProfileBin,

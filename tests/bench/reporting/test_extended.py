@@ -19,8 +19,8 @@ from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.extended.fits import MISS_MM
 from rebar_depth_bench.extended.inspection import CAPABILITY_MEASURES
 from rebar_depth_bench.extended.measures import SCALED, Measure, Statistic
-from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, measures_by_alignment, score_extended
-from rebar_depth_bench.extended.result import (
+from rebar_depth_bench.extended.families import MEASURE_FAMILIES, measures_by_alignment, score_extended
+from rebar_depth_bench.extended.estimates import (
     ExtendedResult,
     MeasureEstimate,
     ViewSamples,

@@ -106,7 +106,7 @@ def test_points_and_references_have_their_errors() -> None:
     assert points(axes) == {**published, "near": (0.04, 0.03)}
     assert points(axes, hollow=True) == {"far": (0.8, 0.05)}
     across, up = references(axes)
-    assert across == [REFERENCE.constant.abs_rel, pytest.approx(0.0529)]
+    assert across == [REFERENCE["constant.abs_rel"], pytest.approx(0.0529)]
     assert up == [REFERENCE.one_pixel.abs_rel]
     names = legend(figure)
     assert names[:2] == ["near", "far"]

@@ -104,7 +104,7 @@ def test_numbers_that_compare_leaves_undecided_are_not_bold() -> None:
         for name, error, change in (("steady", 0.030, 0.0), ("lower", 0.028, 0.0), ("mixed", 0.026, 0.02))
     )
     for other, verdict in ((lower, "better"), (mixed, "undecided")):
-        rows = {row.column.path: row.verdict for row in compare(steady, other).configs["lattice"]}
+        rows = {row.column.place: row.verdict for row in compare(steady, other).configs["lattice"]}
         assert rows["native.abs_rel"] == verdict
     assert list(bold_rows(latex_table([steady, lower], published=False))) == ["lower"]
     undecided = latex_table([steady, lower, mixed], published=False)

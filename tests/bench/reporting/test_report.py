@@ -237,10 +237,10 @@ def test_views_to_show_has_requested_count_and_no_repeats(count: int, total: int
     views = [scored_view(f"lattice/{index:04d}", abs_rel=(index * 7 % 41 + 1) / 100) for index in range(total)]
     shown = views_to_show(views, count)
     assert len({view.view_id for view in shown}) == len(shown) == min(count, total)
-    errors = [view.native.abs_rel for view in shown if view.native]
+    errors = [view["native.abs_rel"] for view in shown if view.native]
     assert errors == sorted(errors, reverse=True)
     if 1 < count <= total:
-        assert errors[-1] == min(view.native.abs_rel for view in views if view.native)
+        assert errors[-1] == min(view["native.abs_rel"] for view in views if view.native)
 
 
 def test_templates_and_scripts_are_package_data() -> None:

@@ -19,8 +19,8 @@ from cards.reference import coverage_text
 from rebar_depth_bench import software_version
 from rebar_depth_bench.base.errors import printable
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.extended.registry import MEASURE_FAMILIES
-from rebar_depth_bench.extended.result import MeasureEstimate
+from rebar_depth_bench.extended.families import MEASURE_FAMILIES
+from rebar_depth_bench.extended.estimates import MeasureEstimate
 from rebar_depth_bench.reporting.detections import DetectionPage, PageTable, print_page
 from rebar_depth_bench.reporting.extended_tables import format_value
 from rebar_depth_bench.reporting.html.extended import estimate_cell
@@ -30,10 +30,10 @@ from rebar_depth_bench.reporting.tables import comparison_cells, print_compariso
 from rebar_depth_bench.scoring import formatting
 from rebar_depth_bench.scoring.columns import DASH, coverage_percent, number
 from rebar_depth_bench.scoring.comparison import compare
-from rebar_depth_bench.scoring.frames import frame_csv
+from rebar_depth_bench.scoring.spreadsheet import frame_csv
 from rebar_depth_bench.scoring.reference import Errors
 from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareIdentity
-from rebar_depth_bench.scoring.score import tabulate
+from rebar_depth_bench.scoring.table import tabulate
 from tests.bench.reporting.pages import Page
 from tests.bench.reporting.results import (
     HOSTILE,

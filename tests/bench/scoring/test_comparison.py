@@ -22,15 +22,16 @@ from rebar_depth_bench import InputError, score
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.bars import Bar, read_bars, write_bars
 from rebar_depth_bench.data.files import file_sha256
-from rebar_depth_bench.extended.result import ExtendedResult
+from rebar_depth_bench.extended.estimates import ExtendedResult
 from rebar_depth_bench.reporting.extended_tables import extended_csv
 from rebar_depth_bench.reporting.tables import print_comparison
 from rebar_depth_bench.scoring.columns import TABLE_COLUMNS, VIEW_COLUMNS
 from rebar_depth_bench.scoring.comparison import Difference, compare
-from rebar_depth_bench.scoring.frames import differences_frame, frame_csv, frame_of_values
+from rebar_depth_bench.scoring.spreadsheet import differences_frame, frame_csv, frame_of_values
 from rebar_depth_bench.scoring.metrics import DepthMetrics
-from rebar_depth_bench.scoring.result import DatasetIdentity, Result, read_result
-from rebar_depth_bench.scoring.score import tabulate
+from rebar_depth_bench.scoring.reading import read_result
+from rebar_depth_bench.scoring.result import DatasetIdentity, Result
+from rebar_depth_bench.scoring.table import tabulate
 from rebar_depth_bench.scoring.table import ViewScore
 from tests.bench.reporting.pages import Page
 from tests.bench.reporting.results import HOSTILE, result, scored_view, unpredicted_view
@@ -52,7 +53,7 @@ def result_of(errors: np.ndarray, method: str = "m", config: str = "lattice", di
 
 def difference(first: Result, other: Result, name: str = "native.abs_rel") -> Difference:
     [rows] = compare(first, other).configs.values()
-    return next(row for row in rows if row.column.path == name)
+    return next(row for row in rows if row.column.place == name)
 
 
 @pytest.mark.slow
@@ -135,7 +136,7 @@ def test_table_is_80_columns_and_names_every_number() -> None:
     assert all(column.heading in text for column in VIEW_COLUMNS)
     assert max(map(len, text.splitlines())) <= 80
     rows = list(csv.DictReader(io.StringIO(frame_csv(comparison.to_pandas()))))
-    assert [row["number"] for row in rows] == [column.path for column in VIEW_COLUMNS]
+    assert [row["number"] for row in rows] == [column.place for column in VIEW_COLUMNS]
     assert rows[0]["other_method"] == "'=B"
     assert {row["verdict"] for row in rows} <= {
         "equal",

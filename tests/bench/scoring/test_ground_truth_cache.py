@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from rebar_depth_bench import DatasetError, score
-from rebar_depth_bench.bar_crossings.table import write_crossings
+from rebar_depth_bench.bar_crossings.crossings_file import write_crossings
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.bars import read_bars, write_bars
 from rebar_depth_bench.data.files import file_sha256

@@ -28,8 +28,9 @@ from rebar_depth_bench.scoring.groups import (
     bar_width_px,
     positions_by_group,
 )
-from rebar_depth_bench.scoring.result import Result, read_result
-from rebar_depth_bench.scoring.table import read_table
+from rebar_depth_bench.scoring.reading import read_result
+from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.scoring.reading import read_table
 from tests.bench.reporting.pages import Page
 from tests.damage import change_manifest
 from tests.ground_truth import truth_of
@@ -222,7 +223,7 @@ def test_groups_of_predictions_that_are_not_metric(
 
 def test_comparison_resamples_scenes(root: Path, tmp_path: Path, scored: Result) -> None:
     other = rdb.score(write_noisy(root, tmp_path / "b.zip", "other", 1.05), root)
-    [row] = [row for row in compare(scored, other).configs["cages"] if row.column.path == "rank_error"]
+    [row] = [row for row in compare(scored, other).configs["cages"] if row.column.place == "rank_error"]
     change = [b.error - a.error for a, b in zip(scored.views, other.views, strict=True)]
     by_scene = np.reshape(change, (len(SCENES), VIEWS))
     counts = resample_scenes(list(SCENES)).counts

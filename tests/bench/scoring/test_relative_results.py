@@ -15,7 +15,8 @@ from PIL import Image
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.scoring.columns import RELATIVE_INTERVALS
-from rebar_depth_bench.scoring.result import Result, read_result
+from rebar_depth_bench.scoring.reading import read_result
+from rebar_depth_bench.scoring.result import Result
 from tests.bench.scoring.conftest import Values, Write, disparity
 
 
@@ -50,7 +51,7 @@ def test_result_is_read_as_it_was_written(relative: Result, tiny_root: Path, wri
         again = read_result(one.to_json(), "result.json")
         assert again.to_json() == one.to_json()
         assert (again.kind, again.columns) == (one.kind, one.columns)
-        assert again.tables["lattice"].intervals.keys() == {column.path for column in RELATIVE_INTERVALS}
+        assert again.tables["lattice"].intervals.keys() == {column.place for column in RELATIVE_INTERVALS}
     assert json.loads(scaled.to_json())["tables"]["lattice"]["aligned_robust"] is None
     assert json.loads(empty.to_json())["tables"]["lattice"]["aligned"]["abs_rel"] is None
     mixed = relative.to_json().replace(b"rebar-relative-1", b"rebar-2")
@@ -87,7 +88,7 @@ def test_intervals_are_those_of_the_view_numbers(relative: Result) -> None:
     table = relative.tables["lattice"]
     for column in RELATIVE_INTERVALS[1:]:
         values = [column.view_value(view) or 0.0 for view in relative.views]
-        low, high = table.intervals[column.path] or (np.nan, np.nan)
+        low, high = table.intervals[column.place] or (np.nan, np.nan)
         assert min(values) <= low <= column.value(table) <= high <= max(values)
 
 
@@ -100,9 +101,11 @@ def test_scale_has_the_scaled_numbers_of_metric_results(write: Write, tiny_root:
         assert of_scale.aligned is not None
         assert of_scale.constant is not None
         assert vars(native.scaled).items() <= vars(of_scale.aligned).items()
-        assert (of_scale.constant.abs_rel, of_scale.constant.rmse_cm) == pytest.approx(native.scaled_constant)
+        assert (of_scale["constant.abs_rel"], of_scale["constant.rmse_cm"]) == pytest.approx(
+            native.scaled_constant
+        )
         assert of_scale.coverage == native.coverage < 1
-        assert of_scale.aligned.error > 1 - of_scale.coverage
+        assert of_scale["aligned.error"] > 1 - of_scale.coverage
 
 
 @pytest.mark.parametrize(("kind", "make"), [("affine-depth", lambda z: z), ("affine-disparity", lambda z: 1 / z)])
@@ -123,7 +126,7 @@ def test_metric_archives_are_aligned_as_weaker_kinds(
     [first, second] = (one.to_pandas("views") for one in (rdb.score(tmp_path / "other.zip", tiny_root), aligned))
     assert list(first["view_id"]) == list(second["view_id"])
     for column in aligned.columns:  # The archives hold float32: some pixels are at a tolerance.
-        tolerance = 2e-3 if "within" in column.path else 1e-6
+        tolerance = 2e-3 if "within" in column.place else 1e-6
         assert list(first[column.name]) == pytest.approx(list(second[column.name]), rel=1e-4, abs=tolerance)
     with pytest.raises(rdb.SubmissionError, match=f"of the kind {kind}, expected metric ones: .*scored as scale"):
         rdb.score(tmp_path / "other.zip", tiny_root, align="scale")
@@ -151,7 +154,7 @@ def test_zero_of_a_png_is_no_value(tiny_root: Path, tiny_truth: dict[str, np.nda
     assert whole.coverage == 1
     assert 0.3 < (holed.coverage or 0) < 0.7
     assert holed.aligned is not None
-    assert holed.aligned.error == pytest.approx(1 - (holed.coverage or 0), abs=0.05)
+    assert holed["aligned.error"] == pytest.approx(1 - (holed.coverage or 0), abs=0.05)
     assert holed.flat_views == 0
 
 

@@ -25,7 +25,8 @@ from rebar_depth_bench.scoring.columns import METRICS, RELATIVE_INTERVALS
 from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
 from rebar_depth_bench.scoring.protocol import scored_pixels
 from rebar_depth_bench.scoring.relative import constant_margin
-from rebar_depth_bench.scoring.result import Result, read_result
+from rebar_depth_bench.scoring.reading import read_result
+from rebar_depth_bench.scoring.result import Result
 from tests.bench.reporting.pages import Page
 from tests.bench.reporting.test_browser import run_in_browser
 from tests.bench.scoring.conftest import Values, Write, disparity
@@ -42,16 +43,16 @@ def test_text_of_a_result(relative: Result, tiny_root: Path, write: Write) -> No
     assert table.aligned is not None
     assert table.aligned_robust is not None
     assert table.constant is not None
-    errors = (table.aligned.error, table.constant.error)
+    errors = (table["aligned.error"], table["constant.error"])
     margin = math.floor(1000 * (1 - errors[0] / errors[1])) / 10
-    shown = (*errors, margin, table.aligned.abs_rel, table.aligned_robust.abs_rel)
+    shown = (*errors, margin, table["aligned.abs_rel"], table["aligned_robust.abs_rel"])
     within = f"{100 * (table.aligned.within_mm[5] or 0):.1f}"
     cells = [f"{value:.4f}" if value != margin else f"{margin:.1f} %" for value in shown]
     assert " ".join(lines[1].split()) == f"lattice 100.0 % {' '.join(cells)} {within} %"
     assert lines[2] == "protocol rebar-relative-1; inputs: rgb; ground truth: not used, as declared"
     assert lines[3].startswith("affine-disparity: disparity up to scale and shift")
     assert len(lines) == 4
-    assert f"aligned error {table.aligned.error:.4g}, constant {table.constant.error:.4g}" in repr(relative)
+    assert f"aligned error {table['aligned.error']:.4g}, constant {table['constant.error']:.4g}" in repr(relative)
     assert all(line in Page(relative._repr_html_()).text for line in lines[2:])
     flat = str(rdb.score(write("flat", "affine-depth", lambda z: -z), tiny_root))
     assert re.search(r"The aligned error (0\.\d+) is not below 95 % of a constant's \(\1\)", flat)
@@ -115,10 +116,10 @@ def test_score_command(
     table = expected.tables["lattice"]
     assert table.aligned is not None
     assert table.constant is not None
-    assert float(row["aligned_error"]) == pytest.approx(table.aligned.error)
+    assert float(row["aligned_error"]) == pytest.approx(table["aligned.error"])
     lines = [line.split() for line in output.out.splitlines()]
     [constant] = [line for line in lines if line[:1] == ["constant"]]
-    assert constant[1:3] == [f"{value:.4f}" for value in (table.constant.error, table.constant.abs_rel)]
+    assert constant[1:3] == [f"{value:.4f}" for value in (table["constant.error"], table["constant.abs_rel"])]
     text = Page(files["html"].read_text()).text
     for column in RELATIVE_INTERVALS[1:]:
         assert column.text(column.value(table)) in text

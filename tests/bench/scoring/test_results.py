@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from rebar_depth_bench.base.errors import InputError
-from rebar_depth_bench.scoring.result import read_result
-from rebar_depth_bench.scoring.score import tabulate
-from rebar_depth_bench.scoring.table import read_table
+from rebar_depth_bench.scoring.reading import read_result
+from rebar_depth_bench.scoring.table import tabulate
+from rebar_depth_bench.scoring.reading import read_table
 from rebar_depth_bench.submission import Declaration
 from tests.bench.reporting.results import overflowed_view, result, scored_view, unpredicted_view
 
@@ -27,7 +27,7 @@ def test_table_has_mean_metrics_and_median_scale() -> None:
     ]
     table = tabulate(views)
     assert table.native is not None
-    assert (table.native.abs_rel, table.scale_median) == (3.0, 0.7)
+    assert (table["native.abs_rel"], table.scale_median) == (3.0, 0.7)
     assert (table.views, table.views_scored, table.ranked) == (3, 3, True)
     assert tabulate(views[:2]).scale_median == pytest.approx(0.6), "the mean of the middle two"
     for seed in range(20):
@@ -51,7 +51,7 @@ def test_view_without_prediction_is_not_averaged_but_counts_in_rank_error() -> N
     views = [scored_view(f"lattice/{n:04}", 1.0) for n in range(99)] + [unpredicted_view("lattice/0099")]
     table = tabulate(views)
     assert table.native is not None
-    assert (table.native.abs_rel, table.views_scored, table.views) == (1.0, 99, 100)
+    assert (table["native.abs_rel"], table.views_scored, table.views) == (1.0, 99, 100)
     assert (table.ranked, table.is_comparable) == (True, False)
     assert table.rank_error == pytest.approx((99 * 0.5 + 1) / 100)
     assert table.coverage == pytest.approx(0.99)

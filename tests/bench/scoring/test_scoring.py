@@ -52,7 +52,7 @@ def test_doubled_depth_is_corrected_by_scale(tiny_truth: Depths, tiny_root: Path
     doubled = archive_of({view: 2 * depth for view, depth in tiny_truth.items()})
     table = score(doubled, tiny_root).tables["lattice"]
     assert table.native is not None
-    assert (table.native.abs_rel, table.native.delta1, table.scale_median) == (1.0, 0.0, 0.5)
+    assert (table["native.abs_rel"], table["native.delta1"], table.scale_median) == (1.0, 0.0, 0.5)
     assert table.scaled == DepthMetrics(abs_rel=0.0, rmse_cm=0.0, mae_cm=0.0, delta1=1.0)
 
 
@@ -95,8 +95,8 @@ def test_score_agrees_with_independent_evaluation(
     table = score(archive_of(predictions), tiny_root).tables["lattice"]
     assert table.native is not None
     assert table.scaled is not None
-    errors = [table.native.abs_rel, table.native.rmse_cm, table.native.mae_cm, table.native.delta1]
-    found = [*errors, table.scaled.abs_rel, table.within_mm[10], table.coverage, table.rank_error]
+    errors = [table["native.abs_rel"], table["native.rmse_cm"], table["native.mae_cm"], table["native.delta1"]]
+    found = [*errors, table["scaled.abs_rel"], table.within_mm[10], table.coverage, table.rank_error]
     assert found == pytest.approx(np.mean(rows, axis=0)[:-1].tolist(), rel=1e-12)
     assert table.scale_median == pytest.approx(np.median([row[-1] for row in rows]), rel=1e-12)
 
@@ -253,12 +253,12 @@ def test_score_of_two_pixels_by_hand() -> None:
     assert (first.scored_px, first.coverage, first.scale) == (2, 1.0, 1.5)
     assert first.rank_error == (0 + (4 - 2) / 4) / 2
     assert first.native is not None
-    assert (first.native.abs_rel, first.native.mae_cm) == ((0 + 2 / 4) / 2, 100.0)
+    assert (first["native.abs_rel"], first["native.mae_cm"]) == ((0 + 2 / 4) / 2, 100.0)
     assert (second.coverage, second.rank_error, second.native) == (0.0, 1.0, None)
     table = tables["a"]
     assert (table.views, table.views_scored, table.coverage, table.ranked) == (2, 1, 0.5, False)
     assert table.rank_error == (0.25 + 1) / 2
-    assert table.reference.constant.abs_rel == ((3 - 2) / 2 + (4 - 3) / 4) / 2
+    assert table["reference.constant.abs_rel"] == ((3 - 2) / 2 + (4 - 3) / 4) / 2
     assert table.reference.scaled_constant == table.reference.constant
 
 
@@ -289,8 +289,8 @@ from rebar_depth_bench.reporting.html.page import render_report
 from rebar_depth_bench.reporting.latex import latex_table
 from rebar_depth_bench.reporting.tables import print_table
 from rebar_depth_bench.scoring.comparison import compare
-from rebar_depth_bench.scoring.frames import frame_csv
-from rebar_depth_bench.scoring.result import read_result
+from rebar_depth_bench.scoring.spreadsheet import frame_csv
+from rebar_depth_bench.scoring.reading import read_result
 from rebar_depth_bench.scoring.score import score_views
 from tests.bench.reporting.results import result as result_of
 from tests.bench.scoring.test_scoring import DEPTH_M, truth_in_memory

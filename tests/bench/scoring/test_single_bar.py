@@ -17,7 +17,7 @@ from numpy import ndarray
 import rebar_depth_bench as rdb
 from rebar_depth_bench.extended.profiles import DISTANCE_EDGES_M, MIN_PIXELS, profile_samples
 from rebar_depth_bench.extended.regions import REGION_NUMBERS, region_samples
-from rebar_depth_bench.extended.registry import MEASURE_FAMILIES, score_extended
+from rebar_depth_bench.extended.families import MEASURE_FAMILIES, score_extended
 from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.protocol import interior, scored_pixels, single_bar_pixels
 from tests.bench.extended.thin_scenes import random_images, random_prediction, random_truth, steel_truth

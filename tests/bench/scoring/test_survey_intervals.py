@@ -15,13 +15,14 @@ from scipy.stats import t as student
 from rebar_depth_bench import SubmissionWriter
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.detections.score import score_crossings
-from rebar_depth_bench.extended.registry import score_extended
+from rebar_depth_bench.extended.families import score_extended
 from rebar_depth_bench.scoring import bootstrap
 from rebar_depth_bench.scoring.bootstrap import MIN_BLOCKS, RESAMPLES, Resampling, interval, resample_survey
 from rebar_depth_bench.scoring.comparison import Difference, compare
 from rebar_depth_bench.scoring.evaluation import open_evaluation
-from rebar_depth_bench.scoring.result import Result, read_result
-from rebar_depth_bench.scoring.score import tabulate
+from rebar_depth_bench.scoring.reading import read_result
+from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.scoring.table import tabulate
 from tests.bench.reporting.results import result, scored_view
 from tests.damage import change_manifest
 from tests.mat_dataset import CONFIG, VIEWS, write_mat_dataset
@@ -87,7 +88,7 @@ def of_survey(rank_errors: np.ndarray, method: str) -> Result:
 
 
 def rank_row(first: Result, other: Result) -> Difference:
-    return next(row for row in compare(first, other).configs["column"] if row.column.path == "rank_error")
+    return next(row for row in compare(first, other).configs["column"] if row.column.place == "rank_error")
 
 
 def test_difference_of_48_views_is_decided_by_students_interval() -> None:

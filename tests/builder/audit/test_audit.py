@@ -33,7 +33,7 @@ from dataset_builder.scene.mesh_ply import write_mesh_ply
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.specs.config_specs import DistanceSweepSpec, DomeSpec, RandomViewsSpec, RingSpec
 from dataset_builder.specs.manifest_specs import rig_spec, trajectory_spec
-from rebar_depth_bench.bar_crossings.table import write_crossings
+from rebar_depth_bench.bar_crossings.crossings_file import write_crossings
 from rebar_depth_bench.base.errors import DatasetError
 from rebar_depth_bench.data.bars import Bar, read_bars
 from rebar_depth_bench.data.files import file_sha256

@@ -27,7 +27,7 @@ from dataset_builder.scene.environments.surroundings import SURROUNDINGS
 from dataset_builder.specs.config_specs import ColourSpec, ConfigSpec, DomeSpec, RigSpec, RingSpec, colour_spec
 from dataset_builder.user_files.make_assembly import make_assembly
 from rebar_depth_bench import score
-from rebar_depth_bench.bar_crossings.table import read_crossings
+from rebar_depth_bench.bar_crossings.crossings_file import read_crossings
 from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.cli.main import main as rebar_bench
 from rebar_depth_bench.data.bars import read_bars
@@ -136,7 +136,7 @@ def test_ground_truth_scores_zero_error_on_every_config(full_root: Path, tmp_pat
     assert set(tables) == set(VIEWS)
     scored = [table for table in tables.values() if table.views_scored]
     assert len(scored) >= len(VIEWS) - 1  # At this size the pier may have no scored pixel.
-    assert all(table.native is not None and table.native.abs_rel == 0.0 for table in scored)
+    assert all(table.native is not None and table["native.abs_rel"] == 0.0 for table in scored)
 
 
 def test_user_scene_without_colour_and_variants_are_added_to_dataset(

@@ -169,7 +169,7 @@ def test_lidar_predictions_of_rendered_dataset_score(tiny_root: Path, tmp_path: 
     assert table.coverage is not None
     assert table.coverage > 0.7
     assert table.native is not None
-    assert table.native.abs_rel < 0.2
+    assert table["native.abs_rel"] < 0.2
     assert table.scale_median == pytest.approx(1.0, abs=0.02)
     repeated = tmp_path / "again.zip"
     predict(NEAR_METHOD, tiny_root, repeated, configs=["lattice-orbit"])

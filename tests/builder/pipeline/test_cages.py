@@ -34,7 +34,7 @@ from rebar_depth_bench.data.bars import BARS_FILE, read_bars
 from rebar_depth_bench.data.files import MANIFEST_FILE
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.extended.as_built import MEASURES
-from rebar_depth_bench.extended.registry import score_extended
+from rebar_depth_bench.extended.families import score_extended
 from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.truth import reference_errors
 from tests.building import RunBuild, StartBuild, contents, staged_rows
@@ -275,9 +275,9 @@ def test_exact_depth_is_perfect_in_every_group(root: Path, truths: Mapping[str, 
         for group in groups.values():
             assert (group.rank_error, group.coverage, group.scale_median) == (0.0, 1.0, 1.0)
             assert group.native is not None
-            assert (group.native.abs_rel, group.native.delta1) == (0.0, 1.0)
+            assert (group["native.abs_rel"], group["native.delta1"]) == (0.0, 1.0)
             assert group.within_mm == dict.fromkeys(group.within_mm, 1.0)
-            assert 0 < (group.reference.one_pixel.abs_rel or 0) < 1
+            assert 0 < (group["reference.one_pixel.abs_rel"] or 0) < 1
 
 
 def test_widths_follow_from_bars_and_cameras(root: Path) -> None:

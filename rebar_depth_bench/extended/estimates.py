@@ -5,21 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray
 
-from rebar_depth_bench.bar_crossings.table import CrossingsSource
+from rebar_depth_bench.bar_crossings.crossings_file import CrossingsSource
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, STATISTICS, Measure, Samples, Statistic
 from rebar_depth_bench.extended.reach import Reach, pooled, reaches
 from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval
 from rebar_depth_bench.scoring.columns import rounded, rounded_interval
-from rebar_depth_bench.scoring.frames import frame_of_values
-
-if TYPE_CHECKING:
-    from pandas import DataFrame
+from rebar_depth_bench.scoring.spreadsheet import Sheet
 
 ViewSamples = Mapping[str, Samples]
 """Samples of one view by alignment and name, the input of the tables."""
@@ -98,7 +95,7 @@ class ExtendedResult:
             ],
         }
 
-    def to_pandas(self) -> DataFrame:
+    def to_sheet(self) -> Sheet:
         """Return one row per config, alignment and measure: value, 95 % interval and number of samples.
 
         Shares are from 0 to 1 and have no unit.
@@ -112,7 +109,7 @@ class ExtendedResult:
             )
             for config, alignment, measure, estimate in self.estimates()
         ]
-        return frame_of_values(_ESTIMATE_COLUMNS, rows)
+        return Sheet(_ESTIMATE_COLUMNS, rows)
 
     def estimates(self) -> Iterator[tuple[str, str, Measure, MeasureEstimate]]:
         """Yield config, alignment, measure and estimate, in order."""

@@ -12,8 +12,8 @@ from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
 from rebar_depth_bench import software_version
+from rebar_depth_bench.bar_crossings.crossings_file import CrossingsSource
 from rebar_depth_bench.bar_crossings.definition import CROSSINGS_PROTOCOL
-from rebar_depth_bench.bar_crossings.table import CrossingsSource
 from rebar_depth_bench.extended.measures import percentile
 from rebar_depth_bench.scoring.bootstrap import INTERVALS, Interval, Resampling, interval
 from rebar_depth_bench.scoring.columns import rounded, rounded_interval
