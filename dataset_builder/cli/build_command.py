@@ -25,7 +25,7 @@ from dataset_builder.specs.config_specs import (
 )
 from rebar_depth_bench.base.errors import InputError, printable, require_extra
 from rebar_depth_bench.base.names import SPLITS
-from rebar_depth_bench.base.terminal import ProgressBars, Rate
+from rebar_depth_bench.base.terminal import ProgressBars
 from rebar_depth_bench.cli.console import add_names
 
 if TYPE_CHECKING:
@@ -206,7 +206,7 @@ def run(options: argparse.Namespace) -> None:
             _print_estimate(request, options.out)
             return
         threads = max(1, (os.cpu_count() or 1) // workers)
-        with ProgressBars(Rate("pictures", 2)) as bars:
+        with ProgressBars(pictures_per_step=2) as bars:
             summary = build(
                 request, options.out, workers=workers, threads=threads, submit=submit, progress=bars.update
             )

@@ -25,7 +25,7 @@ from dataset_builder.importing.source_files import Grid, checked_pose
 from rebar_depth_bench.base.errors import EntryError, InputError, Problem, escape_text
 from rebar_depth_bench.base.limits import JSON_BYTES
 from rebar_depth_bench.base.reading import parse_json, read_file
-from rebar_depth_bench.base.validation import UNITS_M, short_repr, with_lines
+from rebar_depth_bench.base.validation import UNITS_M, short_repr
 from rebar_depth_bench.captures.calibration import Calibration, scaled_calibration, table_calibration
 from rebar_depth_bench.captures.fields import LENS_TERMS, RECTIFY_PAGE, Field, FileFormat
 from rebar_depth_bench.geometry.cameras import HALF_PIXEL
@@ -122,7 +122,7 @@ def read_view_cameras(
         reason = f"{len(unposed)} of {len(cameras)} views have no pose, such as {unposed[0]}"
         problems.append(Problem("missing", "", reason, "poses of all views, or of none in a layout without bars"))
     if problems:
-        raise InputError.from_problems(path, with_lines(problems, content))
+        raise InputError.from_problems(path, problems)
     keys = dict.fromkeys([*whole, *(key for where in places.values() for key in entries[where])])
     notes = file_format.notes(path.name, keys)
     if _UNIT in keys and any(camera.depth_unit_m is None for camera in cameras.values()):

@@ -11,16 +11,14 @@ from typing import TypeVar
 
 from rebar_depth_bench.base.errors import InputError
 
+_Item = TypeVar("_Item")
+_Done = TypeVar("_Done")
 Progress = Callable[[str, int, int], None]
 """Callback with the arguments: name of the task, number of steps done, total number of steps."""
 
 
 def silent(task: str, done: int, total: int) -> None:
     """Ignore progress; the default callback."""
-
-
-_Item = TypeVar("_Item")
-_Done = TypeVar("_Done")
 
 
 def map_in_threads(

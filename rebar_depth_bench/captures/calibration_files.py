@@ -11,7 +11,7 @@ from typing import Literal
 from rebar_depth_bench.base.errors import MAX_PROBLEMS_SHOWN, CalibrationError, Problem, escape_text
 from rebar_depth_bench.base.limits import TOML_BYTES
 from rebar_depth_bench.base.reading import decode_text, parse_number, parse_toml, read_file
-from rebar_depth_bench.base.validation import Expected, format_location, short_repr, with_lines
+from rebar_depth_bench.base.validation import Expected, format_location, short_repr
 from rebar_depth_bench.captures.calibration import (
     ANGLE_RAD,
     DISTORTION,
@@ -83,7 +83,7 @@ def own_calibration(path: Path, width: int, height: int, *, is_stereo: bool) -> 
         is_pair = is_stereo or "right" in document
         calibration = None if problems else table_calibration(document, width, height, problems, is_stereo=is_pair)
     if calibration is None:
-        raise CalibrationError.from_problems(path, with_lines(problems, content))
+        raise CalibrationError.from_problems(path, problems)
     return scaled_calibration(calibration, path, width, height)
 
 

@@ -45,7 +45,6 @@ from rebar_depth_bench.base.validation import (
     one_of,
     text,
     validate_table,
-    with_lines,
 )
 from rebar_depth_bench.captures.calibration import (
     Calibration,
@@ -185,8 +184,7 @@ def cameras_of_table(
         problems.append(Problem("missing", "pose", found, "poses of all images, or none"))
     if table is None or problems:
         located = [replace(one, where=f"{where}.{one.where}") for one in problems] if where else problems
-        content = read_file(path, TOML_BYTES, "the cameras of a capture", CalibrationError)
-        raise CalibrationError.from_problems(path, with_lines(located, content))
+        raise CalibrationError.from_problems(path, located)
     if inline is not None:
         calibration = scaled_calibration(inline, path, width, height)
     else:
@@ -238,8 +236,6 @@ def _file_calibration(
         calibration = program_calibration(documents, width, height, unit_m, problems, rectified=stated.rectified)
     if calibration is None:
         problems = [problem for path in paths if (problem := recognised_problem(path))] or problems
-        for name, content in contents.items():
-            problems = with_lines(problems, content, name)
         raise CalibrationError.from_problems(paths[0].parent, problems)
     if is_stereo and not isinstance(calibration, StereoCalibration):
         problem = Problem("missing", "", "describes one camera", "the left and the right one")

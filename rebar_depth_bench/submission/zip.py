@@ -302,7 +302,7 @@ def _overlap_problems(entries: Sequence[ZipEntry]) -> Iterator[tuple[int, Proble
 
 
 def read_data(source: ByteSource, entry: ZipEntry) -> memoryview:
-    """Return the entry's uncompressed bytes; for a stored entry a view on the source, not a copy.
+    """Return the uncompressed bytes of an entry.
 
     Call it only for entries without problems, since their checked declared size bounds the memory use. Raises
     ``EntryError`` if the data is corrupt or the file was truncated.

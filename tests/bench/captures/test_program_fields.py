@@ -154,9 +154,7 @@ UNDISTORTED = {"D": [0.0] * 5, "P": RECTIFIED_P}
 
 @pytest.mark.parametrize("changes", [UNDISTORTED, UNDISTORTED | {"D": []}, UNDISTORTED | {"distortion_model": ""}])
 def test_two_matrices_without_distortion_must_be_told_apart(changes: dict[str, Any], tmp_path: Path) -> None:
-    with pytest.raises(
-        CalibrationError, match=r"P: line \d+: differs .* rectified = true .* or rectified = false"
-    ):
+    with pytest.raises(CalibrationError, match=r"P: differs .* rectified = true .* or rectified = false"):
         mono(tmp_path, message(**changes), 1280, 800)
     for answer, fx in (("true", 380.0), ("false", 405.0)):
         assert mono(tmp_path, message(**changes), 1280, 800, f"rectified = {answer}\n").left.fx == fx
@@ -214,7 +212,7 @@ def test_rectified_without_a_projection_is_refused(name: str, tmp_path: Path) ->
     with pytest.raises(CalibrationError, match="rectified pictures"):
         rectified_pair(tmp_path, [name])
     (tmp_path / "cameras.toml").write_text("rectified = true\n" + files.TOML)
-    with pytest.raises(CalibrationError, match="rectified: line 1: given without calibration"):
+    with pytest.raises(CalibrationError, match="rectified: given without calibration"):
         read_cameras(tmp_path, ["a"], files.WIDTH, files.HEIGHT, is_stereo=True)
 
 
