@@ -101,6 +101,12 @@ def test_written_result_is_read_unchanged() -> None:
     assert read_result(many, "x").to_json() == many
 
 
+def test_errors_of_views_without_predictions_are_left_out() -> None:
+    document = json.loads(SOUND)
+    document["views"][1]["native"] = dict.fromkeys(document["views"][0]["native"], 0.5)
+    assert read_result(json.dumps(document).encode(), "x").to_json() == SOUND
+
+
 @pytest.mark.parametrize("kind", ["metric", "scale", "affine-depth"])
 def test_table_without_views_is_null_unranked_and_read_unchanged(kind: str) -> None:
     prediction, protocol = (None, "rebar-2") if kind == "metric" else (kind, "rebar-relative-1")
@@ -109,8 +115,7 @@ def test_table_without_views_is_null_unranked_and_read_unchanged(kind: str) -> N
     )
     table = empty.to_dict()["tables"]["lattice"]
     assert (table["views"], table["ranked"], table["coverage"], table["scale_median"]) == (0, False, None, None)
-    errors = table["native" if kind == "metric" else "aligned"]
-    assert (table["rank_error"], errors["abs_rel"], table["ci95"]["coverage"]) == (None, None, None)
+    assert (table["rank_error"], table["native"]["abs_rel"], table["ci95"]["coverage"]) == (None, None, None)
     read = read_result(empty.to_json(), "x")
     assert read.to_json() == empty.to_json()
     assert (len(read.tables["lattice"].groups), read.views) == (0, [])
@@ -174,6 +179,7 @@ def set_groups(groups: object) -> Change:
         (set_at("tables", "lattice", "views", value=True), "invalid tables.lattice.views"),
         (set_at("tables", "lattice", "views_scored", value=-1), "invalid tables.lattice.views_scored"),
         (set_at("tables", "lattice", "coverage", value=1.5), "invalid tables.lattice.coverage"),
+        (set_at("views", 0, "coverage", value=None), "invalid views 1: coverage"),
         (set_at("tables", "lattice", "ranked", value="yes"), "invalid tables.lattice.ranked"),
         (set_at("tables", "lattice", "native", value={}), "missing tables.lattice.native.abs_rel"),
         (set_at("tables", "lattice", "native", value=None), "conflict tables.lattice"),
