@@ -111,9 +111,7 @@ def test_few_scenes_are_named() -> None:
     results = []
     for error in (0.1, 0.8):
         views = [scored_view(f"column/test-s{index % 3}-{index:04d}", error) for index in range(60)]
-        results.append(
-            replace(result(), tables={"column": table_of(views, split="test")}, frames={"column": frame_of(views)})
-        )
+        results.append(replace(result(*views), tables={"column": table_of(views, split="test")}))
     assert rank_row(*results).verdict == "too few scenes"
 
 
