@@ -154,7 +154,7 @@ def _load(spec: OnnxSpec, timeout_s: float) -> Predictor:
             depth_m = factor / scaled if meaning.inverse else factor * scaled
         if meaning.prediction != METRIC:
             return finite_or_nan(scaled)
-        return positive_or_nan(np.where(np.isfinite(scaled), depth_m, np.nan))
+        return positive_or_nan(depth_m)
 
     predict({"view_id": "a black image", "left_rgb": np.zeros((720, 1280, 3), np.uint8), "left_K": np.eye(3)})
     return predict
