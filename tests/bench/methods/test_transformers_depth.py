@@ -152,8 +152,8 @@ def test_zoedepth_round_trip_keeps_pixel_positions(
     np.testing.assert_allclose(255 * restored[inner], (rows, columns)[channel][inner], atol=1.5)
 
 
-@pytest.mark.parametrize("backbone", ["[]", '["x"]', '"dinov2"', "3", "null"])
-def test_backbone_of_wrong_type_is_not_dinov2(backbone: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("backbone", ['{"model_type": "beit"}', "[]", '["x"]', '"dinov2"', "3", "null"])
+def test_other_backbone_is_not_dinov2(backbone: str, tmp_path: Path) -> None:
     (tmp_path / "config.json").write_text(f'{{"model_type": "dpt", "backbone_config": {backbone}}}')
     assert "up to scale" in find_method(f"hf:{tmp_path}").info.summary
 
