@@ -21,7 +21,6 @@ from rebar_depth_bench.captures.calibration_files import read_calibration
 from rebar_depth_bench.captures.views import open_capture
 from rebar_depth_bench.cli.demo import SAMPLE
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.methods.onnx.spec import read_onnx_toml
 from rebar_depth_bench.submission import SubmissionReader
 from tests.bench.geometry.calibrations import CONF
 from tests.bench.submission.zips import DEPTH, EXPECTED, META, Record, build, npy, npz
@@ -59,23 +58,6 @@ points = [[150, 0, 5], [-150, 0, 5]]
 diameter = 900
 points = [[0, 0, 5], [0, 9000000, 5]]
 """
-ONNX = """
-model = "absent.onnx"
-licence = " "
-sumary = "text"
-[input]
-width = 64
-longest_side = 60
-resize = "crop"
-range = 1
-std = [0.2, 58.4, 57.1]
-[output]
-meaning = "canonical-depth"
-min_m = 3
-max_m = 2
-scale = 1e10
-"" = 1
-"""
 CALIBRATION = """
 width = 12
 [left]
@@ -108,7 +90,6 @@ def rejected_inputs(folder: Path) -> Mapping[str, Callable[[], object]]:
     """Write invalid files below ``folder`` and return, by title, the calls that read and reject them."""
     files = {
         "cage.toml": BARS.encode(),
-        "model.toml": ONNX.encode(),
         "rig.toml": CALIBRATION.encode(),
         "rig.conf": CONF.replace("fx=700.5", "fx=none").replace("[STEREO]", "[OTHER]").encode(),
         "prediction.zip": build(SUBMISSION),
@@ -141,7 +122,6 @@ def rejected_inputs(folder: Path) -> Mapping[str, Callable[[], object]]:
         "bars of a scene file": lambda: load_cage(cage_file_spec(folder / "cage.toml")),
         "build options": lambda: BuildRequest(configs=("lattice",), views=0, width=9).config_specs(),
         "configs": lambda: BuildRequest(configs=("latice", "pier")).config_specs(),
-        "ONNX method": lambda: read_onnx_toml(folder / "model.toml"),
         "TOML calibration": lambda: read_calibration(folder / "rig.toml", 1280, 720),
         "INI calibration": lambda: read_calibration(folder / "rig.conf", 1280, 720),
         "submission": lambda: submission("prediction.zip"),
