@@ -17,7 +17,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dataset_builder.catalog.scene_file import scene_config
 from dataset_builder.scene.model import MAX_BARS
 from dataset_builder.user_files import ifc_file
 from dataset_builder.user_files.ifc_file import Answer, ifc_cage
@@ -25,6 +24,7 @@ from dataset_builder.user_files.ifc_reader.bars import SECONDS_PER_SHAPE, limite
 from dataset_builder.user_files.ifc_records import MAX_ARRAY_BYTES, AnswerError
 from rebar_depth_bench.base.errors import InputError, MeshError
 from rebar_depth_bench.base.limits import IFC_MEMORY_BYTES, IFC_SECONDS
+from tests.builder.catalog.scene_files import scene_config
 from tests.builder.user_files.ifc_step_text import MILLIMETRES, Step
 from tests.builder.user_files.ifc_writer import Ifc, extruded_circle
 from tests.processes import is_running, wait_until
