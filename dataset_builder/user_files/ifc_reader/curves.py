@@ -61,10 +61,6 @@ class Leg:
             self, start=start, end=self.end if last == 1 else end, parameters=self.parameters * (last - first)
         )
 
-    def tangents(self) -> Float64[ndarray, "2 3"]:
-        """Return the unit vectors along the leg at its start and at its end, which are equal."""
-        return np.tile((self.end - self.start) / self.length, (2, 1))
-
     def reversed(self) -> Leg:
         """Return the leg from its end to its start."""
         return replace(self, start=self.end, end=self.start)
@@ -105,12 +101,6 @@ class Arc:
             turn_rad=share * self.turn_rad,
             parameters=share * self.parameters,
         )
-
-    def tangents(self) -> Float64[ndarray, "2 3"]:
-        """Return the unit vectors along the arc at its start and at its end."""
-        angles_rad = np.array([[self.first_rad], [self.first_rad + self.turn_rad]])
-        along = np.cos(angles_rad) * self.y_axis - np.sin(angles_rad) * self.x_axis
-        return np.asarray(np.sign(self.turn_rad) * along / np.linalg.norm(self.x_axis))
 
     def reversed(self) -> Arc:
         """Return the arc from its end to its start."""

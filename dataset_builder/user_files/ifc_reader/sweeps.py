@@ -39,6 +39,9 @@ _OBLIQUE = 1e-6
 _STRAIGHT = math.cos(math.radians(1.0))
 """Smallest cosine of the angle between two solids that continue each other."""
 
+_END_SHARE = 1e-4
+"""Share of a piece at its end whose chord is taken for the tangent."""
+
 
 @dataclass(frozen=True, eq=False)
 class Sweep:
@@ -82,7 +85,9 @@ def read_sweep(solid: Any, units: Units, declared: float | None) -> Sweep | None
 def _outward(pieces: Sequence[Piece]) -> Float64[ndarray, "2 3"]:
     """Return the unit vectors along connected pieces that point out of their start and their end."""
     pieces = [piece for piece in pieces if piece.length]
-    return np.array([-pieces[0].tangents()[0], pieces[-1].tangents()[1]])
+    start, end = pieces[0].part(0.0, _END_SHARE).points(), pieces[-1].part(1 - _END_SHARE, 1.0).points()
+    chords = np.array([start[0] - start[-1], end[-1] - end[0]])
+    return np.asarray(chords / np.linalg.norm(chords, axis=1, keepdims=True))
 
 
 def _diameter(radius: float) -> float:

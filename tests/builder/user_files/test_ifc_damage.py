@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 
@@ -112,6 +114,16 @@ NOT_ALL = "not all of it can be read: "
 )  # fmt: skip
 def test_instance_that_is_not_read_as_written_is_refused(old: str, new: str, words: str) -> None:
     assert_rejected(column_with(old, new), words)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("damage", ["#99999", "c{}", "{}", ""])
+def test_damaged_reference_moves_no_bar(damage: str, sound: list[Bar]) -> None:
+    text = COLUMN.read_text()
+    for reference in list(re.finditer(r"(?<=[(,])#(\d+)", text))[::9]:
+        content = text[: reference.start()] + damage.format(reference[1]) + text[reference.end() :]
+        with suppress(MeshError):
+            assert bars_of(content) == sound, reference
 
 
 @pytest.mark.parametrize("missing", ["origin", "direction"])
