@@ -72,7 +72,7 @@ def read_bars(content: bytes, select: Sequence[Selection] = ()) -> Iterator[tupl
     before the geometry kernel is used. ``select`` chooses objects (``choose_objects``).
 
     Raises ``MeshError`` if the file is not a complete IFC file, has no known length unit, nothing to read or too
-    much of it, if a bar depends on an instance that was not read as written, or if it has no usable geometry.
+    much of it, if a bar depends on an instance that is not as its class says, or if it has no usable geometry.
     """
     model = open_model(content)
     chosen, left_out = choose_objects(model, select)

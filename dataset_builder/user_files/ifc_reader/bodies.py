@@ -150,7 +150,7 @@ class BodyItem:
 def body_items(model: Model, entity: Entity, types: list[Entity]) -> list[BodyItem]:
     """Return the items of an object's Body, or of the Body of its type if it has none, in order.
 
-    Raises ``MeshError`` if an instance below the Body was not read as written, and ``ValueError`` if there is no
+    Raises ``MeshError`` if an instance below the Body is not as its class says, and ``ValueError`` if there is no
     Body, if a map is not one of a uniform scale, or if there are more than ``_MAX_BODY_ITEMS`` items.
     """
     shape = entity.Representation
