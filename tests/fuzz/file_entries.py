@@ -11,7 +11,6 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from dataset_builder.catalog.scene_file import scene_config
 from dataset_builder.scene.mesh_ply import write_mesh_ply
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.user_files.cage_file import cage_file_spec, load_cage, mesh_file_spec
@@ -28,6 +27,7 @@ from tests.bench.captures.example_capture import write_capture
 from tests.bench.geometry.calibrations import CONF, CONF_OF_SIZES, TOML
 from tests.bench.reporting.results import overflowed_view, result, scored_view, unpredicted_view
 from tests.bench.submission.zips import exr, npy, npz, png
+from tests.builder.catalog.scene_files import scene_config
 from tests.builder.user_files.ifc_step_text import MILLIMETRES, Step
 from tests.building import TWO_BARS
 from tests.fuzz.workspace import CASE, EntryPoint, Workspace

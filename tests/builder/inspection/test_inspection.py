@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+from contextlib import redirect_stdout
 from io import BytesIO, StringIO
 from pathlib import Path
 
@@ -12,7 +13,6 @@ import numpy as np
 import pytest
 import trimesh
 from PIL import Image, ImageDraw
-from rich.console import Console
 from scipy.spatial import cKDTree
 
 from dataset_builder.catalog.scene_file import scene_cage
@@ -148,8 +148,8 @@ def bars_of(*bars: Bar, **fields: str) -> Cage:
 
 
 def printed(cage: Cage) -> str:
-    stream = StringIO()
-    print_inspection(inspect_cage(cage, "a"), Console(file=stream, width=80))
+    with redirect_stdout(StringIO()) as stream:
+        print_inspection(inspect_cage(cage, "a"))
     return stream.getvalue()
 
 
