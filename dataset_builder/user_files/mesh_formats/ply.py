@@ -37,7 +37,9 @@ _HEADER = re.compile(
 """Header, whose lines end with LF, CR LF, or all with CR: then a line feed behind it belongs to the content."""
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _POLYGONS = ("vertex_index", "vertex_indices")
-_NUMBERS = re.compile(rb"\s*+(?:(?:%b|[-+]?nan|[-+]?inf)(?:\s++|\Z))*+" % NUMBER, re.IGNORECASE)
+_NUMBERS = re.compile(
+    rb"\s*+(?:(?:%b|[-+]?nan(?:\(\w*\))?|[-+]?inf(?:inity)?)(?:\s++|\Z))*+" % NUMBER, re.IGNORECASE
+)
 
 _Properties = dict[str, tuple[str, str]]
 """By name: type of the values, and of their number before them if they are a list, else an empty text."""

@@ -329,7 +329,7 @@ PLY_LIKE_MESHLAB = (
     "property uchar blue\r\nelement face 256\r\nproperty list uint8 uint32 vertex_index\r\n"
     "property float quality\r\nelement camera 1\r\nproperty list int float values\r\nend_header\r\n"
     + "".join(f"{x!r} {y!r} {z!r} 255 0 0 \r\n" for x, y, z in RODS[0].vertices.tolist())
-    + "".join(f"3 {a} {b} {c} nan\r\n" for a, b, c in RODS[0].faces.tolist())
+    + "".join(f"3 {a} {b} {c} -nan(ind)\r\n" for a, b, c in RODS[0].faces.tolist())
     + "4 1 2.5 3 4\r\n\r\n"
 )
 
