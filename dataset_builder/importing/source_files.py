@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -42,6 +43,7 @@ Grid = tuple[int, int]
 """Height and width of an image, pixels."""
 
 _IMAGE_FORMATS = {".tif": "TIFF", ".tiff": "TIFF", ".pfm": "PPM", ".png": "PNG"}
+_PFM_OF_CR_LF = re.compile(rb"\A(Pf[ \t]*\r\n[^\r\n]*\r\n[^\r\n]*)\r\n")
 """Pillow's names of formats."""
 
 DEPTH_SUFFIXES = (*FORMATS, *(suffix for suffix in _IMAGE_FORMATS if suffix not in FORMATS))
@@ -228,6 +230,8 @@ def _pixels(path: Path, content: bytes, *, is_depth: bool = False) -> Shaped[nda
     """
     from PIL import Image, UnidentifiedImageError
 
+    # Pillow would take the line feed of the last line end for the first byte of the values.
+    content = _PFM_OF_CR_LF.sub(rb"\1\n", content)
     image_format = _IMAGE_FORMATS[path.suffix.lower()]
     with _damage(path, image_format), warnings.catch_warnings():
         warnings.simplefilter("error")  # Pillow warns of huge images before it decodes them.

@@ -84,6 +84,8 @@ READ: dict[str, tuple[str, bytes]] = {
     # Rows from bottom to top; a negative scale means little-endian values (Debevec's description of PFM).
     "PFM little-endian": ("a.pfm", PFM.format(-1).encode() + VALUES[::-1].astype("<f4").tobytes()),
     "PFM big-endian": ("a.pfm", PFM.format(1).encode() + VALUES[::-1].astype(">f4").tobytes()),
+    "PFM with CR LF": ("a.pfm", b"Pf\r\n5 3\r\n-1\r\n" + VALUES[::-1].astype("<f4").tobytes()),
+    "PFM with CR": ("a.pfm", b"Pf\r5 3\r-1\r" + VALUES[::-1].astype("<f4").tobytes()),
     "PFM of Middlebury": ("a.pfm", PFM.format(-0.003922).encode() + VALUES[::-1].astype("<f4").tobytes()),
 }
 
