@@ -222,6 +222,6 @@ def test_keys_and_sections_without_a_meaning_are_named_once(tmp_path: Path) -> N
     calibration = read(tmp_path, text.replace("TY = 0.06", "TY_SVGA = 0.06"), (960, 600))
     assert calibration.translation_m == pytest.approx((-0.11982, -0.00006, 0.00011))
     [note] = calibration.notes
-    names = "LEFT_DISTO.lens, STEREO.ry_fhd, LEFT_CAM_WVGA, IMU, EMPTY"
+    names = "LEFT_DISTO.LENS, STEREO.RY_FHD, LEFT_CAM_WVGA, IMU, EMPTY"
     assert note == f"SN1.conf: fields without a known meaning are left out: {names}"
     assert not read(tmp_path, re.sub(r"(?m)^(k[456]) = .*\n", "", ar0234(BROWN)), (960, 600)).notes

@@ -77,10 +77,10 @@ def test_disparity_is_refused_beside_intrinsics_of_each_view(tmp_path: Path) -> 
         plan_import(data.write_layout(tmp_path, ("left_depth", "left_rgb"), tables=tables), "mock-up")
 
 
-def test_invalid_cameras_are_refused_with_their_line(folder: Path) -> None:
+def test_invalid_cameras_are_refused(folder: Path) -> None:
     layout = data.write_layout(folder)
     layout.write_text(layout.read_text().replace("cx = 79.5", "cx = 790"))
-    with pytest.raises(InputError, match=r"cameras\.left\.cx: line \d+: got 790"):
+    with pytest.raises(InputError, match=r"cameras\.left\.cx: got 790"):
         plan_import(layout, "mock-up")
 
 
