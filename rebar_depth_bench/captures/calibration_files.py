@@ -135,10 +135,10 @@ def _read_conf(
     translation_m = (0.0 - baseline_mm / 1000, 0.0 - y_mm / 1000, 0.0 - z_mm / 1000)
     if problems:
         return None
-    keys, known = list[str](), ["MISC"]
+    keys, known = list[str](), {"MISC"}
     for section, texts in sections.items():
         keys += [f"{section}.{key}" for key in texts] if section in _KNOWN else [section]
-        known += [f"{section}.{key}" for key in _KNOWN.get(section, ())]
+        known.update(f"{section}.{key}".upper() for key in _KNOWN.get(section, ()))
     notes = unknown_keys_notes(name, keys, known)
     if ZED_SIZES[size] != (width, height):
         sides = " x ".join(map(str, ZED_SIZES[size]))

@@ -32,7 +32,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 from pydantic import Field, field_validator, model_validator
 
-from rebar_depth_bench.base.errors import CalibrationError, InputError, Problem
+from rebar_depth_bench.base.errors import CalibrationError, EntryError, InputError, Problem
 from rebar_depth_bench.base.limits import TOML_BYTES
 from rebar_depth_bench.base.names import NAME_LETTERS, NAME_PATTERN
 from rebar_depth_bench.base.reading import parse_toml, read_file
@@ -135,7 +135,7 @@ def read_cameras(root: Path, images: Sequence[str], width: int, height: int, *, 
     """Return the cameras of the folder ``root`` with ``images`` of ``width`` x ``height`` pixels.
 
     Raises ``InputError`` if the folder states no cameras or states them twice, ``CalibrationError`` with the
-    problems of its files, which name keys and lines, and if a pair of images has the calibration of one camera.
+    problems of its files, which name keys, and if a pair of images has the calibration of one camera.
     """
     path = root / CAMERAS_FILE
     if not path.exists():
@@ -226,12 +226,13 @@ def _file_calibration(
             raise CalibrationError.from_problems(path.parent, [problem])
         content = read_file(path, TOML_BYTES, "a calibration file", CalibrationError)
         documents[path.name] = parse_document(path.name, content, problems)
-    calibration = None
-    if not problems:
-        unit_m = UNITS_M[stated.unit]
-        calibration = program_calibration(documents, width, height, unit_m, problems, rectified=stated.rectified)
-    if calibration is None:
+    if problems:
         raise CalibrationError.from_problems(paths[0].parent, problems)
+    unit_m = UNITS_M[stated.unit]
+    try:
+        calibration = program_calibration(documents, width, height, unit_m, rectified=stated.rectified)
+    except EntryError as error:
+        raise CalibrationError.from_problems(paths[0].parent, error.problems) from None
     if is_stereo and not isinstance(calibration, StereoCalibration):
         problem = Problem("missing", "", "describes one camera", "the left and the right one")
         raise CalibrationError.from_problems(source, [problem])

@@ -56,8 +56,7 @@ _PINHOLE = ("pinhole", "perspective")
 
 def unknown_keys_notes(source: str, keys: Iterable[Any], known: Collection[str]) -> list[str]:
     """Return a note that names the ``keys`` of the file ``source`` that are not ``known``; none if all are."""
-    plain = set(map(plain_key, known))
-    unknown = [escape_text(str(key)) for key in keys if plain_key(str(key)) not in plain]
+    unknown = [escape_text(str(key)) for key in keys if key not in known]
     if not unknown:
         return []
     more = f" and {len(unknown) - _MAX_NAMED} more" if len(unknown) > _MAX_NAMED else ""
