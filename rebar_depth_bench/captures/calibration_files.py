@@ -7,7 +7,7 @@ import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from rebar_depth_bench.base.errors import MAX_PROBLEMS_SHOWN, CalibrationError, Problem, escape_text
+from rebar_depth_bench.base.errors import CalibrationError, EntryError, Problem, escape_text
 from rebar_depth_bench.base.limits import TOML_BYTES
 from rebar_depth_bench.base.reading import decode_text, parse_number, parse_toml, read_file
 from rebar_depth_bench.base.validation import Expected, format_location, short_repr
@@ -41,8 +41,9 @@ def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibra
     calibration, is the requested size. K may replace fx, fy, cx and cy, and they K; ``rotation`` may be a 3 x 3
     matrix, and ``baseline_m = 0.12`` may replace ``translation_m = [-0.12, 0, 0]``; k3 may be absent.
 
-    Raises ``CalibrationError`` with all problems of the file; also if a distortion model cannot be inverted over
-    the whole image, if the requested size is not 16 to 16384 pixels each, and if its aspect ratio is another one.
+    Raises ``CalibrationError`` with the problems of the file, all those of a ``.toml`` file; also if a distortion
+    model cannot be inverted over the whole image, if the requested size is not 16 to 16384 pixels each, and if its
+    aspect ratio is another one.
     """
     calibration = own_calibration(Path(path), width, height, is_stereo=True)
     assert isinstance(calibration, StereoCalibration)
@@ -57,13 +58,14 @@ def own_calibration(path: Path, width: int, height: int, *, is_stereo: bool) -> 
         raise CalibrationError.from_problems(path, [problem])
     content = read_file(path, TOML_BYTES, "a calibration file", CalibrationError)
     check_image_size(path, width, height)
-    problems: list[Problem] = []
     if suffix == ".conf":
-        calibration: Calibration | None = _read_conf(path.name, content, width, height, problems)
-    else:
-        document, problems = parse_toml(content)
-        is_pair = is_stereo or "right" in document
-        calibration = None if problems else table_calibration(document, width, height, problems, is_stereo=is_pair)
+        try:
+            return scaled_calibration(_read_conf(path.name, content, width, height), path, width, height)
+        except EntryError as error:
+            raise CalibrationError.from_problems(path, error.problems) from None
+    document, problems = parse_toml(content)
+    is_pair = is_stereo or "right" in document
+    calibration = None if problems else table_calibration(document, width, height, problems, is_stereo=is_pair)
     if calibration is None:
         raise CalibrationError.from_problems(path, problems)
     return scaled_calibration(calibration, path, width, height)
@@ -116,25 +118,17 @@ _COMMENT = re.compile(r"(?:^|\s)[;#]")
 _SEPARATOR = re.compile("[=:]")
 
 
-def _read_conf(
-    name: str, content: bytes, width: int, height: int, problems: list[Problem]
-) -> StereoCalibration | None:
+def _read_conf(name: str, content: bytes, width: int, height: int) -> StereoCalibration:
     """Return the calibration of a Stereolabs ``.conf`` file for one of its image sizes; the caller scales it.
 
     The size is that nearest to ``width`` x ``height`` in aspect ratio, then in width. Section names and keys are
-    case-insensitive. Problems are added to ``problems``; the result is None if there are any.
+    case-insensitive. Raises ``EntryError`` for the first problem.
     """
-    sections = _read_sections(content, problems)
-    size = _nearest_size(sections, width, height, problems)
-    if size is None:
-        return None
-    names = (f"LEFT_CAM_{size}", f"RIGHT_CAM_{size}", "STEREO")
-    problems += [Problem("missing", one, "missing", "a section") for one in names if one not in sections]
-    left, right = (_read_lens(sections, eye, size, problems) for eye in ("LEFT", "RIGHT"))
-    baseline_mm, y_mm, z_mm, rx, cv, rz = _numbers(sections, ("STEREO",), _STEREO, problems, f"_{size}")
+    sections = _read_sections(content)
+    size = _nearest_size(sections, width, height)
+    left, right = (_read_lens(sections, eye, size) for eye in ("LEFT", "RIGHT"))
+    baseline_mm, y_mm, z_mm, rx, cv, rz = _numbers(sections, ("STEREO",), _STEREO, f"_{size}")
     translation_m = (0.0 - baseline_mm / 1000, 0.0 - y_mm / 1000, 0.0 - z_mm / 1000)
-    if problems:
-        return None
     keys, known = list[str](), {"MISC"}
     for section, texts in sections.items():
         keys += [f"{section}.{key}" for key in texts] if section in _KNOWN else [section]
@@ -146,38 +140,92 @@ def _read_conf(
     return StereoCalibration(*ZED_SIZES[size], left, right, (rx, cv, rz), translation_m, tuple(notes))
 
 
-def _read_lens(sections: _Sections, eye: str, size: str, problems: list[Problem]) -> Lens:
-    """Return the lens of the camera ``eye`` for an image size; problems are added to ``problems``."""
+def _read_sections(content: bytes) -> _Sections:
+    """Return the texts by section and key, without the comments after ``;`` and ``#``. Raises ``EntryError``."""
+    content_text, problems = decode_text(content)
+    if problems:
+        raise EntryError(problems[0])
+    sections: dict[str, dict[str, str]] = {}
+    section = ""
+    for line_number, line in enumerate(content_text.splitlines(), start=1):
+        text = _COMMENT.split(line, maxsplit=1)[0].strip()
+        key, *value = (part.strip() for part in _SEPARATOR.split(text, maxsplit=1))
+        if text.startswith("[") and text.endswith("]"):
+            section = text[1:-1].strip().upper()
+            if section in sections:
+                found = f"line {line_number}: the section occurs twice"
+                raise EntryError(Problem("duplicate", format_location("", section), found))
+            sections[section] = {}
+        elif key and value and section:
+            if key.upper() in sections[section]:
+                found = f"line {line_number}: the key occurs twice"
+                raise EntryError(Problem("duplicate", format_location("", section, key), found))
+            sections[section][key.upper()] = value[0]
+        elif text:
+            found, expected = f"line {line_number} is {short_repr(text)}", "[SECTION], or key = value in a section"
+            raise EntryError(Problem("syntax", "", found, expected))
+    return sections
+
+
+def _nearest_size(sections: _Sections, width: int, height: int) -> str:
+    """Return the name of the image size of the file that is nearest in aspect ratio, then in width.
+
+    Raises ``EntryError`` if the file has no sections of a known size, and if it has none of this size and one of
+    an unknown size.
+    """
+    present = [name for name in ZED_SIZES if {f"LEFT_CAM_{name}", f"RIGHT_CAM_{name}"} & set(sections)]
+    if not present:
+        found = escape_text(", ".join(f"[{name}]" for name in sections) or "no section")
+        cameras = ", ".join(f"[LEFT_CAM_{name}]" for name in ZED_SIZES)
+        expected = f"one of {cameras} with its [RIGHT_CAM_...] and [STEREO]"
+        raise EntryError(Problem("missing", "", f"the file has {found}", expected))
+
+    def distance(name: str) -> tuple[float, float]:
+        grid_width, grid_height = ZED_SIZES[name]
+        ratio = grid_width * height / (width * grid_height)
+        return round(abs(math.log(ratio)), 9), abs(math.log(grid_width / width))
+
+    nearest = min(present, key=distance)
+    sizes = [name for name in sections if name.startswith(("LEFT_CAM_", "RIGHT_CAM_"))]
+    unknown = [f"[{escape_text(name)}]" for name in sizes if name not in _CAMERAS]
+    if unknown and ZED_SIZES[nearest] != (width, height):
+        found = f"no section is known to be of {width} x {height} pixels; {', '.join(unknown[:10])} may be"
+        expected = "only sections of the size that the images were scaled from, or calibration.toml with that size"
+        raise EntryError(Problem("conflict", "", found, expected))
+    return nearest
+
+
+def _read_lens(sections: _Sections, eye: str, size: str) -> Lens:
+    """Return the lens of the camera ``eye`` for an image size. Raises ``EntryError``."""
     camera, distortion = f"{eye}_CAM_{size}", f"{eye}_DISTO"
     width, height = ZED_SIZES[size]
-    pinhole = dict(
-        zip(_PINHOLE, (FOCAL_PX, FOCAL_PX, principal_point(width), principal_point(height)), strict=True)
-    )
-    fx, fy, cx, cy = _numbers(sections, (camera,), pinhole, problems)
-    invalid = list[Problem]()
-    terms = _numbers(sections, (distortion, camera), dict.fromkeys(_TERMS, DISTORTION), invalid)
+    bounds = (FOCAL_PX, FOCAL_PX, principal_point(width), principal_point(height))
+    fx, fy, cx, cy = _numbers(sections, (camera,), dict(zip(_PINHOLE, bounds, strict=True)))
+    terms = _numbers(sections, (distortion, camera), dict.fromkeys(_TERMS, DISTORTION))
     while terms[5:] and not terms[-1]:
         terms.pop()
-    present = {*sections.get(camera, ()), *sections.get(distortion, ())}
-    is_fisheye = "K4" in present and present.isdisjoint(("P1", "P2"))
+    older, newer = sections[camera], sections.get(distortion, {})
+    is_fisheye = "K4" in {*older, *newer} and {*older, *newer}.isdisjoint(("P1", "P2"))
     models = {"the lens model": "fisheye, k1 k2 k3 k4"} if is_fisheye else {}
-    problem = lens_problem(distortion if distortion in sections else camera, models, terms)
-    problems += invalid if problem is None else [problem]
+    if problem := lens_problem(distortion if newer else camera, models, terms):
+        raise EntryError(problem)
+    for key in _TERMS:
+        texts = [section[key.upper()] for section in (older, newer) if key.upper() in section]
+        if len(set(map(parse_number, texts))) > 1:
+            found = f"differs from {camera}.{key}"
+            raise EntryError(Problem("conflict", f"{distortion}.{key}", found, "one lens model"))
     return Lens(fx, fy, cx, cy, (terms[0], terms[1], terms[2], terms[3], terms[4]))
 
 
 def _numbers(
-    sections: _Sections,
-    places: Sequence[str],
-    keys: Mapping[str, Expected],
-    problems: list[Problem],
-    end: str = "",
+    sections: _Sections, places: Sequence[str], keys: Mapping[str, Expected], end: str = ""
 ) -> list[float]:
-    """Return the numbers of ``keys`` in the first of the sections ``places`` that has each; 0 for an invalid one.
+    """Return the numbers of ``keys``, which may end with ``end``, each in the first of the sections ``places``.
 
-    A key may have ``end`` at its end. A missing or invalid key adds a problem, one that has other numbers in
-    several sections, too; nothing is missing where the last section is.
+    Raises ``EntryError`` for a missing or invalid key, and if the last section is missing.
     """
+    if places[-1] not in sections:
+        raise EntryError(Problem("missing", places[-1], "missing", "a section"))
     numbers = []
     for key, expected in keys.items():
         found = [
@@ -186,71 +234,10 @@ def _numbers(
             for name in (key + end, key)
             if name.upper() in sections.get(section, {})
         ]
-        place, text = found[0] if found else (f"{places[-1]}.{key}", "0")
+        if not found and key not in _OPTIONAL:
+            raise EntryError(Problem("missing", f"{places[-1]}.{key}", "missing", expected.text))
+        place, text = found[0] if found else ("", "0")
         numbers.append(parse_number(text))
-        if not found and places[-1] in sections and key not in _OPTIONAL:
-            problems.append(Problem("missing", place, "missing", expected.text))
-        elif found and not expected.accept(numbers[-1]):
-            problems.append(Problem("invalid", place, f"got {short_repr(text)}", expected.text))
-        elif key in _TERMS and any(parse_number(other) != numbers[-1] for _, other in found):
-            problems.append(Problem("conflict", place, f"differs from {found[-1][0]}", "one lens model"))
+        if found and not expected.accept(numbers[-1]):
+            raise EntryError(Problem("invalid", place, f"got {short_repr(text)}", expected.text))
     return numbers
-
-
-def _read_sections(content: bytes, problems: list[Problem]) -> _Sections:
-    """Return the texts by section and key, without the comments after ``;`` and ``#``."""
-    content_text, text_problems = decode_text(content)
-    problems += text_problems
-    sections: dict[str, dict[str, str]] = {}
-    section = ""
-    for line_number, line in enumerate(content_text.splitlines(), start=1):
-        if len(problems) == MAX_PROBLEMS_SHOWN:
-            break
-        text = _COMMENT.split(line, maxsplit=1)[0].strip()
-        key, *value = (part.strip() for part in _SEPARATOR.split(text, maxsplit=1))
-        if text.startswith("[") and text.endswith("]"):
-            section = text[1:-1].strip().upper()
-            if section in sections:
-                place = format_location("", section)
-                problems.append(Problem("duplicate", place, f"line {line_number}: the section occurs twice"))
-            sections.setdefault(section, {})
-        elif key and value and section:
-            if key.upper() in sections[section]:
-                place = format_location("", section, key)
-                problems.append(Problem("duplicate", place, f"line {line_number}: the key occurs twice"))
-            sections[section][key.upper()] = value[0]
-        elif text:
-            expected = "[SECTION] or key = value" if section else "a [SECTION]"
-            problems.append(Problem("syntax", "", f"line {line_number} is {short_repr(text)}", expected))
-    return sections
-
-
-def _nearest_size(sections: _Sections, width: int, height: int, problems: list[Problem]) -> str | None:
-    """Return the name of the image size of the file that is nearest in aspect ratio, then in width.
-
-    Returns None, and adds a problem if there is none yet, if the file has no sections of a known size, and if it
-    has none of this size and one of an unknown size.
-    """
-    present = [name for name in ZED_SIZES if {f"LEFT_CAM_{name}", f"RIGHT_CAM_{name}"} & set(sections)]
-    if not present and not problems:
-        found = escape_text(", ".join(f"[{name}]" for name in sections) or "no section")
-        cameras = ", ".join(f"[LEFT_CAM_{name}]" for name in ZED_SIZES)
-        expected = f"one of {cameras} with its [RIGHT_CAM_...] and [STEREO]"
-        problems.append(Problem("missing", "", f"the file has {found}", expected))
-
-    def distance(suffix: str) -> tuple[float, float]:
-        grid_width, grid_height = ZED_SIZES[suffix]
-        ratio = grid_width * height / (width * grid_height)
-        return round(abs(math.log(ratio)), 9), abs(math.log(grid_width / width))
-
-    nearest = min(present, key=distance, default=None)
-    if nearest is None or ZED_SIZES[nearest] == (width, height):
-        return nearest
-    sizes = [name for name in sections if name.startswith(("LEFT_CAM_", "RIGHT_CAM_"))]
-    unknown = [f"[{escape_text(name)}]" for name in sizes if name not in _CAMERAS]
-    if not unknown:
-        return nearest
-    found = f"no section is known to be of {width} x {height} pixels; {', '.join(unknown[:10])} may be"
-    expected = "only sections of the size that the images were scaled from, or calibration.toml with that size"
-    problems.append(Problem("conflict", "", found, expected))
-    return None

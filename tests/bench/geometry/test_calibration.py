@@ -193,8 +193,8 @@ INVALID_CONF = [
     ("CV_HD=0.006", "CV_VGA=0.006", "missing STEREO.CV", "expected a number from -0.5 to 0.5 radians"),
     ("RX_HD=-0.001", "RX_HD=-5", "invalid STEREO.RX_HD", ""),
     ("TY=0.25", "TY=1e6", "invalid STEREO.TY", "millimetres"),
-    ("[LEFT_CAM_HD]\n", "", "syntax ", "line 1 is 'fx=700.5', expected a [SECTION]"),
-    ("fx=700.5", "fx 700.5 ", "syntax ", "line 2 is 'fx 700.5', expected [SECTION] or key = value"),
+    ("[LEFT_CAM_HD]\n", "", "syntax ", "line 1 is 'fx=700.5', expected [SECTION], or key = value"),
+    ("fx=700.5", "fx 700.5 ", "syntax ", "line 2 is 'fx 700.5', expected [SECTION], or key = value"),
     ("TY=0.25", "TY=-100", "conflict stereo", "at (0.1205, -0.1, -0.00075) m from the left one"),
     ("k1=-0.17", "k1=-0.9", "conflict left", FOLDS_BACK),
     ("k2=0.02", "k2=-30", "conflict right", FOLDS_BACK),
@@ -265,13 +265,7 @@ def test_impossible_image_size_is_rejected(tmp_path: Path, name: str, text: str,
     assert locations(caught.value.problems) == [("invalid", "")]
 
 
-def test_all_problems_are_reported_at_once(tmp_path: Path) -> None:
-    text = CONF.replace("fx=700.5", "fx=x").replace("fy=703.5\n", "").replace("Baseline=120.5", "Baseline=0")
-    assert locations(reported_problems(tmp_path, text)) == [
-        ("invalid", "LEFT_CAM_HD.fx"),
-        ("missing", "RIGHT_CAM_HD.fy"),
-        ("invalid", "STEREO.Baseline"),
-    ]
+def test_all_problems_of_a_table_are_reported_at_once(tmp_path: Path) -> None:
     text = TOML.replace("height = 720", "height = 7").replace("fx = 700.5", "fx = 0").replace("[0, 0, 1]", "[0]")
     assert locations(reported_problems(tmp_path, text.replace("rotation", "rot"), "rig.toml")) == [
         ("invalid", "height"),
