@@ -61,7 +61,6 @@ from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
 from rebar_depth_bench.geometry.cameras import is_rigid
 
 CAMERAS_FILE = "cameras.toml"
-CALIBRATION_SUFFIXES = (".conf", *DOCUMENT_SUFFIXES)
 _CALIBRATION_FILES = ("calibration.conf", "calibration.toml")
 _CALIBRATION_KEYS = ("width", "height", "left", "right", "stereo")
 

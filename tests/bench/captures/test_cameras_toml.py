@@ -18,7 +18,7 @@ from PIL import Image
 from rebar_depth_bench.base.errors import CalibrationError, InputError
 from rebar_depth_bench.captures.calibration import MonoCalibration, StereoCalibration
 from rebar_depth_bench.captures.camera_files import read_cameras
-from rebar_depth_bench.captures.views import ImageViews, open_capture
+from rebar_depth_bench.captures.views import ImageViews, is_capture, open_capture
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import inverse_rigid
 from tests.bench.captures import calibration_files as files
@@ -321,6 +321,14 @@ def test_other_files_are_refused_with_a_table_that_can_be_read(name: str, camera
     assert read(one_camera, 1280, 720, is_stereo=False).left == calibration.left
     with pytest.raises(CalibrationError, match="right: missing"):
         read(one_camera, 1280, 720)
+
+
+def test_images_beside_another_calibration_are_a_capture(tmp_path: Path) -> None:
+    write_images(tmp_path, "")
+    (tmp_path / "calib.txt").write_text(UNREAD["calib.txt"])
+    assert is_capture(tmp_path)
+    with pytest.raises(InputError, match="the calibration files are none, expected"):
+        open_capture(tmp_path)
 
 
 def test_two_files_of_which_one_is_not_read_are_refused(tmp_path: Path) -> None:
