@@ -12,9 +12,9 @@ import math
 import re
 from collections import defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64
@@ -27,7 +27,7 @@ from rebar_depth_bench.base.limits import JSON_BYTES
 from rebar_depth_bench.base.reading import parse_json, read_file
 from rebar_depth_bench.base.validation import UNITS_M, short_repr
 from rebar_depth_bench.captures.calibration import Calibration, scaled_calibration, table_calibration
-from rebar_depth_bench.captures.fields import LENS_TERMS, RECTIFY_PAGE, Field, FileFormat
+from rebar_depth_bench.captures.fields import LENS_TERMS, RECTIFY_PAGE, unknown_keys_notes
 from rebar_depth_bench.geometry.cameras import HALF_PIXEL
 
 _UNIT = "depth_unit_scale_factor"
@@ -40,6 +40,29 @@ _FURTHER = (
     *("n_frames", "aabb_scale", "aabb", "offset", "up", "orientation_override"),
     *("sharpness", "colmap_im_id", "rotation", "time"),
 )
+
+
+@dataclass(frozen=True)
+class Field:
+    """Field of a format.
+
+    ``use`` is "used" if the value becomes part of the result, "checked" if a file is refused unless the value is
+    as ``meaning`` says, and "harmless" if it changes no number.
+    """
+
+    name: str
+    keys: tuple[str, ...]
+    use: Literal["used", "checked", "harmless"]
+    meaning: str
+
+
+@dataclass(frozen=True)
+class FileFormat:
+    """Format of a file of another program."""
+
+    title: str
+    fields: tuple[Field, ...]
+
 
 BOP = FileFormat(
     "BOP `scene_camera.json`",
@@ -124,7 +147,8 @@ def read_view_cameras(
     if problems:
         raise InputError.from_problems(path, problems)
     keys = dict.fromkeys([*whole, *(key for where in places.values() for key in entries[where])])
-    notes = file_format.notes(path.name, keys)
+    known = [key for field in file_format.fields for key in field.keys]
+    notes = unknown_keys_notes(path.name, keys, known)
     if _UNIT in keys and any(camera.depth_unit_m is None for camera in cameras.values()):
         notes.append(f"{path.name}: {_UNIT} is that of other depth maps, depth_file_path; [depth] states the unit")
     if len(entries) > len(names):

@@ -45,7 +45,7 @@ REFUSED: dict[str, tuple[object, str]] = {
     "no K": (bop(cam_K=None), "0: .*got .* expected a table with cam_K"),
     "eight numbers": (bop(cam_K=[40, 0, 15, 0, 40, 11, 0, 0]), "0: cam_K: .*got .* expected 9 numbers"),
     "text in K": (bop(cam_K=["40", 0, 15, 0, 40, 11, 0, 0, 1]), "0: cam_K: .*expected 9 numbers"),
-    "skew": (bop(cam_K=[40, 1, 15, 0, 40, 11, 0, 0, 1]), r"0: K: .*got .* expected \[\[fx, 0, cx\]"),
+    "skew": (bop(cam_K=[40, 1, 15, 0, 40, 11, 0, 0, 1]), r"0: left: K is .* expected \[\[fx, 0, cx\]"),
     "K of another size": (
         bop(cam_K=[40, 0, 150, 0, 40, 11, 0, 0, 1]),
         "0: cx: .*got 150.0, expected a number from",
