@@ -27,7 +27,6 @@ from dataset_builder.pipeline.folder import (
     PICTURES,
     SHARD_DIGEST_CHARACTERS,
     file_matches,
-    manifest_text,
     remove_temporary_files,
     remove_unlisted_files,
     stored_bars_path,
@@ -254,7 +253,7 @@ def write_folder(
         "files": {name: known[name] for name in sorted({*written, *_listed_files(ordered)})},
     }
     published = validated_folder(manifest, [], str(out), out / MANIFEST_FILE)
-    write_text(out / MANIFEST_FILE, manifest_text(manifest))
+    write_text(out / MANIFEST_FILE, json.dumps(manifest, indent=1, allow_nan=False) + "\n")
     remove_file(out / BUILD_FOLDER / BARS_FILE)
     remove_unlisted_files(out, _listed_files(ordered))
     return published
