@@ -19,7 +19,6 @@ from pydantic import ByteSize
 
 from cards.dataset import column_rows
 from dataset_builder.cli.main import argument_parser
-from dataset_builder.importing.view_cameras import BOP, NERFSTUDIO
 from dataset_builder.scene.variants.registry import VARIANTS
 from dataset_builder.specs.config_specs import STEREO_CAMERAS
 from leaderboard.settings import Settings
@@ -34,7 +33,7 @@ PAGES = (
     ROOT / "SECURITY.md",
     *(ROOT / "docs" / f"{name}.md" for name in ("build", "cages", "formats", "leaderboard-operator")),
 )
-FORMATS = (ZED_CONF, CAMERA, PAIR, KALIBR, MIDDLEBURY, BOP, NERFSTUDIO)
+FORMATS = (ZED_CONF, CAMERA, PAIR, KALIBR, MIDDLEBURY)
 _BLOCK = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
 
 
