@@ -32,6 +32,7 @@ from rebar_depth_bench.reporting.colormap import (
     depth_preview,
     robust_range,
 )
+from rebar_depth_bench.reporting.html.page import render_report
 from rebar_depth_bench.reporting.html.views import (
     ViewPanels,
     depth_image,
@@ -42,11 +43,7 @@ from rebar_depth_bench.reporting.html.views import (
     signed_error,
 )
 from rebar_depth_bench.scoring.protocol import scored_pixels
-from tests.bench.reporting.results import (
-    HOSTILE,
-    panels,
-    scored_view,
-)
+from tests.bench.reporting.results import HOSTILE, panels, result, scored_view
 
 
 def luminance_of(colours: np.ndarray) -> np.ndarray:
@@ -154,6 +151,8 @@ def test_view_without_colour_has_other_panels() -> None:
     view = dataclasses.replace(panels(factor=1.02), rgb=None)
     images, with_colour = shown_view(view), shown_view(panels(factor=1.02))
     assert images.colour is None
+    page = render_report(result(scored_view("lattice/0000")), [images])
+    assert ("<strong>Colour</strong>" in page, "<strong>Native error</strong>" in page) == (False, True)
     assert (images.width, images.truth) == (with_colour.width, with_colour.truth)
     image = error_image(signed_error(view, 1.0), view.steel, None, 1.0)
     assert (image[5, 25].tolist(), image[5, 5].tolist()) == (ERROR_COLOURS[254].tolist(), [0, 0, 0])
