@@ -9,6 +9,7 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pandas as pd
@@ -25,7 +26,7 @@ from rebar_depth_bench.extended.estimates import ExtendedResult
 from rebar_depth_bench.reporting.extended_tables import extended_csv
 from rebar_depth_bench.reporting.tables import print_comparison
 from rebar_depth_bench.scoring.columns import METRIC_COLUMNS, METRICS, WITHIN
-from rebar_depth_bench.scoring.comparison import Difference, compare
+from rebar_depth_bench.scoring.comparison import Difference, Verdict, compare
 from rebar_depth_bench.scoring.result import DatasetIdentity, Result
 from rebar_depth_bench.scoring.spreadsheet import Sheet, differences_sheet, tables_sheet
 from rebar_depth_bench.scoring.table import ViewScore
@@ -157,15 +158,7 @@ def test_table_is_80_columns_and_names_every_number() -> None:
     rows = list(csv.DictReader(io.StringIO(differences_sheet([comparison.to_dict()]).to_csv())))
     assert [row["number"] for row in rows] == [column.place for column in METRIC_COLUMNS]
     assert rows[0]["other_method"] == "'=B"
-    assert {row["verdict"] for row in rows} <= {
-        "equal",
-        "worse",
-        "better",
-        "no verdict",
-        "undecided",
-        "too few views",
-        "",
-    }
+    assert {row["verdict"] for row in rows} <= {*get_args(Verdict)}
     assert float(rows[1]["low"]) <= float(rows[1]["difference"]) <= float(rows[1]["high"])
 
 
