@@ -34,7 +34,7 @@ import rebar_depth_bench as rdb
 from benchmarks.timing import print_markdown
 from rebar_depth_bench.base.names import config_of
 from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
-from rebar_depth_bench.detections.score import score_crossings
+from rebar_depth_bench.detections.crossing_scorer import score_crossings
 from rebar_depth_bench.extended.measures import NATIVE
 from rebar_depth_bench.extended.families import score_extended
 from rebar_depth_bench.scoring.columns import rounded

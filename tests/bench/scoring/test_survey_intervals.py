@@ -14,7 +14,7 @@ from scipy.stats import t as student
 
 from rebar_depth_bench import SubmissionWriter
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.detections.score import score_crossings
+from rebar_depth_bench.detections.crossing_scorer import score_crossings
 from rebar_depth_bench.extended.families import score_extended
 from rebar_depth_bench.scoring import bootstrap
 from rebar_depth_bench.scoring.bootstrap import MIN_BLOCKS, RESAMPLES, Resampling, interval, resample_survey
