@@ -30,8 +30,8 @@ from rebar_depth_bench.base.names import TEST_SPLIT, config_of
 from rebar_depth_bench.base.writing import write_text
 from rebar_depth_bench.cli.main import main as rebar_bench
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.extended.families import MEASURE_FAMILIES, score_extended
 from rebar_depth_bench.extended.estimates import ExtendedTable
+from rebar_depth_bench.extended.families import MEASURE_FAMILIES, score_extended
 from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.submission.declaration import METADATA_NAME
 

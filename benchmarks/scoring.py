@@ -29,13 +29,13 @@ import torch
 import rebar_depth_bench as rdb
 from benchmarks.timing import machine_description, median_seconds, print_markdown
 from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.extended.families import MEASURE_FAMILIES
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
 from rebar_depth_bench.extended.measures import SCALED, MeasureFamily
-from rebar_depth_bench.extended.families import MEASURE_FAMILIES
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.protocol import interior
-from rebar_depth_bench.scoring.score import score_view
 from rebar_depth_bench.scoring.truth import config_truth
+from rebar_depth_bench.scoring.view_numbers import view_numbers
 from rebar_depth_bench.submission import SubmissionReader
 
 REPEATS = 15
@@ -121,7 +121,7 @@ def main(root: str, config: str = "lattice") -> None:
     rows = list(rdb.load(root, config, columns=["view_id", "left_depth", "left_mask"]))
     truths = {row["view_id"]: (row["left_depth"], row["left_mask"]) for row in rows}
     scored = config_truth(folder, folder.config(config))
-    pixels = sum(len(truth.index) for truth in scored) / len(scored)
+    pixels = sum(len(truth.index) for truth in scored.views) / len(scored.views)
     print(f"{len(rows)} views, {pixels:.0f} scored pixels each; {machine_description()}\n")
     with tempfile.TemporaryDirectory() as scratch:
         archive = Path(scratch) / "submission.zip"
@@ -130,8 +130,10 @@ def main(root: str, config: str = "lattice") -> None:
                 writer.add(view_id, 1.1 * truth_m + np.float32(0.01))
         with SubmissionReader(archive, folder.expected_views()) as submission:
             runs: dict[str, Callable[[], object]] = {
-                "read and checksum alone": lambda: [submission.read(truth.view_id) for truth in scored],
-                "rebar-bench": lambda: [score_view(truth, submission.read(truth.view_id)) for truth in scored],
+                "read and checksum alone": lambda: [submission.read(truth.view_id) for truth in scored.views],
+                "rebar-bench": lambda: [
+                    view_numbers(submission.read(truth.view_id), truth) for truth in scored.views
+                ],
                 "plain NumPy": lambda: plain_scores(archive, truths, numpy_metrics),
                 "plain torch": lambda: plain_scores(archive, truths, torch_metrics),
             }
@@ -141,8 +143,10 @@ def main(root: str, config: str = "lattice") -> None:
                 whole_s = median_seconds(
                     lambda: [
                         *pool.map(
-                            lambda index: score_view(scored.read(index), submission.read(scored.view_ids[index])),
-                            islice(cycle(range(len(scored))), FULL_CONFIG),
+                            lambda index: view_numbers(
+                                submission.read(scored.view_ids[index]), scored.views[index]
+                            ),
+                            islice(cycle(range(len(scored.views))), FULL_CONFIG),
                         )
                     ],
                     5,

@@ -1,6 +1,6 @@
 """Evaluation of a model in Python: each view is scored as it arrives.
 
-For complete configs the numbers are those of ``rebar-bench score`` on an archive of the same predictions, exactly.
+For complete configs, ``rebar-bench score`` gives exactly the same numbers for an archive of the predictions.
 """
 
 from __future__ import annotations
@@ -86,7 +86,7 @@ def evaluate(
     takes points of the left camera's frame to the right one's; with ``inputs="multi-view"``, which then needs
     ``uses_ground_truth=True``, also the poses in the world. What the config lacks is None.
 
-    The other arguments are those of ``Evaluator``, and so are the errors. An exception of a function is the cause
+    The other arguments, and the errors, are documented at ``Evaluator``. An exception of a function is the cause
     of a ``MethodError``, which names the view and the line. Progress is shown for methods and functions.
     """
     selected: dict[str, Any] = {"config": config, "split": split, "views": views, "extended": extended}

@@ -77,9 +77,11 @@ def score(
                     prediction = submission.read(truth.scored.view_ids[position])
                     return score_view(prediction, truth, position, kind, meta.prediction)
 
-                positions = range(len(truth.scored.view_ids))
+                count = len(truth.scored.view_ids)
                 task = f"scoring {config.name}"
-                views = list(map_in_threads(score_at, positions, task, workers=workers, progress=progress))
+                views = list(
+                    map_in_threads(score_at, range(count), count, task, workers=workers, progress=progress)
+                )
                 scored[config.name] = tabulate_config(views, truth, kind, meta.declaration)
             for view_id in set(submission.view_ids) - {one for of in scored.values() for one in of.frame.view_ids}:
                 submission.read(view_id)  # A view without scored pixels.
@@ -129,7 +131,7 @@ class ViewResult:
 
 @dataclass(frozen=True)
 class ScoredConfig:
-    """Numbers of a config: those of its views and their table, and the samples of extended measures by view.
+    """Numbers of the views of a config, their table, and the samples of extended measures by view.
 
     ``samples`` is None if no extended measures are computed, and empty for a config without masks or bar ids.
     """
@@ -160,7 +162,7 @@ def score_view(
 def tabulate_config(
     views: Sequence[ViewResult], truth: ConfigTruth, kind: str, declared: Declaration
 ) -> ScoredConfig:
-    """Return the numbers of a config from those of all of its scored views, in order."""
+    """Return the table and frame of a config from the results of all of its scored views, in order."""
     scored = truth.scored
     rows = {
         view_id: {**view.numbers, **references}
@@ -185,7 +187,7 @@ def scored_result(
     archive_notes: Sequence[str] = (),
     kept: Mapping[str, KeptPredictions] | None = None,
 ) -> ScoredResult:
-    """Return the result of scored configs; the other arguments are those of ``ScoredResult``."""
+    """Return the result of scored configs; ``ScoredResult`` documents the other arguments."""
     extended = None
     if any(one.samples is not None for one in scored.values()):
         from rebar_depth_bench.extended.families import extended_result

@@ -25,8 +25,8 @@ from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.base.terminal import ProgressBars
 from rebar_depth_bench.cli.console import add_archive, add_data
 from rebar_depth_bench.data.manifest import DatasetConfig
-from rebar_depth_bench.extended.ground_truth import has_bar_ids
 from rebar_depth_bench.extended.families import MEASURE_FAMILIES, score_extended
+from rebar_depth_bench.extended.ground_truth import has_bar_ids
 from rebar_depth_bench.reporting.extended_tables import reach_sentence
 from rebar_depth_bench.scoring import bootstrap
 from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation

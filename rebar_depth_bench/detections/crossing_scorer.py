@@ -65,8 +65,8 @@ def score_crossings(
             rows = np.array(rows_by_view.get(truth.view_id, ()), dtype=np.int64)
             return compare_view(detections_of_view(file.detections, rows, truth), truth, confidence)
 
-        positions, task = range(len(steel)), f"crossings of {config.name}"
-        found = list(map_in_threads(compare_at, positions, task, workers=workers, progress=progress))
+        count, task = len(steel), f"crossings of {config.name}"
+        found = list(map_in_threads(compare_at, range(count), count, task, workers=workers, progress=progress))
         resampling = None
         if found:
             resampling = resample_views(

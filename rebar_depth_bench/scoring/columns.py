@@ -90,7 +90,7 @@ class Column:
     ``place`` is its place in the JSON of a table, keys joined by dots; ``view_place`` is its place in a view if
     that differs. ``title`` names it, ``unit`` is that of the shown value, which is the value times ``factor`` with
     ``decimals``. ``as_text``, if set, makes the text of the value. ``head`` is a heading of three lines for narrow
-    columns. ``statistic`` makes the number of a table from those of its views: mean or median, or the count of
+    columns. ``statistic`` makes the number of a table from the numbers of its views: mean, median, or the count of
     views for which it is true. ``has_interval`` states whether it has a 95 % interval. Values are from 0 to
     ``most``. Views without predictions have only numbers that are ``of_all_views``.
     """

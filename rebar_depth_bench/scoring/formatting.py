@@ -178,7 +178,7 @@ def ground_truth_text(declared: Declaration) -> str:
 
 
 def interval_note(tables: Iterable[Table]) -> str:
-    """Return the sentence on intervals: how those of configs of one scene, and of several, are determined."""
+    """Return the sentence on how intervals are determined, in configs of one scene and of several scenes."""
     by_scene = {table.split is not None for table in tables}
     if by_scene == {True}:
         return f"Small figures: 95 % interval, {_SCENES_NOTE}"

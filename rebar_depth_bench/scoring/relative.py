@@ -81,7 +81,7 @@ def aligned_numbers(x: Float[ndarray, " n"], z_m: Float[ndarray, " n"], kind: st
 
 
 def metric_as(depth_m: Float[ndarray, "h w"], kind: str) -> Float64[ndarray, "h w"]:
-    """Return metric predictions as those of another kind: disparity is 1 / depth; NaN where there are none."""
+    """Return metric predictions as values of another kind: disparity is 1 / depth; NaN where there are none."""
     values = np.where(is_valid_prediction(depth_m), depth_m, np.nan).astype(np.float64)
     with np.errstate(over="ignore"):
         return 1.0 / values if kind == "affine-disparity" else values

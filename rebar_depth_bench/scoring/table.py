@@ -45,7 +45,7 @@ class Truth:
 
     ``views`` may read a view when it is taken. ``references`` are the reference errors of each view, by place, and
     ``traits`` the properties by which views are grouped. ``split`` is that of the views, None in a config of one
-    scene. ``views_per_distance``, ``truth_sigma_m`` and ``published`` are those of ``Table``.
+    scene. ``Table`` documents ``views_per_distance``, ``truth_sigma_m`` and ``published``.
     """
 
     view_ids: tuple[str, ...]
@@ -146,10 +146,10 @@ class Table:
     no positive slope, and the reference errors. ``kind`` is that of the predictions. ``intervals`` has the 95 %
     bootstrap intervals of the columns that have one, None where undefined. ``published`` is the scene of the
     paper's Table I that the config shows, if any. ``split`` is None for a config of one scene.
-    ``views_per_distance`` is that of a survey, otherwise None. ``truth_sigma_m`` is the standard deviation of the
-    ground truth's depth, None where it is exact. ``of_views`` is the number of the config's views, None if
-    ``views`` are all. ``groups`` has the tables of groups of views by grouping (see ``groups.GROUPINGS``) and
-    group, of a config with splits; they have no groups.
+    ``views_per_distance`` is the number of views at each distance of a survey, otherwise None. ``truth_sigma_m``
+    is the standard deviation of the ground truth's depth, None where it is exact. ``of_views`` is the number of
+    the config's views, None if ``views`` are all. ``groups`` has the tables of groups of views by grouping (see
+    ``groups.GROUPINGS``) and group, of a config with splits; they have no groups.
     """
 
     kind: str
@@ -244,10 +244,10 @@ class Table:
 
 
 def tabulate(frame: Frame, truth: Truth, kind: str = METRIC, declared: Declaration = NOT_DECLARED) -> Table:
-    """Return the table of a config from the numbers of its scored views, with those of groups if it has splits.
+    """Return the table of a config from the numbers of its scored views, with tables of groups if it has splits.
 
-    The intervals of a config with splits are those of resampled scenes, of a survey those of views, of others
-    those of consecutive views. A config without views is not ranked, and neither are predictions that are not
+    Scenes are resampled for the intervals of a config with splits, single views for those of a survey, blocks of
+    consecutive views otherwise. A config without views is not ranked, and neither are predictions that are not
     metric, nor a submission that declares the use of ground truth. An infinite metric (of a prediction so large
     that its square overflows) is written as null; the rank error is always finite.
     """

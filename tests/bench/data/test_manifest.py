@@ -53,10 +53,10 @@ def test_survey_is_a_trajectory(manifest: Any, tmp_path: Path) -> None:
     survey(scene_of(manifest["configs"]["lattice"]))
     (tmp_path / "manifest.json").write_text(json.dumps(manifest))
     config = open_folder(tmp_path).config("lattice")
-    assert isinstance(config.scene.protocol, Survey)
-    assert (config.scene.protocol.views, config.scene.protocol.distances_m) == (504, (0.5, 1.0))
+    assert isinstance(config.scene.trajectory, Survey)
+    assert (config.scene.trajectory.views, config.scene.trajectory.distances_m) == (504, (0.5, 1.0))
     assert published_match(config) is None
-    assert isinstance(open_folder(tmp_path).config("lattice-orbit").scene.protocol, Trajectory)
+    assert isinstance(open_folder(tmp_path).config("lattice-orbit").scene.trajectory, Trajectory)
 
 
 def test_problems_of_head_and_all_configs_are_listed(manifest: Any, tmp_path: Path) -> None:
