@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -159,7 +160,9 @@ def score_view(
         return ViewResult(numbers, None)
     from rebar_depth_bench.extended.families import view_samples
 
-    return ViewResult(numbers, view_samples(prediction, truth.steel.view(position), numbers.get("scale")))
+    return ViewResult(
+        numbers, view_samples(prediction, truth.steel.view(position), numbers.get("scale", math.nan))
+    )
 
 
 def tabulate_config(
