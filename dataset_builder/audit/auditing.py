@@ -49,8 +49,8 @@ from dataset_builder.audit.independent_depth import (
 )
 from dataset_builder.cameras.trajectories import subset
 from dataset_builder.pipeline.plan import BUILD_FOLDER
-from rebar_depth_bench.bar_crossings.definition import Crossings, scene_crossings
 from rebar_depth_bench.bar_crossings.crossings_file import CROSSINGS_FILE, folder_crossings
+from rebar_depth_bench.bar_crossings.definition import Crossings, scene_crossings
 from rebar_depth_bench.base.errors import DatasetError, InputError
 from rebar_depth_bench.base.parallel import Progress, silent
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars, with_axis

@@ -54,6 +54,7 @@ DETECTIONS_BYTES = Limit("detections_bytes", 256 * _MIB, "a file of detected cro
 CELL_BYTES = Limit("cell_bytes", 256 * _MIB, "an encoded image or depth map of a dataset row")
 IMAGE_PIXELS = Limit("image_pixels", 100_000_000, "an image of a capture, before it is decoded")
 MESH_BYTES = Limit("mesh_bytes", _GIB, "a PLY, STL or OBJ file")
+MESH_SECONDS = Limit("mesh_seconds", 1800, "the processor time for finding the bars of a PLY, STL or OBJ file")
 IFC_BYTES = Limit("ifc_bytes", _GIB, "an IFC file")
 IFC_SECONDS = Limit("ifc_seconds", 1800, "the processor time for reading an IFC file")
 IFC_MEMORY_BYTES = Limit("ifc_memory_bytes", 8 * _GIB, "the memory of the process that reads an IFC file")

@@ -31,7 +31,6 @@ from rebar_depth_bench.captures.images import read_image, read_image_shape
 from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.detections.reading import read_detections
-from rebar_depth_bench.methods.onnx.external_data import external_files
 from rebar_depth_bench.methods.onnx.spec import read_onnx_toml
 
 
@@ -130,7 +129,6 @@ LFS = b"version https://git-lfs.github.com/spec/v1\noid sha256:" + b"4d" * 32 + 
 @pytest.mark.parametrize(
     ("name", "read"),
     [
-        ("model.onnx", external_files),
         ("manifest.json", lambda path: open_folder(path.parent)),
         ("bars.parquet", read_bars),
         ("left.png", read_image_shape),

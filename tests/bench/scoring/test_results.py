@@ -74,6 +74,7 @@ def test_json_keys_and_units_match_contract() -> None:
     assert " ".join(table) == f"{numbers} reference published ci95"
     assert table["native"] == {"abs_rel": 0.75, "rmse_cm": 20.09, "mae_cm": 18.71, "delta1": 0.1234}
     assert list(table["within_mm"]) == ["3", "5", "10", "20"]
+    assert list(table["ci95"]) == ["coverage", "rank_error", "native", "scaled", "scale_median", "within_mm"]
     assert " ".join(view) == "view_id scored_px coverage rank_error scale native scaled within_mm"
 
 
