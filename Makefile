@@ -24,6 +24,7 @@ test: system-packages env-dev ## Quick, and real renders, servers, databases and
 nightly: system-packages env-dev ## Everything, with the long stress tests and 10,000 damaged inputs
 	scripts/check.sh $(BIN) nightly
 	$(BIN)/python -m tests.fuzz --cases 10000 --log fuzz.jsonl
+	$(BIN)/python -m tests.fuzz.damaged_meshes
 
 versions: ## The fast tests of the core on other versions of Python: all that are found, or VERSIONS="3.12 3.13"
 	scripts/versions.sh $(VERSIONS)

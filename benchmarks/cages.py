@@ -11,6 +11,7 @@ rules.
 from __future__ import annotations
 
 import argparse
+import io
 import statistics
 import time
 from collections import defaultdict
@@ -24,7 +25,7 @@ from numpy import ndarray
 from PIL import Image, ImageDraw
 
 from benchmarks.timing import machine_description, print_markdown
-from dataset_builder.inspection.picture import corner_view, font
+from dataset_builder.inspection.picture import font, inspection_picture
 from dataset_builder.inspection.summary import inspect_cage
 from dataset_builder.scene.assemblies.cage import Cage
 from dataset_builder.scene.cages.as_built import (
@@ -45,7 +46,7 @@ from dataset_builder.scene.cages.rules import (
 )
 
 SPLIT, COLUMNS, SHEET_CAGES = "train", 8, 64
-_PANEL_PX = (480, 320)
+_PANEL_PX = (480, 365)
 
 
 @dataclass(frozen=True)
@@ -165,15 +166,14 @@ def _row(family: str, cages: Sequence[GeneratedCage], seconds: Sequence[float]) 
 
 
 def contact_sheet(cages: Sequence[GeneratedCage]) -> Image.Image:
-    """Return pictures of the cages side by side, each with its number, family and shape."""
+    """Return pictures of the cages from four sides, each with its number, family and shape."""
     width, height = _PANEL_PX
     sheet = Image.new("RGB", (COLUMNS * width, -(-len(cages) // COLUMNS) * height), "white")
     for number, cage in enumerate(cages):
-        view = corner_view(inspect_cage(Cage(cage_bars(cage)), str(number)))
-        view.paste("white", (0, 0, view.width, 48))
         title = f"{number} {cage.family}, {cage.record['parameters']['shape']}"
-        ImageDraw.Draw(view).text((40, 4), title, "black", font(36))
-        sheet.paste(view.resize(_PANEL_PX), (number % COLUMNS * width, number // COLUMNS * height))
+        content = inspection_picture(inspect_cage(Cage(cage_bars(cage)), title))
+        with Image.open(io.BytesIO(content)) as picture:
+            sheet.paste(picture.resize(_PANEL_PX), (number % COLUMNS * width, number // COLUMNS * height))
     return sheet
 
 

@@ -24,6 +24,7 @@ f B / z of the scored pixels:
 from __future__ import annotations
 
 import json
+import math
 import os
 import statistics
 import sys
@@ -43,6 +44,7 @@ from rebar_depth_bench.base.writing import write_text
 from rebar_depth_bench.cli.main import main as rebar_bench
 from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
 from rebar_depth_bench.data.rows import iterate_rows
+from rebar_depth_bench.scoring.columns import rounded
 from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
 from rebar_depth_bench.scoring.protocol import scored_pixels
@@ -119,8 +121,8 @@ def config_numbers(config: DatasetConfig, root: Path, out: Path) -> dict[str, An
             }
             for limit in REACHES_PX
         },
-        "constant": reference["constant.abs_rel"],
-        "one_pixel": reference.one_pixel.abs_rel,
+        "constant": reference["constant"]["abs_rel"],
+        "one_pixel": reference["one_pixel"]["abs_rel"],
         "methods": {
             method: _method_numbers(archive, root, config.name, truth)
             for method, archive in archives.items()
@@ -142,28 +144,26 @@ def _method_numbers(archive: Path, root: Path, config: str, truth: Mapping[str, 
     table = result.tables[config]
     aligned = (score(archive, root, align=KIND) if is_metric else result).tables[config]
     reached = [
-        view.rank_error
+        view["rank_error"]
         for view in result.views
-        if view.rank_error is not None and truth[view.view_id].disparity_px.max() <= REACHES_PX[0]
+        if not math.isnan(view["rank_error"]) and truth[view.view_id].disparity_px.max() <= REACHES_PX[0]
     ]
-    assert aligned.aligned is not None
-    assert aligned.constant is not None
     return {
         "uses_ground_truth": result.submission.uses_ground_truth,
-        "coverage": table.coverage,
-        "rank_error": table.rank_error,
+        "coverage": rounded(table["coverage"]),
+        "rank_error": rounded(table["rank_error"]),
         "reached_rank_error": statistics.mean(reached) if reached else None,
-        "native": table.native and table["native.abs_rel"],
-        "scaled": table.scaled and table["scaled.abs_rel"],
-        "scaled_constant": table.reference.scaled_constant.abs_rel,
-        "scale": table.scale_median,
-        "within_5_mm": table.within_mm[5],
+        "native": rounded(table["native.abs_rel"]),
+        "scaled": rounded(table["scaled.abs_rel"]),
+        "scaled_constant": rounded(table["reference.scaled_constant.abs_rel"]),
+        "scale": rounded(table["scale_median"]),
+        "within_5_mm": rounded(table["within_mm.5"]),
         "bias_px": _bias_px(archive, root, truth) if is_metric else None,
         "aligned_error": aligned["aligned.error"],
         "aligned": aligned["aligned.abs_rel"],
         "aligned_constant_error": aligned["constant.error"],
         "aligned_constant": aligned["constant.abs_rel"],
-        "flat_views": aligned.flat_views,
+        "flat_views": int(aligned["flat_views"]),
     }
 
 

@@ -18,8 +18,6 @@ import tempfile
 import zipfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
-from functools import partial
 from itertools import cycle, islice
 from pathlib import Path
 
@@ -29,13 +27,11 @@ import torch
 import rebar_depth_bench as rdb
 from benchmarks.timing import machine_description, median_seconds, print_markdown
 from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.extended.families import view_samples
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
-from rebar_depth_bench.extended.measures import SCALED, MeasureFamily
-from rebar_depth_bench.extended.families import MEASURE_FAMILIES
-from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.protocol import interior
-from rebar_depth_bench.scoring.score import score_view
 from rebar_depth_bench.scoring.truth import config_truth
+from rebar_depth_bench.scoring.view_numbers import view_numbers
 from rebar_depth_bench.submission import SubmissionReader
 
 REPEATS = 15
@@ -86,26 +82,17 @@ def _torch_numbers(p: torch.Tensor, z: torch.Tensor) -> list[float]:
 
 
 def extended_rows(root: str, config: str, submission: SubmissionReader) -> list[tuple[str, str]]:
-    """Return the milliseconds per view of each measure family, native and scaled together, and their sum."""
+    """Return the milliseconds per view of its truth, and of all measures, native and scaled."""
     folder = open_folder(root)
     steel = load_steel_truth(folder, folder.config(config))
     views = []
     for index in range(len(steel)):
         truth = steel.view(index)
         views.append((truth, submission.read(truth.view_id).astype(np.float64)))
-    seconds = {"gathering a view's truth": median_seconds(lambda: [*map(steel.view, range(len(steel)))], REPEATS)}
-    for family in MEASURE_FAMILIES.values():
-        seconds[family.title] = median_seconds(partial(_evaluate_all, family, views), REPEATS // 3)
-    seconds["all"] = sum(seconds.values())
-    return [(name, f"{1e3 * value / len(views):.1f}") for name, value in seconds.items()]
-
-
-def _evaluate_all(family: MeasureFamily, views: list[tuple[SteelTruth, np.ndarray]]) -> None:
-    for truth, image_m in views:
-        fresh = replace(truth)  # What predictions share is computed again in each repetition.
-        p_m = image_m if family.on_image else image_m.ravel()[truth.index]
-        for alignment in family.alignments:
-            family.evaluate(p_m / 1.1 if alignment == SCALED else p_m, fresh)
+    gathering_s = median_seconds(lambda: [*map(steel.view, range(len(steel)))], REPEATS)
+    measuring_s = median_seconds(lambda: [view_samples(image_m, truth, 1 / 1.1) for truth, image_m in views], 5)
+    rows = {"gathering a view's truth": gathering_s, "all measures": measuring_s}
+    return [(name, f"{1e3 * value / len(views):.1f}") for name, value in rows.items()]
 
 
 def peak_megabytes(archive: Path, root: str) -> float:
@@ -121,7 +108,7 @@ def main(root: str, config: str = "lattice") -> None:
     rows = list(rdb.load(root, config, columns=["view_id", "left_depth", "left_mask"]))
     truths = {row["view_id"]: (row["left_depth"], row["left_mask"]) for row in rows}
     scored = config_truth(folder, folder.config(config))
-    pixels = sum(len(truth.index) for truth in scored) / len(scored)
+    pixels = sum(len(truth.index) for truth in scored.views) / len(scored.views)
     print(f"{len(rows)} views, {pixels:.0f} scored pixels each; {machine_description()}\n")
     with tempfile.TemporaryDirectory() as scratch:
         archive = Path(scratch) / "submission.zip"
@@ -130,8 +117,10 @@ def main(root: str, config: str = "lattice") -> None:
                 writer.add(view_id, 1.1 * truth_m + np.float32(0.01))
         with SubmissionReader(archive, folder.expected_views()) as submission:
             runs: dict[str, Callable[[], object]] = {
-                "read and checksum alone": lambda: [submission.read(truth.view_id) for truth in scored],
-                "rebar-bench": lambda: [score_view(truth, submission.read(truth.view_id)) for truth in scored],
+                "read and checksum alone": lambda: [submission.read(truth.view_id) for truth in scored.views],
+                "rebar-bench": lambda: [
+                    view_numbers(submission.read(truth.view_id), truth) for truth in scored.views
+                ],
                 "plain NumPy": lambda: plain_scores(archive, truths, numpy_metrics),
                 "plain torch": lambda: plain_scores(archive, truths, torch_metrics),
             }
@@ -141,8 +130,10 @@ def main(root: str, config: str = "lattice") -> None:
                 whole_s = median_seconds(
                     lambda: [
                         *pool.map(
-                            lambda index: score_view(scored.read(index), submission.read(scored.view_ids[index])),
-                            islice(cycle(range(len(scored))), FULL_CONFIG),
+                            lambda index: view_numbers(
+                                submission.read(scored.view_ids[index]), scored.views[index]
+                            ),
+                            islice(cycle(range(len(scored.views))), FULL_CONFIG),
                         )
                     ],
                     5,

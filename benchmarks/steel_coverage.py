@@ -41,7 +41,7 @@ def main(root: str, json_file: str | None = None) -> None:
     rows, complete = [], {}
     for name, config in folder.config_by_name.items():
         views = measure_views(config, Cylinders.from_bars(bars[config.scene.name]))
-        radii_m = config.scene.protocol.distances_m if config.scene.protocol is not None else ()
+        radii_m = config.scene.trajectory.distances_m if config.scene.trajectory is not None else ()
         if len(views) == config.scene.protocol_views:
             complete[name] = summary(config, views)
             shells = zip(radii_m, np.split(views, len(radii_m)), strict=True)
@@ -81,7 +81,7 @@ def summary(config: DatasetConfig, views: np.ndarray) -> Mapping[str, Any]:
         "scored_views": int(np.count_nonzero(scored)),
         "width": config.rig.width,
         "height": config.rig.height,
-        "distance_to": getattr(config.scene.protocol, "distance_to", CENTRE),
+        "distance_to": getattr(config.scene.trajectory, "distance_to", CENTRE),
         "coverage": {
             "mean": _rounded(steel.mean()),
             "least": _rounded(steel.min()),

@@ -15,11 +15,11 @@ import numpy as np
 import rebar_depth_bench as rdb
 from benchmarks.timing import print_markdown
 from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.extended.estimates import tabulate_extended
+from rebar_depth_bench.extended.families import measures_by_alignment, view_samples
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
 from rebar_depth_bench.extended.measures import NATIVE, ONCE
 from rebar_depth_bench.extended.reach import pooled
-from rebar_depth_bench.extended.families import measures_by_alignment, view_samples
-from rebar_depth_bench.extended.estimates import tabulate_extended
 from rebar_depth_bench.scoring.bootstrap import resample
 
 COLUMNS = ["view_id", "left_depth"]

@@ -176,7 +176,7 @@ def _shared_row(config: DatasetConfig, split: str) -> dict[str, Any]:
 
 def _split_row(config: DatasetConfig) -> dict[str, Any]:
     """Return the columns of a split of generated scenes; the first split shows the contact sheet."""
-    trajectories = [scene.protocol for scene in config.scenes if scene.protocol is not None]
+    trajectories = [scene.trajectory for scene in config.scenes if scene.trajectory is not None]
     distances_m = [distance_m for trajectory in trajectories for distance_m in trajectory.distances_m]
     cameras = dict.fromkeys(scene.rig.camera for scene in config.scenes if scene.rig is not None)
     split = config.scenes[0].split
@@ -211,7 +211,7 @@ def _config_row(config: DatasetConfig) -> dict[str, Any]:
     return {
         "views": f"{len(config.views)} of {scene.protocol_views}",
         "steel_source": _steel_source(scene.assembly) if scene.assembly is not None else DASH,
-        "distance": _distance(scene.protocol) if scene.protocol is not None else DASH,
+        "distance": _distance(scene.trajectory) if scene.trajectory is not None else DASH,
         "steel_depth": _steel_depth(config.name, scene),
         "variants": scene.appearance.variants,
         "panorama": light.image if light is not None else None,
@@ -272,5 +272,5 @@ def _steel_depth(config: str, scene: Scene) -> str:
     steel = steel_by_config().get(config)
     if scene.assembly is None or scene.assembly.path is not None or steel is None:
         return DASH
-    distance_to = scene.protocol.distance_to if isinstance(scene.protocol, Trajectory) else CENTRE
+    distance_to = scene.trajectory.distance_to if isinstance(scene.trajectory, Trajectory) else CENTRE
     return depth_text(steel) if distance_to == steel["distance_to"] else DASH

@@ -39,6 +39,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +49,7 @@ from torch.nn import functional
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.base.errors import InputError
-from rebar_depth_bench.base.terminal import duration_text, print_notice
+from rebar_depth_bench.base.terminal import print_notice
 from rebar_depth_bench.base.writing import atomic_replace, write_text
 from rebar_depth_bench.cli.console import run_command
 from rebar_depth_bench.data.manifest import open_folder
@@ -277,7 +278,7 @@ def train(options: argparse.Namespace, checkpoint: Path) -> DepthNet:
         left_s = min(limit_s - training.seconds, training.seconds * (options.epochs / training.epoch - 1))
         print_notice(
             f"epoch {training.epoch} of {options.epochs}: mean error of log depth {steel:.3f} on steel, "
-            f"{frame:.3f} on all surfaces{validation}; {duration_text(max(left_s, 0.0))} left"
+            f"{frame:.3f} on all surfaces{validation}; {timedelta(seconds=round(max(left_s, 0.0)))} left"
         )
     return training.net
 

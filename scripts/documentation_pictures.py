@@ -166,11 +166,11 @@ def leaderboard(data: Path, state: Path, archives: Sequence[Path]) -> Iterator[t
     server = subprocess.Popen([*command, "--port", "0"], stderr=subprocess.PIPE, text=True)
     try:
         url = _announced_url(server)
-        with LeaderboardClient(url, token) as client:
-            # The first of the archives is submitted last, and is the newest.
-            accepted = [client.submit(archive) for archive in reversed(archives)]
-            for submission in accepted:
-                client.wait(submission.id)
+        client = LeaderboardClient(url, token)
+        # The first of the archives is submitted last, and is the newest.
+        accepted = [client.submit(archive) for archive in reversed(archives)]
+        for submission in accepted:
+            client.wait(submission)
         yield url, [submission.url for submission in reversed(accepted)]
     finally:
         server.terminate()

@@ -11,7 +11,6 @@ from __future__ import annotations
 import re
 from argparse import ArgumentParser, _SubParsersAction
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from itertools import groupby
 from math import atan2, degrees
 from pathlib import Path
 
@@ -19,14 +18,12 @@ from pydantic import ByteSize
 
 from cards.dataset import column_rows
 from dataset_builder.cli.main import argument_parser
-from dataset_builder.importing.view_cameras import BOP, NERFSTUDIO
 from dataset_builder.scene.variants.registry import VARIANTS
 from dataset_builder.specs.config_specs import STEREO_CAMERAS
 from leaderboard.settings import Settings
 from rebar_depth_bench.base import limits
-from rebar_depth_bench.captures.calibration_files import ZED_CONF
-from rebar_depth_bench.captures.fields import Field, FileFormat
-from rebar_depth_bench.captures.program_formats import CAMERA, KALIBR, MIDDLEBURY, PAIR
+from rebar_depth_bench.captures.calibration_files import ZED_SIZES
+from rebar_depth_bench.captures.programs import KEYS
 from rebar_depth_bench.geometry.cameras import NOMINAL_WIDTH
 
 ROOT = Path(__file__).parents[1]
@@ -34,7 +31,6 @@ PAGES = (
     ROOT / "SECURITY.md",
     *(ROOT / "docs" / f"{name}.md" for name in ("build", "cages", "formats", "leaderboard-operator")),
 )
-FORMATS = (ZED_CONF, CAMERA, PAIR, KALIBR, MIDDLEBURY, BOP, NERFSTUDIO)
 _BLOCK = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
 
 
@@ -128,28 +124,19 @@ def _columns() -> str:
     return _table("columns | type | meaning", rows)
 
 
-def _formats() -> str:
-    """Return the tables by which the readers of the files of other programs look up keys."""
-    return "\n\n".join(map(format_table, FORMATS))
+def _calibration_keys() -> str:
+    """Return the known keys of files of OpenCV and ROS."""
+    return _table("field | keys", ((field, _code(keys)) for field, keys in KEYS.items()))
 
 
-def format_table(file_format: FileFormat) -> str:
-    """Return the heading and the table of a format; fields of the same use and meaning share a row."""
-    groups = groupby(file_format.fields, lambda field: (field.use, field.meaning))
-    rows = ((_keys(fields), use, meaning) for (use, meaning), fields in groups)
-    return f"### {file_format.title}\n\n{_table('keys | use | meaning', rows)}"
+def _zed_sizes() -> str:
+    """Return the image sizes of Stereolabs cameras."""
+    rows = ((f"`{name}`", f"{width} x {height}") for name, (width, height) in ZED_SIZES.items())
+    return _table("X | pixels", rows)
 
 
-def _keys(fields: Iterable[Field]) -> str:
-    """Return the keys of fields as code, those of one section together."""
-    sections: dict[str, list[str]] = {}
-    for field in fields:
-        for key in field.keys:
-            section, _, name = key.rpartition(".")
-            sections.setdefault(section, []).append(f"`{name}`")
-    return "; ".join(
-        f"`{section}`: {', '.join(names)}" if section else ", ".join(names) for section, names in sections.items()
-    )
+def _code(names: Iterable[str]) -> str:
+    return ", ".join(f"`{name}`" for name in names)
 
 
 TABLES: Mapping[str, Callable[[], str]] = {
@@ -159,7 +146,8 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "variants": _variants,
     "rigs": _rigs,
     "columns": _columns,
-    "formats": _formats,
+    "zed-sizes": _zed_sizes,
+    "calibration-keys": _calibration_keys,
 }
 """Functions of the tables by their names in the marks."""
 

@@ -69,12 +69,9 @@ class AuditReport:
         return tuple(check for check in self.checks if check.problems)
 
 
-def print_audit(report: AuditReport, console: Console | None = None) -> None:
-    """Print one table row per check, then the problems of each failed check.
-
-    ``console`` defaults to a new console on standard output.
-    """
-    console = console or Console()
+def print_audit(report: AuditReport) -> None:
+    """Print one table row per check, then the problems of each failed check."""
+    console = Console()
     table = Table(title=f"Audit of {report.root}")
     for heading in ("check", "found", "bound", ""):
         table.add_column(heading, overflow="fold")

@@ -66,11 +66,6 @@ class UserScene:
     cage: Cage
 
 
-def scene_config(path: str | os.PathLike[str]) -> ConfigSpec:
-    """Return the config of a scene file. Raises as ``read_scene``."""
-    return read_scene(path).config
-
-
 def read_scene(path: str | os.PathLike[str]) -> UserScene:
     """Return the config of a scene file, with the default colour settings and seed, and its cage.
 
@@ -114,7 +109,7 @@ def scene_cage(path: str | os.PathLike[str], mesh_unit: str | float = "m") -> Ca
     """Return the bars of a scene file or of a mesh file, placed in the world frame, with what they leave out.
 
     A mesh file is in the unit ``mesh_unit`` and keeps its coordinates, as with ``--mesh``. Raises ``InputError``
-    and ``MeshError`` as ``scene_config`` where a file cannot be read; reasons for which a build refuses the bars
+    and ``MeshError`` as ``read_scene`` where a file cannot be read; reasons for which a build refuses the bars
     are in ``Cage.problems``.
     """
     path = Path(path)
@@ -126,7 +121,7 @@ def scene_cage(path: str | os.PathLike[str], mesh_unit: str | float = "m") -> Ca
 
 
 def files_of_scene(path: str | os.PathLike[str]) -> list[Path]:
-    """Return a scene file and the file that it names. Raises ``InputError`` as ``scene_config``."""
+    """Return a scene file and the file that it names. Raises ``InputError`` as ``read_scene``."""
     path = Path(path)
     if path.suffix.lower() in MESH_SUFFIXES:
         return [path]

@@ -62,7 +62,6 @@ from rebar_depth_bench.base.validation import (
     text,
     validate_table,
     whole_number,
-    with_lines,
 )
 
 VIEW = "{view}"
@@ -209,10 +208,10 @@ class Layout(StrictModel):
 
 
 def read_layout(path: Path) -> Layout:
-    """Read a layout file. Raises ``InputError`` with all problems, which name keys and lines."""
+    """Read a layout file. Raises ``InputError`` with all problems, which name keys."""
     content = read_file(path, TOML_BYTES, "a layout of data to import", InputError)
     values, problems = parse_toml(content)
     layout = None if problems else validate_table(Layout, values, problems)
     if layout is None:
-        raise InputError.from_problems(path, with_lines(problems, content))
+        raise InputError.from_problems(path, problems)
     return layout

@@ -1,21 +1,27 @@
-"""Picture of a cage from four sides, drawn without Blender: front, right, top and a corner."""
+"""Picture of a cage from four sides, cast by parallel rays without Blender: front, right, top and a corner."""
 
 from __future__ import annotations
 
 import io
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass
+from contextlib import suppress
+from dataclasses import replace
 from functools import cache
 from importlib.resources import files
+from itertools import product
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Integer
 from numpy import ndarray
 from PIL import Image, ImageDraw, ImageFont
 
-from dataset_builder.inspection.summary import Inspection, diameter_mm
+from dataset_builder.inspection.summary import Box, Inspection, diameter_mm
 from dataset_builder.scene.assemblies.cage import CageBar
+from dataset_builder.scene.model import Mesh, WorldMesh
+from dataset_builder.scene.raycast import RayCaster
+from dataset_builder.scene.shapes.bar_mesh import plain_bar_mesh
+from dataset_builder.scene.shapes.solids import world_mesh
 from rebar_depth_bench.base.errors import printable
 from rebar_depth_bench.scoring.formatting import counted
 
@@ -26,184 +32,123 @@ _PANEL_PX, _MARGIN_PX, _HEAD_PX = (960, 640), 40, 90
 _WIDTH_PX, _LEGEND_PX = 2 * _PANEL_PX[0], 2 * _PANEL_PX[1] + _HEAD_PX
 """Width of a picture, and the upper end of the legend below its panels."""
 _OVERSAMPLING = 2
-"""Pixels per pixel of the picture, along each side, that are drawn and averaged."""
+"""Rays per pixel of the picture, along each side, whose colours are averaged."""
+_MIN_PX = 1.2
+"""Smallest diameter of bars in the picture, pixels, so that thin ones are not missed by rays."""
 
 _PAPER, _INK, _GREY, _MARK = (255, 255, 255), (20, 20, 20), (110, 110, 110), (214, 0, 60)
 _COLOURS = ((0, 90, 160), (213, 94, 0), (0, 135, 100), (130, 70, 150), (170, 120, 0), (60, 60, 60), (0, 150, 190))
 """Colours of diameters, the largest first; repeated for further ones."""
 _UNKNOWN = (150, 150, 150)
 _HAZE = 0.6
-"""Share of white in the colour of the farthest bars."""
-
-_Colours = dict[float | None, tuple[int, int, int]]
-"""Colour of each diameter in millimetres; None is an unknown diameter."""
+"""Share of white in the colour of the farthest steel."""
+_RIM = 0.5
+"""Share of the colour that is left where steel is seen at a grazing angle."""
 
 _MAX_MARKS = 200
-_MAX_PIECES = 50_000
-"""Largest number of pieces of bars that are drawn in the order of their own depths."""
-_MAX_EDGES = 20_000
-"""Largest number of edges that are drawn of the mesh of a bar without axis."""
+_SEGMENTS = 16
+"""Sides of the cross-section of bars."""
 
-
-@dataclass(frozen=True)
-class _Side:
-    """Side of a cage: title, and the directions to the right and towards the viewer."""
-
-    title: str
-    right: tuple[float, float, float]
-    towards: tuple[float, float, float]
-
-    @property
-    def axes(self) -> Float64[ndarray, "3 3"]:
-        """Unit vectors to the right, up and towards the viewer, as rows."""
-        rows = np.array([self.right, np.cross(self.towards, self.right), self.towards], dtype=np.float64)
-        return np.asarray(rows / np.linalg.norm(rows, axis=1, keepdims=True))
-
-
-_SIDES = (
-    _Side("front: x to the right, z up", (1, 0, 0), (0, -1, 0)),
-    _Side("right: y to the right, z up", (0, 1, 0), (1, 0, 0)),
-    _Side("top: x to the right, y up", (1, 0, 0), (0, 0, 1)),
-    _Side("corner: from the front, the right and above", (1.2, 0.9, 0.0), (0.9, -1.2, 0.8)),
-)
-
-
-@dataclass(frozen=True, eq=False)
-class _Stroke:
-    """Line to draw: points (world, metres), diameter (0 for an edge of a mesh) and colour.
-
-    ``tips`` are its first and last point (0, -1) that are ends of a bar, where its outline is round.
-    """
-
-    points_m: Float64[ndarray, "n 3"]
-    diameter_m: float
-    colour: tuple[int, int, int]
-    tips: tuple[int, ...] = ()
+_SIDES = {
+    "front: x to the right, z up": ((1, 0, 0), (0, -1, 0)),
+    "right: y to the right, z up": ((0, 1, 0), (1, 0, 0)),
+    "top: x to the right, y up": ((1, 0, 0), (0, 0, 1)),
+    "corner: from the front, the right and above": ((1.2, 0.9, 0.0), (0.9, -1.2, 0.8)),
+}
+"""Directions to the right and towards the viewer, by title."""
 
 
 def inspection_picture(inspection: Inspection) -> bytes:
     """Return a PNG of a cage from four sides, with its diameters, sizes, and marks where bars clash."""
-    colours = _colours(inspection.cage.bars)
-    strokes = _strokes(inspection.cage.bars, colours)
+    counts = Counter(map(diameter_mm, inspection.cage.bars))
+    diameters = sorted(counts, key=lambda size_mm: -(size_mm or 0.0))
+    colours = [_COLOURS[number % len(_COLOURS)] for number in range(len(diameters))]
+    if None in counts:
+        colours[-1] = _UNKNOWN
+    # The cage is cast at unit size, since Embree has 32-bit coordinates.
+    centre_m, size_m = inspection.box_m.mean(axis=0), max(float(np.ptp(inspection.box_m, axis=0).max()), 1e-6)
+    corners = np.array(list(product(*((inspection.box_m - centre_m) / size_m).T)))
+    axes, boxes = list[Float64[ndarray, "3 3"]](), list[Box]()
+    for right, towards in _SIDES.values():
+        rows = np.array([right, np.cross(towards, right), towards], dtype=np.float64)
+        axes.append(rows / np.linalg.norm(rows, axis=1, keepdims=True))
+        in_view = corners @ axes[-1].T
+        boxes.append(np.array([in_view.min(axis=0), in_view.max(axis=0)]))
+    room_px = np.array([_PANEL_PX[0] - 2 * _MARGIN_PX, _PANEL_PX[1] - 4 * _MARGIN_PX])
+    scales = [float((room_px / np.maximum(np.ptp(box, axis=0)[:2], 1e-6)).min()) for box in boxes]
+    mesh = _mesh_of_colours(inspection.cage.bars, diameters, _MIN_PX / min(scales) * size_m)
+    caster = RayCaster(replace(mesh, vertices_m=(mesh.vertices_m - centre_m) / size_m))
     picture = Image.new("RGB", (_WIDTH_PX, _LEGEND_PX + _HEAD_PX), _PAPER)
-    for number, side in enumerate(_SIDES):
-        place = (number % 2 * _PANEL_PX[0], number // 2 * _PANEL_PX[1] + _HEAD_PX)
-        picture.paste(_panel(inspection, strokes, side), place)
-    _write_head(ImageDraw.Draw(picture), inspection)
-    _write_legend(ImageDraw.Draw(picture), colours, inspection)
+    for number, title in enumerate(_SIDES):
+        panel = _cast(caster, axes[number], boxes[number], scales[number], np.array(colours))
+        draw = ImageDraw.Draw(panel)
+        for clash in (inspection.clashes or ())[:_MAX_MARKS]:
+            off_px = axes[number] @ (clash.point_m - centre_m) / size_m * scales[number]
+            x, y = _PANEL_PX[0] / 2 + float(off_px[0]), _PANEL_PX[1] / 2 - float(off_px[1])
+            draw.ellipse((x - 5, y - 5, x + 5, y + 5), outline=_MARK, width=2)
+        draw.text((_MARGIN_PX, 10), title, _INK, font(20))
+        _draw_scale_bar(draw, scales[number] / size_m)
+        picture.paste(panel, (number % 2 * _PANEL_PX[0], number // 2 * _PANEL_PX[1] + _HEAD_PX))
+    draw = ImageDraw.Draw(picture)
+    draw.text((_MARGIN_PX, 14), printable(inspection.name, 60), _INK, font(30))
+    words = f"{counted(len(inspection.cage.bars), 'bar')}, {inspection.size_text} (x, y, z)"
+    if inspection.clashes:
+        words += f"; red circles: {counted(len(inspection.clashes), 'pair')} of bars clash"
+    draw.text((_MARGIN_PX, 54), words, _GREY, font(20))
+    x, y = _MARGIN_PX, _LEGEND_PX + 24
+    for size_mm, colour in zip(diameters, colours, strict=True):
+        text = f"{'no diameter' if size_mm is None else f'{size_mm:g} mm'} ({counts[size_mm]})"
+        width = 46 + int(font(20).getlength(text))
+        if x + width > _WIDTH_PX - _MARGIN_PX:
+            x, y = _MARGIN_PX, y + 30
+        draw.line((x, y + 12, x + 34, y + 12), colour, 8)
+        draw.text((x + 46, y), text, _INK, font(20))
+        x += width + 36
     stream = io.BytesIO()
     picture.save(stream, "png")
     return stream.getvalue()
 
 
-def corner_view(inspection: Inspection) -> Image.Image:
-    """Return a picture of a cage from the front, the right and above."""
-    bars = inspection.cage.bars
-    return _panel(inspection, _strokes(bars, _colours(bars)), _SIDES[-1])
+def _mesh_of_colours(bars: Sequence[CageBar], diameters: Sequence[float | None], min_m: float) -> WorldMesh:
+    """Return the surfaces of bars; the label of each is the number of its diameter from 1.
 
-
-def _colours(bars: Sequence[CageBar]) -> _Colours:
-    """Return the colours of the diameters of bars, the largest first."""
-    found = {diameter_mm(bar) for bar in bars}
-    known = sorted((diameter for diameter in found if diameter is not None), reverse=True)
-    colours: _Colours = {diameter: _COLOURS[number % len(_COLOURS)] for number, diameter in enumerate(known)}
-    return colours | ({None: _UNKNOWN} if None in found else {})
-
-
-def _strokes(bars: Sequence[CageBar], colours: _Colours) -> list[_Stroke]:
-    """Return the straight pieces of all bars, or whole bars if there are more than ``_MAX_PIECES`` pieces."""
-    whole = sum(len(bar.bar.axis_m) for bar in bars) > _MAX_PIECES
-    strokes = []
+    Bars thinner than ``min_m`` are drawn as thick. Those whose axis turns back on itself, which a build refuses,
+    have no surface; if there are no others, it is a triangle without area.
+    """
+    meshes, labels = list[Mesh](), list[int]()
     for bar in bars:
-        colour = colours[diameter_mm(bar)]
-        if not bar.bar.has_axis:
-            strokes += [_Stroke(edge_m, 0.0, colour) for edge_m in _mesh_edges(bar)]
-            continue
-        axis_m = np.array(bar.bar.axis_m)
-        lines = [axis_m] if whole else np.stack([axis_m[:-1], axis_m[1:]], axis=1)
-        for number, line_m in enumerate(lines):
-            tips = (*((0,) if number == 0 else ()), *((-1,) if number == len(lines) - 1 else ()))
-            strokes.append(_Stroke(line_m, bar.bar.diameter_m, colour, tips))
-    return strokes
+        mesh = bar.mesh
+        if mesh is None or (bar.bar.has_axis and bar.bar.diameter_m < min_m):
+            with suppress(ValueError):
+                mesh = plain_bar_mesh(np.array(bar.bar.axis_m), max(bar.bar.diameter_m, min_m), _SEGMENTS)
+        if mesh is not None:
+            meshes.append(mesh)
+            labels.append(1 + diameters.index(diameter_mm(bar)))
+    return world_mesh(meshes or [Mesh(np.zeros((3, 3)), np.array([[0, 1, 2]], np.int32))], labels or [1])
 
 
-def _mesh_edges(bar: CageBar) -> Float64[ndarray, "n 2 3"]:
-    assert bar.mesh is not None  # A bar without axis has a mesh.
-    sides = np.concatenate([bar.mesh.faces[:, pair] for pair in ([0, 1], [1, 2], [2, 0])])
-    edges = np.unique(np.sort(sides), axis=0)
-    return np.asarray(bar.mesh.vertices_m[edges[:: max(1, len(edges) // _MAX_EDGES)]])
-
-
-@dataclass(frozen=True, eq=False)
-class _Projection:
-    """Orthographic projection of the world onto a panel, in pixels of the oversampled panel."""
-
-    axes: Float64[ndarray, "3 3"]
-    px_per_m: float
-    middle_m: Float64[ndarray, " 2"]
-
-    @classmethod
-    def fitting(cls, axes: Float64[ndarray, "3 3"], box_m: Float64[ndarray, "2 3"]) -> _Projection:
-        corners_m = (
-            np.array([[x, y, z] for x in box_m[:, 0] for y in box_m[:, 1] for z in box_m[:, 2]]) @ axes[:2].T
-        )
-        lower_m, upper_m = corners_m.min(axis=0), corners_m.max(axis=0)
-        space_px = np.array([_PANEL_PX[0] - 2 * _MARGIN_PX, _PANEL_PX[1] - 4 * _MARGIN_PX])
-        scale = float((space_px / np.maximum(upper_m - lower_m, 1e-6)).min())
-        return cls(axes, scale * _OVERSAMPLING, (lower_m + upper_m) / 2)
-
-    def pixels(self, points_m: Float64[ndarray, "n 3"]) -> Float64[ndarray, "n 2"]:
-        """Return the places of points in the panel."""
-        right, up = (points_m @ self.axes[:2].T - self.middle_m).T * self.px_per_m
-        width, height = (side * _OVERSAMPLING for side in _PANEL_PX)
-        return np.stack([width / 2 + right, height / 2 - up], axis=-1)
-
-
-def _panel(inspection: Inspection, strokes: Sequence[_Stroke], side: _Side) -> Image.Image:
-    large = Image.new("RGB", (_PANEL_PX[0] * _OVERSAMPLING, _PANEL_PX[1] * _OVERSAMPLING), _PAPER)
-    projection = _Projection.fitting(side.axes, inspection.box_m)
-    draw = ImageDraw.Draw(large)
-    _draw_strokes(draw, strokes, projection)
-    for clash in (inspection.clashes or ())[:_MAX_MARKS]:
-        ((x, y),) = projection.pixels(np.array([clash.point_m])).tolist()
-        draw.ellipse((x - 9, y - 9, x + 9, y + 9), outline=_MARK, width=3)
-    panel = large.resize(_PANEL_PX, Image.Resampling.BOX)
-    draw = ImageDraw.Draw(panel)
-    draw.text((_MARGIN_PX, 10), side.title, _INK, font(20))
-    _draw_scale_bar(draw, projection.px_per_m / _OVERSAMPLING)
-    return panel
-
-
-def _draw_strokes(draw: ImageDraw.ImageDraw, strokes: Sequence[_Stroke], projection: _Projection) -> None:
-    """Draw strokes from back to front, each with a dark outline where it is wide enough, paler in the distance."""
-    nearness_m = np.array([stroke.points_m.mean(axis=0) for stroke in strokes]) @ projection.axes[2]
-    haze = _HAZE * (nearness_m.max() - nearness_m) / (float(np.ptp(nearness_m)) or 1.0)
-    for index in np.argsort(nearness_m, kind="stable").tolist():
-        stroke = strokes[index]
-        places = projection.pixels(stroke.points_m)
-        colour = np.array(stroke.colour) + haze[index] * (255 - np.array(stroke.colour))
-        width = round(max(stroke.diameter_m * projection.px_per_m, _OVERSAMPLING))
-        if width >= 4 * _OVERSAMPLING:
-            # Round outlines at the joints of a bend would cover the pieces beside them.
-            _draw_rod(draw, places, places[list(stroke.tips)], width, 0.55 * colour)
-            width -= 2 * _OVERSAMPLING
-        _draw_rod(draw, places, places, width, colour)
-
-
-def _draw_rod(
-    draw: ImageDraw.ImageDraw,
-    places: Float64[ndarray, "n 2"],
-    discs: Float64[ndarray, "m 2"],
-    width: int,
-    colour: Float64[ndarray, " 3"],
-) -> None:
-    """Draw a line through ``places``, with discs that round its ends and join the pieces of a bend."""
-    red, green, blue = colour.round().astype(int).tolist()
-    draw.line(places.ravel().tolist(), fill=(red, green, blue), width=width)
-    if width > 2 * _OVERSAMPLING:
-        radius = (width - 1) / 2
-        for x, y in discs.tolist():
-            draw.ellipse((x - radius, y - radius, x + radius, y + radius), fill=(red, green, blue))
+def _cast(
+    caster: RayCaster,
+    axes: Float64[ndarray, "3 3"],
+    box: Box,
+    px_per_unit: float,
+    colours: Integer[ndarray, "n 3"],
+) -> Image.Image:
+    """Return the steel that parallel rays hit, paler in the distance; ``box`` is in the frame of ``axes``."""
+    width, height = (side * _OVERSAMPLING for side in _PANEL_PX)
+    step, middle = 1 / (px_per_unit * _OVERSAMPLING), box.mean(axis=0)
+    origins = np.empty((height, width, 3))
+    origins[..., 0] = middle[0] + (np.arange(width) - (width - 1) / 2) * step
+    origins[..., 1] = middle[1] - (np.arange(height) - (height - 1) / 2)[:, None] * step
+    origins[..., 2] = box[1, 2] + 1
+    hits = caster.hits(origins.reshape(-1, 3) @ axes, np.broadcast_to(-axes[2], (width * height, 3)))
+    is_hit = hits.bar_id > 0
+    haze = _HAZE * np.clip((hits.range_m[is_hit] - 1) / max(box[1, 2] - box[0, 2], 1e-6), 0, 1)
+    shade = _RIM + (1 - _RIM) * hits.cos_incidence[is_hit]
+    steel = colours[hits.bar_id[is_hit] - 1] * shade[:, None]
+    pixels = np.full((width * height, 3), 255, np.uint8)
+    pixels[is_hit] = (steel + haze[:, None] * (255 - steel)).round()
+    return Image.fromarray(pixels.reshape(height, width, 3)).resize(_PANEL_PX, Image.Resampling.BOX)
 
 
 def _draw_scale_bar(draw: ImageDraw.ImageDraw, px_per_m: float) -> None:
@@ -220,48 +165,8 @@ def _draw_scale_bar(draw: ImageDraw.ImageDraw, px_per_m: float) -> None:
     draw.text((end + 10, y - 11), text, _INK, font(18))
 
 
-def _write_head(draw: ImageDraw.ImageDraw, inspection: Inspection) -> None:
-    name = shortened(printable(inspection.name), 30, _WIDTH_PX - 2 * _MARGIN_PX)
-    draw.text((_MARGIN_PX, 14), name, _INK, font(30))
-    bars = counted(len(inspection.cage.bars), "bar")
-    words = [f"{bars}, {inspection.size_text} (x, y, z)"]
-    if inspection.clashes:
-        words.append(f"red circles: {counted(len(inspection.clashes), 'pair')} of bars clash")
-    draw.text((_MARGIN_PX, 54), "; ".join(words), _GREY, font(20))
-
-
-def _write_legend(draw: ImageDraw.ImageDraw, colours: _Colours, inspection: Inspection) -> None:
-    """Write the diameters with their colours, in as many columns as fit."""
-    x, y, counts = _MARGIN_PX, _LEGEND_PX + 24, Counter(map(diameter_mm, inspection.cage.bars))
-    for size_mm, colour in colours.items():
-        name = "no diameter" if size_mm is None else f"{size_mm:g} mm"
-        text = f"{name} ({counts[size_mm]})"
-        end = x + 46 + font(20).getlength(text)
-        if end > _WIDTH_PX - _MARGIN_PX:
-            x, y, end = _MARGIN_PX, y + 30, _MARGIN_PX + 46 + font(20).getlength(text)
-        draw.line((x, y + 12, x + 34, y + 12), colour, 8)
-        draw.text((x + 46, y), text, _INK, font(20))
-        x = int(end) + 36
-
-
 @cache
 def font(size_px: float) -> ImageFont.FreeTypeFont:
     """Return the font at a size in pixels."""
     content = files("dataset_builder.inspection").joinpath(FONT_FILE).read_bytes()
     return ImageFont.truetype(io.BytesIO(content), size_px, layout_engine=ImageFont.Layout.BASIC)
-
-
-def text_width(text: str, size_px: float) -> float:
-    """Return the width of a text in pixels."""
-    return font(1000).getlength(text) * size_px / 1000
-
-
-def shortened(text: str, size_px: float, width_px: float) -> str:
-    """Return a text that fits into a width, an ellipsis in its middle if need be: names differ at the end."""
-    if text_width(text, size_px) <= width_px:
-        return text
-    for kept in range(len(text) - 1, 1, -1):
-        short = f"{text[: (kept + 1) // 2]}…{text[len(text) - kept // 2 :]}"
-        if text_width(short, size_px) <= width_px:
-            return short
-    return "…"

@@ -62,12 +62,9 @@ def _bar_values(bar: CageBar) -> dict[str, Any]:
     }
 
 
-def print_inspection(inspection: Inspection, console: Console | None = None) -> None:
-    """Print the groups of bars, then what else there is to know about the cage.
-
-    ``console`` defaults to a new console on standard output.
-    """
-    console = console or Console()
+def print_inspection(inspection: Inspection) -> None:
+    """Print the groups of bars, then what else there is to know about the cage."""
+    console = Console()
     print_unwrapped(console, _group_table(inspection.groups))
     more = inspection.groups[_MAX_GROUPS:]
     if more:

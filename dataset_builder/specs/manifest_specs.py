@@ -23,7 +23,7 @@ def trajectory_spec(config: DatasetConfig) -> TrajectorySpec:
 
     Raises ``DatasetError`` with all problems if the manifest does not have one that this version writes.
     """
-    kind = config.scene.protocol.kind if config.scene.protocol is not None else ""
+    kind = config.scene.trajectory.kind if config.scene.trajectory is not None else ""
     return _read_spec(config, "protocol", _TRAJECTORIES[kind])
 
 

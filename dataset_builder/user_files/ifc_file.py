@@ -61,8 +61,9 @@ def ifc_cage(content: bytes, where: str, select: tuple[Selection, ...] = (), tru
     the declared one is a problem of the cage.
 
     Raises ``MeshError`` if the file is not a complete IFC file, has no known length unit, nothing to read or
-    a bar without usable geometry (with its GlobalId), if a bar depends on an instance that cannot be read as
-    written, or if reading exceeds a limit; ``InputError`` if ifcopenshell is not installed.
+    a bar without usable geometry (with its GlobalId), if a part of it cannot be read, if a bar depends on an
+    instance that is not as its class says, or if reading exceeds a limit; ``InputError`` if ifcopenshell is not
+    installed.
     """
     require_extra("ifc", ["ifcopenshell"])
     seconds = IFC_SECONDS.value()

@@ -2,8 +2,10 @@
 
 - The dataset's own PLY layout (``dataset_builder.scene.mesh_ply``) is used unchanged: the faces with one
   ``bar_id`` form a part with that id; faces with id 0 (board, table) are left out.
-- Every other file is read by ``mesh_formats``. If it holds several OBJ objects (``o``), each is a part. Parts are
-  numbered from 1 in the order of their names, with numbers within names compared by value ("bar2" before "bar10").
+- Every other file is read by ``mesh_formats``. If it holds several OBJ objects (``o``), each is a part, unless no
+  tube fits it and one fits each of its connected components: then these are parts with the object's name and a
+  number. Parts are numbered from 1 in the order of their names, with numbers within names compared by value
+  ("bar2" before "bar10").
 - A file with one object (any STL or PLY) is split into connected components after vertices closer than 10 nm
   are merged. Components are numbered from 1 in the order of their first faces. Bars that share a vertex are
   one part.
@@ -18,6 +20,7 @@ from __future__ import annotations
 
 import logging
 import re
+import time
 import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -33,12 +36,13 @@ from dataset_builder.scene.assemblies.cage import Cage, CageBar, LeftOut, unit_s
 from dataset_builder.scene.mesh_ply import has_mesh_ply_header, parse_mesh_ply
 from dataset_builder.scene.model import ESTIMATED_ROLE, MAX_BARS, NOT_STEEL, Mesh, axis_of
 from dataset_builder.specs.file_specs import MeshFileSpec, nearest_names
-from dataset_builder.user_files.mesh_formats.parsing import MalformedMeshError, Surface
+from dataset_builder.user_files.mesh_formats.parsing import MalformedMeshError, Surface, first_true
 from dataset_builder.user_files.mesh_formats.ply import read_ply
 from dataset_builder.user_files.mesh_formats.stl_obj import read_obj, read_stl
-from dataset_builder.user_files.tubes.tube_fit import fit_tube
+from dataset_builder.user_files.tubes.tube_fit import Tube, fit_tube
 from dataset_builder.user_files.tubes.tube_surface import component_labels
 from rebar_depth_bench.base.errors import DatasetError, MeshError, escape_text
+from rebar_depth_bench.base.limits import MESH_SECONDS
 from rebar_depth_bench.data.bars import Bar
 
 if TYPE_CHECKING:
@@ -61,11 +65,16 @@ logging.getLogger("trimesh").addHandler(logging.NullHandler())
 
 @dataclass(frozen=True, eq=False)
 class MeshPart:
-    """Part of a file: id, name and mesh (the file's frame, metres)."""
+    """Part of a file: id, name and mesh (the file's frame, metres).
+
+    ``object_name`` is the name of the object that it is a piece of; ``tube`` what was fitted to the piece.
+    """
 
     bar_id: int
     name: str
     mesh: Mesh
+    object_name: str = ""
+    tube: Tube | None = None
 
 
 def mesh_cage(content: bytes, spec: MeshFileSpec) -> Cage:
@@ -75,11 +84,29 @@ def mesh_cage(content: bytes, spec: MeshFileSpec) -> Cage:
     be watertight. Selected parts are numbered from 1, but without a selection those of the dataset's own PLY keep
     their ids.
 
-    Raises ``MeshError`` as ``read_parts``, if no part is selected, and for a part without area.
+    Raises ``MeshError`` as ``read_parts``, if no part is selected, for a part without area, and after
+    ``MESH_SECONDS`` of processor time.
     """
-    taken, left_out = _selected(read_parts(content, spec), spec)
-    bars = [_fitted_bar(part, spec.path) for part in taken]
+    deadline_s = time.process_time() + MESH_SECONDS.value()
+    taken, left_out = _selected(read_parts(content, spec, deadline_s), spec)
+    bars = []
+    for part in taken:
+        _check_time(deadline_s, spec.path)
+        label = f"bar {part.bar_id}, {escape_text(part.name)}"
+        try:
+            bar = fitted_bar(part.bar_id, part.mesh, part.tube)
+        except ValueError as error:
+            found = f"{label} ({len(part.mesh.faces)} triangles) is not a valid surface"
+            raise MeshError(f"{spec.path}: {found}: {error}") from error
+        bars.append(CageBar(label, bar, mesh=part.mesh, source=escape_text(part.name)))
     return Cage(tuple(bars), tuple(left_out), unit_scale(spec.unit_m))
+
+
+def _check_time(deadline_s: float, where: str) -> None:
+    """Raise ``MeshError`` that names the file ``where`` if this processor time is over."""
+    if time.process_time() > deadline_s:
+        found = f"finding the bars takes more than {MESH_SECONDS.value()} s of processor time"
+        raise MeshError(f"{where}: {found}, expected {MESH_SECONDS.allowed('s')}")
 
 
 def _selected(parts: list[MeshPart], spec: MeshFileSpec) -> tuple[list[MeshPart], list[LeftOut]]:
@@ -89,42 +116,35 @@ def _selected(parts: list[MeshPart], spec: MeshFileSpec) -> tuple[list[MeshPart]
     taken, left_out = list[MeshPart](), list[LeftOut]()
     for part in parts:
         points = part.mesh.vertices_m / spec.unit_m
-        if any(table.matches({"name": (part.name,)}) and table.contains(points) for table in spec.select):
+        if any(
+            table.matches({"name": (part.name, part.object_name)}) and table.contains(points)
+            for table in spec.select
+        ):
             taken.append(replace(part, bar_id=len(taken) + 1))
         else:
             left_out.append(LeftOut(escape_text(part.name), "no [[select]] table matches"))
     if not taken:
+        names = [name for part in parts for name in (part.object_name, part.name) if name]
         raise MeshError(
             f"{spec.path}: no part is selected, expected [[select]] tables that match at least one of its "
-            f"{len(parts)} parts{nearest_names(spec.select, {'name': [part.name for part in parts]})}"
+            f"{len(parts)} parts{nearest_names(spec.select, {'name': names})}"
         )
     return taken, left_out
 
 
-def _fitted_bar(part: MeshPart, where: str) -> CageBar:
-    """Return the bar of a part; raise ``MeshError`` that names the file ``where`` if its mesh has no area."""
-    label = f"bar {part.bar_id}, {escape_text(part.name)}"
-    try:
-        return CageBar(label, fitted_bar(part.bar_id, part.mesh), mesh=part.mesh, source=escape_text(part.name))
-    except ValueError as error:
-        raise MeshError(
-            f"{where}: {label} ({len(part.mesh.faces)} triangles) is not a valid surface: {error}"
-        ) from error
-
-
-def read_parts(content: bytes, spec: MeshFileSpec) -> list[MeshPart]:
+def read_parts(content: bytes, spec: MeshFileSpec, deadline_s: float) -> list[MeshPart]:
     """Return the parts of a file's ``content``, by ascending id; the suffix of ``spec.path`` selects the format.
 
     Raises ``MeshError`` if the content cannot be read, holds no triangle, only id 0, more than ``MAX_BARS`` parts
-    or a non-finite coordinate, or stores coordinates that are too coarse. Any exception that a damaged or hostile
-    file causes becomes one of one line.
+    or a non-finite coordinate, stores coordinates that are too coarse, or takes longer than to the processor time
+    ``deadline_s``. Any exception that a damaged or hostile file causes becomes one of one line.
     """
     try:
         with warnings.catch_warnings(), np.errstate(all="ignore"):
             warnings.simplefilter("ignore")
             if Path(spec.path).suffix.lower() == ".ply" and has_mesh_ply_header(content):
                 return _dataset_ply_parts(content, spec)
-            return _numbered_parts(_read_objects(content, spec), spec)
+            return _numbered_parts(_read_objects(content, spec), spec, deadline_s)
     except MeshError:
         raise
     except MalformedMeshError as error:
@@ -148,23 +168,48 @@ def _dataset_ply_parts(content: bytes, spec: MeshFileSpec) -> list[MeshPart]:
     return [MeshPart(bar_id, f"bar {bar_id}", mesh) for bar_id, mesh in meshes.items()]
 
 
-def _numbered_parts(objects: Mapping[str, Mesh], spec: MeshFileSpec) -> list[MeshPart]:
-    """Return the parts of objects that are ordered; a single one is split."""
-    if len(objects) == 1:
-        [whole] = objects.values()
-        meshes = connected_components(_mesh_of(_merged_close_vertices(whole)))
-        objects = {f"part {number}": mesh for number, mesh in enumerate(meshes, start=1)}
-    if len(objects) > MAX_BARS:
-        raise MeshError(f"{spec.path}: {len(objects)} separate parts found, expected at most {MAX_BARS} bars")
+def _numbered_parts(objects: Mapping[str, Mesh], spec: MeshFileSpec, deadline_s: float) -> list[MeshPart]:
+    """Return the parts of objects that are ordered; a single one is split, and others if their pieces are bars."""
+    parts: list[MeshPart] = []
+    for name, mesh in objects.items():
+        whole = _mesh_of(_merged_close_vertices(mesh))
+        pieces = connected_components(whole)
+        if len(objects) == 1:
+            parts += [MeshPart(0, f"part {number}", piece, name) for number, piece in enumerate(pieces, start=1)]
+            continue
+        tubes: list[Tube] = []
+        if len(pieces) > 1 and fit_tube(whole.vertices_m, whole.faces) is None:
+            for piece in pieces:
+                _check_time(deadline_s, spec.path)
+                tube = fit_tube(piece.vertices_m, piece.faces)
+                if tube is None:
+                    break
+                tubes.append(tube)
+        if len(tubes) == len(pieces):
+            numbered = enumerate(zip(pieces, tubes, strict=True), start=1)
+            parts += [MeshPart(0, f"{name} {number}", piece, name, tube) for number, (piece, tube) in numbered]
+        else:
+            parts.append(MeshPart(0, name, whole, name))
+    if len(parts) > MAX_BARS:
+        raise MeshError(f"{spec.path}: {len(parts)} separate parts found, expected at most {MAX_BARS} bars")
     return [
-        MeshPart(bar_id, name, _oriented_outward(mesh))
-        for bar_id, (name, mesh) in enumerate(objects.items(), start=1)
+        replace(part, bar_id=bar_id, mesh=_oriented_outward(part.mesh))
+        for bar_id, part in enumerate(parts, start=1)
     ]
 
 
 def _read_objects(content: bytes, spec: MeshFileSpec) -> dict[str, Mesh]:
     """Return the objects of a file of any program, ordered by name, without empty ones."""
     surfaces = _READERS[Path(spec.path).suffix.lower()](content)
+    for vertices, faces in surfaces.values():
+        row = first_true(~np.isfinite(vertices).all(axis=1))
+        if row is not None:
+            found = f"it is {vertices[row].tolist()}"
+            raise MalformedMeshError("invalid", f"vertex {row + 1}", found, "finite coordinates")
+        row = first_true(((faces < 0) | (faces >= len(vertices))).any(axis=1))
+        if row is not None:
+            found = f"the corners are the vertices {faces[row].tolist()}"
+            raise MalformedMeshError("invalid", f"triangle {row + 1}", found, f"0 to {len(vertices) - 1}")
     objects = {
         name: Mesh(vertices.astype(np.float64) * spec.unit_m, faces.astype(np.int32))
         for name, (vertices, faces) in sorted(surfaces.items(), key=lambda item: _natural_sort_key(item[0]))
@@ -233,16 +278,16 @@ def _oriented_outward(mesh: Mesh) -> Mesh:
     return _mesh_of(body)
 
 
-def fitted_bar(bar_id: int, mesh: Mesh) -> Bar:
+def fitted_bar(bar_id: int, mesh: Mesh, tube: Tube | None = None) -> Bar:
     """Return the bar of a surface (world, metres), with role ``imported``; without axis if no tube fits.
 
-    Raises ``ValueError`` if every triangle has zero area.
+    ``tube`` is what was fitted to the surface before. Raises ``ValueError`` if every triangle has zero area.
     """
     a_m, b_m, c_m = mesh.vertices_m[mesh.faces].transpose(1, 0, 2)
     with np.errstate(all="ignore"):  # Products of huge lengths overflow; such bars are refused by their extent.
         if not np.cross(b_m - a_m, c_m - a_m).any():
             raise ValueError("every triangle has zero area")
-        tube = fit_tube(mesh.vertices_m, mesh.faces)
+        tube = tube or fit_tube(mesh.vertices_m, mesh.faces)
     if tube is None:
         return Bar.without_axis(bar_id, ESTIMATED_ROLE)
     return Bar(bar_id, ESTIMATED_ROLE, tube.diameter_m, axis_of(tube.axis_m))

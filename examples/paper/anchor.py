@@ -22,15 +22,15 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from outputs import add_outputs, number, only_config, run_script, write_outputs
-from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.errors import InputError, SubmissionError
 from rebar_depth_bench.base.parallel import map_in_threads
 from rebar_depth_bench.base.terminal import ProgressBars
 from rebar_depth_bench.cli.console import add_archive, add_data
 from rebar_depth_bench.scoring.columns import coverage_percent
 from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
-from rebar_depth_bench.scoring.score import ViewTruth
 from rebar_depth_bench.scoring.truth import config_truth
+from rebar_depth_bench.scoring.view_numbers import ViewTruth
 from rebar_depth_bench.submission import SubmissionReader
 
 if TYPE_CHECKING:
@@ -134,21 +134,22 @@ def anchored(evaluation: Evaluation, options: argparse.Namespace, bars: Progress
         with np.errstate(over="ignore", under="ignore"):
             return float(np.median(z_m / p_m)) if len(p_m) else None, len(p_m) / len(truth.index)
 
-    found = list(map_in_threads(ratio_and_coverage, truths, "ratios", workers=None, progress=bars.update))
+    count = len(truths.view_ids)
+    found = list(map_in_threads(ratio_and_coverage, truths.views, count, "ratios", progress=bars.update))
     predicted = [position for position, (ratio, _) in enumerate(found) if ratio is not None]
     ratios = np.array([ratio for ratio, _ in found if ratio is not None])
     wanted = sorted(set(options.num_anchor_views))
     counts = [k for k in wanted if k <= len(ratios)]
     if not counts:
-        have = f"{len(ratios)} of {len(truths)} views of {config.name} have a prediction"
+        have = f"{len(ratios)} of {count} views of {config.name} have a prediction"
         raise InputError(f"{options.archive}: {have}, expected at least {wanted[0]}, the smallest k")
     drawn = [draw_scales(ratios, k, options.draws, options.seed) for k in counts]
     scales = np.concatenate([[options.baseline_scale, np.median(ratios)], *drawn])
 
     def errors_of_view(position: int) -> Float64[ndarray, "2 m"]:
-        return errors_at_scales(*scored_pairs(evaluation.submission, truths.read(position)), scales)
+        return errors_at_scales(*scored_pairs(evaluation.submission, truths.views[position]), scales)
 
-    errors = list(map_in_threads(errors_of_view, predicted, "errors", workers=None, progress=bars.update))
+    errors = list(map_in_threads(errors_of_view, predicted, len(predicted), "errors", progress=bars.update))
     numbers = zip(scales.tolist(), *np.mean(errors, axis=0).tolist(), strict=True)
     given, all_views, *draws = [dict(zip(("scale", "abs_rel", "rmse_cm"), one, strict=True)) for one in numbers]
     markers = {scene.board.markers if scene.board else None for scene in config.scenes}
@@ -158,7 +159,7 @@ def anchored(evaluation: Evaluation, options: argparse.Namespace, bars: Progress
         "config": config.name,
         "markers": markers.pop() if len(markers) == 1 else None,
         "seed": options.seed,
-        "views": len(truths),
+        "views": count,
         "views_without_prediction": [truths.view_ids[n] for n, (ratio, _) in enumerate(found) if ratio is None],
         "coverage": math.fsum(coverage for _, coverage in found) / len(found),
         "given": given,
@@ -182,7 +183,8 @@ def run(options: argparse.Namespace) -> None:
     """Compute the table, write the requested files and print it."""
     with ProgressBars() as bars, open_evaluation(options.archive, options.data) as evaluation:
         evaluation.require_metric("the scale is that of depth in metres")
-        evaluation.check_entries(bars.update)
+        if problems := list(evaluation.submission.problems(bars.update)):
+            raise SubmissionError.from_problems(options.archive, problems)
         content = anchored(evaluation, options, bars)
     table = pd.json_normalize([{**row, "draws": len(row["draws"])} for row in content["rows"]], sep="_")
     notes = [

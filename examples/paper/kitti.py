@@ -226,7 +226,9 @@ def run(options: argparse.Namespace) -> None:
             predict_views(find_method(options.method), views, options.predictions, bars.update)
         with open_maps(options.predictions, shapes, 1 / 256, optional="kitti/" + missing) as source:
             work, each = partial(score_image, source=source, options=options), images.itertuples()
-            rows = list(map_in_threads(work, each, "scoring", workers=options.workers, progress=bars.update))
+            rows = list(
+                map_in_threads(work, each, len(images), "scoring", workers=options.workers, progress=bars.update)
+            )
     scored = [row for row in rows if row["scored_px"]]
     if not scored:
         raise InputError(f"{options.kitti}: no image has ground truth inside the crop {options.crop}")

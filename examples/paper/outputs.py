@@ -14,11 +14,11 @@ from rebar_depth_bench.base.errors import InputError, printable
 from rebar_depth_bench.base.writing import write_output
 from rebar_depth_bench.cli.console import add_output_file, prints_table, run_program
 from rebar_depth_bench.data.manifest import DatasetConfig
-from rebar_depth_bench.extended.estimates import ViewNumbers
+from rebar_depth_bench.extended.estimates import ViewMeasures
 from rebar_depth_bench.reporting.figure import check_figure, figure_bytes, figure_style
 from rebar_depth_bench.scoring.columns import METRICS, rounded
-from rebar_depth_bench.scoring.spreadsheet import frame_csv
 from rebar_depth_bench.scoring.metrics import mean
+from rebar_depth_bench.scoring.spreadsheet import Sheet
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -84,12 +84,12 @@ def flat_table(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     return table
 
 
-def single_bar_means(views: Sequence[ViewNumbers]) -> dict[str, Any]:
+def single_bar_means(views: Sequence[ViewMeasures]) -> dict[str, Any]:
     """Return share, coverage and metrics of the single-bar interior, means of the views that have a value."""
 
     def mean_of(align: str, name: str) -> float | None:
         values = [view[align][f"single_bar_{name}"] for view in views if view]
-        return mean([value for value in values if value is not None])
+        return rounded(mean([value for value in values if value is not None]))
 
     metrics = {align: {name: mean_of(align, name) for name in METRICS} for align in ("native", "scaled")}
     known = {align: one if one["abs_rel"] is not None else None for align, one in metrics.items()}
@@ -112,7 +112,8 @@ def write_outputs(
         text = json.dumps(_round(content), indent=1, ensure_ascii=False, allow_nan=False)
         write_output(options.json, f"{text}\n")
     if options.csv:
-        write_output(options.csv, frame_csv(table.map(_round)))
+        cells = table.astype(object).where(table.notna(), None)
+        write_output(options.csv, Sheet(list(table.columns), cells.values.tolist()).to_csv())
     if options.figure:
         from matplotlib.figure import Figure
 

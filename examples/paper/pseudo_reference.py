@@ -30,12 +30,12 @@ from rebar_depth_bench.base.parallel import map_in_threads
 from rebar_depth_bench.base.terminal import ProgressBars
 from rebar_depth_bench.cli.console import InputFolder, add_data, add_workers
 from rebar_depth_bench.scoring.bootstrap import INTERVALS
-from rebar_depth_bench.scoring.columns import METRICS
+from rebar_depth_bench.scoring.columns import METRICS, rounded
 from rebar_depth_bench.scoring.evaluation import Provenance
 from rebar_depth_bench.scoring.metrics import mean
 from rebar_depth_bench.scoring.result import SubmissionIdentity
-from rebar_depth_bench.scoring.score import ViewTruth, score_view, tabulate
-from rebar_depth_bench.scoring.table import ViewScore
+from rebar_depth_bench.scoring.table import Frame, Truth, tabulate
+from rebar_depth_bench.scoring.view_numbers import ViewTruth, view_numbers
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -50,6 +50,8 @@ UniDepth v2              45.8  0.98  0.152  0.56    63.4  1.07  0.186  0.56
 Metric3D v2              58.7  1.40  0.253  0.49    72.0  1.54  0.328  0.49"""
 OVER_VIEWS = {"views": "sum", "common_share": "mean", "abs_rel": "mean", "median_ratio": "median"}
 DepthMap = Float[ndarray, "h w"]
+Numbers = Mapping[str, float]
+"""Numbers of a view by place."""
 Pair = tuple[str, str]
 PAIR = ["reference", "against"]
 
@@ -86,7 +88,7 @@ def score_frame(
     references: Mapping[str, DepthMaps],
     clip: Callable[[DepthMap], DepthMap],
     shape: tuple[int, int],
-) -> tuple[dict[str, float], dict[Pair, ViewScore | None], list[dict[str, Any]]]:
+) -> tuple[dict[str, float], dict[Pair, Numbers | None], list[dict[str, Any]]]:
     """Return shares of the frame with depth, scores by (method, reference), and agreements of two references.
 
     ``frame`` is a view id with its exact depth, if that is compared; ``clip`` sets invalid depth to NaN.
@@ -102,30 +104,33 @@ def score_frame(
     agreements = [agreement((a, b), maps[a], maps[b]) for a in maps for b in maps if a not in (b, EXACT)]
     for label, pseudo_m in pseudo.items() if exact else ():
         maps[f"{EXACT} where {label} has depth"] = np.where(np.isnan(pseudo_m), np.nan, exact[EXACT])
-    scores: dict[Pair, ViewScore | None] = {}
+    scores: dict[Pair, Numbers | None] = {}
     for name, reference_m in maps.items():
         index = np.flatnonzero(~np.isnan(reference_m)).astype(np.uint32)
         z_m = reference_m.ravel()[index].astype(np.float64)
         truth = ViewTruth(view_id, index, z_m, float(np.median(z_m))) if len(index) else None
-        scores |= {(method, name): score_view(truth, p) if truth else None for method, p in predictions.items()}
+        scores |= {(method, name): view_numbers(p, truth) if truth else None for method, p in predictions.items()}
     return {name: float((~np.isnan(one)).mean()) for name, one in maps.items()}, scores, agreements
 
 
-def row_json(pair: Pair, views: list[ViewScore | None], frame_px: int, split: str | None) -> dict[str, Any]:
+def row_json(pair: Pair, views: Mapping[str, Numbers | None], frame_px: int, split: str | None) -> dict[str, Any]:
     """Return the row of a method against a reference, with the numbers of a table in the JSON of ``score``."""
-    table = tabulate([view for view in views if view is not None], split=split)
-    aligned = {"native": table.native, "scaled": table.scaled}
+    scored = {view_id: numbers for view_id, numbers in views.items() if numbers is not None}
+    frame = Frame.of_rows(scored)
+    table = tabulate(frame, Truth(tuple(scored), (), (), split=split))
     return {
         "method": pair[0],
         "reference": pair[1],
-        "frame_share": mean([view.coverage * view.scored_px / frame_px if view else 0.0 for view in views]),
+        "frame_share": mean(
+            [one["coverage"] * one["scored_px"] / frame_px if one else 0.0 for one in views.values()]
+        ),
         "ratio": {},
         "views": table.views,
         "views_scored": table.views_scored,
-        "coverage": table.coverage,
+        "coverage": table["coverage"],
         "ranked": table.is_comparable,
-        **{key: {name: getattr(one, name, None) for name in METRICS} for key, one in aligned.items()},
-        "scale_median": table.scale_median,
+        **{key: {name: rounded(table[f"{key}.{name}"]) for name in METRICS} for key in ("native", "scaled")},
+        "scale_median": rounded(table["scale_median"]),
         "ci95": {name: ends for name, ends in table.intervals.items() if not name.startswith("within_mm")},
     }
 
@@ -166,12 +171,17 @@ def run(options: argparse.Namespace) -> None:
         methods, references = dict([*sources.items()][:count]), dict([*sources.items()][count:])
         work = partial(score_frame, methods=methods, references=references, clip=clip, shape=data.shape)
         frames = data.frames(exact=not options.no_exact)
-        outcomes = list(map_in_threads(work, frames, "scoring", workers=options.workers, progress=bars.update))
+        outcomes = list(
+            map_in_threads(work, frames, len(data.views), "scoring", workers=options.workers, progress=bars.update)
+        )
     shares = {name: [share[name] for share, *_ in outcomes] for name in outcomes[0][0]}
     if empty := [name for name, values in shares.items() if not any(values)]:
         raise InputError(f"{', '.join(empty)}: no depth from {options.near:g} to {options.far:g} m, expected some")
     split = data.config.scenes[0].split if data.config and data.config.has_splits else None
-    by_pair = {pair: [scores[pair] for _, scores, _ in outcomes] for pair in outcomes[0][1]}
+    by_pair = {
+        pair: {view_id: scores[pair] for view_id, (_, scores, _) in zip(data.views, outcomes, strict=True)}
+        for pair in outcomes[0][1]
+    }
     rows = [row_json(pair, views, math.prod(data.shape), split) for pair, views in by_pair.items()]
     agreed = pd.DataFrame([row for *_, rows in outcomes for row in rows], columns=[*PAIR, *OVER_VIEWS])
     archives = [SubmissionIdentity(name, source.sha256) for name, source in sources.items()]

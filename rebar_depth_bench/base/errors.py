@@ -13,6 +13,7 @@ from importlib.util import find_spec
 from typing import Literal, Self
 
 MAX_PROBLEMS_SHOWN = 20
+_MAX_TEXT_CHARACTERS, _MAX_LIBRARY_CHARACTERS = 120, 300
 
 ProblemCode = Literal[
     "syntax",  # a file that cannot be parsed at all
@@ -89,13 +90,9 @@ class EntryError(InputError):
     """Rejected entry of an archive; ``problem`` is the reason."""
 
     def __init__(self, problem: Problem) -> None:
-        super().__init__(str(problem))
+        super().__init__(problem)  # The arguments of the constructor, so that it can be pickled.
         self.problem = problem
         self.problems = (problem,)
-
-    def __reduce__(self) -> tuple[type[Self], tuple[Problem]]:
-        """Return the constructor's call: worker processes send this error to their parent."""
-        return type(self), (self.problem,)
 
 
 class CalibrationError(InputError):
@@ -132,9 +129,6 @@ def problem_summary(problems: Sequence[Problem | str]) -> str:
     return "\n".join(lines)
 
 
-_MAX_TEXT_CHARACTERS = 120
-
-
 def escape_text(text: str) -> str:
     """Return ``text`` for a one-line message: escaped if not printable, truncated to 120 characters."""
     escaped = text if text and text.isprintable() else ascii(text)
@@ -154,9 +148,6 @@ def exception_summary(error: Exception) -> str:
     """Return the type of an exception and the first line of its message."""
     first_line = (str(error).strip().splitlines() or [""])[0]
     return f"{type(error).__name__}: {first_line}"
-
-
-_MAX_LIBRARY_CHARACTERS = 300
 
 
 def library_message(error: Exception) -> str:

@@ -1,14 +1,13 @@
 """Limits on the size, time and memory of files and answers from outside.
 
 Each limit has a default, which an environment variable ``REBAR_MAX_<NAME>`` replaces. ``SECURITY.md`` lists them.
-``call_until`` limits the time of a call; ``system.limit_process`` limits a process.
+``call_within`` limits the time of a call; ``system.limit_process`` limits a process.
 """
 
 from __future__ import annotations
 
 import os
 import re
-import time
 from collections.abc import Callable
 from concurrent.futures import Future, wait
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from typing import TypeVar
 from rebar_depth_bench.base.errors import InputError, escape_text
 
 _MIB, _GIB = 1 << 20, 1 << 30
+_Result = TypeVar("_Result")
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +54,7 @@ DETECTIONS_BYTES = Limit("detections_bytes", 256 * _MIB, "a file of detected cro
 CELL_BYTES = Limit("cell_bytes", 256 * _MIB, "an encoded image or depth map of a dataset row")
 IMAGE_PIXELS = Limit("image_pixels", 100_000_000, "an image of a capture, before it is decoded")
 MESH_BYTES = Limit("mesh_bytes", _GIB, "a PLY, STL or OBJ file")
+MESH_SECONDS = Limit("mesh_seconds", 1800, "the processor time for finding the bars of a PLY, STL or OBJ file")
 IFC_BYTES = Limit("ifc_bytes", _GIB, "an IFC file")
 IFC_SECONDS = Limit("ifc_seconds", 1800, "the processor time for reading an IFC file")
 IFC_MEMORY_BYTES = Limit("ifc_memory_bytes", 8 * _GIB, "the memory of the process that reads an IFC file")
@@ -65,50 +66,34 @@ CACHE_BYTES = Limit(
 )
 
 
-# Time limit on a call that may never return: an inference, or a request to a server.
-
-_Result = TypeVar("_Result")
-_GRACE_S = 2.0
-"""Time that a cancelled call has to end, seconds."""
-
-
 class DeadlineError(Exception):
-    """Call that did not return in time."""
+    """Call, such as an inference or a request to a server, that did not return in time."""
 
 
 def call_within(
     seconds: float, function: Callable[[], _Result], cancel: Callable[[], object] = lambda: None
 ) -> _Result:
-    """Return ``function()``. Raises ``DeadlineError`` if it takes longer than ``seconds``."""
-    end = time.monotonic() + seconds
-    return call_until(lambda: end, function, cancel)
-
-
-def call_until(
-    end: Callable[[], float], function: Callable[[], _Result], cancel: Callable[[], object] = lambda: None
-) -> _Result:
-    """Return ``function()``. Raises ``DeadlineError`` once ``time.monotonic()`` has reached ``end()``.
+    """Return ``function()``. Raises ``DeadlineError`` if it takes longer than ``seconds``.
 
     The function runs in another thread. ``cancel`` is called to stop it at the deadline or on Ctrl-C. A function
     that does not end soon after is abandoned: its thread does not keep the process alive.
     """
     future: Future[_Result] = Future()
-    Thread(target=_run, args=(future, function), daemon=True).start()
+
+    def run() -> None:
+        try:
+            future.set_result(function())
+        except BaseException as error:
+            future.set_exception(error)
+
+    Thread(target=run, daemon=True).start()
     try:
-        while not future.done() and (remaining_s := end() - time.monotonic()) > 0:
-            wait([future], remaining_s)
+        wait([future], seconds)
         if not future.done():
             raise DeadlineError
     except BaseException:  # Ctrl-C, too.
         cancel()
         # A thread that returns from native code while Python exits would abort the process.
-        wait([future], _GRACE_S)
+        wait([future], 2.0)
         raise
     return future.result()
-
-
-def _run(future: Future[_Result], function: Callable[[], _Result]) -> None:
-    try:
-        future.set_result(function())
-    except BaseException as error:
-        future.set_exception(error)

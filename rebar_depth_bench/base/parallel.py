@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import islice
 from typing import TypeVar
 
 from rebar_depth_bench.base.errors import InputError
 
+_Item = TypeVar("_Item")
+_Done = TypeVar("_Done")
 Progress = Callable[[str, int, int], None]
 """Callback with the arguments: name of the task, number of steps done, total number of steps."""
 
@@ -19,19 +21,16 @@ def silent(task: str, done: int, total: int) -> None:
     """Ignore progress; the default callback."""
 
 
-_Item = TypeVar("_Item")
-_Done = TypeVar("_Done")
-
-
 def map_in_threads(
     work: Callable[[_Item], _Done],
-    items: Sequence[_Item],
+    items: Iterable[_Item],
+    total: int,
     task: str,
     *,
     workers: int | None = None,
     progress: Progress = silent,
 ) -> Iterator[_Done]:
-    """Yield ``work(item)`` of each item, in order, computed on ``workers`` threads; None means one per core.
+    """Yield ``work(item)`` of each of ``total`` items, in order, on ``workers`` threads; None means one per core.
 
     Each result is a step of ``task`` in ``progress``. At most two items per thread are taken ahead of the next
     result, so that few items are in memory at a time. Exceptions of ``work`` propagate. Raises ``InputError`` if
@@ -44,9 +43,9 @@ def map_in_threads(
     pending: deque[Future[_Done]] = deque()
     pool = ThreadPoolExecutor(threads)
     try:
-        for done in range(1, len(items) + 1):
+        for done in range(1, total + 1):
             pending.extend(pool.submit(work, item) for item in islice(source, 2 * threads - len(pending)))
             yield pending.popleft().result()
-            progress(task, done, len(items))
+            progress(task, done, total)
     finally:
         pool.shutdown(cancel_futures=True)

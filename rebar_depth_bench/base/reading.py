@@ -19,15 +19,16 @@ import tomllib
 import weakref
 from collections import Counter
 from pathlib import Path, PurePosixPath
-from typing import Any, BinaryIO, NoReturn, Protocol
+from typing import Any, BinaryIO, NoReturn
 
 from rebar_depth_bench.base.errors import InputError, Problem, ProblemCode, escape_text
 from rebar_depth_bench.base.limits import Limit
 from rebar_depth_bench.base.names import NAME_LETTERS, PATH_PATTERN
-from rebar_depth_bench.base.system import map_range, open_for_reading, read_range
+from rebar_depth_bench.base.system import READ_FLAGS, read_range
 
 MAX_NESTING = 64
 """Largest number of JSON or TOML containers inside each other."""
+_TOO_DEEP = ("the values are nested too deep", f"at most {MAX_NESTING} levels")
 _MAX_KEY_COST = 10_000_000
 """Largest sum over the lines of a TOML file of the squared number of dots; tomllib needs about 10 ns for each."""
 _DECIMAL_NUMBER = re.compile(rb"(?<![\w.\"'-])[-+]?\d+\.\d+(?=[\s,\]}eE]|$)")
@@ -44,7 +45,7 @@ def open_regular(path: Path) -> BinaryIO:
     Raises ``OSError``, whose ``strerror`` can be shown to users, for anything else, and for a pointer of git LFS.
     """
     try:
-        descriptor = open_for_reading(path)
+        descriptor = os.open(path, READ_FLAGS)
     except ValueError as error:  # The path contains a null character.
         raise OSError(errno.EINVAL, str(error)) from None
     mode = os.fstat(descriptor).st_mode
@@ -110,16 +111,16 @@ def parse_json(content: bytes, where: str = "") -> tuple[Any, list[Problem]]:
         value = json.loads(text, object_pairs_hook=_unique_keys, parse_constant=_refuse_constant)
         # json.loads accepts numbers like 1e999 and lone surrogates, which cannot be written as JSON again.
         json.dumps(value, allow_nan=False, ensure_ascii=False).encode()
+        _check_nesting(value)
     except RecursionError:
-        return None, [_nesting_problem(where)]
-    except _DuplicateKeyError as error:
-        return None, [Problem("duplicate", where, f"the key {error} occurs twice", "each key once")]
+        return None, [Problem("size", where, *_TOO_DEEP)]
+    except KeyError as error:
+        found = f"the key {escape_text(error.args[0])} occurs twice"
+        return None, [Problem("duplicate", where, found, "each key once")]
     except ValueError as error:
         # Of a number with too many digits, json says after the semicolon how a programmer raises the limit.
         found = f"the text is not valid JSON ({escape_text(str(error).partition(';')[0])})"
         return None, [Problem("syntax", where, found, "JSON")]
-    if isinstance(value, dict | list) and _nesting_exceeds(value, MAX_NESTING):
-        return None, [_nesting_problem(where)]
     return value, []
 
 
@@ -133,11 +134,12 @@ def parse_toml(content: bytes) -> tuple[dict[str, Any], list[Problem]]:
         return {}, problems
     try:
         values = tomllib.loads(text)
+        _check_nesting(values)
     except RecursionError:
-        return {}, [_nesting_problem("")]
+        return {}, [Problem("size", "", *_TOO_DEEP)]
     except ValueError as error:
         return {}, [Problem("syntax", "", f"not a valid TOML file: {escape_text(str(error))}")]
-    return ({}, [_nesting_problem("")]) if _nesting_exceeds(values, MAX_NESTING) else (values, [])
+    return values, []
 
 
 def parse_number(text: str) -> float:
@@ -148,15 +150,12 @@ def parse_number(text: str) -> float:
     return float(text) if _NUMBER.fullmatch(text) else math.nan
 
 
-class _DuplicateKeyError(ValueError):
-    """Key that occurs twice in an object."""
-
-
 def _unique_keys(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return the object of some pairs. Raises ``KeyError`` with a key that occurs twice."""
     table = dict(pairs)
     if len(table) < len(pairs):
         [(duplicate, _)] = Counter(key for key, _ in pairs).most_common(1)
-        raise _DuplicateKeyError(escape_text(duplicate))
+        raise KeyError(duplicate)
     return table
 
 
@@ -164,22 +163,13 @@ def _refuse_constant(constant: str) -> NoReturn:
     raise ValueError(f"{constant} is not JSON")
 
 
-def _nesting_problem(where: str) -> Problem:
-    return Problem("size", where, "the values are nested too deep", f"at most {MAX_NESTING} levels")
-
-
-def _nesting_exceeds(value: Any, levels: int) -> bool:
-    containers = [value]
-    for _ in range(levels):
-        children = [
-            child
-            for container in containers
-            for child in (container.values() if isinstance(container, dict) else container)
-        ]
-        containers = [child for child in children if isinstance(child, dict | list)]
-        if not containers:
-            return False
-    return True
+def _check_nesting(value: object, levels: int = MAX_NESTING) -> None:
+    """Raise ``RecursionError`` if more than ``levels`` containers are inside each other."""
+    if isinstance(value, dict | list):
+        if levels == 0:
+            raise RecursionError
+        for child in value.values() if isinstance(value, dict) else value:
+            _check_nesting(child, levels - 1)
 
 
 def path_below(folder: Path, name: str) -> Path:
@@ -227,31 +217,11 @@ def remove_folder(path: Path) -> None:
         shutil.rmtree(path, ignore_errors=True)
 
 
-# Sources of bytes that are read at positions: files and memory.
-
-# For smaller reads, reading is cheaper than a mapping and its page faults.
-_MIN_MAPPED_BYTES = 64 * 1024
-
-
-class ByteSource(Protocol):
-    """Interface of thread-safe random access to a sequence of bytes."""
-
-    @property
-    def size(self) -> int:
-        """Length in bytes."""
-
-    def read_at(self, offset: int, length: int) -> memoryview:
-        """Return exactly ``length`` bytes, or raise ``EOFError`` if the source holds fewer."""
+# Sources of bytes that are read at positions, by several threads at once: files and memory.
 
 
 class FileSource:
-    """Byte source of a regular file, read at positions and through short-lived read-only mappings.
-
-    Every large read maps its own range, and the mapping is released with the last view on it, so the resident
-    memory is that of the views in use, independent of the file size. The file must not be truncated while a view
-    exists (the operating system would terminate the process with SIGBUS). Raises ``OSError`` for a pipe, device or
-    folder.
-    """
+    """Byte source of a regular file. Raises ``OSError`` for a pipe, device or folder."""
 
     def __init__(self, path: Path) -> None:
         with open_regular(path) as stream:
@@ -260,15 +230,13 @@ class FileSource:
         self.size = os.fstat(self._fd).st_size
 
     def read_at(self, offset: int, length: int) -> memoryview:
-        """Return exactly ``length`` bytes, or raise ``EOFError`` if the source holds fewer."""
-        if offset < 0 or length < 0 or offset + length > os.fstat(self._fd).st_size:
+        """Return exactly ``length`` bytes, or raise ``EOFError`` if the file holds fewer."""
+        if offset < 0 or length < 0 or offset + length > self.size:
             raise EOFError(f"{length} bytes at {offset} lie past the end of the file")
-        if length < _MIN_MAPPED_BYTES:
-            data = read_range(self._fd, offset, length)
-            if len(data) < length:  # The file was truncated just now.
-                raise EOFError(f"{len(data)} bytes found at {offset}, expected {length}")
-            return memoryview(data)
-        return map_range(self._fd, offset, length)
+        data = read_range(self._fd, offset, length)
+        if len(data) < length:
+            raise EOFError(f"{len(data)} bytes found at {offset}, expected {length}")
+        return memoryview(data)
 
     def sha256(self) -> str:
         """Return the hex SHA-256 of the whole file."""
@@ -277,7 +245,7 @@ class FileSource:
             return hashlib.file_digest(stream, "sha256").hexdigest()
 
     def close(self) -> None:
-        """Close the file; views that were already returned stay valid. A second call has no effect."""
+        """Close the file; a second call has no effect."""
         self._close()
         self._fd = -1
 
@@ -290,7 +258,10 @@ class MemorySource:
         self.size = len(data)
 
     def read_at(self, offset: int, length: int) -> memoryview:
-        """Return exactly ``length`` bytes, or raise ``EOFError`` if the source holds fewer."""
+        """Return exactly ``length`` bytes, or raise ``EOFError`` if the data have fewer."""
         if offset < 0 or length < 0 or offset + length > self.size:
             raise EOFError(f"{length} bytes at {offset} lie outside the data")
         return self._data[offset : offset + length]
+
+
+ByteSource = FileSource | MemorySource

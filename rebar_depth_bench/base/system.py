@@ -1,4 +1,4 @@
-"""What differs between operating systems: opening and mapping files, flushing them, locks, limits, processors.
+"""What differs between operating systems: opening and reading files, flushing them, locks, limits, processors.
 
 Loading, writing archives and scoring use nothing of Linux outside this module. Locks and limits of processes,
 which the builder and the leaderboard need, exist on POSIX systems only.
@@ -17,31 +17,18 @@ from pathlib import Path
 
 _PR_SET_PDEATHSIG = 1
 _IS_POSIX = hasattr(os, "O_DIRECTORY")
-_READ_FLAGS = os.O_RDONLY | sum(getattr(os, name, 0) for name in ("O_NONBLOCK", "O_NOCTTY", "O_BINARY"))
-
-
-def open_for_reading(path: Path) -> int:
-    """Return a descriptor of a file; a pipe does not block and a terminal does not become that of the process."""
-    return os.open(path, _READ_FLAGS)
+READ_FLAGS = os.O_RDONLY | sum(getattr(os, name, 0) for name in ("O_NONBLOCK", "O_NOCTTY", "O_BINARY"))
+"""Flags for reading: a pipe does not block, and a terminal does not become that of the process."""
 
 
 def read_range(descriptor: int, offset: int, length: int) -> bytes:
     """Return up to ``length`` bytes of a file, whose position does not matter and does not change."""
     if hasattr(os, "pread"):
         return os.pread(descriptor, length, offset)
-    return bytes(map_range(descriptor, offset, length))
-
-
-def map_range(descriptor: int, offset: int, length: int) -> memoryview:
-    """Return ``length`` bytes of a file as a read-only mapping, which is released with the last view on it."""
-    lead = offset % mmap.ALLOCATIONGRANULARITY
-    if hasattr(mmap, "MAP_SHARED"):
-        # MAP_POPULATE loads all pages at once: one page fault per page would take as long as reading the pages.
-        flags = mmap.MAP_SHARED | getattr(mmap, "MAP_POPULATE", 0)
-        mapped = mmap.mmap(descriptor, lead + length, flags, mmap.PROT_READ, offset=offset - lead)
-    else:
-        mapped = mmap.mmap(descriptor, lead + length, access=mmap.ACCESS_READ, offset=offset - lead)
-    return memoryview(mapped)[lead:]
+    if not length:  # An empty file cannot be mapped.
+        return b""
+    with mmap.mmap(descriptor, 0, access=mmap.ACCESS_READ) as mapped:
+        return mapped[offset : offset + length]
 
 
 def fsync_path(path: Path) -> None:

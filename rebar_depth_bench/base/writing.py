@@ -63,11 +63,11 @@ def atomic_replace(target: Path, mode: int = 0) -> Iterator[Path]:
     Raises ``InputError`` if ``target`` is a folder, a device or a pipe, or its name is impossible, and
     ``OutputError`` if it or its folder cannot be written.
     """
-    if target.is_dir():
-        raise InputError(f"{target}: is a folder, expected the name of a file to write")
     if target.exists() and not target.is_file():  # Renaming would replace a device such as /dev/null.
-        raise InputError(f"{target}: is a device or a pipe, expected the name of a file to write")
+        found = "is a folder" if target.is_dir() else "is a device or a pipe"
+        raise InputError(f"{target}: {found}, expected the name of a file to write")
     temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}.tmp")
+    process = os.getpid()
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         os.close(os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode or 0o666))
@@ -82,8 +82,9 @@ def atomic_replace(target: Path, mode: int = 0) -> Iterator[Path]:
             temporary.replace(target)
             fsync_path(target.parent)
     except BaseException:
-        with suppress(OSError):
-            temporary.unlink(missing_ok=True)
+        if os.getpid() == process:  # The file is not that of a process that was forked meanwhile and ends.
+            with suppress(OSError):
+                temporary.unlink(missing_ok=True)
         raise
 
 
@@ -110,41 +111,16 @@ def write_text(target: Path, content: str) -> None:
     write_bytes(target, content.encode())
 
 
-# Outputs that users name: files, links to files, devices, pipes and open descriptors such as /dev/stdout. A file
-# is replaced atomically; of a link, the file that it points to. Devices, pipes and descriptors are written through
-# and never replaced.
+# Outputs that users name: standard output, files, links, devices and pipes. A file, or the file that a link points
+# to, is replaced atomically. Whatever else exists is written in place and never replaced.
 
 STANDARD_OUTPUT = Path("/dev/stdout")
 """Path that ``-`` stands for."""
-_MAX_LINKS = 40
-"""Number of links in a row that Linux follows."""
-
-
-def open_descriptor(path: Path) -> int | None:
-    """Return the descriptor of this process that a path or link names, as ``/dev/fd/63`` does, or None.
-
-    Opening such a path again would start at the beginning of a file, and fails for a socket.
-    """
-    if path == STANDARD_OUTPUT:
-        return 1
-    for _ in range(_MAX_LINKS):
-        folder = os.path.realpath(path.parent)
-        if folder in (f"/proc/{os.getpid()}/fd", "/dev/fd") and path.name.isdecimal():
-            return int(path.name)
-        if not path.is_symlink():
-            return None
-        path = path.parent / path.readlink()
-    return None
-
-
-def is_standard_output(path: Path) -> bool:
-    """Return whether a path names the standard output of this process."""
-    return open_descriptor(path) == 1
 
 
 def is_stream(path: Path) -> bool:
-    """Return whether a path names an open descriptor, a device or a pipe: anything but a file or a folder."""
-    return open_descriptor(path) is not None or (path.exists() and not path.is_file() and not path.is_dir())
+    """Return whether a path names standard output, a device or a pipe: anything but a file or a folder."""
+    return path == STANDARD_OUTPUT or (path.exists() and not path.is_file() and not path.is_dir())
 
 
 def link_target(path: Path) -> Path:
@@ -152,9 +128,7 @@ def link_target(path: Path) -> Path:
 
     Raises ``InputError`` for links that form a loop.
     """
-    if not path.is_symlink():
-        return path
-    target = Path(os.path.realpath(path))
+    target = Path(os.path.realpath(path)) if path.is_symlink() else path
     if target.is_symlink():
         raise InputError(f"{path}: its links form a loop, expected the name of a file to write")
     return target
@@ -169,8 +143,8 @@ def write_output(target: Path, content: bytes | str) -> None:
     data = content.encode() if isinstance(content, str) else content
     if not is_stream(target):
         write_bytes(link_target(target), data)
-    elif is_standard_output(target):
-        _write_standard_output(data)
+    elif target == STANDARD_OUTPUT and not hasattr(sys.stdout, "buffer"):
+        sys.stdout.write(data.decode())  # A program that runs the command in its own process has replaced it.
     else:
         with _opened_stream(target) as stream:
             stream.write(data)
@@ -180,7 +154,7 @@ def write_output(target: Path, content: bytes | str) -> None:
 def output_file(target: Path) -> Iterator[Path]:
     """Yield the path of an empty file to write; on a clean exit, its content becomes that of the output.
 
-    Raises as ``write_output`` does.
+    Raises the errors of ``write_output``.
     """
     if not is_stream(target):
         with atomic_replace(link_target(target)) as temporary:
@@ -195,20 +169,14 @@ def output_file(target: Path) -> Iterator[Path]:
 
 @contextmanager
 def _opened_stream(target: Path) -> Iterator[BinaryIO]:
-    """Yield a descriptor, device or pipe open for writing. Raises as ``write_error`` does."""
-    sys.stdout.flush()  # Its text comes first if the target is standard output.
-    descriptor = open_descriptor(target)
+    """Yield standard output, or a device or pipe that is opened for writing."""
+    if target == STANDARD_OUTPUT:
+        sys.stdout.flush()  # Text that was printed comes first.
+        yield sys.stdout.buffer
+        sys.stdout.flush()
+        return
     try:
-        with target.open("wb") if descriptor is None else os.fdopen(os.dup(descriptor), "wb") as stream:
+        with target.open("wb") as stream:
             yield stream
     except OSError as error:
         raise write_error(target, error) from error
-
-
-def _write_standard_output(data: bytes) -> None:
-    if hasattr(sys.stdout, "buffer"):
-        sys.stdout.flush()
-        sys.stdout.buffer.write(data)
-    else:  # A program that runs the command in its own process may have replaced it.
-        sys.stdout.write(data.decode())
-    sys.stdout.flush()

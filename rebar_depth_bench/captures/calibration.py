@@ -13,7 +13,7 @@ from typing import Annotated, Any, TypeVar
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
-from pydantic import Field, Strict, ValidationInfo, field_validator
+from pydantic import Strict, ValidationInfo, field_validator, model_validator
 
 from rebar_depth_bench.base.errors import CalibrationError, Problem
 from rebar_depth_bench.base.validation import (
@@ -22,6 +22,7 @@ from rebar_depth_bench.base.validation import (
     Triple,
     field_error,
     number,
+    short_repr,
     validate_table,
     whole_number,
 )
@@ -213,10 +214,6 @@ _Matrix = Annotated[tuple[Triple, Triple, Triple], Strict(False)]
 _Offset = Annotated[float, quantity(-10, 10, "metres; the unit of a file is stated in cameras.toml")]
 _Pixels = Annotated[float, Expected("a number of pixels")]
 _Side = Annotated[int, whole_number(SIDES_PX[0], SIDES_PX[-1])]
-_PINHOLE_ENTRIES: Mapping[str, tuple[int, int]] = {"fx": (0, 0), "fy": (1, 1), "cx": (0, 2), "cy": (1, 2)}
-_PINHOLE = Expected(
-    "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]", lambda K: (K[0][1], K[1][0], *K[2]) == (0, 0, 0, 0, 1)
-)
 _TERMS = Expected("[k1, k2, p1, p2] or [k1, k2, p1, p2, k3]", lambda terms: len(terms) in (4, 5))
 
 
@@ -234,24 +231,26 @@ _ROTATION = Expected(
 )
 
 
-class _LensTable(StrictModel):  # Order matters: validators read the fields above theirs.
+class _LensTable(StrictModel):
     """Table ``[left]`` or ``[right]``; ``info.context`` is the image size."""
 
-    K: Annotated[_Matrix, _PINHOLE] | None = None
-    fx: Annotated[float, FOCAL_PX] = Field(default=None, validate_default=True)
-    fy: Annotated[float, FOCAL_PX] = Field(default=None, validate_default=True)
-    cx: _Pixels = Field(default=None, validate_default=True)
-    cy: _Pixels = Field(default=None, validate_default=True)
+    fx: Annotated[float, FOCAL_PX]
+    fy: Annotated[float, FOCAL_PX]
+    cx: _Pixels
+    cy: _Pixels
     distortion: Annotated[list[Annotated[float, DISTORTION]], _TERMS]
 
-    @field_validator(*_PINHOLE_ENTRIES, mode="before")
+    @model_validator(mode="before")
     @classmethod
-    def _take_from_K(cls, value: object, info: ValidationInfo) -> object:
-        """Return the number, or the entry of K; any valid number if K is given but invalid."""
-        K = info.data.get("K", ((1, 0, 1), (0, 1, 1), (0, 0, 1)))
-        _check_one_given({str(info.field_name): value, "K": K})
-        row, column = _PINHOLE_ENTRIES[str(info.field_name)]
-        return value if K is None else K[row][column]
+    def _take_numbers_of_K(cls, table: Any) -> Any:
+        if not isinstance(table, Mapping) or "K" not in table:
+            return table
+        match table:
+            case {"fx": _} | {"fy": _} | {"cx": _} | {"cy": _}:
+                raise field_error("has K beside fx, fy, cx or cy", "either K or these", "conflict")
+            case {"K": [[fx, 0, cx], [0, fy, cy], [0, 0, 1]], **others}:
+                return {**others, "fx": fx, "fy": fy, "cx": cx, "cy": cy}
+        raise field_error(f"K is {short_repr(table['K'])}", "[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]")
 
     @field_validator("cx", "cy")
     @classmethod
@@ -272,18 +271,21 @@ class _StereoTable(StrictModel):
     """Table ``[stereo]``; the baseline is converted to a translation."""
 
     rotation: Annotated[Triple | _Matrix, _ROTATION]
-    baseline_m: Annotated[float, _BASELINE_M] | None = None
     translation_m: Annotated[
-        tuple[_Offset, _Offset, _Offset], Strict(False), Expected("three numbers, metres")
-    ] = Field(default=None, validate_default=True)
+        tuple[_Offset, _Offset, _Offset], Strict(False), Expected("three numbers, metres, or baseline_m")
+    ]
 
-    @field_validator("translation_m", mode="before")
+    @model_validator(mode="before")
     @classmethod
-    def _take_from_baseline(cls, translation_m: object, info: ValidationInfo) -> object:
-        """Return the translation, or that along x; any valid one if the baseline is given but invalid."""
-        baseline_m = info.data.get("baseline_m", 1.0)
-        _check_one_given({"translation_m": translation_m, "baseline_m": baseline_m})
-        return translation_m if baseline_m is None else (-baseline_m, 0.0, 0.0)
+    def _take_baseline(cls, table: Any) -> Any:
+        if not isinstance(table, Mapping) or "baseline_m" not in table:
+            return table
+        if "translation_m" in table:
+            raise field_error("has translation_m beside baseline_m", "one of them", "conflict")
+        baseline_m, others = table["baseline_m"], {key: table[key] for key in table if key != "baseline_m"}
+        if type(baseline_m) not in (int, float) or not _BASELINE_M.accept(baseline_m):
+            raise field_error(f"baseline_m is {short_repr(baseline_m)}", _BASELINE_M.text)
+        return {**others, "translation_m": (-float(baseline_m), 0.0, 0.0)}
 
     @field_validator("translation_m")
     @classmethod
@@ -319,14 +321,6 @@ class _TwoCameras(_OneCamera):
         x, y, z = (rotation if rotation.ndim == 1 else rotation_vector(rotation)).tolist()
         left, right, translation_m = self.left.lens, self.right.lens, self.stereo.translation_m
         return StereoCalibration(self.width, self.height, left, right, (x, y, z), translation_m)
-
-
-def _check_one_given(values: Mapping[str, object]) -> None:
-    """Check that one of two keys has a value. Raises the error of a field otherwise."""
-    given = [key for key, value in values.items() if value is not None]
-    if len(given) != 1:
-        found = f"got {' and '.join(given)}" if given else "missing"
-        raise field_error(found, f"either {' or '.join(values)}", "conflict" if given else "missing")
 
 
 def table_calibration(

@@ -1,13 +1,13 @@
 """Files that state the cameras of a capture, and ``cameras.toml``, which also states its board and its poses.
 
 A folder holds ``cameras.toml``; or one file ``*.conf`` or ``calibration.toml`` (``captures.calibration_files``);
-or one or two calibrations of other programs (``captures.programs``). docs/captures.md lists these files.
+or one or two calibrations of OpenCV or ROS (``captures.programs``). docs/captures.md lists these files.
 
 ``cameras.toml`` has the keys of ``calibration.toml``, of one camera or of a pair, or names files in their place:
 
 ```toml
 calibration = ["intrinsics.yml", "extrinsics.yml"]    # or one file; or [left], [right], [stereo]
-unit = "mm"          # of lengths in files of OpenCV, ROS and Kalibr: "m" (default), "cm", "mm", "in" or "ft"
+unit = "mm"          # of lengths in files of OpenCV and ROS: "m" (default), "cm", "mm", "in" or "ft"
 rectified = false    # true: the pictures are rectified and have the file's matrix P
 
 [board]              # ArUco board; default: the A3 sheet with 6 markers of 50 mm
@@ -32,7 +32,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 from pydantic import Field, field_validator, model_validator
 
-from rebar_depth_bench.base.errors import CalibrationError, InputError, Problem
+from rebar_depth_bench.base.errors import CalibrationError, EntryError, InputError, Problem
 from rebar_depth_bench.base.limits import TOML_BYTES
 from rebar_depth_bench.base.names import NAME_LETTERS, NAME_PATTERN
 from rebar_depth_bench.base.reading import parse_toml, read_file
@@ -45,7 +45,6 @@ from rebar_depth_bench.base.validation import (
     one_of,
     text,
     validate_table,
-    with_lines,
 )
 from rebar_depth_bench.captures.calibration import (
     Calibration,
@@ -55,16 +54,13 @@ from rebar_depth_bench.captures.calibration import (
 )
 from rebar_depth_bench.captures.calibration_files import check_image_size, own_calibration
 from rebar_depth_bench.captures.documents import DOCUMENT_SUFFIXES, parse_document
+from rebar_depth_bench.captures.fields import READABLE
 from rebar_depth_bench.captures.programs import program_calibration
-from rebar_depth_bench.captures.recognised import recognised_problem
 from rebar_depth_bench.data.schema import BoardTable
 from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
 from rebar_depth_bench.geometry.cameras import is_rigid
 
 CAMERAS_FILE = "cameras.toml"
-CALIBRATION_SUFFIXES = (".conf", *DOCUMENT_SUFFIXES)
-_OTHER_SUFFIXES = (".txt", ".bin", ".h5", ".hdf5")
-"""Suffixes of the files that are looked at if a folder has no others."""
 _CALIBRATION_FILES = ("calibration.conf", "calibration.toml")
 _CALIBRATION_KEYS = ("width", "height", "left", "right", "stereo")
 
@@ -138,7 +134,7 @@ def read_cameras(root: Path, images: Sequence[str], width: int, height: int, *, 
     """Return the cameras of the folder ``root`` with ``images`` of ``width`` x ``height`` pixels.
 
     Raises ``InputError`` if the folder states no cameras or states them twice, ``CalibrationError`` with the
-    problems of its files, which name keys and lines, and if a pair of images has the calibration of one camera.
+    problems of its files, which name keys, and if a pair of images has the calibration of one camera.
     """
     path = root / CAMERAS_FILE
     if not path.exists():
@@ -185,8 +181,7 @@ def cameras_of_table(
         problems.append(Problem("missing", "pose", found, "poses of all images, or none"))
     if table is None or problems:
         located = [replace(one, where=f"{where}.{one.where}") for one in problems] if where else problems
-        content = read_file(path, TOML_BYTES, "the cameras of a capture", CalibrationError)
-        raise CalibrationError.from_problems(path, with_lines(located, content))
+        raise CalibrationError.from_problems(path, located)
     if inline is not None:
         calibration = scaled_calibration(inline, path, width, height)
     else:
@@ -200,19 +195,14 @@ def _found_files(root: Path) -> list[Path]:
     """Return the calibration files of a folder. Raises ``InputError`` unless there is one, or a pair."""
     files = sorted(path for path in root.iterdir() if not path.name.startswith("."))
     own = [path for path in files if path.suffix.lower() == ".conf" or path.name in _CALIBRATION_FILES]
-    others = [path for path in files if path.suffix.lower() in DOCUMENT_SUFFIXES and path.suffix.lower() != ".txt"]
-    if not own and not others:
-        texts = [path for path in files if path.suffix.lower() in _OTHER_SUFFIXES]
-        others = [path for path in texts if path.name.lower() == "calib.txt" or recognised_problem(path)][:1]
+    others = [path for path in files if path.suffix.lower() in DOCUMENT_SUFFIXES]
     if len(own) == 1 and (own[0].name in _CALIBRATION_FILES or not others):
         return own
     if not own and 1 <= len(others) <= 2:
         return others
     found = ", ".join(path.name for path in (*own, *others)[:5]) or "none"
-    raise InputError(
-        f"{root}: the calibration files are {found}, expected {CAMERAS_FILE}, calibration.toml, one *.conf, or "
-        f"one or two of *{', *'.join(DOCUMENT_SUFFIXES)}"
-    )
+    expected = f"{CAMERAS_FILE} with the names of those to read, or {READABLE}"
+    raise InputError(f"{root}: the calibration files are {found}, expected {expected}")
 
 
 def _file_calibration(
@@ -221,26 +211,27 @@ def _file_calibration(
     """Return the calibration in one or two files, of the ``stated`` unit, scaled to the image size."""
     source = " and ".join(map(str, paths))
     problems: list[Problem] = []
-    if paths[0].suffix.lower() not in DOCUMENT_SUFFIXES:
-        problem = recognised_problem(paths[0])
-        if problem is None and stated.rectified:
+    if len(paths) == 1 and paths[0].suffix.lower() in (".conf", ".toml"):
+        if stated.rectified:
             expected = "a file with the matrix P of rectified pictures, of ROS or OpenCV"
             problem = Problem("conflict", "", "has no matrix of rectified pictures", expected)
-        if problem is not None:
             raise CalibrationError.from_problems(paths[0], [problem])
         return own_calibration(paths[0], width, height, is_stereo=is_stereo)
     check_image_size(paths[0], width, height)
-    contents = {path.name: read_file(path, TOML_BYTES, "a calibration file", CalibrationError) for path in paths}
-    documents = {name: parse_document(name, content, problems) for name, content in contents.items()}
-    calibration = None
-    if not problems:
-        unit_m = UNITS_M[stated.unit]
-        calibration = program_calibration(documents, width, height, unit_m, problems, rectified=stated.rectified)
-    if calibration is None:
-        problems = [problem for path in paths if (problem := recognised_problem(path))] or problems
-        for name, content in contents.items():
-            problems = with_lines(problems, content, name)
+    documents = {}
+    for path in paths:
+        if path.suffix.lower() not in DOCUMENT_SUFFIXES:
+            problem = Problem("unknown", path.name, f"the file suffix is {path.suffix!r}", READABLE)
+            raise CalibrationError.from_problems(path.parent, [problem])
+        content = read_file(path, TOML_BYTES, "a calibration file", CalibrationError)
+        documents[path.name] = parse_document(path.name, content, problems)
+    if problems:
         raise CalibrationError.from_problems(paths[0].parent, problems)
+    unit_m = UNITS_M[stated.unit]
+    try:
+        calibration = program_calibration(documents, width, height, unit_m, rectified=stated.rectified)
+    except EntryError as error:
+        raise CalibrationError.from_problems(paths[0].parent, error.problems) from None
     if is_stereo and not isinstance(calibration, StereoCalibration):
         problem = Problem("missing", "", "describes one camera", "the left and the right one")
         raise CalibrationError.from_problems(source, [problem])

@@ -1,4 +1,4 @@
-"""Content of other programs' calibration files: YAML, OpenCV's FileStorage in YAML, XML or JSON, and calib.txt.
+"""Content of other programs' calibration files: YAML, and OpenCV's FileStorage in YAML, XML or JSON.
 
 A document is returned as dicts, lists, numbers and texts. Matrices of OpenCV are dicts with rows, cols and data.
 """
@@ -124,25 +124,11 @@ def _element_value(element: ElementTree.Element) -> Any:
     return words if len(words) > 1 else "".join(words)
 
 
-def _parse_text(text: str) -> dict[str, Any]:
-    """Return the values of Middlebury's ``calib.txt``. Raises ``ValueError`` for other texts."""
-    values: dict[str, Any] = {}
-    for number, line in enumerate(text.splitlines(), start=1):
-        key, separator, value = map(str.strip, line.partition("="))
-        if key and (not separator or key in values):
-            raise ValueError(f"line {number}: expected key=value of a calib.txt as Middlebury's, each key once")
-        if key:
-            is_matrix = value.startswith("[") and value.endswith("]")
-            values[key] = value.strip("[]").replace(";", " ").replace(",", " ").split() if is_matrix else value
-    return values
-
-
 _PARSERS: Mapping[str, Callable[[str], Any]] = {
     ".yaml": _parse_yaml,
     ".yml": _parse_yaml,
     ".xml": _parse_xml,
     ".json": _parse_json,
-    ".txt": _parse_text,
 }
 DOCUMENT_SUFFIXES = tuple(_PARSERS)
 """Suffixes of the files that ``parse_document`` reads."""

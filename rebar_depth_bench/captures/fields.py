@@ -1,19 +1,35 @@
-"""Fields of the files of other programs: those that a reader uses or checks, and those that change no number.
+"""Keys and lens models of the files of other programs.
 
-A reader looks up its values in the table of its format and names every field that the table does not list. Lens
-models beyond k1 k2 p1 p2 k3, stated by name or by the number of terms, are refused in one way in all formats.
+A reader names every key that it does not know. Lens models beyond k1 k2 p1 p2 k3, stated by name or by the number
+of terms, are refused in one way in all formats.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Literal
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import Any
 
 from rebar_depth_bench.base.errors import Problem, escape_text
 from rebar_depth_bench.base.validation import short_repr
 
+READABLE = """\
+Stereolabs' *.conf, OpenCV's FileStorage or ROS camera_info (*.yml, *.yaml, *.xml, *.json), or calibration.toml:
+    width = 1280
+    height = 720
+    [left]
+    fx = 701.88  # pixels
+    fy = 701.7
+    cx = 641.285  # pixel centres at integers
+    cy = 344.1835
+    distortion = [-0.175, 0.0283, 0.0001, -0.0002, 0.0]  # k1 k2 p1 p2 k3
+    [right]  # of a pair, also [stereo]
+    K = [[701, 0, 633.5], [0, 701, 359.3], [0, 0, 1]]
+    distortion = [0, 0, 0, 0]
+    [stereo]  # x_right = R x_left + T
+    rotation = [0.001, 0.006, 0]  # Rodrigues vector, radians
+    translation_m = [-0.12, 0, 0]"""
+"""Calibrations that are read, for the message that refuses others."""
 _MAX_NAMED = 10
 LENS_TERMS = ("k1", "k2", "p1", "p2", "k3")
 """Distortion terms that are used, in OpenCV's order."""
@@ -38,39 +54,13 @@ _PINHOLE = ("pinhole", "perspective")
 """Names of a projection without a statement about the distortion."""
 
 
-@dataclass(frozen=True)
-class Field:
-    """Field of a format: its keys in files, of which the first one present counts, and what a reader does with it.
-
-    ``use`` is "used" if the value becomes part of the result, "checked" if a file is refused unless the value is
-    as ``meaning`` says, and "harmless" if it changes no number.
-    """
-
-    name: str
-    keys: tuple[str, ...]
-    use: Literal["used", "checked", "harmless"]
-    meaning: str
-
-
-@dataclass(frozen=True)
-class FileFormat:
-    """Format of a file of another program. Keys are compared without case and punctuation."""
-
-    title: str
-    fields: tuple[Field, ...]
-
-    def keys(self, name: str) -> tuple[str, ...]:
-        """Return the keys of a field; none if the format does not have it."""
-        return next((field.keys for field in self.fields if field.name == name), ())
-
-    def notes(self, source: str, keys: Iterable[Any]) -> list[str]:
-        """Return a note that names the ``keys`` of the file ``source`` that are not listed; none if all are."""
-        listed = {plain_key(key) for field in self.fields for key in field.keys}
-        unlisted = [escape_text(str(key)) for key in keys if plain_key(str(key)) not in listed]
-        if not unlisted:
-            return []
-        more = f" and {len(unlisted) - _MAX_NAMED} more" if len(unlisted) > _MAX_NAMED else ""
-        return [f"{source}: fields without a known meaning are left out: {', '.join(unlisted[:_MAX_NAMED])}{more}"]
+def unknown_keys_notes(source: str, keys: Iterable[Any], known: Collection[str]) -> list[str]:
+    """Return a note that names the ``keys`` of the file ``source`` that are not ``known``; none if all are."""
+    unknown = [escape_text(str(key)) for key in keys if key not in known]
+    if not unknown:
+        return []
+    more = f" and {len(unknown) - _MAX_NAMED} more" if len(unknown) > _MAX_NAMED else ""
+    return [f"{source}: fields without a known meaning are left out: {', '.join(unknown[:_MAX_NAMED])}{more}"]
 
 
 def plain_key(key: str) -> str:

@@ -26,7 +26,7 @@ from numpy import ndarray
 
 from rebar_depth_bench.base.errors import InputError, Problem
 from rebar_depth_bench.captures.calibration import Calibration, MonoCalibration, StereoCalibration, camera_columns
-from rebar_depth_bench.captures.camera_files import CALIBRATION_SUFFIXES, CAMERAS_FILE, read_cameras
+from rebar_depth_bench.captures.camera_files import CAMERAS_FILE, read_cameras
 from rebar_depth_bench.captures.images import (
     IMAGE_SUFFIXES,
     NAME,
@@ -155,14 +155,13 @@ CAPTURE_LAYOUT = "left/<name>.png|jpg, right/<name>.png|jpg, calibration.conf|to
 def is_capture(path: str | os.PathLike[str]) -> bool:
     """Return whether a folder is meant as a capture.
 
-    It has a folder ``left``, or ``cameras.toml`` or ``calibration.toml``, or both images and a calibration file.
+    It has a folder ``left``, ``cameras.toml`` or ``calibration.toml``, or images.
     """
     root = Path(path)
     if (root / "left").is_dir() or any((root / name).is_file() for name in (CAMERAS_FILE, "calibration.toml")):
         return True
-    suffixes = {entry.suffix.lower() for entry in root.iterdir()} if root.is_dir() else set()
-    pictures = {*IMAGE_SUFFIXES, *OTHER_SUFFIXES}
-    return not suffixes.isdisjoint(pictures) and not suffixes.isdisjoint(CALIBRATION_SUFFIXES)
+    pictures = (*IMAGE_SUFFIXES, *OTHER_SUFFIXES)
+    return root.is_dir() and any(entry.suffix.lower() in pictures for entry in root.iterdir())
 
 
 def open_capture(path: str | os.PathLike[str]) -> ImageViews:

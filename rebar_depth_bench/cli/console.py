@@ -19,14 +19,7 @@ from rebar_depth_bench import software_version
 from rebar_depth_bench.base.errors import InputError, OutputError, RebarDepthError
 from rebar_depth_bench.base.reading import parse_number
 from rebar_depth_bench.base.terminal import ProgressBars, discard_stream, prepare_terminal, print_notice
-from rebar_depth_bench.base.writing import (
-    STANDARD_OUTPUT,
-    WRITE_ERRORS,
-    is_standard_output,
-    is_stream,
-    link_target,
-    open_descriptor,
-)
+from rebar_depth_bench.base.writing import STANDARD_OUTPUT, WRITE_ERRORS, is_stream, link_target
 
 if TYPE_CHECKING:
     from rebar_depth_bench.data.manifest import DatasetFolder
@@ -272,7 +265,7 @@ def add_output_file(
 
 def prints_table(options: argparse.Namespace) -> bool:
     """Return whether a command prints its table: standard output is free of the content of an output."""
-    return not any(isinstance(value, OutputFile) and is_standard_output(value) for value in vars(options).values())
+    return STANDARD_OUTPUT not in vars(options).values()
 
 
 def check_outputs(options: Mapping[str, object]) -> None:
@@ -302,20 +295,13 @@ def check_outputs(options: Mapping[str, object]) -> None:
                 raise InputError(
                     f"{option} names {output}, which is inside {path}: expected a path outside the input"
                 )
-        if is_stream(output):
-            _check_stream(option, output)
-        else:
+        if output == STANDARD_OUTPUT:
+            if getattr(sys.stdout, "name", "") == os.devnull:  # ``prepare_terminal`` has opened it.
+                raise InputError(f"{option} names {output}, but standard output is closed: expected an open one")
+        elif not is_stream(output):
             _check_writable(option, output, link_target(output).absolute())
-
-
-def _check_stream(option: str, output: Path) -> None:
-    descriptor = open_descriptor(output)
-    stream = {1: sys.stdout, 2: sys.stderr}.get(descriptor or 0)
-    is_closed = getattr(stream, "name", "") == os.devnull  # By ``prepare_terminal``.
-    if descriptor is not None and (is_closed or not Path(f"/dev/fd/{descriptor}").exists()):
-        raise InputError(f"{option} names {output}, but descriptor {descriptor} is not open")
-    if descriptor is None and not os.access(output, os.W_OK):
-        raise OutputError(f"{option} names {output}, which cannot be written to")
+        elif not os.access(output, os.W_OK):
+            raise OutputError(f"{option} names {output}, which cannot be written to")
 
 
 def _check_writable(option: str, output: Path, target: Path) -> None:

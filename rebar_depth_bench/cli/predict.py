@@ -115,7 +115,7 @@ def _open_views(options: argparse.Namespace, method: AnyMethod) -> tuple[Sequenc
 
     if not is_capture(path):
         raise InputError(
-            f"{path}: has no {MANIFEST_FILE}, no left/, and no images with {CAMERAS_FILE} or a calibration, "
+            f"{path}: has no {MANIFEST_FILE}, no left/, no {CAMERAS_FILE} and no images, "
             "expected a complete dataset folder written by rebar-build, or images with their cameras"
         )
     for option in ("config", "split", "expect_digest"):

@@ -45,14 +45,15 @@ def run(options: argparse.Namespace) -> None:
         raise InputError(
             "--no-wait and --json are both given, expected at most one: without waiting there is no result"
         )
-    with LeaderboardClient(options.url, read_token(options.token_file)) as leaderboard, ProgressBars() as bars:
+    leaderboard = LeaderboardClient(options.url, read_token(options.token_file))
+    with ProgressBars() as bars:
         accepted = leaderboard.submit(Path(options.archive), bars.update)
         print_notice(accepted.url)
         if options.no_wait:
             print(accepted.id)
             return
         try:
-            submission = leaderboard.wait(accepted.id, bars.update, options.wait)
+            submission = leaderboard.wait(accepted, bars.update, options.wait)
         except KeyboardInterrupt:
             print_notice("the submission is accepted and will be scored; its URL is printed above")
             raise
@@ -61,7 +62,7 @@ def run(options: argparse.Namespace) -> None:
             raise InputError(f"{options.archive}: scoring failed: {reason}")
         if submission.outdated:
             print_notice(f"warning: the result is outdated: {printable(submission.outdated, 1000)}")
-        result, result_json = leaderboard.result(accepted.id, accepted.archive_sha256)
+        result, result_json = leaderboard.result(accepted)
     if options.json:
         write_output(options.json, result_json)
     if prints_table(options):

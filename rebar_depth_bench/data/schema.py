@@ -336,8 +336,8 @@ class Scene(ManifestTable):
     ``board`` is the ArUco board under the assembly, or None; ``protocol_views`` is the number of views of the full
     trajectory; ``aim_point_m`` is the point that its cameras aim at, world metres, if they share one; ``bytes`` is
     the size of the shards; ``key`` is the digest of all parameters. ``family`` is the kind of cage of a generated
-    scene, otherwise None, and ``mats`` are its parts that deviate together. ``assembly``, ``protocol``, ``rig``
-    and ``mesh`` are None in a config that was imported. ``entry`` is the scene as it was written, with all
+    scene, otherwise None, and ``mats`` are its parts that deviate together. ``assembly``, ``trajectory``,
+    ``rig`` and ``mesh`` are None in a config that was imported. ``entry`` is the scene as it was written, with all
     parameters of the build.
     """
 
@@ -349,7 +349,7 @@ class Scene(ManifestTable):
     board: BoardSpec | None
     environment: Annotated[str, StringConstraints(max_length=60)] = ""
     appearance: Appearance = Appearance()
-    protocol: Annotated[AnyTrajectory, BeforeValidator(trajectory_of)] | None = None
+    trajectory: Annotated[AnyTrajectory, BeforeValidator(trajectory_of)] | None = Field(None, alias="protocol")
     protocol_views: Annotated[int, whole_number(1, 1_000_000)]
     rig: SceneRig | None = None
     aim_point_m: Annotated[Triple, three_numbers(-1e9, 1e9, "three numbers, [x, y, z]")] | None = None
@@ -372,7 +372,7 @@ class Scene(ManifestTable):
     @field_validator("protocol_views")
     @classmethod
     def _check_protocol_views(cls, protocol_views: int, info: ValidationInfo) -> int:
-        trajectory = info.data.get("protocol")
+        trajectory = info.data.get("trajectory")
         if trajectory is not None and protocol_views != trajectory.views:
             raise field_error(f"got {protocol_views}", f"the trajectory's {trajectory.views} views", "conflict")
         return protocol_views

@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt32
 from numpy import ndarray
 
-from rebar_depth_bench.extended.measures import ONCE, Measure, MeasureFamily, Samples, share_sample
+from rebar_depth_bench.extended.measures import Measure, Samples, share_sample
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
 
@@ -137,6 +137,3 @@ MEASURES = (
     ),
 )  # fmt: skip
 """Boundary measures in table order."""
-
-_NOTE = "independent of scale"
-FAMILIES = (MeasureFamily("boundary", "Boundary", 4, MEASURES, boundary_samples, (ONCE,), _NOTE),)

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt16, UInt32
 from numpy import ndarray
 
-from rebar_depth_bench.extended.measures import Measure, MeasureFamily, Samples, share_sample
+from rebar_depth_bench.extended.measures import Measure, Samples, share_sample
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
 
@@ -116,5 +116,3 @@ MEASURES = (
     ),
 )  # fmt: skip
 """Layer measures in table order."""
-
-FAMILIES = (MeasureFamily("layers", "Layers", 5, MEASURES, layer_samples),)

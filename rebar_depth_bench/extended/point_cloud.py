@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
-from rebar_depth_bench.extended.measures import Measure, MeasureFamily, Samples, subsample
+from rebar_depth_bench.extended.measures import Measure, Samples, subsample
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
 
@@ -71,13 +71,13 @@ def true_cloud(truth: SteelTruth) -> TrueCloud:
     return TrueCloud(position, queried, rays[position], depth_m[position], steel_m)
 
 
-def cloud_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
-    """Return a view's point cloud samples; ``p_m`` is planar depth on ``truth.index``, metres, NaN where missing.
+def cloud_samples(p_m: Float64[ndarray, " n"], cloud: TrueCloud) -> Samples:
+    """Return a view's point cloud samples.
 
+    ``p_m`` is planar depth on the pixels of ``SteelTruth``, metres, NaN where missing.
     Each of ``cloud_accuracy_<t>mm``, ``cloud_completeness_<t>mm`` and ``cloud_f_<t>mm`` has one value from 0 to
     1, none where the view has no interior pixel.
     """
-    cloud = truth.once(true_cloud)
     count = len(cloud.queried)
     if not count:
         return {}
@@ -167,5 +167,3 @@ MEASURES = tuple(
     for t in TOLERANCES_MM
 )
 """Point cloud measures in table order."""
-
-FAMILIES = (MeasureFamily("clouds", "Point clouds", 6, MEASURES, cloud_samples),)

@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
-from rebar_depth_bench.extended.measures import Measure, MeasureFamily, Samples, share_sample
+from rebar_depth_bench.extended.measures import Measure, Samples, share_sample
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.columns import METRICS
 from rebar_depth_bench.scoring.metrics import is_valid_prediction, metrics_at_scales
@@ -136,8 +136,3 @@ SINGLE_BAR_MEASURES = (
     ),
 )  # fmt: skip
 """Single-bar measures in table order."""
-
-FAMILIES = (
-    MeasureFamily("full_mask", "Rim included", 2, FULL_MASK_MEASURES, region_samples),
-    MeasureFamily("single_bar", "Single-bar interior", 3, SINGLE_BAR_MEASURES, region_samples),
-)

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64, UInt8, UInt16, UInt32
+from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt8, UInt16, UInt32
 from numpy import ndarray
 
 from rebar_depth_bench.bar_crossings.definition import Crossings, scene_crossings
 from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.extended.axes import CageTruth, SceneCrossings, cage_truth, prepared_crossings
-
-_Made = TypeVar("_Made")
+from rebar_depth_bench.scoring.metrics import is_valid_prediction
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,11 +98,8 @@ class SteelTruth:
     has_depth: UInt8[ndarray, " b"] = field(default_factory=lambda: np.empty(0, np.uint8))
     near_step: UInt8[ndarray, " b"] = field(default_factory=lambda: np.empty(0, np.uint8))
     step_depth_m: Float32[ndarray, " m"] = field(default_factory=lambda: np.empty(0, np.float32))
-    _made: dict[object, Any] = field(default_factory=dict, init=False, repr=False)
 
-    def once(self, make: Callable[[SteelTruth], _Made]) -> _Made:
-        """Return ``make(self)``, computed at the first call: what several predictions or measures need."""
-        if make not in self._made:
-            self._made[make] = make(self)
-        made: _Made = self._made[make]
-        return made
+    def predicted_m(self, prediction_m: Float[ndarray, "h w"]) -> Float64[ndarray, " n"]:
+        """Return a predicted image on ``index``, planar depth in metres, NaN where there is no prediction."""
+        p_m = prediction_m.ravel().take(self.index.astype(np.intp))
+        return np.where(is_valid_prediction(p_m), p_m.astype(np.float64), np.nan)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import hashlib
 import importlib
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,6 @@ from numpy import ndarray
 
 from rebar_depth_bench.base.errors import MethodError, install_command
 from rebar_depth_bench.base.parallel import Progress
-from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.data.rows import POSE_COLUMNS, TRUTH_COLUMNS, Views
 from rebar_depth_bench.submission.declaration import METRIC, PREDICTION_KINDS
 
@@ -87,7 +85,7 @@ class WeightsMethod(Method):
     """Single-view method whose weights, or code and weights, are not part of this package.
 
     ``with_weights(folder)`` returns the method with those in a folder (``NAME:FOLDER``), or for None (the bare
-    name) those in a local cache, which are downloaded if they are missing. Their digest or commit is part of its
+    name) those in a local cache, which are downloaded if they are missing. Their commit is part of its
     description. Raises ``MethodError`` if they are missing or cannot be downloaded.
     """
 
@@ -139,19 +137,6 @@ def input_class(method: AnyMethod) -> str | None:
     if "left_rgb" in info.columns:
         return "rgb+K" if info.uses_intrinsics else "rgb"
     return None
-
-
-def files_digest(paths: Iterable[Path]) -> str:
-    """Return the hex SHA-256 over the names and SHA-256 digests of a method's files, in the order of ``paths``.
-
-    Folders do not enter the digest, so that copies elsewhere have the same one. Raises ``MethodError`` if a file
-    cannot be read, or if it is a pointer of git LFS.
-    """
-    try:
-        lines = [f"{path.name} {file_sha256(path)}\n" for path in paths]
-    except OSError as error:
-        raise MethodError(f"{error.filename}: cannot be read: {error.strerror}") from None
-    return hashlib.sha256("".join(lines).encode()).hexdigest()
 
 
 def positive_or_nan(depth_m: Float[ndarray, "*grid"]) -> Float32[ndarray, "*grid"]:

@@ -3,7 +3,7 @@
 Names are resolved as follows:
 
 - ``hf:ORG/NAME`` or ``hf:FOLDER``: a checkpoint of ``transformers``;
-- ``NAME:FOLDER``: a network of the paper with its weights, or code and weights, in a folder (``FROM_FOLDER``);
+- ``NAME:FOLDER``: a network of the paper (``FROM_FOLDER``) with its weights, or code and weights, in a folder;
 - ``my_model.py:METHOD``: a method defined in a Python file;
 - ``my_model.toml``: an ONNX model described by a TOML file;
 - any other name: a built-in method, or an entry point of the group ``rebar_depth_bench.methods``.
@@ -30,8 +30,8 @@ ENTRY_POINT_GROUP = "rebar_depth_bench.methods"
 DISTRIBUTION = "rebar-depth-bench"
 _DIGEST_CHARACTERS = 16
 
-FROM_FOLDER = ("depth-anything-3", "foundation-stereo", "metric3d", "unidepth")
-"""Names of the methods that take a folder: ``NAME:FOLDER``."""
+FROM_FOLDER = ("depth-anything-3", "depth-pro", "foundation-stereo", "metric3d", "unidepth")
+"""Names of the methods that take a folder, which are a ``WeightsMethod``: ``NAME:FOLDER``."""
 
 
 class _BuiltIn(UserDict[str, Any]):
@@ -71,7 +71,7 @@ def find_method(name: str, *, view_timeout_s: float = VIEW_TIMEOUT_S, nearest_m:
     nearest surface, metres, to FoundationStereo.
 
     For the bare name of a method whose weights are on the Hub, and for ``hf:`` names, the files that identify the
-    weights are downloaded if they are not cached. Their commit or digest becomes part of the summary.
+    weights are downloaded if they are not cached. Their commit becomes part of the summary.
 
     Raises ``MethodError`` if the name is unknown, if a file or package cannot be imported or holds no method, or
     if ``nearest_m`` is given to another method.
@@ -87,8 +87,12 @@ def find_method(name: str, *, view_timeout_s: float = VIEW_TIMEOUT_S, nearest_m:
         from rebar_depth_bench.methods.transformers import hf_method
 
         return hf_method(folder)
-    if folder and method_name in FROM_FOLDER:
-        return _with_weights(method_name, Path(folder).expanduser())
+    if method_name in METHODS and (folder or not colon):
+        method = METHODS[method_name]
+        if isinstance(method, WeightsMethod):
+            return method.with_weights(Path(folder).expanduser() if folder else None)
+        if not colon:
+            return method
     path, colon, attribute = name.rpartition(":")
     if colon and path.endswith(".py"):
         module = _import_file(Path(path))
@@ -101,8 +105,6 @@ def find_method(name: str, *, view_timeout_s: float = VIEW_TIMEOUT_S, nearest_m:
         from rebar_depth_bench.methods.onnx.model import onnx_method
 
         return onnx_method(Path(name), view_timeout_s)
-    if name in METHODS:
-        return _with_weights(name, None)
     entries = _entry_point_methods()
     if name in entries:
         return _load_entry_point(entries[name])
@@ -111,16 +113,6 @@ def find_method(name: str, *, view_timeout_s: float = VIEW_TIMEOUT_S, nearest_m:
         f"unknown method {name!r}, expected one of {known}, or my_model.py:METHOD, my_model.toml, hf:ORG/NAME, "
         f"or NAME:FOLDER for one of {', '.join(FROM_FOLDER)}"
     )
-
-
-def _with_weights(name: str, folder: Path | None) -> AnyMethod:
-    """Return a built-in method, with the weights in a folder, or None: in a cache, if it needs any."""
-    method = METHODS[name]
-    if name == "depth-pro":
-        from rebar_depth_bench.methods.transformers import depth_pro_method
-
-        return depth_pro_method()
-    return method.with_weights(folder) if isinstance(method, WeightsMethod) else method
 
 
 def all_methods() -> dict[str, AnyMethod | MethodError]:

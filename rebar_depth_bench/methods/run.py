@@ -25,6 +25,7 @@ from rebar_depth_bench import software_version
 from rebar_depth_bench.base.errors import DatasetError, InputError, MethodError, RebarDepthError, escape_text
 from rebar_depth_bench.base.names import TEST_SPLIT
 from rebar_depth_bench.base.parallel import Progress, silent
+from rebar_depth_bench.base.reading import remove_folder
 from rebar_depth_bench.base.writing import NO_SPACE, is_stream, link_target, scratch_folder, write_error
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.data.rows import TRUTH_COLUMNS, Views
@@ -103,7 +104,7 @@ def predict_views(
             _predict_config(method, predictor, config, kept, done, progress)
         reports = noted | kept.run.reports
         _write_archive(method, target, kept, views, reports)
-        kept.remove()
+        remove_folder(folder)
     return reports
 
 
@@ -229,7 +230,11 @@ def _plain_notes(method: AnyMethod, config: str, notes: Mapping[str, Any]) -> di
 def _prepare_method(method: AnyMethod, views: Views, kept: KeptViews, progress: Progress) -> Predictor:
     """Return the predictor of a multi-view method for a config, and store its report unless there is one."""
     assert isinstance(method, MultiViewMethod)
-    work = kept.work_folder(views.config)
+    work = kept.path_of(f"{views.config}.work")
+    try:
+        work.mkdir(exist_ok=True)
+    except OSError as error:
+        raise write_error(work, error) from None
     started_from_scratch = not any(work.iterdir())
     start = time.perf_counter()
     with wrap_errors(f"{method.info.name}: {views.config}: prepare"):

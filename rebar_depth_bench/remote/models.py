@@ -16,11 +16,10 @@ from rebar_depth_bench.base.errors import Problem
 from rebar_depth_bench.base.validation import Expected, StrictModel, whole_number
 from rebar_depth_bench.submission.declaration import HttpUrl
 
-ID_PATTERN = "^[A-Za-z0-9_-]{1,100}$"
-"""Pattern of the id of a submission, which becomes part of URLs."""
 _ID = "5f0c9a7e2b4d4c1f8e6a3d2b1c0f9e8d"
 _PROBLEM = Problem("invalid", "lattice/0042.npy", "the dtype is <i4", "float16, float32 or float64")
-_Id = Annotated[str, Field(pattern=ID_PATTERN), Expected("an id of letters, digits, _ and -")]
+_Id = Annotated[str, Field(pattern="^[A-Za-z0-9_-]{1,100}$"), Expected("an id of letters, digits, _ and -")]
+"""Id of a submission, which becomes part of URLs."""
 _Sha256 = Annotated[str, Field(pattern="^[0-9a-f]{64}$"), Expected("64 hex digits")]
 _Count = Annotated[int, whole_number(0, 2**63 - 1)]
 _Time = Annotated[datetime, Strict(False)]

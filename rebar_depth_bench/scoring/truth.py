@@ -194,7 +194,7 @@ _ZED_RECTIFIED = ("rectified", 0.119978)
 
 @dataclass(frozen=True)
 class _Conditions:
-    """Conditions of a scene; ``optics`` are grid and baseline in metres, ``markers`` are those of the board."""
+    """Conditions of a scene; ``optics`` are grid and baseline in metres, ``markers`` is their number."""
 
     assembly: Mapping[str, Any]
     markers: int
@@ -275,7 +275,7 @@ def paper_differences(config: DatasetConfig) -> list[str]:
     conditions = {
         f"{len(config.views)} of {of_views} views": len(config.views) == of_views,
         f"{width} x {height} pixels, not {_GRID[1]} x {_GRID[0]}": config.grid == _GRID,
-        "other camera positions": scene.protocol == expected.trajectory,
+        "other camera positions": scene.trajectory == expected.trajectory,
         f"{markers} markers, not {expected.markers}": markers == expected.markers,
         f"environment {scene.environment}, not {expected.environment}": scene.environment == expected.environment,
         "variants of appearance": not scene.appearance.variants,

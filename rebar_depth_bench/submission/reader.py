@@ -89,10 +89,9 @@ class SubmissionReader(AbstractContextManager["SubmissionReader"]):
     def read(self, view_id: str) -> Depth:
         """Return the predicted planar depth of a view in metres: (H, W), float16, float32 or float64.
 
-        Of predictions that are not metric, it is what the kind says. A value of 0 of a PNG is returned as NaN. A
-        stored ``.npy`` entry is returned as a read-only view on the mapped file where its alignment allows; all
-        other entries are returned as new arrays. Raises ``EntryError`` if the entry is missing or invalid, and
-        ``ValueError`` if the reader is closed.
+        Of predictions that are not metric, it is what the kind says. A value of 0 of a PNG is returned as NaN. The
+        array may be read-only. Raises ``EntryError`` if the entry is missing or invalid, and ``ValueError`` if the
+        reader is closed.
         """
         if self._source is None:
             raise ValueError(f"{self.path}: the submission is closed")

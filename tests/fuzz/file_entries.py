@@ -11,7 +11,6 @@ import numpy as np
 import trimesh
 from PIL import Image
 
-from dataset_builder.catalog.scene_file import scene_config
 from dataset_builder.scene.mesh_ply import write_mesh_ply
 from dataset_builder.scene.model import WorldMesh
 from dataset_builder.user_files.cage_file import cage_file_spec, load_cage, mesh_file_spec
@@ -28,6 +27,7 @@ from tests.bench.captures.example_capture import write_capture
 from tests.bench.geometry.calibrations import CONF, CONF_OF_SIZES, TOML
 from tests.bench.reporting.results import overflowed_view, result, scored_view, unpredicted_view
 from tests.bench.submission.zips import exr, npy, npz, png
+from tests.builder.catalog.scene_files import scene_config
 from tests.builder.user_files.ifc_step_text import MILLIMETRES, Step
 from tests.building import TWO_BARS
 from tests.fuzz.workspace import CASE, EntryPoint, Workspace
@@ -260,10 +260,8 @@ FILE_ENTRIES = (
     _cameras("cameras: OpenCV YAML", "a.yml", _write_opencv),
     _cameras("cameras: OpenCV XML", "a.xml", _write_opencv),
     _cameras("cameras: OpenCV JSON", "a.json", _write_opencv),
-    _cameras("cameras: Kalibr", "a.yaml", partial(_text, pair.kalibr_text())),
     _cameras("cameras: YAML with aliases", "a.yaml", partial(_text, pair.aliased_text())),
     _cameras("cameras: ROS", "left.yaml", _write_ros),
-    _cameras("cameras: calib.txt", "calib.txt", partial(_text, pair.CALIB_TXT)),
     _picture("capture: PNG", "capture/right/000000.png"),
     _picture("capture: JPEG", "capture/right/000000.jpg"),
     _picture("capture: PNG with EXIF", "capture/right/000000.png", write=_UPRIGHT),

@@ -146,9 +146,9 @@ def test_steel_of_a_folder_is_measured(tiny_masks: dict[str, np.ndarray], tmp_pa
 def test_card_states_what_distances_are_to(tiny_root: Path) -> None:
     folder = open_folder(tiny_root)
     lattice = folder.config("lattice")
-    assert lattice.scene.protocol is not None
-    protocol = lattice.scene.protocol.model_copy(update={"distance_to": NEAREST_STEEL})
-    scene = lattice.scene.model_copy(update={"protocol": protocol})
+    assert lattice.scene.trajectory is not None
+    protocol = lattice.scene.trajectory.model_copy(update={"distance_to": NEAREST_STEEL})
+    scene = lattice.scene.model_copy(update={"trajectory": protocol})
     pier = lattice.model_copy(update={"name": "pier", "scenes": (scene,)})
     older = lattice.model_copy(update={"name": "pier"})
     rows = {

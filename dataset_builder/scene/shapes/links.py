@@ -104,14 +104,12 @@ def hook_m(
     return np.stack([corner_m, corner_m + (tangent_m + extension_m) * back])
 
 
-def helix_m(
-    radius_m: float, rise_m: float, turns: float, start_deg: float = 0.0, step_deg: float = BEND_STEP_DEG
-) -> Float64[ndarray, "n 3"]:
+def helix_m(radius_m: float, rise_m: float, turns: float, start_deg: float = 0.0) -> Float64[ndarray, "n 3"]:
     """Return a helix round the z axis that starts at z = 0 and rises by ``rise_m`` per turn, metres.
 
     The middles of its chords are at ``radius_m`` from the axis, so that a bar of the line touches nothing inside.
     """
-    steps = max(8, int(np.ceil(turns * 360.0 / step_deg)))
+    steps = max(8, int(np.ceil(turns * 360.0 / BEND_STEP_DEG)))
     angle = np.deg2rad(start_deg) + np.linspace(0.0, turns * 2 * np.pi, steps + 1)
     circumscribed_m = radius_m / np.cos((angle[1] - angle[0]) / 2)
     rise = (angle - angle[0]) / (2 * np.pi) * rise_m

@@ -29,6 +29,7 @@ from dataset_builder.user_files.ifc_reader.bodies import BodyItem, body_items, p
 from dataset_builder.user_files.ifc_reader.ifc_model import Entity, Model, open_model
 from dataset_builder.user_files.ifc_reader.objects import (
     DAMAGE,
+    DIAMETERS,
     choose_objects,
     left_out_record,
     object_label,
@@ -50,6 +51,12 @@ from rebar_depth_bench.base.errors import MeshError
 MAX_POINTS = 20_000_000
 """Largest number of points of all axes and surfaces of a model, which maps can multiply: 480 MB."""
 
+_ATTRIBUTES = (
+    *("GlobalId", "Name", "ObjectType", "PredefinedType", "BarRole", "BarLength", *DIAMETERS),
+    *("ObjectPlacement", "Representation", "RepresentationMaps"),
+)
+"""Attributes of an object and of its types that the bars depend on."""
+
 SECONDS_PER_SHAPE = 60
 """Time limit for tessellating one object; SIGALRM ends the process after it."""
 
@@ -65,12 +72,12 @@ def read_bars(content: bytes, select: Sequence[Selection] = ()) -> Iterator[tupl
     before the geometry kernel is used. ``select`` chooses objects (``choose_objects``).
 
     Raises ``MeshError`` if the file is not a complete IFC file, has no known length unit, nothing to read or too
-    much of it, if a bar depends on an instance that was not read as written, or if it has no usable geometry.
+    much of it, if a bar depends on an instance that is not as its class says, or if it has no usable geometry.
     """
     model = open_model(content)
     chosen, left_out = choose_objects(model, select)
     for relation in model.by_type("IfcRelDefinesByType"):
-        model.check_attributes(relation, "RelatedObjects", "RelatingType")
+        model.check(relation, "RelatedObjects", "RelatingType")
     reader = _Reader(model)
     yield ProjectRecord(unit_m=reader.units.length_m), ()
     for record in left_out:
@@ -107,14 +114,12 @@ class _Reader:
         """
         label = object_label(entity)
         try:
-            self._model.check_attributes(
-                entity, *("GlobalId", "Name", "ObjectType", "ObjectPlacement", "Representation"),
-                *("PredefinedType", "BarRole"),
-            )  # fmt: skip
+            types = type_objects(entity)
+            for one in (entity, *types):
+                self._model.check(one, *_ATTRIBUTES)
             if entity.ObjectPlacement is not None:
                 self._model.check_tree(entity.ObjectPlacement)
-            types = type_objects(self._model, entity)
-            source = source_record(self._model, entity, types, self.units.length_m)
+            source = source_record(entity, types, self.units.length_m)
             bar_role = role(entity, types)
             items = body_items(self._model, entity, types)
             world_from_object = placement_matrix(entity.ObjectPlacement, self._placements)

@@ -7,6 +7,7 @@ Placements and maps are matrices, points and directions are numbers, in the file
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -149,10 +150,14 @@ class BodyItem:
 def body_items(model: Model, entity: Entity, types: list[Entity]) -> list[BodyItem]:
     """Return the items of an object's Body, or of the Body of its type if it has none, in order.
 
-    Raises ``MeshError`` if an instance below the Body was not read as written, and ``ValueError`` if there is no
+    Raises ``MeshError`` if an instance below the Body is not as its class says, and ``ValueError`` if there is no
     Body, if a map is not one of a uniform scale, or if there are more than ``_MAX_BODY_ITEMS`` items.
     """
-    pending = [BodyItem(item, np.eye(4), 1.0) for body in _own_bodies(model, entity) for item in body.Items]
+    shape = entity.Representation
+    if shape is not None:
+        model.check(shape, "Representations")
+    bodies = [] if shape is None else _bodies(model, shape.Representations)
+    pending = [BodyItem(item, np.eye(4), 1.0) for body in bodies for item in body.Items]
     if not pending:
         pending = [item for type_object in types for item in _type_items(model, type_object)]
     if not pending:
@@ -160,37 +165,28 @@ def body_items(model: Model, entity: Entity, types: list[Entity]) -> list[BodyIt
     return _resolved(pending)
 
 
-def _own_bodies(model: Model, entity: Entity) -> list[Entity]:
-    if entity.Representation is None:
-        return []
-    model.check_attributes(entity.Representation, "Representations")
-    return _checked_bodies(model, list(entity.Representation.Representations))
-
-
 def _type_items(model: Model, type_object: Entity) -> list[BodyItem]:
-    maps = list(getattr(type_object, "RepresentationMaps", None) or ())
+    maps = getattr(type_object, "RepresentationMaps", None) or ()
+    bodies = _bodies(model, [source.MappedRepresentation for source in maps])
     for source in maps:
-        model.check_attributes(source)
+        model.check(source)
         model.check_tree(source.MappingOrigin)
-    bodies = {body.id() for body in _checked_bodies(model, [source.MappedRepresentation for source in maps])}
     return [
         BodyItem(item, axis_placement(source.MappingOrigin), 1.0)
         for source in maps
-        if source.MappedRepresentation.id() in bodies
+        if source.MappedRepresentation in bodies
         for item in source.MappedRepresentation.Items
     ]
 
 
-def _checked_bodies(model: Model, representations: list[Entity]) -> list[Entity]:
+def _bodies(model: Model, representations: Sequence[Entity]) -> list[Entity]:
     """Return the representations named Body, or all of them if there is none, with everything below checked."""
     for representation in representations:
-        model.check_attributes(representation, "RepresentationIdentifier")
-    named = [
-        representation for representation in representations if representation.RepresentationIdentifier == "Body"
-    ]
+        model.check(representation, "RepresentationIdentifier")
+    named = [one for one in representations if one.RepresentationIdentifier == "Body"]
     for body in named or representations:
         model.check_tree(body)
-    return named or representations
+    return named or list(representations)
 
 
 def _resolved(items: list[BodyItem]) -> list[BodyItem]:

@@ -26,15 +26,15 @@ CLASSES = ("IfcReinforcingBar", "IfcReinforcingMesh", "IfcTendon")
 DAMAGE = (ArithmeticError, AttributeError, LookupError, RuntimeError, TypeError, ValueError)
 """Exceptions of instances that are incomplete or not supported."""
 
-_DIAMETERS = ("NominalDiameter", "LongitudinalBarNominalDiameter", "TransverseBarNominalDiameter")
+DIAMETERS = ("NominalDiameter", "LongitudinalBarNominalDiameter", "TransverseBarNominalDiameter")
 _UNSPECIFIED_TYPES = ("USERDEFINED", "NOTDEFINED", None, "")
 _MAX_NAME = 60
 _NAMED_CLASSES = 5
 
-_PART = {"Decomposes": ("RelatingObject", "RelatedObjects"), "Nests": ("RelatingObject", "RelatedObjects")}
-_CONTENT = {"ContainedInStructure": ("RelatingStructure", "RelatedElements")}
-_CONNECTED = {"ConnectedFrom": ("RelatingElement", "RelatedElement")}
-"""Inverse attributes of an object, with the names of both ends of the relations that they hold."""
+_PART = {"Decomposes": "RelatingObject", "Nests": "RelatingObject"}
+_CONTENT = {"ContainedInStructure": "RelatingStructure"}
+_CONNECTED = {"ConnectedFrom": "RelatingElement"}
+"""Inverse attributes of an object, each with the name of the other end of the relations that it holds."""
 
 _MAX_DEPTH = 50
 """Largest number of wholes that an object is a part of, one in another; deeper nesting is taken to be a cycle."""
@@ -65,16 +65,10 @@ def project_units(model: Model) -> Units:
 def _project_unit(model: Model, kind: str, base: str) -> float | None:
     """Return the project unit of a kind, expressed in the SI unit ``base``, or None."""
     for project in model.by_type("IfcProject"):
-        model.check_attributes(project, "UnitsInContext")
-        if project.UnitsInContext is None:
-            continue
-        model.check_attributes(project.UnitsInContext)
-        for unit in project.UnitsInContext.Units:
-            if unit.is_a("IfcNamedUnit"):
-                model.check_attributes(unit, "UnitType")
-                if unit.UnitType == kind:
-                    model.check_tree(unit)
-                    return _in_base_unit(unit, base)
+        for unit in project.UnitsInContext.Units if project.UnitsInContext else ():
+            if getattr(unit, "UnitType", None) == kind:
+                model.check_tree(unit)
+                return _in_base_unit(unit, base)
     return None
 
 
@@ -107,7 +101,7 @@ def choose_objects(
     for entity in model.by_type("IfcProduct"):
         is_reinforcement = any(map(entity.is_a, CLASSES))
         tables = [table for table in select if is_reinforcement or table.has_class]
-        names = _names(model, entity) if tables else {}
+        names = _names(entity) if tables else {}
         for key, values in names.items():
             known[key].update(values)
         matching = [table for table in tables if table.matches(names)]
@@ -139,15 +133,15 @@ def _has_shape(entity: Entity) -> bool:
         return False
 
 
-def _names(model: Model, entity: Entity) -> Mapping[str, Sequence[str]]:
+def _names(entity: Entity) -> Mapping[str, Sequence[str]]:
     """Return the names of an object by the keys of a selection."""
     return {
         "class": (str(entity.is_a()),),
         "global_id": (str(entity.GlobalId),),
         "name": _texts(entity, "Name"),
-        "host": _texts(_host(model, entity), "Name", "GlobalId"),
-        "storey": _texts(_storey(model, entity), "Name", "GlobalId"),
-        "layer": _layers(model, entity),
+        "host": _texts(_host(entity), "Name", "GlobalId"),
+        "storey": _texts(_storey(entity), "Name", "GlobalId"),
+        "layer": _layers(entity),
     }
 
 
@@ -157,38 +151,33 @@ def _texts(entity: Entity | None, *names: str) -> list[str]:
     return [str(value) for value in values if value]
 
 
-def _host(model: Model, entity: Entity) -> Entity | None:
+def _host(entity: Entity) -> Entity | None:
     """Return the element that an object is a part of, or else is connected with, or None."""
     for kinds in (_PART, _CONNECTED):
-        whole = _relating(model, entity, kinds)
+        whole = _relating(entity, kinds)
         if whole is not None and whole.is_a("IfcElement"):
             return whole
     return None
 
 
-def _storey(model: Model, entity: Entity) -> Entity | None:
+def _storey(entity: Entity) -> Entity | None:
     """Return the storey of an object, or None."""
     for _ in range(_MAX_DEPTH):
         if entity is None or entity.is_a("IfcBuildingStorey"):
             return entity
-        entity = _relating(model, entity, _CONTENT) or _relating(model, entity, _PART)
+        entity = _relating(entity, _CONTENT) or _relating(entity, _PART)
     return None
 
 
-def _relating(model: Model, entity: Entity, kinds: Mapping[str, tuple[str, str]]) -> Entity | None:
-    """Return the other end of an object's first relation of some kinds, or None.
-
-    Raises ``MeshError`` unless the relation is as written.
-    """
-    for inverse, (relating, related) in kinds.items():
+def _relating(entity: Entity, kinds: Mapping[str, str]) -> Entity | None:
+    """Return the other end of an object's first relation of some kinds, or None."""
+    for inverse, relating in kinds.items():
         if relations := getattr(entity, inverse, None):
-            relation = min(relations, key=lambda relation: int(relation.id()))
-            model.check_attributes(relation, relating, related)
-            return getattr(relation, relating)
+            return getattr(min(relations, key=lambda relation: int(relation.id())), relating)
     return None
 
 
-def _layers(model: Model, entity: Entity) -> list[str]:
+def _layers(entity: Entity) -> list[str]:
     """Return the names of the layers of an object's shapes and their items."""
     shape = entity.Representation
     shapes = [] if shape is None else list(shape.Representations or ())
@@ -198,7 +187,6 @@ def _layers(model: Model, entity: Entity) -> list[str]:
     for item in (*shapes, *items, *maps):
         # The name of the inverse attribute depends on the version of IFC.
         for layer in getattr(item, "LayerAssignments", None) or getattr(item, "LayerAssignment", None) or ():
-            model.check_attributes(layer, "Name")
             names += _texts(layer, "Name")
     return names
 
@@ -222,29 +210,21 @@ def object_label(entity: Entity) -> str:
     return f"{entity.is_a()} {_shown(entity.GlobalId)} (#{entity.id()})"
 
 
-def type_objects(model: Model, entity: Entity) -> list[Entity]:
-    """Return the IfcTypeObjects that define an object; raise ``MeshError`` if one was not read as written."""
+def type_objects(entity: Entity) -> list[Entity]:
+    """Return the IfcTypeObjects that define an object."""
     relations = [*(getattr(entity, "IsTypedBy", None) or ()), *(getattr(entity, "IsDefinedBy", None) or ())]
-    types = [relation.RelatingType for relation in relations if relation.is_a("IfcRelDefinesByType")]
-    for type_object in types:
-        model.check_attributes(type_object, "PredefinedType", "BarRole", "RepresentationMaps")
-    return types
+    return [relation.RelatingType for relation in relations if relation.is_a("IfcRelDefinesByType")]
 
 
-def source_record(model: Model, entity: Entity, types: Sequence[Entity], unit_m: float) -> Source:
-    """Return the record of an object: its names, and the sizes that it, or else its types, declare for its bars.
-
-    Raises ``MeshError`` if one of the attributes was not read as written.
-    """
+def source_record(entity: Entity, types: Sequence[Entity], unit_m: float) -> Source:
+    """Return the record of an object: its names, and the sizes of bars that it, or else its types, declare."""
     sources = [entity, *types]
-    for source in sources:
-        model.check_attributes(source, *_DIAMETERS, "BarLength")
     return Source(
         global_id=_shown(entity.GlobalId),
         label=object_label(entity),
-        host=_name(_host(model, entity)),
-        storey=_name(_storey(model, entity)),
-        diameters_m=next(filter(None, (_positive(source, _DIAMETERS, unit_m) for source in sources)), []),
+        host=_name(_host(entity)),
+        storey=_name(_storey(entity)),
+        diameters_m=next(filter(None, (_positive(source, DIAMETERS, unit_m) for source in sources)), []),
         length_m=next((size for source in sources for size in _positive(source, ["BarLength"], unit_m)), None),
     )
 

@@ -40,7 +40,7 @@ _STRAIGHT = math.cos(math.radians(1.0))
 """Smallest cosine of the angle between two solids that continue each other."""
 
 _END_SHARE = 1e-4
-"""Share of an arc at its end whose chord is taken for the tangent."""
+"""Share of a piece at its end whose chord is taken for the tangent."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,18 +69,14 @@ def read_sweep(solid: Any, units: Units, declared: float | None) -> Sweep | None
     a curve that is not supported, degenerate or not connected, has no radius, or has parameters that are not on
     the curve.
     """
-    if solid.is_a("IfcSweptDiskSolid"):
-        return _swept_disc(solid, units, declared)
     is_swept_area = solid.is_a() in ("IfcExtrudedAreaSolid", "IfcRevolvedAreaSolid")
     if is_swept_area and solid.SweptArea.is_a("IfcCircleProfileDef"):
         return _swept_circle(solid, units.angle_rad)
-    return None
-
-
-def _swept_disc(solid: Any, units: Units, declared: float | None) -> Sweep:
+    if not solid.is_a("IfcSweptDiskSolid"):
+        return None
     diameter, notes = _diameter(solid.Radius), _hollow_notes(solid.InnerRadius)
     pieces = _swept_pieces(solid, units, declared, notes)
-    axis = _joined([np.array(piece.points(), np.float64) for piece in pieces], diameter, notes)
+    axis = _joined([piece.points() for piece in pieces], diameter, notes)
     if solid.is_a("IfcSweptDiskSolidPolygonal") and solid.FilletRadius:
         axis = bent_line_m(axis, solid.FilletRadius, ARC_STEP_DEG)
     return Sweep(axis, _outward(pieces), diameter, notes)
@@ -88,21 +84,10 @@ def _swept_disc(solid: Any, units: Units, declared: float | None) -> Sweep:
 
 def _outward(pieces: Sequence[Piece]) -> Float64[ndarray, "2 3"]:
     """Return the unit vectors along connected pieces that point out of their start and their end."""
-    pieces = [piece for piece in pieces if _length([piece])]
-    first, last = pieces[0], pieces[-1]
-    start = (first.part(0.0, _END_SHARE) if isinstance(first, Arc) else first).points()
-    end = (last.part(1 - _END_SHARE, 1.0) if isinstance(last, Arc) else last).points()
-    return -np.array([_tangent(start[:3]), _tangent(end[::-1][:3])])
-
-
-def _tangent(points: Float64[ndarray, "n 3"]) -> Float64[ndarray, " 3"]:
-    """Return the unit tangent at the first of two points, or of three on a circle, towards the others.
-
-    It differs from the chord a to the second point as the chord b to the last one does from that c between them.
-    """
-    chords = points[1] - points[0], points[-1] - points[0], points[-1] - points[-2]
-    a, b, c = (chord / np.linalg.norm(chord) for chord in chords)
-    return np.asarray((a @ c) * b + (b @ c) * a - (a @ b) * c)
+    pieces = [piece for piece in pieces if piece.length]
+    start, end = pieces[0].part(0.0, _END_SHARE).points(), pieces[-1].part(1 - _END_SHARE, 1.0).points()
+    chords = np.array([start[0] - start[-1], end[-1] - end[0]])
+    return np.asarray(chords / np.linalg.norm(chords, axis=1, keepdims=True))
 
 
 def _diameter(radius: float) -> float:
@@ -125,7 +110,7 @@ def _swept_circle(solid: Any, angle_rad: float) -> Sweep | None:
     if solid.is_a("IfcExtrudedAreaSolid"):
         along = unit_vector(solid.ExtrudedDirection)
         is_bar = 1 - abs(along[2]) <= _OBLIQUE
-        piece = Leg.between(start, start + float(solid.Depth) * along)
+        piece = Leg(start, start + float(solid.Depth) * along)
     else:
         along, turn_rad = unit_vector(solid.Axis.Axis, (0.0, 0.0, 1.0)), float(solid.Angle) * angle_rad
         arm = start - np.array(point_xyz(solid.Axis.Location))
@@ -179,7 +164,7 @@ def _swept_pieces(solid: Any, units: Units, declared: float | None, notes: dict[
         part = cut(pieces, (chosen or counts)[0], start, end)
     length = _length(part)
     if declared and length:
-        legs = [getattr(piece, "legs", 1) for piece in pieces]
+        legs = [piece.legs if isinstance(piece, Leg) else 1 for piece in pieces]
         counts.append([size / number for size, number in zip(by_rule, legs, strict=True)])
         counts += [[1 / number for number in legs], [piece.length for piece in pieces]]
         parts = [cut(pieces, count, start, end) for count in counts if end <= sum(count) * (1 + _SAME)]
@@ -279,8 +264,7 @@ def _joined(
 
 
 def _length(pieces: Sequence[Piece]) -> float:
-    """Return the length of the lines through the points of pieces."""
-    return sum((float(np.linalg.norm(np.diff(piece.points(), axis=0), axis=1).sum()) for piece in pieces), 0.0)
+    return sum((piece.length for piece in pieces), 0.0)
 
 
 def _drop_repeated_points(points: Float64[ndarray, "n 3"]) -> Float64[ndarray, "k 3"]:

@@ -1,6 +1,7 @@
 """Reader of PLY files, text and binary: the vertices and polygons of any file with these two elements.
 
-The counts of the header must be those of the content. Other elements and properties are skipped.
+The counts of the header must be those of the content. Other elements and properties are skipped. The numbers of a
+text are read as those of a binary file of 64-bit numbers, whose rows must be the lines.
 """
 
 from __future__ import annotations
@@ -8,23 +9,13 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from itertools import islice
-from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Int64, Shaped
+from jaxtyping import Float64, Int64, Shaped
 from numpy import ndarray
 
-from dataset_builder.user_files.mesh_formats.parsing import (
-    MalformedMeshError,
-    Surface,
-    check_finite,
-    first_true,
-    parse_numbers,
-    shown,
-    triangulate,
-)
+from dataset_builder.user_files.mesh_formats.parsing import NUMBER, MalformedMeshError, Surface, shown, triangulate
 
 _TYPES = {
     **dict.fromkeys(("char", "int8"), "b"),
@@ -40,246 +31,174 @@ _TYPES = {
 }
 """Codes of the types, which NumPy and the module ``struct`` share."""
 _HEADER_BYTES = 1 << 16
-_HEADER = re.compile(rb"ply[ \t]*\r?\n(.*?\n)?[ \t]*end_header[ \t]*(?:\r?\n|\Z)", re.DOTALL)
+_HEADER = re.compile(
+    rb"ply[ \t]*(?:\r?\n|(?P<cr>\r))(.*?[\r\n])?[ \t]*end_header[ \t]*(?:(?(cr)\r|\r?\n)|\Z)", re.DOTALL
+)
+"""Header, whose lines end with LF, CR LF, or all with CR: then a line feed behind it belongs to the content."""
 _ORDERS = {"ascii": "", "binary_little_endian": "<", "binary_big_endian": ">"}
 _POLYGONS = ("vertex_index", "vertex_indices")
+_NUMBERS = re.compile(
+    rb"\s*+(?:(?:%b|[-+]?nan(?:\(\w*\))?|[-+]?inf(?:inity)?)(?:\s++|\Z))*+" % NUMBER, re.IGNORECASE
+)
 
-
-@dataclass(frozen=True)
-class _Property:
-    """Property of an element: type codes of the values, and of the number of values if they are a list."""
-
-    name: str
-    values: str
-    count: str | None = None
-
-
-@dataclass(frozen=True)
-class _Element:
-    """Element of the header, ``count`` rows with these properties."""
-
-    name: str
-    count: int
-    properties: list[_Property]
-
-
-@dataclass(frozen=True, eq=False)
-class _Lists:
-    """Values of a list property: the number of values of each row, and all values in one array."""
-
-    sizes: Int64[ndarray, " n"]
-    values: Shaped[ndarray, " m"]
-
-
-_Columns = Mapping[str, ndarray | _Lists]
-"""Values of an element by property."""
+_Properties = dict[str, tuple[str, str]]
+"""By name: type of the values, and of their number before them if they are a list, else an empty text."""
+_Columns = dict[str, tuple[ndarray, ndarray]]
+"""By property: number of values in each row, and all values."""
 
 
 def read_ply(content: bytes) -> Mapping[str, Surface]:
     """Return the vertices and the triangulated polygons of a PLY file, as one object without a name.
 
     Raises ``MalformedMeshError`` if the header is malformed, if counts in it are not those of the content, if
-    there are no vertices or faces, or for a property ``bar_id``, which only files in another layout have.
+    there are no vertices, or for a property ``bar_id``, which only files in another layout have.
     """
     header = _HEADER.match(content[:_HEADER_BYTES])
     if header is None:
         raise MalformedMeshError("syntax", "", "no PLY header", '"ply" to "end_header"')
-    order, elements = _parse_header((header[1] or b"").split(b"\n"))
-    if any(item.name == "bar_id" for element in elements for item in element.properties):
+    order, elements = _parse_header((header[2] or b"").splitlines())
+    elements = {name: (count, properties) for name, (count, properties) in elements.items() if properties}
+    if any("bar_id" in properties for _, properties in elements.values()):
         raise MalformedMeshError(
             "conflict",
             "header",
             "the file has the property bar_id, but not this dataset's PLY layout",
             "a file without bar_id, whose connected components are numbered as bars",
         )
-    body = content[header.end() :]
-    elements = [element for element in elements if element.properties]
-    read = _binary_elements(elements, body, order) if order else _text_elements(elements, body)
-    vertices, triangles = _vertices(read.get("vertex", {})), _triangles(read.get("face", {}))
-    check_finite(vertices, lambda row: f"vertex {row}")
-    row = first_true(((triangles < 0) | (triangles >= len(vertices))).any(axis=1))
-    if row is not None:
-        found = f"the corners are the vertices {triangles[row].tolist()}"
-        raise MalformedMeshError("invalid", f"triangle {row}", found, f"0 to {len(vertices) - 1}")
-    return {"": (vertices, triangles)}
+    types = elements.get("vertex", (0, {}))[1]
+    if any(types.get(axis, ("", "list"))[1] for axis in "xyz"):
+        raise MalformedMeshError("missing", "header", "no vertices with the properties x, y and z", "a mesh")
+    body, start, columns = content[header.end() :], 0, dict[str, _Columns]()
+    if not order:
+        order, body = "=", _checked_numbers(elements, body).tobytes()
+        elements = {
+            name: (count, {item: ("d", size and "d") for item, (_, size) in properties.items()})
+            for name, (count, properties) in elements.items()
+        }
+    for name, (count, properties) in elements.items():
+        columns[name], start = _columns(name, count, properties, body, start, order)
+    if body[start:].strip(b"\r\n"):
+        found = f"damaged: {len(body) - start} bytes after the last row"
+        raise MalformedMeshError("damaged", "", found, "as many rows as in the header")
+    is_single = all(types[axis][0] == "f" for axis in "xyz")
+    vertices = np.column_stack([columns["vertex"][axis][1] for axis in "xyz"])
+    lists = [item for item, (_, size) in elements.get("face", (0, {}))[1].items() if size]
+    polygons = [item for item in lists if item in _POLYGONS] or lists
+    triangles = np.empty((0, 3), np.int64)
+    if len(polygons) == 1:
+        triangles = _triangles(*columns["face"][polygons[0]])
+    return {"": (vertices.astype(np.float32 if is_single else np.float64), triangles)}
 
 
-def _parse_header(lines: Sequence[bytes]) -> tuple[str, list[_Element]]:
-    """Return the byte order ("": text) and the elements."""
-    order, elements = None, list[_Element]()
+def _parse_header(lines: Sequence[bytes]) -> tuple[str, dict[str, tuple[int, _Properties]]]:
+    """Return the byte order ("": text), and the elements by name: number of rows and properties."""
+    order, elements = None, dict[str, tuple[int, _Properties]]()
+    properties: _Properties = {}
     for number, line in enumerate(lines, start=2):
         match line.decode("latin-1").split():
             case ["format", name, "1.0"] if name in _ORDERS and order is None:
                 order = _ORDERS[name]
-            case ["element", name, count] if re.fullmatch(r"\d{1,18}", count, re.ASCII):
-                elements.append(_Element(name, int(count), []))
-            case ["property", "list", count, values, name] if elements and _are_list_types(count, values):
-                elements[-1].properties.append(_Property(name, _TYPES[values], _TYPES[count]))
-            case ["property", values, name] if elements and values in _TYPES:
-                elements[-1].properties.append(_Property(name, _TYPES[values]))
+            case ["element", name, count] if re.fullmatch(r"[0-9]{1,18}", count) and name not in elements:
+                properties = {}
+                elements[name] = int(count), properties
+            case ["property", "list", size, values, name] if (
+                elements and name not in properties and _TYPES.get(size, "f") not in "fd" and values in _TYPES
+            ):
+                properties[name] = _TYPES[values], _TYPES[size]
+            case ["property", values, name] if elements and name not in properties and values in _TYPES:
+                properties[name] = _TYPES[values], ""
             case [] | ["comment" | "obj_info", *_]:
                 pass
             case _:
-                raise MalformedMeshError("syntax", f"line {number}", f"found {shown(line)}", "a PLY header")
+                expected = "a PLY header, in which a name occurs once"
+                raise MalformedMeshError("syntax", f"line {number}", f"found {shown(line)}", expected)
     if order is None:
         raise MalformedMeshError("missing", "header", "no format", " or ".join(_ORDERS))
-    for names in ([e.name for e in elements], *([item.name for item in e.properties] for e in elements)):
-        if len(set(names)) < len(names):
-            raise MalformedMeshError(
-                "duplicate", "header", "an element or property occurs twice", "each name once"
-            )
     return order, elements
 
 
-def _are_list_types(count: str, values: str) -> bool:
-    return _TYPES.get(count, "f") not in "fd" and values in _TYPES
+def _checked_numbers(elements: Mapping[str, tuple[int, _Properties]], body: bytes) -> Float64[ndarray, " n"]:
+    """Return the numbers of a text; raise ``MalformedMeshError`` if its lines are not the rows of the header."""
+    if body.strip() and not body.endswith((b"\n", b"\r")):
+        raise MalformedMeshError("damaged", "", "truncated: the last row has no line end", "complete rows")
+    lines = [line for line in body.splitlines() if line.strip()]
+    total = sum(count for count, _ in elements.values())
+    if len(lines) != total:
+        found = f"truncated or damaged: {len(lines)} rows after the header"
+        raise MalformedMeshError("damaged", "", found, f"{total} as in the header")
+    following = iter(lines)
+    for name, (count, properties) in elements.items():
+        for row, line in enumerate(islice(following, count)):
+            if not _NUMBERS.fullmatch(line) or not _is_row(line.split(), properties):
+                found, expected = f"found {shown(line)}", "the numbers that the header lists"
+                raise MalformedMeshError("damaged", f"{name} {row}", found, expected)
+    return np.fromstring(b" ".join(lines), sep=" ") if lines else np.empty(0)
 
 
-def _vertices(columns: _Columns) -> Float[ndarray, "v 3"]:
-    """Return the coordinates as float32 or float64, as the file has them."""
-    axes = [column for axis in "xyz" if isinstance(column := columns.get(axis), ndarray)]
-    if len(axes) < 3:
-        raise MalformedMeshError("missing", "header", "no vertices with the properties x, y and z", "a mesh")
-    vertices = np.column_stack(axes)
-    return vertices if vertices.dtype == np.float32 else vertices.astype(np.float64)
+def _is_row(words: Sequence[bytes], properties: _Properties) -> bool:
+    """Return whether numbers are the values of these properties, and those of lists follow their number."""
+    at = 0
+    for _, size in properties.values():
+        if size:
+            listed = float(words[at]) if at < len(words) else -1.0
+            if not (0 <= listed < len(words) and listed.is_integer()):
+                return False
+            at += int(listed)
+        at += 1
+    return at == len(words)
 
 
-def _triangles(columns: _Columns) -> Int64[ndarray, "n 3"]:
-    """Return the triangles of the polygons; raise ``MalformedMeshError`` if one has no three whole corners.
+def _columns(
+    name: str, count: int, properties: _Properties, body: bytes, start: int, order: str
+) -> tuple[_Columns, int]:
+    """Return the values of an element and the position of its end; raise ``MalformedMeshError`` if it is cut."""
+    found = f"truncated or damaged: the file ends within the {count} rows of {name}"
+    too_short = MalformedMeshError("damaged", "", found, "as many rows as in the header")
+    least = sum(struct.calcsize(order + (size or value)) for value, size in properties.values())
+    if start + count * least > len(body):
+        raise too_short
+    if not any(size for _, size in properties.values()):
+        row = np.dtype([(item, order + value) for item, (value, _) in properties.items()])
+        rows = np.frombuffer(body, row, count, start)
+        return {item: (np.ones(count, np.int64), rows[item]) for item in properties}, start + rows.nbytes
+    sizes: dict[str, list[int]] = {item: [] for item in properties}
+    pieces: dict[str, list[bytes]] = {item: [] for item in properties}
+    layout = [
+        (item, size and struct.Struct(order + size), struct.calcsize(order + value))
+        for item, (value, size) in properties.items()
+    ]
+    for _ in range(count):
+        for item, size, width in layout:
+            length = 1
+            if size:
+                if start + size.size > len(body):
+                    raise too_short
+                length = int(size.unpack_from(body, start)[0])
+                start += size.size
+            end = start + length * width
+            if not start <= end <= len(body):
+                raise too_short
+            sizes[item].append(length)
+            pieces[item].append(body[start:end])
+            start = end
+    return {
+        item: (np.array(sizes[item], np.int64), np.frombuffer(b"".join(pieces[item]), order + value))
+        for item, (value, _) in properties.items()
+    }, start
+
+
+def _triangles(sizes: Int64[ndarray, " n"], corners: Shaped[ndarray, " m"]) -> Int64[ndarray, "n 3"]:
+    """Return the triangles of polygons; raise ``MalformedMeshError`` if one has no three whole corners.
 
     Lists of other lengths would also fit most content that is damaged, since a list states its own length.
     """
-    lists = {name: column for name, column in columns.items() if isinstance(column, _Lists)}
-    found = [column for name, column in lists.items() if name in _POLYGONS]
-    if not found and len(lists) == 1:
-        found = [*lists.values()]
-    if not found or not len(found[0].sizes):
-        return np.empty((0, 3), np.int64)
-    sizes, corners = found[0].sizes, found[0].values
-    short = first_true(sizes < 3)
-    if short is not None:
-        raise MalformedMeshError("damaged", f"face {short}", f"{sizes[short]} corners", "three or more")
-    fraction = first_true(corners != np.floor(corners))
-    if fraction is not None:
-        raise MalformedMeshError("invalid", "face", f"a corner is vertex {corners[fraction]}", "a whole number")
+    if sizes.min(initial=3) < 3:
+        found = f"{sizes.min()} corners"
+        raise MalformedMeshError("damaged", f"face {sizes.argmin()}", found, "three or more")
+    fractions = corners[corners != np.floor(corners)]
+    if len(fractions):
+        raise MalformedMeshError("invalid", "face", f"a corner is vertex {fractions[0]}", "a whole number")
     corners = corners.astype(np.int64)
-    if (sizes == sizes[0]).all():
-        return triangulate(corners.reshape(len(sizes), -1))
+    if (sizes == sizes[:1]).all():
+        return triangulate(corners.reshape(len(sizes), -1)) if len(sizes) else np.empty((0, 3), np.int64)
     return triangulate(np.split(corners, np.cumsum(sizes)[:-1]))
-
-
-def _text_elements(elements: Sequence[_Element], body: bytes) -> dict[str, _Columns]:
-    """Return the values of each element; every row is one line."""
-    if body.strip() and not body.endswith((b"\n", b"\r")):
-        raise MalformedMeshError("damaged", "", "truncated: the last row has no line end", "complete rows")
-    rows = [line for line in body.splitlines() if line.strip()]
-    total = sum(element.count for element in elements)
-    if len(rows) != total:
-        found = f"truncated or damaged: {len(rows)} rows after the header"
-        raise MalformedMeshError("damaged", "", found, f"{total} as in the header")
-    following = iter(rows)
-    return {element.name: _text_columns(element, [*islice(following, element.count)]) for element in elements}
-
-
-def _text_columns(element: _Element, rows: Sequence[bytes]) -> _Columns:
-    """Return the values of the rows of an element, of which one property after the other is read."""
-    numbers = parse_numbers(rows, lambda row: f"{element.name} {row}")
-    row_sizes = np.array([len(row.split()) for row in rows], np.int64)
-    ends = np.cumsum(row_sizes)
-    at = ends - row_sizes
-    columns: dict[str, ndarray | _Lists] = {}
-    for item in element.properties:
-        values, is_sound = np.take(numbers, at, mode="clip"), at < ends
-        at = at + 1
-        if item.count is None:
-            with np.errstate(over="ignore"):  # A number beyond float32 becomes infinite and is refused.
-                columns[item.name] = values.astype(item.values)
-        else:
-            is_sound &= (values >= 0) & (values <= ends - at) & (values == np.floor(values))
-            sizes = np.where(is_sound, values, 0).astype(np.int64)
-            inside = np.arange(sizes.sum()) + np.repeat(at - np.cumsum(sizes) + sizes, sizes)
-            columns[item.name] = _Lists(sizes, numbers[inside])
-            at = at + sizes
-        # Only the rows before the first one that is not sound are read on, so that the time is linear.
-        sound_rows = first_true(~is_sound)
-        at, ends = at[:sound_rows], ends[:sound_rows]
-    row = first_true(np.append(at != ends, len(at) < len(rows)))
-    if row is not None:
-        found = f"found {shown(rows[row])}"
-        raise MalformedMeshError("damaged", f"{element.name} {row}", found, "the values that the header lists")
-    return columns
-
-
-def _binary_elements(elements: Sequence[_Element], body: bytes, order: str) -> dict[str, _Columns]:
-    """Return the values of each element; ``order`` is "<" or ">"."""
-    read: dict[str, _Columns] = {}
-    start = 0
-    for element in elements:
-        columns = _equal_rows(element, body, start, order) or _unequal_rows(element, body, start, order)
-        read[element.name], start = columns
-    if body[start:].strip(b"\r\n"):
-        found = f"damaged: {len(body) - start} bytes after the last row"
-        raise MalformedMeshError("damaged", "", found, "as many rows as in the header")
-    return read
-
-
-def _equal_rows(element: _Element, body: bytes, start: int, order: str) -> tuple[_Columns, int] | None:
-    """Return the values of an element and the position of its end, or None if its lists differ in length.
-
-    Raises ``MalformedMeshError`` before anything is allocated if the content is too short.
-    """
-    fields: list[Any] = []
-    for item in element.properties:
-        shape: tuple[int, ...] = ()
-        if item.count is not None:
-            position, count = start + np.dtype(fields).itemsize, np.dtype(order + item.count)
-            first = body[position : position + count.itemsize]
-            shape = (int.from_bytes(first, "little" if order == "<" else "big"),)
-            if shape[0] * np.dtype(item.values).itemsize > len(body):
-                return None
-            fields.append((f"{item.name} count", count))
-        fields.append((item.name, order + item.values, shape))
-    dtype = np.dtype(fields)
-    if start + element.count * dtype.itemsize > len(body):
-        if any(item.count for item in element.properties):
-            return None
-        raise _too_short(element)
-    rows = np.frombuffer(body, dtype, element.count, start)
-    columns: dict[str, ndarray | _Lists] = {}
-    for item in element.properties:
-        values = columns[item.name] = rows[item.name]
-        if item.count is not None:
-            if (rows[f"{item.name} count"] != values.shape[1]).any():
-                return None
-            columns[item.name] = _Lists(np.broadcast_to(values.shape[1], len(values)), values.ravel())
-    return columns, start + rows.nbytes
-
-
-def _unequal_rows(element: _Element, body: bytes, start: int, order: str) -> tuple[_Columns, int]:
-    """Return the values of an element with lists of different lengths, and the position of its end."""
-    sizes: list[list[int]] = [[] for _ in element.properties]
-    values: list[list[Any]] = [[] for _ in element.properties]
-    try:
-        for _ in range(element.count):
-            for number, item in enumerate(element.properties):
-                size = 1
-                if item.count is not None:
-                    [size] = struct.unpack_from(order + item.count, body, start)
-                    start += struct.calcsize(item.count)
-                form = f"{order}{size}{item.values}"
-                values[number] += struct.unpack_from(form, body, start)
-                start += struct.calcsize(form)
-                sizes[number].append(size)
-    except struct.error:  # The content ends, or a length is negative.
-        raise _too_short(element) from None
-    columns: dict[str, ndarray | _Lists] = {}
-    for item, item_sizes, item_values in zip(element.properties, sizes, values, strict=True):
-        array = columns[item.name] = np.array(item_values, item.values)
-        if item.count is not None:
-            columns[item.name] = _Lists(np.array(item_sizes, np.int64), array)
-    return columns, start
-
-
-def _too_short(element: _Element) -> MalformedMeshError:
-    found = f"truncated or damaged: the file ends within the {element.count} rows of {element.name}"
-    return MalformedMeshError("damaged", "", found, "as many rows as in the header")

@@ -358,7 +358,7 @@ def plane_sweep_depth(
             write_bytes(path, content.getvalue())
 
     names = list(reconstruction.cam_from_sfm)
-    list(map_in_threads(store_depth, names, "plane sweep", progress=progress))
+    list(map_in_threads(store_depth, names, len(names), "plane sweep", progress=progress))
 
     def read(name: str) -> Float32[ndarray, "h w"]:
         poses = reconstruction.cam_from_sfm

@@ -12,26 +12,20 @@
     # longest_side = 518            # or these two: the other side is the nearest multiple that keeps the ratio
     # multiple_of = 14
     resize = "pad"                  # keep the aspect ratio, centre, pad with the mean; or "stretch"
-    interpolation = "bilinear"      # optional; or "bicubic"
     range = 255                     # black is 0 and white is 1 or 255, before mean and std
     mean = [123.675, 116.28, 103.53]  # optional (default: 0), in units of range
     std = [58.395, 57.12, 57.375]     # optional (default: 1)
 
-    [output]
+    [output]                        # one map over the field of view of the input, of any size
     meaning = "canonical-depth"     # or depth, inverse-depth, canonical-inverse-depth; of relative networks
                                     # scale, affine-depth, affine-disparity
     focal_canonical_px = 1000       # only for canonical meanings
     scale = 1.0                     # optional: factor applied to the value first (0.001: millimetres)
-    min_m = 0.1                     # optional, as is max_m: depth outside becomes NaN (no prediction)
-    max_m = 300
-    name = "predicted_depth"        # or index = 0; required if the model has several outputs
-    at_input_size = true            # optional; false: another grid over the same field of view
-    resize = "nearest"              # optional; or "bilinear", which interpolates across the edges of bars
+    name = "predicted_depth"        # required if the model has several outputs
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -44,7 +38,6 @@ from rebar_depth_bench.base.limits import TOML_BYTES
 from rebar_depth_bench.base.reading import parse_toml, read_file
 from rebar_depth_bench.base.validation import (
     Expected,
-    Flag,
     StrictModel,
     Triple,
     field_error,
@@ -57,8 +50,6 @@ from rebar_depth_bench.base.validation import (
     whole_number,
 )
 from rebar_depth_bench.submission.declaration import MAX_METHOD_CHARACTERS, METRIC
-
-MAX_SIDE_PX = 8192
 
 
 @dataclass(frozen=True)
@@ -77,8 +68,8 @@ class OutputMeaning:
 
 
 OUTPUT_MEANINGS: Mapping[str, OutputMeaning] = {
-    "depth": OutputMeaning("planar depth, metres", False, False),
-    "inverse-depth": OutputMeaning("one over planar depth, 1/metres", True, False),
+    "depth": OutputMeaning("planar depth, metres"),
+    "inverse-depth": OutputMeaning("one over planar depth, 1/metres", True),
     "canonical-depth": OutputMeaning("depth as a camera of the canonical focal length would see it", False, True),
     "canonical-inverse-depth": OutputMeaning("one over that depth", True, True),
     "scale": OutputMeaning("planar depth up to a scale", prediction="scale"),
@@ -92,10 +83,7 @@ Metric3D (Yin et al., ICCV 2023, label transform). Depth Pro's canonical inverse
 with a canonical focal length equal to its input width: in 1/z = C W / f, W and f belong to the same image.
 """
 
-
-_Side = Annotated[int, whole_number(1, MAX_SIDE_PX)]
-_SIZE_KEYS = ("width", "height", "longest_side", "multiple_of")
-_Positive = Annotated[float, number(0)]
+_Side = Annotated[int, whole_number(1, 8192)]
 _FOCAL_PX = number(1, 100_000)
 _COLOUR = Expected("three numbers: red, green, blue")
 
@@ -112,26 +100,20 @@ class InputSpec(StrictModel):  # Order matters: validators read the fields above
     multiple_of: _Side | None = None
     longest_side: _Side | None = Field(default=None, validate_default=True)
     resize: Annotated[str, one_of("stretch", "pad")]
-    interpolation: Annotated[str, one_of("bilinear", "bicubic")] = "bilinear"
     range: Annotated[int, one_of(1, 255)]
     mean: Annotated[Triple, _COLOUR] = (0.0, 0.0, 0.0)
     std: Annotated[Triple, _COLOUR] = (1.0, 1.0, 1.0)
 
-    @property
-    def size_px(self) -> tuple[int, int] | None:
-        """Fixed size (width, height), or None if the size follows from ``longest_side`` and ``multiple_of``."""
-        return None if self.width is None or self.height is None else (self.width, self.height)
-
     @field_validator("longest_side")
     @classmethod
     def _check_size(cls, longest_px: int | None, info: ValidationInfo) -> int | None:
-        values = {**info.data, "longest_side": longest_px}
-        given = [key for key in _SIZE_KEYS if values.get(key) is not None]
-        all_valid = values.keys() >= set(_SIZE_KEYS)
-        if all_valid and given not in (["width", "height"], ["longest_side"], ["longest_side", "multiple_of"]):
+        sides = {key: info.data.get(key) for key in ("width", "height", "multiple_of")}
+        given = [key for key, value in {**sides, "longest_side": longest_px}.items() if value is not None]
+        allowed = (["width", "height"], ["longest_side"], ["multiple_of", "longest_side"])
+        if given not in allowed and info.data.keys() >= sides.keys():  # A side that is missing there is invalid.
             found = f"got {' and '.join(given)}" if given else "missing"
             raise field_error(found, "width and height, or longest_side", "conflict" if given[1:] else "missing")
-        if longest_px is not None and longest_px % (multiple_px := values.get("multiple_of") or 1):
+        if longest_px is not None and longest_px % (multiple_px := sides["multiple_of"] or 1):
             raise field_error(f"got {longest_px}", f"a multiple of multiple_of, {multiple_px}")
         return longest_px
 
@@ -149,18 +131,13 @@ class InputSpec(StrictModel):  # Order matters: validators read the fields above
 class OutputSpec(StrictModel):  # Order matters: validators read the fields above theirs.
     """Conversion of the model output to depth: the table ``[output]``.
 
-    ``scale`` is in metres per unit of a non-canonical output, ``min_m`` and ``max_m`` are in metres.
+    ``scale`` is in metres per unit of an output of the meaning depth.
     """
 
     meaning: Annotated[str, one_of(*OUTPUT_MEANINGS)]
     focal_canonical_px: Annotated[float, _FOCAL_PX] | None = Field(default=None, validate_default=True)
-    scale: _Positive = 1.0
-    max_m: _Positive = math.inf
-    min_m: _Positive = 0.0
+    scale: Annotated[float, number(0)] = 1.0
     name: Annotated[str, text(500)] | None = None
-    index: Annotated[int, whole_number(0, 999)] | None = None
-    at_input_size: Flag = True
-    resize: Annotated[str, one_of("nearest", "bilinear")] = "nearest"
 
     @field_validator("focal_canonical_px")
     @classmethod
@@ -171,28 +148,6 @@ class OutputSpec(StrictModel):  # Order matters: validators read the fields abov
                 raise field_error("missing", f'{_FOCAL_PX.text} for meaning "{meaning}"', "missing")
             raise field_error(f"got {focal_px:g}", f'none: meaning "{meaning}" does not use it', "conflict")
         return focal_px
-
-    @field_validator("min_m")
-    @classmethod
-    def _check_min_m(cls, min_m: float, info: ValidationInfo) -> float:
-        if min_m >= (max_m := info.data.get("max_m", math.inf)):
-            raise field_error(f"got {min_m:g}", f"less than max_m, {max_m:g}", "conflict")
-        return min_m
-
-    @field_validator("min_m", "max_m")
-    @classmethod
-    def _check_metric(cls, limit_m: float, info: ValidationInfo) -> float:
-        meaning = info.data.get("meaning")
-        if meaning is not None and OUTPUT_MEANINGS[meaning].prediction != METRIC:
-            raise field_error(f"got {limit_m:g}", f'none: meaning "{meaning}" has no metres', "conflict")
-        return limit_m
-
-    @field_validator("index")
-    @classmethod
-    def _check_index(cls, index: int | None, info: ValidationInfo) -> int | None:
-        if info.data.get("name") is not None:
-            raise field_error("got name and index", "one of them", "conflict")
-        return index
 
 
 class OnnxSpec(StrictModel):
@@ -211,9 +166,12 @@ class OnnxSpec(StrictModel):
     def _find_model(cls, name: str, info: ValidationInfo[Path]) -> str:
         """Return the path of the ONNX file; ``info.context`` is the folder of the TOML file."""
         path = info.context / name
-        if not is_file(path):
-            raise field_error(f"no such file: {path}", "the ONNX file", "missing")
-        return str(path)
+        try:
+            if path.is_file():
+                return str(path)
+        except OSError:  # The name is too long for the file system.
+            pass
+        raise field_error(f"no such file: {path}", "the ONNX file", "missing")
 
 
 def read_onnx_toml(path: Path) -> OnnxSpec:
@@ -228,11 +186,3 @@ def read_onnx_toml(path: Path) -> OnnxSpec:
     if spec is None:
         raise MethodError.from_problems(path, problems)
     return spec
-
-
-def is_file(path: Path) -> bool:
-    """Return whether ``path`` is a regular file or a link to one."""
-    try:
-        return path.is_file()
-    except OSError:  # The name is too long for the file system.
-        return False

@@ -27,10 +27,8 @@ The paper does not state its mode.
 from __future__ import annotations
 
 import importlib
-import sys
 from collections.abc import Mapping
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +39,7 @@ from numpy import ndarray
 from rebar_depth_bench.base.errors import MethodError, Problem, install_command
 from rebar_depth_bench.base.limits import TOML_BYTES
 from rebar_depth_bench.base.reading import read_file
+from rebar_depth_bench.base.terminal import print_notice
 from rebar_depth_bench.base.validation import short_repr
 from rebar_depth_bench.captures.documents import parse_document
 from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor
@@ -68,11 +67,6 @@ INSTALL_HINT = (
     f"Drive) into FoundationStereo/{WEIGHTS_FOLDER.parent}, install its requirements, and pass the clone as "
     f"{NAME}:FoundationStereo"
 )
-DOWNLOADS = (
-    "its code downloads what is not cached: DINOv2's code (https://github.com/facebookresearch/dinov2, even if "
-    "HF_HUB_OFFLINE is set), which is then executed, and timm's edgenext_small (from the Hub)"
-)
-ITERATIONS = 32
 SMALL_RATIO = 0.5
 """Size of the first of two passes, relative to the second."""
 NETWORK = Network(
@@ -106,101 +100,86 @@ def foundation_stereo_method(folder: Path | None, nearest_m: float | None = None
     """Return FoundationStereo from a clone of its repository, or with other weights in a folder inside a clone.
 
     ``nearest_m`` is the declared distance of the nearest surface, metres, which chooses the mode (see the module).
-    Raises ``MethodError`` if code, checkpoint or ``cfg.yaml`` is missing, and with install instructions if
-    ``folder`` is None, because the weights cannot be downloaded automatically.
+    Raises ``MethodError`` if code, checkpoint or ``cfg.yaml`` is missing or invalid, and with install instructions
+    if ``folder`` is None, because the weights cannot be downloaded automatically.
     """
     if folder is None:
-        raise MethodError(
-            f"{NAME}: its weights are on Google Drive and cannot be downloaded automatically; to install it: "
-            f"{INSTALL_HINT}"
-        )
+        found = "its weights are on Google Drive and cannot be downloaded automatically"
+        raise MethodError(f"{NAME}: {found}; to install it: {INSTALL_HINT}")
     weights = folder if (folder / CHECKPOINT_FILE).is_file() else folder / WEIGHTS_FOLDER
     start = folder.resolve()
     clone = next((candidate for candidate in (start, *start.parents) if (candidate / CODE_FILE).is_file()), None)
     if not folder.is_dir() or clone is None:
-        raise MethodError(
-            f"{NAME}:{folder}: no clone of FoundationStereo with {CODE_FILE}; to install it: {INSTALL_HINT}"
-        )
-    files = [weights / CHECKPOINT_FILE, weights / SETTINGS_FILE]
-    for file in files:
-        if not file.is_file():
-            raise MethodError(f"{NAME}:{folder}: no {file.name} in {weights}; to install it: {INSTALL_HINT}")
-    declared = "" if nearest_m is None else f", nearest distance {nearest_m} m"
-    info = replace(NETWORK.info, summary=f"{NETWORK.info.summary}{declared}")
-    info = replace(NETWORK, info=info).with_digest(weights.name, files)
-    return Method(info, partial(_load, clone, weights, nearest_m), partial(_notes, weights, nearest_m))
-
-
-def _load(clone: Path, weights: Path, nearest_m: float | None) -> Predictor:
-    """Return the predictor with the code of a clone and a folder of weights, on the GPU if torch finds one.
-
-    Raises ``MethodError`` if torch, OpenCV or a module that its code imports is missing, or if the weights are
-    incomplete.
-    """
-    torch = NETWORK.import_torch()
-    NETWORK.import_package("cv2", install_command("methods"))
-    settings = _read_settings(weights)
-    print(f"{NAME}: {DOWNLOADS}", file=sys.stderr, flush=True)
-    with NETWORK.errors(f"{weights} cannot be loaded"), on_sys_path(clone):
-        code = importlib.import_module("core.foundation_stereo")
-        if not Path(str(code.__file__)).resolve().is_relative_to(clone.resolve()):
-            raise MethodError(f"{NAME}: core is already imported from {code.__file__}, expected it from {clone}")
-        model = code.FoundationStereo(settings)
-        model = NETWORK.load_checkpoint(model, weights / CHECKPOINT_FILE, "model")
-
-    def match(rectified: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
-        is_hierarchical, scale = choose_passes(largest_disparity_px(rectified, nearest_m), settings.max_disp)
-        # The demo rounds to the nearest whole side; rounding down never enlarges the disparity.
-        pair = [
-            image_tensor(scaled_image(rectified[name], scale)).to(torch_device())
-            for name in ("left_rgb", "right_rgb")
-        ]
-        padder = code.InputPadder(pair[0].shape, divis_by=32, force_square=False)
-        with torch.autocast("cuda", enabled=torch.cuda.is_available()):
-            if is_hierarchical:  # Spelled so by its authors.
-                disparity_px = model.run_hierachical(
-                    *padder.pad(*pair), iters=ITERATIONS, test_mode=True, small_ratio=SMALL_RATIO
-                )
-            else:
-                disparity_px = model.forward(*padder.pad(*pair), iters=ITERATIONS, test_mode=True)
-        cropped_px = padder.unpad(disparity_px.float()).cpu().numpy().reshape(pair[0].shape[-2:])
-        return full_size_disparity_px(without_invisible(cropped_px), rectified["left_rgb"].shape[:2])
-
-    return NETWORK.predictor(partial(stereo_depth_m, match=match))
-
-
-def _read_settings(weights: Path) -> Settings:
-    """Return the network's settings. Raises ``MethodError`` if they or the end of its cost volume are invalid."""
+        found = f"no clone of FoundationStereo with {CODE_FILE}"
+        raise MethodError(f"{NAME}:{folder}: {found}; to install it: {INSTALL_HINT}")
+    for file in (CHECKPOINT_FILE, SETTINGS_FILE):
+        if not (weights / file).is_file():
+            raise MethodError(f"{NAME}:{folder}: no {file} in {weights}; to install it: {INSTALL_HINT}")
     path, problems = weights / SETTINGS_FILE, list[Problem]()
-    settings = Settings(
-        parse_document(path.name, read_file(path, TOML_BYTES, "a YAML file", MethodError), problems)
-    )
+    content = read_file(path, TOML_BYTES, "a YAML file", MethodError)
+    settings = Settings(parse_document(path.name, content, problems))
     if problems:
         raise MethodError.from_problems(path, problems)
     settings.setdefault("vit_size", "vitl")
     volume_px = settings.get("max_disp")
     if type(volume_px) is not int or volume_px <= 0:
-        raise MethodError(
-            f"{path}: max_disp is {short_repr(volume_px)}, expected the end of the cost volume, whole pixels"
+        expected = "expected the end of the cost volume, whole pixels"
+        raise MethodError(f"{path}: max_disp is {short_repr(volume_px)}, {expected}")
+    declared = "" if nearest_m is None else f", nearest distance {nearest_m} m"
+    name = f"{NAME}:{weights.resolve().name}"
+    info = replace(NETWORK.info, name=name, summary=f"{NETWORK.info.summary}{declared}")
+
+    def load() -> Predictor:
+        torch = NETWORK.import_package("torch", install_command("torch"))
+        NETWORK.import_package("cv2", install_command("methods"))
+        print_notice(
+            f"{NAME}: its code downloads what is not cached: DINOv2's code (https://github.com/facebookresearch/"
+            "dinov2, even if HF_HUB_OFFLINE is set), which is then executed, and timm's edgenext_small (from the "
+            "Hub)"
         )
-    return settings
+        with NETWORK.errors(f"{weights} cannot be loaded"), on_sys_path(clone):
+            code = importlib.import_module("core.foundation_stereo")
+            if not Path(str(code.__file__)).resolve().is_relative_to(clone):
+                raise MethodError(
+                    f"{NAME}: core is already imported from {code.__file__}, expected it from {clone}"
+                )
+            model = code.FoundationStereo(settings)
+            model = NETWORK.load_checkpoint(model, weights / CHECKPOINT_FILE, "model")
 
+        def match(rectified: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
+            is_hierarchical, scale = choose_passes(largest_disparity_px(rectified, nearest_m), volume_px)
+            # The demo rounds to the nearest whole side; rounding down never enlarges the disparity.
+            images = [scaled_image(rectified[name], scale) for name in ("left_rgb", "right_rgb")]
+            pair = [image_tensor(image).to(torch_device()) for image in images]
+            padder = code.InputPadder(pair[0].shape, divis_by=32, force_square=False)
+            options = {"iters": 32, "test_mode": True}
+            with torch.autocast("cuda", enabled=torch.cuda.is_available()):
+                if is_hierarchical:  # Spelled so by its authors.
+                    disparity_px = model.run_hierachical(*padder.pad(*pair), small_ratio=SMALL_RATIO, **options)
+                else:
+                    disparity_px = model.forward(*padder.pad(*pair), **options)
+            cropped_px = padder.unpad(disparity_px.float()).cpu().numpy().reshape(pair[0].shape[-2:])
+            return full_size_disparity_px(without_invisible(cropped_px), rectified["left_rgb"].shape[:2])
 
-def _notes(weights: Path, nearest_m: float | None, row: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the mode and scale for a row, with the numbers from which they are chosen."""
-    volume_px = _read_settings(weights).max_disp
-    largest_px = largest_disparity_px(rectified_row(row)[0], nearest_m)
-    is_hierarchical, scale = choose_passes(largest_px, volume_px)
-    declared = (
-        f"{SEARCH_SHARE_OF_WIDTH:g} of the width" if nearest_m is None else f"nearest distance {nearest_m} m"
-    )
-    return {
-        "mode": "hierarchical" if is_hierarchical else "single pass",
-        "scale": round(scale, 4),
-        "largest_disparity_px": round(largest_px, 1),
-        "largest_disparity_from": declared,
-        "cost_volume_px": volume_px,
-    }
+        def predict(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
+            with NETWORK.errors("inference failed"), torch.inference_mode():
+                return stereo_depth_m(row, match)
+
+        return predict
+
+    def notes(row: Mapping[str, Any]) -> dict[str, Any]:
+        largest_px = largest_disparity_px(rectified_row(row)[0], nearest_m)
+        is_hierarchical, scale = choose_passes(largest_px, volume_px)
+        from_width = f"{SEARCH_SHARE_OF_WIDTH:g} of the width"
+        return {
+            "mode": "hierarchical" if is_hierarchical else "single pass",
+            "scale": round(scale, 4),
+            "largest_disparity_px": round(largest_px, 1),
+            "largest_disparity_from": from_width if nearest_m is None else f"nearest distance {nearest_m} m",
+            "cost_volume_px": volume_px,
+        }
+
+    return Method(info, load, notes)
 
 
 def choose_passes(largest_px: float, volume_px: int) -> tuple[bool, float]:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import importlib
 import sys
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, redirect_stdout
 from dataclasses import dataclass, replace
 from importlib.util import find_spec
@@ -18,14 +18,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jaxtyping import Float, Float32, Num, UInt8
+from jaxtyping import Float, Num, UInt8
 from numpy import ndarray
 
-from rebar_depth_bench.base.errors import MethodError, Problem, exception_summary, install_command, library_message
+from rebar_depth_bench.base.errors import MethodError, Problem, exception_summary, library_message
 from rebar_depth_bench.base.limits import JSON_BYTES
 from rebar_depth_bench.base.reading import parse_json, read_file
 from rebar_depth_bench.base.validation import short_repr
-from rebar_depth_bench.methods.base import Method, MethodInfo, Predictor, WeightsMethod, files_digest
+from rebar_depth_bench.methods.base import Method, MethodInfo, WeightsMethod
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -43,37 +43,54 @@ class Network:
     info: MethodInfo
     install: str
 
-    def described(self, addition: str) -> MethodInfo:
-        """Return the description with an addition to its summary."""
-        return replace(self.info, summary=f"{self.info.summary}; {addition}")
-
-    def listed(self, with_weights: Callable[[Path | None], Method], addition: str) -> WeightsMethod:
+    def listed(self, method: Callable[[Path | None], Method], addition: str) -> WeightsMethod:
         """Return the method for listings, with ``addition`` to its summary; nothing is looked up for it."""
-        return WeightsMethod(
-            self.described(addition), lambda: with_weights(None).load(), with_weights=with_weights
-        )
-
-    def with_digest(self, label: str, files: Sequence[Path]) -> MethodInfo:
-        """Return the description with ``label`` in the name and the digest of the weights in the summary.
-
-        Different weights are thus a different method, and an interrupted prediction is not resumed with them.
-        Raises ``MethodError`` if a file cannot be read.
-        """
-        info = self.described(f"weights sha256:{files_digest(files)}")
-        return replace(info, name=f"{info.name}:{label}")
+        info = replace(self.info, summary=f"{self.info.summary}; {addition}")
+        return WeightsMethod(info, lambda: method(None).load(), with_weights=method)
 
     def check_folder(self, folder: Path, *required_files: str) -> None:
         """Raise ``MethodError`` unless a folder contains these files."""
-        expected = " and ".join(required_files)
-        if not folder.is_dir():
-            raise MethodError(f"{self.info.name}:{folder}: no such folder, expected one with {expected}")
-        for file in required_files:
-            if not (folder / file).is_file():
-                raise MethodError(f"{self.info.name}:{folder}: no {file} in it, expected {expected}")
+        if missing := [file for file in required_files if not (folder / file).is_file()]:
+            found = f"no {missing[0]} in it" if folder.is_dir() else "no such folder"
+            raise MethodError(f"{self.info.name}:{folder}: {found}, expected {' and '.join(required_files)}")
 
-    def import_torch(self) -> Any:
-        """Import and return torch. Raises ``MethodError`` if it is missing."""
-        return self.import_package("torch", install_command("torch"))
+    def find_weights(
+        self, folder: Path | None, repository: str, package: str, keys: Sequence[str], variant: str
+    ) -> tuple[MethodInfo, Path]:
+        """Return the description with the given weights, and the folder of their ``config.json``.
+
+        It is that of the user, or for None a snapshot of a repository of the Hub with at least this file.
+        ``variant`` is the value that it must have under ``keys``, which are nested: the paper's network. Raises
+        ``MethodError`` if files are missing or belong to another network, if the download fails, or for None, if
+        the package is missing.
+        """
+        if folder is None:
+            if find_spec(package) is None:  # Nothing is downloaded in vain.
+                raise MethodError(f"{self.info.name} needs {package}, which is not installed: {self.install}")
+            found = snapshot(repository, CONFIG, local_copy_hint(self.info.name, repository))
+            info = replace(self.info, summary=f"{self.info.summary}; weights commit {found.name}")
+        else:
+            found = folder
+            self.check_folder(folder, CONFIG, WEIGHTS)
+            info = replace(self.info, name=f"{self.info.name}:{folder.resolve().name}")
+        value: Any = read_json_object(found / CONFIG)
+        for key in keys:
+            value = value.get(key) if isinstance(value, dict) else None
+        if value != variant:
+            wrong = f"{'.'.join(keys)} in {CONFIG} is {short_repr(value)}"
+            raise MethodError(f"{self.info.name}:{found}: {wrong}, expected {variant!r}, the paper's network")
+        return info, found
+
+    def load_pretrained(self, network_class: Any, folder: Path, repository: str) -> Any:
+        """Return the model of a class with the weights in a folder; a snapshot without them is completed."""
+        from safetensors import safe_open
+
+        if not (folder / WEIGHTS).is_file():
+            snapshot(repository, WEIGHTS, local_copy_hint(self.info.name, repository), revision=folder.name)
+        with self.errors(f"{folder.name} cannot be loaded"):
+            model = network_class.from_pretrained(str(folder), local_files_only=True)
+            with safe_open(folder / WEIGHTS, framework="pt") as tensors:
+                return self.with_loaded_weights(model, tensors.keys())
 
     def import_package(self, module: str, install: str) -> Any:
         """Import and return a module.
@@ -133,86 +150,11 @@ class Network:
         model.load_state_dict(weights, strict=strict)
         return self.with_loaded_weights(model, weights)
 
-    def predictor(self, infer: Callable[[Mapping[str, Any]], Float32[ndarray, "h w"]]) -> Predictor:
-        """Return ``infer``, which runs the network on a row, without gradients and with translated errors."""
-        import torch
-
-        def predict(row: Mapping[str, Any]) -> Float32[ndarray, "h w"]:
-            with self.errors("inference failed"), torch.inference_mode():
-                return infer(row)
-
-        return predict
-
     def check_shape(self, shape: Sequence[int], expected: Sequence[int]) -> None:
         """Raise ``MethodError`` unless the network's depth has the shape ``expected``."""
         if tuple(shape) != tuple(expected):
             found = f"the network returned depth of shape {tuple(shape)}"
             raise MethodError(f"{self.info.name}: {found}, expected {tuple(expected)}")
-
-
-@dataclass(frozen=True)
-class HubNetwork(Network):
-    """Network whose class (``class_name`` in ``module`` of an installed package) loads weights from the Hub.
-
-    ``variant`` is the value that ``config.json`` must have under ``variant_keys``, which are nested: the paper's
-    network. ``infer(model, row)`` returns its depth.
-    """
-
-    repository: str
-    module: str
-    class_name: str
-    variant_keys: tuple[str, ...]
-    variant: str
-    infer: Callable[[Any, Mapping[str, Any]], Float32[ndarray, "h w"]]
-
-    def with_weights(self, folder: Path | None) -> Method:
-        """Return the method with weights from a folder, whose digest is in its summary; None: from the Hub.
-
-        Weights from the Hub are downloaded when the method is loaded; only ``config.json`` is downloaded here, if
-        it is not cached, because it is needed to determine the commit, which is in the summary.
-
-        Raises ``MethodError`` if files or the package are missing, if the weights belong to another network, or
-        if the download fails.
-        """
-        name, package = self.info.name, self.module.partition(".")[0]
-        if folder is not None:
-            self.check_folder(folder, CONFIG, WEIGHTS)
-            self._check_variant(folder)
-            info = self.with_digest(folder.resolve().name, [folder / CONFIG, folder / WEIGHTS])
-            return Method(info, lambda: self._load(folder))
-        if find_spec(package) is None:  # Checked first, so that nothing is downloaded in vain.
-            raise MethodError(f"{name} needs {package}, which is not installed: {self.install}")
-        local_hint = local_copy_hint(name, self.repository)
-        cached = snapshot(self.repository, CONFIG, local_hint)
-        self._check_variant(cached)
-        info = self.described(f"weights commit {cached.name}")
-        return Method(info, lambda: self._load(snapshot(self.repository, WEIGHTS, local_hint, cached.name)))
-
-    def _load(self, folder: Path) -> Predictor:
-        """Return the predictor with the weights of a folder.
-
-        Raises ``MethodError`` if torch or the package is missing, or if the weights are incomplete.
-        """
-        from safetensors import safe_open
-
-        self.import_torch()
-        package = self.import_package(self.module, self.install)
-        with self.errors(f"{folder.name} cannot be loaded"):
-            model = getattr(package, self.class_name).from_pretrained(str(folder), local_files_only=True)
-            with safe_open(folder / WEIGHTS, framework="pt") as tensors:
-                model = self.with_loaded_weights(model, tensors.keys())
-        return self.predictor(lambda row: self.infer(model, row))
-
-    def _check_variant(self, folder: Path) -> None:
-        """Raise ``MethodError`` if ``config.json`` in a folder belongs to another network."""
-        value: Any = read_json_object(folder / CONFIG)
-        for key in self.variant_keys:
-            value = value.get(key) if isinstance(value, dict) else None
-        if value != self.variant:
-            found = f"{'.'.join(self.variant_keys)} in {CONFIG} is {short_repr(value)}"
-            raise MethodError(
-                f"{self.info.name}:{folder}: {found}, expected {self.variant!r}, the paper's network"
-            )
 
 
 def _describe(error: Exception, install: str) -> str:
@@ -260,19 +202,9 @@ def scaled_image(rgb: UInt8[ndarray, "h w 3"], scale: float) -> UInt8[ndarray, "
     return np.asarray(cv2.resize(rgb, (width, height), interpolation=cv2.INTER_LINEAR), np.uint8)
 
 
-def resampled(values: Float[Tensor, "h w"], grid: tuple[int, int], mode: str) -> Float[Tensor, "H W"]:
-    """Return values resampled to another grid over the same field of view (``align_corners=False``).
-
-    ``mode`` is the interpolation mode of torch.
-    """
-    from torch.nn import functional
-
-    return functional.interpolate(values[None, None], size=grid, mode=mode, align_corners=False)[0, 0]
-
-
-def read_json_object(path: Path) -> dict[str, Any]:
+def read_json_object(path: Path, expected: str = "a JSON file") -> dict[str, Any]:
     """Return the content of a model's JSON file. Raises ``MethodError`` if it cannot be read or is no object."""
-    value, problems = parse_json(read_file(path, JSON_BYTES, "a JSON file", MethodError))
+    value, problems = parse_json(read_file(path, JSON_BYTES, expected, MethodError))
     if not problems and not isinstance(value, dict):
         problems = [Problem("invalid", "", f"got {short_repr(value)}", "a JSON object")]
     if problems:

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import os
+import pickle
 import resource
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Sequence
 
 import pytest
 
-from rebar_depth_bench.base.errors import InputError
-from rebar_depth_bench.base.parallel import map_in_threads, silent
+from rebar_depth_bench.base.errors import EntryError, InputError, Problem
+from rebar_depth_bench.base.parallel import map_in_threads
 from tests.processes import is_running, wait_until
 
 
-def mapped(work: Callable[[int], int], items: Iterable[int], workers: int | None) -> list[int]:
-    return map_with_progress(work, items, workers, silent, "", 0)
+def mapped(work: Callable[[int], int], items: Sequence[int], workers: int | None) -> list[int]:
+    return list(map_in_threads(work, items, len(items), "t", workers=workers))
 
 
 @pytest.mark.parametrize("workers", [None, 1, 3])
@@ -28,39 +29,33 @@ def test_results_are_in_input_order(workers: int | None) -> None:
 
 
 def test_look_ahead_is_two_items_per_thread() -> None:
-    taken = 0
-
-    def items() -> Iterator[int]:
-        nonlocal taken
-        while taken < 100:
-            taken += 1
-            yield taken
-
+    taken: list[int] = []
     steps: list[tuple[str, int, int]] = []
 
     def progress(task: str, done: int, total: int) -> None:
-        assert taken <= done + 3
+        assert len(taken) <= done + 3
         steps.append((task, done, total))
 
-    map_with_progress(lambda n: n, items(), 2, progress, "t", 100)
+    for _ in map_in_threads(taken.append, range(100), 100, "t", workers=2, progress=progress):
+        time.sleep(0.001)  # The threads could take more items meanwhile.
     assert steps == [("t", done, 100) for done in range(1, 101)]
 
 
-def test_exceptions_of_function_and_iterator_propagate() -> None:
+def test_exceptions_of_the_function_propagate() -> None:
     with pytest.raises(ZeroDivisionError):
         mapped(lambda n: 1 // n, [1, 0, 2], 2)
-
-    def items() -> Iterator[int]:
-        yield 1
-        raise KeyError("from items")
-
-    with pytest.raises(KeyError, match="from items"):
-        mapped(lambda n: n, items(), 2)
 
 
 def test_zero_workers_raises_input_error() -> None:
     with pytest.raises(InputError, match="workers is 0, expected 1 or more"):
         mapped(lambda n: n, [1], 0)
+
+
+def test_error_of_an_entry_arrives_from_another_process() -> None:
+    error = EntryError(Problem("size", "lattice/0000", "4 bytes follow", "none"))
+    received = pickle.loads(pickle.dumps(error))
+    assert str(received) == "lattice/0000: 4 bytes follow, expected none"
+    assert received.problems == error.problems
 
 
 LIMIT = "import os, sys, time; from rebar_depth_bench.base.system import limit_process; "

@@ -10,13 +10,11 @@ from pathlib import Path
 import rebar_depth_bench as rdb
 
 HIDE = """
-import asyncio, mmap, os, sys  # On POSIX systems, asyncio needs sysconf when it is imported.
+import asyncio, os, sys  # On POSIX systems, asyncio needs sysconf when it is imported.
 for name in ("fcntl", "resource"):
     sys.modules[name] = None
 for name in ("O_NONBLOCK", "O_NOCTTY", "O_CLOEXEC", "O_DIRECTORY", "pread", "sched_getaffinity", "sysconf"):
     vars(os).pop(name, None)
-for name in ("MAP_SHARED", "MAP_POPULATE", "PROT_READ"):
-    vars(mmap).pop(name, None)
 os.process_cpu_count = os.cpu_count  # Python 3.13 defines it so where there is no sched_getaffinity.
 """
 RUN = """

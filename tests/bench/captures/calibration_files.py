@@ -1,8 +1,7 @@
-"""Calibrations of one stereo pair as OpenCV, ROS and Kalibr write them, and the same in ``calibration.toml``."""
+"""Calibrations of one stereo pair as OpenCV and ROS write them, and the same in ``calibration.toml``."""
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import cv2
@@ -33,16 +32,6 @@ distortion = {RIGHT_D.tolist()}
 rotation = {ROTATION_RAD.tolist()}
 translation_m = {TRANSLATION_M.tolist()}
 """
-CALIB_TXT = f"""\
-cam0=[534.07 0 341.53; 0 534.07 232.94; 0 0 1]
-cam1=[534.07 0 346.53; 0 534.07 232.94; 0 0 1]
-doffs=5
-baseline=120.5
-width={WIDTH}
-height={HEIGHT}
-ndisp=64
-"""
-"""File of a rectified pair as in the Middlebury and ETH3D data sets."""
 
 
 def expected_calibration(folder: Path, width: int = WIDTH, height: int = HEIGHT) -> StereoCalibration:
@@ -133,19 +122,3 @@ def aliased_text() -> str:
     K, D = LEFT_K.tolist(), LEFT_D.tolist()
     pair = {"K1": K, "K2": K, "D1": D, "D2": D, "R": ROTATION.tolist(), "T": TRANSLATION_M.tolist()}
     return str(yaml.dump(pair))
-
-
-def kalibr_text() -> str:
-    """Return the camera chain that Kalibr writes; radtan has four terms, so k3 is 0."""
-    motion = np.eye(4)
-    motion[:3, :3], motion[:3, 3] = ROTATION, TRANSLATION_M
-    text = ""
-    for name, K, D in (("cam0", LEFT_K, LEFT_D), ("cam1", RIGHT_K, RIGHT_D)):
-        text += f"{name}:\n"
-        if name == "cam1":
-            text += "  T_cn_cnm1:\n" + "".join(f"  - {json.dumps(row)}\n" for row in motion.tolist())
-        text += f"  cam_overlaps: [{1 if name == 'cam0' else 0}]\n  camera_model: pinhole\n"
-        text += f"  distortion_coeffs: {json.dumps(D[:4].tolist())}\n  distortion_model: radtan\n"
-        text += f"  intrinsics: {[K[0, 0], K[1, 1], K[0, 2], K[1, 2]]}\n"
-        text += f"  resolution: [{WIDTH}, {HEIGHT}]\n  rostopic: /{name}/image_raw\n"
-    return text

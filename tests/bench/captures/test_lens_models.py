@@ -1,7 +1,7 @@
 """Lens models beyond k1 k2 p1 p2 k3, which are refused in every format with one remedy, and what stays accepted.
 
 Terms are in OpenCV's order: k1 k2 p1 p2 k3 k4 k5 k6 s1 s2 s3 s4 tau_x tau_y. Names are those of ROS' distortion
-models (image_geometry), Kalibr's wiki, OpenCV's tutorial (fisheye_model), omnidir sample (xi) and camodocal.
+models (image_geometry), OpenCV's tutorial (fisheye_model), omnidir sample (xi) and camodocal.
 """
 
 from __future__ import annotations
@@ -49,12 +49,6 @@ def message(model: str, terms: list[float], name: str = "camera_info.yaml") -> d
     }
 
 
-def kalibr(camera_model: str, distortion_model: str, terms: list[float] | None = None) -> dict[str, str]:
-    text = files.kalibr_text().partition("cam1:")[0].replace("pinhole", camera_model)
-    text = text.replace("radtan", distortion_model)
-    return {"chain.yaml": text if terms is None else text.replace(str(files.LEFT_D[:4].tolist()), str(terms))}
-
-
 def read(folder: Path, contents: dict[str, str]) -> Any:
     for name, text in contents.items():
         (folder / name).write_text(text)
@@ -77,11 +71,6 @@ def read(folder: Path, contents: dict[str, str]) -> Any:
         (message("thin_prism", FIVE), "distortion_model is 'thin_prism'"),
         (message("modified_brown_conrady", FIVE), "distortion_model is 'modified_brown_conrady'"),
         (message("plumb_bob", FIVE[:3]), "the distortion has 3 terms"),
-        (kalibr("pinhole", "equidistant"), "distortion_model is 'equidistant'"),
-        (kalibr("pinhole", "fov", [0.9]), "distortion_model is 'fov'"),
-        (kalibr("omni", "radtan"), "camera_model is 'omni'"),
-        (kalibr("ds", "none", []), "camera_model is 'ds'"),
-        (kalibr("eucm", "none", []), "camera_model is 'eucm'"),
         (opencv(dist_coeffs=FOUR, model="fisheye"), "model is 'fisheye'"),
         (opencv(camera_model="equidistant"), "camera_model is 'equidistant'"),
         (opencv(camera_model="KANNALA_BRANDT"), "camera_model is 'KANNALA_BRANDT'"),
@@ -121,8 +110,6 @@ def test_other_lens_is_refused_with_one_remedy(contents: dict[str, str], found: 
         (message("rational_polynomial", [0.0] * 8), [0.0] * 5),
         (message("", FIVE), FIVE),
         (message("none", []), [0.0] * 5),
-        (kalibr("pinhole", "radtan"), [*files.LEFT_D[:4], 0.0]),
-        (kalibr("pinhole", "none", []), [0.0] * 5),
         (opencv(dist_coeffs=[FIVE]), FIVE),
         (opencv(dist_coeffs=[*FIVE, *[0.0] * 9]), FIVE),
         (opencv(dist_coeffs=[0.0] * 4), [0.0] * 5),
@@ -138,9 +125,7 @@ def test_terms_that_agree_with_the_model_are_read(contents: dict[str, str], term
     assert read(tmp_path, contents).left.distortion == tuple(terms)
 
 
-@pytest.mark.parametrize(
-    "contents", [opencv(dist_coeffs=FOUR), stored(D1=FOUR), message("", FOUR), kalibr("pinhole", "")]
-)
+@pytest.mark.parametrize("contents", [opencv(dist_coeffs=FOUR), stored(D1=FOUR), message("", FOUR)])
 def test_four_terms_without_a_model_may_be_those_of_a_fisheye_lens(
     contents: dict[str, str], tmp_path: Path
 ) -> None:

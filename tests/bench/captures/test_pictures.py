@@ -170,9 +170,7 @@ def test_the_one_stereolabs_file_of_a_capture_has_any_name(tmp_path: Path) -> No
     (root / "calibration.conf").rename(root / "SN12345678.conf")
     assert open_capture(root).calibration == expected
     (root / "SN1.CONF").write_text("")
-    with pytest.raises(
-        InputError, match=r"calibration files are SN1\.CONF, SN12345678\.conf, expected .* one \*\.conf"
-    ):
+    with pytest.raises(InputError, match=r"calibration files are SN1\.CONF, SN12345678\.conf, expected"):
         open_capture(root)
     (root / "SN1.CONF").rename(root / "stereo.yaml")
     with pytest.raises(InputError, match=r"calibration files are SN12345678\.conf, stereo\.yaml, expected"):

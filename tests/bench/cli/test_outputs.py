@@ -137,7 +137,6 @@ def test_json_or_csv_on_standard_output_replaces_the_table(
         ["--json", "-", "--csv", "/dev/stdout"],
         ["--html", "-"],
         ["--extended-csv", "-"],
-        ["--json", "/dev/fd/987"],
         ["--json", "loop"],
     ],
 )
@@ -195,16 +194,6 @@ def test_named_pipes_are_written_through(pipe: tuple[Path, Callable[[], bytes]],
             writer.add("lattice/0000", np.ones((3, 4), np.float32))
     assert received() == (tmp_path / "file.zip").read_bytes()
     assert path.is_fifo()
-
-
-def test_open_descriptors_are_written_where_they_stand(tmp_path: Path) -> None:
-    target = tmp_path / "file"
-    with target.open("wb", buffering=0) as stream:
-        stream.write(b"before ")
-        (tmp_path / "link").symlink_to(f"/dev/fd/{stream.fileno()}")
-        write_output(tmp_path / "link", "zß")
-        stream.write(b" after")
-    assert target.read_bytes() == "before zß after".encode()
 
 
 def test_devices_stay_devices(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Terminals: plain replacements where they are not UTF-8, and progress with rate and remaining time."""
+"""Terminals that are not UTF-8 or closed, and progress with rate and remaining time."""
 
 from __future__ import annotations
 
@@ -10,32 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from rebar_depth_bench.base.terminal import (
-    MAX_SILENCE_S,
-    ProgressBars,
-    Rate,
-    duration_text,
-    plain_characters,
-    prepare_terminal,
-)
+from rebar_depth_bench.base.terminal import MAX_SILENCE_S, ProgressBars, prepare_terminal
 from rebar_depth_bench.cli.main import main
 from tests.commands import run_in_process
-
-
-@pytest.mark.parametrize(
-    ("text", "plain"),
-    [
-        ("AbsRel ↓, % ↑", "AbsRel v, % ^"),
-        ("0.1 → 0.2", "0.1 > 0.2"),
-        ("−0.5 ± 0.1 × 3", "-0.5 +- 0.1 x 3"),
-        ("pier †, 8 – 17 m …", "pier +, 8 - 17 m ..."),
-        ("Säule № 1, δ1 < 1.25²", "Saule No 1, d1 < 1.252"),
-        ("鉄 \udcff", "? ?"),
-    ],
-)
-def test_characters_have_plain_replacements(text: str, plain: str) -> None:
-    assert plain_characters(text) == plain
-
 
 SIGNS = "\N{DOWNWARDS ARROW} \N{MINUS SIGN}\N{PLUS-MINUS SIGN}\N{DAGGER}\N{MULTIPLICATION SIGN}"
 
@@ -43,9 +20,8 @@ SIGNS = "\N{DOWNWARDS ARROW} \N{MINUS SIGN}\N{PLUS-MINUS SIGN}\N{DAGGER}\N{MULTI
 @pytest.mark.parametrize(
     ("encoding", "shown"),
     [
-        ("ascii", "v -+-+x"),
-        ("cp1252", "v -\N{PLUS-MINUS SIGN}\N{DAGGER}\N{MULTIPLICATION SIGN}"),
-        ("latin-1", "v -\N{PLUS-MINUS SIGN}+\N{MULTIPLICATION SIGN}"),
+        ("ascii", "? ????"),
+        ("cp1252", "? ?\N{PLUS-MINUS SIGN}\N{DAGGER}\N{MULTIPLICATION SIGN}"),
         ("utf-8", SIGNS),
     ],
 )
@@ -143,7 +119,7 @@ def test_closed_streams_lose_no_file(
 def test_closed_standard_output_is_no_file(scored: list[str | Path]) -> None:
     finished = in_shell(">&-", *scored, "--json", "-")
     assert finished.returncode == 2
-    assert "descriptor 1 is not open" in finished.stderr
+    assert "standard output is closed" in finished.stderr
 
 
 @pytest.mark.parametrize(
@@ -168,32 +144,6 @@ def test_removed_current_folder_is_named(module: str, words: list[str], tmp_path
     assert "Traceback" not in finished.stderr
 
 
-@pytest.mark.parametrize(
-    ("seconds", "text"),
-    [
-        (0, "0 s"),
-        (59.4, "59 s"),
-        (59.6, "1 min 0 s"),
-        (119.6, "2 min 0 s"),
-        (599.4, "9 min 59 s"),
-        (600, "10 min"),
-        (3599, "1 h 0 min"),
-        (3 * 3600 + 100, "3 h 2 min"),
-        (90 * 3600, "90 h 0 min"),
-    ],
-)
-def test_durations_have_two_units(seconds: float, text: str) -> None:
-    assert duration_text(seconds) == text
-
-
-def test_rate_counts_pictures_and_extrapolates() -> None:
-    rate = Rate("pictures", 2)
-    assert rate.text(steps=10, remaining=30, seconds=100) == "12 pictures/min, 5 min 0 s left"
-    assert rate.text(steps=1, remaining=0, seconds=30) == "4 pictures/min, 0 s left"
-    assert rate.text(steps=0, remaining=30, seconds=100) == ""
-    assert rate.text(steps=1, remaining=30, seconds=0) == ""
-
-
 class Clock:
     """Clock that a test sets."""
 
@@ -212,7 +162,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
 
 
 def lines_of(clock: Clock, capsys: pytest.CaptureFixture[str], updates: list[tuple[float, int]]) -> list[str]:
-    with ProgressBars(Rate("pictures", 2)) as bars:
+    with ProgressBars(pictures_per_step=2) as bars:
         for seconds, done in updates:
             clock.seconds += seconds
             bars.update("pile", done, 504)
@@ -221,7 +171,7 @@ def lines_of(clock: Clock, capsys: pytest.CaptureFixture[str], updates: list[tup
 
 def test_log_has_the_rate_since_the_build_was_resumed(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
     lines = lines_of(clock, capsys, [(0, 250), (30, 251), (30, 252), (30, 253)])
-    assert lines == ["pile: 250 of 504", "pile: 252 of 504, 4 pictures/min, 2 h 6 min left"]
+    assert lines == ["pile: 250 of 504", "pile: 252 of 504, 4 pictures/min, 2:06:00 left"]
 
 
 def test_log_is_short_but_never_silent_for_long(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:

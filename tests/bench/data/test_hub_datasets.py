@@ -18,7 +18,7 @@ from starlette.responses import Response
 import rebar_depth_bench as rdb
 from rebar_depth_bench.base.errors import MethodError
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.methods.transformers import find_checkpoint
+from rebar_depth_bench.methods.transformers import hf_method
 from tests.hub_server import HubServer, folder_files, running_hub
 
 REVISIONS = ("main", "v1.0", "refs/pr/1")
@@ -117,7 +117,7 @@ def test_hub_without_answer_is_asked_once(hub: HubServer, monkeypatch: pytest.Mo
     with pytest.raises(rdb.DatasetError, match=r"^org/data: not a local folder, .* from the Hub: .*503"):
         open_folder("org/data")
     with pytest.raises(MethodError, match=r"cannot be downloaded from .*503"):
-        find_checkpoint("org/model")
+        hf_method("org/model")
     asked = [request.path for request in hub.requests if "/resolve/" in request.path]
     assert asked == ["/datasets/org/data/resolve/main/manifest.json", "/org/model/resolve/main/config.json"]
 
@@ -147,7 +147,7 @@ def test_missing_folder_in_a_folder_is_not_asked_at_the_hub(
         with pytest.raises(rdb.DatasetError, match=f"^{root}: no such folder, .* Hub .* folder org exists here"):
             open_folder(root)
     with pytest.raises(MethodError, match=r"^org/model: .*, or ORG/NAME where there is no folder ORG"):
-        find_checkpoint("org/model")
+        hf_method("org/model")
     assert not [request for request in hub.requests if "/resolve/" in request.path]
 
 

@@ -53,10 +53,10 @@ def test_survey_is_a_trajectory(manifest: Any, tmp_path: Path) -> None:
     survey(scene_of(manifest["configs"]["lattice"]))
     (tmp_path / "manifest.json").write_text(json.dumps(manifest))
     config = open_folder(tmp_path).config("lattice")
-    assert isinstance(config.scene.protocol, Survey)
-    assert (config.scene.protocol.views, config.scene.protocol.distances_m) == (504, (0.5, 1.0))
+    assert isinstance(config.scene.trajectory, Survey)
+    assert (config.scene.trajectory.views, config.scene.trajectory.distances_m) == (504, (0.5, 1.0))
     assert published_match(config) is None
-    assert isinstance(open_folder(tmp_path).config("lattice-orbit").scene.protocol, Trajectory)
+    assert isinstance(open_folder(tmp_path).config("lattice-orbit").scene.trajectory, Trajectory)
 
 
 def test_problems_of_head_and_all_configs_are_listed(manifest: Any, tmp_path: Path) -> None:
@@ -92,7 +92,7 @@ def test_board_is_read_from_manifest(manifest: Any, tmp_path: Path) -> None:
 
 def test_reference_errors_may_be_zero_but_not_negative() -> None:
     zero = {"abs_rel": 0.0, "rmse_cm": 0.0}
-    assert References.model_validate({"constant": zero, "one_pixel": zero})["constant.abs_rel"] == 0.0
+    assert References.model_validate({"constant": zero, "one_pixel": zero}).constant.abs_rel == 0.0
     with pytest.raises(ValidationError):
         References.model_validate({"constant": {**zero, "rmse_cm": -1.0}, "one_pixel": zero})
 

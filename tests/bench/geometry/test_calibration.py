@@ -193,8 +193,8 @@ INVALID_CONF = [
     ("CV_HD=0.006", "CV_VGA=0.006", "missing STEREO.CV", "expected a number from -0.5 to 0.5 radians"),
     ("RX_HD=-0.001", "RX_HD=-5", "invalid STEREO.RX_HD", ""),
     ("TY=0.25", "TY=1e6", "invalid STEREO.TY", "millimetres"),
-    ("[LEFT_CAM_HD]\n", "", "syntax ", "line 1 is 'fx=700.5', expected a [SECTION]"),
-    ("fx=700.5", "fx 700.5 ", "syntax ", "line 2 is 'fx 700.5', expected [SECTION] or key = value"),
+    ("[LEFT_CAM_HD]\n", "", "syntax ", "line 1 is 'fx=700.5', expected [SECTION], or key = value"),
+    ("fx=700.5", "fx 700.5 ", "syntax ", "line 2 is 'fx 700.5', expected [SECTION], or key = value"),
     ("TY=0.25", "TY=-100", "conflict stereo", "at (0.1205, -0.1, -0.00075) m from the left one"),
     ("k1=-0.17", "k1=-0.9", "conflict left", FOLDS_BACK),
     ("k2=0.02", "k2=-30", "conflict right", FOLDS_BACK),
@@ -265,18 +265,12 @@ def test_impossible_image_size_is_rejected(tmp_path: Path, name: str, text: str,
     assert locations(caught.value.problems) == [("invalid", "")]
 
 
-def test_all_problems_are_reported_at_once(tmp_path: Path) -> None:
-    text = CONF.replace("fx=700.5", "fx=x").replace("fy=703.5\n", "").replace("Baseline=120.5", "Baseline=0")
-    assert locations(reported_problems(tmp_path, text)) == [
-        ("invalid", "LEFT_CAM_HD.fx"),
-        ("missing", "RIGHT_CAM_HD.fy"),
-        ("invalid", "STEREO.Baseline"),
-    ]
+def test_all_problems_of_a_table_are_reported_at_once(tmp_path: Path) -> None:
     text = TOML.replace("height = 720", "height = 7").replace("fx = 700.5", "fx = 0").replace("[0, 0, 1]", "[0]")
     assert locations(reported_problems(tmp_path, text.replace("rotation", "rot"), "rig.toml")) == [
         ("invalid", "height"),
         ("invalid", "left.fx"),
-        ("invalid", "right.K"),
+        ("invalid", "right"),
         ("missing", "stereo.rotation"),
         ("unknown", "stereo.rot"),
     ]
@@ -298,14 +292,14 @@ INVALID_TOML = [
     ("fx = 700.5", f"fx = 1{'0' * 400}", "invalid left.fx", "expected a number from 1 to 100000 pixels"),
     ("cx = 640.25", "cx = 1290", "invalid left.cx", "got 1290.0, expected a number from -0.5 to 1279.5 pixels"),
     ("0, 633.25]", "0, -1]", "invalid right.cx", "got -1.0"),
-    ("fx = 700.5\n", "", "missing left.fx", "expected either fx or K"),
+    ("fx = 700.5\n", "", "missing left.fx", "expected a number from 1 to 100000 pixels"),
     ("fx = 700.5", "fx = 700.5\nfz = 700.5", "unknown left.fz", ""),
     ("distortion = [-0.17, 0.03, 0.001, -0.002, 0.0001]\n", "", "missing left.distortion", "[k1, k2, p1, p2]"),
     ("0.001, -0.002, 0.0001]", "0.001]", "invalid left.distortion", "[k1, k2, p1, p2]"),
     ("0.001, -0.002, 0.0001]", "'a', -0.002]", "invalid left.distortion 3", "got 'a'"),
-    ("K = [[702.5, 0,", "K = [[702.5, 3,", "invalid right.K", "expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"),
-    ("K = [[702.5, 0, 633.25],", "K = [[702.5, 633.25],", "invalid right.K", ""),
-    ("K = [[702.5,", "fx = 7\nK = [[702.5,", "conflict right.fx", "got fx and K"),
+    ("K = [[702.5, 0,", "K = [[702.5, 3,", "invalid right", "expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]"),
+    ("K = [[702.5, 0, 633.25],", "K = [[702.5, 633.25],", "invalid right", "K is"),
+    ("K = [[702.5,", "fx = 7\nK = [[702.5,", "conflict right", "has K beside fx, fy, cx or cy"),
     ("K = [[702.5,", "K = [[0.5,", "invalid right.fx", "got 0.5"),
     ("rotation = [-0.001,", "rotation = [-3.1,", "invalid stereo.rotation", "radians"),
     ("rotation = [-0.001,", "rotation = [1, -0.001,", "invalid stereo.rotation", ""),
@@ -315,9 +309,14 @@ INVALID_TOML = [
     (ROTATION, "[[1, 0, 0], [0, nan, 0], [0, 0, 1]]", "invalid stereo.rotation", ""),
     (ROTATION, "[[1, 0, 0], [0, 1e300, 0], [0, 0, 1]]", "invalid stereo.rotation", ""),
     ("rotation = ", "roration = ", "missing stereo.rotation", ""),
-    ("translation_m = ", "baseline_m = 0.12\ntranslation_m = ", "conflict stereo.translation_m", ""),
-    ("translation_m = ", "translation = ", "missing stereo.translation_m", "translation_m or baseline_m"),
-    ("translation_m = [-0.1205, -0.00025, 0.00075]", "baseline_m = 0", "invalid stereo.baseline_m", "metres"),
+    (
+        "translation_m = ",
+        "baseline_m = 0.12\ntranslation_m = ",
+        "conflict stereo",
+        "has translation_m beside baseline_m",
+    ),
+    ("translation_m = ", "translation = ", "missing stereo.translation_m", "three numbers, metres, or baseline_m"),
+    ("translation_m = [-0.1205, -0.00025, 0.00075]", "baseline_m = 0", "invalid stereo", "baseline_m is 0"),
     ("[-0.1205, -0.00025", "[0.1205, -0.00025", "invalid stereo.translation_m", "expected [-baseline, y, z]"),
     ("[-0.1205, -0.00025", "[-120.5, -0.00025", "invalid stereo.translation_m 1", "metres"),
     ("fx = 700.5", "fx = = 700.5", "syntax ", "line 4"),

@@ -59,6 +59,27 @@ UNIDEPTH_MODELS = """
             return {"depth": depth, "radius": 1.2 * depth, "intrinsics": torch.eye(3)[None]}
 """
 
+DEPTH_ANYTHING_3_API = """
+    from types import SimpleNamespace
+    import numpy as np
+    import torch
+    from huggingface_hub import PyTorchModelHubMixin
+    from PIL import Image
+
+    class DepthAnything3(torch.nn.Module, PyTorchModelHubMixin):
+        def __init__(self, model_name, **kwargs):
+            super().__init__()
+            self.gain = torch.nn.Parameter(torch.zeros(()))
+
+        def inference(self, images):
+            [rgb] = images
+            assert rgb.dtype == np.uint8
+            red = Image.fromarray(rgb[..., 0]).resize((504, 280), Image.Resampling.BILINEAR)
+            noise = 1e-3 * torch.rand(1).item()
+            return SimpleNamespace(depth=(self.gain.item() + noise) * np.asarray(red, np.float32)[None])
+"""
+"""Code of a stand-in for Depth Anything 3, whose sky is as random as that of the original."""
+
 INPUT_PADDER = """
     import torch.nn.functional as F
 
@@ -135,14 +156,18 @@ BUILDERS: Mapping[str, Callable[..., Path]] = {
 """Writers of the folder of each method that takes ``NAME:FOLDER``."""
 
 
+_PACKAGES = ("unidepth", "depth_anything_3", "core")
+
+
 @contextmanager
 def stand_in_packages(site: Path) -> Iterator[Path]:
-    """Write the stand-in package into ``site`` and make it importable; remove the modules of stand-ins on exit."""
+    """Write the stand-in packages into ``site`` and make them importable; remove their modules on exit."""
     _write(site / "unidepth" / "models.py", UNIDEPTH_MODELS)
+    _write(site / "depth_anything_3" / "api.py", DEPTH_ANYTHING_3_API)
     with on_sys_path(site):
         importlib.invalidate_caches()
         yield site
-    for name in [module for module in sys.modules if module.split(".")[0] in ("unidepth", "core")]:
+    for name in [module for module in sys.modules if module.split(".")[0] in _PACKAGES]:
         del sys.modules[name]
 
 

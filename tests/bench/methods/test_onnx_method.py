@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import math
 import subprocess
 import sys
 import zipfile
+from fractions import Fraction
 from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -18,18 +19,12 @@ import numpy as np
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from onnx import TensorProto, helper
-from scipy.ndimage import map_coordinates
 
-from rebar_depth_bench import MethodError, load, score
+from rebar_depth_bench import load, score
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.methods import find_method
-from rebar_depth_bench.methods.onnx.model import (
-    input_tensor,
-    output_to_depth_m,
-    place_image,
-    sample_at_image_pixels,
-)
-from rebar_depth_bench.methods.onnx.spec import OUTPUT_MEANINGS, InputSpec, OutputSpec
+from rebar_depth_bench.methods.onnx.model import place_image, source_cells
+from rebar_depth_bench.methods.onnx.spec import InputSpec
 from tests.bench.methods.onnx_models import (
     DEPTH_OUTPUT,
     PLAIN_INPUT,
@@ -43,13 +38,6 @@ from tests.bench.methods.onnx_models import (
 
 GREY = np.full((4, 6, 3), 128, np.uint8)
 SIDES = st.integers(1, 40)
-
-
-def spec_of(size: tuple[int, int] | None, *, pad: bool, longest: int = 1, multiple: int = 1) -> InputSpec:
-    sides: dict[str, Any] = {"longest_side": longest, "multiple_of": multiple}
-    if size is not None:
-        sides = {"width": size[0], "height": size[1]}
-    return InputSpec(**sides, resize="pad" if pad else "stretch", range=255)
 
 
 @pytest.mark.parametrize(
@@ -92,9 +80,11 @@ def test_output_meaning_converts_to_metres(tmp_path: Path) -> None:
 def test_invalid_output_becomes_nan(tmp_path: Path) -> None:
     values = [[0.0, -1.0, np.nan, np.inf, -np.inf, 1e-45], [0.09, 0.1, 0.5, 2.0, 2.01, 3e38], [1] * 6, [1] * 6]
     write_constant_model(tmp_path, np.array(values))
-    depth_m = predict_depth(write_toml(tmp_path, output_table="meaning = 'depth'\nmin_m = 0.1\nmax_m = 2"), GREY)
-    assert np.isnan(depth_m[0]).all()
-    assert np.isnan(depth_m[1]).tolist() == [True, False, False, False, True, True]
+    depth_m = predict_depth(write_toml(tmp_path), GREY)
+    assert np.isnan(depth_m[0]).tolist() == [True] * 5 + [False]
+    assert depth_m[1] == pytest.approx(values[1])
+    depth_m = predict_depth(write_toml(tmp_path, output_table="meaning = 'depth'\nscale = 1000"), GREY)
+    assert np.isnan(depth_m[1]).tolist() == [False] * 5 + [True], "more than float32 holds"
     depth_m = predict_depth(write_toml(tmp_path, output_table="meaning = 'inverse-depth'"), GREY)
     assert np.isnan(depth_m[0]).all(), "one over the smallest float is more than float32 holds"
 
@@ -106,23 +96,6 @@ def test_relative_output_is_kept_as_it_is(tmp_path: Path, meaning: str) -> None:
     assert find_method(str(path)).info.prediction == meaning
     values = predict_depth(path, GREY)[0]
     np.testing.assert_array_equal(values, np.array([-4, 0, 2e-30, np.nan, np.nan, 6], np.float32))
-    with pytest.raises(MethodError, match=f'output.min_m: got 0.1, expected none: meaning "{meaning}"'):
-        find_method(str(write_toml(tmp_path, output_table=f"meaning = '{meaning}'\nmin_m = 0.1")))
-
-
-@given(
-    values=st.lists(st.floats(width=32), min_size=1, max_size=20),
-    meaning=st.sampled_from([name for name, one in OUTPUT_MEANINGS.items() if one.prediction == "metric"]),
-    scale=st.floats(1e-9, 1e9),
-)
-def test_any_output_gives_depth_within_bounds(values: list[float], meaning: str, scale: float) -> None:
-    focal_px = 1000.0 if OUTPUT_MEANINGS[meaning].canonical else None
-    spec = OutputSpec(meaning=meaning, focal_canonical_px=focal_px, scale=scale, min_m=0.1, max_m=30.0)
-    depth_m = output_to_depth_m(np.array(values, np.float32), spec, 0.7)
-    known = ~np.isnan(depth_m)
-    assert (depth_m[known] >= np.float32(0.1)).all()
-    assert (depth_m[known] <= np.float32(30.0)).all()
-    assert not known[~(np.array(values) > 0)].any()
 
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=15)
@@ -142,43 +115,41 @@ def test_coordinate_model_reveals_source_pixels(
         assert source[pixel] == before + (2 * pixel[axis] + 1) * resized // (2 * side)
 
 
-@pytest.mark.slow
-@given(sides=st.tuples(SIDES, SIDES, SIDES, SIDES), pad=st.booleans(), cells=st.tuples(SIDES, SIDES))
-def test_bilinear_sampling_matches_map_coordinates(
-    sides: tuple[int, int, int, int], pad: bool, cells: tuple[int, int]
+@given(image_px=SIDES, canvas_px=SIDES, share=st.floats(0, 1), cells=SIDES, known_px=st.integers(0, 39))
+def test_cell_contains_centre_of_pixel_and_no_padding(
+    image_px: int, canvas_px: int, share: float, cells: int, known_px: int
 ) -> None:
-    width, height, wide, high = sides
-    place = place_image(spec_of((wide, high), pad=pad), width, height)
-    values = np.random.default_rng(7).uniform(1, 2, cells)
-    clipped, ranges = [], []
-    for span, count in zip(reversed(place), cells, strict=True):
-        first_px, end_px, cell_px = (
-            span.pad_before_px,
-            span.pad_before_px + span.resized_px,
-            span.canvas_px / count,
-        )
-        centres = np.linspace(first_px, end_px, 2 * span.image_px + 1)[1::2]
-        inside = [i for i in range(count) if first_px <= i * cell_px + 1e-9 and (i + 1) * cell_px - 1e-9 <= end_px]
-        ranges.append(inside)
-        bounds = (inside[0], inside[-1]) if inside else (0, 0)
-        clipped.append(np.clip(centres / cell_px - 0.5, *bounds))
-    if not all(ranges):  # Every cell of this coarse grid overlaps the padding.
-        assert sample_at_image_pixels(place, values, bilinear=True).shape == (height, width)
-        return
-    expected = map_coordinates(values, np.meshgrid(*clipped, indexing="ij"), order=1, mode="nearest")
-    assert sample_at_image_pixels(place, values, bilinear=True) == pytest.approx(expected, rel=1e-9)
-    assert np.isin(sample_at_image_pixels(place, values, bilinear=False), values[np.ix_(*ranges)]).all()
+    """Exact fractions of the canvas; on a grid that is coarser than the padding, the middle cell is taken."""
+    resized_px, pixel = max(1, round(share * canvas_px)), known_px % image_px
+    first_px = (canvas_px - resized_px) // 2
+    found = int(source_cells(image_px, canvas_px, resized_px, cells)[pixel])
+    inside = [
+        cell
+        for cell in range(cells)
+        if first_px * cells <= cell * canvas_px and (cell + 1) * canvas_px <= (first_px + resized_px) * cells
+    ]
+    centre = (first_px + Fraction(2 * pixel + 1, 2 * image_px) * resized_px) * cells / canvas_px
+    if inside:
+        assert found == min(max(math.floor(centre), inside[0]), inside[-1])
+    else:
+        middle = Fraction(2 * first_px + resized_px, 2 * canvas_px) * cells
+        assert found == min(math.floor(middle), cells - 1)
 
 
-@pytest.mark.parametrize("resize", ["pad", "stretch"])
-def test_identity_model_returns_image_in_place(resize: str, tmp_path: Path) -> None:
+def test_image_is_resized_in_place(tmp_path: Path) -> None:
     """A ramp survives the smoothing of resizing; a shift of half a pixel would change it by one grey level."""
     write_mixer_model(tmp_path, offset=1)
-    input_table = f"width = 40\nheight = 40\nresize = '{resize}'\nrange = 255"
-    path = write_toml(tmp_path, input_table, f"{DEPTH_OUTPUT}\nresize = 'bilinear'")
     rgb = make_image(80, 50, lambda u, v: (2 * u + v, 0, 0))
-    difference = predict_depth(path, rgb) - 1 - rgb[..., 0]
-    assert np.abs(difference[3:-3, 3:-3]).max() < 0.6, "grey levels are rounded"
+    for resize, high, wide in (("pad", 25, 40), ("stretch", 40, 40)):
+        path = write_toml(tmp_path, f"width = 40\nheight = 40\nresize = '{resize}'\nrange = 255")
+        difference = predict_depth(path, rgb) - 1 - rgb[..., 0]
+        v, u = (np.arange(side) + 0.5 for side in (50, 80))
+        cell_v, cell_u = (
+            (np.floor(at * small / side) + 0.5) * side / small - at
+            for at, small, side in ((v, high, 50), (u, wide, 80))
+        )
+        expected = 2 * cell_u[None, :] + cell_v[:, None]
+        assert np.abs(difference - expected)[3:-3, 3:-3].max() < 0.6, "grey levels are rounded"
 
 
 def test_padding_is_mean_and_never_sampled(tmp_path: Path) -> None:
@@ -199,35 +170,23 @@ def test_padding_is_mean_and_never_sampled(tmp_path: Path) -> None:
 
 def test_coarse_output_grid_covers_whole_image(tmp_path: Path) -> None:
     write_constant_model(tmp_path, np.array([[[1, 2], [3, 4]]]))
-    path = write_toml(tmp_path, output_table=f"{DEPTH_OUTPUT}\nat_input_size = false")
+    path = write_toml(tmp_path, PLAIN_INPUT.replace("height = 4", "height = 6"))
     assert predict_depth(path, np.zeros((2, 6, 3), np.uint8)).tolist() == [[1, 1, 1, 2, 2, 2], [3, 3, 3, 4, 4, 4]]
 
 
-def test_nearest_keeps_values_and_bilinear_skips_nan(tmp_path: Path) -> None:
+def test_values_are_never_mixed(tmp_path: Path) -> None:
     bar = np.array([[2.0, 2, 1, 1, np.nan, 2]] * 4)  # A bar at 1 m in front of a wall at 2 m, and a missing value.
     write_constant_model(tmp_path, bar)
-    rgb = np.zeros((16, 24, 3), np.uint8)
-    nearest = predict_depth(write_toml(tmp_path), rgb)
-    assert set(nearest[~np.isnan(nearest)]) == {1.0, 2.0}
-    assert np.isnan(nearest[0]).sum() == 4
-    mixed = predict_depth(write_toml(tmp_path, output_table=f"{DEPTH_OUTPUT}\nresize = 'bilinear'"), rgb)
-    assert ((mixed > 1) & (mixed < 2)).any()
-    assert np.isnan(mixed[0]).nonzero()[0].tolist() == list(range(14, 22))
-    unmoved = predict_depth(write_toml(tmp_path, output_table=f"{DEPTH_OUTPUT}\nresize = 'bilinear'"), GREY)
-    assert np.isnan(unmoved[0]).nonzero()[0].tolist() == [4], "at its own size nothing is mixed, NaN not either"
-    limited = predict_depth(
-        write_toml(tmp_path, output_table=f"{DEPTH_OUTPUT}\nresize = 'bilinear'\nmax_m = 1.5"), rgb
-    )
-    assert set(limited[~np.isnan(limited)]) == {1.0}, "the wall is out before anything is mixed with it"
+    depth_m = predict_depth(write_toml(tmp_path), np.zeros((16, 24, 3), np.uint8))
+    np.testing.assert_array_equal(depth_m, np.kron(bar, np.ones((4, 4))))
 
 
 @pytest.mark.parametrize(
     ("size", "expected"), [((1280, 720), (518, 294)), ((720, 1280), (294, 518)), ((2000, 3), (518, 14))]
 )
 def test_input_size_from_longest_side_and_multiple(size: tuple[int, int], expected: tuple[int, int]) -> None:
-    spec = spec_of(None, pad=False, longest=518, multiple=14)
-    tensor = input_tensor(spec, place_image(spec, *size), np.zeros((size[1], size[0], 3), np.uint8))
-    assert tensor.shape == (1, 3, expected[1], expected[0])
+    spec = InputSpec(longest_side=518, multiple_of=14, resize="stretch", range=255)
+    assert place_image(spec, size[::-1]) == (expected[::-1], expected[::-1])
 
 
 def test_dynamic_size_and_half_precision(tmp_path: Path) -> None:
@@ -250,7 +209,7 @@ def test_method_info_and_coverage_of_its_digest(tmp_path: Path) -> None:
     write_toml(tmp_path, output_table="meaning = 'canonical-depth'\nfocal_canonical_px = 1000")
     canonical = find_method(str(path)).info
     assert (canonical.columns, canonical.uses_intrinsics) == (("left_rgb", "left_K"), True)
-    assert info.source.startswith("a paper (sha256:")
+    assert info.source.startswith("a paper (tiny.toml sha256:")
     write_toml(tmp_path, PLAIN_INPUT + "\nstd = [2, 2, 2]", top_level="source = 'a paper'")
     other_settings = find_method(str(path)).info.source
     write_mixer_model(tmp_path, offset=2)

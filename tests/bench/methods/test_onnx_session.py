@@ -103,13 +103,12 @@ def mismatch(
             outputs=["y", "z"],
         ),
         mismatch("unknown output.name: the model has no output 'q', expected one of 'y'", output="name = 'q'"),
-        mismatch("unknown output.index: the model has no output 1, expected one of 'y'", output="index = 1"),
         mismatch(
-            "output 'y' has the shape (1, 3, 4, 6), expected H x W, with optional leading dimensions of 1", NEGATED
+            "output 'y' has the shape (1, 3, 4, 6), expected H x W in the ratio of the input, 4 x 6", NEGATED
         ),
         mismatch("output 'y' has the shape (), expected H x W", NUMBER),
         mismatch(
-            "model.onnx: fails on an input of 1 x 3 x 4 x 6: ",
+            "model.onnx: a black image: fails on an input of 1 x 3 x 4 x 6: ",
             FAILING_RESHAPE,
             constants={"to": np.array([5, 5])},
         ),
@@ -130,64 +129,24 @@ def test_mismatched_model_is_refused_on_load(
 def test_all_mismatches_are_reported_at_once(tmp_path: Path) -> None:
     write_model(tmp_path, [CHANNEL_MEAN], input_shape=(1, 3, 8, 8))
     with pytest.raises(MethodError) as caught:
-        load_predictor(str(write_toml(tmp_path, output_table=f"{DEPTH_OUTPUT}\nindex = 1")))
+        load_predictor(str(write_toml(tmp_path, output_table=f"{DEPTH_OUTPUT}\nname = 'q'")))
     assert [(problem.code, problem.where) for problem in caught.value.problems] == [
         ("size", "input.height"),
         ("size", "input.width"),
-        ("unknown", "output.index"),
+        ("unknown", "output.name"),
     ]
 
 
-def test_undeclared_smaller_output_raises(tmp_path: Path) -> None:
-    write_constant_model(tmp_path, np.ones((1, 2, 3)))
-    with pytest.raises(
-        MethodError, match=re.escape("(1, 2, 3), expected 4 x 6 or [output] at_input_size = false")
-    ):
-        load_predictor(str(write_toml(tmp_path)))
-
-
-SQUARE_INPUT = "width = 8\nheight = 8\nresize = 'stretch'\nrange = 255"
-
-
 @pytest.mark.parametrize(
-    ("shape", "input_table", "at_input_size", "words"),
-    [
-        ((1, 24), PLAIN_INPUT, "true", "(1, 24), a single row or column"),
-        ((1, 24), PLAIN_INPUT, "false", "(1, 24), a single row or column"),
-        ((1, 24, 1), PLAIN_INPUT, "false", "(1, 24, 1), a single row or column"),
-        ((1, 1, 6, 4), PLAIN_INPUT, "true", "(1, 1, 6, 4), the width before the height"),
-        ((12, 8), PLAIN_INPUT, "false", "(12, 8), the width before the height"),
-        ((12, 6), SQUARE_INPUT, "false", "(12, 6), the width before the height"),
-    ],
+    "shape",
+    [(), (24,), (0, 6), (1, 24), (1, 24, 1), (1, 1), (1, 1, 6, 4), (5, 5), (20, 12), (2, 4, 6)],
+    ids=str,
 )
-def test_flat_or_transposed_output_is_refused_without_a_wrong_remedy(
-    shape: tuple[int, ...], input_table: str, at_input_size: str, words: str, tmp_path: Path
-) -> None:
-    """The input is 4 x 6, or 8 x 8, and the picture 6 x 12."""
+def test_output_without_the_ratio_of_the_input_is_refused(shape: tuple[int, ...], tmp_path: Path) -> None:
+    """The input is 4 x 6."""
     write_constant_model(tmp_path, np.ones(shape))
-    path = write_toml(tmp_path, input_table, f"{DEPTH_OUTPUT}\nat_input_size = {at_input_size}")
-    with pytest.raises(MethodError, match=re.escape(words)) as caught:
-        predict_depth(path, np.zeros((6, 12, 3), np.uint8))
-    assert "at_input_size" not in str(caught.value)
-
-
-@pytest.mark.parametrize(("shape", "noted"), [((2, 3), False), ((6, 12), False), ((5, 5), True), ((20, 12), True)])
-def test_output_of_another_ratio_is_scaled_per_axis_with_a_note(
-    shape: tuple[int, int], noted: bool, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    """The input is 4 x 6 and the picture 12 x 24; a pixel has the value of the cell that contains its centre."""
-    rows, columns = shape
-    values = 1.0 + np.arange(rows * columns).reshape(shape)
-    write_constant_model(tmp_path, values)
-    path = write_toml(tmp_path, output_table=f"{DEPTH_OUTPUT}\nat_input_size = false")
-    predict = load_predictor(str(path))
-    for _ in range(2):
-        depth_m = predict({"left_rgb": np.zeros((12, 24, 3), np.uint8)})
-    down, across = ((np.arange(side) + 0.5) * cells / side for side, cells in ((12, rows), (24, columns)))
-    np.testing.assert_array_equal(depth_m, values[np.ix_(down.astype(int), across.astype(int))])
-    notes = capsys.readouterr().err.splitlines()
-    assert len(notes) == noted, "once for all pictures of a size"
-    assert all(f"the output, {rows} x {columns}, is scaled" in note for note in notes)
+    with pytest.raises(MethodError, match=re.escape(f"the shape {shape}, expected H x W in the ratio")):
+        load_predictor(str(write_toml(tmp_path)))
 
 
 def test_long_message_of_onnxruntime_ends_with_the_cause(tmp_path: Path) -> None:
@@ -196,19 +155,11 @@ def test_long_message_of_onnxruntime_ends_with_the_cause(tmp_path: Path) -> None
         load_predictor(str(write_toml(tmp_path)))
 
 
-def test_output_is_selected_by_name_or_index(tmp_path: Path) -> None:
+def test_output_is_selected_by_name(tmp_path: Path) -> None:
     nodes = [helper.make_node("Neg", ["x"], ["no"]), helper.make_node("ReduceMax", ["x"], ["y"], axes=[1])]
     write_model(tmp_path, nodes, outputs=["no", "y"])
-    for selection in ("name = 'y'", "index = 1"):
-        path = write_toml(tmp_path, output_table=f"{DEPTH_OUTPUT}\n{selection}")
-        assert np.unique(predict_depth(path, BLACK + 9)) == 9
-
-
-def test_invalid_model_file_raises(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    (tmp_path / "model.onnx").write_bytes(b"\x08\x01")  # A message without a graph.
-    with pytest.raises(MethodError, match=r"model\.onnx: onnxruntime cannot open this model: "):
-        load_predictor(str(write_toml(tmp_path)))
-    assert capsys.readouterr().err == ""
+    path = write_toml(tmp_path, output_table=f"{DEPTH_OUTPUT}\nname = 'y'")
+    assert np.unique(predict_depth(path, BLACK + 9)) == 9
 
 
 def test_missing_onnxruntime_names_extra_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -261,7 +212,7 @@ def test_time_limit_does_not_change_results(tmp_path: Path) -> None:
     assert np.isnan(predict_depth(path, BLACK)).all()
     predictor = load_predictor(find_method(str(path), view_timeout_s=0.3))
     for _ in range(2):  # The session can be used again after an inference that was stopped.
-        with pytest.raises(MethodError, match=r"one: takes longer than the limit of 0\.3 s"):
+        with pytest.raises(MethodError, match=r"one: .* takes longer than the limit of 0\.3 s"):
             predictor({"view_id": "one", "left_rgb": BLACK + 1})
         assert np.isnan(predictor({"view_id": "two", "left_rgb": BLACK})).all()
 

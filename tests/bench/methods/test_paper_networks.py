@@ -1,14 +1,12 @@
-"""The paper's networks with stand-ins: units, resizing and back, identified weights, and missing parts."""
+"""The paper's networks with stand-ins: units, resizing and back, names of weights, and missing parts."""
 
 from __future__ import annotations
 
 import importlib
 import re
 import sys
-from collections.abc import Iterator, Mapping
-from functools import partial
+from collections.abc import Iterator
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -19,12 +17,9 @@ pytest.importorskip("torch")
 import cv2
 import numpy as np
 from huggingface_hub import constants
-from PIL import Image
 
 from rebar_depth_bench.base.errors import MethodError
 from rebar_depth_bench.methods import METHODS, Predictor, find_method
-from rebar_depth_bench.methods.paper.monocular import DA3_NETWORK, UNIDEPTH_NETWORK, metric3d_input
-from rebar_depth_bench.methods.registry import FROM_FOLDER
 from tests.bench.methods import stand_in_models as stand_ins
 from tests.bench.methods.predictors import load_predictor
 from tests.bench.methods.stand_in_models import BUILDERS, FX, FY, GAIN, stereo_row
@@ -53,24 +48,14 @@ COMMITS = ("0123456789abcdef0123456789abcdef01234567", "89abcdef0123456789abcdef
 
 @pytest.fixture(autouse=True)
 def site(tmp_path: Path) -> Iterator[Path]:
-    """Make the stand-in package importable during a test."""
+    """Make the stand-in packages importable during a test."""
     with stand_ins.stand_in_packages(tmp_path / "site") as folder:
         yield folder
 
 
-def resized_red(images: list[np.ndarray]) -> SimpleNamespace:
-    """Return the red channel at the size and with the noise that Depth Anything 3's package would return."""
-    [rgb] = images
-    red = np.asarray(Image.fromarray(rgb[..., 0]).resize((504, 280), Image.Resampling.BILINEAR), np.float32)
-    return SimpleNamespace(depth=(GAIN + 1e-3 * torch.rand(1).item()) * red[None])
-
-
 def load_stand_in(name: str, folder: Path) -> Predictor:
     """Return the predictor of a stand-in with the columns that its method reads."""
-    if name == "depth-anything-3":
-        predictor: Predictor = partial(DA3_NETWORK.infer, SimpleNamespace(inference=resized_red))
-    else:
-        predictor = load_predictor(f"{name}:{BUILDERS[name](folder / 'theirs')}")
+    predictor = load_predictor(f"{name}:{BUILDERS[name](folder / 'theirs')}")
     return lambda row: predictor({column: row[column] for column in METHODS[name].info.columns})
 
 
@@ -105,22 +90,24 @@ def test_zero_output_gives_nan(name: str, tmp_path: Path) -> None:
     assert np.isfinite(depth_m[:, 44:]).all()
 
 
-@pytest.mark.parametrize("grid", [(H, W), (720, 1280), (308, 300), (1001, 333)])
-def test_metric3d_input_is_that_of_the_authors_code(grid: tuple[int, int]) -> None:
+@pytest.mark.parametrize("grid", [(H, W), (720, 1280), (91, 160), (1001, 334)])
+def test_metric3d_input_is_that_of_the_authors_code(grid: tuple[int, int], tmp_path: Path) -> None:
     """The reference follows the main part of ``hubconf.py`` step by step, with OpenCV and torch."""
-    rgb = np.random.default_rng(1).integers(0, 256, (*grid, 3), np.uint8)
-    image, inside, factor = metric3d_input(rgb)
+    code = stand_ins.metric3d_clone(tmp_path / "theirs") / "hubconf.py"
+    given = f"torch.save(pixels, {str(tmp_path / 'input.pt')!r}); red ="
+    code.write_text(code.read_text().replace("red =", given, 1))
+    row = stereo_row(np.zeros(grid))
+    load_predictor(f"metric3d:{tmp_path / 'theirs'}")(row)
     scale = min(616 / grid[0], 1064 / grid[1])
-    assert factor == scale
-    resized = cv2.resize(rgb, (int(grid[1] * scale), int(grid[0] * scale)), interpolation=cv2.INTER_LINEAR)
+    size = (int(grid[1] * scale), int(grid[0] * scale))
+    resized = cv2.resize(row["left_rgb"], size, interpolation=cv2.INTER_LINEAR)
     rows, columns = 616 - resized.shape[0], 1064 - resized.shape[1]
     margins = (rows // 2, rows - rows // 2, columns // 2, columns - columns // 2)
     mean, std = [123.675, 116.28, 103.53], [58.395, 57.12, 57.375]
     padded = cv2.copyMakeBorder(resized, *margins, cv2.BORDER_CONSTANT, value=mean)
-    assert np.array_equal(padded[inside], resized)
     mean_tensor, std_tensor = (torch.tensor(values).float()[:, None, None] for values in (mean, std))
     expected = torch.div(torch.from_numpy(padded.transpose((2, 0, 1))).float() - mean_tensor, std_tensor)
-    assert torch.equal(image, expected[None])
+    assert torch.equal(torch.load(tmp_path / "input.pt"), expected[None])
 
 
 def test_metric3d_depth_is_at_most_300_m(tmp_path: Path) -> None:
@@ -128,36 +115,29 @@ def test_metric3d_depth_is_at_most_300_m(tmp_path: Path) -> None:
     assert (predictor(stereo_row(np.full((H, W), 200))) == 300).all()
 
 
-@pytest.mark.parametrize("name", METRES_OF_RED)
-def test_output_of_wrong_shape_is_refused(name: str, tmp_path: Path) -> None:
-    row = stereo_row(np.full((H, W), 200))
-    networks: Mapping[str, Any] = {
-        "depth-anything-3": lambda: DA3_NETWORK.infer(
-            SimpleNamespace(inference=lambda _: SimpleNamespace(depth=np.ones((280, 504)))), row
-        ),
-        "metric3d": lambda: load_predictor(f"metric3d:{tmp_path / 'theirs'}")(row),
-        "unidepth": lambda: UNIDEPTH_NETWORK.infer(
-            SimpleNamespace(infer=lambda _: {"depth": torch.ones(1, 1, 89, 160)}), row
-        ),
-    }
-    code = stand_ins.metric3d_clone(tmp_path / "theirs") / "hubconf.py"
-    code.write_text(code.read_text().replace("self.gain * red", "red[..., ::2]"))
+@pytest.mark.parametrize(
+    ("name", "file", "right", "wrong"),
+    [
+        ("depth-anything-3", "site/depth_anything_3/api.py", "np.float32)[None]", "np.float32)"),
+        ("metric3d", "theirs/hubconf.py", "self.gain * red", "red[..., ::2]"),
+        ("unidepth", "site/unidepth/models.py", "rgb[None, :1]", "rgb[None, :1, 1:]"),
+    ],
+)
+def test_output_of_wrong_shape_is_refused(name: str, file: str, right: str, wrong: str, tmp_path: Path) -> None:
+    folder, code = BUILDERS[name](tmp_path / "theirs"), tmp_path / file
+    assert right in code.read_text()
+    code.write_text(code.read_text().replace(right, wrong))
     with pytest.raises(MethodError, match=rf"^{name}: .*depth of shape \(.*\), expected \("):
-        networks[name]()
+        load_predictor(f"{name}:{folder}")(stereo_row(np.full((H, W), 200)))
 
 
-@pytest.mark.parametrize("name", FROM_FOLDER)
-def test_name_and_digest_identify_the_weights_of_a_folder(name: str, tmp_path: Path) -> None:
-    infos = [
-        find_method(f"{name}:{BUILDERS[name](tmp_path / place / 'theirs', gain=gain)}").info
-        for place, gain in (("1", 1.0), ("2", 2.0), ("3", 1.0))
-    ]
-    assert infos[0] == infos[2]
-    assert infos[0] != infos[1]
-    assert str(tmp_path) not in repr(infos)
-    assert infos[0].name == f"{name}:{'23-51-11' if name == 'foundation-stereo' else 'theirs'}"
-    assert infos[0].columns == METHODS[name].info.columns
-    assert re.search(r"as in the paper; weights sha256:[0-9a-f]{64}$", infos[0].summary)
+@pytest.mark.parametrize("name", BUILDERS)
+def test_folder_of_the_weights_is_in_the_name(name: str, tmp_path: Path) -> None:
+    info = find_method(f"{name}:{BUILDERS[name](tmp_path / 'theirs')}").info
+    assert info.name == f"{name}:{'23-51-11' if name == 'foundation-stereo' else 'theirs'}"
+    assert info.columns == METHODS[name].info.columns
+    assert info.summary.endswith("as in the paper")
+    assert str(tmp_path) not in repr(info)
 
 
 @pytest.fixture
@@ -194,26 +174,18 @@ def test_cached_weights_are_used_and_their_commit_is_reported(hub_cache: Path) -
         find_method("unidepth")
 
 
-def test_metric3d_reports_code_digest_and_weights_commit(
+def test_metric3d_of_the_caches_reports_the_commit_of_its_weights(
     hub_cache: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     code = stand_ins.metric3d_clone(tmp_path / "torch" / "hub" / "yvanyin_metric3d_main")
     (code / "metric_depth_vit_small_800k.pth").unlink()
-    repository = hub_cache / "models--JUGGHM--Metric3D"
-    add_to_hub_cache("metric3d", repository, COMMITS[0])
-    first = find_method("metric3d")
-    assert first.info.name == "metric3d"
-    assert "; code yvanyin_metric3d_main sha256:" in first.info.summary
-    assert first.info.summary.endswith(f"; weights commit {COMMITS[0]}")
-    depth_m = load_predictor(first)(stereo_row(np.full((H, W), 200)))
+    add_to_hub_cache("metric3d", hub_cache / "models--JUGGHM--Metric3D", COMMITS[0])
+    found = find_method("metric3d")
+    assert found.info.name == "metric3d"
+    assert found.info.summary.endswith(f"as in the paper; weights commit {COMMITS[0]}")
+    depth_m = load_predictor(found)(stereo_row(np.full((H, W), 200)))
     np.testing.assert_allclose(depth_m, 200 * METRES_OF_RED["metric3d"], rtol=3e-3)
     assert "downloading" not in capsys.readouterr().err
-    (code / "mono").mkdir()
-    (code / "mono" / "model.py").write_text("")
-    second = find_method("metric3d")
-    add_to_hub_cache("metric3d", repository, COMMITS[1], gain=2.0)
-    assert len({first.info, second.info, find_method("metric3d").info}) == 3, "other code, other weights"
-    assert str(tmp_path) not in repr(second.info)
 
 
 @pytest.mark.parametrize(
@@ -223,7 +195,7 @@ def test_metric3d_reports_code_digest_and_weights_commit(
         ("depth-anything-3", "depth_anything_3", "pip install depth-anything-3 addict"),
         ("metric3d", "cv2", "pip install '.[methods]'"),
         ("foundation-stereo", "cv2", "pip install '.[methods]'"),
-        *((name, "torch", "pip install '.[torch]'") for name in FROM_FOLDER),
+        *((name, "torch", "pip install '.[torch]'") for name in BUILDERS),
     ],
 )
 def test_missing_package_names_install_command(
@@ -247,9 +219,11 @@ def test_missing_package_names_install_command(
         ("foundation-stereo", "Google Drive .*: git clone https://github.com/NVlabs/FoundationStereo, put the f"),
     ],
 )
-def test_bare_name_without_cache_or_package_is_refused(name: str, words: str, hub_cache: Path) -> None:
-    if name == "depth-anything-3" and importlib.util.find_spec("depth_anything_3"):
-        pytest.skip("depth-anything-3 is installed")
+def test_bare_name_without_cache_or_package_is_refused(
+    name: str, words: str, hub_cache: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if name == "depth-anything-3":
+        monkeypatch.setitem(sys.modules, "depth_anything_3", None)
     with pytest.raises(MethodError, match=words):
         load_predictor(name)
 

@@ -1,11 +1,10 @@
-"""Third-party model code: incomplete checkpoints, errors in words, weight digests, downloads and ``sys.path``."""
+"""Third-party model code: incomplete checkpoints, errors in words, downloads and ``sys.path``."""
 
 from __future__ import annotations
 
-import hashlib
 import importlib
 import sys
-from dataclasses import replace
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +14,15 @@ pytest.importorskip("starlette")
 pytest.importorskip("torch")
 pytest.importorskip("uvicorn")
 
+import numpy as np
 from huggingface_hub import constants
 
 from rebar_depth_bench.base.errors import MethodError
-from rebar_depth_bench.methods.base import Method, MethodInfo
-from rebar_depth_bench.methods.paper.monocular import UNIDEPTH_NETWORK
-from rebar_depth_bench.methods.paper.third_party import HubNetwork, Network, on_sys_path
-from tests.bench.methods.stand_in_models import unidepth_weights
+from rebar_depth_bench.methods import find_method
+from rebar_depth_bench.methods.base import MethodInfo
+from rebar_depth_bench.methods.paper.third_party import Network, on_sys_path
+from tests.bench.methods.predictors import load_predictor
+from tests.bench.methods.stand_in_models import GAIN, stand_in_packages, stereo_row, unidepth_weights
 from tests.hub_server import HubServer, StoredRepository, folder_files
 
 pytestmark = pytest.mark.slow  # torch takes seconds to import
@@ -99,22 +100,6 @@ def test_missing_and_broken_packages_are_told_apart(
         NETWORK.import_package("strange", "pip install strange")
 
 
-def test_weights_digest_depends_on_names_and_content(tmp_path: Path) -> None:
-    """The digest is taken over lines like those of ``sha256sum``, with the name first."""
-    digests = []
-    for folder, first, second in (("1", b"x", b"y"), ("2", b"x", b"y"), ("3", b"y", b"x")):
-        (tmp_path / folder).mkdir()
-        files = [tmp_path / folder / "a.pth", tmp_path / folder / "b.yaml"]
-        for file, content in zip(files, (first, second), strict=True):
-            file.write_bytes(content)
-        digests.append(NETWORK.with_digest("mine", files))
-    x, y = (hashlib.sha256(content).hexdigest() for content in (b"x", b"y"))
-    expected = hashlib.sha256(f"a.pth {x}\nb.yaml {y}\n".encode()).hexdigest()
-    info = replace(NETWORK.info, name="m:mine", summary=f"what; weights sha256:{expected}")
-    assert digests[0] == digests[1] == info
-    assert digests[2] != digests[0]
-
-
 def test_on_sys_path_restores_sys_path(tmp_path: Path) -> None:
     before, within = list(sys.path), list[str]()
 
@@ -128,17 +113,16 @@ def test_on_sys_path_restores_sys_path(tmp_path: Path) -> None:
     assert sys.path == before
 
 
+UNIDEPTH = "lpiccinelli/unidepth-v2-vitl14"
+
+
 @pytest.fixture
-def repository(hub: HubServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> StoredRepository:
-    """Return ``org/model`` of the Hub of this test, whose cache is empty, with weights in two formats."""
+def repository(hub: HubServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[StoredRepository]:
+    """Yield UniDepth on the Hub of this test, whose cache is empty, with weights in two formats."""
     monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path / "cache"))
     files = folder_files(unidepth_weights(tmp_path / "model"))
-    return hub.add("models/org/model", {**files, "pytorch_model.bin": b"the same once more"})
-
-
-def hub_method(repository: str = "org/model", package: str = "numpy") -> Method:
-    """Return UniDepth with the weights of a repository of the Hub."""
-    return replace(UNIDEPTH_NETWORK, repository=repository, module=package).with_weights(None)
+    with stand_in_packages(tmp_path / "site"):
+        yield hub.add(f"models/{UNIDEPTH}", {**files, "pytorch_model.bin": b"the same once more"})
 
 
 def test_weights_are_fetched_once_then_read_from_cache(
@@ -148,38 +132,37 @@ def test_weights_are_fetched_once_then_read_from_cache(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    commit, loaded = repository.branches["main"], list[set[str]]()
-    monkeypatch.setattr(
-        HubNetwork, "_load", lambda _, folder: loaded.append({file.name for file in folder.iterdir()})
-    )
-    method = hub_method()
+    commit, row = repository.branches["main"], stereo_row(np.full((9, 16), 200))
+    method = find_method("unidepth")
     assert method.info.name == "unidepth"
     assert method.info.summary.endswith(f"; weights commit {commit}")
-    assert capsys.readouterr().err == f"org/model: downloading config.json from {hub.url}\n", "and no more"
+    assert capsys.readouterr().err == f"{UNIDEPTH}: downloading config.json from {hub.url}\n", "and no more"
     repository.commit("main", {})
-    method.load()
-    assert capsys.readouterr().err == f"org/model: downloading model.safetensors from {hub.url}\n"
+    assert (load_predictor(method)(row) == 200 * GAIN).all()
+    stderr = capsys.readouterr().err
+    assert stderr.splitlines()[0] == f"{UNIDEPTH}: downloading model.safetensors from {hub.url}"
+    assert stderr.count("downloading") == 1
     requested = {f"{request.method} {request.path}" for request in hub.requests}
-    assert f"GET /org/model/resolve/{commit}/model.safetensors" in requested
+    assert f"GET /{UNIDEPTH}/resolve/{commit}/model.safetensors" in requested
     assert not [path for path in requested if "pytorch_model.bin" in path or "main/model.safetensors" in path]
     del hub.requests[:]
     for is_offline in (False, True):
         monkeypatch.setattr(constants, "HF_HUB_OFFLINE", is_offline)
-        assert hub_method().info == method.info
-        hub_method().load()
-    assert loaded == [{"config.json", "model.safetensors"}] * 3
-    assert (hub.requests, capsys.readouterr().err) == ([], "")
+        assert find_method("unidepth").info == method.info
+        assert (load_predictor("unidepth")(row) == 200 * GAIN).all()
+    assert (hub.requests, "downloading" in capsys.readouterr().err) == ([], False)
     [weights] = tmp_path.glob("cache/models--*/snapshots/*/model.safetensors")
     weights.unlink()
-    with pytest.raises(
-        MethodError, match=r"^org/model: model.safetensors must be downloaded, but .*OFFLINE is set"
-    ):
-        method.load()
+    with pytest.raises(MethodError, match=f"^{UNIDEPTH}: model.safetensors must be downloaded, but .*OFFLINE is"):
+        load_predictor(method)
 
 
-def test_missing_package_prevents_download(hub: HubServer, repository: StoredRepository) -> None:
-    with pytest.raises(MethodError, match="unidepth needs no_such_package, which is not installed: pip install"):
-        hub_method(package="no_such_package")
+def test_missing_package_prevents_download(
+    hub: HubServer, repository: StoredRepository, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "unidepth", None)
+    with pytest.raises(MethodError, match="unidepth needs unidepth, which is not installed: pip install"):
+        find_method("unidepth")
     assert hub.requests == []
 
 
@@ -187,11 +170,10 @@ def test_missing_package_prevents_download(hub: HubServer, repository: StoredRep
 def test_failed_download_names_file_source_and_local_copy(
     missing: str, hub: HubServer, repository: StoredRepository
 ) -> None:
-    is_config = missing == "config.json"
-    if not is_config:
-        repository.commit("main", {"config.json": repository.files()["config.json"]})
-    name, error = ("org/other", "Repository") if is_config else ("org/model", "RemoteEntry")
-    words = f"{name}: {missing} cannot be downloaded from {hub.url}: {error}NotFoundError"
+    files = dict(repository.files())
+    del files[missing]
+    repository.commit("main", files)
+    words = f"{UNIDEPTH}: {missing} cannot be downloaded from {hub.url}: RemoteEntryNotFoundError"
     with pytest.raises(MethodError, match=words) as caught:
-        hub_method(name).load()
+        load_predictor("unidepth")
     assert "(and HF_TOKEN if the model is not public), or a local copy: unidepth:FOLDER (hf d" in str(caught.value)

@@ -222,7 +222,8 @@ def test_large_panels_sample_depth_and_average_colour() -> None:
     rgb = np.zeros((720, 1280, 3), np.uint8)
     rgb[::2] = 200
     steel = np.ones((720, 1280), bool)
-    images = shown_view(ViewPanels(rgb, truth, truth, steel, scored_view("lattice/0000")))
+    score = scored_view("lattice/0000")
+    images = shown_view(ViewPanels(rgb, truth, truth, steel, scored_pixels(steel, truth), score))
     assert (images.width, images.height) == (640, 360)
     depth = decoded(images.truth).reshape(-1, 3)
     assert len(np.unique(depth, axis=0)) == 1, "an average would have made depths that do not exist"

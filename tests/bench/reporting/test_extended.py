@@ -21,7 +21,7 @@ from rebar_depth_bench.extended.estimates import (
     MeasureEstimate,
     ViewSamples,
     tabulate_extended,
-    view_numbers,
+    view_measures,
 )
 from rebar_depth_bench.extended.families import MEASURE_FAMILIES, measures_by_alignment
 from rebar_depth_bench.extended.fits import MISS_MM
@@ -88,7 +88,7 @@ def make_extended(*configs: str, levels: dict[str, float] | None = None, views: 
     of_config = {index: make_view(index, LEVELS if levels is None else levels) for index in INDICES[:views]}
     table = tabulate_extended(list(of_config.values()), resample(INDICES[:views]), measures)
     numbers = {
-        f"{config}/{index:04d}": view_numbers(one, measures)
+        f"{config}/{index:04d}": view_measures(one, measures)
         for config in configs
         for index, one in of_config.items()
     }

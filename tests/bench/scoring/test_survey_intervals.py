@@ -12,7 +12,7 @@ import pytest
 from scipy.stats import t as student
 
 from rebar_depth_bench import SubmissionWriter, score
-from rebar_depth_bench.detections.score import score_crossings
+from rebar_depth_bench.detections.crossing_scorer import score_crossings
 from rebar_depth_bench.scoring import bootstrap
 from rebar_depth_bench.scoring.bootstrap import MIN_BLOCKS, RESAMPLES, Resampling, interval, resample_survey
 from rebar_depth_bench.scoring.comparison import Difference, compare

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import mmap
 import os
 import stat
 import struct
@@ -286,7 +285,7 @@ def test_reader_in_threads_and_after_closing(good: Path) -> None:
         reader.read("lattice/0000")
 
 
-def test_stored_view_is_memory_mapped_and_outlives_reader(tmp_path: Path) -> None:
+def test_view_outlives_reader_and_file(tmp_path: Path) -> None:
     shape = (200, 300)
     values = np.random.default_rng(0).random(shape, dtype=np.float32)
     name = b"lattice/0000.npy"
@@ -295,11 +294,7 @@ def test_stored_view_is_memory_mapped_and_outlives_reader(tmp_path: Path) -> Non
     path.write_bytes(build([Record(name, npy(values), local_extra=bytes(aligned)), META]))
     with SubmissionReader(path, {"lattice/0000": shape}) as reader:
         array = reader.read("lattice/0000")
-    base: object = array
-    while isinstance(base, np.ndarray):
-        base = base.base
-    assert isinstance(base, memoryview)
-    assert isinstance(base.obj, mmap.mmap)
+    os.truncate(path, 0)
     assert not array.flags.writeable
     np.testing.assert_array_equal(array, values)
 

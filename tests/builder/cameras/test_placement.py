@@ -26,7 +26,6 @@ from dataset_builder.cameras.camera_placement import (
 from dataset_builder.cameras.rigs import rig_cameras
 from dataset_builder.cameras.trajectories import aim_point_m, camera_offsets_m, poses, view_count
 from dataset_builder.catalog.named_configs import BuildRequest
-from dataset_builder.catalog.scene_file import scene_config
 from dataset_builder.scene.cages.generate import FAMILIES
 from dataset_builder.scene.environments.surroundings import GROUND_CLEARANCE_M, CameraSpace
 from dataset_builder.scene.model import Assembly
@@ -56,7 +55,7 @@ from tests.builder.cameras.survey_cages import (
     two_walls,
     wall,
 )
-from tests.builder.catalog.scene_files import write_scene
+from tests.builder.catalog.scene_files import scene_config, write_scene
 
 pytestmark = pytest.mark.slow
 

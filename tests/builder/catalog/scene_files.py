@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from dataset_builder.catalog.scene_file import read_scene
+from dataset_builder.specs.config_specs import ConfigSpec
+
 BAR = "[[bar]]\ndiameter = 10\npoints = [[-100, 0, 50], [100, 0, 50]]\n"
 
 
@@ -14,3 +17,7 @@ def write_scene(folder: Path, content: str | bytes, name: str = "my-beam.toml") 
     path = folder / name
     path.write_bytes(content.encode() if isinstance(content, str) else content)
     return path
+
+
+def scene_config(path: Path) -> ConfigSpec:
+    return read_scene(path).config

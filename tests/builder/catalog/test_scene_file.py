@@ -18,7 +18,7 @@ from scipy.spatial import cKDTree
 from dataset_builder.cameras.camera_fit import check_fits
 from dataset_builder.cameras.trajectories import aim_point_m, view_count
 from dataset_builder.catalog.named_configs import LATTICE_DOME, BuildRequest
-from dataset_builder.catalog.scene_file import NEAREST_RADIUS_PER_REACH, scene_config
+from dataset_builder.catalog.scene_file import NEAREST_RADIUS_PER_REACH
 from dataset_builder.scene.assemblies.bar_meshes import MAX_RIBS_PER_ROW
 from dataset_builder.scene.assemblies.cage import CageBar
 from dataset_builder.scene.assemblies.lattice import lattice_assembly
@@ -41,7 +41,7 @@ from dataset_builder.user_files.scene_schema import read_scene_toml
 from rebar_depth_bench.base.errors import InputError, MeshError
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
-from tests.builder.catalog.scene_files import BAR, MM, write_scene
+from tests.builder.catalog.scene_files import BAR, MM, scene_config, write_scene
 from tests.builder.scene.cages import assembly_of
 
 EXAMPLES = Path("examples")

@@ -36,39 +36,35 @@ def refused(layout: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> str:
 
 
 @pytest.mark.parametrize(
-    ("old", "new", "code", "where", "line"),
+    ("old", "new", "code", "where"),
     [
-        ("truth_sigma_m = 0.001\n", "", "missing", "truth_sigma_m", None),
-        ("truth_sigma_m = 0.001", "truth_sigma_m = 0", "invalid", "truth_sigma_m", 2),
-        ("[files]", "[file]", "unknown", "file", 4),
-        ('"depth/{view}_left.npy"', '"depth/left.npy"', "invalid", "files.left_depth", 5),
-        ('"depth/{view}_left.npy"', '"../{view}.npy"', "invalid", "files.left_depth", 5),
-        ('"depth/{view}_left.npy"', '"/etc/{view}.npy"', "invalid", "files.left_depth", 5),
-        ('"depth/{view}_left.npy"', '"depth/{view}_{view}.npy"', "invalid", "files.left_depth", 5),
-        ('right_depth = "depth/{view}_right.npy"\n', "", "conflict", "files", 4),
-        ("[poses]", "[depth]\nkind = 'depth'\n[poses]", "invalid", "depth.kind", 35),
-        ("[poses]", "[depth]\nunit = 'mm'\nscale = 1\n[poses]", "conflict", "depth", 34),
-        ("[poses]", "[depth]\nunit = 'mm'\nkind = 'disparity'\n[poses]", "conflict", "depth", 34),
-        ("[bars]", "[masks]\nvalues = 255\n[bars]", "invalid", "masks.values", 38),
-        ('\n[poses]\nfile = "poses/{view}.txt"\n', "", "conflict", "", None),
-        ('"bars.csv"', '"../bars.csv"', "invalid", "bars.file", 38),
-        ('"bars.csv"', '"~/bars.csv"', "invalid", "bars.file", 38),
-        ('"bars.csv"', '""', "invalid", "bars.file", 38),
-        ("[poses]", "[intrinsics]\nfile = 'k/{view}.txt'\n[poses]", "conflict", "", None),
+        ("truth_sigma_m = 0.001\n", "", "missing", "truth_sigma_m"),
+        ("truth_sigma_m = 0.001", "truth_sigma_m = 0", "invalid", "truth_sigma_m"),
+        ("[files]", "[file]", "unknown", "file"),
+        ('"depth/{view}_left.npy"', '"depth/left.npy"', "invalid", "files.left_depth"),
+        ('"depth/{view}_left.npy"', '"../{view}.npy"', "invalid", "files.left_depth"),
+        ('"depth/{view}_left.npy"', '"/etc/{view}.npy"', "invalid", "files.left_depth"),
+        ('"depth/{view}_left.npy"', '"depth/{view}_{view}.npy"', "invalid", "files.left_depth"),
+        ('right_depth = "depth/{view}_right.npy"\n', "", "conflict", "files"),
+        ("[poses]", "[depth]\nkind = 'depth'\n[poses]", "invalid", "depth.kind"),
+        ("[poses]", "[depth]\nunit = 'mm'\nscale = 1\n[poses]", "conflict", "depth"),
+        ("[poses]", "[depth]\nunit = 'mm'\nkind = 'disparity'\n[poses]", "conflict", "depth"),
+        ("[bars]", "[masks]\nvalues = 255\n[bars]", "invalid", "masks.values"),
+        ('\n[poses]\nfile = "poses/{view}.txt"\n', "", "conflict", ""),
+        ('"bars.csv"', '"../bars.csv"', "invalid", "bars.file"),
+        ('"bars.csv"', '"~/bars.csv"', "invalid", "bars.file"),
+        ('"bars.csv"', '""', "invalid", "bars.file"),
+        ("[poses]", "[intrinsics]\nfile = 'k/{view}.txt'\n[poses]", "conflict", ""),
     ],
 )
-def test_invalid_layout_is_refused_with_its_line(
-    old: str, new: str, code: str, where: str, line: int | None, tmp_path: Path
-) -> None:
+def test_invalid_layout_is_refused_with_its_key(old: str, new: str, code: str, where: str, tmp_path: Path) -> None:
     layout = data.write_layout(tmp_path)
     text = layout.read_text()
     assert old in text
     layout.write_text(text.replace(old, new))
     with pytest.raises(InputError) as caught:
         plan_import(layout, "mock-up")
-    problem = next(one for one in caught.value.problems if one.where == where)
-    assert problem.code == code
-    assert problem.found.startswith(f"line {line}: " if line else "")
+    assert (code, where) in [(problem.code, problem.where) for problem in caught.value.problems]
 
 
 def test_disparity_is_refused_beside_intrinsics_of_each_view(tmp_path: Path) -> None:
@@ -77,10 +73,10 @@ def test_disparity_is_refused_beside_intrinsics_of_each_view(tmp_path: Path) -> 
         plan_import(data.write_layout(tmp_path, ("left_depth", "left_rgb"), tables=tables), "mock-up")
 
 
-def test_invalid_cameras_are_refused_with_their_line(folder: Path) -> None:
+def test_invalid_cameras_are_refused_with_their_key(folder: Path) -> None:
     layout = data.write_layout(folder)
     layout.write_text(layout.read_text().replace("cx = 79.5", "cx = 790"))
-    with pytest.raises(InputError, match=r"cameras\.left\.cx: line \d+: got 790"):
+    with pytest.raises(InputError, match=r"cameras\.left\.cx: got 790"):
         plan_import(layout, "mock-up")
 
 

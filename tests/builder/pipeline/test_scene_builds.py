@@ -118,7 +118,7 @@ def test_build_of_life_size_column(tmp_path: Path, run_build: RunBuild) -> None:
     assert process.returncode == 0, process.stderr
 
     config = open_folder(root).config("column")
-    assert isinstance(config.scene.protocol, Survey)
+    assert isinstance(config.scene.trajectory, Survey)
     assert [view.view_id for view in config.views] == [f"column/{n:04d}" for n in (1, 3, 5, 7)]
     assert all((view.steel_px or 0) > 10 for view in config.views)
     assert all(view.scored_px > 20 for view in config.views[:2])  # Bars at 2 m are a pixel thick.

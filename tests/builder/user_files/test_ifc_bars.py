@@ -24,7 +24,6 @@ from dataset_builder.user_files.ifc_file import ifc_cage
 from dataset_builder.user_files.ifc_reader.bodies import axis_placement
 from dataset_builder.user_files.ifc_reader.curves import arc_through
 from dataset_builder.user_files.ifc_reader.ifc_model import open_model
-from dataset_builder.user_files.ifc_reader.step_text import StepText
 from tests.builder.user_files.ifc_writer import Ifc, Numbers, bars_in_process, extruded_circle, extruded_square
 
 COLUMN = Path("examples/column.ifc")
@@ -275,18 +274,6 @@ def test_tessellated_bodies_get_bent_axis_or_none() -> None:
     assert not other.has_axis
 
 
-@pytest.mark.parametrize(("first", "last", "length_mm"), [(100.0, 200.0, 500.0), (100.0, 150.0, 250.0)])
-def test_spline_is_trimmed_in_parameters_of_its_knots(first: float, last: float, length_mm: float) -> None:
-    ifc = Ifc()
-    control = [ifc.point((0, 0, 0)), ifc.point((500, 0, 0))]
-    shape = ("UNSPECIFIED", False, False, [2, 2], [100.0, 200.0], "UNSPECIFIED")
-    spline = ifc.new("IfcBSplineCurveWithKnots", 1, control, *shape)
-    trims = [ifc.parameter(first)], [ifc.parameter(last)]
-    ifc.bar(ifc.disc(ifc.new("IfcTrimmedCurve", spline, *trims, True, "PARAMETER")))
-    axis_mm = ifc.axis_m() * 1000
-    np.testing.assert_allclose(axis_mm[[0, -1]], [(0, 0, 0), (length_mm, 0, 0)], atol=1e-9)
-
-
 def test_host_is_a_whole_or_a_connected_element() -> None:
     ifc = Ifc()
     part, connected, other = (ifc.bar(ifc.disc(ifc.polyline((0, y, 0), (500, y, 0)))) for y in (0, 100, 200))
@@ -298,20 +285,3 @@ def test_host_is_a_whole_or_a_connected_element() -> None:
     storey = ifc.rooted("IfcBuildingStorey", Name="EG")
     ifc.rooted("IfcRelContainedInSpatialStructure", RelatedElements=[wall, other], RelatingStructure=storey)
     assert [(bar.host, bar.storey) for bar in ifc.bars()] == [("W", "EG"), ("S", None), (None, "EG")]
-
-
-def test_relation_of_all_bars_is_compared_with_its_text_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    ifc = Ifc()
-    bars = [ifc.bar(ifc.disc(ifc.polyline((0, 100 * n, 0), (500, 100 * n, 0)))) for n in range(50)]
-    relation = ifc.rooted("IfcRelAggregates", RelatingObject=ifc.rooted("IfcWall", Name="W"), RelatedObjects=bars)
-    content = ifc.file.to_string().encode()
-    compared: list[int] = []
-    instance = StepText.instance
-
-    def noted_instance(step: StepText, number: int) -> str:
-        compared.append(number)
-        return instance(step, number)
-
-    monkeypatch.setattr(StepText, "instance", noted_instance)
-    assert {bar.host for bar in bars_in_process(content)} == {"W"}
-    assert compared.count(relation.id()) == 1  # Once per bar would take quadratic time.

@@ -156,9 +156,7 @@ def extruded() -> Style:
 
 def tendon() -> Style:
     step = Step(MILLIMETRES, "IFC4")
-    control = ",".join(step.point((x, 0, 0)) for x in (0, 2000, 4000, 6000))
-    spline = step.add(f"IFCBSPLINECURVEWITHKNOTS(3,({control}),.UNSPECIFIED.,.F.,.F.,(4,4),(0.,1.),.UNSPECIFIED.)")
-    step.tendon([step.disc(spline, 7.5, "$", "$")], 0.015)
+    step.tendon([step.disc(step.polyline((0, 0, 0), (6000, 0, 0)), 7.5, "$", "$")], 0.015)
     return Style(step.text(), 1, 0.015, 6.0)
 
 
@@ -215,7 +213,7 @@ STYLES = {
     "Geometry Gym, type with geometry, instances without diameter": typed(),
     "Fabric, reinforcing mesh of 40 discs": fabric(),
     "Precast, extruded circles, 6 in one object": extruded(),
-    "Tendon, B-spline": tendon(),
+    "Tendon": tendon(),
     "Spiral, polyline of 60 chords a turn": single(
         lambda step: step.disc(step.polyline(*SPIRAL), 5.0, "0.", SPIRAL_MM), 0.010, SPIRAL_MM / 1000
     ),
@@ -353,18 +351,32 @@ def test_number_of_points_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
         read(STYLES["Tekla, set of 12 mapped polylines, length"].content)
 
 
-def test_ellipses_reversed_senses_and_trimmed_polylines() -> None:
+def test_reversed_senses_and_trimmed_polylines() -> None:
     step = Step(MILLIMETRES, "IFC4")
-    ellipse = step.add(f"IFCELLIPSE({step.axes},200.,100.)")
-    line = step.polyline((400, 0, 0), (300, 0, 0), (200, 0, 0))
+    circle = step.circle((0, 0, 0), 100.0)
+    line = step.polyline((300, 0, 0), (200, 0, 0), (100, 0, 0))
     segments = []
-    for basis, first, last, trim_sense, sense in ((ellipse, 90, 0, "F", "T"), (line, 0.5, 2, "T", "F")):
+    for basis, first, last, trim_sense, sense in ((circle, 90, 0, "F", "T"), (line, 0.5, 2, "T", "F")):
         trims = f"(IFCPARAMETERVALUE({first:.1f})),(IFCPARAMETERVALUE({last:.1f}))"
         curve = step.add(f"IFCTRIMMEDCURVE({basis},{trims},.{trim_sense}.,.PARAMETER.)")
         segments.append(step.add(f"IFCCOMPOSITECURVESEGMENT(.CONTINUOUS.,.{sense}.,{curve})"))
     step.bar([step.disc(step.add(f"IFCCOMPOSITECURVE(({','.join(segments)}),.F.)"), 6.0, "$", "$")], None, None)
     [bar] = read(step.text())
     axis_mm = np.array(bar.bar.axis_m) * 1000
-    np.testing.assert_allclose(axis_mm[[0, -1]], [(0, 100, 0), (350, 0, 0)], atol=1e-9)
-    on_ellipse = axis_mm[:16]
-    np.testing.assert_allclose(np.hypot(on_ellipse[:, 0] / 200, on_ellipse[:, 1] / 100), 1, atol=1e-12)
+    np.testing.assert_allclose(axis_mm[[0, -1]], [(0, 100, 0), (250, 0, 0)], atol=1e-9)
+    np.testing.assert_allclose(np.linalg.norm(axis_mm[:16], axis=1), 100, atol=1e-12)
+
+
+@pytest.mark.parametrize("is_trimmed", [False, True])
+@pytest.mark.parametrize("kind", ["IfcEllipse", "IfcBSplineCurveWithKnots"])
+def test_other_curves_are_refused_by_name(kind: str, is_trimmed: bool) -> None:
+    step = Step(MILLIMETRES, "IFC4")
+    control = f"({step.point((0, 0, 0))},{step.point((500, 0, 0))})"
+    spline = f"1,{control},.UNSPECIFIED.,.F.,.F.,(2,2),(0.,1.),.UNSPECIFIED."
+    curve = step.add(f"{kind.upper()}({f'{step.axes},200.,100.' if kind == 'IfcEllipse' else spline})")
+    if is_trimmed:
+        trims = "(IFCPARAMETERVALUE(0.)),(IFCPARAMETERVALUE(1.))"
+        curve = step.add(f"IFCTRIMMEDCURVE({curve},{trims},.T.,.PARAMETER.)")
+    step.bar([step.disc(curve, 6.0, "$", "$")], None, None)
+    with pytest.raises(MeshError, match=rf"IfcReinforcingBar 0+2 .*{kind}.* expected .*lines?"):
+        read(step.text())

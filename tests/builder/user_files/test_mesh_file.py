@@ -18,8 +18,11 @@ from dataset_builder.scene.assemblies.lattice import lattice_assembly
 from dataset_builder.scene.mesh_ply import write_mesh_ply
 from dataset_builder.scene.model import Assembly, WorldMesh
 from dataset_builder.specs.config_specs import LatticeSpec
+from dataset_builder.specs.file_specs import Selection
+from dataset_builder.user_files import mesh_import
 from dataset_builder.user_files.cage_file import load_cage, mesh_file_spec, read_cage
 from rebar_depth_bench.base.errors import MeshError
+from rebar_depth_bench.base.limits import MESH_SECONDS
 from tests.builder.user_files.tube_shapes import (
     CENTRELINES_M,
     RODS,
@@ -113,12 +116,37 @@ def test_triangle_soup_is_split_in_order_of_first_face(tmp_path: Path) -> None:
 
 
 def test_objects_are_bars_numbered_by_name(tmp_path: Path) -> None:
-    """An object of two pieces is one bar."""
     content = obj_bytes(RODS, ("bar10", "bar9", "bar1"))
     assert diameters_mm(load_content(tmp_path, "a.obj", content)) == [20, 10, 16]
-    lines = obj_bytes((concatenated(RODS[:2]), RODS[2]), "ab").split(b"\n")
-    content = b"\n".join([*lines[:400], b"usemtl paint", b"g group", *lines[400:]])
-    assert [len(part.mesh.faces) for part in load_content(tmp_path, "a.obj", content).parts] == [512, 256]
+    lines = obj_bytes(RODS[:2], "ab").split(b"\n")
+    content = b"\n".join([*lines[:200], b"usemtl paint", b"g group", *lines[200:]])
+    assert [len(part.mesh.faces) for part in load_content(tmp_path, "a.obj", content).parts] == [256, 256]
+
+
+def test_object_of_several_bars_is_split(tmp_path: Path) -> None:
+    """Bars of a layer are found by its name and by their own; a piece that is no bar keeps an object whole."""
+    path = tmp_path / "a.obj"
+    path.write_bytes(obj_bytes((concatenated(RODS[:2]), RODS[2]), ("layer", "single")))
+    bars = read_cage(mesh_file_spec(path, "m")).bars
+    assert [(bar.source, round(bar.bar.diameter_m * 1000)) for bar in bars] == [
+        ("layer 1", 16),
+        ("layer 2", 10),
+        ("single", 20),
+    ]
+    for pattern, sources in (("layer", ["layer 1", "layer 2"]), ("layer 2", ["layer 2"])):
+        spec = mesh_file_spec(path, "m", None, (Selection((("name", pattern),)),))
+        assert [bar.source for bar in read_cage(spec).bars] == sources
+    plate = trimesh.creation.box((0.1, 0.2, 0.01), trimesh.transformations.translation_matrix((0, 1, 0)))
+    path.write_bytes(obj_bytes((concatenated((RODS[0], plate)), RODS[2]), ("layer", "single")))
+    bars = read_cage(mesh_file_spec(path, "m")).bars
+    assert [(bar.source, bar.bar.has_axis) for bar in bars] == [("layer", False), ("single", True)]
+
+
+def test_time_for_finding_bars_is_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(mesh_import, "MESH_SECONDS", replace(MESH_SECONDS, default=0))
+    for name, content in (("a.stl", BINARY_STL), ("a.obj", obj_bytes(RODS, "abc"))):
+        with pytest.raises(MeshError, match=r"more than 0 s of processor time, .* REBAR_MAX_MESH_SECONDS raises"):
+            load_content(tmp_path, name, content)
 
 
 def test_polygons_are_triangulated_and_oriented_outward(tmp_path: Path) -> None:
@@ -156,13 +184,14 @@ def test_axis_and_diameter_of_open_tube_far_from_origin(tmp_path: Path) -> None:
 
 
 def test_parts_that_are_no_round_bar_have_no_axis_and_are_named(tmp_path: Path) -> None:
-    """A note names a wedge, and a part of two rods, which stays one part; a bent bar gets its bent axis."""
+    """A note names a wedge, and an object of two wedges, which stays one; a bent bar gets its bent axis."""
     ends = [[x, y, z] for x in (0.0, 1.0) for y, z in ((0.0, 0.0), (0.03, 0.0), (0.0, 0.04))]
     faces = [[0, 2, 1], [3, 4, 5], [0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4], [2, 0, 3], [2, 3, 5]]
     line_m = CENTRELINES_M["U-bar"]
     u_bar = swept(line_m, 12)
     u_body = trimesh.Trimesh(u_bar.vertices_m, u_bar.faces)
-    bodies = (trimesh.Trimesh(ends, faces), concatenated(RODS[:2]), u_body, RODS[2])
+    wedge = trimesh.Trimesh(ends, faces)
+    bodies = (wedge, concatenated((wedge, wedge.copy().apply_translation([0, 1, 0]))), u_body, RODS[2])
     assembly = load_content(tmp_path, "a.obj", obj_bytes(bodies, "abcd"))
     assert [bar.has_axis for bar in assembly.bars] == [False, False, True, True]
     assert len(assembly.bars[3].axis_m) == 2
@@ -219,35 +248,37 @@ INVALID_OBJ: dict[str, tuple[bytes | str, str]] = {
     "points only": (TRIANGLE, "no triangle found"),
     "corner beyond": (TRIANGLE + "f 1 2 9", "line 4: a corner is vertex 9, expected 1 to 3"),
     "corner 0": (TRIANGLE + "f 0 1 2", "line 4: a corner is vertex 0, expected 1 to 3"),
-    "corner before": (TRIANGLE + "f -3 -2 -4", "line 4: a corner is vertex -4, expected 1 to 3"),
-    "no number": (TRIANGLE + "f 1 2 x", "line 4: found f 1 2 x, expected three or more corners"),
-    "two corners": (TRIANGLE + "f 1 2 3\nf 1 2", "line 5: found f 1 2, expected three or more"),
-    "two coordinates": ("v 0 0 0\nv 1 0\nv 0 1 0\nf 1 2 3", "line 2: a vertex of 2 numbers"),
+    "corner before": (TRIANGLE + "f -3 -2 -4", "line 4: a corner is vertex 0, expected 1 to 3"),
+    "no number": (TRIANGLE + "f 1 2 x", "line 4: found f 1 2 x, expected .* f with three or more corners"),
+    "two corners": (TRIANGLE + "f 1 2 3\nf 1 2", "line 5: found f 1 2, expected .* three or more"),
+    "two coordinates": ("v 0 0 0\nv 1 0\nv 0 1 0\nf 1 2 3", "line 2: found v 1 0, expected v with 3"),
     "four coordinates": (TRIANGLE + "v 1 2 3 4\nf 1 2 3", "line 4: a vertex of 4 numbers"),
-    "underscore": (TRIANGLE + "v 1_0 0 0\nf 1 2 3", "line 4: got 1_0, expected a number"),
-    "damaged v": (TRIANGLE + "w 0 0 0\nf 1 2 3", 'line 4: found w 0 0 0, expected "v"'),
-    "damaged f": (TRIANGLE + "f 1 2 3\ne 1//1 2//1 3//1", 'line 5: found e 1//1 2//1 3//1, expected "v"'),
-    "surface": (TRIANGLE + "f 1 2 3\nsurf 0 1 0 1 1 2 3", "line 5: found surf, expected polygons"),
-    "nan": (TRIANGLE + "v nan 0 0\nf 1 2 4", "line 4: a vertex is .nan, 0.0, 0.0., expected finite"),
+    "underscore": (TRIANGLE + "v 1_0 0 0\nf 1 2 3", "line 4: found v 1_0 0 0, expected v with 3"),
+    "damaged v": (TRIANGLE + "w 0 0 0\nf 1 2 3", "line 4: found w 0 0 0, expected v with 3"),
+    "damaged f": (TRIANGLE + "f 1 2 3\ne 1//1 2//1 3//1", "line 5: found e 1//1 2//1 3//1, expected v with 3"),
+    "surface": (TRIANGLE + "f 1 2 3\nsurf 0 1 0 1 1 2 3", "line 5: found surf 0 1"),
+    "nan": (TRIANGLE + "v nan 0 0\nf 1 2 4", "line 4: found v nan 0 0, expected v with 3"),
     "no area": (
         TRIANGLE + "f 1 2 2",
         "part 1 .1 triangles. is not a valid .*: every triangle has zero area",
     ),
 }
 INVALID_STL: dict[str, tuple[bytes | str, str]] = {
-    "empty": ("", "0 bytes, expected a text or binary STL"),
+    "empty": ("", "has 0 bytes, expected 84, or a text"),
     "cut binary": (BINARY_STL[:-1], "the header counts 256 triangles, but the file has 12883 bytes"),
     "long binary": (BINARY_STL + bytes(50), "counts 256 triangles.* 12934 bytes, expected 12884"),
-    "cut text": (STL[:-80], "line 1787: found facet normal.*, expected a facet of three vertices"),
-    "no endsolid": (STL.replace("endsolid", ""), "the file ends, expected a facet .* or .endsolid"),
+    "cut text": (STL[:-80], "line 1787: found facet normal.*, expected .* facets of three vertices"),
+    "no endsolid": (STL.replace("endsolid", ""), "the file ends, expected .* facets .* and .endsolid"),
     "quadrilateral": (STL.replace("endloop", "vertex 0 0 0\nendloop", 1), "line 2: found facet normal"),
-    "letter in a number": (STL.replace("vertex 0", "vertex O", 1), "triangle [0-9]+: got O.*, expected a number"),
-    "inf in a second solid": (STL + "\n" + STL.replace("vertex 0.0", "vertex inf", 1), "finite"),
+    "letter in a number": (
+        STL.replace("vertex 0", "vertex O", 1),
+        "line 2: found facet normal.*, expected .* three numbers",
+    ),
+    "inf in a second solid": (STL + "\n" + STL.replace("vertex 0.0", "vertex inf", 1), "line 1798: found facet"),
 }
 LINES = "element face 1\nproperty list uchar int a\nend_header\n0 0 0\n2 0 0\n"
 HUGE_LIST = HEADER.replace("ascii", "binary_little_endian")
 HUGE_LIST += "element face 1\nproperty list uint64 double vertex_indices\nend_header\n"
-TWICE = "header: an element or property occurs twice"
 INVALID_PLY: dict[str, tuple[bytes | str, str]] = {
     "empty": ("", "no PLY header"),
     "half a header": (PLY[:60], "no PLY header"),
@@ -257,9 +288,9 @@ INVALID_PLY: dict[str, tuple[bytes | str, str]] = {
     "long text": (PLY + "3 0 1 2\n", "387 rows after the header, expected 386"),
     "fewer faces": (PLY.replace("face 256", "face 255"), "386 rows after the header, expected 385"),
     "split row": (PLY.replace("\n3 ", "\n3\n", 1), "387 rows after the header, expected 386"),
-    "short row": (PLY.replace("\n3 ", "\n4 ", 1), "face 0: found 4 .*, expected the values"),
-    "word": (PLY.replace("\n3 ", "\nthree ", 1), "face 0: got three, expected a number"),
-    "corner beyond": (PLY.replace("\n3 ", "\n3 999", 1), "triangle 0: the corners are the vertices .999"),
+    "short row": (PLY.replace("\n3 ", "\n4 ", 1), "face 0: found 4 .*, expected the numbers"),
+    "word": (PLY.replace("\n3 ", "\nthree ", 1), "face 0: found three .*, expected the numbers"),
+    "corner beyond": (PLY.replace("\n3 ", "\n3 999", 1), "triangle 1: the corners are the vertices .999"),
     "corner 0.5": (PLY.replace("\n3 ", "\n3 0.5", 1), "a corner is vertex 0.5"),
     "cut binary": (BINARY_PLY[:-1], "the file ends within the 256 rows of face"),
     "long binary": (BINARY_PLY + b"a", "1 bytes after the last row"),
@@ -267,8 +298,11 @@ INVALID_PLY: dict[str, tuple[bytes | str, str]] = {
     "huge list": (HUGE_LIST.encode() + bytes(12) + b"\xff" * 8, "the file ends within the 1 rows of face"),
     "no faces": (HEADER + "element face 0\nproperty list uchar int a\nend_header\n0 0 0\n", "no triangle"),
     "lines": (HEADER + LINES, "face 0: 2 corners, expected three or more"),
-    "element twice": (HEADER + "element vertex 1\nend_header\n", TWICE),
-    "property twice": (HEADER + "property int x\nend_header\n", TWICE),
+    "element twice": (
+        HEADER + "element vertex 1\nend_header\n",
+        "line 7: found element vertex 1, expected .* once",
+    ),
+    "property twice": (HEADER + "property int x\nend_header\n", "line 7: found property int x, expected .* once"),
     "unknown type": (PLY.replace("float z", "quad z"), "line 7: found property quad z"),
     "foreign bar_id": (PLY.replace("end_h", "property int bar_id\nend_h"), "has the property bar_id, but not"),
 }
@@ -295,9 +329,16 @@ PLY_LIKE_MESHLAB = (
     "property uchar blue\r\nelement face 256\r\nproperty list uint8 uint32 vertex_index\r\n"
     "property float quality\r\nelement camera 1\r\nproperty list int float values\r\nend_header\r\n"
     + "".join(f"{x!r} {y!r} {z!r} 255 0 0 \r\n" for x, y, z in RODS[0].vertices.tolist())
-    + "".join(f"3 {a} {b} {c} nan\r\n" for a, b, c in RODS[0].faces.tolist())
+    + "".join(f"3 {a} {b} {c} -nan(ind)\r\n" for a, b, c in RODS[0].faces.tolist())
     + "4 1 2.5 3 4\r\n\r\n"
 )
+
+
+_LINES, _, _BODY = BINARY_PLY.replace(
+    b"element vertex", b"element mark 1\nproperty uchar a\nelement vertex"
+).partition(b"end_header\n")
+PLY_LIKE_RHINO = _LINES.replace(b"\n", b"\r") + b"end_header\r\n" + _BODY
+"""PLY whose lines end with CR; the value of the first element, a line feed, follows."""
 
 
 def big_endian_ply() -> bytes:
@@ -328,6 +369,8 @@ OBJ_LIKE_RHINO = (
 SOUND_FILES: dict[str, tuple[str, bytes | str]] = {
     "meshlab ply": (".ply", PLY_LIKE_MESHLAB.encode("latin-1")),
     "ply with a line end": (".ply", BINARY_PLY + b"\n"),
+    "text ply with carriage returns": (".ply", PLY_LIKE_MESHLAB.replace("\n", "").encode("latin-1")),
+    "ply with carriage returns": (".ply", PLY_LIKE_RHINO),
     "rhino obj": (".obj", OBJ_LIKE_RHINO),
     "obj with a byte order mark": (".obj", b"\xef\xbb\xbf" + obj_bytes(RODS[:1], "a")),
     "stl that begins with solid": (".stl", b"solid of a CAD program".ljust(80) + BINARY_STL[80:]),

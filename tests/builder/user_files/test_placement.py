@@ -16,7 +16,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dataset_builder.catalog import scene_file
-from dataset_builder.catalog.scene_file import scene_cage, scene_config
+from dataset_builder.catalog.scene_file import scene_cage
 from dataset_builder.scene.assemblies.cage import Cage, CageBar
 from dataset_builder.specs.config_specs import SurveySpec
 from dataset_builder.specs.file_specs import Origin, PlacementSpec, Up
@@ -25,7 +25,7 @@ from dataset_builder.user_files.cage_placement import placed
 from dataset_builder.user_files.make_assembly import make_assembly
 from rebar_depth_bench.base.errors import InputError, MeshError
 from rebar_depth_bench.data.bars import Bar
-from tests.builder.catalog.scene_files import BAR, MM, write_scene
+from tests.builder.catalog.scene_files import BAR, MM, scene_config, write_scene
 from tests.builder.user_files.ifc_writer import SITE_TURN_DEG, site_from_world_m, write_site_model
 from tests.builder.user_files.tube_shapes import RODS, concatenated, obj_bytes
 

@@ -12,13 +12,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dataset_builder.catalog.named_configs import CONFIGS, BuildRequest
-from dataset_builder.catalog.scene_file import scene_config, scene_name_of
+from dataset_builder.catalog.scene_file import scene_name_of
 from dataset_builder.specs.config_specs import DomeSpec, SurveySpec
 from dataset_builder.user_files import scene_schema
 from dataset_builder.user_files.cage_file import cage_file_spec, load_cage
 from dataset_builder.user_files.scene_schema import read_scene_toml
 from rebar_depth_bench.base.errors import InputError, MeshError
-from tests.builder.catalog.scene_files import BAR, MM, write_scene
+from tests.builder.catalog.scene_files import BAR, MM, scene_config, write_scene
 
 ROW = "count = 3\nstep = [0, 50, 0]\n"
 SURVEY = "[cameras]\nkind = 'survey'\n"
