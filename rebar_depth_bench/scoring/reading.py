@@ -239,8 +239,12 @@ def _is_name(value: Any) -> bool:
     )
 
 
+def _is_finite(value: Any) -> bool:
+    return type(value) in (int, float) and abs(value) <= sys.float_info.max
+
+
 def _is_size(value: Any) -> bool:
-    return type(value) in (int, float) and 0 <= value <= sys.float_info.max
+    return _is_finite(value) and bool(value >= 0)
 
 
 def _numbers_from_json(
@@ -313,15 +317,17 @@ def _intervals_from_json(entry: Any, kind: str, where: str, problems: list[Probl
         group = column.place.rpartition(".")[0]
         inner = at_place(entry, group) if group else entry
         ends = at_place(entry, column.place)
-        is_pair = isinstance(ends, list) and len(ends) == 2
+        intervals[column.place] = None
         if inner is not None and not isinstance(inner, dict):
             problem = Problem(
                 "invalid", format_location(where, *filter(None, [group])), f"got {short_repr(inner)}", "a table"
             )
             if problem not in problems:
                 problems.append(problem)
-        elif ends is not None and not (is_pair and all(end is None or type(end) in (int, float) for end in ends)):
+        elif isinstance(ends, list) and len(ends) == 2 and all(end is None or _is_finite(end) for end in ends):
+            if None not in ends:
+                intervals[column.place] = float(ends[0]), float(ends[1])
+        elif ends is not None:
             place = format_location(where, *column.place.split("."))
             problems.append(Problem("invalid", place, f"got {short_repr(ends)}", "two numbers, or null"))
-        intervals[column.place] = (float(ends[0]), float(ends[1])) if is_pair and None not in ends else None
     return intervals

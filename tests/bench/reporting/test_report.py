@@ -23,7 +23,7 @@ from rebar_depth_bench.reporting.detections import DetectionPage, PageTable, ren
 from rebar_depth_bench.reporting.html.page import WORST_SHOWN, render_report
 from rebar_depth_bench.reporting.html.views import views_to_show
 from rebar_depth_bench.reporting.published import paper_scenes
-from rebar_depth_bench.scoring.columns import COVERAGE, NATIVE, RANK_ERROR, SCALE, SCALED, WITHIN, Cell
+from rebar_depth_bench.scoring.columns import COVERAGE, NATIVE, SCALE, SCALED, WITHIN, Cell
 from tests.bench.reporting.pages import Page, without_embedded
 from tests.bench.reporting.results import (
     HOSTILE,
@@ -186,8 +186,6 @@ def test_intervals_use_the_decimals_of_their_numbers() -> None:
         "1.0 – 2.0",
         "0.600 – 0.700",
     ]
-    assert RANK_ERROR.interval_text((0.1, math.inf)) == ""
-    assert RANK_ERROR.interval_text((math.nan, 1.0)) == ""
     assert COVERAGE.interval_text(None) == ""
 
 

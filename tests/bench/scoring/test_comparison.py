@@ -29,7 +29,6 @@ from rebar_depth_bench.scoring.columns import METRIC_COLUMNS, METRICS, WITHIN
 from rebar_depth_bench.scoring.comparison import Difference, Verdict, compare
 from rebar_depth_bench.scoring.result import DatasetIdentity, Result
 from rebar_depth_bench.scoring.spreadsheet import Sheet, differences_sheet, tables_sheet
-from rebar_depth_bench.scoring.table import ViewScore
 from tests.bench.reporting.pages import Page
 from tests.bench.reporting.results import HOSTILE, changed, result, scored_view, unpredicted_view
 from tests.damage import change_manifest, copy_dataset
@@ -43,19 +42,9 @@ def result_of(errors: np.ndarray, method: str = "m", config: str = "lattice", di
             views.append(unpredicted_view(view_id))
             continue
         metrics = dict(zip(METRICS, (error, 10 * error, 9 * error, 1 - error / 10), strict=True))
-        numbers = {
-            "scored_px": 100.0,
-            "coverage": 1.0,
-            "rank_error": error / (1 + error),
-            "scale": 1.0 + error,
-            **{
-                f"{alignment}.{name}": value
-                for alignment in ("native", "scaled")
-                for name, value in metrics.items()
-            },
-            **{column.place: 1 - error / 2 for column in WITHIN},
-        }
-        views.append(ViewScore(view_id, numbers))
+        numbers = {f"{start}.{name}": metrics[name] for start in ("native", "scaled") for name in METRICS}
+        numbers |= {column.place: 1 - error / 2 for column in WITHIN}
+        views.append(changed(scored_view(view_id, error, scale=1.0 + error), numbers))
     return replace(result(*views, method=method), dataset=DatasetIdentity(digest, "1"))
 
 

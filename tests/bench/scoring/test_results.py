@@ -187,6 +187,11 @@ def set_groups(groups: object) -> Change:
         (set_at("tables", "lattice", "scaled", "delta1", value=2), "invalid tables.lattice.scaled.delta1"),
         (set_at("tables", "lattice", "within_mm", value={"3": 1}), "missing tables.lattice.within_mm.5"),
         (set_at("tables", "lattice", "ci95", "coverage", value=[1]), "invalid tables.lattice.ci95.coverage"),
+        (set_at("tables", "lattice", "ci95", "coverage", value=["a", 1]), "invalid tables.lattice.ci95.coverage"),
+        (
+            set_at("tables", "lattice", "ci95", "coverage", value=[10**400, 1]),
+            "invalid tables.lattice.ci95.coverage",
+        ),
         (set_at("tables", "lattice", "ci95", "native", value=3), "invalid tables.lattice.ci95.native"),
         (set_at("tables", "a\x1b[2J", value={}), r"invalid tables.'a\x1b[2J'"),
         (set_at("views", value={}), "invalid views"),
