@@ -236,7 +236,7 @@ def _scene_checks(
             cycles_eyes += [view.left, view.right]
         progress(f"audit of {config.label}", n + 1, len(config.views))
     yield Check("rows", f"{len(config.views)} views", "all invariants", tuple(row_faults))
-    yield Check("cameras", f"{len(expected)} poses of the protocol", "equal to 1e-12", tuple(camera_faults))
+    yield Check("cameras", f"{len(expected)} poses of the trajectory", "equal to 1e-12", tuple(camera_faults))
     for check, _, measurements in measured:
         yield check.verdict(audited, measurements)
     difference_and_depth_m = cycles_difference_m(

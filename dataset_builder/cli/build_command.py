@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--views",
         type=int,
         metavar="N",
-        help="number of views per config, evenly spaced over the full protocol (default: all)",
+        help="number of views per config, evenly spaced over the trajectory (default: all)",
     )
     parser.add_argument(
         "--width", type=int, default=BuildRequest.width, help="image width in pixels (default: %(default)s)"

@@ -354,8 +354,9 @@ def kind_text(result: Result) -> str:
 
 
 def sort_error(table: Table) -> float:
-    """Return the error by which tables are ordered, rounded as in the JSON; 0 if it is undefined."""
-    return rounded(table.error) or 0.0
+    """Return the error by which tables are ordered, rounded as in the JSON; inf if it is undefined."""
+    error = rounded(table.error)
+    return math.inf if error is None else error
 
 
 def error_and_constant(table: Table) -> tuple[float, float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import statistics
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -74,7 +74,7 @@ class ViewScore:
         return self[column.in_view]
 
     def interval(self, column: Column) -> None:
-        """Return None: numbers of single views have no intervals."""
+        """Return None: numbers of a view have no intervals. Views and tables share ``Column.cell``."""
 
     @property
     def error(self) -> float:
@@ -128,9 +128,10 @@ class Frame:
         columns = {place: column[at] for place, column in self.columns.items()}
         return Frame(tuple(self.view_ids[position] for position in at), columns)
 
-    def of_views(self, view_ids: Collection[str]) -> Frame:
-        """Return some of the views, in the order of this frame."""
-        return self.take([place for place, view_id in enumerate(self.view_ids) if view_id in view_ids])
+    def of_views(self, view_ids: Iterable[str]) -> Frame:
+        """Return the views of these ids, in their order."""
+        position = {view_id: place for place, view_id in enumerate(self.view_ids)}
+        return self.take([position[view_id] for view_id in view_ids])
 
     def views(self) -> Iterator[ViewScore]:
         """Yield the numbers of each view."""
@@ -174,9 +175,8 @@ class Table:
         return self[column.place]
 
     def interval(self, column: Column) -> Interval | None:
-        """Return the interval of the number of a column; None where it is undefined or not finite."""
-        ends = self.intervals.get(column.place)
-        return ends if ends is not None and all(map(math.isfinite, ends)) else None
+        """Return the interval of the number of a column; None where it is undefined."""
+        return self.intervals.get(column.place)
 
     @property
     def error(self) -> float:
@@ -243,7 +243,7 @@ class Table:
         return document
 
 
-def tabulate(frame: Frame, truth: Truth, kind: str = METRIC, declared: Declaration = NOT_DECLARED) -> Table:
+def tabulate(frame: Frame, truth: Truth, kind: str = METRIC, declaration: Declaration = NOT_DECLARED) -> Table:
     """Return the table of a config from the numbers of its scored views, with tables of groups if it has splits.
 
     Scenes are resampled for the intervals of a config with splits, single views for those of a survey, blocks of
@@ -252,43 +252,47 @@ def tabulate(frame: Frame, truth: Truth, kind: str = METRIC, declared: Declarati
     that its square overflows) is written as null; the rank error is always finite.
     """
 
-    def table_of(views: Frame) -> Table:
-        of_kind = kind if len(views) else METRIC  # Without views there is nothing of any kind.
-        columns = interval_columns(of_kind)
-        intervals: dict[str, Interval | None] = dict.fromkeys(column.place for column in columns)
-        if len(views):
-            resampling = resample_views(
-                views.view_ids, by_scene=truth.split is not None, views_per_distance=truth.views_per_distance
-            )
-            values = column_values(views, columns)
-            intervals = column_intervals(
-                bootstrap_estimates(values, columns, resampling), values, columns, resampling
-            )
-        return Table(
-            kind=of_kind,
-            views=len(views),
-            views_scored=int(np.count_nonzero(views["coverage"] > 0)),
-            ranked=kind == METRIC and len(views) > 0 and not declared.uses_ground_truth,
-            numbers={one.place: _summary(one, views) for one in (*table_columns(of_kind), *REFERENCES)},
-            intervals=intervals,
-            split=truth.split,
-            views_per_distance=truth.views_per_distance,
-            truth_sigma_m=truth.truth_sigma_m,
-            published=truth.published,
-        )
-
-    table = table_of(frame)
+    table = _table_of_views(frame, truth, kind, declaration)
     if truth.split is None:
         return table
     groups = {
-        key: {group: table_of(frame.take(at)) for group, at in positions_by_group(grouping, truth.traits).items()}
+        key: {
+            group: _table_of_views(frame.take(positions), truth, kind, declaration)
+            for group, positions in positions_by_group(grouping, truth.traits).items()
+        }
         for key, grouping in GROUPINGS.items()
     }
     return replace(table, groups=groups)
 
 
+def _table_of_views(views: Frame, truth: Truth, kind: str, declaration: Declaration) -> Table:
+    """Return the table of views of a config, all of them or a group, without groups."""
+    if not len(views):
+        kind = METRIC  # Without views there is nothing of any kind.
+    columns = interval_columns(kind)
+    intervals: dict[str, Interval | None] = dict.fromkeys(column.place for column in columns)
+    if len(views):
+        resampling = resample_views(
+            views.view_ids, by_scene=truth.split is not None, views_per_distance=truth.views_per_distance
+        )
+        values = column_values(views, columns)
+        intervals = column_intervals(bootstrap_estimates(values, columns, resampling), values, columns, resampling)
+    return Table(
+        kind=kind,
+        views=len(views),
+        views_scored=int(np.count_nonzero(views["coverage"] > 0)),
+        ranked=kind == METRIC and len(views) > 0 and not declaration.uses_ground_truth,
+        numbers={one.place: _summary(one, views) for one in (*table_columns(kind), *REFERENCES)},
+        intervals=intervals,
+        split=truth.split,
+        views_per_distance=truth.views_per_distance,
+        truth_sigma_m=truth.truth_sigma_m,
+        published=truth.published,
+    )
+
+
 def _summary(column: Column, views: Frame) -> float:
-    """Return what a table has of a column; NaN without values, inf if one overflowed."""
+    """Return the number of a table in a column: NaN without values, inf if one overflowed."""
     values = views[column.in_view]
     defined = values[~np.isnan(values)].tolist()
     if not defined:

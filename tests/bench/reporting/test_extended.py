@@ -16,25 +16,25 @@ from rich.console import Console
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.data.files import file_sha256
-from rebar_depth_bench.extended.fits import MISS_MM
-from rebar_depth_bench.extended.inspection import CAPABILITY_MEASURES
-from rebar_depth_bench.extended.measures import SCALED, Measure, Statistic
-from rebar_depth_bench.extended.families import MEASURE_FAMILIES, measures_by_alignment, score_extended
 from rebar_depth_bench.extended.estimates import (
     ExtendedResult,
     MeasureEstimate,
     ViewSamples,
     tabulate_extended,
-    view_numbers,
+    view_measures,
 )
+from rebar_depth_bench.extended.families import MEASURE_FAMILIES, measures_by_alignment
+from rebar_depth_bench.extended.fits import MISS_MM
+from rebar_depth_bench.extended.inspection import CAPABILITY_MEASURES
+from rebar_depth_bench.extended.measures import SCALED, Measure, Statistic
 from rebar_depth_bench.reporting.extended_tables import print_extended, reach_sentence
 from rebar_depth_bench.reporting.html.extended import (
+    crossing_picture,
     error_kind,
     estimate_cell,
-    extended_config,
     measure_definitions,
 )
-from rebar_depth_bench.reporting.html.page import look_at_views, render_report, write_report
+from rebar_depth_bench.reporting.html.page import render_report
 from rebar_depth_bench.scoring.bootstrap import resample
 from rebar_depth_bench.scoring.evaluation import open_evaluation
 from tests.bench.extended.cage_scenes import HEIGHT, WIDTH
@@ -88,7 +88,7 @@ def make_extended(*configs: str, levels: dict[str, float] | None = None, views: 
     of_config = {index: make_view(index, LEVELS if levels is None else levels) for index in INDICES[:views]}
     table = tabulate_extended(list(of_config.values()), resample(INDICES[:views]), measures)
     numbers = {
-        f"{config}/{index:04d}": view_numbers(one, measures)
+        f"{config}/{index:04d}": view_measures(one, measures)
         for config in configs
         for index, one in of_config.items()
     }
@@ -149,43 +149,29 @@ def test_hostile_name_of_a_config_is_escaped() -> None:
     assert len(ids) == len(set(ids))
 
 
-def test_section_keeps_config_order() -> None:
-    tables = make_extended("pile", "lattice").tables
-    configs = [extended_config(name, table) for name, table in tables.items()]
-    assert [config.name for config in configs] == ["pile", "lattice"]
-    assert all(len(config.tolerances) == len(CAPABILITY_MEASURES) for config in configs)
-
-
 def make_measure(unit: str, statistic: Statistic = "mean") -> Measure:
     return Measure("m", "M", unit, "", "for this test", "s", statistic)
 
 
 @pytest.mark.parametrize(
-    ("estimate", "unit", "text", "interval"),
+    ("estimate", "measure", "text", "interval"),
     [
-        (MeasureEstimate(0.1234, (0.1, 0.2), 9), "%", "12.3", "10.0 – 20.0"),
-        (MeasureEstimate(-1.005, (-2.0, 0.5), 9), "mm", "−1.00", "−2.00 to 0.50"),
-        (MeasureEstimate(1e-9, None, 9), "", "1.0e−09", ""),
-        (MeasureEstimate(math.inf, (1.0, math.inf), 9), "cm", "–", ""),
-        (MeasureEstimate(None, None, 0), "mm", "–", ""),
+        (MeasureEstimate(0.1234, (0.1, 0.2), 9), make_measure("%"), "12.3", "10.0 – 20.0"),
+        (MeasureEstimate(-1.005, (-2.0, 0.5), 9), make_measure("mm"), "−1.00", "−2.00 to 0.50"),
+        (MeasureEstimate(1e-9, None, 9), make_measure(""), "1.0e−09", ""),
+        (MeasureEstimate(math.inf, (1.0, math.inf), 9), make_measure("cm"), "–", ""),
+        (MeasureEstimate(None, None, 0), make_measure("mm"), "–", ""),
+        (MeasureEstimate(2.5, None, 9), CAPABILITY_MEASURES[0], "2.50", ""),
+        (MeasureEstimate(math.inf, None, 9), CAPABILITY_MEASURES[0], "∞", ""),
+        (MeasureEstimate(None, None, 9), CAPABILITY_MEASURES[0], "n/a", ""),
+        (MeasureEstimate(None, None, 0), CAPABILITY_MEASURES[0], "–", ""),
     ],
 )
-def test_estimate_cell_formats_by_unit(estimate: MeasureEstimate, unit: str, text: str, interval: str) -> None:
-    cell = estimate_cell(estimate, make_measure(unit))
+def test_estimate_cell_formats_by_unit(
+    estimate: MeasureEstimate, measure: Measure, text: str, interval: str
+) -> None:
+    cell = estimate_cell(estimate, measure)
     assert (cell.text, cell.interval) == (text, interval)
-
-
-def test_capability_is_formatted_as_ratio() -> None:
-    texts = [
-        estimate_cell(estimate, CAPABILITY_MEASURES[0]).text
-        for estimate in (
-            MeasureEstimate(2.5, None, 9),
-            MeasureEstimate(math.inf, None, 9),
-            MeasureEstimate(None, None, 9),
-            MeasureEstimate(None, None, 0),
-        )
-    ]
-    assert texts == ["2.50", "∞", "n/a", "–"]
 
 
 def test_definitions_differing_only_in_step_are_merged() -> None:
@@ -235,11 +221,9 @@ def mat(tmp_path_factory: pytest.TempPathFactory) -> Mat:
     return Mat(root, write_mat_dataset(root))
 
 
-def extended(archive: Path, root: Path, *families: str) -> ExtendedResult:
-    """Return the extended measures of an archive, all or those of some families."""
-    chosen = [MEASURE_FAMILIES[name] for name in families or MEASURE_FAMILIES]
-    with open_evaluation(archive, root) as evaluation:
-        found = score_extended(evaluation, chosen).extended
+def extended(archive: Path, root: Path) -> ExtendedResult:
+    """Return the extended measures of an archive."""
+    found = rdb.score(archive, root, extended=True).extended
     assert found is not None
     return found
 
@@ -261,12 +245,7 @@ def test_measures_of_a_config_pool_its_views(mat: Mat) -> None:
     text = " ".join(console.export_text().split())
     assert "tie point: median, mm" in text
     assert reach_sentence("scaled", table.reaches["scaled"][1]) in text
-
-    alone = extended(archive, mat.root, "crossings")
-    assert alone.tables[CONFIG].reaches == table.reaches
-    heads = {measure.name.partition("_")[0] for measure in alone.measures["native"]}
-    assert heads == {"crossing", "crossings", "tie"}
-    content = alone.to_dict()
+    content = found.to_dict()
     assert content["crossings"] == {
         "file": "crossings.parquet",
         "sha256": file_sha256(mat.root / "crossings.parquet"),
@@ -292,9 +271,9 @@ def test_older_folder_is_stamped_with_its_bars(mat: Mat, tmp_path: Path) -> None
 def test_report_shows_crossings_by_error(mat: Mat, tmp_path: Path) -> None:
     archive = mat.archive({0: 3.0})
     with open_evaluation(archive, mat.root) as evaluation:
-        scored = score_extended(evaluation)
-        picture = look_at_views(evaluation, {}, crossings=True).pictures[CONFIG]
-        write_report(scored, evaluation, tmp_path / "report.html")
+        picture = crossing_picture(evaluation, evaluation.configs[0])
+    assert picture is not None
+    rdb.score(archive, mat.root, extended=True).to_html(tmp_path / "report.html")
     assert (picture.view_id, picture.width, picture.height) == (f"{CONFIG}/0000", WIDTH, HEIGHT)
     assert [(kind, count) for kind, _, count in picture.counts] == [("within5", 4)]
     assert all(0 < x < WIDTH and 0 < y < HEIGHT for _, x, y in picture.marks)
@@ -315,16 +294,6 @@ def test_config_of_several_scenes_has_crossings_of_each(mat: Mat) -> None:
     assert numbers["crossings_located"].value == 0.5
 
 
-@pytest.mark.parametrize(
-    ("error_mm", "kind"),
-    [
-        (0.0, "within2"),
-        (2.0, "within2"),
-        (2.1, "within5"),
-        (9.9, "within10"),
-        (10.1, "beyond"),
-        (np.inf, "beyond"),
-    ],
-)
-def test_marks_have_the_colour_of_their_error(error_mm: float, kind: str) -> None:
-    assert error_kind(error_mm) == kind
+def test_marks_have_the_colour_of_their_error() -> None:
+    kinds = [error_kind(error_mm) for error_mm in (0.0, 2.0, 2.1, 9.9, 10.1, np.inf)]
+    assert kinds == ["within2", "within2", "within5", "within10", "beyond", "beyond"]

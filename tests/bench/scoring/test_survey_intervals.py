@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -12,21 +11,16 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from rebar_depth_bench import SubmissionWriter
-from rebar_depth_bench.cli.main import main
+from rebar_depth_bench import SubmissionWriter, score
 from rebar_depth_bench.detections.crossing_scorer import score_crossings
-from rebar_depth_bench.extended.families import score_extended
 from rebar_depth_bench.scoring import bootstrap
 from rebar_depth_bench.scoring.bootstrap import MIN_BLOCKS, RESAMPLES, Resampling, interval, resample_survey
 from rebar_depth_bench.scoring.comparison import Difference, compare
-from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.reading import read_result
 from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.scoring.table import tabulate
-from tests.bench.reporting.results import result, scored_view
+from tests.bench.reporting.results import result, scored_view, table_of
 from tests.damage import change_manifest
 from tests.mat_dataset import CONFIG, VIEWS, write_mat_dataset
-from tests.synthetic_dataset import write_archive, write_dataset
 
 PER_DISTANCE = 12
 UNEQUAL = (12, 7, 12, 5)
@@ -83,7 +77,7 @@ def of_survey(rank_errors: np.ndarray, method: str) -> Result:
     views = [
         scored_view(f"column/{index:04d}", float(error / (1 - error))) for index, error in enumerate(rank_errors)
     ]
-    table = tabulate(views, views_per_distance=len(views) // 4)
+    table = table_of(views, views_per_distance=len(views) // 4)
     return replace(result(*views, method=method), tables={"column": table})
 
 
@@ -113,7 +107,7 @@ def test_few_scenes_are_named() -> None:
     results = []
     for error in (0.1, 0.8):
         views = [scored_view(f"column/test-s{index % 3}-{index:04d}", error) for index in range(60)]
-        results.append(replace(result(), tables={"column": tabulate(views, split="test")}, views=views))
+        results.append(replace(result(*views), tables={"column": table_of(views, split="test")}))
     assert rank_row(*results).verdict == "too few scenes"
 
 
@@ -122,27 +116,6 @@ def as_survey(root: Path, config: str, distances: int, views: int) -> None:
     protocol: dict[str, Any] = {"kind": "survey", "distances_m": [1.0] * distances}
     protocol["views_per_distance"] = views // distances
     change_manifest(root, lambda _, entry: entry["scenes"][0].update(protocol=protocol), config)
-
-
-def test_command_compares_a_survey_of_48_views(tmp_path: Path) -> None:
-    root, views = tmp_path / "root", 48
-    write_dataset(root, ["column"], views)
-    as_survey(root, "column", 4, views)
-    for seed, name in enumerate(("a", "b")):
-        write_archive(tmp_path / f"{name}.zip", ["column"], views, name, seed)
-    far = tmp_path / "far.zip"
-    with open_evaluation(tmp_path / "b.zip", root) as evaluation, SubmissionWriter(far, "far") as writer:
-        for view_id in evaluation.submission.view_ids:
-            writer.add(view_id, 1.5 * evaluation.submission.read(view_id))
-    compared, scored = tmp_path / "compared.json", tmp_path / "scored.json"
-    assert main(["compare", str(tmp_path / "a.zip"), str(far), "--data", str(root), "--json", str(compared)]) == 0
-    [comparison] = json.loads(compared.read_text())
-    rows = {row["name"]: row for row in comparison["configs"]["column"]}
-    assert rows["rank_error"]["verdict"] == "worse"
-    assert main(["score", str(far), "--data", str(root), "--json", str(scored)]) == 0
-    written = read_result(scored.read_bytes(), "scored.json")
-    assert written.tables["column"].views_per_distance == 12
-    assert written.to_json() == scored.read_bytes()
 
 
 def test_all_results_of_a_survey_have_its_intervals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -158,10 +131,11 @@ def test_all_results_of_a_survey_have_its_intervals(tmp_path: Path, monkeypatch:
     for is_survey in (False, True):
         if is_survey:
             as_survey(tmp_path / "mat", CONFIG, 1, VIEWS)
-        with open_evaluation(archive, tmp_path / "mat") as evaluation:
-            scored = score_extended(evaluation)
+        scored = score(archive, tmp_path / "mat", extended=True)
         assert scored.extended is not None
         estimates = scored.extended.tables[CONFIG].numbers["native"].values()
+        written = read_result(scored.to_json(), "result.json")
+        assert written.tables[CONFIG].views_per_distance == (VIEWS if is_survey else None)
         found = score_crossings(detected, tmp_path / "mat").to_dict()
         assert (scored.tables[CONFIG].intervals["rank_error"] is not None) == is_survey
         assert any(estimate.interval is not None for estimate in estimates) == is_survey
