@@ -6,11 +6,12 @@ import math
 import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray
+from pydantic import Strict
 
 from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval, resample_views
 from rebar_depth_bench.scoring.columns import (
@@ -35,8 +36,8 @@ from rebar_depth_bench.submission.declaration import METRIC, NOT_DECLARED, Decla
 class PublishedMatch:
     """Scene of Table I that a config shows; ``same_optics`` is False if nothing but the optics differs."""
 
-    scene: str
-    same_optics: bool
+    scene: Annotated[str, Strict()]
+    same_optics: Annotated[bool, Strict()]
 
 
 @dataclass(frozen=True, eq=False)
