@@ -139,7 +139,10 @@ def detections_of_view(detections: Detections, rows: Int64[ndarray, " n"], truth
 
 
 def compare_view(detected: SeenDetections, truth: SteelTruth, least: float | None) -> ViewDetections:
-    """Compare the detections of one view with its crossings; those with a confidence of ``least`` are matched."""
+    """Compare the detections of one view with its crossings.
+
+    Detections with a confidence of ``least`` or more are matched, all of them if it is None.
+    """
     scene = truth.bars.crossings.crossings
     all_m = transform(truth.cam_from_world, scene.tie_point_m)
     judged = truth.judged.crossing

@@ -232,9 +232,9 @@ def _closest_points_m(fitted: FittedAxes) -> tuple[Float64[ndarray, "m 3"], Floa
 def crossing_samples(p_m: Float64[ndarray, " n"], view: ViewCrossings) -> Samples:
     """Return the crossing samples of one view; the measures define what each is.
 
-    ``p_m`` is planar depth on the pixels of ``SteelTruth`` in metres, NaN where missing. Errors named
-    ``..._error_...`` are signed and of located crossings, those named ``..._judged_...`` absolute and of all.
-    ``crossing_z_m`` is the true depth of each tie point, in the order of the judged errors.
+    ``p_m`` is planar depth on the pixels of ``SteelTruth`` in metres, NaN where missing. ``..._error_...`` are
+    signed errors of located crossings, ``..._judged_...`` absolute errors of all crossings. ``crossing_z_m`` is
+    the true depth of each tie point, in the order of the judged errors.
     """
     located, found = fitted_ties(p_m, view)
     true = view.ties

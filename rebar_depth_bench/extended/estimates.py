@@ -168,7 +168,7 @@ def _estimates(
 
 
 def convert_estimate(measure: Measure, statistic: MeasureEstimate) -> MeasureEstimate:
-    """Return a measure's estimate from that of its statistic, with ``convert`` applied to value and interval.
+    """Return the estimate of a measure: the estimate of its statistic, with ``convert`` applied to value and ends.
 
     ``convert`` is decreasing, so the interval's ends are swapped. An end for which ``convert`` returns None
     becomes 0; if the upper end is infinite there is no interval.

@@ -110,7 +110,7 @@ def median_and_p95(
 ) -> tuple[Measure, Measure]:
     """Return median and 95th percentile of an absolute error over all that is judged, misses included.
 
-    ``unit`` is that of the samples, "mm" or "deg", and ``definition`` continues "Median of the".
+    ``unit`` is the unit of the samples, "mm" or "deg", and ``definition`` continues "Median of the".
     """
     shown, sample = "mm" if unit == "mm" else "", f"{name}_judged_{unit}"
     return (

@@ -12,8 +12,8 @@ neighbours are sought among all pixels:
 
 A missing prediction contributes no point to completeness and is a failure in accuracy, so removing predictions
 raises neither. The shares depend on the size of the image: in a larger one, points lie closer to each other, so
-that a wrong point is nearer to that of another pixel. At long range pixels are farther apart than t (17 mm at 12 m
-and 700 px focal length); a point then matches the point of its own pixel or none.
+that a wrong point is nearer to the point of another pixel. At long range pixels are farther apart than t (17 mm at
+12 m and 700 px focal length); a point then matches the point of its own pixel or none.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ _SEARCH_RADIUS_M = 1.001 * TOLERANCES_MM[-1] / 1000  # the tree's bound is exclu
 class TrueCloud:
     """Queried pixels and true points of a view; they do not depend on a prediction.
 
-    ``position`` holds the positions of the interior pixels in ``SteelTruth.index``, and ``queried`` those of the
-    queried pixels among them. ``rays`` are ``(x/z, y/z, 1)`` of the interior pixels and ``z_m`` their true depth.
-    ``steel_m`` are the true points of all steel pixels, metres in the camera frame.
+    ``position`` holds the positions of the interior pixels in ``SteelTruth.index``, and ``queried`` the positions
+    of the queried pixels among the interior ones. ``rays`` are ``(x/z, y/z, 1)`` of the interior pixels and
+    ``z_m`` their true depth. ``steel_m`` are the true points of all steel pixels, metres in the camera frame.
     """
 
     position: Int64[ndarray, " n"]

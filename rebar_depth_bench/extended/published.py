@@ -1,4 +1,4 @@
-"""Numbers that papers on monocular depth print, beside those of the protocol. None of them ranks.
+"""Numbers that papers on monocular depth print and the protocol lacks. None of them ranks.
 
 p is the prediction and z the ground truth, metres. The measures' definitions state the equations. Boundary F1 is
 ``SI_boundary_F1`` of ml-depth-pro (Bochkovskii et al., "Depth Pro: Sharp Monocular Metric Depth in Less Than a

@@ -62,17 +62,17 @@ class SteelTruth:
 
     ``index`` holds flat indices into the height x width grid, ascending; the other arrays are parallel to it.
     ``depth_m`` is planar depth, metres. ``bar_id`` is 0 beside the steel; ``interior`` marks the scored pixels of
-    the protocol, and ``single_bar`` those of them whose 3 x 3 neighbourhood belongs to one bar. ``rays`` are x/z
-    and y/z of each pixel's ray in the camera frame (lens distortion undone), so that ``x_cam = depth_m * (rays[:,
-    0], rays[:, 1], 1)``. ``run`` is the straight bar segment whose axis is nearest to the true point (an index
-    of ``CageTruth``), -1 where the point is on no segment. ``front_m`` and ``behind_m`` are the depths
-    of the closest other layer in front of and behind the pixel, NaN where none is visible: see
-    ``depth_layers.other_layers``. ``bars`` are those of the scene. ``distortion`` is that of the grid
+    the protocol, and ``single_bar`` the scored pixels whose 3 x 3 neighbourhood belongs to one bar. ``rays`` are
+    x/z and y/z of each pixel's ray in the camera frame (lens distortion undone), so that ``x_cam = depth_m *
+    (rays[:, 0], rays[:, 1], 1)``. ``run`` is the straight bar segment whose axis is nearest to the true point (an
+    index of ``CageTruth``), -1 where the point is on no segment. ``front_m`` and ``behind_m`` are the depths of
+    the closest other layer in front of and behind the pixel, NaN where none is visible: see
+    ``depth_layers.other_layers``. ``bars`` are the bars of the scene. ``distortion`` is the distortion of the grid
     (``cameras.distort``), zeros on an ideal one.
 
     ``parallax_px_m`` is focal length times baseline of a rectified pair, pixels times metres, 0 if there is none;
-    ``seen_by_right`` marks the scored pixels that are not occluded in it (``disparity.match_right``). Of the whole
-    image there are two masks, row by row, packed into bits: ``has_depth``, and ``near_step`` with the depth
+    ``seen_by_right`` marks the scored pixels that the right view sees, too (``disparity.match_right``). Two masks
+    cover the whole image, row by row, packed into bits: ``has_depth``, and ``near_step`` with the depth
     ``step_depth_m`` of its pixels (``published.depth_steps``).
     """
 
