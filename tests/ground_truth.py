@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.scoring.score import Truth
+from rebar_depth_bench.scoring.table import Truth
 from rebar_depth_bench.scoring.truth import config_truth
 
 

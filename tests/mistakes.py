@@ -21,9 +21,9 @@ from scipy.ndimage import gaussian_filter, shift
 from rebar_depth_bench import SubmissionWriter
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import iterate_rows
-from rebar_depth_bench.diagnosis.corrections import UNITS
-from rebar_depth_bench.diagnosis.diagnose import diagnose
-from rebar_depth_bench.scoring.evaluation import open_evaluation
+from rebar_depth_bench.diagnosis.corrections import UNITS, KeptPredictions
+from rebar_depth_bench.diagnosis.diagnose import PossibleMistake, diagnose
+from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation
 
 Image = Float[ndarray, "h w"]
 SOUND = "sound"
@@ -54,10 +54,16 @@ def mistakes_named(root: Path, rows: Sequence[Mapping[str, ndarray]], images: Se
                 for row, image in zip(rows, make(images), strict=True):
                     writer.add(str(row["view_id"]), image)
             with open_evaluation(archive, root) as evaluation:
-                named = [mistake.name for mistake in diagnose(evaluation)]
+                named = [mistake.name for mistake in diagnosed(evaluation)]
         # Logarithms of depth below a metre are negative.
         cells[name] = "yes" if named in ([name], ["negative", name]) else ", ".join(named) or "-"
     return cells
+
+
+def diagnosed(evaluation: Evaluation) -> list[PossibleMistake]:
+    """Return the possible mistakes in the predictions of an archive."""
+    kept = [KeptPredictions.of_archive(config, evaluation.submission) for config in evaluation.configs]
+    return diagnose(kept, evaluation.meta.prediction, evaluation.meta.depth_scale)
 
 
 def mistakes(rows: Sequence[Mapping[str, ndarray]]) -> dict[str, Callable[[Sequence[Image]], list[Image]]]:

@@ -128,7 +128,8 @@ def config_differences(first: Result, other: Result, config: str) -> list[Differ
     the difficulty of each view cancels.
     """
     tables, frames = (first.tables[config], other.tables[config]), (first.frames[config], other.frames[config])
-    shared = set(frames[0].view_ids) & set(frames[1].view_ids)
+    of_other = set(frames[1].view_ids)
+    shared = [view_id for view_id in frames[0].view_ids if view_id in of_other]
     frames = frames[0].of_views(shared), frames[1].of_views(shared)
     table = tables[0]
     are_comparable = all(one.is_comparable for one in tables)

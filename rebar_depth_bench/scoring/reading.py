@@ -314,7 +314,8 @@ def _numbers_from_json(
     for group, members in by_group.items():
         inner = at_place(entry, group) if group else entry
         at = format_location(where, *group.split(".")) if group else where
-        is_error = group in ("native", "scaled", *RELATIVE_ALIGNMENTS)
+        is_metric_error = group in ("native", "scaled")
+        is_error = is_metric_error or group in RELATIVE_ALIGNMENTS
         if inner is None and (is_empty or group.startswith("aligned_robust") or (is_error and not is_predicted)):
             numbers |= {place: math.nan for place, _ in members}
         elif inner is None and is_error:
@@ -339,7 +340,7 @@ def _numbers_from_json(
                 elif value is not _REQUIRED and (
                     isinstance(value, bool) if is_flag else _is_size(value) and value <= column.most
                 ):
-                    numbers[place] = float(value)
+                    numbers[place] = float(value) if is_predicted or not is_metric_error else math.nan
                 else:
                     problems.append(_value_problem(format_location(at, key), value, expected_value))
     return numbers

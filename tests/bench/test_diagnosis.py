@@ -23,13 +23,12 @@ from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import iterate_rows
 from rebar_depth_bench.diagnosis.corrections import (
-    COLUMNS,
     MAX_VIEWS,
     UNITS,
     DiagnosedView,
+    KeptPredictions,
     Pixels,
     best_shift,
-    diagnosed_view,
     mean_error,
     median_ratio,
     positions_to_read,
@@ -37,13 +36,12 @@ from rebar_depth_bench.diagnosis.corrections import (
     resistant_line,
     shape_corrections,
 )
-from rebar_depth_bench.diagnosis.diagnose import diagnose
 from rebar_depth_bench.geometry.cameras import Camera, ideal_K
 from rebar_depth_bench.methods import own_methods
 from rebar_depth_bench.methods.run import predict
 from rebar_depth_bench.scoring.evaluation import open_evaluation
 from tests.commands import run_in_process
-from tests.mistakes import SOUND, learned_like, mistakes, mistakes_named
+from tests.mistakes import SOUND, diagnosed, learned_like, mistakes, mistakes_named
 from tests.synthetic_dataset import write_dataset
 
 pytestmark = pytest.mark.slow
@@ -104,7 +102,7 @@ def test_sound_predictions_of_own_methods_are_not_mistaken(method: str, tiny_roo
     archive = tmp_path / "submission.zip"
     predict(own_methods()[method], tiny_root, archive, configs=["lattice"])
     with open_evaluation(archive, tiny_root) as evaluation:
-        assert diagnose(evaluation) == []
+        assert diagnosed(evaluation) == []
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +126,7 @@ def test_factor_that_no_method_has_is_named(factor: float, tiny_root: Path, tmp_
     archive = tmp_path / "factor.zip"
     _write(archive, rows, [factor * row["left_depth"] for row in rows])
     with open_evaluation(archive, tiny_root) as evaluation:
-        [mistake] = diagnose(evaluation)
+        [mistake] = diagnosed(evaluation)
     assert (mistake.name, f" {factor:.4g} times the depth" in mistake.text) == ("factor", True)
 
 
@@ -150,7 +148,7 @@ def test_depth_scale_that_undoes_the_factor_is_named(
             Image.fromarray(np.rint(1000 * row["left_depth"]).astype(np.uint16)).save(image, "png")
             target.writestr(f"{row['view_id']}.png", image.getvalue())
     with open_evaluation(archive, tiny_root) as evaluation:
-        [mistake] = diagnose(evaluation)
+        [mistake] = diagnosed(evaluation)
     assert mistake.name == ("millimetres" if depth_scale == 1 else "factor")
     assert float(mistake.text.rpartition(f"; depth_scale is {depth_scale:g}, try ")[2]) == pytest.approx(0.001)
 
@@ -268,7 +266,7 @@ def test_at_most_eight_evenly_spaced_views_with_steel_are_read(
 
     archive = archive_of({view_id: np.full((90, 160), float(view_id[-4:])) for view_id in config.view_ids})
     with open_evaluation(archive, root) as evaluation:
-        views = [diagnosed_view(view) for view in evaluation.views(config, COLUMNS, positions)]
+        views = KeptPredictions.of_archive(config, evaluation.submission).views()
     assert [view.position for view in views] == positions
     assert all((view.prediction == view.position).all() for view in views)
 
@@ -301,7 +299,7 @@ def test_inverse_depth_with_any_scale_and_offset_is_fitted(a: float, b: float) -
     z_m = np.linspace(0.5, 3.0, 300)
     pixels = Pixels(np.zeros(300, np.int64), np.arange(300), z_m)
     image = (a / z_m + b)[None]
-    corrections = shape_corrections([_view(pixels, image)], lambda _: image, 1)
+    corrections = shape_corrections([_view(pixels, image)], 1)
     _, fitted = (one for one in corrections if one.name == "inverse")
     assert mean_error(fitted.corrected(_view(pixels, image)), z_m, 1.0) < 0.03
     assert np.isnan(fitted.corrected(_view(pixels, z_m[None]))).all(), "a line that falls"
@@ -329,14 +327,14 @@ def test_mean_error_does_not_depend_on_the_scale(scale: float) -> None:
 
 def _view(pixels: Pixels, image: np.ndarray) -> DiagnosedView:
     camera = Camera(ideal_K(*image.shape[::-1]), np.zeros(5), np.eye(4), *image.shape[::-1])
-    return DiagnosedView(0, camera, 0.12, pixels, pixels, image)
+    return DiagnosedView(0, camera, 0.12, pixels, pixels, image, by_order={})
 
 
 def _named(root: Path, folder: Path, rows: Rows, images: Sequence[np.ndarray]) -> list[str]:
     archive = folder / "submission.zip"
     _write(archive, rows, images)
     with open_evaluation(archive, root) as evaluation:
-        return [mistake.name for mistake in diagnose(evaluation)]
+        return [mistake.name for mistake in diagnosed(evaluation)]
 
 
 def _write(archive: Path, rows: Rows, images: Sequence[np.ndarray]) -> None:

@@ -3,78 +3,119 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from rebar_depth_bench.base.names import config_of
 from rebar_depth_bench.reporting.html.views import ShownView, ViewPanels, shown_view
-from rebar_depth_bench.scoring.metrics import DepthMetrics
-from rebar_depth_bench.scoring.reference import Errors, Reference
+from rebar_depth_bench.scoring.columns import METRICS, SCALED_CONSTANT
 from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareIdentity, SubmissionIdentity
-from rebar_depth_bench.scoring.table import tabulate
-from rebar_depth_bench.scoring.table import PublishedMatch, ViewScore
-from rebar_depth_bench.submission.declaration import NOT_DECLARED, Declaration
+from rebar_depth_bench.scoring.table import Frame, PublishedMatch, Table, Truth, ViewScore, tabulate
+from rebar_depth_bench.submission.declaration import METRIC, NOT_DECLARED, Declaration
 
 DECLARED = Declaration("rgb+K", uses_ground_truth=False)
-REFERENCE = Reference(Errors(0.0571, 2.21), Errors(0.0062, 0.71))
-NEAR_REFERENCE = Reference(Errors(0.2222, 7.89), Errors(0.0333, 4.56))
+REFERENCE = {
+    "reference.constant.abs_rel": 0.0571,
+    "reference.constant.rmse_cm": 2.21,
+    "reference.one_pixel.abs_rel": 0.0062,
+    "reference.one_pixel.rmse_cm": 0.71,
+}
+NEAR_REFERENCE = dict(zip(REFERENCE, (0.2222, 7.89, 0.0333, 4.56), strict=True))
 
 HOSTILE = '=<script src="//evil.example/x.js">alert(1)</script>[red]\x1b[31m\u202e&amp;'
 
 
 def scored_view(view_id: str, abs_rel: float = 0.75, coverage: float = 1.0, scale: float = 0.625) -> ViewScore:
-    """Return a view score with the given native AbsRel and a distinct value in every other field.
+    """Return a view score with the given native AbsRel and a distinct value at every other place.
 
     The rank error grows with the AbsRel: its valid pixels are all predicted too far.
     """
-    return ViewScore(
-        view_id=view_id,
-        scored_px=43210,
-        coverage=coverage,
-        rank_error=1 - coverage / (1 + abs_rel),
-        scale=scale,
-        native=DepthMetrics(abs_rel=abs_rel, rmse_cm=20.09, mae_cm=18.71, delta1=0.1234),
-        scaled=DepthMetrics(abs_rel=0.0613, rmse_cm=1.52, mae_cm=1.17, delta1=0.9876),
-        within_mm={3: 0.0123, 5: 0.0456, 10: 0.0789, 20: 0.1357},
-        scaled_constant=(0.0571, 2.21) if coverage == 1 else (0.0529, 2.05),
-    )
+    numbers = {
+        "scored_px": 43210,
+        "coverage": coverage,
+        "rank_error": 1 - coverage / (1 + abs_rel),
+        "scale": scale,
+        "native.abs_rel": abs_rel,
+        "native.rmse_cm": 20.09,
+        "native.mae_cm": 18.71,
+        "native.delta1": 0.1234,
+        "scaled.abs_rel": 0.0613,
+        "scaled.rmse_cm": 1.52,
+        "scaled.mae_cm": 1.17,
+        "scaled.delta1": 0.9876,
+        "within_mm.3": 0.0123,
+        "within_mm.5": 0.0456,
+        "within_mm.10": 0.0789,
+        "within_mm.20": 0.1357,
+        "reference.scaled_constant.abs_rel": 0.0571 if coverage == 1 else 0.0529,
+        "reference.scaled_constant.rmse_cm": 2.21 if coverage == 1 else 2.05,
+    }
+    return ViewScore(view_id, numbers)
+
+
+def changed(view: ViewScore, numbers: Mapping[str, float]) -> ViewScore:
+    """Return a view score with other numbers at some places."""
+    return replace(view, numbers={**view.numbers, **numbers})
 
 
 def unpredicted_view(view_id: str) -> ViewScore:
     """Return the score of a view without any prediction."""
-    return ViewScore(view_id, 777, 0.0, 1.0, None, None, None, {3: 0.0, 5: 0.0, 10: 0.0, 20: 0.0})
+    within = dict.fromkeys((f"within_mm.{limit}" for limit in (3, 5, 10, 20)), 0.0)
+    return ViewScore(view_id, {"scored_px": 777, "coverage": 0.0, "rank_error": 1.0, **within})
 
 
 def overflowed_view(view_id: str) -> ViewScore:
     """Return the score of a view whose squared native error overflows to infinity."""
-    native = DepthMetrics(abs_rel=1e200, rmse_cm=math.inf, mae_cm=1e202, delta1=0.0)
-    view = scored_view(view_id)
-    return ViewScore(view_id, 5, 1.0, 1.0, 1e-200, native, view.scaled, view.within_mm)
+    native = dict(zip(METRICS, (1e200, math.inf, 1e202, 0.0), strict=True))
+    errors = {f"native.{name}": value for name, value in native.items()}
+    unknown = dict.fromkeys((column.place for column in SCALED_CONSTANT), math.nan)
+    return changed(scored_view(view_id), {"scored_px": 5, "rank_error": 1.0, "scale": 1e-200, **errors, **unknown})
+
+
+def frame_of(views: Sequence[ViewScore], reference: Mapping[str, float] = REFERENCE) -> Frame:
+    """Return the frame of views that all have the reference errors ``reference``."""
+    return Frame.of_rows({view.view_id: {**view.numbers, **reference} for view in views})
+
+
+def table_of(
+    views: Sequence[ViewScore],
+    declared: Declaration = NOT_DECLARED,
+    reference: Mapping[str, float] = REFERENCE,
+    kind: str = METRIC,
+    **of_config: Any,
+) -> Table:
+    """Return the table of views without groups; ``of_config`` are fields of ``Truth``."""
+    frame = frame_of(views, reference)
+    truth = Truth(frame.view_ids, views=(), references=(), **of_config)
+    return replace(tabulate(frame, truth, kind, declared), groups={})
 
 
 def result(
     *views: ViewScore,
     method: str = "my model",
     declared: Declaration = DECLARED,
-    reference: Reference = REFERENCE,
+    reference: Mapping[str, float] = REFERENCE,
 ) -> Result:
     """Return the result of ``views`` with one table per config, in order of appearance."""
-    configs = dict.fromkeys(view.view_id.rpartition("/")[0] for view in views)
-    tables = {
-        name: tabulate(
-            [view for view in views if view.view_id.startswith(f"{name}/")],
-            declared,
-            reference,
-            PublishedMatch(name, same_optics=True) if name in ("lattice", "pile", "pier") else None,
-        )
-        for name in configs
+    by_config: dict[str, list[ViewScore]] = {}
+    for view in views:
+        by_config.setdefault(config_of(view.view_id), []).append(view)
+    published = {
+        name: PublishedMatch(name, same_optics=True) if name in ("lattice", "pile", "pier") else None
+        for name in by_config
     }
     return Result(
         dataset=DatasetIdentity("sha256:" + "fedcba9876543210" * 4, "1.2.3"),
         submission=SubmissionIdentity(method, "0123456789abcdef" * 4, declared.inputs, declared.uses_ground_truth),
         software=SoftwareIdentity("0.1.0"),
-        tables=tables,
-        views=list(views),
+        tables={
+            name: table_of(some, declared, reference, published=published[name])
+            for name, some in by_config.items()
+        },
+        frames={name: frame_of(some, reference) for name, some in by_config.items()},
     )
 
 
@@ -82,24 +123,30 @@ def split_result(group: str = "wall", grouping: str = "family", scenes: int = 8)
     """Return a result of the split ``test`` of ``cages`` in groups; its last scene is in one of its own."""
     views = [scored_view(f"cages/test-s{scene}-0000", 0.1 + 0.01 * scene) for scene in range(scenes)]
     last = unpredicted_view(f"cages/test-s{scenes}-0000")
-    table = tabulate([*views, last], reference=REFERENCE, split="test")
+    table = table_of([*views, last], split="test")
     groups = {
         grouping: {
-            group: tabulate(views, reference=NEAR_REFERENCE, split="test"),
-            "slab": tabulate([last], reference=REFERENCE, split="test"),
+            group: table_of(views, reference=NEAR_REFERENCE, split="test"),
+            "slab": table_of([last], split="test"),
         },
-        "distance": {"0.5-1 m": tabulate([*views, last], reference=REFERENCE, split="test")},
+        "distance": {"0.5-1 m": table},
     }
-    return replace(result(), tables={"cages": replace(table, groups=groups)}, views=[*views, last])
+    whole = result(*views, last, declared=DECLARED)
+    return replace(whole, tables={"cages": replace(table, groups=groups)})
+
+
+def joined(*results: Result) -> Result:
+    """Return the first result with the configs of all."""
+    tables = {name: table for one in results for name, table in one.tables.items()}
+    frames = {name: frame for one in results for name, frame in one.frames.items()}
+    return replace(results[0], tables=tables, frames=frames)
 
 
 def example() -> Result:
     """Return the result of the golden texts: configs with intervals, gaps, overflow and groups."""
     lattice = [scored_view(f"lattice/{12 * index:04d}", 0.0215 + 0.003 * index) for index in range(8)]
     gaps = [scored_view("lattice-raw/0000", coverage=0.94996), unpredicted_view("lattice-raw/0001")]
-    of_scenes = result(*lattice, *gaps, overflowed_view("pier/0000"))
-    split = split_result()
-    return replace(of_scenes, tables={**of_scenes.tables, **split.tables}, views=[*of_scenes.views, *split.views])
+    return joined(result(*lattice, *gaps, overflowed_view("pier/0000")), split_result())
 
 
 def examples() -> list[Result]:

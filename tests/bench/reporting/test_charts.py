@@ -14,8 +14,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 
-from rebar_depth_bench.extended.profiles import DISTANCE_EDGES_M
 from rebar_depth_bench.extended.estimates import MeasureEstimate
+from rebar_depth_bench.extended.profiles import DISTANCE_EDGES_M
 from rebar_depth_bench.reporting.axes import Axis, decade_axis, log_axis_with_one, select_spaced
 from rebar_depth_bench.reporting.charts import (
     ProfileBin,
@@ -176,7 +176,7 @@ def test_error_maps_share_the_larger_range_up_to_a_factor_of_three(
     native_cm: float, scaled_cm: float, shared: bool
 ) -> None:
     native, scaled = 1 + 0.999 * native_cm / 50, 1 + 0.999 * scaled_cm / 50
-    score = dataclasses.replace(scored_view("lattice/0000"), scale=scaled / native)
+    score = scored_view("lattice/0000", scale=scaled / native)
     images = shown_view(panels(score=score, factor=native))
     larger = max(native_cm, scaled_cm)
     limits = (larger, larger) if shared else (native_cm, scaled_cm)

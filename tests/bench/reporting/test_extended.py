@@ -16,10 +16,6 @@ from rich.console import Console
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.data.files import file_sha256
-from rebar_depth_bench.extended.fits import MISS_MM
-from rebar_depth_bench.extended.inspection import CAPABILITY_MEASURES
-from rebar_depth_bench.extended.measures import SCALED, Measure, Statistic
-from rebar_depth_bench.extended.families import MEASURE_FAMILIES, measures_by_alignment, score_extended
 from rebar_depth_bench.extended.estimates import (
     ExtendedResult,
     MeasureEstimate,
@@ -27,14 +23,19 @@ from rebar_depth_bench.extended.estimates import (
     tabulate_extended,
     view_numbers,
 )
+from rebar_depth_bench.extended.families import MEASURE_FAMILIES, measures_by_alignment
+from rebar_depth_bench.extended.fits import MISS_MM
+from rebar_depth_bench.extended.inspection import CAPABILITY_MEASURES
+from rebar_depth_bench.extended.measures import SCALED, Measure, Statistic
 from rebar_depth_bench.reporting.extended_tables import print_extended, reach_sentence
 from rebar_depth_bench.reporting.html.extended import (
+    crossing_picture,
     error_kind,
     estimate_cell,
     extended_config,
     measure_definitions,
 )
-from rebar_depth_bench.reporting.html.page import look_at_views, render_report, write_report
+from rebar_depth_bench.reporting.html.page import render_report
 from rebar_depth_bench.scoring.bootstrap import resample
 from rebar_depth_bench.scoring.evaluation import open_evaluation
 from tests.bench.extended.cage_scenes import HEIGHT, WIDTH
@@ -235,11 +236,9 @@ def mat(tmp_path_factory: pytest.TempPathFactory) -> Mat:
     return Mat(root, write_mat_dataset(root))
 
 
-def extended(archive: Path, root: Path, *families: str) -> ExtendedResult:
-    """Return the extended measures of an archive, all or those of some families."""
-    chosen = [MEASURE_FAMILIES[name] for name in families or MEASURE_FAMILIES]
-    with open_evaluation(archive, root) as evaluation:
-        found = score_extended(evaluation, chosen).extended
+def extended(archive: Path, root: Path) -> ExtendedResult:
+    """Return the extended measures of an archive."""
+    found = rdb.score(archive, root, extended=True).extended
     assert found is not None
     return found
 
@@ -261,12 +260,7 @@ def test_measures_of_a_config_pool_its_views(mat: Mat) -> None:
     text = " ".join(console.export_text().split())
     assert "tie point: median, mm" in text
     assert reach_sentence("scaled", table.reaches["scaled"][1]) in text
-
-    alone = extended(archive, mat.root, "crossings")
-    assert alone.tables[CONFIG].reaches == table.reaches
-    heads = {measure.name.partition("_")[0] for measure in alone.measures["native"]}
-    assert heads == {"crossing", "crossings", "tie"}
-    content = alone.to_dict()
+    content = found.to_dict()
     assert content["crossings"] == {
         "file": "crossings.parquet",
         "sha256": file_sha256(mat.root / "crossings.parquet"),
@@ -292,9 +286,9 @@ def test_older_folder_is_stamped_with_its_bars(mat: Mat, tmp_path: Path) -> None
 def test_report_shows_crossings_by_error(mat: Mat, tmp_path: Path) -> None:
     archive = mat.archive({0: 3.0})
     with open_evaluation(archive, mat.root) as evaluation:
-        scored = score_extended(evaluation)
-        picture = look_at_views(evaluation, {}, crossings=True).pictures[CONFIG]
-        write_report(scored, evaluation, tmp_path / "report.html")
+        picture = crossing_picture(evaluation, evaluation.configs[0])
+    assert picture is not None
+    rdb.score(archive, mat.root, extended=True).to_html(tmp_path / "report.html")
     assert (picture.view_id, picture.width, picture.height) == (f"{CONFIG}/0000", WIDTH, HEIGHT)
     assert [(kind, count) for kind, _, count in picture.counts] == [("within5", 4)]
     assert all(0 < x < WIDTH and 0 < y < HEIGHT for _, x, y in picture.marks)

@@ -38,13 +38,13 @@ from rebar_depth_bench.reporting.figure import (
     write_figure,
 )
 from rebar_depth_bench.reporting.published import published_rows
-from rebar_depth_bench.scoring.reference import NO_REFERENCE
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.table import PublishedMatch, ViewScore
 from rebar_depth_bench.submission.declaration import Declaration
 from tests.bench.reporting.results import (
     HOSTILE,
     REFERENCE,
+    changed,
     overflowed_view,
     result,
     scored_view,
@@ -61,9 +61,7 @@ def _style() -> Iterator[None]:
 
 
 def view(view_id: str, native: float, scaled: float, coverage: float = 1.0) -> ViewScore:
-    score = scored_view(view_id, native, coverage)
-    assert score.scaled is not None
-    return replace(score, scaled=replace(score.scaled, abs_rel=scaled))
+    return changed(scored_view(view_id, native, coverage), {"scaled.abs_rel": scaled})
 
 
 def drawn(*results: Result, published: bool = True) -> Figure:
@@ -106,8 +104,8 @@ def test_points_and_references_have_their_errors() -> None:
     assert points(axes) == {**published, "near": (0.04, 0.03)}
     assert points(axes, hollow=True) == {"far": (0.8, 0.05)}
     across, up = references(axes)
-    assert across == [REFERENCE["constant.abs_rel"], pytest.approx(0.0529)]
-    assert up == [REFERENCE.one_pixel.abs_rel]
+    assert across == [REFERENCE["reference.constant.abs_rel"], pytest.approx(0.0529)]
+    assert up == [REFERENCE["reference.one_pixel.abs_rel"]]
     names = legend(figure)
     assert names[:2] == ["near", "far"]
     assert names[2:8] == [f"paper: {row.method}" for row in rows]
@@ -163,9 +161,9 @@ def test_legend_has_the_marks_of_the_tables() -> None:
 def test_rows_without_errors_are_left_out_and_named() -> None:
     empty = result(unpredicted_view("lattice/0000"), view("pile/0000", 0.5, 0.1), method="silent")
     infinite = result(overflowed_view("lattice/0000"), method="huge")
-    assert infinite.tables["lattice"].native is not None
-    native = replace(infinite.tables["lattice"].native, abs_rel=math.inf)
-    infinite = replace(infinite, tables={"lattice": replace(infinite.tables["lattice"], native=native)})
+    table = infinite.tables["lattice"]
+    table = replace(table, numbers={**table.numbers, "native.abs_rel": math.inf})
+    infinite = replace(infinite, tables={"lattice": table})
     content = figure_content([empty, infinite], published=False)
     assert [note.partition(" has no errors of ")[0] for note in content.left_out] == ["silent", "huge"]
     lattice, pile = figure_of(content).axes
@@ -179,7 +177,7 @@ def test_rows_without_errors_are_left_out_and_named() -> None:
     ("native", "scaled"), [(0.0, 0.0), (1e-300, 1e-9), (1e300, 5e-3), (3e-8, 1e9), (0.3, 0.3), (0.001, 10_000.0)]
 )
 def test_any_errors_lie_on_or_in_the_frame(native: float, scaled: float) -> None:
-    figure = drawn(result(view("mine/0000", native, scaled), reference=NO_REFERENCE))
+    figure = drawn(result(view("mine/0000", native, scaled), reference={}))
     [axes] = figure.axes
     [(x, y)] = points(axes).values()
     assert axes.get_xlim()[0] <= x <= axes.get_xlim()[1]

@@ -7,10 +7,8 @@ import dataclasses
 import hashlib
 import math
 import re
-from collections import Counter
 from collections.abc import Callable
 from itertools import pairwise
-from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -18,17 +16,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench import InputError, score
 from rebar_depth_bench.data import codecs
-from rebar_depth_bench.diagnosis.corrections import MAX_VIEWS
 from rebar_depth_bench.reporting.charts import precision_chart
 from rebar_depth_bench.reporting.detections import DetectionPage, PageTable, render_page
-from rebar_depth_bench.reporting.html.page import WORST_SHOWN, render_report, write_report
+from rebar_depth_bench.reporting.html.page import WORST_SHOWN, render_report
 from rebar_depth_bench.reporting.html.views import shown_view, views_to_show
 from rebar_depth_bench.reporting.published import paper_scenes
 from rebar_depth_bench.scoring import formatting
 from rebar_depth_bench.scoring.columns import COVERAGE, NATIVE, RANK_ERROR, SCALE, SCALED, WITHIN, Cell
-from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
 from tests.bench.reporting.pages import Page, without_embedded
 from tests.bench.reporting.results import (
     HOSTILE,
@@ -73,7 +69,7 @@ def test_pages_are_the_golden_texts(rendered: str, check_golden: Callable[[str, 
 
 @pytest.mark.parametrize(("scale", "differ"), [(1.01 / 1.02, False), (1.001 / 1.02, True)])
 def test_captions_of_error_maps_state_that_their_ranges_differ(scale: float, differ: bool) -> None:
-    score = dataclasses.replace(scored_view("lattice/0000"), scale=scale)
+    score = scored_view("lattice/0000", scale=scale)
     page = render_report(result(score), [images_of("lattice/0000", score, 1.02)])
     captions = re.findall(r"<figcaption><strong>(?:Native|Scaled) error</strong>.*?</figcaption>", page, re.DOTALL)
     assert ["other colour range" in caption for caption in captions] == [differ, differ]
@@ -156,9 +152,8 @@ def test_worst_views_come_first_then_all_in_protocol_order() -> None:
 
 
 def test_overflow_and_zero_errors_render() -> None:
-    perfect = dataclasses.replace(scored_view("lattice/0000"), native=None, scaled=None, scale=None)
     exact = scored_view("lattice/0001", abs_rel=0.0, scale=1.0)
-    shown = result(overflowed_view("pier/0000"), perfect, exact)
+    shown = result(overflowed_view("pier/0000"), unpredicted_view("lattice/0000"), exact)
     page = render_report(shown, [images_of(factor=1e30), images_of(factor=math.nan)])
     assert "no prediction on scored pixels" in page
     assert "off the scale" in page
@@ -237,10 +232,10 @@ def test_views_to_show_has_requested_count_and_no_repeats(count: int, total: int
     views = [scored_view(f"lattice/{index:04d}", abs_rel=(index * 7 % 41 + 1) / 100) for index in range(total)]
     shown = views_to_show(views, count)
     assert len({view.view_id for view in shown}) == len(shown) == min(count, total)
-    errors = [view["native.abs_rel"] for view in shown if view.native]
+    errors = [error for view in shown if not math.isnan(error := view["native.abs_rel"])]
     assert errors == sorted(errors, reverse=True)
     if 1 < count <= total:
-        assert errors[-1] == min(view["native.abs_rel"] for view in views if view.native)
+        assert errors[-1] == np.nanmin([view["native.abs_rel"] for view in views])
 
 
 def test_templates_and_scripts_are_package_data() -> None:
@@ -251,46 +246,35 @@ def test_templates_and_scripts_are_package_data() -> None:
 
 @pytest.mark.slow
 def test_report_of_an_archive_embeds_requested_views_worst_first(
-    tiny_root: Path, tiny_truth: dict[str, np.ndarray], archive_of: Callable[..., Path], tmp_path: Path
-) -> None:
-    factors = 1.1 + 0.05 * np.random.default_rng(3).permutation(len(tiny_truth))
-    archive = archive_of(
-        {view: depth_m * factor for (view, depth_m), factor in zip(tiny_truth.items(), factors, strict=True)}
-    )
-    with open_evaluation(archive, tiny_root) as evaluation:
-        shown = score_evaluation(evaluation)
-        worst_first = [view.view_id for view in sorted(shown.views, key=attrgetter("rank_error"), reverse=True)]
-        page = tmp_path / "page.html"
-        write_report(shown, evaluation, page, views_shown=3)
-        text = page.read_text(encoding="utf-8")
-        assert re.findall(r"<h3>(lattice/\d+)</h3>", text) == [*worst_first[:2], worst_first[-1]]
-        assert f"3 of {len(tiny_truth)} views of <b>lattice</b>" in text
-        write_report(shown, evaluation, page, views_shown=0)
-        assert "<article" not in page.read_text(encoding="utf-8")
-        with pytest.raises(InputError, match="views to show: -1, expected 0 or more"):
-            write_report(shown, evaluation, page, views_shown=-1)
-
-
-@pytest.mark.slow
-def test_views_are_decoded_once_for_diagnosis_and_report(
     tiny_root: Path,
     tiny_truth: dict[str, np.ndarray],
     archive_of: Callable[..., Path],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    archive = archive_of({view: 1.1 * depth_m for view, depth_m in tiny_truth.items()})
-    decoded: Counter[bytes] = Counter()
+    factors = 1.1 + 0.05 * np.random.default_rng(3).permutation(len(tiny_truth))
+    archive = archive_of(
+        {view: depth_m * factor for (view, depth_m), factor in zip(tiny_truth.items(), factors, strict=True)}
+    )
+    shown = score(archive, tiny_root)
+    worst_first = sorted(shown.views, key=lambda view: view["rank_error"], reverse=True)
+    page = tmp_path / "page.html"
+    shown.to_html(page, views_shown=3)
+    text = page.read_text(encoding="utf-8")
+    expected = [view.view_id for view in (*worst_first[:2], worst_first[-1])]
+    assert re.findall(r"<h3>(lattice/\d+)</h3>", text) == expected
+    assert f"3 of {len(tiny_truth)} views of <b>lattice</b>" in text
+    decoded = []
     decode = codecs.decode
 
     def count(kind: str, content: bytes, grid: tuple[int, int]) -> np.ndarray:
-        decoded[content] += kind == "depth"
+        decoded.append(kind)
         return decode(kind, content, grid)
 
-    with open_evaluation(archive, tiny_root) as evaluation:
-        shown = score_evaluation(evaluation)
-        monkeypatch.setattr(codecs, "decode", count)
-        write_report(shown, evaluation, tmp_path / "page.html", views_shown=1)
-    diagnosed = min(len(tiny_truth), MAX_VIEWS)
-    assert set(decoded.values()) <= {0, 1}
-    assert 2 * diagnosed <= sum(decoded.values()) <= 2 * diagnosed + 1, "both eyes, and the view that is shown"
+    monkeypatch.setattr(codecs, "decode", count)
+    shown.to_html(page, views_shown=2)
+    assert decoded.count("depth") == 2, "only the views that are shown; mistakes are looked for once"
+    shown.to_html(page, views_shown=0)
+    assert "<article" not in page.read_text(encoding="utf-8")
+    with pytest.raises(InputError, match="views to show: -1, expected 0 or more"):
+        shown.to_html(page, views_shown=-1)

@@ -19,8 +19,8 @@ from cards.reference import coverage_text
 from rebar_depth_bench import software_version
 from rebar_depth_bench.base.errors import printable
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.extended.families import MEASURE_FAMILIES
 from rebar_depth_bench.extended.estimates import MeasureEstimate
+from rebar_depth_bench.extended.families import MEASURE_FAMILIES
 from rebar_depth_bench.reporting.detections import DetectionPage, PageTable, print_page
 from rebar_depth_bench.reporting.extended_tables import format_value
 from rebar_depth_bench.reporting.html.extended import estimate_cell
@@ -30,19 +30,19 @@ from rebar_depth_bench.reporting.tables import comparison_cells, print_compariso
 from rebar_depth_bench.scoring import formatting
 from rebar_depth_bench.scoring.columns import DASH, coverage_percent, number
 from rebar_depth_bench.scoring.comparison import compare
-from rebar_depth_bench.scoring.spreadsheet import frame_csv
-from rebar_depth_bench.scoring.reference import Errors
 from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareIdentity
-from rebar_depth_bench.scoring.table import tabulate
+from rebar_depth_bench.scoring.spreadsheet import tables_sheet
+from rebar_depth_bench.scoring.table import Table
 from tests.bench.reporting.pages import Page
 from tests.bench.reporting.results import (
     HOSTILE,
-    REFERENCE,
     example,
     examples,
+    joined,
     result,
     scored_view,
     split_result,
+    table_of,
 )
 
 Show = Callable[[Console], None]
@@ -75,10 +75,10 @@ def test_terminal_tables_are_the_golden_texts(name: str, check_golden: Callable[
 
 
 def test_csv_is_the_golden_text(check_golden: Callable[[str, str], None]) -> None:
-    check_golden("score.csv", frame_csv(example().to_pandas()))
-    check_golden("groups.csv", frame_csv(example().to_pandas("groups")))
-    [header] = frame_csv(result(scored_view("lattice/0000")).to_pandas("groups")).splitlines()
-    assert header == frame_csv(example().to_pandas("groups")).partition("\n")[0]
+    check_golden("score.csv", tables_sheet([example()]).to_csv())
+    check_golden("groups.csv", tables_sheet([example()], groups=True).to_csv())
+    [header] = tables_sheet([result(scored_view("lattice/0000"))], groups=True).to_csv().splitlines()
+    assert header == tables_sheet([example()], groups=True).to_csv().partition("\n")[0]
 
 
 @pytest.mark.parametrize(("width", "tables"), [(40, 3), (80, 3), (100, 2), (140, 2), (160, 1), (200, 1)])
@@ -101,7 +101,7 @@ def test_notes_and_published_rows_appear_only_where_they_apply() -> None:
         lambda console: print_paper_table([result(scored_view("pier/0000"))], console, published=False), 80
     )
     assert "paper" not in own
-    assert "Not ranked: no views." in formatting.table_notes(tabulate([]))
+    assert "Not ranked: no views." in formatting.table_notes(table_of([]))
 
 
 def test_results_of_some_views_are_named_and_not_marked_as_declared() -> None:
@@ -139,13 +139,17 @@ def test_coverage_is_rounded_down_in_every_display(share: float) -> None:
 def test_notes_state_what_is_resampled() -> None:
     one_scene = result(*(scored_view(f"lattice/{12 * index:04d}") for index in range(8)))
     split = split_result()
-    both = replace(split, tables={**split.tables, **one_scene.tables}, views=[*split.views, *one_scene.views])
+    both = joined(split, one_scene)
     assert formatting.interval_note(one_scene.tables.values()) == formatting.INTERVAL_NOTE
     assert "views" not in formatting.interval_note(split.tables.values())
     assert formatting.interval_note(both.tables.values()).startswith(formatting.INTERVAL_NOTE)
     latex = [latex_table([shown], published=False, intervals=True) for shown in (one_scene, split, both)]
     phrases = ("block bootstrap over views", "bootstrap over scenes", "over views, with splits over scenes")
     assert all(phrase in " ".join(text.split()) for phrase, text in zip(phrases, latex, strict=True))
+
+
+def with_scaled_constant(table: Table, abs_rel: float) -> Table:
+    return replace(table, numbers={**table.numbers, "reference.scaled_constant.abs_rel": abs_rel})
 
 
 def test_constants_of_results_on_other_pixels_are_named() -> None:
@@ -160,7 +164,7 @@ def test_constants_of_results_on_other_pixels_are_named() -> None:
     assert formatting.scaled_constants(rows[1:3]) == {"constant": (0.0529, 2.05)}
     titles = [title for title, _ in formatting.reference_rows(rows)]
     assert titles == [*formatting.scaled_constants(rows), "one pixel"]
-    without = replace(rows[0][1], reference=REFERENCE)
+    without = with_scaled_constant(rows[0][1], math.nan)
     assert formatting.reference_rows([("x", without)])[0][0] == "one pixel"
 
 
@@ -174,7 +178,7 @@ def test_names_of_references_fit_a_line() -> None:
 def test_scaled_error_is_compared_with_the_constant_on_the_same_pixels() -> None:
     table = result(scored_view("lattice/0000", coverage=0.9)).tables["lattice"]
     assert any("of a constant's (0.0529)" in finding for finding in formatting.reference_findings(table))
-    between = replace(table, reference=replace(REFERENCE, scaled_constant=Errors(0.07, 2.6)))
+    between = with_scaled_constant(table, 0.07)
     assert not any("constant" in finding for finding in formatting.reference_findings(between))
 
 
@@ -198,11 +202,11 @@ def test_coverage_is_rounded_down_and_extreme_numbers_are_scientific(shown: str,
 
 @pytest.mark.parametrize("method", [HOSTILE, "+1", "-1", "@x", "a\rb\nc"])
 def test_csv_has_neither_formulas_nor_control_characters(method: str) -> None:
-    content = frame_csv(result(scored_view("lattice/0000"), method=method).to_pandas())
+    content = tables_sheet([result(scored_view("lattice/0000"), method=method)]).to_csv()
     row = next(csv.DictReader(io.StringIO(content, newline="")))
     assert row["method"] == ("" if method.startswith("a") else "'") + printable(method)
     [group] = [
-        line for line in frame_csv(split_result(HOSTILE).to_pandas("groups")).splitlines() if "evil" in line
+        line for line in tables_sheet([split_result(HOSTILE)], groups=True).to_csv().splitlines() if "evil" in line
     ]
     assert "'=" in group
 

@@ -15,10 +15,10 @@ from rebar_depth_bench.scoring.bootstrap import (
     Blocks,
     half_width,
     interval,
-    trajectory_indices,
     resample,
     resample_scenes,
     resample_views,
+    trajectory_indices,
 )
 
 

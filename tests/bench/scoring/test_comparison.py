@@ -25,16 +25,14 @@ from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.extended.estimates import ExtendedResult
 from rebar_depth_bench.reporting.extended_tables import extended_csv
 from rebar_depth_bench.reporting.tables import print_comparison
-from rebar_depth_bench.scoring.columns import TABLE_COLUMNS, VIEW_COLUMNS
+from rebar_depth_bench.scoring.columns import METRIC_COLUMNS, METRICS, WITHIN
 from rebar_depth_bench.scoring.comparison import Difference, compare
-from rebar_depth_bench.scoring.spreadsheet import differences_frame, frame_csv, frame_of_values
-from rebar_depth_bench.scoring.metrics import DepthMetrics
 from rebar_depth_bench.scoring.reading import read_result
 from rebar_depth_bench.scoring.result import DatasetIdentity, Result
-from rebar_depth_bench.scoring.table import tabulate
+from rebar_depth_bench.scoring.spreadsheet import Sheet, differences_sheet, tables_sheet
 from rebar_depth_bench.scoring.table import ViewScore
 from tests.bench.reporting.pages import Page
-from tests.bench.reporting.results import HOSTILE, result, scored_view, unpredicted_view
+from tests.bench.reporting.results import HOSTILE, changed, result, scored_view, unpredicted_view
 from tests.damage import change_manifest, copy_dataset
 
 
@@ -45,9 +43,20 @@ def result_of(errors: np.ndarray, method: str = "m", config: str = "lattice", di
         if math.isnan(error):
             views.append(unpredicted_view(view_id))
             continue
-        metrics = DepthMetrics(error, 10 * error, 9 * error, 1 - error / 10)
-        within = dict.fromkeys((3, 5, 10, 20), 1 - error / 2)
-        views.append(ViewScore(view_id, 100, 1.0, error / (1 + error), 1.0 + error, metrics, metrics, within))
+        metrics = dict(zip(METRICS, (error, 10 * error, 9 * error, 1 - error / 10), strict=True))
+        numbers = {
+            "scored_px": 100.0,
+            "coverage": 1.0,
+            "rank_error": error / (1 + error),
+            "scale": 1.0 + error,
+            **{
+                f"{alignment}.{name}": value
+                for alignment in ("native", "scaled")
+                for name, value in metrics.items()
+            },
+            **{column.place: 1 - error / 2 for column in WITHIN},
+        }
+        views.append(ViewScore(view_id, numbers))
     return replace(result(*views, method=method), dataset=DatasetIdentity(digest, "1"))
 
 
@@ -79,7 +88,7 @@ def test_paired_difference_below_view_spread_is_decided() -> None:
 def test_submission_equals_itself() -> None:
     same = result_of(np.linspace(0.1, 0.9, 20))
     for rows in compare(same, same).configs.values():
-        assert [row.column for row in rows] == list(VIEW_COLUMNS)
+        assert [row.column for row in rows] == list(METRIC_COLUMNS)
         assert all(row.difference == 0 and row.interval == (0, 0) for row in rows)
         assert {row.verdict for row in rows} == {"equal", ""}
 
@@ -87,8 +96,8 @@ def test_submission_equals_itself() -> None:
 def test_errors_at_low_coverage_are_not_comparable() -> None:
     """Compare with predictions on a fifth of the pixels: only the rank error counts the others."""
     complete, partial = result_of(np.full(20, 0.3)), result_of(np.full(20, 0.1))
-    views = [replace(view, coverage=0.2, rank_error=0.8) for view in partial.views]
-    partial = replace(partial, tables={"lattice": tabulate(views)}, views=views)
+    views = [changed(view, {"coverage": 0.2, "rank_error": 0.8}) for view in partial.views]
+    partial = replace(result(*views), dataset=complete.dataset)
     assert not partial.tables["lattice"].is_comparable
     assert difference(complete, partial, "rank_error").verdict == "worse"
     assert difference(complete, partial).verdict == "no verdict"
@@ -106,6 +115,18 @@ def test_errors_use_common_views_and_shares_use_all_views() -> None:
     for name in ("coverage", "rank_error", "within_mm.20"):
         row = difference(first, other, name)
         assert (row.views, row.verdict) == (20, "worse"), name
+
+
+def test_only_shared_views_are_compared() -> None:
+    """The other result lacks the worst views, and then has all in another order."""
+    errors = np.linspace(0.1, 0.9, 20)
+    first, all_views = result_of(errors), result_of(errors + 0.01)
+    frame = all_views.frames["lattice"]
+    other = replace(all_views, frames={"lattice": frame.take(range(10))})
+    expected = compare(result_of(errors[:10]), result_of(errors[:10] + 0.01)).configs
+    assert compare(first, other).configs == expected
+    turned = replace(all_views, frames={"lattice": frame.take(range(20)[::-1])})
+    assert difference(first, turned).interval == pytest.approx((0.01, 0.01))
 
 
 def test_chance_differences_are_undecided_and_few_views_are_named() -> None:
@@ -133,10 +154,10 @@ def test_table_is_80_columns_and_names_every_number() -> None:
     print_comparison(comparison, console)
     text = console.export_text()
     assert "B: =B, against A: A [red]" in text
-    assert all(column.heading in text for column in VIEW_COLUMNS)
+    assert all(column.heading in text for column in METRIC_COLUMNS)
     assert max(map(len, text.splitlines())) <= 80
-    rows = list(csv.DictReader(io.StringIO(frame_csv(comparison.to_pandas()))))
-    assert [row["number"] for row in rows] == [column.place for column in VIEW_COLUMNS]
+    rows = list(csv.DictReader(io.StringIO(differences_sheet([comparison.to_dict()]).to_csv())))
+    assert [row["number"] for row in rows] == [column.place for column in METRIC_COLUMNS]
     assert rows[0]["other_method"] == "'=B"
     assert {row["verdict"] for row in rows} <= {
         "equal",
@@ -193,15 +214,7 @@ def test_tables_have_numbers_and_intervals_of_json(two_configs: Result) -> None:
     low, high = document["tables"]["lattice"]["ci95"]["native"]["abs_rel"]
     assert frame.loc["lattice", ["native_abs_rel_low", "native_abs_rel_high"]].tolist() == [low, high]
     assert math.isnan(frame.loc["pier", "native_abs_rel_low"]), "two views have no interval"
-    assert sum(name.endswith("_low") for name in frame) == len(VIEW_COLUMNS)
-
-
-def test_numbers_of_tables_of_earlier_versions_stay_in_their_columns(two_configs: Result) -> None:
-    table = two_configs.to_dict()["tables"]["lattice"]
-    earlier = {**table, "reference": {"constant": table["reference"]["constant"]}}
-    numbers = {column.name: column.value(earlier) for column in TABLE_COLUMNS}
-    assert (numbers["constant_abs_rel"], numbers["scaled_constant_abs_rel"]) == (0.0571, None)
-    assert {column.name: column.value(table) for column in TABLE_COLUMNS}["scaled_constant_abs_rel"] == 0.0571
+    assert sum(name.endswith("_low") for name in frame) == len(METRIC_COLUMNS)
 
 
 def test_views_have_one_row_each_and_other_rows_are_refused(two_configs: Result) -> None:
@@ -215,18 +228,17 @@ def test_views_have_one_row_each_and_other_rows_are_refused(two_configs: Result)
 
 
 def test_integers_with_missing_values_stay_integers() -> None:
-    frame = frame_of_values(("count", "text"), [(3, "a"), (None, None)])
-    assert isinstance(frame["count"].dtype, pd.Int64Dtype)
-    assert frame_csv(frame) == "count,text\n3,a\n,\n"
-    assert frame_csv(frame_of_values((), [])) == ""
+    sheet = Sheet(("count", "text"), [(3, "a"), (None, None)])
+    assert isinstance(sheet.to_pandas()["count"].dtype, pd.Int64Dtype)
+    assert sheet.to_csv() == "count,text\n3,a\n,\n"
 
 
 def test_csv_without_rows_has_the_header(two_configs: Result) -> None:
     extended = ExtendedResult(measures={}, tables={}, views={})
-    empty = replace(two_configs, tables={}, views=[], extended=extended)
-    assert frame_csv(empty.to_pandas()) == frame_csv(two_configs.to_pandas()).splitlines(keepends=True)[0]
-    compared = frame_csv(compare(two_configs, two_configs).to_pandas())
-    assert frame_csv(differences_frame([])) == compared.splitlines(keepends=True)[0]
+    empty = replace(two_configs, tables={}, frames={}, extended=extended)
+    assert tables_sheet([empty]).to_csv() == tables_sheet([two_configs]).to_csv().splitlines(keepends=True)[0]
+    compared = differences_sheet([compare(two_configs, two_configs).to_dict()]).to_csv()
+    assert differences_sheet([]).to_csv() == compared.splitlines(keepends=True)[0]
     assert extended_csv(empty) == (
         "method,config,alignment,measure,unit,statistic,value,low,high,samples,"
         "protocol,dataset_digest,submission_sha256,software_version\n"
@@ -257,7 +269,8 @@ def test_bars_of_a_dataset_folder(tiny_root: Path, tmp_path: Path) -> None:
 def test_columns_do_not_depend_on_the_order_of_a_document(two_configs: Result) -> None:
     turned = read_result(json.dumps(_reversed(two_configs.to_dict())).encode(), "x")
     assert turned.to_pandas().iloc[::-1].to_csv(index=False) == two_configs.to_pandas().to_csv(index=False)
-    assert turned.to_pandas("views").to_csv() == two_configs.to_pandas("views").to_csv()
+    views = turned.to_pandas("views").sort_values("view_id")
+    assert views.to_csv(index=False) == two_configs.to_pandas("views").to_csv(index=False)
 
 
 def _reversed(value: Any) -> Any:

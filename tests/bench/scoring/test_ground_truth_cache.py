@@ -85,7 +85,7 @@ def test_digest_in_manifest_is_no_path(tiny_root: Path, tmp_path: Path, empty_ca
 
 def test_other_views_have_an_entry_of_their_own(tiny_root: Path, copy: Path, empty_cache: Path) -> None:
     change_manifest(copy, lambda _, config: config["views"].pop(), CONFIG)
-    assert len(truth_of(tiny_root, CONFIG)) == 2
+    assert len(truth_of(tiny_root, CONFIG).views) == 2
     with pytest.raises(DatasetError, match="the file has 2 rows"):
         truth_of(copy, CONFIG)
     assert len([*empty_cache.iterdir()]) == 1
@@ -107,7 +107,7 @@ def test_shuffled_rows_give_the_same_order(tiny_root: Path, copy: Path) -> None:
     for path in Path(os.environ["XDG_CACHE_HOME"]).glob("*/*"):
         path.unlink()
     truths = truth_of(copy, "lattice")
-    assert tuple(truth.view_id for truth in truths) == truths.view_ids == expected
+    assert tuple(truth.view_id for truth in truths.views) == truths.view_ids == expected
 
 
 @pytest.mark.usefixtures("empty_cache")

@@ -28,9 +28,8 @@ from rebar_depth_bench.scoring.groups import (
     bar_width_px,
     positions_by_group,
 )
-from rebar_depth_bench.scoring.reading import read_result
+from rebar_depth_bench.scoring.reading import read_result, read_table
 from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.scoring.reading import read_table
 from tests.bench.reporting.pages import Page
 from tests.damage import change_manifest
 from tests.ground_truth import truth_of

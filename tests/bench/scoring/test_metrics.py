@@ -17,14 +17,14 @@ from rebar_depth_bench.scoring.columns import rounded
 from rebar_depth_bench.scoring.metrics import (
     depth_metrics,
     is_valid_prediction,
+    mean,
     median,
     median_scale,
     metrics_at_scales,
     rank_error,
 )
-from rebar_depth_bench.scoring.protocol import interior, scored_pixels
-from rebar_depth_bench.scoring.score import ViewTruth, score_view, tabulate
-from rebar_depth_bench.scoring.table import ViewScore
+from rebar_depth_bench.scoring.protocol import WITHIN_MM, interior, scored_pixels
+from rebar_depth_bench.scoring.view_numbers import ViewTruth, view_numbers
 
 MASKS = hnp.arrays(bool, st.tuples(st.integers(1, 12), st.integers(1, 12)))
 INVALID = (np.nan, 0.0, -0.0, -1.0, np.inf, -np.inf)
@@ -132,14 +132,14 @@ def test_overflow_gives_infinity_without_warning(huge: float) -> None:
     assert math.isinf(depth_metrics(np.full(3, huge), z).rmse_cm)
 
 
-def scored(p_m: ndarray, z_m: ndarray) -> ViewScore:
+def scored(p_m: ndarray, z_m: ndarray) -> dict[str, float]:
     truth = ViewTruth("lattice/0000", np.arange(len(z_m), dtype=np.uint32), z_m, float(np.median(z_m)))
-    return score_view(truth, p_m.reshape(1, -1))
+    return view_numbers(p_m.reshape(1, -1), truth)
 
 
-def ranked_value(*views: ViewScore) -> float:
+def ranked_value(*views: dict[str, float]) -> float:
     """Return the number that ranks: the mean over views, rounded as in the JSON."""
-    value = rounded(tabulate(views).rank_error)
+    value = rounded(mean([view["rank_error"] for view in views]))
     assert value is not None
     return value
 
@@ -167,7 +167,7 @@ def test_rank_error_equals_the_sum_in_pixel_order(dtype: type) -> None:
     [(1.0, 0.0), (2.0, 0.5), (0.5, 0.5), (1e308, 1.0), (5e-324, 1.0), *((value, 1.0) for value in INVALID)],
 )
 def test_rank_error_of_one_pixel(p: float, expected: float) -> None:
-    assert scored(np.array([p]), np.ones(1, np.float32)).rank_error == expected
+    assert scored(np.array([p]), np.ones(1, np.float32))["rank_error"] == expected
 
 
 @settings(max_examples=40)
@@ -182,8 +182,8 @@ def test_no_removal_improves_what_ranks_or_coverage_or_tolerances(seed: int, sha
     complete = scored(p_m, z_m)
     for reduced in (scored(removed, z_m), scored(worst, z_m)):
         assert ranked_value(complete, other) <= ranked_value(reduced, other)
-        assert reduced.coverage <= complete.coverage
-        assert all((reduced.within_mm[t] or 0) <= (share or 0) for t, share in complete.within_mm.items())
+        for place in ("coverage", *(f"within_mm.{limit}" for limit in WITHIN_MM)):
+            assert reduced[place] <= complete[place]
 
 
 @settings(max_examples=40)

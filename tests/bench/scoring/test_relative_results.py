@@ -14,7 +14,7 @@ import pytest
 from PIL import Image
 
 import rebar_depth_bench as rdb
-from rebar_depth_bench.scoring.columns import RELATIVE_INTERVALS
+from rebar_depth_bench.scoring.columns import METRICS, interval_columns
 from rebar_depth_bench.scoring.reading import read_result
 from rebar_depth_bench.scoring.result import Result
 from tests.bench.scoring.conftest import Values, Write, disparity
@@ -51,7 +51,7 @@ def test_result_is_read_as_it_was_written(relative: Result, tiny_root: Path, wri
         again = read_result(one.to_json(), "result.json")
         assert again.to_json() == one.to_json()
         assert (again.kind, again.columns) == (one.kind, one.columns)
-        assert again.tables["lattice"].intervals.keys() == {column.place for column in RELATIVE_INTERVALS}
+        assert again.tables["lattice"].intervals.keys() == {column.place for column in interval_columns(one.kind)}
     assert json.loads(scaled.to_json())["tables"]["lattice"]["aligned_robust"] is None
     assert json.loads(empty.to_json())["tables"]["lattice"]["aligned"]["abs_rel"] is None
     mixed = relative.to_json().replace(b"rebar-relative-1", b"rebar-2")
@@ -86,10 +86,10 @@ def test_results_that_lack_the_numbers_of_their_kind_are_refused(
 def test_intervals_are_those_of_the_view_numbers(relative: Result) -> None:
     """Nine sparse views are nine blocks: the interval of the mean contains it and is narrower than the views."""
     table = relative.tables["lattice"]
-    for column in RELATIVE_INTERVALS[1:]:
-        values = [column.view_value(view) or 0.0 for view in relative.views]
+    for column in interval_columns(relative.kind)[1:]:
+        values = [view.number(column) for view in relative.views]
         low, high = table.intervals[column.place] or (np.nan, np.nan)
-        assert min(values) <= low <= column.value(table) <= high <= max(values)
+        assert min(values) <= low <= table.number(column) <= high <= max(values)
 
 
 def test_scale_has_the_scaled_numbers_of_metric_results(write: Write, tiny_root: Path) -> None:
@@ -97,15 +97,12 @@ def test_scale_has_the_scaled_numbers_of_metric_results(write: Write, tiny_root:
     metric, aligned = rdb.score(holed, tiny_root), rdb.score(holed, tiny_root, align="scale")
     assert aligned.kind == "scale"
     for native, of_scale in zip(metric.views, aligned.views, strict=True):
-        assert native.scaled is not None
-        assert of_scale.aligned is not None
-        assert of_scale.constant is not None
-        assert vars(native.scaled).items() <= vars(of_scale.aligned).items()
-        assert (of_scale["constant.abs_rel"], of_scale["constant.rmse_cm"]) == pytest.approx(
-            native.scaled_constant
-        )
-        assert of_scale.coverage == native.coverage < 1
-        assert of_scale["aligned.error"] > 1 - of_scale.coverage
+        assert [of_scale[f"aligned.{name}"] for name in METRICS] == [native[f"scaled.{name}"] for name in METRICS]
+        for name in ("abs_rel", "rmse_cm"):
+            constant = native[f"reference.scaled_constant.{name}"]
+            assert of_scale[f"constant.{name}"] == pytest.approx(constant)
+        assert of_scale["coverage"] == native["coverage"] < 1
+        assert of_scale["aligned.error"] > 1 - of_scale["coverage"]
 
 
 @pytest.mark.parametrize(("kind", "make"), [("affine-depth", lambda z: z), ("affine-disparity", lambda z: 1 / z)])
@@ -151,11 +148,10 @@ def test_zero_of_a_png_is_no_value(tiny_root: Path, tiny_truth: dict[str, np.nda
                 Image.fromarray(values).save(image, "PNG")
                 archive.writestr(f"{view_id}.png", image.getvalue())
     whole, holed = (rdb.score(path, tiny_root).tables["lattice"] for path in paths.values())
-    assert whole.coverage == 1
-    assert 0.3 < (holed.coverage or 0) < 0.7
-    assert holed.aligned is not None
-    assert holed["aligned.error"] == pytest.approx(1 - (holed.coverage or 0), abs=0.05)
-    assert holed.flat_views == 0
+    assert whole["coverage"] == 1
+    assert 0.3 < holed["coverage"] < 0.7
+    assert holed["aligned.error"] == pytest.approx(1 - holed["coverage"], abs=0.05)
+    assert holed["flat_views"] == 0
 
 
 def test_metric_json_has_no_keys_of_other_kinds(write: Write, tiny_root: Path) -> None:

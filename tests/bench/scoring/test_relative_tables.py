@@ -18,15 +18,19 @@ from rich.console import Console
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.reporting.html.page import look_at_views, render_report, views_by_config
+from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.data.rows import iterate_rows
+from rebar_depth_bench.reporting.html.page import render_report, view_panels
+from rebar_depth_bench.reporting.html.views import shown_view
 from rebar_depth_bench.reporting.latex import latex_table
 from rebar_depth_bench.reporting.tables import print_paper_table
-from rebar_depth_bench.scoring.columns import METRICS, RELATIVE_INTERVALS
-from rebar_depth_bench.scoring.evaluation import open_evaluation, score_evaluation
+from rebar_depth_bench.scoring.columns import METRICS, interval_columns
+from rebar_depth_bench.scoring.evaluation import open_evaluation
+from rebar_depth_bench.scoring.formatting import constant_margin
 from rebar_depth_bench.scoring.protocol import scored_pixels
-from rebar_depth_bench.scoring.relative import constant_margin
 from rebar_depth_bench.scoring.reading import read_result
 from rebar_depth_bench.scoring.result import Result
+from rebar_depth_bench.submission.declaration import METRIC
 from tests.bench.reporting.pages import Page
 from tests.bench.reporting.test_browser import run_in_browser
 from tests.bench.scoring.conftest import Values, Write, disparity
@@ -40,13 +44,10 @@ def test_text_of_a_result(relative: Result, tiny_root: Path, write: Write) -> No
         *("coverage", "aligned error", "constant error", "margin", "AbsRel", "robust AbsRel", "<= 5 mm")
     ]
     table = relative.tables["lattice"]
-    assert table.aligned is not None
-    assert table.aligned_robust is not None
-    assert table.constant is not None
     errors = (table["aligned.error"], table["constant.error"])
     margin = math.floor(1000 * (1 - errors[0] / errors[1])) / 10
     shown = (*errors, margin, table["aligned.abs_rel"], table["aligned_robust.abs_rel"])
-    within = f"{100 * (table.aligned.within_mm[5] or 0):.1f}"
+    within = f"{100 * table['aligned.within_mm.5']:.1f}"
     cells = [f"{value:.4f}" if value != margin else f"{margin:.1f} %" for value in shown]
     assert " ".join(lines[1].split()) == f"lattice 100.0 % {' '.join(cells)} {within} %"
     assert lines[2] == "protocol rebar-relative-1; inputs: rgb; ground truth: not used, as declared"
@@ -114,15 +115,13 @@ def test_score_command(
     assert files["json"].read_bytes() == expected.to_json()
     [row] = csv.DictReader(io.StringIO(files["csv"].read_text()))
     table = expected.tables["lattice"]
-    assert table.aligned is not None
-    assert table.constant is not None
     assert float(row["aligned_error"]) == pytest.approx(table["aligned.error"])
     lines = [line.split() for line in output.out.splitlines()]
     [constant] = [line for line in lines if line[:1] == ["constant"]]
     assert constant[1:3] == [f"{value:.4f}" for value in (table["constant.error"], table["constant.abs_rel"])]
     text = Page(files["html"].read_text()).text
-    for column in RELATIVE_INTERVALS[1:]:
-        assert column.text(column.value(table)) in text
+    for column in interval_columns(expected.kind)[1:]:
+        assert column.text(table.number(column)) in text
     assert all(view.view_id in text for view in expected.views)
     declared = "etric predictions, scored as affine-disparity (--align): disparity up to scale and shift"
     assert f"M{declared}" in text
@@ -191,10 +190,8 @@ def test_compare(tiny_root: Path, write: Write, capsys: Any, monkeypatch: pytest
     [document] = json.loads(capsys.readouterr().out)
     assert document["protocol"] == "rebar-relative-1"
     rows = {row["name"]: row for row in document["configs"]["lattice"]}
-    results = [rdb.score(path, tiny_root).tables["lattice"].aligned for path in (net, blurred)]
-    assert [rows["aligned.error"][key] for key in ("first", "other")] == [
-        pytest.approx(one.error) for one in results if one is not None
-    ]
+    errors = [rdb.score(path, tiny_root).tables["lattice"]["aligned.error"] for path in (net, blurred)]
+    assert [rows["aligned.error"][key] for key in ("first", "other")] == pytest.approx(errors)
     assert rows["aligned.error"]["verdict"] == "worse"
     assert {name.partition(".")[0] for name in rows} == {"coverage", "aligned", "aligned_robust"}
     assert main(["compare", str(net), str(blurred), "--data", str(tiny_root)]) == 0
@@ -251,11 +248,14 @@ def test_aligned_metric_archive_is_recognised(write: Write, tiny_root: Path, rel
 @pytest.mark.parametrize("declared", [None, "affine-disparity"])
 def test_pictures_show_aligned_depth(declared: str | None, write: Write, tiny_root: Path) -> None:
     path = write("net", declared, disparity if declared else lambda z: 3 * z)
+    result = rdb.score(path, tiny_root, align="affine-disparity")
+    columns = ("view_id", "left_rgb", "left_depth", "left_mask")
+    rows = list(iterate_rows(open_folder(tiny_root).config("lattice"), columns))
     with open_evaluation(path, tiny_root) as evaluation:
-        result = score_evaluation(evaluation, align="affine-disparity")
-        shown = look_at_views(evaluation, views_by_config(result), kind=result.kind).shown
-        [worst] = look_at_views(evaluation, {"lattice": result.views[:1]}).shown
-    assert worst.off_scale, "without alignment"
+        predictions = [evaluation.submission.read(row["view_id"]) for row in rows]
+    views = list(zip(rows, predictions, result.views, strict=True))
+    assert shown_view(view_panels(*views[0], declared or METRIC, METRIC)).off_scale, "without alignment"
+    shown = [shown_view(view_panels(*view, declared or METRIC, result.kind)) for view in views]
     for view in shown:
         assert not view.off_scale
         assert 0.1 <= float(view.native_limit.removesuffix(" cm")) <= 3, "noise of 1 % at 0.22 to 0.43 m"
@@ -268,7 +268,7 @@ def test_report_names_the_fit_of_each_view(kind: str, write: Write, tiny_root: P
     result = rdb.score(write("net", kind, lambda z: np.where(z.max() > 0.75, z.max() - z, z) + 1), tiny_root)
     page = render_report(result, [])
     fits = re.findall(r">(constant|sloped)</td>", page)
-    assert fits.count("constant") == result.tables["lattice"].flat_views
+    assert fits.count("constant") == result.tables["lattice"]["flat_views"]
     assert len(fits) == (0 if kind == "scale" else 9), "a scale has no slope"
     assert ("Constant fit: a view whose fit has no positive slope" in Page(page).text) == (kind != "scale")
 
@@ -332,8 +332,10 @@ def test_disparity_is_no_mistake(tiny_root: Path, write: Write, capsys: Any) -> 
 
 def test_evaluation_of_another_kind(tiny_root: Path, tiny_truth: dict[str, np.ndarray], tmp_path: Path) -> None:
     predictions = {view_id: disparity(depth_m) for view_id, depth_m in tiny_truth.items()}
-    result = rdb.evaluate(predictions, tiny_root, config="lattice", kind="affine-disparity", method="net")
-    result.save_archive(tmp_path / "net.zip")
+    options: Any = {"config": "lattice", "kind": "affine-disparity", "method": "net"}
+    result = rdb.evaluate(predictions, tiny_root, **options, archive=tmp_path / "net.zip")
+    unwritten = rdb.evaluate(predictions, tiny_root, **options)
+    assert unwritten.to_dict()["tables"] == result.to_dict()["tables"]
     assert result.to_json() == rdb.score(tmp_path / "net.zip", tiny_root).to_json()
     assert result.notes[0].startswith("affine-disparity: disparity up to scale and shift")
     assert len(result.notes) == 1

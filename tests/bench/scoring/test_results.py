@@ -13,11 +13,9 @@ import numpy as np
 import pytest
 
 from rebar_depth_bench.base.errors import InputError
-from rebar_depth_bench.scoring.reading import read_result
-from rebar_depth_bench.scoring.table import tabulate
-from rebar_depth_bench.scoring.reading import read_table
+from rebar_depth_bench.scoring.reading import read_result, read_table
 from rebar_depth_bench.submission import Declaration
-from tests.bench.reporting.results import overflowed_view, result, scored_view, unpredicted_view
+from tests.bench.reporting.results import overflowed_view, result, scored_view, table_of, unpredicted_view
 
 
 def test_table_has_mean_metrics_and_median_scale() -> None:
@@ -25,51 +23,42 @@ def test_table_has_mean_metrics_and_median_scale() -> None:
         scored_view(f"lattice/000{n}", value, scale=scale)
         for n, value, scale in ((0, 1.0, 0.5), (1, 2.0, 0.7), (2, 6.0, 4.0))
     ]
-    table = tabulate(views)
-    assert table.native is not None
-    assert (table["native.abs_rel"], table.scale_median) == (3.0, 0.7)
+    table = table_of(views)
+    assert (table["native.abs_rel"], table["scale_median"]) == (3.0, 0.7)
     assert (table.views, table.views_scored, table.ranked) == (3, 3, True)
-    assert tabulate(views[:2]).scale_median == pytest.approx(0.6), "the mean of the middle two"
+    assert table_of(views[:2])["scale_median"] == pytest.approx(0.6), "the mean of the middle two"
     for seed in range(20):
         errors = np.random.default_rng(seed).lognormal(0, 2, 20)
         views = [scored_view(f"lattice/{n:04d}", error) for n, error in enumerate(errors.tolist())]
-        assert tabulate(views).native == tabulate(views[::-1]).native, "the mean depends on no order"
+        assert table_of(views) == table_of(views[::-1]), "the mean depends on no order"
 
 
 @pytest.mark.parametrize(("coverage", "comparable"), [(0.95, True), (math.nextafter(0.95, 0), False)])
 def test_errors_are_comparable_from_coverage_threshold(coverage: float, comparable: bool) -> None:
-    table = tabulate([scored_view(f"lattice/000{n}", coverage=coverage) for n in range(2)])
+    table = table_of([scored_view(f"lattice/000{n}", coverage=coverage) for n in range(2)])
     assert (table.is_comparable, table.ranked) == (comparable, True)
 
 
 @pytest.mark.parametrize(("uses_ground_truth", "ranked"), [(None, True), (False, True), (True, False)])
 def test_declared_use_of_ground_truth_is_not_ranked(uses_ground_truth: bool | None, ranked: bool) -> None:
-    assert tabulate([scored_view("lattice/0000")], Declaration("rgb", uses_ground_truth)).ranked is ranked
+    assert table_of([scored_view("lattice/0000")], Declaration("rgb", uses_ground_truth)).ranked is ranked
 
 
 def test_view_without_prediction_is_not_averaged_but_counts_in_rank_error() -> None:
     views = [scored_view(f"lattice/{n:04}", 1.0) for n in range(99)] + [unpredicted_view("lattice/0099")]
-    table = tabulate(views)
-    assert table.native is not None
+    table = table_of(views)
     assert (table["native.abs_rel"], table.views_scored, table.views) == (1.0, 99, 100)
     assert (table.ranked, table.is_comparable) == (True, False)
-    assert table.rank_error == pytest.approx((99 * 0.5 + 1) / 100)
-    assert table.coverage == pytest.approx(0.99)
+    assert table["rank_error"] == pytest.approx((99 * 0.5 + 1) / 100)
+    assert table["coverage"] == pytest.approx(0.99)
 
 
 def test_infinite_view_makes_mean_null() -> None:
     views = [scored_view("lattice/0000", 1.0), scored_view("lattice/0001", math.inf)]
     table = result(*views).tables["lattice"]
-    assert (table.ranked, table.is_comparable, table.rank_error) == (True, False, 0.75)
+    assert (table.ranked, table.is_comparable, table["rank_error"]) == (True, False, 0.75)
     native = result(*views).to_dict()["tables"]["lattice"]["native"]
     assert (native["abs_rel"], native["delta1"]) == (None, 0.1234)
-
-
-def test_no_views_give_null_and_unranked_table() -> None:
-    empty = replace(result(), tables={"lattice": tabulate([])})
-    table = empty.to_dict()["tables"]["lattice"]
-    assert (table["views"], table["ranked"], table["rank_error"], table["scale_median"]) == (0, False, None, None)
-    assert table["native"]["abs_rel"] is None
 
 
 def test_json_keys_and_units_match_contract() -> None:
@@ -110,6 +99,26 @@ def test_written_result_is_read_unchanged() -> None:
     views = [scored_view(f"lattice/{index:04d}", 0.01 * index) for index in range(30)]
     many = result(*views, unpredicted_view("pile/0000"), method="Größe 2").to_json()
     assert read_result(many, "x").to_json() == many
+
+
+def test_errors_of_views_without_predictions_are_left_out() -> None:
+    document = json.loads(SOUND)
+    document["views"][1]["native"] = dict.fromkeys(document["views"][0]["native"], 0.5)
+    assert read_result(json.dumps(document).encode(), "x").to_json() == SOUND
+
+
+@pytest.mark.parametrize("kind", ["metric", "scale", "affine-depth"])
+def test_table_without_views_is_null_unranked_and_read_unchanged(kind: str) -> None:
+    prediction, protocol = (None, "rebar-2") if kind == "metric" else (kind, "rebar-relative-1")
+    empty = replace(
+        result(), prediction=prediction, protocol=protocol, tables={"lattice": table_of([], kind=kind)}
+    )
+    table = empty.to_dict()["tables"]["lattice"]
+    assert (table["views"], table["ranked"], table["coverage"], table["scale_median"]) == (0, False, None, None)
+    assert (table["rank_error"], table["native"]["abs_rel"], table["ci95"]["coverage"]) == (None, None, None)
+    read = read_result(empty.to_json(), "x")
+    assert read.to_json() == empty.to_json()
+    assert (len(read.tables["lattice"].groups), read.views) == (0, [])
 
 
 def test_keys_of_later_versions_are_ignored_and_intervals_may_be_unstated() -> None:
@@ -170,12 +179,13 @@ def set_groups(groups: object) -> Change:
         (set_at("tables", "lattice", "views", value=True), "invalid tables.lattice.views"),
         (set_at("tables", "lattice", "views_scored", value=-1), "invalid tables.lattice.views_scored"),
         (set_at("tables", "lattice", "coverage", value=1.5), "invalid tables.lattice.coverage"),
+        (set_at("views", 0, "coverage", value=None), "invalid views 1: coverage"),
         (set_at("tables", "lattice", "ranked", value="yes"), "invalid tables.lattice.ranked"),
         (set_at("tables", "lattice", "native", value={}), "missing tables.lattice.native.abs_rel"),
         (set_at("tables", "lattice", "native", value=None), "conflict tables.lattice"),
         (set_at("tables", "lattice", "scaled", "delta1", value=2), "invalid tables.lattice.scaled.delta1"),
-        (set_at("tables", "lattice", "within_mm", value={"3": 1}), "invalid tables.lattice.within_mm"),
-        (set_at("tables", "lattice", "ci95", "coverage", value=[1]), "missing tables.lattice.ci95.coverage 2"),
+        (set_at("tables", "lattice", "within_mm", value={"3": 1}), "missing tables.lattice.within_mm.5"),
+        (set_at("tables", "lattice", "ci95", "coverage", value=[1]), "invalid tables.lattice.ci95.coverage"),
         (set_at("tables", "lattice", "ci95", "native", value=3), "invalid tables.lattice.ci95.native"),
         (set_at("tables", "a\x1b[2J", value={}), r"invalid tables.'a\x1b[2J'"),
         (set_at("views", value={}), "invalid views"),
@@ -204,7 +214,11 @@ def set_groups(groups: object) -> Change:
         (set_groups({"a" * 800_000: {}}), f"invalid tables.lattice.groups.'{'a' * 59} ..."),
         (set_groups({"family": {str(key): 0 for key in range(20_000)}}), "size tables"),
         (set_groups({str(key): {str(group): 0 for group in range(100)} for key in range(1000)}), "size tables"),
-        (set_groups({"family": {"wall": TABLE | {"rank_error": None}}}), "conflict "),
+        (
+            set_groups({"family": {"wall": TABLE | {"rank_error": None}}}),
+            "conflict tables.lattice.groups.family.wall",
+        ),
+        (set_at("views", 0, "native", value=None), "conflict views 1"),
     ],
 )
 def test_wrong_value_is_refused_with_its_place(change: Change, location: str) -> None:

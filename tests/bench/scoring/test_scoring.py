@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import json
-import os
+import math
 import runpy
-import shutil
-import subprocess
-import sys
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
@@ -16,23 +13,16 @@ import numpy as np
 import pytest
 from numpy import ndarray
 
-import rebar_depth_bench
 from rebar_depth_bench import DatasetError, SubmissionError, score
 from rebar_depth_bench.data.codecs import encode_png
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import iterate_rows, truth_columns, truth_from_row
+from rebar_depth_bench.scoring.columns import METRICS, WITHIN
 from rebar_depth_bench.scoring.groups import ViewTraits
-from rebar_depth_bench.scoring.metrics import DepthMetrics
 from rebar_depth_bench.scoring.protocol import interior, scored_pixels
-from rebar_depth_bench.scoring.reference import (
-    NO_REFERENCE,
-    UNDEFINED,
-    Errors,
-    Reference,
-    mean_reference,
-    view_reference,
-)
-from rebar_depth_bench.scoring.score import Truth, ViewTruth, score_views
+from rebar_depth_bench.scoring.reference import UNDEFINED, references, view_reference
+from rebar_depth_bench.scoring.table import Frame, Truth, tabulate
+from rebar_depth_bench.scoring.view_numbers import ViewTruth, view_numbers
 from rebar_depth_bench.submission.declaration import Declaration
 from tests.damage import change_manifest, change_rows, copy_dataset, first_shard
 
@@ -42,18 +32,17 @@ Archive = Callable[..., Path]
 
 def test_ground_truth_scores_perfectly(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
     [(config, table)] = score(archive_of(tiny_truth), tiny_root).tables.items()
-    for metrics in (table.native, table.scaled):
-        assert metrics == DepthMetrics(abs_rel=0.0, rmse_cm=0.0, mae_cm=0.0, delta1=1.0)
-    assert (config, table.scale_median, table.coverage, table.ranked) == ("lattice", 1.0, 1.0, True)
-    assert set(table.within_mm.values()) == {1.0}
+    for alignment in ("native", "scaled"):
+        assert [table[f"{alignment}.{name}"] for name in METRICS] == [0.0, 0.0, 0.0, 1.0]
+    assert (config, table["scale_median"], table["coverage"], table.ranked) == ("lattice", 1.0, 1.0, True)
+    assert {table[column.place] for column in WITHIN} == {1.0}
 
 
 def test_doubled_depth_is_corrected_by_scale(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
     doubled = archive_of({view: 2 * depth for view, depth in tiny_truth.items()})
     table = score(doubled, tiny_root).tables["lattice"]
-    assert table.native is not None
-    assert (table["native.abs_rel"], table["native.delta1"], table.scale_median) == (1.0, 0.0, 0.5)
-    assert table.scaled == DepthMetrics(abs_rel=0.0, rmse_cm=0.0, mae_cm=0.0, delta1=1.0)
+    assert (table["native.abs_rel"], table["native.delta1"], table["scale_median"]) == (1.0, 0.0, 0.5)
+    assert [table[f"scaled.{name}"] for name in METRICS] == [0.0, 0.0, 0.0, 1.0]
 
 
 def test_negative_predictions_have_null_metrics_and_rank_error_one(
@@ -93,12 +82,10 @@ def test_score_agrees_with_independent_evaluation(
         within = share * np.mean(np.abs(p - z) <= 0.01)
         rows.append([*native, delta1, np.mean(np.abs(s * p - z) / z), within, share, ranked, s])
     table = score(archive_of(predictions), tiny_root).tables["lattice"]
-    assert table.native is not None
-    assert table.scaled is not None
     errors = [table["native.abs_rel"], table["native.rmse_cm"], table["native.mae_cm"], table["native.delta1"]]
-    found = [*errors, table["scaled.abs_rel"], table.within_mm[10], table.coverage, table.rank_error]
+    found = [*errors, table["scaled.abs_rel"], table["within_mm.10"], table["coverage"], table["rank_error"]]
     assert found == pytest.approx(np.mean(rows, axis=0)[:-1].tolist(), rel=1e-12)
-    assert table.scale_median == pytest.approx(np.median([row[-1] for row in rows]), rel=1e-12)
+    assert table["scale_median"] == pytest.approx(np.median([row[-1] for row in rows]), rel=1e-12)
 
 
 @pytest.mark.slow
@@ -222,10 +209,11 @@ def test_neighbours_without_depth_are_skipped() -> None:
     alone[1, 1] = 2.0
     undefined = view_reference(alone, np.array([4], np.uint32), 2.0)
     assert undefined == (0.0, 0.0, UNDEFINED, UNDEFINED)
-    assert mean_reference([undefined]) == Reference(Errors(0.0, 0.0), Errors())
-    assert mean_reference([reference, undefined]) == Reference(Errors(0.0, 0.0), Errors(0.25, 50.0))
-    assert mean_reference([]) == NO_REFERENCE
-    assert NO_REFERENCE.to_dict()["constant"] == {"abs_rel": None, "rmse_cm": None}
+    frame = Frame.of_rows({"a/0000": references(reference), "a/0001": references(undefined)})
+    mean = tabulate(frame, truth_in_memory(frame.view_ids)).to_dict()["reference"]
+    assert mean["constant"] == {"abs_rel": 0.0, "rmse_cm": 0.0}
+    assert mean["one_pixel"] == {"abs_rel": 0.25, "rmse_cm": 50.0}, "of the view that has neighbours"
+    assert mean["scaled_constant"] == {"abs_rel": None, "rmse_cm": None}
 
 
 MASK = np.array([[0, 0, 0, 0], [1, 1, 1, 1], [1, 1, 1, 1], [1, 1, 1, 1]], bool)
@@ -238,98 +226,29 @@ def truth_in_memory(view_ids: tuple[str, ...], split: str | None = None) -> Trut
     pixels = scored_pixels(MASK, DEPTH_M)
     return Truth(
         view_ids=view_ids,
-        read=lambda position: ViewTruth(view_ids[position], pixels, DEPTH_M.ravel()[pixels], 3.0),
-        references=[view_reference(DEPTH_M, pixels, 3.0)] * len(view_ids),
+        views=[ViewTruth(view_id, pixels, DEPTH_M.ravel()[pixels], 3.0) for view_id in view_ids],
+        references=[references(view_reference(DEPTH_M, pixels, 3.0))] * len(view_ids),
         traits=[ViewTraits("wall", 3.0, None)] * len(view_ids),
         split=split,
     )
 
 
 def test_score_of_two_pixels_by_hand() -> None:
-    predicted: dict[str, ndarray] = {"a/0000": np.full((4, 4), 2.0), "a/0001": np.full((4, 4), np.nan)}
-    truths = [("a", truth_in_memory(("a/0000", "a/0001")))]
-    tables, views = score_views(truths, predicted.__getitem__, Declaration(uses_ground_truth=True))
-    first, second = views
-    assert (first.scored_px, first.coverage, first.scale) == (2, 1.0, 1.5)
-    assert first.rank_error == (0 + (4 - 2) / 4) / 2
-    assert first.native is not None
+    truth = truth_in_memory(("a/0000", "a/0001"))
+    predictions = (np.full((4, 4), 2.0), np.full((4, 4), np.nan))
+    rows = [view_numbers(prediction, view) for prediction, view in zip(predictions, truth.views, strict=True)]
+    frame = Frame.of_rows({
+        view_id: {**row, **reference}
+        for view_id, row, reference in zip(truth.view_ids, rows, truth.references, strict=True)
+    })  # fmt: skip
+    first, second = frame.views()
+    assert (first["scored_px"], first["coverage"], first["scale"]) == (2, 1.0, 1.5)
+    assert first["rank_error"] == (0 + (4 - 2) / 4) / 2
     assert (first["native.abs_rel"], first["native.mae_cm"]) == ((0 + 2 / 4) / 2, 100.0)
-    assert (second.coverage, second.rank_error, second.native) == (0.0, 1.0, None)
-    table = tables["a"]
-    assert (table.views, table.views_scored, table.coverage, table.ranked) == (2, 1, 0.5, False)
-    assert table.rank_error == (0.25 + 1) / 2
+    assert (second["coverage"], second["rank_error"]) == (0.0, 1.0)
+    assert math.isnan(second["native.abs_rel"])
+    table = tabulate(frame, truth, declared=Declaration(uses_ground_truth=True))
+    assert (table.views, table.views_scored, table["coverage"], table.ranked) == (2, 1, 0.5, False)
+    assert table["rank_error"] == (0.25 + 1) / 2
     assert table["reference.constant.abs_rel"] == ((3 - 2) / 2 + (4 - 3) / 4) / 2
-    assert table.reference.scaled_constant == table.reference.constant
-
-
-BIAS_FIELD = "    bias_mm: Annotated[float | None, PlainSerializer(rounded)] = None\n"
-BIAS_CHANGES = (
-    ("columns.py", "OTHERS: tuple[Column, ...] = ()", 'OTHERS = (Column("bias_mm", "bias", "mm", decimals=1),)'),
-    ("table.py", "    Field,\n", "    Field,\n    PlainSerializer,\n"),
-    ("table.py", "    scaled_constant: Annotated[", f"{BIAS_FIELD}    scaled_constant: Annotated["),
-    ("table.py", "    reference: Reference\n", f"{BIAS_FIELD}    reference: Reference\n"),
-    (
-        "score.py",
-        "scaled_constant=constant",
-        "bias_mm=1000 * np.mean(p_m - z_m.astype(float)), scaled_constant=constant",
-    ),
-    (
-        "score.py",
-        "scale_median=statistics",
-        "bias_mm=mean([view.bias_mm for view in predicted]), scale_median=statistics",
-    ),
-)
-"""Changes of three files that add a signed number outside the depth metrics: old and new text."""
-
-SCORE = """
-import csv, io, json
-from dataclasses import replace
-from rich.console import Console
-from rebar_depth_bench.reporting.html.page import render_report
-from rebar_depth_bench.reporting.latex import latex_table
-from rebar_depth_bench.reporting.tables import print_table
-from rebar_depth_bench.scoring.comparison import compare
-from rebar_depth_bench.scoring.spreadsheet import frame_csv
-from rebar_depth_bench.scoring.reading import read_result
-from rebar_depth_bench.scoring.score import score_views
-from tests.bench.reporting.results import result as result_of
-from tests.bench.scoring.test_scoring import DEPTH_M, truth_in_memory
-
-truth = truth_in_memory(tuple(f"a/{12 * n:04}" for n in range(10)))
-tables, views = score_views([("a", truth)], lambda view_id: DEPTH_M - 0.002 - int(view_id[2:]) / 1e6)
-result = replace(result_of(), tables=tables, views=views)
-written = result.to_json()
-assert read_result(written, "x").to_json() == written
-[row] = csv.DictReader(io.StringIO(frame_csv(result.to_pandas())))
-[compared] = [row for row in compare(result, result).to_dict()["configs"]["a"] if row["name"] == "bias_mm"]
-terminal = io.StringIO()
-print_table(result, Console(file=terminal, width=200))
-shown = [terminal.getvalue(), latex_table([result], published=False, intervals=True), render_report(result, [])]
-print(json.dumps([json.loads(written), row, compared, shown]))
-"""
-
-
-@pytest.mark.slow
-def test_signed_number_with_interval_is_added_in_three_files(tmp_path: Path) -> None:
-    package = Path(rebar_depth_bench.__file__).parent
-    shutil.copytree(package, tmp_path / package.name, ignore=shutil.ignore_patterns("__pycache__"))
-    for name, old, new in BIAS_CHANGES:
-        path = tmp_path / package.name / "scoring" / name
-        content = path.read_text()
-        assert content.count(old) == 1, (name, old)
-        path.write_text(content.replace(old, new))
-    environment = {**os.environ, "PYTHONPATH": f"{tmp_path}:{package.parent}"}
-    finished = subprocess.run(
-        [sys.executable, "-c", SCORE], cwd=tmp_path, env=environment, capture_output=True, text=True, check=False
-    )
-    assert finished.returncode == 0, finished.stderr
-    document, row, compared, shown = json.loads(finished.stdout)
-    table = document["tables"]["a"]
-    assert document["views"][0]["bias_mm"] == pytest.approx(-2, abs=0.001)
-    assert table["bias_mm"] == pytest.approx(-2.054, abs=0.001)
-    low, high = table["ci95"]["bias_mm"]
-    assert low < table["bias_mm"] < high
-    assert [float(row[f"bias_mm{end}"]) for end in ("", "_low", "_high")] == [table["bias_mm"], low, high]
-    assert compared["verdict"] == "", "neither direction of a signed number is better"
-    assert all("bias" in text and "-2.1" in text for text in shown)
-    assert "[-2.1, -2.0]" in shown[1], "LaTeX has the interval"
+    assert table["reference.scaled_constant.abs_rel"] == table["reference.constant.abs_rel"]

@@ -17,8 +17,6 @@ from numpy import ndarray
 import rebar_depth_bench as rdb
 from rebar_depth_bench.extended.profiles import DISTANCE_EDGES_M, MIN_PIXELS, profile_samples
 from rebar_depth_bench.extended.regions import REGION_NUMBERS, region_samples
-from rebar_depth_bench.extended.families import MEASURE_FAMILIES, score_extended
-from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.protocol import interior, scored_pixels, single_bar_pixels
 from tests.bench.extended.thin_scenes import random_images, random_prediction, random_truth, steel_truth
 
@@ -139,8 +137,7 @@ def test_measures_of_a_config_are_those_of_its_pixels(
 ) -> None:
     rng = np.random.default_rng(5)
     noisy = {view: z * rng.uniform(0.8, 1.3, z.shape).astype(np.float32) for view, z in tiny_truth.items()}
-    with open_evaluation(archive_of(noisy), tiny_root) as evaluation:
-        extended = score_extended(evaluation, [MEASURE_FAMILIES["single_bar"]]).extended
+    extended = rdb.score(archive_of(noisy), tiny_root, extended=True).extended
     assert extended is not None
     images = rendered(tiny_root, "lattice")
     for view_id, view in extended.views.items():

@@ -12,18 +12,16 @@ import numpy as np
 import pytest
 from scipy.stats import t as student
 
-from rebar_depth_bench import SubmissionWriter
+from rebar_depth_bench import SubmissionWriter, score
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.detections.score import score_crossings
-from rebar_depth_bench.extended.families import score_extended
 from rebar_depth_bench.scoring import bootstrap
 from rebar_depth_bench.scoring.bootstrap import MIN_BLOCKS, RESAMPLES, Resampling, interval, resample_survey
 from rebar_depth_bench.scoring.comparison import Difference, compare
 from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.reading import read_result
 from rebar_depth_bench.scoring.result import Result
-from rebar_depth_bench.scoring.table import tabulate
-from tests.bench.reporting.results import result, scored_view
+from tests.bench.reporting.results import result, scored_view, table_of
 from tests.damage import change_manifest
 from tests.mat_dataset import CONFIG, VIEWS, write_mat_dataset
 from tests.synthetic_dataset import write_archive, write_dataset
@@ -83,7 +81,7 @@ def of_survey(rank_errors: np.ndarray, method: str) -> Result:
     views = [
         scored_view(f"column/{index:04d}", float(error / (1 - error))) for index, error in enumerate(rank_errors)
     ]
-    table = tabulate(views, views_per_distance=len(views) // 4)
+    table = table_of(views, views_per_distance=len(views) // 4)
     return replace(result(*views, method=method), tables={"column": table})
 
 
@@ -113,7 +111,7 @@ def test_few_scenes_are_named() -> None:
     results = []
     for error in (0.1, 0.8):
         views = [scored_view(f"column/test-s{index % 3}-{index:04d}", error) for index in range(60)]
-        results.append(replace(result(), tables={"column": tabulate(views, split="test")}, views=views))
+        results.append(replace(result(*views), tables={"column": table_of(views, split="test")}))
     assert rank_row(*results).verdict == "too few scenes"
 
 
@@ -158,8 +156,7 @@ def test_all_results_of_a_survey_have_its_intervals(tmp_path: Path, monkeypatch:
     for is_survey in (False, True):
         if is_survey:
             as_survey(tmp_path / "mat", CONFIG, 1, VIEWS)
-        with open_evaluation(archive, tmp_path / "mat") as evaluation:
-            scored = score_extended(evaluation)
+        scored = score(archive, tmp_path / "mat", extended=True)
         assert scored.extended is not None
         estimates = scored.extended.tables[CONFIG].numbers["native"].values()
         found = score_crossings(detected, tmp_path / "mat").to_dict()
