@@ -207,7 +207,7 @@ def test_intervals_are_explained_by_what_is_resampled(rendered: str) -> None:
 
 
 def test_published_rows_are_marked_and_not_sortable(rendered: str) -> None:
-    section = rendered[rendered.index('<section aria-labelledby="paper">') :].partition("</section>")[0]
+    section = rendered[rendered.index('<section aria-labelledby="paper"') :].partition("</section>")[0]
     assert section.count('<tr class="published">') == 12
     assert "sortable" not in section, "sorting would rank them"
     [scene] = paper_scenes(result(unpredicted_view("pile/0000"), scored_view("lattice-zed/0000")))
