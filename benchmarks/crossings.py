@@ -34,11 +34,9 @@ import rebar_depth_bench as rdb
 from benchmarks.timing import print_markdown
 from rebar_depth_bench.base.names import config_of
 from rebar_depth_bench.data.manifest import DatasetConfig, open_folder
-from rebar_depth_bench.detections.score import score_crossings
-from rebar_depth_bench.extended.families import score_extended
+from rebar_depth_bench.detections.crossing_scorer import score_crossings
 from rebar_depth_bench.extended.measures import NATIVE
 from rebar_depth_bench.scoring.columns import rounded
-from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.submission import SubmissionReader
 
 OPENING_SHARE = 0.06
@@ -98,8 +96,7 @@ def _renders_text(config: DatasetConfig) -> str:
 
 def _measures(archive: str, root: str) -> dict[str, Any]:
     """Return the measures at crossings and the reaches of an archive, native, by config."""
-    with open_evaluation(archive, root) as evaluation:
-        extended = score_extended(evaluation).extended
+    extended = rdb.score(archive, root, extended=True).extended
     assert extended is not None
     return {
         config: {

@@ -31,8 +31,6 @@ from rebar_depth_bench.base.writing import write_text
 from rebar_depth_bench.cli.main import main as rebar_bench
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.extended.estimates import ExtendedTable
-from rebar_depth_bench.extended.families import MEASURE_FAMILIES, score_extended
-from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.submission.declaration import METADATA_NAME
 
 
@@ -162,13 +160,15 @@ def _differing(reference: ReferenceSet, root: Path) -> list[str]:
 
 def _result(archive: Path, root: Path) -> dict[str, Any]:
     """Return the result of an archive as a JSON object without views, with the archive's notes and run times."""
-    result = {key: value for key, value in score(archive, root).to_dict().items() if key != "views"}
+    scored = score(archive, root, extended=True)
+    assert scored.extended is not None
+    result = {key: value for key, value in scored.to_dict().items() if key not in ("views", "extended")}
     with zipfile.ZipFile(archive) as source:
         metadata = json.loads(source.read(METADATA_NAME))
     seconds = metadata["runtime"]["seconds"]
     return {
         **result,
-        "single_bar": _single_bar(archive, root),
+        "single_bar": {config: _single_bar(table) for config, table in scored.extended.tables.items()},
         "notes": metadata.get("notes"),
         "seconds": {
             "a_view": {config: _median(seconds, config) for config in result["tables"]},
@@ -177,18 +177,11 @@ def _result(archive: Path, root: Path) -> dict[str, Any]:
     }
 
 
-def _single_bar(archive: Path, root: Path) -> dict[str, dict[str, float | int | None]]:
-    """Return share and AbsRel of the single-bar interior by config, and AbsRel on the whole interior of its views.
+def _single_bar(table: ExtendedTable) -> dict[str, float | int | None]:
+    """Return share and AbsRel of the single-bar interior, and AbsRel on the whole interior of the same views.
 
     The share is a mean over all views. The errors are means over the views with a predicted single-bar pixel.
     """
-    with open_evaluation(archive, root) as evaluation:
-        extended = score_extended(evaluation, [MEASURE_FAMILIES["single_bar"]]).extended
-    assert extended is not None
-    return {config: _single_bar_means(table) for config, table in extended.tables.items()}
-
-
-def _single_bar_means(table: ExtendedTable) -> dict[str, float | int | None]:
     native, scaled = table.numbers["native"], table.numbers["scaled"]
     return {
         "share": native["single_bar_share"].value,

@@ -18,8 +18,6 @@ import tempfile
 import zipfile
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import replace
-from functools import partial
 from itertools import cycle, islice
 from pathlib import Path
 
@@ -29,10 +27,8 @@ import torch
 import rebar_depth_bench as rdb
 from benchmarks.timing import machine_description, median_seconds, print_markdown
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.extended.families import MEASURE_FAMILIES
+from rebar_depth_bench.extended.families import view_samples
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
-from rebar_depth_bench.extended.measures import SCALED, MeasureFamily
-from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.protocol import interior
 from rebar_depth_bench.scoring.truth import config_truth
 from rebar_depth_bench.scoring.view_numbers import view_numbers
@@ -86,26 +82,17 @@ def _torch_numbers(p: torch.Tensor, z: torch.Tensor) -> list[float]:
 
 
 def extended_rows(root: str, config: str, submission: SubmissionReader) -> list[tuple[str, str]]:
-    """Return the milliseconds per view of each measure family, native and scaled together, and their sum."""
+    """Return the milliseconds per view of its truth, and of all measures, native and scaled."""
     folder = open_folder(root)
     steel = load_steel_truth(folder, folder.config(config))
     views = []
     for index in range(len(steel)):
         truth = steel.view(index)
         views.append((truth, submission.read(truth.view_id).astype(np.float64)))
-    seconds = {"gathering a view's truth": median_seconds(lambda: [*map(steel.view, range(len(steel)))], REPEATS)}
-    for family in MEASURE_FAMILIES.values():
-        seconds[family.title] = median_seconds(partial(_evaluate_all, family, views), REPEATS // 3)
-    seconds["all"] = sum(seconds.values())
-    return [(name, f"{1e3 * value / len(views):.1f}") for name, value in seconds.items()]
-
-
-def _evaluate_all(family: MeasureFamily, views: list[tuple[SteelTruth, np.ndarray]]) -> None:
-    for truth, image_m in views:
-        fresh = replace(truth)  # What predictions share is computed again in each repetition.
-        p_m = image_m if family.on_image else image_m.ravel()[truth.index]
-        for alignment in family.alignments:
-            family.evaluate(p_m / 1.1 if alignment == SCALED else p_m, fresh)
+    gathering_s = median_seconds(lambda: [*map(steel.view, range(len(steel)))], REPEATS)
+    measuring_s = median_seconds(lambda: [view_samples(image_m, truth, 1 / 1.1) for truth, image_m in views], 5)
+    rows = {"gathering a view's truth": gathering_s, "all measures": measuring_s}
+    return [(name, f"{1e3 * value / len(views):.1f}") for name, value in rows.items()]
 
 
 def peak_megabytes(archive: Path, root: str) -> float:

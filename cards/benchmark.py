@@ -52,7 +52,7 @@ _CONTACTS = {"lattice": "375", "pier": "4,860", "pile": "15"}
 
 
 def steel_context() -> dict[str, Any]:
-    """Return the template variables of the steel in the full protocols: command, image size and rows."""
+    """Return the template variables of the steel in the full trajectories: command, image size and rows."""
     document = json.loads(STEEL_RESULTS.read_text())
     sizes = {f"{entry['width']} x {entry['height']}" for entry in document["configs"].values()}
     rows = [_steel_row(name, entry) for name, entry in document["configs"].items()]

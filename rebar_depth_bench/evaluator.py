@@ -1,6 +1,6 @@
 """Evaluation of a model in Python: each view is scored as it arrives.
 
-For complete configs the numbers are those of ``rebar-bench score`` on an archive of the same predictions, exactly.
+For complete configs, ``rebar-bench score`` gives exactly the same numbers for an archive of the predictions.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ from rebar_depth_bench.methods.base import input_class
 from rebar_depth_bench.methods.registry import find_method
 from rebar_depth_bench.methods.run import dataset_views, predict_views, wrap_errors
 from rebar_depth_bench.scorer import (
-    ConfigTruth,
     ScoredResult,
+    ScoringTruth,
     ViewResult,
     score,
     score_view,
@@ -45,7 +45,6 @@ from rebar_depth_bench.scorer import (
     tabulate_config,
 )
 from rebar_depth_bench.scoring.result import SubmissionIdentity
-from rebar_depth_bench.scoring.truth import scored_counts
 from rebar_depth_bench.submission import SubmissionReader, SubmissionWriter
 from rebar_depth_bench.submission.declaration import METRIC, Declaration
 from rebar_depth_bench.submission.writer import depth_map, stored_map
@@ -86,7 +85,7 @@ def evaluate(
     takes points of the left camera's frame to the right one's; with ``inputs="multi-view"``, which then needs
     ``uses_ground_truth=True``, also the poses in the world. What the config lacks is None.
 
-    The other arguments are those of ``Evaluator``, and so are the errors. An exception of a function is the cause
+    The other arguments, and the errors, are documented at ``Evaluator``. An exception of a function is the cause
     of a ``MethodError``, which names the view and the line. Progress is shown for methods and functions.
     """
     selected: dict[str, Any] = {"config": config, "split": split, "views": views, "extended": extended}
@@ -142,8 +141,7 @@ def _evaluate_method(
         path = Path(folder, "predictions.zip") if archive is None else Path(archive)
         predict_views(method, evaluator._views, path, bars.update)
         if archive is not None:
-            result = score(path, evaluator._folder, extended=selected["extended"], progress=bars.update)
-            return evaluator._as_partial(result)
+            return score(path, evaluator._folder, extended=selected["extended"], progress=bars.update)
         with SubmissionReader(path, evaluator._grids) as submission:
             for view_id in evaluator.view_ids:
                 evaluator._add(view_id, submission.read(view_id))
@@ -204,7 +202,7 @@ class Evaluator:
         self._grids = self._folder.expected_views()
         self._left_out = {view_id for one in self._all for view_id in one.view_ids} - self._grids.keys()
         self._truths = {
-            one.source.name: ConfigTruth.of(self._folder, one.source, extended=extended) for one in self._views
+            one.source.name: ScoringTruth.of(self._folder, one.source, extended=extended) for one in self._views
         }
         self._positions = {
             name: {view_id: position for position, view_id in enumerate(truth.scored.view_ids)}
@@ -319,7 +317,7 @@ class Evaluator:
                 self._writing.close()
                 self._writing = None
             sha256 = file_sha256(self._archive)
-        result = scored_result(
+        return scored_result(
             scored,
             self._folder,
             SubmissionIdentity(self._metadata["method"], sha256, declared.inputs, declared.uses_ground_truth),
@@ -328,16 +326,6 @@ class Evaluator:
             archive=None if self._archive is None else self._archive.absolute(),
             kept=self._kept,
         )
-        return self._as_partial(result)
-
-    def _as_partial(self, result: ScoredResult) -> ScoredResult:
-        """Return a result whose tables state of how many views of a config those that were selected are."""
-        some = {
-            one.source.name: result.tables[one.source.name].of_some_views(len(scored_counts(one.source.whole)))
-            for one in self._views
-            if one.source.whole is not one.source
-        }
-        return replace(result, tables={**result.tables, **some})
 
     def _rows(self, *, with_poses: bool) -> Iterator[dict[str, Any]]:
         """Yield what a function may read of each view."""

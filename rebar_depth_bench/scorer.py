@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -26,7 +27,7 @@ from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation
 from rebar_depth_bench.scoring.protocol import PROTOCOL, RELATIVE_PROTOCOL
 from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareIdentity, SubmissionIdentity
 from rebar_depth_bench.scoring.table import Frame, Table, Truth, tabulate
-from rebar_depth_bench.scoring.truth import config_truth
+from rebar_depth_bench.scoring.truth import config_truth, scored_counts
 from rebar_depth_bench.scoring.view_numbers import view_numbers
 from rebar_depth_bench.submission import EntryError
 from rebar_depth_bench.submission.declaration import METRIC, Declaration
@@ -51,7 +52,7 @@ def score(
 ) -> ScoredResult:
     """Score an archive against a dataset folder or Hub repository.
 
-    An archive is scored by the kind of its predictions; ``align`` scores a metric one as one of another kind.
+    An archive is scored by the kind of its predictions; with ``align``, a metric one is scored as another kind.
     ``extended`` adds the extended measures, which need metric predictions; they are null for a config without
     masks or bar ids. A folder that is open already may be restricted to some configs and views.
 
@@ -66,13 +67,15 @@ def score(
         kind = evaluation.scored_kind(align)
         if extended:
             evaluation.require_metric("extended measures are in metres")
+            if align is not None:
+                raise InputError(f"extended is true and align is {align}, expected None for measures in metres")
         sha256 = pool.submit(submission.sha256)
         scored: dict[str, ScoredConfig] = {}
         try:
             for config in evaluation.configs:
-                truth = ConfigTruth.of(folder, config, extended=extended, progress=progress)
+                truth = ScoringTruth.of(folder, config, extended=extended, progress=progress)
 
-                def score_at(position: int, truth: ConfigTruth = truth) -> ViewResult:
+                def score_at(position: int, truth: ScoringTruth = truth) -> ViewResult:
                     prediction = submission.read(truth.scored.view_ids[position])
                     return score_view(prediction, truth, position, kind, meta.prediction)
 
@@ -82,8 +85,12 @@ def score(
                     map_in_threads(score_at, range(count), count, task, workers=workers, progress=progress)
                 )
                 scored[config.name] = tabulate_config(views, truth, kind, meta.declaration)
-            for view_id in set(submission.view_ids) - {one for of in scored.values() for one in of.frame.view_ids}:
-                submission.read(view_id)  # A view without scored pixels.
+            # Views without scored pixels have no numbers, but their entries must be valid, too.
+            without_pixels = set(submission.view_ids)
+            for config_scores in scored.values():
+                without_pixels -= set(config_scores.frame.view_ids)
+            for view_id in without_pixels:
+                submission.read(view_id)
         except EntryError:
             raise SubmissionError.from_problems(archive, list(submission.problems(progress))) from None
         return scored_result(
@@ -98,7 +105,7 @@ def score(
 
 
 @dataclass(frozen=True, eq=False)
-class ConfigTruth:
+class ScoringTruth:
     """Ground truth of a config: of its scored pixels, and of its steel if extended measures are computed."""
 
     config: DatasetConfig
@@ -109,7 +116,7 @@ class ConfigTruth:
     @classmethod
     def of(
         cls, folder: DatasetFolder, config: DatasetConfig, *, extended: bool, progress: Progress = silent
-    ) -> ConfigTruth:
+    ) -> ScoringTruth:
         """Return the ground truth of a config, from the user's cache or computed from its rows."""
         steel = None
         if extended:
@@ -130,47 +137,52 @@ class ViewResult:
 
 @dataclass(frozen=True)
 class ScoredConfig:
-    """Numbers of a config: those of its views and their table, and the samples of extended measures by view.
+    """Numbers of the views of a config, their table, and the samples of extended measures by view.
 
     ``samples`` is None if no extended measures are computed, and empty for a config without masks or bar ids.
     """
 
-    truth: ConfigTruth
+    truth: ScoringTruth
     frame: Frame
     table: Table
     samples: Mapping[str, ViewSamples] | None
 
 
 def score_view(
-    prediction: Float[ndarray, "h w"], truth: ConfigTruth, position: int, kind: str, declared: str
+    prediction: Float[ndarray, "h w"], truth: ScoringTruth, position: int, kind: str, declared_kind: str
 ) -> ViewResult:
-    """Return what a result has of one view; ``position`` is that among the scored views of the config.
+    """Return numbers and samples of the view at a position among the scored views of the config.
 
-    ``prediction``, of the kind ``declared``, is scored as ``kind``; if it is metric, it is planar depth in metres.
+    ``prediction``, of the kind ``declared_kind``, is scored as ``kind``; metric ones are planar depth in metres.
     """
-    numbers = view_numbers(prediction, truth.scored.views[position], kind, declared)
+    numbers = view_numbers(prediction, truth.scored.views[position], kind, declared_kind)
     if truth.steel is None:
         return ViewResult(numbers, None)
     from rebar_depth_bench.extended.families import view_samples
 
-    return ViewResult(numbers, view_samples(prediction, truth.steel.view(position), numbers.get("scale")))
+    return ViewResult(
+        numbers, view_samples(prediction, truth.steel.view(position), numbers.get("scale", math.nan))
+    )
 
 
 def tabulate_config(
-    views: Sequence[ViewResult], truth: ConfigTruth, kind: str, declared: Declaration
+    views: Sequence[ViewResult], truth: ScoringTruth, kind: str, declaration: Declaration
 ) -> ScoredConfig:
-    """Return the numbers of a config from those of all of its scored views, in order."""
+    """Return the table and frame of a config from the results of all of its scored views, in order."""
     scored = truth.scored
     rows = {
         view_id: {**view.numbers, **references}
         for view_id, view, references in zip(scored.view_ids, views, scored.references, strict=True)
     }
     frame = Frame.of_rows(rows)
+    table = tabulate(frame, scored, kind, declaration)
+    if truth.config.whole is not truth.config:
+        table = table.of_some_views(len(scored_counts(truth.config.whole)))
     samples = None
     if truth.extended:
         found = zip(scored.view_ids, views, strict=True)
         samples = {view_id: view.samples for view_id, view in found if view.samples is not None}
-    return ScoredConfig(truth, frame, tabulate(frame, scored, kind, declared), samples)
+    return ScoredConfig(truth, frame, table, samples)
 
 
 def scored_result(
@@ -178,13 +190,13 @@ def scored_result(
     folder: DatasetFolder,
     submission: SubmissionIdentity,
     kind: str,
-    declared: str,
+    declared_kind: str,
     *,
     archive: Path | None = None,
     archive_notes: Sequence[str] = (),
     kept: Mapping[str, KeptPredictions] | None = None,
 ) -> ScoredResult:
-    """Return the result of scored configs; the other arguments are those of ``ScoredResult``."""
+    """Return the result of scored configs; ``ScoredResult`` documents the other arguments."""
     extended = None
     if any(one.samples is not None for one in scored.values()):
         from rebar_depth_bench.extended.families import extended_result
@@ -200,7 +212,7 @@ def scored_result(
         frames={name: one.frame for name, one in scored.items()},
         protocol=PROTOCOL if kind == METRIC else RELATIVE_PROTOCOL,
         prediction=None if kind == METRIC else kind,
-        declared_prediction=None if kind == declared else declared,
+        declared_prediction=None if kind == declared_kind else declared_kind,
         extended=extended,
         archive=archive,
         archive_notes=tuple(archive_notes),
@@ -225,7 +237,7 @@ class ScoredResult(Result):
 
     @cached_property
     def mistakes(self) -> Sequence[PossibleMistake]:
-        """Possible mistakes in the predictions, which are looked for when this is read first.
+        """Possible mistakes in the predictions; they are looked for on the first access.
 
         Raises ``InputError`` if the archive has gone or changed, and ``DatasetError`` for a damaged dataset.
         """
@@ -255,11 +267,9 @@ class ScoredResult(Result):
         """
         from rebar_depth_bench.reporting.html.page import write_report
 
-        if self.archive is None:
-            write_report(self, self.mistakes, None, Path(path), views_shown=views_shown)
-            return
-        with self._open() as evaluation:
-            write_report(self, self.mistakes, evaluation, Path(path), views_shown=views_shown)
+        mistakes = self.mistakes
+        with nullcontext() if self.archive is None else self._open() as evaluation:
+            write_report(self, mistakes, evaluation, Path(path), views_shown=views_shown)
 
     def save_archive(self, path: str | Path) -> None:
         """Copy the archive of the predictions.

@@ -11,7 +11,6 @@ from __future__ import annotations
 import re
 from argparse import ArgumentParser, _SubParsersAction
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from itertools import groupby
 from math import atan2, degrees
 from pathlib import Path
 
@@ -19,7 +18,6 @@ from pydantic import ByteSize
 
 from cards.dataset import column_rows
 from dataset_builder.cli.main import argument_parser
-from dataset_builder.importing.view_cameras import BOP, NERFSTUDIO, FileFormat
 from dataset_builder.scene.variants.registry import VARIANTS
 from dataset_builder.specs.config_specs import STEREO_CAMERAS
 from leaderboard.settings import Settings
@@ -33,7 +31,6 @@ PAGES = (
     ROOT / "SECURITY.md",
     *(ROOT / "docs" / f"{name}.md" for name in ("build", "cages", "formats", "leaderboard-operator")),
 )
-FORMATS = (BOP, NERFSTUDIO)
 _BLOCK = re.compile(r"(<!-- table: ([\w-]+) -->\n).*?(<!-- end of table -->)", re.DOTALL)
 
 
@@ -127,18 +124,6 @@ def _columns() -> str:
     return _table("columns | type | meaning", rows)
 
 
-def _formats() -> str:
-    """Return the tables by which the readers of the files of other programs look up keys."""
-    return "\n\n".join(map(format_table, FORMATS))
-
-
-def format_table(file_format: FileFormat) -> str:
-    """Return the heading and the table of a format; fields of the same use and meaning share a row."""
-    groups = groupby(file_format.fields, lambda field: (field.use, field.meaning))
-    rows = ((_code(key for field in fields for key in field.keys), *group) for group, fields in groups)
-    return f"### {file_format.title}\n\n{_table('keys | use | meaning', rows)}"
-
-
 def _calibration_keys() -> str:
     """Return the known keys of files of OpenCV and ROS."""
     return _table("field | keys", ((field, _code(keys)) for field, keys in KEYS.items()))
@@ -163,7 +148,6 @@ TABLES: Mapping[str, Callable[[], str]] = {
     "columns": _columns,
     "zed-sizes": _zed_sizes,
     "calibration-keys": _calibration_keys,
-    "formats": _formats,
 }
 """Functions of the tables by their names in the marks."""
 

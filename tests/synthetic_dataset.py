@@ -17,7 +17,7 @@ from rebar_depth_bench import SubmissionWriter
 from rebar_depth_bench.base.names import config_of
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, write_bars
 from rebar_depth_bench.data.files import MANIFEST_FILE, file_sha256, views_digest
-from rebar_depth_bench.data.manifest import MANIFEST_FORMAT, OLD_FORMAT
+from rebar_depth_bench.data.manifest import MANIFEST_FORMAT
 from rebar_depth_bench.data.rows import RenderedEye
 from rebar_depth_bench.data.schema import ViewRecord
 from rebar_depth_bench.geometry.cameras import Camera
@@ -96,33 +96,6 @@ def write_split_dataset(
     write_bars(root / BARS_FILE, bars)
     entry = {**config_entry(records), "has_splits": True, "scenes": entries}
     _write_manifest(root, {"cages": entry}, records, {BARS_FILE: file_sha256(root / BARS_FILE)})
-
-
-def _earlier(manifest: dict[str, Any]) -> dict[str, Any]:
-    """Return a manifest in the earlier format, in which an entry of one scene had its parameters beside it."""
-    configs = {name: _earlier_config(dict(entry)) for name, entry in manifest["configs"].items()}
-    return {**manifest, "format": OLD_FORMAT, "configs": configs}
-
-
-def _earlier_config(entry: dict[str, Any]) -> dict[str, Any]:
-    views = {"protocol_views": len(entry["views"])}
-    sizes = {"bytes": sum(scene["bytes"] for scene in entry["scenes"])}
-    if entry.pop("has_splits"):
-        return {**entry, "key": "k", **views, **sizes}
-    [scene] = entry.pop("scenes")
-    of_scene = {key: scene.pop(key) for key in ("protocol_views", "key", "mesh", "shards")}
-    of_scene |= {key: scene.pop(key) for key in ("aim_point_m", "generator") if key in scene}
-    references = {"reference": entry.pop("references")["test"]}
-    beside = {"protocol": scene.pop("protocol", None), "rig": scene.pop("rig", entry["rig"])}
-    del scene["split"], scene["bytes"]
-    return {**entry, **beside, **of_scene, **references, **sizes, "scene": scene}
-
-
-def write_earlier_manifest(root: Path) -> dict[str, Any]:
-    """Write the manifest of a folder in the earlier format; return it as it was."""
-    manifest: dict[str, Any] = json.loads((root / MANIFEST_FILE).read_text())
-    (root / MANIFEST_FILE).write_text(json.dumps(_earlier(json.loads(json.dumps(manifest)))))
-    return manifest
 
 
 def write_archive(path: Path, configs: Sequence[str], views: int, method: str, seed: int) -> None:

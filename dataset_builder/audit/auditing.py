@@ -49,8 +49,8 @@ from dataset_builder.audit.independent_depth import (
 )
 from dataset_builder.cameras.trajectories import subset
 from dataset_builder.pipeline.plan import BUILD_FOLDER
-from rebar_depth_bench.bar_crossings.definition import Crossings, scene_crossings
 from rebar_depth_bench.bar_crossings.crossings_file import CROSSINGS_FILE, folder_crossings
+from rebar_depth_bench.bar_crossings.definition import Crossings, scene_crossings
 from rebar_depth_bench.base.errors import DatasetError, InputError
 from rebar_depth_bench.base.parallel import Progress, silent
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars, with_axis
@@ -236,7 +236,7 @@ def _scene_checks(
             cycles_eyes += [view.left, view.right]
         progress(f"audit of {config.label}", n + 1, len(config.views))
     yield Check("rows", f"{len(config.views)} views", "all invariants", tuple(row_faults))
-    yield Check("cameras", f"{len(expected)} poses of the protocol", "equal to 1e-12", tuple(camera_faults))
+    yield Check("cameras", f"{len(expected)} poses of the trajectory", "equal to 1e-12", tuple(camera_faults))
     for check, _, measurements in measured:
         yield check.verdict(audited, measurements)
     difference_and_depth_m = cycles_difference_m(

@@ -117,7 +117,7 @@ def view_list_problems(config: DatasetConfig, views: Sequence[ExpectedView]) -> 
     ]
     if different or len(config.views) != len(views):
         yield (
-            f"the manifest lists {len(config.views)} views, expected the {len(views)} views of its protocol"
+            f"the manifest lists {len(config.views)} views, expected the {len(views)} views of its trajectory"
             f"{''.join(different[:1])}"
         )
 

@@ -41,15 +41,6 @@ _EXTRA_MODULES = ("bpy", "cv2", "embreex", "trimesh")
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the options of a build."""
-    _add_request_arguments(parser)
-    _add_colour_arguments(parser)
-    _add_process_arguments(parser)
-    _add_scene_arguments(parser)
-    _add_cages_arguments(parser)
-
-
-def _add_request_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options for the folder, its configs, and the number and size of views."""
     parser.add_argument("--out", type=Path, metavar="ROOT", help="dataset folder to build or resume")
     add_names(
         parser,
@@ -60,7 +51,7 @@ def _add_request_arguments(parser: argparse.ArgumentParser) -> None:
         "--views",
         type=int,
         metavar="N",
-        help="number of views per config, evenly spaced over the full protocol (default: all)",
+        help="number of views per config, evenly spaced over the trajectory (default: all)",
     )
     parser.add_argument(
         "--width", type=int, default=BuildRequest.width, help="image width in pixels (default: %(default)s)"
@@ -79,10 +70,6 @@ def _add_request_arguments(parser: argparse.ArgumentParser) -> None:
         "--overwrite",
         "finished configs of ROOT that may be replaced; to others, only views and scenes can be added",
     )
-
-
-def _add_colour_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options for sampling and devices of colour."""
     parser.add_argument(
         "--sampling",
         choices=SAMPLINGS,
@@ -109,10 +96,6 @@ def _add_colour_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="build depth, masks, ids and poses only; the columns left_rgb and right_rgb are null in every row",
     )
-
-
-def _add_process_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options for the processes of a build, and for what is done instead of one."""
     parser.add_argument(
         "--workers", type=int, metavar="N", help="number of parallel render processes (default: 1)"
     )
@@ -126,15 +109,15 @@ def _add_process_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="print the number of views, the disk space and the memory that the build needs, and build nothing",
     )
-    parser.add_argument(
-        "--rewrite-manifest",
-        action="store_true",
-        help="only convert the manifest of ROOT, which an earlier version wrote, to the present format",
+    parser.add_argument("--mesh", metavar="FILE", help="STL, PLY or OBJ file that replaces the lattice's rods")
+    add_mesh_unit(parser)
+    add_names(
+        parser,
+        "--scene",
+        "scene files to build: TOML or IFC; only these are built unless --config is given",
+        "FILE",
     )
-
-
-def _add_cages_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options for the scenes of the config ``cages``."""
+    add_names(parser, "--variant", f"appearance variants, appended to the config name: {', '.join(VARIANTS)}")
     cages = parser.add_argument_group(f"scenes of the config {CAGES}")
     cages.add_argument(
         "--split",
@@ -150,19 +133,6 @@ def _add_cages_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help=f"number of views of each scene (default: {CagesRequest.views_per_scene})",
     )
-
-
-def _add_scene_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add the options for user's meshes and scenes, and for variants."""
-    parser.add_argument("--mesh", metavar="FILE", help="STL, PLY or OBJ file that replaces the lattice's rods")
-    add_mesh_unit(parser)
-    add_names(
-        parser,
-        "--scene",
-        "scene files to build: TOML or IFC; only these are built unless --config is given",
-        "FILE",
-    )
-    add_names(parser, "--variant", f"appearance variants, appended to the config name: {', '.join(VARIANTS)}")
 
 
 def add_mesh_unit(parser: argparse.ArgumentParser) -> None:
@@ -181,12 +151,9 @@ def check_extra() -> None:
 
 
 def run(options: argparse.Namespace) -> None:
-    """Build, estimate or only convert the dataset folder of the options."""
+    """Build or estimate the dataset folder of the options."""
     if options.out is None:
         raise InputError("--out ROOT is missing, expected the dataset folder to build")
-    if options.rewrite_manifest:
-        _rewrite(options)
-        return
     check_extra()
     from dataset_builder.pipeline.blender_process import find_device
     from dataset_builder.pipeline.build import build
@@ -211,17 +178,6 @@ def run(options: argparse.Namespace) -> None:
                 request, options.out, workers=workers, threads=threads, submit=submit, progress=bars.update
             )
     _print_summary(options.out, summary)
-
-
-def _rewrite(options: argparse.Namespace) -> None:
-    """Convert the manifest of the folder; raise ``InputError`` for options of a build."""
-    from dataset_builder.pipeline.folder import rewrite_manifest
-
-    names = ("config", "scene", "mesh", "views", "overwrite", "dry_run")
-    if given := [f"--{name.replace('_', '-')}" for name in names if getattr(options, name)]:
-        raise InputError(f"--rewrite-manifest is combined with {', '.join(given)}, expected only --out ROOT")
-    rewrite_manifest(options.out)
-    print(options.out)
 
 
 def _print_estimate(request: BuildRequest, out: Path) -> None:

@@ -6,13 +6,12 @@ Modules that only one command needs are imported when it is called.
 from __future__ import annotations
 
 import argparse
-import re
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from rebar_depth_bench.base.errors import InputError, escape_text
-from rebar_depth_bench.base.names import PATH_PATTERN, SPLITS
+from rebar_depth_bench.base.errors import InputError
+from rebar_depth_bench.base.names import SPLITS
 from rebar_depth_bench.base.terminal import ProgressBars, print_notice
 from rebar_depth_bench.base.writing import write_output
 from rebar_depth_bench.cli.console import (
@@ -226,36 +225,23 @@ def _add_push_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _push(options: argparse.Namespace) -> None:
     """Print what a push changes, and publish it with ``--yes``."""
-    from dataset_builder.push.hub_errors import require_online, require_token
-    from dataset_builder.push.pushing import check_repository_id, plan_push, send_push, verified_folder
+    from dataset_builder.push.pushing import check_request, push, verified_folder
 
-    check_repository_id(options.hub_id)
-    if not re.fullmatch(PATH_PATTERN, options.revision):
-        raise InputError(f"--revision is {escape_text(options.revision)}, expected the name of a branch")
-    if not options.dry_run:
-        require_online()
-    if options.yes:
-        require_token()
+    check_request(options.hub_id, options.revision, connects=not options.dry_run, publishes=options.yes)
     with ProgressBars() as bars:
         source = verified_folder(options.root, bars.update)
     if source.stray:
         more = f" and {len(source.stray) - _STRAY_SHOWN} more" if len(source.stray) > _STRAY_SHOWN else ""
         print_notice(f"not in the manifest, stays local: {', '.join(source.stray[:_STRAY_SHOWN])}{more}")
-    if options.dry_run:
-        private = ", private" if options.private else ""
-        print(f"{options.hub_id}, branch {options.revision}{private}", *source.lines(), sep="\n")
-        print("dry run: not compared with the Hub, nothing was sent")
+    if not options.dry_run:
+        push(source, options.hub_id, options.revision, private=options.private, publish=options.yes)
         return
-    push = plan_push(source, options.hub_id, options.revision, private=options.private)
-    print(*push.lines(), sep="\n")
-    sys.stdout.flush()
-    if not push.is_needed:
-        print("up to date: nothing to send")
-    elif not options.yes:
-        print("nothing was sent; --yes publishes")
-    else:
-        with ProgressBars() as bars:
-            print(send_push(push, bars.update))
+    print(f"{options.hub_id}, branch {options.revision}{', private' if options.private else ''}")
+    sizes = {name: (source.root / name).stat().st_size for name in source.files}
+    for name, size in sizes.items():
+        print(f"  {name}, {size:,} bytes")
+    print(f"{len(sizes)} files ({sum(sizes.values()):,} bytes); what the Hub has is not sent again")
+    print("dry run: not compared with the Hub, nothing was sent")
 
 
 COMMANDS: Mapping[str, Command] = {

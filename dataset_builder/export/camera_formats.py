@@ -234,7 +234,7 @@ _README = """\
 rebar-depth-bench, config {config}: {views} stereo views of steel reinforcement with exact depth
 dataset {digest}, version {version}
 {no_colour}
-Files, NNNN being the view's number in its full protocol, left and right the eye:
+Files, NNNN being the view's number in its full trajectory, left and right the eye:
   images/NNNN_left.png    8-bit colour, lossless
   depth/NNNN_left.exr     OpenEXR, one float32 channel "Y": metres, exact, 0 where there is no surface
   depth_mm/NNNN_left.png  the same in 16 bits, ROUNDED to whole millimetres; 0 also beyond 65.535 m

@@ -35,7 +35,7 @@ class CameraView:
     def stem(self, eye: str) -> str:
         """Return the common file name of one eye's files, without folder and suffix, e.g. ``0000_left``.
 
-        It begins with the number of the view in the full protocol of its scene, with the digits of its id.
+        It begins with the number of the view in the full trajectory of its scene, with the digits of its id.
         """
         return f"{self.view_id.removeprefix(scene_of(self.view_id))}_{eye}"
 

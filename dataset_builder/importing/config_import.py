@@ -83,9 +83,8 @@ def run_import(
     """Write the config into the dataset folder ``out``, or continue an interrupted import.
 
     There are no findings if the config was there. Raises ``InputError`` for images that cannot be read, for a
-    mistake of the layout that the surveyed bars reveal, for a folder that is none of a dataset, and for a config
-    of this name that was rendered or, unless it is among ``overwrite``, imported from other data; nothing is
-    published then.
+    folder that is none of a dataset, and for a config of this name that was rendered or, unless it is among
+    ``overwrite``, imported from other data; nothing is published then.
     """
     key = parameters_digest(_key_inputs(source, progress))
     staging = Staging(out / BUILD_FOLDER / f"{source.name}-{key[:KEY_CHARACTERS]}")
@@ -139,22 +138,15 @@ def _key_inputs(source: Import, progress: Progress) -> list[Any]:
     calibrations = [asdict(one) for one in dict.fromkeys(camera.calibration for camera in cameras)]
     poses = [None if camera.cam_from_world is None else camera.cam_from_world.tolist() for camera in cameras]
     bars = [asdict(bar) for bar in source.bars]
-    return [
-        source.layout.model_dump(),
-        source.views.names,
-        digests,
-        calibrations,
-        poses,
-        bars,
-        generator_versions(),
-    ]
+    layout, names = source.layout.model_dump(), source.views.names
+    return [layout, names, digests, calibrations, poses, bars, generator_versions()]
 
 
 def _stage_views(source: Import, staging: Staging, progress: Progress) -> tuple[set[int], ImportFindings]:
     """Stage the rows of all views; return the bar ids in the left images, and what was found out.
 
     All views are decoded, as those of an interrupted import are compared as well. Raises ``InputError`` for files
-    that cannot be read, and for a mistake of the layout that the surveyed bars reveal.
+    that cannot be read.
     """
     ids: set[int] = set()
     tally, survey = DepthTally(), SurveyCheck(source.layout, source.bars, len(source.views.names))
@@ -170,17 +162,15 @@ def _stage_views(source: Import, staging: Staging, progress: Progress) -> tuple[
             row, record = encode_row({**dict.fromkeys(OPTIONAL_COLUMNS), **identity, **columns})
             stage_row(path, row, record)
         progress(f"import of {source.name}", index + 1, len(source.views.names))
-    if mistake := survey.mistake():
-        raise InputError.from_problems(source.views.root, [mistake])
-    depth, summary = source.layout.depth, survey.lines()
+    depth, (summary, survey_notes) = source.layout.depth, survey.findings()
     if depth.max_m is not None:
         summary.append(f"depth beyond depth.max_m = {depth.max_m:g} m: {tally.beyond_px} pixels left out")
-    unmatched = [value for value in depth.invalid if value not in tally.invalid]
     notes = [
         f"depth.invalid: no pixel of any view has the value {value:.15g}, in units of the files"
-        for value in unmatched
+        for value in depth.invalid
+        if value not in tally.invalid
     ]
-    return ids, ImportFindings(tuple(summary), tuple(notes))
+    return ids, ImportFindings(tuple(summary), (*notes, *survey_notes))
 
 
 def _config_entry(source: Import) -> dict[str, Any]:

@@ -51,7 +51,6 @@ LABEL_SUFFIXES = (".png", ".tif", ".tiff", ".npy")
 MATRIX_SUFFIXES = (".txt", ".npy", ".json")
 
 _MIN_DEPTH_M, _MAX_DEPTH_M = 1e-4, 1000.0
-_BIG_TIFF = 43
 _TIFF_INTEGERS = ("L", "I;16", "I;16B", "I")
 """Pillow's modes of integers in TIFF files."""
 _MAX_BAR_ID = np.iinfo(np.uint16).max
@@ -87,7 +86,19 @@ def read_depth(path: Path, grid: Grid, table: DepthTable, tally: DepthTally) -> 
     value of an integer type, or of half floats, which marks pixels without depth, unless it is among the invalid
     ones; that of half floats is left out with ``depth.max_m``.
     """
-    values = _depth_values(path, grid, table)
+    suffix, content = path.suffix.lower(), read_file(path, CELL_BYTES, "a depth map", InputError)
+    check_upright(io.BytesIO(content), path.name)
+    if suffix == ".exr" and table.channel is not None:
+        values = _exr_channel(path, table.channel)
+    elif suffix == ".exr":
+        values = decode_exr(path.name, memoryview(content), grid)
+    elif suffix == ".png":
+        values = decode_png(path.name, memoryview(content), grid).astype(np.uint16)
+    elif suffix in (".npy", ".npz"):
+        decode = decode_npy if suffix == ".npy" else decode_npz
+        values = decode(path.name, memoryview(content), grid, ints=True)
+    else:
+        values = _pixels(path, content, is_depth=True)
     _check_grid(path, values, grid)
     is_integer = values.dtype.kind in "iu"
     if is_integer or (values.dtype == np.float16 and table.max_m is None):
@@ -105,23 +116,6 @@ def read_depth(path: Path, grid: Grid, table: DepthTable, tally: DepthTally) -> 
             tally.invalid.add(value)
     units[~np.isfinite(units) | (units <= 0) | np.isin(units, marks)] = np.nan
     return units
-
-
-def _depth_values(path: Path, grid: Grid, table: DepthTable) -> Shaped[ndarray, "h w"]:
-    """Return the values of a depth map in the type of the file."""
-    suffix = path.suffix.lower()
-    content = read_file(path, CELL_BYTES, "a depth map", InputError)
-    check_upright(io.BytesIO(content), path.name)
-    if suffix == ".exr":
-        if table.channel is not None:
-            return _exr_channel(path, table.channel)
-        return decode_exr(path.name, memoryview(content), grid)
-    if suffix == ".png":
-        return decode_png(path.name, memoryview(content), grid).astype(np.uint16)
-    if suffix in (".npy", ".npz"):
-        decode = decode_npy if suffix == ".npy" else decode_npz
-        return decode(path.name, memoryview(content), grid, ints=True)
-    return _pixels(path, content, is_depth=True)
 
 
 def planar_depth_m(
@@ -233,16 +227,15 @@ def _pixels(path: Path, content: bytes, *, is_depth: bool = False) -> Shaped[nda
     # Pillow would take the line feed of the last line end for the first byte of the values.
     content = _PFM_OF_CR_LF.sub(rb"\1\n", content)
     image_format = _IMAGE_FORMATS[path.suffix.lower()]
-    with _damage(path, image_format), warnings.catch_warnings():
+    expected = f"{image_format} of float32 or of integers up to 32 bits, or .npy"
+    with _damage(path, expected), warnings.catch_warnings():
         warnings.simplefilter("error")  # Pillow warns of huge images before it decodes them.
         try:
             with Image.open(io.BytesIO(content), formats=[image_format]) as image:
                 tags, values, mode = dict(getattr(image, "tag_v2", {})), np.asarray(image), image.mode
                 stored = _tiff_type(tags) if tags and mode in _TIFF_INTEGERS else values.dtype.newbyteorder("=")
         except UnidentifiedImageError:
-            if image_format != "TIFF":
-                raise
-            return _raw_tiff(path, content)
+            raise ValueError(f"no {image_format} image of a type that Pillow knows") from None
     if values.ndim != 2 or values.dtype.kind not in "buif" or (is_depth and mode in ("1", "P")):
         found = f"has values of type {values.dtype} and shape {values.shape}, Pillow's mode {mode}"
         raise EntryError(Problem("invalid", path.name, found, "one channel of numbers"))
@@ -260,26 +253,6 @@ def _tiff_type(tags: Mapping[int, Any]) -> np.dtype[Any]:
     if kind is None:
         raise ValueError(f"its values have the SampleFormat {sample_format}, expected 1, 2 or 3")
     return np.dtype(f"{kind}{2 ** (bits - 1).bit_length() // 8}")  # 12 bits are read as 16.
-
-
-def _raw_tiff(path: Path, content: bytes) -> Shaped[ndarray, "h w"]:
-    """Return the values of a TIFF image of a type that Pillow does not know, such as float16 and float64."""
-    from PIL.TiffImagePlugin import ImageFileDirectory_v2
-
-    stream = io.BytesIO(content)
-    tags = ImageFileDirectory_v2(content[: 16 if content[2] == _BIG_TIFF else 8])
-    stream.seek(tags.next)
-    tags.load(stream)
-    stored, shape = _tiff_type(tags), (tags[257], tags[256])
-    starts, sizes = tags.get(273, ()), tags.get(279, ())
-    if tags.get(277, 1) != 1 or tags.get(259, 1) != 1 or not starts:
-        found = f"is a TIFF file of {stored} with {tags.get(277, 1)} channels, compressed or in tiles"
-        raise EntryError(Problem("invalid", path.name, found, "one channel, uncompressed; or float32, or .npy"))
-    if sum(sizes) != shape[0] * shape[1] * stored.itemsize or sum(sizes) > len(content):
-        raise ValueError(f"{sum(sizes)} bytes of values for {format_shape(shape)} {stored}")
-    data = b"".join(content[start : start + size] for start, size in zip(starts, sizes, strict=True))
-    in_file = stored.newbyteorder("<" if content[:2] == b"II" else ">")
-    return np.frombuffer(data, in_file).reshape(shape).astype(stored)
 
 
 def _exr_channel(path: Path, channel: str) -> Shaped[ndarray, "h w"]:
@@ -301,14 +274,20 @@ def _exr_channel(path: Path, channel: str) -> Shaped[ndarray, "h w"]:
 def _read_matrix(path: Path, key: str | None, shape: tuple[int, int]) -> Float64[ndarray, "n m"]:
     """Return the matrix in a file, of ``shape`` or, for poses, without its last row.
 
-    ``key`` is that of a JSON object. Raises ``EntryError`` for anything but finite numbers.
+    ``key`` has the keys of JSON objects, joined by dots. Raises ``EntryError`` for anything but finite numbers.
     """
     content, suffix = read_file(path, TOML_BYTES, "a matrix", InputError), path.suffix.lower()
     with _damage(path, "numbers with decimal points between blanks or commas"):
         if suffix == ".npy":
-            numbers: object = _npy(path, content)
+            numbers: Any = _npy(path, content)
         elif suffix == ".json":
-            numbers = _json_value(content, key)
+            numbers, problems = parse_json(content)
+            if problems:
+                raise EntryError(problems[0])
+            for part in key.split(".") if key is not None else ():
+                if not isinstance(numbers, dict) or part not in numbers:
+                    raise ValueError(f"it has no key {key}")
+                numbers = numbers[part]
         else:
             text, problems = decode_text(content, path.name)
             if problems:
@@ -321,18 +300,6 @@ def _read_matrix(path: Path, key: str | None, shape: tuple[int, int]) -> Float64
         found = f"holds {values.size} numbers"
         raise EntryError(Problem("invalid", path.name, found, f"{shape[0]} x {shape[1]} finite numbers"))
     return values.reshape(shape)
-
-
-def _json_value(content: bytes, key: str | None) -> object:
-    """Return the value of a JSON object at a key, whose parts are joined by dots."""
-    value, problems = parse_json(content)
-    if problems:
-        raise EntryError(problems[0])
-    for part in key.split(".") if key is not None else ():
-        if not isinstance(value, dict) or part not in value:
-            raise ValueError(f"it has no key {key}")
-        value = value[part]
-    return value
 
 
 def intrinsics(path: Path, table: MatricesTable) -> Float64[ndarray, "3 3"]:

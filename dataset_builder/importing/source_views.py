@@ -9,8 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Bool
-from numpy import ndarray
 
 from dataset_builder.importing.import_layout import VIEW, Layout
 from dataset_builder.importing.source_files import (
@@ -83,44 +81,38 @@ class SourceViews:
         view's files.
         """
         try:
-            cameras = self._cameras(name)
-            return {**cameras, **self._images(name, cameras, DepthTally() if tally is None else tally)}
+            return self._decoded(name, DepthTally() if tally is None else tally)
         except EntryError as error:
             raise InputError.from_problems(f"{self.root}: view {name}", error.problems) from None
 
-    def _cameras(self, name: str) -> dict[str, Any]:
-        layout, camera = self.layout, self.cameras[name]
-        pose = np.eye(4) if camera.cam_from_world is None else camera.cam_from_world
+    def _decoded(self, name: str, tally: DepthTally) -> dict[str, Any]:
+        layout, (calibration, pose, unit_m) = self.layout, self.cameras[name]
         if layout.poses is not None:
             pose = cam_from_world(self.file(layout.poses.file, name), layout.poses)
-        columns = camera_columns(camera.calibration, pose)
+        columns = camera_columns(calibration, np.eye(4) if pose is None else pose)
         if layout.intrinsics is not None:
             path = self.file(layout.intrinsics.file, name)
             K = columns["left_K"] = intrinsics(path, layout.intrinsics)
-            lens = Lens(K[0, 0], K[1, 1], K[0, 2], K[1, 2], camera.calibration.left.distortion)
+            lens = Lens(K[0, 0], K[1, 1], K[0, 2], K[1, 2], calibration.left.distortion)
             height, width = self.grid
             scaled_calibration(MonoCalibration(width, height, lens), path, width, height)
-        if layout.files.has_right:
-            return columns
-        return {column: cell for column, cell in columns.items() if column.startswith("left_")}
-
-    def _images(self, name: str, cameras: Mapping[str, Any], tally: DepthTally) -> dict[str, Any]:
-        table = self.layout.depth
-        columns: dict[str, Any] = {}
-        for column, pattern in self.layout.files.patterns.items():
+        if not layout.files.has_right:
+            columns = {column: cell for column, cell in columns.items() if column.startswith("left_")}
+        for column, pattern in layout.files.patterns.items():
             path, kind, eye = self.file(pattern, name), column_kind(column), column.partition("_")[0]
             if kind == "rgb":
                 columns[column] = read_image(path, self.grid)
             elif kind == "depth":
-                calibration, _, unit_m = self.cameras[name]
-                factor = table.factor if unit_m is None else unit_m
+                table, factor = layout.depth, layout.depth.factor if unit_m is None else unit_m
                 units = read_depth(path, self.grid, table, tally)
-                K, distortion = cameras[f"{eye}_K"], cameras[f"{eye}_distortion"]
+                K, distortion = columns[f"{eye}_K"], columns[f"{eye}_distortion"]
                 depth_m = planar_depth_m(units, factor, table.kind, calibration, K, distortion)
                 columns[column] = limited_depth_m(path, units, depth_m, table, tally)
+            elif kind == "mask":
+                values, steel = read_labels(path, self.grid), layout.masks.values
+                columns[column] = np.isin(values, steel) if steel else values != 0
             else:
-                values = read_labels(path, self.grid)
-                columns[column] = self._mask(values) if kind == "mask" else bar_ids(path, values)
+                columns[column] = bar_ids(path, read_labels(path, self.grid))
         for eye in EYES:
             if f"{eye}_bars" in columns:
                 has_id = columns[f"{eye}_bars"] > 0
@@ -129,10 +121,6 @@ class SourceViews:
                     found = f"{outside} pixels have a bar id and are no steel in the mask"
                     raise EntryError(Problem("conflict", f"{eye}_bars", found, "bar ids on steel only"))
         return columns
-
-    def _mask(self, values: ndarray) -> Bool[ndarray, "h w"]:
-        steel = self.layout.masks.values
-        return np.isin(values, steel) if steel else values != 0
 
 
 def open_views(path: Path, layout: Layout) -> SourceViews:
@@ -147,7 +135,16 @@ def open_views(path: Path, layout: Layout) -> SourceViews:
             problems.append(
                 Problem("invalid", key, f"got {escape_text(pattern)}", f"a name ending in {', '.join(suffixes)}")
             )
-    names = _view_names(root, layout.files.left_depth, problems)
+    before, _, after = layout.files.left_depth.partition(VIEW)
+    match = re.compile(f"{re.escape(before)}({NAME_PATTERN}){re.escape(after)}")
+    names = []
+    for file in sorted(root.glob(layout.files.left_depth.replace(VIEW, "*"))):
+        if matched := match.fullmatch(file.relative_to(root).as_posix()):
+            names.append(matched[1])
+        else:
+            found = f"got {escape_text(file.relative_to(root).as_posix())}"
+            problems.append(Problem("name", "files.left_depth", found, f"views named by {NAME_LETTERS}"))
+    names.sort()
     if not names and not problems:
         problems.append(Problem("missing", "files.left_depth", "no file has this name", layout.files.left_depth))
     files = {key: [pattern.replace(VIEW, name) for name in names] for key, pattern in patterns.items()}
@@ -188,17 +185,3 @@ def _patterns(layout: Layout) -> dict[str, str]:
         **layout.files.patterns,
         **{f"{key}.file": table.file for key, table in matrices.items() if table is not None},
     }
-
-
-def _view_names(root: Path, pattern: str, problems: list[Problem]) -> list[str]:
-    """Return the sorted names of the views whose left depth map exists."""
-    before, _, after = pattern.partition(VIEW)
-    match = re.compile(f"{re.escape(before)}({NAME_PATTERN}){re.escape(after)}")
-    found = [path.relative_to(root).as_posix() for path in root.glob(pattern.replace(VIEW, "*"))]
-    names = {name: match.fullmatch(name) for name in sorted(found)}
-    problems += [
-        Problem("name", "files.left_depth", f"got {escape_text(name)}", f"views named by {NAME_LETTERS}")
-        for name, matched in names.items()
-        if matched is None
-    ]
-    return sorted(matched[1] for matched in names.values() if matched is not None)

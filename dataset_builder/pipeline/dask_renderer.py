@@ -99,18 +99,14 @@ def connect_to_cluster(address: str) -> Iterator[ClusterRenderer]:
     missing or has another version on the cluster; ``RenderProcessError`` if several workers died while rendering
     the same unit; ``BuildError`` if the scheduler is lost.
     """
-    with _quiet_client(), closing(_connect(address)) as client:
-        renderer = ClusterRenderer(client)
-        with _translate_dask_errors(renderer, address):
+    logger = logging.getLogger("distributed.client")
+    level = logger.level
+    logger.setLevel(logging.CRITICAL)  # dask would log tracebacks of errors that are reported to the user.
+    try:
+        with closing(_connect(address)) as client:
+            renderer = ClusterRenderer(client)
             _check_workers(client, address)
             yield renderer
-
-
-@contextmanager
-def _translate_dask_errors(renderer: ClusterRenderer, address: str) -> Iterator[None]:
-    """Translate the errors of dask about lost workers and schedulers into errors of this package."""
-    try:
-        yield
     except KilledWorker as error:
         unit = renderer.keys.get(str(error.task))
         label = "a staged cage" if unit is None else unit.label
@@ -123,16 +119,6 @@ def _translate_dask_errors(renderer: ClusterRenderer, address: str) -> Iterator[
             f"the dask scheduler at {address} was lost; run the same command again to continue "
             "when the scheduler is running"
         ) from None
-
-
-@contextmanager
-def _quiet_client() -> Iterator[None]:
-    """Suppress the tracebacks that dask logs for errors that are reported to the user."""
-    logger = logging.getLogger("distributed.client")
-    level = logger.level
-    logger.setLevel(logging.CRITICAL)
-    try:
-        yield
     finally:
         logger.setLevel(level)
 

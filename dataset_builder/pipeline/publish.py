@@ -27,7 +27,6 @@ from dataset_builder.pipeline.folder import (
     PICTURES,
     SHARD_DIGEST_CHARACTERS,
     file_matches,
-    manifest_text,
     remove_temporary_files,
     remove_unlisted_files,
     stored_bars_path,
@@ -36,13 +35,13 @@ from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, config_param
 from dataset_builder.pipeline.shards import Staging, pack_shard, split_into_shards
 from dataset_builder.specs.config_specs import SceneConfigSpec
 from rebar_depth_bench import software_version
-from rebar_depth_bench.bar_crossings.definition import Crossings, crossing_parameters
 from rebar_depth_bench.bar_crossings.crossings_file import (
     CROSSINGS_FILE,
     crossings_entry,
     read_crossings,
     write_crossings,
 )
+from rebar_depth_bench.bar_crossings.definition import Crossings, crossing_parameters
 from rebar_depth_bench.base.names import SPLITS, TEST_SPLIT
 from rebar_depth_bench.base.reading import remove_file
 from rebar_depth_bench.base.writing import write_bytes, write_text
@@ -254,7 +253,7 @@ def write_folder(
         "files": {name: known[name] for name in sorted({*written, *_listed_files(ordered)})},
     }
     published = validated_folder(manifest, [], str(out), out / MANIFEST_FILE)
-    write_text(out / MANIFEST_FILE, manifest_text(manifest))
+    write_text(out / MANIFEST_FILE, json.dumps(manifest, indent=1, allow_nan=False) + "\n")
     remove_file(out / BUILD_FOLDER / BARS_FILE)
     remove_unlisted_files(out, _listed_files(ordered))
     return published

@@ -21,11 +21,11 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from outputs import add_outputs, flat_table, number, run_script, single_bar_means, write_outputs
+from rebar_depth_bench import score
 from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.base.terminal import ProgressBars
 from rebar_depth_bench.cli.console import add_archive, add_data
 from rebar_depth_bench.data.manifest import DatasetConfig
-from rebar_depth_bench.extended.families import MEASURE_FAMILIES, score_extended
 from rebar_depth_bench.extended.ground_truth import has_bar_ids
 from rebar_depth_bench.reporting.extended_tables import reach_sentence
 from rebar_depth_bench.scoring import bootstrap
@@ -69,16 +69,16 @@ def view_table(evaluation: Evaluation, config: DatasetConfig, result: Result) ->
     """Return one row per scored view of a config; s and errors of views without prediction are NaN."""
     assert result.extended is not None
     truths = config_truth(evaluation.folder, config)
-    scores = [view for view in result.views if view.view_id.startswith(f"{config.name}/")]
+    frame = result.frames[config.name]
     columns = {
         "config": config.name,
         "by_scene": config.has_splits,
         "views_per_distance": config.views_per_distance,
         "view_id": truths.view_ids,
         "distance_m": [view.distance_m for view in truths.traits],
-        "scale": np.array([score.scale for score in scores], np.float64),
-        "native_abs_rel": [score["native.abs_rel"] if score.native else math.nan for score in scores],
-        "scaled_abs_rel": [score["scaled.abs_rel"] if score.scaled else math.nan for score in scores],
+        "scale": frame["scale"],
+        "native_abs_rel": frame["native.abs_rel"],
+        "scaled_abs_rel": frame["scaled.abs_rel"],
         "single_bar": [result.extended.views.get(view_id, {}) for view_id in truths.view_ids],
     }
     return pd.DataFrame(columns)
@@ -162,8 +162,7 @@ def draw_figure(figure: Figure, views: pd.DataFrame, bins: pd.DataFrame) -> None
 def run(options: argparse.Namespace) -> None:
     """Compute slopes, bins and reaches, write the requested files and print them."""
     with ProgressBars() as bars, open_evaluation(options.archive, options.data) as evaluation:
-        families = [MEASURE_FAMILIES[key] for key in ("single_bar", "crossings")]
-        result = score_extended(evaluation, families, progress=bars.update)
+        result = score(options.archive, evaluation.folder, extended=True, progress=bars.update)
         assert result.extended is not None
         present = {config.name: config for config in evaluation.configs}
         names = dict.fromkeys(options.config or present)

@@ -170,7 +170,7 @@ def score_image(image: Any, source: DepthMaps, options: argparse.Namespace) -> d
 def tabulate(images: list[dict[str, Any]]) -> dict[str, Any]:
     """Return means over images, the median of s, and 95 % block bootstrap intervals over images."""
     values = pd.json_normalize(images).drop(columns=["name", "scored_px"]).astype(float)
-    coverage, scored = mean(values.pop("coverage").tolist()) or 0.0, int(values["scale"].count())
+    coverage, scored = mean(values.pop("coverage").tolist()), int(values["scale"].count())
     values["scale_median"] = values.pop("scale")
     resampling, known = resample(range(len(values))), values.dropna()
     draws = resampling.means(values.to_numpy())
@@ -226,10 +226,10 @@ def run(options: argparse.Namespace) -> None:
             predict_views(find_method(options.method), views, options.predictions, bars.update)
         with open_maps(options.predictions, shapes, 1 / 256, optional="kitti/" + missing) as source:
             work, each = partial(score_image, source=source, options=options), images.itertuples()
-            rows = list(
-                map_in_threads(work, each, len(images), "scoring", workers=options.workers, progress=bars.update)
+            rows = map_in_threads(
+                work, each, len(images), "scoring", workers=options.workers, progress=bars.update
             )
-    scored = [row for row in rows if row["scored_px"]]
+            scored = [row for row in rows if row["scored_px"]]
     if not scored:
         raise InputError(f"{options.kitti}: no image has ground truth inside the crop {options.crop}")
     protocol = {"ground_truth": kind, "crop": options.crop, "cap_m": options.cap}

@@ -14,7 +14,7 @@ from rebar_depth_bench.base.errors import InputError, printable
 from rebar_depth_bench.base.writing import write_output
 from rebar_depth_bench.cli.console import add_output_file, prints_table, run_program
 from rebar_depth_bench.data.manifest import DatasetConfig
-from rebar_depth_bench.extended.estimates import ViewNumbers
+from rebar_depth_bench.extended.estimates import ViewMeasures
 from rebar_depth_bench.reporting.figure import check_figure, figure_bytes, figure_style
 from rebar_depth_bench.scoring.columns import METRICS, rounded
 from rebar_depth_bench.scoring.metrics import mean
@@ -84,7 +84,7 @@ def flat_table(rows: Sequence[Mapping[str, Any]]) -> pd.DataFrame:
     return table
 
 
-def single_bar_means(views: Sequence[ViewNumbers]) -> dict[str, Any]:
+def single_bar_means(views: Sequence[ViewMeasures]) -> dict[str, Any]:
     """Return share, coverage and metrics of the single-bar interior, means of the views that have a value."""
 
     def mean_of(align: str, name: str) -> float | None:

@@ -154,12 +154,14 @@ def validate_table(
         return None
 
 
-def validate_document(schema: TypeAdapter[Document], values: object, problems: list[Problem]) -> Document | None:
-    """Return the validated value of a JSON document that is no model, as ``validate_table`` does of a table."""
+def validate_document(
+    schema: TypeAdapter[Document], values: object, problems: list[Problem], where: str = ""
+) -> Document | None:
+    """Return the validated value of a JSON document that is no model; otherwise as ``validate_table``."""
     try:
         return schema.validate_python(values)
     except ValidationError as error:
-        problems += [_problem(details, BaseModel, "") for details in error.errors(include_url=False)]
+        problems += [_problem(details, BaseModel, where) for details in error.errors(include_url=False)]
         return None
 
 

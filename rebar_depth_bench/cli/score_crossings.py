@@ -18,7 +18,7 @@ from rebar_depth_bench.cli.console import (
     add_workers,
     prints_table,
 )
-from rebar_depth_bench.detections.score import score_crossings
+from rebar_depth_bench.detections.crossing_scorer import score_crossings
 from rebar_depth_bench.reporting.detections import detection_page, print_page, render_page
 from rebar_depth_bench.submission import INPUTS
 

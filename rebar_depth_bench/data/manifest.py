@@ -256,8 +256,6 @@ class DatasetConfig(Located):
 
 
 MANIFEST_FORMAT = "rebar-depth-dataset-2"
-OLD_FORMAT = "rebar-depth-dataset-1"
-"""Format of folders that ``rebar-build --rewrite-manifest`` converts."""
 
 
 class DatasetFolder(Located):
@@ -334,28 +332,15 @@ def open_folder(root: str | Path, *, expect_digest: str | None = None) -> Datase
         )
     root = str(root)
     path = Located(root=root).file(MANIFEST_FILE)
-    values, problems = read_manifest(path)
-    if isinstance(values, dict) and values.get("format") == OLD_FORMAT:
-        raise DatasetError(
-            f"{path}: has the format {OLD_FORMAT}, expected {MANIFEST_FORMAT}; rebar-build --out ROOT "
-            "--rewrite-manifest converts it without rendering"
-        )
+    values, problems = parse_json(read_file(path, JSON_BYTES, "the manifest of a dataset", DatasetError))
     folder = validated_folder(values, problems, root, path)
     if expect_digest not in (None, folder.digest):
         raise DatasetError(f"{root}: the dataset has the digest {folder.digest}, expected {expect_digest}")
     return folder
 
 
-def read_manifest(path: Path) -> tuple[Any, list[Problem]]:
-    """Return the JSON value in a manifest, which is not checked further, or the problem of its text.
-
-    Raises ``DatasetError`` if the file cannot be read or is larger than ``JSON_BYTES``.
-    """
-    return parse_json(read_file(path, JSON_BYTES, "the manifest of a dataset", DatasetError))
-
-
 def validated_folder(values: Any, problems: list[Problem], root: str, path: Path) -> DatasetFolder:
-    """Return the dataset in ``root`` that ``read_manifest`` has read from ``path``, if there are no ``problems``.
+    """Return the dataset in ``root`` that was read from ``path``, if there are no ``problems``.
 
     Raises ``DatasetError`` with ``problems`` and the problems of the values.
     """

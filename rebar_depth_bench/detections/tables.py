@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,8 @@ from numpy import ndarray
 from rebar_depth_bench import software_version
 from rebar_depth_bench.bar_crossings.crossings_file import CrossingsSource
 from rebar_depth_bench.bar_crossings.definition import CROSSINGS_PROTOCOL
-from rebar_depth_bench.extended.measures import percentile
+from rebar_depth_bench.extended.measures import Samples, percentile
+from rebar_depth_bench.extended.reach import pooled
 from rebar_depth_bench.scoring.bootstrap import INTERVALS, Interval, Resampling, interval
 from rebar_depth_bench.scoring.columns import rounded, rounded_interval
 from rebar_depth_bench.submission.declaration import SubmissionMeta
@@ -97,11 +98,11 @@ AVERAGE_PRECISION_MM = (5, 10, 20)
 class ViewDetections:
     """Detections of one view compared with its crossings.
 
-    ``judged`` counts crossings, ``nodes`` the nodes that they belong to and ``nodes_found`` those with a match;
-    ``detections`` counts rows with enough confidence, of which ``matched`` have a crossing, ``ignored`` are
-    excused and the others false. ``position_mm`` and ``normal_deg`` are the errors of matched ones, the latter of
-    those with a normal. ``confidence``, ``counts`` and ``correct`` describe all rows for average precision, the
-    last two by limit: whether a row counts, and whether it is correct.
+    ``judged`` counts crossings, ``nodes`` their nodes and ``nodes_found`` the nodes with a match; ``detections``
+    counts rows with enough confidence, of which ``matched`` have a crossing, ``ignored`` are
+    excused and the others false. ``position_mm`` and ``normal_deg`` are the errors of matched detections, the
+    latter where a normal is given. ``confidence``, ``counts`` and ``correct`` describe all rows for average
+    precision, the last two by limit: whether a row counts, and whether it is correct.
     """
 
     view_id: str
@@ -122,6 +123,21 @@ class ViewDetections:
         """Number of detections that are neither matched nor ignored."""
         return self.detections - self.matched - self.ignored
 
+    @property
+    def shares(self) -> dict[str, tuple[int, int]]:
+        """Numerator and denominator of each of ``SHARES``; both are summed over views."""
+        return {
+            "precision": (self.matched, self.matched + self.false),
+            "recall": (self.matched, self.judged),
+            "f1": (2 * self.matched, self.matched + self.false + self.judged),
+            "node_recall": (self.nodes_found, self.nodes),
+        }
+
+    @property
+    def errors(self) -> Samples:
+        """Errors of matched detections by name."""
+        return {"position_mm": self.position_mm, "normal_deg": self.normal_deg}
+
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object of the view."""
         return {
@@ -139,8 +155,9 @@ class ViewDetections:
 class DetectionTable:
     """Numbers of one config, or of all together.
 
-    ``numbers`` are those of ``tabulate_detections``, ``intervals`` their 95 % intervals (None where unknown), and
-    ``curves`` the points (recall, precision) by limit in mm. ``counts`` are sums over the views.
+    ``counts`` are sums over the views. ``numbers`` has ``SHARES``, the average precisions and ``ERRORS`` by name,
+    and ``intervals`` their 95 % intervals; None where undefined or unknown. ``curves`` has the points (recall,
+    precision) by limit in mm.
     """
 
     views: int
@@ -151,19 +168,19 @@ class DetectionTable:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object of the table."""
-        average = {
-            str(limit): rounded(self.numbers[f"average_precision_{limit}mm"]) for limit in AVERAGE_PRECISION_MM
-        }
-        plain = {name: rounded(value) for name, value in self.numbers.items() if "average_precision" not in name}
-        curves = {
-            str(limit): [[rounded(recall), rounded(precision)] for recall, precision in curve]
-            for limit, curve in self.curves.items()
-        }
-        intervals = {name: rounded_interval(ends) for name, ends in self.intervals.items()}
+        numbers = {name: rounded(value) for name, value in self.numbers.items()}
+        average = {str(limit): numbers.pop(f"average_precision_{limit}mm") for limit in AVERAGE_PRECISION_MM}
         return {
-            "views": self.views, **self.counts, **plain, "average_precision": average, "ci95": intervals,
-            "precision_recall": curves,
-        }  # fmt: skip
+            "views": self.views,
+            **self.counts,
+            **numbers,
+            "average_precision": average,
+            "ci95": {name: rounded_interval(ends) for name, ends in self.intervals.items()},
+            "precision_recall": {
+                str(limit): [[rounded(recall), rounded(precision)] for recall, precision in curve]
+                for limit, curve in self.curves.items()
+            },
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -187,10 +204,13 @@ class DetectionResult:
 
     def to_dict(self) -> dict[str, Any]:
         """Return the result as a JSON-compatible object."""
-        source = {"file": self.source.file, "sha256": self.source.sha256}
         return {
             "protocol": CROSSINGS_PROTOCOL,
-            "dataset": {"digest": self.dataset_digest, "version": self.dataset_version, "crossings": source},
+            "dataset": {
+                "digest": self.dataset_digest,
+                "version": self.dataset_version,
+                "crossings": asdict(self.source),
+            },
             "submission": {
                 "method": self.meta.method,
                 "sha256": self.sha256,
@@ -212,6 +232,18 @@ class DetectionResult:
         return json.dumps(self.to_dict(), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
+SHARES = ("precision", "recall", "f1", "node_recall")
+"""Shares over all views: see ``ViewDetections.shares``."""
+
+ERRORS = {
+    "position_mm": ("position_mm", 50),
+    "position_p95_mm": ("position_mm", 95),
+    "normal_deg": ("normal_deg", 50),
+    "normal_p95_deg": ("normal_deg", 95),
+}
+"""Errors of matched detections: sample and percentile."""
+
+
 def tabulate_detections(views: Sequence[ViewDetections], resampling: Resampling | None) -> DetectionTable:
     """Return the table of some views, without intervals if there is no ``resampling``."""
     counts = {
@@ -222,81 +254,42 @@ def tabulate_detections(views: Sequence[ViewDetections], resampling: Resampling 
         "false": sum(view.false for view in views),
         "ignored": sum(view.ignored for view in views),
     }
-    ranked = {limit: _ranked(views, limit) for limit in AVERAGE_PRECISION_MM}
-    shares = {
-        name: _share(np.array([[top(view), all_(view)] for view in views]))
-        for name, (top, all_) in _SHARES.items()
-    }
-    errors = {name: _error(views, attribute, percent) for name, (attribute, percent) in _ERRORS.items()}
-    average = {f"average_precision_{limit}mm": of_one.average() for limit, of_one in ranked.items()}
-    intervals: dict[str, Interval | None] = dict.fromkeys((*shares, *average, *errors))
-    if resampling is not None:
-        intervals = _intervals(views, resampling, ranked)
-    curves = {limit: of_one.drawn_points() for limit, of_one in ranked.items()}
-    return DetectionTable(len(views), counts, {**shares, **average, **errors}, intervals, curves)
-
-
-_Counter = Callable[[ViewDetections], int]
-
-_SHARES: Mapping[str, tuple[_Counter, _Counter]] = {
-    "precision": (lambda view: view.matched, lambda view: view.matched + view.false),
-    "recall": (lambda view: view.matched, lambda view: view.judged),
-    "f1": (lambda view: 2 * view.matched, lambda view: view.matched + view.false + view.judged),
-    "node_recall": (lambda view: view.nodes_found, lambda view: view.nodes),
-}
-"""Shares as numerator and denominator of one view; both are summed over views."""
-
-_ERRORS = {
-    "position_mm": ("position_mm", 50),
-    "position_p95_mm": ("position_mm", 95),
-    "normal_deg": ("normal_deg", 50),
-    "normal_p95_deg": ("normal_deg", 95),
-}
-"""Errors of matched detections: sample and percentile."""
+    numbers: dict[str, float | None] = {}
+    intervals: dict[str, Interval | None] = {}
+    curves = {}
+    for name in SHARES:
+        parts = np.array([view.shares[name] for view in views], dtype=np.float64).reshape(-1, 2)
+        numerator, denominator = parts.sum(axis=0)
+        numbers[name] = float(numerator / denominator) if denominator else None
+        intervals[name] = None
+        if resampling is not None:
+            sums = resampling.view_counts @ parts
+            with np.errstate(invalid="ignore", divide="ignore"):
+                draws = sums[:, 0] / sums[:, 1]
+            intervals[name] = interval(draws, resampling.blocks(np.flatnonzero(parts[:, 1])))
+    for limit in AVERAGE_PRECISION_MM:
+        name, ranked = f"average_precision_{limit}mm", _ranked(views, limit)
+        numbers[name] = ranked.average()
+        intervals[name] = None if resampling is None else ranked.interval(resampling)
+        curves[limit] = ranked.drawn_points()
+    for name, (sample, percent) in ERRORS.items():
+        errors, view = pooled([view.errors for view in views], sample)
+        numbers[name] = percentile(errors, percent) if len(errors) else None
+        intervals[name] = None
+        if resampling is not None:
+            draws = resampling.percentile(errors, view, percent)
+            intervals[name] = interval(draws, resampling.blocks(view))
+    return DetectionTable(len(views), counts, numbers, intervals, curves)
 
 
 def _ranked(views: Sequence[ViewDetections], limit_mm: int) -> RankedDetections:
+    """Return the detections of all views that count for the average precision at a limit."""
     kept = [view.counts[limit_mm] for view in views]
+    confidence = [view.confidence[rows] for view, rows in zip(views, kept, strict=True)]
+    correct = [view.correct[limit_mm][rows] for view, rows in zip(views, kept, strict=True)]
     return RankedDetections(
-        np.concatenate([np.empty(0), *(view.confidence[keep] for view, keep in zip(views, kept, strict=True))]),
-        np.concatenate(
-            [
-                np.empty(0, bool),
-                *(view.correct[limit_mm][keep] for view, keep in zip(views, kept, strict=True)),
-            ]
-        ),
-        np.repeat(np.arange(len(views)), [int(np.count_nonzero(keep)) for keep in kept]),
+        np.concatenate([np.empty(0), *confidence]),
+        np.concatenate([np.empty(0, bool), *correct]),
+        np.repeat(np.arange(len(views)), list(map(len, confidence))),
         np.array([view.judged for view in views], dtype=np.int64),
     )
-
-
-def _share(parts: ndarray) -> float | None:
-    numerator, denominator = parts.reshape(-1, 2).sum(axis=0)
-    return float(numerator / denominator) if denominator else None
-
-
-def _error(views: Sequence[ViewDetections], attribute: str, percent: int) -> float | None:
-    values = np.concatenate([np.empty(0), *(getattr(view, attribute) for view in views)])
-    return percentile(values, percent) if len(values) else None
-
-
-def _intervals(
-    views: Sequence[ViewDetections], resampling: Resampling, ranked: Mapping[int, RankedDetections]
-) -> dict[str, Interval | None]:
-    """Return the 95 % intervals over resampled views."""
-    intervals: dict[str, Interval | None] = {}
-    for name, (top, all_) in _SHARES.items():
-        parts = np.array([[top(view), all_(view)] for view in views], dtype=np.float64)
-        sums = resampling.view_counts @ parts
-        with np.errstate(invalid="ignore", divide="ignore"):
-            draws = sums[:, 0] / sums[:, 1]
-        intervals[name] = interval(draws, resampling.blocks(np.flatnonzero(parts[:, 1])))
-    for limit, of_one in ranked.items():
-        intervals[f"average_precision_{limit}mm"] = of_one.interval(resampling)
-    for name, (attribute, percent) in _ERRORS.items():
-        values = [getattr(view, attribute) for view in views]
-        samples = np.concatenate([np.empty(0), *values])
-        view = np.repeat(np.arange(len(views)), [len(of_one) for of_one in values])
-        draws = resampling.percentile(samples, view, percent) if len(samples) else np.empty(0)
-        intervals[name] = interval(draws, resampling.blocks(view))
-    return intervals

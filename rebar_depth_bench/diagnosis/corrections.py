@@ -278,7 +278,7 @@ class Correction:
 def unit_corrections(views: Sequence[DiagnosedView], depth_scale: float | None = None) -> list[Correction]:
     """Return the corrections of depth divided by its largest value, and of the factor of all views if it is one.
 
-    ``depth_scale`` is that of an archive of PNG images.
+    ``depth_scale`` is the scale of an archive of PNG images.
     """
     seems = "depth divided by the largest value of each picture"
     hint = RELATIVE.format("scale")

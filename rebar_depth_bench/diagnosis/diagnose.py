@@ -60,9 +60,9 @@ class PossibleMistake:
 def diagnose(
     configs: Iterable[KeptPredictions], kind: str = METRIC, depth_scale: float | None = None
 ) -> list[PossibleMistake]:
-    """Return the possible mistakes in the predictions of configs, those of ``diagnose_config`` for each.
+    """Return the possible mistakes in the predictions of configs: what ``diagnose_config`` finds in each.
 
-    ``kind`` is that of the predictions, and ``depth_scale`` that of an archive of PNG images.
+    ``kind`` is the kind of the predictions, and ``depth_scale`` the scale of an archive of PNG images.
     """
     return [mistake for config in configs for mistake in diagnose_config(config, kind, depth_scale)]
 

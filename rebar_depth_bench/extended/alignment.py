@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from rebar_depth_bench.extended.measures import ONCE, Measure, MeasureFamily, Samples, finite_sample
+from rebar_depth_bench.extended.measures import Measure, Samples, finite_sample
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.columns import METRICS
 from rebar_depth_bench.scoring.metrics import depth_metrics, is_valid_prediction, median, median_scale
@@ -108,6 +108,3 @@ MEASURES = (
     ),
 )  # fmt: skip
 """Alignment measures in table order."""
-
-_NOTE = "own alignment, see the row"
-FAMILIES = (MeasureFamily("alignment", "Scale against shape", 1, MEASURES, alignment_samples, (ONCE,), _NOTE),)

@@ -19,8 +19,8 @@ from numpy import ndarray
 from rebar_depth_bench.bar_crossings.axis_segments import nearest_points
 from rebar_depth_bench.extended.fits import fit_axes, with_misses
 from rebar_depth_bench.extended.inspection import JUDGED_NOTE, MISSED_NOTE
-from rebar_depth_bench.extended.judged import VisibleSegments, visible_segments
-from rebar_depth_bench.extended.measures import Measure, MeasureFamily, Samples
+from rebar_depth_bench.extended.judged import VisibleSegments
+from rebar_depth_bench.extended.measures import Measure, Samples
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.geometry.cameras import transform
 
@@ -36,22 +36,21 @@ It keeps the other arms of a bent bar and its bends apart.
 _MM = 1000.0
 
 
-def as_built_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
+def as_built_samples(p_m: Float64[ndarray, " n"], designed: DesignedSegments | None) -> Samples:
     """Return the samples of one view; ``MEASURES`` defines what each is.
 
-    ``p_m`` is the predicted planar depth on ``truth.index`` in metres; values that are not finite and > 0 count as
-    missing. Without bars that have a nominal axis there are no samples. Which segments are judged depends on the
-    ground truth alone.
+    ``p_m`` is the predicted planar depth on the pixels of ``SteelTruth`` in metres; values that are not finite and
+    > 0 count as missing. Without ``designed_segments`` there are no samples. Which segments are judged depends on
+    the ground truth alone.
     """
-    judged = truth.once(_judged)
-    if judged is None:
+    if designed is None:
         return {}
-    fitted = fit_axes(p_m, judged.shown)
+    fitted = fit_axes(p_m, designed.shown)
     fitted_m = np.where(fitted.found[:, None], fitted.point_m, np.nan)
-    measured_m = _across(fitted_m - judged.nominal_m, judged.direction)
+    measured_m = _across(fitted_m - designed.nominal_m, designed.direction)
     true_mm, measured_mm, error_mm = (
         np.linalg.norm(vector_m, axis=1) * _MM
-        for vector_m in (judged.true_m, measured_m, measured_m - judged.true_m)
+        for vector_m in (designed.true_m, measured_m, measured_m - designed.true_m)
     )
     is_off, is_reported = true_mm > OFF_MM, measured_mm > OFF_MM
     return {
@@ -64,7 +63,7 @@ def as_built_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
 
 
 @dataclass(frozen=True, eq=False)
-class _Judged:
+class DesignedSegments:
     """Judged segments of a view: what is seen of them, and a point and the direction of the nominal axis, metres.
 
     ``true_m`` are the vectors from the nominal axis to the axis as built, across the nominal one.
@@ -76,14 +75,14 @@ class _Judged:
     true_m: Float64[ndarray, "r 3"]
 
 
-def _judged(truth: SteelTruth) -> _Judged | None:
+def designed_segments(truth: SteelTruth, visible: VisibleSegments) -> DesignedSegments | None:
     """Return the visible segments of bars with a nominal axis; None if there are none."""
-    visible, designed = truth.once(visible_segments), truth.bars.designed
+    bars = truth.bars
     rows, built, nominal = [], [], []
-    for row, bar_id in enumerate(truth.bars.cage.bar_id[visible.segment].tolist()):
-        if bar_id not in designed:
+    for row, bar_id in enumerate(bars.cage.bar_id[visible.segment].tolist()):
+        if bar_id not in bars.designed:
             continue
-        bar, along = designed[bar_id], visible.frame[row, 2]
+        bar, along = bars.designed[bar_id], visible.frame[row, 2]
         axis_m, nominal_axis_m = (
             transform(truth.cam_from_world, np.array(line_m)) for line_m in (bar.axis_m, bar.nominal_axis_m)
         )
@@ -96,7 +95,7 @@ def _judged(truth: SteelTruth) -> _Judged | None:
     if not rows:
         return None
     nominal_m, direction = np.array(nominal).transpose(1, 0, 2)
-    return _Judged(
+    return DesignedSegments(
         visible.of(np.array(rows)), nominal_m, direction, _across(np.array(built) - nominal_m, direction)
     )
 
@@ -166,5 +165,3 @@ MEASURES = (
     ),
 )  # fmt: skip
 """Measures of deviations from the design in table order."""
-
-FAMILIES = (MeasureFamily("as_built", "As built against as designed", 8, MEASURES, as_built_samples),)

@@ -81,12 +81,12 @@ def overlapping_pairs(
     bar_id: Int64[ndarray, " r"],
     diameter_m: Float64[ndarray, " r"],
 ) -> Int64[ndarray, "m 2"]:
-    """Return the pairs of neighbouring segments (lower index first, ascending): those to measure the spacing of.
+    """Return the pairs of neighbouring segments whose spacing is measured, lower index first, ascending.
 
     A pair consists of two parallel, overlapping segments of different bars, not lapped, at most ``MAX_SPACING_M``
-    apart, without a third parallel segment between them: none present at the middle of their overlap is nearer to
-    both than they are to each other (the relative neighbourhood graph: Toussaint, Pattern Recognition 12, 1980).
-    ``parallel_m`` are the ``parallel_pairs``.
+    apart, without a third parallel segment between them: no segment that is present at the middle of their overlap
+    is nearer to both than they are to each other (the relative neighbourhood graph: Toussaint, Pattern Recognition
+    12, 1980). ``parallel_m`` is the result of ``parallel_pairs``.
     """
     all_apart_m, low_m, high_m, middle_m = parallel_m
     pairs = [np.empty((0, 2), dtype=np.int64)]
@@ -133,9 +133,9 @@ Segments are compared pairwise, in memory quadratic in their number: 0.8 GB for 
 class CageTruth:
     """Straight bar segments of a scene and the pairs of neighbours among them; world, metres.
 
-    ``bar_id`` and ``diameter_m`` are those of each segment's bar. ``neighbours`` holds indices of segments, the
-    lower one first: see ``overlapping_pairs``. ``match_radius_m`` is for each segment half the distance to the
-    nearest parallel one of any bar, at most ``MAX_MATCH_RADIUS_M``: a fitted axis farther away than that is
+    ``bar_id`` and ``diameter_m`` describe the bar of each segment. ``neighbours`` holds indices of segments, the
+    lower one first: see ``overlapping_pairs``. ``match_radius_m`` is half the distance from each segment to the
+    nearest parallel segment of any bar, at most ``MAX_MATCH_RADIUS_M``: a fitted axis farther away than that is
     attributed to another bar.
     """
 
@@ -290,10 +290,10 @@ class Axis(AxisSegments):
 class SceneCrossings:
     """The n crossings of a scene; arrays n x 2 have a column for bar a and one for bar b.
 
-    ``axes`` are those of the bars that cross, by bar id. ``along_m`` is the crossing's place along the axis and
-    ``tangent`` the unit tangent there. ``straight`` marks where the axis deviates from it by at most
-    ``STRAIGHT_DEG`` within ``WINDOW_DIAMETERS``. ``match_radius_m`` is that of the nearest run of the bar, the
-    largest one without a run.
+    ``axes`` holds the axis of each bar that crosses another, by bar id. ``along_m`` is the crossing's place along
+    the axis and ``tangent`` the unit tangent there. ``straight`` marks where the axis deviates from the tangent by
+    at most ``STRAIGHT_DEG`` within ``WINDOW_DIAMETERS``. ``match_radius_m`` is the radius of the nearest segment
+    of the bar, or ``MAX_MATCH_RADIUS_M`` for a bar without segments.
     """
 
     crossings: Crossings

@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64, UInt32
 from numpy import ndarray
 
-from rebar_depth_bench.extended.measures import ONCE, Measure, MeasureFamily, Samples, share_sample
+from rebar_depth_bench.extended.measures import Measure, Samples, share_sample
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
 
@@ -86,8 +86,9 @@ def contour_counts(
 ) -> tuple[int, Int64[ndarray, " t"], Int64[ndarray, " t"], Int64[ndarray, " t"]]:
     """Count contours among pairs of positions in ``p_m`` (prediction) and ``z_m`` (true, > 0), both metres.
 
-    Returned are the pairs with a missing prediction, and per threshold the contours of the ground truth, those of
-    the prediction plus the missing pairs, and those that are both with the same side in front.
+    Returned are the number of pairs with a missing prediction and three counts per threshold: contours of the
+    ground truth, contours of the prediction plus the missing pairs, and contours of both with the same side in
+    front.
     """
     valid = is_valid_prediction(p_m)
     both_valid = valid[first] & valid[second]
@@ -137,6 +138,3 @@ MEASURES = (
     ),
 )  # fmt: skip
 """Boundary measures in table order."""
-
-_NOTE = "independent of scale"
-FAMILIES = (MeasureFamily("boundary", "Boundary", 4, MEASURES, boundary_samples, (ONCE,), _NOTE),)

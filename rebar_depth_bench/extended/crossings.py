@@ -20,7 +20,7 @@ from numpy import ndarray
 from rebar_depth_bench.bar_crossings.definition import TiePoints, tie_points
 from rebar_depth_bench.extended.fits import MISS_MM, FittedAxes, fit_axes, with_misses
 from rebar_depth_bench.extended.judged import VisibleSegments, visible_parts
-from rebar_depth_bench.extended.measures import Measure, MeasureFamily, Samples, median_and_p95, share_sample
+from rebar_depth_bench.extended.measures import Measure, Samples, median_and_p95, share_sample
 from rebar_depth_bench.extended.profiles import DISTANCE_EDGES_M, WIDTH_EDGES_PX
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.geometry.cameras import transform
@@ -152,6 +152,9 @@ def _binned_measures() -> Iterator[Measure]:
 BINNED_MEASURES = tuple(_binned_measures())
 """Shares of judged crossings by distance, angle, gap and width, in table order."""
 
+MEASURES = (*MAIN_MEASURES, *BINNED_MEASURES)
+"""All crossing measures, in table order."""
+
 _MM = 1000.0
 
 
@@ -159,11 +162,12 @@ _MM = 1000.0
 class ViewCrossings:
     """The m crossings of a view on which depth is judged: judged ones between bars that are straight there.
 
-    ``crossing`` holds indices into the scene's crossings. ``visible`` are the parts of bar a and bar b of the
-    first crossing, then of the second, and so on. ``ties`` are the true tie points in the camera frame, and
-    ``width_px`` the width of the thinner bar in the image.
+    ``crossing`` holds indices into the scene's crossings, of which there are ``of_scene``. ``visible`` are the
+    parts of bar a and bar b of the first crossing, then of the second, and so on. ``ties`` are the true tie points
+    in the camera frame, and ``width_px`` the width of the thinner bar in the image.
     """
 
+    of_scene: int
     crossing: Int64[ndarray, " m"]
     visible: VisibleSegments
     ties: TiePoints
@@ -195,7 +199,7 @@ def view_crossings(truth: SteelTruth) -> ViewCrossings:
         found.angle_deg[crossing],
     )
     width_px = truth.K[0, 0] * scene.diameter_m[crossing].min(axis=1, initial=np.inf) / ties.tie_point_m[:, 2]
-    return ViewCrossings(crossing, visible, ties, width_px)
+    return ViewCrossings(len(scene), crossing, visible, ties, width_px)
 
 
 def fitted_ties(p_m: Float64[ndarray, " n"], view: ViewCrossings) -> tuple[Bool[ndarray, " m"], TiePoints]:
@@ -225,14 +229,13 @@ def _closest_points_m(fitted: FittedAxes) -> tuple[Float64[ndarray, "m 3"], Floa
     return point_m[:, 0] + step_a[:, None] * a, point_m[:, 1] + step_b[:, None] * b
 
 
-def crossing_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
+def crossing_samples(p_m: Float64[ndarray, " n"], view: ViewCrossings) -> Samples:
     """Return the crossing samples of one view; the measures define what each is.
 
-    ``p_m`` is planar depth on the pixels of ``SteelTruth`` in metres, NaN where missing. Errors named
-    ``..._error_...`` are signed and of located crossings, those named ``..._judged_...`` absolute and of all.
-    ``crossing_z_m`` is the true depth of each tie point, in the order of the judged errors.
+    ``p_m`` is planar depth on the pixels of ``SteelTruth`` in metres, NaN where missing. ``..._error_...`` are
+    signed errors of located crossings, ``..._judged_...`` absolute errors of all crossings. ``crossing_z_m`` is
+    the true depth of each tie point, in the order of the judged errors.
     """
-    view = truth.once(view_crossings)
     located, found = fitted_ties(p_m, view)
     true = view.ties
     with np.errstate(all="ignore"):
@@ -254,7 +257,7 @@ def crossing_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
         **{f"within_{limit}mm": (error_mm <= limit).astype(np.float64) for limit in WITHIN_MM},
     }
     return {
-        "crossings_judged": share_sample(len(located), len(truth.bars.crossings)),
+        "crossings_judged": share_sample(len(located), view.of_scene),
         "crossing_located": shares["located"],
         "tie_judged_mm": error_mm,
         "tie_along_judged_mm": with_misses(offset_mm[:, 2]),
@@ -284,6 +287,3 @@ def _binned_samples(shares: Mapping[str, Float64[ndarray, " m"]], view: ViewCros
             inside = (values >= low) & ((values < high) | ((values == high) & (high == edges[-1])))
             samples |= {_bin_name(name, unit, low, high): shares[name][inside] for name in _shares_of_bins(unit)}
     return samples
-
-
-FAMILIES = (MeasureFamily("crossings", "Crossings", 9, (*MAIN_MEASURES, *BINNED_MEASURES), crossing_samples),)

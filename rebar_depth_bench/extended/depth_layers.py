@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float32, Float64, UInt16, UInt32
 from numpy import ndarray
 
-from rebar_depth_bench.extended.measures import Measure, MeasureFamily, Samples, share_sample
+from rebar_depth_bench.extended.measures import Measure, Samples, share_sample
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
 
@@ -70,10 +70,10 @@ def layer_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
 
     Each sample has one value from 0 to 1 over interior pixels, or none where no pixel qualifies:
 
-    - ``layer_swallowed``: of the pixels with a layer behind in sight, those with |p - behind| < |p - z|.
-    - ``layer_pulled_forward``: of those with a layer in front in sight, those with |p - front| < |p - z|.
-    - ``layer_confusion``: of those with either, those to which one of the two applies.
-    - ``layers_in_sight``: the share of interior pixels with either; it depends on the ground truth alone.
+    - ``layer_swallowed``: share of the pixels with a layer behind in sight that have |p - behind| < |p - z|.
+    - ``layer_pulled_forward``: share of the pixels with a layer in front in sight that have |p - front| < |p - z|.
+    - ``layer_confusion``: share of the pixels with either layer in sight to which one of the two applies.
+    - ``layers_in_sight``: share of all interior pixels with either layer; it depends on the ground truth alone.
 
     A missing prediction counts as confused in each.
     """
@@ -116,5 +116,3 @@ MEASURES = (
     ),
 )  # fmt: skip
 """Layer measures in table order."""
-
-FAMILIES = (MeasureFamily("layers", "Layers", 5, MEASURES, layer_samples),)

@@ -15,7 +15,7 @@ from numpy import ndarray
 
 from rebar_depth_bench.data.rows import EyeTruth
 from rebar_depth_bench.data.schema import EYES
-from rebar_depth_bench.extended.measures import Measure, MeasureFamily, Samples, finite_sample, share_sample
+from rebar_depth_bench.extended.measures import Measure, Samples, finite_sample, share_sample
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.geometry.cameras import is_rectified, right_from_left
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
@@ -96,4 +96,3 @@ MEASURES = (
         f"by {MAX_DIFFERENCE_PX:g} px or less, by the exact depth of both views",
     ),
 )  # fmt: skip
-FAMILIES = (MeasureFamily("disparity", "Disparity of rectified pairs", 2, MEASURES, disparity_samples),)

@@ -21,7 +21,7 @@ from rebar_depth_bench.scoring.spreadsheet import Sheet
 ViewSamples = Mapping[str, Samples]
 """Samples of one view by alignment and name, the input of the tables."""
 
-ViewNumbers = Mapping[str, Mapping[str, float | None]]
+ViewMeasures = Mapping[str, Mapping[str, float | None]]
 """Measures of one view by alignment and name."""
 
 _ESTIMATE_COLUMNS = ("config", "alignment", "measure", "unit", "statistic", "value", "low", "high", "samples")
@@ -74,7 +74,7 @@ class ExtendedResult:
 
     measures: Mapping[str, Sequence[Measure]]
     tables: Mapping[str, ExtendedTable]
-    views: Mapping[str, ViewNumbers]
+    views: Mapping[str, ViewMeasures]
     crossings: CrossingsSource | None = None
 
     def to_dict(self) -> dict[str, Any]:
@@ -119,20 +119,18 @@ class ExtendedResult:
                     yield config, alignment, measure, table.numbers[alignment][measure.name]
 
 
-def view_numbers(view: ViewSamples, measures: Mapping[str, Sequence[Measure]]) -> ViewNumbers:
+def view_measures(view: ViewSamples, measures: Mapping[str, Sequence[Measure]]) -> ViewMeasures:
     """Return all measures of a single view, None where it has no sample."""
-
-    def value(measure: Measure, samples: Samples) -> float | None:
-        values = samples.get(measure.sample, np.empty(0))
-        if not len(values):
-            return None
-        statistic = STATISTICS[measure.statistic](values)
-        return statistic if measure.convert is None else measure.convert(statistic)
-
-    return {
-        alignment: {measure.name: value(measure, view[alignment]) for measure in of_alignment}
-        for alignment, of_alignment in measures.items()
-    }
+    values: dict[str, dict[str, float | None]] = {}
+    for alignment, of_alignment in measures.items():
+        values[alignment] = {}
+        for measure in of_alignment:
+            samples = view[alignment].get(measure.sample, np.empty(0))
+            value = STATISTICS[measure.statistic](samples) if len(samples) else None
+            if measure.convert is not None and value is not None:
+                value = measure.convert(value)
+            values[alignment][measure.name] = value
+    return values
 
 
 def tabulate_extended(
@@ -170,7 +168,7 @@ def _estimates(
 
 
 def convert_estimate(measure: Measure, statistic: MeasureEstimate) -> MeasureEstimate:
-    """Return a measure's estimate from that of its statistic, with ``convert`` applied to value and interval.
+    """Return the estimate of a measure: the estimate of its statistic, with ``convert`` applied to value and ends.
 
     ``convert`` is decreasing, so the interval's ends are swapped. An end for which ``convert`` returns None
     becomes 0; if the upper end is infinite there is no interval.

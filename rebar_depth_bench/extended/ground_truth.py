@@ -148,7 +148,7 @@ def _view_arrays(
 ) -> Iterator[ViewArrays]:
     """Yield the cached arrays of some views, or of all with scored pixels.
 
-    The numbers are those of K, distortion and pose, the parallax, and the number of judged crossings.
+    The numbers of a view are K, distortion, pose, parallax, and the number of judged crossings.
     """
     rays: dict[Lens, Rays] = {}
     for view_id, eyes, scored in verified_views(config, view_ids, config.truth_eyes):

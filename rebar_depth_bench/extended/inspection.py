@@ -18,7 +18,7 @@ from jaxtyping import Float64, Int64
 from numpy import ndarray
 
 from rebar_depth_bench.bar_crossings.axis_segments import Rows
-from rebar_depth_bench.extended.axes import MAX_MATCH_RADIUS_M
+from rebar_depth_bench.extended.axes import MAX_MATCH_RADIUS_M, CageTruth
 from rebar_depth_bench.extended.fits import MIN_PREDICTED_SHARE, MISS_MM, FittedAxes, fit_axes, with_misses
 from rebar_depth_bench.extended.judged import (
     FLANK_RADII_AND_SHARE,
@@ -26,10 +26,8 @@ from rebar_depth_bench.extended.judged import (
     MIN_PIXELS,
     MIN_VISIBLE_DIAMETERS,
     VisibleSegments,
-    visible_segments,
 )
-from rebar_depth_bench.extended.measures import Measure, MeasureFamily, Samples, median_and_p95
-from rebar_depth_bench.extended.steel import SteelTruth
+from rebar_depth_bench.extended.measures import Measure, Samples, median_and_p95
 
 ErrorKind = Literal["spacing", "layer", "cover"]
 """Kind of error that a tolerance bounds."""
@@ -221,7 +219,7 @@ _MM = 1000.0
 
 
 @dataclass(frozen=True, eq=False)
-class _SegmentPairs(Rows):
+class VisiblePairs(Rows):
     """Neighbouring segments that are both visible, side by side: two positions among the visible segments.
 
     ``middle_m`` and ``normal`` define the plane that is intersected with both axes.
@@ -232,16 +230,16 @@ class _SegmentPairs(Rows):
     normal: Float64[ndarray, "m 3"]
 
 
-def inspection_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
+def inspection_samples(p_m: Float64[ndarray, " n"], visible: VisibleSegments, pairs: VisiblePairs) -> Samples:
     """Return the inspection samples of one view; ``INSPECTION_MEASURES`` defines what each is.
 
-    ``p_m`` is the predicted planar depth on ``truth.index`` in metres; values that are not finite and > 0 count
-    as missing. The lengths of the samples depend on the ground truth alone, except for those of found bars
+    ``p_m`` is the predicted planar depth on the pixels of ``SteelTruth`` in metres; values that are not finite and
+    > 0 count as missing. ``visible`` and ``pairs`` are the ``visible_segments`` and ``visible_pairs`` of the view.
+    The lengths of the samples depend on the ground truth alone, except for the samples of found bars
     (``..._error_mm``, ``axis_offset_mm``, ``axis_tilt_deg``).
     """
-    visible = truth.once(visible_segments)
     fitted = fit_axes(p_m, visible, diameters=True)
-    spacing_m, layer_m = _pair_errors_m(truth.once(_visible_pairs), visible, fitted)
+    spacing_m, layer_m = _pair_errors_m(pairs, visible, fitted)
     cover_m = (fitted.point_m - visible.middle_m)[:, 2]
     diameter_m = np.where(fitted.found, fitted.diameter_m - visible.diameter_m, np.nan)
     errors_mm = {
@@ -265,9 +263,8 @@ def inspection_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Sample
     }
 
 
-def _visible_pairs(truth: SteelTruth) -> _SegmentPairs:
+def visible_pairs(visible: VisibleSegments, cage: CageTruth) -> VisiblePairs:
     """Return the neighbour pairs whose segments are both visible and overlap along the first one's axis."""
-    visible, cage = truth.once(visible_segments), truth.bars.cage
     position = np.full(len(cage), -1)
     position[visible.segment] = np.arange(len(visible.segment))
     segments = position[cage.neighbours]
@@ -281,11 +278,11 @@ def _visible_pairs(truth: SteelTruth) -> _SegmentPairs:
         visible.diameter_m[first], visible.diameter_m[second]
     )
     middle_m = visible.middle_m[first] + ((low_m + high_m) / 2)[:, None] * normal
-    return _SegmentPairs(segments, middle_m, normal).of(overlapping)
+    return VisiblePairs(segments, middle_m, normal).of(overlapping)
 
 
 def _pair_errors_m(
-    pairs: _SegmentPairs, visible: VisibleSegments, fitted: FittedAxes
+    pairs: VisiblePairs, visible: VisibleSegments, fitted: FittedAxes
 ) -> tuple[Float64[ndarray, " s"], Float64[ndarray, " l"]]:
     """Return the separation errors of pairs across the line of sight, and of pairs along the optical axis.
 
@@ -304,7 +301,7 @@ def _pair_errors_m(
 
 
 def _separation_m(
-    pairs: _SegmentPairs, point_m: Float64[ndarray, "r 3"], direction: Float64[ndarray, "r 3"]
+    pairs: VisiblePairs, point_m: Float64[ndarray, "r 3"], direction: Float64[ndarray, "r 3"]
 ) -> Float64[ndarray, "m 3"]:
     """Return the vector from the first line's intersection with each pair's plane to the second line's."""
     intersections_m = []
@@ -316,4 +313,3 @@ def _separation_m(
 
 
 MEASURES = (*INSPECTION_MEASURES, *CAPABILITY_MEASURES)
-FAMILIES = (MeasureFamily("inspection", "Inspection, bar by bar", 7, MEASURES, inspection_samples),)

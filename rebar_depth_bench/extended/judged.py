@@ -203,7 +203,7 @@ def judged_crossings(truth: SteelTruth) -> JudgedCrossings:
 def _on_side(
     truth: SteelTruth, pixels: Int64[ndarray, " n"], axis: Axis
 ) -> tuple[Int64[ndarray, " n"], Float64[ndarray, " n"]]:
-    """Return those pixels of a bar that are on its side, and their places along its axis, metres."""
+    """Return the pixels of a bar that are on its side, and their places along its axis, metres."""
     rays = np.column_stack([truth.rays[pixels], np.ones(len(pixels))])
     camera_m = truth.depth_m[pixels].astype(np.float64)[:, None] * rays
     rotation, shift_m = truth.cam_from_world[:3, :3], truth.cam_from_world[:3, 3]
@@ -217,7 +217,7 @@ def _near_crossing(
 ) -> Int64[ndarray, " k"]:
     """Return the sampled pixels of a bar near its crossing, none if they do not suffice to judge it.
 
-    ``along_m`` are the places of the pixels along the axis, and ``crossing_m`` that of the crossing.
+    ``along_m`` are the places of the pixels along the axis, and ``crossing_m`` is the place of the crossing.
     """
     relative_m = axis.relative_m(along_m, crossing_m)
     near = np.flatnonzero(np.abs(relative_m) <= WINDOW_DIAMETERS * axis.diameter_m)

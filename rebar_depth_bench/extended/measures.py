@@ -1,7 +1,7 @@
 """Extended measure definitions: a view yields samples, and a measure is a statistic of the pooled samples.
 
-A module of ``extended`` that declares ``FAMILIES`` adds its measures to the registry. Also the alignments of a
-prediction, samples of single values, and pixel subsampling for measures that do not need every pixel.
+``families`` lists all measures. Also samples of single values, and pixel subsampling for measures that do not need
+every pixel.
 """
 
 from __future__ import annotations
@@ -12,12 +12,10 @@ from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Float, Float64, Int64
+from jaxtyping import Float64, Int64
 from numpy import ndarray
 
-from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.columns import Better, Column, coverage_percent
-from rebar_depth_bench.scoring.metrics import is_valid_prediction
 
 EXTENDED_PROTOCOL = "rebar-extended-5"
 """Version of the definitions of all extended measures; any change of a definition changes it."""
@@ -112,7 +110,7 @@ def median_and_p95(
 ) -> tuple[Measure, Measure]:
     """Return median and 95th percentile of an absolute error over all that is judged, misses included.
 
-    ``unit`` is that of the samples, "mm" or "deg", and ``definition`` continues "Median of the".
+    ``unit`` is the unit of the samples, "mm" or "deg", and ``definition`` continues "Median of the".
     """
     shown, sample = "mm" if unit == "mm" else "", f"{name}_judged_{unit}"
     return (
@@ -129,42 +127,21 @@ def median_and_p95(
 
 @dataclass(frozen=True)
 class MeasureFamily:
-    """Related measures under one heading, found by the registry in the ``FAMILIES`` of a module.
+    """Related measures under one heading, taken at each of ``alignments``.
 
-    ``evaluate`` returns a view's samples from a prediction: planar depth on ``SteelTruth.index``, metres, NaN
-    where missing; names that it leaves out have no samples. If the family is ``on_image``, it gets the whole image
-    as submitted. It is called for each of ``alignments``, once for all families that share it. ``note`` explains
-    the single column of measures that are taken ``ONCE``. Reports have the families by ascending ``place``.
+    ``note`` explains the single column of measures that are taken ``ONCE``.
     """
 
     key: str
     title: str
-    place: int
     measures: tuple[Measure, ...]
-    evaluate: Callable[[Float[ndarray, ...], SteelTruth], Samples]
     alignments: tuple[str, ...] = (NATIVE, SCALED)
     note: str = ""
-    on_image: bool = False
 
     @property
     def by_name(self) -> dict[str, Measure]:
-        """The measures by name."""
+        """Measures by name."""
         return {measure.name: measure for measure in self.measures}
-
-
-def aligned_predictions(
-    prediction_m: Float[ndarray, "h w"], truth: SteelTruth, scale: float | None
-) -> dict[str, Float64[ndarray, " n"]]:
-    """Return the prediction under each alignment, metres on ``truth.index``, NaN where missing.
-
-    ``scale`` is the view's median scale s, None if it has none.
-    """
-    predicted_m = prediction_m.ravel().take(truth.index.astype(np.intp))
-    native_m = np.where(is_valid_prediction(predicted_m), predicted_m.astype(np.float64), np.nan)
-    with np.errstate(over="ignore"):
-        scaled_m = native_m * (np.nan if scale is None else scale)
-    scaled_m[~is_valid_prediction(scaled_m)] = np.nan
-    return {ONCE: native_m, NATIVE: native_m, SCALED: scaled_m}
 
 
 def finite_sample(value: float | None) -> Float64[ndarray, " one"]:

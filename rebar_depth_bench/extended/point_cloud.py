@@ -12,8 +12,8 @@ neighbours are sought among all pixels:
 
 A missing prediction contributes no point to completeness and is a failure in accuracy, so removing predictions
 raises neither. The shares depend on the size of the image: in a larger one, points lie closer to each other, so
-that a wrong point is nearer to that of another pixel. At long range pixels are farther apart than t (17 mm at 12 m
-and 700 px focal length); a point then matches the point of its own pixel or none.
+that a wrong point is nearer to the point of another pixel. At long range pixels are farther apart than t (17 mm at
+12 m and 700 px focal length); a point then matches the point of its own pixel or none.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
-from rebar_depth_bench.extended.measures import Measure, MeasureFamily, Samples, subsample
+from rebar_depth_bench.extended.measures import Measure, Samples, subsample
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
 
@@ -43,9 +43,9 @@ _SEARCH_RADIUS_M = 1.001 * TOLERANCES_MM[-1] / 1000  # the tree's bound is exclu
 class TrueCloud:
     """Queried pixels and true points of a view; they do not depend on a prediction.
 
-    ``position`` holds the positions of the interior pixels in ``SteelTruth.index``, and ``queried`` those of the
-    queried pixels among them. ``rays`` are ``(x/z, y/z, 1)`` of the interior pixels and ``z_m`` their true depth.
-    ``steel_m`` are the true points of all steel pixels, metres in the camera frame.
+    ``position`` holds the positions of the interior pixels in ``SteelTruth.index``, and ``queried`` the positions
+    of the queried pixels among the interior ones. ``rays`` are ``(x/z, y/z, 1)`` of the interior pixels and
+    ``z_m`` their true depth. ``steel_m`` are the true points of all steel pixels, metres in the camera frame.
     """
 
     position: Int64[ndarray, " n"]
@@ -71,13 +71,13 @@ def true_cloud(truth: SteelTruth) -> TrueCloud:
     return TrueCloud(position, queried, rays[position], depth_m[position], steel_m)
 
 
-def cloud_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
-    """Return a view's point cloud samples; ``p_m`` is planar depth on ``truth.index``, metres, NaN where missing.
+def cloud_samples(p_m: Float64[ndarray, " n"], cloud: TrueCloud) -> Samples:
+    """Return a view's point cloud samples.
 
+    ``p_m`` is planar depth on the pixels of ``SteelTruth``, metres, NaN where missing.
     Each of ``cloud_accuracy_<t>mm``, ``cloud_completeness_<t>mm`` and ``cloud_f_<t>mm`` has one value from 0 to
     1, none where the view has no interior pixel.
     """
-    cloud = truth.once(true_cloud)
     count = len(cloud.queried)
     if not count:
         return {}
@@ -167,5 +167,3 @@ MEASURES = tuple(
     for t in TOLERANCES_MM
 )
 """Point cloud measures in table order."""
-
-FAMILIES = (MeasureFamily("clouds", "Point clouds", 6, MEASURES, cloud_samples),)

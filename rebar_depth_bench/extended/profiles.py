@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from rebar_depth_bench.extended.measures import Measure, MeasureFamily, Samples, finite_sample, subsample
+from rebar_depth_bench.extended.measures import Measure, Samples, finite_sample, subsample
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.metrics import is_valid_prediction, median
 
@@ -98,5 +98,3 @@ def _measures() -> Iterator[Measure]:
 
 MEASURES = tuple(_measures())
 """Profile measures in table order."""
-
-FAMILIES = (MeasureFamily("profile", "Against distance and bar width", 10, MEASURES, profile_samples),)

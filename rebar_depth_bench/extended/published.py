@@ -1,4 +1,4 @@
-"""Numbers that papers on monocular depth print, beside those of the protocol. None of them ranks.
+"""Numbers that papers on monocular depth print and the protocol lacks. None of them ranks.
 
 p is the prediction and z the ground truth, metres. The measures' definitions state the equations. Boundary F1 is
 ``SI_boundary_F1`` of ml-depth-pro (Bochkovskii et al., "Depth Pro: Sharp Monocular Metric Depth in Less Than a
@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int64
 from numpy import ndarray
 
-from rebar_depth_bench.extended.measures import ONCE, Measure, MeasureFamily, Samples, finite_sample, share_sample
+from rebar_depth_bench.extended.measures import Measure, Samples, finite_sample, share_sample
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
 
@@ -149,13 +149,5 @@ BOUNDARY_MEASURES = (
             "(predicted + true); mean over t weighted by t - 1 (Wang et al. 2025, MoGe-2)",
         )
         for r in RADII
-    ),
-)  # fmt: skip
-
-FAMILIES = (
-    MeasureFamily("published", "Errors as papers print them", 1, ERROR_MEASURES, error_samples),
-    MeasureFamily(
-        "published_boundary", "Boundary as papers print it", 4, BOUNDARY_MEASURES, image_boundary_samples, (ONCE,),
-        "whole image, independent of scale", on_image=True,
     ),
 )  # fmt: skip

@@ -41,7 +41,7 @@ nearest tested bin does not fulfil it; ``none tested``: there is no tested bin.
 
 @dataclass(frozen=True)
 class ReachBin:
-    """Judged crossings of one bin of distance: their number, that of their views, and the share within the limit.
+    """Bin of distance: the numbers of its judged crossings and of their views, and the share within the limit.
 
     ``interval`` is the 95 % interval of the share, None for few views.
     """
@@ -65,7 +65,7 @@ class Reach:
 
     ``distance_m`` is None for the verdicts ``not met`` and ``none tested``. ``interval`` holds edges of bins,
     where 0 stands for ``not met``; it is None if no bin is tested, or one has few blocks of views. ``bins`` are
-    those with judged crossings.
+    the bins with judged crossings.
     """
 
     limit_mm: int

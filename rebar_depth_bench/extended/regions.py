@@ -14,7 +14,7 @@ The interior erodes the union of all bars, so that an interior pixel of a dense 
 it, at another depth. On these pixels, a prediction that is exact but shifted by one pixel has a large error. The
 single-bar interior has no such pixels: where a method's error on it is as large as on the whole interior,
 neighbouring bars do not explain the error. The pixels are chosen by the ground truth alone
-(``protocol.single_bar_pixels``); the scale of the scaled evaluation is that of all scored pixels.
+(``protocol.single_bar_pixels``); the scaled evaluation uses the scale of all scored pixels.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ import numpy as np
 from jaxtyping import Bool, Float64
 from numpy import ndarray
 
-from rebar_depth_bench.extended.measures import Measure, MeasureFamily, Samples, share_sample
+from rebar_depth_bench.extended.measures import Measure, Samples, share_sample
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.columns import METRICS
 from rebar_depth_bench.scoring.metrics import is_valid_prediction, metrics_at_scales
@@ -48,10 +48,9 @@ def region_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
 
     ``<region>_<metric>`` has one value each for abs_rel, rmse_cm, mae_cm, delta1 (over predicted pixels; none
     where there is no such pixel) and for coverage and within_<t>mm (shares of all pixels, 0 to 1; none where the
-    view has no such pixel). ``kept_share`` is the number of interior pixels over that of mask pixels,
-    ``single_bar_share`` that of single-bar pixels over that of scored pixels. ``single_bar_views_abs_rel`` is
-    AbsRel on the scored pixels of a view that has AbsRel on single-bar pixels. Steel without a bar id is in no
-    region.
+    view has no such pixel). ``kept_share`` is interior / mask pixels, and ``single_bar_share`` is single-bar
+    pixels / scored pixels. ``single_bar_views_abs_rel`` is AbsRel on the scored pixels of a view that has AbsRel
+    on single-bar pixels. Steel without a bar id is in no region.
     """
     pixels = {
         "full_mask": truth.bar_id > 0,
@@ -80,7 +79,7 @@ def region_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
 def _region_numbers(
     p_m: Float64[ndarray, " n"], truth: SteelTruth, pixels: Bool[ndarray, " n"]
 ) -> dict[str, float]:
-    """Return those of ``REGION_NUMBERS`` that are defined on the pixels of a region."""
+    """Return the ``REGION_NUMBERS`` of the pixels of a region, without undefined ones."""
     predicted = pixels & is_valid_prediction(p_m)
     p_valid_m, z_m = p_m[predicted], truth.depth_m[predicted].astype(np.float64)
     total = int(np.count_nonzero(pixels))
@@ -136,8 +135,3 @@ SINGLE_BAR_MEASURES = (
     ),
 )  # fmt: skip
 """Single-bar measures in table order."""
-
-FAMILIES = (
-    MeasureFamily("full_mask", "Rim included", 2, FULL_MASK_MEASURES, region_samples),
-    MeasureFamily("single_bar", "Single-bar interior", 3, SINGLE_BAR_MEASURES, region_samples),
-)

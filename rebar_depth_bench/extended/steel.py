@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, TypeVar
 
 import numpy as np
-from jaxtyping import Bool, Float32, Float64, Int64, UInt8, UInt16, UInt32
+from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt8, UInt16, UInt32
 from numpy import ndarray
 
 from rebar_depth_bench.bar_crossings.definition import Crossings, scene_crossings
 from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.extended.axes import CageTruth, SceneCrossings, cage_truth, prepared_crossings
-
-_Made = TypeVar("_Made")
+from rebar_depth_bench.scoring.metrics import is_valid_prediction
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,17 +62,17 @@ class SteelTruth:
 
     ``index`` holds flat indices into the height x width grid, ascending; the other arrays are parallel to it.
     ``depth_m`` is planar depth, metres. ``bar_id`` is 0 beside the steel; ``interior`` marks the scored pixels of
-    the protocol, and ``single_bar`` those of them whose 3 x 3 neighbourhood belongs to one bar. ``rays`` are x/z
-    and y/z of each pixel's ray in the camera frame (lens distortion undone), so that ``x_cam = depth_m * (rays[:,
-    0], rays[:, 1], 1)``. ``run`` is the straight bar segment whose axis is nearest to the true point (an index
-    of ``CageTruth``), -1 where the point is on no segment. ``front_m`` and ``behind_m`` are the depths
-    of the closest other layer in front of and behind the pixel, NaN where none is visible: see
-    ``depth_layers.other_layers``. ``bars`` are those of the scene. ``distortion`` is that of the grid
+    the protocol, and ``single_bar`` the scored pixels whose 3 x 3 neighbourhood belongs to one bar. ``rays`` are
+    x/z and y/z of each pixel's ray in the camera frame (lens distortion undone), so that ``x_cam = depth_m *
+    (rays[:, 0], rays[:, 1], 1)``. ``run`` is the straight bar segment whose axis is nearest to the true point (an
+    index of ``CageTruth``), -1 where the point is on no segment. ``front_m`` and ``behind_m`` are the depths of
+    the closest other layer in front of and behind the pixel, NaN where none is visible: see
+    ``depth_layers.other_layers``. ``bars`` are the bars of the scene. ``distortion`` is the distortion of the grid
     (``cameras.distort``), zeros on an ideal one.
 
     ``parallax_px_m`` is focal length times baseline of a rectified pair, pixels times metres, 0 if there is none;
-    ``seen_by_right`` marks the scored pixels that are not occluded in it (``disparity.match_right``). Of the whole
-    image there are two masks, row by row, packed into bits: ``has_depth``, and ``near_step`` with the depth
+    ``seen_by_right`` marks the scored pixels that the right view sees, too (``disparity.match_right``). Two masks
+    cover the whole image, row by row, packed into bits: ``has_depth``, and ``near_step`` with the depth
     ``step_depth_m`` of its pixels (``published.depth_steps``).
     """
 
@@ -100,11 +98,8 @@ class SteelTruth:
     has_depth: UInt8[ndarray, " b"] = field(default_factory=lambda: np.empty(0, np.uint8))
     near_step: UInt8[ndarray, " b"] = field(default_factory=lambda: np.empty(0, np.uint8))
     step_depth_m: Float32[ndarray, " m"] = field(default_factory=lambda: np.empty(0, np.float32))
-    _made: dict[object, Any] = field(default_factory=dict, init=False, repr=False)
 
-    def once(self, make: Callable[[SteelTruth], _Made]) -> _Made:
-        """Return ``make(self)``, computed at the first call: what several predictions or measures need."""
-        if make not in self._made:
-            self._made[make] = make(self)
-        made: _Made = self._made[make]
-        return made
+    def predicted_m(self, prediction_m: Float[ndarray, "h w"]) -> Float64[ndarray, " n"]:
+        """Return a predicted image on ``index``, planar depth in metres, NaN where there is no prediction."""
+        p_m = prediction_m.ravel().take(self.index.astype(np.intp))
+        return np.where(is_valid_prediction(p_m), p_m.astype(np.float64), np.nan)

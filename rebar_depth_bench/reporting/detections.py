@@ -15,7 +15,7 @@ from rich.console import Console
 from rebar_depth_bench import software_version
 from rebar_depth_bench.bar_crossings.definition import CROSSINGS_PROTOCOL
 from rebar_depth_bench.base.errors import printable
-from rebar_depth_bench.detections.score import MATCH_M
+from rebar_depth_bench.detections.matching import MATCH_M
 from rebar_depth_bench.detections.tables import AVERAGE_PRECISION_MM, DetectionResult, DetectionTable
 from rebar_depth_bench.reporting.charts import precision_chart
 from rebar_depth_bench.reporting.html.assets import environment

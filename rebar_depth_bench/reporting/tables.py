@@ -157,7 +157,7 @@ def _config_rows(tables: Mapping[str, Table]) -> list[Row]:
 
 
 def _table_rows(title: str, table: Table) -> list[Row]:
-    """Return the row of a table; of predictions that are not metric those of both alignments and the constant.
+    """Return the row of a table, or three rows of predictions that are not metric: both alignments, the constant.
 
     A rank error that does not rank is marked.
     """

@@ -6,7 +6,7 @@ block bootstrap of Politis and Romano ("A circular block-resampling procedure fo
 intervals describe the variation with other views of the same scene from the same trajectory, not with other
 cages, lights or cameras.
 
-The views of a survey are spread over the steel, and those of one distance are exchangeable. They are resampled one
+The views of a survey are spread over the steel, and views at one distance are exchangeable. They are resampled one
 by one within each distance: stratified bootstrap (Davison and Hinkley, "Bootstrap Methods and their Application",
 1997, section 3.2).
 

@@ -90,7 +90,7 @@ class Column:
     ``place`` is its place in the JSON of a table, keys joined by dots; ``view_place`` is its place in a view if
     that differs. ``title`` names it, ``unit`` is that of the shown value, which is the value times ``factor`` with
     ``decimals``. ``as_text``, if set, makes the text of the value. ``head`` is a heading of three lines for narrow
-    columns. ``statistic`` makes the number of a table from those of its views: mean or median, or the count of
+    columns. ``statistic`` makes the number of a table from the numbers of its views: mean, median, or the count of
     views for which it is true. ``has_interval`` states whether it has a 95 % interval. Values are from 0 to
     ``most``. Views without predictions have only numbers that are ``of_all_views``.
     """
@@ -156,10 +156,7 @@ class Column:
 
     def interval_text(self, ends: Interval | None, separator: str = " – ") -> str:
         """Return an interval as text; empty if it is undefined."""
-        if ends is None or not all(math.isfinite(end) for end in ends):
-            return ""
-        as_text = self.number_text if self.as_text is None or self.as_text is percent else self.as_text
-        return separator.join(as_text(end) for end in ends)
+        return "" if ends is None else separator.join(map(self.text, ends))
 
     def json_value(self, table: Table) -> float | None:
         """Return the number of a table as it is written in JSON and CSV; None if it is undefined or not finite."""
@@ -239,12 +236,10 @@ def _reference(kind: str, name: str) -> Column:
 COVERAGE = Column(
     "coverage",
     "coverage",
-    "%",
-    "higher",
-    1,
-    100.0,
-    coverage_percent,
-    "cover-\nage ↑\n%",
+    unit="%",
+    better="higher",
+    as_text=coverage_percent,
+    head="cover-\nage ↑\n%",
     of_all_views=True,
     most=1.0,
 )
@@ -261,12 +256,12 @@ WITHIN = tuple(
     Column(
         f"within_mm.{tolerance_mm}",
         f"within {tolerance_mm} mm",
-        "%",
-        "higher",
-        1,
-        100.0,
-        percent,
-        f"within\n{tolerance_mm} mm\n% ↑",
+        unit="%",
+        better="higher",
+        decimals=1,
+        factor=100.0,
+        as_text=percent,
+        head=f"within\n{tolerance_mm} mm\n% ↑",
         of_all_views=True,
         most=1.0,
     )
@@ -310,7 +305,9 @@ FLAT_VIEWS = Column(
 METRIC_COLUMNS = (COVERAGE, RANK_ERROR, *NATIVE, *SCALED, SCALE, *DISTRIBUTION)
 RELATIVE_COLUMNS = (COVERAGE, *ALIGNED, *ALIGNED_ROBUST, *ALIGNED_CONSTANT)
 _METRIC_VIEW_COLUMNS = (COVERAGE, RANK_ERROR, SCALE, *NATIVE, *SCALED, *DISTRIBUTION)
-_BY_PLACE: Mapping[str, Column] = {one.place: one for one in (*METRIC_COLUMNS, *REFERENCES, *RELATIVE_COLUMNS)}
+_BY_PLACE: Mapping[str, Column] = {
+    one.place: one for one in (*METRIC_COLUMNS, *REFERENCES, *RELATIVE_COLUMNS, FLAT_VIEWS)
+}
 
 
 def table_columns(kind: str) -> tuple[Column, ...]:

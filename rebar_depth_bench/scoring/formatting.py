@@ -178,7 +178,7 @@ def ground_truth_text(declared: Declaration) -> str:
 
 
 def interval_note(tables: Iterable[Table]) -> str:
-    """Return the sentence on intervals: how those of configs of one scene, and of several, are determined."""
+    """Return the sentence on how intervals are determined, in configs of one scene and of several scenes."""
     by_scene = {table.split is not None for table in tables}
     if by_scene == {True}:
         return f"Small figures: 95 % interval, {_SCENES_NOTE}"
@@ -354,8 +354,9 @@ def kind_text(result: Result) -> str:
 
 
 def sort_error(table: Table) -> float:
-    """Return the error by which tables are ordered, rounded as in the JSON; 0 if it is undefined."""
-    return rounded(table.error) or 0.0
+    """Return the error by which tables are ordered, rounded as in the JSON; inf if it is undefined."""
+    error = rounded(table.error)
+    return math.inf if error is None else error
 
 
 def error_and_constant(table: Table) -> tuple[float, float]:

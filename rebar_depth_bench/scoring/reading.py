@@ -7,12 +7,12 @@ from __future__ import annotations
 
 import math
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
-from pydantic import Strict, TypeAdapter
+from pydantic import Field, Strict, TypeAdapter
 
 from rebar_depth_bench.base.errors import InputError, Problem
 from rebar_depth_bench.base.limits import JSON_BYTES
@@ -34,6 +34,7 @@ from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND
 from rebar_depth_bench.scoring.result import (
     DatasetIdentity,
     IntervalMethod,
+    Name,
     Result,
     SoftwareIdentity,
     SubmissionIdentity,
@@ -45,9 +46,12 @@ _NAME_CHARACTERS = 300
 _NAME = f"text on one line, 1 to {_NAME_CHARACTERS} characters"
 _MAX_ENTRIES = 5000
 """Largest number of entries of a JSON object whose keys are names, and of all tables of groups."""
-_MAX_COUNT = (1 << 53) - 1
 _MAX_PROBLEMS = 100
 """Number of problems after which reading ends, so that a file of many takes no minutes."""
+
+
+_Count = Annotated[int, Strict(), Field(ge=0, lt=1 << 53)]
+_MISSING: Any = object()
 
 
 @dataclass(frozen=True)
@@ -63,9 +67,34 @@ class _Head:
     intervals: IntervalMethod | None = None
 
 
+@dataclass(frozen=True)
+class _TableHead:
+    """What stands in a table beside its numbers, intervals and groups."""
+
+    views: _Count
+    views_scored: _Count
+    ranked: Annotated[bool, Strict()]
+    of_views: _Count | None = None
+    split: Annotated[str, Strict(), one_of(*SPLITS)] | None = None
+    views_per_distance: Annotated[int, Strict(), Field(ge=1, lt=1 << 53)] | None = None
+    truth_sigma_m: Annotated[float, Strict(), Field(ge=0)] | None = None
+    published: PublishedMatch | None = None
+
+
+@dataclass(frozen=True)
+class _ViewHead:
+    """What stands in a view beside its numbers."""
+
+    view_id: Name
+    scored_px: _Count
+
+
+_Type = TypeVar("_Type")
+
+
 @cache
-def _head_type() -> TypeAdapter[_Head]:
-    return TypeAdapter(_Head)
+def _type_of(head: type[_Type]) -> TypeAdapter[_Type]:
+    return TypeAdapter(head)
 
 
 def read_result(data: bytes, where: str) -> Result:
@@ -77,7 +106,7 @@ def read_result(data: bytes, where: str) -> Result:
         problem = Problem("size", "", f"the result has {len(data)} bytes", JSON_BYTES.allowed())
         raise InputError.from_problems(where, [problem])
     document, problems = parse_json(data)
-    head = None if problems else validate_document(_head_type(), document, problems)
+    head = None if problems else validate_document(_type_of(_Head), document, problems)
     if head is None:
         raise InputError.from_problems(f"{where}: is not a rebar-bench result", problems)
     kind = head.prediction or METRIC
@@ -150,32 +179,14 @@ def _table_from_json(
     A table that ``is_group`` has no groups, whatever the object holds.
     """
     before = len(problems)
-    if not isinstance(entry, dict):
-        problems.append(Problem("invalid", where, f"got {short_repr(entry)}", "a table"))
+    head = validate_document(_type_of(_TableHead), entry, problems, where)
+    if head is None:
         return None
-    counts = {}
-    for key in ("views", "views_scored"):
-        counts[key] = _checked(entry, key, where, problems, "a whole number of 0 or more", _is_count)
-    of_views = _checked(entry, "of_views", where, problems, "a whole number of 0 or more", _is_count, default=None)
-    ranked = _checked(entry, "ranked", where, problems, "true or false", lambda value: isinstance(value, bool))
-    split = _checked(
-        entry, "split", where, problems, f"one of {', '.join(SPLITS)}", SPLITS.__contains__, default=None
-    )
-    views_per_distance = _checked(
-        entry, "views_per_distance", where, problems, "a whole number above 0", _is_positive_count, default=None
-    )
-    sigma_m = _checked(entry, "truth_sigma_m", where, problems, "a number of 0 or more", _is_size, default=None)
-    if counts["views"] == 0:
+    if head.views == 0:
         kind = METRIC  # Without views there is nothing of any kind, and the table is written as a metric one.
-    published = None
-    if (match := entry.get("published")) is not None:
-        place = format_location(where, "published")
-        scene = _checked(match, "scene", place, problems, "the name of a scene", _is_name)
-        same = _checked(match, "same_optics", place, problems, "true or false", lambda one: isinstance(one, bool))
-        published = PublishedMatch(scene, same)
     columns = (*table_columns(kind), *REFERENCES)
     numbers = _numbers_from_json(
-        entry, kind, {column.place: column for column in columns}, where, problems, is_empty=counts["views"] == 0
+        entry, kind, {column.place: column for column in columns}, where, problems, is_empty=head.views == 0
     )
     intervals = _intervals_from_json(entry.get("ci95", {}), kind, format_location(where, "ci95"), problems)
     groups: dict[str, dict[str, Table]] = {}
@@ -189,32 +200,20 @@ def _table_from_json(
                 groups[grouping][group] = table
     if len(problems) > before:
         return None
-    return Table(
-        kind=kind,
-        **counts,
-        ranked=ranked and not math.isnan(numbers.get("rank_error", math.nan)),
-        numbers=numbers,
-        intervals=intervals,
-        split=split,
-        views_per_distance=views_per_distance,
-        truth_sigma_m=sigma_m,
-        of_views=of_views,
-        published=published,
-        groups=groups,
-    )
+    is_ranked = head.ranked and not math.isnan(numbers.get("rank_error", math.nan))
+    known = {**vars(head), "ranked": is_ranked, "numbers": numbers, "intervals": intervals, "groups": groups}
+    return Table(kind=kind, **known)
 
 
 def _view_from_json(entry: Any, kind: str, where: str, problems: list[Problem]) -> ViewScore | None:
     """Return a view from its JSON object; None, with all of its problems appended, if it is invalid."""
     before = len(problems)
-    if not isinstance(entry, dict):
-        problems.append(Problem("invalid", where.removesuffix(":"), f"got {short_repr(entry)}", "a view"))
+    head = validate_document(_type_of(_ViewHead), entry, problems, where)
+    if head is None:
         return None
-    view_id = _checked(entry, "view_id", where, problems, _NAME, _is_name)
-    scored_px = _checked(entry, "scored_px", where, problems, "a whole number of 0 or more", _is_count)
     columns = {column.in_view: column for column in view_columns(kind)}
     numbers = _numbers_from_json(entry, kind, columns, where, problems, never_null=["coverage"])
-    return None if len(problems) > before else ViewScore(view_id, {"scored_px": scored_px, **numbers})
+    return None if len(problems) > before else ViewScore(head.view_id, {"scored_px": head.scored_px, **numbers})
 
 
 def _named_entries(found: Any, where: str, problems: list[Problem]) -> list[tuple[str, Any]]:
@@ -240,48 +239,12 @@ def _is_name(value: Any) -> bool:
     )
 
 
-def _is_count(value: Any) -> bool:
-    return type(value) is int and 0 <= value <= _MAX_COUNT
-
-
-def _is_positive_count(value: Any) -> bool:
-    return _is_count(value) and value > 0
+def _is_finite(value: Any) -> bool:
+    return type(value) in (int, float) and abs(value) <= sys.float_info.max
 
 
 def _is_size(value: Any) -> bool:
-    return type(value) in (int, float) and 0 <= value <= sys.float_info.max
-
-
-_REQUIRED: Any = object()
-
-
-def _checked(
-    entry: Any,
-    key: str,
-    where: str,
-    problems: list[Problem],
-    expected: str,
-    accept: Callable[[Any], bool],
-    default: Any = _REQUIRED,
-) -> Any:
-    """Return the value of a key that ``accept`` accepts; otherwise append its problem and return None.
-
-    A key whose ``default`` is None may be missing or null.
-    """
-    value = entry.get(key, default) if isinstance(entry, dict) else _REQUIRED
-    if value is None and default is None:
-        return None
-    if value is _REQUIRED or not accept(value):
-        problems.append(_value_problem(format_location(where, key), value, expected))
-        return None
-    return value
-
-
-def _value_problem(where: str, value: Any, expected: str) -> Problem:
-    """Return the problem of a value that is missing or invalid."""
-    if value is _REQUIRED:
-        return Problem("missing", where, "missing", expected)
-    return Problem("invalid", where, f"got {short_repr(value)}", expected)
+    return _is_finite(value) and bool(value >= 0)
 
 
 def _numbers_from_json(
@@ -334,15 +297,16 @@ def _numbers_from_json(
                 is_flag = column.statistic == "count" and column.in_view == place
                 most = f"from 0 to {column.most:g}" if math.isfinite(column.most) else "of 0 or more"
                 expected_value = "true or false" if is_flag else f"a number {most}"
-                value = inner.get(key, _REQUIRED)
+                value = inner.get(key, _MISSING)
                 if value is None and key != "error" and place not in never_null:
                     numbers[place] = math.inf if is_error and is_predicted else math.nan
-                elif value is not _REQUIRED and (
-                    isinstance(value, bool) if is_flag else _is_size(value) and value <= column.most
-                ):
+                elif value is _MISSING:
+                    problems.append(Problem("missing", format_location(at, key), "missing", expected_value))
+                elif isinstance(value, bool) if is_flag else _is_size(value) and value <= column.most:
                     numbers[place] = float(value) if is_predicted or not is_metric_error else math.nan
                 else:
-                    problems.append(_value_problem(format_location(at, key), value, expected_value))
+                    got = f"got {short_repr(value)}"
+                    problems.append(Problem("invalid", format_location(at, key), got, expected_value))
     return numbers
 
 
@@ -353,15 +317,17 @@ def _intervals_from_json(entry: Any, kind: str, where: str, problems: list[Probl
         group = column.place.rpartition(".")[0]
         inner = at_place(entry, group) if group else entry
         ends = at_place(entry, column.place)
-        is_pair = isinstance(ends, list) and len(ends) == 2
+        intervals[column.place] = None
         if inner is not None and not isinstance(inner, dict):
             problem = Problem(
                 "invalid", format_location(where, *filter(None, [group])), f"got {short_repr(inner)}", "a table"
             )
             if problem not in problems:
                 problems.append(problem)
-        elif ends is not None and not (is_pair and all(end is None or type(end) in (int, float) for end in ends)):
+        elif isinstance(ends, list) and len(ends) == 2 and all(end is None or _is_finite(end) for end in ends):
+            if None not in ends:
+                intervals[column.place] = float(ends[0]), float(ends[1])
+        elif ends is not None:
             place = format_location(where, *column.place.split("."))
             problems.append(Problem("invalid", place, f"got {short_repr(ends)}", "two numbers, or null"))
-        intervals[column.place] = (float(ends[0]), float(ends[1])) if is_pair and None not in ends else None
     return intervals

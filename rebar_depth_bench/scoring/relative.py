@@ -18,8 +18,8 @@ b = median(y) - a median(x) for the target y (MiDaS: Ranftl et al., TPAMI 2022, 
 the disparity.
 
 Every alignment uses the truth, so that none ranks. Beside each stands the constant of the same fit (a = 0):
-median(z) for scale, else the mean of the target. The error counts 1 outside V and where p <= 0; the other metrics
-take p as it is, over V, and a p <= 0 is not counted in delta1.
+median(z) for scale, else the mean of the target. The error counts 1 outside V and where p <= 0 or overflows; the
+other metrics take p as it is, over V, and a p <= 0 is not counted in delta1.
 """
 
 from __future__ import annotations
@@ -30,7 +30,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Float64, Integer
 from numpy import ndarray
 
-from rebar_depth_bench.scoring.metrics import is_valid_prediction, median, metrics_at_scales, rank_error
+from rebar_depth_bench.scoring.metrics import (
+    is_valid_prediction,
+    median,
+    median_scale,
+    metrics_at_scales,
+    rank_error,
+)
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
 
 ALIGNMENT_BY_KIND: Mapping[str, str] = {
@@ -62,7 +68,7 @@ def aligned_numbers(x: Float[ndarray, " n"], z_m: Float[ndarray, " n"], kind: st
         return numbers
     if kind == "scale":
         with np.errstate(over="ignore"):
-            depths = [values * (median(z) / median(values)), np.full(len(z), median(z))]
+            depths = [values * median_scale(values, median(z)), np.full(len(z), median(z))]
     else:
         target = 1.0 / z if kind == "affine-disparity" else z
         values = _within_range(values, values)
@@ -81,7 +87,7 @@ def aligned_numbers(x: Float[ndarray, " n"], z_m: Float[ndarray, " n"], kind: st
 
 
 def metric_as(depth_m: Float[ndarray, "h w"], kind: str) -> Float64[ndarray, "h w"]:
-    """Return metric predictions as those of another kind: disparity is 1 / depth; NaN where there are none."""
+    """Return metric predictions as values of another kind: disparity is 1 / depth; NaN where there are none."""
     values = np.where(is_valid_prediction(depth_m), depth_m, np.nan).astype(np.float64)
     with np.errstate(over="ignore"):
         return 1.0 / values if kind == "affine-disparity" else values
@@ -101,7 +107,7 @@ def aligned_depth(
     z = truth_m.ravel()[at].astype(np.float64)
     with np.errstate(over="ignore"):
         if kind == "scale":
-            return everywhere * (median(z) / median(everywhere.ravel()[at]))
+            return everywhere * median_scale(everywhere.ravel()[at], median(z))
         everywhere = _within_range(everywhere, everywhere.ravel()[at])
         target = 1.0 / z if kind == "affine-disparity" else z
         return _fitted_depth(_least_squares(everywhere.ravel()[at], target), everywhere, z, kind)

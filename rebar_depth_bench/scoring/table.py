@@ -6,11 +6,12 @@ import math
 import statistics
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray
+from pydantic import Strict
 
 from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval, resample_views
 from rebar_depth_bench.scoring.columns import (
@@ -35,8 +36,8 @@ from rebar_depth_bench.submission.declaration import METRIC, NOT_DECLARED, Decla
 class PublishedMatch:
     """Scene of Table I that a config shows; ``same_optics`` is False if nothing but the optics differs."""
 
-    scene: str
-    same_optics: bool
+    scene: Annotated[str, Strict()]
+    same_optics: Annotated[bool, Strict()]
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +46,7 @@ class Truth:
 
     ``views`` may read a view when it is taken. ``references`` are the reference errors of each view, by place, and
     ``traits`` the properties by which views are grouped. ``split`` is that of the views, None in a config of one
-    scene. ``views_per_distance``, ``truth_sigma_m`` and ``published`` are those of ``Table``.
+    scene. ``Table`` documents ``views_per_distance``, ``truth_sigma_m`` and ``published``.
     """
 
     view_ids: tuple[str, ...]
@@ -74,7 +75,7 @@ class ViewScore:
         return self[column.in_view]
 
     def interval(self, column: Column) -> None:
-        """Return None: numbers of single views have no intervals."""
+        """Return None: numbers of a view have no intervals. Views and tables share ``Column.cell``."""
 
     @property
     def error(self) -> float:
@@ -147,10 +148,10 @@ class Table:
     no positive slope, and the reference errors. ``kind`` is that of the predictions. ``intervals`` has the 95 %
     bootstrap intervals of the columns that have one, None where undefined. ``published`` is the scene of the
     paper's Table I that the config shows, if any. ``split`` is None for a config of one scene.
-    ``views_per_distance`` is that of a survey, otherwise None. ``truth_sigma_m`` is the standard deviation of the
-    ground truth's depth, None where it is exact. ``of_views`` is the number of the config's views, None if
-    ``views`` are all. ``groups`` has the tables of groups of views by grouping (see ``groups.GROUPINGS``) and
-    group, of a config with splits; they have no groups.
+    ``views_per_distance`` is the number of views at each distance of a survey, otherwise None. ``truth_sigma_m``
+    is the standard deviation of the ground truth's depth, None where it is exact. ``of_views`` is the number of
+    the config's views, None if ``views`` are all. ``groups`` has the tables of groups of views by grouping (see
+    ``groups.GROUPINGS``) and group, of a config with splits; they have no groups.
     """
 
     kind: str
@@ -175,9 +176,8 @@ class Table:
         return self[column.place]
 
     def interval(self, column: Column) -> Interval | None:
-        """Return the interval of the number of a column; None where it is undefined or not finite."""
-        ends = self.intervals.get(column.place)
-        return ends if ends is not None and all(map(math.isfinite, ends)) else None
+        """Return the interval of the number of a column; None where it is undefined."""
+        return self.intervals.get(column.place)
 
     @property
     def error(self) -> float:
@@ -244,52 +244,56 @@ class Table:
         return document
 
 
-def tabulate(frame: Frame, truth: Truth, kind: str = METRIC, declared: Declaration = NOT_DECLARED) -> Table:
-    """Return the table of a config from the numbers of its scored views, with those of groups if it has splits.
+def tabulate(frame: Frame, truth: Truth, kind: str = METRIC, declaration: Declaration = NOT_DECLARED) -> Table:
+    """Return the table of a config from the numbers of its scored views, with tables of groups if it has splits.
 
-    The intervals of a config with splits are those of resampled scenes, of a survey those of views, of others
-    those of consecutive views. A config without views is not ranked, and neither are predictions that are not
+    Scenes are resampled for the intervals of a config with splits, single views for those of a survey, blocks of
+    consecutive views otherwise. A config without views is not ranked, and neither are predictions that are not
     metric, nor a submission that declares the use of ground truth. An infinite metric (of a prediction so large
     that its square overflows) is written as null; the rank error is always finite.
     """
 
-    def table_of(views: Frame) -> Table:
-        of_kind = kind if len(views) else METRIC  # Without views there is nothing of any kind.
-        columns = interval_columns(of_kind)
-        intervals: dict[str, Interval | None] = dict.fromkeys(column.place for column in columns)
-        if len(views):
-            resampling = resample_views(
-                views.view_ids, by_scene=truth.split is not None, views_per_distance=truth.views_per_distance
-            )
-            values = column_values(views, columns)
-            intervals = column_intervals(
-                bootstrap_estimates(values, columns, resampling), values, columns, resampling
-            )
-        return Table(
-            kind=of_kind,
-            views=len(views),
-            views_scored=int(np.count_nonzero(views["coverage"] > 0)),
-            ranked=kind == METRIC and len(views) > 0 and not declared.uses_ground_truth,
-            numbers={one.place: _summary(one, views) for one in (*table_columns(of_kind), *REFERENCES)},
-            intervals=intervals,
-            split=truth.split,
-            views_per_distance=truth.views_per_distance,
-            truth_sigma_m=truth.truth_sigma_m,
-            published=truth.published,
-        )
-
-    table = table_of(frame)
+    table = _table_of_views(frame, truth, kind, declaration)
     if truth.split is None:
         return table
     groups = {
-        key: {group: table_of(frame.take(at)) for group, at in positions_by_group(grouping, truth.traits).items()}
+        key: {
+            group: _table_of_views(frame.take(positions), truth, kind, declaration)
+            for group, positions in positions_by_group(grouping, truth.traits).items()
+        }
         for key, grouping in GROUPINGS.items()
     }
     return replace(table, groups=groups)
 
 
+def _table_of_views(views: Frame, truth: Truth, kind: str, declaration: Declaration) -> Table:
+    """Return the table of views of a config, all of them or a group, without groups."""
+    if not len(views):
+        kind = METRIC  # Without views there is nothing of any kind.
+    columns = interval_columns(kind)
+    intervals: dict[str, Interval | None] = dict.fromkeys(column.place for column in columns)
+    if len(views):
+        resampling = resample_views(
+            views.view_ids, by_scene=truth.split is not None, views_per_distance=truth.views_per_distance
+        )
+        values = column_values(views, columns)
+        intervals = column_intervals(bootstrap_estimates(values, columns, resampling), values, columns, resampling)
+    return Table(
+        kind=kind,
+        views=len(views),
+        views_scored=int(np.count_nonzero(views["coverage"] > 0)),
+        ranked=kind == METRIC and len(views) > 0 and not declaration.uses_ground_truth,
+        numbers={one.place: _summary(one, views) for one in (*table_columns(kind), *REFERENCES)},
+        intervals=intervals,
+        split=truth.split,
+        views_per_distance=truth.views_per_distance,
+        truth_sigma_m=truth.truth_sigma_m,
+        published=truth.published,
+    )
+
+
 def _summary(column: Column, views: Frame) -> float:
-    """Return what a table has of a column; NaN without values, inf if one overflowed."""
+    """Return the number of a table in a column: NaN without values, inf if one overflowed."""
     values = views[column.in_view]
     defined = values[~np.isnan(values)].tolist()
     if not defined:

@@ -194,7 +194,7 @@ _ZED_RECTIFIED = ("rectified", 0.119978)
 
 @dataclass(frozen=True)
 class _Conditions:
-    """Conditions of a scene; ``optics`` are grid and baseline in metres, ``markers`` are those of the board."""
+    """Conditions of a scene; ``optics`` are grid and baseline in metres, ``markers`` is their number."""
 
     assembly: Mapping[str, Any]
     markers: int

@@ -41,13 +41,13 @@ class ViewTruth:
 
 
 def view_numbers(
-    prediction: Float[ndarray, "h w"], truth: ViewTruth, kind: str = METRIC, declared: str = METRIC
+    prediction: Float[ndarray, "h w"], truth: ViewTruth, kind: str = METRIC, declared_kind: str = METRIC
 ) -> dict[str, float]:
     """Return the numbers of a view by their places in the JSON.
 
-    ``prediction``, of the kind ``declared``, is scored as ``kind``; if it is metric, it is planar depth in metres.
+    ``prediction``, of the kind ``declared_kind``, is scored as ``kind``; metric ones are planar depth in metres.
     """
-    if kind != declared:
+    if kind != declared_kind:
         prediction = metric_as(prediction, kind)
     p_m = prediction.ravel().take(truth.index.astype(np.intp))
     if kind != METRIC:

@@ -37,7 +37,7 @@ class SubmissionWriter:
     """Context manager that writes an archive to ``path``: one ``.npy`` entry per view, and ``submission.json``.
 
     The archive appears at ``path`` only on a clean exit; after an exception in the block an existing file at
-    ``path`` is unchanged. Of a link its target is replaced; a device or a pipe is written through. The same
+    ``path`` is unchanged. The target of a link is replaced; a device or a pipe is written through. The same
     predictions, added in the same order, give the same bytes. Several threads may add views; the order of the
     entries, which changes no score, is then theirs. Entries are stored uncompressed, which is fastest to read;
     ``compress=True`` deflates them (about 100 times slower to write, 10 times slower to read, a fifth smaller),

@@ -286,7 +286,7 @@ def _check_local_header(source: ByteSource, entry: ZipEntry, directory_offset: i
 
 
 def _overlap_problems(entries: Sequence[ZipEntry]) -> Iterator[tuple[int, Problem]]:
-    """Yield index and problem of every entry whose byte range, header included, overlaps that of another entry."""
+    """Yield index and problem of every entry whose byte range, header included, overlaps another entry's range."""
     located = sorted(
         (entry.header_offset, entry.data_offset + entry.compressed_size, index)
         for index, entry in enumerate(entries)

@@ -20,7 +20,6 @@ from hypothesis import strategies as st
 from numpy import ndarray
 
 import rebar_depth_bench as rdb
-from rebar_depth_bench.bar_crossings.definition import MAX_GAP_M, Crossings, crossing_parameters, scene_crossings
 from rebar_depth_bench.bar_crossings.crossings_file import (
     CROSSINGS_SCHEMA,
     CrossingsSource,
@@ -28,6 +27,7 @@ from rebar_depth_bench.bar_crossings.crossings_file import (
     read_crossings,
     write_crossings,
 )
+from rebar_depth_bench.bar_crossings.definition import MAX_GAP_M, Crossings, crossing_parameters, scene_crossings
 from rebar_depth_bench.base.errors import DatasetError
 from rebar_depth_bench.data.bars import Bar, read_bars
 from rebar_depth_bench.data.files import file_sha256

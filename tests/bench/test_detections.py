@@ -22,16 +22,10 @@ from rebar_depth_bench.bar_crossings.definition import scene_crossings
 from rebar_depth_bench.base.errors import InputError, SubmissionError
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.detections.crossing_scorer import SeenDetections, compare_view, score_crossings
+from rebar_depth_bench.detections.matching import excused, greedy_matches, matched_pairs
 from rebar_depth_bench.detections.reading import MAX_ROWS_PER_VIEW, read_detections
 from rebar_depth_bench.detections.tables import RankedDetections, ViewDetections, tabulate_detections
-from rebar_depth_bench.detections.score import (
-    SeenDetections,
-    compare_view,
-    excused,
-    greedy_matches,
-    matched_pairs,
-    score_crossings,
-)
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
 from rebar_depth_bench.extended.steel import JudgedCrossings
 from rebar_depth_bench.geometry.cameras import transform

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 from scipy.stats import spearmanr
@@ -28,12 +28,9 @@ from rebar_depth_bench.diagnosis.corrections import (
     DiagnosedView,
     KeptPredictions,
     Pixels,
-    best_shift,
     mean_error,
-    median_ratio,
     positions_to_read,
     rank_correlation,
-    resistant_line,
     shape_corrections,
 )
 from rebar_depth_bench.geometry.cameras import Camera, ideal_K
@@ -271,29 +268,6 @@ def test_at_most_eight_evenly_spaced_views_with_steel_are_read(
     assert all((view.prediction == view.position).all() for view in views)
 
 
-@settings(max_examples=25)
-@given(st.integers(-6, 6), st.integers(-6, 6), st.floats(0.1, 10))
-def test_best_shift_is_the_made_shift(dv: int, du: int, scale: float) -> None:
-    random = np.random.default_rng(3)
-    depth_m = random.uniform(1.0, 2.0, (40, 50))
-    v, u = (index.ravel() for index in np.mgrid[10:30, 10:40])
-    pixels = Pixels(v, u, depth_m[v, u])
-    image = scale * np.roll(depth_m, (dv, du), (0, 1))
-    assert best_shift([_view(pixels, image)]) == (dv, du)
-
-
-@given(st.floats(0.01, 100), st.floats(-5, 5), st.integers(0, 20))
-def test_resistant_line_ignores_outliers(slope: float, intercept: float, outliers: int) -> None:
-    x = np.linspace(1.0, 3.0, 99)
-    y = slope * x + intercept
-    y[:: max(99 // max(outliers, 1), 5)] += 1e6  # At most one in five.
-    if outliers == 0:
-        y = slope * x + intercept
-        assert resistant_line(x, y) == pytest.approx((slope, intercept), abs=1e-6 * (1 + slope))
-    found_slope, _ = resistant_line(x, y)
-    assert found_slope == pytest.approx(slope, rel=0.7)
-
-
 @given(st.floats(1e-3, 1e3), st.floats(0.0, 5.0))
 def test_inverse_depth_with_any_scale_and_offset_is_fitted(a: float, b: float) -> None:
     z_m = np.linspace(0.5, 3.0, 300)
@@ -315,14 +289,6 @@ def test_rank_correlation_is_that_of_spearman(values: list[int], seed: int) -> N
         assert rank_correlation(p, z_m) == pytest.approx(expected, abs=1e-12)
     else:
         assert math.isnan(rank_correlation(p, z_m))
-
-
-@given(st.floats(1e-6, 1e6))
-def test_mean_error_does_not_depend_on_the_scale(scale: float) -> None:
-    random = np.random.default_rng(5)
-    z_m, p = random.uniform(0.2, 17, 200), random.uniform(0.2, 17, 200)
-    assert mean_error(scale * p, z_m) == pytest.approx(mean_error(p, z_m), rel=1e-9)
-    assert median_ratio(scale * p, z_m) * scale == pytest.approx(median_ratio(p, z_m), rel=1e-9)
 
 
 def _view(pixels: Pixels, image: np.ndarray) -> DiagnosedView:

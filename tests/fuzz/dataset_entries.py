@@ -27,7 +27,7 @@ from rebar_depth_bench.methods.controls import noisy_depth_m
 from rebar_depth_bench.submission import SubmissionReader
 from tests.fuzz.workspace import CACHE, CASE, EntryPoint, Workspace, bench, run_options
 from tests.mat_dataset import write_mat_dataset
-from tests.synthetic_dataset import write_earlier_manifest, write_split_dataset
+from tests.synthetic_dataset import write_split_dataset
 
 CONFIG = "lattice-orbit"
 ROOT = f"{CASE}/root"
@@ -163,15 +163,6 @@ def _listed_files(workspace: Workspace) -> bytes:
     return b"".join(path.read_bytes() for path in sorted(root.rglob("*")) if path.is_file())
 
 
-def _write_earlier_dataset(workspace: Workspace) -> None:
-    write_dataset(workspace)
-    write_earlier_manifest(workspace.root / ROOT)
-
-
-def _rewrite(workspace: Workspace) -> None:
-    run_options(builder_parser(), "build", "--out", workspace.root / ROOT, "--rewrite-manifest")
-
-
 class _NoRenderer:
     """Renderer of a folder in which everything is up to date unless it is damaged."""
 
@@ -266,14 +257,6 @@ DATASET_ENTRIES = (
         (*METADATA[1:], f"{ROOT}/pictures/*", f"{ROOT}/*/*.parquet"),
         covered=True,
         result=_listed_files,
-    ),
-    EntryPoint(
-        "build: earlier manifest",
-        6,
-        _write_earlier_dataset,
-        _rewrite,
-        METADATA[:1],
-        may_change=(f"{ROOT}/manifest.json", f"{ROOT}/.rebar-build*"),
     ),
     EntryPoint(
         "build: existing folder",

@@ -7,7 +7,6 @@ from dataclasses import astuple
 from functools import partial
 from pathlib import Path
 
-import cv2
 import numpy as np
 from PIL import Image
 
@@ -50,13 +49,6 @@ _BOP = """{
     "cam_R_w2c": [1.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, 1.0, 0.0], "cam_t_w2c": [10.0, -20.0, 500.0]},
   "1": {"cam_K": [20.0, 0.0, 7.5, 0.0, 20.0, 7.5, 0.0, 0.0, 1.0], "depth_scale": 1000.0, "view_level": 2}
 }"""
-_NERFSTUDIO = """{
-  "camera_model": "OPENCV", "w": 16, "h": 16, "fl_x": 20.0, "cx": 8.0, "cy": 8.0, "k1": 0.01, "p2": 0.001,
-  "depth_unit_scale_factor": 1.0, "applied_scale": 0.5, "frames": [
-    {"file_path": "./images/0.png",
-      "transform_matrix": [[1, 0, 0, 0.5], [0, 0, 1, 0.1], [0, -1, 0, 2.0], [0, 0, 0, 1]]},
-    {"file_path": "./images/1.png", "fl_y": 20.5}]}
-"""
 _MILLIMETRES = '[depth]\nunit = "mm"\ninvalid = [65535, 65.535]\nmax_m = 1.8\n'
 _BARS = """bar_id,role,diameter_m,x_m,y_m,z_m
 1,main,0.016,0.0,0.1,0.2
@@ -65,13 +57,7 @@ _BARS = """bar_id,role,diameter_m,x_m,y_m,z_m
 2,stirrup,0.01,0.0,0.2,0.0
 2,stirrup,0.01,0.1,0.3,0.1
 """
-_SPREADSHEET = "\ufeffsep=;\r\n" + _BARS.upper().replace(",", ";").replace(".", ",").replace("\n", "\r\n")
-
-
-def _tiff_float64(depth_m: np.ndarray) -> bytes:
-    """Return a TIFF file as OpenCV writes float64 values, which Pillow does not read."""
-    content: bytes = cv2.imencode(".tiff", depth_m.astype(np.float64))[1].tobytes()
-    return content
+_SPREADSHEET = "\ufeffsep=;\r\n" + _BARS.upper().replace(",", ";").replace("\n", "\r\n")
 
 
 def _tiff(depth_m: np.ndarray) -> bytes:
@@ -124,7 +110,6 @@ def _read_views(path: Path) -> object:
 
 
 _imported = partial(file_entry, read=_import, cpu_s=10.0)
-_views = partial(file_entry, file="views.json", read=_read_views, cpu_s=10.0)
 
 
 def _imported_depth(kind: str, suffix: str, content: bytes, table: str = "") -> EntryPoint:
@@ -135,16 +120,14 @@ def _imported_depth(kind: str, suffix: str, content: bytes, table: str = "") -> 
 IMPORT_ENTRIES = (
     _imported("import: layout", "layout.toml", _write_import),
     file_entry(
-        "import: BOP's cameras", "views.json", partial(_write_views, _BOP), _read_views, share=4, cpu_s=10.0
+        "import: BOP's cameras", "views.json", partial(_write_views, _BOP), _read_views, share=10, cpu_s=10.0
     ),
-    _views("import: nerfstudio's cameras", write=partial(_write_views, _NERFSTUDIO), share=6),
     _imported("import: bars", "bars.csv", _write_import),
     _imported("import: bars of a spreadsheet", "bars.csv", partial(_write_import, bars=_SPREADSHEET)),
     _imported_depth("npy", "npy", npy(IMPORTED_M)),
     _imported_depth("npz", "npz", npz(depth=IMPORTED_M)),
     _imported_depth("npy of integers", "npy", npy(np.round(1000 * IMPORTED_M).astype(np.int32)), _MILLIMETRES),
     _imported_depth("TIFF", "tif", _tiff(IMPORTED_M)),
-    _imported_depth("TIFF of float64", "tif", _tiff_float64(IMPORTED_M)),
     _imported_depth("TIFF of integers", "tif", _tiff(np.round(1000 * IMPORTED_M).astype(np.uint16)), _MILLIMETRES),
     _imported_depth("PFM", "pfm", _pfm(IMPORTED_M)),
     _imported("import: EXR", "depth-a.exr", lambda path: _write_import(path, exr(path, {"V": IMPORTED_M}), "exr")),

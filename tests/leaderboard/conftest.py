@@ -20,10 +20,10 @@ from leaderboard.db.tokens import create_token
 from leaderboard.scoring.sandbox import Outcome
 from rebar_depth_bench import SubmissionWriter, load
 from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.scoring.metrics import DepthMetrics
+from rebar_depth_bench.scoring.columns import METRICS
 from rebar_depth_bench.scoring.result import DatasetIdentity
 from rebar_depth_bench.submission.declaration import Declaration
-from tests.bench.reporting.results import result, scored_view
+from tests.bench.reporting.results import changed, result, scored_view
 from tests.leaderboard import serving
 from tests.leaderboard.boards import OTHER_DIGEST, accept, board_settings, claimed, opened
 from tests.leaderboard.serving import Postgres, RunPostgres, RunServer, Server, make_token
@@ -187,7 +187,9 @@ def crowded(
         for name, error in errors.items():
             view = scored_view("lattice/0000", error)
             if name == "huge":
-                view = replace(view, rank_error=1.0, scale=1e-30, native=DepthMetrics(1e30, 1e32, 1e32, 0.0))
+                native = zip(METRICS, (1e30, 1e32, 1e32, 0.0), strict=True)
+                errors = {f"native.{metric}": value for metric, value in native}
+                view = changed(view, {"rank_error": 1.0, "scale": 1e-30, **errors})
             views = [replace(view, view_id=f"lattice/{8 * index:04d}") for index in range(80)]
             method = "method 3" if name == "worse" else name
             content = result(*views, method=method, declared=Declaration("rgb", name == "truth"))

@@ -162,11 +162,11 @@ def entry_of(name: str, table: dict[str, Any], declared: dict[str, Any]) -> Lead
 def test_rows_of_the_paper_and_references_have_the_columns_that_they_fill() -> None:
     ranking = Ranking((entry_of("m", table_of(0.5), {}),))
     table = config_table(ranking, "lattice", Selection(), 50)
-    paths = {column.number.path for column in COLUMNS_BY_NAME.values() if column.number}
+    places = {column.number.place for column in COLUMNS_BY_NAME.values() if column.number}
     assert len(table["published"]) == 6
     for name, texts in (*table["published"], *table["references"]):
         assert name
-        assert texts.keys() <= paths, name
+        assert texts.keys() <= places, name
     assert config_table(Ranking(()), "lattice", Selection(), 50)["published"] == []
 
 

@@ -79,13 +79,12 @@ def test_documented_commands_parse(command: str) -> None:
     assert parser.parse_args(with_command(arguments) if program == "rebar-build" else arguments)
 
 
-def test_every_script_of_the_paper_is_listed_and_short() -> None:
+def test_every_script_of_the_paper_is_listed() -> None:
     scripts = {Path(shlex.split(command)[1]).name for command in commands("python examples/paper/")}
     assert scripts == {"anchor.py", "distance.py", "kitti.py", "pseudo_reference.py"}
     page = (DOCS / "paper.md").read_text()
-    for path in (ROOT / "examples" / "paper").glob("*.py"):
-        assert len(path.read_text().splitlines()) <= (250 if path.name == "kitti.py" else 200)
-        assert path.name not in scripts or f"[{path.name}](../examples/paper/{path.name})" in page
+    for name in scripts:
+        assert f"[{name}](../examples/paper/{name})" in page
 
 
 def subparsers(parser: ArgumentParser) -> dict[str, ArgumentParser]:

@@ -69,7 +69,7 @@ def test_bench_imports_what_a_command_needs_and_no_heavy_package() -> None:
     assert commands["version"] == commands["help"] == {"main", "console"}
     assert commands["cache"] == {"main", "console", "cache"}
     assert not found["help"] & {"numpy", "pyarrow", "pydantic", "jinja2"}
-    assert "rebar_depth_bench.scoring.score" in found["scoring"]
+    assert "rebar_depth_bench.scorer" in found["scoring"]
     heavy = {"torch", "bpy", "mathutils", "cv2", "embreex", "trimesh", "fastapi", "dataset_builder", "leaderboard"}
     heavy |= {"datasets", "huggingface_hub", "pandas", "scipy", "yaml"}  # Imported on use: each is slow to import.
     assert not found["scoring"] & heavy

@@ -38,7 +38,6 @@ from rebar_depth_bench.extended.measures import (
     SCALED,
     Measure,
     MeasureFamily,
-    aligned_predictions,
 )
 from rebar_depth_bench.extended.point_cloud import TOLERANCES_MM
 from rebar_depth_bench.extended.reach import ReachBin
@@ -310,7 +309,7 @@ def crossing_picture(evaluation: Evaluation, config: DatasetConfig) -> CrossingP
     truth = steel.view(int(np.argmax(steel.judged_counts)))
     scene, crossings = truth.bars.crossings, view_crossings(truth)
     prediction_m = evaluation.submission.read(truth.view_id)
-    is_located, ties = fitted_ties(aligned_predictions(prediction_m, truth, None)[NATIVE], crossings)
+    is_located, ties = fitted_ties(truth.predicted_m(prediction_m), crossings)
     with np.errstate(invalid="ignore", over="ignore"):
         error_mm = 1000 * np.linalg.norm(ties.tie_point_m - crossings.ties.tie_point_m, axis=1)
     kinds = dict.fromkeys(range(len(scene)), "unjudged")

@@ -36,7 +36,15 @@ from rebar_depth_bench.reporting.html.views import (
 )
 from rebar_depth_bench.reporting.published import OTHER_OPTICS_NOTE, load_published, paper_scenes
 from rebar_depth_bench.scoring import formatting
-from rebar_depth_bench.scoring.columns import ALIGNED, ALIGNED_CONSTANT, ALIGNED_ROBUST, METRIC_COLUMNS
+from rebar_depth_bench.scoring.columns import (
+    ALIGNED,
+    ALIGNED_CONSTANT,
+    ALIGNED_ROBUST,
+    METRIC_COLUMNS,
+    METRICS,
+    Column,
+    columns_at,
+)
 from rebar_depth_bench.scoring.evaluation import Evaluation
 from rebar_depth_bench.scoring.groups import GROUPINGS
 from rebar_depth_bench.scoring.protocol import scored_pixels
@@ -126,14 +134,19 @@ def results_context(result: Result, views: Mapping[str, Sequence[ViewScore]]) ->
 
 def relative_context(result: Result, views: Mapping[str, Sequence[ViewScore]]) -> dict[str, object]:
     """Return the context of ``part_relative.html.j2``, of predictions that are not metric."""
-    robust = () if result.kind == "scale" else ALIGNED_ROBUST[1:2]
+    robust = [] if result.kind == "scale" else ["aligned_robust.abs_rel"]
+    shown = ["error", *METRICS, "within_mm.5"]
+    places = [*(f"aligned.{one}" for one in shown), *robust, "constant.error", "constant.abs_rel"]
+    view_columns = columns_at(*places)
+    context = _tables_context(result)
     return {
-        **_tables_context(result),
+        **context,
+        "dash_in_results": context["dash_in_results"] or _have_dash(views, view_columns),
         "group_note": formatting.ALIGNED_GROUP_NOTE,
         "kind_text": formatting.kind_text(result),
         "alignments": {"aligned": ALIGNED, "robust": ALIGNED_ROBUST, "constant": ALIGNED_CONSTANT},
         "aligned_note": formatting.ALIGNED_NOTE,
-        "view_columns": (*ALIGNED[:5], ALIGNED[6], *robust, *ALIGNED_CONSTANT[:2]),
+        "view_columns": view_columns,
         "view_tables": [(printable(name), worst_first(scores), WORST_SHOWN) for name, scores in views.items()],
     }
 
@@ -216,13 +229,17 @@ def views_context(
         )
         for name, scores in views.items()
     ]
-    undefined = any(
-        not math.isfinite(view[column.in_view])
-        for config in configs
-        for view in config.worst
-        for column in METRIC_COLUMNS
+    return {"configs": configs, "dash_in_views": _have_dash(views, METRIC_COLUMNS)}
+
+
+def _have_dash(views: Mapping[str, Sequence[ViewScore]], columns: Sequence[Column]) -> bool:
+    """Return whether any of the ``columns`` is undefined in a view."""
+    return any(
+        not math.isfinite(view.number(column))
+        for scores in views.values()
+        for view in scores
+        for column in columns
     )
-    return {"configs": configs, "dash_in_views": undefined}
 
 
 def _provenance(result: Result) -> list[tuple[str, str]]:
@@ -290,8 +307,9 @@ def view_panels(
     own kind.
     """
     truth_m, mask = row["left_depth"], row["left_mask"]
-    steel = truth_m > 0 if mask is None else mask
+    scored = scored_pixels(mask, truth_m)
     if kind != METRIC:
         values = prediction if kind == declared else metric_as(prediction, kind)
-        prediction = aligned_depth(values, truth_m, scored_pixels(steel, truth_m), kind)
-    return ViewPanels(row["left_rgb"], truth_m, prediction, steel, score)
+        prediction = aligned_depth(values, truth_m, scored, kind)
+    steel = truth_m > 0 if mask is None else mask
+    return ViewPanels(row["left_rgb"], truth_m, prediction, steel, scored, score)

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from operator import attrgetter
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, UInt8, UInt32
 from numpy import ndarray
 from PIL import Image
 
@@ -46,13 +46,14 @@ class ViewPanels:
 
     ``rgb`` is uint8 H x W x 3, None in a config without colour; ``truth_m`` float32 metres, 0 without a surface;
     ``prediction_m`` float metres, not finite or <= 0 without a prediction; ``steel`` bool, rim included; ``score``
-    holds the view's numbers.
+    holds the view's numbers. ``scored`` has the flat indices of the scored pixels.
     """
 
     rgb: UInt8[ndarray, "h w 3"] | None
     truth_m: Float32[ndarray, "h w"]
     prediction_m: Float[ndarray, "h w"]
     steel: Bool[ndarray, "h w"]
+    scored: UInt32[ndarray, " n"]
     score: ViewScore
 
 
@@ -95,7 +96,7 @@ class ShownView:
 def shown_view(view: ViewPanels) -> ShownView:
     """Return a view with its encoded panels, which are about ``PANEL_WIDTH`` pixels wide."""
     step = max(1, round(view.truth_m.shape[1] / PANEL_WIDTH))
-    scored = scored_pixels(view.steel, view.truth_m)
+    scored = view.scored
     near_m, far_m = depth_range(view.truth_m, scored)
     predicted_m = view.prediction_m.ravel()[scored].astype(np.float64)
     predicted_m = predicted_m[is_valid_prediction(predicted_m)]
@@ -139,12 +140,12 @@ def _centimetres(value: float | None) -> str:
 
 
 def backdrop_image(
-    rgb: UInt8[ndarray, "h w 3"] | None, truth_m: Float32[ndarray, "h w"], steel: Bool[ndarray, "h w"]
+    rgb: UInt8[ndarray, "h w 3"] | None, truth_m: Float32[ndarray, "h w"], mask: Bool[ndarray, "h w"] | None
 ) -> bytes:
     """Return the colour image of a view as WebP, or its true depth in a config without colour, to draw over."""
     if rgb is not None:
         return _webp(rgb, lossless=False)
-    return _webp(depth_image(truth_m, *depth_range(truth_m, scored_pixels(steel, truth_m))))
+    return _webp(depth_image(truth_m, *depth_range(truth_m, scored_pixels(mask, truth_m))))
 
 
 def depth_range(truth_m: Float32[ndarray, "h w"], scored: ndarray) -> tuple[float, float]:

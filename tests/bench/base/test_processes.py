@@ -19,7 +19,7 @@ from tests.processes import is_running, wait_until
 
 
 def mapped(work: Callable[[int], int], items: Sequence[int], workers: int | None) -> list[int]:
-    return list(map_in_threads(work, items, "t", workers=workers))
+    return list(map_in_threads(work, items, len(items), "t", workers=workers))
 
 
 @pytest.mark.parametrize("workers", [None, 1, 3])
@@ -36,7 +36,7 @@ def test_look_ahead_is_two_items_per_thread() -> None:
         assert len(taken) <= done + 3
         steps.append((task, done, total))
 
-    for _ in map_in_threads(taken.append, range(100), "t", workers=2, progress=progress):
+    for _ in map_in_threads(taken.append, range(100), 100, "t", workers=2, progress=progress):
         time.sleep(0.001)  # The threads could take more items meanwhile.
     assert steps == [("t", done, 100) for done in range(1, 101)]
 

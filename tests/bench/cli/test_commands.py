@@ -10,7 +10,6 @@ import subprocess
 import sys
 import zipfile
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import huggingface_hub
@@ -30,7 +29,7 @@ from rebar_depth_bench.methods import METHODS, MultiViewMethod, own_methods
 from rebar_depth_bench.methods.base import WeightsMethod
 from rebar_depth_bench.methods.registry import FROM_FOLDER
 from rebar_depth_bench.scoring.result import Result
-from tests.bench.reporting.results import result, scored_view
+from tests.bench.reporting.results import changed, result, scored_view
 from tests.commands import run_in_process
 from tests.damage import change_manifest, change_rows, copy_dataset, first_shard
 from tests.project.pages import PAGES, blocks
@@ -87,13 +86,10 @@ def test_score_writes_table_json_csv_and_report(constant: Path, tiny_root: Path,
 def test_sgbm_is_metric_and_constant_needs_scaling(constant: Path, tiny_root: Path, tmp_path: Path) -> None:
     pytest.importorskip("cv2")
     stereo = rdb.score(predict("sgbm", tiny_root, tmp_path), tiny_root).tables["lattice"]
-    assert stereo.native is not None
     # At 160 x 90 one disparity step is centimetres of depth.
-    assert stereo.scale_median == pytest.approx(1, abs=0.15)
+    assert stereo["scale_median"] == pytest.approx(1, abs=0.15)
     table = rdb.score(constant, tiny_root).tables["lattice"]
-    assert table.native is not None
-    assert table.scaled is not None
-    assert table.scale_median == pytest.approx(0.33, abs=0.1)
+    assert table["scale_median"] == pytest.approx(0.33, abs=0.1)
     assert table["scaled.abs_rel"] < 0.1 * table["native.abs_rel"]
 
 
@@ -324,12 +320,10 @@ def test_demo_lists_all_methods_that_are_hardly_better_than_a_plane() -> None:
         return " ".join(console.file.getvalue().split())  # type: ignore[attr-defined]
 
     whole = scored_view("lattice/0000")
-    assert whole.scaled is not None
-    assert whole.scaled_constant is not None
     results = [result(whole, method="whole"), result(scored_view("lattice/0000", coverage=0.9), method="sparse")]
     for name, share in (("near", 0.97), ("good", 0.9)):
-        scaled = replace(whole.scaled, abs_rel=share * whole.scaled_constant[0])
-        results.append(result(replace(whole, scaled=scaled), method=name))
+        errors = {"scaled.abs_rel": share * whole["reference.scaled_constant.abs_rel"]}
+        results.append(result(changed(whole, errors), method=name))
     assert "less than 5 % for whole, sparse, near." in printed(*results)
     assert "less than" not in printed(results[-1])
 

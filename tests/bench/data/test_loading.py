@@ -37,7 +37,7 @@ def test_plain_datasets_loads_folder(tiny_root: Path) -> None:
     assert row["left_preview"].mode == "P"
 
 
-def test_view_ids_of_the_manifest_are_indices_of_the_full_protocol(tiny_root: Path) -> None:
+def test_view_ids_of_the_manifest_are_indices_of_the_full_trajectory(tiny_root: Path) -> None:
     folder = open_folder(tiny_root)
     assert folder.configs == ("lattice", "lattice-orbit")
     assert len(folder.expected_views()) == VIEWS + 2

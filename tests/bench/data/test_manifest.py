@@ -92,7 +92,7 @@ def test_board_is_read_from_manifest(manifest: Any, tmp_path: Path) -> None:
 
 def test_reference_errors_may_be_zero_but_not_negative() -> None:
     zero = {"abs_rel": 0.0, "rmse_cm": 0.0}
-    assert References.model_validate({"constant": zero, "one_pixel": zero})["constant.abs_rel"] == 0.0
+    assert References.model_validate({"constant": zero, "one_pixel": zero}).constant.abs_rel == 0.0
     with pytest.raises(ValidationError):
         References.model_validate({"constant": {**zero, "rmse_cm": -1.0}, "one_pixel": zero})
 

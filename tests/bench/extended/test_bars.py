@@ -15,15 +15,14 @@ import rebar_depth_bench as rdb
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.extended.as_built import MEASURES as DEVIATION_MEASURES
-from rebar_depth_bench.extended.as_built import OFF_MM, as_built_samples
+from rebar_depth_bench.extended.as_built import OFF_MM, as_built_samples, designed_segments
 from rebar_depth_bench.extended.fits import MISS_MM
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
-from rebar_depth_bench.extended.inspection import INSPECTION_MEASURES, PROFILES, inspection_samples
+from rebar_depth_bench.extended.inspection import INSPECTION_MEASURES, PROFILES, inspection_samples, visible_pairs
+from rebar_depth_bench.extended.judged import visible_segments
 from rebar_depth_bench.extended.measures import STATISTICS, Samples
-from rebar_depth_bench.extended.families import score_extended
-from rebar_depth_bench.extended.steel import SceneBars
+from rebar_depth_bench.extended.steel import SceneBars, SteelTruth
 from rebar_depth_bench.geometry.cameras import rotation_matrix
-from rebar_depth_bench.scoring.evaluation import open_evaluation
 from tests.bench.extended.cage_scenes import bar, mat, predicted_m, view
 
 # Inspection.
@@ -69,12 +68,17 @@ BUILT_TRUTH = view(BARS)
 BUILT_EXACT_M = BUILT_TRUTH.depth_m.astype(np.float64)
 
 
-def samples_of(p_m: np.ndarray) -> Samples:
-    return inspection_samples(p_m, TRUTH)
+def inspected(p_m: np.ndarray, truth: SteelTruth = TRUTH) -> Samples:
+    visible = visible_segments(truth)
+    return inspection_samples(p_m, visible, visible_pairs(visible, truth.bars.cage))
+
+
+def deviations(p_m: np.ndarray, truth: SteelTruth) -> Samples:
+    return as_built_samples(p_m, designed_segments(truth, visible_segments(truth)))
 
 
 def test_ground_truth_of_smooth_bars_is_perfect() -> None:
-    samples = samples_of(EXACT_M)
+    samples = inspected(EXACT_M)
     assert samples["bar_found"].tolist() == [1.0] * 6
     # Neighbours: 1-2, 2-3 and 4-5 side by side, and 2-6, which lies mostly along the optical axis.
     assert len(samples["spacing_judged_mm"]) == 3
@@ -90,7 +94,7 @@ def test_ground_truth_of_smooth_bars_is_perfect() -> None:
 @pytest.mark.parametrize("move_mm", [(0, 0, 6), (0, 0, -6), (1.5, 0, 0), (2, 0, 4)])
 def test_shifted_bars_have_offsets_of_the_shift(move_mm: tuple[float, float, float]) -> None:
     dx, dy, dz = (value / 1000 for value in move_mm)
-    samples = samples_of(predicted_m(mat(dx, dy, dz), TRUTH))
+    samples = inspected(predicted_m(mat(dx, dy, dz), TRUTH))
     np.testing.assert_allclose(samples["cover_error_mm"], move_mm[2], atol=0.05)
     upright = [np.hypot(move_mm[0], move_mm[2])] * 3
     lying = [np.hypot(move_mm[1], move_mm[2])] * 2
@@ -102,7 +106,7 @@ def test_shifted_bars_have_offsets_of_the_shift(move_mm: tuple[float, float, flo
 def test_shifting_one_bar_changes_its_layer_distance_only() -> None:
     steel = mat()
     steel[5] = mat(dz=0.004)[5]
-    samples = samples_of(predicted_m(steel, TRUTH))
+    samples = inspected(predicted_m(steel, TRUTH))
     # Bar 6 is 30 mm aside of and 100 mm behind bar 2.
     expected_mm = 4 * 0.1 / np.hypot(0.03, 0.1)
     np.testing.assert_allclose(samples["layer_error_mm"], expected_mm, atol=0.05)
@@ -111,7 +115,7 @@ def test_shifting_one_bar_changes_its_layer_distance_only() -> None:
 
 @pytest.mark.parametrize("scale", [0.98, 1.03])
 def test_scale_error_stretches_all_distances(scale: float) -> None:
-    samples = samples_of(scale * EXACT_M)
+    samples = inspected(scale * EXACT_M)
     # The fit keeps the nominal radius, so that scaling moves the visible side of a bar, not its axis, by s - 1
     # times its position. From in front of the gap between two bars, their visible sides are closer together than
     # their axes by less than a diameter.
@@ -123,7 +127,7 @@ def test_scale_error_stretches_all_distances(scale: float) -> None:
 
 @pytest.mark.parametrize("diameter_m", [0.018, 0.022])
 def test_diameter_error_is_measured(diameter_m: float) -> None:
-    samples = samples_of(predicted_m(mat(diameter_m=diameter_m), TRUTH))
+    samples = inspected(predicted_m(mat(diameter_m=diameter_m), TRUTH))
     assert len(samples["diameter_error_mm"]) >= 3
     np.testing.assert_allclose(samples["diameter_error_mm"], 1000 * (diameter_m - 0.02), atol=0.1)
 
@@ -134,7 +138,7 @@ def test_tilt_of_bar_is_measured() -> None:
     lean_m = np.tan(np.deg2rad(2.0)) * 0.14
     axis_m = ((*start[:2], start[2] - lean_m), (*end[:2], end[2] + lean_m))
     steel[0] = replace(steel[0], axis_m=axis_m)
-    tilt_deg = samples_of(predicted_m(steel, TRUTH))["axis_tilt_deg"]
+    tilt_deg = inspected(predicted_m(steel, TRUTH))["axis_tilt_deg"]
     assert tilt_deg[0] == pytest.approx(2.0, abs=0.1)
     assert tilt_deg[1:].max() < 0.01
 
@@ -144,7 +148,7 @@ def test_bar_displaced_at_its_ends_is_not_found(lean_m: float, found: int) -> No
     truth = view([bar(i, (x, -0.14, 0.4), (x, 0.14, 0.4)) for i, x in ((1, 0.0), (2, 0.04))])
     leaning = bar(1, (0.0, -0.14, 0.4 - lean_m), (0.0, 0.14, 0.4 + lean_m))
     other = bar(2, (0.04, -0.14, 0.4), (0.04, 0.14, 0.4))
-    samples = inspection_samples(predicted_m([leaning, other], truth), truth)
+    samples = inspected(predicted_m([leaning, other], truth), truth)
     # The middle of the bar does not move; half the distance to the other bar is 20 mm.
     assert samples["bar_found"].tolist() == [found, 1]
 
@@ -153,7 +157,7 @@ def test_noise_does_not_tilt_a_receding_bar() -> None:
     truth = view([bar(1, (-0.1, 0.0, 0.4), (0.06, 0.0, 0.8))])
     exact_m = truth.depth_m.astype(np.float64)
     tilts_deg = [
-        inspection_samples(exact_m + 0.05 * rng.standard_normal(len(exact_m)), truth)["axis_tilt_deg"]
+        inspected(exact_m + 0.05 * rng.standard_normal(len(exact_m)), truth)["axis_tilt_deg"]
         for rng in map(np.random.default_rng, range(20))
     ]
     assert np.median(np.concatenate(tilts_deg)) < 2.5
@@ -162,18 +166,18 @@ def test_noise_does_not_tilt_a_receding_bar() -> None:
 @pytest.mark.parametrize(("left_out", "found"), [(0.35, 1.0), (0.65, 0.0)])
 def test_bar_needs_predictions_on_half_of_its_pixels(left_out: float, found: float) -> None:
     missing = np.random.default_rng(0).random(len(EXACT_M)) < left_out
-    assert (samples_of(np.where(missing, np.nan, EXACT_M))["bar_found"] == found).all()
+    assert (inspected(np.where(missing, np.nan, EXACT_M))["bar_found"] == found).all()
 
 
 def test_rim_pixels_are_ignored() -> None:
-    whole, rim_spoilt = samples_of(EXACT_M), samples_of(np.where(TRUTH.interior, EXACT_M, 9.0))
+    whole, rim_spoilt = inspected(EXACT_M), inspected(np.where(TRUTH.interior, EXACT_M, 9.0))
     assert not TRUTH.interior.all()
     assert all(whole[name].tobytes() == rim_spoilt[name].tobytes() for name in whole)
 
 
 def test_missing_bars_count_as_failures() -> None:
-    whole, all_missing = samples_of(EXACT_M), samples_of(np.full(len(EXACT_M), np.nan))
-    without_one = samples_of(np.where(TRUTH.bar_id == 2, np.nan, EXACT_M))
+    whole, all_missing = inspected(EXACT_M), inspected(np.full(len(EXACT_M), np.nan))
+    without_one = inspected(np.where(TRUTH.bar_id == 2, np.nan, EXACT_M))
     for samples in (all_missing, without_one):
         for name in whole:
             if name not in DETECTED_BARS_ONLY:
@@ -198,8 +202,8 @@ def test_measures_are_independent_of_world_frame_and_ids(
     cam_from_world[:3, 3] = -rotation.T @ shift_m
     noise_m = 0.002 * np.random.default_rng(0).standard_normal(len(EXACT_M))
     for bars, truth, samples_of_view in (
-        (mat(), TRUTH, inspection_samples),
-        (BARS, BUILT_TRUTH, as_built_samples),
+        (mat(), TRUTH, inspected),
+        (BARS, BUILT_TRUTH, deviations),
     ):
         p_m = truth.depth_m * 1.01 + noise_m[: len(truth.depth_m)]
         elsewhere = [
@@ -220,7 +224,7 @@ def test_measures_are_independent_of_world_frame_and_ids(
 
 def test_noise_larger_than_bars_averages_out() -> None:
     rng = np.random.default_rng(1)
-    samples = samples_of(EXACT_M + 0.015 * rng.standard_normal(len(EXACT_M)))
+    samples = inspected(EXACT_M + 0.015 * rng.standard_normal(len(EXACT_M)))
     assert samples["bar_found"].all()
     # 15 mm / sqrt(64 points) is 1.9 mm; Tukey's weights and the slope add a little.
     assert np.abs(samples["cover_error_mm"]).max() < 6.0
@@ -233,27 +237,27 @@ def test_outliers_and_extreme_values_do_not_move_a_bar() -> None:
     extreme_m = EXACT_M.copy()
     extreme_m[::9], extreme_m[4::9], extreme_m[7::9] = 1e300, -np.inf, 1e-300
     for p_m, offset_mm in ((outliers_m, 0.5), (extreme_m, 0.05)):
-        samples = samples_of(p_m)
+        samples = inspected(p_m)
         assert samples["bar_found"].all()
         assert samples["axis_offset_mm"].max() < offset_mm
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 0.0, -1.0, 1e-320, 1e300, np.finfo(float).max])
 def test_uniform_prediction_finds_no_bar(value: float) -> None:
-    samples = samples_of(np.full(len(EXACT_M), value))
+    samples = inspected(np.full(len(EXACT_M), value))
     assert not samples["bar_found"].any()
     assert all(np.isfinite(values).all() for values in samples.values())
 
 
 def test_no_visible_segment_gives_empty_samples() -> None:
     truth = replace(TRUTH, run=np.full_like(TRUTH.run, -1))
-    assert all(len(values) == 0 for values in inspection_samples(EXACT_M, truth).values())
+    assert all(len(values) == 0 for values in inspected(EXACT_M, truth).values())
     no_bars = replace(truth, bars=SceneBars.of(()))
-    assert all(len(values) == 0 for values in inspection_samples(EXACT_M, no_bars).values())
+    assert all(len(values) == 0 for values in inspected(EXACT_M, no_bars).values())
 
 
 def test_measures_have_samples_and_those_without_missed_bars_no_direction() -> None:
-    samples = samples_of(EXACT_M)
+    samples = inspected(EXACT_M)
     for measure in INSPECTION_MEASURES:
         assert np.isfinite(STATISTICS[measure.statistic](samples[measure.sample])), measure.name
         assert measure.better == "" or measure.sample not in DETECTED_BARS_ONLY, measure.name
@@ -265,7 +269,7 @@ def test_rendered_truth_is_perfect_up_to_ribs(tiny_root: Path) -> None:
     offsets_mm, detected = [], []
     for number in range(len(steel)):
         truth = steel.view(number)
-        samples = inspection_samples(truth.depth_m.astype(np.float64), truth)
+        samples = inspected(truth.depth_m.astype(np.float64), truth)
         offsets_mm.append(samples["axis_offset_mm"])
         detected.append(samples["bar_found"])
     assert len(np.concatenate(detected)) > 0
@@ -278,7 +282,7 @@ def test_rendered_truth_is_perfect_up_to_ribs(tiny_root: Path) -> None:
 
 
 def deviation_samples(p_m: np.ndarray, bars: Sequence[Bar] = BARS) -> Samples:
-    return as_built_samples(p_m, replace(BUILT_TRUTH, bars=SceneBars.of(bars)))
+    return deviations(p_m, replace(BUILT_TRUTH, bars=SceneBars.of(bars)))
 
 
 def value(samples: Samples, name: str) -> float:
@@ -331,7 +335,7 @@ def test_bars_without_prediction_are_missed() -> None:
 def test_found_bars_are_those_of_inspection() -> None:
     noisy_m = BUILT_EXACT_M + 0.02 * np.random.default_rng(5).standard_normal(len(BUILT_EXACT_M))
     noisy_m[BUILT_TRUTH.bar_id == 2] = np.nan
-    found = inspection_samples(noisy_m, BUILT_TRUTH)["bar_found"]
+    found = inspected(noisy_m, BUILT_TRUTH)["bar_found"]
     assert ((deviation_samples(noisy_m)["deviation_judged_mm"] == MISS_MM) == (found == 0)).all()
 
 
@@ -354,7 +358,7 @@ def test_arm_of_a_bent_bar_is_compared_with_the_same_arm() -> None:
     nominal = ((x, y, z), end, *across)
     bars = [replace(built, nominal_axis_m=nominal)]
     truth = view(bars)
-    samples = as_built_samples(truth.depth_m.astype(float), truth)
+    samples = deviations(truth.depth_m.astype(float), truth)
     np.testing.assert_allclose(samples["deviation_true_mm"], [10.0], atol=1e-6)
     assert samples["deviation_judged_mm"].max() < 2e-3
 
@@ -368,7 +372,7 @@ def test_bow_of_a_bar_is_measured() -> None:
     straight = Bar(1, "bar", 0.02, nominal, nominal)
     truth = view([straight])
     truth = replace(truth, bars=replace(truth.bars, designed={1: replace(straight, axis_m=axis_m)}))
-    samples = as_built_samples(truth.depth_m.astype(float), truth)
+    samples = deviations(truth.depth_m.astype(float), truth)
     np.testing.assert_allclose(samples["deviation_true_mm"], [0.6], atol=0.01)
     np.testing.assert_allclose(samples["deviation_judged_mm"], [0.6], atol=0.01)
 
@@ -378,8 +382,7 @@ def test_configs_without_design_have_null(tmp_path: Path, tiny_root: Path) -> No
     with rdb.SubmissionWriter(archive, "truth") as writer:
         for row in rdb.load(tiny_root, "lattice", columns=["view_id", "left_depth"]):
             writer.add(row["view_id"], row["left_depth"])
-    with open_evaluation(archive, tiny_root) as evaluation:
-        result = score_extended(evaluation).extended
+    result = rdb.score(archive, tiny_root, extended=True).extended
     assert result is not None
     extended = result.to_dict()
     for measure in DEVIATION_MEASURES:

@@ -12,15 +12,6 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from rebar_depth_bench.extended.fits import MISS_MM
-from rebar_depth_bench.extended.inspection import (
-    CAPABILITY_MEASURES,
-    PROFILES,
-    TOLERANCES,
-    capability,
-)
-from rebar_depth_bench.extended.measures import NATIVE, ONCE, SCALED, STATISTICS, Measure, Samples, Statistic
-from rebar_depth_bench.extended.families import MEASURE_FAMILIES, measures_by_alignment
 from rebar_depth_bench.extended.estimates import (
     ExtendedResult,
     ExtendedTable,
@@ -29,8 +20,17 @@ from rebar_depth_bench.extended.estimates import (
     convert_estimate,
     estimate,
     tabulate_extended,
-    view_numbers,
+    view_measures,
 )
+from rebar_depth_bench.extended.families import MEASURE_FAMILIES, measures_by_alignment
+from rebar_depth_bench.extended.fits import MISS_MM
+from rebar_depth_bench.extended.inspection import (
+    CAPABILITY_MEASURES,
+    PROFILES,
+    TOLERANCES,
+    capability,
+)
+from rebar_depth_bench.extended.measures import NATIVE, ONCE, SCALED, STATISTICS, Measure, Samples, Statistic
 from rebar_depth_bench.reporting.extended_tables import extended_csv, print_extended
 from rebar_depth_bench.scoring.bootstrap import resample
 from tests.bench.reporting.results import result, scored_view
@@ -195,13 +195,13 @@ def test_single_view_has_capability() -> None:
         ({"spacing_judged_mm": np.full(10, MISS_MM)}, None),
         ({}, None),
     ):
-        numbers = view_numbers(view(filled), measures_by_alignment())[NATIVE]
+        numbers = view_measures(view(filled), measures_by_alignment())[NATIVE]
         assert numbers[SPACING.capability_name] == expected
 
 
 def extended_of(filled: list[dict[str, np.ndarray]]) -> ExtendedResult:
     measures = measures_by_alignment()
-    views = {f"lattice/{100 * index:04d}": view_numbers(view(one), measures) for index, one in enumerate(filled)}
+    views = {f"lattice/{100 * index:04d}": view_measures(view(one), measures) for index, one in enumerate(filled)}
     return ExtendedResult(measures, {"lattice": table_of(filled)}, views)
 
 

@@ -41,7 +41,7 @@ def turned(angle_deg: float, z_m: float, bar_id: int = 2) -> Bar:
 
 
 def samples_of(p_m: ndarray, truth: SteelTruth) -> Samples:
-    samples = crossing_samples(p_m, truth)
+    samples = crossing_samples(p_m, view_crossings(truth))
     used = {measure.sample for measure in (*MAIN_MEASURES, *BINNED_MEASURES)}
     assert used | {"crossing_z_m"} == set(samples)
     return samples

@@ -6,8 +6,6 @@ import csv
 import io
 import json
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -20,13 +18,12 @@ from rebar_depth_bench import DatasetError, SubmissionWriter, load, score
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.bars import bars, read_bars, write_bars
 from rebar_depth_bench.data.manifest import open_folder
+from rebar_depth_bench.extended.estimates import ExtendedResult
+from rebar_depth_bench.extended.families import MEASURE_FAMILIES, measures_by_alignment
 from rebar_depth_bench.extended.ground_truth import dilate_mask, load_steel_truth
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, NATIVE, ONCE, SCALED, Measure
 from rebar_depth_bench.extended.published import image_boundary_samples
-from rebar_depth_bench.extended.families import MEASURE_FAMILIES, measures_by_alignment, score_extended
-from rebar_depth_bench.extended.estimates import ExtendedResult
 from rebar_depth_bench.reporting.extended_tables import print_extended
-from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.protocol import scored_pixels
 from rebar_depth_bench.submission import SubmissionReader
 from tests.bench.extended.thin_scenes import steel_truth
@@ -36,8 +33,7 @@ Archive = Callable[..., Path]
 
 
 def extended(archive: Path, root: Path, workers: int = 2) -> ExtendedResult:
-    with open_evaluation(archive, root) as evaluation:
-        result = score_extended(evaluation, workers=workers).extended
+    result = score(archive, root, extended=True, workers=workers).extended
     assert result is not None
     return result
 
@@ -256,44 +252,19 @@ def test_missing_and_damaged_bars_are_refused(tiny_root: Path, archive_of_truth:
     scenes = read_bars(copy / "bars.parquet")
     scene, (bar, *others) = next(iter(scenes.items()))
     write_bars(copy / "bars.parquet", {**scenes, scene: (replace(bar, diameter_m=2 * bar.diameter_m), *others)})
-    with (
-        open_evaluation(archive_of_truth, copy) as evaluation,
-        pytest.raises(DatasetError, match=r"bars\.parquet: the SHA-256 is"),
-    ):
-        score_extended(evaluation)
+    with pytest.raises(DatasetError, match=r"bars\.parquet: the SHA-256 is"):
+        score(archive_of_truth, copy, extended=True)
     with pytest.raises(DatasetError, match=r"bars\.parquet: the SHA-256 is"):
         bars(copy)
     (copy / "bars.parquet").unlink()
     expected = r"has no bars\.parquet, expected a complete dataset folder written by rebar-build"
-    with open_evaluation(archive_of_truth, copy) as evaluation, pytest.raises(DatasetError, match=expected):
-        score_extended(evaluation)
-
-
-NEW_MEASURE = """
-import numpy as np
-from rebar_depth_bench.extended.measures import Measure, MeasureFamily
-
-def samples(p_m, truth):
-    far = truth.interior & (np.abs(p_m - truth.depth_m) > 0.05)
-    return {"far_off": np.array([far.sum() / truth.interior.sum()])}
-
-MEASURES = (Measure("far_off", "Pixels off by 50 mm", "%", "", "share of interior pixels off by over 50 mm"),)
-FAMILIES = (MeasureFamily("far", "Gross errors", 11, MEASURES, samples),)
-"""
-USE_NEW_MEASURE = """
-import sys
-from rebar_depth_bench import extended
-extended.__path__.append(sys.argv.pop(1))
-from rebar_depth_bench.cli.main import main
-status = main(sys.argv[1:])
-assert not {"torch", "cv2", "bpy"} & set(sys.modules)
-sys.exit(status)
-"""
+    with pytest.raises(DatasetError, match=expected):
+        score(archive_of_truth, copy, extended=True)
 
 
 def test_shares_of_frames_are_from_0_to_1_without_a_unit(of_truth: ExtendedResult) -> None:
     units = {one.name: one.unit for measures in measures_by_alignment().values() for one in measures}
-    frame = of_truth.to_pandas()
+    frame = of_truth.to_sheet().to_pandas()
     unit = frame["measure"].map(units)
     shares = frame[unit == "%"]
     assert set(shares["unit"]) == {""}
@@ -306,24 +277,3 @@ def test_measure_of_an_unknown_statistic_or_unit_is_refused() -> None:
     for arguments, words in ((("mm", "", "d", "s", "p90"), "new: got 'p90', expected"), (("km", "", "d"), "'km'")):
         with pytest.raises(ValueError, match=words):
             Measure("new", "New", *arguments)
-
-
-@pytest.mark.slow
-def test_a_new_measure_is_one_file(
-    tiny_truth: Depths, tiny_root: Path, archive_of: Archive, tmp_path: Path
-) -> None:
-    """A module in the folder of the extended measures is in JSON, CSV, terminal and report."""
-    (tmp_path / "new").mkdir()
-    (tmp_path / "new/gross_errors.py").write_text(NEW_MEASURE)
-    archive = archive_of({view: 1.5 * depth for view, depth in tiny_truth.items()})
-    outputs = {name: tmp_path / f"out.{name}" for name in ("json", "html", "csv")}
-    options = ["--json", outputs["json"], "--html", outputs["html"], "--extended-csv", outputs["csv"]]
-    start = [sys.executable, "-c", USE_NEW_MEASURE, tmp_path / "new"]
-    command = [*start, "score", archive, "--data", tiny_root, *options]
-    terminal = subprocess.run(list(map(str, command)), capture_output=True, text=True, check=True).stdout
-    table = json.loads(outputs["json"].read_text())["extended"]["tables"]["lattice"]
-    assert (table["native"]["far_off"]["value"], table["scaled"]["far_off"]["value"]) == (1.0, 0.0)
-    assert "far_off" in outputs["csv"].read_text()
-    for text in (terminal, outputs["html"].read_text()):
-        assert "Gross errors" in text
-        assert "Pixels off by 50 mm" in text

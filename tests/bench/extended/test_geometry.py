@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -16,7 +14,7 @@ from rebar_depth_bench.extended import axes, point_cloud
 from rebar_depth_bench.extended.axes import MAX_MATCH_RADIUS_M, CageTruth, assign_segments, cage_truth
 from rebar_depth_bench.extended.fits import CylinderFits, fit_cylinders
 from rebar_depth_bench.extended.measures import subsample
-from rebar_depth_bench.extended.point_cloud import MAX_POINTS, TOLERANCES_MM, cloud_samples
+from rebar_depth_bench.extended.point_cloud import MAX_POINTS, TOLERANCES_MM, cloud_samples, true_cloud
 from rebar_depth_bench.extended.steel import SteelTruth
 from tests.bench.extended.cage_scenes import bar
 from tests.bench.extended.thin_scenes import pixel_truth, random_prediction, random_truth, steel_truth
@@ -266,8 +264,8 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 
 def cloud_scores(p_m: ndarray, truth: SteelTruth) -> dict[str, float]:
-    fresh = replace(truth)  # The true points are computed once, and some tests change their number.
-    return {name: float(values[0]) for name, values in cloud_samples(p_m, fresh).items() if len(values)}
+    samples = cloud_samples(p_m, true_cloud(truth))
+    return {name: float(values[0]) for name, values in samples.items() if len(values)}
 
 
 def test_clouds_by_hand() -> None:

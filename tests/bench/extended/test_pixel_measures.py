@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -32,15 +32,21 @@ from rebar_depth_bench.extended.profiles import MEASURES as PROFILE_MEASURES
 from rebar_depth_bench.extended.regions import region_samples
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.geometry.cameras import Camera, rotation_matrix
-from rebar_depth_bench.scoring.score import ViewTruth, score_view
+from rebar_depth_bench.scoring.columns import METRICS
+from rebar_depth_bench.scoring.protocol import WITHIN_MM
+from rebar_depth_bench.scoring.view_numbers import ViewTruth, view_numbers
 from tests.bench.extended.thin_scenes import pixel_truth, random_prediction, random_truth, steel_truth, with_holes
 
 # Rules for the families of boundary, point clouds, depth layers and full mask.
 
 
+def cloud_samples(p_m: ndarray, truth: SteelTruth) -> Samples:
+    return point_cloud.cloud_samples(p_m, point_cloud.true_cloud(truth))
+
+
 FAMILIES: dict[str, tuple[Callable[..., Samples], Sequence[Measure]]] = {
     "boundary": (boundary.boundary_samples, boundary.MEASURES),
-    "clouds": (point_cloud.cloud_samples, point_cloud.MEASURES),
+    "clouds": (cloud_samples, point_cloud.MEASURES),
     "layers": (depth_layers.layer_samples, depth_layers.MEASURES),
     "full_mask": (regions.region_samples, regions.FULL_MASK_MEASURES),
     "disparity": (disparity.disparity_samples, disparity.MEASURES),
@@ -129,13 +135,13 @@ def test_interior_measures_equal_rebar_1(seed: int) -> None:
     inside = truth.interior
     z_m = truth.depth_m[inside]
     view = ViewTruth(truth.view_id, truth.index[inside], z_m, float(np.median(z_m.astype(np.float64))))
-    expected = score_view(view, image_m.reshape(truth.height, truth.width))
+    expected = view_numbers(image_m.reshape(truth.height, truth.width), view)
     measured = mask_scores(p_m, truth)
-    assert expected.native is not None
-    for name, value in asdict(expected.native).items():
-        assert measured[f"interior_{name}"] == pytest.approx(value, rel=1e-12)
-    assert measured["interior_coverage"] == expected.coverage
-    assert {t: measured[f"interior_within_{t}mm"] for t in expected.within_mm} == expected.within_mm
+    for name in METRICS:
+        assert measured[f"interior_{name}"] == pytest.approx(expected[f"native.{name}"], rel=1e-12)
+    assert measured["interior_coverage"] == expected["coverage"]
+    for t in WITHIN_MM:
+        assert measured[f"interior_within_{t}mm"] == expected[f"within_mm.{t}"]
 
 
 def test_empty_masks_have_no_samples() -> None:

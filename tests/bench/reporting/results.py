@@ -12,6 +12,7 @@ import numpy as np
 from rebar_depth_bench.base.names import config_of
 from rebar_depth_bench.reporting.html.views import ShownView, ViewPanels, shown_view
 from rebar_depth_bench.scoring.columns import METRICS, SCALED_CONSTANT
+from rebar_depth_bench.scoring.protocol import scored_pixels
 from rebar_depth_bench.scoring.result import DatasetIdentity, Result, SoftwareIdentity, SubmissionIdentity
 from rebar_depth_bench.scoring.table import Frame, PublishedMatch, Table, Truth, ViewScore, tabulate
 from rebar_depth_bench.submission.declaration import METRIC, NOT_DECLARED, Declaration
@@ -168,7 +169,8 @@ def panels(view_id: str = "lattice/0000", score: ViewScore | None = None, factor
     steel[:, 20:30] = True
     truth[steel] = 0.5
     rgb = np.full((40, 60, 3), 128, np.uint8)
-    return ViewPanels(rgb, truth, truth * np.float32(factor), steel, score or scored_view(view_id))
+    scored = scored_pixels(steel, truth)
+    return ViewPanels(rgb, truth, truth * np.float32(factor), steel, scored, score or scored_view(view_id))
 
 
 def shown(view_id: str = "lattice/0000", score: ViewScore | None = None, factor: float = 1.6) -> ShownView:

@@ -10,7 +10,6 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-from rebar_depth_bench.reporting.html.assets import inline_script
 from rebar_depth_bench.reporting.html.page import render_report
 from tests.bench.reporting.results import overflowed_view, result, scored_view, unpredicted_view
 from tests.bench.reporting.results import shown as images_of
@@ -116,11 +115,3 @@ def test_content_security_policy_blocks_foreign_scripts(chromium_program: str, t
     dom = dom_of(chromium_program, foreign, tmp_path)
     assert 'class="browser browsing"' in dom
     assert "<title>stranger" not in dom
-
-
-def test_inline_script_joins_files_and_updates_policy() -> None:
-    both, first = inline_script("static/sortable.js", "browser.js"), inline_script("static/sortable.js")
-    assert both.text.startswith(first.text)
-    assert both.policy != first.policy
-    assert "</script" not in both.text.lower()
-    assert "<!--" not in both.text

@@ -21,6 +21,7 @@ from rebar_depth_bench.reporting.colormap import (
     depth_preview,
     robust_range,
 )
+from rebar_depth_bench.reporting.html.page import render_report
 from rebar_depth_bench.reporting.html.views import (
     ViewPanels,
     depth_image,
@@ -31,7 +32,7 @@ from rebar_depth_bench.reporting.html.views import (
     signed_error,
 )
 from rebar_depth_bench.scoring.protocol import scored_pixels
-from tests.bench.reporting.results import HOSTILE, changed, panels, scored_view, table_of, unpredicted_view
+from tests.bench.reporting.results import HOSTILE, changed, panels, result, scored_view, table_of, unpredicted_view
 
 
 def luminance_of(colours: np.ndarray) -> np.ndarray:
@@ -82,17 +83,8 @@ def test_preview_is_bright_near_and_black_without_depth() -> None:
     assert indices.dtype == np.uint8
     assert len(palette) == 768
     assert indices[:, 0].tolist() == [255, 86, 1, 0], "even in inverse depth: 4, 2, 1 per metre"
-    image = Image.fromarray(indices)
-    image.putpalette(palette)
-    out = io.BytesIO()
-    image.save(out, "PNG")
-    pixels = np.asarray(Image.open(out).convert("RGB"))
-    assert pixels[:, 0].tolist() == [
-        [0xFC, 0xEF, 0x83],
-        DEPTH_COLOURS[85].tolist(),
-        [0x15, 0x1C, 0x53],
-        [0, 0, 0],
-    ]
+    colours = np.reshape(list(palette), (256, 3))[indices[:, 0]]
+    assert colours.tolist() == [[0xFC, 0xEF, 0x83], DEPTH_COLOURS[85].tolist(), [0x15, 0x1C, 0x53], [0, 0, 0]]
 
 
 def test_preview_is_robust_to_outliers_and_empty_or_constant_depth() -> None:
@@ -139,6 +131,8 @@ def test_view_without_colour_has_other_panels() -> None:
     view = dataclasses.replace(panels(factor=1.02), rgb=None)
     images, with_colour = shown_view(view), shown_view(panels(factor=1.02))
     assert images.colour is None
+    page = render_report(result(scored_view("lattice/0000")), [images])
+    assert ("<strong>Colour</strong>" in page, "<strong>Native error</strong>" in page) == (False, True)
     assert (images.width, images.truth) == (with_colour.width, with_colour.truth)
     image = error_image(signed_error(view, 1.0), view.steel, None, 1.0)
     assert (image[5, 25].tolist(), image[5, 5].tolist()) == (ERROR_COLOURS[254].tolist(), [0, 0, 0])
@@ -217,7 +211,8 @@ def test_large_panels_sample_depth_and_average_colour() -> None:
     rgb = np.zeros((720, 1280, 3), np.uint8)
     rgb[::2] = 200
     steel = np.ones((720, 1280), bool)
-    images = shown_view(ViewPanels(rgb, truth, truth, steel, scored_view("lattice/0000")))
+    score = scored_view("lattice/0000")
+    images = shown_view(ViewPanels(rgb, truth, truth, steel, scored_pixels(steel, truth), score))
     assert (images.width, images.height) == (640, 360)
     depth = decoded(images.truth).reshape(-1, 3)
     assert len(np.unique(depth, axis=0)) == 1, "an average would have made depths that do not exist"

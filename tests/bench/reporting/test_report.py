@@ -21,16 +21,14 @@ from rebar_depth_bench.data import codecs
 from rebar_depth_bench.reporting.charts import precision_chart
 from rebar_depth_bench.reporting.detections import DetectionPage, PageTable, render_page
 from rebar_depth_bench.reporting.html.page import WORST_SHOWN, render_report
-from rebar_depth_bench.reporting.html.views import shown_view, views_to_show
+from rebar_depth_bench.reporting.html.views import views_to_show
 from rebar_depth_bench.reporting.published import paper_scenes
-from rebar_depth_bench.scoring import formatting
-from rebar_depth_bench.scoring.columns import COVERAGE, NATIVE, RANK_ERROR, SCALE, SCALED, WITHIN, Cell
+from rebar_depth_bench.scoring.columns import COVERAGE, NATIVE, SCALE, SCALED, WITHIN, Cell
 from tests.bench.reporting.pages import Page, without_embedded
 from tests.bench.reporting.results import (
     HOSTILE,
     example,
     overflowed_view,
-    panels,
     result,
     scored_view,
     split_result,
@@ -160,13 +158,6 @@ def test_overflow_and_zero_errors_render() -> None:
     assert 'data-value="inf"' not in page
 
 
-def test_view_without_colour_has_other_panels() -> None:
-    view = shown_view(dataclasses.replace(panels(factor=1.02), rgb=None))
-    text = render_report(result(scored_view("lattice/0000")), [view])
-    assert "<strong>Colour</strong>" not in text
-    assert "<strong>Native error</strong>" in text
-
-
 def test_cells_sort_by_full_precision_and_skip_undefined() -> None:
     assert NATIVE[0].cell(scored_view("lattice/0000", abs_rel=0.123456789)) == Cell("0.1235", 0.123456789)
     empty = unpredicted_view("lattice/0000")
@@ -195,15 +186,7 @@ def test_intervals_use_the_decimals_of_their_numbers() -> None:
         "1.0 – 2.0",
         "0.600 – 0.700",
     ]
-    assert RANK_ERROR.interval_text((0.1, math.inf)) == ""
-    assert RANK_ERROR.interval_text((math.nan, 1.0)) == ""
     assert COVERAGE.interval_text(None) == ""
-
-
-def test_intervals_are_explained_by_what_is_resampled(rendered: str) -> None:
-    split = split_result()
-    assert formatting.interval_note(example().tables.values()) in rendered
-    assert formatting.interval_note(split.tables.values()) in render_report(split, [])
 
 
 def test_published_rows_are_marked_and_not_sortable(rendered: str) -> None:

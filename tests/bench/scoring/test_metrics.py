@@ -184,12 +184,3 @@ def test_no_removal_improves_what_ranks_or_coverage_or_tolerances(seed: int, sha
         assert ranked_value(complete, other) <= ranked_value(reduced, other)
         for place in ("coverage", *(f"within_mm.{limit}" for limit in WITHIN_MM)):
             assert reduced[place] <= complete[place]
-
-
-@settings(max_examples=40)
-@given(st.integers(0, 2**32 - 1), st.floats(5e-324, 1e308))
-def test_filling_holes_never_raises_the_rank_error(seed: int, fill: float) -> None:
-    p_m, z_m = noisy_view(seed)
-    filled = np.where(is_valid_prediction(p_m), p_m.astype(np.float64), fill)
-    value = ranked_value(scored(filled, z_m))
-    assert 0 <= value <= ranked_value(scored(p_m, z_m))

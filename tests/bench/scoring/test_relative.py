@@ -8,7 +8,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from scipy.optimize import minimize
 
 from rebar_depth_bench.scoring import relative as scoring
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
@@ -113,22 +112,6 @@ def test_errors_are_those_of_the_definitions(kind: str, noise: float) -> None:
         check_view(x, z, kind)
         if kind in AFFINE:
             check_view(x[:3], z[:3], kind)
-
-
-@pytest.mark.parametrize("kind", AFFINE)
-def test_least_squares_are_the_minimum(kind: str) -> None:
-    """Compare with a minimiser that knows neither derivatives nor the closed form."""
-    z = true_depth(3, 60).astype(float)
-    x = prediction(z, kind, 0.3).astype(float)
-    y = 1 / z if kind == "affine-disparity" else z
-
-    def squares(ab: Values) -> float:
-        return float(np.sum((ab[0] * x + ab[1] - y) ** 2))
-
-    options = {"xatol": 1e-13, "fatol": 1e-15, "maxiter": 5000, "maxfev": 5000}
-    best = minimize(squares, [0.01, 1.0], method="Nelder-Mead", options=options)
-    p = depth_of(best.x[0] * x + best.x[1], z, kind)
-    assert align_view(x, z, kind)["aligned.abs_rel"] == pytest.approx(np.mean(np.abs(p - z) / z), rel=1e-6)
 
 
 @pytest.mark.parametrize("kind", KINDS)

@@ -30,6 +30,7 @@ def numbers(document: Any) -> Any:
 def test_result_of_another_kind(relative: Result) -> None:
     document = json.loads(relative.to_json())
     assert (document["protocol"], document["prediction"]) == ("rebar-relative-1", "affine-disparity")
+    assert "declared_prediction" not in document
     [table] = document["tables"].values()
     nulls = {table[key] for key in ("native", "scaled", "rank_error", "scale_median")}
     assert (nulls, table["ranked"], table["flat_views"]) == ({None}, False, 0)
@@ -152,22 +153,6 @@ def test_zero_of_a_png_is_no_value(tiny_root: Path, tiny_truth: dict[str, np.nda
     assert 0.3 < holed["coverage"] < 0.7
     assert holed["aligned.error"] == pytest.approx(1 - holed["coverage"], abs=0.05)
     assert holed["flat_views"] == 0
-
-
-def test_metric_json_has_no_keys_of_other_kinds(write: Write, tiny_root: Path) -> None:
-    path = write("metric", "metric", lambda z: z)
-    with zipfile.ZipFile(path) as archive:
-        assert "prediction" not in json.loads(archive.read("submission.json"))
-    document = json.loads(rdb.score(path, tiny_root).to_json())
-    assert (document["protocol"], "prediction" in document) == ("rebar-2", False)
-    table, view = document["tables"]["lattice"], document["views"][0]
-    assert list(table) == [
-        *("views", "views_scored", "coverage", "ranked", "rank_error", "native", "scaled", "scale_median"),
-        *("within_mm", "reference", "published", "ci95"),
-    ]
-    assert list(table["ci95"]) == ["coverage", "rank_error", "native", "scaled", "scale_median", "within_mm"]
-    shared = ("coverage", "rank_error", "scale", "native", "scaled", "within_mm")
-    assert list(view) == ["view_id", "scored_px", *shared]
 
 
 def test_unknown_kind_is_refused(tiny_root: Path, archive_of: Write, tiny_truth: dict[str, np.ndarray]) -> None:

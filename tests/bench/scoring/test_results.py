@@ -74,6 +74,7 @@ def test_json_keys_and_units_match_contract() -> None:
     assert " ".join(table) == f"{numbers} reference published ci95"
     assert table["native"] == {"abs_rel": 0.75, "rmse_cm": 20.09, "mae_cm": 18.71, "delta1": 0.1234}
     assert list(table["within_mm"]) == ["3", "5", "10", "20"]
+    assert list(table["ci95"]) == ["coverage", "rank_error", "native", "scaled", "scale_median", "within_mm"]
     assert " ".join(view) == "view_id scored_px coverage rank_error scale native scaled within_mm"
 
 
@@ -186,6 +187,11 @@ def set_groups(groups: object) -> Change:
         (set_at("tables", "lattice", "scaled", "delta1", value=2), "invalid tables.lattice.scaled.delta1"),
         (set_at("tables", "lattice", "within_mm", value={"3": 1}), "missing tables.lattice.within_mm.5"),
         (set_at("tables", "lattice", "ci95", "coverage", value=[1]), "invalid tables.lattice.ci95.coverage"),
+        (set_at("tables", "lattice", "ci95", "coverage", value=["a", 1]), "invalid tables.lattice.ci95.coverage"),
+        (
+            set_at("tables", "lattice", "ci95", "coverage", value=[10**400, 1]),
+            "invalid tables.lattice.ci95.coverage",
+        ),
         (set_at("tables", "lattice", "ci95", "native", value=3), "invalid tables.lattice.ci95.native"),
         (set_at("tables", "a\x1b[2J", value={}), r"invalid tables.'a\x1b[2J'"),
         (set_at("views", value={}), "invalid views"),

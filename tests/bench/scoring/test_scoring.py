@@ -247,7 +247,7 @@ def test_score_of_two_pixels_by_hand() -> None:
     assert (first["native.abs_rel"], first["native.mae_cm"]) == ((0 + 2 / 4) / 2, 100.0)
     assert (second["coverage"], second["rank_error"]) == (0.0, 1.0)
     assert math.isnan(second["native.abs_rel"])
-    table = tabulate(frame, truth, declared=Declaration(uses_ground_truth=True))
+    table = tabulate(frame, truth, declaration=Declaration(uses_ground_truth=True))
     assert (table.views, table.views_scored, table["coverage"], table.ranked) == (2, 1, 0.5, False)
     assert table["rank_error"] == (0.25 + 1) / 2
     assert table["reference.constant.abs_rel"] == ((3 - 2) / 2 + (4 - 3) / 4) / 2

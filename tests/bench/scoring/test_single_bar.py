@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,14 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy import ndarray
 
-import rebar_depth_bench as rdb
 from rebar_depth_bench.extended.profiles import DISTANCE_EDGES_M, MIN_PIXELS, profile_samples
 from rebar_depth_bench.extended.regions import REGION_NUMBERS, region_samples
-from rebar_depth_bench.scoring.protocol import interior, scored_pixels, single_bar_pixels
+from rebar_depth_bench.scoring.protocol import scored_pixels, single_bar_pixels
 from tests.bench.extended.thin_scenes import random_images, random_prediction, random_truth, steel_truth
 
-Depths = dict[str, ndarray]
-Archive = Callable[..., Path]
 SEEDS = st.integers(0, 2**32 - 1)
 
 
@@ -121,40 +116,3 @@ def test_view_without_single_bar_pixels_has_no_errors() -> None:
     samples = region_samples(truth.depth_m.astype(np.float64), truth)
     single_bar = {name: values for name, values in samples.items() if name.startswith("single_bar")}
     assert single_bar == {"single_bar_share": [0.0]}
-
-
-def rendered(root: Path, config: str) -> Mapping[str, tuple[ndarray, ndarray, ndarray]]:
-    columns = ["view_id", "left_bars", "left_mask", "left_depth"]
-    return {
-        row["view_id"]: (row["left_bars"], interior(row["left_mask"]), row["left_depth"])
-        for row in rdb.load(root, config, streaming=True, columns=columns)
-    }
-
-
-@pytest.mark.slow
-def test_measures_of_a_config_are_those_of_its_pixels(
-    tiny_root: Path, tiny_truth: Depths, archive_of: Archive
-) -> None:
-    rng = np.random.default_rng(5)
-    noisy = {view: z * rng.uniform(0.8, 1.3, z.shape).astype(np.float32) for view, z in tiny_truth.items()}
-    extended = rdb.score(archive_of(noisy), tiny_root, extended=True).extended
-    assert extended is not None
-    images = rendered(tiny_root, "lattice")
-    for view_id, view in extended.views.items():
-        bars, inside, z_m = images[view_id]
-        pixels = np.flatnonzero(inside)
-        chosen = pixels[np.array(expected_pixels(bars, pixels))]
-        native, scaled = view["native"], view["scaled"]
-        assert native["single_bar_share"] == len(chosen) / len(pixels)
-        if not len(chosen):
-            assert native["single_bar_abs_rel"] is native["single_bar_coverage"] is None
-            continue
-        z, p = (image.ravel().astype(np.float64) for image in (z_m, noisy[view_id]))
-        scale = np.median(z[pixels]) / np.median(p[pixels])
-        assert native["single_bar_coverage"] == 1.0
-        errors = [np.mean(np.abs(s * p[chosen] - z[chosen]) / z[chosen]) for s in (1.0, scale)]
-        assert [native["single_bar_abs_rel"], scaled["single_bar_abs_rel"]] == pytest.approx(errors, rel=1e-9)
-    values = [number for view in extended.views.values() if (number := view["scaled"]["single_bar_abs_rel"])]
-    mean = extended.tables["lattice"].numbers["scaled"]["single_bar_abs_rel"]
-    assert mean.value == pytest.approx(np.mean(values))
-    assert mean.samples == len(values)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from dataclasses import replace
 from pathlib import Path
@@ -13,18 +12,15 @@ import pytest
 from scipy.stats import t as student
 
 from rebar_depth_bench import SubmissionWriter, score
-from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.detections.score import score_crossings
+from rebar_depth_bench.detections.crossing_scorer import score_crossings
 from rebar_depth_bench.scoring import bootstrap
 from rebar_depth_bench.scoring.bootstrap import MIN_BLOCKS, RESAMPLES, Resampling, interval, resample_survey
 from rebar_depth_bench.scoring.comparison import Difference, compare
-from rebar_depth_bench.scoring.evaluation import open_evaluation
 from rebar_depth_bench.scoring.reading import read_result
 from rebar_depth_bench.scoring.result import Result
 from tests.bench.reporting.results import result, scored_view, table_of
 from tests.damage import change_manifest
 from tests.mat_dataset import CONFIG, VIEWS, write_mat_dataset
-from tests.synthetic_dataset import write_archive, write_dataset
 
 PER_DISTANCE = 12
 UNEQUAL = (12, 7, 12, 5)
@@ -122,27 +118,6 @@ def as_survey(root: Path, config: str, distances: int, views: int) -> None:
     change_manifest(root, lambda _, entry: entry["scenes"][0].update(protocol=protocol), config)
 
 
-def test_command_compares_a_survey_of_48_views(tmp_path: Path) -> None:
-    root, views = tmp_path / "root", 48
-    write_dataset(root, ["column"], views)
-    as_survey(root, "column", 4, views)
-    for seed, name in enumerate(("a", "b")):
-        write_archive(tmp_path / f"{name}.zip", ["column"], views, name, seed)
-    far = tmp_path / "far.zip"
-    with open_evaluation(tmp_path / "b.zip", root) as evaluation, SubmissionWriter(far, "far") as writer:
-        for view_id in evaluation.submission.view_ids:
-            writer.add(view_id, 1.5 * evaluation.submission.read(view_id))
-    compared, scored = tmp_path / "compared.json", tmp_path / "scored.json"
-    assert main(["compare", str(tmp_path / "a.zip"), str(far), "--data", str(root), "--json", str(compared)]) == 0
-    [comparison] = json.loads(compared.read_text())
-    rows = {row["name"]: row for row in comparison["configs"]["column"]}
-    assert rows["rank_error"]["verdict"] == "worse"
-    assert main(["score", str(far), "--data", str(root), "--json", str(scored)]) == 0
-    written = read_result(scored.read_bytes(), "scored.json")
-    assert written.tables["column"].views_per_distance == 12
-    assert written.to_json() == scored.read_bytes()
-
-
 def test_all_results_of_a_survey_have_its_intervals(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Six consecutive views of a ring are one block, and six views of a survey are six."""
     monkeypatch.setattr(bootstrap, "MIN_BLOCKS", VIEWS)
@@ -159,6 +134,8 @@ def test_all_results_of_a_survey_have_its_intervals(tmp_path: Path, monkeypatch:
         scored = score(archive, tmp_path / "mat", extended=True)
         assert scored.extended is not None
         estimates = scored.extended.tables[CONFIG].numbers["native"].values()
+        written = read_result(scored.to_json(), "result.json")
+        assert written.tables[CONFIG].views_per_distance == (VIEWS if is_survey else None)
         found = score_crossings(detected, tmp_path / "mat").to_dict()
         assert (scored.tables[CONFIG].intervals["rank_error"] is not None) == is_survey
         assert any(estimate.interval is not None for estimate in estimates) == is_survey

@@ -136,7 +136,7 @@ def test_ground_truth_scores_zero_error_on_every_config(full_root: Path, tmp_pat
     assert set(tables) == set(VIEWS)
     scored = [table for table in tables.values() if table.views_scored]
     assert len(scored) >= len(VIEWS) - 1  # At this size the pier may have no scored pixel.
-    assert all(table.native is not None and table["native.abs_rel"] == 0.0 for table in scored)
+    assert all(table["native.abs_rel"] == 0.0 for table in scored)
 
 
 def test_user_scene_without_colour_and_variants_are_added_to_dataset(

@@ -156,7 +156,7 @@ def disparity_px(row: Row) -> np.ndarray:
 
 
 def opengl_world_from_cam(row: Row) -> np.ndarray:
-    """Return a pose as Blender and nerfstudio state it."""
+    """Return a pose as Blender states it."""
     return np.asarray(inverse_rigid(row["left_cam_from_world"]) @ np.diag([1.0, -1.0, -1.0, 1.0]))
 
 

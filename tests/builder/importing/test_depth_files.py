@@ -68,10 +68,10 @@ def read(folder: Path, name: str, content: bytes, table: DepthTable | None = Non
 READ: dict[str, tuple[str, bytes]] = {
     **{
         f"TIFF {kind} {order}": ("a.tif", tiff(VALUES.astype(kind), order))
-        for kind in ("u2", "i2", "u4", "i4", "u8", "i8", "f2", "f4", "f8")
+        for kind in ("u2", "i2", "u4", "i4", "f4")
         for order in "<>"
+        if (kind, order) != ("u4", ">")  # Pillow does not know it.
     },
-    "TIFF float64 of OpenCV": ("a.tiff", data.opencv(VALUES.astype(np.float64), ".tiff")),
     "TIFF int32 of OpenCV": ("a.tiff", data.opencv(VALUES.astype(np.int32), ".tiff")),
     **{
         f"npy {kind}": ("a.npy", data.npy(VALUES.astype(kind)))
@@ -109,9 +109,8 @@ def test_exr_whose_pixels_begin_beside_the_picture_is_refused(table: DepthTable,
 
 
 def test_unsigned_integers_of_32_bits_are_no_signed_ones(tmp_path: Path) -> None:
-    for order in "<>":
-        content = tiff(np.full((3, 5), 4_000_000_000, np.uint32), order)
-        assert (read(tmp_path, "a.tif", content) == 4_000_000_000).all()
+    content = tiff(np.full((3, 5), 4_000_000_000, np.uint32))
+    assert (read(tmp_path, "a.tif", content) == 4_000_000_000).all()
 
 
 GREY = Image.fromarray(VALUES.astype(np.uint8))
@@ -124,12 +123,22 @@ REFUSED: dict[str, tuple[str, bytes, str]] = {
     "TIFF of bits": ("a.tif", saved(GREY.convert("1"), "TIFF"), "mode 1, expected one channel of numbers"),
     "TIFF in colour": ("a.tif", saved(GREY.convert("RGB"), "TIFF"), "expected one channel"),
     "TIFF turned": ("a.tif", saved(Image.fromarray(VALUES.astype(np.float32)), "TIFF", tiffinfo={274: 3}), "EXIF"),
-    "TIFF of compressed float64": ("a.tif", tiff(VALUES.astype("f8"), tags={259: 5}), "uncompressed; or float32"),
-    "TIFF of three channels": ("a.tif", tiff(VALUES.astype("f8"), tags={277: 3}), "3 channels"),
+    **{
+        f"TIFF {kind}": (
+            "a.tif",
+            tiff(VALUES.astype(kind)),
+            "expected TIFF of float32 or of integers up to 32 bits",
+        )
+        for kind in ("f2", "f8", "u8", "i8")
+    },
+    "TIFF float64 of OpenCV": (
+        "a.tif",
+        data.opencv(VALUES.astype(np.float64), ".tiff"),
+        "a type that Pillow knows",
+    ),
     "TIFF of four bits": ("a.tif", tiff(VALUES.astype("u1"), tags={258: 4}), "grey shades of 4 bits"),
     "TIFF with white as zero": ("a.tif", tiff(VALUES.astype("u1"), tags={262: 0}), "grey shades of 8 bits"),
-    "TIFF of complex numbers": ("a.tif", tiff(VALUES.astype("f8"), tags={339: 6}), "SampleFormat 6"),
-    "TIFF of other sizes": ("a.tif", tiff(VALUES.astype("f8"), tags={257: 4}), "cannot be read"),
+    "TIFF cut off": ("a.tif", tiff(VALUES.astype("f4"))[:60], "cannot be read"),
     "npy of truth values": ("a.npy", data.npy(VALUES > 400), "expected integers, float16"),
     "npy of complex numbers": ("a.npy", data.npy(VALUES.astype(complex)), "expected integers, float16"),
     "PFM in colour": ("a.pfm", b"PF\n5 3\n-1\n" + bytes(180), "cannot be read"),

@@ -112,6 +112,15 @@ def test_depth_format_is_read(name: str, rows: list[Row], folder: Path, tmp_path
         assert np.abs(read["left_depth"] - expected).max() <= tolerance_m
 
 
+@pytest.mark.parametrize(("table", "steel"), [("", 2), ("[masks]\nvalues = [255]\n", 1)])
+def test_values_of_masks_are_steel(table: str, steel: int, folder: Path) -> None:
+    values = np.zeros((90, 160), np.uint8)
+    values[40, 50:52] = 128, 255
+    data.write(folder / f"mask/{NAMES[0]}_left.png", data.png(values))
+    layout = data.write_layout(folder, ("left_depth", "left_rgb", "left_mask"), tables=f"\n{table}")
+    assert np.count_nonzero(plan_import(layout, "mock-up").views.decode(NAMES[0])["left_mask"]) == steel
+
+
 @pytest.mark.parametrize(
     ("table", "write"),
     [
