@@ -8,18 +8,14 @@ numbers wherever they are shown. Numbers are kept as strings, so that they are p
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib.resources import files
-from string import ascii_uppercase
 
-from markupsafe import Markup
 from pydantic import TypeAdapter
 
-from rebar_depth_bench.reporting.charts import ScatterPoint, scatter_chart
-from rebar_depth_bench.scoring.bootstrap import Interval
-from rebar_depth_bench.scoring.columns import NATIVE, PAPER_COLUMNS, SCALED, Cell
+from rebar_depth_bench.scoring.columns import PAPER_COLUMNS, Cell
 from rebar_depth_bench.scoring.formatting import config_title
 from rebar_depth_bench.scoring.result import Result
 
@@ -96,17 +92,12 @@ def published_rows(scene: str) -> tuple[PublishedRow, ...]:
 
 @dataclass(frozen=True)
 class PaperRow:
-    """Row of a scene's table: cells of ``PAPER_COLUMNS``; ``mark`` labels its point in the chart.
+    """Row of a scene's table, with cells of ``PAPER_COLUMNS``."""
 
-    ``intervals`` are those of AbsRel, native and scaled.
-    """
-
-    mark: str
     name: str
     published: bool
     dagger: bool
     cells: list[Cell]
-    intervals: tuple[Interval | None, Interval | None] = (None, None)
 
 
 @dataclass(frozen=True)
@@ -115,7 +106,6 @@ class PaperScene:
 
     heading: str
     distance: str
-    chart: Markup
     rows: list[PaperRow]
     other_optics: bool
 
@@ -132,37 +122,19 @@ def paper_scenes(result: Result) -> list[PaperScene]:
         if own:
             rows = [
                 PaperRow(
-                    mark=str(number),
                     name=config_title(config, table.split)
                     + ("" if match.same_optics else f" {OTHER_OPTICS_MARK}"),
                     published=False,
                     dagger=False,
                     cells=[column.cell(table) for column in PAPER_COLUMNS],
-                    intervals=(table.interval(NATIVE[0]), table.interval(SCALED[0])),
                 )
-                for number, (config, table, match) in enumerate(own, 1)
+                for config, table, match in own
             ]
-            rows += published_table(scene)
+            rows += [
+                PaperRow(row.method, True, row.median_anchored, [Cell(text, float(text)) for text in row.cells])
+                for row in scene.rows
+            ]
             heading = scene.title if scene.title.lower() == name else f"{scene.title} ({name})"
-            chart = scatter_chart(f"{heading}: native and scaled AbsRel", scatter_points(rows))
             other_optics = any(not match.same_optics for _, _, match in own)
-            scenes.append(PaperScene(heading, scene.distance, chart, rows, other_optics))
+            scenes.append(PaperScene(heading, scene.distance, rows, other_optics))
     return scenes
-
-
-def published_table(scene: PublishedScene) -> list[PaperRow]:
-    """Return the rows of a scene, printed as published; their marks are capital letters."""
-    return [
-        PaperRow(mark, row.method, True, row.median_anchored, [Cell(text, float(text)) for text in row.cells])
-        for mark, row in zip(ascii_uppercase, scene.rows, strict=False)
-    ]
-
-
-def scatter_points(rows: Iterable[PaperRow]) -> list[ScatterPoint]:
-    """Return the points of the rows with both values."""
-    points = []
-    for row in rows:
-        native, scaled = row.cells[1].value, row.cells[2].value
-        if native is not None and scaled is not None:
-            points.append(ScatterPoint(row.mark, row.name, native, scaled, row.published, *row.intervals))
-    return points

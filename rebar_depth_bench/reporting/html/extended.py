@@ -1,4 +1,4 @@
-"""Extended measures of the report: charts, inspection, tolerances, collapsed families, and crossings of bars."""
+"""Extended measures of the report: inspection, tolerances, collapsed families, and crossings of bars."""
 
 from __future__ import annotations
 
@@ -8,7 +8,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from markupsafe import Markup
 from numpy import ndarray
 
 from rebar_depth_bench.base.errors import printable
@@ -41,11 +40,9 @@ from rebar_depth_bench.extended.measures import (
     MeasureFamily,
 )
 from rebar_depth_bench.extended.point_cloud import TOLERANCES_MM
-from rebar_depth_bench.extended.profiles import AXES, bins
 from rebar_depth_bench.extended.reach import ReachBin
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.geometry.cameras import fold_radius, project, transform
-from rebar_depth_bench.reporting.charts import ProfileBin, profile_chart
 from rebar_depth_bench.reporting.extended_tables import (
     FITS_NOTE,
     MISSED,
@@ -63,11 +60,7 @@ from rebar_depth_bench.scoring.evaluation import Evaluation
 _TITLE_NUMBER = re.compile(r"\d[\d.]*(?:-[\d.]+)?(?= (?:mm|%|m|px|degrees)(?!\w))")
 """Tolerance, threshold or bin in a measure's title: a number followed by a unit."""
 _HEAD_NOTES: Mapping[str, str] = {NATIVE: "no alignment", SCALED: "oracle median scale per view"}
-_AXIS_TITLES: Mapping[str, tuple[str, str]] = {
-    "m": ("distance", "m"),
-    "px": ("bar width in the picture", "pixels"),
-}
-_SHOWN_FAMILIES = ("inspection", "crossings", "profile")
+_SHOWN_FAMILIES = ("inspection", "crossings")
 """Families that have tables of their own; the others are collapsed, those of the inspection first."""
 
 MAIN_INSPECTION_MEASURES = (
@@ -104,13 +97,12 @@ class MeasureTable:
 class ExtendedConfig:
     """Formatted extended measures of one config.
 
-    ``charts`` are (caption, SVG); the cells of ``tolerances`` are pass rates and capabilities. ``single_bar`` is a
-    sentence on the single-bar interior, empty without scored pixels.
+    The cells of ``tolerances`` are pass rates and capabilities. ``single_bar`` is a sentence on the single-bar
+    interior, empty without scored pixels.
     """
 
     name: str
     views: int
-    charts: list[tuple[str, Markup]]
     main_inspection: MeasureTable
     other_inspection: MeasureTable
     tolerances: list[tuple[ToleranceProfile, Tolerance, list[Cell]]]
@@ -143,18 +135,15 @@ def extended_context(extended: ExtendedResult, pictures: Mapping[str, CrossingPi
 
 def extended_config(name: str, table: ExtendedTable) -> ExtendedConfig:
     """Return the formatted extended measures of a config."""
-    inspection, profile = MEASURE_FAMILIES["inspection"], MEASURE_FAMILIES["profile"]
+    inspection = MEASURE_FAMILIES["inspection"]
     shown = {*MAIN_INSPECTION_MEASURES, *(tolerance.pass_name for _, tolerance in TOLERANCES)}
     other = [measure for measure in INSPECTION_MEASURES if measure.name not in shown]
     others = [family for key, family in MEASURE_FAMILIES.items() if key not in _SHOWN_FAMILIES]
     others.sort(key=lambda family: family.key != "as_built")
     folded = [_folded_table(table, family) for family in others]
-    folded.append(measure_table(table, f"{profile.title}: values", profile, profile.measures))
-    charts = [(_AXIS_TITLES[axis][0], _profile_chart(table, axis)) for axis in AXES]
     return ExtendedConfig(
         name=printable(name),
         views=table.views,
-        charts=[(title, chart) for title, chart in charts if chart],
         main_inspection=measure_table(
             table, inspection.title, inspection, [inspection.by_name[name] for name in MAIN_INSPECTION_MEASURES]
         ),
@@ -247,17 +236,6 @@ def _tolerance_cells(table: ExtendedTable, tolerance: Tolerance) -> list[Cell]:
         for name in (tolerance.pass_name, tolerance.capability_name)
         for alignment in (NATIVE, SCALED)
     ]
-
-
-def _profile_chart(table: ExtendedTable, axis: str) -> Markup:
-    native, scaled = table.numbers[NATIVE], table.numbers[SCALED]
-    shown = [
-        ProfileBin(
-            low, high, native[f"abs_rel_at_{name}"], scaled[f"abs_rel_at_{name}"], native[f"scale_at_{name}"]
-        )
-        for low, high, name in bins(axis)
-    ]
-    return profile_chart(*_AXIS_TITLES[axis], shown)
 
 
 # Crossings: the reach of a method, tables by distance, and a view with its crossings.

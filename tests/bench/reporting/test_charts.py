@@ -6,24 +6,13 @@ import dataclasses
 import io
 import math
 import re
-from itertools import pairwise
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from PIL import Image
 
-from rebar_depth_bench.extended.estimates import MeasureEstimate
-from rebar_depth_bench.extended.profiles import DISTANCE_EDGES_M
 from rebar_depth_bench.reporting.axes import Axis, decade_axis, log_axis_with_one, select_spaced
-from rebar_depth_bench.reporting.charts import (
-    ProfileBin,
-    ScatterPoint,
-    place_labels,
-    profile_chart,
-    scatter_chart,
-)
+from rebar_depth_bench.reporting.charts import alignment_chart, scale_chart, views_chart
 from rebar_depth_bench.reporting.colormap import (
     COLOURS,
     DEPTH_COLOURS,
@@ -43,7 +32,7 @@ from rebar_depth_bench.reporting.html.views import (
     signed_error,
 )
 from rebar_depth_bench.scoring.protocol import scored_pixels
-from tests.bench.reporting.results import HOSTILE, panels, result, scored_view
+from tests.bench.reporting.results import HOSTILE, changed, panels, result, scored_view, table_of, unpredicted_view
 
 
 def luminance_of(colours: np.ndarray) -> np.ndarray:
@@ -254,87 +243,36 @@ def test_axes_cover_their_values() -> None:
         assert len(log_axis_with_one(extreme, 0, 1).ticks()) >= 2
 
 
-def test_scatter_chart_positions_and_describes_points() -> None:
-    points = [
-        ScatterPoint("1", "published one", 0.01, 0.01, published=True),
-        ScatterPoint("A", HOSTILE, 1.0, 0.1, published=False, native_interval=(0.9, 1.1)),
-    ]
-    chart = scatter_chart("title", points)
-    hollow = re.search(r'<circle class="published ring" cx="([\d.]+)" cy="([\d.]+)"', chart)
-    solid = re.search(r'<circle class="native fill" cx="([\d.]+)" cy="([\d.]+)"', chart)
-    assert hollow
-    assert solid
-    assert float(solid[1]) > float(hollow[1]), "larger native error to the right"
-    assert float(solid[2]) < float(hollow[2]), "larger scaled error above"
-    bar = re.search(r'class="bars" d="M([\d.]+) [\d.]+H([\d.]+)"', chart)
-    assert bar
-    assert float(bar[1]) < float(solid[1]) < float(bar[2])
-    assert "1: published one, published, native 0.0100, scaled 0.0100; A: =" in chart
+def test_charts_of_configs_place_their_marks_and_describe_them() -> None:
+    views = [scored_view("a/0000", 0.1, scale=0.8), scored_view("a/0001", 0.4, scale=1.25)]
+    scored = {HOSTILE: views, "none": [unpredicted_view("none/0000")]}
+    tables = {name: table_of(of_config) for name, of_config in scored.items()}
+    chart = alignment_chart(tables)
+    ring, disc = (float(x) for x in re.findall(r'<circle class="[a-z ]*" cx="([\d.]+)"', chart))
+    assert ring < disc, "the larger native error is to the right of the scaled one"
+    assert "0.2500 → 0.0613 scaled; none: no prediction.</desc>" in chart
     assert "<script" not in chart
 
-
-PLACES = st.tuples(st.floats(60, 440), st.floats(20, 280))
-
-
-@given(st.lists(PLACES, max_size=30))
-def test_scatter_labels_touch_their_points_and_do_not_overlap(places: list[tuple[float, float]]) -> None:
-    assert place_labels([(200, 150)]) == [(214, 150)], "a lonely point has one"
-    labels = place_labels(places)
-    assert len(labels) == len(places)
-    shown = [label for label in labels if label is not None]
-    for place, label in zip(places, labels, strict=True):
-        assert label is None or max(abs(label[0] - place[0]), abs(label[1] - place[1])) < 15
-    for index, label in enumerate(shown):
-        for other in [*places, *shown[:index], *shown[index + 1 :]]:
-            assert abs(label[0] - other[0]) >= 9 or abs(label[1] - other[1]) >= 9
+    chart = scale_chart(tables, scored)
+    near, far = (float(x) for x in re.findall(r"M([\d.]+) [-\d.]+h0", chart))
+    one = re.findall(r'class="one" d="M([\d.]+)', chart)
+    assert len(one) == 2
+    assert near < float(one[0]) < far
+    assert "median s –" in chart
 
 
-def make_estimate(value: float) -> MeasureEstimate:
-    return MeasureEstimate(value, (0.9 * value, 1.1 * value), 9)
-
-
-def test_labels_of_a_profile_do_not_overlap() -> None:
-    edges = DISTANCE_EDGES_M
-    bins = [
-        ProfileBin(low, high, make_estimate(0.1), make_estimate(0.01), make_estimate(0.9))
-        for low, high in pairwise(edges)
+def test_chart_of_views_has_a_dot_for_each_error_and_a_mark_for_each_view_without() -> None:
+    views = [
+        scored_view("a/0000", 0.1),
+        unpredicted_view("a/0001"),
+        changed(scored_view("a/0002"), {"scale": 1e9}),
     ]
-    chart = profile_chart("distance", "m", bins)
-    labels = re.findall(r'<text class="middle" x="([\d.]+)" y="287">([\d.]+)</text>', chart)
-    assert labels[0][1] == "0.2"
-    ends = [(float(x) - 3.7 * len(text), float(x) + 3.7 * len(text)) for x, text in labels]
-    assert all(left[1] <= right[0] for left, right in pairwise(ends))
-    assert len(labels) >= 6
-
-
-@pytest.mark.parametrize("value", [0.0, 5e-324, 1e-30, 1e300, math.inf])
-def test_profile_charts_handle_extreme_and_absent_values(value: float) -> None:
-    estimate = MeasureEstimate(value, None, 9)
-    chart = profile_chart(
-        "distance", "m", [ProfileBin(0.3, 0.4, estimate, MeasureEstimate(None, None, 0), estimate)]
-    )
-    assert "nan" not in chart
-    assert chart.count("<circle") == 2
-    for number in re.findall(r'c[xy]="([^"]*)"', chart):
-        assert 0 <= float(number) <= 460
-    none = MeasureEstimate(None, None, 0)
-    assert profile_chart("distance", "m", [ProfileBin(0.3, 0.4, none, none, none)]) == ""
-
-
-def test_marks_of_a_profile_are_placed_by_its_axes() -> None:
-    bins = [
-        ProfileBin(0.3, 0.4, make_estimate(0.2), make_estimate(0.02), make_estimate(0.9)),
-        ProfileBin(0.4, 0.5, make_estimate(0.1), make_estimate(0.01), make_estimate(1.1)),
-    ]
-    chart = profile_chart("distance", "m", bins)
-    marks = {
-        kind: [(float(x), float(y)) for x, y in re.findall(rf'class="{kind}" cx="([^"]+)" cy="([^"]+)"', chart)]
-        for kind in ("native fill", "scaled ring")
-    }
-    (near, far, near_scale, far_scale), rings = marks["native fill"], marks["scaled ring"]
-    assert near[1] < far[1], "a larger error is higher"
-    assert all(native[1] < ring[1] for native, ring in zip((near, far), rings, strict=True))
-    assert (near[1] - far[1]) == pytest.approx(rings[0][1] - rings[1][1], abs=0.2), "logarithmic"
-    unit_scale_y = float(re.search(r'class="one" d="M52.0 ([\d.]+)H', chart)[1])  # type: ignore[index]
-    assert far_scale[1] < unit_scale_y < near_scale[1], "s above 1 is above the line"
-    assert chart.count("V") >= 6, "an interval each"
+    chart = views_chart(HOSTILE, views)
+    dots = re.findall(r"M([\d.]+) ([\d.]+)h0", chart)
+    without = re.findall(r'class="missing" d="M([\d.]+)', chart)
+    assert len(dots) == 4
+    assert float(dots[0][0]) < float(without[0]) < float(dots[1][0])
+    assert len(re.findall("h0", views_chart("a", views * 30))) == 120
+    assert "large" in chart
+    assert "large" not in views_chart("a", views * 61)
+    assert "<script" not in chart
