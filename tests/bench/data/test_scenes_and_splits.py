@@ -19,7 +19,6 @@ from rebar_depth_bench.data.rows import ConfigViews, Views, truth_problems
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
 from rebar_depth_bench.methods.base import Method, MethodInfo, MultiViewMethod, Prepared
 from rebar_depth_bench.methods.run import predict
-from rebar_depth_bench.reporting.figure import figure_content
 from rebar_depth_bench.reporting.latex import latex_table
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.reading import read_result
@@ -119,8 +118,6 @@ def test_reports_name_the_split_and_show_its_views(root: Path, archives: dict[st
     result.to_html(tmp_path / "report.html")
     pictured = re.findall(r"<article.*?<h3>(.*?)</h3>", (tmp_path / "report.html").read_text(), re.DOTALL)
     assert pictured == view_ids("validation")
-    [panel] = figure_content([result], published=True).panels
-    assert panel.title == "cages (validation), 3 views"
     assert latex_table([result], published=True).count("cages (validation)") == 2  # Caption and heading.
 
 
