@@ -54,6 +54,7 @@ from rebar_depth_bench.base.writing import atomic_replace, write_text
 from rebar_depth_bench.cli.console import run_command
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import ConfigViews
+from rebar_depth_bench.methods import find_method
 from rebar_depth_bench.scoring.columns import COVERAGE, NATIVE, RANK_ERROR, SCALED, number, texts
 from rebar_depth_bench.scoring.formatting import scaled_constants
 
@@ -334,9 +335,9 @@ def score_rows(root: str, method_names: Sequence[str], out: Path) -> Iterator[Se
         title = f"{config}, {split}" if configs[config].has_splits else config
         scored = []
         for name in method_names:
-            result = rdb.evaluate(name, root, config=config, split=split)
-            short_name, table = result.method.partition(" ")[0], result.tables[config]
-            result.save_archive(out / f"{short_name}-{config}.zip")
+            short_name = find_method(name).info.name.partition(" ")[0]
+            archive = out / f"{short_name}-{config}.zip"
+            table = rdb.evaluate(name, root, config=config, split=split, archive=archive).tables[config]
             scored.append((short_name, table))
             cells = texts((RANK_ERROR, NATIVE[0], SCALED[0], COVERAGE), table)
             yield (title, short_name, str(table.views), *cells)

@@ -5,12 +5,10 @@ For complete configs, ``rebar-bench score`` gives exactly the same numbers for a
 
 from __future__ import annotations
 
-import copy
 import os
 import tempfile
 import weakref
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, suppress
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -24,6 +22,7 @@ from numpy import ndarray
 from rebar_depth_bench.base.errors import InputError, RebarDepthError, escape_text
 from rebar_depth_bench.base.names import TEST_SPLIT, config_of
 from rebar_depth_bench.base.terminal import ProgressBars
+from rebar_depth_bench.base.writing import is_stream
 from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.data.loading import load
 from rebar_depth_bench.data.manifest import open_folder
@@ -101,25 +100,31 @@ def evaluate(
             remedy = "; score its archive by score(ARCHIVE, ROOT, align=KIND)" if "kind" in given else ""
             raise InputError(f"{named}, but the method {model} declares its own{remedy}")
         return _evaluate_method(find_method(model), root, selected, archive)
+    if callable(model) and inputs == "multi-view" and uses_ground_truth is not True:
+        found = f"inputs is multi-view and uses_ground_truth is {uses_ground_truth}"
+        raise InputError(f"{found}, expected True, because the rows then have the true poses")
     evaluator = Evaluator(root, **selected, **declared, archive=archive)
-    if callable(model):
-        if inputs == "multi-view" and uses_ground_truth is not True:
-            found = f"inputs is multi-view and uses_ground_truth is {uses_ground_truth}"
-            raise InputError(f"{found}, expected True, because the rows then have the true poses")
-        what = "the model"
-        if hasattr(model, "forward"):
-            what += f", a {type(model).__name__} that is given a row; wrap it in a function, as {_WRAPPED_MODULE}"
-        with ProgressBars() as bars:
-            for done, row in enumerate(evaluator._rows(with_poses=inputs == "multi-view"), 1):
-                with wrap_errors(f"{row['view_id']}: {what}"):
-                    predicted = model(row)
-                evaluator._add(row["view_id"], predicted, "the model returned")
-                bars.update(f"evaluating {method}", done, len(evaluator.view_ids))
-    else:
-        for view_id, depth in _pairs(model):
-            if view_id not in evaluator._left_out:
-                evaluator._add(view_id, depth)
-    return evaluator.compute()
+    try:
+        if callable(model):
+            what = "the model"
+            if hasattr(model, "forward"):
+                what += (
+                    f", a {type(model).__name__} that is given a row; wrap it in a function, as {_WRAPPED_MODULE}"
+                )
+            with ProgressBars() as bars:
+                for done, row in enumerate(evaluator._rows(with_poses=inputs == "multi-view"), 1):
+                    with wrap_errors(f"{row['view_id']}: {what}"):
+                        predicted = model(row)
+                    evaluator._add(row["view_id"], predicted, "the model returned")
+                    bars.update(f"evaluating {method}", done, len(evaluator.view_ids))
+        else:
+            for view_id, depth in _pairs(model):
+                if view_id not in evaluator._left_out:
+                    evaluator._add(view_id, depth)
+        return evaluator.compute()
+    except BaseException:
+        evaluator.reset()  # An exception that is kept would keep an archive that is not complete.
+        raise
 
 
 def _evaluate_method(
@@ -156,8 +161,8 @@ class Evaluator:
     measures. ``method``, ``inputs`` and ``uses_ground_truth`` are what the predictions declare, and ``kind`` is
     one of ``PREDICTION_KINDS``. With ``archive``, the predictions are also written to a submission archive.
 
-    Several threads may add views. A copy of an evaluator, as a process that is forked has one, is independent of
-    it; there is none of an evaluator that writes an archive.
+    Several threads may add views. A copy is independent of the evaluator, and so is the evaluator of a forked
+    process; with ``archive``, it cannot be copied, and only the process that made it can add views.
 
     Raises ``DatasetError`` for an invalid dataset folder and an unknown config or split, and ``InputError`` for
     unknown views and invalid declarations.
@@ -188,7 +193,9 @@ class Evaluator:
             "uses_ground_truth": uses_ground_truth,
         }
         self._root, self._split, self._kind = root, split, kind
-        self._archive = None if archive is None else Path(archive)
+        self._archive, self._process = None if archive is None else Path(archive), os.getpid()
+        if self._archive is not None and is_stream(self._archive):
+            raise InputError(f"archive is {self._archive}, a device or a pipe, expected the name of a file")
         try:
             SubmissionWriter(self._archive or "predictions", **self._metadata)
         except InputError as error:  # Its message names an archive.
@@ -204,12 +211,19 @@ class Evaluator:
         self._truths = {
             one.source.name: ScoringTruth.of(self._folder, one.source, extended=extended) for one in self._views
         }
-        self._positions = {
-            name: {view_id: position for position, view_id in enumerate(truth.scored.view_ids)}
-            for name, truth in self._truths.items()
+        scored_at = {
+            view_id: position
+            for truth in self._truths.values()
+            for position, view_id in enumerate(truth.scored.view_ids)
         }
+        self._places = {
+            view_id: (one.source.name, position, scored_at.get(view_id))
+            for one in self._views
+            for position, view_id in enumerate(one.source.view_ids)
+        }
+        """Config of each view, its position there, and that among the scored views, None without scored pixels."""
         self._lock = Lock()
-        self._writing: _WrittenArchive | None = None
+        self._writer: SubmissionWriter | None = None
         self.reset()
 
     @property
@@ -230,12 +244,17 @@ class Evaluator:
 
     def reset(self) -> None:
         """Drop all predictions, and an archive that is not complete."""
-        if self._writing is not None:
-            self._writing.discard()
-            self._writing = None
+        if self._writer is not None:
+            _discard(self._writer, self._process)
+        self._writer = None
+        self._sha256: str | None = None
         self._scored: dict[str, ViewResult | None] = {}
         """Result of each view that was added; None for a view without scored pixels."""
-        self._kept = {one.source.name: KeptPredictions(one.source) for one in self._views}
+        self._kept = {}
+        if self._archive is None:
+            self._kept = {
+                name: KeptPredictions.of_truth(truth.config, truth.scored) for name, truth in self._truths.items()
+            }
 
     def update(self, view_ids: str | Sequence[str], depth: object) -> None:
         """Add the planar depth of left views in metres, or of another kind: of one view or of a batch.
@@ -276,22 +295,41 @@ class Evaluator:
             others = "config=, split= and views= select others"
             raise InputError(f"{found}, expected one as {next(iter(self._grids))}; {others}")
         stored = stored_map(depth_map(f"{view_id}: {what}", depth, self._grids[view_id]))
-        name = config_of(view_id)
-        position = self._positions[name].get(view_id)
+        name, position, scored_at = self._places[view_id]
         result = None
-        if position is not None and view_id not in self._scored:
-            result = score_view(stored, self._truths[name], position, self._kind, self._kind)
+        if scored_at is not None and view_id not in self._scored:
+            result = score_view(stored, self._truths[name], scored_at, self._kind, self._kind)
         with self._lock:
             if view_id in self._scored:
                 sampler = "a distributed sampler repeats views to fill its last batch: gather all in one process"
                 remedy = f"{sampler} and drop the repeated ones; reset() begins again"
                 raise InputError(f"{view_id}: was added before, expected each view once; {remedy}")
-            if self._archive is not None:
-                if self._writing is None:
-                    self._writing = _WrittenArchive(SubmissionWriter(self._archive, **self._metadata))
-                self._writing.add(view_id, stored)
-            self._kept[name].add(self._folder.config_by_name[name].view_ids.index(view_id), stored)
+            if self._archive is None:
+                self._kept[name].add(position, stored)
+            else:
+                self._write(self._archive, view_id, stored)
             self._scored[view_id] = result
+
+    def _write(self, archive: Path, view_id: str, stored: Depth) -> None:
+        """Write a prediction to the archive, which is discarded with all predictions if that fails."""
+        self._check_process(archive)
+        if self._writer is None:
+            writer = SubmissionWriter(archive, **self._metadata).__enter__()
+            weakref.finalize(self, _discard, writer, self._process)
+            self._writer = writer
+        try:
+            self._writer.write_map(view_id, stored)
+        except BaseException:
+            self.reset()
+            raise
+
+    def _check_process(self, archive: Path) -> None:
+        """Raise ``RebarDepthError`` in a process that was forked from the one that writes the archive."""
+        if os.getpid() != self._process:
+            found = f"{archive}: is written by the process {self._process}"
+            raise RebarDepthError(
+                f"{found}, expected all views there; a forked process may evaluate without archive="
+            )
 
     def compute(self) -> ScoredResult:
         """Return the result of the predictions; it may be called again until ``reset``.
@@ -311,16 +349,18 @@ class Evaluator:
         for name, truth in self._truths.items():
             views = [view for view_id in truth.scored.view_ids if (view := self._scored[view_id]) is not None]
             scored[name] = tabulate_config(views, truth, self._kind, declared)
-        sha256 = None
-        if self._archive is not None:
-            if self._writing is not None:
-                self._writing.close()
-                self._writing = None
-            sha256 = file_sha256(self._archive)
+        if self._archive is not None and self._sha256 is None:
+            self._check_process(self._archive)
+            assert self._writer is not None
+            self._writer.__exit__(None, None, None)
+            self._writer = None
+            self._sha256 = file_sha256(self._archive)
         return scored_result(
             scored,
             self._folder,
-            SubmissionIdentity(self._metadata["method"], sha256, declared.inputs, declared.uses_ground_truth),
+            SubmissionIdentity(
+                self._metadata["method"], self._sha256, declared.inputs, declared.uses_ground_truth
+            ),
             self._kind,
             self._kind,
             archive=None if self._archive is None else self._archive.absolute(),
@@ -337,14 +377,13 @@ class Evaluator:
     def __deepcopy__(self, memo: dict[int, Any]) -> Self:
         """Return an evaluator with the same predictions, which shares the ground truth with this one.
 
-        Raises ``RebarDepthError`` while an archive is written.
+        Raises ``RebarDepthError`` if an archive is written.
         """
-        if self._writing is not None:
-            raise RebarDepthError(
-                f"{self._archive}: is being written, expected compute() or reset() before a copy"
-            )
+        if self._archive is not None:
+            raise RebarDepthError(f"{self._archive}: is written by this evaluator, expected none without archive=")
+        twin = type(self).__new__(type(self))
         with self._lock:
-            twin = copy.copy(self)
+            twin.__dict__.update(self.__dict__)
             twin._scored = dict(self._scored)
             twin._kept = {
                 name: replace(kept, images=dict(kept.images), by_order=dict(kept.by_order))
@@ -353,44 +392,15 @@ class Evaluator:
         twin._lock = Lock()
         return twin
 
-
-class _WrittenArchive:
-    """Archive that is being written; it is discarded with this object unless it was closed."""
-
-    def __init__(self, writer: SubmissionWriter) -> None:
-        self._process = os.getpid()
-        self._writer = writer
-        self._open = ExitStack()
-        self._open.enter_context(writer)
-        weakref.finalize(self, _discard, self._open, self._process)
-
-    def add(self, view_id: str, depth: Depth) -> None:
-        """Write a prediction. Raises ``RebarDepthError`` in a process that was forked meanwhile."""
-        if os.getpid() != self._process:
-            found = f"{self._writer.path}: is written by the process {self._process}"
-            raise RebarDepthError(
-                f"{found}, expected all views there; a forked process may evaluate without archive="
-            )
-        self._writer.write_map(view_id, depth)
-
-    def close(self) -> None:
-        """Complete the archive."""
-        self._open.close()
-
-    def discard(self) -> None:
-        """Delete what was written."""
-        _discard(self._open, self._process)
+    def __copy__(self) -> Self:
+        """Return a deep copy: a shallow one would share its predictions."""
+        return self.__deepcopy__({})
 
 
-class _DiscardedError(Exception):
-    """Reason for which the writer of an archive deletes it."""
-
-
-def _discard(open_archive: ExitStack, process: int) -> None:
-    """End an archive that is not complete, unless another process writes it."""
+def _discard(writer: SubmissionWriter, process: int) -> None:
+    """Delete an archive that is not complete, unless another process writes it."""
     if os.getpid() == process:
-        with suppress(_DiscardedError), open_archive.pop_all():
-            raise _DiscardedError
+        writer.discard()
 
 
 def _selected(configs: Sequence[ConfigViews], views: int | Sequence[str]) -> list[ConfigViews]:

@@ -33,6 +33,7 @@ from rebar_depth_bench.submission import EntryError
 from rebar_depth_bench.submission.declaration import METRIC, Declaration
 
 if TYPE_CHECKING:
+    from rebar_depth_bench.bar_crossings.crossings_file import CrossingsSource
     from rebar_depth_bench.extended.estimates import ViewSamples
     from rebar_depth_bench.extended.ground_truth import ConfigSteelTruth
 
@@ -139,10 +140,12 @@ class ViewResult:
 class ScoredConfig:
     """Numbers of the views of a config, their table, and the samples of extended measures by view.
 
-    ``samples`` is None if no extended measures are computed, and empty for a config without masks or bar ids.
+    ``crossings`` is the file that the crossings of bars come from. ``samples`` is None if no extended measures are
+    computed, and empty for a config without masks or bar ids.
     """
 
-    truth: ScoringTruth
+    config: DatasetConfig
+    crossings: CrossingsSource | None
     frame: Frame
     table: Table
     samples: Mapping[str, ViewSamples] | None
@@ -182,7 +185,8 @@ def tabulate_config(
     if truth.extended:
         found = zip(scored.view_ids, views, strict=True)
         samples = {view_id: view.samples for view_id, view in found if view.samples is not None}
-    return ScoredConfig(truth, frame, table, samples)
+    crossings = None if truth.steel is None else truth.steel.source
+    return ScoredConfig(truth.config, crossings, frame, table, samples)
 
 
 def scored_result(
@@ -202,7 +206,7 @@ def scored_result(
         from rebar_depth_bench.extended.families import extended_result
 
         extended = extended_result(
-            {name: (one.truth.config, one.truth.steel, one.samples or {}) for name, one in scored.items()}
+            {name: (one.config, one.crossings, one.samples or {}) for name, one in scored.items()}
         )
     return ScoredResult(
         dataset=DatasetIdentity(folder.digest, folder.version),
@@ -215,25 +219,28 @@ def scored_result(
         declared_prediction=None if kind == declared_kind else declared_kind,
         extended=extended,
         archive=archive,
+        archive_stat=() if archive is None else _identity(archive),
         archive_notes=tuple(archive_notes),
         folder=folder,
         kept=kept or {},
     )
 
 
-@dataclass(frozen=True, repr=False, kw_only=True)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class ScoredResult(Result):
     """Result whose predictions can be looked at, for possible mistakes and for pictures.
 
-    ``archive`` is the archive that was scored, which is read again, and ``archive_notes`` say which of its entries
+    ``archive`` is the archive that was scored, which is read again if it is still the same file: ``archive_stat``
+    has device, inode, size and time of the last change. ``archive_notes`` say which of its entries
     are ignored. It is None if the predictions were scored as they arrived; then ``kept`` has those that are looked
     at for mistakes, by config, and there are no pictures.
     """
 
-    folder: DatasetFolder = field(compare=False)
-    archive: Path | None = field(default=None, compare=False)
-    archive_notes: tuple[str, ...] = field(default=(), compare=False)
-    kept: Mapping[str, KeptPredictions] = field(default_factory=dict, compare=False)
+    folder: DatasetFolder
+    archive: Path | None = None
+    archive_stat: tuple[int, ...] = ()
+    archive_notes: tuple[str, ...] = ()
+    kept: Mapping[str, KeptPredictions] = field(default_factory=dict)
 
     @cached_property
     def mistakes(self) -> Sequence[PossibleMistake]:
@@ -292,8 +299,19 @@ class ScoredResult(Result):
         """Open the archive again. Raises ``InputError`` unless it is the one that was scored."""
         assert self.archive is not None
         with open_evaluation(self.archive, self.folder) as evaluation:
-            found, expected = evaluation.submission.sha256(), self.submission.sha256
+            # The digest of a large archive takes seconds, and a file that was not written to has the same.
+            is_same = _identity(self.archive) == self.archive_stat
+            expected = self.submission.sha256
+            found = expected if is_same else evaluation.submission.sha256()
             if found != expected:
                 of_scored = f"expected {str(expected)[:12]}... of the archive that was scored"
-                raise InputError(f"{self.archive}: has the SHA-256 {found[:12]}..., {of_scored}; score it again")
+                raise InputError(
+                    f"{self.archive}: has the SHA-256 {str(found)[:12]}..., {of_scored}; score it again"
+                )
             yield evaluation
+
+
+def _identity(path: Path) -> tuple[int, ...]:
+    """Return what tells a file from another one, and from itself after it was written to, without reading it."""
+    found = path.stat()
+    return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns

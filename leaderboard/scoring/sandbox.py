@@ -10,7 +10,7 @@ from rebar_depth_bench.base.errors import DatasetError, Problem, SubmissionError
 from rebar_depth_bench.base.names import TEST_SPLIT, config_of, split_of
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.submission import SubmissionMeta, SubmissionReader
-from rebar_depth_bench.submission.declaration import METRIC, RANKS_METRIC
+from rebar_depth_bench.submission.declaration import RANKS_METRIC
 
 
 @dataclass(frozen=True)
@@ -46,16 +46,14 @@ def check(archive: Path, data: str, dataset_digest: str) -> SubmissionMeta:
 
 def score(archive: Path, data: str, dataset_digest: str) -> Outcome:
     """Return the result, and notes on possible mistakes. Raises ``SubmissionError`` and ``DatasetError``."""
-    from rebar_depth_bench.scorer import (
-        score as score_archive,
-    )  # Half a second to import, which a check does not need.
+    # Half a second to import, which a check does not need.
+    from rebar_depth_bench.scorer import score as score_archive
+    from rebar_depth_bench.scoring.evaluation import open_evaluation
 
     _check_digest(data, open_folder(data).digest, dataset_digest)
+    with open_evaluation(archive, data) as evaluation:
+        evaluation.require_metric(RANKS_METRIC)
     result = score_archive(archive, data)
-    if result.kind != METRIC:
-        raise SubmissionError(
-            f"the archive has predictions of the kind {result.kind}, expected metric: {RANKS_METRIC}"
-        )
     mistakes = result.mistakes
     _check_digest(data, result.dataset.digest, dataset_digest)  # The folder may have been replaced meanwhile.
     return Outcome(dataset_digest, result.to_json(), [mistake.text for mistake in mistakes])

@@ -14,7 +14,7 @@ from functools import cached_property, partial
 from typing import Literal
 
 import numpy as np
-from jaxtyping import Bool, Float, Float32, Float64, Int64
+from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt32
 from numpy import ndarray
 
 from rebar_depth_bench.data.manifest import DatasetConfig
@@ -23,6 +23,7 @@ from rebar_depth_bench.data.schema import CAMERA_SHAPES
 from rebar_depth_bench.geometry.cameras import Camera
 from rebar_depth_bench.scoring.metrics import is_valid_prediction, median_scale
 from rebar_depth_bench.scoring.protocol import scored_pixels
+from rebar_depth_bench.scoring.table import Truth
 from rebar_depth_bench.submission import SubmissionReader
 
 Values = Float64[ndarray, " n"]
@@ -89,13 +90,22 @@ class DiagnosedView:
 class KeptPredictions:
     """Predictions of a config that a diagnosis looks at: of a few views, and some pixels of others.
 
-    ``images`` has the predictions of the views that are looked at, by position in the config, and ``by_order`` the
-    values at the pixels of such a view that each wrong order would put there. Both are filled by ``add``.
+    ``pixels`` has the flat indices that are looked at in these views, by position in the config. ``images`` has
+    the predictions of these views, and ``by_order`` the values that each wrong order of the views would put at the
+    pixels of such a view. Both are filled by ``add``.
     """
 
     config: DatasetConfig
+    pixels: dict[int, Int64[ndarray, " n"]] = field(default_factory=dict)
     images: dict[int, Image] = field(default_factory=dict)
     by_order: dict[tuple[int, str], Values] = field(default_factory=dict)
+
+    @classmethod
+    def of_truth(cls, config: DatasetConfig, truth: Truth) -> KeptPredictions:
+        """Return none yet of the predictions of a config with this ground truth."""
+        place = {view_id: place for place, view_id in enumerate(truth.view_ids)}
+        views = {at: truth.views[place[config.view_ids[at]]] for at in positions_to_read(config)}
+        return cls(config, {at: _looked_at(view.index) for at, view in views.items()})
 
     @classmethod
     def of_archive(cls, config: DatasetConfig, submission: SubmissionReader) -> KeptPredictions:
@@ -104,7 +114,8 @@ class KeptPredictions:
         Raises ``EntryError`` and ``DatasetError`` for entries and shards that scoring refuses.
         """
         kept = cls(config)
-        for position in {*kept.truths, *kept.sources}:
+        kept.pixels.update({at: left.v * config.grid[1] + left.u for at, (_, _, left, _) in kept.truths.items()})
+        for position in {*kept.pixels, *kept.sources}:
             kept.add(position, submission.read(config.view_ids[position]))
         return kept
 
@@ -128,20 +139,20 @@ class KeptPredictions:
         """For the position of a prediction, the views that are looked at where wrong orders would put it."""
         found: dict[int, list[tuple[int, str]]] = {}
         for name, (_, source) in orders(len(self.config.views)).items():
-            for position in self.truths:
+            for position in positions_to_read(self.config):
                 if 0 <= source(position) < len(self.config.views):
                     found.setdefault(source(position), []).append((position, name))
         return found
 
     def add(self, position: int, prediction: Image) -> None:
         """Keep what a diagnosis needs of the prediction for the view at a position of the config."""
-        if position in self.truths:
-            self.images[position] = prediction
+        if position in self.pixels:
+            self.images[position] = np.array(prediction)  # The caller may fill the same array again.
         for viewed, order in self.sources.get(position, ()):
-            self.by_order[viewed, order] = self.truths[viewed][2].values(prediction)
+            self.by_order[viewed, order] = prediction.ravel()[self.pixels[viewed]].astype(np.float64)
 
     def views(self) -> list[DiagnosedView]:
-        """Return the views that are looked at, with their predictions."""
+        """Return the views that are looked at, with their predictions. Raises ``DatasetError`` as ``truths``."""
         names = orders(len(self.config.views))
         views = []
         for position, (camera, baseline_m, left, right) in self.truths.items():
@@ -164,10 +175,13 @@ def positions_to_read(config: DatasetConfig) -> list[int]:
 
 
 def _pixels(mask: Bool[ndarray, "h w"] | None, depth_m: Float32[ndarray, "h w"]) -> Pixels:
-    index = scored_pixels(mask, depth_m).astype(np.int64)
-    index = index[:: -(-len(index) // MAX_PIXELS) or 1]
-    v, u = np.divmod(index, depth_m.shape[1])
+    v, u = np.divmod(_looked_at(scored_pixels(mask, depth_m)), depth_m.shape[1])
     return Pixels(v, u, depth_m[v, u].astype(np.float64))
+
+
+def _looked_at(scored: UInt32[ndarray, " n"]) -> Int64[ndarray, " m"]:
+    """Return at most ``MAX_PIXELS`` of the flat indices of scored pixels, evenly spaced."""
+    return scored[:: -(-len(scored) // MAX_PIXELS) or 1].astype(np.int64)
 
 
 def mean_error(p: Values, z_m: Values, scale: float | None = None) -> float:

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy import ndarray
 
+from rebar_depth_bench.bar_crossings.crossings_file import CrossingsSource
 from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.extended import (
     alignment,
@@ -30,7 +31,6 @@ from rebar_depth_bench.extended.estimates import (
     tabulate_extended,
     view_measures,
 )
-from rebar_depth_bench.extended.ground_truth import ConfigSteelTruth
 from rebar_depth_bench.extended.judged import visible_segments
 from rebar_depth_bench.extended.measures import NATIVE, ONCE, SCALED, Measure, MeasureFamily
 from rebar_depth_bench.extended.steel import SteelTruth
@@ -114,21 +114,21 @@ def view_samples(prediction_m: Float[ndarray, "h w"], truth: SteelTruth, scale: 
 
 
 def extended_result(
-    configs: Mapping[str, tuple[DatasetConfig, ConfigSteelTruth | None, Mapping[str, ViewSamples]]],
+    configs: Mapping[str, tuple[DatasetConfig, CrossingsSource | None, Mapping[str, ViewSamples]]],
 ) -> ExtendedResult:
     """Return the extended measures of a submission from the samples of the views of each config, by view id.
 
-    All measures are null for a config without masks or bar ids, which has no steel and no samples.
+    All measures are null for a config without masks or bar ids, which has no samples and no source of crossings.
     """
     measures = measures_by_alignment()
     tables: dict[str, ExtendedTable] = {}
     views: dict[str, ViewMeasures] = {}
     source = None
-    for name, (config, steel, samples) in configs.items():
+    for name, (config, of_config, samples) in configs.items():
         resampling = resample_views(
             tuple(samples), by_scene=config.has_splits, views_per_distance=config.views_per_distance
         )
         tables[name] = tabulate_extended(list(samples.values()), resampling, measures)
         views |= {view_id: view_measures(of_view, measures) for view_id, of_view in samples.items()}
-        source = source if steel is None else steel.source
+        source = of_config or source
     return ExtendedResult(measures, tables, views, source)

@@ -256,13 +256,13 @@ def print_comparison(comparison: Comparison, console: Console) -> None:
     content = comparison.to_dict()
     dataset = content["dataset"]
     archives = (
-        f"{letter} {formatting.short_digest(submission['sha256'])}"
+        f"{letter}: {formatting.archive_text(submission['sha256'])}"
         for letter, submission in zip("AB", content["submissions"], strict=True)
     )
     print_line(
         console,
         f"protocol {content['protocol']}, dataset {printable(dataset['version'])} "
-        f"({formatting.short_digest(dataset['digest'])}), archives {', '.join(archives)}, "
+        f"({formatting.short_digest(dataset['digest'])}), {', '.join(archives)}, "
         f"software {content['software']['version']}",
         style="dim",
     )
@@ -302,8 +302,8 @@ _HEADS = ("rank err. ↓", "RMSE cm ↓", "AbsRel ↓", "AbsRel_s ↓", "s")
 def disambiguate_method_names(results: Sequence[Result]) -> list[Result]:
     """Return the results with unique method names.
 
-    A name that occurs more than once gets the first eight digits of its submission's SHA-256 appended, and a
-    number if the same archive occurs again.
+    A name that occurs more than once gets the first eight digits of its submission's SHA-256 appended, if there is
+    an archive, and a number if the same name results again.
     """
     names = Counter(result.method for result in results)
     renamed = []
@@ -311,7 +311,8 @@ def disambiguate_method_names(results: Sequence[Result]) -> list[Result]:
         submission = result.submission
         if names[result.method] > 1:
             before = [one.submission for one in results[:place]].count(submission)
-            method = f"{result.method} ({str(submission.sha256)[:8]})" + (f" {before + 1}" if before else "")
+            digest = f" ({submission.sha256[:8]})" if submission.sha256 else ""
+            method = f"{result.method}{digest}{f' {before + 1}' if before else ''}"
             submission = replace(submission, method=method)
         renamed.append(replace(result, submission=submission))
     return renamed

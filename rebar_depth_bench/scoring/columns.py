@@ -238,6 +238,8 @@ COVERAGE = Column(
     "coverage",
     unit="%",
     better="higher",
+    decimals=1,
+    factor=100.0,
     as_text=coverage_percent,
     head="cover-\nage ↑\n%",
     of_all_views=True,

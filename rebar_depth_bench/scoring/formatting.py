@@ -127,7 +127,7 @@ def summary(result: Result) -> Summary:
         heads=[method, *by_place.values()],
         rows=rows,
         provenance=f"dataset {printable(dataset.version)} ({short_digest(dataset.digest)}), "
-        f"{archive_text(result)}, software {printable(result.software.version)}",
+        f"{archive_text(result.submission.sha256)}, software {printable(result.software.version)}",
         declared=f"protocol {result.protocol}; inputs: {inputs_text(declared)}; "
         f"ground truth: {ground_truth_text(declared)}",
         notes=result.notes,
@@ -141,9 +141,8 @@ def has_dash(result: Result) -> bool:
     )
 
 
-def archive_text(result: Result) -> str:
+def archive_text(sha256: str | None) -> str:
     """Return the digest of the archive that was scored, or that the predictions were not written to one."""
-    sha256 = result.submission.sha256
     return "no archive" if sha256 is None else f"archive {short_digest(sha256)}"
 
 

@@ -34,12 +34,11 @@ from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND
 from rebar_depth_bench.scoring.result import (
     DatasetIdentity,
     IntervalMethod,
-    Name,
     Result,
     SoftwareIdentity,
     SubmissionIdentity,
 )
-from rebar_depth_bench.scoring.table import Frame, PublishedMatch, Table, ViewScore
+from rebar_depth_bench.scoring.table import Frame, Name, PublishedMatch, Table, ViewScore
 from rebar_depth_bench.submission.declaration import METRIC
 
 _NAME_CHARACTERS = 300
@@ -279,14 +278,14 @@ def _numbers_from_json(
         at = format_location(where, *group.split(".")) if group else where
         is_metric_error = group in ("native", "scaled")
         is_error = is_metric_error or group in RELATIVE_ALIGNMENTS
-        if inner is None and (is_empty or group.startswith("aligned_robust") or (is_error and not is_predicted)):
+        may_be_null = (
+            is_empty or group.startswith(("aligned_robust", "reference")) or (is_error and not is_predicted)
+        )
+        if inner is None and may_be_null:
             numbers |= {place: math.nan for place, _ in members}
         elif inner is None and is_error:
-            problems.append(
-                Problem(
-                    "conflict", where.removesuffix(":"), f"{group} is null", "metrics where there is a prediction"
-                )
-            )
+            found_null, wanted = f"{group} is null", "metrics where there is a prediction"
+            problems.append(Problem("conflict", where.removesuffix(":"), found_null, wanted))
         elif not isinstance(inner, dict):
             problems.append(Problem("invalid", at, f"got {short_repr(inner)}", "a table"))
         elif len(inner) > _MAX_ENTRIES:
@@ -295,18 +294,25 @@ def _numbers_from_json(
             for place, column in members:
                 key = place.rpartition(".")[2]
                 is_flag = column.statistic == "count" and column.in_view == place
+                is_whole = column.statistic == "count" and not is_flag
                 most = f"from 0 to {column.most:g}" if math.isfinite(column.most) else "of 0 or more"
-                expected_value = "true or false" if is_flag else f"a number {most}"
-                value = inner.get(key, _MISSING)
+                wanted = "true or false" if is_flag else f"a {'whole ' * is_whole}number {most}"
+                # Other numbers at the top level may be of a later version, and references of one, too.
+                is_needed = place in ("coverage", "rank_error") or (group and not group.startswith("reference"))
+                value: Any = inner.get(key, _MISSING if is_needed else None)
                 if value is None and key != "error" and place not in never_null:
                     numbers[place] = math.inf if is_error and is_predicted else math.nan
                 elif value is _MISSING:
-                    problems.append(Problem("missing", format_location(at, key), "missing", expected_value))
-                elif isinstance(value, bool) if is_flag else _is_size(value) and value <= column.most:
+                    problems.append(Problem("missing", format_location(at, key), "missing", wanted))
+                elif (
+                    isinstance(value, bool)
+                    if is_flag
+                    else _is_size(value) and value <= column.most and (isinstance(value, int) or not is_whole)
+                ):
                     numbers[place] = float(value) if is_predicted or not is_metric_error else math.nan
                 else:
                     got = f"got {short_repr(value)}"
-                    problems.append(Problem("invalid", format_location(at, key), got, expected_value))
+                    problems.append(Problem("invalid", format_location(at, key), got, wanted))
     return numbers
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 from pydantic import Field, Strict
 
 from rebar_depth_bench.base.errors import printable
-from rebar_depth_bench.base.validation import one_of, text
+from rebar_depth_bench.base.validation import one_of
 from rebar_depth_bench.scoring.bootstrap import INTERVALS
 from rebar_depth_bench.scoring.columns import (
     ALIGNED,
@@ -24,7 +24,7 @@ from rebar_depth_bench.scoring.columns import (
 from rebar_depth_bench.scoring.formatting import result_notes, summary
 from rebar_depth_bench.scoring.protocol import PROTOCOL
 from rebar_depth_bench.scoring.spreadsheet import tables_sheet, views_sheet
-from rebar_depth_bench.scoring.table import Frame, Table, ViewScore
+from rebar_depth_bench.scoring.table import Frame, Name, Table, ViewScore
 from rebar_depth_bench.submission.declaration import INPUTS, METRIC, Declaration
 
 if TYPE_CHECKING:
@@ -32,7 +32,6 @@ if TYPE_CHECKING:
 
     from rebar_depth_bench.extended.estimates import ExtendedResult
 
-Name = Annotated[str, Strict(), text(300)]
 _MAX_CONFIGS_SHOWN = 10
 
 
@@ -73,7 +72,7 @@ class IntervalMethod:
     level: Annotated[float, Strict(), Field(ge=0, le=1)]
 
 
-@dataclass(frozen=True, repr=False, kw_only=True)
+@dataclass(frozen=True, eq=False, repr=False, kw_only=True)
 class Result:
     """Result of scoring one submission, with the digests and versions of its inputs.
 
@@ -93,6 +92,10 @@ class Result:
     declared_prediction: str | None = None
     intervals: IntervalMethod | None = field(default_factory=lambda: IntervalMethod(**INTERVALS))
     extended: ExtendedResult | None = None
+
+    def __eq__(self, other: object) -> bool:
+        """Return whether another result has the same JSON."""
+        return self.to_dict() == other.to_dict() if isinstance(other, Result) else NotImplemented
 
     @property
     def method(self) -> str:

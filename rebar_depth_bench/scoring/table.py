@@ -13,6 +13,7 @@ from jaxtyping import Float64, Int64
 from numpy import ndarray
 from pydantic import Strict
 
+from rebar_depth_bench.base.validation import text
 from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval, resample_views
 from rebar_depth_bench.scoring.columns import (
     METRICS,
@@ -31,12 +32,14 @@ from rebar_depth_bench.scoring.protocol import MIN_COMPARABLE_COVERAGE
 from rebar_depth_bench.scoring.view_numbers import ViewTruth
 from rebar_depth_bench.submission.declaration import METRIC, NOT_DECLARED, Declaration
 
+Name = Annotated[str, Strict(), text(300)]
+
 
 @dataclass(frozen=True)
 class PublishedMatch:
     """Scene of Table I that a config shows; ``same_optics`` is False if nothing but the optics differs."""
 
-    scene: Annotated[str, Strict()]
+    scene: Name
     same_optics: Annotated[bool, Strict()]
 
 

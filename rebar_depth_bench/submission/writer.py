@@ -7,7 +7,7 @@ import os
 import re
 import zipfile
 from collections.abc import Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from threading import Lock
 from types import TracebackType
@@ -20,7 +20,7 @@ from numpy import ndarray
 from rebar_depth_bench.base.errors import InputError, Problem, escape_text
 from rebar_depth_bench.base.names import VIEW_ID_PATTERN
 from rebar_depth_bench.base.validation import short_repr
-from rebar_depth_bench.base.writing import output_file
+from rebar_depth_bench.base.writing import named_write_errors, output_file
 from rebar_depth_bench.submission.declaration import MAX_NUMBER, METADATA_NAME, METRIC, parse_metadata
 from rebar_depth_bench.submission.maps import Depth, resize_hint
 
@@ -31,6 +31,10 @@ _UNIX_MODE = 0o100644
 _ALIGNMENT_BYTES = 64
 _PADDING_FIELD_ID = 0xD935
 _LOCAL_HEADER_BYTES = 30
+
+
+class _DiscardedError(Exception):
+    """Reason for which the file of an archive is deleted."""
 
 
 class SubmissionWriter:
@@ -128,11 +132,12 @@ class SubmissionWriter:
         with self._lock:
             if view_id in self._view_ids:
                 raise InputError(f"{view_id}: the view was added twice, expected once")
-            self._write_entry(self._zip, f"{view_id}.npy", _npy_header(values), values.data.cast("B"))
+            with named_write_errors(self.path):
+                self._write_entry(self._zip, f"{view_id}.npy", _npy_header(values), values.data.cast("B"))
+                self._file.flush()  # A process that is forked now has nothing left to write.
             self._view_ids.add(view_id)
             if seconds is not None:
                 self._seconds[view_id] = float(seconds)
-            self._file.flush()  # A process that is forked now has nothing left to write.
 
     def __enter__(self) -> Self:
         if not self.path.parent.is_dir():
@@ -164,6 +169,14 @@ class SubmissionWriter:
             finally:
                 # Without this, ZipFile would write a directory into the discarded file when it is closed again.
                 archive.fp = None
+
+    def discard(self) -> None:
+        """End the archive without writing it, as an exception in the block does; nothing if it is not open."""
+        archive, self._zip = self._zip, None
+        if archive is not None:
+            archive.fp = None  # Without this, ZipFile would write a directory into the discarded file.
+            with suppress(_DiscardedError), self._open:
+                raise _DiscardedError
 
     def _write_entry(self, archive: zipfile.ZipFile, name: str, header: bytes, body: memoryview) -> None:
         assert self._file is not None

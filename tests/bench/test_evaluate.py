@@ -121,9 +121,62 @@ def test_copy_is_independent(tiny_root: Path, lattice: Truth, tmp_path: Path) ->
         one.update(others, [factor * lattice[view_id] for view_id in others])
     assert evaluator.compute().metrics["lattice/rank_error"] == 0 < twin.compute().metrics["lattice/rank_error"]
     writing = rdb.Evaluator(tiny_root, LATTICE, archive=tmp_path / "a.zip")
-    writing.update(first, lattice[first])
-    with pytest.raises(RebarDepthError, match=r"a\.zip: is being written, expected"):
-        copy.deepcopy(writing)
+    for make in (copy.copy, copy.deepcopy):
+        with pytest.raises(RebarDepthError, match=r"a\.zip: is written by this evaluator, expected none"):
+            make(writing)
+
+
+def test_arrays_may_be_filled_again(tiny_root: Path, lattice: Truth) -> None:
+    """The notes are those of the predictions when they were added."""
+    expected = rdb.evaluate(lattice, tiny_root, config=LATTICE).notes
+    same = np.empty((90, 160), np.float32)
+
+    def fill(row: Any) -> np.ndarray:
+        same[:] = lattice[row["view_id"]]
+        return same
+
+    assert rdb.evaluate(fill, tiny_root, config=LATTICE).notes == expected
+
+
+def test_archive_that_cannot_be_written_is_discarded(tiny_root: Path, tmp_path: Path) -> None:
+    """After a write beyond the limit of file sizes, all views are missing and no file is left."""
+    code = f"""
+import resource, signal
+import numpy as np
+import rebar_depth_bench as rdb
+from rebar_depth_bench.base.errors import RebarDepthError
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+evaluator = rdb.Evaluator({str(tiny_root)!r}, "lattice", archive={str(tmp_path / "a.zip")!r})
+ids, depth = evaluator.view_ids, np.ones((90, 160), np.float32)
+evaluator.update(ids[0], depth)
+limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+resource.setrlimit(resource.RLIMIT_FSIZE, (70_000, limits[1]))
+try:
+    evaluator.update(ids[1], depth)
+except RebarDepthError as error:
+    print(error)
+resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+evaluator.update(ids, [depth] * len(ids))
+written = evaluator.compute()
+assert rdb.score({str(tmp_path / "a.zip")!r}, {str(tiny_root)!r}) == written
+"""
+    finished = run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert (finished.returncode, finished.stderr) == (0, "")
+    assert "a.zip: cannot be written" in finished.stdout
+    assert [path.name for path in tmp_path.iterdir()] == ["a.zip"]
+
+
+def test_digest_is_that_of_the_archive_that_was_written(tiny_root: Path, lattice: Truth, tmp_path: Path) -> None:
+    archive = tmp_path / "a.zip"
+    evaluator = rdb.Evaluator(tiny_root, LATTICE, archive=archive)
+    evaluator.update(list(lattice), list(lattice.values()))
+    first = evaluator.compute()
+    rdb.evaluate({view_id: 2 * z for view_id, z in lattice.items()}, tiny_root, config=LATTICE, archive=archive)
+    assert evaluator.compute() == first
+    with pytest.raises(rdb.InputError, match="of the archive that was scored; score it again"):
+        first.save_archive(tmp_path / "b.zip")
+    with pytest.raises(rdb.InputError, match="archive is /dev/null, a device or a pipe"):
+        rdb.Evaluator(tiny_root, LATTICE, archive="/dev/null")
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
@@ -151,6 +204,13 @@ if not os.fork():
 assert os.waitstatus_to_exitcode(os.wait()[1]) == 7
 for one in (plain, writing):
     one.update(others, [depth] * len(others))
+if not os.fork():
+    try:
+        writing.compute()
+    except RebarDepthError:
+        sys.exit(7)
+    sys.exit(0)
+assert os.waitstatus_to_exitcode(os.wait()[1]) == 7
 written = writing.compute()
 assert rdb.score(archive, {str(tiny_root)!r}).to_json() == written.to_json()
 assert written.metrics == plain.compute().metrics
