@@ -47,6 +47,7 @@ from tests.bench.reporting.results import (
     overflowed_view,
     result,
     scored_view,
+    split_result,
     unpredicted_view,
 )
 
@@ -181,6 +182,11 @@ def test_rows_without_errors_are_left_out_and_named(tmp_path: Path) -> None:
     assert [text.get_text() for text in lattice.texts] == ["no errors"]
     assert points(pile) == {"silent": (0.5, 0.1)}
     assert not pile.texts
+
+
+def test_title_names_the_split() -> None:
+    [axes] = drawn(split_result()).axes
+    assert axes.get_title() == "cages (test), 9 views"
 
 
 @pytest.mark.parametrize(
