@@ -38,6 +38,7 @@ from rebar_depth_bench.scorer import (
     ScoredResult,
     ScoringTruth,
     ViewResult,
+    file_stat,
     score,
     score_view,
     scored_result,
@@ -248,6 +249,7 @@ class Evaluator:
             _discard(self._writer, self._process)
         self._writer = None
         self._sha256: str | None = None
+        self._stat: tuple[int, ...] = ()
         self._scored: dict[str, ViewResult | None] = {}
         """Result of each view that was added; None for a view without scored pixels."""
         self._kept = {}
@@ -354,6 +356,7 @@ class Evaluator:
             assert self._writer is not None
             self._writer.__exit__(None, None, None)
             self._writer = None
+            self._stat = file_stat(self._archive)
             self._sha256 = file_sha256(self._archive)
         return scored_result(
             scored,
@@ -364,6 +367,7 @@ class Evaluator:
             self._kind,
             self._kind,
             archive=None if self._archive is None else self._archive.absolute(),
+            archive_stat=self._stat,
             kept=self._kept,
         )
 

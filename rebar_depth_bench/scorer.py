@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -63,6 +63,7 @@ def score(
     Raises ``SubmissionError`` with all problems if any part of the archive is invalid, and ``DatasetError`` if the
     dataset folder is invalid or its digest is not ``expect_digest``.
     """
+    archive_stat = file_stat(archive)
     with open_evaluation(archive, root, expect_digest=expect_digest) as evaluation, ThreadPoolExecutor(1) as pool:
         folder, submission, meta = evaluation.folder, evaluation.submission, evaluation.meta
         kind = evaluation.scored_kind(align)
@@ -71,21 +72,19 @@ def score(
             if align is not None:
                 raise InputError(f"extended is true and align is {align}, expected None for measures in metres")
         sha256 = pool.submit(submission.sha256)
+
+        def read_and_score(truth: ScoringTruth, position: int) -> ViewResult:
+            prediction = submission.read(truth.scored.view_ids[position])
+            return score_view(prediction, truth, position, kind, meta.prediction)
+
         scored: dict[str, ScoredConfig] = {}
         try:
             for config in evaluation.configs:
                 truth = ScoringTruth.of(folder, config, extended=extended, progress=progress)
-
-                def score_at(position: int, truth: ScoringTruth = truth) -> ViewResult:
-                    prediction = submission.read(truth.scored.view_ids[position])
-                    return score_view(prediction, truth, position, kind, meta.prediction)
-
-                count = len(truth.scored.view_ids)
-                task = f"scoring {config.name}"
-                views = list(
-                    map_in_threads(score_at, range(count), count, task, workers=workers, progress=progress)
-                )
-                scored[config.name] = tabulate_config(views, truth, kind, meta.declaration)
+                count, task = len(truth.scored.view_ids), f"scoring {config.name}"
+                work = partial(read_and_score, truth)
+                views = map_in_threads(work, range(count), count, task, workers=workers, progress=progress)
+                scored[config.name] = tabulate_config(list(views), truth, kind, meta.declaration)
             # Views without scored pixels have no numbers, but their entries must be valid, too.
             without_pixels = set(submission.view_ids)
             for config_scores in scored.values():
@@ -101,6 +100,7 @@ def score(
             kind,
             meta.prediction,
             archive=submission.path.absolute(),
+            archive_stat=archive_stat,
             archive_notes=submission.notes,
         )
 
@@ -197,6 +197,7 @@ def scored_result(
     declared_kind: str,
     *,
     archive: Path | None = None,
+    archive_stat: tuple[int, ...] = (),
     archive_notes: Sequence[str] = (),
     kept: Mapping[str, KeptPredictions] | None = None,
 ) -> ScoredResult:
@@ -219,7 +220,7 @@ def scored_result(
         declared_prediction=None if kind == declared_kind else declared_kind,
         extended=extended,
         archive=archive,
-        archive_stat=() if archive is None else _identity(archive),
+        archive_stat=archive_stat,
         archive_notes=tuple(archive_notes),
         folder=folder,
         kept=kept or {},
@@ -230,10 +231,9 @@ def scored_result(
 class ScoredResult(Result):
     """Result whose predictions can be looked at, for possible mistakes and for pictures.
 
-    ``archive`` is the archive that was scored, which is read again if it is still the same file: ``archive_stat``
-    has device, inode, size and time of the last change. ``archive_notes`` say which of its entries
-    are ignored. It is None if the predictions were scored as they arrived; then ``kept`` has those that are looked
-    at for mistakes, by config, and there are no pictures.
+    ``archive`` is the archive that was scored, which is read again, ``archive_stat`` its ``file_stat`` before, and
+    ``archive_notes`` say which of its entries are ignored. It is None if the predictions were scored as they
+    arrived; then ``kept`` has those that are looked at for mistakes, by config, and there are no pictures.
     """
 
     folder: DatasetFolder
@@ -300,7 +300,7 @@ class ScoredResult(Result):
         assert self.archive is not None
         with open_evaluation(self.archive, self.folder) as evaluation:
             # The digest of a large archive takes seconds, and a file that was not written to has the same.
-            is_same = _identity(self.archive) == self.archive_stat
+            is_same = file_stat(self.archive) == self.archive_stat != ()
             expected = self.submission.sha256
             found = expected if is_same else evaluation.submission.sha256()
             if found != expected:
@@ -311,7 +311,13 @@ class ScoredResult(Result):
             yield evaluation
 
 
-def _identity(path: Path) -> tuple[int, ...]:
-    """Return what tells a file from another one, and from itself after it was written to, without reading it."""
-    found = path.stat()
+def file_stat(path: str | os.PathLike[str]) -> tuple[int, ...]:
+    """Return device, inode, size and time of the last change of a file, which differ once it was written to.
+
+    The result is empty if there is no such file.
+    """
+    try:
+        found = Path(path).stat()
+    except OSError:
+        return ()
     return found.st_dev, found.st_ino, found.st_size, found.st_mtime_ns
