@@ -117,10 +117,10 @@ class Column:
     @property
     def view_name(self) -> str:
         """Name of the column in frames of views."""
-        return _frame_name(self.in_view)
+        return _frame_name(self.place_in_view)
 
     @property
-    def in_view(self) -> str:
+    def place_in_view(self) -> str:
         """Place of the number in the JSON of a view."""
         return self.view_place or self.place
 
@@ -165,7 +165,7 @@ class Column:
 
     def view_json_value(self, view: ViewScore) -> float | bool | None:
         """Return the number of a view as it is written in JSON and CSV; None if undefined or not finite."""
-        value = rounded(view[self.in_view])
+        value = rounded(view[self.place_in_view])
         return bool(value) if self.statistic == "count" and value is not None else value
 
 

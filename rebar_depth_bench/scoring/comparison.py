@@ -157,7 +157,7 @@ def config_differences(first: Result, other: Result, config: str) -> list[Differ
 
 def _value(column: Column, views: Frame) -> float | None:
     """Return the statistic of a column; None without values, or if one is infinite."""
-    values = views[column.in_view]
+    values = views[column.place_in_view]
     values = values[~np.isnan(values)]
     if not len(values) or not np.isfinite(values).all():
         return None

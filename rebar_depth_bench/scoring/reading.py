@@ -210,7 +210,7 @@ def _view_from_json(entry: Any, kind: str, where: str, problems: list[Problem]) 
     head = validate_document(_type_of(_ViewHead), entry, problems, where)
     if head is None:
         return None
-    columns = {column.in_view: column for column in view_columns(kind)}
+    columns = {column.place_in_view: column for column in view_columns(kind)}
     numbers = _numbers_from_json(entry, kind, columns, where, problems, never_null=["coverage"])
     return None if len(problems) > before else ViewScore(head.view_id, {"scored_px": head.scored_px, **numbers})
 
@@ -293,7 +293,7 @@ def _numbers_from_json(
         else:
             for place, column in members:
                 key = place.rpartition(".")[2]
-                is_flag = column.statistic == "count" and column.in_view == place
+                is_flag = column.statistic == "count" and column.place_in_view == place
                 is_whole = column.statistic == "count" and not is_flag
                 most = f"from 0 to {column.most:g}" if math.isfinite(column.most) else "of 0 or more"
                 wanted = "true or false" if is_flag else f"a {'whole ' * is_whole}number {most}"

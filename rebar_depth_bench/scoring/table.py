@@ -75,7 +75,7 @@ class ViewScore:
 
     def number(self, column: Column) -> float:
         """Return the number of a column; NaN where it is undefined."""
-        return self[column.in_view]
+        return self[column.place_in_view]
 
     def interval(self, column: Column) -> None:
         """Return None: numbers of a view have no intervals. Views and tables share ``Column.cell``."""
@@ -89,7 +89,7 @@ class ViewScore:
     def to_dict(self, kind: str) -> dict[str, Any]:
         """Return the JSON object of the view of a kind of predictions."""
         document = {"view_id": self.view_id, "scored_px": int(self["scored_px"])}
-        written = nested({one.in_view: one.view_json_value(self) for one in view_columns(kind)})
+        written = nested({one.place_in_view: one.view_json_value(self) for one in view_columns(kind)})
         if kind != METRIC:
             nulls = dict.fromkeys(("rank_error", "scale", "native", "scaled"))
             written = _relative_object(written, nulls, self["aligned_robust.error"])
@@ -297,7 +297,7 @@ def _table_of_views(views: Frame, truth: Truth, kind: str, declaration: Declarat
 
 def _summary(column: Column, views: Frame) -> float:
     """Return the number of a table in a column: NaN without values, inf if one overflowed."""
-    values = views[column.in_view]
+    values = views[column.place_in_view]
     defined = values[~np.isnan(values)].tolist()
     if not defined:
         return math.nan
@@ -309,7 +309,7 @@ def _summary(column: Column, views: Frame) -> float:
 
 def column_values(views: Frame, columns: Sequence[Column]) -> Float64[ndarray, "n k"]:
     """Return the ``columns`` of each view, one row per view; NaN where it has no value."""
-    return np.column_stack([views[column.in_view] for column in columns])
+    return np.column_stack([views[column.place_in_view] for column in columns])
 
 
 def bootstrap_estimates(
