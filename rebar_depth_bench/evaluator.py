@@ -160,7 +160,8 @@ class Evaluator:
     ``config`` is one config, or None for all that have the ``split``. ``views`` selects views of each config: a
     number of them, spread evenly, or their ids; such a result is not ranked. ``extended`` adds the extended
     measures. ``method``, ``inputs`` and ``uses_ground_truth`` are what the predictions declare, and ``kind`` is
-    one of ``PREDICTION_KINDS``. With ``archive``, the predictions are also written to a submission archive.
+    one of ``PREDICTION_KINDS``. With ``archive``, the predictions are also written to a submission archive, which
+    replaces a file of this name once it is complete.
 
     Several threads may add views. A copy is independent of the evaluator, and so is the evaluator of a forked
     process; with ``archive``, it cannot be copied, and only the process that made it can add views.
@@ -384,7 +385,8 @@ class Evaluator:
         Raises ``RebarDepthError`` if an archive is written.
         """
         if self._archive is not None:
-            raise RebarDepthError(f"{self._archive}: is written by this evaluator, expected none without archive=")
+            found = f"the evaluator writes the archive {self._archive}"
+            raise RebarDepthError(f"{found}, expected one without archive= to copy")
         twin = type(self).__new__(type(self))
         with self._lock:
             twin.__dict__.update(self.__dict__)

@@ -13,8 +13,10 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from decimal import ROUND_FLOOR, Decimal
+from difflib import get_close_matches
 from typing import TYPE_CHECKING, Any, Literal
 
+from rebar_depth_bench.base.errors import InputError, escape_text
 from rebar_depth_bench.scoring.protocol import WITHIN_MM
 from rebar_depth_bench.submission.declaration import METRIC
 
@@ -176,6 +178,13 @@ def _frame_name(place: str) -> str:
     return "_".join(parts)
 
 
+def check_place(place: str) -> None:
+    """Raise ``InputError`` unless a number has this place in a table or view."""
+    if place not in _PLACES:
+        close = get_close_matches(place, _PLACES, n=1)
+        raise InputError(f"{escape_text(place)} is no number, expected {close[0] if close else 'native.abs_rel'}")
+
+
 def nested(values: Mapping[str, Any]) -> dict[str, Any]:
     """Return values by place as a JSON object: a place that has dots stands in objects of their own."""
     document: dict[str, Any] = {}
@@ -310,6 +319,8 @@ _METRIC_VIEW_COLUMNS = (COVERAGE, RANK_ERROR, SCALE, *NATIVE, *SCALED, *DISTRIBU
 _BY_PLACE: Mapping[str, Column] = {
     one.place: one for one in (*METRIC_COLUMNS, *REFERENCES, *RELATIVE_COLUMNS, FLAT_VIEWS)
 }
+
+_PLACES = {"scored_px", *_BY_PLACE, *(one.place_in_view for one in _BY_PLACE.values())}
 
 
 def table_columns(kind: str) -> tuple[Column, ...]:

@@ -20,6 +20,7 @@ from rebar_depth_bench.scoring.columns import (
     REFERENCES,
     WITHIN,
     Column,
+    check_place,
     interval_columns,
     nested,
     rounded_interval,
@@ -70,7 +71,9 @@ class ViewScore:
     numbers: Mapping[str, float]
 
     def __getitem__(self, place: str) -> float:
-        """Return a number; NaN where it is undefined."""
+        """Return a number; NaN where it is undefined. Raises ``InputError`` for a place that no number has."""
+        if place not in self.numbers:
+            check_place(place)
         return self.numbers.get(place, math.nan)
 
     def number(self, column: Column) -> float:
@@ -171,7 +174,9 @@ class Table:
     groups: Mapping[str, Mapping[str, Table]] = field(default_factory=dict)
 
     def __getitem__(self, place: str) -> float:
-        """Return a number; NaN where it is undefined."""
+        """Return a number; NaN where it is undefined. Raises ``InputError`` for a place that no number has."""
+        if place not in self.numbers:
+            check_place(place)
         return self.numbers.get(place, math.nan)
 
     def number(self, column: Column) -> float:
