@@ -30,8 +30,6 @@ from tests.bench.extended.cage_scenes import bar, mat, predicted_m, view
 Point = tuple[float, float, float]
 
 TRUTH = view(mat())
-
-
 EXACT_M = TRUTH.depth_m.astype(np.float64)
 EXACT_M.flags.writeable = False  # Measures that change their input raise.
 

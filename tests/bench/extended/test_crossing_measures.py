@@ -27,11 +27,7 @@ from rebar_depth_bench.scoring.bootstrap import Resampling, resample, resample_s
 from tests.bench.extended.cage_scenes import FOCAL_PX, bar, view
 
 D = 0.02
-
-
 UPRIGHT = bar(1, (0.0, -0.15, 0.40), (0.0, 0.15, 0.40))
-
-
 LYING = bar(2, (-0.2, 0.0, 0.421), (0.2, 0.0, 0.421))
 
 
@@ -141,12 +137,6 @@ def test_bent_bar_is_judged_but_not_fitted() -> None:
         # The picture of the straight bar, the axis of the bent.
         bent_truth = replace(truth, bars=SceneBars.of([UPRIGHT, bent], truth.bars.crossings.crossings))
         assert view_crossings(bent_truth).crossing.tolist() == expected
-
-
-def test_no_crossings_give_empty_samples() -> None:
-    truth, depth_m = exact_depth([UPRIGHT])
-    samples = samples_of(depth_m, truth)
-    assert all(len(values) == 0 for values in samples.values())
 
 
 def test_shifted_depth_shifts_the_tie_point() -> None:

@@ -126,27 +126,6 @@ def test_doubled_depth_is_corrected_by_scale(
 
 
 @pytest.mark.slow
-def test_missing_pixels_never_improve_a_measure(tiny_truth: Depths, tiny_root: Path, archive_of: Archive) -> None:
-    """Remove a random half of all predictions: no measure that has a better direction may improve."""
-    rng = np.random.default_rng(4)
-    noisy = {
-        view: depth + rng.normal(0, 0.01, depth.shape).astype(np.float32) for view, depth in tiny_truth.items()
-    }
-    holes = {view: np.where(rng.random(depth.shape) < 0.5, np.nan, depth) for view, depth in noisy.items()}
-    whole, half = (extended(archive_of(depths, f"{n}.zip"), tiny_root) for n, depths in enumerate((noisy, holes)))
-    gains = {
-        measure.name: (before, after)
-        for measure in whole.measures[NATIVE]
-        if measure.better
-        and (before := values(whole, NATIVE).get(measure.name)) is not None
-        and (after := values(half, NATIVE).get(measure.name)) is not None
-        and (after > before) == (measure.better == "higher")
-        and after != before
-    }
-    assert gains == {}
-
-
-@pytest.mark.slow
 def test_predictions_are_read_once_and_the_number_of_workers_changes_nothing(
     tiny_truth: Depths, tiny_root: Path, archive_of: Archive, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -38,8 +38,6 @@ def pairs_of(cage: CageTruth) -> set[tuple[int, int]]:
 
 # L-shaped: 0.2 m along x, a bend of 25 mm radius in 5-degree steps, 0.15 m along y.
 BEND = arc(0.025, -90, 0, 18) + np.array([0.2, 0.025, 0])
-
-
 L_BAR = polyline(np.concatenate([[[0, 0, 0]], BEND, [[0.225, 0.175, 0]]]))
 
 
