@@ -275,11 +275,7 @@ def test_lattice_has_375_contacts(tiny_root: Path) -> None:
 
 
 X = Bar(3, "x", 0.02, ((-0.1, 0.0, 0.0), (0.1, 0.0, 0.0)))
-
-
 Y = Bar(9, "y", 0.01, ((0.0, -0.1, 0.018), (0.0, 0.1, 0.018)))
-
-
 ROW = {
     "scene": "mat", "crossing_id": 1, "node_id": 1, "bar_a": 3, "bar_b": 9, "point_a": [0.0, 0.0, 0.0],
     "point_b": [0.0, 0.0, 0.018], "tie_point": [0.0, 0.0, 0.0115], "gap_m": 0.003, "angle_deg": 90.0,

@@ -9,32 +9,10 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from tests.bench.geometry.calibrations import SHIPPED_CALIBRATION
+
 WIDTH, HEIGHT = 64, 36
 VIEWS = 24
-ZED_CALIBRATION = """\
-[LEFT_CAM_HD]
-fx=701.88
-fy=701.70
-cx=641.285
-cy=344.1835
-k1=-0.175286
-k2=0.0283094
-
-[RIGHT_CAM_HD]
-fx=700.965
-fy=701.11
-cx=633.515
-cy=359.3135
-k1=-0.172795
-k2=0.0265223
-
-[STEREO]
-Baseline=119.978
-CV_HD=0.00624
-RX_HD=-0.000917
-RZ_HD=0.00077
-"""
-
 Depth = NDArray[Any]
 
 
@@ -44,7 +22,7 @@ def write_capture(root: Path, views: int = VIEWS, size: tuple[int, int] = (WIDTH
         (root / eye).mkdir(parents=True)
         for view in range(views):
             Image.new("L", size).save(root / eye / f"{view:06d}.png")
-    (root / "calibration.conf").write_text(ZED_CALIBRATION)
+    (root / "calibration.conf").write_bytes(SHIPPED_CALIBRATION.read_bytes())
     return root
 
 

@@ -16,7 +16,7 @@ import pytest
 from PIL import Image
 
 from rebar_depth_bench.base.errors import EntryError, InputError
-from rebar_depth_bench.captures.images import check_upright, read_image_shape
+from rebar_depth_bench.captures.images import check_upright
 from rebar_depth_bench.captures.views import is_capture, open_capture
 from tests.bench.captures.example_capture import write_capture, write_images
 
@@ -123,12 +123,6 @@ def test_each_turned_picture_of_a_capture_is_named(tmp_path: Path) -> None:
     with pytest.raises(InputError) as caught:
         open_capture(root)
     assert [problem.where for problem in caught.value.problems] == ["left/000001.jpg", "right/000002.png"]
-
-
-def test_upright_picture_keeps_its_size(tmp_path: Path) -> None:
-    for content in (jpeg(XMP, *of_exif(directory(1))), png(directory(0))):
-        (tmp_path / "a").write_bytes(content)
-        assert read_image_shape(tmp_path / "a") == (36, 64)
 
 
 @pytest.mark.parametrize("suffix", ["tif", "TIFF", "bmp", "webp", "ppm", "exr"])

@@ -97,12 +97,6 @@ def test_matrix_is_that_of_the_pictures(
     assert np.allclose(pinhole(calibration), expected, rtol=0, atol=1e-9)
 
 
-def test_pixel_of_a_binned_window_has_the_ray_of_its_block_of_the_sensor(tmp_path: Path) -> None:
-    (fx, fy, cx, cy) = pinhole(mono(tmp_path, message(roi=WINDOW, binning_x=2, binning_y=2), 320, 200))
-    # Pixel (10, 20) covers columns 340, 341 and rows 240, 241 of the sensor.
-    assert ((10 - cx) / fx, (20 - cy) / fy) == pytest.approx(((340.5 - 633.2) / 405, (240.5 - 377.5) / 405))
-
-
 @pytest.mark.parametrize(
     ("changes", "size", "words"),
     [

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
-import json
 import shutil
 import subprocess
 import sys
@@ -15,12 +12,11 @@ from pathlib import Path
 import huggingface_hub
 import numpy as np
 import pytest
-from rich.console import Console
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.base.errors import MAX_PROBLEMS_SHOWN
 from rebar_depth_bench.cli import check
-from rebar_depth_bench.cli.demo import DEMO_METHODS, _print_results
+from rebar_depth_bench.cli.demo import DEMO_METHODS
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.codecs import encode_depth
 from rebar_depth_bench.data.files import file_sha256
@@ -28,8 +24,6 @@ from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.methods import METHODS, MultiViewMethod, own_methods
 from rebar_depth_bench.methods.base import WeightsMethod
 from rebar_depth_bench.methods.registry import FROM_FOLDER
-from rebar_depth_bench.scoring.result import Result
-from tests.bench.reporting.results import changed, result, scored_view
 from tests.commands import run_in_process
 from tests.damage import change_manifest, change_rows, copy_dataset, first_shard
 from tests.project.pages import PAGES, blocks
@@ -53,34 +47,6 @@ def predict(method: str, root: Path, folder: Path) -> Path:
 def constant(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the archive that ``constant`` predicts on the tiny lattice."""
     return predict("constant", tiny_root, tmp_path_factory.mktemp("predicted"))
-
-
-def is_number(text: str) -> bool:
-    """Return whether a CSV field is a number."""
-    try:
-        float(text)
-    except ValueError:
-        return False
-    return True
-
-
-@pytest.mark.slow
-def test_score_writes_table_json_csv_and_report(constant: Path, tiny_root: Path, tmp_path: Path) -> None:
-    targets = {kind: tmp_path / f"out.{kind}" for kind in ("json", "csv", "html")}
-    options = [part for kind, path in targets.items() for part in (f"--{kind}", path)]
-    finished = run_bench("score", constant, "--data", tiny_root, *options)
-    assert finished.returncode == 0, finished.stderr
-    result = json.loads(targets["json"].read_text())
-    table = result["tables"]["lattice"]
-    assert f"{table['native']['abs_rel']:.4f}" in finished.stdout
-    assert f"{table['scaled']['abs_rel']:.4f}" in finished.stdout
-    assert "native (no alignment)" in finished.stdout
-    assert "s = median(z)/median(p)" in finished.stdout
-    row = next(csv.DictReader(targets["csv"].read_text().splitlines()))
-    assert table["native"]["abs_rel"] in {float(value) for value in row.values() if is_number(value)}
-    page = targets["html"].read_text()
-    assert page.startswith("<!DOCTYPE html>")
-    assert all(view["view_id"] in page for view in result["views"])
 
 
 def test_sgbm_is_metric_and_constant_needs_scaling(constant: Path, tiny_root: Path, tmp_path: Path) -> None:
@@ -200,11 +166,6 @@ def test_a_method_is_printed_whole_without_network_and_packages(monkeypatch: pyt
     assert "unknown method 'magic', expected one of" in unknown.stderr
 
 
-def test_predict_help_names_weight_folders() -> None:
-    shown = " ".join(run_bench("predict", "--help").stdout.split())
-    assert "NAME:FOLDER (a folder with weights for depth-anything-3," in shown
-
-
 @pytest.fixture
 def copy(tiny_root: Path, tmp_path: Path) -> Path:
     return copy_dataset(tiny_root, tmp_path / "dataset")
@@ -218,17 +179,6 @@ def test_sound_folder_passes_with_one_line(copy: Path) -> None:
     assert "files: 10 of 10" in finished.stderr
     files_only = run_bench("verify", copy, "--files-only")
     assert "views" not in files_only.stdout
-
-
-def test_file_that_builds_no_longer_write_is_verified_if_it_is_listed(copy: Path) -> None:
-    (copy / "eval.yaml").write_text("name: Industrial rebar metric depth\n")
-    sha256 = file_sha256(copy / "eval.yaml")
-    change_manifest(copy, lambda manifest, _: manifest["files"].update({"eval.yaml": sha256}))
-    assert "no problem found in 11 files" in run_bench("verify", copy).stdout
-    (copy / "eval.yaml").write_text("name: another\n")
-    finished = run_bench("verify", copy)
-    assert finished.returncode == 2
-    assert "eval.yaml: SHA-256 is " in finished.stderr
 
 
 def test_changed_missing_and_further_files_are_listed(copy: Path) -> None:
@@ -311,21 +261,6 @@ def test_false_digest_is_refused_by_every_command(
         finished = run_bench(*arguments)
         assert (finished.returncode, finished.stdout) == (2, "")
         assert "ground_truth.digest" in finished.stderr
-
-
-def test_demo_lists_all_methods_that_are_hardly_better_than_a_plane() -> None:
-    def printed(*results: Result) -> str:
-        console = Console(width=200, file=io.StringIO())
-        _print_results(results, console)
-        return " ".join(console.file.getvalue().split())  # type: ignore[attr-defined]
-
-    whole = scored_view("lattice/0000")
-    results = [result(whole, method="whole"), result(scored_view("lattice/0000", coverage=0.9), method="sparse")]
-    for name, share in (("near", 0.97), ("good", 0.9)):
-        errors = {"scaled.abs_rel": share * whole["reference.scaled_constant.abs_rel"]}
-        results.append(result(changed(whole, errors), method=name))
-    assert "less than 5 % for whole, sparse, near." in printed(*results)
-    assert "less than" not in printed(results[-1])
 
 
 def test_demo_on_the_sample_prints_what_the_readme_shows(tmp_path: Path) -> None:

@@ -6,6 +6,7 @@ import io
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -33,13 +34,19 @@ def test_only_missing_characters_are_replaced(encoding: str, shown: str, monkeyp
     assert written.getvalue().decode(encoding) == f"{shown}?"
 
 
-@pytest.mark.slow
-def test_commands_run_on_plain_terminals(tiny_root: Path, tmp_path: Path) -> None:
-    archive = tmp_path / "a.zip"
+@pytest.fixture(scope="module")
+def scored(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> list[str | Path]:
+    """Return the start of a command that scores an archive."""
+    archive = tmp_path_factory.mktemp("terminals") / "a.zip"
     command = ("predict", "constant", "--data", tiny_root, "--config", "lattice-orbit", "--out", archive)
     assert run_in_process(main, *command).returncode == 0
+    return ["score", archive, "--data", tiny_root]
+
+
+@pytest.mark.slow
+def test_commands_run_on_plain_terminals(scored: list[str | Path], tmp_path: Path) -> None:
     environment = {**os.environ, "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}
-    score = ["score", str(archive), "--data", str(tiny_root)]
+    score = [str(word) for word in scored]
     for name, arguments in {
         "methods": ["methods"],
         "ascii": [*score, "--csv", str(tmp_path / "ascii.csv"), "--html", str(tmp_path / "ascii.html")],
@@ -74,15 +81,6 @@ def in_shell(redirections: str, *command: str | Path) -> subprocess.CompletedPro
     """Run ``rebar-bench`` with redirections of its streams that a shell makes."""
     words = ["bash", "-c", f'"$@" {redirections}', "bash", sys.executable, "-m", "rebar_depth_bench", *command]
     return subprocess.run(words, capture_output=True, text=True, timeout=100, check=False)
-
-
-@pytest.fixture(scope="module")
-def scored(tiny_root: Path, tmp_path_factory: pytest.TempPathFactory) -> list[str | Path]:
-    """Return the start of a command that scores an archive."""
-    archive = tmp_path_factory.mktemp("terminals") / "a.zip"
-    command = ("predict", "constant", "--data", tiny_root, "--config", "lattice-orbit", "--out", archive)
-    assert run_in_process(main, *command).returncode == 0
-    return ["score", archive, "--data", tiny_root]
 
 
 @pytest.mark.parametrize(
@@ -144,38 +142,32 @@ def test_removed_current_folder_is_named(module: str, words: list[str], tmp_path
     assert "Traceback" not in finished.stderr
 
 
-class Clock:
-    """Clock that a test sets."""
-
-    def __init__(self) -> None:
-        self.seconds = 1000.0
-
-    def __call__(self) -> float:
-        return self.seconds
+Lines = Callable[[list[tuple[float, int]]], list[str]]
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    clock = Clock()
-    monkeypatch.setattr("rebar_depth_bench.base.terminal.time.monotonic", clock)
-    return clock
+def lines_of(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Lines:
+    """Return a function that returns the log of updates, each some seconds after the one before."""
+
+    def log(updates: list[tuple[float, int]]) -> list[str]:
+        now_s = 1000.0
+        monkeypatch.setattr("rebar_depth_bench.base.terminal.time.monotonic", lambda: now_s)
+        with ProgressBars(pictures_per_step=2) as bars:
+            for seconds, done in updates:
+                now_s += seconds
+                bars.update("pile", done, 504)
+        return capsys.readouterr().err.splitlines()
+
+    return log
 
 
-def lines_of(clock: Clock, capsys: pytest.CaptureFixture[str], updates: list[tuple[float, int]]) -> list[str]:
-    with ProgressBars(pictures_per_step=2) as bars:
-        for seconds, done in updates:
-            clock.seconds += seconds
-            bars.update("pile", done, 504)
-    return capsys.readouterr().err.splitlines()
-
-
-def test_log_has_the_rate_since_the_build_was_resumed(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
-    lines = lines_of(clock, capsys, [(0, 250), (30, 251), (30, 252), (30, 253)])
+def test_log_has_the_rate_since_the_build_was_resumed(lines_of: Lines) -> None:
+    lines = lines_of([(0, 250), (30, 251), (30, 252), (30, 253)])
     assert lines == ["pile: 250 of 504", "pile: 252 of 504, 4 pictures/min, 2:06:00 left"]
 
 
-def test_log_is_short_but_never_silent_for_long(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
-    fast = lines_of(clock, capsys, [(1, done) for done in range(505)])
+def test_log_is_short_but_never_silent_for_long(lines_of: Lines) -> None:
+    fast = lines_of([(1, done) for done in range(505)])
     assert len(fast) == 11
-    slow = lines_of(clock, capsys, [(100, done) for done in range(51)])
+    slow = lines_of([(100, done) for done in range(51)])
     assert len(slow) == 1 + 50 * 100 // MAX_SILENCE_S

@@ -313,25 +313,6 @@ def test_views_are_computed_one_by_one_without_cache_folder(
     assert "computed whenever it is needed" in line
 
 
-@pytest.mark.slow
-def test_values_are_computed_where_no_file_can_be_written(folder: Path) -> None:
-    """A file-size limit holds for the cache, as a full disk does."""
-    code = f"""
-        import resource
-        from {__name__} import EXPECTED, content, indices
-        from rebar_depth_bench.data.cache import open_cache
-        for limit_bytes in (40, 0):
-            resource.setrlimit(resource.RLIMIT_FSIZE, (limit_bytes, limit_bytes))
-            cache = open_cache(content(inputs=limit_bytes))
-            assert indices(cache) == EXPECTED and len(cache.numbers) == len(EXPECTED)
-    """
-    command = [sys.executable, "-B", "-c", textwrap.dedent(code)]
-    finished = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    assert finished.returncode == 0, finished.stderr
-    assert "computed whenever it is needed" in finished.stderr
-    assert [*folder.iterdir()] == []
-
-
 def test_entry_of_read_only_folder_is_used(folder: Path, entry: Path) -> None:
     folder.chmod(0o500)
     try:

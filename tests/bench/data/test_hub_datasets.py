@@ -104,15 +104,8 @@ def test_revision_selects_the_commit_of_all_files(
     assert "DatasetError: org/data@v2: not a local folder, and its manifest.json cannot" in finished.stderr
 
 
-def use_hub(monkeypatch: pytest.MonkeyPatch, hub: HubServer) -> None:
-    """Let addresses of files be those of the server; the package makes their template when it is imported."""
-    template = f"{hub.url}/{{repo_id}}/resolve/{{revision}}/{{filename}}"
-    monkeypatch.setattr("huggingface_hub.constants.HUGGINGFACE_CO_URL_TEMPLATE", template)
-
-
 @pytest.mark.slow
-def test_hub_without_answer_is_asked_once(hub: HubServer, monkeypatch: pytest.MonkeyPatch) -> None:
-    use_hub(monkeypatch, hub)
+def test_hub_without_answer_is_asked_once(hub: HubServer) -> None:
     hub.faults["HEAD *"] = lambda _: Response(status_code=503)
     with pytest.raises(rdb.DatasetError, match=r"^org/data: not a local folder, .* from the Hub: .*503"):
         open_folder("org/data")
@@ -140,7 +133,6 @@ def test_cached_manifest_is_read_only_without_an_answer(
 def test_missing_folder_in_a_folder_is_not_asked_at_the_hub(
     hub: HubServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    use_hub(monkeypatch, hub)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "org").mkdir()
     for root in ("org/data", "org/data@refs/pr/1"):
@@ -149,13 +141,6 @@ def test_missing_folder_in_a_folder_is_not_asked_at_the_hub(
     with pytest.raises(MethodError, match=r"^org/model: .*, or ORG/NAME where there is no folder ORG"):
         hf_method("org/model")
     assert not [request for request in hub.requests if "/resolve/" in request.path]
-
-
-def test_repository_without_a_connection_is_named() -> None:
-    with pytest.raises(
-        rdb.DatasetError, match=r"not a local folder, and its manifest\.json cannot be downloaded from the Hub"
-    ):
-        rdb.load("nobody/nothing-here", "lattice")
 
 
 @pytest.mark.parametrize(

@@ -112,29 +112,24 @@ def test_rows_decode_to_contract_dtypes_and_shapes(tiny_root: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("config", "options", "words"),
     [
-        ({"split": None}, "lattice has no split None, expected test"),
-        ({"split": 3}, "lattice has no split 3, expected test"),
-        ({"columns": 3}, "columns is 3, expected a list of column names"),
+        ("lattise", {}, "no config 'lattise', expected one of lattice, lattice-orbit"),
+        ("lattice", {"columns": ["depth"]}, "no column 'depth', expected some of view_id, scene, left_rgb"),
+        ("lattice", {"columns": "left_rgb"}, "columns is 'left_rgb', expected a list"),
+        ("lattice", {"columns": 3}, "columns is 3, expected a list of column names"),
+        ("lattice", {"split": None}, "lattice has no split None, expected test"),
+        ("lattice", {"split": 3}, "lattice has no split 3, expected test"),
     ],
 )
-def test_arguments_of_other_types_are_refused(tiny_root: Path, arguments: dict[str, Any], words: str) -> None:
+def test_load_errors_name_expected_values(tiny_root: Path, config: str, options: Any, words: str) -> None:
     with pytest.raises(rdb.DatasetError, match=words):
-        rdb.load(tiny_root, "lattice", **arguments)
+        rdb.load(tiny_root, config, **options)
 
 
-def test_load_errors_name_expected_values(tiny_root: Path, tmp_path: Path) -> None:
-    with pytest.raises(rdb.DatasetError, match=r"no config 'lattise', expected one of lattice, lattice-orbit"):
-        rdb.load(tiny_root, "lattise")
-    with pytest.raises(rdb.DatasetError, match=r"no column 'depth', expected some of view_id, scene, left_rgb"):
-        rdb.load(tiny_root, "lattice", columns=["depth"])
-    with pytest.raises(
-        rdb.DatasetError, match=r"has no manifest.json, expected a complete dataset folder written by rebar-build"
-    ):
+def test_folder_without_a_dataset_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(rdb.DatasetError, match=r"has no manifest.json, expected a complete dataset folder"):
         rdb.load(tmp_path, "lattice")
-    with pytest.raises(rdb.DatasetError, match="columns is 'left_rgb', expected a list"):
-        rdb.load(tiny_root, "lattice", columns="left_rgb")
     with pytest.raises(rdb.DatasetError, match="no such folder"):
         rdb.load(tmp_path / "missing", "lattice")
 

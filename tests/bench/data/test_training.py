@@ -19,7 +19,7 @@ from tests.synthetic_dataset import write_split_dataset
 
 torch = pytest.importorskip("torch")
 
-from rebar_depth_bench.data.torch import Augmentation, flip_row  # noqa: E402
+from rebar_depth_bench.data.torch import flip_row  # noqa: E402
 
 CROP = (20, 30)
 CONFIG, VIEWS = "lattice", 9
@@ -97,17 +97,19 @@ def test_single_view_is_mirrored_in_place(tiny_root: Path) -> None:
 def test_order_crops_and_flips_depend_on_seed_draws_and_view(
     tiny_root: Path, num_workers: int, streaming: bool
 ) -> None:
-    def two_epochs(**options: Any) -> list[list[dict[str, Any]]]:
+    def two_epochs(torch_seed: int = 3, **options: Any) -> list[list[dict[str, Any]]]:
         views = rdb.load(tiny_root, "lattice", streaming=streaming)
         loader = rdb.torch_loader(views, num_workers=num_workers, crop=CROP, flip=True, **options)
-        torch.manual_seed(3)
+        torch.manual_seed(torch_seed)
         return [list(loader), list(loader)]
 
     first, second = two_epochs(shuffle=True)
     again = two_epochs(shuffle=True)
+    other_torch_seed = two_epochs(4, shuffle=True)
     [unshuffled, _], [other_seed, _] = two_epochs(), two_epochs(seed=1)
     assert len({tuple(ids(epoch)) for epoch in (first, second, unshuffled)}) == 3
     assert [ids(epoch) for epoch in again] == [ids(first), ids(second)]
+    assert (ids(other_torch_seed[0]) != ids(first)) == streaming
     expected = depth_by_view(unshuffled)
     for epoch, is_same in ((first, True), (again[0], True), (second, False), (other_seed, False)):
         found = depth_by_view(epoch)
@@ -143,15 +145,6 @@ def test_what_cannot_be_batched_is_refused(tiny_root: Path) -> None:
         rdb.torch_loader(datasets.load_dataset(str(tiny_root), "lattice"))
     with pytest.raises(rdb.DatasetError, match=r"lacks the columns left_rgb, .*expected those that rdb\.load"):
         rdb.torch_loader(rdb.load(tiny_root, "lattice", columns=["view_id"]))
-    invalid: list[tuple[dict[str, Any], str]] = [
-        ({"crop": (0, 5)}, "crop"),
-        ({"crop": (5,)}, "crop"),
-        ({"seed": -1}, "seed"),
-    ]
-    for options, where in invalid:
-        with pytest.raises(InputError) as caught:
-            Augmentation(**options)
-        assert [problem.where for problem in caught.value.problems] == [where]
     with pytest.raises(InputError, match="crop"):
         batches(tiny_root, crop=(10_000, 10))
     row = dict(rdb.load(tiny_root, "lattice", columns=["view_id", "left_depth", "right_depth"])[0])
@@ -166,7 +159,7 @@ def test_what_cannot_be_batched_is_refused(tiny_root: Path) -> None:
     [
         ("batch_size", [None, 0, -1, 2.0, True, "2", [2]]),
         ("num_workers", [None, -1, 1.0, "1"]),
-        ("crop", [0, -8, 64.0, True, "64", (8.0, 8), (8, None), (8, 8, 8), {8, 9}]),
+        ("crop", [0, -8, 64.0, True, "64", (8.0, 8), (8, None), (0, 8), (8,), (8, 8, 8), {8, 9}]),
         ("seed", [None, -1, 1.5, "1"]),
         ("flip", [None, 0.5, "no"]),
         ("shuffle", [None, "no"]),
@@ -253,16 +246,6 @@ def test_shuffled_loader_is_sent_to_spawned_processes(tiny_root: Path) -> None:
 
 def _expect_batches(_: int, loader: Any, expected: int) -> None:
     assert len(list(loader)) == expected
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("num_workers", [0, 2])
-def test_order_of_a_stream_depends_on_the_seed_of_torch(root: Path, num_workers: int) -> None:
-    def order(torch_seed: int) -> list[list[str]]:
-        torch.manual_seed(torch_seed)
-        return epochs(root, 2, streaming=True, shuffle=True, num_workers=num_workers)
-
-    assert order(1) == order(1) != order(2)
 
 
 def test_batch_has_the_values_of_the_rows(tiny_root: Path) -> None:

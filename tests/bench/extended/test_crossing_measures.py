@@ -27,11 +27,7 @@ from rebar_depth_bench.scoring.bootstrap import Resampling, resample, resample_s
 from tests.bench.extended.cage_scenes import FOCAL_PX, bar, view
 
 D = 0.02
-
-
 UPRIGHT = bar(1, (0.0, -0.15, 0.40), (0.0, 0.15, 0.40))
-
-
 LYING = bar(2, (-0.2, 0.0, 0.421), (0.2, 0.0, 0.421))
 
 
@@ -94,19 +90,6 @@ def test_three_bars_of_one_node_are_judged_where_they_are_seen() -> None:
     assert truth.judged.crossing.tolist() == [0, 1]
 
 
-def test_four_bars_have_four_exact_crossings() -> None:
-    bars = [bar(i + 1, (x, -0.15, 0.40), (x, 0.15, 0.40)) for i, x in enumerate((-0.05, 0.05))]
-    bars += [bar(i + 3, (-0.2, y, 0.4215), (0.2, y, 0.4215)) for i, y in enumerate((-0.04, 0.04))]
-    truth, depth_m = exact_depth(bars)
-    found = view_crossings(truth)
-    assert found.crossing.tolist() == [0, 1, 2, 3]
-    expected = [(x, y, 0.41075) for x in (-0.05, 0.05) for y in (-0.04, 0.04)]
-    np.testing.assert_allclose(found.ties.tie_point_m, expected, atol=1e-9)
-    samples = samples_of(depth_m, truth)
-    assert samples["tie_judged_mm"].max() < 0.1
-    assert samples["crossing_angle_judged_deg"].max() < 0.3
-
-
 def at_border(offset_m: float) -> list[Bar]:
     """Return two bars that cross at a distance from the right border of the image, metres to its right."""
     x = 0.4 * 120 / FOCAL_PX + offset_m
@@ -154,12 +137,6 @@ def test_bent_bar_is_judged_but_not_fitted() -> None:
         # The picture of the straight bar, the axis of the bent.
         bent_truth = replace(truth, bars=SceneBars.of([UPRIGHT, bent], truth.bars.crossings.crossings))
         assert view_crossings(bent_truth).crossing.tolist() == expected
-
-
-def test_no_crossings_give_empty_samples() -> None:
-    truth, depth_m = exact_depth([UPRIGHT])
-    samples = samples_of(depth_m, truth)
-    assert all(len(values) == 0 for values in samples.values())
 
 
 def test_shifted_depth_shifts_the_tie_point() -> None:
@@ -276,10 +253,27 @@ def test_reach_ends_before_the_first_bin_that_fails() -> None:
     assert found.interval == (0.3, 0.5)
 
 
-def test_reach_of_all_tested_bins_is_a_lower_bound() -> None:
-    found = reach_of({0.22: (6, 1), 0.27: (6, 1), 0.35: (4, 0)})  # 40 crossings: the third bin is not tested.
-    assert (found.verdict, found.distance_m, found.interval) == ("at least", 0.3, (0.3, 0.3))
-    assert [one.tested for one in found.bins] == [True, True, False]
+@pytest.mark.parametrize(
+    ("bins", "views", "expected"),
+    [
+        # 40 crossings: the third bin is not tested.
+        ({0.22: (6, 1), 0.27: (6, 1), 0.35: (4, 0)}, 10, ("at least", 0.3, (0.3, 0.3), (0.2, 0.3))),
+        # A gap without crossings ends the reach.
+        ({0.22: (6, 1), 0.45: (6, 1)}, 10, ("at least", 0.25, (0.25, 0.25), (0.2, 0.25))),
+        # Ten crossings nearer than the nearest tested bin say nothing.
+        ({0.22: (1, 0), 0.27: (6, 1)}, 10, ("at least", 0.3, (0.3, 0.3), (0.25, 0.3))),
+        ({0.22: (6, 0.5), 0.27: (6, 1)}, 10, ("not met", None, (0.0, 0.0), (0.2, 0.3))),
+        ({}, 10, ("none tested", None, None, None)),
+        ({0.22: (20, 1.0)}, 4, ("none tested", None, None, None)),
+        ({0.22: (4, 1.0)}, 10, ("none tested", None, None, None)),
+        ({30.0: (9, 1.0)}, 10, ("none tested", None, None, None)),
+    ],
+)
+def test_verdict_distance_interval_and_tested_range(
+    bins: dict[float, tuple[int, float]], views: int, expected: tuple[object, ...]
+) -> None:
+    found = reach_of(bins, views)
+    assert (found.verdict, found.distance_m, found.interval, found.tested_m) == expected
 
 
 def test_share_of_exactly_95_percent_fulfils() -> None:
@@ -288,26 +282,6 @@ def test_share_of_exactly_95_percent_fulfils() -> None:
     ]
     found = reaches(by_view, resample(range(0, 500, 100)))[0]
     assert (found.verdict, found.distance_m) == ("at least", 0.25)
-
-
-def test_untested_gap_ends_the_reach() -> None:
-    found = reach_of({0.22: (6, 1), 0.45: (6, 1)})
-    assert (found.verdict, found.distance_m, found.tested_m) == ("at least", 0.25, (0.2, 0.25))
-    found = reach_of({0.22: (1, 0), 0.27: (6, 1)})  # Ten crossings nearer than the nearest tested bin say nothing.
-    assert (found.verdict, found.distance_m, found.tested_m) == ("at least", 0.3, (0.25, 0.3))
-
-
-def test_reach_is_not_met_in_the_first_tested_bin() -> None:
-    found = reach_of({0.22: (6, 0.5), 0.27: (6, 1)})
-    assert (found.verdict, found.distance_m, found.interval) == ("not met", None, (0.0, 0.0))
-
-
-@pytest.mark.parametrize(
-    ("bins", "views"), [({}, 10), ({0.22: (20, 1.0)}, 4), ({0.22: (4, 1.0)}, 10), ({30.0: (9, 1.0)}, 10)]
-)
-def test_reach_of_no_tested_bin_is_none(bins: dict[float, tuple[int, float]], views: int) -> None:
-    found = reach_of(bins, views)
-    assert (found.verdict, found.distance_m, found.interval, found.tested_m) == ("none tested", None, None, None)
 
 
 def test_reach_is_in_json_terms() -> None:

@@ -18,11 +18,9 @@ import onnxruntime
 from onnx import GraphProto, TensorProto, helper, numpy_helper
 
 from rebar_depth_bench.base.errors import MethodError
-from rebar_depth_bench.base.parallel import Progress
 from rebar_depth_bench.methods import find_method
-from rebar_depth_bench.methods.run import predict
 from tests.bench.methods.onnx_models import predict_depth, write_mixer_model, write_toml
-from tests.bench.methods.predictors import load_predictor, stop_after
+from tests.bench.methods.predictors import load_predictor
 
 GREY = np.full((4, 6, 3), 100, np.uint8)
 WEIGHTS = np.array([1, 0, 0], np.float32)
@@ -156,29 +154,6 @@ def test_old_onnxruntime_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(onnxruntime, "__version__", "1.27.0")
     with pytest.raises(MethodError, match=r"onnxruntime is 1\.27\.0, .* expected at least 1\.28: pip install"):
         load_predictor(str(write_toml(tmp_path)))
-
-
-def test_interrupted_run_is_not_resumed_with_another_model_or_settings(tiny_root: Path, tmp_path: Path) -> None:
-    path, done = write_toml(tmp_path), list[int]()
-
-    def run(progress: Progress) -> None:
-        method = find_method(str(path))
-        predict(method, tiny_root, tmp_path / "x.zip", configs=["lattice-orbit"], progress=progress)
-
-    def change_model() -> None:
-        write_mixer_model(tmp_path, offset=1)
-
-    def change_settings() -> None:
-        write_toml(tmp_path, output_table="meaning = 'depth'\nscale = 2")
-
-    write_mixer_model(tmp_path)
-    for change in (change_model, change_settings):
-        with pytest.raises(KeyboardInterrupt):
-            run(stop_after(1))
-        change()
-        done.clear()
-        run(lambda _, count, __: done.append(count))
-        assert done == [1, 2]
 
 
 def test_snapshot_of_links_runs(tmp_path: Path) -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-import subprocess
-import sys
 import zipfile
 from fractions import Fraction
 from io import BytesIO
@@ -174,13 +172,6 @@ def test_coarse_output_grid_covers_whole_image(tmp_path: Path) -> None:
     assert predict_depth(path, np.zeros((2, 6, 3), np.uint8)).tolist() == [[1, 1, 1, 2, 2, 2], [3, 3, 3, 4, 4, 4]]
 
 
-def test_values_are_never_mixed(tmp_path: Path) -> None:
-    bar = np.array([[2.0, 2, 1, 1, np.nan, 2]] * 4)  # A bar at 1 m in front of a wall at 2 m, and a missing value.
-    write_constant_model(tmp_path, bar)
-    depth_m = predict_depth(write_toml(tmp_path), np.zeros((16, 24, 3), np.uint8))
-    np.testing.assert_array_equal(depth_m, np.kron(bar, np.ones((4, 4))))
-
-
 @pytest.mark.parametrize(
     ("size", "expected"), [((1280, 720), (518, 294)), ((720, 1280), (294, 518)), ((2000, 3), (518, 14))]
 )
@@ -214,17 +205,6 @@ def test_method_info_and_coverage_of_its_digest(tmp_path: Path) -> None:
     other_settings = find_method(str(path)).info.source
     write_mixer_model(tmp_path, offset=2)
     assert len({info.source, other_settings, find_method(str(path)).info.source}) == 3
-
-
-@pytest.mark.slow
-def test_onnxruntime_is_imported_only_on_load(tmp_path: Path) -> None:
-    write_mixer_model(tmp_path)
-    code = (
-        "import sys; from rebar_depth_bench.methods import find_method; "
-        f"find_method({str(write_toml(tmp_path))!r}); print('onnxruntime' in sys.modules, 'onnx' in sys.modules)"
-    )
-    finished = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert finished.stdout == "False False\n"
 
 
 @pytest.mark.slow

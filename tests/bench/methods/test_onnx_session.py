@@ -19,7 +19,6 @@ import numpy as np
 from onnx import TensorProto, helper
 
 from rebar_depth_bench.base.errors import MethodError
-from rebar_depth_bench.base.limits import DeadlineError, call_within
 from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.methods import find_method
 from tests.bench.methods.onnx_models import (
@@ -37,7 +36,6 @@ BLACK = np.zeros((4, 6, 3), np.uint8)
 VARIABLE_INPUT = "longest_side = 6\nresize = 'stretch'\nrange = 1"
 CHANNEL_MEAN = helper.make_node("ReduceMean", ["x"], ["y"], axes=[1])
 NEGATED = helper.make_node("Neg", ["x"], ["y"])
-NUMBER = helper.make_node("ReduceMean", ["x"], ["y"], keepdims=0)
 SHAPE = helper.make_node("Shape", ["x"], ["y"])
 SUM_OF_TWO_INPUTS = helper.make_node("Sum", ["x", "k"], ["y"])
 FAILING_RESHAPE = helper.make_node("Reshape", ["x", "to"], ["y"])
@@ -75,10 +73,6 @@ def mismatch(
             input_shape=(1, "h", "w", 3),
         ),
         mismatch(
-            f"invalid input: the model takes 1 x 4 x 6 x 3, expected 1 x 3 x H x W{PYTHON_METHOD}channels_last.py",
-            input_shape=(1, 4, 6, 3),
-        ),
-        mismatch(
             f"invalid input: the model takes 1 x 2 x ? x ?, expected 1 x 3 x H x W{PYTHON_METHOD}hitnet.py",
             input_shape=(1, 2, "h", "w"),
         ),
@@ -103,10 +97,6 @@ def mismatch(
             outputs=["y", "z"],
         ),
         mismatch("unknown output.name: the model has no output 'q', expected one of 'y'", output="name = 'q'"),
-        mismatch(
-            "output 'y' has the shape (1, 3, 4, 6), expected H x W in the ratio of the input, 4 x 6", NEGATED
-        ),
-        mismatch("output 'y' has the shape (), expected H x W", NUMBER),
         mismatch(
             "model.onnx: a black image: fails on an input of 1 x 3 x 4 x 6: ",
             FAILING_RESHAPE,
@@ -139,7 +129,7 @@ def test_all_mismatches_are_reported_at_once(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     "shape",
-    [(), (24,), (0, 6), (1, 24), (1, 24, 1), (1, 1), (1, 1, 6, 4), (5, 5), (20, 12), (2, 4, 6)],
+    [(), (24,), (0, 6), (1, 24), (1, 24, 1), (1, 1), (1, 1, 6, 4), (5, 5), (20, 12), (2, 4, 6), (1, 3, 4, 6)],
     ids=str,
 )
 def test_output_without_the_ratio_of_the_input_is_refused(shape: tuple[int, ...], tmp_path: Path) -> None:
@@ -162,10 +152,11 @@ def test_output_is_selected_by_name(tmp_path: Path) -> None:
     assert np.unique(predict_depth(path, BLACK + 9)) == 9
 
 
-def test_missing_onnxruntime_names_extra_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_load_without_onnxruntime_names_extra_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     write_mixer_model(tmp_path)
+    for package in ("onnx", "onnxruntime"):
+        monkeypatch.setitem(sys.modules, package, None)
     method = find_method(str(write_toml(tmp_path)))
-    monkeypatch.setitem(sys.modules, "onnxruntime", None)
     with pytest.raises(MethodError, match=re.escape("pip install '.[onnx]'")):
         load_predictor(method)
 
@@ -274,13 +265,3 @@ def test_memory_of_model_is_limited(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     monkeypatch.setenv("REBAR_MAX_ONNX_MEMORY_BYTES", str(1 << 30))
     with pytest.raises(MethodError, match="REBAR_MAX_ONNX_MEMORY_BYTES raises the limit"):
         load_predictor(str(write_toml(tmp_path)))
-
-
-def test_deadline_returns_result_and_raises_errors_of_function() -> None:
-    assert call_within(10, lambda: 7) == 7
-    with pytest.raises(ZeroDivisionError):
-        call_within(10, lambda: 1 // 0)
-    stopped: list[Any] = []
-    with pytest.raises(DeadlineError):
-        call_within(0.05, lambda: time.sleep(0.2), lambda: stopped.append(1))
-    assert stopped == [1]

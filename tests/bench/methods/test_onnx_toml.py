@@ -34,9 +34,7 @@ LONGEST = "longest_side = 50"
 INVALID_EDITS = [
     ("licence = 'MIT'", "", "missing licence", "expected the licence of the model's weights"),
     ("'MIT'", "'  '", "invalid licence", "got ' '"),
-    ("'MIT'", "7", "invalid licence", "got 7"),
     ("'model.onnx'", "'no.onnx'", "missing model", "no such file: "),
-    ("'model.onnx'", "'.'", "missing model", "no such file: "),
     ("'model.onnx'", f"'{'x' * 900}'", "missing model", "no such file: "),
     ("'model.onnx'", '"a\\u0000b"', "invalid model", "got 'a\\x00b', expected the ONNX file's path"),
     ("licence", "naem = 'x'\nlicence", "unknown naem", "expected name"),
@@ -47,14 +45,12 @@ INVALID_EDITS = [
     ("width = 6", "width = 6\nlongest_side = 9", "conflict input.longest_side", NO_SIZE),
     ("width = 6", "width = 6\nmultiple_of = 1", "conflict input.longest_side", NO_SIZE),
     ("width = 6", "width = 6.0", "invalid input.width", "got 6.0, expected a whole number"),
-    ("width = 6", "width = true", "invalid input.width", "got True"),
     ("height = 4", "height = 0", "invalid input.height", "got 0"),
     ("height = 4", "height = 9999", "invalid input.height", "got 9999"),
     ("width = 6\nheight = 4", f"{LONGEST}\nmultiple_of = 14", "invalid input.longest_side", "multiple_of, 14"),
     ("width = 6\nheight = 4", "multiple_of = 14", "missing input.longest_side", NO_SIZE),
     ("'stretch'", "'crop'", "invalid input.resize", 'got \'crop\', expected "stretch" or "pad"'),
     ("range = 255", "range = 256", "invalid input.range", "got 256, expected 1 or 255"),
-    ("range = 255", "range = true", "invalid input.range", "got True, expected 1 or 255"),
     ("range = 255", "", "missing input.range", "expected 1 or 255"),
     ("range = 255", "range = 1\nmean = [123.7, 116.3, 103.5]", "invalid input.mean", "from 0 to 1: red"),
     ("range = 255", "range = 255\nstd = [0.229, 0.224, 0.225]", "invalid input.std", "from 1 to 255"),
@@ -67,11 +63,8 @@ INVALID_EDITS = [
     ("'depth'", "'depth'\nfocal_canonical_px = 1000", "conflict output.focal_canonical_px", 'meaning "depth"'),
     ("'depth'", "'depth'\nscale = 0", "invalid output.scale", "got 0, expected a number above 0"),
     ("'depth'", "'depth'\nscale = inf", "invalid output.scale", "got inf"),
-    ("'depth'", "'depth'\nscale = '1'", "invalid output.scale", "got '1'"),
     ("'depth'", "'depth'\nresize = 'nearest'", "unknown output.resize", "expected one of meaning"),
     ("range = 255", f"range = {'9' * 4000}", "invalid input.range", "got 9999"),
-    ("range = 255", f"range = {'9' * 5000}", "syntax ", "not a valid TOML file"),
-    ("range = 255", f"range = {'[' * 5000}", "size ", "nested too deep"),
     ("range = 255", "range = 255\nrange = 1", "syntax ", "not a valid TOML file: Cannot overwrite a value"),
 ]
 
@@ -124,33 +117,6 @@ def test_example_in_docstring_is_valid(tmp_path: Path) -> None:
     spec = onnx_toml.read_onnx_toml(path)
     assert (spec.input.width, spec.input.height) == (1064, 616)
     assert (spec.output.focal_canonical_px, spec.output.name) == (1000, "predicted_depth")
-
-
-@pytest.mark.parametrize(
-    ("content", "code", "words"),
-    [
-        (
-            None,
-            "missing",
-            "cannot be read: No such file or directory, expected a TOML file that describes an ONNX",
-        ),
-        (b"\xff\xfe", "syntax", "the text is UTF-16"),
-        (b"#" * (1 << 21), "size", "at most 1048576 bytes"),
-        (b"\x00", "syntax", "not a valid TOML file"),
-    ],
-)
-def test_unreadable_file_raises_with_reason(content: bytes | None, code: str, words: str, tmp_path: Path) -> None:
-    path = tmp_path / "x.toml"
-    if content is not None:
-        path.write_bytes(content)
-    with pytest.raises(MethodError, match=words) as caught:
-        find_method(str(path))
-    assert located(caught.value.problems) == [f"{code} "]
-    path.unlink(missing_ok=True)
-    path.mkdir()
-    with pytest.raises(MethodError) as caught:
-        find_method(str(path))
-    assert located(caught.value.problems) == ["unreadable "]
 
 
 VALUES = st.recursive(

@@ -220,29 +220,28 @@ METHOD = Method(MethodInfo("own", "a test", ("left_rgb",), False, "here", "MIT")
     assert sys.modules["json"] is json
 
 
-def test_changed_user_file_gives_different_source(user_file: Path) -> None:
-    before = find_method(f"{user_file}:METHOD").info
-    assert find_method(f"{user_file}:METHOD").info == before
-    user_file.write_text(user_file.read_text() + "# changed\n")
-    after = find_method(f"{user_file}:METHOD").info
-    assert after.name == before.name
-    assert after.source != before.source
-
-
-def test_interrupted_run_is_resumed_on_the_same_images_only(
+def test_interrupted_run_is_resumed_with_the_same_method_and_images_only(
     user_file: Path, tiny_root: Path, tmp_path: Path
 ) -> None:
     """Other lights or sample counts leave the ground truth unchanged, but not the images."""
     archive, (first, second) = tmp_path / "out.zip", orbit_view_ids(tiny_root)
-    run = partial(predict, find_method(f"{user_file}:METHOD"), archive=archive, configs=["lattice-orbit"])
+    run = partial(predict, archive=archive, configs=["lattice-orbit"])
+    method = find_method(f"{user_file}:METHOD")
+    user_file.write_text(user_file.read_text() + "# changed\n")
+    changed = find_method(f"{user_file}:METHOD")
+    again = [first, first, second]
     other = copy_dataset(tiny_root, tmp_path / "other")
     change_manifest(other, lambda manifest, _: manifest["configs"]["lattice-orbit"]["scenes"][0].update(key="x"))
-    for root, predicted in ((tiny_root, [first, second]), (other, [first, first, second])):
+    for resumed, root, predicted in (
+        (method, tiny_root, [first, second]),
+        (method, other, again),
+        (changed, tiny_root, again),
+    ):
         (tmp_path / "log").unlink(missing_ok=True)
         with pytest.raises(KeyboardInterrupt):
-            run(root=tiny_root, progress=stop_after(1))
+            run(method, tiny_root, progress=stop_after(1))
         assert not archive.exists()
-        run(root=root)
+        run(resumed, root)
         assert (tmp_path / "log").read_text().split() == predicted
         assert len(metadata_of(archive)["runtime"]["seconds"]) == 2
         assert not list(tmp_path.glob(".*"))
@@ -348,19 +347,18 @@ def test_folder_as_archive_is_rejected_before_prediction(tiny_root: Path, tmp_pa
     assert list(tmp_path.iterdir()) == []
 
 
-@pytest.mark.parametrize(
-    ("name", "expected"),
-    [
-        *(("sgbm", "stereo"), ("foundation-stereo", "stereo"), ("constant", "rgb"), ("unidepth", "rgb")),
-        *(("metric3d", "rgb+K"), ("sweep-aruco", "multi-view"), ("lidar-mobile", "lidar"), ("truth", None)),
-    ],
-)
-def test_input_class_of_a_bundled_method(name: str, expected: str | None) -> None:
-    assert input_class(own_methods()[name]) == expected
-
-
-def test_methods_that_read_images_have_a_class_unless_they_declare_one() -> None:
-    for method in own_methods().values():
+def test_input_classes_of_bundled_methods() -> None:
+    methods = own_methods()
+    expected = {
+        **dict.fromkeys(("sgbm", "foundation-stereo"), "stereo"),
+        **dict.fromkeys(("constant", "unidepth"), "rgb"),
+        "metric3d": "rgb+K",
+        "sweep-aruco": "multi-view",
+        "lidar-mobile": "lidar",
+        "truth": None,
+    }
+    assert {name: input_class(methods[name]) for name in expected} == expected
+    for method in methods.values():
         reads_images = isinstance(method, MultiViewMethod) or "left_rgb" in method.info.columns
         assert (input_class(method) in INPUTS) or not reads_images
         assert input_class(replace(method, info=replace(method.info, inputs="lidar"))) == "lidar"

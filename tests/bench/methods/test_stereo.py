@@ -32,6 +32,7 @@ from rebar_depth_bench.submission import SubmissionReader
 from tests.bench.geometry.calibrations import SHIPPED_CALIBRATION
 from tests.bench.geometry.textured_plane import HEIGHT, WIDTH, plane_depth_m, raw_row
 from tests.bench.methods.predictors import load_predictor
+from tests.bench.methods.stand_in_models import BASELINE_M, stereo_row
 
 Row = dict[str, Any]
 METRES = st.floats(0.1, 30)
@@ -65,22 +66,11 @@ def test_pixels_seen_by_one_eye_have_no_depth(where: str) -> None:
     left, right = wall[:, :200].copy(), wall[:, 8:208].copy()  # The wall has 8 px of disparity.
     if where == "bar":
         left[:, 100:120], right[:, 70:90] = bar[:, :20], bar[:, :20]  # The bar has 30 px.
-    K = np.array([[700.0, 0, 99.5], [0, 700.0, 29.5], [0, 0, 1.0]])
-    right_cam_from_world = np.eye(4)
-    right_cam_from_world[0, 3] = -0.12
-    row = {
-        "left_rgb": left,
-        "right_rgb": right,
-        **dict.fromkeys(("left_K", "right_K"), K),
-        **dict.fromkeys(("left_distortion", "right_distortion"), np.zeros(5)),
-        "left_cam_from_world": np.eye(4),
-        "right_cam_from_world": right_cam_from_world,
-        "baseline_m": 0.12,
-    }
+    row = stereo_row(np.zeros((60, 200)), fx=700.0) | {"left_rgb": left, "right_rgb": right}
     checked, filled = (load_predictor(name)(row) for name in ("sgbm", "sgbm-filled"))
-    truth_m = np.full((60, 200), 700 * 0.12 / 8)
+    truth_m = np.full((60, 200), 700 * BASELINE_M / 8)
     if where == "bar":
-        truth_m[:, 100:120] = 700 * 0.12 / 30
+        truth_m[:, 100:120] = 700 * BASELINE_M / 30
     known = np.isfinite(checked[:, 40:])
     abs_rel = np.abs(checked[:, 40:] - truth_m[:, 40:])[known] / truth_m[:, 40:][known]
     assert np.array_equal(checked[np.isfinite(checked)], filled[np.isfinite(checked)])

@@ -28,13 +28,12 @@ from PIL import Image
 from rebar_depth_bench import evaluate, score
 from rebar_depth_bench.base.errors import MethodError
 from rebar_depth_bench.cli.main import main
-from rebar_depth_bench.methods import METHODS, find_method
+from rebar_depth_bench.methods import find_method
 from rebar_depth_bench.methods.transformers import (
-    FAMILIES,
     hf_method,
 )
 from tests.bench.methods.predictors import load_predictor
-from tests.bench.methods.tiny_depth_models import IMAGENET, LAST_LAYER, MODELS, save_checkpoint
+from tests.bench.methods.tiny_depth_models import IMAGENET, MODELS, save_checkpoint
 from tests.hub_server import HubServer, folder_files
 
 pytestmark = pytest.mark.slow  # torch and transformers take seconds to import
@@ -341,9 +340,3 @@ def test_offline_and_missing_hub_checkpoint_names_local_copy(
 def test_invalid_hf_name_raises(name: str) -> None:
     with pytest.raises(MethodError, match="is neither a folder nor the name of a model on the Hub"):
         find_method(f"hf:{name}")
-
-
-def test_all_families_are_covered() -> None:
-    assert set(FAMILIES) <= {kind.replace("-", "_") for kind in MODELS}
-    assert set(LAST_LAYER) <= set(MODELS)
-    assert METHODS["depth-pro"].info.uses_intrinsics
