@@ -147,6 +147,15 @@ def test_all_encodings_of_bend_give_same_axis(kind: str) -> None:
     np.testing.assert_allclose(ifc.axis_m() * 1000, [(0, 0, 0), *bend, (240, 140, 0)], atol=1e-9)
 
 
+def test_arc_of_three_quarters_of_a_circle_is_on_the_side_of_its_middle() -> None:
+    ifc = Ifc()
+    start, middle, end, *expected = (
+        (100 * math.cos(angle), 100 * math.sin(angle), 0) for angle in np.radians([0, 50, 270, *range(0, 271, 6)])
+    )
+    ifc.bar(ifc.disc(indexed_curve(ifc, (start, middle, end), (1, 2, 3))))
+    np.testing.assert_allclose(ifc.axis_m() * 1000, expected, atol=1e-6)
+
+
 def test_arc_of_collinear_points_is_line() -> None:
     ifc = Ifc()
     points = [(0, 0, 0), (100, 100, 0), (300, 300, 0)]
