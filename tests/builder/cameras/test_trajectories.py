@@ -169,6 +169,12 @@ def test_pier_cameras_keep_directions_of_dome_above_ground_in_clear_area(
     assert cylinders.distance_m(centres_m).min() > 8 - RigSpec.baseline_m
 
 
+def test_cameras_are_at_the_outermost_place_at_their_distance() -> None:
+    bars = [Bar(n, "bar", 0.1, ((x, 0.0, -1.0), (x, 0.0, 1.0))) for n, x in enumerate((0.0, 10.0), start=1)]
+    [radius_m] = radii_at_steel_distance_m(ORIGIN, np.array([[1.0, 0.0, 0.0]]), np.array([2.0]), bars)
+    assert radius_m == pytest.approx(12.05, abs=1e-6)
+
+
 @pytest.mark.parametrize("radius_m", [1e-3, 1e9])
 def test_extreme_radii_end(radius_m: float) -> None:
     bars = [Bar(1, "bar", 0.1, ((0.0, 0.0, -1.0), (0.0, 0.0, 1.0)))]

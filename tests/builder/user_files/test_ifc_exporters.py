@@ -164,13 +164,6 @@ STYLES = {
     "U, number of segments, IFC4X3": revit(MILLIMETRES, 3.0, "IFC4X3_ADD2"),
     "U, no parameters": revit(MILLIMETRES, "$", "IFC4"),
     "U, cut in the bend": revit(MILLIMETRES, 590.0, length_m=0.5 + 0.05 * math.pi, notes=("cut", "length")),
-    "line, cut at both ends": single(
-        lambda step: step.disc(step.composite(step.line((0, 0, 0), (0, 0, 1), 1000.0)), 5.0, 250.0, 750.0),
-        0.010,
-        1.0,
-        found_m=(0.010, 0.5),
-        notes=("cut", "length"),
-    ),
     "Tekla, stirrup with hooks": single(stirrup, 0.008, STIRRUP_MM / 1000),
     "Tekla, set of 12 mapped polylines, length": mapped(
         lambda step: step.disc(step.polyline((0, 0, 0), (1200, 0, 0), (1200, 0, 983.675)), 10.0, "0.", 2183.675),
@@ -205,9 +198,6 @@ STYLES = {
     "Segments with gaps of 2 mm": single(lambda step: with_gap(step, 501.0), 0.012, 1.0, notes=("gap",)),
     "Map with uniform scale 0.5": single(
         lambda step: step.mapped([straight(step, 10.0, "0.", "1.")], [(0, 0, 0)], scale=0.5)[0], 0.010, 0.5
-    ),
-    "Outer diameter of the ribs modelled": single(
-        lambda step: straight(step, 11.0), 0.020, 1.0, found_m=(0.022, 1.0), notes=("diameter",)
     ),
     "Hollow bar": single(
         lambda step: step.add(f"IFCSWEPTDISKSOLID({step.polyline((0, 0, 0), (1000, 0, 0))},16.,8.,$,$)"),
