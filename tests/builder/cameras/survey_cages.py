@@ -12,6 +12,7 @@ from dataset_builder.scene.model import Assembly
 from dataset_builder.scene.raycast import RayCaster
 from dataset_builder.scene.shapes.solids import world_mesh
 from rebar_depth_bench.data.bars import Bar
+from tests.builder.scene.cages import point_distances_m, segments_m
 
 Corners = Sequence[tuple[float, float, float]]
 
@@ -64,23 +65,12 @@ def girder(length_mm: int) -> list[str]:
     ]
 
 
-def segments(bars: Sequence[Bar]) -> tuple[ndarray, ndarray, ndarray]:
-    """Return starts, ends (s, 3) and radii (s,) of the straight pieces of the bars, metres."""
-    lines_m = [np.array(bar.axis_m) for bar in bars]
-    radii_m = [np.full(len(line_m) - 1, bar.diameter_m / 2) for bar, line_m in zip(bars, lines_m, strict=True)]
-    starts_m, ends_m = (
-        np.concatenate([line_m[part] for line_m in lines_m]) for part in (slice(-1), slice(1, None))
-    )
-    return starts_m, ends_m, np.concatenate(radii_m)
-
-
 def surface_distance_m(points_m: Float64[ndarray, "n 3"], bars: Sequence[Bar]) -> Float64[ndarray, " n"]:
     """Return the signed distance of points from the nearest bar with rounded ends, negative inside."""
-    starts_m, ends_m, radii_m = segments(bars)
-    along_m = ends_m - starts_m
-    share = np.einsum("nsk,sk->ns", points_m[:, None] - starts_m, along_m) / (along_m**2).sum(axis=1)
-    nearest_m = starts_m + np.clip(share, 0, 1)[..., None] * along_m
-    return np.asarray((np.linalg.norm(points_m[:, None] - nearest_m, axis=2) - radii_m).min(axis=1))
+    distances_m = [
+        point_distances_m(points_m, segments_m(np.array(bar.axis_m))) - bar.diameter_m / 2 for bar in bars
+    ]
+    return np.asarray(np.min(distances_m, axis=0))
 
 
 def steel_caster(assembly: Assembly) -> RayCaster:

@@ -1,11 +1,13 @@
-"""Poses and rays with the same bits on processors for which BLAS has different kernels."""
+"""Cameras and generated cages with the same bits on processors for which BLAS and NumPy have different kernels."""
 
 from __future__ import annotations
 
 import hashlib
+import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -13,10 +15,16 @@ import pytest
 from dataset_builder.cameras.rigs import rig_cameras
 from dataset_builder.cameras.trajectories import look_at_with_rig
 from dataset_builder.catalog.named_configs import CONFIGS
+from dataset_builder.scene.cages.generate import FAMILIES, cage_assembly, generate_cage
 from rebar_depth_bench.geometry.cameras import inverse_rigid, matrix_product
 
-KERNELS = ("Prescott", "Sandybridge", "Haswell")
-"""Processors whose kernels of OpenBLAS, which NumPy's wheels contain, run on every processor with AVX2."""
+VECTORISED = "AVX512F AVX512CD AVX512_SKX AVX512_CLX AVX512_CNL AVX512_ICL AVX2 FMA3"
+ENVIRONMENTS = (
+    {"OPENBLAS_CORETYPE": "Prescott", "NPY_DISABLE_CPU_FEATURES": VECTORISED},
+    {"OPENBLAS_CORETYPE": "Sandybridge"},
+    {"OPENBLAS_CORETYPE": "Haswell"},
+)
+"""Kernels of OpenBLAS that run on every processor with AVX2; the first also without NumPy's vector functions."""
 
 
 def cameras_digest() -> str:
@@ -33,16 +41,26 @@ def cameras_digest() -> str:
     return digest.hexdigest()
 
 
-def run_with(kernel: str, program: str) -> str:
-    environment = {**os.environ, "OPENBLAS_CORETYPE": kernel}
-    command = [sys.executable, "-c", program]
-    return subprocess.run(command, env=environment, capture_output=True, text=True, check=True).stdout
+def cages_digest() -> str:
+    """Return the digest of a cage of each family, its record and bars, and of the meshes of two."""
+    digest = hashlib.sha256()
+    for number, family in enumerate(FAMILIES):
+        cage = generate_cage("train", number, 3, family)
+        digest.update(json.dumps(cage.record).encode())
+        for bar in cage.bars:
+            digest.update(bar.line_m.tobytes() + (b"" if bar.nominal_m is None else bar.nominal_m.tobytes()))
+        if family in ("beam", "pile-cage"):
+            digest.update(cage_assembly(cage).vertices_m.tobytes())
+    return digest.hexdigest()
 
 
 @pytest.mark.slow
-def test_cameras_have_the_same_bits_with_all_kernels_of_blas() -> None:
-    product = "import numpy as np; a = np.random.default_rng(0).normal(size=(4, 4)); print((a @ a).tobytes())"
-    if len({run_with(kernel, product) for kernel in KERNELS}) == 1:
-        pytest.skip("this NumPy has no OpenBLAS whose kernel can be chosen")
-    program = "from tests.builder.cameras.test_same_bits import cameras_digest; print(cameras_digest())"
-    assert {run_with(kernel, program).strip() for kernel in KERNELS} == {cameras_digest()}
+@pytest.mark.parametrize("digest", [cameras_digest, cages_digest])
+def test_bits_are_the_same_with_all_kernels(digest: Callable[[], str]) -> None:
+    command = [sys.executable, "-c", f"from {__name__} import {digest.__name__}; print({digest.__name__}())"]
+    expected = digest()
+    for environment in ENVIRONMENTS:
+        process = subprocess.run(
+            command, env={**os.environ, **environment}, capture_output=True, text=True, check=True
+        )
+        assert process.stdout.strip() == expected

@@ -24,7 +24,7 @@ from dataset_builder.cli.main import argument_parser
 from dataset_builder.pipeline.contact_sheet import STRIP_PANEL_PX, TILE_PX
 from dataset_builder.pipeline.plan import config_parameters
 from dataset_builder.scene.environments.surroundings import SURROUNDINGS
-from dataset_builder.specs.config_specs import ColourSpec, ConfigSpec, DomeSpec, RigSpec, RingSpec, colour_spec
+from dataset_builder.specs.config_specs import ColourSpec, ConfigSpec, DomeSpec, RigSpec, colour_spec
 from dataset_builder.user_files.make_assembly import make_assembly
 from rebar_depth_bench import score
 from rebar_depth_bench.bar_crossings.crossings_file import read_crossings
@@ -170,12 +170,6 @@ def test_user_scene_without_colour_and_variants_are_added_to_dataset(
     appearance = captured["scenes"][0]["appearance"]
     assert (appearance["image_light"]["image"], appearance["sensor"]["jpeg_quality"]) == ("sunset", 80)
     assert digests[captured["scenes"][0]["mesh"]] == digests[standard["scenes"][0]["mesh"]]
-    card = (root / "README.md").read_text()
-    assert "The light of `lattice-sunset-sensor` is the panorama sunset" in card
-    assert card.count("panorama") == 1
-    assert "`beam`: built without colour; `left_rgb` and `right_rgb` are null in every row." in card
-    assert "![beam: depth](pictures/beam.webp)" in card
-    assert "![lattice: colour, and depth below it]" in card
     (record,) = captured["views"]
     (plain_record,) = (item for item in standard["views"] if item["view_id"] == f"lattice/{index}")
     assert record == {**plain_record, "view_id": record["view_id"]}, "ground truth does not depend on colour"
@@ -187,8 +181,6 @@ def test_user_scene_without_colour_and_variants_are_added_to_dataset(
 @pytest.mark.parametrize(
     ("request_", "problems"),
     [
-        (BuildRequest(variants=("rust",)), [("unknown", "'rust'")]),
-        (BuildRequest(variants=("wet", "rusted")), [("conflict", "")]),
         (BuildRequest(configs=("pier", "latice", "pil")), [("unknown", "--config")] * 2),
         (BuildRequest(views=0, width=2), [("invalid", "--views"), ("invalid", "--width")]),
         (
@@ -207,26 +199,6 @@ def test_invalid_build_request_is_rejected(request_: BuildRequest, problems: lis
     with pytest.raises(InputError) as raised:
         request_.config_specs()
     assert [(problem.code, problem.where) for problem in raised.value.problems] == problems
-
-
-def test_duplicate_config_names_are_rejected() -> None:
-    request = BuildRequest(configs=(), scenes=(CONFIGS["pile"](), CONFIGS["pile"]()))
-    with pytest.raises(InputError, match="more than one config is named pile"):
-        request.config_specs()
-
-
-def test_variant_order_does_not_matter() -> None:
-    specs = BuildRequest(variants=("wet", "formwork")).config_specs()
-    assert specs == BuildRequest(variants=("formwork", "wet")).config_specs()
-    assert specs[0].name == "lattice-wet-formwork"
-
-
-def test_shadow_screen_among_cameras_is_rejected() -> None:
-    [spec] = BuildRequest(configs=("lattice",), variants=("shadows",)).config_specs()
-    check_fits(make_assembly(spec.scene.assembly), spec)
-    far = replace(spec, protocol=RingSpec(radius_m=0.6, elevation_deg=30.0, azimuths=4))
-    with pytest.raises(InputError, match=r"would be among the cameras: 0\.5"):
-        check_fits(make_assembly(far.scene.assembly), far)
 
 
 def test_size_and_samples_reach_every_rig() -> None:
@@ -327,8 +299,6 @@ def test_sweeps_are_built_only_when_named() -> None:
     assert [spec.name for spec in BuildRequest(configs=tuple(options.config)).config_specs()] == list(
         DISTANCE_RANGES_M
     )
-    [dusk] = BuildRequest(configs=("pile-distance",), variants=("dusk",)).config_specs()
-    assert dusk.name == "pile-distance-dusk"
 
 
 def test_sweep_has_the_scene_of_a_dome_at_12_distances_in_8_directions(config: ConfigSpec) -> None:

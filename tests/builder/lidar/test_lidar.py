@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from dataset_builder.lidar import MOBILE, SURVEY, ScannerSpec
 from dataset_builder.lidar.scanner import (
     beam_angles,
-    beam_pattern,
     directions_from_angles,
     reported_range_m,
     simulate_scan,
@@ -76,15 +75,6 @@ def test_sub_rays_have_gaussian_beam_width_at_any_range(
     # ISO 11146: d = 2 sqrt(2) times the root mean square radius
     mean_square_radius_m2 = (offsets_m**2).sum(axis=1).mean()
     assert 8 * mean_square_radius_m2 == pytest.approx(0.004**2 + (0.01 * range_m) ** 2, rel=1e-9)
-
-
-def test_beam_pattern_is_isotropic_gaussian() -> None:
-    points = beam_pattern(2000)
-    for direction in np.linspace(0, math.pi, 7):
-        projections = np.sort(points @ [math.cos(direction), math.sin(direction)])
-        quantiles = np.array([NormalDist().cdf(value) for value in projections])
-        assert np.abs(quantiles - (np.arange(2000) + 0.5) / 2000).max() < 0.01
-    assert beam_pattern(1).tolist() == [[0, 0]]
 
 
 @settings(max_examples=30)
@@ -166,19 +156,6 @@ def test_rod_thinner_than_footprint_needs_enough_light(width_sigma: float) -> No
     assert depth_m == pytest.approx(2.0 if share > 0.5 else 5.0, abs=2e-3)
     without_background_m = single_beam_range_m(spec, wall(2.0, middle_m - half_m, middle_m + half_m))
     assert math.isnan(without_background_m) == (share < 0.1)
-
-
-def test_rod_thinner_than_step_is_missed_at_expected_rate() -> None:
-    rod_m, depth_m = 0.003, 1.0
-    gap_m = depth_m * (math.tan(1.5 * 0.01) - math.tan(0.5 * 0.01))  # between beams 0 and 1
-    columns = np.arange(4)
-    hits = 0
-    for phase in np.linspace(0, 1, 200, endpoint=False):
-        start_m = depth_m * math.tan(HALF_STEP_RAD) + phase * gap_m
-        caster = RayCaster(wall(depth_m, start_m, start_m + rod_m))
-        origins, directions = sub_rays(PERFECT, *beam_angles(PERFECT, np.zeros(4, np.int64), columns))
-        hits += bool(np.isfinite(caster.hits(origins[:, 0], directions[:, 0]).range_m).any())
-    assert hits / 200 == pytest.approx(rod_m / gap_m, abs=0.01)
 
 
 def test_noise_has_specified_sigma_and_is_deterministic() -> None:

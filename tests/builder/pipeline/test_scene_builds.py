@@ -23,7 +23,8 @@ from rebar_depth_bench.data.schema import Survey
 from rebar_depth_bench.geometry.cameras import camera_centre
 from tests.builder.cameras.survey_cages import column, scene
 from tests.builder.catalog.scene_files import write_scene
-from tests.builder.user_files.tube_shapes import CENTRELINES_M, length_m, line_distance_m, swept
+from tests.builder.scene.cages import line_length_m
+from tests.builder.user_files.tube_shapes import CENTRELINES_M, line_distance_m, swept
 from tests.building import TINY, TWO_BARS, RunBuild
 from tests.commands import run_in_process
 
@@ -92,7 +93,7 @@ def test_build_with_bent_bar_and_plate(tmp_path: Path, run_build: RunBuild) -> N
 
     (bars,) = read_bars(root / "bars.parquet").values()
     assert bars[0].diameter_m == pytest.approx(0.012, rel=0.01)
-    assert bars[0].length_m == pytest.approx(length_m(LINE_M), rel=0.005)
+    assert bars[0].length_m == pytest.approx(line_length_m(LINE_M), rel=0.005)
     assert line_distance_m(np.array(bars[0].axis_m), line_m) < 1e-4
     assert not bars[1].has_axis
     assert pq.read_table(root / "bars.parquet")["axis"].null_count == 1

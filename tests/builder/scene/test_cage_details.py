@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from collections.abc import Sequence
 from functools import cache
 
 import numpy as np
@@ -25,15 +24,6 @@ TOUCH_M = 0.006
 
 SHAPES = [(family, shape) for family, kind in FAMILIES.items() for shape in kind.shapes]
 IN_LINKS = [pair for pair in SHAPES if pair[0] in ("column", "beam", "pile-cage", "joint")]
-AXES_BY_SIZE = {
-    "column": {"side_x_m": 0, "side_y_m": 1},
-    "beam": {"side_x_m": 1, "side_y_m": 2},
-    "joint": {"side_y_m": 1},
-    "wall": {"thickness_m": 1},
-    "slab": {"thickness_m": 2},
-    "footing": {"side_x_m": 0, "side_y_m": 1},
-}
-"""Axes along which the steel is within the cover, by the parameter of the size of the concrete."""
 DESIGNS, MAX_DRAWS = 2, 60
 
 
@@ -135,25 +125,6 @@ def test_hooks_of_beam_bars_stay_within_the_outline_of_the_links(shape: str) -> 
             assert inside_m(hull, bar.line_m[:, 1:]).min() > outer_radius_m(bar.diameter_m)
 
 
-@pytest.mark.parametrize("shape", ["square", "rectangular"])
-def test_column_bars_are_near_a_bend_and_ties_hold_bars_at_both_ends(shape: str) -> None:
-    for design in designs("column", shape):
-        bars = [bar for bar in of(design, "main") if np.ptp(bar.line_m[:, 2]) > 1.0]
-        ties = of(design, "tie")
-        places = np.array([bar.line_m[-1, :2] for bar in bars])
-        reach_m = np.abs(places).sum(axis=1)
-        is_held = np.isclose(reach_m, reach_m.max(), atol=1e-6)
-        is_held |= np.array([touched(bar, ties).any() for bar in bars])
-        apart_m = np.linalg.norm(places[:, None] - places[None, is_held], axis=2).min(axis=1)
-        assert apart_m.max() < 0.150 + 0.010  # The distance between bars, not from the axes of legs.
-        hull = outline(of(design, "link")[0], [0, 1])
-        for tie in ties:
-            assert inside_m(hull, tie.line_m[[0, -1], :2]).min() > 2 * tie.diameter_m
-            at = np.flatnonzero(touched(tie, of(design, "main", "starter")))
-            free_m = np.array([at[0], len(touched(tie, [])) - 1 - at[-1]]) * 0.005
-            assert free_m.max() < 0.05 + 8 * tie.diameter_m
-
-
 @pytest.mark.slow
 def test_chairs_stand_on_the_lower_mat_carry_the_upper_one_and_do_not_fall_over() -> None:
     for number, seed in itertools.product(range(9), (3, 4)):
@@ -222,46 +193,13 @@ def test_links_of_a_column_go_on_past_its_beam(shape: str) -> None:
                 assert inside_m(column, bar.line_m[[bar.line_m[:, 0].argmin()], :2])[0] > 2 * bar.diameter_m
 
 
-@pytest.mark.parametrize(("family", "shape"), SHAPES)
-def test_steel_stays_within_the_cover(family: str, shape: str) -> None:
-    is_round = shape in ("round-ties", "spiral") or family == "pile-cage"
-    axes = {"diameter_m": 1} if is_round else AXES_BY_SIZE[family]
-    for design in designs(family, shape):
-        low = np.min([(bar.line_m - bar.diameter_m / 2).min(axis=0) for bar in design.bars], axis=0)
-        high = np.max([(bar.line_m + bar.diameter_m / 2).max(axis=0) for bar in design.bars], axis=0)
-        for name, axis in axes.items():
-            room_m = float(design.parameters[name]) - 2 * float(design.parameters["cover_m"])
-            assert high[axis] - low[axis] <= room_m + 0.002, (name, design.parameters)
-
-
-def drawn(family: str, shape: str, count: int) -> Iterator[Design]:
-    """Yield the designs of ``count`` draws, also those whose bars touch."""
-    rng = np.random.default_rng(5)
-    for _ in range(count):
-        with suppress(InfeasibleError):
-            yield FAMILIES[family].draw(rng, shape)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("shape", FAMILIES["column"].shapes)
-def test_areas_of_steel_are_within_the_limits_of_columns(shape: str) -> None:
-    shares = []
-    for design in drawn("column", shape, 60):
-        parameters = design.parameters
-        steel_m2 = sum(np.pi / 4 * bar.diameter_m**2 for bar in of(design, "main"))
-        if shape in ("square", "rectangular"):
-            concrete_m2 = float(parameters["side_x_m"]) * float(parameters["side_y_m"])
-        else:
-            concrete_m2 = np.pi / 4 * float(parameters["diameter_m"]) ** 2
-        shares.append(steel_m2 / concrete_m2)
-    assert len(shares) > 20
-    assert 0.002 <= min(shares) < 0.006
-    assert 0.025 < max(shares) <= 0.04
-
-
 def test_bars_of_a_second_layer_lie_on_spacers() -> None:
-    checked = 0
-    for design in drawn("beam", "straight", 60):
+    checked, rng = 0, np.random.default_rng(5)
+    for _ in range(60):
+        try:
+            design = FAMILIES["beam"].draw(rng, "straight")
+        except InfeasibleError:
+            continue
         spacers = of(design, "spacer")
         if design.parameters["layers"] != 2.0 or checked > 3:
             assert checked > 3 or not spacers

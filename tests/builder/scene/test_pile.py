@@ -14,7 +14,6 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
-import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -33,7 +32,7 @@ from dataset_builder.scene.shapes.bending import resample_polyline_m
 from dataset_builder.scene.shapes.links import SELF_GAP_M, hook_extension_m, stirrup_centreline_m
 from dataset_builder.specs.config_specs import PileSpec
 from dataset_builder.user_files.make_assembly import make_assembly
-from rebar_depth_bench.geometry.aruco_board import BoardSpec, marker_corners_m
+from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from scripts import simulate_pile
 from scripts.simulate_pile import (
     PHYSICS,
@@ -82,37 +81,13 @@ def test_six_stirrups_are_numbered_in_order(pile: Assembly) -> None:
     )
 
 
-@pytest.mark.slow
-def test_stirrup_meshes_are_closed_around_their_axes(pile: Assembly, lines_m: list[Line]) -> None:
-    for part, line_m in zip(pile.parts, lines_m, strict=True):
-        solid = trimesh.Trimesh(part.mesh.vertices_m, part.mesh.faces, process=False)
-        assert solid.is_watertight
-        assert solid.is_winding_consistent
-        assert len(part.mesh.faces) < 60_000
-        assert solid.volume == pytest.approx(np.pi / 4 * SPEC.diameter_m**2 * line_length_m(line_m), rel=0.01)
-        assert point_distances_m(part.mesh.vertices_m[::97], segments_m(line_m)).max() < RADIUS_M + 1e-9
-
-
 def test_bars_touch_without_intersection(lines_m: list[Line], pile: Assembly) -> None:
     assert -1e-4 < least_gap_m(pile, lambda _: RADIUS_M) < 1e-4, "a heap whose bars do not lie on each other"
     lowest_m = min(line[:, 2].min() for line in lines_m) - RADIUS_M
     assert -1e-4 < lowest_m < 1e-4
-    assert min(part.mesh.vertices_m[:, 2].min() for part in pile.parts) >= lowest_m
-
-
-def test_pile_is_tilted_and_leaves_four_markers_free(lines_m: list[Line], pile: Assembly) -> None:
-    vertices_m = np.concatenate([part.mesh.vertices_m for part in pile.parts])
-    assert np.abs(vertices_m[:, :2]).max() <= 0.17
-    assert vertices_m[:, 2].max() > 0.03
-    normals = [np.linalg.svd(line - line.mean(axis=0))[2][2] for line in lines_m]
-    assert np.rad2deg(np.arccos(min(abs(normal[2]) for normal in normals))) > 8.0
-    covered = [
-        ((vertices_m[:, :2] > corners[:, :2].min(axis=0)) & (vertices_m[:, :2] < corners[:, :2].max(axis=0)))
-        .all(axis=1)
-        .any()
-        for corners in marker_corners_m(BoardSpec()).values()
-    ]
-    assert len(covered) - sum(covered) >= 4
+    for part, line_m in zip(pile.parts, lines_m, strict=True):
+        assert part.mesh.vertices_m[:, 2].min() >= lowest_m
+        assert point_distances_m(part.mesh.vertices_m[::97], segments_m(line_m)).max() < RADIUS_M + 1e-9
 
 
 def developed_length_m(size_m: tuple[float, float], diameter_m: float) -> float:
@@ -163,17 +138,6 @@ def test_stirrup_does_not_intersect_itself(size_m: tuple[float, float], diameter
     assert 0.5 * SELF_GAP_M < own_gap_m < 1.5 * SELF_GAP_M
 
 
-def test_bend_chords_are_within_50_um_of_arc() -> None:
-    line = stirrup_centreline_m(SPEC.size_m, SPEC.diameter_m, RADIUS_M)
-    corner = (line.min(axis=0) + line.max(axis=0)) / 2 + [0.135 - 0.025, 0.095 - 0.025, 0.0]
-    bend = line[(line[:, 0] >= corner[0] - 1e-9) & (line[:, 1] >= corner[1] - 1e-9)]
-    assert len(bend) > 10
-    from_centre_m = np.linalg.norm((bend - corner)[:, :2], axis=1)
-    np.testing.assert_allclose(from_centre_m, 0.025, atol=1e-12)
-    chord_middles = (bend[:-1] + bend[1:]) / 2
-    assert (0.025 - np.linalg.norm((chord_middles - corner)[:, :2], axis=1)).max() < 5e-5
-
-
 @pytest.mark.parametrize(
     ("size_m", "diameter_m"),
     [((0.12, 0.10), 0.010), ((0.03, 0.20), 0.010), ((0.28, 0.20), 0.0), ((float("nan"), 0.2), 0.010)],
@@ -217,16 +181,6 @@ def test_stored_pile_is_at_rest(resettled: SettledPile) -> None:
     assert max_displacement_m(resettled.poses, load_settled_poses(SPEC)) < 1e-6
     assert max(*resettled.speeds, *resettled.spins) < PHYSICS.rest_speed
     assert find_problems(resettled, SPEC) == []
-
-
-@pytest.mark.slow
-def test_lifted_pile_falls() -> None:
-    lifted = [
-        replace(pose, position_m=(*pose.position_m[:2], pose.position_m[2] + 0.02))
-        for pose in load_settled_poses(SPEC)
-    ]
-    fallen = simulate_drop(SPEC, lifted, replace(PHYSICS, rest_for_s=0.5, limit_s=0.2))
-    assert max_displacement_m(fallen.poses, lifted) > 0.01
 
 
 @pytest.mark.slow

@@ -115,11 +115,6 @@ def distance_to_steel_m(points_m: Float64[ndarray, "n 3"], assembly: Assembly) -
     return float(nearest_m)
 
 
-@pytest.mark.parametrize("names", [(), ("dusk", "wet"), ("backlight",), ("mill-scale",)])
-def test_light_and_steel_variants_add_no_props(names: tuple[str, ...]) -> None:
-    assert props("lattice", *names) == ()
-
-
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("kind", "names"),

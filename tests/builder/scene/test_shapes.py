@@ -12,7 +12,7 @@ from scipy.spatial import cKDTree
 from dataset_builder.scene.assemblies.pile import RIBS as PILE_RIBS
 from dataset_builder.scene.model import Mesh
 from dataset_builder.scene.shapes.bar_mesh import STANDARD_RIBS, RibPattern, outer_radius_m, ribbed_bar_mesh
-from dataset_builder.scene.shapes.point_sets import SurfaceSampler, covering_points, farthest_points, short_path
+from dataset_builder.scene.shapes.point_sets import SurfaceSampler, covering_points
 from tests.builder.scene.cages import Line, line_length_m
 
 _BEND_RAD = np.linspace(0.0, np.pi / 2, 60)
@@ -163,26 +163,3 @@ def test_fine_detail_gives_few_covering_points() -> None:
     corners_m = rng.uniform(0, 1, (20_000, 1, 3)) + rng.uniform(0, 1e-3, (20_000, 3, 3))
     mesh = Mesh(corners_m.reshape(-1, 3), np.arange(60_000, dtype=np.int32).reshape(-1, 3))
     assert len(covering_points(mesh, 0.5)) < 200
-
-
-@settings(max_examples=40)
-@given(seed=SEEDS, points=st.integers(1, 40), count=st.integers(0, 45))
-def test_each_point_is_the_farthest_from_those_before(seed: int, points: int, count: int) -> None:
-    points_m = np.random.default_rng(seed).normal(size=(points, 3))
-    chosen = farthest_points(points_m, count)
-    assert len(set(chosen.tolist())) == len(chosen) == min(points, count)
-    for k in range(1, len(chosen)):
-        distance_m = np.linalg.norm(points_m[:, None] - points_m[chosen[:k]], axis=2).min(axis=1)
-        assert distance_m[chosen[k]] == distance_m.max()
-
-
-@settings(max_examples=40)
-@given(seed=SEEDS, points=st.integers(1, 30))
-def test_short_path_goes_to_the_nearest_point_left(seed: int, points: int) -> None:
-    points_m = np.random.default_rng(seed).normal(size=(points, 3))
-    order = short_path(points_m).tolist()
-    assert sorted(order) == list(range(points))
-    assert points_m[order[0], 2] == points_m[:, 2].min()
-    for k in range(1, points):
-        distance_m = np.linalg.norm(points_m[order[k:]] - points_m[order[k - 1]], axis=1)
-        assert distance_m.argmin() == 0

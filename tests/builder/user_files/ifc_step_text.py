@@ -90,11 +90,6 @@ class Step:
     def disc(self, curve: str, radius: float, start: object, end: object) -> str:
         return self.add(f"IFCSWEPTDISKSOLID({curve},{radius!r},$,{start},{end})")
 
-    def extrusion(self, radius: float, depth: float, x: float) -> str:
-        flat = self.add(f"IFCAXIS2PLACEMENT2D({self.point((x, 0.0))},$)")
-        circle = self.add(f"IFCCIRCLEPROFILEDEF(.AREA.,$,{flat},{radius!r})")
-        return self.add(f"IFCEXTRUDEDAREASOLID({circle},{self.axes},{self.direction((0, 0, 1))},{depth!r})")
-
     def shape(self, items: Sequence[str], kind: str = "AdvancedSweptSolid") -> str:
         return self.add(f"IFCSHAPEREPRESENTATION({self.context},'Body','{kind}',({','.join(items)}))")
 

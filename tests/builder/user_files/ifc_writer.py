@@ -14,28 +14,32 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.scene.assemblies.cage import CageBar
+from dataset_builder.specs.file_specs import Trust
 from dataset_builder.user_files.cage_file import raise_problems
 from dataset_builder.user_files.ifc_file import Answer
 from dataset_builder.user_files.ifc_reader.__main__ import write_answer
 
 Numbers = Sequence[float]
+COLUMN = Path("examples/column.ifc")
 SITE_MM = (4_512_345_678.0, 5_432_109_876.0, 215_000.0)
 SITE_TURN_DEG = 31.0
 
 
-def bars_in_process(content: bytes) -> list[CageBar]:
+def bars_in_process(content: bytes, trust: Trust = "declared") -> list[CageBar]:
     """Return the bars of an IFC file, read without the process that ``ifc_cage`` starts."""
     stream = io.BytesIO()
     write_answer(content, stream)
     stream.seek(0)
-    return checked_bars(Answer(stream, "a.ifc"))
-
-
-def checked_bars(answer: Answer) -> list[CageBar]:
-    """Return the bars of an answer; raise ``MeshError`` for the problems of its cage."""
-    cage = answer.cage()
+    cage = Answer(stream, "a.ifc", trust).cage()
     raise_problems(cage.problems, "a.ifc")
     return list(cage.bars)
+
+
+def column_with(old: str, new: str) -> str:
+    """Return the text of the example column with its first ``old`` replaced."""
+    text = COLUMN.read_text()
+    assert old in text
+    return text.replace(old, new, 1)
 
 
 class Ifc:

@@ -14,9 +14,7 @@ from dataset_builder.user_files.cage_file import cage_file_spec, mesh_file_spec
 from rebar_depth_bench.base.errors import MeshError
 from rebar_depth_bench.data.bars import Bar
 from tests.builder.scene.cages import assembly_of
-from tests.builder.user_files.ifc_writer import Ifc, bars_in_process, extruded_square
-
-COLUMN = Path("examples/column.ifc")
+from tests.builder.user_files.ifc_writer import COLUMN, Ifc, bars_in_process, column_with, extruded_square
 
 
 def assert_rejected(content: str, words: str) -> None:
@@ -31,12 +29,6 @@ def bars_of(content: str) -> list[Bar]:
 @pytest.fixture(scope="module")
 def sound() -> list[Bar]:
     return bars_of(COLUMN.read_text())
-
-
-def column_with(old: str, new: str) -> str:
-    text = COLUMN.read_text()
-    assert old in text
-    return text.replace(old, new, 1)
 
 
 @pytest.mark.parametrize(

@@ -23,14 +23,13 @@ from dataset_builder.user_files import mesh_import
 from dataset_builder.user_files.cage_file import load_cage, mesh_file_spec, read_cage
 from rebar_depth_bench.base.errors import MeshError
 from rebar_depth_bench.base.limits import MESH_SECONDS
+from tests.builder.scene.cages import line_length_m
 from tests.builder.user_files.tube_shapes import (
     CENTRELINES_M,
     RODS,
     concatenated,
-    length_m,
     load_content,
     obj_bytes,
-    rod,
     swept,
 )
 
@@ -169,20 +168,6 @@ def test_units_scale_vertices(tmp_path: Path, unit: str | float, per_metre: floa
     np.testing.assert_allclose(assembly.parts[1].mesh.vertices_m, RODS[1].vertices, atol=1e-12)
 
 
-def test_axis_and_diameter_of_open_tube_far_from_origin(tmp_path: Path) -> None:
-    """Fit a tube one end of which is open and one side of which is finely tessellated."""
-    tube = rod(0.016)
-    tube.update_faces(tube.face_normals[:, 0] < 0.5)
-    for _ in range(3):
-        x, y, _ = tube.triangles_center.T
-        tube = tube.subdivide(np.flatnonzero((x > 0.26) & (y > 0)))
-    tube.apply_translation([300, -200, 500])
-    (tmp_path / "a.obj").write_bytes(obj_bytes((tube,), "a"))
-    bar = read_cage(mesh_file_spec(tmp_path / "a.obj", "m")).bars[0].bar
-    np.testing.assert_allclose(bar.axis_m, [[300.0, -200, 500.1], [300.5, -200, 500.1]], rtol=0, atol=2e-6)
-    assert bar.diameter_m == pytest.approx(0.016, rel=0.005)
-
-
 def test_parts_that_are_no_round_bar_have_no_axis_and_are_named(tmp_path: Path) -> None:
     """A note names a wedge, and an object of two wedges, which stays one; a bent bar gets its bent axis."""
     ends = [[x, y, z] for x in (0.0, 1.0) for y, z in ((0.0, 0.0), (0.03, 0.0), (0.0, 0.04))]
@@ -195,7 +180,7 @@ def test_parts_that_are_no_round_bar_have_no_axis_and_are_named(tmp_path: Path) 
     assembly = load_content(tmp_path, "a.obj", obj_bytes(bodies, "abcd"))
     assert [bar.has_axis for bar in assembly.bars] == [False, False, True, True]
     assert len(assembly.bars[3].axis_m) == 2
-    assert assembly.bars[2].length_m == pytest.approx(length_m(line_m), rel=1e-4)
+    assert assembly.bars[2].length_m == pytest.approx(line_length_m(line_m), rel=1e-4)
     (note,) = assembly.notes
     assert (note.source, note.code) == (str(tmp_path / "a.obj"), "axis")
     assert "2 of 4 " in note.text

@@ -43,34 +43,28 @@ def rods_at(x: float, y: float, z: float) -> Cage:
 
 
 @pytest.mark.slow
-@settings(max_examples=25)
-@given(COORDINATE, COORDINATE, COORDINATE, st.sampled_from(["z", "y"]), st.floats(-360, 360))
-def test_centred_cage_is_the_same_wherever_the_file_has_it(
-    x: float, y: float, z: float, up: Up, rotate_deg: float
-) -> None:
-    placement = PlacementSpec(up, "centre", rotate_deg)
-    cage, at_origin = placed(rods_at(x, y, z), placement, "a"), placed(rods_at(0, 0, 0), placement, "b")
-    for bar, expected in zip(cage.bars, at_origin.bars, strict=True):
-        shift_m = np.array(bar.bar.axis_m) - np.array(expected.bar.axis_m)
-        assert np.abs(shift_m).max() <= 0.0021  # The box is centred by whole millimetres.
-        np.testing.assert_allclose(shift_m - shift_m[0], 0, atol=1e-6)
-    vertices_m = cage_assembly(cage, "a").vertices_m
-    assert -1e-9 <= vertices_m[:, 2].min() <= 0.001 + 1e-9
-
-
-@pytest.mark.slow
 @settings(max_examples=40)
 @given(
-    COORDINATE, COORDINATE, st.floats(-360, 360), st.sampled_from(["z", "y"]), st.sampled_from(["centre", "keep"])
+    st.tuples(COORDINATE, COORDINATE, COORDINATE),
+    st.sampled_from(["z", "y"]),
+    st.sampled_from(["centre", "keep"]),
+    st.floats(-360, 360),
 )
-def test_matrix_takes_source_points_to_the_world(
-    x: float, y: float, rotate_deg: float, up: Up, origin: Origin
+def test_matrix_takes_source_points_to_the_world_where_centred_cages_are_equal(
+    place: tuple[float, float, float], up: Up, origin: Origin, rotate_deg: float
 ) -> None:
-    source = rods_at(x, y, 3.0)
-    cage = placed(source, PlacementSpec(up, origin, rotate_deg, (1.0, -2.0, 0.5)), "a")
-    for before, after in zip(source.bars, cage.bars, strict=True):
+    placement = PlacementSpec(up, origin, rotate_deg, (1.0, -2.0, 0.5))
+    source = rods_at(*place)
+    cage, at_origin = placed(source, placement, "a"), placed(rods_at(0, 0, 0), placement, "b")
+    for before, after, expected in zip(source.bars, cage.bars, at_origin.bars, strict=True):
         points = np.column_stack([before.bar.axis_m, np.ones(2)]) @ cage.world_from_source.T
         np.testing.assert_allclose(points[:, :3], after.bar.axis_m, rtol=0, atol=1e-6)
+        if origin == "centre":
+            shift_m = np.array(after.bar.axis_m) - np.array(expected.bar.axis_m)
+            assert np.abs(shift_m).max() <= 0.0021  # The box is centred by whole millimetres.
+            np.testing.assert_allclose(shift_m - shift_m[0], 0, atol=1e-6)
+    if origin == "centre":
+        assert -1e-9 <= cage_assembly(cage, "a").vertices_m[:, 2].min() - 0.5 <= 0.001 + 1e-9
 
 
 def test_order_is_up_centre_rotation_translation() -> None:
@@ -287,14 +281,8 @@ def test_cage_is_centred_by_whole_millimetres(
         number = bar.bar.bar_id - 1
         expected_m = [[0.075 + 0.3 * number, 0.041, z_m] for z_m in (0.04, 2.96)]
         np.testing.assert_allclose(site_m[:, :3], expected_m, rtol=0, atol=2e-6)
-    lengths_m = [bar.bar.length_m for bar in cage.bars]
-    np.testing.assert_allclose(lengths_m[:20], 2.92, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(lengths_m[20:30], 5.92, rtol=0, atol=1e-6)
     if rotate_deg:  # The wall is parallel to the x axis again.
-        assert np.ptp(vertices_m[:, 0]) == pytest.approx(5.92, abs=0.02)
-        assert np.ptp(vertices_m[:, 1]) == pytest.approx(0.204, abs=0.01)
-    rotation = cage.world_from_source[:3, :3] * 1000
-    np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+        np.testing.assert_allclose(np.ptp(vertices_m[:, :2], axis=0), (5.92, 0.204), rtol=0, atol=0.02)
 
 
 @pytest.mark.slow

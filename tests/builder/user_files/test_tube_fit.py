@@ -14,11 +14,11 @@ from dataset_builder.scene.model import Mesh
 from dataset_builder.scene.shapes.bar_mesh import ribbed_bar_mesh
 from dataset_builder.scene.shapes.solids import ring_faces
 from dataset_builder.user_files.tubes.tube_fit import MAX_TRIANGLES, Tube, fit_tube
+from tests.builder.scene.cages import line_length_m
 from tests.builder.user_files.tube_shapes import (
     CENTRELINES_M,
     DIAMETER_M,
     divided,
-    length_m,
     line_distance_m,
     remeshed,
     swept,
@@ -36,7 +36,7 @@ def test_swept_bars_are_recovered(shape: str, facets: int) -> None:
     line_m = CENTRELINES_M[shape]
     tube = fit(swept(line_m, facets))
     assert tube.diameter_m == pytest.approx(DIAMETER_M, rel=1e-3)
-    assert length_m(tube.axis_m) == pytest.approx(length_m(line_m), rel=1e-3)
+    assert line_length_m(tube.axis_m) == pytest.approx(line_length_m(line_m), rel=1e-3)
     assert line_distance_m(tube.axis_m, line_m) < 0.01 * DIAMETER_M
     assert (tube.axis_m[0] == tube.axis_m[-1]).all() == (shape == "closed hoop")
 
@@ -64,7 +64,7 @@ def test_surfaces_without_rings_and_ribbed_bars(shape: str, tessellation: str) -
     line_m = CENTRELINES_M[shape]
     tube = fit(TESSELLATIONS[tessellation](line_m))
     assert tube.diameter_m == pytest.approx(DIAMETER_M, rel=0.01)
-    assert length_m(tube.axis_m) == pytest.approx(length_m(line_m), rel=0.005)
+    assert line_length_m(tube.axis_m) == pytest.approx(line_length_m(line_m), rel=0.005)
     assert line_distance_m(tube.axis_m, line_m) < 0.06 * DIAMETER_M
 
 
@@ -75,7 +75,7 @@ def test_diameter_of_divided_polygons(facets: int, relative_error: float) -> Non
     line_m = CENTRELINES_M["U-bar"]
     tube = fit(divided(swept(line_m, facets)))
     assert (1 - relative_error) * DIAMETER_M < tube.diameter_m < DIAMETER_M
-    assert length_m(tube.axis_m) == pytest.approx(length_m(line_m), rel=0.005)
+    assert line_length_m(tube.axis_m) == pytest.approx(line_length_m(line_m), rel=0.005)
 
 
 @pytest.mark.slow

@@ -49,10 +49,6 @@ CENTRELINES_M: Mapping[str, Line] = {
 """Exact centrelines, metres. A hoop ends at its first point."""
 
 
-def length_m(line_m: Line) -> float:
-    return float(np.linalg.norm(np.diff(line_m, axis=0), axis=1).sum())
-
-
 def swept(line_m: Line, facets: int, diameter_m: float = DIAMETER_M) -> Mesh:
     """Return the mitred tube along a line: polygons whose corners are on the circle; a hoop has no ends."""
     closed = bool(np.allclose(line_m[0], line_m[-1]))
