@@ -17,7 +17,7 @@ import yaml
 from scipy.ndimage import binary_erosion
 
 import rebar_depth_bench as rdb
-from cards.benchmark import PAGES, measures_page
+from cards.benchmark import PAGES
 from cards.dataset import column_rows, dataset_card
 from cards.learned import LEARNED, baseline_tables, learned_tables
 from cards.reference import CAGES, FULL_SETS, SUBSET, reference_context, results_file
@@ -42,45 +42,15 @@ def test_generated_page_in_repository_is_up_to_date(page: Path) -> None:
 
 
 @pytest.mark.slow
-def test_pages_name_every_method_rule_and_measure() -> None:
-    card, measures, results = (PAGES[page]() for page in PAGES)
+def test_pages_name_every_method_and_measure() -> None:
+    _, measures, results = (PAGES[page]() for page in PAGES)
     assert all(f"| `{name}`" in results for name in own_methods())
-    assert "max(p/z, z/p) < 1.25" in card
-    assert "t = 3, 5, 10, 20 mm" in card
-    assert "at least 0.95" in " ".join(card.split())
     shown = set(re.findall(r"`(\w+)`", measures))
     names = {measure.name for family in MEASURE_FAMILIES.values() for measure in family.measures}
     of_tolerances = {name.removeprefix("pass_") for name in names if name.startswith("pass_")}
     binned = {name for name in names if re.search(r"_\d|-", name)}
     assert of_tolerances <= shown
     assert {name for name in names - binned if not name.startswith(("pass_", "capability_"))} <= shown
-
-
-@pytest.mark.slow
-def test_card_has_at_most_4900_words() -> None:
-    card = next(iter(PAGES.values()))()
-    assert len(card.split()) <= 4900
-
-
-@pytest.mark.slow
-def test_names_of_bins_stand_for_their_numbers_only() -> None:
-    rows = measures_page().replace("\\|", "|").splitlines()
-    row = next(line for line in rows if line.startswith("| `single_bar_within_Nmm`"))
-    assert "3 x 3 neighbourhood belongs to one bar with |p - z| <= N mm" in row
-
-
-@pytest.mark.slow
-def test_measures_whose_definitions_end_alike_share_a_row() -> None:
-    rows = measures_page().splitlines()
-    row = next(
-        line for line in rows if "`cover_bias_mm`, `cover_std_mm`, `cover_median_mm`, `cover_p95_mm`" in line
-    )
-    assert (
-        "| - / - / lower / lower | mean / std / median / p95 | [Mean over what was found; Standard deviation"
-        in row
-    )
-    assert row.count("fitted axis minus true axis") == 1
-    assert "95th percentile of the absolute value]: fitted" in row
 
 
 def test_every_column_is_described_once() -> None:

@@ -35,7 +35,7 @@ from rebar_depth_bench.methods.onnx.spec import OUTPUT_MEANINGS, read_onnx_toml
 from rebar_depth_bench.submission import SubmissionMeta
 from scripts.diagrams import PACKAGE_EDGES, diagrams
 from scripts.tables import PAGES as PAGES_WITH_TABLES
-from scripts.tables import TABLES, _size, with_tables
+from scripts.tables import TABLES, with_tables
 from tests.bench.methods.predictors import load_predictor
 from tests.project.pages import (
     DOCS,
@@ -59,7 +59,6 @@ PARSERS: dict[str, ArgumentParser] = {
     "rebar-bench": bench_parser(),
     "rebar-leaderboard": board_parser(),
 }
-MAX_PICTURE_BYTES = 200_000
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
@@ -77,14 +76,6 @@ def test_documented_commands_parse(command: str) -> None:
     else:
         parser = PARSERS[program]
     assert parser.parse_args(with_command(arguments) if program == "rebar-build" else arguments)
-
-
-def test_every_script_of_the_paper_is_listed() -> None:
-    scripts = {Path(shlex.split(command)[1]).name for command in commands("python examples/paper/")}
-    assert scripts == {"anchor.py", "distance.py", "kitti.py", "pseudo_reference.py"}
-    page = (DOCS / "paper.md").read_text()
-    for name in scripts:
-        assert f"[{name}](../examples/paper/{name})" in page
 
 
 def subparsers(parser: ArgumentParser) -> dict[str, ArgumentParser]:
@@ -238,10 +229,6 @@ def test_diagrams_are_current() -> None:
     assert stored == diagrams(), "write them: python -m scripts.diagrams docs/pictures"
 
 
-def test_sizes_have_the_largest_unit_of_which_they_are_multiples() -> None:
-    assert [_size(size) for size in (0, 1000, 1 << 20, 3 << 29)] == ["0 B", "1000 B", "1 MiB", "1536 MiB"]
-
-
 def test_generated_tables_are_current() -> None:
     stored = {name_of(page): page.read_text() for page in PAGES_WITH_TABLES}
     assert stored == {name: with_tables(text) for name, text in stored.items()}, "write them: make tables"
@@ -260,9 +247,7 @@ def test_results_in_readme_are_those_of_the_card() -> None:
     assert row.findall((ROOT / "README.md").read_text()) == expected
 
 
-def test_pictures_are_used_and_small() -> None:
+def test_pictures_are_used() -> None:
     text = "\n".join(page.read_text() for page in PAGES)
     for picture in (DOCS / "pictures").iterdir():
         assert f"pictures/{picture.name}" in text
-        assert picture.suffix in (".webp", ".svg")
-        assert picture.stat().st_size < MAX_PICTURE_BYTES, picture.name

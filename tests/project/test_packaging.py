@@ -172,15 +172,6 @@ def test_version_below_the_bounds_is_named_and_no_data_are_called_damaged(
     assert "damaged" not in refused
 
 
-def test_wheel_brings_no_heavy_packages(installed: Path, tmp_path: Path) -> None:
-    code = "import rebar_depth_bench; print(rebar_depth_bench.__file__)"
-    assert run(installed / "python", "-c", code, cwd=tmp_path).stdout.startswith(str(installed.parent))
-    listed = json.loads(run(installed / "pip", "list", "--format", "json", cwd=tmp_path).stdout)
-    names = {package["name"].lower() for package in listed}
-    assert {"rebar-depth-bench", "numpy", "datasets"} <= names
-    assert not names & {"torch", "bpy", "opencv-contrib-python-headless", "trimesh", "fastapi", "matplotlib"}
-
-
 def test_wheel_alone_exports(installed: Path, tmp_path: Path) -> None:
     run(installed / "rebar-build", "export", TINY_DATASET, "--out", "plain", "--config", "lattice", cwd=tmp_path)
     assert len(list(tmp_path.glob("plain/lattice/**/*.png"))) > 9
@@ -202,5 +193,6 @@ def test_missing_extra_is_named(installed: Path, command: tuple[str, ...], extra
     program, *arguments = command
     finished = run(installed / program, *arguments, cwd=tmp_path, status=2)
     assert f"pip install '.[{extra}]'" in finished.stderr
+    assert extra != "build" or finished.stderr.startswith("error: not installed: bpy")
     assert "Traceback" not in finished.stderr
     assert not list(tmp_path.iterdir())
