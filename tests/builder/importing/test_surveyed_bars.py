@@ -50,6 +50,8 @@ def test_bars_are_read(name: str, tmp_path: Path) -> None:
 
 LINE = "1,main,0.016,0,0,0\n1,main,0.016,1,0,0\n"
 REFUSED: dict[str, tuple[str | bytes, str]] = {
+    "empty": ("", "bars.csv"),
+    "header alone": (f"{HEADER}\n", "bars.csv"),
     "UTF-16": (PLAIN.encode("utf-16"), "the text is UTF-16, expected UTF-8"),
     "Windows-1252": (PLAIN.replace("main", "Bügel").encode("cp1252"), "is not UTF-8"),
     "decimal commas between commas": (
