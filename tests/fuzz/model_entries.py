@@ -159,18 +159,8 @@ def _answering_server(folder: Path) -> Iterator[str]:
 def _submit(workspace: Workspace) -> None:
     token, output = workspace.case / "my.token", workspace.out / "r.json"
     with _answering_server(workspace.case / "answers") as url:
-        bench(
-            "submit",
-            workspace.case / "a.zip",
-            "--url",
-            url,
-            "--token-file",
-            token,
-            "--wait",
-            "3",
-            "--json",
-            output,
-        )
+        options = ("--url", url, "--token-file", token, "--wait", "3", "--json", output)
+        bench("submit", workspace.case / "a.zip", *options)
 
 
 MODEL_ENTRIES = (

@@ -108,10 +108,7 @@ def test_source_distribution_holds_every_file_of_the_repository(
 
 
 def test_wheel_alone_scores_as_the_source(
-    installed: Path,
-    tiny_truth: dict[str, np.ndarray],
-    archive_of: Callable[..., Path],
-    tmp_path: Path,
+    installed: Path, tiny_truth: dict[str, np.ndarray], archive_of: Callable[..., Path], tmp_path: Path
 ) -> None:
     rng = np.random.default_rng(3)
     archive = archive_of({name: 1.1 * z_m * rng.normal(1, 0.01, z_m.shape) for name, z_m in tiny_truth.items()})

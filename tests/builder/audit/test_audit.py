@@ -236,10 +236,6 @@ def row_and_expected(request: pytest.FixtureRequest) -> tuple[Row, ExpectedView]
     return make_row(rig_cameras(rig, pose), rig.baseline_m), expected[1]
 
 
-def test_correct_cameras_pass_on_every_grid(row_and_expected: tuple[Row, ExpectedView]) -> None:
-    assert list(camera_problems(*row_and_expected)) == []
-
-
 def shifted_pose(pose: np.ndarray, shift_m: float) -> np.ndarray:
     pose = pose.copy()
     pose[0, 3] += shift_m
@@ -271,6 +267,7 @@ def test_deviating_cameras_are_reported(
     row_and_expected: tuple[Row, ExpectedView], damage: Callable[[Row], Row], words: str
 ) -> None:
     row, expected = row_and_expected
+    assert list(camera_problems(row, expected)) == []
     problems = list(camera_problems({**row, **damage(row)}, expected))
     assert any(words in problem for problem in problems), problems
 

@@ -49,10 +49,7 @@ GROUND_TRUTH = (*SIZE, "--no-colour")
 
 
 def cages(split: str, scenes: int, views: int = VIEWS) -> tuple[str, ...]:
-    return (
-        *("--config", "cages", "--split", split),
-        *("--scenes", str(scenes), "--views-per-scene", str(views)),
-    )
+    return (*("--config", "cages", "--split", split), *("--scenes", str(scenes), "--views-per-scene", str(views)))
 
 
 @pytest.fixture(scope="module")
