@@ -12,7 +12,6 @@ import time
 from functools import partial
 from pathlib import Path
 
-import datasets
 import numpy as np
 import pytest
 
@@ -193,23 +192,6 @@ def test_imported_mesh_of_the_lattice_is_read_once_and_reproduces_ground_truth(
         assert imported_bar.bar_id == bar.bar_id
         assert imported_bar.diameter_m == pytest.approx(bar.diameter_m, rel=0.01)
         assert np.array(imported_bar.axis_m) == pytest.approx(np.array(bar.axis_m), abs=1e-4)
-
-
-def test_colour_and_other_sizes_replace_a_config_also_in_caches(tmp_path: Path, run_build: RunBuild) -> None:
-    root, other = tmp_path / "dataset", tmp_path / "other"
-    views = ("--scene", str(TWO_BARS), "--views", "2")
-    colour = (*views, "--width", "64", "--height", "36", "--samples", "1", "--overwrite", "two-bars")
-    assert run_build("--out", root, *views, "--width", "96", "--height", "54", "--no-colour").returncode == 0
-    first = datasets.load_dataset(str(root), "two-bars", split="test")
-    assert (first[0]["left_rgb"], first[0]["left_preview"].size) == (None, (96, 54))
-    old_shards = set(root.glob("two-bars/*.parquet"))
-    assert "built: two-bars" in run_build("--out", root, *colour).stdout
-    second = datasets.load_dataset(str(root), "two-bars", split="test")
-    assert second[0]["left_rgb"].size == (64, 36)
-    assert rdb.load(root, "two-bars")[1]["left_depth"].shape == (36, 64)
-    assert not old_shards & set(root.glob("two-bars/*.parquet"))
-    assert run_build("--out", other, *colour[:-2]).returncode == 0
-    assert contents(root) == contents(other)
 
 
 def test_config_with_other_scene_parameters_is_rejected(tiny_root: Path) -> None:

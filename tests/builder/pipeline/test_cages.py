@@ -21,7 +21,6 @@ from dataset_builder.audit import audit
 from dataset_builder.catalog.cages_config import CagesRequest
 from dataset_builder.catalog.named_configs import BuildRequest
 from dataset_builder.cli.main import main
-from dataset_builder.export import export
 from dataset_builder.pipeline import plan as plan_module
 from dataset_builder.pipeline.build import build
 from dataset_builder.pipeline.plan import BUILD_FOLDER, plan_config
@@ -29,7 +28,6 @@ from dataset_builder.scene.cages import generate as generate_module
 from dataset_builder.scene.cages.generate import drawn_family
 from dataset_builder.specs.config_specs import CAGES_VERSION, ColourSpec, GeneratedCageSpec, SceneConfigSpec
 from rebar_depth_bench.base.errors import InputError
-from rebar_depth_bench.cli.main import main as rebar_bench
 from rebar_depth_bench.data.bars import BARS_FILE, read_bars
 from rebar_depth_bench.data.files import MANIFEST_FILE
 from rebar_depth_bench.data.manifest import open_folder
@@ -299,22 +297,3 @@ def test_exact_depth_measures_the_deviation_from_the_design(root: Path, truths: 
     assert abs(numbers["deviation_bias_mm"].value or 0) < 0.1
     assert 1 < (numbers["deviation_true_p95_mm"].value or 0) < 40, "the tolerances of the generator"
     assert {measure.name for measure in MEASURES} <= numbers.keys()
-
-
-def test_commands_work_on_several_scenes(root: Path, tmp_path: Path, truths: Mapping[str, Path]) -> None:
-    archive, constant = truths["train"], tmp_path / "constant.zip"
-    commands = (
-        ("verify", root),
-        ("predict", "constant", "--data", root, "--split", "train", "--out", constant),
-        ("check", constant, "--data", root),
-        ("score", archive, "--data", root, "--html", tmp_path / "r.html", "--groups-csv", tmp_path / "g.csv"),
-        ("table", archive, constant, "--data", root, "--latex", tmp_path / "t.tex"),
-        ("compare", archive, constant, "--data", root),
-    )
-    for command in commands:
-        process = run_in_process(rebar_bench, *command)
-        assert process.returncode == 0, (command[0], process.stderr)
-    groups = {line.split(",")[6] for line in (tmp_path / "g.csv").read_text().splitlines()[1:]}
-    assert groups == {"family", "distance", "bar_width"}
-    exported = export(root, tmp_path / "out", split="train")
-    assert [part.views for part in exported] == [VIEWS] * SPLITS["train"]

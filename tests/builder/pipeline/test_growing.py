@@ -15,6 +15,7 @@ from dataset_builder.catalog.cages_config import CagesRequest
 from dataset_builder.catalog.named_configs import BuildRequest
 from dataset_builder.pipeline.build import BuildSummary, build
 from dataset_builder.pipeline.plan import BUILD_FOLDER
+from dataset_builder.specs.config_specs import ColourSpec
 from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.base.limits import JSON_BYTES, TABLE_BYTES
 from rebar_depth_bench.base.parallel import silent
@@ -144,6 +145,7 @@ def test_finished_config_is_replaced_only_if_it_is_named(
     config = open_folder(tmp_path).config(name)
     assert (summary.built, set(rendered) <= set(config.view_ids)) == ([name], True)
     assert config.rig.width == then.width
+    assert {f"{name}/{path.name}" for path in (tmp_path / name).iterdir()} == set(config.shards)
 
 
 def test_fewer_scenes_and_same_views_lose_nothing(tmp_path: Path) -> None:
@@ -257,8 +259,9 @@ def test_added_and_rebuilt_scenes_are_loaded_in_place_of_cached_ones(tmp_path: P
     assert loaded_ids(root) == [expected()] * 4
     assert first_depth(root) == depth
     shutil.rmtree(root)
-    built(root, cages(1, 1, "train", seed=1, width=64))
+    built(root, cages(1, 1, "train", seed=1, width=64, colour=ColourSpec(1, 1)))
     assert loaded_ids(root) == [expected()] * 4
+    assert datasets.load_dataset(str(root), "cages", split="train")[0]["left_rgb"].size == (64, 18)
     assert all(new != old for new, old in zip(first_depth(root), depth, strict=True))
     assert 'load_dataset("PATH_OR_HUB_ID", "cages", split="train")' in (root / "README.md").read_text()
 
