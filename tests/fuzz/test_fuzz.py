@@ -17,7 +17,6 @@ import pytest
 
 from rebar_depth_bench.base.errors import InputError, Problem, RebarDepthError
 from tests.fuzz.cases import ENTRY_POINTS, number_of_cases
-from tests.fuzz.damage import damage_content
 from tests.fuzz.oracle import CPU_LIMIT_S, Expectation, failures, observe
 from tests.fuzz.worker import Worker
 from tests.fuzz.workspace import Workspace
@@ -112,17 +111,6 @@ def test_sound_actions_have_no_failure(workspace: Workspace) -> None:
     assert failures(refused, EXPECTED) == failures(accepted, EXPECTED) == []
     slow = replace(accepted, cpu_s=CPU_LIMIT_S + 1)
     assert failures(slow, EXPECTED) == [f"time: {CPU_LIMIT_S + 1:.1f} s of processor time"]
-
-
-@pytest.mark.parametrize("name", ["a.json", "a.toml", "a.ply", "a.zip", "a.parquet", "a.png", "a.bin"])
-def test_damage_depends_on_the_seed_only(name: str) -> None:
-    content = b'a = {"b" = [1, 2.5], "c" = "text"}\n' if name == "a.toml" else b'{"a": [1, 2.5], "b": "text"}'
-
-    def damaged(seed: int) -> bytes:
-        return damage_content(name, content, np.random.default_rng(seed))[0]
-
-    assert [damaged(seed) for seed in range(50)] == [damaged(seed) for seed in range(50)]
-    assert len({damaged(seed) for seed in range(50)} - {content}) > 10
 
 
 def test_numbers_of_cases_follow_the_shares() -> None:

@@ -106,18 +106,12 @@ def test_foreign_folder_is_rejected_and_unchanged(tiny_root: Path, tmp_path: Pat
 @pytest.mark.parametrize(
     ("change", "words"),
     [
+        (lambda record: record.update(dataset="sha256:00"), "dataset sha256:00, expected sha256:"),
         (
-            lambda record: record.update(dataset="sha256:00"),
-            r"contains an export of dataset sha256:00, expected sha256:.* as in",
+            lambda record: record["configs"][SMALL_CONFIG[0]].update(key="0"),
+            "config lattice-orbit of another build",
         ),
-        (
-            lambda record: record["configs"]["lattice-orbit"].update(key="0" * 64),
-            "contains config lattice-orbit of another build",
-        ),
-        (
-            lambda record: record.update(format="rebar-depth-export-9"),
-            r"format: got 'rebar-depth-export-9', expected .rebar-depth-export-1.",
-        ),
+        (lambda record: record.update(format="rebar-depth-export-9"), "got 'rebar-depth-export-9', expected"),
     ],
     ids=["dataset", "build", "format"],
 )

@@ -123,11 +123,7 @@ REFUSED: dict[str, tuple[str, bytes, str]] = {
     "TIFF in colour": ("a.tif", saved(GREY.convert("RGB"), "TIFF"), "expected one channel"),
     "TIFF turned": ("a.tif", saved(Image.fromarray(VALUES.astype(np.float32)), "TIFF", tiffinfo={274: 3}), "EXIF"),
     **{
-        f"TIFF {kind}": (
-            "a.tif",
-            tiff(VALUES.astype(kind)),
-            "expected TIFF of float32 or of integers up to 32 bits",
-        )
+        f"TIFF {kind}": ("a.tif", tiff(VALUES.astype(kind)), "expected TIFF of float32 or")
         for kind in ("f2", "f8", "u8", "i8")
     },
     "TIFF float64 of OpenCV": (
@@ -297,10 +293,7 @@ MATRIX = {
 NO_MATRIX = {
     "UTF-16": ("1 0 0 0.5".encode("utf-16"), "the text is UTF-16, expected UTF-8"),
     "decimal commas": (b"1 0 0 0,5 0 1 0 -1 0 0 1 0,2 0 0", "expected a rotation, a translation, and 0 0 0 1"),
-    "decimal commas and semicolons": (
-        b"1;0;0;0,5\n0;1;0;-1\n0;0;1;0,2\n0;0;0;1",
-        "cannot be read: .* numbers with decimal points",
-    ),
+    "decimal commas and semicolons": (b"1;0;0;0,5\n0;1;0;-1\n0;0;1;0,2\n0;0;0;1", "numbers with decimal points"),
     "words": (b"pose 1 0 0 0", "'pose'"),
     "other number": (b"1 0 0 0.5 0 1 0 -1", "holds 8 numbers, expected 4 x 4"),
 }
