@@ -113,12 +113,6 @@ def test_sound_actions_have_no_failure(workspace: Workspace) -> None:
     assert failures(slow, EXPECTED) == [f"time: {CPU_LIMIT_S + 1:.1f} s of processor time"]
 
 
-def test_numbers_of_cases_follow_the_shares() -> None:
-    numbers = number_of_cases(10_000, list(ENTRY_POINTS))
-    assert sum(numbers.values()) == pytest.approx(10_000, rel=0.01)
-    assert min(number_of_cases(1, list(ENTRY_POINTS)).values()) == 1
-
-
 @pytest.mark.slow
 def test_dead_and_hanging_workers_fail_the_case() -> None:
     with Worker() as worker, Worker(hang_s=0.01) as slow_worker:

@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from scipy.ndimage import binary_erosion
 
 import rebar_depth_bench as rdb
@@ -58,17 +57,6 @@ def test_every_column_is_described_once() -> None:
     described = [name.strip("`") for row in rows for name in row["names"].split(", ")]
     assert sorted(described) == sorted(features())
     assert {row["type"] for row in rows if "K`" in row["names"]} == {"float64 x 3 x 3"}
-
-
-def test_dataset_card_yaml_matches_folder(tiny_root: Path) -> None:
-    text = (tiny_root / "README.md").read_text()
-    metadata = yaml.safe_load(text.split("---")[1])
-    assert [config["config_name"] for config in metadata["configs"]] == ["lattice", "lattice-orbit"]
-    for config in metadata["configs"]:
-        pattern = config["data_files"][0]["path"]
-        assert sorted(tiny_root.glob(pattern)) == sorted(tiny_root.glob(f"{config['config_name']}/*.parquet"))
-    counts = {info["config_name"]: info["splits"][0]["num_examples"] for info in metadata["dataset_info"]}
-    assert counts == {"lattice": 9, "lattice-orbit": 2}
 
 
 def test_dataset_card_steel_share_matches_masks(tiny_root: Path, tiny_masks: dict[str, np.ndarray]) -> None:

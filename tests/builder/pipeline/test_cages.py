@@ -28,7 +28,6 @@ from dataset_builder.scene.cages import generate as generate_module
 from dataset_builder.scene.cages.generate import drawn_family
 from dataset_builder.specs.config_specs import CAGES_VERSION, ColourSpec, GeneratedCageSpec, SceneConfigSpec
 from rebar_depth_bench.base.errors import InputError
-from rebar_depth_bench.data.bars import BARS_FILE, read_bars
 from rebar_depth_bench.data.files import MANIFEST_FILE
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.extended.as_built import MEASURES
@@ -37,7 +36,6 @@ from rebar_depth_bench.scoring.truth import reference_errors
 from tests.building import RunBuild, StartBuild, contents, staged_rows
 from tests.commands import run_in_process
 from tests.dask_cluster import NewCluster
-from tests.ground_truth import truth_of
 from tests.processes import wait_until
 
 SPLITS = {"train": 2, "validation": 1}
@@ -92,16 +90,6 @@ def test_views_of_a_split_are_named_by_family_split_and_number(root: Path, strea
     rows = list(rdb.load(root, "cages", split="train", streaming=streaming))
     assert [row["view_id"] for row in rows] == expected
     assert all(row["left_depth"].shape == (180, 320) and row["left_mask"].any() for row in rows)
-
-
-def test_bars_have_nominal_axes(root: Path) -> None:
-    entries = {scene.name: scene.entry for scene in open_folder(root).config("cages").scenes}
-    for scene, bars in read_bars(root / BARS_FILE).items():
-        designed = [bar for bar in bars if bar.nominal_axis_m]
-        record = entries[scene]["cage"]
-        assert len(bars) - len(designed) == record["doubled"]
-        off_m = [np.linalg.norm(np.subtract(bar.axis_m[0], bar.nominal_axis_m[0])) for bar in designed]
-        assert 0 < max(off_m) < 0.1
 
 
 def test_card_states_how_far_mats_are_off(root: Path) -> None:
@@ -273,17 +261,6 @@ def test_exact_depth_is_perfect_in_every_group(root: Path, truths: Mapping[str, 
             assert (group["native.abs_rel"], group["native.delta1"]) == (0.0, 1.0)
             assert {group.number(column) for column in WITHIN} == {1.0}
             assert 0 < group["reference.one_pixel.abs_rel"] < 1
-
-
-def test_widths_follow_from_bars_and_cameras(root: Path) -> None:
-    """Bars of the cages are millimetres wide: their width in pixels is that in the middle of the steel."""
-    diameters_m = {bar.diameter_m for bars in read_bars(root / BARS_FILE).values() for bar in bars}
-    rows = rdb.load(root, "cages", split="train", columns=["view_id", "left_K"])
-    for row, view in zip(rows, truth_of(root, "cages", "train").traits, strict=True):
-        assert view.bar_width_px is not None
-        assert view.family is not None
-        about_m = view.bar_width_px * view.distance_m / row["left_K"][0, 0]
-        assert 0.5 * min(diameters_m) < about_m < 2 * max(diameters_m)
 
 
 def test_exact_depth_measures_the_deviation_from_the_design(root: Path, truths: Mapping[str, Path]) -> None:

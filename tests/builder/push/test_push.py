@@ -12,7 +12,7 @@ import pytest
 from huggingface_hub import constants
 from starlette.requests import Request
 
-from tests.builder.push.published import (
+from tests.builder.push.conftest import (
     HUB_ID,
     KEY,
     accept_xet,
