@@ -53,14 +53,6 @@ def power_law(slope: float, noise: float, seed: int) -> pd.DataFrame:
     return table(SWEEP_M, [0.5 * metres**slope * math.exp(rng.normal(0, noise)) for metres in SWEEP_M])
 
 
-@pytest.mark.parametrize("slope", [-0.5, 0.0, 0.7, 1.0])
-def test_power_law_is_recovered_exactly(slope: float) -> None:
-    fit = scale_slope("c", {"c": power_law(slope, 0.0, 0)})
-    assert fit["slope"]["value"] == pytest.approx(slope, abs=1e-12)
-    assert fit["slope"]["interval"] == pytest.approx((slope, slope), abs=1e-9)
-    assert (fit["nearest_m"], fit["farthest_m"]) == pytest.approx((0.22, 1.54))
-
-
 @pytest.mark.slow
 def test_slope_interval_has_nominal_coverage() -> None:
     covered, widths = 0, []
@@ -89,7 +81,7 @@ def test_slope_of_all_configs_uses_all_usable_views() -> None:
     far = table(np.linspace(8.0, 16.0, 10).tolist(), [5.0] * 10, step=12)
     fit = scale_slope("all", {"a": near, "b": far, "c": near[:0]})
     x = np.log([*near["distance_m"][:10], *far["distance_m"]])
-    assert fit["views"] == 20
+    assert (fit["views"], fit["nearest_m"], fit["farthest_m"]) == (20, 0.2, 16.0)
     assert fit["slope"]["value"] == pytest.approx(np.polyfit(x, np.log([0.5] * 10 + [5.0] * 10), 1)[0])
     low, high = fit["slope"]["interval"]
     assert 0 < low <= fit["slope"]["value"] <= high

@@ -125,27 +125,23 @@ def test_target_is_canonical_depth_of_both_eyes(example: dict[str, Any]) -> None
     assert example["image_mean"](error, torch.cat([steel[:1], torch.zeros_like(steel[:1])])) == 1
 
 
-def test_other_options_do_not_continue_a_checkpoint(
-    root: Path, example: dict[str, Any], trained: Path, capsys: pytest.CaptureFixture[str]
+def test_other_options_and_unusable_inputs_are_refused(
+    root: Path,
+    example: dict[str, Any],
+    trained: Path,
+    tiny_root: Path,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    before = (trained / "checkpoint.pt").read_bytes()
-    assert example["main"]([str(root), "--out", str(trained), "--epochs", "6", "--seed", "1", *OPTIONS]) == 2
-    assert "other seed" in capsys.readouterr().err
-    assert (trained / "checkpoint.pt").read_bytes() == before
-
-
-def test_folder_without_cages_is_refused(
-    example: dict[str, Any], tiny_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    assert example["main"]([str(tiny_root), "--out", str(tmp_path / "out")]) == 2
-    assert "cages" in capsys.readouterr().err
+    checkpoint = (trained / "checkpoint.pt").read_bytes()
+    (tmp_path / "half").mkdir()
+    (tmp_path / "half" / "checkpoint.pt").write_bytes(checkpoint[: len(checkpoint) // 2])
+    for data, out, options, words in (
+        (root, trained, ("--epochs", "6", "--seed", "1"), "other seed"),
+        (tiny_root, tmp_path / "out", (), "cages"),
+        (root, tmp_path / "half", (), "checkpoint.pt: cannot be read"),
+    ):
+        assert example["main"]([str(data), "--out", str(out), *options, *OPTIONS]) == 2
+        assert words in capsys.readouterr().err
+    assert (trained / "checkpoint.pt").read_bytes() == checkpoint
     assert not (tmp_path / "out").exists()
-
-
-def test_damaged_checkpoint_is_refused(
-    root: Path, example: dict[str, Any], trained: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    whole = (trained / "checkpoint.pt").read_bytes()
-    (tmp_path / "checkpoint.pt").write_bytes(whole[: len(whole) // 2])
-    assert example["main"]([str(root), "--out", str(tmp_path), *OPTIONS]) == 2
-    assert "checkpoint.pt: cannot be read" in capsys.readouterr().err

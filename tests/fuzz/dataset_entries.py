@@ -32,12 +32,8 @@ from tests.synthetic_dataset import write_split_dataset
 CONFIG = "lattice-orbit"
 ROOT = f"{CASE}/root"
 SHARDS = f"{ROOT}/{CONFIG}/*.parquet"
-METADATA = (
-    f"{ROOT}/manifest.json",
-    f"{ROOT}/README.md",
-    f"{ROOT}/bars.parquet",
-    f"{ROOT}/crossings.parquet",
-)
+_TABLES = ("manifest.json", "README.md", "bars.parquet", "crossings.parquet")
+METADATA = tuple(f"{ROOT}/{name}" for name in _TABLES)
 OPTIONAL_OUTPUTS = (*("--html", "r.html", "--csv", "r.csv", "--extended-csv", "e.csv", "--html-views", "1"),)
 
 
@@ -130,19 +126,8 @@ def _write_mat_and_detections(workspace: Workspace) -> None:
     root = workspace.root / ROOT
     root.mkdir(parents=True)
     write_mat_dataset(root)
-    rows = [
-        {
-            "view_id": "mat/0000",
-            "x": 0.01 * i,
-            "y": 0.0,
-            "z": 0.4,
-            "nx": 0.0,
-            "ny": 0.0,
-            "nz": 1.0,
-            "confidence": i,
-        }
-        for i in range(-3, 4)
-    ]
+    rest = {"y": 0.0, "z": 0.4, "nx": 0.0, "ny": 0.0, "nz": 1.0}
+    rows = [{"view_id": "mat/0000", "x": 0.01 * i, **rest, "confidence": i} for i in range(-3, 4)]
     pd.DataFrame(rows).to_csv(workspace.case / "d.csv", index=False)
     table = pa.Table.from_pylist(rows).replace_schema_metadata({"method": "detector", "inputs": "rgb"})
     pq.write_table(table, workspace.case / "d.parquet")
@@ -175,15 +160,7 @@ def _build(workspace: Workspace) -> None:
 
 
 _REQUEST = BuildRequest(configs=(CONFIG,), views=2, width=160, height=90, colour=colour_spec(quality="preview"))
-_DATASET_FILES = (
-    "manifest.json",
-    "README.md",
-    "bars.parquet",
-    "crossings.parquet",
-    "pictures/*.webp",
-    "meshes/*.ply",
-    "*/test-*.parquet",
-)
+_DATASET_FILES = (*_TABLES, "pictures/*.webp", "meshes/*.ply", "*/test-*.parquet")
 _FROM_ARCHIVE = partial(EntryPoint, prepare=write_dataset_and_archive, result=score_result, covered=True)
 
 DATASET_ENTRIES = (

@@ -215,37 +215,15 @@ _calibration = partial(file_entry, read=_read_calibration, share=8)
 _cameras = partial(file_entry, read=_read_cameras)
 _picture = partial(file_entry, write=_write_capture_image, read=_open_capture)
 _UPRIGHT = partial(_write_capture_image, exif=b"II*\0\x08\0\0\0\1\0\x12\1\3\0\1\0\0\0\1\0\0\0\0\0\0\0")
+_slow = partial(file_entry, is_quick=False, cpu_s=10.0)
+_ifc = partial(_slow, read=_read_cage, shows_truncation=True)
 _content = partial(file_entry, special_files=False)
 _depth = partial(_content, read=_decode_depth)
 FILE_ENTRIES = (
     file_entry("scene TOML", "scene.toml", partial(_copy, TWO_BARS), scene_config, share=8),
-    file_entry(
-        "scene TOML: beam",
-        "beam.toml",
-        partial(_copy, EXAMPLES / "beam.toml"),
-        scene_config,
-        is_quick=False,
-        cpu_s=10.0,
-    ),
-    file_entry(
-        "IFC",
-        "c.ifc",
-        partial(_copy, EXAMPLES / "column.ifc"),
-        _read_cage,
-        share=5,
-        is_quick=False,
-        cpu_s=10.0,
-        shows_truncation=True,
-    ),
-    file_entry(
-        "IFC: solids of a bar",
-        "c.ifc",
-        lambda path: path.write_text(_ifc_of_solids()),
-        _read_cage,
-        is_quick=False,
-        cpu_s=10.0,
-        shows_truncation=True,
-    ),
+    _slow("scene TOML: beam", "beam.toml", partial(_copy, EXAMPLES / "beam.toml"), scene_config),
+    _ifc("IFC", "c.ifc", partial(_copy, EXAMPLES / "column.ifc"), share=5),
+    _ifc("IFC: solids of a bar", "c.ifc", lambda path: path.write_text(_ifc_of_solids())),
     _mesh("mesh: dataset PLY", "a.ply", _dataset_ply),
     _mesh("mesh: binary PLY", "a.ply", lambda path: _rods().export(path)),
     _mesh("mesh: ASCII PLY", "a.ply", lambda path: _rods().export(path, encoding="ascii"), share=6),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import astuple
 from functools import partial
 from pathlib import Path
@@ -12,6 +11,7 @@ from PIL import Image
 
 from dataset_builder.importing.config_import import plan_import
 from tests.bench.submission.zips import exr, npy, npz, png
+from tests.builder.importing.source_data import tiff
 from tests.fuzz.file_entries import file_entry, is_finite
 from tests.fuzz.workspace import EntryPoint
 
@@ -58,12 +58,6 @@ _BARS = """bar_id,role,diameter_m,x_m,y_m,z_m
 2,stirrup,0.01,0.1,0.3,0.1
 """
 _SPREADSHEET = "\ufeffsep=;\r\n" + _BARS.upper().replace(",", ";").replace("\n", "\r\n")
-
-
-def _tiff(depth_m: np.ndarray) -> bytes:
-    stream = io.BytesIO()
-    Image.fromarray(depth_m).save(stream, "TIFF")
-    return stream.getvalue()
 
 
 def _pfm(depth_m: np.ndarray) -> bytes:
@@ -127,8 +121,8 @@ IMPORT_ENTRIES = (
     _imported_depth("npy", "npy", npy(IMPORTED_M)),
     _imported_depth("npz", "npz", npz(depth=IMPORTED_M)),
     _imported_depth("npy of integers", "npy", npy(np.round(1000 * IMPORTED_M).astype(np.int32)), _MILLIMETRES),
-    _imported_depth("TIFF", "tif", _tiff(IMPORTED_M)),
-    _imported_depth("TIFF of integers", "tif", _tiff(np.round(1000 * IMPORTED_M).astype(np.uint16)), _MILLIMETRES),
+    _imported_depth("TIFF", "tif", tiff(IMPORTED_M)),
+    _imported_depth("TIFF of integers", "tif", tiff(np.round(1000 * IMPORTED_M).astype(np.uint16)), _MILLIMETRES),
     _imported_depth("PFM", "pfm", _pfm(IMPORTED_M)),
     _imported("import: EXR", "depth-a.exr", lambda path: _write_import(path, exr(path, {"V": IMPORTED_M}), "exr")),
     _imported_depth("PNG", "png", png(np.round(1000 * IMPORTED_M)), _MILLIMETRES),

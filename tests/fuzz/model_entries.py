@@ -3,23 +3,17 @@
 from __future__ import annotations
 
 import json
-import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
-from functools import partial
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 
 import onnx
 
 from rebar_depth_bench.base.errors import MethodError
 from rebar_depth_bench.cli.console import EXIT_DONE, EXIT_INPUT, EXIT_OTHER
-from rebar_depth_bench.data.files import file_sha256
 from rebar_depth_bench.methods import find_method
 from tests.bench.captures.example_capture import write_capture
 from tests.bench.methods.onnx_models import write_mixer_model, write_toml
 from tests.fuzz.dataset_entries import CONFIG, ROOT, check_predictions, write_dataset, write_result
 from tests.fuzz.workspace import CASE, OUT, EntryPoint, Workspace, bench
+from tests.leaderboard.scripted_server import TOKEN_INFO, answer, scripted_server, submission
 
 _STOPPING_METHOD = """
 from pathlib import Path
@@ -33,26 +27,6 @@ def predict(row):
 
 METHOD = Method(MethodInfo("stopping", "stops", ("view_id", "left_rgb"), False, "here", "MIT"), lambda: predict)
 """
-_SUBMISSION = {
-    "id": "5f1c2a",
-    "url": "http://127.0.0.1/submissions/5f1c2a",
-    "method": "noisy-truth",
-    "public": True,
-    "created_at": "2026-01-31T12:00:00Z",
-    "finished_at": None,
-    "reason": None,
-    "archive_bytes": 1234,
-    "archive_kept": True,
-    "result": None,
-}
-_TOKEN = {
-    "name": "a",
-    "quota": 10,
-    "quota_left": 9,
-    "quota_bytes": 1 << 40,
-    "quota_bytes_left": 1 << 39,
-    "max_upload_bytes": 1 << 30,
-}
 
 
 def _predict(workspace: Workspace, method: str) -> None:
@@ -97,80 +71,22 @@ def _write_checkpoint(workspace: Workspace) -> None:
 
 
 def _write_answers(workspace: Workspace) -> None:
-    (workspace.case / "answers").mkdir()
+    """Write the content of the answer of each endpoint of the leaderboard."""
+    folder, archive = workspace.case / "answers", workspace.case / "a.zip"
+    folder.mkdir()
     (workspace.case / "my.token").write_text("secret\n")
-    write_result(workspace, workspace.case / "answers" / "result.json")
-    submission = _SUBMISSION | {"archive_sha256": file_sha256(workspace.case / "a.zip")}
-    answers = {
-        "token": _TOKEN,
-        "accepted": submission | {"status": "queued"},
-        "submission": submission | {"status": "scored"},
-    }
-    for name, answer in answers.items():
-        (workspace.case / "answers" / f"{name}.json").write_text(json.dumps(answer))
-
-
-class _Answers(BaseHTTPRequestHandler):
-    """Handler that answers each request of the client with a file of the folder ``answers``."""
-
-    def __init__(self, folder: Path, *arguments: object) -> None:
-        self._folder = folder
-        super().__init__(*arguments)  # type: ignore[arg-type]
-
-    def do_GET(self) -> None:
-        name = self.path.rpartition("/")[2]
-        self._send(200, {"token": "token", "result.json": "result"}.get(name, "submission"))
-
-    def do_PUT(self) -> None:
-        self.do_POST()
-
-    def do_POST(self) -> None:
-        if self.headers["Transfer-Encoding"] == "chunked":
-            while size := int(self.rfile.readline(), 16):
-                self.rfile.read(size + len("\r\n"))
-        else:
-            self.rfile.read(int(self.headers["Content-Length"]))
-        self._send(202, "accepted")
-
-    def log_message(self, *_: object) -> None:
-        """Write no log."""
-
-    def _send(self, status: int, name: str) -> None:
-        content = (self._folder / f"{name}.json").read_bytes()
-        self.send_response(status)
-        self.send_header("Content-Type", "application/json")
-        self.send_header("Content-Length", str(len(content)))
-        self.end_headers()
-        self.wfile.write(content)
-
-
-@contextmanager
-def _answering_server(folder: Path) -> Iterator[str]:
-    with ThreadingHTTPServer(("127.0.0.1", 0), partial(_Answers, folder)) as server:
-        thread = threading.Thread(target=server.serve_forever, args=(0.01,))
-        thread.start()
-        try:
-            yield f"http://127.0.0.1:{server.server_port}"
-        finally:
-            server.shutdown()
-            thread.join()
+    write_result(workspace, folder / "result.json")
+    answers = {"token": TOKEN_INFO, "submit": submission(archive), "status": submission(archive, status="scored")}
+    for endpoint, content in answers.items():
+        (folder / f"{endpoint}.json").write_text(json.dumps(content))
 
 
 def _submit(workspace: Workspace) -> None:
-    token, output = workspace.case / "my.token", workspace.out / "r.json"
-    with _answering_server(workspace.case / "answers") as url:
-        bench(
-            "submit",
-            workspace.case / "a.zip",
-            "--url",
-            url,
-            "--token-file",
-            token,
-            "--wait",
-            "3",
-            "--json",
-            output,
-        )
+    with scripted_server() as server:
+        folder = workspace.case / "answers"
+        server.answers = {path.stem: [answer(path.read_bytes())] for path in folder.iterdir()}
+        options = ("--token-file", workspace.case / "my.token", "--wait", "3", "--json", workspace.out / "r.json")
+        bench("submit", workspace.case / "a.zip", "--url", server.url, *options)
 
 
 MODEL_ENTRIES = (

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import resource
-import shutil
 import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
@@ -22,7 +21,7 @@ from tests.fuzz.dataset_entries import CONFIG, write_dataset_and_archive
 from tests.fuzz.oracle import Expectation, Observation, failures
 from tests.fuzz.workspace import CACHE, CASE, Workspace, changes
 
-BENCH, BUILD, BOARD = "rebar_depth_bench", "dataset_builder", "leaderboard"
+BENCH, BUILD = "rebar_depth_bench", "dataset_builder"
 Arguments = Sequence[str | Path]
 
 
@@ -77,14 +76,6 @@ def _modules_beside(workspace: Workspace) -> Arguments:
     return "--out", workspace.out / "root", "--scene", workspace.case / "c.ifc", *TINY_SIZE
 
 
-def _linked_meshes(workspace: Workspace) -> Arguments:
-    shutil.rmtree(workspace.case / "root" / "meshes", ignore_errors=True)
-    (workspace.case / "victim" / "mine.ply").write_text("Not to be deleted.\n")
-    (workspace.case / "root" / "meshes").symlink_to(workspace.case / "victim")
-    options = ("--config", CONFIG, "--views", "2", *TINY_SIZE)
-    return "--out", workspace.case / "root", *options
-
-
 def _export_outside(workspace: Workspace) -> Arguments:
     _edit_manifest(workspace, lambda m: m["configs"][CONFIG]["scenes"][0].update(shards=["../victim/notes.txt"]))
     return "export", workspace.case / "root", "--out", workspace.out / "export"
@@ -97,11 +88,6 @@ def _audit_of_pipe(workspace: Workspace) -> Arguments:
     return "audit", workspace.case / "root", "--depth-views", "0"
 
 
-def _settings_of_device(workspace: Workspace) -> Arguments:
-    (workspace.case / "s.toml").symlink_to("/dev/zero")
-    return "serve", "--settings", workspace.case / "s.toml"
-
-
 _COLUMN = Path(__file__).parents[2] / "examples" / "column.ifc"
 
 KNOWN_CASES: Mapping[str, tuple[str, Callable[[Workspace], Arguments]]] = {
@@ -111,10 +97,8 @@ KNOWN_CASES: Mapping[str, tuple[str, Callable[[Workspace], Arguments]]] = {
     "cache: folder is a link": (BENCH, _clear_linked_cache),
     "submit: token file is a device": (BENCH, _no_server),
     "build: modules in the working folder": (BUILD, _modules_beside),
-    "build: folder of meshes is a link": (BUILD, _linked_meshes),
     "export: shard outside": (BUILD, _export_outside),
     "audit: bars are a pipe": (BUILD, _audit_of_pipe),
-    "leaderboard: settings are a device": (BOARD, _settings_of_device),
 }
 """Program of each command, and the function that writes its input and returns its arguments."""
 PROJECT = Path(__file__).parents[2]

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 import sys
@@ -17,11 +16,7 @@ import numpy as np
 import pytest
 
 from rebar_depth_bench.base.errors import InputError, Problem, RebarDepthError
-from rebar_depth_bench.scoring.reading import read_result
-from tests.bench.reporting.results import result, scored_view
-from tests.fuzz.__main__ import table, write_log
-from tests.fuzz.cases import ENTRY_POINTS, Outcome, number_of_cases
-from tests.fuzz.damage import damage_content
+from tests.fuzz.cases import ENTRY_POINTS, number_of_cases
 from tests.fuzz.oracle import CPU_LIMIT_S, Expectation, failures, observe
 from tests.fuzz.worker import Worker
 from tests.fuzz.workspace import Workspace
@@ -66,22 +61,6 @@ def test_depth_map_is_refused_or_read_wherever_it_ends(name: str, workspace: Wor
         path.write_bytes(sound[:end])
         assert failures(observe(lambda: entry.run(workspace), workspace), expected) == [], end
         (workspace.out / "result").unlink(missing_ok=True)
-
-
-@pytest.mark.parametrize(
-    "place", [("tables",), ("views",), ("tables", "lattice", "native"), ("views", 0, "within_mm")]
-)
-@pytest.mark.parametrize("value", [None, 3, "x", [1] * 200_000, {"a": 1}, True, [[]] * 3])
-def test_wrong_type_in_result_names_place(place: tuple[str | int, ...], value: object) -> None:
-    document = json.loads(result(scored_view("lattice/0000")).to_json())
-    target = document
-    for key in place[:-1]:
-        target = target[key]
-    target[place[-1]] = value
-    with pytest.raises(InputError, match=r"result\.json") as caught:
-        read_result(json.dumps(document).encode(), "result.json")
-    assert any(str(place[0]) in str(problem) for problem in caught.value.problems)
-    assert len(str(caught.value)) < 5000
 
 
 def _write_and_refuse(path: Path) -> None:
@@ -134,23 +113,6 @@ def test_sound_actions_have_no_failure(workspace: Workspace) -> None:
     assert failures(slow, EXPECTED) == [f"time: {CPU_LIMIT_S + 1:.1f} s of processor time"]
 
 
-@pytest.mark.parametrize("name", ["a.json", "a.toml", "a.ply", "a.zip", "a.parquet", "a.png", "a.bin"])
-def test_damage_depends_on_the_seed_only(name: str) -> None:
-    content = b'a = {"b" = [1, 2.5], "c" = "text"}\n' if name == "a.toml" else b'{"a": [1, 2.5], "b": "text"}'
-
-    def damaged(seed: int) -> bytes:
-        return damage_content(name, content, np.random.default_rng(seed))[0]
-
-    assert [damaged(seed) for seed in range(50)] == [damaged(seed) for seed in range(50)]
-    assert len({damaged(seed) for seed in range(50)} - {content}) > 10
-
-
-def test_numbers_of_cases_follow_the_shares() -> None:
-    numbers = number_of_cases(10_000, list(ENTRY_POINTS))
-    assert sum(numbers.values()) == pytest.approx(10_000, rel=0.01)
-    assert min(number_of_cases(1, list(ENTRY_POINTS)).values()) == 1
-
-
 @pytest.mark.slow
 def test_dead_and_hanging_workers_fail_the_case() -> None:
     with Worker() as worker, Worker(hang_s=0.01) as slow_worker:
@@ -163,15 +125,3 @@ def test_dead_and_hanging_workers_fail_the_case() -> None:
     assert replace(first, cpu_s=0, peak_mib=0, stderr="") == replace(again, cpu_s=0, peak_mib=0, stderr="")
     assert crashed.failures[0].startswith("crash: exit status -9")
     assert hanging.failures[0].startswith("hang: ")
-
-
-def test_table_and_log_count_the_outcomes(tmp_path: Path) -> None:
-    accepted = Outcome("load", 0, 0, "a.json: bytes", 0, (), (), 0.5, 1, "")
-    refused = replace(accepted, case=1, status=2, codes=("syntax", "missing"))
-    failed = replace(accepted, case=2, status=1, failures=("status: 1",))
-    outcomes = [accepted, refused, refused, failed]
-    assert table(outcomes).splitlines()[-1].split() == ["all", "4", "1", "2", "1", "0.500", "syntax", "2"]
-    write_log(outcomes, tmp_path / "log.jsonl")
-    counts, failure = (tmp_path / "log.jsonl").read_text().splitlines()
-    assert '"accepted": 1, "refused": 2, "failed": 1' in counts
-    assert '"case": 2' in failure

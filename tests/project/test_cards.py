@@ -13,11 +13,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-import yaml
 from scipy.ndimage import binary_erosion
 
 import rebar_depth_bench as rdb
-from cards.benchmark import PAGES, measures_page
+from cards.benchmark import PAGES
 from cards.dataset import column_rows, dataset_card
 from cards.learned import LEARNED, baseline_tables, learned_tables
 from cards.reference import CAGES, FULL_SETS, SUBSET, reference_context, results_file
@@ -42,12 +41,9 @@ def test_generated_page_in_repository_is_up_to_date(page: Path) -> None:
 
 
 @pytest.mark.slow
-def test_pages_name_every_method_rule_and_measure() -> None:
-    card, measures, results = (PAGES[page]() for page in PAGES)
+def test_pages_name_every_method_and_measure() -> None:
+    _, measures, results = (PAGES[page]() for page in PAGES)
     assert all(f"| `{name}`" in results for name in own_methods())
-    assert "max(p/z, z/p) < 1.25" in card
-    assert "t = 3, 5, 10, 20 mm" in card
-    assert "at least 0.95" in " ".join(card.split())
     shown = set(re.findall(r"`(\w+)`", measures))
     names = {measure.name for family in MEASURE_FAMILIES.values() for measure in family.measures}
     of_tolerances = {name.removeprefix("pass_") for name in names if name.startswith("pass_")}
@@ -56,49 +52,11 @@ def test_pages_name_every_method_rule_and_measure() -> None:
     assert {name for name in names - binned if not name.startswith(("pass_", "capability_"))} <= shown
 
 
-@pytest.mark.slow
-def test_card_has_at_most_4900_words() -> None:
-    card = next(iter(PAGES.values()))()
-    assert len(card.split()) <= 4900
-
-
-@pytest.mark.slow
-def test_names_of_bins_stand_for_their_numbers_only() -> None:
-    rows = measures_page().replace("\\|", "|").splitlines()
-    row = next(line for line in rows if line.startswith("| `single_bar_within_Nmm`"))
-    assert "3 x 3 neighbourhood belongs to one bar with |p - z| <= N mm" in row
-
-
-@pytest.mark.slow
-def test_measures_whose_definitions_end_alike_share_a_row() -> None:
-    rows = measures_page().splitlines()
-    row = next(
-        line for line in rows if "`cover_bias_mm`, `cover_std_mm`, `cover_median_mm`, `cover_p95_mm`" in line
-    )
-    assert (
-        "| - / - / lower / lower | mean / std / median / p95 | [Mean over what was found; Standard deviation"
-        in row
-    )
-    assert row.count("fitted axis minus true axis") == 1
-    assert "95th percentile of the absolute value]: fitted" in row
-
-
 def test_every_column_is_described_once() -> None:
     rows = column_rows()
     described = [name.strip("`") for row in rows for name in row["names"].split(", ")]
     assert sorted(described) == sorted(features())
     assert {row["type"] for row in rows if "K`" in row["names"]} == {"float64 x 3 x 3"}
-
-
-def test_dataset_card_yaml_matches_folder(tiny_root: Path) -> None:
-    text = (tiny_root / "README.md").read_text()
-    metadata = yaml.safe_load(text.split("---")[1])
-    assert [config["config_name"] for config in metadata["configs"]] == ["lattice", "lattice-orbit"]
-    for config in metadata["configs"]:
-        pattern = config["data_files"][0]["path"]
-        assert sorted(tiny_root.glob(pattern)) == sorted(tiny_root.glob(f"{config['config_name']}/*.parquet"))
-    counts = {info["config_name"]: info["splits"][0]["num_examples"] for info in metadata["dataset_info"]}
-    assert counts == {"lattice": 9, "lattice-orbit": 2}
 
 
 def test_dataset_card_steel_share_matches_masks(tiny_root: Path, tiny_masks: dict[str, np.ndarray]) -> None:
@@ -180,27 +138,6 @@ def test_stored_set_is_of_one_dataset(name: str) -> None:
         assert result["submission"]["method"] == method
         assert all(table["views"] <= renders["views"] for table in result["tables"].values())
         assert result["dataset"] == results["truth"]["dataset"]
-
-
-@pytest.mark.parametrize("name", PUBLISHED)
-def test_truth_has_zero_error_and_noise_has_specified_error(name: str) -> None:
-    results = STORED[name]["results"]
-    for config, table in results["truth"]["tables"].items():
-        assert table["native"]["abs_rel"] == table["rank_error"] == 0, config
-        assert not table["ranked"]
-    for table in results["noisy-truth"]["tables"].values():
-        assert table["native"]["abs_rel"] == pytest.approx(0.25, abs=0.003)
-        assert table["scale_median"] == pytest.approx(1 / 1.25, abs=0.003)
-
-
-@pytest.mark.parametrize("name", PUBLISHED)
-def test_reference_errors_do_not_depend_on_the_method(name: str) -> None:
-    results = STORED[name]["results"]
-    for config, errors in reference_context(name)["errors"].items():
-        tables = [result["tables"][config] for result in results.values() if config in result["tables"]]
-        for key in ("constant", "one_pixel"):
-            assert all(table["reference"][key] == tables[0]["reference"][key] for table in tables)
-        assert errors["constant"][0] == f"{tables[0]['reference']['constant']['abs_rel']:.4f}"
 
 
 @pytest.mark.parametrize("name", PUBLISHED)

@@ -14,7 +14,6 @@ from importlib.util import find_spec
 from io import StringIO
 from pathlib import Path
 
-import grimp
 import numpy as np
 import pytest
 from _pytest.mark.structures import ParameterSet
@@ -35,7 +34,7 @@ from rebar_depth_bench.methods.onnx.spec import OUTPUT_MEANINGS, read_onnx_toml
 from rebar_depth_bench.submission import SubmissionMeta
 from scripts.diagrams import PACKAGE_EDGES, diagrams
 from scripts.tables import PAGES as PAGES_WITH_TABLES
-from scripts.tables import TABLES, _size, with_tables
+from scripts.tables import TABLES, with_tables
 from tests.bench.methods.predictors import load_predictor
 from tests.project.pages import (
     DOCS,
@@ -59,7 +58,6 @@ PARSERS: dict[str, ArgumentParser] = {
     "rebar-bench": bench_parser(),
     "rebar-leaderboard": board_parser(),
 }
-MAX_PICTURE_BYTES = 200_000
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
 
 
@@ -77,14 +75,6 @@ def test_documented_commands_parse(command: str) -> None:
     else:
         parser = PARSERS[program]
     assert parser.parse_args(with_command(arguments) if program == "rebar-build" else arguments)
-
-
-def test_every_script_of_the_paper_is_listed() -> None:
-    scripts = {Path(shlex.split(command)[1]).name for command in commands("python examples/paper/")}
-    assert scripts == {"anchor.py", "distance.py", "kitti.py", "pseudo_reference.py"}
-    page = (DOCS / "paper.md").read_text()
-    for name in scripts:
-        assert f"[{name}](../examples/paper/{name})" in page
 
 
 def subparsers(parser: ArgumentParser) -> dict[str, ArgumentParser]:
@@ -217,29 +207,16 @@ def test_documented_toml_and_json_are_valid(tmp_path: Path) -> None:
     assert all(json.loads(block) for page in PAGES for block in blocks(page, "json"))
 
 
-@pytest.mark.slow
-def test_architecture_table_and_diagram_have_the_real_imports() -> None:
-    graph = grimp.build_graph(*PACKAGES, exclude_type_checking_imports=True)
-    imports = {
-        (importer, imported)
-        for importer in PACKAGES
-        for imported in PACKAGES
-        if importer != imported
-        and graph.direct_import_exists(importer=importer, imported=imported, as_packages=True)
-    }
+def test_architecture_table_has_the_edges_of_the_diagram() -> None:
     rows = re.findall(r"^\| `(\w+)` \| (.*?) \|", (ROOT / "ARCHITECTURE.md").read_text(), flags=re.MULTILINE)
     assert [name for name, _ in rows] == ["rebar_depth_bench", "dataset_builder", "leaderboard", "cards"]
-    assert {(name, imported) for name, cell in rows for imported in re.findall(r"`(\w+)`", cell)} == imports
-    assert set(PACKAGE_EDGES) == imports
+    edges = {(name, imported) for name, cell in rows for imported in re.findall(r"`(\w+)`", cell)}
+    assert edges == set(PACKAGE_EDGES)
 
 
 def test_diagrams_are_current() -> None:
     stored = {name: (DOCS / "pictures" / name).read_text() for name in diagrams()}
     assert stored == diagrams(), "write them: python -m scripts.diagrams docs/pictures"
-
-
-def test_sizes_have_the_largest_unit_of_which_they_are_multiples() -> None:
-    assert [_size(size) for size in (0, 1000, 1 << 20, 3 << 29)] == ["0 B", "1000 B", "1 MiB", "1536 MiB"]
 
 
 def test_generated_tables_are_current() -> None:
@@ -260,9 +237,7 @@ def test_results_in_readme_are_those_of_the_card() -> None:
     assert row.findall((ROOT / "README.md").read_text()) == expected
 
 
-def test_pictures_are_used_and_small() -> None:
+def test_pictures_are_used() -> None:
     text = "\n".join(page.read_text() for page in PAGES)
     for picture in (DOCS / "pictures").iterdir():
         assert f"pictures/{picture.name}" in text
-        assert picture.suffix in (".webp", ".svg")
-        assert picture.stat().st_size < MAX_PICTURE_BYTES, picture.name

@@ -88,30 +88,19 @@ def test_distributions_are_small_and_pass_the_check_of_the_index(distributions: 
     assert all(path.stat().st_size < MAX_BYTES[kind] for kind, path in distributions.items())
 
 
-def test_wheel_holds_every_file_of_the_packages_and_no_other(
+def test_distributions_hold_every_file_and_no_other(
     distributions: dict[str, Path], source_files: set[str]
 ) -> None:
     expected = {name for name in source_files if name.split("/")[0] in PACKAGES}
     assert set(names_in_wheel(distributions["wheel"])) == expected
-
-
-def test_source_distribution_holds_every_file_of_the_repository(
-    distributions: dict[str, Path], source_files: set[str]
-) -> None:
     with tarfile.open(distributions["sdist"]) as archive:
         names = {member.name.partition("/")[2] for member in archive if member.isfile()}
-    generated = {name for name in names if name.startswith("rebar_depth_bench.egg-info/")} | {
-        "PKG-INFO",
-        "setup.cfg",
-    }
-    assert names - generated == source_files
+    generated = {name for name in names if name.startswith("rebar_depth_bench.egg-info/")}
+    assert names - generated - {"PKG-INFO", "setup.cfg"} == source_files
 
 
 def test_wheel_alone_scores_as_the_source(
-    installed: Path,
-    tiny_truth: dict[str, np.ndarray],
-    archive_of: Callable[..., Path],
-    tmp_path: Path,
+    installed: Path, tiny_truth: dict[str, np.ndarray], archive_of: Callable[..., Path], tmp_path: Path
 ) -> None:
     rng = np.random.default_rng(3)
     archive = archive_of({name: 1.1 * z_m * rng.normal(1, 0.01, z_m.shape) for name, z_m in tiny_truth.items()})
@@ -172,15 +161,6 @@ def test_version_below_the_bounds_is_named_and_no_data_are_called_damaged(
     assert "damaged" not in refused
 
 
-def test_wheel_brings_no_heavy_packages(installed: Path, tmp_path: Path) -> None:
-    code = "import rebar_depth_bench; print(rebar_depth_bench.__file__)"
-    assert run(installed / "python", "-c", code, cwd=tmp_path).stdout.startswith(str(installed.parent))
-    listed = json.loads(run(installed / "pip", "list", "--format", "json", cwd=tmp_path).stdout)
-    names = {package["name"].lower() for package in listed}
-    assert {"rebar-depth-bench", "numpy", "datasets"} <= names
-    assert not names & {"torch", "bpy", "opencv-contrib-python-headless", "trimesh", "fastapi", "matplotlib"}
-
-
 def test_wheel_alone_exports(installed: Path, tmp_path: Path) -> None:
     run(installed / "rebar-build", "export", TINY_DATASET, "--out", "plain", "--config", "lattice", cwd=tmp_path)
     assert len(list(tmp_path.glob("plain/lattice/**/*.png"))) > 9
@@ -202,5 +182,6 @@ def test_missing_extra_is_named(installed: Path, command: tuple[str, ...], extra
     program, *arguments = command
     finished = run(installed / program, *arguments, cwd=tmp_path, status=2)
     assert f"pip install '.[{extra}]'" in finished.stderr
+    assert extra != "build" or finished.stderr.startswith("error: not installed: bpy")
     assert "Traceback" not in finished.stderr
     assert not list(tmp_path.iterdir())

@@ -100,16 +100,10 @@ def test_crossings_that_are_not_those_of_the_bars_are_reported(copy: Path) -> No
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (
-            lambda row: {"left_mask": ~row["left_mask"]},
-            "left: the mask differs from the pixels that have a bar id",
-        ),
+        (lambda row: {"left_mask": ~row["left_mask"]}, "left: the mask differs from"),
         (lambda row: {"left_depth": 0 * row["left_depth"]}, "left: steel pixels without depth"),
         (lambda row: {"right_bars": np.where(row["right_mask"], 999, 0).astype(np.uint16)}, "bar ids [999]"),
-        (
-            lambda row: {"left_depth": np.nextafter(row["left_depth"], np.float32(9))},
-            "left ground-truth digest differs",
-        ),
+        (lambda row: {"left_depth": row["left_depth"] * np.float32(1.000001)}, "left ground-truth digest"),
         (lambda row: {"right_K": row["right_K"] + 1e-9}, "right ground-truth digest differs"),
         (lambda _: {"view_id": "lattice/0001"}, "the row's view_id is lattice/0001"),
     ],
@@ -236,10 +230,6 @@ def row_and_expected(request: pytest.FixtureRequest) -> tuple[Row, ExpectedView]
     return make_row(rig_cameras(rig, pose), rig.baseline_m), expected[1]
 
 
-def test_correct_cameras_pass_on_every_grid(row_and_expected: tuple[Row, ExpectedView]) -> None:
-    assert list(camera_problems(*row_and_expected)) == []
-
-
 def shifted_pose(pose: np.ndarray, shift_m: float) -> np.ndarray:
     pose = pose.copy()
     pose[0, 3] += shift_m
@@ -253,17 +243,14 @@ def shifted_pose(pose: np.ndarray, shift_m: float) -> np.ndarray:
         (lambda row: {"right_distortion": row["right_distortion"] + 1e-9}, "right_distortion differs by 1.0e-09"),
         (
             lambda row: {"left_cam_from_world": shifted_pose(row["left_cam_from_world"], 1e-9)},
-            "left_cam_from_world differs",
+            "left_cam_from_world",
         ),
         (
             lambda row: {"right_cam_from_world": shifted_pose(row["right_cam_from_world"], 1e-6)},
             "the camera centres are 0.1",
         ),
         (lambda row: {"left_cam_from_world": 1.001 * row["left_cam_from_world"]}, "not a rigid pose"),
-        (
-            lambda row: {"left_cam_from_world": row["left_cam_from_world"] * [[-1], [1], [1], [1]]},
-            "not a rigid pose",
-        ),
+        (lambda row: {"left_cam_from_world": np.diag([-1, 1, 1, 1]) @ row["left_cam_from_world"]}, "not a rigid"),
         (lambda _: {"baseline_m": 0.12001}, "baseline_m is 0.12001, expected 0.12"),
     ],
 )
@@ -271,6 +258,7 @@ def test_deviating_cameras_are_reported(
     row_and_expected: tuple[Row, ExpectedView], damage: Callable[[Row], Row], words: str
 ) -> None:
     row, expected = row_and_expected
+    assert list(camera_problems(row, expected)) == []
     problems = list(camera_problems({**row, **damage(row)}, expected))
     assert any(words in problem for problem in problems), problems
 

@@ -130,12 +130,6 @@ def test_cameras_json_matches_rows_and_files(exported: Path, rows: Rows) -> None
             assert (exported / "lattice" / camera[picture]).is_file()
 
 
-def test_readme_states_units_and_licence(exported: Path) -> None:
-    text = (exported / "lattice-orbit/README.txt").read_text()
-    for statement in ("config lattice-orbit: 2 stereo views", "Metres", "ROUNDED", "planar", "CC BY 4.0"):
-        assert statement in text
-
-
 def test_pycolmap_projections_match_our_cameras(exported: Path, rows: Rows, known_points_m: np.ndarray) -> None:
     model = pycolmap.Reconstruction(exported / "lattice/sparse/0")
     assert model.num_cameras() == 1  # Both cameras of an ideal rig share their intrinsics.

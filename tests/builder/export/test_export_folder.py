@@ -21,7 +21,7 @@ from dataset_builder.export import export
 from dataset_builder.export.exporting import MARKER
 from rebar_depth_bench.base.errors import DatasetError, InputError
 from tests.damage import change_manifest
-from tests.synthetic_dataset import write_dataset, write_split_dataset
+from tests.synthetic_dataset import write_split_dataset
 
 SMALL_CONFIG = ("lattice-orbit",)
 """Config with two views, quick to export."""
@@ -75,16 +75,6 @@ def test_write_failure_is_reported(tiny_root: Path, tmp_path: Path) -> None:
     assert not list((tmp_path / "x").rglob("*.tmp"))
 
 
-def test_interrupt_leaves_no_partial_file(tiny_root: Path, tmp_path: Path) -> None:
-    def interrupt(*_: object) -> None:
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        export(tiny_root, tmp_path / "x", SMALL_CONFIG, progress=interrupt)
-    assert not list((tmp_path / "x").rglob("*.tmp"))
-    assert export(tiny_root, tmp_path / "x", SMALL_CONFIG)[0].kept == IMAGES_PER_VIEW
-
-
 @pytest.mark.slow
 def test_export_is_extended_by_views_and_configs(tiny_root: Path, exported: Path, tmp_path: Path) -> None:
     to = tmp_path / "grown"
@@ -113,29 +103,15 @@ def test_foreign_folder_is_rejected_and_unchanged(tiny_root: Path, tmp_path: Pat
     assert not (tiny_root / "raw").exists()
 
 
-@pytest.mark.slow
-def test_export_imports_no_renderer() -> None:
-    code = "import sys, dataset_builder.export; print(*sys.modules)"
-    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert "dataset_builder.export.exporting" in process.stdout.split()
-    assert not {"bpy", "embreex", "trimesh", "pycolmap", "torch"} & set(process.stdout.split())
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
+        (lambda record: record.update(dataset="sha256:00"), "dataset sha256:00, expected sha256:"),
         (
-            lambda record: record.update(dataset="sha256:00"),
-            r"contains an export of dataset sha256:00, expected sha256:.* as in",
+            lambda record: record["configs"][SMALL_CONFIG[0]].update(key="0"),
+            "config lattice-orbit of another build",
         ),
-        (
-            lambda record: record["configs"]["lattice-orbit"].update(key="0" * 64),
-            "contains config lattice-orbit of another build",
-        ),
-        (
-            lambda record: record.update(format="rebar-depth-export-9"),
-            r"format: got 'rebar-depth-export-9', expected .rebar-depth-export-1.",
-        ),
+        (lambda record: record.update(format="rebar-depth-export-9"), "got 'rebar-depth-export-9', expected"),
     ],
     ids=["dataset", "build", "format"],
 )
@@ -167,7 +143,7 @@ def test_fewer_views_than_exported_is_rejected(tiny_root: Path, exported: Path) 
         export(tiny_root, exported, SMALL_CONFIG, views=1)
 
 
-def test_invalid_configs_roots_and_view_counts_are_rejected(tiny_root: Path, tmp_path: Path) -> None:
+def test_invalid_configs_roots_splits_and_view_counts_are_rejected(tiny_root: Path, tmp_path: Path) -> None:
     with pytest.raises(DatasetError, match="no config 'latice', expected one of lattice, lattice-orbit"):
         export(tiny_root, tmp_path / "x", ["lattice", "latice"])
     with pytest.raises(InputError, match="--views is 0, expected 1 or more"):
@@ -176,6 +152,10 @@ def test_invalid_configs_roots_and_view_counts_are_rejected(tiny_root: Path, tmp
         export("someone/rebar", tmp_path / "x")
     with pytest.raises(DatasetError, match=r"has no manifest.json"):
         export(tmp_path, tmp_path / "x")
+    with pytest.raises(DatasetError, match="no config has the split train"):
+        export(tiny_root, tmp_path / "x", split="train")
+    with pytest.raises(DatasetError, match="lattice has no split train"):
+        export(tiny_root, tmp_path / "x", ["lattice"], split="train")
     assert not (tmp_path / "x").exists()
 
 
@@ -284,15 +264,6 @@ def test_export_is_resumed_and_extended_by_splits(scenes_root: Path, tmp_path: P
     assert {path.split("/", 1)[0] for path in content(tmp_path / "out")} == {"cages", MARKER}
     export(scenes_root, tmp_path / "whole")
     assert content(tmp_path / "out").keys() == content(tmp_path / "whole").keys()
-
-
-def test_splits_that_do_not_exist_are_refused(tmp_path: Path) -> None:
-    write_dataset(tmp_path / "one", ["lattice"], 1)
-    with pytest.raises(DatasetError, match="no config has the split train"):
-        export(tmp_path / "one", tmp_path / "out", split="train")
-    with pytest.raises(DatasetError, match="lattice has no split train"):
-        export(tmp_path / "one", tmp_path / "out", ["lattice"], split="train")
-    assert not (tmp_path / "out").exists()
 
 
 def test_link_in_place_of_the_folder_of_a_scene_is_refused(scenes_root: Path, tmp_path: Path) -> None:

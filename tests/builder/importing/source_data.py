@@ -136,13 +136,6 @@ def tiff(values: np.ndarray, **options: Any) -> bytes:
     return stream.getvalue()
 
 
-def pfm(depth: np.ndarray, *, big_endian: bool) -> bytes:
-    """Return a PFM file, whose rows are from bottom to top; its scale's sign states the byte order."""
-    height, width = depth.shape
-    order, scale = (">f4", "1.0") if big_endian else ("<f4", "-1.0")
-    return f"Pf\n{width} {height}\n{scale}\n".encode() + depth[::-1].astype(order).tobytes()
-
-
 def range_m(row: Row) -> np.ndarray:
     """Return the distance along the ray of each pixel, metres."""
     rays = pixel_rays(row["left_K"], 160, 90)
@@ -162,8 +155,6 @@ def opengl_world_from_cam(row: Row) -> np.ndarray:
 
 Encode = Callable[[Path, Row], bytes]
 DEPTH_FORMATS: Mapping[str, tuple[str, str, Encode, float]] = {
-    "npy float64": (".npy", "", lambda _, row: npy(row["left_depth"].astype(np.float64)), 0.0),
-    "npz": (".npz", "", lambda _, row: _npz(row["left_depth"]), 0.0),
     "EXR": (".exr", "", lambda folder, row: exr(folder, {"V": row["left_depth"]}), 0.0),
     "EXR of several channels": (
         ".exr",
@@ -171,14 +162,10 @@ DEPTH_FORMATS: Mapping[str, tuple[str, str, Encode, float]] = {
         lambda folder, row: exr(folder, {"R": row["left_depth"], "G": row["left_depth"] * 2}),
         0.0,
     ),
-    "TIFF float32": (".tif", "", lambda _, row: tiff(row["left_depth"]), 0.0),
     "TIFF compressed": (".tiff", "", lambda _, row: tiff(row["left_depth"], compression="tiff_lzw"), 0.0),
     "TIFF of OpenCV": (".tiff", "", lambda _, row: opencv(row["left_depth"], ".tiff"), 0.0),
-    "TIFF millimetres": (".tif", 'unit = "mm"', lambda _, row: tiff(_units(row, 1000)), 0.0005),
     "PNG millimetres": (".png", 'unit = "mm"', lambda _, row: png(_units(row, 1000)), 0.0005),
     "PNG of OpenCV": (".png", "scale = 0.0001", lambda _, row: opencv(_units(row, 10_000), ".png"), 0.000051),
-    "PFM": (".pfm", "", lambda _, row: pfm(row["left_depth"], big_endian=False), 0.0),
-    "PFM big-endian": (".pfm", "", lambda _, row: pfm(row["left_depth"], big_endian=True), 0.0),
     "PFM of OpenCV": (".pfm", "", lambda _, row: opencv(row["left_depth"], ".pfm"), 0.0),
     "range": (".npy", 'kind = "range"', lambda _, row: npy(range_m(row)), 1e-7),
     "disparity": (".npy", 'kind = "disparity"', lambda _, row: npy(disparity_px(row)), 1e-6),
@@ -194,12 +181,6 @@ def write_depth_format(folder: Path, rows: list[Row], name: str) -> Path:
         write(folder / f"other/{view}{suffix}", encode(folder, row))
     files, tables = {"left_depth": f"other/{{view}}{suffix}"}, f"{STEREO}\n[depth]\n{keys}\n"
     return write_layout(folder, ("left_depth", "left_rgb", "right_rgb"), tables=tables, files=files)
-
-
-def _npz(depth: np.ndarray) -> bytes:
-    stream = io.BytesIO()
-    np.savez_compressed(stream, depth=depth)
-    return stream.getvalue()
 
 
 def _units(row: Row, per_metre: float) -> np.ndarray:

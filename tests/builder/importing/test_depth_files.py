@@ -7,14 +7,13 @@ import struct
 from collections.abc import Callable
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from PIL import Image
 
 import rebar_depth_bench as rdb
 from dataset_builder.cli.main import main
-from dataset_builder.importing.config_import import plan_import, run_import
+from dataset_builder.importing.config_import import plan_import
 from dataset_builder.importing.import_layout import DepthTable
 from dataset_builder.importing.source_files import DepthTally, read_depth
 from rebar_depth_bench.base.errors import EntryError, InputError
@@ -75,7 +74,7 @@ READ: dict[str, tuple[str, bytes]] = {
     "TIFF int32 of OpenCV": ("a.tiff", data.opencv(VALUES.astype(np.int32), ".tiff")),
     **{
         f"npy {kind}": ("a.npy", data.npy(VALUES.astype(kind)))
-        for kind in ("<u2", ">u2", "<i4", ">i8", "<u8", "<f2")
+        for kind in ("<u2", ">u2", "<i4", ">i8", "<u8", "<f2", ">f8")
     },
     "npy of columns": ("a.npy", data.npy(np.asfortranarray(VALUES.astype(np.int32)))),
     "npz of integers": ("a.npz", npz(VALUES.astype(np.uint16))),
@@ -124,11 +123,7 @@ REFUSED: dict[str, tuple[str, bytes, str]] = {
     "TIFF in colour": ("a.tif", saved(GREY.convert("RGB"), "TIFF"), "expected one channel"),
     "TIFF turned": ("a.tif", saved(Image.fromarray(VALUES.astype(np.float32)), "TIFF", tiffinfo={274: 3}), "EXIF"),
     **{
-        f"TIFF {kind}": (
-            "a.tif",
-            tiff(VALUES.astype(kind)),
-            "expected TIFF of float32 or of integers up to 32 bits",
-        )
+        f"TIFF {kind}": ("a.tif", tiff(VALUES.astype(kind)), "expected TIFF of float32 or")
         for kind in ("f2", "f8", "u8", "i8")
     },
     "TIFF float64 of OpenCV": (
@@ -170,6 +165,7 @@ LARGEST: dict[str, tuple[str, Callable[[np.ndarray], bytes], type]] = {
     "PNG": ("a.png", data.png, np.uint16),
     "npy uint8": ("a.npy", data.npy, np.uint8),
     "npy uint16": ("a.npy", data.npy, np.uint16),
+    "npy float16": ("a.npy", data.npy, np.float16),
     "npy int32": ("a.npy", data.npy, np.int32),
     "npy int64": ("a.npy", data.npy, np.int64),
     "TIFF int16": ("a.tif", tiff, np.int16),
@@ -179,14 +175,15 @@ LARGEST: dict[str, tuple[str, Callable[[np.ndarray], bytes], type]] = {
 
 
 @pytest.mark.parametrize("name", LARGEST)
-def test_largest_integer_has_to_be_listed(name: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize("unit", ["m", "mm"])
+def test_largest_integer_or_half_float_has_to_be_listed(name: str, unit: str, tmp_path: Path) -> None:
     file, encode, kind = LARGEST[name]
-    largest = int(np.iinfo(kind).max)
+    largest = int(np.finfo(kind).max if kind is np.float16 else np.iinfo(kind).max)
     values: np.ndarray = np.full((3, 5), 100, kind)
     values[0, :2] = largest
     with pytest.raises(EntryError, match=rf"2 pixels have {largest}.* expected depth.invalid with {largest}"):
-        read(tmp_path, file, encode(values))
-    units = read(tmp_path, file, encode(values), DepthTable(invalid=(float(largest),)))
+        read(tmp_path, file, encode(values), DepthTable(unit=unit))
+    units = read(tmp_path, file, encode(values), DepthTable(unit=unit, invalid=(float(largest),)))
     assert np.isnan(units[0, :2]).all()
     assert (units[1:] == 100).all()
 
@@ -208,15 +205,6 @@ def background(value: float, kind: type = np.float32) -> np.ndarray:
     depth: np.ndarray = np.full((120, 160), 2, kind)
     depth[:40] = value
     return depth
-
-
-@pytest.mark.parametrize("unit", ["m", "mm"])
-def test_largest_half_float_is_no_depth_in_any_unit(unit: str, tmp_path: Path) -> None:
-    content = data.npy(np.where(VALUES == 403, 65504, VALUES).astype(np.float16))
-    with pytest.raises(EntryError, match=r"1 pixels have 65504, .* depth.invalid with 65504, or depth.max_m"):
-        read(tmp_path, "a.npy", content, DepthTable(unit=unit))
-    units = read(tmp_path, "a.npy", content, DepthTable(unit=unit, invalid=(65504.0,)))
-    assert np.argwhere(np.isnan(units)).tolist() == [[1, 3]]
 
 
 FAR: dict[str, tuple[str, np.ndarray, str]] = {
@@ -283,24 +271,10 @@ def test_range_is_converted_with_the_camera_of_each_view(tmp_path: Path) -> None
     path = layout(tmp_path, "kind = 'range'", depth, rest='[intrinsics]\nfile = "k/{view}.txt"\n')
     views = plan_import(path, "mock-up").views
     for name in depth:
-        assert np.abs(views.decode(name)["left_depth"] - expected[name]).max() < 1e-6
+        columns = views.decode(name)
+        assert columns["left_K"][0, 0] == {"a": 150, "b": 90}[name]
+        assert np.abs(columns["left_depth"] - expected[name]).max() < 1e-6
     assert views.decode("b")["left_depth"][0, 0] == pytest.approx(1.6092981)
-
-
-def test_lens_that_does_not_see_every_pixel_of_a_view_is_refused(tmp_path: Path) -> None:
-    """The terms of the lens are those of all views, and fold back inside the picture of a shorter focal length."""
-    data.write(tmp_path / "k/a.txt", b"40 0 79.5 0 40 59.5 0 0 1")
-    path = layout(tmp_path, "", {"a": data.npy(background(2))}, rest='[intrinsics]\nfile = "k/{view}.txt"\n')
-    path.write_text(path.read_text().replace("[0, 0, 0, 0]", "[-0.1, 0, 0, 0]"))
-    with pytest.raises(InputError, match="cannot be inverted"):
-        run_import(plan_import(path, "mock-up"), tmp_path / "out")
-
-
-def test_right_picture_alone_is_refused(tmp_path: Path) -> None:
-    path = layout(tmp_path, "", {"a": data.npy(background(2))}, rest=data.STEREO)
-    path.write_text(path.read_text().replace("[depth]", 'right_rgb = "r/{view}.png"\n[depth]'))
-    with pytest.raises(InputError, match="left_rgb is missing, expected left_rgb beside right_rgb"):
-        plan_import(path, "mock-up")
 
 
 MATRIX = {
@@ -312,10 +286,7 @@ MATRIX = {
 NO_MATRIX = {
     "UTF-16": ("1 0 0 0.5".encode("utf-16"), "the text is UTF-16, expected UTF-8"),
     "decimal commas": (b"1 0 0 0,5 0 1 0 -1 0 0 1 0,2 0 0", "expected a rotation, a translation, and 0 0 0 1"),
-    "decimal commas and semicolons": (
-        b"1;0;0;0,5\n0;1;0;-1\n0;0;1;0,2\n0;0;0;1",
-        "cannot be read: .* numbers with decimal points",
-    ),
+    "decimal commas and semicolons": (b"1;0;0;0,5\n0;1;0;-1\n0;0;1;0,2\n0;0;0;1", "numbers with decimal points"),
     "words": (b"pose 1 0 0 0", "'pose'"),
     "other number": (b"1 0 0 0.5 0 1 0 -1", "holds 8 numbers, expected 4 x 4"),
 }
@@ -333,10 +304,3 @@ def test_matrices_in_text_files(name: str, tmp_path: Path) -> None:
     else:
         expected = np.array([[1, 0, 0, 0.5], [0, 1, 0, -1], [0, 0, 1, 0.2], [0, 0, 0, 1]])
         assert np.array_equal(views.decode("a")["left_cam_from_world"], expected)
-
-
-def test_opencv_reads_the_rows_of_a_pfm_file_as_this_reader(tmp_path: Path) -> None:
-    content = PFM.format(1).encode() + VALUES[::-1].astype(">f4").tobytes()
-    (tmp_path / "b.pfm").write_bytes(content)
-    assert np.array_equal(cv2.imread(str(tmp_path / "b.pfm"), cv2.IMREAD_UNCHANGED), VALUES)
-    assert np.array_equal(read(tmp_path, "a.pfm", content), VALUES)

@@ -145,21 +145,6 @@ def test_pose_convention_is_read(table: str, write: Any, rows: list[Row], folder
         assert np.allclose(read["left_cam_from_world"], row["left_cam_from_world"], rtol=0, atol=1e-12)
 
 
-def test_each_view_may_have_its_own_intrinsics(rows: list[Row], folder: Path, tmp_path: Path) -> None:
-    """They also convert range along the ray to planar depth."""
-    for n, (view, row) in enumerate(zip(NAMES, rows, strict=True)):
-        K = row["left_K"] * [[1 + n, 1, 1], [1, 1 + n, 1], [1, 1, 1]]
-        data.write(folder / f"k/{view}.json", data.json_matrix(K))
-        data.write(folder / f"other/{view}.npy", data.npy(data.range_m({**row, "left_K": K})))
-    tables = '\n[intrinsics]\nfile = "k/{view}.json"\nkey = "camera.K"\n[depth]\nkind = "range"\n'
-    files = {"left_depth": "other/{view}.npy"}
-    imported(data.write_layout(folder, ("left_depth", "left_rgb"), tables=tables, files=files), tmp_path / "out")
-    read = list(rdb.load(tmp_path / "out", "mock-up"))
-    assert [row["left_K"][0, 0] for row in read] == [87.5, 175, 262.5]
-    for row, expected in zip(read, rows, strict=True):
-        assert row["left_depth"] == pytest.approx(expected["left_depth"], abs=1e-7)
-
-
 PARTS = {
     "depth only": (("left_depth",), ""),
     "one camera": (("left_depth", "left_rgb", "left_mask"), data.POSES),

@@ -46,6 +46,7 @@ def refused(layout: Path, out: Path, capsys: pytest.CaptureFixture[str]) -> str:
         ('"depth/{view}_left.npy"', '"/etc/{view}.npy"', "invalid", "files.left_depth"),
         ('"depth/{view}_left.npy"', '"depth/{view}_{view}.npy"', "invalid", "files.left_depth"),
         ('right_depth = "depth/{view}_right.npy"\n', "", "conflict", "files"),
+        ('left_rgb = "left/{view}.png"\n', "", "conflict", "files"),
         ("[poses]", "[depth]\nkind = 'depth'\n[poses]", "invalid", "depth.kind"),
         ("[poses]", "[depth]\nunit = 'mm'\nscale = 1\n[poses]", "conflict", "depth"),
         ("[poses]", "[depth]\nunit = 'mm'\nkind = 'disparity'\n[poses]", "conflict", "depth"),
@@ -148,16 +149,6 @@ def test_turned_picture_is_refused(
     assert f"{FIRST}{suffix}: the EXIF orientation is 3: viewers turn the pixels, expected 1, as the" in message
 
 
-@pytest.mark.slow
-def test_repaired_source_is_imported(folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    layout, pose = data.write_layout(folder), folder / f"poses/{THIRD}.txt"
-    pose.rename(tmp_path / "kept")
-    refused(layout, tmp_path / "out", capsys)
-    (tmp_path / "kept").rename(pose)
-    run_import(plan_import(layout, "mock-up"), tmp_path / "out")
-    assert open_folder(tmp_path / "out").config("mock-up").views
-
-
 @pytest.mark.parametrize(
     ("K", "words"),
     [
@@ -197,15 +188,6 @@ def test_invalid_bars_are_refused(line: str, problem: str, folder: Path) -> None
     with pytest.raises(InputError, match=r"bars\.csv") as caught:
         plan_import(data.write_layout(folder), "mock-up")
     assert caught.value.problems[0].code == problem
-
-
-@pytest.mark.parametrize(
-    "content", [b"", b"\xff\xfe", b"a,b\n1,2\n", b'bar_id\n"', b"bar_id,diameter_m,x_m,y_m,z_m\n"]
-)
-def test_file_without_bars_is_refused(content: bytes, folder: Path) -> None:
-    (folder / "bars.csv").write_bytes(content)
-    with pytest.raises(InputError, match=r"bars\.csv"):
-        plan_import(data.write_layout(folder), "mock-up")
 
 
 def test_folder_that_is_no_dataset_is_refused(

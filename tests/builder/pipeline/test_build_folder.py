@@ -87,16 +87,6 @@ def test_links_are_rejected_before_any_change(root: Path, tmp_path: Path, link: 
     assert outside.exists() == (link in LINKED_FOLDERS)
 
 
-def test_command_reports_link_in_one_line(root: Path, tmp_path: Path) -> None:
-    shutil.rmtree(root / "meshes")
-    (root / "meshes").symlink_to(tmp_path)
-    process = run_in_process(main, "--out", root, "--config", "pile", "--views", "1")
-    assert (process.returncode, process.stdout) == (2, "")
-    assert process.stderr.strip() == (
-        f"error: {root}/meshes: is a symbolic link, expected a file or folder (links are not followed here)"
-    )
-
-
 def test_root_itself_may_be_a_link(root: Path, tmp_path: Path) -> None:
     (tmp_path / "link").symlink_to(root)
     check_target(tmp_path / "link", {"lattice"})

@@ -21,7 +21,6 @@ from dataset_builder.audit import audit
 from dataset_builder.catalog.cages_config import CagesRequest
 from dataset_builder.catalog.named_configs import BuildRequest
 from dataset_builder.cli.main import main
-from dataset_builder.export import export
 from dataset_builder.pipeline import plan as plan_module
 from dataset_builder.pipeline.build import build
 from dataset_builder.pipeline.plan import BUILD_FOLDER, plan_config
@@ -29,8 +28,6 @@ from dataset_builder.scene.cages import generate as generate_module
 from dataset_builder.scene.cages.generate import drawn_family
 from dataset_builder.specs.config_specs import CAGES_VERSION, ColourSpec, GeneratedCageSpec, SceneConfigSpec
 from rebar_depth_bench.base.errors import InputError
-from rebar_depth_bench.cli.main import main as rebar_bench
-from rebar_depth_bench.data.bars import BARS_FILE, read_bars
 from rebar_depth_bench.data.files import MANIFEST_FILE
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.extended.as_built import MEASURES
@@ -39,7 +36,6 @@ from rebar_depth_bench.scoring.truth import reference_errors
 from tests.building import RunBuild, StartBuild, contents, staged_rows
 from tests.commands import run_in_process
 from tests.dask_cluster import NewCluster
-from tests.ground_truth import truth_of
 from tests.processes import wait_until
 
 SPLITS = {"train": 2, "validation": 1}
@@ -49,10 +45,7 @@ GROUND_TRUTH = (*SIZE, "--no-colour")
 
 
 def cages(split: str, scenes: int, views: int = VIEWS) -> tuple[str, ...]:
-    return (
-        *("--config", "cages", "--split", split),
-        *("--scenes", str(scenes), "--views-per-scene", str(views)),
-    )
+    return (*("--config", "cages", "--split", split), *("--scenes", str(scenes), "--views-per-scene", str(views)))
 
 
 @pytest.fixture(scope="module")
@@ -97,16 +90,6 @@ def test_views_of_a_split_are_named_by_family_split_and_number(root: Path, strea
     rows = list(rdb.load(root, "cages", split="train", streaming=streaming))
     assert [row["view_id"] for row in rows] == expected
     assert all(row["left_depth"].shape == (180, 320) and row["left_mask"].any() for row in rows)
-
-
-def test_bars_have_nominal_axes(root: Path) -> None:
-    entries = {scene.name: scene.entry for scene in open_folder(root).config("cages").scenes}
-    for scene, bars in read_bars(root / BARS_FILE).items():
-        designed = [bar for bar in bars if bar.nominal_axis_m]
-        record = entries[scene]["cage"]
-        assert len(bars) - len(designed) == record["doubled"]
-        off_m = [np.linalg.norm(np.subtract(bar.axis_m[0], bar.nominal_axis_m[0])) for bar in designed]
-        assert 0 < max(off_m) < 0.1
 
 
 def test_card_states_how_far_mats_are_off(root: Path) -> None:
@@ -280,17 +263,6 @@ def test_exact_depth_is_perfect_in_every_group(root: Path, truths: Mapping[str, 
             assert 0 < group["reference.one_pixel.abs_rel"] < 1
 
 
-def test_widths_follow_from_bars_and_cameras(root: Path) -> None:
-    """Bars of the cages are millimetres wide: their width in pixels is that in the middle of the steel."""
-    diameters_m = {bar.diameter_m for bars in read_bars(root / BARS_FILE).values() for bar in bars}
-    rows = rdb.load(root, "cages", split="train", columns=["view_id", "left_K"])
-    for row, view in zip(rows, truth_of(root, "cages", "train").traits, strict=True):
-        assert view.bar_width_px is not None
-        assert view.family is not None
-        about_m = view.bar_width_px * view.distance_m / row["left_K"][0, 0]
-        assert 0.5 * min(diameters_m) < about_m < 2 * max(diameters_m)
-
-
 def test_exact_depth_measures_the_deviation_from_the_design(root: Path, truths: Mapping[str, Path]) -> None:
     extended = rdb.score(truths["train"], root, extended=True).extended
     assert extended is not None
@@ -302,22 +274,3 @@ def test_exact_depth_measures_the_deviation_from_the_design(root: Path, truths: 
     assert abs(numbers["deviation_bias_mm"].value or 0) < 0.1
     assert 1 < (numbers["deviation_true_p95_mm"].value or 0) < 40, "the tolerances of the generator"
     assert {measure.name for measure in MEASURES} <= numbers.keys()
-
-
-def test_commands_work_on_several_scenes(root: Path, tmp_path: Path, truths: Mapping[str, Path]) -> None:
-    archive, constant = truths["train"], tmp_path / "constant.zip"
-    commands = (
-        ("verify", root),
-        ("predict", "constant", "--data", root, "--split", "train", "--out", constant),
-        ("check", constant, "--data", root),
-        ("score", archive, "--data", root, "--html", tmp_path / "r.html", "--groups-csv", tmp_path / "g.csv"),
-        ("table", archive, constant, "--data", root, "--latex", tmp_path / "t.tex"),
-        ("compare", archive, constant, "--data", root),
-    )
-    for command in commands:
-        process = run_in_process(rebar_bench, *command)
-        assert process.returncode == 0, (command[0], process.stderr)
-    groups = {line.split(",")[6] for line in (tmp_path / "g.csv").read_text().splitlines()[1:]}
-    assert groups == {"family", "distance", "bar_width"}
-    exported = export(root, tmp_path / "out", split="train")
-    assert [part.views for part in exported] == [VIEWS] * SPLITS["train"]

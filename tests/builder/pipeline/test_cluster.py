@@ -19,7 +19,7 @@ import trimesh
 
 from dataset_builder.catalog.named_configs import CONFIGS
 from dataset_builder.pipeline import dask_renderer
-from dataset_builder.pipeline.dask_renderer import check_software_versions, connect_to_cluster
+from dataset_builder.pipeline.dask_renderer import connect_to_cluster
 from dataset_builder.pipeline.plan import BUILD_FOLDER, ConfigPlan, generator_versions, plan_config
 from dataset_builder.pipeline.shards import Staging
 from dataset_builder.pipeline.work_units import (
@@ -310,22 +310,6 @@ def test_input_errors_on_workers_are_raised_in_client(
             outdated.result(timeout=120)
 
 
-def test_other_software_versions_are_rejected_by_name() -> None:
-    local_versions = dict(generator_versions())
-    check_software_versions(local_versions, "tcp://far:1", dict(local_versions))
-    worker_versions = {**local_versions, "embreex": "4.3.0"}
-    del worker_versions["pillow"]
-    with pytest.raises(InputError) as raised:
-        check_software_versions(local_versions, "tcp://far:1", worker_versions)
-    message = str(raised.value)
-    assert message.startswith("worker tcp://far:1 has other software")
-    assert (
-        f"embreex 4.3.0, expected {local_versions['embreex']}; pillow missing, expected {local_versions['pillow']}"
-        in message
-    )
-    assert "numpy" not in message
-
-
 def test_worker_with_other_software_is_rejected(
     tmp_path: Path, new_cluster: NewCluster, run_build: RunBuild
 ) -> None:
@@ -347,9 +331,7 @@ def test_unusable_cluster_is_rejected_and_nothing_written(
     with new_cluster(tmp_path) as idle:
         idle.start_scheduler()
         expected = {
-            (
-                "nonsense",
-            ): "--cluster nonsense: is not a valid address (missing port number in address 'nonsense')",
+            ("nonsense",): "--cluster nonsense: is not a valid address",
             (idle.address,): f"--cluster {idle.address}: the scheduler has no workers after 10 s",
         }
         for dry_run in ((), ("--dry-run",)):
@@ -365,24 +347,14 @@ def test_unusable_cluster_is_rejected_and_nothing_written(
     assert not (tmp_path / "dataset").exists()
 
 
-def run_cli(prepare: str, *arguments: str) -> subprocess.CompletedProcess[str]:
-    code = f"import sys; {prepare}; from dataset_builder.cli.main import main; sys.exit(main(sys.argv[1:]))"
-    command = [sys.executable, "-c", code, *arguments]
-    return subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-
-
 @pytest.mark.slow
-def test_missing_distributed_names_pip_extra(tmp_path: Path) -> None:
-    arguments = ("--out", str(tmp_path / "dataset"), "--cluster", NOWHERE)
-    process = run_cli("sys.modules['distributed'] = None", *arguments)
-    assert process.returncode == 2, process.stderr
-    assert "pip install '.[cluster]'" in process.stderr
-
-
-@pytest.mark.slow
-def test_local_build_does_not_import_distributed(tmp_path: Path) -> None:
-    """Check ``sys.modules`` after ``--samples 0``, which is rejected only after all modules are imported."""
-    prepare = "import atexit; atexit.register(lambda: print('distributed' in sys.modules, 'bpy' in sys.modules))"
-    process = run_cli(prepare, "--out", str(tmp_path / "dataset"), "--samples", "0")
-    assert "--samples: got 0" in process.stderr
-    assert process.stdout.split() == ["False", "False"]
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [(("--cluster", NOWHERE), "pip install '.[cluster]'"), (("--samples", "0"), "--samples: got 0")],
+)
+def test_builds_without_cluster_need_no_distributed(tmp_path: Path, options: tuple[str, str], words: str) -> None:
+    """The number of samples is refused only after all modules are imported."""
+    code = "import sys; sys.modules['distributed'] = None; from dataset_builder.cli.main import main; exit(main())"
+    command = [sys.executable, "-c", code, "--out", str(tmp_path / "dataset"), *options]
+    process = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
+    assert (process.returncode, words in process.stderr) == (2, True), process.stderr

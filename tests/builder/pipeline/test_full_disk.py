@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import subprocess
-import sys
 from pathlib import Path
 
 import pytest
@@ -55,22 +54,6 @@ def test_build_on_a_full_disk_is_finished_by_a_later_run(new_disk: NewDisk, tmp_
     assert run_in_process(main, "--out", tmp_path / "other", *BUILD, "--samples", "1").returncode == 0
     assert contents(root) == contents(tmp_path / "other")
     assert disk.files() == {f"dataset/{name}" for name in contents(root)}
-
-
-LIMITED = """
-import resource, sys
-from dataset_builder.cli.main import main
-resource.setrlimit(resource.RLIMIT_FSIZE, (int(sys.argv[1]), int(sys.argv[1])))
-sys.exit(main(sys.argv[2:]))
-"""
-
-
-@pytest.mark.usefixtures("blender")
-def test_file_size_limit_holds_in_render_processes(tmp_path: Path) -> None:
-    arguments = ["--out", str(tmp_path / "dataset"), *map(str, BUILD), "--no-colour"]
-    limited = [sys.executable, "-c", LIMITED, str(100 * KIB), *arguments]
-    finished = subprocess.run(limited, capture_output=True, text=True, timeout=600, check=False)
-    _refused(finished, "File too large", "/mesh-")
 
 
 def test_build_on_a_read_only_disk_is_refused(new_disk: NewDisk) -> None:

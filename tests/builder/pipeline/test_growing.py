@@ -5,19 +5,17 @@ from __future__ import annotations
 import json
 import shutil
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import datasets
 import pytest
 
 import rebar_depth_bench as rdb
-from dataset_builder.audit import audit, auditing
 from dataset_builder.catalog.cages_config import CagesRequest
 from dataset_builder.catalog.named_configs import BuildRequest
-from dataset_builder.pipeline import folder, retained
 from dataset_builder.pipeline.build import BuildSummary, build
 from dataset_builder.pipeline.plan import BUILD_FOLDER
+from dataset_builder.specs.config_specs import ColourSpec
 from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.base.limits import JSON_BYTES, TABLE_BYTES
 from rebar_depth_bench.base.parallel import silent
@@ -147,6 +145,7 @@ def test_finished_config_is_replaced_only_if_it_is_named(
     config = open_folder(tmp_path).config(name)
     assert (summary.built, set(rendered) <= set(config.view_ids)) == ([name], True)
     assert config.rig.width == then.width
+    assert {f"{name}/{path.name}" for path in (tmp_path / name).iterdir()} == set(config.shards)
 
 
 def test_fewer_scenes_and_same_views_lose_nothing(tmp_path: Path) -> None:
@@ -260,8 +259,9 @@ def test_added_and_rebuilt_scenes_are_loaded_in_place_of_cached_ones(tmp_path: P
     assert loaded_ids(root) == [expected()] * 4
     assert first_depth(root) == depth
     shutil.rmtree(root)
-    built(root, cages(1, 1, "train", seed=1, width=64))
+    built(root, cages(1, 1, "train", seed=1, width=64, colour=ColourSpec(1, 1)))
     assert loaded_ids(root) == [expected()] * 4
+    assert datasets.load_dataset(str(root), "cages", split="train")[0]["left_rgb"].size == (64, 18)
     assert all(new != old for new, old in zip(first_depth(root), depth, strict=True))
     assert 'load_dataset("PATH_OR_HUB_ID", "cages", split="train")' in (root / "README.md").read_text()
 
@@ -287,32 +287,3 @@ def test_size_of_the_manifest_is_estimated(
         built(tmp_path / "again", request_)
     estimate = int(str(caught.value).partition("about ")[2].partition(" ")[0])
     assert size <= estimate < 1.5 * size
-
-
-def counted(monkeypatch: pytest.MonkeyPatch, module: ModuleType, name: str) -> list[Path]:
-    """Record the first arguments with which a function of a module is called."""
-    calls: list[Path] = []
-    function = getattr(module, name)
-
-    def count(path: Path, *arguments: Any, **options: Any) -> Any:
-        calls.append(path)
-        return function(path, *arguments, **options)
-
-    monkeypatch.setattr(module, name, count)
-    return calls
-
-
-def test_number_of_reads_does_not_grow_with_the_number_of_scenes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    built(tmp_path, cages(5, 1))
-    opened = counted(monkeypatch, retained, "open_folder")
-    hashed = counted(monkeypatch, folder, "file_sha256")
-    tables = counted(monkeypatch, auditing, "read_bars")
-    built(tmp_path, cages(5, 1))
-    audit(tmp_path, depth_views=0)
-    config = open_folder(tmp_path).config("cages")
-    assert (len(opened), len(tables)) == (1, 1)
-    assert sorted(path.name for path in hashed if path.parent.name in ("cages", "meshes")) == sorted(
-        Path(name).name for name in (*config.shards, *config.meshes)
-    )

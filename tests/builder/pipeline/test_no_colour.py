@@ -116,7 +116,7 @@ def test_audit_contact_sheet_and_export_have_depth_alone(root: Path, tmp_path: P
     assert [(config.views, config.written, config.kept) for config in summary] == [(2, 16, 0)]
     folder = tmp_path / "export" / "lattice-orbit"
     assert {path.name for path in folder.iterdir()} == {
-        *("depth", "depth_mm", "masks", "bars", "cameras.json", "README.txt"),
+        *("depth", "depth_mm", "masks", "bars", "cameras.json", "README.txt")
     }
     cameras = json.loads((folder / "cameras.json").read_text())["cameras"]
     assert [camera for camera in cameras if "image" in camera] == []

@@ -16,10 +16,8 @@ from dataset_builder.cli.main import main
 from dataset_builder.pipeline.blender_process import AUTO, available_devices, choose_device
 from dataset_builder.pipeline.disk_space import (
     ConfigSpace,
-    bytes_text,
     check_space,
     config_space,
-    free_bytes,
     needed_bytes,
     spaces_by_config,
     view_bytes,
@@ -53,7 +51,7 @@ NO_GPU = {"cpu": ["AMD EPYC"]}
         (("--no-colour", "--samples", "4"), "--no-colour is combined with --samples 4, expected only one"),
         (
             ("--no-colour", "--quality", "high", "--sampling", "uniform", "--device", "cpu"),
-            "--no-colour is combined with --sampling uniform, --quality high, --device cpu, expected only one",
+            "combined with --sampling uniform, --quality high, --device cpu",
         ),
         (("--config", "lattice", "audit", "ROOT"), "--config is followed by the command audit"),
         (("--views", "3", "audit", "tiny"), "unrecognized arguments: audit tiny"),
@@ -61,10 +59,7 @@ NO_GPU = {"cpu": ["AMD EPYC"]}
         (("--mesh", __file__), "unsupported mesh file type '.py', expected"),
         (("--scene", "missing.toml"), "missing.toml"),
         (("--device", "vulkan"), "--device: invalid choice: 'vulkan' (choose from 'cpu', 'optix', 'cuda'"),
-        (
-            ("--cluster", "tcp://a:1", "--workers", "2"),
-            "--workers 2 is combined with --cluster tcp://a:1, expected",
-        ),
+        (("--cluster", "tcp://a:1", "--workers", "2"), "--workers 2 is combined with --cluster tcp://a:1"),
         ((*CAGES[:-1], "val"), "--split: got 'val', expected one of train, validation, test"),
         ((*CAGES, "--scenes", "0"), "--scenes: got 0"),
         ((*CAGES, "--scenes", str(MAX_SCENES + 1)), f"--scenes: got {MAX_SCENES + 1}"),
@@ -261,10 +256,6 @@ def test_rows_of_one_config_at_a_time_are_beside_finished_files() -> None:
     assert needed_bytes([]) == 0
 
 
-def test_space_of_a_new_folder_is_that_of_its_disk(tmp_path: Path) -> None:
-    assert free_bytes(tmp_path / "a" / "b") == pytest.approx(shutil.disk_usage(tmp_path).free, abs=1e9)
-
-
 def test_build_that_does_not_fit_is_named_with_its_numbers(tmp_path: Path) -> None:
     check_space(tmp_path, [ConfigSpace(0, 1000)])
     with pytest.raises(OutputError) as error:
@@ -293,11 +284,3 @@ def test_scenes_of_a_config_are_staged_together(tmp_path: Path) -> None:
     plans = [plan_config(spec, None, tmp_path) for spec in request.config_specs()]
     one, all_of_them = config_space(plans[:1]), spaces_by_config(plans)["cages"]
     assert all_of_them == ConfigSpace(4 * one.staged_bytes, 4 * one.finished_bytes)
-
-
-@pytest.mark.parametrize(
-    ("count", "text"),
-    [(12, "0.012 kB"), (999_400, "999 kB"), (999_600, "1 MB"), (1.234e9, "1.23 GB"), (3.4e12, "3.4 TB")],
-)
-def test_bytes_are_shown_in_decimal_units(count: float, text: str) -> None:
-    assert bytes_text(count) == text

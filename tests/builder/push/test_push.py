@@ -12,7 +12,7 @@ import pytest
 from huggingface_hub import constants
 from starlette.requests import Request
 
-from tests.builder.push.published import (
+from tests.builder.push.conftest import (
     HUB_ID,
     KEY,
     accept_xet,
@@ -139,8 +139,9 @@ def test_killed_push_continues_without_sending_again_what_arrived(root: Path, tm
         assert visible(hub.repositories[KEY]) == folder_files(root)
 
 
-def test_stray_files_stay_local(hub: HubServer, root: Path) -> None:
+def test_stray_files_stay_local_and_a_gitignore_leaves_nothing_out(hub: HubServer, root: Path) -> None:
     listed = folder_files(root)
+    hub.add(KEY, {".gitignore": b"*.parquet\nmanifest.json\n"})
     for name in ("notes.txt", "lattice/old.parquet", ".rebar-build/lock"):
         (root / name).parent.mkdir(exist_ok=True)
         (root / name).write_text("mine")
@@ -148,12 +149,6 @@ def test_stray_files_stay_local(hub: HubServer, root: Path) -> None:
     assert finished.returncode == 0
     assert "notes.txt" in finished.stderr
     assert visible(hub.repositories[KEY]) == listed
-
-
-def test_gitignore_of_the_repository_leaves_nothing_out(hub: HubServer, root: Path) -> None:
-    repository = hub.add(KEY, {".gitignore": b"*.parquet\nmanifest.json\n"})
-    assert push(root, "--yes").returncode == 0
-    assert visible(repository) == folder_files(root)
 
 
 def test_private_repository_and_branch_are_created(hub: HubServer, root: Path) -> None:

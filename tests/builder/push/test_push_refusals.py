@@ -12,7 +12,7 @@ from huggingface_hub import constants
 from starlette.requests import Request
 from starlette.responses import JSONResponse, RedirectResponse, Response
 
-from tests.builder.push.published import KEY, list_files, push, refused
+from tests.builder.push.conftest import KEY, list_files, push, refused
 from tests.hub_server import READ_TOKEN, TOKEN, HubServer, folder_files, running_hub
 
 READING = ["GET */revision/main", "GET */tree/*"]
