@@ -46,7 +46,7 @@ from rebar_depth_bench.scorer import (
 )
 from rebar_depth_bench.scoring.result import SubmissionIdentity
 from rebar_depth_bench.submission import SubmissionReader, SubmissionWriter
-from rebar_depth_bench.submission.declaration import METRIC, Declaration
+from rebar_depth_bench.submission.declaration import METADATA_NAME, METRIC, Declaration
 from rebar_depth_bench.submission.writer import depth_map, stored_map
 
 if TYPE_CHECKING:
@@ -200,8 +200,11 @@ class Evaluator:
             raise InputError(f"archive is {self._archive}, a device or a pipe, expected the name of a file")
         try:
             SubmissionWriter(self._archive or "predictions", **self._metadata)
-        except InputError as error:  # Its message names an archive.
-            raise InputError.from_problems("declaration", error.problems) from None
+        except InputError as error:
+            argument = {f"{METADATA_NAME}: {name}": name for name in self._metadata}
+            argument[f"{METADATA_NAME}: prediction"] = "kind"
+            problems = [replace(one, where=argument.get(one.where, one.where)) for one in error.problems]
+            raise InputError.from_problems("arguments", problems) from None
         whole = open_folder(root)
         self._all = dataset_views(whole, None if config is None else [config], split)
         self._views = self._all if views is None else _selected(self._all, views)

@@ -616,7 +616,7 @@ def test_turned_and_flat_maps_are_not_to_be_resized(
         ({"views": 2.5}, "views is 2.5, expected a whole number from 1 or view ids"),
         ({"views": np.array(3)}, r"views is array\(3\), expected a whole number from 1"),
         ({"views": True}, "views is True, expected a whole number from 1"),
-        ({"kind": "depth"}, '^declaration: .*\n.* prediction: .*"metric", "scale", "affine-depth" or'),
+        ({"kind": "depth"}, '^arguments: .*\n  - kind: .*"metric", "scale", "affine-depth" or'),
         ({"inputs": "sonar"}, "inputs"),
         ({"split": "train"}, "train"),
         ({"config": "none"}, "no config 'none'"),
