@@ -270,7 +270,7 @@ class Evaluator:
         not finite, and of ``metric`` and ``scale`` those <= 0, mean no prediction.
 
         Raises ``InputError``, which names the view, for one that is not to be predicted or was added before, and
-        for depth of another size.
+        for depth of another size; the views before it in a batch stay added.
         """
         if isinstance(view_ids, str):
             self._add(view_ids, depth)
