@@ -56,6 +56,7 @@ def _bar_values(bar: CageBar) -> dict[str, Any]:
         "diameter_m": bar.bar.diameter_m if known else None,
         "length_m": bar.bar.length_m if known else None,
         "axis": bar.axis_kind,
+        "axis_m": [list(point_m) for point_m in bar.bar.axis_m] if known else None,
         "source": bar.source,
         "host": bar.host,
         "storey": bar.storey,
@@ -84,7 +85,8 @@ def _print(console: Console, line: str) -> None:
 
 def _group_table(groups: Sequence[BarGroup]) -> Table:
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0), show_edge=False)
-    for head in ("diameter\nmm", "role\n", "host\n", "storey\n", "bars\n", "length\nm", "mass\nkg"):
+    numbers = "bars\n", "length\nm", "mass\nkg", "spacing\nmm", "(range)\n", "above ground\nmm"
+    for head in ("diameter\nmm", "role\n", "host\n", "storey\n", *numbers):
         is_text = head.strip() in ("role", "host", "storey")
         table.add_column(head, justify="left" if is_text else "right", no_wrap=True)
     for group in groups[:_MAX_GROUPS]:
@@ -97,11 +99,17 @@ def _group_table(groups: Sequence[BarGroup]) -> Table:
 
 
 def _add_row(table: Table, names: Sequence[str], groups: Sequence[BarGroup]) -> None:
-    """Add a row of names, and the sums of groups."""
+    """Add a row of names, the sums of groups, and the spacing of a single one."""
     lengths_m = [group.length_m for group in groups if group.length_m is not None]
     masses_kg = [group.mass_kg for group in groups if group.mass_kg is not None]
     sums = f"{sum(lengths_m):.2f}" if lengths_m else "", f"{sum(masses_kg):.1f}" if masses_kg else ""
-    table.add_row(*map(plain_text, (*names, str(sum(group.bars for group in groups)), *sums)))
+    spacing, spread = "", ""
+    if len(groups) == 1 and groups[0].spacing_m is not None:
+        median_mm, low_mm, high_mm = (f"{1000 * one_m:.1f}" for one_m in groups[0].spacing_m)
+        spacing, spread = median_mm, "" if low_mm == high_mm else f"({low_mm} - {high_mm})"
+    above_ground_mm = f"{1000 * min(group.above_ground_m for group in groups):.1f}"
+    numbers = str(sum(group.bars for group in groups)), *sums, spacing, spread, above_ground_mm
+    table.add_row(*map(plain_text, (*names, *numbers)))
 
 
 def _axis_lines(inspection: Inspection) -> list[str]:

@@ -15,7 +15,9 @@ from numpy import ndarray
 
 from dataset_builder.scene.assemblies.cage import Cage, CageBar
 from rebar_depth_bench.bar_crossings.axis_segments import AxisSegments, TooManyNeighboursError
+from rebar_depth_bench.base.errors import DatasetError
 from rebar_depth_bench.data.bars import Bar, with_axis
+from rebar_depth_bench.extended.axes import cage_truth
 from rebar_depth_bench.geometry.segments import closest_points_m
 
 STEEL_KG_PER_M3 = 7850.0
@@ -37,7 +39,9 @@ Box = Float64[ndarray, "2 3"]
 class BarGroup:
     """Bars of one diameter (None: unknown), role, host and storey: their number, total length and mass.
 
-    Length and mass are None if the diameter is unknown.
+    Length and mass are None if the diameter is unknown. ``spacing_m`` has the median, least and greatest distance
+    of the axes of neighbouring parallel bars of the group (``extended.axes.overlapping_pairs``), None if there are
+    no such pairs, or too many straight segments. ``above_ground_m`` is the least height of a surface above z = 0.
     """
 
     diameter_mm: float | None
@@ -47,6 +51,8 @@ class BarGroup:
     bars: int
     length_m: float | None
     mass_kg: float | None
+    spacing_m: tuple[float, float, float] | None
+    above_ground_m: float
 
 
 @dataclass(frozen=True)
@@ -86,7 +92,7 @@ def inspect_cage(cage: Cage, name: str) -> Inspection:
     found: tuple[Sequence[Meeting] | None, Sequence[Meeting] | None] = None, None
     with suppress(TooManyNeighboursError):
         found = meetings([bar.bar for bar in cage.bars])
-    return Inspection(name, cage, tuple(_groups(cage.bars)), box_m, *found)
+    return Inspection(name, cage, tuple(_groups(cage.bars, boxes_m[:, 0, 2])), box_m, *found)
 
 
 def meetings(bars: Sequence[Bar]) -> tuple[list[Meeting], list[Meeting]]:
@@ -147,18 +153,26 @@ def diameter_mm(bar: CageBar) -> float | None:
     return round(bar.bar.diameter_m * 1000, 2) if bar.bar.has_axis else None
 
 
-def _groups(bars: Sequence[CageBar]) -> list[BarGroup]:
-    """Return the groups by descending diameter, then by role, host and storey; unknown diameters last."""
-    by_key: dict[tuple[float | None, str, str | None, str | None], list[float]] = defaultdict(list)
-    for bar in bars:
-        by_key[diameter_mm(bar), bar.bar.role, bar.host, bar.storey].append(bar.bar.length_m)
+def _groups(bars: Sequence[CageBar], lowest_m: Float64[ndarray, " n"]) -> list[BarGroup]:
+    """Return the groups by descending diameter, then by role, host and storey; unknown diameters last.
+
+    ``lowest_m`` has the least z of each bar's surface.
+    """
+    by_key: dict[tuple[float | None, str, str | None, str | None], list[int]] = defaultdict(list)
+    for position, bar in enumerate(bars):
+        by_key[diameter_mm(bar), bar.bar.role, bar.host, bar.storey].append(position)
     ordered = sorted(by_key, key=lambda key: (-(key[0] or 0.0), key[1], key[2] or "", key[3] or ""))
     groups = []
     for key in ordered:
-        count, size_mm = len(by_key[key]), key[0]
-        length_m = mass_kg = None
+        members, size_mm = [bars[position].bar for position in by_key[key]], key[0]
+        length_m = mass_kg = spacing_m = None
         if size_mm is not None:
-            length_m = math.fsum(by_key[key])
+            length_m = math.fsum(bar.length_m for bar in members)
             mass_kg = math.pi / 4 * (size_mm / 1000) ** 2 * length_m * STEEL_KG_PER_M3
-        groups.append(BarGroup(*key, count, length_m, mass_kg))
+            with suppress(DatasetError):
+                apart_m = cage_truth(members).spacing_m
+                if len(apart_m):
+                    spacing_m = float(np.median(apart_m)), float(apart_m.min()), float(apart_m.max())
+        above_ground_m = float(lowest_m[by_key[key]].min())
+        groups.append(BarGroup(*key, len(members), length_m, mass_kg, spacing_m, above_ground_m))
     return groups

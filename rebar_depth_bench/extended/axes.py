@@ -134,7 +134,8 @@ class CageTruth:
     """Straight bar segments of a scene and the pairs of neighbours among them; world, metres.
 
     ``bar_id`` and ``diameter_m`` describe the bar of each segment. ``neighbours`` holds indices of segments, the
-    lower one first: see ``overlapping_pairs``. ``match_radius_m`` is half the distance from each segment to the
+    lower one first: see ``overlapping_pairs``; ``spacing_m`` is the distance of their axes in the middle of their
+    overlap. ``match_radius_m`` is half the distance from each segment to the
     nearest parallel segment of any bar, at most ``MAX_MATCH_RADIUS_M``: a fitted axis farther away than that is
     attributed to another bar.
     """
@@ -144,6 +145,7 @@ class CageTruth:
     start_m: Float64[ndarray, "r 3"]
     end_m: Float64[ndarray, "r 3"]
     neighbours: Int64[ndarray, "m 2"]
+    spacing_m: Float64[ndarray, " m"]
     match_radius_m: Float64[ndarray, " r"]
 
     def __len__(self) -> int:
@@ -165,7 +167,8 @@ def cage_truth(bars: Iterable[Bar]) -> CageTruth:
     parallel_m = parallel_pairs(start_m, end_m, diameter_m)
     match_radius_m = np.minimum(parallel_m[0].min(axis=1, initial=np.inf) / 2, MAX_MATCH_RADIUS_M)
     neighbours = overlapping_pairs(parallel_m, bar_id, diameter_m)
-    return CageTruth(bar_id, diameter_m, start_m, end_m, neighbours, match_radius_m)
+    spacing_m = parallel_m[0][neighbours[:, 0], neighbours[:, 1]]
+    return CageTruth(bar_id, diameter_m, start_m, end_m, neighbours, spacing_m, match_radius_m)
 
 
 def assign_segments(

@@ -32,7 +32,7 @@ from tests.builder.user_files.ifc_writer import Ifc
 from tests.commands import run_in_process
 
 COLUMN = Path("examples/column.ifc")
-KEYS = {"bar_id", "role", "diameter_m", "length_m", "axis", "source", "host", "storey"}
+KEYS = {"bar_id", "role", "diameter_m", "length_m", "axis", "axis_m", "source", "host", "storey"}
 
 
 def rods(folder: Path) -> Path:
@@ -56,6 +56,7 @@ def test_json_lists_every_bar(tmp_path: Path) -> None:
     uprights = [bar for bar in values["bars"] if bar["diameter_m"] == 0.008]
     assert len(uprights) == 8
     np.testing.assert_allclose([bar["length_m"] for bar in uprights], 0.2, atol=1e-3)
+    np.testing.assert_allclose([np.ptp(bar["axis_m"], axis=0) for bar in uprights], [[0, 0, 0.2]] * 8, atol=1e-3)
     with Image.open(outputs[1]) as picture:
         assert picture.format == "PNG"
         assert picture.width >= 1600
@@ -70,7 +71,7 @@ def test_mesh_file_has_fitted_and_unknown_axes(tmp_path: Path) -> None:
     assert (rod["axis"], rod["source"], rod["host"]) == ("fitted", "part 1", None)
     assert rod["diameter_m"] == pytest.approx(0.012, rel=0.01)
     assert rod["length_m"] == pytest.approx(0.5, rel=0.005)
-    assert (block["axis"], block["diameter_m"], block["length_m"]) == (None, None, None)
+    assert [block[key] for key in ("axis", "axis_m", "diameter_m", "length_m")] == [None] * 4
 
 
 def test_dash_suppresses_the_table(tmp_path: Path) -> None:
@@ -254,6 +255,26 @@ def test_font_has_the_letters_of_names() -> None:
 
 def rod(bar_id: int, start: tuple[float, ...], end: tuple[float, ...], diameter_m: float = 0.012) -> Bar:
     return Bar(bar_id, "bar", diameter_m, axis_of(np.array([start, end], dtype=np.float64)))
+
+
+def test_groups_have_spacing_and_height_above_the_ground() -> None:
+    """Bars of another group, and those that cross, do not change the spacing; a plate's lowest point counts."""
+    level = [rod(number, (0, y, 0.05), (1, y, 0.05)) for number, y in enumerate((0, 0.15, 0.3, 0.44), 1)]
+    thick = [rod(10 + number, (0, y, 0.1), (1, y, 0.1), 0.02) for number, y in enumerate((0.07, 0.27))]
+    across = rod(20, (0.5, 0, 0.07), (0.5, 1, 0.07), 0.016)
+    plate = trimesh.creation.box((0.1, 0.1, 0.02))
+    unknown = CageBar(
+        "plate", Bar.without_axis(30, "plate"), mesh=Mesh(plate.vertices - (0, 0, 0.03), plate.faces)
+    )
+    groups = inspect_cage(Cage((*bars_of(*level, *thick, across).bars, unknown)), "a").groups
+    assert [group.diameter_mm for group in groups] == [20, 16, 12, None]
+    assert [group.spacing_m for group in groups] == [
+        pytest.approx((0.2, 0.2, 0.2)), None, pytest.approx((0.15, 0.14, 0.15)), None
+    ]  # fmt: skip
+    assert [group.above_ground_m for group in groups] == pytest.approx([0.09, 0.062, 0.044, -0.04])
+    lines = printed(bars_of(*level, *thick)).splitlines()
+    assert lines[4].split()[-5:] == ["150.0", "(140.0", "-", "150.0)", "44.0"]
+    assert lines[6].split()[-1] == "44.0"
 
 
 @pytest.mark.slow
