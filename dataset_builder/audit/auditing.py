@@ -62,7 +62,7 @@ from rebar_depth_bench.geometry.cameras import camera_centre
 from rebar_depth_bench.scoring.protocol import interior
 
 _CROSSING_TOLERANCE_M = 1e-9
-"""Largest difference of crossings from those of the bars."""
+"""Largest difference between stored crossings and crossings computed from the bars."""
 SAMPLED_SCENES = 8
 """Scenes of a config of several scenes in which depth is rendered again."""
 
@@ -167,9 +167,9 @@ def audit(root: str | Path, *, depth_views: int = 4, progress: Progress = silent
 def _config_checks(
     config: DatasetConfig, root: Path, bars: Mapping[str, tuple[Bar, ...]], depth_views: int, progress: Progress
 ) -> Iterator[Check]:
-    """Yield the checks of a config; those of several scenes are made of all scenes together.
+    """Yield the checks of a config; each check covers all scenes of the config.
 
-    Depth is rendered again in ``SAMPLED_SCENES`` of them.
+    Depth is rendered again in ``SAMPLED_SCENES`` scenes.
     """
     if config.imported is not None:
         yield from imported_checks(config, config.imported, bars.get(config.scene.name, ()), progress)

@@ -110,7 +110,7 @@ def expected_views(
 
 
 def view_list_problems(config: DatasetConfig, views: Sequence[ExpectedView]) -> Iterator[str]:
-    """Yield a problem if the manifest's view ids are not those of the expected views, in order."""
+    """Yield a problem unless the manifest has the ids of the expected views, in their order."""
     pairs = list(zip(config.view_ids, [view.view_id for view in views], strict=False))
     different = [
         f": the first difference is {found}, expected {wanted}" for found, wanted in pairs if found != wanted

@@ -40,7 +40,7 @@ RESERVED_NAMES = (*CONFIGS, *SWEEPS, CAGES, "meshes", "pictures", "scenes")
 """Names that a user scene cannot have: names of configs and of other entries of the dataset folder."""
 
 NEAREST_RADIUS_PER_REACH = 2.5
-"""Nearest dome radius per reach of the assembly, close to that of the lattice dome (2.67).
+"""Nearest dome radius per reach of the assembly, close to the value of the lattice dome (2.67).
 
 At this distance the whole assembly is in the frame of the default rig and fills much of it. For another rig,
 it is multiplied by the ratio of the focal lengths.
@@ -69,7 +69,7 @@ class UserScene:
 def read_scene(path: str | os.PathLike[str]) -> UserScene:
     """Return the config of a scene file, with the default colour settings and seed, and its cage.
 
-    Defaults of omitted keys: the name is that of the file in lower case, with hyphens; the cameras are
+    Defaults of omitted keys: the name is the file name in lower case, with hyphens; the cameras are
     ``default_dome``, or a survey if that exceeds ``MAX_DOME_M``; the environment is the laboratory if all steel is
     within 0.45 m and all cameras are within 1.6 m of its centre (wherever a survey places them), otherwise
     outdoors; the board has 6 markers in the laboratory, and there is no board elsewhere; the rig is ``RigSpec()``.

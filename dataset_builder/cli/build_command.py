@@ -194,7 +194,7 @@ def _build_request(options: argparse.Namespace, device: str) -> BuildRequest:
     """Return the build request of the options.
 
     With ``--scene`` and without ``--config``, only the given scene files are built. With ``--mesh``, the default
-    configs are those of the lattice.
+    configs are the lattice configs.
     """
     default = () if options.scene else LATTICE_CONFIGS if options.mesh else CONFIGS
     request = BuildRequest(

@@ -1,6 +1,6 @@
 """Cameras and metadata for other programs: COLMAP's text model, ``transforms.json``, ``cameras.json``, a README.
 
-The centre of their first pixel is (0.5, 0.5), that of ours is (0, 0), so ``HALF_PIXEL`` is added to cx and cy.
+The centre of their first pixel is (0.5, 0.5), the centre of ours is (0, 0), so ``HALF_PIXEL`` is added to cx, cy.
 Numbers have up to 17 digits, so that they are read back as the same float64.
 
 COLMAP (its documentation, "Output Format" and "Camera Models"; files ``cameras.txt``, ``images.txt`` and

@@ -110,7 +110,7 @@ def depth_exr(depth_m: Float32[ndarray, "h w"]) -> bytes:
 def depth_mm_png(depth_m: Float32[ndarray, "h w"]) -> bytes:
     """Encode planar depth as 16-bit grey PNG in whole millimetres, rounded to the nearest.
 
-    0 where there is no surface, or where it is farther than 65.535 m.
+    The value is 0 where there is no surface, or where the surface is farther than 65.535 m.
     """
     depth_mm = np.rint(depth_m.astype(np.float64) / MILLIMETRE_M)
     return plain_png(np.where(depth_mm <= _LARGEST_MM, depth_mm, 0).astype(np.uint16))

@@ -145,8 +145,8 @@ def _key_inputs(source: Import, progress: Progress) -> list[Any]:
 def _stage_views(source: Import, staging: Staging, progress: Progress) -> tuple[set[int], ImportFindings]:
     """Stage the rows of all views; return the bar ids in the left images, and what was found out.
 
-    All views are decoded, as those of an interrupted import are compared as well. Raises ``InputError`` for files
-    that cannot be read.
+    All views are decoded, because views of an interrupted import are compared as well. Raises ``InputError`` for
+    files that cannot be read.
     """
     ids: set[int] = set()
     tally, survey = DepthTally(), SurveyCheck(source.layout, source.bars, len(source.views.names))

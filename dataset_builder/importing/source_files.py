@@ -81,10 +81,10 @@ class DepthTally:
 def read_depth(path: Path, grid: Grid, table: DepthTable, tally: DepthTally) -> Float64[ndarray, "h w"]:
     """Return the values of a depth map of ``grid`` in units of the file; NaN where there is none.
 
-    Values of ``depth.invalid`` are rounded to the type of the file before they are compared, and those that occur
-    are added to ``tally``. Raises ``EntryError`` for a damaged file, for one of another size, and for the largest
-    value of an integer type, or of half floats, which marks pixels without depth, unless it is among the invalid
-    ones; that of half floats is left out with ``depth.max_m``.
+    Values of ``depth.invalid`` are rounded to the type of the file before they are compared, and the values that
+    occur are added to ``tally``. Raises ``EntryError`` for a damaged file, for a map of another size, and for the
+    largest value of an integer type or of half floats, which marks pixels without depth, unless it is one of the
+    invalid values; with ``depth.max_m``, the largest half float is left out.
     """
     suffix, content = path.suffix.lower(), read_file(path, CELL_BYTES, "a depth map", InputError)
     check_upright(io.BytesIO(content), path.name)
@@ -129,8 +129,8 @@ def planar_depth_m(
     """Return the values of a depth map times ``factor`` as planar depth, metres, NaN without depth.
 
     Range is divided by the length of the ray (x, y, 1) of its pixel in the camera with ``K`` and ``distortion``.
-    Disparity d is that of the left pixel to the right: z = fx B / (d + cx_right - cx_left). Raises ``InputError``
-    as ``rectified_pair`` does.
+    Disparity d is measured from the left pixel to the right one: z = fx B / (d + cx_right - cx_left). Raises
+    ``InputError`` as ``rectified_pair`` does.
     """
     with np.errstate(over="ignore"):
         values = units * factor

@@ -66,7 +66,7 @@ class SourceViews:
 
     @property
     def files(self) -> list[Path]:
-        """Files of all views, and that of their cameras."""
+        """Files of all views, and the file of their cameras."""
         files = [self.file(pattern, name) for pattern in _patterns(self.layout).values() for name in self.names]
         return files if self.layout.views is None else [*files, self.root / self.layout.views]
 

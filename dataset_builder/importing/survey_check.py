@@ -121,7 +121,7 @@ class SurveyCheck:
     """Steel pixels of the left images of ``views`` views, compared with the surfaces of the surveyed ``bars``.
 
     ``parts`` has the bar ids of the pixels of each view, their points in the world and their vectors from the
-    camera, metres. An RMS is that of the smallest ``_TRUSTED_SHARE`` of the deviations.
+    camera, metres. An RMS is taken over the smallest ``_TRUSTED_SHARE`` of the deviations.
     """
 
     layout: Layout

@@ -35,11 +35,11 @@ _OWN_NAMES = {MESHES: re.compile(rf"{_NAME}\.ply"), PICTURES: re.compile(rf"{_NA
 SHARD_NAME = re.compile(
     rf"(?:test|(?:{'|'.join(SPLITS)})-{_NAME})-\d{{5}}-of-\d{{5}}-[0-9a-f]{{{SHARD_DIGEST_CHARACTERS}}}\.parquet"
 )
-"""Names of the files in the folder of a config; those of a config of several scenes name split and scene."""
+"""Names of the files in the folder of a config; with several scenes, they include split and scene."""
 
 
 def stagings_by_label(out: Path) -> dict[str, list[Path]]:
-    """Return the staging folders of ``out`` by the label of their config, those of abandoned builds included."""
+    """Return the staging folders of ``out`` by the label of their config, including abandoned builds."""
     by_label: dict[str, list[Path]] = {}
     folder = out / BUILD_FOLDER
     for path in sorted(folder.iterdir()) if folder.is_dir() else ():

@@ -174,7 +174,7 @@ def _references(config: DatasetConfig, published: DatasetConfig | None) -> dict[
 def repair_metadata(out: Path, folder: DatasetFolder, plans: Sequence[ConfigPlan]) -> DatasetFolder:
     """Rewrite bars, crossings, card, pictures and manifest if any of them does not match.
 
-    ``plans`` are those of one config. Returns the dataset that the folder then holds.
+    ``plans`` belong to one config. Returns the dataset that the folder then holds.
     """
     config = folder.config(plans[0].spec.name)
     names = (BARS_FILE, CROSSINGS_FILE, CARD, STRIP, config.sheet)

@@ -72,7 +72,7 @@ class Staging:
 
 
 def split_into_shards(views: Sequence[ViewT], count: int = VIEWS_PER_SHARD) -> list[Sequence[ViewT]]:
-    """Split the views of a config into those of each shard, or other runs of ``count`` views."""
+    """Split the views of a config into runs of ``count`` views, such as the views of each shard."""
     return [views[i : i + count] for i in range(0, len(views), count)]
 
 

@@ -88,7 +88,7 @@ class RayCaster:
     def hits(self, origins_m: Float64[ndarray, "n 3"], directions: Float64[ndarray, "n 3"]) -> RayHits:
         """Return the first intersection of each ray; world frame, directions of any length.
 
-        The ranges are as exact as the depths of ``cast``. The cosine is that of the angle to the face normal, for
+        The ranges are as exact as the depths of ``cast``. The cosine belongs to the angle to the face normal, for
         either side of the face.
         """
         face = self._first_face(origins_m, directions)

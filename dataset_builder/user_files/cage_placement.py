@@ -16,7 +16,7 @@ from dataset_builder.scene.shapes.solids import rotation_about_z
 from dataset_builder.specs.file_specs import PlacementSpec
 
 _Z_FROM_UP = {"z": np.eye(3), "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]])}
-"""Rotation from the axes of a file to those of the world, by the file's vertical axis."""
+"""Rotation from the axes of a file to the axes of the world, by the file's vertical axis."""
 
 _QUARTER_TURN = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
 _STEPS_PER_METRE = 1000
@@ -92,7 +92,7 @@ def _origin_m(
 ) -> Float64[ndarray, " 3"]:
     """Return the point of the file's frame, in metres, that comes to the world's origin when a cage is centred.
 
-    The middle of the box is that of the upright cage before it is turned; ``rotation`` includes ``up``.
+    The middle of the box is taken of the upright cage before it is turned; ``rotation`` includes ``up``.
     """
     corners_m = np.array([(bar.points_m.min(axis=0), bar.points_m.max(axis=0)) for bar in bars])
     near_m = np.round((corners_m.min(axis=(0, 1)) + corners_m.max(axis=(0, 1))) / 2)

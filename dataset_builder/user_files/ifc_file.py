@@ -57,7 +57,7 @@ def ifc_cage(content: bytes, where: str, select: tuple[Selection, ...] = (), tru
     """Return the bars of an IFC file's ``content`` (its frame, metres); ``where`` names the file in messages.
 
     Without ``select``, all reinforcement is read. Bar ids start at 1 and follow the instance numbers in the file.
-    Diameters and lengths are always those of the geometry; with ``trust`` "declared", a diameter that is far from
+    Diameters and lengths always come from the geometry; with ``trust`` "declared", a diameter that is far from
     the declared one is a problem of the cage.
 
     Raises ``MeshError`` if the file is not a complete IFC file, has no known length unit, nothing to read or

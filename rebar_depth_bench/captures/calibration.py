@@ -81,7 +81,7 @@ class StereoCalibration:
 
 @dataclass(frozen=True)
 class MonoCalibration:
-    """Calibrated camera, for images of ``width`` x ``height`` pixels; ``notes`` as those of a stereo pair."""
+    """Calibrated camera, for images of ``width`` x ``height`` pixels; ``notes`` as of a stereo pair."""
 
     width: int
     height: int

@@ -41,9 +41,9 @@ def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibra
     calibration, is the requested size. K may replace fx, fy, cx and cy, and they K; ``rotation`` may be a 3 x 3
     matrix, and ``baseline_m = 0.12`` may replace ``translation_m = [-0.12, 0, 0]``; k3 may be absent.
 
-    Raises ``CalibrationError`` with the problems of the file, all those of a ``.toml`` file; also if a distortion
-    model cannot be inverted over the whole image, if the requested size is not 16 to 16384 pixels each, and if its
-    aspect ratio is another one.
+    Raises ``CalibrationError`` with a problem of the file, or all problems of a ``.toml`` file; also if a
+    distortion model cannot be inverted over the whole image, if the requested size is not 16 to 16384 pixels each,
+    and if its aspect ratio is another one.
     """
     calibration = own_calibration(Path(path), width, height, is_stereo=True)
     assert isinstance(calibration, StereoCalibration)

@@ -5,7 +5,7 @@
   is that of the calibration target's squares: metres unless another unit is stated.
 - ROS: ``camera_info`` as camera_calibration writes it (camera_matrix, ...) or as a printed message (K or k, ...).
   The motion of a pair follows from the rectification of both cameras: x_rectified = R_i x_i, P[0, 3] = -fx B.
-  K and P are those of the full sensor; the pictures may be a region of it, divided by the binning (REP 104).
+  K and P refer to the full sensor; the pictures may be a region of it, divided by the binning (REP 104).
 
 Pictures are those of the camera, with its matrix and distortion, unless they are stated to be rectified: they have
 the projection matrix P then, no distortion, and for a pair the baseline that P states.

@@ -83,7 +83,7 @@ class ImageViews:
 
     @property
     def rectify(self) -> bool:
-        """Whether the images have lens distortion, or are those of a pair that is not parallel."""
+        """Whether the images have lens distortion, or come from a pair that is not parallel."""
         return not self.calibration.is_rectified
 
     @property
@@ -100,7 +100,7 @@ class ImageViews:
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Columns of a row; without the right image, there are those of the left one only."""
+        """Columns of a row; without the right image, only columns of the left one."""
         is_stereo = bool(self.right)
         poses = ("left_cam_from_world",) if self.has_poses or is_stereo else ()
         return (*_LEFT_COLUMNS[:-1], *poses, *(_RIGHT_COLUMNS if is_stereo else ()))

@@ -1,4 +1,4 @@
-"""The ``rebar-bench demo`` command: predict, score and report a few views, rendered or those of the package.
+"""The ``rebar-bench demo`` command: predict, score and report a few views, rendered or bundled.
 
 ``dataset_builder`` depends on this package and not vice versa, so the demo renders by running ``rebar-build`` in a
 subprocess.

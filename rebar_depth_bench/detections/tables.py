@@ -99,10 +99,10 @@ class ViewDetections:
     """Detections of one view compared with its crossings.
 
     ``judged`` counts crossings, ``nodes`` their nodes and ``nodes_found`` the nodes with a match; ``detections``
-    counts rows with enough confidence, of which ``matched`` have a crossing, ``ignored`` are
-    excused and the others false. ``position_mm`` and ``normal_deg`` are the errors of matched detections, the
-    latter where a normal is given. ``confidence``, ``counts`` and ``correct`` describe all rows for average
-    precision, the last two by limit: whether a row counts, and whether it is correct.
+    counts rows with enough confidence, of which ``matched`` have a crossing, ``ignored`` are excused and the
+    others false. ``position_mm`` and ``normal_deg`` are the errors of matched detections, the latter where a
+    normal is given. ``confidence``, ``counts`` and ``correct`` describe all rows for average precision, the last
+    two by limit: whether a row counts, and whether it is correct.
     """
 
     view_id: str

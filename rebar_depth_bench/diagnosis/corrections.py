@@ -263,7 +263,7 @@ RELATIVE = '; if the network is relative, declare kind="{}" (prediction= of Subm
 MAX_SHIFT_PX = 6
 """Largest shift that is looked for, pixels."""
 BETTER_THAN_PLANE = 0.7
-"""Largest error after an inversion, as a share of that of a plane at the median depth.
+"""Largest error after an inversion, as a share of the error of a plane at the median depth.
 
 A line fitted to predictions that have nothing to do with depth is such a plane.
 """

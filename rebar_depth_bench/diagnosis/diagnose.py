@@ -39,7 +39,7 @@ SMALLEST_RATIO = 1e-6
 LEAST_VALID_SHARE = 0.5
 """Least number of valid pixels after a correction, as a share of those before."""
 LEAST_SPREAD = 0.1
-"""Least relative spread of corrected depth within a view, as a share of that of the true depth."""
+"""Least relative spread of corrected depth within a view, as a share of the spread of the true depth."""
 LEAST_RANK_CORRELATION = 0.5
 """Rank correlation of corrected and true depth, over all views, up to which the correction explains nothing."""
 
@@ -48,7 +48,7 @@ LEAST_RANK_CORRELATION = 0.5
 class PossibleMistake:
     """Mistake that most of the views of a config show.
 
-    ``name`` is that of the correction, or of the most frequent kind of invalid values; ``text`` describes the
+    ``name`` is the name of the correction, or of the most frequent kind of invalid values; ``text`` describes the
     mistake with its figures, in one sentence.
     """
 

@@ -135,9 +135,8 @@ class CageTruth:
 
     ``bar_id`` and ``diameter_m`` describe the bar of each segment. ``neighbours`` holds indices of segments, the
     lower one first: see ``overlapping_pairs``; ``spacing_m`` is the distance of their axes in the middle of their
-    overlap. ``match_radius_m`` is half the distance from each segment to the
-    nearest parallel segment of any bar, at most ``MAX_MATCH_RADIUS_M``: a fitted axis farther away than that is
-    attributed to another bar.
+    overlap. ``match_radius_m`` is half the distance from each segment to the nearest parallel segment of any bar,
+    at most ``MAX_MATCH_RADIUS_M``: a fitted axis farther away than that is attributed to another bar.
     """
 
     bar_id: Int64[ndarray, " r"]

@@ -151,7 +151,7 @@ def _load_entry_point(entry: EntryPoint) -> AnyMethod:
 
 
 def _import_error(where: str, error: Exception) -> MethodError:
-    """Return the error of an import; that of a ``MethodInfo`` keeps its words."""
+    """Return the error of an import; an error of a ``MethodInfo`` keeps its words."""
     reason = error if isinstance(error, MethodError) else f"cannot be imported: {exception_summary(error)}"
     return MethodError(f"{where}: {reason}")
 

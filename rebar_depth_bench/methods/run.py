@@ -295,7 +295,7 @@ def rectifying_predictor(
 ) -> tuple[Predictor, tuple[str, ...]]:
     """Return a predictor of raw rows, and the columns that it needs, for a predictor of rectified rows.
 
-    ``columns`` are those that ``predictor`` reads, ``kind`` is that of its predictions. Raises ``MethodError`` if
+    ``predictor`` reads ``columns``, and ``kind`` is the kind of its predictions. Raises ``MethodError`` if
     a rectified row lacks one of the columns, and if OpenCV is missing.
     """
     if others := sorted(set(columns) - RECTIFIED_COLUMNS):

@@ -102,7 +102,7 @@ def print_page(page: DetectionPage, console: Console) -> None:
 
 
 def detection_page(result: DetectionResult) -> DetectionPage:
-    """Return the page of a result; its tables are also those of the terminal."""
+    """Return the page of a result, with the tables of the terminal."""
     rows: list[Row] = list(result.tables.items())
     if len(rows) > 1:
         rows.append(("all", result.pooled))

@@ -160,7 +160,7 @@ def _draw_panel(
 ) -> list[str]:
     """Draw the points and reference lines of a config, and return the notes that explain them.
 
-    ``tables`` are those of the config with the labels and markers of their methods.
+    ``tables`` has the tables of the config with the labels and markers of their methods.
     """
     from matplotlib.ticker import LogLocator, NullFormatter
 

@@ -209,7 +209,7 @@ def _result_rows(
 
 
 def _head(column: Column) -> str:
-    """Return the heading of a column; that of the paper's table, if it has one."""
+    """Return the heading of a column: the heading of the paper's table, if it has one."""
     unit = f", {column.unit}" if column.unit else ""
     heads = {**_HEADS, **_ALIGNED_HEADS}
     arrow = "" if column in ALIGNED_CONSTANT else _ARROWS[column.better]

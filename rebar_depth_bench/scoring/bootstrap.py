@@ -180,7 +180,7 @@ class Resampling:
 def half_width(blocks: Blocks) -> float:
     """Return half the width of the interval of a normal mean of two or more blocks, in standard deviations.
 
-    The deviation is that of the means of resamples. The half width is sqrt(u / (u - d)) t for u blocks at d
+    The deviation is taken over the means of resamples. The half width is sqrt(u / (u - d)) t for u blocks at d
     distances: variance in resamples is (u - d) / u of that in samples, if each distance has as many blocks, and t
     is Student's quantile for u - d degrees of freedom.
     """

@@ -90,7 +90,7 @@ class Column:
     """Number of a table or view.
 
     ``place`` is its place in the JSON of a table, keys joined by dots; ``view_place`` is its place in a view if
-    that differs. ``title`` names it, ``unit`` is that of the shown value, which is the value times ``factor`` with
+    that differs. ``title`` names it, ``unit`` belongs to the shown value, which is the value times ``factor`` with
     ``decimals``. ``as_text``, if set, makes the text of the value. ``head`` is a heading of three lines for narrow
     columns. ``statistic`` makes the number of a table from the numbers of its views: mean, median, or the count of
     views for which it is true. ``has_interval`` states whether it has a 95 % interval. Values are from 0 to
@@ -302,7 +302,7 @@ ALIGNED_METRICS = (
 )
 """Columns of the numbers of an alignment, whose places begin at it."""
 RELATIVE_ALIGNMENTS = ("aligned", "aligned_robust", "constant")
-"""Alignments of predictions that are not metric: that of their kind, its robust variant, and its constant."""
+"""Alignments of predictions that are not metric: by their kind, its robust variant, and its constant."""
 ALIGNED, ALIGNED_ROBUST, ALIGNED_CONSTANT = (
     tuple(_aligned(alignment, one) for one in ALIGNED_METRICS) for alignment in RELATIVE_ALIGNMENTS
 )

@@ -366,7 +366,7 @@ def error_and_constant(table: Table) -> tuple[float, float]:
 
 
 def constant_margin(table: Table) -> float | None:
-    """Return the share by which the error is below that of a constant, negative if above; None if undefined."""
+    """Return the share by which the error is below a constant's, negative if above; None if undefined."""
     error, constant = error_and_constant(table)
     if not table.views_scored or not constant or math.isnan(error / constant):
         return None
@@ -375,11 +375,11 @@ def constant_margin(table: Table) -> float | None:
 
 
 LEAST_MARGIN = 0.05
-"""Share by which an error must be below that of a constant; otherwise the predictions say little about depth."""
+"""Share by which an error must be below a constant's; otherwise the predictions say little about depth."""
 
 
 def is_like_constant(table: Table) -> bool:
-    """Return whether the error of a table is not below that of a constant by ``LEAST_MARGIN``."""
+    """Return whether the error of a table is not below the error of a constant by ``LEAST_MARGIN``."""
     margin = constant_margin(table)
     return margin is not None and margin < LEAST_MARGIN
 

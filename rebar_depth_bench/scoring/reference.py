@@ -1,6 +1,6 @@
 """Reference errors of a config, from ground truth alone: a scaled constant, and depth shifted by one pixel.
 
-They show what the numbers of a config mean. A scaled error above that of the constant says that the prediction
+They show what the numbers of a config mean. A scaled error above the constant's says that the prediction
 describes the shape worse than a plane at one depth does. A native error below that of exact depth shifted by one
 pixel is smaller than the differences between neighbouring pixels.
 """

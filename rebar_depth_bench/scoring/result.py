@@ -76,7 +76,7 @@ class IntervalMethod:
 class Result:
     """Result of scoring one submission, with the digests and versions of its inputs.
 
-    ``tables`` and ``frames`` have the numbers of each config and those of its views. ``prediction`` is the kind of
+    ``tables`` and ``frames`` have the numbers of each config and of its views. ``prediction`` is the kind of
     predictions that are not metric, ``declared_prediction`` the kind of an archive which was scored as another.
     ``intervals`` states how the intervals were computed; None in a file of an earlier
     version. ``extended`` are the extended measures, None in a result that was read from a file.

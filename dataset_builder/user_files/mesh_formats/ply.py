@@ -1,6 +1,6 @@
 """Reader of PLY files, text and binary: the vertices and polygons of any file with these two elements.
 
-The counts of the header must be those of the content. Other elements and properties are skipped. The numbers of a
+The counts of the header must agree with the content. Other elements and properties are skipped. The numbers of a
 text are read as those of a binary file of 64-bit numbers, whose rows must be the lines.
 """
 
@@ -50,7 +50,7 @@ _Columns = dict[str, tuple[ndarray, ndarray]]
 def read_ply(content: bytes) -> Mapping[str, Surface]:
     """Return the vertices and the triangulated polygons of a PLY file, as one object without a name.
 
-    Raises ``MalformedMeshError`` if the header is malformed, if counts in it are not those of the content, if
+    Raises ``MalformedMeshError`` if the header is malformed, if its counts disagree with the content, if
     there are no vertices, or for a property ``bar_id``, which only files in another layout have.
     """
     header = _HEADER.match(content[:_HEADER_BYTES])

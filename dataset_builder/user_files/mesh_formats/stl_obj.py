@@ -144,7 +144,7 @@ def read_obj(content: bytes) -> Mapping[str, Surface]:
 
 
 def _triangles(polygons: list[Int64[ndarray, " k"]]) -> Int64[ndarray, "n 3"]:
-    """Return the triangles of convex polygons; those of a quadrilateral begin at opposite corners."""
+    """Return the triangles of convex polygons; the two of a quadrilateral begin at opposite corners."""
     if len({len(polygon) for polygon in polygons}) == 1:
         return triangulate(np.array(polygons))
     triangles = []

@@ -61,7 +61,7 @@ _TITLE_NUMBER = re.compile(r"\d[\d.]*(?:-[\d.]+)?(?= (?:mm|%|m|px|degrees)(?!\w)
 """Tolerance, threshold or bin in a measure's title: a number followed by a unit."""
 _HEAD_NOTES: Mapping[str, str] = {NATIVE: "no alignment", SCALED: "oracle median scale per view"}
 _SHOWN_FAMILIES = ("inspection", "crossings")
-"""Families that have tables of their own; the others are collapsed, those of the inspection first."""
+"""Families that have tables of their own; the others are collapsed, inspection first."""
 
 MAIN_INSPECTION_MEASURES = (
     "bars_found",
