@@ -148,6 +148,10 @@ class OutputArchive(OutputFile):
     """Argument that names a submission archive to write, which may be inside an input folder."""
 
 
+class OutputFolder(OutputFile):
+    """Argument that names a folder to write files to, new or existing; several may be the same."""
+
+
 def add_archive(parser: argparse.ArgumentParser) -> None:
     """Add the positional argument ``archive``."""
     parser.add_argument("archive", type=InputFile, metavar="ARCHIVE", help="submission archive (zip)")
@@ -272,21 +276,24 @@ def check_outputs(options: Mapping[str, object]) -> None:
     """Check the values of a command's options that are an ``OutputFile``, before any work.
 
     Raises ``InputError`` if one would overwrite an ``InputFile``, another output or a file of an ``InputFolder``,
-    or is a folder, and ``OutputError`` if it or its folder cannot be written. Several outputs may be the same
-    device, but only one may be a pipe or standard output.
+    or is a folder (an ``OutputFolder``: a file), and ``OutputError`` if it or its folder cannot be written.
+    Several outputs may be the same device or folder, but only one may be a pipe or standard output.
     """
     values = [value for given in options.values() for value in (given if isinstance(given, list) else [given])]
     folders = [Path(value) for value in values if isinstance(value, InputFolder)]
     methods = re.compile(r"(?<=\.py):\w+$")
     inputs = [*(Path(methods.sub("", value)) for value in values if isinstance(value, InputFile)), *folders]
-    seen: dict[Path, str] = {}
+    seen: dict[Path, tuple[str, OutputFile]] = {}
     for name, output in options.items():
         if not isinstance(output, OutputFile):
             continue
         option, target = f"--{name.replace('_', '-')}", Path(os.path.realpath(output))
-        if target in seen and not target.is_char_device():
-            raise InputError(f"{option} and {seen[target]} both name {output}, expected different files")
-        seen[target] = option
+        other, first = seen.setdefault(target, (option, output))
+        is_shared = target.is_char_device() or (
+            isinstance(first, OutputFolder) and isinstance(output, OutputFolder)
+        )
+        if other != option and not is_shared:
+            raise InputError(f"{option} and {other} both name {output}, expected different files")
         for path in inputs:
             if path.exists() and target == path.resolve():
                 raise InputError(f"{option} names {output}, which is an input and would be overwritten")
@@ -298,6 +305,8 @@ def check_outputs(options: Mapping[str, object]) -> None:
         if output == STANDARD_OUTPUT:
             if getattr(sys.stdout, "name", "") == os.devnull:  # ``prepare_terminal`` has opened it.
                 raise InputError(f"{option} names {output}, but standard output is closed: expected an open one")
+        elif isinstance(output, OutputFolder):
+            _check_writable(option, output, target / "file")
         elif not is_stream(output):
             _check_writable(option, output, link_target(output).absolute())
         elif not os.access(output, os.W_OK):

@@ -10,13 +10,14 @@ from pathlib import Path
 from rich.console import Console
 
 from rebar_depth_bench.base.errors import InputError, MethodError
-from rebar_depth_bench.base.names import SPLITS, TEST_SPLIT
+from rebar_depth_bench.base.names import SPLITS, TEST_SPLIT, config_of
 from rebar_depth_bench.base.terminal import ProgressBars, print_notice
 from rebar_depth_bench.captures.camera_files import CAMERAS_FILE
 from rebar_depth_bench.captures.views import is_capture, open_capture
 from rebar_depth_bench.cli.console import (
     InputFile,
     OutputArchive,
+    OutputFolder,
     add_data,
     add_expect_digest,
     add_names,
@@ -54,6 +55,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     add_expect_digest(parser)
     archive = "submission archive (zip) to write"
     add_output_file(parser, "--out", archive, kind=OutputArchive, metavar="ARCHIVE", required=True)
+    picture = "write each view's depth in colour, with a scale, to DIR/<view id>.png"
+    add_output_file(parser, "--pictures", picture, kind=OutputFolder, metavar="DIR")
+    cloud = "write each view's points in the colours of the left image, metres, to DIR/<view id>.ply"
+    add_output_file(parser, "--ply", cloud, kind=OutputFolder, metavar="DIR")
     add_names(parser, "--config", "configs to predict (default: all in the folder that have the split)")
     parser.add_argument(
         "--split",
@@ -88,12 +93,15 @@ def run(options: argparse.Namespace) -> None:
     """Predict into an archive; print the method's notes to standard error and the archive's path."""
     method = find_method(options.method, view_timeout_s=options.view_timeout, nearest_m=options.nearest_distance)
     views, notices = _open_views(options, method)
+    _check_folders(options, views)
     info = method.info
     print_notice(f"{info.name}: {info.summary}; from {info.source}; licence {info.licence}")
     for notice in notices:
         print_notice(notice)
     with ProgressBars() as bars:
-        prepared = predict_views(method, views, options.out, bars.update)
+        prepared = predict_views(
+            method, views, options.out, bars.update, pictures=options.pictures, clouds=options.ply
+        )
     for config, preparation in prepared.items():
         for key, value in preparation.notes.items():
             print_notice(f"{config}: {key.replace('_', ' ')}: {format_note(value)}")
@@ -128,6 +136,17 @@ def _open_views(options: argparse.Namespace, method: AnyMethod) -> tuple[Sequenc
     if images.board_is_assumed and isinstance(method, MultiViewMethod):
         notices.append(f"{images.config}: states no board, so it is taken to be {images.board}")
     return [images], notices
+
+
+def _check_folders(options: argparse.Namespace, views: Sequence[Views]) -> None:
+    """Raise ``InputError`` if a picture or point cloud would be written among the data."""
+    data = Path(options.data).resolve()
+    for option, folder in (("--pictures", options.pictures), ("--ply", options.ply)):
+        for config in views if folder is not None and data.is_dir() else ():
+            target = (folder / config_of(config.view_ids[0])).resolve()
+            if data in (target, *target.parents):
+                expected = "expected another folder, such as one that does not exist"
+                raise InputError(f"{option} names {folder}: its files would be in {target}, the input; {expected}")
 
 
 def add_methods_arguments(parser: argparse.ArgumentParser) -> None:

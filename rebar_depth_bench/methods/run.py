@@ -25,17 +25,25 @@ from rebar_depth_bench import software_version
 from rebar_depth_bench.base.errors import DatasetError, InputError, MethodError, RebarDepthError, escape_text
 from rebar_depth_bench.base.names import TEST_SPLIT
 from rebar_depth_bench.base.parallel import Progress, silent
-from rebar_depth_bench.base.reading import remove_folder
-from rebar_depth_bench.base.writing import NO_SPACE, is_stream, link_target, scratch_folder, write_error
+from rebar_depth_bench.base.reading import path_below, remove_folder
+from rebar_depth_bench.base.writing import (
+    NO_SPACE,
+    is_stream,
+    link_target,
+    scratch_folder,
+    write_bytes,
+    write_error,
+)
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.data.rows import TRUTH_COLUMNS, Views
 from rebar_depth_bench.methods import AnyMethod, ConfigViews, Method, MultiViewMethod, Predictor, Prepared
 from rebar_depth_bench.methods.base import MethodInfo, import_optional, input_class
 from rebar_depth_bench.methods.kept_views import KeptViews, PreparationReport
 from rebar_depth_bench.methods.sgbm import RECTIFIED_COLUMNS, STEREO_COLUMNS, pair_row
+from rebar_depth_bench.methods.view_files import CLOUD_COLUMNS, depth_picture, point_cloud
 from rebar_depth_bench.submission import SubmissionWriter
 from rebar_depth_bench.submission.declaration import METRIC
-from rebar_depth_bench.submission.writer import depth_map
+from rebar_depth_bench.submission.writer import depth_map, stored_map
 
 
 def predict(
@@ -58,21 +66,37 @@ def predict(
 
 
 def predict_views(
-    method: AnyMethod, views: Sequence[Views], archive: str | Path, progress: Progress = silent
+    method: AnyMethod,
+    views: Sequence[Views],
+    archive: str | Path,
+    progress: Progress = silent,
+    *,
+    pictures: Path | None = None,
+    clouds: Path | None = None,
 ) -> dict[str, PreparationReport]:
     """Predict all ``views``, and write the archive atomically.
 
     Each view is stored beside the archive until all are predicted: after an interruption, the same call predicts
     only the missing ones. ``submission.json`` records the seconds per view and the method's notes on each config.
+    Before the archive, unless they are None, the folder ``pictures`` is given ``<view_id>.png`` of each view
+    (``depth_picture``), and ``clouds`` its ``<view_id>.ply`` (``point_cloud``); other files in them are kept.
     Returns the report of each scene that a multi-view method prepared, and of each config on which the method has
     notes, by ``Views.config``.
 
-    Raises ``InputError`` if the views lack columns that the method needs, if ``archive`` is a folder or the folder
-    beside it holds anything but kept predictions, ``MethodError`` if the method cannot run or returns invalid
-    values, and ``OutputError`` if the machine cannot write.
+    Raises ``InputError`` if the views lack columns that the method or a point cloud needs, for point clouds of
+    predictions that are not metric, if ``archive`` is a folder or the folder beside it holds anything but kept
+    predictions, ``MethodError`` if the method cannot run or returns invalid values, and ``OutputError`` if the
+    machine cannot write.
     """
+    if clouds is not None and method.info.prediction != METRIC:
+        raise InputError(
+            f"{clouds}: {method.info.name} predicts the kind {method.info.prediction}, expected a method that "
+            f"predicts {METRIC} depth: point clouds (--ply) are in metres; pictures (--pictures) are of any kind"
+        )
     for config in views:
         config.check_columns(method.info.columns, method.info.name)
+        if clouds is not None:
+            config.check_columns(CLOUD_COLUMNS, "a point cloud (--ply)")
     target = Path(archive)
     if target.is_dir():
         raise InputError(f"{target}: is a folder, expected the name of the archive to write")
@@ -103,6 +127,8 @@ def predict_views(
             predictor = _prepare_method(method, config, kept, progress) if loaded is None else loaded
             _predict_config(method, predictor, config, kept, done, progress)
         reports = noted | kept.run.reports
+        if pictures is not None or clouds is not None:
+            _write_view_files(method.info.prediction, kept, views, pictures, clouds, progress)
         _write_archive(method, target, kept, views, reports)
         remove_folder(folder)
     return reports
@@ -246,6 +272,27 @@ def _prepare_method(method: AnyMethod, views: Views, kept: KeptViews, progress: 
         seconds = round(time.perf_counter() - start, 1) if started_from_scratch else None
         kept.put_report(views.config, PreparationReport(notes=notes, seconds=seconds))
     return prepared.predict
+
+
+def _write_view_files(
+    kind: str,
+    kept: KeptViews,
+    views: Sequence[Views],
+    pictures: Path | None,
+    clouds: Path | None,
+    progress: Progress,
+) -> None:
+    """Write the pictures and point clouds of the kept predictions, as the archive stores them."""
+    for config in views:
+        columns = CLOUD_COLUMNS if clouds is not None else ()
+        for count, row in enumerate(config.rows(*columns), start=1):
+            view_id = row["view_id"]
+            depth = stored_map(kept.get(view_id, config.grid)[0])
+            if pictures is not None:
+                write_bytes(path_below(pictures, f"{view_id}.png"), depth_picture(depth, kind, view_id))
+            if clouds is not None:
+                write_bytes(path_below(clouds, f"{view_id}.ply"), point_cloud(depth, row))
+            progress(f"pictures of {config.config}", count, len(config.view_ids))
 
 
 def _write_archive(

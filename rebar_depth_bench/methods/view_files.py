@@ -1,0 +1,121 @@
+"""Files that show a predicted view: its depth in colour with a scale (PNG), and its points in colour (PLY)."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+from numpy import ndarray
+from PIL import Image, ImageDraw, ImageFont
+
+from rebar_depth_bench.base.errors import InputError, printable
+from rebar_depth_bench.geometry.cameras import pixel_rays
+from rebar_depth_bench.reporting.axes import Axis, select_spaced, tick_label
+from rebar_depth_bench.reporting.colormap import COLOURS, DEPTH_COLOURS, colour_indices, robust_range
+from rebar_depth_bench.scoring.metrics import is_valid_prediction
+from rebar_depth_bench.scoring.relative import has_value
+from rebar_depth_bench.submission.declaration import METRIC
+
+CLOUD_COLUMNS = ("left_rgb", "left_K", "left_distortion")
+"""Columns of a row that ``point_cloud`` reads."""
+NO_DEPTH = (150, 150, 150)
+"""Colour of pixels without depth."""
+
+_QUANTITIES = {
+    METRIC: "depth, m",
+    "scale": "depth up to scale, not metres",
+    "affine-depth": "depth up to scale and shift, not metres",
+    "affine-disparity": "disparity up to scale and shift, not metres",
+}
+_PAPER, _INK = (255, 255, 255), (20, 20, 20)
+_MIN_SIDE_PX = 640
+"""Images whose longer side is shorter are enlarged by repetition of pixels."""
+_MIN_RANGE = 1e-4
+"""Smallest range of colours relative to the values; a smaller one is widened, so that labels differ."""
+_HEADER = "ply\nformat binary_little_endian 1.0\ncomment {comment}\nelement vertex {count}\n" + "".join(
+    f"property {kind} {name}\n"
+    for kind, names in (("float", "x y z"), ("uchar", "red green blue"))
+    for name in names.split()
+)
+_VERTEX = np.dtype([("xyz", "<f4", (3,)), ("rgb", "u1", (3,))])
+
+
+def depth_picture(depth: Float[ndarray, "h w"], kind: str, view_id: str) -> bytes:
+    """Return a PNG of a prediction in colour, with a colour bar; ``kind`` is one of ``PREDICTION_KINDS``.
+
+    Near is bright. The colours run between the 2nd and the 98th percentile of the valid pixels, for metric and
+    scaled depth evenly in inverse depth like previews (``colormap.depth_preview``). The picture states the unit,
+    the range and the share of pixels without depth, which are grey.
+    """
+    valid = has_value(depth, kind)
+    repeat = -(-_MIN_SIDE_PX // max(depth.shape))
+    height, width = (side * repeat for side in depth.shape)
+    size = max(12, round(min(height / 36, width / 48)))  # All lengths below are multiples of the font size.
+    font = ImageFont.load_default(size)
+    bar_x, top, bar_px = width + 2 * size, 3 * size, max(height, 8 * size)
+    canvas = (max(bar_x + 7 * size, 44 * size), top + bar_px + 4 * size)
+    picture = Image.new("RGB", canvas, _PAPER)
+    draw = ImageDraw.Draw(picture)
+    draw.text((size, size), printable(view_id, 40), _INK, font)
+    draw.text((canvas[0] - size, size), _QUANTITIES[kind], _INK, font, anchor="ra")
+    image = np.full((*depth.shape, 3), NO_DEPTH, np.uint8)
+    notes = [f"grey: no depth, {100 * (1 - valid.mean()):.1f} % of the pixels"]
+    if valid.any():
+        nearness = _nearness(depth[valid].astype(np.float64), kind)
+        far, near = robust_range(nearness)
+        rule = "the 2nd to the 98th percentile of the pixels"
+        if near - far <= _MIN_RANGE * abs(near):
+            margin = 0.05 * abs(near) or 1.0
+            far, near, rule = far - margin, near + margin, "around values that hardly differ"
+        image[valid] = DEPTH_COLOURS[colour_indices(nearness, far, near)]
+        steps = np.rint(np.linspace(0, COLOURS - 1, bar_px)).astype(int)
+        bar = Image.fromarray(DEPTH_COLOURS[steps][:, None]).resize((size, bar_px), Image.Resampling.NEAREST)
+        picture.paste(bar, (bar_x, top))
+        low, high = sorted(_nearness(np.array([far, near]), kind).tolist())
+        ticks = Axis(low, high, 0, 1, linear=kind.startswith("affine")).ticks()
+        places = Axis(far, near, top, top + bar_px - 1, linear=True)
+        for place in select_spaced(_nearness(np.array(ticks), kind).tolist(), places, 1.2 * size):
+            y, label = places.at(place), tick_label(float(_nearness(np.array(place), kind)))
+            draw.line((bar_x + size, y, bar_x + 1.4 * size, y), _INK, max(1, size // 12))
+            draw.text((bar_x + 1.7 * size, y), label, _INK, font, anchor="lm")
+        unit = " m" if kind == METRIC else ""
+        notes.insert(0, f"colours: {low:.4g} to {high:.4g}{unit}, {rule}")
+    enlarged = Image.fromarray(image).resize((width, height), Image.Resampling.NEAREST)
+    picture.paste(enlarged, (size, top))
+    draw.text((size, top + bar_px + size // 2), "\n".join(notes), _INK, font, spacing=size // 3)
+    stream = io.BytesIO()
+    picture.save(stream, "png")
+    return stream.getvalue()
+
+
+def _nearness(values: Float[ndarray, "*n"], kind: str) -> Float[ndarray, "*n"]:
+    """Return a function of the values of a kind that grows towards the camera, and is its own inverse."""
+    if kind.startswith("affine"):
+        return values if kind == "affine-disparity" else -values
+    return 1.0 / values
+
+
+def point_cloud(depth_m: Float[ndarray, "h w"], row: Mapping[str, Any]) -> bytes:
+    """Return the valid pixels of a view as a binary PLY file, in pixel order.
+
+    The points are float32 metres in the frame of the left camera (x right, y down, z forward), on the rays of its
+    K and lens distortion, with the colours of the left image. ``row`` has the view's ``CLOUD_COLUMNS``. Raises
+    ``InputError`` if the lens distortion cannot be inverted.
+    """
+    height, width = depth_m.shape
+    try:
+        rays = pixel_rays(row["left_K"], width, height, row["left_distortion"])
+    except ValueError as error:
+        raise InputError(f"{row['view_id']}: its point cloud cannot be computed: {error}") from None
+    valid = is_valid_prediction(depth_m)
+    with np.errstate(over="ignore"):
+        points_m = (rays[valid] * depth_m[valid].astype(np.float64)[:, None]).astype(np.float32)
+    finite = np.isfinite(points_m).all(axis=1)
+    vertices = np.empty(np.count_nonzero(finite), _VERTEX)
+    vertices["xyz"], vertices["rgb"] = points_m[finite], row["left_rgb"][valid][finite]
+    comment = f"{row['view_id']}: frame of the left camera, x right, y down, z forward; unit metre"
+    header = _HEADER.format(comment=comment, count=len(vertices)) + "end_header\n"
+    return header.encode("ascii") + vertices.tobytes()
