@@ -75,9 +75,12 @@ def depth_picture(depth: Float[ndarray, "h w"], kind: str, view_id: str) -> byte
         bar = Image.fromarray(DEPTH_COLOURS[steps][:, None]).resize((size, bar_px), Image.Resampling.NEAREST)
         picture.paste(bar, (bar_x, top))
         low, high = sorted(_nearness(np.array([far, near]), kind).tolist())
-        ticks = Axis(low, high, 0, 1, linear=kind.startswith("affine")).ticks()
+        is_affine = kind.startswith("affine")
+        # Even ticks fill the gaps that those of powers of ten leave.
+        ticks = [tick for linear in (is_affine, True) for tick in Axis(low, high, 0, 1, linear).ticks()]
+        inside = _nearness(np.array([tick for tick in ticks if low <= tick <= high]), kind)
         places = Axis(far, near, top, top + bar_px - 1, linear=True)
-        for place in select_spaced(_nearness(np.array(ticks), kind).tolist(), places, 1.2 * size):
+        for place in select_spaced(inside.tolist(), places, 1.5 * size):
             y, label = places.at(place), tick_label(float(_nearness(np.array(place), kind)))
             draw.line((bar_x + size, y, bar_x + 1.4 * size, y), _INK, max(1, size // 12))
             draw.text((bar_x + 1.7 * size, y), label, _INK, font, anchor="lm")
