@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import anchor
-from anchor import draw_scales, errors_at_scales, spread
+from anchor import Pixels, draw_fits, errors_at_scales, picture_fits, spacing_slope, spread
 from rebar_depth_bench import SubmissionWriter, score
 from rebar_depth_bench.base.errors import SubmissionError
 from tests.examples.scripts import refusal, repeated_files, result_of, run
@@ -101,14 +101,91 @@ def test_bad_archive_is_refused_as_by_score(
         assert refusal(anchor, capsys, archive, "--data", tiny_root).endswith(f"error: {by_score.value}\n")
 
 
-def test_predictions_that_are_not_metric_are_refused(
-    noisy: Depths, tiny_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def write_lines(truth: Depths, kind: str, path: Path) -> Path:
+    """Write predictions that are exact up to a scale, and for affine kinds a shift, of each view."""
+    rng = np.random.default_rng(11)
+    with SubmissionWriter(path, method="test", prediction=kind) as writer:
+        for view_id, depth_m in truth.items():
+            scale, shift = rng.uniform(0.5, 2.0), rng.uniform(-0.2, 0.2)
+            surface = np.where(depth_m > 0, depth_m, np.nan).astype(np.float64)
+            y = 1 / surface if kind == "affine-disparity" else surface
+            writer.add(view_id, (y - shift * kind.startswith("affine")) / scale)
+    return path
+
+
+@pytest.mark.parametrize("kind", ["metric", "scale", "affine-depth", "affine-disparity"])
+def test_reading_and_spacing_in_each_picture_recover_its_scale_and_shift(
+    kind: str, tiny_truth: Depths, tiny_root: Path, tmp_path: Path
 ) -> None:
-    with SubmissionWriter(tmp_path / "a.zip", method="test", prediction="scale") as writer:
-        for view_id, depth_m in noisy.items():
-            writer.add(view_id, depth_m)
-    message = refusal(anchor, capsys, tmp_path / "a.zip", "--data", tiny_root)
-    assert "of the kind scale, expected metric ones: the scale is that of depth in metres" in message
+    archive = write_lines(tiny_truth, kind, tmp_path / "a.zip")
+    study = result_of(anchor, tmp_path, archive, "--data", tiny_root, "--num-anchor-views", "1", "9")
+    rows = {row["anchor"]: row for row in study["per_picture"]}
+    assert {row["k"] for row in rows.values()} == {9}
+    found = {name: [draw["abs_rel"] for draw in row["draws"]] for name, row in rows.items()}
+    assert study["rows"][0]["draws"][0]["abs_rel"] > 0.1, "one view does not know the scale of another"
+    if kind.startswith("affine"):
+        assert list(rows) == ["reading+spacing", "two readings"]
+        aligned = score(archive, tiny_root).tables["lattice"]
+        given = study["given"]["abs_rel"], study["given"]["rmse_cm"]
+        assert given == pytest.approx((aligned["aligned.abs_rel"], aligned["aligned.rmse_cm"]), rel=1e-3)
+        assert max(found["two readings"]) < 1e-6
+        # Two slopes can give a spacing its length.
+        assert np.median(found["reading+spacing"]) < 1e-6
+    else:
+        assert list(rows) == ["reading", "spacing", "reading+spacing"]
+        assert max(map(max, found.values())) < 1e-6
+        given_scale = study["all_views"]["scale"] if kind == "scale" else 1.0
+        assert study["given"]["scale"] == given_scale
+
+
+@pytest.mark.parametrize("kind", ["affine-depth", "affine-disparity"])
+def test_line_through_reading_gives_the_spacing_its_length(kind: str) -> None:
+    rng = np.random.default_rng(4)
+    solved = 0
+    for _ in range(100):
+        x, y, length_m = rng.uniform(-0.2, 0.2, 2), rng.uniform(0.8, 1.2), rng.uniform(0.05, 0.5)
+        rays = np.column_stack([rng.uniform(-0.5, 0.5, (2, 2)), np.ones(2)])
+        slope = spacing_slope(x, y, rays, length_m, kind)
+        if slope > 0:
+            values = y + slope * x
+            first, second = (1 / values if kind == "affine-disparity" else values)[:, None] * rays
+            assert math.dist(first, second) == pytest.approx(length_m, rel=1e-9)
+            solved += 1
+    assert solved > 15
+
+
+def test_scale_of_a_picture_is_that_of_its_reading_and_spacing() -> None:
+    x, z_m = np.array([0.5, 0.8, 1.1, 2.0]), np.array([1.0, 1.7, 2.0, 4.1])
+    rays = np.array([[0.0, 0.0, 1.0], [0.3, 0.0, 1.0], [0.0, 0.4, 1.0], [0.1, 0.1, 1.0]])
+    by_reading, by_spacing, both = picture_fits(Pixels(x, z_m, rays), "metric", 1.2, 1.0, [2, 4])
+    # Reading at pixel 2; the point whose distance to that of pixel 0 is nearest to 1.2 m is that of pixel 2.
+    true_m, predicted = math.hypot(0.8, 1.0), math.hypot(0.44, 0.6)
+    assert by_reading == (2.0 / 1.1, 0.0)
+    assert by_spacing == pytest.approx((true_m / predicted, 0.0))
+    assert both == pytest.approx(((2.0 / 1.1 + true_m / predicted) / 2, 0.0))
+    one = Pixels(x[:1], z_m[:1], rays[:1])
+    assert picture_fits(one, "metric", 1.2, 7.0, [5, 6])[1] == (7.0, 0.0)
+    assert picture_fits(one, "affine-disparity", 1.2, 7.0, [5, 6]) == [(0.0, 1.0)] * 2
+
+
+def test_given_scale_of_affine_predictions_is_refused(
+    tiny_truth: Depths, tiny_root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    archive = write_lines(tiny_truth, "affine-depth", tmp_path / "a.zip")
+    message = refusal(anchor, capsys, archive, "--data", tiny_root, "--baseline-scale", "2")
+    assert "--baseline-scale is given, but the predictions are of the kind affine-depth" in message
+
+
+def test_constant_predictions_of_affine_kinds_have_no_scale(
+    tiny_truth: Depths, tiny_root: Path, tmp_path: Path
+) -> None:
+    with SubmissionWriter(tmp_path / "a.zip", method="test", prediction="affine-depth") as writer:
+        for view_id, depth_m in tiny_truth.items():
+            writer.add(view_id, np.full_like(depth_m, -3.0))
+    study = result_of(anchor, tmp_path, tmp_path / "a.zip", "--data", tiny_root, "--num-anchor-views", "1")
+    assert study["given"]["scale"] == study["per_picture"][0]["scale"]["mean"] == 0
+    assert study["per_picture"][0]["deviation_percent"]["mean"] is None
+    assert 0 < study["given"]["abs_rel"] < study["per_picture"][0]["draws"][0]["abs_rel"]
 
 
 def test_archive_of_several_configs_needs_config_option(
@@ -129,7 +206,14 @@ def test_archive_of_several_configs_needs_config_option(
 
 
 @pytest.mark.parametrize(
-    "option", [("--baseline-scale", "0"), ("--num-anchor-views", "0"), ("--draws", "0"), ("--seed", "-1")]
+    "option",
+    [
+        ("--baseline-scale", "0"),
+        ("--num-anchor-views", "0"),
+        ("--draws", "0"),
+        ("--seed", "-1"),
+        ("--spacing", "0"),
+    ],
 )
 def test_numbers_out_of_range_are_refused(
     option: tuple[str, str], tmp_path: Path, capsys: pytest.CaptureFixture[str]
@@ -152,7 +236,8 @@ def test_outputs_are_deterministic_and_inputs_are_kept(
     assert [len(row["draws"]) for row in content["rows"]] == [24, 24]
     manifest = json.loads((tiny_root / "manifest.json").read_text())
     assert content["dataset"]["digest"] == manifest["ground_truth"]["digest"]
-    header, first, _ = files["csv"].decode().splitlines()
+    header, first, *others = files["csv"].decode().splitlines()
+    assert len(others) == 1 + 3
     row = dict(zip(header.split(","), first.split(","), strict=True))
     assert float(row["scale_mean"]) == content["rows"][0]["scale"]["mean"]
     assert "Paper, Sec. III.C" in capsys.readouterr().out
@@ -177,16 +262,16 @@ def test_overflowing_errors_are_infinite_without_warning() -> None:
 def test_views_are_drawn_without_replacement_by_seed_and_k() -> None:
     ratios = 2.0 ** np.arange(5)
     possible = {float(np.median(three)) for three in itertools.combinations(ratios, 3)}
-    assert set(draw_scales(ratios, 3, 300, 0).tolist()) == possible == {2.0, 4.0, 8.0}
-    assert set(draw_scales(ratios, 5, 50, 0).tolist()) == {4.0}
-    first = draw_scales(ratios, 3, 24, 0).tolist()
-    assert draw_scales(ratios, 3, 12, 0).tolist() == first[:12]
-    assert draw_scales(ratios, 3, 24, 1).tolist() != first
+    assert set(draw_fits(ratios, 3, 300, 0).tolist()) == possible == {2.0, 4.0, 8.0}
+    assert set(draw_fits(ratios, 5, 50, 0).tolist()) == {4.0}
+    first = draw_fits(ratios, 3, 24, 0).tolist()
+    assert draw_fits(ratios, 3, 12, 0).tolist() == first[:12]
+    assert draw_fits(ratios, 3, 24, 1).tolist() != first
 
 
 def test_views_are_drawn_uniformly() -> None:
     draws = 6000
-    values, counts = np.unique(draw_scales(np.arange(1.0, 7.0), 1, draws, 3), return_counts=True)
+    values, counts = np.unique(draw_fits(np.arange(1.0, 7.0), 1, draws, 3), return_counts=True)
     assert values.tolist() == [1, 2, 3, 4, 5, 6]
     expected = draws / 6
     assert np.sum((counts - expected) ** 2 / expected) < 20.5  # Chi-square, 5 degrees of freedom: p = 0.001.
