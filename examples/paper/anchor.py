@@ -335,6 +335,8 @@ def draw_figure(figure: Figure, table: pd.DataFrame) -> None:
             axes.fill_between(rows["k"], rows[f"{name}_low"], rows[f"{name}_high"], alpha=0.2)
         axes.axhline(0.0, color="black", linestyle="--", linewidth=1)
         axes.set(xscale="log", xlabel="anchored pictures k", ylabel=title)
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter("")
     axes.legend()
 
 
