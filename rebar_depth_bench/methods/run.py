@@ -26,21 +26,14 @@ from rebar_depth_bench.base.errors import DatasetError, InputError, MethodError,
 from rebar_depth_bench.base.names import TEST_SPLIT
 from rebar_depth_bench.base.parallel import Progress, silent
 from rebar_depth_bench.base.reading import path_below, remove_folder
-from rebar_depth_bench.base.writing import (
-    NO_SPACE,
-    is_stream,
-    link_target,
-    scratch_folder,
-    write_bytes,
-    write_error,
-)
+from rebar_depth_bench.base.writing import NO_SPACE, is_stream, link_target, scratch_folder, write_error
 from rebar_depth_bench.data.manifest import DatasetFolder, open_folder
 from rebar_depth_bench.data.rows import TRUTH_COLUMNS, Views
 from rebar_depth_bench.methods import AnyMethod, ConfigViews, Method, MultiViewMethod, Predictor, Prepared
 from rebar_depth_bench.methods.base import MethodInfo, import_optional, input_class
 from rebar_depth_bench.methods.kept_views import KeptViews, PreparationReport
 from rebar_depth_bench.methods.sgbm import RECTIFIED_COLUMNS, STEREO_COLUMNS, pair_row
-from rebar_depth_bench.methods.view_files import CLOUD_COLUMNS, depth_picture, point_cloud
+from rebar_depth_bench.methods.view_files import CLOUD_COLUMNS, write_depth_picture, write_point_cloud
 from rebar_depth_bench.submission import SubmissionWriter
 from rebar_depth_bench.submission.declaration import METRIC
 from rebar_depth_bench.submission.writer import depth_map, stored_map
@@ -78,8 +71,8 @@ def predict_views(
 
     Each view is stored beside the archive until all are predicted: after an interruption, the same call predicts
     only the missing ones. ``submission.json`` records the seconds per view and the method's notes on each config.
-    Before the archive, unless they are None, the folder ``pictures`` is given ``<view_id>.png`` of each view
-    (``depth_picture``), and ``clouds`` its ``<view_id>.ply`` (``point_cloud``); other files in them are kept.
+    ``<view_id>.png`` of each view is written to the folder ``pictures`` (``write_depth_picture``), and
+    ``<view_id>.ply`` to ``clouds`` (``write_point_cloud``), unless they are None; other files in them are kept.
     Returns the report of each scene that a multi-view method prepared, and of each config on which the method has
     notes, by ``Views.config``.
 
@@ -127,9 +120,7 @@ def predict_views(
             predictor = _prepare_method(method, config, kept, progress) if loaded is None else loaded
             _predict_config(method, predictor, config, kept, done, progress)
         reports = noted | kept.run.reports
-        if pictures is not None or clouds is not None:
-            _write_view_files(method.info.prediction, kept, views, pictures, clouds, progress)
-        _write_archive(method, target, kept, views, reports)
+        _write_archive(method, target, kept, views, reports, pictures, clouds, progress)
         remove_folder(folder)
     return reports
 
@@ -274,35 +265,17 @@ def _prepare_method(method: AnyMethod, views: Views, kept: KeptViews, progress: 
     return prepared.predict
 
 
-def _write_view_files(
-    kind: str,
-    kept: KeptViews,
-    views: Sequence[Views],
-    pictures: Path | None,
-    clouds: Path | None,
-    progress: Progress,
-) -> None:
-    """Write the pictures and point clouds of the kept predictions, as the archive stores them."""
-    for config in views:
-        columns = CLOUD_COLUMNS if clouds is not None else ()
-        for count, row in enumerate(config.rows(*columns), start=1):
-            view_id = row["view_id"]
-            depth = stored_map(kept.get(view_id, config.grid)[0])
-            if pictures is not None:
-                write_bytes(path_below(pictures, f"{view_id}.png"), depth_picture(depth, kind, view_id))
-            if clouds is not None:
-                write_bytes(path_below(clouds, f"{view_id}.ply"), point_cloud(depth, row))
-            progress(f"pictures of {config.config}", count, len(config.view_ids))
-
-
 def _write_archive(
     method: AnyMethod,
     archive: Path,
     kept: KeptViews,
     views: Sequence[Views],
     reports: dict[str, PreparationReport],
+    pictures: Path | None,
+    clouds: Path | None,
+    progress: Progress,
 ) -> None:
-    """Write the kept predictions of ``views`` into the archive, with runtimes and notes."""
+    """Write the kept predictions of ``views`` into the archive, with runtimes and notes, and their files."""
     info = method.info
     runtime: dict[str, Any] = {
         "unit": "seconds",
@@ -322,9 +295,16 @@ def _write_archive(
         notes={config: report.notes for config, report in reports.items()} or None,
     ) as writer:
         for config in views:
-            for view_id in config.view_ids:
-                depth_m, seconds = kept.get(view_id, config.grid)
-                writer.add(view_id, depth_m, round(seconds, 4))
+            rows = iter(config.rows(*CLOUD_COLUMNS) if clouds is not None else ())
+            for count, view_id in enumerate(config.view_ids, start=1):
+                depth, seconds = kept.get(view_id, config.grid)
+                writer.add(view_id, depth, round(seconds, 4))
+                if pictures is not None:
+                    path = path_below(pictures, f"{view_id}.png")
+                    write_depth_picture(path, view_id, stored_map(depth), info.prediction)
+                if clouds is not None:
+                    write_point_cloud(path_below(clouds, f"{view_id}.ply"), stored_map(depth), next(rows))
+                progress(f"writing {config.config}", count, len(config.view_ids))
 
 
 # Rectified images for methods that do not read the lens distortion, and their depth on the raw left grid.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy import ndarray
 from PIL import Image, ImageDraw, ImageFont
 
 from rebar_depth_bench.base.errors import InputError, printable
+from rebar_depth_bench.base.writing import write_bytes
 from rebar_depth_bench.geometry.cameras import pixel_rays
 from rebar_depth_bench.reporting.axes import Axis, select_spaced, tick_label
 from rebar_depth_bench.reporting.colormap import COLOURS, DEPTH_COLOURS, colour_indices, robust_range
@@ -20,47 +22,48 @@ from rebar_depth_bench.scoring.relative import has_value
 from rebar_depth_bench.submission.declaration import METRIC
 
 CLOUD_COLUMNS = ("left_rgb", "left_K", "left_distortion")
-"""Columns of a row that ``point_cloud`` reads."""
+"""Columns of a row that ``write_point_cloud`` reads."""
 NO_DEPTH = (150, 150, 150)
 """Colour of pixels without depth."""
 
-_QUANTITIES = {
-    METRIC: "depth, m",
-    "scale": "depth up to scale, not metres",
-    "affine-depth": "depth up to scale and shift, not metres",
-    "affine-disparity": "disparity up to scale and shift, not metres",
-}
 _PAPER, _INK = (255, 255, 255), (20, 20, 20)
 _MIN_SIDE_PX = 640
 """Images whose longer side is shorter are enlarged by repetition of pixels."""
 _MIN_RANGE = 1e-4
 """Smallest range of colours relative to the values; a smaller one is widened, so that labels differ."""
-_HEADER = "ply\nformat binary_little_endian 1.0\ncomment {comment}\nelement vertex {count}\n" + "".join(
-    f"property {kind} {name}\n"
-    for kind, names in (("float", "x y z"), ("uchar", "red green blue"))
-    for name in names.split()
-)
+_HEADER = """\
+ply
+format binary_little_endian 1.0
+comment {view_id}: frame of the left camera, x right, y down, z forward; unit metre
+element vertex {count}
+property float x
+property float y
+property float z
+property uchar red
+property uchar green
+property uchar blue
+end_header
+"""
 _VERTEX = np.dtype([("xyz", "<f4", (3,)), ("rgb", "u1", (3,))])
 
 
-def depth_picture(depth: Float[ndarray, "h w"], kind: str, view_id: str) -> bytes:
-    """Return a PNG of a prediction in colour, with a colour bar; ``kind`` is one of ``PREDICTION_KINDS``.
+def write_depth_picture(path: Path, view_id: str, depth: Float[ndarray, "h w"], kind: str) -> None:
+    """Write a prediction in colour, with a colour bar, as PNG; ``kind`` is one of ``PREDICTION_KINDS``.
 
-    Near is bright. The colours run between the 2nd and the 98th percentile of the valid pixels, for metric and
-    scaled depth evenly in inverse depth like previews (``colormap.depth_preview``). The picture states the unit,
-    the range and the share of pixels without depth, which are grey.
+    Near is bright. The colours run between the 2nd and the 98th percentile of the pixels with depth, evenly in
+    inverse depth as in ``colormap.depth_preview``; of affine kinds, evenly in their values. The picture states the
+    unit, the range and the share of pixels without depth, which are grey.
     """
-    valid = has_value(depth, kind)
+    valid, is_affine = has_value(depth, kind), kind.startswith("affine")
     repeat = -(-_MIN_SIDE_PX // max(depth.shape))
     height, width = (side * repeat for side in depth.shape)
     size = max(12, round(min(height / 36, width / 48)))  # All lengths below are multiples of the font size.
-    font = ImageFont.load_default(size)
-    bar_x, top, bar_px = width + 2 * size, 3 * size, max(height, 8 * size)
-    canvas = (max(bar_x + 7 * size, 44 * size), top + bar_px + 4 * size)
-    picture = Image.new("RGB", canvas, _PAPER)
+    font, bar_x, top, bar_px = ImageFont.load_default(size), width + 2 * size, 3 * size, max(height, 8 * size)
+    picture = Image.new("RGB", (max(bar_x + 7 * size, 44 * size), top + bar_px + 4 * size), _PAPER)
     draw = ImageDraw.Draw(picture)
     draw.text((size, size), printable(view_id, 40), _INK, font)
-    draw.text((canvas[0] - size, size), _QUANTITIES[kind], _INK, font, anchor="ra")
+    quantity = "depth, m" if kind == METRIC else f"{kind}: not metres"
+    draw.text((picture.width - size, size), quantity, _INK, font, anchor="ra")
     image = np.full((*depth.shape, 3), NO_DEPTH, np.uint8)
     notes = [f"grey: no depth, {100 * (1 - valid.mean()):.1f} % of the pixels"]
     if valid.any():
@@ -75,7 +78,6 @@ def depth_picture(depth: Float[ndarray, "h w"], kind: str, view_id: str) -> byte
         bar = Image.fromarray(DEPTH_COLOURS[steps][:, None]).resize((size, bar_px), Image.Resampling.NEAREST)
         picture.paste(bar, (bar_x, top))
         low, high = sorted(_nearness(np.array([far, near]), kind).tolist())
-        is_affine = kind.startswith("affine")
         # Even ticks fill the gaps that those of powers of ten leave.
         ticks = [tick for linear in (is_affine, True) for tick in Axis(low, high, 0, 1, linear).ticks()]
         inside = _nearness(np.array([tick for tick in ticks if low <= tick <= high]), kind)
@@ -86,12 +88,11 @@ def depth_picture(depth: Float[ndarray, "h w"], kind: str, view_id: str) -> byte
             draw.text((bar_x + 1.7 * size, y), label, _INK, font, anchor="lm")
         unit = " m" if kind == METRIC else ""
         notes.insert(0, f"colours: {low:.4g} to {high:.4g}{unit}, {rule}")
-    enlarged = Image.fromarray(image).resize((width, height), Image.Resampling.NEAREST)
-    picture.paste(enlarged, (size, top))
+    picture.paste(Image.fromarray(image).resize((width, height), Image.Resampling.NEAREST), (size, top))
     draw.text((size, top + bar_px + size // 2), "\n".join(notes), _INK, font, spacing=size // 3)
     stream = io.BytesIO()
     picture.save(stream, "png")
-    return stream.getvalue()
+    write_bytes(path, stream.getvalue())
 
 
 def _nearness(values: Float[ndarray, "*n"], kind: str) -> Float[ndarray, "*n"]:
@@ -101,8 +102,8 @@ def _nearness(values: Float[ndarray, "*n"], kind: str) -> Float[ndarray, "*n"]:
     return 1.0 / values
 
 
-def point_cloud(depth_m: Float[ndarray, "h w"], row: Mapping[str, Any]) -> bytes:
-    """Return the valid pixels of a view as a binary PLY file, in pixel order.
+def write_point_cloud(path: Path, depth_m: Float[ndarray, "h w"], row: Mapping[str, Any]) -> None:
+    """Write the valid pixels of a view as a binary PLY file, in pixel order.
 
     The points are float32 metres in the frame of the left camera (x right, y down, z forward), on the rays of its
     K and lens distortion, with the colours of the left image. ``row`` has the view's ``CLOUD_COLUMNS``. Raises
@@ -113,12 +114,10 @@ def point_cloud(depth_m: Float[ndarray, "h w"], row: Mapping[str, Any]) -> bytes
         rays = pixel_rays(row["left_K"], width, height, row["left_distortion"])
     except ValueError as error:
         raise InputError(f"{row['view_id']}: its point cloud cannot be computed: {error}") from None
-    valid = is_valid_prediction(depth_m)
-    with np.errstate(over="ignore"):
-        points_m = (rays[valid] * depth_m[valid].astype(np.float64)[:, None]).astype(np.float32)
-    finite = np.isfinite(points_m).all(axis=1)
-    vertices = np.empty(np.count_nonzero(finite), _VERTEX)
-    vertices["xyz"], vertices["rgb"] = points_m[finite], row["left_rgb"][valid][finite]
-    comment = f"{row['view_id']}: frame of the left camera, x right, y down, z forward; unit metre"
-    header = _HEADER.format(comment=comment, count=len(vertices)) + "end_header\n"
-    return header.encode("ascii") + vertices.tobytes()
+    with np.errstate(over="ignore", invalid="ignore"):
+        points_m = (rays * depth_m[..., None]).astype(np.float32)
+    valid = is_valid_prediction(depth_m) & np.isfinite(points_m).all(axis=-1)
+    vertices = np.empty(np.count_nonzero(valid), _VERTEX)
+    vertices["xyz"], vertices["rgb"] = points_m[valid], row["left_rgb"][valid]
+    header = _HEADER.format(view_id=row["view_id"], count=len(vertices))
+    write_bytes(path, header.encode("ascii") + vertices.tobytes())

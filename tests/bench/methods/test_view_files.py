@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,7 +16,7 @@ from rebar_depth_bench.cli.main import main
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.methods import Views, find_method
 from rebar_depth_bench.methods.run import dataset_views, predict_views
-from rebar_depth_bench.methods.view_files import NO_DEPTH, depth_picture, point_cloud
+from rebar_depth_bench.methods.view_files import NO_DEPTH, write_depth_picture, write_point_cloud
 from rebar_depth_bench.submission import SubmissionReader
 from tests.bench.captures.example_capture import HEIGHT, WIDTH, write_capture, write_images
 from tests.bench.methods.predictors import stop_after
@@ -83,11 +82,13 @@ def test_points_project_to_their_pixels_of_the_distorted_image(capture: Path, tm
 
 
 @pytest.mark.parametrize("kind", ["metric", "affine-depth", "affine-disparity"])
-def test_colours_of_pixels_are_those_of_the_scale_at_their_value(kind: str) -> None:
+def test_colours_of_pixels_are_those_of_the_scale_at_their_value(kind: str, tmp_path: Path) -> None:
     height, width, size = 480, 640, 13
     values = np.geomspace(0.5, 4, height * width).reshape(height, width).astype(np.float32)
     values[:100, :100] = np.nan
-    picture = np.asarray(Image.open(io.BytesIO(depth_picture(values, kind, "a/0")))).astype(int)
+    write_depth_picture(tmp_path / "a.png", "a/0", values, kind)
+    with Image.open(tmp_path / "a.png") as opened:
+        picture = np.asarray(opened).astype(int)
     low, high = np.percentile(values[np.isfinite(values)], (2, 98))
     nearness: dict[str, Callable[[Any], Any]] = {
         "metric": lambda v: 1 / v,
@@ -112,10 +113,11 @@ def test_colours_of_pixels_are_those_of_the_scale_at_their_value(kind: str) -> N
 
 
 @pytest.mark.parametrize("depth_m", [[[1.0, 1.0]], [[0.0, np.nan]], [[1e-45, 3e38]], [[2.0]]])
-def test_extreme_depth_has_a_picture(depth_m: list[list[float]]) -> None:
+def test_extreme_depth_has_a_picture(depth_m: list[list[float]], tmp_path: Path) -> None:
     for kind in ("metric", "scale", "affine-depth", "affine-disparity"):
-        picture = Image.open(io.BytesIO(depth_picture(np.array(depth_m, np.float32), kind, "a/0")))
-        assert 400 < picture.width < 1000
+        write_depth_picture(tmp_path / "a.png", "a/0", np.array(depth_m, np.float32), kind)
+        with Image.open(tmp_path / "a.png") as picture:
+            assert 400 < picture.width < 1000
 
 
 def orbit(root: Path) -> list[Views]:
@@ -129,7 +131,7 @@ def test_resumed_run_writes_files_of_all_views(tiny_root: Path, tmp_path: Path) 
     assert len(expected) == 4
     (out / "lattice-orbit").mkdir(parents=True)
     (out / "lattice-orbit" / "notes.txt").write_text("mine")
-    for task in ("constant on", "pictures"):
+    for task in ("constant on", "writing"):
         with pytest.raises(KeyboardInterrupt):
             predict_views(
                 method, orbit(tiny_root), tmp_path / "b.zip", stop_after(1, task), pictures=out, clouds=out
@@ -180,10 +182,11 @@ def test_folders_that_hold_inputs_or_are_files_are_refused(
             assert files_below(tmp_path) == before
 
 
-def test_lens_that_cannot_be_inverted_is_refused(tiny_root: Path) -> None:
+def test_lens_that_cannot_be_inverted_is_refused(tiny_root: Path, tmp_path: Path) -> None:
     [row, _] = [
         {**row} for views in orbit(tiny_root) for row in views.rows("left_rgb", "left_K", "left_distortion")
     ]
     row["left_distortion"] = np.array([-5.0, 0, 0, 0, 0])
     with pytest.raises(InputError, match=r"lattice-orbit/.*: its point cloud cannot be computed: the lens model"):
-        point_cloud(np.ones(row["left_rgb"].shape[:2], np.float32), row)
+        write_point_cloud(tmp_path / "a.ply", np.ones(row["left_rgb"].shape[:2], np.float32), row)
+    assert not any(tmp_path.iterdir())
