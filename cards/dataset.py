@@ -19,6 +19,7 @@ from rebar_depth_bench.data.schema import (
     AnyTrajectory,
     Assembly,
     Colour,
+    GivenPoses,
     MatRecord,
     References,
     Scene,
@@ -36,11 +37,11 @@ if TYPE_CHECKING:
 
 PRETTY_NAME = "Industrial rebar metric depth"
 _OPTICS_TEXTS = {
-    "ideal": "ideal pinholes with baseline and field of view of ",
-    "raw": "factory-calibrated lenses, on the distorted grid as the sensor sees it",
-    "rectified": "factory-calibrated lenses, on the grid that OpenCV's stereoRectify makes of the pair; "
-    "depth along the rectified axis",
+    "ideal": "ideal pinholes",
+    "raw": "calibrated lenses, on the distorted grid as the sensor sees it",
+    "rectified": "calibrated lenses, on the rectified grid; depth along the rectified axis",
 }
+_CAMERA_TEXT = " with baseline and field of view, not noise or depth engine, of "
 _SIZE_CATEGORIES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"))
 
 
@@ -185,7 +186,7 @@ def _split_row(config: DatasetConfig) -> dict[str, Any]:
         "steel_source": f"{len(config.scenes)} generated cages",
         "distance": f"{min(distances_m):g}-{max(distances_m):g} m, random views",
         "sheet": config.sheet if split == config.manifest_entry["scenes"][0]["split"] else None,
-        "optics": _OPTICS_TEXTS["ideal"] + ", ".join(sorted(cameras)),
+        "optics": _OPTICS_TEXTS["ideal"] + _CAMERA_TEXT + ", ".join(sorted(cameras)),
     }
 
 
@@ -221,7 +222,9 @@ def _config_row(config: DatasetConfig) -> dict[str, Any]:
 
 def _optics(rig: SceneRig) -> str:
     """Return the optics of a rig in words; an empty string for the default rig."""
-    return "" if rig.grid == "ideal" and not rig.camera else _OPTICS_TEXTS[rig.grid] + rig.camera
+    if rig.calibration is not None:
+        return f"{_OPTICS_TEXTS[rig.grid]}; baseline {rig.baseline_m:.4g} m"
+    return _OPTICS_TEXTS[rig.grid] + _CAMERA_TEXT + rig.camera if rig.camera else ""
 
 
 def _rendered_row(config: DatasetConfig) -> dict[str, Any]:
@@ -262,9 +265,11 @@ def _distance(trajectory: AnyTrajectory) -> str:
     to_steel = ""
     if isinstance(trajectory, Survey):
         to_steel = ", steel aimed at"
+    elif isinstance(trajectory, GivenPoses):
+        to_steel = ", target aimed at"
     elif isinstance(trajectory, Trajectory) and trajectory.distance_to == NEAREST_STEEL:
         to_steel = ", nearest steel"
-    return f"{min(distances_m):g}-{max(distances_m):g} m{to_steel}"
+    return f"{min(distances_m):.4g}-{max(distances_m):.4g} m{to_steel}"
 
 
 def _steel_depth(config: str, scene: Scene) -> str:

@@ -106,16 +106,17 @@ def _variants() -> str:
 
 
 def _rigs() -> str:
-    """Return the stereo cameras that a scene file can name."""
+    """Return the named stereo cameras."""
     rows = (
         (
             f'`"{name}"`',
             f"{rig.baseline_m:.3f} m",
+            f"{rig.width} x {rig.height}",
             f"{2 * degrees(atan2(NOMINAL_WIDTH / 2, rig.focal_px)):.1f} degrees",
         )
         for name, rig in STEREO_CAMERAS.items()
     )
-    return _table("rig | baseline | horizontal field of view", rows)
+    return _table("camera | baseline | pixels | horizontal field of view", rows)
 
 
 def _columns() -> str:

@@ -6,12 +6,16 @@ import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
-from dataset_builder.cameras.trajectories import aim_point_m, camera_offsets_m
+from dataset_builder.cameras.rigs import rig_cameras
+from dataset_builder.cameras.trajectories import Cylinders, aim_point_m, camera_offsets_m, poses
 from dataset_builder.scene.environments.surroundings import LIFE_SIZE_ENVIRONMENTS, SURROUNDINGS
 from dataset_builder.scene.model import Assembly
 from dataset_builder.scene.variants.registry import SCREEN_DISTANCE, SHADOWS
-from dataset_builder.specs.config_specs import ConfigSpec, RandomViewsSpec, SurveySpec, TrajectorySpec
+from dataset_builder.specs.config_specs import ConfigSpec, PosesSpec, RandomViewsSpec, SurveySpec, TrajectorySpec
 from rebar_depth_bench.base.errors import InputError, MeshError
+from rebar_depth_bench.data.bars import with_axis
+from rebar_depth_bench.data.schema import EYES
+from rebar_depth_bench.geometry.cameras import camera_centre
 
 _BOARD_TOLERANCE_M = 0.001
 """Depth below z = 0 that an assembly may reach, metres."""
@@ -21,19 +25,28 @@ def check_fits(assembly: Assembly, config: ConfigSpec) -> None:
     """Check that an assembly stays above the board and clear of the config's cameras.
 
     Raises ``MeshError`` if it reaches more than 1 mm below z = 0 or as far as the nearest camera, and
-    ``InputError`` if the screen of the variant ``shadows`` would be among the cameras. The cameras of a survey
-    and random views may be nearer, since each is clear of the steel by itself.
+    ``InputError`` if the screen of the variant ``shadows`` would be among the cameras, if a given pose is inside
+    of a bar, and as ``look_at_with_rig``. The cameras of a survey, random views and given poses may be nearer,
+    since each is clear of the steel by itself.
     """
     check_above_ground(assembly, config.name)
     vertices_m, aim_m = assembly.vertices_m, aim_point_m(assembly)
     reach_m = float(np.linalg.norm(vertices_m - aim_m, axis=1).max())
-    camera_distances_m = np.linalg.norm(camera_offsets_m(config.protocol, aim_m, assembly.bars), axis=1)
+    lefts = poses(config.protocol, aim_m, config.rig, assembly.bars)
+    camera_distances_m = np.linalg.norm([camera_centre(left) - aim_m for left in lefts], axis=1)
     nearest_m = float(camera_distances_m.min())
-    if reach_m >= nearest_m and not isinstance(config.protocol, SurveySpec | RandomViewsSpec):
+    if reach_m >= nearest_m and not isinstance(config.protocol, SurveySpec | RandomViewsSpec | PosesSpec):
         raise MeshError(
             f"the assembly extends {reach_m:.4g} m from its centre, expected less than {nearest_m:.4g} m, "
             f"the distance of the nearest camera of {config.name}: is the unit right?"
         )
+    if isinstance(config.protocol, PosesSpec) and with_axis(assembly.bars):
+        eyes = [camera for left in lefts for camera in rig_cameras(config.rig, left).values()]
+        eyes_m = np.array([camera_centre(eye.cam_from_world) for eye in eyes])
+        inside = np.flatnonzero(Cylinders.from_bars(assembly.bars).distance_m(eyes_m) == 0)
+        if len(inside):
+            found = f"a camera of position {inside[0] // len(EYES) + 1} of {config.name} is inside of a bar"
+            raise InputError(f"{found}, expected all of them outside: is the unit right?")
     _check_shadow_screen(vertices_m, float(camera_distances_m.max()), config)
 
 
@@ -83,6 +96,8 @@ def misfit(environment: str, assembly: Assembly, trajectory: TrajectorySpec) -> 
         height_m = float(centres_m[:, 2].max())
     if radius_m > space.radius_m:
         return _outside("cameras are", radius_m, space.radius_m, environment)
+    if isinstance(trajectory, PosesSpec) and (lowest_m := float(centres_m[:, 2].min())) <= 0:
+        return f"a camera is at z = {lowest_m:.4g} m, expected above 0, the height of the ground"
     if height_m > space.ceiling_m:
         return (
             f"cameras are {height_m:.4g} m high, "

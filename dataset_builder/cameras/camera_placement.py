@@ -128,7 +128,7 @@ class _Views:
 class _Site:
     """Steel of an assembly and ``obstacles``, with the space for cameras: tests of views of a rig.
 
-    The rig has ideal pinholes. Distances of eyes are to points of the surfaces of which one is within
+    Lenses are taken as pinholes. Distances of eyes are to points of the surfaces of which one is within
     ``spacing_m`` of every point. ``surface`` samples the steel.
     """
 

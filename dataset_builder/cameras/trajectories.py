@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from itertools import product
 from math import cos, radians, sin
 from typing import NamedTuple
@@ -17,14 +17,16 @@ from dataset_builder.scene.shapes.capsules import Capsules
 from dataset_builder.specs.config_specs import (
     DistanceSweepSpec,
     DomeSpec,
+    PosesSpec,
     RandomViewsSpec,
     RigSpec,
     RingSpec,
     SurveySpec,
     TrajectorySpec,
 )
+from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.data.bars import Bar, with_axis
-from rebar_depth_bench.data.schema import NEAREST_STEEL
+from rebar_depth_bench.data.schema import NEAREST_STEEL, trajectory_of
 from rebar_depth_bench.geometry.cameras import look_at, matrix_product, rigid, vector_length
 
 GOLDEN_TURN_DEG = 360.0 * (5**0.5 - 1) / 2
@@ -60,9 +62,14 @@ def poses(
 ) -> list[Float64[ndarray, "4 4"]]:
     """Return ``cam_from_world`` of the left camera for every view of the full trajectory, in order.
 
-    Each is aimed at the target, or at the point of its own station if it has one. Arguments and errors are those
-    of ``camera_offsets_m``.
+    Each is aimed at the target, or at the point of its own station if it has one. Given poses are those of the
+    left camera itself, all others those of a rig that is aimed. Arguments and errors are those of
+    ``camera_offsets_m``.
     """
+    if isinstance(trajectory, PosesSpec):
+        positions_m, targets_m = np.broadcast_arrays(trajectory.positions_m, trajectory.targets_m)
+        up = np.array(trajectory.up) / vector_length(np.array(trajectory.up))
+        return [look_at(*places, up) for places in zip(positions_m, targets_m, strict=True)]
     if isinstance(trajectory, SurveySpec | RandomViewsSpec):
         return [
             look_at_with_rig(np.array(centre_m), np.array(aimed_m), rig.baseline_m, *roll_deg)
@@ -87,8 +94,10 @@ def camera_offsets_m(
     The views of a dome are ordered by shell, then ring, then azimuth, so that consecutive views are close to each
     other. The views of a sweep are ordered by distance, then azimuth; the first azimuth is half a step off the
     x axis, so that square cages are not seen face-on. The views of a survey and random views are those of their
-    stations.
+    stations, and given poses those of their positions.
     """
+    if isinstance(trajectory, PosesSpec):
+        return [np.array(position_m) - target_m for position_m in trajectory.positions_m]
     if isinstance(trajectory, SurveySpec | RandomViewsSpec):
         return [np.array(centre_m) - target_m for centre_m, *_ in trajectory.stations]
     places = _places(trajectory)
@@ -103,11 +112,7 @@ def camera_offsets_m(
 
 def view_count(trajectory: TrajectorySpec) -> int:
     """Return the number of views of the full trajectory."""
-    if isinstance(trajectory, SurveySpec):
-        return len(trajectory.stations)
-    if isinstance(trajectory, RandomViewsSpec):
-        return trajectory.views
-    return len(_places(trajectory))
+    return trajectory_of(asdict(trajectory)).views
 
 
 def _places(trajectory: DomeSpec | RingSpec | DistanceSweepSpec) -> list[_Place]:
@@ -133,10 +138,16 @@ def look_at_with_rig(
     The central axis of the rig, not the axis of the left camera, passes through the target. The target is thus at
     x = baseline / 2 in the left camera and at x = -baseline / 2 in the right one, which keeps the assembly in both
     images at short range. The rig is turned by ``roll_deg`` clockwise about the line from the left camera to the
-    target, so that the scene turns counter-clockwise in the images.
+    target, so that the scene turns counter-clockwise in the images. Raises ``InputError`` for a target that is
+    nearer than the baseline.
     """
     centred_from_world = matrix_product(_roll(roll_deg), look_at(left_centre_m, target_m))
     distance_m = vector_length(target_m - left_centre_m)
+    if distance_m < baseline_m:
+        found = f"a camera is {distance_m:.4g} m from the point that it is aimed at"
+        raise InputError(
+            f"{found}, expected at least the baseline of the rig, {baseline_m:.4g} m: is the unit right?"
+        )
     sine = baseline_m / 2 / distance_m
     cosine = (1.0 - sine * sine) ** 0.5
     yaw = np.array([[cosine, 0.0, sine], [0.0, 1.0, 0.0], [-sine, 0.0, cosine]])

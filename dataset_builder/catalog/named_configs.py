@@ -6,9 +6,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from dataset_builder.cameras.rigs import zed_rig
+from dataset_builder.cameras.rigs import sized_rig, zed_rig
 from dataset_builder.catalog.cages_config import CAGES, MAX_SCENES, MAX_VIEWS_PER_SCENE, CagesRequest, cage_scenes
 from dataset_builder.scene.environments.surroundings import check_suitable
+from dataset_builder.scene.model import Note
 from dataset_builder.scene.variants.registry import VARIANTS, check_variants
 from dataset_builder.specs.config_specs import (
     CPU,
@@ -28,8 +29,10 @@ from dataset_builder.specs.config_specs import (
     SceneSpec,
 )
 from dataset_builder.specs.file_specs import MeshFileSpec
+from dataset_builder.user_files.scene_schema import SCENE_NAME
 from rebar_depth_bench.base.errors import InputError, Problem
 from rebar_depth_bench.base.names import SPLITS
+from rebar_depth_bench.captures.calibration import scale_calibration, scaled_calibration
 from rebar_depth_bench.data.schema import NEAREST_STEEL
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 
@@ -122,6 +125,8 @@ thin to have interior pixels.
 _KNOWN = {**CONFIGS, **SWEEPS}
 LATTICE_CONFIGS = tuple(name for name in CONFIGS if name.startswith("lattice"))
 """Names of the configs in which ``--mesh`` replaces the rods."""
+ZED_CONFIGS = tuple(name for name in CONFIGS if "zed" in name)
+"""Names of the configs of the calibrated ZED, whose rig ``--rig`` does not replace."""
 
 
 @dataclass(frozen=True)
@@ -131,20 +136,24 @@ class BuildRequest:
     ``views`` is the number of views per config, spread evenly over the trajectory; None selects all views.
     ``colour`` None builds no colour. ``mesh`` replaces the rods of the lattice. ``variants`` are names of
     ``VARIANTS``; they are appended to the names of configs and scenes. ``scenes`` are the configs
-    of user scene files. ``cages`` are the scenes of the config of that name, if it is among the ``configs``.
+    of user scene files. ``rig`` replaces the rig of all configs, whose cameras keep their stations; ``rig_name``
+    is appended to their names. Images have the size of the rig; of ``width`` and ``height``, one alone keeps its
+    aspect ratio. ``cages`` are the scenes of the config of that name, if it is among the ``configs``.
     ``overwrite`` are the names of configs whose finished views may be replaced. ``cages_read`` has what was read
     already from files of the ``scenes``, by their specs.
     """
 
     configs: tuple[str, ...] = tuple(CONFIGS)
     views: int | None = None
-    width: int = RigSpec.width
-    height: int = RigSpec.height
+    width: int | None = None
+    height: int | None = None
     colour: ColourSpec | None = field(default_factory=ColourSpec)
     seed: int = 0
     mesh: MeshFileSpec | None = None
     variants: tuple[str, ...] = ()
     scenes: tuple[ConfigSpec, ...] = ()
+    rig: RigSpec | None = None
+    rig_name: str = ""
     cages: CagesRequest | None = None
     overwrite: tuple[str, ...] = ()
     cages_read: Mapping[AssemblySpec, Cage] = field(default_factory=dict)
@@ -159,8 +168,7 @@ class BuildRequest:
         if problems := [*self._problems()]:
             raise InputError.from_problems("build request", problems)
         check_variants(self.variants)
-        named = [_KNOWN[name]() for name in dict.fromkeys(self.configs) if name != CAGES]
-        specs = [self._with_request(spec) for spec in (*named, *self.scenes)]
+        specs = [self._with_request(spec) for spec in self._given_specs()]
         for spec in specs:
             check_suitable(spec.scene.environment, self.variants)
         self._check_lenses(specs)
@@ -172,13 +180,30 @@ class BuildRequest:
             )
         scenes = [*specs]
         if self._cages is not None:
-            scenes += cage_scenes(self._cages, self.seed, self.width, self.height, self.colour)
+            size = sized_rig(RigSpec(), self.width, self.height)
+            scenes += cage_scenes(self._cages, self.seed, size.width, size.height, self.colour)
         names = {spec.name for spec in scenes}
         if unknown := [name for name in self.overwrite if name not in names]:
             expected = f"one of the configs that are built: {', '.join(sorted(names))}"
             problem = Problem("unknown", "--overwrite", f"got {unknown[0]!r}", expected)
             raise InputError.from_problems("build request", [problem])
         return scenes
+
+    def notes(self) -> list[Note]:
+        """Return notes on calibrations, and on rows of images that are added to those of rigs or cropped."""
+        notes = []
+        rigs = [self.rig or spec.rig for spec in self._given_specs()]
+        for rig in dict.fromkeys(rigs if self._cages is None else [*rigs, RigSpec()]):
+            notes += [Note("rig", "rig", text) for text in (rig.calibration.notes if rig.calibration else ())]
+            rows = (self.height or 0) - sized_rig(rig, self.width, None).height
+            if self.width is not None and self.height is not None and rows:
+                text = f"{abs(rows)} rows are {'added' if rows > 0 else 'cropped'}, half of them at the top"
+                notes.append(Note(f"images of {self.width} x {self.height}", "size", text))
+        return notes
+
+    def _given_specs(self) -> list[ConfigSpec]:
+        """Return the named configs of one scene, and the scenes of files, before the request modifies them."""
+        return [*(_KNOWN[name]() for name in dict.fromkeys(self.configs) if name != CAGES), *self.scenes]
 
     @property
     def _cages(self) -> CagesRequest | None:
@@ -210,9 +235,18 @@ class BuildRequest:
                 if text not in known:
                     yield Problem("unknown", name, f"got {text!r}", f"one of {', '.join(known)}")
         # Each scene of cages draws its own variants, and takes no mesh.
-        for name, given in {"--mesh": self.mesh, "--variant": self.variants, "--views": self.views}.items():
+        alone = {"--mesh": self.mesh, "--variant": self.variants, "--views": self.views, "--rig": self.rig}
+        for name, given in alone.items():
             if cages is not None and given:
-                yield Problem("conflict", name, f"is combined with --config {CAGES}", "only one of them")
+                yield Problem(
+                    "conflict",
+                    name,
+                    f"is combined with --config {CAGES}",
+                    f"only one of them: {CAGES} has its own",
+                )
+        if self.rig is not None and (calibrated := [name for name in self.configs if name in ZED_CONFIGS]):
+            expected = "configs without zed in their names, such as lattice: these have the rig of the ZED"
+            yield Problem("conflict", "--rig", f"is combined with --config {' '.join(calibrated)}", expected)
 
     def _check_lenses(self, specs: Sequence[ConfigSpec]) -> None:
         """Raise ``InputError`` if the device cannot render the lenses of a config."""
@@ -235,13 +269,18 @@ class BuildRequest:
             appearance=AppearanceSpec(variants),
             seed=self.seed,
         )
-        return replace(
-            spec,
-            name=spec.name + suffix,
-            scene=scene,
-            rig=replace(spec.rig, width=self.width, height=self.height),
-            colour=self.colour,
-        )
+        name = f"{spec.name}-{self.rig_name}" if self.rig is not None else spec.name
+        if name != spec.name and (name in _KNOWN or not SCENE_NAME.accept(name)):
+            raise InputError(
+                f"--rig: a config would be named {name!r}, expected {SCENE_NAME.text}: rename the file"
+            )
+        rig = sized_rig(self.rig or spec.rig, self.width, self.height)
+        if not 16 <= min(rig.width, rig.height) <= max(rig.width, rig.height) <= 8192:
+            found = f"the images of {name} would have {rig.width} x {rig.height} pixels"
+            raise InputError(f"{found}, expected 16 to 8192 each: give --width and --height")
+        if rig.calibration is not None:
+            scaled_calibration(scale_calibration(rig.calibration, rig.width, rig.height), name, None, None)
+        return replace(spec, name=name + suffix, scene=scene, rig=rig, colour=self.colour)
 
     def _assembly(self, spec: ConfigSpec) -> AssemblySpec:
         if self.mesh is None:

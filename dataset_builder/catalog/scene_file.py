@@ -24,7 +24,7 @@ from dataset_builder.catalog.named_configs import CONFIGS, LATTICE_DOME, SWEEPS
 from dataset_builder.scene.assemblies.cage import Cage
 from dataset_builder.scene.environments.surroundings import SURROUNDINGS
 from dataset_builder.scene.model import Assembly
-from dataset_builder.specs.config_specs import STEREO_CAMERAS, ConfigSpec, DomeSpec, RigSpec, SceneSpec, SurveySpec
+from dataset_builder.specs.config_specs import ConfigSpec, DomeSpec, RigSpec, SceneSpec, SurveySpec
 from dataset_builder.specs.file_specs import CageFileSpec, MeshFileSpec
 from dataset_builder.user_files.cage_file import cage_file_spec, mesh_file_spec, read_cage, unsupported_type
 from dataset_builder.user_files.make_assembly import make_assembly
@@ -34,7 +34,7 @@ from rebar_depth_bench.base.errors import InputError, MeshError
 from rebar_depth_bench.base.limits import TOML_BYTES
 from rebar_depth_bench.base.reading import read_file
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
-from rebar_depth_bench.geometry.cameras import NOMINAL_FOCAL_PX
+from rebar_depth_bench.geometry.cameras import NOMINAL_FOCAL_PX, NOMINAL_HEIGHT, NOMINAL_WIDTH
 
 RESERVED_NAMES = (*CONFIGS, *SWEEPS, CAGES, "meshes", "pictures", "scenes")
 """Names that a user scene cannot have: names of configs and of other entries of the dataset folder."""
@@ -43,7 +43,7 @@ NEAREST_RADIUS_PER_REACH = 2.5
 """Nearest dome radius per reach of the assembly, close to the value of the lattice dome (2.67).
 
 At this distance the whole assembly is in the frame of the default rig and fills much of it. For another rig,
-it is multiplied by the ratio of the focal lengths.
+it is multiplied by the ratio of the focal lengths per side of the image, of the side that shows less.
 """
 
 MAX_DOME_M = 1.0
@@ -86,7 +86,7 @@ def read_scene(path: str | os.PathLike[str]) -> UserScene:
         assembly_spec = _assembly_spec(scene_toml, path)
         cage = read_cage(assembly_spec)
         assembly = make_assembly(assembly_spec, cage)
-    rig = RigSpec() if scene_toml.rig is None else STEREO_CAMERAS[scene_toml.rig]
+    rig = RigSpec() if scene_toml.rig is None else scene_toml.rig.rig(path, scene_toml.unit_m, "rig")
     trajectory = scene_toml.cameras or _default_trajectory(assembly, scene_toml.environment, rig)
     environment = scene_toml.environment or (_LARGE if misfit(_SMALL, assembly, trajectory) else _SMALL)
     if problem := misfit(environment, assembly, trajectory):
@@ -98,8 +98,10 @@ def read_scene(path: str | os.PathLike[str]) -> UserScene:
             trajectory = with_stations(trajectory, assembly, space, rig, str(path))
         config = ConfigSpec(name, SceneSpec(name, assembly_spec, None, environment), trajectory, rig)
         check_fits(assembly, config)
-    except MeshError as error:
-        raise MeshError(f"{path}: {error}") from None
+    except InputError as error:
+        if error.problems:  # They are of this file.
+            raise
+        raise type(error)(f"{path}: {error}") from None
     markers = SURROUNDINGS[environment].markers if scene_toml.board is None else scene_toml.board
     board = BoardSpec(markers=markers) if markers else None
     return UserScene(replace(config, scene=replace(config.scene, board=board)), cage)
@@ -144,11 +146,13 @@ def default_dome(assembly: Assembly, rig: RigSpec) -> DomeSpec:
 
     All radii are multiplied by the factor, at least 1, for which the nearest radius is
     ``NEAREST_RADIUS_PER_REACH`` times the reach of the assembly: the greatest distance of its surface from the aim
-    point, for a rig with the default focal length, and in proportion to it. They are never reduced, because the
-    stereo rig keeps its size. Radii are rounded to millimetres.
+    point, for a rig with the default field of view, and in proportion to the focal length for others. They are
+    never reduced, because the stereo rig keeps its size. Radii are rounded to millimetres.
     """
     reach_m = float(np.linalg.norm(assembly.vertices_m - aim_point_m(assembly), axis=1).max())
-    radius_per_reach = NEAREST_RADIUS_PER_REACH * rig_cameras(rig, np.eye(4))["left"].K[0, 0] / NOMINAL_FOCAL_PX
+    K = rig_cameras(rig, np.eye(4))["left"].K
+    focal_px = max(K[0, 0] * NOMINAL_WIDTH / rig.width, K[1, 1] * NOMINAL_HEIGHT / rig.height)
+    radius_per_reach = NEAREST_RADIUS_PER_REACH * focal_px / NOMINAL_FOCAL_PX
     factor = max(1.0, radius_per_reach * reach_m / min(LATTICE_DOME.radii_m))
     return replace(LATTICE_DOME, radii_m=tuple(round(factor * radius_m, 3) for radius_m in LATTICE_DOME.radii_m))
 

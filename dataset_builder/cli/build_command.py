@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dataset_builder.catalog.cages_config import CAGES, CagesRequest
-from dataset_builder.catalog.named_configs import CONFIGS, LATTICE_CONFIGS, SWEEPS, BuildRequest
+from dataset_builder.catalog.named_configs import CONFIGS, LATTICE_CONFIGS, SWEEPS, ZED_CONFIGS, BuildRequest
 from dataset_builder.scene.variants.registry import VARIANTS
 from dataset_builder.specs.config_specs import (
     CPU,
@@ -54,10 +54,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="number of views per config, evenly spaced over the trajectory (default: all)",
     )
     parser.add_argument(
-        "--width", type=int, default=BuildRequest.width, help="image width in pixels (default: %(default)s)"
+        "--rig",
+        metavar="NAME|FILE",
+        help="camera, calibration file, or TOML file with the keys of [rig], in place of the rig of the configs",
     )
     parser.add_argument(
-        "--height", type=int, default=BuildRequest.height, help="image height in pixels (default: %(default)s)"
+        "--width", type=int, help="image width in pixels (default: that of the rig, or from --height)"
+    )
+    parser.add_argument(
+        "--height", type=int, help="image height in pixels (default: that of the rig, or from --width)"
     )
     parser.add_argument(
         "--seed",
@@ -194,9 +199,11 @@ def _build_request(options: argparse.Namespace, device: str) -> BuildRequest:
     """Return the build request of the options.
 
     With ``--scene`` and without ``--config``, only the given scene files are built. With ``--mesh``, the default
-    configs are the lattice configs.
+    configs are the lattice configs; with ``--rig``, those without a calibration of their own.
     """
-    default = () if options.scene else LATTICE_CONFIGS if options.mesh else CONFIGS
+    default = [] if options.scene else [*(LATTICE_CONFIGS if options.mesh else CONFIGS)]
+    if options.rig:
+        default = [name for name in default if name not in ZED_CONFIGS]
     request = BuildRequest(
         configs=tuple(options.config or default),
         views=options.views,
@@ -208,6 +215,11 @@ def _build_request(options: argparse.Namespace, device: str) -> BuildRequest:
         cages=_cages_request(options),
         overwrite=tuple(options.overwrite or ()),
     )
+    if options.rig:
+        from dataset_builder.catalog.scene_file import scene_name_of
+        from dataset_builder.user_files.rig_file import read_rig
+
+        request = replace(request, rig=read_rig(options.rig), rig_name=scene_name_of(Path(options.rig)))
     if options.mesh:
         from dataset_builder.user_files.cage_file import mesh_file_spec
 

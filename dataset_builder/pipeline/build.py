@@ -105,7 +105,8 @@ def plan_build(request: BuildRequest, out: Path) -> tuple[list[ConfigPlan], Fini
     with_cameras = [plan for plan in plans if not isinstance(plan.spec, SceneConfigSpec)]
     for plan in with_cameras:
         check_fits(plan.assembly, plan.spec)
-    print_notes(list(dict.fromkeys(note for plan in with_cameras for note in plan.assembly.notes)))
+    notes = [note for plan in with_cameras for note in plan.assembly.notes]
+    print_notes(list(dict.fromkeys((*request.notes(), *notes))))
     check_target(out, {spec.name for spec in specs})
     finished = Finished(out)
     check_retained(out, finished, plans, request.overwrite)

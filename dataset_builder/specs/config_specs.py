@@ -13,7 +13,7 @@ from math import radians, tan
 from dataset_builder.specs.file_specs import CageFileSpec, MeshFileSpec
 from rebar_depth_bench.base.names import TEST_SPLIT, scene_prefix, view_id
 from rebar_depth_bench.captures.calibration import StereoCalibration
-from rebar_depth_bench.data.schema import CENTRE, RANDOM_VIEWS, SURVEY
+from rebar_depth_bench.data.schema import CENTRE, POSES, RANDOM_VIEWS, SURVEY
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import NOMINAL_FOCAL_PX, NOMINAL_WIDTH
 
@@ -184,7 +184,20 @@ class RandomViewsSpec:
     kind: str = RANDOM_VIEWS
 
 
-TrajectorySpec = DomeSpec | RingSpec | DistanceSweepSpec | SurveySpec | RandomViewsSpec
+@dataclass(frozen=True)
+class PosesSpec:
+    """Given poses, world metres: the left camera stands at each position and its axis passes through its target.
+
+    One target may be that of all positions. ``up`` points up in the images.
+    """
+
+    positions_m: tuple[Point, ...]
+    targets_m: tuple[Point, ...]
+    up: Point = (0.0, 0.0, 1.0)
+    kind: str = POSES
+
+
+TrajectorySpec = DomeSpec | RingSpec | DistanceSweepSpec | SurveySpec | RandomViewsSpec | PosesSpec
 
 
 @dataclass(frozen=True)
@@ -192,8 +205,9 @@ class RigSpec:
     """Stereo rig and the pixel grid of its images; ``width`` and ``height`` in pixels.
 
     Without a ``calibration`` the rig is a pair of parallel ideal pinholes, ``baseline_m`` apart (``grid`` is
-    ``ideal``). With a calibration, ``grid`` is ``raw`` for the distorted images or ``rectified`` for the rectified
-    pair, and ``baseline_m`` must equal the baseline of the calibration.
+    ``ideal``). With a calibration, ``grid`` is ``raw`` for the distorted images, ``rectified`` for the rectified
+    pair, or ``ideal`` if it has two parallel pinholes; ``baseline_m`` must equal the baseline of the calibration.
+    The width decides the focal length; images of another aspect ratio have fewer or more rows on both sides.
     """
 
     width: int = 1280
@@ -205,33 +219,36 @@ class RigSpec:
 
 @dataclass(frozen=True)
 class FocalRigSpec(RigSpec):
-    """Ideal rig with the ``focal_px`` of a named ``camera``, in pixels of an image 1280 x 720 pixels large."""
+    """Ideal rig with the ``focal_px`` of a named ``camera``, in pixels of an image 1280 pixels wide."""
 
     camera: str = ""
     focal_px: float = NOMINAL_FOCAL_PX
 
 
-def focal_of_view_px(horizontal_deg: float) -> float:
-    """Return the focal length that shows ``horizontal_deg`` in an image 1280 px wide, to 0.1 px."""
-    return round(NOMINAL_WIDTH / 2 / tan(radians(horizontal_deg) / 2), 1)
+def focal_of_view_px(horizontal_deg: float, width: int = NOMINAL_WIDTH) -> float:
+    """Return the focal length that shows ``horizontal_deg`` in an image ``width`` pixels wide."""
+    return width / 2 / tan(radians(horizontal_deg) / 2)
 
 
-def _rig(camera: str, baseline_m: float, focal_px: float) -> FocalRigSpec:
-    return FocalRigSpec(baseline_m=baseline_m, camera=camera, focal_px=focal_px)
+def _rig(camera: str, baseline_m: float, focal_px: float, height: int = RigSpec.height) -> FocalRigSpec:
+    return FocalRigSpec(height=height, baseline_m=baseline_m, camera=camera, focal_px=round(focal_px, 1))
 
 
 _RIGS = (
     _rig("Stereolabs ZED", 0.120, NOMINAL_FOCAL_PX),  # HD720; the rig of the paper.
-    _rig("Luxonis OAK-D", 0.075, 882.5),  # Documentation of stereo depth, 1280 x 800 pixels.
+    _rig("Luxonis OAK-D", 0.075, 882.5, height=800),  # Luxonis, "Configuring stereo depth": focal length at 800P.
+    _rig("Luxonis OAK-D Pro", 0.075, focal_of_view_px(80.0), height=800),  # Luxonis' page of it: 80 x 55 degrees.
+    # Data sheet of the D400 series (337029) and product pages: depth at 1280 x 720.
+    _rig("Intel RealSense D405", 0.018, focal_of_view_px(87.0)),
     _rig("Intel RealSense D415", 0.055, focal_of_view_px(65.0)),
     _rig("Intel RealSense D435", 0.050, focal_of_view_px(87.0)),
     _rig("Intel RealSense D455", 0.095, focal_of_view_px(87.0)),
 )
 STEREO_CAMERAS: Mapping[str, FocalRigSpec] = {rig.camera: rig for rig in _RIGS}
-"""Rigs of stereo cameras that can be bought, by name, for generated cages and scene files.
+"""Rigs of stereo cameras that can be bought, by name.
 
-The fields of view are those of the pair of cameras that depth is computed from, at 16:9, as their makers state
-them. The images are those of ideal pinholes: the differences that matter here are focal length and baseline.
+Sizes and fields of view are those of the pair of cameras that depth is computed from, as their makers state them.
+Only this geometry is that of the camera, with ideal pinholes: not its lenses, projector, noise or depth engine.
 """
 
 

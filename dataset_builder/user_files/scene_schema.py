@@ -5,11 +5,14 @@ name = "my-beam"              # default: the file name; lower-case letters, digi
 unit = "mm"                   # of every length: m, cm, mm, in, ft; default with ifc: m
 environment = "laboratory"    # or "outdoors", "hall", "deck"
 board = 6                     # markers on the A3 sheet: 6, 12, or false for no sheet
-rig = "Intel RealSense D455"  # baseline and field of view; default: 0.12 m, 84.9 degrees
+
+[rig]                         # default: ideal pinholes 0.12 m apart, 1280 x 720 pixels, fx = fy = 700
+camera = "Intel RealSense D455"    # or a calibration or numbers, see below
 
 [cameras]                     # default: a dome around the assembly, or a survey beyond 1 m
 kind = "dome"                 # or "ring" with radius, elevation_deg, azimuths;
-                              # or "survey" with, if wanted, distances, views_per_distance, seed
+                              # or "survey" with, if wanted, distances, views_per_distance, seed;
+                              # or "poses" with positions, targets (as many, or one), up (default [0, 0, 1])
 radii = [300, 400]
 elevations_deg = [15, 45]
 azimuths = 12
@@ -46,16 +49,26 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping
-from dataclasses import dataclass
-from typing import Annotated, Any
+from dataclasses import asdict, dataclass
+from typing import Annotated, Any, Self
 
-from pydantic import AfterValidator, BeforeValidator, Field, Strict, ValidationInfo, field_validator
+import numpy as np
+from pydantic import (
+    AfterValidator,
+    BeforeValidator,
+    Field,
+    Strict,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 
 from dataset_builder.scene.environments.surroundings import SURROUNDINGS
 from dataset_builder.scene.model import MAX_BARS, to_metres
 from dataset_builder.scene.variants.registry import VARIANTS
-from dataset_builder.specs.config_specs import STEREO_CAMERAS, DomeSpec, RigSpec, RingSpec, SurveySpec
+from dataset_builder.specs.config_specs import DomeSpec, PosesSpec, RingSpec, SurveySpec
 from dataset_builder.specs.file_specs import KEYS, Origin, PlacementSpec, Selection, Trust, Up
+from dataset_builder.user_files.rig_file import RigTable
 from rebar_depth_bench.base.errors import InputError, Problem
 from rebar_depth_bench.base.reading import is_below, parse_toml
 from rebar_depth_bench.base.validation import (
@@ -73,10 +86,13 @@ from rebar_depth_bench.base.validation import (
     validate_table,
     whole_number,
 )
+from rebar_depth_bench.data.schema import trajectory_of
 
 MAX_VIEWS = 10_000
 """Maximum number of views of a config: the index in a view id has four digits."""
 _MAX_AZIMUTHS = 3600
+_MIN_SINE = 1e-5
+"""Least sine of the angle of a line of sight and the direction that is up in its image."""
 _MAX_SELECTIONS = 100
 _MESH_KEYS = ("name", "box")
 """Keys of ``[[select]]`` for a mesh file, whose parts have no other names."""
@@ -106,16 +122,6 @@ def _length_in_metres(length: float, info: ValidationInfo[_Context]) -> float:
 def _point_in_metres(point: Triple, info: ValidationInfo[_Context]) -> Triple:
     x, y, z = (to_metres(value, info.context.unit_m) for value in point)
     return x, y, z
-
-
-def _distance_in_metres(distance: float, info: ValidationInfo[_Context]) -> float:
-    """Return a camera distance in metres, which is at least the baseline of the default rig."""
-    distance_m = to_metres(distance, info.context.unit_m)
-    if distance_m < RigSpec.baseline_m:
-        found = f"cameras are {distance_m:.4g} m from the aim point"
-        expected = f"at least {RigSpec.baseline_m} m, the baseline of the default rig: is the unit right?"
-        raise field_error(found, expected, "conflict")
-    return distance_m
 
 
 def _list_of(expected: str, min_length: int = 1) -> Expected:
@@ -149,10 +155,8 @@ _Point = Annotated[
     Triple, three_numbers(-1e9, 1e9, "three numbers from -1e9 to 1e9, [x, y, z]"), AfterValidator(_point_in_metres)
 ]
 _Step = Annotated[_Point, Expected("a step that is not zero, [x, y, z]", any)]
-_Distance = Annotated[
-    float, number(0, expected="a distance above 0, up to 1e9"), AfterValidator(_distance_in_metres)
-]
-_Distances = Annotated[tuple[_Distance, ...], Strict(False), _list_of("a list of distances")]
+_Points = Annotated[tuple[_Point, ...], Strict(False), _list_of("a list of points, [[x, y, z], ...]")]
+_Distances = Annotated[tuple[_Length, ...], Strict(False), _list_of("a list of distances")]
 _Elevation = Annotated[float, number(0, 89, "degrees above 0, up to 89")]
 _Azimuths = Annotated[int, whole_number(1, _MAX_AZIMUTHS)]
 _Pattern = Annotated[str, text(200, 'a name or a glob pattern such as "Level 1*"')]
@@ -194,7 +198,7 @@ class TomlBar(StrictModel):
 class CamerasTable(StrictModel, extra="ignore"):
     """Keys of the table ``[cameras]`` for all kinds; the fields of a kind are those of its spec, in metres."""
 
-    kind: Annotated[str, one_of("dome", "ring", "survey")]
+    kind: Annotated[str, one_of("dome", "ring", "survey", "poses")]
 
 
 class DomeTable(CamerasTable, extra="forbid"):
@@ -209,7 +213,7 @@ class RingTable(CamerasTable, extra="forbid"):
     """Table ``[cameras]`` of a ring."""
 
     azimuths: _Azimuths
-    radius_m: _Distance = Field(alias="radius")
+    radius_m: _Length = Field(alias="radius")
     elevation_deg: _Elevation
 
 
@@ -221,11 +225,34 @@ class SurveyTable(CamerasTable, extra="forbid"):
     seed: Annotated[int, whole_number(0, 2**31 - 1)] = SurveySpec.seed
 
 
-_Trajectory = DomeSpec | RingSpec | SurveySpec
+class PosesTable(CamerasTable, extra="forbid"):
+    """Table ``[cameras]`` of given poses; a single target is that of all positions."""
+
+    positions_m: _Points = Field(alias="positions")
+    targets_m: _Points = Field(alias="targets")
+    up: Annotated[Triple, three_numbers(-1e9, 1e9, "a direction, [x, y, z]")] = PosesSpec.up
+
+    @model_validator(mode="after")
+    def _check_sights(self) -> Self:
+        positions, targets = len(self.positions_m), len(self.targets_m)
+        if targets not in (1, positions):
+            expected = f"as many targets as positions, {positions}, or one"
+            raise field_error(f"got {targets} targets", expected, "conflict")
+        sights_m = np.subtract(self.targets_m, self.positions_m)
+        across = np.linalg.norm(np.cross(sights_m, self.up), axis=1)
+        parallel = across <= _MIN_SINE * np.linalg.norm(sights_m, axis=1) * np.linalg.norm(self.up)
+        if parallel.any():
+            found = f"the line of sight of position {parallel.argmax() + 1} is parallel to up = {list(self.up)}"
+            raise field_error(found, "another direction up in its image, such as [0, 1, 0], or target", "conflict")
+        return self
+
+
+_Trajectory = DomeSpec | RingSpec | SurveySpec | PosesSpec
 _KINDS: Mapping[str, tuple[type[CamerasTable], Callable[..., _Trajectory]]] = {
     "dome": (DomeTable, DomeSpec),
     "ring": (RingTable, RingSpec),
     "survey": (SurveyTable, SurveySpec),
+    "poses": (PosesTable, PosesSpec),
 }
 """Table and spec of each kind of cameras."""
 
@@ -265,7 +292,7 @@ class SceneToml(StrictModel):
     environment: Annotated[str, one_of(*SURROUNDINGS)] | None = None
     board: Annotated[int | bool, Expected("6, 12 or false", lambda markers: markers in (0, 6, 12))] | None = None
     cameras: _Trajectory | None = None
-    rig: Annotated[str, one_of(*STEREO_CAMERAS)] | None = None
+    rig: RigTable | None = None
     up: Annotated[Up, one_of("z", "y")] = "z"
     origin: Annotated[Origin, one_of("centre", "keep")] | None = None
     rotate_deg: Annotated[float, number(-360, 360, "degrees from -360 to 360")] = 0.0
@@ -326,7 +353,10 @@ def _read_cameras(values: object, context: _Context, problems: list[Problem]) ->
         case {"kind": str(kind)} if kind in _KINDS:
             model, spec = _KINDS[kind]
             table = validate_table(model, values, problems, "cameras", context)
-            return None if table is None else spec(**table.model_dump())
+            trajectory = None if table is None else spec(**table.model_dump())
+            if trajectory is not None and (views := trajectory_of(asdict(trajectory)).views) > MAX_VIEWS:
+                problems.append(Problem("conflict", "cameras", f"{views} views requested", f"at most {MAX_VIEWS}"))
+            return trajectory
     validate_table(CamerasTable, values, problems, "cameras")
     return None
 
@@ -353,8 +383,6 @@ def _conflicts(values: Mapping[str, Any]) -> Iterator[Problem]:
             found = f"{', '.join(only_ifc)} with a mesh"
             expected = f"{' or '.join(_MESH_KEYS)}: parts of a mesh have no other names"
             yield Problem("conflict", where, found, expected)
-    if (views := _view_count(values.get("cameras"))) > MAX_VIEWS:
-        yield Problem("conflict", "cameras", f"{views} views requested", f"at most {MAX_VIEWS}")
     yield from _row_conflicts(values)
 
 
@@ -387,14 +415,3 @@ def _numbered_tables(values: Mapping[str, Any], key: str) -> Iterator[tuple[int,
     for table_number, table in enumerate(tables if isinstance(tables, list) else (), start=1):
         if isinstance(table, dict):
             yield table_number, table
-
-
-def _view_count(cameras: object) -> int:
-    """Return the number of views of a dome or survey, by its table; 0 for a ring, and for invalid values."""
-    defaults = {"distances": SurveySpec.distances_m, "views_per_distance": SurveySpec.views_per_distance}
-    match {**defaults, **cameras} if isinstance(cameras, dict) else None:
-        case {"kind": "dome", "radii": [*radii], "elevations_deg": [*elevations], "azimuths": int(azimuths)}:
-            return len(radii) * len(elevations) * azimuths if azimuths <= _MAX_AZIMUTHS else 0
-        case {"kind": "survey", "distances": [*distances], "views_per_distance": int(count_each)}:
-            return len(distances) * count_each if count_each <= MAX_VIEWS else 0
-    return 0

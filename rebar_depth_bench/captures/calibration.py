@@ -95,6 +95,8 @@ class MonoCalibration:
 
 
 Calibration = StereoCalibration | MonoCalibration
+Side = int | None
+"""Width or height of images, pixels; None stands for that of the calibration."""
 _AnyCalibration = TypeVar("_AnyCalibration", StereoCalibration, MonoCalibration, Calibration)
 
 
@@ -117,24 +119,26 @@ def camera_columns(calibration: Calibration, left_cam_from_world: Float64[ndarra
 
 
 def scale_calibration(calibration: _AnyCalibration, width: int, height: int) -> _AnyCalibration:
-    """Return the calibration for another image size that covers the same sensor area.
+    """Return the calibration for another image size: scaled by the width, with rows cropped or added.
 
-    Pixel centres are at integers, so scaling a side from W to W' gives cx' = (cx + 0.5) W'/W - 0.5. The distortion
-    coefficients refer to the plane z = 1 and do not change.
+    As many rows are cropped or added at the top as at the bottom, so that pixels keep their shape. Pixel centres
+    are at integers: scaling by s gives cx' = s (cx + 0.5) - 0.5. The distortion coefficients refer to the plane
+    z = 1 and do not change.
     """
-    scale_x, scale_y = width / calibration.width, height / calibration.height
-    if (scale_x, scale_y) == (1.0, 1.0):
+    if (width, height) == (calibration.width, calibration.height):
         return calibration
+    scale = width / calibration.width
+    top_px = (height - scale * calibration.height) / 2
 
     def scale_lens(lens: Lens) -> Lens:
-        cx, cy = (lens.cx + 0.5) * scale_x - 0.5, (lens.cy + 0.5) * scale_y - 0.5
-        return replace(lens, fx=lens.fx * scale_x, fy=lens.fy * scale_y, cx=cx, cy=cy)
+        cx, cy = (lens.cx + 0.5) * scale - 0.5, (lens.cy + 0.5) * scale - 0.5 + top_px
+        return replace(lens, fx=lens.fx * scale, fy=lens.fy * scale, cx=cx, cy=cy)
 
     scaled = replace(calibration, width=width, height=height, left=scale_lens(calibration.left))
     return scaled if isinstance(scaled, MonoCalibration) else replace(scaled, right=scale_lens(scaled.right))
 
 
-def scaled_calibration(calibration: _AnyCalibration, source: object, width: int, height: int) -> _AnyCalibration:
+def scaled_calibration(calibration: _AnyCalibration, source: object, width: Side, height: Side) -> _AnyCalibration:
     """Return the calibration in the file ``source`` for images of ``width`` x ``height`` pixels.
 
     Raises ``CalibrationError`` if the right camera is not beside the left one, if a distortion has no inverse, and
@@ -154,8 +158,10 @@ def scaled_calibration(calibration: _AnyCalibration, source: object, width: int,
         except ValueError as error:
             found = f"the distortion cannot be inverted at the image border: {error}"
             problems.append(Problem("conflict", eye, found))
+    width, height = width or calibration.width, height or calibration.height
     scaled = scale_calibration(calibration, width, height)
-    ratio = scaled.left.fx / scaled.left.fy
+    stretch = (width / calibration.width) / (height / calibration.height)
+    ratio = stretch * calibration.left.fx / calibration.left.fy
     if not problems and abs(ratio - 1) > _SQUARE_PIXEL_TOLERANCE:
         found = f"at {width} x {height} pixels fx is {ratio:.3f} times fy"
         expected = "1: these are the cameras of images of another aspect ratio"
@@ -211,7 +217,7 @@ _BASELINE_M = quantity(0.001, 10, "metres")
 
 
 _Matrix = Annotated[tuple[Triple, Triple, Triple], Strict(False)]
-_Offset = Annotated[float, quantity(-10, 10, "metres; the unit of a file is stated in cameras.toml")]
+_Offset = Annotated[float, quantity(-10, 10, "metres; unit in cameras.toml or [rig] states that of a file")]
 _Pixels = Annotated[float, Expected("a number of pixels")]
 _Side = Annotated[int, whole_number(SIDES_PX[0], SIDES_PX[-1])]
 _TERMS = Expected("[k1, k2, p1, p2] or [k1, k2, p1, p2, k3]", lambda terms: len(terms) in (4, 5))
@@ -324,7 +330,7 @@ class _TwoCameras(_OneCamera):
 
 
 def table_calibration(
-    document: Mapping[str, Any], width: int, height: int, problems: list[Problem], *, is_stereo: bool
+    document: Mapping[str, Any], width: Side, height: Side, problems: list[Problem], *, is_stereo: bool
 ) -> Calibration | None:
     """Return the calibration in the content of a TOML file, of a stereo pair or of one camera.
 
@@ -332,7 +338,8 @@ def table_calibration(
     result is None if there are any.
     """
     sides_px = {"width": width, "height": height}
-    values = {**sides_px, **document}
-    context = {key: values[key] if values[key] in SIDES_PX else side_px for key, side_px in sides_px.items()}
+    values = {key: side_px for key, side_px in sides_px.items() if side_px is not None} | dict(document)
+    most = {key: side_px or SIDES_PX[-1] for key, side_px in sides_px.items()}
+    context = {key: values[key] if values.get(key) in SIDES_PX else side_px for key, side_px in most.items()}
     table = validate_table(_TwoCameras if is_stereo else _OneCamera, values, problems, context=context)
     return None if table is None else table.calibration

@@ -18,6 +18,7 @@ from rebar_depth_bench.captures.calibration import (
     SIDES_PX,
     Calibration,
     Lens,
+    Side,
     StereoCalibration,
     principal_point,
     quantity,
@@ -25,6 +26,7 @@ from rebar_depth_bench.captures.calibration import (
     table_calibration,
 )
 from rebar_depth_bench.captures.fields import LENS_TERMS, lens_problem, unknown_keys_notes
+from rebar_depth_bench.geometry.cameras import NOMINAL_HEIGHT, NOMINAL_WIDTH
 
 
 def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibration:
@@ -33,7 +35,7 @@ def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibra
     ``.conf`` is Stereolabs' INI file, whose keys docs/formats.md lists: sections ``LEFT_CAM_X``, ``RIGHT_CAM_X``
     for each image size X, such as HD, and ``STEREO``. If the file has no sections for the requested size, those
     nearest in aspect ratio and then in width are read and passed to ``scale_calibration``, which assumes that both
-    sizes cover the same sensor area; a file that shows that they do not, or has sections of unknown sizes, is
+    sizes show the whole width of the sensor; a file that shows otherwise, or has sections of unknown sizes, is
     refused. The motion is ``x_right = R x_left + T`` with R = Rodrigues(RX, CV, RZ) and T = -(Baseline, TY, TZ):
     the whole vector is negated, which keeps it on the line that the vendor's rectification uses.
 
@@ -50,7 +52,7 @@ def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibra
     return calibration
 
 
-def own_calibration(path: Path, width: int, height: int, *, is_stereo: bool) -> Calibration:
+def own_calibration(path: Path, width: Side, height: Side, *, is_stereo: bool) -> Calibration:
     """Return the calibration in a file as ``read_calibration``; a ``.toml`` file may have one camera."""
     suffix = path.suffix.lower()
     if suffix not in (".conf", ".toml"):
@@ -71,9 +73,9 @@ def own_calibration(path: Path, width: int, height: int, *, is_stereo: bool) -> 
     return scaled_calibration(calibration, path, width, height)
 
 
-def check_image_size(path: object, width: int, height: int) -> None:
+def check_image_size(path: object, width: Side, height: Side) -> None:
     """Raise ``CalibrationError`` for images of a size that the calibration ``path`` cannot be scaled to."""
-    if width not in SIDES_PX or height not in SIDES_PX:
+    if not all(side_px is None or side_px in SIDES_PX for side_px in (width, height)):
         expected = f"{SIDES_PX[0]} to {SIDES_PX[-1]} pixels each"
         problem = Problem("invalid", "", f"it is requested for images of {width} x {height}", expected)
         raise CalibrationError.from_problems(path, [problem])
@@ -118,14 +120,14 @@ _COMMENT = re.compile(r"(?:^|\s)[;#]")
 _SEPARATOR = re.compile("[=:]")
 
 
-def _read_conf(name: str, content: bytes, width: int, height: int) -> StereoCalibration:
+def _read_conf(name: str, content: bytes, width: Side, height: Side) -> StereoCalibration:
     """Return the calibration of a Stereolabs ``.conf`` file for one of its image sizes; the caller scales it.
 
-    The size is that nearest to ``width`` x ``height`` in aspect ratio, then in width. Section names and keys are
-    case-insensitive. Raises ``EntryError`` for the first problem.
+    The size is that nearest to ``width`` x ``height``, or to HD, in aspect ratio, then in width. Section names and
+    keys are case-insensitive. Raises ``EntryError`` for the first problem.
     """
     sections = _read_sections(content)
-    size = _nearest_size(sections, width, height)
+    size = _nearest_size(sections, width or NOMINAL_WIDTH, height or NOMINAL_HEIGHT)
     left, right = (_read_lens(sections, eye, size) for eye in ("LEFT", "RIGHT"))
     baseline_mm, y_mm, z_mm, rx, cv, rz = _numbers(sections, ("STEREO",), _STEREO, f"_{size}")
     translation_m = (0.0 - baseline_mm / 1000, 0.0 - y_mm / 1000, 0.0 - z_mm / 1000)
@@ -134,7 +136,7 @@ def _read_conf(name: str, content: bytes, width: int, height: int) -> StereoCali
         keys += [f"{section}.{key}" for key in texts] if section in _KNOWN else [section]
         known.update(f"{section}.{key}".upper() for key in _KNOWN.get(section, ()))
     notes = unknown_keys_notes(name, keys, known)
-    if ZED_SIZES[size] != (width, height):
+    if width is not None and ZED_SIZES[size] != (width, height):
         sides = " x ".join(map(str, ZED_SIZES[size]))
         notes.append(f"{name}: scaled from {size}, {sides}, as if both sizes showed the same part of the sensor")
     return StereoCalibration(*ZED_SIZES[size], left, right, (rx, cv, rz), translation_m, tuple(notes))

@@ -48,6 +48,7 @@ from rebar_depth_bench.base.validation import (
 )
 from rebar_depth_bench.captures.calibration import (
     Calibration,
+    Side,
     StereoCalibration,
     scaled_calibration,
     table_calibration,
@@ -151,8 +152,8 @@ def cameras_of_table(
     path: Path,
     document: Mapping[str, Any],
     images: Sequence[str],
-    width: int,
-    height: int,
+    width: Side,
+    height: Side,
     *,
     is_stereo: bool,
     where: str = "",
@@ -206,7 +207,7 @@ def _found_files(root: Path) -> list[Path]:
 
 
 def _file_calibration(
-    paths: Sequence[Path], stated: _CamerasTable, width: int, height: int, *, is_stereo: bool
+    paths: Sequence[Path], stated: _CamerasTable, width: Side, height: Side, *, is_stereo: bool
 ) -> Calibration:
     """Return the calibration in one or two files, of the ``stated`` unit, scaled to the image size."""
     source = " and ".join(map(str, paths))

@@ -25,7 +25,7 @@ from numpy import ndarray
 from rebar_depth_bench.base.errors import EntryError, Problem, ProblemCode
 from rebar_depth_bench.base.reading import parse_number
 from rebar_depth_bench.base.validation import format_location, short_repr
-from rebar_depth_bench.captures.calibration import Calibration, table_calibration
+from rebar_depth_bench.captures.calibration import Calibration, Side, table_calibration
 from rebar_depth_bench.captures.fields import (
     DISTORTION_TERMS,
     OTHER_LENS,
@@ -89,7 +89,7 @@ _ROUNDED_PX = 0.01
 
 
 def program_calibration(
-    documents: Mapping[str, Document], width: int, height: int, unit_m: float, *, rectified: bool | None
+    documents: Mapping[str, Document], width: Side, height: Side, unit_m: float, *, rectified: bool | None
 ) -> Calibration:
     """Return the calibration in one or two documents, by file name; of two, the left camera is the first.
 
@@ -139,6 +139,10 @@ def program_calibration(
     if calibration is None:
         eye, _, key = problems[0].where.partition(".")
         found = f"{key or eye}: {problems[0].found}"
+        if problems[0].code == "missing":  # Only the size can be missing in the table.
+            raise cameras[0].error(
+                "missing", "width", "missing", "image_width and image_height, or these of a rig"
+            )
         name = "projection" if rectified else "matrix"
         raise cameras[eye == "right"].error(problems[0].code, name, found, problems[0].expected)
     if sizes[0] and sizes[-1] and sizes[0] != sizes[-1]:
@@ -283,7 +287,7 @@ def _check_not_rectified(camera: _Camera, *, is_stated: bool) -> list[str]:
 
 
 def _on_pictures(
-    camera: _Camera, matrix: Values, width: int, height: int, notes: list[str]
+    camera: _Camera, matrix: Values, width: Side, height: Side, notes: list[str]
 ) -> tuple[Values, dict[str, float]]:
     """Return a matrix of the sensor on pictures of ``width`` x ``height``, and the image size that it is for.
 
@@ -292,7 +296,7 @@ def _on_pictures(
     the full size are not cropped; without ``roi``, those of another size show all of the sensor. Raises
     ``EntryError`` for a region that cannot be that of the pictures.
     """
-    size, pictures = camera.size, [width, height]
+    size = camera.size
     sensor = list(size.values())
     bin_x, bin_y = (max(1.0, camera.numbers(f"binning {axis}", 1, default=np.zeros(1))[0]) for axis in "xy")
     roi: Any = next(iter(camera.fields["region"].values()), {})
@@ -310,11 +314,12 @@ def _on_pictures(
         found = f"{sides[0]:g} x {sides[1]:g} pixels at ({x:g}, {y:g}) are not inside width x height"
         expected = "a part of the full sensor, which width, height and K are for (REP 104); or a roi of zeros, "
         raise camera.error("conflict", "region", found, f"{expected}and K of the pictures")
+    pictures = shown if width is None or height is None else [width, height]
     if shown == pictures and not (is_whole and bin_x == bin_y == 1):
         corner = np.array([[0, 0, x - 0.5], [0, 0, y - 0.5], [0, 0, 0]])
         half_pixel = np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]])
         matrix = np.diag([1 / bin_x, 1 / bin_y, 1.0]) @ (matrix - corner) - half_pixel
-        return matrix, {"width": width, "height": height}
+        return matrix, {"width": int(pictures[0]), "height": int(pictures[1])}
     if not is_whole and sensor != pictures:
         expected = f"{shown[0]:g} x {shown[1]:g}, or the size of the full sensor"
         raise camera.error("conflict", "region", f"the pictures have {width} x {height} pixels", expected)

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from functools import reduce
+from itertools import cycle
 from typing import TYPE_CHECKING, Annotated, Any
 
 import pyarrow as pa
@@ -128,6 +130,8 @@ SURVEY = "survey"
 """Kind of a ``Survey``."""
 RANDOM_VIEWS = "random views"
 """Kind of ``RandomViews``."""
+POSES = "poses"
+"""Kind of ``GivenPoses``."""
 _SHELLS = ("dome", "ring", "sweep")
 """Kinds of a ``Trajectory``."""
 _Views = Annotated[int, whole_number(1, 1_000_000)]
@@ -180,11 +184,30 @@ class RandomViews(ManifestTable):
     views: _Views
 
 
-AnyTrajectory = Trajectory | Survey | RandomViews
+class GivenPoses(ManifestTable):
+    """Cameras of a config whose positions and targets are given."""
+
+    kind: Annotated[str, one_of(POSES)] = POSES
+    positions_m: Annotated[tuple[Triple, ...], Strict(False), Field(min_length=1)]
+    targets_m: Annotated[tuple[Triple, ...], Strict(False), Field(min_length=1)]
+
+    @property
+    def distances_m(self) -> tuple[float, ...]:
+        """Distances of the left camera from the targets, metres."""
+        return tuple(map(math.dist, self.positions_m, cycle(self.targets_m)))
+
+    @property
+    def views(self) -> int:
+        """Number of views of the full trajectory."""
+        return len(self.positions_m)
+
+
+AnyTrajectory = Trajectory | Survey | RandomViews | GivenPoses
 _BY_KIND: Mapping[str, type[AnyTrajectory]] = {
     **dict.fromkeys(_SHELLS, Trajectory),
     SURVEY: Survey,
     RANDOM_VIEWS: RandomViews,
+    POSES: GivenPoses,
 }
 
 
@@ -313,11 +336,12 @@ _NEEDED = {
 
 
 class SceneRig(ManifestTable):
-    """Optics of a scene: pixel grid, baseline in metres, and the camera by its name if it has one."""
+    """Optics of a scene: pixel grid, baseline in metres, the camera by its name if it has one, and calibration."""
 
     grid: Annotated[str, one_of("ideal", "raw", "rectified")]
     baseline_m: _Length
     camera: Annotated[str, StringConstraints(max_length=100)] = ""
+    calibration: dict[str, Any] | None = None
 
 
 _Deviation = Annotated[float, number(-1, 1)]

@@ -61,12 +61,11 @@ class Camera:
 def ideal_K(width: int, height: int, focal_px: float = NOMINAL_FOCAL_PX) -> Float[ndarray, "3 3"]:
     """Return the ideal pinhole matrix of a ``width`` x ``height`` image, in pixels.
 
-    ``focal_px``, the focal length at 1280 x 720, is scaled with each side; the principal point is the image
-    centre.
+    Pixels are square: ``focal_px``, the focal length of an image 1280 pixels wide, is scaled with the width. The
+    principal point is the image centre.
     """
-    fx = focal_px * width / NOMINAL_WIDTH
-    fy = focal_px * height / NOMINAL_HEIGHT
-    return np.array([[fx, 0.0, (width - 1) / 2], [0.0, fy, (height - 1) / 2], [0.0, 0.0, 1.0]])
+    focal_px = focal_px * width / NOMINAL_WIDTH
+    return np.array([[focal_px, 0.0, (width - 1) / 2], [0.0, focal_px, (height - 1) / 2], [0.0, 0.0, 1.0]])
 
 
 def look_at(

@@ -256,7 +256,9 @@ def published_match(config: DatasetConfig) -> PublishedMatch | None:
     if name is None or paper_differences(config):
         return None
     rig = config.scene.rig
-    optics = None if rig is None else (rig.grid, rig.baseline_m)
+    # The ideal rig of the paper has neither the name of another camera nor numbers of its own.
+    is_other = rig is None or (rig.grid == "ideal" and bool(rig.camera or rig.calibration))
+    optics = None if rig is None or is_other else (rig.grid, rig.baseline_m)
     return PublishedMatch(name, optics == _CONDITIONS[name].optics)
 
 

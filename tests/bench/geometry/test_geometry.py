@@ -43,7 +43,7 @@ POINT = st.tuples(st.floats(0.3, 5.0), COORDINATE, COORDINATE).map(np.array)
 
 def test_ideal_K_matches_contract() -> None:
     assert ideal_K(1280, 720).tolist() == [[700, 0, 639.5], [0, 700, 359.5], [0, 0, 1]]
-    assert ideal_K(320, 90).tolist() == [[175, 0, 159.5], [0, 87.5, 44.5], [0, 0, 1]]
+    assert ideal_K(320, 90).tolist() == [[175, 0, 159.5], [0, 175, 44.5], [0, 0, 1]]
 
 
 def test_axes_are_right_down_forward() -> None:

@@ -145,7 +145,7 @@ def test_default_dome_scales_with_steel_extent(tmp_path: Path) -> None:
     assert min(config.protocol.radii_m) == pytest.approx(NEAREST_RADIUS_PER_REACH * reach_m, abs=0.002)
     ratio = np.array(config.protocol.radii_m) / np.array(LATTICE_DOME.radii_m)
     np.testing.assert_allclose(ratio, ratio[0], atol=0.003)
-    narrower = scene_config(write_scene(tmp_path, 'rig = "Intel RealSense D415"\n' + MM + BAR))
+    narrower = scene_config(write_scene(tmp_path, MM + BAR + '[rig]\ncamera = "Intel RealSense D415"\n'))
     assert isinstance(narrower.protocol, DomeSpec)
     assert min(narrower.protocol.radii_m) == pytest.approx(min(config.protocol.radii_m) * 1004.6 / 700, abs=0.002)
     lattice = lattice_assembly(LatticeSpec())
@@ -177,7 +177,8 @@ def test_default_is_a_survey_where_a_dome_would_exceed_one_metre(tmp_path: Path)
 
 
 def test_cameras_board_environment_and_rig_are_applied(tmp_path: Path) -> None:
-    head = 'name = "other"\nenvironment = "outdoors"\nboard = 12\nrig = "Luxonis OAK-D"\n' + MM
+    head = 'name = "other"\nenvironment = "outdoors"\nboard = 12\n' + MM
+    head += '[rig]\ncamera = "Luxonis OAK-D"\n'
     ring = '[cameras]\nkind = "ring"\nradius = 400\nelevation_deg = 35\nazimuths = 20\n'
     config = scene_config(write_scene(tmp_path, head + BAR + ring))
     assert (config.name, config.scene.name, config.scene.environment) == ("other", "other", "outdoors")

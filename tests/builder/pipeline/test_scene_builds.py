@@ -110,7 +110,7 @@ SIZE = ("--width", "192", "--height", "108", "--no-colour")
 
 @pytest.mark.slow
 def test_build_of_life_size_column(tmp_path: Path, run_build: RunBuild) -> None:
-    content = f'rig = "Luxonis OAK-D"\n{scene(column(), CAMERAS)}'
+    content = f'{scene(column(), CAMERAS)}\n[rig]\ncamera = "Luxonis OAK-D"\n'
     path = write_scene(tmp_path, content, "column.toml")
     root = tmp_path / "root"
     estimate = run_in_process(main, "--out", root, "--scene", path, "--views", "4", *SIZE, "--dry-run")
@@ -135,7 +135,7 @@ def test_build_of_life_size_column(tmp_path: Path, run_build: RunBuild) -> None:
     assert "up to date: column" in again.stdout
     card = (root / "README.md").read_text()
     assert "0.5-2 m, steel aimed at" in card
-    assert "ideal pinholes with baseline and field of view of Luxonis OAK-D." in card
+    assert "ideal pinholes with baseline and field of view, not noise or depth engine, of Luxonis OAK-D." in card
 
     export(root, tmp_path / "export")
     assert (tmp_path / "export/column/cameras.json").is_file()
