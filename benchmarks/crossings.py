@@ -12,9 +12,9 @@ for all archives:
    diameter, and the tie point lies one diameter behind that front;
 4. the confidence is the share of steel pixels around the point.
 
-The results there are of the datasets and archives of ``python -m benchmarks.reference OUT SET``: of ``subset``
-with ``truth``, ``sgbm``, ``sgbm-filled`` and ``sweep-aruco`` (``crossings.json``), and of ``cages`` with
-``truth``, ``sgbm``, ``sgbm-filled`` and ``lidar-mobile`` (``crossings-cages.json``).
+The results there are of datasets and archives as of ``python -m benchmarks.reference OUT SET``: of the configs
+``lattice`` and ``pile`` of ``subset`` with ``truth``, ``sgbm`` and ``sgbm-filled`` (``crossings.json``), and of
+``cages`` with ``truth``, ``sgbm``, ``sgbm-filled`` and ``lidar-mobile`` (``crossings-cages.json``).
 """
 
 from __future__ import annotations
@@ -52,9 +52,10 @@ MEASURES = (
     *("crossings_judged", "crossings_located", "tie_median_mm", "tie_p95_mm", "crossing_angle_p95_deg"),
     *("tie_within_2mm", "tie_within_5mm", "tie_within_10mm"),
 )
+BIAS = ("right_bias_mm", "down_bias_mm", "along_bias_mm", "spread_mm")
 KEPT = (
     *(*SHARES, "crossings", "detections", "matched", "false", "ignored"),
-    *("average_precision", "position_mm", "position_p95_mm"),
+    *("average_precision", "position_mm", "position_p95_mm", *BIAS, "chance"),
 )
 COLUMNS = ("view_id", "left_rgb", "left_K", "left_depth", "left_mask")
 
@@ -84,7 +85,7 @@ def main(root: str, out: str, *archives: str) -> None:
         "detectors": detectors,
     }
     (target / "crossings.json").write_text(json.dumps(document, indent=1, allow_nan=False) + "\n")
-    head = ["config", "detector", *SHARES, "AP 5", "AP 10", "AP 20", "median mm", "p95 mm"]
+    head = ["config", "detector", *SHARES, "AP 2", "AP 5", "AP 10", "median mm", "p95 mm", "chance: F1"]
     print_markdown(head, [row for method, tables in detectors.items() for row in _table_rows(method, tables)])
 
 
@@ -188,7 +189,9 @@ def _table_rows(method: str, tables: Mapping[str, Any]) -> Iterator[tuple[str, .
     for name, table in tables.items():
         shares = (*(table[share] for share in SHARES), *table["average_precision"].values())
         errors = (table["position_mm"], table["position_p95_mm"])
-        yield name, method, *(_text(share, 100, 1) for share in shares), *(_text(error, 1, 2) for error in errors)
+        chance = _text(table["chance"]["f1"], 100, 1)
+        cells = (*(_text(share, 100, 1) for share in shares), *(_text(error, 1, 2) for error in errors))
+        yield name, method, *cells, chance
 
 
 def _text(value: float | None, factor: float, digits: int) -> str:

@@ -27,10 +27,12 @@ from cards.reference import (
 from cards.steel import STEEL_RESULTS, depth_text, range_text
 from cards.templates import render, wrapped
 from rebar_depth_bench.bar_crossings.definition import crossing_parameters
+from rebar_depth_bench.detections.matching import DETECTIONS_PROTOCOL, HEADLINE_MM
 from rebar_depth_bench.detections.reading import MAX_ROWS_PER_VIEW
 from rebar_depth_bench.extended.families import MEASURE_FAMILIES
 from rebar_depth_bench.extended.fits import MISS_MM
 from rebar_depth_bench.extended.inspection import MISSED_NOTE, PROFILES, TOLERANCES
+from rebar_depth_bench.extended.judged import MAX_SURFACE_DIAMETERS
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, ONCE, Measure, MeasureFamily
 from rebar_depth_bench.methods import AnyMethod, own_methods
 from rebar_depth_bench.reporting.extended_tables import FITS_NOTE, REACH_NOTE
@@ -135,6 +137,9 @@ def measures_page() -> str:
         reach_note=REACH_NOTE,
         contacts=_CONTACTS,
         max_rows=f"{MAX_ROWS_PER_VIEW:,}",
+        detections_protocol=DETECTIONS_PROTOCOL,
+        headline_mm=HEADLINE_MM,
+        max_surface_diameters=MAX_SURFACE_DIAMETERS,
     )
     return wrapped(text)
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from cards.reference import number, percent
-from rebar_depth_bench.detections.tables import AVERAGE_PRECISION_MM
+from rebar_depth_bench.detections.matching import LIMITS_MM
 
 FILES = ("crossings.json", "crossings-cages.json")
 """Files of results: of the scenes, and of generated scenes."""
@@ -66,6 +66,12 @@ def _bin_rows(depth: Mapping[str, Any]) -> Iterator[list[str]]:
 
 
 def _detector_cells(table: Mapping[str, Any]) -> Iterator[str]:
-    yield from (percent(table[name]) for name in ("precision", "recall", "f1"))
-    yield from (percent(table["average_precision"][str(limit_mm)]) for limit_mm in AVERAGE_PRECISION_MM)
+    chance = table["chance"]
+    for name in ("precision", "recall", "f1"):
+        yield f"{percent(table[name])} ({percent(chance[name])})"
+    for limit_mm in LIMITS_MM:
+        average = table["average_precision"][str(limit_mm)]
+        yield f"{percent(average)} ({percent(chance[f'average_precision_{limit_mm}mm'])})"
     yield from (number(table[name], 2, " mm") for name in ("position_mm", "position_p95_mm"))
+    yield ", ".join(number(table[name], 1) for name in ("right_bias_mm", "down_bias_mm", "along_bias_mm")) + " mm"
+    yield number(table["spread_mm"], 1, " mm")

@@ -24,7 +24,7 @@ from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.geometry.segments import closest_on_segments
 
 CROSSINGS_PROTOCOL = "rebar-crossings-1"
-"""Version of the definition of crossings and of the detectors' task; any change changes it."""
+"""Version of the definition of crossings, which the manifest states; any change changes it."""
 
 MAX_GAP_M = 0.005
 """Largest nominal gap between the surfaces of bars that cross, metres."""

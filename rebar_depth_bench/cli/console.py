@@ -305,6 +305,8 @@ def check_outputs(options: Mapping[str, object]) -> None:
         if output == STANDARD_OUTPUT:
             if getattr(sys.stdout, "name", "") == os.devnull:  # ``prepare_terminal`` has opened it.
                 raise InputError(f"{option} names {output}, but standard output is closed: expected an open one")
+        elif isinstance(output, OutputFolder) and is_stream(output):
+            raise InputError(f"{option} names {output}, which is no folder: expected a new or an existing one")
         elif isinstance(output, OutputFolder):
             _check_writable(option, output, target / "file")
         elif not is_stream(output):

@@ -140,9 +140,11 @@ def _open_views(options: argparse.Namespace, method: AnyMethod) -> tuple[Sequenc
 
 def _check_folders(options: argparse.Namespace, views: Sequence[Views]) -> None:
     """Raise ``InputError`` if a picture or point cloud would be written among the data."""
-    for option in ("pictures", "ply"):
-        for config in views if getattr(options, option) else ():
-            target = (getattr(options, option) / config_of(config.view_ids[0])).resolve()
+    for option, folder in (("pictures", options.pictures), ("ply", options.ply)):
+        if folder is None:
+            continue
+        for config in views:
+            target = (folder / config_of(config.view_ids[0])).resolve()
             if Path(options.data).resolve() in (target, *target.parents):
                 raise InputError(f"--{option}: its files would be in {target}, the input; expected another folder")
 

@@ -243,7 +243,11 @@ def read_rows(
     are read (default: all).
     """
     present = pa.schema([column for column in schema if column.name in file.schema_arrow.names])
-    for batch in file.iter_batches(batch_size=batch_rows, row_groups=row_groups, columns=present.names):
+    # A thread of pyarrow that releases the Python file while the interpreter exits ends the process with SIGABRT.
+    batches = file.iter_batches(
+        batch_size=batch_rows, row_groups=row_groups, columns=present.names, use_threads=False
+    )
+    for batch in batches:
         yield from batch.select(present.names).cast(present).to_pylist()
 
 
@@ -352,7 +356,7 @@ def shard_rows(
         with _open_shard(config, shard, table) as file:
             groups = None
             if view_ids is not None:
-                stored = file.read(columns=["view_id"])["view_id"].to_pylist()
+                stored = file.read(columns=["view_id"], use_threads=False)["view_id"].to_pylist()
                 wanted = [index for index, view_id in enumerate(stored) if view_id in view_ids]
                 groups = wanted if not wanted or file.num_row_groups == len(stored) else None
             for row in read_rows(file, table.schema, row_groups=groups):

@@ -4,28 +4,30 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Bool, Float64, Int64
-from numpy import ndarray
 
 from rebar_depth_bench.base.errors import InputError, escape_text
 from rebar_depth_bench.base.names import TEST_SPLIT, config_of, split_of
 from rebar_depth_bench.base.parallel import Progress, map_in_threads, silent
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_folder
-from rebar_depth_bench.detections.matching import excused, greedy_matches, matched_pairs
+from rebar_depth_bench.detections.matching import (
+    HEADLINE_MM,
+    LIMITS_MM,
+    Points,
+    ViewCrossings,
+    random_points,
+)
 from rebar_depth_bench.detections.reading import DetectionFile, Detections, read_detections
 from rebar_depth_bench.detections.tables import (
-    AVERAGE_PRECISION_MM,
     DetectionResult,
     DetectionTable,
     ViewDetections,
     tabulate_detections,
 )
 from rebar_depth_bench.extended.ground_truth import ConfigSteelTruth, has_bar_ids, load_steel_truth
-from rebar_depth_bench.extended.judged import shown_bars
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.geometry.cameras import transform
 from rebar_depth_bench.scoring.bootstrap import resample_views
@@ -44,7 +46,7 @@ def score_crossings(
     """Score a CSV or Parquet file of detected crossings (``detections.reading``) against a dataset.
 
     The configs of the file's views are scored, or ``configs``; views without rows have no detections. Detections
-    with at least ``confidence`` are matched (default: all); average precision uses all of them. ``declared``
+    with at least ``confidence`` are counted (default: all); average precision uses all of them. ``declared``
     replaces the file's metadata. Raises ``SubmissionError`` with all problems of the file, ``InputError`` for a
     file without rows and without ``configs``, and ``DatasetError`` for the dataset.
     """
@@ -60,13 +62,10 @@ def score_crossings(
         steel = load_steel_truth(folder, config, progress)
         source = steel.source
 
-        def compare_at(position: int, steel: ConfigSteelTruth = steel) -> ViewDetections:
-            truth = steel.view(position)
-            rows = np.array(rows_by_view.get(truth.view_id, ()), dtype=np.int64)
-            return compare_view(detections_of_view(file.detections, rows, truth), truth, confidence)
-
+        by_view = [file.detections.of(rows_by_view.get(view_id, [])) for view_id in steel.view_ids]
+        compare = partial(_compare_at, steel, by_view, confidence)
         count, task = len(steel), f"crossings of {config.name}"
-        found = list(map_in_threads(compare_at, range(count), count, task, workers=workers, progress=progress))
+        found = list(map_in_threads(compare, range(count), count, task, workers=workers, progress=progress))
         resampling = None
         if found:
             resampling = resample_views(
@@ -89,6 +88,12 @@ def score_crossings(
         views=views,
         outside=sum(len(rows) for view_id, rows in rows_by_view.items() if view_id not in known),
     )
+
+
+def _compare_at(
+    steel: ConfigSteelTruth, by_view: Sequence[Detections], least: float | None, position: int
+) -> ViewDetections:
+    return compare_view(by_view[position], least, steel.view(position))
 
 
 def _configs(
@@ -114,74 +119,55 @@ _FAR_M = 1e6
 """Largest coordinate, metres: larger ones are as far from every crossing, and their squares overflow."""
 
 
-@dataclass(frozen=True, eq=False)
-class SeenDetections:
-    """Detections of one view in its left camera frame, metres; ``normal`` is NaN where none is given."""
+def compare_view(detections: Detections, least: float | None, truth: SteelTruth) -> ViewDetections:
+    """Compare the detections of one view, in order of their rows, with its crossings, and random points with both.
 
-    point_m: Float64[ndarray, "n 3"]
-    normal: Float64[ndarray, "n 3"]
-    confidence: Float64[ndarray, " n"]
-
-    def of(self, rows: Bool[ndarray, " n"]) -> SeenDetections:
-        """Return some of the detections."""
-        return SeenDetections(self.point_m[rows], self.normal[rows], self.confidence[rows])
-
-
-def detections_of_view(detections: Detections, rows: Int64[ndarray, " n"], truth: SteelTruth) -> SeenDetections:
-    """Return the detections of a view, in its camera frame."""
-    point_m, normal = detections.point_m[rows], detections.normal[rows]
+    Detections with a confidence of ``least`` or more count for the headline, all of them if it is None.
+    """
+    point_m, normal, confidence = detections.point_m, detections.normal, detections.confidence
     if detections.is_world:
         with np.errstate(over="ignore", invalid="ignore"):
             point_m = transform(truth.cam_from_world, point_m)
             point_m = np.where(np.isfinite(point_m), point_m, _FAR_M)
         normal = normal @ truth.cam_from_world[:3, :3].T
-    return SeenDetections(np.clip(point_m, -_FAR_M, _FAR_M), normal, detections.confidence[rows])
+    crossings = ViewCrossings.of_view(truth)
+    all_points = Points.in_view(np.clip(point_m, -_FAR_M, _FAR_M)[None], truth, crossings)
+    counts, is_correct = {}, {}
+    for limit_mm in LIMITS_MM:
+        correct, ignored = all_points.match(crossings, confidence, limit_mm / 1000)
+        counts[limit_mm], is_correct[limit_mm] = ~ignored[0], correct[0]
 
+    chosen = np.flatnonzero(confidence >= (-np.inf if least is None else least))
+    points = all_points.of(chosen)
+    correct, ignored = points.match(crossings, confidence[chosen], HEADLINE_MM / 1000)
+    sums = {name: float(values[0]) for name, values in points.sums(crossings, correct, ignored).items()}
+    found = np.flatnonzero(correct[0])
+    true_normal = truth.bars.crossings.crossings.normal[points.nearest[0, found]] @ truth.cam_from_world[:3, :3].T
+    cosine = np.abs(np.einsum("ki,ki->k", normal[chosen[found]], true_normal))
 
-def compare_view(detected: SeenDetections, truth: SteelTruth, least: float | None) -> ViewDetections:
-    """Compare the detections of one view with its crossings.
-
-    Detections with a confidence of ``least`` or more are matched, all of them if it is None.
-    """
-    scene = truth.bars.crossings.crossings
-    all_m = transform(truth.cam_from_world, scene.tie_point_m)
-    judged = truth.judged.crossing
-    is_judged = np.zeros(len(scene), dtype=bool)
-    is_judged[judged] = True
-    true_m = all_m[judged]
-    chosen = detected if least is None else detected.of(detected.confidence >= least)
-    pairs = matched_pairs(chosen.point_m, true_m)
-    left_over = np.ones(len(chosen.point_m), dtype=bool)
-    left_over[pairs[:, 0]] = False
-    hidden = left_over & _show_bars_without_axis(chosen.point_m, truth)
-    no_priority = np.zeros(len(left_over))
-    ignored = hidden | excused(chosen.point_m, left_over & ~hidden, all_m, is_judged, no_priority)
-    normal = scene.normal[judged] @ truth.cam_from_world[:3, :3].T
-    cosine = np.abs(np.einsum("ki,ki->k", chosen.normal[pairs[:, 0]], normal[pairs[:, 1]]))
-    offset_m = chosen.point_m[pairs[:, 0]] - true_m[pairs[:, 1]]
-    counts, correct = {}, {}
-    for limit in AVERAGE_PRECISION_MM:
-        matched = greedy_matches(detected.point_m, detected.confidence, true_m, limit / 1000)
-        hidden = ~matched & _show_bars_without_axis(detected.point_m, truth)
-        others = excused(detected.point_m, ~matched & ~hidden, all_m, is_judged, detected.confidence)
-        counts[limit], correct[limit] = ~(hidden | others), matched
+    # As many random points as detections that count, at the headline and for each average precision.
+    headline_count = round(sums["matched"] + sums["false"])
+    size = max(headline_count, *(np.count_nonzero(of_limit) for of_limit in counts.values()))
+    random = Points.in_view(random_points(truth, size), truth, crossings)
+    equal = np.ones(size)
+    headline = random.of(np.arange(headline_count))
+    correct, ignored = headline.match(crossings, equal[:headline_count], HEADLINE_MM / 1000)
+    chance = headline.sums(crossings, correct, ignored)
+    chance_position_mm = 1000 * headline.distance_m[correct]
+    chance_at = {}
+    for limit_mm, of_limit in counts.items():
+        count = np.count_nonzero(of_limit)
+        correct, ignored = random.of(np.arange(count)).match(crossings, equal[:count], limit_mm / 1000)
+        chance_at[limit_mm] = np.column_stack([correct.sum(axis=1), (~ignored).sum(axis=1)])
     return ViewDetections(
         view_id=truth.view_id,
-        judged=len(judged),
-        nodes=len(np.unique(scene.node_id[judged])),
-        nodes_found=len(np.unique(scene.node_id[judged[pairs[:, 1]]])),
-        detections=len(chosen.point_m),
-        matched=len(pairs),
-        ignored=int(np.count_nonzero(ignored)),
-        position_mm=1000 * np.linalg.norm(offset_m, axis=1),
+        sums=sums,
+        position_mm=1000 * points.distance_m[0, found],
         normal_deg=np.rad2deg(np.arccos(np.minimum(cosine[~np.isnan(cosine)], 1.0))),
-        confidence=detected.confidence,
+        confidence=confidence,
         counts=counts,
-        correct=correct,
+        correct=is_correct,
+        chance=chance,
+        chance_at=chance_at,
+        chance_position_mm=chance_position_mm,
     )
-
-
-def _show_bars_without_axis(point_m: Float64[ndarray, "n 3"], truth: SteelTruth) -> Bool[ndarray, " n"]:
-    """Return which points project onto a pixel of a bar whose axis is not known."""
-    shown = shown_bars(truth, point_m)
-    return np.asarray((shown > 0) & np.isnan(truth.bars.diameter_m[shown]))

@@ -72,6 +72,18 @@ class Detections:
     confidence: Float64[ndarray, " n"]
     has_confidence: bool
 
+    def of(self, rows: Sequence[int]) -> Detections:
+        """Return some of the rows."""
+        places = np.array(rows, dtype=np.int64)
+        return Detections(
+            [self.view_ids[row] for row in rows],
+            self.is_world,
+            self.point_m[places],
+            self.normal[places],
+            self.confidence[places],
+            self.has_confidence,
+        )
+
 
 def column_problems(names: Sequence[str]) -> list[Problem]:
     """Return the problems of the columns of a file."""
@@ -194,7 +206,7 @@ def _read_csv(path: Path, problems: list[Problem]) -> RawDetections | None:
         problems += undecoded
         return None
     metadata, first = _csv_metadata(text)
-    reader = csv.reader(islice(io.StringIO(text), first, None), strict=True)
+    reader = csv.reader(islice(io.StringIO(text, newline=None), first, None), strict=True)
     try:
         rows = ((first + reader.line_num, row) for row in reader if row)
         _, head = next(rows, (0, []))
@@ -212,7 +224,7 @@ def _csv_metadata(text: str) -> tuple[dict[str, str], int]:
     """Return the values of the lines ``# key: value`` at the start of a CSV, and the number of these lines."""
     metadata: dict[str, str] = {}
     count = 0
-    for line in io.StringIO(text):
+    for line in io.StringIO(text, newline=None):
         if not line.startswith("#"):
             break
         count += 1
@@ -267,7 +279,7 @@ def _read_parquet(path: Path, problems: list[Problem]) -> RawDetections | None:
             metadata = _parquet_metadata(file.schema_arrow.metadata or {})
             columns = [name for name in _SCHEMA.names if name in names]
             schema = pa.schema([_SCHEMA.field(name) for name in columns])
-            read = file.read(columns=columns).select(columns).cast(schema)
+            read = file.read(columns=columns, use_threads=False).select(columns).cast(schema)
     except Exception as error:  # pyarrow raises many types, which depend on the damage.
         reason = library_message(error)
         problems.append(Problem("damaged", "", f"cannot be read as a table of detections: {reason}"))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -13,12 +14,15 @@ from numpy import ndarray
 
 from rebar_depth_bench import software_version
 from rebar_depth_bench.bar_crossings.crossings_file import CrossingsSource
-from rebar_depth_bench.bar_crossings.definition import CROSSINGS_PROTOCOL
-from rebar_depth_bench.extended.measures import Samples, percentile
+from rebar_depth_bench.detections.matching import CHANCE_DRAWS, DETECTIONS_PROTOCOL, HEADLINE_MM, LIMITS_MM, SUMS
+from rebar_depth_bench.extended.measures import percentile
 from rebar_depth_bench.extended.reach import pooled
 from rebar_depth_bench.scoring.bootstrap import INTERVALS, Interval, Resampling, interval
 from rebar_depth_bench.scoring.columns import rounded, rounded_interval
 from rebar_depth_bench.submission.declaration import SubmissionMeta
+
+COUNTS = SUMS[:6]
+"""Sums that a table has as numbers."""
 
 # Precision over recall of detections by confidence, and its average.
 
@@ -90,63 +94,37 @@ def _area(recall: Float64[ndarray, " k"], precision: Float64[ndarray, " k"]) -> 
     return float(np.sum(np.diff(recall, prepend=0.0) * envelope))
 
 
-AVERAGE_PRECISION_MM = (5, 10, 20)
-"""Limits of average precision, mm."""
-
-
 @dataclass(frozen=True, eq=False)
 class ViewDetections:
     """Detections of one view compared with its crossings.
 
-    ``judged`` counts crossings, ``nodes`` their nodes and ``nodes_found`` the nodes with a match; ``detections``
-    counts rows with enough confidence, of which ``matched`` have a crossing, ``ignored`` are excused and the
-    others false. ``position_mm`` and ``normal_deg`` are the errors of matched detections, the latter where a
-    normal is given. ``confidence``, ``counts`` and ``correct`` describe all rows for average precision, the last
-    two by limit: whether a row counts, and whether it is correct.
+    ``sums`` are the ``SUMS`` of the rows with enough confidence, and ``position_mm`` and ``normal_deg`` the errors
+    of the correct ones among them, the latter where a normal is given. ``confidence``, ``counts`` and ``correct``
+    describe all rows for average precision, the last two by limit in mm: whether a row counts, and whether it is
+    correct.
+
+    ``chance`` has the sums of as many random points as detections that count, for each draw, and
+    ``chance_position_mm`` the errors of the correct ones of all draws; ``chance_at`` has, by limit in mm, how many
+    are correct and how many count in each draw.
     """
 
     view_id: str
-    judged: int
-    nodes: int
-    nodes_found: int
-    detections: int
-    matched: int
-    ignored: int
+    sums: Mapping[str, float]
     position_mm: Float64[ndarray, " k"]
     normal_deg: Float64[ndarray, " l"]
     confidence: Float64[ndarray, " n"]
     counts: Mapping[int, Bool[ndarray, " n"]]
     correct: Mapping[int, Bool[ndarray, " n"]]
-
-    @property
-    def false(self) -> int:
-        """Number of detections that are neither matched nor ignored."""
-        return self.detections - self.matched - self.ignored
-
-    @property
-    def shares(self) -> dict[str, tuple[int, int]]:
-        """Numerator and denominator of each of ``SHARES``; both are summed over views."""
-        return {
-            "precision": (self.matched, self.matched + self.false),
-            "recall": (self.matched, self.judged),
-            "f1": (2 * self.matched, self.matched + self.false + self.judged),
-            "node_recall": (self.nodes_found, self.nodes),
-        }
-
-    @property
-    def errors(self) -> Samples:
-        """Errors of matched detections by name."""
-        return {"position_mm": self.position_mm, "normal_deg": self.normal_deg}
+    chance: Mapping[str, Float64[ndarray, " d"]]
+    chance_at: Mapping[int, Int64[ndarray, "d 2"]]
+    chance_position_mm: Float64[ndarray, " m"]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object of the view."""
         return {
             "view_id": self.view_id,
-            "crossings": self.judged,
-            "detections": self.detections,
-            "matched": self.matched,
-            "false": self.false,
-            "ignored": self.ignored,
+            "crossings": int(self.sums["crossings"]),
+            **{name: int(self.sums[name]) for name in ("detections", "matched", "false", "ignored")},
             "position_mm": rounded(percentile(self.position_mm, 50)) if len(self.position_mm) else None,
         }
 
@@ -155,27 +133,29 @@ class ViewDetections:
 class DetectionTable:
     """Numbers of one config, or of all together.
 
-    ``counts`` are sums over the views. ``numbers`` has ``SHARES``, the average precisions and ``ERRORS`` by name,
-    and ``intervals`` their 95 % intervals; None where undefined or unknown. ``curves`` has the points (recall,
-    precision) by limit in mm.
+    ``counts`` are sums over the views. ``numbers`` has the numbers of ``ratios``, the average precisions and
+    ``ERRORS`` by name, ``intervals`` their 95 % intervals, and ``chance`` the numbers of random points; None where
+    undefined or unknown. ``curves`` has the points (recall, precision) by limit in mm.
     """
 
     views: int
     counts: Mapping[str, int]
     numbers: Mapping[str, float | None]
     intervals: Mapping[str, Interval | None]
+    chance: Mapping[str, float | None]
     curves: Mapping[int, Sequence[tuple[float, float]]]
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object of the table."""
         numbers = {name: rounded(value) for name, value in self.numbers.items()}
-        average = {str(limit): numbers.pop(f"average_precision_{limit}mm") for limit in AVERAGE_PRECISION_MM}
+        average = {str(limit): numbers.pop(f"average_precision_{limit}mm") for limit in LIMITS_MM}
         return {
             "views": self.views,
             **self.counts,
             **numbers,
             "average_precision": average,
             "ci95": {name: rounded_interval(ends) for name, ends in self.intervals.items()},
+            "chance": {name: rounded(value) for name, value in self.chance.items()},
             "precision_recall": {
                 str(limit): [[rounded(recall), rounded(precision)] for recall, precision in curve]
                 for limit, curve in self.curves.items()
@@ -185,7 +165,7 @@ class DetectionTable:
 
 @dataclass(frozen=True, eq=False)
 class DetectionResult:
-    """Result of a file of detections; ``least_confidence`` is the threshold of matching, None for all rows.
+    """Result of a file of detections; ``least_confidence`` is the threshold of the headline, None for all rows.
 
     ``outside`` counts rows of views that are not part of the protocol, because they have no scored pixel.
     """
@@ -205,7 +185,7 @@ class DetectionResult:
     def to_dict(self) -> dict[str, Any]:
         """Return the result as a JSON-compatible object."""
         return {
-            "protocol": CROSSINGS_PROTOCOL,
+            "protocol": DETECTIONS_PROTOCOL,
             "dataset": {
                 "digest": self.dataset_digest,
                 "version": self.dataset_version,
@@ -218,6 +198,7 @@ class DetectionResult:
             },
             "software": {"version": software_version()},
             "intervals": dict(INTERVALS),
+            "limit_mm": HEADLINE_MM,
             "least_confidence": rounded(self.least_confidence),
             "has_confidence": self.has_confidence,
             "rows_outside_of_protocol": self.outside,
@@ -232,54 +213,88 @@ class DetectionResult:
         return json.dumps(self.to_dict(), indent=1, ensure_ascii=False, allow_nan=False) + "\n"
 
 
-SHARES = ("precision", "recall", "f1", "node_recall")
-"""Shares over all views: see ``ViewDetections.shares``."""
-
 ERRORS = {
     "position_mm": ("position_mm", 50),
     "position_p95_mm": ("position_mm", 95),
     "normal_deg": ("normal_deg", 50),
     "normal_p95_deg": ("normal_deg", 95),
 }
-"""Errors of matched detections: sample and percentile."""
+"""Errors of correct detections: sample and percentile."""
+
+
+def ratios(sums: Mapping[str, Float64[ndarray, " *k"]]) -> dict[str, Float64[ndarray, " *k"]]:
+    """Return the shares, bias and spread that follow from ``SUMS``, NaN where undefined.
+
+    The bias is the mean offset of detections near judged crossings along an axis of the camera, and the spread the
+    root mean square distance of these detections from their mean offset.
+    """
+    matched, counted, near = sums["matched"], sums["matched"] + sums["false"], sums["near"]
+    with np.errstate(invalid="ignore", divide="ignore"):
+        bias = {f"{axis}_bias_mm": sums[f"{axis}_mm"] / near for axis in ("right", "down", "along")}
+        variance = sums["square_mm2"] / near - sum(mean**2 for mean in bias.values())
+        return {
+            "precision": matched / counted,
+            "recall": matched / sums["crossings"],
+            "f1": 2 * matched / (counted + sums["crossings"]),
+            "node_recall": sums["nodes_found"] / sums["nodes"],
+            **bias,
+            "spread_mm": np.sqrt(np.maximum(variance, 0.0)),
+        }
 
 
 def tabulate_detections(views: Sequence[ViewDetections], resampling: Resampling | None) -> DetectionTable:
     """Return the table of some views, without intervals if there is no ``resampling``."""
-    counts = {
-        "crossings": sum(view.judged for view in views),
-        "nodes": sum(view.nodes for view in views),
-        "detections": sum(view.detections for view in views),
-        "matched": sum(view.matched for view in views),
-        "false": sum(view.false for view in views),
-        "ignored": sum(view.ignored for view in views),
-    }
-    numbers: dict[str, float | None] = {}
-    intervals: dict[str, Interval | None] = {}
+    by_view = {name: np.array([view.sums[name] for view in views], dtype=np.float64) for name in SUMS}
+    defined = ratios(by_view)
+    totals = {name: values.sum(keepdims=True) for name, values in by_view.items()}
+    numbers = {name: _number(value.item()) for name, value in ratios(totals).items()}
+    random = {name: np.zeros(CHANCE_DRAWS) + sum(view.chance[name] for view in views) for name in SUMS}
+    chance = {name: _mean(values) for name, values in ratios(random).items()}
+    intervals: dict[str, Interval | None] = dict.fromkeys(numbers)
+    if resampling is not None:
+        draws = ratios({name: resampling.view_counts @ values for name, values in by_view.items()})
+        for name, values in draws.items():
+            intervals[name] = interval(values, resampling.blocks(np.flatnonzero(~np.isnan(defined[name]))))
+
     curves = {}
-    for name in SHARES:
-        parts = np.array([view.shares[name] for view in views], dtype=np.float64).reshape(-1, 2)
-        numerator, denominator = parts.sum(axis=0)
-        numbers[name] = float(numerator / denominator) if denominator else None
-        intervals[name] = None
-        if resampling is not None:
-            sums = resampling.view_counts @ parts
-            with np.errstate(invalid="ignore", divide="ignore"):
-                draws = sums[:, 0] / sums[:, 1]
-            intervals[name] = interval(draws, resampling.blocks(np.flatnonzero(parts[:, 1])))
-    for limit in AVERAGE_PRECISION_MM:
+    for limit in LIMITS_MM:
         name, ranked = f"average_precision_{limit}mm", _ranked(views, limit)
         numbers[name] = ranked.average()
         intervals[name] = None if resampling is None else ranked.interval(resampling)
+        matched, counted = np.zeros((2, CHANCE_DRAWS)) + sum(view.chance_at[limit].T for view in views)
+        with np.errstate(invalid="ignore", divide="ignore"):  # One point of the curve: precision times recall.
+            chance[name] = _mean(matched**2 / (counted * totals["crossings"]))
         curves[limit] = ranked.drawn_points()
+
+    samples = [{"position_mm": view.position_mm, "normal_deg": view.normal_deg} for view in views]
+    random_mm = np.concatenate([np.empty(0), *(view.chance_position_mm for view in views)])
     for name, (sample, percent) in ERRORS.items():
-        errors, view = pooled([view.errors for view in views], sample)
+        errors, of_view = pooled(samples, sample)
         numbers[name] = percentile(errors, percent) if len(errors) else None
         intervals[name] = None
         if resampling is not None:
-            draws = resampling.percentile(errors, view, percent)
-            intervals[name] = interval(draws, resampling.blocks(view))
-    return DetectionTable(len(views), counts, numbers, intervals, curves)
+            estimates = resampling.percentile(errors, of_view, percent)
+            intervals[name] = interval(estimates, resampling.blocks(of_view))
+        has_chance = sample == "position_mm" and len(random_mm) > 0
+        chance[name] = percentile(random_mm, percent) if has_chance else None
+    return DetectionTable(
+        views=len(views),
+        counts={name: int(totals[name].item()) for name in COUNTS},
+        numbers=numbers,
+        intervals=intervals,
+        chance=chance,
+        curves=curves,
+    )
+
+
+def _mean(values: Float64[ndarray, " d"]) -> float | None:
+    """Return the mean over the draws in which a number is defined."""
+    defined = values[~np.isnan(values)]
+    return _number(defined.mean()) if len(defined) else None
+
+
+def _number(value: float) -> float | None:
+    return float(value) + 0.0 if math.isfinite(value) else None  # Not -0.0.
 
 
 def _ranked(views: Sequence[ViewDetections], limit_mm: int) -> RankedDetections:
@@ -291,5 +306,5 @@ def _ranked(views: Sequence[ViewDetections], limit_mm: int) -> RankedDetections:
         np.concatenate([np.empty(0), *confidence]),
         np.concatenate([np.empty(0, bool), *correct]),
         np.repeat(np.arange(len(views)), list(map(len, confidence))),
-        np.array([view.judged for view in views], dtype=np.int64),
+        np.array([view.sums["crossings"] for view in views], dtype=np.int64),
     )

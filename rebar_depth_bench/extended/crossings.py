@@ -85,8 +85,8 @@ def _bias(name: str, title: str, definition: str) -> Measure:
 MAIN_MEASURES = (
     Measure(
         "crossings_judged", "crossings judged", "%", "",
-        "Mean over views of the share of the scene's crossings that are judged, by the truth alone: crossings "
-        "whose tie point shows one of the bars, both straight there and with 30 single-bar pixels or more.",
+        "Mean over views of the share of the scene's crossings that are judged, by the truth alone: the pixel of "
+        "the tie point shows one of the bars near it; both are straight there, with 30 single-bar pixels or more.",
     ),
     Measure(
         "crossings_located", "crossings located", "%", "higher",

@@ -169,18 +169,33 @@ def _frames(middle_m: Float64[ndarray, "r 3"], direction: Float64[ndarray, "r 3"
 SAMPLED_PIXELS = MIN_PIXELS
 """Number of pixels of each bar that are fitted at a crossing, spread evenly along it."""
 
+MAX_SURFACE_DIAMETERS = 3.0
+"""Largest distance of a judged crossing's tie point from the surface at its pixel, in diameters of the larger bar.
+
+A bar that bends or is long can hide its own crossing.
+"""
+
 
 def judged_crossings(truth: SteelTruth) -> JudgedCrossings:
     """Return the judged crossings of a view, and the sampled pixels of both bars of each.
 
-    A crossing is judged if the pixel of its tie point shows one of its bars, and if each bar has at least
-    ``MIN_PIXELS`` single-bar interior pixels on its side within ``WINDOW_DIAMETERS`` along its axis, on both sides
-    of the crossing and over ``MIN_VISIBLE_DIAMETERS`` or more. Measures of depth further need both bars to be
-    straight there (``SceneCrossings.straight``).
+    A crossing is judged if the pixel of its tie point shows one of its bars, at a surface within
+    ``MAX_SURFACE_DIAMETERS`` of the tie point, and if each bar has at least ``MIN_PIXELS`` single-bar interior
+    pixels on its side within ``WINDOW_DIAMETERS`` along its axis, on both sides of the crossing and over
+    ``MIN_VISIBLE_DIAMETERS`` or more. Measures of depth further need both bars to be straight there
+    (``SceneCrossings.straight``).
     """
     scene = truth.bars.crossings
-    shown = shown_bars(truth, transform(truth.cam_from_world, scene.crossings.tie_point_m))
-    candidates = np.flatnonzero((shown[:, None] == scene.bar_id).any(axis=1))
+    tie_point_m = transform(truth.cam_from_world, scene.crossings.tie_point_m)
+    pixel = shown_pixels(truth, tie_point_m)
+    shown = np.flatnonzero(pixel >= 0)
+    pixel = pixel[shown]
+    rays = np.column_stack([truth.rays[pixel], np.ones(len(pixel))])
+    surface_m = truth.depth_m[pixel].astype(np.float64)[:, None] * rays
+    distance_m = np.linalg.norm(surface_m - tie_point_m[shown], axis=1)
+    is_there = distance_m <= MAX_SURFACE_DIAMETERS * scene.diameter_m[shown].max(axis=1)
+    shows_bar = (truth.bar_id[pixel][:, None] == scene.bar_id[shown]).any(axis=1)
+    candidates = shown[is_there & shows_bar]
     by_bar = np.flatnonzero(truth.single_bar)
     by_bar = by_bar[np.argsort(truth.bar_id[by_bar], kind="stable")]
     bar_id = truth.bar_id[by_bar]
@@ -230,14 +245,15 @@ def _near_crossing(
     return np.asarray(pixels[ordered[_spread(len(ordered), SAMPLED_PIXELS)]])
 
 
-def shown_bars(truth: SteelTruth, points_m: Float64[ndarray, "n 3"]) -> Int64[ndarray, " n"]:
-    """Return the bar id at the nearest pixel of each point (camera frame, metres).
+def shown_pixels(truth: SteelTruth, points_m: Float64[ndarray, "n 3"]) -> Int64[ndarray, " n"]:
+    """Return the nearest pixel of each point (camera frame, metres) as a position in the arrays of ``truth``.
 
-    It is 0 beside the steel, outside of the image and behind the camera.
+    It is -1 where that pixel is not among them, outside of the image and behind the camera.
     """
-    bars = np.zeros(len(points_m), np.int64)
+    positions = np.full(len(points_m), -1, np.int64)
     in_front = points_m[:, 2] > 0
-    ray = points_m[:, :2] / np.where(in_front, points_m[:, 2], 1.0)[:, None]
+    with np.errstate(over="ignore"):  # Points almost in the plane of the camera are outside of the image.
+        ray = points_m[:, :2] / np.where(in_front, points_m[:, 2], 1.0)[:, None]
     in_front &= np.linalg.norm(ray, axis=1) < fold_radius(truth.distortion)
     pixel = np.floor(project(truth.K, points_m[in_front], truth.distortion) + 0.5)
     size = np.array([truth.width, truth.height])
@@ -245,5 +261,5 @@ def shown_bars(truth: SteelTruth, points_m: Float64[ndarray, "n 3"]) -> Int64[nd
     flat = pixel[inside, 1].astype(np.int64) * truth.width + pixel[inside, 0].astype(np.int64)
     position = np.minimum(np.searchsorted(truth.index, flat), max(len(truth.index) - 1, 0))
     known = (truth.index[position] == flat) if len(truth.index) else np.zeros(len(flat), bool)
-    bars[np.flatnonzero(in_front)[inside][known]] = truth.bar_id[position[known]]
-    return bars
+    positions[np.flatnonzero(in_front)[inside][known]] = position[known]
+    return positions

@@ -17,7 +17,7 @@ from numpy import ndarray
 
 from rebar_depth_bench.scoring.columns import Better, Column, coverage_percent
 
-EXTENDED_PROTOCOL = "rebar-extended-5"
+EXTENDED_PROTOCOL = "rebar-extended-6"
 """Version of the definitions of all extended measures; any change of a definition changes it."""
 
 ONCE, NATIVE, SCALED = "once", "native", "scaled"

@@ -10,10 +10,11 @@ import json
 import platform
 import time
 import traceback
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import repeat
 from pathlib import Path
 from typing import Any
 
@@ -295,15 +296,17 @@ def _write_archive(
         notes={config: report.notes for config, report in reports.items()} or None,
     ) as writer:
         for config in views:
-            rows = iter(config.rows(*CLOUD_COLUMNS) if clouds is not None else ())
-            for count, view_id in enumerate(config.view_ids, start=1):
+            rows: Iterable[dict[str, Any]] = (
+                repeat({}, len(config.view_ids)) if clouds is None else config.rows(*CLOUD_COLUMNS)
+            )
+            for count, (view_id, row) in enumerate(zip(config.view_ids, rows, strict=True), start=1):
                 depth, seconds = kept.get(view_id, config.grid)
                 writer.add(view_id, depth, round(seconds, 4))
                 if pictures is not None:
                     path = path_below(pictures, f"{view_id}.png")
                     write_depth_picture(path, view_id, stored_map(depth), info.prediction)
                 if clouds is not None:
-                    write_point_cloud(path_below(clouds, f"{view_id}.ply"), stored_map(depth), next(rows))
+                    write_point_cloud(path_below(clouds, f"{view_id}.ply"), stored_map(depth), row)
                 progress(f"writing {config.config}", count, len(config.view_ids))
 
 

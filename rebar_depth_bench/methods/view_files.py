@@ -15,8 +15,7 @@ from PIL import Image, ImageDraw, ImageFont
 from rebar_depth_bench.base.errors import InputError, printable
 from rebar_depth_bench.base.writing import write_bytes
 from rebar_depth_bench.geometry.cameras import pixel_rays
-from rebar_depth_bench.reporting.axes import Axis, select_spaced, tick_label
-from rebar_depth_bench.reporting.colormap import COLOURS, DEPTH_COLOURS, colour_indices, robust_range
+from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, colour_indices, robust_range
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
 from rebar_depth_bench.scoring.relative import has_value
 from rebar_depth_bench.submission.declaration import METRIC
@@ -27,6 +26,8 @@ NO_DEPTH = (150, 150, 150)
 """Colour of pixels without depth."""
 
 _PAPER, _INK = (255, 255, 255), (20, 20, 20)
+_LABELS = 8
+"""Number of labels of the colour bar, at nearly even places."""
 _MIN_SIDE_PX = 640
 """Images whose longer side is shorter are enlarged by repetition of pixels."""
 _MIN_RANGE = 1e-4
@@ -54,7 +55,7 @@ def write_depth_picture(path: Path, view_id: str, depth: Float[ndarray, "h w"], 
     inverse depth as in ``colormap.depth_preview``; of affine kinds, evenly in their values. The picture states the
     unit, the range and the share of pixels without depth, which are grey.
     """
-    valid, is_affine = has_value(depth, kind), kind.startswith("affine")
+    valid = has_value(depth, kind)
     repeat = -(-_MIN_SIDE_PX // max(depth.shape))
     height, width = (side * repeat for side in depth.shape)
     size = max(12, round(min(height / 36, width / 48)))  # All lengths below are multiples of the font size.
@@ -74,18 +75,16 @@ def write_depth_picture(path: Path, view_id: str, depth: Float[ndarray, "h w"], 
             margin = 0.05 * abs(near) or 1.0
             far, near, rule = far - margin, near + margin, "around values that hardly differ"
         image[valid] = DEPTH_COLOURS[colour_indices(nearness, far, near)]
-        steps = np.rint(np.linspace(0, COLOURS - 1, bar_px)).astype(int)
-        bar = Image.fromarray(DEPTH_COLOURS[steps][:, None]).resize((size, bar_px), Image.Resampling.NEAREST)
+        bar = Image.fromarray(DEPTH_COLOURS[:, None]).resize((size, bar_px), Image.Resampling.NEAREST)
         picture.paste(bar, (bar_x, top))
-        low, high = sorted(_nearness(np.array([far, near]), kind).tolist())
-        # Even ticks fill the gaps that those of powers of ten leave.
-        ticks = [tick for linear in (is_affine, True) for tick in Axis(low, high, 0, 1, linear).ticks()]
-        inside = _nearness(np.array([tick for tick in ticks if low <= tick <= high]), kind)
-        places = Axis(far, near, top, top + bar_px - 1, linear=True)
-        for place in select_spaced(inside.tolist(), places, 1.5 * size):
-            y, label = places.at(place), tick_label(float(_nearness(np.array(place), kind)))
+        digits = 2 if near - far > 0.05 * abs(near) else 6
+        for place in np.linspace(far, near, _LABELS).tolist():
+            label = f"{_nearness(np.array(place), kind):.{digits + (place in (far, near))}g}"
+            share = (float(_nearness(np.array(float(label)), kind)) - far) / (near - far)
+            y = top + min(max(share, 0.0), 1.0) * (bar_px - 1)
             draw.line((bar_x + size, y, bar_x + 1.4 * size, y), _INK, max(1, size // 12))
             draw.text((bar_x + 1.7 * size, y), label, _INK, font, anchor="lm")
+        low, high = sorted(_nearness(np.array([far, near]), kind).tolist())
         unit = " m" if kind == METRIC else ""
         notes.insert(0, f"colours: {low:.4g} to {high:.4g}{unit}, {rule}")
     picture.paste(Image.fromarray(image).resize((width, height), Image.Resampling.NEAREST), (size, top))
@@ -113,7 +112,8 @@ def write_point_cloud(path: Path, depth_m: Float[ndarray, "h w"], row: Mapping[s
     try:
         rays = pixel_rays(row["left_K"], width, height, row["left_distortion"])
     except ValueError as error:
-        raise InputError(f"{row['view_id']}: its point cloud cannot be computed: {error}") from None
+        found = f"{row['view_id']}: its point cloud cannot be computed"
+        raise InputError(f"{found}, leave out --ply: {error}") from None
     with np.errstate(over="ignore", invalid="ignore"):
         points_m = (rays * depth_m[..., None]).astype(np.float32)
     valid = is_valid_prediction(depth_m) & np.isfinite(points_m).all(axis=-1)

@@ -13,10 +13,9 @@ from markupsafe import Markup
 from rich.console import Console
 
 from rebar_depth_bench import software_version
-from rebar_depth_bench.bar_crossings.definition import CROSSINGS_PROTOCOL
 from rebar_depth_bench.base.errors import printable
-from rebar_depth_bench.detections.matching import MATCH_M
-from rebar_depth_bench.detections.tables import AVERAGE_PRECISION_MM, DetectionResult, DetectionTable
+from rebar_depth_bench.detections.matching import CHANCE_DRAWS, DETECTIONS_PROTOCOL, HEADLINE_MM, LIMITS_MM, NEAR_M
+from rebar_depth_bench.detections.tables import DetectionResult, DetectionTable
 from rebar_depth_bench.reporting.charts import precision_chart
 from rebar_depth_bench.reporting.html.assets import environment
 from rebar_depth_bench.reporting.tables import make_grid, plain_text, print_line, print_unwrapped
@@ -33,8 +32,13 @@ _SHARES = (
     Column("node_recall", "Recall of nodes", "%", "higher", 1, 100.0),
 )
 _AVERAGES = tuple(
-    Column(f"average_precision_{limit}mm", f"AP at {limit} mm", "%", "higher", 1, 100.0)
-    for limit in AVERAGE_PRECISION_MM
+    Column(f"average_precision_{limit}mm", f"AP at {limit} mm", "%", "higher", 1, 100.0) for limit in LIMITS_MM
+)
+_BIAS = (
+    Column("right_bias_mm", "Bias, right", "mm", "", 2),
+    Column("down_bias_mm", "Bias, down", "mm", "", 2),
+    Column("along_bias_mm", "Bias, away", "mm", "", 2),
+    Column("spread_mm", "Spread", "mm", "lower", 2),
 )
 _ERRORS = (
     Column("position_mm", "Position", "mm, median", "lower", 2),
@@ -111,19 +115,21 @@ def detection_page(result: DetectionResult) -> DetectionPage:
     method = printable(result.meta.method)
     return DetectionPage(
         title=f"{method}: detected crossings of bars",
-        lead=f"Crossings that the left image shows well enough are to be found. Matched within "
-        f"{1000 * MATCH_M:g} mm: {matched}.",
+        lead="Crossings that the left image shows well enough are to be found. "
+        f"Correct within {HEADLINE_MM} mm of the tie point: {matched}. Chance: as many random points on steel.",
         stamps=_stamps(result),
         figures=[_curve_figure(name, table) for name, table in rows if table.counts["crossings"]],
         tables=(
             _number_table("Precision and recall, pooled over views.", _SHARES, rows),
+            _number_table("Average precision over all confidences.", _AVERAGES, rows),
             _number_table(
-                "Average precision over all confidences: greedy matching, the most confident first.",
-                _AVERAGES,
-                rows,
+                "Errors of correct detections: tie point, and normal where one is given.", _ERRORS, rows
             ),
             _number_table(
-                "Errors of matched detections: tie point, and normal where one is given.", _ERRORS, rows
+                f"Bias (mean) along the camera's axes and spread about it (root mean square) of detections within "
+                f"{1000 * NEAR_M:g} mm, or half the distance to the next crossing, of a judged crossing.",
+                _BIAS,
+                rows,
             ),
             _count_table(rows),
         ),
@@ -134,7 +140,7 @@ def detection_page(result: DetectionResult) -> DetectionPage:
 def _stamps(result: DetectionResult) -> list[tuple[str, str]]:
     declared = result.meta.declaration
     return [
-        ("Protocol", CROSSINGS_PROTOCOL),
+        ("Protocol", DETECTIONS_PROTOCOL),
         ("Inputs", formatting.inputs_text(declared)),
         ("Ground truth", formatting.ground_truth_text(declared)),
         ("Dataset", f"{printable(result.dataset_version)} ({printable(result.dataset_digest)})"),
@@ -145,21 +151,21 @@ def _stamps(result: DetectionResult) -> list[tuple[str, str]]:
 
 
 def _number_table(caption: str, columns: Sequence[Column], rows: list[Row]) -> PageTable:
-    """Return the table of some numbers, each beside its interval."""
+    """Return the table of some numbers, each beside its interval and the number of random points."""
     heads = [("Config", "")]
     for column in columns:
         title = f"{column.title} {ARROWS[column.better]}"
-        heads += [(title, column.unit), (title, "95 % interval")]
+        heads += [(title, column.unit), ("95 % interval", ""), ("chance", "")]
     cells = [
         [printable(name), *(text for column in columns for text in _texts(column, table))] for name, table in rows
     ]
     return PageTable(caption, heads, cells)
 
 
-def _texts(column: Column, table: DetectionTable) -> tuple[str, str]:
-    """Return the number of a table and its interval as text."""
+def _texts(column: Column, table: DetectionTable) -> tuple[str, str, str]:
+    """Return the number of a table, its interval and the number of random points as text."""
     ends = column.interval_text(table.intervals[column.place], " to ")
-    return column.text(table.numbers[column.place]), ends or DASH
+    return column.text(table.numbers[column.place]), ends or DASH, column.text(table.chance[column.place])
 
 
 def _count_table(rows: list[Row]) -> PageTable:
@@ -176,7 +182,7 @@ def _curve_figure(name: str, table: DetectionTable) -> tuple[Markup, str, str]:
     }
     average = "; ".join(
         f"average precision at {limit} mm: {_texts(column, table)[0]} %"
-        for limit, column in zip(AVERAGE_PRECISION_MM, _AVERAGES, strict=True)
+        for limit, column in zip(LIMITS_MM, _AVERAGES, strict=True)
     )
     svg = precision_chart(f"Precision over recall, {name}", average, curves)
     caption = f"By the distance within which a detection is correct; {average}."
@@ -186,9 +192,13 @@ def _curve_figure(name: str, table: DetectionTable) -> tuple[Markup, str, str]:
 def _notes(result: DetectionResult) -> list[str]:
     notes = [
         "A crossing is judged by the ground truth of the left eye alone: its tie point's pixel shows one of the "
-        "bars, and each bar has 30 single-bar interior pixels or more within 6 diameters, on both sides.",
-        f"Ignored: detections whose nearest crossing is not judged and within {1000 * MATCH_M:g} mm, one for each "
-        "such crossing, and those that project onto a bar whose axis is not known.",
+        "bars, near the tie point, and each bar has 30 single-bar interior pixels or more within 6 diameters, on "
+        "both sides.",
+        "A detection belongs to the nearest crossing within the limit. Of the detections of a crossing, the most "
+        "confident one is correct, or ignored if the crossing is not judged. A detection that projects onto a bar "
+        "whose axis is not known is ignored, too. All others are false.",
+        f"Chance: mean over {CHANCE_DRAWS} draws of as many random scored pixels of each view as detections that "
+        "count, on the true surface.",
         f"Intervals: bootstrap over blocks of neighbouring views, or over scenes. {DASH}: undefined or unknown.",
     ]
     if not result.has_confidence:

@@ -106,10 +106,10 @@ def test_colours_of_pixels_are_those_of_the_scale_at_their_value(kind: str, tmp_
     ticks = np.flatnonzero((picture[3 * size : 3 * size + height, bar_x + size + 2] < 100).all(axis=1))
     # 1 / v, -v and v are their own inverses.
     found = [towards(far + (near - far) * tick / (height - 1)) for tick in ticks]
-    assert len(found) >= 3
-    for value in found:
+    assert len(found) == 8
+    for value in found[1:-1]:
         one_px = max(abs(towards(towards(value) + step * (near - far) / height) - value) for step in (-1, 1))
-        assert abs(value - round(value * 20) / 20) <= one_px
+        assert abs(value - float(f"{value:.2g}")) <= one_px
 
 
 @pytest.mark.parametrize("depth_m", [[[1.0, 1.0]], [[0.0, np.nan]], [[1e-45, 3e38]], [[2.0]]])
@@ -118,6 +118,9 @@ def test_extreme_depth_has_a_picture(depth_m: list[list[float]], tmp_path: Path)
         write_depth_picture(tmp_path / "a.png", "a/0", np.array(depth_m, np.float32), kind)
         with Image.open(tmp_path / "a.png") as picture:
             assert 400 < picture.width < 1000
+            colours = picture.crop((0, 60, picture.width, picture.height - 60)).getcolors(1 << 20) or []
+            has_depth = kind.startswith("affine") or bool((np.array(depth_m) > 0).any())
+            assert (len(colours) > 200) == has_depth, "the colour bar"
 
 
 def orbit(root: Path) -> list[Views]:
@@ -174,7 +177,7 @@ def test_folders_that_hold_inputs_or_are_files_are_refused(
         (tmp_path / "mine" / "pictures", "expected a path outside the input"),
         (tmp_path / "mine" / "0001.png", "expected a path outside the input"),
         (archive, "both name"),
-        (Path("/dev/null"), "is a file: expected a folder"),
+        (Path("/dev/null"), "expected a"),
     ):
         for option in ("--pictures", "--ply"):
             assert main([*words, option, str(folder)]) == 2
@@ -187,6 +190,8 @@ def test_lens_that_cannot_be_inverted_is_refused(tiny_root: Path, tmp_path: Path
         {**row} for views in orbit(tiny_root) for row in views.rows("left_rgb", "left_K", "left_distortion")
     ]
     row["left_distortion"] = np.array([-5.0, 0, 0, 0, 0])
-    with pytest.raises(InputError, match=r"lattice-orbit/.*: its point cloud cannot be computed: the lens model"):
+    with pytest.raises(
+        InputError, match=r"lattice-orbit/.*: its point cloud cannot be computed, .*: the lens model"
+    ):
         write_point_cloud(tmp_path / "a.ply", np.ones(row["left_rgb"].shape[:2], np.float32), row)
     assert not any(tmp_path.iterdir())
