@@ -31,8 +31,8 @@ CHANCE_DRAWS = 100
 """Number of draws of random points in each view."""
 
 SUMS = (
-    *("crossings", "nodes", "detections", "matched", "false", "ignored"),
-    *("nodes_found", "near", "right_mm", "down_mm", "along_mm", "square_mm2"),
+    *("crossings", "nodes", "detections", "matched", "false", "ignored", "near"),
+    *("nodes_found", "right_mm", "down_mm", "along_mm", "square_mm2"),
 )
 """What precision, recall, bias and spread are computed from: see ``Points.sums``."""
 

@@ -21,7 +21,7 @@ from rebar_depth_bench.scoring.bootstrap import INTERVALS, Interval, Resampling,
 from rebar_depth_bench.scoring.columns import rounded, rounded_interval
 from rebar_depth_bench.submission.declaration import SubmissionMeta
 
-COUNTS = SUMS[:6]
+COUNTS = SUMS[:7]
 """Sums that a table has as numbers."""
 
 # Precision over recall of detections by confidence, and its average.

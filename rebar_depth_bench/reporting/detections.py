@@ -37,7 +37,7 @@ _AVERAGES = tuple(
 _BIAS = (
     Column("right_bias_mm", "Bias, right", "mm", "", 2),
     Column("down_bias_mm", "Bias, down", "mm", "", 2),
-    Column("along_bias_mm", "Bias, away", "mm", "", 2),
+    Column("along_bias_mm", "Bias, along", "mm", "", 2),
     Column("spread_mm", "Spread", "mm", "lower", 2),
 )
 _ERRORS = (
@@ -55,6 +55,7 @@ _COUNTS = (
     ("Matched", ""),
     ("False", ""),
     ("Ignored", ""),
+    ("Near", "for bias"),
 )
 """Headings of the numbers of crossings and detections, whose keys are the names in lower case."""
 
@@ -201,6 +202,14 @@ def _notes(result: DetectionResult) -> list[str]:
         "count, on the true surface.",
         f"Intervals: bootstrap over blocks of neighbouring views, or over scenes. {DASH}: undefined or unknown.",
     ]
+    counts = result.pooled.counts
+    if not counts["crossings"]:
+        notes.append("No crossing is judged: bars that are thin in the image have less than 30 pixels each.")
+    elif counts["detections"] and not counts["near"]:
+        notes.append(
+            f"No detection is within {1000 * NEAR_M:g} mm of a judged crossing: points are in metres, x to the "
+            "right, y down, z forward of the left camera."
+        )
     if not result.has_confidence:
         notes.append("The file has no confidences, so that average precision has one point of the curve only.")
     return notes
