@@ -294,7 +294,7 @@ def _mean(values: Float64[ndarray, " d"]) -> float | None:
 
 
 def _number(value: float) -> float | None:
-    return float(value) + 0.0 if math.isfinite(value) else None  # Not -0.0.
+    return round(float(value), 12) + 0.0 if math.isfinite(value) else None  # Without rounding errors, not -0.0.
 
 
 def _ranked(views: Sequence[ViewDetections], limit_mm: int) -> RankedDetections:

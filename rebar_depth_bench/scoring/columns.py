@@ -147,7 +147,7 @@ class Column:
 
     def number_text(self, value: float | None) -> str:
         """Return a value in its unit and with its decimals, also of a difference."""
-        if value is not None and self.better != "higher" and abs(value) < 1e-12:
+        if value is not None and self.better == "lower" and abs(value) < 1e-12:
             value = 0.0  # Rounding errors of exact predictions.
         return number(None if value is None else self.factor * value, self.decimals)
 
