@@ -13,8 +13,8 @@ for all archives:
 4. the confidence is the share of steel pixels around the point.
 
 The results there are of datasets and archives as of ``python -m benchmarks.reference OUT SET``: of the configs
-``lattice`` and ``pile`` of ``subset`` with ``truth``, ``sgbm`` and ``sgbm-filled`` (``crossings.json``), and of
-``cages`` with ``truth``, ``sgbm``, ``sgbm-filled`` and ``lidar-mobile`` (``crossings-cages.json``, from 40 views in 10 scenes).
+``lattice`` and ``pile`` of ``subset`` with ``truth``, ``sgbm`` and ``sgbm-filled`` (``crossings.json``), and of 40
+views in 10 scenes of ``cages`` with these and ``lidar-mobile`` (``crossings-cages.json``).
 """
 
 from __future__ import annotations
