@@ -15,7 +15,7 @@ from dataset_builder.specs.config_specs import ConfigSpec, PosesSpec, RandomView
 from rebar_depth_bench.base.errors import InputError, MeshError
 from rebar_depth_bench.data.bars import with_axis
 from rebar_depth_bench.data.schema import EYES
-from rebar_depth_bench.geometry.cameras import camera_centre
+from rebar_depth_bench.geometry.cameras import camera_centre, inverse_rigid, transform
 
 _BOARD_TOLERANCE_M = 0.001
 """Depth below z = 0 that an assembly may reach, metres."""
@@ -25,28 +25,38 @@ def check_fits(assembly: Assembly, config: ConfigSpec) -> None:
     """Check that an assembly stays above the board and clear of the config's cameras.
 
     Raises ``MeshError`` if it reaches more than 1 mm below z = 0 or as far as the nearest camera, and
-    ``InputError`` if the screen of the variant ``shadows`` would be among the cameras, if a given pose is inside
-    of a bar, and as ``look_at_with_rig``. The cameras of a survey, random views and given poses may be nearer,
-    since each is clear of the steel by itself.
+    ``InputError`` if the screen of the variant ``shadows`` would be among the cameras, if an eye is inside of a
+    bar or not above the ground, and as ``look_at_with_rig``. The cameras of a survey, random views and given poses
+    may be nearer, since each eye is tested by itself.
     """
     check_above_ground(assembly, config.name)
     vertices_m, aim_m = assembly.vertices_m, aim_point_m(assembly)
     reach_m = float(np.linalg.norm(vertices_m - aim_m, axis=1).max())
-    lefts = poses(config.protocol, aim_m, config.rig, assembly.bars)
-    camera_distances_m = np.linalg.norm([camera_centre(left) - aim_m for left in lefts], axis=1)
+    try:
+        lefts = poses(config.protocol, aim_m, config.rig, assembly.bars)
+    except InputError as error:
+        raise InputError(f"{config.name}: {error}") from None
+    # In the frame of the physical left camera, which rectification does not move.
+    centres_m = [camera_centre(eye.cam_from_world) for eye in rig_cameras(config.rig, np.eye(4)).values()]
+    eyes_m = np.concatenate([transform(inverse_rigid(left), np.array(centres_m)) for left in lefts])
+    camera_distances_m = np.linalg.norm(eyes_m[:: len(EYES)] - aim_m, axis=1)
     nearest_m = float(camera_distances_m.min())
     if reach_m >= nearest_m and not isinstance(config.protocol, SurveySpec | RandomViewsSpec | PosesSpec):
         raise MeshError(
             f"the assembly extends {reach_m:.4g} m from its centre, expected less than {nearest_m:.4g} m, "
             f"the distance of the nearest camera of {config.name}: is the unit right?"
         )
-    if isinstance(config.protocol, PosesSpec) and with_axis(assembly.bars):
-        eyes = [camera for left in lefts for camera in rig_cameras(config.rig, left).values()]
-        eyes_m = np.array([camera_centre(eye.cam_from_world) for eye in eyes])
-        inside = np.flatnonzero(Cylinders.from_bars(assembly.bars).distance_m(eyes_m) == 0)
-        if len(inside):
-            found = f"a camera of position {inside[0] // len(EYES) + 1} of {config.name} is inside of a bar"
-            raise InputError(f"{found}, expected all of them outside: is the unit right?")
+    in_box = ((eyes_m >= vertices_m.min(axis=0)) & (eyes_m <= vertices_m.max(axis=0))).all(axis=1)
+    in_steel = np.zeros(len(eyes_m), bool)
+    if in_box.any() and with_axis(assembly.bars):
+        in_steel[in_box] = Cylinders.from_bars(assembly.bars).distance_m(eyes_m[in_box]) == 0
+    for found, is_refused in (("not above the ground", eyes_m[:, 2] <= 0), ("inside of a bar", in_steel)):
+        if is_refused.any():
+            view, eye = divmod(int(is_refused.argmax()), len(EYES))
+            raise InputError(
+                f"the {EYES[eye]} camera of view {view + 1} of {config.name} is {found}, at "
+                f"{np.round(eyes_m[2 * view + eye], 4).tolist()} m, expected above z = 0 and outside of the steel"
+            )
     _check_shadow_screen(vertices_m, float(camera_distances_m.max()), config)
 
 
@@ -96,8 +106,6 @@ def misfit(environment: str, assembly: Assembly, trajectory: TrajectorySpec) -> 
         height_m = float(centres_m[:, 2].max())
     if radius_m > space.radius_m:
         return _outside("cameras are", radius_m, space.radius_m, environment)
-    if isinstance(trajectory, PosesSpec) and (lowest_m := float(centres_m[:, 2].min())) <= 0:
-        return f"a camera is at z = {lowest_m:.4g} m, expected above 0, the height of the ground"
     if height_m > space.ceiling_m:
         return (
             f"cameras are {height_m:.4g} m high, "

@@ -11,7 +11,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.specs.config_specs import FocalRigSpec, RigSpec
-from rebar_depth_bench.captures.calibration import scale_calibration
+from rebar_depth_bench.captures.calibration import Lens, StereoCalibration
 from rebar_depth_bench.captures.calibration_files import read_calibration
 from rebar_depth_bench.data.schema import EYES
 from rebar_depth_bench.geometry.cameras import (
@@ -45,6 +45,24 @@ def sized_rig(rig: RigSpec, width: int | None, height: int | None) -> RigSpec:
     return replace(rig, width=new_width, height=height or round(rig.height * new_width / rig.width))
 
 
+def resized(calibration: StereoCalibration, width: int, height: int) -> StereoCalibration:
+    """Return the calibration for another image size: scaled by the width, with rows cropped or added.
+
+    As many rows are cropped or added at the top as at the bottom, so that pixels keep their shape.
+    """
+    if (width, height) == (calibration.width, calibration.height):
+        return calibration
+    scale = width / calibration.width
+    top_px = (height - scale * calibration.height) / 2
+
+    def resize(lens: Lens) -> Lens:
+        cx, cy = (lens.cx + 0.5) * scale - 0.5, (lens.cy + 0.5) * scale - 0.5 + top_px
+        return replace(lens, fx=lens.fx * scale, fy=lens.fy * scale, cx=cx, cy=cy)
+
+    left, right = resize(calibration.left), resize(calibration.right)
+    return replace(calibration, width=width, height=height, left=left, right=right)
+
+
 def rig_cameras(rig: RigSpec, cam_from_world: Float64[ndarray, "4 4"]) -> dict[str, Camera]:
     """Return the cameras of a rig as ``{"left": ..., "right": ...}``.
 
@@ -65,24 +83,22 @@ def rig_cameras(rig: RigSpec, cam_from_world: Float64[ndarray, "4 4"]) -> dict[s
         Ks = [ideal_K(rig.width, rig.height, focal_px)] * 2
         distortions, poses = [no_distortion] * 2, [left, right_camera_pose(left, rig.baseline_m)]
     else:
-        pair = scale_calibration(rig.calibration, rig.width, rig.height)
-        if not isclose(rig.baseline_m, pair.baseline_m, rel_tol=1e-12):
+        if not isclose(rig.baseline_m, rig.calibration.baseline_m, rel_tol=1e-12):
             found = f"the rig's baseline_m is {rig.baseline_m}"
-            raise ValueError(f"{found}, expected {pair.baseline_m} as in its calibration")
-        Ks, distortions = (
-            [pair.left.K, pair.right.K],
-            [np.array(lens.distortion) for lens in (pair.left, pair.right)],
-        )
+            raise ValueError(f"{found}, expected {rig.calibration.baseline_m} as in its calibration")
+        is_rotated = rig.grid != "raw" and not rig.calibration.is_rectified
+        # The whole images are rectified, so that rows that are cropped or added change no focal length.
+        whole_height = round(rig.calibration.height * rig.width / rig.calibration.width)
+        height = whole_height if is_rotated else rig.height
+        pair = resized(rig.calibration, rig.width, height)
+        lenses = (pair.left, pair.right)
+        Ks, distortions = [lens.K for lens in lenses], [np.array(lens.distortion) for lens in lenses]
         poses = [left, matrix_product(pair.right_from_left, left)]
-        if rig.grid != "raw" and not pair.is_rectified:
+        if is_rotated:
             if rig.grid != "rectified":
                 raise ValueError(f"the grid of a calibrated rig is {rig.grid!r}, expected 'raw' or 'rectified'")
             from rebar_depth_bench.geometry.rectification import rectify
 
-            # The whole images are rectified, so that rows that are cropped or added change no focal length.
-            height = round(rig.calibration.height * rig.width / rig.calibration.width)
-            whole = scale_calibration(rig.calibration, rig.width, height)
-            Ks = [whole.left.K, whole.right.K]
             K, (R_left, _) = rectify(Ks, distortions, pair.right_from_left, rig.width, height)
             K[1, 2] += (rig.height - height) / 2
             left = matrix_product(rigid(R_left, np.zeros(3)), left)

@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
-from dataset_builder.cameras.rigs import sized_rig, zed_rig
+from dataset_builder.cameras.rigs import resized, sized_rig, zed_rig
 from dataset_builder.catalog.cages_config import CAGES, MAX_SCENES, MAX_VIEWS_PER_SCENE, CagesRequest, cage_scenes
 from dataset_builder.scene.environments.surroundings import check_suitable
 from dataset_builder.scene.model import Note
@@ -32,7 +32,7 @@ from dataset_builder.specs.file_specs import MeshFileSpec
 from dataset_builder.user_files.scene_schema import SCENE_NAME
 from rebar_depth_bench.base.errors import InputError, Problem
 from rebar_depth_bench.base.names import SPLITS
-from rebar_depth_bench.captures.calibration import scale_calibration, scaled_calibration
+from rebar_depth_bench.captures.calibration import scaled_calibration
 from rebar_depth_bench.data.schema import NEAREST_STEEL
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 
@@ -189,16 +189,16 @@ class BuildRequest:
             raise InputError.from_problems("build request", [problem])
         return scenes
 
-    def notes(self) -> list[Note]:
-        """Return notes on calibrations, and on rows of images that are added to those of rigs or cropped."""
+    def notes(self, specs: Iterable[ConfigSpec]) -> list[Note]:
+        """Return notes on the calibrations of built ``specs``, and on rows of images that are added or cropped."""
         notes = []
-        rigs = [self.rig or spec.rig for spec in self._given_specs()]
-        for rig in dict.fromkeys(rigs if self._cages is None else [*rigs, RigSpec()]):
-            notes += [Note("rig", "rig", text) for text in (rig.calibration.notes if rig.calibration else ())]
-            rows = (self.height or 0) - sized_rig(rig, self.width, None).height
+        for given, spec in zip(self._given_specs(), specs, strict=False):  # Scenes of cages are last.
+            rig = self.rig or given.rig
+            notes += [Note(spec.name, "rig", text) for text in (rig.calibration.notes if rig.calibration else ())]
+            rows = spec.rig.height - sized_rig(rig, self.width, None).height
             if self.width is not None and self.height is not None and rows:
-                text = f"{abs(rows)} rows are {'added' if rows > 0 else 'cropped'}, half of them at the top"
-                notes.append(Note(f"images of {self.width} x {self.height}", "size", text))
+                found = f"{abs(rows)} rows are {'added' if rows > 0 else 'cropped'}, half of them at the top"
+                notes.append(Note(spec.name, "size", f"images of {self.width} x {self.height} pixels: {found}"))
         return notes
 
     def _given_specs(self) -> list[ConfigSpec]:
@@ -238,14 +238,9 @@ class BuildRequest:
         alone = {"--mesh": self.mesh, "--variant": self.variants, "--views": self.views, "--rig": self.rig}
         for name, given in alone.items():
             if cages is not None and given:
-                yield Problem(
-                    "conflict",
-                    name,
-                    f"is combined with --config {CAGES}",
-                    f"only one of them: {CAGES} has its own",
-                )
+                yield Problem("conflict", name, f"is combined with --config {CAGES}", "only one of them")
         if self.rig is not None and (calibrated := [name for name in self.configs if name in ZED_CONFIGS]):
-            expected = "configs without zed in their names, such as lattice: these have the rig of the ZED"
+            expected = "configs without a calibration of their own, such as lattice"
             yield Problem("conflict", "--rig", f"is combined with --config {' '.join(calibrated)}", expected)
 
     def _check_lenses(self, specs: Sequence[ConfigSpec]) -> None:
@@ -278,8 +273,8 @@ class BuildRequest:
         if not 16 <= min(rig.width, rig.height) <= max(rig.width, rig.height) <= 8192:
             found = f"the images of {name} would have {rig.width} x {rig.height} pixels"
             raise InputError(f"{found}, expected 16 to 8192 each: give --width and --height")
-        if rig.calibration is not None:
-            scaled_calibration(scale_calibration(rig.calibration, rig.width, rig.height), name, None, None)
+        if rig.grid == "raw" and rig.calibration is not None:
+            scaled_calibration(resized(rig.calibration, rig.width, rig.height), name, None, None)
         return replace(spec, name=name + suffix, scene=scene, rig=rig, colour=self.colour)
 
     def _assembly(self, spec: ConfigSpec) -> AssemblySpec:

@@ -201,11 +201,11 @@ def _build_request(options: argparse.Namespace, device: str) -> BuildRequest:
     With ``--scene`` and without ``--config``, only the given scene files are built. With ``--mesh``, the default
     configs are the lattice configs; with ``--rig``, those without a calibration of their own.
     """
-    default = [] if options.scene else [*(LATTICE_CONFIGS if options.mesh else CONFIGS)]
-    if options.rig:
-        default = [name for name in default if name not in ZED_CONFIGS]
+    default = () if options.scene else LATTICE_CONFIGS if options.mesh else CONFIGS
     request = BuildRequest(
-        configs=tuple(options.config or default),
+        configs=tuple(
+            options.config or (name for name in default if options.rig is None or name not in ZED_CONFIGS)
+        ),
         views=options.views,
         width=options.width,
         height=options.height,
@@ -215,11 +215,12 @@ def _build_request(options: argparse.Namespace, device: str) -> BuildRequest:
         cages=_cages_request(options),
         overwrite=tuple(options.overwrite or ()),
     )
-    if options.rig:
+    if options.rig is not None:
         from dataset_builder.catalog.scene_file import scene_name_of
         from dataset_builder.user_files.rig_file import read_rig
 
-        request = replace(request, rig=read_rig(options.rig), rig_name=scene_name_of(Path(options.rig)))
+        rig = read_rig(options.rig, options.width, options.height)
+        request = replace(request, rig=rig, rig_name=scene_name_of(Path(options.rig)))
     if options.mesh:
         from dataset_builder.user_files.cage_file import mesh_file_spec
 

@@ -106,7 +106,7 @@ def plan_build(request: BuildRequest, out: Path) -> tuple[list[ConfigPlan], Fini
     for plan in with_cameras:
         check_fits(plan.assembly, plan.spec)
     notes = [note for plan in with_cameras for note in plan.assembly.notes]
-    print_notes(list(dict.fromkeys((*request.notes(), *notes))))
+    print_notes(list(dict.fromkeys((*request.notes(specs), *notes))))
     check_target(out, {spec.name for spec in specs})
     finished = Finished(out)
     check_retained(out, finished, plans, request.overwrite)

@@ -50,18 +50,10 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import asdict, dataclass
-from typing import Annotated, Any, Self
+from typing import Annotated, Any
 
 import numpy as np
-from pydantic import (
-    AfterValidator,
-    BeforeValidator,
-    Field,
-    Strict,
-    ValidationInfo,
-    field_validator,
-    model_validator,
-)
+from pydantic import AfterValidator, BeforeValidator, Field, Strict, ValidationInfo, field_validator
 
 from dataset_builder.scene.environments.surroundings import SURROUNDINGS
 from dataset_builder.scene.model import MAX_BARS, to_metres
@@ -91,8 +83,6 @@ from rebar_depth_bench.data.schema import trajectory_of
 MAX_VIEWS = 10_000
 """Maximum number of views of a config: the index in a view id has four digits."""
 _MAX_AZIMUTHS = 3600
-_MIN_SINE = 1e-5
-"""Least sine of the angle of a line of sight and the direction that is up in its image."""
 _MAX_SELECTIONS = 100
 _MESH_KEYS = ("name", "box")
 """Keys of ``[[select]]`` for a mesh file, whose parts have no other names."""
@@ -230,21 +220,30 @@ class PosesTable(CamerasTable, extra="forbid"):
 
     positions_m: _Points = Field(alias="positions")
     targets_m: _Points = Field(alias="targets")
-    up: Annotated[Triple, three_numbers(-1e9, 1e9, "a direction, [x, y, z]")] = PosesSpec.up
+    up: Annotated[Triple, three_numbers(-1e9, 1e9, "a direction, [x, y, z]")] = Field(
+        default=PosesSpec.up, validate_default=True
+    )
 
-    @model_validator(mode="after")
-    def _check_sights(self) -> Self:
-        positions, targets = len(self.positions_m), len(self.targets_m)
-        if targets not in (1, positions):
-            expected = f"as many targets as positions, {positions}, or one"
-            raise field_error(f"got {targets} targets", expected, "conflict")
-        sights_m = np.subtract(self.targets_m, self.positions_m)
-        across = np.linalg.norm(np.cross(sights_m, self.up), axis=1)
-        parallel = across <= _MIN_SINE * np.linalg.norm(sights_m, axis=1) * np.linalg.norm(self.up)
-        if parallel.any():
-            found = f"the line of sight of position {parallel.argmax() + 1} is parallel to up = {list(self.up)}"
-            raise field_error(found, "another direction up in its image, such as [0, 1, 0], or target", "conflict")
-        return self
+    @field_validator("targets_m")
+    @classmethod
+    def _check_number(cls, targets_m: tuple[Triple, ...], info: ValidationInfo[_Context]) -> tuple[Triple, ...]:
+        positions = len(info.data.get("positions_m", targets_m))
+        if len(targets_m) not in (1, positions):
+            expected = f"as many as positions, {positions}, or one"
+            raise field_error(f"got {len(targets_m)} targets", expected, "conflict")
+        return targets_m
+
+    @field_validator("up")
+    @classmethod
+    def _check_sights(cls, up: Triple, info: ValidationInfo[_Context]) -> Triple:
+        if {"positions_m", "targets_m"} <= info.data.keys():
+            sights_m = np.subtract(info.data["targets_m"], info.data["positions_m"])
+            across = np.linalg.norm(np.cross(sights_m, up), axis=1)
+            parallel = across <= 1e-5 * np.linalg.norm(sights_m, axis=1) * np.linalg.norm(up)
+            if parallel.any():
+                found = f"the line of sight of position {parallel.argmax() + 1} is parallel to {list(up)}"
+                raise field_error(found, "another direction, such as [0, 1, 0], or another target", "conflict")
+        return up
 
 
 _Trajectory = DomeSpec | RingSpec | SurveySpec | PosesSpec

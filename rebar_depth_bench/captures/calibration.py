@@ -119,20 +119,18 @@ def camera_columns(calibration: Calibration, left_cam_from_world: Float64[ndarra
 
 
 def scale_calibration(calibration: _AnyCalibration, width: int, height: int) -> _AnyCalibration:
-    """Return the calibration for another image size: scaled by the width, with rows cropped or added.
+    """Return the calibration for another image size that covers the same sensor area.
 
-    As many rows are cropped or added at the top as at the bottom, so that pixels keep their shape. Pixel centres
-    are at integers: scaling by s gives cx' = s (cx + 0.5) - 0.5. The distortion coefficients refer to the plane
-    z = 1 and do not change.
+    Pixel centres are at integers, so scaling a side from W to W' gives cx' = (cx + 0.5) W'/W - 0.5. The distortion
+    coefficients refer to the plane z = 1 and do not change.
     """
-    if (width, height) == (calibration.width, calibration.height):
+    scale_x, scale_y = width / calibration.width, height / calibration.height
+    if (scale_x, scale_y) == (1.0, 1.0):
         return calibration
-    scale = width / calibration.width
-    top_px = (height - scale * calibration.height) / 2
 
     def scale_lens(lens: Lens) -> Lens:
-        cx, cy = (lens.cx + 0.5) * scale - 0.5, (lens.cy + 0.5) * scale - 0.5 + top_px
-        return replace(lens, fx=lens.fx * scale, fy=lens.fy * scale, cx=cx, cy=cy)
+        cx, cy = (lens.cx + 0.5) * scale_x - 0.5, (lens.cy + 0.5) * scale_y - 0.5
+        return replace(lens, fx=lens.fx * scale_x, fy=lens.fy * scale_y, cx=cx, cy=cy)
 
     scaled = replace(calibration, width=width, height=height, left=scale_lens(calibration.left))
     return scaled if isinstance(scaled, MonoCalibration) else replace(scaled, right=scale_lens(scaled.right))
@@ -160,8 +158,7 @@ def scaled_calibration(calibration: _AnyCalibration, source: object, width: Side
             problems.append(Problem("conflict", eye, found))
     width, height = width or calibration.width, height or calibration.height
     scaled = scale_calibration(calibration, width, height)
-    stretch = (width / calibration.width) / (height / calibration.height)
-    ratio = stretch * calibration.left.fx / calibration.left.fy
+    ratio = scaled.left.fx / scaled.left.fy
     if not problems and abs(ratio - 1) > _SQUARE_PIXEL_TOLERANCE:
         found = f"at {width} x {height} pixels fx is {ratio:.3f} times fy"
         expected = "1: these are the cameras of images of another aspect ratio"
@@ -210,7 +207,7 @@ def principal_point(side_px: int) -> Expected:
 FOCAL_PX = quantity(1, 1e5, "pixels")
 DISTORTION = number(-1000, 1000)
 ANGLE_RAD = quantity(-0.5, 0.5, "radians")
-_BASELINE_M = quantity(0.001, 10, "metres")
+BASELINE_M = quantity(0.001, 10, "metres")
 
 
 # Table of a calibration.
@@ -289,15 +286,15 @@ class _StereoTable(StrictModel):
         if "translation_m" in table:
             raise field_error("has translation_m beside baseline_m", "one of them", "conflict")
         baseline_m, others = table["baseline_m"], {key: table[key] for key in table if key != "baseline_m"}
-        if type(baseline_m) not in (int, float) or not _BASELINE_M.accept(baseline_m):
-            raise field_error(f"baseline_m is {short_repr(baseline_m)}", _BASELINE_M.text)
+        if type(baseline_m) not in (int, float) or not BASELINE_M.accept(baseline_m):
+            raise field_error(f"baseline_m is {short_repr(baseline_m)}", BASELINE_M.text)
         return {**others, "translation_m": (-float(baseline_m), 0.0, 0.0)}
 
     @field_validator("translation_m")
     @classmethod
     def _check_baseline(cls, translation_m: Triple) -> Triple:
-        if not _BASELINE_M.accept(-translation_m[0]):
-            raise field_error(f"got {list(translation_m)}", f"[-baseline, y, z], the baseline {_BASELINE_M.text}")
+        if not BASELINE_M.accept(-translation_m[0]):
+            raise field_error(f"got {list(translation_m)}", f"[-baseline, y, z], the baseline {BASELINE_M.text}")
         return translation_m
 
 

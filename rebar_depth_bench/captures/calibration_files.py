@@ -52,8 +52,13 @@ def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibra
     return calibration
 
 
-def own_calibration(path: Path, width: Side, height: Side, *, is_stereo: bool) -> Calibration:
-    """Return the calibration in a file as ``read_calibration``; a ``.toml`` file may have one camera."""
+def own_calibration(
+    path: Path, width: Side, height: Side, *, is_stereo: bool, is_scaled: bool = True
+) -> Calibration:
+    """Return the calibration in a file as ``read_calibration``; a ``.toml`` file may have one camera.
+
+    Unless ``is_scaled``, it is that of the image size in the file that is nearest to the requested one.
+    """
     suffix = path.suffix.lower()
     if suffix not in (".conf", ".toml"):
         problem = Problem("invalid", "", f"the file suffix is {path.suffix!r}", ".conf or .toml")
@@ -62,7 +67,8 @@ def own_calibration(path: Path, width: Side, height: Side, *, is_stereo: bool) -
     check_image_size(path, width, height)
     if suffix == ".conf":
         try:
-            return scaled_calibration(_read_conf(path.name, content, width, height), path, width, height)
+            pair = _read_conf(path.name, content, width, height)
+            return scaled_calibration(pair, path, *((width, height) if is_scaled else (None, None)))
         except EntryError as error:
             raise CalibrationError.from_problems(path, error.problems) from None
     document, problems = parse_toml(content)
@@ -123,11 +129,11 @@ _SEPARATOR = re.compile("[=:]")
 def _read_conf(name: str, content: bytes, width: Side, height: Side) -> StereoCalibration:
     """Return the calibration of a Stereolabs ``.conf`` file for one of its image sizes; the caller scales it.
 
-    The size is that nearest to ``width`` x ``height``, or to HD, in aspect ratio, then in width. Section names and
-    keys are case-insensitive. Raises ``EntryError`` for the first problem.
+    The size is that of ``_nearest_size``. Section names and keys are case-insensitive. Raises ``EntryError`` for
+    the first problem.
     """
     sections = _read_sections(content)
-    size = _nearest_size(sections, width or NOMINAL_WIDTH, height or NOMINAL_HEIGHT)
+    size = _nearest_size(sections, width, height)
     left, right = (_read_lens(sections, eye, size) for eye in ("LEFT", "RIGHT"))
     baseline_mm, y_mm, z_mm, rx, cv, rz = _numbers(sections, ("STEREO",), _STEREO, f"_{size}")
     translation_m = (0.0 - baseline_mm / 1000, 0.0 - y_mm / 1000, 0.0 - z_mm / 1000)
@@ -136,7 +142,7 @@ def _read_conf(name: str, content: bytes, width: Side, height: Side) -> StereoCa
         keys += [f"{section}.{key}" for key in texts] if section in _KNOWN else [section]
         known.update(f"{section}.{key}".upper() for key in _KNOWN.get(section, ()))
     notes = unknown_keys_notes(name, keys, known)
-    if width is not None and ZED_SIZES[size] != (width, height):
+    if not {width, height} <= {None, *ZED_SIZES[size]}:
         sides = " x ".join(map(str, ZED_SIZES[size]))
         notes.append(f"{name}: scaled from {size}, {sides}, as if both sizes showed the same part of the sensor")
     return StereoCalibration(*ZED_SIZES[size], left, right, (rx, cv, rz), translation_m, tuple(notes))
@@ -169,9 +175,10 @@ def _read_sections(content: bytes) -> _Sections:
     return sections
 
 
-def _nearest_size(sections: _Sections, width: int, height: int) -> str:
+def _nearest_size(sections: _Sections, width: Side, height: Side) -> str:
     """Return the name of the image size of the file that is nearest in aspect ratio, then in width.
 
+    Of one side alone, it is the size whose side is nearest, and without a size that nearest to HD.
     Raises ``EntryError`` if the file has no sections of a known size, and if it has none of this size and one of
     an unknown size.
     """
@@ -182,16 +189,19 @@ def _nearest_size(sections: _Sections, width: int, height: int) -> str:
         expected = f"one of {cameras} with its [RIGHT_CAM_...] and [STEREO]"
         raise EntryError(Problem("missing", "", f"the file has {found}", expected))
 
+    wanted = (width, height) if width or height else (NOMINAL_WIDTH, NOMINAL_HEIGHT)
+
     def distance(name: str) -> tuple[float, float]:
-        grid_width, grid_height = ZED_SIZES[name]
-        ratio = grid_width * height / (width * grid_height)
-        return round(abs(math.log(ratio)), 9), abs(math.log(grid_width / width))
+        sides = zip(ZED_SIZES[name], wanted, strict=True)
+        scales = [math.log(side_px / wanted_px) for side_px, wanted_px in sides if wanted_px]
+        return round(abs(scales[0] - scales[-1]), 9), abs(scales[0])
 
     nearest = min(present, key=distance)
     sizes = [name for name in sections if name.startswith(("LEFT_CAM_", "RIGHT_CAM_"))]
     unknown = [f"[{escape_text(name)}]" for name in sizes if name not in _CAMERAS]
-    if unknown and ZED_SIZES[nearest] != (width, height):
-        found = f"no section is known to be of {width} x {height} pixels; {', '.join(unknown[:10])} may be"
+    if unknown and any(distance(nearest)):
+        size = " x ".join(str(side_px) for side_px in wanted if side_px)
+        found = f"no section is known to be of {size} pixels; {', '.join(unknown[:10])} may be"
         expected = "only sections of the size that the images were scaled from, or calibration.toml with that size"
         raise EntryError(Problem("conflict", "", found, expected))
     return nearest

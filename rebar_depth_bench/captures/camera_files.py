@@ -106,7 +106,7 @@ class _CamerasTable(StrictModel):
 
     calibration: Annotated[
         _FileName | Annotated[list[_FileName], Field(min_length=1, max_length=2)] | None,
-        Expected("the name of a file beside this one, or two"),
+        Expected(f"the name of a file beside this one, or two, of {NAME_LETTERS}"),
     ] = None
     unit: Annotated[str, one_of(*UNITS_M)] = "m"
     rectified: bool | None = None
@@ -215,7 +215,7 @@ def _file_calibration(
     if len(paths) == 1 and paths[0].suffix.lower() in (".conf", ".toml"):
         if stated.rectified:
             expected = "a file with the matrix P of rectified pictures, of ROS or OpenCV"
-            problem = Problem("conflict", "", "has no matrix of rectified pictures", expected)
+            problem = Problem("missing", "", "has no matrix of rectified pictures", expected)
             raise CalibrationError.from_problems(paths[0], [problem])
         return own_calibration(paths[0], width, height, is_stereo=is_stereo)
     check_image_size(paths[0], width, height)

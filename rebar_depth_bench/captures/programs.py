@@ -84,7 +84,7 @@ _MAX_NUMBERS = 100
 _MAX_MAGNITUDE = 1e9
 _ROUNDED_ROTATION = 1e-4
 """Largest deviation of ``R @ R.T`` from the identity in a file with few digits; it is made exact."""
-_ROUNDED_PX = 0.01
+ROUNDED_PX = 0.01
 """Largest difference of K and P that is due to the digits of a file, pixels."""
 
 
@@ -138,13 +138,11 @@ def program_calibration(
     calibration = table_calibration(table, width, height, problems, is_stereo=len(cameras) == 2)
     if calibration is None:
         eye, _, key = problems[0].where.partition(".")
-        found = f"{key or eye}: {problems[0].found}"
+        name, found = "projection" if rectified else "matrix", f"{key or eye}: {problems[0].found}"
+        expected = problems[0].expected
         if problems[0].code == "missing":  # Only the size can be missing in the table.
-            raise cameras[0].error(
-                "missing", "width", "missing", "image_width and image_height, or these of a rig"
-            )
-        name = "projection" if rectified else "matrix"
-        raise cameras[eye == "right"].error(problems[0].code, name, found, problems[0].expected)
+            name, expected = "width", "image_width and image_height, or width and height in [rig]"
+        raise cameras[eye == "right"].error(problems[0].code, name, found, expected)
     if sizes[0] and sizes[-1] and sizes[0] != sizes[-1]:
         left_size, right_size = (" x ".join(map(str, size.values())) for size in sizes)
         found, expected = f"width x height is {right_size}", f"that of the left camera, {left_size}"
@@ -272,7 +270,7 @@ def _check_not_rectified(camera: _Camera, *, is_stated: bool) -> list[str]:
     """
     notes, P, is_distorted = [], camera.projection, any(camera.distortion)
     if P is not None and not is_stated:
-        unlike = np.abs(P[:, :3] - camera.matrix).max() > _ROUNDED_PX
+        unlike = np.abs(P[:, :3] - camera.matrix).max() > ROUNDED_PX
         rotation = camera.numbers("rectification", 9, 3, default=np.eye(3)).reshape(-1, 3)
         if unlike and not is_distorted and np.allclose(rotation, np.eye(3)):
             found = "differs from the camera's matrix without distortion: the pictures may be rectified"

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from functools import reduce
 from itertools import cycle
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, Self
 
 import pyarrow as pa
 from pydantic import (
@@ -190,6 +190,12 @@ class GivenPoses(ManifestTable):
     kind: Annotated[str, one_of(POSES)] = POSES
     positions_m: Annotated[tuple[Triple, ...], Strict(False), Field(min_length=1)]
     targets_m: Annotated[tuple[Triple, ...], Strict(False), Field(min_length=1)]
+
+    @model_validator(mode="after")
+    def _check_targets(self) -> Self:
+        if len(self.targets_m) not in (1, self.views):
+            raise field_error(f"got {len(self.targets_m)} targets", f"as many as positions, {self.views}, or one")
+        return self
 
     @property
     def distances_m(self) -> tuple[float, ...]:

@@ -257,7 +257,7 @@ def published_match(config: DatasetConfig) -> PublishedMatch | None:
         return None
     rig = config.scene.rig
     # The ideal rig of the paper has neither the name of another camera nor numbers of its own.
-    is_other = rig is None or (rig.grid == "ideal" and bool(rig.camera or rig.calibration))
+    is_other = rig is None or (rig.grid == "ideal" and (rig.camera != "" or rig.calibration is not None))
     optics = None if rig is None or is_other else (rig.grid, rig.baseline_m)
     return PublishedMatch(name, optics == _CONDITIONS[name].optics)
 

@@ -222,3 +222,9 @@ def test_damaged_scenes_of_a_config_with_splits_are_named(
     manifest = json.loads((tmp_path / "manifest.json").read_text())
     change(manifest["configs"]["cages"])
     assert (code, f"configs.cages.{where}") in manifest_problems(tmp_path, manifest)
+
+
+def test_given_poses_have_one_target_or_as_many_as_positions(manifest: Any, tmp_path: Path) -> None:
+    poses = {"kind": "poses", "positions_m": [[0, 0, 1]] * 3, "targets_m": [[0, 0, 0]] * 2}
+    scene_of(manifest["configs"]["lattice"])["protocol"] = poses
+    assert manifest_problems(tmp_path, manifest) == [("invalid", "configs.lattice.scenes 1: protocol")]

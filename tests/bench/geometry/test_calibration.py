@@ -106,13 +106,13 @@ def test_right_from_left_of_half_turn() -> None:
     st.integers(16, 4000),
     st.integers(16, 4000),
 )
-def test_scaling_keeps_distances_from_the_middle_per_width(ray: np.ndarray, width: int, height: int) -> None:
+def test_scaling_keeps_relative_image_position(ray: np.ndarray, width: int, height: int) -> None:
+    """Check that a point's position in the image, as a fraction of the image size, is the same on any grid."""
     scaled = scale_calibration(EXPECTED, width, height)
     positions = []
     for calibration in (EXPECTED, scaled):
         pixel = project(calibration.left.K, ray, np.array(calibration.left.distortion))
-        middle_px = np.array([calibration.width, calibration.height]) / 2
-        positions.append((pixel + 0.5 - middle_px) / calibration.width)
+        positions.append((pixel + 0.5) / [calibration.width, calibration.height])
     assert positions[1] == pytest.approx(positions[0], abs=1e-12)
     assert scaled.translation_m == EXPECTED.translation_m
 

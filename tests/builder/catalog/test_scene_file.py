@@ -148,6 +148,10 @@ def test_default_dome_scales_with_steel_extent(tmp_path: Path) -> None:
     narrower = scene_config(write_scene(tmp_path, MM + BAR + '[rig]\ncamera = "Intel RealSense D415"\n'))
     assert isinstance(narrower.protocol, DomeSpec)
     assert min(narrower.protocol.radii_m) == pytest.approx(min(config.protocol.radii_m) * 1004.6 / 700, abs=0.002)
+    numbers = "[rig]\nwidth = 1280\nheight = 480\nbaseline = 120\nfx = 700\n"
+    lower = scene_config(write_scene(tmp_path, MM + BAR + numbers))
+    assert isinstance(lower.protocol, DomeSpec)
+    assert min(lower.protocol.radii_m) == pytest.approx(1.5 * min(config.protocol.radii_m), abs=0.002)
     lattice = lattice_assembly(LatticeSpec())
     reach_m = float(np.linalg.norm(lattice.vertices_m - aim_point_m(lattice), axis=1).max())
     assert min(LATTICE_DOME.radii_m) == pytest.approx(NEAREST_RADIUS_PER_REACH * reach_m, rel=0.08)

@@ -11,6 +11,8 @@ import rebar_depth_bench as rdb
 from dataset_builder.audit import audit
 from dataset_builder.cameras.trajectories import poses
 from dataset_builder.catalog.named_configs import BuildRequest
+from dataset_builder.pipeline.build import plan_build
+from dataset_builder.user_files.rig_file import read_rig
 from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.geometry.cameras import camera_centre, transform
@@ -94,23 +96,46 @@ def test_rigs_of_each_form_are_built_audited_and_scored(tmp_path: Path, run_buil
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("up = [0, 2, 0]", "", r"cameras: the line of sight of position 1 is parallel to up = \[0.0, 0.0, 1.0\]"),
-        ("[60, 40, 0], ", "", "cameras: got 2 targets, expected as many targets as positions, 3, or one"),
-        ("[0, 0, 400]", "[0, 0, 0]", "cameras: the line of sight of position 1 is parallel"),
-        ("[0, 0, 400]", "[0, 0, 50]", "a camera of position 1 of my-beam is inside of a bar"),
-        ("[0, 0, 400]", "[0, 0, -400]", r"a camera is at z = -0.4 m, expected above 0"),
+        ("up = [0, 2, 0]", "", r"cameras.up: the line of sight of position 1 is parallel to \[0.0, 0.0, 1.0\]"),
+        ("[60, 40, 0], ", "", "cameras.targets: got 2 targets, expected as many as positions, 3, or one"),
+        ("[0, 0, 400]", "[0, 0, 0]", "cameras.up: the line of sight of position 1 is parallel"),
+        ("[0, 0, 400]", "[0, 0, 50]", "the left camera of view 1 of my-beam is inside of a bar"),
+        (
+            "[0, 0, 400]",
+            "[0, 0, -400]",
+            r"the left camera of view 1 of my-beam is not above the ground, at \[0.*-0.4\]",
+        ),
         ("positions = ", "places = ", "cameras.positions: missing"),
     ],
 )
 def test_invalid_poses_are_refused(old: str, new: str, words: str, tmp_path: Path) -> None:
     with pytest.raises(InputError, match=words):
-        scene_config(write_scene(tmp_path, MM + BAR + POSES.replace(old, new)))
+        scene_config(write_scene(tmp_path, MM + BAR + NUMBERS + POSES.replace(old, new)))
+
+
+def test_both_cameras_are_tested_against_ground_and_steel_with_each_rig(tmp_path: Path) -> None:
+    beside = '[cameras]\nkind = "poses"\npositions = [[-75, 50, 70]]\ntargets = [[-75, 50, 0]]\nup = [0, 1, 0]\n'
+    with pytest.raises(InputError, match="the right camera of view 1 of my-beam is inside of a bar"):
+        scene_config(write_scene(tmp_path, MM + BAR + ACROSS + NUMBERS + beside))
+    config = scene_config(write_scene(tmp_path, MM + BAR + ACROSS + beside))
+    request = BuildRequest((), scenes=(config,), rig=read_rig("Luxonis OAK-D"), rig_name="oak")
+    with pytest.raises(InputError, match="the right camera of view 1 of my-beam-oak is inside of a bar"):
+        plan_build(request, tmp_path / "root")
+    below = beside.replace("[-75, 50, 70]", "[0, -400, 50]").replace("[-75, 50, 0]", "[0, 0, 50]")
+    with pytest.raises(InputError, match="the right camera of view 1 of my-beam is not above the ground"):
+        scene_config(write_scene(tmp_path, MM + BAR + below.replace("[0, 1, 0]", "[1, 0, 0]")))
+
+
+def test_up_is_up_in_the_images(tmp_path: Path) -> None:
+    config = scene_config(write_scene(tmp_path, MM + BAR + NUMBERS + POSES.replace("[0, 2, 0]", "[3, 0, 0]")))
+    down = poses(config.protocol, np.zeros(3), config.rig)[0]
+    np.testing.assert_allclose(down[:3, :3], [[0, -1, 0], [-1, 0, 0], [0, 0, -1]], atol=1e-12)
 
 
 def test_one_target_is_that_of_all_positions(tmp_path: Path) -> None:
     lefts = []
     for targets in ([[0, 0, 30]], [[0, 0, 30]] * 3):
         table = POSES.replace(str(TARGETS_MM), str(targets))
-        config = scene_config(write_scene(tmp_path, MM + BAR + table))
+        config = scene_config(write_scene(tmp_path, MM + BAR + NUMBERS + table))
         lefts.append(poses(config.protocol, np.zeros(3), config.rig))
     np.testing.assert_array_equal(lefts[0], lefts[1])

@@ -7,14 +7,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 from dataset_builder.cameras.rigs import rig_cameras, sized_rig, zed_rig
 from dataset_builder.catalog.named_configs import BuildRequest
+from dataset_builder.cli.main import main
 from dataset_builder.specs.config_specs import STEREO_CAMERAS, RigSpec
 from dataset_builder.user_files.rig_file import read_rig
 from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.geometry.cameras import Camera, camera_centre, right_from_left
 from tests.bench.captures import calibration_files as files
+from tests.bench.geometry.calibrations import CONF
 from tests.builder.catalog.scene_files import BAR, MM, scene_config, write_scene
 
 NUMBERS = "width = 1280\nheight = 800\nbaseline = 75\nhorizontal_fov_deg = 71.9\n"
@@ -45,6 +48,8 @@ def test_numbers_are_those_of_parallel_square_pinholes(tmp_path: Path) -> None:
         assert pytest.approx(np.array([[fx, 0, 639.5], [0, fx, 399.5], [0, 0, 1]])) == camera.K
         assert not camera.distortion.any()
     assert baseline_m(cameras(rig)) == pytest.approx(0.075, abs=1e-12)
+    in_cm = NUMBERS.replace("75", "7.5") + 'unit = "cm"\n'
+    assert scene_rig(tmp_path, in_cm) == rig
     off_centre = scene_rig(
         tmp_path, "width = 640\nheight = 400\nbaseline = 75\nfx = 441.25\ncx = 310\ncy = 210.5\n"
     )
@@ -90,6 +95,47 @@ def test_rectified_pair_has_the_stated_matrices_P(size: str, tmp_path: Path) -> 
     assert np.array_equal(cameras(rig)["left"].cam_from_world[:3, :3], POSE)
 
 
+def write_with_changed_P(folder: Path, index: int, change: float) -> None:
+    """Write the pair of ROS with a number added to one of P of the right camera."""
+    texts = files.ros_texts(as_message=False)
+    right = yaml.safe_load(texts["right.yaml"])
+    right["projection_matrix"]["data"][index] += change
+    (folder / "left.yaml").write_text(texts["left.yaml"])
+    (folder / "right.yaml").write_text(yaml.safe_dump(right))
+
+
+def test_matrices_P_are_made_equal_or_refused(tmp_path: Path) -> None:
+    table = 'calibration = ["left.yaml", "right.yaml"]\n'
+    write_with_changed_P(tmp_path, 5, 0.004)
+    eyes = cameras(scene_rig(tmp_path, table))
+    assert np.array_equal(eyes["left"].cam_from_world[:3, :3], POSE)
+    assert np.array_equal(eyes["left"].K, eyes["right"].K)
+    for index, change, words in (
+        (5, 4.0, "of the two matrices P differ by 4 pixels"),
+        (3, 1000.0, r"right.yaml: projection_matrix: .*expected fx above 0 and P\[0, 3\]"),
+    ):
+        write_with_changed_P(tmp_path, index, change)
+        with pytest.raises(InputError, match=words):
+            scene_rig(tmp_path, table)
+
+
+def test_sections_of_a_conf_file_are_those_of_the_requested_size(tmp_path: Path) -> None:
+    lenses, motion = CONF.split("[STEREO]")
+    angles = "".join(f"{line}\n" for line in motion.splitlines() if "_HD" in line)
+    smaller = lenses.replace("=70", "=35")
+    path = tmp_path / "zed.conf"
+    path.write_text(lenses + smaller.replace("_HD", "_VGA") + "[STEREO]" + motion + angles.replace("_HD", "_VGA"))
+    for wanted, size in (
+        ((None, None), (1280, 720)),
+        ((672, None), (672, 376)),
+        ((None, 376), (672, 376)),
+        ((320, 200), (1280, 720)),  # Its aspect ratio is nearer.
+    ):
+        rig = read_rig(str(path), *wanted)
+        assert (rig.width, rig.height) == size
+    assert read_rig(str(path), 672) == scene_rig(tmp_path, 'calibration = "zed.conf"\nwidth = 672\nheight = 376\n')
+
+
 def test_width_decides_focal_length_and_rows_are_cropped_or_added(tmp_path: Path) -> None:
     rigs = {
         "ideal": RigSpec(),
@@ -123,8 +169,10 @@ def test_rig_of_a_request_keeps_stations_and_names_the_configs(tmp_path: Path) -
     assert (lattice.name, pier.name) == ("lattice-d405", "pier-d405")
     assert [spec.protocol for spec in (lattice, pier)] == [spec.protocol for spec in plain]
     assert [spec.scene for spec in (lattice, pier)] == [spec.scene for spec in plain]
-    assert (lattice.rig.baseline_m, lattice.rig.width, request.notes()) == (0.018, 1280, [])
-    (note,) = BuildRequest(("lattice", "pile"), width=320, height=200).notes()
+    assert (lattice.rig.baseline_m, lattice.rig.width, request.notes([lattice, pier])) == (0.018, 1280, [])
+    smaller = BuildRequest(("pile", "cages"), width=320, height=200)
+    (note,) = smaller.notes(smaller.config_specs())
+    assert note.source == "pile"
     assert "20 rows are added" in note.text
     path = tmp_path / "rig.toml"
     path.write_text(NUMBERS.replace("75", "0.075"))
@@ -141,9 +189,13 @@ def test_rig_of_a_request_keeps_stations_and_names_the_configs(tmp_path: Path) -
         ('camera = "OAK-D"\n', 'rig.camera: got \'OAK-D\', expected "Stereolabs ZED", .*"Luxonis OAK-D Pro"'),
         (NUMBERS + "fx = 700\n", "rig: found .*fx.*, expected exactly one of"),
         (NUMBERS.replace("height = 800\n", ""), "rig: found .*, expected exactly one of"),
-        (NUMBERS.replace("75", "75_000"), "rig.stereo: baseline_m is 75.0, expected .* from 0.001 to 10 metres"),
+        (NUMBERS.replace("75", "75_000"), "rig.baseline: is 75 m, expected .* from 0.001 to 10 metres"),
         (NUMBERS + "cx = 5000\n", "rig: cx is 5000, expected a number from -0.5 to 1279.5 pixels"),
-        ('calibration = "stereo.yml"\n', "stereo.yml: image_width: missing"),
+        (NUMBERS.replace("1280", "-5"), "rig.width: got -5, expected a whole number from 16 to 16384"),
+        (NUMBERS.replace("75", "0.1") + 'unit = "mm"\n', "rig.baseline: is 0.0001 m"),
+        ('calibration = "stereo.yml"\n', r"stereo.yml: image_width: .*missing, .* or width and height in \[rig\]"),
+        ('calibration = "stereo.toml"\nunit = "mm"\n', "rig: unit is given with stereo.toml, expected no unit"),
+        ('calibration = "my cal.toml"\n', "a file beside this one, or two, of letters"),
         ('calibration = "none.yml"\n', "none.yml"),
         ('calibration = "../stereo.yml"\n', "rig.calibration: .*expected the name of a file beside this one"),
         ('calibration = "stereo.yml"\nwidth = 640\n', "rig: found calibration, width, expected"),
@@ -161,6 +213,7 @@ def test_invalid_rig_is_refused(table: str, words: str, tmp_path: Path) -> None:
 def test_rig_that_does_not_suit_a_request_is_refused(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"no such camera, expected one of Stereolabs ZED, .*, or a calibration"):
         read_rig("OAK-D")
+    assert main(["--out", str(tmp_path / "root"), "--config", "lattice", "--rig", "", "--dry-run"]) == 2
     rig = read_rig("Luxonis OAK-D")
     for config in ("lattice-zed", "cages"):
         with pytest.raises(InputError, match=f"--rig: is combined with --config {config}"):
@@ -176,5 +229,5 @@ def test_rig_that_does_not_suit_a_request_is_refused(tmp_path: Path) -> None:
         BuildRequest(("lattice",), rig=lens, rig_name="lens", width=640, height=960).config_specs()
     near = '[cameras]\nkind = "ring"\nradius = 70\nelevation_deg = 40\nazimuths = 2\n'
     path = write_scene(tmp_path, f"{MM}{BAR}[rig]\n{NUMBERS}{near}")
-    with pytest.raises(InputError, match=r"my-beam.toml: a camera is 0.07 m .*baseline of the rig, 0.075 m"):
+    with pytest.raises(InputError, match=r"my-beam.toml: my-beam: a camera is 0.07 m .*of the rig, 0.075 m"):
         scene_config(path)
