@@ -88,8 +88,8 @@ def rig_cameras(rig: RigSpec, cam_from_world: Float64[ndarray, "4 4"]) -> dict[s
             raise ValueError(f"{found}, expected {rig.calibration.baseline_m} as in its calibration")
         is_rotated = rig.grid != "raw" and not rig.calibration.is_rectified
         # The whole images are rectified, so that rows that are cropped or added change no focal length.
-        whole_height = round(rig.calibration.height * rig.width / rig.calibration.width)
-        height = whole_height if is_rotated else rig.height
+        whole = round(rig.calibration.height * rig.width / rig.calibration.width)
+        height = whole if is_rotated else rig.height
         pair = resized(rig.calibration, rig.width, height)
         lenses = (pair.left, pair.right)
         Ks, distortions = [lens.K for lens in lenses], [np.array(lens.distortion) for lens in lenses]

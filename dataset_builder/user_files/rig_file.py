@@ -17,7 +17,6 @@ from rebar_depth_bench.base.validation import (
     UNITS_M,
     StrictModel,
     field_error,
-    format_location,
     number,
     one_of,
     validate_table,
@@ -28,7 +27,6 @@ from rebar_depth_bench.captures.calibration import (
     FOCAL_PX,
     SIDES_PX,
     Lens,
-    Side,
     StereoCalibration,
     principal_point,
 )
@@ -88,8 +86,9 @@ class RigTable(StrictModel):
         if self.baseline is not None and self.width is not None and self.height is not None:
             baseline_m = to_metres(self.baseline, UNITS_M[self.unit] if self.unit else unit_m)
             if not BASELINE_M.accept(baseline_m):
-                place, found = format_location(where, "baseline"), f"is {baseline_m:g} m"
-                raise CalibrationError.from_problems(path, [Problem("invalid", place, found, BASELINE_M.text)])
+                place = f"{where}.baseline" if where else "baseline"
+                problem = Problem("invalid", place, f"is {baseline_m:g} m", BASELINE_M.text)
+                raise CalibrationError.from_problems(path, [problem])
             fx = self.fx or focal_of_view_px(self.horizontal_fov_deg or 0, self.width)
             cx = (self.width - 1) / 2 if self.cx is None else self.cx
             cy = (self.height - 1) / 2 if self.cy is None else self.cy
@@ -121,7 +120,7 @@ class RigTable(StrictModel):
         return cameras.calibration
 
 
-def read_rig(name: str, width: Side = None, height: Side = None) -> RigSpec:
+def read_rig(name: str, width: int | None = None, height: int | None = None) -> RigSpec:
     """Return the rig of a named camera, of a calibration file, or of a TOML file with the keys of ``[rig]``.
 
     The unit of a TOML file is the metre, unless it states another. Of a ``.conf`` file, the sections nearest to

@@ -219,31 +219,25 @@ class PosesTable(CamerasTable, extra="forbid"):
     """Table ``[cameras]`` of given poses; a single target is that of all positions."""
 
     positions_m: _Points = Field(alias="positions")
+    up: Annotated[Triple, three_numbers(-1e9, 1e9, "a direction, [x, y, z]")] = PosesSpec.up
     targets_m: _Points = Field(alias="targets")
-    up: Annotated[Triple, three_numbers(-1e9, 1e9, "a direction, [x, y, z]")] = Field(
-        default=PosesSpec.up, validate_default=True
-    )
 
     @field_validator("targets_m")
     @classmethod
-    def _check_number(cls, targets_m: tuple[Triple, ...], info: ValidationInfo[_Context]) -> tuple[Triple, ...]:
-        positions = len(info.data.get("positions_m", targets_m))
-        if len(targets_m) not in (1, positions):
-            expected = f"as many as positions, {positions}, or one"
+    def _check_sights(cls, targets_m: tuple[Triple, ...], info: ValidationInfo[_Context]) -> tuple[Triple, ...]:
+        if not {"positions_m", "up"} <= info.data.keys():  # One of them is invalid.
+            return targets_m
+        positions_m, up = info.data["positions_m"], info.data["up"]
+        if len(targets_m) not in (1, len(positions_m)):
+            expected = f"as many as positions, {len(positions_m)}, or one"
             raise field_error(f"got {len(targets_m)} targets", expected, "conflict")
+        sights_m = np.subtract(targets_m, positions_m)
+        across = np.linalg.norm(np.cross(sights_m, up), axis=1)
+        parallel = across <= 1e-5 * np.linalg.norm(sights_m, axis=1) * np.linalg.norm(up)
+        if parallel.any():
+            found = f"the line of sight of position {parallel.argmax() + 1} is parallel to up = {list(up)}"
+            raise field_error(found, "another target, or another up, such as [0, 1, 0]", "conflict")
         return targets_m
-
-    @field_validator("up")
-    @classmethod
-    def _check_sights(cls, up: Triple, info: ValidationInfo[_Context]) -> Triple:
-        if {"positions_m", "targets_m"} <= info.data.keys():
-            sights_m = np.subtract(info.data["targets_m"], info.data["positions_m"])
-            across = np.linalg.norm(np.cross(sights_m, up), axis=1)
-            parallel = across <= 1e-5 * np.linalg.norm(sights_m, axis=1) * np.linalg.norm(up)
-            if parallel.any():
-                found = f"the line of sight of position {parallel.argmax() + 1} is parallel to {list(up)}"
-                raise field_error(found, "another direction, such as [0, 1, 0], or another target", "conflict")
-        return up
 
 
 _Trajectory = DomeSpec | RingSpec | SurveySpec | PosesSpec

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -225,8 +226,10 @@ def test_rig_that_does_not_suit_a_request_is_refused(tmp_path: Path) -> None:
         BuildRequest(("lattice",), rig=rig, rig_name="oak", width=16).config_specs()
     (tmp_path / "lens.toml").write_text(files.TOML.replace("-0.2929, 0.1077", "-0.22, 0.0"))
     lens = read_rig(str(tmp_path / "lens.toml"))
+    request = BuildRequest(("lattice",), rig=lens, rig_name="lens", width=640, height=960)
+    assert len(request.config_specs()) == 1  # The rectified cameras have no distortion.
     with pytest.raises(InputError, match="the distortion cannot be inverted"):
-        BuildRequest(("lattice",), rig=lens, rig_name="lens", width=640, height=960).config_specs()
+        replace(request, rig=replace(lens, grid="raw")).config_specs()
     near = '[cameras]\nkind = "ring"\nradius = 70\nelevation_deg = 40\nazimuths = 2\n'
     path = write_scene(tmp_path, f"{MM}{BAR}[rig]\n{NUMBERS}{near}")
     with pytest.raises(InputError, match=r"my-beam.toml: my-beam: a camera is 0.07 m .*of the rig, 0.075 m"):
