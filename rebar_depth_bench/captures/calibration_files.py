@@ -35,7 +35,7 @@ def read_calibration(path: str | Path, width: int, height: int) -> StereoCalibra
     ``.conf`` is Stereolabs' INI file, whose keys docs/formats.md lists: sections ``LEFT_CAM_X``, ``RIGHT_CAM_X``
     for each image size X, such as HD, and ``STEREO``. If the file has no sections for the requested size, those
     nearest in aspect ratio and then in width are read and passed to ``scale_calibration``, which assumes that both
-    sizes show the whole width of the sensor; a file that shows otherwise, or has sections of unknown sizes, is
+    sizes cover the same sensor area; a file that shows that they do not, or has sections of unknown sizes, is
     refused. The motion is ``x_right = R x_left + T`` with R = Rodrigues(RX, CV, RZ) and T = -(Baseline, TY, TZ):
     the whole vector is negated, which keeps it on the line that the vendor's rectification uses.
 

@@ -26,6 +26,7 @@ from dataset_builder.pipeline.plan import config_parameters
 from dataset_builder.scene.environments.surroundings import SURROUNDINGS
 from dataset_builder.specs.config_specs import ColourSpec, ConfigSpec, DomeSpec, RigSpec, colour_spec
 from dataset_builder.user_files.make_assembly import make_assembly
+from dataset_builder.user_files.rig_file import RigTable
 from rebar_depth_bench import score
 from rebar_depth_bench.bar_crossings.crossings_file import read_crossings
 from rebar_depth_bench.base.errors import InputError
@@ -249,6 +250,12 @@ def test_published_rows_match_complete_standard_configs(name: str) -> None:
     incomplete = config_of_spec(CONFIGS[name](), views=6)
     assert published_match(incomplete) is None
     assert not expected or paper_differences(incomplete) == ["6 of 504 views"]
+
+
+def test_numbers_of_a_rig_are_other_optics_than_those_of_the_paper() -> None:
+    rig = RigTable(width=1280, height=720, baseline=0.12, fx=500.0).rig(Path("scene.toml"), 1.0)
+    config = config_of_spec(replace(CONFIGS["pier"](), rig=rig))
+    assert published_match(config) == PublishedMatch("pier", same_optics=False)
 
 
 @pytest.mark.parametrize(

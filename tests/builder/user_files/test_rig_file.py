@@ -108,10 +108,14 @@ def write_with_changed_P(folder: Path, index: int, change: float) -> None:
 def test_matrices_P_are_made_equal_or_refused(tmp_path: Path) -> None:
     table = 'calibration = ["left.yaml", "right.yaml"]\n'
     write_with_changed_P(tmp_path, 5, 0.004)
-    eyes = cameras(scene_rig(tmp_path, table))
-    assert np.array_equal(eyes["left"].cam_from_world[:3, :3], POSE)
-    assert np.array_equal(eyes["left"].K, eyes["right"].K)
+    rig = scene_rig(tmp_path, table)
+    assert rig.calibration is not None
+    assert rig.calibration.is_rectified
+    for camera in cameras(rig).values():
+        assert np.array_equal(camera.cam_from_world[:3, :3], POSE)
+        assert np.array_equal(camera.K, rig.calibration.left.K)
     for index, change, words in (
+        (5, -2000.0, "right.yaml: projection_matrix: .*fy"),
         (5, 4.0, "of the two matrices P differ by 4 pixels"),
         (3, 1000.0, r"right.yaml: projection_matrix: .*expected fx above 0 and P\[0, 3\]"),
     ):
