@@ -45,7 +45,7 @@ def test_documented_lines_rectify_images(model: str, tmp_path: Path, monkeypatch
     for folder in ("raw", "left"):
         (tmp_path / folder).mkdir()
     cv2.imwrite("raw/a.png", spot.round().astype(np.uint8))
-    lines, fisheye_line = blocks(DOCS / "captures.md", "py")
+    lines, fisheye_line, _ = blocks(DOCS / "captures.md", "py")
     if model == "fisheye":
         [line] = [line for line in lines.splitlines() if line.startswith("maps = ")]
         lines = lines.replace(line, fisheye_line.strip())
