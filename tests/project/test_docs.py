@@ -200,7 +200,7 @@ def test_documented_toml_and_json_are_valid(tmp_path: Path) -> None:
         assert import_layout.read_layout(tmp_path / "layout.toml").truth_sigma_m > 0
     for scene in scenes:
         is_rig = scene.startswith("calibration")  # The keys of [rig] in a file of their own.
-        assert read_scene_toml((f'mesh = "cage.stl"\n[rig]\n{scene}' if is_rig else scene).encode(), "page")
+        assert read_scene_toml((f'ifc = "cage.ifc"\n[rig]\n{scene}' if is_rig else scene).encode(), "page")
     [model] = blocks(DOCS / "methods.md", "toml")
     (tmp_path / "my_model.toml").write_text(model)
     (tmp_path / "model.onnx").touch()
