@@ -1,7 +1,7 @@
 """Baselines at crossings: python -m benchmarks.crossings ROOT OUT ARCHIVE...
 
-For each archive of predicted depth, the measures at crossings and the reach are computed, and a simple detector
-is run on its depth; a further detector returns random points on the steel of the ground truth. Files of
+For each archive of predicted depth, the measures at crossings are computed, and a simple detector is run on its
+depth; a further detector returns random points on the steel of the ground truth. Files of
 detections and ``crossings.json``, which ``docs/results.md`` shows, are written to OUT. The detector is the same
 for all archives:
 
@@ -49,8 +49,8 @@ RANDOM_POINTS = 60
 """Random points of a view."""
 SHARES = ("precision", "recall", "f1", "node_recall")
 MEASURES = (
-    *("crossings_judged", "crossings_located", "tie_median_mm", "tie_p95_mm", "crossing_angle_p95_deg"),
-    *("tie_within_2mm", "tie_within_5mm", "tie_within_10mm"),
+    *("crossings_located", "tie_median_mm", "tie_p95_mm", "crossing_angle_p95_deg"),
+    *("tie_within_2mm", "tie_within_5mm"),
 )
 BIAS = ("right_bias_mm", "down_bias_mm", "along_bias_mm", "spread_mm")
 KEPT = (
@@ -96,13 +96,13 @@ def _renders_text(config: DatasetConfig) -> str:
 
 
 def _measures(archive: str, root: str) -> dict[str, Any]:
-    """Return the measures at crossings and the reaches of an archive, native, by config."""
+    """Return the number of judged crossings and the measures at them of an archive, native, by config."""
     extended = rdb.score(archive, root, extended=True).extended
     assert extended is not None
     return {
         config: {
+            "judged": table.numbers[NATIVE]["crossings_located"].samples,
             "measures": {name: rounded(table.numbers[NATIVE][name].value) for name in MEASURES},
-            "reaches": [reach.to_dict() for reach in table.reaches.get(NATIVE, ())],
         }
         for config, table in extended.tables.items()
     }

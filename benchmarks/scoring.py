@@ -28,6 +28,7 @@ import rebar_depth_bench as rdb
 from benchmarks.timing import machine_description, median_seconds, print_markdown
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.extended.families import view_samples
+from rebar_depth_bench.extended.frames import steel_frames
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
 from rebar_depth_bench.scoring.protocol import interior
 from rebar_depth_bench.scoring.truth import config_truth
@@ -82,7 +83,7 @@ def _torch_numbers(p: torch.Tensor, z: torch.Tensor) -> list[float]:
 
 
 def extended_rows(root: str, config: str, submission: SubmissionReader) -> list[tuple[str, str]]:
-    """Return the milliseconds per view of its truth, and of all measures, native and scaled."""
+    """Return the milliseconds per view of its truth, the fits of its steel, and all measures."""
     folder = open_folder(root)
     steel = load_steel_truth(folder, folder.config(config))
     views = []
@@ -90,8 +91,15 @@ def extended_rows(root: str, config: str, submission: SubmissionReader) -> list[
         truth = steel.view(index)
         views.append((truth, submission.read(truth.view_id).astype(np.float64)))
     gathering_s = median_seconds(lambda: [*map(steel.view, range(len(steel)))], REPEATS)
-    measuring_s = median_seconds(lambda: [view_samples(image_m, truth, 1 / 1.1) for truth, image_m in views], 5)
-    rows = {"gathering a view's truth": gathering_s, "all measures": measuring_s}
+    fitting_s = median_seconds(lambda: [steel_frames(image_m, truth, 0) for truth, image_m in views], REPEATS)
+    frames = [steel_frames(image_m, truth, 0) for truth, image_m in views]
+    measured = [(image_m, truth, 1 / 1.1, steel) for (truth, image_m), steel in zip(views, frames, strict=True)]
+    measuring_s = median_seconds(lambda: [view_samples(*view) for view in measured], REPEATS)
+    rows = {
+        "gathering a view's truth": gathering_s,
+        "fitting bars and crossings": fitting_s,
+        "all measures": measuring_s,
+    }
     return [(name, f"{1e3 * value / len(views):.1f}") for name, value in rows.items()]
 
 

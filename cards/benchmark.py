@@ -6,8 +6,7 @@ The constants of the pages are taken from the code, the tables of results from t
 from __future__ import annotations
 
 import json
-import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -29,13 +28,14 @@ from cards.templates import render, wrapped
 from rebar_depth_bench.bar_crossings.definition import crossing_parameters
 from rebar_depth_bench.detections.matching import DETECTIONS_PROTOCOL, HEADLINE_MM
 from rebar_depth_bench.detections.reading import MAX_ROWS_PER_VIEW
+from rebar_depth_bench.extended import working_range
 from rebar_depth_bench.extended.families import MEASURE_FAMILIES
 from rebar_depth_bench.extended.fits import MISS_MM
-from rebar_depth_bench.extended.inspection import MISSED_NOTE, PROFILES, TOLERANCES
+from rebar_depth_bench.extended.inspection import MISSED_NOTE
 from rebar_depth_bench.extended.judged import MAX_SURFACE_DIAMETERS
-from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, ONCE, Measure, MeasureFamily
+from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL
 from rebar_depth_bench.methods import AnyMethod, own_methods
-from rebar_depth_bench.reporting.extended_tables import FITS_NOTE, REACH_NOTE
+from rebar_depth_bench.reporting.extended_tables import FITS_NOTE
 from rebar_depth_bench.scoring.bootstrap import BLOCK_VIEWS, INTERVALS, MIN_BLOCKS, RESAMPLES
 from rebar_depth_bench.scoring.columns import SIGNIFICANT_DIGITS
 from rebar_depth_bench.scoring.formatting import LEAST_MARGIN
@@ -83,13 +83,6 @@ def _errors(errors: Mapping[str, float]) -> str:
     return f"{errors['abs_rel']:.3f}, {number(rmse_cm, 1 if rmse_cm < 10 else 0, ' cm')}"
 
 
-_PARAMETER = re.compile(r"(?<=_)\d[\d.]*(?:-[\d.]+)?(?=(?:mm|pct|m|px|deg)$)")
-"""Pattern of the tolerance, threshold or bin at the end of a measure's name, without its unit."""
-
-_SHARED_PART = 0.7
-"""Least share of the words of definitions that end alike, from which on they stand in one row."""
-
-
 def benchmark_card() -> str:
     """Return the text of ``cards/BENCHMARK.md``: task, data, protocol, main results and limits."""
     subset, cages, networks = reference_context(SUBSET), reference_context(CAGES), learned_results()["configs"]
@@ -128,13 +121,12 @@ def measures_page() -> str:
         protocol=PROTOCOL,
         extended_protocol=EXTENDED_PROTOCOL,
         groupings=GROUPINGS,
-        families=[_family_rows(family) for family in MEASURE_FAMILIES.values()],
-        profiles=PROFILES,
+        families=MEASURE_FAMILIES.values(),
         miss_mm=MISS_MM,
         missed_note=MISSED_NOTE,
         crossings=crossing_parameters(),
         fits_note=FITS_NOTE,
-        reach_note=REACH_NOTE,
+        ranges=working_range,
         contacts=_CONTACTS,
         max_rows=f"{MAX_ROWS_PER_VIEW:,}",
         detections_protocol=DETECTIONS_PROTOCOL,
@@ -180,82 +172,3 @@ def _method_row(method: AnyMethod) -> dict[str, str]:
     what = f"{info.summary} ({info.untested_note})" if info.untested_note else info.summary
     needs = ", ".join(info.columns) or ("all views of a config" if info.inputs == "multi-view" else "nothing")
     return {"name": name, "what": what, "needs": needs, "licence": info.licence}
-
-
-def _family_rows(family: MeasureFamily) -> dict[str, Any]:
-    """Return title, alignment and rows of a family, without the measures that tolerances have besides."""
-    of_tolerances = {name for _, one in TOLERANCES for name in (one.pass_name, one.capability_name)}
-    by_name: dict[str, list[Measure]] = {}
-    for measure in family.measures:
-        if measure.name not in of_tolerances:
-            by_name.setdefault(_PARAMETER.sub("N", measure.name), []).append(measure)
-    groups: list[list[dict[str, str]]] = []
-    for name, variants in by_name.items():
-        row = _measure_row(name, variants)
-        for group in groups:
-            if _common_end(one["definition"] for one in (row, *group)):
-                group.append(row)
-                break
-        else:
-            groups.append([row])
-    return {
-        "title": family.title,
-        "taken": "once" if family.alignments == (ONCE,) else "native and scaled",
-        "rows": [_merged(group) for group in groups],
-        "tolerances": not of_tolerances.isdisjoint(family.by_name),
-    }
-
-
-def _common_end(definitions: Iterable[str]) -> int:
-    """Return the number of words with which all definitions end; 0 if that is a small part of one of them."""
-    words = [definition.split() for definition in definitions]
-    common = _equal_at_the_start([one[::-1] for one in words])
-    return common if common >= _SHARED_PART * max(map(len, words)) else 0
-
-
-def _equal_at_the_start(texts: Sequence[Sequence[str]]) -> int:
-    """Return the number of words with which all texts begin."""
-    columns = enumerate(zip(*texts, strict=False))
-    return next((place for place, words in columns if len(set(words)) > 1), min(map(len, texts)))
-
-
-def _merged(rows: Sequence[Mapping[str, str]]) -> dict[str, Any]:
-    """Return one row for measures whose definitions end alike: their names, and what differs in brackets."""
-    names = [f"`{row['name']}`" for row in rows]
-    if len(rows) == 1:
-        return {**rows[0], "names": names}
-    words = [row["definition"].split() for row in rows]
-    end = _common_end(row["definition"] for row in rows)
-    beginnings = [one[:-end] for one in words]
-    start = _equal_at_the_start(beginnings)
-    *_, last = texts = [" ".join(one[start:]) or "all" for one in beginnings]
-    listed = "; ".join(text.rstrip(",:") for text in texts)
-    alternatives = f"[{listed}]{last[len(last.rstrip(',:')) :]}"
-    columns = {key: [row[key] or "-" for row in rows] for key in ("unit", "better", "statistic")}
-    return {
-        "names": names,
-        "title": rows[0]["title"] if len({row["title"] for row in rows}) == 1 else "",
-        "definition": " ".join((*words[0][:start], alternatives, *words[0][-end:])),
-        **{
-            key: " / ".join(cells) if len(set(cells)) > 1 else cells[0].strip("-")
-            for key, cells in columns.items()
-        },
-    }
-
-
-def _measure_row(name: str, measures: Sequence[Measure]) -> dict[str, str]:
-    """Return one row for measures that differ only in the tolerance or bin of their name, written as N."""
-    first, definition = measures[0], measures[0].definition.removesuffix(f" {MISSED_NOTE}")
-    parameter = _PARAMETER.search(first.name)
-    if parameter is not None:
-        values = ", ".join(match[0] for measure in measures if (match := _PARAMETER.search(measure.name)))
-        pattern = rf" {re.escape(parameter[0])} (?=mm|m\b|px|%|degrees)"
-        definition = f"{re.sub(pattern, ' N ', definition, count=1)}; N = {values}"
-    return {
-        "name": name,
-        "title": first.title.partition(":")[0] if ":" in first.title and parameter is None else "",
-        "unit": first.unit,
-        "better": first.better,
-        "statistic": first.statistic,
-        "definition": definition.replace("|", r"\|"),
-    }

@@ -22,14 +22,12 @@ def crossing_baselines(file: str) -> dict[str, Any]:
         "file": f"cards/reference/{file}",
         "command": document["command"],
         "renders": document["renders"],
-        "methods": [f"`{method}`" for method in depth],
         "depth": [
             [config, f"`{method}`", *_depth_cells(entry)]
             for method, configs in depth.items()
             for config, entry in configs.items()
             if entry["measures"]["crossings_located"] is not None
         ],
-        "bins": list(_bin_rows(depth)),
         "detectors": [
             [config, method, *_detector_cells(table)]
             for method, configs in document["detectors"].items()
@@ -41,28 +39,9 @@ def crossing_baselines(file: str) -> dict[str, Any]:
 
 def _depth_cells(entry: Mapping[str, Any]) -> Iterator[str]:
     measures = entry["measures"]
-    yield from (percent(measures[name]) for name in ("crossings_judged", "crossings_located"))
+    yield from (str(entry["judged"]), percent(measures["crossings_located"]))
     yield from (number(measures[name], 2, " mm") for name in ("tie_median_mm", "tie_p95_mm"))
-    yield from (percent(measures[f"tie_within_{limit}mm"]) for limit in (2, 5, 10))
-    yield from (_reach_text(reach) for reach in entry["reaches"])
-
-
-def _reach_text(reach: Mapping[str, Any]) -> str:
-    return reach["verdict"] if reach["distance_m"] is None else f"{reach['verdict']} {reach['distance_m']:g} m"
-
-
-def _bin_rows(depth: Mapping[str, Any]) -> Iterator[list[str]]:
-    """Yield the shares of each bin of distance that is tested, for all methods."""
-    first = next(iter(depth.values()))
-    for config, entry in first.items():
-        for place, one in enumerate(entry["reaches"][0]["bins"]):
-            if one["crossings"] >= 50 and one["views"] >= 5:
-                shares = [
-                    ", ".join(percent(reach["bins"][place]["share"]) for reach in configs[config]["reaches"])
-                    for configs in depth.values()
-                ]
-                distance = f"{one['low_m']:g}-{one['high_m']:g}"
-                yield [config, distance, str(one["crossings"]), str(one["views"]), *shares]
+    yield from (percent(measures[f"tie_within_{limit}mm"]) for limit in (2, 5))
 
 
 def _detector_cells(table: Mapping[str, Any]) -> Iterator[str]:

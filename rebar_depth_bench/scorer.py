@@ -33,8 +33,9 @@ from rebar_depth_bench.submission import EntryError
 from rebar_depth_bench.submission.declaration import METRIC, Declaration
 
 if TYPE_CHECKING:
-    from rebar_depth_bench.bar_crossings.crossings_file import CrossingsSource
     from rebar_depth_bench.extended.estimates import ViewSamples
+    from rebar_depth_bench.extended.families import ExtendedViews
+    from rebar_depth_bench.extended.frames import SteelFrames
     from rebar_depth_bench.extended.ground_truth import ConfigSteelTruth
 
 VIEWS_SHOWN = 12
@@ -130,25 +131,20 @@ class ScoringTruth:
 
 @dataclass(frozen=True)
 class ViewResult:
-    """Numbers of a view by place, and its samples of extended measures, if they are computed."""
+    """Numbers of a view by place; if extended measures are computed, its samples, and those of its steel."""
 
     numbers: Mapping[str, float]
-    samples: ViewSamples | None
+    samples: ViewSamples | None = None
+    frames: SteelFrames | None = None
 
 
 @dataclass(frozen=True)
 class ScoredConfig:
-    """Numbers of the views of a config, their table, and the samples of extended measures by view.
+    """Numbers of the views of a config, their table, and their samples if extended measures are computed."""
 
-    ``crossings`` is the file that the crossings of bars come from. ``samples`` is None if no extended measures are
-    computed, and empty for a config without masks or bar ids.
-    """
-
-    config: DatasetConfig
-    crossings: CrossingsSource | None
     frame: Frame
     table: Table
-    samples: Mapping[str, ViewSamples] | None
+    extended: ExtendedViews | None
 
 
 def score_view(
@@ -160,12 +156,13 @@ def score_view(
     """
     numbers = view_numbers(prediction, truth.scored.views[position], kind, declared_kind)
     if truth.steel is None:
-        return ViewResult(numbers, None)
+        return ViewResult(numbers)
     from rebar_depth_bench.extended.families import view_samples
+    from rebar_depth_bench.extended.frames import steel_frames
 
-    return ViewResult(
-        numbers, view_samples(prediction, truth.steel.view(position), numbers.get("scale", math.nan))
-    )
+    steel = truth.steel.view(position)
+    frames = steel_frames(prediction, steel, position)
+    return ViewResult(numbers, view_samples(prediction, steel, numbers.get("scale", math.nan), frames), frames)
 
 
 def tabulate_config(
@@ -181,12 +178,18 @@ def tabulate_config(
     table = tabulate(frame, scored, kind, declaration)
     if truth.config.whole is not truth.config:
         table = table.of_some_views(len(scored_counts(truth.config.whole)))
-    samples = None
-    if truth.extended:
-        found = zip(scored.view_ids, views, strict=True)
-        samples = {view_id: view.samples for view_id, view in found if view.samples is not None}
-    crossings = None if truth.steel is None else truth.steel.source
-    return ScoredConfig(truth.config, crossings, frame, table, samples)
+    if not truth.extended:
+        return ScoredConfig(frame, table, None)
+    from rebar_depth_bench.extended.families import ExtendedViews
+
+    found = zip(scored.view_ids, views, strict=True)
+    extended = ExtendedViews(
+        truth.config,
+        None if truth.steel is None else truth.steel.source,
+        {view_id: view.samples for view_id, view in found if view.samples is not None},
+        [view.frames for view in views if view.frames is not None],
+    )
+    return ScoredConfig(frame, table, extended)
 
 
 def scored_result(
@@ -202,13 +205,11 @@ def scored_result(
     kept: Mapping[str, KeptPredictions] | None = None,
 ) -> ScoredResult:
     """Return the result of scored configs; ``ScoredResult`` documents the other arguments."""
-    extended = None
-    if any(one.samples is not None for one in scored.values()):
+    extended, samples = None, [one.extended for one in scored.values() if one.extended is not None]
+    if samples:
         from rebar_depth_bench.extended.families import extended_result
 
-        extended = extended_result(
-            {name: (one.config, one.crossings, one.samples or {}) for name, one in scored.items()}
-        )
+        extended = extended_result(samples)
     return ScoredResult(
         dataset=DatasetIdentity(folder.digest, folder.version),
         submission=submission,

@@ -19,7 +19,7 @@ from rebar_depth_bench.data.rows import RenderedEye
 from rebar_depth_bench.data.schema import ViewRecord
 from rebar_depth_bench.geometry.cameras import Camera, look_at
 from rebar_depth_bench.scoring.protocol import PROTOCOL
-from tests.bench.extended.cage_scenes import FOCAL_PX, HEIGHT, WIDTH, bar, cast
+from tests.bench.extended.cage_scenes import FOCAL_PX, HEIGHT, WIDTH, bar, cast, pixel_directions
 from tests.synthetic_dataset import config_entry, scene_entry
 
 VIEWS = 6
@@ -44,12 +44,33 @@ def poses(count: int) -> list[np.ndarray]:
     ]
 
 
-def mat_views(ids: Sequence[str], scene: str, bars: Sequence[Bar]) -> list[View]:
-    """Return the views of a mat with the given ids."""
+DECK_Z_M = -0.061
+"""Height of the deck, 30 mm below the lying bars of the mat and 51 mm below the upright ones."""
+DECK = {"name": "deck", "point_m": [0.4, 0.2, DECK_Z_M], "normal": [0.0, 0.0, 1.0]}
+
+
+def on_deck_m(pose: np.ndarray) -> np.ndarray:
+    """Return the planar depth, metres, at which the ray of each pixel meets the deck."""
+    rotation, shift_m = pose[:3, :3], pose[:3, 3]
+    camera_z_m = -(rotation.T @ shift_m)[2]
+    return np.asarray((DECK_Z_M - camera_z_m) / (pixel_directions() @ rotation[:, 2]))
+
+
+def mat_views(
+    ids: Sequence[str],
+    scene: str,
+    bars: Sequence[Bar],
+    *,
+    with_deck: bool = False,
+    at: Sequence[np.ndarray] | None = None,
+) -> list[View]:
+    """Return the views of a mat with the given ids, at poses (default: those of ``poses``)."""
     K = np.array([[FOCAL_PX, 0, (WIDTH - 1) / 2], [0, FOCAL_PX, (HEIGHT - 1) / 2], [0, 0, 1.0]])
     views = []
-    for view_id, pose in zip(ids, poses(len(ids)), strict=True):
+    for view_id, pose in zip(ids, poses(len(ids)) if at is None else at, strict=True):
         depth_m, bar_ids = cast([item for item in bars if item.has_axis], pose)
+        if with_deck:
+            depth_m = np.where(bar_ids > 0, depth_m, on_deck_m(pose))
         depth_m, bar_ids = (image.reshape(HEIGHT, WIDTH) for image in (depth_m, bar_ids))
         eye = RenderedEye(
             Camera(K, np.zeros(5), pose, WIDTH, HEIGHT),
@@ -62,10 +83,20 @@ def mat_views(ids: Sequence[str], scene: str, bars: Sequence[Bar]) -> list[View]
     return views
 
 
-def write_mat_dataset(root: Path, *, with_crossings: bool = True) -> dict[str, np.ndarray]:
-    """Write the folder with the configs ``mat`` and ``cages``; return the left depth of every view by id."""
+def write_mat_dataset(
+    root: Path,
+    *,
+    with_crossings: bool = True,
+    with_deck: bool = False,
+    at: Sequence[np.ndarray] | None = None,
+) -> dict[str, np.ndarray]:
+    """Write the folder with the configs ``mat`` and ``cages``; return the left depth of every view by id.
+
+    With ``with_deck``, all mats lie above a deck of formwork. ``at`` are the poses of the views of ``mat``.
+    """
+    views_of_mat = VIEWS if at is None else len(at)
     bars = {CONFIG: mat_bars(), **{name: mat_bars((-0.06, 0.01 * i)) for i, name in enumerate(SCENES)}}
-    by_scene = {CONFIG: [f"{CONFIG}/{index:04d}" for index in range(VIEWS)]}
+    by_scene = {CONFIG: [f"{CONFIG}/{index:04d}" for index in range(views_of_mat)]}
     by_scene |= {
         name: [f"{CAGES}/{split}-{name}-{index:04d}" for index in range(2)] for name, split in SCENES.items()
     }
@@ -74,23 +105,25 @@ def write_mat_dataset(root: Path, *, with_crossings: bool = True) -> dict[str, n
     depths: dict[str, np.ndarray] = {}
     shards: dict[str, tuple[str, list[ViewRecord]]] = {}
     for scene, ids in by_scene.items():
-        views = mat_views(ids, scene, bars[scene])
+        views = mat_views(ids, scene, bars[scene], with_deck=with_deck, at=at if scene == CONFIG else None)
         encoded = [encode_view(view) for view in views]
         depths |= {view.view_id: view.left.depth_m for view in views}
         folder = CONFIG if scene == CONFIG else CAGES
         (root / folder).mkdir(parents=True, exist_ok=True)
         shard = f"{folder}/{scene}.parquet"
-        pq.write_table(pa.concat_tables([table for table, _ in encoded]), root / shard, row_group_size=1)
+        rows = pa.concat_tables([table for table, _ in encoded])
+        pq.write_table(rows, root / shard, row_group_size=1, write_statistics=False)
         shards[scene] = shard, [record for _, record in encoded]
         records += shards[scene][1]
+    planes = {"planes": [DECK]} if with_deck else {}
     entries[CONFIG] = {
         **config_entry(shards[CONFIG][1], WIDTH, HEIGHT),
-        "scenes": [scene_entry(CONFIG, VIEWS, shards[CONFIG][0])],
+        "scenes": [scene_entry(CONFIG, views_of_mat, shards[CONFIG][0]) | planes],
     }
     entries[CAGES] = {
         **config_entry([record for name in SCENES for record in shards[name][1]], WIDTH, HEIGHT),
         "has_splits": True,
-        "scenes": [scene_entry(name, 2, shards[name][0], split) for name, split in SCENES.items()],
+        "scenes": [scene_entry(name, 2, shards[name][0], split) | planes for name, split in SCENES.items()],
     }
     _write_tables(root, bars, entries, records, with_crossings)
     return depths

@@ -1,4 +1,4 @@
-"""Scale and error of predictions over the distance of the steel (paper, Sec. III.B), and the reach at crossings.
+"""Scale and error of predictions over the distance of the steel (paper, Sec. III.B).
 
     python examples/paper/distance.py a.zip --data ROOT --figure distance.pdf
 
@@ -26,8 +26,6 @@ from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.base.terminal import ProgressBars
 from rebar_depth_bench.cli.console import add_archive, add_data
 from rebar_depth_bench.data.manifest import DatasetConfig
-from rebar_depth_bench.extended.ground_truth import has_bar_ids
-from rebar_depth_bench.reporting.extended_tables import reach_sentence
 from rebar_depth_bench.scoring import bootstrap
 from rebar_depth_bench.scoring.evaluation import Evaluation, open_evaluation
 from rebar_depth_bench.scoring.metrics import mean
@@ -44,7 +42,7 @@ VIEW_COLUMNS = ["view_id", "distance_m", "scale", *ERRORS]
 
 def argument_parser() -> argparse.ArgumentParser:
     """Return the parser of the script's arguments."""
-    parser = argparse.ArgumentParser(description="scale and error of predictions by distance, reach at crossings")
+    parser = argparse.ArgumentParser(description="scale and error of predictions by distance")
     add_archive(parser)
     add_data(parser)
     parser.add_argument("--config", nargs="+", metavar="NAME", help="configs (default: all in the archive)")
@@ -160,18 +158,14 @@ def draw_figure(figure: Figure, views: pd.DataFrame, bins: pd.DataFrame) -> None
 
 
 def run(options: argparse.Namespace) -> None:
-    """Compute slopes, bins and reaches, write the requested files and print them."""
+    """Compute slopes and bins, write the requested files and print them."""
     with ProgressBars() as bars, open_evaluation(options.archive, options.data) as evaluation:
         result = score(options.archive, evaluation.folder, extended=True, progress=bars.update)
-        assert result.extended is not None
         present = {config.name: config for config in evaluation.configs}
         names = dict.fromkeys(options.config or present)
         if names.keys() - present.keys():
             raise InputError(f"{options.archive}: holds {', '.join(present)}, expected --config with some of them")
         by_config = {name: view_table(evaluation, present[name], result) for name in names}
-        reaches = {name: result.extended.tables[name].reaches for name in names if has_bar_ids(present[name])}
-        measures = result.extended.to_dict()
-        source = {"crossings": measures["crossings"]}
         provenance = evaluation.provenance().to_dict() | {"intervals": bootstrap.INTERVALS}
     slopes = [scale_slope(name, {name: of_config}) for name, of_config in by_config.items()]
     slopes += [scale_slope("all", by_config)] if len(by_config) > 1 else []
@@ -184,12 +178,9 @@ def run(options: argparse.Namespace) -> None:
         "bins_per_decade": options.bins_per_decade,
         "slopes": slopes,
         "bins": bin_rows,
-        "crossing_reach": {name: source | measures["tables"][name]["crossing_reach"] for name in reaches},
         "views": views[VIEW_COLUMNS].assign(single_bar=single_bars).to_dict("records"),
     }
     notes = ["Slope of log s over log distance:", flat_table(slopes).to_string(index=False, na_rep="-")]
-    for name, found in reaches.items():
-        notes += [f"{name}: {reach_sentence(align, of_one[0])}" for align, of_one in found.items()]
     shown = [name for name in table if not name.startswith("single_bar")]
     write_outputs(options, content, table, shown, notes, lambda figure: draw_figure(figure, views, table))
 

@@ -214,22 +214,33 @@ def add_expect_digest(parser: argparse.ArgumentParser) -> None:
 
 
 def score_archives(
-    archives: Sequence[str], options: argparse.Namespace, check_kinds: Callable[[Sequence[tuple[str, str]]], None]
+    archives: Sequence[str],
+    options: argparse.Namespace,
+    check_kinds: Callable[[Sequence[tuple[str, str]]], None] | None = None,
+    *,
+    extended: bool = False,
 ) -> list[Result]:
-    """Score archives with a command's options; before any, call ``check_kinds`` with method and kind of each."""
+    """Score archives with a command's options; before any, call ``check_kinds`` with method and kind of each.
+
+    With ``extended``, all must be metric.
+    """
     from rebar_depth_bench.data.manifest import open_folder  # Most commands do not score.
     from rebar_depth_bench.scorer import score
     from rebar_depth_bench.scoring.evaluation import open_evaluation
 
     folder = open_folder(options.data, expect_digest=options.expect_digest)
+    align = None if extended else options.align
     kinds = []
     for archive in archives:  # Opened twice: kinds that do not fit are refused before the first is scored.
         with open_evaluation(archive, folder) as evaluation:
-            kinds.append((evaluation.meta.method, evaluation.scored_kind(options.align)))
-    check_kinds(kinds)
+            kinds.append((evaluation.meta.method, evaluation.scored_kind(align)))
+            if extended:
+                evaluation.require_metric("extended measures are in metres")
+    if check_kinds is not None:
+        check_kinds(kinds)
     with ProgressBars() as bars:
         return [
-            score(archive, folder, workers=options.workers, align=options.align, progress=bars.update)
+            score(archive, folder, workers=options.workers, align=align, extended=extended, progress=bars.update)
             for archive in archives
         ]
 

@@ -25,6 +25,9 @@ COMMANDS: Mapping[str, Command] = {
     "table": module_command(
         f"{_CLI}.table", "print several submissions and the paper's rows in the layout of its Table I"
     ),
+    "tasks": module_command(
+        f"{_CLI}.tasks", "state at which distances methods can be used for which task on bars and crossings"
+    ),
     "check": module_command(f"{_CLI}.check", "list all problems of a submission archive"),
     "verify": module_command(
         f"{_CLI}.check",

@@ -40,7 +40,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--extended",
         action="store_true",
-        help="also compute boundary, point cloud, layer, per-bar inspection and alignment measures",
+        help="also compute boundary, point cloud and disparity measures, and measures of bars and crossings",
     )
     parser.add_argument(
         "--family",
@@ -48,6 +48,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="print all measures of one family of the extended ones, which --extended names (implies --extended)",
     )
     add_output_file(parser, "--extended-csv", "write the extended measures as CSV (implies --extended)")
+    add_output_file(parser, "--bars-csv", "write a row per judged bar and view as CSV (implies --extended)")
+    add_output_file(
+        parser, "--spacings-csv", "write a row per pair of neighbouring bars as CSV (implies --extended)"
+    )
+    add_output_file(parser, "--crossings-csv", "write a row per judged crossing as CSV (implies --extended)")
     add_workers(parser)
 
 
@@ -55,7 +60,8 @@ def run(options: argparse.Namespace) -> None:
     """Score an archive, write the requested files and print the tables."""
     if options.html_views < 0:
         raise InputError(f"--html-views is {options.html_views}, expected 0 or more")
-    is_extended = options.extended or options.extended_csv or options.family is not None
+    has_samples = options.bars_csv or options.spacings_csv or options.crossings_csv
+    is_extended = options.extended or options.extended_csv or has_samples or options.family is not None
     if options.align and is_extended:
         raise InputError("--align and --extended are both given: extended measures need metric predictions")
     if options.family is not None:
@@ -89,6 +95,13 @@ def run(options: argparse.Namespace) -> None:
         from rebar_depth_bench.reporting.extended_tables import extended_csv
 
         write_output(options.extended_csv, extended_csv(result))
+    if result.extended is not None:
+        if options.bars_csv:
+            write_output(options.bars_csv, result.extended.to_samples_sheet("bars").to_csv())
+        if options.spacings_csv:
+            write_output(options.spacings_csv, result.extended.to_samples_sheet("spacings").to_csv())
+        if options.crossings_csv:
+            write_output(options.crossings_csv, result.extended.to_samples_sheet("crossings").to_csv())
     if prints_table(options):
         print_table(result, Console())
         if result.extended is not None:

@@ -353,11 +353,23 @@ class SceneRig(ManifestTable):
 _Deviation = Annotated[float, number(-1, 1)]
 
 
+def _is_unit(vector: tuple[float, ...]) -> bool:
+    return abs(math.hypot(*vector) - 1) <= 1e-9
+
+
 class MatRecord(ManifestTable):
     """Deviation of the cover of a mat as built: least and largest, metres, and whether beyond the tolerance."""
 
     deviation_m: Annotated[tuple[_Deviation, _Deviation], Strict(False)]
     beyond: bool
+
+
+class FormPlane(ManifestTable):
+    """Plane of formwork: a point, and the unit normal towards the side on which the steel is; world, metres."""
+
+    name: Name
+    point_m: Annotated[Triple, three_numbers(-1e9, 1e9, "three numbers, [x, y, z]")]
+    normal: Annotated[Triple, Expected("three numbers, a vector of length 1", _is_unit)]
 
 
 class Scene(ManifestTable):
@@ -366,15 +378,16 @@ class Scene(ManifestTable):
     ``board`` is the ArUco board under the assembly, or None; ``protocol_views`` is the number of views of the full
     trajectory; ``aim_point_m`` is the point that its cameras aim at, world metres, if they share one; ``bytes`` is
     the size of the shards; ``key`` is the digest of all parameters. ``family`` is the kind of cage of a generated
-    scene, otherwise None, and ``mats`` are its parts that deviate together. ``assembly``, ``trajectory``,
-    ``rig`` and ``mesh`` are None in a config that was imported. ``entry`` is the scene as it was written, with all
-    parameters of the build.
+    scene, otherwise None, and ``mats`` are its parts that deviate together. ``planes`` are the faces of formwork
+    that the cover of the steel is measured from. ``assembly``, ``trajectory``, ``rig`` and ``mesh`` are None in a
+    config that was imported. ``entry`` is the scene as it was written, with all parameters of the build.
     """
 
     name: Name
     split: Annotated[str, one_of(*SPLITS)]
     family: Name | None = None
     mats: Annotated[tuple[MatRecord, ...], Strict(False)] = Field((), validation_alias=AliasPath("cage", "mats"))
+    planes: Annotated[tuple[FormPlane, ...], Strict(False)] = ()
     assembly: Assembly | None = None
     board: BoardSpec | None
     environment: Annotated[str, StringConstraints(max_length=60)] = ""

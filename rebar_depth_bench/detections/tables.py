@@ -15,8 +15,7 @@ from numpy import ndarray
 from rebar_depth_bench import software_version
 from rebar_depth_bench.bar_crossings.crossings_file import CrossingsSource
 from rebar_depth_bench.detections.matching import CHANCE_DRAWS, DETECTIONS_PROTOCOL, HEADLINE_MM, LIMITS_MM, SUMS
-from rebar_depth_bench.extended.measures import percentile
-from rebar_depth_bench.extended.reach import pooled
+from rebar_depth_bench.extended.measures import percentile, pooled
 from rebar_depth_bench.scoring.bootstrap import INTERVALS, Interval, Resampling, interval
 from rebar_depth_bench.scoring.columns import rounded, rounded_interval
 from rebar_depth_bench.submission.declaration import SubmissionMeta

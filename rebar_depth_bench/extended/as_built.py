@@ -1,9 +1,7 @@
-"""As built against as designed: the deviation of bars from their nominal axes, as measured and as it is.
+"""As built against as designed: the deviation of bars from their nominal axes.
 
-For each straight bar segment that a view shows, of a bar with a nominal axis, a cylinder is fitted to the
-predicted points as for the other measures of inspection. In the middle of what is seen of the segment, the vectors
-from the nominal axis to the fitted axis and to the axis as built, both across the nominal axis, are compared.
-Frame: the camera's, metres.
+In the middle of what is seen of a straight segment of a bar with a nominal axis, the deviation is the vector from
+the nominal axis to the axis as built, or to the fitted one, across the nominal axis. Frame: the camera's, metres.
 
 The axis as built is the whole polyline, not its straight segments, which leave out the bow of a bar.
 """
@@ -13,19 +11,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Float64
+from jaxtyping import Float64, Int64
 from numpy import ndarray
 
 from rebar_depth_bench.bar_crossings.axis_segments import nearest_points
-from rebar_depth_bench.extended.fits import fit_axes, with_misses
-from rebar_depth_bench.extended.inspection import JUDGED_NOTE, MISSED_NOTE
 from rebar_depth_bench.extended.judged import VisibleSegments
-from rebar_depth_bench.extended.measures import Measure, Samples
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.geometry.cameras import transform
-
-OFF_MM = 10.0
-"""Deviation above which a bar is off: the tolerance of bar spacing in GB 50204 (from a secondary source)."""
 
 MAX_TURN_DEG = 30.0
 """Largest angle between a segment and the part of its nominal axis that it is compared with, degrees.
@@ -33,50 +25,23 @@ MAX_TURN_DEG = 30.0
 It keeps the other arms of a bent bar and its bends apart.
 """
 
-_MM = 1000.0
-
-
-def as_built_samples(p_m: Float64[ndarray, " n"], designed: DesignedSegments | None) -> Samples:
-    """Return the samples of one view; ``MEASURES`` defines what each is.
-
-    ``p_m`` is the predicted planar depth on the pixels of ``SteelTruth`` in metres; values that are not finite and
-    > 0 count as missing. Without ``designed_segments`` there are no samples. Which segments are judged depends on
-    the ground truth alone.
-    """
-    if designed is None:
-        return {}
-    fitted = fit_axes(p_m, designed.shown)
-    fitted_m = np.where(fitted.found[:, None], fitted.point_m, np.nan)
-    measured_m = _across(fitted_m - designed.nominal_m, designed.direction)
-    true_mm, measured_mm, error_mm = (
-        np.linalg.norm(vector_m, axis=1) * _MM
-        for vector_m in (designed.true_m, measured_m, measured_m - designed.true_m)
-    )
-    is_off, is_reported = true_mm > OFF_MM, measured_mm > OFF_MM
-    return {
-        "deviation_judged_mm": with_misses(error_mm),
-        "deviation_excess_mm": (measured_mm - true_mm)[fitted.found],
-        "deviation_true_mm": true_mm,
-        "off_reported": is_reported[is_off].astype(np.float64),
-        "off_confirmed": is_off[is_reported].astype(np.float64),
-    }
-
 
 @dataclass(frozen=True, eq=False)
 class DesignedSegments:
-    """Judged segments of a view: what is seen of them, and a point and the direction of the nominal axis, metres.
+    """Visible segments of bars with a nominal axis: a point and the direction of that axis, metres.
 
-    ``true_m`` are the vectors from the nominal axis to the axis as built, across the nominal one.
+    ``row`` holds positions among the visible segments. ``true_m`` are the vectors from the nominal axis to the
+    axis as built, across the nominal one.
     """
 
-    shown: VisibleSegments
+    row: Int64[ndarray, " r"]
     nominal_m: Float64[ndarray, "r 3"]
     direction: Float64[ndarray, "r 3"]
     true_m: Float64[ndarray, "r 3"]
 
 
-def designed_segments(truth: SteelTruth, visible: VisibleSegments) -> DesignedSegments | None:
-    """Return the visible segments of bars with a nominal axis; None if there are none."""
+def designed_segments(truth: SteelTruth, visible: VisibleSegments) -> DesignedSegments:
+    """Return the visible segments of bars with a nominal axis."""
     bars = truth.bars
     rows, built, nominal = [], [], []
     for row, bar_id in enumerate(bars.cage.bar_id[visible.segment].tolist()):
@@ -92,12 +57,9 @@ def designed_segments(truth: SteelTruth, visible: VisibleSegments) -> DesignedSe
             rows.append(row)
             built.append(built_m)
             nominal.append(nominal_edge)
-    if not rows:
-        return None
-    nominal_m, direction = np.array(nominal).transpose(1, 0, 2)
-    return DesignedSegments(
-        visible.of(np.array(rows)), nominal_m, direction, _across(np.array(built) - nominal_m, direction)
-    )
+    nominal_m, direction = np.array(nominal).reshape(-1, 2, 3).transpose(1, 0, 2)
+    from_nominal_m = np.array(built).reshape(-1, 3) - nominal_m
+    return DesignedSegments(np.array(rows, np.int64), nominal_m, direction, across(from_nominal_m, direction))
 
 
 def _nearest_edge(
@@ -118,50 +80,6 @@ def _nearest_edge(
     return nearest_m[edge], direction[edge]
 
 
-def _across(vector_m: Float64[ndarray, "r 3"], direction: Float64[ndarray, "r 3"]) -> Float64[ndarray, "r 3"]:
+def across(vector_m: Float64[ndarray, "r 3"], direction: Float64[ndarray, "r 3"]) -> Float64[ndarray, "r 3"]:
     """Return the parts of vectors across the directions."""
     return np.asarray(vector_m - np.einsum("ri,ri->r", vector_m, direction)[:, None] * direction)
-
-
-_DEVIATION = (
-    "vector from the nominal axis to the axis of the bar, across the nominal one, in the middle of what is seen "
-    "of a run; bars with a nominal axis"
-)
-_ERROR = "length of the difference of the deviations by the fitted axis and by the axis as built"
-
-MEASURES = (
-    Measure(
-        "deviation_median_mm", "deviation from the design: median error", "mm", "lower",
-        f"Median {_ERROR}. Deviation: {_DEVIATION}. {MISSED_NOTE} {JUDGED_NOTE}", "deviation_judged_mm", "median",
-    ),
-    Measure(
-        "deviation_p95_mm", "deviation from the design: p95 error", "mm", "lower",
-        f"95th percentile of the {_ERROR}. {MISSED_NOTE}", "deviation_judged_mm", "p95",
-    ),
-    Measure(
-        "deviation_bias_mm", "deviation from the design: bias", "mm", "",
-        "Mean length of the deviation by the fitted axis minus that by the axis as built, over found runs.",
-        "deviation_excess_mm",
-    ),
-    Measure(
-        "deviation_true_median_mm", "deviation as built: median", "mm", "",
-        "Median length of the deviation by the axis as built, from the ground truth alone: the error of a report "
-        "that all bars are as designed.", "deviation_true_mm", "median",
-    ),
-    Measure(
-        "deviation_true_p95_mm", "deviation as built: p95", "mm", "",
-        "95th percentile of the length of the deviation by the axis as built, from the ground truth alone.",
-        "deviation_true_mm", "p95",
-    ),
-    Measure(
-        "off_recall", f"bars off by more than {OFF_MM:g} mm: recall", "%", "higher",
-        f"Share of the runs as built more than {OFF_MM:g} mm off the nominal axis whose fitted axis is, too; what "
-        "was not found counts as a failure. The samples are the runs that are off.", "off_reported",
-    ),
-    Measure(
-        "off_precision", f"bars off by more than {OFF_MM:g} mm: precision", "%", "",
-        f"Share of the runs with a fitted axis more than {OFF_MM:g} mm off the nominal one that are as built, "
-        "too. The samples are the runs that are reported as off.", "off_confirmed",
-    ),
-)  # fmt: skip
-"""Measures of deviations from the design in table order."""

@@ -6,7 +6,7 @@ be applied. Determined from the ground truth alone. Frame: world, metres.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -133,7 +133,8 @@ Segments are compared pairwise, in memory quadratic in their number: 0.8 GB for 
 class CageTruth:
     """Straight bar segments of a scene and the pairs of neighbours among them; world, metres.
 
-    ``bar_id`` and ``diameter_m`` describe the bar of each segment. ``neighbours`` holds indices of segments, the
+    ``bar_id`` and ``diameter_m`` describe the bar of each segment, and ``line_m`` are the points of its axis from
+    ``start_m`` to ``end_m``, between which a bar may be bowed. ``neighbours`` holds indices of segments, the
     lower one first: see ``overlapping_pairs``; ``spacing_m`` is the distance of their axes in the middle of their
     overlap. ``match_radius_m`` is half the distance from each segment to the nearest parallel segment of any bar,
     at most ``MAX_MATCH_RADIUS_M``: a fitted axis farther away than that is attributed to another bar.
@@ -143,6 +144,7 @@ class CageTruth:
     diameter_m: Float64[ndarray, " r"]
     start_m: Float64[ndarray, "r 3"]
     end_m: Float64[ndarray, "r 3"]
+    line_m: Sequence[Float64[ndarray, "k 3"]]
     neighbours: Int64[ndarray, "m 2"]
     spacing_m: Float64[ndarray, " m"]
     match_radius_m: Float64[ndarray, " r"]
@@ -156,18 +158,18 @@ def cage_truth(bars: Iterable[Bar]) -> CageTruth:
 
     Raises ``DatasetError`` if there are more than ``MAX_SEGMENTS``.
     """
-    segments = [(bar, *ends_m) for bar in with_axis(bars) for ends_m in _straight_segments(bar)]
+    segments = [(bar, line_m) for bar in with_axis(bars) for line_m in _straight_segments(bar)]
     if len(segments) > MAX_SEGMENTS:
         raise DatasetError(f"the bars have {len(segments)} straight runs, expected up to {MAX_SEGMENTS}")
-    bar_id = np.array([bar.bar_id for bar, _, _ in segments], dtype=np.int64)
-    diameter_m = np.array([bar.diameter_m for bar, _, _ in segments], dtype=np.float64)
-    start_m = np.array([start_m for _, start_m, _ in segments], dtype=np.float64).reshape(-1, 3)
-    end_m = np.array([end_m for _, _, end_m in segments], dtype=np.float64).reshape(-1, 3)
+    bar_id = np.array([bar.bar_id for bar, _ in segments], dtype=np.int64)
+    diameter_m = np.array([bar.diameter_m for bar, _ in segments], dtype=np.float64)
+    lines_m = [line_m for _, line_m in segments]
+    start_m, end_m = (np.array([line_m[end] for line_m in lines_m]).reshape(-1, 3) for end in (0, -1))
     parallel_m = parallel_pairs(start_m, end_m, diameter_m)
     match_radius_m = np.minimum(parallel_m[0].min(axis=1, initial=np.inf) / 2, MAX_MATCH_RADIUS_M)
     neighbours = overlapping_pairs(parallel_m, bar_id, diameter_m)
     spacing_m = parallel_m[0][neighbours[:, 0], neighbours[:, 1]]
-    return CageTruth(bar_id, diameter_m, start_m, end_m, neighbours, spacing_m, match_radius_m)
+    return CageTruth(bar_id, diameter_m, start_m, end_m, lines_m, neighbours, spacing_m, match_radius_m)
 
 
 def assign_segments(
@@ -206,8 +208,8 @@ def is_on_surface(distance_m: Float64[ndarray, " n"], diameter_m: float) -> Bool
     return np.asarray((radii >= SURFACE_DISTANCE_RADII[0]) & (radii <= SURFACE_DISTANCE_RADII[1]))
 
 
-def _straight_segments(bar: Bar) -> Iterator[tuple[Float64[ndarray, " 3"], Float64[ndarray, " 3"]]]:
-    """Yield the ends of the straight segments of a bar that are long enough, from its first point to its last.
+def _straight_segments(bar: Bar) -> Iterator[Float64[ndarray, "k 3"]]:
+    """Yield the points of the straight segments of a bar that are long enough, from its first point to its last.
 
     All edges of a segment follow the direction of its first one.
     """
@@ -219,7 +221,7 @@ def _straight_segments(bar: Bar) -> Iterator[tuple[Float64[ndarray, " 3"], Float
     for edge in range(1, len(directions) + 1):
         if edge == len(directions) or directions[first] @ directions[edge] < least_cosine:
             if np.linalg.norm(points_m[edge] - points_m[first]) >= MIN_SEGMENT_DIAMETERS * bar.diameter_m:
-                yield points_m[first], points_m[edge]
+                yield points_m[first : edge + 1]
             first = edge
 
 

@@ -39,8 +39,8 @@ def boundary_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
     """Return a view's boundary samples; ``p_m`` is planar depth on ``truth.index``, metres, NaN where missing.
 
     Each of ``boundary_f1``, ``boundary_precision``, ``boundary_recall`` (means over the t that have a true
-    contour), ``boundary_f1_<t>pct`` and ``boundary_missing`` (share of pairs with a missing prediction) has one
-    value from 0 to 1. There is none where the view has no true contour (for ``boundary_missing``: no pair).
+    contour) and ``boundary_missing`` (share of pairs with a missing prediction) has one value from 0 to 1. There
+    is none where the view has no true contour (for ``boundary_missing``: no pair).
     """
     first, second = neighbour_pairs(truth.index, truth.bar_id > 0, truth.height, truth.width)
     missing, true, predicted, correct = contour_counts(p_m, truth.depth_m.astype(np.float64), first, second)
@@ -50,10 +50,8 @@ def boundary_samples(p_m: Float64[ndarray, " n"], truth: SteelTruth) -> Samples:
         "precision": (correct / np.maximum(predicted, 1))[has_contour],  # 0 for nothing predicted
         "recall": (correct / np.maximum(true, 1))[has_contour],
     }
-    thresholds = np.array(THRESHOLDS_PERCENT)[has_contour].tolist()
     return {
         **{f"boundary_{name}": values.mean(keepdims=True) for name, values in shares.items() if len(values)},
-        **{f"boundary_f1_{t}pct": shares["f1"][i : i + 1] for i, t in enumerate(thresholds)},
         "boundary_missing": share_sample(missing, len(first)),
     }
 
@@ -125,13 +123,6 @@ MEASURES = (
     Measure("boundary_f1", "Boundary F1", "%", "higher", f"2 right / (predicted + true), {_MEAN}"),
     Measure("boundary_precision", "Boundary precision", "%", "higher", f"right / predicted contours, {_MEAN}"),
     Measure("boundary_recall", "Boundary recall", "%", "higher", f"right / true contours, {_MEAN}"),
-    *(
-        Measure(
-            f"boundary_f1_{t}pct", f"Boundary F1, steps over {t} %", "%", "higher",
-            f"2 right / (predicted + true) at t = {t} % ({_PAIRS}; {_MISSING})",
-        )
-        for t in THRESHOLDS_PERCENT
-    ),
     Measure(
         "boundary_missing", "Pairs without prediction", "%", "lower",
         "share of neighbour pixel pairs at the steel of which a prediction is missing",

@@ -2,18 +2,26 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import asdict, dataclass, field, fields
+from functools import cached_property
+from typing import Any, Literal
 
 import numpy as np
 from jaxtyping import Float64, Int64
 from numpy import ndarray
 
 from rebar_depth_bench.bar_crossings.crossings_file import CrossingsSource
-from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, STATISTICS, Measure, Samples, Statistic
-from rebar_depth_bench.extended.reach import Reach, pooled, reaches
+from rebar_depth_bench.extended.frames import BarSamples, CrossingSamples, SpacingSamples, SteelFrames
+from rebar_depth_bench.extended.measures import (
+    EXTENDED_PROTOCOL,
+    STATISTICS,
+    Measure,
+    Samples,
+    Statistic,
+    pooled,
+)
+from rebar_depth_bench.extended.tasks import ConfigTasks, config_tasks
 from rebar_depth_bench.scoring.bootstrap import Interval, Resampling, interval
 from rebar_depth_bench.scoring.columns import rounded, rounded_interval
 from rebar_depth_bench.scoring.spreadsheet import Sheet
@@ -31,8 +39,7 @@ _ESTIMATE_COLUMNS = ("config", "alignment", "measure", "unit", "statistic", "val
 class MeasureEstimate:
     """Value of a measure, its 95 % block bootstrap interval, and the number of pooled samples.
 
-    ``value`` and ``interval`` are None without samples. ``value`` is also None where ``Measure.convert`` returns
-    None for the statistic.
+    ``value`` and ``interval`` are None without samples.
     """
 
     value: float | None
@@ -46,11 +53,10 @@ class MeasureEstimate:
 
 @dataclass(frozen=True)
 class ExtendedTable:
-    """Estimates of one config by alignment and measure name, and the reaches at its crossings by alignment."""
+    """Estimates of one config by alignment and measure name."""
 
     views: int
     numbers: Mapping[str, Mapping[str, MeasureEstimate]]
-    reaches: Mapping[str, tuple[Reach, ...]] = field(default_factory=dict)
 
     def to_dict(self) -> dict[str, Any]:
         """Return the JSON object of the table."""
@@ -58,24 +64,29 @@ class ExtendedTable:
             alignment: {name: estimate.to_dict() for name, estimate in of_alignment.items()}
             for alignment, of_alignment in self.numbers.items()
         }
-        reaches = {
-            name: [reach.to_dict() for reach in of_alignment] for name, of_alignment in self.reaches.items()
-        }
-        return {"views": self.views, **numbers, "crossing_reach": reaches}
+        return {"views": self.views, **numbers}
 
 
 @dataclass(frozen=True, eq=False)
 class ExtendedResult:
     """Extended measures of a submission; ``measures`` holds the definitions of each alignment, in order.
 
-    ``views`` holds the measures of each view by id, alignment and name. ``crossings`` is None if no config has bar
-    ids.
+    ``views`` holds the measures of each view by id, alignment and name. ``frames`` are the samples of bars and
+    crossings of each config that has bar ids and views, and ``scenes`` the scene of each of these views by its id,
+    in order. ``crossings`` is None if no config has bar ids.
     """
 
     measures: Mapping[str, Sequence[Measure]]
     tables: Mapping[str, ExtendedTable]
     views: Mapping[str, ViewMeasures]
+    frames: Mapping[str, SteelFrames] = field(default_factory=dict)
+    scenes: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
     crossings: CrossingsSource | None = None
+
+    @cached_property
+    def tasks(self) -> Mapping[str, ConfigTasks]:
+        """Working ranges of each config that has ``frames``, computed on the first access."""
+        return {config: config_tasks(frames, self.tables[config].views) for config, frames in self.frames.items()}
 
     def to_dict(self) -> dict[str, Any]:
         """Return the ``extended`` object of the result's JSON."""
@@ -111,6 +122,35 @@ class ExtendedResult:
         ]
         return Sheet(_ESTIMATE_COLUMNS, rows)
 
+    def to_samples_sheet(self, rows: Literal["bars", "spacings", "crossings"]) -> Sheet:
+        """Return one row per sample of native predictions: of judged bars, pairs of neighbours, or crossings.
+
+        A vector has a column for each of x, y and z. What was not found, or is not judged, is undefined.
+        """
+        kind: type[BarSamples | SpacingSamples | CrossingSamples]
+        parts: dict[str, BarSamples] | dict[str, SpacingSamples] | dict[str, CrossingSamples]
+        steel = {config: frames.native.predicted for config, frames in self.frames.items()}
+        if rows == "bars":
+            kind, parts = BarSamples, {config: one.bars for config, one in steel.items()}
+        elif rows == "spacings":
+            kind, parts = SpacingSamples, {config: one.spacings for config, one in steel.items()}
+        else:
+            kind, parts = CrossingSamples, {config: one.crossings for config, one in steel.items()}
+        names = [one.name for one in fields(kind) if one.name != "view"]
+        axes = {
+            "point_m": [f"point_{axis}_m" for axis in "xyz"],
+            "direction": [f"direction_{axis}" for axis in "xyz"],
+        }
+        cells: list[list[Any]] = []
+        for config, samples in parts.items():
+            scenes = list(self.scenes[config].items())
+            views = [(config, scenes[view][1], scenes[view][0]) for view in samples.view.tolist()]
+            columns = [getattr(samples, name).reshape(len(views), -1).tolist() for name in names]
+            for view, *values in zip(views, *columns, strict=True):
+                cells.append([*view, *(value for part in values for value in part)])
+        heads = [head for name in names for head in axes.get(name, [name])]
+        return Sheet(["config", "scene", "view_id", *heads], cells)
+
     def estimates(self) -> Iterator[tuple[str, str, Measure, MeasureEstimate]]:
         """Yield config, alignment, measure and estimate, in order."""
         for config, table in self.tables.items():
@@ -127,8 +167,6 @@ def view_measures(view: ViewSamples, measures: Mapping[str, Sequence[Measure]]) 
         for measure in of_alignment:
             samples = view[alignment].get(measure.sample, np.empty(0))
             value = STATISTICS[measure.statistic](samples) if len(samples) else None
-            if measure.convert is not None and value is not None:
-                value = measure.convert(value)
             values[alignment][measure.name] = value
     return values
 
@@ -137,17 +175,11 @@ def tabulate_extended(
     views: Sequence[ViewSamples], resampling: Resampling, measures: Mapping[str, Sequence[Measure]]
 ) -> ExtendedTable:
     """Return a config's table; ``resampling`` are the resamples of the views, from which its intervals follow."""
-    by_alignment = {alignment: [view[alignment] for view in views] for alignment in measures}
     return ExtendedTable(
         views=len(views),
         numbers={
-            alignment: _estimates(of_alignment, by_alignment[alignment], resampling)
+            alignment: _estimates(of_alignment, [view[alignment] for view in views], resampling)
             for alignment, of_alignment in measures.items()
-        },
-        reaches={
-            alignment: reaches(by_view, resampling)
-            for alignment, by_view in by_alignment.items()
-            if by_view and "crossing_z_m" in by_view[0]
         },
     )
 
@@ -161,26 +193,7 @@ def _estimates(
         key = (measure.sample, measure.statistic)
         if key not in statistics:
             statistics[key] = estimate(measure, by_view, resampling)
-    return {
-        measure.name: convert_estimate(measure, statistics[measure.sample, measure.statistic])
-        for measure in measures
-    }
-
-
-def convert_estimate(measure: Measure, statistic: MeasureEstimate) -> MeasureEstimate:
-    """Return the estimate of a measure: the estimate of its statistic, with ``convert`` applied to value and ends.
-
-    ``convert`` is decreasing, so the interval's ends are swapped. An end for which ``convert`` returns None
-    becomes 0; if the upper end is infinite there is no interval.
-    """
-    if measure.convert is None or statistic.value is None:
-        return statistic
-    value = measure.convert(statistic.value)
-    ends = None
-    if value is not None and statistic.interval is not None:
-        low, high = (measure.convert(end) or 0.0 for end in reversed(statistic.interval))
-        ends = (low, high) if math.isfinite(high) else None
-    return MeasureEstimate(value, ends, statistic.samples)
+    return {measure.name: statistics[measure.sample, measure.statistic] for measure in measures}
 
 
 def estimate(measure: Measure, by_view: Sequence[Samples], resampling: Resampling) -> MeasureEstimate:

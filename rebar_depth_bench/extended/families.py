@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
@@ -12,16 +13,13 @@ from rebar_depth_bench.bar_crossings.crossings_file import CrossingsSource
 from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.extended import (
     alignment,
-    as_built,
     boundary,
     crossings,
-    depth_layers,
     disparity,
     inspection,
     point_cloud,
-    profiles,
     published,
-    regions,
+    single_bar,
 )
 from rebar_depth_bench.extended.estimates import (
     ExtendedResult,
@@ -31,7 +29,7 @@ from rebar_depth_bench.extended.estimates import (
     tabulate_extended,
     view_measures,
 )
-from rebar_depth_bench.extended.judged import visible_segments
+from rebar_depth_bench.extended.frames import SteelFrames
 from rebar_depth_bench.extended.measures import NATIVE, ONCE, SCALED, Measure, MeasureFamily
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.bootstrap import resample_views
@@ -41,8 +39,7 @@ FAMILIES = (
     MeasureFamily("alignment", "Scale against shape", alignment.MEASURES, (ONCE,), "own alignment, see the row"),
     MeasureFamily("published", "Errors as papers print them", published.ERROR_MEASURES),
     MeasureFamily("disparity", "Disparity of rectified pairs", disparity.MEASURES),
-    MeasureFamily("full_mask", "Rim included", regions.FULL_MASK_MEASURES),
-    MeasureFamily("single_bar", "Single-bar interior", regions.SINGLE_BAR_MEASURES),
+    MeasureFamily("single_bar", "Single-bar interior", single_bar.MEASURES),
     MeasureFamily("boundary", "Boundary", boundary.MEASURES, (ONCE,), "independent of scale"),
     MeasureFamily(
         "published_boundary",
@@ -51,12 +48,10 @@ FAMILIES = (
         (ONCE,),
         "whole image, independent of scale",
     ),
-    MeasureFamily("layers", "Layers", depth_layers.MEASURES),
     MeasureFamily("clouds", "Point clouds", point_cloud.MEASURES),
-    MeasureFamily("inspection", "Inspection, bar by bar", inspection.MEASURES),
-    MeasureFamily("as_built", "As built against as designed", as_built.MEASURES),
-    MeasureFamily("crossings", "Crossings", crossings.MEASURES),
-    MeasureFamily("profile", "Against distance and bar width", profiles.MEASURES),
+    MeasureFamily("inspection", "Inspection, bar by bar", inspection.MEASURES, (NATIVE,)),
+    MeasureFamily("as_built", "As built against as designed", inspection.AS_BUILT_MEASURES, (NATIVE,)),
+    MeasureFamily("crossings", "Crossings", crossings.MEASURES, (NATIVE,)),
 )
 """All measure families, in report order; ``view_samples`` computes the samples of their measures."""
 
@@ -74,11 +69,13 @@ def measures_by_alignment() -> dict[str, tuple[Measure, ...]]:
     }
 
 
-def view_samples(prediction_m: Float[ndarray, "h w"], truth: SteelTruth, scale: float) -> ViewSamples:
+def view_samples(
+    prediction_m: Float[ndarray, "h w"], truth: SteelTruth, scale: float, frames: SteelFrames
+) -> ViewSamples:
     """Return the samples of all measures for one view, by alignment.
 
-    ``prediction_m`` is planar depth in metres as submitted, and ``scale`` the view's median scale s, NaN if it has
-    none.
+    ``prediction_m`` is planar depth in metres as submitted, ``scale`` the view's median scale s, NaN if it has
+    none, and ``frames`` are the samples of the bars and crossings of the view.
     """
     native_m = truth.predicted_m(prediction_m)
     with np.errstate(over="ignore"):
@@ -92,43 +89,56 @@ def view_samples(prediction_m: Float[ndarray, "h w"], truth: SteelTruth, scale: 
             **published.image_boundary_samples(prediction_m, truth),
         }
     }
-    # The ground truth that the two predictions share is computed once.
     cloud = point_cloud.true_cloud(truth)
-    visible = visible_segments(truth)
-    pairs = inspection.visible_pairs(visible, truth.bars.cage)
-    designed = as_built.designed_segments(truth, visible)
-    crossed = crossings.view_crossings(truth)
     for of_alignment, p_m in ((NATIVE, native_m), (SCALED, scaled_m)):
         samples[of_alignment] = {
             **published.error_samples(p_m, truth),
             **disparity.disparity_samples(p_m, truth),
-            **regions.region_samples(p_m, truth),
-            **depth_layers.layer_samples(p_m, truth),
+            **single_bar.single_bar_samples(p_m, truth),
             **point_cloud.cloud_samples(p_m, cloud),
-            **inspection.inspection_samples(p_m, visible, pairs),
-            **as_built.as_built_samples(p_m, designed),
-            **crossings.crossing_samples(p_m, crossed),
-            **profiles.profile_samples(p_m, truth),
         }
+    steel = frames.native.predicted
+    samples[NATIVE] |= {
+        **inspection.inspection_samples(steel.bars, steel.spacings),
+        **inspection.as_built_samples(steel.bars),
+        **crossings.crossing_samples(steel.crossings),
+    }
     return samples
 
 
-def extended_result(
-    configs: Mapping[str, tuple[DatasetConfig, CrossingsSource | None, Mapping[str, ViewSamples]]],
-) -> ExtendedResult:
-    """Return the extended measures of a submission from the samples of the views of each config, by view id.
+@dataclass(frozen=True)
+class ExtendedViews:
+    """Samples of the views of a config by view id, and its source of crossings.
 
-    All measures are null for a config without masks or bar ids, which has no samples and no source of crossings.
+    There are none for a config without masks or bar ids. ``frames`` are the samples of bars and crossings of each
+    view, in the same order.
     """
+
+    config: DatasetConfig
+    crossings: CrossingsSource | None
+    samples: Mapping[str, ViewSamples]
+    frames: Sequence[SteelFrames]
+
+
+def extended_result(configs: Sequence[ExtendedViews]) -> ExtendedResult:
+    """Return the extended measures of a submission; all measures are null for a config without samples."""
     measures = measures_by_alignment()
     tables: dict[str, ExtendedTable] = {}
     views: dict[str, ViewMeasures] = {}
-    source = None
-    for name, (config, of_config, samples) in configs.items():
+    for one in configs:
         resampling = resample_views(
-            tuple(samples), by_scene=config.has_splits, views_per_distance=config.views_per_distance
+            tuple(one.samples), by_scene=one.config.has_splits, views_per_distance=one.config.views_per_distance
         )
-        tables[name] = tabulate_extended(list(samples.values()), resampling, measures)
-        views |= {view_id: view_measures(of_view, measures) for view_id, of_view in samples.items()}
-        source = of_config or source
-    return ExtendedResult(measures, tables, views, source)
+        tables[one.config.name] = tabulate_extended(list(one.samples.values()), resampling, measures)
+        views |= {view_id: view_measures(of_view, measures) for view_id, of_view in one.samples.items()}
+    return ExtendedResult(
+        measures,
+        tables,
+        views,
+        frames={one.config.name: SteelFrames.joined(one.frames) for one in configs if one.frames},
+        scenes={
+            one.config.name: {view_id: one.config.scene_by_view[view_id] for view_id in one.samples}
+            for one in configs
+        },
+        crossings=next((one.crossings for one in configs if one.crossings is not None), None),
+    )

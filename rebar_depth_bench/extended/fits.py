@@ -23,7 +23,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float64
+from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
 from rebar_depth_bench.bar_crossings.axis_segments import Rows
@@ -238,7 +238,7 @@ class FittedAxes:
 
     ``found`` marks the segments whose axis was accepted. An axis is a point and a unit direction in the camera
     frame. ``offset_m`` is the distance of the fitted axis from the middle of the visible part of the true one.
-    ``diameter_m`` is NaN where it was not fitted.
+    ``diameter_m`` is NaN where it was not fitted. ``pixels`` is the number of pixels used, with a prediction.
     """
 
     found: Bool[ndarray, " r"]
@@ -247,6 +247,7 @@ class FittedAxes:
     offset_m: Float64[ndarray, " r"]
     tilt_deg: Float64[ndarray, " r"]
     diameter_m: Float64[ndarray, " r"]
+    pixels: Int64[ndarray, " r"]
 
 
 def fit_axes(p_m: Float64[ndarray, " n"], visible: VisibleSegments, *, diameters: bool = False) -> FittedAxes:
@@ -276,6 +277,7 @@ def fit_axes(p_m: Float64[ndarray, " n"], visible: VisibleSegments, *, diameters
             offset_m=offset_m,
             tilt_deg=np.rad2deg(np.arctan(np.sqrt(squared_slope))),
             diameter_m=fits.diameter_m,
+            pixels=predicted.sum(axis=1),
         )
 
 

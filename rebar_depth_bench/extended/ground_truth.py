@@ -19,12 +19,12 @@ from rebar_depth_bench.data.cache import ArrayCache, CacheContent, ViewArrays, o
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder
 from rebar_depth_bench.data.rows import EyeTruth
 from rebar_depth_bench.extended.axes import assign_segments
-from rebar_depth_bench.extended.depth_layers import other_layers
+from rebar_depth_bench.extended.cover import camera_planes, judged_covers
 from rebar_depth_bench.extended.disparity import match_right
-from rebar_depth_bench.extended.judged import SAMPLED_PIXELS, judged_crossings
+from rebar_depth_bench.extended.judged import SAMPLED_PIXELS, judged_crossings, visible_segments
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL
 from rebar_depth_bench.extended.published import depth_steps
-from rebar_depth_bench.extended.steel import JudgedCrossings, SceneBars, SteelTruth
+from rebar_depth_bench.extended.steel import PLANE_PIXELS, CoverPixels, JudgedCrossings, SceneBars, SteelTruth
 from rebar_depth_bench.geometry.cameras import pixel_rays
 from rebar_depth_bench.scoring.protocol import interior, single_bar_pixels
 from rebar_depth_bench.scoring.truth import are_pixels_inside, cache_inputs, scored_counts, verified_views
@@ -36,16 +36,21 @@ _DTYPES: Mapping[str, type] = {
     "interior": np.bool_,
     "single_bar": np.bool_,
     "run": np.int16,
-    "front_m": np.float32,
-    "behind_m": np.float32,
     "seen_by_right": np.bool_,
     "has_depth": np.uint8,
     "near_step": np.uint8,
     "step_depth_m": np.float32,
     "crossing": np.uint32,
     "pixel": np.uint32,
+    "cover_segment": np.uint16,
+    "cover_plane": np.uint16,
+    "cover_pixel": np.uint32,
+    "cover_depth_m": np.float32,
 }
-"""Arrays of ``SteelTruth``, and flattened ones of ``JudgedCrossings``, that are cached, with their types."""
+"""Arrays that are cached, with their types: of ``SteelTruth``, ``JudgedCrossings`` and ``CoverPixels``.
+
+The last two are flattened, and ``cover_plane`` are positions among the planes of the scene.
+"""
 
 
 Rays = Float64[ndarray, "hw 2"]
@@ -54,7 +59,7 @@ Rays = Float64[ndarray, "hw 2"]
 Lens = tuple[float, ...]
 """K, row by row, and distortion of a camera."""
 
-_LENS_NUMBERS, _NUMBERS = 9 + 5, 9 + 5 + 16 + 1 + 1
+_LENS_NUMBERS, _NUMBERS = 9 + 5, 9 + 5 + 16 + 1 + 1 + 1
 
 
 def has_bar_ids(config: DatasetConfig) -> bool:
@@ -112,7 +117,7 @@ def load_steel_truth(
         of_scene = bars.get(scene.name, None if config.imported is None else ())
         if of_scene is None:
             raise DatasetError(f"{path}: has no bars for scene {scene.name!r} of config {config.name}")
-        scenes[scene.name] = SceneBars.of(of_scene, crossings.get(scene.name))
+        scenes[scene.name] = SceneBars.of(of_scene, crossings.get(scene.name), scene.planes)
     bars_by_view = {view_id: scenes[scene] for view_id, scene in config.scene_by_view.items()}
     scored_px = scored_counts(config)
 
@@ -123,9 +128,12 @@ def load_steel_truth(
 
     content = CacheContent(
         task=f"bars in the views of {config.name}",
-        inputs=cache_inputs(
-            config, f"{EXTENDED_PROTOCOL} {CROSSINGS_PROTOCOL}", f"{folder.files[BARS_FILE]} {source.sha256}"
-        ),
+        inputs={
+            **cache_inputs(
+                config, f"{EXTENDED_PROTOCOL} {CROSSINGS_PROTOCOL}", f"{folder.files[BARS_FILE]} {source.sha256}"
+            ),
+            "planes": [[plane.model_dump() for plane in scene.planes] for scene in config.scenes],
+        },
         dtypes=_DTYPES,
         view_ids=tuple(scored_px),
         extract=lambda view_ids: _view_arrays(config, bars_by_view, view_ids),
@@ -148,7 +156,7 @@ def _view_arrays(
 ) -> Iterator[ViewArrays]:
     """Yield the cached arrays of some views, or of all with scored pixels.
 
-    The numbers of a view are K, distortion, pose, parallax, and the number of judged crossings.
+    The numbers of a view are K, distortion, pose, parallax, depth at the centre, and number of judged crossings.
     """
     rays: dict[Lens, Rays] = {}
     for view_id, eyes, scored in verified_views(config, view_ids, config.truth_eyes):
@@ -162,30 +170,51 @@ def _view_arrays(
         parallax_px_m, is_seen = match_right(eyes, scored)
         arrays["seen_by_right"] = np.isin(arrays["index"], scored[is_seen], assume_unique=True)
         arrays |= depth_steps(left.depth_m)
-        arrays |= {"crossing": np.empty(0), "pixel": np.empty(0)}
-        numbers = (*lens, *camera.cam_from_world.ravel().tolist(), parallax_px_m, 0)
-        view = ViewArrays(view_id, arrays, numbers)
-        judged = judged_crossings(_steel_truth(config, view, rays[lens], bars_by_view[view_id]))
-        arrays |= {"crossing": judged.crossing, "pixel": judged.pixels.ravel()}
+        arrays |= {name: np.empty(0) for name in _DTYPES if name not in arrays}
+        centre_m = float(left.depth_m[left.depth_m.shape[0] // 2, left.depth_m.shape[1] // 2])
+        numbers = (*lens, *camera.cam_from_world.ravel().tolist(), parallax_px_m, centre_m, 0)
+        truth = _steel_truth(config, ViewArrays(view_id, arrays, numbers), rays[lens], bars_by_view[view_id])
+        judged = judged_crossings(truth)
+        planes = camera_planes(truth.bars.planes, truth.cam_from_world)
+        segment, plane, pixels = judged_covers(left.depth_m, rays[lens], visible_segments(truth), planes)
+        arrays |= {
+            "crossing": judged.crossing,
+            "pixel": judged.pixels.ravel(),
+            "cover_segment": segment,
+            "cover_plane": plane,
+            "cover_pixel": pixels.ravel(),
+            "cover_depth_m": left.depth_m.ravel()[pixels.ravel()],
+        }
         yield ViewArrays(view_id, arrays, (*numbers[:-1], len(judged.crossing)))
 
 
 def _steel_truth(config: DatasetConfig, view: ViewArrays, rays: Rays, bars: SceneBars) -> SteelTruth:
     """Return a view from its arrays and numbers, the rays of its lens, and the bars of its scene."""
     arrays = dict(view.arrays)
-    crossing, pixel = (arrays.pop(name).astype(np.int64) for name in ("crossing", "pixel"))
-    lens, (*pose, parallax_px_m, _) = view.numbers[:_LENS_NUMBERS], view.numbers[_LENS_NUMBERS:]
+    names = ("crossing", "pixel", "cover_segment", "cover_plane", "cover_pixel")
+    crossing, pixel, segment, plane, cover_pixel = (arrays.pop(name).astype(np.int64) for name in names)
+    cover_pixel, cover_depth_m = cover_pixel.reshape(-1, PLANE_PIXELS), arrays.pop("cover_depth_m")
+    lens, (*pose, parallax_px_m, centre_m, _) = view.numbers[:_LENS_NUMBERS], view.numbers[_LENS_NUMBERS:]
     height, width = config.grid
+    cam_from_world = np.array(pose).reshape(4, 4)
     return SteelTruth(
         view_id=view.view_id,
         height=height,
         width=width,
         K=np.array(lens[:9]).reshape(3, 3),
-        cam_from_world=np.array(pose).reshape(4, 4),
+        cam_from_world=cam_from_world,
         rays=rays[arrays["index"]],
         bars=bars,
         distortion=np.array(lens[9:]),
         judged=JudgedCrossings(crossing, pixel.reshape(-1, 2, SAMPLED_PIXELS)),
+        covers=CoverPixels(
+            segment,
+            camera_planes(bars.planes, cam_from_world)[plane],
+            cover_pixel,
+            rays[cover_pixel],
+            cover_depth_m.reshape(-1, PLANE_PIXELS),
+        ),
+        centre_depth_m=centre_m,
         parallax_px_m=parallax_px_m,
         **arrays,
     )
@@ -194,8 +223,7 @@ def _steel_truth(config: DatasetConfig, view: ViewArrays, rays: Rays, bars: Scen
 def _steel_arrays(left: EyeTruth, scored: ndarray, rays: Rays, scene: SceneBars) -> dict[str, ndarray]:
     """Return the arrays of ``SteelTruth`` for one view, by field name.
 
-    ``scored`` holds the flat indices of the scored pixels. Segments and other layers are determined for these
-    only.
+    ``scored`` holds the flat indices of the scored pixels. Segments are determined for these only.
     """
     depth_m, bars, mask = left.depth_m, left.bars, left.mask
     assert bars is not None  # ``has_bar_ids``
@@ -214,7 +242,6 @@ def _steel_arrays(left: EyeTruth, scored: ndarray, rays: Rays, scene: SceneBars)
     z_m, own = depth_m.ravel()[scored], bars.ravel()[scored]
     camera_m, pose = np.column_stack([z_m[:, None] * rays[scored], z_m]), left.camera.cam_from_world
     run = assign_segments((camera_m - pose[:3, 3]) @ pose[:3, :3], own, scene.cage)
-    front_m, behind_m = other_layers(depth_m, bars, scored, scene.diameter_m[own].astype(np.float32))
     return {
         "index": index,
         "depth_m": depth_m.ravel()[index],
@@ -222,8 +249,6 @@ def _steel_arrays(left: EyeTruth, scored: ndarray, rays: Rays, scene: SceneBars)
         "interior": is_scored,
         "single_bar": spread(single_bar_pixels(bars, scored), False),
         "run": spread(run, -1),
-        "front_m": spread(front_m, np.nan),
-        "behind_m": spread(behind_m, np.nan),
     }
 
 

@@ -1,4 +1,4 @@
-"""Judged parts of a view: visible straight segments of bars, and crossings, with the pixels used of each.
+"""Judged parts of a view: visible straight segments of bars, pairs of them, and crossings, with their pixels.
 
 Determined from the ground truth of the left eye alone. Frame: the camera's (OpenCV axes), metres.
 """
@@ -12,7 +12,8 @@ from jaxtyping import Bool, Float64, Int64
 from numpy import ndarray
 
 from rebar_depth_bench.bar_crossings.axis_segments import Rows
-from rebar_depth_bench.extended.axes import WINDOW_DIAMETERS, Axis, is_on_surface
+from rebar_depth_bench.bar_crossings.definition import TiePoints
+from rebar_depth_bench.extended.axes import WINDOW_DIAMETERS, Axis, CageTruth, is_on_surface
 from rebar_depth_bench.extended.steel import JudgedCrossings, SteelTruth
 from rebar_depth_bench.geometry.cameras import fold_radius, project, transform
 
@@ -24,6 +25,9 @@ MIN_VISIBLE_DIAMETERS = 3.0
 
 MAX_SAMPLES = 64
 """Maximum number of interior pixels that a segment is judged on, evenly spread."""
+
+LINE_SAMPLES = 32
+"""Number of points of the visible part of a bowed axis, evenly spread, that a line is fitted to."""
 
 MIN_DIAMETER_FIT_WIDTH_PX = 8.0
 """Minimum apparent width (f d / z) in pixels of a bar whose diameter is measured."""
@@ -74,22 +78,46 @@ def visible_segments(truth: SteelTruth) -> VisibleSegments:
     """Return the judged segments of a view and their sampled pixels.
 
     Judged are segments with at least ``MIN_PIXELS`` interior pixels that extend over at least
-    ``MIN_VISIBLE_DIAMETERS``.
+    ``MIN_VISIBLE_DIAMETERS``. A bar may be bowed: the axis of a segment is the line that fits its visible part.
     """
-    cage = truth.bars.cage
+    cage, rotation = truth.bars.cage, truth.cam_from_world[:3, :3]
     segment, pixels, used = _sampled_pixels(truth)
-    axis_m = (cage.end_m[segment] - cage.start_m[segment]) @ truth.cam_from_world[:3, :3].T
-    visible = visible_parts(
+    vector_m = cage.end_m[segment] - cage.start_m[segment]
+    direction = vector_m / np.linalg.norm(vector_m, axis=1, keepdims=True)
+    point_m = cage.start_m[segment]
+    seen = _visible_parts(truth, segment, pixels, used, point_m, direction)
+    middle_m = np.einsum("ri,ri->r", (seen.middle_m - truth.cam_from_world[:3, 3]) @ rotation - point_m, direction)
+    for row, line_m in enumerate(cage.line_m[one] for one in segment.tolist()):
+        if len(line_m) > 2:
+            along_m = middle_m[row] + seen.half_m[row] * np.linspace(-1, 1, LINE_SAMPLES)
+            places_m = (line_m - point_m[row]) @ direction[row]
+            shown_m = np.column_stack([np.interp(along_m, places_m, column) for column in line_m.T])
+            point_m[row] = shown_m.mean(axis=0)
+            main = np.linalg.svd(shown_m - point_m[row])[2][0]
+            direction[row] = main if main @ direction[row] > 0 else -main
+    visible = _visible_parts(truth, segment, pixels, used, point_m, direction)
+    return visible.of(2 * seen.half_m >= MIN_VISIBLE_DIAMETERS * seen.diameter_m)
+
+
+def _visible_parts(
+    truth: SteelTruth,
+    segment: Int64[ndarray, " r"],
+    pixels: Int64[ndarray, "r k"],
+    used: Bool[ndarray, "r k"],
+    point_m: Float64[ndarray, "r 3"],
+    direction: Float64[ndarray, "r 3"],
+) -> VisibleSegments:
+    """Return the visible parts of segments by the point and the direction of an axis, world."""
+    return visible_parts(
         truth,
         pixels,
         used,
         segment=segment,
-        diameter_m=cage.diameter_m[segment],
-        match_radius_m=cage.match_radius_m[segment],
-        point_m=transform(truth.cam_from_world, cage.start_m[segment]),
-        direction=axis_m / np.linalg.norm(axis_m, axis=1, keepdims=True),
+        diameter_m=truth.bars.cage.diameter_m[segment],
+        match_radius_m=truth.bars.cage.match_radius_m[segment],
+        point_m=transform(truth.cam_from_world, point_m),
+        direction=direction @ truth.cam_from_world[:3, :3].T,
     )
-    return visible.of(2 * visible.half_m >= MIN_VISIBLE_DIAMETERS * visible.diameter_m)
 
 
 def visible_parts(
@@ -140,11 +168,11 @@ def _sampled_pixels(truth: SteelTruth) -> tuple[Int64[ndarray, " r"], Int64[ndar
     total = counts[segment][:, None]
     slot = np.arange(MAX_SAMPLES)
     used = slot < total
-    chosen = np.where(total > MAX_SAMPLES, _spread(total, MAX_SAMPLES), np.where(used, slot, 0))
+    chosen = np.where(total > MAX_SAMPLES, spread(total, MAX_SAMPLES), np.where(used, slot, 0))
     return segment, by_segment.take(first[:, None] + chosen), used
 
 
-def _spread(total: int | Int64[ndarray, "r 1"], count: int) -> Int64[ndarray, " *k"]:
+def spread(total: int | Int64[ndarray, "r 1"], count: int) -> Int64[ndarray, " *k"]:
     """Return ``count`` of ``total`` positions, evenly spread.
 
     Regular strides can coincide with ribs or with the width of a bar, and sample a single column of it. Multiples
@@ -162,6 +190,53 @@ def _frames(middle_m: Float64[ndarray, "r 3"], direction: Float64[ndarray, "r 3"
     away = np.where((away_norm > 1e-9)[:, None], away, any_side)
     away /= np.linalg.norm(away, axis=1, keepdims=True)
     return np.stack([np.cross(away, direction), away, direction], axis=1)
+
+
+# Pairs of neighbours.
+
+MIN_VISIBLE_OVERLAP_DIAMETERS = 2.0
+"""Minimum overlap of the visible parts of a judged pair along the axis, in larger diameters."""
+
+
+@dataclass(frozen=True, eq=False)
+class VisiblePairs(Rows):
+    """Neighbouring segments that are both visible, side by side: two positions among the visible segments.
+
+    ``middle_m`` and ``normal`` define the plane that is intersected with both axes.
+    """
+
+    segments: Int64[ndarray, "m 2"]
+    middle_m: Float64[ndarray, "m 3"]
+    normal: Float64[ndarray, "m 3"]
+
+    def intersections_m(
+        self, point_m: Float64[ndarray, "r 3"], direction: Float64[ndarray, "r 3"]
+    ) -> Float64[ndarray, "2 m 3"]:
+        """Return the intersections of the planes with the axes of both segments, of the r visible ones."""
+        at_m = []
+        for segment in self.segments.T:
+            to_plane_m = np.einsum("mi,mi->m", self.middle_m - point_m[segment], self.normal)
+            rate = np.einsum("mi,mi->m", direction[segment], self.normal)
+            at_m.append(point_m[segment] + (to_plane_m / rate)[:, None] * direction[segment])
+        return np.asarray(at_m)
+
+
+def visible_pairs(visible: VisibleSegments, cage: CageTruth) -> VisiblePairs:
+    """Return the neighbour pairs whose segments are both visible and overlap along the first one's axis."""
+    position = np.full(len(cage), -1)
+    position[visible.segment] = np.arange(len(visible.segment))
+    segments = position[cage.neighbours]
+    segments = segments[(segments >= 0).all(axis=1)]
+    first, second = segments.T
+    normal = visible.frame[first, 2]
+    between_m = np.einsum("mi,mi->m", visible.middle_m[second] - visible.middle_m[first], normal)
+    low_m = np.maximum(-visible.half_m[first], between_m - visible.half_m[second])
+    high_m = np.minimum(visible.half_m[first], between_m + visible.half_m[second])
+    overlapping = high_m - low_m >= MIN_VISIBLE_OVERLAP_DIAMETERS * np.maximum(
+        visible.diameter_m[first], visible.diameter_m[second]
+    )
+    middle_m = visible.middle_m[first] + ((low_m + high_m) / 2)[:, None] * normal
+    return VisiblePairs(segments, middle_m, normal).of(overlapping)
 
 
 # Crossings that a view can be judged by.
@@ -242,7 +317,7 @@ def _near_crossing(
     if not low_m < 0 < high_m or high_m - low_m < MIN_VISIBLE_DIAMETERS * axis.diameter_m:
         return np.empty(0, np.int64)
     ordered = near[np.argsort(relative_m[near], kind="stable")]
-    return np.asarray(pixels[ordered[_spread(len(ordered), SAMPLED_PIXELS)]])
+    return np.asarray(pixels[ordered[spread(len(ordered), SAMPLED_PIXELS)]])
 
 
 def shown_pixels(truth: SteelTruth, points_m: Float64[ndarray, "n 3"]) -> Int64[ndarray, " n"]:
@@ -263,3 +338,51 @@ def shown_pixels(truth: SteelTruth, points_m: Float64[ndarray, "n 3"]) -> Int64[
     known = (truth.index[position] == flat) if len(truth.index) else np.zeros(len(flat), bool)
     positions[np.flatnonzero(in_front)[inside][known]] = position[known]
     return positions
+
+
+# Crossings that depth is judged at.
+
+
+@dataclass(frozen=True, eq=False)
+class ViewCrossings:
+    """The m crossings of a view on which depth is judged: judged ones between bars that are straight there.
+
+    ``crossing`` holds indices into the scene's crossings. ``visible`` are the parts of bar a and bar b of the
+    first crossing, then of the second, and so on. ``ties`` are the true tie points in the camera frame.
+    """
+
+    crossing: Int64[ndarray, " m"]
+    visible: VisibleSegments
+    ties: TiePoints
+
+    @property
+    def radius_m(self) -> Float64[ndarray, "m 2"]:
+        """Radii of bar a and bar b."""
+        return np.asarray(self.visible.diameter_m.reshape(-1, 2) / 2)
+
+
+def view_crossings(truth: SteelTruth) -> ViewCrossings:
+    """Return the crossings of a view on which depth is judged."""
+    scene = truth.bars.crossings
+    straight = scene.straight[truth.judged.crossing].all(axis=1)
+    crossing, pixels = truth.judged.crossing[straight], truth.judged.pixels[straight]
+    pixels = pixels.reshape(2 * len(crossing), pixels.shape[2])
+    rotation = truth.cam_from_world[:3, :3]
+    visible = visible_parts(
+        truth,
+        pixels,
+        np.ones(pixels.shape, dtype=bool),
+        segment=np.repeat(crossing, 2),
+        diameter_m=scene.diameter_m[crossing].ravel(),
+        match_radius_m=scene.match_radius_m[crossing].ravel(),
+        point_m=transform(truth.cam_from_world, scene.point_m[crossing].reshape(-1, 3)),
+        direction=scene.tangent[crossing].reshape(-1, 3) @ rotation.T,
+    )
+    found = scene.crossings
+    ties = TiePoints(
+        transform(truth.cam_from_world, found.tie_point_m[crossing]),
+        found.normal[crossing] @ rotation.T,
+        found.gap_m[crossing],
+        found.angle_deg[crossing],
+    )
+    return ViewCrossings(crossing, visible, ties)

@@ -7,7 +7,7 @@ every pixel.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -66,9 +66,7 @@ class Measure:
     ``unit`` is "mm", "cm", "%" (samples are shares from 0 to 1, shown times 100), "m", "px" or "". ``better`` is
     "lower" or "higher" only if missing pixels, or bars that were not found, count as failures; otherwise "".
     ``definition`` is one sentence with the formula. ``sample_name`` names the samples if the measure's name does
-    not. ``convert``, if set, maps the statistic to the measure's value. It must be decreasing, and returns None
-    where the statistic only reflects that something was missed. Raises ``ValueError`` for an unknown statistic or
-    unit.
+    not. Raises ``ValueError`` for an unknown statistic or unit.
     """
 
     name: str
@@ -78,7 +76,6 @@ class Measure:
     definition: str
     sample_name: str = ""
     statistic: Statistic = "mean"
-    convert: Callable[[float], float | None] | None = None
 
     def __post_init__(self) -> None:
         for found, known in ((self.statistic, STATISTICS), (self.unit, _DECIMALS)):
@@ -93,36 +90,15 @@ class Measure:
     @property
     def column(self) -> Column:
         """Column of the measure in tables and pages."""
-        is_ratio = self.convert is not None or self.name.endswith("_deg")
         return Column(
             place=self.name,
             title=self.title,
             unit=self.unit,
             better=self.better,
-            decimals=2 if is_ratio else _DECIMALS[self.unit],
+            decimals=2 if self.name.endswith("_deg") else _DECIMALS[self.unit],
             factor=100.0 if self.unit == "%" else 1.0,
             as_text=coverage_percent if self.name.endswith("_coverage") else None,
         )
-
-
-def median_and_p95(
-    name: str, title: str, unit: str, definition: str, title_suffix: str = ""
-) -> tuple[Measure, Measure]:
-    """Return median and 95th percentile of an absolute error over all that is judged, misses included.
-
-    ``unit`` is the unit of the samples, "mm" or "deg", and ``definition`` continues "Median of the".
-    """
-    shown, sample = "mm" if unit == "mm" else "", f"{name}_judged_{unit}"
-    return (
-        Measure(
-            f"{name}_median_{unit}", f"{title}: median{title_suffix}", shown, "lower",
-            f"Median of the {definition}", sample, "median",
-        ),
-        Measure(
-            f"{name}_p95_{unit}", f"{title}: p95{title_suffix}", shown, "lower",
-            f"95th percentile of the {definition}", sample, "p95",
-        ),
-    )  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -142,6 +118,12 @@ class MeasureFamily:
     def by_name(self) -> dict[str, Measure]:
         """Measures by name."""
         return {measure.name: measure for measure in self.measures}
+
+
+def pooled(by_view: Sequence[Samples], name: str) -> tuple[Float64[ndarray, " m"], Int64[ndarray, " m"]]:
+    """Return the samples of all views one after the other, and the position of each one's view."""
+    samples = [samples.get(name, np.empty(0)) for samples in by_view]
+    return np.concatenate([np.empty(0), *samples]), np.repeat(np.arange(len(samples)), list(map(len, samples)))
 
 
 def finite_sample(value: float | None) -> Float64[ndarray, " one"]:

@@ -1,4 +1,4 @@
-"""Point cloud accuracy and completeness of the steel, at 1, 2, 5, 10 and 20 mm.
+"""Point cloud accuracy and completeness of the steel, at 5 and 10 mm.
 
 After Knapitsch et al., "Tanks and Temples", ACM TOG 2017 (precision, recall and F-score of a reconstruction) and
 Seitz et al., CVPR 2006 (accuracy, completeness), for the points of one view in the camera frame: the rays of
@@ -30,7 +30,7 @@ from rebar_depth_bench.extended.measures import Measure, Samples, subsample
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
 
-TOLERANCES_MM = (1, 2, 5, 10, 20)
+TOLERANCES_MM = (5, 10)
 """Distance tolerances t, ascending, in millimetres."""
 
 MAX_POINTS = 4000

@@ -9,8 +9,10 @@ import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int64, UInt8, UInt16, UInt32
 from numpy import ndarray
 
+from rebar_depth_bench.bar_crossings.axis_segments import Rows
 from rebar_depth_bench.bar_crossings.definition import Crossings, scene_crossings
 from rebar_depth_bench.data.bars import Bar, with_axis
+from rebar_depth_bench.data.schema import FormPlane
 from rebar_depth_bench.extended.axes import CageTruth, SceneCrossings, cage_truth, prepared_crossings
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
 
@@ -19,16 +21,19 @@ from rebar_depth_bench.scoring.metrics import is_valid_prediction
 class SceneBars:
     """Bars of a scene: their segments, nominal diameter by bar id (NaN for ids without a bar), and crossings.
 
-    ``designed`` has the bars with a nominal axis, by id.
+    ``designed`` has the bars with a nominal axis, by id, and ``planes`` are those of formwork.
     """
 
     cage: CageTruth
     diameter_m: Float64[ndarray, " ids"]
     designed: Mapping[int, Bar]
     crossings: SceneCrossings
+    planes: Sequence[FormPlane] = ()
 
     @classmethod
-    def of(cls, bars: Sequence[Bar], crossings: Crossings | None = None) -> SceneBars:
+    def of(
+        cls, bars: Sequence[Bar], crossings: Crossings | None = None, planes: Sequence[FormPlane] = ()
+    ) -> SceneBars:
         """Return the bars of a scene with its crossings (default: none). Raises ``DatasetError`` for too many."""
         # NaN for bars without a fitted axis, and for ids that images show and the table lacks.
         diameter_m = np.full(np.iinfo(np.uint16).max + 1, np.nan)
@@ -36,7 +41,7 @@ class SceneBars:
         diameter_m[[bar.bar_id for bar in measured]] = [bar.diameter_m for bar in measured]
         designed = {bar.bar_id: bar for bar in measured if bar.nominal_axis_m}
         cage, crossings = cage_truth(bars), scene_crossings(()) if crossings is None else crossings
-        return cls(cage, diameter_m, designed, prepared_crossings(crossings, bars, cage))
+        return cls(cage, diameter_m, designed, prepared_crossings(crossings, bars, cage), planes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +61,35 @@ class JudgedCrossings:
         return cls(np.empty(0, np.int64), np.empty((0, 2, 1), np.int64))
 
 
+PLANE_PIXELS = 200
+"""Number of plane pixels of a bar whose cover is judged."""
+
+
+@dataclass(frozen=True, eq=False)
+class CoverPixels(Rows):
+    """The r bars of a view whose cover is judged, and k plane pixels of each.
+
+    ``segment`` holds indices of segments of ``CageTruth``, ascending, and ``plane`` the plane n x = d as n / d,
+    camera frame. ``pixels`` are flat indices into the image, ``rays`` their x/z and y/z, ``depth_m`` the true
+    depth.
+    """
+
+    segment: Int64[ndarray, " r"]
+    plane: Float64[ndarray, "r 3"]
+    pixels: Int64[ndarray, "r k"]
+    rays: Float64[ndarray, "r k 2"]
+    depth_m: Float32[ndarray, "r k"]
+
+    @classmethod
+    def none(cls) -> CoverPixels:
+        """Return no bars."""
+        empty = np.empty((0, PLANE_PIXELS))
+        return cls(
+            np.empty(0, np.int64), np.empty((0, 3)), empty.astype(np.int64), np.empty((*empty.shape, 2)),
+            empty.astype(np.float32),
+        )  # fmt: skip
+
+
 @dataclass(frozen=True, eq=False)
 class SteelTruth:
     """Ground truth of one view at the pixels on steel or within one pixel (3 x 3) of it that have true depth > 0.
@@ -65,10 +99,10 @@ class SteelTruth:
     the protocol, and ``single_bar`` the scored pixels whose 3 x 3 neighbourhood belongs to one bar. ``rays`` are
     x/z and y/z of each pixel's ray in the camera frame (lens distortion undone), so that ``x_cam = depth_m *
     (rays[:, 0], rays[:, 1], 1)``. ``run`` is the straight bar segment whose axis is nearest to the true point (an
-    index of ``CageTruth``), -1 where the point is on no segment. ``front_m`` and ``behind_m`` are the depths of
-    the closest other layer in front of and behind the pixel, NaN where none is visible: see
-    ``depth_layers.other_layers``. ``bars`` are the bars of the scene. ``distortion`` is the distortion of the grid
-    (``cameras.distort``), zeros on an ideal one.
+    index of ``CageTruth``), -1 where the point is on no segment. ``bars`` are the bars of the scene.
+    ``distortion`` is the distortion of the grid (``cameras.distort``), zeros on an ideal one. ``covers`` are the
+    bars whose cover is judged. ``centre_depth_m`` is the true depth of the pixel at half of the height and width,
+    0 for none.
 
     ``parallax_px_m`` is focal length times baseline of a rectified pair, pixels times metres, 0 if there is none;
     ``seen_by_right`` marks the scored pixels that the right view sees, too (``disparity.match_right``). Two masks
@@ -88,11 +122,11 @@ class SteelTruth:
     single_bar: Bool[ndarray, " n"]
     rays: Float64[ndarray, "n 2"]
     run: ndarray  # Int16 n
-    front_m: Float32[ndarray, " n"]
-    behind_m: Float32[ndarray, " n"]
     bars: SceneBars = field(default_factory=lambda: SceneBars.of(()))
     distortion: Float64[ndarray, " 5"] = field(default_factory=lambda: np.zeros(5))
     judged: JudgedCrossings = field(default_factory=JudgedCrossings.none)
+    covers: CoverPixels = field(default_factory=CoverPixels.none)
+    centre_depth_m: float = 0.0
     parallax_px_m: float = 0.0
     seen_by_right: Bool[ndarray, " n"] = field(default_factory=lambda: np.empty(0, np.bool_))
     has_depth: UInt8[ndarray, " b"] = field(default_factory=lambda: np.empty(0, np.uint8))

@@ -8,7 +8,8 @@ bytes of circles.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING
 
 from markupsafe import Markup, escape
 
@@ -16,6 +17,9 @@ from rebar_depth_bench.base.errors import printable
 from rebar_depth_bench.reporting.axes import Axis, decade_axis, log_axis_with_one, select_spaced, tick_label
 from rebar_depth_bench.scoring.columns import NATIVE, SCALE, SCALED
 from rebar_depth_bench.scoring.table import Table, ViewScore
+
+if TYPE_CHECKING:
+    from rebar_depth_bench.extended.working_range import WorkingRange
 
 WIDTH = 460
 """View box width, small enough that 13 px text stays readable when a phone shrinks the chart."""
@@ -166,10 +170,87 @@ def precision_chart(title: str, description: str, curves: Mapping[str, Sequence[
     body = _x_grid(x, top, bottom) + _y_grid(y, left)
     for index, (name, curve) in enumerate(curves.items()):
         points = [(x.at(recall), y.at(precision)) for recall, precision in curve]
-        line = "L".join(f"{x_px:.1f} {y_px:.1f}" for x_px, y_px in points)
-        body += _path(f"line c{index}", line and f"M{line}")
+        body += _polyline(f"line c{index}", points)
         body += "".join(_circle(f"disc c{index}", *point, 3.4) for point in points)
         legend_x, legend_y = left + index * (RIGHT - left) / len(curves), bottom + 54
         body += _circle(f"disc c{index}", legend_x + 4, legend_y - 4, 4) + _text(legend_x + 13, legend_y, name)
     body += _text(left, 16, "precision") + _text(RIGHT, bottom + 36, "recall", "end")
     return _figure(title, description, bottom + 62, body)
+
+
+SERIES_COLOURS = 6
+"""Number of colours of lines, ``c0`` and so on; the next lines have the same ones, dashed."""
+
+
+def series_classes(index: int) -> str:
+    """Return the classes of the line of a series, and of its sign in a legend."""
+    return f"c{index % SERIES_COLOURS}{' dashed' if index // SERIES_COLOURS % 2 else ''}"
+
+
+def range_chart(title: str, panels: Mapping[str, Mapping[str, WorkingRange]]) -> Markup | None:
+    """Return the chart of working ranges for one task: the share that passes against distance, on a log axis.
+
+    ``panels`` have the title of an alignment and the working range of each method, a line with intervals. Exact
+    depth and the plane are grey, and tested bins have a band. The result is None if there is no sample.
+    """
+    edges_m = {
+        edge_m
+        for by_method in panels.values()
+        for one in by_method.values()
+        for of_bin in one.bins
+        for edge_m in (of_bin.from_m, of_bin.to_m)
+    }
+    if not edges_m:
+        return None
+    top, bottom, left, gap = 34.0, 170.0, 40.0, 22.0
+    width = (RIGHT - left - gap * (len(panels) - 1)) / len(panels)
+    y = Axis(0, 100, bottom, top, linear=True)
+    body, described = "", []
+    for place, (name, by_method) in enumerate(panels.items()):
+        start = left + place * (width + gap)
+        x = Axis(min(edges_m), max(edges_m), start, start + width)
+        first = next(iter(by_method.values())).bins  # Samples, exact depth and the plane are the truth's.
+        for one in first:
+            if not one.reasons:
+                body += _path("tested", _across(x.at(one.from_m), x.at(one.to_m), (top + bottom) / 2))
+        lines = [_across(start, start + width, y.at(percent)) for percent in range(0, 101, 25)]
+        body += _path("axis", "".join([*lines, *(_down(x.at(edge_m), top, bottom) for edge_m in sorted(edges_m))]))
+        body += _path("one", _across(start, start + width, y.at(95)))
+        for edge_m in select_spaced([x.low, x.high, *sorted(edges_m)], x, 4.5 * _DIGIT_WIDTH_PX):
+            anchor = {x.low: "start", x.high: "end"}.get(edge_m, "middle")
+            body += _text(x.at(edge_m), bottom + 17, tick_label(edge_m), anchor)
+        body += _text(start, top - 12, name, "start")
+        middles = [x.at(math.sqrt(one.from_m * one.to_m)) for one in first]
+        for kind in ("exact", "plane"):
+            body += _polyline(
+                f"{kind} line", zip(middles, (y.at(100 * getattr(one, kind)) for one in first), strict=True)
+            )
+        for index, (method, of_method) in enumerate(by_method.items()):
+            # Intervals at one distance would hide each other.
+            shift = (index - (len(by_method) - 1) / 2) * min(5.0, 0.6 * width / len(first) / len(by_method))
+            points = [
+                (x.at(math.sqrt(one.from_m * one.to_m)) + shift, y.at(100 * one.share)) for one in of_method.bins
+            ]
+            classes = series_classes(index)
+            ends = (
+                _down(px, y.at(100 * one.low), y.at(100 * one.high))
+                for (px, _), one in zip(points, of_method.bins, strict=True)
+            )
+            body += _path(f"whisker {classes}", "".join(ends)) + _polyline(f"line {classes}", points)
+            body += "".join(
+                _circle(f"disc {classes}" if not one.reasons else f"untested {classes}", *point, 3.2)
+                for point, one in zip(points, of_method.bins, strict=True)
+            )
+            shares = ", ".join(f"{one.from_m:g} to {one.to_m:g} m: {one.share:.0%}" for one in of_method.bins)
+            described.append(f"{name}, {printable(method)}: {shares}")
+    for percent in (0, 50, 95):
+        body += _text(left - 6, y.at(percent) + 4.5, str(percent), "end")
+    return _figure(
+        title, f"Share within the limit, per cent, by distance. {'; '.join(described)}.", bottom + 26, body
+    )
+
+
+def _polyline(classes: str, points: Iterable[tuple[float, float]]) -> str:
+    """Return a path through the points."""
+    commands = "L".join(f"{x:.1f} {y:.1f}" for x, y in points)
+    return _path(classes, commands and f"M{commands}")

@@ -14,24 +14,15 @@ from rebar_depth_bench.extended.estimates import ExtendedResult, ExtendedTable, 
 from rebar_depth_bench.extended.families import MEASURE_FAMILIES
 from rebar_depth_bench.extended.fits import MISS_MM
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, NATIVE, SCALED, Measure, MeasureFamily
-from rebar_depth_bench.extended.reach import MIN_CROSSINGS, MIN_REACH_VIEWS, SHARE, Reach
 from rebar_depth_bench.reporting.tables import make_grid, plain_text, print_line
 from rebar_depth_bench.scoring.columns import DASH, number, range_text
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.spreadsheet import Sheet
 
 FITS_NOTE = (
-    "The fits take from the ground truth which pixels show which bar, the radius of each bar, and each pixel's "
-    "position along the bar. A method that has to find the bars itself can only be worse."
+    "The fits take from the ground truth which pixels show which bar and which the form, the radius of each bar, "
+    "and each pixel's position along the bar. A method that has to find the bars itself can only be worse."
 )
-
-REACH_NOTE = (
-    f"Bins by the true depth of the tie point. A bin is tested if it has {MIN_CROSSINGS} judged crossings or more "
-    f"from {MIN_REACH_VIEWS} views or more; what is not located fails."
-)
-
-UNDEFINED = "n/a"
-"""Text of an undefined capability: 5 % or more of the bars were not found, so that p95 is the error of a miss."""
 
 MISSED = "missed"
 """Text of an error of ``MISS_MM``, the value assigned to bars that were not found."""
@@ -70,28 +61,23 @@ def print_extended(extended: ExtendedResult, console: Console, only: str = "") -
             if hidden := len(known_rows) - len(shown_rows):
                 grid.add_row(plain_text(f"  and {hidden} more: --family {family.key}", style="dim"))
         console.print(grid)
-        for alignment, of_alignment in table.reaches.items() if only in ("", "crossings") else ():
-            for reach in of_alignment:
-                print_line(console, reach_sentence(alignment, reach))
     numbers = [(measure, estimate) for _, _, measure, estimate in extended.estimates()]
     if any(is_miss(estimate, measure) for measure, estimate in numbers):
         note = f"{MISSED}: not found, recorded as {MISS_MM:g} mm or {MISS_DEG:g} degrees in CSV and JSON."
         print_line(console, note)
-    if any(estimate.value is None and estimate.samples for _, estimate in numbers):
-        print_line(console, f"{UNDEFINED}: 5 % or more were not found, so the capability is undefined.")
     if not wide:
         width = _MIN_WIDTH_WITH_INTERVALS
         print_line(
             console, f"Intervals: in CSV, JSON and the report, and in terminals with at least {width} columns."
         )
-    note = "A single number in the first column is independent of scale or uses its own alignment."
+    note = "Numbers without a scaled one are of native depth, or independent of scale."
     print_line(console, f"{note} Definitions: docs/measures.md.")
 
 
 def measure_cells(table: ExtendedTable, family: MeasureFamily, measure: Measure) -> list[str]:
     """Return the four cells of a measure: value and interval, native and scaled.
 
-    The last two are empty for a measure that is computed only once.
+    The last two are empty for a measure with one alignment.
     """
     texts: list[str] = []
     for alignment in family.alignments:
@@ -99,9 +85,8 @@ def measure_cells(table: ExtendedTable, family: MeasureFamily, measure: Measure)
         if is_miss(estimate, measure):
             texts += [MISSED, DASH]
         else:
-            defined = estimate.value is not None or not estimate.samples
             texts += [
-                format_value(estimate.value, measure) if defined else UNDEFINED,
+                format_value(estimate.value, measure),
                 range_text(estimate.interval, partial(format_value, measure=measure, digits=3)),
             ]
     return texts + [""] * (4 - len(texts))
@@ -110,8 +95,7 @@ def measure_cells(table: ExtendedTable, family: MeasureFamily, measure: Measure)
 def is_miss(estimate: MeasureEstimate, measure: Measure) -> bool:
     """Return whether an error has the value ``MISS_MM`` or ``MISS_DEG`` of what was not found."""
     misses = (("_judged_mm", MISS_MM), ("_judged_deg", MISS_DEG))
-    is_error = any(measure.sample.endswith(suffix) and estimate.value == miss for suffix, miss in misses)
-    return is_error and measure.convert is None
+    return any(measure.sample.endswith(suffix) and estimate.value == miss for suffix, miss in misses)
 
 
 def format_value(value: float | None, measure: Measure, digits: int = 4) -> str:
@@ -144,26 +128,6 @@ def single_bar_sentence(table: ExtendedTable) -> str:
         f"{text}. AbsRel on them, mean over the views that have any: {', '.join(errors)}. On the others a "
         "second bar is within one pixel, so that a shift by one pixel already causes an error."
     )
-
-
-def reach_text(reach: Reach) -> str:
-    """Return a reach in a few words, such as ``at least 0.4 m``."""
-    if reach.verdict == "none tested":
-        return "none tested"
-    if reach.verdict == "not met":
-        return f"not met from {reach.bins_tested[0].low_m:g} m on"
-    return f"{reach.verdict} {reach.distance_m:g} m"
-
-
-def reach_sentence(alignment: str, reach: Reach) -> str:
-    """Return the reach under one alignment as a sentence."""
-    head = f"{alignment.capitalize()}: {100 * SHARE:g} % of the judged crossings within {reach.limit_mm} mm"
-    if reach.verdict == "none tested":
-        return f"{head}: none tested."
-    informative = reach.interval is not None and reach.interval[0] < reach.interval[1]
-    ends, tested = (range_text(edges_m, "{:g}".format) for edges_m in (reach.interval, reach.tested_m))
-    interval = f"95 % interval {ends} m; " if informative else ""
-    return f"{head} {reach_text(reach)} ({interval}tested {tested} m)."
 
 
 def extended_csv(result: Result) -> str:

@@ -1,4 +1,4 @@
-r"""LaTeX table of results: rank error, and RMSE, AbsRel, AbsRel_s and s as in the paper's Table I, by config.
+r"""LaTeX table of results: rank error, coverage, share within 5 mm, and the numbers of the paper's Table I.
 
 The output of the template ``table.tex.j2`` requires only ``\usepackage{booktabs}``. Non-Latin letters require
 XeLaTeX or LuaLaTeX.
@@ -17,9 +17,10 @@ from rebar_depth_bench.reporting.published import load_published, published_rows
 from rebar_depth_bench.scoring import formatting
 from rebar_depth_bench.scoring.columns import (
     ALIGNED_CONSTANT,
+    COVERAGE,
     DASH,
     PAPER_COLUMNS,
-    RANK_ERROR,
+    TABLE_COLUMNS,
     Better,
     Column,
     columns_at,
@@ -29,12 +30,11 @@ from rebar_depth_bench.scoring.relative import ALIGNMENT_BY_KIND
 from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.table import PublishedMatch, Table
 
-CONFIGS_PER_BLOCK = 2
-"""Number of configs side by side that fit into a page width of 17 cm; further configs follow in blocks below."""
-
-_COLUMNS = (RANK_ERROR, *PAPER_COLUMNS)
+_COLUMNS = (*TABLE_COLUMNS, *PAPER_COLUMNS)
 _HEADS: Mapping[str, str] = {
     "rank_error": "$E$",
+    "coverage": r"cov.\,\%",
+    "within_mm.5": r"5\,mm\,\%",
     "native.rmse_cm": "RMSE",
     "native.abs_rel": "AbsRel",
     "scaled.abs_rel": "AbsRel$_s$",
@@ -50,6 +50,8 @@ _ALIGNED_HEADS: Mapping[str, str] = {
 """Headings of the columns of predictions that are not metric."""
 _ARROWS: Mapping[Better, str] = {"lower": r" $\downarrow$", "higher": r" $\uparrow$", "": ""}
 _MISSING = "--"
+_NONE = [""] * len(TABLE_COLUMNS)
+"""Cells of rows that have the numbers of the paper's table only."""
 _MARKS: Mapping[str, str] = {"‡": r"$^{\ddagger}$", "?": "$^{?}$", "*": "$^{*}$", "": ""}
 _INCOMPARABLE = "$^{*}$Not comparable with other rows: predictions are missing, or a number overflowed."
 """Note of the caption; the methods and reasons are in a comment."""
@@ -104,9 +106,7 @@ def _table_of_kind(results: Sequence[Result], absent: Sequence[str], *, publishe
     kind = results[0].prediction
     columns = _COLUMNS if kind is None else columns_at(*_ALIGNED_HEADS)
     tables = {config: table for result in results for config, table in result.tables.items()}
-    configs = list(tables)
-    configs_per_block = 1 if intervals else CONFIGS_PER_BLOCK
-    blocks = [configs[start : start + configs_per_block] for start in range(0, len(configs), configs_per_block)]
+    blocks = [[config] for config in tables]  # Two side by side are wider than a page of 17 cm.
     published = published and kind is None
     matches = {config: table.published for config, table in tables.items() if published and table.published}
     paper_rows = [row for match in matches.values() for row in published_rows(match.scene)]
@@ -256,7 +256,8 @@ def _cells(
     cells = []
     for column in columns:
         number = column.text(table[column.place]).replace(DASH, _MISSING)
-        interval = column.interval_text(table.interval(column), ", ") if intervals else ""
+        shows_interval = intervals and column not in (COVERAGE, TABLE_COLUMNS[-1])
+        interval = column.interval_text(table.interval(column), ", ") if shows_interval else ""
         shown = rf"\textbf{{{number}}}" if column.place in bold else number
         mark = unranked if column is columns[0] else "" if column.of_all_views else incomparable
         cells.append(shown + mark + (rf" {{\tiny[{interval}]}}" if interval else ""))
@@ -267,7 +268,7 @@ def _reference_rows(results: Sequence[Result], config: str) -> dict[str, list[st
     """Return the cells of each reference of a config of metric results."""
     metric = [result for result in results if result.prediction is None]
     shown = [(result.method, result.tables[config]) for result in metric if config in result.tables]
-    return {name: ["", *cells] for name, cells in formatting.paper_reference_rows(shown)}
+    return {name: [*_NONE, *cells] for name, cells in formatting.paper_reference_rows(shown)}
 
 
 def _published_rows(match: PublishedMatch | None) -> dict[str, list[str]]:
@@ -277,7 +278,7 @@ def _published_rows(match: PublishedMatch | None) -> dict[str, list[str]]:
     optics = "" if match.same_optics else _OTHER_OPTICS_MARK
     return {
         row.method: [
-            "",
+            *_NONE,
             *(cell + (_ANCHORED_MARK if row.median_anchored else "") + optics for cell in row.cells),
         ]
         for row in published_rows(match.scene)

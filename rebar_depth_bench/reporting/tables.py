@@ -39,6 +39,7 @@ from rebar_depth_bench.scoring.columns import (
     SCALE,
     SCALED,
     SCALED_CONSTANT,
+    TABLE_COLUMNS,
     WITHIN,
     Column,
     range_text,
@@ -296,7 +297,11 @@ def comparison_cells(row: Difference) -> list[str]:
 
 # Table of several results in the layout of the paper's Table I.
 
-_HEADS = ("rank err. ↓", "RMSE cm ↓", "AbsRel ↓", "AbsRel_s ↓", "s")
+_HEADS = ("rank\nerr. ↓", "cov.\n% ↑", "5 mm\n% ↑", "RMSE\ncm ↓", "AbsRel\n↓", "AbsRel_s\n↓", "\ns")
+
+
+_NONE = [""] * len(TABLE_COLUMNS)
+"""Cells of rows that have the numbers of the paper's table only."""
 
 
 def disambiguate_method_names(results: Sequence[Result]) -> list[Result]:
@@ -367,7 +372,12 @@ def _print_paper_notes(
     if results[0].prediction is None:
         native = "RMSE, AbsRel: native (no alignment). AbsRel_s: scaled (oracle median scale per view)."
         print_line(console, f"{native} s: median over views of median(z)/median(p).")
-        print_line(console, f"{formatting.RANK_ERROR_NOTE} {formatting.REFERENCE_NOTE}")
+        print_line(
+            console,
+            "cov.: coverage. 5 mm: share of all scored pixels with a native error of at most 5 mm.",
+        )
+        print_line(console, f"{formatting.RANK_ERROR_NOTE} {formatting.RANK_PURPOSE_NOTE}")
+        print_line(console, formatting.REFERENCE_NOTE)
     else:
         print_line(console, formatting.ALIGNED_NOTE)
     for note in formatting.row_notes(results, absent):
@@ -380,13 +390,13 @@ def _print_paper_notes(
 def _paper_table(rows: Sequence[tuple[Result, Table]], match: PublishedMatch | None) -> RichTable:
     paper = make_grid("", _HEADS, fold=True)
     for result, table in rows:
-        cells = texts((RANK_ERROR, *PAPER_COLUMNS), table)
+        cells = texts((*TABLE_COLUMNS, *PAPER_COLUMNS), table)
         paper.add_row(*map(plain_text, [formatting.row_name(result, table), *cells]))
     for title, cells in formatting.paper_reference_rows([(result.method, table) for result, table in rows]):
-        paper.add_row(*map(plain_text, [f"reference: {title}", "", *cells]), style="dim")
+        paper.add_row(*map(plain_text, [f"reference: {title}", *_NONE, *cells]), style="dim")
     if match is not None:
         paper.add_section()
         for row in published_rows(match.scene):
             mark = (" †" if row.median_anchored else "") + ("" if match.same_optics else f" {OTHER_OPTICS_MARK}")
-            paper.add_row(*map(plain_text, [f"paper: {row.method}{mark}", "", *row.cells]), style="dim")
+            paper.add_row(*map(plain_text, [f"paper: {row.method}{mark}", *_NONE, *row.cells]), style="dim")
     return paper

@@ -27,7 +27,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from statistics import NormalDist
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float64, Int64
@@ -196,17 +196,15 @@ def end_percents(blocks: Blocks) -> tuple[float, float]:
     return low, 100 - low
 
 
-def interval(
-    estimates: Float64[ndarray, " draws"], blocks: Blocks, method: Literal["linear", "inverted_cdf"] = "linear"
-) -> Interval | None:
+def interval(estimates: Float64[ndarray, " draws"], blocks: Blocks) -> Interval | None:
     """Return the interval of the finite estimates over resamples; None if there are none, or too few blocks.
 
-    ``blocks`` are the ``Resampling.blocks`` with a value, and ``method`` is that of ``numpy.percentile``.
+    ``blocks`` are the ``Resampling.blocks`` with a value.
     """
     finite = estimates[np.isfinite(estimates)]
     if not blocks.are_enough or not len(finite):
         return None
-    low, high = np.percentile(finite, end_percents(blocks), method=method)
+    low, high = np.percentile(finite, end_percents(blocks))
     return float(low), float(high)
 
 

@@ -293,6 +293,9 @@ REFERENCES = (*CONSTANT, *ONE_PIXEL, *SCALED_CONSTANT)
 PAPER_COLUMNS = (NATIVE[1], NATIVE[0], SCALED[0], SCALE)
 """Columns of the paper's Table I: RMSE and AbsRel native, AbsRel scaled, and the median s."""
 
+TABLE_COLUMNS = (RANK_ERROR, COVERAGE, WITHIN[WITHIN_MM.index(5)])
+"""Columns of tables of several methods before those of the paper's Table I."""
+
 # Columns of predictions that are not metric.
 
 ALIGNED_METRICS = (

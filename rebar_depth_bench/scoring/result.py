@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import Field, Strict
 
-from rebar_depth_bench.base.errors import printable
+from rebar_depth_bench.base.errors import InputError, printable
 from rebar_depth_bench.base.validation import one_of
 from rebar_depth_bench.scoring.bootstrap import INTERVALS
 from rebar_depth_bench.scoring.columns import (
@@ -140,23 +140,33 @@ class Result:
         }
         return {key: value for key, value in document.items() if value is not None}
 
-    def to_pandas(self, rows: Literal["tables", "groups", "views", "extended"] = "tables") -> DataFrame:
+    def to_pandas(
+        self,
+        rows: Literal["tables", "groups", "views", "extended", "bars", "spacings", "crossings"] = "tables",
+    ) -> DataFrame:
         """Return the numbers of the JSON as a frame.
 
         ``"tables"`` has one row per config, with the 95 % interval of each metric in the columns
         ``<metric>_low`` and ``<metric>_high``; ``"groups"`` has one row per group of views of each config with
-        splits, with the same columns; ``"views"`` has one row per view; ``"extended"`` has one row per config,
-        alignment and extended measure. Raises ``ValueError`` for other rows, and for ``"extended"`` if the result
-        has no extended measures.
+        splits, with the same columns; ``"views"`` has one row per view.
+
+        Of a result with extended measures, ``"extended"`` has one row per config, alignment and measure; and of
+        native predictions, ``"bars"`` has one row per judged straight part of a bar and view, ``"spacings"`` one
+        per pair of judged neighbours, and ``"crossings"`` one per judged crossing (``extended.frames``). Raises
+        ``InputError`` for these if there are no extended measures, and ``ValueError`` for other rows.
         """
         if rows in ("tables", "groups"):
             return tables_sheet([self], groups=rows == "groups").to_pandas()
         if rows == "views":
             return views_sheet(self).to_pandas()
-        if rows == "extended" and self.extended is not None:
-            return self.extended.to_sheet().to_pandas()
-        expected = "'tables', 'groups', 'views', or 'extended' for a result that has them"
-        raise ValueError(f"rows is {rows!r}, expected {expected}")
+        if rows not in ("extended", "bars", "spacings", "crossings"):
+            expected = "'tables', 'groups', 'views', 'extended', 'bars', 'spacings' or 'crossings'"
+            raise ValueError(f"rows is {rows!r}, expected {expected}")
+        if self.extended is None:
+            found = f"rows is {rows} and the result has no extended measures"
+            raise InputError(f"{found}, expected one of score(..., extended=True) or evaluate(..., extended=True)")
+        sheet = self.extended.to_sheet() if rows == "extended" else self.extended.to_samples_sheet(rows)
+        return sheet.to_pandas()
 
     @property
     def metrics(self) -> dict[str, float]:

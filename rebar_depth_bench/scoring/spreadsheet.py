@@ -12,6 +12,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from rebar_depth_bench.base.errors import printable
 from rebar_depth_bench.scoring.columns import (
     COVERAGE,
@@ -74,6 +76,8 @@ class Sheet:
             defined = [value for value in column if value is not None]
             if defined and len(defined) < len(column) and all(type(value) is int for value in defined):
                 frame[head] = frame[head].astype("Int64")
+            if column and not defined and isinstance(self.rows[0][self.heads.index(head)], float):
+                frame[head] = np.nan
         return frame
 
 

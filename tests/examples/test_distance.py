@@ -142,7 +142,6 @@ def test_views_have_scores_and_true_distances(
     assert one_bin["views"] == whole["views"]
     assert one_bin["native_abs_rel"]["value"] == pytest.approx(whole["native"]["abs_rel"], rel=1e-12)
     assert one_bin["scale"]["value"] == whole["scale_median"]
-    assert study["crossing_reach"]["lattice"]["native"][0]["limit_mm"] == 5
 
 
 @pytest.mark.slow
@@ -167,6 +166,5 @@ def test_outputs_are_deterministic_and_configs_keep_their_order(
     slopes = json.loads(files["json"])["slopes"]
     assert [slope["config"] for slope in slopes] == ["lattice-orbit", "lattice", "all"]
     assert files["csv"].startswith(b"config,low_m,high_m,distance_m,views,views_scored,scale_range_low")
-    assert "lattice: Native: 95 % of the judged crossings within 5 mm" in capsys.readouterr().out
     message = refusal(distance, capsys, *arguments, "pier")
     assert "holds lattice, lattice-orbit, expected --config with some of them" in message

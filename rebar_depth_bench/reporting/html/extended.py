@@ -1,10 +1,9 @@
-"""Extended measures of the report: inspection, tolerances, collapsed families, and crossings of bars."""
+"""Extended measures of the report: inspection, collapsed families, and crossings of bars."""
 
 from __future__ import annotations
 
 import math
-import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,24 +12,12 @@ from numpy import ndarray
 from rebar_depth_bench.base.errors import printable
 from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.data.rows import iterate_rows
-from rebar_depth_bench.extended.crossings import (
-    BINNED_MEASURES,
-    MAIN_MEASURES,
-    MISS_DEG,
-    fitted_ties,
-    view_crossings,
-)
+from rebar_depth_bench.extended.crossings import MISS_DEG
 from rebar_depth_bench.extended.estimates import ExtendedResult, ExtendedTable, MeasureEstimate
 from rebar_depth_bench.extended.families import MEASURE_FAMILIES
 from rebar_depth_bench.extended.fits import MISS_MM
-from rebar_depth_bench.extended.ground_truth import has_bar_ids, load_steel_truth
-from rebar_depth_bench.extended.inspection import (
-    INSPECTION_MEASURES,
-    PROFILES,
-    TOLERANCES,
-    Tolerance,
-    ToleranceProfile,
-)
+from rebar_depth_bench.extended.frames import CrossingSamples
+from rebar_depth_bench.extended.ground_truth import load_steel_truth
 from rebar_depth_bench.extended.measures import (
     EXTENDED_PROTOCOL,
     NATIVE,
@@ -39,40 +26,17 @@ from rebar_depth_bench.extended.measures import (
     Measure,
     MeasureFamily,
 )
-from rebar_depth_bench.extended.point_cloud import TOLERANCES_MM
-from rebar_depth_bench.extended.reach import ReachBin
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.geometry.cameras import fold_radius, project, transform
-from rebar_depth_bench.reporting.extended_tables import (
-    FITS_NOTE,
-    MISSED,
-    REACH_NOTE,
-    UNDEFINED,
-    is_miss,
-    reach_sentence,
-    single_bar_sentence,
-)
+from rebar_depth_bench.reporting.extended_tables import FITS_NOTE, MISSED, is_miss, single_bar_sentence
 from rebar_depth_bench.reporting.html.views import backdrop_image
 from rebar_depth_bench.scoring.bootstrap import Interval
 from rebar_depth_bench.scoring.columns import DASH, Cell, Column
 from rebar_depth_bench.scoring.evaluation import Evaluation
 
-_TITLE_NUMBER = re.compile(r"\d[\d.]*(?:-[\d.]+)?(?= (?:mm|%|m|px|degrees)(?!\w))")
-"""Tolerance, threshold or bin in a measure's title: a number followed by a unit."""
 _HEAD_NOTES: Mapping[str, str] = {NATIVE: "no alignment", SCALED: "oracle median scale per view"}
 _SHOWN_FAMILIES = ("inspection", "crossings")
-"""Families that have tables of their own; the others are collapsed, inspection first."""
-
-MAIN_INSPECTION_MEASURES = (
-    "bars_found",
-    "axis_offset_median_mm",
-    "axis_offset_p95_mm",
-    *(f"{kind}_{size}_mm" for kind in ("spacing", "layer", "diameter", "cover") for size in ("bias", "p95")),
-)
-"""Inspection measures that are shown openly; the others are collapsed."""
-
-_CLOUD_KINDS = ("accuracy", "completeness", "f")
-_SHARE = Column("share", "judged crossings within a limit", "%", "higher", 1, 100.0)
+"""Families that are shown openly; the others are collapsed, the deviation from the design first."""
 
 
 @dataclass(frozen=True)
@@ -81,8 +45,7 @@ class MeasureTable:
 
     ``heads`` are (alignment, note) of the columns; ``rows`` have the measure's column, its cells and the numbers
     of samples; ``definitions`` are (title, definition). ``note`` explains a placeholder in the cells; it is empty
-    if there is none. A table of point clouds has ``grid`` instead of rows: per tolerance in mm, three cells for
-    each alignment.
+    if there is none.
     """
 
     title: str
@@ -90,88 +53,57 @@ class MeasureTable:
     rows: Sequence[tuple[Column, list[Cell], str]]
     definitions: Sequence[tuple[str, str]]
     note: str = ""
-    grid: Sequence[tuple[int, list[Cell]]] = ()
 
 
 @dataclass(frozen=True)
 class ExtendedConfig:
     """Formatted extended measures of one config.
 
-    The cells of ``tolerances`` are pass rates and capabilities. ``single_bar`` is a sentence on the single-bar
-    interior, empty without scored pixels.
+    ``single_bar`` is a sentence on the single-bar interior, empty without scored pixels.
     """
 
     name: str
     views: int
-    main_inspection: MeasureTable
-    other_inspection: MeasureTable
-    tolerances: list[tuple[ToleranceProfile, Tolerance, list[Cell]]]
+    inspection: MeasureTable
     families: list[MeasureTable]
     single_bar: str = ""
-
-    def has_undefined_capability(self) -> bool:
-        """Return whether any capability is undefined, because too many bars were not found."""
-        return any(cell.text == UNDEFINED for _, _, cells in self.tolerances for cell in cells)
 
 
 def extended_context(extended: ExtendedResult, pictures: Mapping[str, CrossingPicture]) -> dict[str, object]:
     """Return the context of the templates of extended measures and crossings; ``pictures`` are by config."""
     tables, source = extended.tables, extended.crossings
     crossings = [
-        _crossing_config(name, table, pictures.get(name))
+        CrossingConfig(printable(name), measure_table(table, MEASURE_FAMILIES["crossings"]), pictures.get(name))
         for name, table in tables.items()
-        if source is not None and table.numbers[NATIVE]["crossings_judged"].samples
+        if source is not None and name in extended.frames
     ]
     return {
         "extended": [extended_config(name, table) for name, table in tables.items()],
         "extended_protocol": EXTENDED_PROTOCOL,
-        "profiles": PROFILES,
         "crossings": crossings,
         "crossings_source": f"{printable(source.file)}, SHA-256 {printable(source.sha256)}" if source else "",
         "fits_note": FITS_NOTE,
-        "reach_note": REACH_NOTE,
     }
 
 
 def extended_config(name: str, table: ExtendedTable) -> ExtendedConfig:
     """Return the formatted extended measures of a config."""
-    inspection = MEASURE_FAMILIES["inspection"]
-    shown = {*MAIN_INSPECTION_MEASURES, *(tolerance.pass_name for _, tolerance in TOLERANCES)}
-    other = [measure for measure in INSPECTION_MEASURES if measure.name not in shown]
     others = [family for key, family in MEASURE_FAMILIES.items() if key not in _SHOWN_FAMILIES]
     others.sort(key=lambda family: family.key != "as_built")
-    folded = [_folded_table(table, family) for family in others]
+    folded = [measure_table(table, family) for family in others]
     return ExtendedConfig(
         name=printable(name),
         views=table.views,
-        main_inspection=measure_table(
-            table, inspection.title, inspection, [inspection.by_name[name] for name in MAIN_INSPECTION_MEASURES]
-        ),
-        other_inspection=measure_table(table, "Inspection: spread, median, found bars only", inspection, other),
-        tolerances=[(profile, one, _tolerance_cells(table, one)) for profile, one in TOLERANCES],
-        families=[family for family in folded if family.rows or family.grid],
+        inspection=measure_table(table, MEASURE_FAMILIES["inspection"]),
+        families=[family for family in folded if family.rows],
         single_bar=single_bar_sentence(table),
     )
 
 
-def _folded_table(table: ExtendedTable, family: MeasureFamily) -> MeasureTable:
-    if family.key != "clouds":
-        return measure_table(table, family.title, family, family.measures)
-    grid = []
-    for tolerance_mm in TOLERANCES_MM:
-        measures = [family.by_name[f"cloud_{kind}_{tolerance_mm}mm"] for kind in _CLOUD_KINDS]
-        pairs = [(table.numbers[alignment][one.name], one) for alignment in family.alignments for one in measures]
-        if any(estimate.samples for estimate, _ in pairs):
-            grid.append((tolerance_mm, [estimate_cell(*pair) for pair in pairs]))
-    return MeasureTable(family.title, _heads(family), [], measure_definitions(family.measures), grid=grid)
-
-
-def measure_table(
-    table: ExtendedTable, title: str, family: MeasureFamily, measures: Sequence[Measure]
-) -> MeasureTable:
-    """Return the table of some measures of a family, those without samples left out."""
+def measure_table(table: ExtendedTable, family: MeasureFamily) -> MeasureTable:
+    """Return the table of the measures of a family, those without samples left out."""
     rows = []
-    for measure in measures:
+    for measure in family.measures:
         estimates = [table.numbers[alignment][measure.name] for alignment in family.alignments]
         if any(estimate.samples for estimate in estimates):
             cells = [estimate_cell(estimate, measure) for estimate in estimates]
@@ -180,21 +112,21 @@ def measure_table(
     units = {column.unit for column, cells, _ in rows if any(cell.text == MISSED for cell in cells)}
     values = " or ".join(f"{MISS_MM:g} mm" if unit else f"{MISS_DEG:g} degrees" for unit in sorted(units)[::-1])
     note = f"{MISSED}: not found, counted as {values}." if units else ""
-    return MeasureTable(title, _heads(family), rows, measure_definitions(measures), note)
-
-
-def _heads(family: MeasureFamily) -> list[tuple[str, str]]:
-    notes = {**_HEAD_NOTES, ONCE: family.note}
-    return [(alignment, notes[alignment]) for alignment in family.alignments]
+    heads = {**_HEAD_NOTES, ONCE: family.note}
+    return MeasureTable(
+        family.title,
+        [(alignment, heads[alignment]) for alignment in family.alignments],
+        rows,
+        [(measure.title, measure.definition) for measure in family.measures],
+        note,
+    )
 
 
 def estimate_cell(estimate: MeasureEstimate, measure: Measure) -> Cell:
     """Return the cell of an estimate with its interval, formatted in the measure's unit."""
     value, ends = estimate.value, estimate.interval
-    if value is None:
-        return Cell(UNDEFINED if estimate.samples else DASH)
-    if not math.isfinite(value):
-        return Cell("∞" if measure.convert is not None else DASH)
+    if value is None or not math.isfinite(value):
+        return Cell(DASH)
     column = measure.column
     if is_miss(estimate, measure):
         informative = ends is not None and ends[0] < ends[1]
@@ -207,38 +139,7 @@ def _interval_text(ends: Interval | None, column: Column) -> str:
     return column.interval_text(ends, separator).replace("-", "−")
 
 
-def measure_definitions(measures: Iterable[Measure]) -> list[tuple[str, str]]:
-    """Return the titles and definitions of the measures.
-
-    Measures whose titles differ only in a tolerance or bin share one definition, in which N stands for that
-    number.
-    """
-    by_title: dict[str, list[Measure]] = {}
-    for measure in measures:
-        by_title.setdefault(_TITLE_NUMBER.sub("N", measure.title, count=1), []).append(measure)
-    return [_definition(title, group) for title, group in by_title.items()]
-
-
-def _definition(title: str, measures: Sequence[Measure]) -> tuple[str, str]:
-    first = measures[0]
-    if len(measures) == 1:
-        return first.title, first.definition
-    steps = [step[0] for measure in measures if (step := _TITLE_NUMBER.search(measure.title))]
-    definition = _TITLE_NUMBER.sub(lambda step: "N" if step[0] == steps[0] else step[0], first.definition)
-    return title, f"{definition}; N: {', '.join(steps)}"
-
-
-def _tolerance_cells(table: ExtendedTable, tolerance: Tolerance) -> list[Cell]:
-    """Return pass rates, then capabilities, each native and scaled."""
-    measures = MEASURE_FAMILIES["inspection"].by_name
-    return [
-        estimate_cell(table.numbers[alignment][name], measures[name])
-        for name in (tolerance.pass_name, tolerance.capability_name)
-        for alignment in (NATIVE, SCALED)
-    ]
-
-
-# Crossings: the reach of a method, tables by distance, and a view with its crossings.
+# Crossings: a table, and a view with its crossings.
 
 _KINDS: Mapping[str, str] = {
     "within2": "within 2 mm",
@@ -254,14 +155,10 @@ _KINDS: Mapping[str, str] = {
 
 @dataclass(frozen=True)
 class CrossingConfig:
-    """Crossings of one config: ``heads`` are (alignment, limit) of the shares in ``rows``, nearest bin first."""
+    """Crossings of one config."""
 
     name: str
-    sentences: list[str]
-    heads: list[tuple[str, int]]
-    rows: list[tuple[ReachBin, list[Cell]]]
     main: MeasureTable
-    binned: MeasureTable
     picture: CrossingPicture | None
 
 
@@ -280,42 +177,23 @@ class CrossingPicture:
     counts: list[tuple[str, str, int]]
 
 
-def _crossing_config(name: str, table: ExtendedTable, picture: CrossingPicture | None) -> CrossingConfig:
-    family = MEASURE_FAMILIES["crossings"]
-    by_property = [measure for measure in BINNED_MEASURES if not measure.name.rpartition("_")[2].endswith("m")]
-    by_property += [measure for measure in BINNED_MEASURES if measure.name.endswith("mm")]
-    reaches = [(alignment, reach) for alignment in (NATIVE, SCALED) for reach in table.reaches.get(alignment, ())]
-    bins = zip(*(reach.bins for _, reach in reaches), strict=True)
-    return CrossingConfig(
-        name=printable(name),
-        sentences=[reach_sentence(alignment, reach) for alignment, reach in reaches],
-        heads=[(alignment, reach.limit_mm) for alignment, reach in reaches],
-        rows=[
-            (of_limits[0], [_SHARE.value_cell(one.share, one.interval) for one in of_limits]) for of_limits in bins
-        ],
-        main=measure_table(table, family.title, family, MAIN_MEASURES),
-        binned=measure_table(table, "Crossings by angle, gap and bar width", family, by_property),
-        picture=picture,
-    )
+def crossing_picture(
+    evaluation: Evaluation, config: DatasetConfig, crossings: CrossingSamples
+) -> CrossingPicture | None:
+    """Return the view of a config with most judged crossings, with all of its crossings; None if it has none.
 
-
-def crossing_picture(evaluation: Evaluation, config: DatasetConfig) -> CrossingPicture | None:
-    """Return the view of a config with most judged crossings, with all of its crossings; None if it has none."""
-    if not has_bar_ids(config):
-        return None
+    ``crossings`` are the samples of its views.
+    """
     steel = load_steel_truth(evaluation.folder, config)
-    if not any(len(bars.crossings) for bars in steel.bars_by_view.values()) or not len(steel):
+    if not any(len(bars.crossings) for bars in steel.bars_by_view.values()):
         return None
-    truth = steel.view(int(np.argmax(steel.judged_counts)))
-    scene, crossings = truth.bars.crossings, view_crossings(truth)
-    prediction_m = evaluation.submission.read(truth.view_id)
-    is_located, ties = fitted_ties(truth.predicted_m(prediction_m), crossings)
-    with np.errstate(invalid="ignore", over="ignore"):
-        error_mm = 1000 * np.linalg.norm(ties.tie_point_m - crossings.ties.tie_point_m, axis=1)
+    position = int(np.argmax(steel.judged_counts))
+    truth, shown = steel.view(position), crossings.of(crossings.view == position)
+    scene = truth.bars.crossings
     kinds = dict.fromkeys(range(len(scene)), "unjudged")
     kinds |= dict.fromkeys(truth.judged.crossing.tolist(), "bent")
-    located = zip(crossings.crossing.tolist(), is_located.tolist(), error_mm.tolist(), strict=True)
-    kinds |= {crossing: error_kind(error) if found else "missed" for crossing, found, error in located}
+    judged = zip(shown.crossing_id.tolist(), shown.found.tolist(), shown.tie_error_mm.tolist(), strict=True)
+    kinds |= {number - 1: error_kind(error) if found else "missed" for number, found, error in judged}
     marks = list(_marks(truth, scene.crossings.tie_point_m, kinds))
     found = [kind for kind, _, _ in marks]
     [row] = iterate_rows(config, ("left_rgb", "left_depth", "left_mask"), [truth.view_id])

@@ -92,12 +92,13 @@ def render_report(
     script = inline_script("static/sortable.js", "browser.js")
     content = _browser_context(shown, views)
     if result.prediction is not None:
-        content |= relative_context(result, views)
+        content |= {**relative_context(result, views), "tasks": []}
     else:
         content |= {
             **results_context(result, views),
             **paper_context(result),
             **_extended_context(result, pictures or {}),
+            **_tasks_context(result),
             **views_context(views, {name: of for name, of in views.items() if len(of) > WORST_SHOWN}),
         }
     return (
@@ -112,6 +113,7 @@ def render_report(
             mistakes=[printable(mistake.text, _MISTAKE_CHARACTERS) for mistake in mistakes],
             kind=result.prediction,
             has_archive=result.submission.sha256 is not None,
+            rank_purpose_note=formatting.RANK_PURPOSE_NOTE,
             **content,
         )
     )
@@ -199,6 +201,15 @@ def _extended_context(result: Result, pictures: Mapping[str, CrossingPicture]) -
     from rebar_depth_bench.reporting.html.extended import extended_context
 
     return extended_context(result.extended, pictures)
+
+
+def _tasks_context(result: Result) -> dict[str, object]:
+    """Return the context of ``part_tasks.html.j2``, which is shown if a bin of any config is tested."""
+    if result.extended is None or not any(tasks.is_tested for tasks in result.extended.tasks.values()):
+        return {"tasks": []}
+    from rebar_depth_bench.reporting.tasks import tasks_context
+
+    return tasks_context([result])
 
 
 def _browser_context(shown: Sequence[ShownView], views: Mapping[str, Sequence[ViewScore]]) -> dict[str, object]:
@@ -289,10 +300,11 @@ def write_report(
             prediction = evaluation.submission.read(row["view_id"])
             panels = view_panels(row, prediction, scores[row["view_id"]], evaluation.meta.prediction, result.kind)
             shown.append(shown_view(panels))
-        if result.extended is not None:
+        if result.extended is not None and config.name in result.extended.frames:
             from rebar_depth_bench.reporting.html.extended import crossing_picture
 
-            picture = crossing_picture(evaluation, config)
+            samples = result.extended.frames[config.name].native.predicted.crossings
+            picture = crossing_picture(evaluation, config, samples)
             if picture is not None:
                 pictures[config.name] = picture
     write_output(target, render_report(result, shown, mistakes, pictures))

@@ -10,6 +10,7 @@ import numpy as np
 from rebar_depth_bench.bar_crossings.definition import scene_crossings
 from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.extended.axes import assign_segments
+from rebar_depth_bench.extended.frames import SteelSamples, steel_frames
 from rebar_depth_bench.extended.judged import judged_crossings
 from rebar_depth_bench.extended.steel import SceneBars, SteelTruth
 from rebar_depth_bench.scoring.protocol import interior, single_bar_pixels
@@ -87,7 +88,6 @@ def view(bars: Sequence[Bar], cam_from_world: np.ndarray = CAMERA_AT_ORIGIN) -> 
     points_m = np.column_stack([rays, np.ones(len(index))]) * z_m.astype(np.float64)[:, None]
     world_m = (points_m - cam_from_world[:3, 3]) @ cam_from_world[:3, :3]
     bar_id = ids[index].astype(np.uint16)
-    no_layer = np.full(len(index), np.nan, dtype=np.float32)
     inside = interior((ids > 0).reshape(HEIGHT, WIDTH)).ravel()[index]
     K = np.array([[FOCAL_PX, 0, (WIDTH - 1) / 2], [0, FOCAL_PX, (HEIGHT - 1) / 2], [0, 0, 1.0]])
     run = assign_segments(world_m, bar_id, scene.cage)
@@ -96,9 +96,16 @@ def view(bars: Sequence[Bar], cam_from_world: np.ndarray = CAMERA_AT_ORIGIN) -> 
     single_bar[inside] = single_bar_pixels(ids.reshape(HEIGHT, WIDTH).astype(np.uint16), scored)
     truth = SteelTruth(
         "lattice/0000", HEIGHT, WIDTH, K, cam_from_world, index.astype(np.uint32), z_m, bar_id, inside,
-        single_bar, rays, run, no_layer, no_layer, scene,
+        single_bar, rays, run, scene,
     )  # fmt: skip
     return replace(truth, judged=judged_crossings(truth))
+
+
+def steel_samples(p_m: np.ndarray, truth: SteelTruth) -> SteelSamples:
+    """Return the native samples of depth on the pixels of a truth, metres."""
+    image_m = np.full(truth.height * truth.width, np.nan)
+    image_m[truth.index] = p_m
+    return steel_frames(image_m.reshape(truth.height, truth.width), truth, 0).native.predicted
 
 
 def predicted_m(moved: Sequence[Bar], truth: SteelTruth) -> np.ndarray:

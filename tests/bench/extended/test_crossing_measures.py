@@ -1,4 +1,4 @@
-"""Crossings in depth: judged crossings, measures of exact, displaced and noisy depth, and reach."""
+"""Crossings in depth: judged crossings, and measures of exact, displaced and noisy depth."""
 
 from __future__ import annotations
 
@@ -12,19 +12,12 @@ from hypothesis import strategies as st
 from numpy import ndarray
 
 from rebar_depth_bench.data.bars import Bar
-from rebar_depth_bench.extended.crossings import (
-    BINNED_MEASURES,
-    MAIN_MEASURES,
-    ViewCrossings,
-    crossing_samples,
-    view_crossings,
-)
+from rebar_depth_bench.extended.crossings import MEASURES, crossing_samples
 from rebar_depth_bench.extended.fits import LATERAL_PRIOR_RADII
+from rebar_depth_bench.extended.judged import ViewCrossings, view_crossings
 from rebar_depth_bench.extended.measures import Samples
-from rebar_depth_bench.extended.reach import Reach, reaches
 from rebar_depth_bench.extended.steel import SceneBars, SteelTruth
-from rebar_depth_bench.scoring.bootstrap import Resampling, resample, resample_scenes
-from tests.bench.extended.cage_scenes import FOCAL_PX, bar, view
+from tests.bench.extended.cage_scenes import FOCAL_PX, bar, steel_samples, view
 
 D = 0.02
 UPRIGHT = bar(1, (0.0, -0.15, 0.40), (0.0, 0.15, 0.40))
@@ -37,9 +30,8 @@ def turned(angle_deg: float, z_m: float, bar_id: int = 2) -> Bar:
 
 
 def samples_of(p_m: ndarray, truth: SteelTruth) -> Samples:
-    samples = crossing_samples(p_m, view_crossings(truth))
-    used = {measure.sample for measure in (*MAIN_MEASURES, *BINNED_MEASURES)}
-    assert used | {"crossing_z_m"} == set(samples)
+    samples = crossing_samples(steel_samples(p_m, truth).crossings)
+    assert {measure.sample for measure in MEASURES} == set(samples)
     return samples
 
 
@@ -55,21 +47,16 @@ def test_two_bars_by_hand() -> None:
     assert found.crossing.tolist() == [0]
     np.testing.assert_allclose(found.ties.tie_point_m, [[0, 0, 0.4105]], atol=1e-9)
     np.testing.assert_allclose(found.ties.normal, [[0, 0, 1]], atol=1e-9)
-    assert found.width_px[0] == pytest.approx(FOCAL_PX * D / 0.4105)
-    samples = samples_of(depth_m, truth)
-    assert samples["crossings_judged"].tolist() == samples["crossing_located"].tolist() == [1.0]
+    samples, crossing = samples_of(depth_m, truth), steel_samples(depth_m, truth).crossings
+    assert samples["crossing_located"].tolist() == [1.0]
     assert samples["tie_judged_mm"][0] < 0.02
-    assert samples["crossing_gap_judged_mm"][0] < 0.02
+    assert samples["layer_judged_mm"][0] < 0.02
     assert samples["crossing_angle_judged_deg"][0] < 0.1
-    assert samples["crossing_normal_judged_deg"][0] < 0.1
-    assert [samples[f"tie_within_{limit}mm"].tolist() for limit in (2, 5, 10)] == [[1.0]] * 3
-    assert samples["crossing_z_m"] == pytest.approx([0.4105])
-    full = {name for name, values in samples.items() if "_at_" in name and len(values)}
-    shares = ("located", "within_5mm")
-    assert full == {
-        *(f"tie_within_{limit}mm_at_0.4-0.5m" for limit in (2, 5)),
-        *(f"tie_{share}_at_{name}" for share in shares for name in ("75-90deg", "1-2mm", "8-12px")),
-    }
+    assert [samples[f"tie_within_{limit}mm"].tolist() for limit in (2, 5)] == [[1.0]] * 2
+    assert (crossing.crossing_id.tolist(), crossing.bar_a.tolist(), crossing.bar_b.tolist()) == ([1], [1], [2])
+    assert crossing.distance_m == pytest.approx([0.4105])
+    assert crossing.true_layer_mm == pytest.approx([21.0])
+    assert crossing.true_angle_deg == pytest.approx([90.0])
 
 
 def test_three_bars_of_one_node_are_judged_where_they_are_seen() -> None:
@@ -82,7 +69,6 @@ def test_three_bars_of_one_node_are_judged_where_they_are_seen() -> None:
         ([2, 3], 2),
     ]
     assert truth.judged.crossing.tolist() == [0]
-    assert samples_of(truth.depth_m.astype(float), truth)["crossings_judged"].tolist() == [0.5]
     beside = bar(
         3, (0.03, -0.15, 0.442), (0.03, 0.15, 0.442)
     )  # Seen beside the first, its tie point behind bar 2.
@@ -119,8 +105,7 @@ def test_crossings_are_judged_where_both_bars_are_seen(bars: list[Bar], judged: 
     truth, depth_m = exact_depth(bars)
     assert truth.judged.crossing.tolist() == judged
     samples = samples_of(depth_m, truth)
-    assert samples["crossings_judged"].tolist() == [len(judged) / len(truth.bars.crossings)]
-    assert bool(judged) == any(len(values) for name, values in samples.items() if name != "crossings_judged")
+    assert {len(values) for values in samples.values() if len(values) or judged} == ({1} if judged else set())
 
 
 def test_bent_bar_is_judged_but_not_fitted() -> None:
@@ -145,11 +130,11 @@ def test_shifted_depth_shifts_the_tie_point() -> None:
     samples = samples_of(depth_m + 0.003, truth)
     assert samples["tie_along_error_mm"] == pytest.approx([3.0], abs=0.05)
     assert samples["tie_across_judged_mm"] == pytest.approx([0.0], abs=0.05)
-    assert samples["crossing_gap_error_mm"] == pytest.approx([0.0], abs=0.05)
-    assert [samples[f"tie_within_{limit}mm"].tolist() for limit in (2, 5, 10)] == [[0.0], [1.0], [1.0]]
+    assert samples["layer_error_mm"] == pytest.approx([0.0], abs=0.05)
+    assert [samples[f"tie_within_{limit}mm"].tolist() for limit in (2, 5)] == [[0.0], [1.0]]
     samples = samples_of(depth_m + 0.002 * (truth.bar_id == 1), truth)
     assert samples["tie_along_error_mm"] == pytest.approx([1.0], abs=0.05)
-    assert samples["crossing_gap_error_mm"] == pytest.approx([-2.0], abs=0.05)  # Intersecting cylinders: -1 mm.
+    assert samples["layer_error_mm"] == pytest.approx([-2.0], abs=0.05)  # Intersecting cylinders: -1 mm.
 
 
 def test_missing_predictions_are_not_located() -> None:
@@ -157,9 +142,9 @@ def test_missing_predictions_are_not_located() -> None:
     for p_m in (np.full(len(depth_m), np.nan), np.where(truth.bar_id == 1, np.nan, depth_m)):
         samples = samples_of(p_m, truth)
         assert samples["crossing_located"].tolist() == [0.0]
-        assert samples["tie_judged_mm"].tolist() == samples["crossing_gap_judged_mm"].tolist() == [100.0]
+        assert samples["tie_judged_mm"].tolist() == samples["layer_judged_mm"].tolist() == [100.0]
         assert samples["crossing_angle_judged_deg"].tolist() == [90.0]
-        assert samples["tie_within_10mm"].tolist() == [0.0]
+        assert samples["tie_within_5mm"].tolist() == [0.0]
         assert len(samples["tie_along_error_mm"]) == 0
 
 
@@ -216,85 +201,3 @@ def test_noise_has_the_effect_that_error_propagation_predicts(noise_diameters: f
     # Tukey's biweight has an efficiency of 95 %, and 300 draws determine a deviation to 4 %.
     assert 0.92 * expected_mm < np.std(errors_mm) < 1.15 * expected_mm
     assert abs(np.mean(errors_mm)) < 4 * expected_mm / math.sqrt(300) + 0.02 * noise_m * 1000
-
-
-# Reach.
-
-
-REACH_VIEWS = 10
-
-
-def crossings_of_view(bins: dict[float, tuple[int, float]], view: int) -> dict[str, ndarray]:
-    """Return a view's crossings by depth: their number, and the share of views with 3 mm of error, else 9 mm."""
-    z_m = [z for z, (count, _) in bins.items() for _ in range(count)]
-    error_mm = [3.0 if view < share * REACH_VIEWS else 9.0 for count, share in bins.values() for _ in range(count)]
-    return {"crossing_z_m": np.array(z_m), "tie_judged_mm": np.array(error_mm)}
-
-
-def reach_of(
-    bins: dict[float, tuple[int, float]], views: int = REACH_VIEWS, resampling: Resampling | None = None
-) -> Reach:
-    by_view = [crossings_of_view(bins, view) for view in range(views)]
-    five, two = reaches(by_view, resampling or resample([100 * index for index in range(views)]))
-    assert (five.limit_mm, two.limit_mm) == (5, 2)
-    assert two.verdict in ("not met", "none tested")  # 3 mm is never within 2 mm.
-    return five
-
-
-def test_reach_ends_before_the_first_bin_that_fails() -> None:
-    found = reach_of({0.22: (6, 1), 0.27: (6, 1), 0.35: (6, 0.9), 0.45: (6, 1)})
-    assert (found.verdict, found.distance_m, found.tested_m) == ("up to", 0.3, (0.2, 0.5))
-    assert [(one.low_m, one.crossings, one.views) for one in found.bins] == [
-        (0.2, 60, 10), (0.25, 60, 10), (0.3, 60, 10), (0.4, 60, 10),
-    ]  # fmt: skip
-    assert found.bins[2].share == pytest.approx(0.9)
-    assert found.interval is not None
-    # Views of which a tenth fails in the third bin: some resamples have none of them, and all bins are met.
-    assert found.interval == (0.3, 0.5)
-
-
-@pytest.mark.parametrize(
-    ("bins", "views", "expected"),
-    [
-        # 40 crossings: the third bin is not tested.
-        ({0.22: (6, 1), 0.27: (6, 1), 0.35: (4, 0)}, 10, ("at least", 0.3, (0.3, 0.3), (0.2, 0.3))),
-        # A gap without crossings ends the reach.
-        ({0.22: (6, 1), 0.45: (6, 1)}, 10, ("at least", 0.25, (0.25, 0.25), (0.2, 0.25))),
-        # Ten crossings nearer than the nearest tested bin say nothing.
-        ({0.22: (1, 0), 0.27: (6, 1)}, 10, ("at least", 0.3, (0.3, 0.3), (0.25, 0.3))),
-        ({0.22: (6, 0.5), 0.27: (6, 1)}, 10, ("not met", None, (0.0, 0.0), (0.2, 0.3))),
-        ({}, 10, ("none tested", None, None, None)),
-        ({0.22: (20, 1.0)}, 4, ("none tested", None, None, None)),
-        ({0.22: (4, 1.0)}, 10, ("none tested", None, None, None)),
-        ({30.0: (9, 1.0)}, 10, ("none tested", None, None, None)),
-    ],
-)
-def test_verdict_distance_interval_and_tested_range(
-    bins: dict[float, tuple[int, float]], views: int, expected: tuple[object, ...]
-) -> None:
-    found = reach_of(bins, views)
-    assert (found.verdict, found.distance_m, found.interval, found.tested_m) == expected
-
-
-def test_share_of_exactly_95_percent_fulfils() -> None:
-    by_view = [
-        {"crossing_z_m": np.full(20, 0.22), "tie_judged_mm": np.r_[np.full(19, 5.0), 5.1]} for _ in range(5)
-    ]
-    found = reaches(by_view, resample(range(0, 500, 100)))[0]
-    assert (found.verdict, found.distance_m) == ("at least", 0.25)
-
-
-def test_reach_is_in_json_terms() -> None:
-    found = reach_of({0.22: (6, 1), 0.27: (6, 0)}).to_dict()
-    assert {name: value for name, value in found.items() if name != "bins"} == {
-        "limit_mm": 5, "verdict": "up to", "distance_m": 0.25, "ci95": [0.25, 0.25], "tested_m": [0.2, 0.3],
-    }  # fmt: skip
-    assert found["bins"][0] == {
-        "low_m": 0.2, "high_m": 0.25, "crossings": 60, "views": 10, "share": 1.0, "ci95": [1.0, 1.0],
-    }  # fmt: skip
-
-
-def test_interval_of_few_scenes_is_unknown() -> None:
-    few = resample_scenes(["a"] * 5 + ["b"] * 5)
-    found = reach_of({0.22: (6, 1)}, resampling=few)
-    assert (found.verdict, found.distance_m, found.interval) == ("at least", 0.25, None)

@@ -268,8 +268,8 @@ def cloud_scores(p_m: ndarray, truth: SteelTruth) -> dict[str, float]:
 
 def test_clouds_by_hand() -> None:
     truth = pixel_truth([1.0, 2.0, 3.0, 4.0], rays=[(0, 0)] * 4)
-    measured = cloud_scores(np.array([1.0015, 2.0, np.nan, 4.0075]), truth)
-    accuracy = {1: 1 / 4, 2: 2 / 4, 5: 2 / 4, 10: 3 / 4, 20: 3 / 4}
+    measured = cloud_scores(np.array([1.003, 2.0, np.nan, 4.0075]), truth)
+    accuracy = {5: 2 / 4, 10: 3 / 4}
     for t, share in accuracy.items():
         assert measured[f"cloud_accuracy_{t}mm"] == pytest.approx(share)
         assert measured[f"cloud_completeness_{t}mm"] == pytest.approx(share)
@@ -277,10 +277,10 @@ def test_clouds_by_hand() -> None:
 
 
 def test_tolerance_is_inclusive() -> None:
-    truth = pixel_truth([1 / 32], rays=[(0, 0)])
-    p_m = np.array([1 / 32 - 0.02])  # exact, as 0.02 lies between half and twice 1/32
-    assert cloud_scores(p_m, truth)["cloud_accuracy_20mm"] == 1.0
-    assert cloud_scores(np.nextafter(p_m, 0), truth)["cloud_accuracy_20mm"] == 0.0
+    truth = pixel_truth([1 / 64], rays=[(0, 0)])
+    p_m = np.array([1 / 64 - 0.01])  # exact, as 0.01 lies between half and twice 1/64
+    assert cloud_scores(p_m, truth)["cloud_accuracy_10mm"] == 1.0
+    assert cloud_scores(np.nextafter(p_m, 0), truth)["cloud_accuracy_10mm"] == 0.0
 
 
 def brute_force_scores(p_m: ndarray, truth: SteelTruth, queries: int = MAX_POINTS) -> dict[str, float]:

@@ -17,15 +17,12 @@ HOLES = (np.nan, np.inf, -np.inf, 0.0, -1.0)
 """Values of an archive that are no prediction."""
 
 
-def steel_truth(
-    depth_m: ndarray, bars: ndarray, front_m: ndarray | None = None, behind_m: ndarray | None = None
-) -> SteelTruth:
-    """Return the truth of a view from whole images (h x w); there are no front or rear layers by default."""
+def steel_truth(depth_m: ndarray, bars: ndarray) -> SteelTruth:
+    """Return the truth of a view from whole images (h x w)."""
     height, width = depth_m.shape
     padded = np.pad(bars > 0, 1)
     near = np.any([padded[i : i + height, j : j + width] for i in range(3) for j in range(3)], axis=0)
     index = np.flatnonzero(near & (depth_m > 0)).astype(np.uint32)
-    no_layer = np.full(depth_m.shape, np.nan)
     K = ideal_K(width, height)
     inside = interior(bars > 0) & (depth_m > 0)
     single_bar, steps = np.zeros_like(inside), depth_steps(depth_m.astype(np.float32))
@@ -43,8 +40,6 @@ def steel_truth(
         single_bar=single_bar.ravel()[index],
         rays=pixel_rays(K, width, height).reshape(-1, 3)[index, :2],
         run=np.full(len(index), -1, np.int16),
-        front_m=(no_layer if front_m is None else front_m).ravel()[index].astype(np.float32),
-        behind_m=(no_layer if behind_m is None else behind_m).ravel()[index].astype(np.float32),
         parallax_px_m=84.0,
         seen_by_right=inside.ravel()[index] & (index % 3 > 0),
         has_depth=steps["has_depth"],
@@ -58,19 +53,11 @@ def pixel_truth(
     bar_id: ndarray | None = None,
     *,
     rays: Sequence[tuple[float, float]] | None = None,
-    front_m: Sequence[float] | None = None,
-    behind_m: Sequence[float] | None = None,
-    diameter_m: ndarray | None = None,
 ) -> SteelTruth:
-    """Return the truth of a view one pixel high, all of it interior; all but ``diameter_m`` has a value per pixel.
-
-    ``diameter_m`` are the diameters of bars by id, metres. The focal length is 700 px.
-    """
+    """Return the truth of a view one pixel high, all of it interior. The focal length is 700 px."""
     count = len(depth_m)
-    layers = (None if layer_m is None else np.array([layer_m]) for layer_m in (front_m, behind_m))
-    truth = steel_truth(np.array([depth_m]), np.ones((1, count), np.uint16), *layers)
+    truth = steel_truth(np.array([depth_m]), np.ones((1, count), np.uint16))
     K = np.array([[700.0, 0, (count - 1) / 2], [0, 700.0, 0], [0, 0, 1.0]])
-    bars = SceneBars.of(())
     return replace(
         truth,
         K=K,
@@ -79,7 +66,7 @@ def pixel_truth(
         single_bar=np.ones(count, bool),
         rays=np.array(rays or [((u - K[0, 2]) / 700.0, 0.0) for u in range(count)]),
         run=np.zeros(count, np.int16),
-        bars=bars if diameter_m is None else replace(bars, diameter_m=diameter_m),
+        bars=SceneBars.of(()),
     )
 
 
@@ -100,13 +87,8 @@ def random_images(rng: np.random.Generator, height: int = 24, width: int = 31) -
 
 
 def random_truth(rng: np.random.Generator) -> SteelTruth:
-    """Return the truth of a random view with random front and rear layers."""
-    depth_m, bars = random_images(rng)
-    layers = [
-        np.where(rng.random(depth_m.shape) < 0.7, depth_m + sign * rng.uniform(0.01, 0.1), np.nan)
-        for sign in (-1, 1)
-    ]
-    return steel_truth(depth_m, bars, *layers)
+    """Return the truth of a random view."""
+    return steel_truth(*random_images(rng))
 
 
 def random_prediction(rng: np.random.Generator, truth: SteelTruth, holes: float = 0.1) -> ndarray:

@@ -1,8 +1,6 @@
-"""Boundary F1 and depth layers: cases by hand, independent formulas, and invariances."""
+"""Boundary F1: cases by hand, independent formulas, and invariances."""
 
 from __future__ import annotations
-
-import math
 
 import numpy as np
 import pytest
@@ -11,16 +9,8 @@ from hypothesis import strategies as st
 from numpy import ndarray
 
 from rebar_depth_bench.extended.boundary import THRESHOLDS_PERCENT, boundary_samples, neighbour_pairs
-from rebar_depth_bench.extended.depth_layers import DIRECTIONS, RADII_PX, layer_samples, other_layers
 from rebar_depth_bench.extended.published import RADII, image_boundary_samples
-from rebar_depth_bench.extended.steel import SteelTruth
-from tests.bench.extended.thin_scenes import (
-    pixel_truth,
-    random_images,
-    random_prediction,
-    random_truth,
-    steel_truth,
-)
+from tests.bench.extended.thin_scenes import random_images, random_prediction, random_truth, steel_truth
 
 # Boundary F1.
 
@@ -43,11 +33,6 @@ def test_boundary_by_hand() -> None:
             "boundary_f1": (0.5 + 0.5) / 5,
             "boundary_precision": (0.5 + 0.5) / 5,
             "boundary_recall": (0.5 + 0.5) / 5,
-            "boundary_f1_1pct": 0.5,
-            "boundary_f1_2pct": 0.5,
-            "boundary_f1_5pct": 0.0,
-            "boundary_f1_10pct": 0.0,
-            "boundary_f1_20pct": 0.0,
             "boundary_missing": 0.0,
         }
     )
@@ -60,7 +45,7 @@ def test_boundary_by_hand() -> None:
 def dense_scores(p_m: ndarray, z_m: ndarray, steel: ndarray) -> dict[str, float]:
     """Return the scores of boundaries from whole images as the papers define them: over four directions."""
     p_m = np.where(np.isfinite(p_m) & (p_m > 0), p_m, np.nan)
-    f1, precision, recall = {}, [], []
+    f1, precision, recall = [], [], []
     for t in THRESHOLDS_PERCENT:
         true = predicted = correct = 0
         for axis in (0, 1):
@@ -77,11 +62,11 @@ def dense_scores(p_m: ndarray, z_m: ndarray, steel: ndarray) -> dict[str, float]
                 correct += np.sum(z_contour & p_contour & counted)
                 predicted += np.sum(p_contour & counted) + np.sum(missing & counted) / 2  # counted from both sides
         if true:
-            f1[f"boundary_f1_{t}pct"] = float(2 * correct / (true + predicted))
+            f1.append(2 * correct / (true + predicted))
             precision.append(correct / predicted if predicted else 0.0)
             recall.append(correct / true)
-    means = {"boundary_precision": precision, "boundary_recall": recall, "boundary_f1": list(f1.values())}
-    return {**f1, **{name: float(np.mean(values)) for name, values in means.items() if values}}
+    means = {"boundary_precision": precision, "boundary_recall": recall, "boundary_f1": f1}
+    return {name: float(np.mean(values)) for name, values in means.items() if values}
 
 
 @settings(max_examples=60)
@@ -220,126 +205,3 @@ def test_published_boundaries_by_hand() -> None:
     # A missing prediction misses true edges only; without true edges there is no number.
     assert image_scores(np.full(z_m.shape, np.nan), z_m) == dict.fromkeys(exact, 0.0)
     assert image_scores(z_m, np.ones(z_m.shape)) == {}
-
-
-# Depth layers and their confusion.
-
-
-NAN = float("nan")
-
-
-def layers_at(depth_m: ndarray, bars: ndarray, row: int, column: int, gap_m: float) -> tuple[float, float]:
-    index = np.array([row * depth_m.shape[1] + column], np.uint32)
-    front_m, behind_m = other_layers(
-        depth_m.astype(np.float32), bars.astype(np.uint16), index, np.array([gap_m], np.float32)
-    )
-    return float(front_m[0]), float(behind_m[0])
-
-
-def cross() -> tuple[ndarray, ndarray]:
-    """Return depth and bar ids of a vertical bar at 0.25 m before a horizontal one at 0.5 m and a board at 1 m."""
-    depth_m, bars = np.ones((64, 64)), np.zeros((64, 64), int)
-    depth_m[30:33], bars[30:33] = 0.5, 2
-    depth_m[:, 30:33], bars[:, 30:33] = 0.25, 1
-    return depth_m, bars
-
-
-def test_crossing_bars_by_hand() -> None:
-    depth_m, bars = cross()
-    assert layers_at(depth_m, bars, 31, 31, 0.01) == pytest.approx((NAN, 0.5), nan_ok=True)
-    assert layers_at(depth_m, bars, 31, 55, 0.01) == pytest.approx((0.25, NAN), nan_ok=True)  # 24 px to the right
-    assert layers_at(depth_m, bars, 31, 60, 0.01) == pytest.approx((NAN, NAN), nan_ok=True)  # out of range
-    assert layers_at(depth_m, bars, 31, 31, 0.25) == pytest.approx(
-        (NAN, NAN), nan_ok=True
-    )  # the gap must be exceeded
-    assert layers_at(depth_m, np.minimum(bars, 1), 2, 31, 0.01) == pytest.approx((NAN, NAN), nan_ok=True)
-
-
-def test_receding_bar_is_not_its_own_layer() -> None:
-    depth_m, bars = np.ones((64, 64)), np.zeros((64, 64), int)
-    depth_m[30:33], bars[30:33] = 0.25 + 0.005 * np.arange(64), 1
-    assert layers_at(depth_m, bars, 31, 31, 0.01) == pytest.approx((NAN, NAN), nan_ok=True)
-    # A bar that crosses in front is a layer; the part of the first bar that is visible beyond it is not.
-    depth_m[:, 36:39], bars[:, 36:39] = 0.125, 2
-    assert layers_at(depth_m, bars, 31, 31, 0.01) == pytest.approx((0.125, NAN), nan_ok=True)
-
-
-@pytest.mark.parametrize("between_m", [1.0, 0.0])
-def test_far_side_of_hoop_is_a_layer(between_m: float) -> None:
-    """Check with the board or an empty background visible between the two sides."""
-    depth_m, bars = np.full((64, 64), between_m), np.zeros((64, 64), int)
-    depth_m[30:33], bars[30:33] = 0.25, 1
-    depth_m[42:45], bars[42:45] = 0.5, 1
-    assert layers_at(depth_m, bars, 31, 31, 0.01) == pytest.approx((NAN, 0.5), nan_ok=True)
-    assert layers_at(depth_m, bars, 43, 31, 0.01) == pytest.approx((0.25, NAN), nan_ok=True)
-
-
-def reference_layers(
-    depth_m: ndarray, bars: ndarray, row: int, column: int, gap_m: np.float32
-) -> tuple[float, float]:
-    """Return the front and rear depth of one pixel, computed by a plain loop."""
-    z_m, own = depth_m[row, column], bars[row, column]
-    front: list[float] = []
-    behind: list[float] = []
-    for step in range(DIRECTIONS):
-        between: list[float] = []
-        for radius in RADII_PX:
-            angle = 2 * math.pi * step / DIRECTIONS
-            y, x = row + round(radius * math.sin(angle)), column + round(radius * math.cos(angle))
-            if not (0 <= y < depth_m.shape[0] and 0 <= x < depth_m.shape[1]):
-                break
-            seen_m, same = depth_m[y, x], bars[y, x] == own
-            joined = same and not any(m == 0 or m > max(z_m, seen_m) for m in between)
-            if bars[y, x] and not joined:
-                (behind if seen_m > z_m + gap_m else front if seen_m < z_m - gap_m else []).append(float(seen_m))
-            if not same:
-                between.append(seen_m)
-    return max(front, default=NAN), min(behind, default=NAN)
-
-
-@settings(max_examples=20)
-@given(SEEDS)
-def test_layers_agree_with_reference_loop(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    depth_m, bars = random_images(rng, 40, 50)
-    bars[bars > 3] -= 2  # the same bar in several places
-    index = np.flatnonzero(bars)[:: int(rng.integers(5, 9))].astype(np.uint32)
-    gap_m = rng.uniform(0.001, 0.1, len(index)).astype(np.float32)
-    layers_m = np.column_stack(other_layers(depth_m, bars, index, gap_m))
-    expected = [
-        reference_layers(depth_m, bars, i // 50, i % 50, gap) for i, gap in zip(index.tolist(), gap_m, strict=True)
-    ]
-    np.testing.assert_array_equal(layers_m, np.array(expected, np.float32).reshape(-1, 2))
-
-
-def layer_scores(p_m: ndarray, truth: SteelTruth) -> dict[str, float]:
-    return {name: float(values[0]) for name, values in layer_samples(p_m, truth).items() if len(values)}
-
-
-def test_confusion_by_hand() -> None:
-    truth = pixel_truth([2.0] * 6, front_m=[1.0, 1.0, NAN, NAN, 1.0, NAN], behind_m=[4.0, NAN, 4.0, 4.0, 4.0, NAN])
-    measured = layer_scores(np.array([1.4, 1.6, 2.9, 3.1, NAN, 9.0]), truth)
-    assert measured == pytest.approx(
-        {
-            "layer_confusion": 3 / 5,  # the first, the fourth and the missing pixel
-            "layer_swallowed": 2 / 4,  # the fourth and the missing pixel, of those with a layer behind
-            "layer_pulled_forward": 2 / 3,  # the first and the missing pixel
-            "layers_in_sight": 5 / 6,
-        }
-    )
-
-
-def test_midpoint_is_not_confused_and_extremes_are() -> None:
-    truth = pixel_truth([2.0, 2.0], front_m=[1.0, NAN], behind_m=[NAN, 4.0])
-    assert layer_scores(np.array([1.5, 3.0]), truth)["layer_confusion"] == 0.0
-    assert layer_scores(np.array([5e-324, 1e308]), truth)["layer_confusion"] == 1.0
-    assert layer_scores(np.array([np.inf, -1.0]), truth)["layer_confusion"] == 1.0  # both missing
-
-
-def test_ground_truth_has_no_confusion() -> None:
-    truth = random_truth(np.random.default_rng(4))
-    assert layer_scores(truth.depth_m.astype(np.float64), truth)["layer_confusion"] == 0.0
-    alone = steel_truth(np.ones((5, 5)), np.ones((5, 5), np.uint16))
-    assert layer_scores(np.ones(25), alone) == {"layers_in_sight": 0.0}
-    bare = steel_truth(np.ones((2, 2)), np.ones((2, 2), np.uint16))
-    assert layer_scores(np.ones(4), bare) == {}
