@@ -23,9 +23,9 @@ from dataset_builder.blender.materials import (
 )
 from dataset_builder.blender.shader_nodes import NodeTreeBuilder, Socket, WorldBuilder
 from dataset_builder.scene.board_texture import board_texture
-from dataset_builder.scene.environments.laboratory import BENCH_TOP_M, SHEET_THICKNESS_M
+from dataset_builder.scene.environments.laboratory import SHEET_THICKNESS_M
 from dataset_builder.scene.environments.light_rigs import LightRig, Panel, Sky, Spot, Sun
-from dataset_builder.scene.environments.surroundings import SURROUNDINGS
+from dataset_builder.scene.environments.surroundings import SURROUNDINGS, floor_offset_m
 from dataset_builder.scene.model import NOT_STEEL, Assembly, Mesh, Part, WorldMesh, surface
 from dataset_builder.scene.shapes.solids import box, transformed, world_mesh
 from dataset_builder.scene.variants.props import make_props
@@ -68,8 +68,7 @@ def build_scene(assembly: Assembly, spec: SceneSpec, *, colour: bool = True) -> 
         for name, value in surface_variation(spec.seed, part.bar_id).items():
             steel[name] = value
     surroundings = SURROUNDINGS[spec.environment]
-    # A floor at z = 0 would coincide with the top of the sheet, so it is lowered under a board.
-    offset_z_m = 0.0 if spec.board is None else min(0.0, BENCH_TOP_M - surroundings.floor_m)
+    offset_z_m = floor_offset_m(spec)
     panorama = image_light(spec)
     rig = None if panorama is not None else surroundings.light[exclusive_variant(variants, LIGHT_SLOT)]
     opened = surroundings.roof if panorama is None else (*surroundings.enclosure, *surroundings.roof)

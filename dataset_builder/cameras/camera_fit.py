@@ -2,16 +2,30 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.cameras.rigs import rig_cameras
 from dataset_builder.cameras.trajectories import Cylinders, aim_point_m, camera_offsets_m, poses
-from dataset_builder.scene.environments.surroundings import LIFE_SIZE_ENVIRONMENTS, SURROUNDINGS
+from dataset_builder.scene.environments.surroundings import (
+    GROUND_CLEARANCE_M,
+    LIFE_SIZE_ENVIRONMENTS,
+    SURROUNDINGS,
+)
 from dataset_builder.scene.model import Assembly
+from dataset_builder.scene.variants.formwork import SHEET_M, form_sheet, world_from_form
 from dataset_builder.scene.variants.registry import SCREEN_DISTANCE, SHADOWS
-from dataset_builder.specs.config_specs import ConfigSpec, PosesSpec, RandomViewsSpec, SurveySpec, TrajectorySpec
+from dataset_builder.specs.config_specs import (
+    ConfigSpec,
+    FormSpec,
+    PosesSpec,
+    RandomViewsSpec,
+    SurveySpec,
+    TrajectorySpec,
+)
 from rebar_depth_bench.base.errors import InputError, MeshError
 from rebar_depth_bench.data.bars import with_axis
 from rebar_depth_bench.data.schema import EYES
@@ -26,8 +40,8 @@ def check_fits(assembly: Assembly, config: ConfigSpec) -> None:
 
     Raises ``MeshError`` if it reaches more than 1 mm below z = 0 or as far as the nearest camera, and
     ``InputError`` if the screen of the variant ``shadows`` would be among the cameras, if an eye is inside of a
-    bar or not above the ground, and as ``look_at_with_rig``. The cameras of a survey, random views and given poses
-    may be nearer, since each eye is tested by itself.
+    bar or not above the ground, if a form is below the ground or at a camera, and as ``look_at_with_rig``. The
+    cameras of a survey, random views and given poses may be nearer, since each eye is tested by itself.
     """
     check_above_ground(assembly, config.name)
     vertices_m, aim_m = assembly.vertices_m, aim_point_m(assembly)
@@ -58,6 +72,35 @@ def check_fits(assembly: Assembly, config: ConfigSpec) -> None:
                 f"{np.round(eyes_m[2 * view + eye], 4).tolist()} m, expected above z = 0 and outside of the steel"
             )
     _check_shadow_screen(vertices_m, float(camera_distances_m.max()), config)
+    if config.scene.forms:
+        _check_forms(eyes_m, config)
+
+
+def _check_forms(eyes_m: Float64[ndarray, "n 3"], config: ConfigSpec) -> None:
+    """Raise ``InputError`` if a form is below the ground or at a camera, or beside panels of ``formwork``.
+
+    ``eyes_m`` are the places of the left and right camera of each view, alternating.
+    """
+    if "formwork" in config.scene.appearance.variants:
+        found = f"{config.name}: the variant 'formwork' adds panels to a scene with [[form]] tables"
+        raise InputError(f"{found}, expected one of both")
+    for form in config.scene.forms:
+        where = f"{config.name}: the sheet of form {form.name!r}"
+        lowest_m = float(form_sheet(form).mesh.vertices_m[:, 2].min())
+        if lowest_m < -_BOARD_TOLERANCE_M:
+            raise InputError(
+                f"{where}, {SHEET_M:g} m thick, extends down to z = {lowest_m:.4g} m, expected 0 or above (the "
+                "ground is at z = 0): place form and steel higher"
+            )
+        from_middle_m = (eyes_m - form.point_m) @ world_from_form(form) + [0, 0, SHEET_M / 2]
+        outside_m = np.maximum(np.abs(from_middle_m) - [*np.divide(form.size_m, 2), SHEET_M / 2], 0.0)
+        distance_m = np.linalg.norm(outside_m, axis=1)
+        nearest = int(distance_m.argmin())
+        if distance_m[nearest] < GROUND_CLEARANCE_M:
+            raise InputError(
+                f"{where} is {distance_m[nearest]:.4g} m from a camera of view {nearest // 2 + 1}, expected "
+                f"{GROUND_CLEARANCE_M:g} m or more: move the form or the [cameras]"
+            )
 
 
 def check_above_ground(assembly: Assembly, where: str) -> None:
@@ -84,8 +127,10 @@ def _check_shadow_screen(vertices_m: Float64[ndarray, "n 3"], farthest_m: float,
         )
 
 
-def misfit(environment: str, assembly: Assembly, trajectory: TrajectorySpec) -> str | None:
-    """Return why the assembly or its cameras do not fit into an environment, or None if they do.
+def misfit(
+    environment: str, assembly: Assembly, trajectory: TrajectorySpec, forms: Sequence[FormSpec] = ()
+) -> str | None:
+    """Return why the assembly, its forms or its cameras do not fit into an environment, or None if they do.
 
     A survey has no stations yet: in an environment for life-size steel its cameras are placed where they fit, in
     the laboratory all places that they could have must fit.
@@ -94,6 +139,10 @@ def misfit(environment: str, assembly: Assembly, trajectory: TrajectorySpec) -> 
     limit_m = SURROUNDINGS[environment].steel_radius_m
     if steel_radius_m > limit_m:
         return _outside("the steel extends", steel_radius_m, limit_m, environment)
+    for form in forms:
+        radius_m = float(np.linalg.norm(form_sheet(form).mesh.vertices_m[:, :2], axis=1).max())
+        if radius_m > limit_m:
+            return _outside(f"form {form.name!r} extends", radius_m, limit_m, environment)
     space = SURROUNDINGS[environment].cameras
     if isinstance(trajectory, SurveySpec):
         if environment in LIFE_SIZE_ENVIRONMENTS:

@@ -228,18 +228,23 @@ class _Site:
 
 
 def with_stations(
-    survey: SurveySpec, assembly: Assembly, space: CameraSpace, rig: RigSpec, where: str
+    survey: SurveySpec,
+    assembly: Assembly,
+    space: CameraSpace,
+    rig: RigSpec,
+    where: str,
+    obstacles: Sequence[Part] = (),
 ) -> SurveySpec:
     """Return the survey with its stations, by distance and then along short paths.
 
     Of the acceptable views of a distance, those are taken whose points are farthest from each other, and each of
-    them gives way to the acceptable view near it that shows the most steel.
+    them gives way to the acceptable view near it that shows the most steel. ``obstacles`` are avoided as steel is.
 
     Raises ``InputError`` that names ``where``, the file of the scene, and every distance at which fewer views than
     requested are acceptable.
     """
     spacing_m = SURVEY_RULES.clearance_m(min(survey.distances_m)) / _SURVEY_CLEARANCE_PER_SPACING
-    site = _Site(assembly, space, rig, SURVEY_RULES, spacing_m)
+    site = _Site(assembly, space, rig, SURVEY_RULES, spacing_m, obstacles)
     stations: list[Station] = []
     problems: list[Problem] = []
     for number, distance_m in enumerate(survey.distances_m):

@@ -24,6 +24,7 @@ from dataset_builder.catalog.named_configs import CONFIGS, LATTICE_DOME, SWEEPS
 from dataset_builder.scene.assemblies.cage import Cage
 from dataset_builder.scene.environments.surroundings import SURROUNDINGS
 from dataset_builder.scene.model import Assembly
+from dataset_builder.scene.variants.formwork import form_sheet
 from dataset_builder.specs.config_specs import ConfigSpec, DomeSpec, RigSpec, SceneSpec, SurveySpec
 from dataset_builder.specs.file_specs import CageFileSpec, MeshFileSpec
 from dataset_builder.user_files.cage_file import cage_file_spec, mesh_file_spec, read_cage, unsupported_type
@@ -72,7 +73,8 @@ def read_scene(path: str | os.PathLike[str]) -> UserScene:
     Defaults of omitted keys: the name is the file name in lower case, with hyphens; the cameras are
     ``default_dome``, or a survey if that exceeds ``MAX_DOME_M``; the environment is the laboratory if all steel is
     within 0.45 m and all cameras are within 1.6 m of its centre (wherever a survey places them), otherwise
-    outdoors; the board has 6 markers in the laboratory, and there is no board elsewhere; the rig is ``RigSpec()``.
+    outdoors; the board has 6 markers in the laboratory without forms, and there is no board otherwise; the rig is
+    ``RigSpec()``.
 
     Raises ``InputError`` if the file is neither TOML nor IFC, listing every missing, unknown or invalid key, for
     an invalid name, and if the assembly or the cameras do not fit. Raises ``MeshError`` if the cage or mesh is
@@ -88,21 +90,24 @@ def read_scene(path: str | os.PathLike[str]) -> UserScene:
         assembly = make_assembly(assembly_spec, cage)
     rig = RigSpec() if scene_toml.rig is None else scene_toml.rig.rig(path, scene_toml.unit_m, "rig")
     trajectory = scene_toml.cameras or _default_trajectory(assembly, scene_toml.environment, rig)
-    environment = scene_toml.environment or (_LARGE if misfit(_SMALL, assembly, trajectory) else _SMALL)
-    if problem := misfit(environment, assembly, trajectory):
+    forms = scene_toml.forms
+    environment = scene_toml.environment or (_LARGE if misfit(_SMALL, assembly, trajectory, forms) else _SMALL)
+    if problem := misfit(environment, assembly, trajectory, forms):
         raise InputError(f"{path}: {problem}: {_ADVICE if environment == _LARGE else _ADVICE_OF_ROOMS}")
     try:
         check_above_ground(assembly, name)
         if isinstance(trajectory, SurveySpec):
             space = SURROUNDINGS[environment].cameras
-            trajectory = with_stations(trajectory, assembly, space, rig, str(path))
-        config = ConfigSpec(name, SceneSpec(name, assembly_spec, None, environment), trajectory, rig)
+            sheets = [form_sheet(form) for form in forms]
+            trajectory = with_stations(trajectory, assembly, space, rig, str(path), sheets)
+        scene = SceneSpec(name, assembly_spec, None, environment, forms=forms)
+        config = ConfigSpec(name, scene, trajectory, rig)
         check_fits(assembly, config)
     except InputError as error:
         if error.problems:  # They are of this file.
             raise
         raise type(error)(f"{path}: {error}") from None
-    markers = SURROUNDINGS[environment].markers if scene_toml.board is None else scene_toml.board
+    markers = (0 if forms else SURROUNDINGS[environment].markers) if scene_toml.board is None else scene_toml.board
     board = BoardSpec(markers=markers) if markers else None
     return UserScene(replace(config, scene=replace(config.scene, board=board)), cage)
 
@@ -119,7 +124,7 @@ def scene_cage(path: str | os.PathLike[str], mesh_unit: str | float = "m") -> Ca
         return read_cage(mesh_file_spec(path, mesh_unit))
     scene_toml = _read_scene(path)
     with _scene_and_key_named(scene_toml, path):
-        return read_cage(_assembly_spec(scene_toml, path))
+        return replace(read_cage(_assembly_spec(scene_toml, path)), forms=scene_toml.forms)
 
 
 def files_of_scene(path: str | os.PathLike[str]) -> list[Path]:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import json
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -31,8 +32,8 @@ def inspection_json(inspection: Inspection) -> str:
     """Return an inspection as JSON, as the contract defines it.
 
     Further keys are ``box_m`` (lower and upper corner of the steel, world), ``contacts`` and ``clashes`` (null if
-    too many bars are close to each other), ``notes`` and ``problems``, the reasons for which a build refuses the
-    cage.
+    too many bars are close to each other), ``forms`` with their covers, ``notes``, and ``problems``, the reasons
+    for which a build refuses the cage.
     """
     cage = inspection.cage
     pairs = {"contacts": inspection.contacts, "clashes": inspection.clashes}
@@ -42,6 +43,7 @@ def inspection_json(inspection: Inspection) -> str:
         "world_from_source": cage.world_from_source.tolist(),
         "box_m": inspection.box_m.tolist(),
         **{kind: None if found is None else [vars(pair) for pair in found] for kind, found in pairs.items()},
+        "forms": [asdict(form) for form in inspection.forms],
         "notes": [f"{note.source}: {note.text}" for note in cage.notes],
         "problems": [str(problem) for problem in cage.problems],
     }
@@ -74,7 +76,7 @@ def print_inspection(inspection: Inspection) -> None:
             console, f"and {counted(len(more), 'more group')} of {counted(bars, 'bar')} (--json lists all bars)"
         )
     console.print()
-    kinds = (_axis_lines, _place_lines, _meeting_lines, _left_out_lines)
+    kinds = (_axis_lines, _place_lines, _form_lines, _meeting_lines, _left_out_lines)
     for line in (line for lines in kinds for line in lines(inspection)):
         _print(console, line)
 
@@ -130,6 +132,17 @@ def _place_lines(inspection: Inspection) -> list[str]:
         f"steel: {inspection.size_text} ({ranges})",
         *([words, *rows] if is_placed else ["coordinates: those of the file"]),
     ]
+
+
+def _form_lines(inspection: Inspection) -> Iterator[str]:
+    """Yield the least cover of each form, and a warning of bars that go through it."""
+    for found in inspection.forms:
+        cover = "no bar in front of it" if found.cover_m is None else f"cover {found.cover_m * 1000:.1f} mm"
+        yield f"form {found.form.name}: {cover}" + (f" (bar {found.bar_id})" if found.bar_id else "")
+        if found.through:
+            bars = ", ".join(map(str, found.through[:_MAX_CLASHES]))
+            yield f"warning: {counted(len(found.through), 'bar')} through form {found.form.name}: {bars}"
+            yield from _more(len(found.through) - _MAX_CLASHES)
 
 
 def _meeting_lines(inspection: Inspection) -> list[str]:

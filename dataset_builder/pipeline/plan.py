@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any, cast
 from dataset_builder.cameras.trajectories import aim_point_m, subset, view_count
 from dataset_builder.pipeline.shards import VIEWS_PER_SHARD, Staging
 from dataset_builder.scene.model import Assembly, Note
+from dataset_builder.scene.variants.props import form_planes, make_props
 from dataset_builder.scene.variants.registry import image_light
 from dataset_builder.scene.variants.sensor import sensor_spec
 from dataset_builder.specs.config_specs import ConfigSpec, GeneratedCageSpec, RandomViewsSpec, SceneConfigSpec
@@ -28,7 +29,7 @@ from rebar_depth_bench.base.errors import printable
 from rebar_depth_bench.base.parallel import Progress, silent
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.files import parameters_digest
-from rebar_depth_bench.data.schema import ROW_SCHEMA
+from rebar_depth_bench.data.schema import ROW_SCHEMA, FormPlane
 
 if TYPE_CHECKING:
     from dataset_builder.scene.assemblies.cage import Cage
@@ -85,7 +86,13 @@ class ConfigPlan:
         """Return what the scene's entry in the manifest has beside the parameters, and follows from them."""
         matrix = self.assembly.world_from_source
         placement = {} if matrix is None else {"world_from_source": matrix.tolist()}
-        return {"aim_point_m": aim_point_m(self.assembly).tolist(), **placement}
+        planes = form_planes(self.spec.scene, make_props(self.assembly, self.spec.scene))
+        return {"aim_point_m": aim_point_m(self.assembly).tolist(), **_planes_entry(planes), **placement}
+
+
+def _planes_entry(planes: Iterable[FormPlane]) -> dict[str, Any]:
+    dumped = [plane.model_dump() for plane in planes]
+    return {"planes": dumped} if dumped else {}
 
 
 def plan_config(spec: ConfigSpec, views: int | None, out: Path, cage: Cage | None = None) -> ConfigPlan:
@@ -114,9 +121,11 @@ def by_config(plans: Iterable[ConfigPlan]) -> dict[str, list[ConfigPlan]]:
 def config_parameters(spec: ConfigSpec) -> dict[str, Any]:
     """Return the spec of a config as JSON values, with the parameters of its panorama and its sensor.
 
-    The path of an assembly file is reduced to its name.
+    The path of an assembly file is reduced to its name. A scene without forms has no key ``forms``.
     """
     parameters = asdict(spec)
+    if not spec.scene.forms:
+        del parameters["scene"]["forms"]
     of_variants = {"image_light": image_light(spec.scene), "sensor": sensor_spec(spec.scene)}
     parameters["scene"]["appearance"] |= {key: asdict(value) for key, value in of_variants.items() if value}
     assembly = parameters["scene"]["assembly"]
@@ -144,18 +153,19 @@ def _installed_version(name: str) -> str:
 
 @dataclass(frozen=True)
 class ScenePlan(ConfigPlan):
-    """Plan of a generated scene with its cameras: also its bars, and the record of the generator.
+    """Plan of a generated scene with its cameras: also its bars, planes of formwork, and the generator's record.
 
     A cage is generated, and its cameras are placed, only where its scene has to be rendered: this takes about two
     seconds for each. It is done before anything is written, so that a cage that cannot be built leaves no folder.
     """
 
     bars: tuple[Bar, ...] = ()
+    planes: tuple[FormPlane, ...] = ()
     record: Mapping[str, Any] = field(default_factory=dict)
 
     def derived(self) -> dict[str, Any]:
-        """Return the family of the cage and the record of the generator."""
-        return {"family": self.record["family"], "cage": dict(self.record)}
+        """Return the family of the cage, the record of the generator, and the planes of formwork."""
+        return {"family": self.record["family"], "cage": dict(self.record), **_planes_entry(self.planes)}
 
 
 def place_cameras(plans: Sequence[ConfigPlan], processes: int, progress: Progress = silent) -> list[ConfigPlan]:
@@ -186,7 +196,6 @@ def with_cameras(plan: ConfigPlan) -> ScenePlan:
     from dataset_builder.cameras.camera_placement import with_random_stations
     from dataset_builder.scene.cages.generate import cage_assembly, spec_cage
     from dataset_builder.scene.environments.surroundings import SURROUNDINGS
-    from dataset_builder.scene.variants.props import make_props
 
     spec = plan.spec
     cage = spec_cage(cast(GeneratedCageSpec, spec.scene.assembly))
@@ -200,6 +209,7 @@ def with_cameras(plan: ConfigPlan) -> ScenePlan:
         key=plan.key,
         staging=plan.staging,
         bars=assembly.bars,
+        planes=form_planes(spec.scene, props),
         record=cage.record,
     )
 

@@ -46,7 +46,7 @@ from rebar_depth_bench.base.names import SPLITS, TEST_SPLIT
 from rebar_depth_bench.base.reading import remove_file
 from rebar_depth_bench.base.writing import write_bytes, write_text
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, read_bars, write_bars
-from rebar_depth_bench.data.files import MANIFEST_FILE, file_sha256, parameters_digest, views_digest
+from rebar_depth_bench.data.files import MANIFEST_FILE, file_sha256, parameters_digest, planes_digest, views_digest
 from rebar_depth_bench.data.manifest import MANIFEST_FORMAT, DatasetConfig, DatasetFolder, validated_folder
 from rebar_depth_bench.data.schema import ViewRecord
 from rebar_depth_bench.scoring.protocol import PROTOCOL
@@ -133,6 +133,8 @@ def publish(
         "ground_truth_digest": views_digest(views),
         "views": [view.model_dump() for view in views],
     }
+    if any("planes" in scene for scene, _ in ordered):
+        entry["planes_digest"] = planes_digest(scene for scene, _ in ordered)
     published = None if folder is None else folder.config_by_name.get(name)
     entry["references"] = _references(_config(out, name, entry), published)
     config = _config(out, name, entry)

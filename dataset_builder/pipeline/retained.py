@@ -27,6 +27,8 @@ from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_f
 from rebar_depth_bench.data.schema import RANDOM_VIEWS, ViewRecord
 
 _SHOWN_DIFFERENCES = 5
+_NO_FORMS: Mapping[str, Any] = {"forms": []}
+"""What the parameters of a scene without forms leave out."""
 
 
 class Finished:
@@ -129,9 +131,9 @@ def differences(scene: DatasetConfig, plan: ConfigPlan) -> list[str]:
         return ["it was imported"]
     if scene.has_splits != isinstance(plan.spec, SceneConfigSpec):
         return ["its views have other ids"]
-    entry, parameters = scene.scene.entry, config_parameters(plan.spec)
+    entry, parameters = {**_NO_FORMS, **scene.scene.entry}, config_parameters(plan.spec)
     of_config = {key: parameters[key] for key in ("protocol", "rig", "colour")}
-    planned = {**parameters["scene"], **of_config, "generator": dict(generator_versions())}
+    planned = {**_NO_FORMS, **parameters["scene"], **of_config, "generator": dict(generator_versions())}
     found = {**{key: entry.get(key) for key in planned}, "colour": scene.manifest_entry.get("colour")}
     if planned["protocol"]["kind"] == RANDOM_VIEWS:
         found["protocol"], planned["protocol"] = _shared_views(found["protocol"], planned["protocol"])
@@ -279,12 +281,12 @@ def _loss_problems(finished: Finished, config: DatasetConfig, plans: Sequence[Co
 
 def _check_scene(out: Path, config: DatasetConfig, plans: Sequence[ConfigPlan]) -> None:
     """Raise ``InputError`` if a scene of a config that is not planned is being changed."""
-    scenes = {scene.name: scene.entry for scene in config.scenes}
+    scenes = {scene.name: {**_NO_FORMS, **scene.entry} for scene in config.scenes}
     for plan in plans:
         name = plan.spec.scene.name
         if plan.spec.name == config.name or name not in scenes:
             continue
-        planned = config_parameters(plan.spec)["scene"]
+        planned = {**_NO_FORMS, **config_parameters(plan.spec)["scene"]}
         if any(scenes[name].get(key) != value for key, value in planned.items()):
             raise InputError(
                 f"{out}: config {config.name} was built with other parameters of scene {name!r}; rebuild it too "

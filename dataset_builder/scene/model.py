@@ -10,6 +10,7 @@ from jaxtyping import Float64, Int32, UInt16
 from numpy import ndarray
 
 from rebar_depth_bench.data.bars import Bar
+from rebar_depth_bench.data.schema import FormPlane
 
 NOT_STEEL = 0
 """Bar id of all surfaces that are not reinforcement."""
@@ -55,17 +56,21 @@ class Mesh:
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """Object of a scene: a mesh in the world frame, its bar id (0: not steel) and the name of its material."""
+    """Object of a scene: a mesh in the world frame, its bar id (0: not steel) and the name of its material.
+
+    ``plane`` is that of the face towards the steel if the object is a sheet of formwork.
+    """
 
     name: str
     mesh: Mesh
     bar_id: int
     material: str
+    plane: FormPlane | None = None
 
 
-def surface(name: str, mesh: Mesh, material: str) -> Part:
-    """Return a part that is not steel."""
-    return Part(name, mesh, NOT_STEEL, material)
+def surface(name: str, mesh: Mesh, material: str, plane: FormPlane | None = None) -> Part:
+    """Return a part that is not steel, with the ``plane`` of a sheet of formwork."""
+    return Part(name, mesh, NOT_STEEL, material, plane)
 
 
 @dataclass(frozen=True)

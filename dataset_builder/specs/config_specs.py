@@ -93,8 +93,23 @@ class AppearanceSpec:
 
 
 @dataclass(frozen=True)
+class FormSpec:
+    """Form of a scene file: a sheet of plywood behind its face, whose middle is ``point_m``; world, metres.
+
+    The unit vector ``normal`` is towards the steel. The sides of the face are ``size_m``, the first of them along
+    the unit vector ``along``.
+    """
+
+    name: str
+    point_m: Point
+    normal: Point
+    along: Point
+    size_m: tuple[float, float]
+
+
+@dataclass(frozen=True)
 class SceneSpec:
-    """Scene: assembly, ArUco board (None: no board), environment, and the seed of its surface variation.
+    """Scene: assembly, ArUco board (None: no board), environment, seed of its surface variation, and forms.
 
     ``environment`` is a name of ``scene.environments.surroundings.SURROUNDINGS``.
     """
@@ -105,6 +120,7 @@ class SceneSpec:
     environment: str = "laboratory"
     appearance: AppearanceSpec = field(default_factory=AppearanceSpec)
     seed: int = 0
+    forms: tuple[FormSpec, ...] = ()
 
 
 @dataclass(frozen=True)

@@ -43,22 +43,35 @@ class = "IfcBuildingElementProxy"    # default: IfcReinforcingBar, IfcReinforcin
 name = "Rebar*"               # and so global_id, host, storey, layer; of a mesh file: only name and box
 box = [[0, 0, 0], [5e3, 5e3, 3e3]]   # two corners, in the frame and unit of the file; objects wholly inside it
 ```
+
+Forms beside the bars of any of these files.
+
+```toml
+[[form]]                      # a sheet of plywood, 21 mm thick, behind its face
+point = [0, 60, 100]          # the middle of the face; world
+normal = [0, -1, 0]           # towards the steel
+size = [500, 200]             # sides of the face: along, and across it
+along = [1, 0, 0]             # default: horizontal, the x axis for a horizontal face
+name = "side"                 # default: form-1, form-2, ...
+```
 """
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import asdict, dataclass
+from operator import mul
 from typing import Annotated, Any
 
 import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, Strict, ValidationInfo, field_validator
 
 from dataset_builder.scene.environments.surroundings import SURROUNDINGS
-from dataset_builder.scene.model import MAX_BARS, to_metres
+from dataset_builder.scene.model import MAX_BARS, METRE_DECIMALS, to_metres
 from dataset_builder.scene.variants.registry import VARIANTS
-from dataset_builder.specs.config_specs import DomeSpec, PosesSpec, RingSpec, SurveySpec
+from dataset_builder.specs.config_specs import DomeSpec, FormSpec, PosesSpec, RingSpec, SurveySpec
 from dataset_builder.specs.file_specs import KEYS, Origin, PlacementSpec, Selection, Trust, Up
 from dataset_builder.user_files.rig_file import RigTable
 from rebar_depth_bench.base.errors import InputError, Problem
@@ -69,6 +82,7 @@ from rebar_depth_bench.base.validation import (
     Flag,
     StrictModel,
     Triple,
+    check_unique,
     field_error,
     number,
     one_of,
@@ -84,6 +98,9 @@ MAX_VIEWS = 10_000
 """Maximum number of views of a config: the index in a view id has four digits."""
 _MAX_AZIMUTHS = 3600
 _MAX_SELECTIONS = 100
+_MAX_FORMS = 100
+_MAX_COSINE = 1 - 1e-6
+"""Largest cosine of the angle between the normal of a form and its first side."""
 _MESH_KEYS = ("name", "box")
 """Keys of ``[[select]]`` for a mesh file, whose parts have no other names."""
 
@@ -130,10 +147,16 @@ def _tables(key: str, most: int) -> BeforeValidator:
     return BeforeValidator(check)
 
 
+_PLANES_OF_BUILDER = ("deck", "formwork", "falsework")
+"""First words of the names of planes of formwork that environments and variants have."""
 _UNIT = one_of(*UNITS_M)
 _ROLE = Expected(
     "a name of up to 60 printable characters, without spaces at its ends",
     lambda role: role == role.strip() and text(60).accept(role),
+)
+_FORM_NAME = Expected(
+    f"at most 40 lower-case letters, digits and hyphens, after a letter, and not {', '.join(_PLANES_OF_BUILDER)}",
+    lambda name: bool(re.fullmatch(rf"(?!{'|'.join(_PLANES_OF_BUILDER)})[a-z][a-z0-9-]{{0,39}}", name)),
 )
 _File = Annotated[str, Expected("the path of a file in the folder of this file, or below it", is_below)]
 _Length = Annotated[
@@ -143,6 +166,14 @@ _Length = Annotated[
 ]
 _Point = Annotated[
     Triple, three_numbers(-1e9, 1e9, "three numbers from -1e9 to 1e9, [x, y, z]"), AfterValidator(_point_in_metres)
+]
+_Direction = Annotated[
+    Triple, Expected("a direction of numbers up to 1e9, not zero", lambda axis: 1e-9 < math.hypot(*axis) <= 1e9)
+]
+_FormSize = Annotated[
+    tuple[_Length, _Length],
+    Strict(False),
+    Expected("two sides of 10 mm or more, [along, across]", lambda size_m: min(size_m) >= 0.01),
 ]
 _Step = Annotated[_Point, Expected("a step that is not zero, [x, y, z]", any)]
 _Points = Annotated[tuple[_Point, ...], Strict(False), _list_of("a list of points, [[x, y, z], ...]")]
@@ -271,6 +302,37 @@ class SelectTable(StrictModel):
         return Selection(patterns, ((x0, y0, z0), (x1, y1, z1)))
 
 
+class FormTable(StrictModel):
+    """Table ``[[form]]``: face of a sheet of formwork with its middle ``point_m``, world frame, metres."""
+
+    name: Annotated[str, _FORM_NAME] = ""
+    point_m: _Point = Field(alias="point")
+    normal: _Direction
+    size_m: _FormSize = Field(alias="size")
+    along: _Direction | None = None
+
+    @field_validator("along")
+    @classmethod
+    def _check_along(cls, along: Triple, info: ValidationInfo[_Context]) -> Triple:
+        normal = info.data.get("normal")
+        if normal is not None and abs(sum(map(mul, _unit(normal), _unit(along)))) > _MAX_COSINE:
+            raise field_error(f"got {list(along)}", "a direction that is not that of normal", "conflict")
+        return along
+
+    def spec(self, number: int) -> FormSpec:
+        """Return the form; ``number`` is that of its table, which names it by default."""
+        x, y, z = normal = _unit(self.normal)
+        along = _unit(self.along or ((-y, x, 0.0) if abs(z) < _MAX_COSINE else (1.0, 0.0, 0.0)))
+        off = sum(map(mul, normal, along))
+        in_face = _unit((along[0] - off * x, along[1] - off * y, along[2] - off * z))
+        return FormSpec(self.name or f"form-{number}", self.point_m, normal, in_face, self.size_m)
+
+
+def _unit(direction: Triple) -> Triple:
+    x, y, z = (round(value / math.hypot(*direction), METRE_DECIMALS) + 0.0 for value in direction)
+    return x, y, z
+
+
 class SceneToml(StrictModel):
     """Content of a scene TOML file, lengths in metres; None marks keys left to their defaults.
 
@@ -292,6 +354,7 @@ class SceneToml(StrictModel):
     translate_m: _Point = Field(default=(0.0, 0.0, 0.0), alias="translate")
     select: Annotated[tuple[SelectTable, ...], Strict(False), _tables("select", _MAX_SELECTIONS)] = ()
     trust: Annotated[Trust, one_of("declared", "geometry")] = "declared"
+    form: Annotated[tuple[FormTable, ...], Strict(False), _tables("form", _MAX_FORMS)] = ()
 
     @property
     def unit_m(self) -> float:
@@ -308,6 +371,17 @@ class SceneToml(StrictModel):
     def selections(self) -> tuple[Selection, ...]:
         """Tables ``[[select]]`` in file order."""
         return tuple(table.selection() for table in self.select)
+
+    @property
+    def forms(self) -> tuple[FormSpec, ...]:
+        """Forms in file order."""
+        return tuple(table.spec(number) for number, table in enumerate(self.form, start=1))
+
+    @field_validator("form")
+    @classmethod
+    def _check_forms(cls, tables: tuple[FormTable, ...]) -> tuple[FormTable, ...]:
+        check_unique([table.spec(number).name for number, table in enumerate(tables, start=1)], "form")
+        return tables
 
     @field_validator("name")
     @classmethod
@@ -365,6 +439,8 @@ def _conflicts(values: Mapping[str, Any]) -> Iterator[Problem]:
         yield Problem("conflict" if sources else "missing", "", found, expected)
     if "trust" in values and "ifc" not in values:
         yield Problem("conflict", "trust", "only IFC files declare diameters", "ifc, or no trust")
+    if "form" in values and values.get("board"):
+        yield Problem("conflict", "board", "found beside [[form]] tables, which may hide it", "board = false")
     if "bar" in values and "select" in values:
         yield Problem("conflict", "select", "found beside [[bar]] tables", "mesh or ifc, or no [[select]] tables")
     for table_number, table in _numbered_tables(values, "select"):

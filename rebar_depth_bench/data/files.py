@@ -6,11 +6,11 @@ import hashlib
 import json
 import os
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, cast
+from typing import TYPE_CHECKING, Any, BinaryIO, cast
 
 from pydantic import ConfigDict
 
@@ -154,6 +154,11 @@ def parameters_digest(parameters: object) -> str:
     """Return the hex SHA-256 of the canonical JSON of ``parameters`` (sorted keys, no whitespace, no NaN)."""
     canonical = json.dumps(parameters, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return hashlib.sha256(canonical.encode()).hexdigest()
+
+
+def planes_digest(scenes: Iterable[Mapping[str, Any]]) -> str:
+    """Return the digest, ``sha256:...``, of the planes of formwork of scenes, given their manifest entries."""
+    return "sha256:" + parameters_digest({scene["name"]: scene.get("planes", []) for scene in scenes})
 
 
 def file_problems(folder: DatasetFolder, progress: Progress = silent) -> Iterator[Problem]:

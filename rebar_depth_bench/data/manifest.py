@@ -23,7 +23,14 @@ from rebar_depth_bench.base.validation import (
     text,
     validate_table,
 )
-from rebar_depth_bench.data.files import MANIFEST_FILE, Located, file_sha256, parameters_digest, views_digest
+from rebar_depth_bench.data.files import (
+    MANIFEST_FILE,
+    Located,
+    file_sha256,
+    parameters_digest,
+    planes_digest,
+    views_digest,
+)
 from rebar_depth_bench.data.schema import (
     DIGEST_PATTERN,
     EYES,
@@ -49,7 +56,7 @@ class DatasetConfig(Located):
     ``has_splits`` is False for a config of one scene, whose views are all in the split ``test`` and have ids
     ``<config>/<0000>``; in other configs the ids are ``<config>/<split>-<scene>-<0000>``. ``references`` are the
     reference errors by split. ``colour`` is None in configs without colour, whose colour columns are null in every
-    row. ``imported`` is None in configs that were rendered.
+    row. ``imported`` is None in configs that were rendered. ``planes_digest`` may be None if no scene has planes.
     """
 
     manifest_entry: dict[str, Any] = Field(repr=False)
@@ -60,6 +67,7 @@ class DatasetConfig(Located):
     rig: Rig
     views: Annotated[tuple[ViewRecord, ...], Strict(False)]
     ground_truth_digest: Digest
+    planes_digest: Annotated[Digest | None, Field(validate_default=True)] = None
     sheet: RelativePath
     references: dict[str, References] = Field({})
     colour: Colour | None
@@ -129,6 +137,16 @@ class DatasetConfig(Located):
     def _check_digest(cls, digest: str, info: ValidationInfo) -> str:
         if "views" in info.data and digest != (expected := views_digest(info.data["views"])):
             raise field_error(f"got {digest}", f"the digest of the views, {expected}", "conflict")
+        return digest
+
+    @field_validator("planes_digest")
+    @classmethod
+    def _check_planes_digest(cls, digest: str | None, info: ValidationInfo) -> str | None:
+        scenes: tuple[Scene, ...] | None = info.data.get("scenes")
+        if scenes is not None and (digest is not None or any(scene.planes for scene in scenes)):
+            expected = planes_digest(scene.entry for scene in scenes)
+            if digest != expected:
+                raise field_error(f"got {digest}", f"the digest of the planes of formwork, {expected}", "conflict")
         return digest
 
     @property

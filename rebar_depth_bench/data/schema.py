@@ -27,6 +27,7 @@ from rebar_depth_bench.base.validation import (
     Expected,
     StrictModel,
     Triple,
+    check_unique,
     field_error,
     number,
     one_of,
@@ -411,6 +412,13 @@ class Scene(ManifestTable):
     @classmethod
     def _make_board(cls, fields: Any) -> BoardSpec | None:
         return None if fields is None else BoardTable.model_validate(fields).spec
+
+    @field_validator("planes")
+    @classmethod
+    def _check_planes(cls, planes: tuple[FormPlane, ...]) -> tuple[FormPlane, ...]:
+        if planes:
+            check_unique([plane.name for plane in planes], "plane")
+        return planes
 
     @field_validator("protocol_views")
     @classmethod

@@ -16,6 +16,7 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.scene.model import Mesh, Note, axis_of
+from dataset_builder.specs.config_specs import FormSpec
 from rebar_depth_bench.base.errors import Problem
 from rebar_depth_bench.data.bars import Bar
 
@@ -69,7 +70,8 @@ class Cage:
     """Bars of a user's file, what the file holds beside them, and how they were placed.
 
     ``world_from_source`` takes coordinates in the file's frame and unit to the world frame in metres.
-    ``problems`` are the reasons for which a build refuses the cage; ``placement_notes`` say how it was moved.
+    ``problems`` are the reasons for which a build refuses the cage; ``placement_notes`` say how it was moved, and
+    ``forms`` are those of its scene file.
     """
 
     bars: tuple[CageBar, ...]
@@ -77,6 +79,7 @@ class Cage:
     world_from_source: Float64[ndarray, "4 4"] = field(default_factory=lambda: np.eye(4))
     problems: tuple[Problem, ...] = ()
     placement_notes: tuple[Note, ...] = ()
+    forms: tuple[FormSpec, ...] = ()
 
     @property
     def notes(self) -> tuple[Note, ...]:

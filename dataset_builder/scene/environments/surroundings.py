@@ -25,7 +25,9 @@ from dataset_builder.scene.environments.light_rigs import (
 from dataset_builder.scene.environments.outdoors import outdoors
 from dataset_builder.scene.model import Part
 from dataset_builder.scene.variants.registry import IMAGE_LIGHTS, LIGHT_SLOT, VARIANTS
+from dataset_builder.specs.config_specs import SceneSpec
 from rebar_depth_bench.base.errors import InputError, Problem
+from rebar_depth_bench.data.schema import FormPlane
 
 GROUND_CLEARANCE_M = 0.1
 """Least height of an eye above the ground, or above objects that stand there, metres."""
@@ -58,7 +60,7 @@ class Surroundings:
     ``light`` has the lights by light variant, None for the default. ``steel_radius_m`` is the space for steel in
     plan, ``floor_m`` the height of the surface that a board lies on, and ``markers`` the default number of markers
     of a board, 0 for no board. ``enclosure`` and ``roof`` are the first words of the names of surfaces that would
-    keep out the light of a panorama, and that of any sky or lamp.
+    keep out the light of a panorama, and that of any sky or lamp. ``planes`` are those of formwork.
     """
 
     parts: Callable[[], tuple[Part, ...]]
@@ -69,6 +71,7 @@ class Surroundings:
     roof: tuple[str, ...] = ()
     floor_m: float = 0.0
     markers: int = 0
+    planes: tuple[FormPlane, ...] = ()
 
     def suits(self, variant: str) -> bool:
         """Return whether a variant can be built there: not a light variant without an entry in ``light``."""
@@ -106,6 +109,7 @@ SURROUNDINGS: Mapping[str, Surroundings] = {
         CameraSpace(8.3, clear_radius_m=8.3, ceiling_m=8.0),
         steel_radius_m=5.0,
         enclosure=("trees", "hills", "core"),
+        planes=(FormPlane(name="deck", point_m=(0.0, 0.0, 0.0), normal=(0.0, 0.0, 1.0)),),
     ),
 }
 """Surroundings by the name of their environment.
@@ -120,6 +124,12 @@ LIFE_SIZE_ENVIRONMENTS = ("outdoors", "hall", "deck")
 
 FORMWORK_FAMILIES = ("beam", "wall", "slab", "footing")
 """Families of generated cages that ``formwork`` suits: others are round, or cast in the ground or in stages."""
+
+
+def floor_offset_m(scene: SceneSpec) -> float:
+    """Return the height of the surroundings: a floor at z = 0, which would coincide with a board, is lowered."""
+    floor_m = SURROUNDINGS[scene.environment].floor_m
+    return 0.0 if scene.board is None else min(0.0, laboratory.BENCH_TOP_M - floor_m)
 
 
 def check_suitable(environment: str, variants: Iterable[str]) -> None:

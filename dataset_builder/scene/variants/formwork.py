@@ -4,7 +4,8 @@ Two panels with battens stand on adjacent sides of the steel. Formwork that fits
 of its bounding box. Its sheets, up to 2.5 m long, are held by studs, walers and, where they are high, raking
 struts of timber. Two adjacent sides are closed for a cage that stands or is deep, three for a flat one, which is
 seen from above. A cage that is cast lying gets a base, except on the deck, which is one.
-The arms of a beam at a standing column rest on falsework, which belongs to the cage and is no variant.
+The arms of a beam at a standing column rest on falsework, which belongs to the cage and is no variant. Scene files
+place sheets of their own. The parts of all sheets have the planes of their faces towards the steel.
 """
 
 from __future__ import annotations
@@ -16,10 +17,12 @@ from jaxtyping import Float64
 from numpy import ndarray
 
 from dataset_builder.scene.cages.design import LEAST_COVER_M
-from dataset_builder.scene.model import Mesh, Part, surface
+from dataset_builder.scene.model import METRE_DECIMALS, Mesh, Part, surface
 from dataset_builder.scene.shapes.solids import Point, box, lathe, merge_meshes, rotation_about_z, transformed
 from dataset_builder.scene.variants.context import GAP_M, PlacementContext, Rect
 from dataset_builder.scene.variants.spacers import blocks
+from dataset_builder.specs.config_specs import FormSpec
+from rebar_depth_bench.data.schema import FormPlane
 
 PANEL_WIDTHS = (0.8, 0.5)
 """Widths of the scaled panels, as fractions of the side of the steel at which they stand."""
@@ -76,21 +79,45 @@ class _Panel:
     struts_m: tuple[float, ...] = ()
 
 
+def world_from_form(form: FormSpec) -> Float64[ndarray, "3 3"]:
+    """Return the axes of a form as columns: along its first side, along the second one, towards the steel."""
+    along, normal = np.array(form.along), np.array(form.normal)
+    return np.stack([along, np.cross(normal, along), normal], axis=1)
+
+
+def form_sheet(form: FormSpec) -> Part:
+    """Return the sheet of a form of a scene file, ``SHEET_M`` thick behind its face."""
+    x, y = form.size_m[0] / 2, form.size_m[1] / 2
+    sheet = box((-x, -y, -SHEET_M), (x, y, 0.0))
+    plane = FormPlane(name=form.name, point_m=form.point_m, normal=form.normal)
+    return surface(f"form-{form.name}", transformed(sheet, world_from_form(form), form.point_m), "plywood", plane)
+
+
+def _plane(name: str, point_m: Float64[ndarray, " 3"], normal: Float64[ndarray, " 3"]) -> FormPlane:
+    """Return a plane, rounded to the picometre: a turn by 90 degrees leaves cosines of 6e-17."""
+    (x, y, z), (nx, ny, nz) = (np.round([point_m, normal], METRE_DECIMALS) + 0.0).tolist()  # No -0.0.
+    return FormPlane(name=name, point_m=(x, y, z), normal=(nx, ny, nz))
+
+
 def formwork(context: PlacementContext) -> tuple[Part, ...]:
     """Return the panels, and the base of a generated cage; the seed of the scene selects the sides."""
     first = int(context.rng("formwork").integers(4))
     panels = _fitted_panels(context, first) if context.is_life_size else _scaled_panels(context, first)
     middle_m = context.middle_m * [1, 1, 0]
-    parts = [
-        surface(f"formwork-{n}-{name}", transformed(mesh, rotation_about_z(90.0 * side), middle_m), material)
-        for n, (side, panel) in enumerate(panels.items())
-        for name, mesh, material in _pieces(panel)
-    ]
+    parts = []
+    for n, (side, panel) in enumerate(panels.items()):
+        turn = rotation_about_z(90.0 * side)
+        face_m = turn @ [panel.off_m, np.mean(panel.ends_m), GAP_M + panel.height_m / 2] + middle_m
+        plane = _plane(f"formwork-{n}", face_m, -turn[:, 0])
+        for name, mesh, material in _pieces(panel):
+            of_sheet = plane if name in panel.sheets else None
+            parts.append(surface(f"formwork-{n}-{name}", transformed(mesh, turn, middle_m), material, of_sheet))
     if context.is_life_size and _is_lying(context) and context.environment != "deck":
         rim_m = _cover_m(context) - _TIGHT_M
         low, high = context.low_m[:2] - rim_m, context.high_m[:2] + rim_m
         base = box((float(low[0]), float(low[1]), GAP_M), (float(high[0]), float(high[1]), GAP_M + BASE_M))
-        parts.append(surface("formwork-base", base, "plywood"))
+        plane = _plane("formwork-base", np.add(middle_m, [0, 0, GAP_M + BASE_M]), np.array([0.0, 0.0, 1.0]))
+        parts.append(surface("formwork-base", base, "plywood", plane))
     return tuple(parts)
 
 
@@ -281,9 +308,12 @@ def _soffit(name: str, rect: Rect, top_m: float) -> tuple[Part, ...]:
         low = (at - BEARER_M[0] / 2, y - BEARER_END_M, bearer_m - BEARER_M[1])
         timbers.append(box(low, (at + BEARER_M[0] / 2, end_y + BEARER_END_M, bearer_m)))
         props += [_prop((at, side, GAP_M), prop_m) for side in (y - BEARER_END_M / 2, end_y + BEARER_END_M / 2)]
-    pieces = {"sheet": (sheet, "plywood"), "timbers": (merge_meshes(timbers), "timber")}
-    pieces["props"] = (merge_meshes(props), "red paint")
-    return tuple(surface(f"{name}-{piece}", *what) for piece, what in pieces.items())
+    plane = _plane(name, np.array([(x + end_x) / 2, (y + end_y) / 2, top_m]), np.array([0.0, 0.0, 1.0]))
+    return (
+        surface(f"{name}-sheet", sheet, "plywood", plane),
+        surface(f"{name}-timbers", merge_meshes(timbers), "timber"),
+        surface(f"{name}-props", merge_meshes(props), "red paint"),
+    )
 
 
 def _prop(foot_m: Point, height_m: float) -> Mesh:

@@ -9,21 +9,23 @@ steel; they stay outside the envelope of every bar.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 
 import numpy as np
 from jaxtyping import Float64
 from numpy import ndarray
 
+from dataset_builder.scene.environments.surroundings import SURROUNDINGS, floor_offset_m
 from dataset_builder.scene.model import Assembly, Part, surface
 from dataset_builder.scene.shapes.solids import box, merge_meshes, transformed
 from dataset_builder.scene.variants.clutter import clutter
 from dataset_builder.scene.variants.context import GAP_M, PlacementContext
-from dataset_builder.scene.variants.formwork import falsework, formwork
+from dataset_builder.scene.variants.formwork import falsework, form_sheet, formwork
 from dataset_builder.scene.variants.registry import SCREEN_DISTANCE, SHADOWS, SUN_FROM
 from dataset_builder.scene.variants.spacers import spacers, supports
 from dataset_builder.scene.variants.tie_wire import tie_wire
 from dataset_builder.specs.config_specs import SceneSpec
+from rebar_depth_bench.data.schema import FormPlane
 
 SLATS = 9
 """Number of slats of the screen."""
@@ -75,12 +77,13 @@ PROP_BUILDERS: Mapping[str, Callable[[PlacementContext], tuple[Part, ...]]] = {
 
 
 def make_props(assembly: Assembly, spec: SceneSpec) -> tuple[Part, ...]:
-    """Return the props requested by ``spec.appearance``, and what carries a generated cage.
+    """Return the sheets of ``spec.forms``, the props of its ``appearance``, and what carries a generated cage.
 
     They are in the world frame, all with bar id ``NOT_STEEL``.
     """
     context = PlacementContext.from_assembly(assembly, spec)
-    parts = (*supports(context), *falsework(context)) if context.is_life_size else ()
+    parts = tuple(form_sheet(form) for form in spec.forms)
+    parts += (*supports(context), *falsework(context)) if context.is_life_size else ()
     context = context.with_parts(parts)
     for name, build_props in PROP_BUILDERS.items():
         if name in spec.appearance.variants:
@@ -88,3 +91,14 @@ def make_props(assembly: Assembly, spec: SceneSpec) -> tuple[Part, ...]:
             parts = (*parts, *props)
             context = context.with_parts(props)
     return parts
+
+
+def form_planes(scene: SceneSpec, props: Iterable[Part]) -> tuple[FormPlane, ...]:
+    """Return the planes of formwork that the surroundings of a scene and its ``props`` show, each once."""
+    offset_m = np.array([0.0, 0.0, floor_offset_m(scene)])
+    of_surroundings = [
+        plane.model_copy(update={"point_m": tuple((plane.point_m + offset_m).tolist())})
+        for plane in SURROUNDINGS[scene.environment].planes
+    ]
+    of_props = (part.plane for part in props if part.plane is not None)
+    return tuple(dict.fromkeys((*of_surroundings, *of_props)))

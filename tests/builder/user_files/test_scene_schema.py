@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from dataset_builder.catalog.named_configs import CONFIGS, BuildRequest
 from dataset_builder.catalog.scene_file import scene_name_of
-from dataset_builder.specs.config_specs import DomeSpec, SurveySpec
+from dataset_builder.specs.config_specs import DomeSpec, FormSpec, SurveySpec
 from dataset_builder.user_files import scene_schema
 from dataset_builder.user_files.cage_file import cage_file_spec, load_cage
 from dataset_builder.user_files.rig_file import RigTable
@@ -140,11 +140,25 @@ MANY_CONFLICTS = (
     "unknown cameras.foo, conflict name, conflict bar 1: bend_diameter, unknown bar 1: rips, "
     "conflict bar 2: bend_diameter, unknown bar 2: rips, invalid board",
 )  # fmt: skip
+FORM = "[[form]]\npoint = [0, 0, 30]\nnormal = [0, 0, 1]\nsize = [300, 300]\n"
+INVALID_FORMS = [
+    ("[[form]]\n", "missing form 1: point, missing form 1: normal, missing form 1: size"),
+    (FORM + "thickness = 18\n", "unknown form 1: thickness"),
+    (FORM.replace("[0, 0, 1]", "[0, 0, 0]"), "invalid form 1: normal"),
+    (FORM.replace("[0, 0, 1]", "[0, 0, 1, 0]"), "invalid form 1: normal"),
+    (FORM.replace("300]", "9]"), "invalid form 1: size"),
+    (FORM + "along = [0, 0, -2]\n", "conflict form 1: along"),
+    (FORM + "name = 'deck'\n", "invalid form 1: name"),
+    (FORM + "name = 'form-2'\n" + FORM, "duplicate form"),
+    ("form = 3\n", "invalid form"),
+]
 INVALID_DIAMETERS = ("0", "nan", "inf", "'10'", "true", "1" + "0" * 400, "2020-01-01")
 INVALID_POINTS = ("[100, 0]", "[100, 0, nan]", "[100, 0, '5']", "7", "[1e300, 0, 5]")
 INVALID_SCENES += [MANY_CONFLICTS]
 INVALID_SCENES += [(f"{MM}{key}\n{BAR}", problems) for key, problems in INVALID_KEYS]
 INVALID_SCENES += [(MM + BAR + table, problems) for table, problems in INVALID_CAMERAS]
+INVALID_SCENES += [(MM + forms + BAR, problems) for forms, problems in INVALID_FORMS]
+INVALID_SCENES += [(MM + "board = 6\n" + BAR + FORM, "conflict board")]
 INVALID_SCENES += [(f"{MM}{BAR}{key}\n", problems) for key, problems in INVALID_BAR_KEYS]
 INVALID_SCENES += [
     (MM + BAR.replace("= 10", f"= {text}"), "invalid bar 1: diameter") for text in INVALID_DIAMETERS
@@ -190,6 +204,10 @@ def test_documented_example_is_valid() -> None:
     assert (bar.count, bar.step_m) == (4, (0.0, 0.05, 0.0))
     assert (bar.bar_id, bar.role, bar.diameter_m, bar.mandrel_m, bar.ribs) == (7, "main", 0.01, 0.04, True)
     assert bar.corners_m == corners_m
+    example = (scene_schema.__doc__ or "").split("```")[5].removeprefix("toml")
+    assert read_scene_toml((MM + BAR + example).encode(), "example").forms == (
+        FormSpec("side", (0.0, 0.06, 0.1), (0.0, -1.0, 0.0), (1.0, 0.0, 0.0), (0.5, 0.2)),
+    )
 
 
 def test_survey_has_defaults_in_metres_and_distances_in_the_unit() -> None:
