@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -13,7 +14,7 @@ import pyarrow.parquet as pq
 from dataset_builder.pipeline.shards import View, encode_view
 from rebar_depth_bench.bar_crossings.crossings_file import CROSSINGS_FILE, crossings_entry, write_crossings
 from rebar_depth_bench.data.bars import BARS_FILE, Bar, write_bars
-from rebar_depth_bench.data.files import MANIFEST_FILE, file_sha256, views_digest
+from rebar_depth_bench.data.files import MANIFEST_FILE, file_sha256, planes_digest, views_digest
 from rebar_depth_bench.data.manifest import MANIFEST_FORMAT
 from rebar_depth_bench.data.rows import RenderedEye
 from rebar_depth_bench.data.schema import ViewRecord
@@ -100,7 +101,7 @@ def write_mat_dataset(
     by_scene |= {
         name: [f"{CAGES}/{split}-{name}-{index:04d}" for index in range(2)] for name, split in SCENES.items()
     }
-    entries: dict[str, object] = {}
+    entries: dict[str, dict[str, Any]] = {}
     records: list[ViewRecord] = []
     depths: dict[str, np.ndarray] = {}
     shards: dict[str, tuple[str, list[ViewRecord]]] = {}
@@ -125,6 +126,9 @@ def write_mat_dataset(
         "has_splits": True,
         "scenes": [scene_entry(name, 2, shards[name][0], split) | planes for name, split in SCENES.items()],
     }
+    if with_deck:
+        for entry in entries.values():
+            entry["planes_digest"] = planes_digest(entry["scenes"])
     _write_tables(root, bars, entries, records, with_crossings)
     return depths
 

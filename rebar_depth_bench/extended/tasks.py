@@ -15,6 +15,8 @@ from rebar_depth_bench.extended.working_range import TaskSamples, WorkingRange, 
 LASER = "laser"
 """Alignment by one laser reading per view: the reading at the centre pixel over the prediction there."""
 
+MIN_DIAMETER_WIDTH_PX = 12.0
+"""Least apparent width of the bars whose diameter is judged."""
 
 TASKS = {
     "tie_5mm": "ties within 5 mm",
@@ -22,7 +24,7 @@ TASKS = {
     "spacing_10mm": "spacing within 10 mm",
     "layer_5mm": "layer distance within 5 mm",
     "cover_5mm": "cover within 5 mm",
-    "diameter_1mm": "diameter within 1 mm",
+    "diameter_1mm": f"diameter within 1 mm, bars of {MIN_DIAMETER_WIDTH_PX:g} px or more",
 }
 """Titles of all tasks by name, in report order."""
 
@@ -67,7 +69,8 @@ def task_samples(aligned: AlignedSamples) -> dict[str, TaskSamples]:
     """Return the samples of each task with one alignment."""
     depths = (aligned.predicted, aligned.exact, aligned.plane)
     bars, spacings, crossings = depths[0].bars, depths[0].spacings, depths[0].crossings
-    covered, wide = ~np.isnan(bars.true_cover_mm), bars.diameter_judged
+    covered = ~np.isnan(bars.true_cover_mm)
+    wide = bars.diameter_judged & (bars.width_px >= MIN_DIAMETER_WIDTH_PX)
     ties_mm = [one.crossings.tie_error_mm for one in depths]
     spacings_mm = [one.spacings.spacing_mm - one.spacings.true_spacing_mm for one in depths]
     layers_mm = [one.crossings.layer_mm - one.crossings.true_layer_mm for one in depths]

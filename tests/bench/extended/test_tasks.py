@@ -32,7 +32,7 @@ Depths = dict[str, np.ndarray]
 def poses() -> list[np.ndarray]:
     """Return oblique poses at two distances, and poses at a third one that look straight down on the mat."""
     found = []
-    for distance_m in (0.33, 0.45):
+    for distance_m in (0.29, 0.45):
         for index in range(VIEWS_AT_DISTANCE):
             aside, along = (-1) ** index * (0.5 + 0.005 * index), 0.3 * np.sin(index)
             eye_m = distance_m * np.array([np.sin(aside), np.sin(along), np.cos(aside) * np.cos(along)])
@@ -165,7 +165,7 @@ def test_files_of_the_command_have_the_same_numbers(files: Path, exact: ScoredRe
         for found in by_alignment.values()
     )
     ties = document["methods"][second][CONFIG]["tie_5mm"]["native"]
-    assert ties["runs"] == [{"from_m": 0.3, "to_m": 0.5, "state": "met"}]
+    assert ties["runs"] == [{"from_m": 0.25, "to_m": 0.5, "state": "met"}]
 
 
 def test_sheet_and_text_escape_names(files: Path) -> None:
