@@ -49,7 +49,8 @@ _DTYPES: Mapping[str, type] = {
 }
 """Arrays that are cached, with their types: of ``SteelTruth``, ``JudgedCrossings`` and ``CoverPixels``.
 
-The last two are flattened, and ``cover_plane`` are positions among the planes of the scene.
+``pixel``, ``cover_pixel`` and ``cover_depth_m`` are flattened, and ``cover_plane`` holds positions
+among the planes of the scene.
 """
 
 
@@ -59,7 +60,7 @@ Rays = Float64[ndarray, "hw 2"]
 Lens = tuple[float, ...]
 """K, row by row, and distortion of a camera."""
 
-_LENS_NUMBERS, _NUMBERS = 9 + 5, 9 + 5 + 16 + 1 + 1 + 1
+_LENS_NUMBERS, _NUMBERS = 9 + 5, 9 + 5 + 16 + 1 + 1
 
 
 def has_bar_ids(config: DatasetConfig) -> bool:
@@ -95,11 +96,6 @@ class ConfigSteelTruth:
         view = self.cache.view(position)
         rays = self.rays[view.numbers[:_LENS_NUMBERS]]
         return _steel_truth(self.config, view, rays, self.bars_by_view[view.view_id])
-
-    @property
-    def judged_counts(self) -> tuple[int, ...]:
-        """Number of judged crossings of each view."""
-        return tuple(int(numbers[-1]) for numbers in self.cache.numbers)
 
 
 def load_steel_truth(
@@ -156,7 +152,7 @@ def _view_arrays(
 ) -> Iterator[ViewArrays]:
     """Yield the cached arrays of some views, or of all with scored pixels.
 
-    The numbers of a view are K, distortion, pose, parallax, depth at the centre, and number of judged crossings.
+    The numbers of a view are K, distortion, pose, parallax, and depth at the centre.
     """
     rays: dict[Lens, Rays] = {}
     for view_id, eyes, scored in verified_views(config, view_ids, config.truth_eyes):
@@ -172,7 +168,7 @@ def _view_arrays(
         arrays |= depth_steps(left.depth_m)
         arrays |= {name: np.empty(0) for name in _DTYPES if name not in arrays}
         centre_m = float(left.depth_m[left.depth_m.shape[0] // 2, left.depth_m.shape[1] // 2])
-        numbers = (*lens, *camera.cam_from_world.ravel().tolist(), parallax_px_m, centre_m, 0)
+        numbers = (*lens, *camera.cam_from_world.ravel().tolist(), parallax_px_m, centre_m)
         truth = _steel_truth(config, ViewArrays(view_id, arrays, numbers), rays[lens], bars_by_view[view_id])
         judged = judged_crossings(truth)
         planes = camera_planes(truth.bars.planes, truth.cam_from_world)
@@ -185,7 +181,7 @@ def _view_arrays(
             "cover_pixel": pixels.ravel(),
             "cover_depth_m": left.depth_m.ravel()[pixels.ravel()],
         }
-        yield ViewArrays(view_id, arrays, (*numbers[:-1], len(judged.crossing)))
+        yield ViewArrays(view_id, arrays, numbers)
 
 
 def _steel_truth(config: DatasetConfig, view: ViewArrays, rays: Rays, bars: SceneBars) -> SteelTruth:
@@ -194,7 +190,7 @@ def _steel_truth(config: DatasetConfig, view: ViewArrays, rays: Rays, bars: Scen
     names = ("crossing", "pixel", "cover_segment", "cover_plane", "cover_pixel")
     crossing, pixel, segment, plane, cover_pixel = (arrays.pop(name).astype(np.int64) for name in names)
     cover_pixel, cover_depth_m = cover_pixel.reshape(-1, PLANE_PIXELS), arrays.pop("cover_depth_m")
-    lens, (*pose, parallax_px_m, centre_m, _) = view.numbers[:_LENS_NUMBERS], view.numbers[_LENS_NUMBERS:]
+    lens, (*pose, parallax_px_m, centre_m) = view.numbers[:_LENS_NUMBERS], view.numbers[_LENS_NUMBERS:]
     height, width = config.grid
     cam_from_world = np.array(pose).reshape(4, 4)
     return SteelTruth(

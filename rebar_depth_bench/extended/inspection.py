@@ -23,7 +23,7 @@ from rebar_depth_bench.extended.measures import Measure, Samples
 from rebar_depth_bench.extended.steel import PLANE_PIXELS
 
 OFF_MM = 10.0
-"""Deviation above which a bar is off: the tolerance of bar spacing in GB 50204 (from a secondary source)."""
+"""Deviation above which a bar is off; our choice."""
 
 MISSED_NOTE = f"What was not found counts as {MISS_MM:g} mm."
 

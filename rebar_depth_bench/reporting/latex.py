@@ -17,7 +17,6 @@ from rebar_depth_bench.reporting.published import load_published, published_rows
 from rebar_depth_bench.scoring import formatting
 from rebar_depth_bench.scoring.columns import (
     ALIGNED_CONSTANT,
-    COVERAGE,
     DASH,
     PAPER_COLUMNS,
     TABLE_COLUMNS,
@@ -49,6 +48,8 @@ _ALIGNED_HEADS: Mapping[str, str] = {
 }
 """Headings of the columns of predictions that are not metric."""
 _ARROWS: Mapping[Better, str] = {"lower": r" $\downarrow$", "higher": r" $\uparrow$", "": ""}
+_WITHOUT_INTERVAL = ("coverage", "within_mm.5")
+"""Places of the columns whose intervals are left out for width."""
 _MISSING = "--"
 _NONE = [""] * len(TABLE_COLUMNS)
 """Cells of rows that have the numbers of the paper's table only."""
@@ -86,9 +87,9 @@ def latex_table(
     is not ranked is marked with a double dagger. Numbers of valid predictions have an asterisk in a row whose
     errors are not compared with those of others. With ``published``, the paper's rows of the same scenes follow
     below a rule; they are marked and not compared with the results. ``absent`` is as in ``print_paper_table``.
-    With ``intervals``, the 95 % intervals are printed beside the numbers, and each block holds one config. Results
-    that are not metric follow in a table for each kind, in the order of the aligned error of a block's first
-    config, without bold numbers. The caption is for readers of a paper; digest, versions and the reasons why rows
+    With ``intervals``, the 95 % intervals are printed beside the numbers, except for coverage and the share within
+    5 mm. Results that are not metric follow in a table for each kind, in the order of the aligned error, without
+    bold numbers. The caption is for readers of a paper; digest, versions and the reasons why rows
     are not comparable are comments above the table.
 
     Raises ``InputError`` if there are no results, or if they belong to different datasets.
@@ -106,11 +107,10 @@ def _table_of_kind(results: Sequence[Result], absent: Sequence[str], *, publishe
     kind = results[0].prediction
     columns = _COLUMNS if kind is None else columns_at(*_ALIGNED_HEADS)
     tables = {config: table for result in results for config, table in result.tables.items()}
-    blocks = [[config] for config in tables]  # Two side by side are wider than a page of 17 cm.
     published = published and kind is None
     matches = {config: table.published for config, table in tables.items() if published and table.published}
     paper_rows = [row for match in matches.values() for row in published_rows(match.scene)]
-    rows = [_result_rows(results, block, columns, intervals) for block in blocks]
+    rows = {config: _result_rows(results, config, columns, intervals) for config in tables}
     notes, captioned = (formatting.row_notes(results, one) for one in (absent if kind is None else (), ()))
     flat = [
         f"{result.method}, {formatting.config_title(config, table.split)} "
@@ -137,7 +137,7 @@ def _table_of_kind(results: Sequence[Result], absent: Sequence[str], *, publishe
         ],
         notes=[_INCOMPARABLE if note[0] == "*" else _note_text(*note) for note in captioned],
         comments=[_note_text(*note) for note in notes if note[0] == "*" or note not in captioned],
-        bold=any(r"\textbf" in cell for of_block in rows for row in of_block for cell in row[1:]),
+        bold=any(r"\textbf" in cell for of_config in rows.values() for row in of_config for cell in row[1:]),
         intervals=intervals,
         resampled=_resampled(tables.values()),
         anchored=any(row.median_anchored for row in paper_rows),
@@ -146,14 +146,14 @@ def _table_of_kind(results: Sequence[Result], absent: Sequence[str], *, publishe
         other_optics=any(not match.same_optics for match in matches.values()),
         other_optics_mark=_OTHER_OPTICS_MARK,
         paper=load_published(),
-        blocks=[
+        blocks=[  # Two side by side are wider than a page of 17 cm.
             {
-                "titles": [_config_title(config, tables[config]) for config in block],
-                "rows": of_block,
-                "reference_rows": _merged([_reference_rows(results, config) for config in block], ""),
-                "published_rows": _merged([_published_rows(matches.get(config)) for config in block], _MISSING),
+                "title": _config_title(config, table),
+                "rows": rows[config],
+                "reference_rows": _reference_rows(results, config),
+                "published_rows": _published_rows(matches.get(config)),
             }
-            for block, of_block in zip(blocks, rows, strict=True)
+            for config, table in tables.items()
         ],
     )
 
@@ -195,16 +195,16 @@ def _config_title(config: str, table: Table) -> str:
 
 
 def _result_rows(
-    results: Sequence[Result], configs: Sequence[str], columns: Sequence[Column], intervals: bool
+    results: Sequence[Result], config: str, columns: Sequence[Column], intervals: bool
 ) -> list[list[str]]:
-    """Return the rows of a block, each a name and the cells of each config."""
-    shown = [result for result in results if any(name in result.tables for name in configs)]
+    """Return the rows of a config, each a name and its cells."""
+    shown = [result for result in results if config in result.tables]
     return [
         [
             escape_latex(result.method) + _MARKS["?"] * (result.declared.uses_ground_truth is None),
-            *(cell for one in configs for cell in _cells(result, results, one, columns, intervals)),
+            *_cells(result, results, config, columns, intervals),
         ]
-        for result in sorted(shown, key=lambda result: _sort_key(result.tables.get(configs[0])))
+        for result in sorted(shown, key=lambda result: _sort_key(result.tables[config]))
     ]
 
 
@@ -216,11 +216,9 @@ def _head(column: Column) -> str:
     return heads.get(column.place, escape_latex(f"{column.title}{unit}")) + arrow
 
 
-def _sort_key(table: Table | None) -> tuple[bool, bool, float]:
-    """Return the sort key of a row by the block's first config: ranked rows by rank error, the others last."""
-    if table is None:
-        return True, True, 0.0
-    return False, not table.ranked, formatting.sort_error(table)
+def _sort_key(table: Table) -> tuple[bool, float]:
+    """Return the sort key of a row: ranked rows by rank error, the others last."""
+    return not table.ranked, formatting.sort_error(table)
 
 
 def _bold_places(result: Result, results: Sequence[Result], config: str) -> set[str]:
@@ -247,16 +245,14 @@ def _cells(
     result: Result, results: Sequence[Result], config: str, columns: Sequence[Column], intervals: bool
 ) -> list[str]:
     """Return the cells of a result in a config, with their marks, bold among the ``results`` of the table."""
-    table = result.tables.get(config)
-    if table is None:
-        return [_MISSING] * len(columns)
+    table = result.tables[config]
     bold = _bold_places(result, results, config) if table.ranked else set()
     unranked = _MARKS["‡"] if formatting.rank_mark(result.declared) == "‡" else ""
     incomparable = _MARKS["*"] if formatting.incomparable_reasons(table) else ""
     cells = []
     for column in columns:
         number = column.text(table[column.place]).replace(DASH, _MISSING)
-        shows_interval = intervals and column not in (COVERAGE, TABLE_COLUMNS[-1])
+        shows_interval = intervals and column.place not in _WITHOUT_INTERVAL
         interval = column.interval_text(table.interval(column), ", ") if shows_interval else ""
         shown = rf"\textbf{{{number}}}" if column.place in bold else number
         mark = unranked if column is columns[0] else "" if column.of_all_views else incomparable
@@ -264,32 +260,23 @@ def _cells(
     return cells
 
 
-def _reference_rows(results: Sequence[Result], config: str) -> dict[str, list[str]]:
-    """Return the cells of each reference of a config of metric results."""
+def _reference_rows(results: Sequence[Result], config: str) -> list[list[str]]:
+    """Return the name and the cells of each reference of a config of metric results."""
     metric = [result for result in results if result.prediction is None]
     shown = [(result.method, result.tables[config]) for result in metric if config in result.tables]
-    return {name: [*_NONE, *cells] for name, cells in formatting.paper_reference_rows(shown)}
+    return [[escape_latex(name), *_NONE, *cells] for name, cells in formatting.paper_reference_rows(shown)]
 
 
-def _published_rows(match: PublishedMatch | None) -> dict[str, list[str]]:
-    """Return the cells of each published row of the scene that a config shows."""
+def _published_rows(match: PublishedMatch | None) -> list[list[str]]:
+    """Return the method and the cells of each published row of the scene that a config shows."""
     if match is None:
-        return {}
+        return []
     optics = "" if match.same_optics else _OTHER_OPTICS_MARK
-    return {
-        row.method: [
+    return [
+        [
+            escape_latex(row.method),
             *_NONE,
             *(cell + (_ANCHORED_MARK if row.median_anchored else "") + optics for cell in row.cells),
         ]
         for row in published_rows(match.scene)
-    }
-
-
-def _merged(rows_by_config: Sequence[Mapping[str, list[str]]], missing: str) -> list[list[str]]:
-    """Return a row for each name, with the cells of each config, which are ``missing`` where it lacks the row."""
-    names = dict.fromkeys(name for rows in rows_by_config for name in rows)
-    empty = [missing] * len(_COLUMNS)
-    return [
-        [escape_latex(name), *(cell for rows in rows_by_config for cell in rows.get(name, empty))]
-        for name in names
     ]

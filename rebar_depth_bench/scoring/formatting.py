@@ -42,8 +42,8 @@ DASH_NOTE = f"{DASH}: undefined, because no pixel has a prediction or a number o
 RANK_ERROR_NOTE = "Rank error: mean over all scored pixels of |p - z| / max(p, z), 1 without a valid prediction."
 
 RANK_PURPOSE_NOTE = (
-    "The rank error orders depth maps; what a sensor can be used for, and at which distances, say the working "
-    "ranges of tasks (rebar-bench tasks)."
+    "The rank error orders depth maps. Working ranges (rebar-bench tasks) state what a sensor can be used for, "
+    "and at which distances."
 )
 
 CONSTANT_TITLE = "constant"

@@ -12,7 +12,7 @@ import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from jaxtyping import Float
 from markupsafe import Markup
@@ -53,9 +53,6 @@ from rebar_depth_bench.scoring.result import Result
 from rebar_depth_bench.scoring.table import Table, ViewScore
 from rebar_depth_bench.submission.declaration import METRIC
 
-if TYPE_CHECKING:
-    from rebar_depth_bench.reporting.html.extended import CrossingPicture
-
 WORST_SHOWN = 10
 """Number of views of a config that are listed openly; the full list is collapsed."""
 _MISTAKE_CHARACTERS = 1000
@@ -76,16 +73,10 @@ class ConfigViewTables:
     views: int
 
 
-def render_report(
-    result: Result,
-    shown: Iterable[ShownView],
-    mistakes: Sequence[PossibleMistake] = (),
-    pictures: Mapping[str, CrossingPicture] | None = None,
-) -> str:
+def render_report(result: Result, shown: Iterable[ShownView], mistakes: Sequence[PossibleMistake] = ()) -> str:
     """Return the HTML report of ``result`` with the images of ``shown``, by config, worst view first.
 
-    ``mistakes`` are the possible mistakes in the submission, and ``pictures`` the views with their crossings, by
-    config.
+    ``mistakes`` are the possible mistakes in the submission.
     """
     views = views_by_config(result)
     shown = sorted_views(shown, list(result.tables))
@@ -97,7 +88,7 @@ def render_report(
         content |= {
             **results_context(result, views),
             **paper_context(result),
-            **_extended_context(result, pictures or {}),
+            **_extended_context(result),
             **_tasks_context(result),
             **views_context(views, {name: of for name, of in views.items() if len(of) > WORST_SHOWN}),
         }
@@ -193,14 +184,14 @@ def paper_context(result: Result) -> dict[str, object]:
     }
 
 
-def _extended_context(result: Result, pictures: Mapping[str, CrossingPicture]) -> dict[str, object]:
+def _extended_context(result: Result) -> dict[str, object]:
     """Return the context of ``part_extended.html.j2`` and ``part_crossings.html.j2``."""
     if result.extended is None:
         return {"extended": [], "crossings": []}
     # The extended measures are a third of the package, which other reports do not need.
     from rebar_depth_bench.reporting.html.extended import extended_context
 
-    return extended_context(result.extended, pictures)
+    return extended_context(result.extended)
 
 
 def _tasks_context(result: Result) -> dict[str, object]:
@@ -290,9 +281,8 @@ def write_report(
     """
     chosen = {name: views_to_show(views, views_shown) for name, views in views_by_config(result).items()}
     shown: list[ShownView] = []
-    pictures: dict[str, CrossingPicture] = {}
     if evaluation is None:
-        write_output(target, render_report(result, shown, mistakes, pictures))
+        write_output(target, render_report(result, shown, mistakes))
         return
     for config in evaluation.configs:
         scores = {view.view_id: view for view in chosen[config.name]}
@@ -300,14 +290,7 @@ def write_report(
             prediction = evaluation.submission.read(row["view_id"])
             panels = view_panels(row, prediction, scores[row["view_id"]], evaluation.meta.prediction, result.kind)
             shown.append(shown_view(panels))
-        if result.extended is not None and config.name in result.extended.frames:
-            from rebar_depth_bench.reporting.html.extended import crossing_picture
-
-            samples = result.extended.frames[config.name].native.predicted.crossings
-            picture = crossing_picture(evaluation, config, samples)
-            if picture is not None:
-                pictures[config.name] = picture
-    write_output(target, render_report(result, shown, mistakes, pictures))
+    write_output(target, render_report(result, shown, mistakes))
 
 
 def view_panels(

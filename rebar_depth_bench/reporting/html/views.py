@@ -22,7 +22,6 @@ from rebar_depth_bench.base.names import config_of
 from rebar_depth_bench.reporting.colormap import DEPTH_COLOURS, ERROR_COLOURS, colour_indices, robust_range
 from rebar_depth_bench.reporting.html.assets import data_uri
 from rebar_depth_bench.scoring.metrics import is_valid_prediction
-from rebar_depth_bench.scoring.protocol import scored_pixels
 from rebar_depth_bench.scoring.table import ViewScore
 
 PANEL_WIDTH = 640
@@ -137,15 +136,6 @@ def _metres(value: float) -> str:
 
 def _centimetres(value: float | None) -> str:
     return "" if value is None else f"{value:g} cm"
-
-
-def backdrop_image(
-    rgb: UInt8[ndarray, "h w 3"] | None, truth_m: Float32[ndarray, "h w"], mask: Bool[ndarray, "h w"] | None
-) -> bytes:
-    """Return the colour image of a view as WebP, or its true depth in a config without colour, to draw over."""
-    if rgb is not None:
-        return _webp(rgb, lossless=False)
-    return _webp(depth_image(truth_m, *depth_range(truth_m, scored_pixels(mask, truth_m))))
 
 
 def depth_range(truth_m: Float32[ndarray, "h w"], scored: ndarray) -> tuple[float, float]:

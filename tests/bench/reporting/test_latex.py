@@ -20,7 +20,7 @@ COMMANDS = {
     *("begin", "end", "centering", "caption", "label", "setlength", "tabcolsep", "small", "medskip", "tiny"),
     *("toprule", "midrule", "bottomrule", "cmidrule", "multicolumn", "textbf", "emph", "downarrow", "dagger"),
     *("ddagger", "mathrm", "char", "max", "textbackslash", "textasciitilde", "textasciicircum", "textless"),
-    *("textgreater", "textbar", "textasciigrave", "uparrow", "footnotesize"),
+    *("textgreater", "textbar", "textasciigrave", "uparrow", "footnotesize", "texttt"),
 }
 """Commands that a table may contain."""
 
