@@ -38,10 +38,8 @@ from dataset_builder.audit.geometry import (
     board_error,
     board_verdict,
     cage_checks,
-    faces_in_planes,
     max_axis_distance_ratio,
-    plane_pixels,
-    planes_verdict,
+    planes_check,
 )
 from dataset_builder.audit.independent_depth import (
     cycles_difference_m,
@@ -52,7 +50,6 @@ from dataset_builder.audit.independent_depth import (
 )
 from dataset_builder.cameras.trajectories import subset
 from dataset_builder.pipeline.plan import BUILD_FOLDER
-from dataset_builder.scene.mesh_ply import read_mesh_ply
 from rebar_depth_bench.bar_crossings.crossings_file import CROSSINGS_FILE, folder_crossings
 from rebar_depth_bench.bar_crossings.definition import Crossings, scene_crossings
 from rebar_depth_bench.base.errors import DatasetError, InputError
@@ -140,7 +137,6 @@ class ViewCheck:
 VIEW_CHECKS: tuple[ViewCheck, ...] = (
     ViewCheck(max_axis_distance_ratio, axis_verdict),
     ViewCheck(board_error, board_verdict),
-    ViewCheck(plane_pixels, planes_verdict),
     ViewCheck(epipolar_counts, epipolar_verdict),
     # The camera check compares K and distortion of every view, so a few views suffice for the lens model.
     ViewCheck(view_projection_error_px, projection_verdict, views=12),
@@ -221,9 +217,7 @@ def _scene_checks(
 ) -> Iterator[Check]:
     """Yield the checks of a config of one scene, or restricted to one scene, with the bars ``steel``."""
     mesh = root / config.mesh
-    planes = config.scene.planes
-    faces = faces_in_planes(read_mesh_ply(mesh), planes) if planes else None
-    audited = AuditedConfig(config.scene.appearance.variants, steel, config.scene.board, planes, faces)
+    audited = AuditedConfig(config.scene.appearance.variants, steel, config.scene.board)
     aim_m, aim_problems = checked_aim_point_m(config, mesh)
     expected = expected_views(config, aim_m, steel)
     row_faults, camera_faults = list[str](), [*aim_problems, *view_list_problems(config, expected)]
@@ -244,6 +238,7 @@ def _scene_checks(
         progress(f"audit of {config.label}", n + 1, len(config.views))
     yield Check("rows", f"{len(config.views)} views", "all invariants", tuple(row_faults))
     yield Check("cameras", f"{len(expected)} poses of the trajectory", "equal to 1e-12", tuple(camera_faults))
+    yield planes_check(config, mesh)
     for check, _, measurements in measured:
         yield check.verdict(audited, measurements)
     difference_and_depth_m = cycles_difference_m(

@@ -13,12 +13,12 @@ from numpy import ndarray
 from rich.console import Console
 from rich.table import Table
 
-from dataset_builder.scene.model import ESTIMATED_ROLE, WorldMesh
+from dataset_builder.scene.model import ESTIMATED_ROLE
 from dataset_builder.scene.variants.registry import PROPS_SLOT, variants_of_slot
 from rebar_depth_bench.base.errors import problem_summary
 from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.data.rows import EyeTruth, truth_from_row
-from rebar_depth_bench.data.schema import COLUMNS, EYES, FormPlane, ViewRecord
+from rebar_depth_bench.data.schema import COLUMNS, EYES, ViewRecord
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import Camera, inverse_rigid, transform
 from rebar_depth_bench.scoring.protocol import scored_pixels
@@ -84,17 +84,11 @@ def print_audit(report: AuditReport) -> None:
 
 @dataclass(frozen=True, eq=False)
 class AuditedConfig:
-    """Config under audit: its appearance variants, the bars of its scene, and its board (None without one).
-
-    ``planes`` are those of formwork, ``faces`` the faces of the scene's mesh that lie in them, each with the
-    number of its plane, from 1, as its bar id.
-    """
+    """Config under audit: its appearance variants, the bars of its scene, and its board (None without one)."""
 
     variants: tuple[str, ...]
     steel: tuple[Bar, ...]
     board: BoardSpec | None
-    planes: tuple[FormPlane, ...] = ()
-    faces: WorldMesh | None = None
 
     @property
     def bars_with_known_axis(self) -> tuple[Bar, ...]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float64, UInt16
@@ -16,8 +17,7 @@ from numpy import ndarray
 
 from dataset_builder.audit.checks import AuditedConfig, AuditedView, Check
 from dataset_builder.cameras.camera_placement import RANDOM_RULES
-from dataset_builder.scene.model import WorldMesh
-from dataset_builder.scene.raycast import RayCaster
+from dataset_builder.scene.mesh_ply import read_mesh_ply
 from dataset_builder.scene.shapes.bar_mesh import outer_radius_m
 from dataset_builder.scene.shapes.capsules import Clearances
 from dataset_builder.specs.config_specs import CAGES_VERSION, RandomViewsSpec
@@ -25,9 +25,6 @@ from dataset_builder.specs.manifest_specs import cage_spec, trajectory_spec
 from dataset_builder.user_files.make_assembly import assembly_bars
 from rebar_depth_bench.data.bars import Bar
 from rebar_depth_bench.data.manifest import DatasetConfig
-from rebar_depth_bench.data.schema import FormPlane
-from rebar_depth_bench.geometry.cameras import camera_centre
-from rebar_depth_bench.scoring.protocol import interior
 
 MAX_AXIS_RATIO = 1.2
 """Largest distance of a rib's surface from the bar axis, in nominal radii."""
@@ -39,8 +36,8 @@ _CHUNK = 4096
 _BOARD_EDGE_MARGIN_M = 0.001
 _ON_BOARD_TOLERANCE_M = 1e-4
 _MAX_OCCLUDED_SHARE = 0.5
-_IN_PLANE_M, _ON_PLANE_M = 1e-5, 1e-4
-"""Largest distances of a face's corners, and of points that show the face, from a plane of formwork."""
+_IN_PLANE_M = 1e-5
+"""Largest distance of a face's corners from a plane of formwork."""
 _AXIS_TOLERANCE_M = 1e-9
 """Largest difference of a coordinate from that of the generator, which differs by this much between machines."""
 
@@ -194,57 +191,20 @@ def _plane_problems(off_m: float) -> Iterator[str]:
         yield f"a board pixel is {off_m * 1e6:.3f} um away from z = 0"
 
 
-def faces_in_planes(mesh: WorldMesh, planes: Sequence[FormPlane]) -> WorldMesh:
-    """Return ``AuditedConfig.faces``: the faces in the planes, with their normals, that are not steel."""
-    corners_m = mesh.vertices_m[mesh.faces]
-    normals = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
-    number_of_face = np.zeros(len(corners_m), np.uint16)
-    for number, plane in enumerate(planes, start=1):
-        off_m = np.abs((corners_m - plane.point_m) @ plane.normal).max(axis=1)
-        number_of_face[(off_m <= _IN_PLANE_M) & (normals @ plane.normal > 0) & (mesh.face_bar_id == 0)] = number
-    in_planes_m = corners_m[number_of_face > 0].reshape(-1, 3)
-    faces = np.arange(len(in_planes_m), dtype=np.int32).reshape(-1, 3)
-    return WorldMesh(in_planes_m, faces, number_of_face[number_of_face > 0])
-
-
-def plane_pixels(config: AuditedConfig, view: AuditedView) -> Float64[ndarray, "p 3"]:
-    """Return for each plane the number of pixels that show it, that of pixels behind it, and a distance, metres.
-
-    These are pixels inside the faces that lie in the plane, behind which nothing can be seen. A pixel shows the
-    plane if its point is within 0.1 mm of it; the distance is the largest one of these points.
-    """
-    found = np.zeros((len(config.planes), 3))
-    if config.faces is None or not len(config.faces.faces):
-        return found
-    caster = RayCaster(config.faces)
-    for eye in view.eyes.values():
-        number_of_pixel = caster.cast(eye.camera, eye.rays_cam).bars
-        for number, plane in enumerate(config.planes):
-            inside = interior(number_of_pixel == number + 1)
-            side = np.sign((camera_centre(eye.camera.cam_from_world) - plane.point_m) @ plane.normal)
-            in_front_m = side * ((eye.points_m[inside] - plane.point_m) @ plane.normal)
-            is_behind = (in_front_m < -_ON_PLANE_M) | (eye.depth_m[inside] == 0)
-            shown_m = np.abs(in_front_m[~is_behind & (in_front_m <= _ON_PLANE_M) & ~eye.mask[inside]])
-            found[number, :2] += len(shown_m), np.count_nonzero(is_behind)
-            found[number, 2] = max(found[number, 2], shown_m.max(initial=0.0))
-    return found
-
-
-def planes_verdict(config: AuditedConfig, views: Sequence[Float64[ndarray, "p 3"]]) -> Check:
-    """Return the check of the planes of formwork: each has a face of the mesh, and no pixel is behind it."""
-    name = "planes of formwork"
-    if config.faces is None:
+def planes_check(scene: DatasetConfig, mesh: Path) -> Check:
+    """Return the check that a face of the stored mesh, not of steel, lies in each plane of formwork of a scene."""
+    name, planes = "planes of formwork", scene.scene.planes
+    if not planes:
         return Check.skip(name, "no planes in this scene")
-    shown, behind, off_m = np.moveaxis(np.array(views), 2, 0)
-    with_faces, problems = set(config.faces.face_bar_id.tolist()), list[str]()
-    for number, plane in enumerate(config.planes):
-        if number + 1 not in with_faces:
+    stored = read_mesh_ply(mesh)
+    corners_m = stored.vertices_m[stored.faces[stored.face_bar_id == 0]]
+    normals = np.cross(corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0])
+    problems = []
+    for plane in planes:
+        off_m = np.abs((corners_m - plane.point_m) @ plane.normal).max(axis=1)
+        if not ((off_m <= _IN_PLANE_M) & (normals @ plane.normal > 0)).any():
             problems.append(f"no face of the mesh lies in plane {plane.name}")
-        if count := int(behind[:, number].sum()):
-            problems.append(f"{count} pixels show surfaces behind plane {plane.name}")
-    seen = f"{np.count_nonzero(shown.any(axis=0))} of {len(config.planes)} planes in {shown.sum():.0f} pixels"
-    measured = f"{seen}: at most {off_m.max() * 1e6:.3f} um"
-    return Check(name, measured, f"{_ON_PLANE_M * 1000:g} mm", tuple(problems))
+    return Check(name, f"{len(planes)} planes", f"faces within {_IN_PLANE_M * 1e6:g} um", tuple(problems))
 
 
 def cage_checks(scene: DatasetConfig, bars: Sequence[Bar]) -> Iterator[Check]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 
-from dataset_builder.inspection.summary import CONTACT, CONTACT_M, MAX_PAIRS, BarGroup, Inspection
+from dataset_builder.inspection.summary import CONTACT, CONTACT_M, MAX_PAIRS, BarGroup, Inspection, form_distance_m
 from dataset_builder.scene.assemblies.cage import CageBar
 from rebar_depth_bench.reporting.tables import plain_text, print_unwrapped
 from rebar_depth_bench.scoring.formatting import counted
@@ -32,7 +31,7 @@ def inspection_json(inspection: Inspection) -> str:
     """Return an inspection as JSON, as the contract defines it.
 
     Further keys are ``box_m`` (lower and upper corner of the steel, world), ``contacts`` and ``clashes`` (null if
-    too many bars are close to each other), ``forms`` with their covers, ``notes``, and ``problems``, the reasons
+    too many bars are close to each other), ``notes``, and ``problems``, the reasons
     for which a build refuses the cage.
     """
     cage = inspection.cage
@@ -43,7 +42,6 @@ def inspection_json(inspection: Inspection) -> str:
         "world_from_source": cage.world_from_source.tolist(),
         "box_m": inspection.box_m.tolist(),
         **{kind: None if found is None else [vars(pair) for pair in found] for kind, found in pairs.items()},
-        "forms": [asdict(form) for form in inspection.forms],
         "notes": [f"{note.source}: {note.text}" for note in cage.notes],
         "problems": [str(problem) for problem in cage.problems],
     }
@@ -135,14 +133,13 @@ def _place_lines(inspection: Inspection) -> list[str]:
 
 
 def _form_lines(inspection: Inspection) -> Iterator[str]:
-    """Yield the least cover of each form, and a warning of bars that go through it."""
-    for found in inspection.forms:
-        cover = "no bar in front of it" if found.cover_m is None else f"cover {found.cover_m * 1000:.1f} mm"
-        yield f"form {found.form.name}: {cover}" + (f" (bar {found.bar_id})" if found.bar_id else "")
-        if found.through:
-            bars = ", ".join(map(str, found.through[:_MAX_CLASHES]))
-            yield f"warning: {counted(len(found.through), 'bar')} through form {found.form.name}: {bars}"
-            yield from _more(len(found.through) - _MAX_CLASHES)
+    """Yield the least distance of the steel from each form, or a warning that a bar goes through it."""
+    for form in inspection.cage.forms:
+        distance_m = form_distance_m(form, [bar.bar for bar in inspection.cage.bars])
+        found = (
+            "no bar of known axis over it" if distance_m == np.inf else f"steel {distance_m * 1000:.1f} mm from it"
+        )
+        yield f"form {form.name}: " + (found if distance_m >= 0 else "warning: a bar goes through it")
 
 
 def _meeting_lines(inspection: Inspection) -> list[str]:

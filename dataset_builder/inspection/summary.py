@@ -67,22 +67,9 @@ class Meeting:
     point_m: tuple[float, float, float]
 
 
-@dataclass(frozen=True)
-class FormCover:
-    """Form, the ids of the bars that go through its face, and the least cover, metres, with the id of its bar.
-
-    The cover is the least distance from the face of the bars that are in front of it; None without such bars.
-    """
-
-    form: FormSpec
-    through: tuple[int, ...]
-    cover_m: float | None
-    bar_id: int | None
-
-
 @dataclass(frozen=True, eq=False)
 class Inspection:
-    """Cage of the file ``name``, its groups, the box of its steel (world, metres), its ``meetings`` and forms.
+    """Cage of the file ``name``, its groups, the box of its steel (world, metres), and its ``meetings``.
 
     ``contacts`` and ``clashes`` are None if too many bars are close to each other to compare them.
     """
@@ -93,7 +80,6 @@ class Inspection:
     box_m: Box
     contacts: Sequence[Meeting] | None
     clashes: Sequence[Meeting] | None
-    forms: tuple[FormCover, ...] = ()
 
     @property
     def size_text(self) -> str:
@@ -108,42 +94,28 @@ def inspect_cage(cage: Cage, name: str) -> Inspection:
     found: tuple[Sequence[Meeting] | None, Sequence[Meeting] | None] = None, None
     with suppress(TooManyNeighboursError):
         found = meetings([bar.bar for bar in cage.bars])
-    forms = tuple(form_cover(form, cage.bars) for form in cage.forms)
-    return Inspection(name, cage, tuple(_groups(cage.bars, boxes_m[:, 0, 2])), box_m, *found, forms)
+    return Inspection(name, cage, tuple(_groups(cage.bars, boxes_m[:, 0, 2])), box_m, *found)
 
 
-def form_cover(form: FormSpec, bars: Sequence[CageBar]) -> FormCover:
-    """Return the cover of a form by the surfaces of bars, without ribs; bars behind the sheet are ignored.
+def form_distance_m(form: FormSpec, bars: Sequence[Bar]) -> float:
+    """Return the least distance of bars over the face of a form from it, metres, without ribs; inf without bars.
 
-    Only what is over the face counts, of pieces of axes, or of the edges of meshes where the axis is unknown.
+    It is negative where a bar goes through. Bars behind the sheet, and bars without axis, are left out.
     """
-    half_m, through, covers = np.divide(form.size_m, 2), list[int](), list[tuple[float, int]]()
-    for bar in bars:
-        if bar.mesh is None or bar.bar.has_axis:
-            axis_m = np.array(bar.bar.axis_m)
-            start_m, end_m, radius_m = axis_m[:-1], axis_m[1:], bar.bar.diameter_m / 2
-        else:
-            faces = bar.mesh.faces
-            start_m, end_m = (
-                bar.mesh.vertices_m[corners.ravel()] for corners in (faces, np.roll(faces, 1, axis=1))
-            )
-            radius_m = 0.0
-        start_m, end_m = ((points_m - form.point_m) @ world_from_form(form) for points_m in (start_m, end_m))
-        step_m = end_m - start_m
-        slope = step_m[:, 2] / np.maximum(np.linalg.norm(step_m, axis=1), 1e-12)
-        reach_m = radius_m * np.sqrt(np.clip(1 - slope**2, 0, 1))  # Of a circle across the axis, along the normal.
-        step_xy_m = np.where(step_m[:, :2] == 0, 1e-200, step_m[:, :2])
-        enter, leave = np.sort([(side_m - start_m[:, :2]) / step_xy_m for side_m in (-half_m, half_m)], axis=0)
-        first, last = np.maximum(enter.max(axis=1), 0), np.minimum(leave.min(axis=1), 1)
-        over = first <= last
-        heights_m = start_m[over, 2] + np.array([first[over], last[over]]) * step_m[over, 2]
-        low_m = float((heights_m - reach_m[over]).min(initial=np.inf))
-        high_m = float((heights_m + reach_m[over]).max(initial=-np.inf))
-        if low_m < 0 and high_m > -SHEET_M:
-            through.append(bar.bar.bar_id)
-        elif 0 <= low_m < np.inf:
-            covers.append((low_m, bar.bar.bar_id))
-    return FormCover(form, tuple(through), *min(covers, default=(None, None)))
+    axes, half_m, rotation = (
+        AxisSegments.of_bars(with_axis(bars)),
+        np.divide(form.size_m, 2),
+        world_from_form(form),
+    )
+    start_m, step_m = (axes.start_m - form.point_m) @ rotation, axes.vector_m @ rotation
+    slope = step_m[:, 2] / np.maximum(np.linalg.norm(step_m, axis=1), 1e-12)
+    reach_m = axes.diameter_m[axes.bar] / 2 * np.sqrt(np.clip(1 - slope**2, 0, 1))
+    step_xy_m = np.where(step_m[:, :2] == 0, 1e-200, step_m[:, :2])
+    enter, leave = np.sort([(side_m - start_m[:, :2]) / step_xy_m for side_m in (-half_m, half_m)], axis=0)
+    first, last = np.maximum(enter.max(axis=1), 0), np.minimum(leave.min(axis=1), 1)
+    low_m, high_m = np.sort(start_m[:, 2] + np.array([first, last]) * step_m[:, 2], axis=0)
+    is_over = (first <= last) & (high_m + reach_m > -SHEET_M)
+    return float((low_m - reach_m)[is_over].min(initial=np.inf))
 
 
 def meetings(bars: Sequence[Bar]) -> tuple[list[Meeting], list[Meeting]]:

@@ -55,11 +55,6 @@ class JudgedCrossings:
     crossing: Int64[ndarray, " m"]
     pixels: Int64[ndarray, "m 2 k"]
 
-    @classmethod
-    def none(cls) -> JudgedCrossings:
-        """Return no crossings."""
-        return cls(np.empty(0, np.int64), np.empty((0, 2, 1), np.int64))
-
 
 PLANE_PIXELS = 200
 """Number of plane pixels of a bar whose cover is judged."""
@@ -79,15 +74,6 @@ class CoverPixels(Rows):
     pixels: Int64[ndarray, "r k"]
     rays: Float64[ndarray, "r k 2"]
     depth_m: Float32[ndarray, "r k"]
-
-    @classmethod
-    def none(cls) -> CoverPixels:
-        """Return no bars."""
-        empty = np.empty((0, PLANE_PIXELS))
-        return cls(
-            np.empty(0, np.int64), np.empty((0, 3)), empty.astype(np.int64), np.empty((*empty.shape, 2)),
-            empty.astype(np.float32),
-        )  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,10 +108,10 @@ class SteelTruth:
     single_bar: Bool[ndarray, " n"]
     rays: Float64[ndarray, "n 2"]
     run: ndarray  # Int16 n
+    judged: JudgedCrossings
+    covers: CoverPixels
     bars: SceneBars = field(default_factory=lambda: SceneBars.of(()))
     distortion: Float64[ndarray, " 5"] = field(default_factory=lambda: np.zeros(5))
-    judged: JudgedCrossings = field(default_factory=JudgedCrossings.none)
-    covers: CoverPixels = field(default_factory=CoverPixels.none)
     centre_depth_m: float = 0.0
     parallax_px_m: float = 0.0
     seen_by_right: Bool[ndarray, " n"] = field(default_factory=lambda: np.empty(0, np.bool_))

@@ -30,6 +30,7 @@ from rebar_depth_bench.extended.judged import judged_crossings, shown_pixels
 from rebar_depth_bench.extended.steel import JudgedCrossings, SceneBars, SteelTruth
 from rebar_depth_bench.geometry.cameras import transform
 from rebar_depth_bench.scoring.bootstrap import resample
+from tests.bench.extended.cage_scenes import NO_CROSSINGS
 from tests.mat_dataset import CAGES, CONFIG, SCENES, VIEWS, mat_bars, poses, write_mat_dataset
 
 SEEDS = st.integers(0, 2**32 - 1)
@@ -122,7 +123,7 @@ def test_coordinates_that_overflow_are_false(mat: Path) -> None:
 def test_scene_without_crossings_has_false_detections_only(mat: Path) -> None:
     folder = open_folder(mat)
     truth = load_steel_truth(folder, folder.config(CONFIG)).view(0)
-    truth = replace(truth, bars=SceneBars.of(mat_bars()), judged=JudgedCrossings.none())
+    truth = replace(truth, bars=SceneBars.of(mat_bars()), judged=NO_CROSSINGS)
     view = compare_view(detections(on_line(0.0, 10.0)), None, truth)
     assert (view.sums["crossings"], view.sums["false"], view.sums["near"]) == (0, 2, 0)
 

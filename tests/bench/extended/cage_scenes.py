@@ -12,11 +12,16 @@ from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.extended.axes import assign_segments
 from rebar_depth_bench.extended.frames import SteelSamples, steel_frames
 from rebar_depth_bench.extended.judged import judged_crossings
-from rebar_depth_bench.extended.steel import SceneBars, SteelTruth
+from rebar_depth_bench.extended.steel import PLANE_PIXELS, CoverPixels, JudgedCrossings, SceneBars, SteelTruth
 from rebar_depth_bench.scoring.protocol import interior, single_bar_pixels
 
 WIDTH, HEIGHT, FOCAL_PX = 240, 160, 210.0
 CAMERA_AT_ORIGIN = np.eye(4)
+NO_CROSSINGS = JudgedCrossings(np.empty(0, np.int64), np.empty((0, 2, 1), np.int64))
+NO_COVERS = CoverPixels(
+    np.empty(0, np.int64), np.empty((0, 3)), np.empty((0, PLANE_PIXELS), np.int64),
+    np.empty((0, PLANE_PIXELS, 2)), np.empty((0, PLANE_PIXELS), np.float32),
+)  # fmt: skip
 
 
 def bar(bar_id: int, start_m: Sequence[float], end_m: Sequence[float], diameter_m: float = 0.02) -> Bar:
@@ -96,7 +101,7 @@ def view(bars: Sequence[Bar], cam_from_world: np.ndarray = CAMERA_AT_ORIGIN) -> 
     single_bar[inside] = single_bar_pixels(ids.reshape(HEIGHT, WIDTH).astype(np.uint16), scored)
     truth = SteelTruth(
         "lattice/0000", HEIGHT, WIDTH, K, cam_from_world, index.astype(np.uint32), z_m, bar_id, inside,
-        single_bar, rays, run, scene,
+        single_bar, rays, run, NO_CROSSINGS, NO_COVERS, scene,
     )  # fmt: skip
     return replace(truth, judged=judged_crossings(truth))
 

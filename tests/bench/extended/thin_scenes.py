@@ -12,6 +12,7 @@ from rebar_depth_bench.extended.published import depth_steps
 from rebar_depth_bench.extended.steel import SceneBars, SteelTruth
 from rebar_depth_bench.geometry.cameras import ideal_K, pixel_rays
 from rebar_depth_bench.scoring.protocol import interior, single_bar_pixels
+from tests.bench.extended.cage_scenes import NO_COVERS, NO_CROSSINGS
 
 HOLES = (np.nan, np.inf, -np.inf, 0.0, -1.0)
 """Values of an archive that are no prediction."""
@@ -40,6 +41,8 @@ def steel_truth(depth_m: ndarray, bars: ndarray) -> SteelTruth:
         single_bar=single_bar.ravel()[index],
         rays=pixel_rays(K, width, height).reshape(-1, 3)[index, :2],
         run=np.full(len(index), -1, np.int16),
+        judged=NO_CROSSINGS,
+        covers=NO_COVERS,
         parallax_px_m=84.0,
         seen_by_right=inside.ravel()[index] & (index % 3 > 0),
         has_depth=steps["has_depth"],

@@ -63,7 +63,7 @@ def test_correct_dataset_passes_with_measured_values(tiny_root: Path) -> None:
     assert process.returncode == 0, process.stdout + process.stderr
     assert "FAILED" not in process.stdout
     assert (process.stdout.count(" ok "), process.stdout.count("skipped")) == (
-        2 + 2 * (2 + len(VIEW_CHECKS)),
+        2 + 2 * (3 + len(VIEW_CHECKS)),
         2,
     )  # No planes.
     assert "2 views: median 0.0" in process.stdout  # micrometre agreement with Cycles
