@@ -136,10 +136,8 @@ def _form_lines(inspection: Inspection) -> Iterator[str]:
     """Yield the least distance of the steel from each form, or a warning that a bar goes through it."""
     for form in inspection.cage.forms:
         distance_m = form_distance_m(form, [bar.bar for bar in inspection.cage.bars])
-        found = (
-            "no bar of known axis over it" if distance_m == np.inf else f"steel {distance_m * 1000:.1f} mm from it"
-        )
-        yield f"form {form.name}: " + (found if distance_m >= 0 else "warning: a bar goes through it")
+        found = "warning: a bar goes through it" if distance_m < 0 else f"steel {distance_m * 1000:.1f} mm from it"
+        yield f"form {form.name}: " + ("no bar of known axis over it" if distance_m == np.inf else found)
 
 
 def _meeting_lines(inspection: Inspection) -> list[str]:

@@ -102,11 +102,8 @@ def form_distance_m(form: FormSpec, bars: Sequence[Bar]) -> float:
 
     It is negative where a bar goes through. Bars behind the sheet, and bars without axis, are left out.
     """
-    axes, half_m, rotation = (
-        AxisSegments.of_bars(with_axis(bars)),
-        np.divide(form.size_m, 2),
-        world_from_form(form),
-    )
+    axes, half_m = AxisSegments.of_bars(with_axis(bars)), np.divide(form.size_m, 2)
+    rotation = world_from_form(form)
     start_m, step_m = (axes.start_m - form.point_m) @ rotation, axes.vector_m @ rotation
     slope = step_m[:, 2] / np.maximum(np.linalg.norm(step_m, axis=1), 1e-12)
     reach_m = axes.diameter_m[axes.bar] / 2 * np.sqrt(np.clip(1 - slope**2, 0, 1))
