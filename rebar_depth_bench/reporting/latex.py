@@ -89,8 +89,8 @@ def latex_table(
     below a rule; they are marked and not compared with the results. ``absent`` is as in ``print_paper_table``.
     With ``intervals``, the 95 % intervals are printed beside the numbers, except for coverage and the share within
     5 mm. Results that are not metric follow in a table for each kind, in the order of the aligned error, without
-    bold numbers. The caption is for readers of a paper; digest, versions and the reasons why rows are not comparable
-    are comments above the table.
+    bold numbers. The caption is for readers of a paper; digest, versions and the reasons why rows are not
+    comparable are comments above the table.
 
     Raises ``InputError`` if there are no results, or if they belong to different datasets.
     """
