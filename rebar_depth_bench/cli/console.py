@@ -222,7 +222,7 @@ def score_archives(
 ) -> list[Result]:
     """Score archives with a command's options; before any, call ``check_kinds`` with method and kind of each.
 
-    With ``extended``, all must be metric.
+    With ``extended``, all must be metric and of a config with bar ids.
     """
     from rebar_depth_bench.data.manifest import open_folder  # Most commands do not score.
     from rebar_depth_bench.scorer import score
@@ -236,6 +236,12 @@ def score_archives(
             kinds.append((evaluation.meta.method, evaluation.scored_kind(align)))
             if extended:
                 evaluation.require_metric("extended measures are in metres")
+                from rebar_depth_bench.extended.ground_truth import has_bar_ids
+
+                configs = evaluation.configs
+                if not any(has_bar_ids(config) for config in configs):
+                    found = f"{archive}: no masks and bar ids in {', '.join(config.name for config in configs)}"
+                    raise InputError(f"{found}, expected a config that has them: measured are bars and crossings")
     if check_kinds is not None:
         check_kinds(kinds)
     with ProgressBars() as bars:

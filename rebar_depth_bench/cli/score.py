@@ -49,10 +49,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     add_output_file(parser, "--extended-csv", "write the extended measures as CSV (implies --extended)")
     add_output_file(parser, "--bars-csv", "write a row per judged bar and view as CSV (implies --extended)")
-    add_output_file(
-        parser, "--spacings-csv", "write a row per pair of neighbouring bars as CSV (implies --extended)"
-    )
-    add_output_file(parser, "--crossings-csv", "write a row per judged crossing as CSV (implies --extended)")
     add_workers(parser)
 
 
@@ -60,8 +56,8 @@ def run(options: argparse.Namespace) -> None:
     """Score an archive, write the requested files and print the tables."""
     if options.html_views < 0:
         raise InputError(f"--html-views is {options.html_views}, expected 0 or more")
-    has_samples = options.bars_csv or options.spacings_csv or options.crossings_csv
-    is_extended = options.extended or options.extended_csv or has_samples or options.family is not None
+    has_table = options.extended_csv or options.bars_csv
+    is_extended = options.extended or has_table or options.family is not None
     if options.align and is_extended:
         raise InputError("--align and --extended are both given: extended measures need metric predictions")
     if options.family is not None:
@@ -95,13 +91,8 @@ def run(options: argparse.Namespace) -> None:
         from rebar_depth_bench.reporting.extended_tables import extended_csv
 
         write_output(options.extended_csv, extended_csv(result))
-    if result.extended is not None:
-        if options.bars_csv:
-            write_output(options.bars_csv, result.extended.to_samples_sheet("bars").to_csv())
-        if options.spacings_csv:
-            write_output(options.spacings_csv, result.extended.to_samples_sheet("spacings").to_csv())
-        if options.crossings_csv:
-            write_output(options.crossings_csv, result.extended.to_samples_sheet("crossings").to_csv())
+    if options.bars_csv and result.extended is not None:
+        write_output(options.bars_csv, result.extended.to_samples_sheet("bars").to_csv())
     if prints_table(options):
         print_table(result, Console())
         if result.extended is not None:

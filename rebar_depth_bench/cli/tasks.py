@@ -7,7 +7,6 @@ import json
 
 from rich.console import Console
 
-from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.base.writing import write_output
 from rebar_depth_bench.cli.console import (
     InputFile,
@@ -19,7 +18,7 @@ from rebar_depth_bench.cli.console import (
     score_archives,
 )
 from rebar_depth_bench.reporting.tables import disambiguate_method_names
-from rebar_depth_bench.reporting.tasks import config_sheets, print_tasks, render_tasks, tasks_dict, tasks_sheet
+from rebar_depth_bench.reporting.tasks import print_tasks, render_tasks, tasks_dict, tasks_sheet
 from rebar_depth_bench.scoring.comparison import check_same_splits
 
 
@@ -40,11 +39,6 @@ def run(options: argparse.Namespace) -> None:
     results = score_archives(options.archives, options, extended=True)
     check_same_splits(results)
     results = disambiguate_method_names(results)
-    if not config_sheets(results):
-        raise InputError(
-            f"{options.data}: no config of the archives has masks and bar ids, expected one that has: working "
-            "ranges are of bars and their crossings"
-        )
     if options.html:
         write_output(options.html, render_tasks(results))
     if options.json:

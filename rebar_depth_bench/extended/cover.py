@@ -37,8 +37,8 @@ MAX_FROM_BAR_M = 0.5
 MIN_COVER_M = 0.010
 """Least true cover that is judged. Steel that lies on the ground has no cover."""
 
-PLANE_STEPS = 12
-"""Gauss-Newton steps of a plane."""
+PLANE_STEPS, MAX_LAST_STEP_M = 12, 1e-4
+"""Gauss-Newton steps of a plane, and how far the last of them may move it in depth, at any of its pixels."""
 
 MIN_PLANE_SIGMA_M = 1e-4
 """Lower bound of the noise scale of a plane."""
@@ -96,7 +96,8 @@ def fit_planes(p_m: Float64[ndarray, "r k"], covers: CoverPixels) -> Float64[nda
     """Return the planes n / d fitted to predicted planar depth ``p_m`` of the plane pixels.
 
     Each fit starts at the true plane, scaled to the median ratio of true and predicted depth. The plane is NaN
-    with predictions on less than ``MIN_PREDICTED_SHARE`` of the pixels, and where the fit diverges.
+    with predictions on less than ``MIN_PREDICTED_SHARE`` of the pixels, and where the last step moves it by more
+    than ``MAX_LAST_STEP_M``.
     """
     predicted = is_valid_prediction(p_m)
     chosen = np.flatnonzero(predicted.sum(axis=1) >= MIN_PREDICTED_SHARE * PLANE_PIXELS)
@@ -123,7 +124,9 @@ def fit_planes(p_m: Float64[ndarray, "r k"], covers: CoverPixels) -> Float64[nda
             is_sound = np.isfinite(normal).all(axis=(1, 2)) & (np.trace(normal, axis1=1, axis2=2) > 0)
             step = np.linalg.solve(np.where(is_sound[:, None, None], normal, np.eye(3)), right_side[..., None])
             plane = np.where(is_sound[:, None], plane + step[..., 0], np.nan)
-    planes[chosen] = plane
+        moved_m = np.where(used, np.abs(1 / np.einsum("rki,ri->rk", directions, plane) - fitted_m), 0.0)
+        is_settled = moved_m.max(axis=1) <= MAX_LAST_STEP_M  # NaN is not.
+    planes[chosen[is_settled]] = plane[is_settled]
     return planes
 
 

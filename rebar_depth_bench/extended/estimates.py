@@ -127,29 +127,24 @@ class ExtendedResult:
 
         A vector has a column for each of x, y and z. What was not found, or is not judged, is undefined.
         """
-        kind: type[BarSamples | SpacingSamples | CrossingSamples]
-        parts: dict[str, BarSamples] | dict[str, SpacingSamples] | dict[str, CrossingSamples]
-        steel = {config: frames.native.predicted for config, frames in self.frames.items()}
-        if rows == "bars":
-            kind, parts = BarSamples, {config: one.bars for config, one in steel.items()}
-        elif rows == "spacings":
-            kind, parts = SpacingSamples, {config: one.spacings for config, one in steel.items()}
-        else:
-            kind, parts = CrossingSamples, {config: one.crossings for config, one in steel.items()}
+        kind = {"bars": BarSamples, "spacings": SpacingSamples, "crossings": CrossingSamples}[rows]
         names = [one.name for one in fields(kind) if one.name != "view"]
         axes = {
             "point_m": [f"point_{axis}_m" for axis in "xyz"],
             "direction": [f"direction_{axis}" for axis in "xyz"],
         }
+        heads = {name: axes.get(name, [name]) for name in names}
         cells: list[list[Any]] = []
-        for config, samples in parts.items():
+        for config, frames in self.frames.items():
+            samples = getattr(frames.native.predicted, rows)
             scenes = list(self.scenes[config].items())
             views = [(config, scenes[view][1], scenes[view][0]) for view in samples.view.tolist()]
-            columns = [getattr(samples, name).reshape(len(views), -1).tolist() for name in names]
+            columns = [getattr(samples, name).reshape(len(views), len(heads[name])).tolist() for name in names]
             for view, *values in zip(views, *columns, strict=True):
                 cells.append([*view, *(value for part in values for value in part)])
-        heads = [head for name in names for head in axes.get(name, [name])]
-        return Sheet(["config", "scene", "view_id", *heads], cells)
+        return Sheet(
+            ["config", "scene", "view_id", *(head for of_name in heads.values() for head in of_name)], cells
+        )
 
     def estimates(self) -> Iterator[tuple[str, str, Measure, MeasureEstimate]]:
         """Yield config, alignment, measure and estimate, in order."""

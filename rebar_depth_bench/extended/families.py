@@ -29,7 +29,7 @@ from rebar_depth_bench.extended.estimates import (
     tabulate_extended,
     view_measures,
 )
-from rebar_depth_bench.extended.frames import SteelFrames
+from rebar_depth_bench.extended.frames import SteelFrames, joined
 from rebar_depth_bench.extended.measures import NATIVE, ONCE, SCALED, Measure, MeasureFamily
 from rebar_depth_bench.extended.steel import SteelTruth
 from rebar_depth_bench.scoring.bootstrap import resample_views
@@ -135,7 +135,7 @@ def extended_result(configs: Sequence[ExtendedViews]) -> ExtendedResult:
         measures,
         tables,
         views,
-        frames={one.config.name: SteelFrames.joined(one.frames) for one in configs if one.frames},
+        frames={one.config.name: joined(one.frames) for one in configs if one.frames},
         scenes={
             one.config.name: {view_id: one.config.scene_by_view[view_id] for view_id in one.samples}
             for one in configs

@@ -15,7 +15,7 @@ import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from statistics import NormalDist
-from typing import Self
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from jaxtyping import Bool, Float, Float64, Int64
@@ -42,6 +42,8 @@ LASER_SIGMA_M = 0.001
 
 _MM = 1000.0
 
+_T = TypeVar("_T")
+
 
 @dataclass(frozen=True, eq=False)
 class _Samples(Rows):
@@ -52,22 +54,18 @@ class _Samples(Rows):
     def __len__(self) -> int:
         return len(self.view)
 
-    @classmethod
-    def joined(cls, parts: Sequence[Self]) -> Self:
-        """Return the rows of all parts, one or more, in order."""
-        return cls(*(np.concatenate([getattr(part, one.name) for part in parts]) for one in fields(cls)))
-
 
 @dataclass(frozen=True, eq=False)
 class BarSamples(_Samples):
     """Judged straight segments of bars.
 
-    ``distance_m`` is the true planar depth of the axis in the middle of the visible part, and ``width_px`` the
-    apparent width of the bar there. ``pixels`` is the number of pixels that the fit used. All that is measured is
-    NaN unless ``found``. ``point_m`` and ``direction`` (unit) are the fitted axis, world. ``offset_mm`` is the
-    distance of the fitted axis from that middle, ``tilt_deg`` its angle with the true axis, and
-    ``depth_offset_mm`` how much farther it is along the optical axis. ``diameter_mm`` is judged where
-    ``diameter_judged``: the bar is wide enough in the image, and visible on both sides of the axis.
+    ``segment`` is the index of the segment among all straight ones of the scene. ``distance_m`` is the true
+    planar depth of the axis in the middle of the visible part, and ``width_px`` the apparent width of the bar
+    there. ``pixels`` is the number of pixels that the fit used. All that is measured is NaN unless ``found``.
+    ``point_m`` and ``direction`` (unit) are the fitted axis, world. ``offset_mm`` is the distance of the fitted
+    axis from that middle, ``tilt_deg`` its angle with the true axis, and ``depth_offset_mm`` how much farther it
+    is along the optical axis. ``diameter_mm`` is judged where ``diameter_judged``: the bar is wide enough in the
+    image, and visible on both sides of the axis.
 
     ``true_cover_mm`` is NaN where no cover is judged, and ``true_deviation_mm``, the distance of the axis as built
     from the nominal one, without a design. ``deviation_mm`` is that of the fitted axis, and ``deviation_error_mm``
@@ -75,6 +73,7 @@ class BarSamples(_Samples):
     """
 
     bar_id: Int64[ndarray, " n"]
+    segment: Int64[ndarray, " n"]
     distance_m: Float64[ndarray, " n"]
     true_diameter_mm: Float64[ndarray, " n"]
     width_px: Float64[ndarray, " n"]
@@ -96,7 +95,7 @@ class BarSamples(_Samples):
 
 @dataclass(frozen=True, eq=False)
 class SpacingSamples(_Samples):
-    """Pairs of judged neighbours.
+    """Pairs of judged neighbours: the bars, and their ``segment`` in ``BarSamples``.
 
     Both axes are intersected with the plane perpendicular to the first one in the middle of the part where both
     are visible; ``distance_m`` is the true planar depth in the middle of the intersections. ``spacing_mm`` is the
@@ -105,6 +104,8 @@ class SpacingSamples(_Samples):
 
     bar_a: Int64[ndarray, " n"]
     bar_b: Int64[ndarray, " n"]
+    segment_a: Int64[ndarray, " n"]
+    segment_b: Int64[ndarray, " n"]
     distance_m: Float64[ndarray, " n"]
     true_spacing_mm: Float64[ndarray, " n"]
     spacing_mm: Float64[ndarray, " n"]
@@ -141,20 +142,6 @@ class SteelSamples:
     spacings: SpacingSamples
     crossings: CrossingSamples
 
-    @classmethod
-    def joined(cls, parts: Sequence[Self]) -> Self:
-        """Return the samples of all parts, one or more, in order."""
-        return cls(
-            BarSamples.joined([part.bars for part in parts]),
-            SpacingSamples.joined([part.spacings for part in parts]),
-            CrossingSamples.joined([part.crossings for part in parts]),
-        )
-
-    def of_none(self) -> SteelSamples:
-        """Return no samples."""
-        none = np.empty(0, np.int64)
-        return SteelSamples(self.bars.of(none), self.spacings.of(none), self.crossings.of(none))
-
 
 @dataclass(frozen=True, eq=False)
 class AlignedSamples:
@@ -163,11 +150,6 @@ class AlignedSamples:
     predicted: SteelSamples
     exact: SteelSamples
     plane: SteelSamples
-
-    @classmethod
-    def joined(cls, parts: Sequence[Self]) -> Self:
-        """Return the samples of all parts, one or more, in order."""
-        return cls(*(SteelSamples.joined([getattr(part, one.name) for part in parts]) for one in fields(cls)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,15 +165,18 @@ class SteelFrames:
     laser_views: int
     unread_views: int
 
-    @classmethod
-    def joined(cls, parts: Sequence[Self]) -> Self:
-        """Return the samples of all parts, one or more, in order."""
-        return cls(
-            AlignedSamples.joined([part.native for part in parts]),
-            AlignedSamples.joined([part.laser for part in parts]),
-            sum(part.laser_views for part in parts),
-            sum(part.unread_views for part in parts),
-        )
+
+def joined(parts: Sequence[_T]) -> _T:
+    """Return all parts, one or more of one type, as one: arrays in order, numbers added, dataclasses by field."""
+    of_any: Any
+    if isinstance(parts[0], np.ndarray):
+        of_any = np.concatenate(cast("Sequence[ndarray]", parts))
+    elif isinstance(parts[0], int):
+        of_any = sum(cast("Sequence[int]", parts))
+    else:
+        names = [one.name for one in fields(cast("Any", parts[0]))]
+        of_any = type(parts[0])(*(joined([getattr(part, name) for part in parts]) for name in names))
+    return cast("_T", of_any)
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,7 +223,9 @@ def steel_frames(prediction_m: Float[ndarray, "h w"], truth: SteelTruth, positio
         ),
     )
     if not truth.centre_depth_m > 0:
-        return SteelFrames(native, AlignedSamples(*[native.exact.of_none()] * 3), 0, 0)
+        none, some = np.empty(0, np.int64), native.exact
+        nothing = SteelSamples(some.bars.of(none), some.spacings.of(none), some.crossings.of(none))
+        return SteelFrames(native, AlignedSamples(nothing, nothing, nothing), 0, 0)
     reading_m = laser_reading_m(truth.view_id, truth.centre_depth_m)
     centre_m = float(prediction_m[truth.height // 2, truth.width // 2])
     is_read = bool(is_valid_prediction(np.array(centre_m)))
@@ -297,6 +284,7 @@ def _bar_samples(judged: _Judged, fitted: FittedAxes, forms_m: Float64[ndarray, 
     return BarSamples(
         view=np.full(len(found), judged.position),
         bar_id=truth.bars.cage.bar_id[visible.segment],
+        segment=visible.segment,
         distance_m=visible.middle_m[:, 2],
         true_diameter_mm=visible.diameter_m * _MM,
         width_px=truth.K[0, 0] * visible.diameter_m / visible.middle_m[:, 2],
@@ -325,11 +313,14 @@ def _spacing_samples(judged: _Judged, fitted: FittedAxes) -> SpacingSamples:
     with np.errstate(all="ignore"):
         fitted_m = pairs.intersections_m(fitted.point_m, fitted.direction)
         measured_m = np.einsum("mi,mi->m", fitted_m[1] - fitted_m[0], between_m / spacing_m[:, None])
-    bar_id = judged.truth.bars.cage.bar_id[visible.segment[pairs.segments]]
+    segment = visible.segment[pairs.segments]
+    bar_id = judged.truth.bars.cage.bar_id[segment]
     return SpacingSamples(
         view=np.full(len(spacing_m), judged.position),
         bar_a=bar_id[:, 0],
         bar_b=bar_id[:, 1],
+        segment_a=segment[:, 0],
+        segment_b=segment[:, 1],
         distance_m=true_m[..., 2].mean(axis=0),
         true_spacing_mm=spacing_m * _MM,
         spacing_mm=np.where(fitted.found[pairs.segments].all(axis=1), measured_m * _MM, np.nan),

@@ -191,8 +191,12 @@ def range_chart(title: str, panels: Mapping[str, Mapping[str, WorkingRange]]) ->
     """Return the chart of working ranges for one task: the share that passes against distance, on a log axis.
 
     ``panels`` have the title of an alignment and the working range of each method, a line with intervals. Exact
-    depth and the plane are grey, and tested bins have a band. The result is None if there is no sample.
+    depth and the plane are grey, and tested bins have a band. An alignment without bins has no panel, and the
+    result is None if none has any.
     """
+    panels = {name: by_method for name, by_method in panels.items() if next(iter(by_method.values())).bins}
+    if not panels:
+        return None
     edges_m = {
         edge_m
         for by_method in panels.values()
@@ -200,8 +204,6 @@ def range_chart(title: str, panels: Mapping[str, Mapping[str, WorkingRange]]) ->
         for of_bin in one.bins
         for edge_m in (of_bin.from_m, of_bin.to_m)
     }
-    if not edges_m:
-        return None
     top, bottom, left, gap = 34.0, 170.0, 40.0, 22.0
     width = (RIGHT - left - gap * (len(panels) - 1)) / len(panels)
     y = Axis(0, 100, bottom, top, linear=True)

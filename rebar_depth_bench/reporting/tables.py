@@ -308,16 +308,20 @@ def disambiguate_method_names(results: Sequence[Result]) -> list[Result]:
     """Return the results with unique method names.
 
     A name that occurs more than once gets the first eight digits of its submission's SHA-256 appended, if there is
-    an archive, and a number if the same name results again.
+    an archive, and the next number from 2 on that makes it unique if another result has that name.
     """
     names = Counter(result.method for result in results)
+    used = {name for name, count in names.items() if count == 1}
     renamed = []
-    for place, result in enumerate(results):
+    for result in results:
         submission = result.submission
         if names[result.method] > 1:
-            before = [one.submission for one in results[:place]].count(submission)
             digest = f" ({submission.sha256[:8]})" if submission.sha256 else ""
-            method = f"{result.method}{digest}{f' {before + 1}' if before else ''}"
+            method, number = f"{result.method}{digest}", 1
+            while method in used:
+                number += 1
+                method = f"{result.method}{digest} {number}"
+            used.add(method)
             submission = replace(submission, method=method)
         renamed.append(replace(result, submission=submission))
     return renamed

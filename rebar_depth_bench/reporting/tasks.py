@@ -18,6 +18,7 @@ from rebar_depth_bench.base.errors import printable
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL, NATIVE
 from rebar_depth_bench.extended.tasks import LASER, TASKS, ConfigTasks
 from rebar_depth_bench.extended.working_range import (
+    EDGES_M,
     MAX_PLANE_SHARE,
     MET_LOW,
     MET_SHARE,
@@ -54,24 +55,28 @@ NOTES = (RULE_NOTE, LASER_NOTE, FITS_NOTE, formatting.RANK_PURPOSE_NOTE)
 
 @dataclass(frozen=True)
 class ConfigSheet:
-    """Sheet of one config: the working ranges of each method by its name, all of the same views."""
+    """Sheet of one config: the working ranges of each method by its name, all of the same views.
+
+    ``marks`` are the ``rank_mark`` of each method.
+    """
 
     name: str
     views: int
     methods: dict[str, ConfigTasks]
+    marks: dict[str, str]
 
     @property
     def sentences(self) -> list[tuple[str, str, list[tuple[str, bool]]]]:
         """Method, alignment and ``task_phrases`` of each sentence."""
         return [
-            (printable(method), title, task_phrases(tasks, alignment))
+            (f"{printable(method)} {self.marks[method]}".rstrip(), title, task_phrases(tasks, alignment))
             for method, tasks in self.methods.items()
             for alignment, title in ALIGNMENT_TITLES.items()
         ]
 
     @property
     def notes(self) -> list[str]:
-        """Sentences on the views that have no laser reading, or no prediction where it is."""
+        """Sentences on the views that have no laser reading, or no prediction where it is, and on the marks."""
         notes: list[str] = []
         for method, tasks in self.methods.items():
             unjudged, judged = tasks.views - tasks.laser_views, formatting.counted(tasks.laser_views, "view")
@@ -81,7 +86,8 @@ class ConfigSheet:
             if tasks.unread_views:
                 unread = f"{printable(method)}: {tasks.unread_views} of {judged} have no prediction"
                 notes.append(f"{unread} at the centre pixel, and fail with the laser.")
-        return notes
+        marks = formatting.RANK_MARKS.items()
+        return notes + [formatting.note_text(*mark, ()) for mark in marks if mark[0] in self.marks.values()]
 
     def chart(self, task: str) -> Markup | None:
         """Return the chart of a task, None if nothing is judged."""
@@ -103,7 +109,9 @@ def config_sheets(results: Sequence[Result]) -> list[ConfigSheet]:
         assert result.extended is not None
         for config, tasks in result.extended.tasks.items():
             title = formatting.config_title(config, result.tables[config].split)
-            sheets.setdefault(config, ConfigSheet(title, tasks.views, {})).methods[result.method] = tasks
+            sheet = sheets.setdefault(config, ConfigSheet(title, tasks.views, {}, {}))
+            sheet.methods[result.method] = tasks
+            sheet.marks[result.method] = formatting.rank_mark(result.declared)
     return list(sheets.values())
 
 
@@ -118,38 +126,56 @@ def task_phrases(tasks: ConfigTasks, alignment: str) -> list[tuple[str, bool]]:
 
 
 def range_text(found: WorkingRange) -> str:
-    """Return the runs of a working range as text, or why no bin is tested."""
-    if not found.bins:
-        return "not tested (nothing judged)"
+    """Return the runs of a working range as text, or why no bin is tested; and how many samples are in no bin."""
+    unbinned = ""
+    if found.unbinned:
+        everything = "" if found.bins else ", all of them"
+        counted = f"{formatting.counted(found.unbinned, 'sample')}{everything}"
+        unbinned = f"{counted} nearer than {EDGES_M[0]:g} m or from {EDGES_M[-1]:g} m on"
     if not found.runs:
         reasons = dict.fromkeys(reason for one in found.bins for reason in one.reasons.values())
-        return f"not tested ({', '.join(reasons)})"
+        return f"not tested ({', '.join(filter(None, [*reasons, unbinned])) or 'nothing judged'})"
     stretches = {
         state: " and ".join(f"{run.from_m:g}-{run.to_m:g} m" for run in found.runs if run.state == state)
         for state in ("met", "likely", "not met")
     }
+    text = ", ".join(f"{state} in {where}" for state, where in stretches.items() if where)
     if not stretches["met"] and not stretches["likely"]:
-        return f"nowhere met in {stretches['not met']}"
-    return ", ".join(f"{state} in {where}" for state, where in stretches.items() if where)
+        text = f"nowhere met in {stretches['not met']}"
+    return f"{text} (not judged: {unbinned})" if unbinned else text
 
 
 def tasks_dict(results: Sequence[Result]) -> dict[str, Any]:
     """Return the JSON object of the working ranges of all methods, with their provenance."""
     methods: dict[str, Any] = {}
     laser: dict[str, Any] = {}
+    split: dict[str, str | None] = {}
     for result in results:
         assert result.extended is not None
         configs = result.extended.tasks
         methods[result.method] = {config: tasks.to_dict() for config, tasks in configs.items()}
         laser[result.method] = {
-            config: {"views": tasks.laser_views, "views_without_prediction": tasks.unread_views}
+            config: {
+                "views": tasks.laser_views,
+                "of_views": tasks.views,
+                "views_without_prediction": tasks.unread_views,
+            }
             for config, tasks in configs.items()
         }
+        split |= {config: result.tables[config].split for config in configs}
     return {
         "protocol": EXTENDED_PROTOCOL,
         "dataset": {"digest": results[0].dataset.digest, "version": results[0].dataset.version},
-        "submissions": [{"method": one.method, "sha256": one.submission.sha256} for one in results],
+        "submissions": [
+            {
+                "method": one.method,
+                "sha256": one.submission.sha256,
+                "uses_ground_truth": one.declared.uses_ground_truth,
+            }
+            for one in results
+        ],
         "software": {"version": software_version()},
+        "split": split,
         "methods": methods,
         "laser": laser,
     }
@@ -169,15 +195,18 @@ def tasks_sheet(results: Sequence[Result]) -> Sheet:
                 for alignment, found in by_alignment.items():
                     rows += [
                         (
-                            *(EXTENDED_PROTOCOL, result.method, config, task, alignment),
+                            *(EXTENDED_PROTOCOL, result.method, config, result.tables[config].split),
+                            *(task, alignment),
                             *(getattr(one, name) for name in numbers),
                             "; ".join(one.reasons.values()),
-                            *(result.dataset.digest, result.submission.sha256, software_version()),
+                            *(result.dataset.digest, result.submission.sha256),
+                            *(result.declared.uses_ground_truth, software_version()),
                         )
                         for one in found.bins
                     ]
-    heads = ("protocol", "method", "config", "task", "alignment", *numbers, "not_tested_why")
-    return Sheet((*heads, "dataset_digest", "submission_sha256", "software_version"), rows)
+    heads = ("protocol", "method", "config", "split", "task", "alignment", *numbers, "not_tested_why")
+    provenance = ("dataset_digest", "submission_sha256", "uses_ground_truth", "software_version")
+    return Sheet((*heads, *provenance), rows)
 
 
 def print_tasks(results: Sequence[Result], console: Console) -> None:
@@ -193,14 +222,17 @@ def print_tasks(results: Sequence[Result], console: Console) -> None:
         for note in sheet.notes:
             print_line(console, note, style="yellow")
         for alignment, title in ALIGNMENT_TITLES.items():
+            judged = {task: sheet.bins(task, alignment) for task in TASKS if sheet.bins(task, alignment)}
+            if not judged:
+                continue
             console.print()
             print_line(console, f"Share within the limit, per cent: {title}", style="italic")
             heads = ("samples", "views", "exact", "plane", *map(printable, sheet.methods))
             grid = make_grid("task, m", [plain_text(head) for head in heads])
-            for task, heading in TASKS.items():
+            for task, of_task in judged.items():
                 grid.add_section()
-                grid.add_row(plain_text(heading, style="italic"))
-                for bins in sheet.bins(task, alignment):
+                grid.add_row(plain_text(TASKS[task], style="italic"))
+                for bins in of_task:
                     first = bins[0]
                     counts = (str(first.samples), str(first.views), percent(first.exact), percent(first.plane))
                     cells = (*counts, *(f"{percent(one.share)} {_MARKS[one.state]}" for one in bins))
@@ -229,16 +261,16 @@ def tasks_context(results: Sequence[Result]) -> dict[str, object]:
 def render_tasks(results: Sequence[Result]) -> str:
     """Return the page of the working ranges; it follows the reader's light or dark mode and needs no network."""
     dataset = results[0].dataset
+    archives = [
+        f"{formatting.archive_text(one.submission.sha256)}; "
+        f"ground truth: {formatting.ground_truth_text(one.declared)}"
+        for one in results
+    ]
     stamps = [
         ("Protocol", EXTENDED_PROTOCOL),
         ("Dataset", f"{printable(dataset.version)} ({printable(formatting.short_digest(dataset.digest))})"),
-        *((printable(one.method), _archive_text(one)) for one in results),
+        *((printable(one.method), text) for one, text in zip(results, archives, strict=True)),
         ("Software", f"rebar-depth-bench {software_version()}"),
     ]
     template = environment().get_template("tasks.html.j2")
     return template.render(stamps=stamps, **tasks_context(results))
-
-
-def _archive_text(result: Result) -> str:
-    truth = formatting.ground_truth_text(result.declared)
-    return f"{formatting.archive_text(result.submission.sha256)}; ground truth: {truth}"

@@ -59,7 +59,7 @@ ALIGNED_NOTE = (
     "1 where x has no value or p <= 0. Never ranked."
 )
 
-_MARKS = {"‡": "Not ranked (declares the use of ground truth)", "?": "Use of ground truth not declared"}
+RANK_MARKS = {"‡": "Not ranked (declares the use of ground truth)", "?": "Use of ground truth not declared"}
 
 INTERVAL_NOTE = (
     "Small figures: 95 % interval, block bootstrap over views (other views of the same scene, not other scenes)."
@@ -246,7 +246,7 @@ def row_notes(results: Sequence[Result], absent: Sequence[str]) -> list[tuple[st
     of_some_views = ("", "Not ranked: ", partial)
     as_another_kind = ("", "Metric predictions, aligned as this kind: ", aligned)
     marks = {rank_mark(result.declared) for result in results}
-    declared = [(mark, meaning, ()) for mark, meaning in _MARKS.items() if mark in marks]
+    declared = [(mark, meaning, ()) for mark, meaning in RANK_MARKS.items() if mark in marks]
     return declared + [note for note in (incomparable, of_some_views, as_another_kind, without_paper) if note[-1]]
 
 

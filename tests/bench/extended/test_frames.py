@@ -22,7 +22,14 @@ from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.schema import FormPlane
 from rebar_depth_bench.extended import cover
 from rebar_depth_bench.extended.cover import camera_planes, fit_planes, judged_covers
-from rebar_depth_bench.extended.frames import SteelFrames, laser_reading_m, steel_frames
+from rebar_depth_bench.extended.frames import (
+    AlignedSamples,
+    SteelFrames,
+    SteelSamples,
+    joined,
+    laser_reading_m,
+    steel_frames,
+)
 from rebar_depth_bench.extended.ground_truth import load_steel_truth
 from rebar_depth_bench.extended.inspection import MEASURES
 from rebar_depth_bench.extended.judged import visible_segments
@@ -60,9 +67,7 @@ def views(root: Path) -> Views:
 
 def sampled(views: Views, predict: Callable[[ndarray], ndarray]) -> SteelFrames:
     """Return the samples of all views; ``predict`` makes a prediction of the true depth."""
-    return SteelFrames.joined(
-        [steel_frames(predict(z_m), truth, place) for place, (truth, z_m) in enumerate(views)]
-    )
+    return joined([steel_frames(predict(z_m), truth, place) for place, (truth, z_m) in enumerate(views)])
 
 
 def test_exact_depth_measures_everything(views: Views) -> None:
@@ -215,7 +220,9 @@ def test_fits_agree_with_scipy(views: Views) -> None:
     assert np.abs(bars.cover_mm - bars.true_cover_mm).max() < 1
 
 
-def test_plane_fit_ignores_a_third_of_outliers_and_needs_half_of_the_pixels(views: Views) -> None:
+def test_plane_fit_ignores_a_third_of_outliers_and_needs_half_of_the_pixels(
+    views: Views, monkeypatch: pytest.MonkeyPatch
+) -> None:
     truth, _ = views[1]
     covers, rng = truth.covers, np.random.default_rng(3)
     exact_m = covers.depth_m.astype(np.float64)
@@ -229,6 +236,9 @@ def test_plane_fit_ignores_a_third_of_outliers_and_needs_half_of_the_pixels(view
         assert np.isfinite(fit_planes(holes_m, covers)).all() == is_found
     wild = 10 ** rng.uniform(-300, 300, exact_m.shape)
     assert fit_planes(wild, covers).shape == covers.plane.shape  # Without a warning, which is an error.
+    monkeypatch.setattr(cover, "PLANE_STEPS", 1)
+    assert np.isnan(fit_planes(np.full_like(exact_m, 0.7), covers)).all(), "the only step moves the plane far"
+    np.testing.assert_allclose(fit_planes(exact_m, covers), covers.plane, atol=1e-6)
 
 
 def test_plane_pixels_are_on_the_form_near_the_bar(views: Views) -> None:
@@ -325,12 +335,32 @@ def test_evaluate_has_the_same_frames(scored: ScoredResult, root: Path, views: V
 
 
 def test_command_writes_the_frames(scored: ScoredResult, root: Path, tmp_path: Path) -> None:
-    options = [text for name in KINDS for text in (f"--{name}-csv", str(tmp_path / f"{name}.csv"))]
-    assert main(["score", str(scored.archive), "--data", str(root), *options]) == 0
-    for name in KINDS:
-        frame = scored.to_pandas(name)
-        rows = list(csv.DictReader(io.StringIO((tmp_path / f"{name}.csv").read_text())))
-        assert [*rows[0]] == [*frame.columns]
-        assert rows[0]["config"] == rows[0]["scene"] == CONFIG
-        for head in [head for head in frame if frame[head].dtype == float]:
-            assert [float(row[head] or "nan") for row in rows] == pytest.approx(frame[head].tolist(), nan_ok=True)
+    path = tmp_path / "bars.csv"
+    assert main(["score", str(scored.archive), "--data", str(root), "--bars-csv", str(path)]) == 0
+    frame = scored.to_pandas("bars")
+    rows = list(csv.DictReader(io.StringIO(path.read_text())))
+    assert [*rows[0]] == [*frame.columns]
+    assert rows[0]["config"] == rows[0]["scene"] == CONFIG
+    for head in [head for head in frame if frame[head].dtype == float]:
+        assert [float(row[head] or "nan") for row in rows] == pytest.approx(frame[head].tolist(), nan_ok=True)
+
+
+def test_spacings_join_the_bars_by_segment(scored: ScoredResult) -> None:
+    bars, spacings = scored.to_pandas("bars"), scored.to_pandas("spacings")
+    for end in "ab":
+        keys = {"left_on": ["view_id", f"segment_{end}"], "right_on": ["view_id", "segment"]}
+        both = spacings.merge(bars, **keys, validate="many_to_one")
+        assert len(both) == len(spacings) > 0
+        assert (both["bar_id"] == both[f"bar_{end}"]).all()
+
+
+def test_configs_without_any_sample_have_empty_frames(scored: ScoredResult) -> None:
+    assert scored.extended is not None
+    steel, none = scored.extended.frames[CONFIG].native.predicted, np.empty(0, np.int64)
+    empty = SteelSamples(steel.bars.of(none), steel.spacings.of(none), steel.crossings.of(none))
+    frames = SteelFrames(AlignedSamples(empty, empty, empty), AlignedSamples(empty, empty, empty), 0, 0)
+    without = replace(scored, extended=replace(scored.extended, frames={CONFIG: frames}))
+    for kind in KINDS:
+        frame = without.to_pandas(kind)
+        assert len(frame) == 0
+        assert [*frame.columns] == [*scored.to_pandas(kind).columns]

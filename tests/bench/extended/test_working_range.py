@@ -13,6 +13,7 @@ from rebar_depth_bench.extended.working_range import (
     share_interval,
     working_range,
 )
+from rebar_depth_bench.reporting.tasks import range_text
 
 VIEWS, OF_VIEW = 12, 5
 
@@ -38,9 +39,17 @@ def ranges(*parts: dict[str, np.ndarray], limit_mm: float = 5.0) -> WorkingRange
 
 
 def test_interval_is_wilsons_for_independent_samples() -> None:
-    """Newcombe (Statistics in Medicine 17, 1998), table I: 81 of 263 is 0.2553 to 0.3662."""
+    """Newcombe (Statistics in Medicine 17, 1998), table I: 81 of 263 is 0.2553 to 0.3662, 0 of 20 up to 0.1611."""
     passes = np.arange(263) < 81
-    assert share_interval(passes, np.arange(263)) == pytest.approx((0.2553, 0.3662), abs=2e-4)
+    assert share_interval(passes, np.arange(263)) == pytest.approx((0.2553, 0.3662), abs=5e-4)
+    assert share_interval(np.zeros(20, bool), np.arange(20)) == pytest.approx((0, 0.1611), abs=1e-4)
+
+
+def test_interval_of_samples_that_disagree_has_students_quantile_of_the_views() -> None:
+    """Its ends p solve |p - share| = t sqrt(p (1 - p) / n)."""
+    view, passes = np.repeat(np.arange(10), 10), np.tile(np.arange(10) < 9, 10)
+    for end in share_interval(passes, view):
+        assert abs(end - 0.9) / np.sqrt(end * (1 - end) / 100) == pytest.approx(2.262157, abs=1e-5)
 
 
 def test_design_effect_of_views_that_pass_or_fail_as_a_whole_is_their_number_of_samples() -> None:
@@ -75,10 +84,18 @@ def test_runs_are_of_adjacent_tested_bins_of_one_state() -> None:
 
 def test_bins_are_tested_by_counts_exact_depth_and_plane() -> None:
     few = {name: values[: 7 * OF_VIEW] for name, values in at(0.32).items()}
-    found = ranges(few, at(0.6, exact=6.0), at(0.8, plane=5.0), at(30.0))
+    found = ranges(few, at(0.6, exact=6.0), at(0.8, plane=5.0))
     assert [list(one.reasons) for one in found.bins] == [["samples", "views"], ["exact"], ["plane"]]
     assert not found.runs
     assert not working_range(TaskSamples(5.0, np.empty(0, np.int64), *[np.empty(0)] * 4)).bins
+
+
+def test_samples_nearer_or_farther_than_the_bins_are_counted() -> None:
+    outside = "60 samples{} nearer than 0.1 m or from 20 m on"
+    assert range_text(ranges(at(20.0))) == f"not tested ({outside.format(', all of them')})"
+    assert range_text(ranges(at(0.6), at(0.09))) == f"met in 0.5-0.7 m (not judged: {outside.format('')})"
+    few = {name: values[:5] for name, values in at(0.09).items()}
+    assert ranges(few, at(20.0), at(0.1), at(19.9)).unbinned == 65
 
 
 def test_json_of_failures_has_no_bias() -> None:

@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from rebar_depth_bench.extended.working_range import TaskSamples, working_range
 from rebar_depth_bench.reporting.axes import Axis, decade_axis, log_axis_with_one, select_spaced
-from rebar_depth_bench.reporting.charts import alignment_chart, scale_chart, views_chart
+from rebar_depth_bench.reporting.charts import alignment_chart, range_chart, scale_chart, views_chart
 from rebar_depth_bench.reporting.colormap import (
     COLOURS,
     DEPTH_COLOURS,
@@ -276,3 +277,12 @@ def test_chart_of_views_has_a_dot_for_each_error_and_a_mark_for_each_view_withou
     assert "large" in chart
     assert "large" not in views_chart("a", views * 61)
     assert "<script" not in chart
+
+
+def test_alignment_without_samples_has_no_panel() -> None:
+    """The laser reads nothing if no view has true depth at its centre."""
+    some = working_range(TaskSamples(5.0, np.arange(50), *[np.full(50, 0.6)] * 4))
+    none = working_range(TaskSamples(5.0, np.arange(0), *[np.empty(0)] * 4))
+    chart = range_chart("ties", {"native": {"net": some}, "laser": {"net": none}})
+    assert chart == range_chart("ties", {"native": {"net": some}})
+    assert range_chart("ties", {"native": {"net": none}, "laser": {"net": none}}) is None

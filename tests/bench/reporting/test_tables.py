@@ -27,7 +27,13 @@ from rebar_depth_bench.reporting.html.extended import estimate_cell
 from rebar_depth_bench.reporting.html.page import render_report
 from rebar_depth_bench.reporting.latex import latex_table
 from rebar_depth_bench.reporting.published import published_rows
-from rebar_depth_bench.reporting.tables import comparison_cells, print_comparison, print_paper_table, print_table
+from rebar_depth_bench.reporting.tables import (
+    comparison_cells,
+    disambiguate_method_names,
+    print_comparison,
+    print_paper_table,
+    print_table,
+)
 from rebar_depth_bench.scoring import formatting
 from rebar_depth_bench.scoring.columns import DASH, METRICS, coverage_percent, number
 from rebar_depth_bench.scoring.comparison import compare
@@ -322,3 +328,10 @@ def test_published_rows_are_those_of_the_paper(scene: str, column: int) -> None:
         values = [row.rmse_cm, row.abs_rel, row.abs_rel_scaled, row.scale]
         assert values == line[column : column + 4]
         assert row.median_anchored == (scene == "pier" and row.method == "COLMAP+ArUco")
+
+
+def test_names_that_occur_twice_get_no_name_of_another() -> None:
+    names = ["x", "x", "x (01234567)", "x (01234567) 3"]
+    results = [result(scored_view("lattice/0000"), method=name) for name in names]
+    found = [one.method for one in disambiguate_method_names(results)]
+    assert found == ["x (01234567) 2", "x (01234567) 4", *names[2:]]
