@@ -3,20 +3,27 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
+import shutil
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from rich.console import Console
 from scipy.ndimage import gaussian_filter
 
 import rebar_depth_bench as rdb
 from rebar_depth_bench.cli.main import main
+from rebar_depth_bench.data.files import MANIFEST_FILE
+from rebar_depth_bench.extended.frames import AlignedSamples, SteelSamples
 from rebar_depth_bench.extended.measures import NATIVE
 from rebar_depth_bench.extended.tasks import LASER, TASKS, ConfigTasks
 from rebar_depth_bench.extended.working_range import RangeBin
 from rebar_depth_bench.geometry.cameras import look_at
+from rebar_depth_bench.reporting.tasks import print_tasks
 from rebar_depth_bench.scorer import ScoredResult
 from tests.commands import run_in_process
 from tests.mat_dataset import CONFIG, write_mat_dataset
@@ -130,13 +137,14 @@ def test_depth_that_is_8_mm_too_far_places_no_tie_until_a_laser_reads_it(root: P
 
 @pytest.fixture(scope="module")
 def files(root: Path, truth: Depths, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the folder of what the command writes for two archives of one hostile name and a third one."""
+    """Return the folder of what the command writes for two archives of one hostile name, and one that declares."""
     folder = tmp_path_factory.mktemp("sheet")
     farther = {view_id: depth_m + np.float32(0.004) for view_id, depth_m in truth.items()}
     archives: list[tuple[str, Mapping[str, np.ndarray]]] = [(HOSTILE, truth), (HOSTILE, farther), ("net", truth)]
     paths = [folder / f"{index}.zip" for index in range(len(archives))]
     for path, (method, predictions) in zip(paths, archives, strict=True):
-        rdb.evaluate(predictions, root, config=CONFIG, method=method, archive=path)
+        declared = True if method == "net" else None
+        rdb.evaluate(predictions, root, config=CONFIG, method=method, uses_ground_truth=declared, archive=path)
     outputs = [word for kind in ("json", "csv", "html") for word in (f"--{kind}", folder / f"out.{kind}")]
     finished = run_in_process(main, "tasks", *paths, "--data", root, *outputs)
     assert finished.returncode == 0, finished.stderr
@@ -178,7 +186,37 @@ def test_sheet_and_text_escape_names(files: Path) -> None:
         for row in csv.DictReader((files / "out.csv").read_text().splitlines())
     )
     assert page.count('<svg class="chart" role="img"') == len(TASKS)
-    assert "net, native: " in " ".join(text.split())
+
+
+def test_use_of_ground_truth_and_split_are_stated(files: Path) -> None:
+    page, text = (files / "out.html").read_text(), " ".join((files / "out.txt").read_text().split())
+    legends = "‡: Not ranked (declares the use of ground truth). ?: Use of ground truth not declared."
+    assert "net ‡, native: " in text
+    assert legends in text
+    assert "<bdi>net ‡</bdi>" in page
+    assert all(legend in page for legend in legends.split(". "))
+    document = json.loads((files / "out.json").read_text())
+    assert [one["uses_ground_truth"] for one in document["submissions"]] == [None, None, True]
+    assert document["split"] == {CONFIG: None}
+    assert document["laser"]["net"][CONFIG] == {"views": 63, "of_views": 63, "views_without_prediction": 0}
+    rows = list(csv.DictReader((files / "out.csv").read_text().splitlines()))
+    assert {(row["uses_ground_truth"], row["split"]) for row in rows if row["method"] == "net"} == {("true", "")}
+
+
+def test_terminal_has_no_section_of_a_task_without_samples(root: Path, exact: ScoredResult) -> None:
+    """The laser reads nothing in views without depth at their centre."""
+    assert exact.extended is not None
+    frames = exact.extended.frames[CONFIG]
+    none = np.empty(0, np.int64)
+    steel = frames.laser.exact
+    empty = SteelSamples(steel.bars.of(none), steel.spacings.of(none), steel.crossings.of(none))
+    frames = replace(frames, laser=AlignedSamples(empty, empty, empty), laser_views=0)
+    unread = replace(exact, extended=replace(exact.extended, frames={CONFIG: frames}))
+    stream = io.StringIO()
+    print_tasks([unread], Console(file=stream, width=200))
+    text = stream.getvalue()
+    assert "per cent: native" in text
+    assert "per cent: one laser reading" not in text
 
 
 def test_report_of_a_score_begins_with_the_sheet(exact: ScoredResult, root: Path, tmp_path: Path) -> None:
@@ -188,11 +226,21 @@ def test_report_of_a_score_begins_with_the_sheet(exact: ScoredResult, root: Path
     assert page.index("Working ranges: mat") < page.index("How to read this")
 
 
-def test_archives_without_bars_or_metres_are_refused(
-    files: Path, root: Path, truth: Depths, tmp_path: Path
-) -> None:
+def test_archives_that_are_not_metric_are_refused(files: Path, root: Path, truth: Depths, tmp_path: Path) -> None:
     path = tmp_path / "relative.zip"
     rdb.evaluate(truth, root, config=CONFIG, kind="scale", archive=path)
     finished = run_in_process(main, "tasks", files / "2.zip", path, "--data", root)
     assert finished.returncode != 0
     assert "metres" in finished.stderr
+
+
+def test_archives_of_configs_without_bar_ids_are_refused(files: Path, root: Path, tmp_path: Path) -> None:
+    folder = shutil.copytree(root, tmp_path / "imported")
+    manifest = json.loads((folder / MANIFEST_FILE).read_text())
+    entry = manifest["configs"][CONFIG]
+    entry["imported"] = {"truth_sigma_m": 0.001, "absent_columns": ["left_bars"]}
+    entry["scenes"][0] |= {"assembly": None, "protocol": None, "rig": None, "mesh": None}
+    (folder / MANIFEST_FILE).write_text(json.dumps(manifest))
+    finished = run_in_process(main, "tasks", files / "2.zip", "--data", folder)
+    assert finished.returncode != 0
+    assert f"no masks and bar ids in {CONFIG}, expected" in " ".join(finished.stderr.split())
