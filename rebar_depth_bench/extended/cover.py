@@ -97,7 +97,7 @@ def fit_planes(p_m: Float64[ndarray, "r k"], covers: CoverPixels) -> Float64[nda
 
     Each fit starts at the true plane, scaled to the median ratio of true and predicted depth. The plane is NaN
     with predictions on less than ``MIN_PREDICTED_SHARE`` of the pixels, and where the last step moves it by more
-    than ``MAX_LAST_STEP_M``.
+    than ``MAX_LAST_STEP_M`` at any of them.
     """
     predicted = is_valid_prediction(p_m)
     chosen = np.flatnonzero(predicted.sum(axis=1) >= MIN_PREDICTED_SHARE * PLANE_PIXELS)

@@ -168,15 +168,15 @@ class SteelFrames:
 
 def joined(parts: Sequence[_T]) -> _T:
     """Return all parts, one or more of one type, as one: arrays in order, numbers added, dataclasses by field."""
-    of_any: Any
-    if isinstance(parts[0], np.ndarray):
-        of_any = np.concatenate(cast("Sequence[ndarray]", parts))
-    elif isinstance(parts[0], int):
-        of_any = sum(cast("Sequence[int]", parts))
+    some: Sequence[Any] = parts
+    whole: Any
+    if isinstance(some[0], np.ndarray):
+        whole = np.concatenate(some)
+    elif isinstance(some[0], int):
+        whole = sum(some)
     else:
-        names = [one.name for one in fields(cast("Any", parts[0]))]
-        of_any = type(parts[0])(*(joined([getattr(part, name) for part in parts]) for name in names))
-    return cast("_T", of_any)
+        whole = type(some[0])(*(joined([getattr(part, one.name) for part in some]) for one in fields(some[0])))
+    return cast("_T", whole)
 
 
 @dataclass(frozen=True, eq=False)
