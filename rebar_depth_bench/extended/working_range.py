@@ -181,7 +181,8 @@ def share_interval(passes: Bool[ndarray, " n"], view: Int64[ndarray, " n"]) -> I
     n = len(passes) / design_effect(passes, view)
     z = _Z if share in (0.0, 1.0) else float(stdtrit(max(k - 1, 1), _QUANTILE))
     centre, half = share + z**2 / (2 * n), z * math.sqrt(share * (1 - share) / n + (z / (2 * n)) ** 2)
-    return (max(0.0, (centre - half) / (1 + z**2 / n)), min(1.0, (centre + half) / (1 + z**2 / n)))
+    low, high = (centre - half) / (1 + z**2 / n), (centre + half) / (1 + z**2 / n)
+    return (max(0.0, low) if share > 0 else 0.0, min(1.0, high) if share < 1 else 1.0)
 
 
 def design_effect(passes: Bool[ndarray, " n"], view: Int64[ndarray, " n"]) -> float:
