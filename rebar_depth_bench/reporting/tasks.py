@@ -41,7 +41,8 @@ ALIGNMENT_TITLES = {NATIVE: "native", LASER: "one laser reading"}
 
 RULE_NOTE = (
     f"Bins by true distance. Met: {100 * MET_SHARE:g} % or more are within the limit, and the lower end of the "
-    f"95 % interval (Wilson, views as clusters) is {100 * MET_LOW:g} % or more; likely: the share alone. What is "
+    f"95 % interval (Wilson, Student's quantile, views as clusters) is {100 * MET_LOW:g} % or more; likely: only "
+    "the share. What is "
     f"not found fails. A bin is tested with {MIN_SAMPLES} samples of {MIN_VIEWS} views if exact depth passes "
     f"{100 * MIN_EXACT_SHARE:g} % or more there, and the plane {100 * MAX_PLANE_SHARE:g} % or less: in each view "
     "one constant, the median true distance of what is judged, less the radius; with the laser, its reading."
