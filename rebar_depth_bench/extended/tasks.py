@@ -24,7 +24,7 @@ TASKS = {
     "spacing_10mm": "spacing within 10 mm",
     "layer_5mm": "layer distance within 5 mm",
     "cover_5mm": "cover within 5 mm",
-    "diameter_1mm": f"diameter within 1 mm, bars of {MIN_DIAMETER_WIDTH_PX:g} px or more",
+    "diameter_1mm": f"diameter within 1 mm (bars of {MIN_DIAMETER_WIDTH_PX:g} px or more)",
 }
 """Titles of all tasks by name, in report order."""
 
