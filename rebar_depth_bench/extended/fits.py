@@ -211,7 +211,8 @@ def _gauss_newton_step(
     normal = weighted_jacobian @ jacobian.transpose(0, 2, 1)
     diagonal = np.arange(size)
     normal[:, diagonal, diagonal] += prior
-    right_side = (weighted_jacobian @ residual_m[..., None])[..., 0] - prior * unknowns_m[:, :size]
+    with np.errstate(invalid="ignore"):  # The prior of a set whose values overflow is inf.
+        right_side = (weighted_jacobian @ residual_m[..., None])[..., 0] - prior * unknowns_m[:, :size]
     step_m = np.zeros_like(unknowns_m)
     step_m[:, :size] = np.linalg.solve(normal, right_side[..., None])[..., 0]
     return step_m
