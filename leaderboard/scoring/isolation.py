@@ -9,6 +9,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
@@ -25,6 +26,12 @@ NICENESS = 10
 MIN_MEMORY_BYTES = 1 << 30
 """Minimum memory limit: interpreter, libraries and thread stacks alone take several hundred megabytes."""
 _SPAWN = multiprocessing.get_context("spawn")
+_CHILDREN_LOCK = threading.Lock()
+"""Held while a process is started or waited for.
+
+Starting one polls all others. Of two threads that wait for the same process, one sees an error in place of its
+exit status, and then takes it for running.
+"""
 
 T = TypeVar("T")
 
@@ -80,7 +87,8 @@ class IsolatedCall(Generic[T]):
         try:
             found: T | UnavailableError | SubmissionError | ProcessEndedError = self.receiver.recv()
         except EOFError:
-            self.process.join()
+            with _CHILDREN_LOCK:
+                self.process.join()
             raise ProcessEndedError(self.process.exitcode) from None
         if isinstance(found, UnavailableError | SubmissionError | ProcessEndedError):
             raise found
@@ -102,7 +110,8 @@ def isolated_call(
             # A terminal or systemd signals the children too, for which the parent decides. The mask is inherited.
             former = signal.pthread_sigmask(signal.SIG_BLOCK, (signal.SIGINT, signal.SIGTERM))
             try:
-                process.start()
+                with _CHILDREN_LOCK:
+                    process.start()
             except OSError as error:  # Out of memory or processes.
                 raise UnavailableError(str(error)) from None
             finally:
@@ -110,9 +119,10 @@ def isolated_call(
         try:
             yield IsolatedCall(process, receiver, time.monotonic() + time_limit_s)
         finally:
-            process.kill()
-            process.join()
-            process.close()
+            with _CHILDREN_LOCK:
+                process.kill()
+                process.join()
+                process.close()
 
 
 def _run(
