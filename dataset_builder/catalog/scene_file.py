@@ -37,8 +37,8 @@ from rebar_depth_bench.base.reading import read_file
 from rebar_depth_bench.geometry.aruco_board import BoardSpec
 from rebar_depth_bench.geometry.cameras import NOMINAL_FOCAL_PX, NOMINAL_HEIGHT, NOMINAL_WIDTH
 
-RESERVED_NAMES = (*CONFIGS, *SWEEPS, CAGES, "meshes", "pictures", "scenes")
-"""Names that a user scene cannot have: names of configs and of other entries of the dataset folder."""
+RESERVED_NAMES = (*CONFIGS, *SWEEPS, CAGES, "bars", "crossings", "meshes", "pictures", "scenes")
+"""Names that a user scene cannot have: names of configs, of tables and of other entries of the dataset folder."""
 
 NEAREST_RADIUS_PER_REACH = 2.5
 """Nearest dome radius per reach of the assembly, close to the value of the lattice dome (2.67).

@@ -62,7 +62,8 @@ def plan_import(path: Path, name: str) -> Import:
     """
     is_name = scene_name_of(Path(f"{name}.toml")) == name and SCENE_NAME.accept(name)
     if not is_name or name in RESERVED_NAMES:
-        raise InputError(f"--config is {escape_text(name)}, expected {SCENE_NAME.text}, not a standard one")
+        expected = f"{SCENE_NAME.text}, none of {', '.join(RESERVED_NAMES)}"
+        raise InputError(f"--config is {escape_text(name)}, expected {expected}")
     layout = read_layout(path)
     views = open_views(path, layout)
     bars = read_bars_file(path.parent / layout.bars.file) if layout.bars is not None else ()

@@ -68,6 +68,7 @@ INVALID_KEYS = [
     ("name = 'lattice-dusk'", "invalid name"),
     ("name = 'lattice'", "conflict name"),
     ("name = 'meshes'", "conflict name"),
+    ("name = 'crossings'", "conflict name"),
     ("name = 'scenes'", "conflict name"),
     ("name = '../x'", "invalid name"),
     ("name = ''", "invalid name"),
