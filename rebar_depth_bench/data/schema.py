@@ -48,8 +48,9 @@ CAMERA_SHAPES: Mapping[str, tuple[int, ...]] = {"K": (3, 3), "distortion": (5,),
 COLUMNS = (
     "view_id",
     "scene",
-    *(f"{eye}_{kind}" for kind in ("rgb", "depth", "mask", "bars") for eye in EYES),
-    "left_preview",
+    *(f"{eye}_rgb" for eye in EYES),
+    "left_preview",  # Before depth, which the viewer of the Hub shows as bytes.
+    *(f"{eye}_{kind}" for kind in ("depth", "mask", "bars") for eye in EYES),
     *(f"{eye}_{kind}" for kind in CAMERA_SHAPES for eye in EYES),
     "baseline_m",
 )
@@ -76,11 +77,11 @@ COLUMN_DESCRIPTIONS: dict[str, str] = {
     "`<config>/<split>-<scene>-<0000>` in configs of several scenes",
     "scene": "name of the scene, as in `bars.parquet` and `meshes/`",
     "rgb": "lossless 8-bit colour, H x W, WebP; null in every row of a config built without colour",
+    "preview": "8-bit colour-mapped depth, for people and the Hub viewer",
     "depth": "lossless float32 planar depth along the optical axis, metres, 0.0 where there is no surface; "
     'TIFF, which `Image(mode="F")` of `datasets` reads too',
     "mask": "1-bit: steel, rim included",
     "bars": "16-bit: the bar's id as in `bars.parquet`, 0 where no steel",
-    "preview": "8-bit colour-mapped depth, for people and the Hub viewer",
     "K": "3 x 3 pinhole matrix, pixels; pixel centres at integer coordinates",
     "distortion": "k1 k2 p1 p2 k3 (OpenCV), zeros where the grid has none",
     "cam_from_world": "4 x 4 rigid pose: `x_cam = cam_from_world @ x_world`; OpenCV axes, metres",
