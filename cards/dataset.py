@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -10,7 +10,9 @@ from huggingface_hub import DatasetCardData
 
 from cards.steel import depth_text, steel_by_config
 from cards.templates import render
+from rebar_depth_bench.bar_crossings.crossings_file import CROSSINGS_FILE
 from rebar_depth_bench.base.names import TEST_SPLIT
+from rebar_depth_bench.data.bars import BARS_FILE
 from rebar_depth_bench.data.manifest import DatasetConfig
 from rebar_depth_bench.data.schema import (
     CENTRE,
@@ -35,7 +37,8 @@ from rebar_depth_bench.scoring.protocol import PROTOCOL
 if TYPE_CHECKING:
     from datasets import DatasetInfo
 
-PRETTY_NAME = "Industrial rebar metric depth"
+PRETTY_NAME = "Reinforcement views with metric depth (rebar-depth-bench)"
+"""Title of the card; the evaluation set of the paper, which is in another format, has another one."""
 _OPTICS_TEXTS = {
     "ideal": "ideal pinholes",
     "raw": "calibrated lenses, on the distorted grid as the sensor sees it",
@@ -45,15 +48,17 @@ _CAMERA_TEXT = " with baseline and field of view, not noise or depth engine, of 
 _SIZE_CATEGORIES = ((1_000, "n<1K"), (10_000, "1K<n<10K"), (100_000, "10K<n<100K"))
 
 
-def dataset_card(version: str, digest: str, configs: Sequence[DatasetConfig]) -> str:
+def dataset_card(version: str, digest: str, configs: Sequence[DatasetConfig], tables: Mapping[str, str]) -> str:
     """Return the text of the ``README.md`` of a dataset folder, for its version and ground-truth digest.
 
-    Its YAML header is sufficient for ``datasets.load_dataset(ROOT, config)``. The file pattern of each config
-    contains the digest of its shards, so that the cache of ``datasets`` never serves an older build of a config.
+    ``tables`` are the hex SHA-256 of its tables of bars and crossings that have rows, by file name. The YAML
+    header is sufficient for ``datasets.load_dataset(ROOT, config)``. The file pattern of each config contains the
+    digest of its shards, and a table has a version, so that the cache of ``datasets`` serves no older build.
     """
     return render(
         "dataset_card.md.j2",
-        yaml=_card_metadata(version, configs).to_yaml(),
+        yaml=_card_metadata(version, configs, tables).to_yaml(),
+        title=PRETTY_NAME,
         version=version,
         digest=digest,
         protocol=PROTOCOL,
@@ -61,6 +66,7 @@ def dataset_card(version: str, digest: str, configs: Sequence[DatasetConfig]) ->
         has_rendered=bool(_rendered(configs)),
         mats=[row for config in configs for row in _mat_rows(config)],
         columns=column_rows(),
+        has_tables=bool(tables),
         example=configs[0].name,
         example_split=configs[0].splits[0],
     )
@@ -91,12 +97,15 @@ def _type_name(feature: Any) -> str:
     return "image" if kind == "Image" else str(feature.dtype)
 
 
-def _card_metadata(version: str, configs: Sequence[DatasetConfig]) -> DatasetCardData:
+def _card_metadata(version: str, configs: Sequence[DatasetConfig], tables: Mapping[str, str]) -> DatasetCardData:
     from datasets.info import DatasetInfosDict
 
     views = sum(len(config.views) for config in configs)
+    has_imported = any(config.imported for config in configs)  # Of other licences, sources and annotations.
     card = DatasetCardData(
-        license="other" if any(config.imported for config in configs) else "cc-by-4.0",
+        license="other" if has_imported else "cc-by-4.0",
+        annotations_creators=None if has_imported else ["machine-generated"],
+        source_datasets=None if has_imported else ["original"],
         pretty_name=PRETTY_NAME,
         task_categories=["depth-estimation"],
         tags=["depth", "stereo", "construction", "rebar", *(["synthetic"] if _rendered(configs) else [])],
@@ -111,7 +120,24 @@ def _card_metadata(version: str, configs: Sequence[DatasetConfig]) -> DatasetCar
         }
         for config in configs
     ]
+    card["configs"] += [
+        {
+            "config_name": name,
+            "data_files": [{"split": "train", "path": file}],
+            "version": _table_version(tables[file]),
+        }
+        for name, file in (("bars", BARS_FILE), ("crossings", CROSSINGS_FILE))
+        if file in tables and name not in infos
+    ]
     return card
+
+
+def _table_version(sha256: str) -> str:
+    """Return a version ``x.y.z`` from the digest of a table.
+
+    The path of a table is always the same, so that ``datasets`` would take an older one from its cache.
+    """
+    return ".".join(f"{int(sha256[start : start + 8], 16)}" for start in (0, 8, 16))
 
 
 def _dataset_info(config: DatasetConfig, version: str) -> DatasetInfo:

@@ -17,6 +17,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import pyarrow.parquet as pq
+
 from cards.dataset import dataset_card
 from dataset_builder.cameras.trajectories import view_count
 from dataset_builder.catalog.named_configs import CONFIGS
@@ -233,9 +235,8 @@ def write_folder(
     order = [*CONFIGS, *sorted(set(configs) - set(CONFIGS))]
     ordered = [configs[name] for name in order if name in configs]
     version, digest = software_version(), views_digest(view for config in ordered for view in config.views)
-    card = dataset_card(version, digest, ordered)
     known = {**(folder.files if folder is not None else {}), **digests}
-    written = [STRIP, BARS_FILE, CROSSINGS_FILE, CARD]
+    written = [STRIP, BARS_FILE, CROSSINGS_FILE]
     for config in ordered:
         if not (out / config.sheet).is_file():
             write_contact_sheet(config, out / config.sheet)
@@ -243,8 +244,11 @@ def write_folder(
     by_scene = {_strip_key(config): config for config in reversed(ordered)}
     write_scenes_strip(list(reversed(by_scene.values())), out / STRIP)
     _write_scene_bars(out, folder, ordered, bars)
-    write_text(out / CARD, card)
     known |= {name: file_sha256(out / name) for name in written}
+    # ``datasets`` raises an error for a table without rows, as in a folder of imported views without bars.
+    tables = {name: known[name] for name in (BARS_FILE, CROSSINGS_FILE) if pq.read_metadata(out / name).num_rows}
+    write_text(out / CARD, dataset_card(version, digest, ordered, tables))
+    known[CARD] = file_sha256(out / CARD)
     manifest = {
         "format": MANIFEST_FORMAT,
         "version": version,
@@ -252,7 +256,7 @@ def write_folder(
         "ground_truth": {"digest": digest},
         "crossings": crossings_entry(out / CROSSINGS_FILE),
         "configs": {config.name: config.manifest_entry for config in ordered},
-        "files": {name: known[name] for name in sorted({*written, *_listed_files(ordered)})},
+        "files": {name: known[name] for name in sorted({*written, CARD, *_listed_files(ordered)})},
     }
     published = validated_folder(manifest, [], str(out), out / MANIFEST_FILE)
     write_text(out / MANIFEST_FILE, json.dumps(manifest, indent=1, allow_nan=False) + "\n")

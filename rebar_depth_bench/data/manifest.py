@@ -309,7 +309,9 @@ class DatasetFolder(Located):
     def config(self, name: str) -> DatasetConfig:
         """Return a config; raise ``DatasetError`` if there is none of that name."""
         if name not in self.config_by_name:
-            raise DatasetError(f"{self.root}: no config {name!r}, expected one of {', '.join(self.configs)}")
+            hint = f"; rdb.{name} reads {name}.parquet" if f"{name}.parquet" in self.files else ""
+            expected = f"one of {', '.join(self.configs)}{hint}"
+            raise DatasetError(f"{self.root}: no config {name!r}, expected {expected}")
         return self.config_by_name[name]
 
     def verified_file(self, name: str) -> Path:

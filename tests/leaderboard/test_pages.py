@@ -12,6 +12,7 @@ from typing import Any
 import httpx2
 import pytest
 
+from cards.dataset import PRETTY_NAME
 from rebar_depth_bench.reporting.tables import comparison_cells
 from rebar_depth_bench.scoring.comparison import compare
 from rebar_depth_bench.scoring.reading import read_result
@@ -245,7 +246,7 @@ def test_comparison_of_other_than_two_results_is_refused_in_words(
 
 def test_pages_name_dataset_licence_and_scenes(board: SharedServer) -> None:
     _, parsed = page(board.url + "/")
-    assert "Industrial rebar metric depth , licence cc-by-4.0" in parsed.text
+    assert f"{PRETTY_NAME} , licence cc-by-4.0" in parsed.text
     scenes = [str(image["src"]) for image in parsed.attributes_of("img") if "/scenes/" in str(image["src"])]
     assert scenes == [f"/scenes/{config}.webp" for config in CONFIGS]
     for source in scenes:

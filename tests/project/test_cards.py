@@ -65,7 +65,7 @@ def test_dataset_card_steel_share_matches_masks(tiny_root: Path, tiny_masks: dic
 
 def test_dataset_card_is_rendered_from_manifest(tiny_root: Path) -> None:
     folder = open_folder(tiny_root)
-    card = dataset_card(folder.version, folder.digest, list(folder.config_by_name.values()))
+    card = dataset_card(folder.version, folder.digest, list(folder.config_by_name.values()), folder.files)
     assert card == (tiny_root / "README.md").read_text()
 
 
@@ -108,7 +108,7 @@ def test_card_states_what_distances_are_to(tiny_root: Path) -> None:
     older = lattice.model_copy(update={"name": "pier"})
     rows = {
         kind: next(
-            line for line in dataset_card("1.0.0", "d", [config]).splitlines() if line.startswith("| `pier`")
+            line for line in dataset_card("1.0.0", "d", [config], {}).splitlines() if line.startswith("| `pier`")
         )
         for kind, config in (("pier", pier), ("older", older))
     }

@@ -115,6 +115,7 @@ def test_rows_decode_to_contract_dtypes_and_shapes(tiny_root: Path) -> None:
     ("config", "options", "words"),
     [
         ("lattise", {}, "no config 'lattise', expected one of lattice, lattice-orbit"),
+        ("bars", {}, "no config 'bars', expected one of lattice, lattice-orbit; rdb.bars reads bars.parquet"),
         ("lattice", {"columns": ["depth"]}, "no column 'depth', expected some of view_id, scene, left_rgb"),
         ("lattice", {"columns": "left_rgb"}, "columns is 'left_rgb', expected a list"),
         ("lattice", {"columns": 3}, "columns is 3, expected a list of column names"),

@@ -90,14 +90,17 @@ def test_uncertainty_is_beside_the_results(
 def test_card_states_licence_and_origin_of_each_config(complete: Path, tiny_root: Path) -> None:
     """What holds for rendered configs only is not said of imported ones."""
     own, rendered = (list(open_folder(root).config_by_name.values()) for root in (complete, tiny_root))
-    text = dataset_card("1.0.0", "digest", own)
+    text = dataset_card("1.0.0", "digest", own, {})
     header = yaml.safe_load(text.split("---")[1])
     assert header["license"] == "other"
     assert "synthetic" not in header["tags"]
+    assert not {"annotations_creators", "source_datasets"} & set(header)
     assert "`mock-up`: its authors state no licence." in text
     assert not [word for word in ("Cycles", "CC BY", "Synthetic") if word in text]
-    both = dataset_card("1.0.0", "digest", [*rendered, *own])
-    assert yaml.safe_load(both.split("---")[1])["license"] == "other"
+    both = dataset_card("1.0.0", "digest", [*rendered, *own], {})
+    header = yaml.safe_load(both.split("---")[1])
+    assert header["license"] == "other"
+    assert not {"annotations_creators", "source_datasets"} & set(header)
     assert "The configs `mock-up` were imported" in both
     assert "The rendered data: CC BY 4.0." in both
 
@@ -203,8 +206,9 @@ def test_import_is_repeatable_and_keeps_other_configs(
     files = {path: path.read_bytes() for path in out.rglob("*") if path.is_file()}
     imported(layout, out)
     assert {path: path.read_bytes() for path in out.rglob("*") if path.is_file()} == files
-    with pytest.raises(InputError, match="not a standard one"):
-        imported(layout, out, "lattice-orbit")
+    for name in ("lattice-orbit", "bars"):
+        with pytest.raises(InputError, match=f"--config is {name}, expected .* none of .*{name}"):
+            imported(layout, out, name)
 
 
 def test_interrupted_import_is_continued_to_the_same_bytes(source: Path, complete: Path, tmp_path: Path) -> None:

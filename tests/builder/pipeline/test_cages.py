@@ -123,7 +123,7 @@ def test_folder_of_an_earlier_generator_is_scored_and_not_continued(
     assert len(rdb.load(copy, "cages", split="train")) == SPLITS["train"] * VIEWS
     assert rdb.score(truths["train"], copy).tables["cages"]["rank_error"] == 0.0
     folder = open_folder(copy)
-    assert "mats" not in dataset_card(folder.version, folder.digest, [folder.config("cages")])
+    assert "mats" not in dataset_card(folder.version, folder.digest, [folder.config("cages")], {})
     before = contents(copy)
     for request in (cages("train", 2), cages("train", 3), cages("test", 1)):
         refused = run_in_process(main, "--out", copy, *request, *GROUND_TRUTH)

@@ -9,21 +9,24 @@ from typing import Any
 
 import datasets
 import pytest
+from pyarrow.compute import field
+from pyarrow.dataset import dataset as parquet_dataset
 
 import rebar_depth_bench as rdb
 from dataset_builder.catalog.cages_config import CagesRequest
 from dataset_builder.catalog.named_configs import BuildRequest
 from dataset_builder.pipeline.build import BuildSummary, build
 from dataset_builder.pipeline.plan import BUILD_FOLDER
+from dataset_builder.pipeline.publish import write_folder
 from dataset_builder.specs.config_specs import ColourSpec
 from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.base.limits import JSON_BYTES, TABLE_BYTES
 from rebar_depth_bench.base.parallel import silent
-from rebar_depth_bench.data.bars import BARS_FILE
+from rebar_depth_bench.data.bars import BARS_FILE, Bar
 from rebar_depth_bench.data.files import MANIFEST_FILE, file_problems
 from rebar_depth_bench.data.manifest import open_folder
 from tests.building import contents
-from tests.prepared_rows import PreparedRows, placed
+from tests.prepared_rows import BARS, PreparedRows, placed
 
 pytestmark = pytest.mark.slow
 
@@ -264,6 +267,44 @@ def test_added_and_rebuilt_scenes_are_loaded_in_place_of_cached_ones(tmp_path: P
     assert datasets.load_dataset(str(root), "cages", split="train")[0]["left_rgb"].size == (64, 18)
     assert all(new != old for new, old in zip(first_depth(root), depth, strict=True))
     assert 'load_dataset("PATH_OR_HUB_ID", "cages", split="train")' in (root / "README.md").read_text()
+
+
+def loaded_rows(root: Path, table: str) -> list[dict[str, Any]]:
+    return list(datasets.load_dataset(str(root), table, split="train"))
+
+
+def test_rebuilt_tables_are_loaded_in_place_of_cached_ones(tmp_path: Path) -> None:
+    """The names of the tables stay; a table without rows, which ``datasets`` cannot read, is no config."""
+    root = tmp_path / "dataset"
+    built(root, cages(1))
+    assert [row["bar_id"] for row in loaded_rows(root, "bars")] == [bar.bar_id for bar in BARS]
+    assert datasets.get_dataset_config_names(str(root)) == ["cages", "bars"]
+    folder = open_folder(root)
+    [scene] = folder.config("cages").scenes
+    for diameter_m in (0.03, 0.02):
+        y_m = 0.01 + diameter_m / 2
+        crossing = Bar(5, "bar", diameter_m, ((-0.1, y_m, 0.5), (0.5, y_m, 0.5)))
+        write_folder(root, folder, folder.config_by_name, {}, {scene.name: (*BARS, crossing)})
+        assert loaded_rows(root, "bars")[-1]["diameter_m"] == diameter_m
+        assert [row["point_b"][1] for row in loaded_rows(root, "crossings")] == [pytest.approx(y_m)] * len(BARS)
+    assert datasets.get_dataset_config_names(str(root)) == ["cages", "bars", "crossings"]
+    assert list(datasets.load_dataset(str(root))) == ["test"], "the only config with views is the default"
+
+
+def test_filters_skip_the_row_groups_of_other_scenes_and_views(tmp_path: Path) -> None:
+    built(tmp_path / "dataset", cages(2))
+    view = open_folder(tmp_path / "dataset").config("cages").views[1].view_id
+    fragments = list(parquet_dataset(tmp_path / "dataset" / "cages").get_fragments())
+    scenes = {fragment.head(1)["scene"][0].as_py() for fragment in fragments}
+    assert len(scenes) == 2
+    for column, value, rows in [("view_id", view, 1), *(("scene", scene, 2) for scene in scenes)]:
+        left = [fragment.subset(field(column) == value).row_groups for fragment in fragments]
+        assert sum(map(len, left)) == rows, column
+        options: dict[str, Any] = {"filters": [(column, "==", value)], "split": "test", "streaming": True}
+        assert len(list(datasets.load_dataset(str(tmp_path / "dataset"), "cages", **options))) == rows
+    group = fragments[0].metadata.row_group(0)
+    columns = [group.column(index) for index in range(group.num_columns)]
+    assert [chunk.path_in_schema for chunk in columns if chunk.is_stats_set] == ["view_id", "scene"]
 
 
 @pytest.mark.parametrize(("limit", "value"), [(JSON_BYTES, 5000), (TABLE_BYTES, 1000)])
