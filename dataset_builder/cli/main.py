@@ -244,9 +244,27 @@ def _push(options: argparse.Namespace) -> None:
     print("dry run: not compared with the Hub, nothing was sent")
 
 
+def _add_croissant_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("root", metavar="ROOT", help="dataset folder or Hub repository id")
+    parser.add_argument("--hub-id", metavar="ID", help="id of the repository, ORG/NAME (default: paths in ROOT)")
+
+
+def _croissant(options: argparse.Namespace) -> None:
+    from cards.croissant import croissant
+    from dataset_builder.push.pushing import check_request
+    from rebar_depth_bench.data.manifest import open_folder
+
+    if options.hub_id is not None:
+        check_request(options.hub_id, "main", connects=False, publishes=False)
+    print(croissant(open_folder(options.root), options.hub_id), end="")
+
+
 COMMANDS: Mapping[str, Command] = {
     BUILD: Command("render a dataset folder", _add_build_arguments, _build),
     "audit": Command("check a dataset folder and its ground truth", _add_audit_arguments, _audit),
+    "croissant": Command(
+        "describe a dataset folder in the Croissant format", _add_croissant_arguments, _croissant
+    ),
     "export": Command(
         "export a dataset folder as plain files, with COLMAP's and nerfstudio's cameras",
         _add_export_arguments,
