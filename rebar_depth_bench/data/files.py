@@ -26,6 +26,8 @@ if TYPE_CHECKING:
 
 
 MANIFEST_FILE = "manifest.json"
+CROISSANT_FILE = "croissant.json"
+"""Description of a folder that ``rebar-build croissant`` prints: it names the digests of all files."""
 _HUB_NAME = "[A-Za-z0-9][A-Za-z0-9_.-]{0,95}"
 _HUB_ROOT_PATTERN = re.compile(rf"(?P<repository>{_HUB_NAME}/{_HUB_NAME})(@(?P<revision>{PATH_PATTERN}))?")
 
@@ -174,7 +176,9 @@ def file_problems(folder: DatasetFolder, progress: Progress = silent) -> Iterato
     for name in sorted(used - set(folder.files)):
         yield Problem("missing", name, "has no SHA-256 in the manifest, which names it", "one for each file")
     if folder.local is not None:
-        for name in sorted(_existing_files(folder.local) - set(folder.files) - used - {MANIFEST_FILE}):
+        for name in sorted(
+            _existing_files(folder.local) - set(folder.files) - used - {MANIFEST_FILE, CROISSANT_FILE}
+        ):
             yield Problem("unknown", escape_text(name), "is not in the manifest")
 
 

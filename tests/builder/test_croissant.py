@@ -18,7 +18,7 @@ from rdflib.namespace import SDO
 import rebar_depth_bench as rdb
 from dataset_builder.cli.main import main
 from dataset_builder.importing.config_import import plan_import, run_import
-from rebar_depth_bench.data.files import file_sha256
+from rebar_depth_bench.data.files import file_problems, file_sha256
 from rebar_depth_bench.data.manifest import open_folder
 from tests.builder.importing import source_data
 from tests.builder.push.conftest import list_files
@@ -88,6 +88,7 @@ def test_every_table_of_a_folder_is_read(
     assert len(issues.warnings) == len(recommended)
     assert all(any(f'/{name}"' in warning for name in recommended) for warning in issues.warnings)
     folder = open_folder(root)
+    assert path.name not in {problem.where for problem in file_problems(open_folder(path.parent))}
     tables = [
         name.removesuffix(".parquet") for name in ("bars.parquet", "crossings.parquet") if name in folder.files
     ]
