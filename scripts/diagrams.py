@@ -1,9 +1,9 @@
-"""Diagrams of the architecture as SVG: the packages with their imports, and the flow of data.
+"""Diagrams of the architecture as SVG (the packages with their imports, the flow of data), and badges of README.
 
 python -m scripts.diagrams docs/pictures
 
 The layers of the packages are read from the import contracts in pyproject.toml, so that the diagram shows what
-import-linter enforces.
+import-linter enforces, and the badges from its metadata: no other server is asked for an image.
 """
 
 from __future__ import annotations
@@ -132,6 +132,19 @@ def flow_svg() -> str:
     return _document(860, 520, "Flow of data", [*(box.svg for box in boxes), *edges])
 
 
+def badge_svg(name: str, value: str) -> str:
+    """Return a badge: a name on dark grey, and its value on blue."""
+    left, width = 20 + 7 * len(name), 40 + 7 * (len(name) + len(value))
+    return (
+        f'<svg xmlns="http://www.w3.org/2000/svg" width="{width}" height="20" viewBox="0 0 {width} 20" role="img" '
+        f'aria-label="{escape(name)}: {escape(value)}">\n<style>text {{ font: 12px "DejaVu Sans", Verdana, '
+        f'sans-serif; fill: #ffffff; text-anchor: middle; }}</style>\n<rect width="{width}" height="20" rx="4" '
+        f'fill="#4b5563"/>\n<path d="M{left} 0H{width - 4}a4 4 0 0 1 4 4V16a4 4 0 0 1 -4 4H{left}z" '
+        f'fill="#1d5fa8"/>\n<text x="{left / 2:g}" y="14">{escape(name)}</text>\n'
+        f'<text x="{(left + width) / 2:g}" y="14">{escape(value)}</text>\n</svg>\n'
+    )
+
+
 def bench_layers() -> list[str]:
     """Return the layers of the bench as the import contracts state them, highest first."""
     contracts = tomllib.loads(PROJECT.read_text())["tool"]["importlinter"]["contracts"]
@@ -154,7 +167,13 @@ def _document(width: int, height: int, title: str, elements: Sequence[str]) -> s
 
 def diagrams() -> dict[str, str]:
     """Return the text of each file by its name."""
-    return {"packages.svg": packages_svg(bench_layers()), "data-flow.svg": flow_svg()}
+    project = tomllib.loads(PROJECT.read_text())["project"]
+    return {
+        "packages.svg": packages_svg(bench_layers()),
+        "data-flow.svg": flow_svg(),
+        "licence.svg": badge_svg("licence", project["license"]),
+        "python.svg": badge_svg("python", project["requires-python"].replace(">=", "≥ ")),
+    }
 
 
 def main(folder: str) -> None:
