@@ -1,4 +1,4 @@
-"""Benchmark card and its two further pages: definitions of measures, and the long tables of results.
+"""Benchmark card, its two further pages (definitions of measures, long tables of results), and README's table.
 
 The constants of the pages are taken from the code, the tables of results from the JSON files of this package.
 """
@@ -6,6 +6,7 @@ The constants of the pages are taken from the code, the tables of results from t
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -22,6 +23,7 @@ from cards.reference import (
     number,
     percent,
     reference_context,
+    results_file,
 )
 from cards.steel import STEEL_RESULTS, depth_text, range_text
 from cards.templates import render, wrapped
@@ -36,6 +38,7 @@ from rebar_depth_bench.extended.judged import MAX_SURFACE_DIAMETERS
 from rebar_depth_bench.extended.measures import EXTENDED_PROTOCOL
 from rebar_depth_bench.methods import AnyMethod, own_methods
 from rebar_depth_bench.reporting.extended_tables import FITS_NOTE
+from rebar_depth_bench.reporting.published import load_published
 from rebar_depth_bench.scoring.bootstrap import BLOCK_VIEWS, INTERVALS, MIN_BLOCKS, RESAMPLES
 from rebar_depth_bench.scoring.columns import SIGNIFICANT_DIGITS
 from rebar_depth_bench.scoring.formatting import LEAST_MARGIN
@@ -158,10 +161,25 @@ def results_page() -> str:
     return wrapped(text)
 
 
+def readme() -> str:
+    """Return the text of README.md with its table of methods, the only part of it that is not written by hand."""
+    table = render(
+        "readme_table.md.j2",
+        published=load_published().scenes,
+        subset=json.loads(results_file(SUBSET).read_text()),
+        networks=learned_results()["configs"],
+        number=number,
+    )
+    text = (_ROOT / "README.md").read_text()
+    marks = r"(?<=<!-- methods -->\n\n).*(?=\n\n<!-- end of methods -->)"
+    return re.sub(marks, table.strip(), text, flags=re.DOTALL)
+
+
 PAGES: Mapping[Path, Callable[[], str]] = {
     _ROOT / "cards" / "BENCHMARK.md": benchmark_card,
     _ROOT / "docs" / "measures.md": measures_page,
     _ROOT / "docs" / "results.md": results_page,
+    _ROOT / "README.md": readme,
 }
 """Generated pages of the repository, and the functions that return their texts."""
 

@@ -28,7 +28,9 @@ from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.schema import CENTRE, NEAREST_STEEL, features
 from rebar_depth_bench.extended.families import MEASURE_FAMILIES
 from rebar_depth_bench.methods import own_methods
+from rebar_depth_bench.reporting.published import published_rows
 from tests.conftest import TINY_DATASET
+from tests.project.pages import ROOT
 
 PUBLISHED = (SUBSET, *FULL_SETS, CAGES)
 STORED: dict[str, dict[str, Any]] = {name: json.loads(results_file(name).read_text()) for name in PUBLISHED}
@@ -42,7 +44,7 @@ def test_generated_page_in_repository_is_up_to_date(page: Path) -> None:
 
 @pytest.mark.slow
 def test_pages_name_every_method_and_measure() -> None:
-    _, measures, results = (PAGES[page]() for page in PAGES)
+    _, measures, results, _ = (PAGES[page]() for page in PAGES)
     assert all(f"| `{name}`" in results for name in own_methods())
     shown = set(re.findall(r"`([\w.]+)`", measures))
     names = {measure.name for family in MEASURE_FAMILIES.values() for measure in family.measures}
@@ -164,6 +166,20 @@ def test_main_table_has_methods_and_networks_by_rank_error() -> None:
         assert errors == sorted(errors)
     [sgbm] = [row for row in rows if row[0] == "`sgbm`"]
     assert sgbm[2] == f"{STORED[CAGES]['results']['sgbm']['tables']['cages']['rank_error']:.4f}"
+
+
+def test_table_of_readme_has_the_published_rows_and_stored_results() -> None:
+    text = PAGES[ROOT / "README.md"]()
+    table = text[text.index("<!-- methods -->") : text.index("<!-- end of methods -->")]
+    rows = {name: cells.split(" | ") for name, cells in re.findall(r"^\| (.+?) \| (.+) \|$", table, re.MULTILINE)}
+    for n, scene in enumerate(("lattice", "pile", "pier")):
+        for row in published_rows(scene):
+            mark = " †" if row.median_anchored else ""
+            assert rows[row.method][n] == f"{row.abs_rel}, {row.abs_rel_scaled}{mark}"
+        stored = STORED[SUBSET]["results"]["sgbm-filled"]["tables"][scene]
+        errors = [f"{stored[key]['abs_rel']:.3f}" for key in ("native", "scaled")]
+        assert rows["SGBM of OpenCV, holes filled"][n] == ", ".join(errors)
+        assert rows["a plane at one depth"][n] == f"scaled {stored['reference']['constant']['abs_rel']:.3f}"
 
 
 def test_reference_results_refuse_a_folder_with_other_views(

@@ -228,17 +228,6 @@ def test_generated_tables_are_current() -> None:
     assert sorted(marks) == sorted(TABLES)
 
 
-def test_results_in_readme_are_those_of_the_card() -> None:
-    """The table of README has all rows of methods of the card's table of the lattice, without views and scale."""
-    row = re.compile(r"^\| (`[\w-]+`(?: ‡)?) \| (.*) \|$", re.MULTILINE)
-    card = (ROOT / "cards/BENCHMARK.md").read_text()
-    of_card = card[card.index("| lattice | views |") : card.index("| pile | views |")]
-    rows = [(name, cells.split(" | ")) for name, cells in row.findall(of_card)]
-    expected = [(name, " | ".join([*cells[1:5], cells[6]])) for name, cells in rows]
-    assert len(expected) >= 8
-    assert row.findall((ROOT / "README.md").read_text()) == expected
-
-
 def test_pictures_are_used() -> None:
     text = "\n".join(page.read_text() for page in PAGES)
     for picture in (DOCS / "pictures").iterdir():
