@@ -99,6 +99,8 @@ def _add_export_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, required=True, metavar="DIR", help="output folder: new, or an earlier export to resume"
     )
+    formats = ("plain", "ultralytics")
+    parser.add_argument("--format", choices=formats, default="plain", help="files to write (default: plain)")
     add_names(parser, "--config", "configs to export (default: all)")
     parser.add_argument(
         "--split", choices=SPLITS, metavar="NAME", help="split to export: train, validation or test (default: all)"
@@ -124,6 +126,7 @@ def _export(options: argparse.Namespace) -> None:
             options.views,
             progress=bars.update,
             split=options.split,
+            file_format=options.format,
         )
     for config in exported:
         print(f"{config.config}: {config.views} views, {config.written} files written, {config.kept} kept")
@@ -266,7 +269,7 @@ COMMANDS: Mapping[str, Command] = {
         "describe a dataset folder in the Croissant format", _add_croissant_arguments, _croissant
     ),
     "export": Command(
-        "export a dataset folder as plain files, with COLMAP's and nerfstudio's cameras",
+        "export a dataset folder as plain files, with COLMAP's and nerfstudio's cameras, or for Ultralytics",
         _add_export_arguments,
         _export,
     ),

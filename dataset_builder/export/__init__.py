@@ -1,4 +1,4 @@
-"""Export of a dataset folder as plain images, OpenEXR depth, COLMAP models and nerfstudio transforms."""
+"""Export of a dataset folder: images, OpenEXR depth, COLMAP models, nerfstudio transforms; data of Ultralytics."""
 
 from dataset_builder.export.exporting import ConfigExport, export
 

@@ -1,4 +1,4 @@
-"""Cameras and metadata for other programs: COLMAP's text model, ``transforms.json``, ``cameras.json``, a README.
+"""Cameras and metadata for other programs: COLMAP, ``transforms.json``, ``cameras.json``, README, Ultralytics.
 
 The centre of their first pixel is (0.5, 0.5), the centre of ours is (0, 0), so ``HALF_PIXEL`` is added to cx, cy.
 Numbers have up to 17 digits, so that they are read back as the same float64.
@@ -16,12 +16,14 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
+import yaml
 from jaxtyping import Float64
 from numpy import ndarray
 from scipy.spatial.transform import Rotation
 
 from dataset_builder.export.exported_views import EXPORT_FILES, MILLIMETRE_M, CameraView, exported_files
 from dataset_builder.scene.shapes.bending import resample_polyline_m
+from rebar_depth_bench.base.names import SPLITS
 from rebar_depth_bench.captures.fields import LENS_TERMS
 from rebar_depth_bench.data.bars import Bar, with_axis
 from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder
@@ -266,3 +268,21 @@ OpenCV reads the depth with OPENCV_IO_ENABLE_OPENEXR=1 in the environment:
 
 Licence: {licence}
 """
+
+
+def ultralytics_yaml(folder: DatasetFolder, config: DatasetConfig, parts: Mapping[str, DatasetConfig]) -> str:
+    """Return the data file of a config for Ultralytics; ``parts`` has what was exported by folder, relative to it.
+
+    ``train`` and ``val`` are required keys, whose lists may be empty. Without splits, ``val`` has the test views.
+    """
+    images: dict[str, list[str]] = {split: [] for split in SPLITS}
+    for name, part in parts.items():
+        if part.name == config.name:
+            images[part.scene.split].append(f"{name}/images")
+    val = images["validation"] if config.has_splits else list(images["test"])  # A list used twice gets an anchor.
+    keys = {"train": images["train"], "val": val, "test": images["test"], "names": {0: "depth"}}
+    return (
+        f"# rebar-depth-bench, config {config.name}, dataset {folder.digest}, version {folder.version}\n"
+        f"# depth/*.npy: planar, float32 metres, 0 where there is no surface. Licence: {LICENCE}\n"
+        f"{yaml.safe_dump(keys, sort_keys=False)}"
+    )

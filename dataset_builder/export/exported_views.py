@@ -107,6 +107,13 @@ def depth_exr(depth_m: Float32[ndarray, "h w"]) -> bytes:
     return stream.getvalue()
 
 
+def depth_npy(depth_m: Float32[ndarray, "h w"]) -> bytes:
+    """Encode float32 planar depth, metres, as a NumPy file, losslessly."""
+    stream = io.BytesIO()
+    np.save(stream, depth_m, allow_pickle=False)
+    return stream.getvalue()
+
+
 def depth_mm_png(depth_m: Float32[ndarray, "h w"]) -> bytes:
     """Encode planar depth as 16-bit grey PNG in whole millimetres, rounded to the nearest.
 
@@ -137,9 +144,12 @@ EXPORT_FILES: Mapping[str, ExportFile] = {
     "mask": ExportFile("masks", ".png", "mask", mask_png),
     "bars": ExportFile("bars", ".png", "bars", plain_png),
 }
-"""Files exported for each eye, by their key in ``cameras.json``."""
+"""Files of the format ``plain`` for each eye, by their key in ``cameras.json``."""
+
+ULTRALYTICS_FILES = (EXPORT_FILES["image"], ExportFile("depth", ".npy", "depth", depth_npy))
+"""Files for Ultralytics; its ``DepthDataset`` reads ``depth/NAME.npy``, unless ``depth/NAME.png`` exists."""
 
 
 def exported_files(config: DatasetConfig) -> Mapping[str, ExportFile]:
-    """Return the files exported for each eye of a config, by key: without colour there is no image."""
+    """Return the files of the format ``plain`` for each eye of a config, by key; without colour, no image."""
     return {name: file for name, file in EXPORT_FILES.items() if config.colour is not None or file.column != "rgb"}

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal, get_args
 
 from dataset_builder.cameras.trajectories import subset
 from dataset_builder.export.camera_formats import (
@@ -17,9 +17,11 @@ from dataset_builder.export.camera_formats import (
     points_txt,
     readme_txt,
     transforms_json,
+    ultralytics_yaml,
 )
 from dataset_builder.export.exported_views import (
     EXPORT_FILES,
+    ULTRALYTICS_FILES,
     CameraView,
     decoded_row,
     exported_files,
@@ -38,6 +40,9 @@ from rebar_depth_bench.data.manifest import DatasetConfig, DatasetFolder, open_f
 
 _FOLDERS = (".", "sparse/0", *sorted({file.folder for file in EXPORT_FILES.values()}))
 """Folders with files, relative to that of a config, which is "."."""
+
+FileFormat = Literal["plain", "ultralytics"]
+"""Format of an export: all files with their cameras, or those that Ultralytics reads."""
 
 
 @dataclass(frozen=True)
@@ -60,6 +65,7 @@ def export(
     views: int | None = None,
     progress: Progress = silent,
     split: str | None = None,
+    file_format: FileFormat = "plain",
 ) -> list[ConfigExport]:
     """Export configs (default: all) of the dataset folder ``root``, each into its own folder below ``to``.
 
@@ -68,12 +74,16 @@ def export(
     they are named. ``views`` selects that many views of a config, or of each scene, spread evenly. Files are
     written atomically, images before the metadata that refers to them. An interrupted export is resumed by calling
     it again: images that exist are kept, and the result is byte-identical to that of an uninterrupted export.
-    ``progress`` counts views.
+    ``progress`` counts views. For ``ultralytics``, images and depth of both eyes are written, and
+    ``<config>.yaml`` in ``to``, which names the folders of this call by split.
 
     Raises ``DatasetError`` for a folder that is not a complete local dataset folder, an unknown config or split,
-    or data that contradict the manifest; ``InputError`` for fewer than one view and for a ``to`` that contains
-    anything but an earlier export of the same data; ``OutputError`` for one that cannot be written.
+    or data that contradict the manifest; ``InputError`` for fewer than one view, an unknown format, no colour for
+    Ultralytics, and for a ``to`` that contains anything but an earlier export of the same data; ``OutputError``
+    for one that cannot be written.
     """
+    if file_format not in get_args(FileFormat):
+        raise InputError(f"the format is {file_format!r}, expected one of {', '.join(get_args(FileFormat))}")
     if views is not None and views < 1:
         raise InputError(f"--views is {views}, expected 1 or more")
     folder = open_folder(local_folder(root))
@@ -81,6 +91,11 @@ def export(
     for config in chosen:
         if config.imported is not None:
             raise InputError(f"{root}: config {config.name} was imported, expected configs that were rendered")
+        if file_format == "ultralytics" and config.colour is None:
+            raise InputError(
+                f"{root}: config {config.name} was built with --no-colour, expected colour for Ultralytics; build "
+                "it without --no-colour in another folder, or name others with --config"
+            )
     parts = _by_folder(chosen, split)
     wanted = {
         name: ExportedPart(
@@ -92,10 +107,13 @@ def export(
     target = Path(to)
     try:
         with export_target(target, folder, wanted, _FOLDERS):
-            return [
-                _export_part(folder, name, config, wanted[name].views, bars, target, progress)
+            summary = [
+                _export_part(folder, name, config, wanted[name].views, bars, target, progress, file_format)
                 for name, config in parts.items()
             ]
+            for config in chosen if file_format == "ultralytics" else ():
+                write_text(target / f"{config.name}.yaml", ultralytics_yaml(folder, config, parts))
+            return summary
     except OSError as error:  # Only writing raises OSError here: reading raises DatasetError.
         raise write_error(error.filename or to, error) from error
 
@@ -132,19 +150,21 @@ def _export_part(
     bars: dict[str, tuple[Bar, ...]],
     to: Path,
     progress: Progress,
+    file_format: FileFormat,
 ) -> ConfigExport:
-    """Write the images of what is exported into the folder ``name``, then the texts that refer to them.
+    """Write the images of what is exported into the folder ``name``, then for ``plain`` the texts that name them.
 
     Images that exist are kept.
     """
     views: list[CameraView] = []
     written = kept = 0
     records = {record.view_id: record for record in config.views}
+    files = list(exported_files(config).values()) if file_format == "plain" else ULTRALYTICS_FILES
     for view, row in stored_views(config, wanted):
         images = [
             (to / name / file.path(view.stem(eye)), f"{eye}_{file.column}", file.encode)
             for eye in view.cameras
-            for file in exported_files(config).values()
+            for file in files
         ]
         missing = [image for image in images if not image[0].is_file()]
         decoded = decoded_row(config, records[view.view_id], row) if missing else {}
@@ -153,8 +173,9 @@ def _export_part(
         written, kept = written + len(missing), kept + len(images) - len(missing)
         views.append(view)
         progress(f"export of {name}", len(views), len(wanted))
-    for place, text in _texts(folder, config, views, bars).items():
-        write_text(to / name / place, text)
+    if file_format == "plain":
+        for place, text in _texts(folder, config, views, bars).items():
+            write_text(to / name / place, text)
     return ConfigExport(name, len(views), written, kept)
 
 
@@ -226,18 +247,19 @@ def export_target(
         earlier = _read_marker(to / MARKER, folder) if (to / MARKER).is_file() else {}
         for name in earlier.keys() & parts.keys():
             _check_same_build(to, name, earlier[name], parts[name])
+        data_files = {f"{name.partition('/')[0]}.yaml" for name in parts}  # of Ultralytics
         for path in (to, *(to / name for name in folders)):
-            _remove_temporary_files(path, MARKER if path == to else None)
+            _remove_temporary_files(path, {MARKER, *data_files} if path == to else None)
         marker = _Marker(format=FORMAT, dataset=folder.digest, configs={**earlier, **parts})
         write_text(to / MARKER, json.dumps(marker.model_dump()) + "\n")
         yield
 
 
-def _remove_temporary_files(folder: Path, only_of: str | None) -> None:
-    """Delete the temporary files in a folder, which need not exist: all, or those of the file ``only_of``."""
+def _remove_temporary_files(folder: Path, only_of: Collection[str] | None) -> None:
+    """Delete the temporary files in a folder, which need not exist: all, or those of the files ``only_of``."""
     for path in list(folder.iterdir()) if folder.is_dir() else ():
         target = temporary_target(path.name)
-        if target is not None and only_of in (None, target):
+        if target is not None and (only_of is None or target in only_of):
             remove_file(path)
 
 

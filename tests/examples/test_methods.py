@@ -6,8 +6,10 @@ import itertools
 import json
 import runpy
 import shutil
+import sys
 import zipfile
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -202,3 +204,23 @@ def forward(self, images: List[Tensor], K: Tensor, pose: Tensor, low: Tensor, hi
     steel = view["left_depth"][(view["left_mask"] > 0) & (view["left_depth"] > 0)]
     expected = 1.25 * np.percentile(steel, 99) - 0.75 * np.percentile(steel, 1)
     np.testing.assert_allclose(depth_m, expected, rtol=1e-5)
+
+
+def test_ultralytics_receives_blue_green_red_and_its_depth_is_returned(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The package is not installed here: a stand-in returns the red channel, the last, as its network's depth."""
+
+    class Stand:
+        def __init__(self, weights: Path, task: str) -> None:
+            assert (weights, task) == (tmp_path / "best.pt", "depth")
+
+        def predict(self, image: np.ndarray, verbose: bool) -> list[Any]:
+            assert image.flags.c_contiguous
+            depth_m = SimpleNamespace(cpu=lambda: SimpleNamespace(numpy=lambda: image[..., 2].astype(np.float32)))
+            return [SimpleNamespace(depth=SimpleNamespace(data=depth_m))]
+
+    monkeypatch.setitem(sys.modules, "ultralytics", SimpleNamespace(YOLO=Stand))
+    monkeypatch.setenv("MODELS", str(tmp_path))
+    predict = load_predictor(f"{EXAMPLES}/ultralytics_depth.py:METHOD")
+    assert np.array_equal(predict(STEREO_ROW), LEFT[..., 0])
