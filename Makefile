@@ -47,7 +47,7 @@ tables: env-dev ## Write the tables of the documentation that list what the code
 docs: system-packages env-dev ## Build the documentation as a site in build/docs; a warning is an error
 	$(BIN)/python -m sphinx -W --keep-going -n -q docs build/docs
 
-sample-data: system-packages env-dev ## Render the sample of the package and the tests again, after a change of the format
+sample-data: system-packages env-dev ## Render the sample of the package and the data of the tests again, after a change of the format
 	$(BIN)/python -m tests.data.render
 
 env-dev: ## Make .venv for developing and testing

@@ -53,7 +53,7 @@ root_doc = "index"
 myst_enable_extensions = ["colon_fence"]
 myst_heading_anchors = 4
 
-# The notebooks read the small dataset of the tests, and find the commands of this environment.
+# The notebooks read the sample of the package, and find the commands of this environment.
 os.environ.setdefault("REBAR_NOTEBOOK_DATA", str(ROOT / "rebar_depth_bench" / "sample"))
 os.environ["PATH"] = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
 nb_execution_mode = "force"

@@ -14,6 +14,8 @@ TINY = ("--width", "160", "--height", "90", "--quality", "preview")
 """Small pictures, rendered in two passes like those of the default quality."""
 TINY_VIEWS = 9
 """One more than a shard holds."""
+TINY_DATASET = Path(__file__).parent / "data" / "tiny"
+"""Dataset folder of ``TINY_VIEWS`` views of the lattice and two of its orbit; its mesh is packed."""
 TWO_BARS = Path(__file__).parent / "data" / "two-bars.toml"
 """Cage that renders in a third of the time of the lattice."""
 

@@ -23,7 +23,7 @@ os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
 from rebar_depth_bench import SubmissionWriter, load  # noqa: E402
 from rebar_depth_bench.cli.demo import SAMPLE, copy_sample  # noqa: E402
 from tests import building, dask_cluster, requirements  # noqa: E402
-from tests.building import RunBuild, StartBuild  # noqa: E402
+from tests.building import TINY_DATASET, RunBuild, StartBuild  # noqa: E402
 from tests.dask_cluster import NewCluster  # noqa: E402
 from tests.requirements import Repetitions  # noqa: E402
 from tests.small_disks import NewDisk, mounted_disks  # noqa: E402
@@ -38,7 +38,6 @@ settings.load_profile("untimed")
 if TYPE_CHECKING:
     from tests.hub_server import HubServer
 
-TINY_DATASET = SAMPLE
 GOLDEN_TEXTS = Path(__file__).parent / "data" / "golden"
 
 FIXTURE_MARKERS = {
@@ -177,13 +176,21 @@ def chromium_program() -> str:
 
 
 @pytest.fixture(scope="session")
-def tiny_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a copy of the package's sample: lattice (nine views), lattice-orbit (two), 160 x 90.
+def sample_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a copy of the package's sample: lattice and pile (three views each), mat (four), 480 x 270."""
+    root = tmp_path_factory.mktemp("sample") / "dataset"
+    copy_sample(SAMPLE, root)
+    return root
 
-    ``make sample-data`` renders it anew; the nightly tier compares it with a fresh render.
+
+@pytest.fixture(scope="session")
+def tiny_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return a copy of ``tests/data/tiny``: lattice (nine views), lattice-orbit (two), 160 x 90.
+
+    ``make sample-data`` renders both samples anew; the nightly tier compares them with fresh renders.
     """
     root = tmp_path_factory.mktemp("tiny") / "dataset"
-    copy_sample(root)
+    copy_sample(TINY_DATASET, root)
     return root
 
 

@@ -24,8 +24,6 @@ from rebar_depth_bench.methods import METHODS
 from rebar_depth_bench.methods.controls import NOISY_TRUTH_FACTOR
 from rebar_depth_bench.reporting.tables import make_grid, plain_text, print_line, print_unwrapped
 from rebar_depth_bench.scoring.formatting import (
-    LEAST_MARGIN,
-    is_like_constant,
     note_text,
     row_name,
     row_notes,
@@ -34,7 +32,7 @@ from rebar_depth_bench.scoring.formatting import (
 from rebar_depth_bench.scoring.result import Result
 
 SAMPLE = Path(__file__).parents[1] / "sample"
-"""Dataset folder in the package: small views of the lattice and of its orbit; its mesh is packed."""
+"""Dataset folder in the package: ten small views of the lattice, the pile and a mat; its meshes are packed."""
 DEMO_CONFIG = "lattice"
 DEMO_METHODS = ("sgbm", "sgbm-filled", "constant", "noisy-truth")
 DEMO_SAMPLES = 8
@@ -47,12 +45,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, default=folder, help="working folder (default: %(default)s)")
     views = parser.add_mutually_exclusive_group()
     views.add_argument("--views", type=int, default=6, help="stereo views to render (default: %(default)s)")
-    sample = "use nine views of 160 x 90 that come with the package, without Blender; written to sample in --out"
+    sample = "use the ten views of three scenes in the package, without Blender; written to sample in --out"
     views.add_argument("--sample", action="store_true", help=sample)
 
 
 def run(options: argparse.Namespace) -> None:
-    """Copy or render lattice views, run four methods, write a report of each, and print one table.
+    """Copy the sample or render lattice views, run four methods, write a report of each, and print one table.
 
     An interrupted build is resumed. Raises ``InputError`` if the extra ``methods``, or ``build`` for rendering, is
     not installed.
@@ -61,7 +59,7 @@ def run(options: argparse.Namespace) -> None:
     data = out / "dataset"
     if options.sample:
         require_extra("methods", ["cv2"])
-        copy_sample(data)
+        copy_sample(SAMPLE, data)
     else:
         require_extra("build", ["dataset_builder", "bpy"])
         print_notice(f"rendering {options.views} stereo views of the lattice at 1280 x 720 into {data}")
@@ -69,7 +67,7 @@ def run(options: argparse.Namespace) -> None:
     results = []
     for name in DEMO_METHODS:
         print_notice(f"predicting with {name}: {METHODS[name].info.summary}")
-        result = evaluate(name, data, config=DEMO_CONFIG, archive=out / f"{name}.zip")
+        result = evaluate(name, data, archive=out / f"{name}.zip")
         result.to_html(out / f"{name}.html")
         write_bytes(out / f"{name}.json", result.to_json())
         results.append(result)
@@ -79,10 +77,10 @@ def run(options: argparse.Namespace) -> None:
         print(f"  {(out / name).resolve()}.html")
 
 
-def copy_sample(root: Path) -> None:
-    """Write the sample of the package to the dataset folder ``root``, its mesh unpacked."""
-    for source in filter(Path.is_file, SAMPLE.rglob("*")):
-        target, content = root / source.relative_to(SAMPLE), source.read_bytes()
+def copy_sample(sample: Path, root: Path) -> None:
+    """Write the dataset folder ``sample`` to the folder ``root``, its packed meshes unpacked."""
+    for source in filter(Path.is_file, sample.rglob("*")):
+        target, content = root / source.relative_to(sample), source.read_bytes()
         if target.suffix == ".xz":
             target, content = target.with_suffix(""), lzma.decompress(content)
         write_bytes(target, content)
@@ -99,23 +97,24 @@ def _build_dataset(data: Path, views: int) -> None:
 
 
 def _print_results(results: Sequence[Result], console: Console) -> None:
-    """Print one row per result, what the rows show, and the meaning of their marks."""
+    """Print one row per config and result, what the rows show, and the meaning of their marks."""
     shown = [summary(result) for result in results]
     grid = make_grid("method", shown[0].heads[1:])
-    flat = []
-    for result, one in zip(results, shown, strict=True):
-        table = result.tables[DEMO_CONFIG]
-        grid.add_row(*map(plain_text, [row_name(result, table), *one.rows[0][1:]]))
-        if is_like_constant(table):
-            flat.append(result.method)
+    for n, config in enumerate(results[0].tables):
+        grid.add_row(plain_text(config))
+        for result, one in zip(results, shown, strict=True):
+            name = f" {row_name(result, result.tables[config])}"
+            grid.add_row(*map(plain_text, [name, *one.rows[n][1:]]))
+        grid.add_section()
     print_unwrapped(console, grid)
     console.print()
-    listed = f", less than {LEAST_MARGIN * 100:.0f} % for {', '.join(flat)}" if flat else ""
     print_line(
         console,
-        f"noisy-truth, exact depth times {NOISY_TRUTH_FACTOR:g} with noise, has a wrong scale and almost the "
-        "exact shape: AbsRel shows the one, scaled AbsRel the other. A plane at one depth has the scaled AbsRel "
-        f"in the column constant; margin is the share by which a method is below it{listed}.",
+        "AbsRel is the mean relative error of depth on steel; scaled, that of depth times the best factor of each "
+        "view. A plane at one depth has the scaled AbsRel in the column constant; margin is the share by which a "
+        "method is below it. The lattice is so near that disparities reach half the image width: sgbm-filled is "
+        f"no better there than a plane. noisy-truth, exact depth times {NOISY_TRUTH_FACTOR:g} with noise, has a "
+        "wrong scale and almost the exact shape: AbsRel shows the one, scaled AbsRel the other.",
     )
     for note in row_notes(results, ()):
         print_line(console, note_text(*note))

@@ -20,11 +20,12 @@ from dataset_builder.specs.config_specs import colour_spec
 from rebar_depth_bench import SubmissionWriter, load
 from rebar_depth_bench.base.errors import InputError
 from rebar_depth_bench.cli.console import EXIT_DONE
-from rebar_depth_bench.cli.demo import SAMPLE, copy_sample
+from rebar_depth_bench.cli.demo import copy_sample
 from rebar_depth_bench.data.manifest import open_folder
 from rebar_depth_bench.data.rows import ConfigViews
 from rebar_depth_bench.methods.controls import noisy_depth_m
 from rebar_depth_bench.submission import SubmissionReader
+from tests.building import TINY_DATASET
 from tests.fuzz.workspace import CACHE, CASE, EntryPoint, Workspace, bench, run_options
 from tests.mat_dataset import write_mat_dataset
 from tests.synthetic_dataset import write_split_dataset
@@ -39,12 +40,12 @@ OPTIONAL_OUTPUTS = (*("--html", "r.html", "--csv", "r.csv", "--extended-csv", "e
 
 def write_dataset(workspace: Workspace) -> None:
     """Copy the tiny dataset, whose config ``lattice-orbit`` has two views, without its mesh, which is large."""
-    shutil.copytree(SAMPLE, workspace.root / ROOT, ignore=shutil.ignore_patterns("meshes"))
+    shutil.copytree(TINY_DATASET, workspace.root / ROOT, ignore=shutil.ignore_patterns("meshes"))
 
 
 def _write_complete_dataset(workspace: Workspace) -> None:
     """Copy the tiny dataset with its mesh, as if this software had just built it."""
-    copy_sample(workspace.root / ROOT)
+    copy_sample(TINY_DATASET, workspace.root / ROOT)
 
 
 def write_dataset_and_archive(workspace: Workspace) -> None:

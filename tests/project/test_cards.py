@@ -29,7 +29,7 @@ from rebar_depth_bench.data.schema import CENTRE, NEAREST_STEEL, features
 from rebar_depth_bench.extended.families import MEASURE_FAMILIES
 from rebar_depth_bench.methods import own_methods
 from rebar_depth_bench.reporting.published import published_rows
-from tests.conftest import TINY_DATASET
+from tests.building import TINY_DATASET
 from tests.project.pages import ROOT
 
 PUBLISHED = (SUBSET, *FULL_SETS, CAGES)

@@ -135,12 +135,11 @@ def pages_with_python() -> list[ParameterSet]:
 
 @pytest.mark.parametrize("page", pages_with_python())
 def test_documented_python_runs(
-    page: Path, tiny_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    page: Path, sample_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "demo-output" / "sample").mkdir(parents=True)
-    (tmp_path / "demo-output" / "sample" / "dataset").symlink_to(tiny_root)
-    (tmp_path / "demo-output" / "dataset").symlink_to(tiny_root)
+    (tmp_path / "demo-output" / "sample" / "dataset").symlink_to(sample_root)
     names: dict[str, object] = {}
     for block, output in python_blocks(page):
         with redirect_stdout(StringIO()) as printed:

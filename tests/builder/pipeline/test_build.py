@@ -9,6 +9,7 @@ import signal
 import subprocess
 import sys
 import time
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -24,11 +25,13 @@ from dataset_builder.pipeline.build import build
 from dataset_builder.pipeline.plan import BUILD_FOLDER
 from dataset_builder.specs.config_specs import CPU, colour_spec
 from dataset_builder.user_files.cage_file import mesh_file_spec
+from rebar_depth_bench.cli.demo import SAMPLE, copy_sample
 from rebar_depth_bench.data.bars import read_bars
 from rebar_depth_bench.data.codecs import decode
 from rebar_depth_bench.data.manifest import open_folder
 from tests.building import (
     TINY,
+    TINY_DATASET,
     TINY_VIEWS,
     TWO_BARS,
     RunBuild,
@@ -40,7 +43,7 @@ from tests.building import (
 )
 from tests.commands import run_in_process
 from tests.data import orbit
-from tests.data.render import render, render_orbit
+from tests.data.render import render_orbit, render_sample, render_tiny
 from tests.processes import wait_until
 from tests.requirements import Repetitions
 
@@ -260,9 +263,11 @@ def test_process_exit_before_reading_task_raises_no_error() -> None:
 
 @pytest.mark.nightly
 @pytest.mark.usefixtures("blender")
-def test_sample_data_equals_fresh_render(tiny_root: Path, tmp_path: Path) -> None:
-    render(tmp_path / "dataset")
-    assert contents(tmp_path / "dataset") == contents(tiny_root), "run `make sample-data`"
+@pytest.mark.parametrize(("stored", "render"), [(SAMPLE, render_sample), (TINY_DATASET, render_tiny)])
+def test_sample_data_equals_fresh_render(stored: Path, render: Callable[[Path], None], tmp_path: Path) -> None:
+    copy_sample(stored, tmp_path / "stored")
+    render(tmp_path / "rendered")
+    assert contents(tmp_path / "rendered") == contents(tmp_path / "stored"), "run `make sample-data`"
 
 
 @pytest.mark.nightly
