@@ -21,7 +21,7 @@ os.environ.update(HF_HOME=_CACHES.name, XDG_CACHE_HOME=_CACHES.name, HF_HUB_OFFL
 os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1")
 
 from rebar_depth_bench import SubmissionWriter, load  # noqa: E402
-from rebar_depth_bench.cli.demo import SAMPLE, copy_sample  # noqa: E402
+from rebar_depth_bench.cli.demo import copy_sample  # noqa: E402
 from tests import building, dask_cluster, requirements  # noqa: E402
 from tests.building import TINY_DATASET, RunBuild, StartBuild  # noqa: E402
 from tests.dask_cluster import NewCluster  # noqa: E402
@@ -173,14 +173,6 @@ def chromium_program() -> str:
     path = requirements.chromium_path()
     assert path is not None
     return path
-
-
-@pytest.fixture(scope="session")
-def sample_root(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return a copy of the package's sample: lattice and pile (three views each), mat (four), 480 x 270."""
-    root = tmp_path_factory.mktemp("sample") / "dataset"
-    copy_sample(SAMPLE, root)
-    return root
 
 
 @pytest.fixture(scope="session")

@@ -21,7 +21,7 @@ from rebar_depth_bench.base.writing import write_bytes
 from rebar_depth_bench.cli.console import EXIT_INPUT
 from rebar_depth_bench.evaluator import evaluate
 from rebar_depth_bench.methods import METHODS
-from rebar_depth_bench.methods.controls import NOISY_TRUTH_FACTOR
+from rebar_depth_bench.methods.controls import CONSTANT_DEPTH_M, NOISY_TRUTH_FACTOR
 from rebar_depth_bench.reporting.tables import make_grid, plain_text, print_line, print_unwrapped
 from rebar_depth_bench.scoring.formatting import (
     note_text,
@@ -111,10 +111,11 @@ def _print_results(results: Sequence[Result], console: Console) -> None:
     print_line(
         console,
         "AbsRel is the mean relative error of depth on steel; scaled, that of depth times the best factor of each "
-        "view. A plane at one depth has the scaled AbsRel in the column constant; margin is the share by which a "
-        "method is below it. The lattice is so near that disparities reach half the image width: sgbm-filled is "
-        f"no better there than a plane. noisy-truth, exact depth times {NOISY_TRUTH_FACTOR:g} with noise, has a "
-        "wrong scale and almost the exact shape: AbsRel shows the one, scaled AbsRel the other.",
+        f"view. A plane, such as constant with {CONSTANT_DEPTH_M:g} m everywhere, has the scaled AbsRel in the "
+        "column constant; margin is the share by which a method is below it. The lattice is so near, with "
+        "disparities of up to half the image width, that sgbm-filled is worse there than a plane. noisy-truth, "
+        f"exact depth times {NOISY_TRUTH_FACTOR:g} with noise, has a wrong scale and almost the exact shape: "
+        "AbsRel shows the one, scaled AbsRel the other.",
     )
     for note in row_notes(results, ()):
         print_line(console, note_text(*note))

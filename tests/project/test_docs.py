@@ -26,6 +26,7 @@ from dataset_builder.scene.variants.registry import VARIANTS
 from dataset_builder.user_files.scene_schema import read_scene_toml
 from leaderboard.cli import argument_parser as board_parser
 from rebar_depth_bench.bar_crossings.crossings_file import CROSSINGS_SCHEMA
+from rebar_depth_bench.cli.demo import SAMPLE
 from rebar_depth_bench.cli.main import argument_parser as bench_parser
 from rebar_depth_bench.cli.main import main as bench_main
 from rebar_depth_bench.data.bars import BARS_SCHEMA
@@ -126,20 +127,18 @@ def test_extras_are_installed_from_the_repository_and_listed() -> None:
 
 
 def pages_with_python() -> list[ParameterSet]:
-    """Return the pages with Python; the one that imports and scores 96 views takes seconds."""
-    slow = {"docs/score-by-hand.md": pytest.mark.slow}
+    """Return the pages with Python; those that predict the sample or import 96 views take seconds."""
+    slow = dict.fromkeys(("README.md", "docs/score.md", "docs/score-by-hand.md"), pytest.mark.slow)
     pages = {name_of(page): page for page in PAGES if blocks(page, "python")}
     assert {"README.md", "docs/score.md"} <= set(pages)
     return [pytest.param(page, id=name, marks=slow.get(name, ())) for name, page in pages.items()]
 
 
 @pytest.mark.parametrize("page", pages_with_python())
-def test_documented_python_runs(
-    page: Path, sample_root: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_documented_python_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     (tmp_path / "demo-output" / "sample").mkdir(parents=True)
-    (tmp_path / "demo-output" / "sample" / "dataset").symlink_to(sample_root)
+    (tmp_path / "demo-output" / "sample" / "dataset").symlink_to(SAMPLE)
     names: dict[str, object] = {}
     for block, output in python_blocks(page):
         with redirect_stdout(StringIO()) as printed:

@@ -263,6 +263,7 @@ def test_false_digest_is_refused_by_every_command(
         assert "ground_truth.digest" in finished.stderr
 
 
+@pytest.mark.slow
 def test_demo_on_the_sample_prints_what_the_readme_shows(tmp_path: Path) -> None:
     pytest.importorskip("cv2")
     finished = run_bench("demo", "--sample", "--out", tmp_path)
