@@ -14,7 +14,7 @@ from tests.building import TINY, TINY_DATASET, TINY_VIEWS, run_build
 from tests.data import orbit
 
 MAT = Path(__file__).parents[2] / "examples" / "mat.toml"
-SAMPLE_SIZE = ("--width", "480", "--height", "270", "--quality", "standard")
+SAMPLE_SIZE = ("--width", "480", "--height", "270", "--quality", "high")
 
 
 def render_sample(root: Path) -> None:
