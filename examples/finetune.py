@@ -1,15 +1,16 @@
-"""Training of a small depth network on generated cages, its export to ONNX, and its score beside SGBM.
+"""Training of a small depth network on generated cages, its export to ONNX, and its score beside references.
 
     SIZE="--width 320 --height 180 --quality preview"
-    rebar-build --out ROOT --config cages --split train --scenes 40 --views-per-scene 6 $SIZE
+    rebar-build --out ROOT --config cages --split train --scenes 48 --views-per-scene 6 $SIZE
     rebar-build --out ROOT --config cages --split validation --scenes 8 --views-per-scene 6 $SIZE
-    rebar-build --out ROOT --config lattice pile --views 24 $SIZE
-    python examples/finetune.py ROOT --out finetuned --minutes 10
+    rebar-build --out ROOT --config cages --split test --scenes 40 --views-per-scene 4 $SIZE
+    rebar-build --out ROOT --config lattice pile pier --views 72 $SIZE
+    python examples/finetune.py ROOT --out finetuned --crop 144 256
 
-It needs ``pip install '.[torch,onnx,methods]' onnx`` and torch 2.5 or later. ``finetuned/`` then
-holds the weights of the last epoch (``checkpoint.pt``), the network as ``finetuned.onnx`` with ``finetuned.toml``,
-which ``rebar-bench predict finetuned/finetuned.toml --data ROOT`` takes, and one archive for each method and
-config of the table that is printed.
+It needs ``pip install '.[torch,onnx,methods]' onnx`` and torch 2.5 or later, and uses only the public interface
+(``docs/api.md``). ``finetuned/`` then holds the weights of the last epoch (``checkpoint.pt``), the network as
+``finetuned.onnx`` with ``finetuned.toml``, which ``rebar-bench predict finetuned/finetuned.toml --data ROOT``
+takes, and an archive ``METHOD-CONFIG-SPLIT.zip`` for each row of the table that is printed.
 
 **What the network predicts.** An image shows the ratio of bar diameter to distance, times the focal length: it
 cannot tell a long focal length from a short distance. The network therefore predicts canonical depth, the depth
@@ -22,11 +23,13 @@ the protocol does, plus ``FRAME_WEIGHT`` times that of all pixels with a surface
 rank error of a pixel is 1 - exp(-|e|). Both images of each stereo pair are used, and no other data or weights.
 
 **What it prints.** After each epoch, the errors on the training views and, if the folder has it, on the split
-``validation``, which ``rdb.Evaluator`` computes; at the end, the table of the exported network beside SGBM.
+``validation``, which ``rdb.Evaluator`` computes; at the end, the table of the exported network on the configs
+``TARGETS`` that the folder has, beside two references. ``constant`` predicts one canonical depth at every pixel,
+the median of the training views: what can be known without looking at an image. SGBM uses both images.
 
 The same command continues an interrupted training after its last complete epoch, with the result that an
 uninterrupted one has. The same ``--seed``, ``--epochs``, ``--batch`` and ``--crop`` give the same weights on the
-same machine, unless ``--minutes`` ends the training.
+same machine.
 """
 
 from __future__ import annotations
@@ -37,30 +40,32 @@ import math
 import sys
 import time
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
+from datasets import Dataset
 from torch import Tensor, nn
 from torch.nn import functional
 
 import rebar_depth_bench as rdb
-from rebar_depth_bench.base.errors import InputError
-from rebar_depth_bench.base.terminal import print_notice
-from rebar_depth_bench.base.writing import atomic_replace, write_text
-from rebar_depth_bench.cli.console import run_command
-from rebar_depth_bench.data.manifest import open_folder
-from rebar_depth_bench.data.rows import ConfigViews
-from rebar_depth_bench.methods import find_method
-from rebar_depth_bench.scoring.columns import COVERAGE, NATIVE, RANK_ERROR, SCALED, number, texts
-from rebar_depth_bench.scoring.formatting import scaled_constants
 
 CONFIG = "cages"
-TARGETS = ((CONFIG, "validation"), ("lattice", "test"), ("pile", "test"))
+TARGETS = ((CONFIG, "validation"), (CONFIG, "test"), ("lattice", "test"), ("pile", "test"), ("pier", "test"))
 """Configs and splits that are scored, if the folder has them."""
+NUMBERS = {
+    "rank error": "rank_error",
+    "AbsRel": "native.abs_rel",
+    "AbsRel scaled": "scaled.abs_rel",
+    "constant, scaled": "reference.scaled_constant.abs_rel",
+    "within 5 mm": "within_mm.5",
+    "coverage": "coverage",
+}
+"""Numbers of the printed table by their headings; "constant, scaled" is a plane at one depth after scaling."""
 FOCAL_PX = 200.0
 """Focal length of the canonical camera, pixels of the images that the network is trained on."""
 MEAN, STD = 0.5, 0.25
@@ -165,12 +170,12 @@ class Training:
             try:
                 saved = torch.load(path, weights_only=True)
             except Exception as error:  # torch raises many types, which depend on the damage.
-                raise InputError(
+                raise rdb.InputError(
                     f"{path}: cannot be read ({type(error).__name__}); delete it to start over"
                 ) from None
             if saved["plan"] != plan:
                 changed = [name for name in plan if saved["plan"].get(name) != plan[name]]
-                raise InputError(f"{path}: was trained with other {', '.join(changed)}; choose another --out")
+                raise rdb.InputError(f"{path}: was trained with other {', '.join(changed)}; choose another --out")
             training.net.load_state_dict(saved["net"])
             training.optimiser.load_state_dict(saved["optimiser"])
             training.epoch, training.seconds = saved["epoch"], saved["seconds"]
@@ -179,8 +184,9 @@ class Training:
     def save(self, path: Path) -> None:
         """Write the checkpoint atomically."""
         saved = {"net": self.net.state_dict(), "optimiser": self.optimiser.state_dict()}
-        with atomic_replace(path) as temporary:
-            torch.save({"plan": self.plan, "epoch": self.epoch, "seconds": self.seconds, **saved}, temporary)
+        temporary = path.with_suffix(".partial")
+        torch.save({"plan": self.plan, "epoch": self.epoch, "seconds": self.seconds, **saved}, temporary)
+        temporary.replace(path)
 
 
 def images(batch: dict[str, Any]) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -202,18 +208,12 @@ def image_mean(values: Tensor, mask: Tensor) -> Tensor:
     return means.sum() / (pixels > 0).sum().clamp(min=1)
 
 
-def train_epoch(
-    training: Training, batches: Sequence[dict[str, Any]] | Any, share_done: Callable[[int], float]
-) -> tuple[float, float]:
-    """Train one epoch, and return the mean errors of the logarithm on steel and on all surfaces.
-
-    ``share_done`` returns the share of the training that is done before a step of this epoch; at 1 it ends.
-    """
+def train_epoch(training: Training, batches: Sequence[dict[str, Any]] | Any) -> tuple[float, float]:
+    """Train one epoch, and return the mean errors of the logarithm on steel and on all surfaces."""
     random = torch.Generator().manual_seed(training.plan["seed"] + training.epoch)
-    sums, steps = [0.0, 0.0], 0
+    sums = [0.0, 0.0]
     for step, batch in enumerate(batches):
-        if (share := share_done(step)) >= 1:
-            break
+        share = (training.epoch + step / len(batches)) / training.plan["epochs"]
         for group in training.optimiser.param_groups:
             group["lr"] = LEARNING_RATE * min(share / WARM_UP + 0.01, 0.5 + 0.5 * math.cos(math.pi * share))
         rgb, target, steel, surface = images(batch)
@@ -225,8 +225,8 @@ def train_epoch(
         (steel_error + FRAME_WEIGHT * frame_error).backward()  # type: ignore[no-untyped-call]
         nn.utils.clip_grad_norm_(training.net.parameters(), 1.0)
         training.optimiser.step()
-        sums, steps = [sums[0] + steel_error.item(), sums[1] + frame_error.item()], steps + 1
-    return sums[0] / max(steps, 1), sums[1] / max(steps, 1)
+        sums = [sums[0] + steel_error.item(), sums[1] + frame_error.item()]
+    return sums[0] / len(batches), sums[1] / len(batches)
 
 
 def validate(net: DepthNet, evaluator: rdb.Evaluator, batch_size: int) -> str:
@@ -244,19 +244,18 @@ def validate(net: DepthNet, evaluator: rdb.Evaluator, batch_size: int) -> str:
     return f"; validation: rank error {rank_error:.4f}, AbsRel {abs_rel:.4f}"
 
 
-def train(options: argparse.Namespace, checkpoint: Path) -> DepthNet:
-    """Return the network, trained until ``--epochs`` or ``--minutes``; print the errors of each epoch."""
-    splits = open_folder(options.root).config(CONFIG).splits
-    evaluator = rdb.Evaluator(options.root, CONFIG, split="validation") if "validation" in splits else None
-    views = rdb.load(options.root, CONFIG, split="train", columns=COLUMNS)
+def train(options: argparse.Namespace, views: Dataset, checkpoint: Path) -> DepthNet:
+    """Return the network, trained for ``--epochs``; print the errors of each epoch."""
+    try:
+        evaluator = rdb.Evaluator(options.root, CONFIG, split="validation")
+    except rdb.DatasetError as error:
+        evaluator = None
+        notice(f"training without validation: {error}")
     plan = {name: getattr(options, name) for name in ("seed", "epochs", "crop", "batch")}
     training = Training.open(checkpoint, plan | {"views": list(views["view_id"]), "channels": list(CHANNELS)})
-    steps = -(-len(views) // options.batch)
-    limit_s = 60 * (options.minutes or math.inf)
     start = time.monotonic() - training.seconds
-    while training.epoch < options.epochs and training.seconds < limit_s:
+    while training.epoch < options.epochs:
         # A loader of its own for each epoch: order and crops do not depend on interruptions.
-        seed = options.seed * 100_000 + training.epoch
         loader = rdb.torch_loader(
             views,
             options.batch,
@@ -265,43 +264,42 @@ def train(options: argparse.Namespace, checkpoint: Path) -> DepthNet:
             stereo=True,
             crop=options.crop,
             flip=True,
-            seed=seed,
+            seed=options.seed * 100_000 + training.epoch,
         )
-
-        def share_done(step: int) -> float:
-            by_steps: float = (training.epoch + step / steps) / options.epochs
-            return max(by_steps, (time.monotonic() - start) / limit_s)
-
-        steel, frame = train_epoch(training, loader, share_done)
+        steel, frame = train_epoch(training, loader)
         training.epoch, training.seconds = training.epoch + 1, time.monotonic() - start
         training.save(checkpoint)
         validation = validate(training.net, evaluator, options.batch) if evaluator else ""
-        left_s = min(limit_s - training.seconds, training.seconds * (options.epochs / training.epoch - 1))
-        print_notice(
+        left_s = training.seconds * (options.epochs / training.epoch - 1)
+        notice(
             f"epoch {training.epoch} of {options.epochs}: mean error of log depth {steel:.3f} on steel, "
-            f"{frame:.3f} on all surfaces{validation}; {timedelta(seconds=round(max(left_s, 0.0)))} left"
+            f"{frame:.3f} on all surfaces{validation}; {timedelta(seconds=round(left_s))} left"
         )
     return training.net
+
+
+def notice(message: str) -> None:
+    """Print a message to standard error."""
+    print(message, file=sys.stderr, flush=True)
 
 
 def export(net: DepthNet, out: Path, width: int, height: int) -> Path:
     """Write ``finetuned.onnx`` for images of any size, and ``finetuned.toml``, whose path is returned."""
     sides = {2: "height", 3: "width"}
-    with warnings.catch_warnings(), atomic_replace(out / "finetuned.onnx") as temporary:
+    with warnings.catch_warnings():
         # This exporter is deprecated, but the new one needs onnxscript.
         warnings.simplefilter("ignore", DeprecationWarning)
         torch.onnx.export(
             _Exported(net).eval(),
             (torch.zeros(1, 3, height, width),),
-            str(temporary),
+            str(out / "finetuned.onnx"),
             dynamo=False,
             input_names=["image"],
             output_names=["canonical_depth"],
             dynamic_axes={"image": sides, "canonical_depth": sides},
         )
     toml = out / "finetuned.toml"
-    write_text(
-        toml,
+    toml.write_text(
         f"""model = "finetuned.onnx"
 name = "finetuned"
 summary = "small U-Net trained on generated cages"
@@ -323,39 +321,60 @@ focal_canonical_px = {FOCAL_PX:g}
     return toml
 
 
-def score_rows(root: str, method_names: Sequence[str], out: Path) -> Iterator[Sequence[str]]:
-    """Yield the rows of the table: for each config of the folder, those of the methods and of the constant.
+def median_canonical_m(views: Dataset) -> float:
+    """Return the median canonical depth of steel of the training views: the median over views of their medians."""
+    medians = []
+    for row in views.select_columns(["left_depth", "left_mask", "left_K"]):
+        is_steel = row["left_mask"] & (row["left_depth"] > 0)
+        if is_steel.any():
+            medians.append(np.median(row["left_depth"][is_steel]) * FOCAL_PX / row["left_K"][0, 0])
+    return float(np.median(medians))
 
-    The constant has the true median depth of each view; that of incomplete predictions is on their pixels.
-    """
-    configs = open_folder(root).config_by_name
+
+def score_rows(root: str, toml: Path, constant_m: float) -> Iterator[Sequence[str]]:
+    """Yield the rows of the table: for each config of the folder, those of the network, the constant and SGBM."""
+
+    def constant(row: dict[str, Any]) -> np.ndarray:
+        height, width, _ = row["left_rgb"].shape
+        return np.full((height, width), constant_m * row["left_K"][0, 0] / FOCAL_PX)
+
+    declared = {"method": "constant", "inputs": "rgb+K", "uses_ground_truth": False}
+    methods: dict[str, tuple[Any, dict[str, Any]]] = {
+        "finetuned": (str(toml), {}),
+        "constant": (constant, declared),
+        "sgbm": ("sgbm", {}),
+    }
     for config, split in TARGETS:
-        if config not in configs or split not in configs[config].splits:
-            continue
-        title = f"{config}, {split}" if configs[config].has_splits else config
-        scored = []
-        for name in method_names:
-            short_name = find_method(name).info.name.partition(" ")[0]
-            archive = out / f"{short_name}-{config}.zip"
-            table = rdb.evaluate(name, root, config=config, split=split, archive=archive).tables[config]
-            scored.append((short_name, table))
-            cells = texts((RANK_ERROR, NATIVE[0], SCALED[0], COVERAGE), table)
-            yield (title, short_name, str(table.views), *cells)
-        for name, (abs_rel, _) in scaled_constants(scored).items():
-            yield title, f"{name}, scaled", str(table.views), "", "", number(abs_rel, 4), ""
+        for name, (model, options) in methods.items():
+            archive = toml.parent / f"{name}-{config}-{split}.zip"
+            try:
+                result = rdb.evaluate(model, root, config=config, split=split, archive=archive, **options)
+            except rdb.DatasetError as error:
+                notice(f"{config}, {split}: not scored: {error}")
+                break
+            table = result.tables[config]
+            yield (
+                f"{config}, {split}",
+                name,
+                str(table.views),
+                *(f"{table[place]:.4f}" for place in NUMBERS.values()),
+            )
 
 
 def run(options: argparse.Namespace) -> None:
     """Train, export, predict and score; print the table as Markdown."""
-    config = open_folder(options.root).config(CONFIG).of_split("train")
-    ConfigViews(config).check_columns(COLUMNS, "the training")
+    views = rdb.load(options.root, CONFIG, split="train", columns=COLUMNS)
+    if missing := [name for name, cell in views[0].items() if cell is None]:
+        raise rdb.InputError(
+            f"{options.root}: the config {CONFIG} has no {', '.join(missing)}, which training needs"
+        )
     options.out.mkdir(parents=True, exist_ok=True)
-    net = train(options, options.out / "checkpoint.pt")
-    height, width = config.grid
+    net = train(options, views, options.out / "checkpoint.pt")
+    height, width, _ = views[0]["left_rgb"].shape
     toml = export(net, options.out, width, height)
-    print("| config | method | views | rank error | AbsRel native | AbsRel scaled | coverage % |")
-    print("|---|---|---|---|---|---|---|")
-    for row in score_rows(options.root, (str(toml), "sgbm"), options.out):
+    print(f"| config | method | views | {' | '.join(NUMBERS)} |")
+    print("|---" * (3 + len(NUMBERS)) + "|")
+    for row in score_rows(options.root, toml, median_canonical_m(views)):
         print(f"| {' | '.join(row)} |", flush=True)
 
 
@@ -365,15 +384,22 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("root", metavar="ROOT", help="dataset folder with the split train of cages")
     parser.add_argument("--out", type=Path, default=Path("finetuned"), metavar="FOLDER", help="default: finetuned")
     parser.add_argument("--epochs", type=int, default=45, help="number of passes over the views (default: 45)")
-    parser.add_argument("--minutes", type=float, help="end the training after this time (default: no limit)")
     parser.add_argument("--crop", type=int, nargs=2, metavar=("HEIGHT", "WIDTH"), help="size of random crops")
     parser.add_argument("--batch", type=int, default=4, help="stereo pairs in a batch (default: 4)")
     parser.add_argument("--workers", type=int, default=1, help="processes that load views (default: 1)")
     parser.add_argument("--seed", type=int, default=0, help="seed of weights, order, crops and flips (default: 0)")
     options = parser.parse_args(arguments)
-    if min(options.epochs, options.batch) < 1 or options.workers < 0 or not (options.minutes or 1) > 0:
-        parser.error("--epochs and --batch must be 1 or more, --workers 0 or more, --minutes above 0")
-    return run_command(lambda: run(options), "interrupted; the same command continues after the last epoch")
+    if min(options.epochs, options.batch) < 1 or options.workers < 0:
+        parser.error("--epochs and --batch must be 1 or more, --workers 0 or more")
+    try:
+        run(options)
+    except rdb.RebarDepthError as error:
+        notice(f"error: {error}")
+        return 2 if isinstance(error, rdb.InputError) else 1
+    except KeyboardInterrupt:
+        notice("interrupted; the same command continues after the last epoch")
+        return 1
+    return 0
 
 
 if __name__ == "__main__":
