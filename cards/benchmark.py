@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from cards.crossings import FILES, crossing_baselines
-from cards.learned import baseline_tables, learned_results, learned_tables
+from cards.learned import OWN_NETWORK, baseline_tables, learned_results, learned_tables, own_network_table
 from cards.reference import (
     CAGES,
     FULL_SETS,
@@ -89,6 +89,7 @@ def _errors(errors: Mapping[str, float]) -> str:
 def benchmark_card() -> str:
     """Return the text of ``cards/BENCHMARK.md``: task, data, protocol, main results and limits."""
     subset, cages, networks = reference_context(SUBSET), reference_context(CAGES), learned_results()["configs"]
+    own = learned_results(OWN_NETWORK)
     text = render(
         "benchmark_card.md.j2",
         protocol=PROTOCOL,
@@ -107,6 +108,8 @@ def benchmark_card() -> str:
         cages=cages,
         baselines={**baseline_tables(SUBSET), **baseline_tables(CAGES)},
         networks=networks,
+        own=own,
+        own_table=own_network_table(own["configs"]),
         same_views=(networks["lattice"]["views"], networks["cages"]["views"])
         == (subset["renders"]["views"], cages["renders"]["views"]),
         number=number,

@@ -13,12 +13,30 @@ from cards.reference import coverage_text, number, percent, reference_context, r
 
 LEARNED = "learned"
 """Set of results of learned networks."""
+OWN_NETWORK = "own-network"
+"""Set of results of the network of ``examples/finetune.py``, written by ``benchmarks.own_network``."""
 
 
-def learned_results() -> dict[str, Any]:
+def learned_results(set_name: str = LEARNED) -> dict[str, Any]:
     """Return the stored numbers: ``command``, and ``configs`` with those of each config and its methods."""
-    document: dict[str, Any] = json.loads(results_file(LEARNED).read_text())
+    document: dict[str, Any] = json.loads(results_file(set_name).read_text())
     return document
+
+
+def own_network_table(configs: Mapping[str, Any]) -> str:
+    """Return the Markdown table of the network of ``examples/finetune.py`` beside its references."""
+    errors = ("rank_error", "native", "scaled", "scaled_constant")
+    head = ("config", "views", "method", "rank error", "AbsRel", "AbsRel scaled", "constant there")
+    rows = [
+        (
+            *(config, str(numbers["views"]), f"`{method}`"),
+            *(number(row[key], 4) for key in errors),
+            *(percent(row["within_5_mm"]), coverage_text(row["coverage"])),
+        )
+        for config, numbers in configs.items()
+        for method, row in numbers["methods"].items()
+    ]
+    return _markdown((*head, "within 5 mm", "coverage"), rows)
 
 
 def baseline_tables(set_name: str) -> dict[str, str]:

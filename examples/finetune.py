@@ -2,9 +2,9 @@
 
     SIZE="--width 320 --height 180 --quality preview"
     rebar-build --out ROOT --config cages --split train --scenes 48 --views-per-scene 6 $SIZE
-    rebar-build --out ROOT --config cages --split validation --scenes 8 --views-per-scene 6 $SIZE
-    rebar-build --out ROOT --config cages --split test --scenes 40 --views-per-scene 4 $SIZE
-    rebar-build --out ROOT --config lattice pile pier --views 72 $SIZE
+    rebar-build --out ROOT --config cages --split validation --scenes 8 --views-per-scene 3 $SIZE
+    rebar-build --out ROOT --config cages --split test --scenes 24 --views-per-scene 3 $SIZE
+    rebar-build --out ROOT --config lattice pile pier --views 24 $SIZE
     python examples/finetune.py ROOT --out finetuned --crop 144 256
 
 It needs ``pip install '.[torch,onnx,methods]' onnx`` and torch 2.5 or later, and uses only the public interface

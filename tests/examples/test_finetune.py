@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import runpy
 import shutil
@@ -11,6 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+import rebar_depth_bench as rdb
+from cards.learned import own_network_table
 from tests.bench.methods.predictors import load_predictor
 from tests.synthetic_dataset import write_split_dataset
 
@@ -25,7 +28,7 @@ pytestmark = pytest.mark.slow
 def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder without the configs lattice and pile."""
     folder = tmp_path_factory.mktemp("cages") / "dataset"
-    write_split_dataset(folder, {"a": "train", "b": "train", "c": "validation"}, 2)
+    write_split_dataset(folder, {"a": "train", "b": "train", "c": "validation", "d": "test"}, 2)
     return folder
 
 
@@ -60,9 +63,13 @@ def test_errors_fall_and_the_table_has_every_method(
     _, _, *rows = printed.out.splitlines()
     cells = [[cell.strip() for cell in row.strip("|").split("|")] for row in rows]
     assert [row[:3] for row in cells] == [
-        ["cages, validation", method, "2"] for method in ("finetuned", "constant", "sgbm")
+        [f"cages, {split}", method, "2"]
+        for split in ("validation", "test")
+        for method in ("finetuned", "constant", "sgbm")
     ]
-    network, constant, sgbm = (dict(zip(example["NUMBERS"], map(float, row[3:]), strict=True)) for row in cells)
+    network, constant, sgbm = (
+        dict(zip(example["NUMBERS"], map(float, row[3:]), strict=True)) for row in cells[:3]
+    )
     assert 0 < network["rank error"] < sgbm["rank error"] == 1
     assert constant["coverage"] == 1
     assert constant["AbsRel scaled"] == constant["constant, scaled"]
@@ -70,6 +77,23 @@ def test_errors_fall_and_the_table_has_every_method(
     assert validated[-1] == pytest.approx(network["rank error"], abs=2e-4)
     # The same seed and options give the same weights.
     assert all(torch.equal(value, weights(trained)[name]) for name, value in weights(tmp_path / "out").items())
+
+
+def test_stored_numbers_are_those_of_the_archives(
+    root: Path, trained: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    main = runpy.run_path("benchmarks/own_network.py")["main"]
+    monkeypatch.setitem(main.__globals__, "results_file", lambda name: tmp_path / f"{name}.json")
+    assert main(root, trained) == 0
+    stored = json.loads((tmp_path / "own-network.json").read_text())
+    assert (stored["training"]["epochs"], stored["training"]["views"], stored["training"]["scenes"]) == (6, 4, 2)
+    [(config, numbers)] = stored["configs"].items()
+    assert (config, numbers["views"], numbers["scenes"]) == ("cages", 2, 1)
+    for method, row in numbers["methods"].items():
+        table = rdb.score(trained / f"{method}-cages-test.zip", root).tables["cages"]
+        assert row["rank_error"] == pytest.approx(table["rank_error"])
+        assert row["within_5_mm"] == pytest.approx(table["within_mm.5"])
+    assert "| cages | 2 | `finetuned` | " in own_network_table(stored["configs"])
 
 
 def test_interrupted_training_continues_to_the_same_weights(
