@@ -1,11 +1,11 @@
 """Training of a small depth network on generated cages, its export to ONNX, and its score beside references.
 
     SIZE="--width 320 --height 180 --quality preview"
-    rebar-build --out ROOT --config cages --split train --scenes 48 --views-per-scene 6 $SIZE
+    rebar-build --out ROOT --config cages --split train --scenes 32 --views-per-scene 6 $SIZE
     rebar-build --out ROOT --config cages --split validation --scenes 8 --views-per-scene 3 $SIZE
     rebar-build --out ROOT --config cages --split test --scenes 24 --views-per-scene 3 $SIZE
     rebar-build --out ROOT --config lattice pile pier --views 24 $SIZE
-    python examples/finetune.py ROOT --out finetuned --crop 144 256
+    OMP_NUM_THREADS=1 python examples/finetune.py ROOT --out finetuned --crop 144 256
 
 It needs ``pip install '.[torch,onnx,methods]' onnx`` and torch 2.5 or later, and uses only the public interface
 (``docs/api.md``). ``finetuned/`` then holds the weights of the last epoch (``checkpoint.pt``), the network as
@@ -29,7 +29,7 @@ the median of the training views: what can be known without looking at an image.
 
 The same command continues an interrupted training after its last complete epoch, with the result that an
 uninterrupted one has. The same ``--seed``, ``--epochs``, ``--batch`` and ``--crop`` give the same weights on the
-same machine.
+same machine with the same number of threads.
 """
 
 from __future__ import annotations
@@ -383,7 +383,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="train a small depth network on the config cages and score it")
     parser.add_argument("root", metavar="ROOT", help="dataset folder with the split train of cages")
     parser.add_argument("--out", type=Path, default=Path("finetuned"), metavar="FOLDER", help="default: finetuned")
-    parser.add_argument("--epochs", type=int, default=45, help="number of passes over the views (default: 45)")
+    parser.add_argument("--epochs", type=int, default=60, help="number of passes over the views (default: 60)")
     parser.add_argument("--crop", type=int, nargs=2, metavar=("HEIGHT", "WIDTH"), help="size of random crops")
     parser.add_argument("--batch", type=int, default=4, help="stereo pairs in a batch (default: 4)")
     parser.add_argument("--workers", type=int, default=1, help="processes that load views (default: 1)")
