@@ -25,17 +25,13 @@ def learned_results(set_name: str = LEARNED) -> dict[str, Any]:
 
 def own_network_table(configs: Mapping[str, Any]) -> str:
     """Return the Markdown table of the network of ``examples/finetune.py`` beside its references."""
-    errors = ("rank_error", "native", "scaled", "scaled_constant")
     head = ("config", "views", "method", "rank error", "AbsRel", "AbsRel scaled", "constant there")
-    rows = [
-        (
-            *(config, str(numbers["views"]), f"`{method}`"),
-            *(number(row[key], 4) for key in errors),
-            *(percent(row["within_5_mm"]), coverage_text(row["coverage"])),
-        )
-        for config, numbers in configs.items()
-        for method, row in numbers["methods"].items()
-    ]
+    rows = []
+    for config, numbers in configs.items():
+        for method, row in numbers["methods"].items():
+            errors = [number(row[key], 4) for key in ("rank_error", "native", "scaled", "scaled_constant")]
+            shares = (percent(row["within_5_mm"]), coverage_text(row["coverage"]))
+            rows.append((config, str(numbers["views"]), f"`{method}`", *errors, *shares))
     return _markdown((*head, "within 5 mm", "coverage"), rows)
 
 
