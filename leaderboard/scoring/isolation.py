@@ -25,6 +25,8 @@ from rebar_depth_bench.base.system import limit_process
 NICENESS = 10
 MIN_MEMORY_BYTES = 1 << 30
 """Minimum memory limit: interpreter, libraries and thread stacks alone take several hundred megabytes."""
+EXIT_S = 10.0
+"""Time, seconds, in which a process ends that has closed its pipe; after it, the exit status is not known."""
 _SPAWN = multiprocessing.get_context("spawn")
 _CHILDREN_LOCK = threading.Lock()
 """Held while a process is started or waited for.
@@ -88,7 +90,7 @@ class IsolatedCall(Generic[T]):
             found: T | UnavailableError | SubmissionError | ProcessEndedError = self.receiver.recv()
         except EOFError:
             with _CHILDREN_LOCK:
-                self.process.join()
+                self.process.join(EXIT_S)
             raise ProcessEndedError(self.process.exitcode) from None
         if isinstance(found, UnavailableError | SubmissionError | ProcessEndedError):
             raise found

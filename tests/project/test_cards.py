@@ -179,6 +179,7 @@ def test_table_of_readme_has_the_published_rows_and_stored_results() -> None:
         stored = STORED[SUBSET]["results"]["sgbm-filled"]["tables"][scene]
         errors = [f"{stored[key]['abs_rel']:.3f}" for key in ("native", "scaled")]
         assert rows["SGBM of OpenCV, holes filled"][n] == ", ".join(errors)
+        assert stored["coverage"] >= 0.987, "the README states it"
         assert rows["a plane at one depth"][n] == f"scaled {stored['reference']['constant']['abs_rel']:.3f}"
 
 
