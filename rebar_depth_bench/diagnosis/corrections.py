@@ -363,7 +363,7 @@ def shape_corrections(views: Sequence[DiagnosedView], count: int) -> list[Correc
         corrections.append(Correction(name, f"those of other views: {order}", corrected, scale="all"))
     if (dv, du) != (0, 0):
         seems = f"shifted by {du:+d} columns and {dv:+d} rows"
-        corrections.append(Correction("shift", seems, partial(_shifted, dv=dv, du=du), clearly_better=0.9))
+        corrections.append(Correction("shift", seems, partial(_shifted, dv=dv, du=du), clearly_better=0.75))
     return corrections
 
 

@@ -276,5 +276,7 @@ def test_demo_on_the_sample_prints_what_the_readme_shows(tmp_path: Path) -> None
     assert reports == [out / f"{name}.html" for name in DEMO_METHODS]
     assert all(path.read_text().startswith("<!DOCTYPE html>") for path in reports)
     for name in DEMO_METHODS:
-        assert (out / f"{name}.json").read_bytes() == rdb.score(out / f"{name}.zip", out / "dataset").to_json()
+        result = rdb.score(out / f"{name}.zip", out / "dataset")
+        assert (out / f"{name}.json").read_bytes() == result.to_json()
+        assert not [note for note in result.notes if "mistake" in note]
         assert f"{name} " in shown
