@@ -96,11 +96,12 @@ def evaluate(
         "uses_ground_truth": uses_ground_truth,
     }
     if isinstance(model, str):
+        found_method = find_method(model)
         if given := [name for name, value in declared.items() if value != _UNDECLARED[name]]:
             named = f"{' and '.join(given)} {'is' if len(given) == 1 else 'are'} given"
             remedy = "; score its archive by score(ARCHIVE, ROOT, align=KIND)" if "kind" in given else ""
             raise InputError(f"{named}, but the method {model} declares its own{remedy}")
-        return _evaluate_method(find_method(model), root, selected, archive)
+        return _evaluate_method(found_method, root, selected, archive)
     if callable(model) and inputs == "multi-view" and uses_ground_truth is not True:
         found = f"inputs is multi-view and uses_ground_truth is {uses_ground_truth}"
         raise InputError(f"{found}, expected True, because the rows then have the true poses")

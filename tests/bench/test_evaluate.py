@@ -400,6 +400,8 @@ def test_a_method_declares_itself(tiny_root: Path) -> None:
         rdb.evaluate("sgbm", tiny_root, kind="affine-disparity", uses_ground_truth=False)
     with pytest.raises(rdb.InputError, match=r"^method is given, but the method sgbm declares its own$"):
         rdb.evaluate("sgbm", tiny_root, method="mine")
+    with pytest.raises(rdb.MethodError, match="mine"):
+        rdb.evaluate("mine", tiny_root, method="mine")
 
 
 def test_batches_of_tensors(tiny_root: Path) -> None:
