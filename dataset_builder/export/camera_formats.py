@@ -271,14 +271,13 @@ Licence: {licence}
 
 
 def ultralytics_yaml(folder: DatasetFolder, config: DatasetConfig, parts: Mapping[str, DatasetConfig]) -> str:
-    """Return the data file of a config for Ultralytics; ``parts`` has what was exported by folder, relative to it.
+    """Return the data file of a config for Ultralytics; ``parts`` has its scenes by folder, relative to it.
 
     ``train`` and ``val`` are required keys, whose lists may be empty. Without splits, ``val`` has the test views.
     """
     images: dict[str, list[str]] = {split: [] for split in SPLITS}
     for name, part in parts.items():
-        if part.name == config.name:
-            images[part.scene.split].append(f"{name}/images")
+        images[part.scene.split].append(f"{name}/images")
     val = images["validation"] if config.has_splits else list(images["test"])  # A list used twice gets an anchor.
     keys = {"train": images["train"], "val": val, "test": images["test"], "names": {0: "depth"}}
     return (

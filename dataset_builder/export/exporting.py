@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Literal, get_args
+from typing import Annotated, Literal
 
 from dataset_builder.cameras.trajectories import subset
 from dataset_builder.export.camera_formats import (
@@ -75,15 +75,13 @@ def export(
     written atomically, images before the metadata that refers to them. An interrupted export is resumed by calling
     it again: images that exist are kept, and the result is byte-identical to that of an uninterrupted export.
     ``progress`` counts views. For ``ultralytics``, images and depth of both eyes are written, and
-    ``<config>.yaml`` in ``to``, which names the folders of this call by split.
+    ``<config>.yaml`` in ``to``, which names all folders exported for it so far by split.
 
     Raises ``DatasetError`` for a folder that is not a complete local dataset folder, an unknown config or split,
-    or data that contradict the manifest; ``InputError`` for fewer than one view, an unknown format, no colour for
-    Ultralytics, and for a ``to`` that contains anything but an earlier export of the same data; ``OutputError``
-    for one that cannot be written.
+    or data that contradict the manifest; ``InputError`` for fewer than one view, no colour for Ultralytics, and
+    for a ``to`` that contains anything but an earlier export of the same data; ``OutputError`` for one that cannot
+    be written.
     """
-    if file_format not in get_args(FileFormat):
-        raise InputError(f"the format is {file_format!r}, expected one of {', '.join(get_args(FileFormat))}")
     if views is not None and views < 1:
         raise InputError(f"--views is {views}, expected 1 or more")
     folder = open_folder(local_folder(root))
@@ -112,7 +110,9 @@ def export(
                 for name, config in parts.items()
             ]
             for config in chosen if file_format == "ultralytics" else ():
-                write_text(target / f"{config.name}.yaml", ultralytics_yaml(folder, config, parts))
+                scenes = _by_folder([config], None).items()
+                done = {name: part for name, part in scenes if any((target / name / "depth").glob("*.npy"))}
+                write_text(target / f"{config.name}.yaml", ultralytics_yaml(folder, config, done))
             return summary
     except OSError as error:  # Only writing raises OSError here: reading raises DatasetError.
         raise write_error(error.filename or to, error) from error

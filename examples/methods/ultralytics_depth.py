@@ -5,6 +5,9 @@
 It needs ``ultralytics`` 8.4.104 or later beside rebar-depth-bench, in an environment of its own (docs/methods.md);
 any other scores the archive. FOLDER has ``best.pt`` of a training. Ultralytics stretches the image to the square
 size of the training, predicts depth at a quarter of it, and resizes that to the image. It is AGPL-3.0.
+
+``INFO`` names the network and the version that this file was tried with, whatever ``best.pt`` is: edit ``name``,
+``summary`` and ``source`` for another network or version, since the archive and its results state them.
 """
 
 from __future__ import annotations
