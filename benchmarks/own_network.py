@@ -5,8 +5,7 @@
 ROOT and OUT are the dataset folder and the ``--out`` folder of the commands at the head of
 ``examples/finetune.py``, which trains the network and writes an archive ``OUT/METHOD-CONFIG-SPLIT.zip`` for each
 row of its table. This command scores the archives of the split ``test`` and writes
-``cards/reference/own-network.json``, from which ``make cards`` writes the card. It runs with the torch that the
-network was trained with.
+``cards/reference/own-network.json``, from which ``make cards`` writes the card.
 """
 
 from __future__ import annotations
@@ -44,13 +43,12 @@ def main(root: Path, out: Path) -> int:
     checkpoint = torch.load(out / "checkpoint.pt", weights_only=True)
     plan = checkpoint["plan"]
     training = {
-        **{name: plan[name] for name in ("seed", "epochs", "batch", "crop")},
+        **{name: plan[name] for name in ("seed", "epochs", "batch", "crop", "torch")},
         "views": len(plan["views"]),
         "scenes": len(folder.config("cages").of_split("train").scenes),
         "parameters": sum(
             value.numel() for name, value in checkpoint["net"].items() if name.endswith(("weight", "bias"))
         ),
-        "torch": torch.__version__,
     }
     configs = {
         name: config_numbers(config.of_split(TEST_SPLIT), root, out)
@@ -75,7 +73,6 @@ def config_numbers(config: DatasetConfig, root: Path, out: Path) -> dict[str, An
     }
     return {
         "views": len(config.view_ids),
-        "scenes": len(config.by_scene()),
         "width": config.grid[1],
         "height": config.grid[0],
         "methods": {

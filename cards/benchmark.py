@@ -165,7 +165,7 @@ def results_page() -> str:
 
 
 def readme() -> str:
-    """Return the text of README.md with its table of methods, the only part of it that is not written by hand."""
+    """Return README.md with a new table of methods between its marks; ``ValueError`` without these marks."""
     table = render(
         "readme_table.md.j2",
         published=load_published().scenes,
@@ -173,9 +173,9 @@ def readme() -> str:
         networks=learned_results()["configs"],
         number=number,
     )
-    text = (_ROOT / "README.md").read_text()
     marks = r"(?<=<!-- methods -->\n\n).*(?=\n\n<!-- end of methods -->)"
-    return re.sub(marks, table.strip(), text, flags=re.DOTALL)
+    before, after = re.split(marks, (_ROOT / "README.md").read_text(), flags=re.DOTALL)
+    return before + table.strip() + after
 
 
 PAGES: Mapping[Path, Callable[[], str]] = {

@@ -25,7 +25,7 @@ def learned_results(set_name: str = LEARNED) -> dict[str, Any]:
 
 def own_network_table(configs: Mapping[str, Any]) -> str:
     """Return the Markdown table of the network of ``examples/finetune.py`` beside its references."""
-    head = ("config", "views", "method", "rank error", "AbsRel", "AbsRel scaled", "constant there")
+    head = ("config", "views", "method", "rank error", "AbsRel", "AbsRel scaled", "plane, scaled")
     rows = []
     for config, numbers in configs.items():
         for method, row in numbers["methods"].items():
@@ -103,7 +103,7 @@ def _metric_table(name: str, config: Mapping[str, Any]) -> str:
         "coverage",
         "AbsRel",
         "AbsRel scaled",
-        "constant there",
+        "plane, scaled",
         "s",
         "within 5 mm",
         "bias, px",

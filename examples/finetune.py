@@ -8,9 +8,10 @@
     OMP_NUM_THREADS=1 python examples/finetune.py ROOT --out finetuned --crop 144 256
 
 It needs ``pip install '.[torch,onnx,methods]' onnx`` and torch 2.5 or later, and uses only the public interface
-(``docs/api.md``). ``finetuned/`` then holds the weights of the last epoch (``checkpoint.pt``), the network as
-``finetuned.onnx`` with ``finetuned.toml``, which ``rebar-bench predict finetuned/finetuned.toml --data ROOT``
-takes, and an archive ``METHOD-CONFIG-SPLIT.zip`` for each row of the table that is printed.
+(``docs/api.md``) and the manifest (``docs/formats.md``). ``finetuned/`` then holds the weights of the last epoch
+(``checkpoint.pt``), the network as ``finetuned.onnx`` with ``finetuned.toml``, which
+``rebar-bench predict finetuned/finetuned.toml --data ROOT`` takes, and an archive ``METHOD-CONFIG-SPLIT.zip`` for
+each row of the table that is printed.
 
 **What the network predicts.** An image shows the ratio of bar diameter to distance, times the focal length: it
 cannot tell a long focal length from a short distance. The network therefore predicts canonical depth, the depth
@@ -29,13 +30,14 @@ the median of the training views: what can be known without looking at an image.
 
 The same command continues an interrupted training after its last complete epoch, with the result that an
 uninterrupted one has. The same ``--seed``, ``--epochs``, ``--batch`` and ``--crop`` give the same weights on the
-same machine with the same number of threads.
+same machine with the same number of threads and the same version of torch.
 """
 
 from __future__ import annotations
 
 import argparse
 import itertools
+import json
 import math
 import sys
 import time
@@ -61,11 +63,11 @@ NUMBERS = {
     "rank error": "rank_error",
     "AbsRel": "native.abs_rel",
     "AbsRel scaled": "scaled.abs_rel",
-    "constant, scaled": "reference.scaled_constant.abs_rel",
+    "plane, scaled": "reference.scaled_constant.abs_rel",
     "within 5 mm": "within_mm.5",
     "coverage": "coverage",
 }
-"""Numbers of the printed table by their headings; "constant, scaled" is a plane at one depth after scaling."""
+"""Numbers of the printed table by their headings; "plane, scaled" is a plane at one depth after scaling."""
 FOCAL_PX = 200.0
 """Focal length of the canonical camera, pixels of the images that the network is trained on."""
 MEAN, STD = 0.5, 0.25
@@ -246,13 +248,12 @@ def validate(net: DepthNet, evaluator: rdb.Evaluator, batch_size: int) -> str:
 
 def train(options: argparse.Namespace, views: Dataset, checkpoint: Path) -> DepthNet:
     """Return the network, trained for ``--epochs``; print the errors of each epoch."""
-    try:
+    evaluator = None
+    if has_views(options.root, CONFIG, "validation"):
         evaluator = rdb.Evaluator(options.root, CONFIG, split="validation")
-    except rdb.DatasetError as error:
-        evaluator = None
-        notice(f"training without validation: {error}")
     plan = {name: getattr(options, name) for name in ("seed", "epochs", "crop", "batch")}
-    training = Training.open(checkpoint, plan | {"views": list(views["view_id"]), "channels": list(CHANNELS)})
+    plan |= {"views": list(views["view_id"]), "channels": list(CHANNELS), "torch": str(torch.__version__)}
+    training = Training.open(checkpoint, plan)
     start = time.monotonic() - training.seconds
     while training.epoch < options.epochs:
         # A loader of its own for each epoch: order and crops do not depend on interruptions.
@@ -278,6 +279,18 @@ def train(options: argparse.Namespace, views: Dataset, checkpoint: Path) -> Dept
     return training.net
 
 
+def has_views(root: str, config: str, split: str) -> bool:
+    """Return whether the manifest of a dataset folder has views of a split of a config; print if it has not.
+
+    ``rdb.load`` raises ``DatasetError`` for a damaged split as well as for a missing one.
+    """
+    configs = json.loads((Path(root) / "manifest.json").read_text())["configs"]
+    found = config in configs and any(scene["split"] == split for scene in configs[config]["scenes"])
+    if not found:
+        notice(f"{config}, {split}: not scored, since {root} has no such views")
+    return found
+
+
 def notice(message: str) -> None:
     """Print a message to standard error."""
     print(message, file=sys.stderr, flush=True)
@@ -286,20 +299,21 @@ def notice(message: str) -> None:
 def export(net: DepthNet, out: Path, width: int, height: int) -> Path:
     """Write ``finetuned.onnx`` for images of any size, and ``finetuned.toml``, whose path is returned."""
     sides = {2: "height", 3: "width"}
+    temporary = out / "finetuned.partial"
     with warnings.catch_warnings():
         # This exporter is deprecated, but the new one needs onnxscript.
         warnings.simplefilter("ignore", DeprecationWarning)
         torch.onnx.export(
             _Exported(net).eval(),
             (torch.zeros(1, 3, height, width),),
-            str(out / "finetuned.onnx"),
+            str(temporary),
             dynamo=False,
             input_names=["image"],
             output_names=["canonical_depth"],
             dynamic_axes={"image": sides, "canonical_depth": sides},
         )
-    toml = out / "finetuned.toml"
-    toml.write_text(
+    temporary.replace(out / "finetuned.onnx")
+    temporary.write_text(
         f"""model = "finetuned.onnx"
 name = "finetuned"
 summary = "small U-Net trained on generated cages"
@@ -318,7 +332,7 @@ meaning = "canonical-depth"
 focal_canonical_px = {FOCAL_PX:g}
 """,
     )
-    return toml
+    return temporary.replace(out / "finetuned.toml")
 
 
 def median_canonical_m(views: Dataset) -> float:
@@ -345,13 +359,11 @@ def score_rows(root: str, toml: Path, constant_m: float) -> Iterator[Sequence[st
         "sgbm": ("sgbm", {}),
     }
     for config, split in TARGETS:
+        if not has_views(root, config, split):
+            continue
         for name, (model, options) in methods.items():
             archive = toml.parent / f"{name}-{config}-{split}.zip"
-            try:
-                result = rdb.evaluate(model, root, config=config, split=split, archive=archive, **options)
-            except rdb.DatasetError as error:
-                notice(f"{config}, {split}: not scored: {error}")
-                break
+            result = rdb.evaluate(model, root, config=config, split=split, archive=archive, **options)
             table = result.tables[config]
             yield (
                 f"{config}, {split}",
@@ -363,6 +375,8 @@ def score_rows(root: str, toml: Path, constant_m: float) -> Iterator[Sequence[st
 
 def run(options: argparse.Namespace) -> None:
     """Train, export, predict and score; print the table as Markdown."""
+    if not Path(options.root).is_dir():
+        raise rdb.InputError(f"{options.root}: is not a folder, expected a local dataset folder")
     views = rdb.load(options.root, CONFIG, split="train", columns=COLUMNS)
     if missing := [name for name, cell in views[0].items() if cell is None]:
         raise rdb.InputError(
