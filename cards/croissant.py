@@ -35,7 +35,7 @@ def croissant(folder: DatasetFolder, hub_id: str | None = None) -> str:
     """Return the Croissant description of a dataset folder as JSON.
 
     The addresses of files are those of the Hub repository ``hub_id``; without one, they are paths relative to the
-    JSON file, which has to be in the folder. Raises ``DatasetError`` if ``bars.parquet`` is missing or damaged.
+    JSON file, which has to be in the folder. Raises ``DatasetError`` if ``bars.parquet`` is listed but not intact.
     """
     page = f"https://huggingface.co/datasets/{hub_id}" if hub_id else "."
     statements = render("croissant.yaml.j2", folder=folder, name=PRETTY_NAME, page=page, hub_id=hub_id)
@@ -62,10 +62,11 @@ def croissant(folder: DatasetFolder, hub_id: str | None = None) -> str:
         split["references"] = {"field": {"@id": "dataset/splits/name"}}
         columns = [column for column in ROW_SCHEMA if column.name not in config.absent_columns]
         record_sets.append(_node("RecordSet", config.name, field=[split, *_fields(config.name, columns, source)]))
-    bars = folder.verified_file(BARS_FILE)
-    read_bars(bars)  # Refuses damaged tables.
-    stored = pq.read_schema(bars).names  # The column ``nominal_axis`` may be absent.
-    tables = {BARS_FILE: [column for column in BARS_SCHEMA if column.name in stored]}
+    tables = {}
+    if BARS_FILE in folder.files:
+        read_bars(folder.verified_file(BARS_FILE))  # Refuses damaged tables.
+        stored = pq.read_schema(folder.file(BARS_FILE)).names  # The column ``nominal_axis`` may be absent.
+        tables[BARS_FILE] = [column for column in BARS_SCHEMA if column.name in stored]
     if CROSSINGS_FILE in folder.files:
         tables[CROSSINGS_FILE] = list(CROSSINGS_SCHEMA)
     for file_name, columns in tables.items():

@@ -55,9 +55,10 @@ def dataset_card(version: str, digest: str, configs: Sequence[DatasetConfig], ta
     header is sufficient for ``datasets.load_dataset(ROOT, config)``. The file pattern of each config contains the
     digest of its shards, and a table has a version, so that the cache of ``datasets`` serves no older build.
     """
+    metadata = _card_metadata(version, configs, tables)
     return render(
         "dataset_card.md.j2",
-        yaml=_card_metadata(version, configs, tables).to_yaml(),
+        yaml=metadata.to_yaml(),
         title=PRETTY_NAME,
         version=version,
         digest=digest,
@@ -66,7 +67,7 @@ def dataset_card(version: str, digest: str, configs: Sequence[DatasetConfig], ta
         has_rendered=bool(_rendered(configs)),
         mats=[row for config in configs for row in _mat_rows(config)],
         columns=column_rows(),
-        has_tables=bool(tables),
+        tables=[entry["config_name"] for entry in metadata["configs"][len(configs) :]],
         example=configs[0].name,
         example_split=configs[0].splits[0],
     )

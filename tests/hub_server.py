@@ -171,10 +171,14 @@ class HubServer:
         commit, folder = self._at(repository, argument)
         files = repository.commits[commit]
         inside = {name: content for name, content in files.items() if name.startswith(f"{folder}/"[not folder :])}
+        folders = list[dict[str, Any]]()
         if request.query_params.get("recursive", "").lower() != "true":
             prefix = f"{folder}/" if folder else ""
-            inside = {name: content for name, content in inside.items() if "/" not in name.removeprefix(prefix)}
-        return JSONResponse([_entry(name, content) for name, content in inside.items()])
+            parts = {name: name.removeprefix(prefix).partition("/") for name in inside}
+            names = {f"{prefix}{first}" for first, separator, _ in parts.values() if separator}
+            folders = [{"type": "directory", "path": name, "oid": git_hash(b"")} for name in sorted(names)]
+            inside = {name: content for name, content in inside.items() if not parts[name][1]}
+        return JSONResponse([*folders, *(_entry(name, content) for name, content in inside.items())])
 
     async def _resolve(self, request: Request, _: str, repository: StoredRepository, argument: str) -> Response:
         commit, name = self._at(repository, argument)

@@ -249,7 +249,7 @@ def _push(options: argparse.Namespace) -> None:
 
 def _add_croissant_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("root", metavar="ROOT", help="dataset folder or Hub repository id")
-    parser.add_argument("--hub-id", metavar="ID", help="id of the repository, ORG/NAME (default: paths in ROOT)")
+    parser.add_argument("--hub-id", metavar="ID", help="repository id, ORG/NAME (default: ROOT, or paths in it)")
 
 
 def _croissant(options: argparse.Namespace) -> None:
@@ -259,7 +259,9 @@ def _croissant(options: argparse.Namespace) -> None:
 
     if options.hub_id is not None:
         check_request(options.hub_id, "main", connects=False, publishes=False)
-    print(croissant(open_folder(options.root), options.hub_id), end="")
+    folder = open_folder(options.root)
+    hub_id = options.hub_id or (None if folder.local else folder.root.partition("@")[0])
+    print(croissant(folder, hub_id), end="")
 
 
 COMMANDS: Mapping[str, Command] = {

@@ -1,8 +1,8 @@
 """Publishing of a dataset folder as a dataset repository of the Hugging Face Hub.
 
-The repository then holds the manifest and the files that it lists, and no others. Large files are uploaded first,
-and the Hub keeps them, so that an interrupted upload continues where it ended. One commit then makes all changes
-visible at once, so that nobody loads the shards of one version with the manifest of another.
+The repository then holds the manifest, the files that it lists, and the Croissant description that it had. Large
+files are uploaded first, and the Hub keeps them, so that an interrupted upload continues where it ended. One
+commit makes all changes visible at once, so that nobody loads shards of one version with the manifest of another.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from rebar_depth_bench.base.errors import (
 from rebar_depth_bench.base.names import PATH_PATTERN
 from rebar_depth_bench.base.parallel import Progress, silent
 from rebar_depth_bench.base.terminal import print_notice
-from rebar_depth_bench.data.files import MANIFEST_FILE, file_problems, file_sha256, local_folder
+from rebar_depth_bench.data.files import CROISSANT_FILE, MANIFEST_FILE, file_problems, file_sha256, local_folder
 from rebar_depth_bench.data.manifest import open_folder
 
 
@@ -114,7 +114,8 @@ def push(source: VerifiedFolder, repository_id: str, branch: str, *, private: bo
         if info is not None:
             tree = api.list_repo_tree(repository_id, recursive=True, revision=info.sha, repo_type="dataset")
             remote = {str(entry.path): entry for entry in tree if isinstance(entry, RepoFile)}
-    visible = {name for name in remote if not name.startswith(".")}  # The Hub itself makes .gitattributes.
+    # The Hub itself makes .gitattributes, and maintainers upload the Croissant description.
+    visible = {name for name in remote if not name.startswith(".") and name != CROISSANT_FILE}
     if visible - {REPOCARD_NAME} and MANIFEST_FILE not in visible:
         raise InputError(
             f"{url}: has {len(visible)} files and no {MANIFEST_FILE}, expected an empty repository or one that "

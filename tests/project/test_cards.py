@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import yaml
 from scipy.ndimage import binary_erosion
 
 import rebar_depth_bench as rdb
@@ -69,6 +70,17 @@ def test_dataset_card_is_rendered_from_manifest(tiny_root: Path) -> None:
     folder = open_folder(tiny_root)
     card = dataset_card(folder.version, folder.digest, list(folder.config_by_name.values()), folder.files)
     assert card == (tiny_root / "README.md").read_text()
+
+
+@pytest.mark.parametrize("names", [[], ["bars"], ["bars", "crossings"]])
+def test_card_names_the_configs_of_its_tables(names: list[str], tiny_root: Path) -> None:
+    folder = open_folder(tiny_root)
+    configs = list(folder.config_by_name.values())
+    card = dataset_card("1.0.0", "d", configs, {f"{name}.parquet": "0" * 64 for name in names})
+    header = yaml.safe_load(card.split("---")[1])
+    assert [entry["config_name"] for entry in header["configs"]] == [*folder.configs, *names]
+    sentence = re.search("`load_dataset` reads the rows of all scenes as (.*), whose", card)
+    assert re.findall("`(.*?)`", sentence[1] if sentence else "") == names
 
 
 def test_steel_on_cards_is_of_all_views_of_all_configs() -> None:

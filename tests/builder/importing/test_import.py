@@ -96,12 +96,13 @@ def test_card_states_licence_and_origin_of_each_config(complete: Path, tiny_root
     assert "synthetic" not in header["tags"]
     assert not {"annotations_creators", "source_datasets"} & set(header)
     assert "`mock-up`: its authors state no licence." in text
-    assert not [word for word in ("Cycles", "CC BY", "Synthetic") if word in text]
+    assert not [word for word in ("Cycles", "CC BY", "Synthetic", "measured depth") if word in text]
     both = dataset_card("1.0.0", "digest", [*rendered, *own], {})
     header = yaml.safe_load(both.split("---")[1])
     assert header["license"] == "other"
     assert not {"annotations_creators", "source_datasets"} & set(header)
     assert "The configs `mock-up` were imported" in both
+    assert "was measured" not in both
     assert "The rendered data: CC BY 4.0." in both
 
 

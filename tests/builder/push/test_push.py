@@ -12,6 +12,7 @@ import pytest
 from huggingface_hub import constants
 from starlette.requests import Request
 
+from dataset_builder.cli.main import main
 from tests.builder.push.conftest import (
     HUB_ID,
     KEY,
@@ -23,11 +24,14 @@ from tests.builder.push.conftest import (
     visible,
     write_publishable,
 )
+from tests.commands import run_in_process
 from tests.hub_server import GITATTRIBUTES, LFS_SUFFIXES, HubServer, folder_files, running_hub
 from tests.synthetic_dataset import write_dataset
 
 READ_BACK = """
 import sys
+import datasets
+import dataset_builder.cli.main
 import rebar_depth_bench as rdb
 from rebar_depth_bench.cli.main import main
 local, published = (rdb.load(root, "lattice") for root in sys.argv[1:])
@@ -35,7 +39,12 @@ for one, other in zip(local, published, strict=True):
     assert one["view_id"] == other["view_id"]
     for name in ("left_rgb", "right_depth", "left_bars", "left_K", "right_cam_from_world"):
         assert one[name].tobytes() == other[name].tobytes(), name
-sys.exit(main(["verify", sys.argv[2]]))
+for table in ("bars", "crossings"):
+    local, published = (datasets.load_dataset(root, table, split="train") for root in sys.argv[1:])
+    assert len(local) > 0
+    assert published.to_list() == local.to_list()
+assert main(["verify", sys.argv[2]]) == 0
+sys.exit(dataset_builder.cli.main.main(["croissant", f"{sys.argv[2]}@main"]))
 """
 
 
@@ -78,7 +87,10 @@ def test_published_folder_is_read_back_byte_for_byte(tiny_root: Path, hub: HubSe
     reading = environment(hub, tmp_path, HF_TOKEN="")
     read = subprocess.run(command, env=reading, capture_output=True, text=True, timeout=300, check=False)
     assert read.returncode == 0, read.stderr
-    assert "no problem found in 10 files, 11 views" in read.stdout
+    verified, description = read.stdout.split("{", 1)
+    assert "no problem found in 10 files, 11 views" in verified
+    named = run_in_process(main, "croissant", tiny_root, "--hub-id", HUB_ID)
+    assert "{" + description == named.stdout
 
 
 def test_one_commit_makes_everything_visible_and_a_second_push_makes_none(hub: HubServer, root: Path) -> None:
@@ -107,6 +119,15 @@ def test_only_changes_are_sent_and_files_of_an_earlier_version_are_deleted(
     assert visible(hub.repositories[KEY]) == folder_files(later)
     assert hub.repositories[KEY].files()[".gitattributes"] == GITATTRIBUTES
     assert hub.uploads() == []  # Only small files changed, which are part of the commit.
+
+
+def test_croissant_description_of_the_repository_is_kept(hub: HubServer, root: Path) -> None:
+    hub.add(KEY, {"manifest.json": b"{}", "croissant.json": b"mine", "notes.txt": b""})
+    (root / "croissant.json").write_text("not sent")
+    finished = push(root, "--yes")
+    assert finished.returncode == 0, finished.stderr
+    (root / "croissant.json").write_text("mine")
+    assert visible(hub.repositories[KEY]) == folder_files(root)
 
 
 def test_killed_push_continues_without_sending_again_what_arrived(root: Path, tmp_path: Path) -> None:
