@@ -46,8 +46,9 @@ def croissant(folder: DatasetFolder, hub_id: str | None = None) -> str:
         file = {"encodingFormat": _MEDIA_TYPES.get(Path(name).suffix, _OTHER), "sha256": sha256}
         address = f"{page}/resolve/main/{name}" if hub_id else name
         distribution.append(_node("FileObject", name, contentUrl=address, **file))
-    # The repository, or the folder, has no digest, which is mandatory; that of the manifest covers all files.
+    # The repository, or the folder, has no digest, which is mandatory.
     repository = {"contentUrl": page, "encodingFormat": "git+https", "sha256": manifest_sha256}
+    repository["description"] = "All files; the SHA-256 is that of manifest.json, which has those of the others."
     distribution.append(_node("FileObject", "repository", **repository))
     for config in folder.config_by_name.values():
         shards = f"{config.name}/shards"

@@ -72,16 +72,7 @@ def check_fits(assembly: Assembly, config: ConfigSpec) -> None:
                 f"{np.round(eyes_m[2 * view + eye], 4).tolist()} m, expected above z = 0 and outside of the steel"
             )
     _check_shadow_screen(vertices_m, float(camera_distances_m.max()), config)
-    if config.scene.forms:
-        _check_forms(eyes_m, config)
-
-
-def _check_forms(eyes_m: Float64[ndarray, "n 3"], config: ConfigSpec) -> None:
-    """Raise ``InputError`` if a form is below the ground or at a camera, or beside panels of ``formwork``.
-
-    ``eyes_m`` are the places of the left and right camera of each view, alternating.
-    """
-    if "formwork" in config.scene.appearance.variants:
+    if config.scene.forms and "formwork" in config.scene.appearance.variants:
         found = f"{config.name}: the variant 'formwork' adds panels to a scene with [[form]] tables"
         raise InputError(f"{found}, expected one of both")
     for form in config.scene.forms:

@@ -85,7 +85,11 @@ def export(
     if views is not None and views < 1:
         raise InputError(f"--views is {views}, expected 1 or more")
     folder = open_folder(local_folder(root))
-    chosen = [folder.config(name) for name in dict.fromkeys(configs or _with_split(folder, split))]
+    every = folder.config_by_name.items()
+    names = configs or [name for name, config in every if split is None or split in config.splits]
+    if not names:
+        raise DatasetError(f"{folder.root}: no config has the split {split}")
+    chosen = [folder.config(name) for name in dict.fromkeys(names)]
     for config in chosen:
         if config.imported is not None:
             raise InputError(f"{root}: config {config.name} was imported, expected configs that were rendered")
@@ -116,14 +120,6 @@ def export(
             return summary
     except OSError as error:  # Only writing raises OSError here: reading raises DatasetError.
         raise write_error(error.filename or to, error) from error
-
-
-def _with_split(folder: DatasetFolder, split: str | None) -> list[str]:
-    """Return the names of the configs that have a split, or of all. Raises ``DatasetError`` if there are none."""
-    names = [name for name, config in folder.config_by_name.items() if split is None or split in config.splits]
-    if not names:
-        raise DatasetError(f"{folder.root}: no config has the split {split}")
-    return names
 
 
 def _by_folder(chosen: Sequence[DatasetConfig], split: str | None) -> dict[str, DatasetConfig]:
