@@ -38,7 +38,7 @@ format: env-dev ## Format the code and apply the linter's safe fixes
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-cards: env-dev ## Write the benchmark card, measures and results from the code
+cards: env-dev ## Write the benchmark card, measures, results and the table of the README
 	$(BIN)/python -m cards
 
 tables: env-dev ## Write the tables of the documentation that list what the code declares

@@ -1,4 +1,4 @@
-"""Command ``python -m cards``: writes the benchmark card and the pages of measures and results."""
+"""Command ``python -m cards``: writes the benchmark card, measures, results and the table of the README."""
 
 from cards.benchmark import PAGES
 from rebar_depth_bench.base.writing import write_text

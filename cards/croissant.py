@@ -52,8 +52,9 @@ def croissant(folder: DatasetFolder, hub_id: str | None = None) -> str:
     distribution.append(_node("FileObject", "repository", **repository))
     for config in folder.config_by_name.values():
         shards = f"{config.name}/shards"
-        # In a folder, readers check the shards that are named here. From the Hub, they would load them twice.
-        containers = [{"@id": name} for name in (*(() if hub_id else config.shards), "repository")]
+        containers = [{"@id": "repository"}]
+        if not hub_id:  # Readers check the digests of these shards. From the Hub, they would also download them.
+            containers = [*({"@id": name} for name in config.shards), *containers]
         file_set = {"containedIn": containers, "encodingFormat": _PARQUET, "includes": list(config.shards)}
         distribution.append(_node("FileSet", shards, **file_set))
         source = {"fileSet": {"@id": shards}}
@@ -65,8 +66,9 @@ def croissant(folder: DatasetFolder, hub_id: str | None = None) -> str:
         record_sets.append(_node("RecordSet", config.name, field=[split, *_fields(config.name, columns, source)]))
     tables = {}
     if BARS_FILE in folder.files:
-        read_bars(folder.verified_file(BARS_FILE))  # Refuses damaged tables.
-        stored = pq.read_schema(folder.file(BARS_FILE)).names  # The column ``nominal_axis`` may be absent.
+        bars = folder.verified_file(BARS_FILE)
+        read_bars(bars)  # Refuses damaged tables.
+        stored = pq.read_schema(bars).names  # The column ``nominal_axis`` may be absent.
         tables[BARS_FILE] = [column for column in BARS_SCHEMA if column.name in stored]
     if CROSSINGS_FILE in folder.files:
         tables[CROSSINGS_FILE] = list(CROSSINGS_SCHEMA)

@@ -18,7 +18,7 @@ OWN_NETWORK = "own-network"
 
 
 def learned_results(set_name: str = LEARNED) -> dict[str, Any]:
-    """Return the stored numbers: ``command``, and ``configs`` with those of each config and its methods."""
+    """Return the stored numbers: ``command``, ``configs`` with their methods, and ``training`` of our network."""
     document: dict[str, Any] = json.loads(results_file(set_name).read_text())
     return document
 

@@ -287,7 +287,7 @@ def has_views(root: str, config: str, split: str) -> bool:
     configs = json.loads((Path(root) / "manifest.json").read_text())["configs"]
     found = config in configs and any(scene["split"] == split for scene in configs[config]["scenes"])
     if not found:
-        notice(f"{config}, {split}: not scored, since {root} has no such views")
+        notice(f"{config}, {split}: left out, since {root} has no such views")
     return found
 
 
@@ -397,7 +397,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description="train a small depth network on the config cages and score it")
     parser.add_argument("root", metavar="ROOT", help="dataset folder with the split train of cages")
     parser.add_argument("--out", type=Path, default=Path("finetuned"), metavar="FOLDER", help="default: finetuned")
-    parser.add_argument("--epochs", type=int, default=60, help="number of passes over the views (default: 60)")
+    parser.add_argument("--epochs", type=int, default=120, help="number of passes over the views (default: 120)")
     parser.add_argument("--crop", type=int, nargs=2, metavar=("HEIGHT", "WIDTH"), help="size of random crops")
     parser.add_argument("--batch", type=int, default=4, help="stereo pairs in a batch (default: 4)")
     parser.add_argument("--workers", type=int, default=1, help="processes that load views (default: 1)")

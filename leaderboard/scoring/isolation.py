@@ -31,8 +31,8 @@ _SPAWN = multiprocessing.get_context("spawn")
 _CHILDREN_LOCK = threading.Lock()
 """Held while a process is started or waited for.
 
-Starting one polls all others. Of two threads that wait for the same process, one sees an error in place of its
-exit status, and then takes it for running.
+``multiprocessing`` polls all child processes when it starts one. If this reaps a process that another thread
+waits for, that thread gets no exit status: it takes the process for running, and a sound archive for a bad one.
 """
 
 T = TypeVar("T")
@@ -91,7 +91,8 @@ class IsolatedCall(Generic[T]):
         except EOFError:
             with _CHILDREN_LOCK:
                 self.process.join(EXIT_S)
-            raise ProcessEndedError(self.process.exitcode) from None
+                status = self.process.exitcode
+            raise ProcessEndedError(status) from None
         if isinstance(found, UnavailableError | SubmissionError | ProcessEndedError):
             raise found
         return found
