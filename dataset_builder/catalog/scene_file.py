@@ -83,7 +83,11 @@ def read_scene(path: str | os.PathLike[str]) -> UserScene:
     path = Path(path)
     scene_toml = _read_scene(path)
     name = scene_name_of(path) if scene_toml.name is None else scene_toml.name
-    _check_name(name, path)
+    if name in RESERVED_NAMES or not SCENE_NAME.accept(name):
+        raise InputError(
+            f"{path}: the scene would be named {name!r}, expected {SCENE_NAME.text}, none of "
+            f"{', '.join(RESERVED_NAMES)}: rename the file, or set its name in a TOML file"
+        )
     with _scene_and_key_named(scene_toml, path):
         assembly_spec = _assembly_spec(scene_toml, path)
         cage = read_cage(assembly_spec)
@@ -179,15 +183,6 @@ def scene_name_of(path: Path) -> str:
     letters = unicodedata.normalize("NFKD", path.stem).casefold()
     plain = "".join(character for character in letters if not unicodedata.combining(character))
     return re.sub("[^a-z0-9]+", "-", plain).strip("-")
-
-
-def _check_name(name: str, path: Path) -> None:
-    """Raise ``InputError`` if ``name`` is not a valid name of a scene; ``path`` is the scene file."""
-    if name in RESERVED_NAMES or not SCENE_NAME.accept(name):
-        raise InputError(
-            f"{path}: the scene would be named {name!r}, expected {SCENE_NAME.text}, none of "
-            f"{', '.join(RESERVED_NAMES)}: rename the file, or set its name in a TOML file"
-        )
 
 
 def _assembly_spec(scene_toml: SceneToml, path: Path) -> CageFileSpec | MeshFileSpec:

@@ -63,7 +63,13 @@ def run(options: argparse.Namespace) -> None:
     else:
         require_extra("build", ["dataset_builder", "bpy"])
         print_notice(f"rendering {options.views} stereo views of the lattice at 1280 x 720 into {data}")
-        _build_dataset(data, options.views)
+        build = ("-P", "-m", "dataset_builder", "--out", str(data), "--config", DEMO_CONFIG)
+        limits = ("--views", str(options.views), "--samples", str(DEMO_SAMPLES))
+        finished = subprocess.run([sys.executable, *build, *limits], stdout=sys.stderr, check=False)
+        if finished.returncode == EXIT_INPUT:
+            raise InputError("the demo dataset cannot be built, see the error above")
+        if finished.returncode:
+            raise BuildError(f"rebar-build ended with exit status {finished.returncode}, expected 0")
     results = []
     for name in DEMO_METHODS:
         print_notice(f"predicting with {name}: {METHODS[name].info.summary}")
@@ -92,16 +98,6 @@ def copy_sample(sample: Path, root: Path) -> None:
         if target.suffix == ".xz":
             target, content = target.with_suffix(""), lzma.decompress(content)
         write_bytes(target, content)
-
-
-def _build_dataset(data: Path, views: int) -> None:
-    command = ["-P", "-m", "dataset_builder", "--out", str(data), "--config", DEMO_CONFIG, "--views", str(views)]
-    command += ["--samples", str(DEMO_SAMPLES)]
-    finished = subprocess.run([sys.executable, *command], stdout=sys.stderr, check=False)
-    if finished.returncode == EXIT_INPUT:
-        raise InputError("the demo dataset cannot be built, see the error above")
-    if finished.returncode:
-        raise BuildError(f"rebar-build ended with exit status {finished.returncode}, expected 0")
 
 
 def _print_results(results: Sequence[Result], console: Console) -> None:

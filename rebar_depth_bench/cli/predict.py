@@ -93,7 +93,11 @@ def run(options: argparse.Namespace) -> None:
     """Predict into an archive; print the method's notes to standard error and the archive's path."""
     method = find_method(options.method, view_timeout_s=options.view_timeout, nearest_m=options.nearest_distance)
     views, notices = _open_views(options, method)
-    _check_folders(options, views)
+    for option, folder in (("pictures", options.pictures), ("ply", options.ply)):
+        for of_config in views if folder is not None else ():
+            target = (folder / config_of(of_config.view_ids[0])).resolve()
+            if Path(options.data).resolve() in (target, *target.parents):
+                raise InputError(f"--{option}: its files would be in {target}, the input; expected another folder")
     info = method.info
     print_notice(f"{info.name}: {info.summary}; from {info.source}; licence {info.licence}")
     for notice in notices:
@@ -136,17 +140,6 @@ def _open_views(options: argparse.Namespace, method: AnyMethod) -> tuple[Sequenc
     if images.board_is_assumed and isinstance(method, MultiViewMethod):
         notices.append(f"{images.config}: states no board, so it is taken to be {images.board}")
     return [images], notices
-
-
-def _check_folders(options: argparse.Namespace, views: Sequence[Views]) -> None:
-    """Raise ``InputError`` if a picture or point cloud would be written among the data."""
-    for option, folder in (("pictures", options.pictures), ("ply", options.ply)):
-        if folder is None:
-            continue
-        for config in views:
-            target = (folder / config_of(config.view_ids[0])).resolve()
-            if Path(options.data).resolve() in (target, *target.parents):
-                raise InputError(f"--{option}: its files would be in {target}, the input; expected another folder")
 
 
 def add_methods_arguments(parser: argparse.ArgumentParser) -> None:
