@@ -1,1 +1,1 @@
-"""Generators of the Markdown cards: those of dataset folders, and the benchmark card."""
+"""Generators of the cards of dataset folders, their Croissant description, and the benchmark card."""

@@ -13,8 +13,8 @@ _LINE_WIDTH = 120
 
 
 def render(template: str, **values: object) -> str:
-    """Render a Markdown template of this package. Raises ``UndefinedError`` for an undefined name."""
-    # The output is Markdown, and all values come from this project.
+    """Render a template of this package, Markdown or YAML. Raises ``UndefinedError`` for an undefined name."""
+    # The output is no HTML. In YAML, the template writes the texts of imported data as JSON strings.
     markdown_environment = environment(PackageLoader("cards", ".")).overlay(autoescape=False)
     return markdown_environment.get_template(template).render(**values)
 

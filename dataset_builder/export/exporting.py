@@ -252,7 +252,7 @@ def export_target(
 
 
 def _remove_temporary_files(folder: Path, only_of: Collection[str] | None) -> None:
-    """Delete the temporary files in a folder, which need not exist: all, or those of the files ``only_of``."""
+    """Delete the temporary files in a folder, if it exists, or with ``only_of`` those for files of these names."""
     for path in list(folder.iterdir()) if folder.is_dir() else ():
         target = temporary_target(path.name)
         if target is not None and (only_of is None or target in only_of):

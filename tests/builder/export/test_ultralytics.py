@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import shutil
 from pathlib import Path
 
@@ -14,7 +13,6 @@ from PIL import Image
 import rebar_depth_bench as rdb
 from dataset_builder.cli.main import main
 from dataset_builder.export import export
-from dataset_builder.export.exported_views import depth_npy
 from rebar_depth_bench.base.errors import InputError
 from tests.damage import change_manifest
 from tests.synthetic_dataset import write_split_dataset
@@ -93,12 +91,6 @@ def test_data_file_names_the_folders_of_earlier_exports(scenes_root: Path, tmp_p
     data = yaml.safe_load((tmp_path / "cages.yaml").read_text())
     assert data["train"] == ["cages/train-a/images", "cages/train-b/images"]
     assert (data["val"], data["test"]) == ([], ["cages/test-d/images"]), "without the plain export, which has EXR"
-
-
-def test_background_stays_zero_and_depth_float32() -> None:
-    depth_m = np.array([[0, 1.25], [1e-3, 80]], np.float32)
-    read = np.load(io.BytesIO(depth_npy(depth_m[:, ::-1])))
-    assert (read.dtype, read.tolist()) == (np.float32, depth_m[:, ::-1].tolist())
 
 
 def test_interrupted_export_resumes_to_same_bytes(scenes_root: Path, tmp_path: Path) -> None:
